@@ -1,0 +1,78 @@
+"""The command line. Each command is one module with `add` (its arguments) and `run`."""
+
+import argparse
+import importlib
+import logging
+import os
+import sys
+from collections.abc import Sequence
+
+from orthonav import __version__
+from orthonav.errors import OrthonavError
+
+COMMANDS = {
+    "demo": "whole story on a generated area: build, fly, report",
+    "build": "make a map from orthophotos",
+    "info": "print what is in a map",
+    "localize": "find where the views of a flight were taken",
+    "evaluate": "compare fixes with the truth",
+    "simulate": "fly over an orthophoto of another year",
+    "landscape": "generate an area: orthophotos of a landscape at several dates",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code: 0 done, 1 a known error, 2 wrong usage."""
+    # Matrices here are small: more BLAS threads only wait for each other.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    options = _parser(arguments).parse_args(arguments)
+    level = (
+        logging.ERROR if options.quiet else logging.DEBUG if options.verbose else logging.WARNING
+    )
+    logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
+    logging.getLogger("rasterio").setLevel(logging.CRITICAL)
+    try:
+        importlib.import_module(f"orthonav.cli.{options.command}").run(options)
+        sys.stdout.flush()
+    except OrthonavError as error:
+        return _failed(_one_line(error), options.verbose)
+    except KeyboardInterrupt:
+        return _failed("interrupted; nothing was written", False)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except MemoryError:
+        return _failed("out of memory", options.verbose)
+    return 0
+
+
+def _parser(arguments: list[str]) -> argparse.ArgumentParser:
+    """The parser; only the command asked for loads its own arguments."""
+    parser = argparse.ArgumentParser(
+        prog="orthonav",
+        description="Position fixes for aircraft without GNSS, from a downward camera and an "
+        "orthophoto of another year.",
+        epilog="orthonav COMMAND --help tells more.",
+    )
+    parser.add_argument("--version", action="version", version=f"orthonav {__version__}")
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("-v", "--verbose", action="store_true", help="say more, on stderr")
+    common.add_argument("-q", "--quiet", action="store_true", help="errors only, no progress")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for name, text in COMMANDS.items():
+        command = commands.add_parser(name, help=text, description=text, parents=[common])
+        if name in arguments:
+            importlib.import_module(f"orthonav.cli.{name}").add(command)
+    return parser
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _failed(message: str, verbose: bool) -> int:
+    if verbose:
+        logging.getLogger(__name__).debug("", exc_info=True)
+    print(f"orthonav: error: {message}", file=sys.stderr)
+    return 1

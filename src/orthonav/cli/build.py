@@ -1,0 +1,71 @@
+"""`orthonav build`: make a map from orthophotos."""
+
+import argparse
+import time
+from pathlib import Path
+
+from orthonav.cli.common import add_orthos, bounds, print_json, progress
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    add_orthos(parser, "orthophoto (any georeferenced raster that GDAL reads)")
+    area = parser.add_mutually_exclusive_group()
+    area.add_argument("--route", type=Path, help="planned route (GeoJSON or CSV lat_deg,lon_deg)")
+    area.add_argument(
+        "--bounds",
+        type=bounds,
+        metavar="W,S,E,N",
+        help="area in degrees; write --bounds=W,S,E,N where W is negative",
+    )
+    parser.add_argument("--band-m", type=float, help="width of the search band around the route")
+    parser.add_argument(
+        "--gsd-m", type=float, help="ground resolution, metres per pixel (default: the imagery's)"
+    )
+    parser.add_argument("--tile-px", type=int, default=256, help="width of a tile (default 256)")
+    parser.add_argument(
+        "--overlap", type=float, default=0.875, help="share common to neighbours (default 0.875)"
+    )
+    parser.add_argument(
+        "--method",
+        default="gradient",
+        help="embedding, name:field=value,... (default gradient)",
+    )
+    parser.add_argument(
+        "--edges",
+        default="gradient",
+        help="what is compared: gradient, gray or canny, e.g. canny:low=100,high=200",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of what is drawn (default 0)")
+    parser.add_argument("--out", type=Path, required=True, metavar="MAP.onav")
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Build and print a summary."""
+    from orthonav.cli.info import summary, summary_text
+    from orthonav.geo.route import read_route
+    from orthonav.prepare import BuildRequest, build_map
+
+    start = time.perf_counter()
+    request = BuildRequest(
+        orthos=options.ortho,
+        out=options.out,
+        bounds_deg=options.bounds,
+        route=read_route(options.route) if options.route else None,
+        band_m=options.band_m,
+        gsd_m=options.gsd_m,
+        tile_px=options.tile_px,
+        overlap=options.overlap,
+        method=options.method,
+        edges=options.edges,
+        seed=options.seed,
+    )
+    with progress(options) as shown:
+        result = build_map(request, shown)
+    plain = summary(result.manifest, result.size_bytes, options.out)
+    plain["build_s"] = round(time.perf_counter() - start, 3)
+    if options.json:
+        print_json(plain)
+    else:
+        print(summary_text(plain))

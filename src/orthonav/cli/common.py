@@ -1,0 +1,77 @@
+"""What several commands share: argument types, progress, printing JSON."""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+
+class Progress:
+    """Progress bars by stage on a terminal; silent elsewhere or when quiet."""
+
+    def __init__(self, quiet: bool) -> None:
+        self._off = quiet or not sys.stderr.isatty()
+        self._bar: Any = None
+        self._stage = ""
+
+    def __call__(self, stage: str, share: float) -> None:
+        """Show that `share` (0..1) of `stage` is done."""
+        if self._off:
+            return
+        if stage != self._stage:
+            self.close()
+            self._stage = stage
+            self._bar = tqdm(
+                total=1000,
+                desc=stage,
+                delay=1,
+                bar_format="{desc:>10} {percentage:3.0f}%|{bar}| {remaining}",
+            )
+        self._bar.update(round(share * 1000) - self._bar.n)
+
+    def close(self) -> None:
+        """End the bar that is shown."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+
+@contextmanager
+def progress(options: argparse.Namespace) -> Iterator[Progress]:
+    """Progress for a command, closed whatever happens."""
+    shown = Progress(options.quiet)
+    try:
+        yield shown
+    finally:
+        shown.close()
+
+
+def bounds(text: str) -> tuple[float, float, float, float]:
+    """W,S,E,N in degrees."""
+    try:
+        west, south, east, north = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"expected W,S,E,N in degrees, got '{text}'") from error
+    return west, south, east, north
+
+
+def print_json(plain: Any) -> None:
+    """One JSON document on stdout."""
+    print(json.dumps(plain, indent=1, allow_nan=False))
+
+
+def add_orthos(parser: argparse.ArgumentParser, what: str) -> None:
+    """`--ortho FILE`, which may come several times."""
+    parser.add_argument(
+        "--ortho",
+        action="append",
+        required=True,
+        type=Path,
+        metavar="FILE",
+        help=f"{what}; may be given several times, the first covers the next",
+    )

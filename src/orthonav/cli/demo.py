@@ -1,0 +1,136 @@
+"""`orthonav demo`: the whole story on a generated area."""
+
+import argparse
+import json
+import shutil
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from orthonav.cli.common import Progress, print_json, progress
+
+MARKER = "demo.json"
+HEIGHT_M = 270.0
+SPACING_M = 24.0
+# The route in metres east and north of the area's centre, for a size of 2 km.
+TURNS_EN_M = (
+    (-720, -720),
+    (-720, 650),
+    (-300, 730),
+    (-150, -650),
+    (350, -720),
+    (420, 600),
+    (740, 740),
+)
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument(
+        "--out", type=Path, default=Path("orthonav-demo"), help="folder (default ./orthonav-demo)"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="which landscape (default 1)")
+    parser.add_argument("--json", action="store_true", help="print the metrics as JSON")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Generate, build, fly, localize, report."""
+    from orthonav.files import replacing_folder
+
+    start = time.perf_counter()
+    _remove_earlier(options.out)
+    with progress(options) as shown, replacing_folder(options.out) as folder:
+        plain, text = _story(folder, options, shown)
+        (folder / MARKER).write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+    if options.json:
+        print_json(plain)
+        return
+    print(text)
+    print(f"\ndone in {time.perf_counter() - start:.0f} s; open {options.out}/report/index.html")
+
+
+def _remove_earlier(out: Path) -> None:
+    """Remove what an earlier demo left; anything else in the way is refused later."""
+    if (out / MARKER).is_file():
+        shutil.rmtree(out)
+
+
+def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[Any, str]:
+    from orthonav.cli.evaluate import map_background
+    from orthonav.cli.info import summary, summary_text
+    from orthonav.evaluate.metrics import compare, measure
+    from orthonav.evaluate.report import (
+        FlightReport,
+        MadeFrom,
+        metrics_to_json,
+        table,
+        write_report,
+    )
+    from orthonav.flight import open_flight, read_truth
+    from orthonav.geo.route import read_route
+    from orthonav.localizer import Localizer
+    from orthonav.mapfile import open_map
+    from orthonav.onboard.run import localize_flight
+    from orthonav.prepare import BuildRequest, build_map
+    from orthonav.publish.jsonl import write_results
+    from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+    from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
+
+    _say(options, f"1/4 generating 2 x 2 km at two dates (seed {options.seed})")
+    past, present = generate_area(
+        folder,
+        dates=DEFAULT_DATES[:2],
+        seed=options.seed,
+        progress=lambda share: shown("landscape", share),
+    )
+    _say(options, f"2/4 building the map from {past.name}")
+    map_path = folder / "area.onav"
+    built = build_map(BuildRequest([past], map_path), shown)
+    opened = open_map(map_path)
+    frame = opened.manifest.sheets[0].frame
+    route = folder / "route.geojson"
+    _write_route(route, frame.latlon_from_en(TURNS_EN_M))
+    _say(options, f"3/4 flying over {present.name}, heading off by 5 deg, height by 5 %")
+    request = SimulateRequest(
+        [present],
+        folder / "flight",
+        route=read_route(route),
+        agl_m=HEIGHT_M,
+        spacing_m=SPACING_M,
+        errors=Errors(yaw_std_deg=5.0, agl_std=0.05),
+        seed=options.seed,
+    )
+    simulate_flight(request, lambda share: shown("simulate", share))
+    _say(options, "4/4 localizing every view anywhere on the map")
+    results = []
+    flight = open_flight(request.out)
+    for result in localize_flight(Localizer(opened), flight, use_prior=False):
+        results.append(result)
+        shown("localize", len(results) / len(flight.views))
+    write_results(folder / "fixes.jsonl", results)
+    comparison = compare(read_truth(request.out / "truth.csv"), results, frame)
+    metrics = measure(comparison, opened.manifest.radius_m)
+    shown_flight = FlightReport("demo", comparison, metrics, map_background(opened))
+    about = summary(built.manifest, built.size_bytes, Path(map_path.name))
+    made_from = MadeFrom(
+        map_name=map_path.name,
+        recipe=summary_text(about),
+        flight=f"{len(results)} views of {present.name}",
+        command="orthonav demo",
+        version=str(about["created_by"]),
+    )
+    write_report(folder / "report", [shown_flight], made_from)
+    return metrics_to_json(metrics), f"{summary_text(about)}\n\n{table([shown_flight])}"
+
+
+def _write_route(path: Path, latlon_deg: Any) -> None:
+    line = [[float(lon), float(lat)] for lat, lon in zip(*latlon_deg, strict=True)]
+    geometry = {"type": "LineString", "coordinates": line}
+    feature = {"type": "Feature", "properties": {"name": "demo"}, "geometry": geometry}
+    path.write_text(json.dumps(feature) + "\n", encoding="utf-8")
+
+
+def _say(options: argparse.Namespace, text: str) -> None:
+    if not options.quiet:
+        print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,115 @@
+"""`orthonav info`: print what is in a map."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orthonav.cli.common import print_json
+
+if TYPE_CHECKING:
+    from orthonav.mapfile.manifest import Manifest
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("map", type=Path, metavar="MAP.onav")
+    parser.add_argument("--json", action="store_true", help="print as JSON")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Open the map, which verifies it, and print."""
+    from orthonav.mapfile import open_map
+
+    opened = open_map(options.map)
+    plain = summary(opened.manifest, opened.size_bytes, options.map)
+    if options.json:
+        print_json(plain)
+    else:
+        print(summary_text(plain))
+
+
+def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]:
+    """What people ask of a map, as plain values."""
+    area_km2 = sum(sheet.area_km2 for sheet in manifest.sheets)
+    size_mb = size_bytes / 1e6
+    return {
+        "map": str(path),
+        "created_by": manifest.created_by,
+        "area_km2": round(area_km2, 4),
+        "tiles": sum(sheet.tiles for sheet in manifest.sheets),
+        "size_mb": round(size_mb, 4),
+        "mb_per_km2": round(size_mb / area_km2, 4) if area_km2 > 0 else None,
+        "recipe": manifest.recipe,
+        "radius_m": manifest.radius_m,
+        "calibrated": manifest.confidence is not None,
+        "sheets": [
+            {
+                "centre_lat_deg": sheet.frame.lat_deg,
+                "centre_lon_deg": sheet.frame.lon_deg,
+                "bounds_deg": _bounds_deg(sheet),
+                "gsd_m": sheet.grid.gsd_m,
+                "tile_px": sheet.grid.tile_px,
+                "stride_m": sheet.grid.stride_m,
+                "tiles": sheet.tiles,
+                "area_km2": sheet.area_km2,
+            }
+            for sheet in manifest.sheets
+        ],
+        "imagery": list(manifest.imagery),
+        "parts_mb": {
+            name: round(_part_bytes(part) / 1e6, 4) for name, part in manifest.parts.items()
+        },
+    }
+
+
+def _bounds_deg(sheet: Any) -> list[float]:
+    """West, south, east, north of the outer tile centres."""
+    import numpy as np
+
+    grid = sheet.grid
+    corners = grid.centres_en_m(np.array([[grid.rows - 1, 0], [0, grid.cols - 1]]))
+    lat, lon = sheet.frame.latlon_from_en(corners)
+    return [round(float(value), 7) for value in (lon[0], lat[0], lon[1], lat[1])]
+
+
+def _part_bytes(part: dict[str, Any]) -> int:
+    import numpy as np
+
+    return int(np.prod(part["shape"]) * np.dtype(part["dtype"]).itemsize)
+
+
+def summary_text(plain: dict[str, Any]) -> str:
+    """The same for people."""
+    lines = [
+        f"map        {plain['map']}  ({plain['created_by']})",
+        f"area       {plain['area_km2']:.2f} km2 of tile centres, {plain['tiles']} tiles",
+        f"size       {plain['size_mb']:.3f} MB, {plain['mb_per_km2']:.3f} MB per km2",
+        f"recipe     {_recipe_text(plain['recipe'])}",
+    ]
+    for sheet in plain["sheets"]:
+        lines.append(
+            f"sheet      {sheet['gsd_m']:g} m per pixel, tiles of {sheet['tile_px']} px every "
+            f"{sheet['stride_m']:g} m, centre {sheet['centre_lat_deg']:.6f}, "
+            f"{sheet['centre_lon_deg']:.6f}"
+        )
+    for source in plain["imagery"]:
+        date = source.get("date") or "date unknown"
+        lines.append(
+            f"imagery    {source.get('name')}  {date}  {source.get('gsd_m')} m  {source.get('crs')}"
+        )
+    calibrated = "probability of an error below" if plain["calibrated"] else "none, for"
+    lines.append(f"confidence {calibrated} {plain['radius_m']:g} m")
+    if "build_s" in plain:
+        speed = plain["area_km2"] / plain["build_s"]
+        lines.append(f"built in   {plain['build_s']:.1f} s, {speed:.2f} km2/s")
+    return "\n".join(lines)
+
+
+def _recipe_text(recipe: dict[str, Any]) -> str:
+    parts = [str(recipe.get("method"))]
+    for name in ("represent", "embed"):
+        variant = dict(recipe.get(name, {}))
+        title = variant.pop("name", "?")
+        values = ",".join(f"{key}={value:g}" for key, value in variant.items())
+        parts.append(f"{name} {title}:{values}" if values else f"{name} {title}")
+    return ", ".join(parts) + f", overlap {recipe.get('overlap')}"

@@ -1,0 +1,74 @@
+"""`orthonav localize`: find where the views of a flight were taken."""
+
+import argparse
+from pathlib import Path
+
+from orthonav.cli.common import print_json, progress
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("map", type=Path, metavar="MAP.onav")
+    parser.add_argument("flight", type=Path, metavar="FLIGHT_DIR")
+    parser.add_argument("--out", type=Path, required=True, metavar="fixes.jsonl")
+    parser.add_argument(
+        "--heading",
+        choices=("known", "unknown"),
+        default="known",
+        help="known: from telemetry (default); unknown: all headings are tried",
+    )
+    parser.add_argument(
+        "--prior",
+        choices=("telemetry", "none"),
+        default="telemetry",
+        help="telemetry: search where its prior columns say, if it has them (default)",
+    )
+    parser.add_argument(
+        "--skip-bad-images",
+        action="store_true",
+        help="images that cannot be decoded become no_fix instead of an error",
+    )
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Localize and write one line per view."""
+    import numpy as np
+
+    from orthonav.flight import open_flight
+    from orthonav.localizer import Localizer
+    from orthonav.mapfile import open_map
+    from orthonav.onboard.run import localize_flight
+    from orthonav.publish.jsonl import write_results
+    from orthonav.records import Fix
+
+    localizer = Localizer(open_map(options.map))
+    flight = open_flight(options.flight)
+    results = []
+    with progress(options) as shown:
+        for result in localize_flight(
+            localizer,
+            flight,
+            use_prior=options.prior == "telemetry",
+            heading_known=options.heading == "known",
+            skip_bad_images=options.skip_bad_images,
+        ):
+            results.append(result)
+            shown("localize", len(results) / len(flight.views))
+    write_results(options.out, results)
+    fixes = sum(isinstance(result.outcome, Fix) for result in results)
+    median_ms = float(np.median([result.latency_ms for result in results]))
+    plain = {
+        "fixes": str(options.out),
+        "views": len(results),
+        "n_fix": fixes,
+        "n_no_fix": len(results) - fixes,
+        "median_latency_ms": round(median_ms, 3) if np.isfinite(median_ms) else None,
+    }
+    if options.json:
+        print_json(plain)
+    else:
+        print(
+            f"{plain['views']} views: {fixes} fixes, {plain['n_no_fix']} without; "
+            f"median {median_ms:.1f} ms per view\nwritten to {options.out}"
+        )

@@ -1,0 +1,80 @@
+"""A probability from evidence, by logistic regression learnt when the map is built."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from orthonav.errors import VariantError
+
+FEATURES = ("score", "margin")
+RIDGE = 1e-3
+
+
+@dataclass(frozen=True)
+class LogisticConfidence:
+    """P(right) = 1 / (1 + exp(-(bias + weights . evidence))).
+
+    `weights` belong to the evidence named in `FEATURES`: the best score, and its lead over the
+    best score elsewhere. Weights are never negative: more evidence never means less confidence.
+    """
+
+    bias: float
+    weights: tuple[float, ...]
+
+    def __call__(self, evidence: Mapping[str, float]) -> float:
+        """Probability in 0..1 that the fix is right."""
+        total = self.bias + sum(
+            weight * evidence[name] for name, weight in zip(FEATURES, self.weights, strict=True)
+        )
+        return 1 / (1 + math.exp(-min(max(total, -60.0), 60.0)))
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for a manifest."""
+        return {"bias": self.bias, "weights": dict(zip(FEATURES, self.weights, strict=True))}
+
+    @classmethod
+    def from_plain(cls, plain: Any) -> "LogisticConfidence":
+        """Inverse of `to_plain`; raises `VariantError` if it does not fit."""
+        try:
+            numbers = [float(plain["bias"]), *(float(plain["weights"][name]) for name in FEATURES)]
+        except (KeyError, TypeError, ValueError) as error:
+            raise VariantError(f"confidence must have bias and weights of {FEATURES}") from error
+        if not all(math.isfinite(number) for number in numbers) or min(numbers[1:]) < 0:
+            raise VariantError(f"confidence has a weight that is negative or not finite: {plain}")
+        return cls(numbers[0], tuple(numbers[1:]))
+
+
+def fit_logistic(
+    features: NDArray[np.float64], right: NDArray[np.bool_], sample_weight: NDArray[np.float64]
+) -> LogisticConfidence:
+    """Weighted maximum likelihood with a slight ridge, weights bounded at zero.
+
+    `features` (N, len(FEATURES)), `right` (N,) whether the fix was right, `sample_weight` (N,).
+    Features are standardized inside, the result applies to raw ones.
+    """
+    mean, std = features.mean(axis=0), features.std(axis=0) + 1e-9
+    scaled = (features - mean) / std
+    sign = np.where(right, 1.0, -1.0)
+    total = sample_weight.sum()
+
+    def loss(parameters: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        logit = parameters[0] + scaled @ parameters[1:]
+        value = sample_weight @ np.logaddexp(0, -sign * logit) / total
+        slope = -sign * sample_weight / (1 + np.exp(np.clip(sign * logit, -60, 60))) / total
+        gradient = np.concatenate([[slope.sum()], scaled.T @ slope])
+        gradient[1:] += 2 * RIDGE * parameters[1:]
+        return float(value + RIDGE * (parameters[1:] ** 2).sum()), gradient
+
+    bounds = [(None, None)] + [(0.0, None)] * features.shape[1]
+    found = minimize(
+        loss, np.zeros(features.shape[1] + 1), jac=True, bounds=bounds, method="L-BFGS-B"
+    ).x
+    weights = found[1:] / std
+    return LogisticConfidence(
+        float(found[0] - weights @ mean), tuple(float(weight) for weight in weights)
+    )

@@ -1,0 +1,253 @@
+"""The whitened embedding: pooled oriented gradients, decorrelated on the reference area itself.
+
+Cells of a tile overlap (each pixel belongs to up to four, with triangular weights), so that a
+shift or turn of the view moves energy gradually from one cell to the next. Each cell is divided
+by its own norm: contrast differs between years, directions do not. Principal components of the
+reference tiles, each divided by its standard deviation (whitening, Jegou and Chum, ECCV 2012),
+give every way in which places differ an equal say. Similarity is the scalar product of unit
+vectors.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.embed.cells import MICRO, CellLayout, cell_means
+from orthonav.errors import VariantError
+
+CHUNK_TILES = 512
+MAX_LEARNT_TILES = 20_000
+PART_NOISE = 2.0
+
+
+@dataclass(frozen=True)
+class WhitenedRecipe:
+    """Parameters of the whitened embedding.
+
+    `cells`: cells along one side of a tile. `dims`: numbers kept per tile. `floor`: norm below
+    which a cell counts as empty rather than being blown up, in units of the representation.
+    """
+
+    cells: int = 8
+    dims: int = 128
+    floor: float = 0.3
+
+    def __post_init__(self) -> None:
+        if self.cells < 1 or MICRO % self.cells:
+            raise VariantError(f"cells must divide {MICRO}, got {self.cells}")
+        if not 1 <= self.dims <= 4096:
+            raise VariantError(f"dims must be 1 to 4096, got {self.dims}")
+        if not self.floor > 0:
+            raise VariantError(f"floor must be above 0, got {self.floor}")
+
+    @cached_property
+    def pooling(self) -> NDArray[np.float32]:
+        """Weights (cells, MICRO) of micro-cells in cells: triangles two cells wide."""
+        width = MICRO / self.cells
+        micro = (np.arange(MICRO) + 0.5) / width
+        centre = np.arange(self.cells) + 0.5
+        weights = np.maximum(0, 1 - np.abs(micro[None] - centre[:, None])) / width
+        return np.asarray(weights, dtype=np.float32)
+
+
+class CellSheet:
+    """Micro-cell means of a whole sheet, filled block by block.
+
+    `means` is (h, w, C) and `valid` (h, w), sampled as `CellLayout` says.
+    """
+
+    def __init__(self, layout: CellLayout, height_px: int, width_px: int, channels: int) -> None:
+        shape = (layout.samples(height_px), layout.samples(width_px))
+        self.layout = layout
+        self.means = np.zeros((*shape, channels), dtype=np.float32)
+        self.valid = np.zeros(shape, dtype=np.float32)
+
+    def fill(
+        self, row_px: int, col_px: int, maps: NDArray[np.float32], valid: NDArray[np.bool_]
+    ) -> None:
+        """Take in maps (C, H, W) and valid (H, W) of the block that starts at a sampled pixel."""
+        means, share = cell_means(maps, valid, self.layout)
+        row, col = row_px // self.layout.spacing_px, col_px // self.layout.spacing_px
+        part = np.s_[row : row + share.shape[0], col : col + share.shape[1]]
+        self.means[part], self.valid[part] = means, share
+
+    def valid_share(self, tiles_px: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Share of valid pixels of each tile whose first pixel (row, col) is in (N, 2)."""
+        step, spacing = self.layout.step, self.layout.spacing_px
+        reach = np.arange(MICRO) * step
+        out = np.empty(len(tiles_px))
+        for part in _chunks(len(tiles_px)):
+            row, col = (tiles_px[part] // spacing).T
+            cells = self.valid[(row[:, None] + reach)[:, :, None], (col[:, None] + reach)[:, None]]
+            out[part] = cells.mean(axis=(1, 2))
+        return out
+
+
+def pooled_features(
+    recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Features (N, F) of the tiles whose first pixels (row, col) are given, and weights (N, F).
+
+    A weight is the share of a cell that is valid; features are normalized cell by cell.
+    """
+    step, spacing = sheet.layout.step, sheet.layout.spacing_px
+    reach = np.arange(MICRO) * step
+    row, col = (tiles_px // spacing).T
+    index = (row[:, None] + reach)[:, :, None], (col[:, None] + reach)[:, None]
+    features = _normalized(recipe, _pooled(recipe, sheet.means[index]))
+    count, channels = len(tiles_px), features.shape[-1]
+    valid = sheet.valid[index][..., None]
+    if valid.min() >= 1:
+        weights = np.ones((1, 1), dtype=np.float32)
+        return features.reshape(count, -1), np.broadcast_to(weights, (count, features[0].size))
+    full = _pooled(recipe, np.ones_like(valid[:1]))
+    share = np.repeat(_pooled(recipe, valid) / full, channels, axis=-1)
+    return features.reshape(count, -1), share.reshape(count, -1)
+
+
+def _normalized(recipe: WhitenedRecipe, cells: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Cells (N, cells, cells, C) free of contrast: each divided by its norm.
+
+    Where there is one channel only (grey levels, edge maps) a cell has no direction to keep: the
+    tile's mean is taken out and the tile as a whole divided by its norm.
+    """
+    axes: tuple[int, ...] = (-1,)
+    if cells.shape[-1] == 1:
+        cells = cells - cells.mean(axis=(1, 2), keepdims=True)
+        axes = (1, 2, 3)
+    power = np.sum(cells**2, axis=axes, keepdims=True)
+    return np.asarray(cells / np.sqrt(power + np.float32(recipe.floor) ** 2))
+
+
+def _pooled(recipe: WhitenedRecipe, micro: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Cells (N, cells, cells, C) of micro-cells (N, MICRO, MICRO, C)."""
+    count, _, _, channels = micro.shape
+    cells = recipe.cells
+    rows = recipe.pooling @ micro.reshape(count, MICRO, MICRO * channels)
+    cols = rows.reshape(count, cells, MICRO, channels).transpose(0, 1, 3, 2) @ recipe.pooling.T
+    return np.ascontiguousarray(cols.transpose(0, 1, 3, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class WhitenedEmbedder:
+    """A learnt whitened embedding.
+
+    `mean` (F,) and `basis` (F, D) float16 as stored in the map; computed in float32.
+    """
+
+    recipe: WhitenedRecipe
+    mean: NDArray[np.float16]
+    basis: NDArray[np.float16]
+
+    @cached_property
+    def _mean(self) -> NDArray[np.float32]:
+        return self.mean.astype(np.float32)
+
+    @cached_property
+    def _basis(self) -> NDArray[np.float32]:
+        return self.basis.astype(np.float32)
+
+    @property
+    def dims(self) -> int:
+        """Numbers per embedding."""
+        return int(self.basis.shape[1])
+
+    def tiles(self, sheet: CellSheet, tiles_px: NDArray[np.intp]) -> NDArray[np.float16]:
+        """Unit embeddings (N, D) of tiles whose first pixels (row, col) are given (N, 2)."""
+        out = np.empty((len(tiles_px), self.dims), dtype=np.float16)
+        for part in _chunks(len(tiles_px)):
+            features, weights = pooled_features(self.recipe, sheet, tiles_px[part])
+            out[part] = _unit(((features - self._mean) * weights) @ self._basis)
+        return out
+
+    def view(self, maps: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Unit embedding (D,) of a view's representation (C, S, S); zero for an empty one.
+
+        Raises `ValueError` if the view is not a square of a multiple of `MICRO` pixels.
+        """
+        channels, height, width = maps.shape
+        if height != width or height % MICRO:
+            raise ValueError(f"view must be square, a multiple of {MICRO} px, got {maps.shape}")
+        sheet = CellSheet(CellLayout(height // MICRO, height // MICRO), height, width, channels)
+        sheet.fill(0, 0, maps, valid)
+        origin = np.zeros((1, 2), dtype=np.intp)
+        features, weights = pooled_features(self.recipe, sheet, origin)
+        centred = (features - self._mean)[0]
+        if weights.min() < 1:
+            return _unit(self._from_part(centred, weights[0]))
+        return _unit(centred @ self._basis)
+
+    def _from_part(
+        self, centred: NDArray[np.float32], weights: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Whitened components (D,) of a view in which cells are missing or partly seen.
+
+        Components are no longer orthogonal on the rest of the tile, so their most probable values
+        are solved for: the conditional mean of probabilistic PCA (Tipping and Bishop 1999) with
+        noise of `PART_NOISE` times the smallest variance kept. In reference tiles missing cells
+        stay at the mean instead: solved for, tiles with little imagery attract too many views.
+        """
+        loadings = self._loadings
+        seen = loadings.T * (weights / PART_NOISE)
+        normal = seen @ loadings + np.eye(self.dims, dtype=np.float32)
+        return np.asarray(np.linalg.solve(normal, seen @ centred))
+
+    @cached_property
+    def _loadings(self) -> NDArray[np.float32]:
+        """Features (F, D) per unit of each whitened component, smallest variance kept = 1."""
+        norms = np.linalg.norm(self._basis, axis=0)
+        return np.asarray(self._basis / norms**2 * norms.max())
+
+    def parts(self) -> dict[str, NDArray[Any]]:
+        """Arrays to be stored in the map."""
+        return {"mean": self.mean, "basis": self.basis}
+
+
+def _unit(vectors: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    norms = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.maximum(norms, 1e-12), dtype=np.float32)
+
+
+def learn(recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp]) -> WhitenedEmbedder:
+    """Learn mean and whitening from the tiles (N, 2) of the reference area.
+
+    At most `MAX_LEARNT_TILES` of them, evenly taken, are used. Fewer than `dims` components are
+    kept where the tiles do not span more.
+    """
+    taken = tiles_px[:: max(1, -(-len(tiles_px) // MAX_LEARNT_TILES))]
+    total: Any = 0.0
+    weight: Any = 1e-9
+    for features, weights in _features(recipe, sheet, taken):
+        total = total + np.einsum("nf,nf->f", features, weights, dtype=np.float64)
+        weight = weight + weights.sum(axis=0, dtype=np.float64)
+    mean = (total / weight).astype(np.float16)
+    scatter: Any = 0.0
+    for features, weights in _features(recipe, sheet, taken):
+        centred = (features - mean.astype(np.float32)) * weights
+        scatter = scatter + (centred.T @ centred).astype(np.float64)
+    variances, vectors = np.linalg.eigh(scatter / len(taken))
+    variances, vectors = variances[::-1], vectors[:, ::-1]
+    kept = int(np.count_nonzero(variances[: recipe.dims] > 1e-6 * max(variances[0], 1e-12)))
+    kept = max(1, min(kept, len(taken)))
+    scale = 1 / np.sqrt(np.maximum(variances[:kept], 1e-12))
+    basis = vectors[:, :kept] * (scale / scale.max())
+    # The sign of an eigenvector is arbitrary: the largest entry is made positive.
+    largest = np.abs(basis).argmax(axis=0)
+    basis *= np.sign(basis[largest, np.arange(kept)])
+    return WhitenedEmbedder(recipe, mean, basis.astype(np.float16))
+
+
+def _features(
+    recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp]
+) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    for part in _chunks(len(tiles_px)):
+        yield pooled_features(recipe, sheet, tiles_px[part])
+
+
+def _chunks(count: int) -> Iterator[slice]:
+    for start in range(0, count, CHUNK_TILES):
+        yield slice(start, min(count, start + CHUNK_TILES))

@@ -1,0 +1,54 @@
+"""Errors raised for broken input; each says what came, what was expected, and what to do.
+
+All derive from `OrthonavError`, which the command line turns into one line and exit code 1,
+and from the builtin that fits, so that callers who know nothing of orthonav can still catch them.
+A view that cannot be placed is not an error: see `orthonav.records.NoFix`.
+"""
+
+
+class OrthonavError(Exception):
+    """Root of everything orthonav raises on purpose."""
+
+
+class MissingFileError(OrthonavError, FileNotFoundError):
+    """A file or folder that was named does not exist or cannot be read."""
+
+
+class ImageryError(OrthonavError, ValueError):
+    """An orthophoto cannot be used: no georeference, no valid pixels, unreadable, wrong bands."""
+
+
+class AreaError(OrthonavError, ValueError):
+    """The requested area is empty, too large, outside the imagery, or smaller than one tile."""
+
+
+class RouteError(OrthonavError, ValueError):
+    """A route file cannot be read as a route."""
+
+
+class MapFileError(OrthonavError, ValueError):
+    """A map file is not a map, is truncated, or was altered."""
+
+
+class MapVersionError(MapFileError):
+    """A map file was written for a newer schema than this program knows."""
+
+
+class FlightError(OrthonavError, ValueError):
+    """A flight folder, its telemetry, its truth or one of its images is broken."""
+
+
+class CameraError(OrthonavError, ValueError):
+    """Camera parameters are impossible or do not belong to the images."""
+
+
+class VariantError(OrthonavError, ValueError):
+    """An unknown method, representation or parameter was named."""
+
+
+class OutputError(OrthonavError, OSError):
+    """A result could not be written (disk full, no permission); nothing was left behind."""
+
+
+class MissingExtraError(OrthonavError, ImportError):
+    """An optional dependency is needed for this and is not installed."""

@@ -1,0 +1,326 @@
+"""Figures of merit of the fixes of a flight. Arrays and records only: no files, no plots.
+
+The names follow the paper (arXiv 2404.06207): accuracy at a radius (`acc_at_15m`), confidence
+criterion, Lowe's ratio. A share is between 0 and 1 and NaN where there is nothing to share.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import FlightError
+from orthonav.geo.frames import LocalFrame
+from orthonav.records import Fix, NoFix, ViewResult
+
+FloatArray = NDArray[np.float64]
+Positions = Mapping[str, tuple[float, float]]
+"""Frame name -> (latitude, longitude) in degrees."""
+
+RADII_M = (5.0, 10.0, 15.0, 25.0, 35.0, 50.0, 100.0)
+CRITERIA: Mapping[str, tuple[float, ...]] = MappingProxyType(
+    {
+        "lowe_ratio": (1.13,),  # best tile against second best, threshold of the paper
+        "peak_ratio": (1.05, 1.13, 1.3),  # best peak against best peak elsewhere
+        "confidence": (0.5, 0.9, 0.99),
+    }
+)
+"""Confidence criterion -> thresholds; a view is kept where its value is at least the threshold."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Results beside the truth, one entry per view that has both, in the order of the results.
+
+    `truth_en_m` and `fix_en_m` are (N, 2) metres east and north of (`lat_deg`, `lon_deg`), fixes
+    NaN where there is none, and then so is `errors_m` (N,), the distance between the two.
+    `criteria` maps each name of `CRITERIA` to (N,) values, NaN where not known or no fix.
+    `reasons` has the word of each view without a fix, and "" for a fix.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    frames: tuple[str, ...]
+    time_ns: tuple[int, ...]
+    truth_en_m: FloatArray
+    fix_en_m: FloatArray
+    errors_m: FloatArray
+    criteria: Mapping[str, FloatArray]
+    reasons: tuple[str, ...]
+    latency_ms: FloatArray
+    n_without_truth: int
+    n_without_result: int
+
+
+@dataclass(frozen=True)
+class CriterionRow:
+    """What is left at one threshold: share of all views kept, and share of those that are right.
+
+    Both are NaN where no view has the criterion, `accuracy` also where no view is kept.
+    """
+
+    name: str
+    threshold: float
+    share_kept: float
+    accuracy: float
+
+
+@dataclass(frozen=True, eq=False)
+class CriterionCurve:
+    """The same over all thresholds (K,), from the strictest to the one that keeps every fix."""
+
+    name: str
+    thresholds: FloatArray
+    share_kept: FloatArray
+    accuracy: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Metrics:
+    """Figures of one flight, or of several pooled. A figure that is not defined is NaN.
+
+    `acc_at_m` maps each radius to the share of all views with a fix within it, `acc_fixes_at_m` to
+    the share of fixes; both hold `radius_m`, the radius that "right" stands for. Errors are of
+    fixes, `latency_*` of all views, `coverage` is the share of views with a fix.
+    """
+
+    radius_m: float
+    n_views: int
+    n_fixes: int
+    n_without_truth: int
+    n_without_result: int
+    coverage: float
+    acc_at_m: Mapping[float, float]
+    acc_fixes_at_m: Mapping[float, float]
+    error_median_m: float
+    error_p95_m: float
+    error_mean_m: float
+    error_max_m: float
+    latency_median_ms: float
+    latency_p95_ms: float
+    reasons: Mapping[str, int]
+    criteria: tuple[CriterionRow, ...]
+    curves: tuple[CriterionCurve, ...]
+
+    @property
+    def accuracy(self) -> float:
+        """Share of all views with a fix within `radius_m`."""
+        return self.acc_at_m[self.radius_m]
+
+    @property
+    def accuracy_of_fixes(self) -> float:
+        """Share of fixes within `radius_m`."""
+        return self.acc_fixes_at_m[self.radius_m]
+
+
+def radius_key(radius_m: float) -> str:
+    """The name of the accuracy at a radius: `acc_at_15m`."""
+    return f"acc_at_{radius_m:g}m"
+
+
+def compare(
+    truth: Positions, results: Sequence[ViewResult], local: LocalFrame | None = None
+) -> Comparison:
+    """Results set beside the truth by frame name.
+
+    `local` is the plane of the positions, by default one centred on the first true position.
+    A true position that is not finite counts as none. Raises `FlightError` where no result has a
+    truth or a frame has two results.
+    """
+    known = {name: at for name, at in truth.items() if all(map(math.isfinite, at))}
+    _refuse_twice(result.frame for result in results)
+    matched = [result for result in results if result.frame in known]
+    if not matched:
+        raise FlightError(_no_overlap(known, results))
+    local = local or LocalFrame(*known[matched[0].frame])
+    truth_en_m = _local(local, [known[result.frame] for result in matched])
+    fix_en_m = _local(local, [_position(result.outcome) for result in matched])
+    criteria = {
+        name: _frozen([_criterion(result, name) for result in matched]) for name in CRITERIA
+    }
+    return Comparison(
+        lat_deg=local.lat_deg,
+        lon_deg=local.lon_deg,
+        frames=tuple(result.frame for result in matched),
+        time_ns=tuple(result.time_ns for result in matched),
+        truth_en_m=truth_en_m,
+        fix_en_m=fix_en_m,
+        errors_m=_frozen(np.hypot(*(fix_en_m - truth_en_m).T)),
+        criteria=MappingProxyType(criteria),
+        reasons=tuple(_reason(result.outcome) for result in matched),
+        latency_ms=_frozen([result.latency_ms for result in matched]),
+        n_without_truth=len(results) - len(matched),
+        n_without_result=len(known) - len(matched),
+    )
+
+
+def pool(comparisons: Sequence[Comparison]) -> Comparison:
+    """Several flights as one, for figures; positions stay in the planes they came in.
+
+    Raises `ValueError` for no flight at all.
+    """
+    if not comparisons:
+        raise ValueError("nothing to pool: expected at least one flight")
+    parts = list(comparisons)
+    joined = {n: _frozen(np.concatenate([p.criteria[n] for p in parts])) for n in CRITERIA}
+    return Comparison(
+        lat_deg=parts[0].lat_deg,
+        lon_deg=parts[0].lon_deg,
+        frames=tuple(name for p in parts for name in p.frames),
+        time_ns=tuple(time for p in parts for time in p.time_ns),
+        truth_en_m=_frozen(np.concatenate([p.truth_en_m for p in parts])),
+        fix_en_m=_frozen(np.concatenate([p.fix_en_m for p in parts])),
+        errors_m=_frozen(np.concatenate([p.errors_m for p in parts])),
+        criteria=MappingProxyType(joined),
+        reasons=tuple(reason for p in parts for reason in p.reasons),
+        latency_ms=_frozen(np.concatenate([p.latency_ms for p in parts])),
+        n_without_truth=sum(p.n_without_truth for p in parts),
+        n_without_result=sum(p.n_without_result for p in parts),
+    )
+
+
+def measure(
+    comparison: Comparison, radius_m: float = 15.0, radii_m: Sequence[float] = RADII_M
+) -> Metrics:
+    """All figures of `comparison`; `radius_m` says which fixes are right and joins `radii_m`.
+
+    Raises `ValueError` for a radius that is not a positive finite number.
+    """
+    radii = sorted({float(r) for r in (*radii_m, radius_m)})
+    if not all(0.0 < radius < math.inf for radius in radii):
+        raise ValueError(f"a radius must be positive and finite, got {radii} (metres)")
+    errors_m = comparison.errors_m
+    of_fixes_m = errors_m[np.isfinite(errors_m)]
+    return Metrics(
+        radius_m=float(radius_m),
+        n_views=errors_m.size,
+        n_fixes=of_fixes_m.size,
+        n_without_truth=comparison.n_without_truth,
+        n_without_result=comparison.n_without_result,
+        coverage=_share(of_fixes_m.size, errors_m.size),
+        acc_at_m=_within(of_fixes_m, radii, errors_m.size),
+        acc_fixes_at_m=_within(of_fixes_m, radii, of_fixes_m.size),
+        error_median_m=_percentile(of_fixes_m, 50.0),
+        error_p95_m=_percentile(of_fixes_m, 95.0),
+        error_mean_m=float(of_fixes_m.mean()) if of_fixes_m.size else math.nan,
+        error_max_m=float(of_fixes_m.max()) if of_fixes_m.size else math.nan,
+        latency_median_ms=_percentile(comparison.latency_ms, 50.0),
+        latency_p95_ms=_percentile(comparison.latency_ms, 95.0),
+        reasons=MappingProxyType(dict(Counter(r for r in comparison.reasons if r).most_common())),
+        criteria=criterion_rows(comparison, radius_m),
+        curves=tuple(criterion_curve(comparison, name, radius_m) for name in CRITERIA),
+    )
+
+
+def criterion_rows(comparison: Comparison, radius_m: float) -> tuple[CriterionRow, ...]:
+    """One row per criterion and threshold of `CRITERIA`."""
+    rows = []
+    for name, thresholds in CRITERIA.items():
+        values = comparison.criteria[name]
+        for threshold in thresholds:
+            kept = values >= threshold  # NaN is never kept
+            right = int(np.count_nonzero(comparison.errors_m[kept] <= radius_m))
+            n_kept = int(np.count_nonzero(kept))
+            known = bool(np.any(~np.isnan(values)))
+            share = _share(n_kept, values.size) if known else math.nan
+            rows.append(CriterionRow(name, threshold, share, _share(right, n_kept)))
+    return tuple(rows)
+
+
+def criterion_curve(comparison: Comparison, name: str, radius_m: float) -> CriterionCurve:
+    """Share kept and accuracy among kept at every value that the criterion takes.
+
+    Views of equal value are kept or dropped together. Empty where no view has the criterion.
+    """
+    values = comparison.criteria[name]
+    known = ~np.isnan(values)
+    order = np.argsort(-values[known], kind="stable")
+    ordered = values[known][order]
+    n_right = np.cumsum(comparison.errors_m[known][order] <= radius_m)
+    last = np.ones(ordered.size, dtype=bool)
+    last[:-1] = ordered[1:] != ordered[:-1]
+    n_kept = np.flatnonzero(last) + 1
+    return CriterionCurve(
+        name=name,
+        thresholds=_frozen(ordered[last]),
+        share_kept=_frozen(n_kept / max(values.size, 1)),
+        accuracy=_frozen(n_right[last] / n_kept),
+    )
+
+
+def worst_views(comparison: Comparison, n: int = 10) -> list[int]:
+    """Indices of the `n` fixes with the largest error, largest first."""
+    fixes = np.flatnonzero(np.isfinite(comparison.errors_m))
+    order = np.argsort(-comparison.errors_m[fixes], kind="stable")
+    return [int(i) for i in fixes[order[:n]]]
+
+
+def _position(outcome: Fix | NoFix) -> tuple[float, float]:
+    return (outcome.lat_deg, outcome.lon_deg) if isinstance(outcome, Fix) else (math.nan, math.nan)
+
+
+def _is_fix(outcome: Fix | NoFix) -> bool:
+    return all(map(math.isfinite, _position(outcome)))
+
+
+def _reason(outcome: Fix | NoFix) -> str:
+    if isinstance(outcome, NoFix):
+        return outcome.reason or "not_said"
+    return "" if _is_fix(outcome) else "not_finite"
+
+
+def _criterion(result: ViewResult, name: str) -> float:
+    outcome = result.outcome
+    if not isinstance(outcome, Fix) or not _is_fix(outcome):
+        return math.nan
+    return outcome.confidence if name == "confidence" else outcome.evidence.get(name, math.nan)
+
+
+def _local(local: LocalFrame, positions: Sequence[tuple[float, float]]) -> FloatArray:
+    """(N, 2) metres east and north; NaN where a position is NaN."""
+    lat_lon_deg = np.array(positions, dtype=np.float64)
+    en_m = np.full(lat_lon_deg.shape, np.nan)
+    known = np.isfinite(lat_lon_deg).all(axis=1)
+    if known.any():
+        en_m[known] = local.en_from_latlon(lat_lon_deg[known, 0], lat_lon_deg[known, 1])
+    return _frozen(en_m)
+
+
+def _within(errors_m: FloatArray, radii_m: Iterable[float], total: int) -> Mapping[float, float]:
+    shares = {r: _share(int(np.count_nonzero(errors_m <= r)), total) for r in radii_m}
+    return MappingProxyType(shares)
+
+
+def _share(part: int, whole: int) -> float:
+    return part / whole if whole else math.nan
+
+
+def _percentile(values: FloatArray, percent: float) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.percentile(finite, percent)) if finite.size else math.nan
+
+
+def _frozen(values: FloatArray | Sequence[float]) -> FloatArray:
+    array = np.array(values, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+def _refuse_twice(frames: Iterable[str]) -> None:
+    twice = [name for name, count in Counter(frames).items() if count > 1]
+    if twice:
+        raise FlightError(f"{len(twice)} frames have more than one result, such as {twice[0]!r}")
+
+
+def _no_overlap(known: Positions, results: Sequence[ViewResult]) -> str:
+    first_known = repr(next(iter(known))) if known else "none"
+    first_result = repr(results[0].frame) if results else "none"
+    return (
+        "no view has both a result and a true position: "
+        f"{len(results)} results (first {first_result}), {len(known)} true positions "
+        f"(first {first_known}); are these of the same flight?"
+    )

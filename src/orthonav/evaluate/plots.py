@@ -1,0 +1,339 @@
+"""Pictures of an evaluation as PNG bytes: map, error curve, criteria, errors along the flight.
+
+Drawn on matplotlib's Agg canvas without pyplot, so nothing global is kept and no display needed.
+Right and wrong differ by colour and by mark (colours of Okabe and Ito, told apart by everyone).
+"""
+
+import io
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import MissingExtraError
+from orthonav.evaluate.metrics import Comparison, CriterionCurve, Metrics
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+RIGHT, WRONG, TRUTH, GREY, INK = "#0072B2", "#D55E00", "#1A1A1A", "#8C8C8C", "#222222"
+# colour, line, mark, place of a threshold's number (points), order from below
+CURVE_STYLES: dict[str, tuple[str, Any, str, tuple[int, int], float]] = {
+    "confidence": ("#0072B2", "-", "o", (-4, 7), 2.0),
+    "peak_ratio": ("#009E73", (0, (5, 3)), "s", (-26, -12), 2.1),
+    "lowe_ratio": ("#B8558F", (0, (1.5, 1.5)), "^", (5, -12), 2.2),
+}
+LABELS = {
+    "confidence": "confidence",
+    "peak_ratio": "peak ratio",
+    "lowe_ratio": "Lowe's ratio",
+}
+_STYLE: dict[Any, Any] = {
+    "font.size": 10,
+    "axes.edgecolor": GREY,
+    "axes.labelcolor": INK,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.color": "#E3E3E3",
+    "grid.linewidth": 0.8,
+    "text.color": INK,
+    "xtick.color": "#555555",
+    "ytick.color": "#555555",
+    "legend.frameon": True,
+    "legend.framealpha": 0.9,
+    "legend.edgecolor": "#DDDDDD",
+    "legend.fontsize": 9,
+}
+_DPI = 110
+_BACKGROUND_LEVELS = 16  # few grey levels keep the PNG small
+_NO_FIX_SHADE = "#EFE6C8"
+
+
+@dataclass(frozen=True, eq=False)
+class Background:
+    """A grey picture under the map: `grey` (rows, columns) uint8, north up.
+
+    Its outer edges are in metres east and north in the plane of the comparison it is drawn under.
+    """
+
+    grey: NDArray[np.uint8]
+    west_m: float
+    south_m: float
+    east_m: float
+    north_m: float
+
+
+def map_picture(
+    comparison: Comparison, radius_m: float, background: Background | None = None
+) -> bytes:
+    """True positions and fixes from above, a line from each truth to its fix; north is up.
+
+    Fixes far outside the flight are not shown themselves, only their lines to the edge.
+    """
+    box = _view_box(comparison, radius_m)
+    width_m, height_m = box[1] - box[0], box[3] - box[2]
+    scale = 7.5 / max(width_m, height_m)
+    size_in = (max(scale * width_m, 3.0) + 1.0, max(scale * height_m, 3.0) + 1.0)
+
+    def draw(axes: "Axes") -> None:
+        if background is not None:
+            _draw_background(axes, background, box)
+        _draw_positions(axes, comparison, radius_m, box)
+        axes.set(xlim=box[:2], ylim=box[2:], aspect="equal")
+        axes.set(xlabel="east (m)", ylabel="north (m)")
+        _draw_scale_bar(axes, box)
+        _draw_north(axes)
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
+
+    return _png(size_in, draw)
+
+
+def error_curve_picture(comparison: Comparison, metrics: Metrics) -> bytes:
+    """Share of all views with a fix within an error, over that error; the radius marked."""
+
+    def draw(axes: "Axes") -> None:
+        radius_m = metrics.radius_m
+        errors_m = np.sort(comparison.errors_m[np.isfinite(comparison.errors_m)])
+        shown_m = np.maximum(errors_m, 0.01)  # a log axis has no zero
+        low = min([radius_m / 30, *shown_m[:1]]) * 0.8
+        high = max([radius_m * 30, *shown_m[-1:]]) * 1.25
+        shares = np.arange(errors_m.size + 1) / metrics.n_views * 100
+        x = np.concatenate([[low], shown_m, [high]])
+        axes.step(x, [*shares, shares[-1]], where="post", color=RIGHT, linewidth=2)
+        axes.axhline(100 * metrics.coverage, color=GREY, linestyle=(0, (4, 3)), linewidth=1)
+        coverage = f"{100 * metrics.coverage:.0f} % of views have a fix"
+        axes.annotate(coverage, (low, 100 * metrics.coverage), (6, 4), **_OFFSET, color="#555555")
+        axes.axvline(radius_m, color=WRONG, linewidth=1.2)
+        axes.plot([radius_m], [100 * metrics.accuracy], "o", color=WRONG, zorder=5)
+        lift = -14 if metrics.accuracy > 0.15 else 18  # clear of the axis, and of the other note
+        note = f"{100 * metrics.accuracy:.0f} % within {radius_m:g} m"
+        axes.annotate(note, (radius_m, 100 * metrics.accuracy), (8, lift), **_OFFSET, color=WRONG)
+        axes.set(xscale="log", xlim=(low, high), ylim=(0, 107))
+        axes.set(xlabel="error (m)", ylabel="share of all views (%)")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("")
+
+    return _png((6.2, 4.0), draw)
+
+
+def criteria_picture(metrics: Metrics) -> bytes:
+    """Share of views kept against accuracy among them, per criterion; its thresholds marked."""
+
+    def draw(axes: "Axes") -> None:
+        drawn = [curve for curve in metrics.curves if curve.thresholds.size]
+        for curve in drawn:
+            _draw_criterion(axes, curve, metrics)
+        # the first few views make wild shares: they do not set the scale
+        tails = [curve.accuracy[curve.share_kept >= 0.05] for curve in drawn]
+        lowest = min((float(tail.min()) for tail in tails if tail.size), default=0.0)
+        bottom = max(0.0, math.floor(lowest * 10 - 0.5) * 10)
+        axes.set(xlim=(0, 102), ylim=(min(bottom, 85.0), 101.5))
+        axes.set(xlabel="share of all views kept (%)")
+        axes.set(ylabel=f"of these within {metrics.radius_m:g} m (%)")
+        if drawn:
+            axes.legend(loc="best")
+        else:
+            axes.text(51, 50 + min(bottom, 85.0) / 2, "no fix has a criterion", ha="center")
+
+    return _png((6.2, 4.0), draw)
+
+
+def along_picture(comparison: Comparison, radius_m: float) -> bytes:
+    """Error of each view in the order of the flight; views without a fix are shaded."""
+
+    def draw(axes: "Axes") -> None:
+        errors_m = comparison.errors_m
+        views = np.arange(1, errors_m.size + 1)
+        shown_m = np.maximum(errors_m, 0.01)  # a log axis has no zero; NaN stays NaN
+        for i, (start, stop) in enumerate(_runs(np.isnan(errors_m))):
+            label = "no fix" if i == 0 else "_nolegend_"
+            axes.axvspan(start + 0.5, stop + 0.5, color=_NO_FIX_SHADE, linewidth=0, label=label)
+        axes.plot(views, shown_m, color="#BBBBBB", linewidth=0.9, zorder=2)
+        right = errors_m <= radius_m
+        wrong = errors_m > radius_m
+        marks: dict[str, Any] = {"linestyle": "none", "markersize": 4.5, "zorder": 3}
+        axes.plot(views[right], shown_m[right], "o", color=RIGHT, label="right", **marks)
+        axes.plot(views[wrong], shown_m[wrong], "X", color=WRONG, label="wrong", **marks)
+        axes.axhline(radius_m, color=WRONG, linewidth=1.2, label=f"{radius_m:g} m")
+        finite = shown_m[np.isfinite(shown_m)]
+        low = min([radius_m / 10, *finite]) / 1.5
+        high = max([radius_m * 10, *finite]) * 1.5
+        axes.set(yscale="log", ylim=(low, high), xlim=(0.5, errors_m.size + 0.5))
+        axes.set(xlabel="view, in order of the flight", ylabel="error (m)")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("")
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
+
+    return _png((10.5, 3.4), draw)
+
+
+_OFFSET: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9}
+
+
+def _draw_positions(
+    axes: "Axes", comparison: Comparison, radius_m: float, box: tuple[float, ...]
+) -> None:
+    truth, fixes, errors_m = comparison.truth_en_m, comparison.fix_en_m, comparison.errors_m
+    right, wrong = errors_m <= radius_m, errors_m > radius_m
+    for chosen, colour in ((right, RIGHT), (wrong, WRONG)):
+        lines = np.full((3 * int(chosen.sum()), 2), np.nan)  # truth, fix, pen up
+        lines[0::3], lines[1::3] = truth[chosen], fixes[chosen]
+        axes.plot(*lines.T, color=colour, linewidth=0.9, alpha=0.7, zorder=3)
+    none = np.isnan(errors_m)
+    ring: dict[str, Any] = {
+        "linestyle": "none",
+        "marker": "o",
+        "markerfacecolor": "white",
+        "zorder": 4,
+    }
+    axes.plot(*truth[~none].T, ".", color=TRUTH, markersize=3, zorder=7, label="truth")
+    axes.plot(*fixes[right].T, "o", color=RIGHT, markersize=5.5, zorder=5, label="right fix")
+    outside = wrong & ~_inside(fixes, box)
+    label = "wrong fix" + (f" ({int(outside.sum())} outside)" if outside.any() else "")
+    axes.plot(*fixes[wrong].T, "X", color=WRONG, markersize=6.5, zorder=6, label=label)
+    axes.plot(*truth[none].T, color=TRUTH, markersize=4.5, label="truth, no fix", **ring)
+
+
+def _draw_background(axes: "Axes", background: Background, box: tuple[float, ...]) -> None:
+    """The part of the picture that is seen, pale and in few grey levels."""
+    rows, columns = background.grey.shape
+    west, south = background.west_m, background.south_m
+    east_step = (background.east_m - west) / columns
+    north_step = (background.north_m - south) / rows
+    left, right = (int(np.clip((x - west) / east_step, 0, columns)) for x in box[:2])
+    below, above = (int(np.clip((y - south) / north_step, 0, rows)) for y in box[2:])
+    right, above = min(right + 1, columns), min(above + 1, rows)
+    seen = background.grey[rows - above : rows - below, left:right]
+    if seen.size == 0:
+        return
+    step = max(1, math.ceil(max(seen.shape) / (7.5 * _DPI)))
+    seen = seen[: seen.shape[0] // step * step, : seen.shape[1] // step * step]
+    coarse = seen.reshape(seen.shape[0] // step, step, -1, step).mean(axis=(1, 3))
+    levels = np.round(coarse / 255 * (_BACKGROUND_LEVELS - 1)) / (_BACKGROUND_LEVELS - 1)
+    extent = (
+        west + left * east_step,
+        west + (left + coarse.shape[1] * step) * east_step,
+        south + (above - coarse.shape[0] * step) * north_step,
+        south + above * north_step,
+    )
+    axes.imshow(
+        0.45 + 0.55 * levels, cmap="gray", vmin=0, vmax=1, extent=extent, interpolation="nearest"
+    )
+    axes.grid(visible=False)
+
+
+def _draw_scale_bar(axes: "Axes", box: tuple[float, ...]) -> None:
+    width_m, height_m = box[1] - box[0], box[3] - box[2]
+    length_m = _round_length(0.25 * min(width_m, height_m))
+    x, y = box[0] + 0.04 * width_m, box[2] + 0.04 * height_m
+    for width, colour in ((6, "white"), (3, INK)):
+        axes.plot([x, x + length_m], [y, y], color=colour, linewidth=width, zorder=8)
+    text = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
+    backing = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5}
+    axes.annotate(
+        text, (x + length_m / 2, y), (0, 6), **_OFFSET, ha="center", zorder=8, bbox=backing
+    )
+
+
+def _draw_north(axes: "Axes") -> None:
+    axes.annotate(
+        "N",
+        xy=(0.965, 0.975),
+        xytext=(0.965, 0.89),
+        xycoords="axes fraction",
+        ha="center",
+        weight="bold",
+        zorder=8,
+        arrowprops={"arrowstyle": "-|>", "color": INK, "linewidth": 1.6, "shrinkA": 1},
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5},
+    )
+
+
+def _draw_criterion(axes: "Axes", curve: CriterionCurve, metrics: Metrics) -> None:
+    colour, line, mark, place, order = CURVE_STYLES[curve.name]
+    axes.plot(
+        100 * curve.share_kept,
+        100 * curve.accuracy,
+        color=colour,
+        linestyle=line,
+        linewidth=1.8,
+        label=LABELS[curve.name],
+        zorder=order,
+    )
+    for row in metrics.criteria:
+        if row.name == curve.name and math.isfinite(row.accuracy):
+            at = (100 * row.share_kept, 100 * row.accuracy)
+            axes.plot(*at, mark, color=colour, markersize=6, markeredgecolor="white", zorder=4)
+            axes.annotate(f"{row.threshold:g}", at, place, **_OFFSET, color=colour)
+
+
+def _view_box(comparison: Comparison, radius_m: float) -> tuple[float, float, float, float]:
+    """West, east, south, north: the flight, and what of its fixes is near to it."""
+    truth, fixes = comparison.truth_en_m, comparison.fix_en_m
+    low, high = truth.min(axis=0), truth.max(axis=0)
+    reach = max(float((high - low).max()) * 0.35, 5 * radius_m)
+    near = _inside(fixes, (low[0] - reach, high[0] + reach, low[1] - reach, high[1] + reach))
+    seen = np.concatenate([truth, fixes[near]])
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    side = max(float((high - low).max()), 4 * radius_m)
+    middle = (low + high) / 2
+    half = np.maximum((high - low) / 2 + 0.06 * side, 0.3 * side)
+    west, south = (float(value) for value in middle - half)
+    east, north = (float(value) for value in middle + half)
+    return west, east, south, north
+
+
+def _inside(positions_en_m: NDArray[np.float64], box: tuple[float, ...]) -> NDArray[np.bool_]:
+    east, north = positions_en_m.T
+    inside: NDArray[np.bool_] = (
+        (box[0] <= east) & (east <= box[1]) & (box[2] <= north) & (north <= box[3])
+    )
+    return inside
+
+
+def _round_length(length_m: float) -> float:
+    """The largest 1, 2 or 5 times a power of ten that is not above `length_m`."""
+    power = 10.0 ** math.floor(math.log10(length_m))
+    return max(factor * power for factor in (1, 2, 5) if factor * power <= length_m * (1 + 1e-9))
+
+
+def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Start and stop of each run of true flags."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+@contextmanager
+def _own_style() -> Iterator[None]:
+    """matplotlib's defaults and our style, whatever the user's own settings are."""
+    import matplotlib
+
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_STYLE)
+        yield
+
+
+def _png(size_in: tuple[float, float], draw: "Callable[[Axes], None]") -> bytes:
+    """What `draw` puts on one pair of axes, as PNG with a palette."""
+    try:
+        from matplotlib.figure import Figure
+        from PIL import Image
+    except ImportError as error:
+        raise MissingExtraError(
+            "pictures need matplotlib, which is not installed: pip install 'orthonav[report]'"
+        ) from error
+    raw, out = io.BytesIO(), io.BytesIO()
+    with _own_style():
+        figure = Figure(figsize=size_in, dpi=_DPI, layout="constrained")
+        draw(figure.add_subplot())
+        figure.savefig(raw, format="png")
+    image = Image.open(raw).convert("RGB").quantize(colors=128)
+    image.save(out, format="PNG", optimize=True)
+    return out.getvalue()

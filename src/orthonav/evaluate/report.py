@@ -1,0 +1,330 @@
+"""The evaluation of flights as one self-contained page, as a table and as JSON values."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from orthonav.evaluate import plots
+from orthonav.evaluate.metrics import (
+    Comparison,
+    Metrics,
+    measure,
+    pool,
+    radius_key,
+    worst_views,
+)
+from orthonav.evaluate.page import definitions, document, html_table, picture
+from orthonav.files import write_text
+
+_COLUMNS = (
+    "flight",
+    "views",
+    "fixes",
+    "coverage",
+    "right",  # named after the radius
+    "of fixes",
+    "median m",
+    "95 % m",
+    "mean m",
+    "max m",
+    "latency ms",
+)
+_N_WORST = 10
+
+
+@dataclass(frozen=True, eq=False)
+class FlightReport:
+    """One evaluated flight: its name, its results beside the truth, and the figures of those.
+
+    `background` is in the plane of `comparison`; see `orthonav.evaluate.plots.Background`.
+    """
+
+    name: str
+    comparison: Comparison
+    metrics: Metrics
+    background: plots.Background | None = None
+
+
+@dataclass(frozen=True)
+class MadeFrom:
+    """What a report was made from, as text to show; empty where not known."""
+
+    map_name: str = ""
+    recipe: str = ""
+    flight: str = ""
+    command: str = ""
+    version: str = ""
+    date: str = ""
+
+
+def total(flights: Sequence[FlightReport]) -> Metrics:
+    """Figures of all views of all flights together.
+
+    Raises `ValueError` for no flight, and where flights were measured at different radii.
+    """
+    if len({flight.metrics.radius_m for flight in flights}) != 1:
+        raise ValueError("a total needs at least one flight, and one radius for all of them")
+    if len(flights) == 1:
+        return flights[0].metrics
+    first = flights[0].metrics
+    return measure(pool([f.comparison for f in flights]), first.radius_m, list(first.acc_at_m))
+
+
+def table(flights: Sequence[FlightReport]) -> str:
+    """The figures in aligned columns for a terminal: a row per flight, and a total of several."""
+    rows = [list(_header(flights)), *_rows(flights)]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(_COLUMNS))]
+    lines = []
+    for row in rows:
+        first, *others = zip(row, widths, strict=True)
+        cells = [first[0].ljust(first[1]), *(text.rjust(width) for text, width in others)]
+        lines.append("  ".join(cells).rstrip())
+    if len(flights) > 1:
+        lines.insert(-1, "-" * max(map(len, lines)))
+    return "\n".join(lines)
+
+
+def metrics_to_json(metrics: Metrics) -> dict[str, object]:
+    """`metrics` as values for strict JSON; what is not defined becomes None."""
+    return {
+        "n_views": metrics.n_views,
+        "n_fixes": metrics.n_fixes,
+        "n_without_truth": metrics.n_without_truth,
+        "n_without_result": metrics.n_without_result,
+        "radius_m": metrics.radius_m,
+        "coverage": _or_none(metrics.coverage),
+        **{radius_key(r): _or_none(share) for r, share in metrics.acc_at_m.items()},
+        **{f"fixes_{radius_key(r)}": _or_none(s) for r, s in metrics.acc_fixes_at_m.items()},
+        "error_median_m": _or_none(metrics.error_median_m),
+        "error_p95_m": _or_none(metrics.error_p95_m),
+        "error_mean_m": _or_none(metrics.error_mean_m),
+        "error_max_m": _or_none(metrics.error_max_m),
+        "latency_median_ms": _or_none(metrics.latency_median_ms),
+        "latency_p95_ms": _or_none(metrics.latency_p95_ms),
+        "reasons": dict(metrics.reasons),
+        "criteria": [
+            {
+                "name": row.name,
+                "threshold": row.threshold,
+                "share_kept": _or_none(row.share_kept),
+                "accuracy": _or_none(row.accuracy),
+            }
+            for row in metrics.criteria
+        ],
+        "curves": {
+            curve.name: {
+                "threshold": [_or_none(value) for value in curve.thresholds],
+                "share_kept": curve.share_kept.tolist(),
+                "accuracy": curve.accuracy.tolist(),
+            }
+            for curve in metrics.curves
+        },
+    }
+
+
+def write_report(
+    out_dir: Path,
+    flights: Sequence[FlightReport],
+    made_from: MadeFrom | None = None,
+    title: str = "orthonav evaluation",
+) -> Path:
+    """Write `index.html` into `out_dir` and return its path; it needs no other file and no network.
+
+    Raises `MissingExtraError` without matplotlib, `OutputError` where it cannot be written.
+    """
+    path = Path(out_dir) / "index.html"
+    page = render(flights, made_from or MadeFrom(), title)
+    write_text(path, page.encode("utf-8", "replace").decode("utf-8"))
+    return path
+
+
+def render(flights: Sequence[FlightReport], made_from: MadeFrom, title: str) -> str:
+    """The whole page as HTML text."""
+    whole = total(flights)
+    parts = [
+        f"<h1>{escape(title)}</h1>",
+        _headline(whole),
+        _notes(whole),
+        "<h2>Flights</h2>",
+        html_table(_header(flights), _rows(flights), last_is_total=len(flights) > 1),
+        _legend(whole.radius_m),
+        *(_section(flight) for flight in flights),
+    ]
+    if len(flights) > 1:
+        parts += ["<h2>Confidence criteria, all flights</h2>", _criteria(whole)]
+    parts += ["<h2>Made from</h2>", _made_from(made_from)]
+    return document(title, "\n".join(parts))
+
+
+def _headline(metrics: Metrics) -> str:
+    radius = f"{metrics.radius_m:g} m"
+    cards = (
+        (_percent(metrics.accuracy), f"of all views have a fix within {radius}"),
+        (_percent(metrics.accuracy_of_fixes), f"of fixes are within {radius}"),
+        (_percent(metrics.coverage), f"of {metrics.n_views} views have a fix"),
+        (_figure(metrics.error_median_m, " m"), "median error of fixes"),
+        (_figure(metrics.error_p95_m, " m"), "95 % of fixes err less"),
+        (_figure(metrics.latency_median_ms, " ms"), "median time per view"),
+    )
+    inside = "".join(f"<div><b>{value}</b><span>{said}</span></div>" for value, said in cards)
+    return f'<div class="cards">{inside}</div>'
+
+
+def _notes(metrics: Metrics) -> str:
+    notes = []
+    if metrics.n_without_truth:
+        notes.append(f"{metrics.n_without_truth} results have no true position and are left out.")
+    if metrics.n_without_result:
+        notes.append(f"{metrics.n_without_result} true positions have no result: not counted.")
+    if not metrics.n_fixes:
+        notes.append("No view has a fix, so errors are not defined.")
+    return "".join(f'<p class="note">{note}</p>' for note in notes)
+
+
+def _legend(radius_m: float) -> str:
+    radius = f"{radius_m:g} m"
+    return (
+        f'<p class="small">“acc@{radius}”: share of all views with a fix within {radius}; “of '
+        "fixes”: share of fixes within it. Errors are of fixes, latency is the median over all "
+        "views.</p>"
+    )
+
+
+def _section(flight: FlightReport) -> str:
+    comparison, metrics = flight.comparison, flight.metrics
+    radius = f"{metrics.radius_m:g} m"
+    pictures = (
+        (
+            plots.map_picture(comparison, metrics.radius_m, flight.background),
+            f"Map of {metrics.n_views} true positions and {metrics.n_fixes} fixes",
+            "From above, north up: each fix is joined to where the view was really taken.",
+        ),
+        (
+            plots.along_picture(comparison, metrics.radius_m),
+            f"Error of each view in order; {_percent(metrics.coverage)} have a fix",
+            "Error along the flight; shaded where there is no fix.",
+        ),
+        (
+            plots.error_curve_picture(comparison, metrics),
+            f"Error curve: {_percent(metrics.accuracy)} of all views within {radius}",
+            "Share of all views with a fix within an error.",
+        ),
+        (
+            plots.criteria_picture(metrics),
+            "Share of views kept against accuracy among them, per confidence criterion",
+            "What a stricter criterion keeps and how much of it is right, with thresholds.",
+        ),
+    )
+    shown = "".join(picture(png, f"{flight.name}: {alt}", said) for png, alt, said in pictures)
+    return (
+        f'<section><h2>{escape(flight.name)}</h2><div class="pictures">{shown}</div>'
+        f"<h3>Confidence criteria</h3>{_criteria(metrics)}"
+        f"<h3>Worst views</h3>{_worst(comparison, metrics)}"
+        f"<h3>Views without a fix</h3>{_reasons(metrics)}</section>"
+    )
+
+
+def _criteria(metrics: Metrics) -> str:
+    header = ("criterion", "at least", "views kept", f"of these within {metrics.radius_m:g} m")
+    rows = [
+        (
+            plots.LABELS[row.name],
+            f"{row.threshold:g}",
+            _percent(row.share_kept),
+            _percent(row.accuracy),
+        )
+        for row in metrics.criteria
+    ]
+    return html_table(header, rows)
+
+
+def _worst(comparison: Comparison, metrics: Metrics) -> str:
+    worst = worst_views(comparison, _N_WORST)
+    if not worst:
+        return "<p>There is no fix.</p>"
+    header = ("frame", "time s", "error m", "east m", "north m", "confidence", "peak ratio")
+    rows = []
+    for i in worst:
+        east_m, north_m = comparison.fix_en_m[i] - comparison.truth_en_m[i]
+        right = comparison.errors_m[i] <= metrics.radius_m
+        rows.append(
+            (
+                comparison.frames[i],
+                f"{comparison.time_ns[i] / 1e9:.2f}",
+                _figure(comparison.errors_m[i]) + ("" if right else " ✗"),
+                f"{east_m:+.1f}",
+                f"{north_m:+.1f}",
+                _plain(comparison.criteria["confidence"][i]),
+                _plain(comparison.criteria["peak_ratio"][i]),
+            )
+        )
+    said = f"The fixes with the largest errors; ✗ marks those beyond {metrics.radius_m:g} m."
+    return f'<p class="small">{said}</p>' + html_table(header, rows)
+
+
+def _reasons(metrics: Metrics) -> str:
+    if not metrics.reasons:
+        return "<p>Every view has a fix.</p>"
+    rows = [(reason, str(count)) for reason, count in metrics.reasons.items()]
+    return html_table(("reason", "views"), rows)
+
+
+def _made_from(made_from: MadeFrom) -> str:
+    said = {
+        "map": made_from.map_name,
+        "recipe": made_from.recipe,
+        "flight": made_from.flight,
+        "command": made_from.command,
+        "orthonav": made_from.version,
+        "date": made_from.date,
+    }
+    return definitions({name: text for name, text in said.items() if text}) or "<p>Not said.</p>"
+
+
+def _header(flights: Sequence[FlightReport]) -> Sequence[str]:
+    radius_m = total(flights).radius_m
+    return [f"acc@{radius_m:g} m" if name == "right" else name for name in _COLUMNS]
+
+
+def _rows(flights: Sequence[FlightReport]) -> list[list[str]]:
+    rows = [_row(flight.name, flight.metrics) for flight in flights]
+    return rows if len(flights) == 1 else [*rows, _row("total", total(flights))]
+
+
+def _row(name: str, metrics: Metrics) -> list[str]:
+    return [
+        " ".join(name.split()),
+        str(metrics.n_views),
+        str(metrics.n_fixes),
+        _percent(metrics.coverage),
+        _percent(metrics.accuracy),
+        _percent(metrics.accuracy_of_fixes),
+        _figure(metrics.error_median_m),
+        _figure(metrics.error_p95_m),
+        _figure(metrics.error_mean_m),
+        _figure(metrics.error_max_m),
+        _figure(metrics.latency_median_ms),
+    ]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %" if math.isfinite(share) else "-"
+
+
+def _figure(value: float, unit: str = "") -> str:
+    """A length or time with as many decimals as say something."""
+    if not math.isfinite(value):
+        return "-"
+    return (f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}") + unit
+
+
+def _plain(value: float) -> str:
+    return f"{value:.3f}" if math.isfinite(value) else "-"
+
+
+def _or_none(value: float | np.floating) -> float | None:
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,194 @@
+"""Reading a flight folder."""
+
+import csv
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import CameraError, FlightError, MissingFileError
+from orthonav.files import require_file
+from orthonav.geo.camera import Camera
+from orthonav.records import Prior, Telemetry
+
+TELEMETRY_COLUMNS = ("frame", "time_s", "yaw_deg", "pitch_deg", "roll_deg", "agl_m")
+OPTIONAL_COLUMNS = (
+    "yaw_std_deg",
+    "agl_std_m",
+    "prior_lat_deg",
+    "prior_lon_deg",
+    "prior_std_m",
+    "vel_east_mps",
+    "vel_north_mps",
+)
+MAX_TEXT_BYTES = 500_000_000
+# The camera describes the sensor: an orientation tag must not turn the picture.
+_DECODE = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+
+
+@dataclass(frozen=True)
+class FlightView:
+    """One view of a flight: its name in `frames/`, where it lies, what was known at exposure."""
+
+    frame: str
+    path: Path
+    telemetry: Telemetry
+
+
+@dataclass(frozen=True)
+class FlightFolder:
+    """A flight as it was recorded: one camera, views in the order of the telemetry."""
+
+    path: Path
+    camera: Camera
+    note: str
+    views: tuple[FlightView, ...]
+
+
+def open_flight(path: Path) -> FlightFolder:
+    """Open a flight folder and check that every image named is there.
+
+    Raises `MissingFileError`, `FlightError` or `CameraError`, saying which file and line. Values
+    that are not numbers become NaN: what lacks heading or height is a matter of one view.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        kind = "is a file, not a folder" if path.exists() else "does not exist"
+        raise MissingFileError(f"flight folder {kind}: {path}")
+    camera, note = read_camera(path / "flight.json")
+    telemetry = require_file(path / "telemetry.csv", "telemetry of the flight")
+    views = tuple(_views(telemetry, path / "frames"))
+    if not views:
+        raise FlightError(f"telemetry has no views: {telemetry}")
+    return FlightFolder(path, camera, note, views)
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """Grey levels (H, W) uint8 of an image file; 16-bit images are scaled down.
+
+    Raises `MissingFileError` or, where it cannot be decoded, `FlightError`.
+    """
+    require_file(path, "image of the flight")
+    data = np.fromfile(path, dtype=np.uint8)
+    try:
+        image = cv2.imdecode(data, _DECODE) if data.size else None
+    except cv2.error:
+        image = None
+    if image is None:
+        raise FlightError(f"image of the flight cannot be decoded: {path}")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def read_truth(path: Path) -> dict[str, tuple[float, float]]:
+    """True positions by frame, (lat_deg, lon_deg), from `truth.csv`.
+
+    Raises `MissingFileError` or `FlightError`, naming the line.
+    """
+    path = require_file(path, "truth")
+    truth: dict[str, tuple[float, float]] = {}
+    for line, row in _rows(path, ("frame", "lat_deg", "lon_deg")):
+        lat, lon = _number(row["lat_deg"]), _number(row["lon_deg"])
+        if not (abs(lat) <= 90 and abs(lon) <= 360):
+            raise FlightError(f"line {line}: no latitude and longitude in degrees: {path}")
+        if row["frame"] in truth:
+            raise FlightError(f"line {line}: frame {row['frame']} comes twice: {path}")
+        truth[row["frame"]] = (lat, lon)
+    return truth
+
+
+def read_camera(path: Path) -> tuple[Camera, str]:
+    """Camera and note of a `flight.json`.
+
+    Raises `MissingFileError`, `FlightError` or `CameraError`.
+    """
+    path = require_file(path, "camera of the flight")
+    try:
+        plain = json.loads(path.read_text(encoding="utf-8"))
+        raw = plain["camera"]
+        camera = Camera(
+            width_px=int(raw["width_px"]),
+            height_px=int(raw["height_px"]),
+            **{name: float(raw[name]) for name in ("fx_px", "fy_px", "cx_px", "cy_px")},
+            distortion=tuple(float(value) for value in raw.get("distortion", [])),
+        )
+        return camera, str(plain.get("note", ""))
+    except CameraError as error:
+        raise CameraError(f"{error}: {path}") from error
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise FlightError(
+            "expected {camera: {width_px, height_px, fx_px, fy_px, cx_px, cy_px}} as JSON "
+            f"({type(error).__name__}: {error}): {path}"
+        ) from error
+
+
+def _views(telemetry: Path, frames: Path) -> Iterator[FlightView]:
+    seen: set[str] = set()
+    for line, row in _rows(telemetry, TELEMETRY_COLUMNS):
+        frame = row["frame"]
+        pure = PurePosixPath(frame)
+        if not frame or pure.is_absolute() or ".." in pure.parts or "\\" in frame:
+            raise FlightError(f"line {line}: '{frame}' is not a name inside frames/: {telemetry}")
+        if frame in seen:
+            raise FlightError(f"line {line}: frame {frame} comes twice: {telemetry}")
+        seen.add(frame)
+        time_s = _number(row["time_s"])
+        if not (math.isfinite(time_s) and abs(time_s) < 9e9):
+            raise FlightError(f"line {line}: time_s is no time in seconds: {telemetry}")
+        image = frames / frame
+        if not image.is_file():
+            raise FlightError(f"telemetry line {line} names an image that does not exist: {image}")
+        yield FlightView(frame, image, _telemetry(row, time_s))
+
+
+def _telemetry(row: Mapping[str, str], time_s: float) -> Telemetry:
+    prior = [_optional(row, f"prior_{name}") for name in ("lat_deg", "lon_deg", "std_m")]
+    velocity = [_optional(row, f"vel_{name}_mps") for name in ("east", "north")]
+    usable = prior[0] is not None and prior[1] is not None and prior[2] is not None
+    usable = usable and abs(prior[0] or 0) <= 90 and abs(prior[1] or 0) <= 360
+    return Telemetry(
+        time_ns=round(time_s * 1e9),
+        yaw_deg=_number(row["yaw_deg"]),
+        pitch_deg=_number(row["pitch_deg"]),
+        roll_deg=_number(row["roll_deg"]),
+        agl_m=_number(row["agl_m"]),
+        yaw_std_deg=_optional(row, "yaw_std_deg"),
+        agl_std_m=_optional(row, "agl_std_m"),
+        prior=Prior(prior[0] or 0.0, prior[1] or 0.0, prior[2] or 0.0) if usable else None,
+        vel_en_mps=None if None in velocity else (velocity[0] or 0.0, velocity[1] or 0.0),
+    )
+
+
+def _rows(path: Path, needed: tuple[str, ...]) -> Iterator[tuple[int, dict[str, str]]]:
+    """Line number and fields of each row of a CSV that must have the columns `needed`."""
+    if path.stat().st_size > MAX_TEXT_BYTES:
+        raise FlightError(f"file is larger than {MAX_TEXT_BYTES // 10**6} MB: {path}")
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            reader = csv.DictReader(stream, skipinitialspace=True)
+            missing = [name for name in needed if name not in (reader.fieldnames or ())]
+            if missing:
+                raise FlightError(f"columns are missing: {', '.join(missing)}: {path}")
+            for row in reader:
+                if any(row[name] is None for name in needed):
+                    raise FlightError(f"line {reader.line_num} has too few fields: {path}")
+                yield reader.line_num, {k: v or "" for k, v in row.items() if isinstance(k, str)}
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise FlightError(f"not a CSV file in UTF-8 ({error}): {path}") from error
+
+
+def _number(text: Any) -> float:
+    try:
+        return float(text)
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def _optional(row: Mapping[str, str], name: str) -> float | None:
+    value = _number(row.get(name, ""))
+    return value if math.isfinite(value) else None

@@ -1,0 +1,98 @@
+"""Writing a flight folder."""
+
+import csv
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import OutputError
+from orthonav.flight.folder import OPTIONAL_COLUMNS, TELEMETRY_COLUMNS
+from orthonav.geo.camera import Camera
+from orthonav.records import Telemetry
+
+
+class FlightWriter:
+    """Writes views into an existing empty folder; `close` writes telemetry, camera and truth.
+
+    Use it inside `orthonav.files.replacing_folder`, so that a flight is there whole or not.
+    """
+
+    def __init__(self, folder: Path, camera: Camera, note: str) -> None:
+        self._folder = folder
+        self._camera = camera
+        self._note = note
+        self._rows: list[dict[str, Any]] = []
+        self._truth: list[tuple[str, str, str]] = []
+        (folder / "frames").mkdir()
+
+    def add(
+        self,
+        frame: str,
+        image: NDArray[np.uint8],
+        telemetry: Telemetry,
+        truth_latlon_deg: tuple[float, float],
+        jpeg_quality: int = 90,
+    ) -> None:
+        """Add one view: `image` (H, W, 3) RGB, JPEG or PNG by the ending of `frame`."""
+        options = [int(cv2.IMWRITE_JPEG_QUALITY), jpeg_quality]
+        if not frame.lower().endswith((".jpg", ".jpeg")):
+            options = []
+        done, data = cv2.imencode(
+            Path(frame).suffix, np.ascontiguousarray(image[..., ::-1]), options
+        )
+        if not done:
+            raise OutputError(f"image cannot be encoded: {frame}")
+        (self._folder / "frames" / frame).write_bytes(data.tobytes())
+        self._rows.append({"frame": frame, **_columns(telemetry)})
+        lat, lon = truth_latlon_deg
+        self._truth.append((frame, f"{lat:.8f}", f"{lon:.8f}"))
+
+    def close(self) -> None:
+        """Write `telemetry.csv`, `flight.json` and `truth.csv`."""
+        used = [
+            name for name in OPTIONAL_COLUMNS if any(row[name] is not None for row in self._rows)
+        ]
+        columns = [*TELEMETRY_COLUMNS, *used]
+        table = [[_text(row[name]) for name in columns] for row in self._rows]
+        _write_csv(self._folder / "telemetry.csv", columns, table)
+        _write_csv(self._folder / "truth.csv", ("frame", "lat_deg", "lon_deg"), self._truth)
+        camera = dataclasses.asdict(self._camera)
+        text = json.dumps({"camera": camera, "note": self._note}, indent=1)
+        (self._folder / "flight.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _columns(telemetry: Telemetry) -> dict[str, Any]:
+    prior, velocity = telemetry.prior, telemetry.vel_en_mps
+    return {
+        "time_s": telemetry.time_ns / 1e9,
+        "yaw_deg": telemetry.yaw_deg,
+        "pitch_deg": telemetry.pitch_deg,
+        "roll_deg": telemetry.roll_deg,
+        "agl_m": telemetry.agl_m,
+        "yaw_std_deg": telemetry.yaw_std_deg,
+        "agl_std_m": telemetry.agl_std_m,
+        "prior_lat_deg": prior and prior.lat_deg,
+        "prior_lon_deg": prior and prior.lon_deg,
+        "prior_std_m": prior and prior.std_m,
+        "vel_east_mps": velocity and velocity[0],
+        "vel_north_mps": velocity and velocity[1],
+    }
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    return f"{value:.8f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)
+
+
+def _write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)

@@ -1,0 +1,1 @@
+"""Geometry without GDAL or PROJ: local frames, tile grids, areas, the camera, routes."""

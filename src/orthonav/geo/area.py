@@ -1,0 +1,92 @@
+"""The reference area: where the aircraft may be, so where tile centres must lie."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import AreaError
+from orthonav.geo.frames import MAX_SHEET_M, LocalFrame
+from orthonav.geo.route import Route, distance_to_polyline_m
+
+Extent = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Area:
+    """A reference area in its own local plane.
+
+    `extent_en_m` is (west, south, east, north) in metres of `frame`. With `route` and `band_m`
+    the area is the search band, `band_m` metres across, around the route; else the whole extent.
+    """
+
+    frame: LocalFrame
+    extent_en_m: Extent
+    route: Route | None = None
+    band_m: float = 0.0
+
+    @classmethod
+    def from_bounds(cls, bounds_deg: Extent) -> "Area":
+        """Area of a latitude/longitude box (west, south, east, north in degrees)."""
+        west, south, east, north = bounds_deg
+        if not (np.isfinite(bounds_deg).all() and west < east and south < north):
+            raise AreaError(
+                "bounds must be west,south,east,north in degrees with west < east and "
+                f"south < north, got {','.join(map(str, bounds_deg))}"
+            )
+        if max(abs(south), abs(north)) > 89.9 or east - west > 10 or north - south > 10:
+            raise AreaError(f"bounds are no area a sheet can hold, in degrees: {bounds_deg}")
+        share = np.linspace(0, 1, 33)
+        lon = west + (east - west) * share
+        lat = south + (north - south) * share
+        edge_lat = np.concatenate([np.full(33, south), np.full(33, north), lat, lat])
+        edge_lon = np.concatenate([lon, lon, np.full(33, west), np.full(33, east)])
+        return cls.from_outline(edge_lat, edge_lon)
+
+    @classmethod
+    def from_outline(cls, lat_deg: NDArray[np.float64], lon_deg: NDArray[np.float64]) -> "Area":
+        """Smallest north-up box around outline points, in a plane centred on that box."""
+        frame = LocalFrame(
+            round(float(lat_deg.min() + lat_deg.max()) / 2, 7),
+            round(float(lon_deg.min() + lon_deg.max()) / 2, 7),
+        )
+        points = frame.en_from_latlon(lat_deg, lon_deg)
+        west, south = points.min(axis=0)
+        east, north = points.max(axis=0)
+        return cls(frame, _checked((float(west), float(south), float(east), float(north))))
+
+    @classmethod
+    def from_route(cls, route: Route, band_m: float) -> "Area":
+        """Search band `band_m` metres across, around `route`."""
+        if not (np.isfinite(band_m) and band_m > 0):
+            raise AreaError(f"search band must be wider than 0 m, got {band_m}")
+        lat_lon = np.array(route.waypoints)
+        box = cls.from_outline(lat_lon[:, 0], lat_lon[:, 1])
+        west, south, east, north = box.extent_en_m
+        half = band_m / 2
+        extent = _checked((west - half, south - half, east + half, north + half))
+        return cls(box.frame, extent, route, band_m)
+
+    def contains(
+        self, points_en_m: NDArray[np.float64], margin_m: float = 0.0
+    ) -> NDArray[np.bool_]:
+        """Which of `(N, 2)` local points lie inside, or at most `margin_m` outside."""
+        if self.route is not None:
+            line = self.route.points_en_m(self.frame)
+            distance = distance_to_polyline_m(points_en_m, line)
+            return np.asarray(distance <= self.band_m / 2 + margin_m)
+        west, south, east, north = self.extent_en_m
+        low = np.array([west, south]) - margin_m
+        high = np.array([east, north]) + margin_m
+        return np.asarray(((points_en_m >= low) & (points_en_m <= high)).all(axis=1))
+
+
+def _checked(extent: Extent) -> Extent:
+    west, south, east, north = extent
+    across = max(east - west, north - south)
+    if across > MAX_SHEET_M:
+        raise AreaError(
+            f"area is {across / 1000:.1f} km across, a sheet holds at most "
+            f"{MAX_SHEET_M / 1000:.0f} km; build it in parts with --bounds or --route"
+        )
+    return extent

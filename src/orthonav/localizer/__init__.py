@@ -1,0 +1,11 @@
+"""READ FIRST: a view, what the autopilot knew, and a map go in; a `Fix` or a `NoFix` comes out.
+
+`localizer.Localizer.locate` is the whole path: check the view, rectify it to the map's ground
+resolution with north up (`rectify`), represent and embed it, search the tiles that the prior
+allows, and say how sure that is.
+"""
+
+from orthonav.localizer.localizer import Localizer, Match
+from orthonav.localizer.rectify import PreparedView, Rectified, prepare_view, rectify
+
+__all__ = ["Localizer", "Match", "PreparedView", "Rectified", "prepare_view", "rectify"]

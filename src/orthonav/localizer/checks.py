@@ -1,0 +1,69 @@
+"""Views that cannot be placed, told before any search: each a `NoFix` with its reason."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.geo.camera import Camera, enu_from_camera
+from orthonav.localizer.rectify import Rectified
+from orthonav.records import NoFix, Telemetry
+
+MAX_TILT_DEG = 45.0
+MIN_SIDE_PX = 32
+MAX_COARSER = 4.0
+DARK_LEVEL = 16.0
+BRIGHT_LEVEL = 250.0
+MIN_STD = 3.0
+_SAMPLE_STEP_PX = 4
+
+
+def check_telemetry(
+    telemetry: Telemetry, camera: Camera, gsd_m: float, heading_known: bool
+) -> NoFix | None:
+    """Why a view with this telemetry cannot be rectified to `gsd_m`; None if it can."""
+    missing = [name for name in telemetry.missing() if heading_known or name != "yaw_deg"]
+    if missing:
+        return NoFix("missing_telemetry", f"not a number: {', '.join(missing)}")
+    if telemetry.agl_m <= 0:
+        return NoFix("bad_height", f"height above ground is {telemetry.agl_m:.1f} m")
+    axis_up = enu_from_camera(0.0, telemetry.pitch_deg, telemetry.roll_deg)[2, 2]
+    tilt_deg = math.degrees(math.acos(max(-1.0, min(1.0, -float(axis_up)))))
+    if tilt_deg > MAX_TILT_DEG:
+        return NoFix(
+            "extreme_tilt",
+            f"camera leans {tilt_deg:.0f} deg, at most {MAX_TILT_DEG:.0f} can be used",
+        )
+    if min(camera.width_px, camera.height_px) < MIN_SIDE_PX:
+        return NoFix("too_small", f"view is {camera.width_px} x {camera.height_px} px")
+    coarser = camera.gsd_m(telemetry.agl_m) / gsd_m
+    if coarser > MAX_COARSER:
+        return NoFix("too_coarse", f"a pixel of the view covers {coarser:.1f} pixels of the map")
+    return None
+
+
+def check_view(grey: NDArray[np.uint8]) -> NoFix | None:
+    """Why a view (H, W) shows nothing: too dark, too bright, blank; None if it shows something."""
+    sample = grey[::_SAMPLE_STEP_PX, ::_SAMPLE_STEP_PX]
+    low, high = (float(value) for value in np.percentile(sample, [1, 99]))
+    std = float(sample.std())
+    if high < DARK_LEVEL:
+        return NoFix("too_dark", f"99 % of the view is darker than {high:.0f} of 255")
+    if low > BRIGHT_LEVEL:
+        return NoFix("too_bright", f"99 % of the view is brighter than {low:.0f} of 255")
+    if std < MIN_STD:
+        return NoFix("blank", f"grey levels differ by {std:.1f} of 255 only (standard deviation)")
+    return None
+
+
+def check_rectified(view: Rectified, min_valid_share: float) -> NoFix | None:
+    """Why too little of a tile is seen; None if enough is."""
+    share = float(view.valid.mean())
+    if share < min_valid_share:
+        return NoFix(
+            "too_small", f"view covers {share:.0%} of a tile, {min_valid_share:.0%} are needed"
+        )
+    seen = view.grey[view.valid]
+    if float(seen.std()) < MIN_STD / 2:
+        return NoFix("blank", "the part of the view that would be compared is uniform")
+    return None

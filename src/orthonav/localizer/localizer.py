@@ -1,0 +1,196 @@
+"""From one view to a fix."""
+
+import math
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav import embed, represent
+from orthonav.confidence.logistic import LogisticConfidence
+from orthonav.confidence.ratios import lowe_ratio, peak_ratio, rival_score
+from orthonav.embed.whitened import WhitenedEmbedder
+from orthonav.errors import CameraError, MapFileError, VariantError
+from orthonav.geo.camera import Camera
+from orthonav.localizer.checks import check_rectified, check_telemetry, check_view
+from orthonav.localizer.rectify import PreparedView, Rectified, prepare_view, rectify
+from orthonav.mapfile.reader import MapFile
+from orthonav.records import Fix, NoFix, Prior, Telemetry
+from orthonav.search.exact import ExactIndex, rows_within
+from orthonav.variants import variant_from_recipe
+
+DEFAULT_YAW_STD_DEG = 5.0
+PRIOR_SIGMAS = 3.0
+HEADING_SIGMAS = 1.5
+UNKNOWN_HEADING_STEP_DEG = 8.0
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """What search found for one view.
+
+    `tile` is the row of the best tile, `query` the index of the best of the headings tried,
+    `evidence` the numbers behind it.
+    """
+
+    tile: int
+    query: int
+    evidence: dict[str, float]
+
+
+class Localizer:
+    """Places views on one map. Cheap to make, safe to share between threads once warm."""
+
+    def __init__(self, opened: MapFile) -> None:
+        """Take an opened map; raises `MapFileError` if it cannot be flown with this program."""
+        manifest = opened.manifest
+        if len(manifest.sheets) != 1:
+            raise MapFileError(f"this program flies maps of one sheet: {opened.path}")
+        self.sheet = manifest.sheets[0]
+        self.grid = self.sheet.grid
+        self.centres_en_m = opened.array("sheet0/centres_en_m", np.float32, 2)
+        embeddings = opened.array("sheet0/embeddings", np.float16, 2)
+        try:
+            self.representation = variant_from_recipe(
+                represent.TABLE, manifest.recipe.get("represent")
+            )
+            self.embedder = _embedder(opened, manifest.recipe.get("embed"))
+            plain = manifest.confidence
+            self.confidence = None if plain is None else LogisticConfidence.from_plain(plain)
+            self._step_deg = float(manifest.view["heading_step_deg"])
+            self._position_std_m = float(manifest.view["position_std_m"])
+            self._min_valid_share = float(manifest.view["min_valid_share"])
+        except (VariantError, KeyError, TypeError, ValueError) as error:
+            raise MapFileError(f"map cannot be flown ({error}): {opened.path}") from error
+        tiles = self.sheet.tiles
+        if self.centres_en_m.shape != (tiles, 2) or embeddings.shape != (tiles, self.embedder.dims):
+            raise MapFileError(f"map's parts do not fit together: {opened.path}")
+        if not (self._step_deg > 0 and self._position_std_m > 0):
+            raise MapFileError(f"map has impossible view parameters: {opened.path}")
+        self.radius_m = manifest.radius_m
+        self.index = ExactIndex(embeddings)
+
+    def locate(
+        self,
+        grey: NDArray[np.uint8],
+        camera: Camera,
+        telemetry: Telemetry,
+        *,
+        prior: Prior | None = None,
+        heading_known: bool = True,
+    ) -> Fix | NoFix:
+        """Where `grey` (H, W) was taken.
+
+        `prior` limits the search to the tiles within three standard deviations of it. With
+        `heading_known` false all headings are tried and `telemetry.yaw_deg` may be NaN. Raises
+        `CameraError` if the camera is not that of the image; everything else that is wrong with a
+        view makes a `NoFix`.
+        """
+        if grey.shape != (camera.height_px, camera.width_px):
+            raise CameraError(
+                f"camera is {camera.width_px} x {camera.height_px} px, "
+                f"the image is {grey.shape[1]} x {grey.shape[0]} px"
+            )
+        refused = check_telemetry(telemetry, camera, self.grid.gsd_m, heading_known)
+        refused = refused or check_view(grey)
+        if refused is not None:
+            return refused
+        rows = self._allowed(prior)
+        if rows is not None and rows.size == 0:
+            return NoFix("outside_map", "no tile of the map lies where the prior says")
+        headings = self._headings_deg(telemetry, heading_known)
+        prepared = prepare_view(grey, camera, telemetry.agl_m, self.grid.gsd_m)
+        rectified = [self.rectified(prepared, telemetry, heading) for heading in headings]
+        refused = check_rectified(rectified[len(headings) // 2], self._min_valid_share)
+        if refused is not None:
+            return refused
+        match = self.match(self.embedded(rectified), rows)
+        return self._fix(match, rectified[match.query], headings[match.query], telemetry)
+
+    def rectified(self, view: PreparedView, telemetry: Telemetry, heading_deg: float) -> Rectified:
+        """The view as one tile of the map would look, under a heading."""
+        return rectify(
+            view,
+            yaw_deg=heading_deg,
+            pitch_deg=telemetry.pitch_deg,
+            roll_deg=telemetry.roll_deg,
+            agl_m=telemetry.agl_m,
+            gsd_m=self.grid.gsd_m,
+            size_px=self.grid.tile_px,
+        )
+
+    def embedded(self, views: list[Rectified]) -> NDArray[np.float32]:
+        """Embeddings (Q, D) of rectified views."""
+        maps = [self.representation(view.grey, view.valid) for view in views]
+        return np.stack(
+            [self.embedder.view(one, view.valid) for one, view in zip(maps, views, strict=True)]
+        )
+
+    def match(self, queries: NDArray[np.float32], rows: NDArray[np.intp] | None = None) -> Match:
+        """Best tile for queries (Q, D), one per heading, among `rows` (all where None).
+
+        Evidence: `score` (best scalar product), `margin` (its lead over the best score farther
+        than half a tile away), `lowe_ratio`, `peak_ratio` (the same with that exclusion).
+        """
+        scores = self.index.scores(queries, rows)
+        best_heading = scores.argmax(axis=1)
+        per_tile = np.take_along_axis(scores, best_heading[:, None], axis=1)[:, 0]
+        centres = self.centres_en_m if rows is None else self.centres_en_m[rows]
+        best = int(per_tile.argmax())
+        score = float(per_tile[best])
+        rival = rival_score(per_tile, centres, best, self.grid.tile_m / 2)
+        evidence = {
+            "score": score,
+            "margin": score - rival,
+            "lowe_ratio": lowe_ratio(per_tile),
+            "peak_ratio": peak_ratio(score, rival),
+            "tiles_searched": float(len(per_tile)),
+        }
+        tile = best if rows is None else int(rows[best])
+        return Match(tile, int(best_heading[best]), evidence)
+
+    def _allowed(self, prior: Prior | None) -> NDArray[np.intp] | None:
+        if prior is None:
+            return None
+        centre = self.sheet.frame.en_from_latlon(prior.lat_deg, prior.lon_deg)
+        radius_m = PRIOR_SIGMAS * max(prior.std_m, 0.0) + self.grid.stride_m
+        return rows_within(self.centres_en_m, centre, radius_m)
+
+    def _headings_deg(self, telemetry: Telemetry, heading_known: bool) -> list[float]:
+        """Headings to try: around the told one as far as its error reaches, or all."""
+        if not heading_known:
+            return [float(heading) for heading in np.arange(0, 360, UNKNOWN_HEADING_STEP_DEG)]
+        std = telemetry.yaw_std_deg
+        std = DEFAULT_YAW_STD_DEG if std is None else min(max(std, 0.0), 90.0)
+        side = math.floor(HEADING_SIGMAS * std / self._step_deg + 0.5)
+        return [telemetry.yaw_deg + k * self._step_deg for k in range(-side, side + 1)]
+
+    def _fix(self, match: Match, view: Rectified, heading_deg: float, telemetry: Telemetry) -> Fix:
+        # The tile shows the ground where the camera looks; the aircraft is `offset` before that.
+        position = self.centres_en_m[match.tile].astype(np.float64) - view.offset_en_m
+        lat, lon = self.sheet.frame.latlon_from_en(position)
+        evidence = {**match.evidence, "valid_share": float(view.valid.mean())}
+        confidence = math.nan if self.confidence is None else self.confidence(evidence)
+        return Fix(
+            lat_deg=float(lat),
+            lon_deg=float(lon),
+            cov_en_m2=np.eye(2) * self._position_std_m**2,
+            confidence=confidence,
+            radius_m=self.radius_m,
+            heading_deg=heading_deg % 360,
+            agl_m=telemetry.agl_m,
+            evidence=MappingProxyType(evidence),
+        )
+
+
+def _embedder(opened: MapFile, plain: Any) -> WhitenedEmbedder:
+    recipe = variant_from_recipe(embed.TABLE, plain)
+    mean = opened.array("embed/mean", np.float16, 1)
+    basis = opened.array("embed/basis", np.float16, 2)
+    if basis.shape[0] != mean.shape[0] or mean.shape[0] % recipe.cells**2:
+        raise MapFileError("map's embedding parts do not fit together")
+    if not (np.isfinite(mean).all() and np.isfinite(basis).all()):
+        raise MapFileError("map's embedding is not finite")
+    return WhitenedEmbedder(recipe, mean, basis)

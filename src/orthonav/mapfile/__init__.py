@@ -1,0 +1,7 @@
+"""The map file (`*.onav`): everything that flies, in one memory-mapped file safe to open."""
+
+from orthonav.mapfile.manifest import SCHEMA, Manifest, SheetInfo
+from orthonav.mapfile.reader import MapFile, open_map
+from orthonav.mapfile.writer import write_map
+
+__all__ = ["SCHEMA", "Manifest", "MapFile", "SheetInfo", "open_map", "write_map"]

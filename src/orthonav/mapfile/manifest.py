@@ -1,0 +1,169 @@
+"""The manifest of a map: what it was made from and how, and what its parts must be.
+
+Version 1, see `docs/map-format.md`. Reading checks every value it will use, because a map may come
+from a stranger.
+"""
+
+import hashlib
+import json
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from orthonav.errors import AreaError, MapFileError, MapVersionError
+from orthonav.geo.frames import MAX_SHEET_M, LocalFrame
+from orthonav.geo.grid import TileGrid
+
+FORMAT = "orthonav-map"
+SCHEMA = 1
+MAX_MANIFEST_BYTES = 8 * 2**20
+MAX_SHEETS = 10_000
+
+
+@dataclass(frozen=True)
+class SheetInfo:
+    """One sheet: its plane, its tile grid, how many tiles it has and the area they stand for."""
+
+    frame: LocalFrame
+    grid: TileGrid
+    tiles: int
+    area_km2: float
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for the manifest."""
+        grid = self.grid
+        return {
+            "origin_lat_deg": self.frame.lat_deg,
+            "origin_lon_deg": self.frame.lon_deg,
+            "grid": {
+                "west_m": grid.west_m,
+                "north_m": grid.north_m,
+                "gsd_m": grid.gsd_m,
+                "tile_px": grid.tile_px,
+                "stride_px": grid.stride_px,
+                "rows": grid.rows,
+                "cols": grid.cols,
+            },
+            "tiles": self.tiles,
+            "area_km2": self.area_km2,
+        }
+
+    @classmethod
+    def from_plain(cls, plain: Any) -> "SheetInfo":
+        """Inverse of `to_plain`; raises `MapFileError` on anything impossible."""
+        raw = _get(plain, "grid", dict)
+        grid = TileGrid(
+            west_m=_number(raw, "west_m"),
+            north_m=_number(raw, "north_m"),
+            gsd_m=_number(raw, "gsd_m"),
+            **{name: _get(raw, name, int) for name in ("tile_px", "stride_px", "rows", "cols")},
+        )
+        tiles = _get(plain, "tiles", int)
+        sane = (
+            grid.gsd_m > 0
+            and 16 <= grid.tile_px <= 4096
+            and 1 <= grid.stride_px <= grid.tile_px
+            and grid.rows >= 1
+            and grid.cols >= 1
+            and 1 <= tiles <= grid.rows * grid.cols
+            and max(grid.width_px, grid.height_px) * grid.gsd_m <= 4 * MAX_SHEET_M
+        )
+        if not sane:
+            raise MapFileError(f"map has an impossible tile grid: {raw}")
+        try:
+            frame = LocalFrame(_number(plain, "origin_lat_deg"), _number(plain, "origin_lon_deg"))
+        except AreaError as error:
+            raise MapFileError(f"map has an impossible sheet origin: {error}") from error
+        return cls(frame, grid, tiles, _number(plain, "area_km2"))
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """All of a map that is not an array.
+
+    `recipe` names method, representation and their parameters; `imagery` the sources and dates;
+    `view` what a view must bring (`min_valid_share`, `heading_step_deg`); `confidence` the fitted
+    probability, None where there is none; `radius_m` the radius it speaks of; `parts` name to
+    {dtype, shape, sha256}.
+    """
+
+    recipe: dict[str, Any]
+    sheets: tuple[SheetInfo, ...]
+    imagery: tuple[dict[str, Any], ...]
+    view: dict[str, Any]
+    confidence: dict[str, Any] | None
+    radius_m: float
+    created_by: str
+    parts: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def to_json(self) -> str:
+        """Canonical JSON, with the SHA-256 of everything else in `manifest_sha256`."""
+        plain = {
+            "format": FORMAT,
+            "schema": SCHEMA,
+            "created_by": self.created_by,
+            "recipe": self.recipe,
+            "sheets": [sheet.to_plain() for sheet in self.sheets],
+            "imagery": list(self.imagery),
+            "view": self.view,
+            "confidence": self.confidence,
+            "radius_m": self.radius_m,
+            "parts": self.parts,
+        }
+        return _canonical({**plain, "manifest_sha256": _digest(plain)})
+
+    @classmethod
+    def from_json(cls, text: str) -> "Manifest":
+        """Inverse of `to_json`; raises `MapFileError` or `MapVersionError`."""
+        if len(text) > MAX_MANIFEST_BYTES:
+            raise MapFileError(f"manifest of the map is larger than {MAX_MANIFEST_BYTES} bytes")
+        try:
+            plain = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise MapFileError(f"manifest of the map is not JSON ({error})") from error
+        if not isinstance(plain, dict) or plain.get("format") != FORMAT:
+            raise MapFileError("not an orthonav map")
+        schema = _get(plain, "schema", int)
+        if schema > SCHEMA:
+            raise MapVersionError(
+                f"map has schema {schema}, this program reads up to {SCHEMA}; update orthonav"
+            )
+        stated = plain.pop("manifest_sha256", None)
+        if schema < 1 or stated != _digest(plain):
+            raise MapFileError("manifest of the map was altered (checksum does not match)")
+        sheets = _get(plain, "sheets", list)
+        if not 1 <= len(sheets) <= MAX_SHEETS:
+            raise MapFileError(f"map must have 1 to {MAX_SHEETS} sheets, has {len(sheets)}")
+        confidence = plain.get("confidence")
+        return cls(
+            recipe=_get(plain, "recipe", dict),
+            sheets=tuple(SheetInfo.from_plain(sheet) for sheet in sheets),
+            imagery=tuple(item for item in _get(plain, "imagery", list) if isinstance(item, dict)),
+            view=_get(plain, "view", dict),
+            confidence=confidence if isinstance(confidence, dict) else None,
+            radius_m=_number(plain, "radius_m"),
+            created_by=str(plain.get("created_by", "")),
+            parts=_get(plain, "parts", dict),
+        )
+
+
+def _canonical(plain: Any) -> str:
+    return json.dumps(plain, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def _digest(plain: dict[str, Any]) -> str:
+    return hashlib.sha256(_canonical(plain).encode()).hexdigest()
+
+
+def _get(plain: Any, name: str, kind: type) -> Any:
+    value = plain.get(name) if isinstance(plain, dict) else None
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise MapFileError(f"manifest of the map: {name} must be {kind.__name__}, got {value!r}")
+    return value
+
+
+def _number(plain: Any, name: str) -> float:
+    value = plain.get(name) if isinstance(plain, dict) else None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise MapFileError(f"manifest of the map: {name} must be a finite number, got {value!r}")
+    return float(value)

@@ -1,0 +1,41 @@
+"""Writing a map: one safetensors file, whole or not at all, the same bytes every time."""
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import save_file
+
+from orthonav.errors import OutputError
+from orthonav.files import replacing
+from orthonav.mapfile.manifest import Manifest
+
+METADATA_KEY = "orthonav"
+
+
+def write_map(path: Path, manifest: Manifest, arrays: Mapping[str, NDArray[Any]]) -> Manifest:
+    """Write `arrays` and `manifest` to `path`; returns the manifest with its `parts` filled in.
+
+    Raises `OutputError` where it cannot be written; then nothing is left behind.
+    """
+    parts = {name: np.ascontiguousarray(array) for name, array in sorted(arrays.items())}
+    described = {
+        name: {
+            "dtype": str(array.dtype),
+            "shape": list(array.shape),
+            "sha256": hashlib.sha256(array.data).hexdigest(),
+        }
+        for name, array in parts.items()
+    }
+    full = dataclasses.replace(manifest, parts=described)
+    with replacing(path) as temporary:
+        try:
+            save_file(parts, temporary, metadata={METADATA_KEY: full.to_json()})
+        except SafetensorError as error:
+            raise OutputError(f"map cannot be written ({error}): {path}") from error
+    return full

@@ -1,0 +1,170 @@
+"""Confidence of a new map, learnt from its own imagery: where would changed views be placed?
+
+Views are cut from the reference at random places and changed as years change them: light,
+contrast, blur, noise, heading and height errors, and up to two thirds of the picture replaced by
+another place. Mirrored views stand for places that are not on the map: no place looks like the
+mirror image of another. Both are searched, and a logistic regression learns which were right.
+This is cautious rather than exact: it knows no second date.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.confidence.logistic import FEATURES, LogisticConfidence, fit_logistic
+from orthonav.confidence.ratios import rival_score
+from orthonav.embed.whitened import WhitenedEmbedder
+from orthonav.geo.grid import TileGrid
+from orthonav.search.exact import ExactIndex
+
+CROPS = 192
+CROP_TILES = 1.5
+HEADING_STD_DEG = 5.0
+SCALE_STD = 0.05
+MAX_REPLACED = 0.65
+MIRRORED_WEIGHT = 0.25
+RADIUS_STRIDES = 0.75
+MIN_RIGHT = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """Grey levels (S, S) cut from the reference, and where its centre lies on the sheet."""
+
+    grey: NDArray[np.uint8]
+    row_px: float
+    col_px: float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was learnt: the confidence (None if nothing could be) and the error when right."""
+
+    confidence: LogisticConfidence | None
+    position_std_m: float
+    right_share: float
+
+
+class CropSampler:
+    """Collects crops at random places from blocks of imagery as they pass by."""
+
+    def __init__(self, grid: TileGrid, seed: int) -> None:
+        self._rng = np.random.default_rng([seed, 1])
+        self.size_px = round(grid.tile_px * CROP_TILES)
+        self._rate = CROPS / max(1.0, grid.width_px * grid.height_px - 1.0)
+        self.crops: list[Crop] = []
+
+    def offer(
+        self, grey: NDArray[np.uint8], valid: NDArray[np.bool_], row_px: int, col_px: int
+    ) -> None:
+        """Take some crops from a block whose first pixel is (row_px, col_px) of the sheet."""
+        height, width = grey.shape
+        if min(height, width) < self.size_px:
+            return
+        for _ in range(self._rng.poisson(2.0 * self._rate * height * width)):
+            row = int(self._rng.integers(0, height - self.size_px + 1))
+            col = int(self._rng.integers(0, width - self.size_px + 1))
+            part = np.s_[row : row + self.size_px, col : col + self.size_px]
+            if valid[part].all() and grey[part].std() > 1 and len(self.crops) < 2 * CROPS:
+                half = self.size_px / 2
+                self.crops.append(Crop(grey[part].copy(), row_px + row + half, col_px + col + half))
+
+
+def calibrate(
+    sampler: CropSampler,
+    grid: TileGrid,
+    representation: Any,
+    embedder: WhitenedEmbedder,
+    embeddings: NDArray[np.float16],
+    centres_en_m: NDArray[np.float32],
+    heading_step_deg: float,
+    report: Callable[[str, float], None],
+) -> Calibration:
+    """Search changed and mirrored crops on the new map and fit the confidence to the outcome."""
+    rng = np.random.default_rng([len(sampler.crops), 2])
+    index = ExactIndex(embeddings)
+    crops = [sampler.crops[i] for i in rng.permutation(len(sampler.crops))[:CROPS]]
+    features, errors, mirrored = [], [], []
+    for done, crop in enumerate(crops):
+        other = crops[int(rng.integers(len(crops)))].grey[:, ::-1]
+        for mirror in (False, True):
+            picture = crop.grey[:, ::-1] if mirror else crop.grey
+            changed = changed_picture(rng, picture, other)
+            queries = _queries(rng, changed, grid, representation, embedder, heading_step_deg)
+            scores = index.scores(queries).max(axis=1)
+            best = int(scores.argmax())
+            rival = rival_score(scores, centres_en_m, best, grid.tile_m / 2)
+            features.append([scores[best], scores[best] - rival])
+            truth = [
+                grid.west_m + crop.col_px * grid.gsd_m,
+                grid.north_m - crop.row_px * grid.gsd_m,
+            ]
+            errors.append(centres_en_m[best] - truth)
+            mirrored.append(mirror)
+        report("calibrate", (done + 1) / len(crops))
+    return _fitted(np.array(features), np.array(errors), np.array(mirrored, dtype=bool), grid)
+
+
+def _fitted(
+    features: NDArray[np.float64],
+    errors_en_m: NDArray[np.float64],
+    mirrored: NDArray[np.bool_],
+    grid: TileGrid,
+) -> Calibration:
+    fallback = Calibration(None, grid.stride_m, 0.0)
+    if len(features) == 0:
+        return fallback
+    near = np.hypot(*errors_en_m.T) <= RADIUS_STRIDES * grid.stride_m
+    right = near & ~mirrored
+    if right.sum() < MIN_RIGHT:
+        return fallback
+    # Beyond doubt wrong: elsewhere, or mirrored. A near miss of a stride teaches nothing.
+    far = np.hypot(*errors_en_m.T) > 2 * grid.stride_m
+    used = right | far | mirrored
+    weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)[used]
+    confidence = fit_logistic(features[used][:, : len(FEATURES)], right[used], weight)
+    std_m = float(np.sqrt(np.mean(errors_en_m[right] ** 2)))
+    share = float(right.sum() / (~mirrored).sum())
+    return Calibration(confidence, max(std_m, grid.gsd_m), share)
+
+
+def changed_picture(
+    rng: np.random.Generator, grey: NDArray[np.uint8], other: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    """`grey` (S, S) as another year might show it: light, blur, noise, places that changed."""
+    size = grey.shape[0]
+    mask = cv2.resize(
+        rng.random((8, 8)).astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC
+    )
+    replaced = mask < np.quantile(mask, rng.uniform(0, MAX_REPLACED))
+    picture = np.where(replaced, other, grey).astype(np.float32) / 255
+    picture = np.power(picture, rng.uniform(0.6, 1.7)) * rng.uniform(0.5, 1.3)
+    blurred = np.asarray(cv2.GaussianBlur(picture, (0, 0), float(rng.uniform(0.3, 1.4))))
+    noisy = blurred * 255 + rng.normal(0, rng.uniform(1, 6), picture.shape)
+    return np.asarray(np.clip(noisy, 0, 255), dtype=np.uint8)
+
+
+def _queries(
+    rng: np.random.Generator,
+    picture: NDArray[np.uint8],
+    grid: TileGrid,
+    representation: Any,
+    embedder: WhitenedEmbedder,
+    heading_step_deg: float,
+) -> NDArray[np.float32]:
+    """Embeddings (3, D) of the middle of a picture under the headings the localizer would try."""
+    heading = rng.normal(0, HEADING_STD_DEG)
+    scale = float(np.exp(rng.normal(0, SCALE_STD)))
+    size, middle = grid.tile_px, (picture.shape[0] - 1) / 2
+    valid = np.ones((size, size), dtype=np.bool_)
+    queries = []
+    for step in (-heading_step_deg, 0.0, heading_step_deg):
+        matrix = cv2.getRotationMatrix2D((middle, middle), heading + step, scale)
+        matrix[:, 2] -= middle - (size - 1) / 2
+        view = np.asarray(cv2.warpAffine(picture, matrix, (size, size)), dtype=np.uint8)
+        queries.append(embedder.view(representation(view, valid), valid))
+    return np.stack(queries)

@@ -1,0 +1,96 @@
+"""The values that cross borders between parts: telemetry, prior, fix, no fix."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+Evidence = Mapping[str, float]
+"""Named numbers that say why a fix should be believed or not; see `docs/design.md`."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of the position before looking: a round Gaussian.
+
+    `std_m` is the standard deviation per axis in metres; search is cut off at three of them.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    std_m: float
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """What the autopilot knew at the exposure of one view.
+
+    `time_ns` is the time of exposure; `yaw_deg` the heading of the top of the image, clockwise from
+    true north; `pitch_deg` and `roll_deg` are 0, 0 where the optical axis points straight down
+    (positive pitch looks ahead, positive roll looks left); `agl_m` is the height above ground.
+    NaN stands for "not known". Velocities are over ground, true east and north.
+    """
+
+    time_ns: int
+    yaw_deg: float
+    pitch_deg: float
+    roll_deg: float
+    agl_m: float
+    yaw_std_deg: float | None = None
+    agl_std_m: float | None = None
+    prior: Prior | None = None
+    vel_en_mps: tuple[float, float] | None = None
+
+    def missing(self) -> list[str]:
+        """Names of the fields without which a view cannot be rectified, empty if all are there."""
+        named = {
+            "yaw_deg": self.yaw_deg,
+            "pitch_deg": self.pitch_deg,
+            "roll_deg": self.roll_deg,
+            "agl_m": self.agl_m,
+        }
+        return [name for name, value in named.items() if not math.isfinite(value)]
+
+
+@dataclass(frozen=True, eq=False)
+class Fix:
+    """Where a view was taken, and how sure that is.
+
+    `cov_en_m2` is the (2, 2) covariance of east and north in m2; `confidence` the probability that
+    the error is below `radius_m`; `heading_deg` and `agl_m` are the values the position rests on.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    cov_en_m2: NDArray[np.float64]
+    confidence: float
+    radius_m: float
+    heading_deg: float
+    agl_m: float
+    evidence: Evidence = field(default_factory=lambda: MappingProxyType({}))
+
+
+@dataclass(frozen=True, eq=False)
+class NoFix:
+    """No position, and why. A value, not an exception.
+
+    `reason` is a short stable word for programs (such as `blank`, `too_dark`, `outside_map`),
+    `detail` one sentence for people.
+    """
+
+    reason: str
+    detail: str
+    evidence: Evidence = field(default_factory=lambda: MappingProxyType({}))
+
+
+@dataclass(frozen=True, eq=False)
+class ViewResult:
+    """What came out for one view of a flight: a line of `fixes.jsonl`."""
+
+    frame: str
+    time_ns: int
+    outcome: Fix | NoFix
+    latency_ms: float

@@ -1,0 +1,1 @@
+"""Search: which stored embeddings are most like the one of a view."""

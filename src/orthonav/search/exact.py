@@ -1,0 +1,66 @@
+"""Exact search: the scalar product with every stored embedding; the oracle for any other index."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+BLOCK_ROWS = 1024
+CACHE_BYTES = 128 * 2**20
+_CONVERT_FP16 = getattr(cv2, "convertFp16", None)  # OpenCV 4, where cv2.add knows no float16
+_ZERO = np.zeros(1, dtype=np.float16)
+
+
+class ExactIndex:
+    """Scalar products of queries with stored embeddings (N, D) float16.
+
+    Storage stays as it is (a memory-mapped file, say). Up to `cache_bytes` of it are kept decoded
+    to float32 after first use; a larger map is decoded block by block at every search, so memory
+    stays bounded whatever the size of the map.
+    """
+
+    def __init__(self, embeddings: NDArray[np.float16], cache_bytes: int = CACHE_BYTES) -> None:
+        if embeddings.ndim != 2 or embeddings.dtype != np.float16:
+            raise ValueError(
+                f"embeddings must be (N, D) float16, got {embeddings.shape} {embeddings.dtype}"
+            )
+        self._stored = embeddings
+        self._may_cache = embeddings.size * 4 <= cache_bytes
+        self._decoded: NDArray[np.float32] | None = None
+
+    def __len__(self) -> int:
+        return len(self._stored)
+
+    def scores(
+        self, queries: NDArray[np.float32], rows: NDArray[np.intp] | None = None
+    ) -> NDArray[np.float32]:
+        """Scalar products (N, Q) of queries (Q, D) with all embeddings, or with `rows` of them."""
+        columns = np.ascontiguousarray(queries.T, dtype=np.float32)
+        if self._may_cache:
+            if self._decoded is None:
+                self._decoded = self._stored.astype(np.float32)
+            chosen = self._decoded if rows is None else self._decoded[rows]
+            return np.asarray(chosen @ columns)
+        count = len(self._stored) if rows is None else len(rows)
+        out = np.empty((count, columns.shape[1]), dtype=np.float32)
+        for start in range(0, count, BLOCK_ROWS):
+            part = slice(start, start + BLOCK_ROWS)
+            block = self._stored[part] if rows is None else self._stored[rows[part]]
+            np.matmul(_decode(block), columns, out=out[part])
+        return out
+
+
+def _decode(block: NDArray[np.float16]) -> NDArray[np.float32]:
+    """float32 of float16; OpenCV's conversions are several times as fast as NumPy's."""
+    block = np.ascontiguousarray(block)
+    if _CONVERT_FP16 is not None:
+        return np.asarray(_CONVERT_FP16(block.view(np.int16))).reshape(block.shape)
+    decoded = cv2.add(block, _ZERO, dtype=cv2.CV_32F)
+    return np.asarray(decoded, dtype=np.float32).reshape(block.shape)
+
+
+def rows_within(
+    centres_en_m: NDArray[np.float32], centre_en_m: NDArray[np.float64], radius_m: float
+) -> NDArray[np.intp]:
+    """Rows of tiles whose centres (N, 2) lie within `radius_m` of a point: the prior's gate."""
+    offset = centres_en_m - np.asarray(centre_en_m, dtype=np.float32)
+    return np.flatnonzero(np.einsum("ij,ij->i", offset, offset) <= radius_m**2)

@@ -1,0 +1,117 @@
+"""Orthophotos of a generated landscape as GeoTIFF files, one per date."""
+
+from collections.abc import Callable, Sequence
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from orthonav.errors import AreaError, MissingExtraError, OutputError
+from orthonav.files import replacing
+from orthonav.simulate.landscape.epoch import DEFAULT_DATES, Epoch
+from orthonav.simulate.landscape.scene import ORIGIN_M, Landscape, check_gsd
+from orthonav.simulate.landscape.window import chunks
+
+_BLOCK_PX = 512
+_WINDOW_PX = 1024  # a whole number of blocks, so that no block is compressed twice
+_LARGEST_PX = 2_000_000
+
+
+def generate_area(
+    out_dir: Path,
+    *,
+    size_m: tuple[float, float] = (2000.0, 2000.0),
+    gsd_m: float = 1.0,
+    dates: Sequence[Epoch] = DEFAULT_DATES,
+    seed: int = 1,
+    progress: Callable[[float], None] | None = None,
+) -> list[Path]:
+    """Write one orthophoto `out_dir/<date name>.tif` per date and return their paths.
+
+    size_m: (east, north) extent; rounded up to whole pixels. gsd_m: metres per pixel, 0.2..5.
+    The lower left corner is `ORIGIN_M` in EPSG:2154. `progress` is called with 0..1. Files are
+    tiled RGB uint8, written window by window, so memory does not grow with the area.
+    Raises `AreaError` on impossible sizes, `MissingExtraError` without rasterio and `OutputError`
+    where the files cannot be written.
+    """
+    width_px, height_px = _size_px(size_m, gsd_m)
+    names = [date.name for date in dates]
+    if not names or len(set(names)) < len(names):
+        raise AreaError(f"dates must be one or more with different names, got {names}")
+    landscape = Landscape(seed)
+    paths = []
+    for number, date in enumerate(dates):
+        path = Path(out_dir) / f"{date.name}.tif"
+
+        def report(share: float, done: int = number) -> None:
+            if progress is not None:
+                progress((done + share) / len(names))
+
+        report(0.0)
+        with replacing(path) as temporary:
+            try:
+                _write(temporary, landscape, date, (width_px, height_px), gsd_m, report)
+            except OSError as error:
+                if isinstance(error, OutputError) or error.errno is not None:
+                    raise  # GDAL's own errors carry no number
+                raise OutputError(f"cannot write ({error}): {path}") from error
+        paths.append(path)
+    return paths
+
+
+def _size_px(size_m: tuple[float, float], gsd_m: float) -> tuple[int, int]:
+    """Return (width, height) in pixels; raise `AreaError` where they make no picture."""
+    check_gsd(gsd_m)
+    if not all(isfinite(side) and side > 0.0 for side in size_m):
+        raise AreaError(f"size_m must be two finite positive lengths, got {size_m}")
+    width, height = (max(1, int(np.ceil(side / gsd_m - 1e-6))) for side in size_m)
+    if max(width, height) > _LARGEST_PX:
+        raise AreaError(f"area of {width} x {height} px is over {_LARGEST_PX} px a side: {size_m}")
+    return width, height
+
+
+def _write(
+    path: Path,
+    landscape: Landscape,
+    date: Epoch,
+    size_px: tuple[int, int],
+    gsd_m: float,
+    report: Callable[[float], None],
+) -> None:
+    try:
+        import rasterio
+        from rasterio import Affine
+        from rasterio.windows import Window
+    except ImportError as error:
+        raise MissingExtraError(
+            "writing a generated area needs rasterio: pip install 'orthonav[geo]'"
+        ) from error
+    width_px, height_px = size_px
+    west_m, north_m = ORIGIN_M[0], ORIGIN_M[1] + height_px * gsd_m
+    profile: dict[str, Any] = {
+        "driver": "GTiff",
+        "width": width_px,
+        "height": height_px,
+        "count": 3,
+        "dtype": "uint8",
+        "crs": "EPSG:2154",
+        "transform": Affine(gsd_m, 0.0, west_m, 0.0, -gsd_m, north_m),
+        "photometric": "RGB",
+        "tiled": True,
+        "blockxsize": _BLOCK_PX,
+        "blockysize": _BLOCK_PX,
+        "compress": "deflate",
+        "predictor": 2,
+        "BIGTIFF": "IF_SAFER",
+    }
+    done = 0
+    with rasterio.open(path, "w", **profile) as target:
+        target.update_tags(TIFFTAG_DATETIME=date.tiff_datetime, TIFFTAG_SOFTWARE="orthonav")
+        for col, row, width, height in chunks(width_px, height_px, _WINDOW_PX):
+            picture = landscape.render(
+                date, west_m + col * gsd_m, north_m - row * gsd_m, width, height, gsd_m
+            )
+            target.write(np.moveaxis(picture, 2, 0), window=Window(col, row, width, height))
+            done += width * height
+            report(done / (width_px * height_px))

@@ -1,0 +1,116 @@
+"""When and how the landscape is photographed: season, light, air and camera of one date."""
+
+from dataclasses import dataclass
+from enum import Enum
+from types import MappingProxyType
+
+
+class Season(Enum):
+    """State of crops and leaves; the value is the column in the colour tables."""
+
+    SPRING = 0
+    SUMMER = 1
+    AUTUMN = 2
+    WINTER = 3
+
+
+_MONTH_DAY = MappingProxyType(
+    {Season.SPRING: 15, Season.SUMMER: 12, Season.AUTUMN: 20, Season.WINTER: 10}
+)
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """One photographic campaign over a generated landscape.
+
+    name: file stem of the orthophoto, such as "2016-07".
+    year, month: calendar; what was built, felled or merged before then shows.
+    season: which crop and leaf colours are seen.
+    sun_azimuth_deg: where the light comes from, clockwise from north.
+    sun_elevation_deg: height of the sun above the horizon, 15..90.
+    haze: share of the light that is scattered air, 0..1.
+    exposure, contrast: factors on brightness and on its spread.
+    white_balance: factors on red, green and blue.
+    noise: standard deviation of the sensor noise, in grey levels.
+    water_level_m: by how much every shore lies farther out than on average.
+    """
+
+    name: str
+    year: int
+    month: int
+    season: Season
+    sun_azimuth_deg: float
+    sun_elevation_deg: float
+    haze: float = 0.05
+    exposure: float = 1.0
+    contrast: float = 1.0
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    noise: float = 2.0
+    water_level_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse values that no photograph can have."""
+        if not self.name or any(character in self.name for character in '/\\:*?"<>|'):
+            raise ValueError(f"epoch name must be a plain file stem, got {self.name!r}")
+        if not 1 <= self.month <= 12 or not 1 <= self.year <= 9999:
+            raise ValueError(f"epoch {self.name!r}: no such month: {self.year}-{self.month}")
+        if not 15.0 <= self.sun_elevation_deg <= 90.0:
+            raise ValueError(
+                f"epoch {self.name!r}: sun elevation {self.sun_elevation_deg} is not 15..90 deg"
+            )
+        if not 0.0 <= self.haze < 1.0:
+            raise ValueError(f"epoch {self.name!r}: haze must be in [0, 1), got {self.haze}")
+
+    @property
+    def time_years(self) -> float:
+        """Time of the photograph in years, middle of the month."""
+        return self.year + (self.month - 0.5) / 12.0
+
+    @property
+    def tiff_datetime(self) -> str:
+        """The date as TIFFTAG_DATETIME wants it, at noon."""
+        return f"{self.year:04d}:{self.month:02d}:{_MONTH_DAY[self.season]:02d} 12:00:00"
+
+
+DEFAULT_DATES: tuple[Epoch, ...] = (
+    Epoch(
+        name="2016-07",
+        year=2016,
+        month=7,
+        season=Season.SUMMER,
+        sun_azimuth_deg=152.0,
+        sun_elevation_deg=57.0,
+        haze=0.05,
+        exposure=1.02,
+        white_balance=(1.02, 1.0, 0.96),
+    ),
+    Epoch(
+        name="2021-10",
+        year=2021,
+        month=10,
+        season=Season.AUTUMN,
+        sun_azimuth_deg=207.0,
+        sun_elevation_deg=31.0,
+        haze=0.12,
+        exposure=0.97,
+        contrast=0.95,
+        white_balance=(0.98, 1.0, 1.05),
+        noise=2.5,
+        water_level_m=1.0,
+    ),
+    Epoch(
+        name="2012-05",
+        year=2012,
+        month=5,
+        season=Season.SPRING,
+        sun_azimuth_deg=118.0,
+        sun_elevation_deg=46.0,
+        haze=0.08,
+        exposure=1.0,
+        contrast=1.05,
+        white_balance=(0.98, 1.02, 0.99),
+        noise=3.0,
+        water_level_m=2.0,
+    ),
+)
+"""Dates of the demo area: the first two make map and flight, the third is an older map."""

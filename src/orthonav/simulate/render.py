@@ -1,0 +1,93 @@
+"""Rendering what a camera sees of flat ground, with the faults of real pictures."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import FlightError
+from orthonav.geo.camera import Camera, camera_from_en, enu_from_camera
+
+Array = NDArray[np.float64]
+_HALF_PIXEL = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+
+
+@dataclass(frozen=True)
+class ViewEffects:
+    """Faults of the picture.
+
+    `exposure_std`: relative error of exposure; `blur_px`: standard deviation of the blur in
+    pixels of the view; `noise_std`: sensor noise in grey levels; `jpeg_quality` 1..100.
+    """
+
+    exposure_std: float = 0.15
+    blur_px: float = 0.6
+    noise_std: float = 2.0
+    jpeg_quality: int = 90
+
+    def __post_init__(self) -> None:
+        limits = {"exposure_std": 1.0, "blur_px": 50.0, "noise_std": 128.0}
+        for name, limit in limits.items():
+            if not 0 <= getattr(self, name) <= limit:
+                raise FlightError(f"{name} must be 0 to {limit:g}, got {getattr(self, name)}")
+        if not 1 <= self.jpeg_quality <= 100:
+            raise FlightError(f"JPEG quality must be 1 to 100, got {self.jpeg_quality}")
+
+
+def render_view(
+    camera: Camera,
+    attitude: tuple[float, float, float, float],
+    ground_rgb: NDArray[np.uint8],
+    ground_corner_en_m: Array,
+    gsd_m: float,
+    effects: ViewEffects,
+    rng: np.random.Generator,
+) -> NDArray[np.uint8]:
+    """Picture (H, W, 3) of ground (h, w, 3) whose north-west corner lies at `ground_corner_en_m`,
+    metres from the point below the camera; `attitude` is yaw, pitch, roll (deg) and height (m).
+    """
+    picture = _projected(camera, attitude, ground_rgb, ground_corner_en_m, gsd_m)
+    if effects.blur_px > 0:
+        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), effects.blur_px), dtype=np.uint8)
+    gain = float(np.exp(rng.normal(0, 1) * effects.exposure_std))
+    noise = rng.standard_normal(picture.shape[:2], dtype=np.float32) * effects.noise_std
+    exposed = picture.astype(np.float32) * gain + noise[..., None]
+    return np.asarray(np.clip(exposed, 0, 255), dtype=np.uint8)
+
+
+def _projected(
+    camera: Camera,
+    attitude: tuple[float, float, float, float],
+    ground_rgb: NDArray[np.uint8],
+    corner_en_m: Array,
+    gsd_m: float,
+) -> NDArray[np.uint8]:
+    size = (camera.width_px, camera.height_px)
+    ground_from_en = np.array(
+        [
+            [1 / gsd_m, 0, -corner_en_m[0] / gsd_m],
+            [0, -1 / gsd_m, corner_en_m[1] / gsd_m],
+            [0, 0, 1],
+        ]
+    )
+    if not camera.distortion:
+        px_from_en = camera.matrix @ camera_from_en(*attitude)
+        ground_from_px = ground_from_en @ np.linalg.inv(px_from_en)
+        matrix = np.linalg.inv(_HALF_PIXEL) @ ground_from_px @ _HALF_PIXEL
+        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        border = cv2.BORDER_REPLICATE
+        seen = cv2.warpPerspective(ground_rgb, matrix, size, flags=flags, borderMode=border)
+        return np.asarray(seen, dtype=np.uint8)
+    columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
+    coefficients = np.array(camera.distortion)
+    plane = np.asarray(cv2.undistortPoints(pixels, camera.matrix, coefficients)).reshape(-1, 2)
+    rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
+    enu = rays @ enu_from_camera(*attitude[:3]).T
+    en = enu[:, :2] * (attitude[3] / np.maximum(-enu[:, 2:], 1e-9))
+    index = (en - corner_en_m) / gsd_m * [1, -1] - 0.5
+    maps = index.astype(np.float32).reshape(size[1], size[0], 2)
+    border = cv2.BORDER_REPLICATE
+    seen = cv2.remap(ground_rgb, maps, None, cv2.INTER_CUBIC, borderMode=border)  # type: ignore[call-overload]
+    return np.asarray(seen, dtype=np.uint8)

@@ -1,0 +1,213 @@
+"""Figures of an evaluation against cases worked out by hand."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from orthonav.errors import FlightError
+from orthonav.evaluate.metrics import (
+    CRITERIA,
+    Comparison,
+    compare,
+    criterion_curve,
+    measure,
+    pool,
+    radius_key,
+    worst_views,
+)
+from orthonav.geo.frames import LocalFrame
+from orthonav.records import Fix, NoFix, ViewResult
+
+CENTRE = LocalFrame(48.0, -4.5)
+TRUTH_EN_M = {"a": (0.0, 0.0), "b": (100.0, 0.0), "c": (200.0, 50.0), "d": (300.0, 50.0)}
+
+
+def truth_of(places: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    found = {name: CENTRE.latlon_from_en(np.array(at)) for name, at in places.items()}
+    return {name: (float(lat), float(lon)) for name, (lat, lon) in found.items()}
+
+
+def fix(frame: str, offset_en_m: tuple[float, float], latency_ms: float = 10.0, **known: float):
+    east, north = np.add(TRUTH_EN_M[frame], offset_en_m)
+    lat, lon = CENTRE.latlon_from_en(np.array([east, north]))
+    confidence = known.pop("confidence", math.nan)
+    outcome = Fix(float(lat), float(lon), np.eye(2), confidence, 15.0, 0.0, 100.0, known)
+    return ViewResult(frame, 0, outcome, latency_ms)
+
+
+def no_fix(frame: str, reason: str = "blank") -> ViewResult:
+    return ViewResult(frame, 0, NoFix(reason, "", {"peak_ratio": 9.0}), 50.0)
+
+
+def three_fixes() -> Comparison:
+    """Errors 5, 10 and 500 m and one view without a fix."""
+    results = [
+        fix("a", (3.0, 4.0), 10.0, confidence=0.95, peak_ratio=2.0, lowe_ratio=1.2),
+        fix("b", (-6.0, 8.0), 20.0, confidence=0.6, peak_ratio=1.2, lowe_ratio=1.0),
+        no_fix("c"),
+        fix("d", (300.0, -400.0), 30.0, confidence=0.6, peak_ratio=1.1),
+    ]
+    return compare(truth_of(TRUTH_EN_M), results)
+
+
+def test_errors_are_distances_in_metres_and_nan_without_a_fix() -> None:
+    comparison = three_fixes()
+    np.testing.assert_allclose(comparison.errors_m, [5.0, 10.0, math.nan, 500.0], atol=1e-2)
+    np.testing.assert_allclose(comparison.truth_en_m[0], [0.0, 0.0], atol=1e-6)
+    assert comparison.reasons == ("", "", "blank", "")
+    assert comparison.frames == ("a", "b", "c", "d")
+    assert not comparison.errors_m.flags.writeable
+
+
+def test_shares_are_of_all_views_or_of_fixes() -> None:
+    metrics = measure(three_fixes(), 15.0, [6.0, 1000.0])
+    assert (metrics.n_views, metrics.n_fixes) == (4, 3)
+    assert metrics.coverage == 0.75
+    assert dict(metrics.acc_at_m) == {6.0: 0.25, 15.0: 0.5, 1000.0: 0.75}
+    assert dict(metrics.acc_fixes_at_m) == {6.0: 1 / 3, 15.0: 2 / 3, 1000.0: 1.0}
+    assert metrics.accuracy == 0.5
+    assert metrics.accuracy_of_fixes == 2 / 3
+    assert metrics.reasons == {"blank": 1}
+
+
+def test_error_and_latency_figures() -> None:
+    metrics = measure(three_fixes())
+    assert metrics.error_median_m == pytest.approx(10.0, abs=1e-2)
+    assert metrics.error_p95_m == pytest.approx(10.0 + 0.9 * 490.0, abs=1e-1)
+    assert metrics.error_mean_m == pytest.approx(515.0 / 3, abs=1e-2)
+    assert metrics.error_max_m == pytest.approx(500.0, abs=1e-1)
+    assert metrics.latency_median_ms == pytest.approx(25.0)  # of 10, 20, 30, 50
+    assert metrics.latency_p95_ms == pytest.approx(47.0)
+
+
+def test_criteria_keep_views_at_or_above_a_threshold() -> None:
+    rows = {(r.name, r.threshold): r for r in measure(three_fixes()).criteria}
+    assert len(rows) == sum(map(len, CRITERIA.values()))
+    kept = {key: (row.share_kept, row.accuracy) for key, row in rows.items()}
+    assert kept["lowe_ratio", 1.13] == (0.25, 1.0)
+    assert kept["peak_ratio", 1.05] == (0.75, 2 / 3)
+    assert kept["peak_ratio", 1.13] == (0.5, 1.0)
+    assert kept["peak_ratio", 1.3] == (0.25, 1.0)
+    assert kept["confidence", 0.5] == (0.75, 2 / 3)
+    assert kept["confidence", 0.9] == (0.25, 1.0)
+    share, accuracy = kept["confidence", 0.99]
+    assert share == 0.0 and math.isnan(accuracy)
+
+
+def test_a_criterion_that_no_view_has_is_not_defined() -> None:
+    comparison = compare(truth_of(TRUTH_EN_M), [fix("a", (0.0, 0.0), confidence=1.0)])
+    row = next(r for r in measure(comparison).criteria if r.name == "lowe_ratio")
+    assert math.isnan(row.share_kept) and math.isnan(row.accuracy)
+    assert criterion_curve(comparison, "lowe_ratio", 15.0).thresholds.size == 0
+
+
+def test_a_curve_keeps_equal_values_together() -> None:
+    curve = criterion_curve(three_fixes(), "confidence", 15.0)
+    assert curve.thresholds.tolist() == [0.95, 0.6]
+    assert curve.share_kept.tolist() == [0.25, 0.75]
+    assert curve.accuracy.tolist() == [1.0, 2 / 3]
+
+
+def test_an_error_of_just_the_radius_is_right() -> None:
+    comparison = compare({"a": (48.0, -4.5)}, [fix("a", (0.0, 0.0))])
+    radius_m = 12.0
+    object.__setattr__(comparison, "errors_m", np.array([radius_m]))
+    assert measure(comparison, radius_m).accuracy == 1.0
+
+
+def test_all_is_defined_without_any_fix() -> None:
+    metrics = measure(compare(truth_of(TRUTH_EN_M), [no_fix("a"), no_fix("b", "too_dark")]))
+    assert (metrics.coverage, metrics.accuracy, metrics.n_fixes) == (0.0, 0.0, 0)
+    undefined = (metrics.accuracy_of_fixes, metrics.error_median_m, metrics.error_p95_m)
+    assert all(map(math.isnan, (*undefined, metrics.error_mean_m, metrics.error_max_m)))
+    assert metrics.reasons == {"blank": 1, "too_dark": 1}
+    assert worst_views(compare(truth_of(TRUTH_EN_M), [no_fix("a")])) == []
+
+
+def test_what_has_no_partner_is_counted_and_left_out() -> None:
+    truth = {**truth_of(TRUTH_EN_M), "a": (math.nan, 0.0)}
+    stranger = ViewResult("z", 0, NoFix("blank", ""), 1.0)
+    metrics = measure(compare(truth, [fix("a", (0, 0)), fix("b", (0, 0)), stranger]))
+    assert (metrics.n_views, metrics.n_without_truth, metrics.n_without_result) == (1, 2, 2)
+
+
+def test_no_overlap_is_an_error_that_shows_both_names() -> None:
+    with pytest.raises(FlightError, match=r"'z'.*'a'"):
+        compare(truth_of(TRUTH_EN_M), [ViewResult("z", 0, NoFix("blank", ""), 1.0)])
+    with pytest.raises(FlightError, match="0 results"):
+        compare({}, [])
+
+
+def test_two_results_for_a_frame_are_refused() -> None:
+    with pytest.raises(FlightError, match="more than one result, such as 'a'"):
+        compare(truth_of(TRUTH_EN_M), [no_fix("a"), no_fix("a")])
+
+
+def test_a_fix_without_a_finite_position_is_no_fix() -> None:
+    broken = Fix(math.nan, 0.0, np.eye(2), 1.0, 15.0, 0.0, 100.0)
+    metrics = measure(compare(truth_of(TRUTH_EN_M), [ViewResult("a", 0, broken, 1.0)]))
+    assert metrics.n_fixes == 0 and metrics.reasons == {"not_finite": 1}
+
+
+def test_a_plane_of_ones_own_moves_positions_but_not_errors() -> None:
+    results = [fix("b", (3.0, 4.0))]
+    comparison = compare(truth_of(TRUTH_EN_M), results, CENTRE)
+    np.testing.assert_allclose(comparison.truth_en_m, [[100.0, 0.0]], atol=1e-3)
+    np.testing.assert_allclose(comparison.errors_m, [5.0], atol=1e-3)
+
+
+def test_pooled_flights_count_every_view() -> None:
+    one = three_fixes()
+    two = compare(truth_of(TRUTH_EN_M), [fix("a", (1.0, 0.0)), no_fix("b", "too_dark")])
+    metrics = measure(pool([one, two]))
+    assert (metrics.n_views, metrics.n_fixes, metrics.n_without_result) == (6, 4, 2)
+    assert metrics.accuracy == 0.5
+    assert metrics.reasons == {"blank": 1, "too_dark": 1}
+    with pytest.raises(ValueError, match="at least one flight"):
+        pool([])
+
+
+def test_worst_views_come_largest_error_first() -> None:
+    assert worst_views(three_fixes(), 2) == [3, 1]
+
+
+@pytest.mark.parametrize("radius_m", [0.0, -1.0, math.nan, math.inf])
+def test_an_impossible_radius_is_refused(radius_m: float) -> None:
+    with pytest.raises(ValueError, match="radius"):
+        measure(three_fixes(), radius_m)
+
+
+def test_accuracy_is_named_after_its_radius() -> None:
+    assert [radius_key(r) for r in (15.0, 2.5, 100)] == [
+        "acc_at_15m",
+        "acc_at_2.5m",
+        "acc_at_100m",
+    ]
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(0, 200), st.floats(1, 3).map(lambda v: round(v, 1)) | st.none()),
+        min_size=1,
+        max_size=30,
+    )
+)
+def test_curves_and_rows_agree_and_shares_grow(views: list[tuple[float, float | None]]) -> None:
+    n = len(views)
+    values = np.array([math.nan if v is None else v for _, v in views])
+    base = compare({"a": (48.0, -4.5)}, [fix("a", (0.0, 0.0))])
+    fields = {**vars(base), "errors_m": np.array([e for e, _ in views])}
+    nothing = np.full(n, math.nan)
+    fields["criteria"] = {"peak_ratio": values, "lowe_ratio": nothing, "confidence": nothing}
+    comparison = Comparison(**fields)
+    curve = criterion_curve(comparison, "peak_ratio", 15.0)
+    assert np.all(np.diff(curve.share_kept) > 0) and np.all(np.diff(curve.thresholds) < 0)
+    for threshold, share, accuracy in zip(
+        curve.thresholds, curve.share_kept, curve.accuracy, strict=True
+    ):
+        kept = [error for error, value in views if value is not None and value >= threshold]
+        assert share == pytest.approx(len(kept) / n)
+        assert accuracy == pytest.approx(sum(error <= 15.0 for error in kept) / len(kept))

@@ -1,0 +1,276 @@
+"""The report page, its pictures, the table and the JSON values."""
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from orthonav.errors import MissingExtraError
+from orthonav.evaluate import plots
+from orthonav.evaluate.metrics import compare, measure
+from orthonav.evaluate.report import (
+    FlightReport,
+    MadeFrom,
+    metrics_to_json,
+    table,
+    total,
+    write_report,
+)
+from orthonav.geo.frames import LocalFrame
+from orthonav.records import Fix, NoFix, ViewResult
+
+CENTRE = LocalFrame(48.0, -4.5)
+PICTURES_PER_FLIGHT = 4
+
+
+def made_flight(n: int, share_fixed: float = 0.9, name: str = "flight", seed: int = 3):
+    """A flight along a wave, one fix in ten far off, some views without a fix."""
+    random = np.random.default_rng(seed)
+    along = np.linspace(0.0, 1.0, n)
+    truth_en_m = np.stack([1200 * along, 300 * np.sin(6 * along)], axis=1)
+    lat, lon = CENTRE.latlon_from_en(truth_en_m)
+    truth = {f"{i:04d}.jpg": (float(lat[i]), float(lon[i])) for i in range(n)}
+    results = []
+    for i, frame in enumerate(truth):
+        outcome: Fix | NoFix = NoFix("too_dark", "mean grey 3", {})
+        if random.random() < share_fixed:
+            wrong = random.random() < 0.1
+            at = truth_en_m[i] + random.normal(0.0, 600.0 if wrong else 3.0, 2)
+            fix_lat, fix_lon = (float(value) for value in CENTRE.latlon_from_en(at))
+            ratio = 1.05 + random.random() * (0.2 if wrong else 2.0)
+            known = {"peak_ratio": ratio, "lowe_ratio": 1.0 + random.random() / 5}
+            sure = min(ratio / 3, 1.0)
+            outcome = Fix(fix_lat, fix_lon, np.eye(2), sure, 15.0, 0.0, 100.0, known)
+        results.append(ViewResult(frame, i * 500_000_000, outcome, 40.0 + random.random()))
+    comparison = compare(truth, results, CENTRE)
+    return FlightReport(name, comparison, measure(comparison))
+
+
+def noisy_background() -> plots.Background:
+    grey = np.random.default_rng(5).integers(0, 256, (900, 1700), dtype=np.uint8)
+    return plots.Background(grey, -250.0, -450.0, 1450.0, 450.0)
+
+
+class Page(HTMLParser):
+    """What a page shows and what it asks for."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.images: list[dict[str, str | None]] = []
+        self.addresses: list[str] = []
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        if tag == "img":
+            self.images.append(dict(attrs))
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+
+
+def test_the_page_needs_nothing_from_outside(tmp_path: Path) -> None:
+    path = write_report(tmp_path / "report", [made_flight(40)])
+    html = path.read_text(encoding="utf-8")
+    page = Page(html)
+    assert path == tmp_path / "report" / "index.html"
+    assert [p.name for p in path.parent.iterdir()] == ["index.html"]
+    assert not re.search(r"https?:|url\(|@import|//www", html)
+    assert not {"script", "link", "iframe", "object"} & set(page.tags)
+    assert len(page.images) == PICTURES_PER_FLIGHT
+    assert all(address.startswith("data:image/png;base64,") for address in page.addresses)
+    assert all(image["alt"] for image in page.images)
+
+
+def test_the_page_says_the_figures_and_what_it_was_made_from(tmp_path: Path) -> None:
+    flight = made_flight(50)
+    made_from = MadeFrom(
+        map_name="brest.onav",
+        recipe="gradient:sigma_px=1.5",
+        flight="logs/7",
+        command="orthonav evaluate fixes.jsonl --truth truth.csv",
+        version="0.1.0",
+        date="2026-07-28",
+    )
+    html = write_report(tmp_path, [flight], made_from, "Brest at noon").read_text("utf-8")
+    assert "<h1>Brest at noon</h1>" in html
+    assert f"{100 * flight.metrics.accuracy:.1f} %" in html
+    for said in vars(made_from).values():
+        assert said in html
+    worst = flight.comparison.frames[int(np.nanargmax(flight.comparison.errors_m))]
+    assert f"<td>{worst}</td>" in html
+    assert "<td>too_dark</td>" in html
+    assert "Lowe&#x27;s ratio" in html
+
+
+def test_text_is_escaped(tmp_path: Path) -> None:
+    nasty = '<img src=x onerror="1">&$\\frac'
+    flight = made_flight(12, name=nasty)
+    frames = (f"{nasty}\udcff", *flight.comparison.frames[1:])
+    flight = replace(flight, comparison=replace(flight.comparison, frames=frames))
+    made_from = MadeFrom(map_name=nasty, command=nasty)
+    html = write_report(tmp_path, [flight], made_from, nasty).read_text("utf-8")
+    assert "<img src=x" not in html
+    assert len(Page(html).images) == PICTURES_PER_FLIGHT
+
+
+def test_a_long_flight_over_a_noisy_background_stays_small(tmp_path: Path) -> None:
+    flight = replace(made_flight(200), background=noisy_background())
+    assert write_report(tmp_path, [flight]).stat().st_size < 1_000_000
+
+
+def test_several_flights_have_a_total(tmp_path: Path) -> None:
+    flights = [made_flight(30, name="one"), made_flight(20, name="two", seed=4)]
+    whole = total(flights)
+    assert whole.n_views == 50
+    assert whole.n_fixes == sum(flight.metrics.n_fixes for flight in flights)
+    html = write_report(tmp_path, flights).read_text("utf-8")
+    assert len(Page(html).images) == 2 * PICTURES_PER_FLIGHT
+    assert '<tr class="total"><td>total</td><td>50</td>' in html
+
+
+def test_flights_at_different_radii_have_no_total() -> None:
+    one = made_flight(10)
+    other = replace(one, metrics=measure(one.comparison, 50.0))
+    with pytest.raises(ValueError, match="one radius"):
+        total([one, other])
+    with pytest.raises(ValueError, match="at least one flight"):
+        table([])
+
+
+def test_a_flight_without_any_fix_is_reported(tmp_path: Path) -> None:
+    flight = made_flight(6, share_fixed=0.0)
+    html = write_report(tmp_path, [flight]).read_text("utf-8")
+    assert "No view has a fix" in html
+    assert "nan" not in re.sub(r"base64,[^\"]+", "", html).lower()
+    assert "nan" not in table([flight]).lower()
+    json.dumps(metrics_to_json(flight.metrics), allow_nan=False)
+
+
+@pytest.mark.parametrize("share_fixed", [0.0, 1.0])
+def test_a_flight_of_one_view_can_be_drawn(tmp_path: Path, share_fixed: float) -> None:
+    html = write_report(tmp_path, [made_flight(1, share_fixed)]).read_text("utf-8")
+    assert len(Page(html).images) == PICTURES_PER_FLIGHT
+
+
+def test_unmatched_views_are_said(tmp_path: Path) -> None:
+    flight = made_flight(10)
+    comparison = replace(flight.comparison, n_without_truth=3, n_without_result=2)
+    flight = FlightReport("f", comparison, measure(comparison))
+    html = write_report(tmp_path, [flight]).read_text("utf-8")
+    assert "3 results have no true position" in html
+    assert "2 true positions have no result" in html
+
+
+def test_the_table_is_aligned() -> None:
+    flights = [made_flight(30, name="one"), made_flight(5, 0.0, name="a longer name")]
+    lines = table(flights).splitlines()
+    header, *rows, rule, whole = lines
+    assert header.split()[:4] == ["flight", "views", "fixes", "coverage"]
+    assert "acc@15 m" in header
+    assert len(rows) == 2 and set(rule) == {"-"} and whole.startswith("total")
+    assert len({len(line) for line in lines}) == 1
+    assert len(table(flights[:1]).splitlines()) == 2
+
+
+def test_json_values_are_strict_and_named() -> None:
+    flight = made_flight(30)
+    values = json.loads(json.dumps(metrics_to_json(flight.metrics), allow_nan=False))
+    assert values["n_views"] == 30
+    assert values["acc_at_15m"] == flight.metrics.accuracy
+    assert values["fixes_acc_at_15m"] == flight.metrics.accuracy_of_fixes
+    assert {"coverage", "error_median_m", "error_p95_m", "error_mean_m"} <= set(values)
+    assert {row["name"] for row in values["criteria"]} == set(values["curves"])
+
+
+def decoded(png: bytes) -> np.ndarray:
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return image[..., ::-1].astype(int)
+
+
+def has_colour(image: np.ndarray, colour: str) -> bool:
+    wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+    return bool((np.abs(image - wanted).max(axis=2) < 12).any())
+
+
+def test_the_map_shows_right_and_wrong_and_the_background() -> None:
+    flight = made_flight(80)
+    plain = decoded(plots.map_picture(flight.comparison, 15.0))
+    over = decoded(plots.map_picture(flight.comparison, 15.0, noisy_background()))
+    for image in (plain, over):
+        assert has_colour(image, plots.RIGHT) and has_colour(image, plots.WRONG)
+    assert np.ptp(over, axis=2).mean() < 40
+    assert over.mean() < plain.mean() - 20
+
+
+def test_the_background_lies_where_it_says() -> None:
+    flight = made_flight(2, 0.0)
+    grey = np.full((100, 100), 255, dtype=np.uint8)
+    grey[:20, :20] = 0  # north-west corner
+    image = decoded(
+        plots.map_picture(
+            flight.comparison, 15.0, plots.Background(grey, -50.0, -380.0, 1250.0, 300.0)
+        )
+    )
+    rows, columns = np.nonzero(np.abs(image - 115).max(axis=2) < 6)  # black, made pale
+    assert rows.size > 1000
+    assert np.median(rows) < image.shape[0] / 2 and np.median(columns) < image.shape[1] / 2
+
+
+@pytest.mark.parametrize(
+    "extent", [(-9e3, -9e3, -8e3, -8e3), (0.0, 0.0, 1.0, 1.0), (-1e5, -1e5, 1e5, 1e5)]
+)
+def test_a_background_beside_the_flight_or_far_larger_does_no_harm(extent: tuple) -> None:
+    background = plots.Background(np.zeros((50, 40), np.uint8), *extent)
+    decoded(plots.map_picture(made_flight(5).comparison, 15.0, background))
+
+
+def test_the_same_flight_gives_the_same_picture() -> None:
+    flight = made_flight(20)
+    assert plots.along_picture(flight.comparison, 15.0) == plots.along_picture(
+        flight.comparison, 15.0
+    )
+
+
+def test_without_matplotlib_the_remedy_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'orthonav\[report\]'"):
+        plots.map_picture(made_flight(3).comparison, 15.0)
+
+
+def test_importing_the_report_does_not_import_matplotlib() -> None:
+    code = (
+        "import sys, orthonav.evaluate.report; "
+        "assert not {'matplotlib', 'PIL', 'torch', 'rasterio', 'pyproj'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_pictures_leave_the_users_settings_alone() -> None:
+    import matplotlib
+
+    matplotlib.rcParams["font.size"] = 7.5
+    before = matplotlib.rcParams.copy()
+    plots.criteria_picture(made_flight(10).metrics)
+    assert matplotlib.rcParams["font.size"] == 7.5
+    assert {key for key in before if before._get(key) != matplotlib.rcParams._get(key)} == set()
+    matplotlib.rcParams["font.size"] = 10.0
+
+
+def test_drawing_does_not_import_pyplot() -> None:
+    code = (
+        "import sys, numpy as np\n"
+        "from orthonav.evaluate import metrics, plots\n"
+        "from orthonav.records import NoFix, ViewResult\n"
+        "result = ViewResult('a', 0, NoFix('blank', ''), 1.0)\n"
+        "plots.map_picture(metrics.compare({'a': (48.0, -4.5)}, [result]), 15.0)\n"
+        "assert 'matplotlib.pyplot' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,133 @@
+"""The reference area: its box in its own plane, and the search band around a route."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pyproj import Geod
+
+from orthonav.errors import AreaError
+from orthonav.geo.area import Area
+from orthonav.geo.grid import TileGrid
+from orthonav.geo.route import Route
+
+GEOD = Geod(ellps="WGS84")
+offsets_deg = st.floats(-0.03, 0.03)
+
+
+@st.composite
+def routes(draw):
+    lat, lon = draw(st.floats(-70, 70)), draw(st.floats(-179, 179))
+    legs = draw(st.lists(st.tuples(offsets_deg, offsets_deg), min_size=1, max_size=5))
+    return Route(tuple((lat + dlat, lon + dlon) for dlat, dlon in legs))
+
+
+@given(
+    st.floats(-79, 79),
+    st.floats(-179, 179),
+    st.floats(0.001, 0.3),
+    st.floats(0.001, 0.3),
+    st.floats(0, 1),
+    st.floats(0, 1),
+)
+def test_every_point_of_the_bounds_is_in_the_area(south, west, height, width, up, right):
+    area = Area.from_bounds((west, south, west + width, south + height))
+    point = area.frame.en_from_latlon([south + up * height], [west + right * width])
+    assert area.contains(point, margin_m=0.05).all()
+
+
+def test_extent_of_bounds_is_true_metres():
+    area = Area.from_bounds((2.4, 46.4, 2.6, 46.6))
+    west, south, east, north = area.extent_en_m
+    _, _, across = GEOD.inv(2.4, 46.4, 2.6, 46.4)  # the southern edge is the longer one
+    _, _, along = GEOD.inv(2.5, 46.4, 2.5, 46.6)
+    assert east - west == pytest.approx(across, abs=0.05)
+    assert north - south == pytest.approx(along, abs=10)  # the northern edge bends up
+    assert (area.frame.lat_deg, area.frame.lon_deg) == (46.5, 2.5)
+    assert west == pytest.approx(-east, abs=1e-6)
+
+
+def test_box_of_an_outline_holds_its_points_tightly():
+    lat, lon = np.array([46.50, 46.53, 46.51]), np.array([2.50, 2.52, 2.55])
+    area = Area.from_outline(lat, lon)
+    points = area.frame.en_from_latlon(lat, lon)
+    assert area.contains(points, margin_m=1e-6).all()
+    assert area.extent_en_m == pytest.approx((*points.min(axis=0), *points.max(axis=0)))
+
+
+def test_margin_widens_a_box():
+    area = Area.from_bounds((2.49, 46.49, 2.51, 46.51))
+    east = area.extent_en_m[2]
+    points = np.array([[east - 1, 0], [east + 9, 0], [east + 11, 0]])
+    assert area.contains(points, margin_m=10).tolist() == [True, True, False]
+    assert area.contains(points).tolist() == [True, False, False]
+
+
+def test_band_is_as_wide_as_asked_in_true_metres():
+    area = Area.from_route(Route(((46.5, 2.5), (46.6, 2.5))), band_m=400)
+    side = [GEOD.fwd(2.5, 46.55, 90, distance)[:2] for distance in (199.9, 200.1)]
+    points = area.frame.en_from_latlon([lat for _, lat in side], [lon for lon, _ in side])
+    assert area.contains(points).tolist() == [True, False]
+    beyond = [GEOD.fwd(2.5, 46.6, 0, distance)[:2] for distance in (199.9, 200.1)]
+    points = area.frame.en_from_latlon([lat for _, lat in beyond], [lon for lon, _ in beyond])
+    assert area.contains(points).tolist() == [True, False]
+
+
+@given(
+    routes(),
+    st.floats(50, 800),
+    st.sampled_from([0.0, 0.5, 0.875]),
+    st.integers(0, 2**32 - 1),
+)
+def test_every_point_of_the_band_is_near_a_kept_tile(route, band_m, overlap, seed):
+    area = Area.from_route(route, band_m)
+    grid = TileGrid.covering(area.extent_en_m, gsd_m=5.0, tile_px=128, overlap=overlap)
+    rows, cols = np.mgrid[: grid.rows, : grid.cols]
+    centres = grid.centres_en_m(np.stack([rows.ravel(), cols.ravel()], axis=1))
+    kept = centres[area.contains(centres, margin_m=grid.stride_m * math.sqrt(2) / 2)]
+
+    rng = np.random.default_rng(seed)
+    line = area.route.points_en_m(area.frame)
+    start = rng.integers(0, max(1, len(line) - 1), 20)
+    end = np.minimum(start + 1, len(line) - 1)
+    on_line = line[start] + rng.random((20, 1)) * (line[end] - line[start])
+    angle, reach = rng.uniform(0, 2 * np.pi, 20), rng.uniform(0, band_m / 2, 20)
+    points = on_line + np.stack([np.cos(angle), np.sin(angle)], axis=1) * reach[:, None]
+
+    assert area.contains(points, margin_m=1e-6).all()
+    off = np.abs(points[:, None] - kept[None]).max(axis=2).min(axis=1)
+    assert (off <= grid.stride_m / 2 + 1e-6).all()
+
+
+@pytest.mark.parametrize(
+    "bounds, message",
+    [
+        ((2.6, 46.4, 2.4, 46.6), "west < east"),
+        ((2.4, 46.6, 2.6, 46.4), "south < north"),
+        ((2.4, 46.4, 2.4, 46.6), "west < east"),
+        ((math.nan, 46.4, 2.6, 46.6), "west,south,east,north"),
+        ((2.4, 46.4, math.inf, 46.6), "west,south,east,north"),
+        ((2.0, 46.0, 2.2, 46.6), r"66\.\d km across.*50 km.*--bounds or --route"),
+        ((-170.0, -80.0, 170.0, 80.0), "no area a sheet can hold"),
+        ((2.4, 89.8, 2.6, 90.0), "no area a sheet can hold"),
+        ((500.0, 46.4, 500.1, 46.6), "centre of a sheet"),
+    ],
+)
+def test_bounds_that_are_no_area_are_refused(bounds, message):
+    with pytest.raises(AreaError, match=message):
+        Area.from_bounds(bounds)
+
+
+def test_a_band_that_makes_the_sheet_too_large_is_refused():
+    route = Route(((46.28, 2.5), (46.72, 2.5)))  # 49 km
+    Area.from_route(route, 500)
+    with pytest.raises(AreaError, match="50 km"):
+        Area.from_route(route, 2000)
+
+
+@pytest.mark.parametrize("band_m", [0, -5, math.nan, math.inf])
+def test_a_band_without_width_is_refused(band_m):
+    with pytest.raises(AreaError, match="wider than 0"):
+        Area.from_route(Route(((46.5, 2.5),)), band_m)

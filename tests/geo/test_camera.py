@@ -1,0 +1,190 @@
+"""The camera: conventions by hand, projection against OpenCV, the homography against rays."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from orthonav.errors import CameraError
+from orthonav.geo.camera import (
+    Camera,
+    axis_on_ground_en_m,
+    camera_from_en,
+    distort,
+    enu_from_camera,
+    footprint_en_m,
+)
+
+CAMERA = Camera(640, 480, 500.0, 510.0, 321.5, 238.0)
+yaws, tilts = st.floats(-360, 360), st.floats(-25, 25)
+coefficients = st.tuples(
+    st.floats(-0.1, 0.1), st.floats(-0.05, 0.05), *[st.floats(-0.01, 0.01)] * 2
+)
+
+
+def px_from_en(camera, yaw_deg, pitch_deg, roll_deg, agl_m, points_en_m):
+    """Ours: pixel-is-area coordinates of ground points, through the homography and the lens."""
+    ground = np.column_stack([points_en_m, np.ones(len(points_en_m))])
+    axes = ground @ camera_from_en(yaw_deg, pitch_deg, roll_deg, agl_m).T
+    plane = distort(camera, axes[:, :2] / axes[:, 2:])
+    return np.column_stack([plane, np.ones(len(plane))]) @ camera.matrix[:2].T
+
+
+@given(
+    yaws, tilts, tilts, st.floats(30, 500), st.just(()) | coefficients, st.integers(0, 2**32 - 1)
+)
+def test_projection_is_that_of_opencv(yaw, pitch, roll, agl_m, distortion, seed):
+    camera = Camera(640, 480, 500.0, 510.0, 321.5, 238.0, distortion)
+    points = np.random.default_rng(seed).uniform(-agl_m / 3, agl_m / 3, (10, 2))
+    enu = np.column_stack([points, np.full(10, -agl_m)])
+    rotation = Rotation.from_matrix(enu_from_camera(yaw, pitch, roll).T).as_rotvec()
+    expected, _ = cv2.projectPoints(
+        enu, rotation, np.zeros(3), camera.matrix, np.array(distortion or (0.0,) * 4)
+    )
+    ours = px_from_en(camera, yaw, pitch, roll, agl_m, points)
+    np.testing.assert_allclose(ours, expected[:, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "distortion", [(-0.28, 0.09, 1e-3, -5e-4), (-0.28, 0.09, 1e-3, -5e-4, -0.01)]
+)
+def test_strong_distortion_is_that_of_opencv(distortion):
+    camera = Camera(640, 480, 500.0, 500.0, 320, 240, distortion)
+    plane = np.stack(np.meshgrid(np.linspace(-0.64, 0.64, 9), np.linspace(-0.48, 0.48, 9)), axis=-1)
+    rays = np.concatenate([plane, np.ones((9, 9, 1))], axis=-1).reshape(-1, 3)
+    expected, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), np.array(distortion))
+    np.testing.assert_allclose(distort(camera, plane).reshape(-1, 2), expected[:, 0], atol=1e-12)
+
+
+def test_pixel_is_area():
+    """The middle of a picture of 4 x 4 pixels is the corner (2, 2) that four pixels share."""
+    camera = Camera(4, 4, 2.0, 2.0, 2.0, 2.0)
+    assert px_from_en(camera, 0, 0, 0, 10, np.array([[0.0, 0.0]])).tolist() == [[2, 2]]
+    corners = np.array([[-10.0, 10], [10, 10], [10, -10], [-10, -10]])
+    assert px_from_en(camera, 0, 0, 0, 10, corners).tolist() == [[0, 0], [4, 0], [4, 4], [0, 4]]
+    assert footprint_en_m(camera, 0, 0, 0, 10).tolist() == corners.tolist()
+
+
+@pytest.mark.parametrize(
+    "yaw, pitch, roll, east, north",
+    [
+        (0, 0, 0, 0, 0),
+        (0, 10, 0, 0, 1),  # nose up looks ahead: north
+        (90, 10, 0, 1, 0),  # heading east, ahead is east
+        (0, -10, 0, 0, -1),
+        (0, 0, 10, -1, 0),  # right wing down looks left: west
+        (180, 0, 10, 1, 0),
+        (270, 0, -10, 0, 1),  # heading west, looking right is north
+    ],
+)
+def test_where_the_axis_meets_the_ground(yaw, pitch, roll, east, north):
+    reach = 100 * math.tan(math.radians(10))
+    expected = (east * reach, north * reach)
+    assert axis_on_ground_en_m(yaw, pitch, roll, 100) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "yaw, top_east, top_north", [(0, 0, 1), (90, 1, 0), (180, 0, -1), (-90, -1, 0), (45, 0.5, 0.5)]
+)
+def test_heading_is_that_of_the_top_of_the_image(yaw, top_east, top_north):
+    top = enu_from_camera(yaw, 0, 0) @ [0, -1, 0]
+    expected = np.array([top_east, top_north, 0]) / math.hypot(top_east, top_north)
+    np.testing.assert_allclose(top, expected, atol=1e-12)
+
+
+def test_pitch_then_roll_order():
+    """Yaw, pitch, roll of the Z-Y-X convention: roll turns about the axis pitch has raised."""
+    nose = enu_from_camera(0, 30, 70) @ [0, -1, 0]
+    np.testing.assert_allclose(nose, [0, math.cos(math.pi / 6), 0.5], atol=1e-12)
+
+
+@given(yaws, st.floats(-90, 90), st.floats(-180, 180))
+def test_attitude_is_a_rotation(yaw, pitch, roll):
+    rotation = enu_from_camera(yaw, pitch, roll)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+@given(yaws, tilts, tilts, st.floats(10, 3000), st.floats(0, 640), st.floats(0, 480))
+def test_homography_agrees_with_casting_the_ray(yaw, pitch, roll, agl_m, x, y):
+    ray_camera = np.array(
+        [(x - CAMERA.cx_px) / CAMERA.fx_px, (y - CAMERA.cy_px) / CAMERA.fy_px, 1.0]
+    )
+    ray = enu_from_camera(yaw, pitch, roll) @ ray_camera
+    if ray[2] > -0.1:
+        return
+    ground = ray[:2] * (agl_m / -ray[2])
+    axes = camera_from_en(yaw, pitch, roll, agl_m) @ [*ground, 1]
+    assert axes[2] > 0
+    np.testing.assert_allclose(axes / axes[2], ray_camera, atol=1e-9)
+
+
+@given(yaws, st.floats(-15, 15), st.floats(-15, 15), st.floats(10, 3000))
+def test_footprint_projects_to_the_image_corners(yaw, pitch, roll, agl_m):
+    ground = footprint_en_m(CAMERA, yaw, pitch, roll, agl_m)
+    corners = [[0, 0], [640, 0], [640, 480], [0, 480]]
+    np.testing.assert_allclose(
+        px_from_en(CAMERA, yaw, pitch, roll, agl_m, ground), corners, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("pitch, roll", [(70, 0), (0, -75), (120, 0), (0, 180)])
+def test_a_view_of_the_horizon_has_no_footprint(pitch, roll):
+    with pytest.raises(CameraError, match="horizon"):
+        footprint_en_m(CAMERA, 0, pitch, roll, 100)
+
+
+@pytest.mark.parametrize("pitch, finite", [(89, True), (90, False), (91, False)])
+def test_an_axis_above_the_horizon_meets_no_ground(pitch, finite):
+    assert all(map(math.isfinite, axis_on_ground_en_m(0, pitch, 0, 100))) is finite
+
+
+@pytest.mark.parametrize("distortion", [(-0.5, 0.0, 0.0, 0.0), (-0.5, 0.05, 0.0, 0.0)])
+def test_no_point_beyond_the_fold_of_the_lens_model_is_placed(distortion):
+    """Both models stop growing near 0.8; the second grows again from 2.3 on."""
+    camera = Camera(640, 480, 500.0, 500.0, 320, 240, distortion)
+    fold = math.sqrt(min(r.real for r in np.roots([5 * distortion[1], 3 * distortion[0], 1])))
+    radius = np.array([0, 0.5, 0.99, 1.01, 1.5, 2, 3, 5, 50]) * fold
+    placed = distort(camera, np.stack([radius * 0.6, radius * 0.8], axis=-1))
+    assert np.isfinite(placed).all(axis=1).tolist() == [True] * 3 + [False] * 6
+
+
+def test_distort_leaves_its_input_alone():
+    plane = np.array([[0.1, 0.2], [3.0, 3.0]])
+    plane.flags.writeable = False
+    distort(Camera(640, 480, 500.0, 500.0, 320, 240, (-0.5, 0, 0, 0)), plane)
+
+
+def test_resized_camera_sees_the_same_ground():
+    small = CAMERA.resized(320, 160)
+    np.testing.assert_allclose(
+        footprint_en_m(small, 10, 2, 3, 100), footprint_en_m(CAMERA, 10, 2, 3, 100)
+    )
+    assert CAMERA.gsd_m(100) == pytest.approx(100 / math.sqrt(500 * 510))
+
+
+GOOD = {"width_px": 640, "height_px": 480, "fx_px": 500, "fy_px": 500, "cx_px": 320, "cy_px": 240}
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"width_px": 0}, "width_px must be"),
+        ({"height_px": 65_536}, "height_px must be"),
+        ({"width_px": math.nan}, "width_px must be"),
+        ({"fx_px": 0}, "focal length"),
+        ({"fy_px": -500}, "focal length"),
+        ({"fx_px": math.inf}, "not finite"),
+        ({"cx_px": math.nan}, "not finite"),
+        ({"distortion": (0.1, math.nan, 0, 0)}, "not finite"),
+        ({"distortion": (0.1,)}, "k1,k2,p1,p2"),
+        ({"distortion": (0.1,) * 8}, "k1,k2,p1,p2"),
+    ],
+)
+def test_impossible_cameras_are_refused(change, message):
+    with pytest.raises(CameraError, match=message):
+        Camera(**(GOOD | change))

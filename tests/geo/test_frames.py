@@ -1,0 +1,101 @@
+"""The local plane: inverse of itself, PROJ's azimuthal-equidistant plane, true to geodesics."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from pyproj import Geod, Transformer
+
+from orthonav.errors import AreaError
+from orthonav.geo.frames import MAX_SHEET_M, LocalFrame
+
+HALF_DIAGONAL_M = MAX_SHEET_M / math.sqrt(2)
+ONE_MM = 1e-3
+
+frames = st.builds(LocalFrame, st.floats(-80, 80), st.floats(-180, 180))
+azimuths_deg = st.floats(0, 360)
+
+
+def en_of(distance_m: float, azimuth_deg: float) -> np.ndarray:
+    azimuth = math.radians(azimuth_deg)
+    return np.array([distance_m * math.sin(azimuth), distance_m * math.cos(azimuth)])
+
+
+@given(
+    st.builds(LocalFrame, st.floats(-89.9, 89.9), st.floats(-360, 360)),
+    st.floats(0, HALF_DIAGONAL_M),
+    azimuths_deg,
+)
+def test_local_to_latlon_and_back(frame, distance_m, azimuth_deg):
+    position = en_of(distance_m, azimuth_deg)
+    lat, lon = frame.latlon_from_en(position)
+    assert abs(lat) <= 90 and abs(lon) <= 180
+    np.testing.assert_allclose(frame.en_from_latlon(lat, lon), position, atol=ONE_MM)
+
+
+@given(frames, st.floats(-0.15, 0.15), st.floats(-0.15, 0.15))
+def test_latlon_to_local_and_back(frame, dlat, dlon):
+    lat, lon = frame.lat_deg + dlat, frame.lon_deg + dlon
+    back_lat, back_lon = frame.latlon_from_en(frame.en_from_latlon(lat, lon))
+    assert back_lat == pytest.approx(lat, abs=1e-8)
+    assert math.remainder(back_lon - lon, 360) == pytest.approx(0, abs=5e-8)
+
+
+@given(frames, st.floats(0, 25_000), azimuths_deg)
+@example(LocalFrame(1e-07, -1e-07), 25_000.0, 45.0)
+@example(LocalFrame(48.1, 179.99), 20_000.0, 90.0)
+@example(LocalFrame(-80, -180), 25_000.0, 270.0)
+def test_is_the_plane_of_proj_within_a_millimetre(frame, distance_m, azimuth_deg):
+    proj = Transformer.from_crs("EPSG:4326", frame.proj4, always_xy=True)
+    position = en_of(distance_m, azimuth_deg)
+    lat, lon = frame.latlon_from_en(position)
+    np.testing.assert_allclose(proj.transform(lon, lat), position, atol=ONE_MM)
+    lon, lat = proj.transform(*position, direction="INVERSE")
+    np.testing.assert_allclose(frame.en_from_latlon(lat, lon), position, atol=ONE_MM)
+
+
+@given(frames, st.floats(0, 25_000), azimuths_deg)
+def test_distance_and_azimuth_are_those_of_the_geodesic(frame, distance_m, azimuth_deg):
+    lon, lat, _ = Geod(ellps="WGS84").fwd(frame.lon_deg, frame.lat_deg, azimuth_deg, distance_m)
+    expected = en_of(distance_m, azimuth_deg)
+    np.testing.assert_allclose(frame.en_from_latlon(lat, lon), expected, atol=ONE_MM)
+
+
+@pytest.mark.parametrize(
+    "bearing, east, north", [(0, 0, 1), (90, 1, 0), (180, 0, -1), (270, -1, 0)]
+)
+def test_axes_point_true_east_and_north(bearing, east, north):
+    brest = LocalFrame(48.39, -4.49)
+    lon, lat, _ = Geod(ellps="WGS84").fwd(-4.49, 48.39, bearing, 20_000)
+    expected = [20_000 * east, 20_000 * north]
+    np.testing.assert_allclose(brest.en_from_latlon(lat, lon), expected, atol=ONE_MM)
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (5,), (3, 4)])
+def test_arrays_keep_their_shape(shape):
+    frame = LocalFrame(46.5, 2.5)
+    en = frame.en_from_latlon(np.full(shape, 46.51), np.full(shape, 2.49))
+    assert en.shape == (*shape, 2)
+    lat, lon = frame.latlon_from_en(en)
+    assert lat.shape == lon.shape == shape
+
+
+@pytest.mark.parametrize("number", [float, np.float64, np.float32, int])
+def test_proj_string_is_plain_whatever_the_kind_of_number(number):
+    assert "+lat_0=46" in LocalFrame(number(46), number(2)).proj4
+    assert "+lon_0=2" in LocalFrame(number(46), number(2)).proj4
+
+
+def test_far_away_is_far_away():
+    en = LocalFrame(46.5, 2.5).en_from_latlon([46.5, -46.5, 89.0], [12.5, -177.5, 2.5])
+    assert np.isfinite(en).all() and (np.linalg.norm(en, axis=1) > 500_000).all()
+
+
+@pytest.mark.parametrize(
+    "lat, lon", [(90, 0), (-89.95, 0), (math.nan, 0), (0, math.nan), (0, 361), (math.inf, 0)]
+)
+def test_a_centre_that_is_no_place_is_refused(lat, lon):
+    with pytest.raises(AreaError, match="centre of a sheet"):
+        LocalFrame(lat, lon)

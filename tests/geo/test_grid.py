@@ -1,0 +1,108 @@
+"""The tile grid: nothing of the extent is farther than half a stride from a tile centre."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from orthonav.errors import AreaError
+from orthonav.geo.grid import TileGrid
+
+coordinates = st.floats(-25_000, 25_000)
+shares = st.floats(0, 1)
+GOOD = {"gsd_m": 1.0, "tile_px": 256, "overlap": 0.875}
+
+
+@st.composite
+def grids(draw):
+    west, south = draw(coordinates), draw(coordinates)
+    extent = (west, south, west + draw(st.floats(0, 3000)), south + draw(st.floats(0, 3000)))
+    grid = TileGrid.covering(
+        extent,
+        gsd_m=draw(st.floats(0.5, 5)),
+        tile_px=draw(st.integers(64, 512)),
+        overlap=draw(st.floats(0, 0.95)),
+    )
+    return extent, grid
+
+
+def every_centre(grid: TileGrid) -> np.ndarray:
+    rows, cols = np.mgrid[: grid.rows, : grid.cols]
+    return grid.centres_en_m(np.stack([rows.ravel(), cols.ravel()], axis=1))
+
+
+@given(grids(), shares, shares)
+def test_every_point_is_within_half_a_stride_of_a_centre(extent_and_grid, along_east, along_north):
+    (west, south, east, north), grid = extent_and_grid
+    point = np.array([west + along_east * (east - west), south + along_north * (north - south)])
+    off = np.abs(every_centre(grid) - point).max(axis=1).min()
+    assert off <= grid.stride_m / 2 + 1e-6
+
+
+@given(grids())
+def test_no_row_or_column_is_more_than_needed(extent_and_grid):
+    (west, south, east, north), grid = extent_and_grid
+    assert (grid.cols - 1) * grid.stride_m <= east - west + 1e-6
+    assert (grid.rows - 1) * grid.stride_m <= north - south + 1e-6
+
+
+@given(grids())
+def test_centres_are_symmetric_in_the_extent(extent_and_grid):
+    (west, south, east, north), grid = extent_and_grid
+    centres = every_centre(grid)
+    middle = (centres.min(axis=0) + centres.max(axis=0)) / 2
+    np.testing.assert_allclose(middle, [(west + east) / 2, (south + north) / 2], atol=1e-6)
+    np.testing.assert_allclose(centres.mean(axis=0), middle, atol=1e-6)
+
+
+@given(grids())
+def test_tiles_fill_the_raster_exactly(extent_and_grid):
+    _, grid = extent_and_grid
+    half = grid.tile_m / 2
+    first, last = grid.centres_en_m(np.array([[0, 0], [grid.rows - 1, grid.cols - 1]]))
+    corner = [grid.west_m + grid.width_px * grid.gsd_m, grid.north_m - grid.height_px * grid.gsd_m]
+    np.testing.assert_allclose(first, [grid.west_m + half, grid.north_m - half], atol=1e-6)
+    np.testing.assert_allclose(last, [corner[0] - half, corner[1] + half], atol=1e-6)
+
+
+def test_rows_go_south_and_columns_east():
+    grid = TileGrid.covering((0, 0, 96, 64), gsd_m=1, tile_px=64, overlap=0.5)
+    assert (grid.rows, grid.cols, grid.stride_m, grid.tile_m) == (2, 3, 32, 64)
+    assert grid.centres_en_m(np.array([[0, 0], [0, 2], [1, 0]])).tolist() == [
+        [16, 48],
+        [80, 48],
+        [16, 16],
+    ]
+
+
+def test_a_point_gets_one_tile_around_it():
+    grid = TileGrid.covering((5, 7, 5, 7), **GOOD)
+    assert (grid.rows, grid.cols, grid.width_px) == (1, 1, 256)
+    assert every_centre(grid).tolist() == [[5, 7]]
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"gsd_m": 0}, "ground resolution"),
+        ({"gsd_m": math.nan}, "ground resolution"),
+        ({"gsd_m": math.inf}, "ground resolution"),
+        ({"tile_px": 15}, "at least 16 px"),
+        ({"overlap": 1.0}, "overlap"),
+        ({"overlap": -0.1}, "overlap"),
+        ({"overlap": math.nan}, "overlap"),
+    ],
+)
+def test_impossible_numbers_are_refused(change, message):
+    with pytest.raises(AreaError, match=message):
+        TileGrid.covering((0, 0, 1000, 1000), **(GOOD | change))
+
+
+@pytest.mark.parametrize(
+    "extent", [(1, 0, 0, 1), (0, 1, 1, 0), (math.nan, 0, 1, 1), (-math.inf, 0, math.inf, 1)]
+)
+def test_an_empty_or_endless_extent_is_refused(extent):
+    with pytest.raises(AreaError, match="area is empty or endless"):
+        TileGrid.covering(extent, **GOOD)

@@ -1,0 +1,329 @@
+"""Every kind of orthophoto comes out as the same picture, with what is missing marked."""
+
+import numpy as np
+import pytest
+import rasterio
+from geotiffs import SIZE, placed, read, smooth_scene, write
+from rasterio.drivers import raster_driver_extensions
+from rasterio.enums import ColorInterp
+from rasterio.transform import Affine
+from scipy.ndimage import binary_dilation
+
+from orthonav.imagery.mosaic import Mosaic
+
+INNER = np.s_[4:-4, 4:-4]
+RGB = [ColorInterp.red, ColorInterp.green, ColorInterp.blue]
+NIR, ALPHA = ColorInterp.undefined, ColorInterp.alpha
+SCENE = smooth_scene()
+HOLE = np.zeros((SIZE, SIZE), dtype=bool)
+HOLE[20:50, 30:70] = True
+MASK = np.where(HOLE, 0, 255).astype(np.uint8)
+
+
+def with_band(bands, extra):
+    return np.concatenate([bands, extra[None].astype(bands.dtype)])
+
+
+def rgb(path):
+    return write(path, SCENE)
+
+
+def jpeg_ycbcr(path):
+    return write(path, SCENE, compress="JPEG", photometric="YCBCR", tiled=True, jpeg_quality=98)
+
+
+def rgb_nir(path):
+    return write(path, with_band(SCENE, 255 - SCENE[0]), colours=[*RGB, NIR], alpha="NO")
+
+
+def bgr(path):
+    return write(path, SCENE[::-1], colours=RGB[::-1])
+
+
+def full_mask(path):
+    return write(path, SCENE, mask=np.full_like(MASK, 255))
+
+
+def south_up(path):
+    flip = Affine.translation(0, SIZE) * Affine.scale(1, -1)
+    return write(path, SCENE[:, ::-1], transform=placed() * flip)
+
+
+def vrt_of_two(path):
+    left, right = path.with_name("left.tif"), path.with_name("right.tif")
+    write(left, SCENE[:, :, :60], transform=placed())
+    write(right, SCENE[:, :, 60:], transform=placed() * Affine.translation(60, 0))
+    bands = "".join(
+        f'<VRTRasterBand dataType="Byte" band="{band}"><ColorInterp>{colour}</ColorInterp>'
+        + "".join(
+            f'<SimpleSource><SourceFilename relativeToVRT="1">{name}</SourceFilename>'
+            f'<SourceBand>{band}</SourceBand><SrcRect xOff="0" yOff="0" xSize="60" ySize="{SIZE}"/>'
+            f'<DstRect xOff="{x}" yOff="0" xSize="60" ySize="{SIZE}"/></SimpleSource>'
+            for name, x in ((left.name, 0), (right.name, 60))
+        )
+        + "</VRTRasterBand>"
+        for band, colour in ((1, "Red"), (2, "Green"), (3, "Blue"))
+    )
+    geo = ", ".join(repr(number) for number in placed().to_gdal())
+    path = path.with_suffix(".vrt")
+    path.write_text(
+        f'<VRTDataset rasterXSize="{SIZE}" rasterYSize="{SIZE}"><SRS>EPSG:2154</SRS>'
+        f"<GeoTransform>{geo}</GeoTransform>{bands}</VRTDataset>"
+    )
+    return path
+
+
+def jpeg2000(path):
+    if "jp2" not in raster_driver_extensions():
+        pytest.skip("this GDAL has no JPEG 2000 driver (JP2OpenJPEG)")
+    path = path.with_suffix(".jp2")
+    return write(path, SCENE, driver="JP2OpenJPEG", quality=100, reversible="YES")
+
+
+@pytest.mark.parametrize(
+    "make", [rgb, jpeg_ycbcr, rgb_nir, bgr, full_mask, south_up, vrt_of_two, jpeg2000]
+)
+def test_colour_of_every_kind_is_the_same_picture(tmp_path, make):
+    pixels = read(make(tmp_path / "ortho.tif"))
+    assert pixels.rgb.shape == (SIZE, SIZE, 3) and pixels.rgb.dtype == np.uint8
+    assert pixels.valid[INNER].all()
+    off = np.abs(pixels.rgb[INNER].astype(int) - SCENE.transpose(1, 2, 0)[INNER])
+    assert off.max() <= (8 if make is jpeg_ycbcr else 3)
+
+
+def grey(path):
+    return write(path, SCENE[:1])
+
+
+def two_bands(path):
+    return write(path, SCENE[:2])
+
+
+@pytest.mark.parametrize("make", [grey, two_bands])
+def test_grey_fills_all_three(tmp_path, make):
+    pixels = read(make(tmp_path / "ortho.tif"))
+    for band in range(3):
+        off = np.abs(pixels.rgb[INNER][..., band].astype(int) - SCENE[0][INNER])
+        assert off.max() <= 3
+    assert np.abs(pixels.grey[INNER].astype(int) - SCENE[0][INNER]).max() <= 3
+
+
+@pytest.mark.parametrize(
+    "dtype, scale, offset",
+    [("uint16", 16, 100), ("int16", 20, -3000), ("float32", 1 / 255, 0), ("float64", 1e4, -7e5)],
+)
+@pytest.mark.parametrize("bands", [1, 3, 4])
+def test_deeper_pixels_are_stretched_alike(tmp_path, dtype, scale, offset, bands):
+    scene = with_band(SCENE, SCENE[0])[:bands]
+    deep = (scene * float(scale) + offset).astype(dtype)
+    path = write(tmp_path / "ortho.tif", deep, colours=[*RGB, NIR] if bands == 4 else None)
+    mosaic = Mosaic.open([path])
+    expected = mosaic.stretch.apply(deep)[:3].transpose(1, 2, 0)
+    assert expected.min() == 0 and expected.max() == 255
+    pixels = read(path)
+    assert pixels.valid[INNER].all()
+    assert np.abs(pixels.rgb[INNER].astype(int) - expected[INNER]).max() <= 5
+
+
+def palette(path):
+    """SCENE[0] through a table of colours."""
+    with rasterio.open(write(path, SCENE[:1], nodata=0), "r+") as data:
+        data.write_colormap(1, {value: (value, 255 - value, 7, 255) for value in range(256)})
+    return path
+
+
+def test_a_palette_becomes_its_colours(tmp_path):
+    pixels = read(palette(tmp_path / "ortho.tif"))
+    value = SCENE[0][INNER].astype(int)
+    expected = np.stack([value, 255 - value, np.full_like(value, 7)], axis=-1)
+    assert pixels.valid[INNER].all()
+    assert np.abs(pixels.rgb[INNER] - expected).max() <= 3
+
+
+def nodata_value(path):
+    return write(path, np.where(HOLE, 0, SCENE), nodata=0)
+
+
+def nodata_in_white(path):
+    return write(path, np.where(HOLE, 255, SCENE), nodata=255)
+
+
+def grey_nodata(path):
+    return write(path, np.where(HOLE, 0, SCENE[:1]), nodata=0)
+
+
+def alpha_band(path):
+    return write(path, with_band(SCENE, MASK), colours=[*RGB, ALPHA])
+
+
+def grey_alpha(path):
+    return write(path, with_band(SCENE[:1], MASK), alpha="YES")
+
+
+def deep_alpha(path):
+    deep = with_band(SCENE.astype(np.uint16) * 100, MASK.astype(np.uint16) * 257)
+    return write(path, deep, colours=[*RGB, ALPHA])
+
+
+def internal_mask(path):
+    return write(path, np.where(HOLE, 90, SCENE).astype(np.uint8), mask=MASK)
+
+
+def jpeg_mask(path):
+    holed = np.where(HOLE, 0, SCENE)
+    options = {"compress": "JPEG", "photometric": "YCBCR", "tiled": True, "jpeg_quality": 98}
+    return write(path, holed, mask=MASK, **options)
+
+
+def float_nodata(path):
+    return write(path, np.where(HOLE, -9999, SCENE / 255).astype(np.float32), nodata=-9999)
+
+
+def float_nan(path):
+    return write(path, np.where(HOLE, np.nan, SCENE / 255).astype(np.float32), nodata=np.nan)
+
+
+def float_nan_undeclared(path):
+    return write(path, np.where(HOLE, np.nan, SCENE / 255).astype(np.float32))
+
+
+def deep_nodata(path):
+    return write(path, np.where(HOLE, 0, SCENE.astype(np.uint16) * 100), nodata=0)
+
+
+def palette_nodata(path):
+    with rasterio.open(write(path, np.where(HOLE, 0, SCENE[:1]), nodata=0), "r+") as data:
+        data.write_colormap(1, {value: (value, value, value, 255) for value in range(256)})
+    return path
+
+
+HOLED = [
+    nodata_value,
+    nodata_in_white,
+    grey_nodata,
+    alpha_band,
+    grey_alpha,
+    deep_alpha,
+    internal_mask,
+    jpeg_mask,
+    float_nodata,
+    float_nan,
+    float_nan_undeclared,
+    deep_nodata,
+    palette_nodata,
+]
+
+
+@pytest.mark.parametrize("make", HOLED)
+def test_holes_of_every_kind_are_marked(tmp_path, make):
+    path = make(tmp_path / "ortho.tif")
+    pixels, stretch = read(path), Mosaic.open([path]).stretch
+    ring = binary_dilation(HOLE, iterations=2)
+    inner = np.zeros_like(HOLE)
+    inner[INNER] = True
+    assert not pixels.valid[HOLE].any() and not pixels.rgb[~pixels.valid].any()
+    assert pixels.valid[inner & ~ring].all()
+    if stretch is None:
+        expected = SCENE if make not in (grey_nodata, grey_alpha, palette_nodata) else SCENE[:1]
+        clear = inner & ~binary_dilation(HOLE, iterations=16 if make is jpeg_mask else 3)
+        off = np.abs(pixels.rgb.transpose(2, 0, 1).astype(int) - expected)[:, clear]
+        assert off.max() <= (8 if make is jpeg_mask else 3)
+
+
+@pytest.mark.parametrize("make", HOLED)
+def test_colours_beside_a_hole_are_not_mixed_with_it(tmp_path, make):
+    """What counts as valid shows the ground, not the filling of the hole."""
+    whole = np.where(HOLE, 128, SCENE).astype(float)
+    pixels = read(make(tmp_path / "ortho.tif"))
+    if Mosaic.open([tmp_path / "ortho.tif"]).stretch is not None:
+        whole = np.interp(whole, [np.percentile(SCENE, 0.5), np.percentile(SCENE, 99.5)], [0, 255])
+    rim = pixels.valid & binary_dilation(HOLE, iterations=3)
+    off = np.abs(pixels.rgb[..., 0] - whole[0])[rim]
+    assert rim.sum() > 100 and off.max() <= 30
+
+
+@pytest.mark.parametrize("make", HOLED)
+@pytest.mark.parametrize("coarser", [2, 5])
+def test_thinning_keeps_the_holes(tmp_path, make, coarser):
+    pixels = read(make(tmp_path / "ortho.tif"), SIZE // coarser, gsd_m=coarser)
+    share = HOLE.reshape(SIZE // coarser, coarser, -1, coarser).mean(axis=(1, 3))
+    inner = np.s_[2:-2, 2:-2]
+    assert not pixels.valid[share == 1].any()
+    assert pixels.valid[inner][~binary_dilation(share > 0, iterations=2)[inner]].all()
+    assert not pixels.rgb[~pixels.valid].any()
+
+
+def test_outside_the_imagery_is_not_valid_and_black(tmp_path):
+    pixels = read(rgb(tmp_path / "ortho.tif"), 2 * SIZE)
+    inside = np.s_[SIZE // 2 + 2 : -SIZE // 2 - 2]
+    assert pixels.valid[inside, inside].all()
+    assert pixels.valid.sum() == pytest.approx(SIZE**2, rel=0.04)
+    assert not pixels.rgb[~pixels.valid].any() and not pixels.grey[~pixels.valid].any()
+
+
+def shifted(path, cols, level, **more):
+    bands = np.full((3, SIZE, SIZE), level, np.uint8)
+    return write(path, bands, transform=placed() * Affine.translation(cols, 0), **more)
+
+
+def test_first_named_wins_and_gaps_stay_gaps(tmp_path):
+    """Columns 0..120 of the first, 80..200 of the second, a gap, 220..340 of the third."""
+    paths = [
+        shifted(tmp_path / f"{level}.tif", cols, level)
+        for cols, level in ((-100, 50), (-20, 100), (120, 200))
+    ]
+    row, width = SIZE, 3 * SIZE
+    for order, overlap in ((paths, 50), (paths[::-1], 100)):
+        pixels = read(order, width)
+        line, valid = pixels.rgb[row + 60, :, 1], pixels.valid[row + 60]
+        left = SIZE - 100
+        assert (line[left + 3 : left + 77] == 50).all()
+        assert (line[left + 83 : left + 117] == overlap).all()
+        assert (line[left + 123 : left + 197] == 100).all()
+        assert not valid[left + 203 : left + 217].any()
+        assert (line[left + 223 : left + 337] == 200).all()
+        assert valid[left + 3 : left + 197].all()
+
+
+def test_a_later_file_fills_the_holes_of_the_first(tmp_path):
+    below = shifted(tmp_path / "below.tif", 0, 222)
+    pixels = read([nodata_value(tmp_path / "holed.tif"), below])
+    assert pixels.valid[INNER].all()
+    assert (pixels.rgb[22:48, 32:68] == 222).all()
+    clear = ~binary_dilation(HOLE, iterations=3)[INNER]
+    off = np.abs(pixels.rgb[INNER].astype(int) - SCENE.transpose(1, 2, 0)[INNER])
+    assert off[clear].max() <= 3
+
+
+def test_more_files_than_are_kept_open(tmp_path, monkeypatch):
+    monkeypatch.setattr("orthonav.imagery.mosaic.MAX_OPEN", 2)
+    paths = []
+    for index in range(5):
+        strip = np.full((3, 24, SIZE), 50 * index, np.uint8)
+        transform = placed() * Affine.translation(0, 24 * index)
+        paths.append(write(tmp_path / f"{index}.tif", strip, transform=transform))
+    pixels = read(paths)
+    assert (pixels.rgb[12::24, 4:-4, 0] == np.arange(0, 250, 50)[:, None]).all()
+    assert pixels.valid[INNER].all()
+
+
+@pytest.mark.parametrize(
+    "name, tags, expected",
+    [
+        ("ortho", {"TIFFTAG_DATETIME": "2021:06:17 10:00:00"}, "2021-06-17"),
+        ("ortho_2019", {"ACQUISITION_DATE": "2021-06"}, "2021-06"),
+        ("BDORTHO_2154_2018-07_0M20", {}, "2018-07"),
+        ("naip_20200715", {}, "2020-07-15"),
+        ("ortho", {}, None),
+        ("1234567", {}, None),
+    ],
+)
+def test_what_the_manifest_keeps(tmp_path, name, tags, expected):
+    path = rgb(tmp_path / f"{name}.tif")
+    with rasterio.open(path, "r+") as data:
+        data.update_tags(**tags)
+    mosaic = Mosaic.open([path])
+    kept = mosaic.sources[0].describe()
+    assert kept["date"] == expected and kept["name"] == f"{name}.tif"
+    assert (kept["width_px"], kept["height_px"], kept["dtype"]) == (SIZE, SIZE, "uint8")
+    assert mosaic.gsd_m == pytest.approx(1.0, rel=1e-3) and kept["crs"] == "EPSG:2154"

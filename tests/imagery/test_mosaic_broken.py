@@ -1,0 +1,238 @@
+"""Orthophotos that cannot be used are refused in words; big ones are read in bounded memory."""
+
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+import rasterio.shutil
+from geotiffs import SIZE, read, sheet_of, smooth_scene, write
+from rasterio.drivers import raster_driver_extensions
+from rasterio.transform import Affine
+
+from orthonav.errors import ImageryError, MissingFileError
+from orthonav.imagery.mosaic import Mosaic
+
+SCENE = smooth_scene()
+
+
+@pytest.fixture
+def ortho(tmp_path):
+    """Where the orthophoto of a test is written."""
+    return tmp_path / "ortho.tif"
+
+
+def refused(path, message):
+    with pytest.raises(ImageryError, match=message) as caught:
+        Mosaic.open([path])
+    assert str(caught.value).endswith(str(path))
+
+
+def test_a_file_that_is_missing(tmp_path):
+    for path in (tmp_path / "none.tif", tmp_path):
+        with pytest.raises(MissingFileError, match="does not exist"):
+            Mosaic.open([path])
+
+
+def test_no_file_at_all():
+    with pytest.raises(ImageryError, match="no orthophoto was named"):
+        Mosaic.open([])
+
+
+@pytest.mark.parametrize("content", [b"", b"not an image", b"II*\0" + b"\xff" * 40, bytes(4096)])
+def test_a_file_that_is_no_image(ortho, content):
+    ortho.write_bytes(content)
+    refused(ortho, "cannot be read")
+
+
+def test_no_coordinate_reference_system(ortho):
+    refused(write(ortho, SCENE, crs=None), "no coordinate reference system.*gdal_edit.py")
+
+
+def test_no_geotransform(ortho):
+    refused(write(ortho, SCENE, transform=Affine.identity()), "no georeference")
+
+
+def test_a_local_coordinate_system_is_nowhere_on_earth(ortho):
+    crs = 'LOCAL_CS["mine",UNIT["metre",1]]'
+    refused(write(ortho, SCENE, crs=crs), "coordinate system cannot be turned into latitude")
+
+
+@pytest.mark.parametrize("shape", [(15, 60), (60, 15), (1, 1)])
+def test_too_small(ortho, shape):
+    refused(write(ortho, np.ones((3, *shape), np.uint8)), f"only {shape[1]} x {shape[0]} px")
+
+
+def test_complex_numbers(ortho):
+    refused(write(ortho, np.ones((1, 32, 32), np.complex64)), "no band of real numbers")
+
+
+def test_metres_called_degrees(ortho):
+    refused(write(ortho, SCENE, crs="EPSG:4326"), "border cannot be turned into latitude")
+
+
+def test_8_and_16_bit_are_not_mixed(tmp_path):
+    shallow = write(tmp_path / "a.tif", SCENE)
+    deep = write(tmp_path / "b.tif", SCENE.astype(np.uint16))
+    with pytest.raises(ImageryError, match="cannot be mixed"):
+        Mosaic.open([shallow, deep])
+
+
+@pytest.mark.parametrize("dtype, nodata", [("uint16", 0), ("float32", -1), ("float32", np.nan)])
+def test_deep_images_of_nothing_but_nodata(ortho, dtype, nodata):
+    write(ortho, np.full((3, SIZE, SIZE), nodata, dtype), nodata=nodata)
+    with pytest.raises(ImageryError, match="no valid pixel"):
+        Mosaic.open([ortho])
+
+
+def test_8_bit_images_of_nothing_but_nodata_have_no_valid_pixel(ortho):
+    write(ortho, np.zeros((3, SIZE, SIZE), np.uint8), nodata=0)
+    assert not read(ortho).valid.any()
+
+
+@pytest.mark.parametrize("dtype", ["uint16", "float32"])
+def test_one_level_everywhere_is_no_division_by_zero(ortho, dtype):
+    write(ortho, np.full((1, SIZE, SIZE), 700, dtype))
+    pixels = read(ortho)
+    assert pixels.valid[4:-4, 4:-4].all() and not pixels.rgb.any()
+
+
+def noise(size=512):
+    return np.random.default_rng(0).integers(0, 256, (3, size, size)).astype(np.uint8)
+
+
+TILED = {"tiled": True, "blockxsize": 256, "blockysize": 256}
+KINDS = {
+    "deflate tiles": {"compress": "DEFLATE"} | TILED,
+    "deflate strips": {"compress": "DEFLATE"},
+    "lzw tiles": {"compress": "LZW"} | TILED,
+    "jpeg tiles": {"compress": "JPEG", "photometric": "YCBCR"} | TILED,
+    "plain": {},
+    "JPEG": {"driver": "JPEG"},
+    "PNG": {"driver": "PNG"},
+    "JP2OpenJPEG": {"driver": "JP2OpenJPEG"},
+}
+
+
+def made(kind, ortho):
+    """A file of noise of that kind."""
+    driver = KINDS[kind].get("driver", "GTiff")
+    if driver not in raster_driver_extensions().values():
+        pytest.skip(f"this GDAL has no {driver} driver")
+    if driver == "GTiff":
+        return write(ortho, noise(), **KINDS[kind])
+    path = ortho.with_suffix({"JPEG": ".jpg", "PNG": ".png", "JP2OpenJPEG": ".jp2"}[driver])
+    rasterio.shutil.copy(write(ortho, noise()), path, driver=driver)
+    return path
+
+
+@pytest.mark.parametrize("kept", [0.1, 0.5, 0.95])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_file_that_was_cut_short_is_never_read_as_if_whole(ortho, kind, kept):
+    path = made(kind, ortho)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content))])
+    with pytest.raises(ImageryError, match="cannot be read") as caught:
+        read(path, 500)
+    assert "previous exception" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["deflate tiles", "lzw tiles", "jpeg tiles", "PNG"])
+def test_altered_bytes_are_noticed(ortho, kind):
+    path = made(kind, ortho)
+    content = bytearray(path.read_bytes())
+    middle = slice(len(content) // 2, len(content) // 2 + 2000)
+    content[middle] = bytes(byte ^ 0x5A for byte in content[middle])
+    path.write_bytes(bytes(content))
+    with pytest.raises(ImageryError, match="cannot be read"):
+        read(path, 500)
+
+
+def test_what_lies_before_the_damage_can_be_read(ortho):
+    whole = read(write(ortho, noise(), **KINDS["deflate tiles"], interleave="pixel"), 500)
+    ortho.write_bytes(ortho.read_bytes()[:-1000])
+    with sheet_of(ortho, 500) as sheet:
+        first = sheet.read(0, 0, 200, 200)
+        with pytest.raises(ImageryError):
+            sheet.read(300, 300, 200, 200)
+        again = sheet.read(0, 0, 200, 200)
+    assert (first.rgb == whole.rgb[:200, :200]).all() and (again.rgb == first.rgb).all()
+
+
+def test_a_deep_file_that_was_cut_short(ortho):
+    write(ortho, noise().astype(np.uint16), compress="DEFLATE", **TILED)
+    ortho.write_bytes(ortho.read_bytes()[: ortho.stat().st_size // 2])
+    with pytest.raises(ImageryError):
+        read(ortho, 500)
+
+
+def test_a_file_that_vanishes_is_named(ortho):
+    sheet = sheet_of(write(ortho, SCENE))
+    ortho.unlink()
+    with sheet, pytest.raises(ImageryError, match=r"cannot be read.*ortho\.tif"):
+        sheet.read(0, 0, 50, 50)
+
+
+HUGE_PX = 20_000
+READ_HUGE = """
+    import resource, sys
+    from pathlib import Path
+    from orthonav.geo.frames import LocalFrame
+    from orthonav.imagery.mosaic import Mosaic
+
+    path, gsd_m, step = Path(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])
+    across = int(4000 / gsd_m)
+    mosaic = Mosaic.open([path])
+    sheet = mosaic.sheet(
+        LocalFrame(46.5, 3.0), west_m=-2000, north_m=2000, width_px=across, height_px=across,
+        gsd_m=gsd_m,
+    )
+    valid = read = 0
+    with sheet:
+        for row in range(0, across, 1024 * step):
+            for col in range(0, across, 1024 * step):
+                width, height = min(1024, across - col), min(1024, across - row)
+                pixels = sheet.read(col, row, width, height)
+                valid, read = valid + int(pixels.valid.sum()), read + width * height
+    print(valid / read, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+@pytest.fixture(scope="module")
+def huge(tmp_path_factory):
+    """A 20,000 x 20,000 px orthophoto at 0.2 m, 1.2 GB when unpacked."""
+    path = tmp_path_factory.mktemp("huge") / "huge.tif"
+    block = smooth_scene(2000)
+    half = HUGE_PX / 2
+    profile = {
+        "driver": "GTiff",
+        "dtype": "uint8",
+        "count": 3,
+        "width": HUGE_PX,
+        "height": HUGE_PX,
+        "crs": "EPSG:2154",
+        "transform": Affine(0.2, 0, 700_000 - 0.2 * half, 0, -0.2, 6_600_000 + 0.2 * half),
+        "compress": "DEFLATE",
+        "zlevel": 1,
+        "interleave": "pixel",
+        "tiled": True,
+        "SPARSE_OK": "TRUE",
+    }
+    with rasterio.open(path, "w", **profile) as data:
+        for at in range(0, HUGE_PX, 4000):
+            data.write(block, window=rasterio.windows.Window(at, at, 2000, 2000))
+    return path
+
+
+@pytest.mark.parametrize("gsd_m, step", [(0.2, 7), (1.0, 2), (4.0, 1)])
+def test_memory_is_bounded_whatever_the_file(huge, gsd_m, step):
+    """Windows of 1024 px: some at 0.2 m, a quarter of all at 1 m, at 4 m the file in one piece."""
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(READ_HUGE), str(huge), str(gsd_m), str(step)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    share, peak_kib = map(float, done.stdout.split())
+    assert share > 0.2 and peak_kib < 1e6

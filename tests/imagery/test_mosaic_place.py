@@ -1,0 +1,266 @@
+"""A thing on the ground comes out where PROJ says it is, whatever the file and the window."""
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from geotiffs import FRAME, LAMBERT, centres_en_m, from_local, placed, read, sheet_of, write
+from rasterio.enums import Resampling
+from rasterio.transform import Affine
+
+from orthonav.geo.frames import LocalFrame
+from orthonav.imagery.mosaic import Mosaic
+
+BREST = LocalFrame(48.39, -4.49)  # Lambert-93 is turned by -5.4 degrees here
+VOSGES = LocalFrame(46.5, 7.5)
+MARKS_EN_M = np.array([[e, n] for e in (-70, 0, 55) for n in (-60, 10, 70)], dtype=float)
+
+
+def source_with_marks(path, crs, transform, size, frame, sigma_px):
+    """Round marks at `MARKS_EN_M`, placed by PROJ; (x, y) of a pixel is its centre."""
+    x, y = from_local(crs, frame).transform(*MARKS_EN_M.T)
+    cols, rows = ~transform * (np.asarray(x), np.asarray(y))
+    along = np.arange(size) + 0.5
+    grey = np.full((size, size), 40.0)
+    for col, row in zip(cols, rows, strict=True):
+        grey += 180 * np.exp(-((along - col) ** 2 + (along[:, None] - row) ** 2) / 2 / sigma_px**2)
+    return write(path, np.rint(grey).astype(np.uint8)[None], crs=crs, transform=transform)
+
+
+def marks_off_px(grey, gsd_m):
+    """How far the centroid of each mark lies from where it should, in pixels of the sheet."""
+    east, north = centres_en_m(len(grey), gsd_m)
+    off = []
+    for mark_east, mark_north in MARKS_EN_M:
+        near = np.maximum(abs(east - mark_east), abs(north - mark_north)) < 10 * max(1.0, gsd_m)
+        weight = np.where(near, np.maximum(grey.astype(float) - 45, 0), 0)
+        centroid = np.array([(east * weight).sum(), (north * weight).sum()]) / weight.sum()
+        off.append((centroid - (mark_east, mark_north)) / gsd_m)
+    return np.array(off)
+
+
+@pytest.mark.parametrize(
+    "crs, frame, source_gsd_m, turn_deg, gsd_m",
+    [
+        (LAMBERT, FRAME, 1.0, 0, 1.0),
+        (LAMBERT, BREST, 1.0, 0, 1.0),
+        (LAMBERT, BREST, 0.2, 0, 1.0),
+        (LAMBERT, BREST, 0.4, 0, 1.0),
+        (LAMBERT, FRAME, 1.0, 30, 1.0),
+        (LAMBERT, BREST, 0.5, -100, 1.0),
+        ("EPSG:3857", FRAME, 1.0, 0, 1.0),
+        ("EPSG:3857", VOSGES, 0.25, 0, 1.0),
+        ("EPSG:4326", FRAME, 1.0, 0, 1.0),
+        ("EPSG:4326", BREST, 0.3, 0, 1.0),
+        ("EPSG:32632", VOSGES, 0.6, 0, 1.0),
+        ("EPSG:32632", VOSGES, 0.6, 0, 0.5),
+        ("EPSG:4258", FRAME, 0.8, 0, 2.0),
+        ("ESRI:102014", FRAME, 1.0, 0, 1.0),
+    ],
+)
+def test_marks_lie_where_proj_puts_them(tmp_path, crs, frame, source_gsd_m, turn_deg, gsd_m):
+    size = int(290 / source_gsd_m)
+    transform = placed(crs, source_gsd_m, size, turn_deg, frame)
+    path = tmp_path / "ortho.tif"
+    source_with_marks(path, crs, transform, size, frame, sigma_px=2.5 / source_gsd_m)
+    pixels = read(path, int(200 / gsd_m), gsd_m, frame)
+    off = marks_off_px(pixels.grey, gsd_m)
+    assert pixels.valid.all()
+    assert np.abs(off).max() < 0.1, f"marks are off by up to {np.abs(off).max():.2f} px"
+    assert np.abs(off.mean(axis=0)).max() < 0.03
+
+
+def test_web_mercator_is_measured_in_true_metres(tmp_path):
+    """At 46.5 degrees its unit is 0.69 m on the ground."""
+    transform = placed("EPSG:3857", size=64)
+    assert transform.a == pytest.approx(1.45, abs=0.01)
+    bands = np.ones((1, 64, 64), np.uint8)
+    path = write(tmp_path / "a.tif", bands, crs="EPSG:3857", transform=transform)
+    assert Mosaic.open([path]).gsd_m == pytest.approx(1.0, abs=0.005)
+
+
+@pytest.mark.parametrize("turn_deg", [0, 30, -100])
+def test_resolution_of_a_turned_raster(tmp_path, turn_deg):
+    transform = placed(gsd_m=0.5, turn_deg=turn_deg)
+    path = write(tmp_path / "a.tif", np.ones((1, 64, 64), np.uint8), transform=transform)
+    assert Mosaic.open([path]).gsd_m == pytest.approx(0.5, rel=2e-3)
+
+
+@pytest.mark.parametrize("frame", [FRAME, BREST], ids=["straight", "turned"])
+@pytest.mark.parametrize("source_gsd_m", [1.0, 0.5, 0.2, 0.4, 2.0])
+def test_a_ramp_keeps_its_value_at_every_pixel_centre(tmp_path, frame, source_gsd_m):
+    """Two grey levels per metre of sheet: half a pixel off would show as one grey level."""
+    size = round(140 / source_gsd_m)
+    transform = placed(LAMBERT, source_gsd_m, size, frame=frame)
+    ramp = np.tile((np.arange(size) + 0.5) * source_gsd_m * 400, (size, 1))
+    bands = np.rint(np.stack([ramp, ramp.T, (ramp + ramp.T) / 2])).astype(np.uint16)
+    path = write(tmp_path / "ramp.tif", bands, transform=transform)
+    stretch = Mosaic.open([path]).stretch
+
+    pixels = read(path, 100, 1.0, frame)
+    x, y = from_local(LAMBERT, frame).transform(*centres_en_m(100, 1.0))
+    cols, rows = ~transform * (np.asarray(x), np.asarray(y))
+    raw = np.stack([cols, rows, (cols + rows) / 2], axis=-1) * source_gsd_m * 400
+    off = pixels.rgb - (raw - stretch.low) * 255 / (stretch.high - stretch.low)
+    assert pixels.valid.all()
+    assert np.abs(off).max() < 1.2
+    assert np.abs(off.mean(axis=(0, 1))).max() < 0.05
+
+
+def rich_scene(size, source_gsd_m, seed=0):
+    """Structure at all scales from two sheet pixels up."""
+    noise = np.random.default_rng(seed).normal(size=(3, size, size)).astype(np.float32)
+    bands = np.zeros_like(noise)
+    for band, out in zip(noise, bands, strict=True):
+        for sigma_m in (1, 4):
+            layer = cv2.GaussianBlur(band, (0, 0), sigma_m / source_gsd_m)
+            out += layer / layer.std()
+    return np.clip(128 + 35 * bands, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    "crs, frame, source_gsd_m",
+    [
+        (LAMBERT, FRAME, 1.0),
+        (LAMBERT, BREST, 1.0),
+        (LAMBERT, BREST, 0.2),
+        (LAMBERT, FRAME, 0.4),
+        (LAMBERT, FRAME, 0.7),
+        ("EPSG:3857", VOSGES, 0.3),
+        ("EPSG:4326", FRAME, 1.0),
+    ],
+)
+def test_windows_do_not_change_what_is_read(tmp_path, crs, frame, source_gsd_m):
+    size = int(260 / source_gsd_m)
+    transform = placed(crs, source_gsd_m, size, frame=frame)
+    scene = rich_scene(size, source_gsd_m)
+    path = write(tmp_path / "ortho.tif", scene, crs=crs, transform=transform)
+    with sheet_of(path, 200, 1.0, frame) as sheet:
+        whole = sheet.read(0, 0, 200, 200)
+        for col, row, width, height in [
+            (0, 0, 100, 100),
+            (100, 0, 100, 100),
+            (0, 100, 100, 100),
+            (100, 100, 100, 100),
+            (37, 61, 1, 1),
+            (13, 90, 171, 7),
+            (150, 0, 9, 200),
+        ]:
+            part = sheet.read(col, row, width, height)
+            window = np.s_[row : row + height, col : col + width]
+            off = np.abs(part.rgb.astype(int) - whole.rgb[window])
+            assert (part.valid == whole.valid[window]).all()
+            assert off.max() <= 2, f"{off.max()} grey levels at {col}, {row}"
+
+
+@pytest.mark.parametrize("gsd_m", [0.5, 1.0, 2.0])
+def test_a_window_that_starts_in_the_middle_of_the_sheet(tmp_path, gsd_m):
+    """GDAL takes a raster at (0, 0) with pixels of 1 for one without georeference."""
+    path = write(tmp_path / "ortho.tif", rich_scene(260, 1.0))
+    with sheet_of(path, 100, gsd_m) as sheet:
+        whole, quarter = sheet.read(0, 0, 100, 100), sheet.read(50, 50, 50, 50)
+    assert quarter.valid.all()
+    assert np.abs(quarter.rgb.astype(int) - whole.rgb[50:, 50:]).max() <= 2
+
+
+@pytest.mark.parametrize("turn_deg", [0, 5, 45, 90])
+def test_narrow_windows_are_as_sharp_as_wide_ones(tmp_path, turn_deg):
+    scene = rich_scene(200, 1.0)
+    path = write(tmp_path / "ortho.tif", scene, transform=placed(size=200, turn_deg=turn_deg))
+    with sheet_of(path, 100) as sheet:
+        whole, strip = sheet.read(0, 0, 100, 100), sheet.read(0, 48, 100, 3)
+    assert np.abs(strip.rgb.astype(int) - whole.rgb[48:51]).max() <= 2
+    assert whole.grey.std() == pytest.approx(scene.mean(axis=0).std(), rel=0.3)
+
+
+@pytest.mark.parametrize("source_gsd_m", [1.0, 0.3, 0.2])
+def test_windows_at_the_border_of_the_imagery(tmp_path, source_gsd_m):
+    """The source ends within a block of averaged pixels."""
+    size = int(151 / source_gsd_m) - 1
+    transform = placed(LAMBERT, source_gsd_m, size)
+    path = write(tmp_path / "ortho.tif", rich_scene(size, source_gsd_m), transform=transform)
+    with sheet_of(path, 200) as sheet:
+        whole, part = sheet.read(0, 0, 200, 200), sheet.read(90, 95, 110, 105)
+    window = np.s_[95:, 90:]
+    assert (part.valid != whole.valid[window]).sum() <= 5
+    both = part.valid & whole.valid[window]
+    assert both.sum() > 6000
+    assert np.abs(part.rgb.astype(int) - whole.rgb[window])[both].max() <= 2
+
+
+def test_a_window_may_reach_beyond_the_sheet(tmp_path):
+    scene = rich_scene(260, 1.0)
+    path = write(tmp_path / "ortho.tif", scene)
+    with sheet_of(path, 100) as sheet:
+        inside, beyond = sheet.read(0, 0, 100, 100), sheet.read(-20, -30, 150, 160)
+        nothing = sheet.read(200, 200, 10, 10)
+    assert (beyond.rgb[30:130, 20:120] == inside.rgb).all()
+    assert beyond.valid.sum() == 100 * 100 and not nothing.valid.any()
+
+
+@pytest.mark.parametrize("coarser", [2, 3, 4, 5, 8, 2.5, 3.4])
+@pytest.mark.parametrize("deep", [False, True], ids=["8 bit", "16 bit"])
+def test_a_fine_chequerboard_comes_out_grey(tmp_path, coarser, deep):
+    board = np.indices((600, 600)).sum(axis=0) % 2 * 255
+    bands = board[None].astype(np.uint16 if deep else np.uint8)
+    path = write(tmp_path / "board.tif", bands, transform=placed(gsd_m=0.2, size=600))
+    pixels = read(path, int(100 / coarser / 0.2 / 5) * 4, gsd_m=0.2 * coarser)
+    inner = pixels.grey[3:-3, 3:-3].astype(float)
+    assert pixels.valid[3:-3, 3:-3].all()
+    assert inner.mean() == pytest.approx(127.5, abs=3)
+    assert np.abs(inner - 127.5).max() <= 127.5 / coarser**2 * 2.5 + 3
+
+
+def test_thinning_averages_the_right_pixels(tmp_path):
+    """Blocks of 5 x 5 pixels at 0.2 m, each with its own mean, are the pixels at 1 m."""
+    rng = np.random.default_rng(0)
+    means = cv2.GaussianBlur(rng.uniform(0, 255, (120, 120)), (0, 0), 3)
+    means = np.clip((means - means.mean()) * 3 + 128, 60, 195)
+    fine = np.kron(means, np.ones((5, 5))) + rng.uniform(-50, 50, (600, 600))
+    path = write(
+        tmp_path / "fine.tif",
+        np.rint(fine).astype(np.uint8)[None],
+        transform=placed(gsd_m=0.2, size=600),
+    )
+    expected = np.rint(fine).reshape(120, 5, 120, 5).mean(axis=(1, 3))
+    off = read(path, 120).grey.astype(float)[4:-4, 4:-4] - expected[4:-4, 4:-4]
+    assert np.abs(off).max() < 12 and abs(off.mean()) < 0.5
+
+
+def test_overviews_change_little(tmp_path):
+    scene = rich_scene(800, 0.25)
+    path = write(tmp_path / "ortho.tif", scene, transform=placed(gsd_m=0.25, size=800))
+    without = read(path, 180)
+    with rasterio.open(path, "r+") as data:
+        data.build_overviews([2, 4], Resampling.average)
+    with_overviews = read(path, 180)
+    assert np.abs(without.rgb.astype(int) - with_overviews.rgb)[4:-4, 4:-4].max() <= 6
+
+
+def test_a_sheet_far_from_the_imagery_is_empty(tmp_path):
+    path = write(tmp_path / "ortho.tif", rich_scene(64, 1.0))
+    for frame in (BREST, LocalFrame(-46.5, -177.0), LocalFrame(89.0, 3.0)):
+        assert not read(path, 50, 1.0, frame).valid.any()
+
+
+def test_across_the_antimeridian(tmp_path):
+    """An orthophoto in UTM 60 that reaches into the western hemisphere."""
+    frame = LocalFrame(-17.0, 180.0)
+    transform = placed("EPSG:32760", 1.0, 260, frame=frame)
+    path = tmp_path / "fiji.tif"
+    source_with_marks(path, "EPSG:32760", transform, 260, frame, 2.5)
+    pixels = read(path, 200, 1.0, frame)
+    assert pixels.valid.all() and np.abs(marks_off_px(pixels.grey, 1.0)).max() < 0.1
+
+
+def test_identity_of_pixel_and_sheet_pixel(tmp_path):
+    """One bright pixel stays in its pixel: no half pixel is lost on the way."""
+    bands = np.zeros((1, 64, 64), np.uint8)
+    bands[0, 20, 41] = 255
+    path = write(tmp_path / "dot.tif", bands, transform=placed(size=64))
+    grey = read(path, 64).grey
+    assert np.unravel_index(grey.argmax(), grey.shape) == (20, 41) and grey.max() > 240
+    shifted = placed(size=64) * Affine.translation(0.5, 0)
+    path = write(tmp_path / "half.tif", bands, transform=shifted)
+    pair = read(path, 64).grey[20, 41:43].astype(int)
+    assert abs(pair[0] - pair[1]) < 20 and pair.min() > 100

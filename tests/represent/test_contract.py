@@ -1,0 +1,220 @@
+"""What every representation promises, and what each says of itself."""
+
+import dataclasses
+import importlib
+import json
+import pickle
+
+import cv2
+import numpy as np
+import pytest
+
+from orthonav.errors import VariantError
+from orthonav.represent import TABLE
+from orthonav.represent.canny import Canny
+from orthonav.represent.gradients import OrientedGradients
+from orthonav.represent.gray import Gray
+from orthonav.variants import make_variant, variant_from_recipe, variant_recipe
+
+SHAPES = [(1, 1), (1, 40), (2, 3), (16, 16), (33, 47), (64, 64), (256, 255)]
+
+
+@pytest.fixture(params=sorted(TABLE))
+def variant(request):
+    """Every entry of the table, with its defaults."""
+    return make_variant(TABLE, request.param)
+
+
+def picture(shape=(96, 96), seed=0, blur=1.5):
+    """Blurred noise over the whole range of grey levels, read-only."""
+    noise = np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), blur).reshape(shape)
+    grey = cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8).reshape(shape)
+    return frozen(grey)
+
+
+def frozen(array):
+    array.flags.writeable = False
+    return array
+
+
+def everywhere(grey):
+    return frozen(np.ones(grey.shape, dtype=bool))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_shape_dtype_and_finite(variant, shape):
+    grey = picture(shape)
+    out = variant(grey, everywhere(grey))
+    assert out.shape == (variant.channels, *shape) and out.dtype == np.float32
+    assert np.isfinite(out).all()
+
+
+def test_says_something_of_a_picture(variant):
+    grey = picture()
+    out = variant(grey, everywhere(grey))
+    assert (out.reshape(len(out), -1).std(axis=1) > 0).all()
+
+
+def test_deterministic_and_inputs_untouched(variant):
+    grey = picture()
+    valid = everywhere(grey)
+    first, second = variant(grey, valid), variant(grey.copy(), valid.copy())
+    assert first.tobytes() == second.tobytes()
+    assert not np.shares_memory(first, grey)
+    np.testing.assert_array_equal(grey, picture())
+
+
+def test_views_into_larger_pictures_are_taken(variant):
+    large = picture((200, 200))
+    window = large[10:106:2, 7:103]
+    np.testing.assert_array_equal(
+        variant(window, everywhere(window)), variant(window.copy(), everywhere(window))
+    )
+
+
+@pytest.mark.parametrize("level", [0, 1, 128, 255])
+@pytest.mark.parametrize("shape", [(16, 16), (40, 41)])
+def test_blank_is_flat(variant, level, shape):
+    grey = np.full(shape, level, np.uint8)
+    out = variant(grey, everywhere(grey))
+    assert np.isfinite(out).all()
+    assert np.ptp(out.reshape(len(out), -1), axis=1).max() < 1e-2
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_nothing_valid_is_zero(variant, shape):
+    grey = picture(shape)
+    assert not variant(grey, np.zeros(shape, dtype=bool)).any()
+
+
+def test_masked_area_is_zero_and_says_nothing_of_what_lies_under_it(variant):
+    grey = picture((128, 128))
+    valid = everywhere(grey).copy()
+    valid[40:90, 50:] = False
+    valid[3, 3] = False
+    painted = np.where(valid, grey, 255).astype(np.uint8)
+    out, other = variant(grey, frozen(valid)), variant(painted, valid)
+    assert not out[:, ~valid].any()
+    far = cv2.erode(valid.astype(np.uint8), np.ones((31, 31), np.uint8)) > 0
+    if not isinstance(variant, Canny):  # hysteresis follows an edge however far
+        np.testing.assert_array_equal(out[:, far], other[:, far])
+        unmasked = variant(grey, everywhere(grey))
+        np.testing.assert_array_equal(out[:, far], unmasked[:, far])
+
+
+def test_the_border_of_the_valid_area_is_no_edge():
+    valid = np.zeros((64, 64), dtype=bool)
+    valid[20:, 20:] = True
+    grey = np.where(valid, 200, 0).astype(np.uint8)
+    for name in ("canny", "canny:kernel=7", "gradient", "gradient:sigma_px=4"):
+        assert np.abs(make_variant(TABLE, name)(grey, valid)).max() < 1e-2, name
+
+
+def test_is_a_frozen_value(variant):
+    again = pickle.loads(pickle.dumps(variant))
+    assert again == variant and hash(again) == hash(variant)
+    for field in dataclasses.fields(variant):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(variant, field.name, 1)
+
+
+def test_recipe_round_trip(variant):
+    recipe = json.loads(json.dumps(variant_recipe(TABLE, variant)))
+    assert variant_from_recipe(TABLE, recipe) == variant
+
+
+@pytest.mark.parametrize("name", sorted(TABLE))
+def test_table_names_what_exists(name):
+    module, _, cls = TABLE[name].path.partition(":")
+    assert callable(getattr(importlib.import_module(module), cls))
+
+
+def test_gray_is_the_grey_level():
+    grey = picture()
+    np.testing.assert_array_equal(Gray()(grey, everywhere(grey))[0] * 255, grey)
+
+
+@pytest.mark.parametrize("low, high, kernel", [(100, 200, 3), (50, 80, 3), (2000, 4000, 5)])
+def test_canny_is_opencvs(low, high, kernel):
+    grey = picture(blur=1.0)
+    expected = cv2.Canny(grey, low, high, apertureSize=kernel, L2gradient=False) > 0
+    assert expected.any() and not expected.all()
+    np.testing.assert_array_equal(Canny(low, high, kernel)(grey, everywhere(grey))[0], expected)
+
+
+def test_canny_has_the_papers_thresholds():
+    assert Canny() == Canny(low=100, high=200, kernel=3)
+
+
+@pytest.mark.parametrize(
+    "text", ["canny:low=200,high=100", "canny:low=-1", "canny:kernel=4", "canny:kernel=9"]
+)
+def test_impossible_canny_is_refused(text):
+    with pytest.raises(VariantError, match="canny"):
+        make_variant(TABLE, text)
+
+
+def gradients(grey):
+    return OrientedGradients()(grey, everywhere(grey))
+
+
+def test_gradients_do_not_see_the_sign_of_contrast():
+    grey = picture()
+    np.testing.assert_allclose(gradients(255 - grey), gradients(grey), atol=1e-3)
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_gradients_turn_with_the_picture(quarters):
+    """A quarter turn adds 90 degrees to a direction t: exp(2ik t) changes sign for odd k only."""
+    sign = np.array([1, -1, -1, 1, 1, -1, -1.0]) ** quarters
+    grey = picture((64, 80))
+    turned = gradients(np.ascontiguousarray(np.rot90(grey, quarters)))
+    expected = np.rot90(gradients(grey), quarters, axes=(1, 2)) * sign[:, None, None]
+    np.testing.assert_allclose(turned, expected, atol=1e-3)
+
+
+def test_gradients_mirrored_turn_the_other_way():
+    """A mirror makes the direction t into -t: imaginary parts change sign, real parts stay."""
+    sign = np.array([1, 1, -1, 1, -1, 1, -1.0])[:, None, None]
+    grey = picture()
+    mirrored = gradients(np.ascontiguousarray(grey[:, ::-1]))
+    np.testing.assert_allclose(mirrored, gradients(grey)[:, :, ::-1] * sign, atol=1e-3)
+
+
+@pytest.mark.parametrize("direction_deg", range(0, 180, 15))
+def test_harmonics_of_a_known_edge(direction_deg):
+    """On a ramp the direction of the gradient is the ramp's, everywhere."""
+    turn = np.radians(direction_deg)
+    y, x = np.mgrid[:96, :96] - 48.0
+    ramp = np.rint(128 + 1.8 * (x * np.cos(turn) + y * np.sin(turn))).clip(0, 255)
+    out = OrientedGradients(4.0)(ramp.astype(np.uint8), np.ones((96, 96), bool))[:, 40:56, 40:56]
+    magnitude, *harmonics = out.mean(axis=(1, 2))
+    assert magnitude == pytest.approx(np.sqrt(1.8), rel=0.02)
+    for k in (1, 2, 3):
+        measured = complex(harmonics[2 * k - 2], harmonics[2 * k - 1])
+        off = np.angle(measured * np.exp(-2j * k * turn))
+        assert abs(np.degrees(off)) < 2 and abs(measured) > 0
+
+
+@pytest.mark.parametrize("sigma_px", [0.3, 1.2, 2.0, 3.3, 4.0, 16.0])
+def test_gradients_reach_no_farther_than_the_margin(sigma_px):
+    variant = OrientedGradients(sigma_px)
+    reach = variant.margin_px
+    grey = np.zeros((2 * reach + 9,) * 2, np.uint8)
+    grey[reach + 4, reach + 4] = 255
+    out = variant(grey, everywhere(grey))
+    assert out[0, reach + 4 :, reach + 4 :][: reach + 1, : reach + 1].any()
+    assert not out[:, :4].any() and not out[..., :4].any()
+    assert not out[:, -4:].any() and not out[..., -4:].any()
+
+
+def test_doubled_contrast_gives_root_two():
+    grey = picture() // 2
+    np.testing.assert_allclose(gradients(grey * 2), gradients(grey) * np.sqrt(2), atol=0.05)
+
+
+@pytest.mark.parametrize("sigma_px", [0, -1, 17])
+def test_impossible_gradients_are_refused(sigma_px):
+    with pytest.raises(VariantError, match="sigma_px"):
+        OrientedGradients(sigma_px)

@@ -1,0 +1,94 @@
+"""Exact search: the oracle itself, against float64."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from orthonav.search.exact import BLOCK_ROWS, ExactIndex, rows_within
+
+CACHES = pytest.mark.parametrize("cache_bytes", [0, 2**27], ids=["blocks", "cached"])
+
+
+def embeddings(count, width=128, seed=0):
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=(count, width)) / np.sqrt(width)
+    return values.astype(np.float16)
+
+
+def queries(count=3, width=128):
+    return embeddings(count, width, seed=1).astype(np.float32)
+
+
+@CACHES
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 4, BLOCK_ROWS - 1, BLOCK_ROWS, 2 * BLOCK_ROWS + 7])
+@pytest.mark.parametrize("width", [1, 3, 4, 128])
+def test_scores_are_scalar_products(cache_bytes, count, width):
+    stored, asked = embeddings(count, width), queries(width=width)
+    scores = ExactIndex(stored, cache_bytes).scores(asked)
+    assert scores.shape == (count, 3) and scores.dtype == np.float32
+    np.testing.assert_allclose(scores, stored.astype(float) @ asked.astype(float).T, atol=1e-5)
+
+
+@CACHES
+@pytest.mark.parametrize("picked", [0, 1, 500, 1500])
+def test_rows_give_the_same_as_all(cache_bytes, picked):
+    index = ExactIndex(embeddings(2000), cache_bytes)
+    rows = np.random.default_rng(2).permutation(2000)[:picked]
+    some = index.scores(queries(), rows)
+    np.testing.assert_allclose(some, index.scores(queries())[rows], atol=1e-6)
+
+
+def test_cached_and_uncached_agree_in_value_and_order():
+    stored = embeddings(3000)
+    blocks, cached = (ExactIndex(stored, limit).scores(queries()) for limit in (0, 2**27))
+    np.testing.assert_allclose(blocks, cached, atol=1e-6)
+    assert (blocks.argmax(axis=0) == cached.argmax(axis=0)).all()
+
+
+@CACHES
+def test_every_float16_is_decoded_exactly(cache_bytes):
+    every = np.arange(2**16, dtype=np.uint16).view(np.float16)
+    stored = every[np.isfinite(every)].reshape(-1, 2).copy()
+    scores = ExactIndex(stored, cache_bytes).scores(np.eye(2, dtype=np.float32))
+    assert (scores == stored.astype(np.float32)).all()
+
+
+@CACHES
+def test_storage_may_be_read_only_and_stays_as_it_is(cache_bytes, tmp_path):
+    stored = embeddings(1500)
+    np.save(tmp_path / "stored.npy", stored)
+    mapped = np.load(tmp_path / "stored.npy", mmap_mode="r")
+    index, asked = ExactIndex(mapped, cache_bytes), queries()
+    asked.flags.writeable = False
+    first, second = index.scores(asked), index.scores(asked)
+    assert len(index) == 1500
+    assert (first == second).all() and (mapped == stored).all()
+
+
+@CACHES
+def test_a_stored_embedding_finds_itself(cache_bytes):
+    stored = embeddings(2500)
+    asked = stored[[7, 1300, 2499]].astype(np.float32)
+    assert ExactIndex(stored, cache_bytes).scores(asked).argmax(axis=0).tolist() == [7, 1300, 2499]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [np.zeros((4, 8), np.float32), np.zeros(8, np.float16), np.zeros((2, 2, 2), np.float16)],
+)
+def test_other_arrays_are_refused(wrong):
+    with pytest.raises(ValueError, match=r"\(N, D\) float16, got"):
+        ExactIndex(wrong)
+
+
+@given(
+    st.lists(st.tuples(st.integers(-99, 99), st.integers(-99, 99)), max_size=30),
+    st.integers(-99, 99),
+    st.integers(0, 150),
+)
+def test_gate_is_a_closed_circle(centres, east, radius_m):
+    points = np.array(centres, dtype=np.float32).reshape(-1, 2)
+    rows = rows_within(points, np.array([east, 0.0]), float(radius_m))
+    expected = [i for i, (e, n) in enumerate(centres) if (e - east) ** 2 + n**2 <= radius_m**2]
+    assert rows.tolist() == expected

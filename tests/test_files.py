@@ -1,0 +1,198 @@
+"""Results are written whole or not at all, whatever happens on the way."""
+
+import errno
+import os
+import resource
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from orthonav.errors import MissingFileError, OutputError, RouteError
+from orthonav.files import replacing, replacing_folder, require_file, write_text
+
+INTERRUPTIONS = pytest.mark.parametrize(
+    "interruption", [ValueError("bug"), KeyboardInterrupt(), SystemExit(3), RouteError("known")]
+)
+NEEDS_DEV_FULL = pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="this system has no /dev/full"
+)
+
+
+@pytest.fixture
+def out(tmp_path):
+    """A path in a folder of its own."""
+    return tmp_path / "out" / "result.bin"
+
+
+def names_in(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("old", [None, b"old"])
+def test_success_puts_the_new_file_in_place(out, old):
+    if old is not None:
+        out.parent.mkdir()
+        out.write_bytes(old)
+    with replacing(out) as temporary:
+        temporary.write_bytes(b"new")
+        assert temporary.parent == out.parent and temporary.suffix == out.suffix
+        assert (out.read_bytes() if out.exists() else None) == old
+    assert out.read_bytes() == b"new" and names_in(out.parent) == ["result.bin"]
+
+
+def test_the_new_file_has_the_rights_of_any_new_file(out):
+    before = os.umask(0o027)
+    try:
+        with replacing(out):
+            pass
+        with replacing_folder(out.parent / "folder"):
+            pass
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(out.stat().st_mode) == 0o640
+    assert stat.S_IMODE((out.parent / "folder").stat().st_mode) == 0o750
+
+
+@INTERRUPTIONS
+@pytest.mark.parametrize("old", [None, b"old"])
+def test_what_interrupts_leaves_the_old_file_only(out, old, interruption):
+    out.parent.mkdir()
+    if old is not None:
+        out.write_bytes(old)
+    with pytest.raises(type(interruption)), replacing(out) as temporary:
+        temporary.write_bytes(b"half")
+        raise interruption
+    assert names_in(out.parent) == ([] if old is None else ["result.bin"])
+    assert old is None or out.read_bytes() == old
+
+
+@INTERRUPTIONS
+def test_what_interrupts_leaves_no_folder(out, interruption):
+    with pytest.raises(type(interruption)), replacing_folder(out) as temporary:
+        (temporary / "deep").mkdir()
+        (temporary / "deep" / "half").write_text("half")
+        raise interruption
+    assert names_in(out.parent) == []
+
+
+@pytest.mark.parametrize("writer", [replacing, replacing_folder])
+@pytest.mark.parametrize(
+    "error, message",
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "disk full; nothing was written"),
+        (OSError(errno.EACCES, "Permission denied"), r"cannot write \(Permission denied\)"),
+        (OSError(errno.EIO, "Input/output error"), "cannot write"),
+    ],
+)
+def test_refusals_of_the_system_are_named(out, writer, error, message):
+    with pytest.raises(OutputError, match=message) as caught, writer(out):
+        raise error
+    assert str(caught.value).endswith(str(out)) and names_in(out.parent) == []
+
+
+@NEEDS_DEV_FULL
+def test_a_disk_that_is_full(out):
+    with pytest.raises(OutputError, match="disk full"), replacing(out) as temporary:
+        temporary.write_text("half")
+        Path("/dev/full").write_text("rest")
+    assert names_in(out.parent) == []
+
+
+def test_a_disk_that_fills_up_when_synced(out, monkeypatch):
+    out.parent.mkdir()
+    out.write_text("old")
+
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OutputError, match="disk full"):
+        write_text(out, "new")
+    assert out.read_text() == "old" and names_in(out.parent) == ["result.bin"]
+
+
+def test_a_real_limit_on_file_size(out):
+    """The kernel refuses to write more than 64 KiB."""
+    out.parent.mkdir()
+    out.write_text("old")
+    script = (
+        "import sys, pathlib, orthonav.files as files;"
+        "files.write_text(pathlib.Path(sys.argv[1]), 'x' * 10**6)"
+    )
+    limit = 64 * 1024
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", script, str(out)],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1 and "OutputError: cannot write (File too large)" in done.stderr
+    assert out.read_text() == "old" and names_in(out.parent) == ["result.bin"]
+
+
+@pytest.mark.parametrize("error", [MissingFileError("no such ortho"), OutputError("no room")])
+def test_our_own_errors_pass_unchanged(out, error):
+    with pytest.raises(type(error)) as caught, replacing(out):
+        raise error
+    assert caught.value is error
+
+
+@pytest.mark.parametrize("writer", [replacing, replacing_folder])
+def test_a_place_that_cannot_be_written_is_refused(tmp_path, writer):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OutputError, match="cannot write"), writer(tmp_path / "file" / "out"):
+        pytest.fail("no work is done for a place that cannot be written")
+
+
+def test_a_file_does_not_replace_a_folder(tmp_path):
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OutputError, match="cannot write"):
+        write_text(tmp_path / "folder", "text")
+    assert names_in(tmp_path) == ["folder"]
+
+
+@pytest.mark.parametrize("exists", [False, True], ids=["new", "empty"])
+def test_a_folder_takes_its_place_at_the_end(out, exists):
+    if exists:
+        out.mkdir(parents=True)
+    with replacing_folder(out) as temporary:
+        (temporary / "a").write_text("a")
+        assert not out.exists() or names_in(out) == []
+    assert names_in(out) == ["a"] and names_in(out.parent) == ["result.bin"]
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_what_has_content_is_refused_before_any_work(out, kind):
+    held = out / "held" if kind == "folder" else out
+    held.parent.mkdir(parents=True)
+    held.write_text("keep")
+    with pytest.raises(OutputError, match="not empty"), replacing_folder(out):
+        pytest.fail("no work is done for a folder that cannot be replaced")
+    assert held.read_text() == "keep" and names_in(out.parent) == ["result.bin"]
+
+
+def test_content_that_appears_meanwhile_is_kept(out):
+    with pytest.raises(OutputError, match="cannot write"), replacing_folder(out) as temporary:
+        (temporary / "mine").write_text("mine")
+        out.mkdir()
+        (out / "theirs").write_text("theirs")
+    assert names_in(out) == ["theirs"] and names_in(out.parent) == ["result.bin"]
+
+
+def test_text_is_utf8(out):
+    write_text(out, "Écu d'or\n")
+    assert out.read_bytes() == "Écu d'or\n".encode()
+
+
+def test_a_required_file(tmp_path):
+    path = tmp_path / "map.onav"
+    with pytest.raises(MissingFileError, match=f"map does not exist: {path}"):
+        require_file(path, "map")
+    with pytest.raises(MissingFileError, match="map is a folder, not a file"):
+        require_file(tmp_path, "map")
+    path.touch()
+    assert require_file(str(path), "map") == path
