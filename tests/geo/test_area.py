@@ -131,3 +131,20 @@ def test_a_band_that_makes_the_sheet_too_large_is_refused():
 def test_a_band_without_width_is_refused(band_m):
     with pytest.raises(AreaError, match="wider than 0"):
         Area.from_route(Route(((46.5, 2.5),)), band_m)
+
+
+@pytest.mark.parametrize("lon_deg", [179.95, -179.95])
+def test_an_area_may_lie_across_the_antimeridian(lon_deg):
+    there = np.array([lon_deg, lon_deg - math.copysign(359.9, lon_deg), lon_deg])
+    outline = Area.from_outline(np.array([-17.0, -17.05, -17.1]), there)
+    bounds = Area.from_bounds((179.95, -17.1, -179.95, -17.0))
+    route = Route(((-17.0, lon_deg), (-17.05, there[1]), (-17.1, lon_deg)))
+    band = Area.from_route(route, band_m=200)
+    _, _, across = GEOD.inv(179.95, -17.0, -179.95, -17.0)
+    for area in (outline, bounds, band):
+        west, _, east, _ = area.extent_en_m
+        assert east - west == pytest.approx(across + area.band_m, rel=1e-3)
+        _, lon = area.frame.latlon_from_en(np.array([[east - 1, 0], [west + 1, 0]]))
+        assert lon.tolist() == pytest.approx([-179.95, 179.95], abs=2e-3)
+    points = band.frame.en_from_latlon([-17.025, -17.0], [180.0, -179.95])
+    assert band.contains(points).tolist() == [True, lon_deg < 0]

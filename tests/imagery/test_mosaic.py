@@ -36,6 +36,11 @@ def rgb_nir(path):
     return write(path, with_band(SCENE, 255 - SCENE[0]), colours=[*RGB, NIR], alpha="NO")
 
 
+def rgb_nir_as_gdal_marks_it(path):
+    """GDAL calls the fourth band of four alpha unless told otherwise."""
+    return write(path, with_band(SCENE, 255 - SCENE[0]))
+
+
 def bgr(path):
     return write(path, SCENE[::-1], colours=RGB[::-1])
 
@@ -81,7 +86,18 @@ def jpeg2000(path):
 
 
 @pytest.mark.parametrize(
-    "make", [rgb, jpeg_ycbcr, rgb_nir, bgr, full_mask, south_up, vrt_of_two, jpeg2000]
+    "make",
+    [
+        rgb,
+        jpeg_ycbcr,
+        rgb_nir,
+        rgb_nir_as_gdal_marks_it,
+        bgr,
+        full_mask,
+        south_up,
+        vrt_of_two,
+        jpeg2000,
+    ],
 )
 def test_colour_of_every_kind_is_the_same_picture(tmp_path, make):
     pixels = read(make(tmp_path / "ortho.tif"))
@@ -140,12 +156,49 @@ def test_a_palette_becomes_its_colours(tmp_path):
     assert np.abs(pixels.rgb[INNER] - expected).max() <= 3
 
 
+def test_a_palette_is_thinned_by_its_colours(tmp_path):
+    """Neighbouring numbers of a palette may be opposite colours: checks of 0 and 1."""
+    checks = np.indices((SIZE, SIZE)).sum(axis=0)[None].astype(np.uint8) % 2
+    with rasterio.open(write(tmp_path / "ortho.tif", checks), "r+") as data:
+        data.write_colormap(1, {0: (200, 0, 40, 255), 1: (0, 100, 40, 255), 2: (9, 9, 9, 255)})
+    pixels = read(tmp_path / "ortho.tif", 19, gsd_m=6)
+    assert pixels.valid[1:-1, 1:-1].all()
+    assert np.abs(pixels.rgb[1:-1, 1:-1] - np.array([100.0, 50, 40])).max() <= 1
+
+
+@pytest.mark.parametrize("dtype, top", [("uint8", 255), ("uint16", 65_535)])
+def test_a_band_marked_alpha_that_is_a_picture_masks_nothing(tmp_path, caplog, dtype, top):
+    scene = np.tile(SCENE, (1, 9, 9)).astype(dtype) * (top // 255)
+    infrared = np.where(np.arange(9 * SIZE) < 60, 0, top - scene[0])
+    path = write(tmp_path / "ortho.tif", with_band(scene, infrared), colours=[*RGB, ALPHA])
+    with caplog.at_level("INFO"):
+        mosaic = Mosaic.open([path])
+    assert f"ignored: {path}" in caplog.text and mosaic.sources[0].bands == (1, 2, 3)
+    for gsd_m in (1, 4):
+        pixels = read(path, 240, gsd_m=gsd_m)
+        assert pixels.valid[INNER].all() and pixels.rgb[..., 0][INNER].std() > 30
+
+
+def test_a_mask_with_soft_edges_stays_a_mask(tmp_path, caplog):
+    soft = np.where(np.arange(SIZE) == 50, 128, MASK)  # 1 % of all
+    path = write(tmp_path / "ortho.tif", with_band(SCENE, soft), colours=[*RGB, ALPHA])
+    with caplog.at_level("INFO"):
+        assert not read(path).valid[HOLE].any()
+    assert not caplog.text
+
+
 def nodata_value(path):
     return write(path, np.where(HOLE, 0, SCENE), nodata=0)
 
 
 def nodata_in_white(path):
     return write(path, np.where(HOLE, 255, SCENE), nodata=255)
+
+
+def nodata_beside_false_alpha(path):
+    """Near infrared that is 0 over water, which is not missing for that."""
+    water = np.where(np.arange(SIZE) < 40, 0, 255 - SCENE[0])
+    return write(path, np.where(HOLE, 0, with_band(SCENE, water)).astype(np.uint8), nodata=0)
 
 
 def grey_nodata(path):
@@ -200,6 +253,7 @@ def palette_nodata(path):
 HOLED = [
     nodata_value,
     nodata_in_white,
+    nodata_beside_false_alpha,
     grey_nodata,
     alpha_band,
     grey_alpha,
@@ -315,6 +369,14 @@ def test_more_files_than_are_kept_open(tmp_path, monkeypatch):
         ("BDORTHO_2154_2018-07_0M20", {}, "2018-07"),
         ("naip_20200715", {}, "2020-07-15"),
         ("ortho", {}, None),
+        ("dop_2048x2048", {}, None),
+        ("tile_2000x2000", {}, None),
+        ("1024X1999_b", {}, None),
+        ("tile_2000px", {}, None),
+        ("tile_2000_px_2018", {}, "2018"),
+        ("tile_2040_1899", {}, None),
+        ("bordeaux2018", {}, "2018"),
+        ("2000x2000_2019-05", {}, "2019-05"),
         ("1234567", {}, None),
     ],
 )

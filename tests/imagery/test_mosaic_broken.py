@@ -11,8 +11,9 @@ from geotiffs import SIZE, read, sheet_of, smooth_scene, write
 from rasterio.drivers import raster_driver_extensions
 from rasterio.transform import Affine
 
-from orthonav.errors import ImageryError, MissingFileError
+from orthonav.errors import AreaError, ImageryError, MissingFileError
 from orthonav.imagery.mosaic import Mosaic
+from orthonav.prepare import BuildRequest, build_map
 
 SCENE = smooth_scene()
 
@@ -72,6 +73,12 @@ def test_metres_called_degrees(ortho):
     refused(write(ortho, SCENE, crs="EPSG:4326"), "border cannot be turned into latitude")
 
 
+@pytest.mark.parametrize("west_deg", [179.999, -180.001, 200.0])
+def test_degrees_across_the_antimeridian(ortho, west_deg):
+    transform = Affine(1e-4, 0, west_deg, 0, -1e-4, -17)
+    refused(write(ortho, SCENE, crs="EPSG:4326", transform=transform), "beyond longitude 180")
+
+
 def test_8_and_16_bit_are_not_mixed(tmp_path):
     shallow = write(tmp_path / "a.tif", SCENE)
     deep = write(tmp_path / "b.tif", SCENE.astype(np.uint16))
@@ -89,6 +96,14 @@ def test_deep_images_of_nothing_but_nodata(ortho, dtype, nodata):
 def test_8_bit_images_of_nothing_but_nodata_have_no_valid_pixel(ortho):
     write(ortho, np.zeros((3, SIZE, SIZE), np.uint8), nodata=0)
     assert not read(ortho).valid.any()
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+def test_no_map_is_built_from_nothing_but_nodata(ortho, tmp_path, dtype):
+    write(ortho, np.zeros((3, SIZE, SIZE), dtype), nodata=0)
+    with pytest.raises((AreaError, ImageryError), match="nodata"):
+        build_map(BuildRequest([ortho], tmp_path / "area.onav", tile_px=32, overlap=0.5))
+    assert list(tmp_path.iterdir()) == [ortho]
 
 
 @pytest.mark.parametrize("dtype", ["uint16", "float32"])
@@ -163,8 +178,10 @@ def test_what_lies_before_the_damage_can_be_read(ortho):
 def test_a_deep_file_that_was_cut_short(ortho):
     write(ortho, noise().astype(np.uint16), compress="DEFLATE", **TILED)
     ortho.write_bytes(ortho.read_bytes()[: ortho.stat().st_size // 2])
-    with pytest.raises(ImageryError):
-        read(ortho, 500)
+    with pytest.raises(ImageryError, match=r"cannot be read.*ortho\.tif"):
+        Mosaic.open([ortho])
+    whole = write(ortho.with_name("whole.tif"), noise().astype(np.uint16))
+    assert Mosaic.open([ortho, whole]).stretch is not None  # the broken one may not be needed
 
 
 def test_a_file_that_vanishes_is_named(ortho):
@@ -199,16 +216,17 @@ READ_HUGE = """
 """
 
 
-@pytest.fixture(scope="module")
-def huge(tmp_path_factory):
+@pytest.fixture(scope="module", params=["colours", "palette"])
+def huge(request, tmp_path_factory):
     """A 20,000 x 20,000 px orthophoto at 0.2 m, 1.2 GB when unpacked."""
     path = tmp_path_factory.mktemp("huge") / "huge.tif"
-    block = smooth_scene(2000)
+    bands = 3 if request.param == "colours" else 1
+    block = smooth_scene(2000)[:bands]
     half = HUGE_PX / 2
     profile = {
         "driver": "GTiff",
         "dtype": "uint8",
-        "count": 3,
+        "count": bands,
         "width": HUGE_PX,
         "height": HUGE_PX,
         "crs": "EPSG:2154",
@@ -220,6 +238,8 @@ def huge(tmp_path_factory):
         "SPARSE_OK": "TRUE",
     }
     with rasterio.open(path, "w", **profile) as data:
+        if bands == 1:
+            data.write_colormap(1, {value: (value, 0, 0, 255) for value in range(256)})
         for at in range(0, HUGE_PX, 4000):
             data.write(block, window=rasterio.windows.Window(at, at, 2000, 2000))
     return path

@@ -56,6 +56,7 @@ def marks_off_px(grey, gsd_m):
         ("EPSG:32632", VOSGES, 0.6, 0, 0.5),
         ("EPSG:4258", FRAME, 0.8, 0, 2.0),
         ("ESRI:102014", FRAME, 1.0, 0, 1.0),
+        ("EPSG:32760", LocalFrame(-17.0, 180.0), 0.5, 0, 1.0),
     ],
 )
 def test_marks_lie_where_proj_puts_them(tmp_path, crs, frame, source_gsd_m, turn_deg, gsd_m):
@@ -68,6 +69,26 @@ def test_marks_lie_where_proj_puts_them(tmp_path, crs, frame, source_gsd_m, turn
     assert pixels.valid.all()
     assert np.abs(off).max() < 0.1, f"marks are off by up to {np.abs(off).max():.2f} px"
     assert np.abs(off.mean(axis=0)).max() < 0.03
+
+
+@pytest.mark.parametrize("source_gsd_m, window", [(0.3, 200), (0.2, 63)])
+def test_marks_of_a_palette_thinned_in_strips(tmp_path, monkeypatch, source_gsd_m, window):
+    monkeypatch.setattr("orthonav.imagery.thin.STRIP_BYTES", 100_000)
+    size = int(290 / source_gsd_m)
+    transform = placed(LAMBERT, source_gsd_m, size, frame=BREST)
+    path = tmp_path / "ortho.tif"
+    source_with_marks(path, LAMBERT, transform, size, BREST, sigma_px=2.5 / source_gsd_m)
+    plain = read(path, 200, frame=BREST).grey
+    with rasterio.open(path, "r+") as data:
+        data.write_colormap(1, {value: (value, value, value, 255) for value in range(256)})
+    with sheet_of(path, 200, frame=BREST) as sheet:
+        rows = [
+            [sheet.read(col, row, window, window).grey for col in range(0, 200, window)]
+            for row in range(0, 200, window)
+        ]
+    grey = np.block(rows)[:200, :200]
+    assert np.abs(marks_off_px(grey, 1.0)).max() < 0.1
+    assert np.abs(grey.astype(int) - plain).max() <= 2
 
 
 def test_web_mercator_is_measured_in_true_metres(tmp_path):

@@ -34,7 +34,7 @@ class WhitenedRecipe:
 
     cells: int = 8
     dims: int = 128
-    floor: float = 0.3
+    floor: float = 0.6
 
     def __post_init__(self) -> None:
         if self.cells < 1 or MICRO % self.cells:

@@ -30,6 +30,8 @@ OPTIONAL_COLUMNS = (
 MAX_TEXT_BYTES = 500_000_000
 # The camera describes the sensor: an orientation tag must not turn the picture.
 _DECODE = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+_BROKEN_JSON = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
+_JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 
 
 @dataclass(frozen=True)
@@ -72,17 +74,41 @@ def open_flight(path: Path) -> FlightFolder:
 def read_image(path: Path) -> NDArray[np.uint8]:
     """Grey levels (H, W) uint8 of an image file; 16-bit images are scaled down.
 
-    Raises `MissingFileError` or, where it cannot be decoded, `FlightError`.
+    Raises `MissingFileError` or, where it cannot be decoded or was cut short, `FlightError`.
     """
-    require_file(path, "image of the flight")
-    data = np.fromfile(path, dtype=np.uint8)
+    path = require_file(path, "image of the flight")
     try:
-        image = cv2.imdecode(data, _DECODE) if data.size else None
+        data = path.read_bytes()
+    except OSError as error:
+        raise FlightError(
+            f"image of the flight cannot be read ({error.strerror}): {path}"
+        ) from error
+    if _is_cut_jpeg(data):
+        raise FlightError(f"image of the flight was cut short: {path}")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _DECODE) if data else None
     except cv2.error:
         image = None
     if image is None:
         raise FlightError(f"image of the flight cannot be decoded: {path}")
     return np.asarray(image, dtype=np.uint8)
+
+
+def _is_cut_jpeg(data: bytes) -> bool:
+    """Whether this is a JPEG that lacks its end-of-image marker.
+
+    OpenCV before 5 fills what is missing of a JPEG with grey and says nothing; of PNG and TIFF it
+    decodes none. The marker is looked for behind the header of the first scan: thumbnails before
+    it end with a marker of their own, compressed data never holds one, and what some cameras put
+    behind it (previews, padding) does not matter.
+    """
+    if not data.startswith(_JPEG_START):
+        return False
+    at = len(_JPEG_START)
+    while data[at : at + 1] == b"\xff" and data[at : at + 2] != _JPEG_SCAN:
+        filling = data[at + 1 : at + 2] == b"\xff"
+        at += 1 if filling else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return data.find(_JPEG_END, at) < 0
 
 
 def read_truth(path: Path) -> dict[str, tuple[float, float]]:
@@ -109,18 +135,21 @@ def read_camera(path: Path) -> tuple[Camera, str]:
     """
     path = require_file(path, "camera of the flight")
     try:
-        plain = json.loads(path.read_text(encoding="utf-8"))
+        plain = json.loads(path.read_text(encoding="utf-8-sig"))
         raw = plain["camera"]
+        distortion = raw.get("distortion", [])
+        if not isinstance(distortion, list):
+            raise TypeError(f"distortion must be a list, got {distortion!r:.80}")
         camera = Camera(
             width_px=int(raw["width_px"]),
             height_px=int(raw["height_px"]),
             **{name: float(raw[name]) for name in ("fx_px", "fy_px", "cx_px", "cy_px")},
-            distortion=tuple(float(value) for value in raw.get("distortion", [])),
+            distortion=tuple(float(value) for value in distortion),
         )
         return camera, str(plain.get("note", ""))
     except CameraError as error:
         raise CameraError(f"{error}: {path}") from error
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except _BROKEN_JSON as error:
         raise FlightError(
             "expected {camera: {width_px, height_px, fx_px, fy_px, cx_px, cy_px}} as JSON "
             f"({type(error).__name__}: {error}): {path}"
@@ -141,7 +170,7 @@ def _views(telemetry: Path, frames: Path) -> Iterator[FlightView]:
         if not (math.isfinite(time_s) and abs(time_s) < 9e9):
             raise FlightError(f"line {line}: time_s is no time in seconds: {telemetry}")
         image = frames / frame
-        if not image.is_file():
+        if not _is_file(image):
             raise FlightError(f"telemetry line {line} names an image that does not exist: {image}")
         yield FlightView(frame, image, _telemetry(row, time_s))
 
@@ -180,6 +209,13 @@ def _rows(path: Path, needed: tuple[str, ...]) -> Iterator[tuple[int, dict[str, 
                 yield reader.line_num, {k: v or "" for k, v in row.items() if isinstance(k, str)}
     except (UnicodeDecodeError, csv.Error) as error:
         raise FlightError(f"not a CSV file in UTF-8 ({error}): {path}") from error
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name longer than the system allows
+        return False
 
 
 def _number(text: Any) -> float:

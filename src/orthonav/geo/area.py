@@ -29,6 +29,8 @@ class Area:
     def from_bounds(cls, bounds_deg: Extent) -> "Area":
         """Area of a latitude/longitude box (west, south, east, north in degrees)."""
         west, south, east, north = bounds_deg
+        if west > east + 180:  # across the antimeridian, as in GeoJSON (RFC 7946, 5.2)
+            east += 360
         if not (np.isfinite(bounds_deg).all() and west < east and south < north):
             raise AreaError(
                 "bounds must be west,south,east,north in degrees with west < east and "
@@ -45,7 +47,11 @@ class Area:
 
     @classmethod
     def from_outline(cls, lat_deg: NDArray[np.float64], lon_deg: NDArray[np.float64]) -> "Area":
-        """Smallest north-up box around outline points, in a plane centred on that box."""
+        """Smallest north-up box around outline points, in a plane centred on that box.
+
+        Longitudes are taken as near the first point, so the outline may cross the antimeridian.
+        """
+        lon_deg = lon_deg - 360 * np.round((lon_deg - lon_deg[0]) / 360)
         frame = LocalFrame(
             round(float(lat_deg.min() + lat_deg.max()) / 2, 7),
             round(float(lon_deg.min() + lon_deg.max()) / 2, 7),

@@ -59,7 +59,7 @@ def read_route(path: Path) -> Route:
         return Route(tuple(reader(path.read_text(encoding="utf-8-sig"))))
     except RouteError as error:
         raise RouteError(f"{error}: {path}") from error
-    except (ValueError, KeyError, TypeError, IndexError, RecursionError, csv.Error) as error:
+    except (ValueError, LookupError, TypeError, OverflowError, RecursionError, csv.Error) as error:
         raise RouteError(f"route cannot be read ({error!r}): {path}") from error
     except OSError as error:
         raise MissingFileError(f"route file cannot be read ({error.strerror}): {path}") from error
@@ -68,8 +68,18 @@ def read_route(path: Path) -> Route:
 def _read_geojson(text: str) -> list[tuple[float, float]]:
     for geometry in _geometries(json.loads(text)):
         if geometry.get("type") == "LineString":
-            return [(float(point[1]), float(point[0])) for point in geometry["coordinates"]]
+            return [_lat_lon_deg(point) for point in geometry["coordinates"]]
     raise RouteError("GeoJSON holds no LineString")
+
+
+def _lat_lon_deg(point: Any) -> tuple[float, float]:
+    """Latitude and longitude of a GeoJSON position, which must be numbers: `"12"` is not 1, 2."""
+    numbers = isinstance(point, list) and all(type(value) in (int, float) for value in point[:2])
+    if not numbers or len(point) < 2:
+        raise RouteError(
+            f"GeoJSON position must be [longitude, latitude] as numbers, got {point!r:.80}"
+        )
+    return float(point[1]), float(point[0])
 
 
 def _geometries(node: Any) -> Iterator[dict[str, Any]]:

@@ -23,7 +23,9 @@ from rasterio.windows import Window
 
 from orthonav.errors import ImageryError
 from orthonav.geo.frames import LocalFrame
-from orthonav.imagery.source import Source, Stretch, open_source, sample_stretch
+from orthonav.imagery.source import Source, open_source, unreadable
+from orthonav.imagery.stretch import Stretch, sample_stretch
+from orthonav.imagery.thin import read_thinned
 
 GDAL_OPTIONS = {"GDAL_CACHEMAX": 128 * 2**20, "GDAL_NUM_THREADS": "ALL_CPUS"}
 MAX_OPEN = 24
@@ -154,13 +156,10 @@ class SheetRaster:
             part = self._source_window(dataset, source, target, shape)
             if part is None:
                 return np.zeros((*shape, 3), np.uint8), np.zeros(shape, bool)
-            values, mask, transform = _read_thinned(dataset, source, part, self._gsd_m)
+            values, mask, transform = read_thinned(dataset, source, part, self._gsd_m)
         except RasterioError as error:
-            reason = error.__cause__ or error  # rasterio says no more than "see previous exception"
-            raise ImageryError(f"orthophoto cannot be read ({reason}): {source.path}") from error
-        if source.palette is not None:
-            values = np.ascontiguousarray(source.palette[values[0]].transpose(2, 0, 1))
-        elif self._mosaic.stretch is not None:
+            raise unreadable(source.path, error) from error
+        if self._mosaic.stretch is not None and source.palette is None:
             values = self._mosaic.stretch.apply(values)
         warped = np.zeros((values.shape[0], *shape), dtype=np.uint8)
         valid = np.zeros(shape, dtype=np.uint8)
@@ -236,36 +235,3 @@ class SheetRaster:
         y = (self._transform.f - points[:, 1]) / self._gsd_m
         low, high = np.floor([x.min(), y.min()]) - 2, np.ceil([x.max(), y.max()]) + 2
         return int(low[0]), int(low[1]), int(high[0]), int(high[1])
-
-
-def _read_thinned(
-    dataset: Any, source: Source, window: Window, gsd_m: float
-) -> tuple[NDArray[Any], NDArray[np.uint8], Affine]:
-    """Bands (C, h, w), mask (h, w) and transform of a source window.
-
-    Averaged to about the ground resolution wanted where the source is finer than that, so that
-    nothing aliases and overviews are used where the file has them.
-    """
-    factor = 1 if source.palette is not None else max(1, round(gsd_m / source.gsd_m))
-    window = _aligned(window, factor, dataset)
-    shape = (max(1, round(window.height / factor)), max(1, round(window.width / factor)))
-    how = Resampling.nearest if factor == 1 else Resampling.average
-    bands = list(source.bands)
-    values = dataset.read(bands, window=window, out_shape=(len(bands), *shape), resampling=how)
-    mask = dataset.dataset_mask(window=window, out_shape=shape, resampling=how)
-    if values.dtype.kind == "f":  # not a number is no data, whether the file says so or not
-        mask = mask * np.isfinite(values).all(axis=0)
-    scale = Affine.scale(window.width / shape[1], window.height / shape[0])
-    return (
-        values,
-        mask,
-        dataset.transform * Affine.translation(window.col_off, window.row_off) * scale,
-    )
-
-
-def _aligned(window: Window, factor: int, dataset: Any) -> Window:
-    """The window grown to multiples of `factor` pixels, so that every window averages alike."""
-    left, top = window.col_off // factor * factor, window.row_off // factor * factor
-    right = min(-(-(window.col_off + window.width) // factor) * factor, dataset.width)
-    bottom = min(-(-(window.row_off + window.height) // factor) * factor, dataset.height)
-    return Window(left, top, right - left, bottom - top)

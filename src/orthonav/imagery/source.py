@@ -1,8 +1,8 @@
-"""One orthophoto file: is it usable, where does it lie, how are its bands made into 8 bits?"""
+"""One orthophoto file: is it usable, where does it lie, which of its bands are used?"""
 
+import logging
 import re
 import warnings
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,17 +19,24 @@ try:
     from rasterio.enums import ColorInterp
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
     from rasterio.warp import transform as transform_coordinates
+    from rasterio.windows import Window
 except ImportError as error:  # pragma: no cover - depends on the installation
     raise MissingExtraError(
         "reading orthophotos needs rasterio; install it with: pip install 'orthonav[geo]'"
     ) from error
 
 OUTLINE_POINTS = 21
-SAMPLE_PX = 512
+ALPHA_SAMPLE_PX = 512
+ALPHA_WINDOWS = 8
+MAX_PARTLY_CLEAR = 0.05
 _DATE_TAGS = ("TIFFTAG_DATETIME", "ACQUISITION_DATE", "ACQUISITIONDATE", "DATE")
-_DATE_IN_NAME = re.compile(
-    r"(?<!\d)((?:19|20)\d\d)(?:[-_]?(0[1-9]|1[0-2])(?:[-_]?([0-3]\d))?)?(?!\d)"
+_DATE_IN_NAME = re.compile(  # not 2000x2000, nor 2000px
+    r"(?<!\d)(?<!\dx)(19\d\d|20[0-3]\d)(?:[-_]?(0[1-9]|1[0-2])(?:[-_]?([0-3]\d))?)?"
+    r"(?![\dx]|[-_ ]?px)",
+    re.IGNORECASE,
 )
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +45,8 @@ class Source:
 
     `bands` are the 1-based indexes used (one for grey, three for red, green, blue);
     `outline_latlon_deg` is the (N, 2) border; `gsd_m` the ground resolution at the centre;
-    `palette` the (256, 3) colours of a colour-mapped image.
+    `palette` the (N, 3) colours of a colour-mapped image; `false_alpha` tells that the band the
+    file calls alpha is a picture, such as near infrared, so it says nothing of what is missing.
     """
 
     path: Path
@@ -51,6 +59,7 @@ class Source:
     outline_latlon_deg: NDArray[np.float64]
     date: str | None
     palette: NDArray[np.uint8] | None = None
+    false_alpha: bool = False
 
     def describe(self) -> dict[str, Any]:
         """What the map's manifest keeps of this source."""
@@ -80,7 +89,7 @@ def open_source(path: Path) -> Source:
             with rasterio.open(path) as dataset:
                 return _inspect(path, dataset)
     except RasterioError as error:
-        raise ImageryError(f"orthophoto cannot be read ({_first_line(error)}): {path}") from error
+        raise unreadable(path, error) from error
 
 
 def _inspect(path: Path, dataset: Any) -> Source:
@@ -111,6 +120,7 @@ def _inspect(path: Path, dataset: Any) -> Source:
         outline_latlon_deg=outline,
         date=_date(path, dataset),
         palette=palette,
+        false_alpha=_has_false_alpha(path, dataset),
     )
 
 
@@ -125,10 +135,48 @@ def _bands(dataset: Any) -> tuple[int, ...]:
     return tuple(colours[:3]) if len(colours) >= 3 else tuple(colours[:1])
 
 
+def _has_false_alpha(path: Path, dataset: Any) -> bool:
+    """Whether the band marked alpha, as GDAL marks the fourth of four by default, is no mask.
+
+    A mask is clear or opaque nearly everywhere; a picture holds every value between.
+    """
+    if ColorInterp.alpha not in dataset.colorinterp or dataset.count < 2:
+        return False
+    values = _sample(dataset, dataset.colorinterp.index(ColorInterp.alpha) + 1)
+    partly = float(((values != 0) & (values != values.max())).mean())
+    if partly <= MAX_PARTLY_CLEAR:
+        return False
+    log.info(
+        "band marked alpha is no mask (%.0f %% of it is neither clear nor opaque); ignored: %s",
+        100 * partly,
+        path,
+    )
+    return True
+
+
+def _sample(dataset: Any, band: int) -> NDArray[Any]:
+    """Values (N,) of a band: all of a small one, else of windows spread evenly over it.
+
+    A thinned read of a large file without overviews would unpack all of it.
+    """
+    if max(dataset.width, dataset.height) <= ALPHA_SAMPLE_PX:
+        return np.asarray(dataset.read(band)).ravel()
+    side = ALPHA_SAMPLE_PX // ALPHA_WINDOWS
+    cols = np.linspace(0, max(0, dataset.width - side), ALPHA_WINDOWS).astype(int)
+    rows = np.linspace(0, max(0, dataset.height - side), ALPHA_WINDOWS).astype(int)
+    windows = [
+        Window(col, row, min(side, dataset.width), min(side, dataset.height))
+        for row in rows.tolist()
+        for col in cols.tolist()
+    ]
+    return np.concatenate([dataset.read(band, window=window).ravel() for window in windows])
+
+
 def _palette(dataset: Any) -> NDArray[np.uint8]:
-    table = np.zeros((256, 3), dtype=np.uint8)
+    size = 256 if dataset.dtypes[0] == "uint8" else 65_536
+    table = np.zeros((size, 3), dtype=np.uint8)
     for value, colour in dataset.colormap(1).items():
-        if 0 <= value < 256:
+        if 0 <= value < size:
             table[value] = colour[:3]
     return table
 
@@ -147,6 +195,11 @@ def _outline_latlon_deg(path: Path, dataset: Any) -> NDArray[np.float64]:
         ) from error
     if not np.isfinite(latlon).all() or np.abs(latlon[:, 0]).max() > 90:
         raise ImageryError(f"orthophoto's border cannot be turned into latitude, longitude: {path}")
+    if dataset.crs.is_geographic and max(-dataset.bounds.left, dataset.bounds.right) > 180 + 1e-6:
+        raise ImageryError(
+            "orthophoto in degrees lies beyond longitude 180, where GDAL reads one side only; "
+            f"reproject it to metres, such as UTM (gdalwarp -t_srs EPSG:32760): {path}"
+        )
     return latlon
 
 
@@ -179,48 +232,8 @@ def _date(path: Path, dataset: Any) -> str | None:
     return None
 
 
-@dataclass(frozen=True)
-class Stretch:
-    """Linear map of raw values to 0..255: `low` becomes 0, `high` 255."""
-
-    low: float
-    high: float
-
-    def apply(self, values: NDArray[Any]) -> NDArray[np.uint8]:
-        """8-bit values, same shape."""
-        scale = 255.0 / (self.high - self.low)
-        scaled = (values.astype(np.float32) - self.low) * scale
-        return np.asarray(np.clip(np.nan_to_num(scaled) + 0.5, 0, 255), dtype=np.uint8)
-
-
-def sample_stretch(sources: list[Source]) -> Stretch | None:
-    """Common stretch of sources that are not 8 bit; None where all are 8 bit.
-
-    From the 0.5 and 99.5 percentiles of valid pixels in a thinned read of up to 12 sources.
-    Raises `ImageryError` where 8-bit and other files are mixed or no pixel is valid.
-    """
-    deep = [source.dtype != "uint8" for source in sources]
-    if not any(deep):
-        return None
-    if not all(deep):
-        raise ImageryError(
-            "orthophotos of 8 bit and of more bits cannot be mixed in one map; convert one kind"
-        )
-    values = []
-    for source in sources[:: max(1, len(sources) // 12)]:
-        with warnings.catch_warnings(), suppress(RasterioError), rasterio.open(source.path) as data:
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            shape = (min(SAMPLE_PX, data.height), min(SAMPLE_PX, data.width))
-            pixels = data.read(list(source.bands), out_shape=(len(source.bands), *shape))
-            valid = data.dataset_mask(out_shape=shape) > 0
-            values.append(pixels[:, valid].ravel())
-    every = np.concatenate(values) if values else np.empty(0)
-    every = every[np.isfinite(every)]
-    if every.size == 0:
-        raise ImageryError("orthophotos hold no valid pixel (all nodata)")
-    low, high = (float(value) for value in np.percentile(every, [0.5, 99.5]))
-    return Stretch(low, high if high > low else low + 1.0)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+def unreadable(path: Path, error: Exception) -> ImageryError:
+    """What GDAL says of a file it cannot read, in one line."""
+    reason = error.__cause__ or error  # rasterio says no more than "see previous exception"
+    line = (str(reason).splitlines() or [type(reason).__name__])[0]
+    return ImageryError(f"orthophoto cannot be read ({line}): {path}")

@@ -59,7 +59,7 @@ def check_view(grey: NDArray[np.uint8]) -> NoFix | None:
 def check_rectified(view: Rectified, min_valid_share: float) -> NoFix | None:
     """Why too little of a tile is seen; None if enough is."""
     share = float(view.valid.mean())
-    if share < min_valid_share:
+    if share < min_valid_share or share == 0:
         return NoFix(
             "too_small", f"view covers {share:.0%} of a tile, {min_valid_share:.0%} are needed"
         )

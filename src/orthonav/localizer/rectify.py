@@ -27,8 +27,8 @@ class PreparedView:
 class Rectified:
     """A rectified view.
 
-    `grey` (S, S) uint8 and `valid` (S, S) bool, north up; `offset_en_m` where the centre of the
-    window lies, metres east and north of the camera.
+    `grey` (S, S) uint8 and `valid` (S, S) bool, north up, grey 0 where not valid; `offset_en_m`
+    where the centre of the window lies, metres east and north of the camera.
     """
 
     grey: NDArray[np.uint8]
@@ -85,7 +85,9 @@ def _warped(
     # Ours counts from the pixel's outer corner, OpenCV from its centre.
     matrix = np.linalg.inv(_HALF_PIXEL) @ px_from_window @ _HALF_PIXEL
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    grey = cv2.warpPerspective(view.grey, matrix, (size_px, size_px), flags=flags)
+    grey = cv2.warpPerspective(
+        view.grey, matrix, (size_px, size_px), flags=flags, borderMode=cv2.BORDER_REPLICATE
+    )
     projected = corners @ px_from_window.T
     seen = projected[:, :2] / projected[:, 2:]
     height, width = view.grey.shape
@@ -95,6 +97,7 @@ def _warped(
         inside = np.full(view.grey.shape, 255, dtype=np.uint8)
         flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
         valid = cv2.warpPerspective(inside, matrix, (size_px, size_px), flags=flags) > 0
+        grey = np.where(valid, grey, 0)
     return np.asarray(grey, dtype=np.uint8), np.asarray(valid, dtype=np.bool_)
 
 
@@ -114,5 +117,7 @@ def _remapped(
     with np.errstate(invalid="ignore"):
         valid = ahead & (seen >= 0).all(axis=-1) & (seen <= [width, height]).all(axis=-1)
     index = np.where(valid[..., None], seen - 0.5, -10).astype(np.float32)
-    grey = cv2.remap(view.grey, index[..., 0], index[..., 1], cv2.INTER_LINEAR)
-    return np.asarray(grey, dtype=np.uint8), np.asarray(valid, dtype=np.bool_)
+    grey = cv2.remap(
+        view.grey, index[..., 0], index[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.where(valid, grey, 0).astype(np.uint8), np.asarray(valid, dtype=np.bool_)

@@ -129,7 +129,11 @@ class Manifest:
                 f"map has schema {schema}, this program reads up to {SCHEMA}; update orthonav"
             )
         stated = plain.pop("manifest_sha256", None)
-        if schema < 1 or stated != _digest(plain):
+        try:
+            altered = stated != _digest(plain)
+        except ValueError:  # a number that is not finite
+            altered = True
+        if schema < 1 or altered:
             raise MapFileError("manifest of the map was altered (checksum does not match)")
         sheets = _get(plain, "sheets", list)
         if not 1 <= len(sheets) <= MAX_SHEETS:
@@ -158,12 +162,16 @@ def _digest(plain: dict[str, Any]) -> str:
 def _get(plain: Any, name: str, kind: type) -> Any:
     value = plain.get(name) if isinstance(plain, dict) else None
     if not isinstance(value, kind) or isinstance(value, bool):
-        raise MapFileError(f"manifest of the map: {name} must be {kind.__name__}, got {value!r}")
+        raise MapFileError(
+            f"manifest of the map: {name} must be {kind.__name__}, got {value!r:.80}"
+        )
     return value
 
 
 def _number(plain: Any, name: str) -> float:
     value = plain.get(name) if isinstance(plain, dict) else None
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise MapFileError(f"manifest of the map: {name} must be a finite number, got {value!r}")
+        raise MapFileError(
+            f"manifest of the map: {name} must be a finite number, got {value!r:.80}"
+        )
     return float(value)

@@ -11,7 +11,7 @@ from typing import Any, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MapFileError
+from orthonav.errors import MapFileError, MissingFileError
 from orthonav.files import require_file
 from orthonav.mapfile.manifest import Manifest
 from orthonav.mapfile.writer import METADATA_KEY
@@ -51,11 +51,8 @@ def open_map(path: Path) -> MapFile:
     Raises `MissingFileError`, `MapFileError`, or `MapVersionError`.
     """
     path = require_file(path, "map")
-    with path.open("rb") as stream:
-        size = os.fstat(stream.fileno()).st_size
-        if size < MIN_FILE_BYTES:
-            raise MapFileError(f"not an orthonav map, only {size} bytes: {path}")
-        mapped = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    mapped = _mapped(path)
+    size = len(mapped)
     try:
         header, start = _header(mapped, size)
         metadata = header.pop("__metadata__", None)
@@ -65,7 +62,20 @@ def open_map(path: Path) -> MapFile:
         arrays = _arrays(mapped, size, start, header, manifest)
     except MapFileError as error:
         raise type(error)(f"{error}: {path}") from error
+    except (OverflowError, RecursionError) as error:  # crafted: numbers or nesting beyond reason
+        raise MapFileError(f"map is damaged ({error}): {path}") from error
     return MapFile(path, size, manifest, arrays)
+
+
+def _mapped(path: Path) -> mmap.mmap:
+    try:
+        with path.open("rb") as stream:
+            size = os.fstat(stream.fileno()).st_size
+            if size < MIN_FILE_BYTES:
+                raise MapFileError(f"not an orthonav map, only {size} bytes: {path}")
+            return mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    except OSError as error:
+        raise MissingFileError(f"map cannot be read ({error.strerror}): {path}") from error
 
 
 def _header(mapped: mmap.mmap, size: int) -> tuple[dict[str, Any], int]:
@@ -132,4 +142,7 @@ def _array(
     view = memoryview(mapped)[first : first + length]
     if hashlib.sha256(view).hexdigest() != described.get("sha256"):
         raise MapFileError(f"map was altered (checksum of part {name} does not match)")
-    return np.frombuffer(view, dtype=dtype).reshape(shape)
+    try:
+        return np.frombuffer(view, dtype=dtype).reshape(shape)
+    except ValueError as error:  # an empty part can claim any shape
+        raise MapFileError(f"map is damaged (part {name}: {error})") from error

@@ -24,7 +24,7 @@ from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic, Pixels, SheetRaster
 from orthonav.mapfile.manifest import Manifest, SheetInfo
 from orthonav.mapfile.writer import write_map
-from orthonav.prepare.calibrate import Calibration, CropSampler, calibrate
+from orthonav.prepare.calibrate import RADIUS_STRIDES, Calibration, CropSampler, calibrate
 from orthonav.variants import make_variant, variant_recipe
 
 log = logging.getLogger(__name__)
@@ -34,7 +34,6 @@ PREVIEW_PX = 384
 MIN_TILE_VALID_SHARE = 0.5
 MIN_VIEW_VALID_SHARE = 0.1
 HEADING_STEP_DEG = 6.0
-RADIUS_STRIDES = 0.75
 Progress = Callable[[str, float], None]
 
 

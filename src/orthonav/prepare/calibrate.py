@@ -27,7 +27,10 @@ HEADING_STD_DEG = 5.0
 SCALE_STD = 0.05
 MAX_REPLACED = 0.65
 MIRRORED_WEIGHT = 0.25
-RADIUS_STRIDES = 0.75
+ELSEWHERE_SHARE = 0.25
+"""Share of changes that paste in another place of the map rather than none of it."""
+RADIUS_STRIDES = 1.0
+"""A fix is right where its tile's centre lies within this many strides of the truth."""
 MIN_RIGHT = 10
 
 
@@ -90,7 +93,9 @@ def calibrate(
     crops = [sampler.crops[i] for i in rng.permutation(len(sampler.crops))[:CROPS]]
     features, errors, mirrored = [], [], []
     for done, crop in enumerate(crops):
-        other = crops[int(rng.integers(len(crops)))].grey[:, ::-1]
+        other = crops[int(rng.integers(len(crops)))].grey
+        if rng.random() > ELSEWHERE_SHARE:
+            other = other[:, ::-1]
         for mirror in (False, True):
             picture = crop.grey[:, ::-1] if mirror else crop.grey
             changed = changed_picture(rng, picture, other)
@@ -122,11 +127,8 @@ def _fitted(
     right = near & ~mirrored
     if right.sum() < MIN_RIGHT:
         return fallback
-    # Beyond doubt wrong: elsewhere, or mirrored. A near miss of a stride teaches nothing.
-    far = np.hypot(*errors_en_m.T) > 2 * grid.stride_m
-    used = right | far | mirrored
-    weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)[used]
-    confidence = fit_logistic(features[used][:, : len(FEATURES)], right[used], weight)
+    weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)
+    confidence = fit_logistic(features[:, : len(FEATURES)], right, weight)
     std_m = float(np.sqrt(np.mean(errors_en_m[right] ** 2)))
     share = float(right.sum() / (~mirrored).sum())
     return Calibration(confidence, max(std_m, grid.gsd_m), share)

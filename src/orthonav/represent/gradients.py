@@ -1,10 +1,9 @@
 """Oriented gradients as circular harmonics of the edge direction.
 
-A pixel with gradient magnitude m and direction t contributes sqrt(m) * exp(2ik t), k = 0..3:
+A pixel with gradient magnitude m and direction t contributes m * exp(2ik t), k = 0..3:
 the Fourier series of an orientation histogram in which a direction and its opposite are one (an
 edge keeps its place when its contrast flips between seasons). Sums over a cell of these seven
-numbers say the same as a histogram of orientations with soft bins, without any binning. The
-square root keeps a few strong edges from drowning the many weak ones.
+numbers say the same as a histogram of orientations with soft bins, without any binning.
 """
 
 from dataclasses import dataclass
@@ -28,7 +27,7 @@ class OrientedGradients:
     gradient.
     """
 
-    sigma_px: float = 1.2
+    sigma_px: float = 1.5
 
     def __post_init__(self) -> None:
         if not 0 < self.sigma_px <= 16:
@@ -47,7 +46,7 @@ class OrientedGradients:
         return int(np.ceil(4 * self.sigma_px)) + 1  # OpenCV's kernel of 4 sigma, then Scharr
 
     def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Orientation harmonics (7, H, W), in square roots of grey levels per pixel."""
+        """Orientation harmonics (7, H, W), in grey levels per pixel."""
         smooth = cv2.GaussianBlur(
             np.asarray(grey, dtype=np.float32), (0, 0), self.sigma_px
         ).reshape(grey.shape)
@@ -56,7 +55,7 @@ class OrientedGradients:
         power = east * east + south * south
         inverse = 1 / (power + np.float32(1e-6))
         cos, sin = (east * east - south * south) * inverse, 2 * east * south * inverse
-        weight = np.sqrt(np.sqrt(power))
+        weight = np.sqrt(power)
         if not valid.all():
             reach = 2 * self.margin_px + 1
             weight *= cv2.erode(

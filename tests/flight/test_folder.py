@@ -1,0 +1,344 @@
+"""Flight folders come back as they were written; what is broken in them is named."""
+
+import json
+import math
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from orthonav.errors import CameraError, FlightError, MissingFileError, OutputError
+from orthonav.flight import FlightWriter, open_flight, read_image, read_truth
+from orthonav.geo.camera import Camera
+from orthonav.records import Prior, Telemetry
+
+CAMERA = Camera(64, 48, 60.0, 61.5, 32.25, 23.75, (0.01, -0.02, 1e-4, 2e-4))
+FULL = Telemetry(
+    time_ns=1_500_000_000,
+    yaw_deg=-12.5,
+    pitch_deg=1.25,
+    roll_deg=-0.5,
+    agl_m=120.0,
+    yaw_std_deg=3.0,
+    agl_std_m=2.5,
+    prior=Prior(46.5, -0.0001, 30.0),
+    vel_en_mps=(-3.5, 0.0),
+)
+BARE = Telemetry(2_000_000_000, math.nan, 0.0, 0.0, 99.75)
+HEADER = "frame,time_s,yaw_deg,pitch_deg,roll_deg,agl_m"
+ROW = "a.png,1,90,0,0,100"
+
+
+def scene(height=48, width=64, seed=0):
+    """Smooth grey levels (H, W) uint8 over the whole range."""
+    noise = np.random.default_rng(seed).normal(size=(height, width)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 3)
+    return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def rgb():
+    """Three unlike bands (48, 64, 3)."""
+    return np.stack([scene(seed=1), scene(seed=2), scene(seed=3)], axis=-1)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A flight of three views as the writer leaves it."""
+    writer = FlightWriter(tmp_path, CAMERA, "été")
+    writer.add("a.png", rgb(), FULL, (46.5, 2.5))
+    writer.add("b.jpg", rgb(), BARE, (-46.123456789, 179.5))
+    writer.add("c.tif", rgb(), replace(FULL, time_ns=3_000_000_001, prior=None), (0.0, 0.0))
+    writer.close()
+    return tmp_path
+
+
+def telemetry(folder, text):
+    (folder / "telemetry.csv").write_text(text, encoding="utf-8")
+    return folder
+
+
+def refused(folder, message, error=FlightError, names="telemetry.csv"):
+    with pytest.raises(error, match=message) as caught:
+        open_flight(folder)
+    assert str(caught.value).endswith(str(folder / names))
+
+
+def test_round_trip(folder):
+    flight = open_flight(folder)
+    assert flight.camera == CAMERA and flight.note == "été"
+    assert [view.frame for view in flight.views] == ["a.png", "b.jpg", "c.tif"]
+    assert [view.path for view in flight.views] == sorted((folder / "frames").iterdir())
+    first, second, third = (view.telemetry for view in flight.views)
+    assert first == FULL and third.prior is None and third.vel_en_mps == (-3.5, 0.0)
+    assert third.time_ns == pytest.approx(3_000_000_001, abs=10)
+    assert math.isnan(second.yaw_deg) and second.missing() == ["yaw_deg"]
+    assert replace(second, yaw_deg=0.0) == replace(BARE, yaw_deg=0.0)
+    truth = read_truth(folder / "truth.csv")
+    assert truth == {"a.png": (46.5, 2.5), "b.jpg": (-46.12345679, 179.5), "c.tif": (0.0, 0.0)}
+
+
+def test_columns_that_no_view_needs_are_not_written(tmp_path):
+    writer = FlightWriter(tmp_path, CAMERA, "")
+    writer.add("a.png", rgb(), BARE, (0.0, 0.0))
+    writer.close()
+    assert (tmp_path / "telemetry.csv").read_text() == f"{HEADER}\na.png,2,nan,0,0,99.75\n"
+
+
+def test_an_image_of_no_known_kind_is_not_written(tmp_path):
+    with pytest.raises((OutputError, cv2.error)):
+        FlightWriter(tmp_path, CAMERA, "").add("a.xyz", rgb(), BARE, (0.0, 0.0))
+
+
+def test_images_come_back_as_grey_levels(folder):
+    grey = cv2.cvtColor(rgb(), cv2.COLOR_RGB2GRAY)
+    for name, off in (("a.png", 1), ("b.jpg", 12), ("c.tif", 1)):
+        read = read_image(folder / "frames" / name)
+        assert read.dtype == np.uint8 and read.shape == grey.shape
+        assert np.abs(read.astype(int) - grey).max() <= off
+
+
+def test_spreadsheets_are_read(folder):
+    row = '"a.png", 1.5, 361, , west, 100, , "46.5", 2.5, 30, extra, more'
+    text = f"\ufeff{HEADER.replace(',', ', ')}, note, prior_lat_deg, prior_lon_deg, prior_std_m\r\n"
+    view = open_flight(telemetry(folder, f"{text}{row}\r\n\r\n")).views[0]
+    assert view.frame == "a.png" and view.telemetry.time_ns == 1_500_000_000
+    assert view.telemetry.yaw_deg == 361 and view.telemetry.prior == Prior(46.5, 2.5, 30.0)
+    assert view.telemetry.missing() == ["pitch_deg", "roll_deg"]
+
+
+@pytest.mark.parametrize("values", ["nan,2,3", "46,,3", "46,2,", "91,2,3", "46,361,3", "46,2,inf"])
+def test_half_a_prior_is_none(folder, values):
+    text = f"{HEADER},prior_lat_deg,prior_lon_deg,prior_std_m,vel_east_mps\n{ROW},{values},1\n"
+    view = open_flight(telemetry(folder, text)).views[0]
+    assert view.telemetry.prior is None and view.telemetry.vel_en_mps is None
+
+
+def test_views_in_subfolders(folder):
+    (folder / "frames" / "left").mkdir()
+    (folder / "frames" / "a.png").rename(folder / "frames" / "left" / "a.png")
+    flight = open_flight(telemetry(folder, f"{HEADER}\nleft/{ROW}\n"))
+    assert read_image(flight.views[0].path).shape == (48, 64)
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("", "columns are missing: frame, time_s, yaw_deg, pitch_deg, roll_deg, agl_m"),
+        (f"{HEADER[:-6]}\n{ROW[:-4]}\n", "columns are missing: agl_m"),
+        (HEADER.upper() + "\n", "columns are missing"),
+        (f"{HEADER}\n", "telemetry has no views"),
+        (f"{HEADER}\n\n{ROW}\na.png,2,90\n", "line 4 has too few fields"),
+        (f"{HEADER}\n{ROW}\n{ROW}\n", "line 3: frame a.png comes twice"),
+        (f"{HEADER}\n../{ROW}\n", r"line 2: '../a.png' is not a name inside frames/"),
+        (f"{HEADER}\nx/../../{ROW}\n", "not a name inside"),
+        (f"{HEADER}\n/etc/{ROW}\n", "not a name inside"),
+        (f"{HEADER}\n..\\{ROW}\n", "not a name inside"),
+        (f"{HEADER}\n,1,90,0,0,100\n", "not a name inside"),
+        (f"{HEADER}\na.png,soon,90,0,0,100\n", "line 2: time_s is no time"),
+        (f"{HEADER}\na.png,inf,90,0,0,100\n", "line 2: time_s is no time"),
+        (f"{HEADER}\na.png,1e10,90,0,0,100\n", "line 2: time_s is no time"),
+        (f"{HEADER}\na.png,1,{'9' * 200_000},0,0,100\n", "not a CSV file in UTF-8"),
+    ],
+)
+def test_broken_telemetry(folder, text, message):
+    refused(telemetry(folder, text), message)
+
+
+@pytest.mark.parametrize("frame", ["none.png", ".", "a.png/b", "x" * 5000, "a\0.png"])
+def test_views_without_an_image(folder, frame):
+    text = f"{HEADER}\n{frame},1,90,0,0,100\n"
+    refused(telemetry(folder, text), "line 2 names an image that does not", names=f"frames/{frame}")
+
+
+def test_telemetry_in_another_encoding(folder):
+    (folder / "telemetry.csv").write_bytes(f"{HEADER}\né.png,1,0,0,0,9\n".encode("latin-1"))
+    refused(folder, "not a CSV file in UTF-8")
+
+
+@pytest.mark.parametrize("name", ["telemetry.csv", "flight.json"])
+def test_missing_files(folder, name):
+    (folder / name).unlink()
+    refused(folder, "of the flight does not exist", MissingFileError, name)
+    (folder / name).mkdir()
+    refused(folder, "is a folder, not a file", MissingFileError, name)
+
+
+def test_missing_folders(folder):
+    refused(folder / "none", "flight folder does not exist", MissingFileError, "")
+    refused(folder / "flight.json", "is a file, not a folder", MissingFileError, "")
+    (folder / "frames").rename(folder / "pictures")
+    refused(folder, "does not exist", names="frames/a.png")
+
+
+def test_huge_telemetry_is_refused(folder, monkeypatch):
+    monkeypatch.setattr("orthonav.flight.folder.MAX_TEXT_BYTES", 10)
+    refused(folder, "larger than")
+
+
+def camera(folder, **changes):
+    plain = json.loads((folder / "flight.json").read_text())
+    plain["camera"] = {**plain["camera"], **changes}
+    (folder / "flight.json").write_text(json.dumps(plain))
+    return folder
+
+
+def test_a_camera_without_distortion_and_note(folder):
+    plain = {name: getattr(CAMERA, name) for name in ("width_px", "height_px")}
+    plain |= {name: getattr(CAMERA, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
+    text = "\ufeff" + json.dumps({"camera": plain})
+    (folder / "flight.json").write_text(text, encoding="utf-8")
+    flight = open_flight(folder)
+    assert flight.camera == replace(CAMERA, distortion=()) and flight.note == ""
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"width_px": 0},
+        {"height_px": 10**6},
+        {"fx_px": -5},
+        {"fy_px": math.nan},
+        {"cx_px": math.inf},
+        {"distortion": [1, 2, 3]},
+        {"distortion": [1, 2, 3, math.nan]},
+    ],
+    ids=str,
+)
+def test_cameras_that_cannot_be(folder, changes):
+    refused(camera(folder, **changes), "camera", CameraError, "flight.json")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"width_px": None},
+        {"width_px": math.inf},
+        {"fx_px": "wide"},
+        {"fx_px": 10**400},
+        {"distortion": None},
+        {"distortion": "1234"},
+        {"distortion": {"k1": 0}},
+        {"distortion": [[0], 0, 0, 0]},
+    ],
+    ids=lambda changes: str(changes)[:30],
+)
+def test_cameras_that_are_none(folder, changes):
+    refused(camera(folder, **changes), "expected {camera", names="flight.json")
+
+
+@pytest.mark.parametrize("text", ["", "{", "null", "5", "[]", "{}", '{"camera": 5}', "[" * 10**5])
+def test_a_camera_file_that_is_none(folder, text):
+    (folder / "flight.json").write_text(text)
+    refused(folder, "expected {camera.*as JSON", names="flight.json")
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("frame,lat_deg\na.png,46\n", "columns are missing: lon_deg"),
+        ("frame,lat_deg,lon_deg\na.png,46\n", "line 2 has too few fields"),
+        ("frame,lat_deg,lon_deg\na.png,46,2\na.png,46,2\n", "line 3: frame a.png comes twice"),
+        ("frame,lat_deg,lon_deg\na.png,91,2\n", "line 2: no latitude and longitude"),
+        ("frame,lat_deg,lon_deg\na.png,46,nan\n", "line 2: no latitude and longitude"),
+        ("frame,lat_deg,lon_deg\na.png,,2\n", "line 2: no latitude and longitude"),
+    ],
+)
+def test_broken_truth(tmp_path, text, message):
+    path = tmp_path / "truth.csv"
+    with pytest.raises(MissingFileError, match="truth does not exist"):
+        read_truth(path)
+    path.write_text(text)
+    with pytest.raises(FlightError, match=message) as caught:
+        read_truth(path)
+    assert str(caught.value).endswith(str(path))
+
+
+def encoded(kind, image, *options):
+    return cv2.imencode(kind, image, list(options))[1].tobytes()
+
+
+def unreadable(path, content, message="cannot be decoded|was cut short"):
+    path.write_bytes(content)
+    with pytest.raises(FlightError, match=message) as caught:
+        read_image(path)
+    assert str(caught.value).endswith(str(path))
+
+
+def test_what_is_no_image(tmp_path):
+    path = tmp_path / "a.jpg"
+    with pytest.raises(MissingFileError, match="image of the flight does not exist"):
+        read_image(path)
+    for content in (b"", b"\xff\xd8", b"\xff\xd8\xff\xe0", b"not an image", bytes(1000)):
+        unreadable(path, content)
+
+
+PROGRESSIVE = (cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
+KINDS = {"jpeg": (".jpg",), "progressive": (".jpg", *PROGRESSIVE), "png": (".png",)}
+KINDS |= {"tiff": (".tif",), "raw tiff": (".tif", cv2.IMWRITE_TIFF_COMPRESSION, 1)}
+
+
+@pytest.mark.parametrize("kept", [0.03, 0.5, 0.95, 0.999])
+@pytest.mark.parametrize("kind", KINDS)
+def test_images_that_were_cut_short(tmp_path, kind, kept):
+    """Also where the file system left zeros in place of what is missing."""
+    suffix, *options = KINDS[kind]
+    whole = encoded(suffix, scene(240, 320), *options)
+    cut = whole[: int(kept * len(whole))]
+    unreadable(tmp_path / "a", cut, "was cut short" if suffix == ".jpg" else "cannot be decoded")
+    if suffix != ".tif":  # the directory of a TIFF lies at its end
+        unreadable(tmp_path / "a", cut + bytes(len(whole) - len(cut)))
+
+
+def with_exif(jpeg, orientation, thumbnail=b"", filling=b""):
+    """The JPEG with an orientation tag and a thumbnail in front."""
+    tag = struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0)
+    exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + tag + bytes(4) + thumbnail
+    segment = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
+    return jpeg[:2] + filling + segment + jpeg[2:]
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_the_orientation_tag_does_not_turn_the_picture(tmp_path, orientation):
+    path = tmp_path / "a.jpg"
+    jpeg = encoded(".jpg", scene())
+    path.write_bytes(jpeg)
+    plain = read_image(path)
+    path.write_bytes(with_exif(jpeg, orientation))
+    if orientation == 6:
+        turned = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert turned.shape == plain.shape[::-1]  # the tag is one that decoders heed
+    assert np.array_equal(read_image(path), plain)
+
+
+def test_thumbnails_padding_and_previews_do_not_hide_a_cut(tmp_path):
+    jpeg, small = encoded(".jpg", scene(240, 320)), encoded(".jpg", scene(24, 32))
+    whole = with_exif(jpeg, 1, thumbnail=small, filling=b"\xff\xff")
+    path = tmp_path / "a.jpg"
+    for behind in (b"", bytes(9000), small, b"motion picture" * 1000):
+        path.write_bytes(whole + behind)
+        assert read_image(path).shape == (240, 320)
+    unreadable(path, whole[: len(whole) // 2], "was cut short")
+    unreadable(path, whole[: len(small) + 60], "was cut short")
+
+
+def test_every_depth_and_kind_becomes_8_bit_grey(tmp_path):
+    grey = scene()
+    colour = cv2.cvtColor(rgb(), cv2.COLOR_RGB2GRAY)
+    clear = np.dstack([rgb()[..., ::-1], np.full_like(grey, 7)])
+    images = {
+        "grey.png": (grey, grey),
+        "deep.png": (grey.astype(np.uint16) * 257, grey),
+        "clear.png": (clear, colour),
+        "grey.tif": (grey, grey),
+        "deep.tif": (grey.astype(np.uint16) * 257, grey),
+        "colour.TIFF": (rgb()[..., ::-1], colour),
+        "colour.JPEG": (rgb()[..., ::-1], colour),
+    }
+    for name, (image, expected) in images.items():
+        (tmp_path / name).write_bytes(encoded(Path(name).suffix.lower(), image))
+        read = read_image(tmp_path / name)
+        assert read.dtype == np.uint8 and read.shape == grey.shape, name
+        assert np.abs(read.astype(int) - expected).max() <= (15 if "JPEG" in name else 1), name

@@ -1,0 +1,217 @@
+"""Rectified views show the ground as it is, told by a renderer that shares no code with them."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from orthonav.geo.camera import Camera
+from orthonav.localizer.rectify import PreparedView, prepare_view, rectify
+
+AGL_M, GSD_M, SIZE_PX = 100.0, 0.5, 160
+PLAIN = Camera(320, 240, 240.0, 240.0, 160.0, 120.0)
+LENSES = {
+    "pinhole": PLAIN,
+    "off centre": Camera(320, 240, 235.0, 245.0, 171.3, 108.6),
+    "barrel": Camera(320, 240, 240.0, 240.0, 160.0, 120.0, (-0.12, 0.03, 0.002, -0.003)),
+    "all": Camera(320, 240, 235.0, 245.0, 171.3, 108.6, (0.08, -0.04, -0.003, 0.002, 0.01)),
+}
+ATTITUDES = [(0, 0, 0), (37, 8, -6), (200, -15, 12), (-90, 0, 20), (300, 25, 0)]
+
+
+class Ground:
+    """Grey levels of a ground that is smooth and random, known at every point."""
+
+    def __init__(self, shortest_m=8.0, seed=0):
+        rng = np.random.default_rng(seed)
+        length_m = shortest_m * rng.uniform(1, 6, 12)
+        direction = rng.uniform(0, 2 * np.pi, 12)
+        self.waves = 2 * np.pi / length_m * np.stack([np.cos(direction), np.sin(direction)])
+        self.phase = rng.uniform(0, 2 * np.pi, 12)
+
+    def __call__(self, east_m, north_m):
+        angle = east_m[..., None] * self.waves[0] + north_m[..., None] * self.waves[1] + self.phase
+        return 128 + 20 * np.sin(angle).sum(axis=-1)
+
+
+def rays_of(camera):
+    """Directions (H, W, 3) of all pixel centres: right, down, along the optical axis.
+
+    Brown's model is undone by fixed-point iteration.
+    """
+    cols, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
+    seen_x = (cols + 0.5 - camera.cx_px) / camera.fx_px
+    seen_y = (rows + 0.5 - camera.cy_px) / camera.fy_px
+    k1, k2, p1, p2, k3 = (*camera.distortion, 0, 0, 0, 0, 0)[:5]
+    x, y = seen_x, seen_y
+    for _ in range(60):
+        r2 = x**2 + y**2
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        x, y = (
+            (seen_x - 2 * p1 * x * y - p2 * (r2 + 2 * x**2)) / radial,
+            (seen_y - p1 * (r2 + 2 * y**2) - 2 * p2 * x * y) / radial,
+        )
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def enu(attitude, right_down_along):
+    """East, north, up of camera directions (..., 3): forward-right-down body, Z-Y-X angles."""
+    yaw, pitch, roll = attitude
+    right, down, along = np.moveaxis(right_down_along, -1, 0)
+    body = np.stack([-down, right, along], axis=-1)
+    turn = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True)
+    north, east, below = np.moveaxis(turn.apply(body.reshape(-1, 3)).reshape(body.shape), -1, 0)
+    return np.stack([east, north, -below], axis=-1)
+
+
+def rendered(ground, camera, attitude, agl_m=AGL_M):
+    """What the camera sees (H, W) uint8 from above (0, 0)."""
+    direction = enu(attitude, rays_of(camera))
+    below = np.where(direction[..., 2] < -1e-6, -direction[..., 2], np.nan)
+    east, north = (direction[..., i] * agl_m / below for i in (0, 1))
+    seen = np.nan_to_num(ground(east, north), nan=255)
+    return np.rint(np.clip(seen, 0, 255)).astype(np.uint8)
+
+
+def window_en_m(offset_en_m, size_px=SIZE_PX, gsd_m=GSD_M):
+    """East and north (S, S) of the pixel centres of the rectified window."""
+    along = (np.arange(size_px) + 0.5 - size_px / 2) * gsd_m
+    return offset_en_m[0] + along[None] + 0 * along[:, None], offset_en_m[1] - along[:, None]
+
+
+def seen_px(camera, attitude, east_m, north_m, agl_m=AGL_M):
+    """Image column and row of ground points, NaN behind the camera."""
+    to_camera = enu(attitude, np.eye(3)).T  # rows of the identity are the camera's axes
+    east_m, north_m = np.broadcast_arrays(east_m, north_m)
+    points = np.stack([east_m, north_m, np.full_like(east_m, -agl_m)], axis=-1)
+    right, down, along = np.moveaxis(points @ to_camera, -1, 0)
+    along = np.where(along > 0, along, np.nan)
+    plane = np.stack([right / along, down / along, np.ones_like(along)], axis=-1)
+    matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
+    flat = np.nan_to_num(plane.reshape(-1, 3), nan=1e6)
+    distortion = np.array(camera.distortion or (0, 0, 0, 0), dtype=float)
+    seen, _ = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), matrix, distortion)
+    seen = seen.reshape(*along.shape, 2)
+    return np.where(np.isfinite(along)[..., None], seen, np.nan)
+
+
+def tilted_and_prepared(grey, camera, attitude, gsd_m=GSD_M, size_px=SIZE_PX, agl_m=AGL_M):
+    yaw, pitch, roll = attitude
+    view = prepare_view(grey, camera, agl_m, gsd_m)
+    pose = {"yaw_deg": yaw, "pitch_deg": pitch, "roll_deg": roll, "agl_m": agl_m}
+    return rectify(view, **pose, gsd_m=gsd_m, size_px=size_px)
+
+
+def shift_px(found, expected, where):
+    """Least-squares shift (column, row) between two pictures, in pixels, over `where`."""
+    row_slope, col_slope = np.gradient(expected)
+    slopes = np.stack([col_slope[where], row_slope[where]], axis=1)
+    return np.linalg.lstsq(slopes, (expected - found)[where], rcond=None)[0]
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("attitude", ATTITUDES, ids=str)
+def test_the_ground_comes_out_as_it_is(attitude, lens):
+    ground, camera = Ground(), LENSES[lens]
+    view = tilted_and_prepared(rendered(ground, camera, attitude), camera, attitude)
+    expected = ground(*window_en_m(view.offset_en_m))
+    inner = cv2.erode(view.valid.astype(np.uint8), np.ones((5, 5)), borderValue=1) > 0
+    assert view.grey.shape == (SIZE_PX, SIZE_PX) and view.valid.mean() > 0.5
+    assert np.abs(view.grey - expected)[inner].mean() < 1.0
+    assert np.abs(shift_px(view.grey, expected, inner)).max() < 0.04  # OpenCV steps by 1/32 px
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("attitude", [*ATTITUDES, (10, 44, 0)], ids=str)
+def test_valid_is_what_the_camera_saw(attitude, lens):
+    camera = LENSES[lens]
+    grey = np.full((camera.height_px, camera.width_px), 99, np.uint8)
+    view = tilted_and_prepared(grey, camera, attitude, gsd_m=2.0)
+    east, north = window_en_m(view.offset_en_m, gsd_m=2.0)
+    seen = seen_px(camera, attitude, east, north)
+    inside = np.minimum(seen, [camera.width_px, camera.height_px] - seen).min(axis=-1)
+    assert 0.05 < view.valid.mean() < 0.9
+    assert view.valid[inside > 0.1].all()
+    if lens in ("pinhole", "off centre"):
+        assert not view.valid[~(inside >= -0.1)].any()
+    else:  # far outside the image the distortion folds points back into it
+        near = np.abs(inside) < 20
+        assert not view.valid[near & (inside < -0.1)].any()
+
+
+@pytest.mark.parametrize("attitude", ATTITUDES, ids=str)
+def test_offset_is_where_the_optical_axis_meets_the_ground(attitude):
+    grey = np.zeros((240, 320), np.uint8)
+    offset = tilted_and_prepared(grey, PLAIN, attitude).offset_en_m
+    east, north, up = enu(attitude, np.array([0.0, 0, 1]))
+    assert offset == pytest.approx([east / -up * AGL_M, north / -up * AGL_M], abs=1e-9)
+    yaw, pitch, roll = attitude
+    if roll == 0:  # ahead, by the tangent of the pitch
+        reach = AGL_M * math.tan(math.radians(pitch))
+        expected = [reach * math.sin(math.radians(yaw)), reach * math.cos(math.radians(yaw))]
+        assert offset == pytest.approx(expected, abs=1e-9)
+
+
+def test_valid_pixels_hold_no_black_from_beyond_the_border():
+    for camera in LENSES.values():
+        grey = np.full((camera.height_px, camera.width_px), 200, np.uint8)
+        view = tilted_and_prepared(grey, camera, (37, 8, -6), gsd_m=2.0)
+        assert not view.valid.all() and (view.grey[view.valid] == 200).all()
+        assert not view.grey[~view.valid].any()
+
+
+def test_a_picture_beyond_the_horizon_is_not_valid():
+    view = tilted_and_prepared(rendered(Ground(), PLAIN, (0, 44, 0)), PLAIN, (0, 44, 0), gsd_m=8.0)
+    east, north = window_en_m(view.offset_en_m, gsd_m=8.0)
+    assert not view.valid[np.broadcast_to(north, east.shape) < -AGL_M / math.tan(0.767)].any()
+
+
+@pytest.mark.parametrize("lens, size", [("pinhole", (960, 720)), ("all", (963, 719))])
+def test_fine_views_are_thinned_without_aliasing_or_shift(lens, size):
+    """Stripes of two image pixels are gone, the ground below them stays in place."""
+    camera, attitude = LENSES[lens].resized(*size), (37, 8, -6)
+    ground = Ground(shortest_m=16)
+    grey = rendered(ground, camera, attitude).astype(int)
+    stripes = np.where(np.indices(grey.shape).sum(axis=0) % 2, 25, -25)
+    grey = np.clip(grey, 30, 225)
+    striped = (grey + stripes).astype(np.uint8)
+    plain = tilted_and_prepared(grey.astype(np.uint8), camera, attitude)
+    view = tilted_and_prepared(striped, camera, attitude)
+    expected = np.clip(ground(*window_en_m(view.offset_en_m)), 30, 225)
+    inner = cv2.erode(view.valid.astype(np.uint8), np.ones((5, 5)), borderValue=1) > 0
+    assert np.abs(view.grey.astype(int) - plain.grey)[inner].mean() < 2.5
+    assert np.abs(shift_px(view.grey, expected, inner)).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    "agl_m, gsd_m, expected",
+    [
+        (100, 0.5, (320, 240)),
+        (100, 0.42, (320, 240)),
+        (100, 0.84, (160, 120)),
+        (100, 1.3, (106, 80)),
+        (100, 12.0, (11, 8)),
+        (100, 100.0, (320, 240)),
+    ],
+)
+def test_thinning_is_by_whole_numbers(agl_m, gsd_m, expected):
+    """A pixel covers 0.417 m; a view is never thinned below 8 px."""
+    view = prepare_view(np.zeros((240, 320), np.uint8), PLAIN, agl_m, gsd_m)
+    assert view.grey.shape[::-1] == expected
+    assert (view.camera.width_px, view.camera.height_px) == expected
+    assert view.camera == PLAIN.resized(*expected)
+
+
+def test_the_view_given_is_not_changed():
+    grey = rendered(Ground(), PLAIN, (0, 0, 0))
+    grey.flags.writeable = False
+    kept = grey.copy()
+    tilted_and_prepared(grey, PLAIN, (37, 8, -6), gsd_m=2.0)
+    view = PreparedView(grey, PLAIN)
+    first, second = (
+        rectify(view, yaw_deg=5, pitch_deg=0, roll_deg=0, agl_m=AGL_M, gsd_m=1.0, size_px=64)
+        for _ in range(2)
+    )
+    assert np.array_equal(first.grey, second.grey) and np.array_equal(grey, kept)

@@ -1,0 +1,434 @@
+"""A map comes back as it was written, or not at all."""
+
+import errno
+import hashlib
+import mmap
+import sys
+import tracemalloc
+
+import numpy as np
+import pytest
+import safetensors
+import safetensors.numpy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from maps import arrays, described, manifest, put_together, taken_apart
+
+from orthonav.errors import MapFileError, MapVersionError, MissingFileError, OutputError
+from orthonav.mapfile import open_map, write_map
+
+
+@pytest.fixture(scope="module")
+def content(tmp_path_factory):
+    """The bytes of a map."""
+    path = tmp_path_factory.mktemp("map") / "area.onav"
+    write_map(path, manifest(), arrays())
+    return path.read_bytes()
+
+
+@pytest.fixture
+def path(tmp_path, content):
+    """A whole map file."""
+    path = tmp_path / "area.onav"
+    path.write_bytes(content)
+    return path
+
+
+def same_as_written(opened):
+    """Whether all that can be read is what was written."""
+    found = opened.manifest
+    wanted = {**vars(manifest()), "parts": found.parts}
+    same = vars(found) == wanted and sorted(opened.arrays) == sorted(arrays())
+    return same and all(
+        opened.arrays[name].dtype == array.dtype and np.array_equal(opened.arrays[name], array)
+        for name, array in arrays().items()
+    )
+
+
+def refused(path, message=None, error=MapFileError):
+    with pytest.raises(error, match=message) as caught:
+        open_map(path)
+    assert str(caught.value).endswith(str(path))
+
+
+def test_round_trip(path, content):
+    opened = open_map(path)
+    assert same_as_written(opened)
+    assert opened.size_bytes == len(content) and opened.path == path
+    again = path.with_name("again.onav")
+    assert write_map(again, opened.manifest, opened.arrays) == opened.manifest
+    assert again.read_bytes() == content
+
+
+def test_the_order_of_the_parts_does_not_matter(tmp_path, content):
+    parts = dict(reversed(arrays().items()))
+    parts["sheet0/embeddings"] = np.asfortranarray(parts["sheet0/embeddings"])
+    write_map(tmp_path / "a.onav", manifest(), parts)
+    assert (tmp_path / "a.onav").read_bytes() == content
+
+
+def test_arrays_are_read_only_views_of_the_mapped_file(path):
+    opened = open_map(path)
+    for name, array in opened.arrays.items():
+        assert not array.flags.writeable and not array.flags.owndata, name
+        with pytest.raises(ValueError):
+            array.flags.writeable = True
+    base = opened.arrays["sheet0/embeddings"]
+    while isinstance(base, np.ndarray):
+        base = base.base
+    assert isinstance(base.obj, mmap.mmap)
+
+
+def test_an_open_map_outlives_its_file_being_replaced(path):
+    opened = open_map(path)
+    write_map(path, manifest(), arrays(seed=1))
+    assert same_as_written(opened)
+
+
+def test_a_part_of_another_kind_is_refused(path):
+    opened = open_map(path)
+    assert opened.array("tiles", np.int32, 1) is opened.arrays["tiles"]
+    for name, dtype, ndim in (("tiles", np.uint8, 1), ("tiles", np.int32, 2), ("no", np.int32, 1)):
+        with pytest.raises(MapFileError, match=f"map part {name} must be"):
+            opened.array(name, dtype, ndim)
+
+
+def test_the_safetensors_library_reads_the_same(path):
+    opened = open_map(path)
+    with safetensors.safe_open(path, framework="numpy") as other:
+        assert sorted(other.keys()) == sorted(opened.arrays)
+        for name, array in opened.arrays.items():
+            np.testing.assert_array_equal(other.get_tensor(name), array)
+        assert other.metadata()["orthonav"].startswith("{")
+
+
+@pytest.mark.parametrize("share", np.linspace(0, 1, 41)[:-1])
+def test_cut_short(path, content, share):
+    path.write_bytes(content[: int(share * len(content))])
+    refused(path)
+
+
+@pytest.mark.parametrize("cut", [1, 2, 8, 64])
+def test_the_last_bytes_missing_or_too_many(path, content, cut):
+    path.write_bytes(content[:-cut])
+    refused(path, "truncated")
+    path.write_bytes(content + bytes(cut))
+    refused(path, f"{cut} bytes too many")
+
+
+def test_no_flipped_bit_goes_unnoticed(path, content):
+    rng = np.random.default_rng(0)
+    header_end = 8 + int.from_bytes(content[:8], "little")
+    places = [*rng.integers(0, len(content), 100), *rng.integers(0, header_end, 100), *range(10)]
+    for place in map(int, places):
+        flipped = bytearray(content)
+        flipped[place] ^= 1 << rng.integers(8)
+        path.write_bytes(flipped)
+        try:
+            opened = open_map(path)
+        except MapFileError:
+            continue
+        assert same_as_written(opened), f"byte {place}"  # such as 1e-05 become 1E-05
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_whatever_is_done_to_a_map_only_our_errors_come_out(tmp_path_factory, content, data):
+    path = tmp_path_factory.getbasetemp() / "mutated.onav"
+    mutated = bytearray(content)
+    for _ in range(data.draw(st.integers(1, 4))):
+        place = data.draw(st.integers(0, len(mutated)))
+        end = place + data.draw(st.integers(0, 40))
+        mutated[place:end] = data.draw(
+            st.one_of(
+                st.binary(max_size=40),
+                st.sampled_from(
+                    [b"[" * 99, b"{", b'"', b"9" * 30, b"-1", b"NaN", b"null", b"1e999"]
+                ),
+            )
+        )
+    path.write_bytes(mutated)
+    try:
+        opened = open_map(path)
+    except MapFileError:
+        return
+    assert bytes(mutated) == content or same_as_written(opened)
+
+
+@pytest.mark.parametrize(
+    "junk",
+    [
+        b"",
+        b"{",
+        bytes(9),
+        bytes(4096),
+        b"\xff" * 4096,
+        b"PK\x03\x04" + bytes(100),
+        (2).to_bytes(8, "little") + b"{}",
+        (4).to_bytes(8, "little") + b"null",
+        (2).to_bytes(8, "little") + b"[]",
+        (4).to_bytes(8, "little") + b'{"\xff"',
+        (17 * 2**20).to_bytes(8, "little") + b"{" + bytes(100),
+        (2**64 - 1).to_bytes(8, "little") + b"{" + bytes(100),
+        (100_000).to_bytes(8, "little") + b'{"a":' + b"[" * 99_995,
+        np.random.default_rng(0).bytes(5000),
+    ],
+    ids=range(14),
+)
+def test_a_file_that_is_no_map(path, junk):
+    path.write_bytes(junk)
+    refused(path)
+
+
+def test_a_file_that_is_missing_a_folder_or_not_ours(tmp_path):
+    refused(tmp_path / "none.onav", "does not exist", MissingFileError)
+    refused(tmp_path, "is a folder", MissingFileError)
+    for metadata in (None, {"format": "pt"}, {"orthonav": "{}"}, {"orthonav": "no JSON"}):
+        safetensors.numpy.save_file(arrays(), tmp_path / "model.safetensors", metadata)
+        refused(tmp_path / "model.safetensors", "not an orthonav map|not JSON")
+
+
+def test_a_file_that_may_not_be_read(path, monkeypatch):
+    def refuse(*args, **kwargs):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(type(path), "open", refuse)
+    refused(path, "cannot be read", MissingFileError)
+
+
+def test_a_newer_schema_is_named(path):
+    header, plain, data = taken_apart(path)
+    put_together(path, header, {**plain, "schema": 2, "sheets": "of another kind"}, data)
+    refused(path, r"has schema 2, this program reads up to 1; update", MapVersionError)
+
+
+@pytest.mark.parametrize("schema", [0, -1, 1.0, True, "1", None])
+def test_a_schema_that_never_was(path, schema):
+    header, plain, data = taken_apart(path)
+    refused(put_together(path, header, {**plain, "schema": schema}, data))
+
+
+def test_putting_together_what_was_taken_apart(path):
+    assert same_as_written(open_map(put_together(path, *taken_apart(path))))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"sheets": []},
+        {"sheets": [5]},
+        {"sheets": {}},
+        {"recipe": []},
+        {"imagery": None},
+        {"view": 5},
+        {"radius_m": "24"},
+        {"radius_m": True},
+        {"radius_m": 10**400},
+        {"parts": []},
+        {"parts": {}},
+        {"format": "other"},
+    ],
+    ids=lambda changes: str(changes)[:50],
+)
+def test_a_signed_manifest_of_nonsense(path, changes):
+    header, plain, data = taken_apart(path)
+    refused(put_together(path, header, {**plain, **changes}, data))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"origin_lat_deg": 90.5},
+        {"origin_lon_deg": 1e9},
+        {"origin_lat_deg": None},
+        {"tiles": 13},
+        {"tiles": 0},
+        {"tiles": 1.5},
+        {"area_km2": "1"},
+        {"grid": {"gsd_m": 0}},
+        {"grid": {"gsd_m": 1e300}},
+        {"grid": {"tile_px": 8}},
+        {"grid": {"tile_px": 10**6}},
+        {"grid": {"stride_px": 0}},
+        {"grid": {"stride_px": 65}},
+        {"grid": {"rows": 0}},
+        {"grid": {"cols": 10**9}},
+        {"grid": {"cols": 10**400}},
+        {"grid": {"west_m": -(10**400)}},
+        {"grid": {"north_m": []}},
+        {"grid": {"rows": True}},
+    ],
+    ids=lambda changes: str(changes)[:50],
+)
+def test_a_signed_sheet_of_nonsense(path, changes):
+    header, plain, data = taken_apart(path)
+    sheet = plain["sheets"][0]
+    if "grid" in changes:
+        changes = {"grid": {**sheet["grid"], **changes["grid"]}}
+    refused(put_together(path, header, {**plain, "sheets": [{**sheet, **changes}]}, data))
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
+def test_numbers_that_are_none(path, number):
+    header, _, data = taken_apart(path)
+    stated = header["__metadata__"]["orthonav"].replace('"radius_m":24.0', f'"radius_m":{number}')
+    assert number in stated
+    refused(put_together(path, header, stated, data))
+    refused(put_together(path, header, f'{{"format":"orthonav-map","schema":{number}}}', data))
+
+
+def test_nesting_however_deep(path):
+    header, _, data = taken_apart(path)
+    depths = [*range(sys.getrecursionlimit() - 250, sys.getrecursionlimit() + 5, 3), 10**5]
+    for depth in depths:
+        nested = "[" * depth + "]" * depth
+        text = f'{{"format":"orthonav-map","recipe":{nested},"schema":1}}'
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        signed = f'{text[:-1]},"manifest_sha256":"{digest}"}}'
+        refused(put_together(path, header, signed, data))
+
+
+def with_part(path, name, entry, part, more=b""):
+    """The map with one part as told put after the others."""
+    header, plain, data = taken_apart(path)
+    header[name], plain["parts"][name] = entry, part
+    return put_together(path, header, plain, data + more)
+
+
+def test_a_part_more_that_is_described_is_carried(path):
+    extra = np.arange(5, dtype=np.int32)
+    entry, part, more = described(extra, len(taken_apart(path)[2]))
+    opened = open_map(with_part(path, "extra", entry, part, more))
+    assert opened.arrays["extra"].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_a_part_more_or_less_than_the_manifest_says(path):
+    header, plain, data = taken_apart(path)
+    entry, _, more = described(np.arange(5, dtype=np.int32), len(data))
+    refused(put_together(path, {**header, "extra": entry}, plain, data + more), "its parts are not")
+    del header["tiles"]
+    refused(put_together(path, header, plain, data), "its parts are not")
+    del plain["parts"]["tiles"]
+    refused(put_together(path, header, plain, data), "not where it should be|too many")
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        [6],
+        [8],
+        [7, 1],
+        [1, 7],
+        [-7],
+        [-1, -7],
+        [7.0],
+        [True, 7],
+        "7",
+        7,
+        None,
+        [],
+        [2**62],
+        [2**64],
+    ],
+    ids=lambda changes: str(changes)[:50],
+)
+def test_wrong_shapes(path, shape):
+    header, plain, data = taken_apart(path)
+    header["tiles"]["shape"] = shape
+    refused(put_together(path, header, plain, data))
+    if shape not in ([7, 1], [1, 7]):  # the same bytes otherwise told are no damage
+        plain["parts"]["tiles"]["shape"] = shape
+        refused(put_together(path, header, plain, data))
+
+
+@pytest.mark.parametrize("shape", [[0, 2**65], [0, 10**30], [2**40, 0, 2**40], [0] * 100, [1] * 65])
+def test_shapes_that_numpy_cannot_hold(path, shape):
+    array = np.zeros(1 if shape[0] == 1 else 0, dtype=np.uint8)
+    entry, part, more = described(array, len(taken_apart(path)[2]))
+    entry["shape"] = part["shape"] = shape
+    refused(with_part(path, "odd", entry, part, more))
+
+
+@pytest.mark.parametrize("dtype", ["F64", "I64", "U16", "BOOL", "f16", "", None, 5, ["F16"]])
+def test_wrong_types(path, dtype):
+    header, plain, data = taken_apart(path)
+    header["sheet0/embeddings"]["dtype"] = dtype
+    refused(put_together(path, header, plain, data))
+
+
+def test_wrong_places(path):
+    header, plain, data = taken_apart(path)
+    first, last = header["tiles"]["data_offsets"]
+    for offsets in (
+        [first - 4, last - 4],
+        [first + 4, last + 4],
+        [0, last - first],
+        [first, last - 4],
+        [last, first],
+        [-last, -first],
+        [first, last + 2**40],
+        [first + 2**64, last + 2**64],
+        [float(first), last],
+        [first],
+        [first, last, last],
+        None,
+        {},
+    ):
+        moved = {**header, "tiles": {**header["tiles"], "data_offsets": offsets}}
+        refused(put_together(path, moved, plain, data))
+    for entry in (None, [], 5, {}):
+        refused(put_together(path, {**header, "tiles": entry}, plain, data))
+        stated = {**plain, "parts": {**plain["parts"], "tiles": entry}}
+        refused(put_together(path, header, stated, data))
+
+
+def test_huge_shapes_take_no_memory(path):
+    huge = {"dtype": "F32", "shape": [2**31, 2**10], "data_offsets": [0, 2**43]}
+    part = {"dtype": "float32", "shape": [2**31, 2**10], "sha256": "0" * 64}
+    _, plain, data = taken_apart(path)
+    put_together(path, {"huge": huge}, {**plain, "parts": {"huge": part}}, data)
+    tracemalloc.start()
+    try:
+        refused(path, "truncated")
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 5e6
+
+
+@pytest.mark.parametrize("fails", ["orthonav.mapfile.writer.save_file", "os.fsync"])
+@pytest.mark.parametrize("old", [True, False])
+def test_a_full_disk_keeps_the_old_map(path, content, monkeypatch, fails, old):
+    if not old:
+        path.unlink()
+
+    def full(*args, **kwargs):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(fails, full)
+    with pytest.raises(OutputError, match="disk full"):
+        write_map(path, manifest(), arrays(seed=1))
+    assert list(path.parent.iterdir()) == ([path] if old else [])
+    assert not old or path.read_bytes() == content
+
+
+def test_a_disk_that_is_really_full(tmp_path):
+    """The library has errors of its own for what the system refuses."""
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OutputError):
+        write_map(tmp_path / "file" / "area.onav", manifest(), arrays())
+    with pytest.raises(OutputError):
+        write_map(tmp_path, manifest(), arrays())
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, safetensors.SafetensorError])
+def test_what_interrupts_the_writing_leaves_nothing(tmp_path, monkeypatch, error):
+    def half(parts, path, metadata):
+        path.write_bytes(b"half")
+        raise error
+
+    monkeypatch.setattr("orthonav.mapfile.writer.save_file", half)
+    with pytest.raises(KeyboardInterrupt if error is KeyboardInterrupt else OutputError):
+        write_map(tmp_path / "area.onav", manifest(), arrays())
+    assert list(tmp_path.iterdir()) == []

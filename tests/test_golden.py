@@ -1,0 +1,100 @@
+"""A map file of version 1 stays readable and flies as it did.
+
+`data/make_golden.py` made both files and printed the numbers here.
+"""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthonav.flight import read_image
+from orthonav.geo.frames import LocalFrame
+from orthonav.geo.grid import TileGrid
+from orthonav.localizer import Localizer
+from orthonav.mapfile import SheetInfo, open_map
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.records import Fix
+
+DATA = Path(__file__).parent / "data"
+SHEET = SheetInfo(
+    frame=LocalFrame(lat_deg=46.5, lon_deg=3.0),
+    grid=TileGrid(
+        west_m=-192.00000000000392,
+        north_m=192.0000002679686,
+        gsd_m=1.0,
+        tile_px=96,
+        stride_px=12,
+        rows=25,
+        cols=25,
+    ),
+    tiles=585,
+    area_km2=0.08424,
+)
+FIRST_EMBEDDING = [
+    0.11407470703125,
+    -0.51220703125,
+    -0.1380615234375,
+    -0.1754150390625,
+    -0.2462158203125,
+]
+LAST_CENTRE_EN_M = [96.0, -144.0]
+FIX_DEG = (46.499892048, 2.999843674)
+RADIUS_M = 12.0
+CONFIDENCE = 0.9307
+
+
+@pytest.fixture(scope="module")
+def maker():
+    """The script that made the files."""
+    spec = importlib.util.spec_from_file_location("make_golden", DATA / "make_golden.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def golden():
+    """The map as it was stored."""
+    return open_map(DATA / "golden_v1.onav")
+
+
+def test_the_manifest_says_what_was_built(golden):
+    manifest = golden.manifest
+    assert manifest.sheets == (SHEET,)
+    assert manifest.created_by == "orthonav 0.1.0" and manifest.radius_m == RADIUS_M
+    assert manifest.recipe["method"] == manifest.recipe["represent"]["name"] == "gradient"
+    assert manifest.recipe["embed"]["dims"] == 16 and manifest.recipe["overlap"] == 0.875
+    source = manifest.imagery[0]
+    assert (source["name"], source["date"], source["gsd_m"]) == ("golden.tif", "2021-06-17", 1.001)
+    assert manifest.confidence is not None and golden.size_bytes < 150_000
+
+
+def test_the_parts_hold_the_same_numbers(golden):
+    embeddings = golden.array("sheet0/embeddings", np.float16, 2)
+    centres = golden.array("sheet0/centres_en_m", np.float32, 2)
+    assert embeddings.shape == (SHEET.tiles, 16) and centres.shape == (SHEET.tiles, 2)
+    assert embeddings[0, :5].tolist() == FIRST_EMBEDDING
+    assert centres[-1].tolist() == LAST_CENTRE_EN_M
+    assert np.linalg.norm(embeddings.astype(float), axis=1) == pytest.approx(1, abs=2e-3)
+
+
+def test_the_view_is_placed_where_it_was(golden, maker):
+    grey = read_image(DATA / "golden_view.png")
+    fix = Localizer(golden).locate(grey, maker.CAMERA, maker.TELEMETRY)
+    assert isinstance(fix, Fix)
+    off_m = SHEET.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
+    off_m = off_m - SHEET.frame.en_from_latlon(*FIX_DEG)
+    assert np.hypot(*off_m) < 0.01
+    assert fix.confidence == pytest.approx(CONFIDENCE, abs=0.02) and fix.radius_m == RADIUS_M
+
+
+def test_the_same_imagery_gives_the_same_bytes_twice(tmp_path, maker):
+    """Not those of the stored file: other machines round otherwise, and methods get better."""
+    maker.write_ortho(tmp_path / "golden.tif", maker.ground())
+    request = {"gsd_m": 1.0, "tile_px": 96, "method": "gradient:dims=16"}
+    paths = [tmp_path / "a.onav", tmp_path / "b.onav"]
+    for path in paths:
+        build_map(BuildRequest([tmp_path / "golden.tif"], path, **request))
+    assert paths[0].read_bytes() == paths[1].read_bytes()
