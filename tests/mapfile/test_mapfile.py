@@ -224,6 +224,7 @@ def test_putting_together_what_was_taken_apart(path):
         {"radius_m": "24"},
         {"radius_m": True},
         {"radius_m": 10**400},
+        {"view": {"heading_step_deg": 10**400}},
         {"parts": []},
         {"parts": {}},
         {"format": "other"},

@@ -18,6 +18,8 @@ FORMAT = "orthonav-map"
 SCHEMA = 1
 MAX_MANIFEST_BYTES = 8 * 2**20
 MAX_SHEETS = 10_000
+MAX_DIGITS = 20
+"""More than any number in a map needs, and few enough for every one to be a float."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ class Manifest:
         if len(text) > MAX_MANIFEST_BYTES:
             raise MapFileError(f"manifest of the map is larger than {MAX_MANIFEST_BYTES} bytes")
         try:
-            plain = json.loads(text)
+            plain = json.loads(text, parse_int=_integer)
         except (ValueError, RecursionError) as error:
             raise MapFileError(f"manifest of the map is not JSON ({error})") from error
         if not isinstance(plain, dict) or plain.get("format") != FORMAT:
@@ -149,6 +151,12 @@ class Manifest:
             created_by=str(plain.get("created_by", "")),
             parts=_get(plain, "parts", dict),
         )
+
+
+def _integer(text: str) -> int:
+    if len(text) > MAX_DIGITS:
+        raise ValueError(f"a number has {len(text)} digits")
+    return int(text)
 
 
 def _canonical(plain: Any) -> str:

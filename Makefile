@@ -1,0 +1,49 @@
+# make demo    install into .venv and run the whole story on a generated area
+# make test    install and run the tests
+# make lint    style, types, import layers
+# make bench   measure speed, memory and accuracy beside what a user would pick instead
+# make clean   remove .venv and what was made here
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+DEPENDS := pyproject.toml constraints.txt
+
+.PHONY: demo test test-slow lint format bench clean
+
+demo: $(VENV)/.run-installed
+	$(BIN)/orthonav demo --out demo
+
+test: $(VENV)/.dev-installed
+	$(BIN)/python -m pytest -n auto
+
+test-slow: $(VENV)/.dev-installed
+	$(BIN)/python -m pytest -n auto -m "slow or not slow"
+
+lint: $(VENV)/.dev-installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(VENV)/.dev-installed
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(VENV)/.dev-installed
+	$(BIN)/python -m benchmarks
+
+$(BIN)/python:
+	@sh tools/make_venv.sh "$(PYTHON)" "$(VENV)"
+
+$(VENV)/.run-installed: $(DEPENDS) | $(BIN)/python
+	$(PIP) -e ".[geo,report]"
+	@touch $@
+
+$(VENV)/.dev-installed: $(DEPENDS) | $(BIN)/python
+	$(PIP) -e ".[dev]"
+	@touch $@ $(VENV)/.run-installed
+
+clean:
+	rm -rf $(VENV) demo bench_results .mypy_cache .ruff_cache .pytest_cache .hypothesis
