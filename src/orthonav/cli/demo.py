@@ -6,9 +6,12 @@ import shutil
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import Progress, print_json, progress
+
+if TYPE_CHECKING:
+    from orthonav.evaluate.metrics import Metrics
 
 MARKER = "demo.json"
 HEIGHT_M = 270.0
@@ -58,7 +61,7 @@ def _remove_earlier(out: Path) -> None:
 
 def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[Any, str]:
     from orthonav.cli.evaluate import map_background
-    from orthonav.cli.info import summary, summary_text
+    from orthonav.cli.info import recipe_text, summary, summary_text
     from orthonav.evaluate.metrics import compare, measure
     from orthonav.evaluate.report import (
         FlightReport,
@@ -115,13 +118,24 @@ def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[
     about = summary(built.manifest, built.size_bytes, Path(map_path.name))
     made_from = MadeFrom(
         map_name=map_path.name,
-        recipe=summary_text(about),
+        recipe=recipe_text(about["recipe"]),
         flight=f"{len(results)} views of {present.name}",
         command="orthonav demo",
         version=str(about["created_by"]),
     )
     write_report(folder / "report", [shown_flight], made_from)
-    return metrics_to_json(metrics), f"{summary_text(about)}\n\n{table([shown_flight])}"
+    lines = [summary_text(about), "", table([shown_flight]), "", *_criteria_lines(metrics)]
+    return metrics_to_json(metrics), "\n".join(lines)
+
+
+def _criteria_lines(metrics: "Metrics") -> list[str]:
+    """What trusting only confident fixes would keep."""
+    return [
+        f"confidence >= {row.threshold:g}: {row.share_kept:.0%} of views kept, "
+        f"{row.accuracy:.1%} of them within {metrics.radius_m:g} m"
+        for row in metrics.criteria
+        if row.name == "confidence" and row.share_kept > 0
+    ]
 
 
 def _write_route(path: Path, latlon_deg: Any) -> None:

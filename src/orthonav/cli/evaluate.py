@@ -76,15 +76,12 @@ def run(options: argparse.Namespace) -> None:
 
 def _write_report(out: Path, flights: list[Any], opened: "MapFile | None") -> None:
     from orthonav import __version__
-    from orthonav.cli.info import summary, summary_text
+    from orthonav.cli.info import recipe_text
     from orthonav.evaluate.report import MadeFrom, write_report
 
-    about = ""
-    if opened is not None:
-        about = summary_text(summary(opened.manifest, opened.size_bytes, Path(opened.path.name)))
     made_from = MadeFrom(
         map_name=opened.path.name if opened else "",
-        recipe=about,
+        recipe=recipe_text(opened.manifest.recipe) if opened else "",
         flight=", ".join(flight.name for flight in flights),
         command=" ".join(["orthonav", *sys.argv[1:]]),
         version=__version__,

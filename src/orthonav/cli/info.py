@@ -84,7 +84,7 @@ def summary_text(plain: dict[str, Any]) -> str:
         f"map        {plain['map']}  ({plain['created_by']})",
         f"area       {plain['area_km2']:.2f} km2 of tile centres, {plain['tiles']} tiles",
         f"size       {plain['size_mb']:.3f} MB, {plain['mb_per_km2']:.3f} MB per km2",
-        f"recipe     {_recipe_text(plain['recipe'])}",
+        f"recipe     {recipe_text(plain['recipe'])}",
     ]
     for sheet in plain["sheets"]:
         lines.append(
@@ -105,7 +105,8 @@ def summary_text(plain: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _recipe_text(recipe: dict[str, Any]) -> str:
+def recipe_text(recipe: dict[str, Any]) -> str:
+    """Method, variants and their parameters on one line."""
     parts = [str(recipe.get("method"))]
     for name in ("represent", "embed"):
         variant = dict(recipe.get(name, {}))

@@ -1,6 +1,7 @@
 """The tile grid of a sheet: where reference tiles of `tile_px` pixels are cut, and how densely."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +84,14 @@ class TileGrid:
     def height_px(self) -> int:
         """Rows of the raster that all tiles together cover."""
         return (self.rows - 1) * self.stride_px + self.tile_px
+
+    def tiles_rc(self, centres_en_m: NDArray[np.floating[Any]]) -> NDArray[np.intp]:
+        """Grid rows and columns (N, 2) of tile centres (N, 2): inverse of `centres_en_m`."""
+        centres = np.asarray(centres_en_m, dtype=np.float64)
+        half_m = self.tile_m / 2
+        rows = (self.north_m - half_m - centres[:, 1]) / self.stride_m
+        cols = (centres[:, 0] - self.west_m - half_m) / self.stride_m
+        return np.rint(np.stack([rows, cols], axis=1)).astype(np.intp)
 
     def centres_en_m(self, tiles_rc: NDArray[np.integer]) -> NDArray[np.float64]:
         """Local `(N, 2)` centres in metres of tiles given as `(N, 2)` grid rows and columns."""

@@ -19,6 +19,7 @@ from orthonav.localizer.rectify import PreparedView, Rectified, prepare_view, re
 from orthonav.mapfile.reader import MapFile
 from orthonav.records import Fix, NoFix, Prior, Telemetry
 from orthonav.search.exact import ExactIndex, rows_within
+from orthonav.search.peak import TileNeighbours
 from orthonav.variants import variant_from_recipe
 
 DEFAULT_YAW_STD_DEG = 5.0
@@ -31,11 +32,13 @@ UNKNOWN_HEADING_STEP_DEG = 8.0
 class Match:
     """What search found for one view.
 
-    `tile` is the row of the best tile, `query` the index of the best of the headings tried,
-    `evidence` the numbers behind it.
+    `tile` is the row of the best tile, `shift_en_m` where between the tiles the peak lies,
+    measured from its centre, `query` the index of the best of the headings tried, `evidence` the
+    numbers behind it.
     """
 
     tile: int
+    shift_en_m: tuple[float, float]
     query: int
     evidence: dict[str, float]
 
@@ -69,6 +72,10 @@ class Localizer:
             raise MapFileError(f"map's parts do not fit together: {opened.path}")
         if not (self._step_deg > 0 and self._position_std_m > 0):
             raise MapFileError(f"map has impossible view parameters: {opened.path}")
+        try:
+            self.neighbours = TileNeighbours(self.grid, self.centres_en_m)
+        except MapFileError as error:
+            raise MapFileError(f"{error}: {opened.path}") from error
         self.radius_m = manifest.radius_m
         self.index = ExactIndex(embeddings)
 
@@ -149,7 +156,9 @@ class Localizer:
             "tiles_searched": float(len(per_tile)),
         }
         tile = best if rows is None else int(rows[best])
-        return Match(tile, int(best_heading[best]), evidence)
+        east, north = self.neighbours.peak_offset(per_tile, tile, rows)
+        shift = east * self.grid.stride_m, north * self.grid.stride_m
+        return Match(tile, shift, int(best_heading[best]), evidence)
 
     def _allowed(self, prior: Prior | None) -> NDArray[np.intp] | None:
         if prior is None:
@@ -169,9 +178,14 @@ class Localizer:
 
     def _fix(self, match: Match, view: Rectified, heading_deg: float, telemetry: Telemetry) -> Fix:
         # The tile shows the ground where the camera looks; the aircraft is `offset` before that.
-        position = self.centres_en_m[match.tile].astype(np.float64) - view.offset_en_m
+        centre = self.centres_en_m[match.tile].astype(np.float64)
+        position = centre + match.shift_en_m - view.offset_en_m
         lat, lon = self.sheet.frame.latlon_from_en(position)
-        evidence = {**match.evidence, "valid_share": float(view.valid.mean())}
+        evidence = {
+            **match.evidence,
+            "valid_share": float(view.valid.mean()),
+            "tile_shift_m": float(np.hypot(*match.shift_en_m)),
+        }
         confidence = math.nan if self.confidence is None else self.confidence(evidence)
         return Fix(
             lat_deg=float(lat),

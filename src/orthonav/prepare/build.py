@@ -74,7 +74,7 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     recipe = _embedding_recipe(request.method, representation)
     mosaic = Mosaic.open(request.orthos)
     area = _area(request, mosaic)
-    gsd_m = request.gsd_m or _rounded(mosaic.gsd_m)
+    gsd_m = _rounded(mosaic.gsd_m) if request.gsd_m is None else request.gsd_m
     grid = TileGrid.covering(
         area.extent_en_m, gsd_m=gsd_m, tile_px=request.tile_px, overlap=request.overlap
     )

@@ -20,6 +20,7 @@ from orthonav.confidence.ratios import rival_score
 from orthonav.embed.whitened import WhitenedEmbedder
 from orthonav.geo.grid import TileGrid
 from orthonav.search.exact import ExactIndex
+from orthonav.search.peak import TileNeighbours
 
 CROPS = 192
 CROP_TILES = 1.5
@@ -29,8 +30,8 @@ MAX_REPLACED = 0.65
 MIRRORED_WEIGHT = 0.25
 ELSEWHERE_SHARE = 0.25
 """Share of changes that paste in another place of the map rather than none of it."""
-RADIUS_STRIDES = 1.0
-"""A fix is right where its tile's centre lies within this many strides of the truth."""
+RADIUS_STRIDES = 0.75
+"""A fix is right where it lies within this many strides of the truth."""
 MIN_RIGHT = 10
 
 
@@ -90,6 +91,7 @@ def calibrate(
     """Search changed and mirrored crops on the new map and fit the confidence to the outcome."""
     rng = np.random.default_rng([len(sampler.crops), 2])
     index = ExactIndex(embeddings)
+    neighbours = TileNeighbours(grid, centres_en_m)
     crops = [sampler.crops[i] for i in rng.permutation(len(sampler.crops))[:CROPS]]
     features, errors, mirrored = [], [], []
     for done, crop in enumerate(crops):
@@ -108,7 +110,8 @@ def calibrate(
                 grid.west_m + crop.col_px * grid.gsd_m,
                 grid.north_m - crop.row_px * grid.gsd_m,
             ]
-            errors.append(centres_en_m[best] - truth)
+            shift = np.multiply(neighbours.peak_offset(scores, best), grid.stride_m)
+            errors.append(centres_en_m[best] + shift - truth)
             mirrored.append(mirror)
         report("calibrate", (done + 1) / len(crops))
     return _fitted(np.array(features), np.array(errors), np.array(mirrored, dtype=bool), grid)

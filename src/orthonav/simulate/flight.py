@@ -214,7 +214,7 @@ def _route_poses(
     request: SimulateRequest, route: Route, area: Area, agl_m: float, coverage: _Coverage
 ) -> Iterator[_Pose]:
     line = route.points_en_m(area.frame)
-    spacing_m = request.spacing_m or request.speed_mps
+    spacing_m = request.speed_mps if request.spacing_m is None else request.spacing_m
     if not (spacing_m > 0 and request.speed_mps > 0):
         raise FlightError("distance between views and speed must be above 0")
     places, courses = along_polyline_en_m(line, spacing_m)

@@ -1,0 +1,129 @@
+"""What many tests share: a generated area at two dates, a map of it, a flight over it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from orthonav.flight import open_flight, read_truth
+from orthonav.geo.camera import Camera
+from orthonav.localizer import Localizer
+from orthonav.mapfile import open_map
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
+
+SEED = 2
+
+
+@dataclass(frozen=True)
+class SmallArea:
+    """A generated area: one orthophoto per date, a camera whose views at `agl_m` fill a tile."""
+
+    past: Path
+    present: Path
+    camera: Camera
+    agl_m: float
+
+
+@pytest.fixture(scope="session")
+def area(tmp_path_factory):
+    """Orthophotos of 1.2 x 1.0 km at 1 m, of two dates; not to be changed."""
+    folder = tmp_path_factory.mktemp("area")
+    dates = generate_area(folder, size_m=(1200.0, 1000.0), dates=DEFAULT_DATES[:2], seed=SEED)
+    return SmallArea(*dates, camera=Camera(320, 240, 250.0, 250.0, 160.0, 120.0), agl_m=300.0)
+
+
+@pytest.fixture(scope="session")
+def map_path(area, tmp_path_factory):
+    """A map of the first date: tiles of 128 px of 2 m; not to be changed."""
+    path = tmp_path_factory.mktemp("map") / "area.onav"
+    build_map(BuildRequest([area.past], path, tile_px=128, gsd_m=2.0))
+    return path
+
+
+@pytest.fixture(scope="session")
+def localizer(map_path):
+    """A localizer on that map."""
+    return Localizer(open_map(map_path))
+
+
+@pytest.fixture(scope="session")
+def flight_path(area, tmp_path_factory):
+    """A flight of 30 views of the second date, with errors and no prior; not to be changed."""
+    path = tmp_path_factory.mktemp("flights") / "flight"
+    errors = Errors(yaw_std_deg=4.0, agl_std=0.03, lean_std_deg=3.0)
+    request = SimulateRequest(
+        [area.present],
+        path,
+        random=30,
+        agl_m=area.agl_m,
+        camera=area.camera,
+        errors=errors,
+        seed=SEED,
+    )
+    simulate_flight(request)
+    return path
+
+
+@pytest.fixture(scope="session")
+def flight(flight_path):
+    """That flight, opened."""
+    return open_flight(flight_path)
+
+
+@pytest.fixture(scope="session")
+def truth_en_m(flight_path, localizer):
+    """True places of its views by frame, metres east and north in the plane of the map."""
+    truth = read_truth(flight_path / "truth.csv")
+    return {name: localizer.sheet.frame.en_from_latlon(*latlon) for name, latlon in truth.items()}
+
+
+def textured(shape=(400, 400), seed=0):
+    """A picture (H, W) uint8 of blots of many sizes, unlike itself everywhere."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros(shape, dtype=np.float32)
+    for sigma in (1.5, 4.0, 12.0):
+        blots = cv2.GaussianBlur(rng.normal(size=shape).astype(np.float32), (0, 0), sigma)
+        total += (blots / blots.std()).reshape(shape)
+    return np.clip(128 + 32 * total, 1, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="session")
+def make_ortho():
+    """Function that writes a picture (H, W) as an orthophoto in Lambert-93, 1 m a pixel."""
+    import rasterio
+    from rasterio.transform import Affine
+
+    def write(path, grey=None, crs="EPSG:2154", nodata=None, gsd_m=1.0):
+        grey = textured() if grey is None else grey
+        corner = Affine(gsd_m, 0, 700_000, 0, -gsd_m, 6_600_000)
+        height, width = grey.shape
+        with rasterio.open(
+            path,
+            "w",
+            driver="GTiff",
+            count=1,
+            height=height,
+            width=width,
+            dtype="uint8",
+            crs=crs,
+            transform=corner,
+            nodata=nodata,
+        ) as data:
+            data.write(grey[None])
+        return Path(path)
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def names_in():
+    """Function that lists everything below a folder, hidden temporaries included."""
+
+    def names(folder):
+        return sorted(str(path.relative_to(folder)) for path in Path(folder).rglob("*"))
+
+    return names

@@ -1,0 +1,310 @@
+"""The whitened embedding: a view of a tile gives what the tile gave, however it came in."""
+
+import dataclasses
+import pickle
+
+import cv2
+import numpy as np
+import pytest
+
+from orthonav import embed, represent
+from orthonav.embed.cells import MICRO, CellLayout
+from orthonav.embed.whitened import CellSheet, WhitenedRecipe, learn, pooled_features
+from orthonav.errors import AreaError, VariantError
+from orthonav.variants import make_variant, variant_from_recipe, variant_recipe
+
+TILE_PX = 128
+SHEET_PX = 384
+STRIDES = [64, 32, 16, 12, 10, 4, 2, 1]
+
+
+def ground(seed=0, size=SHEET_PX):
+    """Grey levels with detail of several sizes."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros((size, size), np.float32)
+    for sigma in (1.5, 5.0, 15.0):
+        blots = cv2.GaussianBlur(rng.normal(size=(size, size)).astype(np.float32), (0, 0), sigma)
+        total += blots / blots.std()
+    return np.clip(128 + 35 * total, 0, 255).astype(np.uint8)
+
+
+def maps_of(grey, valid=None, name="gradient"):
+    valid = np.ones(grey.shape, bool) if valid is None else valid
+    return make_variant(represent.TABLE, name)(grey, valid)
+
+
+def sheet_of(maps, valid, stride_px):
+    layout = CellLayout.for_tiles(TILE_PX, stride_px)
+    sheet = CellSheet(layout, *maps.shape[1:], len(maps))
+    sheet.fill(0, 0, maps, valid)
+    return sheet
+
+
+def grid_px(stride_px, count=5):
+    """First pixels (N, 2) of `count` x `count` tiles around the middle of the sheet."""
+    first = (SHEET_PX - TILE_PX) // 2 // stride_px - count // 2
+    along = np.clip(first + np.arange(count), 0, (SHEET_PX - TILE_PX) // stride_px) * stride_px
+    rows, cols = np.meshgrid(np.unique(along), np.unique(along), indexing="ij")
+    return np.stack([rows.ravel(), cols.ravel()], axis=1).astype(np.intp)
+
+
+class Place:
+    """A sheet whose every part is imagery, and an embedder learnt on it."""
+
+    def __init__(self, name="gradient", cells=8, dims=48, seed=0):
+        self.maps = maps_of(ground(seed), name=name)
+        self.valid = np.ones((SHEET_PX, SHEET_PX), bool)
+        self.sheet = sheet_of(self.maps, self.valid, 16)
+        self.tiles_px = grid_px(16, 17)
+        self.embedder = learn(WhitenedRecipe(cells=cells, dims=dims), self.sheet, self.tiles_px)
+
+    def cut(self, row, col):
+        part = np.s_[row : row + TILE_PX, col : col + TILE_PX]
+        return self.maps[:, part[0], part[1]], self.valid[part]
+
+
+@pytest.fixture(scope="module")
+def place():
+    return Place()
+
+
+@pytest.fixture(
+    scope="module", params=[("gradient", 8), ("gradient", 16), ("gray", 16), ("canny", 16)], ids=str
+)
+def any_place(request):
+    return Place(*request.param)
+
+
+def test_a_view_that_equals_a_tile_gives_its_embedding(any_place):
+    stored = any_place.embedder.tiles(any_place.sheet, any_place.tiles_px)
+    for row in (0, 40, len(stored) - 1):
+        seen = any_place.embedder.view(*any_place.cut(*any_place.tiles_px[row]))
+        np.testing.assert_allclose(seen, stored[row], atol=2e-3)
+        assert int((stored.astype(np.float32) @ seen).argmax()) == row
+
+
+@pytest.mark.parametrize("name, least", [("gradient", 0.9), ("gray", 0.999)])
+def test_a_view_is_represented_on_its_own(name, least):
+    """Its representation knows no pixels beyond its border; that costs little."""
+    place = Place(name, cells=8 if name == "gradient" else 16)
+    stored = place.embedder.tiles(place.sheet, place.tiles_px)
+    row, col = place.tiles_px[77]
+    grey = np.ascontiguousarray(ground()[row : row + TILE_PX, col : col + TILE_PX])
+    seen = place.embedder.view(maps_of(grey, name=name), np.ones(grey.shape, bool))
+    scores = stored.astype(np.float32) @ seen
+    assert scores.argmax() == 77 and scores[77] > least
+
+
+@pytest.mark.parametrize("stride_px", STRIDES)
+def test_the_stride_does_not_matter(place, stride_px):
+    sheet, tiles_px = sheet_of(place.maps, place.valid, stride_px), grid_px(stride_px)
+    together = place.embedder.tiles(sheet, tiles_px)
+    alone = [place.embedder.view(*place.cut(*tile)) for tile in tiles_px]
+    np.testing.assert_allclose(together, alone, atol=2e-3)
+
+
+@pytest.mark.parametrize("stride_px", [12, 1])
+def test_the_stride_does_not_matter_where_imagery_is_missing(place, stride_px):
+    valid = place.valid.copy()
+    valid[150:, 170:] = False
+    maps = maps_of(ground(), valid)
+    sheet, tiles_px = sheet_of(maps, valid, stride_px), grid_px(stride_px)
+    together = place.embedder.tiles(sheet, tiles_px)
+    shares = sheet.valid_share(tiles_px)
+    for tile_px, embedding, share in zip(tiles_px, together, shares, strict=True):
+        part = np.s_[tile_px[0] : tile_px[0] + TILE_PX, tile_px[1] : tile_px[1] + TILE_PX]
+        single = sheet_of(maps[:, part[0], part[1]], valid[part], TILE_PX)
+        alone = place.embedder.tiles(single, np.zeros((1, 2), np.intp))[0]
+        np.testing.assert_allclose(embedding, alone, atol=2e-3)
+        assert share == pytest.approx(valid[part].mean(), abs=1e-6)
+
+
+@pytest.mark.parametrize("stride_px", [16, 12, 6, 1])
+@pytest.mark.parametrize("block_px", [64, 100, 384])
+def test_filling_block_by_block_equals_filling_at_once(place, stride_px, block_px):
+    valid = place.valid.copy()
+    valid[100:180, 60:333] = False
+    maps = place.maps * valid
+    layout = CellLayout.for_tiles(TILE_PX, stride_px)
+    whole = sheet_of(maps, valid, stride_px)
+    blocks = CellSheet(layout, SHEET_PX, SHEET_PX, len(maps))
+    end = layout.micro_px - layout.spacing_px
+    for row in range(0, SHEET_PX, block_px):
+        for col in range(0, SHEET_PX, block_px):
+            part = np.s_[row : row + block_px + end, col : col + block_px + end]
+            blocks.fill(row, col, maps[:, part[0], part[1]], valid[part])
+    np.testing.assert_allclose(blocks.means, whole.means, atol=1e-3)
+    np.testing.assert_allclose(blocks.valid, whole.valid, atol=1e-6)
+
+
+@pytest.mark.parametrize("size_px", [1, 3, 4, 5, 127])
+def test_samples_are_those_that_fit(size_px):
+    for stride_px in (1, 2, 4):
+        layout = CellLayout.for_tiles(TILE_PX, stride_px)
+        starts = [at for at in range(0, size_px, layout.spacing_px) if at + 4 <= size_px]
+        assert layout.samples(size_px) == len(starts)
+
+
+@pytest.mark.parametrize("hidden", [0.1, 0.3, 0.5])
+def test_part_of_a_view_still_finds_its_tile(place, hidden):
+    stored = place.embedder.tiles(place.sheet, place.tiles_px).astype(np.float32)
+    side = round(TILE_PX * hidden)
+    for number, hide in enumerate((np.s_[:side, :], np.s_[:, -side:])):
+        row = 60 + number
+        maps, valid = (array.copy() for array in place.cut(*place.tiles_px[row]))
+        valid[hide] = False
+        seen = place.embedder.view(maps * valid, valid)
+        scores = stored @ seen
+        assert scores.argmax() == row and np.linalg.norm(seen) == pytest.approx(1, abs=1e-5)
+
+
+def test_what_is_hidden_does_not_matter(place):
+    valid = np.ones((TILE_PX, TILE_PX), bool)
+    valid[30:, 90:] = False
+    grey = ground()[:TILE_PX, :TILE_PX]
+    painted = np.where(valid, grey, ground(1)[:TILE_PX, :TILE_PX])
+    seen = [place.embedder.view(maps_of(one, valid), valid) for one in (grey, painted)]
+    np.testing.assert_array_equal(*seen)
+
+
+def test_nothing_to_see_is_zero(place):
+    maps = np.zeros_like(place.cut(0, 0)[0])
+    nothing = np.zeros(maps.shape[1:], bool)
+    assert not place.embedder.view(maps, nothing).any()
+    empty = sheet_of(maps, nothing, TILE_PX)
+    stored = place.embedder.tiles(empty, np.zeros((1, 2), np.intp))
+    assert np.isfinite(stored).all() and not stored.any()
+
+
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_blank_is_finite(any_place, level):
+    grey = np.full((TILE_PX, TILE_PX), level, np.uint8)
+    name = {7: "gradient", 1: "gray"}[len(any_place.maps)]
+    seen = any_place.embedder.view(maps_of(grey, name=name), np.ones(grey.shape, bool))
+    assert np.isfinite(seen).all() and np.linalg.norm(seen) < 1 + 1e-5
+
+
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_fewer_tiles_than_dims(place, count):
+    few = place.tiles_px[:: len(place.tiles_px) // count][:count]
+    embedder = learn(WhitenedRecipe(dims=128), place.sheet, few)
+    assert 1 <= embedder.dims <= count
+    stored = embedder.tiles(place.sheet, place.tiles_px)
+    assert np.isfinite(stored).all() and stored.shape == (len(place.tiles_px), embedder.dims)
+
+
+def test_no_more_dims_than_asked_for_and_the_first_are_the_same(place):
+    small = learn(WhitenedRecipe(dims=7), place.sheet, place.tiles_px)
+    assert small.dims == 7 and place.embedder.dims == 48
+    cosine = [
+        a @ b / np.linalg.norm(a) / np.linalg.norm(b)
+        for a, b in zip(
+            small.basis.T.astype(float), place.embedder.basis.T[:7].astype(float), strict=True
+        )
+    ]
+    assert min(cosine) > 0.999
+
+
+def test_identical_tiles_are_no_error():
+    maps, valid = np.zeros((7, SHEET_PX, SHEET_PX), np.float32), np.ones((SHEET_PX,) * 2, bool)
+    sheet = sheet_of(maps, valid, 16)
+    embedder = learn(WhitenedRecipe(), sheet, grid_px(16))
+    assert np.isfinite(embedder.tiles(sheet, grid_px(16))).all()
+
+
+def test_embeddings_are_unit_vectors(any_place):
+    stored = any_place.embedder.tiles(any_place.sheet, any_place.tiles_px).astype(float)
+    assert np.linalg.norm(stored, axis=1) == pytest.approx(1, abs=2e-3)
+    seen = any_place.embedder.view(*any_place.cut(3, 5))
+    assert seen.dtype == np.float32 and np.linalg.norm(seen) == pytest.approx(1, abs=1e-5)
+
+
+def test_places_are_told_apart(any_place):
+    """Whitened, tiles that share nothing are as likely alike as unlike."""
+    stored = any_place.embedder.tiles(any_place.sheet, any_place.tiles_px).astype(float)
+    apart = np.abs(any_place.tiles_px[:, None] - any_place.tiles_px[None]).max(axis=2) >= TILE_PX
+    scores = (stored @ stored.T)[apart]
+    assert abs(scores.mean()) < 0.15 and np.percentile(scores, 99) < 0.8
+
+
+def test_the_same_bytes_every_time(place):
+    again = Place()
+    for name, part in place.embedder.parts().items():
+        assert part.dtype == np.float16 and part.tobytes() == again.embedder.parts()[name].tobytes()
+    stored = place.embedder.tiles(place.sheet, place.tiles_px)
+    assert stored.tobytes() == again.embedder.tiles(again.sheet, again.tiles_px).tobytes()
+
+
+def test_chunks_do_not_matter(place, monkeypatch):
+    stored = place.embedder.tiles(place.sheet, place.tiles_px)
+    monkeypatch.setattr("orthonav.embed.whitened.CHUNK_TILES", 7)
+    np.testing.assert_allclose(place.embedder.tiles(place.sheet, place.tiles_px), stored, atol=2e-3)
+
+
+def test_a_share_of_many_tiles_is_learnt_from(place, monkeypatch):
+    monkeypatch.setattr("orthonav.embed.whitened.MAX_LEARNT_TILES", 100)
+    thinned = learn(place.embedder.recipe, place.sheet, place.tiles_px)
+    taken = learn(place.embedder.recipe, place.sheet, place.tiles_px[::3])
+    assert thinned.basis.tobytes() == taken.basis.tobytes()
+
+
+def test_inputs_are_untouched(place):
+    maps, valid = (array.copy() for array in place.cut(16, 16))
+    valid[:40] = False
+    kept = maps.copy(), valid.copy()
+    maps.flags.writeable = valid.flags.writeable = False
+    place.embedder.view(maps, valid)
+    np.testing.assert_array_equal(maps, kept[0])
+    np.testing.assert_array_equal(valid, kept[1])
+
+
+def test_contrast_does_not_matter_much(place):
+    """Each cell is divided by its own norm; only the floor below which it is empty stays."""
+    maps, valid = place.cut(48, 32)
+    assert place.embedder.view(maps, valid) @ place.embedder.view(maps * 2, valid) > 0.95
+    assert place.embedder.view(maps * 3, valid) @ place.embedder.view(maps * 6, valid) > 0.99
+
+
+def test_features_are_normalized_cell_by_cell(place):
+    features, weights = pooled_features(WhitenedRecipe(), place.sheet, place.tiles_px[:3])
+    assert features.shape == weights.shape == (3, 8 * 8 * 7) and (weights == 1).all()
+    norms = np.linalg.norm(features.reshape(3, 64, 7), axis=2)
+    assert (norms < 1).all() and norms.mean() > 0.8
+
+
+@pytest.mark.parametrize("shape", [(7, 128, 96), (7, 100, 100), (7, 33, 33)])
+def test_views_of_another_shape_are_refused(place, shape):
+    with pytest.raises(ValueError, match=f"square, a multiple of {MICRO}"):
+        place.embedder.view(np.zeros(shape, np.float32), np.ones(shape[1:], bool))
+
+
+@pytest.mark.parametrize("tile_px", [16, 100, 127])
+def test_tiles_that_cannot_be_divided_are_refused(tile_px):
+    with pytest.raises(AreaError, match=f"multiple of {MICRO}"):
+        CellLayout.for_tiles(tile_px, 16)
+
+
+@pytest.mark.parametrize("name", sorted(embed.TABLE))
+def test_recipe_is_a_frozen_value(name):
+    recipe = make_variant(embed.TABLE, name)
+    assert pickle.loads(pickle.dumps(recipe)) == recipe and hash(recipe) == hash(
+        make_variant(embed.TABLE, name)
+    )
+    assert variant_from_recipe(embed.TABLE, variant_recipe(embed.TABLE, recipe)) == recipe
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        recipe.dims = 3
+
+
+def test_embedder_can_be_sent_to_another_process(place):
+    again = pickle.loads(pickle.dumps(place.embedder))
+    np.testing.assert_array_equal(
+        again.view(*place.cut(16, 0)), place.embedder.view(*place.cut(16, 0))
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ["cells=0", "cells=5", "cells=64", "dims=0", "dims=5000", "floor=0", "floor=-1"]
+)
+def test_impossible_recipes_are_refused(text):
+    with pytest.raises(VariantError, match=text.partition("=")[0]):
+        make_variant(embed.TABLE, f"gradient:{text}")

@@ -1,0 +1,365 @@
+"""A built map: covers its area, is the same every time, and is written whole or not at all."""
+
+import errno
+import os
+
+import cv2
+import numpy as np
+import pytest
+
+from conftest import textured
+from orthonav.confidence.logistic import FEATURES
+from orthonav.errors import AreaError, MissingFileError, OrthonavError, OutputError, VariantError
+from orthonav.geo.area import Area
+from orthonav.geo.camera import Camera
+from orthonav.geo.route import Route
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.mapfile import open_map
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.prepare.calibrate import RADIUS_STRIDES
+from orthonav.records import Fix, Telemetry
+
+CAMERA = Camera(256, 256, 256.0, 256.0, 128.0, 128.0)
+"""It sees as many metres of ground as it is above it."""
+
+
+@pytest.fixture(scope="module")
+def ortho(make_ortho, tmp_path_factory):
+    """An orthophoto of 400 x 400 m, all valid."""
+    return make_ortho(tmp_path_factory.mktemp("ortho") / "2019-06.tif")
+
+
+@pytest.fixture(scope="module")
+def frame(ortho):
+    """The plane of a map of the whole of it."""
+    outline = Mosaic.open([ortho]).outline_latlon_deg
+    return Area.from_outline(outline[:, 0], outline[:, 1]).frame
+
+
+@pytest.fixture(autouse=True)
+def fewer_crops(map_path, monkeypatch):
+    """Calibration from a quarter of the crops, but for the map that all tests share."""
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 48)
+
+
+def built(ortho, folder, name="map.onav", **request):
+    request = {"tile_px": 64, "overlap": 0.75, **request}
+    orthos = ortho if isinstance(ortho, list) else [ortho]
+    build_map(BuildRequest(orthos, folder / name, **request))
+    return open_map(folder / name)
+
+
+def bounds_deg(frame, west_m, south_m, east_m, north_m):
+    lat, lon = frame.latlon_from_en([[west_m, south_m], [east_m, north_m]])
+    return float(lon[0]), float(lat[0]), float(lon[1]), float(lat[1])
+
+
+def route_of(frame, *points_en_m):
+    return Route(tuple(zip(*(c.tolist() for c in frame.latlon_from_en(points_en_m)), strict=True)))
+
+
+def centres_en_m(opened):
+    return opened.array("sheet0/centres_en_m", np.float32, 2).astype(float)
+
+
+def farthest_m(points_en_m, opened, frame):
+    """Distance per axis (Chebyshev) of each point (N, 2) of `frame` to the nearest tile centre."""
+    sheet = opened.manifest.sheets[0]
+    points = sheet.frame.en_from_latlon(*frame.latlon_from_en(points_en_m))
+    offset = np.abs(points[:, None] - centres_en_m(opened)[None]).max(axis=2)
+    return offset.min(axis=1)
+
+
+def inside_band(points_en_m, a, b, half_m):
+    along = np.clip(((points_en_m - a) @ (b - a)) / ((b - a) @ (b - a)), 0, 1)
+    return np.linalg.norm(points_en_m - (a + along[:, None] * (b - a)), axis=1) <= half_m
+
+
+def random_points(west_m, south_m, east_m, north_m, count=2000):
+    return np.random.default_rng(0).uniform([west_m, south_m], [east_m, north_m], (count, 2))
+
+
+REQUESTS = {
+    "plain": {},
+    "gray": {"edges": "gray"},
+    "canny": {"edges": "canny:low=50,high=120"},
+    "64 dims": {"method": "gradient:dims=64"},
+    "both": {"method": "gradient:dims=32,cells=16", "edges": "canny"},
+    "seed": {"seed": 5},
+}
+
+
+@pytest.mark.parametrize("request_", REQUESTS.values(), ids=REQUESTS.keys())
+def test_the_same_request_gives_the_same_bytes(ortho, tmp_path, names_in, request_):
+    first = built(ortho, tmp_path, "a.onav", **request_)
+    again = built(ortho, tmp_path, "b.onav", **request_)
+    assert first.path.read_bytes() == again.path.read_bytes()
+    assert names_in(tmp_path) == ["a.onav", "b.onav"]
+    recipe = first.manifest.recipe
+    assert recipe["overlap"] == 0.75 and recipe["seed"] == request_.get("seed", 0)
+
+
+def test_the_recipe_is_in_the_map(ortho, tmp_path):
+    recipe = built(ortho, tmp_path, **REQUESTS["both"]).manifest.recipe
+    assert recipe["embed"] == {"name": "gradient", "cells": 16, "dims": 32, "floor": 0.6}
+    assert recipe["represent"] == {"name": "canny", "low": 100.0, "high": 200.0, "kernel": 3}
+
+
+@pytest.mark.parametrize("edges", ["gray", "canny", "gradient"])
+def test_one_channel_is_compared_on_finer_cells(ortho, tmp_path, edges):
+    chosen = built(ortho, tmp_path, edges=edges).manifest.recipe["embed"]["cells"]
+    assert chosen == (8 if edges == "gradient" else 16)
+    told = built(ortho, tmp_path, "told.onav", edges=edges, method="gradient:cells=4")
+    assert told.manifest.recipe["embed"]["cells"] == 4
+
+
+def test_another_seed_changes_the_calibration_only(ortho, tmp_path):
+    a, b = built(ortho, tmp_path, "a.onav"), built(ortho, tmp_path, "b.onav", seed=1)
+    for name, part in a.arrays.items():
+        np.testing.assert_array_equal(part, b.arrays[name])
+    assert a.manifest.confidence != b.manifest.confidence
+
+
+def test_the_whole_imagery_is_covered(ortho, tmp_path, frame):
+    """A tile needs imagery under half of it, so corners of the imagery are left out."""
+    opened = built(ortho, tmp_path)
+    points = random_points(-195, -195, 195, 195)
+    points = points[np.abs(points).min(axis=1) < 195 - 32]
+    grid = opened.manifest.sheets[0].grid
+    assert farthest_m(points, opened, frame).max() <= grid.stride_m / 2 + 0.01
+    assert opened.manifest.sheets[0].area_km2 == pytest.approx(0.16, rel=0.1)
+
+
+@pytest.mark.parametrize("tile_px, overlap", [(64, 0.0), (96, 0.5), (64, 0.75), (96, 0.9)])
+def test_bounds_are_covered(ortho, tmp_path, frame, tile_px, overlap):
+    box = (-120.0, -60.0, 77.3, 131.9)
+    opened = built(
+        ortho, tmp_path, bounds_deg=bounds_deg(frame, *box), overlap=overlap, tile_px=tile_px
+    )
+    sheet = opened.manifest.sheets[0]
+    assert sheet.grid.stride_px == max(1, round(tile_px * (1 - overlap)))
+    assert farthest_m(random_points(*box), opened, frame).max() <= sheet.grid.stride_m / 2 + 0.01
+    reach = sheet.grid.stride_m
+    centres = frame.en_from_latlon(*sheet.frame.latlon_from_en(centres_en_m(opened)))
+    assert (centres > np.array(box[:2]) - reach).all()
+    assert (centres < np.array(box[2:]) + reach).all()
+
+
+def test_a_band_around_a_route_is_covered(ortho, tmp_path, frame):
+    a, b = np.array([-110.0, -90.0]), np.array([100.0, 60.0])
+    opened = built(ortho, tmp_path, route=route_of(frame, a, b), band_m=80.0, overlap=0.875)
+    points = random_points(-160, -140, 150, 110)
+    near = inside_band(points, a, b, 40.0)
+    stride_m = opened.manifest.sheets[0].grid.stride_m
+    assert 100 < near.sum() < 1500
+    assert farthest_m(points[near], opened, frame).max() <= stride_m / 2 + 0.01
+    sheet = opened.manifest.sheets[0]
+    centres = frame.en_from_latlon(*sheet.frame.latlon_from_en(centres_en_m(opened)))
+    assert inside_band(centres, a, b, 40.0 + stride_m).all()
+    assert sheet.tiles == len(centres) < sheet.grid.rows * sheet.grid.cols / 2
+
+
+def test_imagery_with_a_hole_is_covered_around_it(make_ortho, tmp_path, frame):
+    grey = textured()
+    grey[150:300, 170:260] = 0
+    opened = built(make_ortho(tmp_path / "hole.tif", grey, nodata=0), tmp_path)
+    cols, rows = np.meshgrid(np.arange(400), np.arange(400))
+    missing = cv2.dilate((grey == 0).astype(np.uint8), np.ones((65, 65), np.uint8)) > 0
+    points = np.stack([cols + 0.5 - 200, 200 - rows - 0.5], axis=-1)[40:360:5, 40:360:5]
+    points = points.reshape(-1, 2)[~missing[40:360:5, 40:360:5].ravel()]
+    stride_m = opened.manifest.sheets[0].grid.stride_m
+    assert farthest_m(points, opened, frame).max() <= stride_m / 2 + 0.5
+    assert farthest_m(np.array([[215 - 200, 200 - 225.0]]), opened, frame)[0] > stride_m
+
+
+@pytest.mark.parametrize("told, expected", [(None, 1.0), (0.5, 0.5), (1.7, 1.7), (2.0, 2.0)])
+def test_ground_resolution(ortho, tmp_path, told, expected):
+    grid = built(ortho, tmp_path, gsd_m=told, tile_px=32).manifest.sheets[0].grid
+    assert grid.gsd_m == expected and grid.stride_m == 8 * expected
+
+
+def test_the_finest_orthophoto_gives_the_resolution(make_ortho, tmp_path):
+    coarse = make_ortho(tmp_path / "coarse.tif", textured((200, 200)), gsd_m=2.0)
+    fine = make_ortho(tmp_path / "fine.tif", textured((300, 300)), gsd_m=0.7)
+    opened = built([coarse, fine], tmp_path, tile_px=128)
+    assert opened.manifest.sheets[0].grid.gsd_m == 0.7
+    assert [source["name"] for source in opened.manifest.imagery] == ["coarse.tif", "fine.tif"]
+
+
+def test_blocks_do_not_matter(ortho, tmp_path, monkeypatch):
+    whole = built(ortho, tmp_path, "a.onav")
+    monkeypatch.setattr("orthonav.prepare.build.BLOCK_PX", 150)
+    blocks = built(ortho, tmp_path, "b.onav")
+    scores = np.einsum(
+        "nd,nd->n",
+        *(m.array("sheet0/embeddings", np.float16, 2).astype(float) for m in (whole, blocks)),
+    )
+    assert scores.min() > 0.995
+    np.testing.assert_array_equal(centres_en_m(whole), centres_en_m(blocks))
+
+
+def test_the_manifest(ortho, tmp_path):
+    calls = []
+    request = BuildRequest([ortho], tmp_path / "deep" / "map.onav", tile_px=64)
+    result = build_map(request, lambda stage, share: calls.append((stage, share)))
+    manifest = open_map(request.out).manifest
+    assert manifest == result.manifest and result.size_bytes == request.out.stat().st_size
+    assert manifest.imagery[0]["date"] == "2019-06" and manifest.imagery[0]["name"] == ortho.name
+    assert manifest.radius_m == RADIUS_STRIDES * manifest.sheets[0].grid.stride_m
+    assert list(dict.fromkeys(stage for stage, _ in calls)) == ["imagery", "learn", "calibrate"]
+    assert all(0 <= share <= 1 for _, share in calls) and calls[-1] == ("calibrate", 1.0)
+
+
+def test_the_preview_shows_the_area(ortho, tmp_path):
+    opened = built(ortho, tmp_path)
+    picture = cv2.imdecode(opened.array("sheet0/preview_jpeg", np.uint8, 1), cv2.IMREAD_GRAYSCALE)
+    grid = opened.manifest.sheets[0].grid
+    assert picture.shape[0] / picture.shape[1] == pytest.approx(
+        grid.height_px / grid.width_px, rel=0.02
+    )
+    assert picture.std() > 10
+
+
+REFUSED = {
+    "both": (lambda frame: {"bounds_deg": (2, 46, 3, 47), "route": ROUTE}, AreaError, "not both"),
+    "band alone": (lambda frame: {"band_m": 100.0}, AreaError, "needs a route"),
+    "route alone": (lambda frame: {"route": ROUTE}, AreaError, "--band-m"),
+    "no band": (lambda frame: {"route": ROUTE, "band_m": 0.0}, AreaError, "wider than 0"),
+    "outside": (
+        lambda frame: {"bounds_deg": bounds_deg(frame, 3000, 3000, 3100, 3100)},
+        AreaError,
+        "outside the orthophotos",
+    ),
+    "just outside": (
+        lambda frame: {"bounds_deg": bounds_deg(frame, 250, -50, 300, 50)},
+        AreaError,
+        "outside the orthophotos",
+    ),
+    "turned bounds": (lambda frame: {"bounds_deg": (3, 46, 2, 47)}, AreaError, "west < east"),
+    "far route": (lambda frame: {"route": ROUTE, "band_m": 100.0}, AreaError, "no imagery"),
+    "large tiles": (lambda frame: {"tile_px": 1024}, AreaError, "larger than the imagery"),
+    "large pixels": (lambda frame: {"gsd_m": 20.0}, AreaError, "larger than the imagery"),
+    "tiny tiles": (lambda frame: {"tile_px": 8}, AreaError, "at least 16"),
+    "odd tiles": (lambda frame: {"tile_px": 100}, AreaError, "multiple of 32"),
+    "overlap": (lambda frame: {"overlap": 1.0}, AreaError, "overlap"),
+    "negative overlap": (lambda frame: {"overlap": -0.5}, AreaError, "overlap"),
+    "nan overlap": (lambda frame: {"overlap": float("nan")}, AreaError, "overlap"),
+    "negative gsd": (lambda frame: {"gsd_m": -1.0}, AreaError, "resolution"),
+    "zero gsd": (lambda frame: {"gsd_m": 0.0}, AreaError, "resolution"),
+    "nan gsd": (lambda frame: {"gsd_m": float("nan")}, AreaError, "resolution"),
+    "method": (lambda frame: {"method": "magic"}, VariantError, "unknown variant 'magic'"),
+    "edges": (lambda frame: {"edges": "canny:low=x"}, VariantError, "low"),
+    "parameter": (lambda frame: {"method": "gradient:size=3"}, VariantError, "size"),
+}
+ROUTE = Route(((46.0, 2.0), (46.001, 2.001)))
+
+
+@pytest.mark.parametrize("request_, error, message", REFUSED.values(), ids=REFUSED.keys())
+def test_what_cannot_be_built(ortho, tmp_path, frame, names_in, request_, error, message):
+    with pytest.raises(error, match=message):
+        built(ortho, tmp_path, **request_(frame))
+    assert names_in(tmp_path) == []
+
+
+def test_imagery_without_any_pixel(make_ortho, tmp_path, names_in):
+    nothing = make_ortho(tmp_path / "nothing.tif", np.zeros((300, 300), np.uint8), nodata=0)
+    with pytest.raises(OrthonavError, match=r"valid|nodata"):
+        built(nothing, tmp_path)
+    assert names_in(tmp_path) == ["nothing.tif"]
+
+
+def test_imagery_that_is_not_there(tmp_path, names_in):
+    with pytest.raises(MissingFileError):
+        built(tmp_path / "no.tif", tmp_path)
+    assert names_in(tmp_path) == []
+
+
+def test_a_uniform_orthophoto_is_no_crash(make_ortho, tmp_path):
+    """Nothing to learn from: a map, but one that promises nothing."""
+    flat = make_ortho(tmp_path / "flat.tif", np.full((300, 300), 99, np.uint8))
+    opened = built(flat, tmp_path)
+    assert opened.manifest.confidence is None and opened.manifest.view["position_std_m"] > 0
+
+
+@pytest.mark.parametrize("old", [None, b"an older map"])
+def test_a_full_disk_leaves_nothing_new(ortho, tmp_path, names_in, monkeypatch, old):
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    out = tmp_path / "out" / "map.onav"
+    out.parent.mkdir()
+    if old is not None:
+        out.write_bytes(old)
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OutputError, match="disk full"):
+        built(ortho, out.parent)
+    assert names_in(out.parent) == ([] if old is None else ["map.onav"])
+    assert old is None or out.read_bytes() == old
+
+
+@pytest.mark.parametrize("stage", ["imagery", "learn", "calibrate"])
+def test_an_interrupt_leaves_nothing(ortho, tmp_path, names_in, stage):
+    def progress(now, share):
+        if now == stage and share > 0.3:
+            raise KeyboardInterrupt
+
+    request = BuildRequest([ortho], tmp_path / "out" / "map.onav", tile_px=64)
+    with pytest.raises(KeyboardInterrupt):
+        build_map(request, progress)
+    assert names_in(tmp_path) == []
+
+
+def own_views(localizer, path, mirrored=False, count=40):
+    """Fixes of views cut from the imagery of a map, mirrored or not, with their true places."""
+    grid, rng = localizer.grid, np.random.default_rng(3)
+    width_m, height_m = grid.width_px * grid.gsd_m, grid.height_px * grid.gsd_m
+    corner = np.array([grid.west_m, grid.north_m])
+    fixes, truth = [], []
+    size = round(grid.tile_m * 1.3)
+    with Mosaic.open([path]).sheet(
+        localizer.sheet.frame,
+        west_m=corner[0],
+        north_m=corner[1],
+        width_px=int(width_m),
+        height_px=int(height_m),
+        gsd_m=1.0,
+    ) as raster:
+        while len(fixes) < count:
+            row, col = rng.integers(0, [int(height_m) - size, int(width_m) - size])
+            pixels = raster.read(int(col), int(row), size, size)
+            if not pixels.valid.all():
+                continue
+            grey = cv2.resize(pixels.grey, (256, 256), interpolation=cv2.INTER_AREA)
+            grey = np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey
+            fix = localizer.locate(grey, CAMERA, Telemetry(0, 0.0, 0.0, 0.0, float(size)))
+            assert isinstance(fix, Fix)
+            fixes.append(fix)
+            truth.append(corner + np.array([col + size / 2, -(row + size / 2)]))
+    return fixes, np.array(truth)
+
+
+def test_own_views_are_believed_and_mirrored_ones_not(localizer, area):
+    fixes, truth = own_views(localizer, area.past)
+    places = [localizer.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg) for fix in fixes]
+    errors_m = np.abs(np.array(places) - truth).max(axis=1)
+    own = np.array([fix.confidence for fix in fixes])
+    false = np.array([fix.confidence for fix in own_views(localizer, area.past, True)[0]])
+    assert (errors_m <= localizer.grid.stride_m).mean() >= 0.95
+    assert np.median(own) > 0.8 and np.median(false) < 0.4
+    assert (false[:, None] < own).mean() > 0.97  # nearly every pair is told apart
+    assert np.isfinite(own).all() and own.min() >= 0 and max(own.max(), false.max()) <= 1
+
+
+def test_confidence_is_a_probability_whatever_the_evidence(localizer):
+    rng = np.random.default_rng(0)
+    for scale in (0, 1, 1e3, 1e300):
+        for values in rng.uniform(-1, 1, (20, len(FEATURES))) * scale:
+            confidence = localizer.confidence(dict(zip(FEATURES, values, strict=True)))
+            assert 0 <= confidence <= 1
+
+
+def test_the_error_told_is_that_of_the_grid(map_path, ortho, tmp_path):
+    """A fix is the centre of a tile: at least the error of rounding to half a stride."""
+    for opened in (open_map(map_path), built(ortho, tmp_path)):
+        stride_m = opened.manifest.sheets[0].grid.stride_m
+        assert stride_m / np.sqrt(12) * 0.7 < opened.manifest.view["position_std_m"] < stride_m
