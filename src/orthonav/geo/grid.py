@@ -91,7 +91,8 @@ class TileGrid:
         half_m = self.tile_m / 2
         rows = (self.north_m - half_m - centres[:, 1]) / self.stride_m
         cols = (centres[:, 0] - self.west_m - half_m) / self.stride_m
-        return np.rint(np.stack([rows, cols], axis=1)).astype(np.intp)
+        with np.errstate(invalid="ignore"):  # NaN becomes a row far outside
+            return np.rint(np.stack([rows, cols], axis=1)).astype(np.intp)
 
     def centres_en_m(self, tiles_rc: NDArray[np.integer]) -> NDArray[np.float64]:
         """Local `(N, 2)` centres in metres of tiles given as `(N, 2)` grid rows and columns."""

@@ -23,6 +23,7 @@ from rasterio.windows import Window
 
 from orthonav.errors import ImageryError
 from orthonav.geo.frames import LocalFrame
+from orthonav.geo.grid import TileGrid
 from orthonav.imagery.source import Source, open_source, unreadable
 from orthonav.imagery.stretch import Stretch, sample_stretch
 from orthonav.imagery.thin import read_thinned
@@ -88,6 +89,17 @@ class Mosaic:
     ) -> "SheetRaster":
         """The mosaic resampled into `frame`, as a raster to be read by windows (use `with`)."""
         return SheetRaster(self, frame, west_m, north_m, width_px, height_px, gsd_m)
+
+    def grid_sheet(self, frame: LocalFrame, grid: TileGrid) -> "SheetRaster":
+        """The raster that all tiles of a grid together cover (use `with`)."""
+        return self.sheet(
+            frame,
+            west_m=grid.west_m,
+            north_m=grid.north_m,
+            width_px=grid.width_px,
+            height_px=grid.height_px,
+            gsd_m=grid.gsd_m,
+        )
 
 
 class SheetRaster:

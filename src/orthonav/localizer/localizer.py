@@ -172,7 +172,9 @@ class Localizer:
         if not heading_known:
             return [float(heading) for heading in np.arange(0, 360, UNKNOWN_HEADING_STEP_DEG)]
         std = telemetry.yaw_std_deg
-        std = DEFAULT_YAW_STD_DEG if std is None else min(max(std, 0.0), 90.0)
+        if std is None or math.isnan(std):
+            std = DEFAULT_YAW_STD_DEG
+        std = min(max(std, 0.0), 90.0)
         side = math.floor(HEADING_SIGMAS * std / self._step_deg + 0.5)
         return [telemetry.yaw_deg + k * self._step_deg for k in range(-side, side + 1)]
 

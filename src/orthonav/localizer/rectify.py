@@ -40,7 +40,7 @@ def prepare_view(
     grey: NDArray[np.uint8], camera: Camera, agl_m: float, gsd_m: float
 ) -> PreparedView:
     """Average the view down by whole numbers towards `gsd_m`, so that resampling cannot alias."""
-    factor = int(gsd_m / camera.gsd_m(agl_m))
+    factor = int(gsd_m / max(camera.gsd_m(agl_m), 1e-9))  # heights may be absurd, not yet refused
     width, height = camera.width_px // max(1, factor), camera.height_px // max(1, factor)
     if factor < 2 or width < 8 or height < 8:
         return PreparedView(grey, camera)

@@ -5,12 +5,11 @@ is a seven-number mean per micro-cell (about 0.5 MB per km2 at 1 m and 256 px ti
 """
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,9 +20,10 @@ from orthonav.errors import AreaError, VariantError
 from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
-from orthonav.imagery.mosaic import Mosaic, Pixels, SheetRaster
+from orthonav.imagery.mosaic import Mosaic
 from orthonav.mapfile.manifest import Manifest, SheetInfo
 from orthonav.mapfile.writer import write_map
+from orthonav.prepare.blocks import Preview, blocks_of, read_block
 from orthonav.prepare.calibrate import RADIUS_STRIDES, Calibration, CropSampler, calibrate
 from orthonav.variants import make_variant, variant_recipe
 
@@ -82,7 +82,7 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
         log.warning(
             "ground resolution of %.3g m is finer than the imagery's %.3g m", gsd_m, mosaic.gsd_m
         )
-    sampler = CropSampler(grid, request.seed)
+    sampler = CropSampler(grid.tile_px, request.seed)
     cells, preview = _read_cells(mosaic, area, grid, representation, sampler, report)
     tiles_rc = _tiles(area, grid, cells)
     report("learn", 0.0)
@@ -152,105 +152,28 @@ def _read_cells(
     """Micro-cell means of the whole sheet, and a small grey picture of it as JPEG bytes."""
     layout = CellLayout.for_tiles(grid.tile_px, grid.stride_px)
     cells = CellSheet(layout, grid.height_px, grid.width_px, representation.channels)
-    scale = min(1.0, PREVIEW_PX / max(grid.width_px, grid.height_px))
-    preview = np.zeros(
-        (max(1, round(grid.height_px * scale)), max(1, round(grid.width_px * scale))), np.uint8
-    )
-    raster = mosaic.sheet(
-        area.frame,
-        west_m=grid.west_m,
-        north_m=grid.north_m,
-        width_px=grid.width_px,
-        height_px=grid.height_px,
-        gsd_m=grid.gsd_m,
-    )
-    margin = layout.micro_px + getattr(representation, "margin_px", 8)
-    with raster:
-        blocks = list(_blocks(grid, layout))
-        for done, (row, col, height, width) in enumerate(blocks):
-            if _may_matter(area, grid, row, col, height, width):
-                pixels, top, left = _with_margin(raster, row, col, height, width, margin)
-                _fill(cells, pixels, representation, row, col, top, left, height, width)
-                sampler.offer(pixels.grey, pixels.valid, row - top, col - left)
-                _thumbnail(preview, pixels, scale, row, col, top, left, height, width)
+    preview = Preview(grid, PREVIEW_PX)
+    # Cells that begin in a block may end beyond it, within the margin.
+    beyond_px = layout.micro_px - layout.spacing_px
+    margin_px = layout.micro_px + representation.margin_px
+    side_px = max(1, BLOCK_PX // layout.micro_px) * layout.micro_px
+    blocks = [block for block in blocks_of(grid, side_px) if block.may_matter(area, grid)]
+    total_px = sum(block.height * block.width for block in blocks)
+    with mosaic.grid_sheet(area.frame, grid) as raster:
+        for done, block in enumerate(blocks):
+            read = read_block(raster, block, margin_px)
+            grey, valid = read.pixels.grey, read.pixels.valid
+            if valid.any():
+                part = read.part(beyond_px)
+                maps = representation(grey, valid)
+                cells.fill(block.row, block.col, maps[:, part[0], part[1]], valid[part])
+            share = block.height * block.width / total_px
+            sampler.offer(grey, valid, block.row - read.top, block.col - read.left, share)
+            preview.add(read)
             report("imagery", (done + 1) / len(blocks))
     if not cells.valid.any():
         raise AreaError("the area has no imagery: it lies outside the orthophotos or is all nodata")
-    encoded = cv2.imencode(".jpg", preview, [int(cv2.IMWRITE_JPEG_QUALITY), 70])[1]
-    return cells, np.asarray(encoded, dtype=np.uint8).reshape(-1)
-
-
-def _blocks(grid: TileGrid, layout: CellLayout) -> Iterator[tuple[int, int, int, int]]:
-    """Row, column, height, width in pixels of blocks that fill the sheet, on the cell raster."""
-    side = max(layout.micro_px, BLOCK_PX // layout.micro_px * layout.micro_px)
-    for row in range(0, grid.height_px, side):
-        for col in range(0, grid.width_px, side):
-            yield row, col, min(side, grid.height_px - row), min(side, grid.width_px - col)
-
-
-def _may_matter(area: Area, grid: TileGrid, row: int, col: int, height: int, width: int) -> bool:
-    """Whether a tile of the area could need the block (False may only come far from a route)."""
-    if area.route is None:
-        return True
-    centre = np.array(
-        [
-            [
-                grid.west_m + (col + width / 2) * grid.gsd_m,
-                grid.north_m - (row + height / 2) * grid.gsd_m,
-            ]
-        ]
-    )
-    reach_m = (np.hypot(height, width) / 2 + grid.tile_px + grid.stride_px) * grid.gsd_m
-    return bool(area.contains(centre, reach_m)[0])
-
-
-def _with_margin(
-    raster: SheetRaster, row: int, col: int, height: int, width: int, margin: int
-) -> tuple[Pixels, int, int]:
-    """A block with up to `margin` pixels around it, and how many of them are above and left."""
-    top, left = min(margin, row), min(margin, col)
-    bottom = min(margin, raster.height_px - row - height)
-    right = min(margin, raster.width_px - col - width)
-    pixels = raster.read(col - left, row - top, left + width + right, top + height + bottom)
-    return pixels, top, left
-
-
-def _fill(
-    cells: CellSheet,
-    pixels: Pixels,
-    representation: Any,
-    row: int,
-    col: int,
-    top: int,
-    left: int,
-    height: int,
-    width: int,
-) -> None:
-    if not pixels.valid.any():
-        return
-    maps = representation(pixels.grey, pixels.valid)
-    # Cells that begin in the block may end beyond it, within the margin.
-    end = cells.layout.micro_px - cells.layout.spacing_px
-    part = np.s_[top : top + height + end, left : left + width + end]
-    cells.fill(row, col, maps[:, part[0], part[1]], pixels.valid[part])
-
-
-def _thumbnail(
-    preview: NDArray[np.uint8],
-    pixels: Pixels,
-    scale: float,
-    row: int,
-    col: int,
-    top: int,
-    left: int,
-    height: int,
-    width: int,
-) -> None:
-    y0, y1 = round(row * scale), min(preview.shape[0], round((row + height) * scale))
-    x0, x1 = round(col * scale), min(preview.shape[1], round((col + width) * scale))
-    if y1 > y0 and x1 > x0:
-        block = pixels.grey[top : top + height, left : left + width]
-        preview[y0:y1, x0:x1] = cv2.resize(block, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
+    return cells, preview.jpeg()
 
 
 def _tiles(area: Area, grid: TileGrid, cells: CellSheet) -> NDArray[np.intp]:

@@ -56,20 +56,27 @@ class Calibration:
 class CropSampler:
     """Collects crops at random places from blocks of imagery as they pass by."""
 
-    def __init__(self, grid: TileGrid, seed: int) -> None:
+    def __init__(self, tile_px: int, seed: int) -> None:
         self._rng = np.random.default_rng([seed, 1])
-        self.size_px = round(grid.tile_px * CROP_TILES)
-        self._rate = CROPS / max(1.0, grid.width_px * grid.height_px - 1.0)
+        self.size_px = round(tile_px * CROP_TILES)
         self.crops: list[Crop] = []
 
     def offer(
-        self, grey: NDArray[np.uint8], valid: NDArray[np.bool_], row_px: int, col_px: int
+        self,
+        grey: NDArray[np.uint8],
+        valid: NDArray[np.bool_],
+        row_px: int,
+        col_px: int,
+        share: float,
     ) -> None:
-        """Take some crops from a block whose first pixel is (row_px, col_px) of the sheet."""
+        """Take some crops from a block whose first pixel is (row_px, col_px) of the sheet.
+
+        `share` is the part of all imagery offered that this block is.
+        """
         height, width = grey.shape
         if min(height, width) < self.size_px:
             return
-        for _ in range(self._rng.poisson(2.0 * self._rate * height * width)):
+        for _ in range(self._rng.poisson(2.0 * CROPS * share)):
             row = int(self._rng.integers(0, height - self.size_px + 1))
             col = int(self._rng.integers(0, width - self.size_px + 1))
             part = np.s_[row : row + self.size_px, col : col + self.size_px]

@@ -32,6 +32,11 @@ class Canny:
         """Number of channels C."""
         return 1
 
+    @property
+    def margin_px(self) -> int:
+        """How far a pixel's value can reach into the representation, but for hysteresis."""
+        return self.kernel // 2 + 2
+
     def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Edges (1, H, W), 1 on an edge and 0 elsewhere; none along the border of `valid`."""
         edges = cv2.Canny(np.ascontiguousarray(grey), self.low, self.high, apertureSize=self.kernel)

@@ -15,6 +15,11 @@ class Gray:
         """Number of channels C."""
         return 1
 
+    @property
+    def margin_px(self) -> int:
+        """How far a pixel's value can reach into the representation."""
+        return 0
+
     def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Grey levels (1, H, W) in 0..1."""
         return np.where(valid, grey, 0).astype(np.float32)[None] / np.float32(255)

@@ -1,0 +1,91 @@
+"""Reading a sheet block by block, so that memory does not depend on the orthophotos."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.geo.area import Area
+from orthonav.geo.grid import TileGrid
+from orthonav.imagery.mosaic import Pixels, SheetRaster
+
+
+@dataclass(frozen=True)
+class Block:
+    """A rectangle of a sheet's raster, in pixels."""
+
+    row: int
+    col: int
+    height: int
+    width: int
+
+    def may_matter(self, area: Area, grid: TileGrid) -> bool:
+        """Whether a tile of the area could need it (False comes only far from a route)."""
+        if area.route is None:
+            return True
+        east_m = grid.west_m + (self.col + self.width / 2) * grid.gsd_m
+        north_m = grid.north_m - (self.row + self.height / 2) * grid.gsd_m
+        reach_px = np.hypot(self.height, self.width) / 2 + grid.tile_px + grid.stride_px
+        return bool(area.contains(np.array([[east_m, north_m]]), reach_px * grid.gsd_m)[0])
+
+
+@dataclass(frozen=True, eq=False)
+class BlockPixels:
+    """Pixels of a block and of a margin around it; the block begins at (`top`, `left`) in them."""
+
+    block: Block
+    pixels: Pixels
+    top: int
+    left: int
+
+    def part(self, beyond_px: int = 0) -> tuple[slice, slice]:
+        """Rows and columns of the block in the pixels, `beyond_px` more to south and east."""
+        return (
+            slice(self.top, self.top + self.block.height + beyond_px),
+            slice(self.left, self.left + self.block.width + beyond_px),
+        )
+
+
+def blocks_of(grid: TileGrid, side_px: int) -> Iterator[Block]:
+    """Blocks of at most `side_px` that fill the raster of a grid."""
+    for row in range(0, grid.height_px, side_px):
+        for col in range(0, grid.width_px, side_px):
+            height, width = min(side_px, grid.height_px - row), min(side_px, grid.width_px - col)
+            yield Block(row, col, height, width)
+
+
+def read_block(raster: SheetRaster, block: Block, margin_px: int) -> BlockPixels:
+    """Read a block with up to `margin_px` around it, less where the raster ends."""
+    top, left = min(margin_px, block.row), min(margin_px, block.col)
+    bottom = min(margin_px, raster.height_px - block.row - block.height)
+    right = min(margin_px, raster.width_px - block.col - block.width)
+    width, height = left + block.width + right, top + block.height + bottom
+    pixels = raster.read(block.col - left, block.row - top, width, height)
+    return BlockPixels(block, pixels, top, left)
+
+
+class Preview:
+    """A small grey picture of a sheet, at most `across_px` wide or high, filled by blocks."""
+
+    def __init__(self, grid: TileGrid, across_px: int) -> None:
+        self._scale = min(1.0, across_px / max(grid.width_px, grid.height_px))
+        height, width = grid.height_px * self._scale, grid.width_px * self._scale
+        self._grey = np.zeros((max(1, round(height)), max(1, round(width))), np.uint8)
+
+    def add(self, read: BlockPixels) -> None:
+        """Take in a block."""
+        block, (rows, cols) = read.block, self._grey.shape
+        y0, y1 = (round(edge * self._scale) for edge in (block.row, block.row + block.height))
+        x0, x1 = (round(edge * self._scale) for edge in (block.col, block.col + block.width))
+        y1, x1 = min(y1, rows), min(x1, cols)
+        if y1 > y0 and x1 > x0:
+            grey = read.pixels.grey[read.part()]
+            small = cv2.resize(grey, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
+            self._grey[y0:y1, x0:x1] = small
+
+    def jpeg(self) -> NDArray[np.uint8]:
+        """The picture as bytes of a JPEG."""
+        encoded = cv2.imencode(".jpg", self._grey, [int(cv2.IMWRITE_JPEG_QUALITY), 70])[1]
+        return np.asarray(encoded, dtype=np.uint8).reshape(-1)
