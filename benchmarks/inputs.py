@@ -1,0 +1,123 @@
+"""What is measured on: generated orthophotos, kept between runs, and views flown over them."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import orthonav.simulate.landscape as landscape
+from orthonav.flight import open_flight, read_truth
+from orthonav.flight.folder import read_image
+from orthonav.geo.camera import Camera
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.records import Telemetry
+from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+
+LANDSCAPE_SEED = 1
+FLIGHT_SEED = 7
+PAST, PRESENT = landscape.DEFAULT_DATES[:2]
+REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+NAIP = REAL_DATA / "naip_nd"
+USUAL_ERRORS = Errors(yaw_std_deg=5.0, agl_std=0.05)
+# A heading told to be this good is tried as told; the error itself is far below a pixel.
+NO_ERRORS = Errors(yaw_std_deg=0.001)
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """Where a run may write: `scratch` is removed after it, `kept` holds generated areas."""
+
+    scratch: Path
+    kept: Path
+    quick: bool
+
+    @property
+    def views(self) -> int:
+        """Views per scene."""
+        return 25 if self.quick else 100
+
+    @property
+    def repeats(self) -> int:
+        """How often a whole process is timed."""
+        return 2 if self.quick else 3
+
+    def area(self, side_m: int, gsd_m: float, dates: Sequence[landscape.Epoch]) -> list[Path]:
+        """Orthophotos of a generated square; made anew when the generator has changed."""
+        name = f"{_generator()}-{side_m}m-{gsd_m:g}m"
+        paths = [self.kept / name / f"{date.name}.tif" for date in dates]
+        missing = [date for date, path in zip(dates, paths, strict=True) if not path.is_file()]
+        if missing:
+            landscape.generate_area(
+                self.kept / name,
+                size_m=(side_m, side_m),
+                gsd_m=gsd_m,
+                dates=missing,
+                seed=LANDSCAPE_SEED,
+            )
+        return paths
+
+    def map(self, ortho: Path, edges: str = "gradient", overlap: float = 0.875) -> Path:
+        """A map with the defaults of `orthonav build`, built once per run."""
+        out = self.scratch / f"{ortho.parent.name}-{ortho.stem}-{edges}-{overlap}.onav"
+        if not out.is_file():
+            build_map(BuildRequest([ortho], out, edges=edges, overlap=overlap))
+        return out
+
+    def fly(self, ortho: Path, count: int, errors: Errors) -> "Flight":
+        """Views at random places over an orthophoto."""
+        folder = self.scratch / f"{ortho.parent.name}-{ortho.stem}-{count}-{errors.agl_std}"
+        if not folder.is_dir():
+            request = SimulateRequest(
+                [ortho], folder, random=count, errors=errors, seed=FLIGHT_SEED
+            )
+            simulate_flight(request)
+        recorded = open_flight(folder)
+        truth = read_truth(folder / "truth.csv")
+        views = tuple(
+            View(view.path, read_image(view.path), view.telemetry, truth[view.frame])
+            for view in recorded.views
+        )
+        return Flight(folder, recorded.camera, views)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A picture `grey` (H, W), what was told with it, and where it was taken."""
+
+    path: Path
+    grey: NDArray[np.uint8]
+    telemetry: Telemetry
+    truth_latlon_deg: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """Views of one camera."""
+
+    folder: Path
+    camera: Camera
+    views: tuple[View, ...]
+
+
+def naip(year_file: str) -> Path | None:
+    """An orthophoto of the optional real imagery beside the checkout, None where it is absent."""
+    path = NAIP / year_file
+    return path if path.is_file() else None
+
+
+NAIP_ABSENT = (
+    "NAIP skipped: the optional real imagery beside the checkout (../shared/data) is absent"
+)
+NAIP_PAST, NAIP_PRESENT = "20090818.tif", "20180716.tif"
+
+
+def _generator() -> str:
+    """Short digest of the generator's sources."""
+    folder = Path(landscape.__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted(folder.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:8]

@@ -1,0 +1,91 @@
+"""One view on one core: the stages of `Localizer.locate` and the whole, warm."""
+
+from collections import defaultdict
+from collections.abc import Callable
+from functools import partial
+from typing import Any, TypeVar
+
+import numpy as np
+
+from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, USUAL_ERRORS, View, Workplace
+from benchmarks.machine import timed
+from benchmarks.record import Section, Table, timing_cells
+from orthonav.flight.folder import read_image
+from orthonav.geo.camera import Camera
+from orthonav.localizer import Localizer
+from orthonav.localizer.localizer import UNKNOWN_HEADING_STEP_DEG
+from orthonav.localizer.rectify import prepare_view
+from orthonav.mapfile import open_map
+
+REPEATS = 3
+Made = TypeVar("Made")
+STAGES = {
+    "decode": "decode JPEG (not part of locate)",
+    "thin": "thin the view to the map's resolution",
+    "rectify": "rectify, per heading",
+    "represent": "represent, per heading",
+    "embed": "embed, per heading",
+    "search": "search, 3 queries",
+    "match": "match: search and evidence, 3 queries",
+    "locate": "**whole `locate`, 3 headings**",
+    "unknown": "**whole `locate`, heading unknown**",
+}
+
+
+def measure(place: Workplace) -> Section:
+    """Time every stage on views of another date."""
+    section = Section("One view on one core")
+    side_m = 2000 if place.quick else 4000
+    present = place.area(2000, 1.0, [PRESENT])[0]
+    localizer = Localizer(open_map(place.map(place.area(side_m, 1.0, [PAST])[0])))
+    flight = place.fly(present, place.views, USUAL_ERRORS)
+    times_s: dict[str, list[float]] = defaultdict(list)
+    for view in flight.views[:3]:  # warm-up
+        _once(localizer, flight.camera, view, defaultdict(list))
+    for view in flight.views:
+        for _ in range(REPEATS):
+            _once(localizer, flight.camera, view, times_s)
+    tiles = len(localizer.centres_en_m)
+    data = f"generated {side_m / 1000:g} x {side_m / 1000:g} km, {tiles} tiles"
+    rows = []
+    for key, text in STAGES.items():
+        values_ms = np.array(times_s[key]) * 1e3
+        timing = section.add(key, "ms", values_ms, data=data, seed=FLIGHT_SEED)
+        rows.append([text, *timing_cells(timing), str(timing.n)])
+    section.facts["view_ms"] = float(np.median(times_s["locate"])) * 1e3
+    camera = flight.camera
+    notes = (
+        f"{camera.width_px} x {camera.height_px} px views on a map of {tiles:,} tiles at 1 m, "
+        f"{len(flight.views)} views, each {REPEATS} times, warm; ms",
+        f"heading unknown: {360 / UNKNOWN_HEADING_STEP_DEG:.0f} headings; one round per view",
+    )
+    header = ("stage", "median", "p10", "p90", "p99", "n")
+    section.tables = [Table("Stages of a view, ms", header, rows, notes)]
+    return section
+
+
+def _once(
+    localizer: Localizer, camera: Camera, view: View, times_s: dict[str, list[float]]
+) -> None:
+    """Run one view through every stage, then whole."""
+
+    def stage(name: str, run: Callable[..., Made], *arguments: Any) -> Made:
+        made, took_s = timed(run, *arguments)
+        times_s[name].append(took_s)
+        return made
+
+    told, gsd_m = view.telemetry, localizer.grid.gsd_m
+    stage("decode", read_image, view.path)
+    thinned = stage("thin", prepare_view, view.grey, camera, told.agl_m, gsd_m)
+    queries = []
+    for turn_deg in (-6.0, 0.0, 6.0):
+        seen = stage("rectify", localizer.rectified, thinned, told, told.yaw_deg + turn_deg)
+        maps = stage("represent", localizer.representation, seen.grey, seen.valid)
+        queries.append(stage("embed", localizer.embedder.view, maps, seen.valid))
+    stacked = np.stack(queries)
+    stage("search", localizer.index.scores, stacked)
+    stage("match", localizer.match, stacked)
+    stage("locate", localizer.locate, view.grey, camera, told)
+    if len(times_s["unknown"]) * REPEATS < len(times_s["locate"]):
+        unknown = partial(localizer.locate, heading_known=False)
+        stage("unknown", unknown, view.grey, camera, told)

@@ -1,0 +1,210 @@
+"""What a run leaves behind: measurements for programs, tables for people, and the machine."""
+
+import datetime
+import json
+import math
+import os
+import platform
+import subprocess
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+PACKAGES = ("orthonav", "numpy", "scipy", "opencv-python-headless", "safetensors", "rasterio")
+WILSON_Z = 1.2816
+"""For 80 % intervals of shares, so that their p10 and p90 mean what those of timings mean."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One measured quantity: median and spread of `n` samples.
+
+    Of a share, `median` is the share itself and p10 and p90 bound it (Wilson interval).
+    """
+
+    section: str
+    name: str
+    unit: str
+    median: float
+    p10: float
+    p90: float
+    p99: float | None
+    n: int
+    data: str
+    seed: int | None
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text under a header, the first column left-aligned, with notes below."""
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    notes: Sequence[str] = ()
+
+    def markdown(self) -> str:
+        """The table in Markdown, its columns aligned for the terminal."""
+        lines = [self.header, *self.rows]
+        widths = [max(len(line[col]) for line in lines) for col in range(len(self.header))]
+        rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
+        text = [f"#### {self.title}", ""]
+        for line in (self.header, rule, *self.rows):
+            first, *rest = line
+            cells = [first.ljust(widths[0])]
+            cells += [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
+            text.append(f"| {' | '.join(cells)} |")
+        notes = [f"- {note}" for note in self.notes]
+        return "\n".join([*text, "", *notes, ""] if notes else [*text, ""])
+
+
+@dataclass
+class Section:
+    """Everything one part of the suite found. `facts` are figures that targets ask for."""
+
+    title: str
+    tables: list[Table] = field(default_factory=list)
+    measurements: list[Measurement] = field(default_factory=list)
+    facts: dict[str, float] = field(default_factory=dict)
+
+    def add(
+        self, name: str, unit: str, samples: ArrayLike, *, data: str, seed: int | None = None
+    ) -> Measurement:
+        """Keep the median and the spread of samples (N,)."""
+        values = np.asarray(samples, dtype=np.float64).reshape(-1)
+        p10, median, p90, p99 = (float(v) for v in np.percentile(values, [10, 50, 90, 99]))
+        tail = p99 if len(values) >= 50 else None
+        made = Measurement(self.title, name, unit, median, p10, p90, tail, len(values), data, seed)
+        self.measurements.append(made)
+        return made
+
+    def add_share(self, name: str, hits: ArrayLike, *, data: str, seed: int) -> Measurement:
+        """Keep the share of true values among (N,) and the interval it is known to."""
+        values = np.asarray(hits, dtype=bool).reshape(-1)
+        low, high = _wilson(int(values.sum()), len(values))
+        share = float(values.mean())
+        made = Measurement(self.title, name, "1", share, low, high, None, len(values), data, seed)
+        self.measurements.append(made)
+        return made
+
+    def markdown(self) -> str:
+        """Title and tables in Markdown."""
+        text = [table.markdown() for table in self.tables]
+        own = [f"### {self.title}", ""] if all(t.title != self.title for t in self.tables) else []
+        return "\n".join([*own, *text])
+
+
+def _wilson(hits: int, count: int) -> tuple[float, float]:
+    """Wilson interval of a share (Wilson 1927)."""
+    share, z2 = hits / count, WILSON_Z**2
+    centre = (share + z2 / (2 * count)) / (1 + z2 / count)
+    half = WILSON_Z * math.sqrt(share * (1 - share) / count + z2 / (4 * count**2))
+    half /= 1 + z2 / count
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def number(value: float) -> str:
+    """Three digits that count, never an exponent."""
+    if not math.isfinite(value):
+        return "-"
+    digits = 2 - math.floor(math.log10(abs(value))) if value else 0
+    return f"{value:,.{min(6, max(0, digits))}f}"
+
+
+def timing_cells(timing: Measurement) -> list[str]:
+    """Median, p10, p90 and p99 as cells of a table."""
+    tail = "-" if timing.p99 is None else number(timing.p99)
+    return [number(timing.median), number(timing.p10), number(timing.p90), tail]
+
+
+TARGETS = (
+    ("naip_build_s", "NAIP map (17 km2 at 5 m, 256 px tiles) built in, s", 10.0),
+    ("view_ms", "one view, 3 headings, one core, ms", 10.0),
+    ("search_100k_ms", "3 queries on 100,000 tiles, one core, ms", 10.0),
+    ("map_mb_per_km2", "map at 1 m, 256 px tiles, 87.5 % overlap, MB per km2", 0.3),
+)
+
+
+def targets_table(done: Sequence[Section]) -> Section:
+    """Each target beside what was measured."""
+    facts = {key: value for section in done for key, value in section.facts.items()}
+    rows = []
+    for key, text, limit in TARGETS:
+        found = facts.get(key)
+        verdict = "not measured" if found is None else "yes" if found < limit else "NO"
+        rows.append([text, f"< {number(limit)}", "-" if found is None else number(found), verdict])
+    header = ("target", "limit", "measured", "met")
+    return Section("Targets", [Table("Targets", header, rows)], facts=facts)
+
+
+def save(
+    out: Path, done: Sequence[Section], *, quick: bool, wall_s: float, latest: bool
+) -> list[Path]:
+    """Write JSON and Markdown named by date and commit; also `latest.md` after a full run."""
+    about = provenance(quick, wall_s)
+    plain = {
+        **about,
+        "measurements": [asdict(one) for section in done for one in section.measurements],
+        "facts": done[-1].facts,
+    }
+    commit = str(about["commit"])[:10]
+    stem = f"{about['date'][:19].replace(':', '')}-{commit}{'-quick' if quick else ''}"
+    head = "\n".join(f"- {key}: {_said(value)}" for key, value in about.items())
+    text = "\n".join([head, "", *(section.markdown() for section in done)])
+    contents = {f"{stem}.json": json.dumps(plain, indent=1) + "\n", f"{stem}.md": text}
+    if latest:
+        contents["latest.md"] = text
+    out.mkdir(parents=True, exist_ok=True)
+    for name, content in contents.items():
+        (out / name).write_text(content, encoding="utf-8")
+    return [out / name for name in contents]
+
+
+def _said(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {item}" for key, item in value.items())
+    return str(value)
+
+
+def provenance(quick: bool, wall_s: float) -> dict[str, Any]:
+    """Commit, date, machine and versions of this run."""
+    with Path("/proc/meminfo").open() as stream:
+        memory_gb = int(stream.readline().split()[1]) / 2**20
+    return {
+        "commit": _git("rev-parse", "HEAD") or "unknown",
+        "dirty": bool(_git("status", "--porcelain")),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "run": f"{'quick' if quick else 'full'}, {wall_s:.0f} s",
+        "cpu": _cpu(),
+        "cores": os.cpu_count(),
+        "memory_gb": round(memory_gb, 1),
+        "load_1_5_15_min": " ".join(f"{load:.2f}" for load in os.getloadavg()),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in PACKAGES},
+        "threads": {
+            "BLAS": os.environ.get("OPENBLAS_NUM_THREADS", "unset"),
+            "OpenCV": f"{cv2.getNumThreads()} (map builds: all cores)",
+        },
+    }
+
+
+def _git(*arguments: str) -> str:
+    try:
+        found = subprocess.run(("git", *arguments), capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return found.stdout.strip()
+
+
+def _cpu() -> str:
+    for line in Path("/proc/cpuinfo").read_text().splitlines():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.processor() or "unknown"

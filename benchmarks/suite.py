@@ -1,0 +1,61 @@
+"""All sections in order, and what is made of them."""
+
+import argparse
+import logging
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+
+from benchmarks import building, comparison, per_view, processes, search_scale
+from benchmarks.inputs import Workplace
+from benchmarks.record import Section, save, targets_table
+
+SECTIONS: dict[str, Callable[[Workplace], Section]] = {
+    "build": building.measure,
+    "view": per_view.measure,
+    "search": search_scale.measure,
+    "process": processes.measure,
+    "compare": comparison.measure,
+}
+
+
+def run_suite(arguments: Sequence[str]) -> int:
+    """Run the sections asked for; returns the exit code."""
+    options = _parser().parse_args(arguments)
+    logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
+    cv2.setNumThreads(1)
+    cv2.setRNGSeed(0)
+    start = time.perf_counter()
+    done: list[Section] = []
+    with tempfile.TemporaryDirectory(prefix="orthonav-bench-") as folder:
+        place = Workplace(Path(folder), options.out / "data", options.quick)
+        for name in options.only or SECTIONS:
+            _say(f"{time.perf_counter() - start:5.0f} s  {name} ..")
+            section = SECTIONS[name](place)
+            print(section.markdown(), flush=True)
+            done.append(section)
+    done.append(targets_table(done))
+    print(done[-1].markdown())
+    whole = not options.only and not options.quick
+    wall_s = time.perf_counter() - start
+    paths = save(options.out, done, quick=options.quick, wall_s=wall_s, latest=whole)
+    _say(f"{wall_s:5.0f} s  done; written to {', '.join(map(str, paths))}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="smaller areas, fewer views")
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, help="only these sections")
+    parser.add_argument(
+        "--out", type=Path, default=Path("bench_results"), help="folder (default bench_results)"
+    )
+    return parser
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,397 @@
+"""The whole path of one view: found, gated by the prior, or told why not; never an exception."""
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from orthonav.errors import CameraError
+from orthonav.flight import read_image
+from orthonav.geo.area import Area
+from orthonav.geo.camera import Camera
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.localizer import Localizer
+from orthonav.mapfile import open_map
+from orthonav.records import Fix, NoFix, Prior, Telemetry
+from orthonav.simulate.render import ViewEffects, render_view
+
+EVIDENCE = {"score", "margin", "lowe_ratio", "peak_ratio", "tiles_searched", "valid_share"}
+PLAIN = ViewEffects(exposure_std=0.0, blur_px=0.0, noise_std=0.0)
+GROUND_M = 420
+
+
+@pytest.fixture(scope="module")
+def views(flight):
+    """Views of the second date: grey levels and telemetry by frame."""
+    return {view.frame: (read_image(view.path), view.telemetry) for view in flight.views}
+
+
+@pytest.fixture(scope="module")
+def fixes(views, flight, localizer):
+    """Their fixes, without any prior."""
+    return {
+        name: localizer.locate(grey, flight.camera, told) for name, (grey, told) in views.items()
+    }
+
+
+def place_en_m(localizer, fix):
+    return localizer.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
+
+
+def error_m(localizer, fix, truth_en_m):
+    return float(np.hypot(*(place_en_m(localizer, fix) - truth_en_m)))
+
+
+def prior_at(localizer, place_en_m, std_m):
+    lat, lon = localizer.sheet.frame.latlon_from_en(place_en_m)
+    return Prior(float(lat), float(lon), std_m)
+
+
+@pytest.fixture(scope="module")
+def good(fixes, localizer, truth_en_m):
+    """The frame that is placed best."""
+    return min(fixes, key=lambda name: error_m(localizer, fixes[name], truth_en_m[name]))
+
+
+class Ground:
+    """The first date, to be seen with any attitude."""
+
+    def __init__(self, area, localizer):
+        outline = Mosaic.open([area.past]).outline_latlon_deg
+        extent = Area.from_outline(outline[:, 0], outline[:, 1])
+        self.offset = localizer.sheet.frame.en_from_latlon(
+            extent.frame.lat_deg, extent.frame.lon_deg
+        )
+        assert np.hypot(*self.offset) < 0.1  # the map is of the whole imagery: the same plane
+        self.camera, self.agl_m = area.camera, area.agl_m
+        self.mosaic, self.frame = Mosaic.open([area.past]), localizer.sheet.frame
+
+    def view(self, east_m, north_m, yaw_deg=0.0, pitch_deg=0.0, roll_deg=0.0, camera=None):
+        """Grey levels of a view from that place, and telemetry that tells all but the place."""
+        west, north = east_m - GROUND_M, north_m + GROUND_M
+        sheet = self.mosaic.sheet(
+            self.frame,
+            west_m=west,
+            north_m=north,
+            width_px=2 * GROUND_M,
+            height_px=2 * GROUND_M,
+            gsd_m=1.0,
+        )
+        with sheet:
+            rgb = sheet.read(0, 0, 2 * GROUND_M, 2 * GROUND_M).rgb
+        attitude = (yaw_deg, pitch_deg, roll_deg, self.agl_m)
+        corner = np.array([-GROUND_M, GROUND_M], float)
+        rng = np.random.default_rng(0)
+        picture = render_view(camera or self.camera, attitude, rgb, corner, 1.0, PLAIN, rng)
+        grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
+        return grey, Telemetry(0, yaw_deg, pitch_deg, roll_deg, self.agl_m)
+
+
+@pytest.fixture(scope="module")
+def ground(area, localizer):
+    return Ground(area, localizer)
+
+
+def test_most_views_of_another_date_are_placed(fixes, localizer, truth_en_m):
+    errors = [error_m(localizer, fix, truth_en_m[name]) for name, fix in fixes.items()]
+    assert np.mean(np.array(errors) <= localizer.grid.stride_m) >= 0.9
+    right = [fix.confidence for fix, off in zip(fixes.values(), errors, strict=True) if off < 40]
+    assert np.median(right) > 0.5
+
+
+def test_a_fix_says_what_it_rests_on(fixes, flight, localizer):
+    for view in flight.views:
+        fix = fixes[view.frame]
+        assert isinstance(fix, Fix) and set(fix.evidence) >= EVIDENCE
+        assert all(math.isfinite(value) for value in fix.evidence.values())
+        assert fix.evidence["tiles_searched"] == localizer.sheet.tiles
+        assert 0 < fix.evidence["valid_share"] <= 1 and -1 <= fix.evidence["score"] <= 1.001
+        assert fix.evidence["peak_ratio"] >= fix.evidence["lowe_ratio"] >= 1
+        assert 0 <= fix.confidence <= 1 and fix.radius_m == localizer.radius_m
+        assert fix.agl_m == view.telemetry.agl_m
+        turned = (fix.heading_deg - view.telemetry.yaw_deg + 180) % 360 - 180
+        assert 0 <= fix.heading_deg < 360 and abs(turned) < 20
+        assert np.linalg.eigvalsh(fix.cov_en_m2).min() > 0
+        with pytest.raises(TypeError):
+            fix.evidence["score"] = 1.0
+
+
+def same(one, other):
+    assert type(one) is type(other)
+    if isinstance(one, NoFix):
+        return (one.reason, one.detail) == (other.reason, other.detail)
+    values = [
+        (f.lat_deg, f.lon_deg, f.confidence, f.heading_deg, f.agl_m, dict(f.evidence))
+        for f in (one, other)
+    ]
+    return values[0] == values[1] and (one.cov_en_m2 == other.cov_en_m2).all()
+
+
+def test_the_same_view_gives_the_same_fix(fixes, views, flight, localizer, map_path):
+    fresh = Localizer(open_map(map_path))
+    for name in list(fixes)[:6]:
+        grey, told = views[name]
+        kept = grey.copy()
+        assert same(localizer.locate(grey, flight.camera, told), fixes[name])
+        assert same(fresh.locate(grey, flight.camera, told), fixes[name])
+        np.testing.assert_array_equal(grey, kept)
+
+
+def test_threads_may_share_a_localizer(fixes, views, flight, map_path):
+    fresh = Localizer(open_map(map_path))  # cold, so that the caches are filled by both at once
+    with ThreadPoolExecutor(4) as pool:
+        found = pool.map(lambda item: fresh.locate(item[0], flight.camera, item[1]), views.values())
+        assert all(same(one, fix) for one, fix in zip(found, fixes.values(), strict=True))
+
+
+def test_a_prior_elsewhere_is_outside_the_map(views, flight, localizer, good):
+    grey, told = views[good]
+    for place in ([50_000.0, 0.0], [0.0, -3000.0]):
+        outcome = localizer.locate(
+            grey, flight.camera, told, prior=prior_at(localizer, place, 100.0)
+        )
+        assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
+
+
+def test_a_prior_near_the_truth_changes_nothing(views, fixes, flight, localizer, good, truth_en_m):
+    grey, told = views[good]
+    for std_m in (50.0, 150.0, 1e5):
+        prior = prior_at(localizer, truth_en_m[good], std_m)
+        fix = localizer.locate(grey, flight.camera, told, prior=prior)
+        assert place_en_m(localizer, fix) == pytest.approx(
+            place_en_m(localizer, fixes[good]), abs=1e-6
+        )
+        assert fix.evidence["score"] == pytest.approx(fixes[good].evidence["score"], abs=1e-6)
+        searched = fix.evidence["tiles_searched"]
+        assert (searched < localizer.sheet.tiles) == (std_m < 1e5) and searched > 0
+
+
+def test_a_prior_lets_no_tile_through_that_is_too_far(views, flight, localizer, good, truth_en_m):
+    grey, told = views[good]
+    wrong = truth_en_m[good] + [-400.0 if truth_en_m[good][0] > 0 else 400.0, 0.0]
+    std_m = 40.0
+    fix = localizer.locate(grey, flight.camera, told, prior=prior_at(localizer, wrong, std_m))
+    reach_m = 3 * std_m + localizer.grid.stride_m
+    assert error_m(localizer, fix, wrong) <= reach_m + localizer.grid.stride_m
+    inside = np.linalg.norm(localizer.centres_en_m - wrong, axis=1) <= reach_m
+    assert fix.evidence["tiles_searched"] == inside.sum()
+
+
+def test_a_prior_helps(views, flight, localizer, fixes, truth_en_m):
+    def right(found):
+        errors = [error_m(localizer, fix, truth_en_m[name]) for name, fix in found.items()]
+        return sum(error <= localizer.grid.stride_m for error in errors)
+
+    gated = {
+        name: localizer.locate(
+            grey, flight.camera, told, prior=prior_at(localizer, truth_en_m[name], 60.0)
+        )
+        for name, (grey, told) in views.items()
+    }
+    assert right(gated) >= right(fixes) and right(gated) >= 28
+
+
+@pytest.mark.parametrize("std_m", [0.0, -5.0])
+def test_a_prior_without_width_still_reaches_a_stride(
+    views, flight, localizer, good, truth_en_m, std_m
+):
+    grey, told = views[good]
+    prior = prior_at(localizer, truth_en_m[good], std_m)
+    fix = localizer.locate(grey, flight.camera, told, prior=prior)
+    assert isinstance(fix, Fix) and 1 <= fix.evidence["tiles_searched"] <= 5
+
+
+@pytest.mark.parametrize(
+    "prior", [Prior(math.nan, 3.0, 50.0), Prior(46.0, math.nan, 50.0), Prior(46.0, 3.0, math.nan)]
+)
+def test_a_prior_that_is_not_known_is_no_crash(views, flight, localizer, good, prior):
+    grey, told = views[good]
+    outcome = localizer.locate(grey, flight.camera, told, prior=prior)
+    assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
+
+
+def test_unknown_heading(ground, localizer):
+    places = [(-150.0, 40.0), (60.0, -30.0), (170.0, 100.0), (0.0, 0.0), (-60.0, -90.0)]
+    found = 0
+    for place in places:
+        grey, told = ground.view(*place, yaw_deg=137.0)
+        told = replace(told, yaw_deg=math.nan)
+        fix = localizer.locate(grey, ground.camera, told, heading_known=False)
+        assert isinstance(fix, Fix)
+        right = error_m(localizer, fix, np.array(place)) <= localizer.grid.stride_m
+        found += right
+        if right:
+            assert abs((fix.heading_deg - 137 + 180) % 360 - 180) <= 8
+        refused = localizer.locate(grey, ground.camera, told)
+        assert refused.reason == "missing_telemetry" and "yaw_deg" in refused.detail
+    assert found >= 4
+
+
+def test_a_told_heading_is_believed_only_as_far_as_it_errs(ground, localizer):
+    place = (60.0, -30.0)
+    grey, told = ground.view(*place, yaw_deg=40.0)
+    off = replace(told, yaw_deg=65.0)
+    sure = localizer.locate(grey, ground.camera, replace(off, yaw_std_deg=1.0))
+    unsure = localizer.locate(grey, ground.camera, replace(off, yaw_std_deg=20.0))
+    assert sure.heading_deg == pytest.approx(65.0, abs=6.1)
+    assert unsure.heading_deg == pytest.approx(40.0, abs=6.1)
+    assert error_m(localizer, unsure, np.array(place)) <= localizer.grid.stride_m
+
+
+@pytest.mark.parametrize("std_deg", [math.nan, math.inf, -3.0, 0.0, 1e9])
+def test_an_odd_error_of_the_heading_is_no_crash(ground, localizer, std_deg):
+    grey, told = ground.view(60.0, -30.0, yaw_deg=40.0)
+    fix = localizer.locate(grey, ground.camera, replace(told, yaw_std_deg=std_deg))
+    assert error_m(localizer, fix, np.array([60.0, -30.0])) <= localizer.grid.stride_m
+
+
+@pytest.mark.parametrize("yaw_deg", [-360.0, 360.0, 3600.0])
+def test_a_full_turn_changes_nothing(ground, localizer, yaw_deg):
+    grey, told = ground.view(-60.0, 20.0, yaw_deg=30.0)
+    turned = replace(told, yaw_deg=30.0 + yaw_deg)
+    one, other = (localizer.locate(grey, ground.camera, t) for t in (told, turned))
+    assert place_en_m(localizer, one) == pytest.approx(place_en_m(localizer, other), abs=0.5)
+    assert one.heading_deg == pytest.approx(other.heading_deg, abs=1e-6)
+
+
+@pytest.mark.parametrize("attitude", [(0, 15, -10), (75, 15, -10), (200, -12, 14), (0, 0, 25)])
+def test_tilt_is_compensated(ground, localizer, attitude):
+    place = np.array([40.0, -10.0])
+    level = localizer.locate(*args_of(ground, place, (attitude[0], 0, 0)))
+    leaning = localizer.locate(*args_of(ground, place, attitude))
+    assert error_m(localizer, level, place) <= localizer.grid.stride_m
+    apart = place_en_m(localizer, level) - place_en_m(localizer, leaning)
+    assert np.abs(apart).max() <= localizer.grid.stride_m
+
+
+def args_of(ground, place, attitude):
+    grey, told = ground.view(*place, *map(float, attitude))
+    return grey, ground.camera, told
+
+
+def test_a_lens_is_undone(ground, localizer):
+    lens = replace(ground.camera, distortion=(-0.3, 0.08, 0.001, -0.001))
+    grey, told = ground.view(40.0, -10.0, camera=lens)
+    fix = localizer.locate(grey, lens, told)
+    assert error_m(localizer, fix, np.array([40.0, -10.0])) <= localizer.grid.stride_m
+    plain = localizer.locate(ground.view(40.0, -10.0)[0], ground.camera, told)
+    assert fix.evidence["score"] == pytest.approx(plain.evidence["score"], abs=0.02)
+
+
+def test_a_fine_picture_of_the_same_ground(ground, localizer):
+    """Five times as many pixels, thinned before they are compared."""
+    fine = ground.camera.resized(1600, 1200)
+    grey, told = ground.view(40.0, -10.0, camera=fine)
+    fix = localizer.locate(grey, fine, told)
+    assert error_m(localizer, fix, np.array([40.0, -10.0])) <= localizer.grid.stride_m
+
+
+REFUSED_TELEMETRY = [
+    ({"yaw_deg": math.nan}, "missing_telemetry"),
+    ({"pitch_deg": math.nan}, "missing_telemetry"),
+    ({"roll_deg": math.inf}, "missing_telemetry"),
+    ({"agl_m": math.nan}, "missing_telemetry"),
+    ({"agl_m": 0.0}, "bad_height"),
+    ({"agl_m": -120.0}, "bad_height"),
+    ({"agl_m": 1e7}, "too_coarse"),
+    ({"agl_m": 1e300}, "too_coarse"),
+    ({"agl_m": 0.5}, "too_small"),
+    ({"agl_m": 1e-300}, "too_small"),
+    ({"agl_m": 5e-324}, "too_small"),
+    ({"pitch_deg": 80.0}, "extreme_tilt"),
+    ({"roll_deg": -80.0}, "extreme_tilt"),
+    ({"pitch_deg": 180.0}, "extreme_tilt"),
+]
+
+
+@pytest.mark.parametrize("changes, reason", REFUSED_TELEMETRY)
+def test_telemetry_that_makes_no_fix(views, flight, localizer, good, changes, reason):
+    grey, told = views[good]
+    outcome = localizer.locate(grey, flight.camera, replace(told, **changes))
+    assert isinstance(outcome, NoFix) and outcome.reason == reason
+    assert outcome.detail and "\n" not in outcome.detail
+
+
+@pytest.mark.parametrize(
+    "grey, reason",
+    [
+        (np.full((240, 320), 128, np.uint8), "blank"),
+        (np.zeros((240, 320), np.uint8), "too_dark"),
+        (np.full((240, 320), 255, np.uint8), "too_bright"),
+        (np.full((16, 16), 99, np.uint8), "too_small"),
+        (np.zeros((1, 1), np.uint8), "too_small"),
+    ],
+)
+def test_pictures_that_make_no_fix(localizer, grey, reason):
+    height, width = grey.shape
+    camera = Camera(width, height, 250.0, 250.0, width / 2, height / 2)
+    outcome = localizer.locate(grey, camera, Telemetry(0, 0.0, 0.0, 0.0, 300.0))
+    assert isinstance(outcome, NoFix) and outcome.reason == reason
+
+
+def test_a_picture_with_detail_only_where_it_is_not_compared(localizer):
+    grey = np.full((240, 960), 128, np.uint8)
+    grey[:, :200] = np.random.default_rng(0).integers(0, 255, (240, 200))
+    camera = Camera(960, 240, 250.0, 250.0, 480.0, 120.0)
+    outcome = localizer.locate(grey, camera, Telemetry(0, 0.0, 0.0, 0.0, 300.0))
+    assert isinstance(outcome, NoFix) and outcome.reason == "blank"
+
+
+@pytest.mark.parametrize("shape", [(240, 319), (320, 240), (480, 640)])
+def test_a_camera_of_another_size_is_an_error(localizer, flight, shape):
+    told = Telemetry(0, 0.0, 0.0, 0.0, 300.0)
+    with pytest.raises(CameraError, match=f"320 x 240 px, the image is {shape[1]} x {shape[0]}"):
+        localizer.locate(np.zeros(shape, np.uint8), flight.camera, told)
+
+
+anything = st.floats(allow_nan=True, allow_infinity=True)
+
+
+def mostly(usual):
+    """Mostly sane values, so that what follows the first checks is reached too."""
+    return st.one_of(usual, usual, usual, usual, usual, anything)
+
+
+told = st.builds(
+    Telemetry,
+    time_ns=st.just(0),
+    yaw_deg=mostly(st.floats(-400, 400)),
+    pitch_deg=mostly(st.floats(-46, 46)),
+    roll_deg=mostly(st.floats(-40, 40)),
+    agl_m=mostly(st.floats(100, 2000)),
+    yaw_std_deg=st.none() | mostly(st.floats(0, 40)),
+    agl_std_m=st.none() | anything,
+)
+priors = st.none() | st.builds(
+    Prior,
+    lat_deg=mostly(st.floats(48.85, 48.87)),
+    lon_deg=mostly(st.floats(2.34, 2.36)),
+    std_m=mostly(st.floats(0, 1000)),
+)
+
+
+@settings(
+    max_examples=150,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(telemetry=told, prior=priors, heading_known=st.booleans() | st.just(True))
+def test_no_telemetry_raises(localizer, views, flight, good, telemetry, prior, heading_known):
+    outcome = localizer.locate(
+        views[good][0], flight.camera, telemetry, prior=prior, heading_known=heading_known
+    )
+    if isinstance(outcome, NoFix):
+        assert outcome.reason and outcome.detail
+        return
+    assert isinstance(outcome, Fix)
+    assert math.isfinite(outcome.lat_deg) and math.isfinite(outcome.lon_deg)
+    assert abs(outcome.lat_deg) <= 90 and abs(outcome.lon_deg) <= 180
+    assert 0 <= outcome.heading_deg <= 360 and math.isfinite(outcome.agl_m)
+    assert np.isfinite(outcome.cov_en_m2).all() and 0 <= outcome.confidence <= 1
+    assert all(math.isfinite(value) for value in outcome.evidence.values())
