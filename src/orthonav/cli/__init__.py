@@ -4,8 +4,11 @@ import argparse
 import importlib
 import logging
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from orthonav import __version__
 from orthonav.errors import OrthonavError
@@ -33,8 +36,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
     logging.getLogger("rasterio").setLevel(logging.CRITICAL)
     try:
-        importlib.import_module(f"orthonav.cli.{options.command}").run(options)
-        sys.stdout.flush()
+        with _terminable():
+            importlib.import_module(f"orthonav.cli.{options.command}").run(options)
+            sys.stdout.flush()
     except OrthonavError as error:
         return _failed(_one_line(error), options.verbose)
     except KeyboardInterrupt:
@@ -45,6 +49,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     except MemoryError:
         return _failed("out of memory", options.verbose)
     return 0
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM ends like Ctrl-C meanwhile, so that it leaves no temporary files either."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may change signals
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _parser(arguments: list[str]) -> argparse.ArgumentParser:

@@ -15,7 +15,7 @@ MAX_COARSER = 4.0
 DARK_LEVEL = 16.0
 BRIGHT_LEVEL = 250.0
 MIN_STD = 3.0
-_SAMPLE_STEP_PX = 4
+_SAMPLE_STEP_PX = 8
 
 
 def check_telemetry(

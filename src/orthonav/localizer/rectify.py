@@ -3,7 +3,7 @@
 The ground is taken as flat. Rolling shutter is ignored.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -44,8 +44,11 @@ def prepare_view(
     width, height = camera.width_px // max(1, factor), camera.height_px // max(1, factor)
     if factor < 2 or width < 8 or height < 8:
         return PreparedView(grey, camera)
-    thinned = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
-    return PreparedView(np.asarray(thinned, dtype=np.uint8), camera.resized(width, height))
+    # Whole multiples only: what is left over at the right and below is not worth a slower path.
+    whole = replace(camera, width_px=width * factor, height_px=height * factor)
+    used = grey[: whole.height_px, : whole.width_px]
+    thinned = cv2.resize(used, (width, height), interpolation=cv2.INTER_AREA)
+    return PreparedView(np.asarray(thinned, dtype=np.uint8), whole.resized(width, height))
 
 
 def rectify(

@@ -16,6 +16,8 @@ from orthonav.errors import VariantError
 
 HARMONICS = 3
 BINS = 8
+# A triangular bin of an orientation histogram passes harmonic k with the weight sinc(k / bins)^2.
+_SHARES = [np.float32(np.sqrt(2) * np.sinc(k / BINS) ** 2) for k in range(1, HARMONICS + 1)]
 
 
 @dataclass(frozen=True)
@@ -52,21 +54,39 @@ class OrientedGradients:
         ).reshape(grey.shape)
         east = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32)
         south = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32)
-        power = east * east + south * south
-        inverse = 1 / (power + np.float32(1e-6))
-        cos, sin = (east * east - south * south) * inverse, 2 * east * south * inverse
-        weight = np.sqrt(power)
+        out = np.empty((self.channels, *grey.shape), dtype=np.float32)
+        power, south2 = east * east, south * south
+        cos = power - south2
+        power += south2
+        np.sqrt(power, out=out[0])
         if not valid.all():
             reach = 2 * self.margin_px + 1
-            weight *= cv2.erode(
+            out[0] *= cv2.erode(
                 valid.astype(np.uint8), np.ones((reach, reach), np.uint8), borderValue=1
             )
-        out = np.empty((self.channels, *grey.shape), dtype=np.float32)
-        out[0] = weight
-        real, imaginary = weight * cos, weight * sin
-        for k in range(1, HARMONICS + 1):
-            share = np.float32(np.sqrt(2) * np.sinc(k / BINS) ** 2)
-            np.multiply(real, share, out=out[2 * k - 1])
-            np.multiply(imaginary, share, out=out[2 * k])
-            real, imaginary = real * cos - imaginary * sin, real * sin + imaginary * cos
+        power += np.float32(1e-6)
+        cos /= power
+        sin = np.multiply(east, south, out=south2)
+        sin *= 2 / power
+        _fill_harmonics(out, cos, sin)
         return out
+
+
+def _fill_harmonics(
+    out: NDArray[np.float32], cos: NDArray[np.float32], sin: NDArray[np.float32]
+) -> None:
+    """Fill channels 1 on of `out` from channel 0 and the doubled direction's cosine and sine.
+
+    In place, each harmonic from the one before: fresh arrays would cost more than the arithmetic.
+    """
+    product = np.empty_like(cos)
+    np.multiply(out[0], cos, out=out[1])
+    np.multiply(out[0], sin, out=out[2])
+    for k in range(2, HARMONICS + 1):
+        real, imaginary = out[2 * k - 3], out[2 * k - 2]
+        np.multiply(real, cos, out=out[2 * k - 1])
+        out[2 * k - 1] -= np.multiply(imaginary, sin, out=product)
+        np.multiply(real, sin, out=out[2 * k])
+        out[2 * k] += np.multiply(imaginary, cos, out=product)
+    for k, share in enumerate(_SHARES, 1):
+        out[2 * k - 1 : 2 * k + 1] *= share

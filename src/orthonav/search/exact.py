@@ -35,27 +35,28 @@ class ExactIndex:
     ) -> NDArray[np.float32]:
         """Scalar products (N, Q) of queries (Q, D) with all embeddings, or with `rows` of them."""
         columns = np.ascontiguousarray(queries.T, dtype=np.float32)
-        if self._may_cache:
-            if self._decoded is None:
-                self._decoded = self._stored.astype(np.float32)
-            chosen = self._decoded if rows is None else self._decoded[rows]
-            return np.asarray(chosen @ columns)
-        count = len(self._stored) if rows is None else len(rows)
+        if self._may_cache and self._decoded is None:
+            self._decoded = self._stored.astype(np.float32)
+        source = self._stored if self._decoded is None else self._decoded
+        count = len(source) if rows is None else len(rows)
         out = np.empty((count, columns.shape[1]), dtype=np.float32)
+        # In blocks also where nothing is decoded: BLAS then takes a few queries twice as fast.
         for start in range(0, count, BLOCK_ROWS):
             part = slice(start, start + BLOCK_ROWS)
-            block = self._stored[part] if rows is None else self._stored[rows[part]]
-            np.matmul(_decode(block), columns, out=out[part])
+            block = source[part] if rows is None else source[rows[part]]
+            np.matmul(_float32(block), columns, out=out[part])
         return out
 
 
-def _decode(block: NDArray[np.float16]) -> NDArray[np.float32]:
+def _float32(block: NDArray[np.float16] | NDArray[np.float32]) -> NDArray[np.float32]:
     """float32 of float16; OpenCV's conversions are several times as fast as NumPy's."""
-    block = np.ascontiguousarray(block)
+    if block.dtype == np.float32:
+        return np.asarray(block, dtype=np.float32)
+    halves = np.ascontiguousarray(block, dtype=np.float16)
     if _CONVERT_FP16 is not None:
-        return np.asarray(_CONVERT_FP16(block.view(np.int16))).reshape(block.shape)
-    decoded = cv2.add(block, _ZERO, dtype=cv2.CV_32F)
-    return np.asarray(decoded, dtype=np.float32).reshape(block.shape)
+        return np.asarray(_CONVERT_FP16(halves.view(np.int16))).reshape(halves.shape)
+    decoded = cv2.add(halves, _ZERO, dtype=cv2.CV_32F)
+    return np.asarray(decoded, dtype=np.float32).reshape(halves.shape)
 
 
 def rows_within(
