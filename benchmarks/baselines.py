@@ -124,7 +124,7 @@ class TemplateMatch:
         what = "Canny edges" if canny else "grey"
         headings = "told heading" if len(turns_deg) == 1 else f"{len(turns_deg)} headings"
         self.name = f"matchTemplate, {what}, {headings}"
-        self.reference, self._canny, self._turns_deg = reference, canny, turns_deg
+        self.reference, self._canny, self.turns_deg = reference, canny, turns_deg
         self._picture = reference.edges if canny else reference.grey
         if canny:
             one_bit = [int(cv2.IMWRITE_PNG_BILEVEL), 1]
@@ -137,7 +137,7 @@ class TemplateMatch:
 
     def locate(self, camera: Camera, view: View) -> Place:
         """The highest correlation anywhere."""
-        views = self.reference.rectified(camera, view, self._turns_deg)
+        views = self.reference.rectified(camera, view, self.turns_deg)
         middle = views[0].grey.shape[0] // 2
         half = min(_seen_half_px(one.valid) for one in views)
         part = np.s_[middle - half : middle + half, middle - half : middle + half]

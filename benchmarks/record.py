@@ -1,6 +1,7 @@
 """What a run leaves behind: measurements for programs, tables for people, and the machine."""
 
 import datetime
+import hashlib
 import json
 import math
 import os
@@ -15,6 +16,8 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
+
+import orthonav
 
 PACKAGES = ("orthonav", "numpy", "scipy", "opencv-python-headless", "safetensors", "rasterio")
 WILSON_Z = 1.2816
@@ -49,12 +52,12 @@ class Table:
     rows: Sequence[Sequence[str]]
     notes: Sequence[str] = ()
 
-    def markdown(self) -> str:
+    def markdown(self, level: int = 3) -> str:
         """The table in Markdown, its columns aligned for the terminal."""
         lines = [self.header, *self.rows]
         widths = [max(len(line[col]) for line in lines) for col in range(len(self.header))]
         rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
-        text = [f"#### {self.title}", ""]
+        text = [f"{'#' * level} {self.title}", ""]
         for line in (self.header, rule, *self.rows):
             first, *rest = line
             cells = [first.ljust(widths[0])]
@@ -95,9 +98,9 @@ class Section:
 
     def markdown(self) -> str:
         """Title and tables in Markdown."""
-        text = [table.markdown() for table in self.tables]
-        own = [f"### {self.title}", ""] if all(t.title != self.title for t in self.tables) else []
-        return "\n".join([*own, *text])
+        if len(self.tables) == 1:
+            return self.tables[0].markdown(level=2)
+        return "\n".join([f"## {self.title}", "", *(table.markdown() for table in self.tables)])
 
 
 def _wilson(hits: int, count: int) -> tuple[float, float]:
@@ -144,17 +147,26 @@ def targets_table(done: Sequence[Section]) -> Section:
 
 
 def save(
-    out: Path, done: Sequence[Section], *, quick: bool, wall_s: float, latest: bool
+    out: Path, done: Sequence[Section], started: dict[str, Any], *, wall_s: float, latest: bool
 ) -> list[Path]:
-    """Write JSON and Markdown named by date and commit; also `latest.md` after a full run."""
-    about = provenance(quick, wall_s)
+    """Write JSON and Markdown named by date and commit; also `latest.md` after a full run.
+
+    `started` is the `provenance` taken before anything was measured.
+    """
+    same = started["sources"] == sources_digest()
+    about = {
+        **started,
+        "wall_s": round(wall_s),
+        "load_1_5_15_min": " ".join(f"{load:.2f}" for load in os.getloadavg()),
+        "sources": started["sources"] if same else "CHANGED DURING THE RUN: figures are mixed",
+    }
     plain = {
         **about,
         "measurements": [asdict(one) for section in done for one in section.measurements],
         "facts": done[-1].facts,
     }
     commit = str(about["commit"])[:10]
-    stem = f"{about['date'][:19].replace(':', '')}-{commit}{'-quick' if quick else ''}"
+    stem = f"{about['date'][:19].replace(':', '')}-{commit}-{about['run']}"
     head = "\n".join(f"- {key}: {_said(value)}" for key, value in about.items())
     text = "\n".join([head, "", *(section.markdown() for section in done)])
     contents = {f"{stem}.json": json.dumps(plain, indent=1) + "\n", f"{stem}.md": text}
@@ -172,19 +184,19 @@ def _said(value: Any) -> str:
     return str(value)
 
 
-def provenance(quick: bool, wall_s: float) -> dict[str, Any]:
-    """Commit, date, machine and versions of this run."""
+def provenance(run: str) -> dict[str, Any]:
+    """Commit, date, machine and versions; `run` is a word for what is run."""
     with Path("/proc/meminfo").open() as stream:
         memory_gb = int(stream.readline().split()[1]) / 2**20
     return {
         "commit": _git("rev-parse", "HEAD") or "unknown",
         "dirty": bool(_git("status", "--porcelain")),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "run": f"{'quick' if quick else 'full'}, {wall_s:.0f} s",
+        "sources": sources_digest(),
+        "run": run,
         "cpu": _cpu(),
         "cores": os.cpu_count(),
         "memory_gb": round(memory_gb, 1),
-        "load_1_5_15_min": " ".join(f"{load:.2f}" for load in os.getloadavg()),
         "system": platform.platform(),
         "python": platform.python_version(),
         "packages": {name: version(name) for name in PACKAGES},
@@ -193,6 +205,14 @@ def provenance(quick: bool, wall_s: float) -> dict[str, Any]:
             "OpenCV": f"{cv2.getNumThreads()} (map builds: all cores)",
         },
     }
+
+
+def sources_digest() -> str:
+    """Short digest of the package's sources: tells whether they changed during a run."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(orthonav.__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def _git(*arguments: str) -> str:

@@ -12,7 +12,7 @@ import cv2
 
 from benchmarks import building, comparison, per_view, processes, search_scale
 from benchmarks.inputs import Workplace
-from benchmarks.record import Section, save, targets_table
+from benchmarks.record import Section, provenance, save, targets_table
 
 SECTIONS: dict[str, Callable[[Workplace], Section]] = {
     "build": building.measure,
@@ -30,6 +30,7 @@ def run_suite(arguments: Sequence[str]) -> int:
     cv2.setNumThreads(1)
     cv2.setRNGSeed(0)
     start = time.perf_counter()
+    started = provenance(_kind(options))
     done: list[Section] = []
     with tempfile.TemporaryDirectory(prefix="orthonav-bench-") as folder:
         place = Workplace(Path(folder), options.out / "data", options.quick)
@@ -40,11 +41,15 @@ def run_suite(arguments: Sequence[str]) -> int:
             done.append(section)
     done.append(targets_table(done))
     print(done[-1].markdown())
-    whole = not options.only and not options.quick
     wall_s = time.perf_counter() - start
-    paths = save(options.out, done, quick=options.quick, wall_s=wall_s, latest=whole)
+    paths = save(options.out, done, started, wall_s=wall_s, latest=started["run"] == "full")
     _say(f"{wall_s:5.0f} s  done; written to {', '.join(map(str, paths))}")
     return 0
+
+
+def _kind(options: argparse.Namespace) -> str:
+    kind = "quick" if options.quick else "full"
+    return "-".join([kind, "only", *options.only]) if options.only else kind
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -201,7 +201,7 @@ def test_thinning_is_by_whole_numbers(agl_m, gsd_m, expected):
     view = prepare_view(np.zeros((240, 320), np.uint8), PLAIN, agl_m, gsd_m)
     assert view.grey.shape[::-1] == expected
     assert (view.camera.width_px, view.camera.height_px) == expected
-    factor = max(320 // expected[0], 1)
+    factor = 1 if expected == (320, 240) else int(gsd_m / PLAIN.gsd_m(agl_m))
     assert view.camera.fx_px == pytest.approx(PLAIN.fx_px / factor)
     assert view.camera.cy_px == pytest.approx(PLAIN.cy_px / factor)
 

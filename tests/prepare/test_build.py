@@ -231,14 +231,14 @@ REFUSED = {
         "outside the orthophotos",
     ),
     "just outside": (
-        lambda frame: {"bounds_deg": bounds_deg(frame, 250, -50, 300, 50)},
+        lambda frame: {"bounds_deg": bounds_deg(frame, 250, -50, 350, 50)},
         AreaError,
         "outside the orthophotos",
     ),
     "turned bounds": (lambda frame: {"bounds_deg": (3, 46, 2, 47)}, AreaError, "west < east"),
     "far route": (lambda frame: {"route": ROUTE, "band_m": 100.0}, AreaError, "no imagery"),
-    "large tiles": (lambda frame: {"tile_px": 1024}, AreaError, "larger than the imagery"),
-    "large pixels": (lambda frame: {"gsd_m": 20.0}, AreaError, "larger than the imagery"),
+    "large tiles": (lambda frame: {"tile_px": 1024}, AreaError, "larger than the area"),
+    "large pixels": (lambda frame: {"gsd_m": 20.0}, AreaError, "larger than the area"),
     "tiny tiles": (lambda frame: {"tile_px": 8}, AreaError, "at least 16"),
     "odd tiles": (lambda frame: {"tile_px": 100}, AreaError, "multiple of 32"),
     "overlap": (lambda frame: {"overlap": 1.0}, AreaError, "overlap"),
@@ -309,7 +309,7 @@ def test_an_interrupt_leaves_nothing(ortho, tmp_path, names_in, stage):
     assert names_in(tmp_path) == []
 
 
-def own_views(localizer, path, mirrored=False, count=40):
+def own_views(localizer, path, mirrored=False, count=30):
     """Fixes of views cut from the imagery of a map, mirrored or not, with their true places."""
     grid, rng = localizer.grid, np.random.default_rng(3)
     width_m, height_m = grid.width_px * grid.gsd_m, grid.height_px * grid.gsd_m

@@ -29,25 +29,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Matrices here are small: more BLAS threads only wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = list(sys.argv[1:] if argv is None else argv)
-    options = _parser(arguments).parse_args(arguments)
-    level = (
-        logging.ERROR if options.quiet else logging.DEBUG if options.verbose else logging.WARNING
-    )
-    logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
-    logging.getLogger("rasterio").setLevel(logging.CRITICAL)
+    verbose = False
     try:
+        options = _parser(arguments).parse_args(arguments)
+        verbose = options.verbose
+        level = logging.DEBUG if verbose else logging.ERROR if options.quiet else logging.WARNING
+        logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
+        logging.getLogger("rasterio").setLevel(logging.CRITICAL)
         with _terminable():
             importlib.import_module(f"orthonav.cli.{options.command}").run(options)
             sys.stdout.flush()
     except OrthonavError as error:
-        return _failed(_one_line(error), options.verbose)
+        return _failed(_one_line(error), verbose)
     except KeyboardInterrupt:
         return _failed("interrupted; nothing was written", False)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except MemoryError:
-        return _failed("out of memory", options.verbose)
+        return _failed("out of memory", verbose)
     return 0
 
 

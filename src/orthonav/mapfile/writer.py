@@ -1,6 +1,7 @@
 """Writing a map: one safetensors file, whole or not at all, the same bytes every time."""
 
 import dataclasses
+import errno
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -37,5 +38,7 @@ def write_map(path: Path, manifest: Manifest, arrays: Mapping[str, NDArray[Any]]
         try:
             save_file(parts, temporary, metadata={METADATA_KEY: full.to_json()})
         except SafetensorError as error:
+            if f"os error {errno.ENOSPC}" in str(error):
+                raise OSError(errno.ENOSPC, "disk full") from error
             raise OutputError(f"map cannot be written ({error}): {path}") from error
     return full

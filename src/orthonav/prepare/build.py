@@ -78,6 +78,14 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     grid = TileGrid.covering(
         area.extent_en_m, gsd_m=gsd_m, tile_px=request.tile_px, overlap=request.overlap
     )
+    west, south, east, north = area.extent_en_m
+    side_m = min(east - west, north - south)
+    if area.route is None and side_m < 0.999 * grid.tile_m:
+        raise AreaError(
+            f"a tile of {grid.tile_px} px is {grid.tile_m:.0f} m wide, larger than the area, "
+            f"{east - west:.0f} x {north - south:.0f} m; use smaller tiles, a finer ground "
+            "resolution or a larger area"
+        )
     if gsd_m < 0.8 * mosaic.gsd_m:
         log.warning(
             "ground resolution of %.3g m is finer than the imagery's %.3g m", gsd_m, mosaic.gsd_m

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from math import isfinite
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 
@@ -55,7 +56,7 @@ def generate_area(
             except OSError as error:
                 if isinstance(error, OutputError) or error.errno is not None:
                     raise  # GDAL's own errors carry no number
-                raise OutputError(f"cannot write ({error}): {path}") from error
+                raise OutputError(f"cannot write ({error.__cause__ or error}): {path}") from error
         paths.append(path)
     return paths
 
@@ -106,12 +107,27 @@ def _write(
         "BIGTIFF": "IF_SAFER",
     }
     done = 0
+    checksums = []
     with rasterio.open(path, "w", **profile) as target:
         target.update_tags(TIFFTAG_DATETIME=date.tiff_datetime, TIFFTAG_SOFTWARE="orthonav")
         for col, row, width, height in chunks(width_px, height_px, _WINDOW_PX):
             picture = landscape.render(
                 date, west_m + col * gsd_m, north_m - row * gsd_m, width, height, gsd_m
             )
-            target.write(np.moveaxis(picture, 2, 0), window=Window(col, row, width, height))
+            window = Window(col, row, width, height)
+            target.write(np.moveaxis(picture, 2, 0), window=window)
+            checksums.append((window, crc32(picture.tobytes())))
             done += width * height
             report(done / (width_px * height_px))
+    _check_written(path, checksums)
+
+
+def _check_written(path: Path, checksums: list[tuple[Any, int]]) -> None:
+    """Read windows back: GDAL writes its last blocks while closing, and fails there silently."""
+    import rasterio
+
+    with rasterio.open(path) as source:
+        for window, checksum in checksums:
+            picture = np.moveaxis(source.read(window=window), 0, 2)
+            if crc32(picture.tobytes()) != checksum:
+                raise OSError("what was written cannot be read back; is the disk full?")

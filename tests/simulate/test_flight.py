@@ -1,0 +1,308 @@
+"""Simulated flights: the picture shows the ground at the truth, the telemetry errs as stated."""
+
+import errno
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from orthonav.errors import AreaError, FlightError, OutputError
+from orthonav.flight import FlightWriter, open_flight, read_image, read_truth
+from orthonav.geo.area import Area
+from orthonav.geo.camera import Camera
+from orthonav.geo.route import Route
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.localizer import prepare_view, rectify
+from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+from orthonav.simulate.render import ViewEffects
+
+PLAIN = ViewEffects(exposure_std=0.0, blur_px=0.0, noise_std=0.0, jpeg_quality=100)
+SMALL = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
+SEEN = Camera(320, 240, 260.0, 255.0, 158.0, 121.5)
+LENS = Camera(320, 240, 260.0, 255.0, 158.0, 121.5, (-0.15, 0.03, 0.001, -0.002))
+SIZE_PX = 96
+
+
+@pytest.fixture(scope="module")
+def plane(area):
+    """The plane that simulated flights over the first date use."""
+    outline = Mosaic.open([area.past]).outline_latlon_deg
+    return Area.from_outline(outline[:, 0], outline[:, 1])
+
+
+def flown(area, path, **request):
+    request = {"random": 5, "agl_m": 100.0, "camera": SMALL, "effects": PLAIN, **request}
+    simulate_flight(SimulateRequest([area.past], path, **request))
+    return open_flight(path), read_truth(path / "truth.csv")
+
+
+def route_of(frame, *points_en_m):
+    return Route(tuple(zip(*(c.tolist() for c in frame.latlon_from_en(points_en_m)), strict=True)))
+
+
+def ground_at(area, frame, place_en_m, gsd_m=1.0):
+    """The orthophoto (S, S) around a place."""
+    half = SIZE_PX * gsd_m / 2
+    with Mosaic.open([area.past]).sheet(
+        frame,
+        west_m=place_en_m[0] - half,
+        north_m=place_en_m[1] + half,
+        width_px=SIZE_PX,
+        height_px=SIZE_PX,
+        gsd_m=gsd_m,
+    ) as raster:
+        return raster.read(0, 0, SIZE_PX, SIZE_PX).grey
+
+
+@pytest.mark.parametrize("camera", [SEEN, LENS], ids=["pinhole", "lens"])
+@pytest.mark.parametrize("lean_std_deg", [0.0, 6.0])
+def test_the_picture_shows_the_ground_at_the_truth(area, plane, tmp_path, camera, lean_std_deg):
+    flight, truth = flown(
+        area,
+        tmp_path / "f",
+        camera=camera,
+        agl_m=150.0,
+        errors=Errors(lean_std_deg=lean_std_deg),
+        seed=4,
+    )
+    for view in flight.views:
+        told = view.telemetry
+        prepared = prepare_view(read_image(view.path), camera, told.agl_m, 1.0)
+        rectified = rectify(
+            prepared,
+            yaw_deg=told.yaw_deg,
+            pitch_deg=told.pitch_deg,
+            roll_deg=told.roll_deg,
+            agl_m=told.agl_m,
+            gsd_m=1.0,
+            size_px=SIZE_PX,
+        )
+        place = plane.frame.en_from_latlon(*truth[view.frame]) + rectified.offset_en_m
+        ground = ground_at(area, plane.frame, place)
+        assert rectified.valid.all()
+        found = np.eye(2, 3, dtype=np.float32)
+        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)
+        alike, found = cv2.findTransformECC(
+            ground, rectified.grey, found, cv2.MOTION_TRANSLATION, stop
+        )
+        assert np.hypot(*found[:, 2]) < 0.1 and alike > 0.9
+
+
+def test_errors_have_the_stated_size(area, plane, tmp_path):
+    """The same seed without errors is the same flight, told exactly."""
+    count = 180
+    errors = Errors(yaw_std_deg=4.0, agl_std=0.05, tilt_std_deg=1.5, prior_std_m=30.0)
+    exact, truth = flown(area, tmp_path / "exact", random=count, seed=9)
+    erring, same = flown(area, tmp_path / "erring", random=count, errors=errors, seed=9)
+    assert truth == same
+    pairs = [(a.telemetry, b.telemetry) for a, b in zip(exact.views, erring.views, strict=True)]
+    yaw = np.array([(b.yaw_deg - a.yaw_deg + 180) % 360 - 180 for a, b in pairs])
+    height = np.array([b.agl_m / 100.0 - 1 for _, b in pairs])
+    tilt = np.array([[b.pitch_deg, b.roll_deg] for _, b in pairs]).ravel()
+    places = np.array([plane.frame.en_from_latlon(*truth[v.frame]) for v in erring.views])
+    priors = [b.prior for _, b in pairs]
+    prior = plane.frame.en_from_latlon([p.lat_deg for p in priors], [p.lon_deg for p in priors])
+    for values, std in ((yaw, 4.0), (height, 0.05), (tilt, 1.5), ((prior - places).ravel(), 30.0)):
+        assert values.std() == pytest.approx(std, rel=0.15)
+        assert abs(values.mean()) < 4 * std / math.sqrt(len(values))
+    assert {p.std_m for p in priors} == {30.0}
+    assert {b.yaw_std_deg for _, b in pairs} == {4.0} and {b.agl_std_m for _, b in pairs} == {5.0}
+    assert {(a.pitch_deg, a.roll_deg, a.agl_m) for a, _ in pairs} == {(0.0, 0.0, 100.0)}
+    assert all(a.prior is None for a, _ in pairs)
+
+
+def test_leaning_is_true_and_told(area, tmp_path):
+    flight, _ = flown(area, tmp_path / "f", random=150, errors=Errors(lean_std_deg=3.0))
+    tilt = np.array([[v.telemetry.pitch_deg, v.telemetry.roll_deg] for v in flight.views])
+    assert tilt.std() == pytest.approx(3.0, rel=0.15) and np.abs(tilt).max() <= 7.5
+
+
+def test_places_and_headings_are_anywhere(area, plane, tmp_path):
+    flight, truth = flown(area, tmp_path / "f", random=200)
+    places = np.array([plane.frame.en_from_latlon(*value) for value in truth.values()])
+    for step in (1.0, 8.0, 16.0, 40.0):
+        rest = places.ravel() % step / step
+        assert abs(rest.mean() - 0.5) < 0.08 and rest.std() == pytest.approx(0.289, abs=0.04)
+    assert np.ptp(places, axis=0) == pytest.approx([1060, 860], abs=60)
+    yaw = np.array([view.telemetry.yaw_deg for view in flight.views])
+    assert np.histogram(yaw, 4, (0, 360))[0].min() > 25
+
+
+def bytes_of(folder):
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_the_same_seed_gives_the_same_bytes(area, tmp_path):
+    errors = Errors(5.0, 0.05, 1.0, 2.0, 40.0)
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        flown(area, tmp_path / name, errors=errors, seed=seed, effects=ViewEffects())
+    assert bytes_of(tmp_path / "a") == bytes_of(tmp_path / "b") != bytes_of(tmp_path / "c")
+
+
+def test_the_first_views_of_a_longer_flight_are_the_same(area, tmp_path):
+    short, long = (flown(area, tmp_path / str(n), random=n)[1] for n in (3, 6))
+    assert list(short.items()) == list(long.items())[:3]
+
+
+def test_a_route(area, plane, tmp_path):
+    corners = np.array([[-300.0, -200.0], [-300.0, 100.0], [200.0, 100.0]])
+    flight, truth = flown(
+        area,
+        tmp_path / "f",
+        random=None,
+        route=route_of(plane.frame, *corners),
+        spacing_m=50.0,
+        speed_mps=20.0,
+    )
+    places = np.array([plane.frame.en_from_latlon(*truth[view.frame]) for view in flight.views])
+    assert len(places) == 17 and places[0] == pytest.approx(corners[0], abs=0.01)
+    assert np.linalg.norm(np.diff(places, axis=0), axis=1) == pytest.approx(50, abs=0.05)
+    yaw = np.array([view.telemetry.yaw_deg for view in flight.views])
+    assert set(yaw[:6].round(1) % 360) == {0.0} and set(yaw[7:].round(1)) == {90.0}
+    seconds = np.array([view.telemetry.time_ns / 1e9 for view in flight.views])
+    assert seconds == pytest.approx(np.arange(17) * 2.5, abs=1e-6)
+
+
+def test_a_route_without_spacing_has_a_view_a_second(area, plane, tmp_path):
+    route = route_of(plane.frame, [-100.0, 0.0], [100.0, 0.0])
+    flight, _ = flown(area, tmp_path / "f", random=None, route=route, speed_mps=40.0)
+    assert len(flight.views) == 6
+    assert [view.telemetry.time_ns for view in flight.views] == [n * 10**9 for n in range(6)]
+
+
+def test_the_folder(area, tmp_path, names_in):
+    flight, truth = flown(area, tmp_path / "f", camera=LENS, agl_m=60.0, random=2)
+    frames = [view.frame for view in flight.views]
+    assert flight.camera == LENS and frames == list(truth) == ["0001.jpg", "0002.jpg"]
+    assert names_in(tmp_path) == sorted(
+        ["f", "f/flight.json", "f/frames", "f/telemetry.csv", "f/truth.csv"]
+        + [f"f/frames/{frame}" for frame in frames]
+    )
+    assert area.past.name in flight.note and json.loads((tmp_path / "f/flight.json").read_text())
+    assert read_image(flight.views[0].path).shape == (240, 320)
+    header = (tmp_path / "f/telemetry.csv").read_text().splitlines()[0]
+    assert header == "frame,time_s,yaw_deg,pitch_deg,roll_deg,agl_m"
+
+
+def test_the_usual_height_covers_a_tile(area, tmp_path):
+    flight, _ = flown(area, tmp_path / "f", agl_m=None, random=1)
+    shorter_m = 48 * SMALL.gsd_m(flight.views[0].telemetry.agl_m)
+    assert shorter_m == pytest.approx(256, rel=0.01)
+
+
+def test_effects_change_the_picture_as_stated(area, tmp_path):
+    seen = {}
+    for name, effects in {
+        "plain": PLAIN,
+        "noise": ViewEffects(0.0, 0.0, 6.0, 100),
+        "blur": ViewEffects(0.0, 2.0, 0.0, 100),
+        "exposure": ViewEffects(0.5, 0.0, 0.0, 100),
+    }.items():
+        flight, _ = flown(area, tmp_path / name, effects=effects, camera=SEEN, random=4)
+        seen[name] = np.stack([read_image(v.path) for v in flight.views]).astype(float)
+    difference = (seen["noise"] - seen["plain"])[seen["plain"] < 200]
+    assert difference.std() == pytest.approx(6, rel=0.15)
+    sharp = [np.abs(np.diff(seen[name], axis=2)).mean() for name in ("plain", "blur")]
+    assert sharp[1] < 0.8 * sharp[0]
+    gains = seen["exposure"].mean(axis=(1, 2)) / seen["plain"].mean(axis=(1, 2))
+    assert np.ptp(np.log(gains)) > 0.1
+
+
+LEAVES = "does not lie wholly within the imagery"
+REFUSED = {
+    "too high": ({"agl_m": 5000.0}, AreaError, "fly lower"),
+    "too low": ({"agl_m": 0.1}, FlightError, "1 to 50,000"),
+    "nan": ({"agl_m": math.nan}, FlightError, "1 to 50,000"),
+    "none": ({"random": 0}, FlightError, "number of random places"),
+    "neither": ({"random": None}, FlightError, "one of them"),
+}
+
+
+@pytest.mark.parametrize("request_, error, message", REFUSED.values(), ids=REFUSED.keys())
+def test_flights_that_cannot_be(area, tmp_path, names_in, request_, error, message):
+    with pytest.raises(error, match=message):
+        flown(area, tmp_path / "out" / "f", **request_)
+    assert [name for name in names_in(tmp_path) if name != "out"] == []
+
+
+def test_leaving_the_imagery_is_refused(area, plane, tmp_path, names_in):
+    route = route_of(plane.frame, [0.0, 0.0], [700.0, 0.0])
+    with pytest.raises(AreaError, match=LEAVES) as caught:
+        flown(area, tmp_path / "f", random=None, route=route)
+    assert "view 24 of the route" in str(caught.value)  # 575 + 48 m; imagery ends at 604 m
+    assert names_in(tmp_path) == []
+
+
+@pytest.mark.parametrize("spacing", [{"spacing_m": 0.0}, {"spacing_m": -5.0}, {"speed_mps": 0.0}])
+def test_impossible_spacing_is_refused(area, plane, tmp_path, names_in, spacing):
+    route = route_of(plane.frame, [0.0, 0.0], [100.0, 0.0])
+    with pytest.raises(FlightError, match="above 0"):
+        flown(area, tmp_path / "f", random=None, route=route, **spacing)
+    assert names_in(tmp_path) == []
+
+
+def test_views_keep_off_missing_imagery(make_ortho, tmp_path):
+    grey = np.full((300, 300), 100, np.uint8)
+    grey[:, :150] = 0
+    ortho = make_ortho(tmp_path / "half.tif", grey, nodata=0)
+    request = SimulateRequest(
+        [ortho], tmp_path / "f", random=20, agl_m=50.0, camera=SMALL, effects=PLAIN
+    )
+    simulate_flight(request)
+    for view in open_flight(tmp_path / "f").views:
+        assert read_image(view.path).min() > 90
+
+
+@pytest.mark.parametrize(
+    "name, value", [("yaw_std_deg", -1), ("agl_std", 5.0), ("tilt_std_deg", 90)]
+)
+def test_impossible_errors_are_refused(name, value):
+    with pytest.raises(FlightError, match=name):
+        Errors(**{name: value})
+
+
+@pytest.mark.parametrize("effects", [{"jpeg_quality": 0}, {"blur_px": -1}, {"noise_std": 1e9}])
+def test_impossible_effects_are_refused(effects):
+    with pytest.raises(FlightError):
+        ViewEffects(**effects)
+
+
+@pytest.mark.parametrize(
+    "error, expected",
+    [(OSError(errno.ENOSPC, "No space left on device"), OutputError), (KeyboardInterrupt(),) * 2],
+    ids=["disk", "interrupt"],
+)
+def test_a_failure_leaves_nothing(area, tmp_path, names_in, monkeypatch, error, expected):
+    whole, calls = FlightWriter.add, []
+
+    def add(*arguments, **keywords):
+        calls.append(1)
+        if len(calls) == 3:
+            raise error
+        whole(*arguments, **keywords)
+
+    monkeypatch.setattr(FlightWriter, "add", add)
+    with pytest.raises(expected if isinstance(expected, type) else type(expected)):
+        flown(area, tmp_path / "f")
+    assert len(calls) == 3 and names_in(tmp_path) == []
+
+
+def test_a_folder_in_use_is_kept(area, tmp_path, names_in):
+    (tmp_path / "f").mkdir()
+    (tmp_path / "f" / "mine").write_text("mine")
+    with pytest.raises(OutputError, match="not empty"):
+        flown(area, tmp_path / "f")
+    assert names_in(tmp_path) == ["f", "f/mine"]
+
+
+def test_progress_is_told(area, tmp_path):
+    shares = []
+    request = SimulateRequest([area.past], tmp_path / "f", random=4, agl_m=100.0, camera=SMALL)
+    assert simulate_flight(request, shares.append) == 4
+    assert shares == [0.25, 0.5, 0.75, 1.0]

@@ -1,0 +1,696 @@
+"""Every command as it is typed: what it prints, how it exits, what it leaves behind."""
+
+import errno
+import hashlib
+import json
+import logging
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from conftest import textured
+from orthonav import __version__
+from orthonav.cli import COMMANDS, main
+from orthonav.mapfile import open_map
+from orthonav.publish.jsonl import read_results
+from orthonav.records import Fix
+
+SMALL_MAP = ["--tile-px", "64", "--overlap", "0.75"]
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a command gave: exit code, stdout and stderr, those of C libraries included."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def run(capfd, monkeypatch):
+    """Function that runs a command in this process as a fresh one would."""
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    root = logging.getLogger()
+
+    def command(*arguments):
+        handlers, root.handlers, level = root.handlers, [], root.level
+        capfd.readouterr()
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as left:
+            code = left.code
+        finally:
+            root.handlers = handlers
+            root.setLevel(level)
+        told = capfd.readouterr()
+        return Done(code, told.out, told.err)
+
+    return command
+
+
+def process(*arguments, script=None, limit=None):
+    """A command in a process of its own; `limit` bytes is the largest file it may write."""
+    script = script or "import sys, orthonav.cli as cli; sys.exit(cli.main())"
+    limits = None
+    if limit is not None:
+        limits = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))  # noqa: E731
+    return subprocess.Popen(
+        [sys.executable, "-B", "-c", script, *map(str, arguments)],
+        preexec_fn=limits,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def finished(popen):
+    out, err = popen.communicate(timeout=120)
+    return Done(popen.returncode, out, err)
+
+
+def refused(done, *words):
+    """Exactly one line on stderr, nothing on stdout, exit code 1."""
+    assert done.code == 1 and done.out == ""
+    assert done.err.startswith("orthonav: error: ") and done.err.endswith("\n")
+    assert done.err.count("\n") == 1 and "Traceback" not in done.err
+    for word in words:
+        assert word in done.err
+
+
+@pytest.fixture(scope="module")
+def ortho(make_ortho, tmp_path_factory):
+    """An orthophoto of 400 x 400 m."""
+    return make_ortho(tmp_path_factory.mktemp("cli") / "2020.tif")
+
+
+@pytest.fixture(autouse=True)
+def fewer_crops(map_path, monkeypatch):
+    """Calibration from a quarter of the crops, but for the map that all tests share."""
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 48)
+
+
+@pytest.fixture
+def out(tmp_path):
+    """A folder that holds nothing, for what a command writes."""
+    folder = tmp_path / "out"
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture
+def flown(flight_path, tmp_path):
+    """A copy of the flight, to be broken."""
+    return shutil.copytree(flight_path, tmp_path / "flight")
+
+
+@pytest.fixture(scope="module")
+def fixes_path(map_path, flight_path, tmp_path_factory):
+    path = tmp_path_factory.mktemp("fixes") / "fixes.jsonl"
+    assert main(["localize", str(map_path), str(flight_path), "--out", str(path), "-q"]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def truth_path(flight_path):
+    return flight_path / "truth.csv"
+
+
+# What works.
+
+
+def test_build(run, ortho, out, names_in):
+    done = run("build", "--ortho", ortho, *SMALL_MAP, "--out", out / "a.onav")
+    assert (done.code, done.err) == (0, "") and "km2" in done.out and "built in" in done.out
+    again = run("build", "--ortho", ortho, *SMALL_MAP, "--out", out / "b.onav", "--json", "-q")
+    assert (again.code, again.err) == (0, "")
+    plain = json.loads(again.out)
+    assert plain["map"] == str(out / "b.onav") and plain["tiles"] > 300 and plain["build_s"] > 0
+    assert names_in(out) == ["a.onav", "b.onav"]
+    assert (out / "a.onav").read_bytes() == (out / "b.onav").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--edges", "canny:low=50,high=120", "--method", "gradient:dims=16"],
+        ["--edges", "gray", "--gsd-m", "2", "--tile-px", "32"],
+        ["--seed", "7", "--overlap", "0.5"],
+    ],
+)
+def test_build_as_told(run, ortho, out, options):
+    done = run("build", "--ortho", ortho, *SMALL_MAP, *options, "--json", "--out", out / "m.onav")
+    assert done.code == 0
+    recipe = json.loads(done.out)["recipe"]
+    assert recipe == open_map(out / "m.onav").manifest.recipe
+    if "canny" in options[1]:
+        assert recipe["represent"]["low"] == 50 and recipe["embed"]["dims"] == 16
+
+
+def test_build_of_a_part(run, ortho, out):
+    route = out / "route.csv"
+    route.write_text("lat_deg,lon_deg\n46.4975,3.0015\n46.4990,3.0035\n")
+    band = run(
+        *("build", "--ortho", ortho, "--ortho", ortho, "--route", route, "--band-m", "60"),
+        *(*SMALL_MAP, "--json", "--out", out / "band.onav"),
+    )
+    box = run(
+        *("build", "--ortho", ortho, "--bounds=3.0000,46.4962,3.0052,46.4998"),
+        *(*SMALL_MAP, "--json", "--out", out / "box.onav"),
+    )
+    assert band.code == box.code == 0
+    assert len(json.loads(band.out)["imagery"]) == 2
+    tiles = [json.loads(done.out)["tiles"] for done in (band, box)]
+    assert 5 < tiles[0] < 200 and 5 < tiles[1] < 700
+
+
+def test_info(run, map_path):
+    done = run("info", map_path)
+    assert (done.code, done.err) == (0, "")
+    assert str(map_path) in done.out and "2.5 m per pixel" in done.out and "2016-07" in done.out
+    plain = json.loads(run("info", map_path, "--json").out)
+    assert plain["tiles"] == open_map(map_path).manifest.sheets[0].tiles and plain["calibrated"]
+    west, south, east, north = plain["sheets"][0]["bounds_deg"]
+    assert west < plain["sheets"][0]["centre_lon_deg"] < east and south < north
+    assert plain["size_mb"] == pytest.approx(map_path.stat().st_size / 1e6, abs=1e-3)
+
+
+def test_localize(run, map_path, flight_path, out, names_in):
+    done = run("localize", map_path, flight_path, "--out", out / "fixes.jsonl", "--json")
+    assert (done.code, done.err) == (0, "") and names_in(out) == ["fixes.jsonl"]
+    plain = json.loads(done.out)
+    assert plain["views"] == plain["n_fix"] == 30 and plain["median_latency_ms"] > 0
+    lines = [json.loads(line) for line in (out / "fixes.jsonl").read_text().splitlines()]
+    assert [line["frame"] for line in lines] == [f"{n:04d}.jpg" for n in range(1, 31)]
+    assert {line["status"] for line in lines} == {"fix"}
+    told = run("localize", map_path, flight_path, "--out", out / "fixes.jsonl", "--prior", "none")
+    assert told.code == 0 and "30 views: 30 fixes" in told.out
+
+
+def test_localize_without_heading(run, map_path, flight_path, out):
+    telemetry = (flight_path / "telemetry.csv").read_text().splitlines()
+    frames = shutil.copytree(flight_path, out / "flight")
+    lines = [telemetry[0], *(_with(line, 2, "nan") for line in telemetry[1:4])]
+    (frames / "telemetry.csv").write_text("\n".join(lines) + "\n")
+    known = run("localize", map_path, frames, "--out", out / "a.jsonl", "--json")
+    unknown = run(
+        "localize", map_path, frames, "--out", out / "b.jsonl", "--json", "--heading", "unknown"
+    )
+    assert json.loads(known.out)["n_no_fix"] == 3 and json.loads(unknown.out)["n_fix"] == 3
+
+
+def test_evaluate(run, fixes_path, truth_path, map_path, out, names_in):
+    done = run(
+        *("evaluate", fixes_path, "--truth", truth_path, "--radius-m", "40", "--map", map_path),
+        *("--json", out / "metrics.json", "--report", out / "report"),
+    )
+    assert (done.code, done.err) == (0, "") and "fixes" in done.out and "index.html" in done.out
+    assert names_in(out) == ["metrics.json", "report", "report/index.html"]
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["n_views"] == 30 and metrics["radius_m"] == 40
+    assert metrics["acc_at_15m"] <= metrics["acc_at_40m"] and metrics["acc_at_40m"] >= 0.9
+    stdout = run("evaluate", fixes_path, "--truth", truth_path, "--json", "-")
+    assert (stdout.code, stdout.err) == (0, "") and json.loads(stdout.out)["radius_m"] == 15
+
+
+def test_evaluate_several(run, fixes_path, truth_path):
+    done = run(
+        "evaluate", fixes_path, fixes_path, "--truth", truth_path, "--truth", truth_path, "--json=-"
+    )
+    plain = json.loads(done.out)
+    assert done.code == 0 and plain["n_views"] == 60
+
+
+def test_simulate(run, ortho, out, names_in):
+    fly = ["simulate", "--ortho", ortho, "--agl-m", "60", "--json"]
+    done = run(*fly, "--random", "3", "--prior-std-m", "20", "--out", out / "random")
+    assert (done.code, done.err) == (0, "") and json.loads(done.out)["views"] == 3
+    assert "prior_lat_deg" in (out / "random" / "telemetry.csv").read_text()
+    route = out / "route.csv"
+    route.write_text("lat_deg,lon_deg\n46.4980,3.0020\n46.4985,3.0030\n")
+    camera = out / "random" / "flight.json"
+    along = ["--route", route, "--spacing-m", "20", "--camera", camera]
+    done = run(*fly, *along, "--out", out / "route")
+    assert done.code == 0 and json.loads(done.out)["views"] == 5
+    assert not [name for name in names_in(out) if name.startswith(".")]
+
+
+def test_landscape(run, out, names_in):
+    done = run("landscape", "--out", out, "--size-m", "120", "100", "--gsd-m", "2", "--json")
+    assert (done.code, done.err) == (0, "")
+    files = json.loads(done.out)["files"]
+    assert sorted(Path(path).name for path in files) == names_in(out) and len(files) == 3
+
+
+def test_the_program_is_installed():
+    done = finished(process("--version"))
+    assert done == Done(0, f"orthonav {__version__}\n", "")
+
+
+@pytest.mark.parametrize("command", [None, *COMMANDS])
+def test_help(run, command):
+    done = run(*([command] if command else []), "--help")
+    assert done.code == 0 and done.err == "" and "usage: orthonav" in done.out
+    if command is None:
+        assert all(name in done.out for name in COMMANDS)
+    else:
+        assert COMMANDS[command] in " ".join(done.out.split()) and "--quiet" in done.out
+
+
+# Wrong usage: exit code 2, nothing done.
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["fly-away"],
+        ["info"],
+        ["info", "a", "b"],
+        ["build", "--ortho", "a.tif"],
+        ["build", "--out", "a.onav"],
+        ["build", "--ortho", "a", "--out", "b", "--bounds", "1,2,3"],
+        ["build", "--ortho", "a", "--out", "b", "--bounds", "w,s,e,n"],
+        ["build", "--ortho", "a", "--out", "b", "--tile-px", "big"],
+        ["build", "--ortho", "a", "--out", "b", "--route", "r", "--bounds", "1,2,3,4"],
+        ["simulate", "--ortho", "a", "--out", "b"],
+        ["simulate", "--ortho", "a", "--out", "b", "--route", "r", "--random", "3"],
+        ["localize", "a.onav", "flight", "--out", "c", "--heading", "maybe"],
+        ["evaluate", "fixes.jsonl"],
+        ["landscape", "--out", "a", "--size-m", "5"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_usage(run, tmp_path, monkeypatch, names_in, arguments):
+    monkeypatch.chdir(tmp_path)
+    done = run(*arguments)
+    assert done.code == 2 and done.out == "" and done.err.startswith("usage: orthonav")
+    assert "orthonav" in done.err.splitlines()[-1] and "error: " in done.err
+    assert names_in(tmp_path) == []
+
+
+# Bad input of `build`.
+
+
+def test_build_refuses(run, ortho, out, names_in, make_ortho, tmp_path):
+    def built(*arguments):
+        return run("build", *arguments, "--out", out / "map.onav")
+
+    text = tmp_path / "text.tif"
+    text.write_text("not a picture")
+    no_crs = make_ortho(tmp_path / "no_crs.tif", crs=None)
+    nothing = make_ortho(tmp_path / "nothing.tif", np.zeros((400, 400), np.uint8), nodata=0)
+    cut = tmp_path / "cut.tif"
+    cut.write_bytes(ortho.read_bytes()[:60_000])
+    route = tmp_path / "route.csv"
+    route.write_text("lat_deg,lon_deg\n46.0,3.0\n46.001,3.0\n")
+    good, small = ["--ortho", ortho], SMALL_MAP
+    refused(built("--ortho", tmp_path / "no.tif"), "does not exist", "no.tif")
+    refused(built("--ortho", tmp_path), "does not exist", str(tmp_path))
+    refused(built("--ortho", text, *small), "text.tif")
+    refused(built("--ortho", cut, *small), "cut.tif")
+    refused(built("--ortho", no_crs, *small), "coordinate reference system", "no_crs.tif")
+    refused(built("--ortho", nothing, *small))
+    refused(built(*good, "--bounds=5.0,46.0,5.01,46.01", *small), "outside the orthophotos")
+    refused(built(*good, "--bounds=5.0,46.0,4.0,46.01", *small), "west < east")
+    refused(built(*good, "--bounds=nan,46.0,4.0,46.01", *small), "bounds")
+    refused(built(*good, "--tile-px", "1024"), "larger than the area")
+    tiny = "--bounds=3.00259,46.49819,3.00261,46.49821"
+    refused(built(*good, tiny, *small), "larger than the area")
+    refused(built(*good, "--tile-px", "100"), "multiple of 32")
+    refused(built(*good, "--gsd-m", "0", *small), "ground resolution")
+    refused(built(*good, "--overlap", "1.0"), "overlap")
+    refused(built(*good, "--band-m", "100"), "--route")
+    refused(built(*good, "--route", route), "--band-m")
+    refused(built(*good, "--route", route, "--band-m", "-5"), "wider than 0")
+    refused(built(*good, "--route", route, "--band-m", "50", *small), "no imagery")
+    refused(built(*good, "--route", tmp_path / "no.csv", "--band-m", "50"), "does not exist")
+    refused(built(*good, "--route", text, "--band-m", "50"), "route must be")
+    refused(built(*good, "--method", "magic"), "unknown variant 'magic'")
+    refused(built(*good, "--edges", "canny:low=300,high=100"), "canny")
+    assert names_in(out) == []
+
+
+def test_a_map_cannot_be_written_there(run, ortho, out, names_in):
+    (out / "file").write_text("in the way")
+    (out / "folder.onav").mkdir()
+    build = ["build", "--ortho", ortho, *SMALL_MAP, "--out"]
+    refused(run(*build, out / "file" / "map.onav"), "cannot write")
+    refused(run(*build, out / "folder.onav"), "cannot write")
+    assert names_in(out) == ["file", "folder.onav"]
+
+
+# Bad maps.
+
+
+def newer(data):
+    """The map as a later program would write it, properly signed."""
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    manifest = json.loads(header["__metadata__"]["orthonav"])
+    del manifest["manifest_sha256"]
+    manifest["schema"] = 99
+    text = json.dumps(manifest, sort_keys=True, separators=(",", ":"))
+    manifest["manifest_sha256"] = hashlib.sha256(text.encode()).hexdigest()
+    header["__metadata__"]["orthonav"] = json.dumps(manifest)
+    text = json.dumps(header).encode()
+    return len(text).to_bytes(8, "little") + text + data[8 + length :]
+
+
+def altered(data, at):
+    at = at % len(data)
+    return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
+
+
+BAD_MAPS = {
+    "empty": (lambda data: b"", "not an orthonav map"),
+    "text": (lambda data: b"this is no map at all", "not an orthonav map"),
+    "cut in the header": (lambda data: data[:500], "truncated"),
+    "cut in the data": (lambda data: data[: len(data) // 2], "truncated"),
+    "cut at the end": (lambda data: data[:-1], "truncated"),
+    "too long": (lambda data: data + b"x", "altered"),
+    "altered data": (lambda data: altered(data, -5000), "altered"),
+    "altered manifest": (lambda data: data.replace(b"gradient", b"gradiemt", 1), "altered"),
+    "newer": (newer, "schema 99"),
+}
+
+
+@pytest.mark.parametrize("break_, word", BAD_MAPS.values(), ids=BAD_MAPS.keys())
+def test_bad_maps(run, map_path, flight_path, fixes_path, truth_path, out, names_in, break_, word):
+    bad = out / "bad.onav"
+    bad.write_bytes(break_(map_path.read_bytes()))
+    refused(run("info", bad), word, str(bad))
+    refused(run("localize", bad, flight_path, "--out", out / "fixes.jsonl"), word, str(bad))
+    report = ["--map", bad, "--report", out / "report"]
+    refused(run("evaluate", fixes_path, "--truth", truth_path, *report), word, str(bad))
+    assert names_in(out) == ["bad.onav"]
+
+
+def test_maps_that_are_not_there(run, out, flight_path, names_in):
+    refused(run("info", out / "no.onav"), "does not exist", "no.onav")
+    refused(run("info", out), "is a folder")
+    refused(run("localize", out / "no.onav", flight_path, "--out", out / "f"), "does not exist")
+    assert names_in(out) == []
+
+
+# Bad flights.
+
+
+def _with(line, column, value):
+    fields = line.split(",")
+    fields[column] = value
+    return ",".join(fields)
+
+
+def edit(path, change):
+    path.write_text(change(path.read_text()))
+
+
+def edit_camera(flight, **values):
+    plain = json.loads((flight / "flight.json").read_text())
+    plain["camera"].update(values)
+    (flight / "flight.json").write_text(json.dumps(plain))
+
+
+def noise(count):
+    return bytes(np.random.default_rng(0).integers(0, 256, count, dtype=np.uint8))
+
+
+BAD_FLIGHTS = {
+    "no folder": (shutil.rmtree, "does not exist"),
+    "no telemetry": (lambda f: (f / "telemetry.csv").unlink(), "telemetry.csv"),
+    "no camera": (lambda f: (f / "flight.json").unlink(), "flight.json"),
+    "camera is no json": (lambda f: (f / "flight.json").write_text("{"), "flight.json"),
+    "impossible camera": (lambda f: edit_camera(f, fx_px=-5), "focal length"),
+    "camera of others": (lambda f: edit_camera(f, width_px=640), "640 x 240"),
+    "empty telemetry": (lambda f: (f / "telemetry.csv").write_text(""), "columns are missing"),
+    "binary telemetry": (lambda f: (f / "telemetry.csv").write_bytes(noise(999)), "telemetry"),
+    "no views": (
+        lambda f: edit(f / "telemetry.csv", lambda text: text.splitlines()[0] + "\n"),
+        "no views",
+    ),
+    "column": (
+        lambda f: edit(f / "telemetry.csv", lambda text: text.replace("agl_m", "height", 1)),
+        "agl_m",
+    ),
+    "missing image": (lambda f: (f / "frames/0007.jpg").unlink(), "0007.jpg"),
+    "image outside": (
+        lambda f: edit(f / "telemetry.csv", lambda text: text.replace("0007", "../0007")),
+        "not a name inside",
+    ),
+    "text for an image": (lambda f: (f / "frames/0007.jpg").write_text("no image"), "0007.jpg"),
+    "noise for an image": (lambda f: (f / "frames/0007.jpg").write_bytes(noise(999)), "0007.jpg"),
+    "empty image": (lambda f: (f / "frames/0007.jpg").write_bytes(b""), "0007.jpg"),
+    "cut image": (
+        lambda f: (f / "frames/0007.jpg").write_bytes((f / "frames/0007.jpg").read_bytes()[:3000]),
+        "0007.jpg",
+    ),
+}
+
+
+@pytest.mark.parametrize("break_, word", BAD_FLIGHTS.values(), ids=BAD_FLIGHTS.keys())
+def test_bad_flights(run, map_path, flown, out, names_in, break_, word):
+    break_(flown)
+    refused(run("localize", map_path, flown, "--out", out / "fixes.jsonl"), word)
+    assert names_in(out) == []
+
+
+def test_bad_images_may_be_skipped(run, map_path, flown, out):
+    (flown / "frames" / "0007.jpg").write_text("no image")
+    (flown / "frames" / "0009.jpg").write_bytes((flown / "frames/0009.jpg").read_bytes()[:3000])
+    done = run("localize", map_path, flown, "--out", out / "f.jsonl", "--skip-bad-images", "--json")
+    plain = json.loads(done.out)
+    assert done.code == 0 and (plain["n_fix"], plain["n_no_fix"]) == (28, 2)
+    results = read_results(out / "f.jsonl")
+    assert [r.outcome.reason for r in results if not isinstance(r.outcome, Fix)] == [
+        "bad_image"
+    ] * 2
+
+
+@pytest.mark.parametrize("value", ["nan", "", "unknown", "inf"])
+@pytest.mark.parametrize("column", [2, 5], ids=["heading", "height"])
+def test_views_without_telemetry_do_not_end_a_flight(run, map_path, flown, out, column, value):
+    lines = (flown / "telemetry.csv").read_text().splitlines()
+    lines[4] = _with(lines[4], column, value)
+    (flown / "telemetry.csv").write_text("\n".join(lines) + "\n")
+    done = run("localize", map_path, flown, "--out", out / "fixes.jsonl", "--json")
+    assert (done.code, done.err) == (0, "") and json.loads(done.out)["n_no_fix"] == 1
+    outcome = read_results(out / "fixes.jsonl")[3].outcome
+    assert outcome.reason == "missing_telemetry"
+
+
+# Bad input of the others.
+
+
+def test_evaluate_refuses(run, fixes_path, truth_path, out, names_in, tmp_path):
+    def evaluated(fixes, truth, *more):
+        return run("evaluate", fixes, "--truth", truth, "--json", out / "m.json", *more)
+
+    broken, other = tmp_path / "broken.jsonl", tmp_path / "other.csv"
+    broken.write_text(fixes_path.read_text()[:-20])
+    other.write_text("frame,lat_deg,lon_deg\nelse.jpg,46.0,3.0\n")
+    refused(evaluated(tmp_path / "no.jsonl", truth_path), "does not exist")
+    refused(evaluated(fixes_path, tmp_path / "no.csv"), "does not exist")
+    refused(evaluated(broken, truth_path), "line 30")
+    refused(evaluated(truth_path, truth_path), "line 1")
+    refused(evaluated(fixes_path, fixes_path), "columns are missing")
+    refused(evaluated(fixes_path, other), "same flight")
+    refused(evaluated(fixes_path, truth_path, "--truth", other), "as many --truth")
+    refused(evaluated(fixes_path, truth_path, "--radius-m", "0"), "radius")
+    refused(evaluated(fixes_path, truth_path, "--radius-m", "nan"), "radius")
+    (out / "file").write_text("in the way")
+    refused(evaluated(fixes_path, truth_path, "--report", out / "file" / "report"), "cannot write")
+    assert names_in(out) == ["file"]
+
+
+def test_simulate_refuses(run, ortho, out, names_in, make_ortho, tmp_path):
+    def simulated(*arguments):
+        return run("simulate", "--ortho", ortho, *arguments, "--out", out / "flight")
+
+    route = tmp_path / "route.csv"
+    route.write_text("lat_deg,lon_deg\n46.498,3.002\n46.60,3.002\n")
+    random, low = ["--random", "3"], ["--agl-m", "60"]
+    refused(simulated(*random, "--agl-m", "9000"), "fly lower")
+    refused(simulated(*random, "--agl-m", "-5"), "height")
+    refused(simulated("--random", "0"), "number of random places")
+    refused(simulated("--route", route, *low), "within the imagery")
+    refused(simulated("--route", route, *low, "--spacing-m", "0"), "above 0")
+    refused(simulated("--route", tmp_path / "no.csv", *low), "does not exist")
+    refused(simulated(*random, *low, "--agl-std", "5"), "agl_std", "0.05 is 5 %")
+    refused(simulated(*random, *low, "--yaw-std-deg", "nan"), "yaw_std_deg")
+    refused(simulated(*random, *low, "--jpeg-quality", "500"), "quality")
+    refused(simulated(*random, *low, "--camera", tmp_path / "no.json"), "does not exist")
+    no_crs = make_ortho(tmp_path / "no_crs.tif", crs=None)
+    refused(simulated(*random, *low, "--ortho", no_crs), "coordinate reference system")
+    assert names_in(out) == []
+    (out / "flight").mkdir()
+    (out / "flight" / "mine").write_text("mine")
+    refused(simulated(*random, *low), "not empty")
+    assert names_in(out) == ["flight", "flight/mine"]
+
+
+def test_landscape_refuses(run, out, names_in):
+    refused(run("landscape", "--out", out / "l", "--size-m", "-5", "5"), "size_m")
+    refused(run("landscape", "--out", out / "l", "--gsd-m", "500"), "gsd_m")
+    (out / "file").write_text("in the way")
+    refused(run("landscape", "--out", out / "file", "--size-m", "50", "50"), "cannot write")
+    assert names_in(out) == ["file"]
+
+
+# Full disks and interrupts.
+
+
+def commands(ortho, map_path, flight_path, fixes_path, truth_path, out):
+    """One call of every command that writes, by name."""
+    return {
+        "build": ["build", "--ortho", ortho, *SMALL_MAP, "--out", out / "map.onav"],
+        "simulate": [
+            *("simulate", "--ortho", ortho, "--random", "3", "--agl-m", "60"),
+            *("--out", out / "flight"),
+        ],
+        "localize": ["localize", map_path, flight_path, "--out", out / "fixes.jsonl"],
+        "evaluate": ["evaluate", fixes_path, "--truth", truth_path, "--report", out / "report"],
+        "metrics": ["evaluate", fixes_path, "--truth", truth_path, "--json", out / "m.json"],
+        "landscape": ["landscape", "--out", out / "land", "--size-m", "300", "300"],
+    }
+
+
+@pytest.fixture
+def writing(ortho, map_path, flight_path, fixes_path, truth_path, out):
+    return commands(ortho, map_path, flight_path, fixes_path, truth_path, out)
+
+
+WRITERS = ["build", "simulate", "localize", "evaluate", "metrics", "landscape"]
+
+
+def files_in(folder):
+    return [path for path in folder.rglob("*") if not path.is_dir()]
+
+
+def nothing_in(folder):
+    """Neither files nor hidden temporaries; an empty folder does no harm."""
+    return files_in(folder) == [] and not [p for p in folder.iterdir() if p.name[0] == "."]
+
+
+@pytest.mark.parametrize("name", [name for name in WRITERS if name != "landscape"])
+def test_no_room_for_the_whole_file(writing, out, name):
+    """The kernel refuses to write more than 4 KiB to a file."""
+    done = finished(process(*writing[name], limit=4096))
+    refused(done, "File too large")
+    assert nothing_in(out)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.9, 0.999])
+def test_no_room_for_a_whole_orthophoto(run, writing, out, share):
+    """GDAL writes its last blocks while closing; its TIFF library has a line of its own to say."""
+    assert run(*writing["landscape"]).code == 0
+    sizes = [path.stat().st_size for path in files_in(out)]
+    shutil.rmtree(out / "land")
+    done = finished(process(*writing["landscape"], limit=int(share * min(sizes))))
+    assert done.code == 1 and done.out == "" and "Traceback" not in done.err
+    assert done.err.splitlines()[-1].startswith("orthonav: error: cannot write")
+    assert nothing_in(out)
+
+
+@pytest.mark.parametrize("name", ["build", "localize", "evaluate", "metrics", "landscape"])
+def test_a_full_disk(run, writing, out, name, monkeypatch):
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    refused(run(*writing[name]), "disk full; nothing was written")
+    assert files_in(out) == []
+
+
+@pytest.mark.parametrize("name", ["build", "metrics"])
+def test_a_reader_that_has_gone_is_no_traceback(writing, name):
+    with process(*writing[name]) as popen:
+        popen.stdout.close()
+        err = popen.stderr.read()
+    assert popen.returncode == 1 and err == ""
+
+
+HOLD = """
+import sys, time
+from orthonav.cli import common, main
+
+class Held(common.Progress):
+    def __call__(self, stage, share):
+        if stage == sys.argv[1] and share > 0:
+            print("here", flush=True)
+            time.sleep(60)
+
+common.Progress = Held
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.parametrize(
+    "name, stage, number",
+    [
+        ("build", "imagery", signal.SIGINT),
+        ("build", "calibrate", signal.SIGINT),
+        ("build", "calibrate", signal.SIGTERM),
+        ("simulate", "simulate", signal.SIGINT),
+        ("simulate", "simulate", signal.SIGTERM),
+        ("localize", "localize", signal.SIGINT),
+        ("landscape", "landscape", signal.SIGTERM),
+    ],
+)
+def test_an_interrupt_leaves_nothing(writing, out, name, stage, number):
+    popen = process(stage, *writing[name], script=HOLD)
+    assert popen.stdout.readline() == "here\n"
+    popen.send_signal(number)
+    done = finished(popen)
+    assert done == Done(1, "", "orthonav: error: interrupted; nothing was written\n")
+    assert nothing_in(out)
+
+
+KILLED = """
+import os, sys, time
+from orthonav.cli import main
+
+def held(_):
+    print("here", flush=True)
+    time.sleep(60)
+
+os.fsync = held
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("old", [None, b"an older map"])
+def test_a_killed_build_leaves_the_old_map_or_none(writing, out, names_in, number, old):
+    if old is not None:
+        (out / "map.onav").write_bytes(old)
+    popen = process(*writing["build"], script=KILLED)
+    assert popen.stdout.readline() == "here\n"
+    popen.send_signal(number)
+    finished(popen)
+    kept = [name for name in names_in(out) if not name.startswith(".")]
+    assert kept == ([] if old is None else ["map.onav"])
+    assert old is None or (out / "map.onav").read_bytes() == old
+    if number == signal.SIGTERM:
+        assert names_in(out) == kept
+
+
+def test_commands_may_run_in_a_thread(map_path, capfd):
+    """Signals belong to the main thread; a command elsewhere leaves them alone."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(main, ["info", str(map_path)]).result() == 0
+
+
+def test_texture_is_worth_a_map(ortho):
+    """The small orthophoto has detail; else the tests above would prove little."""
+    assert textured().std() > 20 and ortho.is_file()

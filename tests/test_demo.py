@@ -1,0 +1,63 @@
+"""The demo tells the whole story and leaves a report that needs nothing else."""
+
+import json
+import re
+import shutil
+
+import pytest
+
+from orthonav.cli import demo, main
+from orthonav.simulate import landscape
+
+
+@pytest.fixture
+def small_demo(area, monkeypatch):
+    """The demo on the small area instead of one that it generates for itself."""
+
+    def generate(folder, progress=None, **_):
+        shutil.copy(area.past, folder)
+        shutil.copy(area.present, folder)
+        return [folder / area.past.name, folder / area.present.name]
+
+    monkeypatch.setattr(landscape, "generate_area", generate)
+    turns = tuple((east * 0.45, north * 0.35) for east, north in demo.TURNS_EN_M)
+    monkeypatch.setattr(demo, "TURNS_EN_M", turns)
+    monkeypatch.setattr(demo, "SPACING_M", 80.0)
+
+
+def test_the_demo(small_demo, tmp_path, capsys, names_in):
+    out = tmp_path / "demo"
+    assert main(["demo", "--out", str(out)]) == 0
+    told = capsys.readouterr()
+    assert f"{out}/report/index.html" in told.out and "4/4" in told.err
+    names = [name for name in names_in(out) if not name.startswith(("flight/", "."))]
+    assert {"area.onav", "demo.json", "fixes.jsonl", "flight", "report"} <= set(names)
+    metrics = json.loads((out / "demo.json").read_text())
+    assert metrics["n_views"] > 15 and metrics["coverage"] > 0.9
+    page = (out / "report" / "index.html").read_text()
+    assert names_in(out / "report") == ["index.html"] and "data:image/png;base64," in page
+    linked = re.findall(r'(?:src|href|url)\s*[=(]\s*["\']?([^"\'>)\s]{1,40})', page)
+    assert linked and all(link.startswith(("data:", "#")) for link in linked)
+    assert "<script src" not in page and "@import" not in page
+
+
+def test_the_demo_may_be_repeated_but_replaces_nothing_else(small_demo, tmp_path, capsys, names_in):
+    out = tmp_path / "demo"
+    out.mkdir()
+    (out / "mine").write_text("mine")
+    assert main(["demo", "--out", str(out)]) == 1
+    assert "not empty" in capsys.readouterr().err and names_in(out) == ["mine"]
+    (out / "mine").rename(out / demo.MARKER)  # as if an earlier demo had made the folder
+    assert main(["demo", "--quiet", "--json", "--out", str(out)]) == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out)["n_views"] > 15 and told.err == ""
+
+
+def test_a_demo_that_fails_leaves_nothing(small_demo, tmp_path, capsys, names_in, monkeypatch):
+    def broken(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("orthonav.prepare.build_map", broken)
+    assert main(["demo", "--quiet", "--out", str(tmp_path / "demo")]) == 1
+    assert capsys.readouterr().err == "orthonav: error: interrupted; nothing was written\n"
+    assert names_in(tmp_path) == []

@@ -1,0 +1,93 @@
+"""What flies needs little: in a fresh interpreter, a fix without torch, GDAL, PROJ or plots."""
+
+import json
+import subprocess
+import sys
+
+FORBIDDEN = ("torch", "rasterio", "pyproj", "shapely", "matplotlib", "osgeo")
+
+BLOCK = f"""
+import sys
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {FORBIDDEN}:
+            raise ImportError(f"{{name}} must not be needed here")
+
+sys.meta_path.insert(0, Blocked())
+"""
+
+FIX = """
+import json, pathlib
+from orthonav.flight import open_flight
+from orthonav.localizer import Localizer
+from orthonav.mapfile import open_map
+from orthonav.onboard.run import localize_flight
+from orthonav.publish.jsonl import result_to_json
+
+map_path, flight_path = map(pathlib.Path, sys.argv[1:])
+flight = open_flight(flight_path)
+results = localize_flight(Localizer(open_map(map_path)), flight, views=flight.views[:2])
+lines = [json.loads(result_to_json(result)) for result in results]
+loaded = sorted({name.partition(".")[0] for name in sys.modules})
+print(json.dumps({"lines": lines, "loaded": loaded}))
+"""
+
+ALL_MODULES = """
+import importlib, json, os, pathlib, pkgutil, signal, sys, threading
+import orthonav
+
+before = os.getcwd(), signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+names = [m.name for m in pkgutil.walk_packages(orthonav.__path__, "orthonav.")]
+for name in names:
+    if not name.endswith("__main__"):
+        importlib.import_module(name)
+after = os.getcwd(), signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+assert before == after, "importing changed the working directory or a signal"
+assert threading.active_count() == 1, threading.enumerate()
+print(json.dumps(names))
+"""
+
+HELP = """
+import sys
+from orthonav.cli import main
+
+try:
+    main(sys.argv[1:])
+except SystemExit as left:
+    assert left.code == 0
+heavy = {"numpy", "cv2", "scipy", "rasterio", "matplotlib", "safetensors"} & set(sys.modules)
+assert not heavy, f"--help loaded {sorted(heavy)}"
+"""
+
+
+def fresh(script, *arguments, cwd):
+    """What a fresh interpreter prints, which must not fail or say anything on stderr."""
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", script, *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+def test_a_fix_without_heavy_libraries(map_path, flight_path, tmp_path, names_in):
+    told = json.loads(fresh(BLOCK + FIX, map_path, flight_path, cwd=tmp_path))
+    assert [line["status"] for line in told["lines"]] == ["fix", "fix"]
+    assert not set(told["loaded"]) & set(FORBIDDEN)
+    assert names_in(tmp_path) == []
+
+
+def test_importing_has_no_side_effect(tmp_path, names_in):
+    names = json.loads(fresh(ALL_MODULES, cwd=tmp_path))
+    assert "orthonav.localizer.localizer" in names and len(names) > 50
+    assert names_in(tmp_path) == []
+
+
+def test_help_loads_no_heavy_library(tmp_path):
+    assert "COMMAND" in fresh(HELP, "--help", cwd=tmp_path)
+    for command in ("build", "localize", "demo"):
+        assert f"orthonav {command}" in fresh(HELP, command, "--help", cwd=tmp_path)

@@ -1,0 +1,44 @@
+"""A floor under what real imagery gives: orthophotos of two dates, where they are at hand.
+
+Looked for in `../shared/data` beside the checkout, or in the folder that ORTHONAV_DATA names.
+"""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthonav.evaluate.metrics import compare
+from orthonav.flight import open_flight, read_truth
+from orthonav.localizer import Localizer
+from orthonav.mapfile import open_map
+from orthonav.onboard.run import localize_flight
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+
+BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
+DATA = Path(os.environ.get("ORTHONAV_DATA", BESIDE))
+VIEWS = 25
+WITHIN_STRIDES = 0.75
+ERRORS = Errors(yaw_std_deg=5.0, agl_std=0.05)
+PAIRS = {
+    "naip": ("naip_nd/20090818.tif", "naip_nd/20180716.tif", 0.9),
+    "szada": ("airchange/szada_5_a.tif", "airchange/szada_5_b.tif", 0.8),
+}
+
+
+@pytest.mark.parametrize("past, present, least", PAIRS.values(), ids=PAIRS.keys())
+def test_views_of_another_year_are_placed(tmp_path, past, present, least):
+    for name in (past, present):
+        if not (DATA / name).is_file():
+            pytest.skip(f"optional real imagery is not there (see ORTHONAV_DATA): {DATA / name}")
+    build_map(BuildRequest([DATA / past], tmp_path / "map.onav"))
+    flight = tmp_path / "flight"
+    simulate_flight(SimulateRequest([DATA / present], flight, random=VIEWS, errors=ERRORS, seed=1))
+    opened = open_map(tmp_path / "map.onav")
+    results = list(localize_flight(Localizer(opened), open_flight(flight)))
+    sheet = opened.manifest.sheets[0]
+    comparison = compare(read_truth(flight / "truth.csv"), results, sheet.frame)
+    right = comparison.errors_m <= WITHIN_STRIDES * sheet.grid.stride_m
+    assert len(right) == VIEWS and np.mean(right) >= least
