@@ -47,7 +47,10 @@ def test_the_demo_may_be_repeated_but_replaces_nothing_else(small_demo, tmp_path
     (out / "mine").write_text("mine")
     assert main(["demo", "--out", str(out)]) == 1
     assert "not empty" in capsys.readouterr().err and names_in(out) == ["mine"]
-    (out / "mine").rename(out / demo.MARKER)  # as if an earlier demo had made the folder
+    (out / demo.MARKER).write_text('{"made_by": "orthonav demo"}')
+    assert main(["demo", "--out", str(out)]) == 1 and (out / "mine").exists()
+    (out / "mine").unlink()  # what is left is what an earlier demo might have made
+    capsys.readouterr()
     assert main(["demo", "--quiet", "--json", "--out", str(out)]) == 0
     told = capsys.readouterr()
     assert json.loads(told.out)["n_views"] > 15 and told.err == ""

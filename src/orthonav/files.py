@@ -4,7 +4,7 @@ import errno
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,7 +18,9 @@ def replacing(path: Path) -> Iterator[Path]:
     On any exception, an interrupt included, the temporary file is removed and `path` is untouched.
     Raises `OutputError` where the system refuses to write (disk full, no permission).
     """
-    path = Path(path)
+    path = Path(path).resolve()
+    if path.exists() and not path.is_file():
+        raise OutputError(f"cannot write over a folder or a device: {path}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(
@@ -42,14 +44,15 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def replacing_folder(path: Path) -> Iterator[Path]:
+def replacing_folder(path: Path, is_ours: Callable[[Path], bool] | None = None) -> Iterator[Path]:
     """Yield a temporary folder beside `path`; on success it takes the place of `path`.
 
     An existing empty folder is replaced; an existing folder with content is refused before any
-    work is done. On any exception the temporary folder is removed.
+    work is done, unless `is_ours` says that it may go. On any exception the temporary folder is
+    removed and the old one stays.
     """
     path = Path(path)
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+    if not _may_be_replaced(path, is_ours):
         raise OutputError(
             f"output folder exists and is not empty; remove it or name another: {path}"
         )
@@ -61,8 +64,10 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         temporary.chmod(0o777 & ~_umask())
-        if path.exists():
-            path.rmdir()
+        if is_ours is not None and path.exists() and is_ours(path):
+            _remove_folder(path)
+        elif path.exists():
+            path.rmdir()  # refuses what appeared in it meanwhile
         temporary.replace(path)
     except OSError as error:
         if isinstance(error, MissingFileError | OutputError) or error.errno is None:
@@ -70,6 +75,22 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         raise _output_error(error, path) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _may_be_replaced(path: Path, is_ours: Callable[[Path], bool] | None) -> bool:
+    try:
+        if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+            return True
+        return path.is_dir() and is_ours is not None and is_ours(path)
+    except OSError as error:
+        raise _output_error(error, path) from error
+
+
+def _remove_folder(path: Path) -> None:
+    """Remove a folder, out of sight first, so that a kill leaves no half of it."""
+    aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
+    path.replace(aside)
+    shutil.rmtree(aside, ignore_errors=True)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -47,9 +47,10 @@ LINE_EN_M = np.array([[0, 0], [10, 0], [20, 0], [100, 0]], dtype=np.float32)
 
 @pytest.mark.parametrize(
     "exclusion_m, expected",
-    [(0, 0.9), (9.9, 0.9), (10, 0.8), (19.9, 0.8), (20, 0.3), (100, -1), (1000, -1)],
+    [(0, 0.9), (9.9, 0.9), (10, 0.8), (19.9, 0.8), (20, 0.3), (100, 1.0), (1000, 1.0)],
 )
 def test_rival_lies_beyond_the_exclusion_radius(exclusion_m, expected):
+    """Without any tile out there the best is its own rival: nothing stands out."""
     rival = rival_score(scores(1.0, 0.9, 0.8, 0.3), LINE_EN_M, 0, exclusion_m)
     assert rival == pytest.approx(expected)
 

@@ -89,7 +89,7 @@ def test_a_point_gets_one_tile_around_it():
         ({"gsd_m": 0}, "ground resolution"),
         ({"gsd_m": math.nan}, "ground resolution"),
         ({"gsd_m": math.inf}, "ground resolution"),
-        ({"tile_px": 15}, "at least 16 px"),
+        ({"tile_px": 15}, "16 to 4096 px"),
         ({"overlap": 1.0}, "overlap"),
         ({"overlap": -0.1}, "overlap"),
         ({"overlap": math.nan}, "overlap"),

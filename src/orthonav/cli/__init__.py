@@ -28,6 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code: 0 done, 1 a known error, 2 wrong usage."""
     # Matrices here are small: more BLAS threads only wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # errors are told once, by us
     arguments = list(sys.argv[1:] if argv is None else argv)
     verbose = False
     try:
@@ -46,6 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:  # a disk or a device that fails where nobody expected it
+        return _failed(_one_line(error), verbose)
     except MemoryError:
         return _failed("out of memory", verbose)
     return 0

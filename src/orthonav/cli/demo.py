@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import shutil
 import sys
 import time
 from pathlib import Path
@@ -42,9 +41,9 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.files import replacing_folder
 
     start = time.perf_counter()
-    _remove_earlier(options.out)
-    with progress(options) as shown, replacing_folder(options.out) as folder:
+    with progress(options) as shown, replacing_folder(options.out, _is_earlier_demo) as folder:
         plain, text = _story(folder, options, shown)
+        plain["made_by"] = "orthonav demo"
         (folder / MARKER).write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
     if options.json:
         print_json(plain)
@@ -53,10 +52,16 @@ def run(options: argparse.Namespace) -> None:
     print(f"\ndone in {time.perf_counter() - start:.0f} s; open {options.out}/report/index.html")
 
 
-def _remove_earlier(out: Path) -> None:
-    """Remove what an earlier demo left; anything else in the way is refused later."""
-    if (out / MARKER).is_file():
-        shutil.rmtree(out)
+def _is_earlier_demo(out: Path) -> bool:
+    """Whether a folder holds what a demo left and nothing else."""
+    try:
+        plain = json.loads((out / MARKER).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    names = {path.name for path in out.iterdir()}
+    known = {MARKER, "area.onav", "fixes.jsonl", "flight", "report", "route.geojson"}
+    made = isinstance(plain, dict) and plain.get("made_by") == "orthonav demo"
+    return made and all(name in known or name.endswith(".tif") for name in names)
 
 
 def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[Any, str]:

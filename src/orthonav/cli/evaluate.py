@@ -28,7 +28,11 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--radius-m", type=float, default=15.0, help="an error below it is right (default 15)"
     )
     parser.add_argument(
-        "--json", metavar="metrics.json", help="write metrics as JSON; - for stdout"
+        "--json",
+        nargs="?",
+        const="-",
+        metavar="metrics.json",
+        help="write metrics as JSON, to stdout where no file is named",
     )
     parser.add_argument("--report", type=Path, metavar="REPORT/", help="write an HTML report")
     parser.add_argument("--map", type=Path, metavar="MAP.onav", help="background of the report")
@@ -53,11 +57,12 @@ def run(options: argparse.Namespace) -> None:
     opened = open_map(options.map) if options.map else None
     local = opened.manifest.sheets[0].frame if opened else None
     background = map_background(opened) if opened else None
-    flights = []
+    names = _names(options.fixes)
+    flights: list[FlightReport] = []
     for fixes, truth in zip(options.fixes, options.truth, strict=True):
         comparison = compare(read_truth(truth), read_results(fixes), local)
         metrics = measure(comparison, options.radius_m)
-        flights.append(FlightReport(fixes.stem, comparison, metrics, background))
+        flights.append(FlightReport(names[len(flights)], comparison, metrics, background))
     if options.report:
         _write_report(options.report, flights, opened)
     plain: dict[str, Any] = metrics_to_json(flights[0].metrics)
@@ -72,6 +77,16 @@ def run(options: argparse.Namespace) -> None:
     print(table(flights))
     if options.report:
         print(f"report: {options.report / 'index.html'}")
+
+
+def _names(paths: list[Path]) -> list[str]:
+    """A name for each file: its stem, with its folder where stems are alike."""
+    names = [path.stem for path in paths]
+    if len(set(names)) < len(names):
+        names = [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
+    if len(set(names)) < len(names):
+        names = [str(path) for path in paths]
+    return names
 
 
 def _write_report(out: Path, flights: list[Any], opened: "MapFile | None") -> None:

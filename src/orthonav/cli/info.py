@@ -83,7 +83,7 @@ def summary_text(plain: dict[str, Any]) -> str:
     lines = [
         f"map        {plain['map']}  ({plain['created_by']})",
         f"area       {plain['area_km2']:.2f} km2 of tile centres, {plain['tiles']} tiles",
-        f"size       {plain['size_mb']:.3f} MB, {plain['mb_per_km2']:.3f} MB per km2",
+        f"size       {plain['size_mb']:.3f} MB, {plain['mb_per_km2'] or 0:.3f} MB per km2",
         f"recipe     {recipe_text(plain['recipe'])}",
     ]
     for sheet in plain["sheets"]:
@@ -109,8 +109,12 @@ def recipe_text(recipe: dict[str, Any]) -> str:
     """Method, variants and their parameters on one line."""
     parts = [str(recipe.get("method"))]
     for name in ("represent", "embed"):
-        variant = dict(recipe.get(name, {}))
+        found = recipe.get(name)
+        variant = dict(found) if isinstance(found, dict) else {}
         title = variant.pop("name", "?")
-        values = ",".join(f"{key}={value:g}" for key, value in variant.items())
+        values = ",".join(
+            f"{key}={value:g}" if isinstance(value, int | float) else f"{key}={value!r}"
+            for key, value in variant.items()
+        )
         parts.append(f"{name} {title}:{values}" if values else f"{name} {title}")
     return ", ".join(parts) + f", overlap {recipe.get('overlap')}"

@@ -57,18 +57,20 @@ def run(options: argparse.Namespace) -> None:
             shown("localize", len(results) / len(flight.views))
     write_results(options.out, results)
     fixes = sum(isinstance(result.outcome, Fix) for result in results)
-    median_ms = float(np.median([result.latency_ms for result in results]))
+    latencies = np.array([result.latency_ms for result in results])
+    latencies = latencies[np.isfinite(latencies)]
+    median_ms = float(np.median(latencies)) if latencies.size else None
     plain = {
         "fixes": str(options.out),
         "views": len(results),
         "n_fix": fixes,
         "n_no_fix": len(results) - fixes,
-        "median_latency_ms": round(median_ms, 3) if np.isfinite(median_ms) else None,
+        "median_latency_ms": None if median_ms is None else round(median_ms, 3),
     }
     if options.json:
         print_json(plain)
     else:
         print(
             f"{plain['views']} views: {fixes} fixes, {plain['n_no_fix']} without; "
-            f"median {median_ms:.1f} ms per view\nwritten to {options.out}"
+            f"median {median_ms or 0:.1f} ms per view\nwritten to {options.out}"
         )

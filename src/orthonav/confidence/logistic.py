@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from orthonav.errors import VariantError
 
@@ -57,6 +56,8 @@ def fit_logistic(
     `features` (N, len(FEATURES)), `right` (N,) whether the fix was right, `sample_weight` (N,).
     Features are standardized inside, the result applies to raw ones.
     """
+    from scipy.optimize import minimize  # not needed to fly
+
     mean, std = features.mean(axis=0), features.std(axis=0) + 1e-9
     scaled = (features - mean) / std
     sign = np.where(right, 1.0, -1.0)

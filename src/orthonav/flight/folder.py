@@ -5,6 +5,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -166,22 +167,22 @@ def _views(telemetry: Path, frames: Path) -> Iterator[FlightView]:
         if frame in seen:
             raise FlightError(f"line {line}: frame {frame} comes twice: {telemetry}")
         seen.add(frame)
-        time_s = _number(row["time_s"])
-        if not (math.isfinite(time_s) and abs(time_s) < 9e9):
+        time_ns = _time_ns(row["time_s"])
+        if time_ns is None:
             raise FlightError(f"line {line}: time_s is no time in seconds: {telemetry}")
         image = frames / frame
         if not _is_file(image):
             raise FlightError(f"telemetry line {line} names an image that does not exist: {image}")
-        yield FlightView(frame, image, _telemetry(row, time_s))
+        yield FlightView(frame, image, _telemetry(row, time_ns))
 
 
-def _telemetry(row: Mapping[str, str], time_s: float) -> Telemetry:
+def _telemetry(row: Mapping[str, str], time_ns: int) -> Telemetry:
     prior = [_optional(row, f"prior_{name}") for name in ("lat_deg", "lon_deg", "std_m")]
     velocity = [_optional(row, f"vel_{name}_mps") for name in ("east", "north")]
     usable = prior[0] is not None and prior[1] is not None and prior[2] is not None
     usable = usable and abs(prior[0] or 0) <= 90 and abs(prior[1] or 0) <= 360
     return Telemetry(
-        time_ns=round(time_s * 1e9),
+        time_ns=time_ns,
         yaw_deg=_number(row["yaw_deg"]),
         pitch_deg=_number(row["pitch_deg"]),
         roll_deg=_number(row["roll_deg"]),
@@ -216,6 +217,13 @@ def _is_file(path: Path) -> bool:
         return path.is_file()
     except OSError:  # a name longer than the system allows
         return False
+
+
+def _time_ns(text: str) -> int | None:
+    """Nanoseconds of decimal seconds; floats could not hold them for times since 1970."""
+    if not math.isfinite(_number(text)) or abs(_number(text)) >= 9e9:
+        return None
+    return round(Decimal(text.strip()) * 10**9)
 
 
 def _number(text: Any) -> float:

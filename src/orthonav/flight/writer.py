@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 from collections.abc import Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,7 @@ class FlightWriter:
 def _columns(telemetry: Telemetry) -> dict[str, Any]:
     prior, velocity = telemetry.prior, telemetry.vel_en_mps
     return {
-        "time_s": telemetry.time_ns / 1e9,
+        "time_s": Decimal(telemetry.time_ns) / 10**9,
         "yaw_deg": telemetry.yaw_deg,
         "pitch_deg": telemetry.pitch_deg,
         "roll_deg": telemetry.roll_deg,
@@ -88,6 +89,8 @@ def _columns(telemetry: Telemetry) -> dict[str, Any]:
 def _text(value: Any) -> str:
     if value is None:
         return ""
+    if isinstance(value, Decimal):
+        return f"{value:.9f}".rstrip("0").rstrip(".")
     return f"{value:.8f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)
 
 

@@ -37,6 +37,8 @@ class Camera:
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.distortion and not any(self.distortion):
+            object.__setattr__(self, "distortion", ())  # none at all, and faster
         for name in ("width_px", "height_px"):
             if not 1 <= getattr(self, name) <= MAX_DIMENSION_PX:
                 raise CameraError(f"camera {name} must be 1 to {MAX_DIMENSION_PX}: {self}")

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from orthonav.errors import AreaError
 
+MAX_TILE_PX = 4096
+
 
 @dataclass(frozen=True)
 class TileGrid:
@@ -44,8 +46,8 @@ class TileGrid:
         west, south, east, north = extent_en_m
         if not (np.isfinite(gsd_m) and gsd_m > 0):
             raise AreaError(f"ground resolution must be above 0 m per pixel, got {gsd_m}")
-        if tile_px < 16:
-            raise AreaError(f"tiles must be at least 16 px across, got {tile_px}")
+        if not 16 <= tile_px <= MAX_TILE_PX:
+            raise AreaError(f"tiles must be 16 to {MAX_TILE_PX} px across, got {tile_px}")
         if not 0 <= overlap < 1:
             raise AreaError(f"overlap must be at least 0 and below 1, got {overlap}")
         if not (np.isfinite(extent_en_m).all() and east >= west and north >= south):

@@ -47,7 +47,7 @@ def sample_stretch(sources: list[Source]) -> Stretch | None:
         )
     values = []
     broken: ImageryError | None = None
-    for source in sources[:: max(1, len(sources) // SAMPLED_SOURCES)]:
+    for source in sources[:: max(1, -(-len(sources) // SAMPLED_SOURCES))]:
         try:
             values.append(_valid_values(source))
         except RasterioError as error:  # it may not be needed, and is reported if it is

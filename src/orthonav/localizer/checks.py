@@ -38,7 +38,7 @@ def check_telemetry(
         return NoFix("too_small", f"view is {camera.width_px} x {camera.height_px} px")
     coarser = camera.gsd_m(telemetry.agl_m) / gsd_m
     if coarser > MAX_COARSER:
-        return NoFix("too_coarse", f"a pixel of the view covers {coarser:.1f} pixels of the map")
+        return NoFix("too_coarse", f"a pixel of the view covers {coarser:.3g} pixels of the map")
     return None
 
 

@@ -26,6 +26,7 @@ DEFAULT_YAW_STD_DEG = 5.0
 PRIOR_SIGMAS = 3.0
 HEADING_SIGMAS = 1.5
 UNKNOWN_HEADING_STEP_DEG = 8.0
+BACKGROUND_TILES = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,9 @@ class Localizer:
             self.representation = variant_from_recipe(
                 represent.TABLE, manifest.recipe.get("represent")
             )
-            self.embedder = _embedder(opened, manifest.recipe.get("embed"))
+            self.embedder = _embedder(
+                opened, manifest.recipe.get("embed"), self.representation.channels
+            )
             plain = manifest.confidence
             self.confidence = None if plain is None else LogisticConfidence.from_plain(plain)
             self._step_deg = float(manifest.view["heading_step_deg"])
@@ -70,7 +73,7 @@ class Localizer:
         tiles = self.sheet.tiles
         if self.centres_en_m.shape != (tiles, 2) or embeddings.shape != (tiles, self.embedder.dims):
             raise MapFileError(f"map's parts do not fit together: {opened.path}")
-        if not (self._step_deg > 0 and self._position_std_m > 0):
+        if not (self._step_deg > 0 and self._position_std_m > 0 and manifest.radius_m > 0):
             raise MapFileError(f"map has impossible view parameters: {opened.path}")
         try:
             self.neighbours = TileNeighbours(self.grid, self.centres_en_m)
@@ -78,6 +81,7 @@ class Localizer:
             raise MapFileError(f"{error}: {opened.path}") from error
         self.radius_m = manifest.radius_m
         self.index = ExactIndex(embeddings)
+        self._background = np.arange(0, tiles, -(-tiles // BACKGROUND_TILES), dtype=np.intp)
 
     def locate(
         self,
@@ -104,16 +108,18 @@ class Localizer:
         refused = refused or check_view(grey)
         if refused is not None:
             return refused
-        rows = self._allowed(prior)
-        if rows is not None and rows.size == 0:
-            return NoFix("outside_map", "no tile of the map lies where the prior says")
         headings = self._headings_deg(telemetry, heading_known)
         prepared = prepare_view(grey, camera, telemetry.agl_m, self.grid.gsd_m)
         rectified = [self.rectified(prepared, telemetry, heading) for heading in headings]
         refused = check_rectified(rectified[len(headings) // 2], self._min_valid_share)
         if refused is not None:
             return refused
+        rows = self._allowed(prior, [view.offset_en_m for view in rectified])
+        if rows is not None and rows.size == 0:
+            return NoFix("outside_map", "no tile of the map lies where the prior says")
         match = self.match(self.embedded(rectified), rows)
+        if not math.isfinite(match.evidence["score"]):
+            return NoFix("internal_error", "the map's embeddings are not finite")
         return self._fix(match, rectified[match.query], headings[match.query], telemetry)
 
     def rectified(self, view: PreparedView, telemetry: Telemetry, heading_deg: float) -> Rectified:
@@ -139,32 +145,46 @@ class Localizer:
         """Best tile for queries (Q, D), one per heading, among `rows` (all where None).
 
         Evidence: `score` (best scalar product), `margin` (its lead over the best score farther
-        than half a tile away), `lowe_ratio`, `peak_ratio` (the same with that exclusion).
+        than half a tile away), `lowe_ratio`, `peak_ratio` (the same with that exclusion). Rivals
+        are looked for beyond `rows` too, on up to `BACKGROUND_TILES` tiles of the whole map: a
+        narrow prior leaves no rival of its own, and that must not look like certainty.
         """
-        scores = self.index.scores(queries, rows)
+        searched = None
+        if rows is not None:
+            searched = np.union1d(rows, self._background)
+        scores = self.index.scores(queries, searched)
         best_heading = scores.argmax(axis=1)
         per_tile = np.take_along_axis(scores, best_heading[:, None], axis=1)[:, 0]
-        centres = self.centres_en_m if rows is None else self.centres_en_m[rows]
-        best = int(per_tile.argmax())
+        if searched is None or rows is None:
+            centres, best = self.centres_en_m, int(per_tile.argmax())
+            tile = best
+        else:
+            centres, allowed = self.centres_en_m[searched], np.searchsorted(searched, rows)
+            best = int(allowed[per_tile[allowed].argmax()])
+            tile = int(searched[best])
         score = float(per_tile[best])
         rival = rival_score(per_tile, centres, best, self.grid.tile_m / 2)
         evidence = {
             "score": score,
             "margin": score - rival,
-            "lowe_ratio": lowe_ratio(per_tile),
+            "lowe_ratio": lowe_ratio(per_tile, best),
             "peak_ratio": peak_ratio(score, rival),
-            "tiles_searched": float(len(per_tile)),
+            "tiles_searched": float(len(per_tile) if rows is None else len(rows)),
         }
-        tile = best if rows is None else int(rows[best])
-        east, north = self.neighbours.peak_offset(per_tile, tile, rows)
+        east, north = self.neighbours.peak_offset(per_tile, tile, searched)
         shift = east * self.grid.stride_m, north * self.grid.stride_m
         return Match(tile, shift, int(best_heading[best]), evidence)
 
-    def _allowed(self, prior: Prior | None) -> NDArray[np.intp] | None:
+    def _allowed(
+        self, prior: Prior | None, offsets_en_m: list[NDArray[np.float64]]
+    ) -> NDArray[np.intp] | None:
+        """Rows of tiles that the camera may look at: around the prior, moved by where it leans."""
         if prior is None:
             return None
-        centre = self.sheet.frame.en_from_latlon(prior.lat_deg, prior.lon_deg)
-        radius_m = PRIOR_SIGMAS * max(prior.std_m, 0.0) + self.grid.stride_m
+        offset = np.mean(offsets_en_m, axis=0)
+        spread_m = max(float(np.hypot(*(each - offset))) for each in offsets_en_m)
+        centre = self.sheet.frame.en_from_latlon(prior.lat_deg, prior.lon_deg) + offset
+        radius_m = PRIOR_SIGMAS * max(prior.std_m, 0.0) + self.grid.stride_m + spread_m
         return rows_within(self.centres_en_m, centre, radius_m)
 
     def _headings_deg(self, telemetry: Telemetry, heading_known: bool) -> list[float]:
@@ -189,10 +209,12 @@ class Localizer:
             "tile_shift_m": float(np.hypot(*match.shift_en_m)),
         }
         confidence = math.nan if self.confidence is None else self.confidence(evidence)
+        covariance = np.eye(2) * self._position_std_m**2
+        covariance.flags.writeable = False
         return Fix(
             lat_deg=float(lat),
             lon_deg=float(lon),
-            cov_en_m2=np.eye(2) * self._position_std_m**2,
+            cov_en_m2=covariance,
             confidence=confidence,
             radius_m=self.radius_m,
             heading_deg=heading_deg % 360,
@@ -201,11 +223,11 @@ class Localizer:
         )
 
 
-def _embedder(opened: MapFile, plain: Any) -> WhitenedEmbedder:
+def _embedder(opened: MapFile, plain: Any, channels: int) -> WhitenedEmbedder:
     recipe = variant_from_recipe(embed.TABLE, plain)
     mean = opened.array("embed/mean", np.float16, 1)
     basis = opened.array("embed/basis", np.float16, 2)
-    if basis.shape[0] != mean.shape[0] or mean.shape[0] % recipe.cells**2:
+    if not basis.shape[0] == mean.shape[0] == recipe.cells**2 * channels:
         raise MapFileError("map's embedding parts do not fit together")
     if not (np.isfinite(mean).all() and np.isfinite(basis).all()):
         raise MapFileError("map's embedding is not finite")

@@ -12,7 +12,7 @@ from typing import Any
 
 from orthonav.errors import AreaError, MapFileError, MapVersionError
 from orthonav.geo.frames import MAX_SHEET_M, LocalFrame
-from orthonav.geo.grid import TileGrid
+from orthonav.geo.grid import MAX_TILE_PX, TileGrid
 
 FORMAT = "orthonav-map"
 SCHEMA = 1
@@ -63,7 +63,7 @@ class SheetInfo:
         tiles = _get(plain, "tiles", int)
         sane = (
             grid.gsd_m > 0
-            and 16 <= grid.tile_px <= 4096
+            and 16 <= grid.tile_px <= MAX_TILE_PX
             and 1 <= grid.stride_px <= grid.tile_px
             and grid.rows >= 1
             and grid.cols >= 1

@@ -6,7 +6,7 @@ is a seven-number mean per micro-cell (about 0.5 MB per km2 at 1 m and 256 px ti
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__, embed, represent
-from orthonav.embed.cells import CellLayout
+from orthonav.embed.cells import MICRO, CellLayout
 from orthonav.embed.whitened import CellSheet, WhitenedEmbedder, WhitenedRecipe, learn
-from orthonav.errors import AreaError, VariantError
+from orthonav.errors import AreaError, OutputError, VariantError
 from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 BLOCK_PX = 1024
 PREVIEW_PX = 384
 MIN_TILE_VALID_SHARE = 0.5
-MIN_VIEW_VALID_SHARE = 0.1
+MIN_VIEW_VALID_SHARE = 0.4
 HEADING_STEP_DEG = 6.0
 Progress = Callable[[str, float], None]
 
@@ -52,7 +52,7 @@ class BuildRequest:
     overlap: float = 0.875
     method: str = "gradient"
     edges: str = "gradient"
-    seed: int = field(default=0)
+    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -73,10 +73,15 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     representation = make_variant(represent.TABLE, request.edges)
     recipe = _embedding_recipe(request.method, representation)
     mosaic = Mosaic.open(request.orthos)
+    if any(request.out.exists() and request.out.samefile(path) for path in request.orthos):
+        raise OutputError(f"the map would replace an orthophoto; name another file: {request.out}")
     area = _area(request, mosaic)
     gsd_m = _rounded(mosaic.gsd_m) if request.gsd_m is None else request.gsd_m
+    if request.seed < 0:
+        raise VariantError(f"seed must be 0 or more, got {request.seed}")
+    overlap = _whole_cells(request.tile_px, request.overlap)
     grid = TileGrid.covering(
-        area.extent_en_m, gsd_m=gsd_m, tile_px=request.tile_px, overlap=request.overlap
+        area.extent_en_m, gsd_m=gsd_m, tile_px=request.tile_px, overlap=overlap
     )
     west, south, east, north = area.extent_en_m
     side_m = min(east - west, north - south)
@@ -101,6 +106,8 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     calibration = calibrate(
         sampler, grid, representation, embedder, embeddings, centres, HEADING_STEP_DEG, report
     )
+    if calibration.confidence is None:
+        log.warning("too little imagery to calibrate: fixes on this map will have no confidence")
     manifest = _manifest(
         request, mosaic, area, grid, representation, embedder, calibration, tiles_rc
     )
@@ -149,6 +156,18 @@ def _rounded(gsd_m: float) -> float:
     return float(f"{gsd_m:.4g}")
 
 
+def _whole_cells(tile_px: int, overlap: float) -> float:
+    """The overlap that makes tiles whole micro-cells apart, where they are at least one apart.
+
+    Tiles then share all their cells; memory would grow with the square of what is left over.
+    """
+    micro_px = max(1, tile_px // MICRO)
+    stride_px = tile_px * (1 - overlap)
+    if not micro_px <= stride_px <= tile_px:
+        return overlap
+    return 1 - round(stride_px / micro_px) * micro_px / tile_px
+
+
 def _read_cells(
     mosaic: Mosaic,
     area: Area,
@@ -164,7 +183,7 @@ def _read_cells(
     # Cells that begin in a block may end beyond it, within the margin.
     beyond_px = layout.micro_px - layout.spacing_px
     margin_px = layout.micro_px + representation.margin_px
-    side_px = max(1, BLOCK_PX // layout.micro_px) * layout.micro_px
+    side_px = -(-max(BLOCK_PX, 2 * grid.tile_px) // layout.micro_px) * layout.micro_px
     blocks = [block for block in blocks_of(grid, side_px) if block.may_matter(area, grid)]
     total_px = sum(block.height * block.width for block in blocks)
     with mosaic.grid_sheet(area.frame, grid) as raster:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.confidence.logistic import FEATURES, LogisticConfidence, fit_logistic
+from orthonav.confidence.logistic import LogisticConfidence, fit_logistic
 from orthonav.confidence.ratios import rival_score
 from orthonav.embed.whitened import WhitenedEmbedder
 from orthonav.geo.grid import TileGrid
@@ -50,7 +50,6 @@ class Calibration:
 
     confidence: LogisticConfidence | None
     position_std_m: float
-    right_share: float
 
 
 class CropSampler:
@@ -58,6 +57,7 @@ class CropSampler:
 
     def __init__(self, tile_px: int, seed: int) -> None:
         self._rng = np.random.default_rng([seed, 1])
+        self._tile_px = tile_px
         self.size_px = round(tile_px * CROP_TILES)
         self.crops: list[Crop] = []
 
@@ -74,14 +74,15 @@ class CropSampler:
         `share` is the part of all imagery offered that this block is.
         """
         height, width = grey.shape
-        if min(height, width) < self.size_px:
+        size = min(height, width, self.size_px)
+        if size < self._tile_px:
             return
         for _ in range(self._rng.poisson(2.0 * CROPS * share)):
-            row = int(self._rng.integers(0, height - self.size_px + 1))
-            col = int(self._rng.integers(0, width - self.size_px + 1))
-            part = np.s_[row : row + self.size_px, col : col + self.size_px]
+            row = int(self._rng.integers(0, height - size + 1))
+            col = int(self._rng.integers(0, width - size + 1))
+            part = np.s_[row : row + size, col : col + size]
             if valid[part].all() and grey[part].std() > 1 and len(self.crops) < 2 * CROPS:
-                half = self.size_px / 2
+                half = size / 2
                 self.crops.append(Crop(grey[part].copy(), row_px + row + half, col_px + col + half))
 
 
@@ -130,7 +131,7 @@ def _fitted(
     mirrored: NDArray[np.bool_],
     grid: TileGrid,
 ) -> Calibration:
-    fallback = Calibration(None, grid.stride_m, 0.0)
+    fallback = Calibration(None, grid.stride_m)
     if len(features) == 0:
         return fallback
     near = np.hypot(*errors_en_m.T) <= RADIUS_STRIDES * grid.stride_m
@@ -138,10 +139,9 @@ def _fitted(
     if right.sum() < MIN_RIGHT:
         return fallback
     weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)
-    confidence = fit_logistic(features[:, : len(FEATURES)], right, weight)
+    confidence = fit_logistic(features, right, weight)
     std_m = float(np.sqrt(np.mean(errors_en_m[right] ** 2)))
-    share = float(right.sum() / (~mirrored).sum())
-    return Calibration(confidence, max(std_m, grid.gsd_m), share)
+    return Calibration(confidence, max(std_m, grid.gsd_m))
 
 
 def changed_picture(
@@ -149,6 +149,7 @@ def changed_picture(
 ) -> NDArray[np.uint8]:
     """`grey` (S, S) as another year might show it: light, blur, noise, places that changed."""
     size = grey.shape[0]
+    other = np.asarray(cv2.resize(other, (size, size)), dtype=np.uint8)
     mask = cv2.resize(
         rng.random((8, 8)).astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC
     )
@@ -172,11 +173,12 @@ def _queries(
     heading = rng.normal(0, HEADING_STD_DEG)
     scale = float(np.exp(rng.normal(0, SCALE_STD)))
     size, middle = grid.tile_px, (picture.shape[0] - 1) / 2
-    valid = np.ones((size, size), dtype=np.bool_)
+    inside = np.ones(picture.shape, dtype=np.uint8)
     queries = []
     for step in (-heading_step_deg, 0.0, heading_step_deg):
         matrix = cv2.getRotationMatrix2D((middle, middle), heading + step, scale)
         matrix[:, 2] -= middle - (size - 1) / 2
         view = np.asarray(cv2.warpAffine(picture, matrix, (size, size)), dtype=np.uint8)
+        valid = np.asarray(cv2.warpAffine(inside, matrix, (size, size)) > 0, dtype=np.bool_)
         queries.append(embedder.view(representation(view, valid), valid))
     return np.stack(queries)

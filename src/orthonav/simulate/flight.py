@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import AreaError, FlightError
+from orthonav.errors import AreaError, CameraError, FlightError
 from orthonav.files import replacing_folder
 from orthonav.flight.writer import FlightWriter
 from orthonav.geo.area import Area
@@ -106,6 +106,8 @@ def simulate_flight(
         raise FlightError("fly along a route or at a number of random places, one of them")
     if request.random is not None and not 1 <= request.random <= MAX_VIEWS:
         raise FlightError(f"number of random places must be 1 to {MAX_VIEWS}: {request.random}")
+    if request.seed < 0:
+        raise FlightError(f"seed must be 0 or more, got {request.seed}")
     mosaic = Mosaic.open(request.orthos)
     outline = mosaic.outline_latlon_deg
     area = Area.from_outline(outline[:, 0], outline[:, 1])
@@ -169,6 +171,13 @@ class _Coverage:
         ) as raster:
             self._missing = ~raster.read(0, 0, width, height).valid
 
+    def sees_ground(self, camera: Camera, pose: _Pose) -> bool:
+        """Whether the whole view lies on imagery, the horizon not in it."""
+        try:
+            return self.whole(_corners_en_m(camera, pose))
+        except CameraError:
+            return False
+
     def whole(self, corners_en_m: Array) -> bool:
         """Whether imagery lies under all of the quadrilateral (4, 2)."""
         x = (corners_en_m[:, 0] - self._west) / self._gsd_m
@@ -198,7 +207,7 @@ def _poses(
         for _ in range(TRIES_PER_VIEW):
             place = rng.uniform([west, south], [east, north])
             pose = _leaning(request, rng, place, rng.uniform(0, 360), agl_m, number * 1.0)
-            if coverage.whole(_corners_en_m(request.camera, pose)):
+            if coverage.sees_ground(request.camera, pose):
                 yield pose
                 break
         else:
@@ -224,7 +233,7 @@ def _route_poses(
         rng = np.random.default_rng([request.seed, 0, number])
         time_s = number * spacing_m / request.speed_mps
         pose = _leaning(request, rng, place, float(course), agl_m, time_s)
-        if not coverage.whole(_corners_en_m(request.camera, pose)):
+        if not coverage.sees_ground(request.camera, pose):
             lat, lon = area.frame.latlon_from_en(place)
             raise AreaError(
                 f"view {number + 1} of the route, at {lat:.5f}, {lon:.5f}, "
