@@ -71,14 +71,7 @@ class Reference:
     def of(cls, ortho: Path, localizer: Localizer) -> "Reference":
         """Read the whole sheet."""
         grid = localizer.grid
-        with Mosaic.open([ortho]).sheet(
-            localizer.sheet.frame,
-            west_m=grid.west_m,
-            north_m=grid.north_m,
-            width_px=grid.width_px,
-            height_px=grid.height_px,
-            gsd_m=grid.gsd_m,
-        ) as raster:
+        with Mosaic.open([ortho]).grid_sheet(localizer.sheet.frame, grid) as raster:
             pixels = raster.read(0, 0, grid.width_px, grid.height_px)
         mean = round(float(pixels.grey[pixels.valid].mean()))
         return cls(

@@ -86,14 +86,7 @@ def _dense_embeddings(ortho: Path, map_path: Path, count: int) -> NDArray[np.flo
         tile_px=tile_px,
         overlap=1 - DENSE_STRIDE_PX / tile_px,
     )
-    with mosaic.sheet(
-        sheet.frame,
-        west_m=grid.west_m,
-        north_m=grid.north_m,
-        width_px=grid.width_px,
-        height_px=grid.height_px,
-        gsd_m=grid.gsd_m,
-    ) as raster:
+    with mosaic.grid_sheet(sheet.frame, grid) as raster:
         pixels = raster.read(0, 0, grid.width_px, grid.height_px)
     layout = CellLayout.for_tiles(tile_px, grid.stride_px)
     representation = localizer.representation

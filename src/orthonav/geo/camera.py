@@ -17,6 +17,7 @@ from orthonav.errors import CameraError
 
 Array = NDArray[np.float64]
 MAX_DIMENSION_PX = 65_535
+_HALF_PIXEL = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,14 @@ def camera_from_en(yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: flo
     """
     ground = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -agl_m]])
     return np.asarray(enu_from_camera(yaw_deg, pitch_deg, roll_deg).T @ ground)
+
+
+def counted_from_centres(homography: Array) -> Array:
+    """A homography (3, 3) between pixel-is-area pictures, as OpenCV wants it.
+
+    Ours counts from the outer corner of the first pixel, OpenCV from its centre.
+    """
+    return np.asarray(np.linalg.inv(_HALF_PIXEL) @ homography @ _HALF_PIXEL)
 
 
 def axis_on_ground_en_m(

@@ -7,6 +7,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,7 @@ class Pixels:
     rgb: NDArray[np.uint8]
     valid: NDArray[np.bool_]
 
-    @property
+    @cached_property
     def grey(self) -> NDArray[np.uint8]:
         """Grey levels (H, W) uint8 (ITU-R BT.601 weights); 0 where not valid."""
         return np.asarray(cv2.cvtColor(self.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)

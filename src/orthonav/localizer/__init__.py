@@ -5,7 +5,16 @@ resolution with north up (`rectify`), represent and embed it, search the tiles t
 allows, and say how sure that is.
 """
 
-from orthonav.localizer.localizer import Localizer, Match
+from orthonav.localizer.localizer import Localizer
+from orthonav.localizer.match import Match, TileMatcher
 from orthonav.localizer.rectify import PreparedView, Rectified, prepare_view, rectify
 
-__all__ = ["Localizer", "Match", "PreparedView", "Rectified", "prepare_view", "rectify"]
+__all__ = [
+    "Localizer",
+    "Match",
+    "PreparedView",
+    "Rectified",
+    "TileMatcher",
+    "prepare_view",
+    "rectify",
+]

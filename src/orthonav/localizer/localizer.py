@@ -1,7 +1,6 @@
 """From one view to a fix."""
 
 import math
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
@@ -10,38 +9,21 @@ from numpy.typing import NDArray
 
 from orthonav import embed, represent
 from orthonav.confidence.logistic import LogisticConfidence
-from orthonav.confidence.ratios import lowe_ratio, peak_ratio, rival_score
 from orthonav.embed.whitened import WhitenedEmbedder
 from orthonav.errors import CameraError, MapFileError, VariantError
 from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_rectified, check_telemetry, check_view
+from orthonav.localizer.match import Match, TileMatcher
 from orthonav.localizer.rectify import PreparedView, Rectified, prepare_view, rectify
 from orthonav.mapfile.reader import MapFile
 from orthonav.records import Fix, NoFix, Prior, Telemetry
-from orthonav.search.exact import ExactIndex, rows_within
-from orthonav.search.peak import TileNeighbours
+from orthonav.search.exact import rows_within
 from orthonav.variants import variant_from_recipe
 
 DEFAULT_YAW_STD_DEG = 5.0
 PRIOR_SIGMAS = 3.0
 HEADING_SIGMAS = 1.5
 UNKNOWN_HEADING_STEP_DEG = 8.0
-BACKGROUND_TILES = 20_000
-
-
-@dataclass(frozen=True, eq=False)
-class Match:
-    """What search found for one view.
-
-    `tile` is the row of the best tile, `shift_en_m` where between the tiles the peak lies,
-    measured from its centre, `query` the index of the best of the headings tried, `evidence` the
-    numbers behind it.
-    """
-
-    tile: int
-    shift_en_m: tuple[float, float]
-    query: int
-    evidence: dict[str, float]
 
 
 class Localizer:
@@ -76,12 +58,11 @@ class Localizer:
         if not (self._step_deg > 0 and self._position_std_m > 0 and manifest.radius_m > 0):
             raise MapFileError(f"map has impossible view parameters: {opened.path}")
         try:
-            self.neighbours = TileNeighbours(self.grid, self.centres_en_m)
+            self._matcher = TileMatcher(self.grid, self.centres_en_m, embeddings)
         except MapFileError as error:
             raise MapFileError(f"{error}: {opened.path}") from error
         self.radius_m = manifest.radius_m
-        self.index = ExactIndex(embeddings)
-        self._background = np.arange(0, tiles, -(-tiles // BACKGROUND_TILES), dtype=np.intp)
+        self.index = self._matcher.index
 
     def locate(
         self,
@@ -142,38 +123,8 @@ class Localizer:
         )
 
     def match(self, queries: NDArray[np.float32], rows: NDArray[np.intp] | None = None) -> Match:
-        """Best tile for queries (Q, D), one per heading, among `rows` (all where None).
-
-        Evidence: `score` (best scalar product), `margin` (its lead over the best score farther
-        than half a tile away), `lowe_ratio`, `peak_ratio` (the same with that exclusion). Rivals
-        are looked for beyond `rows` too, on up to `BACKGROUND_TILES` tiles of the whole map: a
-        narrow prior leaves no rival of its own, and that must not look like certainty.
-        """
-        searched = None
-        if rows is not None:
-            searched = np.union1d(rows, self._background)
-        scores = self.index.scores(queries, searched)
-        best_heading = scores.argmax(axis=1)
-        per_tile = np.take_along_axis(scores, best_heading[:, None], axis=1)[:, 0]
-        if searched is None or rows is None:
-            centres, best = self.centres_en_m, int(per_tile.argmax())
-            tile = best
-        else:
-            centres, allowed = self.centres_en_m[searched], np.searchsorted(searched, rows)
-            best = int(allowed[per_tile[allowed].argmax()])
-            tile = int(searched[best])
-        score = float(per_tile[best])
-        rival = rival_score(per_tile, centres, best, self.grid.tile_m / 2)
-        evidence = {
-            "score": score,
-            "margin": score - rival,
-            "lowe_ratio": lowe_ratio(per_tile, best),
-            "peak_ratio": peak_ratio(score, rival),
-            "tiles_searched": float(len(per_tile) if rows is None else len(rows)),
-        }
-        east, north = self.neighbours.peak_offset(per_tile, tile, searched)
-        shift = east * self.grid.stride_m, north * self.grid.stride_m
-        return Match(tile, shift, int(best_heading[best]), evidence)
+        """Best tile for queries (Q, D) among `rows`: see `TileMatcher.match`."""
+        return self._matcher.match(queries, rows)
 
     def _allowed(
         self, prior: Prior | None, offsets_en_m: list[NDArray[np.float64]]

@@ -9,10 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.camera import Camera, axis_on_ground_en_m, camera_from_en, distort
+from orthonav.geo.camera import (
+    Camera,
+    axis_on_ground_en_m,
+    camera_from_en,
+    counted_from_centres,
+    distort,
+)
 
 Array = NDArray[np.float64]
-_HALF_PIXEL = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +90,7 @@ def _warped(
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """The fast path: no distortion, no horizon, so one homography does it."""
     px_from_window = view.camera.matrix @ camera_from_window
-    # Ours counts from the pixel's outer corner, OpenCV from its centre.
-    matrix = np.linalg.inv(_HALF_PIXEL) @ px_from_window @ _HALF_PIXEL
+    matrix = counted_from_centres(px_from_window)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     grey = cv2.warpPerspective(
         view.grey, matrix, (size_px, size_px), flags=flags, borderMode=cv2.BORDER_REPLICATE

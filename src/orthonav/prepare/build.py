@@ -76,25 +76,9 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     if any(request.out.exists() and request.out.samefile(path) for path in request.orthos):
         raise OutputError(f"the map would replace an orthophoto; name another file: {request.out}")
     area = _area(request, mosaic)
-    gsd_m = _rounded(mosaic.gsd_m) if request.gsd_m is None else request.gsd_m
+    grid = _grid(request, area, mosaic)
     if request.seed < 0:
         raise VariantError(f"seed must be 0 or more, got {request.seed}")
-    overlap = _whole_cells(request.tile_px, request.overlap)
-    grid = TileGrid.covering(
-        area.extent_en_m, gsd_m=gsd_m, tile_px=request.tile_px, overlap=overlap
-    )
-    west, south, east, north = area.extent_en_m
-    side_m = min(east - west, north - south)
-    if area.route is None and side_m < 0.999 * grid.tile_m:
-        raise AreaError(
-            f"a tile of {grid.tile_px} px is {grid.tile_m:.0f} m wide, larger than the area, "
-            f"{east - west:.0f} x {north - south:.0f} m; use smaller tiles, a finer ground "
-            "resolution or a larger area"
-        )
-    if gsd_m < 0.8 * mosaic.gsd_m:
-        log.warning(
-            "ground resolution of %.3g m is finer than the imagery's %.3g m", gsd_m, mosaic.gsd_m
-        )
     sampler = CropSampler(grid.tile_px, request.seed)
     cells, preview = _read_cells(mosaic, area, grid, representation, sampler, report)
     tiles_rc = _tiles(area, grid, cells)
@@ -145,6 +129,28 @@ def _area(request: BuildRequest, mosaic: Mosaic) -> Area:
         return Area.from_bounds(request.bounds_deg)
     outline = mosaic.outline_latlon_deg
     return Area.from_outline(outline[:, 0], outline[:, 1])
+
+
+def _grid(request: BuildRequest, area: Area, mosaic: Mosaic) -> TileGrid:
+    """The tile grid; refuses tiles larger than an area that is not the band of a route."""
+    gsd_m = _rounded(mosaic.gsd_m) if request.gsd_m is None else request.gsd_m
+    overlap = _whole_cells(request.tile_px, request.overlap)
+    grid = TileGrid.covering(
+        area.extent_en_m, gsd_m=gsd_m, tile_px=request.tile_px, overlap=overlap
+    )
+    west, south, east, north = area.extent_en_m
+    side_m = min(east - west, north - south)
+    if area.route is None and side_m < 0.999 * grid.tile_m:
+        raise AreaError(
+            f"a tile of {grid.tile_px} px is {grid.tile_m:.0f} m wide, larger than the area, "
+            f"{east - west:.0f} x {north - south:.0f} m; use smaller tiles, a finer ground "
+            "resolution or a larger area"
+        )
+    if gsd_m < 0.8 * mosaic.gsd_m:
+        log.warning(
+            "ground resolution of %.3g m is finer than the imagery's %.3g m", gsd_m, mosaic.gsd_m
+        )
+    return grid
 
 
 def _rounded(gsd_m: float) -> float:

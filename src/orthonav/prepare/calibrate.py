@@ -15,12 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.confidence.logistic import LogisticConfidence, fit_logistic
-from orthonav.confidence.ratios import rival_score
+from orthonav.confidence.logistic import FEATURES, LogisticConfidence, fit_logistic
 from orthonav.embed.whitened import WhitenedEmbedder
 from orthonav.geo.grid import TileGrid
-from orthonav.search.exact import ExactIndex
-from orthonav.search.peak import TileNeighbours
+from orthonav.localizer.match import TileMatcher
 
 CROPS = 192
 CROP_TILES = 1.5
@@ -98,8 +96,7 @@ def calibrate(
 ) -> Calibration:
     """Search changed and mirrored crops on the new map and fit the confidence to the outcome."""
     rng = np.random.default_rng([len(sampler.crops), 2])
-    index = ExactIndex(embeddings)
-    neighbours = TileNeighbours(grid, centres_en_m)
+    matcher = TileMatcher(grid, centres_en_m, embeddings)
     crops = [sampler.crops[i] for i in rng.permutation(len(sampler.crops))[:CROPS]]
     features, errors, mirrored = [], [], []
     for done, crop in enumerate(crops):
@@ -110,16 +107,13 @@ def calibrate(
             picture = crop.grey[:, ::-1] if mirror else crop.grey
             changed = changed_picture(rng, picture, other)
             queries = _queries(rng, changed, grid, representation, embedder, heading_step_deg)
-            scores = index.scores(queries).max(axis=1)
-            best = int(scores.argmax())
-            rival = rival_score(scores, centres_en_m, best, grid.tile_m / 2)
-            features.append([scores[best], scores[best] - rival])
+            match = matcher.match(queries)
+            features.append([match.evidence[name] for name in FEATURES])
             truth = [
                 grid.west_m + crop.col_px * grid.gsd_m,
                 grid.north_m - crop.row_px * grid.gsd_m,
             ]
-            shift = np.multiply(neighbours.peak_offset(scores, best), grid.stride_m)
-            errors.append(centres_en_m[best] + shift - truth)
+            errors.append(centres_en_m[match.tile] + np.array(match.shift_en_m) - truth)
             mirrored.append(mirror)
         report("calibrate", (done + 1) / len(crops))
     return _fitted(np.array(features), np.array(errors), np.array(mirrored, dtype=bool), grid)

@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import FlightError
-from orthonav.geo.camera import Camera, camera_from_en, enu_from_camera
+from orthonav.geo.camera import Camera, camera_from_en, counted_from_centres, enu_from_camera
 
 Array = NDArray[np.float64]
-_HALF_PIXEL = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ def _projected(
     if not camera.distortion:
         px_from_en = camera.matrix @ camera_from_en(*attitude)
         ground_from_px = ground_from_en @ np.linalg.inv(px_from_en)
-        matrix = np.linalg.inv(_HALF_PIXEL) @ ground_from_px @ _HALF_PIXEL
+        matrix = counted_from_centres(ground_from_px)
         flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
         border = cv2.BORDER_REPLICATE
         seen = cv2.warpPerspective(ground_rgb, matrix, size, flags=flags, borderMode=border)

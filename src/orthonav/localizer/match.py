@@ -1,0 +1,84 @@
+"""Finding the tile that queries look like, and the evidence for it.
+
+One piece for the localizer and for the calibration of a map, so that the confidence is learnt on
+the very numbers that it is asked about in flight.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.confidence.ratios import lowe_ratio, peak_ratio, rival_score
+from orthonav.geo.grid import TileGrid
+from orthonav.search.exact import ExactIndex
+from orthonav.search.peak import TileNeighbours
+
+BACKGROUND_TILES = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """What search found for one view.
+
+    `tile` is the row of the best tile, `shift_en_m` where between the tiles the peak lies,
+    measured from its centre, `query` the index of the best of the headings tried, `evidence` the
+    numbers behind it.
+    """
+
+    tile: int
+    shift_en_m: tuple[float, float]
+    query: int
+    evidence: dict[str, float]
+
+
+class TileMatcher:
+    """The tiles of a sheet, to be matched: centres (N, 2) float32 and embeddings (N, D) float16."""
+
+    def __init__(
+        self,
+        grid: TileGrid,
+        centres_en_m: NDArray[np.float32],
+        embeddings: NDArray[np.float16],
+    ) -> None:
+        """Raises `MapFileError` where the centres are not those of the grid."""
+        self.index = ExactIndex(embeddings)
+        self._grid = grid
+        self._centres_en_m = centres_en_m
+        self._neighbours = TileNeighbours(grid, centres_en_m)
+        step = -(-len(embeddings) // BACKGROUND_TILES)
+        self._background = np.arange(0, len(embeddings), step, dtype=np.intp)
+
+    def match(self, queries: NDArray[np.float32], rows: NDArray[np.intp] | None = None) -> Match:
+        """Best tile for queries (Q, D), one per heading, among `rows` (all where None).
+
+        Evidence: `score` (best scalar product), `margin` (its lead over the best score farther
+        than half a tile away), `lowe_ratio`, `peak_ratio` (the same with that exclusion). Rivals
+        are looked for beyond `rows` too, on up to `BACKGROUND_TILES` tiles of the whole map: a
+        narrow prior leaves no rival of its own, and that must not look like certainty.
+        """
+        searched = None
+        if rows is not None:
+            searched = np.union1d(rows, self._background)
+        scores = self.index.scores(queries, searched)
+        best_heading = scores.argmax(axis=1)
+        per_tile = np.take_along_axis(scores, best_heading[:, None], axis=1)[:, 0]
+        if searched is None or rows is None:
+            centres, best = self._centres_en_m, int(per_tile.argmax())
+            tile = best
+        else:
+            centres, allowed = self._centres_en_m[searched], np.searchsorted(searched, rows)
+            best = int(allowed[per_tile[allowed].argmax()])
+            tile = int(searched[best])
+        score = float(per_tile[best])
+        rival = rival_score(per_tile, centres, best, self._grid.tile_m / 2)
+        evidence = {
+            "score": score,
+            "margin": score - rival,
+            "lowe_ratio": lowe_ratio(per_tile, best),
+            "peak_ratio": peak_ratio(score, rival),
+            "tiles_searched": float(len(per_tile) if rows is None else len(rows)),
+        }
+        east, north = self._neighbours.peak_offset(per_tile, tile, searched)
+        shift = east * self._grid.stride_m, north * self._grid.stride_m
+        return Match(tile, shift, int(best_heading[best]), evidence)
