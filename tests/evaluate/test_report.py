@@ -27,7 +27,8 @@ from orthonav.geo.frames import LocalFrame
 from orthonav.records import Fix, NoFix, ViewResult
 
 CENTRE = LocalFrame(48.0, -4.5)
-PICTURES_PER_FLIGHT = 4
+PICTURES_PER_FLIGHT = 6
+PICTURES_OF_ALL = 4
 
 
 def made_flight(n: int, share_fixed: float = 0.9, name: str = "flight", seed: int = 3):
@@ -131,7 +132,7 @@ def test_several_flights_have_a_total(tmp_path: Path) -> None:
     assert whole.n_views == 50
     assert whole.n_fixes == sum(flight.metrics.n_fixes for flight in flights)
     html = write_report(tmp_path, flights).read_text("utf-8")
-    assert len(Page(html).images) == 2 * PICTURES_PER_FLIGHT
+    assert len(Page(html).images) == 2 * PICTURES_PER_FLIGHT + PICTURES_OF_ALL
     assert '<tr class="total"><td>total</td><td>50</td>' in html
 
 

@@ -37,6 +37,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="what is compared: gradient, gray or canny, e.g. canny:low=100,high=200",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of what is drawn (default 0)")
+    parser.add_argument(
+        "--no-registration",
+        dest="registration",
+        action="store_false",
+        help="leave out the grey picture of the area: a smaller map, positions at tile level only",
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="MAP.onav")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
@@ -60,6 +66,7 @@ def run(options: argparse.Namespace) -> None:
         method=options.method,
         edges=options.edges,
         seed=options.seed,
+        registration=options.registration,
     )
     with progress(options) as shown:
         result = build_map(request, shown)

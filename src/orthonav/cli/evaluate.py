@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> None:
     """Measure, print the table, write what was asked for."""
     from orthonav.errors import FlightError
     from orthonav.evaluate.metrics import compare, measure
-    from orthonav.evaluate.report import FlightReport, metrics_to_json, table, total
+    from orthonav.evaluate.report import FlightReport, metrics_to_json, summary, table, total
     from orthonav.files import write_text
     from orthonav.flight import read_truth
     from orthonav.mapfile import open_map
@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> None:
         return
     if options.json:
         write_text(Path(options.json), json.dumps(plain, indent=1, allow_nan=False) + "\n")
-    print(table(flights))
+    print(f"{table(flights)}\n\n{summary(flights)}")
     if options.report:
         print(f"report: {options.report / 'index.html'}")
 

@@ -42,6 +42,7 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
         "recipe": manifest.recipe,
         "radius_m": manifest.radius_m,
         "calibrated": manifest.confidence is not None,
+        "registration": _registration(manifest),
         "sheets": [
             {
                 "centre_lat_deg": sheet.frame.lat_deg,
@@ -59,6 +60,35 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
         "parts_mb": {
             name: round(_part_bytes(part) / 1e6, 4) for name, part in manifest.parts.items()
         },
+    }
+
+
+def _registration(manifest: "Manifest") -> dict[str, Any] | None:
+    """The registration layers of all sheets; None where there is none.
+
+    They are set against the ground that shows imagery, which reaches beyond the tile centres, and
+    against the same pixels as RGB without compression.
+    """
+    from orthonav.mapfile.layer import part_names
+
+    size, raw, ground_km2 = 0, 0, 0.0
+    infos = [sheet.grey for sheet in manifest.sheets if sheet.grey is not None]
+    for number, sheet in enumerate(manifest.sheets):
+        if sheet.grey is not None:
+            found = [manifest.parts.get(name) for name in part_names(number).values()]
+            size += sum(_part_bytes(part) for part in found if part is not None)
+            raw += sheet.grey.raw_bytes
+            ground_km2 += sheet.grey.valid_px * sheet.grid.gsd_m**2 / 1e6
+    if not infos:
+        return None
+    return {
+        "levels": max(info.levels for info in infos),
+        "quality": max(info.quality for info in infos),
+        "bytes": size,
+        "raw_bytes": raw,
+        "raw_ratio": round(raw / size, 2) if size else None,
+        "ground_km2": round(ground_km2, 4),
+        "mb_per_km2": round(size / 1e6 / ground_km2, 4) if ground_km2 > 0 else None,
     }
 
 
@@ -92,6 +122,7 @@ def summary_text(plain: dict[str, Any]) -> str:
             f"{sheet['stride_m']:g} m, centre {sheet['centre_lat_deg']:.6f}, "
             f"{sheet['centre_lon_deg']:.6f}"
         )
+    lines.append(f"grey       {_registration_text(plain['registration'])}")
     for source in plain["imagery"]:
         date = source.get("date") or "date unknown"
         lines.append(
@@ -103,6 +134,16 @@ def summary_text(plain: dict[str, Any]) -> str:
         speed = plain["area_km2"] / plain["build_s"]
         lines.append(f"built in   {plain['build_s']:.1f} s, {speed:.2f} km2/s")
     return "\n".join(lines)
+
+
+def _registration_text(layer: dict[str, Any] | None) -> str:
+    if layer is None:
+        return "no registration layer: positions at tile level only"
+    return (
+        f"registration layer of {layer['bytes'] / 1e6:.3f} MB, {layer['mb_per_km2'] or 0:.2f} MB "
+        f"per km2 of ground, {layer['levels']} levels, 1/{layer['raw_ratio'] or 0:.0f} of the raw "
+        "orthophoto"
+    )
 
 
 def recipe_text(recipe: dict[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 The names follow the paper (arXiv 2404.06207): accuracy at a radius (`acc_at_15m`), confidence
 criterion, Lowe's ratio. A share is between 0 and 1 and NaN where there is nothing to share.
+What a fix says about itself, confidence and covariance, is checked in `calibration`.
 """
 
 import math
@@ -11,16 +12,18 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthonav.errors import FlightError
+from orthonav.evaluate.calibration import Calibration, Consistency, calibrate, check_covariance
+from orthonav.evaluate.figures import FloatArray, frozen, mean, percentile, share
 from orthonav.geo.frames import LocalFrame
 from orthonav.records import Fix, NoFix, ViewResult
 
-FloatArray = NDArray[np.float64]
 Positions = Mapping[str, tuple[float, float]]
 """Frame name -> (latitude, longitude) in degrees."""
 
+FAR_M = 35.0
+"""A fix that is farther off than this is wrong by any measure: `wrong_by_35m`."""
 RADII_M = (5.0, 10.0, 15.0, 25.0, 35.0, 50.0, 100.0)
 CRITERIA: Mapping[str, tuple[float, ...]] = MappingProxyType(
     {
@@ -38,6 +41,7 @@ class Comparison:
 
     `truth_en_m` and `fix_en_m` are (N, 2) metres east and north of (`lat_deg`, `lon_deg`), fixes
     NaN where there is none, and then so is `errors_m` (N,), the distance between the two.
+    `cov_en_m2` (N, 2, 2) and `own_radius_m` (N,) are what each fix states, NaN where not known.
     `criteria` maps each name of `CRITERIA` to (N,) values, NaN where not known or no fix.
     `reasons` has the word of each view without a fix, and "" for a fix.
     """
@@ -49,6 +53,8 @@ class Comparison:
     truth_en_m: FloatArray
     fix_en_m: FloatArray
     errors_m: FloatArray
+    cov_en_m2: FloatArray
+    own_radius_m: FloatArray
     criteria: Mapping[str, FloatArray]
     reasons: tuple[str, ...]
     latency_ms: FloatArray
@@ -60,13 +66,21 @@ class Comparison:
 class CriterionRow:
     """What is left at one threshold: share of all views kept, and share of those that are right.
 
-    Both are NaN where no view has the criterion, `accuracy` also where no view is kept.
+    Of the `n_kept` views kept, `n_right` are right and `n_far` are wrong by more than `far_m`;
+    `share_far` is their share, `recall` the share of all right fixes that is kept. Shares are NaN
+    where no view has the criterion, those of the kept also where no view is kept.
     """
 
     name: str
     threshold: float
     share_kept: float
     accuracy: float
+    n_kept: int
+    n_right: int
+    recall: float
+    far_m: float
+    n_far: int
+    share_far: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +99,8 @@ class Metrics:
 
     `acc_at_m` maps each radius to the share of all views with a fix within it, `acc_fixes_at_m` to
     the share of fixes; both hold `radius_m`, the radius that "right" stands for. Errors are of
-    fixes, `latency_*` of all views, `coverage` is the share of views with a fix.
+    fixes, `latency_*` of all views, `coverage` is the share of views with a fix. `calibration` and
+    `consistency` take each fix at its own word: right is what is within the radius it states.
     """
 
     radius_m: float
@@ -105,6 +120,8 @@ class Metrics:
     reasons: Mapping[str, int]
     criteria: tuple[CriterionRow, ...]
     curves: tuple[CriterionCurve, ...]
+    calibration: Calibration
+    consistency: Consistency
 
     @property
     def accuracy(self) -> float:
@@ -120,6 +137,11 @@ class Metrics:
 def radius_key(radius_m: float) -> str:
     """The name of the accuracy at a radius: `acc_at_15m`."""
     return f"acc_at_{radius_m:g}m"
+
+
+def wrong_key(far_m: float) -> str:
+    """The name of the share that is wrong by more than a distance: `wrong_by_35m`."""
+    return f"wrong_by_{far_m:g}m"
 
 
 def compare(
@@ -139,9 +161,7 @@ def compare(
     local = local or LocalFrame(*known[matched[0].frame])
     truth_en_m = _local(local, [known[result.frame] for result in matched])
     fix_en_m = _local(local, [_position(result.outcome) for result in matched])
-    criteria = {
-        name: _frozen([_criterion(result, name) for result in matched]) for name in CRITERIA
-    }
+    criteria = {name: frozen([_criterion(result, name) for result in matched]) for name in CRITERIA}
     return Comparison(
         lat_deg=local.lat_deg,
         lon_deg=local.lon_deg,
@@ -149,10 +169,12 @@ def compare(
         time_ns=tuple(result.time_ns for result in matched),
         truth_en_m=truth_en_m,
         fix_en_m=fix_en_m,
-        errors_m=_frozen(np.hypot(*(fix_en_m - truth_en_m).T)),
+        errors_m=frozen(np.hypot(*(fix_en_m - truth_en_m).T)),
+        cov_en_m2=frozen(np.array([_covariance(result.outcome) for result in matched])),
+        own_radius_m=frozen([_own_radius(result.outcome) for result in matched]),
         criteria=MappingProxyType(criteria),
         reasons=tuple(_reason(result.outcome) for result in matched),
-        latency_ms=_frozen([result.latency_ms for result in matched]),
+        latency_ms=frozen([result.latency_ms for result in matched]),
         n_without_truth=len(results) - len(matched),
         n_without_result=len(known) - len(matched),
     )
@@ -166,34 +188,41 @@ def pool(comparisons: Sequence[Comparison]) -> Comparison:
     if not comparisons:
         raise ValueError("nothing to pool: expected at least one flight")
     parts = list(comparisons)
-    joined = {n: _frozen(np.concatenate([p.criteria[n] for p in parts])) for n in CRITERIA}
+    joined = {n: frozen(np.concatenate([p.criteria[n] for p in parts])) for n in CRITERIA}
     return Comparison(
         lat_deg=parts[0].lat_deg,
         lon_deg=parts[0].lon_deg,
         frames=tuple(name for p in parts for name in p.frames),
         time_ns=tuple(time for p in parts for time in p.time_ns),
-        truth_en_m=_frozen(np.concatenate([p.truth_en_m for p in parts])),
-        fix_en_m=_frozen(np.concatenate([p.fix_en_m for p in parts])),
-        errors_m=_frozen(np.concatenate([p.errors_m for p in parts])),
+        truth_en_m=frozen(np.concatenate([p.truth_en_m for p in parts])),
+        fix_en_m=frozen(np.concatenate([p.fix_en_m for p in parts])),
+        errors_m=frozen(np.concatenate([p.errors_m for p in parts])),
+        cov_en_m2=frozen(np.concatenate([p.cov_en_m2 for p in parts])),
+        own_radius_m=frozen(np.concatenate([p.own_radius_m for p in parts])),
         criteria=MappingProxyType(joined),
         reasons=tuple(reason for p in parts for reason in p.reasons),
-        latency_ms=_frozen(np.concatenate([p.latency_ms for p in parts])),
+        latency_ms=frozen(np.concatenate([p.latency_ms for p in parts])),
         n_without_truth=sum(p.n_without_truth for p in parts),
         n_without_result=sum(p.n_without_result for p in parts),
     )
 
 
 def measure(
-    comparison: Comparison, radius_m: float = 15.0, radii_m: Sequence[float] = RADII_M
+    comparison: Comparison,
+    radius_m: float = 15.0,
+    radii_m: Sequence[float] = RADII_M,
+    far_m: float = FAR_M,
 ) -> Metrics:
     """All figures of `comparison`; `radius_m` says which fixes are right and joins `radii_m`.
 
-    Raises `ValueError` for a radius that is not a positive finite number.
+    Raises `ValueError` for a radius that is not a positive finite number, and for a confidence
+    that is not 0 to 1.
     """
     radii = sorted({float(r) for r in (*radii_m, radius_m)})
-    if not all(0.0 < radius < math.inf for radius in radii):
-        raise ValueError(f"a radius must be positive and finite, got {radii} (metres)")
-    errors_m = comparison.errors_m
+    if not all(0.0 < radius < math.inf for radius in (*radii, far_m)):
+        raise ValueError(f"a radius must be positive and finite, got {[*radii, far_m]} (metres)")
+    errors_m, own_radius_m = comparison.errors_m, comparison.own_radius_m
+    errors_en_m = comparison.fix_en_m - comparison.truth_en_m
     of_fixes_m = errors_m[np.isfinite(errors_m)]
     return Metrics(
         radius_m=float(radius_m),
@@ -201,34 +230,36 @@ def measure(
         n_fixes=of_fixes_m.size,
         n_without_truth=comparison.n_without_truth,
         n_without_result=comparison.n_without_result,
-        coverage=_share(of_fixes_m.size, errors_m.size),
+        coverage=share(of_fixes_m.size, errors_m.size),
         acc_at_m=_within(of_fixes_m, radii, errors_m.size),
         acc_fixes_at_m=_within(of_fixes_m, radii, of_fixes_m.size),
-        error_median_m=_percentile(of_fixes_m, 50.0),
-        error_p95_m=_percentile(of_fixes_m, 95.0),
-        error_mean_m=float(of_fixes_m.mean()) if of_fixes_m.size else math.nan,
+        error_median_m=percentile(of_fixes_m, 50.0),
+        error_p95_m=percentile(of_fixes_m, 95.0),
+        error_mean_m=mean(of_fixes_m),
         error_max_m=float(of_fixes_m.max()) if of_fixes_m.size else math.nan,
-        latency_median_ms=_percentile(comparison.latency_ms, 50.0),
-        latency_p95_ms=_percentile(comparison.latency_ms, 95.0),
+        latency_median_ms=percentile(comparison.latency_ms, 50.0),
+        latency_p95_ms=percentile(comparison.latency_ms, 95.0),
         reasons=MappingProxyType(dict(Counter(r for r in comparison.reasons if r).most_common())),
-        criteria=criterion_rows(comparison, radius_m),
+        criteria=criterion_rows(comparison, radius_m, far_m),
         curves=tuple(criterion_curve(comparison, name, radius_m) for name in CRITERIA),
+        calibration=calibrate(
+            comparison.criteria["confidence"], errors_m, own_radius_m, float(radius_m)
+        ),
+        consistency=check_covariance(
+            errors_en_m, comparison.cov_en_m2, own_radius_m, float(radius_m)
+        ),
     )
 
 
-def criterion_rows(comparison: Comparison, radius_m: float) -> tuple[CriterionRow, ...]:
+def criterion_rows(
+    comparison: Comparison, radius_m: float, far_m: float = FAR_M
+) -> tuple[CriterionRow, ...]:
     """One row per criterion and threshold of `CRITERIA`."""
-    rows = []
-    for name, thresholds in CRITERIA.items():
-        values = comparison.criteria[name]
-        for threshold in thresholds:
-            kept = values >= threshold  # NaN is never kept
-            right = int(np.count_nonzero(comparison.errors_m[kept] <= radius_m))
-            n_kept = int(np.count_nonzero(kept))
-            known = bool(np.any(~np.isnan(values)))
-            share = _share(n_kept, values.size) if known else math.nan
-            rows.append(CriterionRow(name, threshold, share, _share(right, n_kept)))
-    return tuple(rows)
+    return tuple(
+        _criterion_row(comparison, name, threshold, radius_m, far_m)
+        for name, thresholds in CRITERIA.items()
+        for threshold in thresholds
+    )
 
 
 def criterion_curve(comparison: Comparison, name: str, radius_m: float) -> CriterionCurve:
@@ -246,9 +277,9 @@ def criterion_curve(comparison: Comparison, name: str, radius_m: float) -> Crite
     n_kept = np.flatnonzero(last) + 1
     return CriterionCurve(
         name=name,
-        thresholds=_frozen(ordered[last]),
-        share_kept=_frozen(n_kept / max(values.size, 1)),
-        accuracy=_frozen(n_right[last] / n_kept),
+        thresholds=frozen(ordered[last]),
+        share_kept=frozen(n_kept / max(values.size, 1)),
+        accuracy=frozen(n_right[last] / n_kept),
     )
 
 
@@ -257,6 +288,43 @@ def worst_views(comparison: Comparison, n: int = 10) -> list[int]:
     fixes = np.flatnonzero(np.isfinite(comparison.errors_m))
     order = np.argsort(-comparison.errors_m[fixes], kind="stable")
     return [int(i) for i in fixes[order[:n]]]
+
+
+def _criterion_row(
+    comparison: Comparison, name: str, threshold: float, radius_m: float, far_m: float
+) -> CriterionRow:
+    values, errors_m = comparison.criteria[name], comparison.errors_m
+    known = bool(np.any(~np.isnan(values)))
+    kept = values >= threshold  # NaN is never kept
+    n_kept = int(np.count_nonzero(kept))
+    n_right = int(np.count_nonzero(errors_m[kept] <= radius_m))
+    n_far = int(np.count_nonzero(errors_m[kept] > far_m))
+    n_all_right = int(np.count_nonzero(errors_m <= radius_m))
+    return CriterionRow(
+        name=name,
+        threshold=threshold,
+        share_kept=share(n_kept, values.size) if known else math.nan,
+        accuracy=share(n_right, n_kept),
+        n_kept=n_kept,
+        n_right=n_right,
+        recall=share(n_right, n_all_right) if known else math.nan,
+        far_m=float(far_m),
+        n_far=n_far,
+        share_far=share(n_far, n_kept),
+    )
+
+
+def _covariance(outcome: Fix | NoFix) -> FloatArray:
+    """(2, 2) m2, NaN where there is none; of a fix with a covariance of another shape too."""
+    nothing = np.full((2, 2), np.nan)
+    if not isinstance(outcome, Fix):
+        return nothing
+    stated = np.asarray(outcome.cov_en_m2, dtype=np.float64)
+    return stated if stated.shape == (2, 2) else nothing
+
+
+def _own_radius(outcome: Fix | NoFix) -> float:
+    return outcome.radius_m if isinstance(outcome, Fix) else math.nan
 
 
 def _position(outcome: Fix | NoFix) -> tuple[float, float]:
@@ -287,27 +355,12 @@ def _local(local: LocalFrame, positions: Sequence[tuple[float, float]]) -> Float
     known = np.isfinite(lat_lon_deg).all(axis=1)
     if known.any():
         en_m[known] = local.en_from_latlon(lat_lon_deg[known, 0], lat_lon_deg[known, 1])
-    return _frozen(en_m)
+    return frozen(en_m)
 
 
 def _within(errors_m: FloatArray, radii_m: Iterable[float], total: int) -> Mapping[float, float]:
-    shares = {r: _share(int(np.count_nonzero(errors_m <= r)), total) for r in radii_m}
+    shares = {r: share(int(np.count_nonzero(errors_m <= r)), total) for r in radii_m}
     return MappingProxyType(shares)
-
-
-def _share(part: int, whole: int) -> float:
-    return part / whole if whole else math.nan
-
-
-def _percentile(values: FloatArray, percent: float) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.percentile(finite, percent)) if finite.size else math.nan
-
-
-def _frozen(values: FloatArray | Sequence[float]) -> FloatArray:
-    array = np.array(values, dtype=np.float64)
-    array.setflags(write=False)
-    return array
 
 
 def _refuse_twice(frames: Iterable[str]) -> None:

@@ -37,7 +37,7 @@ th:first-child, td:first-child { text-align: left; padding-left: 0; }
 .total td { font-weight: 700; border-top: 2px solid var(--line); }
 .pictures { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 1rem; }
 figure { margin: 0; }
-figure:nth-child(-n+2) { grid-column: 1 / -1; }
+.pictures:not(.even) figure:nth-child(-n+2) { grid-column: 1 / -1; }
 figure img { display: block; max-width: 100%; height: auto; margin: 0 auto; background: #fff;
   border: 1px solid var(--line); border-radius: 8px; padding: .4rem; }
 figcaption { padding: .35rem .2rem 0; text-align: center; }

@@ -1,56 +1,34 @@
 """Pictures of an evaluation as PNG bytes: map, error curve, criteria, errors along the flight.
 
-Drawn on matplotlib's Agg canvas without pyplot, so nothing global is kept and no display needed.
-Right and wrong differ by colour and by mark (colours of Okabe and Ito, told apart by everyone).
+Right and wrong differ by colour and by mark.
 """
 
-import io
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MissingExtraError
+from orthonav.evaluate.canvas import DPI, GREY, INK, OFFSET, RIGHT, TRUTH, WRONG, halo, png
 from orthonav.evaluate.metrics import Comparison, CriterionCurve, Metrics
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-RIGHT, WRONG, TRUTH, GREY, INK = "#0072B2", "#D55E00", "#1A1A1A", "#8C8C8C", "#222222"
-# colour, line, mark, place of a threshold's number (points), order from below
-CURVE_STYLES: dict[str, tuple[str, Any, str, tuple[int, int], float]] = {
-    "confidence": ("#0072B2", "-", "o", (-4, 7), 2.0),
-    "peak_ratio": ("#009E73", (0, (5, 3)), "s", (-26, -12), 2.1),
-    "lowe_ratio": ("#B8558F", (0, (1.5, 1.5)), "^", (5, -12), 2.2),
+# colour, line, mark, order from below
+CURVE_STYLES: dict[str, tuple[str, Any, str, float]] = {
+    "confidence": ("#0072B2", "-", "o", 2.0),
+    "peak_ratio": ("#009E73", (0, (5, 3)), "s", 2.1),
+    "lowe_ratio": ("#B8558F", (0, (1.5, 1.5)), "^", 2.2),
 }
 LABELS = {
     "confidence": "confidence",
     "peak_ratio": "peak ratio",
     "lowe_ratio": "Lowe's ratio",
 }
-_STYLE: dict[Any, Any] = {
-    "font.size": 10,
-    "axes.edgecolor": GREY,
-    "axes.labelcolor": INK,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "grid.color": "#E3E3E3",
-    "grid.linewidth": 0.8,
-    "text.color": INK,
-    "xtick.color": "#555555",
-    "ytick.color": "#555555",
-    "legend.frameon": True,
-    "legend.framealpha": 0.9,
-    "legend.edgecolor": "#DDDDDD",
-    "legend.fontsize": 9,
-}
-_DPI = 110
+MAIN = ("confidence", 0.9)
+"""The criterion and threshold that people ask for first."""
 _BACKGROUND_LEVELS = 16  # few grey levels keep the PNG small
 _NO_FIX_SHADE = "#EFE6C8"
 
@@ -91,7 +69,7 @@ def map_picture(
         _draw_north(axes)
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
 
-    return _png(size_in, draw)
+    return png(size_in, draw)
 
 
 def error_curve_picture(comparison: Comparison, metrics: Metrics) -> bytes:
@@ -108,18 +86,18 @@ def error_curve_picture(comparison: Comparison, metrics: Metrics) -> bytes:
         axes.step(x, [*shares, shares[-1]], where="post", color=RIGHT, linewidth=2)
         axes.axhline(100 * metrics.coverage, color=GREY, linestyle=(0, (4, 3)), linewidth=1)
         coverage = f"{100 * metrics.coverage:.0f} % of views have a fix"
-        axes.annotate(coverage, (low, 100 * metrics.coverage), (6, 4), **_OFFSET, color="#555555")
+        axes.annotate(coverage, (low, 100 * metrics.coverage), (6, 4), **OFFSET, color="#555555")
         axes.axvline(radius_m, color=WRONG, linewidth=1.2)
         axes.plot([radius_m], [100 * metrics.accuracy], "o", color=WRONG, zorder=5)
         lift = -14 if metrics.accuracy > 0.15 else 18  # clear of the axis, and of the other note
         note = f"{100 * metrics.accuracy:.0f} % within {radius_m:g} m"
-        axes.annotate(note, (radius_m, 100 * metrics.accuracy), (8, lift), **_OFFSET, color=WRONG)
+        axes.annotate(note, (radius_m, 100 * metrics.accuracy), (8, lift), **OFFSET, color=WRONG)
         axes.set(xscale="log", xlim=(low, high), ylim=(0, 107))
         axes.set(xlabel="error (m)", ylabel="share of all views (%)")
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter("")
 
-    return _png((6.2, 4.0), draw)
+    return png((6.2, 4.0), draw)
 
 
 def criteria_picture(metrics: Metrics) -> bytes:
@@ -128,7 +106,7 @@ def criteria_picture(metrics: Metrics) -> bytes:
     def draw(axes: "Axes") -> None:
         drawn = [curve for curve in metrics.curves if curve.thresholds.size]
         for curve in drawn:
-            _draw_criterion(axes, curve, metrics)
+            _draw_criterion(axes, curve)
         # the first few views make wild shares: they do not set the scale
         tails = [curve.accuracy[curve.share_kept >= 0.05] for curve in drawn]
         lowest = min((float(tail.min()) for tail in tails if tail.size), default=0.0)
@@ -137,11 +115,12 @@ def criteria_picture(metrics: Metrics) -> bytes:
         axes.set(xlabel="share of all views kept (%)")
         axes.set(ylabel=f"of these within {metrics.radius_m:g} m (%)")
         if drawn:
-            axes.legend(loc="best")
+            _draw_thresholds(axes, metrics)
+            axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)
         else:
             axes.text(51, 50 + min(bottom, 85.0) / 2, "no fix has a criterion", ha="center")
 
-    return _png((6.2, 4.0), draw)
+    return png((6.2, 4.0), draw)
 
 
 def along_picture(comparison: Comparison, radius_m: float) -> bytes:
@@ -170,10 +149,7 @@ def along_picture(comparison: Comparison, radius_m: float) -> bytes:
         axes.yaxis.set_minor_formatter("")
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
 
-    return _png((10.5, 3.4), draw)
-
-
-_OFFSET: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9}
+    return png((10.5, 3.4), draw)
 
 
 def _draw_positions(
@@ -212,7 +188,7 @@ def _draw_background(axes: "Axes", background: Background, box: tuple[float, ...
     seen = background.grey[rows - above : rows - below, left:right]
     if seen.size == 0:
         return
-    step = max(1, math.ceil(max(seen.shape) / (7.5 * _DPI)))
+    step = max(1, math.ceil(max(seen.shape) / (7.5 * DPI)))
     seen = seen[: seen.shape[0] // step * step, : seen.shape[1] // step * step]
     coarse = seen.reshape(seen.shape[0] // step, step, -1, step).mean(axis=(1, 3))
     levels = np.round(coarse / 255 * (_BACKGROUND_LEVELS - 1)) / (_BACKGROUND_LEVELS - 1)
@@ -237,7 +213,7 @@ def _draw_scale_bar(axes: "Axes", box: tuple[float, ...]) -> None:
     text = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
     backing = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5}
     axes.annotate(
-        text, (x + length_m / 2, y), (0, 6), **_OFFSET, ha="center", zorder=8, bbox=backing
+        text, (x + length_m / 2, y), (0, 6), **OFFSET, ha="center", zorder=8, bbox=backing
     )
 
 
@@ -255,8 +231,8 @@ def _draw_north(axes: "Axes") -> None:
     )
 
 
-def _draw_criterion(axes: "Axes", curve: CriterionCurve, metrics: Metrics) -> None:
-    colour, line, mark, place, order = CURVE_STYLES[curve.name]
+def _draw_criterion(axes: "Axes", curve: CriterionCurve) -> None:
+    colour, line, _, order = CURVE_STYLES[curve.name]
     axes.plot(
         100 * curve.share_kept,
         100 * curve.accuracy,
@@ -266,11 +242,45 @@ def _draw_criterion(axes: "Axes", curve: CriterionCurve, metrics: Metrics) -> No
         label=LABELS[curve.name],
         zorder=order,
     )
-    for row in metrics.criteria:
-        if row.name == curve.name and math.isfinite(row.accuracy):
-            at = (100 * row.share_kept, 100 * row.accuracy)
-            axes.plot(*at, mark, color=colour, markersize=6, markeredgecolor="white", zorder=4)
-            axes.annotate(f"{row.threshold:g}", at, place, **_OFFSET, color=colour)
+
+
+def _draw_thresholds(axes: "Axes", metrics: Metrics) -> None:
+    """A mark and a number for each threshold; numbers keep clear of each other and of marks."""
+    rows = [row for row in metrics.criteria if math.isfinite(row.accuracy)]
+    rows.sort(key=lambda row: list(CURVE_STYLES).index(row.name))
+    spots = [(100 * row.share_kept, 100 * row.accuracy) for row in rows]
+    at_pt = axes.transData.transform(np.reshape(spots, (-1, 2))) * 72 / DPI
+    taken = [(x - 5, y - 5, x + 5, y + 5) for x, y in at_pt]
+    for row, spot, (x, y) in zip(rows, spots, at_pt, strict=True):
+        colour, _, mark, _ = CURVE_STYLES[row.name]
+        main = (row.name, row.threshold) == MAIN
+        if main:
+            _draw_main(axes, spot, colour)
+        axes.plot(*spot, mark, color=colour, markersize=6, markeredgecolor="white", zorder=4)
+        text = f"{row.threshold:g}"
+        width = 6.5 * len(text)
+        places = ((-8, 8), (7, -14), (-width - 5, -14), (8, 3), (-width - 8, 3), (-8, -26))
+        boxes = {p: (x + p[0], y + p[1], x + p[0] + width, y + p[1] + 10) for p in places}
+        free = [p for p, box in boxes.items() if not any(_overlap(box, other) for other in taken)]
+        place = (free or places)[0]
+        taken.append(boxes[place])
+        weight = "bold" if main else "normal"
+        note = axes.annotate(text, spot, place, **OFFSET, color=colour, weight=weight, zorder=5)
+        note.set_path_effects(halo())
+
+
+def _overlap(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
+    """Whether two boxes (left, bottom, right, top) share more than an edge."""
+    across = min(one[2], other[2]) > max(one[0], other[0])
+    return across and min(one[3], other[3]) > max(one[1], other[1])
+
+
+def _draw_main(axes: "Axes", at: tuple[float, float], colour: str) -> None:
+    """A ring around the point, led to both axes."""
+    lead: dict[str, Any] = {"color": colour, "linewidth": 1.0, "alpha": 0.55, "zorder": 1.5}
+    axes.plot([at[0], at[0], 0], [0, at[1], at[1]], linestyle=(0, (1, 2)), **lead)
+    ring: dict[str, Any] = {"markerfacecolor": "none", "markeredgewidth": 1.5, "zorder": 4}
+    axes.plot(*at, "o", markersize=12, markeredgecolor=colour, **ring)
 
 
 def _view_box(comparison: Comparison, radius_m: float) -> tuple[float, float, float, float]:
@@ -307,33 +317,3 @@ def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Start and stop of each run of true flags."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-
-
-@contextmanager
-def _own_style() -> Iterator[None]:
-    """matplotlib's defaults and our style, whatever the user's own settings are."""
-    import matplotlib
-
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(_STYLE)
-        yield
-
-
-def _png(size_in: tuple[float, float], draw: "Callable[[Axes], None]") -> bytes:
-    """What `draw` puts on one pair of axes, as PNG with a palette."""
-    try:
-        from matplotlib.figure import Figure
-        from PIL import Image
-    except ImportError as error:
-        raise MissingExtraError(
-            "pictures need matplotlib, which is not installed: pip install 'orthonav[report]'"
-        ) from error
-    raw, out = io.BytesIO(), io.BytesIO()
-    with _own_style():
-        figure = Figure(figsize=size_in, dpi=_DPI, layout="constrained")
-        draw(figure.add_subplot())
-        figure.savefig(raw, format="png")
-    image = Image.open(raw).convert("RGB").quantize(colors=128)
-    image.save(out, format="PNG", optimize=True)
-    return out.getvalue()

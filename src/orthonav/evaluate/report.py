@@ -6,9 +6,18 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-import numpy as np
-
 from orthonav.evaluate import plots
+from orthonav.evaluate.calibration_report import (
+    Picture,
+    calibration_html,
+    calibration_lines,
+    calibration_pictures,
+    calibration_to_json,
+    consistency_to_json,
+    criteria_html,
+    row_to_json,
+)
+from orthonav.evaluate.figures import or_none, percent_text, plain_text
 from orthonav.evaluate.metrics import (
     Comparison,
     Metrics,
@@ -96,34 +105,36 @@ def metrics_to_json(metrics: Metrics) -> dict[str, object]:
         "n_without_truth": metrics.n_without_truth,
         "n_without_result": metrics.n_without_result,
         "radius_m": metrics.radius_m,
-        "coverage": _or_none(metrics.coverage),
-        **{radius_key(r): _or_none(share) for r, share in metrics.acc_at_m.items()},
-        **{f"fixes_{radius_key(r)}": _or_none(s) for r, s in metrics.acc_fixes_at_m.items()},
-        "error_median_m": _or_none(metrics.error_median_m),
-        "error_p95_m": _or_none(metrics.error_p95_m),
-        "error_mean_m": _or_none(metrics.error_mean_m),
-        "error_max_m": _or_none(metrics.error_max_m),
-        "latency_median_ms": _or_none(metrics.latency_median_ms),
-        "latency_p95_ms": _or_none(metrics.latency_p95_ms),
+        "coverage": or_none(metrics.coverage),
+        **{radius_key(r): or_none(share) for r, share in metrics.acc_at_m.items()},
+        **{f"fixes_{radius_key(r)}": or_none(s) for r, s in metrics.acc_fixes_at_m.items()},
+        "error_median_m": or_none(metrics.error_median_m),
+        "error_p95_m": or_none(metrics.error_p95_m),
+        "error_mean_m": or_none(metrics.error_mean_m),
+        "error_max_m": or_none(metrics.error_max_m),
+        "latency_median_ms": or_none(metrics.latency_median_ms),
+        "latency_p95_ms": or_none(metrics.latency_p95_ms),
         "reasons": dict(metrics.reasons),
-        "criteria": [
-            {
-                "name": row.name,
-                "threshold": row.threshold,
-                "share_kept": _or_none(row.share_kept),
-                "accuracy": _or_none(row.accuracy),
-            }
-            for row in metrics.criteria
-        ],
+        "criteria": [row_to_json(row) for row in metrics.criteria],
         "curves": {
             curve.name: {
-                "threshold": [_or_none(value) for value in curve.thresholds],
+                "threshold": [or_none(value) for value in curve.thresholds],
                 "share_kept": curve.share_kept.tolist(),
                 "accuracy": curve.accuracy.tolist(),
             }
             for curve in metrics.curves
         },
+        "calibration": calibration_to_json(metrics.calibration),
+        "covariance": consistency_to_json(metrics.consistency),
     }
+
+
+def summary(flights: Sequence[FlightReport]) -> str:
+    """How far confidence and covariance can be believed, in lines for a terminal, of all flights.
+
+    Raises `ValueError` as `total` does.
+    """
+    return "\n".join(calibration_lines(total(flights)))
 
 
 def write_report(
@@ -155,7 +166,7 @@ def render(flights: Sequence[FlightReport], made_from: MadeFrom, title: str) -> 
         *(_section(flight) for flight in flights),
     ]
     if len(flights) > 1:
-        parts += ["<h2>Confidence criteria, all flights</h2>", _criteria(whole)]
+        parts.append(_all_flights(flights, whole))
     parts += ["<h2>Made from</h2>", _made_from(made_from)]
     return document(title, "\n".join(parts))
 
@@ -163,9 +174,9 @@ def render(flights: Sequence[FlightReport], made_from: MadeFrom, title: str) -> 
 def _headline(metrics: Metrics) -> str:
     radius = f"{metrics.radius_m:g} m"
     cards = (
-        (_percent(metrics.accuracy), f"of all views have a fix within {radius}"),
-        (_percent(metrics.accuracy_of_fixes), f"of fixes are within {radius}"),
-        (_percent(metrics.coverage), f"of {metrics.n_views} views have a fix"),
+        (percent_text(metrics.accuracy), f"of all views have a fix within {radius}"),
+        (percent_text(metrics.accuracy_of_fixes), f"of fixes are within {radius}"),
+        (percent_text(metrics.coverage), f"of {metrics.n_views} views have a fix"),
         (_figure(metrics.error_median_m, " m"), "median error of fixes"),
         (_figure(metrics.error_p95_m, " m"), "95 % of fixes err less"),
         (_figure(metrics.latency_median_ms, " ms"), "median time per view"),
@@ -196,7 +207,6 @@ def _legend(radius_m: float) -> str:
 
 def _section(flight: FlightReport) -> str:
     comparison, metrics = flight.comparison, flight.metrics
-    radius = f"{metrics.radius_m:g} m"
     pictures = (
         (
             plots.map_picture(comparison, metrics.radius_m, flight.background),
@@ -205,41 +215,55 @@ def _section(flight: FlightReport) -> str:
         ),
         (
             plots.along_picture(comparison, metrics.radius_m),
-            f"Error of each view in order; {_percent(metrics.coverage)} have a fix",
+            f"Error of each view in order; {percent_text(metrics.coverage)} have a fix",
             "Error along the flight; shaded where there is no fix.",
         ),
-        (
-            plots.error_curve_picture(comparison, metrics),
-            f"Error curve: {_percent(metrics.accuracy)} of all views within {radius}",
-            "Share of all views with a fix within an error.",
-        ),
-        (
-            plots.criteria_picture(metrics),
-            "Share of views kept against accuracy among them, per confidence criterion",
-            "What a stricter criterion keeps and how much of it is right, with thresholds.",
-        ),
+        *_figure_pictures(comparison, metrics),
     )
-    shown = "".join(picture(png, f"{flight.name}: {alt}", said) for png, alt, said in pictures)
     return (
-        f'<section><h2>{escape(flight.name)}</h2><div class="pictures">{shown}</div>'
-        f"<h3>Confidence criteria</h3>{_criteria(metrics)}"
+        f'<section><h2>{escape(flight.name)}</h2><div class="pictures">'
+        f"{_shown(pictures, flight.name)}</div>{_trust(metrics)}"
         f"<h3>Worst views</h3>{_worst(comparison, metrics)}"
         f"<h3>Views without a fix</h3>{_reasons(metrics)}</section>"
     )
 
 
-def _criteria(metrics: Metrics) -> str:
-    header = ("criterion", "at least", "views kept", f"of these within {metrics.radius_m:g} m")
-    rows = [
+def _all_flights(flights: Sequence[FlightReport], whole: Metrics) -> str:
+    pictures = _figure_pictures(pool([flight.comparison for flight in flights]), whole)
+    return (
+        '<section><h2>All flights</h2><div class="pictures even">'
+        f"{_shown(pictures, 'all flights')}</div>{_trust(whole)}</section>"
+    )
+
+
+def _figure_pictures(comparison: Comparison, metrics: Metrics) -> Sequence[Picture]:
+    """The pictures that need no place, so that they can be drawn of several flights too."""
+    return (
         (
-            plots.LABELS[row.name],
-            f"{row.threshold:g}",
-            _percent(row.share_kept),
-            _percent(row.accuracy),
-        )
-        for row in metrics.criteria
-    ]
-    return html_table(header, rows)
+            plots.error_curve_picture(comparison, metrics),
+            f"Error curve: {percent_text(metrics.accuracy)} of all views within "
+            f"{metrics.radius_m:g} m",
+            "Share of all views with a fix within an error.",
+        ),
+        (
+            plots.criteria_picture(metrics),
+            "Share of views kept against accuracy among them, per confidence criterion",
+            "What a stricter criterion keeps and how much of it is right, with thresholds; "
+            "the ring is a confidence of 0.9.",
+        ),
+        *calibration_pictures(metrics),
+    )
+
+
+def _shown(pictures: Sequence[Picture], name: str) -> str:
+    return "".join(picture(png, f"{name}: {alt}", said) for png, alt, said in pictures)
+
+
+def _trust(metrics: Metrics) -> str:
+    return (
+        f"<h3>Confidence criteria</h3>{criteria_html(metrics, plots.LABELS)}"
+        f"<h3>Confidence and covariance against errors</h3>{calibration_html(metrics)}"
+    )
 
 
 def _worst(comparison: Comparison, metrics: Metrics) -> str:
@@ -258,8 +282,8 @@ def _worst(comparison: Comparison, metrics: Metrics) -> str:
                 _figure(comparison.errors_m[i]) + ("" if right else " ✗"),
                 f"{east_m:+.1f}",
                 f"{north_m:+.1f}",
-                _plain(comparison.criteria["confidence"][i]),
-                _plain(comparison.criteria["peak_ratio"][i]),
+                plain_text(comparison.criteria["confidence"][i]),
+                plain_text(comparison.criteria["peak_ratio"][i]),
             )
         )
     said = f"The fixes with the largest errors; ✗ marks those beyond {metrics.radius_m:g} m."
@@ -300,9 +324,9 @@ def _row(name: str, metrics: Metrics) -> list[str]:
         " ".join(name.split()),
         str(metrics.n_views),
         str(metrics.n_fixes),
-        _percent(metrics.coverage),
-        _percent(metrics.accuracy),
-        _percent(metrics.accuracy_of_fixes),
+        percent_text(metrics.coverage),
+        percent_text(metrics.accuracy),
+        percent_text(metrics.accuracy_of_fixes),
         _figure(metrics.error_median_m),
         _figure(metrics.error_p95_m),
         _figure(metrics.error_mean_m),
@@ -311,20 +335,8 @@ def _row(name: str, metrics: Metrics) -> list[str]:
     ]
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %" if math.isfinite(share) else "-"
-
-
 def _figure(value: float, unit: str = "") -> str:
     """A length or time with as many decimals as say something."""
     if not math.isfinite(value):
         return "-"
     return (f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}") + unit
-
-
-def _plain(value: float) -> str:
-    return f"{value:.3f}" if math.isfinite(value) else "-"
-
-
-def _or_none(value: float | np.floating) -> float | None:
-    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,65 @@
+"""Small figures that the evaluation is made of: shares, percentiles, intervals."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+_Z95 = 1.959963984540054  # two-sided 95 % of a normal distribution
+
+
+def share(part: int, whole: int) -> float:
+    """`part` of `whole`, 0 to 1; NaN where there is nothing to share."""
+    return part / whole if whole else math.nan
+
+
+def mean(values: FloatArray) -> float:
+    """Mean of `values` (N,); NaN for none."""
+    return float(values.mean()) if values.size else math.nan
+
+
+def percentile(values: FloatArray, percent: float) -> float:
+    """A percentile of the finite ones of `values` (N,); NaN for none."""
+    finite = values[np.isfinite(values)]
+    return float(np.percentile(finite, percent)) if finite.size else math.nan
+
+
+def wilson(part: int, whole: int) -> tuple[float, float]:
+    """The 95 % interval of a share of which `part` of `whole` were seen; NaN for none.
+
+    Wilson, "Probable inference, the law of succession, and statistical inference", 1927: unlike
+    the normal interval it stays within 0 to 1 and has a width where all or none were seen.
+    """
+    if not whole:
+        return math.nan, math.nan
+    seen, square = part / whole, _Z95**2 / whole
+    middle = (seen + square / 2) / (1 + square)
+    half = math.sqrt(square * (seen * (1 - seen) + square / 4)) / (1 + square)
+    low = 0.0 if part == 0 else max(middle - half, 0.0)
+    high = 1.0 if part == whole else min(middle + half, 1.0)
+    return low, high
+
+
+def frozen(values: FloatArray | Sequence[float]) -> FloatArray:
+    """A read-only copy as float64."""
+    array = np.array(values, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+def or_none(value: float | np.floating) -> float | None:
+    """`value` for strict JSON, which knows neither NaN nor infinity."""
+    return float(value) if math.isfinite(value) else None
+
+
+def percent_text(value: float) -> str:
+    """A share as `12.3 %`, and `-` where it is not defined."""
+    return f"{100 * value:.1f} %" if math.isfinite(value) else "-"
+
+
+def plain_text(value: float) -> str:
+    """A number without unit, with three decimals, and `-` where it is not defined."""
+    return f"{value:.3f}" if math.isfinite(value) else "-"

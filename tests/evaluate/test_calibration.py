@@ -1,0 +1,400 @@
+"""Calibration of confidence and consistency of covariance against cases worked out by hand."""
+
+import json
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from orthonav.errors import FlightError
+from orthonav.evaluate.calibration import (
+    N_BINS,
+    NEES_LEVELS,
+    Calibration,
+    calibrate,
+    check_covariance,
+    is_covariance,
+    nees_bound,
+    normalized_squared,
+)
+from orthonav.evaluate.calibration_plots import nees_picture, reliability_picture
+from orthonav.evaluate.calibration_report import (
+    calibration_html,
+    calibration_lines,
+    calibration_to_json,
+    consistency_to_json,
+)
+from orthonav.evaluate.figures import wilson
+from orthonav.evaluate.metrics import Comparison, compare, criterion_rows, measure, pool, wrong_key
+from orthonav.evaluate.report import FlightReport, metrics_to_json, summary, write_report
+from orthonav.geo.frames import LocalFrame
+from orthonav.publish.jsonl import result_from_json, result_to_json
+from orthonav.records import Fix, ViewResult
+
+RADIUS_M = 20.0
+RIGHT_M, WRONG_M = 3.0, 300.0
+
+
+def of_shares(*groups: tuple[float, int, int], radius_m: float = RADIUS_M) -> Calibration:
+    """Groups of (confidence, fixes right, fixes wrong)."""
+    stated = [c for c, right, wrong in groups for _ in range(right + wrong)]
+    errors_m = [m for _, right, wrong in groups for m in [RIGHT_M] * right + [WRONG_M] * wrong]
+    own_m = np.full(len(stated), radius_m)
+    return calibrate(np.array(stated), np.array(errors_m), own_m, 15.0)
+
+
+def test_exact_calibration_has_no_error() -> None:
+    found = of_shares((0.25, 1, 3), (0.5, 5, 5), (0.75, 9, 3), (1.0, 4, 0))
+    assert found.ece == pytest.approx(0.0, abs=1e-12)
+    assert found.n_fixes == found.n_own_radius == 30
+    assert found.mean_confidence == pytest.approx(found.share_right) == pytest.approx(19 / 30)
+    # the mean of c (1 - c), as outcomes are Bernoulli with just that c
+    assert found.brier == pytest.approx((4 * 0.1875 + 10 * 0.25 + 12 * 0.1875) / 30)
+
+
+def test_over_confidence_is_the_gap() -> None:
+    found = of_shares((0.95, 60, 40))
+    assert found.ece == pytest.approx(0.35)
+    assert found.brier == pytest.approx(0.6 * 0.05**2 + 0.4 * 0.95**2)
+    assert found.mean_confidence - found.share_right == pytest.approx(0.35)
+
+
+def test_gaps_of_both_signs_add_up() -> None:
+    found = of_shares((0.9, 7, 3), (0.1, 9, 21))  # gaps 0.2 of 10 and 0.2 of 30
+    assert found.ece == pytest.approx(0.2)
+
+
+def test_within_a_bin_gaps_cancel() -> None:
+    assert of_shares((0.62, 1, 0), (0.68, 0, 1)).ece == pytest.approx(0.15)
+    assert of_shares((0.52, 1, 0), (0.48, 0, 1)).ece == pytest.approx(0.48)
+
+
+def test_bins_cover_0_to_1_and_hold_their_lower_edge() -> None:
+    edges = [i / N_BINS for i in range(N_BINS + 1)]
+    found = of_shares(*((edge, 1, 0) for edge in edges))
+    assert [b.n_fixes for b in found.bins] == [1] * 9 + [2]  # 0.9 and 1 in the last
+    assert (found.bins[0].lower, found.bins[-1].upper) == (0.0, 1.0)
+    assert all(a.upper == b.lower for a, b in pairwise(found.bins))
+    below = of_shares(*((float(np.nextafter(edge, 0)), 1, 0) for edge in edges[1:]))
+    assert [b.n_fixes for b in below.bins] == [1] * N_BINS
+
+
+def test_empty_bins_are_not_defined_and_do_not_count() -> None:
+    found = of_shares((0.05, 1, 19), (0.95, 19, 1))
+    empty = [b for b in found.bins if not b.n_fixes]
+    assert len(empty) == 8 and found.ece == pytest.approx(0.0, abs=1e-12)
+    for b in empty:
+        figures = (b.mean_confidence, b.share_right, b.right_low, b.right_high)
+        assert all(map(math.isnan, figures))
+
+
+def test_fixes_without_a_confidence_are_left_out() -> None:
+    stated = np.array([0.8, math.nan, 0.8, math.nan, 0.8])
+    errors_m = np.array([RIGHT_M, RIGHT_M, WRONG_M, WRONG_M, math.nan])  # the last has no fix
+    found = calibrate(stated, errors_m, np.full(5, RADIUS_M), 15.0)
+    assert (found.n_fixes, found.share_right) == (2, 0.5)
+    assert found.ece == pytest.approx(0.3)
+
+
+def test_no_confidence_at_all_leaves_nothing_defined() -> None:
+    for n in (0, 4):
+        found = calibrate(np.full(n, math.nan), np.ones(n), np.ones(n), 15.0)
+        assert found.n_fixes == 0 and len(found.bins) == N_BINS
+        figures = (found.ece, found.brier, found.mean_confidence, found.share_right)
+        assert all(map(math.isnan, figures))
+
+
+@pytest.mark.parametrize("bad", [-0.01, 1.01, math.inf, -math.inf])
+def test_a_confidence_beyond_0_to_1_is_refused(bad: float) -> None:
+    with pytest.raises(ValueError, match="confidence must be 0 to 1"):
+        calibrate(np.array([0.5, bad]), np.ones(2), np.ones(2), 15.0)
+
+
+def test_right_is_within_the_radius_a_fix_states_itself() -> None:
+    errors_m = np.full(6, 20.0)
+    own_m = np.array([19.0, 20.0, math.nan, 0.0, -5.0, math.inf])
+    one = calibrate(np.ones(6), errors_m, own_m, 15.0)
+    assert (one.n_own_radius, one.share_right) == (2, pytest.approx(1 / 6))
+    other = calibrate(np.ones(6), errors_m, own_m, 30.0)  # where none is stated
+    assert other.share_right == pytest.approx(5 / 6)
+
+
+def test_drawn_as_stated_is_calibrated_and_wilson_covers() -> None:
+    random = np.random.default_rng(11)
+    stated = random.random(40_000)
+    errors_m = np.where(random.random(stated.size) < stated, RIGHT_M, WRONG_M)
+    found = calibrate(stated, errors_m, np.full(stated.size, RADIUS_M), 15.0)
+    assert found.ece < 0.015
+    assert found.brier == pytest.approx(1 / 6, abs=0.005)  # the integral of c (1 - c)
+    inside = [b.right_low <= b.mean_confidence <= b.right_high for b in found.bins]
+    assert sum(inside) >= 8
+
+
+def test_wilson_against_known_values() -> None:
+    assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)  # Newcombe 1998
+    assert wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
+    assert wilson(1, 29) == pytest.approx((0.0061, 0.1718), abs=1e-4)
+    assert wilson(29, 29) == pytest.approx((0.8830, 1.0), abs=1e-4)
+    assert all(map(math.isnan, wilson(0, 0)))
+
+
+def test_nees_bounds_are_those_of_chi_square() -> None:
+    expected = chi2.ppf(NEES_LEVELS, 2)
+    assert [nees_bound(level) for level in NEES_LEVELS] == pytest.approx(expected)
+
+
+def test_nees_against_an_inverse() -> None:
+    random = np.random.default_rng(2)
+    roots = random.normal(0.0, 5.0, (50, 2, 2))
+    cov = roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(2)
+    errors = random.normal(0.0, 5.0, (50, 2))
+    expected = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(cov), errors)
+    np.testing.assert_allclose(normalized_squared(errors, cov), expected, rtol=1e-9)
+
+
+def test_right_covariance_is_consistent_and_a_halved_one_is_not() -> None:
+    random = np.random.default_rng(4)
+    cov = np.array([[25.0, 12.0], [12.0, 16.0]])
+    errors = random.multivariate_normal([0.0, 0.0], cov, 20_000)
+    own_m = np.full(len(errors), 100.0)
+    good = check_covariance(errors, np.tile(cov, (len(errors), 1, 1)), own_m, 15.0)
+    assert good.n_right == good.nees.size == 20_000
+    assert good.nees_mean == pytest.approx(2.0, abs=0.05)
+    assert good.nees_median == pytest.approx(2 * math.log(2), abs=0.05)
+    assert all(share == pytest.approx(level, abs=0.01) for level, share in good.within.items())
+    small = check_covariance(errors, np.tile(cov / 2, (len(errors), 1, 1)), own_m, 15.0)
+    assert small.nees_mean == pytest.approx(2 * good.nees_mean)
+    assert small.within[0.9] == pytest.approx(1 - 0.1**0.5, abs=0.01)
+
+
+def test_only_right_fixes_count() -> None:
+    errors = np.array([[3.0, 4.0], [300.0, 0.0], [math.nan, math.nan], [0.0, 20.0]])
+    own_m = np.array([10.0, 10.0, 10.0, math.nan])
+    cov = np.tile(25.0 * np.eye(2), (4, 1, 1))
+    found = check_covariance(errors, cov, own_m, 15.0)
+    assert (found.n_right, found.nees.tolist()) == (1, [1.0])
+    assert check_covariance(errors, cov, own_m, 25.0).nees.tolist() == [1.0, 16.0]
+
+
+BROKEN = {
+    "singular": [[4.0, 4.0], [4.0, 4.0]],
+    "nearly singular": [[4.0, 4.0 * (1 - 1e-15)], [4.0 * (1 - 1e-15), 4.0]],
+    "zero": [[0.0, 0.0], [0.0, 0.0]],
+    "one axis": [[4.0, 0.0], [0.0, 0.0]],
+    "negative": [[-4.0, 0.0], [0.0, -4.0]],
+    "indefinite": [[4.0, 5.0], [5.0, 4.0]],
+    "not symmetric": [[4.0, 1.0], [2.0, 4.0]],
+    "infinite": [[math.inf, 0.0], [0.0, 4.0]],
+}
+
+
+@pytest.mark.parametrize("rows", BROKEN.values(), ids=BROKEN)
+def test_a_covariance_that_is_none_is_counted_and_left_out(rows: list[list[float]]) -> None:
+    cov = np.array([rows, np.eye(2)])
+    assert is_covariance(cov).tolist() == [False, True]
+    found = check_covariance(np.ones((2, 2)), cov, np.full(2, RADIUS_M), 15.0)
+    assert (found.n_right, found.n_unusable, found.n_without) == (2, 1, 0)
+    assert found.nees.tolist() == [2.0]
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-9, 1.0, 1e9, 1e300])
+def test_the_size_of_a_covariance_does_not_make_it_unusable(scale: float) -> None:
+    cov = scale * np.array([[[4.0, 1.0], [1.0, 1.0]]])
+    found = check_covariance(np.ones((1, 2)), cov, np.full(1, RADIUS_M), 15.0)
+    assert (found.n_unusable, found.nees_mean * scale) == (0, pytest.approx(1.0))
+
+
+def test_no_covariance_leaves_nothing_defined() -> None:
+    cov = np.full((3, 2, 2), math.nan)
+    found = check_covariance(np.ones((3, 2)), cov, np.full(3, RADIUS_M), 15.0)
+    assert (found.n_right, found.n_without, found.n_unusable, found.nees.size) == (3, 3, 0, 0)
+    figures = (found.nees_mean, found.nees_median, *found.within.values())
+    assert all(map(math.isnan, figures))
+    nothing = check_covariance(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0), 15.0)
+    assert nothing.n_right == 0 and math.isnan(nothing.nees_mean)
+
+
+CENTRE = LocalFrame(48.0, -4.5)
+
+
+def flown(
+    offsets_en_m: list[tuple[float, float]],
+    confidence: float | None = 0.9,
+    cov_en_m2: list[list[float]] | None = None,
+    radius_m: float = RADIUS_M,
+) -> Comparison:
+    """Fixes off by `offsets_en_m`, written to a line and read again; null stands for unknown."""
+    truth, results = {}, []
+    for i, offset in enumerate(offsets_en_m):
+        truth[f"{i}.jpg"] = (48.0, -4.5)
+        lat, lon = CENTRE.latlon_from_en(np.array(offset))
+        fix = Fix(float(lat), float(lon), np.eye(2), 0.5, radius_m, 0.0, 100.0)
+        line = json.loads(result_to_json(ViewResult(f"{i}.jpg", i, fix, 10.0)))
+        line |= {"confidence": confidence, "cov_en_m2": cov_en_m2}
+        results.append(result_from_json(json.dumps(line)))
+    return compare(truth, results, CENTRE)
+
+
+OFFSETS = [(3.0, 4.0), (0.0, 30.0), (40.0, 0.0), (500.0, 0.0)]
+
+
+def test_what_fixes_state_reaches_the_figures() -> None:
+    comparison = flown(OFFSETS, 0.9, [[25.0, 0.0], [0.0, 4.0]])
+    metrics = measure(comparison, 35.0)
+    assert metrics.calibration.share_right == 0.25  # 20 m, what the fixes say, not 35 m
+    assert metrics.calibration.ece == pytest.approx(0.65)
+    assert metrics.consistency.nees == pytest.approx([9.0 / 25 + 16.0 / 4], rel=1e-3)
+    assert not comparison.cov_en_m2.flags.writeable
+
+
+def test_rows_say_how_many_are_kept_right_and_far_off() -> None:
+    comparison = flown(OFFSETS, 0.9)
+    low = replace(comparison, criteria={**comparison.criteria, "confidence": np.full(4, math.nan)})
+    values = np.array([0.95, 0.6, 0.92, 0.3])
+    known = replace(comparison, criteria={**comparison.criteria, "confidence": values})
+    rows = {r.threshold: r for r in criterion_rows(known, 32.0) if r.name == "confidence"}
+    assert (rows[0.5].n_kept, rows[0.5].n_right, rows[0.5].n_far) == (3, 2, 1)
+    assert (rows[0.9].n_kept, rows[0.9].n_right, rows[0.9].n_far) == (2, 1, 1)
+    assert (rows[0.9].recall, rows[0.9].share_far) == (0.5, 0.5)
+    assert (rows[0.99].recall, rows[0.99].n_kept) == (0.0, 0)
+    assert math.isnan(rows[0.99].share_far)
+    farther = {r.threshold: r for r in criterion_rows(known, 32.0, 50.0) if r.name == "confidence"}
+    assert (farther[0.5].n_far, farther[0.5].far_m) == (0, 50.0)
+    unknown = [r for r in criterion_rows(low, 32.0) if r.name == "confidence"]
+    assert all(math.isnan(r.recall) and math.isnan(r.share_far) for r in unknown)
+    none_right = [r for r in criterion_rows(known, 1.0) if r.name == "confidence"]
+    assert all(math.isnan(r.recall) for r in none_right)
+
+
+def test_a_distance_that_is_none_is_refused() -> None:
+    with pytest.raises(ValueError, match="positive and finite"):
+        measure(flown(OFFSETS), far_m=math.nan)
+    assert wrong_key(35.0) == "wrong_by_35m"
+
+
+def test_pooled_flights_keep_what_each_fix_states() -> None:
+    one = flown(OFFSETS, 0.9, [[25.0, 0.0], [0.0, 25.0]], radius_m=20.0)
+    two = flown(OFFSETS, 0.1, None, radius_m=35.0)
+    metrics = measure(pool([one, two]))
+    assert metrics.calibration.n_fixes == 8
+    assert metrics.calibration.share_right == (1 + 2) / 8
+    assert metrics.calibration.ece == pytest.approx((4 * 0.65 + 4 * 0.4) / 8)
+    assert (metrics.consistency.n_right, metrics.consistency.n_without) == (3, 2)
+    assert metrics.consistency.nees_mean == pytest.approx(1.0, rel=1e-3)
+
+
+def test_json_names_and_keeps_what_was_there() -> None:
+    metrics = measure(flown(OFFSETS, 0.9, [[25.0, 0.0], [0.0, 25.0]]))
+    values = json.loads(json.dumps(metrics_to_json(metrics), allow_nan=False))
+    row = next(r for r in values["criteria"] if (r["name"], r["threshold"]) == ("confidence", 0.9))
+    assert row == {
+        "name": "confidence",
+        "threshold": 0.9,
+        "share_kept": 1.0,
+        "accuracy": 0.25,
+        "n_kept": 4,
+        "n_right": 1,
+        "share_of_right_kept": 1.0,
+        "n_wrong_by_35m": 2,
+        "wrong_by_35m": 0.5,
+    }
+    assert values["calibration"]["ece"] == pytest.approx(0.65)
+    assert values["calibration"]["brier"] == pytest.approx((0.01 + 3 * 0.81) / 4)
+    assert values["calibration"]["bins"][0] == {
+        "lower": 0.0,
+        "upper": 0.1,
+        "n_fixes": 0,
+        "mean_confidence": None,
+        "share_right": None,
+        "right_low": None,
+        "right_high": None,
+    }
+    assert values["calibration"]["bins"][9]["n_fixes"] == 4
+    covariance = values["covariance"]
+    assert (covariance["n_right"], covariance["n_nees"]) == (1, 1)
+    assert covariance["nees_mean"] == pytest.approx(1.0, rel=1e-3)
+    shares = [covariance[f"nees_within_{level}"] for level in (50, 90, 99)]
+    assert shares == [1.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("offsets", "confidence", "cov", "words"),
+    [
+        (OFFSETS, None, None, ["no fix states one", "of 1 right fixes 1 state none"]),
+        (OFFSETS, 0.5, [[1.0, 1.0], [1.0, 1.0]], ["4 fixes state 0.500", "1 one of no use"]),
+        (OFFSETS[1:], 0.5, [[1.0, 0.0], [0.0, 1.0]], ["0.000 of them", "no fix is right"]),
+        (OFFSETS, 0.5, [[1.0, None], [None, 1.0]], ["1 state none"]),
+    ],
+)
+def test_what_is_not_known_is_said(offsets, confidence, cov, words, tmp_path) -> None:
+    comparison = flown(offsets, confidence, cov)
+    metrics = measure(comparison)
+    flight = FlightReport("f", comparison, metrics)
+    said = summary([flight])
+    html = write_report(tmp_path, [flight]).read_text("utf-8")
+    for word in words:
+        assert word in said and word in html
+    for text in (said, calibration_html(metrics)):
+        assert "nan" not in text.lower()
+    json.dumps(calibration_to_json(metrics.calibration), allow_nan=False)
+    json.dumps(consistency_to_json(metrics.consistency), allow_nan=False)
+
+
+def test_lines_say_the_thresholds_and_a_missing_radius() -> None:
+    lines = calibration_lines(measure(flown(OFFSETS, 0.9, None, radius_m=math.nan), 35.0))
+    assert "4 state no radius and are held to 35 m" in lines[0]
+    assert [line.split(":")[0] for line in lines[1:-1]] == ["  >= 0.5", "  >= 0.9", "  >= 0.99"]
+    assert "50.0 % of them within 35 m (100.0 % of all that are); 2 of 4 wrong" in lines[2]
+
+
+def test_the_command_prints_and_writes_it_of_several_flights(tmp_path, capsys) -> None:
+    from orthonav.cli import main
+
+    lat, lon = CENTRE.latlon_from_en(np.array([3.0, 4.0]))
+    fix = Fix(float(lat), float(lon), 25 * np.eye(2), 0.95, RADIUS_M, 0.0, 100.0)
+    unsure = replace(fix, confidence=math.nan, cov_en_m2=np.full((2, 2), math.nan))
+    truth, out = tmp_path / "truth.csv", tmp_path / "metrics.json"
+    truth.write_text("frame,lat_deg,lon_deg\na.jpg,48.0,-4.5\n")
+    paths = [tmp_path / "one.jsonl", tmp_path / "two.jsonl"]
+    for path, known in zip(paths, (fix, unsure), strict=True):
+        path.write_text(result_to_json(ViewResult("a.jpg", 0, known, 10.0)) + "\n")
+    options = [*map(str, paths), "--truth", str(truth), "--truth", str(truth), "--json", str(out)]
+    assert main(["evaluate", *options]) in (0, None)
+    said = capsys.readouterr().out
+    assert "confidence: 1 fixes state 0.950" in said and ">= 0.9: 50.0 % of views" in said
+    assert "covariance: NEES of 1 right fixes has mean 1 " in said and "1 state none" in said
+    values = json.loads(out.read_text())
+    assert values["calibration"]["n_fixes"] == 1
+    flights = values["flights"]
+    assert flights["two"]["calibration"]["ece"] is None
+    assert flights["one"]["covariance"]["nees_mean"] == pytest.approx(1.0, rel=1e-3)
+
+
+def test_a_file_with_an_impossible_confidence_is_refused() -> None:
+    with pytest.raises(FlightError, match="confidence"):
+        flown(OFFSETS, 1.5)
+
+
+@pytest.mark.parametrize("n", [0, 1, 40])
+def test_pictures_are_drawn_and_alike(n: int) -> None:
+    random = np.random.default_rng(9)
+    offsets = [(float(e), float(k)) for e, k in random.normal(0.0, 8.0, (n, 2))]
+    errors_m = np.hypot(*np.reshape(offsets, (-1, 2)).T)
+    stated, own_m = random.random(n), np.full(n, RADIUS_M)
+    calibration = calibrate(stated, errors_m, own_m, 15.0)
+    cov = np.tile(64.0 * np.eye(2), (n, 1, 1))
+    consistency = check_covariance(np.reshape(offsets, (-1, 2)), cov, own_m, 15.0)
+    for draw in (lambda: reliability_picture(calibration), lambda: nees_picture(consistency)):
+        png = draw()
+        assert png.startswith(b"\x89PNG") and png == draw()
+
+
+def test_errors_beyond_all_measure_can_be_drawn() -> None:
+    cov = np.tile(np.eye(2), (2, 1, 1)) * np.array([1e-12, 5e-324])[:, None, None]
+    found = check_covariance(np.ones((2, 2)), cov, np.full(2, RADIUS_M), 15.0)
+    assert found.nees.tolist()[1] == math.inf
+    assert consistency_to_json(found)["nees_mean"] is None
+    assert nees_picture(found).startswith(b"\x89PNG")
