@@ -13,7 +13,7 @@ from orthonav.flight import read_image
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer import Localizer
-from orthonav.mapfile import SheetInfo, open_map
+from orthonav.mapfile import GreyInfo, GreyLayer, SheetInfo, open_map
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import Fix
 
@@ -31,6 +31,7 @@ SHEET = SheetInfo(
     ),
     tiles=585,
     area_km2=0.08424,
+    grey=GreyInfo(chunk_px=256, levels=4, quality=70, valid_px=82944),
 )
 FIRST_EMBEDDING = [
     0.11407470703125,
@@ -40,6 +41,7 @@ FIRST_EMBEDDING = [
     -0.2462158203125,
 ]
 LAST_CENTRE_EN_M = [96.0, -144.0]
+GREY_ROW = [139, 112, 81, 64, 87, 114, 131, 152]
 FIX_DEG = (46.499925536, 2.999828287)
 RADIUS_M = 9.0
 CONFIDENCE = 0.9422
@@ -78,6 +80,22 @@ def test_the_parts_hold_the_same_numbers(golden):
     assert embeddings[0, :5].tolist() == FIRST_EMBEDDING
     assert centres[-1].tolist() == LAST_CENTRE_EN_M
     assert np.linalg.norm(embeddings.astype(float), axis=1) == pytest.approx(1, abs=2e-3)
+
+
+def test_the_layer_shows_the_ground(golden, maker):
+    layer = GreyLayer.of(golden)
+    assert [layer.shape(level) for level in range(layer.levels)] == [
+        (384, 384),
+        (192, 192),
+        (96, 96),
+        (48, 48),
+    ]
+    corner = (384 - maker.SIZE_PX) // 2
+    grey, valid = layer.read(0, corner, corner, maker.SIZE_PX, maker.SIZE_PX)
+    assert valid.all() and valid.sum() == SHEET.grey.valid_px
+    assert np.corrcoef(grey.ravel(), maker.ground().ravel())[0, 1] > 0.98
+    row = layer.read(1, 96, 60, 1, 8)[0][0]
+    np.testing.assert_allclose(row, GREY_ROW, atol=2)
 
 
 def test_the_view_is_placed_where_it_was(golden, maker):

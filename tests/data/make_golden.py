@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
-from orthonav.mapfile import open_map
+from orthonav.mapfile import GreyLayer, open_map
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import Fix, Telemetry
 
@@ -83,6 +83,9 @@ def main() -> None:
     print("SHEET =", sheet)
     print("FIRST_EMBEDDING =", opened.arrays["sheet0/embeddings"][0, :5].tolist())
     print("LAST_CENTRE_EN_M =", opened.arrays["sheet0/centres_en_m"][-1].tolist())
+    layer = GreyLayer.of(opened)
+    assert layer is not None
+    print("GREY_ROW =", layer.read(1, 96, 60, 1, 8)[0][0].tolist())
     print("FIX_DEG =", (round(fix.lat_deg, 9), round(fix.lon_deg, 9)))
     print("RADIUS_M =", fix.radius_m)
     print("CONFIDENCE =", round(fix.confidence, 4))

@@ -1,7 +1,17 @@
 """The map file (`*.onav`): everything that flies, in one memory-mapped file safe to open."""
 
-from orthonav.mapfile.manifest import SCHEMA, Manifest, SheetInfo
+from orthonav.mapfile.layer import GreyLayer
+from orthonav.mapfile.manifest import SCHEMA, GreyInfo, Manifest, SheetInfo
 from orthonav.mapfile.reader import MapFile, open_map
 from orthonav.mapfile.writer import write_map
 
-__all__ = ["SCHEMA", "Manifest", "MapFile", "SheetInfo", "open_map", "write_map"]
+__all__ = [
+    "SCHEMA",
+    "GreyInfo",
+    "GreyLayer",
+    "Manifest",
+    "MapFile",
+    "SheetInfo",
+    "open_map",
+    "write_map",
+]

@@ -18,18 +18,66 @@ FORMAT = "orthonav-map"
 SCHEMA = 1
 MAX_MANIFEST_BYTES = 8 * 2**20
 MAX_SHEETS = 10_000
+MAX_LEVELS = 10
+MIN_CHUNK_PX, MAX_CHUNK_PX = 16, 1024
+CODEC = "jpeg"
 MAX_DIGITS = 20
 """More than any number in a map needs, and few enough for every one to be a float."""
 
 
 @dataclass(frozen=True)
+class GreyInfo:
+    """The registration layer of a sheet: a grey pyramid in square chunks of `chunk_px`.
+
+    `quality` is that of its JPEGs (1 to 100, less for chunks of noise); `valid_px` the number of
+    pixels of the finest level that show imagery.
+    """
+
+    chunk_px: int
+    levels: int
+    quality: int
+    valid_px: int
+
+    @property
+    def raw_bytes(self) -> int:
+        """What the imagery would take as RGB without compression, at the working resolution."""
+        return 3 * self.valid_px
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for the manifest."""
+        return {"codec": CODEC, **vars(self)}
+
+    @classmethod
+    def from_plain(cls, plain: Any, grid: TileGrid) -> "GreyInfo":
+        """Inverse of `to_plain` for a sheet with `grid`; raises `MapFileError`."""
+        codec = _get(plain, "codec", str)
+        names = ("chunk_px", "levels", "quality", "valid_px")
+        info = cls(**{name: _get(plain, name, int) for name in names})
+        sane = (
+            codec == CODEC
+            and MIN_CHUNK_PX <= info.chunk_px <= MAX_CHUNK_PX
+            and info.chunk_px % 2 == 0
+            and 1 <= info.levels <= MAX_LEVELS
+            and 1 <= info.quality <= 100
+            and 0 <= info.valid_px <= grid.height_px * grid.width_px
+        )
+        if not sane:
+            raise MapFileError(f"map has an impossible registration layer: {plain!r:.200}")
+        return info
+
+
+@dataclass(frozen=True)
 class SheetInfo:
-    """One sheet: its plane, its tile grid, how many tiles it has and the area they stand for."""
+    """One sheet: its plane, its tile grid, how many tiles it has and the area they stand for.
+
+    `grey` describes its registration layer, None where it has none.
+    """
 
     frame: LocalFrame
     grid: TileGrid
     tiles: int
     area_km2: float
+    grey: GreyInfo | None = None
 
     def to_plain(self) -> dict[str, Any]:
         """Plain values for the manifest."""
@@ -48,6 +96,7 @@ class SheetInfo:
             },
             "tiles": self.tiles,
             "area_km2": self.area_km2,
+            "grey": None if self.grey is None else self.grey.to_plain(),
         }
 
     @classmethod
@@ -76,7 +125,9 @@ class SheetInfo:
             frame = LocalFrame(_number(plain, "origin_lat_deg"), _number(plain, "origin_lon_deg"))
         except AreaError as error:
             raise MapFileError(f"map has an impossible sheet origin: {error}") from error
-        return cls(frame, grid, tiles, _number(plain, "area_km2"))
+        layer = plain.get("grey")
+        grey = None if layer is None else GreyInfo.from_plain(layer, grid)
+        return cls(frame, grid, tiles, _number(plain, "area_km2"), grey)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,13 @@ from orthonav.mapfile.writer import METADATA_KEY
 
 MAX_HEADER_BYTES = 16 * 2**20
 MIN_FILE_BYTES = 10
-_DTYPES = {"F16": np.float16, "F32": np.float32, "U8": np.uint8, "I32": np.int32}
+_DTYPES = {
+    "F16": np.float16,
+    "F32": np.float32,
+    "U8": np.uint8,
+    "I32": np.int32,
+    "I64": np.int64,
+}
 
 
 @dataclass(frozen=True, eq=False)

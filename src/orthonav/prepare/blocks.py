@@ -30,6 +30,15 @@ class Block:
         reach_px = np.hypot(self.height, self.width) / 2 + grid.tile_px + grid.stride_px
         return bool(area.contains(np.array([[east_m, north_m]]), reach_px * grid.gsd_m)[0])
 
+    def cut(self, side_px: int) -> Iterator["Block"]:
+        """Its parts between the multiples of `side_px` of the raster."""
+        bottom, right = self.row + self.height, self.col + self.width
+        for row in range(self.row // side_px * side_px, bottom, side_px):
+            for col in range(self.col // side_px * side_px, right, side_px):
+                top, left = max(row, self.row), max(col, self.col)
+                height, width = min(row + side_px, bottom) - top, min(col + side_px, right) - left
+                yield Block(top, left, height, width)
+
 
 @dataclass(frozen=True, eq=False)
 class BlockPixels:
@@ -39,6 +48,12 @@ class BlockPixels:
     pixels: Pixels
     top: int
     left: int
+
+    def within(self, block: Block) -> tuple[slice, slice]:
+        """Rows and columns in the pixels of a part of the block."""
+        row = block.row - self.block.row + self.top
+        col = block.col - self.block.col + self.left
+        return slice(row, row + block.height), slice(col, col + block.width)
 
     def part(self, beyond_px: int = 0) -> tuple[slice, slice]:
         """Rows and columns of the block in the pixels, `beyond_px` more to south and east."""

@@ -1,7 +1,8 @@
 """Building a map: area -> tile grid -> blocks of imagery -> cells -> embeddings -> file.
 
 Imagery is read block by block, so memory depends on the area, not on the orthophotos: what stays
-is a seven-number mean per micro-cell (about 0.5 MB per km2 at 1 m and 256 px tiles).
+is a seven-number mean per micro-cell (about 0.5 MB per km2 at 1 m and 256 px tiles) and the
+compressed registration layer (0.15 to 0.35 MB per km2 at 1 m).
 """
 
 import logging
@@ -23,8 +24,9 @@ from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.mapfile.manifest import Manifest, SheetInfo
 from orthonav.mapfile.writer import write_map
-from orthonav.prepare.blocks import Preview, blocks_of, read_block
+from orthonav.prepare.blocks import BlockPixels, Preview, blocks_of, read_block
 from orthonav.prepare.calibrate import RADIUS_STRIDES, Calibration, CropSampler, calibrate
+from orthonav.prepare.layer import CHUNK_PX, GreyLayerWriter
 from orthonav.variants import make_variant, variant_recipe
 
 log = logging.getLogger(__name__)
@@ -40,7 +42,8 @@ Progress = Callable[[str, float], None]
 @dataclass(frozen=True)
 class BuildRequest:
     """What to build. `bounds_deg` is west, south, east, north; with neither it nor a route, the
-    whole imagery is the area. `gsd_m` None takes that of the finest orthophoto."""
+    whole imagery is the area. `gsd_m` None takes that of the finest orthophoto. With
+    `registration` the map carries the grey picture that places views below tile size."""
 
     orthos: Sequence[Path]
     out: Path
@@ -53,6 +56,7 @@ class BuildRequest:
     method: str = "gradient"
     edges: str = "gradient"
     seed: int = 0
+    registration: bool = True
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,8 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     if request.seed < 0:
         raise VariantError(f"seed must be 0 or more, got {request.seed}")
     sampler = CropSampler(grid.tile_px, request.seed)
-    cells, preview = _read_cells(mosaic, area, grid, representation, sampler, report)
+    layer = GreyLayerWriter(grid.height_px, grid.width_px) if request.registration else None
+    cells, preview = _read_cells(mosaic, area, grid, representation, sampler, layer, report)
     tiles_rc = _tiles(area, grid, cells)
     report("learn", 0.0)
     embedder = learn(recipe, cells, tiles_rc * grid.stride_px)
@@ -92,14 +97,16 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     )
     if calibration.confidence is None:
         log.warning("too little imagery to calibrate: fixes on this map will have no confidence")
-    manifest = _manifest(
-        request, mosaic, area, grid, representation, embedder, calibration, tiles_rc
-    )
+    grey, grey_parts = (None, {}) if layer is None else layer.finish()
+    area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
+    sheet = SheetInfo(area.frame, grid, len(tiles_rc), area_km2, grey)
+    manifest = _manifest(request, mosaic, sheet, representation, embedder, calibration)
     arrays: dict[str, NDArray[Any]] = {
         "sheet0/centres_en_m": centres,
         "sheet0/embeddings": embeddings,
         "sheet0/preview_jpeg": preview,
         **{f"embed/{name}": array for name, array in embedder.parts().items()},
+        **grey_parts,
     }
     written = write_map(request.out, manifest, arrays)
     return BuildResult(written, request.out.stat().st_size)
@@ -180,9 +187,13 @@ def _read_cells(
     grid: TileGrid,
     representation: Any,
     sampler: CropSampler,
+    layer: GreyLayerWriter | None,
     report: Progress,
 ) -> tuple[CellSheet, NDArray[np.uint8]]:
-    """Micro-cell means of the whole sheet, and a small grey picture of it as JPEG bytes."""
+    """Micro-cell means of the whole sheet, and a small grey picture of it as JPEG bytes.
+
+    The sampler and the layer take in what they need as the blocks pass by.
+    """
     layout = CellLayout.for_tiles(grid.tile_px, grid.stride_px)
     cells = CellSheet(layout, grid.height_px, grid.width_px, representation.channels)
     preview = Preview(grid, PREVIEW_PX)
@@ -203,10 +214,20 @@ def _read_cells(
             share = block.height * block.width / total_px
             sampler.offer(grey, valid, block.row - read.top, block.col - read.left, share)
             preview.add(read)
+            if layer is not None:
+                _add_to_layer(layer, read, area, grid)
             report("imagery", (done + 1) / len(blocks))
     if not cells.valid.any():
         raise AreaError("the area has no imagery: it lies outside the orthophotos or is all nodata")
     return cells, preview.jpeg()
+
+
+def _add_to_layer(layer: GreyLayerWriter, read: BlockPixels, area: Area, grid: TileGrid) -> None:
+    """Hand a block to the layer, less the chunks that are too far from the route."""
+    for chunk in read.block.cut(CHUNK_PX):
+        if chunk.may_matter(area, grid):
+            where = read.within(chunk)
+            layer.add(chunk.row, chunk.col, read.pixels.grey[where], read.pixels.valid[where])
 
 
 def _tiles(area: Area, grid: TileGrid, cells: CellSheet) -> NDArray[np.intp]:
@@ -230,14 +251,11 @@ def _tiles(area: Area, grid: TileGrid, cells: CellSheet) -> NDArray[np.intp]:
 def _manifest(
     request: BuildRequest,
     mosaic: Mosaic,
-    area: Area,
-    grid: TileGrid,
+    sheet: SheetInfo,
     representation: Any,
     embedder: WhitenedEmbedder,
     calibration: Calibration,
-    tiles_rc: NDArray[np.intp],
 ) -> Manifest:
-    area_km2 = len(tiles_rc) * grid.stride_m**2 / 1e6
     return Manifest(
         recipe={
             "method": request.method.partition(":")[0],
@@ -246,7 +264,7 @@ def _manifest(
             "overlap": request.overlap,
             "seed": request.seed,
         },
-        sheets=(SheetInfo(area.frame, grid, len(tiles_rc), round(area_km2, 6)),),
+        sheets=(sheet,),
         imagery=tuple(source.describe() for source in mosaic.sources),
         view={
             "heading_step_deg": HEADING_STEP_DEG,
@@ -254,6 +272,6 @@ def _manifest(
             "position_std_m": calibration.position_std_m,
         },
         confidence=calibration.confidence.to_plain() if calibration.confidence else None,
-        radius_m=RADIUS_STRIDES * grid.stride_m,
+        radius_m=RADIUS_STRIDES * sheet.grid.stride_m,
         created_by=f"orthonav {__version__}",
     )

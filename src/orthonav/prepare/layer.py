@@ -1,0 +1,152 @@
+"""Writing the registration layer: blocks of grey in, compressed chunks of a pyramid out.
+
+A chunk is encoded as soon as its last pixel has come, and handed at half the resolution to the
+next level, so memory holds what is compressed and the chunks that blocks have only touched.
+"""
+
+import zlib
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.mapfile.layer import ChunkTable, part_names
+from orthonav.mapfile.manifest import MAX_LEVELS, GreyInfo
+
+CHUNK_PX = 256
+COARSEST_PX = 64
+"""Levels are added until the larger side is at most this."""
+QUALITY = 70
+COARSER_QUALITIES = (50, 30)
+"""Taken for chunks of little but noise, so that the size of a map has a bound."""
+MAX_BYTES_PER_PX = 0.5
+_HEADER_BYTES = 512
+
+
+def level_count(height_px: int, width_px: int) -> int:
+    """Levels of the pyramid of a sheet."""
+    levels = 1
+    while max(height_px, width_px) > COARSEST_PX << (levels - 1) and levels < MAX_LEVELS:
+        levels += 1
+    return levels
+
+
+def halved(
+    grey: NDArray[np.uint8], valid: NDArray[np.bool_]
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Grey and valid (H, W) at half the resolution, (ceil(H / 2), ceil(W / 2)).
+
+    A pixel is the mean of the valid ones of the four under it, rounded, halves up; it is valid
+    where two or more are. Outside the picture nothing is.
+    """
+    border = ((0, grey.shape[0] % 2), (0, grey.shape[1] % 2))
+    weight = np.pad(valid, border).astype(np.uint16)
+    count = _sum_of_four(weight)
+    total = _sum_of_four(np.pad(grey, border) * weight)
+    kept = count >= 2
+    mean = (total + count // 2) // np.maximum(count, 1)
+    return np.where(kept, mean, 0).astype(np.uint8), kept
+
+
+def _sum_of_four(values: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    pairs = values[0::2] + values[1::2]
+    return pairs[:, 0::2] + pairs[:, 1::2]
+
+
+class _Pending:
+    """A chunk of which some pixels have come."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self.grey = np.zeros(shape, dtype=np.uint8)
+        self.valid = np.zeros(shape, dtype=bool)
+        self.missing_px = shape[0] * shape[1]
+
+
+class GreyLayerWriter:
+    """Takes a sheet's grey by blocks, in any order and of any size, and compresses it."""
+
+    def __init__(self, height_px: int, width_px: int, chunk_px: int = CHUNK_PX) -> None:
+        self._chunk_px = chunk_px
+        self._levels = level_count(height_px, width_px)
+        self._table = ChunkTable(height_px, width_px, self._levels, chunk_px)
+        self._pending: list[dict[tuple[int, int], _Pending]] = [{} for _ in range(self._levels)]
+        self._encoded: dict[int, tuple[bytes, bytes]] = {}
+        self._valid_px = 0
+
+    def add(self, row: int, col: int, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> None:
+        """Take in a block (H, W) that begins at (row, col); every pixel comes at most once.
+
+        Pixels that never come are not valid.
+        """
+        self._valid_px += int(np.count_nonzero(valid))
+        self._add(0, row, col, grey, valid)
+
+    def finish(self, sheet: int = 0) -> tuple[GreyInfo, dict[str, NDArray[np.uint8 | np.int64]]]:
+        """What the manifest says of the layer, and its parts by name."""
+        for level, pending in enumerate(self._pending):
+            for place in sorted(pending):
+                self._complete(level, place)
+        empty = (b"", b"")
+        chunks = [self._encoded.get(number, empty) for number in range(self._table.count)]
+        names = part_names(sheet)
+        parts: dict[str, NDArray[np.uint8 | np.int64]] = {}
+        for index, kind in enumerate(("", "mask_")):
+            blobs = [chunk[index] for chunk in chunks]
+            ends = np.cumsum([0, *map(len, blobs)], dtype=np.int64)
+            parts[names[f"{kind}bytes"]] = np.frombuffer(b"".join(blobs), dtype=np.uint8)
+            parts[names[f"{kind}offsets"]] = ends
+        return GreyInfo(self._chunk_px, self._levels, QUALITY, self._valid_px), parts
+
+    def _add(
+        self, level: int, row: int, col: int, grey: NDArray[np.uint8], valid: NDArray[np.bool_]
+    ) -> None:
+        side = self._chunk_px
+        height, width = grey.shape
+        for chunk_row in range(row // side, -(-(row + height) // side)):
+            for chunk_col in range(col // side, -(-(col + width) // side)):
+                place = (chunk_row, chunk_col)
+                chunk = self._pending[level].get(place)
+                if chunk is None:
+                    chunk = _Pending(self._table.shape(level, *place))
+                    self._pending[level][place] = chunk
+                top, left = chunk_row * side, chunk_col * side
+                source = np.s_[
+                    max(top - row, 0) : top + side - row, max(left - col, 0) : left + side - col
+                ]
+                part = grey[source]
+                y, x = max(row - top, 0), max(col - left, 0)
+                target = np.s_[y : y + part.shape[0], x : x + part.shape[1]]
+                chunk.grey[target], chunk.valid[target] = part, valid[source]
+                chunk.missing_px -= part.size
+                if chunk.missing_px == 0:
+                    self._complete(level, place)
+
+    def _complete(self, level: int, place: tuple[int, int]) -> None:
+        """Encode a chunk and hand it on to the next level."""
+        chunk = self._pending[level].pop(place)
+        if chunk.valid.any():
+            number = self._table.number(level, *place)
+            self._encoded[number] = encode_chunk(chunk.grey, chunk.valid)
+        if level + 1 < self._levels:
+            half = self._chunk_px // 2
+            smaller = halved(chunk.grey, chunk.valid)
+            self._add(level + 1, place[0] * half, place[1] * half, *smaller)
+
+
+def encode_chunk(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> tuple[bytes, bytes]:
+    """Bytes of a chunk (H, W) as JPEG, and of its mask, empty where all of it is valid."""
+    if valid.all():
+        return _jpeg(grey), b""
+    # The mean costs least and leaves the least of an edge.
+    filled = np.where(valid, grey, round(float(grey[valid].mean()))).astype(np.uint8)
+    return _jpeg(filled), zlib.compress(np.packbits(valid).tobytes(), 9)
+
+
+def _jpeg(grey: NDArray[np.uint8]) -> bytes:
+    encoded = b""
+    for quality in (QUALITY, *COARSER_QUALITIES):
+        options = [int(cv2.IMWRITE_JPEG_QUALITY), quality, int(cv2.IMWRITE_JPEG_OPTIMIZE), 1]
+        encoded = cv2.imencode(".jpg", grey, options)[1].tobytes()
+        if len(encoded) <= MAX_BYTES_PER_PX * grey.size + _HEADER_BYTES:
+            break
+    return encoded

@@ -1,0 +1,305 @@
+"""The registration layer as built: the pyramid is exact, however its blocks come, and small."""
+
+import json
+import tracemalloc
+
+import cv2
+import numpy as np
+import pytest
+
+from conftest import textured
+from orthonav.cli import main
+from orthonav.geo.route import Route
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.mapfile import GreyLayer, open_map
+from orthonav.mapfile.layer import ChunkTable, decode_chunk, part_names
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.prepare.layer import (
+    CHUNK_PX,
+    MAX_BYTES_PER_PX,
+    GreyLayerWriter,
+    encode_chunk,
+    halved,
+    level_count,
+)
+
+NAMES = part_names(0)
+
+
+@pytest.fixture(autouse=True)
+def fewer_crops(map_path, monkeypatch):
+    """Calibration from few crops, but for the map that all tests share."""
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 16)
+
+
+def holes(shape, seed=0):
+    """Grey and valid (H, W) with borders and holes of many sizes."""
+    blots = textured(shape, seed + 1)
+    valid = (blots > 90) & (np.add.outer(np.arange(shape[0]), np.arange(shape[1])) > 60)
+    return np.where(valid, textured(shape, seed), 0).astype(np.uint8), valid
+
+
+def naively_halved(grey, valid):
+    """As the format says, pixel by pixel."""
+    height, width = grey.shape
+    small = np.zeros((-(-height // 2), -(-width // 2)), np.uint8)
+    kept = np.zeros(small.shape, bool)
+    for row in range(small.shape[0]):
+        for col in range(small.shape[1]):
+            part = np.s_[2 * row : 2 * row + 2, 2 * col : 2 * col + 2]
+            under = grey[part][valid[part]].astype(int)
+            if len(under) >= 2:
+                small[row, col] = int(under.sum() / len(under) + 0.5)
+                kept[row, col] = True
+    return small, kept
+
+
+def written(grey, valid, chunk_px=CHUNK_PX, steps=None, order=None):
+    """The layer of a picture handed over in blocks of `steps` rows and columns."""
+    writer = GreyLayerWriter(*grey.shape, chunk_px=chunk_px)
+    steps = steps or grey.shape
+    corners = [
+        (row, col)
+        for row in range(0, grey.shape[0], steps[0])
+        for col in range(0, grey.shape[1], steps[1])
+    ]
+    for index in range(len(corners)) if order is None else order.permutation(len(corners)):
+        row, col = corners[index]
+        part = np.s_[row : row + steps[0], col : col + steps[1]]
+        writer.add(row, col, grey[part], valid[part])
+    return writer.finish()
+
+
+def total_bytes(parts):
+    return sum(part.nbytes for part in parts.values())
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (8, 8), (9, 6), (37, 51)])
+def test_halving(shape):
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        grey = rng.integers(0, 256, shape).astype(np.uint8)
+        valid = rng.random(shape) < (0.3, 0.7, 1.1)[seed]
+        for found, wanted in zip(halved(grey, valid), naively_halved(grey, valid), strict=True):
+            assert found.dtype == wanted.dtype
+            np.testing.assert_array_equal(found, wanted)
+
+
+def test_each_level_is_half_the_one_before():
+    grey, valid = holes((150, 237))
+    info, parts = written(grey, valid, chunk_px=32, steps=(50, 70))
+    table = ChunkTable(150, 237, info.levels, 32)
+    level_grey, level_valid, expected = grey, valid, []
+    for level in range(info.levels):
+        assert table.shapes[level] == level_grey.shape
+        for row in range(0, level_grey.shape[0], 32):
+            for col in range(0, level_grey.shape[1], 32):
+                part = np.s_[row : row + 32, col : col + 32]
+                some = level_valid[part].any()
+                blobs = encode_chunk(level_grey[part], level_valid[part]) if some else (b"", b"")
+                expected.append(blobs)
+        level_grey, level_valid = naively_halved(level_grey, level_valid)
+    assert len(expected) == table.count and info.valid_px == valid.sum()
+    assert parts[NAMES["bytes"]].tobytes() == b"".join(jpeg for jpeg, _ in expected)
+    assert parts[NAMES["mask_bytes"]].tobytes() == b"".join(mask for _, mask in expected)
+    lengths = [[len(blob) for blob in blobs] for blobs in zip(*expected, strict=True)]
+    assert np.diff(parts[NAMES["offsets"]]).tolist() == lengths[0]
+    assert np.diff(parts[NAMES["mask_offsets"]]).tolist() == lengths[1]
+
+
+@pytest.mark.parametrize("steps", [(32, 32), (64, 128), (1, 237), (150, 5), (33, 47), (100, 100)])
+def test_how_the_blocks_come_does_not_matter(steps):
+    grey, valid = holes((150, 237))
+    info, parts = written(grey, valid, chunk_px=32)
+    for order in (None, np.random.default_rng(0)):
+        other_info, other = written(grey, valid, chunk_px=32, steps=steps, order=order)
+        assert other_info == info and other.keys() == parts.keys()
+        for name, part in parts.items():
+            assert part.dtype == other[name].dtype
+            np.testing.assert_array_equal(part, other[name])
+
+
+def test_blocks_that_never_come_are_not_valid():
+    grey = textured((150, 237))
+    valid = np.ones(grey.shape, bool)
+    writer = GreyLayerWriter(150, 237, chunk_px=32)
+    came = np.zeros(grey.shape, bool)
+    for row, col in ((0, 0), (40, 80), (90, 160)):
+        part = np.s_[row : row + 43, col : col + 77]
+        writer.add(row, col, grey[part], valid[part])
+        came[part] = True
+    info, parts = writer.finish()
+    wanted_info, wanted = written(np.where(came, grey, 0).astype(np.uint8), came, chunk_px=32)
+    assert info == wanted_info
+    for name in parts:
+        np.testing.assert_array_equal(parts[name], wanted[name])
+
+
+@pytest.mark.parametrize(
+    "shape, levels",
+    [
+        ((1, 1), 1),
+        ((64, 64), 1),
+        ((16, 65), 2),
+        ((128, 128), 2),
+        ((129, 20), 3),
+        ((2272, 2272), 7),
+        ((50_000, 1000), 10),
+        ((60_000_000, 1), 10),
+    ],
+)
+def test_levels_end_at_64_px_or_after_ten(shape, levels):
+    assert level_count(*shape) == level_count(*shape[::-1]) == levels
+
+
+def test_a_chunk_without_a_hole_has_no_mask_and_holes_cost_no_ringing():
+    grey = textured((64, 64))
+    full = np.ones((64, 64), bool)
+    jpeg, mask = encode_chunk(grey, full)
+    assert mask == b"" and len(jpeg) > 500
+    hole = full.copy()
+    hole[:, 32:] = False
+    half, mask = encode_chunk(np.where(hole, grey, 0).astype(np.uint8), hole)
+    assert 0 < len(mask) < 40 and len(half) < 0.75 * len(jpeg)
+    decoded, valid = decode_chunk(*(np.frombuffer(b, np.uint8) for b in (half, mask)), (64, 64))
+    np.testing.assert_array_equal(valid, hole)
+    assert (decoded[~hole] == 0).all()
+    assert np.abs(decoded[:, 24:32].astype(int) - grey[:, 24:32]).mean() < 6
+
+
+def noise(kind, shape=(700, 600)):
+    rng = np.random.default_rng(0)
+    if kind == "black and white":
+        return (rng.integers(0, 2, shape) * 255).astype(np.uint8)
+    if kind == "grains of two pixels":
+        coarse = rng.integers(0, 2, (shape[0] // 2, shape[1] // 2)) * 255
+        return np.kron(coarse, np.ones((2, 2))).astype(np.uint8)
+    return rng.integers(0, 256, shape).astype(np.uint8)
+
+
+@pytest.mark.parametrize("kind", ["even", "black and white", "grains of two pixels"])
+def test_noise_cannot_make_it_large(kind):
+    grey = noise(kind)
+    parts = written(grey, np.ones(grey.shape, bool))[1]
+    assert total_bytes(parts) < 4 / 3 * MAX_BYTES_PER_PX * grey.size
+    holed = written(grey, np.random.default_rng(1).random(grey.shape) < 0.7)[1]
+    assert total_bytes(holed) < 0.8 * grey.size
+
+
+def test_nothing_at_all():
+    info, parts = written(np.zeros((300, 300), np.uint8), np.zeros((300, 300), bool))
+    assert info.valid_px == 0 and parts[NAMES["bytes"]].size == 0
+    assert not parts[NAMES["offsets"]].any()
+
+
+def test_memory_does_not_grow_with_the_sheet():
+    def peak(rows):
+        writer = GreyLayerWriter(rows, 1024)
+        grey, valid = np.full((200, 1024), 99, np.uint8), np.ones((200, 1024), bool)
+        tracemalloc.start()
+        try:
+            for row in range(0, rows, 200):
+                writer.add(row, 0, grey[: rows - row], valid[: rows - row])
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    small, large = peak(2048), peak(8192)
+    assert large < 1.4 * small < 4e6
+
+
+@pytest.fixture(scope="module")
+def ortho(make_ortho, tmp_path_factory):
+    """An orthophoto of 400 x 400 m with a hole."""
+    grey = textured()
+    grey[150:230, 170:260] = 0
+    return make_ortho(tmp_path_factory.mktemp("ortho") / "2019-06.tif", grey, nodata=0)
+
+
+def built(ortho, folder, name="map.onav", **request):
+    request = {"tile_px": 64, "overlap": 0.75, **request}
+    build_map(BuildRequest([ortho], folder / name, **request))
+    return open_map(folder / name)
+
+
+@pytest.mark.parametrize("block_px", [1024, 150])
+def test_a_map_carries_its_imagery(ortho, tmp_path, monkeypatch, block_px):
+    monkeypatch.setattr("orthonav.prepare.build.BLOCK_PX", block_px)
+    opened = built(ortho, tmp_path)
+    sheet, layer = opened.manifest.sheets[0], GreyLayer.of(opened)
+    with Mosaic.open([ortho]).grid_sheet(sheet.frame, sheet.grid) as raster:
+        pixels = raster.read(0, 0, sheet.grid.width_px, sheet.grid.height_px)
+    grey, valid = layer.read(0, 0, 0, *layer.shape(0))
+    assert layer.shape(0) == pixels.grey.shape
+    assert (valid != pixels.valid).mean() < (1e-3 if block_px < 1024 else 1e-9)
+    assert sheet.grey.valid_px == valid.sum() and 0.5 < valid.mean() < 0.98
+    error = grey.astype(float)[valid] - pixels.grey[valid]
+    assert np.sqrt((error**2).mean()) < 7
+    assert max(layer.shape(layer.levels - 1)) <= 64
+
+
+def test_levels_show_the_same_place(ortho, tmp_path):
+    layer = GreyLayer.of(built(ortho, tmp_path))
+    grey, valid = layer.read(0, 0, 0, *layer.shape(0))
+    for level in range(1, layer.levels):
+        grey, valid = halved(grey, valid)
+        read, read_valid = layer.read(level, 0, 0, *layer.shape(level))
+        np.testing.assert_array_equal(read_valid, valid)
+        match = cv2.matchTemplate(np.pad(read, 2), grey, cv2.TM_CCOEFF_NORMED)
+        assert np.unravel_index(match.argmax(), match.shape) == (2, 2)
+        assert match.max() > 0.97
+
+
+def test_far_from_the_route_there_is_nothing(make_ortho, tmp_path):
+    grey = textured((1500, 1500))
+    wide = make_ortho(tmp_path / "wide.tif", grey)
+    frame = built(wide, tmp_path, "whole.onav", registration=False).manifest.sheets[0].frame
+    ends = frame.latlon_from_en(np.array([[-700.0, -700.0], [700.0, 700.0]]))
+    route = Route(tuple(zip(*(each.tolist() for each in ends), strict=True)))
+    opened = built(wide, tmp_path, route=route, band_m=100.0)
+    layer = GreyLayer.of(opened)
+    rows, cols = layer.shape(0)
+    middle = layer.read(0, rows // 2 - 100, cols // 2 - 100, 200, 200)[1]
+    assert middle.all() and not layer.read(0, 0, 0, 400, 400)[1].any()
+    sheet = opened.manifest.sheets[0]
+    assert sheet.grey.valid_px < 0.7 * rows * cols
+    half = sheet.grid.tile_px // 2
+    for east_m, north_m in opened.array("sheet0/centres_en_m", np.float32, 2)[::9]:
+        row, col = int(sheet.grid.north_m - north_m), int(east_m - sheet.grid.west_m)
+        assert layer.read(0, row - half, col - half, 2 * half, 2 * half)[1].mean() > 0.4
+
+
+def test_without_a_layer(ortho, tmp_path):
+    with_it, without = built(ortho, tmp_path), built(ortho, tmp_path, "b.onav", registration=False)
+    assert GreyLayer.of(without) is None
+    assert set(with_it.arrays) - set(without.arrays) == set(NAMES.values())
+    for name, part in without.arrays.items():
+        np.testing.assert_array_equal(part, with_it.arrays[name])
+
+
+def test_info_tells_of_the_layer(ortho, tmp_path, capsys):
+    opened = built(ortho, tmp_path)
+    grey = opened.manifest.sheets[0].grey
+    assert main(["info", str(opened.path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["registration"]
+    size = sum(opened.arrays[name].nbytes for name in NAMES.values())
+    assert told["bytes"] == size and told["levels"] == grey.levels
+    assert told["raw_bytes"] == 3 * grey.valid_px
+    assert told["raw_ratio"] == pytest.approx(3 * grey.valid_px / size, abs=0.01)
+    assert told["mb_per_km2"] == pytest.approx(size / grey.valid_px, rel=0.01)  # 1 m pixels
+    assert main(["info", str(opened.path)]) == 0
+    text = capsys.readouterr().out
+    assert f"registration layer of {size / 1e6:.3f} MB" in text
+    assert f"{grey.levels} levels, 1/{told['raw_ratio']:.0f} of the raw orthophoto" in text
+
+
+def test_the_command_can_leave_it_out(ortho, tmp_path, capsys):
+    arguments = ["--ortho", str(ortho), "--tile-px", "64", "--overlap", "0.75", "-q"]
+    out = tmp_path / "map.onav"
+    assert main(["build", *arguments, "--no-registration", "--out", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["registration"] is None
+    assert main(["info", str(out)]) == 0
+    assert "no registration layer: positions at tile level only" in capsys.readouterr().out
+    assert main(["build", *arguments, "--out", str(out)]) == 0
+    assert "registration layer of" in capsys.readouterr().out
+    assert GreyLayer.of(open_map(out)) is not None
