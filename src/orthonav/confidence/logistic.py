@@ -51,10 +51,17 @@ class LogisticConfidence:
 def fit_logistic(
     features: NDArray[np.float64], right: NDArray[np.bool_], sample_weight: NDArray[np.float64]
 ) -> LogisticConfidence:
-    """Weighted maximum likelihood with a slight ridge, weights bounded at zero.
+    """Confidence from `features` (N, len(FEATURES)), as `fit_weights` fits it."""
+    return LogisticConfidence(*fit_weights(features, right, sample_weight))
 
-    `features` (N, len(FEATURES)), `right` (N,) whether the fix was right, `sample_weight` (N,).
-    Features are standardized inside, the result applies to raw ones.
+
+def fit_weights(
+    features: NDArray[np.float64], right: NDArray[np.bool_], sample_weight: NDArray[np.float64]
+) -> tuple[float, tuple[float, ...]]:
+    """Bias and weights of a logistic regression: weighted maximum likelihood with a slight ridge.
+
+    Weights are bounded at zero. `features` (N, F), `right` (N,) whether the fix was right,
+    `sample_weight` (N,). Features are standardized inside, the result applies to raw ones.
     """
     from scipy.optimize import minimize  # not needed to fly
 
@@ -76,6 +83,4 @@ def fit_logistic(
         loss, np.zeros(features.shape[1] + 1), jac=True, bounds=bounds, method="L-BFGS-B"
     ).x
     weights = found[1:] / std
-    return LogisticConfidence(
-        float(found[0] - weights @ mean), tuple(float(weight) for weight in weights)
-    )
+    return float(found[0] - weights @ mean), tuple(float(weight) for weight in weights)

@@ -22,6 +22,9 @@ from orthonav.errors import VariantError
 CHUNK_TILES = 512
 MAX_LEARNT_TILES = 20_000
 PART_NOISE = 2.0
+SOLVER_STEPS = 6
+SHARE_ROUNDING = 1e-3
+TINY = np.float32(1e-30)
 
 
 @dataclass(frozen=True)
@@ -196,6 +199,59 @@ class WhitenedEmbedder:
         normal = seen @ loadings + np.eye(self.dims, dtype=np.float32)
         return np.asarray(np.linalg.solve(normal, seen @ centred))
 
+    def cells(self, cells: NDArray[np.float32], valid: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Unit embeddings (Q, D) of many views at once, as `view` gives them one by one.
+
+        `cells` (Q, cells, cells, C) are sums of micro-cells weighted by `recipe.pooling` along
+        rows and columns, `valid` (Q, cells, cells) sums of their valid shares.
+        """
+        out = np.empty((len(cells), self.dims), dtype=np.float32)
+        along = self.recipe.pooling.sum(axis=1)
+        shares = (valid / np.outer(along, along)).reshape(len(cells), -1)
+        for part in _chunks(len(cells)):
+            features = _normalized(self.recipe, cells[part])
+            centred = features.reshape(len(features), -1) - self._mean
+            out[part] = centred @ self._basis
+            missing = shares[part].min(axis=1) < 1 - SHARE_ROUNDING
+            if missing.any():
+                weights = np.repeat(shares[part][missing], cells.shape[-1], axis=-1)
+                out[part][missing] = self._from_parts(centred[missing], weights)
+        return _unit(out)
+
+    def _from_parts(
+        self, centred: NDArray[np.float32], weights: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Components (Q, D) of many views, solved for as in `_from_part`.
+
+        By conjugate gradients for all of them at once, preconditioned with what would be exact if
+        every cell had the mean weight: a twentieth of the time of exact solutions.
+        """
+        loadings = self._loadings
+        noisy = weights / np.float32(PART_NOISE)
+        power = np.square(loadings).sum(axis=0)
+        shrink = np.reciprocal(noisy.mean(axis=1, keepdims=True) * power + np.float32(1))
+        wanted = (centred * noisy) @ loadings
+        solved = shrink * wanted
+        residual = wanted - self._normal(solved, noisy)
+        step = shrink * residual
+        fit = _dots(residual, step)
+        for _ in range(SOLVER_STEPS):
+            response = self._normal(step, noisy)
+            length = fit / np.maximum(_dots(step, response), TINY)
+            solved += length * step
+            residual -= length * response
+            scaled = shrink * residual
+            before, fit = fit, _dots(residual, scaled)
+            step = scaled + (fit / np.maximum(before, TINY)) * step
+        return np.asarray(solved)
+
+    def _normal(
+        self, components: NDArray[np.float32], noisy: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """What the normal matrices of `_from_part` make of components (Q, D)."""
+        loadings = self._loadings
+        return np.asarray(components + ((components @ loadings.T) * noisy) @ loadings)
+
     @cached_property
     def _loadings(self) -> NDArray[np.float32]:
         """Features (F, D) per unit of each whitened component, smallest variance kept = 1."""
@@ -210,6 +266,11 @@ class WhitenedEmbedder:
 def _unit(vectors: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
     norms = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.maximum(norms, 1e-12), dtype=np.float32)
+
+
+def _dots(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Scalar products (Q, 1) of the rows of two arrays (Q, D)."""
+    return np.asarray(np.einsum("qd,qd->q", first, second)[:, None])
 
 
 def learn(recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp]) -> WhitenedEmbedder:

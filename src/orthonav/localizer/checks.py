@@ -67,3 +67,19 @@ def check_rectified(view: Rectified, min_valid_share: float) -> NoFix | None:
     if float(seen.std()) < MIN_STD / 2:
         return NoFix("blank", "the part of the view that would be compared is uniform")
     return None
+
+
+def check_footprint(view: Rectified, pixel: float, min_side_px: float) -> NoFix | None:
+    """Why a rectified footprint shows too little; None if enough.
+
+    `pixel` is the size of its pixels in pixels of the map, `min_side_px` the least side, in those.
+    """
+    side = math.sqrt(float(view.valid.sum())) * pixel
+    if side < min_side_px:
+        return NoFix(
+            "too_small",
+            f"view covers {side:.0f} pixels of the map across, {min_side_px:.0f} needed",
+        )
+    if float(view.grey[view.valid].std()) < MIN_STD / 2:
+        return NoFix("blank", "the part of the view that would be compared is uniform")
+    return None

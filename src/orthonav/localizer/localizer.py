@@ -9,12 +9,16 @@ from numpy.typing import NDArray
 
 from orthonav import embed, represent
 from orthonav.confidence.logistic import LogisticConfidence
+from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.embed.whitened import WhitenedEmbedder
 from orthonav.errors import CameraError, MapFileError, VariantError
 from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_rectified, check_telemetry, check_view
 from orthonav.localizer.match import Match, TileMatcher
 from orthonav.localizer.rectify import PreparedView, Rectified, prepare_view, rectify
+from orthonav.localizer.registration import RegistrationLocalizer
+from orthonav.mapfile.layer import GreyLayer
+from orthonav.mapfile.manifest import SheetInfo
 from orthonav.mapfile.reader import MapFile
 from orthonav.records import Fix, NoFix, Prior, Telemetry
 from orthonav.search.exact import rows_within
@@ -29,8 +33,12 @@ UNKNOWN_HEADING_STEP_DEG = 8.0
 class Localizer:
     """Places views on one map. Cheap to make, safe to share between threads once warm."""
 
-    def __init__(self, opened: MapFile) -> None:
-        """Take an opened map; raises `MapFileError` if it cannot be flown with this program."""
+    def __init__(self, opened: MapFile, *, registration: bool = True) -> None:
+        """Take an opened map; raises `MapFileError` if it cannot be flown with this program.
+
+        Without `registration`, or where the map has no registration layer, views are placed by
+        their tiles only.
+        """
         manifest = opened.manifest
         if len(manifest.sheets) != 1:
             raise MapFileError(f"this program flies maps of one sheet: {opened.path}")
@@ -63,6 +71,7 @@ class Localizer:
             raise MapFileError(f"{error}: {opened.path}") from error
         self.radius_m = manifest.radius_m
         self.index = self._matcher.index
+        self.registration = _registration(opened, self.sheet) if registration else None
 
     def locate(
         self,
@@ -89,6 +98,8 @@ class Localizer:
         refused = refused or check_view(grey)
         if refused is not None:
             return refused
+        if self.registration is not None:
+            return self.registration.locate(grey, camera, telemetry, prior, heading_known)
         headings = self._headings_deg(telemetry, heading_known)
         prepared = prepare_view(grey, camera, telemetry.agl_m, self.grid.gsd_m)
         rectified = [self.rectified(prepared, telemetry, heading) for heading in headings]
@@ -172,6 +183,22 @@ class Localizer:
             agl_m=telemetry.agl_m,
             evidence=MappingProxyType(evidence),
         )
+
+
+def _registration(opened: MapFile, sheet: SheetInfo) -> RegistrationLocalizer | None:
+    layer = GreyLayer.of(opened)
+    if layer is None:
+        return None
+    plain = opened.manifest.registration or {}
+    try:
+        fitted = plain.get("confidence")
+        confidence = None if fitted is None else RegisteredConfidence.from_plain(fitted)
+        radius_m, floor_px = float(plain["radius_m"]), float(plain["position_floor_px"])
+    except (VariantError, KeyError, TypeError, ValueError) as error:
+        raise MapFileError(f"map cannot be flown ({error}): {opened.path}") from error
+    if not (0 < radius_m < math.inf and 0 <= floor_px < math.inf):
+        raise MapFileError(f"map has impossible registration parameters: {opened.path}")
+    return RegistrationLocalizer(sheet, layer, confidence, radius_m, floor_px)
 
 
 def _embedder(opened: MapFile, plain: Any, channels: int) -> WhitenedEmbedder:

@@ -9,14 +9,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.errors import CameraError
 from orthonav.geo.camera import (
     Camera,
     axis_on_ground_en_m,
     camera_from_en,
     counted_from_centres,
     distort,
+    footprint_en_m,
 )
 
+MAX_REACH = 2.0
+EDGE_PX = 1e-6
 Array = NDArray[np.float64]
 
 
@@ -32,8 +36,8 @@ class PreparedView:
 class Rectified:
     """A rectified view.
 
-    `grey` (S, S) uint8 and `valid` (S, S) bool, north up, grey 0 where not valid; `offset_en_m`
-    where the centre of the window lies, metres east and north of the camera.
+    `grey` (H, W) uint8 and `valid` (H, W) bool, grey 0 where not valid; `offset_en_m` where the
+    centre of the window lies, metres east and north of the camera.
     """
 
     grey: NDArray[np.uint8]
@@ -71,49 +75,93 @@ def rectify(
     The axis must point below the horizon. Pixels that the camera did not see are not valid.
     """
     offset = np.array(axis_on_ground_en_m(yaw_deg, pitch_deg, roll_deg, agl_m))
-    half_m = size_px * gsd_m / 2
-    en_from_window = np.array(
-        [[gsd_m, 0, offset[0] - half_m], [0, -gsd_m, offset[1] + half_m], [0, 0, 1]]
-    )
-    camera_from_window = camera_from_en(yaw_deg, pitch_deg, roll_deg, agl_m) @ en_from_window
-    corners = np.array([[0, 0, 1], [size_px, 0, 1], [size_px, size_px, 1], [0, size_px, 1.0]])
-    depth = corners @ camera_from_window[2]
-    if view.camera.distortion or depth.min() <= 0:
-        grey, valid = _remapped(view, camera_from_window, size_px)
-    else:
-        grey, valid = _warped(view, camera_from_window, size_px, corners)
+    attitude = yaw_deg, pitch_deg, roll_deg, agl_m
+    grey, valid = _window(view, attitude, offset, gsd_m, (size_px, size_px))
     return Rectified(grey, valid, offset)
 
 
+def rectify_footprint(
+    view: PreparedView,
+    *,
+    pitch_deg: float,
+    roll_deg: float,
+    agl_m: float,
+    gsd_m: float,
+    multiple_px: int,
+) -> Rectified:
+    """Rectify what the camera sees, its own heading up, sides whole multiples of `multiple_px`.
+
+    What is left over of the sides is cut off, so that a vertical view has no pixels not seen.
+    Where the view reaches far out to one side (it leans), no more than `MAX_REACH` times the half
+    sides of a vertical view are kept on either side of the optical axis. The `offset_en_m` is that
+    of a heading of 0.
+    """
+    camera = view.camera
+    axis = np.array(axis_on_ground_en_m(0.0, pitch_deg, roll_deg, agl_m))
+    half_m = np.array([camera.width_px / camera.fx_px, camera.height_px / camera.fy_px]) * agl_m / 2
+    low, high = axis - MAX_REACH * half_m, axis + MAX_REACH * half_m
+    try:
+        corners = footprint_en_m(camera, 0.0, pitch_deg, roll_deg, agl_m)
+        low, high = np.maximum(low, corners.min(axis=0)), np.minimum(high, corners.max(axis=0))
+    except CameraError:
+        pass  # the horizon is in the view: as far as it may reach
+    width, height = (
+        max(1, int(side / gsd_m / multiple_px + 1e-6)) * multiple_px for side in high - low
+    )
+    middle = (low + high) / 2
+    attitude = 0.0, pitch_deg, roll_deg, agl_m
+    grey, valid = _window(view, attitude, middle, gsd_m, (height, width))
+    return Rectified(grey, valid, middle)
+
+
+def _window(
+    view: PreparedView,
+    attitude: tuple[float, float, float, float],
+    middle_en_m: Array,
+    gsd_m: float,
+    shape: tuple[int, int],
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Grey and valid of the window of ground about `middle_en_m`, metres from the camera."""
+    height, width = shape
+    west, north = middle_en_m + np.array([-width, height]) * gsd_m / 2
+    en_from_window = np.array([[gsd_m, 0, west], [0, -gsd_m, north], [0, 0, 1]])
+    camera_from_window = camera_from_en(*attitude) @ en_from_window
+    corners = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1.0]])
+    depth = corners @ camera_from_window[2]
+    if view.camera.distortion or depth.min() <= 0:
+        return _remapped(view, camera_from_window, shape)
+    return _warped(view, camera_from_window, shape, corners)
+
+
 def _warped(
-    view: PreparedView, camera_from_window: Array, size_px: int, corners: Array
+    view: PreparedView, camera_from_window: Array, shape: tuple[int, int], corners: Array
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """The fast path: no distortion, no horizon, so one homography does it."""
+    size = shape[1], shape[0]
     px_from_window = view.camera.matrix @ camera_from_window
     matrix = counted_from_centres(px_from_window)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     grey = cv2.warpPerspective(
-        view.grey, matrix, (size_px, size_px), flags=flags, borderMode=cv2.BORDER_REPLICATE
+        view.grey, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
     projected = corners @ px_from_window.T
     seen = projected[:, :2] / projected[:, 2:]
     height, width = view.grey.shape
-    if (seen >= 0).all() and (seen[:, 0] <= width).all() and (seen[:, 1] <= height).all():
-        valid = np.ones((size_px, size_px), dtype=np.bool_)
+    if (seen >= -EDGE_PX).all() and (seen <= np.array([width, height]) + EDGE_PX).all():
+        valid = np.ones(shape, dtype=np.bool_)
     else:
         inside = np.full(view.grey.shape, 255, dtype=np.uint8)
         flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-        valid = cv2.warpPerspective(inside, matrix, (size_px, size_px), flags=flags) > 0
+        valid = cv2.warpPerspective(inside, matrix, size, flags=flags) > 0
         grey = np.where(valid, grey, 0)
     return np.asarray(grey, dtype=np.uint8), np.asarray(valid, dtype=np.bool_)
 
 
 def _remapped(
-    view: PreparedView, camera_from_window: Array, size_px: int
+    view: PreparedView, camera_from_window: Array, shape: tuple[int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """The general path: every pixel through lens and horizon."""
-    centres = np.arange(size_px) + 0.5
-    columns, rows = np.meshgrid(centres, centres)
+    columns, rows = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0]) + 0.5)
     window = np.stack([columns, rows, np.ones_like(rows)], axis=-1)
     rays = window @ camera_from_window.T
     ahead = rays[..., 2] > 1e-9

@@ -136,8 +136,9 @@ class Manifest:
 
     `recipe` names method, representation and their parameters; `imagery` the sources and dates;
     `view` what a view must bring (`min_valid_share`, `heading_step_deg`); `confidence` the fitted
-    probability, None where there is none; `radius_m` the radius it speaks of; `parts` name to
-    {dtype, shape, sha256}.
+    probability, None where there is none; `radius_m` the radius it speaks of; `registration` the
+    same for registered views (`confidence`, `radius_m`, `position_floor_px`), None where the map
+    has no registration layer; `parts` name to {dtype, shape, sha256}.
     """
 
     recipe: dict[str, Any]
@@ -147,6 +148,7 @@ class Manifest:
     confidence: dict[str, Any] | None
     radius_m: float
     created_by: str
+    registration: dict[str, Any] | None = None
     parts: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def to_json(self) -> str:
@@ -161,6 +163,7 @@ class Manifest:
             "view": self.view,
             "confidence": self.confidence,
             "radius_m": self.radius_m,
+            "registration": self.registration,
             "parts": self.parts,
         }
         return _canonical({**plain, "manifest_sha256": _digest(plain)})
@@ -191,7 +194,7 @@ class Manifest:
         sheets = _get(plain, "sheets", list)
         if not 1 <= len(sheets) <= MAX_SHEETS:
             raise MapFileError(f"map must have 1 to {MAX_SHEETS} sheets, has {len(sheets)}")
-        confidence = plain.get("confidence")
+        confidence, registration = plain.get("confidence"), plain.get("registration")
         return cls(
             recipe=_get(plain, "recipe", dict),
             sheets=tuple(SheetInfo.from_plain(sheet) for sheet in sheets),
@@ -200,6 +203,7 @@ class Manifest:
             confidence=confidence if isinstance(confidence, dict) else None,
             radius_m=_number(plain, "radius_m"),
             created_by=str(plain.get("created_by", "")),
+            registration=registration if isinstance(registration, dict) else None,
             parts=_get(plain, "parts", dict),
         )
 

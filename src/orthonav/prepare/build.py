@@ -7,7 +7,7 @@ compressed registration layer (0.15 to 0.35 MB per km2 at 1 m).
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +22,14 @@ from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
+from orthonav.localizer.registration import RegistrationLocalizer
+from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import Manifest, SheetInfo
+from orthonav.mapfile.reader import MapFile
 from orthonav.mapfile.writer import write_map
 from orthonav.prepare.blocks import BlockPixels, Preview, blocks_of, read_block
-from orthonav.prepare.calibrate import RADIUS_STRIDES, Calibration, CropSampler, calibrate
+from orthonav.prepare.calibrate import RADIUS_STRIDES, Calibration, Crop, CropSampler, calibrate
+from orthonav.prepare.calibrate_registration import FLOOR_PX, calibrate_registration
 from orthonav.prepare.layer import CHUNK_PX, GreyLayerWriter
 from orthonav.variants import make_variant, variant_recipe
 
@@ -36,6 +40,9 @@ PREVIEW_PX = 384
 MIN_TILE_VALID_SHARE = 0.5
 MIN_VIEW_VALID_SHARE = 0.4
 HEADING_STEP_DEG = 6.0
+RADIUS_PX = 10.0
+MIN_RADIUS_M = 35.0
+"""A registered view is right within so many pixels or metres: cameras lean more than told."""
 Progress = Callable[[str, float], None]
 
 
@@ -43,7 +50,8 @@ Progress = Callable[[str, float], None]
 class BuildRequest:
     """What to build. `bounds_deg` is west, south, east, north; with neither it nor a route, the
     whole imagery is the area. `gsd_m` None takes that of the finest orthophoto. With
-    `registration` the map carries the grey picture that places views below tile size."""
+    `registration` the map carries the grey picture that places views below tile size;
+    `other_dates` are orthophotos of the same ground to learn the confidence from."""
 
     orthos: Sequence[Path]
     out: Path
@@ -57,6 +65,7 @@ class BuildRequest:
     edges: str = "gradient"
     seed: int = 0
     registration: bool = True
+    other_dates: Sequence[Path] = ()
 
 
 @dataclass(frozen=True)
@@ -79,6 +88,7 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     mosaic = Mosaic.open(request.orthos)
     if any(request.out.exists() and request.out.samefile(path) for path in request.orthos):
         raise OutputError(f"the map would replace an orthophoto; name another file: {request.out}")
+    mosaic_of_dates = [Mosaic.open([path]) for path in request.other_dates]
     area = _area(request, mosaic)
     grid = _grid(request, area, mosaic)
     if request.seed < 0:
@@ -108,8 +118,55 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
         **{f"embed/{name}": array for name, array in embedder.parts().items()},
         **grey_parts,
     }
+    if grey is not None:
+        registration = _registration(
+            request, mosaic_of_dates, area, manifest, arrays, sampler, report
+        )
+        manifest = replace(manifest, registration=registration)
     written = write_map(request.out, manifest, arrays)
     return BuildResult(written, request.out.stat().st_size)
+
+
+def _registration(
+    request: BuildRequest,
+    other_dates: Sequence[Mosaic],
+    area: Area,
+    manifest: Manifest,
+    arrays: dict[str, NDArray[Any]],
+    sampler: CropSampler,
+    report: Progress,
+) -> dict[str, Any]:
+    """What the manifest says of registration: placed on the map as it will be written."""
+    sheet = manifest.sheets[0]
+    radius_m = max(RADIUS_PX * sheet.grid.gsd_m, MIN_RADIUS_M)
+    made = MapFile(request.out, 0, manifest, arrays)
+    layer = GreyLayer.of(made)
+    assert layer is not None
+    localizer = RegistrationLocalizer(sheet, layer, None, radius_m, FLOOR_PX)
+    later = [crop for each in other_dates for crop in _crops_of(each, area, sheet.grid, sampler)]
+    if other_dates and not later:
+        log.warning("the other dates do not cover the area: nothing can be learnt from them")
+    learnt = calibrate_registration(localizer, sampler.crops, later, request.seed, report)
+    if learnt.confidence is None:
+        log.warning("too little imagery to calibrate registration: fixes will have no confidence")
+    return {
+        "confidence": None if learnt.confidence is None else learnt.confidence.to_plain(),
+        "radius_m": radius_m,
+        "position_floor_px": learnt.floor_px,
+    }
+
+
+def _crops_of(mosaic: Mosaic, area: Area, grid: TileGrid, sampler: CropSampler) -> list[Crop]:
+    """What another date shows at the places of the crops, where it shows all of them."""
+    found = []
+    with mosaic.grid_sheet(area.frame, grid) as raster:
+        for crop in sampler.crops:
+            size = crop.grey.shape[0]
+            col, row = round(crop.col_px - size / 2), round(crop.row_px - size / 2)
+            pixels = raster.read(col, row, size, size)
+            if pixels.valid.all() and pixels.grey.std() > 1:
+                found.append(Crop(pixels.grey, crop.row_px, crop.col_px))
+    return found
 
 
 def _embedding_recipe(method: str, representation: Any) -> WhitenedRecipe:

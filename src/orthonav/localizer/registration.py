@@ -1,0 +1,268 @@
+"""Placing a view by registration: rectify it, find candidates, refine them, judge the best.
+
+Candidates come from where they cost least: a search by FFT of the whole sheet or of the part that
+the prior allows, at the level where the view is judged or one coarser; or, on large sheets, tiles
+whose embeddings are alike. Where the outcome leaves doubt, the next dearer way is tried too.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.confidence.registered import RegisteredConfidence
+from orthonav.geo.camera import Camera
+from orthonav.localizer.checks import check_footprint
+from orthonav.localizer.rectify import Rectified, prepare_view, rectify_footprint
+from orthonav.mapfile.manifest import SheetInfo
+from orthonav.records import Fix, NoFix, Prior, Telemetry
+from orthonav.register.reference import GreyPyramid, Reference
+from orthonav.register.registrar import Levels, PosePrior, Registered, Registrar
+from orthonav.register.search import Bank, Candidate, bank, search
+from orthonav.register.template import ViewTemplates
+
+DEFAULT_YAW_STD_DEG = 7.0
+DEFAULT_AGL_STD = 0.08
+MIN_YAW_STD_DEG = 2.0
+MIN_AGL_STD = 0.03
+TURN_STEP_RAD = math.radians(8.0)
+SCALE_STEP = 0.13
+BANK_SIGMAS = 3.0
+PRIOR_SIGMAS = 3.0
+CANDIDATES = 24
+MIN_VIEW_PX = 24.0
+USUAL_CHANCE = 28.0
+SURE_STRENGTH = 2.2
+SURE_RATIO = 1.9
+"""A view this far above chance and its rivals is not searched again."""
+POSE_MS = 0.1
+PIXEL_MS = 6e-7
+TILE_POSE_MS = 0.25
+TILE_PIXEL_MS = 1.3e-5
+LOOK_MS = 14.0
+COARSE_MS = 60.0
+LAST_MS = 900.0
+"""What searches cost on one core of a desktop, roughly: to choose between them, no more."""
+
+TileProposer = Callable[[Rectified, list[tuple[float, float]], Prior | None], list[Candidate]]
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A view made ready: its templates, levels, and where the camera is seen from its middle."""
+
+    templates: ViewTemplates
+    levels: Levels
+    side_px: float
+    camera_px: NDArray[np.float64]
+    prior: PosePrior
+    bank: Bank
+
+
+class RegistrationLocalizer:
+    """Places views on one sheet by registration. Safe to share between threads."""
+
+    def __init__(
+        self,
+        sheet: SheetInfo,
+        layer: GreyPyramid,
+        confidence: RegisteredConfidence | None,
+        radius_m: float,
+        floor_px: float,
+    ) -> None:
+        """`floor_px` is the standard deviation with which maps of two dates agree, in pixels."""
+        self.sheet, self.grid = sheet, sheet.grid
+        self.registrar = Registrar(Reference(layer))
+        self.confidence, self.radius_m = confidence, radius_m
+        self._floor_px = floor_px
+
+    def locate(
+        self,
+        grey: NDArray[np.uint8],
+        camera: Camera,
+        telemetry: Telemetry,
+        prior: Prior | None,
+        heading_known: bool,
+    ) -> Fix | NoFix:
+        """Where a view (H, W) was taken; checks of view and telemetry have been made."""
+        view = self.prepared(grey, camera, telemetry, heading_known)
+        if isinstance(view, NoFix):
+            return view
+        if prior is not None and not self._touches_map(prior, view):
+            return NoFix("outside_map", "the map does not reach to where the prior says")
+        best = self.best(view, prior)
+        if best is None:
+            return NoFix("no_match", "no place of the map could be compared with the view")
+        return self._fix(view, best, telemetry)
+
+    def prepared(
+        self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry, heading_known: bool
+    ) -> _View | NoFix:
+        """The view rectified to the level where it is finished, heading up, all that it sees."""
+        agl_m = telemetry.agl_m
+        nominal_m = agl_m * math.sqrt(
+            camera.width_px * camera.height_px / (camera.fx_px * camera.fy_px)
+        )
+        levels = Levels.of(nominal_m / self.grid.gsd_m, self.registrar.reference.levels)
+        gsd_m = self.grid.gsd_m * 2**levels.final
+        rectified = rectify_footprint(
+            prepare_view(grey, camera, agl_m, gsd_m),
+            pitch_deg=telemetry.pitch_deg,
+            roll_deg=telemetry.roll_deg,
+            agl_m=agl_m,
+            gsd_m=gsd_m,
+            multiple_px=2 ** (levels.coarse - levels.final),
+        )
+        refused = check_footprint(rectified, gsd_m / self.grid.gsd_m, MIN_VIEW_PX)
+        if refused is not None:
+            return refused
+        templates = ViewTemplates(rectified.grey, rectified.valid, levels.final)
+        pose_prior = _pose_prior(telemetry, heading_known)
+        offset = rectified.offset_en_m / self.grid.gsd_m
+        side_px = math.sqrt(float(rectified.valid.sum())) * gsd_m / self.grid.gsd_m
+        poses = bank(
+            pose_prior.turn_std_rad if heading_known else None,
+            pose_prior.log_scale_std,
+            turn_step_rad=TURN_STEP_RAD,
+            scale_step=SCALE_STEP,
+            sigmas=BANK_SIGMAS,
+        )
+        camera_px = np.array([-offset[0], offset[1]])
+        return _View(templates, levels, side_px, camera_px, pose_prior, poses)
+
+    def best(self, view: _View, prior: Prior | None) -> Registered | None:
+        """The best place over all ways of search that had to be tried."""
+        best: Registered | None = None
+        for level, candidates in self._ways(view, prior):
+            found = self.registrar.verify(
+                view.templates, view.levels, candidates, level, view.prior
+            )
+            if found is not None and (best is None or found.score > best.score):
+                best = found if best is None else found.beside(best, view.side_px)
+            elif found is not None and best is not None:
+                best = best.beside(found, view.side_px)
+            if best is not None and self._is_sure(best):
+                break
+        return best
+
+    def _is_sure(self, best: Registered) -> bool:
+        chance = self.confidence.chance if self.confidence else USUAL_CHANCE
+        if best.score <= SURE_STRENGTH * chance:
+            return False
+        return min(best.peak_ratio, best.look_ratio) > SURE_RATIO
+
+    def _ways(self, view: _View, prior: Prior | None) -> Iterator[tuple[int, list[Candidate]]]:
+        """Candidates and the level they were found at, by the cheapest way first."""
+        poses = _absolute(view)
+        look, coarse = view.levels.look, view.levels.coarse
+        look_ms = self._search_ms(view, prior, look, len(poses))
+        coarse_ms = self._search_ms(view, prior, coarse, len(poses))
+        if look_ms > LOOK_MS and coarse > look and coarse_ms <= LAST_MS:
+            yield coarse, self._searched(view, prior, coarse, poses)
+        if look_ms <= LAST_MS or coarse == look:
+            yield look, self._searched(view, prior, look, poses)
+
+    def _search_ms(self, view: _View, prior: Prior | None, level: int, poses: int) -> float:
+        rows, cols = self.registrar.reference.shape(level)
+        if prior is not None:
+            across = 2 * self._reach_px(view, prior) / 2**level
+            rows, cols = round(min(rows, across)), round(min(cols, across))
+        side = view.side_px / 2**level
+        pixels = float((rows + side) * (cols + side))
+        return poses * (POSE_MS + PIXEL_MS * pixels * math.log2(pixels))
+
+    def _searched(
+        self, view: _View, prior: Prior | None, level: int, poses: list[tuple[float, float]]
+    ) -> list[Candidate]:
+        recipe = view.levels.recipe(level)
+        if prior is None:
+            window = self.registrar.whole_window(level, recipe, view.side_px)
+        else:
+            window = self.registrar.part_window(
+                level,
+                recipe,
+                view.side_px,
+                self._prior_px(prior, view),
+                self._reach_px(view, prior),
+            )
+        return search(view.templates.at(level, recipe), window, poses, CANDIDATES)
+
+    def _prior_px(self, prior: Prior, view: _View) -> tuple[float, float]:
+        """Where the middle of the view should lie by the prior, x and y at level 0."""
+        east, north = self.sheet.frame.en_from_latlon(prior.lat_deg, prior.lon_deg)
+        x = (float(east) - self.grid.west_m) / self.grid.gsd_m
+        y = (self.grid.north_m - float(north)) / self.grid.gsd_m
+        if view.prior.turn_rad is None:
+            return x, y
+        cos, sin = math.cos(view.prior.turn_rad), math.sin(view.prior.turn_rad)
+        moved = np.array([[cos, -sin], [sin, cos]]) @ view.camera_px
+        return x - float(moved[0]), y - float(moved[1])
+
+    def _reach_px(self, view: _View, prior: Prior) -> float:
+        """How far from there the middle of the view may lie."""
+        lean = float(np.hypot(*view.camera_px))
+        turn = 2.0 if view.prior.turn_rad is None else 2 * view.prior.turn_std_rad
+        reach = PRIOR_SIGMAS * max(prior.std_m, 0.0) / self.grid.gsd_m
+        return float(reach + lean * min(turn, 1.0) + 2.0 * 2**view.levels.coarse)
+
+    def _touches_map(self, prior: Prior, view: _View) -> bool:
+        x, y = self._prior_px(prior, view)
+        reach = self._reach_px(view, prior)
+        rows, cols = self.registrar.reference.shape(0)
+        return -reach < x < cols + reach and -reach < y < rows + reach
+
+    def _fix(self, view: _View, best: Registered, telemetry: Telemetry) -> Fix:
+        placed, gsd_m = best.placed, self.grid.gsd_m
+        x, y = placed.pose.map_px(view.camera_px)
+        east, north = self.grid.west_m + x * gsd_m, self.grid.north_m - y * gsd_m
+        lat, lon = self.sheet.frame.latlon_from_en(np.array([east, north]))
+        evidence = best.evidence()
+        confidence = math.nan if self.confidence is None else self.confidence(evidence)
+        return Fix(
+            lat_deg=float(lat),
+            lon_deg=float(lon),
+            cov_en_m2=self._covariance(view, best),
+            confidence=confidence,
+            radius_m=self.radius_m,
+            heading_deg=math.degrees(placed.pose.turn_rad) % 360,
+            agl_m=telemetry.agl_m * math.exp(placed.pose.log_scale),
+            evidence=MappingProxyType(evidence),
+        )
+
+    def _covariance(self, view: _View, best: Registered) -> NDArray[np.float64]:
+        """Covariance (2, 2) of the camera's east and north in m2."""
+        pose, covariance = best.placed.pose, best.placed.covariance
+        assert covariance is not None
+        moved = pose.linear @ view.camera_px
+        camera_from_pose = np.array([[1, 0, -moved[1], moved[0]], [0, 1, moved[0], moved[1]]])
+        spread = camera_from_pose @ covariance @ camera_from_pose.T
+        spread += np.eye(2) * self._floor_px**2
+        flip = np.diag([1.0, -1.0]) * self.grid.gsd_m
+        out = np.asarray(flip @ spread @ flip)
+        out.flags.writeable = False
+        return out
+
+
+def _pose_prior(telemetry: Telemetry, heading_known: bool) -> PosePrior:
+    """What the telemetry says of heading and scale."""
+    yaw_std = _or_default(telemetry.yaw_std_deg, DEFAULT_YAW_STD_DEG)
+    agl_std_m = telemetry.agl_std_m
+    agl_std = None if agl_std_m is None else agl_std_m / telemetry.agl_m
+    return PosePrior(
+        math.radians(telemetry.yaw_deg) if heading_known else None,
+        math.radians(min(max(yaw_std, MIN_YAW_STD_DEG), 90.0)),
+        min(max(_or_default(agl_std, DEFAULT_AGL_STD), MIN_AGL_STD), 0.5),
+    )
+
+
+def _or_default(value: float | None, default: float) -> float:
+    return default if value is None or not math.isfinite(value) else value
+
+
+def _absolute(view: _View) -> list[tuple[float, float]]:
+    """Poses of the bank about the told heading."""
+    told = view.prior.turn_rad or 0.0
+    return [(told + turn, log_scale) for turn, log_scale in view.bank.poses]

@@ -1,0 +1,150 @@
+"""Confidence of registered views on a new map: where would views of another year be placed?
+
+Views are cut from the reference at random places, sizes, headings and heights and changed as years
+change them (`change`), or cut from another date of the same ground where one is given. Mirrored
+views stand for places that are not on the map: no place looks like the mirror image of another.
+All are placed by the very localizer that flies; a logistic regression learns which were right.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.confidence.registered import RegisteredConfidence, fit_registered
+from orthonav.geo.camera import Camera
+from orthonav.geo.grid import TileGrid
+from orthonav.localizer.registration import RegistrationLocalizer
+from orthonav.prepare.calibrate import Crop
+from orthonav.prepare.change import changed
+from orthonav.records import NoFix, Telemetry
+
+VIEWS = 96
+YAW_STD_DEG = 5.0
+AGL_STD = 0.05
+FOCAL_PX = 1000.0
+SIDES = (0.55, 1.0)
+"""Long side of a view, from and to, in tiles; the short side is three quarters of it."""
+SAME_PLACE_PX = 12.0
+MIN_RIGHT = 10
+FLOOR_PX = 0.6
+"""Standard deviation per axis, in pixels, with which orthophotos of two dates usually agree."""
+FLOOR_LIMITS_PX = (0.25, 3.0)
+MIRRORED_WEIGHT = 0.5
+
+
+@dataclass(frozen=True)
+class RegistrationCalibration:
+    """The confidence (None if too little could be learnt) and the floor of the covariance."""
+
+    confidence: RegisteredConfidence | None
+    floor_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Outcome:
+    evidence: Mapping[str, float]
+    error_px: NDArray[np.float64]
+    mirrored: bool
+    other_date: bool
+
+
+def calibrate_registration(
+    localizer: RegistrationLocalizer,
+    crops: Sequence[Crop],
+    other_dates: Sequence[Crop],
+    seed: int,
+    report: Callable[[str, float], None],
+) -> RegistrationCalibration:
+    """Place changed, mirrored and other-date views and fit the confidence to the outcome."""
+    rng = np.random.default_rng([seed, 3])
+    chosen = [crops[i] for i in rng.permutation(len(crops))[:VIEWS]]
+    later = [other_dates[i] for i in rng.permutation(len(other_dates))[:VIEWS]]
+    work = [(crop, False, False) for crop in chosen] + [(crop, False, True) for crop in later]
+    work += [(crop, True, False) for crop in (later or chosen)[: VIEWS // 2]]
+    outcomes = []
+    for done, (crop, mirror, other_date) in enumerate(work):
+        stranger = crops[int(rng.integers(len(crops)))].grey
+        outcome = _placed(rng, localizer, crop, stranger, mirror, other_date)
+        if outcome is not None:
+            outcomes.append(outcome)
+        report("calibrate registration", (done + 1) / len(work))
+    return _fitted(outcomes)
+
+
+def _placed(
+    rng: np.random.Generator,
+    localizer: RegistrationLocalizer,
+    crop: Crop,
+    stranger: NDArray[np.uint8],
+    mirror: bool,
+    other_date: bool,
+) -> _Outcome | None:
+    """Where one view made of a crop is placed; None if nowhere."""
+    picture = np.ascontiguousarray(crop.grey[:, ::-1]) if mirror else crop.grey
+    if not other_date:
+        picture = changed(rng, picture, stranger)
+    view, camera, telemetry = _view(rng, picture, localizer.grid)
+    prepared = localizer.prepared(view, camera, telemetry, True)
+    best = None if isinstance(prepared, NoFix) else localizer.best(prepared, None)
+    if best is None:
+        return None
+    error = np.array([best.placed.pose.x_px - crop.col_px, best.placed.pose.y_px - crop.row_px])
+    return _Outcome(best.evidence(), error, mirror, other_date)
+
+
+def _view(
+    rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid
+) -> tuple[NDArray[np.uint8], Camera, Telemetry]:
+    """A vertical view of the middle of a picture, and what its telemetry would tell."""
+    size = picture.shape[0]
+    longest = min(grid.tile_px, int(size / 1.27))  # its diagonal fits into the picture
+    width = max(16, round(longest * rng.uniform(*SIDES)))
+    height = max(12, round(width * 0.75))
+    yaw_deg = rng.uniform(0, 360)
+    cos, sin = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
+    linear = np.array([[cos, -sin], [sin, cos]])
+    move = np.full(2, (size - 1) / 2) - linear @ [(width - 1) / 2, (height - 1) / 2]
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    matrix = np.column_stack([linear, move])
+    view = cv2.warpAffine(picture, matrix, (width, height), flags=flags)
+    agl_m = FOCAL_PX * grid.gsd_m
+    told_m = agl_m * max(0.5, 1 + rng.normal(0, AGL_STD))
+    telemetry = Telemetry(
+        time_ns=0,
+        yaw_deg=yaw_deg + rng.normal(0, YAW_STD_DEG),
+        pitch_deg=0.0,
+        roll_deg=0.0,
+        agl_m=told_m,
+        yaw_std_deg=YAW_STD_DEG,
+        agl_std_m=AGL_STD * told_m,
+    )
+    camera = Camera(width, height, FOCAL_PX, FOCAL_PX, width / 2, height / 2)
+    return np.asarray(view, dtype=np.uint8), camera, telemetry
+
+
+def _fitted(outcomes: Sequence[_Outcome]) -> RegistrationCalibration:
+    """The confidence, and from other dates the floor of the covariance."""
+    if not outcomes:
+        return RegistrationCalibration(None, FLOOR_PX)
+    mirrored = np.array([each.mirrored for each in outcomes])
+    errors = np.stack([each.error_px for each in outcomes])
+    right = (np.hypot(*errors.T) <= SAME_PLACE_PX) & ~mirrored
+    later = right & np.array([each.other_date for each in outcomes])
+    floor_px = FLOOR_PX
+    if later.sum() >= MIN_RIGHT:
+        # From the median: Rayleigh's is 1.1774 standard deviations.
+        spread = float(np.median(np.hypot(*errors[later].T))) / 1.1774
+        floor_px = min(max(spread, FLOOR_LIMITS_PX[0]), FLOOR_LIMITS_PX[1])
+    if right.sum() < MIN_RIGHT or not mirrored.any():
+        return RegistrationCalibration(None, floor_px)
+    evidence = [each.evidence for each in outcomes]
+    lost = [each for each, known in zip(evidence, mirrored, strict=True) if known]
+    chance = float(np.median([each["strength"] for each in lost]))
+    look_chance = float(np.median([each["look"] for each in lost]))
+    weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)
+    confidence = fit_registered(evidence, right, weight, max(chance, 1.0), max(look_chance, 1.0))
+    return RegistrationCalibration(confidence, floor_px)

@@ -1,0 +1,45 @@
+"""The pose of a view on the map: a similarity, position, turn and scale."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the middle of a view's window lies on the map, and how it is turned and scaled.
+
+    `x_px, y_px`: columns and rows of the map at level 0, pixel-is-area, y to the south;
+    `turn_rad`: heading of the top of the window, clockwise from north; `log_scale`: natural
+    logarithm of the true over the assumed ground resolution (and so of true over told height).
+    """
+
+    x_px: float
+    y_px: float
+    turn_rad: float
+    log_scale: float
+
+    @property
+    def linear(self) -> Array:
+        """Rotation and scale (2, 2) from the view's window to the map."""
+        scale = math.exp(self.log_scale)
+        cos, sin = scale * math.cos(self.turn_rad), scale * math.sin(self.turn_rad)
+        return np.array([[cos, -sin], [sin, cos]])
+
+    def map_px(self, from_middle_px: Array) -> Array:
+        """Map coordinates (..., 2) of points given from the middle of the window, level 0 px."""
+        return np.asarray(from_middle_px @ self.linear.T + [self.x_px, self.y_px])
+
+    def stepped(self, step: Array) -> "Pose":
+        """This pose after the inverse of a small step (dx, dy, turn, log scale) of the window."""
+        moved = self.linear @ step[:2]
+        return Pose(
+            self.x_px - float(moved[0]),
+            self.y_px - float(moved[1]),
+            self.turn_rad - float(step[2]),
+            self.log_scale - float(step[3]),
+        )

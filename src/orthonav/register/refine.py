@@ -1,0 +1,207 @@
+"""Moving a candidate to its best position, heading and scale, and judging it there.
+
+Gauss-Newton on the sum of squared differences between a view's evidence and the map's, each kind
+of evidence with its own gain, so that correlation is what is maximized; the step is found on the
+view's side, whose derivatives are made once (inverse compositional alignment, Baker and Matthews,
+IJCV 2004). The covariance is the sandwich of robust statistics (Huber 1967; clustered as in Liang
+and Zeger 1986): residuals of neighbouring pixels are not independent, so their scores are summed
+by blocks of the view, and the spread of those sums is what moves the peak.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.register.evidence import GROUPS
+from orthonav.register.pose import Pose
+from orthonav.register.reference import Reference
+from orthonav.register.template import BLOCKS, Template, turned_planes
+
+Array = NDArray[np.float32]
+STEPS = 6
+SLACK_PX = 6
+SMALL_STEP_PX = 0.03
+MAX_STEP_PX = 3.0
+DAMPING = 1e-3
+MIN_CORRELATION = 0.08
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A view placed on the map.
+
+    `score`: weighted sum of correlations times the square root of the pixels of the level that
+    it rests on; `correlations` of the kinds of evidence, `weighted` their weighted mean;
+    `overlap`: share of the view that lies on valid map; `converged` whether it stopped moving;
+    `agreement`: share of the blocks of the view that speak for it, and `covariance` (4, 4) of
+    position (level-0 pixels), turn (rad) and log scale, where they were asked for.
+    """
+
+    pose: Pose
+    level: int
+    score: float
+    correlations: tuple[float, ...]
+    weighted: float
+    overlap: float
+    converged: bool
+    agreement: float = math.nan
+    covariance: NDArray[np.float64] | None = None
+
+    @classmethod
+    def unjudged(cls, pose: Pose, level: int) -> "Placed":
+        """A pose that was proposed and not looked at."""
+        return cls(pose, level, math.nan, (), math.nan, math.nan, False)
+
+
+class Refiner:
+    """Refines candidates of one view at one level."""
+
+    def __init__(self, template: Template, reference: Reference) -> None:
+        self.template, self.reference = template, reference
+        self._jacobian = [rows.reshape(4, -1) for rows in template.jacobian]
+        self._reach_px = math.hypot(*template.mask.shape) / 2
+
+    def place(self, pose: Pose, steps: int = STEPS, with_covariance: bool = False) -> Placed:
+        """The view at the best pose near `pose`, within a few pixels of the level."""
+        window = _Window(self.template, self.reference, pose)
+        unit = np.array([2.0**self.template.level, 2.0**self.template.level, 1.0, 1.0])
+        converged = False
+        best = _Seen(self.template, window.sampled(pose), pose)
+        current = best
+        for _ in range(steps):
+            step = self._step(current)
+            moves_px = self._moves_px(step)
+            step *= min(1.0, MAX_STEP_PX / max(moves_px, 1e-9))
+            moved = current.pose.stepped(step * unit)
+            current = _Seen(self.template, window.sampled(moved), moved)
+            if current.score > best.score:
+                best = current
+            if moves_px < SMALL_STEP_PX:
+                converged = True
+                break
+        placed = Placed(
+            best.pose,
+            self.template.level,
+            best.score,
+            best.correlations,
+            best.weighted,
+            best.overlap,
+            converged,
+        )
+        if not with_covariance:
+            return placed
+        return replace(placed, covariance=self._covariance(best), agreement=best.agreement())
+
+    def _inverse(self, seen: "_Seen") -> NDArray[np.float64]:
+        hessian = np.tensordot(seen.squares, self.template.hessians, axes=1)
+        damping = DAMPING * np.diag(np.diag(hessian)) + 1e-12 * np.eye(4)
+        return np.asarray(np.linalg.inv(hessian + damping))
+
+    def _step(self, seen: "_Seen") -> NDArray[np.float64]:
+        """Gauss-Newton step of the window: x, y (px of the level), turn, log scale."""
+        slope = sum(
+            rows @ part.reshape(-1)
+            for rows, part in zip(self._jacobian, seen.residual, strict=True)
+        )
+        return np.asarray(self._inverse(seen) @ np.asarray(slope, np.float64))
+
+    def _moves_px(self, step: NDArray[np.float64]) -> float:
+        return float(math.hypot(step[0], step[1]) + self._reach_px * math.hypot(step[2], step[3]))
+
+    def _covariance(self, seen: "_Seen") -> NDArray[np.float64]:
+        """Covariance (4, 4) of x, y (level-0 px), turn and log scale."""
+        terms = np.einsum("cphw,chw->phw", self.template.jacobian, seen.residual)
+        rows, cols = self.template.block_starts
+        sums = np.add.reduceat(np.add.reduceat(terms, rows, axis=1), cols, axis=2)
+        sums = sums.reshape(4, BLOCKS * BLOCKS).astype(np.float64)
+        spread = sums @ sums.T * (BLOCKS**2 / (BLOCKS**2 - 4))
+        inverse = self._inverse(seen)
+        to_map = np.eye(4)
+        to_map[:2, :2] = seen.pose.linear * 2.0**self.template.level
+        return np.asarray(to_map @ inverse @ spread @ inverse @ to_map.T)
+
+
+class _Window:
+    """The part of the map that a view may touch while its pose is refined."""
+
+    def __init__(self, template: Template, reference: Reference, pose: Pose) -> None:
+        self._template = template
+        self._unit = 2.0**template.level
+        height, width = template.mask.shape
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, height / 2]
+        at = pose.map_px(corners * self._unit) / self._unit
+        low, high = np.floor(at.min(axis=0)) - SLACK_PX, np.ceil(at.max(axis=0)) + SLACK_PX
+        self._col, self._row = int(low[0]), int(low[1])
+        size = (high - low).astype(int)
+        self._made = reference.window(
+            template.level, self._row, self._col, int(size[1]), int(size[0]), template.recipe
+        )
+
+    def sampled(self, pose: Pose) -> Array:
+        """Evidence (H, W, 4) of the map as the view's window shows it under a pose."""
+        height, width = self._template.mask.shape
+        linear = pose.linear
+        middle = np.array([pose.x_px, pose.y_px]) / self._unit - [self._col, self._row]
+        move = middle - linear @ [width / 2, height / 2]
+        # Pixel-is-area to pixel centres: source and target are both half a pixel off.
+        move = move + linear @ [0.5, 0.5] - 0.5
+        matrix = np.column_stack([linear, move])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        warped = cv2.warpAffine(self._made, matrix, (width, height), flags=flags)
+        return turned_planes(warped, -pose.turn_rad)
+
+
+class _Seen:
+    """A template beside the map (4, H, W) under one pose.
+
+    `residual` (3, H, W): for each kind of evidence gain * map - correlation^2 * view, so that its
+    part of the step is what moves the peak, weighted by what that kind can say: steps from the
+    plain difference would fall short by the square of the correlation.
+    """
+
+    def __init__(self, template: Template, sampled: Array, pose: Pose) -> None:
+        self._template = template
+        self.pose = pose
+        view, seen = template.channels, sampled[:3]
+        counts = template.mask
+        if not (template.whole and sampled[3].min() > 0.99):
+            counts = counts * (sampled[3] > 0.99)
+            seen *= counts
+        self._counts = counts
+        pixels = float(counts.sum())
+        self.overlap = pixels / max(template.pixels, 1.0)
+        if self.overlap < 0.9999:
+            view = view * counts
+        self._view, self._map = view, seen
+        self.residual = np.empty_like(seen)
+        found, squares = [], []
+        for group in GROUPS:
+            mine, theirs = view[group].reshape(-1), seen[group].reshape(-1)
+            product = float(mine @ theirs)
+            energy, own = float(theirs @ theirs), float(mine @ mine)
+            correlation = product / math.sqrt(energy * own) if energy * own > 0 else 0.0
+            square = max(correlation, MIN_CORRELATION) ** 2
+            gain = math.sqrt(square * own / energy) if energy > 0 else 0.0
+            np.multiply(seen[group], np.float32(gain), out=self.residual[group])
+            self.residual[group] -= np.float32(square) * view[group]
+            found.append(correlation)
+            squares.append(square)
+        self.correlations = tuple(found)
+        self.squares = np.array(squares)
+        total = float(np.dot(template.weights, found))
+        self.weighted = total / sum(template.weights)
+        self.score = total * math.sqrt(pixels) * math.exp(pose.log_scale)
+
+    def agreement(self) -> float:
+        """Share of the blocks of a view whose evidence speaks for the pose."""
+        rows, cols = self._template.block_starts
+        product = (self._view * self._map).sum(axis=0)
+        sums, counts = (
+            np.add.reduceat(np.add.reduceat(each, rows, axis=0), cols, axis=1)
+            for each in (product, self._counts)
+        )
+        used = counts > 0.25 * counts.max()
+        return float((sums[used] > 0).mean()) if used.any() else 0.0

@@ -1,0 +1,251 @@
+"""From a view to its best place on the map, and the evidence for it.
+
+Candidates come from a search of a window (here, by FFT) or from elsewhere (tiles whose embeddings
+are alike). Either way they are refined from coarse to fine, most are dropped on the way, and the
+best of the last few is the answer; how far it stands above the best one elsewhere is the evidence.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from orthonav.register.evidence import COARSE, FINE, EvidenceRecipe
+from orthonav.register.pose import Pose
+from orthonav.register.reference import Reference
+from orthonav.register.refine import Placed, Refiner
+from orthonav.register.search import Candidate, SearchWindow
+from orthonav.register.template import ViewTemplates
+
+LOOK_PX = 72.0
+"""A view is judged at the level where it is about so many pixels across."""
+KEPT_TO_LOOK = 14
+KEPT_TO_FINISH = 3
+EXCLUSION_SHARE = 0.25
+"""A rival lies farther from the best than this share of the view's side."""
+NAT_SCORE = 0.4
+"""What a nat of prior probability of heading and scale is worth in units of the score."""
+MAX_KEPT_WINDOWS = 4
+MAX_RATIO = 10.0
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """What is known of heading and scale: told heading (None: nothing) and standard deviations."""
+
+    turn_rad: float | None
+    turn_std_rad: float
+    log_scale_std: float
+
+    def cost(self, pose: Pose) -> float:
+        """What a pose loses for being unlikely, in units of the score."""
+        nats = (pose.log_scale / max(self.log_scale_std, 0.01)) ** 2 / 2
+        if self.turn_rad is not None:
+            off = math.remainder(pose.turn_rad - self.turn_rad, 2 * math.pi)
+            nats += (off / max(self.turn_std_rad, 0.01)) ** 2 / 2
+        return NAT_SCORE * nats
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Levels of the map at which a view is searched coarsely, judged, and finished."""
+
+    coarse: int
+    look: int
+    final: int
+
+    @classmethod
+    def of(cls, view_px: float, levels: int) -> "Levels":
+        """Levels for a view of `view_px` pixels of level 0 across (root of its area)."""
+        look = max(0, min(round(math.log2(max(view_px, 1.0) / LOOK_PX)), levels - 1))
+        return cls(min(look + 1, levels - 1), look, max(look - 1, 0))
+
+    def recipe(self, level: int) -> EvidenceRecipe:
+        """The evidence that a level is looked at with."""
+        return COARSE if level > self.look else FINE
+
+
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """The best place of a view, and what speaks for it.
+
+    `placed` is where it was finished, with its covariance; `score` the scores of the levels it
+    was judged and finished at together; `rival` the best such score elsewhere; `look_ratio` the
+    same comparison at the level it was judged at, over all candidates.
+    """
+
+    placed: Placed
+    score: float
+    rival: float
+    look_score: float
+    look_rival: float
+    candidates: int
+
+    @property
+    def look_ratio(self) -> float:
+        """Score of the best over the best elsewhere, where all candidates were judged."""
+        return self.look_score / max(self.look_rival, 1e-6)
+
+    @property
+    def peak_ratio(self) -> float:
+        """Score of the best over the best elsewhere that was finished."""
+        return self.score / max(self.rival, 1e-6)
+
+    def evidence(self) -> dict[str, float]:
+        """The numbers behind a fix, as `docs/design.md` lists them."""
+        gradient, grey = self.placed.correlations
+        return {
+            "score": self.placed.weighted,
+            "strength": self.score,
+            "rival": self.rival,
+            "look": self.look_score,
+            "look_rival": self.look_rival,
+            "peak_ratio": min(MAX_RATIO, self.peak_ratio),
+            "look_ratio": min(MAX_RATIO, self.look_ratio),
+            "gradient_correlation": gradient,
+            "grey_correlation": grey,
+            "agreement": self.placed.agreement,
+            "overlap": self.placed.overlap,
+            "candidates": float(self.candidates),
+        }
+
+    def beside(self, other: "Registered", view_px: float) -> "Registered":
+        """This one, with the rivals that another search of the same view found."""
+        elsewhere = _apart(self.placed, other.placed) > EXCLUSION_SHARE * view_px
+        return replace(
+            self,
+            rival=max(self.rival, other.score if elsewhere else other.rival),
+            look_rival=max(self.look_rival, other.look_score if elsewhere else other.look_rival),
+            candidates=self.candidates + other.candidates,
+        )
+
+
+class Registrar:
+    """Registers views on one sheet. Safe to share between threads."""
+
+    def __init__(self, reference: Reference) -> None:
+        self.reference = reference
+        self._windows: dict[tuple[int, EvidenceRecipe, int], SearchWindow] = {}
+
+    def whole_window(self, level: int, recipe: EvidenceRecipe, view_px: float) -> SearchWindow:
+        """The whole sheet at a level, kept: views of about the same size share it."""
+        side = _rounded_side(view_px / 2**level)
+        key = (level, recipe, side)
+        found = self._windows.get(key)
+        if found is None:
+            found = SearchWindow(self.reference.whole(level, recipe), level, 0, 0, side)
+            while len(self._windows) >= MAX_KEPT_WINDOWS:
+                self._windows.pop(next(iter(self._windows)))
+            self._windows[key] = found
+        return found
+
+    def part_window(
+        self,
+        level: int,
+        recipe: EvidenceRecipe,
+        view_px: float,
+        centre_px: tuple[float, float],
+        reach_px: float,
+    ) -> SearchWindow:
+        """The square whose middles of views reach `reach_px` (level 0) around a point (x, y)."""
+        unit = 2.0**level
+        margin = math.ceil(view_px / 2 / unit)
+        low = [math.floor((middle - reach_px) / unit) - margin for middle in centre_px]
+        size = math.ceil(2 * reach_px / unit) + 2 + 2 * margin
+        made = self.reference.window(level, low[1], low[0], size, size, recipe)
+        side = _rounded_side(view_px / unit)
+        return SearchWindow(made, level, low[1], low[0], side, margin)
+
+    def verify(
+        self,
+        templates: ViewTemplates,
+        levels: Levels,
+        candidates: Sequence[Candidate],
+        level: int,
+        prior: PosePrior,
+    ) -> Registered | None:
+        """The best of candidates found at `level`, refined from there down; None without any."""
+        placed = [Placed.unjudged(found.pose, level) for found in candidates]
+        if not placed:
+            return None
+        for at in range(level, levels.look - 1, -1):
+            refiner = self._refiner(templates, levels, at)
+            steps = 4 if at > levels.look else 5
+            placed = _ranked([refiner.place(each.pose, steps) for each in placed], prior)
+            if at > levels.look:
+                placed = placed[:KEPT_TO_LOOK]
+        return self._verdict(templates, levels, placed, prior, len(candidates))
+
+    def _verdict(
+        self,
+        templates: ViewTemplates,
+        levels: Levels,
+        judged: list[Placed],
+        prior: PosePrior,
+        candidates: int,
+    ) -> Registered:
+        """The best of the judged candidates, best first, after the best of them are finished."""
+        exclusion = EXCLUSION_SHARE * view_side_px(templates)
+        totals = [
+            (total - prior.cost(each.pose), each)
+            for total, each in (
+                self._finished(templates, levels, each)
+                for each in _distinct(judged, KEPT_TO_FINISH, exclusion)
+            )
+        ]
+        score, best = max(totals, key=lambda pair: pair[0])
+        rival = max((t for t, each in totals if _apart(each, best) > exclusion), default=0.0)
+        nearest = min(judged, key=lambda each: _apart(each, best))
+        others = [each for each in judged if _apart(each, best) > exclusion]
+        look_rival = max((each.score - prior.cost(each.pose) for each in others), default=0.0)
+        final = self._refiner(templates, levels, levels.final)
+        return Registered(
+            placed=final.place(best.pose, 3, with_covariance=True),
+            score=score,
+            rival=rival,
+            look_score=nearest.score - prior.cost(nearest.pose),
+            look_rival=look_rival,
+            candidates=candidates,
+        )
+
+    def _finished(
+        self, templates: ViewTemplates, levels: Levels, judged: Placed
+    ) -> tuple[float, Placed]:
+        """A judged candidate refined at the final level, and the sum of its scores."""
+        if levels.final == levels.look:
+            return judged.score, judged
+        placed = self._refiner(templates, levels, levels.final).place(judged.pose)
+        again = self._refiner(templates, levels, levels.look).place(placed.pose, 0)
+        return placed.score + again.score, placed
+
+    def _refiner(self, templates: ViewTemplates, levels: Levels, level: int) -> Refiner:
+        return Refiner(templates.at(level, levels.recipe(level)), self.reference)
+
+
+def view_side_px(templates: ViewTemplates) -> float:
+    """Root of the area of a view, in pixels of level 0."""
+    return math.sqrt(templates.at(templates.finest).pixels) * 2.0**templates.finest
+
+
+def _rounded_side(side: float) -> int:
+    """A side rounded up by steps of about a quarter, so that views of like size share a window."""
+    return math.ceil(2 ** (math.ceil(4 * math.log2(max(side, 8.0))) / 4))
+
+
+def _ranked(placed: list[Placed], prior: PosePrior) -> list[Placed]:
+    return sorted(placed, key=lambda each: prior.cost(each.pose) - each.score)
+
+
+def _distinct(placed: list[Placed], count: int, apart: float) -> list[Placed]:
+    """The first `count` that are farther than `apart` (pixels of level 0) from each other."""
+    kept: list[Placed] = []
+    for each in placed:
+        if all(_apart(each, other) > apart for other in kept):
+            kept.append(each)
+        if len(kept) == count:
+            break
+    return kept
+
+
+def _apart(one: Placed, other: Placed) -> float:
+    """Distance of two places in pixels of level 0."""
+    return math.hypot(one.pose.x_px - other.pose.x_px, one.pose.y_px - other.pose.y_px)

@@ -1,0 +1,225 @@
+"""Candidates: where, and how turned and scaled, a view might lie in a window of the map.
+
+The view's evidence is laid on the window at every position at once by FFT, for each heading and
+scale of a bank. Evidence of the map is divided by its local energy beforehand, so that one
+backward transform gives the sum over all kinds of evidence. What comes out is the correlation
+times the square root of the pixels that it rests on: pure chance then gives values alike at every
+scale, whereas correlation alone favours small views.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.register.evidence import GROUPS
+from orthonav.register.pose import Pose
+from orthonav.register.template import Template, energy_of, turned_planes
+
+Array = NDArray[np.float32]
+ENERGY_FLOOR = 0.3
+_HALF = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+
+
+@dataclass(frozen=True, eq=False)
+class Bank:
+    """Turns (rad) and log scales (natural) that are tried, each with each."""
+
+    turns_rad: NDArray[np.float64]
+    log_scales: NDArray[np.float64]
+
+    @property
+    def poses(self) -> list[tuple[float, float]]:
+        """All pairs (turn, log scale)."""
+        return [(float(t), float(s)) for s in self.log_scales for t in self.turns_rad]
+
+
+def bank(
+    turn_std_rad: float | None,
+    log_scale_std: float,
+    *,
+    turn_step_rad: float,
+    scale_step: float,
+    sigmas: float,
+) -> Bank:
+    """Turns and scales that reach `sigmas` standard deviations; all turns where `None`."""
+    if turn_std_rad is None or sigmas * turn_std_rad + turn_step_rad / 2 >= math.pi:
+        count = math.ceil(2 * math.pi / turn_step_rad)
+        turns = np.arange(count, dtype=np.float64) * (2 * math.pi / count)
+    else:
+        turns = _spread(sigmas * turn_std_rad, turn_step_rad)
+    return Bank(turns, _spread(sigmas * log_scale_std, scale_step))
+
+
+def _spread(reach: float, step: float) -> NDArray[np.float64]:
+    """Values around 0, `step` apart, so that nothing within `reach` is farther than half a step."""
+    count = max(1, math.ceil(2 * reach / step))
+    return (np.arange(count, dtype=np.float64) - (count - 1) / 2) * step
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A peak: `score` (correlation times square root of pixels) at a pose."""
+
+    score: float
+    pose: Pose
+
+
+class SearchWindow:
+    """A window of the map made ready to be searched: evidence (H, W, 4) at a level.
+
+    (`row`, `col`) is its first pixel on that level of the sheet; `view_px` about the side of the
+    views that will be laid on it; within `margin_px` of the border no middle of a view is sought.
+    """
+
+    def __init__(
+        self, made: Array, level: int, row: int, col: int, view_px: int, margin_px: int = 0
+    ) -> None:
+        self.level, self.row, self.col, self.margin_px = level, row, col, margin_px
+        self.height, self.width = made.shape[:2]
+        # Beyond the border the other side shows: harmless where the window is far larger.
+        pad = view_px if min(self.height, self.width) < 3 * view_px else 0
+        self.size = (
+            cv2.getOptimalDFTSize(max(self.height + pad, view_px)),
+            cv2.getOptimalDFTSize(max(self.width + pad, view_px)),
+        )
+        self.spectra = []
+        for group in GROUPS:
+            even = _even(made[..., group], made[..., 3], view_px)
+            for channel in np.moveaxis(even, -1, 0):
+                padded = np.zeros(self.size, np.float32)
+                padded[: self.height, : self.width] = channel
+                self.spectra.append(cv2.dft(padded))
+
+
+def _even(channels: Array, counts: Array, view_px: int) -> Array:
+    """Channels (H, W, C) divided by the root of their mean energy in windows as large as views."""
+    energy = np.einsum("ijc,ijc->ij", channels, channels)
+    side = min(max(3, view_px // 2), 2 * min(energy.shape) - 1)
+    local = cv2.blur(energy, (side, side)) / np.maximum(cv2.blur(counts, (side, side)), 0.1)
+    typical = float(energy.sum() / max(counts.sum(), 1.0))
+    return np.asarray(channels / np.sqrt(local + ENERGY_FLOOR * typical + 1e-12)[..., None])
+
+
+def search(
+    template: Template, window: SearchWindow, poses: list[tuple[float, float]], count: int
+) -> list[Candidate]:
+    """The `count` best candidates, best first, not closer together than an eighth of the view."""
+    best = np.full((window.height, window.width), -np.inf, np.float32)
+    which = np.zeros(best.shape, np.int32)
+    scratch = _Scratch(window)
+    for number, (turn, log_scale) in enumerate(poses):
+        scores = scratch.scores(template, turn, log_scale)
+        better = scores > best
+        np.copyto(best, scores, where=better)
+        np.copyto(which, number, where=better)
+    if window.margin_px:
+        inner = np.zeros(best.shape, np.bool_)
+        inner[window.margin_px : -window.margin_px, window.margin_px : -window.margin_px] = True
+        best[~inner] = -np.inf
+    apart = max(1, round(math.sqrt(template.pixels) / 8))
+    peaks = _peaks(best, count, apart)
+    unit = 2.0**template.level
+    found = []
+    for row, col in peaks:
+        x, y = _between(best, row, col)
+        turn, log_scale = poses[int(which[row, col])]
+        pose = Pose((window.col + x) * unit, (window.row + y) * unit, turn, log_scale)
+        found.append(Candidate(float(best[row, col]), pose))
+    return found
+
+
+class _Scratch:
+    """Memory of one search, used again for every pose: fresh pages would cost more than the FFT."""
+
+    def __init__(self, window: SearchWindow) -> None:
+        self._window = window
+        self._padded = np.zeros(window.size, np.float32)
+        self._spectrum = np.empty(window.size, np.float32)
+        self._product = np.empty(window.size, np.float32)
+        self._total = np.empty(window.size, np.float32)
+        self._surface = np.empty(window.size, np.float32)
+
+    def scores(self, template: Template, turn: float, log_scale: float) -> Array:
+        """Score (H, W) of the view's middle lying on each pixel's first corner; used up by the
+        next call."""
+        window = self._window
+        half = posed_half_px(template, log_scale)
+        size = 2 * half
+        if size > min(window.size):
+            return np.full((window.height, window.width), -np.inf, np.float32)
+        posed = posed_channels(template, turn, log_scale)
+        for number, (channel, spectrum) in enumerate(zip(posed, window.spectra, strict=True)):
+            # The middle goes to the first pixel, what lies before it wraps to the end.
+            padded = self._padded
+            padded[:half, :half] = channel[half:, half:]
+            padded[:half, -half:] = channel[half:, :half]
+            padded[-half:, :half] = channel[:half, half:]
+            padded[-half:, -half:] = channel[:half, :half]
+            cv2.dft(padded, dst=self._spectrum)
+            target = self._product if number else self._total
+            cv2.mulSpectrums(spectrum, self._spectrum, 0, c=target, conjB=True)
+            if number:
+                cv2.add(self._total, self._product, dst=self._total)
+        for rows in (slice(None, half), slice(-half, None)):
+            for cols in (slice(None, half), slice(-half, None)):
+                self._padded[rows, cols] = 0
+        cv2.idft(self._total, dst=self._surface, flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)
+        return self._surface[: window.height, : window.width]
+
+
+def posed_half_px(template: Template, log_scale: float) -> int:
+    """Half the side of the square in which a template fits under any turn."""
+    return math.ceil(math.exp(log_scale) * math.hypot(*template.mask.shape) / 2) + 1
+
+
+def posed_channels(template: Template, turn: float, log_scale: float) -> Array:
+    """Channels (3, P, P) of a template as the map would show them, its middle in theirs.
+
+    Each kind of evidence has the norm of its weight.
+    """
+    height, width = template.mask.shape
+    scale = math.exp(log_scale)
+    half = posed_half_px(template, log_scale)
+    cos, sin = scale * math.cos(turn), scale * math.sin(turn)
+    linear = np.array([[cos, -sin], [sin, cos]])
+    move = np.array([half, half]) - linear @ [width / 2, height / 2]
+    matrix = np.vstack([np.column_stack([linear, move]), [0, 0, 1]])
+    centred = np.linalg.inv(_HALF) @ matrix @ _HALF
+    warped = cv2.warpAffine(template.interleaved, centred[:2], (2 * half, 2 * half))
+    posed = turned_planes(warped, turn)
+    for group, weight in zip(GROUPS, template.weights, strict=True):
+        energy = energy_of(posed[group])
+        posed[group] *= np.float32(weight / math.sqrt(energy) if energy > 0 else 0.0)
+    return posed
+
+
+def _peaks(scores: Array, count: int, apart: int) -> list[tuple[int, int]]:
+    """Rows and columns of the `count` highest local maxima, at least `apart` from each other."""
+    side = 2 * apart + 1
+    highest = cv2.dilate(scores, np.ones((side, side), np.uint8))
+    rows, cols = np.nonzero((scores >= highest) & np.isfinite(scores))
+    values = scores[rows, cols]
+    if len(values) > count:
+        kept = np.argpartition(-values, count)[:count]
+        rows, cols, values = rows[kept], cols[kept], values[kept]
+    order = np.argsort(-values, kind="stable")
+    return [(int(rows[i]), int(cols[i])) for i in order]
+
+
+def _between(scores: Array, row: int, col: int) -> tuple[float, float]:
+    """Peak (x, y) in pixels, by a parabola on each axis."""
+
+    def offset(before: float, at: float, after: float) -> float:
+        bend = before - 2 * at + after
+        return max(-0.5, min(0.5, (before - after) / (2 * bend))) if bend < 0 else 0.0
+
+    height, width = scores.shape
+    x, y = float(col), float(row)
+    if 0 < col < width - 1:
+        x += offset(*(float(v) for v in scores[row, col - 1 : col + 2]))
+    if 0 < row < height - 1:
+        y += offset(*(float(v) for v in scores[row - 1 : row + 2, col]))
+    return x, y

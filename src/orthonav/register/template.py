@@ -1,0 +1,143 @@
+"""A view made ready for registration, at each level it is looked at."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.register.evidence import FINE, GROUPS, EvidenceRecipe, evidence
+
+Array = NDArray[np.float32]
+BLOCKS = 6
+"""Blocks along one side of a view, in which residuals are taken as one (see `refine`)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """One view at one level.
+
+    `channels` (3, H, W): evidence, each kind scaled to the energy that its weight gives it; `mask`
+    (H, W) float32, 1 where it counts; `weights` of the kinds; `level` of the map whose ground
+    resolution it has.
+    """
+
+    level: int
+    channels: Array
+    mask: Array
+    weights: tuple[float, ...]
+    recipe: EvidenceRecipe
+
+    @classmethod
+    def of(
+        cls, grey: NDArray[np.uint8], valid: NDArray[np.bool_], level: int, recipe: EvidenceRecipe
+    ) -> "Template":
+        """The template of grey levels (H, W) at the ground resolution of `level`."""
+        made = np.ascontiguousarray(np.moveaxis(evidence(grey, valid, recipe), -1, 0))
+        channels, mask = made[:3], made[3]
+        weights = (1.0, recipe.grey_share)
+        for group, weight in zip(GROUPS, weights, strict=True):
+            energy = energy_of(channels[group])
+            channels[group] *= np.float32(math.sqrt(weight / energy) if energy > 0 else 0.0)
+        return cls(level, channels, mask, weights, recipe)
+
+    @cached_property
+    def pixels(self) -> float:
+        """Number of pixels that count."""
+        return float(self.mask.sum())
+
+    @cached_property
+    def whole(self) -> bool:
+        """Whether every pixel counts."""
+        return bool(self.mask.min() > 0)
+
+    @cached_property
+    def interleaved(self) -> Array:
+        """The channels as (H, W, 3)."""
+        return np.ascontiguousarray(np.moveaxis(self.channels, 0, -1))
+
+    @cached_property
+    def jacobian(self) -> Array:
+        """How the channels change with a small step of the window: (3, 4, H, W).
+
+        Steps are x, y (pixels of the level), turn (rad) and log scale about the middle.
+        """
+        height, width = self.mask.shape
+        x = (np.arange(width, dtype=np.float32) + np.float32(0.5 - width / 2))[None]
+        y = (np.arange(height, dtype=np.float32) + np.float32(0.5 - height / 2))[:, None]
+        out = np.empty((len(self.channels), 4, height, width), dtype=np.float32)
+        for channel, into in zip(self.channels, out, strict=True):
+            dx = np.asarray(cv2.Sobel(channel, cv2.CV_32F, 1, 0, scale=1 / 8), np.float32)
+            dy = np.asarray(cv2.Sobel(channel, cv2.CV_32F, 0, 1, scale=1 / 8), np.float32)
+            dx *= self.mask
+            dy *= self.mask
+            into[0], into[1] = dx, dy
+            np.subtract(dy * x, dx * y, out=into[2])
+            np.add(dx * x, dy * y, out=into[3])
+        return out
+
+    @cached_property
+    def hessians(self) -> NDArray[np.float64]:
+        """Gauss-Newton matrices (G, 4, 4) of the steps, one for each kind of evidence."""
+        each = np.stack([rows @ rows.T for rows in self.jacobian.reshape(3, 4, -1)])
+        return np.stack([each[group].sum(axis=0) for group in GROUPS]).astype(np.float64)
+
+    @cached_property
+    def block_starts(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """First rows and first columns of `BLOCKS` x `BLOCKS` blocks of the window."""
+        rows, cols = ((np.arange(BLOCKS) * side) // BLOCKS for side in self.mask.shape)
+        return rows.astype(np.intp), cols.astype(np.intp)
+
+
+def turned_planes(made: object, turn_rad: float) -> Array:
+    """Evidence (H, W, C) as planes (C, H, W), edge directions turned clockwise by `turn_rad`."""
+    planes = cv2.split(np.asarray(made, np.float32))
+    out = np.empty((len(planes), *planes[0].shape), np.float32)
+    cos, sin = math.cos(2 * turn_rad), math.sin(2 * turn_rad)
+    cv2.addWeighted(planes[0], cos, planes[1], -sin, 0, dst=out[0])
+    cv2.addWeighted(planes[0], sin, planes[1], cos, 0, dst=out[1])
+    for number, plane in enumerate(planes[2:], 2):
+        out[number] = plane
+    return out
+
+
+def energy_of(values: Array) -> float:
+    """Sum of squares of a contiguous array."""
+    flat = values.reshape(-1)
+    return float(flat @ flat)
+
+
+class ViewTemplates:
+    """A view's templates at the levels of a map, made when asked for.
+
+    `grey` and `valid` (H, W) are the rectified view at the ground resolution of level `finest`.
+    """
+
+    def __init__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_], finest: int) -> None:
+        self.finest = finest
+        self._pictures = [(grey, valid)]
+        self._made: dict[tuple[int, EvidenceRecipe], Template] = {}
+
+    def at(self, level: int, recipe: EvidenceRecipe = FINE) -> Template:
+        """The template at a level, `finest` or coarser."""
+        key = (level, recipe)
+        if key not in self._made:
+            while len(self._pictures) <= level - self.finest:
+                self._pictures.append(halved(*self._pictures[-1]))
+            self._made[key] = Template.of(*self._pictures[level - self.finest], level, recipe)
+        return self._made[key]
+
+
+def halved(
+    grey: NDArray[np.uint8], valid: NDArray[np.bool_]
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Grey and valid at half the resolution about the same middle; sides must be even."""
+    size = grey.shape[1] // 2, grey.shape[0] // 2
+    smaller = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    if valid.all():
+        return smaller, np.ones(smaller.shape, np.bool_)
+    inside = cv2.resize(valid.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA)
+    whole = np.asarray(inside) > 252
+    return np.where(whole, smaller, 0).astype(np.uint8), whole
