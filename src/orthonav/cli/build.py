@@ -43,6 +43,15 @@ def add(parser: argparse.ArgumentParser) -> None:
         action="store_false",
         help="leave out the grey picture of the area: a smaller map, positions at tile level only",
     )
+    parser.add_argument(
+        "--other-date",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="TIF",
+        help="orthophoto of the same ground of another year: the confidence and the covariance "
+        "are learnt from it (may be given again; it does not become part of the map)",
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="MAP.onav")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
@@ -67,6 +76,7 @@ def run(options: argparse.Namespace) -> None:
         edges=options.edges,
         seed=options.seed,
         registration=options.registration,
+        other_dates=options.other_date,
     )
     with progress(options) as shown:
         result = build_map(request, shown)

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 MARKER = "demo.json"
 HEIGHT_M = 270.0
 SPACING_M = 24.0
+RADIUS_M = 15.0
 # The route in metres east and north of the area's centre, for a size of 2 km.
 TURNS_EN_M = (
     (-720, -720),
@@ -118,7 +119,7 @@ def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[
         shown("localize", len(results) / len(flight.views))
     write_results(folder / "fixes.jsonl", results)
     comparison = compare(read_truth(request.out / "truth.csv"), results, frame)
-    metrics = measure(comparison, opened.manifest.radius_m)
+    metrics = measure(comparison, RADIUS_M)
     shown_flight = FlightReport("demo", comparison, metrics, map_background(opened))
     about = summary(built.manifest, built.size_bytes, Path(map_path.name))
     made_from = MadeFrom(

@@ -1,9 +1,12 @@
 """`orthonav localize`: find where the views of a flight were taken."""
 
 import argparse
+import logging
 from pathlib import Path
 
 from orthonav.cli.common import print_json, progress
+
+log = logging.getLogger(__name__)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -24,6 +27,18 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="telemetry: search where its prior columns say, if it has them (default)",
     )
     parser.add_argument(
+        "--registration",
+        choices=("on", "off"),
+        default="on",
+        help="on: metres, where the map carries a registration layer (default); off: tiles only",
+    )
+    parser.add_argument(
+        "--accept",
+        metavar="NAME:MIN",
+        help="withhold fixes below a threshold: confidence:0.9, peak_ratio:1.3, or the paper's "
+        "lowe_ratio:1.13 (with --registration off); default: all are written",
+    )
+    parser.add_argument(
         "--skip-bad-images",
         action="store_true",
         help="images that cannot be decoded become no_fix instead of an error",
@@ -35,6 +50,8 @@ def run(options: argparse.Namespace) -> None:
     """Localize and write one line per view."""
     import numpy as np
 
+    from orthonav.confidence.accept import Acceptance
+    from orthonav.errors import VariantError
     from orthonav.flight import open_flight
     from orthonav.localizer import Localizer
     from orthonav.mapfile import open_map
@@ -42,7 +59,12 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.publish.jsonl import write_results
     from orthonav.records import Fix
 
-    localizer = Localizer(open_map(options.map))
+    accept = Acceptance.parse(options.accept) if options.accept else None
+    localizer = Localizer(open_map(options.map), registration=options.registration == "on")
+    if localizer.registration is not None and accept and accept.criterion == "lowe_ratio":
+        raise VariantError("lowe_ratio compares tiles: give --registration off with it")
+    if localizer.registration is None and options.registration == "on":
+        log.warning("the map has no registration layer: positions at tile level only")
     flight = open_flight(options.flight)
     results = []
     with progress(options) as shown:
@@ -52,6 +74,7 @@ def run(options: argparse.Namespace) -> None:
             use_prior=options.prior == "telemetry",
             heading_known=options.heading == "known",
             skip_bad_images=options.skip_bad_images,
+            accept=accept,
         ):
             results.append(result)
             shown("localize", len(results) / len(flight.views))

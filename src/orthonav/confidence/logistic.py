@@ -56,18 +56,24 @@ def fit_logistic(
 
 
 def fit_weights(
-    features: NDArray[np.float64], right: NDArray[np.bool_], sample_weight: NDArray[np.float64]
+    features: NDArray[np.float64],
+    right: NDArray[np.bool_],
+    sample_weight: NDArray[np.float64],
+    ridge: float = RIDGE,
+    usual: tuple[float, ...] | None = None,
 ) -> tuple[float, tuple[float, ...]]:
     """Bias and weights of a logistic regression: weighted maximum likelihood with a slight ridge.
 
     Weights are bounded at zero. `features` (N, F), `right` (N,) whether the fix was right,
-    `sample_weight` (N,). Features are standardized inside, the result applies to raw ones.
+    `sample_weight` (N,). Features are standardized inside, the result applies to raw ones. Weights
+    are drawn towards `usual` ones (F, of raw features), towards zero where None.
     """
     from scipy.optimize import minimize  # not needed to fly
 
     mean, std = features.mean(axis=0), features.std(axis=0) + 1e-9
     scaled = (features - mean) / std
     sign = np.where(right, 1.0, -1.0)
+    towards = np.zeros(len(std)) if usual is None else np.array(usual) * std
     total = sample_weight.sum()
 
     def loss(parameters: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
@@ -75,8 +81,9 @@ def fit_weights(
         value = sample_weight @ np.logaddexp(0, -sign * logit) / total
         slope = -sign * sample_weight / (1 + np.exp(np.clip(sign * logit, -60, 60))) / total
         gradient = np.concatenate([[slope.sum()], scaled.T @ slope])
-        gradient[1:] += 2 * RIDGE * parameters[1:]
-        return float(value + RIDGE * (parameters[1:] ** 2).sum()), gradient
+        off = parameters[1:] - towards
+        gradient[1:] += 2 * ridge * off
+        return float(value + ridge * (off**2).sum()), gradient
 
     bounds = [(None, None)] + [(0.0, None)] * features.shape[1]
     found = minimize(

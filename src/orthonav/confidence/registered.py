@@ -1,7 +1,7 @@
 """Confidence of a registered view: a probability from how well it fits, here and elsewhere."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,41 +12,58 @@ from orthonav.confidence.logistic import fit_weights
 from orthonav.errors import VariantError
 
 FEATURES = ("log_strength", "log_peak_ratio", "log_look_ratio")
+CHANCES = ("total", "look", "fine")
+USUAL_WEIGHTS = (1.0, 11.0, 0.5)
+"""Weights fitted to generated landscapes; a map's own are drawn towards them."""
+RIDGE = 3e-3
+STAND_IN = 0.7
+"""Share of the chance value that stands in for a rival where a narrow search found none."""
 LIMIT = 60.0
+
+
+@dataclass(frozen=True)
+class Chances:
+    """What the best place of a view that is not on the map scores, on all of the map.
+
+    `total`: the levels it is judged and finished at; `look`: the first of them; `fine`: with one
+    more.
+    """
+
+    total: float
+    look: float
+    fine: float
+
+    def __post_init__(self) -> None:
+        if not all(0 < value < math.inf for value in (self.total, self.look, self.fine)):
+            raise VariantError(f"chance values must be above 0 and finite: {self}")
 
 
 @dataclass(frozen=True)
 class RegisteredConfidence:
     """P(right) = 1 / (1 + exp(-(bias + weights . features))).
 
-    Features are logarithms: of the strength over `chance` (that of the best place of a view that
-    is not on the map), of the strength over the best elsewhere, and of the same comparison among
-    all candidates at a coarser level. `chance` also stands in for a rival where none was looked
-    at, so that a narrow search does not look like certainty. Weights are never negative: more
-    evidence never means less confidence. `look_chance` is the chance value at the coarser level.
+    Features are logarithms: of the strength over that of chance, of the strength over the best
+    elsewhere, and of the same comparison among all candidates at a coarser level. The second uses
+    one finer level where the view was doubtful enough to be looked at there. A share of chance
+    stands in for a rival where none was found, so that a narrow search does not look like
+    certainty. Weights are never negative: more evidence never means less confidence.
     """
 
     bias: float
     weights: tuple[float, ...]
-    chance: float
-    look_chance: float
+    chances: Chances
 
     def __call__(self, evidence: Mapping[str, float]) -> float:
         """Probability in 0..1 that the fix is right."""
-        total = self.bias + float(np.dot(self.weights, self.features(evidence)))
+        total = self.bias + float(np.dot(self.weights, features_of(evidence, self.chances)))
         return 1 / (1 + math.exp(-min(max(total, -LIMIT), LIMIT)))
-
-    def features(self, evidence: Mapping[str, float]) -> NDArray[np.float64]:
-        """Features (3,) of evidence with `strength`, `rival`, `look`, `look_rival`."""
-        return features_of(evidence, self.chance, self.look_chance)
 
     def to_plain(self) -> dict[str, Any]:
         """Plain values for a manifest."""
         return {
             "bias": self.bias,
             "weights": dict(zip(FEATURES, self.weights, strict=True)),
-            "chance": self.chance,
-            "look_chance": self.look_chance,
+            "chances": {name: getattr(self.chances, name) for name in CHANCES},
         }
 
     @classmethod
@@ -54,42 +71,38 @@ class RegisteredConfidence:
         """Inverse of `to_plain`; raises `VariantError` if it does not fit."""
         try:
             weights = tuple(float(plain["weights"][name]) for name in FEATURES)
-            bias, chance, look = (float(plain[key]) for key in ("bias", "chance", "look_chance"))
+            chances = Chances(**{name: float(plain["chances"][name]) for name in CHANCES})
+            bias = float(plain["bias"])
         except (KeyError, TypeError, ValueError) as error:
             raise VariantError(
-                f"confidence of registration must have bias, chance, look_chance and weights of "
-                f"{FEATURES}"
+                f"confidence of registration must have a bias, weights of {FEATURES} and chances "
+                f"of {CHANCES}, got {plain!r:.200}"
             ) from error
-        numbers = [bias, chance, look, *weights]
-        if not all(math.isfinite(number) for number in numbers):
-            raise VariantError(f"confidence of registration is not finite: {plain}")
-        if min(weights) < 0 or min(chance, look) <= 0:
-            raise VariantError(f"confidence of registration has impossible values: {plain}")
-        return cls(bias, weights, chance, look)
+        if not all(math.isfinite(number) for number in (bias, *weights)) or min(weights) < 0:
+            raise VariantError(
+                f"confidence of registration has a weight that is negative or not finite: {plain}"
+            )
+        return cls(bias, weights, chances)
 
 
-def features_of(
-    evidence: Mapping[str, float], chance: float, look_chance: float
-) -> NDArray[np.float64]:
-    """Features (3,) of evidence, as `RegisteredConfidence` describes them."""
+def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.float64]:
+    """Features (3,) of the evidence of a registered view, see `RegisteredConfidence`."""
     strength, look = max(evidence["strength"], 1e-3), max(evidence["look"], 1e-3)
-    return np.log(
-        [
-            strength / chance,
-            strength / max(evidence["rival"], chance),
-            look / max(evidence["look_rival"], look_chance),
-        ]
-    )
+    ratio = strength / max(evidence["rival"], STAND_IN * chances.total)
+    fine, fine_rival = evidence.get("fine", math.nan), evidence.get("fine_rival", math.nan)
+    if math.isfinite(fine + fine_rival):
+        ratio = max(fine, 1e-3) / max(fine_rival, STAND_IN * chances.fine)
+    look_ratio = look / max(evidence["look_rival"], STAND_IN * chances.look)
+    return np.log(np.array([strength / chances.total, ratio, look_ratio], dtype=np.float64))
 
 
 def fit_registered(
-    evidence: list[Mapping[str, float]],
+    evidence: Sequence[Mapping[str, float]],
     right: NDArray[np.bool_],
     sample_weight: NDArray[np.float64],
-    chance: float,
-    look_chance: float,
+    chances: Chances,
 ) -> RegisteredConfidence:
     """The confidence that fits views (N) of which it is known whether they came out right."""
-    features = np.stack([features_of(each, chance, look_chance) for each in evidence])
-    bias, weights = fit_weights(features, right, sample_weight)
-    return RegisteredConfidence(bias, weights, chance, look_chance)
+    features = np.stack([features_of(each, chances) for each in evidence])
+    bias, weights = fit_weights(features, right, sample_weight, RIDGE, USUAL_WEIGHTS)
+    return RegisteredConfidence(bias, weights, chances)

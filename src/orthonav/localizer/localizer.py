@@ -15,6 +15,7 @@ from orthonav.errors import CameraError, MapFileError, VariantError
 from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_rectified, check_telemetry, check_view
 from orthonav.localizer.match import Match, TileMatcher
+from orthonav.localizer.propose import TileProposer
 from orthonav.localizer.rectify import PreparedView, Rectified, prepare_view, rectify
 from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.mapfile.layer import GreyLayer
@@ -71,7 +72,17 @@ class Localizer:
             raise MapFileError(f"{error}: {opened.path}") from error
         self.radius_m = manifest.radius_m
         self.index = self._matcher.index
-        self.registration = _registration(opened, self.sheet) if registration else None
+        self.registration = None
+        if registration:
+            propose = TileProposer(
+                self.grid,
+                self.centres_en_m,
+                self.index,
+                self.embedder,
+                self.representation,
+                self._matcher.neighbours,
+            )
+            self.registration = _registration(opened, self.sheet, propose)
 
     def locate(
         self,
@@ -185,7 +196,9 @@ class Localizer:
         )
 
 
-def _registration(opened: MapFile, sheet: SheetInfo) -> RegistrationLocalizer | None:
+def _registration(
+    opened: MapFile, sheet: SheetInfo, propose: TileProposer
+) -> RegistrationLocalizer | None:
     layer = GreyLayer.of(opened)
     if layer is None:
         return None
@@ -198,7 +211,7 @@ def _registration(opened: MapFile, sheet: SheetInfo) -> RegistrationLocalizer | 
         raise MapFileError(f"map cannot be flown ({error}): {opened.path}") from error
     if not (0 < radius_m < math.inf and 0 <= floor_px < math.inf):
         raise MapFileError(f"map has impossible registration parameters: {opened.path}")
-    return RegistrationLocalizer(sheet, layer, confidence, radius_m, floor_px)
+    return RegistrationLocalizer(sheet, layer, confidence, radius_m, floor_px, propose)
 
 
 def _embedder(opened: MapFile, plain: Any, channels: int) -> WhitenedEmbedder:

@@ -45,7 +45,7 @@ class TileMatcher:
         self.index = ExactIndex(embeddings)
         self._grid = grid
         self._centres_en_m = centres_en_m
-        self._neighbours = TileNeighbours(grid, centres_en_m)
+        self.neighbours = TileNeighbours(grid, centres_en_m)
         step = -(-len(embeddings) // BACKGROUND_TILES)
         self._background = np.arange(0, len(embeddings), step, dtype=np.intp)
 
@@ -79,6 +79,6 @@ class TileMatcher:
             "peak_ratio": peak_ratio(score, rival),
             "tiles_searched": float(len(per_tile) if rows is None else len(rows)),
         }
-        east, north = self._neighbours.peak_offset(per_tile, tile, searched)
+        east, north = self.neighbours.peak_offset(per_tile, tile, searched)
         shift = east * self._grid.stride_m, north * self._grid.stride_m
         return Match(tile, shift, int(best_heading[best]), evidence)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_footprint
+from orthonav.localizer.propose import TileProposer
 from orthonav.localizer.rectify import Rectified, prepare_view, rectify_footprint
 from orthonav.mapfile.manifest import SheetInfo
 from orthonav.records import Fix, NoFix, Prior, Telemetry
@@ -23,6 +24,7 @@ from orthonav.register.reference import GreyPyramid, Reference
 from orthonav.register.registrar import Levels, PosePrior, Registered, Registrar
 from orthonav.register.search import Bank, Candidate, bank, search
 from orthonav.register.template import ViewTemplates
+from orthonav.search.exact import rows_within
 
 DEFAULT_YAW_STD_DEG = 7.0
 DEFAULT_AGL_STD = 0.08
@@ -40,20 +42,19 @@ SURE_RATIO = 1.9
 """A view this far above chance and its rivals is not searched again."""
 POSE_MS = 0.1
 PIXEL_MS = 6e-7
-TILE_POSE_MS = 0.25
-TILE_PIXEL_MS = 1.3e-5
 LOOK_MS = 14.0
-COARSE_MS = 60.0
 LAST_MS = 900.0
 """What searches cost on one core of a desktop, roughly: to choose between them, no more."""
-
-TileProposer = Callable[[Rectified, list[tuple[float, float]], Prior | None], list[Candidate]]
 
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """A view made ready: its templates, levels, and where the camera is seen from its middle."""
+    """A view made ready: its templates, levels, and where the camera is seen from its middle.
 
+    `rectified_at` makes the view at the ground resolution of a level.
+    """
+
+    rectified_at: Callable[[int], Rectified]
     templates: ViewTemplates
     levels: Levels
     side_px: float
@@ -72,11 +73,16 @@ class RegistrationLocalizer:
         confidence: RegisteredConfidence | None,
         radius_m: float,
         floor_px: float,
+        propose: TileProposer | None = None,
     ) -> None:
-        """`floor_px` is the standard deviation with which maps of two dates agree, in pixels."""
+        """`floor_px` is the standard deviation with which maps of two dates agree, in pixels.
+
+        Without `propose` candidates come from FFT search alone.
+        """
         self.sheet, self.grid = sheet, sheet.grid
         self.registrar = Registrar(Reference(layer))
         self.confidence, self.radius_m = confidence, radius_m
+        self.propose = propose
         self._floor_px = floor_px
 
     def locate(
@@ -108,14 +114,20 @@ class RegistrationLocalizer:
         )
         levels = Levels.of(nominal_m / self.grid.gsd_m, self.registrar.reference.levels)
         gsd_m = self.grid.gsd_m * 2**levels.final
-        rectified = rectify_footprint(
-            prepare_view(grey, camera, agl_m, gsd_m),
-            pitch_deg=telemetry.pitch_deg,
-            roll_deg=telemetry.roll_deg,
-            agl_m=agl_m,
-            gsd_m=gsd_m,
-            multiple_px=2 ** (levels.coarse - levels.final),
-        )
+        reduce = levels.coarse - levels.final
+
+        def rectified_at(finest: int) -> Rectified:
+            finest_m = self.grid.gsd_m * 2**finest
+            return rectify_footprint(
+                prepare_view(grey, camera, agl_m, finest_m),
+                pitch_deg=telemetry.pitch_deg,
+                roll_deg=telemetry.roll_deg,
+                agl_m=agl_m,
+                gsd_m=finest_m,
+                multiple_px=2 ** max(0, reduce + levels.final - finest),
+            )
+
+        rectified = rectified_at(levels.final)
         refused = check_footprint(rectified, gsd_m / self.grid.gsd_m, MIN_VIEW_PX)
         if refused is not None:
             return refused
@@ -131,7 +143,7 @@ class RegistrationLocalizer:
             sigmas=BANK_SIGMAS,
         )
         camera_px = np.array([-offset[0], offset[1]])
-        return _View(templates, levels, side_px, camera_px, pose_prior, poses)
+        return _View(rectified_at, templates, levels, side_px, camera_px, pose_prior, poses)
 
     def best(self, view: _View, prior: Prior | None) -> Registered | None:
         """The best place over all ways of search that had to be tried."""
@@ -140,30 +152,62 @@ class RegistrationLocalizer:
             found = self.registrar.verify(
                 view.templates, view.levels, candidates, level, view.prior
             )
-            if found is not None and (best is None or found.score > best.score):
+            if found is not None:
                 best = found if best is None else found.beside(best, view.side_px)
-            elif found is not None and best is not None:
-                best = best.beside(found, view.side_px)
-            if best is not None and self._is_sure(best):
-                break
-        return best
+                if self._is_sure(best):
+                    return best
+        if best is None or view.levels.final == 0:
+            return best
+        made = view.rectified_at(view.levels.final - 1)
+        finer = ViewTemplates(made.grey, made.valid, view.levels.final - 1)
+        return self.registrar.deepened(view.templates, finer, view.levels, best)
 
     def _is_sure(self, best: Registered) -> bool:
-        chance = self.confidence.chance if self.confidence else USUAL_CHANCE
+        chance = self.confidence.chances.total if self.confidence else USUAL_CHANCE
         if best.score <= SURE_STRENGTH * chance:
             return False
         return min(best.peak_ratio, best.look_ratio) > SURE_RATIO
 
     def _ways(self, view: _View, prior: Prior | None) -> Iterator[tuple[int, list[Candidate]]]:
-        """Candidates and the level they were found at, by the cheapest way first."""
+        """Candidates and the level they were found at, by the cheapest way first.
+
+        The level where views are judged misses least: it alone is searched where that is cheap,
+        and after a cheaper way that left doubt where it can be afforded at all.
+        """
         poses = _absolute(view)
         look, coarse = view.levels.look, view.levels.coarse
         look_ms = self._search_ms(view, prior, look, len(poses))
         coarse_ms = self._search_ms(view, prior, coarse, len(poses))
-        if look_ms > LOOK_MS and coarse > look and coarse_ms <= LAST_MS:
-            yield coarse, self._searched(view, prior, coarse, poses)
-        if look_ms <= LAST_MS or coarse == look:
+        if look_ms > LOOK_MS:
+            rows = self._tiles(view, prior)
+            tiles_ms = self._tiles_ms(view, rows, len(poses))
+            ways = sorted([(coarse_ms, False), (tiles_ms, True)])
+            if look_ms <= LAST_MS:
+                ways = ways[:1]
+            for cost_ms, from_tiles in ways:
+                if from_tiles and self.propose is not None and math.isfinite(cost_ms):
+                    yield coarse, self.propose.candidates(view.rectified_at(0), poses, rows)
+                elif not from_tiles and (cost_ms <= LAST_MS or self.propose is None):
+                    yield coarse, self._searched(view, prior, coarse, poses)
+        if look_ms <= LAST_MS:
             yield look, self._searched(view, prior, look, poses)
+
+    def _tiles(self, view: _View, prior: Prior | None) -> NDArray[np.intp] | None:
+        """Rows of the tiles that the prior allows, None for all."""
+        if prior is None or self.propose is None:
+            return None
+        x, y = self._prior_px(prior, view)
+        grid = self.grid
+        centre = np.array([grid.west_m + x * grid.gsd_m, grid.north_m - y * grid.gsd_m])
+        reach_m = self._reach_px(view, prior) * grid.gsd_m + grid.stride_m
+        return rows_within(self.propose.centres_en_m, centre, reach_m)
+
+    def _tiles_ms(self, view: _View, rows: NDArray[np.intp] | None, poses: int) -> float:
+        """What candidates from tiles cost; infinite where there can be none."""
+        if self.propose is None or not self.propose.fits(view.side_px):
+            return math.inf
+        tiles = len(self.propose.centres_en_m) if rows is None else len(rows)
+        return self.propose.cost_ms(poses, tiles) if tiles else math.inf
 
     def _search_ms(self, view: _View, prior: Prior | None, level: int, poses: int) -> float:
         rows, cols = self.registrar.reference.shape(level)

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.confidence.accept import Acceptance
 from orthonav.errors import CameraError, FlightError
 from orthonav.flight.folder import FlightFolder, FlightView, read_image
 from orthonav.geo.camera import Camera
@@ -56,10 +57,12 @@ def localize_flight(
     use_prior: bool = True,
     heading_known: bool = True,
     skip_bad_images: bool = False,
+    accept: Acceptance | None = None,
     views: Iterable[FlightView] | None = None,
 ) -> Iterator[ViewResult]:
     """Results for the views of a recorded flight, in order, as they are computed.
 
+    Fixes that do not pass `accept` become `NoFix` with their evidence.
     Raises `FlightError` at an image that cannot be decoded, unless `skip_bad_images` makes it a
     `NoFix`; raises `CameraError` where the camera is not that of an image.
     """
@@ -83,6 +86,8 @@ def localize_flight(
                 )
             except CameraError as error:
                 raise CameraError(f"{error}: {view.path}") from error
+        if accept is not None:
+            outcome = accept(outcome)
         yield ViewResult(view.frame, view.telemetry.time_ns, outcome, latency_ms)
 
 

@@ -22,6 +22,7 @@ from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
+from orthonav.localizer.propose import TileProposer
 from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import Manifest, SheetInfo
@@ -31,6 +32,8 @@ from orthonav.prepare.blocks import BlockPixels, Preview, blocks_of, read_block
 from orthonav.prepare.calibrate import RADIUS_STRIDES, Calibration, Crop, CropSampler, calibrate
 from orthonav.prepare.calibrate_registration import FLOOR_PX, calibrate_registration
 from orthonav.prepare.layer import CHUNK_PX, GreyLayerWriter
+from orthonav.search.exact import ExactIndex
+from orthonav.search.peak import TileNeighbours
 from orthonav.variants import make_variant, variant_recipe
 
 log = logging.getLogger(__name__)
@@ -86,7 +89,8 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     representation = make_variant(represent.TABLE, request.edges)
     recipe = _embedding_recipe(request.method, representation)
     mosaic = Mosaic.open(request.orthos)
-    if any(request.out.exists() and request.out.samefile(path) for path in request.orthos):
+    inputs = [*request.orthos, *request.other_dates]
+    if any(request.out.exists() and request.out.samefile(path) for path in inputs):
         raise OutputError(f"the map would replace an orthophoto; name another file: {request.out}")
     mosaic_of_dates = [Mosaic.open([path]) for path in request.other_dates]
     area = _area(request, mosaic)
@@ -120,7 +124,15 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     }
     if grey is not None:
         registration = _registration(
-            request, mosaic_of_dates, area, manifest, arrays, sampler, report
+            request,
+            mosaic_of_dates,
+            area,
+            manifest,
+            arrays,
+            sampler,
+            representation,
+            embedder,
+            report,
         )
         manifest = replace(manifest, registration=registration)
     written = write_map(request.out, manifest, arrays)
@@ -134,6 +146,8 @@ def _registration(
     manifest: Manifest,
     arrays: dict[str, NDArray[Any]],
     sampler: CropSampler,
+    representation: Any,
+    embedder: WhitenedEmbedder,
     report: Progress,
 ) -> dict[str, Any]:
     """What the manifest says of registration: placed on the map as it will be written."""
@@ -142,7 +156,15 @@ def _registration(
     made = MapFile(request.out, 0, manifest, arrays)
     layer = GreyLayer.of(made)
     assert layer is not None
-    localizer = RegistrationLocalizer(sheet, layer, None, radius_m, FLOOR_PX)
+    propose = TileProposer(
+        sheet.grid,
+        arrays["sheet0/centres_en_m"],
+        ExactIndex(arrays["sheet0/embeddings"]),
+        embedder,
+        representation,
+        TileNeighbours(sheet.grid, arrays["sheet0/centres_en_m"]),
+    )
+    localizer = RegistrationLocalizer(sheet, layer, None, radius_m, FLOOR_PX, propose)
     later = [crop for each in other_dates for crop in _crops_of(each, area, sheet.grid, sampler)]
     if other_dates and not later:
         log.warning("the other dates do not cover the area: nothing can be learnt from them")

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.confidence.registered import RegisteredConfidence, fit_registered
+from orthonav.confidence.registered import Chances, RegisteredConfidence, fit_registered
 from orthonav.geo.camera import Camera
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.registration import RegistrationLocalizer
@@ -22,18 +22,18 @@ from orthonav.prepare.calibrate import Crop
 from orthonav.prepare.change import changed
 from orthonav.records import NoFix, Telemetry
 
-VIEWS = 96
+VIEWS = 64
 YAW_STD_DEG = 5.0
 AGL_STD = 0.05
 FOCAL_PX = 1000.0
 SIDES = (0.55, 1.0)
 """Long side of a view, from and to, in tiles; the short side is three quarters of it."""
-SAME_PLACE_PX = 12.0
 MIN_RIGHT = 10
 FLOOR_PX = 0.6
 """Standard deviation per axis, in pixels, with which orthophotos of two dates usually agree."""
 FLOOR_LIMITS_PX = (0.25, 3.0)
 MIRRORED_WEIGHT = 0.5
+FALLBACK_CHANCE = 40.0
 
 
 @dataclass(frozen=True)
@@ -67,12 +67,13 @@ def calibrate_registration(
     work += [(crop, True, False) for crop in (later or chosen)[: VIEWS // 2]]
     outcomes = []
     for done, (crop, mirror, other_date) in enumerate(work):
-        stranger = crops[int(rng.integers(len(crops)))].grey
+        # What replaces parts of a view is mirrored: as it is, it would be found where it is from.
+        stranger = crops[int(rng.integers(len(crops)))].grey[:, ::-1]
         outcome = _placed(rng, localizer, crop, stranger, mirror, other_date)
         if outcome is not None:
             outcomes.append(outcome)
         report("calibrate registration", (done + 1) / len(work))
-    return _fitted(outcomes)
+    return _fitted(outcomes, localizer.radius_m / localizer.grid.gsd_m)
 
 
 def _placed(
@@ -126,13 +127,13 @@ def _view(
     return np.asarray(view, dtype=np.uint8), camera, telemetry
 
 
-def _fitted(outcomes: Sequence[_Outcome]) -> RegistrationCalibration:
-    """The confidence, and from other dates the floor of the covariance."""
+def _fitted(outcomes: Sequence[_Outcome], radius_px: float) -> RegistrationCalibration:
+    """The confidence of errors below a radius, and from other dates the floor of the covariance."""
     if not outcomes:
         return RegistrationCalibration(None, FLOOR_PX)
     mirrored = np.array([each.mirrored for each in outcomes])
     errors = np.stack([each.error_px for each in outcomes])
-    right = (np.hypot(*errors.T) <= SAME_PLACE_PX) & ~mirrored
+    right = (np.hypot(*errors.T) <= radius_px) & ~mirrored
     later = right & np.array([each.other_date for each in outcomes])
     floor_px = FLOOR_PX
     if later.sum() >= MIN_RIGHT:
@@ -143,8 +144,13 @@ def _fitted(outcomes: Sequence[_Outcome]) -> RegistrationCalibration:
         return RegistrationCalibration(None, floor_px)
     evidence = [each.evidence for each in outcomes]
     lost = [each for each, known in zip(evidence, mirrored, strict=True) if known]
-    chance = float(np.median([each["strength"] for each in lost]))
-    look_chance = float(np.median([each["look"] for each in lost]))
+    chances = Chances(*(_median(lost, name) for name in ("strength", "look", "fine")))
     weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)
-    confidence = fit_registered(evidence, right, weight, max(chance, 1.0), max(look_chance, 1.0))
+    confidence = fit_registered(evidence, right, weight, chances)
     return RegistrationCalibration(confidence, floor_px)
+
+
+def _median(evidence: Sequence[Mapping[str, float]], name: str) -> float:
+    """Median of one number of the evidence where it is known, at least 1."""
+    values = [each[name] for each in evidence if math.isfinite(each[name])]
+    return max(float(np.median(values)), 1.0) if values else FALLBACK_CHANCE

@@ -22,7 +22,7 @@ KEPT_TO_LOOK = 14
 KEPT_TO_FINISH = 3
 EXCLUSION_SHARE = 0.25
 """A rival lies farther from the best than this share of the view's side."""
-NAT_SCORE = 0.4
+NAT_SCORE = 1.0
 """What a nat of prior probability of heading and scale is worth in units of the score."""
 MAX_KEPT_WINDOWS = 4
 MAX_RATIO = 10.0
@@ -68,9 +68,11 @@ class Levels:
 class Registered:
     """The best place of a view, and what speaks for it.
 
-    `placed` is where it was finished, with its covariance; `score` the scores of the levels it
-    was judged and finished at together; `rival` the best such score elsewhere; `look_ratio` the
-    same comparison at the level it was judged at, over all candidates.
+    `placed` is where it was finished, with its covariance. `score` adds up the scores of the
+    levels it was judged and finished at, `rival` is the best such score elsewhere; `look_score`
+    and `look_rival` compare all candidates at the level they were judged at; `fine_score` and
+    `fine_rival` the finalists with one finer level added, NaN where that was not needed.
+    `finalists` are the places that were finished, with their scores, best first.
     """
 
     placed: Placed
@@ -79,6 +81,9 @@ class Registered:
     look_score: float
     look_rival: float
     candidates: int
+    finalists: tuple[tuple[float, Placed], ...]
+    fine_score: float = math.nan
+    fine_rival: float = math.nan
 
     @property
     def look_ratio(self) -> float:
@@ -99,6 +104,8 @@ class Registered:
             "rival": self.rival,
             "look": self.look_score,
             "look_rival": self.look_rival,
+            "fine": self.fine_score,
+            "fine_rival": self.fine_rival,
             "peak_ratio": min(MAX_RATIO, self.peak_ratio),
             "look_ratio": min(MAX_RATIO, self.look_ratio),
             "gradient_correlation": gradient,
@@ -109,13 +116,22 @@ class Registered:
         }
 
     def beside(self, other: "Registered", view_px: float) -> "Registered":
-        """This one, with the rivals that another search of the same view found."""
-        elsewhere = _apart(self.placed, other.placed) > EXCLUSION_SHARE * view_px
+        """The better of two searches of the same view, with the rivals that both found."""
+        first, second = (self, other) if self.score >= other.score else (other, self)
+        exclusion = EXCLUSION_SHARE * view_px
+        elsewhere = _apart(first.placed, second.placed) > exclusion
+        more = [
+            (score, each)
+            for score, each in second.finalists
+            if all(_apart(each, known) > exclusion for _, known in first.finalists)
+        ]
+        finalists = sorted((*first.finalists, *more), key=lambda pair: -pair[0])
         return replace(
-            self,
-            rival=max(self.rival, other.score if elsewhere else other.rival),
-            look_rival=max(self.look_rival, other.look_score if elsewhere else other.look_rival),
-            candidates=self.candidates + other.candidates,
+            first,
+            rival=max(first.rival, second.score if elsewhere else second.rival),
+            look_rival=max(first.look_rival, second.look_score if elsewhere else second.look_rival),
+            candidates=first.candidates + second.candidates,
+            finalists=tuple(finalists[:KEPT_TO_FINISH]),
         )
 
 
@@ -192,20 +208,55 @@ class Registrar:
                 for each in _distinct(judged, KEPT_TO_FINISH, exclusion)
             )
         ]
-        score, best = max(totals, key=lambda pair: pair[0])
-        rival = max((t for t, each in totals if _apart(each, best) > exclusion), default=0.0)
+        totals.sort(key=lambda pair: -pair[0])
+        score, best = totals[0]
         nearest = min(judged, key=lambda each: _apart(each, best))
         others = [each for each in judged if _apart(each, best) > exclusion]
-        look_rival = max((each.score - prior.cost(each.pose) for each in others), default=0.0)
-        final = self._refiner(templates, levels, levels.final)
         return Registered(
-            placed=final.place(best.pose, 3, with_covariance=True),
+            placed=self._with_covariance(templates, levels, best),
             score=score,
-            rival=rival,
+            rival=totals[1][0] if len(totals) > 1 else 0.0,
             look_score=nearest.score - prior.cost(nearest.pose),
-            look_rival=look_rival,
+            look_rival=max((each.score - prior.cost(each.pose) for each in others), default=0.0),
             candidates=candidates,
+            finalists=tuple(totals),
         )
+
+    def deepened(
+        self, templates: ViewTemplates, finer: ViewTemplates, levels: Levels, found: Registered
+    ) -> Registered:
+        """`found` judged anew with one level finer than the final one, of which `finer` is made.
+
+        The best may become another of the finalists.
+        """
+        refiner = Refiner(finer.at(finer.finest), self.reference)
+        totals = [
+            (score + refiner.place(each.pose, 4).score, score, each)
+            for score, each in found.finalists
+        ]
+        totals.sort(key=lambda entry: -entry[0])
+        fine_score, score, best = totals[0]
+        rivals = totals[1:]
+        changed = best is not found.finalists[0][1]
+        deep = replace(
+            found,
+            fine_score=fine_score,
+            fine_rival=max((entry[0] for entry in rivals), default=0.0),
+        )
+        if not changed:
+            return deep
+        return replace(
+            deep,
+            placed=self._with_covariance(templates, levels, best),
+            score=score,
+            rival=max((entry[1] for entry in rivals), default=0.0),
+            look_score=found.look_rival,
+            look_rival=found.look_score,
+        )
+
+    def _with_covariance(self, templates: ViewTemplates, levels: Levels, best: Placed) -> Placed:
+        final = self._refiner(templates, levels, levels.final)
+        return final.place(best.pose, 3, with_covariance=True)
 
     def _finished(
         self, templates: ViewTemplates, levels: Levels, judged: Placed

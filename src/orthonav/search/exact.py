@@ -1,11 +1,15 @@
 """Exact search: the scalar product with every stored embedding; the oracle for any other index."""
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 BLOCK_ROWS = 1024
 CACHE_BYTES = 128 * 2**20
+SHORTLIST = 32
+"""Tiles looked at for each one wanted of `top_tiles`, before more are."""
 _CONVERT_FP16 = getattr(cv2, "convertFp16", None)  # OpenCV 4, where cv2.add knows no float16
 _ZERO = np.zeros(1, dtype=np.float16)
 
@@ -35,17 +39,48 @@ class ExactIndex:
     ) -> NDArray[np.float32]:
         """Scalar products (N, Q) of queries (Q, D) with all embeddings, or with `rows` of them."""
         columns = np.ascontiguousarray(queries.T, dtype=np.float32)
+        out = np.empty((self._count(rows), columns.shape[1]), dtype=np.float32)
+        for part, block in self._blocks(rows):
+            np.matmul(block, columns, out=out[part])
+        return out
+
+    def best(
+        self, queries: NDArray[np.float32], rows: NDArray[np.intp] | None = None
+    ) -> NDArray[np.float32]:
+        """Highest scalar product (N,) of each embedding, or each of `rows`, with any query (Q, D).
+
+        Memory does not grow with N times Q. Raises `ValueError` if there is no query.
+        """
+        if len(queries) == 0:
+            raise ValueError("at least one query is needed, got none")
+        columns = np.ascontiguousarray(queries.T, dtype=np.float32)
+        count = self._count(rows)
+        out = np.empty(count, dtype=np.float32)
+        scores = np.empty((min(count, BLOCK_ROWS), columns.shape[1]), dtype=np.float32)
+        for part, block in self._blocks(rows):
+            some = np.matmul(block, columns, out=scores[: len(block)])
+            some.max(axis=1, out=out[part])
+        return out
+
+    def which(self, queries: NDArray[np.float32], rows: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Which of the queries (Q, D) scores highest with each of `rows`: indices (len(rows),).
+
+        For the few tiles that matter: finding it costs more than the score itself.
+        """
+        return np.asarray(self.scores(queries, rows).argmax(axis=1), dtype=np.intp)
+
+    def _count(self, rows: NDArray[np.intp] | None) -> int:
+        return len(self._stored) if rows is None else len(rows)
+
+    def _blocks(self, rows: NDArray[np.intp] | None) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+        """Embeddings decoded to float32, `BLOCK_ROWS` at a time, and which part of all they are."""
         if self._may_cache and self._decoded is None:
             self._decoded = self._stored.astype(np.float32)
         source = self._stored if self._decoded is None else self._decoded
-        count = len(source) if rows is None else len(rows)
-        out = np.empty((count, columns.shape[1]), dtype=np.float32)
         # In blocks also where nothing is decoded: BLAS then takes a few queries twice as fast.
-        for start in range(0, count, BLOCK_ROWS):
+        for start in range(0, self._count(rows), BLOCK_ROWS):
             part = slice(start, start + BLOCK_ROWS)
-            block = source[part] if rows is None else source[rows[part]]
-            np.matmul(_float32(block), columns, out=out[part])
-        return out
+            yield part, _float32(source[part] if rows is None else source[rows[part]])
 
 
 def _float32(block: NDArray[np.float16] | NDArray[np.float32]) -> NDArray[np.float32]:
@@ -65,3 +100,45 @@ def rows_within(
     """Rows of tiles whose centres (N, 2) lie within `radius_m` of a point: the prior's gate."""
     offset = centres_en_m - np.asarray(centre_en_m, dtype=np.float32)
     return np.flatnonzero(np.einsum("ij,ij->i", offset, offset) <= radius_m**2)
+
+
+def top_tiles(
+    scores: NDArray[np.float32], centres_en_m: NDArray[np.float32], count: int, apart_m: float
+) -> NDArray[np.intp]:
+    """Rows of the best tiles, best first, each at least `apart_m` from every better one chosen.
+
+    `scores` (N,) and `centres_en_m` (N, 2) belong together. Up to `count` rows: fewer where no
+    more lie far enough apart. Of equal scores the first row counts as better; tiles whose score is
+    not finite are left out.
+    """
+    finite = np.flatnonzero(np.isfinite(scores))
+    values = scores[finite]
+    looked_at = SHORTLIST * max(count, 1)
+    while True:
+        order = _best_first(values, looked_at)
+        chosen = _apart(centres_en_m[finite[order]], count, apart_m)
+        if len(chosen) == count or len(order) == len(finite):
+            return finite[order[chosen]]
+        looked_at = 8 * len(order)
+
+
+def _best_first(values: NDArray[np.float32], at_least: int) -> NDArray[np.intp]:
+    """Indices of the `at_least` highest values and all that equal the last of them, sorted."""
+    kept = np.arange(len(values))
+    if at_least < len(values):
+        lowest = np.partition(values, len(values) - at_least)[len(values) - at_least]
+        kept = np.flatnonzero(values >= lowest)
+    return kept[np.argsort(-values[kept], kind="stable")]
+
+
+def _apart(points_m: NDArray[np.float32], count: int, apart_m: float) -> NDArray[np.intp]:
+    """Indices of up to `count` points (N, 2), each the first that is far enough from the others."""
+    free = np.ones(len(points_m), dtype=np.bool_)
+    chosen: list[int] = []
+    while len(chosen) < count and free.any():
+        at = int(free.argmax())
+        chosen.append(at)
+        offset = points_m - points_m[at]
+        free &= np.einsum("ij,ij->i", offset, offset) >= apart_m**2
+        free[at] = False
+    return np.array(chosen, dtype=np.intp)

@@ -1,0 +1,50 @@
+"""What a fix must bring to be given out: a threshold on one number of its evidence."""
+
+import math
+from dataclasses import dataclass
+
+from orthonav.errors import VariantError
+from orthonav.records import Fix, NoFix
+
+CRITERIA = ("confidence", "peak_ratio", "lowe_ratio")
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """Fixes whose `criterion` is below `threshold` are withheld.
+
+    `confidence`: the calibrated probability; `peak_ratio`: best over best elsewhere; `lowe_ratio`:
+    best over second best tile, the criterion of Di Piazza et al. 2024 (threshold 1.13), which only
+    tile search knows.
+    """
+
+    criterion: str
+    threshold: float
+
+    @classmethod
+    def parse(cls, text: str) -> "Acceptance":
+        """From `name:threshold`; raises `VariantError`."""
+        name, _, value = text.partition(":")
+        try:
+            threshold = float(value)
+        except ValueError:
+            threshold = math.nan
+        if name not in CRITERIA or not math.isfinite(threshold):
+            raise VariantError(
+                f"criterion must be one of {', '.join(CRITERIA)} with a threshold, such as "
+                f"confidence:0.9 or lowe_ratio:1.13, got '{text}'"
+            )
+        return cls(name, threshold)
+
+    def __call__(self, outcome: Fix | NoFix) -> Fix | NoFix:
+        """The outcome, or `NoFix` where it is not sure enough or the number is not known."""
+        if isinstance(outcome, NoFix):
+            return outcome
+        value = outcome.confidence
+        if self.criterion != "confidence":
+            value = outcome.evidence.get(self.criterion, math.nan)
+        if value >= self.threshold:
+            return outcome
+        known = "not known" if math.isnan(value) else f"{value:.3g}"
+        detail = f"{self.criterion} is {known}, {self.threshold:g} is asked for"
+        return NoFix("not_sure", detail, outcome.evidence)
