@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.inputs import View
+from benchmarks.flights import View
 from orthonav.geo.camera import Camera
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.localizer import Localizer

@@ -12,12 +12,13 @@ from benchmarks.machine import multiplying_gflops
 from benchmarks.record import Section, Table, number
 from orthonav.embed.whitened import MAX_LEARNT_TILES
 
-STAGES = ("start", "read", "represent", "cells", "learn", "embed", "calibrate", "write")
+STAGES = ("start", "read", "represent", "cells", "learn", "embed", "calibrate", "register", "write")
 STAGE_NOTES = (
     "start: Python, imports, opening the orthophoto; read: decoding and resampling into the "
     "sheet; represent: oriented gradients; cells: means over micro-cells and what else is done "
     "per block; learn: mean and whitening; embed: projection of all tiles; calibrate: confidence "
-    "from changed crops of the map itself; write: file, checksums, end of the process.",
+    "from changed crops of the map itself; register: joining the registration layer and its own "
+    "calibration; write: file, checksums, end of the process.",
 )
 
 
@@ -34,14 +35,16 @@ def measure(place: Workplace) -> Section:
             f"{name}: peak memory", "MB", [r["peak_mb"] for r in runs], data=name, seed=seed
         )
         km2, tiles, map_mb = first["km2"], first["tiles"], first["map_bytes"] / 1e6
+        layer_mb = first["layer_bytes"] / 1e6
         section.add(f"{name}: map", "MB", [map_mb], data=name, seed=seed)
+        section.add(f"{name}: registration layer", "MB", [layer_mb], data=name, seed=seed)
         rows.append(
             [
                 name,
                 *(number(km2), f"{tiles:,}", number(wall.median)),
                 f"{number(wall.p10)}..{number(wall.p90)}",
                 *(number(km2 / wall.median), number(tiles / wall.median)),
-                *(number(peak.median), number(map_mb), number(map_mb / km2)),
+                *(number(peak.median), number(map_mb), number(layer_mb), number(map_mb / km2)),
             ]
         )
         spent = [
@@ -50,9 +53,9 @@ def measure(place: Workplace) -> Section:
         ]
         stages.append([name, *(f"{one.median:.2f}" for one in spent)])
         floors.append([name, *_floor(first, ortho, gflops)])
-        _facts(section, name, wall.median, map_mb / km2)
+        _facts(section, name, wall.median, (map_mb - layer_mb) / km2)
     header = ["area", "km2", "tiles", "wall s", "p10..p90", "km2/s", "tiles/s"]
-    header += ["peak MB", "map MB", "MB/km2"]
+    header += ["peak MB", "map MB", "layer MB", "MB/km2"]
     absent = () if naip(NAIP_PAST) else (NAIP_ABSENT,)
     note = f"256 px tiles, 87.5 % overlap, n = {place.repeats} processes each, all cores"
     section.tables = [

@@ -63,6 +63,9 @@ def build(ortho: Path, out: Path) -> None:
         begun = time.perf_counter()
         result = build_map(BuildRequest([ortho], out), progress)
         ended = time.perf_counter()
+    registered = "calibrate registration last"
+    if registered not in marks:
+        registered = "calibrate last"
     # The first crop's share of the calibration (a few ms) is counted as embedding.
     account = {
         "start": begun - start + opened.total_s,
@@ -71,11 +74,14 @@ def build(ortho: Path, out: Path) -> None:
         "learn": marks["learn last"] - marks["learn"],
         "embed": marks["calibrate first"] - marks["learn last"],
         "calibrate": marks["calibrate last"] - marks["calibrate first"],
-        "write": ended - marks["calibrate last"],
+        "register": marks[registered] - marks["calibrate last"],
+        "write": ended - marks[registered],
         "cells": marks["learn"] - begun - opened.total_s - read.total_s - marks["represent_s"],
     }
     sheet = result.manifest.sheets[0]
-    basis = open_map(out).arrays["embed/basis"]
+    arrays = open_map(out).arrays
+    basis = arrays["embed/basis"]
+    layer = [array.nbytes for name, array in arrays.items() if name.startswith("sheet0/grey/")]
     source = result.manifest.imagery[0]
     account |= {
         "km2": sheet.area_km2,
@@ -83,6 +89,7 @@ def build(ortho: Path, out: Path) -> None:
         "features": basis.shape[0],
         "dims": basis.shape[1],
         "map_bytes": result.size_bytes,
+        "layer_bytes": sum(layer),
         "decoded_bytes": 3 * source["width_px"] * source["height_px"],
         "peak_mb": peak_memory_mb(),
         "inside_s": time.perf_counter() - start,

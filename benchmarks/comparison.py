@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.baselines import Method, Orthonav, Reference, SiftMatch, TemplateMatch
+from benchmarks.flights import Flight
 from benchmarks.inputs import (
     FLIGHT_SEED,
     NAIP_ABSENT,
@@ -17,7 +18,6 @@ from benchmarks.inputs import (
     PAST,
     PRESENT,
     USUAL_ERRORS,
-    Flight,
     Workplace,
     naip,
 )
@@ -123,13 +123,16 @@ def _methods(place: Workplace, past: Path) -> list[Method]:
     builds = [("gradient", 0.875), ("gray", 0.875), ("canny", 0.875)]
     if not place.quick:
         builds.insert(1, ("gradient", DENSER))
-    methods: list[Method] = []
+    path = place.map(past)
+    default = Orthonav("orthonav (default)", Localizer(open_map(path)), path.stat().st_size)
+    methods: list[Method] = [default]
     for edges, overlap in builds:
-        path = place.map(past, edges, overlap)
-        name = "orthonav (default)" if edges == "gradient" else f"orthonav --edges {edges}"
+        path = place.map(past, edges, overlap, registration=False)
+        name = "embedding only" + (f", --edges {edges}" if edges != "gradient" else "")
         if overlap == DENSER:
-            name = f"orthonav --overlap {overlap}"
-        methods.append(Orthonav(name, Localizer(open_map(path)), path.stat().st_size))
+            name += f", --overlap {overlap}"
+        localizer = Localizer(open_map(path), registration=False)
+        methods.append(Orthonav(f"orthonav, {name}", localizer, path.stat().st_size))
     reference = Reference.of(past, Localizer(open_map(place.map(past))))
     turns: tuple[Sequence[float], ...] = ((0.0,), TURNS_DEG)
     methods += [

@@ -5,15 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 import orthonav.simulate.landscape as landscape
-from orthonav.flight import open_flight, read_truth
-from orthonav.flight.folder import read_image
-from orthonav.geo.camera import Camera
+from benchmarks.flights import Flight, read_views
 from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import Telemetry
 from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 
 LANDSCAPE_SEED = 1
@@ -22,6 +16,7 @@ PAST, PRESENT = landscape.DEFAULT_DATES[:2]
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 NAIP = REAL_DATA / "naip_nd"
 USUAL_ERRORS = Errors(yaw_std_deg=5.0, agl_std=0.05)
+WIDE_ERRORS = Errors(yaw_std_deg=10.0, agl_std=0.1)
 # A heading told to be this good is tried as told; the error itself is far below a pixel.
 NO_ERRORS = Errors(yaw_std_deg=0.001)
 
@@ -59,47 +54,40 @@ class Workplace:
             )
         return paths
 
-    def map(self, ortho: Path, edges: str = "gradient", overlap: float = 0.875) -> Path:
+    def map(
+        self,
+        ortho: Path,
+        edges: str = "gradient",
+        overlap: float = 0.875,
+        registration: bool = True,
+    ) -> Path:
         """A map with the defaults of `orthonav build`, built once per run."""
-        out = self.scratch / f"{ortho.parent.name}-{ortho.stem}-{edges}-{overlap}.onav"
+        kind = f"{edges}-{overlap}-{'layer' if registration else 'tiles'}"
+        out = self.scratch / f"{ortho.parent.name}-{ortho.stem}-{kind}.onav"
         if not out.is_file():
-            build_map(BuildRequest([ortho], out, edges=edges, overlap=overlap))
+            request = BuildRequest(
+                [ortho], out, edges=edges, overlap=overlap, registration=registration
+            )
+            build_map(request)
         return out
 
-    def fly(self, ortho: Path, count: int, errors: Errors) -> "Flight":
-        """Views at random places over an orthophoto."""
-        folder = self.scratch / f"{ortho.parent.name}-{ortho.stem}-{count}-{errors.agl_std}"
+    def flown(self, ortho: Path, count: int, errors: Errors) -> Path:
+        """Folder of a flight with views at random places over an orthophoto, flown once per run."""
+        told = (errors.yaw_std_deg, errors.agl_std, errors.prior_std_m)
+        name = f"{ortho.parent.name}-{ortho.stem}-{count}-" + "-".join(map(str, told))
+        folder = self.scratch / name
         if not folder.is_dir():
             request = SimulateRequest(
                 [ortho], folder, random=count, errors=errors, seed=FLIGHT_SEED
             )
             simulate_flight(request)
-        recorded = open_flight(folder)
-        truth = read_truth(folder / "truth.csv")
-        views = tuple(
-            View(view.path, read_image(view.path), view.telemetry, truth[view.frame])
-            for view in recorded.views
-        )
-        return Flight(folder, recorded.camera, views)
+        return folder
 
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A picture `grey` (H, W), what was told with it, and where it was taken."""
-
-    path: Path
-    grey: NDArray[np.uint8]
-    telemetry: Telemetry
-    truth_latlon_deg: tuple[float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class Flight:
-    """Views of one camera."""
-
-    folder: Path
-    camera: Camera
-    views: tuple[View, ...]
+    def fly(self, ortho: Path, count: int, errors: Errors) -> Flight:
+        """The views of `flown`, all read."""
+        folder = self.flown(ortho, count, errors)
+        camera, views = read_views(folder)
+        return Flight(folder, camera, tuple(views))
 
 
 def naip(year_file: str) -> Path | None:

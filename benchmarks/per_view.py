@@ -7,7 +7,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, USUAL_ERRORS, View, Workplace
+from benchmarks.flights import View
+from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, USUAL_ERRORS, Workplace
 from benchmarks.machine import timed
 from benchmarks.record import Section, Table, timing_cells
 from orthonav.flight.folder import read_image
@@ -27,8 +28,10 @@ STAGES = {
     "embed": "embed, per heading",
     "search": "search, 3 queries",
     "match": "match: search and evidence, 3 queries",
-    "locate": "**whole `locate`, 3 headings**",
-    "unknown": "**whole `locate`, heading unknown**",
+    "locate": "**whole `locate`, embedding only, 3 headings**",
+    "unknown": "**whole `locate`, embedding only, heading unknown**",
+    "default": "**whole `locate`, default**",
+    "default unknown": "**whole `locate`, default, heading unknown**",
 }
 
 
@@ -37,14 +40,16 @@ def measure(place: Workplace) -> Section:
     section = Section("One view on one core")
     side_m = 2000 if place.quick else 4000
     present = place.area(2000, 1.0, [PRESENT])[0]
-    localizer = Localizer(open_map(place.map(place.area(side_m, 1.0, [PAST])[0])))
+    map_path = place.map(place.area(side_m, 1.0, [PAST])[0])
+    localizer = Localizer(open_map(map_path), registration=False)
+    whole = Localizer(open_map(map_path))
     flight = place.fly(present, place.views, USUAL_ERRORS)
     times_s: dict[str, list[float]] = defaultdict(list)
     for view in flight.views[:3]:  # warm-up
-        _once(localizer, flight.camera, view, defaultdict(list))
+        _once(localizer, whole, flight.camera, view, defaultdict(list))
     for view in flight.views:
         for _ in range(REPEATS):
-            _once(localizer, flight.camera, view, times_s)
+            _once(localizer, whole, flight.camera, view, times_s)
     tiles = len(localizer.centres_en_m)
     data = f"generated {side_m / 1000:g} x {side_m / 1000:g} km, {tiles} tiles"
     rows = []
@@ -57,7 +62,8 @@ def measure(place: Workplace) -> Section:
     notes = (
         f"{camera.width_px} x {camera.height_px} px views on a map of {tiles:,} tiles at 1 m, "
         f"{len(flight.views)} views, each {REPEATS} times, warm; ms",
-        f"heading unknown: {360 / UNKNOWN_HEADING_STEP_DEG:.0f} headings; one round per view",
+        f"embedding only: without the registration layer; heading unknown: "
+        f"{360 / UNKNOWN_HEADING_STEP_DEG:.0f} headings; unknown and default: one round per view",
     )
     header = ("stage", "median", "p10", "p90", "p99", "n")
     section.tables = [Table("Stages of a view, ms", header, rows, notes)]
@@ -65,9 +71,13 @@ def measure(place: Workplace) -> Section:
 
 
 def _once(
-    localizer: Localizer, camera: Camera, view: View, times_s: dict[str, list[float]]
+    localizer: Localizer,
+    whole: Localizer,
+    camera: Camera,
+    view: View,
+    times_s: dict[str, list[float]],
 ) -> None:
-    """Run one view through every stage, then whole."""
+    """Run one view through every stage, then whole by tiles only, then by the default."""
 
     def stage(name: str, run: Callable[..., Made], *arguments: Any) -> Made:
         made, took_s = timed(run, *arguments)
@@ -89,3 +99,6 @@ def _once(
     if len(times_s["unknown"]) * REPEATS < len(times_s["locate"]):
         unknown = partial(localizer.locate, heading_known=False)
         stage("unknown", unknown, view.grey, camera, told)
+        stage("default", whole.locate, view.grey, camera, told)
+        unknown = partial(whole.locate, heading_known=False)
+        stage("default unknown", unknown, view.grey, camera, told)

@@ -10,7 +10,16 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks import building, comparison, per_view, processes, search_scale
+from benchmarks import (
+    building,
+    comparison,
+    growth,
+    per_view,
+    processes,
+    search_scale,
+    side_by_side,
+    spent,
+)
 from benchmarks.inputs import Workplace
 from benchmarks.record import Section, provenance, save, targets_table
 
@@ -20,6 +29,9 @@ SECTIONS: dict[str, Callable[[Workplace], Section]] = {
     "search": search_scale.measure,
     "process": processes.measure,
     "compare": comparison.measure,
+    "registration": side_by_side.measure,
+    "growth": growth.measure,
+    "spent": spent.measure,
 }
 
 

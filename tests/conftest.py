@@ -19,6 +19,7 @@ from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
 
 SEED = 2
+cv2.setNumThreads(1)  # tests run side by side
 
 
 @dataclass(frozen=True)
@@ -43,14 +44,14 @@ def area(tmp_path_factory):
 def map_path(area, tmp_path_factory):
     """A map of the first date: tiles of 128 px of 2.5 m; not to be changed."""
     path = tmp_path_factory.mktemp("map") / "area.onav"
-    build_map(BuildRequest([area.past], path, tile_px=128, gsd_m=2.5))
+    build_map(BuildRequest([area.past], path, tile_px=128, gsd_m=2.5, calibration_views=24))
     return path
 
 
 @pytest.fixture(scope="session")
 def localizer(map_path):
-    """A localizer on that map."""
-    return Localizer(open_map(map_path))
+    """A localizer on that map that searches tiles only."""
+    return Localizer(open_map(map_path), registration=False)
 
 
 @pytest.fixture(scope="session")

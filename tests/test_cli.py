@@ -23,7 +23,7 @@ from orthonav.mapfile import open_map
 from orthonav.publish.jsonl import read_results
 from orthonav.records import Fix
 
-SMALL_MAP = ["--tile-px", "64", "--overlap", "0.75"]
+SMALL_MAP = ["--tile-px", "64", "--overlap", "0.75", "--calibration-views", "24"]
 
 
 @dataclass(frozen=True)

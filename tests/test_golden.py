@@ -42,9 +42,10 @@ FIRST_EMBEDDING = [
 ]
 LAST_CENTRE_EN_M = [96.0, -144.0]
 GREY_ROW = [139, 112, 81, 64, 87, 114, 131, 152]
-FIX_DEG = (46.499925536, 2.999828287)
-RADIUS_M = 9.0
-CONFIDENCE = 0.9422
+FIX_DEG = (46.499855888, 2.999830484)
+TILE_RADIUS_M = 9.0
+RADIUS_M = 35.0
+CONFIDENCE = 1.0
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +66,7 @@ def golden():
 def test_the_manifest_says_what_was_built(golden):
     manifest = golden.manifest
     assert manifest.sheets == (SHEET,)
-    assert manifest.created_by == "orthonav 0.1.0" and manifest.radius_m == RADIUS_M
+    assert manifest.created_by == "orthonav 0.1.0" and manifest.radius_m == TILE_RADIUS_M
     assert manifest.recipe["method"] == manifest.recipe["represent"]["name"] == "gradient"
     assert manifest.recipe["embed"]["dims"] == 16 and manifest.recipe["overlap"] == 0.875
     source = manifest.imagery[0]

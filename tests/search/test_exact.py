@@ -1,11 +1,14 @@
 """Exact search: the oracle itself, against float64."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.search.exact import BLOCK_ROWS, ExactIndex, rows_within
+from orthonav.search import exact
+from orthonav.search.exact import BLOCK_ROWS, ExactIndex, rows_within, top_tiles
 
 CACHES = pytest.mark.parametrize("cache_bytes", [0, 2**27], ids=["blocks", "cached"])
 
@@ -92,3 +95,87 @@ def test_gate_is_a_closed_circle(centres, east, radius_m):
     rows = rows_within(points, np.array([east, 0.0]), float(radius_m))
     expected = [i for i, (e, n) in enumerate(centres) if (e - east) ** 2 + n**2 <= radius_m**2]
     assert rows.tolist() == expected
+
+
+@CACHES
+@pytest.mark.parametrize("count", [0, 1, BLOCK_ROWS - 1, BLOCK_ROWS, 2 * BLOCK_ROWS + 7])
+@pytest.mark.parametrize("asked", [1, 2, 50])
+def test_best_and_which_are_those_of_all_scores(cache_bytes, count, asked):
+    index, many = ExactIndex(embeddings(count, 16), cache_bytes), queries(asked, 16)
+    scores = index.scores(many)
+    best = index.best(many)
+    assert best.shape == (count,) and best.dtype == np.float32
+    np.testing.assert_allclose(best, scores.max(axis=1), atol=1e-6)
+    rows = np.random.default_rng(3).permutation(count)[:40]
+    np.testing.assert_allclose(index.best(many, rows), best[rows], atol=1e-6)
+    which = index.which(many, rows)
+    assert which.shape == rows.shape and which.dtype == np.intp
+    np.testing.assert_allclose(scores[rows, which], best[rows], atol=1e-6)
+
+
+def test_the_best_of_no_queries_is_an_error():
+    with pytest.raises(ValueError, match="at least one query"):
+        ExactIndex(embeddings(4)).best(queries(0))
+
+
+def test_best_needs_little_memory():
+    stored, many = embeddings(60_000, 8), queries(300, 8)
+    index = ExactIndex(stored, cache_bytes=0)
+    tracemalloc.start()
+    try:
+        index.best(many)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 4 * 2**20  # all scores would be 72 MB
+
+
+def greedy(scores, centres, count, apart_m):
+    """`top_tiles` as it is defined: the best, then the best of those far enough away, .."""
+    chosen = []
+    for row in sorted(range(len(scores)), key=lambda i: (-scores[i], i)):
+        near = [i for i in chosen if np.hypot(*(centres[i] - centres[row])) < apart_m]
+        if np.isfinite(scores[row]) and not near and len(chosen) < count:
+            chosen.append(row)
+    return chosen
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 20),
+            st.integers(0, 20),
+            st.sampled_from([0, 1, 2, 3, 0.5, -np.inf, np.nan]),
+        ),
+        max_size=60,
+    ),
+    st.integers(0, 8),
+    st.integers(0, 12),
+    st.integers(1, 4),
+)
+def test_top_tiles_are_the_best_that_lie_apart(tiles, count, apart_m, shortlist):
+    centres = np.array([tile[:2] for tile in tiles], dtype=np.float32).reshape(-1, 2)
+    scores = np.array([tile[2] for tile in tiles], dtype=np.float32)
+    plain = np.where(np.isnan(scores), -np.inf, scores)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(exact, "SHORTLIST", shortlist)
+        rows = top_tiles(scores, centres, count, float(apart_m))
+    assert rows.dtype == np.intp and rows.tolist() == greedy(plain, centres, count, apart_m)
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+def test_top_tiles_of_many(smooth):
+    """Also where all the best tiles lie beside each other, as they do around a peak."""
+    rows, cols = np.mgrid[:300, :300]
+    centres = np.stack([cols.ravel(), rows.ravel()], axis=1).astype(np.float32) * 8
+    scores = np.random.default_rng(4).random(len(centres)).astype(np.float32)
+    if smooth:
+        scores = -np.hypot(*(centres - [700, 900]).T).astype(np.float32)
+    chosen = top_tiles(scores, centres, 16, 60.0)
+    apart = np.hypot(*(centres[chosen][:, None] - centres[chosen]).transpose(2, 0, 1))
+    assert len(chosen) == 16 and chosen[0] == scores.argmax()
+    assert (apart[~np.eye(16, dtype=bool)] >= 60).all()
+    assert (np.diff(scores[chosen]) <= 0).all()
+    better = scores > scores[chosen[-1]]
+    nearest = np.hypot(*(centres[better][:, None] - centres[chosen]).transpose(2, 0, 1)).min(axis=1)
+    assert (nearest < 60).all()

@@ -52,6 +52,13 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="orthophoto of the same ground of another year: the confidence and the covariance "
         "are learnt from it (may be given again; it does not become part of the map)",
     )
+    parser.add_argument(
+        "--calibration-views",
+        type=int,
+        default=48,
+        metavar="N",
+        help="views made of the orthophoto to learn the confidence from (default 48)",
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="MAP.onav")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
@@ -77,6 +84,7 @@ def run(options: argparse.Namespace) -> None:
         seed=options.seed,
         registration=options.registration,
         other_dates=options.other_date,
+        calibration_views=options.calibration_views,
     )
     with progress(options) as shown:
         result = build_map(request, shown)

@@ -30,6 +30,7 @@ DEFAULT_YAW_STD_DEG = 7.0
 DEFAULT_AGL_STD = 0.08
 MIN_YAW_STD_DEG = 2.0
 MIN_AGL_STD = 0.03
+MAX_AGL_STD = 0.15
 TURN_STEP_RAD = math.radians(8.0)
 SCALE_STEP = 0.13
 BANK_SIGMAS = 3.0
@@ -74,16 +75,18 @@ class RegistrationLocalizer:
         radius_m: float,
         floor_px: float,
         propose: TileProposer | None = None,
+        last_ms: float = LAST_MS,
     ) -> None:
         """`floor_px` is the standard deviation with which maps of two dates agree, in pixels.
 
-        Without `propose` candidates come from FFT search alone.
+        Without `propose` candidates come from FFT search alone. Searches dearer than `last_ms`,
+        by a rough estimate, are left out.
         """
         self.sheet, self.grid = sheet, sheet.grid
         self.registrar = Registrar(Reference(layer))
         self.confidence, self.radius_m = confidence, radius_m
         self.propose = propose
-        self._floor_px = floor_px
+        self._floor_px, self._last_ms = floor_px, last_ms
 
     def locate(
         self,
@@ -182,14 +185,16 @@ class RegistrationLocalizer:
             rows = self._tiles(view, prior)
             tiles_ms = self._tiles_ms(view, rows, len(poses))
             ways = sorted([(coarse_ms, False), (tiles_ms, True)])
-            if look_ms <= LAST_MS:
-                ways = ways[:1]
-            for cost_ms, from_tiles in ways:
-                if from_tiles and self.propose is not None and math.isfinite(cost_ms):
+            # The cheapest always, whatever it costs; a second one only where it can be afforded.
+            dearest = 0.0 if look_ms <= self._last_ms else self._last_ms
+            for number, (cost_ms, from_tiles) in enumerate(ways):
+                if number and cost_ms > dearest:
+                    break
+                if from_tiles and self.propose is not None:
                     yield coarse, self.propose.candidates(view.rectified_at(0), poses, rows)
-                elif not from_tiles and (cost_ms <= LAST_MS or self.propose is None):
+                else:
                     yield coarse, self._searched(view, prior, coarse, poses)
-        if look_ms <= LAST_MS:
+        if look_ms <= max(self._last_ms, LOOK_MS):
             yield look, self._searched(view, prior, look, poses)
 
     def _tiles(self, view: _View, prior: Prior | None) -> NDArray[np.intp] | None:
@@ -298,7 +303,7 @@ def _pose_prior(telemetry: Telemetry, heading_known: bool) -> PosePrior:
     return PosePrior(
         math.radians(telemetry.yaw_deg) if heading_known else None,
         math.radians(min(max(yaw_std, MIN_YAW_STD_DEG), 90.0)),
-        min(max(_or_default(agl_std, DEFAULT_AGL_STD), MIN_AGL_STD), 0.5),
+        min(max(_or_default(agl_std, DEFAULT_AGL_STD), MIN_AGL_STD), MAX_AGL_STD),
     )
 
 

@@ -29,7 +29,14 @@ from orthonav.mapfile.manifest import Manifest, SheetInfo
 from orthonav.mapfile.reader import MapFile
 from orthonav.mapfile.writer import write_map
 from orthonav.prepare.blocks import BlockPixels, Preview, blocks_of, read_block
-from orthonav.prepare.calibrate import RADIUS_STRIDES, Calibration, Crop, CropSampler, calibrate
+from orthonav.prepare.calibrate import (
+    CROPS,
+    RADIUS_STRIDES,
+    Calibration,
+    Crop,
+    CropSampler,
+    calibrate,
+)
 from orthonav.prepare.calibrate_registration import FLOOR_PX, calibrate_registration
 from orthonav.prepare.layer import CHUNK_PX, GreyLayerWriter
 from orthonav.search.exact import ExactIndex
@@ -43,6 +50,9 @@ PREVIEW_PX = 384
 MIN_TILE_VALID_SHARE = 0.5
 MIN_VIEW_VALID_SHARE = 0.4
 HEADING_STEP_DEG = 6.0
+SEARCH_MS = 40.0
+"""Dearest search of a view while the confidence is learnt, by estimate: there are many views."""
+MAX_CALIBRATION_VIEWS = 2 * CROPS
 RADIUS_PX = 10.0
 MIN_RADIUS_M = 35.0
 """A registered view is right within so many pixels or metres: cameras lean more than told."""
@@ -54,7 +64,8 @@ class BuildRequest:
     """What to build. `bounds_deg` is west, south, east, north; with neither it nor a route, the
     whole imagery is the area. `gsd_m` None takes that of the finest orthophoto. With
     `registration` the map carries the grey picture that places views below tile size;
-    `other_dates` are orthophotos of the same ground to learn the confidence from."""
+    `other_dates` are orthophotos of the same ground to learn the confidence from, besides
+    `calibration_views` views made of the reference itself."""
 
     orthos: Sequence[Path]
     out: Path
@@ -69,6 +80,7 @@ class BuildRequest:
     seed: int = 0
     registration: bool = True
     other_dates: Sequence[Path] = ()
+    calibration_views: int = 48
 
 
 @dataclass(frozen=True)
@@ -97,6 +109,11 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     grid = _grid(request, area, mosaic)
     if request.seed < 0:
         raise VariantError(f"seed must be 0 or more, got {request.seed}")
+    if not 1 <= request.calibration_views <= MAX_CALIBRATION_VIEWS:
+        raise VariantError(
+            f"calibration views must be 1 to {MAX_CALIBRATION_VIEWS}, "
+            f"got {request.calibration_views}"
+        )
     sampler = CropSampler(grid.tile_px, request.seed)
     layer = GreyLayerWriter(grid.height_px, grid.width_px) if request.registration else None
     cells, preview = _read_cells(mosaic, area, grid, representation, sampler, layer, report)
@@ -164,11 +181,15 @@ def _registration(
         representation,
         TileNeighbours(sheet.grid, arrays["sheet0/centres_en_m"]),
     )
-    localizer = RegistrationLocalizer(sheet, layer, None, radius_m, FLOOR_PX, propose)
+    localizer = RegistrationLocalizer(
+        sheet, layer, None, radius_m, FLOOR_PX, propose, last_ms=SEARCH_MS
+    )
     later = [crop for each in other_dates for crop in _crops_of(each, area, sheet.grid, sampler)]
     if other_dates and not later:
         log.warning("the other dates do not cover the area: nothing can be learnt from them")
-    learnt = calibrate_registration(localizer, sampler.crops, later, request.seed, report)
+    learnt = calibrate_registration(
+        localizer, sampler.crops, later, request.calibration_views, request.seed, report
+    )
     if learnt.confidence is None:
         log.warning("too little imagery to calibrate registration: fixes will have no confidence")
     return {

@@ -22,7 +22,6 @@ from orthonav.prepare.calibrate import Crop
 from orthonav.prepare.change import changed
 from orthonav.records import NoFix, Telemetry
 
-VIEWS = 64
 YAW_STD_DEG = 5.0
 AGL_STD = 0.05
 FOCAL_PX = 1000.0
@@ -56,15 +55,16 @@ def calibrate_registration(
     localizer: RegistrationLocalizer,
     crops: Sequence[Crop],
     other_dates: Sequence[Crop],
+    views: int,
     seed: int,
     report: Callable[[str, float], None],
 ) -> RegistrationCalibration:
     """Place changed, mirrored and other-date views and fit the confidence to the outcome."""
     rng = np.random.default_rng([seed, 3])
-    chosen = [crops[i] for i in rng.permutation(len(crops))[:VIEWS]]
-    later = [other_dates[i] for i in rng.permutation(len(other_dates))[:VIEWS]]
+    chosen = [crops[i] for i in rng.permutation(len(crops))[:views]]
+    later = [other_dates[i] for i in rng.permutation(len(other_dates))[:views]]
     work = [(crop, False, False) for crop in chosen] + [(crop, False, True) for crop in later]
-    work += [(crop, True, False) for crop in (later or chosen)[: VIEWS // 2]]
+    work += [(crop, True, False) for crop in (later or chosen)[: views // 2]]
     outcomes = []
     for done, (crop, mirror, other_date) in enumerate(work):
         # What replaces parts of a view is mirrored: as it is, it would be found where it is from.

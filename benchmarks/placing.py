@@ -1,0 +1,166 @@
+"""A process that places the views of a flight by one method and tells errors, times and memory.
+
+It imports nothing but what it measures. `python -m benchmarks.placing JSON` prints JSON.
+"""
+
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+BOTH, TILES, REGISTRATION = OWN = "both", "tiles", "registration"
+TEMPLATE, CANNY, PHASE, MUTUAL, SIFT = "template", "canny", "phase", "mutual", "sift"
+
+
+@dataclass(frozen=True)
+class Task:
+    """What to place and how: `pixels` and `factor` (map pixels averaged to one) are for methods
+    that are not orthonav's, `told_only` tries no other pose than the told one."""
+
+    method: str
+    map_path: str
+    flight: str
+    heading_known: bool = True
+    use_prior: bool = False
+    pixels: str = ""
+    factor: int = 1
+    told_only: bool = False
+    views: int | None = None
+
+
+def placed(task: Task) -> dict[str, Any]:
+    """Run a task in a process of its own."""
+    command = [sys.executable, "-m", "benchmarks.placing", json.dumps(asdict(task))]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
+    told: dict[str, Any] = json.loads(done.stdout)
+    return told
+
+
+def run(task: Task) -> dict[str, Any]:
+    """Place every view, the first one twice: cold, and again when warm.
+
+    `rows` hold east and north error in m, confidence, radius in m, the covariance's three numbers
+    and the time in ms; NaN where there is none.
+    """
+    import cv2
+
+    from benchmarks.child import peak_memory_mb
+    from benchmarks.flights import read_views
+    from orthonav.mapfile import open_map
+
+    if task.method in OWN:
+        import orthonav.localizer  # noqa: F401  opening a map is timed, importing is not
+
+    cv2.setNumThreads(1)
+    cv2.setRNGSeed(0)
+    camera, views = read_views(Path(task.flight))
+    start = time.perf_counter()
+    place = _method(task)
+    opened_ms = 1e3 * (time.perf_counter() - start)
+    frame = open_map(Path(task.map_path)).manifest.sheets[0].frame
+    cold_ms, rows = math.nan, []
+    for number, view in enumerate(views):
+        if number == task.views:
+            break
+        if number == 0:
+            cold_ms = _timed(place, camera, view)[1]
+        found, took_ms = _timed(place, camera, view)
+        rows.append([*row_of(found, frame, view.truth_latlon_deg), took_ms])
+    return {
+        "rows": rows,
+        "opened_ms": opened_ms,
+        "cold_ms": cold_ms,
+        "peak_mb": peak_memory_mb(),
+    }
+
+
+Placer = Callable[[Any, Any], Any]
+
+
+def _timed(place: Placer, camera: Any, view: Any) -> tuple[Any, float]:
+    start = time.perf_counter()
+    found = place(camera, view)
+    return found, 1e3 * (time.perf_counter() - start)
+
+
+def row_of(found: Any, frame: Any, truth_latlon_deg: tuple[float, float]) -> list[float]:
+    """East and north error, confidence, radius, three numbers of the covariance."""
+    from orthonav.records import Fix, NoFix
+
+    nothing = [math.nan] * 7
+    truth = frame.en_from_latlon(*truth_latlon_deg)
+    if found is None or isinstance(found, NoFix):
+        return nothing
+    if not isinstance(found, Fix):
+        return [*(float(v) for v in found - truth), *nothing[2:]]
+    error = frame.en_from_latlon(found.lat_deg, found.lon_deg) - truth
+    cov = found.cov_en_m2
+    spread = [cov[0, 0], cov[0, 1], cov[1, 1]]
+    return [float(v) for v in (*error, found.confidence, found.radius_m, *spread)]
+
+
+def _method(task: Task) -> Placer:
+    return _orthonav(task) if task.method in OWN else _other(task)
+
+
+def _orthonav(task: Task) -> Placer:
+    from orthonav.localizer import Localizer
+    from orthonav.mapfile import open_map
+
+    localizer = Localizer(open_map(Path(task.map_path)), registration=task.method != TILES)
+    if task.method == REGISTRATION:
+        without_tiles(localizer)
+
+    def place(camera: Any, view: Any) -> Any:
+        return localizer.locate(
+            view.grey,
+            camera,
+            view.telemetry,
+            prior=view.telemetry.prior if task.use_prior else None,
+            heading_known=task.heading_known,
+        )
+
+    return place
+
+
+def without_tiles(localizer: Any) -> None:
+    """Registration that searches the whole sheet by FFT and never asks for tiles."""
+    if hasattr(localizer.registration, "propose"):
+        localizer.registration.propose = None
+
+
+def _other(task: Task) -> Placer:
+    from benchmarks import posed
+
+    picture = posed.Picture.read(Path(task.map_path), Path(task.pixels), task.factor)
+    method: Any
+    if task.method == SIFT:
+        method = posed.Sift(picture)
+    else:
+        surfaces: dict[str, Callable[[], Any]] = {
+            TEMPLATE: lambda: posed.TemplateSurface(picture, False),
+            CANNY: lambda: posed.TemplateSurface(picture, True),
+            PHASE: lambda: posed.PhaseSurface(picture),
+            MUTUAL: lambda: posed.MutualSurface(picture),
+        }
+        method = posed.BestOfPoses(picture, surfaces[task.method](), task.told_only)
+
+    def place(camera: Any, view: Any) -> Any:
+        return method.locate(camera, view, task.heading_known)
+
+    return place
+
+
+if __name__ == "__main__":
+    for name in THREADS:
+        os.environ[name] = "1"
+    print(json.dumps(run(Task(**json.loads(sys.argv[1])))))

@@ -1,0 +1,236 @@
+"""A bank of poses: close to turning, representing and embedding the view anew for each of them."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from orthonav import represent
+from orthonav.embed.bank import CHUNK_POSES, embed_poses
+from orthonav.embed.cells import CellLayout
+from orthonav.embed.whitened import CellSheet, WhitenedRecipe, learn
+from orthonav.variants import make_variant
+
+TILE_PX = 128
+GROUND_PX = 640
+MIDDLE = GROUND_PX / 2
+WHOLE = (256, 341)
+STEP_RAD, SCALE_STEP = math.radians(8), 0.13
+
+
+def ground(seed=0):
+    """Grey levels with detail of several sizes."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros((GROUND_PX, GROUND_PX), np.float32)
+    for sigma in (2.0, 5.0, 15.0):
+        noise = rng.normal(size=total.shape).astype(np.float32)
+        blots = cv2.GaussianBlur(noise, (0, 0), sigma)
+        total += blots / blots.std()
+    return np.clip(128 + 35 * total, 0, 255).astype(np.uint8)
+
+
+def warped(picture, shape, linear, at, flags=cv2.INTER_LINEAR):
+    """Picture of `shape` whose point u px from its middle shows `at + linear @ u` of another."""
+    height, width = shape
+    half = np.array([width / 2, height / 2])
+    move = np.asarray(at) - linear @ half + linear @ [0.5, 0.5] - 0.5
+    matrix = np.column_stack([linear, move])
+    return cv2.warpAffine(picture, matrix, (width, height), flags=flags | cv2.WARP_INVERSE_MAP)
+
+
+def linear_of(turn, log_scale):
+    cos, sin = math.cos(turn), math.sin(turn)
+    return math.exp(log_scale) * np.array([[cos, -sin], [sin, cos]])
+
+
+class Place:
+    """Ground with tiles every 16 px, and an embedder learnt on them."""
+
+    def __init__(self, name="gradient", cells=8):
+        self.representation = make_variant(represent.TABLE, name)
+        self.grey = ground()
+        valid = np.ones(self.grey.shape, bool)
+        maps = self.representation(self.grey, valid)
+        self.sheet = CellSheet(CellLayout.for_tiles(TILE_PX, 16), *self.grey.shape, len(maps))
+        self.sheet.fill(0, 0, maps, valid)
+        along = np.arange(0, GROUND_PX - TILE_PX + 1, 16)
+        self.tiles_px = np.stack(np.meshgrid(along, along, indexing="ij"), axis=-1).reshape(-1, 2)
+        self.embedder = learn(WhitenedRecipe(cells=cells, dims=64), self.sheet, self.tiles_px)
+        self.tiles = self.embedder.tiles(self.sheet, self.tiles_px).astype(np.float32)
+        self.middle_tile = int(np.flatnonzero((self.tiles_px == 256).all(axis=1))[0])
+
+    def view(self, turn, log_scale, shape=WHOLE):
+        """What a camera over the middle sees, its top at the top, as told without scale."""
+        grey = warped(self.grey, shape, linear_of(turn, log_scale), (MIDDLE, MIDDLE))
+        return grey, np.ones(shape, bool)
+
+    def slow(self, grey, valid, turn, log_scale):
+        """The embedding of a view turned north up as a picture."""
+        height, width = grey.shape
+        linear, at = np.linalg.inv(linear_of(turn, log_scale)), (width / 2, height / 2)
+        square = (TILE_PX, TILE_PX)
+        seen = warped(valid.astype(np.uint8), square, linear, at, cv2.INTER_NEAREST) > 0
+        north_up = np.where(seen, warped(grey, square, linear, at), 0).astype(np.uint8)
+        return self.embedder.view(self.representation(north_up, seen), seen)
+
+    def bank(self, grey, valid, poses):
+        return embed_poses(self.embedder, self.representation, grey, valid, poses, TILE_PX)
+
+    def likeness(self, grey, valid, poses):
+        """Cosines (Q,) of bank and slow path."""
+        slow = np.stack([self.slow(grey, valid, *pose) for pose in poses])
+        return np.einsum("qd,qd->q", self.bank(grey, valid, poses), slow)
+
+
+@pytest.fixture(scope="module")
+def place():
+    return Place()
+
+
+def random_poses(count, scale=0.26, seed=0):
+    rng = np.random.default_rng(seed)
+    turns, scales = rng.uniform(-7, 7, count), rng.uniform(-scale, scale, count)
+    return list(zip(turns.tolist(), scales.tolist(), strict=True))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(-math.pi, math.pi), st.floats(-0.26, 0.26))
+def test_under_its_true_pose_a_view_looks_like_its_tile(place, turn, log_scale):
+    grey, valid = place.view(turn, log_scale)
+    seen = place.bank(grey, valid, [(turn, log_scale)])[0]
+    scores = place.tiles @ seen
+    assert scores.argmax() == place.middle_tile and scores[place.middle_tile] > 0.85
+
+
+@pytest.mark.parametrize("turn", [0.7, 2.0, -1.2])
+@pytest.mark.parametrize("log_scale", [-0.26, 0.13])
+def test_of_a_whole_bank_the_true_pose_wins(place, turn, log_scale):
+    """So the turn of the picture and that of the phases have the right sign, each."""
+    grey, valid = place.view(turn, log_scale)
+    poses = [
+        (turn + k * STEP_RAD, log_scale + j * SCALE_STEP) for j in range(-2, 3) for k in range(45)
+    ]
+    scores = place.bank(grey, valid, poses) @ place.tiles[place.middle_tile]
+    assert poses[int(scores.argmax())] == (turn, log_scale)
+
+
+def test_close_to_the_slow_path(place):
+    poses = random_poses(100)
+    likeness = place.likeness(*place.view(0.4, 0.0), poses)
+    assert np.median(likeness) > 0.97 and likeness.min() > 0.9
+
+
+def test_without_turn_or_scale_it_is_the_slow_path(place):
+    assert place.likeness(*place.view(0.4, 0.0, (128, 128)), [(0.0, 0.0)])[0] > 0.9999
+
+
+@pytest.mark.parametrize("name, least", [("gray", 0.98), ("canny", 0.5)])
+def test_one_channel_is_only_turned(name, least):
+    """Which edges Canny finds depends on their direction: there the bank is a poor stand-in."""
+    place = Place(name, cells=16)
+    likeness = place.likeness(*place.view(0.4, 0.0), random_poses(30, scale=0.13))
+    assert np.median(likeness) > least
+    grey, valid = place.view(2.0, 0.1)
+    seen = place.bank(grey, valid, [(2.0, 0.1)])[0]
+    assert (place.tiles @ seen).argmax() == place.middle_tile
+
+
+@pytest.mark.parametrize("shape", [WHOLE, (128, 171), (80, 107), (107, 80), (81, 201)])
+def test_views_are_no_less_like_their_tile_than_by_the_slow_path(place, shape):
+    """More so where they cover part of a tile: turned as a picture, a view loses its border."""
+    truth, bank, slow = place.tiles[place.middle_tile], [], []
+    for pose in random_poses(30, scale=0.13, seed=3):
+        grey, valid = place.view(*pose, shape)
+        bank.append(place.bank(grey, valid, [pose])[0])
+        slow.append(place.slow(grey, valid, *pose))
+    assert np.median(bank @ truth) > np.median(slow @ truth)
+    found, found_slow = (
+        np.mean((some @ place.tiles.T).argmax(axis=1) == place.middle_tile)
+        for some in (np.array(bank), np.array(slow))
+    )
+    assert found >= found_slow
+
+
+def test_what_is_not_valid_does_not_count(place):
+    grey, valid = place.view(1.0, 0.1)
+    valid[:, :150] = False
+    hidden = np.where(valid, grey, 0).astype(np.uint8)
+    poses = random_poses(40, scale=0.13)
+    assert np.median(place.likeness(hidden, valid, poses)) > 0.9
+    other = np.where(valid, grey, 255 - grey[::-1]).astype(np.uint8)
+    np.testing.assert_allclose(
+        place.bank(hidden, valid, poses), place.bank(other, valid, poses), atol=1e-4
+    )
+
+
+def test_what_lies_beyond_the_poses_changes_nothing(place):
+    poses = random_poses(20)
+    large, small = (place.view(0.4, 0.0, shape) for shape in [(500, 560), (260, 280)])
+    assert np.einsum("qd,qd->q", place.bank(*large, poses), place.bank(*small, poses)).min() > 0.995
+
+
+def test_poses_do_not_depend_on_each_other(place):
+    grey, valid = place.view(0.4, 0.0, (120, 150))
+    poses = random_poses(2 * CHUNK_POSES + 3)
+    together = place.bank(grey, valid, poses)
+    alone = np.concatenate([place.bank(grey, valid, [pose]) for pose in poses])
+    # The reach of the farthest pose decides what is cut off, so micro-cells may begin elsewhere.
+    assert np.einsum("qd,qd->q", together, alone).min() > 0.99
+    np.testing.assert_array_equal(together, place.bank(grey, valid, poses))
+
+
+def test_inputs_stay_as_they_are(place):
+    grey, valid = place.view(0.4, 0.0)
+    grey.flags.writeable = valid.flags.writeable = False
+    out = place.bank(grey, valid, random_poses(3))
+    assert out.dtype == np.float32 and out.shape == (3, place.embedder.dims)
+    np.testing.assert_allclose(np.linalg.norm(out, axis=1), 1, atol=1e-5)
+
+
+def test_no_poses(place):
+    assert place.bank(*place.view(0.0, 0.0), []).shape == (0, place.embedder.dims)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 200), (256, 341)])
+def test_views_without_content_are_finite(place, shape):
+    poses = [*random_poses(3), (0.0, 4.0), (0.0, -4.0)]
+    grey = np.full(shape, 77, np.uint8)
+    assert not place.bank(grey, np.zeros(shape, bool), poses).any()
+    assert np.isfinite(place.bank(grey, np.ones(shape, bool), poses)).all()
+
+
+class TwoChannels:
+    channels, margin_px = 2, 0
+
+    def __call__(self, grey, valid):
+        raise AssertionError("not to be called")
+
+
+def test_what_cannot_be_turned_is_refused(place):
+    grey, valid = place.view(0.0, 0.0)
+    with pytest.raises(ValueError, match="multiple of 32"):
+        embed_poses(place.embedder, place.representation, grey, valid, [(0.0, 0.0)], 100)
+    with pytest.raises(ValueError, match="odd"):
+        embed_poses(place.embedder, TwoChannels(), grey, valid, [(0.0, 0.0)], TILE_PX)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.7, 0.3, 0.05])
+def test_many_cells_at_once_give_what_one_view_gives(place, share):
+    """The solution for missing cells comes in few steps, and close enough."""
+    valid = np.ones((TILE_PX, TILE_PX), bool)
+    valid[:, round(share * TILE_PX) :] = False
+    views, cells, shares = [], [], []
+    pooling = place.embedder.recipe.pooling
+    for row, col in place.tiles_px[::97]:
+        grey = place.grey[row : row + TILE_PX, col : col + TILE_PX]
+        maps = place.representation(grey, valid)
+        views.append(place.embedder.view(maps, valid))
+        sheet = CellSheet(CellLayout(4, 4), TILE_PX, TILE_PX, len(maps))
+        sheet.fill(0, 0, maps, valid)
+        cells.append(np.einsum("ai,ijc,bj->abc", pooling, sheet.means, pooling))
+        shares.append(pooling @ sheet.valid @ pooling.T)
+    many = place.embedder.cells(np.array(cells), np.array(shares))
+    np.testing.assert_allclose(np.einsum("qd,qd->q", many, views), 1, atol=1e-3)

@@ -1,0 +1,545 @@
+"""Views on a map whose ground is known at every point: found to a fraction of a pixel, or refused.
+
+The views are rendered by code that shares nothing with the program.
+"""
+
+import math
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from orthonav.confidence.registered import Chances, RegisteredConfidence
+from orthonav.geo.area import Area
+from orthonav.geo.camera import Camera
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.localizer import Localizer
+from orthonav.mapfile import GreyLayer, open_map
+from orthonav.mapfile.layer import part_names
+from orthonav.onboard.run import locate_view
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.prepare.calibrate_registration import RegistrationCalibration
+from orthonav.records import Fix, NoFix, Prior, Telemetry
+
+SIDE_M = 620
+CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
+LENS = replace(CAMERA, distortion=(-0.25, 0.06, 0.001, -0.002))
+AGL_M = 150.0
+FINEST_M = 0.5
+EVIDENCE = {"score", "strength", "rival", "look", "look_rival", "peak_ratio", "look_ratio"}
+EVIDENCE |= {"gradient_correlation", "grey_correlation", "agreement", "overlap", "candidates"}
+
+
+class Ground:
+    """Grey levels of a ground of blots of many sizes, by metres east and north of its middle."""
+
+    def __init__(self, seed=0, reach_m=560.0):
+        rng = np.random.default_rng(seed)
+        side = int(reach_m / FINEST_M) * 2
+        self._grey = np.full((side, side), 128, np.float32)
+        for sigma_m in (1.5, 4.0, 12.0):
+            small = cv2.GaussianBlur(
+                rng.standard_normal((side, side), np.float32), (0, 0), sigma_m / FINEST_M
+            )
+            self._grey += 17 * small / small.std()
+        self._reach_m = reach_m
+
+    def __call__(self, east_m, north_m):
+        """The table is far finer than what it holds: a cubic spline between its pixels is it."""
+        col, row = self._reach_m + np.asarray(east_m), self._reach_m - np.asarray(north_m)
+        index = [np.float32(each / FINEST_M - 0.5) for each in (col, row)]
+        return cv2.remap(self._grey, *index, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+
+
+def as_grey(values):
+    return np.rint(np.clip(values, 0, 255)).astype(np.uint8)
+
+
+def rendered(ground, place_en_m, attitude, agl_m=AGL_M, camera=CAMERA):
+    """What the camera sees (H, W) uint8: forward-right-down body, Z-Y-X angles."""
+    cols, rows = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
+    matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
+    seen = np.stack([cols, rows], axis=-1).reshape(-1, 1, 2)
+    lens = np.array(camera.distortion or (0.0, 0, 0, 0))
+    right, down = cv2.undistortPoints(seen, matrix, lens)[:, 0].T
+    body = np.stack([-down, right, np.ones_like(right)], axis=-1)
+    ned = Rotation.from_euler("ZYX", attitude, degrees=True).apply(body)
+    north, east = (np.reshape(ned[:, i] / ned[:, 2] * agl_m, cols.shape) for i in (0, 1))
+    return as_grey(ground(place_en_m[0] + east, place_en_m[1] + north))
+
+
+GROUND = Ground()
+
+
+@pytest.fixture(scope="module")
+def ortho(make_ortho, tmp_path_factory):
+    """An orthophoto of the ground, and the plane of a map of it."""
+    import pyproj
+
+    folder = tmp_path_factory.mktemp("ortho")
+    empty = np.ones((SIDE_M, SIDE_M), np.uint8)
+    path = make_ortho(folder / "2020-05.tif", empty)
+    outline = Mosaic.open([path]).outline_latlon_deg
+    frame = Area.from_outline(outline[:, 0], outline[:, 1]).frame
+    x, y = np.meshgrid(np.arange(SIDE_M) + 700_000.5, 6_599_999.5 - np.arange(SIDE_M))
+    to_degrees = pyproj.Transformer.from_crs("EPSG:2154", "EPSG:4326", always_xy=True)
+    lon, lat = to_degrees.transform(x.ravel(), y.ravel())
+    east, north = np.reshape(frame.en_from_latlon(lat, lon).T, (2, SIDE_M, SIDE_M))
+    make_ortho(path, as_grey(GROUND(east, north)))
+    return path, frame
+
+
+@pytest.fixture(scope="module")
+def map_path(ortho, tmp_path_factory):
+    """A map of it with 1 m pixels; its confidence is as maps of its kind learn it."""
+    path = tmp_path_factory.mktemp("map") / "area.onav"
+    confidence = RegisteredConfidence(-3.5, (0.5, 12.0, 3.0), Chances(18.0, 16.0, 30.0))
+    learnt = RegistrationCalibration(confidence, 0.6)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("orthonav.prepare.calibrate.CROPS", 16)
+        patch.setattr("orthonav.prepare.build.calibrate_registration", lambda *_: learnt)
+        build_map(BuildRequest([ortho[0]], path, tile_px=128, overlap=0.75, gsd_m=1.0))
+    return path
+
+
+@pytest.fixture(scope="module")
+def localizer(map_path, ortho):
+    made = Localizer(open_map(map_path))
+    offset = made.sheet.frame.en_from_latlon(ortho[1].lat_deg, ortho[1].lon_deg)
+    assert made.registration is not None and np.hypot(*offset) < 1e-3
+    return made
+
+
+def place_of(localizer, fix):
+    return localizer.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
+
+
+def error_m(localizer, fix, place_en_m):
+    assert isinstance(fix, Fix), fix
+    return float(np.hypot(*(place_of(localizer, fix) - place_en_m)))
+
+
+def prior_at(localizer, place_en_m, std_m):
+    lat, lon = localizer.sheet.frame.latlon_from_en(place_en_m)
+    return Prior(float(lat), float(lon), std_m)
+
+
+def turned_deg(one, other):
+    return (one - other + 180) % 360 - 180
+
+
+def telemetry(yaw_deg=0.0, pitch_deg=0.0, roll_deg=0.0, agl_m=AGL_M, **more):
+    return Telemetry(0, yaw_deg, pitch_deg, roll_deg, agl_m, **more)
+
+
+def located(
+    localizer, place_en_m, attitude=(0.0, 0.0, 0.0), camera=CAMERA, agl_m=AGL_M, **keywords
+):
+    """Where a view is placed whose telemetry is right."""
+    grey = rendered(GROUND, place_en_m, attitude, agl_m, camera)
+    return localizer.locate(grey, camera, telemetry(*attitude, agl_m), **keywords)
+
+
+PLACES = [(-120.0, 95.0), (60.3, -110.7), (133.1, 140.2), (-30.0, 5.5), (10.0, -80.0)]
+HEADINGS = [0.0, 77.0, 181.0, -100.0, 290.0]
+
+
+@pytest.fixture(scope="module")
+def plain(localizer):
+    """A view like any other: grey levels, telemetry, place and fix."""
+    place = np.array([40.0, -25.0])
+    grey, told = rendered(GROUND, place, (33.0, 0.0, 0.0)), telemetry(33.0)
+    grey.flags.writeable = False
+    return grey, told, place, localizer.locate(grey, CAMERA, told)
+
+
+@pytest.mark.parametrize("place, yaw_deg", list(zip(PLACES, HEADINGS, strict=True)))
+def test_a_view_is_placed_to_a_fraction_of_a_pixel(localizer, place, yaw_deg):
+    """Heading and height come out right although they were told wrong."""
+    rng = np.random.default_rng(abs(int(yaw_deg)))
+    agl_m = AGL_M * rng.uniform(0.85, 1.15)
+    grey = rendered(GROUND, place, (yaw_deg, 0, 0), agl_m)
+    told = telemetry(yaw_deg + rng.normal(0, 4), agl_m=agl_m * rng.normal(1, 0.04))
+    fix = localizer.locate(grey, CAMERA, told)
+    assert error_m(localizer, fix, place) < 0.1
+    assert abs(turned_deg(fix.heading_deg, yaw_deg)) < 0.1 and 0 <= fix.heading_deg < 360
+    assert fix.agl_m == pytest.approx(agl_m, rel=0.002)
+    assert fix.confidence > 0.9 and fix.evidence["score"] > 0.85
+
+
+def test_a_fix_says_what_it_rests_on(localizer, plain):
+    fix = plain[3]
+    assert set(fix.evidence) >= EVIDENCE and fix.radius_m == localizer.registration.radius_m
+    assert all(math.isfinite(fix.evidence[name]) for name in EVIDENCE)
+    assert fix.evidence["overlap"] == pytest.approx(1) and fix.evidence["agreement"] > 0.9
+    assert fix.evidence["strength"] > fix.evidence["rival"] > 0
+    with pytest.raises(TypeError):
+        fix.evidence["score"] = 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        fix.cov_en_m2[0, 0] = 0.0
+
+
+def test_covariances_are_symmetric_and_positive(localizer, plain):
+    fixes = [plain[3], located(localizer, (0.0, 0.0), (120.0, 14.0, -11.0))]
+    for fix in fixes:
+        np.testing.assert_allclose(fix.cov_en_m2, fix.cov_en_m2.T)
+        deviations = np.sqrt(np.linalg.eigvalsh(fix.cov_en_m2))
+        assert deviations.min() > 0.59 and deviations.max() < 5  # the floor is not undercut
+    assert np.trace(fixes[1].cov_en_m2) > np.trace(fixes[0].cov_en_m2)
+
+
+def test_another_floor_widens_the_covariance(localizer, map_path, plain):
+    grey, told, _, fix = plain
+    wide = Localizer(open_map(map_path))
+    floors_m2 = (wide.registration._floor_px * wide.grid.gsd_m) ** 2, (3 * wide.grid.gsd_m) ** 2
+    wide.registration._floor_px = 3.0
+    widened = wide.locate(grey, CAMERA, told).cov_en_m2 - fix.cov_en_m2
+    np.testing.assert_allclose(widened, np.eye(2) * (floors_m2[1] - floors_m2[0]), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "yaw_deg, along", [(0, (0, 1)), (90, (1, 0)), (45, (1, 1)), (-45, (-1, 1))]
+)
+def test_a_view_blurred_by_motion_is_known_across_it_only(map_path, yaw_deg, along):
+    """East and north, with the right sign of what they have in common."""
+    exact = Localizer(open_map(map_path))
+    exact.registration._floor_px = 0.0
+    grey = cv2.blur(rendered(GROUND, (0.0, 0.0), (yaw_deg, 0.0, 0.0)), (1, 25))
+    fix = exact.locate(grey, CAMERA, telemetry(float(yaw_deg)))
+    assert error_m(exact, fix, (0.0, 0.0)) < 1.0
+    _, axes = np.linalg.eigh(fix.cov_en_m2)
+    assert abs(axes[:, 1] @ along) / np.hypot(*along) > 0.95
+    variances = np.linalg.eigvalsh(fix.cov_en_m2)
+    assert variances[1] > 5 * variances[0]
+
+
+@pytest.mark.parametrize("attitude", [(0, 10, -8), (75, 10, -8), (200, -12, 9), (310, 0, 20)])
+def test_the_place_is_that_of_the_camera(localizer, attitude):
+    """Not of what it looks at, which lies up to 55 m away."""
+    attitude = tuple(map(float, attitude))
+    place = np.array([-20.0, 30.0])
+    fix = located(localizer, place, attitude)
+    assert error_m(localizer, fix, place) < 0.15
+    assert abs(turned_deg(fix.heading_deg, attitude[0])) < 0.1
+    assert fix.agl_m == pytest.approx(AGL_M, rel=0.002)
+
+
+def test_a_tilted_view_whose_heading_and_height_are_told_wrong(localizer):
+    place, yaw_deg = np.array([15.0, -40.0]), 140.0
+    grey = rendered(GROUND, place, (yaw_deg, 10.0, -8.0), 160.0)
+    fix = localizer.locate(grey, CAMERA, telemetry(yaw_deg + 5, 10.0, -8.0, 150.0))
+    assert error_m(localizer, fix, place) < 0.15
+    assert abs(turned_deg(fix.heading_deg, yaw_deg)) < 0.1
+    assert fix.agl_m == pytest.approx(160.0, rel=0.002)
+
+
+@pytest.mark.parametrize("attitude", [(0.0, 0.0, 0.0), (160.0, -9.0, 6.0)])
+def test_a_lens_is_undone(localizer, attitude):
+    fix = located(localizer, (25.0, 60.0), attitude, LENS)
+    assert error_m(localizer, fix, (25.0, 60.0)) < 0.15
+    assert fix.evidence["score"] > 0.85
+    grey = rendered(GROUND, (25.0, 60.0), attitude, camera=LENS)
+    unknown = localizer.locate(grey, CAMERA, telemetry(*attitude))
+    assert not isinstance(unknown, Fix) or unknown.evidence["score"] < fix.evidence["score"] - 0.05
+
+
+@pytest.mark.parametrize(
+    "size, agl_m", [((1280, 960), AGL_M), ((640, 480), 300.0), ((160, 120), 90.0)]
+)
+def test_other_pictures_of_the_ground(localizer, size, agl_m):
+    """Finer than the map, of more ground, of less."""
+    camera = CAMERA.resized(*size)
+    fix = located(localizer, (-40.0, 22.0), (250.0, 0.0, 0.0), camera, agl_m)
+    assert error_m(localizer, fix, (-40.0, 22.0)) < 0.15
+
+
+def test_the_principal_point_need_not_be_the_middle(localizer):
+    camera = replace(CAMERA, cx_px=130.0, cy_px=150.0)
+    fix = located(localizer, (-40.0, 22.0), (250.0, 0.0, 0.0), camera)
+    assert error_m(localizer, fix, (-40.0, 22.0)) < 0.15
+
+
+@pytest.mark.parametrize("yaw_deg", [3.0, 125.0, 257.0])
+def test_unknown_heading(localizer, yaw_deg):
+    place = np.array([-60.0, 50.0])
+    grey = rendered(GROUND, place, (yaw_deg, 5.0, -4.0))
+    told = telemetry(math.nan, 5.0, -4.0)
+    fix = localizer.locate(grey, CAMERA, told, heading_known=False)
+    assert error_m(localizer, fix, place) < 0.15 and fix.confidence > 0.9
+    assert abs(turned_deg(fix.heading_deg, yaw_deg)) < 0.1
+    refused = localizer.locate(grey, CAMERA, told)
+    assert isinstance(refused, NoFix) and refused.reason == "missing_telemetry"
+    near = localizer.locate(
+        grey, CAMERA, told, heading_known=False, prior=prior_at(localizer, place, 20.0)
+    )
+    assert error_m(localizer, near, place) < 0.15
+
+
+def test_a_heading_told_wrong_is_not_believed_beyond_its_error(localizer):
+    grey = rendered(GROUND, (60.0, -30.0), (40.0, 0.0, 0.0))
+    unsure = localizer.locate(grey, CAMERA, telemetry(75.0, yaw_std_deg=25.0))
+    assert error_m(localizer, unsure, (60.0, -30.0)) < 0.15
+    assert abs(turned_deg(unsure.heading_deg, 40.0)) < 0.1
+    sure = localizer.locate(grey, CAMERA, telemetry(75.0, yaw_std_deg=1.0))
+    assert not isinstance(sure, Fix) or sure.confidence < 0.5
+
+
+def test_a_height_told_wrong_is_made_up_for(localizer):
+    grey = rendered(GROUND, (60.0, -30.0), (40.0, 0.0, 0.0))
+    told = telemetry(40.0, agl_m=AGL_M / 0.82, agl_std_m=20.0)
+    fix = localizer.locate(grey, CAMERA, told)
+    assert error_m(localizer, fix, (60.0, -30.0)) < 0.15
+    assert fix.agl_m == pytest.approx(AGL_M, rel=0.002)
+
+
+@pytest.mark.parametrize("std_m", [5.0, 40.0, 150.0])
+def test_a_prior_near_the_truth_changes_nothing(localizer, plain, std_m):
+    grey, told, place, free = plain
+    prior = prior_at(localizer, place + np.array([0.6, -0.6]) * std_m, std_m)
+    fix = localizer.locate(grey, CAMERA, told, prior=prior)
+    assert place_of(localizer, fix) == pytest.approx(place_of(localizer, free), abs=0.1)
+    assert fix.evidence["strength"] == pytest.approx(free.evidence["strength"], rel=0.02)
+
+
+def test_a_prior_keeps_the_fix_near_it(localizer, plain):
+    grey, told, place, free = plain
+    wrong = place + np.array([-180.0, 120.0])
+    fix = localizer.locate(grey, CAMERA, told, prior=prior_at(localizer, wrong, 20.0))
+    if isinstance(fix, Fix):
+        assert np.abs(place_of(localizer, fix) - wrong).max() < 3 * 20.0 + 25.0
+        assert fix.confidence < 0.5 < free.confidence
+
+
+def test_the_prior_is_of_the_aircraft_not_of_what_it_sees(localizer):
+    place = np.array([-20.0, -60.0])
+    grey = rendered(GROUND, place, (45.0, 30.0, 0.0))
+    told = telemetry(45.0, 30.0, yaw_std_deg=1.0)
+    for heading_known in (True, False):
+        fix = localizer.locate(
+            grey,
+            CAMERA,
+            told,
+            prior=prior_at(localizer, place, 2.0),
+            heading_known=heading_known,
+        )
+        assert error_m(localizer, fix, place) < 0.3
+
+
+@pytest.mark.parametrize("away_en_m", [(50_000.0, 0.0), (0.0, -3000.0), (-900.0, 900.0)])
+def test_a_prior_outside_is_outside_the_map(localizer, plain, away_en_m):
+    outcome = localizer.locate(
+        plain[0], CAMERA, plain[1], prior=prior_at(localizer, away_en_m, 100.0)
+    )
+    assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
+
+
+@pytest.mark.parametrize(
+    "prior", [Prior(math.nan, 3.0, 50.0), Prior(46.0, math.nan, 50.0), Prior(46.5, 3.0, math.nan)]
+)
+def test_a_prior_that_is_not_known_is_no_crash(localizer, plain, prior):
+    outcome = localizer.locate(plain[0], CAMERA, plain[1], prior=prior)
+    assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
+
+
+@pytest.mark.parametrize("place", [(-300.0, 60.0), (40.0, 302.0), (290.0, -10.0)])
+def test_a_view_half_outside_is_found(localizer, place):
+    """Half of what it sees is on the map, and that is enough."""
+    fix = located(localizer, np.array(place), (10.0, 0.0, 0.0))
+    assert error_m(localizer, fix, place) < 0.4
+    assert 0.4 < fix.evidence["overlap"] < 0.7 and fix.evidence["agreement"] > 0.9
+
+
+def test_a_view_from_beyond_the_map_is_not_believed(localizer, plain):
+    """The ground goes on there, but the map does not."""
+    for place in ((-430.0, 60.0), (410.0, 400.0), (30.0, -420.0)):
+        outcome = located(localizer, np.array(place), (33.0, 0.0, 0.0))
+        assert isinstance(outcome, NoFix) or outcome.confidence < 0.3 < plain[3].confidence
+
+
+def noise(blur_px):
+    grey = np.random.default_rng(0).normal(size=(240, 320)).astype(np.float32)
+    grey = cv2.GaussianBlur(grey, (0, 0), blur_px)
+    return as_grey(128 + 40 * grey / grey.std())
+
+
+def mirrored(place_en_m):
+    return np.ascontiguousarray(rendered(GROUND, place_en_m, (33.0, 0.0, 0.0))[:, ::-1])
+
+
+STRANGERS = {
+    "elsewhere": lambda: rendered(Ground(5, 200.0), (0.0, 0.0), (33.0, 0.0, 0.0)),
+    "another elsewhere": lambda: rendered(Ground(6, 200.0), (20.0, 0.0), (33.0, 0.0, 0.0)),
+    "fine noise": lambda: noise(0.5),
+    "coarse noise": lambda: noise(4.0),
+    "mirrored": lambda: mirrored((40.0, -25.0)),
+    "mirrored too": lambda: mirrored((-100.0, 60.0)),
+}
+
+
+@pytest.mark.parametrize(
+    "name, heading_known", [*((name, True) for name in STRANGERS), ("elsewhere", False)]
+)
+def test_a_view_of_elsewhere_is_not_believed(localizer, name, heading_known):
+    told = telemetry(33.0)
+    outcome = localizer.locate(STRANGERS[name](), CAMERA, told, heading_known=heading_known)
+    assert isinstance(outcome, NoFix) or outcome.confidence < 0.5
+
+
+def test_a_narrow_prior_does_not_make_sure(localizer):
+    """With hardly any place to choose from, a wrong one does not look right."""
+    for place in ((40.0, -25.0), (-100.0, 60.0)):
+        prior = prior_at(localizer, np.array(place), 3.0)
+        outcome = localizer.locate(mirrored(place), CAMERA, telemetry(33.0), prior=prior)
+        assert isinstance(outcome, NoFix) or outcome.confidence < 0.5
+
+
+def same(one, other):
+    assert type(one) is type(other)
+    if isinstance(one, NoFix):
+        return (one.reason, one.detail) == (other.reason, other.detail)
+    values = [
+        (f.lat_deg, f.lon_deg, f.confidence, f.heading_deg, f.agl_m, str(dict(f.evidence)))
+        for f in (one, other)
+    ]
+    return values[0] == values[1] and (one.cov_en_m2 == other.cov_en_m2).all()
+
+
+def test_the_same_view_gives_the_same_fix(localizer, map_path, plain):
+    grey, told, _, fix = plain
+    kept = grey.copy()
+    assert same(localizer.locate(grey, CAMERA, told), fix)
+    assert same(Localizer(open_map(map_path)).locate(grey, CAMERA, told), fix)
+    np.testing.assert_array_equal(grey, kept)
+
+
+def test_threads_may_share_a_localizer(localizer, map_path):
+    views = [
+        (rendered(GROUND, place, (yaw, 4.0, 0.0)), telemetry(yaw + 2, 4.0))
+        for place, yaw in zip(PLACES[:4], HEADINGS[:4], strict=True)
+    ]
+    alone = [localizer.locate(grey, CAMERA, told) for grey, told in views]
+    cold = Localizer(open_map(map_path))
+    with ThreadPoolExecutor(2) as pool:
+        shared = list(pool.map(lambda view: cold.locate(view[0], CAMERA, view[1]), views))
+    assert all(same(one, other) for one, other in zip(alone, shared, strict=True))
+
+
+REFUSED = {
+    "no heading": ({"yaw_deg": math.nan}, "missing_telemetry"),
+    "no pitch": ({"pitch_deg": math.nan}, "missing_telemetry"),
+    "no height": ({"agl_m": math.nan}, "missing_telemetry"),
+    "below ground": ({"agl_m": -3.0}, "bad_height"),
+    "leaning": ({"roll_deg": 60.0}, "extreme_tilt"),
+    "far up": ({"agl_m": 1e6}, "too_coarse"),
+    "on the ground": ({"agl_m": 5.0}, "too_small"),
+    "tiny height": ({"agl_m": 1e-300}, "too_small"),
+}
+
+
+@pytest.mark.parametrize("changes, reason", REFUSED.values(), ids=REFUSED.keys())
+def test_telemetry_that_makes_no_fix(localizer, plain, changes, reason):
+    outcome = localizer.locate(plain[0], CAMERA, replace(plain[1], **changes))
+    assert isinstance(outcome, NoFix) and outcome.reason == reason
+    assert outcome.detail and "\n" not in outcome.detail
+
+
+@pytest.mark.parametrize(
+    "grey, reason",
+    [
+        (np.full((240, 320), 128, np.uint8), "blank"),
+        (np.zeros((240, 320), np.uint8), "too_dark"),
+        (np.full((240, 320), 255, np.uint8), "too_bright"),
+        (np.full((16, 16), 99, np.uint8), "too_small"),
+        (np.zeros((1, 1), np.uint8), "too_small"),
+    ],
+)
+def test_pictures_that_make_no_fix(localizer, grey, reason):
+    height, width = grey.shape
+    camera = Camera(width, height, 250.0, 250.0, width / 2, height / 2)
+    outcome = localizer.locate(grey, camera, telemetry())
+    assert isinstance(outcome, NoFix) and outcome.reason == reason
+
+
+ODD = {
+    "heading std": {"yaw_std_deg": math.nan},
+    "huge heading std": {"yaw_std_deg": 1e9},
+    "negative heading std": {"yaw_std_deg": -5.0},
+    "height std": {"agl_std_m": math.inf},
+    "huge height std": {"agl_std_m": 1e9},
+    "negative height std": {"agl_std_m": -20.0},
+    "many turns": {"yaw_deg": 33.0 + 3600},
+}
+
+
+@pytest.mark.parametrize("changes", ODD.values(), ids=ODD.keys())
+def test_odd_telemetry_is_no_crash(localizer, plain, changes):
+    grey, told, place, _ = plain
+    fix = localizer.locate(grey, CAMERA, replace(told, **changes))
+    assert error_m(localizer, fix, place) < 0.5 and 0 <= fix.heading_deg < 360
+
+
+def test_a_strip_of_a_view(localizer):
+    camera = Camera(320, 60, 250.0, 250.0, 160.0, 30.0)
+    fix = located(localizer, (30.0, 30.0), (20.0, 0.0, 0.0), camera)
+    assert error_m(localizer, fix, (30.0, 30.0)) < 0.3
+
+
+def test_without_registration_it_is_placed_by_its_tiles(localizer, map_path, plain):
+    grey, told, place, fix = plain
+    coarse = Localizer(open_map(map_path), registration=False)
+    assert coarse.registration is None
+    tiled = coarse.locate(grey, CAMERA, told)
+    assert error_m(coarse, tiled, place) < coarse.grid.stride_m
+    assert "lowe_ratio" in tiled.evidence and "strength" not in tiled.evidence
+    assert tiled.radius_m == coarse.radius_m and tiled.agl_m == told.agl_m
+    assert error_m(localizer, fix, place) < error_m(coarse, tiled, place)
+
+
+def test_a_map_without_the_layer_is_flown_by_its_tiles(ortho, tmp_path, plain):
+    path = tmp_path / "tiles.onav"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("orthonav.prepare.calibrate.CROPS", 16)
+        request = BuildRequest([ortho[0]], path, tile_px=128, overlap=0.75, gsd_m=1.0)
+        build_map(replace(request, registration=False))
+    opened = open_map(path)
+    assert GreyLayer.of(opened) is None and opened.manifest.registration is None
+    made = Localizer(opened)
+    assert made.registration is None
+    fix = made.locate(plain[0], CAMERA, plain[1])
+    assert error_m(made, fix, plain[2]) < made.grid.stride_m
+
+
+def damaged(map_path, folder):
+    """A copy of the map whose chunks hold no picture, but their sums are right."""
+    from orthonav.mapfile import write_map
+
+    opened = open_map(map_path)
+    arrays = {name: np.array(part) for name, part in opened.arrays.items()}
+    name = part_names(0)["bytes"]
+    arrays[name] = np.zeros_like(arrays[name])
+    shutil.copy(map_path, folder / "damaged.onav")
+    write_map(folder / "damaged.onav", opened.manifest, arrays)
+    return open_map(folder / "damaged.onav")
+
+
+def test_a_damaged_layer_is_no_fix(map_path, tmp_path, plain, caplog):
+    broken = Localizer(damaged(map_path, tmp_path))
+    outcome, latency_ms = locate_view(
+        broken, plain[0], CAMERA, plain[1], use_prior=True, heading_known=True
+    )
+    assert isinstance(outcome, NoFix) and outcome.reason == "internal_error"
+    assert "damaged" in outcome.detail and latency_ms > 0
+    assert any(record.exc_info for record in caplog.records)
+
+
+def test_noise_and_light_move_it_little(localizer):
+    rng = np.random.default_rng(2)
+    for place, yaw_deg in zip(PLACES[:4], HEADINGS[:4], strict=True):
+        clean = rendered(GROUND, place, (yaw_deg, 0.0, 0.0)).astype(float)
+        light = np.linspace(0.6, 1.1, 320)[None] * clean + rng.normal(0, 10, clean.shape)
+        fix = localizer.locate(as_grey(light), CAMERA, telemetry(yaw_deg + 3))
+        assert error_m(localizer, fix, place) < 0.3 and fix.confidence > 0.9

@@ -1,0 +1,231 @@
+"""What a map learns of its own registration: which views to believe, and how dates agree."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from conftest import textured
+from orthonav.geo.frames import LocalFrame
+from orthonav.geo.grid import TileGrid
+from orthonav.localizer.registration import RegistrationLocalizer
+from orthonav.mapfile import SheetInfo, open_map
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.prepare import calibrate_registration as module
+from orthonav.prepare.calibrate import Crop
+from orthonav.prepare.calibrate_registration import (
+    FLOOR_LIMITS_PX,
+    FLOOR_PX,
+    RegistrationCalibration,
+    calibrate_registration,
+)
+from orthonav.prepare.layer import halved
+
+SIDE_PX, TILE_PX = 240, 64
+CROP_PX = round(1.5 * TILE_PX)
+FEW = 14
+
+
+class Pyramid:
+    """A picture at several resolutions, all of it valid."""
+
+    levels = 4
+
+    def __init__(self, grey):
+        self._pictures = [(grey, np.ones(grey.shape, bool))]
+        for _ in range(self.levels - 1):
+            self._pictures.append(halved(*self._pictures[-1]))
+
+    def shape(self, level):
+        return self._pictures[level][0].shape
+
+    def read(self, level, row, col, height, width):
+        far = max(height, width) + 8
+        grey, valid = (np.pad(each, far) for each in self._pictures[level])
+        rows, cols = self.shape(level)
+        top, left = (
+            min(max(at, -far), size + far - side) + far
+            for at, size, side in ((row, rows, height), (col, cols, width))
+        )
+        part = np.s_[top : top + height, left : left + width]
+        return grey[part], valid[part]
+
+
+GREY = textured((SIDE_PX, SIDE_PX))
+
+
+@pytest.fixture(scope="module")
+def localizer():
+    half_m = SIDE_PX / 2
+    grid = TileGrid(-half_m, half_m, 1.0, TILE_PX, 16, 12, 12)
+    assert grid.width_px == grid.height_px == SIDE_PX
+    sheet = SheetInfo(LocalFrame(46.5, 2.5), grid, 144, 0.06)
+    return RegistrationLocalizer(sheet, Pyramid(GREY), None, 10.0, FLOOR_PX)
+
+
+@pytest.fixture(autouse=True)
+def few_will_do(monkeypatch):
+    monkeypatch.setattr(module, "MIN_RIGHT", 6)
+
+
+def crops_of(grey, count=FEW, seed=0, moved_px=(0, 0)):
+    """Crops at random places of `GREY`; what is cut there of `grey` lies `moved_px` beside."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for row, col in rng.integers(8, SIDE_PX - CROP_PX - 8, (count, 2)):
+        y, x = row + moved_px[1], col + moved_px[0]
+        part = grey[y : y + CROP_PX, x : x + CROP_PX]
+        found.append(Crop(part.copy(), float(row + CROP_PX / 2), float(col + CROP_PX / 2)))
+    return found
+
+
+def calibrated(localizer, crops, later=(), seed=0, report=lambda stage, share: None):
+    return calibrate_registration(localizer, crops, list(later), FEW, seed, report)
+
+
+@pytest.fixture(scope="module")
+def learnt(localizer):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "MIN_RIGHT", 6)
+        return calibrated(localizer, crops_of(GREY))
+
+
+def test_the_same_seed_gives_the_same(localizer, learnt):
+    assert calibrated(localizer, crops_of(GREY)) == learnt
+
+
+def test_another_seed_gives_another(localizer, learnt):
+    other = calibrated(localizer, crops_of(GREY), seed=1)
+    assert other.confidence != learnt.confidence and other.floor_px == learnt.floor_px == FLOOR_PX
+
+
+def test_no_more_views_are_made_than_asked_for(localizer):
+    crops, calls = crops_of(GREY, 7), []
+    for views, expected in ((2, 2 + 1), (4, 4 + 2), (50, 7 + 7)):
+        calls.clear()
+        calibrate_registration(localizer, crops, [], views, 0, lambda *call: calls.append(call))
+        assert len(calls) == expected
+
+
+def test_crops_are_untouched_and_progress_is_told(localizer):
+    crops, calls = crops_of(GREY, 6), []
+    kept = [crop.grey.copy() for crop in crops]
+    for crop in crops:
+        crop.grey.flags.writeable = False
+    calibrated(localizer, crops, report=lambda *call: calls.append(call))
+    assert all(np.array_equal(crop.grey, grey) for crop, grey in zip(crops, kept, strict=True))
+    shares = [share for _, share in calls]
+    assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) >= 6
+    assert {stage for stage, _ in calls} == {"calibrate registration"}
+
+
+def verdicts(localizer, confidence, crops, mirrored):
+    """Confidence in views of crops as they are, and how far from the truth they were placed."""
+    rng = np.random.default_rng(5)
+    said, off = [], []
+    for crop in crops:
+        picture = np.ascontiguousarray(crop.grey[:, ::-1]) if mirrored else crop.grey
+        view, camera, telemetry = module._view(rng, picture, localizer.grid)
+        best = localizer.best(localizer.prepared(view, camera, telemetry, True), None)
+        said.append(confidence(best.evidence()))
+        pose = best.placed.pose
+        off.append(np.hypot(pose.x_px - crop.col_px, pose.y_px - crop.row_px))
+    return np.array(said), np.array(off)
+
+
+def test_views_of_the_map_are_believed_and_mirrored_ones_not(localizer, learnt):
+    fresh = crops_of(GREY, 8, seed=9)
+    own, off = verdicts(localizer, learnt.confidence, fresh, mirrored=False)
+    false, _ = verdicts(localizer, learnt.confidence, fresh, mirrored=True)
+    assert off.max() < 0.5  # views are cut where the crops say, to half a pixel
+    assert own.min() > 0.8 and np.median(false) < 0.3
+    assert own.min() > false.max()
+
+
+def test_views_made_of_crops_are_vertical_and_told_roughly(localizer):
+    rng = np.random.default_rng(1)
+    crop = crops_of(GREY, 1)[0]
+    off = []
+    for _ in range(60):
+        view, camera, telemetry = module._view(rng, crop.grey, localizer.grid)
+        assert view.shape == (camera.height_px, camera.width_px) and view.dtype == np.uint8
+        assert 0.5 * TILE_PX < camera.width_px <= TILE_PX and view.std() > 5
+        assert telemetry.pitch_deg == telemetry.roll_deg == 0
+        off.append(telemetry.agl_m / camera.fx_px / localizer.grid.gsd_m - 1)
+    assert 0.5 * module.AGL_STD < np.std(off) < 1.5 * module.AGL_STD
+
+
+@pytest.mark.parametrize(
+    "moved_px, expected",
+    [
+        ((0, 0), FLOOR_LIMITS_PX[0]),
+        ((-2, 1), 5**0.5 / 1.1774),
+        ((6, 3), FLOOR_LIMITS_PX[1]),
+    ],
+)
+def test_the_floor_is_how_far_the_other_date_lies_off(localizer, moved_px, expected):
+    later = crops_of(GREY, seed=2, moved_px=moved_px)
+    found = calibrated(localizer, crops_of(GREY, 2), later)
+    assert found.floor_px == pytest.approx(expected, rel=0.06)
+
+
+def test_a_few_views_of_another_date_say_nothing(localizer):
+    later = crops_of(GREY, 5, seed=2, moved_px=(2, 1))
+    assert calibrated(localizer, crops_of(GREY, 2), later).floor_px == FLOOR_PX
+
+
+def test_another_place_is_no_other_date(localizer):
+    """What is not found at its place is wrong, not badly registered."""
+    later = crops_of(textured((SIDE_PX, SIDE_PX), 7), seed=2)
+    assert calibrated(localizer, crops_of(GREY, 2), later).floor_px == FLOOR_PX
+
+
+def test_too_little_gives_no_confidence(localizer):
+    assert calibrated(localizer, []) == RegistrationCalibration(None, FLOOR_PX)
+    few = calibrated(localizer, crops_of(GREY, 5))
+    assert few == RegistrationCalibration(None, FLOOR_PX)
+
+
+def test_blank_crops_give_no_confidence(localizer):
+    blank = [Crop(np.full((CROP_PX, CROP_PX), 99, np.uint8), 120.0, 120.0)] * 6
+    assert calibrated(localizer, blank).confidence is None
+
+
+@pytest.fixture
+def small(make_ortho, tmp_path, monkeypatch):
+    """Function that builds a map of 200 x 200 m and gives what it says of registration."""
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 10)
+    grey = textured((240, 240), 11)
+
+    def build(made_of=grey[20:220, 20:220], *other_dates):
+        ortho = make_ortho(tmp_path / "2020.tif", made_of)
+        later = [make_ortho(tmp_path / "later.tif", picture) for picture in other_dates]
+        request = BuildRequest([ortho], tmp_path / "map.onav", tile_px=64, other_dates=later)
+        build_map(replace(request, calibration_views=12))
+        return open_map(request.out).manifest.registration
+
+    build.grey = grey
+    return build
+
+
+def test_a_second_date_tells_the_floor_of_a_map(small):
+    """The other picture is the same ground, three pixels to the west and one to the south."""
+    grey = small.grey
+    plain = small(grey[20:220, 20:220], grey[19:219, 23:223])
+    assert plain["position_floor_px"] == pytest.approx(10**0.5 / 1.1774, rel=0.1)
+    assert plain["confidence"] is not None and plain["radius_m"] > 0
+
+
+def test_a_uniform_map_has_no_confidence_and_says_so(small, caplog):
+    with caplog.at_level(logging.WARNING):
+        plain = small(np.full((200, 200), 99, np.uint8))
+    assert plain["confidence"] is None and plain["position_floor_px"] == FLOOR_PX
+    assert "too little imagery to calibrate registration" in caplog.text
+
+
+def test_a_second_date_that_shows_nothing_is_told(small, caplog):
+    with caplog.at_level(logging.WARNING):
+        plain = small(small.grey[20:220, 20:220], np.full((200, 200), 99, np.uint8))
+    assert plain["position_floor_px"] == FLOOR_PX
+    assert "other dates" in caplog.text

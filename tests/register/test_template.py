@@ -1,0 +1,193 @@
+"""A view made ready: its evidence in balance, its derivatives true, its levels of one middle."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from scenes import Ground, as_grey, reference_of, seen, templates_of
+
+from orthonav.register.evidence import COARSE, FINE, GROUPS, evidence
+from orthonav.register.pose import Pose
+from orthonav.register.search import posed_channels, posed_half_px
+from orthonav.register.template import (
+    BLOCKS,
+    Template,
+    ViewTemplates,
+    energy_of,
+    halved,
+    turned_planes,
+)
+
+SHAPE = (384, 448)
+PLACE = Pose(210.0, 180.0, 0.0, 0.0)
+GROUND = Ground()
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return reference_of(GROUND, SHAPE)
+
+
+def alike(one, other):
+    return float((one * other).sum() / math.sqrt((one**2).sum() * (other**2).sum()))
+
+
+def ragged(shape=(96, 128)):
+    """A valid part with a slanted border and a hole."""
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    return (np.abs(x - shape[1] / 2) < (0.25 + 0.25 * y / shape[0]) * shape[1]) & (
+        np.hypot(x - 60, y - 40) > 9
+    )
+
+
+@pytest.mark.parametrize("valid", [None, ragged()], ids=["whole", "ragged"])
+def test_each_kind_of_evidence_has_the_energy_of_its_weight(valid):
+    template = templates_of(GROUND, PLACE, valid=valid).at(0)
+    assert template.weights == (1.0, FINE.grey_share) and template.channels.shape == (3, 96, 128)
+    for group, weight in zip(GROUPS, template.weights, strict=True):
+        assert energy_of(template.channels[group]) == pytest.approx(weight, rel=1e-4)
+    assert template.whole == (valid is None)
+    assert (
+        template.pixels == template.mask.sum()
+        and not template.channels[:, template.mask == 0].any()
+    )
+    np.testing.assert_array_equal(np.moveaxis(template.interleaved, -1, 0), template.channels)
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (6, 40), (16, 16)])
+def test_a_view_that_says_nothing_is_no_crash(shape):
+    for grey, valid in (
+        (np.full(shape, 99, np.uint8), np.ones(shape, bool)),
+        (np.zeros(shape, np.uint8), np.zeros(shape, bool)),
+    ):
+        template = Template.of(grey, valid, 0, FINE)
+        assert np.isfinite(template.channels).all() and np.isfinite(template.jacobian).all()
+        assert np.isfinite(template.hessians).all()
+        assert np.isfinite(posed_channels(template, 0.3, 0.1)).all()
+
+
+@pytest.mark.parametrize("turn_deg", range(-180, 180, 20))
+@pytest.mark.parametrize("log_scale", [-0.1, 0.0, 0.15])
+def test_a_posed_view_is_what_the_map_shows(reference, turn_deg, log_scale):
+    """Evidence that is warped is close to evidence of what is warped, under any heading."""
+    pose = Pose(PLACE.x_px, PLACE.y_px, math.radians(turn_deg), log_scale)
+    template = templates_of(GROUND, pose).at(0)
+    posed = posed_channels(template, pose.turn_rad, pose.log_scale)
+    half = posed_half_px(template, log_scale)
+    assert posed.shape == (3, 2 * half, 2 * half)
+    row, col = int(pose.y_px) - half, int(pose.x_px) - half
+    shown = np.moveaxis(reference.window(0, row, col, 2 * half, 2 * half), -1, 0)[:3]
+    inside = np.abs(posed).max(axis=0) > 0
+    for group, weight in zip(GROUPS, template.weights, strict=True):
+        assert energy_of(posed[group]) == pytest.approx(weight**2, rel=1e-4)
+        assert alike(posed[group], shown[group] * inside) > 0.93
+    turned_wrongly = posed_channels(template, -pose.turn_rad, pose.log_scale)[0:2]
+    if 20 < abs(turn_deg) % 180 < 160:
+        assert alike(turned_wrongly, shown[0:2]) < 0.3
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_planes_turn_with_their_picture(quarters):
+    """Clockwise: `rot90` turns a picture counter-clockwise, y being to the south."""
+    grey = as_grey(seen(GROUND, PLACE, (60, 80)))
+    plain = evidence(grey, np.ones(grey.shape, bool))
+    picture = np.ascontiguousarray(np.rot90(grey, -quarters))
+    turned = evidence(picture, np.ones(picture.shape, bool))
+    planes = turned_planes(np.ascontiguousarray(np.rot90(plain, -quarters)), quarters * math.pi / 2)
+    np.testing.assert_allclose(np.moveaxis(planes, 0, -1), turned, atol=2e-3)
+
+
+def test_planes_turned_back_are_the_same():
+    made = evidence(as_grey(seen(GROUND, PLACE, (60, 80))), np.ones((60, 80), bool))
+    kept = made.copy()
+    there = turned_planes(made, 0.7)
+    np.testing.assert_allclose(
+        np.hypot(*there[:2]), np.hypot(made[..., 0], made[..., 1]), atol=1e-5
+    )
+    back = turned_planes(np.ascontiguousarray(np.moveaxis(there, 0, -1)), -0.7)
+    np.testing.assert_allclose(back, np.moveaxis(made, -1, 0), atol=1e-5)
+    np.testing.assert_array_equal(made, kept)
+
+
+@pytest.mark.parametrize("number, size", [(0, 0.7), (1, 0.7), (2, 0.02), (3, 0.02)])
+def test_derivatives_tell_how_the_view_changes_with_the_window(number, size):
+    """Against views really moved, turned and scaled: directions are turned back by the pose."""
+
+    def channels(size):
+        step = np.zeros(4)
+        step[number] = size
+        x, y, turn, log_scale = step
+        pose = Pose(PLACE.x_px + x, PLACE.y_px + y, turn, log_scale)
+        made = templates_of(GROUND, pose, (96, 96)).at(0).interleaved
+        return turned_planes(made, turn)
+
+    found = (channels(size) - channels(-size)) / (2 * size)
+    expected = templates_of(GROUND, PLACE, (96, 96)).at(0).jacobian[:, number]
+    for group in GROUPS:
+        one, other = found[group][:, 8:-8, 8:-8], expected[group][:, 8:-8, 8:-8]
+        assert alike(one, other) > 0.9
+        assert 0.6 < float((one * other).sum() / (one**2).sum()) < 1.1
+
+
+def test_hessians_are_the_products_of_the_derivatives():
+    template = templates_of(GROUND, PLACE, valid=ragged()).at(0)
+    for group, hessian in zip(GROUPS, template.hessians, strict=True):
+        rows = template.jacobian[group].astype(np.float64)
+        np.testing.assert_allclose(hessian, np.einsum("cphw,cqhw->pq", rows, rows), rtol=1e-3)
+        assert np.linalg.eigvalsh(hessian).min() > 0
+    assert not template.jacobian[:, :, template.mask == 0].any()
+
+
+@pytest.mark.parametrize("shape", [(96, 128), (50, 34), (7, 9)])
+def test_blocks_cut_the_whole_window(shape):
+    template = Template.of(np.zeros(shape, np.uint8), np.ones(shape, bool), 0, FINE)
+    for starts, side in zip(template.block_starts, shape, strict=True):
+        assert len(starts) == BLOCKS and starts[0] == 0 and (np.diff(starts) > 0).all()
+        assert side - starts[-1] <= side / BLOCKS + 1
+
+
+def test_coarser_templates_show_the_same_window():
+    """Halved about the same middle: a level down, the pixels cover four of the one above."""
+    views = templates_of(GROUND, PLACE, (96, 128))
+    for level in range(3):
+        template = views.at(level)
+        assert template.level == level and template.mask.shape == (96 >> level, 128 >> level)
+    assert views.at(1) is views.at(1) and views.at(1, COARSE) is not views.at(1)
+    assert views.at(1, COARSE).recipe == COARSE
+    fours = as_grey(seen(GROUND, PLACE, (96, 128))).reshape(48, 2, 64, 2).mean(axis=(1, 3))
+    expected = Template.of(np.rint(fours).astype(np.uint8), np.ones((48, 64), bool), 1, FINE)
+    np.testing.assert_allclose(views.at(1).channels, expected.channels, atol=2e-3)
+
+
+def test_levels_count_from_the_finest():
+    grey = as_grey(seen(GROUND, PLACE, (64, 64)))
+    views = ViewTemplates(grey, np.ones(grey.shape, bool), 2)
+    assert views.at(2).level == 2 and views.at(2).mask.shape == (64, 64)
+    assert views.at(4).mask.shape == (16, 16)
+
+
+def test_halving_keeps_only_pixels_that_are_valid_all_over():
+    grey = as_grey(seen(GROUND, PLACE, (40, 60)))
+    valid = ragged((40, 60))
+    kept = grey.copy(), valid.copy()
+    smaller, inside = halved(grey, valid)
+    np.testing.assert_array_equal(inside, valid.reshape(20, 2, 30, 2).all(axis=(1, 3)))
+    mean = grey.reshape(20, 2, 30, 2).mean(axis=(1, 3))
+    assert np.abs(smaller - mean)[inside].max() <= 0.5 and not smaller[~inside].any()
+    assert smaller.dtype == np.uint8 and inside.dtype == bool
+    np.testing.assert_array_equal(grey, kept[0])
+    np.testing.assert_array_equal(valid, kept[1])
+
+
+def test_halving_a_whole_view_keeps_it_whole():
+    smaller, inside = halved(np.full((8, 12), 7, np.uint8), np.ones((8, 12), bool))
+    assert smaller.shape == inside.shape == (4, 6) and inside.all() and (smaller == 7).all()
+
+
+def test_masks_do_not_shift_what_is_seen():
+    """A view cut by a mask says of its inner part what the whole view says."""
+    whole, cut = (templates_of(GROUND, PLACE, valid=v).at(0) for v in (None, ragged()))
+    inner = cv2.erode(ragged().astype(np.uint8), np.ones((9, 9))) > 0
+    for group in GROUPS:
+        assert alike(whole.channels[group][:, inner], cut.channels[group][:, inner]) > 0.97
