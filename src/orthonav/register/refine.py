@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from orthonav.register.evidence import GROUPS
 from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
-from orthonav.register.template import BLOCKS, Template, turned_planes
+from orthonav.register.template import BLOCKS, Template, derivatives, turned_planes
 
 Array = NDArray[np.float32]
 STEPS = 6
@@ -27,6 +27,8 @@ SMALL_STEP_PX = 0.03
 MAX_STEP_PX = 3.0
 DAMPING = 1e-3
 MIN_CORRELATION = 0.08
+WHOLE_OVERLAP = 0.97
+MIN_CURVATURE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +98,34 @@ class Refiner:
         return replace(placed, covariance=self._covariance(best), agreement=best.agreement())
 
     def _inverse(self, seen: "_Seen") -> NDArray[np.float64]:
-        hessian = np.tensordot(seen.squares, self.template.hessians, axes=1)
+        hessian = np.tensordot(seen.squares, self._hessians(seen), axes=1)
         damping = DAMPING * np.diag(np.diag(hessian)) + 1e-12 * np.eye(4)
         return np.asarray(np.linalg.inv(hessian + damping))
+
+    def _hessians(self, seen: "_Seen") -> NDArray[np.float64]:
+        """Gauss-Newton matrices (G, 4, 4) over the part of the view that lies on the map."""
+        if seen.overlap > WHOLE_OVERLAP:
+            return self.template.hessians
+        counts = seen.counts.reshape(-1) > 0
+        each = np.stack([rows[:, counts] @ rows[:, counts].T for rows in self._jacobian])
+        return np.stack([each[group].sum(axis=0) for group in GROUPS]).astype(np.float64)
+
+    def _observed_inverse(self, seen: "_Seen") -> NDArray[np.float64]:
+        """As `_inverse`, of the view's derivatives times the map's.
+
+        Noise and change have derivatives too: counted as if they held the view in place, they
+        would make it look known where the ground runs in one direction.
+        """
+        theirs = derivatives(seen.map, seen.counts).reshape(3, 4, -1)
+        gains = np.repeat(seen.gains, [2, 1])
+        observed = np.zeros((4, 4))
+        for gain, mine, other in zip(gains, self._jacobian, theirs, strict=True):
+            observed += gain * (mine @ other.T)
+        observed = (observed + observed.T) / 2
+        own = np.sqrt(np.diag(np.tensordot(seen.squares, self._hessians(seen), axes=1))) + 1e-12
+        values, vectors = np.linalg.eigh(observed / np.outer(own, own))
+        inverse = (vectors / np.maximum(values, MIN_CURVATURE)) @ vectors.T
+        return np.asarray(inverse / np.outer(own, own))
 
     def _step(self, seen: "_Seen") -> NDArray[np.float64]:
         """Gauss-Newton step of the window: x, y (px of the level), turn, log scale."""
@@ -118,7 +145,7 @@ class Refiner:
         sums = np.add.reduceat(np.add.reduceat(terms, rows, axis=1), cols, axis=2)
         sums = sums.reshape(4, BLOCKS * BLOCKS).astype(np.float64)
         spread = sums @ sums.T * (BLOCKS**2 / (BLOCKS**2 - 4))
-        inverse = self._inverse(seen)
+        inverse = self._observed_inverse(seen)
         to_map = np.eye(4)
         to_map[:2, :2] = seen.pose.linear * 2.0**self.template.level
         return np.asarray(to_map @ inverse @ spread @ inverse @ to_map.T)
@@ -170,14 +197,14 @@ class _Seen:
         if not (template.whole and sampled[3].min() > 0.99):
             counts = counts * (sampled[3] > 0.99)
             seen *= counts
-        self._counts = counts
+        self.counts = counts
         pixels = float(counts.sum())
         self.overlap = pixels / max(template.pixels, 1.0)
         if self.overlap < 0.9999:
             view = view * counts
-        self._view, self._map = view, seen
+        self._view, self.map = view, seen
         self.residual = np.empty_like(seen)
-        found, squares = [], []
+        found, squares, gains = [], [], []
         for group in GROUPS:
             mine, theirs = view[group].reshape(-1), seen[group].reshape(-1)
             product = float(mine @ theirs)
@@ -188,9 +215,10 @@ class _Seen:
             np.multiply(seen[group], np.float32(gain), out=self.residual[group])
             self.residual[group] -= np.float32(square) * view[group]
             found.append(correlation)
+            gains.append(gain)
             squares.append(square)
         self.correlations = tuple(found)
-        self.squares = np.array(squares)
+        self.squares, self.gains = np.array(squares), np.array(gains)
         total = float(np.dot(template.weights, found))
         self.weighted = total / sum(template.weights)
         self.score = total * math.sqrt(pixels) * math.exp(pose.log_scale)
@@ -198,10 +226,10 @@ class _Seen:
     def agreement(self) -> float:
         """Share of the blocks of a view whose evidence speaks for the pose."""
         rows, cols = self._template.block_starts
-        product = (self._view * self._map).sum(axis=0)
+        product = (self._view * self.map).sum(axis=0)
         sums, counts = (
             np.add.reduceat(np.add.reduceat(each, rows, axis=0), cols, axis=1)
-            for each in (product, self._counts)
+            for each in (product, self.counts)
         )
         used = counts > 0.25 * counts.max()
         return float((sums[used] > 0).mean()) if used.any() else 0.0

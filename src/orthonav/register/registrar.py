@@ -6,6 +6,7 @@ best of the last few is the answer; how far it stands above the best one elsewhe
 """
 
 import math
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -141,17 +142,19 @@ class Registrar:
     def __init__(self, reference: Reference) -> None:
         self.reference = reference
         self._windows: dict[tuple[int, EvidenceRecipe, int], SearchWindow] = {}
+        self._lock = threading.Lock()
 
     def whole_window(self, level: int, recipe: EvidenceRecipe, view_px: float) -> SearchWindow:
         """The whole sheet at a level, kept: views of about the same size share it."""
         side = _rounded_side(view_px / 2**level)
         key = (level, recipe, side)
-        found = self._windows.get(key)
-        if found is None:
-            found = SearchWindow(self.reference.whole(level, recipe), level, 0, 0, side)
-            while len(self._windows) >= MAX_KEPT_WINDOWS:
-                self._windows.pop(next(iter(self._windows)))
-            self._windows[key] = found
+        with self._lock:
+            found = self._windows.get(key)
+            if found is None:
+                found = SearchWindow(self.reference.whole(level, recipe), level, 0, 0, side)
+                while len(self._windows) >= MAX_KEPT_WINDOWS:
+                    self._windows.pop(next(iter(self._windows)))
+                self._windows[key] = found
         return found
 
     def part_window(
@@ -165,9 +168,15 @@ class Registrar:
         """The square whose middles of views reach `reach_px` (level 0) around a point (x, y)."""
         unit = 2.0**level
         margin = math.ceil(view_px / 2 / unit)
-        low = [math.floor((middle - reach_px) / unit) - margin for middle in centre_px]
-        size = math.ceil(2 * reach_px / unit) + 2 + 2 * margin
-        made = self.reference.window(level, low[1], low[0], size, size, recipe)
+        rows, cols = self.reference.shape(level)
+        low, size = [], []
+        for middle, extent in zip(centre_px, (cols, rows), strict=True):
+            # Middles farther out than half a view see nothing of the sheet.
+            first = math.floor(max((middle - reach_px) / unit, -margin))
+            last = math.ceil(min((middle + reach_px) / unit + 2, extent + margin))
+            low.append(first - margin)
+            size.append(max(last - first, 1) + 2 * margin)
+        made = self.reference.window(level, low[1], low[0], size[1], size[0], recipe)
         side = _rounded_side(view_px / unit)
         return SearchWindow(made, level, low[1], low[0], side, margin)
 

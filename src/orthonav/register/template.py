@@ -64,19 +64,7 @@ class Template:
 
         Steps are x, y (pixels of the level), turn (rad) and log scale about the middle.
         """
-        height, width = self.mask.shape
-        x = (np.arange(width, dtype=np.float32) + np.float32(0.5 - width / 2))[None]
-        y = (np.arange(height, dtype=np.float32) + np.float32(0.5 - height / 2))[:, None]
-        out = np.empty((len(self.channels), 4, height, width), dtype=np.float32)
-        for channel, into in zip(self.channels, out, strict=True):
-            dx = np.asarray(cv2.Sobel(channel, cv2.CV_32F, 1, 0, scale=1 / 8), np.float32)
-            dy = np.asarray(cv2.Sobel(channel, cv2.CV_32F, 0, 1, scale=1 / 8), np.float32)
-            dx *= self.mask
-            dy *= self.mask
-            into[0], into[1] = dx, dy
-            np.subtract(dy * x, dx * y, out=into[2])
-            np.add(dx * x, dy * y, out=into[3])
-        return out
+        return derivatives(self.channels, self.mask)
 
     @cached_property
     def hessians(self) -> NDArray[np.float64]:
@@ -89,6 +77,23 @@ class Template:
         """First rows and first columns of `BLOCKS` x `BLOCKS` blocks of the window."""
         rows, cols = ((np.arange(BLOCKS) * side) // BLOCKS for side in self.mask.shape)
         return rows.astype(np.intp), cols.astype(np.intp)
+
+
+def derivatives(channels: Array, mask: Array) -> Array:
+    """How channels (C, H, W) change with a small step of the window: (C, 4, H, W)."""
+    height, width = mask.shape
+    x = (np.arange(width, dtype=np.float32) + np.float32(0.5 - width / 2))[None]
+    y = (np.arange(height, dtype=np.float32) + np.float32(0.5 - height / 2))[:, None]
+    out = np.empty((len(channels), 4, height, width), dtype=np.float32)
+    for channel, into in zip(channels, out, strict=True):
+        dx = np.asarray(cv2.Sobel(channel, cv2.CV_32F, 1, 0, scale=1 / 8), np.float32)
+        dy = np.asarray(cv2.Sobel(channel, cv2.CV_32F, 0, 1, scale=1 / 8), np.float32)
+        dx *= mask
+        dy *= mask
+        into[0], into[1] = dx, dy
+        np.subtract(dy * x, dx * y, out=into[2])
+        np.add(dx * x, dy * y, out=into[3])
+    return out
 
 
 def turned_planes(made: object, turn_rad: float) -> Array:

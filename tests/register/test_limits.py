@@ -1,0 +1,100 @@
+"""Limits of registration: partly missing maps, ground of one direction, wide priors, threads."""
+
+import math
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from scenes import Ground, random_poses, reference_of, templates_of
+from test_refine import GROUND, HOLES, REACH_PX, SHAPE, errors, moved, noisy, normalized_squares
+from test_registrar import VIEW_PX
+
+from orthonav.register.evidence import FINE
+from orthonav.register.pose import Pose
+from orthonav.register.refine import Refiner
+from orthonav.register.registrar import Registrar
+from orthonav.register.search import search
+
+
+# -> test_refine.py
+@pytest.mark.parametrize("hole", [hole for hole, _ in HOLES.values()], ids=HOLES.keys())
+@pytest.mark.parametrize("level", [0, 1])
+def test_errors_on_a_part_of_the_map_are_as_large_as_the_covariance_says(hole, level):
+    valid = np.ones(SHAPE, bool)
+    valid[hole] = False
+    reference = reference_of(GROUND, SHAPE, valid)
+    rng = np.random.default_rng(5)
+    off, covariances = [], []
+    for number in range(60):
+        x, y, turn, log_scale = rng.uniform(-1, 1, 4) * [8, 8, math.pi, 0.05]
+        pose = Pose(222 + x, 181 + y, turn, log_scale)
+        start = moved(pose, 2.0**level, number, 1.0, 1.01)
+        view = noisy(GROUND, pose, rng, noise=10.0, clutter=12.0).at(level)
+        placed = Refiner(view, reference).place(start, with_covariance=True)
+        off.append(errors(placed, pose))
+        covariances.append(placed.covariance)
+    squares = normalized_squares(np.array(off), np.array(covariances))
+    assert 1.0 < squares.mean() < 3.5
+
+
+@pytest.mark.parametrize("hole", [hole for hole, _ in HOLES.values()], ids=HOLES.keys())
+@pytest.mark.parametrize("turn_deg", [0.0, 35.0])
+def test_a_part_of_the_map_is_converged_upon_as_fast_and_known_less_exactly(hole, turn_deg):
+    valid = np.ones(SHAPE, bool)
+    valid[hole] = False
+    pose = Pose(222.0, 181.0, math.radians(turn_deg), 0.0)
+    template = noisy(GROUND, pose, np.random.default_rng(1), noise=10.0).at(0)
+    start = moved(pose, 1.5, 2.0, 2.0, 1.02)
+    part, whole = (
+        Refiner(template, reference_of(GROUND, SHAPE, v)).place(start, with_covariance=True)
+        for v in (valid, None)
+    )
+    assert np.hypot(*errors(part, pose)[:2]) < 0.12
+    assert np.trace(part.covariance[:2, :2]) > np.trace(whole.covariance[:2, :2])
+
+
+@pytest.mark.parametrize("spread_rad", [0.12, 0.3, 0.6])
+@pytest.mark.parametrize("level", [0, 1])
+def test_where_the_ground_runs_in_one_direction_errors_are_told(spread_rad, level):
+    """Furrows: a changed view says nothing along them, whatever its own noise says."""
+    furrows = Ground(seed=1, spread_rad=spread_rad)
+    reference = reference_of(furrows, SHAPE)
+    rng = np.random.default_rng(5)
+    off, covariances = [], []
+    for pose in random_poses(50, SHAPE, REACH_PX, seed=5):
+        view = noisy(furrows, pose, rng, noise=8.0, clutter=24.0).at(level)
+        placed = Refiner(view, reference).place(pose, with_covariance=True)
+        off.append(errors(placed, pose))
+        covariances.append(placed.covariance)
+    assert normalized_squares(np.array(off), np.array(covariances)).mean() < 3.5
+
+
+# -> test_registrar.py
+@pytest.mark.parametrize("reach_px", [2e3, 1e6, math.inf])
+@pytest.mark.parametrize("centre", [(200.0, 170.0), (-1500.0, 100.0)])
+def test_a_part_is_no_larger_than_the_sheet_and_a_view_around_it(reach_px, centre):
+    registrar = Registrar(reference_of(GROUND, SHAPE))
+    window = registrar.part_window(1, FINE, VIEW_PX, centre, reach_px)
+    rows, cols = registrar.reference.shape(1)
+    assert window.height <= rows + 2 * VIEW_PX + 8 and window.width <= cols + 2 * VIEW_PX + 8
+    pose = Pose(150.0, 120.0, 0.2, 0.0)
+    best = search(templates_of(GROUND, pose).at(1), window, [(0.2, 0.0)], 1)[0]
+    assert math.hypot(best.pose.x_px - 150, best.pose.y_px - 120) < 1
+
+
+def test_threads_may_ask_for_windows_of_many_sizes():
+    registrar = Registrar(reference_of(GROUND, (64, 64)))
+    registrar.whole_window(2, FINE, 20.0)
+
+    def ask(seed):
+        for view_px in np.random.default_rng(seed).uniform(8, 300, 400):
+            registrar.whole_window(2, FINE, float(view_px))
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            list(pool.map(ask, range(8)))
+    finally:
+        sys.setswitchinterval(interval)
