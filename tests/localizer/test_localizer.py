@@ -133,7 +133,7 @@ def same(one, other):
 
 
 def test_the_same_view_gives_the_same_fix(fixes, views, flight, localizer, map_path):
-    fresh = Localizer(open_map(map_path))
+    fresh = Localizer(open_map(map_path), registration=False)
     for name in list(fixes)[:6]:
         grey, told = views[name]
         kept = grey.copy()
@@ -143,7 +143,9 @@ def test_the_same_view_gives_the_same_fix(fixes, views, flight, localizer, map_p
 
 
 def test_threads_may_share_a_localizer(fixes, views, flight, map_path):
-    fresh = Localizer(open_map(map_path))  # cold, so that the caches are filled by both at once
+    fresh = Localizer(
+        open_map(map_path), registration=False
+    )  # cold, so that the caches are filled by both at once
     with ThreadPoolExecutor(4) as pool:
         found = pool.map(lambda item: fresh.locate(item[0], flight.camera, item[1]), views.values())
         assert all(same(one, fix) for one, fix in zip(found, fixes.values(), strict=True))

@@ -208,8 +208,16 @@ def test_the_manifest(ortho, tmp_path):
     assert manifest == result.manifest and result.size_bytes == request.out.stat().st_size
     assert manifest.imagery[0]["date"] == "2019-06" and manifest.imagery[0]["name"] == ortho.name
     assert manifest.radius_m == RADIUS_STRIDES * manifest.sheets[0].grid.stride_m
-    assert list(dict.fromkeys(stage for stage, _ in calls)) == ["imagery", "learn", "calibrate"]
-    assert all(0 <= share <= 1 for _, share in calls) and calls[-1] == ("calibrate", 1.0)
+    assert list(dict.fromkeys(stage for stage, _ in calls)) == [
+        "imagery",
+        "learn",
+        "calibrate",
+        "calibrate registration",
+    ]
+    assert all(0 <= share <= 1 for _, share in calls) and calls[-1] == (
+        "calibrate registration",
+        1.0,
+    )
 
 
 def test_the_preview_shows_the_area(ortho, tmp_path):
