@@ -12,6 +12,7 @@ from orthonav.errors import VariantError
 
 FEATURES = ("score", "margin")
 RIDGE = 1e-3
+LIMIT = 60.0
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class LogisticConfidence:
         total = self.bias + sum(
             weight * evidence[name] for name, weight in zip(FEATURES, self.weights, strict=True)
         )
-        return 1 / (1 + math.exp(-min(max(total, -60.0), 60.0)))
+        return probability(total)
 
     def to_plain(self) -> dict[str, Any]:
         """Plain values for a manifest."""
@@ -46,6 +47,11 @@ class LogisticConfidence:
         if not all(math.isfinite(number) for number in numbers) or min(numbers[1:]) < 0:
             raise VariantError(f"confidence has a weight that is negative or not finite: {plain}")
         return cls(numbers[0], tuple(numbers[1:]))
+
+
+def probability(logit: float) -> float:
+    """The logistic function, cut off where it is 0 or 1 to all digits that matter."""
+    return 1 / (1 + math.exp(-min(max(logit, -LIMIT), LIMIT)))
 
 
 def fit_logistic(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.confidence.logistic import fit_weights
+from orthonav.confidence.logistic import fit_weights, probability
 from orthonav.errors import VariantError
 
 FEATURES = ("log_strength", "log_peak_ratio", "log_look_ratio")
@@ -18,7 +18,6 @@ USUAL_WEIGHTS = (1.0, 11.0, 0.5)
 RIDGE = 3e-3
 STAND_IN = 0.7
 """Share of the chance value that stands in for a rival where a narrow search found none."""
-LIMIT = 60.0
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class RegisteredConfidence:
     def __call__(self, evidence: Mapping[str, float]) -> float:
         """Probability in 0..1 that the fix is right."""
         total = self.bias + float(np.dot(self.weights, features_of(evidence, self.chances)))
-        return 1 / (1 + math.exp(-min(max(total, -LIMIT), LIMIT)))
+        return probability(total)
 
     def to_plain(self) -> dict[str, Any]:
         """Plain values for a manifest."""

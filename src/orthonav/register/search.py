@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.geo.camera import counted_from_centres
 from orthonav.register.evidence import GROUPS
 from orthonav.register.pose import Pose
 from orthonav.register.template import Template, energy_of, turned_planes
 
 Array = NDArray[np.float32]
 ENERGY_FLOOR = 0.3
-_HALF = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +187,7 @@ def posed_channels(template: Template, turn: float, log_scale: float) -> Array:
     linear = np.array([[cos, -sin], [sin, cos]])
     move = np.array([half, half]) - linear @ [width / 2, height / 2]
     matrix = np.vstack([np.column_stack([linear, move]), [0, 0, 1]])
-    centred = np.linalg.inv(_HALF) @ matrix @ _HALF
+    centred = counted_from_centres(matrix)
     warped = cv2.warpAffine(template.interleaved, centred[:2], (2 * half, 2 * half))
     posed = turned_planes(warped, turn)
     for group, weight in zip(GROUPS, template.weights, strict=True):
