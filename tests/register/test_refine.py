@@ -267,7 +267,7 @@ def test_beyond_the_map_nothing_is_said(reference):
 @pytest.mark.parametrize("grey", [0, 130])
 def test_a_blank_view_says_nothing(reference, grey):
     view = ViewTemplates(np.full(VIEW, grey, np.uint8), np.ones(VIEW, bool), 0)
-    placed = Refiner(view.at(0), reference).place(Pose(200.0, 180.0, 0.0, 0.0), STEPS, True)
+    placed = Refiner(view.at(0), reference).place(Pose(200.0, 180.0, 0.0, 0.0), STEPS, with_covariance=True)
     assert abs(placed.score) < 1e-3 and np.isfinite(placed.covariance).all()
     assert math.isfinite(placed.pose.x_px + placed.pose.turn_rad + placed.pose.log_scale)
 

@@ -9,6 +9,7 @@ by blocks of the view, and the spread of those sums is what moves the peak.
 """
 
 import math
+import threading
 from dataclasses import dataclass, replace
 
 import cv2
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from orthonav.register.evidence import GROUPS
 from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
-from orthonav.register.template import BLOCKS, Template, derivatives, turned_planes
+from orthonav.register.template import BLOCKS, Template, derivatives, turn_planes
 
 Array = NDArray[np.float32]
 STEPS = 6
@@ -59,56 +60,56 @@ class Placed:
 
 
 class Refiner:
-    """Refines candidates of one view at one level."""
+    """Refines candidates of one view at one level. Not to be shared between threads."""
 
     def __init__(self, template: Template, reference: Reference) -> None:
         self.template, self.reference = template, reference
         self._jacobian = [rows.reshape(4, -1) for rows in template.jacobian]
         self._reach_px = math.hypot(*template.mask.shape) / 2
+        self._scratch = _Scratch(template)
 
-    def place(self, pose: Pose, steps: int = STEPS, with_covariance: bool = False) -> Placed:
-        """The view at the best pose near `pose`, within a few pixels of the level."""
+    def place(
+        self,
+        pose: Pose,
+        steps: int = STEPS,
+        small_step_px: float = SMALL_STEP_PX,
+        *,
+        with_covariance: bool = False,
+    ) -> Placed:
+        """The view at the best pose near `pose`, within a few pixels of the level.
+
+        It ends where a step moves no part of the view by more than `small_step_px`.
+        """
         window = _Window(self.template, self.reference, pose)
         unit = np.array([2.0**self.template.level, 2.0**self.template.level, 1.0, 1.0])
         converged = False
-        best = _Seen(self.template, window.sampled(pose), pose)
-        current = best
+        seen = self._scratch.seen(window, pose)
+        best = seen.placed()
         for _ in range(steps):
-            step = self._step(current)
+            step = self._step(seen)
             moves_px = self._moves_px(step)
             step *= min(1.0, MAX_STEP_PX / max(moves_px, 1e-9))
-            moved = current.pose.stepped(step * unit)
-            current = _Seen(self.template, window.sampled(moved), moved)
-            if current.score > best.score:
-                best = current
-            if moves_px < SMALL_STEP_PX:
+            seen = self._scratch.seen(window, seen.pose.stepped(step * unit))
+            if seen.score > best.score:
+                best = seen.placed()
+            if moves_px < small_step_px:
                 converged = True
                 break
-        placed = Placed(
-            best.pose,
-            self.template.level,
-            best.score,
-            best.correlations,
-            best.weighted,
-            best.overlap,
-            converged,
-        )
+        best = replace(best, converged=converged)
         if not with_covariance:
-            return placed
-        return replace(placed, covariance=self._covariance(best), agreement=best.agreement())
+            return best
+        if seen.pose is not best.pose:
+            seen = self._scratch.seen(window, best.pose)
+        return replace(best, covariance=self._covariance(seen), agreement=seen.agreement())
 
-    def _inverse(self, seen: "_Seen") -> NDArray[np.float64]:
-        hessian = np.tensordot(seen.squares, self._hessians(seen), axes=1)
-        damping = DAMPING * np.diag(np.diag(hessian)) + 1e-12 * np.eye(4)
-        return np.asarray(np.linalg.inv(hessian + damping))
-
-    def _hessians(self, seen: "_Seen") -> NDArray[np.float64]:
-        """Gauss-Newton matrices (G, 4, 4) over the part of the view that lies on the map."""
+    def _hessian(self, seen: "_Seen") -> NDArray[np.float64]:
+        """Gauss-Newton matrix (4, 4) over the part of the view that lies on the map."""
         if seen.overlap > WHOLE_OVERLAP:
-            return self.template.hessians
-        counts = seen.counts.reshape(-1) > 0
-        each = np.stack([rows[:, counts] @ rows[:, counts].T for rows in self._jacobian])
-        return np.stack([each[group].sum(axis=0) for group in GROUPS]).astype(np.float64)
+            return np.asarray(np.tensordot(seen.squares, self.template.hessians, axes=1))
+        # Block by block: derivatives weigh alike within one.
+        share = self.template.block_sums(seen.counts) / np.maximum(self.template.block_pixels, 1.0)
+        each = np.tensordot(share, self.template.block_hessians, axes=1)
+        return np.asarray(np.tensordot(seen.squares, each, axes=1))
 
     def _observed_inverse(self, seen: "_Seen") -> NDArray[np.float64]:
         """As `_inverse`, of the view's derivatives times the map's.
@@ -122,7 +123,7 @@ class Refiner:
         for gain, mine, other in zip(gains, self._jacobian, theirs, strict=True):
             observed += gain * (mine @ other.T)
         observed = (observed + observed.T) / 2
-        own = np.sqrt(np.diag(np.tensordot(seen.squares, self._hessians(seen), axes=1))) + 1e-12
+        own = np.sqrt(np.diag(self._hessian(seen))) + 1e-12
         values, vectors = np.linalg.eigh(observed / np.outer(own, own))
         inverse = (vectors / np.maximum(values, MIN_CURVATURE)) @ vectors.T
         return np.asarray(inverse / np.outer(own, own))
@@ -133,7 +134,10 @@ class Refiner:
             rows @ part.reshape(-1)
             for rows, part in zip(self._jacobian, seen.residual, strict=True)
         )
-        return np.asarray(self._inverse(seen) @ np.asarray(slope, np.float64))
+        hessian = self._hessian(seen)
+        hessian.flat[::5] *= 1 + DAMPING
+        hessian.flat[::5] += 1e-12
+        return np.asarray(np.linalg.solve(hessian, np.asarray(slope, np.float64)))
 
     def _moves_px(self, step: NDArray[np.float64]) -> float:
         return float(math.hypot(step[0], step[1]) + self._reach_px * math.hypot(step[2], step[3]))
@@ -141,9 +145,7 @@ class Refiner:
     def _covariance(self, seen: "_Seen") -> NDArray[np.float64]:
         """Covariance (4, 4) of x, y (level-0 px), turn and log scale."""
         terms = np.einsum("cphw,chw->phw", self.template.jacobian, seen.residual)
-        rows, cols = self.template.block_starts
-        sums = np.add.reduceat(np.add.reduceat(terms, rows, axis=1), cols, axis=2)
-        sums = sums.reshape(4, BLOCKS * BLOCKS).astype(np.float64)
+        sums = self.template.block_sums(terms).astype(np.float64)
         spread = sums @ sums.T * (BLOCKS**2 / (BLOCKS**2 - 4))
         inverse = self._observed_inverse(seen)
         to_map = np.eye(4)
@@ -167,7 +169,7 @@ class _Window:
             template.level, self._row, self._col, int(size[1]), int(size[0]), template.recipe
         )
 
-    def sampled(self, pose: Pose) -> Array:
+    def sample(self, pose: Pose, into: Array) -> None:
         """Evidence (H, W, 4) of the map as the view's window shows it under a pose."""
         height, width = self._template.mask.shape
         linear = pose.linear
@@ -177,8 +179,36 @@ class _Window:
         move = move + linear @ [0.5, 0.5] - 0.5
         matrix = np.column_stack([linear, move])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        warped = cv2.warpAffine(self._made, matrix, (width, height), flags=flags)
-        return turned_planes(warped, -pose.turn_rad)
+        cv2.warpAffine(self._made, matrix, (width, height), dst=into, flags=flags)
+
+
+class _Scratch:
+    """Memory for one pose of a view, used again for every other: fresh pages would cost more than
+    the arithmetic. What `seen` returned before, from any refiner of the thread, is overwritten."""
+
+    def __init__(self, template: Template) -> None:
+        self.template = template
+        planes = _memory(16 * template.mask.size).reshape(16, *template.mask.shape)
+        self.interleaved = planes[:4].reshape(*template.mask.shape, 4)
+        self.planes, self.turned = planes[4:8], planes[8:10]
+        self.residual, self.product, self.counts = planes[10:13], planes[13:16], planes[8]
+
+    def seen(self, window: "_Window", pose: Pose) -> "_Seen":
+        """The view beside the map under a pose."""
+        window.sample(pose, self.interleaved)
+        turn_planes(self.interleaved, -pose.turn_rad, self.planes, self.turned)
+        return _Seen(self, pose)
+
+
+_thread = threading.local()
+
+
+def _memory(size: int) -> Array:
+    """`size` numbers that belong to this thread, the same ones at every call."""
+    kept: Array | None = getattr(_thread, "memory", None)
+    if kept is None or kept.size < size:
+        kept = _thread.memory = np.empty(size, np.float32)
+    return kept[:size]
 
 
 class _Seen:
@@ -189,21 +219,21 @@ class _Seen:
     plain difference would fall short by the square of the correlation.
     """
 
-    def __init__(self, template: Template, sampled: Array, pose: Pose) -> None:
-        self._template = template
+    def __init__(self, scratch: _Scratch, pose: Pose) -> None:
+        template = self._template = scratch.template
         self.pose = pose
-        view, seen = template.channels, sampled[:3]
+        view, seen, valid = template.channels, scratch.planes[:3], scratch.planes[3]
         counts = template.mask
-        if not (template.whole and sampled[3].min() > 0.99):
-            counts = counts * (sampled[3] > 0.99)
+        if not (template.whole and valid.min() > 0.99):
+            counts = np.multiply(counts, valid > 0.99, out=scratch.counts)
             seen *= counts
         self.counts = counts
         pixels = float(counts.sum())
         self.overlap = pixels / max(template.pixels, 1.0)
         if self.overlap < 0.9999:
-            view = view * counts
+            view = np.multiply(view, counts, out=scratch.product)
         self._view, self.map = view, seen
-        self.residual = np.empty_like(seen)
+        self.residual = scratch.residual
         found, squares, gains = [], [], []
         for group in GROUPS:
             mine, theirs = view[group].reshape(-1), seen[group].reshape(-1)
@@ -212,8 +242,8 @@ class _Seen:
             correlation = product / math.sqrt(energy * own) if energy * own > 0 else 0.0
             square = max(correlation, MIN_CORRELATION) ** 2
             gain = math.sqrt(square * own / energy) if energy > 0 else 0.0
-            np.multiply(seen[group], np.float32(gain), out=self.residual[group])
-            self.residual[group] -= np.float32(square) * view[group]
+            for at in range(group.start, group.stop):
+                cv2.addWeighted(seen[at], gain, view[at], -square, 0, dst=self.residual[at])
             found.append(correlation)
             gains.append(gain)
             squares.append(square)
@@ -223,13 +253,21 @@ class _Seen:
         self.weighted = total / sum(template.weights)
         self.score = total * math.sqrt(pixels) * math.exp(pose.log_scale)
 
+    def placed(self) -> Placed:
+        """The numbers of this pose."""
+        return Placed(
+            self.pose,
+            self._template.level,
+            self.score,
+            self.correlations,
+            self.weighted,
+            self.overlap,
+            converged=False,
+        )
+
     def agreement(self) -> float:
         """Share of the blocks of a view whose evidence speaks for the pose."""
-        rows, cols = self._template.block_starts
-        product = (self._view * self.map).sum(axis=0)
-        sums, counts = (
-            np.add.reduceat(np.add.reduceat(each, rows, axis=0), cols, axis=1)
-            for each in (product, self.counts)
-        )
+        sums = self._template.block_sums((self._view * self.map).sum(axis=0))
+        counts = self._template.block_sums(self.counts)
         used = counts > 0.25 * counts.max()
         return float((sums[used] > 0).mean()) if used.any() else 0.0

@@ -21,6 +21,15 @@ LOOK_PX = 72.0
 """A view is judged at the level where it is about so many pixels across."""
 KEPT_TO_LOOK = 14
 KEPT_TO_FINISH = 3
+HOPE_AT_FIRST = 0.4
+HOPE = 0.5
+MIN_HOPEFUL = 4
+"""Candidates below a share of the best score are dropped, after one step and after all steps of
+a level; so many stay whatever their score, for the evidence needs rivals."""
+FIRST_STEPS = 1
+FULL_STEPS = 4
+ROUGH_STEP_PX = 0.1
+"""Candidates that are only compared need no smaller steps."""
 EXCLUSION_SHARE = 0.25
 """A rival lies farther from the best than this share of the view's side."""
 NAT_SCORE = 1.0
@@ -193,12 +202,18 @@ class Registrar:
         if not placed:
             return None
         for at in range(level, levels.look - 1, -1):
-            refiner = self._refiner(templates, levels, at)
-            steps = 4 if at > levels.look else 5
-            placed = _ranked([refiner.place(each.pose, steps) for each in placed], prior)
+            placed = self._compared(self._refiner(templates, levels, at), placed, prior)
             if at > levels.look:
-                placed = placed[:KEPT_TO_LOOK]
+                placed = _hopeful(placed, prior, HOPE)[:KEPT_TO_LOOK]
         return self._verdict(templates, levels, placed, prior, len(candidates))
+
+    def _compared(self, refiner: Refiner, placed: list[Placed], prior: PosePrior) -> list[Placed]:
+        """Candidates refined at one level, best first; those without hope only a little."""
+        first = [refiner.place(each.pose, FIRST_STEPS, ROUGH_STEP_PX) for each in placed]
+        ranked = _ranked(first, prior)
+        hopeful = _hopeful(ranked, prior, HOPE_AT_FIRST)
+        further = [refiner.place(each.pose, FULL_STEPS, ROUGH_STEP_PX) for each in hopeful]
+        return _ranked(further + ranked[len(hopeful) :], prior)
 
     def _verdict(
         self,
@@ -210,12 +225,10 @@ class Registrar:
     ) -> Registered:
         """The best of the judged candidates, best first, after the best of them are finished."""
         exclusion = EXCLUSION_SHARE * view_side_px(templates)
+        finalists = _hopeful(_distinct(judged, KEPT_TO_FINISH, exclusion), prior, HOPE, 2)
         totals = [
             (total - prior.cost(each.pose), each)
-            for total, each in (
-                self._finished(templates, levels, each)
-                for each in _distinct(judged, KEPT_TO_FINISH, exclusion)
-            )
+            for total, each in (self._finished(templates, levels, each) for each in finalists)
         ]
         totals.sort(key=lambda pair: -pair[0])
         score, best = totals[0]
@@ -273,7 +286,9 @@ class Registrar:
         """A judged candidate refined at the final level, and the sum of its scores."""
         if levels.final == levels.look:
             return judged.score, judged
-        placed = self._refiner(templates, levels, levels.final).place(judged.pose)
+        placed = self._refiner(templates, levels, levels.final).place(
+            judged.pose, FULL_STEPS, ROUGH_STEP_PX
+        )
         again = self._refiner(templates, levels, levels.look).place(placed.pose, 0)
         return placed.score + again.score, placed
 
@@ -293,6 +308,15 @@ def _rounded_side(side: float) -> int:
 
 def _ranked(placed: list[Placed], prior: PosePrior) -> list[Placed]:
     return sorted(placed, key=lambda each: prior.cost(each.pose) - each.score)
+
+
+def _hopeful(
+    ranked: list[Placed], prior: PosePrior, share: float, at_least: int = MIN_HOPEFUL
+) -> list[Placed]:
+    """The first of candidates, best first, that reach a share of the best score."""
+    values = [each.score - prior.cost(each.pose) for each in ranked]
+    enough = sum(value >= share * values[0] for value in values)
+    return ranked[: max(enough, at_least)]
 
 
 def _distinct(placed: list[Placed], count: int, apart: float) -> list[Placed]:

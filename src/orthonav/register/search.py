@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from orthonav.geo.camera import counted_from_centres
 from orthonav.register.evidence import GROUPS
 from orthonav.register.pose import Pose
-from orthonav.register.template import Template, energy_of, turned_planes
+from orthonav.register.template import Template, energy_of, turn_planes
 
 Array = NDArray[np.float32]
 ENERGY_FLOOR = 0.3
@@ -189,7 +189,9 @@ def posed_channels(template: Template, turn: float, log_scale: float) -> Array:
     matrix = np.vstack([np.column_stack([linear, move]), [0, 0, 1]])
     centred = counted_from_centres(matrix)
     warped = cv2.warpAffine(template.interleaved, centred[:2], (2 * half, 2 * half))
-    posed = turned_planes(warped, turn)
+    planes = np.empty((2 + warped.shape[2], *warped.shape[:2]), np.float32)
+    posed, scratch = planes[2:], planes[:2]
+    turn_planes(warped, turn, posed, scratch)
     for group, weight in zip(GROUPS, template.weights, strict=True):
         energy = energy_of(posed[group])
         posed[group] *= np.float32(weight / math.sqrt(energy) if energy > 0 else 0.0)

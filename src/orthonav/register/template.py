@@ -69,14 +69,45 @@ class Template:
     @cached_property
     def hessians(self) -> NDArray[np.float64]:
         """Gauss-Newton matrices (G, 4, 4) of the steps, one for each kind of evidence."""
-        each = np.stack([rows @ rows.T for rows in self.jacobian.reshape(3, 4, -1)])
-        return np.stack([each[group].sum(axis=0) for group in GROUPS]).astype(np.float64)
+        return _products(self.jacobian)
+
+    @cached_property
+    def block_hessians(self) -> NDArray[np.float64]:
+        """What each block of the view (row by row) adds to `hessians`: (B * B, G, 4, 4)."""
+        starts = zip(self.block_starts, self.mask.shape, strict=True)
+        rows, cols = (np.append(first, side) for first, side in starts)
+        return np.stack(
+            [
+                _products(self.jacobian[:, :, rows[i] : rows[i + 1], cols[j] : cols[j + 1]])
+                for i, j in np.ndindex(BLOCKS, BLOCKS)
+            ]
+        )
+
+    @cached_property
+    def block_pixels(self) -> NDArray[np.float64]:
+        """Pixels that count in each block (B * B)."""
+        return self.block_sums(self.mask).astype(np.float64)
+
+    def block_sums(self, values: Array) -> Array:
+        """Sums of values (..., H, W) over the blocks of the view, row by row: (..., B * B)."""
+        rows, cols = self.block_starts
+        sums = np.add.reduceat(np.add.reduceat(values, rows, axis=-2), cols, axis=-1)
+        return np.asarray(sums.reshape(*values.shape[:-2], BLOCKS * BLOCKS))
 
     @cached_property
     def block_starts(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """First rows and first columns of `BLOCKS` x `BLOCKS` blocks of the window."""
         rows, cols = ((np.arange(BLOCKS) * side) // BLOCKS for side in self.mask.shape)
         return rows.astype(np.intp), cols.astype(np.intp)
+
+
+def _products(jacobian: Array) -> NDArray[np.float64]:
+    """Products (G, 4, 4) of derivatives (3, 4, H, W), summed over the channels of each kind."""
+    out = np.zeros((len(GROUPS), 4, 4))
+    for number, group in enumerate(GROUPS):
+        for rows in jacobian[group].reshape(-1, 4, jacobian[0, 0].size):
+            out[number] += rows @ rows.T
+    return out
 
 
 def derivatives(channels: Array, mask: Array) -> Array:
@@ -96,16 +127,15 @@ def derivatives(channels: Array, mask: Array) -> Array:
     return out
 
 
-def turned_planes(made: object, turn_rad: float) -> Array:
-    """Evidence (H, W, C) as planes (C, H, W), edge directions turned clockwise by `turn_rad`."""
-    planes = cv2.split(np.asarray(made, np.float32))
-    out = np.empty((len(planes), *planes[0].shape), np.float32)
+def turn_planes(made: Array, turn_rad: float, into: Array, scratch: Array) -> None:
+    """Evidence (H, W, C) as planes `into` (C, H, W), edge directions turned clockwise.
+
+    `scratch` (2, H, W) is overwritten.
+    """
+    cv2.split(made, [*scratch, *into[2:]])
     cos, sin = math.cos(2 * turn_rad), math.sin(2 * turn_rad)
-    cv2.addWeighted(planes[0], cos, planes[1], -sin, 0, dst=out[0])
-    cv2.addWeighted(planes[0], sin, planes[1], cos, 0, dst=out[1])
-    for number, plane in enumerate(planes[2:], 2):
-        out[number] = plane
-    return out
+    cv2.addWeighted(scratch[0], cos, scratch[1], -sin, 0, dst=into[0])
+    cv2.addWeighted(scratch[0], sin, scratch[1], cos, 0, dst=into[1])
 
 
 def energy_of(values: Array) -> float:
