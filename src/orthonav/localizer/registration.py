@@ -8,12 +8,13 @@ whose embeddings are alike. Where the outcome leaves doubt, the next dearer way 
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.confidence.registered import RegisteredConfidence
+from orthonav.confidence.registered import Chances, RegisteredConfidence
 from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_footprint
 from orthonav.localizer.propose import TileProposer
@@ -21,8 +22,9 @@ from orthonav.localizer.rectify import Rectified, prepare_view, rectify_footprin
 from orthonav.mapfile.manifest import SheetInfo
 from orthonav.records import Fix, NoFix, Prior, Telemetry
 from orthonav.register.reference import GreyPyramid, Reference
+from orthonav.register.refine import Placed
 from orthonav.register.registrar import Levels, PosePrior, Registered, Registrar
-from orthonav.register.search import Bank, Candidate, bank, search
+from orthonav.register.search import Candidate, bank, search
 from orthonav.register.template import ViewTemplates
 from orthonav.search.exact import rows_within
 
@@ -31,19 +33,28 @@ DEFAULT_AGL_STD = 0.08
 MIN_YAW_STD_DEG = 2.0
 MIN_AGL_STD = 0.03
 MAX_AGL_STD = 0.15
-TURN_STEP_RAD = math.radians(8.0)
-SCALE_STEP = 0.13
+TURN_STEP_RAD, SCALE_STEP = math.radians(8.0), 0.13
+LOOK_TURN_STEP_RAD, LOOK_SCALE_STEP = math.radians(6.0), 0.09
+"""Steps of heading and scale: of candidates that are refined at a coarser level first, and of those
+that are not."""
 BANK_SIGMAS = 3.0
+MAX_NATS = 5.5
+STAGES_NATS = (-1.0, 0.4, 2.0, math.inf)
+"""Headings and scales are tried in stages, by how unlikely they are."""
 PRIOR_SIGMAS = 3.0
 CANDIDATES = 24
+STAGE_CANDIDATES = 12
+MIN_CANDIDATES = 6
+CANDIDATE_SHARE = 0.5
 MIN_VIEW_PX = 24.0
-USUAL_CHANCE = 28.0
+USUAL_CHANCES = Chances(28.0, 20.0, 40.0)
 SURE_STRENGTH = 2.2
 SURE_RATIO = 1.9
 """A view this far above chance and its rivals is not searched again."""
 POSE_MS = 0.1
-PIXEL_MS = 6e-7
+PIXEL_MS = 5.5e-7
 LOOK_MS = 14.0
+DOUBT = 0.01
 LAST_MS = 900.0
 """What searches cost on one core of a desktop, roughly: to choose between them, no more."""
 
@@ -61,7 +72,6 @@ class _View:
     side_px: float
     camera_px: NDArray[np.float64]
     prior: PosePrior
-    bank: Bank
 
 
 class RegistrationLocalizer:
@@ -138,53 +148,72 @@ class RegistrationLocalizer:
         pose_prior = _pose_prior(telemetry, heading_known)
         offset = rectified.offset_en_m / self.grid.gsd_m
         side_px = math.sqrt(float(rectified.valid.sum())) * gsd_m / self.grid.gsd_m
-        poses = bank(
-            pose_prior.turn_std_rad if heading_known else None,
-            pose_prior.log_scale_std,
-            turn_step_rad=TURN_STEP_RAD,
-            scale_step=SCALE_STEP,
-            sigmas=BANK_SIGMAS,
-        )
         camera_px = np.array([-offset[0], offset[1]])
-        return _View(rectified_at, templates, levels, side_px, camera_px, pose_prior, poses)
+        return _View(rectified_at, templates, levels, side_px, camera_px, pose_prior)
 
     def best(self, view: _View, prior: Prior | None) -> Registered | None:
         """The best place over all ways of search that had to be tried."""
+        judged: list[Placed] = []
         best: Registered | None = None
-        for level, candidates in self._ways(view, prior):
-            found = self.registrar.verify(
-                view.templates, view.levels, candidates, level, view.prior
+        candidates = 0
+        for level, found in self._ways(view, prior):
+            judged += self.registrar.judged(
+                view.templates, view.levels, found, level, view.prior
             )
-            if found is not None:
-                best = found if best is None else found.beside(best, view.side_px)
+            candidates += len(found)
+            best = None
+            if judged and self._looks_sure(view, judged):
+                best = self._finished(view, judged, candidates)
                 if self._is_sure(best):
                     return best
-        if best is None or view.levels.final == 0:
+        if not judged:
+            return None
+        best = best or self._finished(view, judged, candidates)
+        if view.levels.final == 0 or not self._is_doubtful(best):
             return best
         made = view.rectified_at(view.levels.final - 1)
         finer = ViewTemplates(made.grey, made.valid, view.levels.final - 1)
         return self.registrar.deepened(view.templates, finer, view.levels, best)
 
+    def _finished(self, view: _View, judged: list[Placed], candidates: int) -> Registered:
+        return self.registrar.finished(view.templates, view.levels, judged, view.prior, candidates)
+
+    def _looks_sure(self, view: _View, judged: list[Placed]) -> bool:
+        """Whether finishing the best of them may end the search."""
+        best, rival = self.registrar.standing(view.templates, judged, view.prior)
+        return best > SURE_STRENGTH * self._chances.look and best > SURE_RATIO * rival
+
     def _is_sure(self, best: Registered) -> bool:
-        chance = self.confidence.chances.total if self.confidence else USUAL_CHANCE
-        if best.score <= SURE_STRENGTH * chance:
+        if best.score <= SURE_STRENGTH * self._chances.total:
             return False
         return min(best.peak_ratio, best.look_ratio) > SURE_RATIO
+
+    def _is_doubtful(self, best: Registered) -> bool:
+        """Whether one finer level could change whether the place is believed."""
+        if self.confidence is None:
+            return True
+        return DOUBT <= self.confidence(best.evidence()) <= 1 - DOUBT
+
+    @property
+    def _chances(self) -> Chances:
+        return self.confidence.chances if self.confidence else USUAL_CHANCES
 
     def _ways(self, view: _View, prior: Prior | None) -> Iterator[tuple[int, list[Candidate]]]:
         """Candidates and the level they were found at, by the cheapest way first.
 
         The level where views are judged misses least: it alone is searched where that is cheap,
-        and after a cheaper way that left doubt where it can be afforded at all.
+        elsewhere after a cheaper way that left doubt, if it can be afforded at all. The likeliest
+        headings and scales come first.
         """
-        poses = _absolute(view)
         look, coarse = view.levels.look, view.levels.coarse
-        look_ms = self._search_ms(view, prior, look, len(poses))
-        coarse_ms = self._search_ms(view, prior, coarse, len(poses))
+        rough = _by_likelihood(view.prior, TURN_STEP_RAD, SCALE_STEP)
+        fine = _by_likelihood(view.prior, LOOK_TURN_STEP_RAD, LOOK_SCALE_STEP)
+        look_ms = self._search_ms(view, prior, look, len(fine))
         if look_ms > LOOK_MS:
+            poses = [pose for pose, _ in rough]
+            coarse_ms = self._search_ms(view, prior, coarse, len(poses))
             rows = self._tiles(view, prior)
-            tiles_ms = self._tiles_ms(view, rows, len(poses))
-            ways = sorted([(coarse_ms, False), (tiles_ms, True)])
+            ways = sorted([(coarse_ms, False), (self._tiles_ms(view, rows, len(poses)), True)])
             # The cheapest always, whatever it costs; a second one only where it can be afforded.
             dearest = 0.0 if look_ms <= self._last_ms else self._last_ms
             for number, (cost_ms, from_tiles) in enumerate(ways):
@@ -193,9 +222,12 @@ class RegistrationLocalizer:
                 if from_tiles and self.propose is not None:
                     yield coarse, self.propose.candidates(view.rectified_at(0), poses, rows)
                 else:
-                    yield coarse, self._searched(view, prior, coarse, poses)
+                    yield coarse, self._searched(view, prior, coarse, poses, CANDIDATES)
         if look_ms <= max(self._last_ms, LOOK_MS):
-            yield look, self._searched(view, prior, look, poses)
+            for least, most in pairwise(STAGES_NATS):
+                stage = [pose for pose, nats in fine if least < nats <= most]
+                if stage:
+                    yield look, self._searched(view, prior, look, stage, STAGE_CANDIDATES)
 
     def _tiles(self, view: _View, prior: Prior | None) -> NDArray[np.intp] | None:
         """Rows of the tiles that the prior allows, None for all."""
@@ -220,11 +252,18 @@ class RegistrationLocalizer:
             across = 2 * self._reach_px(view, prior) / 2**level
             rows, cols = round(min(rows, across)), round(min(cols, across))
         side = view.side_px / 2**level
-        pixels = float((rows + side) * (cols + side))
+        if prior is not None or min(rows, cols) < 3 * side:
+            rows, cols = round(rows + side), round(cols + side)
+        pixels = float(rows * cols)
         return poses * (POSE_MS + PIXEL_MS * pixels * math.log2(pixels))
 
     def _searched(
-        self, view: _View, prior: Prior | None, level: int, poses: list[tuple[float, float]]
+        self,
+        view: _View,
+        prior: Prior | None,
+        level: int,
+        poses: list[tuple[float, float]],
+        count: int,
     ) -> list[Candidate]:
         recipe = view.levels.recipe(level)
         if prior is None:
@@ -237,7 +276,9 @@ class RegistrationLocalizer:
                 self._prior_px(prior, view),
                 self._reach_px(view, prior),
             )
-        return search(view.templates.at(level, recipe), window, poses, CANDIDATES)
+        found = search(view.templates.at(level, recipe), window, poses, count)
+        worth = sum(each.score >= CANDIDATE_SHARE * found[0].score for each in found)
+        return found[: max(worth, MIN_CANDIDATES)]
 
     def _prior_px(self, prior: Prior, view: _View) -> tuple[float, float]:
         """Where the middle of the view should lie by the prior, x and y at level 0."""
@@ -311,7 +352,19 @@ def _or_default(value: float | None, default: float) -> float:
     return default if value is None or not math.isfinite(value) else value
 
 
-def _absolute(view: _View) -> list[tuple[float, float]]:
-    """Poses of the bank about the told heading."""
-    told = view.prior.turn_rad or 0.0
-    return [(told + turn, log_scale) for turn, log_scale in view.bank.poses]
+def _by_likelihood(
+    prior: PosePrior, turn_step_rad: float, scale_step: float
+) -> list[tuple[tuple[float, float], float]]:
+    """Headings (rad) and log scales to try, each with its `nats`, the likeliest first."""
+    made = bank(
+        None if prior.turn_rad is None else prior.turn_std_rad,
+        prior.log_scale_std,
+        turn_step_rad=turn_step_rad,
+        scale_step=scale_step,
+        sigmas=BANK_SIGMAS,
+    )
+    told = prior.turn_rad or 0.0
+    cell = turn_step_rad / 2, scale_step / 2
+    poses = [(told + turn, log_scale) for turn, log_scale in made.poses]
+    known = [(pose, prior.nats(*pose, within=cell)) for pose in poses]
+    return sorted((each for each in known if each[1] <= MAX_NATS), key=lambda each: each[1])

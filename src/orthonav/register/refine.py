@@ -9,7 +9,6 @@ by blocks of the view, and the spread of those sums is what moves the peak.
 """
 
 import math
-import threading
 from dataclasses import dataclass, replace
 
 import cv2
@@ -17,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.register.evidence import GROUPS
-from orthonav.register.pose import Pose
+from orthonav.register.memory import thread_memory
+from orthonav.register.pose import Pose, even_scale
 from orthonav.register.reference import Reference
 from orthonav.register.template import BLOCKS, Template, derivatives, turn_planes
 
@@ -188,7 +188,7 @@ class _Scratch:
 
     def __init__(self, template: Template) -> None:
         self.template = template
-        planes = _memory(16 * template.mask.size).reshape(16, *template.mask.shape)
+        planes = thread_memory("refine", 16 * template.mask.size).reshape(16, *template.mask.shape)
         self.interleaved = planes[:4].reshape(*template.mask.shape, 4)
         self.planes, self.turned = planes[4:8], planes[8:10]
         self.residual, self.product, self.counts = planes[10:13], planes[13:16], planes[8]
@@ -198,17 +198,6 @@ class _Scratch:
         window.sample(pose, self.interleaved)
         turn_planes(self.interleaved, -pose.turn_rad, self.planes, self.turned)
         return _Seen(self, pose)
-
-
-_thread = threading.local()
-
-
-def _memory(size: int) -> Array:
-    """`size` numbers that belong to this thread, the same ones at every call."""
-    kept: Array | None = getattr(_thread, "memory", None)
-    if kept is None or kept.size < size:
-        kept = _thread.memory = np.empty(size, np.float32)
-    return kept[:size]
 
 
 class _Seen:
@@ -251,7 +240,7 @@ class _Seen:
         self.squares, self.gains = np.array(squares), np.array(gains)
         total = float(np.dot(template.weights, found))
         self.weighted = total / sum(template.weights)
-        self.score = total * math.sqrt(pixels) * math.exp(pose.log_scale)
+        self.score = total * math.sqrt(pixels) * even_scale(pose.log_scale)
 
     def placed(self) -> Placed:
         """The numbers of this pose."""

@@ -10,6 +10,8 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from orthonav.register.evidence import COARSE, FINE, EvidenceRecipe
 from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
@@ -48,11 +50,20 @@ class PosePrior:
 
     def cost(self, pose: Pose) -> float:
         """What a pose loses for being unlikely, in units of the score."""
-        nats = (pose.log_scale / max(self.log_scale_std, 0.01)) ** 2 / 2
+        return NAT_SCORE * self.nats(pose.turn_rad, pose.log_scale)
+
+    def nats(
+        self, turn_rad: float, log_scale: float, *, within: tuple[float, float] = (0.0, 0.0)
+    ) -> float:
+        """Negative log density of a heading and scale, 0 at its peak.
+
+        Where they stand for all `within` (rad, log scale) around, that of the likeliest of those.
+        """
+        parts = [(log_scale, self.log_scale_std, within[1])]
         if self.turn_rad is not None:
-            off = math.remainder(pose.turn_rad - self.turn_rad, 2 * math.pi)
-            nats += (off / max(self.turn_std_rad, 0.01)) ** 2 / 2
-        return NAT_SCORE * nats
+            off = math.remainder(turn_rad - self.turn_rad, 2 * math.pi)
+            parts.append((off, self.turn_std_rad, within[0]))
+        return sum((max(abs(o) - w, 0.0) / max(std, 0.01)) ** 2 / 2 for o, std, w in parts)
 
 
 @dataclass(frozen=True)
@@ -125,25 +136,6 @@ class Registered:
             "candidates": float(self.candidates),
         }
 
-    def beside(self, other: "Registered", view_px: float) -> "Registered":
-        """The better of two searches of the same view, with the rivals that both found."""
-        first, second = (self, other) if self.score >= other.score else (other, self)
-        exclusion = EXCLUSION_SHARE * view_px
-        elsewhere = _apart(first.placed, second.placed) > exclusion
-        more = [
-            (score, each)
-            for score, each in second.finalists
-            if all(_apart(each, known) > exclusion for _, known in first.finalists)
-        ]
-        finalists = sorted((*first.finalists, *more), key=lambda pair: -pair[0])
-        return replace(
-            first,
-            rival=max(first.rival, second.score if elsewhere else second.rival),
-            look_rival=max(first.look_rival, second.look_score if elsewhere else second.look_rival),
-            candidates=first.candidates + second.candidates,
-            finalists=tuple(finalists[:KEPT_TO_FINISH]),
-        )
-
 
 class Registrar:
     """Registers views on one sheet. Safe to share between threads."""
@@ -189,46 +181,65 @@ class Registrar:
         side = _rounded_side(view_px / unit)
         return SearchWindow(made, level, low[1], low[0], side, margin)
 
-    def verify(
+    def judged(
         self,
         templates: ViewTemplates,
         levels: Levels,
         candidates: Sequence[Candidate],
         level: int,
         prior: PosePrior,
-    ) -> Registered | None:
-        """The best of candidates found at `level`, refined from there down; None without any."""
+    ) -> list[Placed]:
+        """Candidates found at `level`, refined from there down to the look level, best first."""
         placed = [Placed.unjudged(found.pose, level) for found in candidates]
-        if not placed:
-            return None
         for at in range(level, levels.look - 1, -1):
             placed = self._compared(self._refiner(templates, levels, at), placed, prior)
             if at > levels.look:
                 placed = _hopeful(placed, prior, HOPE)[:KEPT_TO_LOOK]
-        return self._verdict(templates, levels, placed, prior, len(candidates))
+        return placed
+
+    def standing(
+        self, templates: ViewTemplates, judged: Sequence[Placed], prior: PosePrior
+    ) -> tuple[float, float]:
+        """Score of the best of judged candidates, and of the best elsewhere."""
+        values = [each.score - prior.cost(each.pose) for each in judged]
+        best = int(np.argmax(values))
+        exclusion = EXCLUSION_SHARE * view_side_px(templates)
+        elsewhere = [
+            value
+            for value, each in zip(values, judged, strict=True)
+            if _apart(each, judged[best]) > exclusion
+        ]
+        return values[best], max(elsewhere, default=0.0)
 
     def _compared(self, refiner: Refiner, placed: list[Placed], prior: PosePrior) -> list[Placed]:
         """Candidates refined at one level, best first; those without hope only a little."""
         first = [refiner.place(each.pose, FIRST_STEPS, ROUGH_STEP_PX) for each in placed]
+        if not first:
+            return []
         ranked = _ranked(first, prior)
         hopeful = _hopeful(ranked, prior, HOPE_AT_FIRST)
         further = [refiner.place(each.pose, FULL_STEPS, ROUGH_STEP_PX) for each in hopeful]
         return _ranked(further + ranked[len(hopeful) :], prior)
 
-    def _verdict(
+    def finished(
         self,
         templates: ViewTemplates,
         levels: Levels,
-        judged: list[Placed],
+        judged: Sequence[Placed],
         prior: PosePrior,
         candidates: int,
     ) -> Registered:
-        """The best of the judged candidates, best first, after the best of them are finished."""
+        """The best of the judged candidates, of one or more searches of `candidates` in all.
+
+        The best of them are refined at the final level, their rivals too. `judged` must not be
+        empty.
+        """
+        judged = _ranked(judged, prior)
         exclusion = EXCLUSION_SHARE * view_side_px(templates)
         finalists = _hopeful(_distinct(judged, KEPT_TO_FINISH, exclusion), prior, HOPE, 2)
         totals = [
             (total - prior.cost(each.pose), each)
-            for total, each in (self._finished(templates, levels, each) for each in finalists)
+            for total, each in (self._at_final(templates, levels, each) for each in finalists)
         ]
         totals.sort(key=lambda pair: -pair[0])
         score, best = totals[0]
@@ -253,7 +264,7 @@ class Registrar:
         """
         refiner = Refiner(finer.at(finer.finest), self.reference)
         totals = [
-            (score + refiner.place(each.pose, 4).score, score, each)
+            (score + refiner.place(each.pose, 2).score, score, each)
             for score, each in found.finalists
         ]
         totals.sort(key=lambda entry: -entry[0])
@@ -280,7 +291,7 @@ class Registrar:
         final = self._refiner(templates, levels, levels.final)
         return final.place(best.pose, 3, with_covariance=True)
 
-    def _finished(
+    def _at_final(
         self, templates: ViewTemplates, levels: Levels, judged: Placed
     ) -> tuple[float, Placed]:
         """A judged candidate refined at the final level, and the sum of its scores."""
@@ -306,7 +317,7 @@ def _rounded_side(side: float) -> int:
     return math.ceil(2 ** (math.ceil(4 * math.log2(max(side, 8.0))) / 4))
 
 
-def _ranked(placed: list[Placed], prior: PosePrior) -> list[Placed]:
+def _ranked(placed: Sequence[Placed], prior: PosePrior) -> list[Placed]:
     return sorted(placed, key=lambda each: prior.cost(each.pose) - each.score)
 
 

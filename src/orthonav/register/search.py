@@ -13,10 +13,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import fft, irfft2, next_fast_len, rfft, rfft2
 
 from orthonav.geo.camera import counted_from_centres
 from orthonav.register.evidence import GROUPS
-from orthonav.register.pose import Pose
+from orthonav.register.memory import thread_memory
+from orthonav.register.pose import Pose, even_scale
 from orthonav.register.template import Template, energy_of, turn_planes
 
 Array = NDArray[np.float32]
@@ -82,16 +84,12 @@ class SearchWindow:
         # Beyond the border the other side shows: harmless where the window is far larger.
         pad = view_px if min(self.height, self.width) < 3 * view_px else 0
         self.size = (
-            cv2.getOptimalDFTSize(max(self.height + pad, view_px)),
-            cv2.getOptimalDFTSize(max(self.width + pad, view_px)),
+            next_fast_len(max(self.height + pad, view_px), real=True),
+            next_fast_len(max(self.width + pad, view_px), real=True),
         )
-        self.spectra = []
-        for group in GROUPS:
-            even = _even(made[..., group], made[..., 3], view_px)
-            for channel in np.moveaxis(even, -1, 0):
-                padded = np.zeros(self.size, np.float32)
-                padded[: self.height, : self.width] = channel
-                self.spectra.append(cv2.dft(padded))
+        even = [_even(made[..., group], made[..., 3], view_px) for group in GROUPS]
+        planes = np.moveaxis(np.concatenate(even, axis=2), 2, 0)
+        self.spectra = np.asarray(rfft2(planes, s=self.size), np.complex64)
 
 
 def _even(channels: Array, counts: Array, view_px: int) -> Array:
@@ -109,12 +107,16 @@ def search(
     """The `count` best candidates, best first, not closer together than an eighth of the view."""
     best = np.full((window.height, window.width), -np.inf, np.float32)
     which = np.zeros(best.shape, np.int32)
+    numbers = np.empty(best.shape, np.int32)
     scratch = _Scratch(window)
     for number, (turn, log_scale) in enumerate(poses):
         scores = scratch.scores(template, turn, log_scale)
-        better = scores > best
-        np.copyto(best, scores, where=better)
-        np.copyto(which, number, where=better)
+        if scores is None:
+            continue
+        better = cv2.compare(scores, best, cv2.CMP_GT)
+        numbers.fill(number)
+        cv2.copyTo(scores, better, best)
+        cv2.copyTo(numbers, better, which)
     if window.margin_px:
         inner = np.zeros(best.shape, np.bool_)
         inner[window.margin_px : -window.margin_px, window.margin_px : -window.margin_px] = True
@@ -132,42 +134,42 @@ def search(
 
 
 class _Scratch:
-    """Memory of one search, used again for every pose: fresh pages would cost more than the FFT."""
+    """Memory of one search, used again for every pose."""
 
     def __init__(self, window: SearchWindow) -> None:
         self._window = window
-        self._padded = np.zeros(window.size, np.float32)
-        self._spectrum = np.empty(window.size, np.float32)
-        self._product = np.empty(window.size, np.float32)
-        self._total = np.empty(window.size, np.float32)
-        self._surface = np.empty(window.size, np.float32)
+        rows, cols = window.size
+        half = cols // 2 + 1
+        # Real and imaginary parts: three channels, their sum, and one product.
+        made = thread_memory("search", 2 * 5 * rows * half).view(np.complex64)
+        self._spectra = made[: 3 * rows * half].reshape(3, rows, half)
+        self._total, self._product = made[3 * rows * half :].reshape(2, rows, half)
 
-    def scores(self, template: Template, turn: float, log_scale: float) -> Array:
-        """Score (H, W) of the view's middle lying on each pixel's first corner; used up by the
-        next call."""
+    def scores(self, template: Template, turn: float, log_scale: float) -> Array | None:
+        """Score (H, W) of the view's middle lying on each pixel's first corner; None if the view
+        does not fit into the window."""
         window = self._window
         half = posed_half_px(template, log_scale)
-        size = 2 * half
-        if size > min(window.size):
-            return np.full((window.height, window.width), -np.inf, np.float32)
-        posed = posed_channels(template, turn, log_scale)
-        for number, (channel, spectrum) in enumerate(zip(posed, window.spectra, strict=True)):
-            # The middle goes to the first pixel, what lies before it wraps to the end.
-            padded = self._padded
-            padded[:half, :half] = channel[half:, half:]
-            padded[:half, -half:] = channel[half:, :half]
-            padded[-half:, :half] = channel[:half, half:]
-            padded[-half:, -half:] = channel[:half, :half]
-            cv2.dft(padded, dst=self._spectrum)
-            target = self._product if number else self._total
-            cv2.mulSpectrums(spectrum, self._spectrum, 0, c=target, conjB=True)
-            if number:
-                cv2.add(self._total, self._product, dst=self._total)
-        for rows in (slice(None, half), slice(-half, None)):
-            for cols in (slice(None, half), slice(-half, None)):
-                self._padded[rows, cols] = 0
-        cv2.idft(self._total, dst=self._surface, flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)
-        return self._surface[: window.height, : window.width]
+        rows, cols = window.size
+        if 2 * half > min(rows, cols):
+            return None
+        # Turned by half a turn, for a product of spectra to be a correlation; the middle goes to
+        # the first pixel, what lies before it wraps to the end.
+        posed = posed_channels(template, turn, log_scale)[:, ::-1, ::-1]
+        strip = np.zeros((3, 2 * half, cols), np.float32)
+        strip[:, :, : half + 1] = posed[:, :, half - 1 :]
+        strip[:, :, cols - half + 1 :] = posed[:, :, : half - 1]
+        along = rfft(strip, axis=2)
+        self._spectra[:, : half + 1] = along[:, half - 1 :]
+        self._spectra[:, half + 1 : rows - half + 1] = 0
+        self._spectra[:, rows - half + 1 :] = along[:, : half - 1]
+        spectra = fft(self._spectra, axis=1, overwrite_x=True)
+        np.multiply(window.spectra[0], spectra[0], out=self._total)
+        for number in (1, 2):
+            np.multiply(window.spectra[number], spectra[number], out=self._product)
+            np.add(self._total, self._product, out=self._total)
+        surface = irfft2(self._total, s=window.size, overwrite_x=True)
+        return np.asarray(surface, np.float32)[: window.height, : window.width]
 
 
 def posed_half_px(template: Template, log_scale: float) -> int:
@@ -194,7 +196,8 @@ def posed_channels(template: Template, turn: float, log_scale: float) -> Array:
     turn_planes(warped, turn, posed, scratch)
     for group, weight in zip(GROUPS, template.weights, strict=True):
         energy = energy_of(posed[group])
-        posed[group] *= np.float32(weight / math.sqrt(energy) if energy > 0 else 0.0)
+        even = weight * even_scale(-log_scale)
+        posed[group] *= np.float32(even / math.sqrt(energy) if energy > 0 else 0.0)
     return posed
 
 
