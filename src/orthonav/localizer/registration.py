@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,15 +49,25 @@ MIN_CANDIDATES = 6
 CANDIDATE_SHARE = 0.5
 MIN_VIEW_PX = 24.0
 USUAL_CHANCES = Chances(28.0, 20.0, 40.0)
-SURE_STRENGTH = 2.2
-SURE_RATIO = 1.9
-"""A view this far above chance and its rivals is not searched again."""
 POSE_MS = 0.1
 PIXEL_MS = 5.5e-7
 LOOK_MS = 14.0
 DOUBT = 0.01
 LAST_MS = 900.0
 """What searches cost on one core of a desktop, roughly: to choose between them, no more."""
+
+
+class _Sure(NamedTuple):
+    """A view this far above chance and above its rivals is not searched again."""
+
+    strength: float
+    look_ratio: float
+    peak_ratio: float
+
+
+SURE = _Sure(2.2, 1.9, 1.9)
+SURE_AT_LOOK = _Sure(1.8, 1.5, 1.5)
+"""Less is enough where the level that misses least was searched, if only in part."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,9 +173,10 @@ class RegistrationLocalizer:
             )
             candidates += len(found)
             best = None
-            if judged and self._looks_sure(view, judged):
+            enough = SURE_AT_LOOK if level == view.levels.look else SURE
+            if judged and self._looks_sure(view, judged, enough):
                 best = self._finished(view, judged, candidates)
-                if self._is_sure(best):
+                if self._is_sure(best, enough):
                     return best
         if not judged:
             return None
@@ -178,15 +190,15 @@ class RegistrationLocalizer:
     def _finished(self, view: _View, judged: list[Placed], candidates: int) -> Registered:
         return self.registrar.finished(view.templates, view.levels, judged, view.prior, candidates)
 
-    def _looks_sure(self, view: _View, judged: list[Placed]) -> bool:
+    def _looks_sure(self, view: _View, judged: list[Placed], enough: _Sure) -> bool:
         """Whether finishing the best of them may end the search."""
         best, rival = self.registrar.standing(view.templates, judged, view.prior)
-        return best > SURE_STRENGTH * self._chances.look and best > SURE_RATIO * rival
+        return best > enough.strength * self._chances.look and best > enough.look_ratio * rival
 
-    def _is_sure(self, best: Registered) -> bool:
-        if best.score <= SURE_STRENGTH * self._chances.total:
+    def _is_sure(self, best: Registered, enough: _Sure) -> bool:
+        if best.score <= enough.strength * self._chances.total:
             return False
-        return min(best.peak_ratio, best.look_ratio) > SURE_RATIO
+        return best.look_ratio > enough.look_ratio and best.peak_ratio > enough.peak_ratio
 
     def _is_doubtful(self, best: Registered) -> bool:
         """Whether one finer level could change whether the place is believed."""
