@@ -97,7 +97,8 @@ def _watched(account: _Account) -> Iterator[_Account]:
     clocked = [
         (locate, "prepared", lambda *a, **k: "rectify"),
         (locate, "_searched", lambda *a, **k: f"search, level {a[3] if len(a) > 3 else '?'}"),
-        (registrar.Registrar, "verify", lambda *a, **k: VERIFY),
+        (registrar.Registrar, "judged", lambda *a, **k: VERIFY),
+        (registrar.Registrar, "finished", lambda *a, **k: VERIFY),
         (registrar.Registrar, "deepened", lambda *a, **k: VERIFY),
         (propose.TileProposer, "candidates", lambda *a, **k: "search, tiles"),
         (refiner, "place", lambda self, *a, **k: f"refine, level {self.template.level}"),

@@ -23,9 +23,12 @@ from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
 from orthonav.register.registrar import (
     EXCLUSION_SHARE,
+    KEPT_TO_LOOK,
     LOOK_PX,
     MAX_KEPT_WINDOWS,
     MAX_RATIO,
+    MIN_HOPEFUL,
+    NAT_SCORE,
     Levels,
     PosePrior,
     Registrar,
@@ -66,9 +69,15 @@ def searched(registrar, templates, prior, level, count=24):
     return search(templates.at(level, recipe), window, around, count)
 
 
+def verified(registrar, templates, levels, candidates, level, prior):
+    """One search from candidates to the place."""
+    judged = registrar.judged(templates, levels, candidates, level, prior)
+    return registrar.finished(templates, levels, judged, prior, len(candidates))
+
+
 def registered(registrar, templates, prior, level=LEVELS.look):
     candidates = searched(registrar, templates, prior, level)
-    return registrar.verify(templates, LEVELS, candidates, level, prior)
+    return verified(registrar, templates, LEVELS, candidates, level, prior)
 
 
 def near(pose, dx=0.0, dy=0.0, score=1.0):
@@ -172,11 +181,11 @@ def test_of_two_like_places_the_one_told_is_taken(turn_deg):
     candidates = [near(ONE, 3, -2), near(twin, -2, 3), near(twin, 0, 90), near(ONE, 0, -80)]
     ratios = []
     for pose, std_deg in ((ONE, 10.0), (twin, 10.0), (ONE, 40.0)):
-        found = registrar.verify(templates, LEVELS, candidates, LEVELS.look, told(pose, std_deg))
+        found = verified(registrar, templates, LEVELS, candidates, LEVELS.look, told(pose, std_deg))
         assert apart_px(found.placed.pose, pose) < 0.1
         ratios.append(found.peak_ratio)
     assert min(ratios[:2]) > ratios[2] >= 0.99
-    unknown = registrar.verify(templates, LEVELS, candidates, LEVELS.look, NOTHING_TOLD)
+    unknown = verified(registrar, templates, LEVELS, candidates, LEVELS.look, NOTHING_TOLD)
     assert unknown.peak_ratio == pytest.approx(1, abs=0.05)
 
 
@@ -185,18 +194,20 @@ def test_what_lies_beside_the_best_is_no_rival(registrar):
     pose = Pose(180.0, 200.0, 0.5, 0.0)
     close = [near(pose, *away) for away in ((0, 0), (1.5, 1), (15, 3), (-4, -16))]
     assert math.hypot(4, 16) < EXCLUSION_SHARE * VIEW_PX - 8
-    found = registrar.verify(templates_of(GROUND, pose), LEVELS, close, LEVELS.look, told(pose))
+    found = verified(registrar, templates_of(GROUND, pose), LEVELS, close, LEVELS.look, told(pose))
     assert found.rival == 0 and found.look_rival == 0 and found.candidates == 4
     assert found.evidence()["peak_ratio"] == found.evidence()["look_ratio"] == MAX_RATIO
     further = [*close, near(pose, 90.0, 60.0)]
-    found = registrar.verify(templates_of(GROUND, pose), LEVELS, further, LEVELS.look, told(pose))
+    found = verified(
+        registrar, templates_of(GROUND, pose), LEVELS, further, LEVELS.look, told(pose)
+    )
     assert found.rival > 0 and found.look_rival > 0 and found.peak_ratio > 1.8
 
 
 def test_without_candidates_there_is_no_place(registrar):
     templates = templates_of(GROUND, Pose(180.0, 200.0, 0.5, 0.0))
     for level in (LEVELS.look, LEVELS.coarse):
-        assert registrar.verify(templates, LEVELS, [], level, NOTHING_TOLD) is None
+        assert registrar.judged(templates, LEVELS, [], level, NOTHING_TOLD) == []
 
 
 def test_the_order_of_candidates_does_not_matter(registrar):
@@ -204,7 +215,7 @@ def test_the_order_of_candidates_does_not_matter(registrar):
     templates = templates_of(GROUND, pose)
     candidates = searched(registrar, templates, told(pose), LEVELS.coarse)
     one, other = (
-        registrar.verify(templates, LEVELS, each, LEVELS.coarse, told(pose))
+        verified(registrar, templates, LEVELS, each, LEVELS.coarse, told(pose))
         for each in (candidates, candidates[::-1])
     )
     assert one.placed.pose == other.placed.pose and one.score == other.score
@@ -228,40 +239,63 @@ def test_blank_views_and_blank_maps_are_no_crash(registrar, grey):
     empty = Registrar(reference_of(lambda x, y: grey + 0 * x + 0 * y, SHAPE))
     for where, templates in ((registrar, blank), (empty, templates_of(GROUND, pose))):
         candidates = [near(pose), near(pose, 80.0, 40.0), near(pose, 1e4, 1e4)]
-        found = where.verify(templates, LEVELS, candidates, LEVELS.coarse, told(pose))
+        found = verified(where, templates, LEVELS, candidates, LEVELS.coarse, told(pose))
         assert abs(found.score) < 30 and np.isfinite(found.placed.covariance).all()
         assert math.isfinite(found.peak_ratio) and math.isfinite(found.look_ratio)
-
-
-def finished(registrar, templates, pose, prior):
-    return registrar.verify(templates, LEVELS, [near(pose)], LEVELS.look, prior)
 
 
 def test_two_searches_know_of_each_others_rivals():
     """Each search found one of the twins: together they are not sure."""
     registrar = Registrar(reference_of(Twin(), SHAPE))
-    templates = templates_of(GROUND, ONE)
-    one, other = (finished(registrar, templates, each, told(ONE)) for each in (ONE, SAME_AGAIN))
-    assert one.rival == other.rival == 0
-    best, less = sorted((one, other), key=lambda each: -each.score)
-    both = best.beside(less, VIEW_PX)
-    assert both.placed is best.placed and both.score == best.score
-    assert both.rival == less.score and both.peak_ratio == pytest.approx(1, abs=0.05)
-    assert both.look_rival == less.look_score and both.candidates == 2
+    templates, prior = templates_of(GROUND, ONE), told(ONE)
+    searches = [
+        registrar.judged(templates, LEVELS, [near(each)], LEVELS.look, prior)
+        for each in (ONE, SAME_AGAIN)
+    ]
+    for judged in searches:
+        alone = registrar.finished(templates, LEVELS, judged, prior, 1)
+        assert alone.rival == alone.look_rival == 0 and alone.candidates == 1
+        assert registrar.standing(templates, judged, prior)[1] == 0
+    both = registrar.finished(templates, LEVELS, searches[0] + searches[1], prior, 2)
+    assert both.peak_ratio == pytest.approx(1, abs=0.05) and both.candidates == 2
+    assert both.look_ratio == pytest.approx(1, abs=0.05)
+    best, rival = registrar.standing(templates, searches[0] + searches[1], prior)
+    assert best == pytest.approx(max(each[0].score for each in searches), abs=0.01)
+    assert rival == pytest.approx(best, rel=0.05)
 
 
 def test_two_searches_of_one_place_are_no_rivals(registrar):
     pose = Pose(180.0, 200.0, 0.5, 0.0)
-    templates = templates_of(GROUND, pose)
-    prior = told(pose)
-    alone = finished(registrar, templates, pose, prior)
-    with_rival = registrar.verify(
-        templates, LEVELS, [near(pose, 1.0), near(pose, -90.0, 30.0)], LEVELS.look, prior
-    )
-    best, less = sorted((alone, with_rival), key=lambda each: -each.score)
-    both = best.beside(less, VIEW_PX)
-    assert both.rival == with_rival.rival > 0 and both.look_rival == with_rival.look_rival
+    templates, prior = templates_of(GROUND, pose), told(pose)
+    one = registrar.judged(templates, LEVELS, [near(pose)], LEVELS.look, prior)
+    again = [near(pose, 1.0), near(pose, -90.0, 30.0)]
+    other = registrar.judged(templates, LEVELS, again, LEVELS.look, prior)
+    both = registrar.finished(templates, LEVELS, one + other, prior, 3)
+    alone = registrar.finished(templates, LEVELS, other, prior, 2)
+    assert both.rival == alone.rival > 0 and both.look_rival == alone.look_rival
     assert both.candidates == 3 and both.peak_ratio > 1.8
+
+
+def test_candidates_without_hope_are_dropped_early_and_still_known_as_rivals(registrar):
+    pose = Pose(180.0, 200.0, 0.5, 0.0)
+    templates, prior = templates_of(GROUND, pose), told(pose)
+    rng = np.random.default_rng(0)
+    away = [near(pose, *rng.uniform(60, 150, 2) * rng.choice([-1, 1], 2)) for _ in range(20)]
+    judged = registrar.judged(templates, LEVELS, [*away, near(pose, 2.0)], LEVELS.look, prior)
+    assert len(judged) == 21 and apart_px(judged[0].pose, pose) < 0.3
+    scores = [each.score - prior.cost(each.pose) for each in judged]
+    assert scores == sorted(scores, reverse=True)
+    coarser = registrar.judged(templates, LEVELS, [*away, near(pose, 2.0)], LEVELS.coarse, prior)
+    assert MIN_HOPEFUL <= len(coarser) <= KEPT_TO_LOOK
+    assert apart_px(coarser[0].pose, pose) < 0.3
+
+
+def test_a_step_of_a_bank_is_as_likely_as_the_likeliest_within_it():
+    prior = PosePrior(1.0, 0.2, 0.1)
+    assert prior.nats(1.3, 0.2) == pytest.approx(1.5**2 / 2 + 2)
+    assert prior.nats(1.3, 0.2, within=(0.1, 0.05)) == pytest.approx(1 / 2 + 1.5**2 / 2)
+    assert prior.nats(0.95, -0.04, within=(0.1, 0.05)) == 0
+    assert prior.nats(1.3, 0.2) == prior.cost(Pose(0.0, 0.0, 1.3, 0.2)) / NAT_SCORE
 
 
 def test_the_cost_of_being_unlikely():
@@ -399,16 +433,13 @@ def test_one_finer_level_tells_what_coarser_ones_cannot():
     levels = Levels.of(math.sqrt(192 * 224), 4)
     assert levels.final == 1
     candidates = [near(pose, 3.0), near(twin, -2.0), near(twin, 0.0, 90.0)]
-    found = registrar.verify(templates, levels, candidates, levels.look, told(pose))
+    found = verified(registrar, templates, levels, candidates, levels.look, told(pose))
     deep = registrar.deepened(templates, finer, levels, found)
     assert apart_px(deep.placed.pose, pose) < 0.3 and deep.placed.covariance is not None
     assert deep.fine_score > deep.score and deep.fine_rival > 0
     assert deep.fine_score / deep.fine_rival > found.peak_ratio + 0.1
     # Told the wrong one of both, the finer level sets it right.
-    wrong = registrar.verify(templates, levels, [near(twin)], levels.look, told(pose))
-    both = wrong.beside(
-        registrar.verify(templates, levels, [near(pose)], levels.look, told(pose)), 200.0
-    )
+    both = verified(registrar, templates, levels, candidates[:2], levels.look, told(pose))
     turned = replace(both, finalists=both.finalists[::-1])
     again = registrar.deepened(templates, finer, levels, turned)
     assert apart_px(again.placed.pose, pose) < 0.3 and again.fine_score > again.fine_rival
@@ -422,7 +453,7 @@ def test_sheets_of_one_level():
     templates = templates_of(GROUND, pose)
     window = registrar.whole_window(0, levels.recipe(0), VIEW_PX)
     candidates = search(templates.at(0, levels.recipe(0)), window, [(0.4, 0.0)], 6)
-    found = registrar.verify(templates, levels, candidates, 0, told(pose))
+    found = verified(registrar, templates, levels, candidates, 0, told(pose))
     assert apart_px(found.placed.pose, pose) < 0.1 and found.peak_ratio > 1.5
 
 

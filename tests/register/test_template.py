@@ -16,7 +16,7 @@ from orthonav.register.template import (
     ViewTemplates,
     energy_of,
     halved,
-    turned_planes,
+    turn_planes,
 )
 
 SHAPE = (384, 448)
@@ -85,6 +85,26 @@ def test_a_posed_view_is_what_the_map_shows(reference, turn_deg, log_scale):
     turned_wrongly = posed_channels(template, -pose.turn_rad, pose.log_scale)[0:2]
     if 20 < abs(turn_deg) % 180 < 160:
         assert alike(turned_wrongly, shown[0:2]) < 0.3
+
+
+def turned_planes(made, turn_rad):
+    planes = np.empty((made.shape[2], *made.shape[:2]), np.float32)
+    turn_planes(np.ascontiguousarray(made), turn_rad, planes, np.empty_like(planes[:2]))
+    return planes
+
+
+@pytest.mark.parametrize("shape", [(96, 128), (61, 83)])
+def test_what_blocks_add_up_to_is_the_whole(shape):
+    template = templates_of(GROUND, PLACE, shape).at(0)
+    blocks = template.block_hessians
+    assert blocks.shape == (BLOCKS**2, 2, 4, 4)
+    np.testing.assert_allclose(blocks.sum(axis=0), template.hessians, rtol=1e-4, atol=1e-5)
+    assert template.block_pixels.sum() == template.pixels
+    # The blocks are those of the rows and columns they say: each alone gives its own part.
+    first = np.zeros(shape, np.float32)
+    first[: shape[0] // BLOCKS, : shape[1] // BLOCKS] = 1
+    rows = (template.jacobian[2, 1] * first).reshape(-1)
+    assert blocks[0, 1, 1, 1] == pytest.approx(float(rows @ rows), rel=1e-4)
 
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])

@@ -44,11 +44,12 @@ STAGES_NATS = (-1.0, 0.4, 2.0, math.inf)
 """Headings and scales are tried in stages, by how unlikely they are."""
 PRIOR_SIGMAS = 3.0
 CANDIDATES = 24
-STAGE_CANDIDATES = 12
+STAGE_CANDIDATES = 8
 MIN_CANDIDATES = 6
 CANDIDATE_SHARE = 0.5
 MIN_VIEW_PX = 24.0
-USUAL_CHANCES = Chances(28.0, 20.0, 40.0)
+MIN_LEAN_COS = 0.5
+USUAL_CHANCES = Chances(32.0, 15.0, 48.0)
 POSE_MS = 0.1
 PIXEL_MS = 5.5e-7
 LOOK_MS = 14.0
@@ -133,7 +134,11 @@ class RegistrationLocalizer:
     ) -> _View | NoFix:
         """The view rectified to the level where it is finished, heading up, all that it sees."""
         agl_m = telemetry.agl_m
-        nominal_m = agl_m * math.sqrt(
+        lean = math.cos(math.radians(telemetry.pitch_deg)) * math.cos(
+            math.radians(telemetry.roll_deg)
+        )
+        # The area seen grows with the inverse cube of the cosine, as far as it is looked at.
+        nominal_m = (agl_m / max(lean, MIN_LEAN_COS) ** 1.5) * math.sqrt(
             camera.width_px * camera.height_px / (camera.fx_px * camera.fy_px)
         )
         levels = Levels.of(nominal_m / self.grid.gsd_m, self.registrar.reference.levels)
@@ -169,7 +174,7 @@ class RegistrationLocalizer:
         candidates = 0
         for level, found in self._ways(view, prior):
             judged += self.registrar.judged(
-                view.templates, view.levels, found, level, view.prior
+                view.templates, view.levels, found, level, view.prior, judged
             )
             candidates += len(found)
             best = None

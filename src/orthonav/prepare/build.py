@@ -50,7 +50,7 @@ PREVIEW_PX = 384
 MIN_TILE_VALID_SHARE = 0.5
 MIN_VIEW_VALID_SHARE = 0.4
 HEADING_STEP_DEG = 6.0
-SEARCH_MS = 40.0
+SEARCH_MS = 100.0
 """Dearest search of a view while the confidence is learnt, by estimate: there are many views."""
 MAX_CALIBRATION_VIEWS = 2 * CROPS
 RADIUS_PX = 10.0

@@ -46,7 +46,7 @@ class Pose:
 
 
 def even_scale(log_scale: float) -> float:
-    """What makes scores of chance alike at every scale: correlation times root of pixels times this.
+    """Factor of correlation times root of pixels that makes scores of chance alike at any scale.
 
     A view that is magnified touches more pixels of the map, but says no more; measured on mirrored
     views, chance grows with about the root of the scale.

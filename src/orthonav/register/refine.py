@@ -82,7 +82,7 @@ class Refiner:
         """
         window = _Window(self.template, self.reference, pose)
         unit = np.array([2.0**self.template.level, 2.0**self.template.level, 1.0, 1.0])
-        converged = False
+        converged, step = False, np.zeros(4)
         seen = self._scratch.seen(window, pose)
         best = seen.placed()
         for _ in range(steps):
@@ -100,7 +100,11 @@ class Refiner:
             return best
         if seen.pose is not best.pose:
             seen = self._scratch.seen(window, best.pose)
-        return replace(best, covariance=self._covariance(seen), agreement=seen.agreement())
+        covariance = self._covariance(seen)
+        if not converged:
+            # Still moving: its last step is an error of its own.
+            covariance += np.outer(move := self._to_map(seen) @ step, move)
+        return replace(best, covariance=covariance, agreement=seen.agreement())
 
     def _hessian(self, seen: "_Seen") -> NDArray[np.float64]:
         """Gauss-Newton matrix (4, 4) over the part of the view that lies on the map."""
@@ -142,14 +146,19 @@ class Refiner:
     def _moves_px(self, step: NDArray[np.float64]) -> float:
         return float(math.hypot(step[0], step[1]) + self._reach_px * math.hypot(step[2], step[3]))
 
+    def _to_map(self, seen: "_Seen") -> NDArray[np.float64]:
+        """From steps of the window to position (level-0 px), turn and log scale: (4, 4)."""
+        to_map = np.eye(4)
+        to_map[:2, :2] = seen.pose.linear * 2.0**self.template.level
+        return to_map
+
     def _covariance(self, seen: "_Seen") -> NDArray[np.float64]:
         """Covariance (4, 4) of x, y (level-0 px), turn and log scale."""
         terms = np.einsum("cphw,chw->phw", self.template.jacobian, seen.residual)
         sums = self.template.block_sums(terms).astype(np.float64)
         spread = sums @ sums.T * (BLOCKS**2 / (BLOCKS**2 - 4))
         inverse = self._observed_inverse(seen)
-        to_map = np.eye(4)
-        to_map[:2, :2] = seen.pose.linear * 2.0**self.template.level
+        to_map = self._to_map(seen)
         return np.asarray(to_map @ inverse @ spread @ inverse @ to_map.T)
 
 

@@ -188,11 +188,17 @@ class Registrar:
         candidates: Sequence[Candidate],
         level: int,
         prior: PosePrior,
+        known: Sequence[Placed] = (),
     ) -> list[Placed]:
-        """Candidates found at `level`, refined from there down to the look level, best first."""
+        """Candidates found at `level`, refined from there down to the look level, best first.
+
+        Hope is measured at the best of them, at the look level also at those `known` already.
+        """
         placed = [Placed.unjudged(found.pose, level) for found in candidates]
         for at in range(level, levels.look - 1, -1):
-            placed = self._compared(self._refiner(templates, levels, at), placed, prior)
+            refiner = self._refiner(templates, levels, at)
+            rivals = known if at == levels.look else ()
+            placed = self._compared(refiner, placed, prior, rivals)
             if at > levels.look:
                 placed = _hopeful(placed, prior, HOPE)[:KEPT_TO_LOOK]
         return placed
@@ -211,13 +217,19 @@ class Registrar:
         ]
         return values[best], max(elsewhere, default=0.0)
 
-    def _compared(self, refiner: Refiner, placed: list[Placed], prior: PosePrior) -> list[Placed]:
+    def _compared(
+        self, refiner: Refiner, placed: list[Placed], prior: PosePrior, known: Sequence[Placed]
+    ) -> list[Placed]:
         """Candidates refined at one level, best first; those without hope only a little."""
         first = [refiner.place(each.pose, FIRST_STEPS, ROUGH_STEP_PX) for each in placed]
         if not first:
             return []
         ranked = _ranked(first, prior)
-        hopeful = _hopeful(ranked, prior, HOPE_AT_FIRST)
+        least, at_least = 0.0, MIN_HOPEFUL
+        if known:
+            least = HOPE * max(each.score - prior.cost(each.pose) for each in known)
+            at_least = 1
+        hopeful = _hopeful(ranked, prior, HOPE_AT_FIRST, at_least, least)
         further = [refiner.place(each.pose, FULL_STEPS, ROUGH_STEP_PX) for each in hopeful]
         return _ranked(further + ranked[len(hopeful) :], prior)
 
@@ -322,11 +334,15 @@ def _ranked(placed: Sequence[Placed], prior: PosePrior) -> list[Placed]:
 
 
 def _hopeful(
-    ranked: list[Placed], prior: PosePrior, share: float, at_least: int = MIN_HOPEFUL
+    ranked: list[Placed],
+    prior: PosePrior,
+    share: float,
+    at_least: int = MIN_HOPEFUL,
+    least: float = 0.0,
 ) -> list[Placed]:
-    """The first of candidates, best first, that reach a share of the best score."""
+    """The first of candidates, best first, that reach `least` and a share of the best score."""
     values = [each.score - prior.cost(each.pose) for each in ranked]
-    enough = sum(value >= share * values[0] for value in values)
+    enough = sum(value >= max(share * values[0], least) for value in values)
     return ranked[: max(enough, at_least)]
 
 

@@ -156,6 +156,7 @@ class _Scratch:
         # Turned by half a turn, for a product of spectra to be a correlation; the middle goes to
         # the first pixel, what lies before it wraps to the end.
         posed = posed_channels(template, turn, log_scale)[:, ::-1, ::-1]
+        posed *= np.float32(even_scale(-log_scale))
         strip = np.zeros((3, 2 * half, cols), np.float32)
         strip[:, :, : half + 1] = posed[:, :, half - 1 :]
         strip[:, :, cols - half + 1 :] = posed[:, :, : half - 1]
@@ -190,14 +191,14 @@ def posed_channels(template: Template, turn: float, log_scale: float) -> Array:
     move = np.array([half, half]) - linear @ [width / 2, height / 2]
     matrix = np.vstack([np.column_stack([linear, move]), [0, 0, 1]])
     centred = counted_from_centres(matrix)
-    warped = cv2.warpAffine(template.interleaved, centred[:2], (2 * half, 2 * half))
+    size = 2 * half, 2 * half
+    warped = np.asarray(cv2.warpAffine(template.interleaved, centred[:2], size), np.float32)
     planes = np.empty((2 + warped.shape[2], *warped.shape[:2]), np.float32)
     posed, scratch = planes[2:], planes[:2]
     turn_planes(warped, turn, posed, scratch)
     for group, weight in zip(GROUPS, template.weights, strict=True):
         energy = energy_of(posed[group])
-        even = weight * even_scale(-log_scale)
-        posed[group] *= np.float32(even / math.sqrt(energy) if energy > 0 else 0.0)
+        posed[group] *= np.float32(weight / math.sqrt(energy) if energy > 0 else 0.0)
     return posed
 
 
