@@ -12,6 +12,8 @@ from orthonav.confidence.registered import (
     CHANCES,
     FEATURES,
     STAND_IN,
+    USUAL_BIAS,
+    USUAL_WEIGHTS,
     Chances,
     RegisteredConfidence,
     features_of,
@@ -60,9 +62,11 @@ def test_chance_stands_in_for_a_rival_that_is_missing():
 
 def test_the_finer_level_counts_where_it_was_looked_at():
     deep = evidence(50.0, 45.0, 30.0, 20.0, fine=120.0, fine_rival=60.0)
-    assert np.exp(features_of(deep, CHANCE))[1] == pytest.approx(2)
+    # The mean of both: 50 over 45 and 120 over 60.
+    assert np.exp(features_of(deep, CHANCE))[1] == pytest.approx(math.sqrt(50 / 45 * 2))
     alone = evidence(50.0, 45.0, 30.0, 20.0, fine=120.0, fine_rival=0.0)
-    assert np.exp(features_of(alone, CHANCE))[1] == pytest.approx(120 / (STAND_IN * CHANCE.fine))
+    stood_in = 50 / 45 * 120 / (STAND_IN * CHANCE.fine)
+    assert np.exp(features_of(alone, CHANCE))[1] == pytest.approx(math.sqrt(stood_in))
     for half in ({"fine": 120.0}, {"fine_rival": 60.0}, {}):
         plain = evidence(50.0, 45.0, 30.0, 20.0, **half)
         assert np.exp(features_of(plain, CHANCE))[1] == pytest.approx(50 / 45)
@@ -211,9 +215,10 @@ def test_few_views_do_not_make_it_certain():
 def test_one_sided_views_give_a_finite_answer(all_right):
     views, _ = synthetic(40, seed=3)
     fitted = fit_registered(views, np.full(40, all_right), np.ones(40), CHANCE)
-    said = [fitted(each) for each in views]
     assert all(math.isfinite(number) for number in (fitted.bias, *fitted.weights))
-    assert min(said) > 0.5 if all_right else max(said) < 0.5
+    usual = RegisteredConfidence(USUAL_BIAS, USUAL_WEIGHTS, CHANCE)
+    moved = [fitted(each) - usual(each) for each in views]
+    assert min(moved) > 0 if all_right else max(moved) < 0
 
 
 def test_the_same_views_give_the_same_confidence():

@@ -13,9 +13,10 @@ from orthonav.errors import VariantError
 
 FEATURES = ("log_strength", "log_peak_ratio", "log_look_ratio")
 CHANCES = ("total", "look", "fine")
-USUAL_WEIGHTS = (1.0, 11.0, 0.5)
-"""Weights fitted to generated landscapes; a map's own are drawn towards them."""
-RIDGE = 3e-3
+USUAL_BIAS, USUAL_WEIGHTS = -4.2, (3.0, 9.0, 1.5)
+"""What separates right from wrong on generated landscapes, cautious enough to refuse views of other
+places; a map's own are drawn towards them."""
+RIDGE = 3e-2
 STAND_IN = 0.7
 """Share of the chance value that stands in for a rival where a narrow search found none."""
 
@@ -42,10 +43,11 @@ class RegisteredConfidence:
     """P(right) = 1 / (1 + exp(-(bias + weights . features))).
 
     Features are logarithms: of the strength over that of chance, of the strength over the best
-    elsewhere, and of the same comparison among all candidates at a coarser level. The second uses
-    one finer level where the view was doubtful enough to be looked at there. A share of chance
-    stands in for a rival where none was found, so that a narrow search does not look like
-    certainty. Weights are never negative: more evidence never means less confidence.
+    elsewhere, and of the same comparison among all candidates at a coarser level. Where the view
+    was doubtful enough to be looked at one level finer too, the second is the mean with and without
+    it: on blurred views the finer level alone says too much. A share of chance stands in for a
+    rival where none was found, so that a narrow search does not look like certainty. Weights are
+    never negative: more evidence never means less confidence.
     """
 
     bias: float
@@ -90,7 +92,7 @@ def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.f
     ratio = strength / max(evidence["rival"], STAND_IN * chances.total)
     fine, fine_rival = evidence.get("fine", math.nan), evidence.get("fine_rival", math.nan)
     if math.isfinite(fine + fine_rival):
-        ratio = max(fine, 1e-3) / max(fine_rival, STAND_IN * chances.fine)
+        ratio = math.sqrt(ratio * max(fine, 1e-3) / max(fine_rival, STAND_IN * chances.fine))
     look_ratio = look / max(evidence["look_rival"], STAND_IN * chances.look)
     return np.log(np.array([strength / chances.total, ratio, look_ratio], dtype=np.float64))
 
@@ -103,5 +105,5 @@ def fit_registered(
 ) -> RegisteredConfidence:
     """The confidence that fits views (N) of which it is known whether they came out right."""
     features = np.stack([features_of(each, chances) for each in evidence])
-    bias, weights = fit_weights(features, right, sample_weight, RIDGE, USUAL_WEIGHTS)
+    bias, weights = fit_weights(features, right, sample_weight, RIDGE, (USUAL_BIAS, USUAL_WEIGHTS))
     return RegisteredConfidence(bias, weights, chances)

@@ -31,7 +31,7 @@ MIN_RIGHT = 10
 FLOOR_PX = 0.6
 """Standard deviation per axis, in pixels, with which orthophotos of two dates usually agree."""
 FLOOR_LIMITS_PX = (0.25, 3.0)
-MIRRORED_WEIGHT = 0.5
+MIRRORED_WEIGHT = 1.0
 FALLBACK_CHANCE = 40.0
 
 
