@@ -29,12 +29,12 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method",
         default="gradient",
-        help="embedding, name:field=value,... (default gradient)",
+        help="embedding, name:field=value,...: gradient (default), autoencoder, triplet or bovw",
     )
     parser.add_argument(
         "--edges",
-        default="gradient",
-        help="what is compared: gradient, gray or canny, e.g. canny:low=100,high=200",
+        help="what is compared: gradient, gray, canny (e.g. canny:low=100,high=200), segments or "
+        "sam:weights=PATH (default: gradient; canny for autoencoder, gray for triplet and bovw)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of what is drawn (default 0)")
     parser.add_argument(
@@ -58,6 +58,13 @@ def add(parser: argparse.ArgumentParser) -> None:
         default=48,
         metavar="N",
         help="views made of the orthophoto to learn the confidence from (default 48)",
+    )
+    parser.add_argument(
+        "--work",
+        type=Path,
+        metavar="DIR",
+        help="keep checkpoints and pictures of a network's learning there; a build that was "
+        "interrupted goes on from them",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="MAP.onav")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -85,6 +92,7 @@ def run(options: argparse.Namespace) -> None:
         registration=options.registration,
         other_dates=options.other_date,
         calibration_views=options.calibration_views,
+        work=options.work,
     )
     with progress(options) as shown:
         result = build_map(request, shown)

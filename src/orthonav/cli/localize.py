@@ -33,6 +33,13 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="on: metres, where the map carries a registration layer (default); off: tiles only",
     )
     parser.add_argument(
+        "--position",
+        choices=("peak", "best", "neighbours", "weighted"),
+        default="peak",
+        help="with --registration off, from scores to a position: peak between tiles (default), "
+        "best tile (the paper), mean of the best and its neighbours, or of all tiles, weighted",
+    )
+    parser.add_argument(
         "--accept",
         metavar="NAME:MIN",
         help="withhold fixes below a threshold: confidence:0.9, peak_ratio:1.3, or the paper's "
@@ -60,7 +67,11 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.records import Fix
 
     accept = Acceptance.parse(options.accept) if options.accept else None
-    localizer = Localizer(open_map(options.map), registration=options.registration == "on")
+    localizer = Localizer(
+        open_map(options.map),
+        registration=options.registration == "on",
+        position=options.position,
+    )
     if localizer.registration is not None and accept and accept.criterion == "lowe_ratio":
         raise VariantError("lowe_ratio compares tiles: give --registration off with it")
     if localizer.registration is None and options.registration == "on":

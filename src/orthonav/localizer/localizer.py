@@ -2,14 +2,14 @@
 
 import math
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav import embed, represent
+from orthonav import represent
 from orthonav.confidence.logistic import LogisticConfidence
 from orthonav.confidence.registered import RegisteredConfidence
+from orthonav.embed.stored import embedder_of
 from orthonav.embed.whitened import WhitenedEmbedder
 from orthonav.errors import CameraError, MapFileError, VariantError
 from orthonav.geo.camera import Camera
@@ -23,6 +23,7 @@ from orthonav.mapfile.manifest import SheetInfo
 from orthonav.mapfile.reader import MapFile
 from orthonav.records import Fix, NoFix, Prior, Telemetry
 from orthonav.search.exact import rows_within
+from orthonav.search.position import PositionRule
 from orthonav.variants import variant_from_recipe
 
 DEFAULT_YAW_STD_DEG = 5.0
@@ -34,11 +35,14 @@ UNKNOWN_HEADING_STEP_DEG = 8.0
 class Localizer:
     """Places views on one map. Cheap to make, safe to share between threads once warm."""
 
-    def __init__(self, opened: MapFile, *, registration: bool = True) -> None:
+    def __init__(
+        self, opened: MapFile, *, registration: bool = True, position: PositionRule = "peak"
+    ) -> None:
         """Take an opened map; raises `MapFileError` if it cannot be flown with this program.
 
         Without `registration`, or where the map has no registration layer, views are placed by
-        their tiles only.
+        their tiles only; `position` is then how scores of tiles become a position. Raises
+        `MissingExtraError` where the map's encoder needs onnxruntime and it is not installed.
         """
         manifest = opened.manifest
         if len(manifest.sheets) != 1:
@@ -51,8 +55,10 @@ class Localizer:
             self.representation = variant_from_recipe(
                 represent.TABLE, manifest.recipe.get("represent")
             )
-            self.embedder = _embedder(
-                opened, manifest.recipe.get("embed"), self.representation.channels
+            self.embedder = embedder_of(
+                manifest.recipe.get("embed"),
+                lambda name, dtype, ndim: opened.array(f"embed/{name}", dtype, ndim),
+                self.representation.channels,
             )
             plain = manifest.confidence
             self.confidence = None if plain is None else LogisticConfidence.from_plain(plain)
@@ -67,21 +73,23 @@ class Localizer:
         if not (self._step_deg > 0 and self._position_std_m > 0 and manifest.radius_m > 0):
             raise MapFileError(f"map has impossible view parameters: {opened.path}")
         try:
-            self._matcher = TileMatcher(self.grid, self.centres_en_m, embeddings)
+            self._matcher = TileMatcher(self.grid, self.centres_en_m, embeddings, position)
         except MapFileError as error:
             raise MapFileError(f"{error}: {opened.path}") from error
         self.radius_m = manifest.radius_m
         self.index = self._matcher.index
         self.registration = None
         if registration:
-            propose = TileProposer(
-                self.grid,
-                self.centres_en_m,
-                self.index,
-                self.embedder,
-                self.representation,
-                self._matcher.neighbours,
-            )
+            propose = None
+            if isinstance(self.embedder, WhitenedEmbedder):
+                propose = TileProposer(
+                    self.grid,
+                    self.centres_en_m,
+                    self.index,
+                    self.embedder,
+                    self.representation,
+                    self._matcher.neighbours,
+                )
             self.registration = _registration(opened, self.sheet, propose)
 
     def locate(
@@ -197,7 +205,7 @@ class Localizer:
 
 
 def _registration(
-    opened: MapFile, sheet: SheetInfo, propose: TileProposer
+    opened: MapFile, sheet: SheetInfo, propose: TileProposer | None
 ) -> RegistrationLocalizer | None:
     layer = GreyLayer.of(opened)
     if layer is None:
@@ -212,14 +220,3 @@ def _registration(
     if not (0 < radius_m < math.inf and 0 <= floor_px < math.inf):
         raise MapFileError(f"map has impossible registration parameters: {opened.path}")
     return RegistrationLocalizer(sheet, layer, confidence, radius_m, floor_px, propose)
-
-
-def _embedder(opened: MapFile, plain: Any, channels: int) -> WhitenedEmbedder:
-    recipe = variant_from_recipe(embed.TABLE, plain)
-    mean = opened.array("embed/mean", np.float16, 1)
-    basis = opened.array("embed/basis", np.float16, 2)
-    if not basis.shape[0] == mean.shape[0] == recipe.cells**2 * channels:
-        raise MapFileError("map's embedding parts do not fit together")
-    if not (np.isfinite(mean).all() and np.isfinite(basis).all()):
-        raise MapFileError("map's embedding is not finite")
-    return WhitenedEmbedder(recipe, mean, basis)

@@ -13,6 +13,7 @@ from orthonav.confidence.ratios import lowe_ratio, peak_ratio, rival_score
 from orthonav.geo.grid import TileGrid
 from orthonav.search.exact import ExactIndex
 from orthonav.search.peak import TileNeighbours
+from orthonav.search.position import PositionRule, offset_en_m
 
 BACKGROUND_TILES = 20_000
 
@@ -40,8 +41,13 @@ class TileMatcher:
         grid: TileGrid,
         centres_en_m: NDArray[np.float32],
         embeddings: NDArray[np.float16],
+        position: PositionRule = "peak",
     ) -> None:
-        """Raises `MapFileError` where the centres are not those of the grid."""
+        """`position` says how scores become a position between the tiles.
+
+        Raises `MapFileError` where the centres are not those of the grid.
+        """
+        self._position: PositionRule = position
         self.index = ExactIndex(embeddings)
         self._grid = grid
         self._centres_en_m = centres_en_m
@@ -79,6 +85,17 @@ class TileMatcher:
             "peak_ratio": peak_ratio(score, rival),
             "tiles_searched": float(len(per_tile) if rows is None else len(rows)),
         }
-        east, north = self.neighbours.peak_offset(per_tile, tile, searched)
-        shift = east * self._grid.stride_m, north * self._grid.stride_m
+        # The background serves as rivals only: a mean of all is one of those that are allowed.
+        used, used_rows = per_tile, searched
+        if self._position == "weighted" and searched is not None and rows is not None:
+            used, used_rows = per_tile[np.searchsorted(searched, rows)], rows
+        shift = offset_en_m(
+            self._position,
+            used,
+            tile,
+            used_rows,
+            self._centres_en_m,
+            self.neighbours,
+            self._grid.stride_m,
+        )
         return Match(tile, shift, int(best_heading[best]), evidence)

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from orthonav import __version__, embed, represent
 from orthonav.embed.cells import MICRO, CellLayout
+from orthonav.embed.contract import ViewEmbedder
+from orthonav.embed.network import TripletRecipe
 from orthonav.embed.whitened import CellSheet, WhitenedEmbedder, WhitenedRecipe, learn
 from orthonav.errors import AreaError, OutputError, VariantError
 from orthonav.geo.area import Area
@@ -38,7 +40,10 @@ from orthonav.prepare.calibrate import (
     calibrate,
 )
 from orthonav.prepare.calibrate_registration import FLOOR_PX, calibrate_registration
+from orthonav.prepare.encoders import learn_encoder
 from orthonav.prepare.layer import CHUNK_PX, GreyLayerWriter
+from orthonav.prepare.methods import method_recipe, usual_edges
+from orthonav.prepare.pictures import SheetPictures, read_pictures
 from orthonav.search.exact import ExactIndex
 from orthonav.search.peak import TileNeighbours
 from orthonav.variants import make_variant, variant_recipe
@@ -65,7 +70,9 @@ class BuildRequest:
     whole imagery is the area. `gsd_m` None takes that of the finest orthophoto. With
     `registration` the map carries the grey picture that places views below tile size;
     `other_dates` are orthophotos of the same ground to learn the confidence from, besides
-    `calibration_views` views made of the reference itself."""
+    `calibration_views` views made of the reference itself; a triplet network learns from them too.
+    `edges` None is what suits the method; `work` keeps checkpoints of networks, from which a build
+    that was interrupted goes on."""
 
     orthos: Sequence[Path]
     out: Path
@@ -76,11 +83,12 @@ class BuildRequest:
     tile_px: int = 256
     overlap: float = 0.875
     method: str = "gradient"
-    edges: str = "gradient"
+    edges: str | None = None
     seed: int = 0
     registration: bool = True
     other_dates: Sequence[Path] = ()
     calibration_views: int = 48
+    work: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -98,8 +106,8 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     Raises `MissingFileError`, `ImageryError`, `AreaError`, `VariantError` or `OutputError`.
     """
     report = progress or (lambda stage, share: None)
-    representation = make_variant(represent.TABLE, request.edges)
-    recipe = _embedding_recipe(request.method, representation)
+    representation = make_variant(represent.TABLE, request.edges or usual_edges(request.method))
+    recipe = method_recipe(request.method, representation)
     mosaic = Mosaic.open(request.orthos)
     inputs = [*request.orthos, *request.other_dates]
     if any(request.out.exists() and request.out.samefile(path) for path in inputs):
@@ -116,12 +124,29 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
         )
     sampler = CropSampler(grid.tile_px, request.seed)
     layer = GreyLayerWriter(grid.height_px, grid.width_px) if request.registration else None
-    cells, preview = _read_cells(mosaic, area, grid, representation, sampler, layer, report)
+    pictures = None
+    if not isinstance(recipe, WhitenedRecipe):
+        pictures = SheetPictures(grid, representation)
+    cells, preview = _read_cells(
+        mosaic, area, grid, representation, sampler, layer, pictures, report
+    )
     tiles_rc = _tiles(area, grid, cells)
+    tiles_px = tiles_rc * grid.stride_px
+    embedder: ViewEmbedder
     report("learn", 0.0)
-    embedder = learn(recipe, cells, tiles_rc * grid.stride_px)
+    if isinstance(recipe, WhitenedRecipe):
+        embedder = whitened = learn(recipe, cells, tiles_px)
+        embeddings = whitened.tiles(cells, tiles_px)
+    else:
+        assert pictures is not None
+        dates = [
+            read_pictures(date, area, grid, representation, report)
+            for date in (mosaic_of_dates if isinstance(recipe, TripletRecipe) else ())
+        ]
+        embedder, embeddings = learn_encoder(
+            recipe, pictures, dates, tiles_px, representation, request.seed, request.work, report
+        )
     report("learn", 1.0)
-    embeddings = embedder.tiles(cells, tiles_rc * grid.stride_px)
     centres = grid.centres_en_m(tiles_rc).astype(np.float32)
     calibration = calibrate(
         sampler, grid, representation, embedder, embeddings, centres, HEADING_STEP_DEG, report
@@ -164,7 +189,7 @@ def _registration(
     arrays: dict[str, NDArray[Any]],
     sampler: CropSampler,
     representation: Any,
-    embedder: WhitenedEmbedder,
+    embedder: ViewEmbedder,
     report: Progress,
 ) -> dict[str, Any]:
     """What the manifest says of registration: placed on the map as it will be written."""
@@ -173,14 +198,16 @@ def _registration(
     made = MapFile(request.out, 0, manifest, arrays)
     layer = GreyLayer.of(made)
     assert layer is not None
-    propose = TileProposer(
-        sheet.grid,
-        arrays["sheet0/centres_en_m"],
-        ExactIndex(arrays["sheet0/embeddings"]),
-        embedder,
-        representation,
-        TileNeighbours(sheet.grid, arrays["sheet0/centres_en_m"]),
-    )
+    propose = None
+    if isinstance(embedder, WhitenedEmbedder):
+        propose = TileProposer(
+            sheet.grid,
+            arrays["sheet0/centres_en_m"],
+            ExactIndex(arrays["sheet0/embeddings"]),
+            embedder,
+            representation,
+            TileNeighbours(sheet.grid, arrays["sheet0/centres_en_m"]),
+        )
     localizer = RegistrationLocalizer(
         sheet, layer, None, radius_m, FLOOR_PX, propose, last_ms=SEARCH_MS
     )
@@ -210,17 +237,6 @@ def _crops_of(mosaic: Mosaic, area: Area, grid: TileGrid, sampler: CropSampler) 
             if pixels.valid.all() and pixels.grey.std() > 1:
                 found.append(Crop(pixels.grey, crop.row_px, crop.col_px))
     return found
-
-
-def _embedding_recipe(method: str, representation: Any) -> WhitenedRecipe:
-    """The method's recipe; one-channel pictures are compared on finer cells by default."""
-    name, _, parameters = method.partition(":")
-    if representation.channels == 1 and "cells=" not in parameters:
-        method = f"{name}:{parameters},cells=16"
-    recipe = make_variant(embed.TABLE, method)
-    if not isinstance(recipe, WhitenedRecipe):
-        raise VariantError(f"method '{method}' cannot be built by this program")
-    return recipe
 
 
 def _area(request: BuildRequest, mosaic: Mosaic) -> Area:
@@ -288,6 +304,7 @@ def _read_cells(
     representation: Any,
     sampler: CropSampler,
     layer: GreyLayerWriter | None,
+    pictures: SheetPictures | None,
     report: Progress,
 ) -> tuple[CellSheet, NDArray[np.uint8]]:
     """Micro-cell means of the whole sheet, and a small grey picture of it as JPEG bytes.
@@ -311,6 +328,8 @@ def _read_cells(
                 part = read.part(beyond_px)
                 maps = representation(grey, valid)
                 cells.fill(block.row, block.col, maps[:, part[0], part[1]], valid[part])
+                if pictures is not None:
+                    pictures.fill(read, maps)
             share = block.height * block.width / total_px
             sampler.offer(grey, valid, block.row - read.top, block.col - read.left, share)
             preview.add(read)
@@ -353,7 +372,7 @@ def _manifest(
     mosaic: Mosaic,
     sheet: SheetInfo,
     representation: Any,
-    embedder: WhitenedEmbedder,
+    embedder: ViewEmbedder,
     calibration: Calibration,
 ) -> Manifest:
     return Manifest(

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.confidence.logistic import FEATURES, LogisticConfidence, fit_logistic
-from orthonav.embed.whitened import WhitenedEmbedder
+from orthonav.embed.contract import ViewEmbedder
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.match import TileMatcher
 
@@ -88,7 +88,7 @@ def calibrate(
     sampler: CropSampler,
     grid: TileGrid,
     representation: Any,
-    embedder: WhitenedEmbedder,
+    embedder: ViewEmbedder,
     embeddings: NDArray[np.float16],
     centres_en_m: NDArray[np.float32],
     heading_step_deg: float,
@@ -160,7 +160,7 @@ def _queries(
     picture: NDArray[np.uint8],
     grid: TileGrid,
     representation: Any,
-    embedder: WhitenedEmbedder,
+    embedder: ViewEmbedder,
     heading_step_deg: float,
 ) -> NDArray[np.float32]:
     """Embeddings (3, D) of the middle of a picture under the headings the localizer would try."""

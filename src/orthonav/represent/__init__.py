@@ -10,4 +10,6 @@ TABLE = {
     "gradient": Variant("orthonav.represent.gradients:OrientedGradients"),
     "gray": Variant("orthonav.represent.gray:Gray"),
     "canny": Variant("orthonav.represent.canny:Canny"),
+    "segments": Variant("orthonav.represent.segments:Segments", extra="segments"),
+    "sam": Variant("orthonav.neural.sam:SamBoundaries", flies=False, extra="train"),
 }

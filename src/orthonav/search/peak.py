@@ -51,6 +51,20 @@ class TileNeighbours:
             offsets.append(parabola_peak(behind, _score(scores, rows, best), ahead))
         return offsets[0], offsets[1]
 
+    def around(
+        self, scores: NDArray[np.float32], best: int, rows: NDArray[np.intp] | None = None
+    ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """The best tile and those next to it, corners too, that have a score: rows and scores."""
+        steps = [(east, north) for east in (-1, 0, 1) for north in (-1, 0, 1)]
+        known = [(tile, _score(scores, rows, tile)) for tile in self._besides(best, steps)]
+        kept = [(tile, score) for tile, score in known if np.isfinite(score)]
+        tiles, values = zip(*kept, strict=True)
+        return np.array(tiles, dtype=np.intp), np.array(values, dtype=np.float64)
+
+    def _besides(self, best: int, steps: list[tuple[int, int]]) -> list[int]:
+        found = (self.beside(best, east, north) for east, north in steps)
+        return [tile for tile in found if tile is not None]
+
 
 def parabola_peak(behind: float, middle: float, ahead: float) -> float:
     """Where the parabola through values at -1, 0, 1 has its peak, within 0.5 of the middle.

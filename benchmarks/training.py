@@ -1,0 +1,197 @@
+"""`python -m benchmarks.training`: what a step of learning the auto-encoder costs, and why.
+
+Each row adds one means to the row above, in a process of its own, on the model that
+`orthonav build --method autoencoder` learns: 256 px edge maps, 32 a batch. The losses of a smaller
+model, learnt plainly and with all means, say whether what is learnt stays the same.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.child import peak_memory_mb
+from benchmarks.record import Section, Table, number, provenance, save
+
+PLAIN = {"bf16": False, "channels_last": False, "fused": False, "keep_memory": False}
+MEANS: dict[str, dict[str, bool]] = {
+    "plain float32": PLAIN,
+    "+ fused optimizer": {**PLAIN, "fused": True},
+    "+ memory kept": {**PLAIN, "fused": True, "keep_memory": True},
+    "+ channels last": {**PLAIN, "fused": True, "keep_memory": True, "channels_last": True},
+    "+ bfloat16": {"bf16": True, "channels_last": True, "fused": True, "keep_memory": True},
+}
+COMPILED = "+ torch.compile"
+MEANS[COMPILED] = {**MEANS["+ bfloat16"], "compile": True}
+WHOLE = "+ bfloat16"
+LOSSES = "losses"
+PARTS = (*MEANS, LOSSES)
+SEEDS = (0, 1, 2)
+CURVE = {"tile_px": 64, "width": 32, "dims": 128, "epochs": 60}
+"""A smaller model, for which plain learning takes seconds."""
+TILE_PX, BATCH = 256, 32
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, print and write; returns the exit code."""
+    options = _parser().parse_args(arguments)
+    if options.child:
+        print(json.dumps(_learn(**json.loads(options.child))))
+        return 0
+    start = time.perf_counter()
+    started = provenance("training")
+    wanted = options.only or [name for name in PARTS if options.compile or name != COMPILED]
+    section = Section("Learning the auto-encoder")
+    rows = [name for name in wanted if name != LOSSES]
+    if rows:
+        section.tables.append(_speed(section, rows, options.steps))
+    if LOSSES in wanted:
+        section.tables.append(_curves(section))
+    print(section.markdown(), flush=True)
+    # The suite keeps the facts of its last section.
+    wall_s = time.perf_counter() - start
+    for path in save(options.out, [section], started, wall_s=wall_s, latest=False):
+        print(path, file=sys.stderr)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.training", description=str(__doc__).splitlines()[0]
+    )
+    parser.add_argument("--steps", type=int, default=5, help="timed steps per row")
+    parser.add_argument("--compile", action="store_true", help="torch.compile too (minutes)")
+    parser.add_argument("--only", nargs="+", choices=PARTS, help="only these rows")
+    parser.add_argument(
+        "--out", type=Path, default=Path("bench_results"), help="folder (default bench_results)"
+    )
+    parser.add_argument("--child", help=argparse.SUPPRESS)
+    return parser
+
+
+def _speed(section: Section, names: Sequence[str], steps: int) -> Table:
+    """Time of a step with each means added."""
+    rows, first_s, threads = [], None, 0
+    for name in names:
+        told = _in_a_process(means=MEANS[name], epochs=steps + 1, seed=0)
+        timing = section.add(name, "s", told["seconds"][1:], data="generated edges", seed=0)
+        first_s, threads = first_s or timing.median, told["threads"]
+        cells = [number(value) for value in (timing.median, timing.p10, timing.p90)]
+        gain = first_s / timing.median
+        section.facts[f"gain {name}"] = gain
+        first_step = number(told["seconds"][0])
+        rows.append([name, *cells, number(gain), first_step, number(told["peak_mb"])])
+    header = ("means", "step s", "p10", "p90", "times faster", "first step s", "peak MB")
+    notes = (
+        f"{threads} threads; {told['parameters']:,} parameters, {TILE_PX} px, batch {BATCH}; a "
+        f"step reads tiles, forward, backward, optimizer; {steps} steps after the first one",
+    )
+    return Table("One step of learning", header, rows, notes)
+
+
+def _curves(section: Section) -> Table:
+    """Losses of the smaller model, plain and with all means, from the same first weights."""
+    rows = []
+    for name in ("plain float32", WHOLE):
+        told = [
+            _in_a_process(means=MEANS[name], seed=seed, count=8 * BATCH, **CURVE) for seed in SEEDS
+        ]
+        curves = np.array([one["losses"] for one in told])
+        shown = [curves[:, at - 1] for at in (1, 10, 30, CURVE["epochs"])]
+        section.add(f"last loss, {name}", "1", shown[-1], data="generated edges", seed=SEEDS[0])
+        rows.append([name, *(" ".join(number(loss) for loss in losses) for losses in shown)])
+    header = ("means", "epoch 1", "epoch 10", "epoch 30", f"epoch {CURVE['epochs']}")
+    notes = (
+        f"mean squared error of seeds {', '.join(map(str, SEEDS))}; {8 * BATCH} tiles of "
+        f"{CURVE['tile_px']} px, width {CURVE['width']}, {CURVE['dims']} numbers",
+    )
+    return Table("Losses with and without", header, rows, notes)
+
+
+def _in_a_process(**wanted: Any) -> dict[str, Any]:
+    """What `_learn` gives in a fresh process, whose memory nothing else has touched."""
+    # Benchmarks that import NumPy first may be held to one thread; learning uses what there is.
+    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+    environment = {name: value for name, value in os.environ.items() if name not in names}
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.training", "--child", json.dumps(wanted)],
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+    told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return told
+
+
+def _learn(
+    means: dict[str, bool],
+    epochs: int,
+    seed: int,
+    count: int = BATCH,
+    tile_px: int = TILE_PX,
+    width: int = 320,
+    dims: int = 1024,
+) -> dict[str, Any]:
+    """Learn on `count` generated tiles; seconds and loss of each epoch, threads, peak memory."""
+    import torch
+
+    from orthonav.embed.network import AutoEncoderRecipe
+    from orthonav.neural.autoencoder import Reconstruction
+    from orthonav.neural.training import Means, World, kept_memory, train
+
+    recipe = AutoEncoderRecipe(dims=dims, width=width, epochs=epochs, batch=BATCH)
+    tiles = _edge_tiles(count, tile_px)
+    how = dataclasses.replace(Means(device="cpu", workers=1), **means)
+    marks = []
+    with kept_memory(how.keep_memory):
+        torch.manual_seed(seed)
+        task = Reconstruction(recipe, tiles, binary=True)
+        marks.append(time.perf_counter())
+        losses = train(
+            task,
+            recipe,
+            tiles,
+            seed=seed,
+            work=None,
+            report=lambda text, share: marks.append(time.perf_counter()),
+            means=how,
+            world=World(),
+        )
+    return {
+        "seconds": np.diff(marks).tolist(),
+        "losses": losses,
+        "threads": torch.get_num_threads(),
+        "peak_mb": peak_memory_mb(),
+        "parameters": sum(values.numel() for values in task.model.parameters()),
+    }
+
+
+def _edge_tiles(count: int, tile_px: int) -> Any:
+    """Tiles (binary edges) of a generated sheet with detail of several sizes."""
+    import cv2
+
+    from orthonav.neural.tiles import SheetTiles
+
+    rng = np.random.default_rng(0)
+    side = 4 * tile_px
+    grey = np.zeros((side, side), np.float32)
+    for sigma in (2.0, 6.0, 18.0):
+        blots = cv2.GaussianBlur(rng.normal(size=grey.shape).astype(np.float32), (0, 0), sigma)
+        grey += blots / blots.std()
+    levels = np.clip(128 + 35 * grey, 0, 255).astype(np.uint8)
+    edges = (np.asarray(cv2.Canny(levels, 100, 200)) > 0).astype(np.uint8)
+    tiles_px = rng.integers(0, side - tile_px, (count, 2))
+    return SheetTiles(edges[None], np.ones(edges.shape, bool), tiles_px, tile_px, scale=1.0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,508 @@
+"""Boundaries of Segment Anything masks (Kirillov et al., ICCV 2023) as binary edge maps.
+
+Di Piazza et al. 2024, section 4: Segment Anything is applied to each picture, and its masks are
+turned into one binary map of all their boundaries; Base does as well as Large and Huge. Masks come
+from the automatic mask generator of the paper's appendix B: a grid of points is asked about, three
+masks each; masks that the network itself or a stability check doubts are dropped, then near
+duplicates. The network is that of the `transformers` library (Apache-2.0), its weights are given
+by path and never fetched. This does not fly: it needs PyTorch and seconds to minutes a picture.
+"""
+
+import hashlib
+import itertools
+import logging
+import os
+import pickle
+import re
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import MissingExtraError, OutputError, VariantError
+from orthonav.files import replacing
+from orthonav.neural.superpoint import (
+    chosen_device,
+    pretrained,
+    quiet,
+    require_device,
+    transformers,
+    weights_stamp,
+)
+
+try:
+    import torch
+except ImportError as error:  # pragma: no cover - depends on the installation
+    raise MissingExtraError(
+        "neural networks need PyTorch, which is not installed: pip install 'orthonav[train]'"
+    ) from error
+
+WHERE = (
+    "the folder of facebook/sam-vit-base, -large or -huge (config.json and model.safetensors) from "
+    "the Hugging Face hub, or an original checkpoint such as sam_vit_b_01ec64.pth from "
+    "https://dl.fbaipublicfiles.com/segment_anything/"
+)
+PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
+CACHE_FORMAT = b"orthonav sam boundaries 1"
+_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as it was trained
+_CHUNK_PIXELS = 1 << 24
+_DIGEST_BYTES = 32
+
+log = logging.getLogger(__name__)
+
+Grey = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Predict = Callable[[NDArray[np.float32]], tuple[torch.Tensor, torch.Tensor]]
+"""Points (P, 2), x and y in pixels of the network, to logits (P, 3, h, w) and IoU (P, 3)."""
+
+
+@dataclass(frozen=True)
+class SamBoundaries:
+    """Binary map of the boundaries of all automatic Segment Anything masks of a picture.
+
+    `weights`: path of a Hugging Face folder or of an original `.pth` checkpoint (Base, Large or
+    Huge, as the weights say). `grid`: points along one side of a window. `iou`: least overlap the
+    network expects of a mask with the truth; `stability`: least overlap of the mask cut at logits
+    `offset` above and below zero; `overlap`: overlap of boxes above which only the mask with the
+    better expected `iou` is kept. All as in the original generator.
+
+    Larger pictures are cut into windows of `window` px, so that points and magnification are those
+    of a tile; 0 takes them whole. `prompts`: points at once. `device`: "auto", "cpu" or "cuda".
+    `precision`: "fp32", or "bf16" or "fp16" for the two transformers. `cache`: folder of finished
+    windows, "none" for no cache; by default ORTHONAV_CACHE or the user's cache folder.
+    """
+
+    weights: str = ""
+    grid: int = 32
+    iou: float = 0.88
+    stability: float = 0.95
+    offset: float = 1.0
+    overlap: float = 0.7
+    window: int = 256
+    prompts: int = 64
+    device: str = "auto"
+    precision: str = "fp32"
+    cache: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.weights:
+            raise VariantError(f"sam needs weights=PATH: {WHERE}")
+        for name, least, most in (("grid", 1, 256), ("prompts", 1, 4096)):
+            if not least <= getattr(self, name) <= most:
+                raise VariantError(
+                    f"sam {name} must be {least} to {most}, got {getattr(self, name)}"
+                )
+        for name in ("iou", "stability", "overlap"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise VariantError(f"sam {name} must be 0 to 1, got {getattr(self, name)}")
+        if not self.offset > 0:
+            raise VariantError(f"sam offset must be above 0, got {self.offset}")
+        if self.window and not 16 <= self.window <= 4096:
+            raise VariantError(f"sam window must be 0 or 16 to 4096 px, got {self.window}")
+        if self.precision not in PRECISIONS:
+            raise VariantError(
+                f"sam precision must be {', '.join(PRECISIONS)}, got '{self.precision}'"
+            )
+        require_device(self.device)
+
+    @property
+    def channels(self) -> int:
+        """Number of channels C."""
+        return 1
+
+    @property
+    def margin_px(self) -> int:
+        """Always 0: a mask depends on the whole window, and no margin would change that."""
+        return 0
+
+    def __call__(self, grey: Grey, valid: Mask) -> NDArray[np.float32]:
+        """Boundaries (1, H, W), 1 on one and 0 elsewhere; none along the border of `valid`.
+
+        What lies under pixels that are not valid has no influence. Raises `MissingFileError` or
+        `VariantError` where the weights are missing or not Segment Anything's.
+        """
+        out = np.zeros((1, *grey.shape), dtype=np.float32)
+        for part in _windows(grey.shape, self.window):
+            if valid[part].any():
+                out[0][part] = np.maximum(out[0][part], self._window(grey[part], valid[part]))
+        if not valid.all():
+            inner = cv2.erode(valid.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1)
+            out[0][inner.reshape(valid.shape) == 0] = 0
+        return out
+
+    def batch(
+        self,
+        greys: NDArray[np.uint8],
+        valid: NDArray[np.bool_],
+        report: Callable[[float], None] = lambda share: None,
+    ) -> NDArray[np.float32]:
+        """Boundaries (N, 1, H, W) of pictures (N, H, W); `report` is told the share done."""
+        out = np.zeros((len(greys), 1, *greys.shape[1:]), dtype=np.float32)
+        for index, (grey, seen) in enumerate(zip(greys, valid, strict=True)):
+            out[index] = self(grey, seen)
+            report((index + 1) / len(greys))
+        return out
+
+    def _window(self, grey: Grey, valid: Mask) -> Mask:
+        """Boundaries (H, W) of one window, from the cache where it is there."""
+        filled = np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
+        stamp = weights_stamp(self.weights, WHERE)
+        folder = _cache_folder(self.cache)
+        path = folder / f"{self._key(filled, stamp)}.edges" if folder else None
+        edges = _cached(path, grey.shape) if path else None
+        if edges is None:
+            device = chosen_device(self.device)
+            model = _model(self.weights, stamp, str(device))
+            predict = _predictor(model, filled, PRECISIONS[self.precision])
+            side = int(model.config.vision_config.image_size)
+            edges = boundary_map(automatic_masks(predict, grey.shape, side, self), grey.shape)
+            if path:
+                _keep(path, edges)
+        return edges
+
+    def _key(self, filled: Grey, stamp: tuple[int, ...]) -> str:
+        """Name of a window in the cache: its pixels, the weights and what else decides."""
+        rules = (self.grid, self.iou, self.stability, self.offset, self.overlap, self.precision)
+        digest = hashlib.sha256(CACHE_FORMAT)
+        digest.update(repr((filled.shape, rules, _weights_digest(self.weights, stamp))).encode())
+        digest.update(filled.tobytes())
+        return digest.hexdigest()
+
+
+def _windows(shape: tuple[int, ...], window: int) -> Iterator[tuple[slice, slice]]:
+    """Windows of at most `window` px that cover a picture (H, W), evenly laid."""
+    sides = []
+    for size in shape:
+        length = min(size, window or size)
+        starts = np.linspace(0, size - length, -(-size // length)).round().astype(int)
+        sides.append([slice(int(start), int(start) + length) for start in starts])
+    yield from itertools.product(*sides)
+
+
+class _Box(NamedTuple):
+    """A mask that passed: bits of (H, W), corners (x0, y0, x1, y1) of its pixels, expected IoU."""
+
+    bits: NDArray[np.uint8]
+    corners: NDArray[np.int64]
+    iou: float
+
+
+def automatic_masks(
+    predict: Predict, shape: tuple[int, ...], side: int, rules: SamBoundaries
+) -> Iterator[Mask]:
+    """Masks (H, W) that a grid of points finds and the rules leave, the most trusted first.
+
+    `side` is the width of the network's square picture, on which the picture's longer side lies.
+    """
+    height, width = shape
+    centres = (np.arange(rules.grid) + 0.5) / rules.grid
+    x, y = np.meshgrid(centres, centres)
+    resized = _resized_shape(shape, side)
+    points = np.stack([x.ravel() * resized[1], y.ravel() * resized[0]], axis=1).astype(np.float32)
+    found: list[_Box] = []
+    for start in range(0, len(points), rules.prompts):
+        logits, iou = predict(points[start : start + rules.prompts])
+        found += _trusted(logits.flatten(0, 1), iou.flatten(), shape, side, rules)
+    if not found:
+        return
+    corners = np.stack([mask.corners for mask in found])
+    for index in suppressed(corners, np.array([mask.iou for mask in found]), rules.overlap):
+        bits = np.unpackbits(found[index].bits, count=height * width)
+        yield bits.reshape(height, width).astype(bool)
+
+
+def _trusted(
+    logits: torch.Tensor, iou: torch.Tensor, shape: tuple[int, ...], side: int, rules: SamBoundaries
+) -> Iterator[_Box]:
+    """Those of masks (M, h, w) whose expected IoU (M,) and stability are good enough."""
+    good = iou > rules.iou
+    logits, iou = logits[good], iou[good]
+    resized = _resized_shape(shape, side)
+    chunk = max(1, _CHUNK_PIXELS // max(side * side, shape[0] * shape[1]))
+    for start in range(0, len(logits), chunk):
+        part = logits[start : start + chunk, None].float()
+        part = _scaled(part, (side, side))[..., : resized[0], : resized[1]]
+        full = _scaled(part, (shape[0], shape[1]))[:, 0]
+        inner = (full > rules.offset).sum(dim=(1, 2))
+        outer = (full > -rules.offset).sum(dim=(1, 2))
+        stable = (inner >= rules.stability * outer) & (outer > 0)
+        masks = (full[stable] > 0).cpu().numpy()
+        for mask, trust in zip(masks, iou[start : start + chunk][stable].tolist(), strict=True):
+            if mask.any():
+                yield _Box(np.packbits(mask), _corners(mask), trust)
+
+
+def _scaled(logits: torch.Tensor, shape: tuple[int, int]) -> torch.Tensor:
+    return torch.nn.functional.interpolate(logits, shape, mode="bilinear", align_corners=False)
+
+
+def _corners(mask: Mask) -> NDArray[np.int64]:
+    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    return np.array([columns[0], rows[0], columns[-1], rows[-1]], dtype=np.int64)
+
+
+def suppressed(
+    corners: NDArray[np.int64], scores: NDArray[np.floating[Any]], overlap: float
+) -> list[int]:
+    """Indices of boxes that are left, best score first, when near duplicates are dropped.
+
+    `corners` (N, 4) are x0, y0, x1, y1. A box goes if its intersection over union with a better
+    one that stays is above `overlap`. Boxes as the original takes them: from the first to the last
+    pixel's number, so that a box one pixel wide has no area and duplicates nothing.
+    """
+    order = np.argsort(-scores, kind="stable")
+    areas = (corners[:, 2:] - corners[:, :2]).prod(axis=1)
+    kept = []
+    while len(order):
+        best, order = order[0], order[1:]
+        kept.append(int(best))
+        first = np.maximum(corners[best, :2], corners[order, :2])
+        last = np.minimum(corners[best, 2:], corners[order, 2:])
+        common = (last - first).clip(min=0).prod(axis=1)
+        union = areas[best] + areas[order] - common
+        order = order[common <= overlap * union]
+    return kept
+
+
+def boundary_map(masks: Iterable[Mask], shape: tuple[int, ...]) -> Mask:
+    """Pixels (H, W) of any mask (H, W) next to a pixel outside it; the picture's border is none."""
+    edges = np.zeros(shape, dtype=bool)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    for mask in masks:
+        inside = cv2.erode(mask.astype(np.uint8), cross, borderValue=1).reshape(shape)
+        edges |= mask & (inside == 0)
+    return edges
+
+
+def _resized_shape(shape: tuple[int, ...], side: int) -> tuple[int, int]:
+    """Height and width of a picture (H, W) with its longer side as long as the network's."""
+    height, width = (max(1, int(size * side / max(shape) + 0.5)) for size in shape)
+    return height, width
+
+
+def network_pixels(grey: Grey, side: int) -> torch.Tensor:
+    """A grey picture (H, W) as the network takes it: (1, 3, side, side), zeros below or beside."""
+    height, width = _resized_shape(grey.shape, side)
+    pixels = torch.from_numpy(np.array(grey, dtype=np.float32))[None, None]
+    pixels = torch.nn.functional.interpolate(
+        pixels, (height, width), mode="bilinear", align_corners=False, antialias=True
+    )
+    mean, deviation = (torch.tensor(values).reshape(3, 1, 1) for values in (_MEAN, _DEVIATION))
+    pixels = (pixels.round().clamp(0, 255) / 255 - mean) / deviation
+    return torch.nn.functional.pad(pixels, (0, side - width, 0, side - height))
+
+
+def _predictor(model: Any, grey: Grey, dtype: torch.dtype) -> Predict:
+    """Function that asks the network about points of one picture, encoded once.
+
+    In half precision, positions are still encoded in float32: their phases would suffer.
+    """
+    device = model.device
+    half = (
+        nullcontext()
+        if dtype == torch.float32
+        else torch.autocast(device_type=device.type, dtype=dtype)
+    )
+    pixels = network_pixels(grey, int(model.config.vision_config.image_size)).to(device)
+    with torch.inference_mode():
+        with half:
+            encoded = model.get_image_embeddings(pixels).float()
+        places = model.get_image_wide_positional_embeddings()
+
+    def predict(points: NDArray[np.float32]) -> tuple[torch.Tensor, torch.Tensor]:
+        asked = torch.from_numpy(points).to(device)[None, :, None]
+        labels = torch.ones(asked.shape[:-1], dtype=torch.int, device=device)
+        with torch.inference_mode():
+            sparse, dense = model.prompt_encoder(asked, labels, None, None)
+            with half:
+                logits, iou = model.mask_decoder(encoded, places, sparse, dense, True)
+        return logits[0], iou[0].float()
+
+    return predict
+
+
+@lru_cache(maxsize=1)
+def _model(weights: str, stamp: tuple[int, ...], device: str) -> Any:
+    del stamp  # part of the key only: files may change
+    path = Path(weights).expanduser()
+    model = pretrained(weights, "sam", "SamModel") if path.is_dir() else original_model(path)
+    return model.to(device)
+
+
+@lru_cache(maxsize=8)
+def _weights_digest(weights: str, stamp: tuple[int, ...]) -> str:
+    """SHA-256 of what a path of weights holds."""
+    del stamp
+    path = Path(weights).expanduser()
+    files = [path]
+    if path.is_dir():
+        files = sorted([*path.glob("config.json"), *path.glob("*.safetensors")])
+    digest = hashlib.sha256()
+    for file in files:
+        with file.open("rb") as stream:
+            digest.update(hashlib.file_digest(stream, "sha256").digest())
+    return digest.hexdigest()
+
+
+# Original checkpoints: the same network under other names.
+
+_RENAMES = [
+    (re.compile(pattern), name)
+    for pattern, name in (
+        (r"^image_encoder\.", "vision_encoder."),
+        (r"\.patch_embed\.proj\.", ".patch_embed.projection."),
+        (r"^vision_encoder\.blocks\.", "vision_encoder.layers."),
+        (r"\.neck\.0\.", ".neck.conv1."),
+        (r"\.neck\.1\.", ".neck.layer_norm1."),
+        (r"\.neck\.2\.", ".neck.conv2."),
+        (r"\.neck\.3\.", ".neck.layer_norm2."),
+        (
+            r"\.pe_layer\.positional_encoding_gaussian_matrix$",
+            ".shared_embedding.positional_embedding",
+        ),
+        (r"\.point_embeddings\.", ".point_embed."),
+        (r"\.mask_downscaling\.0\.", ".mask_embed.conv1."),
+        (r"\.mask_downscaling\.1\.", ".mask_embed.layer_norm1."),
+        (r"\.mask_downscaling\.3\.", ".mask_embed.conv2."),
+        (r"\.mask_downscaling\.4\.", ".mask_embed.layer_norm2."),
+        (r"\.mask_downscaling\.6\.", ".mask_embed.conv3."),
+        (r"\.output_upscaling\.0\.", ".upscale_conv1."),
+        (r"\.output_upscaling\.1\.", ".upscale_layer_norm."),
+        (r"\.output_upscaling\.3\.", ".upscale_conv2."),
+        (r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers\.0\.", r".\1.proj_in."),
+        (r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers\.1\.", r".\1.layers.0."),
+        (r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers\.2\.", r".\1.proj_out."),
+        (r"\.norm(\d|_final_attn)\.", r".layer_norm\1."),
+    )
+]
+_POSITIONS = "prompt_encoder.shared_embedding.positional_embedding"
+
+
+def converted_weights(original: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Weights of an original checkpoint under the names that `transformers` gives them."""
+    converted = {}
+    for key, value in original.items():
+        for pattern, name in _RENAMES:
+            key = pattern.sub(name, key)
+        converted[key] = value
+    converted["shared_image_embedding.positional_embedding"] = converted[_POSITIONS]
+    return converted
+
+
+def original_model(path: Path) -> Any:
+    """The network of an original checkpoint (`sam_vit_b_01ec64.pth` and its like), in float32.
+
+    Its size is read from the shapes of its weights. Raises `VariantError` if it is no such file.
+    """
+    try:
+        weights = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
+        raise VariantError(f"cannot read the weights; expected {WHERE}: {path}") from error
+    try:
+        # Constants of the preparation of pictures, in some files.
+        named = {k: v for k, v in weights.items() if k not in ("pixel_mean", "pixel_std")}
+        with quiet():
+            model = transformers().SamModel(_config(named))
+        model.load_state_dict(converted_weights(named))
+    except (KeyError, AttributeError, TypeError, ValueError, IndexError, RuntimeError) as error:
+        raise VariantError(f"not Segment Anything weights; expected {WHERE}: {path}") from error
+    return model.eval().requires_grad_(False)
+
+
+def _config(original: Mapping[str, torch.Tensor]) -> Any:
+    """The `SamConfig` that the shapes of an original checkpoint tell."""
+    library = transformers()
+    shapes = {key: tuple(value.shape) for key, value in original.items()}
+    hidden, colours, patch, _ = shapes["image_encoder.patch_embed.proj.weight"]
+    grid = shapes["image_encoder.pos_embed"][1]
+    depth = _count(shapes, r"image_encoder\.blocks\.(\d+)\.norm1\.weight")
+    reaches, head = zip(
+        *(shapes[f"image_encoder.blocks.{i}.attn.rel_pos_h"] for i in range(depth)), strict=True
+    )
+    windows = [(reach + 1) // 2 for reach in reaches]  # of 2 * window - 1 relative positions
+    vision = library.SamVisionConfig(
+        hidden_size=hidden,
+        output_channels=shapes["image_encoder.neck.0.weight"][0],
+        num_hidden_layers=depth,
+        num_attention_heads=hidden // head[0],
+        num_channels=colours,
+        image_size=grid * patch,
+        patch_size=patch,
+        window_size=min(windows) if min(windows) < grid else 14,
+        global_attn_indexes=[i for i, window in enumerate(windows) if window == grid],
+        num_pos_feats=shapes["prompt_encoder.pe_layer.positional_encoding_gaussian_matrix"][1],
+        mlp_dim=shapes["image_encoder.blocks.0.mlp.lin1.weight"][0],
+    )
+    tokens, decoded = shapes["mask_decoder.mask_tokens.weight"]
+    prompt = library.SamPromptEncoderConfig(
+        hidden_size=decoded,
+        image_size=grid * patch,
+        patch_size=patch,
+        mask_input_channels=shapes["prompt_encoder.mask_downscaling.3.weight"][0],
+        num_point_embeddings=_count(shapes, r"prompt_encoder\.point_embeddings\.(\d+)\.weight"),
+    )
+    layers = "mask_decoder.transformer.layers"
+    decoder = library.SamMaskDecoderConfig(
+        hidden_size=decoded,
+        mlp_dim=shapes[f"{layers}.0.mlp.lin1.weight"][0],
+        num_hidden_layers=_count(shapes, layers.replace(".", r"\.") + r"\.(\d+)\.norm1\.weight"),
+        attention_downsample_rate=decoded
+        // shapes[f"{layers}.0.cross_attn_token_to_image.q_proj.weight"][0],
+        num_multimask_outputs=tokens - 1,
+        iou_head_hidden_dim=shapes["mask_decoder.iou_prediction_head.layers.0.weight"][0],
+    )
+    return library.SamConfig(
+        vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=decoder
+    )
+
+
+def _count(keys: Iterable[str], pattern: str) -> int:
+    return sum(re.fullmatch(pattern, key) is not None for key in keys)
+
+
+# The cache: a digest, then the compressed bits of a map, each entry written whole or not at all.
+
+
+def _cache_folder(cache: str) -> Path | None:
+    if cache == "none":
+        return None
+    if cache:
+        return Path(cache).expanduser()
+    if own := os.environ.get("ORTHONAV_CACHE"):
+        return Path(own) / "sam"
+    users = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(users).expanduser() / "orthonav" / "sam"
+
+
+def _cached(path: Path, shape: tuple[int, ...]) -> Mask | None:
+    """The map (H, W) of a cache entry; none if there is none or it was damaged."""
+    try:
+        entry = path.read_bytes()
+        digest, packed = entry[:_DIGEST_BYTES], entry[_DIGEST_BYTES:]
+        if hashlib.sha256(packed).digest() != digest:
+            log.warning("damaged cache entry is made again: %s", path)
+            return None
+        bits = np.unpackbits(np.frombuffer(zlib.decompress(packed), np.uint8))
+        return bits[: shape[0] * shape[1]].reshape(shape).astype(bool)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, zlib.error) as error:
+        log.warning("unreadable cache entry (%s): %s", error, path)
+        return None
+
+
+def _keep(path: Path, edges: Mask) -> None:
+    """Write a cache entry; a cache that cannot be written costs time, not the result."""
+    packed = zlib.compress(np.packbits(edges).tobytes())
+    try:
+        with replacing(path) as temporary:
+            temporary.write_bytes(hashlib.sha256(packed).digest() + packed)
+    except OutputError as error:
+        log.warning("nothing cached: %s", error)

@@ -1,0 +1,121 @@
+"""Reference tiles for learning, cut on the fly out of one sheet: nothing is stored per tile."""
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+BATCHES_AHEAD = 2
+
+Arrays = tuple[NDArray[Any], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SheetTiles:
+    """Tiles of one sheet picture.
+
+    `pixels` (C, H, W) uint8, any array or memory map; `scale` is the value that stands for 1.0:
+    255 for grey levels, 1 for edge maps. `valid` (H, W) bool. `tiles_px` (N, 2) is the row and
+    column of each tile's first pixel, `tile_px` the side S of a tile. `grey` (H, W) uint8 is the
+    picture that `pixels` were made from, where it is not their first channel itself: what
+    positives of triplets are made from. Raises `ValueError` where these do not fit together.
+    """
+
+    pixels: NDArray[np.uint8]
+    valid: NDArray[np.bool_]
+    tiles_px: NDArray[np.integer[Any]]
+    tile_px: int
+    scale: float = 255.0
+    grey: NDArray[np.uint8] | None = None
+
+    def __post_init__(self) -> None:
+        if self.pixels.ndim != 3 or self.pixels.dtype != np.uint8:
+            raise ValueError(
+                f"pixels must be uint8 (C, H, W), got {self.pixels.dtype} {self.pixels.shape}"
+            )
+        shape = self.pixels.shape[1:]
+        if self.valid.shape != shape or self.valid.dtype != np.bool_:
+            raise ValueError(
+                f"valid must be bool {shape}, got {self.valid.dtype} {self.valid.shape}"
+            )
+        if self.grey is not None and (self.grey.shape != shape or self.grey.dtype != np.uint8):
+            raise ValueError(f"grey must be uint8 {shape}, got {self.grey.dtype} {self.grey.shape}")
+        if self.tiles_px.ndim != 2 or self.tiles_px.shape[1] != 2 or len(self.tiles_px) == 0:
+            raise ValueError(f"tiles_px must be (N, 2), N above 0, got {self.tiles_px.shape}")
+        if not self.scale > 0:
+            raise ValueError(f"scale must be above 0, got {self.scale}")
+        last = self.tiles_px.max(axis=0) + self.tile_px
+        if self.tile_px < 1 or self.tiles_px.min() < 0 or last[0] > shape[0] or last[1] > shape[1]:
+            raise ValueError(f"tiles of {self.tile_px} px reach beyond the sheet of {shape} px")
+
+    def __len__(self) -> int:
+        return len(self.tiles_px)
+
+    @property
+    def channels(self) -> int:
+        """Number of channels C."""
+        return int(self.pixels.shape[0])
+
+    def batch(self, indices: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
+        """Tiles (B, C, S, S) with the given indices (B,), 1.0 for `scale`, zero where not valid."""
+        out = np.empty((len(indices), self.channels, self.tile_px, self.tile_px), np.float32)
+        for row, index in enumerate(indices):
+            part = self._part(int(index))
+            self.scaled(self.pixels[:, *part], self.valid[part], out[row])
+        return out
+
+    def scaled(
+        self, raw: NDArray[np.uint8], valid: NDArray[np.bool_], out: NDArray[np.float32]
+    ) -> None:
+        """Write raw (C, S, S) as float32 into `out` (C, S, S), zero where not valid (S, S)."""
+        np.multiply(raw, valid, out=out, casting="unsafe")
+        out /= np.float32(self.scale)
+
+    def grey_tile(self, index: int) -> NDArray[np.uint8]:
+        """Grey levels (S, S) of a tile, a copy."""
+        part = self._part(index)
+        picture = self.pixels[0] if self.grey is None else self.grey
+        return np.array(picture[part])
+
+    def valid_tile(self, index: int) -> NDArray[np.bool_]:
+        """Which pixels (S, S) of a tile are imagery."""
+        return self.valid[self._part(index)]
+
+    def _part(self, index: int) -> tuple[slice, slice]:
+        row, col = (int(first) for first in self.tiles_px[index])
+        return slice(row, row + self.tile_px), slice(col, col + self.tile_px)
+
+
+def epoch_batches(
+    count: int, batch: int, seed: int, epoch: int, *, rank: int = 0, processes: int = 1
+) -> list[NDArray[np.intp]]:
+    """This process's part of every batch of an epoch: indices below `count`, in random order.
+
+    Batches hold at most `batch` tiles and nearly the same number each; every process gets the same
+    number, at least 2, for which up to a process's worth of tiles is left out or taken twice.
+    """
+    order = np.random.default_rng([seed, epoch]).permutation(count)
+    parts = []
+    for whole in np.array_split(order, math.ceil(count / batch)):
+        size = max(len(whole) // processes, min(2, batch))
+        parts.append(np.resize(whole, size * processes)[rank::processes])
+    return parts
+
+
+def made_ahead(
+    make: Callable[[NDArray[np.intp]], Arrays], plan: Sequence[NDArray[np.intp]], workers: int
+) -> Iterator[Arrays]:
+    """What `make` gives for each batch of the plan, in order, made by threads a few ahead."""
+    with ThreadPoolExecutor(max(1, workers)) as pool:
+        waiting: deque[Future[Arrays]] = deque()
+        for indices in plan:
+            waiting.append(pool.submit(make, indices))
+            if len(waiting) > BATCHES_AHEAD:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()

@@ -1,0 +1,109 @@
+"""Learning the paper's embeddings for a map: auto-encoder, triplet network, bag of visual words."""
+
+import importlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.embed.network import AutoEncoderRecipe, NetworkEmbedder, TripletRecipe
+from orthonav.embed.words import WordsEmbedder, WordsRecipe, learn_words
+from orthonav.errors import MissingExtraError, VariantError
+from orthonav.neural.tiles import SheetTiles
+from orthonav.prepare.change import changed
+from orthonav.prepare.pictures import SheetPictures
+
+BATCH_TILES = 64
+MAX_WORD_TILES = 2000
+
+EncoderRecipe = AutoEncoderRecipe | TripletRecipe | WordsRecipe
+Encoder = NetworkEmbedder | WordsEmbedder
+Report = Callable[[str, float], None]
+
+
+def learn_encoder(
+    recipe: EncoderRecipe,
+    pictures: SheetPictures,
+    other_dates: Sequence[SheetPictures],
+    tiles_px: NDArray[np.intp],
+    representation: Any,
+    seed: int,
+    work: Path | None,
+    report: Report,
+) -> tuple[Encoder, NDArray[np.float16]]:
+    """Learn from the reference tiles and embed them: the embedder and embeddings (N, D).
+
+    A triplet network's positives are the same tiles of `other_dates`; without any, the tiles
+    themselves, changed as years change them. `work` keeps checkpoints and pictures of networks.
+    Raises `MissingExtraError` where PyTorch or faiss is needed and absent.
+    """
+    tiles = pictures.tiles(tiles_px)
+    encoder: Encoder
+    if isinstance(recipe, WordsRecipe):
+        chosen = _word_tiles(tiles)
+        encoder = learn_words(recipe, chosen, seed, lambda share: report("learn words", share))
+    else:
+        positive: Any = [each.tiles(tiles_px) for each in other_dates]
+        learn_network = _training().learn_network
+        encoder = learn_network(
+            recipe,
+            tiles,
+            binary=not pictures.is_grey,
+            seed=seed,
+            work=work,
+            positive=positive or _changed_tiles(tiles, representation),
+            report=lambda text, share: report("learn", share),
+        )
+    return encoder, _embedded(encoder, tiles, report)
+
+
+def _word_tiles(tiles: SheetTiles) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_]]]:
+    step = -(-len(tiles) // MAX_WORD_TILES)
+    for index in range(0, len(tiles), step):
+        yield tiles.grey_tile(index), tiles.valid_tile(index)
+
+
+def _changed_tiles(
+    tiles: SheetTiles, representation: Any
+) -> Callable[[np.random.Generator, NDArray[np.uint8]], NDArray[np.float32]]:
+    """What makes a positive (1, S, S) of the grey levels (S, S) of a tile."""
+
+    def positive(rng: np.random.Generator, grey: NDArray[np.uint8]) -> NDArray[np.float32]:
+        # Mirrored: as it is, it would be ground of the map.
+        stranger = tiles.grey_tile(int(rng.integers(len(tiles))))[:, ::-1]
+        made = changed(rng, grey, stranger)
+        return np.asarray(representation(made, np.ones(made.shape, np.bool_)), np.float32)
+
+    return positive
+
+
+def _embedded(encoder: Encoder, tiles: SheetTiles, report: Report) -> NDArray[np.float16]:
+    out = np.empty((len(tiles), encoder.dims), np.float16)
+    for start in range(0, len(tiles), BATCH_TILES):
+        indices = np.arange(start, min(start + BATCH_TILES, len(tiles)))
+        maps = tiles.batch(indices)
+        if isinstance(encoder, WordsEmbedder):
+            valid = np.stack([tiles.valid_tile(int(index)) for index in indices])
+            out[indices] = encoder.views(maps, valid)
+        else:
+            out[indices] = encoder.views(maps)
+        report("embed", (int(indices[-1]) + 1) / len(tiles))
+    if not np.isfinite(out).all():
+        raise VariantError(
+            "embeddings have grown too large to be stored; learn with similarity=cosine, a smaller "
+            "learning_rate or fewer epochs"
+        )
+    return out
+
+
+def _training() -> Any:
+    try:
+        importlib.import_module("torch")
+    except ImportError as error:
+        raise MissingExtraError(
+            "learning a network needs PyTorch, which is not installed: "
+            "pip install 'orthonav[train]'"
+        ) from error
+    return importlib.import_module("orthonav.neural.training")

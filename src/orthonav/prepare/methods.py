@@ -1,0 +1,39 @@
+"""Methods and what they look at, as the command line names them."""
+
+import logging
+from typing import Any
+
+from orthonav import embed, represent
+from orthonav.embed.network import AutoEncoderRecipe, TripletRecipe
+from orthonav.embed.whitened import WhitenedRecipe
+from orthonav.embed.words import WordsRecipe
+from orthonav.errors import VariantError
+from orthonav.prepare.encoders import EncoderRecipe
+from orthonav.represent.gray import Gray
+from orthonav.variants import make_variant, variant_recipe
+
+log = logging.getLogger(__name__)
+
+
+def usual_edges(method: str) -> str:
+    """What a method looks at unless told: the paper's choices for its methods."""
+    name = method.partition(":")[0]
+    return {"autoencoder": "canny", "triplet": "gray", "bovw": "gray"}.get(name, "gradient")
+
+
+def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderRecipe:
+    """The method's recipe; one-channel pictures are whitened on finer cells by default."""
+    name, _, parameters = method.partition(":")
+    if name == "gradient" and representation.channels == 1 and "cells=" not in parameters:
+        method = f"{name}:{parameters},cells=16"
+    recipe = make_variant(embed.TABLE, method)
+    assert isinstance(recipe, WhitenedRecipe | AutoEncoderRecipe | TripletRecipe | WordsRecipe)
+    if isinstance(recipe, WordsRecipe) and not isinstance(representation, Gray):
+        raise VariantError("visual words are of grey levels: give --edges gray, or none, with bovw")
+    if not represent.TABLE[_name_of(representation)].flies:
+        log.warning("%s is too slow to fly: this map is for experiments", _name_of(representation))
+    return recipe
+
+
+def _name_of(representation: Any) -> str:
+    return str(variant_recipe(represent.TABLE, representation)["name"])

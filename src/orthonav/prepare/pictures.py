@@ -1,0 +1,71 @@
+"""The representation of a whole sheet, kept in bytes: what encoders of pictures learn from."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import VariantError
+from orthonav.geo.area import Area
+from orthonav.geo.grid import TileGrid
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.neural.tiles import SheetTiles
+from orthonav.prepare.blocks import BlockPixels, blocks_of, read_block
+from orthonav.represent.gray import Gray
+
+BLOCK_PX = 1024
+
+
+class SheetPictures:
+    """Grey levels or edges of a sheet, filled block by block; 1 to 2 bytes per pixel.
+
+    Raises `VariantError` for representations of several channels: encoders look at pictures.
+    """
+
+    def __init__(self, grid: TileGrid, representation: Any) -> None:
+        if representation.channels != 1:
+            raise VariantError(
+                "this method looks at pictures of one channel: give --edges gray, canny, segments "
+                "or sam with it"
+            )
+        shape = grid.height_px, grid.width_px
+        self.is_grey = isinstance(representation, Gray)
+        self._grid = grid
+        self._scale = 255.0 if self.is_grey else 1.0
+        self._pixels = np.zeros((1, *shape), np.uint8)
+        self._valid = np.zeros(shape, np.bool_)
+        self._grey = None if self.is_grey else np.zeros(shape, np.uint8)
+
+    def fill(self, read: BlockPixels, maps: NDArray[np.float32]) -> None:
+        """Take in a block, whose representation with its margin is `maps` (1, H, W)."""
+        block, part = read.block, read.part()
+        where = np.s_[block.row : block.row + block.height, block.col : block.col + block.width]
+        self._pixels[0][where] = np.rint(maps[0][part] * self._scale)
+        self._valid[where] = read.pixels.valid[part]
+        if self._grey is not None:
+            self._grey[where] = read.pixels.grey[part]
+
+    def tiles(self, tiles_px: NDArray[np.intp]) -> SheetTiles:
+        """Tiles whose first pixels (row, col) are given (N, 2)."""
+        grey, tile_px = self._grey, self._grid.tile_px
+        return SheetTiles(self._pixels, self._valid, tiles_px, tile_px, self._scale, grey)
+
+
+def read_pictures(
+    mosaic: Mosaic,
+    area: Area,
+    grid: TileGrid,
+    representation: Any,
+    report: Callable[[str, float], None],
+) -> SheetPictures:
+    """What another date shows of a sheet."""
+    pictures = SheetPictures(grid, representation)
+    blocks = [block for block in blocks_of(grid, BLOCK_PX) if block.may_matter(area, grid)]
+    with mosaic.grid_sheet(area.frame, grid) as raster:
+        for done, block in enumerate(blocks):
+            read = read_block(raster, block, representation.margin_px)
+            if read.pixels.valid.any():
+                pictures.fill(read, representation(read.pixels.grey, read.pixels.valid))
+            report("other date", (done + 1) / len(blocks))
+    return pictures

@@ -1,0 +1,276 @@
+"""A network in a map: embeds as it should, and nothing but plain layers gets in."""
+
+import builtins
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from orthonav.embed.network import AutoEncoderRecipe, NetworkEmbedder, TripletRecipe
+from orthonav.errors import MapFileError, MissingExtraError, VariantError
+
+onnx = pytest.importorskip("onnx", reason="making graphs needs ONNX")
+pytest.importorskip("onnxruntime", reason="neural encoders need onnxruntime")
+helper, FLOAT = onnx.helper, onnx.TensorProto.FLOAT
+
+SIDE, DIMS = 8, 5
+RECIPE = AutoEncoderRecipe(dims=DIMS, width=8)
+WEIGHTS = np.random.default_rng(0).normal(size=(DIMS, 2 * SIDE * SIDE)).astype(np.float32)
+
+
+def graph(
+    *,
+    nodes=None,
+    weights=WEIGHTS,
+    inputs=None,
+    outputs=None,
+    opsets=None,
+    functions=(),
+    name="maps",
+):
+    """Bytes of an encoder of one dense layer, or of a changed one."""
+    nodes = nodes or [
+        helper.make_node("Flatten", [name], ["flat"], axis=1),
+        helper.make_node("Gemm", ["flat", "w"], ["embedding"], transB=1),
+    ]
+    inputs = inputs or [helper.make_tensor_value_info(name, FLOAT, ["N", 2, SIDE, SIDE])]
+    outputs = outputs or [helper.make_tensor_value_info("embedding", FLOAT, ["N", DIMS])]
+    tensors = [onnx.numpy_helper.from_array(weights, "w")]
+    made = helper.make_model(
+        helper.make_graph(nodes, "encoder", inputs, outputs, tensors),
+        opset_imports=opsets or [helper.make_opsetid("", 17)],
+        functions=functions,
+    )
+    made.ir_version = 8
+    return made
+
+
+def embedder(model=None, recipe=RECIPE):
+    data = (model or graph()).SerializeToString()
+    return NetworkEmbedder(recipe, np.frombuffer(data, np.uint8))
+
+
+def maps(count, seed=1):
+    return np.random.default_rng(seed).random((count, 2, SIDE, SIDE), dtype=np.float32)
+
+
+def test_it_gives_what_the_graph_computes():
+    seen = maps(40)
+    wanted = seen.reshape(40, -1) @ WEIGHTS.T
+    made = embedder().views(seen)
+    assert made.dtype == np.float32
+    np.testing.assert_allclose(made, wanted, rtol=1e-4, atol=1e-5)
+    everywhere = np.ones((SIDE, SIDE), bool)
+    np.testing.assert_allclose(embedder().view(seen[3], everywhere), wanted[3], rtol=1e-4)
+    assert embedder().views(seen[:0]).shape == (0, DIMS)
+    assert embedder().dims == DIMS
+    assert embedder().shape == (2, SIDE, SIDE)
+
+
+def test_what_is_not_valid_counts_as_zero():
+    seen, valid = maps(1)[0], np.random.default_rng(2).random((SIDE, SIDE)) > 0.5
+    kept = seen.copy()
+    made = embedder().view(seen, valid)
+    np.testing.assert_allclose(made, embedder().views((seen * valid)[None])[0], rtol=1e-5)
+    np.testing.assert_array_equal(seen, kept)
+    spoilt = np.where(valid, seen, np.float32(np.nan))
+    np.testing.assert_array_equal(embedder().view(spoilt, valid), made)
+
+
+def test_cosine_gives_unit_vectors_and_zero_for_nothing():
+    cosine = embedder(recipe=AutoEncoderRecipe(dims=DIMS, similarity="cosine"))
+    made = cosine.views(maps(4))
+    np.testing.assert_allclose(np.linalg.norm(made, axis=1), 1, rtol=1e-5)
+    plain = embedder().views(maps(4))
+    np.testing.assert_allclose(
+        made, plain / np.linalg.norm(plain, axis=1, keepdims=True), rtol=1e-4
+    )
+    np.testing.assert_array_equal(cosine.views(np.zeros((1, 2, SIDE, SIDE), np.float32)), 0)
+
+
+def test_it_travels_and_is_the_same_in_many_threads():
+    one = embedder()
+    wanted = one.views(maps(6))
+    again = pickle.loads(pickle.dumps(one))
+    np.testing.assert_array_equal(again.views(maps(6)), wanted)
+    np.testing.assert_array_equal(again.parts()["onnx"], one.onnx)
+    fresh = embedder()
+    with ThreadPoolExecutor(8) as pool:
+        for made in pool.map(lambda _: fresh.views(maps(6)), range(40)):
+            np.testing.assert_array_equal(made, wanted)
+
+
+@pytest.mark.parametrize("shape", [(1, 2, SIDE, SIDE + 1), (1, 1, SIDE, SIDE), (2, SIDE, SIDE)])
+def test_views_of_another_shape_are_refused(shape):
+    with pytest.raises(ValueError, match="maps must be"):
+        embedder().views(np.zeros(shape, np.float32))
+
+
+def test_a_mask_of_another_shape_is_refused():
+    with pytest.raises(ValueError, match="valid must be"):
+        embedder().view(maps(1)[0], np.ones((SIDE, SIDE - 1), bool))
+
+
+def test_without_onnxruntime_the_error_says_what_to_install(monkeypatch):
+    honest = builtins.__import__
+
+    def refusing(name, *arguments, **named):
+        if name.startswith("onnxruntime"):
+            raise ImportError(name)
+        return honest(name, *arguments, **named)
+
+    made = embedder()
+    monkeypatch.setattr(builtins, "__import__", refusing)
+    with pytest.raises(MissingExtraError, match=r"pip install orthonav\[neural\]"):
+        made.views(maps(1))
+
+
+WHOLE = graph().SerializeToString()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"garbage", b"\x00" * 64, b"\xff" * 64, WHOLE[:-1], WHOLE[: len(WHOLE) // 2], WHOLE * 2],
+    ids=["empty", "garbage", "zeros", "ones", "cut", "half", "twice"],
+)
+def test_bytes_that_are_no_graph_are_refused(data):
+    with pytest.raises(MapFileError):
+        NetworkEmbedder(RECIPE, np.frombuffer(data, np.uint8))
+
+
+def test_altered_bytes_are_refused_or_give_numbers():
+    """Whatever a flipped byte means, it is no crash and no surprise of another kind."""
+    rng = np.random.default_rng(0)
+    refused = 0
+    for at in rng.integers(0, len(WHOLE), 60):
+        data = np.frombuffer(WHOLE, np.uint8).copy()
+        data[at] ^= rng.integers(1, 256, dtype=np.uint8)
+        try:
+            assert np.isfinite(NetworkEmbedder(RECIPE, data).views(maps(2))).all()
+        except MapFileError:
+            refused += 1
+        except ValueError as error:
+            assert "maps must be" in str(error)
+    assert 0 < refused < 60
+
+
+def test_an_array_that_is_not_bytes_is_refused():
+    with pytest.raises(MapFileError, match="bytes"):
+        NetworkEmbedder(RECIPE, np.zeros(8, np.float32))
+
+
+def external(model):
+    tensor = model.graph.initializer[0]
+    tensor.ClearField("raw_data")
+    tensor.data_location = onnx.TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value="/etc/passwd")
+    return model
+
+
+def test_weights_in_other_files_are_refused():
+    with pytest.raises(MapFileError, match="another file"):
+        embedder(external(graph()))
+    pointed = external(graph())
+    pointed.graph.initializer[0].ClearField("data_location")
+    with pytest.raises(MapFileError, match="another file"):
+        embedder(pointed)
+
+
+def dense(source):
+    return helper.make_node("Gemm", [source, "w"], ["embedding"], transB=1)
+
+
+def strange_graphs():
+    flat = helper.make_node("Flatten", ["maps"], ["flat"], axis=1)
+    inner = helper.make_graph([], "inner", [], [])
+    tensor = onnx.numpy_helper.from_array(np.zeros(2, np.float32), "t")
+    with_tensor = helper.make_node("Identity", ["flat"], ["same"], value=tensor)
+    with_graph = helper.make_node("Identity", ["flat"], ["same"], body=inner)
+    elsewhere = helper.make_node("Identity", ["flat"], ["same"], domain="com.microsoft")
+    loop = helper.make_node("Loop", ["flat"], ["same"], body=inner)
+    huge = helper.make_node("ConstantOfShape", ["w"], ["same"])
+    nodes = (with_tensor, with_graph, elsewhere, loop, huge)
+    names = ("tensor", "graph", "domain", "loop", "huge")
+    for name, node in zip(names, nodes, strict=True):
+        yield pytest.param(graph(nodes=[flat, node, dense("same")]), id=name)
+    opset = helper.make_opsetid("", 17)
+    function = helper.make_function("x", "F", ["a"], ["a"], [], [opset])
+    yield pytest.param(graph(functions=[function]), id="function")
+
+
+@pytest.mark.parametrize("model", list(strange_graphs()))
+def test_anything_but_plain_layers_is_refused_before_it_is_loaded(model, monkeypatch):
+    monkeypatch.setattr("orthonav.embed.network._onnxruntime", lambda: pytest.fail("was loaded"))
+    with pytest.raises(MapFileError, match=r"encoder (holds|needs)"):
+        embedder(model)
+
+
+def info(name, shape, kind=FLOAT):
+    return helper.make_tensor_value_info(name, kind, shape)
+
+
+@pytest.mark.parametrize(
+    "model, recipe",
+    [
+        (graph(name="picture"), RECIPE),
+        (graph(inputs=[info("maps", [1, 2, SIDE, SIDE])]), RECIPE),
+        (graph(inputs=[info("maps", ["N", 2, 4, 16])]), RECIPE),
+        (graph(inputs=[info("maps", ["N", 2, "S", "S"])]), RECIPE),
+        (graph(inputs=[info("maps", ["N", 2, SIDE, SIDE]), info("more", ["N"])]), RECIPE),
+        (graph(), AutoEncoderRecipe(dims=DIMS + 1)),
+        (graph(outputs=[info("embedding", ["N", DIMS]), info("flat", ["N", 128])]), RECIPE),
+    ],
+    ids=["name", "one", "oblong", "free", "two", "dims", "outputs"],
+)
+def test_graphs_that_take_or_give_something_else_are_refused(model, recipe):
+    with pytest.raises(MapFileError, match="must take maps"):
+        embedder(model, recipe).views(maps(1))
+
+
+def test_embeddings_that_are_not_finite_are_refused():
+    endless = graph(weights=np.full_like(WEIGHTS, np.inf))
+    with pytest.raises(MapFileError, match="not finite"):
+        embedder(endless).views(maps(1))
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"dims": 0},
+        {"width": 12},
+        {"epochs": 0},
+        {"batch": 0},
+        {"learning_rate": 0.0},
+        {"similarity": "best"},
+        {"precision": "int4"},
+    ],
+)
+def test_impossible_auto_encoders_are_refused(fields):
+    with pytest.raises(VariantError, match=next(iter(fields))):
+        AutoEncoderRecipe(**fields)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"width": 0},
+        {"margin": 0.0},
+        {"mining": "soft"},
+        {"apart": -0.1},
+        {"batch": 1},
+        {"learning_rate": 2.0},
+        {"similarity": ""},
+    ],
+)
+def test_impossible_triplet_networks_are_refused(fields):
+    with pytest.raises(VariantError, match=next(iter(fields))):
+        TripletRecipe(**fields)
+
+
+def test_defaults_are_the_papers():
+    auto, triplet = AutoEncoderRecipe(), TripletRecipe()
+    assert (auto.dims, auto.epochs, auto.batch, auto.learning_rate) == (1024, 200, 32, 3e-4)
+    assert (triplet.dims, triplet.epochs, triplet.batch) == (1024, 200, 512)
+    assert (triplet.learning_rate, triplet.mining) == (1e-3, "hardest")
+    assert auto.similarity == triplet.similarity == "product"

@@ -1,0 +1,396 @@
+"""Bags of visual words: frequencies of known features, and places told apart by them."""
+
+import json
+import pickle
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from orthonav.embed.words import (
+    WordsEmbedder,
+    WordsRecipe,
+    describe,
+    learn_words,
+    pictures_of,
+)
+from orthonav.errors import MissingExtraError, VariantError
+from orthonav.represent.gray import Gray
+from orthonav.variants import Variant, make_variant, variant_from_recipe, variant_recipe
+
+TABLE = {"bovw": Variant("orthonav.embed.words:WordsRecipe")}
+NOTHING = np.zeros(0, np.float32)
+needs_faiss = pytest.mark.skipif(
+    __import__("importlib.util").util.find_spec("faiss") is None, reason="faiss is not installed"
+)
+
+
+def area(seed=0, size=700):
+    """A picture of blots of many sizes, unlike itself everywhere."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros((size, size), np.float32)
+    for sigma in (1.5, 3.0, 8.0):
+        blots = cv2.GaussianBlur(rng.normal(size=(size, size)).astype(np.float32), (0, 0), sigma)
+        total += blots / blots.std()
+    return np.clip(128 + 32 * total, 0, 255).astype(np.uint8)
+
+
+def tiles(grey, size=128, step=96):
+    starts = range(0, grey.shape[0] - size + 1, step)
+    return [grey[y : y + size, x : x + size] for y in starts for x in starts]
+
+
+def everywhere(grey):
+    return np.ones(grey.shape, bool)
+
+
+def maps_of(grey):
+    return Gray()(grey, everywhere(grey))
+
+
+def random_embedder(words=300, seed=0, tfidf=0, **parameters):
+    rng = np.random.default_rng(seed)
+    vocabulary = rng.integers(0, 120, (words, 128), dtype=np.uint8)
+    idf = rng.uniform(0.1, 5, words).astype(np.float32) if tfidf else NOTHING
+    return WordsEmbedder(WordsRecipe(words=words, tfidf=tfidf, **parameters), vocabulary, idf)
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    pytest.importorskip("faiss")
+    return learn_words(WordsRecipe(words=256), pictures_of(tiles(area())), seed=1)
+
+
+# Frequencies.
+
+
+def test_frequencies_are_counts_of_nearest_words():
+    """Against a plain calculation in float64."""
+    embedder = random_embedder()
+    grey = tiles(area())[0]
+    _, descriptors = cv2.SIFT_create().detectAndCompute(grey, None)
+    differences = descriptors[:, None].astype(float) - embedder.vocabulary[None].astype(float)
+    nearest = (differences**2).sum(axis=2).argmin(axis=1)
+    expected = np.bincount(nearest, minlength=300) / len(descriptors)
+    out = embedder.view(maps_of(grey), everywhere(grey))
+    assert len(descriptors) > 100 and len(np.unique(nearest)) > 10
+    assert out.shape == (300,) and out.dtype == np.float32
+    np.testing.assert_allclose(out, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("words", [256, 5000])
+def test_assignment_is_exact(words):
+    """Whole numbers: the same as OpenCV's exhaustive search, ties included."""
+    embedder = random_embedder(words)
+    rng = np.random.default_rng(1)
+    descriptors = rng.integers(0, 180, (5000, 128)).astype(np.float32)
+    matches = cv2.BFMatcher(cv2.NORM_L2).match(descriptors, embedder.vocabulary.astype(np.float32))
+    distances = np.array([match.distance for match in matches]) ** 2
+    found = embedder.assigned(descriptors)
+    own = np.square(descriptors - embedder.vocabulary[found].astype(np.float32)).sum(axis=1)
+    np.testing.assert_allclose(own, distances, rtol=1e-5)
+    np.testing.assert_array_equal(found[4090:4100], embedder.assigned(descriptors[4090:4100]))
+
+
+def test_equally_near_words_are_the_first():
+    embedder = random_embedder()
+    twice = np.concatenate([embedder.vocabulary[:150], embedder.vocabulary[:150]])
+    doubled = WordsEmbedder(embedder.recipe, twice, NOTHING)
+    found = doubled.assigned(twice[150:].astype(np.float32))
+    np.testing.assert_array_equal(found, np.arange(150))
+
+
+@pytest.mark.parametrize("tfidf", [0, 1])
+def test_similarity_says_how_vectors_are_scaled(tfidf):
+    grey = tiles(area())[3]
+    product = random_embedder(similarity="product", tfidf=tfidf)
+    cosine = random_embedder(similarity="cosine", tfidf=tfidf)
+    first, second = (e.view(maps_of(grey), everywhere(grey)) for e in (product, cosine))
+    frequencies = random_embedder().view(maps_of(grey), everywhere(grey))
+    assert frequencies.sum() == pytest.approx(1, abs=1e-6)
+    expected = frequencies * product.idf if tfidf else frequencies
+    np.testing.assert_allclose(first, expected, rtol=1e-6)
+    np.testing.assert_allclose(second, first / np.linalg.norm(first), rtol=1e-5)
+    assert np.linalg.norm(second) == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize("similarity", ["product", "cosine"])
+@pytest.mark.parametrize("tfidf", [0, 1])
+def test_views_without_features_are_zero(similarity, tfidf):
+    embedder = random_embedder(similarity=similarity, tfidf=tfidf)
+    for grey in (np.full((128, 128), 90, np.uint8), np.zeros((16, 16), np.uint8)):
+        assert not embedder.view(maps_of(grey), everywhere(grey)).any()
+    grey = tiles(area())[0]
+    blind = embedder.view(maps_of(grey), np.zeros(grey.shape, bool))
+    assert not blind.any() and np.isfinite(blind).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (2, 3), (8, 8), (33, 47)])
+def test_any_size_is_taken(shape):
+    grey = np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8)
+    out = random_embedder().view(maps_of(grey), everywhere(grey))
+    assert out.shape == (300,) and (not out.any() or out.sum() == pytest.approx(1))
+
+
+def test_grey_levels_of_either_range_are_taken():
+    embedder, grey = random_embedder(), tiles(area())[0]
+    whole = grey.astype(np.float32)[None]
+    np.testing.assert_array_equal(
+        embedder.view(whole, everywhere(grey)), embedder.view(maps_of(grey), everywhere(grey))
+    )
+
+
+def test_several_channels_are_refused():
+    with pytest.raises(ValueError, match="one channel"):
+        random_embedder().view(np.zeros((7, 64, 64), np.float32), np.ones((64, 64), bool))
+
+
+def test_views_are_one_by_one():
+    embedder = random_embedder()
+    greys = tiles(area())[:3]
+    maps = np.stack([maps_of(grey) for grey in greys])
+    out = embedder.views(maps)
+    assert out.shape == (3, 300) and out.dtype == np.float32
+    for one, row in zip(maps, out, strict=True):
+        np.testing.assert_array_equal(embedder.view(one, np.ones((128, 128), bool)), row)
+    valid = np.ones((3, 128, 128), bool)
+    valid[1, :, 64:] = False
+    seen = embedder.views(maps, valid)
+    np.testing.assert_array_equal(seen[[0, 2]], out[[0, 2]])
+    np.testing.assert_array_equal(seen[1], embedder.view(maps[1], valid[1]))
+    assert not np.array_equal(seen[1], out[1])
+
+
+def test_features_that_see_invalid_pixels_are_dropped():
+    """What lies there has no influence, and its border gives no features."""
+    grey = tiles(area(), size=192)[0]
+    valid = everywhere(grey)
+    valid[:, 96:] = False
+    recipe = WordsRecipe()
+    painted = np.where(valid, grey, 255).astype(np.uint8)
+    kept, other = describe(recipe, grey, valid), describe(recipe, painted, valid)
+    np.testing.assert_array_equal(kept, other)
+    assert 0.2 < len(kept) / len(describe(recipe, grey, everywhere(grey))) < 0.5
+    flat = np.where(valid, np.uint8(40), np.uint8(220))
+    assert len(describe(recipe, flat, valid)) == 0
+
+
+def test_features_are_limited_to_the_strongest():
+    grey = tiles(area(), size=256)[0]
+    all_of_them = describe(WordsRecipe(), grey, everywhere(grey))
+    few = describe(WordsRecipe(max_features=40), grey, everywhere(grey))
+    assert len(few) == 40 < len(all_of_them)
+    rows = {row.tobytes() for row in all_of_them}
+    assert sum(row.tobytes() in rows for row in few) == 40
+
+
+def test_deterministic_and_inputs_untouched():
+    grey = tiles(area())[0]
+    maps, valid = maps_of(grey), everywhere(grey)
+    maps.flags.writeable = valid.flags.writeable = False
+    first, second = (random_embedder().view(maps, valid) for _ in range(2))
+    assert first.tobytes() == second.tobytes()
+    np.testing.assert_array_equal(maps, maps_of(grey))
+
+
+# Learning.
+
+
+def test_places_are_found_again(learnt):
+    """Views between the tiles, turned by 8 degrees and darker: the nearest tile is most alike."""
+    grey = area()
+    reference = learnt.views(np.stack([maps_of(tile) for tile in tiles(grey)]))
+    starts = [(y, x) for y in range(0, 573, 96) for x in range(0, 573, 96)]
+    turn = cv2.getRotationMatrix2D((349.5, 349.5), 8, 1)
+    turned = (cv2.warpAffine(grey, turn, (700, 700)) * 0.8).astype(np.uint8)
+    right = 0
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        centre = rng.uniform(220, 480, 2)  # x, y in the turned picture
+        x, y = np.rint(centre - 64).astype(int)
+        view = turned[y : y + 128, x : x + 128]
+        scores = reference @ learnt.view(maps_of(view), everywhere(view))
+        place = cv2.invertAffineTransform(turn) @ [x + 63.5, y + 63.5, 1]
+        best = np.array(starts[int(scores.argmax())])[::-1] + 63.5
+        right += np.abs(best - place).max() <= 64
+    assert right >= 17
+
+
+def test_learning_gives_words_of_its_pictures(learnt):
+    assert learnt.dims == 256 and learnt.recipe == WordsRecipe(words=256)
+    parts = learnt.parts()
+    assert parts["vocabulary"].shape == (256, 128) and parts["vocabulary"].dtype == np.uint8
+    assert parts["idf"].shape == (0,)
+    assert len(np.unique(learnt.vocabulary, axis=0)) == 256
+    descriptors = describe(learnt.recipe, area(), np.ones((700, 700), bool))
+    near = learnt.vocabulary[learnt.assigned(descriptors)].astype(np.float32)
+    within = np.square(descriptors - near).sum(axis=1).mean()
+    whole = np.square(descriptors - descriptors.mean(axis=0)).sum(axis=1).mean()
+    assert within < 0.75 * whole
+
+
+def test_learning_is_deterministic_and_seeded(learnt):
+    def again(seed):
+        return learn_words(WordsRecipe(words=256), pictures_of(tiles(area())), seed=seed)
+
+    assert again(1).vocabulary.tobytes() == learnt.vocabulary.tobytes()
+    assert again(2).vocabulary.tobytes() != learnt.vocabulary.tobytes()
+
+
+@needs_faiss
+def test_large_samples_are_drawn_evenly(monkeypatch):
+    """More descriptors than are wanted: every picture still has its share."""
+    import orthonav.embed.words as words
+
+    sample = words._Sample(1000, seed=3)
+    for number in range(50):
+        sample.put(np.full((200, 1), number))
+    rows = sample.rows()[:, 0]
+    assert len(rows) == 1000 and (np.diff(rows) >= 0).all()
+    counts = np.bincount(rows, minlength=50)
+    assert counts.min() >= 5 and counts.max() <= 40
+    monkeypatch.setattr(words, "MIN_SAMPLES", 300)
+    monkeypatch.setattr(words, "SAMPLES_PER_WORD", 1)
+    made = learn_words(WordsRecipe(words=256, tfidf=1), pictures_of(tiles(area())), seed=1)
+    assert made.vocabulary.shape == (256, 128) and made.idf.max() <= np.log(50) + 1e-5
+
+
+@needs_faiss
+def test_rare_words_weigh_more():
+    """Half of the pictures are one and the same: their words are common."""
+    common, *rest = tiles(area())
+    shown = [common] * 15 + rest[:15]
+    made = learn_words(WordsRecipe(words=256, tfidf=1), pictures_of(shown), seed=1)
+    plain = WordsEmbedder(WordsRecipe(words=256), made.vocabulary, NOTHING)
+    counts = np.stack([plain.counts(tile, everywhere(tile)) for tile in shown])
+    expected = np.log(31 / np.maximum(1, (counts > 0).sum(axis=0)))
+    np.testing.assert_allclose(made.idf, expected, rtol=1e-5)
+    assert made.idf[counts[0] > 0].max() < made.idf.max()
+
+
+@needs_faiss
+@pytest.mark.parametrize("greys", [[], [np.zeros((64, 64), np.uint8)], [area(size=100)]])
+def test_too_few_features_are_refused(greys):
+    with pytest.raises(VariantError, match=r"1024 words cannot be learnt from \d+ features"):
+        learn_words(WordsRecipe(), pictures_of(greys))
+
+
+@needs_faiss
+def test_learning_reports_and_leaves_out_what_is_not_valid():
+    shares, grey = [], area()
+    half = everywhere(grey)
+    half[:, 350:] = False
+    made = learn_words(WordsRecipe(words=256), [(grey, half)], seed=1, report=shares.append)
+    assert shares == sorted(shares) and shares[-1] == 1 and len(shares) > 5
+    painted = np.where(half, grey, 7).astype(np.uint8)
+    again = learn_words(WordsRecipe(words=256), [(painted, half)], seed=1)
+    assert again.vocabulary.tobytes() == made.vocabulary.tobytes()
+
+
+def test_without_faiss_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "faiss", None)
+    with pytest.raises(MissingExtraError, match=r"orthonav\[train\]"):
+        learn_words(WordsRecipe(), pictures_of([area()]))
+
+
+# SuperPoint.
+
+
+def test_superpoint_words(tmp_path):
+    pytest.importorskip("faiss")
+    pytest.importorskip("torch")
+    transformers = pytest.importorskip("transformers")
+    import torch
+
+    torch.manual_seed(3)
+    model = transformers.SuperPointForKeypointDetection(
+        transformers.SuperPointConfig(keypoint_threshold=0.016)
+    )
+    with torch.no_grad():
+        for name, weight in model.named_parameters():
+            if name.endswith("weight"):
+                weight.normal_(0, (2 / weight[0].numel()) ** 0.5)
+    model.save_pretrained(tmp_path)
+    recipe = WordsRecipe(words=256, features="superpoint", weights=str(tmp_path))
+    shown = tiles(area())[:12]
+    made = learn_words(recipe, pictures_of(shown))
+    assert made.vocabulary.shape == (256, 256) and made.vocabulary.dtype == np.float16
+    out = made.views(np.stack([maps_of(tile) for tile in shown[:2]]))
+    np.testing.assert_allclose(out.sum(axis=1), 1, atol=1e-5)
+    assert (out[0] != out[1]).any()
+    valid = everywhere(shown[0])
+    valid[:, 40:] = False
+    some = describe(recipe, shown[0], valid)
+    assert 0 < len(some) < len(describe(recipe, shown[0], everywhere(shown[0])))
+    assert not made.view(maps_of(np.zeros((64, 64), np.uint8)), np.zeros((64, 64), bool)).any()
+
+
+# Values.
+
+
+def test_sift_words_need_no_torch_and_no_faiss():
+    script = """
+import sys
+import numpy as np
+from orthonav.embed.words import WordsEmbedder, WordsRecipe
+
+rng = np.random.default_rng(0)
+words = rng.integers(0, 99, (256, 128), dtype=np.uint8)
+embedder = WordsEmbedder(WordsRecipe(words=256), words, np.zeros(0, np.float32))
+grey = rng.random((1, 96, 96), dtype=np.float32)
+assert embedder.view(grey, np.ones((96, 96), bool)).any()
+print({name.partition(".")[0] for name in sys.modules} & {"torch", "faiss", "transformers"})
+"""
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", script], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout.strip()) == (0, "set()"), done.stderr
+
+
+def test_recipe_round_trip():
+    made = make_variant(TABLE, "bovw:words=512,similarity=cosine,tfidf=1,max_features=300")
+    assert made == WordsRecipe(512, "sift", "", 300, "cosine", 1)
+    recipe = json.loads(json.dumps(variant_recipe(TABLE, made)))
+    assert variant_from_recipe(TABLE, recipe) == made
+
+
+def test_embedders_can_be_pickled():
+    embedder, grey = random_embedder(), tiles(area())[0]
+    first = embedder.view(maps_of(grey), everywhere(grey))
+    again = pickle.loads(pickle.dumps(embedder))
+    np.testing.assert_array_equal(again.view(maps_of(grey), everywhere(grey)), first)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "words=255",
+        "words=10001",
+        "features=orb",
+        "features=superpoint",
+        "weights=somewhere",
+        "max_features=0",
+        "similarity=l2",
+        "tfidf=2",
+    ],
+)
+def test_impossible_parameters_are_refused(text):
+    with pytest.raises(VariantError, match=text.partition("=")[0]):
+        make_variant(TABLE, f"bovw:{text}")
+
+
+def test_vocabularies_that_do_not_fit_are_refused():
+    words = np.zeros((256, 128), np.uint8)
+    for recipe, vocabulary, idf in [
+        (WordsRecipe(words=300), words, NOTHING),
+        (WordsRecipe(words=256), words.astype(np.float32), NOTHING),
+        (WordsRecipe(words=256), words[:, :100], NOTHING),
+        (WordsRecipe(words=256), words, np.ones(256, np.float32)),
+        (WordsRecipe(words=256, tfidf=1), words, NOTHING),
+        (WordsRecipe(words=256, tfidf=1), words, np.full(256, np.nan, np.float32)),
+        (WordsRecipe(words=256, features="superpoint", weights="x"), words, NOTHING),
+    ]:
+        with pytest.raises(VariantError, match=r"vocabulary|idf"):
+            WordsEmbedder(recipe, vocabulary, idf)

@@ -1,0 +1,66 @@
+"""The auto-encoder has the paper's layers and size, and learns to draw what it sees."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="learning needs PyTorch")
+
+from orthonav.neural.autoencoder import AutoEncoder, reconstruction_loss, reconstructions  # noqa: E402
+from orthonav.neural.tiles import SheetTiles  # noqa: E402
+
+PAPER_PARAMETERS = 172_506_561
+
+
+def test_the_default_is_about_as_large_as_the_papers():
+    with torch.device("meta"):
+        count = sum(values.numel() for values in AutoEncoder().parameters())
+    assert count == 170_009_425
+    assert abs(count / PAPER_PARAMETERS - 1) < 0.02
+
+
+def test_the_encoder_has_four_strided_convolutions_each_normalized_and_rectified():
+    model = AutoEncoder(tile_px=64, width=16, dims=8)
+    kinds = [type(layer).__name__ for layer in model.encoder]
+    assert kinds == ["Conv2d", "BatchNorm2d", "LeakyReLU"] * 4 + ["Flatten", "Linear"]
+    kinds = [type(layer).__name__ for layer in model.decoder]
+    up = ["ConvTranspose2d", "BatchNorm2d", "LeakyReLU"] * 3
+    assert kinds == ["Linear", "Unflatten", *up, "ConvTranspose2d"]
+
+
+@pytest.mark.parametrize("tile_px", [32, 48, 128])
+@pytest.mark.parametrize("channels", [1, 2])
+def test_every_tile_size_comes_back_as_it_went_in(tile_px, channels):
+    model = AutoEncoder(tile_px=tile_px, channels=channels, width=8, dims=12)
+    tiles = torch.rand(3, channels, tile_px, tile_px)
+    assert model.encoder(tiles).shape == (3, 12)
+    assert model(tiles).shape == tiles.shape
+
+
+@pytest.mark.parametrize("bad", [{"tile_px": 16}, {"tile_px": 72}, {"width": 12}, {"dims": 0}])
+def test_impossible_sizes_are_refused(bad):
+    with pytest.raises(ValueError, match="must be"):
+        AutoEncoder(**{"tile_px": 64, "width": 8, "dims": 8, **bad})
+
+
+def test_only_binary_inputs_end_in_a_sigmoid():
+    pictures = []
+    for binary in (True, False):
+        torch.manual_seed(0)
+        model = AutoEncoder(tile_px=32, width=8, dims=8, binary=binary)
+        pictures.append(model(torch.rand(2, 1, 32, 32, generator=torch.Generator().manual_seed(1))))
+    torch.testing.assert_close(pictures[0], torch.sigmoid(pictures[1]))
+
+
+def test_the_loss_is_the_mean_square():
+    loss = reconstruction_loss(torch.zeros(2, 1, 4, 4), torch.full((2, 1, 4, 4), 3.0))
+    assert float(loss) == 9
+
+
+def test_the_picture_of_reconstructions_shows_tiles_above_what_is_made_of_them():
+    pixels = np.random.default_rng(0).integers(0, 256, (1, 64, 64), dtype=np.uint8)
+    tiles = SheetTiles(pixels, np.ones((64, 64), bool), np.array([[0, 0], [32, 32]]), 32)
+    model = AutoEncoder(tile_px=32, width=8, dims=8).train()
+    picture = reconstructions(model, tiles)
+    assert picture.shape == (64, 64)
+    np.testing.assert_allclose(picture[:32, :32], pixels[0, :32, :32], atol=1)
+    assert model.training, "must be left as it was"

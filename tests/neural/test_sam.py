@@ -1,0 +1,568 @@
+"""Segment Anything boundaries: known masks, and the true architecture with small random weights."""
+
+import dataclasses
+import json
+import pickle
+import re
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("transformers")
+
+import torch
+import transformers
+
+from orthonav.errors import MissingFileError, VariantError
+from orthonav.neural import sam
+from orthonav.neural.sam import SamBoundaries, automatic_masks, boundary_map, suppressed
+from orthonav.variants import Variant, make_variant, variant_from_recipe, variant_recipe
+
+SIDE = 64
+TABLE = {"sam": Variant("orthonav.neural.sam:SamBoundaries", flies=False, extra="train")}
+# Names in the published checkpoints, for a model of two blocks and two decoder layers.
+ORIGINAL_NAMES = [
+    (r"^vision_encoder\.", "image_encoder."),
+    (r"patch_embed\.projection", "patch_embed.proj"),
+    (r"^(image_encoder)\.layers\.", r"\1.blocks."),
+    (r"neck\.conv1", "neck.0"),
+    (r"neck\.layer_norm1", "neck.1"),
+    (r"neck\.conv2", "neck.2"),
+    (r"neck\.layer_norm2", "neck.3"),
+    (r"shared_embedding\.positional_embedding", "pe_layer.positional_encoding_gaussian_matrix"),
+    (r"\.point_embed\.", ".point_embeddings."),
+    (r"mask_embed\.conv1", "mask_downscaling.0"),
+    (r"mask_embed\.layer_norm1", "mask_downscaling.1"),
+    (r"mask_embed\.conv2", "mask_downscaling.3"),
+    (r"mask_embed\.layer_norm2", "mask_downscaling.4"),
+    (r"mask_embed\.conv3", "mask_downscaling.6"),
+    (r"upscale_conv1", "output_upscaling.0"),
+    (r"upscale_layer_norm", "output_upscaling.1"),
+    (r"upscale_conv2", "output_upscaling.3"),
+    (r"((?:head|mlps\.\d)\.)layers\.0", r"\1layers.1"),
+    (r"((?:head|mlps\.\d)\.)proj_in", r"\1layers.0"),
+    (r"((?:head|mlps\.\d)\.)proj_out", r"\1layers.2"),
+    (r"layer_norm", "norm"),
+]
+PUBLISHED = """
+image_encoder.pos_embed image_encoder.patch_embed.proj.weight image_encoder.blocks.0.norm1.weight
+image_encoder.blocks.1.norm2.bias image_encoder.blocks.0.attn.rel_pos_h
+image_encoder.blocks.0.attn.qkv.weight image_encoder.blocks.0.attn.proj.bias
+image_encoder.blocks.1.mlp.lin2.weight image_encoder.neck.0.weight image_encoder.neck.1.bias
+image_encoder.neck.2.weight image_encoder.neck.3.weight
+prompt_encoder.pe_layer.positional_encoding_gaussian_matrix
+prompt_encoder.point_embeddings.3.weight prompt_encoder.not_a_point_embed.weight
+prompt_encoder.no_mask_embed.weight prompt_encoder.mask_downscaling.0.weight
+prompt_encoder.mask_downscaling.1.weight prompt_encoder.mask_downscaling.3.bias
+prompt_encoder.mask_downscaling.4.bias prompt_encoder.mask_downscaling.6.weight
+mask_decoder.iou_token.weight mask_decoder.mask_tokens.weight
+mask_decoder.transformer.layers.0.self_attn.q_proj.weight
+mask_decoder.transformer.layers.1.cross_attn_token_to_image.out_proj.bias
+mask_decoder.transformer.layers.0.norm4.weight mask_decoder.transformer.layers.0.mlp.lin1.weight
+mask_decoder.transformer.final_attn_token_to_image.v_proj.weight
+mask_decoder.transformer.norm_final_attn.weight mask_decoder.output_upscaling.0.weight
+mask_decoder.output_upscaling.1.weight mask_decoder.output_upscaling.3.bias
+mask_decoder.output_hypernetworks_mlps.3.layers.0.weight
+mask_decoder.output_hypernetworks_mlps.0.layers.1.weight
+mask_decoder.output_hypernetworks_mlps.0.layers.2.bias
+mask_decoder.iou_prediction_head.layers.0.weight mask_decoder.iou_prediction_head.layers.1.bias
+mask_decoder.iou_prediction_head.layers.2.bias
+"""
+SIZES = {
+    "base": {},
+    "large": {
+        "hidden_size": 1024,
+        "num_hidden_layers": 24,
+        "num_attention_heads": 16,
+        "global_attn_indexes": [5, 11, 17, 23],
+    },
+    "huge": {
+        "hidden_size": 1280,
+        "num_hidden_layers": 32,
+        "num_attention_heads": 16,
+        "global_attn_indexes": [7, 15, 23, 31],
+    },
+}
+
+
+def tiny_model():
+    """The true architecture, small, with weights that react to picture and point."""
+    config = transformers.SamConfig(
+        vision_config=transformers.SamVisionConfig(
+            hidden_size=32,
+            output_channels=32,
+            num_hidden_layers=2,
+            num_attention_heads=2,
+            image_size=SIDE,
+            patch_size=8,
+            window_size=3,
+            global_attn_indexes=[1],
+            num_pos_feats=16,
+            mlp_dim=48,
+        ),
+        prompt_encoder_config=transformers.SamPromptEncoderConfig(
+            hidden_size=32, image_size=SIDE, patch_size=8, mask_input_channels=8
+        ),
+        mask_decoder_config=transformers.SamMaskDecoderConfig(
+            hidden_size=32, mlp_dim=64, iou_head_hidden_dim=40
+        ),
+    )
+    torch.manual_seed(5)
+    model = transformers.SamModel(config)
+    with torch.no_grad():
+        for name, weight in model.named_parameters():
+            if weight.ndim > 1 and "positional_embedding" not in name:
+                weight.normal_(0, (2 / weight[0].numel()) ** 0.5)
+        model.mask_decoder.iou_prediction_head.proj_out.bias.fill_(0.9)
+    return model.eval()
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """A Hugging Face folder as `save_pretrained` writes it."""
+    folder = tmp_path_factory.mktemp("sam")
+    tiny_model().save_pretrained(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def checkpoint(weights, tmp_path_factory):
+    """The same weights as an original checkpoint: a pickled dictionary with the old names."""
+    path = tmp_path_factory.mktemp("original") / "sam_vit_tiny.pth"
+    torch.save(original_weights(transformers.SamModel.from_pretrained(weights)), path)
+    return path
+
+
+def original_weights(model):
+    original = {}
+    for name, value in model.state_dict().items():
+        if name.startswith("shared_image_embedding"):
+            continue  # in the old files, the prompt encoder alone has it
+        for pattern, old in ORIGINAL_NAMES:
+            name = re.sub(pattern, old, name)
+        original[name] = value
+    return original
+
+
+def variant(weights, **parameters):
+    """All masks that the tiny network gives, whatever it thinks of them."""
+    chosen = {"grid": 4, "iou": 0.0, "stability": 0.0, "cache": "none", "device": "cpu"}
+    return SamBoundaries(str(weights), **(chosen | parameters))
+
+
+def picture(shape=(48, 64), seed=0):
+    noise = np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 3).reshape(shape)
+    return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def drawn(chosen, grey):
+    return chosen(grey, np.ones(grey.shape, bool))[0]
+
+
+def box_mask(top, left, bottom, right, shape=(32, 32)):
+    mask = np.zeros(shape, bool)
+    mask[top:bottom, left:right] = True
+    return mask
+
+
+def outline(top, left, bottom, right, shape=(32, 32)):
+    inner = box_mask(top + 1, left + 1, bottom - 1, right - 1, shape)
+    return box_mask(top, left, bottom, right, shape) & ~inner
+
+
+# Known masks.
+
+
+def test_boundaries_of_known_masks():
+    masks = [box_mask(4, 5, 14, 20), box_mask(10, 10, 25, 30)]
+    expected = outline(4, 5, 14, 20) | outline(10, 10, 25, 30)
+    np.testing.assert_array_equal(boundary_map(masks, (32, 32)), expected)
+    assert not boundary_map([], (32, 32)).any()
+
+
+def test_the_border_of_the_picture_is_no_boundary():
+    assert not boundary_map([np.ones((32, 32), bool)], (32, 32)).any()
+    edges = boundary_map([box_mask(0, 0, 32, 12)], (32, 32))
+    np.testing.assert_array_equal(edges, box_mask(0, 11, 32, 12))
+
+
+def fake(truth, ious, sharpness=50.0, shape=(32, 32)):
+    """A network that answers every point with the same three masks, in a picture twice as wide."""
+    low = torch.stack([torch.from_numpy(mask).float() for mask in truth])
+    assert low.shape[1:] == shape
+
+    def predict(points):
+        assert points.dtype == np.float32 and points.shape[1:] == (2,)
+        predict.asked.append(points)
+        logits = ((low - 0.5) * sharpness).expand(len(points), -1, -1, -1)
+        return logits, torch.tensor(ious).expand(len(points), -1)
+
+    predict.asked = []
+    return predict
+
+
+THREE = [box_mask(4, 4, 12, 12), box_mask(16, 16, 28, 28), box_mask(2, 20, 10, 30)]
+
+
+def test_fake_network_gives_known_boundaries():
+    """Masks of 32 x 32 on a network of 64 and a picture of 64: everything twice as large."""
+    rules = SamBoundaries("somewhere", grid=2)
+    predict = fake(THREE, [0.95, 0.99, 0.9])
+    masks = list(automatic_masks(predict, (64, 64), 64, rules))
+    expected = [np.kron(THREE[i], np.ones((2, 2), bool)) for i in (1, 0, 2)]  # best IoU first
+    assert len(masks) == 3  # twelve were found, nine of them duplicates
+    for mask, true in zip(masks, expected, strict=True):
+        assert (mask ^ true).sum() <= 4  # corners are rounded
+    edges = boundary_map(masks, (64, 64))
+    wanted = outline(8, 8, 24, 24, (64, 64)) | outline(32, 32, 56, 56, (64, 64))
+    wanted |= outline(4, 40, 20, 60, (64, 64))
+    assert (edges ^ wanted).sum() <= 24
+
+
+def test_points_are_an_even_grid_asked_in_batches():
+    rules = SamBoundaries("somewhere", grid=4, prompts=7)
+    predict = fake(THREE, [0.9, 0.9, 0.9])
+    list(automatic_masks(predict, (32, 64), 128, rules))
+    assert [len(points) for points in predict.asked] == [7, 7, 2]
+    x, y = np.concatenate(predict.asked).T
+    assert sorted(set(x)) == [16, 48, 80, 112] and sorted(set(y)) == [8, 24, 40, 56]
+
+
+@pytest.mark.parametrize("iou, left", [(0.8, 3), (0.92, 2), (0.97, 1), (1.0, 0)])
+def test_masks_that_the_network_doubts_are_dropped(iou, left):
+    rules = SamBoundaries("somewhere", grid=1, iou=iou)
+    predict = fake(THREE, [0.95, 0.99, 0.9])
+    assert len(list(automatic_masks(predict, (64, 64), 64, rules))) == left
+
+
+def test_unstable_masks_are_dropped():
+    """Logits that fall slowly across a border: the mask depends on where it is cut."""
+    rules = SamBoundaries("somewhere", grid=1)
+    for sharpness, left in ((50.0, 3), (2.1, 0)):
+        predict = fake(THREE, [0.99, 0.99, 0.99], sharpness)
+        assert len(list(automatic_masks(predict, (64, 64), 64, rules))) == left
+
+
+def test_empty_masks_are_dropped():
+    rules = SamBoundaries("somewhere", grid=2, iou=0.0, stability=0.0)
+    predict = fake([np.zeros((32, 32), bool)] * 3, [0.99, 0.99, 0.99])
+    assert list(automatic_masks(predict, (64, 64), 64, rules)) == []
+
+
+def test_suppression_keeps_the_best_of_near_duplicates():
+    corners = np.array([[0, 0, 10, 10], [0, 0, 10, 11], [0, 0, 10, 10], [30, 30, 40, 40]])
+    scores = np.array([0.8, 0.9, 0.95, 0.7])
+    assert suppressed(corners, scores, 0.7) == [2, 3]
+    assert suppressed(corners, scores, 0.95) == [2, 1, 3]
+    assert suppressed(corners, scores, 1.0) == [2, 1, 0, 3]
+
+
+def test_suppression_is_that_of_opencv():
+    rng = np.random.default_rng(1)
+    first = rng.integers(0, 60, (200, 2))
+    corners = np.hstack([first, first + rng.integers(5, 30, (200, 2))])
+    scores = rng.permutation(200) / 200 + 0.01
+    boxes = np.hstack([first, corners[:, 2:] - first]).tolist()
+    expected = cv2.dnn.NMSBoxes(boxes, scores.tolist(), 0.0, 0.5)
+    assert 10 < len(expected) < 180
+    assert suppressed(corners, scores, 0.5) == list(expected)
+
+
+def test_pixels_are_those_of_the_librarys_processor():
+    processing = pytest.importorskip("transformers.models.sam.image_processing_pil_sam")
+    for shape in ((100, 256), (256, 200), (1500, 700)):
+        grey = picture(shape)
+        made = sam.network_pixels(grey, 1024).numpy()
+        expected = processing.SamImageProcessorPil()(
+            np.repeat(grey[..., None], 3, axis=2), return_tensors="np"
+        )["pixel_values"]
+        assert made.shape == expected.shape == (1, 3, 1024, 1024)
+        assert np.abs(made - expected).max() < 1.1 / 255 / 0.224  # a grey level of rounding
+
+
+# The true architecture.
+
+
+def test_gives_a_binary_map(weights):
+    grey = picture()
+    out = variant(weights)(grey, np.ones(grey.shape, bool))
+    assert out.shape == (1, *grey.shape) and out.dtype == np.float32
+    assert set(np.unique(out)) == {0.0, 1.0}
+    assert not np.array_equal(out[0], drawn(variant(weights), picture(seed=1)))
+
+
+def test_predictions_are_the_librarys(weights):
+    """What the parts give for a point is what the whole model gives."""
+    model = transformers.SamModel.from_pretrained(weights)
+    grey = picture()
+    points = np.array([[10, 20], [40, 30]], np.float32)
+    logits, iou = sam._predictor(model, grey, torch.float32)(points)
+    with torch.no_grad():
+        expected = model(
+            pixel_values=sam.network_pixels(grey, SIDE),
+            input_points=torch.from_numpy(points)[None, :, None],
+        )
+    torch.testing.assert_close(logits, expected.pred_masks[0])
+    torch.testing.assert_close(iou, expected.iou_scores[0])
+    assert logits.shape == (2, 3, 32, 32) and (logits[0] - logits[1]).abs().max() > 0.01
+
+
+def test_deterministic_and_inputs_untouched(weights):
+    grey = picture()
+    valid = np.ones(grey.shape, bool)
+    grey.flags.writeable = valid.flags.writeable = False
+    first, second = variant(weights)(grey, valid), variant(weights)(grey.copy(), valid)
+    assert first.tobytes() == second.tobytes()
+    np.testing.assert_array_equal(grey, picture())
+
+
+@pytest.mark.parametrize("precision", ["bf16", "fp16"])
+def test_half_precision_is_close(weights, precision):
+    rough = drawn(variant(weights, precision=precision), picture()) > 0
+    exact = drawn(variant(weights), picture()) > 0
+    assert (rough & exact).sum() > 0.9 * (rough | exact).sum() > 100
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (2, 3), (33, 47)])
+def test_any_size_is_taken(weights, shape):
+    grey = picture(shape)
+    out = variant(weights)(grey, np.ones(shape, bool))
+    assert out.shape == (1, *shape) and set(np.unique(out)) <= {0.0, 1.0}
+
+
+def test_masked_area_is_zero_and_says_nothing_of_what_lies_under_it(weights):
+    grey = picture()
+    valid = np.ones(grey.shape, bool)
+    valid[20:, 30:] = False
+    painted = np.where(valid, grey, 255).astype(np.uint8)
+    out, other = variant(weights)(grey, valid), variant(weights)(painted, valid)
+    assert out.any() and not out[:, ~valid].any()
+    assert not out[:, 18:20, 40:].any()  # along the border
+    np.testing.assert_array_equal(out, other)
+
+
+def test_nothing_valid_is_zero_without_asking(tmp_path):
+    out = variant(tmp_path / "none")(picture(), np.zeros((48, 64), bool))
+    assert out.shape == (1, 48, 64) and not out.any()
+
+
+def test_large_pictures_are_taken_window_by_window(weights):
+    grey = picture((32, 80))
+    whole = drawn(variant(weights, window=32), grey)
+    parts = [drawn(variant(weights, window=32), grey[:, x : x + 32]) for x in (0, 24, 48)]
+    expected = np.zeros((32, 80), np.float32)
+    for x, part in zip((0, 24, 48), parts, strict=True):
+        expected[:, x : x + 32] = np.maximum(expected[:, x : x + 32], part)
+    np.testing.assert_array_equal(whole, expected)
+    assert not np.array_equal(whole, drawn(variant(weights, window=0), grey))
+
+
+def test_batch_is_one_by_one(weights):
+    greys = np.stack([picture(seed=seed) for seed in range(3)])
+    valid = np.ones(greys.shape, bool)
+    shares = []
+    out = variant(weights).batch(greys, valid, shares.append)
+    for grey, seen, edges in zip(greys, valid, out, strict=True):
+        np.testing.assert_array_equal(edges, variant(weights)(grey, seen))
+    assert out.shape == (3, 1, 48, 64) and shares == pytest.approx([1 / 3, 2 / 3, 1])
+
+
+# The cache.
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """How often a network was taken up."""
+    calls = []
+    real = sam._predictor
+    monkeypatch.setattr(sam, "_predictor", lambda *given: calls.append(1) or real(*given))
+    return calls
+
+
+def test_second_call_does_not_run_the_network(weights, tmp_path, asked, monkeypatch):
+    chosen = variant(weights, cache=str(tmp_path / "cache"))
+    first = drawn(chosen, picture())
+    assert len(asked) == 1 and first.any()
+    monkeypatch.setattr(sam, "_model", lambda *given: pytest.fail("the network was loaded"))
+    np.testing.assert_array_equal(drawn(chosen, picture()), first)
+    assert len(asked) == 1
+
+
+def test_cache_tells_pictures_and_parameters_apart(weights, tmp_path, asked):
+    cache = {"cache": str(tmp_path)}
+    for chosen, grey in [
+        (variant(weights, **cache), picture()),
+        (variant(weights, **cache), picture(seed=1)),
+        (variant(weights, **cache), picture().reshape(64, 48)),
+        (variant(weights, grid=3, **cache), picture()),
+        (variant(weights, overlap=0.5, **cache), picture()),
+        (variant(weights, precision="bf16", **cache), picture()),
+    ]:
+        drawn(chosen, grey)
+    assert len(asked) == 6
+    drawn(variant(weights, prompts=3, **cache), picture())  # changes nothing but speed
+    assert len(asked) == 6
+
+
+def test_cache_tells_weights_apart_but_not_their_place(weights, tmp_path, asked):
+    moved = tmp_path / "moved"
+    shutil.copytree(weights, moved)
+    for place in (weights, moved):
+        drawn(variant(place, cache=str(tmp_path / "cache")), picture())
+    assert len(asked) == 1
+    model = transformers.SamModel.from_pretrained(moved)
+    with torch.no_grad():
+        model.mask_decoder.iou_token.weight += 1
+    model.save_pretrained(moved)
+    drawn(variant(moved, cache=str(tmp_path / "cache")), picture())
+    assert len(asked) == 2
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda b: b[:-5], lambda b: b"", lambda b: b[:40] + b"x" + b[41:]]
+)
+def test_damaged_entries_are_made_again(weights, tmp_path, asked, damage, names_in):
+    chosen = variant(weights, cache=str(tmp_path))
+    first = drawn(chosen, picture())
+    (entry,) = tmp_path.iterdir()
+    whole = entry.read_bytes()
+    entry.write_bytes(damage(whole))
+    np.testing.assert_array_equal(drawn(chosen, picture()), first)
+    assert len(asked) == 2 and entry.read_bytes() == whole
+    assert names_in(tmp_path) == [entry.name]
+
+
+def test_a_cache_that_cannot_be_written_costs_no_result(weights, tmp_path, caplog):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    out = drawn(variant(weights, cache=str(blocked / "below")), picture())
+    np.testing.assert_array_equal(out, drawn(variant(weights), picture()))
+    assert "nothing cached" in caplog.text
+
+
+def test_cache_lies_where_the_environment_says(weights, tmp_path, monkeypatch, names_in):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
+    monkeypatch.delenv("ORTHONAV_CACHE", raising=False)
+    drawn(variant(weights, cache=""), picture())
+    assert len(list((tmp_path / "user" / "orthonav" / "sam").iterdir())) == 1
+    monkeypatch.setenv("ORTHONAV_CACHE", str(tmp_path / "ours"))
+    drawn(variant(weights, cache=""), picture())
+    assert len(list((tmp_path / "ours" / "sam").iterdir())) == 1
+    before = names_in(tmp_path)
+    drawn(variant(weights, cache="none"), picture(seed=1))
+    assert names_in(tmp_path) == before
+
+
+# Weights.
+
+
+def test_original_checkpoints_are_read(weights, checkpoint):
+    names = set(torch.load(checkpoint, weights_only=True))
+    assert set(PUBLISHED.split()) <= names and len(names) > 100
+    assert {name.partition(".")[0] for name in names} == {
+        "image_encoder",
+        "prompt_encoder",
+        "mask_decoder",
+    }
+    model = sam.original_model(checkpoint)
+    expected = transformers.SamModel.from_pretrained(weights)
+    assert model.state_dict().keys() == expected.state_dict().keys()
+    for name, value in expected.state_dict().items():
+        torch.testing.assert_close(model.state_dict()[name], value, rtol=0, atol=0)
+    grey = picture()
+    out = drawn(variant(checkpoint), grey)
+    assert out.any()
+    np.testing.assert_array_equal(out, drawn(variant(weights), grey))
+
+
+@pytest.mark.parametrize("size", sorted(SIZES))
+def test_sizes_are_told_by_the_shapes_of_the_weights(size):
+    expected = transformers.SamConfig(vision_config=transformers.SamVisionConfig(**SIZES[size]))
+    with torch.device("meta"):
+        original = original_weights(transformers.SamModel(expected))
+    made = sam._config(original)
+    for part in ("vision_config", "prompt_encoder_config", "mask_decoder_config"):
+        told, wanted = getattr(made, part).to_dict(), getattr(expected, part).to_dict()
+        assert told.pop("global_attn_indexes", []) == list(wanted.pop("global_attn_indexes", []))
+        assert told == wanted
+
+
+def test_incomplete_checkpoints_are_refused(checkpoint, tmp_path):
+    whole = torch.load(checkpoint, weights_only=True)
+    for name in ("mask_decoder.iou_token.weight", "image_encoder.neck.0.weight"):
+        path = tmp_path / "part.pth"
+        torch.save({key: value for key, value in whole.items() if key != name}, path)
+        with pytest.raises(VariantError, match="not Segment Anything"):
+            sam.original_model(path)
+    torch.save([1, 2], tmp_path / "list.pth")
+    with pytest.raises(VariantError, match="not Segment Anything"):
+        sam.original_model(tmp_path / "list.pth")
+
+
+class Evil:
+    """What a pickle could do."""
+
+    def __reduce__(self):
+        return (pytest.fail, ("code of a checkpoint was run",))
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"no checkpoint", pickle.dumps(Evil(), 2)], ids=["empty", "text", "code"]
+)
+def test_files_that_are_no_checkpoints_are_refused(tmp_path, content):
+    path = tmp_path / "sam_vit_b.pth"
+    path.write_bytes(content)
+    with pytest.raises(VariantError, match="cannot read"):
+        drawn(variant(path), picture())
+
+
+def test_weights_of_another_model_are_refused(tmp_path):
+    (tmp_path / "config.json").write_text(json.dumps({"model_type": "sam2"}))
+    with pytest.raises(VariantError, match="'sam'"):
+        drawn(variant(tmp_path), picture())
+
+
+def test_missing_weights_say_where_they_are(tmp_path):
+    with pytest.raises(MissingFileError, match=r"facebook/sam-vit-base.*fbaipublicfiles"):
+        drawn(variant(tmp_path / "none"), picture())
+    with pytest.raises(VariantError, match=r"weights=PATH.*facebook/sam-vit-base"):
+        make_variant(TABLE, "sam")
+
+
+def test_is_a_frozen_value():
+    made = make_variant(TABLE, "sam:weights=/some/where,grid=16,iou=0.8,window=128")
+    assert made == SamBoundaries("/some/where", grid=16, iou=0.8, window=128)
+    assert pickle.loads(pickle.dumps(made)) == made and hash(made) == hash(made)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        made.grid = 3
+    recipe = json.loads(json.dumps(variant_recipe(TABLE, made)))
+    assert variant_from_recipe(TABLE, recipe) == made
+
+
+def test_defaults_are_those_of_the_original_generator():
+    made = SamBoundaries("somewhere")
+    assert (made.grid, made.prompts, made.iou) == (32, 64, 0.88)
+    assert (made.stability, made.offset, made.overlap) == (0.95, 1.0, 0.7)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "grid=0",
+        "iou=1.1",
+        "stability=-1",
+        "offset=0",
+        "overlap=2",
+        "window=8",
+        "prompts=0",
+        "device=tpu",
+        "precision=fp8",
+    ],
+)
+def test_impossible_parameters_are_refused(text):
+    with pytest.raises(VariantError, match=text.partition("=")[0]):
+        make_variant(TABLE, f"sam:weights=somewhere,{text}")

@@ -1,0 +1,111 @@
+"""Tiles are what the sheet shows, nothing more."""
+
+import time
+
+import numpy as np
+import pytest
+
+from orthonav.neural.tiles import SheetTiles, epoch_batches, made_ahead
+
+TILE_PX = 32
+
+
+def sheet(channels=1, **changes):
+    rng = np.random.default_rng(0)
+    parts = {
+        "pixels": rng.integers(0, 256, (channels, 80, 96), dtype=np.uint8),
+        "valid": rng.random((80, 96)) > 0.2,
+        "tiles_px": np.array([[0, 0], [48, 64], [7, 9]]),
+        "tile_px": TILE_PX,
+    }
+    return SheetTiles(**{**parts, **changes})
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_tile_is_its_part_of_the_sheet_and_zero_where_not_valid(channels):
+    tiles = sheet(channels)
+    maps = tiles.batch(np.array([2, 1]))
+    assert maps.dtype == np.float32
+    assert maps.shape == (2, channels, TILE_PX, TILE_PX)
+    for made, (row, col) in zip(maps, [(7, 9), (48, 64)], strict=True):
+        part = np.s_[row : row + TILE_PX, col : col + TILE_PX]
+        wanted = tiles.pixels[:, *part] / 255 * tiles.valid[part]
+        np.testing.assert_allclose(made, wanted, atol=1e-7)
+
+
+def test_scale_says_what_is_one():
+    edges = np.ones((1, 80, 96), np.uint8)
+    assert (
+        sheet(pixels=edges, scale=1.0, valid=np.ones((80, 96), bool)).batch(np.arange(3)).min() == 1
+    )
+
+
+def test_memory_maps_will_do(tmp_path):
+    tiles = sheet()
+    np.save(tmp_path / "pixels.npy", tiles.pixels)
+    mapped = np.load(tmp_path / "pixels.npy", mmap_mode="r")
+    same = sheet(pixels=mapped).batch(np.arange(3))
+    np.testing.assert_array_equal(same, tiles.batch(np.arange(3)))
+
+
+def test_grey_levels_of_a_tile():
+    grey = np.arange(80 * 96, dtype=np.uint32).astype(np.uint8).reshape(80, 96)
+    tiles = sheet(grey=grey)
+    np.testing.assert_array_equal(tiles.grey_tile(2), grey[7:39, 9:41])
+    np.testing.assert_array_equal(sheet().grey_tile(2), sheet().pixels[0, 7:39, 9:41])
+    tiles.grey_tile(2)[:] = 0
+    assert tiles.grey_tile(2).any(), "a copy must be given"
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"pixels": np.zeros((80, 96), np.uint8)},
+        {"pixels": np.zeros((1, 80, 96), np.float32)},
+        {"valid": np.ones((80, 95), bool)},
+        {"valid": np.ones((80, 96), np.uint8)},
+        {"grey": np.zeros((79, 96), np.uint8)},
+        {"tiles_px": np.array([[49, 0]])},
+        {"tiles_px": np.array([[0, -1]])},
+        {"tiles_px": np.zeros((0, 2), int)},
+        {"scale": 0.0},
+    ],
+)
+def test_what_does_not_fit_is_refused(changes):
+    with pytest.raises(ValueError):
+        sheet(**changes)
+
+
+@pytest.mark.parametrize("count, batch", [(25, 8), (3, 8), (64, 32), (1, 1)])
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_batches_are_shared_among_processes(count, batch, size):
+    plans = [epoch_batches(count, batch, 0, 4, rank=rank, processes=size) for rank in range(size)]
+    assert len({len(plan) for plan in plans}) == 1
+    for parts in zip(*plans, strict=True):
+        assert len({len(part) for part in parts}) == 1
+        assert len(parts[0]) >= min(2, batch)
+        together = np.concatenate(parts)
+        assert len(together) <= max(batch, 2 * size)
+    if size == 1 and count > 1:
+        seen = np.sort(np.concatenate(plans[0]))
+        np.testing.assert_array_equal(seen, np.arange(count))
+        assert not np.array_equal(np.concatenate(plans[0]), seen)
+
+
+def test_batches_come_in_order_whoever_is_first():
+    plan = [np.array([number]) for number in range(12)]
+
+    def make(indices):
+        time.sleep(0.002 * (5 - int(indices[0]) % 6))
+        return (indices * 10,)
+
+    made = [int(array[0]) for (array,) in made_ahead(make, plan, workers=3)]
+    assert made == [10 * number for number in range(12)]
+
+
+def test_an_error_in_a_thread_comes_out():
+    def make(indices):
+        raise ValueError("broken tile")
+
+    with pytest.raises(ValueError, match="broken tile"):
+        list(made_ahead(make, [np.array([0])], workers=2))

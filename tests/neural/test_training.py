@@ -1,0 +1,263 @@
+"""Learning: the loss falls, a kill changes nothing, several processes learn one network."""
+
+import dataclasses
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="learning needs PyTorch")
+pytest.importorskip("onnx", reason="writing what flies needs ONNX")
+pytest.importorskip("onnxruntime", reason="checking what flies needs onnxruntime")
+
+from orthonav.embed.network import AutoEncoderRecipe, TripletRecipe  # noqa: E402
+from orthonav.errors import OutputError  # noqa: E402
+from orthonav.neural.tiles import SheetTiles  # noqa: E402
+from orthonav.neural.training import (  # noqa: E402
+    Means,
+    TrainingError,
+    learn_network,
+    loss_picture,
+)
+
+TILE_PX = 32
+AUTO = AutoEncoderRecipe(dims=16, width=16, epochs=3, batch=8, learning_rate=3e-3)
+TRIPLET = TripletRecipe(width=2, epochs=3, batch=8, mining="semihard", apart=0.5)
+QUICK = Means(save_every_s=0, workers=1, device="cpu")
+RARELY_SAVED = dataclasses.replace(QUICK, save_every_s=1e6)
+
+
+def ground(seed=0, size=128):
+    rng = np.random.default_rng(seed)
+    blots = cv2.GaussianBlur(rng.normal(size=(size, size)).astype(np.float32), (0, 0), 4)
+    return np.clip(128 + 60 * blots / blots.std(), 0, 255).astype(np.uint8)
+
+
+def sheet(grey=None):
+    grey = ground() if grey is None else grey
+    rows, cols = np.meshgrid(np.arange(0, 97, 24), np.arange(0, 97, 24), indexing="ij")
+    tiles_px = np.stack([rows.ravel(), cols.ravel()], axis=1)
+    return SheetTiles(grey[None], np.ones(grey.shape, bool), tiles_px, TILE_PX)
+
+
+def noisy(rng, grey):
+    return np.clip(grey * 0.8 + rng.normal(20, 8, grey.shape), 0, 255).astype(np.uint8)
+
+
+def learn(recipe, work=None, tiles=None, means=QUICK, seed=1, report=None):
+    positive = noisy if isinstance(recipe, TripletRecipe) else None
+    return learn_network(
+        recipe,
+        tiles or sheet(),
+        binary=False,
+        seed=seed,
+        work=work,
+        positive=positive,
+        means=means,
+        report=report,
+    )
+
+
+def losses(work):
+    return json.loads((work / "history.json").read_text())["loss"]
+
+
+class Killed(Exception):
+    """Stands for what ends a process."""
+
+
+def kill_after(epochs):
+    def report(text, share):
+        if text.startswith(f"epoch {epochs + 1} "):
+            raise Killed
+
+    return report
+
+
+def test_the_auto_encoder_learns_to_draw_the_area(tmp_path):
+    told = []
+    learn(
+        dataclasses.replace(AUTO, epochs=25),
+        tmp_path,
+        means=RARELY_SAVED,
+        report=lambda text, share: told.append((text, share)),
+    )
+    history = losses(tmp_path)
+    assert len(history) == 25
+    assert history[-1] < 0.3 * history[0]
+    epochs = [share for text, share in told if text.startswith("epoch")]
+    assert epochs == pytest.approx(np.arange(1, 26) / 25)
+    assert "float32" in told[-1][0]
+
+
+def test_the_triplet_network_learns_to_find_a_changed_place(tmp_path):
+    recipe = TripletRecipe(width=4, epochs=30, batch=32, learning_rate=2e-3, apart=0.5)
+    recipe = dataclasses.replace(recipe, similarity="cosine", margin=0.2)
+    tiles = sheet()
+    before = learn(dataclasses.replace(recipe, epochs=1, learning_rate=1e-9), tiles=tiles)
+    after = learn(recipe, tmp_path, tiles=tiles, means=RARELY_SAVED)
+    history = losses(tmp_path)
+    assert history[-1] < 0.1 * history[0]
+    rng = np.random.default_rng(9)
+    seen = np.stack([noisy(rng, tiles.grey_tile(row)) for row in range(len(tiles))])
+    seen = seen[:, None].astype(np.float32) / 255
+    found = []
+    for embedder in (before, after):
+        scores = embedder.views(seen) @ embedder.views(tiles.batch(np.arange(len(tiles)))).T
+        found.append(np.mean(scores.argmax(axis=1) == np.arange(len(tiles))))
+    assert found[0] < 0.5
+    assert found[1] > 0.9
+
+
+@pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
+def test_a_killed_learning_goes_on_as_if_it_had_not_been(recipe, tmp_path):
+    whole = learn(recipe, tmp_path / "whole")
+    with pytest.raises(Killed):
+        learn(recipe, tmp_path / "killed", report=kill_after(1))
+    assert len(losses(tmp_path / "killed")) == 1
+    resumed = learn(recipe, tmp_path / "killed")
+    np.testing.assert_array_equal(resumed.onnx, whole.onnx)
+    assert losses(tmp_path / "killed") == losses(tmp_path / "whole")
+    np.testing.assert_array_equal(learn(recipe, tmp_path / "killed").onnx, whole.onnx)
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not():
+    first, second, other = (learn(AUTO, seed=seed).onnx for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, second)
+    assert not np.array_equal(first, other)
+
+
+def test_callers_randomness_is_left_alone():
+    torch.manual_seed(5)
+    wanted = torch.rand(3)
+    torch.manual_seed(5)
+    learn(dataclasses.replace(AUTO, epochs=1))
+    torch.testing.assert_close(torch.rand(3), wanted)
+
+
+def test_pictures_show_the_progress(tmp_path):
+    learn(AUTO, tmp_path)
+    tiles = cv2.imread(str(tmp_path / "tiles.png"), cv2.IMREAD_GRAYSCALE)
+    assert tiles.shape == (2 * TILE_PX, 6 * TILE_PX)
+    np.testing.assert_allclose(tiles[:TILE_PX, :TILE_PX], sheet().grey_tile(0), atol=1)
+    assert cv2.imread(str(tmp_path / "loss.png")).shape == (360, 640, 3)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "checkpoint.pt",
+        "history.json",
+        "loss.png",
+        "tiles.png",
+    }
+
+
+def test_the_curve_falls_where_the_loss_does():
+    dark = loss_picture([1.0, 0.1, 0.01])[40:].min(axis=2) < 128
+    rows = [np.flatnonzero(dark[:, col]).mean() for col in (22, 320, 618)]
+    assert rows[0] < rows[1] < rows[2]
+    assert loss_picture([0.5]).shape == loss_picture([0.0, 0.0]).shape
+
+
+@pytest.mark.parametrize("change", ["recipe", "seed", "tiles"])
+def test_a_folder_of_another_learning_is_refused(change, tmp_path):
+    learn(dataclasses.replace(AUTO, epochs=1), tmp_path)
+    before = (tmp_path / "checkpoint.pt").read_bytes()
+    changes = {
+        "recipe": {"recipe": AUTO},
+        "seed": {"seed": 2},
+        "tiles": {"tiles": sheet(ground(7))},
+    }
+    given = {"recipe": dataclasses.replace(AUTO, epochs=1), "work": tmp_path, **changes[change]}
+    with pytest.raises(OutputError, match="something else"):
+        learn(**given)
+    assert (tmp_path / "checkpoint.pt").read_bytes() == before
+
+
+def test_a_broken_checkpoint_is_refused_and_nothing_in_it_is_run(tmp_path):
+    (tmp_path / "checkpoint.pt").write_bytes(b"broken")
+    with pytest.raises(OutputError, match="cannot be read"):
+        learn(AUTO, tmp_path)
+    torch.save({"fingerprint": Killed}, tmp_path / "checkpoint.pt")
+    with pytest.raises(OutputError, match="cannot be read"):
+        learn(AUTO, tmp_path)
+
+
+def test_a_loss_that_is_no_number_ends_the_learning():
+    with pytest.raises(TrainingError, match="learning_rate"):
+        learn_network(
+            TRIPLET,
+            sheet(),
+            binary=False,
+            seed=0,
+            work=None,
+            positive=lambda rng, grey: np.full((1, *grey.shape), np.nan, np.float32),
+            means=QUICK,
+        )
+
+
+def test_triplets_need_positives():
+    with pytest.raises(ValueError, match="positives"):
+        learn_network(TRIPLET, sheet(), binary=False, seed=0, work=None, means=QUICK)
+
+
+def test_fast_means_learn_the_same_up_to_rounding(tmp_path):
+    recipe = dataclasses.replace(AUTO, epochs=8)
+    plain = Means(bf16=False, channels_last=False, fused=False, keep_memory=False, device="cpu")
+    fast = dataclasses.replace(QUICK, bf16=True)
+    learn(recipe, tmp_path / "plain", means=plain)
+    learn(recipe, tmp_path / "fast", means=fast)
+    exact, rounded = losses(tmp_path / "plain"), losses(tmp_path / "fast")
+    assert rounded != exact
+    np.testing.assert_allclose(rounded, exact, rtol=0.1)
+
+
+SHARED = """
+import sys
+from pathlib import Path
+import numpy as np
+import torch
+torch.set_num_threads(1)
+sys.path.insert(0, sys.argv[1])
+import test_training as here
+
+means = here.dataclasses.replace(here.QUICK, chunk=4)
+rank = here.os.environ["RANK"]
+torch.distributed.init_process_group("gloo")
+for name in ("AUTO", "TRIPLET"):
+    folder = Path(sys.argv[2]) / name
+    made = here.learn(getattr(here, name), folder, means=means)
+    np.save(Path(sys.argv[2]) / f"{name}{rank}.npy", made.onnx)
+torch.distributed.destroy_process_group()
+"""
+
+
+def test_two_processes_learn_one_network(tmp_path):
+    """Started as torchrun starts them; each writes the network it ends with."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    shared = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    command = [sys.executable, "-c", SHARED, str(Path(__file__).parent), str(tmp_path)]
+    running = [
+        subprocess.Popen(
+            command,
+            env={**os.environ, **shared, "RANK": str(rank), "LOCAL_RANK": str(rank)},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in range(2)
+    ]
+    for process in running:
+        _, said = process.communicate(timeout=60)
+        assert process.returncode == 0, said
+    for name, recipe in (("AUTO", AUTO), ("TRIPLET", TRIPLET)):
+        first, second = (np.load(tmp_path / f"{name}{rank}.npy") for rank in range(2))
+        np.testing.assert_array_equal(first, second)
+        alone = learn(recipe, tmp_path / "alone" / name)
+        assert not np.array_equal(first, alone.onnx), "each process must take its part only"
+    shared_losses, own_losses = losses(tmp_path / "AUTO"), losses(tmp_path / "alone" / "AUTO")
+    np.testing.assert_allclose(shared_losses, own_losses, rtol=0.3)

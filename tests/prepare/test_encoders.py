@@ -1,0 +1,145 @@
+"""Maps of the paper's methods: built, carried, flown like any other."""
+
+import numpy as np
+import pytest
+
+from orthonav.embed.network import NetworkEmbedder
+from orthonav.embed.words import WordsEmbedder
+from orthonav.errors import MapFileError, VariantError
+from orthonav.flight import open_flight, read_truth
+from orthonav.localizer import Localizer
+from orthonav.mapfile import open_map
+from orthonav.onboard.run import localize_flight
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.prepare.methods import usual_edges
+from orthonav.records import Fix
+
+SMALL = {"tile_px": 64, "gsd_m": 5.0, "overlap": 0.75, "calibration_views": 2}
+METHODS = {
+    "autoencoder:width=16,dims=64,epochs=2": NetworkEmbedder,
+    "triplet:width=4,epochs=1,batch=64": NetworkEmbedder,
+    "bovw:words=256": WordsEmbedder,
+}
+
+
+@pytest.fixture(scope="module")
+def built(area, tmp_path_factory):
+    """A map of each method, built once."""
+    made = {}
+
+    def build(method, **more):
+        key = method, str(sorted(more.items()))
+        if key not in made:
+            path = tmp_path_factory.mktemp("methods") / "area.onav"
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr("orthonav.prepare.calibrate.CROPS", 24)
+                request = BuildRequest([area.past], path, method=method, **{**SMALL, **more})
+                made[key] = build_map(request)
+            made[key] = path
+        return made[key]
+
+    return build
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_map_of_any_method_flies(built, flight_path, method):
+    path = built(method)
+    localizer = Localizer(open_map(path), registration=False)
+    assert isinstance(localizer.embedder, METHODS[method])
+    recipe = open_map(path).manifest.recipe
+    assert recipe["method"] == method.partition(":")[0]
+    assert recipe["represent"]["name"] == usual_edges(method)
+    flight = open_flight(flight_path)
+    for result in localize_flight(localizer, flight, views=flight.views[:3]):
+        assert isinstance(result.outcome, Fix), result.outcome
+        assert np.isfinite(result.outcome.evidence["lowe_ratio"])
+
+
+def test_its_own_tiles_are_found(built):
+    """What was embedded at building is what is embedded in flight."""
+    localizer = Localizer(open_map(built("bovw:words=256")), registration=False)
+    stored = localizer.index.scores(np.eye(256, dtype=np.float32))
+    assert stored.shape == (localizer.sheet.tiles, 256)
+    total = stored.sum(axis=1)
+    # Frequencies; a tile of bare ground may have no feature at all.
+    np.testing.assert_allclose(total[total > 0], 1, atol=0.02)
+    assert np.mean(total > 0) > 0.9
+
+
+@pytest.mark.parametrize("method", ["bovw:words=256"])
+def test_registration_works_on_maps_of_other_methods(built, flight_path, method):
+    localizer = Localizer(open_map(built(method)))
+    assert localizer.registration is not None and localizer.registration.propose is None
+    flight = open_flight(flight_path)
+    truth = read_truth(flight_path / "truth.csv")
+    errors = []
+    for result in localize_flight(localizer, flight, views=flight.views[:5]):
+        frame = localizer.sheet.frame
+        place = frame.en_from_latlon(result.outcome.lat_deg, result.outcome.lon_deg)
+        errors.append(np.hypot(*(place - frame.en_from_latlon(*truth[result.frame]))))
+    assert np.median(errors) < 15
+
+
+def test_an_interrupted_learning_goes_on(area, tmp_path):
+    class Killed(Exception):
+        pass
+
+    def kill(stage, share):
+        if stage == "learn" and share >= 0.5:
+            raise Killed
+
+    method = "autoencoder:width=16,dims=32,epochs=4"
+    request = BuildRequest(
+        [area.past],
+        tmp_path / "a.onav",
+        method=method,
+        registration=False,
+        work=tmp_path / "work",
+        **SMALL,
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("orthonav.prepare.calibrate.CROPS", 24)
+        patch.setattr("orthonav.neural.training.Means.save_every_s", 0.0, raising=False)
+        with pytest.raises(Killed):
+            build_map(request, kill)
+        assert not (tmp_path / "a.onav").exists()
+        build_map(request)
+    assert (tmp_path / "a.onav").exists() and (tmp_path / "work" / "loss.png").exists()
+
+
+@pytest.mark.parametrize(
+    "method, edges, says",
+    [
+        ("autoencoder", "gradient", "one channel"),
+        ("bovw", "canny", "grey levels"),
+        ("triplet:width=0", None, "width must be"),
+        ("vlad", None, "unknown variant 'vlad'"),
+        ("autoencoder", "sam", "weights"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(area, tmp_path, method, edges, says):
+    request = BuildRequest([area.past], tmp_path / "a.onav", method=method, edges=edges, **SMALL)
+    with pytest.raises(VariantError, match=says):
+        build_map(request)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_same_request_gives_the_same_embeddings(area, tmp_path):
+    parts = []
+    for name in ("a.onav", "b.onav"):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("orthonav.prepare.calibrate.CROPS", 12)
+            request = BuildRequest(
+                [area.past], tmp_path / name, method="bovw:words=256", registration=False, **SMALL
+            )
+            build_map(request)
+        parts.append((tmp_path / name).read_bytes())
+    assert parts[0] == parts[1]
+
+
+def test_words_of_files_elsewhere_do_not_fly():
+    from orthonav.embed.stored import embedder_of
+
+    plain = {"name": "bovw", "features": "superpoint", "weights": "/etc", "words": 256}
+    with pytest.raises(MapFileError, match="do not fly"):
+        embedder_of(plain, lambda *_: np.zeros(0), 1)

@@ -1,0 +1,90 @@
+"""From scores to a position, by the rules of the literature."""
+
+import numpy as np
+import pytest
+
+from orthonav.errors import VariantError
+from orthonav.geo.grid import TileGrid
+from orthonav.search.peak import TileNeighbours
+from orthonav.search.position import RULES, check_rule, offset_en_m
+
+GRID = TileGrid.covering((0.0, 0.0, 800.0, 640.0), gsd_m=1.0, tile_px=256, overlap=0.875)
+ROWS, COLS = np.mgrid[: GRID.rows, : GRID.cols]
+TILES = np.stack([ROWS.ravel(), COLS.ravel()], axis=1)
+CENTRES = GRID.centres_en_m(TILES).astype(np.float32)
+NEIGHBOURS = TileNeighbours(GRID, CENTRES)
+
+
+def scores_around(east, north, width_m=60.0):
+    away = CENTRES - np.array([east, north])
+    return np.exp(-(away**2).sum(axis=1) / (2 * width_m**2)).astype(np.float32)
+
+
+def position(rule, scores, rows=None):
+    best = int(scores.argmax()) if rows is None else int(rows[scores.argmax()])
+    offset = offset_en_m(rule, scores, best, rows, CENTRES, NEIGHBOURS, GRID.stride_m)
+    return CENTRES[best] + np.array(offset)
+
+
+def inner_tile():
+    return int(np.flatnonzero(([GRID.rows // 2, GRID.cols // 2] == TILES).all(axis=1))[0])
+
+
+def test_the_best_tile_is_where_it_is():
+    tile = inner_tile()
+    truth = CENTRES[tile] + [9.0, -12.0]
+    np.testing.assert_array_equal(position("best", scores_around(*truth)), CENTRES[tile])
+
+
+@pytest.mark.parametrize("rule, within_m", [("peak", 1.0), ("neighbours", 6.0)])
+def test_neighbours_tell_where_between_tiles(rule, within_m):
+    tile = inner_tile()
+    for away in ([9.0, -12.0], [-14.0, 3.0], [0.0, 0.0]):
+        truth = CENTRES[tile] + np.array(away, np.float32)
+        found = position(rule, scores_around(*truth))
+        best = position("best", scores_around(*truth))
+        assert np.hypot(*(found - truth)) < within_m
+        assert np.hypot(*(found - truth)) <= np.hypot(*(best - truth)) + 1e-3
+
+
+def test_the_mean_of_all_is_the_weighted_mean_of_all():
+    rng = np.random.default_rng(0)
+    scores = rng.normal(size=len(CENTRES)).astype(np.float32)
+    weights = np.maximum(scores.astype(np.float64), 0)
+    expected = weights @ CENTRES / weights.sum()
+    np.testing.assert_allclose(position("weighted", scores), expected, atol=1e-2)
+    # Nearly alike scores: the mean lies in the middle of the area, wherever the best is.
+    flat = np.full(len(CENTRES), 0.5, np.float32)
+    flat[3] = 0.51
+    np.testing.assert_allclose(position("weighted", flat), CENTRES.mean(axis=0), atol=2)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_part_of_the_tiles_is_a_part_of_the_answer(rule):
+    tile = inner_tile()
+    near = np.flatnonzero(np.hypot(*(CENTRES - CENTRES[tile]).T) < 100)
+    scores = scores_around(*(CENTRES[tile] + [5.0, 5.0]))
+    found = position(rule, scores[near], near)
+    assert np.hypot(*(found - CENTRES[tile])) < 32
+    if rule != "weighted":
+        np.testing.assert_allclose(found, position(rule, scores), atol=1e-3)
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("value", [0.0, -1.0, 1.0])
+def test_scores_that_say_nothing_move_nothing_far(rule, value):
+    scores = np.full(len(CENTRES), value, np.float32)
+    offset = offset_en_m(rule, scores, 0, None, CENTRES, NEIGHBOURS, GRID.stride_m)
+    assert np.isfinite(offset).all()
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_one_tile_alone_is_the_answer(rule):
+    rows = np.array([7], np.intp)
+    np.testing.assert_array_equal(position(rule, np.array([0.3], np.float32), rows), CENTRES[7])
+
+
+def test_rules_by_name():
+    assert [check_rule(rule) for rule in RULES] == list(RULES)
+    with pytest.raises(VariantError, match="unknown rule of position 'mean'"):
+        check_rule("mean")
