@@ -12,7 +12,7 @@ from benchmarks.record import Section, Table, number
 from benchmarks.verdicts import from_placed, percent
 from orthonav.simulate.flight import Errors
 
-SIDES_M = (1000, 3200, 10000)
+SIDES_M = (1000, 4000, 10000)
 USUAL_YAW_DEG, USUAL_AGL = 10.0, 0.1
 PRIOR_STD_M = 50.0
 HEADER = (
