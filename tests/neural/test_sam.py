@@ -566,3 +566,14 @@ def test_defaults_are_those_of_the_original_generator():
 def test_impossible_parameters_are_refused(text):
     with pytest.raises(VariantError, match=text.partition("=")[0]):
         make_variant(TABLE, f"sam:weights=somewhere,{text}")
+
+
+def test_weights_may_be_named_by_the_machine(weights, monkeypatch):
+    """A map does not say where they lie; whoever replays it does."""
+    monkeypatch.setenv("ORTHONAV_SAM_WEIGHTS", str(weights))
+    there = variant("")
+    assert there.path == str(weights) and variant(weights).path == str(weights)
+    np.testing.assert_array_equal(drawn(there, picture()), drawn(variant(weights), picture()))
+    monkeypatch.delenv("ORTHONAV_SAM_WEIGHTS")
+    with pytest.raises(VariantError, match="ORTHONAV_SAM_WEIGHTS"):
+        variant("")

@@ -11,8 +11,10 @@ from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import localize_flight
 from orthonav.prepare import BuildRequest, build_map
-from orthonav.prepare.methods import usual_edges
+from orthonav.prepare.methods import stored_representation, usual_edges
 from orthonav.records import Fix
+from orthonav.represent import TABLE
+from orthonav.variants import make_variant
 
 SMALL = {"tile_px": 64, "gsd_m": 5.0, "overlap": 0.75, "calibration_views": 2}
 METHODS = {
@@ -135,6 +137,14 @@ def test_the_same_request_gives_the_same_embeddings(area, tmp_path):
             build_map(request)
         parts.append((tmp_path / name).read_bytes())
     assert parts[0] == parts[1]
+
+
+def test_a_map_says_nothing_of_the_machine_that_made_it(monkeypatch):
+    monkeypatch.setenv("ORTHONAV_SAM_WEIGHTS", "")
+    made = make_variant(TABLE, "sam:weights=/home/somebody/sam,cache=/home/somebody/kept,grid=16")
+    stored = stored_representation(made)
+    assert stored["name"] == "sam" and stored["grid"] == 16
+    assert stored["weights"] == stored["cache"] == ""
 
 
 def test_words_of_files_elsewhere_do_not_fly():

@@ -57,6 +57,7 @@ _DIGEST_BYTES = 32
 
 log = logging.getLogger(__name__)
 
+WEIGHTS_VARIABLE = "ORTHONAV_SAM_WEIGHTS"
 Grey = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 Predict = Callable[[NDArray[np.float32]], tuple[torch.Tensor, torch.Tensor]]
@@ -92,8 +93,8 @@ class SamBoundaries:
     cache: str = ""
 
     def __post_init__(self) -> None:
-        if not self.weights:
-            raise VariantError(f"sam needs weights=PATH: {WHERE}")
+        if not self.path:
+            raise VariantError(f"sam needs weights=PATH, or {WEIGHTS_VARIABLE}: {WHERE}")
         for name, least, most in (("grid", 1, 256), ("prompts", 1, 4096)):
             if not least <= getattr(self, name) <= most:
                 raise VariantError(
@@ -111,6 +112,14 @@ class SamBoundaries:
                 f"sam precision must be {', '.join(PRECISIONS)}, got '{self.precision}'"
             )
         require_device(self.device)
+
+    @property
+    def path(self) -> str:
+        """Where the weights lie: as told, else as ORTHONAV_SAM_WEIGHTS says.
+
+        Maps do not say: a path of the machine that built one means nothing to another.
+        """
+        return self.weights or os.environ.get(WEIGHTS_VARIABLE, "")
 
     @property
     def channels(self) -> int:
@@ -153,13 +162,13 @@ class SamBoundaries:
     def _window(self, grey: Grey, valid: Mask) -> Mask:
         """Boundaries (H, W) of one window, from the cache where it is there."""
         filled = np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
-        stamp = weights_stamp(self.weights, WHERE)
+        stamp = weights_stamp(self.path, WHERE)
         folder = _cache_folder(self.cache)
         path = folder / f"{self._key(filled, stamp)}.edges" if folder else None
         edges = _cached(path, grey.shape) if path else None
         if edges is None:
             device = chosen_device(self.device)
-            model = _model(self.weights, stamp, str(device))
+            model = _model(self.path, stamp, str(device))
             predict = _predictor(model, filled, PRECISIONS[self.precision])
             side = int(model.config.vision_config.image_size)
             edges = boundary_map(automatic_masks(predict, grey.shape, side, self), grey.shape)
@@ -171,7 +180,7 @@ class SamBoundaries:
         """Name of a window in the cache: its pixels, the weights and what else decides."""
         rules = (self.grid, self.iou, self.stability, self.offset, self.overlap, self.precision)
         digest = hashlib.sha256(CACHE_FORMAT)
-        digest.update(repr((filled.shape, rules, _weights_digest(self.weights, stamp))).encode())
+        digest.update(repr((filled.shape, rules, _weights_digest(self.path, stamp))).encode())
         digest.update(filled.tobytes())
         return digest.hexdigest()
 

@@ -42,7 +42,7 @@ from orthonav.prepare.calibrate import (
 from orthonav.prepare.calibrate_registration import FLOOR_PX, calibrate_registration
 from orthonav.prepare.encoders import learn_encoder
 from orthonav.prepare.layer import CHUNK_PX, GreyLayerWriter
-from orthonav.prepare.methods import method_recipe, usual_edges
+from orthonav.prepare.methods import method_recipe, stored_representation, usual_edges
 from orthonav.prepare.pictures import SheetPictures, read_pictures
 from orthonav.search.exact import ExactIndex
 from orthonav.search.peak import TileNeighbours
@@ -378,7 +378,7 @@ def _manifest(
     return Manifest(
         recipe={
             "method": request.method.partition(":")[0],
-            "represent": variant_recipe(represent.TABLE, representation),
+            "represent": stored_representation(representation),
             "embed": variant_recipe(embed.TABLE, embedder.recipe),
             "overlap": request.overlap,
             "seed": request.seed,

@@ -14,6 +14,8 @@ from orthonav.variants import make_variant, variant_recipe
 
 log = logging.getLogger(__name__)
 
+LOCAL_FIELDS = ("weights", "cache")
+
 
 def usual_edges(method: str) -> str:
     """What a method looks at unless told: the paper's choices for its methods."""
@@ -33,6 +35,12 @@ def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderR
     if not represent.TABLE[_name_of(representation)].flies:
         log.warning("%s is too slow to fly: this map is for experiments", _name_of(representation))
     return recipe
+
+
+def stored_representation(representation: Any) -> dict[str, Any]:
+    """Its recipe for a manifest, without what is this machine's alone: paths and devices."""
+    recipe = variant_recipe(represent.TABLE, representation)
+    return {name: "" if name in LOCAL_FIELDS else value for name, value in recipe.items()}
 
 
 def _name_of(representation: Any) -> str:

@@ -1,0 +1,1 @@
+"""Experiments: published ones run again with orthonav's own code."""

@@ -1,0 +1,97 @@
+"""What is flown over: two orthophotos of two dates, generated, real or a user's own."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from experiments.paper.trajectories import TABLE_1, Setting, Trajectory
+from orthonav.geo.area import Area
+from orthonav.geo.frames import LocalFrame
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
+
+SEED = 1
+AGL_M = 2000.0
+"""Told height over imagery that no trajectory of the paper is flown over; any would do."""
+REAL = (
+    ("naip-2012", "naip_nd/20090818.tif", "naip_nd/20120731.tif"),
+    ("naip-2018", "naip_nd/20090818.tif", "naip_nd/20180716.tif"),
+    ("szada-1", "airchange/szada_1_a.tif", "airchange/szada_1_b.tif"),
+    ("szada-5", "airchange/szada_5_a.tif", "airchange/szada_5_b.tif"),
+    ("szada-7", "airchange/szada_7_a.tif", "airchange/szada_7_b.tif"),
+)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A trajectory over the imagery of two dates: the map is made of `past`."""
+
+    name: str
+    past: Path
+    present: Path
+    trajectory: Trajectory
+
+    def bounds_deg(self) -> tuple[float, float, float, float]:
+        """West, south, east, north of the search band, in the middle of the imagery."""
+        area = _outline(self.past)
+        west, south, east, north = area.extent_en_m
+        middle = np.array([west + east, south + north]) / 2
+        half = np.array([self.trajectory.length_m, self.trajectory.band_m]) / 2
+        return _box_deg(area.frame, middle - half, middle + half)
+
+
+def generated(setting: Setting, name: str, folder: Path) -> Scene:
+    """A trajectory of Table 1 over a generated area of two dates, made once."""
+    trajectory = setting.trajectory(name)
+    east_m, north_m = trajectory.imagery_m
+    place = folder / f"{name}-{east_m:.0f}x{north_m:.0f}m-{trajectory.gsd_m:g}m"
+    dates = DEFAULT_DATES[:2]
+    paths = [place / f"{date.name}.tif" for date in dates]
+    if not all(path.is_file() for path in paths):
+        generate_area(
+            place, size_m=(east_m, north_m), gsd_m=trajectory.gsd_m, dates=dates, seed=SEED
+        )
+    return Scene(name, *paths, trajectory)
+
+
+def over(name: str, past: Path, present: Path, gsd_m: float | None = None) -> Scene:
+    """The same protocol over two orthophotos: all of the first that holds whole views."""
+    area, mosaic = _outline(past), Mosaic.open([past])
+    pixel_m = gsd_m or float(f"{mosaic.gsd_m:.3g}")
+    empty = Trajectory(name, AGL_M, 1.0, 1.0, TABLE_1["B"].overlap, pixel_m)
+    west, south, east, north = area.extent_en_m
+    sides = [side - 2 * empty.margin_m for side in (east - west, north - south)]
+    if min(sides) <= 0:
+        raise ValueError(
+            f"imagery of {east - west:.0f} x {north - south:.0f} m is too small for tiles of "
+            f"{256 * pixel_m:.0f} m and turned views; give a finer ground resolution: {past}"
+        )
+    length_m, band_m = (math.floor(side) for side in sides)
+    made = Trajectory(name, AGL_M, length_m, band_m, empty.overlap, pixel_m)
+    return Scene(name, past, present, made)
+
+
+def real(data: Path) -> Iterator[Scene]:
+    """Scenes of the optional real imagery, those that are there."""
+    for name, past, present in REAL:
+        if (data / past).is_file() and (data / present).is_file():
+            yield over(name, data / past, data / present)
+
+
+def _outline(path: Path) -> Area:
+    outline = Mosaic.open([path]).outline_latlon_deg
+    return Area.from_outline(outline[:, 0], outline[:, 1])
+
+
+def _box_deg(
+    frame: LocalFrame, low: np.ndarray, high: np.ndarray
+) -> tuple[float, float, float, float]:
+    middle = (low + high) / 2
+    sides = np.array(
+        [[low[0], middle[1]], [high[0], middle[1]], [middle[0], low[1]], [middle[0], high[1]]]
+    )
+    lat, lon = frame.latlon_from_en(sides)
+    return float(lon[0]), float(lat[2]), float(lon[1]), float(lat[3])

@@ -1,0 +1,99 @@
+"""The paper's Table 1: trajectories A to D, their search bands and overlaps; and how it is cut.
+
+The paper does not state the ground resolution of its tiles: 0.2 m is taken for A, 1 m for B and D,
+2 m for C, so that a tile of 256 px is about what a camera sees from 40, 2000 and 4000 m.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+TILE_PX = 256
+VIEW_ROOM = 1.5
+"""Ground around a view, in widths of it: turned by up to 45 deg it still lies within."""
+LARGEST_M = 49_500.0
+"""A map holds at most 50 km; C's 50 km are cut to this."""
+CONVERGENCE = 0.01
+"""How far true north and the imagery's may part, as a share of the length."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One column of Table 1, and what the paper leaves open: `gsd_m`, metres per pixel."""
+
+    name: str
+    agl_m: float
+    length_m: float
+    band_m: float
+    overlap: float
+    gsd_m: float
+
+    @property
+    def stride_m(self) -> float:
+        """Distance between neighbouring tiles, whole pixels."""
+        return max(1, round(TILE_PX * (1 - self.overlap))) * self.gsd_m
+
+    @property
+    def tiles(self) -> int:
+        """Number of reference tiles that cover the search band."""
+        across = (math.ceil(side / self.stride_m - 1e-9) for side in (self.length_m, self.band_m))
+        return math.prod(max(1, count) for count in across)
+
+    @property
+    def margin_m(self) -> float:
+        """Imagery needed beyond the search band on each side, for tiles and turned views."""
+        return VIEW_ROOM * TILE_PX * self.gsd_m / 2 + self.stride_m
+
+    @property
+    def imagery_m(self) -> tuple[float, float]:
+        """East and north extent of the imagery that holds all tiles and views."""
+        slack_m = 2 * self.margin_m + 2 * CONVERGENCE * self.length_m
+        return self.length_m + slack_m, self.band_m + slack_m
+
+
+TABLE_1 = {
+    "A": Trajectory("A", 40, 150, 10, 0.995, 0.2),
+    "B": Trajectory("B", 2000, 12_000, 1000, 0.875, 1.0),
+    "C": Trajectory("C", 4000, 50_000, 5000, 0.875, 2.0),
+    "D": Trajectory("D", 2000, 2000, 2000, 0.875, 1.0),
+}
+REDUCED_M = {"A": (150, 1), "B": (3000, 250), "C": (5000, 1000), "D": (1000, 1000)}
+"""Length and search band where hours are not to be had."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How much is run.
+
+    `encoder_width` and `triplet_width` are those of the networks (320 and 64 in the paper),
+    `encoder_tiles` and `triplet_tiles` how many tiles are shown to them while they learn, None for
+    the paper's 200 epochs; `views` per placement and `swept` per step of the sensitivity.
+    """
+
+    name: str
+    encoder_width: int
+    encoder_tiles: int | None
+    triplet_width: int
+    triplet_tiles: int | None
+    triplet_batch: int
+    words: tuple[int, ...]
+    views: int
+    swept: int
+
+    def trajectory(self, name: str) -> Trajectory:
+        """A trajectory of Table 1, cut to what this setting runs."""
+        whole = TABLE_1[name]
+        if self.name == "reduced":
+            length_m, band_m = REDUCED_M[name]
+            return replace(whole, length_m=length_m, band_m=band_m)
+        return replace(whole, length_m=min(whole.length_m, LARGEST_M))
+
+
+REDUCED = Setting("reduced", 32, 12_800, 8, 4096, 64, (256, 1024), 100, 60)
+FULL = Setting("full", 320, None, 64, None, 512, (256, 1000, 3000, 10_000), 300, 300)
+SETTINGS = {each.name: each for each in (REDUCED, FULL)}
+PAPER_EPOCHS = 200
+
+
+def epochs(tiles: int, shown: int | None) -> int:
+    """Epochs in which about `shown` tiles are seen, the paper's where None."""
+    return PAPER_EPOCHS if shown is None else max(1, round(shown / tiles))
