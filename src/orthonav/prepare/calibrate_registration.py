@@ -33,6 +33,8 @@ FLOOR_PX = 0.6
 FLOOR_LIMITS_PX = (0.25, 3.0)
 MIRRORED_WEIGHT = 1.0
 FALLBACK_CHANCE = 40.0
+USUAL_FINE, USUAL_FINE_VIEWS = 1.45, 8.0
+"""With one more level chance scores so many times as much; that counts like so many views."""
 
 
 @dataclass(frozen=True)
@@ -144,10 +146,21 @@ def _fitted(outcomes: Sequence[_Outcome], radius_px: float) -> RegistrationCalib
         return RegistrationCalibration(None, floor_px)
     evidence = [each.evidence for each in outcomes]
     lost = [each for each, known in zip(evidence, mirrored, strict=True) if known]
-    chances = Chances(*(_median(lost, name) for name in ("strength", "look", "fine")))
+    total, look = _median(lost, "strength"), _median(lost, "look")
+    chances = Chances(total, look, _fine_chance(lost, total))
     weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)
     confidence = fit_registered(evidence, right, weight, chances)
     return RegistrationCalibration(confidence, floor_px)
+
+
+def _fine_chance(evidence: Sequence[Mapping[str, float]], total: float) -> float:
+    """What chance gives with one more level: from few views, if any, so drawn to what is usual."""
+    known = sum(math.isfinite(each["fine"]) for each in evidence)
+    usual = USUAL_FINE * total
+    if not known:
+        return usual
+    share = known / (known + USUAL_FINE_VIEWS)
+    return math.exp(share * math.log(_median(evidence, "fine")) + (1 - share) * math.log(usual))
 
 
 def _median(evidence: Sequence[Mapping[str, float]], name: str) -> float:
