@@ -50,10 +50,11 @@ CANDIDATE_SHARE = 0.5
 MIN_VIEW_PX = 24.0
 MIN_LEAN_COS = 0.5
 USUAL_CHANCES = Chances(32.0, 15.0, 48.0)
+DOUBT = 0.01
+"""Views of this confidence to one less it are looked at one level finer."""
 POSE_MS = 0.1
 PIXEL_MS = 5.5e-7
 LOOK_MS = 14.0
-DOUBT = 0.01
 LAST_MS = 900.0
 """What searches cost on one core of a desktop, roughly: to choose between them, no more."""
 
