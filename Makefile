@@ -2,6 +2,7 @@
 # make test    install and run the tests
 # make lint    style, types, import layers
 # make bench   measure speed, memory and accuracy beside what a user would pick instead
+# make paper   the tables of the paper in the reduced setting, an hour or more
 # make clean   remove .venv and what was made here
 
 PYTHON ?= python3
@@ -10,7 +11,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 DEPENDS := pyproject.toml constraints.txt
 
-.PHONY: demo test test-slow lint format bench clean
+.PHONY: demo test test-slow lint format bench paper clean
 
 demo: $(VENV)/.run-installed
 	$(BIN)/orthonav demo --out demo
@@ -34,6 +35,10 @@ format: $(VENV)/.dev-installed
 bench: $(VENV)/.dev-installed
 	$(BIN)/python -m benchmarks
 
+paper: $(VENV)/.dev-installed
+	$(BIN)/python -m experiments.paper
+	$(BIN)/python -m experiments.paper report
+
 $(BIN)/python:
 	@sh tools/make_venv.sh "$(PYTHON)" "$(VENV)"
 
@@ -46,4 +51,4 @@ $(VENV)/.dev-installed: $(DEPENDS) | $(BIN)/python
 	@touch $@ $(VENV)/.run-installed
 
 clean:
-	rm -rf $(VENV) demo bench_results .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) demo bench_results paper_results .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -32,7 +32,10 @@ class Method:
 def methods(setting: Setting, tiles: int, sam_weights: str | None = None) -> list[Method]:
     """All rows for a map of so many tiles, quick ones first."""
     shown, width = setting.encoder_tiles, setting.encoder_width
-    encoder = f"autoencoder:width={width},epochs={epochs(tiles, shown)}"
+    encoder = (
+        f"autoencoder:width={width},learning_rate={setting.encoder_rate:g},"
+        f"epochs={epochs(tiles, shown)}"
+    )
     triplet = (
         f"triplet:width={setting.triplet_width},batch={setting.triplet_batch},"
         f"epochs={epochs(tiles, setting.triplet_tiles)}"
@@ -40,8 +43,8 @@ def methods(setting: Setting, tiles: int, sam_weights: str | None = None) -> lis
     looked_at = [CANNY, GREY, SEGMENTS]
     if sam_weights:
         looked_at.append(f"{SAM}:weights={sam_weights}")
-    rows = [Method(DEFAULT, DEFAULT, DEFAULT), Method(DEFAULT, DEFAULT, DEFAULT, True)]
+    rows = [Method(DEFAULT, DEFAULT, DEFAULT)]
     rows += [Method("bovw", f"bovw:words={words}", GREY) for words in setting.words]
     rows += [Method("autoencoder", encoder, edges) for edges in looked_at]
     rows += [Method("triplet", triplet, edges) for edges in looked_at]
-    return rows
+    return [*rows, Method(DEFAULT, DEFAULT, DEFAULT, True)]

@@ -4,12 +4,15 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from experiments.paper.trajectories import TABLE_1, Setting, Trajectory
+from experiments.paper.trajectories import TABLE_1, TILE_PX, Setting, Trajectory
 from orthonav.geo.area import Area
 from orthonav.geo.frames import LocalFrame
+from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
 
@@ -34,13 +37,21 @@ class Scene:
     present: Path
     trajectory: Trajectory
 
-    def bounds_deg(self) -> tuple[float, float, float, float]:
-        """West, south, east, north of the search band, in the middle of the imagery."""
-        area = _outline(self.past)
+    def area(self) -> dict[str, Any]:
+        """The search band in the middle of the imagery, as `BuildRequest` takes an area.
+
+        A rectangle; where that is narrower than a tile, a band around the trajectory.
+        """
+        flown, area = self.trajectory, _outline(self.past)
         west, south, east, north = area.extent_en_m
         middle = np.array([west + east, south + north]) / 2
-        half = np.array([self.trajectory.length_m, self.trajectory.band_m]) / 2
-        return _box_deg(area.frame, middle - half, middle + half)
+        half = np.array([flown.length_m, flown.band_m]) / 2
+        if flown.band_m < TILE_PX * flown.gsd_m:
+            ends = middle + np.array([[-half[0], 0.0], [half[0], 0.0]])
+            lat, lon = area.frame.latlon_from_en(ends)
+            waypoints = tuple(zip(lat.tolist(), lon.tolist(), strict=True))
+            return {"route": Route(waypoints), "band_m": flown.band_m}
+        return {"bounds_deg": _box_deg(area.frame, middle - half, middle + half)}
 
 
 def generated(setting: Setting, name: str, folder: Path) -> Scene:
@@ -54,7 +65,7 @@ def generated(setting: Setting, name: str, folder: Path) -> Scene:
         generate_area(
             place, size_m=(east_m, north_m), gsd_m=trajectory.gsd_m, dates=dates, seed=SEED
         )
-    return Scene(name, *paths, trajectory)
+    return Scene(name, paths[0], paths[1], trajectory)
 
 
 def over(name: str, past: Path, present: Path, gsd_m: float | None = None) -> Scene:
@@ -67,7 +78,7 @@ def over(name: str, past: Path, present: Path, gsd_m: float | None = None) -> Sc
     if min(sides) <= 0:
         raise ValueError(
             f"imagery of {east - west:.0f} x {north - south:.0f} m is too small for tiles of "
-            f"{256 * pixel_m:.0f} m and turned views; give a finer ground resolution: {past}"
+            f"{TILE_PX * pixel_m:.0f} m and turned views; give a finer ground resolution: {past}"
         )
     length_m, band_m = (math.floor(side) for side in sides)
     made = Trajectory(name, AGL_M, length_m, band_m, empty.overlap, pixel_m)
@@ -87,7 +98,7 @@ def _outline(path: Path) -> Area:
 
 
 def _box_deg(
-    frame: LocalFrame, low: np.ndarray, high: np.ndarray
+    frame: LocalFrame, low: NDArray[np.float64], high: NDArray[np.float64]
 ) -> tuple[float, float, float, float]:
     middle = (low + high) / 2
     sides = np.array(

@@ -5,7 +5,9 @@ figure here comes twice: for views *on the grid*, and *anywhere* between the til
 """
 
 from dataclasses import dataclass
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,7 +36,7 @@ class Ground:
     rgb: NDArray[np.uint8]
 
 
-def places_en_m(centres_en_m: NDArray[np.floating], count: int) -> Array:
+def places_en_m(centres_en_m: NDArray[np.floating[Any]], count: int) -> Array:
     """Places (count, 2) along the trajectory, evenly spaced, anywhere across the search band."""
     low, high = centres_en_m.min(axis=0), centres_en_m.max(axis=0)
     rng = np.random.default_rng(SEED)
@@ -42,10 +44,11 @@ def places_en_m(centres_en_m: NDArray[np.floating], count: int) -> Array:
     return np.stack([along, rng.uniform(low[1], high[1], count)], axis=1)
 
 
-def on_grid(places: Array, centres_en_m: NDArray[np.floating]) -> Array:
+def on_grid(places: Array, centres_en_m: NDArray[np.floating[Any]]) -> Array:
     """The nearest tile centre of each place (N, 2)."""
     away = places[:, None] - centres_en_m[None].astype(np.float64)
-    return centres_en_m[(away**2).sum(axis=2).argmin(axis=1)].astype(np.float64)
+    nearest = (away**2).sum(axis=2).argmin(axis=1)
+    return np.asarray(centres_en_m[nearest], dtype=np.float64)
 
 
 def grounds(scene: Scene, frame: LocalFrame, grid: TileGrid, places: Array) -> list[Ground]:
@@ -85,8 +88,6 @@ def view_of(
     drop_m: float = 0.0,
 ) -> NDArray[np.uint8]:
     """Grey view (256, 256) from the place, turned and lower than told by so much."""
-    import cv2
-
     half_m = ground.rgb.shape[0] * gsd_m / 2
     attitude = (turned_deg, 0.0, 0.0, agl_m - drop_m)
     corner = np.array([-half_m, half_m])

@@ -1,0 +1,44 @@
+"""The paper's own figures, from its Tables 2 and 3: other imagery, so shapes and no targets."""
+
+from experiments.paper.methods import CANNY, GREY, SAM
+
+TRAJECTORIES = ("A", "B", "C", "D")
+ACCURACY = {
+    ("bovw", GREY): (50.40, 23.92, 2.67, 1.20),
+    ("triplet", GREY): (16.02, 82.16, 78.60, 54.21),
+    ("triplet", CANNY): (43.91, 67.94, 85.28, 44.58),
+    ("triplet", SAM): (12.42, 30.06, 78.26, 67.47),
+    ("autoencoder", GREY): (86.24, 71.20, 92.00, 50.00),
+    ("autoencoder", CANNY): (88.16, 90.20, 99.67, 88.10),
+    ("autoencoder", SAM): (89.76, 90.40, 98.00, 83.33),
+}
+"""Table 2: accuracy at 15 m in per cent for A, B, C and D."""
+CONFIDENT = {
+    GREY: ((0, 0), (89.5, 72.8), (99.2, 91.3), (82.0, 46.4)),
+    CANNY: ((96.0, 12.1), (99.7, 91.0), (98.6, 85.7), (100, 79.7)),
+    SAM: ((95.0, 0.2), (96.4, 89.8), (99.3, 98.6), (100, 67.8)),
+}
+"""Table 3: accuracy and share kept in per cent at Lowe's ratio 1.13, auto-encoder."""
+LOWE = 1.13
+
+
+def stands_for(edges: str) -> str:
+    """What the paper looked at where we look at `edges`: segments stand for Segment Anything."""
+    return SAM if edges == "segments" else edges
+
+
+def accuracy(family: str, edges: str, scene: str) -> str:
+    """The paper's figure of Table 2 as text, "-" where it has none."""
+    row = ACCURACY.get((family, stands_for(edges)))
+    if row is None or scene not in TRAJECTORIES:
+        return "-"
+    return f"{row[TRAJECTORIES.index(scene)]:.1f}"
+
+
+def confident(edges: str, scene: str) -> str:
+    """The paper's pair of Table 3 as text."""
+    row = CONFIDENT.get(stands_for(edges))
+    if row is None or scene not in TRAJECTORIES:
+        return "-"
+    right, kept = row[TRAJECTORIES.index(scene)]
+    return f"{right:.1f} / {kept:.1f}"

@@ -1,0 +1,107 @@
+"""Result files read back, and the figures that tables and plots are made of."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+ACCURACY_M = 15.0
+NEAREST_STRIDES = math.sqrt(0.5)
+"""A position is that of the right tile where it lies within half a tile spacing on each axis."""
+SURE = 0.95
+COLUMNS = {"error_m": 0, "score": 1, "lowe_ratio": 2, "peak_ratio": 3}
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Result:
+    """One result file, as it was written."""
+
+    plain: dict[str, Any]
+
+    @property
+    def scene(self) -> str:
+        """Name of the trajectory or pair of orthophotos."""
+        return str(self.plain["scene"])
+
+    @property
+    def family(self) -> str:
+        """Method without its parameters; "" for a file of baselines."""
+        return str(self.plain.get("method", {}).get("family", ""))
+
+    @property
+    def edges(self) -> str:
+        """What the method looks at."""
+        return str(self.plain["method"]["edges"]).partition(":")[0]
+
+    @property
+    def registration(self) -> bool:
+        """Whether views are placed below tile size."""
+        return bool(self.plain.get("method", {}).get("registration"))
+
+    @property
+    def stride_m(self) -> float:
+        """Distance between neighbouring tiles."""
+        flown = self.plain["trajectory"]
+        return float(max(1, round(256 * (1 - flown["overlap"]))) * flown["gsd_m"])
+
+    def column(self, placement: str, name: str) -> Array:
+        """A number per view (N,); NaN where there was none, errors then infinite."""
+        at = COLUMNS[name]
+        values = [row[at] for row in self.plain["views"][placement]]
+        return numbers(values, math.inf if name == "error_m" else math.nan)
+
+    def right(self, placement: str) -> NDArray[np.bool_]:
+        """Which views (N,) lie within 15 m."""
+        return self.column(placement, "error_m") <= ACCURACY_M
+
+    def accuracy(self, placement: str, radius_m: float = ACCURACY_M) -> float:
+        """Share of views within a radius; NaN without any."""
+        errors = self.column(placement, "error_m")
+        return float((errors <= radius_m).mean()) if errors.size else math.nan
+
+    def right_tile(self, placement: str) -> float:
+        """Share of views that were given the tile they lie on, or one as near."""
+        return self.accuracy(placement, NEAREST_STRIDES * self.stride_m + 1e-6)
+
+
+def read(folder: Path) -> list[Result]:
+    """All results of a folder, by name of file."""
+    paths = sorted(folder.glob("*.json"))
+    return [Result(json.loads(path.read_text(encoding="utf-8"))) for path in paths]
+
+
+def numbers(values: Sequence[float | None], missing: float) -> Array:
+    """Numbers (N,) of a JSON list, None as `missing`."""
+    return np.array([missing if value is None else value for value in values], np.float64)
+
+
+def share(errors_m: Sequence[float | None]) -> float:
+    """Share of errors within 15 m."""
+    errors = numbers(errors_m, math.inf)
+    return float((errors <= ACCURACY_M).mean()) if errors.size else math.nan
+
+
+def confident(right: NDArray[np.bool_], ratio: Array, threshold: float) -> tuple[float, float]:
+    """Accuracy among views kept, and the share kept; accuracy NaN where none is kept."""
+    kept = ratio >= threshold
+    return float(right[kept].mean()) if kept.any() else math.nan, float(kept.mean())
+
+
+def kept_at(right: NDArray[np.bool_], ratio: Array, accuracy: float = SURE) -> float:
+    """Largest share of views that a threshold on `ratio` keeps with at least that accuracy."""
+    thresholds = np.unique(ratio[np.isfinite(ratio)])
+    pairs = [confident(right, ratio, threshold) for threshold in thresholds]
+    return max((kept for found, kept in pairs if found >= accuracy), default=0.0)
+
+
+def ceiling(stride_m: float) -> float:
+    """Accuracy at 15 m of one who always names the right tile, for views anywhere: the part of a
+    square of `stride_m` that lies within the circle."""
+    axis = (np.arange(400) + 0.5) / 400 * stride_m / 2
+    return float((np.hypot(axis[:, None], axis) <= ACCURACY_M).mean())

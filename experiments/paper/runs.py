@@ -1,0 +1,239 @@
+"""One method on one trajectory: build the map, place the views, write down all that is asked of it.
+
+Everything the tables and plots need is in the file that a run leaves; a run that has its file is
+not run again.
+"""
+
+import hashlib
+import json
+import statistics
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from benchmarks.record import provenance
+from numpy.typing import NDArray
+
+from experiments.paper import views
+from experiments.paper.methods import Method
+from experiments.paper.rules import compared
+from experiments.paper.scenes import Scene
+from experiments.paper.trajectories import TILE_PX, Setting
+from orthonav.files import write_text
+from orthonav.localizer import Localizer
+from orthonav.mapfile import MapFile, open_map
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.records import Fix
+
+ACCURACY_M = 15.0
+SWEPT_ON = "B"
+HEADINGS_DEG = (0, 1, 2, 3, 5, 7, 10, 15)
+DROPS_M = (0, 25, 50, 75, 100, 150, 200)
+EVIDENCE = ("score", "lowe_ratio", "peak_ratio")
+MORE_PACKAGES = ("torch", "onnxruntime", "scikit-image", "faiss-cpu")
+MB = 1e6
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """Where results, maps and generated areas lie, and what the run was called with."""
+
+    out: Path
+    setting: Setting
+    command: str
+
+    @property
+    def results(self) -> Path:
+        """Folder of the result files."""
+        return self.out / self.setting.name
+
+    def result(self, scene: Scene, key: str) -> Path:
+        """The file that a run leaves."""
+        return self.results / f"{scene.name}-{key}.json"
+
+    def work(self, scene: Scene, key: str) -> Path:
+        """Folder of checkpoints, and of the map."""
+        return self.out / "work" / self.setting.name / f"{scene.name}-{key}"
+
+
+def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
+    """Build, place, write; what was written. Returns at once what an earlier run has written."""
+    out = place.result(scene, method.key)
+    if out.is_file():
+        found: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
+        return found
+    start, before = time.perf_counter(), provenance("paper")
+    opened, built = _map(scene, method, place.work(scene, method.key))
+    localizer = Localizer(
+        opened,
+        registration=method.registration,
+        position="peak" if method.registration else "best",
+    )
+    made = head(place, scene, before)
+    made |= {"method": asdict(method), **built, **_sizes(opened)}
+    made |= _placed(scene, localizer, place.setting, method.registration)
+    made["rules"] = {} if method.registration else _rules(scene, opened, place.setting)
+    save(out, made, start)
+    return made
+
+
+def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, Any]:
+    """What every result file begins with: what was run, on what, with what."""
+    return {
+        "scene": scene.name,
+        "trajectory": asdict(scene.trajectory),
+        "setting": asdict(place.setting),
+        "command": place.command,
+        "seeds": {"views": views.SEED, "build": 0},
+        "inputs": {path.name: _digest(path) for path in (scene.past, scene.present)},
+        "provenance": started,
+        "more_packages": {name: _version(name) for name in MORE_PACKAGES},
+    }
+
+
+def save(out: Path, made: dict[str, Any], start: float) -> None:
+    """Write a result, whole or not at all, with the minutes since `start`."""
+    made["minutes"] = round((time.perf_counter() - start) / 60, 2)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_text(out, json.dumps(made, indent=1) + "\n")
+
+
+def _map(scene: Scene, method: Method, work: Path) -> tuple[MapFile, dict[str, float]]:
+    """The map by `build_map`, and the seconds it took; `learn_s` includes embedding the tiles."""
+    work.mkdir(parents=True, exist_ok=True)
+    marks: dict[float, float] = {}
+
+    def progress(stage: str, share: float) -> None:
+        if stage == "learn" and share in (0.0, 1.0):
+            marks[share] = time.perf_counter()
+
+    def request(out: Path) -> BuildRequest:
+        return BuildRequest(
+            [scene.past],
+            out,
+            **scene.area(),
+            gsd_m=scene.trajectory.gsd_m,
+            tile_px=TILE_PX,
+            overlap=scene.trajectory.overlap,
+            method=method.recipe,
+            edges=method.edges,
+            registration=method.registration,
+            work=work,
+        )
+
+    start = time.perf_counter()
+    build_map(request(work / "map.onav"), progress)
+    build_s = time.perf_counter() - start
+    opened = open_map(work / "map.onav")
+    return opened, {"build_s": build_s, "learn_s": marks[1.0] - marks[0.0]}
+
+
+def _sizes(opened: MapFile) -> dict[str, float]:
+    """Megabytes of the map per km2, and of what it holds once: the encoder or vocabulary."""
+    sheet = opened.manifest.sheets[0]
+    embeddings = opened.array("sheet0/embeddings", np.float16, 2)
+    once = sum(part.nbytes for name, part in opened.arrays.items() if name.startswith("embed/"))
+    whole = opened.path.stat().st_size
+    return {
+        "tiles": len(embeddings),
+        "dims": embeddings.shape[1],
+        "area_km2": sheet.area_km2,
+        "encoder_mb": once / MB,
+        "mb_per_km2": (whole - once) / MB / sheet.area_km2,
+    }
+
+
+def _placed(
+    scene: Scene, localizer: Localizer, setting: Setting, registration: bool
+) -> dict[str, Any]:
+    """Errors and evidence of the views of both placements, the sweep, chance, and times."""
+    grid, frame = localizer.grid, localizer.sheet.frame
+    agl_m, gsd_m = scene.trajectory.agl_m, grid.gsd_m
+    camera = views.camera_of(agl_m, gsd_m)
+    telemetry = views.told(agl_m, exact=not registration)
+    times_ms: list[float] = []
+
+    def locate(ground: views.Ground, **wrong: float) -> list[float]:
+        grey = views.view_of(ground, camera, agl_m, gsd_m, **wrong)
+        start = time.perf_counter()
+        found = localizer.locate(grey, camera, telemetry)
+        times_ms.append(1e3 * (time.perf_counter() - start))
+        if not isinstance(found, Fix):
+            return [float("nan")] * (1 + len(EVIDENCE))
+        error = frame.en_from_latlon(found.lat_deg, found.lon_deg) - ground.truth_en_m
+        evidence = [float(found.evidence.get(name, float("nan"))) for name in EVIDENCE]
+        return [float(np.hypot(*error)), *evidence]
+
+    told: dict[str, Any] = {"views": {}, "chance": {}, "sweep": {}}
+    seen = dict(placements(scene, localizer, setting.views))
+    for name, grounds in seen.items():
+        told["views"][name] = [locate(ground) for ground in grounds]
+        told["chance"][name] = _chance(grounds, localizer.centres_en_m)
+    told["view_ms"] = statistics.median(times_ms)
+    if scene.name == SWEPT_ON:
+        count = min(setting.swept, len(seen["grid"]))
+        few = [seen["grid"][at] for at in np.linspace(0, len(seen["grid"]) - 1, count, dtype=int)]
+        turned = {v: [locate(each, turned_deg=v)[0] for each in few] for v in HEADINGS_DEG}
+        lower = {v: [locate(each, drop_m=v)[0] for each in few] for v in DROPS_M}
+        told["sweep"] = {"heading_deg": turned, "drop_m": lower}
+    plain: dict[str, Any] = _without_nan(told)
+    return plain
+
+
+def placements(
+    scene: Scene, localizer: Localizer, count: int
+) -> Iterator[tuple[str, list[views.Ground]]]:
+    """Views on the grid and anywhere, at the same places but for where they are snapped to."""
+    centres = localizer.centres_en_m
+    anywhere = views.places_en_m(centres, count)
+    places = {"grid": views.on_grid(anywhere, centres), "anywhere": anywhere}
+    for name in views.PLACEMENTS:
+        yield name, views.grounds(scene, localizer.sheet.frame, localizer.grid, places[name])
+
+
+def _chance(grounds: list[views.Ground], centres_en_m: NDArray[np.float32]) -> float:
+    """Share of tiles within the radius of a view, the mean over views: what a guess gets."""
+    if not grounds:
+        return float("nan")
+    shares = [
+        (np.hypot(*(centres_en_m - ground.truth_en_m).T) <= ACCURACY_M).mean() for ground in grounds
+    ]
+    return float(np.mean(shares))
+
+
+def _rules(scene: Scene, opened: MapFile, setting: Setting) -> dict[str, Any]:
+    """Positions by each rule, with scalar product and cosine, on the same embeddings."""
+    localizer = Localizer(opened, registration=False)
+    agl_m, gsd_m = scene.trajectory.agl_m, localizer.grid.gsd_m
+    camera, telemetry = views.camera_of(agl_m, gsd_m), views.told(agl_m)
+    made: dict[str, Any] = {}
+    for name, grounds in placements(scene, localizer, setting.views):
+        greys = [views.view_of(ground, camera, agl_m, gsd_m) for ground in grounds]
+        truths = [ground.truth_en_m for ground in grounds]
+        made[name] = compared(localizer, opened, greys, camera, telemetry, truths)
+    return made
+
+
+def _without_nan(value: Any) -> Any:
+    """The same with None for numbers that are none: JSON has no NaN."""
+    if isinstance(value, dict):
+        return {str(key): _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "absent"

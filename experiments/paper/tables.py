@@ -1,0 +1,240 @@
+"""Tables 2 and 3 and those beside them, from result files alone."""
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from benchmarks.record import Table, number
+
+from experiments.paper import published
+from experiments.paper.results import Result, ceiling, confident, kept_at, read, share
+
+FAMILIES = {
+    "bovw": "Bag of Words",
+    "triplet": "Triplet",
+    "autoencoder": "Auto-Encoder",
+    "gradient": "orthonav",
+}
+EDGES = {
+    "gray": "grey",
+    "canny": "Canny",
+    "segments": "segments",
+    "sam": "Segment Anything",
+    "gradient": "gradients",
+}
+Pair = tuple[float, float]
+
+
+def report(out: Path, setting: str) -> Path | None:
+    """Write `tables.md` and the plots beside the result files; None where there are none."""
+    folder = out / setting
+    results = read(folder)
+    if not results:
+        return None
+    made = [r for r in results if r.family]
+    tables = [
+        *table_2(made),
+        *table_3(made),
+        *rules(made),
+        *baselines(results, made),
+        *costs(made),
+        run_table(results),
+    ]
+    try:
+        from experiments.paper.plots import draw
+    except ImportError:
+        notes = ["Plots need matplotlib: pip install 'orthonav[report]'"]
+    else:
+        notes = [f"![{path.stem}]({path.name})" for path in draw(made, folder)]
+    text = "\n".join([*(table.markdown() for table in tables), *notes, ""])
+    path = folder / "tables.md"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def table_2(results: Sequence[Result]) -> list[Table]:
+    """Accuracy at 15 m by method and scene, views on the grid and anywhere."""
+    header = ("method", "looks at", "paper", "on grid", "anywhere", "right tile", "of")
+    tables = []
+    for scene, found in _by_scene(results):
+        rows = [_table_2_row(each) for each in _best_words(found)]
+        chance = found[0].plain["chance"]
+        guessed = (percent(chance.get(name)) for name in ("grid", "anywhere"))
+        rows.append(["a guess", "", "-", *guessed, "", ""])
+        tables.append(Table(f"Table 2, {scene}: accuracy at 15 m, %", header, rows, _area(found)))
+    return tables
+
+
+def _table_2_row(each: Result) -> list[str]:
+    placed = [each.accuracy("grid"), each.accuracy("anywhere"), each.right_tile("anywhere")]
+    views = len(each.plain["views"]["anywhere"])
+    paper = "-" if each.registration else published.accuracy(each.family, each.edges, each.scene)
+    return [_name(each), EDGES[each.edges], paper, *map(percent, placed), str(views)]
+
+
+def _area(found: Sequence[Result]) -> list[str]:
+    flown, first = found[0].plain["trajectory"], found[0]
+    tiles = first.plain["tiles"]
+    bound = ceiling(first.stride_m)
+    return [
+        f"{flown['length_m']:g} x {flown['band_m']:g} m from {flown['agl_m']:g} m, "
+        f"{flown['gsd_m']:g} m per pixel, {tiles:,} tiles {first.stride_m:g} m apart; one who "
+        f"always named the right tile would have {percent(bound)} % at 15 m anywhere",
+        "right tile: of views anywhere, within half a tile spacing (along the diagonal)",
+    ]
+
+
+def _best_words(found: Sequence[Result]) -> list[Result]:
+    """All but the worse ones of several vocabularies: "the best performances will be displayed"."""
+    words = [each for each in found if each.family == "bovw"]
+    best = max(words, key=lambda each: each.accuracy("grid"), default=None)
+    kept = [each for each in found if each.family != "bovw" or each is best]
+    order = list(FAMILIES)
+    edges = list(EDGES)
+    return sorted(kept, key=lambda r: (order.index(r.family), r.registration, edges.index(r.edges)))
+
+
+def table_3(results: Sequence[Result]) -> list[Table]:
+    """The confidence criterion, beside the ratio with an exclusion radius; views on the grid."""
+    header = (
+        *("scene", "method", "looks at", "paper acc. / kept", "Lowe 1.13: acc. / kept"),
+        *("Lowe: kept at 95 %", "excluding: kept at 95 %", "median Lowe", "median excluding"),
+    )
+    rows = []
+    for scene, found in _by_scene(results):
+        for each in _best_words(found):
+            if each.registration or each.family == "bovw":
+                continue
+            rows.append(_table_3_row(scene, each))
+    if not rows:
+        return []
+    notes = (
+        "accuracy at 15 m of the views kept, and the share kept, in %, views on the grid",
+        "kept at 95 %: the largest share that a threshold keeps with at least 95 % right, chosen "
+        "on these very views; excluding: best score over the best one farther than half a tile",
+    )
+    return [Table("Table 3: confidence criteria", header, rows, notes)]
+
+
+def _table_3_row(scene: str, each: Result) -> list[str]:
+    right = each.right("grid")
+    lowe, peak = (each.column("grid", name) for name in ("lowe_ratio", "peak_ratio"))
+    found, kept = confident(right, lowe, published.LOWE)
+    paper = published.confident(each.edges, scene) if each.family == "autoencoder" else "-"
+    cells = [percent(kept_at(right, ratio)) for ratio in (lowe, peak)]
+    medians = [f"{_median(ratio):.3f}" for ratio in (lowe, peak)]
+    both = f"{percent(found)} / {percent(kept)}"
+    return [scene, _name(each), EDGES[each.edges], paper, both, *cells, *medians]
+
+
+def rules(results: Sequence[Result]) -> list[Table]:
+    """Rules of position and similarities on one trajectory."""
+    found = [each for each in results if each.plain.get("rules") and each.scene == "B"]
+    if not found:
+        return []
+    names = list(found[0].plain["rules"]["grid"])
+    rows = []
+    for each in _best_words(found):
+        for placement in ("grid", "anywhere"):
+            shares = [share(each.plain["rules"][placement][name]) for name in names]
+            rows.append([f"{_name(each)}, {EDGES[each.edges]}", placement, *map(percent, shares)])
+    notes = (
+        "product: embeddings as they come; cosine: the same ones, scaled to length 1. best: the "
+        "paper; weighted: all tiles by score (Bianchi and Barfoot); neighbours: after Couturier "
+        "and Akhloufi; peak: orthonav's",
+    )
+    header = ("method", "views", *names)
+    return [Table("Rules of position, B: accuracy at 15 m, %", header, rows, notes)]
+
+
+def baselines(results: Sequence[Result], made: Sequence[Result]) -> list[Table]:
+    """Methods that carry the reference images, beside orthonav's rows on the same trajectory."""
+    rows = []
+    for each in results:
+        for name, told in each.plain.get("baselines", {}).items():
+            shares = [share(told["views"][placement]) for placement in ("grid", "anywhere")]
+            count = len(told["views"]["anywhere"])
+            rows.append(
+                [each.scene, name, *map(percent, shares), str(count), number(told["view_ms"])]
+            )
+    if not rows:
+        return []
+    scenes = {row[0] for row in rows}
+    for each in made:
+        if each.family == "gradient" and each.scene in scenes:
+            shares = [each.accuracy(placement) for placement in ("grid", "anywhere")]
+            count = len(each.plain["views"]["anywhere"])
+            ms = number(each.plain["view_ms"])
+            rows.append([each.scene, _name(each), *map(percent, shares), str(count), ms])
+    header = ("scene", "method", "on grid", "anywhere", "of", "ms per view")
+    notes = ("the baselines carry the orthophoto itself; told pose, whole map, no prior",)
+    return [Table("Related work: accuracy at 15 m, %", header, rows, notes)]
+
+
+def costs(results: Sequence[Result]) -> list[Table]:
+    """What each method takes: time to learn, size of the map, time of a view."""
+    rows = []
+    for scene, found in _by_scene(results):
+        for each in found:
+            plain = each.plain
+            figures = [plain["learn_s"], plain["mb_per_km2"], plain["encoder_mb"], plain["view_ms"]]
+            recipe = plain["method"]["recipe"]
+            name = f"{recipe}, with registration" if each.registration else recipe
+            rows.append([scene, name, EDGES[each.edges], *map(number, figures)])
+    header = ("scene", "method", "looks at", "learn s", "MB per km2", "encoder MB", "ms per view")
+    notes = (
+        "learn s: the encoder, with embedding all tiles; MB per km2: the map file less the encoder "
+        "or vocabulary, which it holds once; ms: one view from its picture to the fix",
+    )
+    return [Table("What it costs", header, rows, notes)]
+
+
+def run_table(results: Sequence[Result]) -> Table:
+    """Commit, versions and minutes of the runs that these tables are made of."""
+    found = {
+        (
+            str(each.plain["provenance"]["commit"])[:10],
+            "yes" if each.plain["provenance"]["dirty"] else "no",
+            str(each.plain["provenance"]["sources"]),
+            str(each.plain["setting"]["name"]),
+        )
+        for each in results
+    }
+    rows = []
+    for key in sorted(found):
+        mine = [
+            each
+            for each in results
+            if str(each.plain["provenance"]["commit"])[:10] == key[0]
+            and str(each.plain["provenance"]["sources"]) == key[2]
+        ]
+        minutes = sum(each.plain["minutes"] for each in mine)
+        rows.append([*key, str(len(mine)), number(minutes), mine[0].plain["provenance"]["cpu"]])
+    header = ("commit", "changed", "sources", "setting", "runs", "minutes", "processor")
+    return Table("Runs", header, rows)
+
+
+def percent(value: float | None) -> str:
+    """A share in per cent, "-" where there is none."""
+    return "-" if value is None or math.isnan(value) else f"{100 * value:.0f}"
+
+
+def _name(each: Result) -> str:
+    name = FAMILIES[each.family]
+    if each.family == "bovw":
+        return f"{name}, k = {each.plain['dims']}"
+    if each.family == "gradient":
+        return f"{name}, default" if each.registration else f"{name}, embedding only"
+    return name
+
+
+def _by_scene(results: Iterable[Result]) -> list[tuple[str, list[Result]]]:
+    scenes: dict[str, list[Result]] = {}
+    for each in results:
+        scenes.setdefault(each.scene, []).append(each)
+    return sorted(scenes.items())
+
+
+def _median(values: Iterable[float]) -> float:
+    known = sorted(value for value in values if math.isfinite(value))
+    return known[len(known) // 2] if known else math.nan

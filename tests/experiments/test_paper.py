@@ -1,0 +1,203 @@
+"""The paper's experiments: geometry of trajectories, views, tables, resuming. No figure of it."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from experiments.paper import published, runs, scenes, views
+from experiments.paper.methods import Method, methods
+from experiments.paper.results import ceiling, confident, kept_at, read
+from experiments.paper.tables import report
+from experiments.paper.trajectories import FULL, REDUCED, TABLE_1, epochs
+
+from orthonav.errors import AreaError
+from orthonav.geo.area import Area
+from orthonav.geo.frames import LocalFrame
+from orthonav.geo.grid import TileGrid
+from orthonav.localizer import Localizer
+from orthonav.mapfile import open_map
+
+SMALL = replace(TABLE_1["B"], name="B", length_m=320.0, band_m=288.0)
+
+
+@pytest.mark.parametrize("name", TABLE_1)
+def test_tiles_of_the_full_trajectories_are_those_of_the_grid(name):
+    flown = FULL.trajectory(name)
+    half = flown.length_m / 2, flown.band_m / 2
+    grid = TileGrid.covering(
+        (-half[0], -half[1], half[0], half[1]),
+        gsd_m=flown.gsd_m,
+        tile_px=256,
+        overlap=flown.overlap,
+    )
+    assert grid.rows * grid.cols == flown.tiles
+    assert grid.stride_m == pytest.approx(flown.stride_m)
+
+
+def test_table_1_is_the_papers():
+    rows = [(t.agl_m, t.length_m, t.band_m, t.overlap) for t in TABLE_1.values()]
+    assert rows == [
+        (40, 150, 10, 0.995),
+        (2000, 12_000, 1000, 0.875),
+        (4000, 50_000, 5000, 0.875),
+        (2000, 2000, 2000, 0.875),
+    ]
+
+
+def test_epochs_are_the_papers_where_nothing_is_cut():
+    assert epochs(1000, FULL.encoder_tiles) == 200
+    assert epochs(960, 19_200) == 20
+    assert epochs(10**6, 19_200) == 1
+
+
+def test_rows_have_different_keys():
+    keys = [each.key for each in methods(REDUCED, 900, sam_weights="weights.pth")]
+    assert len(set(keys)) == len(keys)
+    assert "autoencoder-sam" in keys
+
+
+def test_views_snap_to_the_nearest_tile_centre():
+    centres = np.stack(np.meshgrid(np.arange(0, 320, 32), np.arange(0, 160, 32)), -1)
+    centres = centres.reshape(-1, 2).astype(np.float32)
+    places = views.places_en_m(centres, 50)
+    snapped = views.on_grid(places, centres)
+    assert np.abs(snapped - places).max() <= 16
+    assert {tuple(each) for each in snapped} <= {tuple(each) for each in centres}
+    assert np.abs(places / 32 - np.rint(places / 32)).max() > 0.1
+    assert np.array_equal(places, views.places_en_m(centres, 50))
+    assert (np.diff(places[:, 0]) > 0).all()
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    setting = replace(REDUCED, views=6, swept=2)
+    return runs.Workplace(tmp_path_factory.mktemp("paper"), setting, "test")
+
+
+@pytest.fixture(scope="module")
+def scene(area):
+    return scenes.Scene("B", area.past, area.present, SMALL)
+
+
+@pytest.fixture(scope="module")
+def made(place, scene):
+    return runs.run(place, scene, Method("gradient", "gradient", "gradient"))
+
+
+def test_map_covers_the_search_band(place, scene, made):
+    localizer = Localizer(open_map(place.work(scene, "gradient-gradient") / "map.onav"))
+    extent = np.ptp(localizer.centres_en_m, axis=0) + localizer.grid.stride_m
+    assert extent == pytest.approx([SMALL.length_m, SMALL.band_m], abs=33)
+    assert localizer.grid.gsd_m == 1.0
+
+
+def test_band_narrower_than_a_tile_is_one_around_the_route(scene):
+    narrow = replace(scene, trajectory=replace(SMALL, band_m=100.0)).area()
+    made = Area.from_route(narrow["route"], narrow["band_m"])
+    west, south, east, north = made.extent_en_m
+    assert (east - west, north - south) == pytest.approx((420, 100), abs=1)
+    west, south, east, north = Area.from_bounds(scene.area()["bounds_deg"]).extent_en_m
+    assert (east - west, north - south) == pytest.approx((320, 288), abs=1)
+
+
+def test_views_show_the_ground_of_the_map_pixel_by_pixel(place, scene, made):
+    localizer = Localizer(open_map(place.work(scene, "gradient-gradient") / "map.onav"))
+    same = replace(scene, present=scene.past)
+    seen = dict(runs.placements(same, localizer, 3))
+    camera = views.camera_of(SMALL.agl_m, 1.0)
+    for ground in seen["grid"]:
+        grey = views.view_of(ground, camera, SMALL.agl_m, 1.0)
+        found = localizer.locate(grey, camera, views.told(SMALL.agl_m))
+        error = localizer.sheet.frame.en_from_latlon(found.lat_deg, found.lon_deg)
+        assert np.hypot(*(error - ground.truth_en_m)) < 3
+        lower = views.view_of(ground, camera, SMALL.agl_m, 1.0, drop_m=200)
+        inner = grey[64:192, 64:192].astype(float)
+        assert abs(lower.mean() - inner.mean()) < 20
+        turned = views.view_of(ground, camera, SMALL.agl_m, 1.0, turned_deg=90)
+        # Heading east: the top of the picture is the east of the north-up one.
+        assert np.abs(np.rot90(grey).astype(int) - turned).mean() < 3
+
+
+def test_a_run_says_what_it_was_and_is_not_run_twice(place, scene, made, monkeypatch):
+    out = place.result(scene, "gradient-gradient")
+    written = json.loads(out.read_text())
+    assert written == json.loads(json.dumps(made))
+    assert {"provenance", "inputs", "minutes", "command", "seeds"} <= set(made)
+    assert all(len(digest) == 64 for digest in made["inputs"].values())
+    assert len(made["views"]["grid"]) == len(made["views"]["anywhere"]) == 6
+    assert set(made["sweep"]) == {"heading_deg", "drop_m"}
+
+    def refuse(*_):
+        raise AssertionError("built again")
+
+    monkeypatch.setattr(runs, "build_map", refuse)
+    assert runs.run(place, scene, Method("gradient", "gradient", "gradient")) == written
+
+
+def test_tables_and_plots_are_made_of_the_files_alone(tmp_path, made):
+    folder = tmp_path / "reduced"
+    folder.mkdir()
+    plain = json.loads(json.dumps(made))
+    plain["method"] = {"family": "autoencoder", "recipe": "autoencoder", "edges": "canny"}
+    plain["views"] = {
+        "grid": [[0.0, 1, 1.5, 2.0], [14.0, 1, 1.2, 1.9], [99.0, 1, 1.2, 1.1], [None] * 4],
+        "anywhere": [[20.0, 1, 1.1, 1.3]] * 4,
+    }
+    (folder / "B-autoencoder-canny.json").write_text(json.dumps(plain))
+    text = report(tmp_path, "reduced").read_text()
+    row = next(line for line in text.splitlines() if line.startswith("| Auto-Encoder"))
+    assert [cell.strip() for cell in row.split("|")[2:-1]] == [
+        *("Canny", "90.2", "50", "0", "100", "4"),
+    ]
+    confidence = next(
+        line for line in text.splitlines() if line.startswith("| B") and " / " in line
+    )
+    assert "99.7 / 91.0" in confidence
+    assert "67 / 75" in confidence
+    assert (folder / "sensitivity.png").is_file()
+    assert (folder / "confidence-B.png").is_file()
+    assert report(tmp_path, "full") is None
+
+
+def test_ratios_are_compared_at_equal_accuracy():
+    right = np.array([True, True, True, False])
+    ratio = np.array([2.0, 1.5, 1.2, 1.1])
+    assert confident(right, ratio, 1.13) == (1.0, 0.75)
+    assert kept_at(right, ratio) == 0.75
+    assert kept_at(~right, ratio) == 0.0
+    nothing = confident(right, ratio, 9.0)
+    assert np.isnan(nothing[0])
+    assert nothing[1] == 0
+
+
+def test_ceiling_is_the_part_of_the_square_in_the_circle():
+    assert ceiling(10) == 1
+    assert ceiling(64) == pytest.approx(np.pi * 15**2 / 64**2, rel=0.01)
+
+
+def test_published_figures_are_found():
+    assert published.accuracy("autoencoder", "segments", "B") == "90.4"
+    assert published.accuracy("gradient", "gradient", "B") == "-"
+    assert published.confident("canny", "A") == "96.0 / 12.1"
+
+
+def test_imagery_too_small_is_refused(area):
+    made = scenes.over("own", area.past, area.present)
+    assert made.trajectory.length_m > 0
+    with pytest.raises(ValueError, match="too small"):
+        scenes.over("own", area.past, area.present, gsd_m=4.0)
+
+
+def test_local_frame_box_is_centred():
+    frame = LocalFrame(45.0, 3.0)
+    box = scenes._box_deg(frame, np.array([-100.0, -50.0]), np.array([100.0, 50.0]))
+    area = Area.from_bounds(box)
+    assert area.extent_en_m == pytest.approx((-100, -50, 100, 50), abs=0.5)
+    with pytest.raises(AreaError):
+        Area.from_bounds((0.0, 0.0, 0.0, 0.0))
+
+
+def test_no_results_are_no_tables(tmp_path):
+    assert read(tmp_path) == []
+    assert report(tmp_path, "reduced") is None
