@@ -619,8 +619,11 @@ def test_a_reader_that_has_gone_is_no_traceback(writing, name):
 
 
 HOLD = """
-import sys, time
+import signal, sys, time
 from orthonav.cli import common, main
+
+# Ignored where the tests themselves run in the background of a shell.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 class Held(common.Progress):
     def __call__(self, stage, share):
