@@ -65,12 +65,13 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.onboard.run import localize_flight
     from orthonav.publish.jsonl import write_results
     from orthonav.records import Fix
+    from orthonav.search.position import check_rule
 
     accept = Acceptance.parse(options.accept) if options.accept else None
     localizer = Localizer(
         open_map(options.map),
         registration=options.registration == "on",
-        position=options.position,
+        position=check_rule(options.position),
     )
     if localizer.registration is not None and accept and accept.criterion == "lowe_ratio":
         raise VariantError("lowe_ratio compares tiles: give --registration off with it")

@@ -10,7 +10,6 @@ from orthonav import represent
 from orthonav.confidence.logistic import LogisticConfidence
 from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.embed.stored import embedder_of
-from orthonav.embed.whitened import WhitenedEmbedder
 from orthonav.errors import CameraError, MapFileError, VariantError
 from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_rectified, check_telemetry, check_view
@@ -80,16 +79,14 @@ class Localizer:
         self.index = self._matcher.index
         self.registration = None
         if registration:
-            propose = None
-            if isinstance(self.embedder, WhitenedEmbedder):
-                propose = TileProposer(
-                    self.grid,
-                    self.centres_en_m,
-                    self.index,
-                    self.embedder,
-                    self.representation,
-                    self._matcher.neighbours,
-                )
+            propose = TileProposer.of(
+                self.grid,
+                self.centres_en_m,
+                self.index,
+                self.embedder,
+                self.representation,
+                self._matcher.neighbours,
+            )
             self.registration = _registration(opened, self.sheet, propose)
 
     def locate(

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.embed.bank import embed_poses
+from orthonav.embed.contract import ViewEmbedder
 from orthonav.embed.whitened import WhitenedEmbedder
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.rectify import Rectified
@@ -35,6 +36,21 @@ class TileProposer:
     embedder: WhitenedEmbedder
     representation: Any
     neighbours: TileNeighbours
+
+    @classmethod
+    def of(
+        cls,
+        grid: TileGrid,
+        centres_en_m: NDArray[np.float32],
+        index: ExactIndex,
+        embedder: ViewEmbedder,
+        representation: Any,
+        neighbours: TileNeighbours,
+    ) -> "TileProposer | None":
+        """A proposer for embeddings of which many poses can be made at once, None for others."""
+        if not isinstance(embedder, WhitenedEmbedder):
+            return None
+        return cls(grid, centres_en_m, index, embedder, representation, neighbours)
 
     def fits(self, side_px: float) -> bool:
         """Whether views of this side (pixels of the map) can be proposed for."""

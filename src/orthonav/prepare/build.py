@@ -18,7 +18,7 @@ from orthonav import __version__, embed, represent
 from orthonav.embed.cells import MICRO, CellLayout
 from orthonav.embed.contract import ViewEmbedder
 from orthonav.embed.network import TripletRecipe
-from orthonav.embed.whitened import CellSheet, WhitenedEmbedder, WhitenedRecipe, learn
+from orthonav.embed.whitened import CellSheet, WhitenedRecipe, learn
 from orthonav.errors import AreaError, OutputError, VariantError
 from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
@@ -198,16 +198,14 @@ def _registration(
     made = MapFile(request.out, 0, manifest, arrays)
     layer = GreyLayer.of(made)
     assert layer is not None
-    propose = None
-    if isinstance(embedder, WhitenedEmbedder):
-        propose = TileProposer(
-            sheet.grid,
-            arrays["sheet0/centres_en_m"],
-            ExactIndex(arrays["sheet0/embeddings"]),
-            embedder,
-            representation,
-            TileNeighbours(sheet.grid, arrays["sheet0/centres_en_m"]),
-        )
+    propose = TileProposer.of(
+        sheet.grid,
+        arrays["sheet0/centres_en_m"],
+        ExactIndex(arrays["sheet0/embeddings"]),
+        embedder,
+        representation,
+        TileNeighbours(sheet.grid, arrays["sheet0/centres_en_m"]),
+    )
     localizer = RegistrationLocalizer(
         sheet, layer, None, radius_m, FLOOR_PX, propose, last_ms=SEARCH_MS
     )
