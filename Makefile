@@ -17,10 +17,10 @@ demo: $(VENV)/.run-installed
 	$(BIN)/orthonav demo --out demo
 
 test: $(VENV)/.dev-installed
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 test-slow: $(VENV)/.dev-installed
-	$(BIN)/python -m pytest -n auto -m "slow or not slow"
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "slow or not slow"
 
 lint: $(VENV)/.dev-installed
 	$(BIN)/ruff check .

@@ -23,6 +23,7 @@ def small_demo(area, monkeypatch):
     turns = tuple((east * 0.45, north * 0.35) for east, north in demo.TURNS_EN_M)
     monkeypatch.setattr(demo, "TURNS_EN_M", turns)
     monkeypatch.setattr(demo, "SPACING_M", 80.0)
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 48)
 
 
 def test_the_demo(small_demo, tmp_path, capsys, names_in):

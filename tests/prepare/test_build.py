@@ -38,12 +38,19 @@ def frame(ortho):
 
 @pytest.fixture(autouse=True)
 def fewer_crops(map_path, monkeypatch):
-    """Calibration from a quarter of the crops, but for the map that all tests share."""
+    """Calibration from an eighth of the crops, but for the map that all tests share."""
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 24)
+
+
+@pytest.fixture
+def calibrated(fewer_crops, monkeypatch):
+    """What to ask for where the confidence itself is looked at, which takes longer."""
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 48)
+    return {"calibration_views": 24}
 
 
 def built(ortho, folder, name="map.onav", **request):
-    request = {"tile_px": 64, "overlap": 0.75, **request}
+    request = {"tile_px": 64, "overlap": 0.75, "calibration_views": 8, **request}
     orthos = ortho if isinstance(ortho, list) else [ortho]
     build_map(BuildRequest(orthos, folder / name, **request))
     return open_map(folder / name)
@@ -113,8 +120,10 @@ def test_one_channel_is_compared_on_finer_cells(ortho, tmp_path, edges):
     assert told.manifest.recipe["embed"]["cells"] == 4
 
 
-def test_another_seed_changes_the_calibration_only(ortho, tmp_path):
-    a, b = built(ortho, tmp_path, "a.onav"), built(ortho, tmp_path, "b.onav", seed=1)
+def test_another_seed_changes_the_calibration_only(ortho, tmp_path, calibrated):
+    a = built(ortho, tmp_path, "a.onav", **calibrated)
+    b = built(ortho, tmp_path, "b.onav", **calibrated, seed=1)
+    assert a.manifest.confidence and b.manifest.confidence
     for name, part in a.arrays.items():
         np.testing.assert_array_equal(part, b.arrays[name])
     assert a.manifest.confidence != b.manifest.confidence
@@ -368,7 +377,7 @@ def test_confidence_is_a_probability_whatever_the_evidence(localizer):
             assert 0 <= confidence <= 1
 
 
-def test_the_error_told_is_of_the_order_of_the_grid(map_path, ortho, tmp_path):
-    for opened in (open_map(map_path), built(ortho, tmp_path)):
+def test_the_error_told_is_of_the_order_of_the_grid(map_path, ortho, tmp_path, calibrated):
+    for opened in (open_map(map_path), built(ortho, tmp_path, **calibrated)):
         grid = opened.manifest.sheets[0].grid
         assert grid.gsd_m <= opened.manifest.view["position_std_m"] < grid.stride_m / 2
