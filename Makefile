@@ -2,7 +2,7 @@
 # make test    install and run the tests
 # make lint    style, types, import layers
 # make bench   measure speed, memory and accuracy beside what a user would pick instead
-# make paper   the tables of the paper in the reduced setting, an hour or more
+# make paper   the tables of the paper in the reduced setting, less than an hour
 # make clean   remove .venv and what was made here
 
 PYTHON ?= python3

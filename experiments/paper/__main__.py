@@ -9,56 +9,100 @@ import os
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 PARTS = ("A", "B", "C", "D", "real", "own", "baselines")
+ORDER = ("triplet", "autoencoder", "gradient", "bovw")
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
 def main(arguments: list[str]) -> int:
     """Run what is asked for, then report; returns the exit code."""
     options = _parser().parse_args(arguments)
-    for name in THREADS:  # NumPy's BLAS reads it once; PyTorch is told below
+    for name in THREADS:  # NumPy's BLAS reads it once; PyTorch is told later
         os.environ.setdefault(name, "1")
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
     from experiments.paper.tables import report
 
+    failed = 0
     if options.what == "run":
-        _run(options, " ".join(["python -m experiments.paper", *arguments]))
+        failed = _run(options, " ".join(["python -m experiments.paper", *arguments]))
     made = report(options.out, options.setting)
     if made is None:
         _say(f"nothing to report: no results in {options.out / options.setting}")
         return 1
     print(made.read_text(encoding="utf-8"))
     _say(f"written to {made.parent}")
-    return 0
+    return 1 if failed else 0
 
 
-def _run(options: argparse.Namespace, command: str) -> None:
-    import cv2
-
-    from experiments.paper import baselines, runs
+def _run(options: argparse.Namespace, command: str) -> int:
+    """Run all rows that are wanted, several at a time; how many failed."""
+    from experiments.paper import baselines
     from experiments.paper.methods import methods
+    from experiments.paper.runs import Workplace
     from experiments.paper.trajectories import SETTINGS
 
+    start = time.perf_counter()
+    place = Workplace(options.out, SETTINGS[options.setting], command)
+    wanted = set(options.only or PARTS)
+    tasks: list[tuple[Any, ...]] = []
+    for scene in _scenes(options, wanted):
+        rows = methods(place.setting, scene.name, scene.trajectory.tiles, options.sam)
+        chosen = [each for each in rows if not options.methods or each.family in options.methods]
+        if scene.name not in wanted and scene.name == baselines.TRIED_ON:
+            chosen = [each for each in rows if each.key == baselines.MAP_OF]
+        tasks += [(place, scene, method) for method in chosen]
+        _say(f"{_minutes(start)}  {scene.name}: imagery is there, {len(chosen)} runs")
+    # Those that learn longest first, so that no core is idle at the end.
+    tasks.sort(key=lambda task: ORDER.index(task[2].family))
+    based = [task for task in tasks if task[1].name == baselines.TRIED_ON]
+    jobs = options.jobs or (_cores() if options.setting == "reduced" else 1)
+    failed = 0
+    with ProcessPoolExecutor(jobs, get_context("spawn"), _prepare, (jobs,)) as pool:
+        waiting = {pool.submit(_one, *task): task for task in tasks}
+        for done in as_completed(waiting):
+            _, scene, method = waiting[done]
+            error = done.exception()
+            told = f"{done.result()} min" if error is None else f"failed: {error!r}"
+            failed += error is not None
+            _say(f"{_minutes(start)}  {scene.name} {method.key}: {told}")
+    if "baselines" in wanted and based and baselines.run(place, based[0][1]):
+        _say(f"{_minutes(start)}  baselines")
+    return failed
+
+
+def _one(place: Any, scene: Any, method: Any) -> float:
+    """Run one row in a process of its own; its minutes."""
+    from experiments.paper import runs
+
+    return float(runs.run(place, scene, method)["minutes"])
+
+
+def _prepare(jobs: int) -> None:
+    """Give each of several processes its part of the cores."""
+    import cv2
+
+    logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
     cv2.setNumThreads(1)
     cv2.setRNGSeed(0)
-    _use_cores()
-    start = time.perf_counter()
-    place = runs.Workplace(options.out, SETTINGS[options.setting], command)
-    wanted = set(options.only or PARTS)
-    for scene in _scenes(options, wanted):
-        for method in methods(place.setting, scene.trajectory.tiles, options.sam):
-            if options.methods and method.family not in options.methods:
-                continue
-            made = runs.run(place, scene, method)
-            minutes = (time.perf_counter() - start) / 60
-            _say(f"{minutes:5.1f} min  {scene.name} {method.key}: {made['minutes']} min")
-        based = place.work(scene, baselines.MAP_OF) / "map.onav"
-        if scene.name == baselines.TRIED_ON and "baselines" in wanted and based.is_file():
-            baselines.run(place, scene)
+    try:
+        import torch
+    except ImportError:
+        return
+    torch.set_num_threads(max(1, _cores() // jobs))
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _minutes(start: float) -> str:
+    return f"{(time.perf_counter() - start) / 60:5.1f} min"
 
 
 def _scenes(options: argparse.Namespace, wanted: set[str]) -> Iterator[Any]:
@@ -73,19 +117,10 @@ def _scenes(options: argparse.Namespace, wanted: set[str]) -> Iterator[Any]:
         name = f"own-{options.past.stem}-{options.present.stem}"
         yield scenes.over(name, options.past, options.present, options.gsd_m)
     if "real" in wanted:
-        found = list(scenes.real(options.data))
+        found = list(scenes.real(options.data, setting))
         if not found:
             _say("real imagery skipped: the optional real imagery beside the checkout is absent")
         yield from found
-
-
-def _use_cores() -> None:
-    """PyTorch may use every core that this process may run on; the rest of it one."""
-    try:
-        import torch
-    except ImportError:
-        return
-    torch.set_num_threads(len(os.sched_getaffinity(0)))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -99,6 +134,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, default=Path("paper_results"), metavar="DIR")
     parser.add_argument(
         "--data", type=Path, default=DATA, metavar="DIR", help="optional real imagery"
+    )
+    parser.add_argument(
+        "--jobs", type=int, help="runs at a time (default one per core; 1 in the full setting)"
     )
     parser.add_argument("--past", type=Path, help="an orthophoto of your own, for the map")
     parser.add_argument("--present", type=Path, help="the same ground at another date")

@@ -61,13 +61,12 @@ BASELINES = (
 )
 
 
-def run(place: Workplace, scene: Scene) -> None:
-    """Place views by every baseline; nothing where an earlier run has its file."""
-    out = place.result(scene, KEY)
-    if out.is_file():
-        return
+def run(place: Workplace, scene: Scene) -> bool:
+    """Place views by every baseline; false where an earlier run has its file or there is no map."""
+    out, map_path = place.result(scene, KEY), place.work(scene, MAP_OF) / "map.onav"
+    if out.is_file() or not map_path.is_file():
+        return False
     start, made = time.perf_counter(), head(place, scene, provenance("paper"))
-    map_path = place.work(scene, MAP_OF) / "map.onav"
     localizer = Localizer(open_map(map_path), registration=False)
     pixels_path = place.work(scene, KEY).with_suffix(".npz")
     _store(scene, localizer, pixels_path)
@@ -78,6 +77,7 @@ def run(place: Workplace, scene: Scene) -> None:
         for each in BASELINES
     }
     save(out, made, start)
+    return True
 
 
 def _placed(

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from experiments.paper.trajectories import Setting, epochs
+from experiments.paper.trajectories import TABLE_1, Setting, epochs
 
 GREY, CANNY, SEGMENTS, SAM = "gray", "canny", "segments", "sam"
 DEFAULT = "gradient"
@@ -29,8 +29,21 @@ class Method:
         return "-".join(part for part in parts if part)
 
 
-def methods(setting: Setting, tiles: int, sam_weights: str | None = None) -> list[Method]:
-    """All rows for a map of so many tiles, quick ones first."""
+REDUCED_NETWORKS = {
+    "autoencoder": {GREY: "ABCD", CANNY: "ABCD", SEGMENTS: "B", SAM: "B"},
+    "triplet": {GREY: "B", CANNY: "B"},
+}
+"""Trajectories that the reduced setting learns a network on, by what it looks at."""
+
+
+def methods(
+    setting: Setting, scene: str, tiles: int, sam_weights: str | None = None
+) -> list[Method]:
+    """All rows for a scene whose map has so many tiles, quick ones first.
+
+    The reduced setting learns fewer networks: `REDUCED_NETWORKS`, and over imagery that no
+    trajectory of the paper is flown over the paper's best, the auto-encoder on Canny edges.
+    """
     shown, width = setting.encoder_tiles, setting.encoder_width
     encoder = (
         f"autoencoder:width={width},learning_rate={setting.encoder_rate:g},"
@@ -38,13 +51,22 @@ def methods(setting: Setting, tiles: int, sam_weights: str | None = None) -> lis
     )
     triplet = (
         f"triplet:width={setting.triplet_width},batch={setting.triplet_batch},"
-        f"epochs={epochs(tiles, setting.triplet_tiles)}"
+        f"epochs={epochs(tiles, setting.triplet_tiles)}{setting.triplet_more}"
     )
     looked_at = [CANNY, GREY, SEGMENTS]
     if sam_weights:
         looked_at.append(f"{SAM}:weights={sam_weights}")
     rows = [Method(DEFAULT, DEFAULT, DEFAULT)]
     rows += [Method("bovw", f"bovw:words={words}", GREY) for words in setting.words]
-    rows += [Method("autoencoder", encoder, edges) for edges in looked_at]
-    rows += [Method("triplet", triplet, edges) for edges in looked_at]
+    networks = [Method("autoencoder", encoder, edges) for edges in looked_at]
+    networks += [Method("triplet", triplet, edges) for edges in looked_at]
+    rows += [each for each in networks if setting.name != "reduced" or _reduced(each, scene)]
     return [*rows, Method(DEFAULT, DEFAULT, DEFAULT, True)]
+
+
+def _reduced(method: Method, scene: str) -> bool:
+    """Whether the reduced setting learns this network here."""
+    edges = method.edges.partition(":")[0]
+    if scene not in TABLE_1:
+        return (method.family, edges) == ("autoencoder", CANNY)
+    return scene in REDUCED_NETWORKS[method.family].get(edges, "")

@@ -14,7 +14,7 @@ ACCURACY_M = 15.0
 NEAREST_STRIDES = math.sqrt(0.5)
 """A position is that of the right tile where it lies within half a tile spacing on each axis."""
 SURE = 0.95
-COLUMNS = {"error_m": 0, "score": 1, "lowe_ratio": 2, "peak_ratio": 3}
+COLUMNS = {"error_m": 0, "score": 1, "lowe_ratio": 2, "peak_ratio": 3, "confidence": 4}
 Array = NDArray[np.float64]
 
 

@@ -34,6 +34,7 @@ SWEPT_ON = "B"
 HEADINGS_DEG = (0, 1, 2, 3, 5, 7, 10, 15)
 DROPS_M = (0, 25, 50, 75, 100, 150, 200)
 EVIDENCE = ("score", "lowe_ratio", "peak_ratio")
+"""Written of every view behind its error, then its confidence."""
 MORE_PACKAGES = ("torch", "onnxruntime", "scikit-image", "faiss-cpu")
 MB = 1e6
 
@@ -163,10 +164,10 @@ def _placed(
         found = localizer.locate(grey, camera, telemetry)
         times_ms.append(1e3 * (time.perf_counter() - start))
         if not isinstance(found, Fix):
-            return [float("nan")] * (1 + len(EVIDENCE))
+            return [float("nan")] * (2 + len(EVIDENCE))
         error = frame.en_from_latlon(found.lat_deg, found.lon_deg) - ground.truth_en_m
         evidence = [float(found.evidence.get(name, float("nan"))) for name in EVIDENCE]
-        return [float(np.hypot(*error)), *evidence]
+        return [float(np.hypot(*error)), *evidence, found.confidence]
 
     told: dict[str, Any] = {"views": {}, "chance": {}, "sweep": {}}
     seen = dict(placements(scene, localizer, setting.views))

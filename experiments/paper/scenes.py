@@ -26,6 +26,7 @@ REAL = (
     ("szada-5", "airchange/szada_5_a.tif", "airchange/szada_5_b.tif"),
     ("szada-7", "airchange/szada_7_a.tif", "airchange/szada_7_b.tif"),
 )
+REDUCED_REAL = ("naip-2018", "szada-1", "szada-7")
 
 
 @dataclass(frozen=True)
@@ -85,9 +86,11 @@ def over(name: str, past: Path, present: Path, gsd_m: float | None = None) -> Sc
     return Scene(name, past, present, made)
 
 
-def real(data: Path) -> Iterator[Scene]:
-    """Scenes of the optional real imagery, those that are there."""
+def real(data: Path, setting: Setting) -> Iterator[Scene]:
+    """Scenes of the optional real imagery, those that are there; fewer in the reduced setting."""
     for name, past, present in REAL:
+        if setting.name == "reduced" and name not in REDUCED_REAL:
+            continue
         if (data / past).is_file() and (data / present).is_file():
             yield over(name, data / past, data / present)
 

@@ -22,7 +22,8 @@ EDGES = {
     "sam": "Segment Anything",
     "gradient": "gradients",
 }
-Pair = tuple[float, float]
+SURE = 0.9
+"""Confidence from which a registered position is believed."""
 
 
 def report(out: Path, setting: str) -> Path | None:
@@ -35,6 +36,7 @@ def report(out: Path, setting: str) -> Path | None:
     tables = [
         *table_2(made),
         *table_3(made),
+        *choice(made),
         *rules(made),
         *baselines(results, made),
         *costs(made),
@@ -125,6 +127,42 @@ def _table_3_row(scene: str, each: Result) -> list[str]:
     medians = [f"{_median(ratio):.3f}" for ratio in (lowe, peak)]
     both = f"{percent(found)} / {percent(kept)}"
     return [scene, _name(each), EDGES[each.edges], paper, both, *cells, *medians]
+
+
+def choice(results: Sequence[Result]) -> list[Table]:
+    """The paper's best beside orthonav, over imagery that is not the paper's: what to choose."""
+    rows = []
+    for scene, found in _by_scene(results):
+        shown = [e for e in found if e.family == "gradient" or _is_papers_best(e)]
+        if scene not in published.TRAJECTORIES and len(shown) > 1:
+            rows += [_choice_row(scene, each) for each in shown]
+    if not rows:
+        return []
+    header = (
+        *("scene", "method", "looks at", "on grid", "anywhere", "right tile", "criterion"),
+        *("right / kept", "learn s", "MB per km2", "encoder MB", "ms per view"),
+    )
+    notes = (
+        "accuracy at 15 m in %; right tile: of views anywhere; right / kept: of views on the grid, "
+        "those kept by the criterion; ms: one view, one core, from its picture to the fix",
+    )
+    return [Table("The paper's best and orthonav on other imagery", header, rows, notes)]
+
+
+def _is_papers_best(each: Result) -> bool:
+    return each.family == "autoencoder" and each.edges == "canny"
+
+
+def _choice_row(scene: str, each: Result) -> list[str]:
+    plain, right = each.plain, each.right("grid")
+    name, threshold = ("confidence", SURE) if each.registration else ("lowe_ratio", published.LOWE)
+    found, kept = confident(right, each.column("grid", name), threshold)
+    shares = [each.accuracy("grid"), each.accuracy("anywhere"), each.right_tile("anywhere")]
+    criterion = f"confidence {SURE}" if each.registration else f"Lowe {published.LOWE}"
+    figures = [plain["learn_s"], plain["mb_per_km2"], plain["encoder_mb"], plain["view_ms"]]
+    both = f"{percent(found)} / {percent(kept)}"
+    cells = [_name(each), EDGES[each.edges], *map(percent, shares), criterion, both]
+    return [scene, *cells, *map(number, figures)]
 
 
 def rules(results: Sequence[Result]) -> list[Table]:

@@ -67,8 +67,9 @@ class Setting:
     `encoder_width` and `triplet_width` are those of the networks, 320 and 64 in the paper;
     `encoder_tiles` and `triplet_tiles` how many tiles are shown to them while they learn, None for
     the paper's 200 epochs. `encoder_rate` is the auto-encoder's learning rate, 3e-4 in the paper;
-    1e-3, that of the authors' released code, where few steps must do. `views` are flown per
-    placement, `swept` per step of the sensitivity.
+    1e-3, that of the authors' released code, where few steps must do. `triplet_more` are further
+    fields of the triplet recipe: with the hardest negatives and plain distances few steps end where
+    all embeddings are one. `views` are flown per placement, `swept` per step of the sensitivity.
     """
 
     name: str
@@ -78,6 +79,7 @@ class Setting:
     triplet_width: int
     triplet_tiles: int | None
     triplet_batch: int
+    triplet_more: str
     words: tuple[int, ...]
     views: int
     swept: int
@@ -91,8 +93,9 @@ class Setting:
         return replace(whole, length_m=min(whole.length_m, LARGEST_M))
 
 
-REDUCED = Setting("reduced", 32, 1e-3, 19_200, 8, 4096, 64, (256, 1024), 100, 60)
-FULL = Setting("full", 320, 3e-4, None, 64, None, 512, (256, 1000, 3000, 10_000), 300, 300)
+LEARNABLE = ",mining=semihard,similarity=cosine,margin=0.2"
+REDUCED = Setting("reduced", 32, 1e-3, 19_200, 8, 28_800, 64, LEARNABLE, (256, 1024), 100, 40)
+FULL = Setting("full", 320, 3e-4, None, 64, None, 512, "", (256, 1000, 3000, 10_000), 300, 300)
 SETTINGS = {each.name: each for each in (REDUCED, FULL)}
 PAPER_EPOCHS = 200
 

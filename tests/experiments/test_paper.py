@@ -52,9 +52,18 @@ def test_epochs_are_the_papers_where_nothing_is_cut():
 
 
 def test_rows_have_different_keys():
-    keys = [each.key for each in methods(REDUCED, 900, sam_weights="weights.pth")]
+    keys = [each.key for each in methods(REDUCED, "B", 900, sam_weights="weights.pth")]
     assert len(set(keys)) == len(keys)
-    assert "autoencoder-sam" in keys
+    assert "autoencoder-sam" in keys and "triplet-canny" in keys
+
+
+def test_the_full_setting_leaves_no_row_out():
+    rows = {each.key for each in methods(FULL, "D", 900)}
+    for scene in (*TABLE_1, "szada-1"):
+        assert {each.key for each in methods(FULL, scene, 900)} == rows
+        fewer = {each.key for each in methods(REDUCED, scene, 900)}
+        assert {"gradient-gradient", "autoencoder-canny"} <= fewer
+    assert {"autoencoder-segments", "triplet-segments", "triplet-gray"} <= rows
 
 
 def test_views_snap_to_the_nearest_tile_centre():

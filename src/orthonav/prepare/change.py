@@ -11,23 +11,29 @@ MAX_MIXED = 0.85
 
 
 def changed(
-    rng: np.random.Generator, grey: NDArray[np.uint8], other: NDArray[np.uint8]
+    rng: np.random.Generator,
+    grey: NDArray[np.uint8],
+    other: NDArray[np.uint8],
+    *,
+    most_replaced: float = MAX_REPLACED,
+    most_mixed: float = MAX_MIXED,
 ) -> NDArray[np.uint8]:
     """`grey` (S, S) uint8 with what years change.
 
     `other` is a picture of ground that must not be found on the map itself. Parts are erased and
     replaced by it, and its detail is mixed into the rest; fields change their brightness and
-    contrast, some turn it around; light, blur and noise are others.
+    contrast, some turn it around; light, blur and noise are others. At most the share
+    `most_replaced` is erased and `most_mixed` of the stranger's detail mixed into the rest.
     """
     size = grey.shape[0]
     stranger = np.asarray(cv2.resize(other, (size, size)), dtype=np.float32)
     own, own_broad = _detail(grey.astype(np.float32), size)
     strange, strange_broad = _detail(stranger, size)
     mask = _smooth(rng, size, int(rng.integers(3, 12)))
-    replaced = mask < np.quantile(mask, rng.uniform(0, MAX_REPLACED))
+    replaced = mask < np.quantile(mask, rng.uniform(0, most_replaced))
     gain = 0.35 + 0.9 * _smooth(rng, size, 6)
     turned = _smooth(rng, size, 5) > rng.uniform(0.55, 1.1)
-    mixed = rng.uniform(0, MAX_MIXED)
+    mixed = rng.uniform(0, most_mixed)
     detail = (1 - mixed) * own * np.where(turned, -gain, gain)
     # The stranger's detail turned upside down is another one, so that both are not the same.
     detail = np.where(replaced, strange, detail + mixed * strange[::-1])

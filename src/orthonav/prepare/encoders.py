@@ -17,6 +17,9 @@ from orthonav.prepare.pictures import SheetPictures
 
 BATCH_TILES = 64
 MAX_WORD_TILES = 2000
+MOST_REPLACED, MOST_MIXED = 0.35, 0.4
+"""Change of a triplet's positives. Those that a confidence is learnt from are changed more: a
+network that begins with them learns a third as much in its first 300 batches."""
 
 EncoderRecipe = AutoEncoderRecipe | TripletRecipe | WordsRecipe
 Encoder = NetworkEmbedder | WordsEmbedder
@@ -73,7 +76,7 @@ def _changed_tiles(
     def positive(rng: np.random.Generator, grey: NDArray[np.uint8]) -> NDArray[np.float32]:
         # Mirrored: as it is, it would be ground of the map.
         stranger = tiles.grey_tile(int(rng.integers(len(tiles))))[:, ::-1]
-        made = changed(rng, grey, stranger)
+        made = changed(rng, grey, stranger, most_replaced=MOST_REPLACED, most_mixed=MOST_MIXED)
         return np.asarray(representation(made, np.ones(made.shape, np.bool_)), np.float32)
 
     return positive
