@@ -9,8 +9,6 @@ import os
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,7 @@ DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 def main(arguments: list[str]) -> int:
     """Run what is asked for, then report; returns the exit code."""
     options = _parser().parse_args(arguments)
-    for name in THREADS:  # NumPy's BLAS reads it once; PyTorch is told later
+    for name in THREADS:  # NumPy's BLAS reads it once, in the processes started too
         os.environ.setdefault(name, "1")
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
     from experiments.paper.tables import report
@@ -44,13 +42,14 @@ def _run(options: argparse.Namespace, command: str) -> int:
     """Run all rows that are wanted, several at a time; how many failed."""
     from experiments.paper import baselines
     from experiments.paper.methods import methods
+    from experiments.paper.pool import cores, side_by_side
     from experiments.paper.runs import Workplace
     from experiments.paper.trajectories import SETTINGS
 
     start = time.perf_counter()
     place = Workplace(options.out, SETTINGS[options.setting], command)
     wanted = set(options.only or PARTS)
-    tasks: list[tuple[Any, ...]] = []
+    tasks: list[Any] = []
     for scene in _scenes(options, wanted):
         rows = methods(place.setting, scene.name, scene.trajectory.tiles, options.sam)
         chosen = [each for each in rows if not options.methods or each.family in options.methods]
@@ -61,44 +60,15 @@ def _run(options: argparse.Namespace, command: str) -> int:
     # Those that learn longest first, so that no core is idle at the end.
     tasks.sort(key=lambda task: ORDER.index(task[2].family))
     based = [task for task in tasks if task[1].name == baselines.TRIED_ON]
-    jobs = options.jobs or (_cores() if options.setting == "reduced" else 1)
+    jobs = options.jobs or (cores() if options.setting == "reduced" else 1)
     failed = 0
-    with ProcessPoolExecutor(jobs, get_context("spawn"), _prepare, (jobs,)) as pool:
-        waiting = {pool.submit(_one, *task): task for task in tasks}
-        for done in as_completed(waiting):
-            _, scene, method = waiting[done]
-            error = done.exception()
-            told = f"{done.result()} min" if error is None else f"failed: {error!r}"
-            failed += error is not None
-            _say(f"{_minutes(start)}  {scene.name} {method.key}: {told}")
+    for (_, scene, method), minutes in side_by_side(tasks, jobs):
+        told = f"failed: {minutes!r}" if isinstance(minutes, Exception) else f"{minutes} min"
+        failed += isinstance(minutes, Exception)
+        _say(f"{_minutes(start)}  {scene.name} {method.key}: {told}")
     if "baselines" in wanted and based and baselines.run(place, based[0][1]):
         _say(f"{_minutes(start)}  baselines")
     return failed
-
-
-def _one(place: Any, scene: Any, method: Any) -> float:
-    """Run one row in a process of its own; its minutes."""
-    from experiments.paper import runs
-
-    return float(runs.run(place, scene, method)["minutes"])
-
-
-def _prepare(jobs: int) -> None:
-    """Give each of several processes its part of the cores."""
-    import cv2
-
-    logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
-    cv2.setNumThreads(1)
-    cv2.setRNGSeed(0)
-    try:
-        import torch
-    except ImportError:
-        return
-    torch.set_num_threads(max(1, _cores() // jobs))
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
 
 
 def _minutes(start: float) -> str:

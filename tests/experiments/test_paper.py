@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from experiments.paper import published, runs, scenes, views
 from experiments.paper.methods import Method, methods
+from experiments.paper.pool import side_by_side
 from experiments.paper.results import ceiling, confident, kept_at, read
 from experiments.paper.tables import report
 from experiments.paper.trajectories import FULL, REDUCED, TABLE_1, epochs
 
-from orthonav.errors import AreaError
+from orthonav.errors import AreaError, MissingFileError
 from orthonav.geo.area import Area
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.grid import TileGrid
@@ -142,6 +143,14 @@ def test_a_run_says_what_it_was_and_is_not_run_twice(place, scene, made, monkeyp
 
     monkeypatch.setattr(runs, "build_map", refuse)
     assert runs.run(place, scene, Method("gradient", "gradient", "gradient")) == written
+
+
+def test_runs_side_by_side_say_what_went_wrong(place, scene, made, tmp_path):
+    method = Method("gradient", "gradient", "gradient")
+    missing = replace(scene, name="none", past=tmp_path / "none.tif")
+    tasks = [(place, scene, method), (place, missing, method)]
+    ended = {task[1].name: outcome for task, outcome in side_by_side(tasks, 2)}
+    assert ended["B"] == made["minutes"] and isinstance(ended["none"], MissingFileError)
 
 
 def test_tables_and_plots_are_made_of_the_files_alone(tmp_path, made):

@@ -1,0 +1,51 @@
+"""Runs side by side, each in a process of its own."""
+
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+
+from experiments.paper.methods import Method
+from experiments.paper.runs import Workplace, run
+from experiments.paper.scenes import Scene
+
+Task = tuple[Workplace, Scene, Method]
+
+
+def side_by_side(tasks: Sequence[Task], jobs: int) -> Iterator[tuple[Task, float | Exception]]:
+    """Each task with its minutes or what went wrong with it, as they end.
+
+    Raises `BrokenProcessPool` where a process died: memory has run out, or somebody ended it.
+    """
+    with ProcessPoolExecutor(jobs, get_context("spawn"), _prepare, (jobs,)) as pool:
+        waiting = {pool.submit(_minutes, *task): task for task in tasks}
+        for done in as_completed(waiting):
+            error = done.exception()
+            if isinstance(error, BrokenProcessPool) or not isinstance(error, Exception | None):
+                raise error
+            yield waiting[done], done.result() if error is None else error
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def _minutes(place: Workplace, scene: Scene, method: Method) -> float:
+    return float(run(place, scene, method)["minutes"])
+
+
+def _prepare(jobs: int) -> None:
+    """Give a process its part of the cores."""
+    import cv2
+
+    logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
+    cv2.setNumThreads(1)
+    cv2.setRNGSeed(0)
+    try:
+        import torch
+    except ImportError:
+        return
+    torch.set_num_threads(max(1, cores() // jobs))
