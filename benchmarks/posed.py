@@ -145,7 +145,7 @@ class _Spectra:
 
     def holds(self, seen: Rectified) -> bool:
         """Whether a view fits on the map."""
-        return min(self._shape) > seen.grey.shape[0]
+        return bool(min(self._shape) > seen.grey.shape[0])
 
     def surface(self, one: Array, other: Array, seen: Rectified) -> Array:
         """Correlation (h, w) from two spectra, for every place of the view's corner."""
@@ -236,8 +236,8 @@ class MutualSurface:
             for number, theirs in enumerate(self._map):
                 counts = self._spectra.surface(theirs, spectrum, seen)
                 share = np.maximum(counts, np.float32(1e-3)) / np.float32(pixels)
-                total = total + share * cv2.log(share)
-                rows[number] = rows[number] + share
+                total = np.asarray(total + share * cv2.log(share), np.float32)
+                rows[number] = np.asarray(rows[number] + share, np.float32)
             own = float(mine.sum()) / pixels
             total = total - np.float32(own * math.log(max(own, 1e-9)))
         for row in rows:

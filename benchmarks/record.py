@@ -9,7 +9,7 @@ import platform
 import subprocess
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,20 @@ from numpy.typing import ArrayLike
 
 import orthonav
 
-PACKAGES = ("orthonav", "numpy", "scipy", "opencv-python-headless", "safetensors", "rasterio")
+PACKAGES = (
+    "orthonav",
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+    "safetensors",
+    "rasterio",
+    "torch",
+    "onnx",
+    "onnxruntime",
+    "faiss-cpu",
+    "scikit-image",
+    "transformers",
+)
 WILSON_Z = 1.2816
 """For 80 % intervals of shares, so that their p10 and p90 mean what those of timings mean."""
 
@@ -203,7 +216,7 @@ def provenance(run: str) -> dict[str, Any]:
         "memory_gb": round(memory_gb, 1),
         "system": platform.platform(),
         "python": platform.python_version(),
-        "packages": {name: version(name) for name in PACKAGES},
+        "packages": {name: _version(name) for name in PACKAGES},
         "threads": {
             "BLAS": os.environ.get("OPENBLAS_NUM_THREADS", "unset"),
             "OpenCV": f"{cv2.getNumThreads()} (map builds: all cores)",
@@ -217,6 +230,13 @@ def sources_digest() -> str:
     for path in sorted(Path(orthonav.__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "absent"
 
 
 def _git(*arguments: str) -> str:

@@ -9,7 +9,7 @@ from benchmarks.inputs import LANDSCAPE_SEED, PAST, Workplace
 from benchmarks.machine import reading_gb_per_s, seconds
 from benchmarks.record import Section, Table, number
 from orthonav.embed.cells import CellLayout
-from orthonav.embed.whitened import CellSheet
+from orthonav.embed.whitened import CellSheet, WhitenedEmbedder
 from orthonav.geo.grid import TileGrid
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.localizer import Localizer
@@ -97,4 +97,5 @@ def _dense_embeddings(ortho: Path, map_path: Path, count: int) -> NDArray[np.flo
     taken = np.sort(rng.permutation(len(tiles))[:count])
     if len(taken) < count:
         raise RuntimeError(f"area holds {len(taken)} tiles, {count} are needed: {ortho}")
+    assert isinstance(localizer.embedder, WhitenedEmbedder)
     return localizer.embedder.tiles(cells, tiles[taken] * grid.stride_px)

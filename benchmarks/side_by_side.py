@@ -153,9 +153,9 @@ def _table(
                 *_stated(verdict),
             ]
         )
-    count = len(verdicts[0][1].times_ms)
+    views = len(verdicts[0][1].times_ms)
     first = (
-        f"{count} views, generated {SIDE_M / 1000:g} x {SIDE_M / 1000:g} km at 1 m, 2016 to 2021"
+        f"{views} views, generated {SIDE_M / 1000:g} x {SIDE_M / 1000:g} km at 1 m, 2016 to 2021"
     )
     notes = NOTES if not section.tables else ()
     return Table(f"Registration: {title}", HEADER, rows, (first, *notes))

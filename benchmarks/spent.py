@@ -19,6 +19,7 @@ from benchmarks.record import Section, Table, number
 from orthonav.localizer import Localizer, propose, registration
 from orthonav.mapfile import open_map
 from orthonav.register import refine, registrar
+from orthonav.register.search import search
 
 FORWARD, BACKWARD = 3, 1
 """FFTs of a pose: one per channel of evidence, and one of the sum of products."""
@@ -79,8 +80,8 @@ def _accounts(
             locate = account.around(lambda *a, **k: REST, localizer.locate)
             locate(view.grey, flight.camera, view.telemetry, heading_known=known)
         accounts.append(account)
-        for search in account.searches:
-            searches[search] += 1
+        for each in account.searches:
+            searches[each] += 1
     return accounts
 
 
@@ -88,7 +89,6 @@ def _accounts(
 def _watched(account: _Account) -> Iterator[_Account]:
     """Clocks around the stages of registration."""
     locate, refiner = registration.RegistrationLocalizer, refine.Refiner
-    search = registration.search
 
     def searched(template: Any, window: Any, poses: Any, *rest: Any) -> Any:
         account.searches.append((template.level, tuple(window.size), len(poses)))
@@ -126,7 +126,7 @@ def _stages(section: Section, columns: dict[bool, list[_Account]]) -> Table:
             share = sum(figures[name]) / sum(figures[WHOLE])
             cells += [number(made.median), number(float(np.mean(figures[name]))), f"{share:.0%}"]
         rows.append([name, *cells])
-    header = ("stage", "known: median ms", "mean ms", "share")
+    header: tuple[str, ...] = ("stage", "known: median ms", "mean ms", "share")
     header += ("unknown: median ms", "mean ms", "share")
     notes = (
         f"generated 2 x 2 km at 1 m; heading known to 10 deg ({len(columns[True])} views) and "
@@ -173,8 +173,8 @@ def _floors(section: Section, searches: dict[Search, int]) -> Table:
                 *(number(flops / pose_ms / 1e6), number(poses * pose_ms)),
             ]
         )
-    header = ("FFT of", "poses", "searches", "MFLOP a pose", "MB a pose", "bytes' floor ms")
-    header += ("bare FFTs of a pose ms", "GFLOP/s", "all poses ms")
+    header: tuple[str, ...] = ("FFT of", "poses", "searches", "MFLOP a pose", "MB a pose")
+    header += ("bytes' floor ms", "bare FFTs of a pose ms", "GFLOP/s", "all poses ms")
     notes = (
         f"a pose: {FORWARD} forward and {BACKWARD} backward real FFTs, 2.5 N log2 N each (half of "
         f"a complex one), and {FORWARD} products of spectra; bytes: every plane read and written "

@@ -54,8 +54,9 @@ def strangers(
         for _ in range(max(1, round(share * count))):
             picture = makers[kind]()
             if picture.shape != size:
-                picture = cv2.resize(picture, size[::-1], interpolation=cv2.INTER_CUBIC)
-            yield kind, np.asarray(picture, np.uint8)
+                made = cv2.resize(picture, size[::-1], interpolation=cv2.INTER_CUBIC)
+                picture = np.asarray(made, np.uint8)
+            yield kind, picture
 
 
 class _OtherPlaces:

@@ -2,7 +2,8 @@
 
 Each row adds one means to the row above, in a process of its own, on the model that
 `orthonav build --method autoencoder` learns: 256 px edge maps, 32 a batch. The losses of a smaller
-model, learnt plainly and with all means, say whether what is learnt stays the same.
+model, learnt plainly and with all means, say whether what is learnt stays the same. The last table
+says what an encoder of width 32 costs and keeps in each precision that it can fly in.
 """
 
 import argparse
@@ -33,7 +34,8 @@ COMPILED = "+ torch.compile"
 MEANS[COMPILED] = {**MEANS["+ bfloat16"], "compile": True}
 WHOLE = "+ bfloat16"
 LOSSES = "losses"
-PARTS = (*MEANS, LOSSES)
+PRECISIONS = "precisions"
+PARTS = (*MEANS, LOSSES, PRECISIONS)
 SEEDS = (0, 1, 2)
 CURVE = {"tile_px": 64, "width": 32, "dims": 128, "epochs": 60}
 """A smaller model, for which plain learning takes seconds."""
@@ -50,11 +52,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     started = provenance("training")
     wanted = options.only or [name for name in PARTS if options.compile or name != COMPILED]
     section = Section("Learning the auto-encoder")
-    rows = [name for name in wanted if name != LOSSES]
+    rows = [name for name in wanted if name in MEANS]
     if rows:
         section.tables.append(_speed(section, rows, options.steps))
     if LOSSES in wanted:
         section.tables.append(_curves(section))
+    if PRECISIONS in wanted:
+        section.tables.append(_precisions(section))
     print(section.markdown(), flush=True)
     # The suite keeps the facts of its last section.
     wall_s = time.perf_counter() - start
@@ -116,6 +120,24 @@ def _curves(section: Section) -> Table:
     return Table("Losses with and without", header, rows, notes)
 
 
+def _precisions(section: Section) -> Table:
+    """What flies of a smaller encoder in each precision: size, time of a tile, likeness."""
+    told = _in_a_process(
+        means=MEANS[WHOLE], epochs=10, seed=0, count=6 * BATCH, width=32, exported=True
+    )
+    rows = []
+    for name, one in told["exported"].items():
+        time_ms = section.add(f"a tile, {name}", "ms", one["ms"], data="generated edges", seed=0)
+        cells = [number(value) for value in (one["mb"], time_ms.median, time_ms.p10, time_ms.p90)]
+        rows.append([name, *cells, f"{one['mean']:.5f}", f"{one['least']:.5f}"])
+    header = ("precision", "MB", "tile ms", "p10", "p90", "mean cosine", "least cosine")
+    notes = (
+        f"{TILE_PX} px, width 32, 1024 numbers, learnt for 60 steps; onnxruntime, one thread, "
+        "processor time, one tile at a time; cosine to float32's embeddings of 32 other tiles",
+    )
+    return Table("Precisions of what flies", header, rows, notes)
+
+
 def _in_a_process(**wanted: Any) -> dict[str, Any]:
     """What `_learn` gives in a fresh process, whose memory nothing else has touched."""
     # Benchmarks that import NumPy first may be held to one thread; learning uses what there is.
@@ -133,20 +155,22 @@ def _in_a_process(**wanted: Any) -> dict[str, Any]:
 
 
 def _learn(
-    means: dict[str, bool],
+    means: dict[str, Any],
     epochs: int,
     seed: int,
     count: int = BATCH,
     tile_px: int = TILE_PX,
     width: int = 320,
     dims: int = 1024,
+    exported: bool = False,
 ) -> dict[str, Any]:
     """Learn on `count` generated tiles; seconds and loss of each epoch, threads, peak memory."""
     import torch
 
     from orthonav.embed.network import AutoEncoderRecipe
     from orthonav.neural.autoencoder import Reconstruction
-    from orthonav.neural.training import Means, World, kept_memory, train
+    from orthonav.neural.means import Means, World, kept_memory
+    from orthonav.neural.training import train
 
     recipe = AutoEncoderRecipe(dims=dims, width=width, epochs=epochs, batch=BATCH)
     tiles = _edge_tiles(count, tile_px)
@@ -172,16 +196,44 @@ def _learn(
         "threads": torch.get_num_threads(),
         "peak_mb": peak_memory_mb(),
         "parameters": sum(values.numel() for values in task.model.parameters()),
+        "exported": _exported(task.encoder, recipe, tiles) if exported else {},
     }
 
 
-def _edge_tiles(count: int, tile_px: int) -> Any:
+def _exported(encoder: Any, recipe: Any, tiles: Any) -> dict[str, dict[str, Any]]:
+    """Megabytes, milliseconds of single tiles and likeness of the encoder in each precision."""
+    from orthonav.embed.network import PRECISIONS as NAMES
+    from orthonav.neural.export import cosines, export_encoder
+
+    held_out = _edge_tiles(32, TILE_PX, seed=1).batch(np.arange(32))
+    calibration = tiles.batch(np.arange(64))
+    wanted = export_encoder(encoder, recipe, calibration, held_out).embedder.views(held_out)
+    told = {}
+    for name in NAMES:
+        flown = dataclasses.replace(recipe, precision=name)
+        made = export_encoder(encoder, flown, calibration, held_out, least_cosine=-1.0).embedder
+        alike = cosines(made.views(held_out), wanted)
+        times_ms = []
+        for at in list(range(32)) * 3:
+            start = time.thread_time()
+            made.views(held_out[at : at + 1])
+            times_ms.append(1e3 * (time.thread_time() - start))
+        told[name] = {
+            "mb": made.onnx.nbytes / 1e6,
+            "ms": times_ms,
+            "mean": float(alike.mean()),
+            "least": float(alike.min()),
+        }
+    return told
+
+
+def _edge_tiles(count: int, tile_px: int, seed: int = 0) -> Any:
     """Tiles (binary edges) of a generated sheet with detail of several sizes."""
     import cv2
 
     from orthonav.neural.tiles import SheetTiles
 
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     side = 4 * tile_px
     grey = np.zeros((side, side), np.float32)
     for sigma in (2.0, 6.0, 18.0):

@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 
 from experiments.paper.methods import Method
 from experiments.paper.runs import Workplace, run
@@ -21,11 +21,17 @@ def side_by_side(tasks: Sequence[Task], jobs: int) -> Iterator[tuple[Task, float
     """
     with ProcessPoolExecutor(jobs, get_context("spawn"), _prepare, (jobs,)) as pool:
         waiting = {pool.submit(_minutes, *task): task for task in tasks}
-        for done in as_completed(waiting):
-            error = done.exception()
-            if isinstance(error, BrokenProcessPool) or not isinstance(error, Exception | None):
-                raise error
-            yield waiting[done], done.result() if error is None else error
+        try:
+            for done in as_completed(waiting):
+                error = done.exception()
+                if isinstance(error, BrokenProcessPool) or not isinstance(error, Exception | None):
+                    raise error
+                yield waiting[done], done.result() if error is None else error
+        except BaseException:  # interrupted: hours of work are not waited for, checkpoints stay
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in active_children():
+                process.terminate()
+            raise
 
 
 def cores() -> int:

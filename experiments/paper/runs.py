@@ -10,7 +10,6 @@ import statistics
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +34,6 @@ HEADINGS_DEG = (0, 1, 2, 3, 5, 7, 10, 15)
 DROPS_M = (0, 25, 50, 75, 100, 150, 200)
 EVIDENCE = ("score", "lowe_ratio", "peak_ratio")
 """Written of every view behind its error, then its confidence."""
-MORE_PACKAGES = ("torch", "onnxruntime", "scikit-image", "faiss-cpu")
 MB = 1e6
 
 
@@ -92,7 +90,6 @@ def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, A
         "seeds": {"views": views.SEED, "build": 0},
         "inputs": {path.name: _digest(path) for path in (scene.past, scene.present)},
         "provenance": started,
-        "more_packages": {name: _version(name) for name in MORE_PACKAGES},
     }
 
 
@@ -231,10 +228,3 @@ def _without_nan(value: Any) -> Any:
 def _digest(path: Path) -> str:
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "absent"

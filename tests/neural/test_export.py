@@ -69,6 +69,7 @@ def test_smaller_precisions_are_smaller_and_alike(kind, precision, most):
     tiles = maps(6, 64, 7)
     made = export_encoder(encoder, recipe, maps(16, 64, 5), tiles, least_cosine=0.9)
     assert (made.precision, made.least_cosine) == (precision, 0.9)
+    assert made.embedder.recipe == recipe
     assert made.sizes_mb[precision] < most * made.sizes_mb["float32"]
     assert made.embedder.onnx.nbytes / 1e6 == pytest.approx(made.sizes_mb[precision])
     seen, wanted = made.embedder.views(tiles), embedded(encoder, tiles)
@@ -88,7 +89,7 @@ def test_a_precision_that_costs_too_much_is_not_used():
     encoder, recipe = encoder_and_recipe("autoencoder", 32, precision="int8")
     tiles = maps(8, 32)
     made = export_encoder(encoder, recipe, tiles, tiles, least_cosine=1.1)
-    assert made.precision == "float32"
+    assert made.precision == made.embedder.recipe.precision == "float32"
     assert set(made.cosine) == {"float32", "int8"}
     assert made.embedder.onnx.nbytes / 1e6 == pytest.approx(made.sizes_mb["float32"])
 

@@ -17,7 +17,7 @@ import torch
 import transformers
 
 from orthonav.errors import MissingFileError, VariantError
-from orthonav.neural import sam
+from orthonav.neural import sam, sam_weights
 from orthonav.neural.sam import SamBoundaries, automatic_masks, boundary_map, suppressed
 from orthonav.variants import Variant, make_variant, variant_from_recipe, variant_recipe
 
@@ -361,6 +361,13 @@ def test_large_pictures_are_taken_window_by_window(weights):
     assert not np.array_equal(whole, drawn(variant(weights, window=0), grey))
 
 
+def test_how_many_masks_are_scaled_at_once_changes_nothing(weights, monkeypatch):
+    expected = drawn(variant(weights), picture())
+    for pixels in (1, 3 * SIDE * SIDE, 1 << 24):
+        monkeypatch.setattr(sam, "_CHUNK_PIXELS", {"cpu": pixels})
+        np.testing.assert_array_equal(drawn(variant(weights), picture()), expected)
+
+
 def test_batch_is_one_by_one(weights):
     greys = np.stack([picture(seed=seed) for seed in range(3)])
     valid = np.ones(greys.shape, bool)
@@ -468,7 +475,7 @@ def test_original_checkpoints_are_read(weights, checkpoint):
         "prompt_encoder",
         "mask_decoder",
     }
-    model = sam.original_model(checkpoint)
+    model = sam_weights.original_model(checkpoint)
     expected = transformers.SamModel.from_pretrained(weights)
     assert model.state_dict().keys() == expected.state_dict().keys()
     for name, value in expected.state_dict().items():
@@ -484,7 +491,7 @@ def test_sizes_are_told_by_the_shapes_of_the_weights(size):
     expected = transformers.SamConfig(vision_config=transformers.SamVisionConfig(**SIZES[size]))
     with torch.device("meta"):
         original = original_weights(transformers.SamModel(expected))
-    made = sam._config(original)
+    made = sam_weights._config(original)
     for part in ("vision_config", "prompt_encoder_config", "mask_decoder_config"):
         told, wanted = getattr(made, part).to_dict(), getattr(expected, part).to_dict()
         assert told.pop("global_attn_indexes", []) == list(wanted.pop("global_attn_indexes", []))
@@ -497,10 +504,10 @@ def test_incomplete_checkpoints_are_refused(checkpoint, tmp_path):
         path = tmp_path / "part.pth"
         torch.save({key: value for key, value in whole.items() if key != name}, path)
         with pytest.raises(VariantError, match="not Segment Anything"):
-            sam.original_model(path)
+            sam_weights.original_model(path)
     torch.save([1, 2], tmp_path / "list.pth")
     with pytest.raises(VariantError, match="not Segment Anything"):
-        sam.original_model(tmp_path / "list.pth")
+        sam_weights.original_model(tmp_path / "list.pth")
 
 
 class Evil:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -18,13 +19,11 @@ pytest.importorskip("onnxruntime", reason="checking what flies needs onnxruntime
 
 from orthonav.embed.network import AutoEncoderRecipe, TripletRecipe  # noqa: E402
 from orthonav.errors import OutputError  # noqa: E402
+from orthonav.neural import checkpoints, means, training  # noqa: E402
+from orthonav.neural.checkpoints import TrainingError, loss_picture  # noqa: E402
+from orthonav.neural.means import Means  # noqa: E402
 from orthonav.neural.tiles import SheetTiles  # noqa: E402
-from orthonav.neural.training import (  # noqa: E402
-    Means,
-    TrainingError,
-    learn_network,
-    loss_picture,
-)
+from orthonav.neural.training import learn_network  # noqa: E402
 
 TILE_PX = 32
 AUTO = AutoEncoderRecipe(dims=16, width=16, epochs=3, batch=8, learning_rate=3e-3)
@@ -72,9 +71,11 @@ class Killed(Exception):
     """Stands for what ends a process."""
 
 
-def kill_after(epochs):
+def kill_at(beginning):
+    """A report that ends the learning where what is told begins so; what follows is not written."""
+
     def report(text, share):
-        if text.startswith(f"epoch {epochs + 1} "):
+        if text.startswith(beginning):
             raise Killed
 
     return report
@@ -119,12 +120,80 @@ def test_the_triplet_network_learns_to_find_a_changed_place(tmp_path):
 def test_a_killed_learning_goes_on_as_if_it_had_not_been(recipe, tmp_path):
     whole = learn(recipe, tmp_path / "whole")
     with pytest.raises(Killed):
-        learn(recipe, tmp_path / "killed", report=kill_after(1))
+        learn(recipe, tmp_path / "killed", report=kill_at("epoch 2 of 3, loss"))
     assert len(losses(tmp_path / "killed")) == 1
     resumed = learn(recipe, tmp_path / "killed")
     np.testing.assert_array_equal(resumed.onnx, whole.onnx)
     assert losses(tmp_path / "killed") == losses(tmp_path / "whole")
     np.testing.assert_array_equal(learn(recipe, tmp_path / "killed").onnx, whole.onnx)
+
+
+@pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
+@pytest.mark.parametrize("at", ["epoch 1 of 3, batch 2", "epoch 2 of 3, batch 3"])
+def test_a_learning_killed_within_an_epoch_does_not_begin_it_again(
+    recipe, at, tmp_path, monkeypatch
+):
+    whole = learn(recipe, tmp_path / "whole")
+    monkeypatch.setattr(training, "TOLD_EVERY_S", 0)
+    with pytest.raises(Killed):
+        learn(recipe, tmp_path / "killed", report=kill_at(at))
+    told = []
+    resumed = learn(recipe, tmp_path / "killed", report=lambda text, share: told.append(text))
+    assert told[0].startswith(at)
+    np.testing.assert_array_equal(resumed.onnx, whole.onnx)
+    assert losses(tmp_path / "killed") == losses(tmp_path / "whole")
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+import torch
+torch.set_num_threads(1)
+sys.path.insert(0, sys.argv[1])
+import test_training as here
+
+written = []
+save = torch.save
+
+def save_and_die(content, path):
+    save(content, path)
+    written.append(path)
+    if len(written) == 6:
+        with open(path, "r+b") as stream:
+            stream.truncate(1000)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+torch.save = save_and_die
+here.learn(here.AUTO, Path(sys.argv[2]))
+"""
+
+
+def test_a_kill_in_the_middle_of_writing_leaves_the_checkpoint_before(tmp_path, monkeypatch):
+    command = [sys.executable, "-c", KILLED, str(Path(__file__).parent), str(tmp_path)]
+    assert subprocess.run(command, timeout=60).returncode == -signal.SIGKILL
+    assert len(list(tmp_path.glob(".checkpoint*"))) == 1
+    monkeypatch.setattr(training, "TOLD_EVERY_S", 0)
+    told = []
+    learn(AUTO, tmp_path, report=lambda text, share: told.append(text))
+    assert told[0].startswith("epoch 2 of 3, batch 2 of 4")  # five were written
+    assert not list(tmp_path.glob(".*"))
+    alone = tmp_path / "alone"
+    learn(AUTO, alone)
+    np.testing.assert_allclose(losses(tmp_path), losses(alone), rtol=1e-4)
+
+
+def test_long_epochs_tell_how_far_they_are(monkeypatch):
+    monkeypatch.setattr(training, "TOLD_EVERY_S", 0)
+    told = []
+    learn(AUTO, report=lambda text, share: told.append((text, share)))
+    assert [text.partition(", loss")[0] for text, _ in told[:5]] == [
+        "epoch 1 of 3, batch 1 of 4",
+        "epoch 1 of 3, batch 2 of 4",
+        "epoch 1 of 3, batch 3 of 4",
+        "epoch 1 of 3",
+        "epoch 2 of 3, batch 1 of 4",
+    ]
+    assert [share for _, share in told[:12]] == pytest.approx(np.arange(1, 13) / 12)
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not():
@@ -155,11 +224,21 @@ def test_pictures_show_the_progress(tmp_path):
     }
 
 
+def test_pictures_do_not_wait_for_a_long_first_epoch(tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoints, "SHOWN_AFTER_S", (0.0,))
+    monkeypatch.setattr(training, "TOLD_EVERY_S", 0)
+    with pytest.raises(Killed):
+        learn(AUTO, tmp_path, means=RARELY_SAVED, report=kill_at("epoch 1 of 3, batch 2"))
+    assert {path.name for path in tmp_path.iterdir()} == {"history.json", "loss.png", "tiles.png"}
+    assert losses(tmp_path) == []
+
+
 def test_the_curve_falls_where_the_loss_does():
     dark = loss_picture([1.0, 0.1, 0.01])[40:].min(axis=2) < 128
     rows = [np.flatnonzero(dark[:, col]).mean() for col in (22, 320, 618)]
     assert rows[0] < rows[1] < rows[2]
     assert loss_picture([0.5]).shape == loss_picture([0.0, 0.0]).shape
+    assert loss_picture([]).all() and loss_picture([0.5, np.nan]).all()
 
 
 @pytest.mark.parametrize("change", ["recipe", "seed", "tiles"])
@@ -175,6 +254,27 @@ def test_a_folder_of_another_learning_is_refused(change, tmp_path):
     with pytest.raises(OutputError, match="something else"):
         learn(**given)
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
+
+
+def test_what_was_learnt_can_be_had_in_another_precision(tmp_path):
+    plain = learn(AUTO, tmp_path)
+    told = []
+    small = learn(
+        dataclasses.replace(AUTO, precision="float16"),
+        tmp_path,
+        report=lambda text, share: told.append(text),
+    )
+    assert len(told) == 2 and told[1].startswith("export: float16")  # nothing was learnt again
+    assert small.recipe.precision == "float16" and small.onnx.nbytes < 0.6 * plain.onnx.nbytes
+
+
+def test_a_folder_learnt_with_other_dates_is_refused(tmp_path):
+    recipe = dataclasses.replace(TRIPLET, epochs=1)
+    given = {"binary": False, "seed": 0, "work": tmp_path, "means": QUICK}
+    learn_network(recipe, sheet(), positive=[sheet(ground(1))], **given)
+    learn_network(recipe, sheet(), positive=[sheet(ground(1))], **given)
+    with pytest.raises(OutputError, match="something else"):
+        learn_network(recipe, sheet(), positive=[sheet(ground(2))], **given)
 
 
 def test_a_broken_checkpoint_is_refused_and_nothing_in_it_is_run(tmp_path):
@@ -213,6 +313,19 @@ def test_fast_means_learn_the_same_up_to_rounding(tmp_path):
     exact, rounded = losses(tmp_path / "plain"), losses(tmp_path / "fast")
     assert rounded != exact
     np.testing.assert_allclose(rounded, exact, rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    "able, wanted",
+    [({"avx512_bf16": True}, True), ({"amx_bf16": True}, True), ({"avx512_bf16": False}, False)],
+)
+def test_bfloat16_is_used_where_the_processor_has_it(able, wanted, monkeypatch):
+    cpu = torch.device("cpu")
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: able, raising=False)
+    assert means.uses_bf16(Means(), cpu) is wanted
+    assert means.uses_bf16(Means(bf16=not wanted), cpu) is not wanted
+    monkeypatch.delattr(torch.cpu, "get_capabilities")
+    assert means.uses_bf16(Means(), cpu) is False
 
 
 SHARED = """

@@ -1,5 +1,7 @@
 """Maps of the paper's methods: built, carried, flown like any other."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -99,13 +101,18 @@ def test_an_interrupted_learning_goes_on(area, tmp_path):
         work=tmp_path / "work",
         **SMALL,
     )
+    training = pytest.importorskip("orthonav.neural.training")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.prepare.calibrate.CROPS", 24)
-        patch.setattr("orthonav.neural.training.Means.save_every_s", 0.0, raising=False)
+        often = functools.partial(training.Means, save_every_s=0.0)
+        patch.setattr("orthonav.neural.training.Means", often)
         with pytest.raises(Killed):
             build_map(request, kill)
         assert not (tmp_path / "a.onav").exists()
-        build_map(request)
+        learnt = []
+        build_map(request, lambda stage, share: learnt.append(share) if stage == "learn" else None)
+    # What was learnt before is not learnt again.
+    assert min(share for share in learnt if share > 0) > 0.25
     assert (tmp_path / "a.onav").exists() and (tmp_path / "work" / "loss.png").exists()
 
 

@@ -24,7 +24,21 @@ OPSET, IR_VERSION = 17, 8
 FLOAT_TOLERANCE = 1e-3
 """Largest difference between ONNX and PyTorch, in units of the largest number of an embedding."""
 LEAST_COSINE = {"float32": 0.99999, "float16": 0.9999, "int8": 0.97}
-"""Below it between the embeddings of what flies and of float32, a precision is not used."""
+"""Below it between the embeddings of what flies and of float32, a precision is not used.
+
+Of the least over the tiles held out, so that the mean is above it too. 256 px, one tile at a time,
+onnxruntime 1.31 with one thread of an AMD EPYC with AVX-512 VNNI, processor time; the triplet
+network's cosines are of tiles of another date:
+
+    auto-encoder, width 32   float32 33.6 MB 1.8 ms   float16 16.8 MB 1.9 ms, cosine 1.0000
+                                                      int8     8.4 MB 0.7 ms, least 0.9990
+    triplet, width 16        float32  5.3 MB 5.8 ms   float16  2.7 MB 6.0 ms, cosine 1.0000
+                                                      int8     1.4 MB 2.9 ms, least 0.986
+
+float16 halves the file and saves no time: weights are turned back when it is loaded. Where a
+processor lacks 8-bit products, int8 saves only the file. `python -m benchmarks.training --only
+precisions` measures the first of these again.
+"""
 CALIBRATION_BATCH = 8
 
 Array = NDArray[np.float32]
@@ -60,13 +74,15 @@ def export_encoder(
 ) -> Exported:
     """The encoder in the recipe's precision, or in float32 where that costs too much likeness.
 
+    The embedder's own recipe, which the map's manifest repeats, has the precision that it flies in.
+
     `encoder` is `AutoEncoder.encoder` or a `ResNet34`; `calibration` and `held_out` (N, C, S, S)
     are tiles, to choose the ranges of int8 with and to judge with. `least_cosine` replaces the
     value of `LEAST_COSINE`. Raises `ExportError` where ONNX in float32 and PyTorch disagree,
     `MissingExtraError` without onnx or onnxruntime.
     """
     model = encoder_graph(encoder, held_out.shape[1:])
-    plain = _embedder(recipe, model.SerializeToString())
+    plain = _embedder(dataclasses.replace(recipe, precision="float32"), model.SerializeToString())
     random = np.random.default_rng(0).random((2, *held_out.shape[1:]), dtype=np.float32)
     expected = _torch_embeddings(encoder, held_out)
     _require_same(_raw(plain, random), _torch_embeddings(encoder, random), "random numbers")
@@ -85,12 +101,17 @@ def export_encoder(
     return Exported(plain, "float32", cosine, enough, sizes)
 
 
-def least_likeness(first: Array, second: Array) -> float:
-    """Least cosine between embeddings (N, D) of the same tiles; two without length are alike."""
+def cosines(first: Array, second: Array) -> Array:
+    """Cosines (N,) between embeddings (N, D) of the same tiles; two without length are alike."""
     norms = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
     products = np.einsum("nd,nd->n", first, second)
     both_zero = np.maximum(np.abs(first).max(axis=1), np.abs(second).max(axis=1)) == 0
-    return float(np.where(both_zero, 1, products / np.maximum(norms, 1e-30)).min())
+    return np.asarray(np.where(both_zero, 1, products / np.maximum(norms, 1e-30)), np.float32)
+
+
+def least_likeness(first: Array, second: Array) -> float:
+    """Least of the cosines between embeddings (N, D) of the same tiles."""
+    return float(cosines(first, second).min())
 
 
 def encoder_graph(encoder: nn.Module, shape: tuple[int, ...]) -> Any:

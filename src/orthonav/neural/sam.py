@@ -10,32 +10,21 @@ by path and never fetched. This does not fly: it needs PyTorch and seconds to mi
 
 import hashlib
 import itertools
-import logging
 import os
-import pickle
-import re
-import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MissingExtraError, OutputError, VariantError
-from orthonav.files import replacing
-from orthonav.neural.superpoint import (
-    chosen_device,
-    pretrained,
-    quiet,
-    require_device,
-    transformers,
-    weights_stamp,
-)
+from orthonav.errors import MissingExtraError, VariantError
+from orthonav.neural.sam_cache import cache_folder, cached, keep
+from orthonav.neural.sam_weights import WHERE, network, weights_digest
+from orthonav.neural.superpoint import chosen_device, require_device, weights_stamp
 
 try:
     import torch
@@ -44,18 +33,12 @@ except ImportError as error:  # pragma: no cover - depends on the installation
         "neural networks need PyTorch, which is not installed: pip install 'orthonav[train]'"
     ) from error
 
-WHERE = (
-    "the folder of facebook/sam-vit-base, -large or -huge (config.json and model.safetensors) from "
-    "the Hugging Face hub, or an original checkpoint such as sam_vit_b_01ec64.pth from "
-    "https://dl.fbaipublicfiles.com/segment_anything/"
-)
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 CACHE_FORMAT = b"orthonav sam boundaries 1"
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as it was trained
-_CHUNK_PIXELS = 1 << 24
-_DIGEST_BYTES = 32
-
-log = logging.getLogger(__name__)
+_CHUNK_PIXELS = {"cpu": 1 << 20, "cuda": 1 << 24}
+"""Pixels of masks scaled at once: on a CPU so few that no memory comes fresh from the system each
+time, which takes half of the time at 1 << 24 (0.57 against 1.18 s a window, small network)."""
 
 WEIGHTS_VARIABLE = "ORTHONAV_SAM_WEIGHTS"
 Grey = NDArray[np.uint8]
@@ -163,9 +146,9 @@ class SamBoundaries:
         """Boundaries (H, W) of one window, from the cache where it is there."""
         filled = np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
         stamp = weights_stamp(self.path, WHERE)
-        folder = _cache_folder(self.cache)
+        folder = cache_folder(self.cache)
         path = folder / f"{self._key(filled, stamp)}.edges" if folder else None
-        edges = _cached(path, grey.shape) if path else None
+        edges = cached(path, grey.shape) if path else None
         if edges is None:
             device = chosen_device(self.device)
             model = _model(self.path, stamp, str(device))
@@ -173,14 +156,14 @@ class SamBoundaries:
             side = int(model.config.vision_config.image_size)
             edges = boundary_map(automatic_masks(predict, grey.shape, side, self), grey.shape)
             if path:
-                _keep(path, edges)
+                keep(path, edges)
         return edges
 
     def _key(self, filled: Grey, stamp: tuple[int, ...]) -> str:
         """Name of a window in the cache: its pixels, the weights and what else decides."""
         rules = (self.grid, self.iou, self.stability, self.offset, self.overlap, self.precision)
         digest = hashlib.sha256(CACHE_FORMAT)
-        digest.update(repr((filled.shape, rules, _weights_digest(self.path, stamp))).encode())
+        digest.update(repr((filled.shape, rules, weights_digest(self.path, stamp))).encode())
         digest.update(filled.tobytes())
         return digest.hexdigest()
 
@@ -234,7 +217,8 @@ def _trusted(
     good = iou > rules.iou
     logits, iou = logits[good], iou[good]
     resized = _resized_shape(shape, side)
-    chunk = max(1, _CHUNK_PIXELS // max(side * side, shape[0] * shape[1]))
+    pixels = _CHUNK_PIXELS.get(logits.device.type, _CHUNK_PIXELS["cpu"])
+    chunk = max(1, pixels // max(side * side, shape[0] * shape[1]))
     for start in range(0, len(logits), chunk):
         part = logits[start : start + chunk, None].float()
         part = _scaled(part, (side, side))[..., : resized[0], : resized[1]]
@@ -340,178 +324,4 @@ def _predictor(model: Any, grey: Grey, dtype: torch.dtype) -> Predict:
 @lru_cache(maxsize=1)
 def _model(weights: str, stamp: tuple[int, ...], device: str) -> Any:
     del stamp  # part of the key only: files may change
-    path = Path(weights).expanduser()
-    model = pretrained(weights, "sam", "SamModel") if path.is_dir() else original_model(path)
-    return model.to(device)
-
-
-@lru_cache(maxsize=8)
-def _weights_digest(weights: str, stamp: tuple[int, ...]) -> str:
-    """SHA-256 of what a path of weights holds."""
-    del stamp
-    path = Path(weights).expanduser()
-    files = [path]
-    if path.is_dir():
-        files = sorted([*path.glob("config.json"), *path.glob("*.safetensors")])
-    digest = hashlib.sha256()
-    for file in files:
-        with file.open("rb") as stream:
-            digest.update(hashlib.file_digest(stream, "sha256").digest())
-    return digest.hexdigest()
-
-
-# Original checkpoints: the same network under other names.
-
-_RENAMES = [
-    (re.compile(pattern), name)
-    for pattern, name in (
-        (r"^image_encoder\.", "vision_encoder."),
-        (r"\.patch_embed\.proj\.", ".patch_embed.projection."),
-        (r"^vision_encoder\.blocks\.", "vision_encoder.layers."),
-        (r"\.neck\.0\.", ".neck.conv1."),
-        (r"\.neck\.1\.", ".neck.layer_norm1."),
-        (r"\.neck\.2\.", ".neck.conv2."),
-        (r"\.neck\.3\.", ".neck.layer_norm2."),
-        (
-            r"\.pe_layer\.positional_encoding_gaussian_matrix$",
-            ".shared_embedding.positional_embedding",
-        ),
-        (r"\.point_embeddings\.", ".point_embed."),
-        (r"\.mask_downscaling\.0\.", ".mask_embed.conv1."),
-        (r"\.mask_downscaling\.1\.", ".mask_embed.layer_norm1."),
-        (r"\.mask_downscaling\.3\.", ".mask_embed.conv2."),
-        (r"\.mask_downscaling\.4\.", ".mask_embed.layer_norm2."),
-        (r"\.mask_downscaling\.6\.", ".mask_embed.conv3."),
-        (r"\.output_upscaling\.0\.", ".upscale_conv1."),
-        (r"\.output_upscaling\.1\.", ".upscale_layer_norm."),
-        (r"\.output_upscaling\.3\.", ".upscale_conv2."),
-        (r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers\.0\.", r".\1.proj_in."),
-        (r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers\.1\.", r".\1.layers.0."),
-        (r"\.(iou_prediction_head|output_hypernetworks_mlps\.\d+)\.layers\.2\.", r".\1.proj_out."),
-        (r"\.norm(\d|_final_attn)\.", r".layer_norm\1."),
-    )
-]
-_POSITIONS = "prompt_encoder.shared_embedding.positional_embedding"
-
-
-def converted_weights(original: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Weights of an original checkpoint under the names that `transformers` gives them."""
-    converted = {}
-    for key, value in original.items():
-        for pattern, name in _RENAMES:
-            key = pattern.sub(name, key)
-        converted[key] = value
-    converted["shared_image_embedding.positional_embedding"] = converted[_POSITIONS]
-    return converted
-
-
-def original_model(path: Path) -> Any:
-    """The network of an original checkpoint (`sam_vit_b_01ec64.pth` and its like), in float32.
-
-    Its size is read from the shapes of its weights. Raises `VariantError` if it is no such file.
-    """
-    try:
-        weights = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
-        raise VariantError(f"cannot read the weights; expected {WHERE}: {path}") from error
-    try:
-        # Constants of the preparation of pictures, in some files.
-        named = {k: v for k, v in weights.items() if k not in ("pixel_mean", "pixel_std")}
-        with quiet():
-            model = transformers().SamModel(_config(named))
-        model.load_state_dict(converted_weights(named))
-    except (KeyError, AttributeError, TypeError, ValueError, IndexError, RuntimeError) as error:
-        raise VariantError(f"not Segment Anything weights; expected {WHERE}: {path}") from error
-    return model.eval().requires_grad_(False)
-
-
-def _config(original: Mapping[str, torch.Tensor]) -> Any:
-    """The `SamConfig` that the shapes of an original checkpoint tell."""
-    library = transformers()
-    shapes = {key: tuple(value.shape) for key, value in original.items()}
-    hidden, colours, patch, _ = shapes["image_encoder.patch_embed.proj.weight"]
-    grid = shapes["image_encoder.pos_embed"][1]
-    depth = _count(shapes, r"image_encoder\.blocks\.(\d+)\.norm1\.weight")
-    reaches, head = zip(
-        *(shapes[f"image_encoder.blocks.{i}.attn.rel_pos_h"] for i in range(depth)), strict=True
-    )
-    windows = [(reach + 1) // 2 for reach in reaches]  # of 2 * window - 1 relative positions
-    vision = library.SamVisionConfig(
-        hidden_size=hidden,
-        output_channels=shapes["image_encoder.neck.0.weight"][0],
-        num_hidden_layers=depth,
-        num_attention_heads=hidden // head[0],
-        num_channels=colours,
-        image_size=grid * patch,
-        patch_size=patch,
-        window_size=min(windows) if min(windows) < grid else 14,
-        global_attn_indexes=[i for i, window in enumerate(windows) if window == grid],
-        num_pos_feats=shapes["prompt_encoder.pe_layer.positional_encoding_gaussian_matrix"][1],
-        mlp_dim=shapes["image_encoder.blocks.0.mlp.lin1.weight"][0],
-    )
-    tokens, decoded = shapes["mask_decoder.mask_tokens.weight"]
-    prompt = library.SamPromptEncoderConfig(
-        hidden_size=decoded,
-        image_size=grid * patch,
-        patch_size=patch,
-        mask_input_channels=shapes["prompt_encoder.mask_downscaling.3.weight"][0],
-        num_point_embeddings=_count(shapes, r"prompt_encoder\.point_embeddings\.(\d+)\.weight"),
-    )
-    layers = "mask_decoder.transformer.layers"
-    decoder = library.SamMaskDecoderConfig(
-        hidden_size=decoded,
-        mlp_dim=shapes[f"{layers}.0.mlp.lin1.weight"][0],
-        num_hidden_layers=_count(shapes, layers.replace(".", r"\.") + r"\.(\d+)\.norm1\.weight"),
-        attention_downsample_rate=decoded
-        // shapes[f"{layers}.0.cross_attn_token_to_image.q_proj.weight"][0],
-        num_multimask_outputs=tokens - 1,
-        iou_head_hidden_dim=shapes["mask_decoder.iou_prediction_head.layers.0.weight"][0],
-    )
-    return library.SamConfig(
-        vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=decoder
-    )
-
-
-def _count(keys: Iterable[str], pattern: str) -> int:
-    return sum(re.fullmatch(pattern, key) is not None for key in keys)
-
-
-# The cache: a digest, then the compressed bits of a map, each entry written whole or not at all.
-
-
-def _cache_folder(cache: str) -> Path | None:
-    if cache == "none":
-        return None
-    if cache:
-        return Path(cache).expanduser()
-    if own := os.environ.get("ORTHONAV_CACHE"):
-        return Path(own) / "sam"
-    users = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(users).expanduser() / "orthonav" / "sam"
-
-
-def _cached(path: Path, shape: tuple[int, ...]) -> Mask | None:
-    """The map (H, W) of a cache entry; none if there is none or it was damaged."""
-    try:
-        entry = path.read_bytes()
-        digest, packed = entry[:_DIGEST_BYTES], entry[_DIGEST_BYTES:]
-        if hashlib.sha256(packed).digest() != digest:
-            log.warning("damaged cache entry is made again: %s", path)
-            return None
-        bits = np.unpackbits(np.frombuffer(zlib.decompress(packed), np.uint8))
-        return bits[: shape[0] * shape[1]].reshape(shape).astype(bool)
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, zlib.error) as error:
-        log.warning("unreadable cache entry (%s): %s", error, path)
-        return None
-
-
-def _keep(path: Path, edges: Mask) -> None:
-    """Write a cache entry; a cache that cannot be written costs time, not the result."""
-    packed = zlib.compress(np.packbits(edges).tobytes())
-    try:
-        with replacing(path) as temporary:
-            temporary.write_bytes(hashlib.sha256(packed).digest() + packed)
-    except OutputError as error:
-        log.warning("nothing cached: %s", error)
+    return network(weights).to(device)

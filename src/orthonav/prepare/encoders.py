@@ -1,6 +1,7 @@
 """Learning the paper's embeddings for a map: auto-encoder, triplet network, bag of visual words."""
 
 import importlib
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ from orthonav.errors import MissingExtraError, VariantError
 from orthonav.neural.tiles import SheetTiles
 from orthonav.prepare.change import changed
 from orthonav.prepare.pictures import SheetPictures
+
+log = logging.getLogger(__name__)
 
 BATCH_TILES = 64
 MAX_WORD_TILES = 2000
@@ -57,9 +60,14 @@ def learn_encoder(
             seed=seed,
             work=work,
             positive=positive or _changed_tiles(tiles, representation),
-            report=lambda text, share: report("learn", share),
+            report=lambda text, share: _told(report, text, share),
         )
     return encoder, _embedded(encoder, tiles, report)
+
+
+def _told(report: Report, text: str, share: float) -> None:
+    log.info("%s", text)
+    report("learn", share)
 
 
 def _word_tiles(tiles: SheetTiles) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_]]]:

@@ -1,0 +1,129 @@
+"""How learning is made fast: precision, memory, processes. What is learnt stays the same."""
+
+import contextlib
+import ctypes
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, distributed, nn
+from torch.nn.parallel import DistributedDataParallel
+
+
+@dataclass(frozen=True)
+class Means:
+    """How learning is made fast; what is learnt stays the same up to rounding.
+
+    `bf16`: mixed precision, None where the processor multiplies bfloat16 itself. `channels_last`:
+    memory layout of convolutions. `fused`: the optimizer's step in one pass over memory.
+    `keep_memory`: freed memory stays with the process (Linux, CPU). `compile`: `torch.compile`,
+    which needs a C++ compiler. `chunk`: most tiles of a triplet batch held for gradients at once;
+    batch norms are then taken over each chunk. `workers`: threads that make batches.
+    `save_every_s`: least time between checkpoints, s. `device`: None for a GPU where there is one.
+    """
+
+    bf16: bool | None = None
+    channels_last: bool = True
+    fused: bool = True
+    keep_memory: bool = True
+    compile: bool = False
+    chunk: int = 128
+    workers: int = 2
+    save_every_s: float = 300.0
+    device: str | None = None
+
+
+@dataclass(frozen=True)
+class World:
+    """This process among those that learn together."""
+
+    rank: int = 0
+    size: int = 1
+    local_rank: int = 0
+
+
+def device_of(means: Means, world: World) -> torch.device:
+    """Where this process learns."""
+    name = means.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    return torch.device("cuda", world.local_rank) if name == "cuda" else torch.device(name)
+
+
+def uses_bf16(means: Means, device: torch.device) -> bool:
+    """Whether to learn in mixed precision: as told, or where the device multiplies bfloat16 itself.
+
+    Elsewhere float32 is faster.
+    """
+    if means.bf16 is not None:
+        return means.bf16
+    if device.type == "cuda":
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
+    # Older releases of PyTorch do not tell.
+    able: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
+    return any(bool(able.get(name)) for name in ("avx512_bf16", "amx_bf16", "bf16"))
+
+
+def wrapped(model: nn.Module, device: torch.device, means: Means, world: World) -> nn.Module:
+    """The model as it is run: compiled if wanted, with gradients averaged over processes."""
+    if world.size > 1:
+        ids = [world.local_rank] if device.type == "cuda" else None
+        model = DistributedDataParallel(model, device_ids=ids)
+    return torch.compile(model) if means.compile else model  # type: ignore[return-value]
+
+
+@contextlib.contextmanager
+def processes(means: Means) -> Iterator[World]:
+    """This process's place among those that torchrun started; alone where it did not."""
+    size = int(os.environ.get("WORLD_SIZE", "1"))
+    if size == 1:
+        yield World()
+        return
+    local = int(os.environ.get("LOCAL_RANK", "0"))
+    device = device_of(means, World(local_rank=local))
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    ours = not distributed.is_initialized()
+    if ours:
+        distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    try:
+        yield World(distributed.get_rank(), distributed.get_world_size(), local)
+    finally:
+        if ours:
+            distributed.destroy_process_group()
+
+
+def mean_over_processes(value: Tensor, world: World, device: torch.device) -> float:
+    """The mean of a number over all processes, the same for each."""
+    if world.size > 1:
+        value = value.to(device)
+        distributed.all_reduce(value)
+        value = value / world.size
+    return float(value)
+
+
+@contextlib.contextmanager
+def kept_memory(wanted: bool) -> Iterator[None]:
+    """Let glibc keep freed memory while this lasts, instead of giving it back to the system.
+
+    Activations and gradients are hundreds of MB that come and go in every step; a system that
+    fills each page with zeros anew costs as much as the arithmetic (mallopt(3)).
+    """
+    try:
+        library = ctypes.CDLL(None) if wanted and sys.platform == "linux" else None
+        mallopt, trim = library and library.mallopt, library and library.malloc_trim
+    except (OSError, AttributeError):
+        mallopt = trim = None
+    if not mallopt or not trim:
+        yield
+        return
+    trim_threshold, mmap_max = -1, -4
+    mallopt(mmap_max, 0)
+    mallopt(trim_threshold, -1)
+    try:
+        yield
+    finally:
+        mallopt(mmap_max, 65_536)
+        mallopt(trim_threshold, 128 * 1024)
+        trim(0)

@@ -1,0 +1,61 @@
+"""Boundaries that were found once: a digest, then the compressed bits of a map, one file each.
+
+Every entry is written whole or not at all; what is damaged is made again.
+"""
+
+import hashlib
+import logging
+import os
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import OutputError
+from orthonav.files import replacing
+
+_DIGEST_BYTES = 32
+
+log = logging.getLogger(__name__)
+
+Mask = NDArray[np.bool_]
+
+
+def cache_folder(cache: str) -> Path | None:
+    """Where entries lie: as told, ORTHONAV_CACHE or the user's cache; None for "none"."""
+    if cache == "none":
+        return None
+    if cache:
+        return Path(cache).expanduser()
+    if own := os.environ.get("ORTHONAV_CACHE"):
+        return Path(own) / "sam"
+    users = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(users).expanduser() / "orthonav" / "sam"
+
+
+def cached(path: Path, shape: tuple[int, ...]) -> Mask | None:
+    """The map (H, W) of a cache entry; none if there is none or it was damaged."""
+    try:
+        entry = path.read_bytes()
+        digest, packed = entry[:_DIGEST_BYTES], entry[_DIGEST_BYTES:]
+        if hashlib.sha256(packed).digest() != digest:
+            log.warning("damaged cache entry is made again: %s", path)
+            return None
+        bits = np.unpackbits(np.frombuffer(zlib.decompress(packed), np.uint8))
+        return bits[: shape[0] * shape[1]].reshape(shape).astype(bool)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, zlib.error) as error:
+        log.warning("unreadable cache entry (%s): %s", error, path)
+        return None
+
+
+def keep(path: Path, edges: Mask) -> None:
+    """Write a cache entry; a cache that cannot be written costs time, not the result."""
+    packed = zlib.compress(np.packbits(edges).tobytes())
+    try:
+        with replacing(path) as temporary:
+            temporary.write_bytes(hashlib.sha256(packed).digest() + packed)
+    except OutputError as error:
+        log.warning("nothing cached: %s", error)
