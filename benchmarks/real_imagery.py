@@ -27,7 +27,7 @@ from benchmarks.verdicts import FAR_M, SURE, Verdict, percent
 from orthonav.flight import open_flight, read_truth
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
-from orthonav.onboard.run import localize_flight, locate_view
+from orthonav.onboard.run import SingleViews, localize_flight, locate_view
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import Fix, Telemetry
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
@@ -160,10 +160,8 @@ def _verdict(bench: Bench, scene: Scene) -> Verdict:
     flight = open_flight(folder)
     warm = flight.views[:1]  # the first view prepares the map: it is placed twice
     placed = localize_flight(
-        localizer,
+        SingleViews(localizer, use_prior=False, heading_known=scene.heading_known),
         flight,
-        use_prior=False,
-        heading_known=scene.heading_known,
         views=[*warm, *flight.views],
     )
     rows = [
@@ -242,9 +240,8 @@ def _refusals(bench: Bench) -> Table:
             yaw_std_deg=options.yaw_std_deg,
             agl_std_m=options.agl_std * agl_m,
         )
-        outcome, took_ms = locate_view(
-            localizer, picture, DEFAULT_CAMERA, told, use_prior=False, heading_known=True
-        )
+        alone = SingleViews(localizer, use_prior=False)
+        outcome, took_ms = locate_view(alone, picture, DEFAULT_CAMERA, told)
         stated[kind].append(outcome.confidence if isinstance(outcome, Fix) else np.nan)
         times_ms.append(took_ms)
     rows = [_refused(kind, np.array(values)) for kind, values in stated.items()]

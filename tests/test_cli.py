@@ -207,6 +207,25 @@ def test_localize_without_heading(run, map_path, flight_path, out):
     assert json.loads(known.out)["n_no_fix"] == 3 and json.loads(unknown.out)["n_fix"] == 3
 
 
+def test_localize_as_a_track(run, map_path, flight_path, out):
+    """Views of places that have nothing to do with each other: each is searched for."""
+    few = shutil.copytree(flight_path, out / "flight")
+    lines = (few / "telemetry.csv").read_text().splitlines()[:7]
+    (few / "telemetry.csv").write_text("\n".join(lines) + "\n")
+    (few / "frames" / "0003.jpg").write_bytes(b"no picture")
+    to = ["--out", out / "fixes.jsonl", "--json", "-q"]
+    refused(run("localize", map_path, few, *to, "--track"), "0003.jpg")
+    for how in ("--track", "--hindsight"):
+        done = run("localize", map_path, few, *to, how, "--skip-bad-images")
+        assert done.code == 0, done.err
+        lines = [json.loads(line) for line in (out / "fixes.jsonl").read_text().splitlines()]
+        assert len(lines) == 6 and {line["tracked"] for line in lines} == {True}
+        assert {line["state"] for line in lines} <= {"searching", "tracking", "lost"}
+        assert lines[0]["status"] == "fix" and "heading_bias_deg" in lines[0]["evidence"]
+    off = run("localize", map_path, few, *to, "--track", "--registration", "off")
+    refused(off, "registration layer")
+
+
 def test_evaluate(run, fixes_path, truth_path, map_path, out, names_in):
     done = run(
         *("evaluate", fixes_path, "--truth", truth_path, "--radius-m", "40", "--map", map_path),

@@ -22,12 +22,13 @@ import json, pathlib
 from orthonav.flight import open_flight
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
-from orthonav.onboard.run import localize_flight
+from orthonav.onboard.run import SingleViews, localize_flight
 from orthonav.publish.jsonl import result_to_json
 
 map_path, flight_path = map(pathlib.Path, sys.argv[1:])
 flight = open_flight(flight_path)
-results = localize_flight(Localizer(open_map(map_path)), flight, views=flight.views[:2])
+alone = SingleViews(Localizer(open_map(map_path)))
+results = localize_flight(alone, flight, views=flight.views[:2])
 lines = [json.loads(result_to_json(result)) for result in results]
 loaded = sorted({name.partition(".")[0] for name in sys.modules})
 print(json.dumps({"lines": lines, "loaded": loaded}))
@@ -89,5 +90,5 @@ def test_importing_has_no_side_effect(tmp_path, names_in):
 
 def test_help_loads_no_heavy_library(tmp_path):
     assert "COMMAND" in fresh(HELP, "--help", cwd=tmp_path)
-    for command in ("build", "localize", "demo"):
+    for command in ("build", "import", "localize", "demo"):
         assert f"orthonav {command}" in fresh(HELP, command, "--help", cwd=tmp_path)

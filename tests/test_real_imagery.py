@@ -13,7 +13,7 @@ from orthonav.evaluate.metrics import compare
 from orthonav.flight import open_flight, read_truth
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
-from orthonav.onboard.run import localize_flight
+from orthonav.onboard.run import SingleViews, localize_flight
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 
@@ -37,7 +37,7 @@ def test_views_of_another_year_are_placed(tmp_path, past, present, least):
     flight = tmp_path / "flight"
     simulate_flight(SimulateRequest([DATA / present], flight, random=VIEWS, errors=ERRORS, seed=1))
     opened = open_map(tmp_path / "map.onav")
-    results = list(localize_flight(Localizer(opened), open_flight(flight)))
+    results = list(localize_flight(SingleViews(Localizer(opened)), open_flight(flight)))
     sheet = opened.manifest.sheets[0]
     comparison = compare(read_truth(flight / "truth.csv"), results, sheet.frame)
     right = comparison.errors_m <= WITHIN_STRIDES * sheet.grid.stride_m

@@ -42,7 +42,8 @@ def methods(
     """All rows for a scene whose map has so many tiles, quick ones first.
 
     The reduced setting learns fewer networks: `REDUCED_NETWORKS`, and over imagery that no
-    trajectory of the paper is flown over the paper's best, the auto-encoder on Canny edges.
+    trajectory of the paper is flown over the auto-encoder on Canny edges, the paper's best, and on
+    grey levels.
     """
     shown, width = setting.encoder_tiles, setting.encoder_width
     encoder = (
@@ -68,5 +69,5 @@ def _reduced(method: Method, scene: str) -> bool:
     """Whether the reduced setting learns this network here."""
     edges = method.edges.partition(":")[0]
     if scene not in TABLE_1:
-        return (method.family, edges) == ("autoencoder", CANNY)
+        return method.family == "autoencoder" and edges in (CANNY, GREY)
     return scene in REDUCED_NETWORKS[method.family].get(edges, "")

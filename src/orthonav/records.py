@@ -88,9 +88,14 @@ class NoFix:
 
 @dataclass(frozen=True, eq=False)
 class ViewResult:
-    """What came out for one view of a flight: a line of `fixes.jsonl`."""
+    """What came out for one view of a flight: a line of `fixes.jsonl`.
+
+    `state` is that of the track (`searching`, `tracking`, `lost`), None where views are placed one
+    by one.
+    """
 
     frame: str
     time_ns: int
     outcome: Fix | NoFix
     latency_ms: float
+    state: str | None = None

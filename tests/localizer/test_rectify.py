@@ -17,6 +17,9 @@ LENSES = {
     "off centre": Camera(320, 240, 235.0, 245.0, 171.3, 108.6),
     "barrel": Camera(320, 240, 240.0, 240.0, 160.0, 120.0, (-0.12, 0.03, 0.002, -0.003)),
     "all": Camera(320, 240, 235.0, 245.0, 171.3, 108.6, (0.08, -0.04, -0.003, 0.002, 0.01)),
+    "fisheye": Camera(
+        320, 240, 235.0, 245.0, 171.3, 108.6, (-0.03, 0.01, -0.004, 0.001), "fisheye"
+    ),
 }
 ATTITUDES = [(0, 0, 0), (37, 8, -6), (200, -15, 12), (-90, 0, 20), (300, 25, 0)]
 
@@ -39,11 +42,15 @@ class Ground:
 def rays_of(camera):
     """Directions (H, W, 3) of all pixel centres: right, down, along the optical axis.
 
-    Brown's model is undone by fixed-point iteration.
+    Brown's model is undone by fixed-point iteration, the fisheye's by OpenCV.
     """
     cols, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
     seen_x = (cols + 0.5 - camera.cx_px) / camera.fx_px
     seen_y = (rows + 0.5 - camera.cy_px) / camera.fy_px
+    if camera.model == "fisheye":
+        seen = np.stack([seen_x, seen_y], axis=-1).reshape(-1, 1, 2)
+        plane = cv2.fisheye.undistortPoints(seen, np.eye(3), np.array(camera.distortion))
+        return np.concatenate([plane.reshape(*rows.shape, 2), np.ones((*rows.shape, 1))], axis=-1)
     k1, k2, p1, p2, k3 = (*camera.distortion, 0, 0, 0, 0, 0)[:5]
     x, y = seen_x, seen_y
     for _ in range(60):
@@ -92,7 +99,11 @@ def seen_px(camera, attitude, east_m, north_m, agl_m=AGL_M):
     matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
     flat = np.nan_to_num(plane.reshape(-1, 3), nan=1e6)
     distortion = np.array(camera.distortion or (0, 0, 0, 0), dtype=float)
-    seen, _ = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), matrix, distortion)
+    if camera.model == "fisheye":
+        flat = flat.reshape(-1, 1, 3)
+        seen, _ = cv2.fisheye.projectPoints(flat, np.zeros(3), np.zeros(3), matrix, distortion)
+    else:
+        seen, _ = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), matrix, distortion)
     seen = seen.reshape(*along.shape, 2)
     return np.where(np.isfinite(along)[..., None], seen, np.nan)
 

@@ -1,7 +1,4 @@
-"""Views on a map whose ground is known at every point: found to a fraction of a pixel, or refused.
-
-The views are rendered by code that shares nothing with the program.
-"""
+"""Views on a map whose ground is known everywhere: found to a fraction of a pixel, or refused."""
 
 import math
 import shutil
@@ -11,99 +8,38 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from blots import (
+    AGL_M,
+    CAMERA,
+    GROUND,
+    Ground,
+    as_grey,
+    map_of_blots,
+    ortho_of_blots,
+    rendered,
+)
 
-from orthonav.confidence.registered import Chances, RegisteredConfidence
-from orthonav.geo.area import Area
 from orthonav.geo.camera import Camera
-from orthonav.imagery.mosaic import Mosaic
 from orthonav.localizer import Localizer
 from orthonav.mapfile import GreyLayer, open_map
 from orthonav.mapfile.layer import part_names
-from orthonav.onboard.run import locate_view
+from orthonav.onboard.run import SingleViews, locate_view
 from orthonav.prepare import BuildRequest, build_map
-from orthonav.prepare.calibrate_registration import RegistrationCalibration
 from orthonav.records import Fix, NoFix, Prior, Telemetry
 
-SIDE_M = 620
-CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 LENS = replace(CAMERA, distortion=(-0.25, 0.06, 0.001, -0.002))
-AGL_M = 150.0
-FINEST_M = 0.5
 EVIDENCE = {"score", "strength", "rival", "look", "look_rival", "peak_ratio", "look_ratio"}
 EVIDENCE |= {"gradient_correlation", "grey_correlation", "agreement", "overlap", "candidates"}
 
 
-class Ground:
-    """Grey levels of a ground of blots of many sizes, by metres east and north of its middle."""
-
-    def __init__(self, seed=0, reach_m=560.0):
-        rng = np.random.default_rng(seed)
-        side = int(reach_m / FINEST_M) * 2
-        self._grey = np.full((side, side), 128, np.float32)
-        for sigma_m in (1.5, 4.0, 12.0):
-            small = cv2.GaussianBlur(
-                rng.standard_normal((side, side), np.float32), (0, 0), sigma_m / FINEST_M
-            )
-            self._grey += 17 * small / small.std()
-        self._reach_m = reach_m
-
-    def __call__(self, east_m, north_m):
-        """The table is far finer than what it holds: a cubic spline between its pixels is it."""
-        col, row = self._reach_m + np.asarray(east_m), self._reach_m - np.asarray(north_m)
-        index = [np.float32(each / FINEST_M - 0.5) for each in (col, row)]
-        return cv2.remap(self._grey, *index, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-
-
-def as_grey(values):
-    return np.rint(np.clip(values, 0, 255)).astype(np.uint8)
-
-
-def rendered(ground, place_en_m, attitude, agl_m=AGL_M, camera=CAMERA):
-    """What the camera sees (H, W) uint8: forward-right-down body, Z-Y-X angles."""
-    cols, rows = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
-    matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
-    seen = np.stack([cols, rows], axis=-1).reshape(-1, 1, 2)
-    lens = np.array(camera.distortion or (0.0, 0, 0, 0))
-    right, down = cv2.undistortPoints(seen, matrix, lens)[:, 0].T
-    body = np.stack([-down, right, np.ones_like(right)], axis=-1)
-    ned = Rotation.from_euler("ZYX", attitude, degrees=True).apply(body)
-    north, east = (np.reshape(ned[:, i] / ned[:, 2] * agl_m, cols.shape) for i in (0, 1))
-    return as_grey(ground(place_en_m[0] + east, place_en_m[1] + north))
-
-
-GROUND = Ground()
-
-
 @pytest.fixture(scope="module")
 def ortho(make_ortho, tmp_path_factory):
-    """An orthophoto of the ground, and the plane of a map of it."""
-    import pyproj
-
-    folder = tmp_path_factory.mktemp("ortho")
-    empty = np.ones((SIDE_M, SIDE_M), np.uint8)
-    path = make_ortho(folder / "2020-05.tif", empty)
-    outline = Mosaic.open([path]).outline_latlon_deg
-    frame = Area.from_outline(outline[:, 0], outline[:, 1]).frame
-    x, y = np.meshgrid(np.arange(SIDE_M) + 700_000.5, 6_599_999.5 - np.arange(SIDE_M))
-    to_degrees = pyproj.Transformer.from_crs("EPSG:2154", "EPSG:4326", always_xy=True)
-    lon, lat = to_degrees.transform(x.ravel(), y.ravel())
-    east, north = np.reshape(frame.en_from_latlon(lat, lon).T, (2, SIDE_M, SIDE_M))
-    make_ortho(path, as_grey(GROUND(east, north)))
-    return path, frame
+    return ortho_of_blots(make_ortho, tmp_path_factory.mktemp("ortho"))
 
 
 @pytest.fixture(scope="module")
 def map_path(ortho, tmp_path_factory):
-    """A map of it with 1 m pixels; its confidence is as maps of its kind learn it."""
-    path = tmp_path_factory.mktemp("map") / "area.onav"
-    confidence = RegisteredConfidence(-3.5, (0.5, 12.0, 3.0), Chances(18.0, 16.0, 30.0))
-    learnt = RegistrationCalibration(confidence, 0.6)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthonav.prepare.calibrate.CROPS", 16)
-        patch.setattr("orthonav.prepare.build.calibrate_registration", lambda *_: learnt)
-        build_map(BuildRequest([ortho[0]], path, tile_px=128, overlap=0.75, gsd_m=1.0))
-    return path
+    return map_of_blots(ortho[0], tmp_path_factory.mktemp("map") / "area.onav")
 
 
 @pytest.fixture(scope="module")
@@ -195,8 +131,8 @@ def test_covariances_are_symmetric_and_positive(localizer, plain):
 def test_another_floor_widens_the_covariance(localizer, map_path, plain):
     grey, told, _, fix = plain
     wide = Localizer(open_map(map_path))
-    floors_m2 = (wide.registration._floor_px * wide.grid.gsd_m) ** 2, (3 * wide.grid.gsd_m) ** 2
-    wide.registration._floor_px = 3.0
+    floors_m2 = (wide.registration.floor_px * wide.grid.gsd_m) ** 2, (3 * wide.grid.gsd_m) ** 2
+    wide.registration.floor_px = 3.0
     widened = wide.locate(grey, CAMERA, told).cov_en_m2 - fix.cov_en_m2
     np.testing.assert_allclose(widened, np.eye(2) * (floors_m2[1] - floors_m2[0]), atol=1e-6)
 
@@ -207,7 +143,7 @@ def test_another_floor_widens_the_covariance(localizer, map_path, plain):
 def test_a_view_blurred_by_motion_is_known_across_it_only(map_path, yaw_deg, along):
     """East and north, with the right sign of what they have in common."""
     exact = Localizer(open_map(map_path))
-    exact.registration._floor_px = 0.0
+    exact.registration.floor_px = 0.0
     grey = cv2.blur(rendered(GROUND, (0.0, 0.0), (yaw_deg, 0.0, 0.0)), (1, 25))
     fix = exact.locate(grey, CAMERA, telemetry(float(yaw_deg)))
     assert error_m(exact, fix, (0.0, 0.0)) < 1.0
@@ -528,9 +464,7 @@ def damaged(map_path, folder):
 
 def test_a_damaged_layer_is_no_fix(map_path, tmp_path, plain, caplog):
     broken = Localizer(damaged(map_path, tmp_path))
-    outcome, latency_ms = locate_view(
-        broken, plain[0], CAMERA, plain[1], use_prior=True, heading_known=True
-    )
+    outcome, latency_ms = locate_view(SingleViews(broken), plain[0], CAMERA, plain[1])
     assert isinstance(outcome, NoFix) and outcome.reason == "internal_error"
     assert "damaged" in outcome.detail and latency_ms > 0
     assert any(record.exc_info for record in caplog.records)

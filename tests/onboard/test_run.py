@@ -10,7 +10,7 @@ import pytest
 from orthonav.errors import CameraError, FlightError, MissingFileError
 from orthonav.flight import open_flight, read_image
 from orthonav.localizer import Localizer
-from orthonav.onboard.run import localize_flight, locate_view
+from orthonav.onboard.run import SingleViews, localize_flight, locate_view
 from orthonav.records import Fix, NoFix, Prior
 
 VIEWS = 8
@@ -52,7 +52,7 @@ def failing_at(localizer, monkeypatch, number, error):
 )
 def test_one_broken_view_does_not_end_a_flight(localizer, short, monkeypatch, caplog, error):
     failing_at(localizer, monkeypatch, 3, error)
-    results = list(localize_flight(localizer, short))
+    results = list(localize_flight(SingleViews(localizer), short))
     assert outcomes(results) == ["fix"] * 3 + ["internal_error"] + ["fix"] * (VIEWS - 4)
     detail = results[3].outcome.detail
     assert detail.startswith(type(error).__name__) and "\n" not in detail
@@ -63,8 +63,8 @@ def test_an_interrupt_ends_it(localizer, short, monkeypatch):
     failing_at(localizer, monkeypatch, 2, KeyboardInterrupt())
     done = []
     with pytest.raises(KeyboardInterrupt):
-        done.extend(localize_flight(localizer, short))
-    flown = localize_flight(localizer, short)
+        done.extend(localize_flight(SingleViews(localizer), short))
+    flown = localize_flight(SingleViews(localizer), short)
     assert next(flown).frame == short.views[0].frame
 
 
@@ -77,11 +77,11 @@ def test_a_position_that_is_no_number_is_no_fix(localizer, short, monkeypatch, f
         return replace(fix, **{field: np.full((2, 2), np.nan) if "cov" in field else math.nan})
 
     monkeypatch.setattr(Localizer, "locate", located)
-    assert set(outcomes(localize_flight(localizer, short))) == {"internal_error"}
+    assert set(outcomes(localize_flight(SingleViews(localizer), short))) == {"internal_error"}
 
 
 def test_order_time_and_latency(localizer, short):
-    results = list(localize_flight(localizer, short))
+    results = list(localize_flight(SingleViews(localizer), short))
     assert [result.frame for result in results] == [view.frame for view in short.views]
     assert [result.time_ns for result in results] == [v.telemetry.time_ns for v in short.views]
     assert all(0 < result.latency_ms < 60_000 for result in results)
@@ -89,7 +89,7 @@ def test_order_time_and_latency(localizer, short):
 
 def test_views_may_come_in_another_order_or_in_part(localizer, short):
     chosen = [short.views[4], short.views[1]]
-    results = list(localize_flight(localizer, short, views=chosen))
+    results = list(localize_flight(SingleViews(localizer), short, views=chosen))
     assert [result.frame for result in results] == [view.frame for view in chosen]
 
 
@@ -102,7 +102,7 @@ def test_results_come_one_by_one(localizer, short):
             taken.append(view.frame)
             yield view
 
-    flown = localize_flight(localizer, short, views=views())
+    flown = localize_flight(SingleViews(localizer), short, views=views())
     for number in range(1, 4):
         next(flown)
         assert len(taken) == number
@@ -123,8 +123,8 @@ def test_a_bad_image_is_an_error_or_skipped(localizer, copied, kind):
     path = flight.views[2].path
     path.write_bytes(BREAK[kind](path.read_bytes()))
     with pytest.raises(FlightError, match=path.name):
-        list(localize_flight(localizer, flight))
-    results = list(localize_flight(localizer, flight, skip_bad_images=True))
+        list(localize_flight(SingleViews(localizer), flight))
+    results = list(localize_flight(SingleViews(localizer), flight, skip_bad_images=True))
     assert outcomes(results) == ["fix", "fix", "bad_image", "fix"]
     assert path.name in results[2].outcome.detail and math.isnan(results[2].latency_ms)
 
@@ -133,42 +133,38 @@ def test_an_image_that_vanishes_is_named(localizer, copied):
     flight = open_flight(copied)
     flight.views[0].path.unlink()
     with pytest.raises(MissingFileError, match=flight.views[0].frame):
-        list(localize_flight(localizer, flight))
+        list(localize_flight(SingleViews(localizer), flight))
 
 
 def test_a_camera_of_another_size_ends_the_flight(localizer, short):
     wrong = replace(short, camera=short.camera.resized(640, 480))
     for skip in (False, True):
         with pytest.raises(CameraError, match=str(short.views[0].path)):
-            list(localize_flight(localizer, wrong, skip_bad_images=skip))
+            list(localize_flight(SingleViews(localizer), wrong, skip_bad_images=skip))
 
 
 def test_the_prior_is_used_only_where_it_should_be(localizer, short):
     far = Prior(0.0, 0.0, 10.0)
     views = [replace(v, telemetry=replace(v.telemetry, prior=far)) for v in short.views]
-    assert set(outcomes(localize_flight(localizer, short, views=views))) == {"outside_map"}
-    without = localize_flight(localizer, short, views=views, use_prior=False)
+    assert set(outcomes(localize_flight(SingleViews(localizer), short, views=views))) == {
+        "outside_map"
+    }
+    without = localize_flight(SingleViews(localizer, use_prior=False), short, views=views)
     assert set(outcomes(without)) == {"fix"}
 
 
 def test_the_heading_may_be_unknown(localizer, short):
     views = [replace(v, telemetry=replace(v.telemetry, yaw_deg=math.nan)) for v in short.views[:3]]
-    told = localize_flight(localizer, short, views=views)
+    told = localize_flight(SingleViews(localizer), short, views=views)
     assert set(outcomes(told)) == {"missing_telemetry"}
-    untold = localize_flight(localizer, short, views=views, heading_known=False)
+    untold = localize_flight(SingleViews(localizer, heading_known=False), short, views=views)
     assert set(outcomes(untold)) == {"fix"}
 
 
 def test_one_view_is_the_same_as_in_a_flight(localizer, short):
     view = short.views[0]
-    outcome, latency_ms = locate_view(
-        localizer,
-        read_image(view.path),
-        short.camera,
-        view.telemetry,
-        use_prior=True,
-        heading_known=True,
-    )
-    flown = next(localize_flight(localizer, short)).outcome
+    alone, grey = SingleViews(localizer), read_image(view.path)
+    outcome, latency_ms = locate_view(alone, grey, short.camera, view.telemetry)
+    flown = next(localize_flight(SingleViews(localizer), short)).outcome
     assert isinstance(outcome, Fix) and latency_ms > 0
     assert (outcome.lat_deg, outcome.lon_deg) == (flown.lat_deg, flown.lon_deg)

@@ -11,7 +11,7 @@ from orthonav.errors import MapFileError, VariantError
 from orthonav.flight import open_flight, read_truth
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
-from orthonav.onboard.run import localize_flight
+from orthonav.onboard.run import SingleViews, localize_flight
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.prepare.methods import stored_representation, usual_edges
 from orthonav.records import Fix
@@ -54,7 +54,7 @@ def test_a_map_of_any_method_flies(built, flight_path, method):
     assert recipe["method"] == method.partition(":")[0]
     assert recipe["represent"]["name"] == usual_edges(method)
     flight = open_flight(flight_path)
-    for result in localize_flight(localizer, flight, views=flight.views[:3]):
+    for result in localize_flight(SingleViews(localizer), flight, views=flight.views[:3]):
         assert isinstance(result.outcome, Fix), result.outcome
         assert np.isfinite(result.outcome.evidence["lowe_ratio"])
 
@@ -77,7 +77,7 @@ def test_registration_works_on_maps_of_other_methods(built, flight_path, method)
     flight = open_flight(flight_path)
     truth = read_truth(flight_path / "truth.csv")
     errors = []
-    for result in localize_flight(localizer, flight, views=flight.views[:5]):
+    for result in localize_flight(SingleViews(localizer), flight, views=flight.views[:5]):
         frame = localizer.sheet.frame
         place = frame.en_from_latlon(result.outcome.lat_deg, result.outcome.lon_deg)
         errors.append(np.hypot(*(place - frame.en_from_latlon(*truth[result.frame]))))

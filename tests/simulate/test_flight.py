@@ -22,6 +22,7 @@ PLAIN = ViewEffects(exposure_std=0.0, blur_px=0.0, noise_std=0.0, jpeg_quality=1
 SMALL = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
 SEEN = Camera(320, 240, 260.0, 255.0, 158.0, 121.5)
 LENS = Camera(320, 240, 260.0, 255.0, 158.0, 121.5, (-0.15, 0.03, 0.001, -0.002))
+FISH = Camera(320, 240, 260.0, 255.0, 158.0, 121.5, (0.02, -0.01, 0.003, -0.001), "fisheye")
 SIZE_PX = 96
 
 
@@ -56,7 +57,7 @@ def ground_at(area, frame, place_en_m, gsd_m=1.0):
         return raster.read(0, 0, SIZE_PX, SIZE_PX).grey
 
 
-@pytest.mark.parametrize("camera", [SEEN, LENS], ids=["pinhole", "lens"])
+@pytest.mark.parametrize("camera", [SEEN, LENS, FISH], ids=["pinhole", "lens", "fisheye"])
 @pytest.mark.parametrize("lean_std_deg", [0.0, 6.0])
 def test_the_picture_shows_the_ground_at_the_truth(area, plane, tmp_path, camera, lean_std_deg):
     flight, truth = flown(

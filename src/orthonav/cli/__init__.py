@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from types import ModuleType
 
 from orthonav import __version__
 from orthonav.errors import OrthonavError
@@ -17,6 +18,7 @@ COMMANDS = {
     "demo": "whole story on a generated area: build, fly, report",
     "build": "make a map from orthophotos",
     "info": "print what is in a map",
+    "import": "write photographs, a video or a ROS recording as a flight folder",
     "localize": "find where the views of a flight were taken",
     "evaluate": "compare fixes with the truth",
     "simulate": "fly over an orthophoto of another year",
@@ -29,6 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Matrices here are small: more BLAS threads only wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # errors are told once, by us
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     arguments = list(sys.argv[1:] if argv is None else argv)
     verbose = False
     try:
@@ -38,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
         logging.getLogger("rasterio").setLevel(logging.CRITICAL)
         with _terminable():
-            importlib.import_module(f"orthonav.cli.{options.command}").run(options)
+            _module(options.command).run(options)
             sys.stdout.flush()
     except OrthonavError as error:
         return _failed(_one_line(error), verbose)
@@ -83,8 +86,13 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     for name, text in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text, parents=[common])
         if name in arguments:
-            importlib.import_module(f"orthonav.cli.{name}").add(command)
+            _module(name).add(command)
     return parser
+
+
+def _module(command: str) -> ModuleType:
+    name = "import_" if command == "import" else command  # a word of Python's own
+    return importlib.import_module(f"orthonav.cli.{name}")
 
 
 def _one_line(error: Exception) -> str:

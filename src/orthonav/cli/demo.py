@@ -80,7 +80,7 @@ def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[
     from orthonav.geo.route import read_route
     from orthonav.localizer import Localizer
     from orthonav.mapfile import open_map
-    from orthonav.onboard.run import localize_flight
+    from orthonav.onboard.run import SingleViews, localize_flight
     from orthonav.prepare import BuildRequest, build_map
     from orthonav.publish.jsonl import write_results
     from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
@@ -114,7 +114,7 @@ def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[
     _say(options, "4/4 localizing every view anywhere on the map")
     results = []
     flight = open_flight(request.out)
-    for result in localize_flight(Localizer(opened), flight, use_prior=False):
+    for result in localize_flight(SingleViews(Localizer(opened), use_prior=False), flight):
         results.append(result)
         shown("localize", len(results) / len(flight.views))
     write_results(folder / "fixes.jsonl", results)

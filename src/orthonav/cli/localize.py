@@ -5,6 +5,7 @@ import logging
 from pathlib import Path
 
 from orthonav.cli.common import print_json, progress
+from orthonav.cli.source import add_source, open_told
 
 log = logging.getLogger(__name__)
 
@@ -12,7 +13,12 @@ log = logging.getLogger(__name__)
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("map", type=Path, metavar="MAP.onav")
-    parser.add_argument("flight", type=Path, metavar="FLIGHT_DIR")
+    parser.add_argument(
+        "flight",
+        type=Path,
+        metavar="SOURCE",
+        help="flight folder, photographs, video or ROS recording, as for `orthonav import`",
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="fixes.jsonl")
     parser.add_argument(
         "--heading",
@@ -50,6 +56,17 @@ def add(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="images that cannot be decoded become no_fix instead of an error",
     )
+    parser.add_argument(
+        "--track",
+        action="store_true",
+        help="follow the aircraft: every position rests on all views before it",
+    )
+    parser.add_argument(
+        "--hindsight",
+        action="store_true",
+        help="track, then place every view by all views of the flight, also those after it",
+    )
+    add_source(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
@@ -59,10 +76,10 @@ def run(options: argparse.Namespace) -> None:
 
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
-    from orthonav.flight import open_flight
     from orthonav.localizer import Localizer
+    from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
-    from orthonav.onboard.run import localize_flight
+    from orthonav.onboard.run import SingleViews, in_hindsight, localize_flight
     from orthonav.publish.jsonl import write_results
     from orthonav.records import Fix
     from orthonav.search.position import check_rule
@@ -77,19 +94,24 @@ def run(options: argparse.Namespace) -> None:
         raise VariantError("lowe_ratio compares tiles: give --registration off with it")
     if localizer.registration is None and options.registration == "on":
         log.warning("the map has no registration layer: positions at tile level only")
-    flight = open_flight(options.flight)
+    flight = open_told(options.flight, options)
+    how = {
+        "use_prior": options.prior == "telemetry",
+        "heading_known": options.heading == "known",
+    }
+    locator: SingleViews | Tracker = SingleViews(localizer, **how)
+    if options.track or options.hindsight:
+        locator = Tracker(localizer, hindsight=options.hindsight, **how)
     results = []
     with progress(options) as shown:
         for result in localize_flight(
-            localizer,
-            flight,
-            use_prior=options.prior == "telemetry",
-            heading_known=options.heading == "known",
-            skip_bad_images=options.skip_bad_images,
-            accept=accept,
+            locator, flight, skip_bad_images=options.skip_bad_images, accept=accept
         ):
             results.append(result)
-            shown("localize", len(results) / len(flight.views))
+            if flight.expected:
+                shown("localize", min(1.0, len(results) / flight.expected))
+    if isinstance(locator, Tracker) and options.hindsight:
+        results = in_hindsight(locator, results, accept)
     write_results(options.out, results)
     fixes = sum(isinstance(result.outcome, Fix) for result in results)
     latencies = np.array([result.latency_ms for result in results])

@@ -1,13 +1,26 @@
 """Flight folders: views, telemetry, camera and, where known, truth. Format: design section 5."""
 
-from orthonav.flight.folder import FlightFolder, FlightView, open_flight, read_image, read_truth
+from orthonav.flight.folder import (
+    FlightFolder,
+    FlightView,
+    decode_image,
+    open_flight,
+    read_camera,
+    read_image,
+    read_truth,
+)
+from orthonav.flight.recording import Flight, View
 from orthonav.flight.writer import FlightWriter
 
 __all__ = [
+    "Flight",
     "FlightFolder",
     "FlightView",
     "FlightWriter",
+    "View",
+    "decode_image",
     "open_flight",
+    "read_camera",
     "read_image",
     "read_truth",
 ]

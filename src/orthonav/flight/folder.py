@@ -43,6 +43,15 @@ class FlightView:
     path: Path
     telemetry: Telemetry
 
+    @property
+    def where(self) -> str:
+        """Where the picture lies, for messages."""
+        return str(self.path)
+
+    def grey(self) -> NDArray[np.uint8]:
+        """Grey levels (H, W) uint8 of the picture; raises as `read_image`."""
+        return read_image(self.path)
+
 
 @dataclass(frozen=True)
 class FlightFolder:
@@ -52,6 +61,11 @@ class FlightFolder:
     camera: Camera
     note: str
     views: tuple[FlightView, ...]
+
+    @property
+    def expected(self) -> int:
+        """Number of views."""
+        return len(self.views)
 
 
 def open_flight(path: Path) -> FlightFolder:
@@ -84,14 +98,22 @@ def read_image(path: Path) -> NDArray[np.uint8]:
         raise FlightError(
             f"image of the flight cannot be read ({error.strerror}): {path}"
         ) from error
+    return decode_image(data, str(path))
+
+
+def decode_image(data: bytes, where: str) -> NDArray[np.uint8]:
+    """Grey levels (H, W) uint8 of an encoded image (JPEG, PNG, TIFF); `where` it lies, for errors.
+
+    Raises `FlightError` where it cannot be decoded or was cut short.
+    """
     if _is_cut_jpeg(data):
-        raise FlightError(f"image of the flight was cut short: {path}")
+        raise FlightError(f"image of the flight was cut short: {where}")
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _DECODE) if data else None
     except cv2.error:
         image = None
     if image is None:
-        raise FlightError(f"image of the flight cannot be decoded: {path}")
+        raise FlightError(f"image of the flight cannot be decoded: {where}")
     return np.asarray(image, dtype=np.uint8)
 
 
@@ -146,6 +168,7 @@ def read_camera(path: Path) -> tuple[Camera, str]:
             height_px=int(raw["height_px"]),
             **{name: float(raw[name]) for name in ("fx_px", "fy_px", "cx_px", "cy_px")},
             distortion=tuple(float(value) for value in distortion),
+            model=str(raw.get("model", "brown")),
         )
         return camera, str(plain.get("note", ""))
     except CameraError as error:

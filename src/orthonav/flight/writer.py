@@ -41,31 +41,52 @@ class FlightWriter:
         jpeg_quality: int = 90,
     ) -> None:
         """Add one view: `image` (H, W, 3) RGB, JPEG or PNG by the ending of `frame`."""
-        options = [int(cv2.IMWRITE_JPEG_QUALITY), jpeg_quality]
-        if not frame.lower().endswith((".jpg", ".jpeg")):
-            options = []
-        done, data = cv2.imencode(
-            Path(frame).suffix, np.ascontiguousarray(image[..., ::-1]), options
-        )
-        if not done:
-            raise OutputError(f"image cannot be encoded: {frame}")
-        (self._folder / "frames" / frame).write_bytes(data.tobytes())
+        data = encoded(np.ascontiguousarray(image[..., ::-1]), frame, jpeg_quality)
+        self.add_encoded(frame, data, telemetry, truth_latlon_deg)
+
+    def add_encoded(
+        self,
+        frame: str,
+        data: bytes,
+        telemetry: Telemetry,
+        truth_latlon_deg: tuple[float, float] | None,
+    ) -> None:
+        """Add one view whose picture is encoded already, as `data`; its truth where known."""
+        path = self._folder / "frames" / frame
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
         self._rows.append({"frame": frame, **_columns(telemetry)})
-        lat, lon = truth_latlon_deg
-        self._truth.append((frame, f"{lat:.8f}", f"{lon:.8f}"))
+        if truth_latlon_deg is not None:
+            lat, lon = truth_latlon_deg
+            self._truth.append((frame, f"{lat:.8f}", f"{lon:.8f}"))
 
     def close(self) -> None:
-        """Write `telemetry.csv`, `flight.json` and `truth.csv`."""
+        """Write `telemetry.csv`, `flight.json` and, where any is known, `truth.csv`."""
         used = [
             name for name in OPTIONAL_COLUMNS if any(row[name] is not None for row in self._rows)
         ]
         columns = [*TELEMETRY_COLUMNS, *used]
         table = [[_text(row[name]) for name in columns] for row in self._rows]
         _write_csv(self._folder / "telemetry.csv", columns, table)
-        _write_csv(self._folder / "truth.csv", ("frame", "lat_deg", "lon_deg"), self._truth)
+        if self._truth:
+            _write_csv(self._folder / "truth.csv", ("frame", "lat_deg", "lon_deg"), self._truth)
         camera = dataclasses.asdict(self._camera)
         text = json.dumps({"camera": camera, "note": self._note}, indent=1)
         (self._folder / "flight.json").write_text(text + "\n", encoding="utf-8")
+
+
+def encoded(image: NDArray[np.uint8], frame: str, jpeg_quality: int = 90) -> bytes:
+    """`image` (H, W) grey or (H, W, 3) BGR encoded by the ending of `frame`.
+
+    Raises `OutputError` where that cannot be done.
+    """
+    options = [int(cv2.IMWRITE_JPEG_QUALITY), jpeg_quality]
+    if not frame.lower().endswith((".jpg", ".jpeg")):
+        options = []
+    done, data = cv2.imencode(Path(frame).suffix, image, options)
+    if not done:
+        raise OutputError(f"image cannot be encoded: {frame}")
+    return data.tobytes()
 
 
 def _columns(telemetry: Telemetry) -> dict[str, Any]:

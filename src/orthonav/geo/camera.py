@@ -1,4 +1,4 @@
-"""The camera: pinhole with Brown distortion, its attitude, and where it looks on flat ground.
+"""The camera: lens (`orthonav.geo.lens`), attitude, and where it looks on flat ground.
 
 Camera axes: x to the right of the image, y down the image, z along the optical axis.
 Attitude: with heading, pitch and roll 0 the optical axis points straight down and the top of the
@@ -14,18 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import CameraError
+from orthonav.geo import lens
 
 Array = NDArray[np.float64]
 MAX_DIMENSION_PX = 65_535
+_BROWN = (0, 4, 5), "k1,k2,p1,p2[,k3]"
 _HALF_PIXEL = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+_BODY_FROM_CAMERA = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+_ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Pinhole camera with Brown distortion.
+    """A camera: pinhole with Brown distortion, or fisheye.
 
     Focal lengths and principal point in pixels, measured from the outer corner of the first pixel
-    (pixel-is-area: its centre is 0.5, 0.5). `distortion` is empty or k1, k2, p1, p2[, k3], as in
+    (pixel-is-area: its centre is 0.5, 0.5). With `model` "brown", `distortion` is empty or
+    k1, k2, p1, p2[, k3]; with "fisheye" (equidistant) it is empty or k1, k2, k3, k4; both as in
     OpenCV. Raises `CameraError` on values no camera has.
     """
 
@@ -36,6 +41,7 @@ class Camera:
     cx_px: float
     cy_px: float
     distortion: tuple[float, ...] = ()
+    model: str = "brown"
 
     def __post_init__(self) -> None:
         if self.distortion and not any(self.distortion):
@@ -48,10 +54,19 @@ class Camera:
             raise CameraError(f"camera has a value that is not finite: {self}")
         if self.fx_px <= 0 or self.fy_px <= 0:
             raise CameraError(f"camera focal length must be above 0 px: {self}")
-        if len(self.distortion) not in (0, 4, 5):
+        if self.model not in ("brown", "fisheye"):
+            raise CameraError(f"camera model must be brown or fisheye, got '{self.model}'")
+        allowed, names = ((0, 4), "k1,k2,k3,k4") if self.model == "fisheye" else _BROWN
+        if len(self.distortion) not in allowed:
             raise CameraError(
-                f"camera distortion must be empty or k1,k2,p1,p2[,k3], got {self.distortion}"
+                f"camera distortion of a {self.model} lens must be empty or {names}, "
+                f"got {self.distortion}"
             )
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether straight lines stay straight, so that one homography does it."""
+        return self.model == "brown" and not self.distortion
 
     @property
     def matrix(self) -> Array:
@@ -80,9 +95,23 @@ def enu_from_camera(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Array:
     """Rotation (3, 3) from camera axes to east, north, up."""
     yaw, pitch, roll = np.radians([yaw_deg, pitch_deg, roll_deg])
     ned_from_body = _rotation(2, yaw) @ _rotation(1, pitch) @ _rotation(0, roll)
-    body_from_camera = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    enu_from_ned = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
-    return np.asarray(enu_from_ned @ ned_from_body @ body_from_camera)
+    return np.asarray(_ENU_FROM_NED @ ned_from_body @ _BODY_FROM_CAMERA)
+
+
+def attitude_of(enu_from_camera: Array) -> tuple[float, float, float]:
+    """Heading (0..360), pitch and roll in degrees of a rotation (3, 3) from camera axes.
+
+    The inverse of `enu_from_camera`. At a pitch of 90 or -90 only the sum or the difference of
+    heading and roll is determined; the roll is then 0.
+    """
+    ned_from_body = _ENU_FROM_NED.T @ enu_from_camera @ _BODY_FROM_CAMERA.T
+    pitch = math.asin(min(1.0, max(-1.0, -ned_from_body[2, 0])))
+    if math.hypot(ned_from_body[0, 0], ned_from_body[1, 0]) < 1e-9:
+        yaw, roll = math.atan2(-ned_from_body[0, 1], ned_from_body[1, 1]), 0.0
+    else:
+        yaw = math.atan2(ned_from_body[1, 0], ned_from_body[0, 0])
+        roll = math.atan2(ned_from_body[2, 1], ned_from_body[2, 2])
+    return math.degrees(yaw) % 360 % 360, math.degrees(pitch), math.degrees(roll)
 
 
 def _rotation(axis: int, angle_rad: float) -> Array:
@@ -129,32 +158,27 @@ def axis_on_ground_en_m(
 
 
 def distort(camera: Camera, xy: Array) -> Array:
-    """Distorted camera-plane coordinates `(..., 2)` of ideal ones (Brown's model, as OpenCV's).
+    """Distorted camera-plane coordinates `(..., 2)` of ideal ones, as OpenCV's models give them.
 
     Points beyond the radius where the model stops growing (it folds back there) become NaN.
     """
-    if not camera.distortion:
+    if camera.is_pinhole:
         return xy
-    k1, k2, p1, p2, k3 = (*camera.distortion, 0.0)[:5]
-    x, y = xy[..., 0], xy[..., 1]
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    out = np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        axis=-1,
-    )
-    out[r2 >= _fold_r2(k1, k2, k3)] = np.nan
-    return out
+    if camera.model == "fisheye":
+        return lens.fisheye_distort(camera.distortion, xy)
+    return lens.brown_distort(camera.distortion, xy)
 
 
-def _fold_r2(k1: float, k2: float, k3: float) -> float:
-    """Squared radius at which the radial model stops growing; infinite where it never does."""
-    inverse = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])  # of 1 / r2: the leading 1 keeps it sound
-    largest = inverse.real[np.abs(inverse.imag) < 1e-9].max(initial=0.0)
-    return float(1 / largest) if largest > 1e-12 else math.inf
+def undistort(camera: Camera, xy: Array) -> Array:
+    """Ideal camera-plane coordinates `(..., 2)` of distorted ones: the inverse of `distort`.
+
+    Points that no ideal point is distorted to become NaN.
+    """
+    if camera.is_pinhole:
+        return xy
+    if camera.model == "fisheye":
+        return lens.fisheye_undistort(camera.distortion, xy)
+    return lens.brown_undistort(camera.distortion, xy)
 
 
 def footprint_en_m(

@@ -128,7 +128,7 @@ def _window(
     camera_from_window = camera_from_en(*attitude) @ en_from_window
     corners = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1.0]])
     depth = corners @ camera_from_window[2]
-    if view.camera.distortion or depth.min() <= 0:
+    if not view.camera.is_pinhole or depth.min() <= 0:
         return _remapped(view, camera_from_window, shape)
     return _warped(view, camera_from_window, shape, corners)
 

@@ -73,7 +73,7 @@ SURE_AT_LOOK = _Sure(1.8, 1.5, 1.5)
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class PreparedFootprint:
     """A view made ready: its templates, levels, and where the camera is seen from its middle.
 
     `rectified_at` makes the view at the ground resolution of a level.
@@ -109,7 +109,7 @@ class RegistrationLocalizer:
         self.registrar = Registrar(Reference(layer))
         self.confidence, self.radius_m = confidence, radius_m
         self.propose = propose
-        self._floor_px, self._last_ms = floor_px, last_ms
+        self.floor_px, self._last_ms = floor_px, last_ms
 
     def locate(
         self,
@@ -132,7 +132,7 @@ class RegistrationLocalizer:
 
     def prepared(
         self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry, heading_known: bool
-    ) -> _View | NoFix:
+    ) -> PreparedFootprint | NoFix:
         """The view rectified to the level where it is finished, heading up, all that it sees."""
         agl_m = telemetry.agl_m
         lean = math.cos(math.radians(telemetry.pitch_deg)) * math.cos(
@@ -166,9 +166,9 @@ class RegistrationLocalizer:
         offset = rectified.offset_en_m / self.grid.gsd_m
         side_px = math.sqrt(float(rectified.valid.sum())) * gsd_m / self.grid.gsd_m
         camera_px = np.array([-offset[0], offset[1]])
-        return _View(rectified_at, templates, levels, side_px, camera_px, pose_prior)
+        return PreparedFootprint(rectified_at, templates, levels, side_px, camera_px, pose_prior)
 
-    def best(self, view: _View, prior: Prior | None) -> Registered | None:
+    def best(self, view: PreparedFootprint, prior: Prior | None) -> Registered | None:
         """The best place over all ways of search that had to be tried."""
         judged: list[Placed] = []
         best: Registered | None = None
@@ -193,10 +193,12 @@ class RegistrationLocalizer:
         finer = ViewTemplates(made.grey, made.valid, view.levels.final - 1)
         return self.registrar.deepened(view.templates, finer, view.levels, best)
 
-    def _finished(self, view: _View, judged: list[Placed], candidates: int) -> Registered:
+    def _finished(
+        self, view: PreparedFootprint, judged: list[Placed], candidates: int
+    ) -> Registered:
         return self.registrar.finished(view.templates, view.levels, judged, view.prior, candidates)
 
-    def _looks_sure(self, view: _View, judged: list[Placed], enough: _Sure) -> bool:
+    def _looks_sure(self, view: PreparedFootprint, judged: list[Placed], enough: _Sure) -> bool:
         """Whether finishing the best of them may end the search."""
         best, rival = self.registrar.standing(view.templates, judged, view.prior)
         return best > enough.strength * self._chances.look and best > enough.look_ratio * rival
@@ -216,7 +218,9 @@ class RegistrationLocalizer:
     def _chances(self) -> Chances:
         return self.confidence.chances if self.confidence else USUAL_CHANCES
 
-    def _ways(self, view: _View, prior: Prior | None) -> Iterator[tuple[int, list[Candidate]]]:
+    def _ways(
+        self, view: PreparedFootprint, prior: Prior | None
+    ) -> Iterator[tuple[int, list[Candidate]]]:
         """Candidates and the level they were found at, by the cheapest way first.
 
         The level where views are judged misses least: it alone is searched where that is cheap,
@@ -247,7 +251,7 @@ class RegistrationLocalizer:
                 if stage:
                     yield look, self._searched(view, prior, look, stage, STAGE_CANDIDATES)
 
-    def _tiles(self, view: _View, prior: Prior | None) -> NDArray[np.intp] | None:
+    def _tiles(self, view: PreparedFootprint, prior: Prior | None) -> NDArray[np.intp] | None:
         """Rows of the tiles that the prior allows, None for all."""
         if prior is None or self.propose is None:
             return None
@@ -257,14 +261,18 @@ class RegistrationLocalizer:
         reach_m = self._reach_px(view, prior) * grid.gsd_m + grid.stride_m
         return rows_within(self.propose.centres_en_m, centre, reach_m)
 
-    def _tiles_ms(self, view: _View, rows: NDArray[np.intp] | None, poses: int) -> float:
+    def _tiles_ms(
+        self, view: PreparedFootprint, rows: NDArray[np.intp] | None, poses: int
+    ) -> float:
         """What candidates from tiles cost; infinite where there can be none."""
         if self.propose is None or not self.propose.fits(view.side_px):
             return math.inf
         tiles = len(self.propose.centres_en_m) if rows is None else len(rows)
         return self.propose.cost_ms(poses, tiles) if tiles else math.inf
 
-    def _search_ms(self, view: _View, prior: Prior | None, level: int, poses: int) -> float:
+    def _search_ms(
+        self, view: PreparedFootprint, prior: Prior | None, level: int, poses: int
+    ) -> float:
         rows, cols = self.registrar.reference.shape(level)
         if prior is not None:
             across = 2 * self._reach_px(view, prior) / 2**level
@@ -277,7 +285,7 @@ class RegistrationLocalizer:
 
     def _searched(
         self,
-        view: _View,
+        view: PreparedFootprint,
         prior: Prior | None,
         level: int,
         poses: list[tuple[float, float]],
@@ -298,7 +306,7 @@ class RegistrationLocalizer:
         worth = sum(each.score >= CANDIDATE_SHARE * found[0].score for each in found)
         return found[: max(worth, MIN_CANDIDATES)]
 
-    def _prior_px(self, prior: Prior, view: _View) -> tuple[float, float]:
+    def _prior_px(self, prior: Prior, view: PreparedFootprint) -> tuple[float, float]:
         """Where the middle of the view should lie by the prior, x and y at level 0."""
         east, north = self.sheet.frame.en_from_latlon(prior.lat_deg, prior.lon_deg)
         x = (float(east) - self.grid.west_m) / self.grid.gsd_m
@@ -309,20 +317,20 @@ class RegistrationLocalizer:
         moved = np.array([[cos, -sin], [sin, cos]]) @ view.camera_px
         return x - float(moved[0]), y - float(moved[1])
 
-    def _reach_px(self, view: _View, prior: Prior) -> float:
+    def _reach_px(self, view: PreparedFootprint, prior: Prior) -> float:
         """How far from there the middle of the view may lie."""
         lean = float(np.hypot(*view.camera_px))
         turn = 2.0 if view.prior.turn_rad is None else 2 * view.prior.turn_std_rad
         reach = PRIOR_SIGMAS * max(prior.std_m, 0.0) / self.grid.gsd_m
         return float(reach + lean * min(turn, 1.0) + 2.0 * 2**view.levels.coarse)
 
-    def _touches_map(self, prior: Prior, view: _View) -> bool:
+    def _touches_map(self, prior: Prior, view: PreparedFootprint) -> bool:
         x, y = self._prior_px(prior, view)
         reach = self._reach_px(view, prior)
         rows, cols = self.registrar.reference.shape(0)
         return -reach < x < cols + reach and -reach < y < rows + reach
 
-    def _fix(self, view: _View, best: Registered, telemetry: Telemetry) -> Fix:
+    def _fix(self, view: PreparedFootprint, best: Registered, telemetry: Telemetry) -> Fix:
         placed, gsd_m = best.placed, self.grid.gsd_m
         x, y = placed.pose.map_px(view.camera_px)
         east, north = self.grid.west_m + x * gsd_m, self.grid.north_m - y * gsd_m
@@ -340,14 +348,14 @@ class RegistrationLocalizer:
             evidence=MappingProxyType(evidence),
         )
 
-    def _covariance(self, view: _View, best: Registered) -> NDArray[np.float64]:
+    def _covariance(self, view: PreparedFootprint, best: Registered) -> NDArray[np.float64]:
         """Covariance (2, 2) of the camera's east and north in m2."""
         pose, covariance = best.placed.pose, best.placed.covariance
         assert covariance is not None
         moved = pose.linear @ view.camera_px
         camera_from_pose = np.array([[1, 0, -moved[1], moved[0]], [0, 1, moved[0], moved[1]]])
         spread = camera_from_pose @ covariance @ camera_from_pose.T
-        spread += np.eye(2) * self._floor_px**2
+        spread += np.eye(2) * self.floor_px**2
         flip = np.diag([1.0, -1.0]) * self.grid.gsd_m
         out = np.asarray(flip @ spread @ flip)
         out.flags.writeable = False

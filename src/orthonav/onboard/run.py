@@ -3,29 +3,64 @@
 import logging
 import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.confidence.accept import Acceptance
 from orthonav.errors import CameraError, FlightError
-from orthonav.flight.folder import FlightFolder, FlightView, read_image
+from orthonav.flight.recording import Flight, View
 from orthonav.geo.camera import Camera
 from orthonav.localizer.localizer import Localizer
+from orthonav.localizer.tracker import Tracker
 from orthonav.records import Fix, NoFix, Telemetry, ViewResult
 
 log = logging.getLogger(__name__)
 
 
+class Locator(Protocol):
+    """What places the views of one flight: each for itself, or as a track."""
+
+    def locate(self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry) -> Fix | NoFix:
+        """Where `grey` (H, W) was taken. Raises `CameraError` where the camera is another."""
+
+    def passed(self, camera: Camera, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+        """What is known at a view whose picture cannot be used, for `reason`."""
+
+    @property
+    def state_name(self) -> str | None:
+        """State of the track, None where there is none."""
+
+
+@dataclass(frozen=True)
+class SingleViews:
+    """Every view for itself."""
+
+    localizer: Localizer
+    use_prior: bool = True
+    heading_known: bool = True
+    state_name: str | None = None
+
+    def locate(self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry) -> Fix | NoFix:
+        """See `Localizer.locate`."""
+        return self.localizer.locate(
+            grey,
+            camera,
+            telemetry,
+            prior=telemetry.prior if self.use_prior else None,
+            heading_known=self.heading_known,
+        )
+
+    def passed(self, camera: Camera, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+        """Nothing."""
+        return reason
+
+
 def locate_view(
-    localizer: Localizer,
-    grey: NDArray[np.uint8],
-    camera: Camera,
-    telemetry: Telemetry,
-    *,
-    use_prior: bool,
-    heading_known: bool,
+    locator: Locator, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry
 ) -> tuple[Fix | NoFix, float]:
     """Place one view; whatever goes wrong inside is a `NoFix`. Also the time taken, in ms.
 
@@ -33,32 +68,22 @@ def locate_view(
     """
     start = time.perf_counter()
     try:
-        outcome = localizer.locate(
-            grey,
-            camera,
-            telemetry,
-            prior=telemetry.prior if use_prior else None,
-            heading_known=heading_known,
-        )
-        if isinstance(outcome, Fix) and not _is_finite(outcome):
-            outcome = NoFix("internal_error", "the position came out as not a number")
+        outcome = locator.locate(grey, camera, telemetry)
     except CameraError:
         raise
     except Exception as error:  # One bad view never ends a flight.
         log.exception("view could not be processed")
-        outcome = NoFix("internal_error", f"{type(error).__name__}: {error}")
-    return outcome, (time.perf_counter() - start) * 1e3
+        outcome = _passed(locator, camera, telemetry, _internal(error))
+    return _finite(outcome), (time.perf_counter() - start) * 1e3
 
 
 def localize_flight(
-    localizer: Localizer,
-    flight: FlightFolder,
+    locator: Locator,
+    flight: Flight,
     *,
-    use_prior: bool = True,
-    heading_known: bool = True,
     skip_bad_images: bool = False,
     accept: Acceptance | None = None,
-    views: Iterable[FlightView] | None = None,
+    views: Iterable[View] | None = None,
 ) -> Iterator[ViewResult]:
     """Results for the views of a recorded flight, in order, as they are computed.
 
@@ -69,26 +94,52 @@ def localize_flight(
     for view in flight.views if views is None else views:
         outcome: Fix | NoFix
         try:
-            grey = read_image(view.path)
+            grey = view.grey()
         except FlightError as error:
             if not skip_bad_images:
                 raise
-            outcome, latency_ms = NoFix("bad_image", str(error)), math.nan
+            reason = NoFix("bad_image", str(error))
+            outcome = _finite(_passed(locator, flight.camera, view.telemetry, reason))
+            latency_ms = math.nan
         else:
             try:
-                outcome, latency_ms = locate_view(
-                    localizer,
-                    grey,
-                    flight.camera,
-                    view.telemetry,
-                    use_prior=use_prior,
-                    heading_known=heading_known,
-                )
+                outcome, latency_ms = locate_view(locator, grey, flight.camera, view.telemetry)
             except CameraError as error:
-                raise CameraError(f"{error}: {view.path}") from error
+                raise CameraError(f"{error}: {view.where}") from error
         if accept is not None:
             outcome = accept(outcome)
-        yield ViewResult(view.frame, view.telemetry.time_ns, outcome, latency_ms)
+        yield ViewResult(
+            view.frame, view.telemetry.time_ns, outcome, latency_ms, locator.state_name
+        )
+
+
+def in_hindsight(
+    tracker: Tracker, results: Sequence[ViewResult], accept: Acceptance | None
+) -> list[ViewResult]:
+    """Results of a whole flight again, every view placed by all of them."""
+    placed = [_finite(outcome) for outcome in tracker.in_hindsight()]
+    chosen = placed if accept is None else [accept(outcome) for outcome in placed]
+    return [
+        replace(result, outcome=outcome) for result, outcome in zip(results, chosen, strict=True)
+    ]
+
+
+def _passed(locator: Locator, camera: Camera, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+    try:
+        return locator.passed(camera, telemetry, reason)
+    except Exception as error:
+        log.exception("view could not be passed over")
+        return _internal(error)
+
+
+def _internal(error: Exception) -> NoFix:
+    return NoFix("internal_error", f"{type(error).__name__}: {error}")
+
+
+def _finite(outcome: Fix | NoFix) -> Fix | NoFix:
+    if isinstance(outcome, Fix) and not _is_finite(outcome):
+        return NoFix("internal_error", "the position came out as not a number")
+    return outcome
 
 
 def _is_finite(fix: Fix) -> bool:

@@ -1,8 +1,9 @@
 """`fixes.jsonl`, written and read side by side: one JSON object per view, in order of the flight.
 
-The keys of a line and their order are those of `KEYS`. Numbers that are not known (NaN, infinite)
-are written as null and read as NaN. `time_s` is written with all nine decimals that differ from
-zero, so that nanoseconds since 1970 survive, which a float64 of seconds cannot hold.
+The keys of a line and their order are those of `KEYS`; those of a track end with `TRACK_KEYS`.
+Numbers that are not known (NaN, infinite) are written as null and read as NaN. `time_s` is written
+with all nine decimals that differ from zero, so that nanoseconds since 1970 survive, which a
+float64 of seconds cannot hold.
 """
 
 import json
@@ -36,6 +37,11 @@ KEYS = (
     "evidence",  # names and numbers
     "latency_ms",
 )
+TRACK_KEYS = (
+    "tracked",  # true: the position rests on all views so far, not on this one alone
+    "state",  # "searching", "tracking" or "lost"
+)
+STATES = ("searching", "tracking", "lost")
 _NULL_IN_FIX = {"reason": None, "detail": None}
 _NULL_IN_NO_FIX = dict.fromkeys(KEYS[3:10])
 _TIME_LIMIT_S = 2**63 / 1e9
@@ -51,7 +57,11 @@ def result_to_json(result: ViewResult) -> str:
     }
     texts = {key: json.dumps(value, allow_nan=False) for key, value in values.items()}
     texts["time_s"] = _seconds(result.time_ns)
-    return "{" + ", ".join(f'"{key}": {texts[key]}' for key in KEYS) + "}"
+    keys: tuple[str, ...] = KEYS
+    if result.state is not None:
+        keys += TRACK_KEYS
+        texts |= {"tracked": "true", "state": json.dumps(result.state)}
+    return "{" + ", ".join(f'"{key}": {texts[key]}' for key in keys) + "}"
 
 
 def result_from_json(line: str) -> ViewResult:
@@ -71,6 +81,7 @@ def result_from_json(line: str) -> ViewResult:
         time_ns=_time_ns(values),
         outcome=_outcome(values),
         latency_ms=_number(values, "latency_ms"),
+        state=_state(values),
     )
 
 
@@ -117,6 +128,13 @@ def _outcome_values(outcome: Fix | NoFix) -> dict[str, Any]:
         "agl_m": _or_none(outcome.agl_m),
         **_NULL_IN_FIX,
     }
+
+
+def _state(values: Mapping[str, Any]) -> str | None:
+    state = values.get("state")
+    if state is not None and state not in STATES:
+        raise FlightError(f"state: expected one of {', '.join(STATES)}, got {state!r:.40}")
+    return state
 
 
 def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:

@@ -106,6 +106,10 @@ class Refiner:
             covariance += np.outer(move := self._to_map(seen) @ step, move)
         return replace(best, covariance=covariance, agreement=seen.agreement())
 
+    def seen(self, pose: Pose) -> "_Seen":
+        """The view beside the map at a pose, until this or another refiner looks again."""
+        return self._scratch.seen(_Window(self.template, self.reference, pose), pose)
+
     def _hessian(self, seen: "_Seen") -> NDArray[np.float64]:
         """Gauss-Newton matrix (4, 4) over the part of the view that lies on the map."""
         if seen.overlap > WHOLE_OVERLAP:
@@ -126,11 +130,7 @@ class Refiner:
         observed = np.zeros((4, 4))
         for gain, mine, other in zip(gains, self._jacobian, theirs, strict=True):
             observed += gain * (mine @ other.T)
-        observed = (observed + observed.T) / 2
-        own = np.sqrt(np.diag(self._hessian(seen))) + 1e-12
-        values, vectors = np.linalg.eigh(observed / np.outer(own, own))
-        inverse = (vectors / np.maximum(values, MIN_CURVATURE)) @ vectors.T
-        return np.asarray(inverse / np.outer(own, own))
+        return bounded_inverse((observed + observed.T) / 2, self._hessian(seen))
 
     def _step(self, seen: "_Seen") -> NDArray[np.float64]:
         """Gauss-Newton step of the window: x, y (px of the level), turn, log scale."""
@@ -160,6 +160,16 @@ class Refiner:
         inverse = self._observed_inverse(seen)
         to_map = self._to_map(seen)
         return np.asarray(to_map @ inverse @ spread @ inverse @ to_map.T)
+
+
+def bounded_inverse(
+    observed: NDArray[np.float64], hessian: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Inverse (P, P) of `observed`, no direction held less than a share of what `hessian` says."""
+    own = np.sqrt(np.diag(hessian)) + 1e-12
+    values, vectors = np.linalg.eigh(observed / np.outer(own, own))
+    inverse = (vectors / np.maximum(values, MIN_CURVATURE)) @ vectors.T
+    return np.asarray(inverse / np.outer(own, own))
 
 
 class _Window:

@@ -113,8 +113,7 @@ def _products(jacobian: Array) -> NDArray[np.float64]:
 def derivatives(channels: Array, mask: Array) -> Array:
     """How channels (C, H, W) change with a small step of the window: (C, 4, H, W)."""
     height, width = mask.shape
-    x = (np.arange(width, dtype=np.float32) + np.float32(0.5 - width / 2))[None]
-    y = (np.arange(height, dtype=np.float32) + np.float32(0.5 - height / 2))[:, None]
+    x, y = _from_middle(height, width)
     out = np.empty((len(channels), 4, height, width), dtype=np.float32)
     for channel, into in zip(channels, out, strict=True):
         dx = np.asarray(cv2.Sobel(channel, cv2.CV_32F, 1, 0, scale=1 / 8), np.float32)
@@ -125,6 +124,23 @@ def derivatives(channels: Array, mask: Array) -> Array:
         np.subtract(dy * x, dx * y, out=into[2])
         np.add(dx * x, dy * y, out=into[3])
     return out
+
+
+def basis_fields(shape: tuple[int, ...]) -> Array:
+    """By how much x and y of each pixel change with those steps: (4, 2, H, W)."""
+    x, y = _from_middle(*shape)
+    out = np.zeros((4, 2, *shape), dtype=np.float32)
+    out[0, 0], out[1, 1] = 1, 1
+    out[2, 0], out[2, 1] = -y, x
+    out[3, 0], out[3, 1] = x, y
+    return out
+
+
+def _from_middle(height: int, width: int) -> tuple[Array, Array]:
+    """Centres of pixels from the middle of a window, x (1, W) and y (H, 1)."""
+    x = (np.arange(width, dtype=np.float32) + np.float32(0.5 - width / 2))[None]
+    y = (np.arange(height, dtype=np.float32) + np.float32(0.5 - height / 2))[:, None]
+    return x, y
 
 
 def turn_planes(made: Array, turn_rad: float, into: Array, scratch: Array) -> None:

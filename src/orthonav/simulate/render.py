@@ -7,7 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import FlightError
-from orthonav.geo.camera import Camera, camera_from_en, counted_from_centres, enu_from_camera
+from orthonav.geo.camera import (
+    Camera,
+    camera_from_en,
+    counted_from_centres,
+    enu_from_camera,
+    undistort,
+)
 
 Array = NDArray[np.float64]
 
@@ -70,7 +76,7 @@ def _projected(
             [0, 0, 1],
         ]
     )
-    if not camera.distortion:
+    if camera.is_pinhole:
         px_from_en = camera.matrix @ camera_from_en(*attitude)
         ground_from_px = ground_from_en @ np.linalg.inv(px_from_en)
         matrix = counted_from_centres(ground_from_px)
@@ -79,9 +85,9 @@ def _projected(
         seen = cv2.warpPerspective(ground_rgb, matrix, size, flags=flags, borderMode=border)
         return np.asarray(seen, dtype=np.uint8)
     columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
-    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
-    coefficients = np.array(camera.distortion)
-    plane = np.asarray(cv2.undistortPoints(pixels, camera.matrix, coefficients)).reshape(-1, 2)
+    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2)
+    seen_from = (pixels - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
+    plane = np.nan_to_num(undistort(camera, seen_from), nan=1e3)  # beyond the lens: far out
     rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
     enu = rays @ enu_from_camera(*attitude[:3]).T
     en = enu[:, :2] * (attitude[3] / np.maximum(-enu[:, 2:], 1e-9))

@@ -1,0 +1,58 @@
+"""`orthonav import`: write what somebody recorded as a flight folder."""
+
+import argparse
+import logging
+from dataclasses import asdict
+from pathlib import Path
+
+from orthonav.cli.common import print_json, progress
+from orthonav.cli.source import add_source, open_told
+
+log = logging.getLogger(__name__)
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument(
+        "source",
+        type=Path,
+        metavar="SOURCE",
+        help="folder of photographs, video, ROS 1 or 2 bag, MCAP file, or flight folder",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FLIGHT_DIR")
+    add_source(parser)
+    parser.add_argument(
+        "--jpeg-quality",
+        type=int,
+        choices=range(1, 101),
+        metavar="1..100",
+        help="write pictures that were not encoded as JPEG (default: PNG, without loss)",
+    )
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Import and say what was written."""
+    from orthonav.sources import import_flight
+
+    recording = open_told(options.source, options)
+    with progress(options) as shown:
+        done = import_flight(
+            recording, options.out, options.jpeg_quality, lambda share: shown("import", share)
+        )
+    if done.broken:
+        log.warning("%d views left out, the first: %s", done.broken, done.first_broken)
+    if done.complete < done.views:
+        log.warning(
+            "%d of %d views lack heading, pitch, roll or height",
+            done.views - done.complete,
+            done.views,
+        )
+    if options.json:
+        plain = {"flight": str(options.out), "kind": recording.kind, "note": recording.note}
+        print_json({**plain, **asdict(done)})
+    else:
+        print(
+            f"{done.views} views, {done.complete} with heading, tilt and height, "
+            f"{done.with_truth} with a position\nwritten to {options.out}"
+        )

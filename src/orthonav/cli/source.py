@@ -1,0 +1,107 @@
+"""The arguments of a source, which `import` and `localize` share."""
+
+import argparse
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from orthonav.sources import Recording
+
+log = logging.getLogger(__name__)
+
+
+def topic(text: str) -> tuple[str, str]:
+    """ROLE=NAME."""
+    role, equals, name = text.partition("=")
+    if not (role and equals and name):
+        raise argparse.ArgumentTypeError(f"expected ROLE=/topic, got '{text}'")
+    return role, name
+
+
+def add_source(parser: argparse.ArgumentParser) -> None:
+    """The arguments; see docs/flights.md."""
+    group = parser.add_argument_group("how the source is read")
+    group.add_argument(
+        "--kind",
+        choices=("flight", "photos", "video", "ros"),
+        help="what the source is (default: found by content)",
+    )
+    group.add_argument(
+        "--camera",
+        type=Path,
+        metavar="FILE",
+        help="camera of flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",
+    )
+    group.add_argument(
+        "--telemetry",
+        type=Path,
+        metavar="LOG",
+        help="log to join by time: PX4 .ulg, ArduPilot .bin or .tlog, DJI .srt, .csv",
+    )
+    group.add_argument(
+        "--time-offset-s",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="added to the times of the pictures to get those of the log",
+    )
+    group.add_argument(
+        "--mount-deg",
+        type=float,
+        nargs=3,
+        default=(0.0, 0.0, 0.0),
+        metavar=("YAW", "PITCH", "ROLL"),
+        help="camera in the aircraft: 0 0 0 (default) looks straight down, top forward",
+    )
+    group.add_argument(
+        "--topic",
+        type=topic,
+        action="append",
+        default=[],
+        metavar="ROLE=NAME",
+        help="ROS topic for image, camera_info, attitude, velocity, position or height",
+    )
+    group.add_argument(
+        "--rate-hz", type=float, default=1.0, metavar="HZ", help="views per second of a video"
+    )
+    group.add_argument(
+        "--sensor-width-mm", type=float, metavar="MM", help="of photographs, for the focal length"
+    )
+    group.add_argument(
+        "--ground-alt-m",
+        type=float,
+        metavar="M",
+        help="altitude of the ground, where only altitudes were recorded",
+    )
+    group.add_argument(
+        "--looks-down",
+        action="store_true",
+        help="take pitch and roll as 0 where they were not recorded",
+    )
+    group.add_argument(
+        "--prior-std-m", type=float, metavar="M", help="tell the recorded position as a prior"
+    )
+
+
+def open_told(path: Path, options: argparse.Namespace) -> "Recording":
+    """The source of the command line, opened; its warnings are logged."""
+    from orthonav.sources import SourceOptions, open_source
+
+    told = SourceOptions(
+        kind=options.kind,
+        camera=options.camera,
+        rate_hz=options.rate_hz,
+        telemetry=options.telemetry,
+        time_offset_s=options.time_offset_s,
+        mount_deg=tuple(options.mount_deg),
+        topics=dict(options.topic),
+        prior_std_m=options.prior_std_m,
+        sensor_width_mm=options.sensor_width_mm,
+        ground_alt_m=options.ground_alt_m,
+        looks_down=options.looks_down,
+    )
+    recording = open_source(path, told)
+    for warning in recording.warnings:
+        log.warning("%s", warning)
+    return recording

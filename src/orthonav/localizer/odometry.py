@@ -1,0 +1,174 @@
+"""How far the aircraft moved between two views, by registering one on the other."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.geo.camera import Camera
+from orthonav.localizer.checks import check_footprint
+from orthonav.localizer.rectify import prepare_view, rectify_footprint
+from orthonav.records import Telemetry
+from orthonav.register.reference import Reference
+from orthonav.register.registrar import Levels, PosePrior, Registered, Registrar
+from orthonav.register.search import bank, search
+from orthonav.register.template import ViewTemplates, halved
+from orthonav.track.model import Displacement
+
+VIEW_PX = 160
+"""Views are compared at about so many pixels across."""
+LEVELS = 3
+TURN_STD_RAD, LOG_SCALE_STD = math.radians(2.5), 0.02
+MAX_SPEED_MPS = 80.0
+MIN_SCORE_RATIO = 1.35
+MIN_CORRELATION = 0.25
+NOISE_PX, NOISE_SHARE = 0.4, 0.01
+CANDIDATES = 8
+LEAN_SHARE = 0.6
+"""How much of what a wrong lean moves a view stays in the sum of many ways: the next way takes most
+of it back."""
+Array = NDArray[np.float64]
+
+
+class _Picture:
+    """One rectified view as a map: grey and valid (H, W) at several levels."""
+
+    levels = LEVELS
+
+    def __init__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> None:
+        self._pictures = [(grey, valid)]
+        for _ in range(LEVELS - 1):
+            self._pictures.append(halved(*self._pictures[-1]))
+
+    def shape(self, level: int) -> tuple[int, int]:
+        """Rows and columns of a level."""
+        rows, cols = self._pictures[level][0].shape
+        return rows, cols
+
+    def read(
+        self, level: int, row: int, col: int, height: int, width: int
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Grey and valid (height, width) of a window, which may reach beyond the view."""
+        out = np.zeros((height, width), np.uint8), np.zeros((height, width), np.bool_)
+        rows, cols = self.shape(level)
+        y0, x0, y1, x1 = max(row, 0), max(col, 0), min(row + height, rows), min(col + width, cols)
+        if y0 < y1 and x0 < x1:
+            for whole, part in zip(self._pictures[level], out, strict=True):
+                part[y0 - row : y1 - row, x0 - col : x1 - col] = whole[y0:y1, x0:x1]
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Footprint:
+    """A view as odometry sees it: rectified, heading up, `pixel_m` per pixel.
+
+    `camera_px` is where the camera is from the middle, x to the right and y down; `telemetry` what
+    it was rectified with. What was told is less by what was known to be wrong with it: `off_deg`
+    of heading, `off_log_scale` of height.
+    """
+
+    registrar: Registrar
+    grey: NDArray[np.uint8]
+    valid: NDArray[np.bool_]
+    pixel_m: float
+    camera_px: Array
+    telemetry: Telemetry
+    off_deg: float = 0.0
+    off_log_scale: float = 0.0
+
+    @classmethod
+    def of(
+        cls,
+        grey: NDArray[np.uint8],
+        camera: Camera,
+        telemetry: Telemetry,
+        pixel_m: float | None,
+        *,
+        off_deg: float = 0.0,
+        off_log_scale: float = 0.0,
+    ) -> "Footprint | None":
+        """A view (H, W) with its telemetry, None where it shows too little."""
+        side_m = telemetry.agl_m * math.sqrt(
+            camera.width_px * camera.height_px / (camera.fx_px * camera.fy_px)
+        )
+        pixel_m = pixel_m or side_m / VIEW_PX
+        made = rectify_footprint(
+            prepare_view(grey, camera, telemetry.agl_m, pixel_m),
+            pitch_deg=telemetry.pitch_deg,
+            roll_deg=telemetry.roll_deg,
+            agl_m=telemetry.agl_m,
+            gsd_m=pixel_m,
+            multiple_px=2 ** (LEVELS - 1),
+        )
+        if check_footprint(made, 1.0, VIEW_PX / 4) is not None:
+            return None
+        camera_px = np.array([-made.offset_en_m[0], made.offset_en_m[1]]) / pixel_m
+        registrar = Registrar(Reference(_Picture(made.grey, made.valid)))
+        return cls(
+            registrar, made.grey, made.valid, pixel_m, camera_px, telemetry, off_deg, off_log_scale
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """A displacement, and the share of the later view that the earlier one showed too."""
+
+    displacement: Displacement
+    overlap: float
+
+
+def moved_between(before: Footprint, now: Footprint, lean_noise_rad: float) -> Moved | None:
+    """The way from one view to the next, both with the same `pixel_m`; None where they do not
+    show enough of the same ground to say.
+
+    The displacement is turned and scaled as was told of the view before; `lean_noise_rad` is how
+    the lean differs from what was told between views.
+    """
+    told_turn = math.radians(now.telemetry.yaw_deg - before.telemetry.yaw_deg)
+    if not math.isfinite(told_turn):
+        return None
+    found = _registered(before, now, math.remainder(told_turn, 2 * math.pi))
+    if found is None or found.peak_ratio < MIN_SCORE_RATIO:
+        return None
+    if found.placed.weighted < MIN_CORRELATION:
+        return None
+    pose = found.placed.pose
+    rows, cols = before.grey.shape
+    x, y = pose.map_px(now.camera_px) - [cols / 2, rows / 2] - before.camera_px
+    heading = math.radians(before.telemetry.yaw_deg - before.off_deg)
+    metres = before.pixel_m * math.exp(-before.off_log_scale)
+    right_m, forward_m = float(x) * metres, -float(y) * metres
+    cos, sin = math.cos(heading), math.sin(heading)
+    way = np.array([right_m * cos + forward_m * sin, forward_m * cos - right_m * sin])
+    std_m = math.hypot(NOISE_PX * before.pixel_m, NOISE_SHARE * float(np.hypot(*way)))
+    variance = std_m**2 + (LEAN_SHARE * now.telemetry.agl_m * lean_noise_rad) ** 2
+    displacement = Displacement(way, np.eye(2) * variance, relative=True)
+    return Moved(displacement, min(max(found.placed.overlap, 0.0), 1.0))
+
+
+def _registered(before: Footprint, now: Footprint, turn_rad: float) -> Registered | None:
+    """The later view registered on the earlier one."""
+    templates = ViewTemplates(now.grey, now.valid, 0)
+    rows, cols = before.grey.shape
+    side_px = math.sqrt(float(now.valid.sum()))
+    levels = Levels.of(side_px, LEVELS)
+    seconds = (now.telemetry.time_ns - before.telemetry.time_ns) / 1e9
+    far = math.hypot(rows, cols)
+    # A clock that stands still says nothing of how far it may be.
+    reach = min(MAX_SPEED_MPS * seconds / before.pixel_m, far) if seconds > 0 else far
+    prior = PosePrior(turn_rad, TURN_STD_RAD, LOG_SCALE_STD)
+    tried = bank(
+        TURN_STD_RAD, LOG_SCALE_STD, turn_step_rad=TURN_STD_RAD * 2, scale_step=0.06, sigmas=2.0
+    )
+    poses = [(turn_rad + turn, scale) for turn, scale in tried.poses]
+    level = levels.coarse
+    recipe = levels.recipe(level)
+    middle = cols / 2, rows / 2
+    registrar = before.registrar
+    window = registrar.part_window(level, recipe, side_px, middle, reach + 2.0 * 2**level)
+    candidates = search(templates.at(level, recipe), window, poses, CANDIDATES)
+    if not candidates:
+        return None
+    judged = registrar.judged(templates, levels, candidates, level, prior)
+    return registrar.finished(templates, levels, judged, prior, len(candidates))

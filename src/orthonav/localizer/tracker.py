@@ -1,0 +1,334 @@
+"""From the views of a flight to one track: registration sees, the mixture decides.
+
+Every view is placed where the track expects it, or anywhere on the map while that is not known,
+and whatever it may be is handed to the mixture with its odds. Views that overlap are registered on
+each other too, which is odometry without instruments.
+"""
+
+import math
+from dataclasses import replace
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import CameraError, MapFileError
+from orthonav.geo.camera import Camera
+from orthonav.localizer.checks import check_telemetry, check_view
+from orthonav.localizer.levelled import levelled
+from orthonav.localizer.localizer import Localizer
+from orthonav.localizer.odometry import Footprint, moved_between
+from orthonav.localizer.registration import PreparedFootprint
+from orthonav.records import Fix, NoFix, Prior, Telemetry
+from orthonav.register.pose import Pose
+from orthonav.register.registrar import Registered
+from orthonav.track import Displacement, Estimate, Mixture, Model, Sighting, State, Told
+from orthonav.track.mixture import within
+from orthonav.track.model import HEADING, LEAN, SCALE
+from orthonav.track.smooth import History
+
+LOCAL_SHARE = 0.8
+"""Belief in one place from which on views are looked for around it only."""
+LOCAL_SIGMAS = 4.0
+MIN_LOCAL_M = 30.0
+LEAST_NEW = 0.15
+"""Share of a view that counts as new although it was seen before: noise, light and lean differ."""
+LONGEST_GAP_S = 600.0
+UNKNOWN_STEP_S = 1.0
+"""Time that is taken to have passed where the clock stands still or jumps back."""
+WORTH_LOG_ODDS = -12.0
+VELOCITY_STD_MPS = 1.0
+VELOCITY_SHARE = 0.02
+Array = NDArray[np.float64]
+
+
+class Tracker:
+    """Follows one flight over one map. Mutable; not to be shared between threads."""
+
+    def __init__(
+        self,
+        localizer: Localizer,
+        *,
+        model: Model | None = None,
+        heading_known: bool = True,
+        use_prior: bool = True,
+        hindsight: bool = False,
+    ) -> None:
+        """With `use_prior` the flight begins where the first view's prior says. With `hindsight`
+        what is needed for `in_hindsight` is kept.
+
+        Raises `MapFileError` where the map has no registration layer or no confidence.
+        """
+        registration = localizer.registration
+        if registration is None or registration.confidence is None:
+            raise MapFileError("a track needs a map with a registration layer and its confidence")
+        self._registration, self._confidence = registration, registration.confidence
+        self._localizer, self._heading_known = localizer, heading_known
+        self.model = model or Model()
+        grid = localizer.grid
+        self._area_m2 = grid.width_px * grid.height_px * grid.gsd_m**2
+        self.mixture = Mixture(self.model, self._area_m2)
+        self._time_ns: int | None = None
+        self._before: Footprint | None = None
+        self._use_prior = use_prior
+        self._history = History() if hindsight else None
+        self._told: list[Telemetry] = []
+        self.state = State.SEARCHING
+
+    def locate(self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry) -> Fix | NoFix:
+        """Where the aircraft is, with this view (H, W) and all before it.
+
+        A view that shows nothing moves the track on by what is known of the velocity. Raises
+        `CameraError` if the camera is not that of the image.
+        """
+        if grey.shape != (camera.height_px, camera.width_px):
+            raise CameraError(
+                f"camera is {camera.width_px} x {camera.height_px} px, "
+                f"the image is {grey.shape[1]} x {grey.shape[0]} px"
+            )
+        refused = check_telemetry(
+            telemetry, camera, self._localizer.grid.gsd_m, self._heading_known
+        )
+        refused = refused or check_view(grey)
+        overlap = self._predict(None if refused else grey, camera, telemetry)
+        if refused is None:
+            refused = self._observe(grey, camera, telemetry, overlap)
+        return self._outcome(telemetry, refused)
+
+    @property
+    def state_name(self) -> str:
+        """The state as `fixes.jsonl` has it."""
+        return self.state.value
+
+    def passed(self, camera: Camera, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+        """Where the aircraft is at a view whose picture cannot be used, for `reason`."""
+        self._predict(None, camera, telemetry)
+        return self._outcome(telemetry, reason)
+
+    def in_hindsight(self) -> list[Fix | NoFix]:
+        """Where the aircraft was at each view so far, by all views together."""
+        if self._history is None:
+            raise ValueError("this tracker keeps no history")
+        out: list[Fix | NoFix] = []
+        for smoothed, telemetry in zip(self._history.smoothed(), self._told, strict=True):
+            if smoothed is None:
+                out.append(NoFix("searching", "no place was found"))
+                continue
+            inside = within(smoothed.mean, smoothed.covariance, self._registration.radius_m)
+            out.append(
+                self._fix(
+                    smoothed.mean,
+                    smoothed.covariance,
+                    min(smoothed.belief, 1.0) * inside,
+                    telemetry,
+                    {},
+                )
+            )
+        return out
+
+    def _outcome(self, telemetry: Telemetry, refused: NoFix | None) -> Fix | NoFix:
+        estimate = self.mixture.estimate(self._registration.radius_m)
+        self.state = State.SEARCHING if estimate is None else estimate.state
+        if self._history is not None:
+            self._history.record(self.mixture)
+            self._told.append(telemetry)
+        if estimate is None:
+            return refused or NoFix("searching", "no place has been found yet")
+        more = {
+            "hypotheses": float(len(self.mixture.hypotheses)),
+            "elsewhere": self.mixture.elsewhere,
+        }
+        return self._fix(estimate.mean, estimate.covariance, estimate.confidence, telemetry, more)
+
+    def _predict(
+        self, grey: NDArray[np.uint8] | None, camera: Camera, telemetry: Telemetry
+    ) -> float:
+        """Move the track to the time of this view; the share of it that was seen before."""
+        before, now = self._before, None
+        if grey is not None and self._heading_known:
+            now = self._footprint(grey, camera, telemetry, before)
+        if self._time_ns is None and self._use_prior and telemetry.prior is not None:
+            prior = telemetry.prior
+            place = self._localizer.sheet.frame.en_from_latlon(prior.lat_deg, prior.lon_deg)
+            self.mixture.start(place, max(prior.std_m, 1.0))
+        if self._time_ns is None:
+            self._time_ns, self._before = telemetry.time_ns, now
+            return 0.0
+        seconds = (telemetry.time_ns - self._time_ns) / 1e9
+        if not 0 < seconds < LONGEST_GAP_S:
+            seconds = UNKNOWN_STEP_S if seconds <= 0 else LONGEST_GAP_S
+        self._time_ns = telemetry.time_ns
+        moved, overlap = self._moved(before, now, telemetry, seconds)
+        self._before = now
+        self.mixture.predict(seconds, moved)
+        return overlap
+
+    def _footprint(
+        self,
+        grey: NDArray[np.uint8],
+        camera: Camera,
+        telemetry: Telemetry,
+        before: Footprint | None,
+    ) -> Footprint | None:
+        """The view for odometry, in pixels of the one before unless they differ too much."""
+        bias = self._bias()
+        known = {"off_deg": math.degrees(bias[0]), "off_log_scale": float(bias[1])}
+        corrected = _corrected(telemetry, bias)
+        if before is not None:
+            made = Footprint.of(grey, camera, corrected, before.pixel_m, **known)
+            if made is None or made.grey.size < 4 * before.grey.size:
+                return made
+        return Footprint.of(grey, camera, corrected, None, **known)
+
+    def _bias(self) -> Array:
+        """What is known to be wrong with what is told (4,): heading, log scale, pitch, roll."""
+        expected = self.mixture.estimate(self._registration.radius_m)
+        return np.zeros(4) if expected is None else expected.mean[4:]
+
+    def _moved(
+        self,
+        before: Footprint | None,
+        now: Footprint | None,
+        telemetry: Telemetry,
+        seconds: float,
+    ) -> tuple[Displacement | None, float]:
+        if before is not None and now is not None and before.pixel_m == now.pixel_m:
+            seen = moved_between(before, now, self.model.lean_noise_rad)
+            if seen is not None:
+                return seen.displacement, seen.overlap
+        velocity = telemetry.vel_en_mps
+        if velocity is None:
+            return None, 0.0
+        way = np.array(velocity) * seconds
+        std = VELOCITY_STD_MPS * seconds + VELOCITY_SHARE * float(np.hypot(*way))
+        return Displacement(way, np.eye(2) * std**2, relative=False), 0.0
+
+    def _observe(
+        self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry, overlap: float
+    ) -> NoFix | None:
+        """Look for the view and hand what it may be to the mixture; why not, if it cannot be."""
+        expected = self.mixture.estimate(self._registration.radius_m)
+        bias = np.zeros(4) if expected is None else expected.mean[4:]
+        corrected = _corrected(telemetry, bias)
+        view = self._registration.prepared(grey, camera, corrected, self._heading_known)
+        if isinstance(view, NoFix):
+            return view
+        prior, searched = self._where(expected)
+        found = self._registration.best(view, prior)
+        if found is not None:
+            told = Told(
+                math.radians(telemetry.yaw_deg) if self._heading_known else None,
+                math.radians(telemetry.pitch_deg),
+                math.radians(telemetry.roll_deg),
+            )
+            sightings = self._sightings(grey, camera, corrected, view, found, bias)
+            self.mixture.update(told, sightings, max(1 - overlap, LEAST_NEW), searched)
+        return None
+
+    def _where(self, expected: Estimate | None) -> tuple[Prior | None, tuple[Array, float] | None]:
+        """The part of the map to look at: around the track where that is nearly certain."""
+        if expected is None or expected.confidence < LOCAL_SHARE:
+            return None, None
+        spread = float(np.linalg.eigvalsh(expected.covariance[:2, :2])[-1])
+        reach = max(LOCAL_SIGMAS * math.sqrt(spread), MIN_LOCAL_M)
+        if 4 * reach**2 > self._area_m2 / 4:
+            return None, None
+        lat, lon = self._localizer.sheet.frame.latlon_from_en(expected.mean[:2])
+        return Prior(float(lat), float(lon), reach / 3), (expected.mean[:2], reach)
+
+    def _sightings(
+        self,
+        grey: NDArray[np.uint8],
+        camera: Camera,
+        telemetry: Telemetry,
+        view: PreparedFootprint,
+        found: Registered,
+        bias: Array,
+    ) -> list[Sighting]:
+        made = []
+        lean = math.radians(telemetry.pitch_deg), math.radians(telemetry.roll_deg)
+        for log_odds, pose in self._places(found):
+            placed = levelled(
+                self._registration,
+                grey,
+                camera,
+                telemetry,
+                view,
+                pose,
+                lean_rad=lean,
+                lean_std_rad=math.radians(6.0),
+            )
+            if placed is None:
+                continue
+            mean = placed.mean.copy()
+            mean[3] += bias[1]
+            made.append(Sighting(mean, placed.covariance, log_odds))
+        return made
+
+    def _places(self, found: Registered) -> list[tuple[float, Pose]]:
+        """Places with their log odds: the best, and those that were finished beside it."""
+        best = found.evidence()
+        out = [(_log_odds(self._confidence(best)), found.placed.pose)]
+        for score, placed in found.finalists:
+            if placed.pose == found.finalists[0][1].pose:
+                continue
+            share = score / max(found.score, 1e-6)
+            evidence = {
+                "strength": score,
+                "rival": found.score,
+                "look": found.look_score * share,
+                "look_rival": found.look_score,
+            }
+            log_odds = _log_odds(self._confidence(evidence))
+            if log_odds > WORTH_LOG_ODDS:
+                out.append((log_odds, placed.pose))
+        return out
+
+    def _fix(
+        self,
+        mean: Array,
+        covariance: Array,
+        confidence: float,
+        telemetry: Telemetry,
+        more: dict[str, float],
+    ) -> Fix:
+        lat, lon = self._localizer.sheet.frame.latlon_from_en(mean[:2])
+        spread = covariance[:2, :2].copy()
+        spread.flags.writeable = False
+        pitch, roll = np.degrees(mean[LEAN])
+        evidence = {
+            "heading_bias_deg": math.degrees(mean[HEADING]),
+            "log_scale_bias": float(mean[SCALE]),
+            "pitch_bias_deg": float(pitch),
+            "roll_bias_deg": float(roll),
+            "vel_east_mps": float(mean[2]),
+            "vel_north_mps": float(mean[3]),
+            **more,
+        }
+        return Fix(
+            lat_deg=float(lat),
+            lon_deg=float(lon),
+            cov_en_m2=spread,
+            confidence=confidence,
+            radius_m=self._registration.radius_m,
+            heading_deg=(telemetry.yaw_deg + math.degrees(mean[HEADING])) % 360,
+            agl_m=telemetry.agl_m * math.exp(mean[SCALE]),
+            evidence=MappingProxyType(evidence),
+        )
+
+
+def _corrected(telemetry: Telemetry, bias: Array) -> Telemetry:
+    """What is told, less what is known to be wrong with it."""
+    yaw_deg, pitch_deg, roll_deg = np.degrees(bias[[0, 2, 3]]).tolist()
+    return replace(
+        telemetry,
+        yaw_deg=telemetry.yaw_deg + yaw_deg,
+        agl_m=telemetry.agl_m * math.exp(bias[1]),
+        pitch_deg=telemetry.pitch_deg + pitch_deg,
+        roll_deg=telemetry.roll_deg + roll_deg,
+    )
+
+
+def _log_odds(confidence: float) -> float:
+    inside = min(max(confidence, 1e-12), 1 - 1e-12)
+    return math.log(inside / (1 - inside))

@@ -1,0 +1,18 @@
+"""What people record, read as flights: photographs, videos, ROS recordings, autopilots' logs."""
+
+from orthonav.sources.importing import Imported, import_flight
+from orthonav.sources.opening import open_source, source_kind
+from orthonav.sources.options import KINDS, ROLES, SourceOptions
+from orthonav.sources.recording import Recording, SourceView
+
+__all__ = [
+    "KINDS",
+    "ROLES",
+    "Imported",
+    "Recording",
+    "SourceOptions",
+    "SourceView",
+    "import_flight",
+    "open_source",
+    "source_kind",
+]

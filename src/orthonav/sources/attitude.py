@@ -1,0 +1,64 @@
+"""Angles of other makers, turned into rotations from our camera axes to east, north, up.
+
+Ours: `orthonav.geo.camera`. The makers' conventions, with sources: `docs/flights.md`. Angles are
+arrays (..., 3) of yaw, pitch, roll in degrees, rotations (..., 3, 3).
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from orthonav.geo.camera import enu_from_camera
+
+Array = NDArray[np.float64]
+Angles = tuple[float, float, float]
+
+_ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
+# A gimbal's axes look ahead, right, down; a camera's x, y, z are right, down, ahead.
+_GIMBAL_FROM_CAMERA = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+_FRD_FROM_FLU = np.diag([1.0, -1.0, -1.0])
+LOOKS_DOWN = (0.0, 0.0, 0.0)
+
+
+def ned_from_angles(yaw_pitch_roll_deg: ArrayLike) -> Array:
+    """Rotations to north-east-down of Z-Y-X angles, as autopilots and gimbals write them."""
+    return np.asarray(Rotation.from_euler("ZYX", yaw_pitch_roll_deg, degrees=True).as_matrix())
+
+
+def enu_from_gimbal_camera(yaw_pitch_roll_deg: ArrayLike) -> Array:
+    """Rotations from camera axes to ENU of gimbal angles as DJI and Autel write them.
+
+    They are those of a camera that looks ahead: pitch -90 looks straight down, and there the top
+    of the image is at the gimbal's yaw (plus its roll, about the same axis).
+    """
+    return np.asarray(_ENU_FROM_NED @ ned_from_angles(yaw_pitch_roll_deg) @ _GIMBAL_FROM_CAMERA)
+
+
+def enu_from_body_camera(ned_from_frd: Array, mount_deg: Angles = LOOKS_DOWN) -> Array:
+    """Rotations from camera axes to ENU of an autopilot's attitudes and the mount.
+
+    `mount_deg` is yaw, pitch, roll of the camera in the body: 0, 0, 0 looks straight down with
+    the top of the image forward; pitch 90 looks forward.
+    """
+    return np.asarray(_ENU_FROM_NED @ ned_from_frd @ _frd_from_camera(mount_deg))
+
+
+def enu_from_ros_camera(enu_from_flu: Array, mount_deg: Angles) -> Array:
+    """The same of attitudes as ROS writes them (REP 103): ENU from forward-left-up."""
+    return np.asarray(enu_from_flu @ _FRD_FROM_FLU @ _frd_from_camera(mount_deg))
+
+
+def rotations_of_wxyz(wxyz: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Rotations (N, 3, 3) of those quaternions (N, 4) that are one, and which are (N,) bool.
+
+    All zeros and NaN, which stand for "not known", are none.
+    """
+    with np.errstate(invalid="ignore"):
+        sound = np.abs(np.linalg.norm(wxyz, axis=1) - 1) < 0.1
+    if not sound.any():
+        return np.zeros((0, 3, 3)), sound
+    return np.asarray(Rotation.from_quat(wxyz[sound][:, [1, 2, 3, 0]]).as_matrix()), sound
+
+
+def _frd_from_camera(mount_deg: Angles) -> Array:
+    return np.asarray(_ENU_FROM_NED.T @ enu_from_camera(*mount_deg))

@@ -1,0 +1,165 @@
+"""Camera files of other programs.
+
+OpenCV, ROS and Kalibr count the principal point from the centre of the first pixel, we from its
+outer corner: theirs plus half a pixel is ours.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from orthonav.errors import CameraError
+from orthonav.files import require_file
+from orthonav.flight import read_camera
+from orthonav.geo.camera import Camera
+from orthonav.sources.guard import needed
+
+MAX_BYTES = 10_000_000
+_BROWN = ("", "brown", "plumb_bob", "rational_polynomial", "radtan", "none")
+_FISHEYE = ("equidistant", "fisheye")
+_BROKEN = (ValueError, KeyError, TypeError, AttributeError, OverflowError, IndexError)
+
+
+def read_camera_file(path: Path) -> Camera:
+    """The camera of a `flight.json`, or of a file of OpenCV (YAML, JSON), ROS or Kalibr (YAML).
+
+    Raises `MissingFileError`, `CameraError` or `MissingExtraError`.
+    """
+    path = require_file(path, "camera file")
+    if path.stat().st_size > MAX_BYTES:
+        raise CameraError(f"camera file is larger than {MAX_BYTES // 10**6} MB: {path}")
+    data = path.read_bytes()
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise CameraError(f"camera file is no text in UTF-8: {path}") from error
+    try:
+        if text.startswith("%YAML:1.0") or "opencv-matrix" in text:
+            return _opencv(text)
+        if text.lstrip().startswith("{"):
+            plain = json.loads(text)
+            return read_camera(path)[0] if "camera" in plain else _plain(plain)
+        return _plain(_yaml(text))
+    except CameraError as error:
+        raise CameraError(f"{error}: {path}") from error
+    except _BROKEN as error:
+        raise CameraError(
+            "expected flight.json, or a camera of OpenCV, ROS or Kalibr "
+            f"({type(error).__name__}: {error}): {path}"
+        ) from error
+
+
+def camera_from_numbers(
+    size_px: Sequence[int], matrix: Sequence[float], distortion: Sequence[float], model: str
+) -> Camera:
+    """A camera from width and height, fx, fy, cx, cy as others count them, and their model's name.
+
+    Raises `CameraError` on models that we do not have.
+    """
+    fx, fy, cx, cy = (float(number) for number in matrix)
+    numbers = tuple(float(number) for number in distortion)
+    if model in _FISHEYE:
+        ours = "fisheye"
+    elif model in _BROWN:
+        ours = "brown"
+        if any(numbers[5:]):
+            raise CameraError(
+                f"distortion with more than k1,k2,p1,p2,k3 is not supported, got {numbers}"
+            )
+        numbers = (*numbers, *(0.0,) * (4 - len(numbers))) if 0 < len(numbers) < 4 else numbers[:5]
+    else:
+        raise CameraError(f"distortion model '{model}' is not supported: brown or equidistant are")
+    return Camera(int(size_px[0]), int(size_px[1]), fx, fy, cx + 0.5, cy + 0.5, numbers, model=ours)
+
+
+def _yaml(text: str) -> Any:
+    yaml = needed("yaml", "camera files in YAML")
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise CameraError(f"camera file is no YAML ({error.__class__.__name__})") from error
+
+
+def _plain(plain: Any) -> Camera:
+    """A camera of ROS or Kalibr."""
+    if not isinstance(plain, Mapping):
+        raise TypeError(f"a mapping was expected, got {type(plain).__name__}")
+    cameras = [name for name in plain if str(name).startswith("cam") and str(name)[3:].isdecimal()]
+    if len(cameras) > 1:
+        raise CameraError(f"file holds {', '.join(cameras)}: leave one in it")
+    if cameras:
+        return _kalibr(plain[cameras[0]])
+    if "intrinsics" in plain:
+        return _kalibr(plain)
+    matrix = _numbers(plain["camera_matrix"]["data"], 9)
+    return camera_from_numbers(
+        (plain["image_width"], plain["image_height"]),
+        matrix[[0, 4, 2, 5]].tolist(),
+        plain["distortion_coefficients"]["data"],
+        str(plain.get("distortion_model", "plumb_bob")),
+    )
+
+
+def _kalibr(plain: Mapping[str, Any]) -> Camera:
+    if plain["camera_model"] != "pinhole":
+        raise CameraError(f"camera model '{plain['camera_model']}' is not supported: pinhole is")
+    return camera_from_numbers(
+        plain["resolution"],
+        plain["intrinsics"],
+        plain.get("distortion_coeffs", []),
+        str(plain.get("distortion_model", "none")),
+    )
+
+
+def _opencv(text: str) -> Camera:
+    try:
+        storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
+        try:
+            return _stored(storage)
+        finally:
+            storage.release()
+    except (cv2.error, SystemError) as error:
+        raise CameraError("camera file cannot be read by OpenCV") from error
+
+
+def _stored(storage: cv2.FileStorage) -> Camera:
+    matrix = _matrix(storage, "camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1")
+    lens = _matrix(
+        storage, "distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D", "D1"
+    )
+    sides = [_whole(storage, f"image_{side}") for side in ("width", "height")]
+    if 0 in sides:
+        sides = [_whole(storage, f"image_{side}") for side in ("Width", "Height")]
+    if matrix is None or matrix.size != 9 or 0 in sides:
+        raise CameraError("file lacks camera_matrix, image_width or image_height")
+    fisheye = _whole(storage, "fisheye_model") or _whole(storage, "fisheye")
+    return camera_from_numbers(
+        sides,
+        matrix.ravel()[[0, 4, 2, 5]].tolist(),
+        [] if lens is None else lens.ravel().tolist(),
+        "fisheye" if fisheye else "brown",
+    )
+
+
+def _matrix(storage: cv2.FileStorage, *names: str) -> Any:
+    for name in names:
+        node = storage.getNode(name)
+        if not node.empty() and (matrix := node.mat()) is not None:
+            return np.asarray(matrix, dtype=np.float64)
+    return None
+
+
+def _whole(storage: cv2.FileStorage, name: str) -> int:
+    node = storage.getNode(name)
+    return int(node.real()) if not node.empty() and (node.isInt() or node.isReal()) else 0
+
+
+def _numbers(values: Any, count: int) -> Any:
+    numbers = np.array(values, dtype=np.float64)
+    if numbers.shape != (count,):
+        raise ValueError(f"{count} numbers were expected, got {len(numbers)}")
+    return numbers

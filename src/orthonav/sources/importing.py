@@ -1,0 +1,76 @@
+"""Writing a source as a flight folder."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from orthonav.errors import CameraError, FlightError
+from orthonav.files import replacing_folder
+from orthonav.flight import FlightWriter
+from orthonav.flight.writer import encoded
+from orthonav.sources.recording import Recording, SourceView
+
+READABLE = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What was written: views, and of them with truth and with all that a fix needs.
+
+    `broken`: views left out because their picture cannot be decoded; `first_broken`: why.
+    """
+
+    views: int
+    with_truth: int
+    complete: int
+    broken: int
+    first_broken: str
+
+
+def import_flight(
+    recording: Recording,
+    out: Path,
+    jpeg_quality: int | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Imported:
+    """Write the views of `recording` as a flight folder `out`, whole or not at all.
+
+    Encoded pictures are copied as they are; others are written grey, as PNG or, with
+    `jpeg_quality`, as JPEG. Raises `FlightError` where no picture can be decoded, `CameraError`
+    where one is of another size than the camera, `OutputError` where `out` cannot be written.
+    """
+    views = truths = complete = broken = 0
+    first_broken = ""
+    with replacing_folder(Path(out)) as folder:
+        writer = FlightWriter(folder, recording.camera, recording.note)
+        for view in recording.views:
+            try:
+                frame, data = _picture(view, recording, jpeg_quality)
+            except FlightError as error:
+                broken, first_broken = broken + 1, first_broken or str(error)
+                continue
+            writer.add_encoded(frame, data, view.telemetry, view.truth_latlon_deg)
+            views += 1
+            truths += view.truth_latlon_deg is not None
+            complete += not view.telemetry.missing()
+            if recording.expected:
+                progress(min(1.0, (views + broken) / recording.expected))
+        if views == 0:
+            raise FlightError(first_broken or f"source holds no view: {recording.path}")
+        writer.close()
+    return Imported(views, truths, complete, broken, first_broken)
+
+
+def _picture(view: SourceView, recording: Recording, jpeg_quality: int | None) -> tuple[str, bytes]:
+    """Name and bytes of the picture as it is written, once it is known to be one."""
+    grey, camera = view.grey(), recording.camera
+    if grey.shape != (camera.height_px, camera.width_px):
+        raise CameraError(
+            f"camera is {camera.width_px} x {camera.height_px} px, the image is "
+            f"{grey.shape[1]} x {grey.shape[0]} px: {view.where}"
+        )
+    if view.data is not None and view.frame.lower().endswith(READABLE):
+        return view.frame, view.data()
+    suffix = ".png" if jpeg_quality is None else ".jpg"
+    frame = str(PurePosixPath(view.frame).with_suffix(suffix))
+    return frame, encoded(grey, frame, jpeg_quality or 0)

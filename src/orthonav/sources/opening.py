@@ -1,0 +1,114 @@
+"""Finding out what a source is, and opening it."""
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+from orthonav.errors import FlightError, MissingFileError
+from orthonav.flight import FlightFolder, open_flight, read_truth
+from orthonav.sources.cameras import read_camera_file
+from orthonav.sources.options import SourceOptions
+from orthonav.sources.photos import open_photos, photo_paths
+from orthonav.sources.recording import Recording, SourceView, as_told, fitted
+from orthonav.sources.ros import bag_suffix, open_ros
+from orthonav.sources.video import open_video
+
+_VIDEO_STARTS = (b"\x1aE\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3", b"FLV\1")
+_TS_PACKET_BYTES = 188
+
+
+def open_source(path: Path, options: SourceOptions | None = None) -> Recording:
+    """Open what somebody recorded: a flight folder, photographs, a video, ROS messages.
+
+    Raises `MissingFileError`, `FlightError`, `CameraError` or `MissingExtraError`.
+    """
+    path, options = Path(path), options or SourceOptions()
+    if not path.exists():
+        raise MissingFileError(f"source does not exist: {path}")
+    kind = options.kind or source_kind(path)
+    if kind in ("flight", "photos") and not path.is_dir():
+        raise FlightError(f"expected a folder for kind {kind}, got a file: {path}")
+    if kind == "video" and not path.is_file():
+        raise FlightError(f"expected a file for kind video, got a folder: {path}")
+    if kind == "flight":
+        return _flight(open_flight(path), options)
+    if kind == "photos":
+        return open_photos(path, options)
+    return open_video(path, options) if kind == "video" else open_ros(path, options)
+
+
+def source_kind(path: Path) -> str:
+    """`flight`, `photos`, `video` or `ros`, by content; `FlightError` where it is none of them."""
+    if path.is_dir():
+        if (path / "flight.json").exists() or (path / "telemetry.csv").exists():
+            return "flight"
+        if (path / "metadata.yaml").exists():
+            return "ros"
+        if photo_paths(path):
+            return "photos"
+        raise FlightError(
+            "expected a flight folder (flight.json), photographs or a ROS 2 bag (metadata.yaml), "
+            f"found none: {path}"
+        )
+    if path.stat().st_size == 0:
+        raise FlightError(f"source is empty: {path}")
+    if bag_suffix(path) is not None:
+        return "ros"
+    if _is_video(path):
+        return "video"
+    raise FlightError(
+        "expected a video (MP4, MOV, AVI, MKV, MPEG) or a ROS recording (.bag, .db3, .mcap); a "
+        f"log of an autopilot goes with --telemetry: {path}"
+    )
+
+
+def _is_video(path: Path) -> bool:
+    with path.open("rb") as stream:
+        head = stream.read(_TS_PACKET_BYTES + 1)
+    if head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free"):  # ISO base media, QuickTime
+        return True
+    if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
+        return True
+    transport = len(head) > _TS_PACKET_BYTES and head[0] == head[_TS_PACKET_BYTES] == 0x47
+    return transport or head.startswith(_VIDEO_STARTS)
+
+
+def _flight(folder: FlightFolder, options: SourceOptions) -> Recording:
+    """A flight folder as a source; its truth may become a prior, and its camera be another."""
+    if options.telemetry is not None:
+        raise FlightError(
+            f"a flight folder has telemetry of its own: no --telemetry: {folder.path}"
+        )
+    camera = folder.camera
+    if options.camera is not None:
+        told = read_camera_file(options.camera)
+        camera = fitted(told, camera.width_px, camera.height_px, str(folder.path))
+    path, truth, warnings = folder.path / "truth.csv", {}, []
+    try:
+        truth = read_truth(path) if path.exists() else {}
+    except FlightError as error:  # a flight can be localized without
+        warnings.append(f"truth is left out: {error}")
+    return Recording(
+        kind="flight",
+        path=folder.path,
+        camera=camera,
+        note=folder.note,
+        expected=len(folder.views),
+        stream=partial(_flight_views, folder, truth, options),
+        warnings=tuple(warnings),
+    )
+
+
+def _flight_views(
+    folder: FlightFolder, truth: dict[str, tuple[float, float]], options: SourceOptions
+) -> Iterator[SourceView]:
+    for view in folder.views:
+        known = truth.get(view.frame)
+        yield SourceView(
+            frame=view.frame,
+            telemetry=as_told(view.telemetry, known, options),
+            truth_latlon_deg=known,
+            where=view.where,
+            load=view.grey,
+            data=view.path.read_bytes,
+        )

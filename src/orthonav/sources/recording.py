@@ -1,0 +1,123 @@
+"""A recorded flight that is read view by view."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import CameraError, FlightError
+from orthonav.geo.camera import Camera
+from orthonav.records import Prior, Telemetry
+from orthonav.sources.options import SourceOptions
+from orthonav.sources.track import Track
+
+Grey = NDArray[np.uint8]
+DECIMALS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class SourceView:
+    """One view of a source: an `orthonav.flight.View` that also knows what is written of it.
+
+    `frame` ends as its picture is to be written; `data` gives the picture as it was encoded, None
+    where it was not; `load` decodes it.
+    """
+
+    frame: str
+    telemetry: Telemetry
+    truth_latlon_deg: tuple[float, float] | None
+    where: str
+    load: Callable[[], Grey]
+    data: Callable[[], bytes] | None = None
+
+    def grey(self) -> Grey:
+        """Grey levels (H, W) uint8. Raises `FlightError` where it cannot be decoded."""
+        return self.load()
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A source opened: an `orthonav.flight.Flight`. `warnings`: what people must be told."""
+
+    kind: str
+    path: Path
+    camera: Camera
+    note: str
+    expected: int
+    stream: Callable[[], Iterator[SourceView]]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def views(self) -> Iterator[SourceView]:
+        """The views, from the first; each is read when it comes."""
+        return self.stream()
+
+
+def as_told(
+    telemetry: Telemetry, truth_latlon_deg: tuple[float, float] | None, options: SourceOptions
+) -> Telemetry:
+    """The telemetry with what the options add: the recorded position as a prior, a level camera."""
+    if options.prior_std_m is not None and truth_latlon_deg is not None:
+        prior = Prior(*truth_latlon_deg, options.prior_std_m)
+        telemetry = replace(telemetry, prior=prior)
+    if options.looks_down and math.isnan(telemetry.pitch_deg + telemetry.roll_deg):
+        telemetry = replace(telemetry, pitch_deg=0.0, roll_deg=0.0)
+    return telemetry
+
+
+def rounded(telemetry: Telemetry) -> Telemetry:
+    """The telemetry as a flight folder holds it, so that a source and its import give the same."""
+    prior, velocity = telemetry.prior, telemetry.vel_en_mps
+    yaw_std, agl_std = telemetry.yaw_std_deg, telemetry.agl_std_m
+    return Telemetry(
+        time_ns=telemetry.time_ns,
+        yaw_deg=round(telemetry.yaw_deg, DECIMALS),
+        pitch_deg=round(telemetry.pitch_deg, DECIMALS),
+        roll_deg=round(telemetry.roll_deg, DECIMALS),
+        agl_m=round(telemetry.agl_m, DECIMALS),
+        yaw_std_deg=None if yaw_std is None else round(yaw_std, DECIMALS),
+        agl_std_m=None if agl_std is None else round(agl_std, DECIMALS),
+        prior=prior and Prior(*(round(number, DECIMALS) for number in astuple(prior))),
+        vel_en_mps=velocity and (round(velocity[0], DECIMALS), round(velocity[1], DECIMALS)),
+    )
+
+
+def known_at(
+    track: Track, time_ns: int, options: SourceOptions
+) -> tuple[Telemetry, tuple[float, float] | None]:
+    """Telemetry and true position at a moment of the track's own clock."""
+    truth = track.latlon_deg(time_ns)
+    telemetry = track.telemetry(time_ns, options.ground_alt_m)
+    return rounded(as_told(telemetry, truth, options)), truth
+
+
+def fitted(camera: Camera, width_px: int, height_px: int, where: str) -> Camera:
+    """The camera for pictures of this size.
+
+    Raises `CameraError` where the sides are not in the same proportion: then the picture is not
+    a smaller one of the same view but a part of it, and which part is not known.
+    """
+    if (camera.width_px, camera.height_px) == (width_px, height_px):
+        return camera
+    if abs(camera.height_px * width_px - height_px * camera.width_px) > max(
+        camera.width_px, width_px
+    ):
+        raise CameraError(
+            f"camera is {camera.width_px} x {camera.height_px} px, pictures are {width_px} x "
+            f"{height_px} px, of other proportions: calibrate in that mode: {where}"
+        )
+    return camera.resized(width_px, height_px)
+
+
+def check_overlap(track: Track, first_ns: int, last_ns: int, path: Path) -> None:
+    """Raise `FlightError` where no picture was taken while the track was recorded."""
+    span = track.span_ns()
+    if span is None or first_ns > span[1] or last_ns < span[0]:
+        told = "none" if span is None else f"{span[0] / 1e9:.3f} to {span[1] / 1e9:.3f} s"
+        raise FlightError(
+            f"pictures and telemetry do not meet: pictures {first_ns / 1e9:.3f} to "
+            f"{last_ns / 1e9:.3f} s, telemetry {told}; give --time-offset-s: {path}"
+        )

@@ -1,0 +1,157 @@
+"""ROS 1 bags, ROS 2 bags (SQLite and MCAP) and plain MCAP files with ROS messages, without ROS.
+
+Messages: https://docs.ros.org/en/rolling/p/sensor_msgs/, axes: REP 103 and REP 105.
+"""
+
+import contextlib
+import tempfile
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import CameraError, FlightError
+from orthonav.flight import decode_image
+from orthonav.geo.camera import Camera
+from orthonav.sources.cameras import read_camera_file
+from orthonav.sources.guard import needed, reading
+from orthonav.sources.logs import read_log
+from orthonav.sources.options import SourceOptions
+from orthonav.sources.recording import Recording, SourceView, check_overlap, fitted, known_at
+from orthonav.sources.ros_images import camera_of_info, grey_of_image
+from orthonav.sources.ros_topics import Topics, find_topics
+from orthonav.sources.ros_track import read_track, stamp_ns
+from orthonav.sources.track import Track
+
+MAGICS = {b"#ROSBAG V": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}
+_COMPRESSED = "sensor_msgs/msg/CompressedImage"
+_ENDINGS = {b"\xff\xd8": ".jpg", b"\x89PNG": ".png", b"II*\0": ".tif", b"MM\0*": ".tif"}
+
+
+def bag_suffix(path: Path) -> str | None:
+    """The ending that fits the content of a file, None where it is no bag."""
+    with path.open("rb") as stream:
+        head = stream.read(16)
+    return next((suffix for magic, suffix in MAGICS.items() if head.startswith(magic)), None)
+
+
+def open_ros(path: Path, options: SourceOptions) -> Recording:
+    """The flight of a recording of ROS messages.
+
+    Telemetry comes first, in one pass over its topics; images are read as they are asked for.
+    Raises `FlightError`, `CameraError` or `MissingExtraError`.
+    """
+    with _opened(path) as reader:
+        topics = find_topics(reader, options.topics, path)
+        size, first_ns, last_ns = _first_image(reader, topics, path)
+        camera = fitted(_camera(reader, topics, options, path), *size, str(path))
+        if options.telemetry is not None:
+            track = read_log(options.telemetry, options.mount_deg)
+        else:
+            track = read_track(reader, topics, options.mount_deg)
+        warnings = [] if track.attitude else ["no topic tells the attitude of the aircraft"]
+        if track.span_ns() is not None or options.telemetry is not None:
+            offset = options.time_offset_ns
+            check_overlap(track, first_ns + offset, last_ns + offset, options.telemetry or path)
+        expected = topics.image.msgcount
+    return Recording(
+        kind="ros",
+        path=path,
+        camera=camera,
+        note=f"{path.name}: {topics.told()}",
+        expected=expected,
+        stream=partial(_views, path, topics.image.topic, track, options),
+        warnings=tuple(warnings),
+    )
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A reader of the recording, whatever its file is called."""
+    highlevel = needed("rosbags.highlevel", "ROS recordings")
+    typesys = needed("rosbags.typesys", "ROS recordings")
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(reading("ROS recording", path))
+        named = path
+        if path.is_file() and (suffix := bag_suffix(path)) not in (None, path.suffix):
+            folder = stack.enter_context(tempfile.TemporaryDirectory())
+            named = Path(folder) / f"recording{suffix}"  # the library goes by the ending
+            named.symlink_to(path.resolve())
+        known = typesys.get_typestore(typesys.Stores.LATEST)  # for old bags without definitions
+        yield stack.enter_context(highlevel.AnyReader([named], default_typestore=known))
+
+
+def _first_image(reader: Any, topics: Topics, path: Path) -> tuple[tuple[int, int], int, int]:
+    """Width and height of the first image that can be read, and when images begin and end."""
+    told = "there is none"
+    for _, time_ns, raw in reader.messages(connections=topics.of(topics.image)):
+        try:
+            message = reader.deserialize(raw, topics.image.msgtype)
+            grey = _grey(message, topics.image.msgtype, "the last")
+        except Exception as error:  # a broken one is counted when its turn comes
+            told = f"{type(error).__name__}: {error}"
+            continue
+        stamp = stamp_ns(message, time_ns)
+        late_ns = max(0, reader.end_time - time_ns)
+        return (grey.shape[1], grey.shape[0]), stamp, stamp + late_ns
+    raise FlightError(f"no image of {topics.image.topic} can be read ({told}): {path}")
+
+
+def _camera(reader: Any, topics: Topics, options: SourceOptions, path: Path) -> Camera:
+    if options.camera is not None:
+        return read_camera_file(options.camera)
+    info = topics.roles.get("camera_info")
+    if info is None:
+        raise CameraError(f"no camera_info beside the images; give --camera FILE: {path}")
+    for _, _, raw in reader.messages(connections=topics.of(info)):
+        try:
+            return camera_of_info(reader.deserialize(raw, info.msgtype))
+        except CameraError as error:
+            raise CameraError(f"{error}: {path}") from error
+    raise CameraError(f"no message on {info.topic}; give --camera FILE: {path}")
+
+
+def _views(path: Path, topic: str, track: Track, options: SourceOptions) -> Iterator[SourceView]:
+    with _opened(path) as reader:
+        connections = [one for one in reader.connections if one.topic == topic]
+        messages = reader.messages(connections=connections)
+        for number, (connection, time_ns, raw) in enumerate(messages):
+            yield _view(reader, (connection.msgtype, time_ns, raw), number, path, track, options)
+
+
+def _view(
+    reader: Any,
+    message: tuple[str, int, bytes],
+    number: int,
+    path: Path,
+    track: Track,
+    options: SourceOptions,
+) -> SourceView:
+    """One view; what is broken in its message is told when its picture is asked for."""
+    kind, time_ns, raw = message
+    where, data, ending = f"image {number} of {path}", None, ".png"
+    try:
+        image = reader.deserialize(raw, kind)
+        time_ns = stamp_ns(image, time_ns)
+        load = partial(_grey, image, kind, where)
+        if kind == _COMPRESSED:
+            encoded = np.asarray(image.data, dtype=np.uint8).tobytes()
+            starts = (name for start, name in _ENDINGS.items() if encoded.startswith(start))
+            ending, data = next(starts, ".bin"), partial(bytes, encoded)
+    except Exception as error:
+        load = partial(_broken, f"{type(error).__name__}: {error}", where)
+    telemetry, truth = known_at(track, time_ns + options.time_offset_ns, options)
+    return SourceView(f"{number:06d}{ending}", telemetry, truth, where, load, data)
+
+
+def _grey(message: Any, kind: str, where: str) -> NDArray[np.uint8]:
+    if kind == _COMPRESSED:
+        return decode_image(np.asarray(message.data, dtype=np.uint8).tobytes(), where)
+    return grey_of_image(message, where)
+
+
+def _broken(told: str, where: str) -> NDArray[np.uint8]:
+    raise FlightError(f"image message cannot be read ({told}): {where}")

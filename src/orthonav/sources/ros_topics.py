@@ -1,0 +1,100 @@
+"""Which topic of a ROS recording tells what: by type, or as told."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from orthonav.errors import FlightError
+
+TYPES: dict[str, tuple[str, ...]] = {
+    "image": ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
+    "camera_info": ("sensor_msgs/msg/CameraInfo",),
+    "attitude": (
+        "sensor_msgs/msg/Imu",
+        "nav_msgs/msg/Odometry",
+        "geometry_msgs/msg/PoseStamped",
+    ),
+    "velocity": ("nav_msgs/msg/Odometry",),
+    "position": ("sensor_msgs/msg/NavSatFix",),
+    "height": (
+        "sensor_msgs/msg/Range",
+        "mavros_msgs/msg/Altitude",
+        "std_msgs/msg/Float64",
+        "std_msgs/msg/Float32",
+    ),
+}
+_PLAIN_NUMBERS = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
+_HEIGHT_NAMES = ("rel_alt", "relative_altitude", "agl", "height_above_ground")
+
+
+@dataclass(frozen=True, eq=False)
+class Topics:
+    """The connection of each role that was found, and for attitude all that may tell it."""
+
+    image: Any
+    roles: Mapping[str, Any]
+    attitudes: tuple[Any, ...]
+    connections: tuple[Any, ...]
+
+    def of(self, connection: Any) -> list[Any]:
+        """All connections on the topic of one (bags split or appended have several)."""
+        return [one for one in self.connections if one.topic == connection.topic]
+
+    def told(self) -> str:
+        """What is read from where, for people."""
+        named = {"image": self.image, **self.roles}
+        return ", ".join(f"{role} {one.topic}" for role, one in named.items())
+
+
+def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
+    """The topics of a recording by role.
+
+    Raises `FlightError` where a topic that was asked for is not there or of another type, and
+    where there is no topic of images, or more than one.
+    """
+    connections = tuple(reader.connections)
+    counted = {one.topic: one for one in connections if one.msgcount}
+    found: dict[str, list[Any]] = {}
+    for role, types in TYPES.items():
+        if role in asked:
+            found[role] = [_asked(role, asked[role], counted, path)]
+        else:
+            of_type = [one for one in counted.values() if _fits(one, role)]
+            found[role] = sorted(
+                of_type, key=lambda one: (types.index(one.msgtype), -one.msgcount, one.topic)
+            )
+    images = found.pop("image")
+    if len(images) != 1:
+        names = ", ".join(sorted(one.topic for one in images)) or "none"
+        raise FlightError(f"expected one topic of images, found {names}; give --topic: {path}")
+    infos = found["camera_info"]
+    near = [one for one in infos if _beside(one.topic, images[0].topic)]
+    found["camera_info"] = near or (infos if len(infos) == 1 else [])
+    roles = {role: ones[0] for role, ones in found.items() if ones}
+    return Topics(images[0], roles, tuple(found["attitude"]), connections)
+
+
+def _asked(role: str, name: str, counted: Mapping[str, Any], path: Path) -> Any:
+    if name not in counted:
+        raise FlightError(
+            f"no messages on {name}; there are {', '.join(sorted(counted)) or 'none'}: {path}"
+        )
+    if counted[name].msgtype not in TYPES[role]:
+        raise FlightError(
+            f"{name} carries {counted[name].msgtype}; {role} is one of "
+            f"{', '.join(TYPES[role])}: {path}"
+        )
+    return counted[name]
+
+
+def _fits(connection: Any, role: str) -> bool:
+    if connection.msgtype not in TYPES[role]:
+        return False
+    named = connection.topic.rpartition("/")[2] in _HEIGHT_NAMES
+    return named or connection.msgtype not in _PLAIN_NUMBERS
+
+
+def _beside(info: str, image: str) -> bool:
+    """Whether a camera_info is in the namespace of an image (image_raw/compressed too)."""
+    return image.startswith(info.rpartition("/")[0] + "/")

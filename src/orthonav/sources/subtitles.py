@@ -1,0 +1,122 @@
+"""DJI's telemetry in subtitle files (SRT), in its dialects; see `docs/flights.md`."""
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from orthonav.errors import FlightError
+from orthonav.sources.attitude import enu_from_gimbal_camera
+from orthonav.sources.track import Samples, Track, attitude_of_angles
+
+MAX_BYTES = 500_000_000
+_NUMBER = r"([-+]?\d+(?:\.\d+)?)"
+_TIMES = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->\s*(\d+):(\d\d):(\d\d)[,.](\d{1,3})")
+_TAG = re.compile(r"<[^<>]*>")
+_FIELD = re.compile(rf"\b([a-z]+(?:_[a-z]+)*)\s*:\s*{_NUMBER}")
+_GPS = re.compile(rf"\bGPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}")
+_BAROMETER = re.compile(rf"\bBAROMETER\s*:\s*{_NUMBER}")
+_HEIGHT = re.compile(rf"\bH\s+{_NUMBER}m\b")
+_GIMBAL = re.compile(rf"\bG\.PRY\s*\(\s*{_NUMBER}[^,]*,\s*{_NUMBER}[^,]*,\s*{_NUMBER}")
+
+
+@dataclass(frozen=True)
+class Block:
+    """One block: its times in the video in ns, and what it tells; NaN for what it does not.
+
+    `height_m` is above take-off; `alt_m` an altitude of whatever reference the drone uses.
+    """
+
+    start_ns: int
+    end_ns: int
+    lat_deg: float = math.nan
+    lon_deg: float = math.nan
+    alt_m: float = math.nan
+    height_m: float = math.nan
+    yaw_deg: float = math.nan
+    pitch_deg: float = math.nan
+    roll_deg: float = math.nan
+
+
+def read_srt(path: Path) -> Track:
+    """The track of an SRT file; times are those of its video.
+
+    Raises `FlightError` where it holds no block with telemetry.
+    """
+    if path.stat().st_size > MAX_BYTES:
+        raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
+    attitude, position, height = Samples(3), Samples(3), Samples(1)
+    last = None
+    for last in blocks(path.read_bytes()):
+        _add(last, last.start_ns, attitude, position, height)
+    if last is None:
+        raise FlightError(f"subtitles hold no block of telemetry: {path}")
+    _add(last, last.end_ns, attitude, position, height)
+    heights = height.series()
+    track = Track(
+        attitude=attitude_of_angles(attitude, enu_from_gimbal_camera),
+        heights=() if heights is None else (heights,),
+        position=position.positions(),
+    )
+    if track.attitude is None and track.position is None:
+        raise FlightError(f"subtitles tell neither position nor gimbal angles: {path}")
+    return track
+
+
+def end_ns(track: Track) -> int:
+    """The moment after which a track from subtitles or a table tells nothing more."""
+    series = (track.attitude, track.position, *track.heights)
+    return max(int(one.time_ns[-1]) for one in series if one is not None)
+
+
+def _add(block: Block, time_ns: int, attitude: Samples, position: Samples, height: Samples) -> None:
+    attitude.add(time_ns, block.yaw_deg, block.pitch_deg, block.roll_deg)
+    position.add(time_ns, block.lat_deg, block.lon_deg, block.alt_m)
+    height.add(time_ns, block.height_m)
+
+
+def blocks(data: bytes) -> Iterator[Block]:
+    """The blocks of an SRT file in order; those without a line of times are left out."""
+    text = _decoded(data)
+    for part in re.split(r"\n\s*\n", text.replace("\r\n", "\n")):
+        times = _TIMES.search(part)
+        if times:
+            start, end = _ns(times.groups()[:4]), _ns(times.groups()[4:])
+            yield _block(start, end, _TAG.sub(" ", part[times.end() :]))
+
+
+def _decoded(data: bytes) -> str:
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return data.decode("utf-16", errors="replace")
+    return data.decode("utf-8-sig", errors="replace")
+
+
+def _ns(parts: tuple[str, ...]) -> int:
+    hours, minutes, seconds = (int(part) for part in parts[:3])
+    return ((hours * 60 + minutes) * 60 + seconds) * 10**9 + int(parts[3].ljust(3, "0")) * 10**6
+
+
+def _block(start_ns: int, end: int, text: str) -> Block:
+    fields = {name: float(value) for name, value in _FIELD.findall(text)}
+    lat, lon = fields.get("latitude", math.nan), fields.get("longitude", math.nan)
+    lon = fields.get("longtitude", lon)  # so some models spell it
+    if gps := _GPS.search(text):
+        lon, lat = float(gps[1]), float(gps[2])
+        if abs(lat) > 90:  # written the other way round
+            lat, lon = lon, lat
+    height = fields.get("rel_alt", _first(_BAROMETER, text))
+    if math.isnan(height):
+        height = _first(_HEIGHT, text)
+    pitch, roll, yaw = (fields.get(f"gb_{name}", math.nan) for name in ("pitch", "roll", "yaw"))
+    if gimbal := _GIMBAL.search(text):
+        pitch, roll, yaw = (float(gimbal[i]) for i in (1, 2, 3))
+    altitude = fields.get("abs_alt", fields.get("altitude", math.nan))
+    if not (abs(lat) <= 90 and abs(lon) <= 360):
+        lat = lon = math.nan
+    return Block(start_ns, end, lat, lon, altitude, height, yaw, pitch, roll)
+
+
+def _first(pattern: re.Pattern[str], text: str) -> float:
+    found = pattern.search(text)
+    return float(found[1]) if found else math.nan

@@ -1,0 +1,85 @@
+"""Telemetry as a table over time: the columns of a flight folder's `telemetry.csv`."""
+
+import csv
+import math
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+from orthonav.errors import FlightError
+from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
+from orthonav.sources.track import Samples, Series, Track, attitude_of_angles
+
+NEEDED = ("time_s", "pitch_deg", "roll_deg")
+MAX_BYTES = 500_000_000
+_NAMES = {
+    "height": ("agl_m",),
+    "velocity": ("vel_east_mps", "vel_north_mps"),
+    "yaw_std": ("yaw_std_deg",),
+    "agl_std": ("agl_std_m",),
+    "prior": ("prior_lat_deg", "prior_lon_deg", "prior_std_m"),
+}
+
+
+def read_table(path: Path) -> Track:
+    """The track of a CSV with `time_s` and the columns of a flight's telemetry, and, where it was
+    measured, `lat_deg,lon_deg`. Angles are in our convention, of the camera.
+
+    Raises `FlightError`, naming the line, where it is no such table.
+    """
+    if path.stat().st_size > MAX_BYTES:
+        raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
+    attitude, position = Samples(3), Samples(3)
+    others = {name: Samples(len(columns)) for name, columns in _NAMES.items()}
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            reader = csv.DictReader(stream, skipinitialspace=True)
+            missing = [name for name in NEEDED if name not in (reader.fieldnames or ())]
+            if missing:
+                raise FlightError(f"columns are missing: {', '.join(missing)}: {path}")
+            for row in reader:
+                time_ns = _time_ns(row["time_s"])
+                if time_ns is None:
+                    raise FlightError(f"line {reader.line_num}: time_s is no time: {path}")
+                angles = (_number(row.get(f"{name}_deg")) for name in ("yaw", "pitch", "roll"))
+                attitude.add(time_ns, *angles)
+                place = _number(row.get("lat_deg")), _number(row.get("lon_deg"))
+                position.add(time_ns, *place, math.nan)
+                for name, columns in _NAMES.items():
+                    others[name].add(time_ns, *(_number(row.get(column)) for column in columns))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise FlightError(f"not a CSV file in UTF-8 ({error}): {path}") from error
+    return _track(attitude, position, others, path)
+
+
+def _track(attitude: Samples, position: Samples, others: dict[str, Samples], path: Path) -> Track:
+    found: dict[str, Series | None] = {name: each.series() for name, each in others.items()}
+    height = found["height"]
+    track = Track(
+        attitude=attitude_of_angles(
+            attitude, lambda angles: enu_from_body_camera(ned_from_angles(angles))
+        ),
+        heights=() if height is None else (height,),
+        position=position.positions(),
+        velocity=found["velocity"],
+        yaw_std=found["yaw_std"],
+        agl_std=found["agl_std"],
+        prior=found["prior"],
+    )
+    if track.attitude is None:
+        raise FlightError(f"telemetry has no line with pitch and roll: {path}")
+    return track
+
+
+def _time_ns(text: str | None) -> int | None:
+    try:
+        seconds = Decimal((text or "").strip())
+    except InvalidOperation:
+        return None
+    return round(seconds * 10**9) if seconds.is_finite() and abs(seconds) < 9 * 10**9 else None
+
+
+def _number(text: str | None) -> float:
+    try:
+        return float(text or "nan")
+    except ValueError:
+        return math.nan

@@ -1,0 +1,220 @@
+"""What was measured along a flight, as series over time, and telemetry at any moment of it."""
+
+import math
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from orthonav.geo.camera import attitude_of
+from orthonav.records import Prior, Telemetry
+
+Array = NDArray[np.float64]
+DAY_NS = 86_400 * 10**9
+LATEST_NS = 2**62
+GAP_NS = 2_000_000_000
+"""Across gaps longer than this nothing is interpolated: what was then is not known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Values (N, D) at increasing times (N,) in integer ns."""
+
+    time_ns: NDArray[np.int64]
+    values: Array
+
+    def around(self, time_ns: int) -> tuple[int, int, float] | None:
+        """The samples before and after a moment and the weight of the later one.
+
+        None outside the series and within gaps of more than `GAP_NS`.
+        """
+        after = int(np.searchsorted(self.time_ns, time_ns))
+        if after < len(self.time_ns) and self.time_ns[after] == time_ns:
+            return after, after, 0.0
+        if after in (0, len(self.time_ns)):
+            return None
+        start, end = int(self.time_ns[after - 1]), int(self.time_ns[after])
+        if end - start > GAP_NS:
+            return None
+        return after - 1, after, (time_ns - start) / (end - start)
+
+    def at(self, time_ns: int) -> Array:
+        """Values (D,) at a moment, linear between samples; NaN where they are not known."""
+        found = self.around(time_ns)
+        if found is None:
+            return np.full(self.values.shape[1], np.nan)
+        before, after, weight = found
+        return np.asarray((1 - weight) * self.values[before] + weight * self.values[after])
+
+
+class Samples:
+    """Collects samples in the order they come; `series` sorts them and drops what is no number."""
+
+    def __init__(self, width: int) -> None:
+        self._width = width
+        self._times = array("q")
+        self._values = array("d")
+
+    def add(self, time_ns: int, *values: float) -> None:
+        """One sample; a time that no clock tells (a damaged message) is dropped."""
+        if abs(time_ns) > LATEST_NS:
+            return
+        self._times.append(time_ns)
+        self._values.extend(values)
+
+    def arrays(self) -> tuple[NDArray[np.int64], Array]:
+        """Times (N,) and values (N, D), as they came."""
+        return np.array(self._times, dtype=np.int64), np.array(self._values).reshape(
+            -1, self._width
+        )
+
+    def series(self) -> Series | None:
+        """The series, or None where there is no sample. The first of equal times counts."""
+        return series_of(*self.arrays())
+
+    def positions(self) -> Series | None:
+        """The same of (lat_deg, lon_deg, alt_m): see `position_series`."""
+        return position_series(*self.arrays())
+
+
+def series_of(time_ns: NDArray[np.int64], values: Array) -> Series | None:
+    """A series from times (N,) and values (N, D) in any order; None where none is a number."""
+    return _sorted(time_ns, values, np.asarray(np.isfinite(values).all(axis=1)))
+
+
+def attitude_series(
+    time_ns: NDArray[np.int64], rotations: Array, known: NDArray[np.bool_] | None = None
+) -> Series | None:
+    """An attitude series from `enu_from_camera` (N, 3, 3) and whether its heading is known (N,)."""
+    if len(time_ns) == 0:
+        return None
+    quaternions = Rotation.from_matrix(rotations).as_quat()
+    flags = np.ones(len(time_ns)) if known is None else known.astype(np.float64)
+    return series_of(time_ns, np.column_stack([quaternions, flags]))
+
+
+def attitude_of_angles(
+    samples: Samples, enu_from_angles: Callable[[Array], Array]
+) -> Series | None:
+    """An attitude series from samples of yaw, pitch, roll in degrees, and what they mean.
+
+    A heading that is NaN is noted as not known; without pitch and roll there is no sample.
+    """
+    times, angles = samples.arrays()
+    sound = np.isfinite(angles[:, 1:]).all(axis=1)
+    known = np.isfinite(angles[sound, 0])
+    turns = np.where(np.isfinite(angles[sound]), angles[sound], 0.0)
+    return attitude_series(times[sound], enu_from_angles(turns), known) if sound.any() else None
+
+
+def position_series(time_ns: NDArray[np.int64], latlonalt: Array) -> Series | None:
+    """A series of (lat_deg, lon_deg, alt_m) that crosses the 180th meridian the short way.
+
+    Altitudes may be NaN. Samples at 0, 0 are left out: so recorders write "no position".
+    """
+    sound = np.isfinite(latlonalt[:, :2]).all(axis=1) & latlonalt[:, :2].any(axis=1)
+    series = _sorted(time_ns, latlonalt, np.asarray(sound))
+    if series is not None:
+        series.values[:, 1] = np.unwrap(series.values[:, 1], period=360)
+    return series
+
+
+def _sorted(time_ns: NDArray[np.int64], values: Array, sound: NDArray[np.bool_]) -> Series | None:
+    """A series of what is sound, less times a day off the others (damaged, or a clock unset)."""
+    if not sound.any():
+        return None
+    near = np.abs(time_ns - np.median(time_ns[sound])) < DAY_NS
+    times, first = np.unique(time_ns[sound & near], return_index=True)
+    return Series(times, values[sound & near][first])
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """What was measured along a flight; a series that is None was not measured.
+
+    `attitude`: quaternion x, y, z, w of `enu_from_camera`, and 1 where its heading is known.
+    `heights`: metres above ground, the better ones first. `position`: latitude, longitude,
+    altitude. `velocity`: east and north. `yaw_std`, `agl_std`, `prior` (latitude, longitude,
+    deviation): as told. `origin_ns`: the moment that a recording without a clock begins at.
+    """
+
+    attitude: Series | None
+    heights: tuple[Series, ...] = ()
+    position: Series | None = None
+    velocity: Series | None = None
+    yaw_std: Series | None = None
+    agl_std: Series | None = None
+    prior: Series | None = None
+    origin_ns: int = 0
+
+    def span_ns(self) -> tuple[int, int] | None:
+        """First and last moment of its attitude or, without any, of what else it tells."""
+        told = (self.attitude, *self.heights, self.position)
+        series = next((one for one in told if one is not None), None)
+        return None if series is None else (int(series.time_ns[0]), int(series.time_ns[-1]))
+
+    def telemetry(self, time_ns: int, ground_alt_m: float | None = None) -> Telemetry:
+        """What is known at a moment; with `ground_alt_m` height from altitude where need be."""
+        yaw, pitch, roll = angles_at(self.attitude, time_ns)
+        prior = _at(self.prior, time_ns, 3)
+        velocity = _at(self.velocity, time_ns, 2)
+        return Telemetry(
+            time_ns=time_ns,
+            yaw_deg=yaw,
+            pitch_deg=pitch,
+            roll_deg=roll,
+            agl_m=self._agl_m(time_ns, ground_alt_m),
+            yaw_std_deg=_number(_at(self.yaw_std, time_ns, 1)[0]),
+            agl_std_m=_number(_at(self.agl_std, time_ns, 1)[0]),
+            prior=Prior(*map(float, prior)) if np.isfinite(prior).all() else None,
+            vel_en_mps=(float(velocity[0]), float(velocity[1]))
+            if np.isfinite(velocity).all()
+            else None,
+        )
+
+    def latlon_deg(self, time_ns: int) -> tuple[float, float] | None:
+        """Where the aircraft was by its own GPS, or None."""
+        lat, lon, _ = _at(self.position, time_ns, 3)
+        if not math.isfinite(lat + lon):
+            return None
+        return float(lat), float((lon + 180) % 360 - 180)
+
+    def _agl_m(self, time_ns: int, ground_alt_m: float | None) -> float:
+        for series in self.heights:
+            height = float(series.at(time_ns)[0])
+            if math.isfinite(height):
+                return height
+        altitude = float(_at(self.position, time_ns, 3)[2])
+        if ground_alt_m is None or not math.isfinite(altitude):
+            return math.nan
+        return altitude - ground_alt_m
+
+
+def angles_at(attitude: Series | None, time_ns: int) -> tuple[float, float, float]:
+    """Heading, pitch and roll of the camera at a moment, along the shortest turn between samples.
+
+    Where the heading of a sample beside it is not known, the nearer sample counts, heading NaN.
+    """
+    found = None if attitude is None else attitude.around(time_ns)
+    if attitude is None or found is None:
+        return math.nan, math.nan, math.nan
+    before, after, weight = found
+    ends = attitude.values[[before, after]]
+    known = bool(ends[:, 4].all())
+    if before == after or not known:
+        rotation = Rotation.from_quat(ends[int(weight > 0.5), :4])
+    else:
+        rotation = Slerp([0.0, 1.0], Rotation.from_quat(ends[:, :4]))(weight)
+    yaw, pitch, roll = attitude_of(rotation.as_matrix())
+    return yaw if known else math.nan, pitch, roll
+
+
+def _at(series: Series | None, time_ns: int, width: int) -> Array:
+    return np.full(width, np.nan) if series is None else series.at(time_ns)
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,124 @@
+"""PX4 flight logs (ULog): https://docs.px4.io/main/en/dev_log/ulog_file_format.html."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import FlightError
+from orthonav.sources.attitude import Angles, enu_from_body_camera, rotations_of_wxyz
+from orthonav.sources.guard import needed, reading
+from orthonav.sources.track import Series, Track, attitude_series, position_series, series_of
+
+MAGIC = b"ULog\x01\x12\x35"
+_TOPICS = [
+    "vehicle_attitude",
+    "vehicle_local_position",
+    "vehicle_global_position",
+    "vehicle_gps_position",
+    "sensor_gps",
+    "distance_sensor",
+    "home_position",
+]
+_DOWNWARD = 25  # distance_sensor.orientation, as MAV_SENSOR_ROTATION_PITCH_270
+Columns = dict[str, NDArray[Any]]
+
+
+def read_ulog(path: Path, mount_deg: Angles) -> Track:
+    """The track of a ULog; times are UTC where the log has a GPS fix, else since boot.
+
+    Raises `FlightError` where it is no ULog, broken, or without attitude.
+    """
+    core = needed("pyulog.core", "PX4 logs")
+    with reading("PX4 log", path, silent=True), path.open("rb") as stream:
+        log = core.ULog(stream, _TOPICS)
+        topics: dict[str, Columns] = {one.name: one.data for one in reversed(log.data_list)}
+        gps = topics.get("vehicle_gps_position") or topics.get("sensor_gps") or {}
+        shift_us = _utc_shift_us(gps)
+        attitude = _attitude(topics.get("vehicle_attitude", {}), shift_us, mount_deg)
+        if attitude is None:
+            raise FlightError(f"PX4 log has no attitude (vehicle_attitude): {path}")
+        return Track(
+            attitude=attitude,
+            heights=_heights(topics, shift_us),
+            position=_position(gps, topics, shift_us),
+            velocity=_velocity(topics.get("vehicle_local_position", {}), shift_us),
+            origin_ns=int(attitude.time_ns[0]),
+        )
+
+
+def _utc_shift_us(gps: Columns) -> int:
+    """Microseconds from the log's clock to UTC; 0 where the GPS never knew the time."""
+    if "time_utc_usec" not in gps:
+        return 0
+    utc, own = gps["time_utc_usec"].astype(np.int64), gps["timestamp"].astype(np.int64)
+    sound = utc > 0
+    return int(np.median((utc - own)[sound])) if sound.any() else 0
+
+
+def _time_ns(columns: Columns, shift_us: int) -> NDArray[np.int64]:
+    return np.asarray((columns["timestamp"].astype(np.int64) + shift_us) * 1000)
+
+
+def _attitude(columns: Columns, shift_us: int, mount_deg: Angles) -> Series | None:
+    if "q[3]" not in columns:
+        return None
+    wxyz = np.stack([columns[f"q[{i}]"] for i in range(4)], axis=1).astype(np.float64)
+    ned_from_frd, sound = rotations_of_wxyz(wxyz)
+    rotations = enu_from_body_camera(ned_from_frd, mount_deg)
+    return attitude_series(_time_ns(columns, shift_us)[sound], rotations)
+
+
+def _heights(topics: dict[str, Columns], shift_us: int) -> tuple[Series, ...]:
+    """Above ground by distance sensor (the estimator's, then the raw one), then above home."""
+    local = topics.get("vehicle_local_position", {})
+    sensor = topics.get("distance_sensor", {})
+    place, home = topics.get("vehicle_global_position", {}), topics.get("home_position", {})
+    found = []
+    if "dist_bottom" in local:
+        valid = local.get("dist_bottom_valid", np.ones(len(local["dist_bottom"]))) != 0
+        found.append(_height(local, local["dist_bottom"], valid, shift_us))
+    if "current_distance" in sensor:
+        distance = sensor["current_distance"]
+        valid = sensor.get("orientation", np.full(len(distance), _DOWNWARD)) == _DOWNWARD
+        valid &= distance > sensor.get("min_distance", np.zeros(len(distance)))
+        valid &= distance < sensor.get("max_distance", np.full(len(distance), np.inf))
+        found.append(_height(sensor, distance, valid, shift_us))
+    if "alt" in place and "alt" in home:
+        above = place["alt"].astype(np.float64) - float(home["alt"][-1])
+        found.append(_height(place, above, np.ones(len(above), dtype=bool), shift_us))
+    elif "z" in local:
+        found.append(_height(local, -local["z"], np.ones(len(local["z"]), dtype=bool), shift_us))
+    return tuple(series for series in found if series is not None)
+
+
+def _height(
+    columns: Columns, height_m: NDArray[Any], valid: NDArray[np.bool_], shift_us: int
+) -> Series | None:
+    times = _time_ns(columns, shift_us)
+    return series_of(times[valid], height_m[valid].astype(np.float64)[:, None])
+
+
+def _position(gps: Columns, topics: dict[str, Columns], shift_us: int) -> Series | None:
+    """Of the GPS receiver; of the estimator where there is none in the log."""
+    if "latitude_deg" in gps:  # since PX4 1.14
+        parts = gps["latitude_deg"], gps["longitude_deg"], gps["altitude_msl_m"]
+    elif "lat" in gps:
+        parts = gps["lat"] * 1e-7, gps["lon"] * 1e-7, gps["alt"] * 1e-3
+    else:
+        gps = topics.get("vehicle_global_position", {})
+        if "lat" not in gps:
+            return None
+        parts = gps["lat"], gps["lon"], gps["alt"]
+    place = np.stack(parts, axis=1).astype(np.float64)
+    sound = gps.get("fix_type", np.full(len(place), 3)) >= 3
+    return position_series(_time_ns(gps, shift_us)[sound], place[sound])
+
+
+def _velocity(local: Columns, shift_us: int) -> Series | None:
+    if "vx" not in local:
+        return None
+    east_north = np.stack([local["vy"], local["vx"]], axis=1).astype(np.float64)
+    sound = local.get("v_xy_valid", np.ones(len(east_north))) != 0
+    return series_of(_time_ns(local, shift_us)[sound], east_north[sound])

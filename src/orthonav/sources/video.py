@@ -1,0 +1,139 @@
+"""A video, with subtitles, a table or a log joined by time.
+
+Decoded by OpenCV's FFmpeg, which is there already with what flies; a second one (PyAV) would
+bring no format that is needed here.
+"""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import CameraError, FlightError
+from orthonav.sources.cameras import read_camera_file
+from orthonav.sources.logs import log_kind, read_log
+from orthonav.sources.options import SourceOptions
+from orthonav.sources.recording import (
+    Recording,
+    SourceView,
+    check_overlap,
+    fitted,
+    known_at,
+)
+from orthonav.sources.subtitles import end_ns
+from orthonav.sources.track import Track
+
+SIDECARS = (".srt", ".SRT", ".csv", ".CSV")
+_SHORT_NS = 1_000_000_000
+_MISSING_FRAMES = 0.01
+
+
+def open_video(path: Path, options: SourceOptions) -> Recording:
+    """The flight of a video, `options.rate_hz` views per second.
+
+    Telemetry is that of `options.telemetry`, else of a file beside it with the same name. Raises
+    `FlightError` or `CameraError`.
+    """
+    with _opened(path) as capture:
+        width, height = _sides(capture)
+        fps, frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        if width < 1 or height < 1 or not capture.grab():
+            raise FlightError(f"video holds no frame: {path}")
+    if options.camera is None:
+        raise CameraError(f"a video does not tell its camera; give --camera FILE: {path}")
+    camera = fitted(read_camera_file(options.camera), width, height, str(path))
+    last_ns = round((frames - 1) / fps * 1e9) if fps > 0 and frames > 0 else 0
+    track, told_by = _track(path, last_ns, options)
+    return Recording(
+        kind="video",
+        path=path,
+        camera=camera,
+        note=f"video {path.name}, telemetry of {told_by.name}",
+        expected=math.floor(last_ns / 1e9 * options.rate_hz) + 1 if last_ns else 0,
+        stream=partial(_views, path, track, options),
+    )
+
+
+def _track(path: Path, last_ns: int, options: SourceOptions) -> tuple[Track, Path]:
+    """The telemetry of a video and the file it is from."""
+    beside = [path.with_suffix(suffix) for suffix in SIDECARS]
+    told_by = options.telemetry or next((one for one in beside if one.is_file()), None)
+    if told_by is None:
+        raise FlightError(
+            f"no telemetry beside the video ({path.stem}.srt or .csv); give --telemetry: {path}"
+        )
+    track = read_log(told_by, options.mount_deg)
+    start_ns = track.origin_ns + options.time_offset_ns
+    check_overlap(track, start_ns, start_ns + last_ns, told_by)
+    short_ns = start_ns + last_ns - end_ns(track)
+    if log_kind(told_by) in ("srt", "table") and short_ns > _SHORT_NS:
+        raise FlightError(
+            f"telemetry ends {short_ns / 1e9:.1f} s before the video of {last_ns / 1e9:.1f} s: "
+            f"{told_by}"
+        )
+    return track, told_by
+
+
+def _views(path: Path, track: Track, options: SourceOptions) -> Iterator[SourceView]:
+    start_ns = track.origin_ns + options.time_offset_ns
+    due, number, stuck, before_ns = 0, 0, 0, -1
+    with _opened(path) as capture:
+        promised = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        while capture.grab():
+            time_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+            stuck += time_ns <= before_ns
+            if time_ns > before_ns and time_ns >= due / options.rate_hz * 1e9 - 1:
+                due = math.floor(time_ns / 1e9 * options.rate_hz + 1e-6) + 1
+                telemetry, truth = known_at(track, start_ns + time_ns, options)
+                where = f"frame {number} of {path}"
+                found, frame = capture.retrieve()
+                yield SourceView(
+                    frame=f"{number:06d}.png",
+                    telemetry=telemetry,
+                    truth_latlon_deg=truth,
+                    where=where,
+                    load=partial(_grey, np.asarray(frame) if found else None, where),
+                )
+            number, before_ns = number + 1, max(time_ns, before_ns)
+    if stuck > number / 2:
+        raise FlightError(f"video has no times: {path}")
+    if number < promised - max(2, _MISSING_FRAMES * promised):
+        raise FlightError(f"video was cut short: {number} of {promised} frames: {path}")
+
+
+def _grey(frame: NDArray[Any] | None, where: str) -> NDArray[np.uint8]:
+    if frame is None:
+        raise FlightError(f"image of the flight cannot be decoded: {where}")
+    grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) if frame.ndim == 3 else frame
+    return np.asarray(grey, dtype=np.uint8)
+
+
+def _sides(capture: cv2.VideoCapture) -> tuple[int, int]:
+    width = capture.get(cv2.CAP_PROP_FRAME_WIDTH)
+    return int(width), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
+    """The video opened; what OpenCV would print of failures is ours to tell."""
+    logging = cv2.utils.logging
+    before = logging.getLogLevel()
+    logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    try:
+        capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
+    finally:
+        logging.setLogLevel(before)
+    try:
+        if not capture.isOpened():
+            raise FlightError(f"video cannot be opened: cut short, or not a video: {path}")
+        # The camera describes the sensor: an orientation tag must not turn the picture.
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        yield capture
+    finally:
+        capture.release()

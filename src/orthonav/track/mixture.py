@@ -1,0 +1,319 @@
+"""The track: a mixture of hypotheses, each a Kalman filter, and "somewhere else".
+
+A view seldom says one thing only: the true place may be its second best, or none of those that
+were found. So every hypothesis is split, one for each place where the view may have been taken and
+one for none of them, weighed by how well each fits (multiple hypothesis tracking, Reid 1979; a
+Gaussian sum filter, Sorenson and Alspach 1971); the unlikely ones are dropped, those that have
+become one are merged. Beside them stands what is left: that the aircraft is somewhere else. All of
+it was there at the start; some comes back with every view, so that no mistake is for ever.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+
+from orthonav.track.model import (
+    POSITION,
+    STATE,
+    VELOCITY,
+    Array,
+    Displacement,
+    Expected,
+    Model,
+    Sighting,
+    Told,
+    held_to_map,
+    innovation,
+    knocked,
+    log_density,
+    predicted,
+    updated,
+)
+
+MAX_HYPOTHESES = 40
+MIN_SHARE = 1e-7
+MERGE_SIGMAS = 1.0
+TOLD_SHARE = 0.9
+"""Belief in a position that was told before anything was seen."""
+SURE = 0.9
+LIKELY = 0.5
+CONFIRMED = 1.4
+"""Views' worth of new ground that must have been recognized before a track is one."""
+GATE = 36.0
+MAX_LOG_ODDS = 9.0
+"""No single view is believed more than this."""
+
+
+class State(Enum):
+    """What the track is doing."""
+
+    SEARCHING = "searching"
+    TRACKING = "tracking"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One way things may be.
+
+    Its share of belief, mean (8,), covariance (8, 8), how much new ground was sighted (in views),
+    and its number; the number of what it came from, and what that was expected to become by now:
+    None where it came from nowhere.
+    """
+
+    share: float
+    mean: Array
+    covariance: Array
+    sighted: float
+    number: int
+    parent: int = -1
+    expected: Expected | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Where the aircraft is: mean (8,) and covariance (8, 8) of the best cluster of hypotheses,
+    the probability that it is within the radius asked for, and the state of the track."""
+
+    mean: Array
+    covariance: Array
+    confidence: float
+    state: State
+    number: int
+
+
+class Mixture:
+    """The belief about one flight. Mutable; not to be shared between threads."""
+
+    def __init__(self, model: Model, area_m2: float) -> None:
+        """`area_m2` is that of the map: the aircraft may be anywhere on it."""
+        self.model, self.area_m2 = model, area_m2
+        self.hypotheses: list[Hypothesis] = []
+        self.elsewhere = 1.0
+        self._tracked = False
+        self._numbers = 0
+
+    def start(self, mean_en_m: Array, std_m: float) -> None:
+        """Begin with a position (2,) that was told, good to `std_m` per axis."""
+        mean, covariance = np.zeros(STATE), np.zeros((STATE, STATE))
+        mean[POSITION] = mean_en_m
+        variances = [std_m**2] * 2 + [self.model.speed_mps**2] * 2
+        covariance[range(STATE), range(STATE)] = [*variances, *self.model.initial_bias]
+        self._numbers += 1
+        self.hypotheses = [Hypothesis(TOLD_SHARE, mean, covariance, 0.0, self._numbers)]
+        self.elsewhere = 1 - TOLD_SHARE
+
+    def predict(self, seconds: float, moved: Displacement | None = None) -> None:
+        """Let time pass; `moved` is what the camera or instruments say of the way gone."""
+        kept = 1 - self.model.lost
+        made = []
+        for each in self.hypotheses:
+            expected = predicted(self.model, each.mean, each.covariance, seconds, moved)
+            expected = held_to_map(self.model, expected, self.area_m2)
+            made.append(self._from(each, expected, each.share * kept))
+        self.hypotheses = made
+        self.elsewhere += (1 - kept) * (1 - self.elsewhere)
+
+    def update(
+        self,
+        told: Told,
+        sightings: Sequence[Sighting],
+        newness: float = 1.0,
+        searched: tuple[Array, float] | None = None,
+    ) -> None:
+        """Take in where a view may have been taken; none of it may be true.
+
+        `searched` is the circle of the map that was looked at, middle (2,) and radius in metres;
+        None for all of it. `newness` is the share of the view that the last one did not show:
+        views of the same ground err alike, so that many of them are not more than one.
+        """
+        made = []
+        missed = self.model.miss**newness
+        found = (1 - self.model.miss) ** newness
+        for each in self.hypotheses:
+            looked_at = searched is None or np.hypot(*(each.mean[:2] - searched[0])) < searched[1]
+            made.append(replace(each, share=each.share * (missed if looked_at else 1.0)))
+            for start in self._or_knocked(each):
+                for sighting in sightings:
+                    split = self._seen(start, told, sighting, newness)
+                    if split is not None:
+                        made.append(replace(split, share=split.share * found))
+        for sighting in sightings:
+            made.append(self._born(told, sighting, newness))
+        total = sum(each.share for each in made) + self.elsewhere
+        self.elsewhere /= total
+        made = [replace(each, share=each.share / total) for each in made]
+        self.hypotheses = _merged(sorted(made, key=lambda each: -each.share))
+        self._settle()
+
+    def estimate(self, radius_m: float) -> Estimate | None:
+        """The best cluster, None where there is no hypothesis at all."""
+        if not self.hypotheses:
+            return None
+        best = self._best(radius_m)
+        near = [each for each in self.hypotheses if _distance(each, best) <= radius_m]
+        mean, covariance = _moments(near)
+        inside = sum(
+            each.share * within(each.mean, each.covariance, radius_m, mean[POSITION])
+            for each in self.hypotheses
+        )
+        confidence = min(inside, 1.0)
+        sighted = max(each.sighted for each in near)
+        state = self._state(confidence, sighted)
+        self._tracked = self._tracked or state is State.TRACKING
+        return Estimate(mean, covariance, confidence, state, best.number)
+
+    def _best(self, radius_m: float) -> Hypothesis:
+        """The hypothesis with most belief around it."""
+        heaviest = self.hypotheses[:8]
+
+        def around(one: Hypothesis) -> float:
+            return sum(e.share for e in self.hypotheses if _distance(e, one) <= radius_m)
+
+        return max(heaviest, key=around)
+
+    def _state(self, confidence: float, sighted: float) -> State:
+        if confidence >= SURE and sighted >= CONFIRMED:
+            return State.TRACKING
+        if not self._tracked:
+            return State.SEARCHING
+        return State.TRACKING if confidence >= LIKELY else State.LOST
+
+    def _or_knocked(self, each: Hypothesis) -> list[Hypothesis]:
+        """A hypothesis as it is, and as it is if the camera was knocked since the last view."""
+        rare = self.model.knocked
+        if each.expected is None:
+            return [each]
+        expected = knocked(self.model, each.expected)
+        other = replace(
+            each,
+            share=each.share * rare,
+            mean=expected.mean,
+            covariance=expected.covariance,
+            expected=expected,
+        )
+        return [replace(each, share=each.share * (1 - rare)), other]
+
+    def _seen(
+        self, each: Hypothesis, told: Told, sighting: Sighting, newness: float
+    ) -> Hypothesis | None:
+        """The hypothesis after a sighting, weighed; None where they have nothing in common."""
+        model = self.model
+        away = sighting.mean[:2] - each.mean[POSITION]
+        reach = np.trace(each.covariance[:2, :2]) + 100 * np.trace(sighting.covariance[:2, :2])
+        if away @ away > GATE * (reach + 100.0):
+            return None  # quickly, what is far beyond doubt
+        off, spread = innovation(model, each.mean, each.covariance, told, sighting, 1 - newness)
+        far = off[:2] @ np.linalg.solve(spread[:2, :2], off[:2])
+        if far > GATE:
+            return None
+        log_weight = self._log_odds(sighting, newness)
+        log_weight += log_density(off, spread) - self._before(told, sighting, newness)
+        mean, covariance = updated(each.mean, each.covariance, off, spread)
+        share = each.share * math.exp(min(log_weight, 60.0))
+        self._numbers += 1
+        return replace(
+            each,
+            share=share,
+            mean=mean,
+            covariance=covariance,
+            sighted=each.sighted + newness,
+            number=self._numbers,
+        )
+
+    def _born(self, told: Told, sighting: Sighting, newness: float) -> Hypothesis:
+        """The hypothesis that the aircraft was elsewhere, and is here."""
+        off, spread = self._first(told, sighting, newness)
+        mean, covariance = np.zeros(STATE), np.zeros((STATE, STATE))
+        covariance[POSITION, POSITION] = np.eye(2) * self.area_m2
+        covariance[VELOCITY, VELOCITY] = np.eye(2) * self.model.speed_mps**2
+        covariance[range(4, 8), range(4, 8)] = self.model.initial_bias
+        spread = spread.copy()
+        spread[:2, :2] += np.eye(2) * self.area_m2
+        mean, covariance = updated(mean, covariance, off, spread)
+        share = self.elsewhere * math.exp(self._log_odds(sighting, newness))
+        self._numbers += 1
+        return Hypothesis(share, mean, covariance, newness, self._numbers)
+
+    def _log_odds(self, sighting: Sighting, newness: float) -> float:
+        """Log odds of a sighting of which only a part is new.
+
+        A likelihood taken to the power `newness` is not only lower: the peak becomes broader, and
+        stands out less from all the places that the map has.
+        """
+        place_m2 = 2 * math.pi * math.sqrt(float(np.linalg.det(sighting.covariance[:2, :2])))
+        places = math.log(self.area_m2 / place_m2)
+        odds = newness * min(sighting.log_odds, MAX_LOG_ODDS)
+        return odds - (1 - newness) * places - math.log(newness)
+
+    def _first(self, told: Told, sighting: Sighting, newness: float) -> tuple[Array, Array]:
+        nothing = np.zeros((STATE, STATE))
+        nothing[range(4, 8), range(4, 8)] = self.model.initial_bias
+        return innovation(self.model, np.zeros(STATE), nothing, told, sighting, 1 - newness)
+
+    def _before(self, told: Told, sighting: Sighting, newness: float) -> float:
+        """Log density of the sighting for somebody who knows only that it is on the map."""
+        off, spread = self._first(told, sighting, newness)
+        return log_density(off[2:], spread[2:, 2:]) - math.log(self.area_m2)
+
+    def _from(self, each: Hypothesis, expected: Expected, share: float) -> Hypothesis:
+        self._numbers += 1
+        mean, covariance = expected.mean, expected.covariance
+        return Hypothesis(
+            share, mean, covariance, each.sighted, self._numbers, each.number, expected
+        )
+
+    def _settle(self) -> None:
+        """Shares that add up to one with what is elsewhere."""
+        total = sum(each.share for each in self.hypotheses) + self.elsewhere
+        self.hypotheses = [replace(e, share=e.share / total) for e in self.hypotheses]
+        self.elsewhere /= total
+
+
+def _merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
+    """Hypotheses, heaviest first, with those that have become one put together, few kept."""
+    likely = [each for each in ordered[: 4 * MAX_HYPOTHESES] if each.share > MIN_SHARE]
+    left = likely or ordered[:1]  # the last one stays, however unlikely
+    kept: list[Hypothesis] = []
+    while left and len(kept) < MAX_HYPOTHESES:
+        first, rest = left[0], left[1:]
+        inverse = np.linalg.inv(first.covariance[:4, :4])
+        group, left = [first], []
+        for each in rest:
+            off = each.mean[:4] - first.mean[:4]
+            (group if off @ inverse @ off < 4 * MERGE_SIGMAS**2 else left).append(each)
+        mean, covariance = _moments(group)
+        share = sum(each.share for each in group)
+        sighted = sum(each.share * each.sighted for each in group) / share
+        kept.append(replace(first, share=share, mean=mean, covariance=covariance, sighted=sighted))
+    return kept
+
+
+def _moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:
+    """Mean and covariance of several hypotheses taken as one."""
+    shares = np.array([each.share for each in group])
+    shares = shares / shares.sum()
+    means = np.stack([each.mean for each in group])
+    mean = shares @ means
+    off = means - mean
+    covariance = sum(s * each.covariance for s, each in zip(shares, group, strict=True))
+    return mean, np.asarray(covariance + (off * shares[:, None]).T @ off)
+
+
+def _distance(one: Hypothesis, other: Hypothesis) -> float:
+    return float(np.hypot(*(one.mean[POSITION] - other.mean[POSITION])))
+
+
+def within(mean: Array, covariance: Array, radius_m: float, middle: Array | None = None) -> float:
+    """About how much of a state lies within a radius of `middle` (2,), its own mean where None.
+
+    Exact for a round Gaussian around the middle; distance counts as so much more spread.
+    """
+    variance = float(np.trace(covariance[POSITION, POSITION])) / 2
+    away = 0.0 if middle is None else float(np.hypot(*(mean[POSITION] - middle)))
+    if away > radius_m + 3 * math.sqrt(variance):
+        return 0.0
+    return 1 - math.exp(-(radius_m**2) / (2 * variance + away**2 + 1e-9))

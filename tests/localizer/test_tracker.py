@@ -1,0 +1,324 @@
+"""A flight over a ground that is known everywhere: followed, calibrated, lost and found."""
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from blots import AGL_M, GROUND, Ground, map_of_blots, ortho_of_blots, rendered
+
+from orthonav.errors import CameraError, MapFileError
+from orthonav.geo.camera import Camera
+from orthonav.localizer import Localizer
+from orthonav.localizer.levelled import levelled
+from orthonav.localizer.odometry import Footprint, moved_between
+from orthonav.localizer.tracker import Tracker
+from orthonav.mapfile import open_map
+from orthonav.onboard.run import in_hindsight, localize_flight
+from orthonav.records import Fix, NoFix, Prior, Telemetry
+
+WIDE = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
+SPEED_MPS = 14.0
+OTHER = Ground(seed=1)
+
+
+@pytest.fixture(scope="module")
+def map_path(make_ortho, tmp_path_factory):
+    ortho, _ = ortho_of_blots(make_ortho, tmp_path_factory.mktemp("ortho"))
+    return map_of_blots(ortho, tmp_path_factory.mktemp("map") / "a.onav")
+
+
+@pytest.fixture(scope="module")
+def localizer(map_path):
+    return Localizer(open_map(map_path))
+
+
+def changed(grey, rng):
+    """Another year: other light, noise, and a part of the view that is something else."""
+    other = OTHER(*np.meshgrid(np.arange(320) + rng.uniform(-200, 200), np.arange(240)))
+    mask = cv2.GaussianBlur(rng.standard_normal(grey.shape), (0, 0), 25) > 0
+    mixed = np.where(mask, 0.7 * grey.astype(float) + 20, 0.5 * grey + 0.5 * other)
+    return np.clip(mixed + rng.normal(0, 4, grey.shape), 0, 255).astype(np.uint8)
+
+
+def lit(grey, rng):
+    """The same ground in other light."""
+    return np.clip(0.75 * grey + 30 + rng.normal(0, 6, grey.shape), 0, 255).astype(np.uint8)
+
+
+def legs(count, start=(-160.0, -120.0), turn_at=14):
+    """Places (N, 2) and headings of a flight with a turn, one view a second."""
+    place, heading = np.array(start), 60.0
+    for number in range(count):
+        yield place.copy(), heading
+        heading = 60.0 if number < turn_at else -35.0
+        along = math.radians(heading)
+        place = place + SPEED_MPS * np.array([math.sin(along), math.cos(along)])
+
+
+def spots(count, seed=4):
+    """Places (N, 2) and headings that have nothing to do with each other."""
+    rng = np.random.default_rng(seed)
+    return zip(rng.uniform(-150, 150, (count, 2)), rng.uniform(0, 360, count), strict=True)
+
+
+def views(
+    count,
+    *,
+    where=None,
+    heading_off=0.0,
+    lean=(0.0, 0.0),
+    scale=1.0,
+    seed=0,
+    year=changed,
+    every_s=1,
+    **legs_,
+):
+    """Grey views, what is told of them, and where they were taken."""
+    rng = np.random.default_rng(seed)
+    for number, (place, heading) in enumerate(where or legs(count, **legs_)):
+        grey = rendered(GROUND, place, (heading, *lean), AGL_M * scale, WIDE)
+        told = Telemetry(
+            every_s * number * 10**9, heading - heading_off + rng.normal(0, 1.0), 0.0, 0.0, AGL_M
+        )
+        yield year(grey, rng), told, place
+
+
+def place_of(localizer, fix):
+    return localizer.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
+
+
+def followed(tracker, localizer, seen):
+    """Errors in m, confidences, states and fixes of a flight."""
+    rows = []
+    for grey, told, place in seen:
+        found = tracker.locate(grey, WIDE, told)
+        error = np.inf
+        if isinstance(found, Fix):
+            error = float(np.hypot(*(place_of(localizer, found) - place)))
+        rows.append((error, getattr(found, "confidence", 0.0), tracker.state_name, found))
+    return rows
+
+
+def test_a_flight_is_followed(localizer):
+    tracker = Tracker(localizer)
+    rows = followed(tracker, localizer, views(22))
+    errors = np.array([row[0] for row in rows])
+    assert [row[2] for row in rows[10:]] == ["tracking"] * 12
+    assert errors[4:].max() < 6 and all(row[1] > 0.9 for row in rows[10:])
+    last = rows[-1][3]
+    assert last.evidence["vel_north_mps"] == pytest.approx(SPEED_MPS * math.cos(0.61), abs=3)
+
+
+def test_wrong_heading_height_and_mount_are_learnt(localizer):
+    """Without learning, 5 deg of pitch are 13 m from 150 m."""
+    tracker = Tracker(localizer)
+    seen = list(
+        views(
+            0, where=spots(24), year=lit, every_s=60, heading_off=6.0, lean=(5.0, -2.0), scale=1.05
+        )
+    )
+    rows = followed(tracker, localizer, seen)
+    evidence = rows[-1][3].evidence
+    assert evidence["heading_bias_deg"] == pytest.approx(6.0, abs=1.5)
+    assert evidence["log_scale_bias"] == pytest.approx(math.log(1.05), abs=0.02)
+    assert evidence["pitch_bias_deg"] == pytest.approx(5.0, abs=1.5)
+    assert evidence["roll_bias_deg"] == pytest.approx(-2.0, abs=1.5)
+    alone = [localizer.locate(grey, WIDE, told) for grey, told, _ in seen[12:]]
+    single = [
+        np.hypot(*(place_of(localizer, a) - s[2])) for a, s in zip(alone, seen[12:], strict=True)
+    ]
+    tracked = [row[0] for row in rows[12:]]
+    assert np.median(tracked) < 5 < 10 < np.median(single)
+
+
+def test_hindsight_calibrates_the_beginning_too(localizer):
+    tracker = Tracker(localizer, hindsight=True)
+    seen = list(views(24, lean=(5.0, 0.0)))
+    rows = followed(tracker, localizer, seen)
+    after = [
+        np.hypot(*(place_of(localizer, fix) - place))
+        for fix, (_, _, place) in zip(tracker.in_hindsight(), seen, strict=True)
+    ]
+    assert max(after) < 10 and len(rows) == len(after)
+    assert np.mean(after) < 1.3 * np.mean([row[0] for row in rows[4:]])
+    with pytest.raises(ValueError, match="no history"):
+        Tracker(localizer).in_hindsight()
+
+
+def test_leaving_the_map_is_lost_and_coming_back_is_found(localizer):
+    tracker = Tracker(localizer)
+    followed(tracker, localizer, views(12))
+    rng = np.random.default_rng(5)
+    spread = []
+    for number in range(12, 40):
+        place = rng.uniform(-150, 150, 2)
+        grey = changed(rendered(OTHER, place, (60.0, 0, 0), AGL_M, WIDE), rng)
+        found = tracker.locate(grey, WIDE, Telemetry(number * 10**9, 60.0, 0, 0, AGL_M))
+        if isinstance(found, Fix):
+            spread.append(float(np.trace(found.cov_en_m2)))
+            assert number < 24 or found.confidence < 0.9
+    assert tracker.state_name == "lost" and spread[-1] > 10 * spread[0]
+    back = [
+        (grey, replace(told, time_ns=told.time_ns + 40 * 10**9), place)
+        for grey, told, place in views(10, start=(100.0, 60.0), turn_at=3)
+    ]
+    rows = followed(tracker, localizer, back)
+    assert rows[-1][2] == "tracking" and rows[-1][0] < 8
+
+
+def test_views_that_show_nothing_are_flown_through(localizer):
+    tracker = Tracker(localizer)
+    rows = []
+    for number, (grey, told, place) in enumerate(views(20)):
+        if number in (8, 9, 10):
+            grey = np.full_like(grey, 255)
+        if number == 12:
+            told = replace(told, agl_m=math.nan)
+        if number == 14:
+            told = replace(told, time_ns=told.time_ns - 3 * 10**9)  # a clock that jumps
+        rows += followed(tracker, localizer, [(grey, told, place)])
+    errors = [row[0] for row in rows]
+    assert max(errors[5:8]) < 6 and max(errors[8:11]) < 30 and max(errors[15:]) < 8
+    variance = [float(np.trace(row[3].cov_en_m2)) for row in rows]
+    assert variance[10] > variance[8] > variance[7]
+
+
+def test_a_told_start_needs_no_search(localizer):
+    lat, lon = localizer.sheet.frame.latlon_from_en((-160.0, -120.0))
+    told = Prior(float(lat), float(lon), 15.0)
+    seen = [
+        (g, replace(t, prior=told if not n else None), p) for n, (g, t, p) in enumerate(views(4))
+    ]
+    rows = followed(Tracker(localizer), localizer, seen)
+    assert rows[0][0] < 15 and rows[0][1] > 0.9
+    unused = Tracker(localizer, use_prior=False)
+    followed(unused, localizer, seen[:1])
+    assert all(each.parent == -1 for each in unused.mixture.hypotheses)
+
+
+def test_unknown_heading_is_tracked(localizer):
+    seen = [(g, replace(t, yaw_deg=math.nan), p) for g, t, p in views(8)]
+    rows = followed(Tracker(localizer, heading_known=False), localizer, seen)
+    assert max(row[0] for row in rows[3:]) < 10
+
+
+def test_a_wrong_camera_is_refused(localizer):
+    grey, told, _ = next(iter(views(1)))
+    with pytest.raises(CameraError, match="320 x 240"):
+        Tracker(localizer).locate(grey, replace(WIDE, width_px=640), told)
+
+
+def test_a_map_without_a_layer_is_refused(map_path):
+    plain = Localizer(open_map(map_path), registration=False)
+    with pytest.raises(MapFileError, match="registration layer"):
+        Tracker(plain)
+
+
+class Recorded:
+    """A flight in memory."""
+
+    camera, note, expected = WIDE, "", 0
+
+    def __init__(self, seen, broken=()):
+        self.views = [View(n, g, t, n in broken) for n, (g, t, _) in enumerate(seen)]
+
+
+class View:
+    def __init__(self, number, grey, telemetry, broken):
+        self.frame, self.where, self.telemetry = f"{number}.png", "memory", telemetry
+        self._grey, self._broken = grey, broken
+
+    def grey(self):
+        if self._broken:
+            from orthonav.errors import FlightError
+
+            raise FlightError("broken")
+        return self._grey
+
+
+def test_every_view_has_a_result_and_a_state(localizer, monkeypatch):
+    seen = list(views(9))
+    tracker = Tracker(localizer, hindsight=True)
+    whole = tracker._observe
+
+    def sometimes(*arguments):
+        if tracker._time_ns == 5 * 10**9:
+            raise RuntimeError("a bug")
+        return whole(*arguments)
+
+    monkeypatch.setattr(tracker, "_observe", sometimes)
+    flight = Recorded(seen, broken=(3,))
+    results = list(localize_flight(tracker, flight, skip_bad_images=True))
+    assert [result.frame for result in results] == [f"{n}.png" for n in range(9)]
+    assert results[-1].state == "tracking" and isinstance(results[3].outcome, Fix)
+    assert isinstance(results[5].outcome, Fix)
+    again = in_hindsight(tracker, results, None)
+    assert len(again) == 9 and all(isinstance(each.outcome, Fix | NoFix) for each in again)
+
+
+@pytest.mark.parametrize("lean_deg", [(0.0, 0.0), (7.0, 0.0), (-5.0, 4.0), (2.0, -6.0)])
+def test_lean_is_seen_in_the_perspective(localizer, lean_deg):
+    rng = np.random.default_rng(3)
+    place = np.array([20.0, -35.0])
+    grey = changed(rendered(GROUND, place, (25.0, *lean_deg), AGL_M, WIDE), rng)
+    told = Telemetry(0, 25.0, 0.0, 0.0, AGL_M)
+    registration = localizer.registration
+    view = registration.prepared(grey, WIDE, told, heading_known=True)
+    pose = registration.best(view, None).placed.pose
+    found = levelled(
+        registration, grey, WIDE, told, view, pose, lean_rad=(0.0, 0.0), lean_std_rad=0.15
+    )
+    assert np.degrees(found.mean[4:]) == pytest.approx(lean_deg, abs=2.0)
+    assert np.hypot(*(found.mean[:2] - place)) < 6
+    truth = np.array([*place, math.radians(25.0), 0.0, *np.radians(lean_deg)])
+    off = (found.mean - truth) / np.sqrt(np.diag(found.covariance))
+    assert np.abs(off).max() < 4
+
+
+def test_a_narrow_view_knows_less_of_its_lean(localizer):
+    std_deg, rng = [], np.random.default_rng(11)
+    for focal_px, agl_m in ((200.0, 150.0), (2000.0, 1500.0)):
+        camera = Camera(320, 240, focal_px, focal_px, 160.0, 120.0)
+        grey = changed(rendered(GROUND, (20.0, -35.0), (25.0, 0.0, 0.0), agl_m, camera), rng)
+        told = Telemetry(0, 25.0, 0.0, 0.0, agl_m)
+        registration = localizer.registration
+        view = registration.prepared(grey, camera, told, heading_known=True)
+        pose = registration.best(view, None).placed.pose
+        found = levelled(
+            registration, grey, camera, told, view, pose, lean_rad=(0.0, 0.0), lean_std_rad=0.05
+        )
+        std = np.sqrt(np.diag(found.covariance))
+        std_deg.append(np.degrees(std[4:]))
+        # What the lean is not known to, the position is not either.
+        assert std[:2].max() > 0.7 * agl_m * std[4:].max()
+    assert (std_deg[1] > 3 * std_deg[0]).all() and std_deg[1].max() < 21
+
+
+@pytest.mark.parametrize("moved", [(18.0, 0.0), (-30.0, 25.0), (0.0, -70.0)])
+def test_odometry_measures_the_way(moved):
+    rng = np.random.default_rng(7)
+    footprints = []
+    for number, (place, heading) in enumerate((((0.0, 0.0), 40.0), (moved, 43.0))):
+        grey = rendered(GROUND, place, (heading, 0, 0), AGL_M, WIDE)
+        noisy = np.clip(grey + rng.normal(0, 5, grey.shape), 0, 255).astype(np.uint8)
+        told = Telemetry(number * 10**9, heading, 0.0, 0.0, AGL_M)
+        pixel_m = footprints[0].pixel_m if footprints else None
+        footprints.append(Footprint.of(noisy, WIDE, told, pixel_m))
+    seen = moved_between(*footprints, lean_noise_rad=0.0)
+    assert seen.displacement.moved_en_m == pytest.approx(moved, abs=0.7)
+    assert 0 < seen.overlap < 1
+
+
+def test_odometry_refuses_views_without_common_ground():
+    told = Telemetry(0, 0.0, 0.0, 0.0, AGL_M)
+    first = Footprint.of(rendered(GROUND, (0, 0), (0, 0, 0), AGL_M, WIDE), WIDE, told, None)
+    later = replace(told, time_ns=2 * 10**9)
+    other = rendered(OTHER, (0, 0), (0, 0, 0), AGL_M, WIDE)
+    second = Footprint.of(other, WIDE, later, first.pixel_m)
+    assert moved_between(first, second, 0.01) is None
+    nan = Footprint.of(other, WIDE, replace(later, yaw_deg=math.nan), first.pixel_m)
+    assert moved_between(first, nan, 0.01) is None
+    blank = Footprint.of(np.full((240, 320), 90, np.uint8), WIDE, later, first.pixel_m)
+    assert blank is None or moved_between(first, blank, 0.01) is None

@@ -1,0 +1,126 @@
+"""Angles of other makers, by where the camera looks and where the top of its image points."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from orthonav.geo.camera import attitude_of, enu_from_camera
+from orthonav.sources.attitude import (
+    enu_from_body_camera,
+    enu_from_gimbal_camera,
+    enu_from_ros_camera,
+    ned_from_angles,
+    rotations_of_wxyz,
+)
+
+angles = st.floats(-180, 180)
+
+
+def sight(enu_from_camera_):
+    """Directions in ENU of the optical axis and of the top of the image."""
+    return enu_from_camera_[:, 2], -enu_from_camera_[:, 1]
+
+
+def level(heading_deg, up=0.0):
+    """A direction at a compass heading and an angle above the horizon."""
+    heading, rise = math.radians(heading_deg), math.radians(up)
+    return [
+        math.sin(heading) * math.cos(rise),
+        math.cos(heading) * math.cos(rise),
+        math.sin(rise),
+    ]
+
+
+@given(angles, st.floats(-90, 30))
+def test_a_gimbal_looks_where_it_says(yaw, pitch):
+    """DJI: yaw is a compass heading, pitch the angle above the horizon, both of the axis."""
+    axis, top = sight(enu_from_gimbal_camera([yaw, pitch, 0.0]))
+    np.testing.assert_allclose(axis, level(yaw, pitch), atol=1e-12)
+    np.testing.assert_allclose(top, level(yaw, pitch + 90), atol=1e-12)
+
+
+@given(angles)
+def test_straight_down_the_heading_is_the_gimbals_yaw(yaw):
+    heading, pitch, roll = attitude_of(enu_from_gimbal_camera([yaw, -90.0, 0.0]))
+    assert (heading - yaw + 180) % 360 - 180 == pytest.approx(0, abs=1e-6)
+    assert (pitch, roll) == pytest.approx((0, 0), abs=1e-6)
+
+
+def test_a_gimbal_that_is_upside_down_is_turned():
+    """Straight down, yaw and roll turn about one axis: 180 and 180 is as 0 and 0."""
+    np.testing.assert_allclose(
+        enu_from_gimbal_camera([190, -90, 180]), enu_from_gimbal_camera([10, -90, 0]), atol=1e-12
+    )
+
+
+@given(angles, st.floats(-89, 30), st.floats(-20, 20))
+def test_a_gimbals_roll_turns_the_picture_about_its_axis(yaw, pitch, roll):
+    """Right-handed about the axis: with positive roll the top of the image leans to the right."""
+    straight, rolled = (enu_from_gimbal_camera([yaw, pitch, angle]) for angle in (0.0, roll))
+    np.testing.assert_allclose(rolled[:, 2], straight[:, 2], atol=1e-12)
+    right, top = straight[:, 0], -straight[:, 1]
+    lean = math.radians(roll)
+    expected = math.cos(lean) * top + math.sin(lean) * right
+    np.testing.assert_allclose(-rolled[:, 1], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("pitch, ours", [(-90, 0), (-60, 30), (-100, -10)])
+def test_our_pitch_looks_ahead(pitch, ours):
+    heading, tilt, roll = attitude_of(enu_from_gimbal_camera([40, pitch, 0]))
+    assert (heading, tilt, roll) == pytest.approx((40, ours, 0))
+
+
+@given(angles, st.floats(-60, 60), st.floats(-60, 60))
+def test_a_camera_that_looks_down_has_the_angles_of_the_body(yaw, pitch, roll):
+    camera = enu_from_body_camera(ned_from_angles([yaw, pitch, roll]), (0.0, 0.0, 0.0))
+    np.testing.assert_allclose(camera, enu_from_camera(yaw, pitch, roll), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "mount, axis, top",
+    [
+        ((0, 0, 0), [0, 0, -1], level(70)),
+        ((90, 0, 0), [0, 0, -1], level(160)),  # top of the image to the right wing
+        ((180, 0, 0), [0, 0, -1], level(250)),  # top of the image to the tail
+        ((0, 90, 0), level(70), [0, 0, 1]),  # looks forward, top up
+        ((0, 30, 0), level(70, -60), level(70, 30)),
+        ((90, 90, 0), level(160), [0, 0, 1]),  # looks out of the right side
+    ],
+)
+def test_mounts(mount, axis, top):
+    """The camera in an aircraft that flies level at a heading of 70."""
+    found = sight(enu_from_body_camera(ned_from_angles([70, 0, 0]), mount))
+    np.testing.assert_allclose(found, [axis, top], atol=1e-12)
+
+
+def test_the_mount_leans_with_the_body():
+    """Right wing down, a camera that looks down looks left; seen from above at heading 0: west."""
+    axis, _ = sight(enu_from_body_camera(ned_from_angles([0, 0, 20]), (0.0, 0.0, 0.0)))
+    np.testing.assert_allclose(axis, level(270, -70), atol=1e-12)
+
+
+@pytest.mark.parametrize("ros_yaw, heading", [(0, 90), (90, 0), (180, 270), (-90, 180), (30, 60)])
+def test_ros_counts_from_east_to_the_left(ros_yaw, heading):
+    turn = Rotation.from_euler("Z", ros_yaw, degrees=True).as_matrix()
+    axis, top = sight(enu_from_ros_camera(turn, (0.0, 0.0, 0.0)))
+    np.testing.assert_allclose(axis, [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(top, level(heading), atol=1e-12)
+
+
+def test_ros_pitch_is_nose_down():
+    """REP 103: y to the left, so a positive turn about it lowers the nose; we look back then."""
+    turn = Rotation.from_euler("ZY", [90, 10], degrees=True).as_matrix()
+    heading, pitch, roll = attitude_of(enu_from_ros_camera(turn, (0.0, 0.0, 0.0)))
+    assert (heading % 360, pitch, roll) == pytest.approx((0, -10, 0), abs=1e-9)
+
+
+def test_what_is_no_rotation_is_not_taken_for_one():
+    wxyz = np.array([[0, 0, 0, 0], [1, 0, 0, 0], [math.nan, 0, 0, 1], [0, 0, 0, 1.0]])
+    turns, sound = rotations_of_wxyz(wxyz)
+    assert sound.tolist() == [False, True, False, True]
+    np.testing.assert_allclose(turns, [np.eye(3), np.diag([-1, -1, 1])], atol=1e-12)
+    assert rotations_of_wxyz(wxyz[:1])[0].shape == (0, 3, 3)

@@ -1,0 +1,283 @@
+"""`orthonav import` as it is typed, and `localize` of a source as of its import."""
+
+import json
+import logging
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from bags import Messages, record
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+from recorders import START_S, camera_file, packet, photo, subtitles, tlog, video
+
+from orthonav.cli import main
+from orthonav.flight import FlightWriter, open_flight, read_image
+from orthonav.geo.camera import Camera
+from orthonav.publish.jsonl import read_results
+from orthonav.records import Fix, Telemetry
+
+DATA = Path(__file__).parents[1] / "data"
+MAP = DATA / "golden_v1.onav"
+VIEW = read_image(DATA / "golden_view.png")
+PLACE = 46.499856, 2.999830  # of the stored view, with heading 20 and height 160
+SIDES = {"width_px": 160, "height_px": 160, "fx_px": 200.0, "fy_px": 200.0}
+SIDES |= {"cx_px": 80.0, "cy_px": 80.0}
+
+
+@pytest.fixture
+def run(capfd, monkeypatch):
+    """Function that runs a command and gives exit code, stdout and stderr."""
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    root = logging.getLogger()
+
+    def command(*arguments):
+        handlers, root.handlers, level = root.handlers, [], root.level
+        capfd.readouterr()
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as left:
+            code = left.code
+        finally:
+            root.handlers = handlers
+            root.setLevel(level)
+        told = capfd.readouterr()
+        return code, told.out, told.err
+
+    return command
+
+
+@pytest.fixture
+def camera(tmp_path):
+    return camera_file(tmp_path / "camera.json", **SIDES)
+
+
+def seen(seed):
+    """The stored view with noise of its own."""
+    noise = np.random.default_rng(seed).normal(0, 3, VIEW.shape)
+    return np.clip(VIEW + noise, 0, 255).astype(np.uint8)
+
+
+def photographs(folder):
+    """PNG photographs of DJI, an orientation tag that is not to turn them among them."""
+    xmp = packet(
+        GimbalYawDegree="20.0",
+        GimbalPitchDegree="-90.0",
+        GimbalRollDegree="0.0",
+        RelativeAltitude="160.0",
+    )
+    for index in range(2):
+        path = photo(folder / f"{index}.png", f"2023:11:14 22:13:2{index}", xmp=xmp)
+        with Image.open(path) as written:
+            tags, text = written.getexif(), written.info["XML:com.adobe.xmp"]
+        tags[0x0112] = 6
+        info = PngInfo()
+        info.add_itxt("XML:com.adobe.xmp", text)
+        Image.fromarray(seen(index)).save(path, exif=tags, pnginfo=info)
+    return folder
+
+
+def filmed(folder):
+    """A lossless video of 2 s with a table of what was known."""
+    folder.mkdir()
+    path = folder / "film.mkv"
+    writer = cv2.VideoWriter(
+        str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), 5.0, VIEW.shape
+    )
+    for index in range(10):
+        writer.write(cv2.cvtColor(seen(index), cv2.COLOR_GRAY2BGR))
+    writer.release()
+    path.with_suffix(".csv").write_text(
+        "time_s,yaw_deg,pitch_deg,roll_deg,agl_m\n0,19,0,0,160\n1,21,0,0,160\n2,21,0,0,160\n"
+    )
+    return path
+
+
+def bag(folder, form):
+    """A recording of ROS messages at that place."""
+    messages = Messages(ros1=form == "bag")
+    stamps = [START_S * 10**9 + index * 333_333_333 for index in range(4)]
+    body = messages.turn(70)
+    topics = {
+        "/cam": [(t, messages.image(t, seen(i))) for i, t in enumerate(stamps[1:3])],
+        "/imu": [(t, messages.imu(t, body)) for t in stamps],
+        "/height": [(t, messages.altitude(t, 160.0, 160.0)) for t in stamps],
+        "/fix": [(t, messages.fix(t, *PLACE)) for t in stamps],
+    }
+    return record(folder, topics, messages, form)
+
+
+def folder_of(path):
+    """A flight folder."""
+    path.mkdir()
+    writer = FlightWriter(path, Camera(**SIDES), "as it was")
+    for index in range(2):
+        telemetry = Telemetry(index * 10**9, 20.0, 0.0, 0.0, 160.0)
+        writer.add(f"{index}.png", np.dstack([seen(index)] * 3), telemetry, PLACE)
+    writer.close()
+    return path
+
+
+MAKERS = {
+    "photos": lambda folder: photographs(folder / "photos"),
+    "video": lambda folder: filmed(folder / "film"),
+    "bag": lambda folder: bag(folder / "bag", "bag"),
+    "db3": lambda folder: bag(folder / "db3", "db3"),
+    "mcap": lambda folder: bag(folder / "mcap", "file"),
+    "flight": lambda folder: folder_of(folder / "recorded"),
+}
+
+
+@pytest.mark.parametrize("kind", MAKERS)
+def test_a_source_is_localized_as_its_import_is(run, kind, tmp_path, camera):
+    source = MAKERS[kind](tmp_path)
+    told = ["--camera", camera]
+    code, out, err = run("import", source, "--out", tmp_path / "flight", *told, "--json")
+    assert (code, err) == (0, "")
+    plain = json.loads(out)
+    assert plain["kind"] == {"bag": "ros", "db3": "ros", "mcap": "ros"}.get(kind, kind)
+    assert plain["views"] == plain["complete"] == 2 and plain["broken"] == 0
+    flight = open_flight(tmp_path / "flight")
+    assert flight.camera == Camera(**SIDES) and len(flight.views) == 2
+    results = []
+    for name, path, more in (("a", source, told), ("b", tmp_path / "flight", [])):
+        fixes = tmp_path / f"{name}.jsonl"
+        assert run("localize", MAP, path, "--out", fixes, *more)[0] == 0
+        lines = [json.loads(line) for line in fixes.read_text().splitlines()]
+        results.append([{k: v for k, v in line.items() if k != "latency_ms"} for line in lines])
+        for result in read_results(fixes):
+            assert isinstance(result.outcome, Fix)
+            off = np.subtract((result.outcome.lat_deg, result.outcome.lon_deg), PLACE)
+            assert np.abs(off * [111e3, 76e3]).max() < 2
+    assert results[0] == results[1]
+
+
+def test_import_of_a_flight_changes_nothing(run, tmp_path):
+    source = folder_of(tmp_path / "recorded")
+    assert run("import", source, "--out", tmp_path / "flight")[0] == 0
+    for path in source.rglob("*.*"):
+        assert (tmp_path / "flight" / path.relative_to(source)).read_bytes() == path.read_bytes()
+    again = run("import", source, "--out", tmp_path / "told", "--prior-std-m", "25")
+    assert again[0] == 0 and "2 views, 2 with heading, tilt and height, 2 with a" in again[1]
+    assert open_flight(tmp_path / "told").views[0].telemetry.prior.std_m == 25
+
+
+def test_a_flight_may_be_given_another_camera_but_no_log(run, tmp_path):
+    source = folder_of(tmp_path / "recorded")
+    other = camera_file(tmp_path / "other.json", **SIDES, distortion=[0.01, 0, 0, 0])
+    assert run("import", source, "--out", tmp_path / "flight", "--camera", other)[0] == 0
+    assert open_flight(tmp_path / "flight").camera.distortion == (0.01, 0, 0, 0)
+    code, _, err = run("import", source, "--out", tmp_path / "b", "--telemetry", other)
+    assert code == 1 and "telemetry of its own" in err
+
+
+def test_a_flight_is_localized_whatever_its_truth(run, tmp_path):
+    source = folder_of(tmp_path / "recorded")
+    (source / "truth.csv").write_text("frame,lat_deg,lon_deg\n0.png,north,east\n")
+    code, out, err = run("localize", MAP, source, "--out", tmp_path / "fixes.jsonl")
+    assert code == 0 and "2 fixes" in out and "truth is left out: line 2" in err
+
+
+def test_what_is_doubtful_is_said(run, tmp_path):
+    for index in range(3):
+        photo(tmp_path / f"photos/{index}.jpg", f"2023:11:14 22:13:2{index}", seed=index)
+    data = (tmp_path / "photos/1.jpg").read_bytes()
+    (tmp_path / "photos/1.jpg").write_bytes(data[:-200])
+    code, out, err = run("import", tmp_path / "photos", "--out", tmp_path / "flight")
+    assert code == 0 and "2 views, 0 with heading" in out
+    assert "focal length from EXIF: expect errors of some per cent" in err
+    assert "1 views left out, the first" in err and "1.jpg" in err
+    assert "2 of 2 views lack heading, pitch, roll or height" in err
+    note = json.loads((tmp_path / "flight/flight.json").read_text())["note"]
+    assert "focal length from EXIF" in note
+    assert not (tmp_path / "flight/truth.csv").exists()
+    quiet = run("import", tmp_path / "photos", "--out", tmp_path / "quiet", "-q")
+    assert quiet[0] == 0 and quiet[2] == ""
+    located = run("localize", MAP, tmp_path / "photos", "--out", tmp_path / "fixes.jsonl")
+    assert located[0] == 1 and "1.jpg" in located[2] and not (tmp_path / "fixes.jsonl").exists()
+    skipped = ("localize", MAP, tmp_path / "photos", "--out", tmp_path / "f", "--skip-bad-images")
+    assert run(*skipped)[0] == 0
+    reasons = [result.outcome.reason for result in read_results(tmp_path / "f")]
+    assert reasons == ["missing_telemetry", "bad_image", "missing_telemetry"]
+
+
+def truncated(path):
+    path.write_bytes(path.read_bytes()[:700])
+    return path
+
+
+def written(path, data):
+    path.write_bytes(data)
+    return path
+
+
+def short_film(folder):
+    path = video(folder / "a.mkv")
+    subtitles(folder / "a.srt", ["[latitude: 46.5] [longitude: 2.5]"] * 9)
+    return path
+
+
+BROKEN = {
+    "nothing": (lambda folder: folder / "none", "does not exist"),
+    "empty file": (lambda folder: written(folder / "a.mp4", b""), "source is empty"),
+    "empty folder": (lambda folder: (folder / "e").mkdir() or folder / "e", "found none"),
+    "text": (lambda folder: written(folder / "a.mp4", b"words " * 99), "expected a video"),
+    "a log": (lambda folder: tlog(folder / "a.tlog"), "goes with --telemetry"),
+    "video cut": (lambda folder: truncated(video(folder / "a.mkv")), "a.mkv"),
+    "short subtitles": (short_film, "telemetry ends"),
+    "mcap cut": (lambda folder: truncated(bag(folder / "b", "file")), "ROS recording cannot be"),
+    "bag cut": (lambda folder: truncated(bag(folder / "b", "bag")), "ROS recording cannot be"),
+    "no flight": (lambda folder: folder_of(folder / "f") / "frames", "no time in EXIF"),
+}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_what_is_broken_is_one_line_and_nothing_is_written(run, how, tmp_path, camera, names_in):
+    make, message = BROKEN[how]
+    source = make(tmp_path)
+    before = names_in(tmp_path)
+    options = ("--camera", camera_file(tmp_path / "camera.json"))
+    for arguments in (
+        ("import", source, "--out", tmp_path / "flight"),
+        ("localize", MAP, source, "--out", tmp_path / "fixes.jsonl"),
+    ):
+        code, out, err = run(*arguments, *options)
+        assert (code, out) == (1, "") and message in err
+        assert err.startswith("orthonav: error: ") and err.count("\n") == 1
+    assert names_in(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    "options",
+    [["--topic", "image"], ["--jpeg-quality", "101"], ["--kind", "film"], ["--mount-deg", "1"]],
+)
+def test_wrong_usage(run, tmp_path, options):
+    code, out, err = run("import", tmp_path, "--out", tmp_path / "flight", *options)
+    assert code == 2 and out == "" and "usage: orthonav import" in err
+
+
+def test_the_kind_may_be_told(run, tmp_path, camera):
+    source = folder_of(tmp_path / "recorded")
+    code, _, err = run("import", source, "--out", tmp_path / "flight", "--kind", "ros")
+    assert code == 1 and err.count("\n") == 1
+    code, _, err = run("import", source, "--out", tmp_path / "flight", "--kind", "video")
+    assert code == 1 and "expected a file" in err
+
+
+def test_an_output_that_is_there_is_kept(run, tmp_path, names_in):
+    source = folder_of(tmp_path / "recorded")
+    before = names_in(tmp_path)
+    code, _, err = run("import", source, "--out", source)
+    assert code == 1 and "not empty" in err and names_in(tmp_path) == before
+
+
+def test_help_is_quick():
+    from orthonav.cli import import_, source  # loaded when the command is asked for
+
+    assert import_.add and source.add_source
+    start = time.perf_counter()
+    with pytest.raises(SystemExit):
+        main(["import", "--help"])
+    assert time.perf_counter() - start < 0.3

@@ -1,0 +1,43 @@
+"""Libraries that are not there or fail are one line that says what to do."""
+
+import ctypes
+import sys
+
+import pytest
+
+from orthonav.errors import CameraError, FlightError, MissingExtraError
+from orthonav.sources.guard import needed, reading
+
+
+def test_a_library_that_is_missing_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyulog.core", None)
+    with pytest.raises(MissingExtraError, match=r"PX4 logs needs pyulog: pip install 'orthonav\[f"):
+        needed("pyulog.core", "PX4 logs")
+
+
+def test_what_a_library_raises_is_one_line(tmp_path):
+    with pytest.raises(FlightError) as caught, reading("log", tmp_path):
+        raise KeyError("first line\nsecond line")
+    assert (
+        str(caught.value)
+        == f"log cannot be read (KeyError: 'first line\\nsecond line'): {tmp_path}"
+    )
+    with (
+        pytest.raises(FlightError, match="MemoryError: no more is known"),
+        reading("log", tmp_path),
+    ):
+        raise MemoryError
+    with pytest.raises(CameraError, match="ours"), reading("log", tmp_path):
+        raise CameraError("ours")
+    with pytest.raises(KeyboardInterrupt), reading("log", tmp_path):
+        raise KeyboardInterrupt
+
+
+def test_silence_ends_where_it_began(tmp_path, capfd):
+    with reading("log", tmp_path, silent=True):
+        print("unheard")
+        print("unheard", file=sys.stderr)
+        ctypes.CDLL(None).dprintf(2, b"unheard\n")
+    print("heard")
+    print("heard", file=sys.stderr)
+    assert capfd.readouterr() == ("heard\n", "heard\n")

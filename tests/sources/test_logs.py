@@ -1,0 +1,261 @@
+"""Autopilots' logs: PX4 ULog, ArduPilot DataFlash and telemetry logs, joined by time."""
+
+import math
+import struct
+
+import numpy as np
+import pytest
+from recorders import (
+    START_S,
+    camera_file,
+    dataflash,
+    flown,
+    photo,
+    px4_topics,
+    quaternion_wxyz,
+    tlog,
+    ulog,
+    video,
+)
+
+from orthonav.errors import FlightError, MissingFileError
+from orthonav.sources import SourceOptions, import_flight, open_source
+from orthonav.sources.logs import log_kind, read_log
+from orthonav.sources.track import angles_at
+
+DOWN = (0.0, 0.0, 0.0)
+WRITERS = {
+    "ulog": lambda path: ulog(path, px4_topics()),
+    "dataflash": dataflash,
+    "tlog": tlog,
+}
+
+
+@pytest.fixture(params=WRITERS)
+def kind(request):
+    return request.param
+
+
+@pytest.fixture
+def log(kind, tmp_path):
+    return WRITERS[kind](tmp_path / "flight.log")
+
+
+def turned(first, second):
+    """The difference of two headings, -180..180."""
+    return (first - second + 180) % 360 - 180
+
+
+def test_the_kind_is_found_by_content(kind, log):
+    assert log_kind(log) == kind
+
+
+def test_attitude_of_a_camera_that_looks_down_is_that_of_the_body(log):
+    """In UTC by the GPS; a hundredth of a degree is what DataFlash holds."""
+    track = read_log(log, DOWN)
+    for t, yaw, pitch, roll in flown():
+        told = angles_at(track.attitude, (START_S * 1000 + round(t * 1000)) * 10**6)
+        assert turned(told[0], yaw) == pytest.approx(0, abs=0.02)
+        assert told[1:] == pytest.approx((pitch, roll), abs=0.02)
+    between = angles_at(track.attitude, START_S * 10**9 + 2_550_000_000)  # across north
+    assert turned(between[0], 350 + 4 * 2.55) == pytest.approx(0, abs=0.02)
+
+
+def test_position_and_velocity(log):
+    track = read_log(log, DOWN)
+    at = START_S * 10**9 + 3 * 10**9
+    assert track.latlon_deg(at) == pytest.approx((46.5, 2.5), abs=1e-7)
+    east, north = track.telemetry(at).vel_en_mps
+    if log_kind(log) == "dataflash":  # speed 5 m/s over a course of 90
+        assert (east, north) == pytest.approx((5, 0), abs=1e-6)
+    else:
+        assert (east, north) == pytest.approx((-1, 3) if log_kind(log) == "ulog" else (3, -1))
+
+
+@pytest.mark.parametrize(
+    "kind, early, late",
+    [("ulog", 90 + 3, 400 + 9 - 280), ("dataflash", 95.5, 110 + 9), ("tlog", 105 + 3, 105 + 9)],
+)
+def test_heights_are_of_the_distance_sensor_where_it_is_sound(kind, early, late, tmp_path):
+    track = read_log(WRITERS[kind](tmp_path / "log"), DOWN)
+    heights = [track.telemetry((START_S + t) * 10**9).agl_m for t in (3, 9)]
+    assert heights == pytest.approx([early, late], abs=0.01)
+
+
+def test_the_mount_turns_the_camera(log):
+    right = read_log(log, (90.0, 0.0, 0.0))
+    told = angles_at(right.attitude, START_S * 10**9)
+    _, yaw, _, roll = next(flown())
+    assert turned(told[0], yaw + 90) == pytest.approx(0, abs=0.1)
+    assert told[1:] == pytest.approx((-roll, 0), abs=0.1)  # right wing down: lower top of the image
+
+
+def test_newer_px4_names(tmp_path):
+    topics = px4_topics()
+    stamp = "uint64_t"
+    rows = [(row[0], row[1], 46.5, 2.5, 400.0, 3) for row in topics.pop("vehicle_gps_position")[1]]
+    topics["sensor_gps"] = (
+        {
+            "timestamp": stamp,
+            "time_utc_usec": stamp,
+            "latitude_deg": "double",
+            "longitude_deg": "double",
+            "altitude_msl_m": "double",
+            "fix_type": "uint8_t",
+        },
+        rows,
+    )
+    track = read_log(ulog(tmp_path / "a.ulg", topics), DOWN)
+    assert track.latlon_deg(START_S * 10**9) == (46.5, 2.5)
+    assert track.origin_ns == START_S * 10**9
+
+
+def test_px4_without_gps_counts_from_boot(tmp_path):
+    topics = px4_topics(sensor=False)
+    for name in ("vehicle_gps_position", "vehicle_global_position", "home_position"):
+        del topics[name]
+    track = read_log(ulog(tmp_path / "a.ulg", topics), DOWN)
+    assert track.origin_ns == 5 * 10**9 and track.latlon_deg(6 * 10**9) is None
+    assert track.telemetry(6 * 10**9).agl_m == pytest.approx(101)  # above its origin
+
+
+def test_ardupilot_without_gps_counts_from_boot(tmp_path):
+    track = read_log(dataflash(tmp_path / "a.bin", gps=False), DOWN)
+    assert track.origin_ns == 3 * 10**9
+
+
+def test_attitude_as_a_quaternion_in_a_tlog(tmp_path):
+    from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+    sender = dialect.MAVLink(None, srcSystem=7)
+    w, x, y, z = quaternion_wxyz(200, 5, -3)
+    data = b""
+    for step in range(20):
+        message = dialect.MAVLink_attitude_quaternion_message(step, w, x, y, z, 0, 0, 0)
+        stamp = struct.pack(">Q", START_S * 10**6 + step * 100_000)
+        data += stamp + message.pack(sender, force_mavlink1=step % 2 == 0)
+    (tmp_path / "a.tlog").write_bytes(data)
+    track = read_log(tmp_path / "a.tlog", DOWN)
+    assert len(track.attitude.time_ns) == 20
+    assert angles_at(track.attitude, START_S * 10**9) == pytest.approx((200, 5, -3), abs=1e-4)
+
+
+def test_damage_between_messages_costs_only_those(kind, log):
+    data = log.read_bytes()
+    cut = int(len(data) * 0.6)
+    log.write_bytes(data[:cut] + bytes(range(1, 200)) + data[cut + 100 :])
+    track = read_log(log, DOWN)
+    assert len(track.attitude.time_ns) > 55
+    assert track.span_ns()[0] == pytest.approx(START_S * 10**9, abs=10**7)
+
+
+def test_a_log_that_was_cut_tells_what_came_before(kind, log):
+    data = log.read_bytes()
+    log.write_bytes(data[: len(data) // 2])
+    track = read_log(log, DOWN)
+    assert 30 < len(track.attitude.time_ns) < 70
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    """Three photographs, 2 s apart, by a clock without a zone that is 1.5 s slow."""
+    for second in (0, 2, 4):
+        photo(
+            tmp_path / f"photos/{second}.jpg",
+            f"2023:11:14 22:13:2{second}",
+            more={0x9291: "50"},
+            xmp=None,
+            seed=second,
+        )
+    return tmp_path / "photos"
+
+
+def test_photographs_with_a_log(photographs, log, tmp_path):
+    options = SourceOptions(telemetry=log, time_offset_s=1.5, prior_std_m=20.0)
+    done = import_flight(open_source(photographs, options), tmp_path / "flight")
+    assert (done.views, done.complete, done.with_truth) == (3, 3, 3)
+    for view, second in zip(open_source(photographs, options).views, (0, 2, 4), strict=True):
+        told = view.telemetry
+        assert told.time_ns == (START_S + second + 2) * 10**9
+        assert turned(told.yaw_deg, 350 + 4 * (second + 2)) == pytest.approx(0, abs=0.02)
+        assert told.prior.std_m == 20 and math.isfinite(told.agl_m)
+
+
+def test_views_after_the_end_of_a_log_are_not_made_up(photographs, log, tmp_path):
+    options = SourceOptions(telemetry=log, time_offset_s=7.0)
+    told = [view.telemetry.missing() for view in open_source(photographs, options).views]
+    assert told[0] == told[1] == [] and len(told[2]) == 4
+
+
+def test_a_log_of_another_flight_is_refused(photographs, log, tmp_path):
+    options = SourceOptions(telemetry=log, time_offset_s=3600.0)
+    with pytest.raises(FlightError, match="give --time-offset-s"):
+        open_source(photographs, options)
+
+
+def test_a_video_counts_from_the_first_attitude(log, tmp_path):
+    path = video(tmp_path / "a.mkv")
+    camera = camera_file(tmp_path / "camera.json")
+    options = SourceOptions(camera=camera, telemetry=log, time_offset_s=2.0)
+    views = list(open_source(path, options).views)
+    assert [view.telemetry.time_ns for view in views] == [
+        (START_S + second) * 10**9 for second in (2, 3, 4)
+    ]
+    headings = [turned(view.telemetry.yaw_deg, 358 + 4 * i) for i, view in enumerate(views)]
+    assert headings == pytest.approx([0, 0, 0], abs=0.02)
+
+
+def broken(tmp_path, kind):
+    path = tmp_path / "log"
+    writers = {
+        "ulog without attitude": lambda: ulog(
+            path, {k: v for k, v in px4_topics().items() if k != "vehicle_attitude"}
+        ),
+        "ulog header": lambda: path.write_bytes(b"ULog\x01\x12\x35\x01" + bytes(8)),
+        "ulog of noise": lambda: path.write_bytes(
+            b"ULog\x01\x12\x35\x01" + np.random.default_rng(0).bytes(4000)
+        ),
+        "dataflash without attitude": lambda: dataflash(path, attitude=False),
+        "dataflash of noise": lambda: path.write_bytes(
+            b"\xa3\x95\x80" + np.random.default_rng(0).bytes(4000)
+        ),
+        "tlog without attitude": lambda: tlog(path, attitude=False),
+        "tlog of noise": lambda: path.write_bytes(
+            struct.pack(">QB", START_S * 10**6, 0xFD) + np.random.default_rng(0).bytes(4000)
+        ),
+        "empty": path.touch,
+        "text": lambda: path.write_text("what happened on this flight"),
+        "a table without angles": lambda: path.write_text("time_s,agl_m\n1,100\n"),
+        "a table of nothing": lambda: path.write_text("time_s,pitch_deg,roll_deg\n1,,\n"),
+    }
+    writers[kind]()
+    return path
+
+
+BROKEN = {
+    "ulog without attitude": "PX4 log has no attitude",
+    "ulog header": "PX4 log",
+    "ulog of noise": "PX4 log",
+    "dataflash without attitude": "ArduPilot log has no attitude",
+    "dataflash of noise": "ArduPilot log",
+    "tlog without attitude": "telemetry log has no attitude",
+    "tlog of noise": "telemetry log has no attitude",
+    "empty": "telemetry log is empty",
+    "text": "expected a PX4 log",
+    "a table without angles": "columns are missing: pitch_deg, roll_deg",
+    "a table of nothing": "no line with pitch and roll",
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_what_is_broken_is_one_error(tmp_path, kind, capfd):
+    path = broken(tmp_path, kind)
+    with pytest.raises(FlightError, match=BROKEN[kind]) as caught:
+        read_log(path, DOWN)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_log_that_is_not_there(tmp_path):
+    with pytest.raises(MissingFileError, match="telemetry log"):
+        read_log(tmp_path / "none.ulg", DOWN)

@@ -1,0 +1,234 @@
+"""Folders of photographs: what EXIF and XMP tell, and what they do not."""
+
+import math
+
+import numpy as np
+import pytest
+from recorders import (
+    AUTEL,
+    DJI,
+    HEIGHT,
+    PIX4D,
+    START_S,
+    WIDTH,
+    camera_file,
+    dji,
+    packet,
+    photo,
+    picture,
+    place,
+)
+
+from orthonav.errors import CameraError, FlightError
+from orthonav.flight import open_flight, read_image, read_truth
+from orthonav.geo.camera import attitude_of
+from orthonav.records import Prior
+from orthonav.sources import SourceOptions, import_flight, open_source
+from orthonav.sources.exif import read_photo
+from orthonav.sources.photos import EXIF_NOTE
+
+SUBSEC, OFFSET = 0x9291, 0x9011
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Three photographs of a DJI drone, the names not in the order of time."""
+    root = tmp_path / "DCIM"
+    for name, second in (("c.jpg", 0), ("sub/b.jpg", 1), ("a.jpg", 2)):
+        photo(
+            root / name,
+            f"2023:11:14 22:13:2{second}",
+            more={SUBSEC: "250"},
+            gps=place(46.5 + second / 1000, -0.25),
+            xmp=dji(yaw=30 + second, pitch=-80),
+            seed=second,
+        )
+    (root / "notes.txt").write_text("a flight")
+    return root
+
+
+def test_a_folder_of_dji(folder, tmp_path):
+    recording = open_source(folder)
+    assert recording.kind == "photos" and recording.expected == 3
+    assert EXIF_NOTE in recording.note and recording.warnings == (EXIF_NOTE,)
+    done = import_flight(recording, tmp_path / "flight")
+    assert (done.views, done.complete, done.with_truth, done.broken) == (3, 3, 3, 0)
+    flight = open_flight(tmp_path / "flight")
+    assert [view.frame for view in flight.views] == ["c.jpg", "sub/b.jpg", "a.jpg"]
+    told = flight.views[1].telemetry
+    assert told.time_ns == (START_S + 1) * 10**9 + 250_000_000
+    assert (told.yaw_deg, told.pitch_deg, told.roll_deg) == pytest.approx((31, 10, 0))
+    assert told.agl_m == 120.5 and told.vel_en_mps == (-1.25, 3.5) and told.prior is None
+    truth = read_truth(tmp_path / "flight/truth.csv")
+    assert truth["sub/b.jpg"] == pytest.approx((46.501, -0.25), abs=1e-7)
+    copied = tmp_path / "flight/frames/sub/b.jpg"
+    assert copied.read_bytes() == (folder / "sub/b.jpg").read_bytes()
+    assert np.array_equal(read_image(copied), next(iter(recording.views)).grey()) is False
+
+
+def test_the_camera_is_that_of_the_focal_length(folder):
+    camera = open_source(folder).camera
+    assert (
+        camera.fx_px == camera.fy_px == pytest.approx(24 * math.hypot(64, 48) / math.hypot(36, 24))
+    )
+    assert (camera.cx_px, camera.cy_px) == (32, 24)
+    told = open_source(folder, SourceOptions(sensor_width_mm=13.2)).camera
+    assert told.fx_px == pytest.approx(8.8 / 13.2 * 64)
+
+
+def test_the_focal_length_by_the_resolution_of_the_sensor(tmp_path):
+    """8.8 mm at 200 px per mm (5080 per inch) are 1760 px of 640 that were thinned to 64."""
+    more = {0xA405: None, 0xA20E: 5080.0, 0xA210: 2, 0xA002: 640}
+    assert read_photo(photo(tmp_path / "a.jpg", more=more)).focal_px == pytest.approx(176.0)
+    per_cm = {0xA405: None, 0xA20E: 2000.0, 0xA210: 3}
+    assert read_photo(photo(tmp_path / "b.jpg", more=per_cm)).focal_px == pytest.approx(1760.0)
+    none = {0xA405: 0, 0x920A: None}
+    assert read_photo(photo(tmp_path / "c.jpg", more=none)).focal_px is None
+
+
+def test_a_camera_file_is_better(folder, tmp_path):
+    file = camera_file(tmp_path / "c.json", width_px=128, height_px=96, cx_px=66.0)
+    recording = open_source(folder, SourceOptions(camera=file))
+    assert (recording.camera.width_px, recording.camera.cx_px) == (WIDTH, 33.0)
+    assert EXIF_NOTE not in recording.note and recording.warnings == ()
+    wrong = camera_file(tmp_path / "d.json", width_px=128, height_px=72)
+    with pytest.raises(CameraError, match="other proportions"):
+        open_source(folder, SourceOptions(camera=wrong))
+
+
+def test_the_position_may_be_told_as_a_prior(folder):
+    view = next(open_source(folder, SourceOptions(prior_std_m=25.0)).views)
+    assert view.telemetry.prior == Prior(*view.truth_latlon_deg, 25.0)
+
+
+@pytest.mark.parametrize("as_elements", [False, True])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
+def test_xmp_in_every_form(tmp_path, suffix, as_elements):
+    values = {"GimbalYawDegree": "-12.5", "GimbalPitchDegree": "-70.0", "GimbalRollDegree": "0.0"}
+    xmp = packet(as_elements=as_elements, **values)
+    told = read_photo(photo(tmp_path / f"a.{suffix}", xmp=xmp))
+    assert attitude_of(told.rotation) == pytest.approx((347.5, 20, 0))
+    assert math.isnan(told.height_m) and (told.width_px, told.height_px) == (WIDTH, HEIGHT)
+
+
+def test_autel(tmp_path):
+    xmp = packet(
+        AUTEL,
+        GimbalYawDegree="90.0",
+        GimbalPitchDegree="-90.0",
+        GimbalRollDegree="0.0",
+        RelativeAltitude="80.25",
+    )
+    told = read_photo(photo(tmp_path / "a.jpg", xmp=xmp, make="Autel Robotics"))
+    assert attitude_of(told.rotation) == pytest.approx((90, 0, 0), abs=1e-6)
+    assert told.height_m == 80.25
+
+
+@pytest.mark.parametrize("make, roll", [("Sony", 4), ("senseFly", -4), ("Parrot", 4)])
+def test_angles_as_pix4d_names_them(tmp_path, make, roll):
+    xmp = packet(PIX4D, Yaw="200.0", Pitch="6.0", Roll="4.0")
+    told = read_photo(photo(tmp_path / "a.jpg", xmp=xmp, make=make))
+    assert attitude_of(told.rotation) == pytest.approx((200, 6, roll))
+
+
+@pytest.mark.parametrize(
+    "time, more, gps, seconds, known",
+    [
+        ("2023:11:14 22:13:20", {}, {}, 0, True),
+        ("2023:11:14 23:13:20", {OFFSET: "+01:00"}, {}, 0, True),
+        ("2023:11:14 17:13:20", {OFFSET: "-05:00", SUBSEC: "5"}, {}, 0.5, True),
+        ("2023:11:14 22:13:20", {OFFSET: None, SUBSEC: "007"}, {}, 0.007, False),
+        # Two hours and some seconds after the GPS: the zone is two hours, the rest a slow clock.
+        (
+            "2023:11:15 00:13:20",
+            {OFFSET: None},
+            {29: "2023:11:14", 7: (22.0, 13.0, 25.5)},
+            0,
+            True,
+        ),
+        ("2023:11:14 22:13:20", {OFFSET: None}, {29: "x", 7: ()}, 0, False),
+    ],
+)
+def test_times(tmp_path, time, more, gps, seconds, known):
+    told = read_photo(photo(tmp_path / "a.jpg", time, more=more, gps=gps))
+    assert told.time_ns == START_S * 10**9 + round(seconds * 1e9) and told.zone_known == known
+
+
+@pytest.mark.parametrize("lat, lon", [(46.5, 2.5), (-33.9, 151.2), (10.0, -179.5)])
+def test_places(tmp_path, lat, lon):
+    told = read_photo(photo(tmp_path / "a.jpg", gps=place(lat, lon)))
+    assert told.latlon_deg == pytest.approx((lat, lon), abs=1e-7) and told.alt_m == 400
+
+
+@pytest.mark.parametrize("maker", [DJI, AUTEL])
+@pytest.mark.parametrize("name", ["GpsLongitude", "GpsLongtitude"])
+def test_the_position_of_xmp_is_the_better_one(tmp_path, maker, name):
+    xmp = packet(maker, GpsLatitude="+29.282190206", **{name: "-94.922448090"})
+    told = read_photo(photo(tmp_path / "a.jpg", gps=place(29.28, -94.92), xmp=xmp))
+    assert told.latlon_deg == (29.282190206, -94.92244809)
+
+
+def test_the_time_of_exposure_is_the_better_one(tmp_path):
+    xmp = packet(UTCAtExposure="2023-11-14T22:13:20.073960")
+    told = read_photo(
+        photo(tmp_path / "a.jpg", "2023:11:14 23:13:20", more={OFFSET: None}, xmp=xmp)
+    )
+    assert told.time_ns == START_S * 10**9 + 73_960_000 and told.zone_known
+    wrong = packet(UTCAtExposure="2023-99-14T22:13:20")
+    assert read_photo(photo(tmp_path / "b.jpg", xmp=wrong)).time_ns == START_S * 10**9
+
+
+def test_what_is_not_told_is_not_known(tmp_path):
+    photo(tmp_path / "p/a.jpg", gps={1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0)})
+    view = next(open_source(tmp_path / "p").views)
+    assert view.telemetry.missing() == ["yaw_deg", "pitch_deg", "roll_deg", "agl_m"]
+    assert view.truth_latlon_deg is None and view.telemetry.vel_en_mps is None
+    photo(tmp_path / "q/a.jpg", gps=place(46.5, 2.5, alt=400.0))
+    options = SourceOptions(ground_alt_m=290.0, looks_down=True)
+    told = next(open_source(tmp_path / "q", options).views).telemetry
+    assert told.missing() == ["yaw_deg"] and told.agl_m == 110.0
+
+
+def test_what_is_broken_is_left_out_and_said(folder, tmp_path):
+    (folder / "d.jpg").write_bytes(b"not a picture")
+    (folder / "e.jpg").touch()
+    photo(folder / "f.jpg", time=None)
+    photo(folder / "g.jpg", time="2023:11:14 22:14:00", more={OFFSET: None})
+    whole = photo(folder / "h.jpg", time="2023:11:14 22:15:00", seed=7).read_bytes()
+    (folder / "h.jpg").write_bytes(whole[: len(whole) - 300])  # its header can be read
+    recording = open_source(folder)
+    assert recording.warnings[:3] == (
+        "2 of 8 photographs left out, no readable picture, the first: d.jpg",
+        "1 of 8 photographs left out, no time in EXIF, the first: f.jpg",
+        "time zone of 1 photographs not in EXIF: taken as UTC",
+    )
+    done = import_flight(recording, tmp_path / "flight")
+    assert (done.views, done.broken) == (4, 1) and "h.jpg" in done.first_broken
+    assert len(open_flight(tmp_path / "flight").views) == 4
+
+
+def test_a_picture_of_another_size_ends_it(folder, tmp_path, names_in):
+    photo(folder / "z.jpg", "2023:11:14 23:00:00", width=48, height=64)
+    with pytest.raises(CameraError, match=r"48 x 64 px: .*z\.jpg"):
+        import_flight(open_source(folder), tmp_path / "flight")
+    assert "flight" not in names_in(tmp_path)
+
+
+def test_folders_that_are_no_flight_are_refused(tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FlightError, match="found none"):
+        open_source(tmp_path / "empty")
+    photo(tmp_path / "p/a.jpg", time=None)
+    with pytest.raises(FlightError, match="no time in EXIF"):
+        open_source(tmp_path / "p")
+    photo(tmp_path / "q/a.jpg", more={0xA405: None, 0x920A: None})
+    with pytest.raises(CameraError, match="give --camera"):
+        open_source(tmp_path / "q")
+
+
+def test_no_copy_of_a_picture_is_made_before_it_is_asked_for(folder):
+    views = list(open_source(folder).views)
+    (folder / "c.jpg").unlink()
+    with pytest.raises(FileNotFoundError):
+        views[0].grey()
+    assert views[1].grey().shape == picture().shape

@@ -1,0 +1,300 @@
+"""ROS 1 and ROS 2 recordings and MCAP files: topics, images, cameras, and what is broken."""
+
+import math
+import tracemalloc
+
+import cv2
+import numpy as np
+import pytest
+from bags import FORMATS, Messages, flight, record
+from recorders import START_S, camera_file, picture, px4_topics, ulog
+
+from orthonav.errors import CameraError, FlightError
+from orthonav.flight import open_flight, read_truth
+from orthonav.sources import SourceOptions, import_flight, open_source
+from orthonav.sources.ros_images import camera_of_info, grey_of_image
+
+MIDDLE = (START_S * 2 + 1) * 5 * 10**8  # of the first image: half a second
+
+
+@pytest.fixture
+def messages():
+    return Messages()
+
+
+@pytest.fixture
+def topics(messages):
+    return flight(messages)
+
+
+@pytest.mark.parametrize("form", [*FORMATS, "file"])
+def test_every_format(tmp_path, form):
+    messages = Messages(ros1=form == "bag")
+    path = record(tmp_path / "flight", flight(messages), messages, form)
+    recording = open_source(path)
+    assert recording.kind == "ros" and recording.expected == 4 and recording.warnings == ()
+    assert "image /cam/image_raw" in recording.note and "attitude /imu/data" in recording.note
+    done = import_flight(recording, tmp_path / "out")
+    assert (done.views, done.complete, done.with_truth, done.broken) == (4, 4, 4, 0)
+    written = open_flight(tmp_path / "out")
+    assert (written.camera.fx_px, written.camera.cx_px, written.camera.cy_px) == (60, 32, 24)
+    told = written.views[0].telemetry
+    assert told.time_ns == MIDDLE  # of the stamp, not of the recording
+    assert told.yaw_deg == pytest.approx(355) and told.agl_m == 85
+    assert (told.pitch_deg, told.roll_deg) == pytest.approx((0, 0), abs=1e-6)
+    east, north = told.vel_en_mps
+    heading = math.radians(355)
+    assert (east, north) == pytest.approx((5 * math.sin(heading), 5 * math.cos(heading)))
+    for view, step in zip(written.views, (5, 15, 25, 35), strict=True):
+        assert np.array_equal(view.grey(), picture(step))
+    assert read_truth(tmp_path / "out/truth.csv")["000001.png"] == (46.5015, 2.5)
+
+
+@pytest.mark.parametrize("form", [*FORMATS, "file"])
+def test_the_kind_is_found_by_content(tmp_path, form):
+    messages = Messages(ros1=form == "bag")
+    path = record(tmp_path / "flight", flight(messages), messages, form)
+    if path.is_file():
+        path = path.rename(tmp_path / "recorded.dat")
+    assert len(list(open_source(path).views)) == 4
+
+
+def test_compressed_images_are_copied(tmp_path, messages, topics):
+    greys = [picture(seed) for seed in range(4)]
+    stamped = [START_S * 10**9 + step * 10**9 for step in range(4)]
+    suffixes = (".jpg", ".png", ".jpg", ".tif")
+    del topics["/cam/image_raw"]
+    topics["/cam/image_raw/compressed"] = [
+        (time_ns, messages.compressed(time_ns, grey, suffix))
+        for time_ns, grey, suffix in zip(stamped, greys, suffixes, strict=True)
+    ]
+    recording = open_source(record(tmp_path / "flight", topics, messages))
+    import_flight(recording, tmp_path / "out")
+    views = open_flight(tmp_path / "out").views
+    assert [view.path.suffix for view in views] == list(suffixes)
+    assert np.array_equal(views[1].grey(), greys[1])
+    for view, (_, message) in zip(views, topics["/cam/image_raw/compressed"], strict=True):
+        assert view.path.read_bytes() == message.data.tobytes()
+
+
+def bayer(rgb, order):
+    """A mosaic (H, W) as the sensor with that order of colours gives it, of rgb (H, W, 3)."""
+    mosaic = np.empty(rgb.shape[:2], dtype=rgb.dtype)
+    for position, colour in enumerate(order):
+        row, column = divmod(position, 2)
+        mosaic[row::2, column::2] = rgb[row::2, column::2, "rgb".index(colour)]
+    return mosaic
+
+
+@pytest.mark.parametrize("depth", [8, 16])
+@pytest.mark.parametrize("order", ["rggb", "bggr", "gbrg", "grbg"])
+def test_bayer(messages, order, depth):
+    """Of a red, a green and a blue field; taken in another order they would swap."""
+    rgb = np.zeros((24, 36, 3), dtype=np.uint8)
+    for index in range(3):
+        rgb[:, 12 * index : 12 * index + 12, index] = 200
+    expected = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    mosaic = bayer(rgb, order)
+    data = mosaic if depth == 8 else mosaic.astype(np.uint16) * 256
+    grey = grey_of_image(messages.image(0, data, f"bayer_{order}{depth}"), "x")
+    for index in range(3):
+        inner = np.s_[4:-4, 12 * index + 4 : 12 * index + 8]
+        assert np.abs(grey[inner].astype(int) - expected[inner]).max() <= 2
+
+
+COLOURS = np.stack([picture(1), picture(2), picture(3)], axis=-1)
+GREY = cv2.cvtColor(COLOURS, cv2.COLOR_RGB2GRAY)
+FULL = np.full((48, 64, 1), 255, np.uint8)
+
+
+@pytest.mark.parametrize(
+    "encoding, data, expected",
+    [
+        ("mono8", picture(1), picture(1)),
+        ("8UC1", picture(1), picture(1)),
+        ("rgb8", COLOURS, GREY),
+        ("bgr8", COLOURS[..., ::-1], GREY),
+        ("rgba8", np.concatenate([COLOURS, FULL], axis=-1), GREY),
+        ("bgra8", np.concatenate([COLOURS[..., ::-1], FULL], axis=-1), GREY),
+        ("mono16", picture(1).astype("<u2") * 256 + 99, picture(1)),
+    ],
+)
+def test_encodings(messages, encoding, data, expected):
+    data = np.ascontiguousarray(data)
+    assert np.array_equal(grey_of_image(messages.image(0, data, encoding), "x"), expected)
+
+
+def test_padded_rows_and_big_ends(messages):
+    padded = np.zeros((48, 80), np.uint8)
+    padded[:, :64] = picture(1)
+    message = messages.image(0, padded, width=64)
+    assert np.array_equal(grey_of_image(message, "x"), picture(1))
+    big = picture(1).astype(">u2") * 256
+    message = messages.image(0, big.astype(">u2"), "mono16", is_bigendian=1)
+    assert np.array_equal(grey_of_image(message, "x"), picture(1))
+
+
+@pytest.mark.parametrize(
+    "changes, error",
+    [
+        ({"encoding": "yuv422"}, "'yuv422' is not known"),
+        ({"data": np.zeros(10, np.uint8)}, "cut short"),
+        ({"step": 3}, "cut short"),
+        ({"height": 0}, "has no size"),
+    ],
+)
+def test_images_that_cannot_be_read(messages, changes, error):
+    with pytest.raises(FlightError, match=error):
+        grey_of_image(messages.image(0, picture(), **changes), "x")
+
+
+def test_cameras(messages):
+    plumb = camera_of_info(messages.camera_info(lens=(-0.2, 0.1, 0.001, -0.001, 0.05)))
+    assert plumb.model == "brown" and plumb.distortion == (-0.2, 0.1, 0.001, -0.001, 0.05)
+    rational = messages.camera_info("rational_polynomial", (-0.2, 0.1, 0, 0, 0.05, 0, 0, 0))
+    assert camera_of_info(rational).distortion == (-0.2, 0.1, 0, 0, 0.05)
+    fish = camera_of_info(messages.camera_info("equidistant", (0.1, 0.01, 0, 0)))
+    assert fish.model == "fisheye" and (fish.cx_px, fish.cy_px) == (32, 24)
+
+
+@pytest.mark.parametrize(
+    "model, lens, changes, error",
+    [
+        ("rational_polynomial", (0.1, 0, 0, 0, 0, 0.2, 0, 0), {}, "more than k1"),
+        ("thin_prism", (), {}, "not supported"),
+        ("plumb_bob", (), {"k": np.zeros(9)}, "not calibrated"),
+        ("plumb_bob", (), {"binning_x": 2}, "binning"),
+    ],
+)
+def test_cameras_that_we_do_not_have(messages, model, lens, changes, error):
+    with pytest.raises(CameraError, match=error):
+        camera_of_info(messages.camera_info(model, lens, **changes))
+
+
+def test_a_raw_imu_is_passed_over(tmp_path, messages, topics):
+    zero = messages.new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=0.0)
+    topics["/imu/data"] = [
+        (time_ns, messages.imu(time_ns, zero, known=index % 2 == 0))
+        for index, (time_ns, _) in enumerate(topics["/imu/data"])
+    ]
+    view = next(open_source(record(tmp_path / "flight", topics, messages)).views)
+    assert view.telemetry.yaw_deg == pytest.approx(355)  # of the odometry
+
+
+def test_heights_of_mavros(tmp_path, messages, topics):
+    del topics["/range"]
+    times = [time_ns for time_ns, _ in topics["/imu/data"]]
+    topics["/mavros/altitude"] = [
+        (t, messages.altitude(t, 110.0, math.nan if i < 20 else 90.0)) for i, t in enumerate(times)
+    ]
+    views = list(open_source(record(tmp_path / "a", topics, messages)).views)
+    assert [view.telemetry.agl_m for view in views] == [110, 110, 90, 90]
+    del topics["/mavros/altitude"]
+    topics["/mavros/global_position/rel_alt"] = [(t, messages.number(105.0)) for t in times]
+    topics["/battery"] = [(t, messages.number(12.5)) for t in times]
+    views = list(open_source(record(tmp_path / "b", topics, messages)).views)
+    assert views[0].telemetry.agl_m == 105
+
+
+def test_topics_as_told(tmp_path, messages, topics):
+    topics["/other/image_raw"] = [(START_S * 10**9, messages.image(START_S * 10**9, picture(9)))]
+    path = record(tmp_path / "flight", topics, messages)
+    with pytest.raises(FlightError, match=r"found /cam/image_raw, /other/image_raw; give --topic"):
+        open_source(path)
+    told = SourceOptions(topics={"image": "/cam/image_raw", "attitude": "/odom"})
+    recording = open_source(path, told)
+    assert "attitude /odom" in recording.note and len(list(recording.views)) == 4
+    for role, name, error in (
+        ("image", "/none", "no messages on /none; there are /cam/camera_info"),
+        ("image", "/imu/data", "carries sensor_msgs/msg/Imu; image is one of"),
+    ):
+        with pytest.raises(FlightError, match=error):
+            open_source(path, SourceOptions(topics={role: name}))
+
+
+def test_without_attitude_nothing_is_made_up(tmp_path, messages, topics):
+    del topics["/imu/data"], topics["/odom"]
+    recording = open_source(record(tmp_path / "flight", topics, messages))
+    assert recording.warnings == ("no topic tells the attitude of the aircraft",)
+    told = next(recording.views).telemetry
+    assert told.missing() == ["yaw_deg", "pitch_deg", "roll_deg"] and told.vel_en_mps is None
+
+
+def test_no_fix_is_no_position(tmp_path, messages, topics):
+    topics["/fix"] = [(t, messages.fix(t, status=-1)) for t, _ in topics["/fix"]]
+    recording = open_source(record(tmp_path / "flight", topics, messages))
+    assert next(recording.views).truth_latlon_deg is None
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_one_broken_message_does_not_end_it(tmp_path, form):
+    messages = Messages(ros1=form == "bag")
+    topics = flight(messages)
+    images = topics["/cam/image_raw"]
+    images[1] = (images[1][0], b"\0\1\0\0broken")
+    odd = messages.image(images[2][0], picture(), encoding="strange")
+    images[2] = (images[2][0], odd)
+    topics["/imu/data"][3] = (topics["/imu/data"][3][0], b"\0\1\0\0broken")
+    recording = open_source(record(tmp_path / "flight", topics, messages, form))
+    done = import_flight(recording, tmp_path / "out")
+    assert (done.views, done.broken) == (2, 2) and "image 1 of" in done.first_broken
+    assert [view.frame for view in open_flight(tmp_path / "out").views] == [
+        "000000.png",
+        "000003.png",
+    ]
+
+
+def test_a_camera_file_and_a_log_may_stand_in(tmp_path, messages, topics):
+    kept = {"/cam/image_raw": topics["/cam/image_raw"]}
+    path = record(tmp_path / "flight", kept, messages)
+    with pytest.raises(CameraError, match="no camera_info"):
+        open_source(path)
+    log = ulog(tmp_path / "a.ulg", px4_topics())
+    camera = camera_file(tmp_path / "camera.json", width_px=128, height_px=96)
+    recording = open_source(path, SourceOptions(camera=camera, telemetry=log))
+    assert recording.camera.width_px == 64
+    told = next(recording.views).telemetry
+    assert told.missing() == [] and told.yaw_deg == pytest.approx(352)
+
+
+@pytest.mark.parametrize("form", [*FORMATS, "file"])
+@pytest.mark.parametrize("how", ["cut", "noise", "header"])
+def test_a_damaged_recording_is_one_error(tmp_path, form, how, capfd):
+    messages = Messages(ros1=form == "bag")
+    path = record(tmp_path / "flight", flight(messages), messages, form)
+    file = path if path.is_file() else next(one for one in path.iterdir() if one.suffix != ".yaml")
+    data = file.read_bytes()
+    noise = np.random.default_rng(0).bytes(len(data) - 16)
+    file.write_bytes(
+        {"cut": data[: len(data) // 2], "noise": data[:16] + noise, "header": data[:16]}[how]
+    )
+    with pytest.raises(FlightError) as caught:
+        import_flight(open_source(path), tmp_path / "out")
+    told = str(caught.value)
+    assert "\n" not in told and str(path) in told and len(told) < 600
+    assert not (tmp_path / "out").exists()
+
+
+def test_pictures_are_not_held(tmp_path, messages):
+    """Peak memory is that of a few pictures, not of all 60 (18 MB)."""
+    image = picture(0, 640, 480)
+    stamps = [START_S * 10**9 + step * 10**8 for step in range(60)]
+    topics = {
+        "/cam/image_raw": [(t, messages.image(t, image)) for t in stamps],
+        "/cam/camera_info": [(stamps[0], messages.camera_info(width=640, height=480))],
+    }
+    path = record(tmp_path / "flight", topics, messages)
+    del topics
+    recording = open_source(path)
+    tracemalloc.start()
+    try:
+        assert sum(view.grey().shape == (480, 640) for view in recording.views) == 60
+        assert tracemalloc.get_traced_memory()[1] < 20 * image.nbytes
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_bag_without_images_is_refused(tmp_path, messages, topics):
+    del topics["/cam/image_raw"]
+    with pytest.raises(FlightError, match="expected one topic of images, found none"):
+        open_source(record(tmp_path / "flight", topics, messages))

@@ -1,0 +1,150 @@
+"""Series over time: between samples, across north and the 180th meridian, and where nothing is."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from orthonav.errors import FlightError
+from orthonav.geo.camera import enu_from_camera
+from orthonav.records import Prior
+from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
+from orthonav.sources.options import SourceOptions
+from orthonav.sources.recording import as_told, check_overlap, fitted
+from orthonav.sources.track import GAP_NS, Samples, Track, angles_at, attitude_of_angles
+
+S = 10**9
+
+
+def attitudes(*samples):
+    collected = Samples(3)
+    for time_s, *angles in samples:
+        collected.add(round(time_s * S), *angles)
+    return attitude_of_angles(collected, lambda told: enu_from_body_camera(ned_from_angles(told)))
+
+
+@pytest.mark.parametrize(
+    "first, last, middle", [(350, 20, 5), (20, 350, 5), (80, 100, 90), (179, 181, 180)]
+)
+def test_headings_turn_the_short_way(first, last, middle):
+    series = attitudes((0, first, 0, 0), (1, last, 0, 0))
+    assert angles_at(series, S // 2) == pytest.approx((middle, 0, 0), abs=1e-9)
+    assert angles_at(series, 0)[0] == pytest.approx(first)
+
+
+@given(*[st.floats(-180, 180)] * 2, *[st.floats(-40, 40)] * 4, st.floats(0, 1))
+def test_the_turn_between_samples_is_even(yaw1, yaw2, pitch1, pitch2, roll1, roll2, share):
+    """Slerp: the angle turned from the first sample is the share of the whole angle."""
+    series = attitudes((0, yaw1, pitch1, roll1), (1, yaw2, pitch2, roll2))
+    first, last = enu_from_camera(yaw1, pitch1, roll1), enu_from_camera(yaw2, pitch2, roll2)
+    between = enu_from_camera(*angles_at(series, round(share * S)))
+
+    def angle(a, b):
+        return math.acos(max(-1.0, min(1.0, (np.trace(a.T @ b) - 1) / 2)))
+
+    if angle(first, last) < 3.1:  # half a turn may go either way
+        assert angle(first, between) == pytest.approx(share * angle(first, last), abs=1e-6)
+
+
+def test_a_heading_that_is_not_known_is_not_made_up():
+    series = attitudes((0, math.nan, 5, 1), (1, 90, 7, 1), (2, 90, 9, 1))
+    yaw, pitch, roll = angles_at(series, S // 4)
+    assert math.isnan(yaw) and (pitch, roll) == pytest.approx((5, 1))
+    assert angles_at(series, 3 * S // 2) == pytest.approx((90, 8, 1), abs=0.01)
+
+
+def test_outside_and_in_gaps_nothing_is_known():
+    series = attitudes((0, 0, 0, 0), (1, 0, 0, 0), (1 + GAP_NS / S + 0.1, 0, 0, 0))
+    assert not math.isnan(angles_at(series, S)[0])
+    for time_ns in (-1, S + 1, 4 * S):
+        assert all(math.isnan(angle) for angle in angles_at(series, time_ns))
+    bare = Track(series).telemetry(S // 2)
+    assert bare.missing() == ["agl_m"] and bare.prior is None and bare.vel_en_mps is None
+
+
+def test_samples_come_in_any_order_and_what_is_no_number_is_dropped():
+    samples = Samples(1)
+    for time_ns, value in ((3, 30.0), (1, 10.0), (2, math.nan), (1, 99.0), (5, math.inf)):
+        samples.add(time_ns, value)
+    series = samples.series()
+    assert series.time_ns.tolist() == [1, 3] and series.values[:, 0].tolist() == [10, 30]
+    assert series.at(2) == 20.0
+    samples.add(2**70, 1.0)
+    samples.add(10**18, 1.0)  # decades off the others
+    assert samples.series().time_ns.tolist() == [1, 3]
+    assert Samples(2).series() is None and Samples(3).positions() is None
+
+
+def test_nanoseconds_survive():
+    start = 1_700_000_000_123_456_789
+    samples = Samples(1)
+    samples.add(start, 0.0)
+    samples.add(start + 10, 1.0)
+    assert samples.series().at(start + 1) == pytest.approx(0.1)
+
+
+def test_positions_cross_the_180th_meridian():
+    samples = Samples(3)
+    samples.add(0, 10.0, 179.9, 100.0)
+    samples.add(S, 10.0, -179.9, math.nan)
+    samples.add(2 * S, 0.0, 0.0, 0.0)  # "no position"
+    track = Track(None, position=samples.positions())
+    assert track.latlon_deg(S // 2) == pytest.approx((10, -180))
+    assert track.latlon_deg(S)[1] == pytest.approx(-179.9)
+    assert track.latlon_deg(S + S // 2) is None
+
+
+def test_the_better_height_counts_where_it_is_there():
+    good, other, place = Samples(1), Samples(1), Samples(3)
+    good.add(0, 50.0), good.add(S, 52.0)
+    other.add(0, 80.0), other.add(2 * S, 80.0)
+    place.add(0, 46.0, 2.0, 400.0), place.add(4 * S, 46.0, 2.0, 400.0)
+    place.add(2 * S, 46.0, 2.0, 400.0)
+    track = Track(None, (good.series(), other.series()), place.positions())
+    heights = [track.telemetry(t).agl_m for t in (S // 2, 3 * S // 2, 3 * S)]
+    assert heights[:2] == [51.0, 80.0] and math.isnan(heights[2])
+    assert track.telemetry(3 * S, ground_alt_m=310.0).agl_m == 90.0
+
+
+def test_what_the_options_add():
+    telemetry = Track(None).telemetry(0)
+    told = as_told(telemetry, (46.0, 2.0), SourceOptions(prior_std_m=30.0, looks_down=True))
+    assert told.prior == Prior(46.0, 2.0, 30.0) and (told.pitch_deg, told.roll_deg) == (0, 0)
+    assert math.isnan(told.yaw_deg)
+    assert as_told(telemetry, None, SourceOptions(prior_std_m=30.0)).prior is None
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"rate_hz": 0.0}, "rate_hz"),
+        ({"prior_std_m": -1.0}, "prior_std_m"),
+        ({"time_offset_s": math.inf}, "finite"),
+        ({"kind": "film"}, "photos, video"),
+        ({"topics": {"depth": "/d"}}, "image, camera_info"),
+    ],
+)
+def test_impossible_options_are_refused(change, message):
+    with pytest.raises(FlightError, match=message):
+        SourceOptions(**change)
+
+
+def test_recordings_that_do_not_meet_are_told_apart(tmp_path):
+    track = Track(attitudes((10, 0, 0, 0), (20, 0, 0, 0)))
+    check_overlap(track, 15 * S, 30 * S, tmp_path)
+    with pytest.raises(FlightError, match=r"30\.000 to 40\.000 s, telemetry 10\.000 to 20\.000"):
+        check_overlap(track, 30 * S, 40 * S, tmp_path)
+
+
+def test_cameras_fit_pictures_of_the_same_proportions():
+    from orthonav.errors import CameraError
+    from orthonav.geo.camera import Camera
+
+    camera = Camera(4000, 3000, 3000.0, 3000.0, 2010.0, 1490.0)
+    assert fitted(camera, 2000, 1500, "x").cx_px == 1005.0
+    assert fitted(camera, 4000, 3000, "x") is camera
+    assert fitted(camera, 1333, 1000, "x").width_px == 1333  # a third, rounded
+    with pytest.raises(CameraError, match="other proportions"):
+        fitted(camera, 4000, 2250, "x")

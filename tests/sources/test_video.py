@@ -1,0 +1,232 @@
+"""Videos with subtitles or a table: times, dialects, and what is broken."""
+
+import math
+
+import numpy as np
+import pytest
+from recorders import camera_file, dji_subtitle, picture, subtitles, video
+
+from orthonav.errors import CameraError, FlightError
+from orthonav.flight import open_flight, read_image
+from orthonav.sources import SourceOptions, import_flight, open_source
+from orthonav.sources.subtitles import blocks, read_srt
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """Three seconds at 10 frames a second, with subtitles; its heading passes north."""
+    path = video(tmp_path / "DJI_0001.mkv")
+    subtitles(tmp_path / "DJI_0001.SRT", [dji_subtitle(n, yaw=355 + n) for n in range(30)])
+    camera_file(tmp_path / "camera.json")
+    return path
+
+
+def options(path, **more):
+    return SourceOptions(camera=path.parent / "camera.json", **more)
+
+
+def test_views_come_at_the_rate_asked_for(recorded):
+    recording = open_source(recorded, options(recorded, rate_hz=2))
+    assert recording.kind == "video" and recording.expected == 6
+    views = list(recording.views)
+    assert [view.frame for view in views] == [f"{n:06d}.png" for n in (0, 5, 10, 15, 20, 25)]
+    assert [view.telemetry.time_ns for view in views] == [n * 500_000_000 for n in range(6)]
+    assert [view.telemetry.yaw_deg for view in views] == pytest.approx([355, 0, 5, 10, 15, 20])
+    assert views[0].telemetry.agl_m == 120 and views[0].truth_latlon_deg == (46.5, 2.5)
+    for view, number in zip(views, (0, 5, 10, 15, 20, 25), strict=True):
+        assert np.abs(view.grey().astype(int) - picture(number)).max() <= 1  # by way of colours
+    assert len(list(open_source(recorded, options(recorded, rate_hz=100)).views)) == 30
+    assert len(list(recording.views)) == 6  # again from the first
+
+
+@pytest.mark.parametrize("name, code", [("a.mp4", "mp4v"), ("a.avi", "MJPG"), ("a.mov", "mp4v")])
+def test_other_containers(tmp_path, name, code):
+    path = video(tmp_path / name, 20, 10.0, code)
+    subtitles(tmp_path / "a.srt", [dji_subtitle(n) for n in range(20)])
+    camera_file(tmp_path / "camera.json")
+    views = list(open_source(path, options(path)).views)
+    assert [view.telemetry.time_ns for view in views] == [0, 10**9]
+    assert np.abs(views[1].grey().astype(int) - picture(10)).mean() < 6
+
+
+def test_the_kind_is_found_by_content(recorded, tmp_path):
+    path = recorded.rename(tmp_path / "DJI_0001.txt")
+    assert open_source(path, options(path)).kind == "video"
+
+
+@pytest.mark.parametrize("quality", [None, 95])
+def test_import(recorded, tmp_path, quality):
+    recording = open_source(recorded, options(recorded))
+    import_flight(recording, tmp_path / "flight", quality)
+    flight = open_flight(tmp_path / "flight")
+    assert len(flight.views) == 3 and flight.camera == recording.camera
+    for written, view in zip(flight.views, recording.views, strict=True):
+        assert written.telemetry == view.telemetry
+        off = np.abs(written.grey().astype(int) - view.grey())
+        assert off.max() == 0 if quality is None else off.mean() < 3
+        assert written.path.suffix == (".png" if quality is None else ".jpg")
+
+
+def test_a_table_beside_the_video(tmp_path):
+    path = video(tmp_path / "a.mkv")
+    camera_file(tmp_path / "camera.json")
+    (tmp_path / "a.csv").write_text(
+        "time_s,yaw_deg,pitch_deg,roll_deg,agl_m,yaw_std_deg,vel_east_mps,vel_north_mps,lat_deg,lon_deg\n"
+        "0,350,1,0,100,3,5,0,46.5,2.5\n2,10,3,0,104,3,5,2,46.502,2.5\n3,10,3,0,104,,,,,\n"
+    )
+    views = list(open_source(path, options(path)).views)
+    told = views[1].telemetry
+    assert (told.pitch_deg, told.agl_m) == pytest.approx((2, 102), abs=0.02)
+    assert (told.yaw_deg + 180) % 360 == pytest.approx(180, abs=0.02)
+    assert told.yaw_std_deg == 3 and told.vel_en_mps == (5.0, 1.0)
+    assert views[1].truth_latlon_deg == pytest.approx((46.501, 2.5))
+    assert views[2].telemetry.agl_m == 104
+    (tmp_path / "a.csv").write_text("time_s,pitch_deg,roll_deg\n0,0,0\n1,0,0\nx,0,0\n")
+    with pytest.raises(FlightError, match=r"line 4: time_s"):
+        open_source(path, options(path))
+
+
+def test_the_offset_is_added_to_the_times_of_the_video(recorded):
+    view = next(open_source(recorded, options(recorded, time_offset_s=0.9)).views)
+    assert view.telemetry.time_ns == 900_000_000
+    assert view.telemetry.yaw_deg == pytest.approx(355 + 9 - 360)
+
+
+DIALECTS = {
+    "rel_alt and gimbal": (dji_subtitle(0), (46.5, 2.5, 120.0, 402.125, 10.0, -90.0, 0.0)),
+    "SrtCnt and altitude": (
+        '<font size="36">SrtCnt : 1, DiffTime : 16ms\n2023-01-06 18:56:48,380,821\n'
+        "[iso : 3200] [shutter : 1/60.0] [fnum : 280] [ev : 0] [ct : 3925] [color_md : default] "
+        "[focal_len : 240] [latitude: -12.25] [longitude: 77.5] [altitude: 512.375] </font>",
+        (-12.25, 77.5, math.nan, 512.375, *[math.nan] * 3),
+    ),
+    "longtitude": (
+        "[latitude : 12.5] [longtitude : -77.5] [rel_alt: 5 abs_alt: 6]",
+        (12.5, -77.5, 5, 6, *[math.nan] * 3),
+    ),
+    "barometer": (
+        "HOME(149.0251,-20.2532) 2017.08.05 14:11:51\nGPS(149.0261,-20.2533,16) BAROMETER:91.9\n"
+        "ISO:100 Shutter:60 EV: Fnum:2.2",
+        (-20.2533, 149.0261, 91.9, math.nan, *[math.nan] * 3),
+    ),
+    "barometer with units": (
+        "GPS(-1.5,42.5,0.0M) BAROMETER:36.5M",
+        (42.5, -1.5, 36.5, math.nan, *[math.nan] * 3),
+    ),
+    "latitude first": ("GPS(-20.25,149.5,16)", (-20.25, 149.5, *[math.nan] * 5)),
+    "one line": (
+        "F/2.8, SS 206.14, ISO 150, EV 0, GPS (-82.6669, 27.7716, 10), D 2.80m, H 41.50m, "
+        "H.S 0.00m/s, V.S 0.00m/s",
+        (27.7716, -82.6669, 41.5, math.nan, *[math.nan] * 3),
+    ),
+    "gimbal in one line": (
+        "F/2.8, SS 400, ISO 100, EV 0, DZOOM 1.0, GPS (77.6, 12.9, 21), D 80.50m, H 45.00m, "
+        "H.S 3.20m/s, V.S 0.00m/s, F.PRY (1.2°, -0.5°, 88.0°), G.PRY (-60.0°, 0.5°, 90.0°)",
+        (12.9, 77.6, 45.0, math.nan, 90.0, -60.0, 0.5),
+    ),
+    "separate brackets": (
+        "[latitude: 45.5] [longitude: -121.5] [gb_yaw: 1.0] [gb_pitch: -89.9] [gb_roll: 0.5]",
+        (45.5, -121.5, math.nan, math.nan, 1.0, -89.9, 0.5),
+    ),
+    "no place on Earth": ("[latitude: 145.5] [longitude: 1.5]", (math.nan,) * 7),
+}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_dialects(tmp_path, dialect, encoding):
+    text, expected = DIALECTS[dialect]
+    path = subtitles(tmp_path / "a.srt", [text, text], encoding=encoding)
+    first, second = blocks(path.read_bytes())
+    assert (first.start_ns, first.end_ns, second.end_ns) == (0, 10**8, 2 * 10**8)
+    told = (first.lat_deg, first.lon_deg, first.height_m, first.alt_m)
+    told += (first.yaw_deg, first.pitch_deg, first.roll_deg)
+    assert told == pytest.approx(expected, nan_ok=True)
+
+
+def test_windows_lines_and_long_times(tmp_path):
+    text = "7\r\n01:02:03,5 --> 01:02:04,000\r\n[latitude: 1.5] [longitude: 2.5]\r\n\r\n"
+    (block,) = blocks(text.encode())
+    assert block.start_ns == 3_723_500_000_000 and block.lat_deg == 1.5
+
+
+def test_one_block_a_second_holds_until_the_next(tmp_path):
+    """Older drones write one block a second; the last one holds until it ends."""
+    path = video(tmp_path / "a.mkv")
+    subtitles(tmp_path / "a.srt", [dji_subtitle(n, yaw=10 * n) for n in range(3)], spacing_s=1)
+    camera_file(tmp_path / "camera.json")
+    views = list(open_source(path, options(path, rate_hz=2)).views)
+    yaws = [view.telemetry.yaw_deg for view in views]
+    assert yaws == pytest.approx([0, 5, 10, 15, 20, 20])
+
+
+def test_without_gimbal_angles_nothing_is_made_up(tmp_path):
+    path = video(tmp_path / "a.mkv")
+    texts = ["GPS(2.5,46.5,16) BAROMETER:91.9"] * 30
+    subtitles(tmp_path / "a.srt", texts)
+    camera_file(tmp_path / "camera.json")
+    told = next(open_source(path, options(path)).views).telemetry
+    assert told.missing() == ["yaw_deg", "pitch_deg", "roll_deg"] and told.agl_m == 91.9
+    level = next(open_source(path, options(path, looks_down=True)).views).telemetry
+    assert level.missing() == ["yaw_deg"]
+
+
+def broken(recorded, how):
+    """Break the video or its subtitles; gives options that go with it."""
+    srt, data = recorded.with_suffix(".SRT"), recorded.read_bytes()
+    breaking = {
+        "no frames": lambda: recorded.write_bytes(data[:600]),
+        "cut": lambda: recorded.write_bytes(data[: len(data) * 2 // 3]),
+        "empty": lambda: recorded.write_bytes(b""),
+        "another kind": lambda: recorded.write_bytes(b"plain words, and no video\n" * 99),
+        "fewer blocks": lambda: subtitles(srt, [dji_subtitle(n) for n in range(12)]),
+        "no blocks": lambda: srt.write_text("words\n\nand words\n"),
+        "empty subtitles": lambda: srt.write_bytes(b""),
+        "subtitles of a film": lambda: subtitles(srt, ["- Who goes there?", "- A friend."] * 15),
+        "no subtitles": srt.unlink,
+    }
+    breaking.get(how, lambda: None)()
+    return {"time_offset_s": 60.0} if how == "no overlap" else {}
+
+
+BROKEN = {
+    "no frames": "cannot be opened|holds no frame",
+    "cut": r"cut short: \d+ of 30 frames",
+    "empty": "source is empty",
+    "another kind": "expected a video",
+    "fewer blocks": "telemetry ends 1.7 s before the video",
+    "no blocks": "expected a PX4 log",
+    "empty subtitles": "telemetry log is empty",
+    "subtitles of a film": "neither position nor gimbal angles",
+    "no subtitles": "no telemetry beside the video",
+    "no overlap": "do not meet",
+}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_what_is_broken_is_one_error_and_nothing_written(recorded, tmp_path, names_in, how, capfd):
+    more = broken(recorded, how)
+    before = names_in(tmp_path)
+    with pytest.raises(FlightError, match=BROKEN[how]) as caught:
+        import_flight(open_source(recorded, options(recorded, **more)), tmp_path / "flight")
+    assert "\n" not in str(caught.value) and names_in(tmp_path) == before
+
+
+def test_a_video_needs_a_camera(recorded, tmp_path):
+    with pytest.raises(CameraError, match="give --camera"):
+        open_source(recorded)
+    camera_file(tmp_path / "camera.json", height_px=36)
+    with pytest.raises(CameraError, match="other proportions"):
+        open_source(recorded, options(recorded))
+
+
+def test_read_srt_of_what_is_not_text(tmp_path):
+    (tmp_path / "a.srt").write_bytes(bytes(range(256)) * 40)
+    with pytest.raises(FlightError, match="no block"):
+        read_srt(tmp_path / "a.srt")
+
+
+def test_frames_are_read_back_as_they_were(recorded, tmp_path):
+    import_flight(open_source(recorded, options(recorded)), tmp_path / "flight")
+    grey = read_image(tmp_path / "flight/frames/000010.png")
+    assert np.abs(grey.astype(int) - picture(10)).max() <= 1

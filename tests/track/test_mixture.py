@@ -1,0 +1,249 @@
+"""The track of simulated sightings: found, followed, lost, found again, and honest all along."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from orthonav.track import Displacement, Mixture, Model, Sighting, State, Told
+from orthonav.track.mixture import within
+from orthonav.track.smooth import History
+
+AREA_M2 = 4e6
+SIDE_M = math.sqrt(AREA_M2)
+RADIUS_M = 35.0
+MODEL = Model(lean_view_noise_rad=math.radians(1.0), sighting_growth=1.0)
+SPEED = np.array([12.0, 5.0])
+BIAS = np.array([math.radians(5.0), 0.04, math.radians(-2.0), math.radians(1.5)])
+HEIGHT_M = 120.0
+
+
+class Flight:
+    """True positions, and what views and odometry say of them."""
+
+    def __init__(self, seed, model=MODEL, bias=BIAS):
+        self.rng = np.random.default_rng(seed)
+        self.place = self.rng.uniform(-0.3, 0.3, 2) * SIDE_M
+        self.model, self.bias = model, bias
+
+    def moved(self, seconds=1.0):
+        """A second of flight: what odometry says, turned and scaled by the biases."""
+        way = SPEED * seconds + self.rng.normal(0, 1.0, 2)
+        self.place = self.place + way
+        cos, sin = math.cos(-self.bias[0]), math.sin(-self.bias[0])
+        told = np.array([[cos, sin], [-sin, cos]]) @ way * math.exp(-self.bias[1])
+        noisy = told + self.rng.normal(0, 0.5, 2)
+        return Displacement(noisy, np.eye(2) * 0.25, relative=True)
+
+    def told(self):
+        """What instruments say: level and north, where the truth is the biases and noise."""
+        return Told(0.0, 0.0, 0.0)
+
+    def sighting(self, log_odds=4.0, at=None):
+        """The view's own place, or a false one: lean and position err together."""
+        spread = np.diag([4.0, 4.0, 1e-4, 1e-4, 4e-4, 4e-4])
+        spread[0, 4] = spread[4, 0] = 0.7 * math.sqrt(4.0 * 4e-4)
+        # As the model says of what views see: the lean errs, and the position with it.
+        hangs = spread[:, 4:] @ np.linalg.inv(spread[4:, 4:])
+        error = self.rng.multivariate_normal(np.zeros(6), spread)
+        error += hangs @ self.rng.normal(0, self.model.lean_view_noise_rad, 2)
+        error[:2] += self.rng.normal(0, self.model.sighting_noise_m, 2)
+        noise = self.rng.normal(0, np.sqrt(self.model.told_noise))
+        mean = np.concatenate([self.place if at is None else at, self.bias + noise]) + error
+        return Sighting(mean, spread, log_odds)
+
+
+def off_m(mixture, flight):
+    return float(np.hypot(*(mixture.estimate(RADIUS_M).mean[:2] - flight.place)))
+
+
+def flown(seed, views=60, false_share=0.3, model=MODEL, history=None):
+    """A flight with false sightings beside the true ones, some of them instead."""
+    flight, mixture = Flight(seed, model), Mixture(model, AREA_M2)
+    rows = []
+    for view in range(views):
+        if view:
+            mixture.predict(1.0, flight.moved())
+        false = flight.sighting(-1.0, flight.rng.uniform(-0.5, 0.5, 2) * SIDE_M)
+        seen = [false] if flight.rng.random() < false_share else [flight.sighting(2.0), false]
+        mixture.update(flight.told(), seen)
+        estimate = mixture.estimate(RADIUS_M)
+        error = estimate.mean[:2] - flight.place
+        rows.append((*error, estimate.confidence, estimate))
+        if history is not None:
+            history.record(mixture)
+            rows[-1] += (flight.place,)
+    return flight, mixture, rows
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_flight_is_found_and_followed(seed):
+    _, _, rows = flown(seed)
+    errors = np.hypot([row[0] for row in rows], [row[1] for row in rows])
+    assert errors[10:].max() < 15 and np.median(errors[10:]) < 4
+    assert rows[-1][3].state is State.TRACKING and rows[-1][2] > 0.99
+
+
+def test_what_is_wrong_with_what_is_told_is_learnt():
+    learnt = np.array([flown(seed)[1].estimate(RADIUS_M).mean[4:] for seed in range(8)])
+    assert (np.abs(learnt.mean(axis=0) - BIAS) < [0.01, 0.01, 0.012, 0.012]).all()
+
+
+def test_normalized_errors_are_those_of_its_covariance():
+    """Chi-square of two: mean 2. 95 % bounds of the mean over independent flights."""
+    values = []
+    for seed in range(60):
+        flight, mixture, _ = flown(seed, views=20, false_share=0.2)
+        estimate = mixture.estimate(RADIUS_M)
+        error = estimate.mean[:2] - flight.place
+        values.append(error @ np.linalg.solve(estimate.covariance[:2, :2], error))
+    assert 1.48 < np.mean(values) < 2.55
+
+
+def test_one_lucky_view_is_no_track():
+    flight, mixture = Flight(1), Mixture(MODEL, AREA_M2)
+    mixture.update(flight.told(), [flight.sighting(30.0)])
+    first = mixture.estimate(RADIUS_M)
+    assert first.state is State.SEARCHING and first.confidence < 0.9999
+    mixture.predict(1.0, flight.moved())
+    mixture.update(flight.told(), [flight.sighting(3.0)])
+    assert mixture.estimate(RADIUS_M).state is State.TRACKING
+
+
+def test_views_of_the_same_ground_are_not_new():
+    """A false place that stays with views that overlap is not believed as if they did not."""
+    believed = []
+    for newness in (0.1, 1.0):
+        flight, mixture = Flight(2), Mixture(MODEL, AREA_M2)
+        for _ in range(5):
+            mixture.update(flight.told(), [flight.sighting(0.0)], newness)
+        believed.append(mixture.estimate(RADIUS_M).confidence)
+    assert believed[0] < 0.9 < believed[1]
+
+
+def test_without_sightings_it_becomes_lost_and_its_covariance_grows():
+    flight, mixture, _ = flown(3)
+    spread = [np.trace(mixture.estimate(RADIUS_M).covariance[:2, :2])]
+    states = []
+    for _ in range(60):
+        mixture.predict(5.0)
+        mixture.update(flight.told(), [])
+        estimate = mixture.estimate(RADIUS_M)
+        spread.append(np.trace(estimate.covariance[:2, :2]))
+        states.append(estimate.state)
+    assert (np.diff(spread[:5]) > 0).all() and spread[-1] > 50 * spread[0]
+    assert states[-1] is State.LOST and estimate.confidence < 0.3
+    assert np.isfinite(estimate.mean).all() and np.abs(estimate.mean[:2]).max() < SIDE_M
+
+
+def test_a_kidnapped_aircraft_is_found_again():
+    flight, mixture, _ = flown(4)
+    flight.place = -flight.place
+    states, confident_wrong = [], 0
+    for _ in range(25):
+        mixture.predict(1.0, flight.moved())
+        mixture.update(flight.told(), [flight.sighting(3.0)])
+        states.append(mixture.estimate(RADIUS_M).state)
+        wrong = off_m(mixture, flight) > RADIUS_M
+        confident_wrong += wrong and mixture.estimate(RADIUS_M).confidence > 0.9
+    assert states[-1] is State.TRACKING and off_m(mixture, flight) < 10
+    assert confident_wrong <= 4
+
+
+def test_false_places_that_come_and_go_are_not_followed():
+    """Views of nowhere on the map, each with a place that it is somewhat like."""
+    confident = 0
+    for seed in range(4):
+        flight, mixture = Flight(seed), Mixture(MODEL, AREA_M2)
+        for _ in range(30):
+            mixture.predict(1.0, flight.moved())
+            places = [flight.rng.uniform(-0.5, 0.5, 2) * SIDE_M for _ in range(3)]
+            seen = [flight.sighting(flight.rng.normal(-3, 1), place) for place in places]
+            mixture.update(flight.told(), seen)
+            confident += mixture.estimate(RADIUS_M).confidence > 0.9
+    assert confident <= 1
+
+
+def test_a_camera_that_was_knocked_is_followed():
+    flight, mixture, _ = flown(5)
+    flight.bias = flight.bias + np.array([0.0, 0.0, math.radians(9.0), 0.0])
+    for _ in range(15):
+        mixture.predict(1.0, flight.moved())
+        mixture.update(flight.told(), [flight.sighting(3.0)])
+    assert off_m(mixture, flight) < 12
+    assert mixture.estimate(RADIUS_M).mean[6] == pytest.approx(flight.bias[2], abs=0.05)
+
+
+def test_a_told_start_is_believed_until_views_say_otherwise():
+    flight = Flight(6)
+    right, wrong = Mixture(MODEL, AREA_M2), Mixture(MODEL, AREA_M2)
+    right.start(flight.place + np.array([10.0, 0.0]), 20.0)
+    wrong.start(-flight.place, 20.0)
+    for _ in range(12):
+        moved = flight.moved()
+        sighting = flight.sighting(2.0)
+        for mixture in (right, wrong):
+            mixture.predict(1.0, moved)
+            mixture.update(flight.told(), [sighting])
+    assert off_m(right, flight) < 10 and off_m(wrong, flight) < 10
+
+
+def test_hindsight_is_better_and_knows_it():
+    before, after, ratios = [], [], []
+    for seed in range(6):
+        history = History()
+        _, _, rows = flown(seed, history=history)
+        smoothed = history.smoothed()
+        assert len(smoothed) == len(rows) and None not in smoothed
+        pairs = list(zip(rows, smoothed, strict=True))[5:]  # before, it may not be found yet
+        for (east, north, _, estimate, place), found in pairs:
+            error = found.mean[:2] - place
+            before.append(math.hypot(east, north))
+            after.append(float(np.hypot(*error)))
+            spread = np.trace(found.covariance[:2, :2])
+            ratios.append(spread / np.trace(estimate.covariance[:2, :2]))
+    assert np.mean(after) < 0.85 * np.mean(before) and max(after) < max(before)
+    assert np.median(ratios) < 0.95
+
+
+def test_history_of_a_long_flight_stays_small():
+    history = History()
+    flown(7, views=120, history=history)
+    kept = [len(view) for view in history._views]
+    assert np.mean(kept[:-20]) < 4
+
+
+def test_far_hypotheses_and_gaps_stay_finite():
+    flight, mixture, _ = flown(8, views=10)
+    for seconds in (0.0, 1e-3, 600.0, 1e5):
+        mixture.predict(seconds)
+        mixture.update(flight.told(), [flight.sighting(1.0)])
+        estimate = mixture.estimate(RADIUS_M)
+        assert np.isfinite(estimate.mean).all() and np.isfinite(estimate.covariance).all()
+        assert np.linalg.eigvalsh(estimate.covariance).min() > 0
+        total = sum(each.share for each in mixture.hypotheses) + mixture.elsewhere
+        assert total == pytest.approx(1)
+
+
+def test_unknown_heading_is_followed():
+    model = replace(MODEL, heading_rad=math.radians(7.0))
+    flight, mixture = Flight(9, model), Mixture(model, AREA_M2)
+    for view in range(30):
+        if view:
+            mixture.predict(1.0, replace(flight.moved(), relative=False))
+        sighting = flight.sighting(2.0)
+        turned = sighting.mean + np.array([0, 0, 2.2, 0, 0, 0])
+        mixture.update(Told(None, 0.0, 0.0), [replace(sighting, mean=turned)])
+    assert off_m(mixture, flight) < 25
+
+
+def test_within_is_the_share_of_a_round_gaussian():
+    rng = np.random.default_rng(0)
+    covariance = np.eye(8) * 100.0
+    drawn = rng.normal(0, 10, (200_000, 2))
+    for middle, tolerance in (((0.0, 0.0), 0.003), ((8.0, 0.0), 0.08)):
+        share = (np.hypot(*(drawn - middle).T) <= 15).mean()
+        told = within(np.zeros(8), covariance, 15.0, np.array(middle))
+        assert told == pytest.approx(share, abs=tolerance)
+    assert within(np.zeros(8), covariance, 15.0, np.array([500.0, 0.0])) == 0
