@@ -147,24 +147,39 @@ def test_hindsight_calibrates_the_beginning_too(localizer):
         Tracker(localizer).in_hindsight()
 
 
-def test_leaving_the_map_is_lost_and_coming_back_is_found(localizer):
+def out_and_back():
+    """Places and headings of a flight that leaves the map to the east for 12 s and comes back."""
+    place = np.array([60.0, -40.0])
+    for number in range(34):
+        yield place.copy(), 90.0 if number < 17 else 270.0
+        place = place + np.array([20.0 if number < 16 else -20.0, 0.0])
+
+
+def test_off_the_map_the_way_is_followed_and_coming_back_is_found(localizer):
+    tracker = Tracker(localizer)
+    rows = followed(tracker, localizer, views(0, where=out_and_back()))
+    std = [math.sqrt(np.trace(row[3].cov_en_m2) / 2) for row in rows]
+    errors = [row[0] for row in rows]
+    assert all(error < 3.5 * one for error, one in zip(errors, std, strict=True))
+    assert not any(row[1] > 0.9 and row[0] > 35 for row in rows)
+    assert max(errors[10:]) < 12
+    assert rows[-1][2] == "tracking" and errors[-1] < 8
+
+
+def test_without_anything_to_see_it_is_lost_and_found_again(localizer):
     tracker = Tracker(localizer)
     followed(tracker, localizer, views(12))
-    rng = np.random.default_rng(5)
-    spread = []
-    for number in range(12, 40):
-        place = rng.uniform(-150, 150, 2)
-        grey = changed(rendered(OTHER, place, (60.0, 0, 0), AGL_M, WIDE), rng)
-        found = tracker.locate(grey, WIDE, Telemetry(number * 10**9, 60.0, 0, 0, AGL_M))
-        if isinstance(found, Fix):
-            spread.append(float(np.trace(found.cov_en_m2)))
-            assert number < 24 or found.confidence < 0.9
-    assert tracker.state_name == "lost" and spread[-1] > 10 * spread[0]
-    back = [
-        (grey, replace(told, time_ns=told.time_ns + 40 * 10**9), place)
-        for grey, told, place in views(10, start=(100.0, 60.0), turn_at=3)
-    ]
-    rows = followed(tracker, localizer, back)
+    white, spread = np.full((240, 320), 255, np.uint8), []
+    for number in range(12, 60):
+        found = tracker.locate(white, WIDE, Telemetry(number * 10**9, 60.0, 0, 0, AGL_M))
+        spread.append(float(np.trace(found.cov_en_m2)))
+    assert tracker.state_name == "lost" and found.confidence < 0.3
+    assert spread[-1] > 50 * spread[0]
+    later = (
+        (grey, replace(told, time_ns=told.time_ns + 60 * 10**9), place)
+        for grey, told, place in views(12, start=(60.0, 0.0), turn_at=3)
+    )
+    rows = followed(tracker, localizer, later)
     assert rows[-1][2] == "tracking" and rows[-1][0] < 8
 
 

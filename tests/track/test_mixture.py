@@ -12,6 +12,7 @@ from orthonav.track.smooth import History
 
 AREA_M2 = 4e6
 SIDE_M = math.sqrt(AREA_M2)
+EXTENT = (-SIDE_M / 2, -SIDE_M / 2, SIDE_M / 2, SIDE_M / 2)
 RADIUS_M = 35.0
 MODEL = Model(lean_view_noise_rad=math.radians(1.0), sighting_growth=1.0)
 SPEED = np.array([12.0, 5.0])
@@ -60,7 +61,7 @@ def off_m(mixture, flight):
 
 def flown(seed, views=60, false_share=0.3, model=MODEL, history=None):
     """A flight with false sightings beside the true ones, some of them instead."""
-    flight, mixture = Flight(seed, model), Mixture(model, AREA_M2)
+    flight, mixture = Flight(seed, model), Mixture(model, EXTENT)
     rows = []
     for view in range(views):
         if view:
@@ -102,7 +103,7 @@ def test_normalized_errors_are_those_of_its_covariance():
 
 
 def test_one_lucky_view_is_no_track():
-    flight, mixture = Flight(1), Mixture(MODEL, AREA_M2)
+    flight, mixture = Flight(1), Mixture(MODEL, EXTENT)
     mixture.update(flight.told(), [flight.sighting(30.0)])
     first = mixture.estimate(RADIUS_M)
     assert first.state is State.SEARCHING and first.confidence < 0.9999
@@ -115,7 +116,7 @@ def test_views_of_the_same_ground_are_not_new():
     """A false place that stays with views that overlap is not believed as if they did not."""
     believed = []
     for newness in (0.1, 1.0):
-        flight, mixture = Flight(2), Mixture(MODEL, AREA_M2)
+        flight, mixture = Flight(2), Mixture(MODEL, EXTENT)
         for _ in range(5):
             mixture.update(flight.told(), [flight.sighting(0.0)], newness)
         believed.append(mixture.estimate(RADIUS_M).confidence)
@@ -137,6 +138,18 @@ def test_without_sightings_it_becomes_lost_and_its_covariance_grows():
     assert np.isfinite(estimate.mean).all() and np.abs(estimate.mean[:2]).max() < SIDE_M
 
 
+def test_off_the_map_nothing_is_missed():
+    flight, mixture, _ = flown(3)
+    inside = mixture.estimate(RADIUS_M).confidence
+    mixture.hypotheses = [
+        replace(each, mean=each.mean + np.array([3000.0, 0, 0, 0, 0, 0, 0, 0]))
+        for each in mixture.hypotheses
+    ]
+    for _ in range(5):
+        mixture.update(flight.told(), [])
+    assert mixture.estimate(RADIUS_M).confidence == pytest.approx(inside, abs=0.01)
+
+
 def test_a_kidnapped_aircraft_is_found_again():
     flight, mixture, _ = flown(4)
     flight.place = -flight.place
@@ -155,7 +168,7 @@ def test_false_places_that_come_and_go_are_not_followed():
     """Views of nowhere on the map, each with a place that it is somewhat like."""
     confident = 0
     for seed in range(4):
-        flight, mixture = Flight(seed), Mixture(MODEL, AREA_M2)
+        flight, mixture = Flight(seed), Mixture(MODEL, EXTENT)
         for _ in range(30):
             mixture.predict(1.0, flight.moved())
             places = [flight.rng.uniform(-0.5, 0.5, 2) * SIDE_M for _ in range(3)]
@@ -177,7 +190,7 @@ def test_a_camera_that_was_knocked_is_followed():
 
 def test_a_told_start_is_believed_until_views_say_otherwise():
     flight = Flight(6)
-    right, wrong = Mixture(MODEL, AREA_M2), Mixture(MODEL, AREA_M2)
+    right, wrong = Mixture(MODEL, EXTENT), Mixture(MODEL, EXTENT)
     right.start(flight.place + np.array([10.0, 0.0]), 20.0)
     wrong.start(-flight.place, 20.0)
     for _ in range(12):
@@ -228,7 +241,7 @@ def test_far_hypotheses_and_gaps_stay_finite():
 
 def test_unknown_heading_is_followed():
     model = replace(MODEL, heading_rad=math.radians(7.0))
-    flight, mixture = Flight(9, model), Mixture(model, AREA_M2)
+    flight, mixture = Flight(9, model), Mixture(model, EXTENT)
     for view in range(30):
         if view:
             mixture.predict(1.0, replace(flight.moved(), relative=False))

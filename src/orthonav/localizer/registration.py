@@ -123,7 +123,7 @@ class RegistrationLocalizer:
         view = self.prepared(grey, camera, telemetry, heading_known)
         if isinstance(view, NoFix):
             return view
-        if prior is not None and not self._touches_map(prior, view):
+        if prior is not None and not self.touches_map(prior, view):
             return NoFix("outside_map", "the map does not reach to where the prior says")
         best = self.best(view, prior)
         if best is None:
@@ -324,7 +324,8 @@ class RegistrationLocalizer:
         reach = PRIOR_SIGMAS * max(prior.std_m, 0.0) / self.grid.gsd_m
         return float(reach + lean * min(turn, 1.0) + 2.0 * 2**view.levels.coarse)
 
-    def _touches_map(self, prior: Prior, view: PreparedFootprint) -> bool:
+    def touches_map(self, prior: Prior, view: PreparedFootprint) -> bool:
+        """Whether any of the map lies where the prior allows the view to be."""
         x, y = self._prior_px(prior, view)
         reach = self._reach_px(view, prior)
         rows, cols = self.registrar.reference.shape(0)

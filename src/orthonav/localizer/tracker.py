@@ -37,6 +37,8 @@ LONGEST_GAP_S = 600.0
 UNKNOWN_STEP_S = 1.0
 """Time that is taken to have passed where the clock stands still or jumps back."""
 WORTH_LOG_ODDS = -12.0
+LEAN_STD_RAD = math.radians(6.0)
+"""How far from the expected lean that of a view is looked for."""
 VELOCITY_STD_MPS = 1.0
 VELOCITY_SHARE = 0.02
 Array = NDArray[np.float64]
@@ -66,8 +68,9 @@ class Tracker:
         self._localizer, self._heading_known = localizer, heading_known
         self.model = model or Model()
         grid = localizer.grid
-        self._area_m2 = grid.width_px * grid.height_px * grid.gsd_m**2
-        self.mixture = Mixture(self.model, self._area_m2)
+        east_m, south_m = grid.width_px * grid.gsd_m, -grid.height_px * grid.gsd_m
+        extent = grid.west_m, grid.north_m + south_m, grid.west_m + east_m, grid.north_m
+        self.mixture = Mixture(self.model, extent)
         self._time_ns: int | None = None
         self._before: Footprint | None = None
         self._use_prior = use_prior
@@ -214,15 +217,17 @@ class Tracker:
         if isinstance(view, NoFix):
             return view
         prior, searched = self._where(expected)
-        found = self._registration.best(view, prior)
-        if found is not None:
-            told = Told(
-                math.radians(telemetry.yaw_deg) if self._heading_known else None,
-                math.radians(telemetry.pitch_deg),
-                math.radians(telemetry.roll_deg),
-            )
-            sightings = self._sightings(grey, camera, corrected, view, found, bias)
-            self.mixture.update(told, sightings, max(1 - overlap, LEAST_NEW), searched)
+        sightings = []
+        if prior is None or self._registration.touches_map(prior, view):
+            found = self._registration.best(view, prior)
+            if found is not None:
+                sightings = self._sightings(grey, camera, corrected, view, found, bias)
+        told = Told(
+            math.radians(telemetry.yaw_deg) if self._heading_known else None,
+            math.radians(telemetry.pitch_deg),
+            math.radians(telemetry.roll_deg),
+        )
+        self.mixture.update(told, sightings, max(1 - overlap, LEAST_NEW), searched)
         return None
 
     def _where(self, expected: Estimate | None) -> tuple[Prior | None, tuple[Array, float] | None]:
@@ -231,7 +236,7 @@ class Tracker:
             return None, None
         spread = float(np.linalg.eigvalsh(expected.covariance[:2, :2])[-1])
         reach = max(LOCAL_SIGMAS * math.sqrt(spread), MIN_LOCAL_M)
-        if 4 * reach**2 > self._area_m2 / 4:
+        if 4 * reach**2 > self.mixture.area_m2 / 4:
             return None, None
         lat, lon = self._localizer.sheet.frame.latlon_from_en(expected.mean[:2])
         return Prior(float(lat), float(lon), reach / 3), (expected.mean[:2], reach)
@@ -256,7 +261,7 @@ class Tracker:
                 view,
                 pose,
                 lean_rad=lean,
-                lean_std_rad=math.radians(6.0),
+                lean_std_rad=LEAN_STD_RAD,
             )
             if placed is None:
                 continue

@@ -88,9 +88,11 @@ class Estimate:
 class Mixture:
     """The belief about one flight. Mutable; not to be shared between threads."""
 
-    def __init__(self, model: Model, area_m2: float) -> None:
-        """`area_m2` is that of the map: the aircraft may be anywhere on it."""
-        self.model, self.area_m2 = model, area_m2
+    def __init__(self, model: Model, extent_en_m: tuple[float, float, float, float]) -> None:
+        """`extent_en_m` (west, south, east, north) is that of the map: the aircraft may be
+        anywhere on it."""
+        self.model, self._extent = model, np.array(extent_en_m)
+        self.area_m2 = float(np.prod(self._extent[2:] - self._extent[:2]))
         self.hypotheses: list[Hypothesis] = []
         self.elsewhere = 1.0
         self._tracked = False
@@ -134,7 +136,9 @@ class Mixture:
         missed = self.model.miss**newness
         found = (1 - self.model.miss) ** newness
         for each in self.hypotheses:
-            looked_at = searched is None or np.hypot(*(each.mean[:2] - searched[0])) < searched[1]
+            looked_at = self._on_map(each.mean)
+            if searched is not None:
+                looked_at &= bool(np.hypot(*(each.mean[:2] - searched[0])) < searched[1])
             made.append(replace(each, share=each.share * (missed if looked_at else 1.0)))
             for start in self._or_knocked(each):
                 for sighting in sightings:
@@ -181,6 +185,10 @@ class Mixture:
         if not self._tracked:
             return State.SEARCHING
         return State.TRACKING if confidence >= LIKELY else State.LOST
+
+    def _on_map(self, mean: Array) -> bool:
+        inside = (mean[:2] >= self._extent[:2]) & (mean[:2] <= self._extent[2:])
+        return bool(inside.all())
 
     def _or_knocked(self, each: Hypothesis) -> list[Hypothesis]:
         """A hypothesis as it is, and as it is if the camera was knocked since the last view."""
