@@ -19,6 +19,7 @@ from benchmarks import (
     search_scale,
     side_by_side,
     spent,
+    tracking,
 )
 from benchmarks.inputs import Workplace
 from benchmarks.record import Section, provenance, save, targets_table
@@ -32,6 +33,7 @@ SECTIONS: dict[str, Callable[[Workplace], Section]] = {
     "registration": side_by_side.measure,
     "growth": growth.measure,
     "spent": spent.measure,
+    "track": tracking.measure,
 }
 
 
