@@ -118,7 +118,7 @@ def test_views_of_the_same_ground_are_not_new():
     for newness in (0.1, 1.0):
         flight, mixture = Flight(2), Mixture(MODEL, EXTENT)
         for _ in range(5):
-            mixture.update(flight.told(), [flight.sighting(0.0)], newness)
+            mixture.update(flight.told(), [flight.sighting(-1.5)], newness)
         believed.append(mixture.estimate(RADIUS_M).confidence)
     assert believed[0] < 0.9 < believed[1]
 

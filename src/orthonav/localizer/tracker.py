@@ -212,7 +212,7 @@ class Tracker:
         """Look for the view and hand what it may be to the mixture; why not, if it cannot be."""
         expected = self.mixture.estimate(self._registration.radius_m)
         bias = np.zeros(4) if expected is None else expected.mean[4:]
-        corrected = _corrected(telemetry, bias)
+        corrected = self._known(_corrected(telemetry, bias), expected)
         view = self._registration.prepared(grey, camera, corrected, self._heading_known)
         if isinstance(view, NoFix):
             return view
@@ -229,6 +229,16 @@ class Tracker:
         )
         self.mixture.update(told, sightings, max(1 - overlap, LEAST_NEW), searched)
         return None
+
+    def _known(self, corrected: Telemetry, expected: Estimate | None) -> Telemetry:
+        """Told values with how well they are known by now, which says how widely to look."""
+        bias = self.model.initial_bias
+        if expected is not None and expected.confidence >= LOCAL_SHARE:
+            bias = np.diag(expected.covariance)[4:]
+        heading, scale = np.sqrt(bias[:2] + self.model.told_noise[:2]).tolist()
+        return replace(
+            corrected, yaw_std_deg=math.degrees(heading), agl_std_m=scale * corrected.agl_m
+        )
 
     def _where(self, expected: Estimate | None) -> tuple[Prior | None, tuple[Array, float] | None]:
         """The part of the map to look at: around the track where that is nearly certain."""

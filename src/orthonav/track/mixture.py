@@ -43,7 +43,9 @@ LIKELY = 0.5
 CONFIRMED = 1.4
 """Views' worth of new ground that must have been recognized before a track is one."""
 GATE = 36.0
-MAX_LOG_ODDS = 9.0
+SEARCHED_SIGMAS = 6.0
+"""How wide headings and scales are looked for, in standard deviations, from end to end."""
+MAX_LOG_ODDS = 7.0
 """No single view is believed more than this."""
 
 
@@ -219,7 +221,7 @@ class Mixture:
         if far > GATE:
             return None
         log_weight = self._log_odds(sighting, newness)
-        log_weight += log_density(off, spread) - self._before(told, sighting, newness)
+        log_weight += _log_fit(off, spread) - self._log_chance(told, sighting, newness)
         mean, covariance = updated(each.mean, each.covariance, off, spread)
         share = each.share * math.exp(min(log_weight, 60.0))
         self._numbers += 1
@@ -239,10 +241,13 @@ class Mixture:
         covariance[POSITION, POSITION] = np.eye(2) * self.area_m2
         covariance[VELOCITY, VELOCITY] = np.eye(2) * self.model.speed_mps**2
         covariance[range(4, 8), range(4, 8)] = self.model.initial_bias
+        log_weight = self._log_odds(sighting, newness) - math.log(self.area_m2)
+        log_weight += _log_fit(off, spread, slice(2, 4))
+        log_weight -= self._log_chance(told, sighting, newness)
         spread = spread.copy()
         spread[:2, :2] += np.eye(2) * self.area_m2
         mean, covariance = updated(mean, covariance, off, spread)
-        share = self.elsewhere * math.exp(self._log_odds(sighting, newness))
+        share = self.elsewhere * math.exp(min(log_weight, 60.0))
         self._numbers += 1
         return Hypothesis(share, mean, covariance, newness, self._numbers)
 
@@ -262,10 +267,12 @@ class Mixture:
         nothing[range(4, 8), range(4, 8)] = self.model.initial_bias
         return innovation(self.model, np.zeros(STATE), nothing, told, sighting, 1 - newness)
 
-    def _before(self, told: Told, sighting: Sighting, newness: float) -> float:
-        """Log density of the sighting for somebody who knows only that it is on the map."""
-        off, spread = self._first(told, sighting, newness)
-        return log_density(off[2:], spread[2:, 2:]) - math.log(self.area_m2)
+    def _log_chance(self, told: Told, sighting: Sighting, newness: float) -> float:
+        """Log density of places that are only alike: anywhere, with any heading and scale that were
+        looked for."""
+        _, spread = self._first(told, sighting, newness)
+        widths = SEARCHED_SIGMAS * np.sqrt(np.diag(spread)[2:4])
+        return -math.log(self.area_m2) - float(np.log(widths).sum())
 
     def _from(self, each: Hypothesis, expected: Expected, share: float) -> Hypothesis:
         self._numbers += 1
@@ -279,6 +286,14 @@ class Mixture:
         total = sum(each.share for each in self.hypotheses) + self.elsewhere
         self.hypotheses = [replace(e, share=e.share / total) for e in self.hypotheses]
         self.elsewhere /= total
+
+
+def _log_fit(off: Array, spread: Array, part: slice = slice(0, 4)) -> float:
+    """Log density of a sighting's place, heading and scale.
+
+    Its lean does not count: what a view shows of it is too little to tell right from wrong.
+    """
+    return log_density(off[part], spread[part, part])
 
 
 def _merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
