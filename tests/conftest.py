@@ -7,6 +7,8 @@ from pathlib import Path
 # Before NumPy and PyTorch are loaded: tests run side by side.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# As the program does: FFmpeg reads it once, and otherwise writes lines of its own to stderr.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 import cv2
 import numpy as np

@@ -1,5 +1,6 @@
 """The demo tells the whole story and leaves a report that needs nothing else."""
 
+import functools
 import json
 import re
 import shutil
@@ -7,6 +8,7 @@ import shutil
 import pytest
 
 from orthonav.cli import demo, main
+from orthonav.prepare import BuildRequest
 from orthonav.simulate import landscape
 
 
@@ -24,6 +26,8 @@ def small_demo(area, monkeypatch):
     monkeypatch.setattr(demo, "TURNS_EN_M", turns)
     monkeypatch.setattr(demo, "SPACING_M", 80.0)
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 48)
+    quicker = functools.partial(BuildRequest, calibration_views=20)
+    monkeypatch.setattr("orthonav.prepare.BuildRequest", quicker)
 
 
 def test_the_demo(small_demo, tmp_path, capsys, names_in):
