@@ -15,6 +15,7 @@ from orthonav.localizer.registration import PreparedFootprint, RegistrationLocal
 from orthonav.records import Telemetry
 from orthonav.register.lean import LeanRefiner
 from orthonav.register.pose import Pose
+from orthonav.register.registrar import NAT_SCORE
 
 ROUNDS, STEPS = 8, 4
 SHRINKAGE, GROWTH, MOST_GROWTH = 0.4, 1.6, 2.5
@@ -71,7 +72,7 @@ def levelled(
         moved = Pose(*(np.array(_numbers(best.pose)) + step[:4]).tolist())
         start = best.view, moved
         tried = _looked(registration, grey, camera, telemetry, start, best.lean_rad + step[4:])
-        if tried is not None and tried.score > best.score:
+        if tried is not None and tried.worth(prior, expected) > best.worth(prior, expected):
             best, factor = tried, min(factor * GROWTH, MOST_GROWTH)
         else:
             factor *= SHRINKAGE
@@ -96,6 +97,11 @@ class _Looked:
     score: float
     towards: Array
     information: Array
+
+    def worth(self, prior: Array, expected_rad: Array) -> float:
+        """Its score less what its lean costs for being unexpected, a unit for a nat."""
+        off = self.lean_rad - expected_rad
+        return self.score - NAT_SCORE * float(off @ prior[4:, 4:] @ off) / 2
 
     def step(self, prior: Array, expected_rad: Array) -> Array:
         """From here to the best pose and lean (6,), given what is expected."""

@@ -19,10 +19,12 @@ from orthonav.track.model import Displacement
 VIEW_PX = 160
 """Views are compared at about so many pixels across."""
 LEVELS = 3
-TURN_STD_RAD, LOG_SCALE_STD = math.radians(2.5), 0.02
+TURN_STEP_RAD, SCALE_STEP = math.radians(8.0), 0.1
 MAX_SPEED_MPS = 80.0
-MIN_SCORE_RATIO = 1.35
-MIN_CORRELATION = 0.25
+MIN_SCORE_RATIO = 2.5
+MIN_CORRELATION = 0.4
+"""Right ways have 4 and 0.56 at the least on Arroio and generated ground, wrong ones 1.7 and 0.11
+at the most."""
 NOISE_PX, NOISE_SHARE = 0.4, 0.01
 CANDIDATES = 8
 LEAN_SHARE = 0.6
@@ -118,17 +120,25 @@ class Moved:
     overlap: float
 
 
-def moved_between(before: Footprint, now: Footprint, lean_noise_rad: float) -> Moved | None:
+def moved_between(
+    before: Footprint, now: Footprint, lean_noise_rad: float, told_noise: Array
+) -> Moved | None:
     """The way from one view to the next, both with the same `pixel_m`; None where they do not
     show enough of the same ground to say.
 
     The displacement is turned and scaled as was told of the view before; `lean_noise_rad` is how
-    the lean differs from what was told between views.
+    the lean differs from what was told between views, `told_noise` (2,) the variances with which
+    told heading (rad) and log scale do.
     """
     told_turn = math.radians(now.telemetry.yaw_deg - before.telemetry.yaw_deg)
     if not math.isfinite(told_turn):
         return None
-    found = _registered(before, now, math.remainder(told_turn, 2 * math.pi))
+    prior = PosePrior(
+        math.remainder(told_turn, 2 * math.pi),
+        max(math.sqrt(2 * told_noise[0]), TURN_STEP_RAD / 3),
+        max(math.sqrt(2 * told_noise[1]), SCALE_STEP / 3),
+    )
+    found = _registered(before, now, prior)
     if found is None or found.peak_ratio < MIN_SCORE_RATIO:
         return None
     if found.placed.weighted < MIN_CORRELATION:
@@ -143,11 +153,20 @@ def moved_between(before: Footprint, now: Footprint, lean_noise_rad: float) -> M
     way = np.array([right_m * cos + forward_m * sin, forward_m * cos - right_m * sin])
     std_m = math.hypot(NOISE_PX * before.pixel_m, NOISE_SHARE * float(np.hypot(*way)))
     variance = std_m**2 + (LEAN_SHARE * now.telemetry.agl_m * lean_noise_rad) ** 2
-    displacement = Displacement(way, np.eye(2) * variance, relative=True)
+    told_rad = math.radians(
+        (now.telemetry.yaw_deg - now.off_deg) - (before.telemetry.yaw_deg - before.off_deg)
+    )
+    displacement = Displacement(
+        way,
+        np.eye(2) * variance,
+        relative=True,
+        turned_rad=math.remainder(pose.turn_rad - told_rad, 2 * math.pi),
+        scaled=pose.log_scale + now.off_log_scale - before.off_log_scale,
+    )
     return Moved(displacement, min(max(found.placed.overlap, 0.0), 1.0))
 
 
-def _registered(before: Footprint, now: Footprint, turn_rad: float) -> Registered | None:
+def _registered(before: Footprint, now: Footprint, prior: PosePrior) -> Registered | None:
     """The later view registered on the earlier one."""
     templates = ViewTemplates(now.grey, now.valid, 0)
     rows, cols = before.grey.shape
@@ -157,11 +176,14 @@ def _registered(before: Footprint, now: Footprint, turn_rad: float) -> Registere
     far = math.hypot(rows, cols)
     # A clock that stands still says nothing of how far it may be.
     reach = min(MAX_SPEED_MPS * seconds / before.pixel_m, far) if seconds > 0 else far
-    prior = PosePrior(turn_rad, TURN_STD_RAD, LOG_SCALE_STD)
     tried = bank(
-        TURN_STD_RAD, LOG_SCALE_STD, turn_step_rad=TURN_STD_RAD * 2, scale_step=0.06, sigmas=2.0
+        prior.turn_std_rad,
+        prior.log_scale_std,
+        turn_step_rad=TURN_STEP_RAD,
+        scale_step=SCALE_STEP,
+        sigmas=2.5,
     )
-    poses = [(turn_rad + turn, scale) for turn, scale in tried.poses]
+    poses = [((prior.turn_rad or 0.0) + turn, scale) for turn, scale in tried.poses]
     level = levels.coarse
     recipe = levels.recipe(level)
     middle = cols / 2, rows / 2

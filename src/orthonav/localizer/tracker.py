@@ -37,7 +37,7 @@ LONGEST_GAP_S = 600.0
 UNKNOWN_STEP_S = 1.0
 """Time that is taken to have passed where the clock stands still or jumps back."""
 WORTH_LOG_ODDS = -12.0
-LEAN_STD_RAD = math.radians(6.0)
+LEAN_STD_RAD = math.radians(3.0)
 """How far from the expected lean that of a view is looked for."""
 VELOCITY_STD_MPS = 1.0
 VELOCITY_SHARE = 0.02
@@ -163,8 +163,17 @@ class Tracker:
         self._time_ns = telemetry.time_ns
         moved, overlap = self._moved(before, now, telemetry, seconds)
         self._before = now
-        self.mixture.predict(seconds, moved)
+        self.mixture.predict(seconds, moved, self._told_noise(telemetry))
         return overlap
+
+    def _told_noise(self, telemetry: Telemetry) -> Array:
+        """Variances (2,) of told heading and log scale from view to view, as told or as usual."""
+        noise = self.model.told_noise.copy()
+        if telemetry.yaw_std_deg is not None:
+            noise[0] = math.radians(telemetry.yaw_std_deg) ** 2
+        if telemetry.agl_std_m is not None and telemetry.agl_m > 0:
+            noise[1] = (telemetry.agl_std_m / telemetry.agl_m) ** 2
+        return noise
 
     def _footprint(
         self,
@@ -196,7 +205,8 @@ class Tracker:
         seconds: float,
     ) -> tuple[Displacement | None, float]:
         if before is not None and now is not None and before.pixel_m == now.pixel_m:
-            seen = moved_between(before, now, self.model.lean_noise_rad)
+            noise = self._told_noise(telemetry)
+            seen = moved_between(before, now, self.model.lean_noise_rad, noise)
             if seen is not None:
                 return seen.displacement, seen.overlap
         velocity = telemetry.vel_en_mps
@@ -232,10 +242,10 @@ class Tracker:
 
     def _known(self, corrected: Telemetry, expected: Estimate | None) -> Telemetry:
         """Told values with how well they are known by now, which says how widely to look."""
-        bias = self.model.initial_bias
+        bias = self.model.initial_bias()
         if expected is not None and expected.confidence >= LOCAL_SHARE:
             bias = np.diag(expected.covariance)[4:]
-        heading, scale = np.sqrt(bias[:2] + self.model.told_noise[:2]).tolist()
+        heading, scale = np.sqrt(bias[:2]).tolist()
         return replace(
             corrected, yaw_std_deg=math.degrees(heading), agl_std_m=scale * corrected.agl_m
         )

@@ -17,8 +17,8 @@ import numpy as np
 
 from orthonav.track.model import (
     POSITION,
+    SEEN,
     STATE,
-    VELOCITY,
     Array,
     Displacement,
     Expected,
@@ -26,10 +26,10 @@ from orthonav.track.model import (
     Sighting,
     Told,
     held_to_map,
-    innovation,
     knocked,
     log_density,
     predicted,
+    reading,
     updated,
 )
 
@@ -43,6 +43,8 @@ LIKELY = 0.5
 CONFIRMED = 1.4
 """Views' worth of new ground that must have been recognized before a track is one."""
 GATE = 36.0
+POSE = slice(2, 4)
+"""Heading and scale in what a sighting says."""
 SEARCHED_SIGMAS = 6.0
 """How wide headings and scales are looked for, in standard deviations, from end to end."""
 MAX_LOG_ODDS = 7.0
@@ -87,6 +89,17 @@ class Estimate:
     number: int
 
 
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """What a view says of the state (6,), its covariance (6, 6), and the log of what it is worth:
+    odds over the density of places, headings and scales that are only alike."""
+
+    seen: Array
+    noise: Array
+    log_odds: float
+    newness: float
+
+
 class Mixture:
     """The belief about one flight. Mutable; not to be shared between threads."""
 
@@ -102,20 +115,26 @@ class Mixture:
 
     def start(self, mean_en_m: Array, std_m: float) -> None:
         """Begin with a position (2,) that was told, good to `std_m` per axis."""
-        mean, covariance = np.zeros(STATE), np.zeros((STATE, STATE))
+        mean, covariance = self._nowhere()
         mean[POSITION] = mean_en_m
-        variances = [std_m**2] * 2 + [self.model.speed_mps**2] * 2
-        covariance[range(STATE), range(STATE)] = [*variances, *self.model.initial_bias]
+        covariance[POSITION, POSITION] = np.eye(2) * std_m**2
         self._numbers += 1
         self.hypotheses = [Hypothesis(TOLD_SHARE, mean, covariance, 0.0, self._numbers)]
         self.elsewhere = 1 - TOLD_SHARE
 
-    def predict(self, seconds: float, moved: Displacement | None = None) -> None:
-        """Let time pass; `moved` is what the camera or instruments say of the way gone."""
+    def predict(
+        self, seconds: float, moved: Displacement | None = None, told_noise: Array | None = None
+    ) -> None:
+        """Let time pass; `moved` is what the camera or instruments say of the way gone.
+
+        `told_noise` (2,): variances with which told heading (rad) and log scale scatter from view
+        to view, those of the model where None.
+        """
+        noise = self.model.told_noise if told_noise is None else told_noise
         kept = 1 - self.model.lost
         made = []
         for each in self.hypotheses:
-            expected = predicted(self.model, each.mean, each.covariance, seconds, moved)
+            expected = predicted(self.model, each.mean, each.covariance, seconds, moved, noise)
             expected = held_to_map(self.model, expected, self.area_m2)
             made.append(self._from(each, expected, each.share * kept))
         self.hypotheses = made
@@ -137,18 +156,18 @@ class Mixture:
         made = []
         missed = self.model.miss**newness
         found = (1 - self.model.miss) ** newness
+        readings = [self._reading(told, each, newness) for each in sightings]
         for each in self.hypotheses:
             looked_at = self._on_map(each.mean)
             if searched is not None:
                 looked_at &= bool(np.hypot(*(each.mean[:2] - searched[0])) < searched[1])
             made.append(replace(each, share=each.share * (missed if looked_at else 1.0)))
             for start in self._or_knocked(each):
-                for sighting in sightings:
-                    split = self._seen(start, told, sighting, newness)
+                for seen in readings:
+                    split = self._seen(start, seen)
                     if split is not None:
                         made.append(replace(split, share=split.share * found))
-        for sighting in sightings:
-            made.append(self._born(told, sighting, newness))
+        made += [self._born(each) for each in readings]
         total = sum(each.share for each in made) + self.elsewhere
         self.elsewhere /= total
         made = [replace(each, share=each.share / total) for each in made]
@@ -207,72 +226,56 @@ class Mixture:
         )
         return [replace(each, share=each.share * (1 - rare)), other]
 
-    def _seen(
-        self, each: Hypothesis, told: Told, sighting: Sighting, newness: float
-    ) -> Hypothesis | None:
+    def _reading(self, told: Told, sighting: Sighting, newness: float) -> "_Reading":
+        """A sighting, of which only a part is new, as it is weighed.
+
+        A likelihood taken to the power `newness` is not only lower: its peak becomes broader, and
+        stands out less from all the places, headings and scales that there are. Lean does not
+        count: it is looked for near where it is expected, so that it always seems to fit.
+        """
+        seen, noise = reading(self.model, told, sighting)
+        own = np.diag(noise)[POSE] + self.model.initial_bias()[:2]
+        wide = math.log(self.area_m2) + float(np.log(SEARCHED_SIGMAS * np.sqrt(own)).sum())
+        _, log_det = np.linalg.slogdet(2 * math.pi * noise[:4, :4])
+        odds = newness * min(sighting.log_odds, MAX_LOG_ODDS) - 2 * math.log(newness)
+        odds -= (1 - newness) * (wide - float(log_det) / 2)
+        return _Reading(seen, noise / newness, odds + wide, newness)
+
+    def _seen(self, each: Hypothesis, seen: "_Reading") -> Hypothesis | None:
         """The hypothesis after a sighting, weighed; None where they have nothing in common."""
-        model = self.model
-        away = sighting.mean[:2] - each.mean[POSITION]
-        reach = np.trace(each.covariance[:2, :2]) + 100 * np.trace(sighting.covariance[:2, :2])
-        if away @ away > GATE * (reach + 100.0):
-            return None  # quickly, what is far beyond doubt
-        off, spread = innovation(model, each.mean, each.covariance, told, sighting, 1 - newness)
-        far = off[:2] @ np.linalg.solve(spread[:2, :2], off[:2])
-        if far > GATE:
+        off = seen.seen - each.mean[SEEN]
+        reach = np.trace(each.covariance[:2, :2]) + np.trace(seen.noise[:2, :2])
+        if off[:2] @ off[:2] > GATE * reach:
             return None
-        log_weight = self._log_odds(sighting, newness)
-        log_weight += _log_fit(off, spread) - self._log_chance(told, sighting, newness)
+        spread = each.covariance[np.ix_(SEEN, SEEN)] + seen.noise
+        log_weight = seen.log_odds + log_density(off[:4], spread[:4, :4])
         mean, covariance = updated(each.mean, each.covariance, off, spread)
-        share = each.share * math.exp(min(log_weight, 60.0))
         self._numbers += 1
         return replace(
             each,
-            share=share,
+            share=each.share * math.exp(min(log_weight, 60.0)),
             mean=mean,
             covariance=covariance,
-            sighted=each.sighted + newness,
+            sighted=each.sighted + seen.newness,
             number=self._numbers,
         )
 
-    def _born(self, told: Told, sighting: Sighting, newness: float) -> Hypothesis:
+    def _nowhere(self) -> tuple[Array, Array]:
+        """Mean (8,) and covariance (8, 8) of an aircraft that may be anywhere on the map."""
+        place, speed = self.area_m2, self.model.speed_mps**2
+        variances = [place, place, speed, speed, *self.model.initial_bias()]
+        return np.zeros(STATE), np.diag(np.array(variances))
+
+    def _born(self, seen: "_Reading") -> Hypothesis:
         """The hypothesis that the aircraft was elsewhere, and is here."""
-        off, spread = self._first(told, sighting, newness)
-        mean, covariance = np.zeros(STATE), np.zeros((STATE, STATE))
-        covariance[POSITION, POSITION] = np.eye(2) * self.area_m2
-        covariance[VELOCITY, VELOCITY] = np.eye(2) * self.model.speed_mps**2
-        covariance[range(4, 8), range(4, 8)] = self.model.initial_bias
-        log_weight = self._log_odds(sighting, newness) - math.log(self.area_m2)
-        log_weight += _log_fit(off, spread, slice(2, 4))
-        log_weight -= self._log_chance(told, sighting, newness)
-        spread = spread.copy()
-        spread[:2, :2] += np.eye(2) * self.area_m2
-        mean, covariance = updated(mean, covariance, off, spread)
+        mean, covariance = self._nowhere()
+        spread = covariance[np.ix_(SEEN, SEEN)] + seen.noise
+        log_weight = seen.log_odds - math.log(self.area_m2)
+        log_weight += log_density(seen.seen[POSE], spread[POSE, POSE])
+        mean, covariance = updated(mean, covariance, seen.seen, spread)
         share = self.elsewhere * math.exp(min(log_weight, 60.0))
         self._numbers += 1
-        return Hypothesis(share, mean, covariance, newness, self._numbers)
-
-    def _log_odds(self, sighting: Sighting, newness: float) -> float:
-        """Log odds of a sighting of which only a part is new.
-
-        A likelihood taken to the power `newness` is not only lower: the peak becomes broader, and
-        stands out less from all the places that the map has.
-        """
-        place_m2 = 2 * math.pi * math.sqrt(float(np.linalg.det(sighting.covariance[:2, :2])))
-        places = math.log(self.area_m2 / place_m2)
-        odds = newness * min(sighting.log_odds, MAX_LOG_ODDS)
-        return odds - (1 - newness) * places - math.log(newness)
-
-    def _first(self, told: Told, sighting: Sighting, newness: float) -> tuple[Array, Array]:
-        nothing = np.zeros((STATE, STATE))
-        nothing[range(4, 8), range(4, 8)] = self.model.initial_bias
-        return innovation(self.model, np.zeros(STATE), nothing, told, sighting, 1 - newness)
-
-    def _log_chance(self, told: Told, sighting: Sighting, newness: float) -> float:
-        """Log density of places that are only alike: anywhere, with any heading and scale that were
-        looked for."""
-        _, spread = self._first(told, sighting, newness)
-        widths = SEARCHED_SIGMAS * np.sqrt(np.diag(spread)[2:4])
-        return -math.log(self.area_m2) - float(np.log(widths).sum())
+        return Hypothesis(share, mean, covariance, seen.newness, self._numbers)
 
     def _from(self, each: Hypothesis, expected: Expected, share: float) -> Hypothesis:
         self._numbers += 1
@@ -286,14 +289,6 @@ class Mixture:
         total = sum(each.share for each in self.hypotheses) + self.elsewhere
         self.hypotheses = [replace(e, share=e.share / total) for e in self.hypotheses]
         self.elsewhere /= total
-
-
-def _log_fit(off: Array, spread: Array, part: slice = slice(0, 4)) -> float:
-    """Log density of a sighting's place, heading and scale.
-
-    Its lean does not count: what a view shows of it is too little to tell right from wrong.
-    """
-    return log_density(off[part], spread[part, part])
 
 
 def _merged(ordered: list[Hypothesis]) -> list[Hypothesis]:

@@ -1,8 +1,8 @@
 """What the track knows of an aircraft, how it moves, and what a view says of it.
 
 The state of one hypothesis, 8 numbers: position and velocity (m, m/s, east and north), and what is
-wrong with what is told: heading (rad, added to the told one), log scale (of true over told height,
-focal length included), pitch and roll (rad). The first four move, the others drift slowly.
+wrong with what is told of the view at hand: heading (rad, added to the told one), log scale (of
+true over told height, focal length included), pitch and roll (rad; of these what stays the same).
 """
 
 import math
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 STATE = 8
 POSITION, VELOCITY, HEADING, SCALE, LEAN = slice(0, 2), slice(2, 4), 4, 5, slice(6, 8)
+HEADING_FLOOR_RAD, SCALE_FLOOR = math.radians(0.3), 0.004
 SEEN = [0, 1, 4, 5, 6, 7]
 """Which of the state a sighting speaks of."""
 
@@ -29,20 +30,21 @@ class Model:
     two dates disagree by beyond what registration knows, which counts `sighting_growth` times.
     `lean_view_noise_rad`: how wrong the lean is that a view shows: hills and houses bend it too.
     `knocked`: how likely heading, scale and lean are suddenly wrong by something else than before:
-    a gimbal that moved, a compass that was reset. `miss`: how likely a view of ground that is on
-    the map shows nothing that can be found. `lost`: how likely the track went wrong since the last
-    view.
+    a gimbal that moved (by `knocked_lean_rad`), a compass that was reset. `miss`: how likely a view
+    of ground that is on the map shows nothing that can be found. `lost`: how likely the track went
+    wrong since the last view.
     """
 
     speed_mps: float = 30.0
-    accel_mps2: float = 1.5
+    accel_mps2: float = 5.0
     heading_rad: float = math.radians(7.0)
     heading_noise_rad: float = math.radians(2.0)
     heading_walk: float = math.radians(0.05)
     log_scale: float = 0.08
     log_scale_noise: float = 0.02
     log_scale_walk: float = 5e-4
-    lean_rad: float = math.radians(3.0)
+    lean_rad: float = math.radians(1.5)
+    knocked_lean_rad: float = math.radians(6.0)
     lean_noise_rad: float = math.radians(0.7)
     lean_walk: float = math.radians(0.05)
     sighting_noise_m: float = 1.0
@@ -52,16 +54,15 @@ class Model:
     miss: float = 0.5
     lost: float = 1e-3
 
-    @property
-    def initial_bias(self) -> Array:
+    def initial_bias(self, lean_rad: float | None = None) -> Array:
         """Variances (4,) of heading, log scale, pitch and roll before anything is seen."""
-        return np.square([self.heading_rad, self.log_scale, self.lean_rad, self.lean_rad])
+        lean = self.lean_rad if lean_rad is None else lean_rad
+        return np.square([self.heading_rad, self.log_scale, lean, lean])
 
     @property
     def told_noise(self) -> Array:
-        """Variances (4,) of what is told anew with every view."""
-        noise = self.lean_noise_rad
-        return np.square([self.heading_noise_rad, self.log_scale_noise, noise, noise])
+        """Variances (2,) with which told heading and log scale scatter from view to view."""
+        return np.square([self.heading_noise_rad, self.log_scale_noise])
 
     def drift(self, seconds: float) -> Array:
         """Variances (4,) that are added to those of the biases in so many seconds."""
@@ -97,12 +98,18 @@ class Displacement:
     """Movement since the last view, metres east and north (2,), covariance (2, 2).
 
     `relative`: it was measured by the camera and turned by the told heading, so that wrong heading
-    and scale bend it like everything else.
+    and scale bend it like everything else. Then the camera also saw by how much the heading turned
+    and the scale changed other than told (rad, natural logarithm), known to `turned_std_rad` and
+    `scaled_std`.
     """
 
     moved_en_m: Array
     covariance: Array
     relative: bool
+    turned_rad: float = 0.0
+    scaled: float = 0.0
+    turned_std_rad: float = math.radians(0.4)
+    scaled_std: float = 0.004
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,12 +132,25 @@ class Expected:
 
 
 def predicted(
-    model: Model, mean: Array, covariance: Array, seconds: float, moved: Displacement | None
+    model: Model,
+    mean: Array,
+    covariance: Array,
+    seconds: float,
+    moved: Displacement | None,
+    told_noise: Array,
 ) -> Expected:
-    """What a state is expected to be after so many seconds."""
+    """What a state is expected to be after so many seconds.
+
+    `told_noise` (2,) are the variances with which told heading and log scale scatter from view to
+    view: what was wrong with the last ones says that much less of these, unless the camera saw how
+    they changed.
+    """
     mean, step = mean.copy(), np.eye(STATE)
     noise = np.zeros((STATE, STATE))
     noise[range(4, 8), range(4, 8)] = model.drift(seconds)
+    if moved is None or not moved.relative:
+        noise[HEADING, HEADING] += told_noise[0]
+        noise[SCALE, SCALE] += told_noise[1]
     if moved is None:
         step[0, 2] = step[1, 3] = seconds
         power = model.accel_mps2**2
@@ -149,6 +169,11 @@ def predicted(
     gone = scale @ [east, north]
     spread = scale @ moved.covariance @ scale.T
     per_s = 1 / max(seconds, 1e-3)
+    if moved.relative:
+        mean[HEADING] += moved.turned_rad
+        mean[SCALE] += moved.scaled
+        noise[HEADING, HEADING] += moved.turned_std_rad**2
+        noise[SCALE, SCALE] += moved.scaled_std**2
     mean[POSITION] += gone
     mean[VELOCITY] = gone * per_s
     step[VELOCITY, VELOCITY] = 0
@@ -173,22 +198,15 @@ def held_to_map(model: Model, expected: Expected, area_m2: float) -> Expected:
 
 def knocked(model: Model, expected: Expected) -> Expected:
     """The same where heading, scale and lean are no longer what they were."""
-    return expected.without(slice(4, 8), model.initial_bias)
+    return expected.without(slice(4, 8), model.initial_bias(model.knocked_lean_rad))
 
 
-def innovation(
-    model: Model, mean: Array, covariance: Array, told: Told, sighting: Sighting, sameness: float
-) -> tuple[Array, Array]:
-    """How far a sighting lies from what was expected (6,), and the covariance (6, 6) of that.
-
-    `sameness` is the share of what the view shows that the last one showed too: what it says then
-    is not new, and counts less.
-    """
+def reading(model: Model, told: Told, sighting: Sighting) -> tuple[Array, Array]:
+    """What a sighting says of the state (6,), in the order of `SEEN`, and its covariance (6, 6)."""
     noise = _with_lean_noise(sighting.covariance, model.lean_view_noise_rad)
     noise[:2, :2] *= model.sighting_growth
-    noise[:2, :2] += np.eye(2) * model.sighting_noise_m**2
-    noise[range(2, 6), range(2, 6)] += model.told_noise
-    noise /= max(1 - sameness, 0.1)
+    floor = [model.sighting_noise_m] * 2 + [HEADING_FLOOR_RAD, SCALE_FLOOR]
+    noise[range(6), range(6)] += np.square([*floor, model.lean_noise_rad, model.lean_noise_rad])
     seen = sighting.mean.copy()
     if told.heading_rad is None:
         seen[2] = 0.0
@@ -197,8 +215,7 @@ def innovation(
     else:
         seen[2] = math.remainder(seen[2] - told.heading_rad, 2 * math.pi)
     seen[4:] -= [told.pitch_rad, told.roll_rad]
-    off = seen - mean[SEEN]
-    return off, covariance[np.ix_(SEEN, SEEN)] + noise
+    return seen, noise
 
 
 def _with_lean_noise(covariance: Array, std_rad: float) -> Array:
