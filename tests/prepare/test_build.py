@@ -2,12 +2,14 @@
 
 import errno
 import os
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from conftest import textured
+from orthonav import represent
 from orthonav.confidence.logistic import FEATURES
 from orthonav.errors import AreaError, MissingFileError, OrthonavError, OutputError, VariantError
 from orthonav.geo.area import Area
@@ -381,3 +383,25 @@ def test_the_error_told_is_of_the_order_of_the_grid(map_path, ortho, tmp_path, c
     for opened in (open_map(map_path), built(ortho, tmp_path, **calibrated)):
         grid = opened.manifest.sheets[0].grid
         assert grid.gsd_m <= opened.manifest.view["position_std_m"] < grid.stride_m / 2
+
+
+def test_slow_representations_are_calibrated_on_fewer_crops(ortho, tmp_path, monkeypatch):
+    """Where one takes minutes; counted by what is told of the progress."""
+    told = {}
+    for name in ("canny", "slow"):
+        if name == "slow":
+            table = {**represent.TABLE, "canny": replace(represent.TABLE["canny"], flies=False)}
+            monkeypatch.setattr(represent, "TABLE", table)
+        monkeypatch.setattr("orthonav.prepare.calibrate.SLOW_CROPS", 6)
+        shares = []
+
+        def tell(stage, share, shares=shares):
+            if stage == "calibrate":
+                shares.append(share)
+
+        request = BuildRequest(
+            [ortho], tmp_path / f"{name}.onav", tile_px=64, edges="canny", registration=False
+        )
+        build_map(request, tell)
+        told[name] = len(shares)
+    assert told["slow"] == 6 < told["canny"]

@@ -149,7 +149,15 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     report("learn", 1.0)
     centres = grid.centres_en_m(tiles_rc).astype(np.float32)
     calibration = calibrate(
-        sampler, grid, representation, embedder, embeddings, centres, HEADING_STEP_DEG, report
+        sampler,
+        grid,
+        representation,
+        embedder,
+        embeddings,
+        centres,
+        HEADING_STEP_DEG,
+        report,
+        slow=not represent.TABLE[stored_representation(representation)["name"]].flies,
     )
     if calibration.confidence is None:
         log.warning("too little imagery to calibrate: fixes on this map will have no confidence")

@@ -21,6 +21,7 @@ from orthonav.geo.grid import TileGrid
 from orthonav.localizer.match import TileMatcher
 
 CROPS = 192
+SLOW_CROPS = 32
 CROP_TILES = 1.5
 HEADING_STD_DEG = 5.0
 SCALE_STD = 0.05
@@ -93,11 +94,17 @@ def calibrate(
     centres_en_m: NDArray[np.float32],
     heading_step_deg: float,
     report: Callable[[str, float], None],
+    *,
+    slow: bool = False,
 ) -> Calibration:
-    """Search changed and mirrored crops on the new map and fit the confidence to the outcome."""
+    """Search changed and mirrored crops on the new map and fit the confidence to the outcome.
+
+    A `slow` representation, minutes a crop, is tried on `SLOW_CROPS` only.
+    """
     rng = np.random.default_rng([len(sampler.crops), 2])
     matcher = TileMatcher(grid, centres_en_m, embeddings)
-    crops = [sampler.crops[i] for i in rng.permutation(len(sampler.crops))[:CROPS]]
+    most = min(CROPS, SLOW_CROPS) if slow else CROPS
+    crops = [sampler.crops[i] for i in rng.permutation(len(sampler.crops))[:most]]
     features, errors, mirrored = [], [], []
     for done, crop in enumerate(crops):
         other = crops[int(rng.integers(len(crops)))].grey
