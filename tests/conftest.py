@@ -1,8 +1,10 @@
 """What many tests share: a generated area at two dates, a map of it, a flight over it."""
 
+import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 # Before NumPy and PyTorch are loaded: tests run side by side.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -14,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
+from orthonav.cli import main
 from orthonav.flight import open_flight, read_truth
 from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
@@ -135,3 +138,33 @@ def names_in():
         return sorted(str(path.relative_to(folder)) for path in Path(folder).rglob("*"))
 
     return names
+
+
+class Done(NamedTuple):
+    """What a command gave: exit code, stdout and stderr, those of C libraries included."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def run(capfd, monkeypatch):
+    """Function that runs a command in this process as a fresh one would."""
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    root = logging.getLogger()
+
+    def command(*arguments):
+        handlers, root.handlers, level = root.handlers, [], root.level
+        capfd.readouterr()
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as left:
+            code = left.code
+        finally:
+            root.handlers = handlers
+            root.setLevel(level)
+        told = capfd.readouterr()
+        return Done(code, told.out, told.err)
+
+    return command

@@ -3,20 +3,18 @@
 import errno
 import hashlib
 import json
-import logging
 import os
 import resource
 import shutil
 import signal
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from conftest import textured
+from conftest import Done, textured
 from orthonav import __version__
 from orthonav.cli import COMMANDS, main
 from orthonav.mapfile import open_map
@@ -24,37 +22,6 @@ from orthonav.publish.jsonl import read_results
 from orthonav.records import Fix
 
 SMALL_MAP = ["--tile-px", "64", "--overlap", "0.75", "--calibration-views", "24"]
-
-
-@dataclass(frozen=True)
-class Done:
-    """What a command gave: exit code, stdout and stderr, those of C libraries included."""
-
-    code: int
-    out: str
-    err: str
-
-
-@pytest.fixture
-def run(capfd, monkeypatch):
-    """Function that runs a command in this process as a fresh one would."""
-    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
-    root = logging.getLogger()
-
-    def command(*arguments):
-        handlers, root.handlers, level = root.handlers, [], root.level
-        capfd.readouterr()
-        try:
-            code = main([str(argument) for argument in arguments])
-        except SystemExit as left:
-            code = left.code
-        finally:
-            root.handlers = handlers
-            root.setLevel(level)
-        told = capfd.readouterr()
-        return Done(code, told.out, told.err)
-
-    return command
 
 
 def process(*arguments, script=None, limit=None):

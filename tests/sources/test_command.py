@@ -1,7 +1,6 @@
 """`orthonav import` as it is typed, and `localize` of a source as of its import."""
 
 import json
-import logging
 import time
 from pathlib import Path
 
@@ -25,28 +24,6 @@ VIEW = read_image(DATA / "golden_view.png")
 PLACE = 46.499856, 2.999830  # of the stored view, with heading 20 and height 160
 SIDES = {"width_px": 160, "height_px": 160, "fx_px": 200.0, "fy_px": 200.0}
 SIDES |= {"cx_px": 80.0, "cy_px": 80.0}
-
-
-@pytest.fixture
-def run(capfd, monkeypatch):
-    """Function that runs a command and gives exit code, stdout and stderr."""
-    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
-    root = logging.getLogger()
-
-    def command(*arguments):
-        handlers, root.handlers, level = root.handlers, [], root.level
-        capfd.readouterr()
-        try:
-            code = main([str(argument) for argument in arguments])
-        except SystemExit as left:
-            code = left.code
-        finally:
-            root.handlers = handlers
-            root.setLevel(level)
-        told = capfd.readouterr()
-        return code, told.out, told.err
-
-    return command
 
 
 @pytest.fixture

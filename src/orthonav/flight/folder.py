@@ -142,7 +142,7 @@ def read_truth(path: Path) -> dict[str, tuple[float, float]]:
     path = require_file(path, "truth")
     truth: dict[str, tuple[float, float]] = {}
     for line, row in _rows(path, ("frame", "lat_deg", "lon_deg")):
-        lat, lon = _number(row["lat_deg"]), _number(row["lon_deg"])
+        lat, lon = number_of(row["lat_deg"]), number_of(row["lon_deg"])
         if not (abs(lat) <= 90 and abs(lon) <= 360):
             raise FlightError(f"line {line}: no latitude and longitude in degrees: {path}")
         if row["frame"] in truth:
@@ -190,7 +190,7 @@ def _views(telemetry: Path, frames: Path) -> Iterator[FlightView]:
         if frame in seen:
             raise FlightError(f"line {line}: frame {frame} comes twice: {telemetry}")
         seen.add(frame)
-        time_ns = _time_ns(row["time_s"])
+        time_ns = time_ns_of(row["time_s"])
         if time_ns is None:
             raise FlightError(f"line {line}: time_s is no time in seconds: {telemetry}")
         image = frames / frame
@@ -206,10 +206,10 @@ def _telemetry(row: Mapping[str, str], time_ns: int) -> Telemetry:
     usable = usable and abs(prior[0] or 0) <= 90 and abs(prior[1] or 0) <= 360
     return Telemetry(
         time_ns=time_ns,
-        yaw_deg=_number(row["yaw_deg"]),
-        pitch_deg=_number(row["pitch_deg"]),
-        roll_deg=_number(row["roll_deg"]),
-        agl_m=_number(row["agl_m"]),
+        yaw_deg=number_of(row["yaw_deg"]),
+        pitch_deg=number_of(row["pitch_deg"]),
+        roll_deg=number_of(row["roll_deg"]),
+        agl_m=number_of(row["agl_m"]),
         yaw_std_deg=_optional(row, "yaw_std_deg"),
         agl_std_m=_optional(row, "agl_std_m"),
         prior=Prior(prior[0] or 0.0, prior[1] or 0.0, prior[2] or 0.0) if usable else None,
@@ -242,14 +242,18 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def _time_ns(text: str) -> int | None:
-    """Nanoseconds of decimal seconds; floats could not hold them for times since 1970."""
-    if not math.isfinite(_number(text)) or abs(_number(text)) >= 9e9:
+def time_ns_of(text: str | None) -> int | None:
+    """Nanoseconds of decimal seconds, None where it is no time.
+
+    Floats could not hold them for times since 1970.
+    """
+    if text is None or not abs(number_of(text)) < 9e9:  # NaN too
         return None
     return round(Decimal(text.strip()) * 10**9)
 
 
-def _number(text: Any) -> float:
+def number_of(text: Any) -> float:
+    """The number that a text of a table is, NaN where it is none."""
     try:
         return float(text)
     except (TypeError, ValueError):
@@ -257,5 +261,5 @@ def _number(text: Any) -> float:
 
 
 def _optional(row: Mapping[str, str], name: str) -> float | None:
-    value = _number(row.get(name, ""))
+    value = number_of(row.get(name, ""))
     return value if math.isfinite(value) else None

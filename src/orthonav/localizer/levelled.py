@@ -34,12 +34,11 @@ class Levelled:
 
     `mean` (6,): metres east and north of the sheet's origin, heading (rad), log scale (of true over
     told height), pitch and roll (rad); `covariance` (6, 6) of them, of what the view itself says: a
-    lean that it does not show is known to 20 deg. `score` as of `Placed`.
+    lean that it does not show is known to 20 deg.
     """
 
     mean: Array
     covariance: Array
-    score: float
 
 
 def levelled(
@@ -84,7 +83,7 @@ def levelled(
     shift = covariance @ weak @ np.concatenate([np.zeros(4), expected - best.lean_rad])
     pose = Pose(*(np.array(_numbers(best.pose)) + shift[:4]).tolist())
     lean = np.asarray(best.lean_rad + shift[4:], np.float64)
-    return _on_sheet(registration, best.view, pose, lean, covariance, best.score)
+    return _on_sheet(registration, best.view, pose, lean, covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +175,6 @@ def _on_sheet(
     pose: Pose,
     lean_rad: Array,
     covariance: Array,
-    score: float,
 ) -> Levelled:
     """Of the window's middle in pixels to the camera in metres."""
     grid = registration.grid
@@ -190,4 +188,4 @@ def _on_sheet(
     spread[:2, :2] += np.eye(2) * (registration.floor_px * grid.gsd_m) ** 2
     position = grid.west_m + x * grid.gsd_m, grid.north_m - y * grid.gsd_m
     mean = np.array([*position, pose.turn_rad, pose.log_scale, *lean_rad])
-    return Levelled(mean, spread, score)
+    return Levelled(mean, spread)

@@ -91,9 +91,7 @@ class Footprint:
         off_log_scale: float = 0.0,
     ) -> "Footprint | None":
         """A view (H, W) with its telemetry, None where it shows too little."""
-        side_m = telemetry.agl_m * math.sqrt(
-            camera.width_px * camera.height_px / (camera.fx_px * camera.fy_px)
-        )
+        side_m = camera.gsd_m(telemetry.agl_m) * math.sqrt(camera.width_px * camera.height_px)
         pixel_m = pixel_m or side_m / VIEW_PX
         made = rectify_footprint(
             prepare_view(grey, camera, telemetry.agl_m, pixel_m),

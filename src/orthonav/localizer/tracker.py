@@ -161,9 +161,10 @@ class Tracker:
         if not 0 < seconds < LONGEST_GAP_S:
             seconds = UNKNOWN_STEP_S if seconds <= 0 else LONGEST_GAP_S
         self._time_ns = telemetry.time_ns
-        moved, overlap = self._moved(before, now, telemetry, seconds)
+        noise = self._told_noise(telemetry)
+        moved, overlap = self._moved(before, now, telemetry.vel_en_mps, seconds, noise)
         self._before = now
-        self.mixture.predict(seconds, moved, self._told_noise(telemetry))
+        self.mixture.predict(seconds, moved, noise)
         return overlap
 
     def _told_noise(self, telemetry: Telemetry) -> Array:
@@ -201,15 +202,16 @@ class Tracker:
         self,
         before: Footprint | None,
         now: Footprint | None,
-        telemetry: Telemetry,
+        velocity: tuple[float, float] | None,
         seconds: float,
+        told_noise: Array,
     ) -> tuple[Displacement | None, float]:
+        """The way since the last view by the camera, else by the told velocity; the share of the
+        view that the last one showed too."""
         if before is not None and now is not None and before.pixel_m == now.pixel_m:
-            noise = self._told_noise(telemetry)
-            seen = moved_between(before, now, self.model.lean_noise_rad, noise)
+            seen = moved_between(before, now, self.model.lean_noise_rad, told_noise)
             if seen is not None:
                 return seen.displacement, seen.overlap
-        velocity = telemetry.vel_en_mps
         if velocity is None:
             return None, 0.0
         way = np.array(velocity) * seconds

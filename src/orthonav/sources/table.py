@@ -2,10 +2,10 @@
 
 import csv
 import math
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 from orthonav.errors import FlightError
+from orthonav.flight.folder import number_of, time_ns_of
 from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
 from orthonav.sources.track import Samples, Series, Track, attitude_of_angles
 
@@ -37,15 +37,15 @@ def read_table(path: Path) -> Track:
             if missing:
                 raise FlightError(f"columns are missing: {', '.join(missing)}: {path}")
             for row in reader:
-                time_ns = _time_ns(row["time_s"])
+                time_ns = time_ns_of(row["time_s"])
                 if time_ns is None:
                     raise FlightError(f"line {reader.line_num}: time_s is no time: {path}")
-                angles = (_number(row.get(f"{name}_deg")) for name in ("yaw", "pitch", "roll"))
+                angles = (number_of(row.get(f"{name}_deg")) for name in ("yaw", "pitch", "roll"))
                 attitude.add(time_ns, *angles)
-                place = _number(row.get("lat_deg")), _number(row.get("lon_deg"))
+                place = number_of(row.get("lat_deg")), number_of(row.get("lon_deg"))
                 position.add(time_ns, *place, math.nan)
                 for name, columns in _NAMES.items():
-                    others[name].add(time_ns, *(_number(row.get(column)) for column in columns))
+                    others[name].add(time_ns, *(number_of(row.get(column)) for column in columns))
     except (UnicodeDecodeError, csv.Error) as error:
         raise FlightError(f"not a CSV file in UTF-8 ({error}): {path}") from error
     return _track(attitude, position, others, path)
@@ -68,18 +68,3 @@ def _track(attitude: Samples, position: Samples, others: dict[str, Samples], pat
     if track.attitude is None:
         raise FlightError(f"telemetry has no line with pitch and roll: {path}")
     return track
-
-
-def _time_ns(text: str | None) -> int | None:
-    try:
-        seconds = Decimal((text or "").strip())
-    except InvalidOperation:
-        return None
-    return round(seconds * 10**9) if seconds.is_finite() and abs(seconds) < 9 * 10**9 else None
-
-
-def _number(text: str | None) -> float:
-    try:
-        return float(text or "nan")
-    except ValueError:
-        return math.nan

@@ -86,7 +86,6 @@ class Estimate:
     covariance: Array
     confidence: float
     state: State
-    number: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +188,7 @@ class Mixture:
         sighted = max(each.sighted for each in near)
         state = self._state(confidence, sighted)
         self._tracked = self._tracked or state is State.TRACKING
-        return Estimate(mean, covariance, confidence, state, best.number)
+        return Estimate(mean, covariance, confidence, state)
 
     def _best(self, radius_m: float) -> Hypothesis:
         """The hypothesis with most belief around it."""
