@@ -1,0 +1,174 @@
+"""What autopilots are told: the record, its accuracy, its clocks, GPS time."""
+
+import math
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from orthonav.publish.estimate import (
+    Clock,
+    EstimateError,
+    NavigationEstimate,
+    error_ellipse,
+    estimate_from_result,
+)
+from orthonav.publish.gpstime import gps_time
+from orthonav.records import Fix, NoFix, ViewResult
+
+COV = np.array([[16.0, 3.0], [3.0, 9.0]])
+PLAIN = NavigationEstimate(48.0, -4.0, COV, 0.95, utc_ns=1_789_000_000_000_000_000)
+VELOCITY = {"vel_east_mps": 12.0, "vel_north_mps": -3.5}
+
+
+def a_result(state: str | None = None, **evidence: float) -> ViewResult:
+    fix = Fix(48.1, -4.3, COV, 0.93, 15.0, 87.0, 121.0, evidence)
+    return ViewResult("a.jpg", 5_000_000_000, fix, 80.0, state)
+
+
+def unix_ns(text: str) -> int:
+    return int(datetime.fromisoformat(text).replace(tzinfo=UTC).timestamp()) * 10**9
+
+
+def test_a_fix_becomes_an_estimate() -> None:
+    made = estimate_from_result(a_result("tracking", **VELOCITY), utc_minus_boot_ns=4 * 10**9)
+    assert made is not None
+    assert (made.lat_deg, made.lon_deg, made.confidence) == (48.1, -4.3, 0.93)
+    assert (made.heading_deg, made.agl_m, made.state) == (87.0, 121.0, "tracking")
+    assert made.vel_en_mps == (12.0, -3.5) and made.vel_cov_en is None
+    assert (made.utc_ns, made.boot_ns) == (5 * 10**9, 10**9)
+    assert made.processing_s == 0.08
+    assert math.isnan(made.alt_amsl_m) and math.isnan(made.alt_std_m)
+
+
+def test_without_a_fix_there_is_no_estimate() -> None:
+    assert estimate_from_result(ViewResult("a.jpg", 0, NoFix("blank", ""), 1.0)) is None
+
+
+@pytest.mark.parametrize(
+    "evidence", [{}, {"vel_east_mps": 1.0}, {**VELOCITY, "vel_east_mps": math.nan}]
+)
+def test_half_a_velocity_is_none(evidence: dict[str, float]) -> None:
+    made = estimate_from_result(a_result("tracking", **evidence))
+    assert made is not None and made.vel_en_mps is None
+
+
+def test_a_single_view_has_no_velocity() -> None:
+    made = estimate_from_result(a_result(None, **VELOCITY))
+    assert made is not None and made.vel_en_mps is None
+
+
+def test_clocks_are_kept_apart() -> None:
+    utc = estimate_from_result(a_result())
+    boot = estimate_from_result(a_result(), clock=Clock.BOOT, utc_minus_boot_ns=10**18)
+    assert utc is not None and boot is not None
+    assert (utc.utc_ns, utc.boot_ns) == (5 * 10**9, None)
+    assert (boot.utc_ns, boot.boot_ns) == (10**18 + 5 * 10**9, 5 * 10**9)
+    assert boot.sent_ns(Clock.BOOT) - boot.exposed_ns(Clock.BOOT) == 80_000_000
+    with pytest.raises(EstimateError, match="'boot'"):
+        utc.exposed_ns(Clock.BOOT)
+
+
+def test_an_unknown_latency_is_no_processing_time() -> None:
+    made = estimate_from_result(replace(a_result(), latency_ms=math.nan))
+    told = estimate_from_result(a_result(), processing_s=0.25)
+    assert made is not None and made.processing_s == 0.0
+    assert told is not None and told.processing_s == 0.25
+
+
+angles = st.floats(0, math.pi)
+axes = st.floats(0.01, 1e4)
+
+
+@given(angles, axes, axes)
+def test_the_ellipse_is_that_of_the_covariance(turn: float, one: float, other: float) -> None:
+    east_north = np.array([[math.sin(turn), math.cos(turn)], [math.cos(turn), -math.sin(turn)]])
+    cov = east_north.T @ np.diag([one**2, other**2]) @ east_north
+    major, minor, direction_deg = error_ellipse(cov)
+    assert major == pytest.approx(max(one, other), rel=1e-6)
+    assert minor == pytest.approx(min(one, other), rel=1e-3, abs=1e-4 * major)
+    assert 0 <= direction_deg < 180
+    along = np.array([math.sin(math.radians(direction_deg)), math.cos(math.radians(direction_deg))])
+    assert along @ cov @ along == pytest.approx(major**2, rel=1e-6)
+
+
+def test_a_long_axis_to_the_north_east_points_there() -> None:
+    assert error_ellipse(np.array([[5.0, 4.0], [4.0, 5.0]])) == pytest.approx((3.0, 1.0, 45.0))
+
+
+@pytest.mark.parametrize("cov", [[[1, 0], [0, math.nan]], [[1, 2], [2, 1]], [[-1, 0], [0, -1]]])
+def test_what_is_no_covariance_has_no_accuracy(cov: list[list[float]]) -> None:
+    estimate = replace(PLAIN, cov_en_m2=np.array(cov))
+    assert all(map(math.isnan, error_ellipse(estimate.cov_en_m2)))
+    assert math.isnan(estimate.horizontal_std_m(3.0))
+    assert not estimate.is_sure()
+
+
+def test_the_accuracy_is_that_of_the_worst_direction_and_not_below_the_least() -> None:
+    values = np.linalg.eigvalsh(COV)
+    assert PLAIN.horizontal_std_m() == pytest.approx(math.sqrt(values[1]))
+    assert PLAIN.horizontal_std_m() >= math.sqrt(COV.diagonal().max())
+    assert PLAIN.horizontal_std_m(10.0) == 10.0
+
+
+@pytest.mark.parametrize(
+    ("confidence", "state", "sure"),
+    [
+        (0.9, None, True),
+        (0.899, None, False),
+        (math.nan, None, False),
+        (0.99, "tracking", True),
+        (0.99, "searching", False),
+        (0.99, "lost", False),
+    ],
+)
+def test_sure_is_confident_and_tracking(confidence: float, state: str | None, sure: bool) -> None:
+    assert replace(PLAIN, confidence=confidence, state=state).is_sure() is sure
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"lat_deg": 90.01}, "latitude"),
+        ({"lat_deg": math.nan}, "latitude"),
+        ({"lon_deg": -180.5}, "longitude"),
+        ({"cov_en_m2": np.eye(3)}, "cov_en_m2"),
+        ({"vel_cov_en": np.ones(2)}, "vel_cov_en"),
+        ({"confidence": 1.5}, "confidence"),
+        ({"processing_s": math.inf}, "processing_s"),
+        ({"alt_std_m": -1.0}, "alt_std_m"),
+        ({"reset_counter": 256}, "reset_counter"),
+        ({"utc_ns": None}, "time of exposure"),
+    ],
+)
+def test_what_cannot_be_is_named(change: dict[str, object], said: str) -> None:
+    with pytest.raises(EstimateError, match=said):
+        replace(PLAIN, **change)
+
+
+@pytest.mark.parametrize(
+    ("utc", "week", "second_of_week"),
+    [
+        ("1980-01-06T00:00:00", 0, 0),
+        ("1981-06-30T23:59:59", 77, 259199),
+        ("1981-07-01T00:00:00", 77, 259201),
+        ("2016-12-31T23:59:42", 1929, 604799),
+        ("2016-12-31T23:59:59", 1930, 16),
+        ("2017-01-01T00:00:00", 1930, 18),
+        ("2026-01-03T23:59:41", 2399, 604799),
+        ("2026-01-03T23:59:42", 2400, 0),
+        ("1979-12-31T00:00:00", 0, 0),
+    ],
+)
+def test_gps_time_knows_leap_seconds(utc: str, week: int, second_of_week: int) -> None:
+    assert gps_time(unix_ns(utc) + 999_999) == (week, second_of_week * 1000)
+
+
+def test_gps_time_agrees_with_pymavlink() -> None:
+    dfreader = pytest.importorskip("pymavlink.DFReader")
+    utc_ns = unix_ns("2026-11-21T10:20:30") + 250_000_000
+    back_s = dfreader.DFReaderClock()._gpsTimeToTime(*gps_time(utc_ns))
+    assert back_s == pytest.approx(utc_ns / 1e9, abs=1e-3)

@@ -1,0 +1,203 @@
+"""What may go out: nothing unsure, old or too often, with counts; and when the position jumped."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from orthonav.geo.frames import LocalFrame
+from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
+from orthonav.publish.gate import Gate, GateRules
+
+START_NS = 1_789_000_000_000_000_000
+SECOND = 10**9
+FRAME = LocalFrame(48.0, -4.0)
+
+
+def estimate_at(seconds: float, east_m: float = 0.0, north_m: float = 0.0, **more: object):
+    lat, lon = FRAME.latlon_from_en((east_m, north_m))
+    made = NavigationEstimate(
+        float(lat), float(lon), np.eye(2) * 4.0, 0.95, utc_ns=START_NS + round(seconds * 1e9)
+    )
+    return replace(made, **more)
+
+
+def now(seconds: float) -> int:
+    return START_NS + round(seconds * 1e9)
+
+
+@pytest.mark.parametrize(
+    ("reason", "change", "later_s"),
+    [
+        ("low_confidence", {"confidence": 0.89}, 0.1),
+        ("low_confidence", {"confidence": math.nan}, 0.1),
+        ("not_tracking", {"state": "searching"}, 0.1),
+        ("not_tracking", {"state": "lost"}, 0.1),
+        ("no_covariance", {"cov_en_m2": np.full((2, 2), math.nan)}, 0.1),
+        ("too_uncertain", {"cov_en_m2": np.diag([1.0, 51.0**2])}, 0.1),
+        ("stale", {}, 1.01),
+        ("from_the_future", {}, -0.11),
+    ],
+)
+def test_what_must_not_go_out_is_withheld_and_counted(reason, change, later_s) -> None:
+    gate = Gate()
+    assert gate.admit(estimate_at(0.0, **change), now(later_s)) is None
+    assert gate.withheld == {reason: 1}
+
+
+@pytest.mark.parametrize("state", [None, "tracking"])
+def test_what_is_sure_and_fresh_passes(state: str | None) -> None:
+    gate = Gate()
+    passed = gate.admit(estimate_at(0.0, state=state), now(0.9))
+    assert passed is not None and passed.reset_counter == 0
+    assert not gate.withheld
+
+
+def test_no_fix_is_counted() -> None:
+    gate = Gate()
+    assert gate.admit(None, now(0)) is None
+    assert gate.withheld == {"no_fix": 1}
+
+
+def test_the_user_sets_the_least_confidence() -> None:
+    strict, lax = Gate(GateRules(min_confidence=0.99)), Gate(GateRules(min_confidence=0.5))
+    assert strict.admit(estimate_at(0.0), now(0)) is None
+    assert lax.admit(estimate_at(0.0, confidence=0.5), now(0)) is not None
+
+
+def test_views_out_of_order_are_withheld() -> None:
+    gate = Gate()
+    assert gate.admit(estimate_at(0.5), now(0.6)) is not None
+    assert gate.admit(estimate_at(0.5), now(0.7)) is None
+    assert gate.admit(estimate_at(0.4), now(0.7)) is None
+    assert gate.withheld == {"out_of_order": 2}
+
+
+def test_a_clock_that_is_set_back_does_not_silence_for_ever() -> None:
+    gate = Gate()
+    gate.admit(estimate_at(3600.0), now(3600.0))
+    passed = gate.admit(estimate_at(0.0), now(0.1))
+    assert passed is not None and passed.reset_counter == 1
+
+
+def test_the_gate_needs_its_clock() -> None:
+    with pytest.raises(EstimateError, match="boot"):
+        Gate(clock=Clock.BOOT).admit(estimate_at(0.0), now(0))
+
+
+def test_a_track_found_again_is_a_reset() -> None:
+    gate = Gate()
+    counters = []
+    for second, state in enumerate(["tracking", "tracking", "lost", "searching", "tracking"]):
+        passed = gate.admit(estimate_at(second, state=state), now(second))
+        counters.append(None if passed is None else passed.reset_counter)
+    assert counters == [0, 0, None, None, 1]
+    gate.admit(None, now(5))
+    again = gate.admit(estimate_at(6, state="tracking"), now(6))
+    assert again is not None and again.reset_counter == 2 == gate.resets
+
+
+def test_doubt_alone_is_no_reset() -> None:
+    gate = Gate()
+    for second, confidence in enumerate([0.95, 0.5, 0.95]):
+        passed = gate.admit(
+            estimate_at(second, state="tracking", confidence=confidence), now(second)
+        )
+    assert passed is not None and passed.reset_counter == 0
+
+
+@pytest.mark.parametrize(("jump_m", "resets"), [(20.0, 0), (90.0, 1)])
+def test_a_jump_beyond_what_flight_allows_is_a_reset(jump_m: float, resets: int) -> None:
+    """60 m/s for a second and five times 2.8 m are 74 m."""
+    gate = Gate()
+    gate.admit(estimate_at(0.0), now(0))
+    passed = gate.admit(estimate_at(1.0, east_m=jump_m), now(1))
+    assert passed is not None and passed.reset_counter == resets
+
+
+@pytest.mark.parametrize(("jump_m", "resets"), [(0.0, 0), (15.0, 0), (30.0, 1)])
+def test_a_known_velocity_leaves_less_room(jump_m: float, resets: int) -> None:
+    """30 m/s foretell 30 m; 5 m of acceleration and five times 3 m are 20 m more."""
+    gate = Gate()
+    moving = {"vel_en_mps": (30.0, 0.0), "state": "tracking"}
+    gate.admit(estimate_at(0.0, **moving), now(0))
+    passed = gate.admit(estimate_at(1.0, east_m=30.0 + jump_m, **moving), now(1))
+    assert passed is not None and passed.reset_counter == resets
+
+
+def test_noise_as_told_is_no_reset() -> None:
+    rng = np.random.default_rng(3)
+    cov = np.array([[25.0, 12.0], [12.0, 16.0]])
+    gate = Gate()
+    for step, noise in enumerate(rng.multivariate_normal([0, 0], cov, 2000)):
+        east, north = 25.0 * step * 0.2 + noise[0], noise[1]
+        at = estimate_at(0.2 * step, east, north, cov_en_m2=cov, vel_en_mps=(25.0, 0.0))
+        assert gate.admit(at, now(0.2 * step)) is not None
+    assert gate.resets == 0
+
+
+def test_the_counter_begins_again_after_255() -> None:
+    gate = Gate()
+    for second in range(300):
+        passed = gate.admit(estimate_at(second, east_m=500.0 * (second % 2)), now(second))
+    assert gate.resets == 299
+    assert passed is not None and passed.reset_counter == 299 - 256
+
+
+@pytest.mark.parametrize("place", [(90.0, 0.0), (-90.0, 180.0), (0.0, 180.0), (89.95, -180.0)])
+def test_poles_and_the_antimeridian_are_no_jump(place: tuple[float, float]) -> None:
+    gate = Gate()
+    lat, lon = place
+    gate.admit(estimate_at(0.0, lat_deg=lat, lon_deg=lon), now(0))
+    passed = gate.admit(estimate_at(1.0, lat_deg=lat, lon_deg=-lon), now(1))
+    assert passed is not None and passed.reset_counter == 0
+
+
+def test_messages_come_no_more_often_than_asked() -> None:
+    gate = Gate(GateRules(min_interval_s={"A": 1.0}))
+    sent = [gate.due("A", now(0.25 * step)) for step in range(17)]
+    assert [step for step, out in enumerate(sent) if out] == [0, 4, 8, 12, 16]
+    assert gate.sent == {"A": 5} and gate.withheld == {"rate:A": 12}
+    assert all(gate.due("B", now(0.0)) for _ in range(3))
+
+
+def test_views_that_come_a_little_unevenly_all_pass() -> None:
+    rng = np.random.default_rng(1)
+    gate = Gate(GateRules(min_interval_s={"A": 0.2}))
+    times = 0.2 * np.arange(500) + rng.uniform(-0.004, 0.004, 500)
+    assert all(gate.due("A", now(float(time_s))) for time_s in times)
+
+
+@given(st.lists(st.integers(0, 3 * SECOND), min_size=1, max_size=60), st.integers(1, 20))
+def test_over_a_long_time_the_rate_is_kept(steps_ns: list[int], tenths: int) -> None:
+    gate = Gate(GateRules(min_interval_s={"A": tenths / 10}))
+    times = np.cumsum(steps_ns).tolist()
+    sent = [time_ns for time_ns in times if gate.due("A", START_NS + time_ns)]
+    assert sent[0] == times[0]
+    span_s = (sent[-1] - sent[0]) / 1e9
+    assert (len(sent) - 1) * tenths / 10 <= span_s + 0.1 * tenths / 10 + 1e-6
+
+
+def test_a_rate_survives_a_clock_that_is_set_back() -> None:
+    gate = Gate(GateRules(min_interval_s={"A": 1.0}))
+    assert gate.due("A", now(1000.0))
+    assert gate.due("A", now(0.0))
+    assert not gate.due("A", now(0.5))
+
+
+@pytest.mark.parametrize(
+    "rules",
+    [
+        {"max_std_m": 0.0},
+        {"max_age_s": math.nan},
+        {"min_interval_s": {"A": 0.0}},
+        {"min_confidence": 1.1},
+        {"jump_sigmas": -1.0},
+    ],
+)
+def test_impossible_rules_are_refused(rules: dict) -> None:
+    with pytest.raises(EstimateError):
+        GateRules(**rules)

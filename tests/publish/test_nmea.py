@@ -1,0 +1,175 @@
+"""NMEA sentences: as recorded here, and as pynmeagps reads them, which shares no code with us."""
+
+import math
+from dataclasses import replace
+from datetime import date, time
+
+import numpy as np
+import pynmeagps
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from orthonav.publish.estimate import EstimateError, NavigationEstimate
+from orthonav.publish.nmea import MAX_LENGTH, MPS_PER_KNOT, Quality, checksum, gga, gst, rmc
+
+UTC_NS = 1_789_000_000_123_456_789  # 2026-09-10 00:26:40
+ESTIMATE = NavigationEstimate(
+    48.1234567,
+    -4.3210987,
+    np.array([[16.0, 3.0], [3.0, 9.0]]),
+    0.95,
+    utc_ns=UTC_NS,
+    alt_amsl_m=134.56,
+    alt_std_m=2.5,
+    vel_en_mps=(12.0, -3.5),
+    state="tracking",
+)
+UNSURE = [
+    None,
+    replace(ESTIMATE, confidence=0.89),
+    replace(ESTIMATE, confidence=math.nan),
+    replace(ESTIMATE, state="lost"),
+    replace(ESTIMATE, cov_en_m2=np.full((2, 2), math.nan)),
+]
+
+
+def read(sentence: bytes) -> pynmeagps.NMEAMessage:
+    """What pynmeagps makes of it: it checks the checksum."""
+    assert len(sentence) <= MAX_LENGTH
+    return pynmeagps.NMEAReader.parse(sentence, validate=pynmeagps.VALCKSUM)
+
+
+@pytest.mark.parametrize(
+    ("made", "golden"),
+    [
+        (
+            gga(ESTIMATE),
+            b"$GPGGA,002640.123,4807.40740,N,00419.26592,W,6,00,,134.6,M,,,,*3E\r\n",
+        ),
+        (
+            gga(ESTIMATE, talker="GN", quality=Quality.AUTONOMOUS, hdop_m=2.0),
+            b"$GNGGA,002640.123,4807.40740,N,00419.26592,W,1,00,2.07,134.6,M,,,,*3C\r\n",
+        ),
+        (
+            rmc(ESTIMATE),
+            b"$GPRMC,002640.123,V,4807.40740,N,00419.26592,W,24.30,106.3,100926,,,E*68\r\n",
+        ),
+        (
+            rmc(ESTIMATE, quality=Quality.AUTONOMOUS),
+            b"$GPRMC,002640.123,A,4807.40740,N,00419.26592,W,24.30,106.3,100926,,,A*7B\r\n",
+        ),
+        (gst(ESTIMATE), b"$GPGST,002640.123,,4.14,2.81,69.7,3.00,4.00,2.50*4B\r\n"),
+        (gga(None, utc_ns=UTC_NS), b"$GPGGA,002640.123,,,,,0,00,,,,,,,*78\r\n"),
+        (rmc(None, utc_ns=UTC_NS), b"$GPRMC,002640.123,V,,,,,,,100926,,,N*41\r\n"),
+        (gst(None), b"$GPGST,,,,,,,,*57\r\n"),
+    ],
+)
+def test_sentences_stay_as_they_are(made: bytes, golden: bytes) -> None:
+    assert made == golden
+
+
+def test_the_checksum_is_that_of_a_published_sentence() -> None:
+    published = "GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,"
+    assert checksum(published) == "47"
+
+
+def test_pynmeagps_reads_every_field() -> None:
+    fix, minimum, errors = read(gga(ESTIMATE)), read(rmc(ESTIMATE)), read(gst(ESTIMATE))
+    assert (fix.quality, fix.numSV, fix.alt, fix.altUnit, fix.HDOP) == (6, 0, 134.6, "M", "")
+    assert fix.time == minimum.time == errors.time == time(0, 26, 40, 123000)
+    assert minimum.date == date(2026, 9, 10)
+    assert (minimum.status, minimum.posMode) == ("V", "E")
+    assert minimum.spd * MPS_PER_KNOT == pytest.approx(12.5, abs=0.005)
+    assert minimum.cog == pytest.approx(math.degrees(math.atan2(12.0, -3.5)), abs=0.05)
+    values, vectors = np.linalg.eigh(ESTIMATE.cov_en_m2)
+    assert errors.stdMajor == pytest.approx(math.sqrt(values[1]), abs=0.005)
+    assert errors.stdMinor == pytest.approx(math.sqrt(values[0]), abs=0.005)
+    east, north = vectors[:, 1]
+    assert math.tan(math.radians(errors.orient)) == pytest.approx(east / north, rel=0.01)
+    assert (errors.stdLat, errors.stdLong, errors.stdAlt) == (3.0, 4.0, 2.5)
+
+
+@pytest.mark.parametrize("estimate", UNSURE)
+@pytest.mark.parametrize("quality", list(Quality))
+def test_what_is_not_sure_says_so(estimate: NavigationEstimate | None, quality: Quality) -> None:
+    fix, minimum = read(gga(estimate, quality=quality)), read(rmc(estimate, quality=quality))
+    errors = read(gst(estimate))
+    assert fix.quality == 0
+    assert (minimum.status, minimum.posMode) == ("V", "N")
+    for message in (fix, minimum):
+        assert (message.lat, message.lon, message.NS, message.EW) == ("", "", "", "")
+    assert (minimum.spd, minimum.cog) == ("", "")
+    assert (errors.stdMajor, errors.stdLat) == ("", "")
+
+
+latitudes = st.floats(-90, 90) | st.sampled_from([90.0, -90.0, 0.0, -0.0, 47.99999999, 59.9999999])
+longitudes = st.floats(-180, 180) | st.sampled_from([180.0, -180.0, 179.99999999, -9.99999999])
+
+
+@given(latitudes, longitudes)
+def test_any_place_comes_back_within_two_centimetres(lat_deg: float, lon_deg: float) -> None:
+    estimate = replace(ESTIMATE, lat_deg=lat_deg, lon_deg=lon_deg)
+    for sentence in (gga(estimate), rmc(estimate)):
+        message = read(sentence)
+        assert message.lat == pytest.approx(lat_deg, abs=0.51e-5 / 60)
+        assert message.lon == pytest.approx(lon_deg, abs=0.51e-5 / 60)
+        minutes = [field[-8:] for field in sentence.decode().split(",") if field[-6:-5] == "."]
+        assert len(minutes) == 2 and all(float(minute) < 60 for minute in minutes)
+
+
+numbers = st.floats() | st.sampled_from([1e9, -1e9, 1e300, math.nan, math.inf])
+
+
+@given(numbers, numbers, numbers, numbers, st.integers(-(2**70), 2**70))
+def test_nothing_is_too_large_for_a_sentence(
+    altitude: float, deviation: float, east: float, north: float, utc_ns: int
+) -> None:
+    estimate = replace(
+        ESTIMATE,
+        alt_amsl_m=altitude,
+        alt_std_m=abs(deviation),
+        vel_en_mps=(east, north),
+        cov_en_m2=np.eye(2) * 1e10,
+        utc_ns=utc_ns,
+    )
+    fix = read(gga(estimate, hdop_m=0.1, quality=Quality.AUTONOMOUS))
+    minimum, errors = read(rmc(estimate)), read(gst(estimate))
+    assert fix.alt == "" or abs(fix.alt - altitude) <= 0.051
+    assert fix.HDOP == 99.99 and errors.stdMajor == 9999.99
+    assert minimum.spd == "" or 0 <= minimum.spd <= 999.99
+    assert minimum.cog == "" or 0 <= minimum.cog < 360
+
+
+def test_a_time_that_is_not_known_is_left_out() -> None:
+    at_boot = replace(ESTIMATE, utc_ns=None, boot_ns=61 * 10**9)
+    assert rmc(at_boot).startswith(b"$GPRMC,,V,4807.40740,N")
+    assert read(gga(at_boot)).time == ""
+
+
+@pytest.mark.parametrize(
+    ("velocity", "speed", "course"),
+    [((0.0, 5.0), 9.72, 0.0), ((-1e-6, 5.0), 9.72, 0.0), ((-5.0, 0.0), 9.72, 270.0)],
+)
+def test_course_is_from_north_and_below_360(velocity, speed, course) -> None:
+    message = read(rmc(replace(ESTIMATE, vel_en_mps=velocity)))
+    assert (message.spd, message.cog) == (speed, course)
+
+
+def test_an_unknown_velocity_has_no_speed_and_a_still_one_no_course() -> None:
+    unknown = read(rmc(replace(ESTIMATE, vel_en_mps=None)))
+    still = read(rmc(replace(ESTIMATE, vel_en_mps=(0.0, 0.0))))
+    assert (unknown.spd, unknown.cog) == ("", "")
+    assert (still.spd, still.cog) == (0.0, "")
+
+
+@pytest.mark.parametrize("hdop_m", [0.0, -1.0, math.nan])
+def test_a_dilution_needs_metres(hdop_m: float) -> None:
+    with pytest.raises(EstimateError, match="hdop_m"):
+        gga(ESTIMATE, hdop_m=hdop_m)
+
+
+@pytest.mark.parametrize("talker", ["G", "gp", "GPS", "G1", "ÄÖ", "G,"])
+def test_a_talker_is_two_letters(talker: str) -> None:
+    with pytest.raises(EstimateError, match="talker"):
+        gga(ESTIMATE, talker=talker)
