@@ -9,8 +9,14 @@ from typing import TYPE_CHECKING, Any
 from orthonav.cli.common import print_json
 
 if TYPE_CHECKING:
+    from orthonav.evaluate.contact_sheet import Row
+    from orthonav.evaluate.metrics import Comparison
     from orthonav.evaluate.plots import Background
+    from orthonav.evaluate.report import FlightReport
+    from orthonav.flight import FlightFolder
+    from orthonav.mapfile.layer import GreyLayer
     from orthonav.mapfile.reader import MapFile
+    from orthonav.records import ViewResult
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -36,17 +42,22 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--report", type=Path, metavar="REPORT/", help="write an HTML report")
     parser.add_argument("--map", type=Path, metavar="MAP.onav", help="background of the report")
+    parser.add_argument(
+        "--flight",
+        type=Path,
+        action="append",
+        metavar="FLIGHT_DIR",
+        help="show the worst views beside the map in the report (with --map and --report); one for "
+        "each file of fixes, in the same order",
+    )
 
 
 def run(options: argparse.Namespace) -> None:
     """Measure, print the table, write what was asked for."""
     from orthonav.errors import FlightError
-    from orthonav.evaluate.metrics import compare, measure
-    from orthonav.evaluate.report import FlightReport, metrics_to_json, summary, table, total
+    from orthonav.evaluate.report import flights_to_json, summary, table
     from orthonav.files import write_text
-    from orthonav.flight import read_truth
     from orthonav.mapfile import open_map
-    from orthonav.publish.jsonl import read_results
 
     if len(options.fixes) != len(options.truth):
         raise FlightError(
@@ -54,21 +65,12 @@ def run(options: argparse.Namespace) -> None:
         )
     if not 0 < options.radius_m < 1e7:
         raise FlightError(f"radius must be above 0 m, got {options.radius_m}")
+    _check_flights(options)
     opened = open_map(options.map) if options.map else None
-    local = opened.manifest.sheets[0].frame if opened else None
-    background = map_background(opened) if opened else None
-    names = _names(options.fixes)
-    flights: list[FlightReport] = []
-    for fixes, truth in zip(options.fixes, options.truth, strict=True):
-        comparison = compare(read_truth(truth), read_results(fixes), local)
-        metrics = measure(comparison, options.radius_m)
-        flights.append(FlightReport(names[len(flights)], comparison, metrics, background))
+    flights = _measured(options, opened)
     if options.report:
         _write_report(options.report, flights, opened)
-    plain: dict[str, Any] = metrics_to_json(flights[0].metrics)
-    if len(flights) > 1:
-        plain = metrics_to_json(total(flights))
-        plain["flights"] = {flight.name: metrics_to_json(flight.metrics) for flight in flights}
+    plain = flights_to_json(flights)
     if options.json == "-":
         print_json(plain)
         return
@@ -77,6 +79,72 @@ def run(options: argparse.Namespace) -> None:
     print(f"{table(flights)}\n\n{summary(flights)}")
     if options.report:
         print(f"report: {options.report / 'index.html'}")
+
+
+def _check_flights(options: argparse.Namespace) -> None:
+    """Raises `FlightError` where `--flight` lacks what it needs."""
+    from orthonav.errors import FlightError
+
+    flights = options.flight or []
+    if flights and not (options.map and options.report):
+        raise FlightError(
+            "--flight shows views beside the map in a report: give --map and --report"
+        )
+    if flights and len(flights) != len(options.fixes):
+        raise FlightError(
+            f"{len(options.fixes)} files of fixes need as many --flight, got {len(flights)}"
+        )
+
+
+def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[FlightReport]":
+    """Every flight beside its truth, and its worst views where their pictures were given."""
+    from orthonav.evaluate.metrics import compare, measure
+    from orthonav.evaluate.report import FlightReport
+    from orthonav.evaluate.track import measure_track
+    from orthonav.flight import open_flight, read_truth
+    from orthonav.publish.jsonl import read_results
+
+    local = opened.manifest.sheets[0].frame if opened else None
+    background = map_background(opened) if opened else None
+    layer = _grey_layer(opened) if opened and options.flight else None
+    folders = [open_flight(path) for path in options.flight or []]
+    names = _names(options.fixes)
+    flights = []
+    for i, (fixes, truth) in enumerate(zip(options.fixes, options.truth, strict=True)):
+        results = read_results(fixes)
+        comparison = compare(read_truth(truth), results, local)
+        worst: tuple[Row, ...] = ()
+        if opened and layer:
+            worst = _worst(comparison, results, folders[i], opened, layer)
+        metrics = measure(comparison, options.radius_m)
+        track = measure_track(comparison, results, options.radius_m)
+        flights.append(FlightReport(names[i], comparison, metrics, background, track, worst))
+    return flights
+
+
+def _grey_layer(opened: "MapFile") -> "GreyLayer":
+    """The grey pyramid of a map; raises `MapFileError` where it has none."""
+    from orthonav.errors import MapFileError
+    from orthonav.mapfile.layer import GreyLayer
+
+    layer = GreyLayer.of(opened)
+    if layer is None:
+        raise MapFileError(f"--flight needs a map with a registration layer: {opened.path}")
+    return layer
+
+
+def _worst(
+    comparison: "Comparison",
+    results: "list[ViewResult]",
+    folder: "FlightFolder",
+    opened: "MapFile",
+    layer: "GreyLayer",
+) -> "tuple[Row, ...]":
+    """Rows of the contact sheet of one flight."""
+    from orthonav.evaluate.contact_sheet import worst_rows
+
+    grid = opened.manifest.sheets[0].grid
+    return tuple(worst_rows(comparison, results, folder, layer, grid))
 
 
 def _names(paths: list[Path]) -> list[str]:

@@ -47,14 +47,18 @@ dt { color: var(--soft); }
 dd { margin: 0; overflow-wrap: anywhere; font-family: ui-monospace, Menlo, Consolas, monospace;
   font-size: .9rem; }
 """
+SAID_STYLE = """
+dl.said dd { font: inherit; font-variant-numeric: tabular-nums; }
+"""
+"""Beside `STYLE`, for definitions that are sentences."""
 
 
-def document(title: str, body: str) -> str:
+def document(title: str, body: str, style: str = STYLE) -> str:
     """A whole page around `body`, which is HTML already."""
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n"
+        f"<title>{escape(title)}</title>\n<style>{style}</style>\n</head>\n"
         f"<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
     )
 
@@ -82,7 +86,8 @@ def picture(png: bytes, alt: str, caption: str) -> str:
     )
 
 
-def definitions(said: Mapping[str, str]) -> str:
-    """Names and what they are, one per line; empty for none."""
+def definitions(said: Mapping[str, str], sentences: bool = False) -> str:
+    """Names and what they are, one per line; empty for none. Sentences need `SAID_STYLE`."""
     rows = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in said.items())
-    return f"<dl>{rows}</dl>" if rows else ""
+    kind = ' class="said"' if sentences else ""
+    return f"<dl{kind}>{rows}</dl>" if rows else ""

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import Any
 
 from orthonav.evaluate import plots
 from orthonav.evaluate.calibration_report import (
@@ -17,6 +18,7 @@ from orthonav.evaluate.calibration_report import (
     criteria_html,
     row_to_json,
 )
+from orthonav.evaluate.contact_sheet import Row, row_text, sheet_picture
 from orthonav.evaluate.figures import or_none, percent_text, plain_text
 from orthonav.evaluate.metrics import (
     Comparison,
@@ -26,7 +28,22 @@ from orthonav.evaluate.metrics import (
     radius_key,
     worst_views,
 )
-from orthonav.evaluate.page import definitions, document, html_table, picture
+from orthonav.evaluate.page import (
+    SAID_STYLE,
+    STYLE,
+    definitions,
+    document,
+    html_table,
+    picture,
+)
+from orthonav.evaluate.track import Track
+from orthonav.evaluate.track_plots import (
+    track_lines,
+    track_pictures,
+    track_rows,
+    track_to_json,
+    tracks_to_json,
+)
 from orthonav.files import write_text
 
 _COLUMNS = (
@@ -49,13 +66,16 @@ _N_WORST = 10
 class FlightReport:
     """One evaluated flight: its name, its results beside the truth, and the figures of those.
 
-    `background` is in the plane of `comparison`; see `orthonav.evaluate.plots.Background`.
+    `background` is in the plane of `comparison`; see `orthonav.evaluate.plots.Background`. `track`
+    is None where views were placed one by one, `worst` empty where pictures were not asked for.
     """
 
     name: str
     comparison: Comparison
     metrics: Metrics
     background: plots.Background | None = None
+    track: Track | None = None
+    worst: tuple[Row, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -129,12 +149,34 @@ def metrics_to_json(metrics: Metrics) -> dict[str, object]:
     }
 
 
+def flights_to_json(flights: Sequence[FlightReport]) -> dict[str, Any]:
+    """The figures of all flights together, and of several also of each, for strict JSON.
+
+    A track's figures are those of its flight: only what adds up is told of several. Raises
+    `ValueError` as `total` does.
+    """
+    plain = metrics_to_json(total(flights))
+    if len(flights) == 1:
+        track = flights[0].track
+        return plain if track is None else {**plain, "track": track_to_json(track)}
+    tracks = [flight.track for flight in flights if flight.track is not None]
+    if tracks:
+        plain["track"] = tracks_to_json(tracks)
+    plain["flights"] = {flight.name: flights_to_json([flight]) for flight in flights}
+    return plain
+
+
 def summary(flights: Sequence[FlightReport]) -> str:
-    """How far confidence and covariance can be believed, in lines for a terminal, of all flights.
+    """How far confidence and covariance can be believed, in lines for a terminal, of all flights;
+    and how each track held.
 
     Raises `ValueError` as `total` does.
     """
-    return "\n".join(calibration_lines(total(flights)))
+    lines = calibration_lines(total(flights))
+    for flight in flights:
+        if flight.track is not None:
+            lines += track_lines(flight.track, flight.name if len(flights) > 1 else "")
+    return "\n".join(lines)
 
 
 def write_report(
@@ -168,7 +210,8 @@ def render(flights: Sequence[FlightReport], made_from: MadeFrom, title: str) -> 
     if len(flights) > 1:
         parts.append(_all_flights(flights, whole))
     parts += ["<h2>Made from</h2>", _made_from(made_from)]
-    return document(title, "\n".join(parts))
+    style = STYLE + SAID_STYLE * any(flight.track is not None for flight in flights)
+    return document(title, "\n".join(parts), style)
 
 
 def _headline(metrics: Metrics) -> str:
@@ -222,10 +265,34 @@ def _section(flight: FlightReport) -> str:
     )
     return (
         f'<section><h2>{escape(flight.name)}</h2><div class="pictures">'
-        f"{_shown(pictures, flight.name)}</div>{_trust(metrics)}"
-        f"<h3>Worst views</h3>{_worst(comparison, metrics)}"
+        f"{_shown(pictures, flight.name)}</div>{_track(flight)}{_trust(metrics)}"
+        f"<h3>Worst views</h3>{_worst(comparison, metrics)}{_contact_sheet(flight)}"
         f"<h3>Views without a fix</h3>{_reasons(metrics)}</section>"
     )
+
+
+def _track(flight: FlightReport) -> str:
+    """Figures and pictures of the track; nothing where there is none."""
+    track, radius_m = flight.track, flight.metrics.radius_m
+    if track is None:
+        return ""
+    pictures = track_pictures(flight.comparison, track, radius_m, flight.background)
+    return (
+        f"<h3>Track</h3>{definitions(dict(track_rows(track)), sentences=True)}"
+        f'<div class="pictures">{_shown(pictures, flight.name)}</div>'
+    )
+
+
+def _contact_sheet(flight: FlightReport) -> str:
+    """The worst views as pictures; nothing where these were not asked for."""
+    if not flight.worst:
+        return ""
+    alt = f"{flight.name}: the worst views. " + "; ".join(map(row_text, flight.worst))
+    said = (
+        "The worst fixes, those of state tracking first: the view by the heading and height of its "
+        "fix, north up, and the map at the same scale; + where it was put, ○ where it was taken."
+    )
+    return picture(sheet_picture(flight.worst), alt, said)
 
 
 def _all_flights(flights: Sequence[FlightReport], whole: Metrics) -> str:

@@ -1,0 +1,391 @@
+"""Does a track hold? Figures of views that were followed (`ViewResult.state`), given the truth.
+
+States and confidence are those of all results, errors those of the views whose true position is
+known. A view stands for the time and the way until the next one. Where times are not known or do
+not rise, figures in seconds are not defined; what is not defined is NaN, and null in JSON.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+from orthonav.evaluate.calibration import is_covariance, nees_bound, normalized_squared
+from orthonav.evaluate.figures import FloatArray, frozen, mean, percentile, share
+from orthonav.evaluate.metrics import FAR_M, Comparison
+from orthonav.publish.jsonl import STATES
+from orthonav.records import Fix, ViewResult
+
+BoolArray = NDArray[np.bool_]
+SURE = 0.9
+"""A fix of at least this confidence is believed."""
+RADII_M = (25.0, 60.0)
+COURSE_M = 5.0
+"""Courses are taken between places usually at least so far apart."""
+STILL_M = 1.0
+"""Between places nearer than this there is no course: the aircraft stands still."""
+BIASES = ("heading_bias_deg", "log_scale_bias", "pitch_bias_deg", "roll_bias_deg")
+"""Evidence of a track: what is learnt to be wrong with what is told."""
+
+
+@dataclass(frozen=True)
+class After:
+    """Errors from the first confirmed fix on, in whatever state.
+
+    Errors are of the `n_fixes` fixes; `acc_at_m` is the share of the `n_views` views within it.
+    """
+
+    n_views: int
+    n_fixes: int
+    error_median_m: float
+    error_p95_m: float
+    error_max_m: float
+    acc_at_m: Mapping[float, float]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean (bias), standard deviation and root of the mean square of signed errors, in metres."""
+
+    n_views: int
+    mean_m: float
+    std_m: float
+    rms_m: float
+
+
+@dataclass(frozen=True)
+class Longest:
+    """The longest of several stretches in seconds and in metres of true way: two may hold these."""
+
+    seconds_s: float
+    way_m: float
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Normalized errors squared (NEES, 2 degrees of freedom, 2 expected) of the tracking views.
+
+    Of `n_views` with a usable covariance; `n_left_out` have none. The mean of so many independent
+    ones lies within `independent_low`, `independent_high` with a probability of 95 %; errors of
+    consecutive views are alike, so `n_effective` of them count and the wider `effective_low`,
+    `effective_high` decide on the `verdict`: "consistent", "too sure", "too cautious"; "" for none.
+    """
+
+    n_views: int
+    n_left_out: int
+    nees_mean: float
+    nees_within_95: float
+    independent_low: float
+    independent_high: float
+    n_effective: float
+    effective_low: float
+    effective_high: float
+    verdict: str
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """What pictures need, one entry per compared view (N,): seconds since the first view, state,
+    error ahead of and to the right of the truth, and biases by the name of their evidence.
+
+    `sigma_m` is the standard deviation along the longer axis of the covariance, `bound_95_m` the
+    same axis of the ellipse that holds 95 %: an error beyond it has a NEES above 5.99.
+    """
+
+    seconds_s: FloatArray
+    states: tuple[str, ...]
+    sigma_m: FloatArray
+    bound_95_m: FloatArray
+    along_m: FloatArray
+    across_m: FloatArray
+    biases: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Figures of one track.
+
+    `first_view` (1 is the first view of the flight) and `first_s` (seconds since it) are of the
+    first confirmed fix: tracking, with a position. `share_of_views` and `share_of_time` are by
+    state. `unsure` is without a confident fix (not tracking, or confidence below `SURE`), over the
+    whole flight; `unsure_after` from the first confirmed fix on. A view is sure and wrong where its
+    confidence is at least `SURE` or it is tracking, and it errs by more than `far_m`; a false lock
+    is a stretch of such views. `along` and `across` are of the tracking views.
+    """
+
+    n_views: int
+    n_compared: int
+    first_view: float
+    first_s: float
+    after: After
+    share_of_views: Mapping[str, float]
+    share_of_time: Mapping[str, float]
+    n_lost: int
+    unsure: Longest
+    unsure_after: Longest
+    far_m: float
+    n_sure_wrong: int
+    n_false_locks: int
+    false_lock_longest_s: float
+    along: Spread
+    across: Spread
+    consistency: Consistency
+    series: Series
+
+
+def measure_track(
+    comparison: Comparison, results: Sequence[ViewResult], radius_m: float
+) -> Track | None:
+    """All figures of a track; None where no result has a state.
+
+    `comparison` is made of these `results`; raises `ValueError` where it is not.
+    """
+    if not any(result.state for result in results):
+        return None
+    number = {result.frame: i for i, result in enumerate(results)}
+    if not set(comparison.frames) <= set(number):
+        raise ValueError("the comparison has views that are not among the results")
+    rows = np.array([number[frame] for frame in comparison.frames], dtype=np.intp)
+    states = np.array([result.state or "" for result in results])
+    seconds_s = seconds_since_first([result.time_ns for result in results])
+    way_m = _way_m(comparison.truth_en_m, rows, len(results))
+    sure = np.array([_confidence(result) >= SURE for result in results])
+    tracking = states == "tracking"
+    confirmed = tracking & np.array([isinstance(result.outcome, Fix) for result in results])
+    first = int(np.argmax(confirmed)) if confirmed.any() else len(results)
+    far_m = max(FAR_M, radius_m)
+    wrong = (sure | tracking)[rows] & (comparison.errors_m > far_m)
+    unsure = ~(tracking & sure)
+    found = first < len(results)
+    series = _series(comparison, [results[i] for i in rows], seconds_s[rows])
+    return Track(
+        n_views=len(results),
+        n_compared=len(rows),
+        first_view=first + 1 if found else math.nan,
+        first_s=float(seconds_s[first]) if found else math.nan,
+        after=_after(comparison.errors_m[rows >= first], radius_m),
+        share_of_views=_shares(states, np.ones(len(states))),
+        share_of_time=_shares(states, _until_next(seconds_s)),
+        n_lost=len(runs(states == "lost")),
+        unsure=_longest(unsure, seconds_s, way_m),
+        unsure_after=_longest(unsure[first:], seconds_s[first:], way_m[first:]),
+        far_m=far_m,
+        n_sure_wrong=int(np.count_nonzero(wrong)),
+        n_false_locks=len(runs(wrong)),
+        false_lock_longest_s=_longest_stretch(wrong, seconds_s[rows]),
+        along=_spread(series.along_m[tracking[rows]]),
+        across=_spread(series.across_m[tracking[rows]]),
+        consistency=check_consistency(
+            (comparison.fix_en_m - comparison.truth_en_m)[tracking[rows]],
+            comparison.cov_en_m2[tracking[rows]],
+        ),
+        series=series,
+    )
+
+
+def seconds_since_first(times_ns: Sequence[float]) -> FloatArray:
+    """(N,) seconds since the first view; all NaN where times are not known, fall or stand still.
+
+    Nanoseconds since 1970 do not fit a float64: they are subtracted before they become one.
+    """
+    unknown = np.full(len(times_ns), math.nan)
+    if not times_ns or not all(math.isfinite(time) for time in times_ns):
+        return unknown
+    seconds = np.array([(time - times_ns[0]) / 1e9 for time in times_ns], dtype=np.float64)
+    rises = bool((np.diff(seconds) >= 0.0).all()) and seconds[-1] > 0.0
+    return seconds if rises or len(seconds) == 1 else unknown
+
+
+def course_en(truth_en_m: FloatArray) -> FloatArray:
+    """(N, 2) unit vectors of the course, east and north; NaN where the aircraft stands still.
+
+    Central differences of true positions (N, 2), over 1, 2, 4.. views to either side: the fewest
+    over which at least half of the views move by `COURSE_M`.
+    """
+    number = np.arange(len(truth_en_m))
+    last, reach = len(number) - 1, 1
+    while True:
+        ends = np.minimum(number + reach, last), np.maximum(number - reach, 0)
+        way_m = truth_en_m[ends[0]] - truth_en_m[ends[1]]
+        length_m = np.hypot(way_m[:, 0], way_m[:, 1])
+        if 2 * reach > last // 4 or np.median(length_m) >= COURSE_M:
+            break
+        reach *= 2
+    moves = length_m >= STILL_M
+    course = np.full(way_m.shape, math.nan)
+    course[moves] = way_m[moves] / length_m[moves, None]
+    return course
+
+
+def check_consistency(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> Consistency:
+    """Whether errors (N, 2) of consecutive views are as large as their covariances (N, 2, 2) say.
+
+    n times the mean NEES of n independent views follows chi-square with 2 n degrees of freedom
+    (Bar-Shalom et al., "Estimation with applications to tracking and navigation", 2001, section
+    5.4); the effective number of views takes the place of n where errors are alike.
+    """
+    usable = is_covariance(cov_en_m2) & np.isfinite(errors_en_m).all(axis=1)
+    errors_en_m, cov_en_m2 = errors_en_m[usable], cov_en_m2[usable]
+    nees = normalized_squared(errors_en_m, cov_en_m2)
+    n_effective = effective_number(_whitened(errors_en_m, cov_en_m2))
+    low, high = nees_mean_bounds(n_effective)
+    found = mean(nees)
+    verdict = "too sure" if found > high else "too cautious" if found < low else "consistent"
+    independent = nees_mean_bounds(nees.size)
+    return Consistency(
+        n_views=nees.size,
+        n_left_out=int(np.count_nonzero(~usable)),
+        nees_mean=found,
+        nees_within_95=share(int(np.count_nonzero(nees <= nees_bound(0.95))), nees.size),
+        independent_low=independent[0],
+        independent_high=independent[1],
+        n_effective=n_effective,
+        effective_low=low,
+        effective_high=high,
+        verdict=verdict if nees.size else "",
+    )
+
+
+def nees_mean_bounds(n: float) -> tuple[float, float]:
+    """Within which the mean NEES of `n` independent views lies with 95 %; NaN for none.
+
+    chi2.ppf(p, 2 n) / n, and chi2.ppf(p, k) is 2 gammaincinv(k / 2, p).
+    """
+    if not n > 0:
+        return math.nan, math.nan
+    low, high = (float(2.0 * gammaincinv(n, p) / n) for p in (0.025, 0.975))
+    return low, high
+
+
+def effective_number(whitened: FloatArray) -> float:
+    """How many independent views tell as much of the mean NEES as these, 1 to N.
+
+    `whitened` (N, 2) are consecutive errors in units of their covariance, two independent parts.
+    If these are Gaussian with autocorrelation r_k, their squares have autocorrelation r_k^2
+    (Isserlis 1918), so the variance of the mean of N squares is tau / N times that of one, with
+
+        tau = 1 + 2 sum over k of (1 - k / N) r_k^2,    effective number N / tau,
+
+    the mean of both parts. r_k is estimated about zero, since right errors have no bias: a bias is
+    one error seen N times. The sum ends before the first r_k that is not positive, where the
+    estimate is noise (Geyer, "Practical Markov chain Monte Carlo", 1992, truncates alike).
+    """
+    n = len(whitened)
+    if n < 2:
+        return float(n)
+    tau = np.mean([_autocorrelation_time(part) for part in whitened.T])
+    return float(np.clip(n / tau, 1.0, n))
+
+
+def runs(flags: BoolArray) -> list[tuple[int, int]]:
+    """Start and stop of each run of true flags."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _autocorrelation_time(part: FloatArray) -> float:
+    """`tau` of `effective_number`, 1 to N, of one part (N,)."""
+    n = part.size
+    with np.errstate(over="ignore", invalid="ignore"):  # covariances may be next to nothing
+        power = np.abs(np.fft.rfft(part, 2 * n)) ** 2
+        products = np.fft.irfft(power)[:n] / np.arange(n, 0, -1)
+    if not (np.isfinite(products).all() and products[0] > 0.0):
+        return float(n)  # always the same
+    alike = np.minimum(products[1:] / products[0], 1.0)
+    ends = np.flatnonzero(alike <= 0.0)
+    stop = int(ends[0]) if ends.size else n - 1
+    weights = 1.0 - np.arange(1, stop + 1) / n
+    return 1.0 + 2.0 * float(weights @ alike[:stop] ** 2)
+
+
+def _confidence(result: ViewResult) -> float:
+    return result.outcome.confidence if isinstance(result.outcome, Fix) else math.nan
+
+
+def _way_m(truth_en_m: FloatArray, rows: NDArray[np.intp], n: int) -> FloatArray:
+    """(n,) metres flown until each result, by the true positions of the results `rows`."""
+    steps_m = [float(np.hypot(*(b - a))) for a, b in pairwise(truth_en_m)]
+    flown_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    return np.asarray(np.interp(np.arange(n), rows, flown_m))
+
+
+def _until_next(values: FloatArray) -> FloatArray:
+    """How far each value is from the next; nothing for the last."""
+    return np.append(np.diff(values), 0.0)
+
+
+def _shares(states: NDArray[np.str_], weights: FloatArray) -> Mapping[str, float]:
+    whole = float(weights.sum())
+    found = {name: float(weights[states == name].sum()) for name in STATES}
+    known = whole > 0.0  # not NaN
+    return MappingProxyType({k: part / whole if known else math.nan for k, part in found.items()})
+
+
+def _longest_stretch(flags: BoolArray, until: FloatArray) -> float:
+    """The most that `until` rises from the start of a run to what follows it; 0 without any."""
+    last = len(flags) - 1
+    steps = [until[min(stop, last)] - until[start] for start, stop in runs(flags)]
+    return float(max(steps, default=0.0 if np.isfinite(until).all() else math.nan))
+
+
+def _longest(flags: BoolArray, seconds_s: FloatArray, way_m: FloatArray) -> Longest:
+    if not flags.size:
+        return Longest(math.nan, math.nan)
+    return Longest(_longest_stretch(flags, seconds_s), _longest_stretch(flags, way_m))
+
+
+def _after(errors_m: FloatArray, radius_m: float) -> After:
+    of_fixes_m = errors_m[np.isfinite(errors_m)]
+    within = {
+        r: share(int(np.count_nonzero(of_fixes_m <= r)), errors_m.size)
+        for r in sorted({float(radius_m), *RADII_M})
+    }
+    return After(
+        n_views=errors_m.size,
+        n_fixes=of_fixes_m.size,
+        error_median_m=percentile(of_fixes_m, 50.0),
+        error_p95_m=percentile(of_fixes_m, 95.0),
+        error_max_m=float(of_fixes_m.max()) if of_fixes_m.size else math.nan,
+        acc_at_m=MappingProxyType(within),
+    )
+
+
+def _spread(errors_m: FloatArray) -> Spread:
+    known = errors_m[np.isfinite(errors_m)]
+    std_m = float(known.std()) if known.size else math.nan
+    return Spread(known.size, mean(known), std_m, math.sqrt(mean(known**2)))
+
+
+def _whitened(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> FloatArray:
+    """(N, 2) errors in units of their covariance: the solution z of L z = e where C = L L^T."""
+    if not len(errors_en_m):
+        return errors_en_m
+    lower = np.linalg.cholesky(cov_en_m2)
+    return np.asarray(np.linalg.solve(lower, errors_en_m[..., None])[..., 0])
+
+
+def _series(comparison: Comparison, results: Sequence[ViewResult], seconds_s: FloatArray) -> Series:
+    errors_en_m = comparison.fix_en_m - comparison.truth_en_m
+    course = course_en(comparison.truth_en_m)
+    right = np.stack([course[:, 1], -course[:, 0]], axis=1)
+    usable = is_covariance(comparison.cov_en_m2)
+    sigma_m = np.full(len(results), math.nan)
+    sigma_m[usable] = np.sqrt(np.linalg.eigvalsh(comparison.cov_en_m2[usable])[:, 1])
+    biases = {
+        name: frozen([result.outcome.evidence.get(name, math.nan) for result in results])
+        for name in BIASES
+    }
+    return Series(
+        seconds_s=frozen(seconds_s),
+        states=tuple(result.state or "" for result in results),
+        sigma_m=frozen(sigma_m),
+        bound_95_m=frozen(sigma_m * math.sqrt(nees_bound(0.95))),
+        along_m=frozen((errors_en_m * course).sum(axis=1)),
+        across_m=frozen((errors_en_m * right).sum(axis=1)),
+        biases=MappingProxyType(biases),
+    )
