@@ -14,7 +14,7 @@ AREA_M2 = 4e6
 SIDE_M = math.sqrt(AREA_M2)
 EXTENT = (-SIDE_M / 2, -SIDE_M / 2, SIDE_M / 2, SIDE_M / 2)
 RADIUS_M = 35.0
-MODEL = Model(lean_view_noise_rad=math.radians(1.0), sighting_growth=1.0)
+MODEL = Model(sighting_growth=1.0)
 SPEED = np.array([12.0, 5.0])
 BIAS = np.array([math.radians(5.0), 0.04, math.radians(-2.0), math.radians(1.5)])
 HEIGHT_M = 120.0
@@ -45,10 +45,7 @@ class Flight:
         """The view's own place, or a false one: lean and position err together."""
         spread = np.diag([4.0, 4.0, 1e-4, 1e-4, 4e-4, 4e-4])
         spread[0, 4] = spread[4, 0] = 0.7 * math.sqrt(4.0 * 4e-4)
-        # As the model says of what views see: the lean errs, and the position with it.
-        hangs = spread[:, 4:] @ np.linalg.inv(spread[4:, 4:])
         error = self.rng.multivariate_normal(np.zeros(6), spread)
-        error += hangs @ self.rng.normal(0, self.model.lean_view_noise_rad, 2)
         error[:2] += self.rng.normal(0, self.model.sighting_noise_m, 2)
         error[4:] += self.rng.normal(0, self.model.lean_noise_rad, 2)
         mean = np.concatenate([self.place if at is None else at, self.bias]) + error

@@ -19,6 +19,7 @@ COMMANDS = {
     "build": "make a map from orthophotos",
     "info": "print what is in a map",
     "import": "write photographs, a video or a ROS recording as a flight folder",
+    "calibrate": "find out what is wrong with what a flight tells: mount, compass, height",
     "localize": "find where the views of a flight were taken",
     "evaluate": "compare fixes with the truth",
     "simulate": "fly over an orthophoto of another year",

@@ -66,6 +66,18 @@ def add(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="track, then place every view by all views of the flight, also those after it",
     )
+    parser.add_argument(
+        "--lag",
+        type=int,
+        metavar="VIEWS",
+        help="with --hindsight: only so many views after each one (default: all)",
+    )
+    parser.add_argument(
+        "--mount",
+        type=Path,
+        metavar="mount.json",
+        help="what `orthonav calibrate` found: told heading, height and lean are corrected by it",
+    )
     add_source(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
@@ -76,14 +88,18 @@ def run(options: argparse.Namespace) -> None:
 
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
+    from orthonav.flight.mount import read_mount
     from orthonav.localizer import Localizer
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
-    from orthonav.onboard.run import SingleViews, in_hindsight, localize_flight
+    from orthonav.onboard.calibrate import Mounted, model_of
+    from orthonav.onboard.run import Locator, SingleViews, in_hindsight, localize_flight
     from orthonav.publish.jsonl import write_results
     from orthonav.records import Fix
     from orthonav.search.position import check_rule
 
+    if options.lag is not None and not (options.hindsight and options.lag >= 0):
+        raise VariantError("--lag is a number of views, for --hindsight")
     accept = Acceptance.parse(options.accept) if options.accept else None
     localizer = Localizer(
         open_map(options.map),
@@ -99,9 +115,16 @@ def run(options: argparse.Namespace) -> None:
         "use_prior": options.prior == "telemetry",
         "heading_known": options.heading == "known",
     }
-    locator: SingleViews | Tracker = SingleViews(localizer, **how)
+    mount = read_mount(options.mount) if options.mount else None
+    locator: Locator = SingleViews(localizer, **how)
+    tracker = None
     if options.track or options.hindsight:
-        locator = Tracker(localizer, hindsight=options.hindsight, **how)
+        model = model_of(mount) if mount else None
+        locator = tracker = Tracker(
+            localizer, hindsight=options.hindsight, lag=options.lag, model=model, **how
+        )
+    if mount:
+        locator = Mounted(locator, mount)
     results = []
     with progress(options) as shown:
         for result in localize_flight(
@@ -110,8 +133,8 @@ def run(options: argparse.Namespace) -> None:
             results.append(result)
             if flight.expected:
                 shown("localize", min(1.0, len(results) / flight.expected))
-    if isinstance(locator, Tracker) and options.hindsight:
-        results = in_hindsight(locator, results, accept)
+    if tracker is not None and options.hindsight:
+        results = in_hindsight(tracker, results, accept)
     write_results(options.out, results)
     fixes = sum(isinstance(result.outcome, Fix) for result in results)
     latencies = np.array([result.latency_ms for result in results])

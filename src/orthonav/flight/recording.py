@@ -1,6 +1,7 @@
 """What `localize` needs of a flight, whatever it was recorded with."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -47,3 +48,25 @@ class Flight(Protocol):
     @property
     def expected(self) -> int:
         """About how many views will come, for progress; 0 where that is not known."""
+
+
+@dataclass(frozen=True)
+class Retold:
+    """A view of which something else was known."""
+
+    view: View
+    telemetry: Telemetry
+
+    @property
+    def frame(self) -> str:
+        """See `View.frame`."""
+        return self.view.frame
+
+    @property
+    def where(self) -> str:
+        """See `View.where`."""
+        return self.view.where
+
+    def grey(self) -> NDArray[np.uint8]:
+        """See `View.grey`."""
+        return self.view.grey()

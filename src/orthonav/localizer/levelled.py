@@ -1,7 +1,11 @@
 """A registered view placed anew together with how its camera leans.
 
 Autopilots and gimbals say how the camera leans to a degree or a few; where a mount is off, every
-fix is off by the height times that angle. The perspective of a wide view tells the lean itself.
+fix is off by the height times that angle. A camera that leans sees near ground larger than far
+ground: told too little of it, the rectified view is bent against the map. So the view is rectified
+under a few leans around the expected one, and how well it fits each says which is true. A parabola
+through these scores is what one view knows; of many views together the sum of them (a single peak
+is bent by houses and hills, and most of that differs from view to view).
 """
 
 import math
@@ -10,21 +14,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.camera import Camera, camera_from_en
+from orthonav.geo.camera import Camera
 from orthonav.localizer.registration import PreparedFootprint, RegistrationLocalizer
 from orthonav.records import Telemetry
-from orthonav.register.lean import LeanRefiner
 from orthonav.register.pose import Pose
-from orthonav.register.registrar import NAT_SCORE
+from orthonav.register.refine import Placed
 
-ROUNDS, STEPS = 8, 4
-SHRINKAGE, GROWTH, MOST_GROWTH = 0.4, 1.6, 2.5
-UNDERRATED = 4.0
-WORST_CONDITION = 1e14
+RIM_PX = 10.0
+"""Leans are tried so far from the expected one that the corner of the view moves by so many pixels:
+scores that near to a peak are too bent to say where the middle of it is."""
+MAX_STEP_RAD = math.radians(6.0)
+NATS_PER_SCORE = 0.4
+"""What a unit of the score says of a lean: peaks of single views scatter by more than their
+curvature would have it."""
 WEAK_LEAN_RAD = math.radians(20.0)
-SMALL_LEAN_RAD, MOST_STEP_RAD = math.radians(0.3), math.radians(5.0)
-MOST_LEAN_RAD = math.radians(25.0)
-_EPSILON_RAD = 1e-4
 Array = NDArray[np.float64]
 
 
@@ -48,144 +51,97 @@ def levelled(
     telemetry: Telemetry,
     view: PreparedFootprint,
     pose: Pose,
-    *,
-    lean_rad: tuple[float, float],
-    lean_std_rad: float,
 ) -> Levelled | None:
     """The view (H, W), prepared as `view` and registered at `pose`, placed with its lean.
 
-    `lean_rad` is the pitch and roll to be expected, `lean_std_rad` how well that is known. None
-    where the view cannot be looked at under the lean that comes out.
+    The pitch and roll of `telemetry` are those to be expected; a lean that differs by more than a
+    few degrees is found in several views, each from what is known by then. None where the view
+    cannot be looked at under leans around the expected one.
     """
-    expected = np.array(lean_rad)
-    prior = np.diag([0.0, 0, 0, 0, lean_std_rad**-2, lean_std_rad**-2])
-    best = _looked(registration, grey, camera, telemetry, (view, pose), expected)
-    factor = 1.0
-    for _ in range(ROUNDS):
-        if best is None or np.abs(best.lean_rad - expected).max() > MOST_LEAN_RAD:
+    looks = _Looks(registration, grey, camera, telemetry, view.levels.final)
+    middle = looks.placed(view, pose)
+    lean = np.radians([telemetry.pitch_deg, telemetry.roll_deg])
+    mean, known, hangs = middle.mean.copy(), np.zeros(2), np.zeros((4, 2))
+    for axis in range(2):
+        after, before = (looks.at(middle, lean, axis, sign * looks.step_rad) for sign in (1, -1))
+        if after is None or before is None:
             return None
-        step = factor * best.step(prior, expected)
-        if np.abs(step[4:]).max() < SMALL_LEAN_RAD:
-            break
-        # How exactly a view knows its lean is underrated while it is far off: the step is tried.
-        moved = Pose(*(np.array(_numbers(best.pose)) + step[:4]).tolist())
-        start = best.view, moved
-        tried = _looked(registration, grey, camera, telemetry, start, best.lean_rad + step[4:])
-        if tried is not None and tried.worth(prior, expected) > best.worth(prior, expected):
-            best, factor = tried, min(factor * GROWTH, MOST_GROWTH)
-        else:
-            factor *= SHRINKAGE
-    if best is None:
+        ahead = after.mean - before.mean
+        ahead[2] = math.remainder(ahead[2], 2 * math.pi)
+        hangs[:, axis] = ahead / (2 * looks.step_rad)
+        slope = (after.score - before.score) / (2 * looks.step_rad)
+        bend = 2 * middle.score - after.score - before.score
+        # On a flank it bends less than at the peak: no farther than to the next lean tried.
+        bend = max(bend / looks.step_rad**2, abs(slope) / looks.step_rad)
+        known[axis] = NATS_PER_SCORE * bend
+        move = NATS_PER_SCORE * slope / (known[axis] + WEAK_LEAN_RAD**-2)
+        lean[axis] += move
+        mean += hangs[:, axis] * move
+    spread = np.diag(1 / (known + WEAK_LEAN_RAD**-2))
+    covariance = np.zeros((6, 6))
+    covariance[:4, :4] = looks.covariance(middle) + hangs @ spread @ hangs.T
+    covariance[:4, 4:] = hangs @ spread
+    covariance[4:, :4] = covariance[:4, 4:].T
+    covariance[4:, 4:] = spread
+    if not np.isfinite(covariance).all():
         return None
-    # What the view itself says, less what was expected.
-    weak = np.diag([0.0, 0, 0, 0, WEAK_LEAN_RAD**-2, WEAK_LEAN_RAD**-2])
-    covariance = np.asarray(np.linalg.inv(best.information + weak), np.float64)
-    shift = covariance @ weak @ np.concatenate([np.zeros(4), expected - best.lean_rad])
-    pose = Pose(*(np.array(_numbers(best.pose)) + shift[:4]).tolist())
-    lean = np.asarray(best.lean_rad + shift[4:], np.float64)
-    return _on_sheet(registration, best.view, pose, lean, covariance)
+    return Levelled(np.concatenate([mean, lean]), covariance)
 
 
 @dataclass(frozen=True, eq=False)
-class _Looked:
-    """A view under some lean: where it was placed, how well, and what it says of both."""
+class _Look:
+    """A view under some lean: how it was prepared, where placed, and `mean` (4,), the position of
+    the camera (m), heading and log scale."""
 
     view: PreparedFootprint
-    pose: Pose
-    lean_rad: Array
-    score: float
-    towards: Array
-    information: Array
+    placed: Placed
+    mean: Array
 
-    def worth(self, prior: Array, expected_rad: Array) -> float:
-        """Its score less what its lean costs for being unexpected, a unit for a nat."""
-        off = self.lean_rad - expected_rad
-        return self.score - NAT_SCORE * float(off @ prior[4:, 4:] @ off) / 2
-
-    def step(self, prior: Array, expected_rad: Array) -> Array:
-        """From here to the best pose and lean (6,), given what is expected."""
-        off = np.concatenate([np.zeros(4), expected_rad - self.lean_rad])
-        known = UNDERRATED * self.information
-        step = np.linalg.solve(known + prior, known @ self.towards + prior @ off)
-        return np.asarray(step * min(1.0, MOST_STEP_RAD / max(np.abs(step[4:]).max(), 1e-9)))
+    @property
+    def score(self) -> float:
+        return self.placed.score
 
 
-def _looked(
-    registration: RegistrationLocalizer,
-    grey: NDArray[np.uint8],
-    camera: Camera,
-    telemetry: Telemetry,
-    start: tuple[PreparedFootprint, Pose],
-    lean_rad: Array,
-) -> _Looked | None:
-    """The view rectified with a lean, and placed from where it was before."""
-    pitch, roll = np.degrees(lean_rad).tolist()
-    leaning = replace(telemetry, pitch_deg=pitch, roll_deg=roll)
-    view = registration.prepared(grey, camera, leaning, heading_known=True)
-    if not isinstance(view, PreparedFootprint):
-        return None
-    before, pose = start
-    # The camera stays where it is: the middle of the new window lies elsewhere.
-    x, y = pose.map_px(before.camera_px - view.camera_px)
-    level = view.levels.final
-    template = view.templates.at(level, view.levels.recipe(level))
-    fields = lean_fields(telemetry.agl_m, lean_rad, view, registration.grid.gsd_m, level)
-    refiner = LeanRefiner(template, registration.registrar.reference, fields)
-    placed = refiner.place(replace(pose, x_px=float(x), y_px=float(y)), STEPS)
-    found = refiner.look(placed.pose)
-    if not np.linalg.cond(found.covariance) < WORST_CONDITION:
-        return None
-    information = np.asarray(np.linalg.inv(found.covariance), np.float64)
-    return _Looked(view, placed.pose, lean_rad, placed.score, found.step, information)
+class _Looks:
+    """Looks at one view under several leans."""
 
+    def __init__(
+        self,
+        registration: RegistrationLocalizer,
+        grey: NDArray[np.uint8],
+        camera: Camera,
+        telemetry: Telemetry,
+        level: int,
+    ) -> None:
+        self._registration, self._grey, self._camera = registration, grey, camera
+        self._telemetry = telemetry
+        corner = math.hypot(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px) / 2
+        rim_m = RIM_PX * registration.grid.gsd_m * 2**level
+        self.step_rad = min(rim_m / max(telemetry.agl_m * corner**2, 1e-9), MAX_STEP_RAD)
 
-def lean_fields(
-    agl_m: float, lean_rad: Array, view: PreparedFootprint, gsd_m: float, level: int
-) -> NDArray[np.float32]:
-    """How the ground of each pixel of a rectified view moves with pitch and roll, (2, 2, H, W).
+    def at(self, known: _Look, lean_rad: Array, axis: int, more_rad: float) -> _Look | None:
+        """The view leaning more about one axis, its middle starting where it is known to be."""
+        leans = lean_rad.copy()
+        leans[axis] += more_rad
+        pitch, roll = np.degrees(leans).tolist()
+        leaning = replace(self._telemetry, pitch_deg=pitch, roll_deg=roll)
+        view = self._registration.prepared(self._grey, self._camera, leaning, heading_known=True)
+        if not isinstance(view, PreparedFootprint):
+            return None
+        return self.placed(view, known.placed.pose)
 
-    In pixels of `level` per rad, x to the right and y down the view.
-    """
-    pixel_m = gsd_m * 2**level
-    mask = view.templates.at(level, view.levels.recipe(level)).mask
-    height, width = mask.shape
-    middle = -view.camera_px * gsd_m
-    x = middle[0] + (np.arange(width) + 0.5 - width / 2) * pixel_m
-    y = middle[1] + (np.arange(height) + 0.5 - height / 2) * pixel_m
-    ground = np.stack([*np.broadcast_arrays(x[None], -y[:, None]), np.ones((height, width))])
-    pitch, roll = np.degrees(lean_rad)
-    rays = np.tensordot(camera_from_en(0.0, pitch, roll, agl_m), ground, axes=1)
-    out = np.empty((2, 2, height, width), np.float32)
-    small = math.degrees(_EPSILON_RAD)
-    for number, (more_pitch, more_roll) in enumerate(((small, 0.0), (0.0, small))):
-        leaning = camera_from_en(0.0, pitch + more_pitch, roll + more_roll, agl_m)
-        seen = np.tensordot(np.linalg.inv(leaning), rays, axes=1)
-        moved = (seen[:2] / seen[2] - ground[:2]) / (_EPSILON_RAD * pixel_m)
-        out[number, 0], out[number, 1] = moved[0], -moved[1]
-    return out
+    def placed(self, view: PreparedFootprint, pose: Pose) -> _Look:
+        """A prepared view at the best pose near `pose`."""
+        refiner = self._registration.registrar.refiner(
+            view.templates, view.levels, view.levels.final
+        )
+        placed = refiner.place(pose)
+        place = self._registration.camera_en_m(view, placed.pose)
+        mean = np.array([*place, placed.pose.turn_rad, placed.pose.log_scale])
+        return _Look(view, placed, mean)
 
-
-def _numbers(pose: Pose) -> tuple[float, float, float, float]:
-    return pose.x_px, pose.y_px, pose.turn_rad, pose.log_scale
-
-
-def _on_sheet(
-    registration: RegistrationLocalizer,
-    view: PreparedFootprint,
-    pose: Pose,
-    lean_rad: Array,
-    covariance: Array,
-) -> Levelled:
-    """Of the window's middle in pixels to the camera in metres."""
-    grid = registration.grid
-    x, y = pose.map_px(view.camera_px)
-    moved = pose.linear @ view.camera_px
-    turned = np.eye(6)
-    turned[0, 2:4], turned[1, 2:4] = (-moved[1], moved[0]), (moved[0], moved[1])
-    turned[0] *= grid.gsd_m
-    turned[1] *= -grid.gsd_m
-    spread = turned @ covariance @ turned.T
-    spread[:2, :2] += np.eye(2) * (registration.floor_px * grid.gsd_m) ** 2
-    position = grid.west_m + x * grid.gsd_m, grid.north_m - y * grid.gsd_m
-    mean = np.array([*position, pose.turn_rad, pose.log_scale, *lean_rad])
-    return Levelled(mean, spread)
+    def covariance(self, look: _Look) -> Array:
+        """Covariance (4, 4) of camera position (m), heading and log scale for a given lean."""
+        view, registrar = look.view, self._registration.registrar
+        placed = registrar.with_covariance(view.templates, view.levels, look.placed)
+        return self._registration.covariance(view, placed)

@@ -22,6 +22,7 @@ from orthonav.localizer.propose import TileProposer
 from orthonav.localizer.rectify import Rectified, prepare_view, rectify_footprint
 from orthonav.mapfile.manifest import SheetInfo
 from orthonav.records import Fix, NoFix, Prior, Telemetry
+from orthonav.register.pose import Pose
 from orthonav.register.reference import GreyPyramid, Reference
 from orthonav.register.refine import Placed
 from orthonav.register.registrar import Levels, PosePrior, Registered, Registrar
@@ -332,16 +333,16 @@ class RegistrationLocalizer:
         return -reach < x < cols + reach and -reach < y < rows + reach
 
     def _fix(self, view: PreparedFootprint, best: Registered, telemetry: Telemetry) -> Fix:
-        placed, gsd_m = best.placed, self.grid.gsd_m
-        x, y = placed.pose.map_px(view.camera_px)
-        east, north = self.grid.west_m + x * gsd_m, self.grid.north_m - y * gsd_m
-        lat, lon = self.sheet.frame.latlon_from_en(np.array([east, north]))
+        placed = best.placed
+        lat, lon = self.sheet.frame.latlon_from_en(self.camera_en_m(view, placed.pose))
+        covariance = self.covariance(view, placed)[:2, :2]
+        covariance.flags.writeable = False
         evidence = best.evidence()
         confidence = math.nan if self.confidence is None else self.confidence(evidence)
         return Fix(
             lat_deg=float(lat),
             lon_deg=float(lon),
-            cov_en_m2=self._covariance(view, best),
+            cov_en_m2=covariance,
             confidence=confidence,
             radius_m=self.radius_m,
             heading_deg=math.degrees(placed.pose.turn_rad) % 360,
@@ -349,18 +350,22 @@ class RegistrationLocalizer:
             evidence=MappingProxyType(evidence),
         )
 
-    def _covariance(self, view: PreparedFootprint, best: Registered) -> NDArray[np.float64]:
-        """Covariance (2, 2) of the camera's east and north in m2."""
-        pose, covariance = best.placed.pose, best.placed.covariance
-        assert covariance is not None
-        moved = pose.linear @ view.camera_px
-        camera_from_pose = np.array([[1, 0, -moved[1], moved[0]], [0, 1, moved[0], moved[1]]])
-        spread = camera_from_pose @ covariance @ camera_from_pose.T
-        spread += np.eye(2) * self.floor_px**2
-        flip = np.diag([1.0, -1.0]) * self.grid.gsd_m
-        out = np.asarray(flip @ spread @ flip)
-        out.flags.writeable = False
-        return out
+    def camera_en_m(self, view: PreparedFootprint, pose: Pose) -> NDArray[np.float64]:
+        """Metres east and north (2,) of the camera where a view's window lies at `pose`."""
+        x, y = pose.map_px(view.camera_px)
+        gsd_m = self.grid.gsd_m
+        return np.array([self.grid.west_m + float(x) * gsd_m, self.grid.north_m - float(y) * gsd_m])
+
+    def covariance(self, view: PreparedFootprint, placed: Placed) -> NDArray[np.float64]:
+        """Covariance (4, 4) of the camera's east and north (m), heading (rad) and log scale."""
+        assert placed.covariance is not None
+        moved = placed.pose.linear @ view.camera_px
+        camera_from_pose = np.eye(4)
+        camera_from_pose[:2, 2:] = [[-moved[1], moved[0]], [moved[0], moved[1]]]
+        spread = camera_from_pose @ placed.covariance @ camera_from_pose.T
+        spread[:2, :2] += np.eye(2) * self.floor_px**2
+        metres = np.diag([self.grid.gsd_m, -self.grid.gsd_m, 1.0, 1.0])
+        return np.asarray(metres @ spread @ metres)
 
 
 def _pose_prior(telemetry: Telemetry, heading_known: bool) -> PosePrior:

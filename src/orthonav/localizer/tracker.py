@@ -25,7 +25,7 @@ from orthonav.register.registrar import Registered
 from orthonav.track import Displacement, Estimate, Mixture, Model, Sighting, State, Told
 from orthonav.track.mixture import within
 from orthonav.track.model import HEADING, LEAN, SCALE
-from orthonav.track.smooth import History
+from orthonav.track.smooth import History, Smoothed
 
 LOCAL_SHARE = 0.8
 """Belief in one place from which on views are looked for around it only."""
@@ -37,8 +37,6 @@ LONGEST_GAP_S = 600.0
 UNKNOWN_STEP_S = 1.0
 """Time that is taken to have passed where the clock stands still or jumps back."""
 WORTH_LOG_ODDS = -12.0
-LEAN_STD_RAD = math.radians(3.0)
-"""How far from the expected lean that of a view is looked for."""
 VELOCITY_STD_MPS = 1.0
 VELOCITY_SHARE = 0.02
 Array = NDArray[np.float64]
@@ -54,11 +52,15 @@ class Tracker:
         model: Model | None = None,
         heading_known: bool = True,
         use_prior: bool = True,
+        every_prior: bool = False,
         hindsight: bool = False,
+        lag: int | None = None,
     ) -> None:
-        """With `use_prior` the flight begins where the first view's prior says. With `hindsight`
-        what is needed for `in_hindsight` is kept.
+        """With `use_prior` the flight begins where the first view's prior says; with `every_prior`
+        those of all views are measured positions, such as GNSS.
 
+        With `hindsight` what is needed for `in_hindsight` is kept: every view by all, or, with
+        `lag`, by those before it and so many after it.
         Raises `MapFileError` where the map has no registration layer or no confidence.
         """
         registration = localizer.registration
@@ -73,9 +75,11 @@ class Tracker:
         self.mixture = Mixture(self.model, extent)
         self._time_ns: int | None = None
         self._before: Footprint | None = None
-        self._use_prior = use_prior
+        self._use_prior, self._every_prior = use_prior, every_prior
         self._history = History() if hindsight else None
-        self._told: list[Telemetry] = []
+        self._lag = lag
+        self._seen: list[tuple[Fix | NoFix, Telemetry]] = []
+        self._lagged: list[Fix | NoFix] = []
         self.state = State.SEARCHING
 
     def locate(self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry) -> Fix | NoFix:
@@ -109,39 +113,51 @@ class Tracker:
         return self._outcome(telemetry, reason)
 
     def in_hindsight(self) -> list[Fix | NoFix]:
-        """Where the aircraft was at each view so far, by all views together."""
+        """Where the aircraft was at each view so far, by views after it too."""
         if self._history is None:
             raise ValueError("this tracker keeps no history")
-        out: list[Fix | NoFix] = []
-        for smoothed, telemetry in zip(self._history.smoothed(), self._told, strict=True):
-            if smoothed is None:
-                out.append(NoFix("searching", "no place was found"))
-                continue
-            inside = within(smoothed.mean, smoothed.covariance, self._registration.radius_m)
-            out.append(
-                self._fix(
-                    smoothed.mean,
-                    smoothed.covariance,
-                    min(smoothed.belief, 1.0) * inside,
-                    telemetry,
-                    {},
-                )
-            )
-        return out
+        left = len(self._seen) - len(self._lagged)
+        smoothed = self._history.smoothed(left) if left else []
+        return self._lagged + [
+            self._with_hindsight(*pair)
+            for pair in zip(smoothed, self._seen[len(self._lagged) :], strict=True)
+        ]
+
+    def _with_hindsight(
+        self, smoothed: Smoothed | None, seen: tuple[Fix | NoFix, Telemetry]
+    ) -> Fix | NoFix:
+        """A view by those after it; as it was at the time where those know less of it.
+
+        That is so where the likeliest track passes over a view that is far from its neighbours.
+        """
+        before, telemetry = seen
+        if smoothed is None:
+            return NoFix("searching", "no place was found")
+        spread = float(np.trace(smoothed.covariance[:2, :2]))
+        if isinstance(before, Fix) and spread > float(np.trace(before.cov_en_m2)):
+            return before
+        inside = within(smoothed.mean, smoothed.covariance, self._registration.radius_m)
+        belief = min(smoothed.belief, 1.0) * inside
+        return self._fix(smoothed.mean, smoothed.covariance, belief, telemetry, {})
 
     def _outcome(self, telemetry: Telemetry, refused: NoFix | None) -> Fix | NoFix:
         estimate = self.mixture.estimate(self._registration.radius_m)
         self.state = State.SEARCHING if estimate is None else estimate.state
+        outcome: Fix | NoFix = refused or NoFix("searching", "no place has been found yet")
+        if estimate is not None:
+            more = {
+                "hypotheses": float(len(self.mixture.hypotheses)),
+                "elsewhere": self.mixture.elsewhere,
+            }
+            mean, covariance = estimate.mean, estimate.covariance
+            outcome = self._fix(mean, covariance, estimate.confidence, telemetry, more)
         if self._history is not None:
             self._history.record(self.mixture)
-            self._told.append(telemetry)
-        if estimate is None:
-            return refused or NoFix("searching", "no place has been found yet")
-        more = {
-            "hypotheses": float(len(self.mixture.hypotheses)),
-            "elsewhere": self.mixture.elsewhere,
-        }
-        return self._fix(estimate.mean, estimate.covariance, estimate.confidence, telemetry, more)
+            self._seen.append((outcome, telemetry))
+            if self._lag is not None and len(self._seen) > self._lag:
+                smoothed = self._history.smoothed(self._lag + 1)[0]
+                self._lagged.append(self._with_hindsight(smoothed, self._seen[-self._lag - 1]))
+        return outcome
 
     def _predict(
         self, grey: NDArray[np.uint8] | None, camera: Camera, telemetry: Telemetry
@@ -150,12 +166,11 @@ class Tracker:
         before, now = self._before, None
         if grey is not None and self._heading_known:
             now = self._footprint(grey, camera, telemetry, before)
-        if self._time_ns is None and self._use_prior and telemetry.prior is not None:
-            prior = telemetry.prior
-            place = self._localizer.sheet.frame.en_from_latlon(prior.lat_deg, prior.lon_deg)
-            self.mixture.start(place, max(prior.std_m, 1.0))
+        prior = telemetry.prior if self._use_prior or self._every_prior else None
         if self._time_ns is None:
             self._time_ns, self._before = telemetry.time_ns, now
+            if prior is not None:
+                self.mixture.start(*self._place(prior))
             return 0.0
         seconds = (telemetry.time_ns - self._time_ns) / 1e9
         if not 0 < seconds < LONGEST_GAP_S:
@@ -165,7 +180,14 @@ class Tracker:
         moved, overlap = self._moved(before, now, telemetry.vel_en_mps, seconds, noise)
         self._before = now
         self.mixture.predict(seconds, moved, noise)
+        if self._every_prior and prior is not None:
+            self.mixture.told_position(*self._place(prior))
         return overlap
+
+    def _place(self, prior: Prior) -> tuple[Array, float]:
+        """Metres east and north (2,) of a prior, and its standard deviation."""
+        frame = self._localizer.sheet.frame
+        return frame.en_from_latlon(prior.lat_deg, prior.lon_deg), max(prior.std_m, 1.0)
 
     def _told_noise(self, telemetry: Telemetry) -> Array:
         """Variances (2,) of told heading and log scale from view to view, as told or as usual."""
@@ -184,7 +206,7 @@ class Tracker:
         before: Footprint | None,
     ) -> Footprint | None:
         """The view for odometry, in pixels of the one before unless they differ too much."""
-        bias = self._bias()
+        bias, _ = self.mixture.bias()
         known = {"off_deg": math.degrees(bias[0]), "off_log_scale": float(bias[1])}
         corrected = _corrected(telemetry, bias)
         if before is not None:
@@ -192,11 +214,6 @@ class Tracker:
             if made is None or made.grey.size < 4 * before.grey.size:
                 return made
         return Footprint.of(grey, camera, corrected, None, **known)
-
-    def _bias(self) -> Array:
-        """What is known to be wrong with what is told (4,): heading, log scale, pitch, roll."""
-        expected = self.mixture.estimate(self._registration.radius_m)
-        return np.zeros(4) if expected is None else expected.mean[4:]
 
     def _moved(
         self,
@@ -223,8 +240,8 @@ class Tracker:
     ) -> NoFix | None:
         """Look for the view and hand what it may be to the mixture; why not, if it cannot be."""
         expected = self.mixture.estimate(self._registration.radius_m)
-        bias = np.zeros(4) if expected is None else expected.mean[4:]
-        corrected = self._known(_corrected(telemetry, bias), expected)
+        bias, spread = self.mixture.bias()
+        corrected = _known(_corrected(telemetry, bias), spread)
         view = self._registration.prepared(grey, camera, corrected, self._heading_known)
         if isinstance(view, NoFix):
             return view
@@ -241,16 +258,6 @@ class Tracker:
         )
         self.mixture.update(told, sightings, max(1 - overlap, LEAST_NEW), searched)
         return None
-
-    def _known(self, corrected: Telemetry, expected: Estimate | None) -> Telemetry:
-        """Told values with how well they are known by now, which says how widely to look."""
-        bias = self.model.initial_bias()
-        if expected is not None and expected.confidence >= LOCAL_SHARE:
-            bias = np.diag(expected.covariance)[4:]
-        heading, scale = np.sqrt(bias[:2]).tolist()
-        return replace(
-            corrected, yaw_std_deg=math.degrees(heading), agl_std_m=scale * corrected.agl_m
-        )
 
     def _where(self, expected: Estimate | None) -> tuple[Prior | None, tuple[Array, float] | None]:
         """The part of the map to look at: around the track where that is nearly certain."""
@@ -273,18 +280,8 @@ class Tracker:
         bias: Array,
     ) -> list[Sighting]:
         made = []
-        lean = math.radians(telemetry.pitch_deg), math.radians(telemetry.roll_deg)
         for log_odds, pose in self._places(found):
-            placed = levelled(
-                self._registration,
-                grey,
-                camera,
-                telemetry,
-                view,
-                pose,
-                lean_rad=lean,
-                lean_std_rad=LEAN_STD_RAD,
-            )
+            placed = levelled(self._registration, grey, camera, telemetry, view, pose)
             if placed is None:
                 continue
             mean = placed.mean.copy()
@@ -328,6 +325,7 @@ class Tracker:
             "log_scale_bias": float(mean[SCALE]),
             "pitch_bias_deg": float(pitch),
             "roll_bias_deg": float(roll),
+            **_stds(covariance),
             "vel_east_mps": float(mean[2]),
             "vel_north_mps": float(mean[3]),
             **more,
@@ -342,6 +340,25 @@ class Tracker:
             agl_m=telemetry.agl_m * math.exp(mean[SCALE]),
             evidence=MappingProxyType(evidence),
         )
+
+
+def _stds(covariance: Array) -> dict[str, float]:
+    """How well it is known what is wrong with what is told."""
+    std = np.sqrt(np.maximum(np.diag(covariance)[4:], 0.0))
+    names = (
+        "heading_bias_std_deg",
+        "log_scale_bias_std",
+        "pitch_bias_std_deg",
+        "roll_bias_std_deg",
+    )
+    values = np.where([True, False, True, True], np.degrees(std), std)
+    return dict(zip(names, values.tolist(), strict=True))
+
+
+def _known(corrected: Telemetry, spread: Array) -> Telemetry:
+    """Told values with how well they are known by now, which says how widely to look."""
+    heading, scale = np.sqrt(np.diag(spread)[:2]).tolist()
+    return replace(corrected, yaw_std_deg=math.degrees(heading), agl_std_m=scale * corrected.agl_m)
 
 
 def _corrected(telemetry: Telemetry, bias: Array) -> Telemetry:

@@ -106,10 +106,6 @@ class Refiner:
             covariance += np.outer(move := self._to_map(seen) @ step, move)
         return replace(best, covariance=covariance, agreement=seen.agreement())
 
-    def seen(self, pose: Pose) -> "_Seen":
-        """The view beside the map at a pose, until this or another refiner looks again."""
-        return self._scratch.seen(_Window(self.template, self.reference, pose), pose)
-
     def _hessian(self, seen: "_Seen") -> NDArray[np.float64]:
         """Gauss-Newton matrix (4, 4) over the part of the view that lies on the map."""
         if seen.overlap > WHOLE_OVERLAP:
@@ -120,7 +116,7 @@ class Refiner:
         return np.asarray(np.tensordot(seen.squares, each, axes=1))
 
     def _observed_inverse(self, seen: "_Seen") -> NDArray[np.float64]:
-        """As `_inverse`, of the view's derivatives times the map's.
+        """Inverse (4, 4) of the view's derivatives times the map's.
 
         Noise and change have derivatives too: counted as if they held the view in place, they
         would make it look known where the ground runs in one direction.
@@ -130,7 +126,7 @@ class Refiner:
         observed = np.zeros((4, 4))
         for gain, mine, other in zip(gains, self._jacobian, theirs, strict=True):
             observed += gain * (mine @ other.T)
-        return bounded_inverse((observed + observed.T) / 2, self._hessian(seen))
+        return _bounded_inverse((observed + observed.T) / 2, self._hessian(seen))
 
     def _step(self, seen: "_Seen") -> NDArray[np.float64]:
         """Gauss-Newton step of the window: x, y (px of the level), turn, log scale."""
@@ -162,7 +158,7 @@ class Refiner:
         return np.asarray(to_map @ inverse @ spread @ inverse @ to_map.T)
 
 
-def bounded_inverse(
+def _bounded_inverse(
     observed: NDArray[np.float64], hessian: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Inverse (P, P) of `observed`, no direction held less than a share of what `hessian` says."""

@@ -196,7 +196,7 @@ class Registrar:
         """
         placed = [Placed.unjudged(found.pose, level) for found in candidates]
         for at in range(level, levels.look - 1, -1):
-            refiner = self._refiner(templates, levels, at)
+            refiner = self.refiner(templates, levels, at)
             rivals = known if at == levels.look else ()
             placed = self._compared(refiner, placed, prior, rivals)
             if at > levels.look:
@@ -258,7 +258,7 @@ class Registrar:
         nearest = min(judged, key=lambda each: _apart(each, best))
         others = [each for each in judged if _apart(each, best) > exclusion]
         return Registered(
-            placed=self._with_covariance(templates, levels, best),
+            placed=self.with_covariance(templates, levels, best),
             score=score,
             rival=totals[1][0] if len(totals) > 1 else 0.0,
             look_score=nearest.score - prior.cost(nearest.pose),
@@ -292,15 +292,16 @@ class Registrar:
             return deep
         return replace(
             deep,
-            placed=self._with_covariance(templates, levels, best),
+            placed=self.with_covariance(templates, levels, best),
             score=score,
             rival=max((entry[1] for entry in rivals), default=0.0),
             look_score=found.look_rival,
             look_rival=found.look_score,
         )
 
-    def _with_covariance(self, templates: ViewTemplates, levels: Levels, best: Placed) -> Placed:
-        final = self._refiner(templates, levels, levels.final)
+    def with_covariance(self, templates: ViewTemplates, levels: Levels, best: Placed) -> Placed:
+        """A placed view once more, at the final level, with its covariance."""
+        final = self.refiner(templates, levels, levels.final)
         return final.place(best.pose, 3, with_covariance=True)
 
     def _at_final(
@@ -309,13 +310,14 @@ class Registrar:
         """A judged candidate refined at the final level, and the sum of its scores."""
         if levels.final == levels.look:
             return judged.score, judged
-        placed = self._refiner(templates, levels, levels.final).place(
+        placed = self.refiner(templates, levels, levels.final).place(
             judged.pose, FULL_STEPS, ROUGH_STEP_PX
         )
-        again = self._refiner(templates, levels, levels.look).place(placed.pose, 0)
+        again = self.refiner(templates, levels, levels.look).place(placed.pose, 0)
         return placed.score + again.score, placed
 
-    def _refiner(self, templates: ViewTemplates, levels: Levels, level: int) -> Refiner:
+    def refiner(self, templates: ViewTemplates, levels: Levels, level: int) -> Refiner:
+        """The refiner of a view at one of its levels."""
         return Refiner(templates.at(level, levels.recipe(level)), self.reference)
 
 

@@ -121,6 +121,27 @@ class Mixture:
         self.hypotheses = [Hypothesis(TOLD_SHARE, mean, covariance, 0.0, self._numbers)]
         self.elsewhere = 1 - TOLD_SHARE
 
+    def told_position(self, mean_en_m: Array, std_m: float) -> None:
+        """Take in a position (2,) that was measured otherwise, good to `std_m` per axis."""
+        if not self.hypotheses:
+            self.start(mean_en_m, std_m)
+            return
+        made, noise = [], np.eye(2) * std_m**2
+        for each in self.hypotheses:
+            spread = each.covariance[POSITION, POSITION] + noise
+            off = mean_en_m - each.mean[POSITION]
+            gain = np.linalg.solve(spread, each.covariance[POSITION]).T
+            after = each.covariance - gain @ spread @ gain.T
+            share = each.share * math.exp(max(log_density(off, spread), -700.0))
+            made.append(
+                replace(
+                    each, share=share, mean=each.mean + gain @ off, covariance=(after + after.T) / 2
+                )
+            )
+        self.hypotheses = made
+        self.elsewhere /= self.area_m2
+        self._settle()
+
     def predict(
         self, seconds: float, moved: Displacement | None = None, told_noise: Array | None = None
     ) -> None:
@@ -180,11 +201,7 @@ class Mixture:
         best = self._best(radius_m)
         near = [each for each in self.hypotheses if _distance(each, best) <= radius_m]
         mean, covariance = _moments(near)
-        inside = sum(
-            each.share * within(each.mean, each.covariance, radius_m, mean[POSITION])
-            for each in self.hypotheses
-        )
-        confidence = min(inside, 1.0)
+        confidence = min(self._inside(radius_m, mean[POSITION]), 1.0)
         sighted = max(each.sighted for each in near)
         state = self._state(confidence, sighted)
         self._tracked = self._tracked or state is State.TRACKING
@@ -193,11 +210,22 @@ class Mixture:
     def _best(self, radius_m: float) -> Hypothesis:
         """The hypothesis with most belief around it."""
         heaviest = self.hypotheses[:8]
+        return max(heaviest, key=lambda one: self._inside(radius_m, one.mean[POSITION]))
 
-        def around(one: Hypothesis) -> float:
-            return sum(e.share for e in self.hypotheses if _distance(e, one) <= radius_m)
+    def _inside(self, radius_m: float, middle: Array) -> float:
+        """How much of the belief lies within a radius of a place (2,)."""
+        return sum(
+            each.share * within(each.mean, each.covariance, radius_m, middle)
+            for each in self.hypotheses
+        )
 
-        return max(heaviest, key=around)
+    def bias(self) -> tuple[Array, Array]:
+        """What is believed to be wrong with what is told, by all hypotheses: mean (4,) and
+        covariance (4, 4) of heading, log scale, pitch and roll."""
+        if not self.hypotheses:
+            return np.zeros(4), np.diag(self.model.initial_bias())
+        mean, covariance = _moments(self.hypotheses)
+        return mean[4:], covariance[4:, 4:]
 
     def _state(self, confidence: float, sighted: float) -> State:
         if confidence >= SURE and sighted >= CONFIRMED:
@@ -297,16 +325,28 @@ def _merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
     kept: list[Hypothesis] = []
     while left and len(kept) < MAX_HYPOTHESES:
         first, rest = left[0], left[1:]
-        inverse = np.linalg.inv(first.covariance[:4, :4])
+        inverse = np.asarray(np.linalg.inv(first.covariance[:4, :4]), np.float64)
         group, left = [first], []
         for each in rest:
-            off = each.mean[:4] - first.mean[:4]
-            (group if off @ inverse @ off < 4 * MERGE_SIGMAS**2 else left).append(each)
+            alike = _divergence(each, first, inverse) < 2 * MERGE_SIGMAS**2
+            (group if alike else left).append(each)
         mean, covariance = _moments(group)
         share = sum(each.share for each in group)
         sighted = sum(each.share * each.sighted for each in group) / share
         kept.append(replace(first, share=share, mean=mean, covariance=covariance, sighted=sighted))
     return kept
+
+
+def _divergence(one: Hypothesis, heavier: Hypothesis, inverse: Array) -> float:
+    """How much is lost (nats, Kullback and Leibler) where a hypothesis becomes part of a heavier
+    one, in position and velocity; `inverse` (4, 4) is that of the heavier one's covariance.
+
+    A place that is known well is not the same as a wide guess around it.
+    """
+    off = one.mean[:4] - heavier.mean[:4]
+    turned = inverse @ one.covariance[:4, :4]
+    _, log_det = np.linalg.slogdet(turned)
+    return float(off @ inverse @ off + np.trace(turned) - 4 - log_det) / 2
 
 
 def _moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:

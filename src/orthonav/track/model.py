@@ -28,7 +28,6 @@ class Model:
     `heading_noise_rad`, `log_scale_noise`, `lean_noise_rad`: how they scatter from view to view;
     the `_walk` ones how the former drift, per root of a second. `sighting_noise_m`: what maps of
     two dates disagree by beyond what registration knows, which counts `sighting_growth` times.
-    `lean_view_noise_rad`: how wrong the lean is that a view shows: hills and houses bend it too.
     `knocked`: how likely heading, scale and lean are suddenly wrong by something else than before:
     a gimbal that moved (by `knocked_lean_rad`), a compass that was reset. `miss`: how likely a view
     of ground that is on the map shows nothing that can be found. `lost`: how likely the track went
@@ -43,13 +42,12 @@ class Model:
     log_scale: float = 0.08
     log_scale_noise: float = 0.02
     log_scale_walk: float = 5e-4
-    lean_rad: float = math.radians(1.5)
+    lean_rad: float = math.radians(3.0)
     knocked_lean_rad: float = math.radians(6.0)
     lean_noise_rad: float = math.radians(0.7)
     lean_walk: float = math.radians(0.05)
     sighting_noise_m: float = 1.0
     sighting_growth: float = 2.0
-    lean_view_noise_rad: float = math.radians(2.5)
     knocked: float = 0.01
     miss: float = 0.5
     lost: float = 1e-3
@@ -203,7 +201,7 @@ def knocked(model: Model, expected: Expected) -> Expected:
 
 def reading(model: Model, told: Told, sighting: Sighting) -> tuple[Array, Array]:
     """What a sighting says of the state (6,), in the order of `SEEN`, and its covariance (6, 6)."""
-    noise = _with_lean_noise(sighting.covariance, model.lean_view_noise_rad)
+    noise = sighting.covariance.copy()
     noise[:2, :2] *= model.sighting_growth
     floor = [model.sighting_noise_m] * 2 + [HEADING_FLOOR_RAD, SCALE_FLOOR]
     noise[range(6), range(6)] += np.square([*floor, model.lean_noise_rad, model.lean_noise_rad])
@@ -216,13 +214,6 @@ def reading(model: Model, told: Told, sighting: Sighting) -> tuple[Array, Array]
         seen[2] = math.remainder(seen[2] - told.heading_rad, 2 * math.pi)
     seen[4:] -= [told.pitch_rad, told.roll_rad]
     return seen, noise
-
-
-def _with_lean_noise(covariance: Array, std_rad: float) -> Array:
-    """Covariance (6, 6) of a sighting whose lean is less well known, and what hangs on it too."""
-    lean = slice(4, 6)
-    hangs = np.linalg.solve(covariance[lean, lean], covariance[lean]).T
-    return covariance + std_rad**2 * hangs @ hangs.T
 
 
 def updated(mean: Array, covariance: Array, off: Array, spread: Array) -> tuple[Array, Array]:

@@ -43,22 +43,23 @@ class History:
                 return
             self._views[at - 1] = kept
 
-    def smoothed(self) -> list[Smoothed | None]:
-        """One for each view, None where nothing was known of it even afterwards."""
+    def smoothed(self, last: int | None = None) -> list[Smoothed | None]:
+        """One for each view, or for each of the `last` ones; None where nothing was known of it
+        even afterwards."""
         out: list[Smoothed | None] = []
         after: Hypothesis | None = None
-        last: Smoothed | None = None
-        for view in reversed(self._views):
+        later: Smoothed | None = None
+        for view in reversed(self._views if last is None else self._views[-last:]):
             before = None if after is None else view.get(after.parent)
-            if after is None or before is None or after.expected is None or last is None:
+            if after is None or before is None or after.expected is None or later is None:
                 after = max(view.values(), key=lambda each: each.share) if view else None
-                last = (
+                later = (
                     None if after is None else Smoothed(after.mean, after.covariance, after.share)
                 )
             else:
-                last = _one_back(before, after, last)
+                later = _one_back(before, after, later)
                 after = before
-            out.append(last)
+            out.append(later)
         return out[::-1]
 
 

@@ -1,0 +1,114 @@
+"""`orthonav calibrate`: find out what is wrong with what a flight tells, by flying it."""
+
+import argparse
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orthonav.cli.common import print_json, progress
+from orthonav.cli.source import add_source, open_told
+
+if TYPE_CHECKING:
+    from orthonav.onboard.calibrate import Calibration
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("map", type=Path, metavar="MAP.onav")
+    parser.add_argument(
+        "flight", type=Path, metavar="SOURCE", help="flight to learn from, as for `localize`"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="mount.json")
+    parser.add_argument(
+        "--gnss",
+        type=Path,
+        metavar="positions.csv",
+        help="measured positions of (some of) the views, frame,lat_deg,lon_deg: views then tell "
+        "the mount by where they are seen, not by their perspective alone",
+    )
+    parser.add_argument(
+        "--gnss-std-m", type=float, default=5.0, metavar="M", help="how good they are (default 5)"
+    )
+    parser.add_argument(
+        "--heading",
+        choices=("known", "unknown"),
+        default="known",
+        help="known: from telemetry (default); unknown: all headings are tried",
+    )
+    add_source(parser)
+    parser.add_argument("--json", action="store_true", help="print the mount as JSON")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Track the flight, place its views in hindsight, and keep what they agree on."""
+    from orthonav.errors import FlightError
+    from orthonav.flight import read_truth
+    from orthonav.flight.mount import write_mount
+    from orthonav.flight.recording import Retold
+    from orthonav.localizer import Localizer
+    from orthonav.localizer.tracker import Tracker
+    from orthonav.mapfile import open_map
+    from orthonav.onboard.calibrate import calibrated
+    from orthonav.onboard.run import in_hindsight, localize_flight
+    from orthonav.records import Prior
+
+    if not 0 < options.gnss_std_m < 1e5:
+        raise FlightError(f"--gnss-std-m must be above 0, got {options.gnss_std_m}")
+    flight = open_told(options.flight, options)
+    places = read_truth(options.gnss) if options.gnss else {}
+    told = {frame: Prior(*place, options.gnss_std_m) for frame, place in places.items()}
+    views = (Retold(v, replace(v.telemetry, prior=told.get(v.frame))) for v in flight.views)
+    tracker = Tracker(
+        Localizer(open_map(options.map)),
+        heading_known=options.heading == "known",
+        use_prior=bool(options.gnss),
+        every_prior=bool(options.gnss),
+        hindsight=True,
+    )
+    results = []
+    with progress(options) as shown:
+        for result in localize_flight(tracker, flight, skip_bad_images=True, views=views):
+            results.append(result)
+            if flight.expected:
+                shown("calibrate", min(1.0, len(results) / flight.expected))
+    found = calibrated(in_hindsight(tracker, results, None))
+    write_mount(options.out, found.mount)
+    if options.json:
+        print_json(_plain(found))
+        return
+    print(_table(found))
+    print(f"from {found.mount.views} views, {found.first} to {found.last}")
+    if found.moved:
+        print("before these it was mounted otherwise; those views are left out")
+    print(f"written to {options.out}")
+
+
+def _plain(found: "Calibration") -> dict[str, Any]:
+    from orthonav.flight.mount import Bias
+
+    mount = found.mount
+    names = ("heading_deg", "log_scale", "pitch_deg", "roll_deg")
+    plain: dict[str, Any] = {
+        name: {each.name: getattr(getattr(mount, name), each.name) for each in fields(Bias)}
+        for name in names
+    }
+    return plain | {
+        "views": mount.views,
+        "first": found.first,
+        "last": found.last,
+        "moved": found.moved,
+    }
+
+
+def _table(found: "Calibration") -> str:
+    lines = [f"{'':22} {'value':>8} {'known to':>9} {'scatter':>8}"]
+    rows = (
+        ("heading, deg", found.mount.heading_deg, 1.0),
+        ("height (or focal), %", found.mount.log_scale, 100.0),
+        ("pitch, deg", found.mount.pitch_deg, 1.0),
+        ("roll, deg", found.mount.roll_deg, 1.0),
+    )
+    for name, bias, unit in rows:
+        value, std, scatter = (unit * each for each in (bias.value, bias.std, bias.scatter))
+        lines.append(f"{name:22} {value:+8.2f} {std:9.2f} {scatter:8.2f}")
+    return "\n".join(lines)

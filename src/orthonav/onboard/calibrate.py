@@ -1,0 +1,131 @@
+"""What is wrong with what a flight tells all along, from the track of that flight."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import FlightError
+from orthonav.flight.mount import Bias, Mount
+from orthonav.geo.camera import Camera
+from orthonav.onboard.run import Locator
+from orthonav.records import Fix, NoFix, Telemetry, ViewResult
+from orthonav.track import Model
+
+SURE = 0.9
+MIN_VIEWS = 5
+MOVED_DEG, MOVED_SIGMAS = 2.0, 3.0
+"""A mount that differs by more than both from what it is in the end has moved meanwhile."""
+MAD_TO_STD = 1.4826
+STD_FLOOR = {"heading_deg": 0.2, "log_scale": 0.003, "pitch_deg": 0.3, "roll_deg": 0.3}
+_EVIDENCE = {
+    "heading_deg": "heading_bias_deg",
+    "log_scale": "log_scale_bias",
+    "pitch_deg": "pitch_bias_deg",
+    "roll_deg": "roll_bias_deg",
+}
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A mount, the frames of its first and last view, and whether it had moved before those."""
+
+    mount: Mount
+    first: str
+    last: str
+    moved: bool
+
+
+def calibrated(results: Sequence[ViewResult]) -> Calibration:
+    """The mount at the end of a flight that was tracked, from its confident views.
+
+    Views before the camera moved in its mount are left out. Medians are taken, so that single
+    views do not matter; their standard deviation counts views that err alike as fewer.
+    Raises `FlightError` where fewer than `MIN_VIEWS` views are confident.
+    """
+    sure = [each for each in results if _is_sure(each)]
+    if len(sure) < MIN_VIEWS:
+        raise FlightError(
+            f"{len(sure)} of {len(results)} views have a confidence of {SURE}; a calibration needs "
+            f"{MIN_VIEWS}: is it the right map, camera and height?"
+        )
+    values = {name: _column(sure, key) for name, key in _EVIDENCE.items()}
+    spreads = {
+        name: _column(sure, key.replace("bias", "bias_std")) for name, key in _EVIDENCE.items()
+    }
+    begin = max(_still_from(values[name], spreads[name]) for name in ("pitch_deg", "roll_deg"))
+    begin = min(begin, len(sure) - MIN_VIEWS)
+    biases = {
+        name: _bias(values[name][begin:], spreads[name][begin:], STD_FLOOR[name])
+        for name in _EVIDENCE
+    }
+    mount = Mount(**biases, views=len(sure) - begin)
+    return Calibration(mount, sure[begin].frame, sure[-1].frame, begin > 0)
+
+
+def _is_sure(result: ViewResult) -> bool:
+    fix = result.outcome
+    return isinstance(fix, Fix) and fix.confidence >= SURE and "pitch_bias_deg" in fix.evidence
+
+
+def _column(sure: Sequence[ViewResult], key: str) -> Array:
+    return np.array([each.outcome.evidence[key] for each in sure])
+
+
+def _still_from(values: Array, spreads: Array) -> int:
+    """The first of the last views between which a value hardly changes."""
+    end = float(np.median(values[-MIN_VIEWS:]))
+    far = np.abs(values - end) > np.maximum(MOVED_SIGMAS * spreads, MOVED_DEG)
+    return int(np.flatnonzero(far)[-1]) + 1 if far.any() else 0
+
+
+def _bias(values: Array, spreads: Array, floor: float) -> Bias:
+    """Median, how well it is known, and the scatter around it."""
+    middle = float(np.median(values))
+    off = values - middle
+    scatter = MAD_TO_STD * float(np.median(np.abs(off)))
+    energy = float(off @ off)
+    alike = float(off[1:] @ off[:-1]) / energy if energy > 0 else 0.0
+    alike = min(max(alike, 0.0), 0.99)
+    mean_std = scatter * math.sqrt((1 + alike) / (1 - alike) / len(values))
+    # No view knows it better than the track did where it knew it best.
+    std = max(floor, min(math.hypot(mean_std, float(spreads.min())), float(np.median(spreads))))
+    return Bias(middle, std, scatter)
+
+
+def model_of(mount: Mount, model: Model | None = None) -> Model:
+    """The model of a flight whose told values were corrected by a mount."""
+    heading, lean = mount.heading_deg, max(mount.pitch_deg.std, mount.roll_deg.std)
+    return replace(
+        model or Model(),
+        heading_rad=math.radians(max(heading.std, heading.scatter, 1.0)),
+        log_scale=max(mount.log_scale.std, mount.log_scale.scatter, 0.01),
+        lean_rad=math.radians(max(lean, 0.5)),
+    )
+
+
+@dataclass(frozen=True)
+class Mounted:
+    """A locator that is told everything corrected by a mount.
+
+    What its fixes call wrong with what is told is what is left.
+    """
+
+    locator: Locator
+    mount: Mount
+
+    def locate(self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry) -> Fix | NoFix:
+        """See `Locator.locate`."""
+        return self.locator.locate(grey, camera, self.mount.corrected(telemetry))
+
+    def passed(self, camera: Camera, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+        """See `Locator.passed`."""
+        return self.locator.passed(camera, self.mount.corrected(telemetry), reason)
+
+    @property
+    def state_name(self) -> str | None:
+        """See `Locator.state_name`."""
+        return self.locator.state_name
