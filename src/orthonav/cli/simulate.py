@@ -20,7 +20,19 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--spacing-m", type=float, help="distance of views on a route (default: 1 s)"
     )
-    parser.add_argument("--speed-mps", type=float, default=25.0, help="ground speed (default 25)")
+    parser.add_argument("--speed-mps", type=float, default=25.0, help="airspeed (default 25)")
+    parser.add_argument(
+        "--turn-radius-m", type=float, default=0.0, help="fly corners of the route as arcs"
+    )
+    parser.add_argument(
+        "--wind-mps", type=float, help="wind and gusts: heading crabs, ground speed varies"
+    )
+    parser.add_argument(
+        "--wind-from-deg", type=float, help="where it comes from (default 270, the west)"
+    )
+    parser.add_argument(
+        "--beyond", action="store_true", help="the route may leave the imagery: it is mirrored"
+    )
     parser.add_argument(
         "--camera", type=Path, metavar="flight.json", help="camera (default 1280 x 960, 65 deg)"
     )
@@ -30,7 +42,26 @@ def add(parser: argparse.ArgumentParser) -> None:
     errors.add_argument("--tilt-std-deg", type=float, default=0.0, help="told pitch and roll")
     errors.add_argument("--lean-std-deg", type=float, default=0.0, help="true pitch and roll")
     errors.add_argument("--prior-std-m", type=float, help="tell a position with this error")
+    errors.add_argument(
+        "--velocity-drift",
+        type=float,
+        help="tell a velocity with this error of scale (a share) and direction (rad)",
+    )
+    biases = parser.add_argument_group("errors that stay the same all along")
+    biases.add_argument("--yaw-bias-deg", type=float, default=0.0, help="heading told too large")
+    biases.add_argument(
+        "--agl-bias", type=float, default=0.0, help="height told too large, as a share: 0.05"
+    )
+    biases.add_argument(
+        "--pitch-bias-deg", type=float, default=0.0, help="the camera leans more than told"
+    )
+    biases.add_argument(
+        "--roll-bias-deg", type=float, default=0.0, help="the camera leans more than told"
+    )
     effects = parser.add_argument_group("faults of the picture")
+    effects.add_argument(
+        "--cloud-share", type=float, default=0.0, help="share of the views with clouds: 0.2"
+    )
     effects.add_argument("--exposure-std", type=float, default=0.15, help="relative exposure")
     effects.add_argument("--blur-px", type=float, default=0.6, help="blur in pixels")
     effects.add_argument("--noise-std", type=float, default=2.0, help="noise in grey levels")
@@ -42,11 +73,16 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Simulate and say what was written."""
+    from orthonav.errors import FlightError
     from orthonav.flight.folder import read_camera
     from orthonav.geo.route import read_route
     from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
+    from orthonav.simulate.motion import Wind
     from orthonav.simulate.render import ViewEffects
 
+    if options.wind_from_deg is not None and options.wind_mps is None:
+        raise FlightError("--wind-from-deg needs a speed: --wind-mps")
+    from_deg = 270.0 if options.wind_from_deg is None else options.wind_from_deg
     request = SimulateRequest(
         orthos=options.ortho,
         out=options.out,
@@ -62,11 +98,20 @@ def run(options: argparse.Namespace) -> None:
             tilt_std_deg=options.tilt_std_deg,
             lean_std_deg=options.lean_std_deg,
             prior_std_m=options.prior_std_m,
+            yaw_bias_deg=options.yaw_bias_deg,
+            agl_bias=options.agl_bias,
+            pitch_bias_deg=options.pitch_bias_deg,
+            roll_bias_deg=options.roll_bias_deg,
+            velocity_drift=options.velocity_drift,
         ),
         effects=ViewEffects(
             options.exposure_std, options.blur_px, options.noise_std, options.jpeg_quality
         ),
         seed=options.seed,
+        wind=None if options.wind_mps is None else Wind(options.wind_mps, from_deg),
+        turn_radius_m=options.turn_radius_m,
+        cloud_share=options.cloud_share,
+        beyond=options.beyond,
     )
     with progress(options) as shown:
         views = simulate_flight(request, lambda share: shown("simulate", share))

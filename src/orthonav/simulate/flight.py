@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,25 +17,32 @@ from orthonav.files import replacing_folder
 from orthonav.flight.writer import FlightWriter
 from orthonav.geo.area import Area
 from orthonav.geo.camera import Camera, footprint_en_m
-from orthonav.geo.route import Route, along_polyline_en_m
+from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic, SheetRaster
 from orthonav.records import Prior, Telemetry
+from orthonav.simulate.clouds import Clouds
+from orthonav.simulate.ground import Coverage, Ground
+from orthonav.simulate.motion import Way, Wind, drifting, mounted, rounded, steady_way, windy_way
 from orthonav.simulate.render import ViewEffects, render_view
 
 DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
 MAX_VIEWS = 1_000_000
 TRIES_PER_VIEW = 400
-COVERAGE_PX = 1024
 MARGIN_PX = 4
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Standard deviations of what the telemetry gets wrong, and of how the camera leans.
+    """What the telemetry gets wrong, and how the camera leans.
 
-    `agl_std` is a share of the height; `lean_std_deg` true pitch and roll, which are told;
-    `tilt_std_deg` the error of the told ones. `prior_std_m` None tells no prior.
+    `_std` is the standard deviation of what is drawn anew at every view: `agl_std` a share of the
+    height; `lean_std_deg` true pitch and roll, which are told; `tilt_std_deg` the error of the told
+    ones. `prior_std_m` None tells no prior. What is wrong all along: `yaw_bias_deg` and `agl_bias`
+    (a share) are added to what is told; the camera is mounted so that in the aircraft it leans by
+    `pitch_bias_deg` and `roll_bias_deg` more than told. The standard deviations that are told are
+    those of the scatter alone. `velocity_drift` is the standard deviation of the scale (a share)
+    and the direction (rad) of the told velocity, see `motion.drifting`; None tells no velocity.
     """
 
     yaw_std_deg: float = 0.0
@@ -44,6 +50,11 @@ class Errors:
     tilt_std_deg: float = 0.0
     lean_std_deg: float = 0.0
     prior_std_m: float | None = None
+    yaw_bias_deg: float = 0.0
+    agl_bias: float = 0.0
+    pitch_bias_deg: float = 0.0
+    roll_bias_deg: float = 0.0
+    velocity_drift: float | None = None
 
     def __post_init__(self) -> None:
         limits = {
@@ -52,12 +63,25 @@ class Errors:
             "tilt_std_deg": 20.0,
             "lean_std_deg": 20.0,
             "prior_std_m": 1e6,
+            "velocity_drift": 0.5,
         }
-        for name, limit in limits.items():
-            value = getattr(self, name)
-            if value is not None and not 0 <= value <= limit:
-                hint = " (a share of the height: 0.05 is 5 %)" if name == "agl_std" else ""
-                raise FlightError(f"{name} must be 0 to {limit:g}, got {value}{hint}")
+        biases = {
+            "yaw_bias_deg": 180.0,
+            "agl_bias": 0.5,
+            "pitch_bias_deg": 20.0,
+            "roll_bias_deg": 20.0,
+        }
+        for name, limit in {**limits, **biases}.items():
+            value, least = getattr(self, name), -limit if name in biases else 0.0
+            if value is not None and not least <= value <= limit:
+                share = {"agl": "the height", "velocity": "the velocity"}.get(name.split("_")[0])
+                hint = f" (a share of {share}: 0.05 is 5 %)" if share else ""
+                raise FlightError(f"{name} must be {least:g} to {limit:g}, got {value}{hint}")
+
+    @property
+    def mount_deg(self) -> tuple[float, float]:
+        """Pitch and roll of the camera in the aircraft that nobody tells."""
+        return self.pitch_bias_deg, self.roll_bias_deg
 
 
 NO_ERRORS = Errors()
@@ -68,7 +92,11 @@ USUAL_EFFECTS = ViewEffects()
 class SimulateRequest:
     """What to fly: along `route` every `spacing_m`, or at `random` places; `agl_m` above ground.
 
-    Without `agl_m` the shorter side of the image covers 256 pixels of the orthophoto.
+    Without `agl_m` the shorter side of the image covers 256 pixels of the orthophoto. `speed_mps`
+    is the airspeed; in `wind` views are as far apart in time as without, `spacing_m / speed_mps`.
+    Corners of the route are flown as arcs of `turn_radius_m`, with 0 on the spot. `cloud_share` of
+    the views have clouds before them. With `beyond` the route may leave the imagery, which is then
+    mirrored at its border.
     """
 
     orthos: Sequence[Path]
@@ -82,16 +110,30 @@ class SimulateRequest:
     errors: Errors = NO_ERRORS
     effects: ViewEffects = USUAL_EFFECTS
     seed: int = 0
+    wind: Wind | None = None
+    turn_radius_m: float = 0.0
+    cloud_share: float = 0.0
+    beyond: bool = False
 
 
 @dataclass(frozen=True)
 class _Pose:
+    """Where and how the camera is; what a faultless autopilot would tell of that is `told_deg`:
+    heading, pitch and roll of the aircraft."""
+
     position_en_m: Array
     yaw_deg: float
     pitch_deg: float
     roll_deg: float
     agl_m: float
     time_s: float
+    told_deg: tuple[float, float, float]
+    told_en_mps: tuple[float, float] | None = None
+
+    @property
+    def attitude(self) -> tuple[float, float, float, float]:
+        """Heading, pitch, roll (deg) and height (m) of the camera."""
+        return self.yaw_deg, self.pitch_deg, self.roll_deg, self.agl_m
 
 
 def simulate_flight(
@@ -102,12 +144,7 @@ def simulate_flight(
     Raises `AreaError` where no view fits into the imagery or the route leaves it, and as
     `Mosaic.open` does.
     """
-    if (request.route is None) == (request.random is None):
-        raise FlightError("fly along a route or at a number of random places, one of them")
-    if request.random is not None and not 1 <= request.random <= MAX_VIEWS:
-        raise FlightError(f"number of random places must be 1 to {MAX_VIEWS}: {request.random}")
-    if request.seed < 0:
-        raise FlightError(f"seed must be 0 or more, got {request.seed}")
+    _check(request)
     mosaic = Mosaic.open(request.orthos)
     outline = mosaic.outline_latlon_deg
     area = Area.from_outline(outline[:, 0], outline[:, 1])
@@ -123,14 +160,18 @@ def simulate_flight(
         gsd_m=gsd_m,
     )
     with replacing_folder(request.out) as folder, raster:
-        coverage = _Coverage(mosaic, area)
+        coverage = Coverage(mosaic, area)
         poses = list(_poses(request, area, agl_m, coverage))
+        ground = _ground(request, raster, (west, north, gsd_m), coverage)
+        clouds = None
+        if request.cloud_share > 0:
+            clouds = Clouds(len(poses), request.cloud_share, request.seed)
         note = f"simulated over {mosaic.sources[0].path.name}, seed {request.seed}"
         writer = FlightWriter(folder, request.camera, note)
         digits = max(4, len(str(len(poses))))
         for number, pose in enumerate(poses):
             rng = np.random.default_rng([request.seed, 1, number])
-            image = _picture(request, raster, west, north, gsd_m, pose, rng)
+            image = _picture(request, ground, clouds, number, pose, rng)
             lat, lon = area.frame.latlon_from_en(pose.position_en_m)
             telemetry = _told(request, area, pose, rng)
             quality = request.effects.jpeg_quality
@@ -140,6 +181,31 @@ def simulate_flight(
                 progress((number + 1) / len(poses))
         writer.close()
     return len(poses)
+
+
+def _check(request: SimulateRequest) -> None:
+    """Raises `FlightError` on what cannot be flown, as far as that is known without imagery."""
+    if (request.route is None) == (request.random is None):
+        raise FlightError("fly along a route or at a number of random places, one of them")
+    if request.random is not None and not 1 <= request.random <= MAX_VIEWS:
+        raise FlightError(f"number of random places must be 1 to {MAX_VIEWS}: {request.random}")
+    if request.seed < 0:
+        raise FlightError(f"seed must be 0 or more, got {request.seed}")
+    if not 0 <= request.turn_radius_m <= 100_000:
+        raise FlightError(f"radius of turns must be 0 to 100,000 m, got {request.turn_radius_m}")
+    if not 0 <= request.cloud_share <= 1:
+        raise FlightError(
+            f"cloud_share must be 0 to 1 (a share of the views), got {request.cloud_share}"
+        )
+    on_a_route = {
+        "wind": request.wind is not None,
+        "turn_radius_m": request.turn_radius_m > 0,
+        "velocity_drift": request.errors.velocity_drift is not None,
+        "beyond": request.beyond,
+    }
+    asked = [name for name, value in on_a_route.items() if value]
+    if request.route is None and asked:
+        raise FlightError(f"{', '.join(asked)}: only along a route, not at random places")
 
 
 def _height_m(request: SimulateRequest, mosaic: Mosaic) -> float:
@@ -152,51 +218,36 @@ def _height_m(request: SimulateRequest, mosaic: Mosaic) -> float:
     return request.agl_m
 
 
-class _Coverage:
-    """Which places the imagery covers, thinned to at most `COVERAGE_PX` pixels across."""
+def _ground(
+    request: SimulateRequest,
+    raster: SheetRaster,
+    corner: tuple[float, float, float],
+    coverage: Coverage,
+) -> Ground:
+    """The raster whose west, north and pixel size in m are `corner`, mirrored if that is asked."""
+    west_m, north_m, gsd_m = corner
+    if not request.beyond:
+        return Ground(raster, west_m, north_m, gsd_m)
+    west, south, east, north = coverage.box_en_m()
+    box = (
+        math.ceil((west - west_m) / gsd_m),
+        math.ceil((north_m - north) / gsd_m),
+        math.floor((east - west_m) / gsd_m),
+        math.floor((north_m - south) / gsd_m),
+    )
+    return Ground(raster, west_m, north_m, gsd_m, box)
 
-    def __init__(self, mosaic: Mosaic, area: Area) -> None:
-        self._west, south, east, self._north = area.extent_en_m
-        across = max(east - self._west, self._north - south)
-        self._gsd_m = max(mosaic.gsd_m, across / COVERAGE_PX)
-        width = math.ceil((east - self._west) / self._gsd_m)
-        height = math.ceil((self._north - south) / self._gsd_m)
-        with mosaic.sheet(
-            area.frame,
-            west_m=self._west,
-            north_m=self._north,
-            width_px=width,
-            height_px=height,
-            gsd_m=self._gsd_m,
-        ) as raster:
-            self._missing = ~raster.read(0, 0, width, height).valid
 
-    def sees_ground(self, camera: Camera, pose: _Pose) -> bool:
-        """Whether the whole view lies on imagery, the horizon not in it."""
-        try:
-            return self.whole(_corners_en_m(camera, pose))
-        except CameraError:
-            return False
-
-    def whole(self, corners_en_m: Array) -> bool:
-        """Whether imagery lies under all of the quadrilateral (4, 2)."""
-        x = (corners_en_m[:, 0] - self._west) / self._gsd_m
-        y = (self._north - corners_en_m[:, 1]) / self._gsd_m
-        height, width = self._missing.shape
-        if min(x.min(), y.min()) < 0 or x.max() > width or y.max() > height:
-            return False
-        left, top = int(x.min()), int(y.min())
-        part = self._missing[top : math.ceil(y.max()), left : math.ceil(x.max())]
-        if not part.any():
-            return True
-        inside = np.zeros(part.shape, dtype=np.uint8)
-        corners = np.round(np.stack([x - left, y - top], axis=1) - 0.5).astype(np.int32)
-        cv2.fillConvexPoly(inside, corners, 1)
-        return not (part & (inside > 0)).any()
+def _sees_ground(coverage: Coverage, camera: Camera, pose: _Pose) -> bool:
+    """Whether the whole view lies on imagery, the horizon not in it."""
+    try:
+        return coverage.whole(_corners_en_m(camera, pose))
+    except CameraError:
+        return False
 
 
 def _poses(
-    request: SimulateRequest, area: Area, agl_m: float, coverage: _Coverage
+    request: SimulateRequest, area: Area, agl_m: float, coverage: Coverage
 ) -> Iterator[_Pose]:
     if request.route is not None:
         yield from _route_poses(request, request.route, area, agl_m, coverage)
@@ -207,12 +258,11 @@ def _poses(
         for _ in range(TRIES_PER_VIEW):
             place = rng.uniform([west, south], [east, north])
             pose = _leaning(request, rng, place, rng.uniform(0, 360), agl_m, number * 1.0)
-            if coverage.sees_ground(request.camera, pose):
+            if _sees_ground(coverage, request.camera, pose):
                 yield pose
                 break
         else:
-            corners = _corners_en_m(request.camera, _Pose(np.zeros(2), 0, 0, 0, agl_m, 0))
-            wide, high = np.ptp(corners, axis=0)
+            wide, high = np.ptp(footprint_en_m(request.camera, 0, 0, 0, agl_m), axis=0)
             raise AreaError(
                 f"found no place where a view of {wide:.0f} x {high:.0f} m lies within the "
                 f"imagery of {east - west:.0f} x {north - south:.0f} m; fly lower (--agl-m)"
@@ -220,26 +270,46 @@ def _poses(
 
 
 def _route_poses(
-    request: SimulateRequest, route: Route, area: Area, agl_m: float, coverage: _Coverage
+    request: SimulateRequest, route: Route, area: Area, agl_m: float, coverage: Coverage
 ) -> Iterator[_Pose]:
-    line = route.points_en_m(area.frame)
-    spacing_m = request.speed_mps if request.spacing_m is None else request.spacing_m
-    if not (spacing_m > 0 and request.speed_mps > 0):
-        raise FlightError("distance between views and speed must be above 0")
-    places, courses = along_polyline_en_m(line, spacing_m)
-    if len(places) > MAX_VIEWS:
-        raise FlightError(f"route gives {len(places)} views, more than {MAX_VIEWS}")
-    for number, (place, course) in enumerate(zip(places, courses, strict=True)):
+    way = _way(request, route.points_en_m(area.frame))
+    velocities = _told_velocities(request, way)
+    for number, (place, heading) in enumerate(zip(way.places_en_m, way.headings_deg, strict=True)):
         rng = np.random.default_rng([request.seed, 0, number])
-        time_s = number * spacing_m / request.speed_mps
-        pose = _leaning(request, rng, place, float(course), agl_m, time_s)
-        if not coverage.sees_ground(request.camera, pose):
+        time_s, told = float(way.times_s[number]), velocities[number]
+        pose = _leaning(request, rng, place, float(heading), agl_m, time_s, told)
+        if not request.beyond and not _sees_ground(coverage, request.camera, pose):
             lat, lon = area.frame.latlon_from_en(place)
             raise AreaError(
                 f"view {number + 1} of the route, at {lat:.5f}, {lon:.5f}, "
                 "does not lie wholly within the imagery"
             )
         yield pose
+
+
+def _way(request: SimulateRequest, line_en_m: Array) -> Way:
+    speed_mps = request.speed_mps
+    spacing_m = speed_mps if request.spacing_m is None else request.spacing_m
+    if not (0 < spacing_m < math.inf and 0 < speed_mps < math.inf):
+        raise FlightError("distance between views and speed must be above 0")
+    line = rounded(line_en_m, request.turn_radius_m) if request.turn_radius_m else line_en_m
+    if request.wind is None:
+        way = steady_way(line, spacing_m, speed_mps)
+    else:
+        rng = np.random.default_rng([request.seed, 2])
+        way = windy_way(line, spacing_m, speed_mps, request.wind, rng, MAX_VIEWS)
+    if len(way.places_en_m) > MAX_VIEWS:
+        raise FlightError(f"route gives {len(way.places_en_m)} views, more than {MAX_VIEWS}")
+    return way
+
+
+def _told_velocities(request: SimulateRequest, way: Way) -> list[tuple[float, float] | None]:
+    drift = request.errors.velocity_drift
+    if drift is None:
+        return [None] * len(way.places_en_m)
+    rng = np.random.default_rng([request.seed, 4])
+    told = drifting(way.velocities_en_mps, way.times_s, drift, rng)
+    return [(round(float(east), 4), round(float(north), 4)) for east, north in told]
 
 
 def _leaning(
@@ -249,9 +319,13 @@ def _leaning(
     yaw_deg: float,
     agl_m: float,
     time_s: float,
+    told_en_mps: tuple[float, float] | None = None,
 ) -> _Pose:
-    lean = np.clip(rng.normal(0, 1, 2), -2.5, 2.5) * request.errors.lean_std_deg
-    return _Pose(place, float(yaw_deg), float(lean[0]), float(lean[1]), agl_m, time_s)
+    errors = request.errors
+    lean = np.clip(rng.normal(0, 1, 2), -2.5, 2.5) * errors.lean_std_deg
+    told = (float(yaw_deg), float(lean[0]), float(lean[1]))
+    true = mounted(told, *errors.mount_deg) if any(errors.mount_deg) else told
+    return _Pose(place, *true, agl_m, time_s, told, told_en_mps)
 
 
 def _corners_en_m(camera: Camera, pose: _Pose) -> Array:
@@ -261,29 +335,27 @@ def _corners_en_m(camera: Camera, pose: _Pose) -> Array:
 
 def _picture(
     request: SimulateRequest,
-    raster: SheetRaster,
-    west_m: float,
-    north_m: float,
-    gsd_m: float,
+    ground: Ground,
+    clouds: Clouds | None,
+    number: int,
     pose: _Pose,
     rng: np.random.Generator,
 ) -> NDArray[np.uint8]:
     """What the camera sees (H, W, 3), rendered from the window of imagery under it."""
-    corners = _corners_en_m(request.camera, pose)
-    cols = (corners[:, 0] - west_m) / gsd_m
-    rows = (north_m - corners[:, 1]) / gsd_m
-    left, top = math.floor(cols.min()) - MARGIN_PX, math.floor(rows.min()) - MARGIN_PX
-    width = math.ceil(cols.max()) + MARGIN_PX - left
-    height = math.ceil(rows.max()) + MARGIN_PX - top
-    pixels = raster.read(left, top, width, height)
-    corner = np.array([west_m + left * gsd_m, north_m - top * gsd_m]) - pose.position_en_m
-    attitude = (pose.yaw_deg, pose.pitch_deg, pose.roll_deg, pose.agl_m)
-    return render_view(request.camera, attitude, pixels.rgb, corner, gsd_m, request.effects, rng)
+    camera, attitude = request.camera, pose.attitude
+    rgb, corner_en_m = ground.window(_corners_en_m(camera, pose), MARGIN_PX)
+    cover = None
+    if clouds is not None:
+        cover = clouds.before(number, camera, attitude, pose.position_en_m)
+    corner = corner_en_m - pose.position_en_m
+    return render_view(camera, attitude, rgb, corner, ground.gsd_m, request.effects, rng, cover)
 
 
 def _told(request: SimulateRequest, area: Area, pose: _Pose, rng: np.random.Generator) -> Telemetry:
     """Telemetry of a pose with its errors."""
-    errors = request.errors
+    errors, height = request.errors, 1 + request.errors.agl_bias
+    yaw_deg, pitch_deg, roll_deg = pose.told_deg
+    yaw_deg += errors.yaw_bias_deg
     prior = None
     if errors.prior_std_m is not None:
         place = pose.position_en_m + rng.normal(0, errors.prior_std_m, 2)
@@ -291,11 +363,12 @@ def _told(request: SimulateRequest, area: Area, pose: _Pose, rng: np.random.Gene
         prior = Prior(float(lat), float(lon), errors.prior_std_m)
     return Telemetry(
         time_ns=round(pose.time_s * 1e9),
-        yaw_deg=round((pose.yaw_deg + rng.normal(0, 1) * errors.yaw_std_deg) % 360, 3),
-        pitch_deg=round(pose.pitch_deg + rng.normal(0, 1) * errors.tilt_std_deg, 3),
-        roll_deg=round(pose.roll_deg + rng.normal(0, 1) * errors.tilt_std_deg, 3),
-        agl_m=round(pose.agl_m * max(0.05, 1 + rng.normal(0, 1) * errors.agl_std), 3),
+        yaw_deg=round((yaw_deg + rng.normal(0, 1) * errors.yaw_std_deg) % 360, 3),
+        pitch_deg=round(pitch_deg + rng.normal(0, 1) * errors.tilt_std_deg, 3),
+        roll_deg=round(roll_deg + rng.normal(0, 1) * errors.tilt_std_deg, 3),
+        agl_m=round(pose.agl_m * max(0.05, height + rng.normal(0, 1) * errors.agl_std), 3),
         yaw_std_deg=errors.yaw_std_deg or None,
         agl_std_m=errors.agl_std * pose.agl_m or None,
         prior=prior,
+        vel_en_mps=pose.told_en_mps,
     )

@@ -14,6 +14,7 @@ from orthonav.geo.camera import (
     enu_from_camera,
     undistort,
 )
+from orthonav.simulate.clouds import Cover
 
 Array = NDArray[np.float64]
 
@@ -48,11 +49,14 @@ def render_view(
     gsd_m: float,
     effects: ViewEffects,
     rng: np.random.Generator,
+    clouds: Cover | None = None,
 ) -> NDArray[np.uint8]:
     """Picture (H, W, 3) of ground (h, w, 3) whose north-west corner lies at `ground_corner_en_m`,
     metres from the point below the camera; `attitude` is yaw, pitch, roll (deg) and height (m).
     """
     picture = _projected(camera, attitude, ground_rgb, ground_corner_en_m, gsd_m)
+    if clouds is not None:
+        picture = clouds.over(picture)
     if effects.blur_px > 0:
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), effects.blur_px), dtype=np.uint8)
     gain = float(np.exp(rng.normal(0, 1) * effects.exposure_std))

@@ -1,0 +1,207 @@
+"""How an aircraft gets along its route: corners, wind, what odometry tells of it, and its mount."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import FlightError
+from orthonav.geo.camera import attitude_of, enu_from_camera
+from orthonav.geo.route import along_polyline_en_m
+
+GUST_STD = 0.15
+"""Standard deviation per axis of what gusts add to the wind, as a share of its speed."""
+LARGEST_GUST = 0.4
+"""What gusts add at most, as a share of the wind's speed."""
+GUST_TIME_S = 60.0
+"""Time after which a gust is e times weaker."""
+DRIFT_TIME_S = 300.0
+"""Time after which the error of odometry is e times smaller: it hardly changes within a minute."""
+ARC_STEP_DEG = 2.0
+SHARPEST_DEG = 179.0
+"""A corner that turns by more is no arc: the aircraft turns about on the spot."""
+LONGEST_STEP_S = 0.5
+"""Wind and course stay the same for so long."""
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Wind:
+    """Wind of `speed_mps` that comes from `from_deg` (clockwise from true north), with gusts.
+
+    Gusts are an Ornstein-Uhlenbeck process per axis, `GUST_STD` of the speed strong and gone after
+    about `GUST_TIME_S`.
+    """
+
+    speed_mps: float
+    from_deg: float = 270.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.speed_mps <= 200:
+            raise FlightError(f"wind must be 0 to 200 m/s, got {self.speed_mps}")
+        if not -360 <= self.from_deg <= 360:
+            raise FlightError(
+                f"wind must come from -360 to 360 deg from true north, got {self.from_deg}"
+            )
+
+    @property
+    def strongest_mps(self) -> float:
+        """Speed in the strongest gust."""
+        return self.speed_mps * (1 + LARGEST_GUST)
+
+    @property
+    def velocity_en_mps(self) -> Array:
+        """Mean velocity of the air over ground (2,)."""
+        angle = math.radians(self.from_deg)
+        return -self.speed_mps * np.array([math.sin(angle), math.cos(angle)])
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """Views (N) along a route: places (N, 2), heading (N,), time since the first (N,), and the
+    velocity over ground at the first (2,)."""
+
+    places_en_m: Array
+    headings_deg: Array
+    times_s: Array
+    first_velocity_en_mps: Array
+
+    @property
+    def velocities_en_mps(self) -> Array:
+        """(N, 2) velocity over ground since the view before: what adds up to the way."""
+        moved = np.diff(self.places_en_m, axis=0) / np.diff(self.times_s)[:, None]
+        return np.concatenate([self.first_velocity_en_mps[None], moved])
+
+
+def steady_way(line_en_m: Array, spacing_m: float, speed_mps: float) -> Way:
+    """Along the polyline (M, 2) in still air: the heading is the course."""
+    places, courses = along_polyline_en_m(line_en_m, spacing_m)
+    first = speed_mps * _direction(float(courses[0]))
+    times = np.arange(len(places), dtype=np.float64) * spacing_m / speed_mps
+    return Way(places, courses, times, first)
+
+
+def windy_way(
+    line_en_m: Array,
+    spacing_m: float,
+    airspeed_mps: float,
+    wind: Wind,
+    rng: np.random.Generator,
+    most: int,
+) -> Way:
+    """Along the polyline (M, 2) in wind: the heading crabs, the speed over ground varies.
+
+    Views are `spacing_m / airspeed_mps` seconds apart, `most` of them and one at the most. Raises
+    `FlightError` where the strongest gust is not slower than the aircraft.
+    """
+    if wind.strongest_mps >= airspeed_mps:
+        raise FlightError(
+            f"wind of {wind.speed_mps:g} m/s, {wind.strongest_mps:.3g} m/s in gusts, is too strong "
+            f"for an airspeed of {airspeed_mps:g} m/s: the aircraft cannot keep to its route"
+        )
+    legs = np.diff(line_en_m, axis=0)
+    lengths = np.linalg.norm(legs, axis=1)
+    legs, starts, lengths = legs[lengths > 0], line_en_m[:-1][lengths > 0], lengths[lengths > 0]
+    if not len(legs):
+        return steady_way(line_en_m, spacing_m, airspeed_mps)
+    courses, ends = legs / lengths[:, None], np.cumsum(lengths)
+    interval_s = spacing_m / airspeed_mps
+    steps = math.ceil(interval_s / LONGEST_STEP_S)
+    air = _moving_air(wind, interval_s / steps, rng)
+    rows: list[tuple[float, ...]] = []
+    along_m, number = 0.0, 0
+    while along_m <= ends[-1] + 1e-9 and len(rows) <= most:
+        leg = min(int(np.searchsorted(ends, along_m)), len(ends) - 1)
+        course, moved_by = courses[leg], next(air)
+        across = np.array([course[1], -course[0]])
+        drift_mps = float(moved_by @ across)
+        ahead_mps = math.sqrt(airspeed_mps**2 - drift_mps**2)
+        ground_mps = ahead_mps + float(moved_by @ course)
+        if number % steps == 0:
+            place = starts[leg] + (along_m - (ends[leg] - lengths[leg])) * course
+            heading = ahead_mps * course - drift_mps * across
+            rows.append((*place, *heading, *(ground_mps * course)))
+        along_m += ground_mps * interval_s / steps
+        number += 1
+    made = np.array(rows)
+    headings = np.asarray(np.degrees(np.arctan2(made[:, 2], made[:, 3])) % 360, dtype=np.float64)
+    times = np.arange(len(made), dtype=np.float64) * interval_s
+    return Way(made[:, :2], headings, times, made[0, 4:])
+
+
+def _moving_air(wind: Wind, step_s: float, rng: np.random.Generator) -> Iterator[Array]:
+    """Velocity of the air (2,) after every step, without end."""
+    std, most = GUST_STD * wind.speed_mps, LARGEST_GUST * wind.speed_mps
+    for gust in _wandering(step_s / GUST_TIME_S, rng):
+        added = gust * std
+        yield wind.velocity_en_mps + added * min(1.0, most / max(float(np.hypot(*added)), 1e-9))
+
+
+def _wandering(step: float, rng: np.random.Generator) -> Iterator[Array]:
+    """A stationary Ornstein-Uhlenbeck process (2,) of standard deviation 1, steps of `step` time
+    constants (Gillespie 1996, doi:10.1103/PhysRevE.54.2084)."""
+    kept = math.exp(-step)
+    value = rng.normal(0, 1, 2)
+    while True:
+        yield value
+        value = kept * value + math.sqrt(1 - kept**2) * rng.normal(0, 1, 2)
+
+
+def drifting(velocities: Array, times_s: Array, drift: float, rng: np.random.Generator) -> Array:
+    """What odometry tells of velocities (N, 2): too long or short by a share of `drift`, turned by
+    `drift` radians (standard deviations), both wandering with `DRIFT_TIME_S`."""
+    step_s = float(times_s[1] - times_s[0]) if len(times_s) > 1 else 1.0
+    off = drift * np.array(
+        [error for error, _ in zip(_wandering(step_s / DRIFT_TIME_S, rng), times_s, strict=False)]
+    )
+    cos, sin = np.cos(off[:, 1]), np.sin(off[:, 1])
+    east, north = velocities.T
+    turned = np.stack([cos * east + sin * north, cos * north - sin * east], axis=1)
+    return np.asarray((1 + off[:, :1]) * turned)
+
+
+def rounded(line_en_m: Array, radius_m: float) -> Array:
+    """The polyline (M, 2) with its corners cut to arcs of a radius, tighter where legs are short.
+
+    About-turns stay as they are.
+    """
+    if len(line_en_m) < 3:
+        return line_en_m
+    parts = [line_en_m[:1]]
+    for before, corner, after in zip(line_en_m, line_en_m[1:], line_en_m[2:], strict=False):
+        parts.append(_arc(before, corner, after, radius_m))
+    return np.concatenate([*parts, line_en_m[-1:]])
+
+
+def _arc(before: Array, corner: Array, after: Array, radius_m: float) -> Array:
+    """Points (K, 2) of the arc that leaves one leg and joins the next, half of each at most."""
+    legs = np.array([corner - before, after - corner])
+    lengths = np.linalg.norm(legs, axis=1)
+    if lengths.min() == 0:
+        return corner[None]
+    into, out = legs / lengths[:, None]
+    turn = math.atan2(into[0] * out[1] - into[1] * out[0], float(into @ out))
+    if not 1e-6 < abs(turn) < math.radians(SHARPEST_DEG):
+        return corner[None]
+    tangent_m = min(radius_m * math.tan(abs(turn) / 2), float(lengths.min()) / 2)
+    radius_m = tangent_m / math.tan(abs(turn) / 2)
+    left = np.array([-into[1], into[0]]) * math.copysign(1.0, turn)
+    angles = np.linspace(0, abs(turn), 2 + int(math.degrees(abs(turn)) / ARC_STEP_DEG))[:, None]
+    start = corner - tangent_m * into
+    return np.asarray(start + radius_m * (np.sin(angles) * into + (1 - np.cos(angles)) * left))
+
+
+def mounted(
+    attitude_deg: tuple[float, float, float], pitch_deg: float, roll_deg: float
+) -> tuple[float, float, float]:
+    """Heading, pitch and roll of a camera that leans in an aircraft of that attitude."""
+    level = enu_from_camera(0.0, 0.0, 0.0)
+    leaning = enu_from_camera(0.0, pitch_deg, roll_deg)
+    return attitude_of(enu_from_camera(*attitude_deg) @ level.T @ leaning)
+
+
+def _direction(course_deg: float) -> Array:
+    angle = math.radians(course_deg)
+    return np.array([math.sin(angle), math.cos(angle)])

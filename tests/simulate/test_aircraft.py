@@ -1,0 +1,300 @@
+"""Simulated flights of a real aircraft: wind, odometry, biases, clouds, ground beyond the map."""
+
+import math
+
+import numpy as np
+import pytest
+
+from conftest import textured
+from orthonav.errors import AreaError, FlightError
+from orthonav.flight import open_flight, read_image, read_truth
+from orthonav.geo.area import Area
+from orthonav.geo.camera import Camera
+from orthonav.geo.route import Route, distance_to_polyline_m
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.localizer import prepare_view, rectify
+from orthonav.simulate.clouds import Clouds
+from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+from orthonav.simulate.ground import reflected
+from orthonav.simulate.motion import Wind
+from orthonav.simulate.render import ViewEffects
+
+PLAIN = ViewEffects(exposure_std=0.0, blur_px=0.0, noise_std=0.0, jpeg_quality=100)
+SMALL = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
+SEEN = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
+CORNERS = np.array([[-300.0, -200.0], [-300.0, 100.0], [200.0, 100.0]])
+ALL = Errors(5.0, 0.05, 1.0, 2.0, 40.0)
+
+
+def frame_of(ortho):
+    """Of the plane that simulated flights over an orthophoto use."""
+    outline = Mosaic.open([ortho]).outline_latlon_deg
+    return Area.from_outline(outline[:, 0], outline[:, 1]).frame
+
+
+def route_over(frame, corners):
+    lat, lon = frame.latlon_from_en(np.array(corners, dtype=np.float64))
+    return Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)))
+
+
+@pytest.fixture(scope="module")
+def ortho(make_ortho, tmp_path_factory):
+    """800 x 700 m of blots."""
+    return make_ortho(tmp_path_factory.mktemp("blots") / "blots.tif", textured((700, 800)))
+
+
+@pytest.fixture(scope="module")
+def frame(ortho):
+    return frame_of(ortho)
+
+
+@pytest.fixture
+def fly(ortho, frame, tmp_path):
+    def flown(name="f", corners=CORNERS, **request):
+        route = route_over(frame, corners)
+        kinds = {"route": route, "agl_m": 100.0, "camera": SMALL, "effects": PLAIN, **request}
+        simulate_flight(SimulateRequest([ortho], tmp_path / name, **kinds))
+        return open_flight(tmp_path / name), read_truth(tmp_path / name / "truth.csv")
+
+    return flown
+
+
+def told_by(flight, *fields):
+    return np.array([[getattr(v.telemetry, name) for name in fields] for v in flight.views])
+
+
+def pictures(flight):
+    return [read_image(view.path) for view in flight.views]
+
+
+def test_a_flight_without_the_new_options_is_what_it_was(area, tmp_path):
+    """Numbers of the simulator as it was before it had wind, biases and clouds."""
+    request = SimulateRequest(
+        [area.past],
+        tmp_path / "f",
+        route=route_over(frame_of(area.past), CORNERS),
+        agl_m=100.0,
+        camera=SMALL,
+        errors=ALL,
+        seed=1,
+        spacing_m=50.0,
+    )
+    simulate_flight(request)
+    lines = (tmp_path / "f/telemetry.csv").read_text().splitlines()
+    assert lines[0].endswith("prior_std_m")
+    assert lines[1] == "0001.jpg,0,344.838,0.245,1.841,102.234,5,5,48.85912509,2.34941189,40"
+    assert lines[4] == "0004.jpg,6,353.495,2.995,0.282,106.121,5,5,48.86032265,2.34959257,40"
+
+
+def test_in_wind_the_aircraft_keeps_its_route_and_crabs(fly, frame):
+    flight, truth = fly(wind=Wind(10.0, 270.0), spacing_m=25.0, errors=Errors(velocity_drift=0.0))
+    places = np.array([frame.en_from_latlon(*truth[view.frame]) for view in flight.views])
+    assert distance_to_polyline_m(places, CORNERS).max() < 0.05
+    seconds = told_by(flight, "time_ns")[:, 0] / 1e9
+    assert np.diff(seconds) == pytest.approx(1.0)
+    north = places[:, 1] < 99
+    yaw = (told_by(flight, "yaw_deg")[:, 0] + 180) % 360 - 180
+    assert yaw[north].mean() == pytest.approx(-math.degrees(math.asin(0.4)), abs=6)
+    assert yaw[~north] == pytest.approx(90, abs=15)
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    assert steps[~north[1:]][1:].min() > 29 and steps[north[1:]].max() < 25
+    told = told_by(flight, "vel_en_mps")[:, 0]
+    assert told[1:] == pytest.approx(np.diff(places, axis=0), abs=0.01)
+
+
+def test_odometry_drifts_and_is_told(fly, frame, tmp_path):
+    exact, truth = fly("exact", errors=Errors(velocity_drift=0.0), spacing_m=80.0, seed=2)
+    erring, same = fly("erring", errors=Errors(velocity_drift=0.1), spacing_m=80.0, seed=2)
+    assert truth == same
+    true, told = (told_by(flight, "vel_en_mps")[:, 0] for flight in (exact, erring))
+    ratio = np.linalg.norm(told, axis=1) / np.linalg.norm(true, axis=1) - 1
+    assert 0.001 < np.abs(ratio).mean() < 0.3 and np.abs(np.diff(ratio)).max() < 0.05
+    header = (tmp_path / "erring/telemetry.csv").read_text().splitlines()[0]
+    assert header.endswith("vel_east_mps,vel_north_mps")
+
+
+def test_turns_are_arcs(fly, frame):
+    flight, truth = fly(turn_radius_m=100.0, spacing_m=20.0)
+    yaw = told_by(flight, "yaw_deg")[:, 0]
+    turned = (np.diff(yaw) + 180) % 360 - 180
+    assert turned.sum() == pytest.approx(90, abs=0.1)
+    assert np.abs(turned).max() < 1.1 * math.degrees(20 / 100)
+    places = np.array([frame.en_from_latlon(*truth[view.frame]) for view in flight.views])
+    inside = np.linalg.norm(places - [-200.0, 0.0], axis=1)
+    assert inside[(yaw > 5) & (yaw < 85)] == pytest.approx(100, abs=0.5)
+
+
+def test_biases_are_told_wrong_all_along(fly):
+    exact, truth = fly("exact", errors=ALL, spacing_m=100.0, seed=3)
+    bias = Errors(*[5.0, 0.05, 1.0, 2.0, 40.0], yaw_bias_deg=-4.0, agl_bias=0.08)
+    erring, same = fly("erring", errors=bias, spacing_m=100.0, seed=3)
+    assert truth == same
+    off = told_by(erring, "yaw_deg", "agl_m") - told_by(exact, "yaw_deg", "agl_m")
+    assert (off[:, 0] + 180) % 360 - 180 == pytest.approx(-4)
+    assert off[:, 1] == pytest.approx(8)
+    rest = ("pitch_deg", "roll_deg", "yaw_std_deg", "agl_std_m", "time_ns")
+    assert (told_by(erring, *rest) == told_by(exact, *rest)).all()
+    for a, b in zip(pictures(exact), pictures(erring), strict=True):
+        assert (a == b).all()
+
+
+def test_the_mount_leans_more_than_told(fly, ortho, frame):
+    """A view shows the ground at the truth if it is levelled with the bias too."""
+    bias = Errors(lean_std_deg=1.0, pitch_bias_deg=4.0, roll_bias_deg=-3.0)
+    straight, truth = fly("straight", camera=SEEN, errors=Errors(lean_std_deg=1.0))
+    leaning, same = fly("leaning", camera=SEEN, errors=bias)
+    rest = ("yaw_deg", "pitch_deg", "roll_deg", "agl_m")
+    assert truth == same and (told_by(straight, *rest) == told_by(leaning, *rest)).all()
+
+    def alike(view, pitch_deg, roll_deg):
+        """Correlation of the levelled view with the orthophoto where it should lie."""
+        told, size_px = view.telemetry, 64
+        levelled = rectify(
+            prepare_view(read_image(view.path), SEEN, told.agl_m, 1.0),
+            yaw_deg=told.yaw_deg,
+            pitch_deg=told.pitch_deg + pitch_deg,
+            roll_deg=told.roll_deg + roll_deg,
+            agl_m=told.agl_m,
+            gsd_m=1.0,
+            size_px=size_px,
+        )
+        west, north = (
+            frame.en_from_latlon(*truth[view.frame])
+            + levelled.offset_en_m
+            + [-size_px / 2, size_px / 2]
+        )
+        sheet = {"west_m": west, "north_m": north, "width_px": size_px, "height_px": size_px}
+        with Mosaic.open([ortho]).sheet(frame, **sheet, gsd_m=1.0) as raster:
+            ground = raster.read(0, 0, size_px, size_px).grey
+        return np.corrcoef(levelled.grey.ravel(), ground.ravel())[0, 1]
+
+    for view in leaning.views[::8]:
+        assert alike(view, 4.0, -3.0) > 0.98 and alike(view, 0.0, 0.0) < 0.8
+    assert alike(straight.views[0], 0.0, 0.0) > 0.98
+
+
+def test_clouds_hide_some_views_and_leave_the_others(fly):
+    kinds = {"camera": SEEN, "spacing_m": 25.0, "seed": 3}
+    clear, truth = fly("clear", **kinds)
+    hidden, same = fly("hidden", **kinds, cloud_share=0.4)
+    assert truth == same
+    fields = ("yaw_deg", "time_ns", "agl_m")
+    assert (told_by(clear, *fields) == told_by(hidden, *fields)).all()
+    pairs = list(zip(pictures(clear), pictures(hidden), strict=True))
+    clouds = Clouds(len(pairs), 0.4, 3)
+    degree = np.array([clouds.degree(number) for number in range(len(pairs))])
+    assert [not np.array_equal(a, b) for a, b in pairs] == (degree > 0).tolist()
+    spread = np.array([b.std() for _, b in pairs])
+    assert (degree == 1).sum() >= 3 and spread[degree == 1].max() < 6
+    assert spread[(degree > 0.3) & (degree < 0.7)].min() > 15
+
+
+OUT = [[0.0, 0.0], [700.0, 40.0]]
+
+
+def test_beyond_the_imagery_the_ground_is_mirrored(fly, frame):
+    flight, _ = fly(corners=OUT, beyond=True, camera=SEEN, spacing_m=90.0)
+    views = pictures(flight)
+    assert len(views) == 8
+    for view in views:
+        assert view.std() > 4 and (view == 0).mean() < 0.03
+    with pytest.raises(AreaError, match="wholly within"):
+        fly("not", corners=OUT, camera=SEEN, spacing_m=90.0)
+    inside, _ = fly("inside", corners=[[0.0, 0.0], [280.0, 16.0]], camera=SEEN, spacing_m=90.0)
+    for a, b in zip(views, pictures(inside), strict=False):
+        assert np.abs(a.astype(int) - b).mean() < 0.5
+
+
+def test_the_mirror_is_the_border(fly):
+    """Flown out along a row, what is seen comes back the other way round."""
+    edge = 400.0
+    lines = [[edge - 150, 0.0], [edge - 150, 1.0]], [[edge + 146, 0.0], [edge + 146, 1.0]]
+    (inside, _), (outside, _) = (
+        fly(f"f{n}", corners=line, beyond=True, camera=SEEN) for n, line in enumerate(lines)
+    )
+    a, b = read_image(inside.views[0].path), read_image(outside.views[0].path)[:, ::-1]
+    alike = max(
+        np.corrcoef(a[:, 12:-12].ravel(), np.roll(b, shift, axis=1)[:, 12:-12].ravel())[0, 1]
+        for shift in range(-12, 13)
+    )
+    assert alike > 0.9
+
+
+def test_mirrors_at_both_ends():
+    """The last row comes first again: nothing is skipped at the border."""
+    assert reflected(np.arange(-3, 9), 0, 3).tolist() == [2, 1, 0, 0, 1, 2, 2, 1, 0, 0, 1, 2]
+    assert reflected(np.arange(3, 8), 4, 6).tolist() == [4, 4, 5, 5, 4]
+
+
+REFUSED = {
+    "gale": ({"wind": Wind(25.0)}, "too strong"),
+    "turn": ({"turn_radius_m": -1.0}, "radius of turns"),
+    "turn nan": ({"turn_radius_m": math.nan}, "radius of turns"),
+    "cloud": ({"cloud_share": -0.1}, "cloud_share must be 0 to 1"),
+    "clouds": ({"cloud_share": 1.1}, "cloud_share must be 0 to 1"),
+    "cloud nan": ({"cloud_share": math.nan}, "cloud_share must be 0 to 1"),
+    "spacing": ({"spacing_m": math.inf}, "above 0"),
+    "speed": ({"speed_mps": math.nan}, "above 0"),
+}
+
+
+@pytest.mark.parametrize("request_, message", REFUSED.values(), ids=REFUSED.keys())
+def test_flights_that_cannot_be(fly, tmp_path, names_in, request_, message):
+    with pytest.raises(FlightError, match=message):
+        fly(**request_)
+    assert names_in(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        {"wind": Wind(5.0)},
+        {"turn_radius_m": 10.0},
+        {"beyond": True},
+        {"errors": Errors(velocity_drift=0.0)},
+    ],
+    ids=["wind", "turn_radius_m", "beyond", "velocity_drift"],
+)
+def test_random_places_are_no_route(fly, request, request_):
+    with pytest.raises(FlightError, match=f"{request.node.callspec.id}: only along a route"):
+        fly(route=None, random=3, **request_)
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("velocity_drift", -0.02),
+        ("velocity_drift", 2.0),
+        ("velocity_drift", math.nan),
+        ("yaw_bias_deg", math.nan),
+        ("yaw_bias_deg", 270.0),
+        ("agl_bias", 1.5),
+        ("agl_bias", math.nan),
+        ("pitch_bias_deg", -45.0),
+        ("roll_bias_deg", math.inf),
+    ],
+)
+def test_impossible_errors_are_refused(name, value):
+    with pytest.raises(FlightError, match=f"{name} must be"):
+        Errors(**{name: value})
+
+
+def test_the_command(run, ortho, frame, tmp_path):
+    points = route_over(frame, OUT).waypoints
+    lines = ["lat_deg,lon_deg", *(f"{lat},{lon}" for lat, lon in points)]
+    (tmp_path / "route.csv").write_text("\n".join(lines))
+    fly = ["simulate", "--ortho", ortho, "--route", tmp_path / "route.csv", "--agl-m", "100"]
+    biases = ["--yaw-bias-deg", "-3", "--agl-bias", "0.05", "--pitch-bias-deg", "1"]
+    wind = ["--wind-mps", "8", "--wind-from-deg", "200", "--turn-radius-m", "50"]
+    rest = ["--velocity-drift", "0.02", "--cloud-share", "0.2", "--roll-bias-deg", "-1"]
+    done = run(
+        *fly, *biases, *wind, *rest, "--beyond", "--spacing-m", "300", "--out", tmp_path / "f"
+    )
+    assert done.code == 0 and "views written" in done.out
+    told = open_flight(tmp_path / "f").views[0].telemetry
+    assert told.vel_en_mps is not None and told.agl_m == pytest.approx(105)
+    done = run(*fly, "--wind-mps", "30", "--out", tmp_path / "g")
+    assert done.code == 1 and "too strong for an airspeed of 25 m/s" in done.err
+    done = run(*fly, "--wind-from-deg", "30", "--out", tmp_path / "g")
+    assert done.code == 1 and "--wind-mps" in done.err
+    assert not (tmp_path / "g").exists()

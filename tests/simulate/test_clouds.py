@@ -1,0 +1,89 @@
+"""Clouds: as many as asked, closed in the middle, soft at the edges, moving with the ground."""
+
+import numpy as np
+import pytest
+
+from orthonav.geo.camera import Camera
+from orthonav.simulate.clouds import EDGE, GRID, HEIGHT, MOST_VIEWS, Clouds
+
+CAMERA = Camera(320, 240, 260.0, 260.0, 160.0, 120.0)
+AGL_M = 1000.0
+LEVEL = (0.0, 0.0, 0.0, AGL_M)
+
+
+def degrees_of(count, share, seed=0):
+    clouds = Clouds(count, share, seed)
+    return np.array([clouds.degree(number) for number in range(count)])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.2, 0.77, 1.0])
+@pytest.mark.parametrize("count", [1, 7, 500])
+def test_the_share_of_views_with_clouds(count, share):
+    degree = degrees_of(count, share)
+    assert (degree > 0).sum() == round(share * count)
+    assert degree.min() >= 0 and degree.max() <= 1
+
+
+def test_stretches_close_and_open_again():
+    made = [degrees_of(500, 0.15, seed) for seed in range(8)]
+    for degree in made:
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], degree > 0, [0]])))
+        lengths = np.diff(edges)[::2]
+        assert lengths.max() <= 2 * MOST_VIEWS  # two may touch
+        assert np.abs(np.diff(degree)).max() <= 1 / (1 + EDGE * min(lengths.min(), 10)) + 1e-9
+    closed = np.concatenate(made)
+    share = (closed == 1).sum() / (closed > 0).sum()
+    assert 0.2 < share < 0.7
+
+
+def test_another_seed_has_clouds_elsewhere():
+    assert (degrees_of(500, 0.2, 1) == degrees_of(500, 0.2, 1)).all()
+    assert (degrees_of(500, 0.2, 1) != degrees_of(500, 0.2, 2)).any()
+
+
+@pytest.fixture(scope="module")
+def clouds():
+    return Clouds(60, 1.0, 5)
+
+
+def test_cover_grows_with_the_degree(clouds):
+    found = []
+    for number in range(60):
+        cover = clouds.before(number, CAMERA, LEVEL, np.zeros(2))
+        assert cover.opacity.shape == (240, 320) == cover.grey.shape
+        assert cover.opacity.min() >= 0 and cover.opacity.max() <= 1
+        found.append((clouds.degree(number), float(cover.opacity.mean())))
+    degree, hidden = np.array(sorted(found)).T
+    assert np.corrcoef(degree, hidden)[0, 1] > 0.9
+    assert (hidden[degree == 1] == 1).all() and hidden[degree < 0.2].max() < 0.6
+
+
+def test_edges_are_soft(clouds):
+    number = min(range(60), key=lambda n: abs(clouds.degree(n) - 0.5))
+    opacity = clouds.before(number, CAMERA, LEVEL, np.zeros(2)).opacity
+    assert ((opacity > 0.05) & (opacity < 0.95)).mean() > 0.05
+    assert np.abs(np.diff(opacity, axis=1)).max() < 0.2
+
+
+def test_clouds_pass_below_the_aircraft(clouds):
+    """Half as high as the aircraft, they move twice as fast through the view as the ground."""
+    number = min(range(60), key=lambda n: abs(clouds.degree(n) - 0.5))
+    rows = 4 * GRID
+    north_m = rows * CAMERA.gsd_m(AGL_M * (1 - HEIGHT))
+    before = clouds.before(number, CAMERA, LEVEL, np.zeros(2)).opacity
+    after = clouds.before(number, CAMERA, LEVEL, np.array([0.0, north_m])).opacity
+    same = np.corrcoef(after[rows:].ravel(), before[:-rows].ravel())[0, 1]
+    assert same > 0.97
+    assert np.corrcoef(after.ravel(), before.ravel())[0, 1] < 0.9
+
+
+def test_a_picture_behind_clouds(clouds):
+    picture = np.full((240, 320, 3), 50, np.uint8)
+    numbers = sorted(range(60), key=clouds.degree)
+    thin, closed = (
+        clouds.before(n, CAMERA, LEVEL, np.zeros(2)) for n in numbers[:: len(numbers) - 1]
+    )
+    assert (thin.over(picture)[thin.opacity == 0] == 50).all()
+    white = closed.over(picture)
+    assert white.min() > 175 and white.std() < 8 and white.dtype == np.uint8
+    assert (picture == 50).all()
