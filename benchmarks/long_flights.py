@@ -52,7 +52,7 @@ LEG_M, SHARPEST_DEG = (3000.0, 9000.0), 120.0
 WIND_MPS, DRIFT, CLOUD_SHARE = 8.0, 0.02, 0.15
 YAW_BIAS_DEG, AGL_BIAS = 3.0, 0.05
 SCATTER = Errors(
-    yaw_std_deg=1.0, agl_std=0.01, tilt_std_deg=0.7, lean_std_deg=2.0, velocity_drift=DRIFT
+    yaw_std_deg=1.0, agl_std=0.01, tilt_std_deg=0.2, lean_std_deg=2.0, velocity_drift=DRIFT
 )
 GAP_M, JUMP_M = 3000.0, 2000.0
 """What a kidnapped flight leaves out at least: so much of the way, and so far as the crow flies."""

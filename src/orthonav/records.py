@@ -32,6 +32,8 @@ class Telemetry:
     true north; `pitch_deg` and `roll_deg` are 0, 0 where the optical axis points straight down
     (positive pitch looks ahead, positive roll looks left); `agl_m` is the height above ground.
     NaN stands for "not known". Velocities are over ground, true east and north.
+    The `_std` ones are standard deviations of what is told, from view to view, None where not
+    known: `lean_std_deg` of pitch and of roll, `vel_std_mps` per axis.
     """
 
     time_ns: int
@@ -43,6 +45,8 @@ class Telemetry:
     agl_std_m: float | None = None
     prior: Prior | None = None
     vel_en_mps: tuple[float, float] | None = None
+    lean_std_deg: float | None = None
+    vel_std_mps: float | None = None
 
     def missing(self) -> list[str]:
         """Names of the fields without which a view cannot be rectified, empty if all are there."""

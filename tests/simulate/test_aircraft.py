@@ -81,9 +81,9 @@ def test_a_flight_without_the_new_options_is_what_it_was(area, tmp_path):
     )
     simulate_flight(request)
     lines = (tmp_path / "f/telemetry.csv").read_text().splitlines()
-    assert lines[0].endswith("prior_std_m")
-    assert lines[1] == "0001.jpg,0,344.838,0.245,1.841,102.234,5,5,48.85912509,2.34941189,40"
-    assert lines[4] == "0004.jpg,6,353.495,2.995,0.282,106.121,5,5,48.86032265,2.34959257,40"
+    assert lines[0].endswith("prior_std_m,lean_std_deg")
+    assert lines[1] == "0001.jpg,0,344.838,0.245,1.841,102.234,5,5,48.85912509,2.34941189,40,1"
+    assert lines[4] == "0004.jpg,6,353.495,2.995,0.282,106.121,5,5,48.86032265,2.34959257,40,1"
 
 
 def test_in_wind_the_aircraft_keeps_its_route_and_crabs(fly, frame):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthonav.track import Displacement, Mixture, Model, Sighting, State, Told
+from orthonav.track import CameraWay, Mixture, Model, Sighting, State, Told, ToldVelocity
 from orthonav.track.mixture import within
 from orthonav.track.smooth import History
 
@@ -35,7 +35,7 @@ class Flight:
         cos, sin = math.cos(-self.bias[0]), math.sin(-self.bias[0])
         told = np.array([[cos, sin], [-sin, cos]]) @ way * math.exp(-self.bias[1])
         noisy = told + self.rng.normal(0, 0.5, 2)
-        return Displacement(noisy, np.eye(2) * 0.25, relative=True)
+        return CameraWay(noisy, np.eye(2) * 0.25, 80.0)
 
     def told(self):
         """What instruments say: level and north, where the truth is the biases and noise."""
@@ -62,7 +62,7 @@ def flown(seed, views=60, false_share=0.3, model=MODEL, history=None):
     rows = []
     for view in range(views):
         if view:
-            mixture.predict(1.0, flight.moved())
+            mixture.predict(1.0, camera=flight.moved())
         false = flight.sighting(-1.0, flight.rng.uniform(-0.5, 0.5, 2) * SIDE_M)
         seen = [false] if flight.rng.random() < false_share else [flight.sighting(2.0), false]
         mixture.update(flight.told(), seen)
@@ -105,7 +105,7 @@ def test_one_lucky_view_is_no_track():
     mixture.update(flight.told(), [flight.sighting(30.0)])
     first = mixture.estimate(RADIUS_M)
     assert first.state is State.SEARCHING and first.confidence < 0.9999
-    mixture.predict(1.0, flight.moved())
+    mixture.predict(1.0, camera=flight.moved())
     mixture.update(flight.told(), [flight.sighting(3.0)])
     assert mixture.estimate(RADIUS_M).state is State.TRACKING
 
@@ -153,7 +153,7 @@ def test_a_kidnapped_aircraft_is_found_again():
     flight.place = -flight.place
     states, confident_wrong = [], 0
     for _ in range(25):
-        mixture.predict(1.0, flight.moved())
+        mixture.predict(1.0, camera=flight.moved())
         mixture.update(flight.told(), [flight.sighting(3.0)])
         states.append(mixture.estimate(RADIUS_M).state)
         wrong = off_m(mixture, flight) > RADIUS_M
@@ -168,7 +168,7 @@ def test_false_places_that_come_and_go_are_not_followed():
     for seed in range(4):
         flight, mixture = Flight(seed), Mixture(MODEL, EXTENT)
         for _ in range(30):
-            mixture.predict(1.0, flight.moved())
+            mixture.predict(1.0, camera=flight.moved())
             places = [flight.rng.uniform(-0.5, 0.5, 2) * SIDE_M for _ in range(3)]
             seen = [flight.sighting(flight.rng.normal(-3, 1), place) for place in places]
             mixture.update(flight.told(), seen)
@@ -180,7 +180,7 @@ def test_a_camera_that_was_knocked_is_followed():
     flight, mixture, _ = flown(5)
     flight.bias = flight.bias + np.array([0.0, 0.0, math.radians(9.0), 0.0])
     for _ in range(15):
-        mixture.predict(1.0, flight.moved())
+        mixture.predict(1.0, camera=flight.moved())
         mixture.update(flight.told(), [flight.sighting(3.0)])
     assert off_m(mixture, flight) < 12
     assert mixture.estimate(RADIUS_M).mean[6] > BIAS[2] + 0.05
@@ -195,7 +195,7 @@ def test_a_told_start_is_believed_until_views_say_otherwise():
         moved = flight.moved()
         sighting = flight.sighting(2.0)
         for mixture in (right, wrong):
-            mixture.predict(1.0, moved)
+            mixture.predict(1.0, camera=moved)
             mixture.update(flight.told(), [sighting])
     assert off_m(right, flight) < 10 and off_m(wrong, flight) < 10
 
@@ -242,7 +242,8 @@ def test_unknown_heading_is_followed():
     flight, mixture = Flight(9, model), Mixture(model, EXTENT)
     for view in range(30):
         if view:
-            mixture.predict(1.0, replace(flight.moved(), relative=False))
+            seen = flight.moved()
+            mixture.predict(1.0, ToldVelocity(seen.moved_en_m, None, 0.7))
         sighting = flight.sighting(2.0)
         turned = sighting.mean + np.array([0, 0, 2.2, 0, 0, 0])
         mixture.update(Told(None, 0.0, 0.0), [replace(sighting, mean=turned)])

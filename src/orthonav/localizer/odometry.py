@@ -14,7 +14,7 @@ from orthonav.register.reference import Reference
 from orthonav.register.registrar import Levels, PosePrior, Registered, Registrar
 from orthonav.register.search import bank, search
 from orthonav.register.template import ViewTemplates, halved
-from orthonav.track.model import Displacement
+from orthonav.track import CameraWay
 
 VIEW_PX = 160
 """Views are compared at about so many pixels across."""
@@ -114,7 +114,7 @@ class Footprint:
 class Moved:
     """A displacement, and the share of the later view that the earlier one showed too."""
 
-    displacement: Displacement
+    way: CameraWay
     overlap: float
 
 
@@ -154,14 +154,14 @@ def moved_between(
     told_rad = math.radians(
         (now.telemetry.yaw_deg - now.off_deg) - (before.telemetry.yaw_deg - before.off_deg)
     )
-    displacement = Displacement(
+    seen = CameraWay(
         way,
         np.eye(2) * variance,
-        relative=True,
+        reach_m=_reach_px(before, now) * before.pixel_m,
         turned_rad=math.remainder(pose.turn_rad - told_rad, 2 * math.pi),
         scaled=pose.log_scale + now.off_log_scale - before.off_log_scale,
     )
-    return Moved(displacement, min(max(found.placed.overlap, 0.0), 1.0))
+    return Moved(seen, min(max(found.placed.overlap, 0.0), 1.0))
 
 
 def _registered(before: Footprint, now: Footprint, prior: PosePrior) -> Registered | None:
@@ -170,10 +170,7 @@ def _registered(before: Footprint, now: Footprint, prior: PosePrior) -> Register
     rows, cols = before.grey.shape
     side_px = math.sqrt(float(now.valid.sum()))
     levels = Levels.of(side_px, LEVELS)
-    seconds = (now.telemetry.time_ns - before.telemetry.time_ns) / 1e9
-    far = math.hypot(rows, cols)
-    # A clock that stands still says nothing of how far it may be.
-    reach = min(MAX_SPEED_MPS * seconds / before.pixel_m, far) if seconds > 0 else far
+    reach = _reach_px(before, now)
     tried = bank(
         prior.turn_std_rad,
         prior.log_scale_std,
@@ -192,3 +189,11 @@ def _registered(before: Footprint, now: Footprint, prior: PosePrior) -> Register
         return None
     judged = registrar.judged(templates, levels, candidates, level, prior)
     return registrar.finished(templates, levels, judged, prior, len(candidates))
+
+
+def _reach_px(before: Footprint, now: Footprint) -> float:
+    """How far from the earlier view the later one is looked for, in pixels of both."""
+    seconds = (now.telemetry.time_ns - before.telemetry.time_ns) / 1e9
+    far = math.hypot(*before.grey.shape)
+    # A clock that stands still says nothing of how far it may be.
+    return min(MAX_SPEED_MPS * seconds / before.pixel_m, far) if seconds > 0 else far

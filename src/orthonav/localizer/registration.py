@@ -336,6 +336,9 @@ class RegistrationLocalizer:
         placed = best.placed
         lat, lon = self.sheet.frame.latlon_from_en(self.camera_en_m(view, placed.pose))
         covariance = self.covariance(view, placed)[:2, :2]
+        if telemetry.lean_std_deg is not None:
+            lean_m = telemetry.agl_m * math.radians(telemetry.lean_std_deg)
+            covariance = covariance + np.eye(2) * lean_m**2
         covariance.flags.writeable = False
         evidence = best.evidence()
         confidence = math.nan if self.confidence is None else self.confidence(evidence)

@@ -17,12 +17,12 @@ from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_telemetry, check_view
 from orthonav.localizer.levelled import levelled
 from orthonav.localizer.localizer import Localizer
-from orthonav.localizer.odometry import Footprint, moved_between
+from orthonav.localizer.odometry import Footprint, Moved, moved_between
 from orthonav.localizer.registration import PreparedFootprint
 from orthonav.records import Fix, NoFix, Prior, Telemetry
 from orthonav.register.pose import Pose
 from orthonav.register.registrar import Registered
-from orthonav.track import Displacement, Estimate, Mixture, Model, Sighting, State, Told
+from orthonav.track import Estimate, Mixture, Model, Sighting, State, Told, ToldVelocity
 from orthonav.track.mixture import within
 from orthonav.track.model import HEADING, LEAN, SCALE
 from orthonav.track.smooth import History, Smoothed
@@ -37,6 +37,8 @@ LONGEST_GAP_S = 600.0
 UNKNOWN_STEP_S = 1.0
 """Time that is taken to have passed where the clock stands still or jumps back."""
 WORTH_LOG_ODDS = -12.0
+RADIUS_SHARE = 0.025
+"""Of the height, the least radius that a confidence is about: what an angle of 1.4 deg makes."""
 VELOCITY_STD_MPS = 1.0
 VELOCITY_SHARE = 0.02
 Array = NDArray[np.float64]
@@ -68,13 +70,14 @@ class Tracker:
             raise MapFileError("a track needs a map with a registration layer and its confidence")
         self._registration, self._confidence = registration, registration.confidence
         self._localizer, self._heading_known = localizer, heading_known
-        self.model = model or Model()
+        self.model, self._usual_model = model or Model(), model is None
         grid = localizer.grid
         east_m, south_m = grid.width_px * grid.gsd_m, -grid.height_px * grid.gsd_m
         extent = grid.west_m, grid.north_m + south_m, grid.west_m + east_m, grid.north_m
         self.mixture = Mixture(self.model, extent)
         self._time_ns: int | None = None
         self._before: Footprint | None = None
+        self._velocity: Array | None = None
         self._use_prior, self._every_prior = use_prior, every_prior
         self._history = History() if hindsight else None
         self._lag = lag
@@ -136,12 +139,18 @@ class Tracker:
         spread = float(np.trace(smoothed.covariance[:2, :2]))
         if isinstance(before, Fix) and spread > float(np.trace(before.cov_en_m2)):
             return before
-        inside = within(smoothed.mean, smoothed.covariance, self._registration.radius_m)
+        inside = within(smoothed.mean, smoothed.covariance, self._radius_m(telemetry))
         belief = min(smoothed.belief, 1.0) * inside
         return self._fix(smoothed.mean, smoothed.covariance, belief, telemetry, {})
 
+    def _radius_m(self, telemetry: Telemetry) -> float:
+        """The error that a confidence is about."""
+        high = RADIUS_SHARE * telemetry.agl_m
+        least = self._registration.radius_m
+        return max(least, high) if math.isfinite(high) else least
+
     def _outcome(self, telemetry: Telemetry, refused: NoFix | None) -> Fix | NoFix:
-        estimate = self.mixture.estimate(self._registration.radius_m)
+        estimate = self.mixture.estimate(self._radius_m(telemetry))
         self.state = State.SEARCHING if estimate is None else estimate.state
         outcome: Fix | NoFix = refused or NoFix("searching", "no place has been found yet")
         if estimate is not None:
@@ -167,6 +176,9 @@ class Tracker:
         if grey is not None and self._heading_known:
             now = self._footprint(grey, camera, telemetry, before)
         prior = telemetry.prior if self._use_prior or self._every_prior else None
+        if self._usual_model and math.isfinite(telemetry.agl_m):
+            self._usual_model = False
+            self.model = self.mixture.model = self.model.at_height(telemetry.agl_m)
         if self._time_ns is None:
             self._time_ns, self._before = telemetry.time_ns, now
             if prior is not None:
@@ -177,12 +189,13 @@ class Tracker:
             seconds = UNKNOWN_STEP_S if seconds <= 0 else LONGEST_GAP_S
         self._time_ns = telemetry.time_ns
         noise = self._told_noise(telemetry)
-        moved, overlap = self._moved(before, now, telemetry.vel_en_mps, seconds, noise)
+        seen = self._seen_way(before, now, noise)
         self._before = now
-        self.mixture.predict(seconds, moved, noise)
+        told = self._told_velocity(telemetry)
+        self.mixture.predict(seconds, told, None if seen is None else seen.way, noise)
         if self._every_prior and prior is not None:
             self.mixture.told_position(*self._place(prior))
-        return overlap
+        return 0.0 if seen is None else seen.overlap
 
     def _place(self, prior: Prior) -> tuple[Array, float]:
         """Metres east and north (2,) of a prior, and its standard deviation."""
@@ -215,31 +228,36 @@ class Tracker:
                 return made
         return Footprint.of(grey, camera, corrected, None, **known)
 
-    def _moved(
-        self,
-        before: Footprint | None,
-        now: Footprint | None,
-        velocity: tuple[float, float] | None,
-        seconds: float,
-        told_noise: Array,
-    ) -> tuple[Displacement | None, float]:
-        """The way since the last view by the camera, else by the told velocity; the share of the
-        view that the last one showed too."""
-        if before is not None and now is not None and before.pixel_m == now.pixel_m:
-            seen = moved_between(before, now, self.model.lean_noise_rad, told_noise)
-            if seen is not None:
-                return seen.displacement, seen.overlap
-        if velocity is None:
-            return None, 0.0
-        way = np.array(velocity) * seconds
-        std = VELOCITY_STD_MPS * seconds + VELOCITY_SHARE * float(np.hypot(*way))
-        return Displacement(way, np.eye(2) * std**2, relative=False), 0.0
+    def _told_velocity(self, telemetry: Telemetry) -> ToldVelocity | None:
+        """The told velocity beside that of the view before, None where none is told."""
+        before, told = self._velocity, telemetry.vel_en_mps
+        self._velocity = None
+        if told is None or not np.isfinite(told).all():
+            return None
+        self._velocity = now = np.array(told)
+        std = telemetry.vel_std_mps
+        if std is None or not std > 0:
+            std = VELOCITY_STD_MPS + VELOCITY_SHARE * float(np.hypot(*now))
+        return ToldVelocity(now, before, std)
+
+    def _lean_noise(self, telemetry: Telemetry) -> float:
+        """How far told pitch and roll are off from view to view (rad), as told or as usual."""
+        told = telemetry.lean_std_deg
+        return self.model.lean_noise_rad if told is None else math.radians(told)
+
+    def _seen_way(
+        self, before: Footprint | None, now: Footprint | None, told_noise: Array
+    ) -> Moved | None:
+        """The way since the last view by the camera, and how much of it both views showed."""
+        if before is None or now is None or before.pixel_m != now.pixel_m:
+            return None
+        return moved_between(before, now, self._lean_noise(now.telemetry), told_noise)
 
     def _observe(
         self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry, overlap: float
     ) -> NoFix | None:
         """Look for the view and hand what it may be to the mixture; why not, if it cannot be."""
-        expected = self.mixture.estimate(self._registration.radius_m)
+        expected = self.mixture.estimate(self._radius_m(telemetry))
         bias, spread = self.mixture.bias()
         corrected = _known(_corrected(telemetry, bias), spread)
         view = self._registration.prepared(grey, camera, corrected, self._heading_known)
@@ -255,6 +273,7 @@ class Tracker:
             math.radians(telemetry.yaw_deg) if self._heading_known else None,
             math.radians(telemetry.pitch_deg),
             math.radians(telemetry.roll_deg),
+            self._lean_noise(telemetry),
         )
         self.mixture.update(told, sightings, max(1 - overlap, LEAST_NEW), searched)
         return None
@@ -317,7 +336,7 @@ class Tracker:
         more: dict[str, float],
     ) -> Fix:
         lat, lon = self._localizer.sheet.frame.latlon_from_en(mean[:2])
-        spread = covariance[:2, :2].copy()
+        spread = covariance[:2, :2] + np.eye(2) * self.model.map_m**2
         spread.flags.writeable = False
         pitch, roll = np.degrees(mean[LEAN])
         evidence = {
@@ -335,7 +354,7 @@ class Tracker:
             lon_deg=float(lon),
             cov_en_m2=spread,
             confidence=confidence,
-            radius_m=self._registration.radius_m,
+            radius_m=self._radius_m(telemetry),
             heading_deg=(telemetry.yaw_deg + math.degrees(mean[HEADING])) % 360,
             agl_m=telemetry.agl_m * math.exp(mean[SCALE]),
             evidence=MappingProxyType(evidence),

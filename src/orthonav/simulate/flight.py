@@ -369,6 +369,7 @@ def _told(request: SimulateRequest, area: Area, pose: _Pose, rng: np.random.Gene
         agl_m=round(pose.agl_m * max(0.05, height + rng.normal(0, 1) * errors.agl_std), 3),
         yaw_std_deg=errors.yaw_std_deg or None,
         agl_std_m=errors.agl_std * pose.agl_m or None,
+        lean_std_deg=errors.tilt_std_deg or None,
         prior=prior,
         vel_en_mps=pose.told_en_mps,
     )

@@ -72,8 +72,8 @@ def rounded(telemetry: Telemetry) -> Telemetry:
     """The telemetry as a flight folder holds it, so that a source and its import give the same."""
     prior, velocity = telemetry.prior, telemetry.vel_en_mps
     yaw_std, agl_std = telemetry.yaw_std_deg, telemetry.agl_std_m
-    return Telemetry(
-        time_ns=telemetry.time_ns,
+    return replace(
+        telemetry,
         yaw_deg=round(telemetry.yaw_deg, DECIMALS),
         pitch_deg=round(telemetry.pitch_deg, DECIMALS),
         roll_deg=round(telemetry.roll_deg, DECIMALS),

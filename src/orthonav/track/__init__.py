@@ -1,6 +1,16 @@
 """Following the aircraft over time: from what single views say to one consistent track."""
 
 from orthonav.track.mixture import Estimate, Mixture, State
-from orthonav.track.model import Displacement, Model, Sighting, Told
+from orthonav.track.model import Model, Sighting, Told
+from orthonav.track.motion import CameraWay, ToldVelocity
 
-__all__ = ["Displacement", "Estimate", "Mixture", "Model", "Sighting", "State", "Told"]
+__all__ = [
+    "CameraWay",
+    "Estimate",
+    "Mixture",
+    "Model",
+    "Sighting",
+    "State",
+    "Told",
+    "ToldVelocity",
+]

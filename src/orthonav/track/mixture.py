@@ -9,31 +9,41 @@ it was there at the start; some comes back with every view, so that no mistake i
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
 from orthonav.track.model import (
+    LEAN,
     POSITION,
     SEEN,
     STATE,
     Array,
-    Displacement,
-    Expected,
     Model,
     Sighting,
     Told,
-    held_to_map,
-    knocked,
     log_density,
-    predicted,
     reading,
     updated,
 )
+from orthonav.track.motion import (
+    CameraWay,
+    Expected,
+    ToldVelocity,
+    by_camera,
+    held_to_map,
+    knocked,
+    predicted,
+    velocity_forgotten,
+)
 
 MAX_HYPOTHESES = 40
+MIN_WAY = 1e-5
+"""Less likely ways are not followed."""
+MINOR_SHARE = 1e-4
+"""Hypotheses with less belief are not split for what is rare."""
 MIN_SHARE = 1e-7
 MERGE_SIGMAS = 1.0
 TOLD_SHARE = 0.9
@@ -42,6 +52,11 @@ SURE = 0.9
 LIKELY = 0.5
 CONFIRMED = 1.4
 """Views' worth of new ground that must have been recognized before a track is one."""
+WHAT_DIFFERS = np.ix_([0, 1, 2, 3, 6, 7], [0, 1, 2, 3, 6, 7])
+"""Of the covariances of two hypotheses: position, velocity and lean."""
+WIDE_M, FORGOTTEN = 50.0, 0.5
+"""A track whose position is known less well than this counts but half, every time, of what was
+recognized before: after a while it must be confirmed anew."""
 GATE = 36.0
 POSE = slice(2, 4)
 """Heading and scale in what a sighting says."""
@@ -114,11 +129,13 @@ class Mixture:
 
     def start(self, mean_en_m: Array, std_m: float) -> None:
         """Begin with a position (2,) that was told, good to `std_m` per axis."""
-        mean, covariance = self._nowhere()
-        mean[POSITION] = mean_en_m
-        covariance[POSITION, POSITION] = np.eye(2) * std_m**2
-        self._numbers += 1
-        self.hypotheses = [Hypothesis(TOLD_SHARE, mean, covariance, 0.0, self._numbers)]
+        self.hypotheses = []
+        for share, mean, covariance in self._mounts():
+            mean[POSITION] = mean_en_m
+            covariance[POSITION, POSITION] = np.eye(2) * std_m**2
+            self._numbers += 1
+            told = Hypothesis(TOLD_SHARE * share, mean, covariance, 0.0, self._numbers)
+            self.hypotheses.append(told)
         self.elsewhere = 1 - TOLD_SHARE
 
     def told_position(self, mean_en_m: Array, std_m: float) -> None:
@@ -143,9 +160,13 @@ class Mixture:
         self._settle()
 
     def predict(
-        self, seconds: float, moved: Displacement | None = None, told_noise: Array | None = None
+        self,
+        seconds: float,
+        told: ToldVelocity | None = None,
+        camera: CameraWay | None = None,
+        told_noise: Array | None = None,
     ) -> None:
-        """Let time pass; `moved` is what the camera or instruments say of the way gone.
+        """Let time pass; `told` is what instruments say of the way gone, `camera` what views say.
 
         `told_noise` (2,): variances with which told heading (rad) and log scale scatter from view
         to view, those of the model where None.
@@ -154,11 +175,50 @@ class Mixture:
         kept = 1 - self.model.lost
         made = []
         for each in self.hypotheses:
-            expected = predicted(self.model, each.mean, each.covariance, seconds, moved, noise)
-            expected = held_to_map(self.model, expected, self.area_m2)
-            made.append(self._from(each, expected, each.share * kept))
+            for share, expected in self._ways(each, seconds, told, camera, noise):
+                on_map = held_to_map(self.model, expected, self.area_m2)
+                made.append(self._from(each, on_map, each.share * share * kept))
         self.hypotheses = made
         self.elsewhere += (1 - kept) * (1 - self.elsewhere)
+
+    def _ways(
+        self,
+        each: Hypothesis,
+        seconds: float,
+        told: ToldVelocity | None,
+        camera: CameraWay | None,
+        told_noise: Array,
+    ) -> Iterator[tuple[float, Expected]]:
+        """Where a hypothesis may be next, and how likely: as the camera saw it, or not so.
+
+        What the camera saw is weighed by what was expected: of a way that nothing else tells, it
+        may also be that the aircraft turned as nobody expected.
+        """
+        model, likely = self.model, 1 - self.model.slip
+        slipped = predicted(model, each.mean, each.covariance, seconds, told, told_noise)
+        if camera is None:
+            yield 1.0, slipped
+            return
+        # A wrong way lies anywhere that it was looked for.
+        wrong = math.log(model.slip / (math.pi * camera.reach_m**2))
+        ways = [(wrong, slipped)]
+        turns = [(likely, each.covariance)]
+        if each.share < MINOR_SHARE:
+            ways = []
+        elif told is None:
+            turns = [
+                (likely * (1 - model.turn), each.covariance),
+                (likely * model.turn, velocity_forgotten(model, each.covariance)),
+            ]
+        for share, covariance in turns:
+            turned = predicted(model, each.mean, covariance, seconds, told, told_noise, camera)
+            seen, log_fit = by_camera(turned, camera)
+            ways.append((math.log(share) + log_fit, seen))
+        best = max(log_share for log_share, _ in ways)
+        shares = [math.exp(max(log_share - best, -700.0)) for log_share, _ in ways]
+        for share, (_, expected) in zip(shares, ways, strict=True):
+            if share > MIN_WAY * sum(shares):
+                yield share / sum(shares), expected
 
     def update(
         self,
@@ -187,7 +247,7 @@ class Mixture:
                     split = self._seen(start, seen)
                     if split is not None:
                         made.append(replace(split, share=split.share * found))
-        made += [self._born(each) for each in readings]
+        made += [born for each in readings for born in self._born(each)]
         total = sum(each.share for each in made) + self.elsewhere
         self.elsewhere /= total
         made = [replace(each, share=each.share / total) for each in made]
@@ -241,7 +301,7 @@ class Mixture:
     def _or_knocked(self, each: Hypothesis) -> list[Hypothesis]:
         """A hypothesis as it is, and as it is if the camera was knocked since the last view."""
         rare = self.model.knocked
-        if each.expected is None:
+        if each.expected is None or each.share < MINOR_SHARE:
             return [each]
         expected = knocked(self.model, each.expected)
         other = replace(
@@ -257,16 +317,24 @@ class Mixture:
         """A sighting, of which only a part is new, as it is weighed.
 
         A likelihood taken to the power `newness` is not only lower: its peak becomes broader, and
-        stands out less from all the places, headings and scales that there are. Lean does not
-        count: it is looked for near where it is expected, so that it always seems to fit.
+        stands out less from all the places, headings and scales that there are. What is told anew
+        with every view is not part of that.
         """
-        seen, noise = reading(self.model, told, sighting)
+        seen, noise, anew = reading(self.model, told, sighting)
         own = np.diag(noise)[POSE] + self.model.initial_bias()[:2]
         wide = math.log(self.area_m2) + float(np.log(SEARCHED_SIGMAS * np.sqrt(own)).sum())
-        _, log_det = np.linalg.slogdet(2 * math.pi * noise[:4, :4])
-        odds = newness * min(sighting.log_odds, MAX_LOG_ODDS) - 2 * math.log(newness)
-        odds -= (1 - newness) * (wide - float(log_det) / 2)
-        return _Reading(seen, noise / newness, odds + wide, newness)
+        # A view leans as mounts do wherever it is put: that is no evidence for a place.
+        leans = noise[4:, 4:] + anew[4:, 4:]
+        wide -= math.log(
+            sum(
+                share * math.exp(log_density(seen[4:], leans + covariance[LEAN, LEAN]))
+                for share, _, covariance in self._mounts()
+            )
+        )
+        _, log_det = np.linalg.slogdet(2 * math.pi * noise)
+        odds = newness * (min(sighting.log_odds, MAX_LOG_ODDS) + wide)
+        odds += (1 - newness) * float(log_det) / 2 - len(SEEN) / 2 * math.log(newness)
+        return _Reading(seen, noise / newness + anew, odds, newness)
 
     def _seen(self, each: Hypothesis, seen: "_Reading") -> Hypothesis | None:
         """The hypothesis after a sighting, weighed; None where they have nothing in common."""
@@ -275,7 +343,7 @@ class Mixture:
         if off[:2] @ off[:2] > GATE * reach:
             return None
         spread = each.covariance[np.ix_(SEEN, SEEN)] + seen.noise
-        log_weight = seen.log_odds + log_density(off[:4], spread[:4, :4])
+        log_weight = seen.log_odds + log_density(off, spread)
         mean, covariance = updated(each.mean, each.covariance, off, spread)
         self._numbers += 1
         return replace(
@@ -287,29 +355,36 @@ class Mixture:
             number=self._numbers,
         )
 
-    def _nowhere(self) -> tuple[Array, Array]:
+    def _nowhere(self, lean_rad: float | None = None) -> tuple[Array, Array]:
         """Mean (8,) and covariance (8, 8) of an aircraft that may be anywhere on the map."""
         place, speed = self.area_m2, self.model.speed_mps**2
-        variances = [place, place, speed, speed, *self.model.initial_bias()]
+        variances = [place, place, speed, speed, *self.model.initial_bias(lean_rad)]
         return np.zeros(STATE), np.diag(np.array(variances))
 
-    def _born(self, seen: "_Reading") -> Hypothesis:
-        """The hypothesis that the aircraft was elsewhere, and is here."""
-        mean, covariance = self._nowhere()
-        spread = covariance[np.ix_(SEEN, SEEN)] + seen.noise
-        log_weight = seen.log_odds - math.log(self.area_m2)
-        log_weight += log_density(seen.seen[POSE], spread[POSE, POSE])
-        mean, covariance = updated(mean, covariance, seen.seen, spread)
-        share = self.elsewhere * math.exp(min(log_weight, 60.0))
-        self._numbers += 1
-        return Hypothesis(share, mean, covariance, seen.newness, self._numbers)
+    def _mounts(self) -> Iterator[tuple[float, Array, Array]]:
+        """How likely a mount is good, or off; mean and covariance of somebody anywhere with it."""
+        off = self.model.off_mount
+        yield 1 - off, *self._nowhere()
+        yield off, *self._nowhere(self.model.off_lean_rad)
+
+    def _born(self, seen: "_Reading") -> Iterator[Hypothesis]:
+        """The hypotheses that the aircraft was elsewhere, and is here."""
+        for share, mean, covariance in self._mounts():
+            spread = covariance[np.ix_(SEEN, SEEN)] + seen.noise
+            log_weight = seen.log_odds - math.log(self.area_m2)
+            log_weight += log_density(seen.seen[2:], spread[2:, 2:])
+            mean, covariance = updated(mean, covariance, seen.seen, spread)
+            share *= self.elsewhere * math.exp(min(log_weight, 60.0))
+            self._numbers += 1
+            yield Hypothesis(share, mean, covariance, seen.newness, self._numbers)
 
     def _from(self, each: Hypothesis, expected: Expected, share: float) -> Hypothesis:
         self._numbers += 1
         mean, covariance = expected.mean, expected.covariance
-        return Hypothesis(
-            share, mean, covariance, each.sighted, self._numbers, each.number, expected
-        )
+        sighted = each.sighted
+        if float(np.trace(covariance[POSITION, POSITION])) > 2 * WIDE_M**2:
+            sighted *= FORGOTTEN
+        return Hypothesis(share, mean, covariance, sighted, self._numbers, each.number, expected)
 
     def _settle(self) -> None:
         """Shares that add up to one with what is elsewhere."""
@@ -325,7 +400,7 @@ def _merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
     kept: list[Hypothesis] = []
     while left and len(kept) < MAX_HYPOTHESES:
         first, rest = left[0], left[1:]
-        inverse = np.asarray(np.linalg.inv(first.covariance[:4, :4]), np.float64)
+        inverse = np.asarray(np.linalg.inv(first.covariance[WHAT_DIFFERS]), np.float64)
         group, left = [first], []
         for each in rest:
             alike = _divergence(each, first, inverse) < 2 * MERGE_SIGMAS**2
@@ -339,14 +414,14 @@ def _merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
 
 def _divergence(one: Hypothesis, heavier: Hypothesis, inverse: Array) -> float:
     """How much is lost (nats, Kullback and Leibler) where a hypothesis becomes part of a heavier
-    one, in position and velocity; `inverse` (4, 4) is that of the heavier one's covariance.
+    one, in position, velocity and lean; `inverse` (6, 6) is that of the heavier one's covariance.
 
     A place that is known well is not the same as a wide guess around it.
     """
-    off = one.mean[:4] - heavier.mean[:4]
-    turned = inverse @ one.covariance[:4, :4]
+    off = (one.mean - heavier.mean)[[0, 1, 2, 3, 6, 7]]
+    turned = inverse @ one.covariance[WHAT_DIFFERS]
     _, log_det = np.linalg.slogdet(turned)
-    return float(off @ inverse @ off + np.trace(turned) - 4 - log_det) / 2
+    return float(off @ inverse @ off + np.trace(turned) - 6 - log_det) / 2
 
 
 def _moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ true over told height, focal length included), pitch and roll (rad; of these wha
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ Array = NDArray[np.float64]
 STATE = 8
 POSITION, VELOCITY, HEADING, SCALE, LEAN = slice(0, 2), slice(2, 4), 4, 5, slice(6, 8)
 HEADING_FLOOR_RAD, SCALE_FLOOR = math.radians(0.3), 0.004
+MOUNT_M, MOUNT_RAD = 10.0, (math.radians(0.5), math.radians(1.5))
+LEAN_WALK_SHARE = 1 / 30
+"""Of how far a mount may be off is how far it drifts, per root of a second."""
 SEEN = [0, 1, 4, 5, 6, 7]
 """Which of the state a sighting speaks of."""
 
@@ -24,33 +27,53 @@ class Model:
     """How aircraft and instruments behave.
 
     `speed_mps`: standard deviation of an unknown velocity per axis; `accel_mps2`: of what changes
-    it. `heading_rad`, `log_scale`, `lean_rad`: how wrong the told values may be all along;
-    `heading_noise_rad`, `log_scale_noise`, `lean_noise_rad`: how they scatter from view to view;
-    the `_walk` ones how the former drift, per root of a second. `sighting_noise_m`: what maps of
-    two dates disagree by beyond what registration knows, which counts `sighting_growth` times.
+    it; `told_velocity_s`: for how long a told one is off by about the same. `heading_rad`,
+    `log_scale`, `lean_rad`: how wrong the told values may be all along; `heading_noise_rad`,
+    `log_scale_noise`, `lean_noise_rad`: how they scatter from view to view; the `_walk` ones how
+    the former drift, per root of a second. `sighting_noise_m`: what maps of two dates disagree by
+    beyond what registration knows, which counts `sighting_growth` times; `map_m`: how far a map
+    may be displaced as a whole.
+    `off_mount`: how likely the mount is not as good as `lean_rad` but off by `off_lean_rad`.
+    `slip`: how likely a way between two views is wrong though it looks right: clouds that move, a
+    field that repeats. `turn`: how likely the velocity changes by more than `accel_mps2` says.
     `knocked`: how likely heading, scale and lean are suddenly wrong by something else than before:
-    a gimbal that moved (by `knocked_lean_rad`), a compass that was reset. `miss`: how likely a view
+    a gimbal that moved (by `off_lean_rad`), a compass that was reset. `miss`: how likely a view
     of ground that is on the map shows nothing that can be found. `lost`: how likely the track went
     wrong since the last view.
     """
 
     speed_mps: float = 30.0
-    accel_mps2: float = 5.0
+    accel_mps2: float = 4.0
+    told_velocity_s: float = 120.0
     heading_rad: float = math.radians(7.0)
     heading_noise_rad: float = math.radians(2.0)
     heading_walk: float = math.radians(0.05)
     log_scale: float = 0.08
     log_scale_noise: float = 0.02
     log_scale_walk: float = 5e-4
-    lean_rad: float = math.radians(3.0)
-    knocked_lean_rad: float = math.radians(6.0)
+    lean_rad: float = math.radians(0.5)
+    off_lean_rad: float = math.radians(6.0)
+    off_mount: float = 0.03
     lean_noise_rad: float = math.radians(0.7)
-    lean_walk: float = math.radians(0.05)
-    sighting_noise_m: float = 1.0
+    lean_walk: float = math.radians(0.01)
+    sighting_noise_m: float = 2.0
+    map_m: float = 3.0
     sighting_growth: float = 2.0
     knocked: float = 0.01
+    slip: float = 0.01
+    turn: float = 0.03
     miss: float = 0.5
     lost: float = 1e-3
+
+    def at_height(self, agl_m: float) -> "Model":
+        """The same, with a mount as good as flying at that height asks for.
+
+        Who flies high has mounted the camera so that fixes are of use: it is expected to be off by
+        what is `MOUNT_M` on the ground, within `MOUNT_RAD`.
+        """
+        low, high = MOUNT_RAD
+        lean_rad = min(max(MOUNT_M / max(agl_m, 1e-3), low), high)
+        return replace(self, lean_rad=lean_rad, lean_walk=LEAN_WALK_SHARE * lean_rad)
 
     def initial_bias(self, lean_rad: float | None = None) -> Array:
         """Variances (4,) of heading, log scale, pitch and roll before anything is seen."""
@@ -70,11 +93,13 @@ class Model:
 
 @dataclass(frozen=True)
 class Told:
-    """What was told of a view: heading (rad; None where unknown), pitch and roll (rad)."""
+    """What was told of a view: heading (rad; None where unknown), pitch and roll (rad), and how
+    far these two are off from view to view (None: as usual)."""
 
     heading_rad: float | None
     pitch_rad: float
     roll_rad: float
+    lean_noise_rad: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,120 +116,17 @@ class Sighting:
     log_odds: float
 
 
-@dataclass(frozen=True, eq=False)
-class Displacement:
-    """Movement since the last view, metres east and north (2,), covariance (2, 2).
-
-    `relative`: it was measured by the camera and turned by the told heading, so that wrong heading
-    and scale bend it like everything else. Then the camera also saw by how much the heading turned
-    and the scale changed other than told (rad, natural logarithm), known to `turned_std_rad` and
-    `scaled_std`.
-    """
-
-    moved_en_m: Array
-    covariance: Array
-    relative: bool
-    turned_rad: float = 0.0
-    scaled: float = 0.0
-    turned_std_rad: float = math.radians(0.4)
-    scaled_std: float = 0.004
-
-
-@dataclass(frozen=True, eq=False)
-class Expected:
-    """What a state became until the next view: mean (8,), covariance (8, 8), and how much of each
-    part of it is left in that, `step` (8, 8)."""
-
-    mean: Array
-    covariance: Array
-    step: Array
-
-    def without(self, part: slice, variances: Array) -> "Expected":
-        """The same with a part of the state forgotten: nothing is left of it but variances."""
-        mean, covariance, step = self.mean.copy(), self.covariance.copy(), self.step.copy()
-        mean[part] = 0.0
-        step[part] = 0.0
-        covariance[part] = covariance[:, part] = 0.0
-        covariance[part, part] = np.diag(variances)
-        return Expected(mean, covariance, step)
-
-
-def predicted(
-    model: Model,
-    mean: Array,
-    covariance: Array,
-    seconds: float,
-    moved: Displacement | None,
-    told_noise: Array,
-) -> Expected:
-    """What a state is expected to be after so many seconds.
-
-    `told_noise` (2,) are the variances with which told heading and log scale scatter from view to
-    view: what was wrong with the last ones says that much less of these, unless the camera saw how
-    they changed.
-    """
-    mean, step = mean.copy(), np.eye(STATE)
-    noise = np.zeros((STATE, STATE))
-    noise[range(4, 8), range(4, 8)] = model.drift(seconds)
-    if moved is None or not moved.relative:
-        noise[HEADING, HEADING] += told_noise[0]
-        noise[SCALE, SCALE] += told_noise[1]
-    if moved is None:
-        step[0, 2] = step[1, 3] = seconds
-        power = model.accel_mps2**2
-        for axis in (0, 1):
-            noise[axis, axis] = power * seconds**4 / 4
-            noise[axis, axis + 2] = noise[axis + 2, axis] = power * seconds**3 / 2
-            noise[axis + 2, axis + 2] = power * seconds**2
-        return Expected(step @ mean, step @ covariance @ step.T + noise, step)
-    east, north = moved.moved_en_m
-    scale = np.eye(2)
-    by_bias = np.zeros((2, 2))
-    if moved.relative:
-        cos, sin = math.cos(mean[HEADING]), math.sin(mean[HEADING])
-        scale = math.exp(mean[SCALE]) * np.array([[cos, sin], [-sin, cos]])
-        by_bias = np.stack([scale @ [north, -east], scale @ [east, north]], axis=1)
-    gone = scale @ [east, north]
-    spread = scale @ moved.covariance @ scale.T
-    per_s = 1 / max(seconds, 1e-3)
-    if moved.relative:
-        mean[HEADING] += moved.turned_rad
-        mean[SCALE] += moved.scaled
-        noise[HEADING, HEADING] += moved.turned_std_rad**2
-        noise[SCALE, SCALE] += moved.scaled_std**2
-    mean[POSITION] += gone
-    mean[VELOCITY] = gone * per_s
-    step[VELOCITY, VELOCITY] = 0
-    step[POSITION, 4:6] = by_bias
-    step[VELOCITY, 4:6] = by_bias * per_s
-    into = np.zeros((STATE, 2))
-    into[POSITION], into[VELOCITY] = np.eye(2), np.eye(2) * per_s
-    noise += into @ spread @ into.T
-    noise[VELOCITY, VELOCITY] += np.eye(2) * (model.accel_mps2 * seconds) ** 2
-    return Expected(mean, step @ covariance @ step.T + noise, step)
-
-
-def held_to_map(model: Model, expected: Expected, area_m2: float) -> Expected:
-    """The same, with a position that is known to be on the map at least.
-
-    Where no more than that is left of it, it is forgotten, with the velocity.
-    """
-    if float(np.linalg.eigvalsh(expected.covariance[POSITION, POSITION])[-1]) <= area_m2:
-        return expected
-    return expected.without(slice(0, 4), np.repeat([area_m2, model.speed_mps**2], 2))
-
-
-def knocked(model: Model, expected: Expected) -> Expected:
-    """The same where heading, scale and lean are no longer what they were."""
-    return expected.without(slice(4, 8), model.initial_bias(model.knocked_lean_rad))
-
-
-def reading(model: Model, told: Told, sighting: Sighting) -> tuple[Array, Array]:
-    """What a sighting says of the state (6,), in the order of `SEEN`, and its covariance (6, 6)."""
+def reading(model: Model, told: Told, sighting: Sighting) -> tuple[Array, Array, Array]:
+    """What a sighting says of the state (6,), in the order of `SEEN`, and two covariances (6, 6):
+    of how map and view err, and of what is told anew at every view."""
     noise = sighting.covariance.copy()
-    noise[:2, :2] *= model.sighting_growth
+    lean = slice(4, 6)
+    by_lean = noise[:2, lean] @ np.linalg.solve(noise[lean, lean], noise[lean, :2])
+    noise[:2, :2] += (model.sighting_growth - 1) * (noise[:2, :2] - by_lean)
     floor = [model.sighting_noise_m] * 2 + [HEADING_FLOOR_RAD, SCALE_FLOOR]
-    noise[range(6), range(6)] += np.square([*floor, model.lean_noise_rad, model.lean_noise_rad])
+    noise[range(4), range(4)] += np.square(floor)
+    told_lean = model.lean_noise_rad if told.lean_noise_rad is None else told.lean_noise_rad
+    anew = np.diag(np.square([0.0, 0.0, 0.0, 0.0, told_lean, told_lean]))
     seen = sighting.mean.copy()
     if told.heading_rad is None:
         seen[2] = 0.0
@@ -213,7 +135,7 @@ def reading(model: Model, told: Told, sighting: Sighting) -> tuple[Array, Array]
     else:
         seen[2] = math.remainder(seen[2] - told.heading_rad, 2 * math.pi)
     seen[4:] -= [told.pitch_rad, told.roll_rad]
-    return seen, noise
+    return seen, noise, anew
 
 
 def updated(mean: Array, covariance: Array, off: Array, spread: Array) -> tuple[Array, Array]:

@@ -57,17 +57,18 @@ class History:
                     None if after is None else Smoothed(after.mean, after.covariance, after.share)
                 )
             else:
-                later = _one_back(before, after, later)
+                later = _one_back(after, later)
                 after = before
             out.append(later)
         return out[::-1]
 
 
-def _one_back(before: Hypothesis, after: Hypothesis, later: Smoothed) -> Smoothed:
+def _one_back(after: Hypothesis, later: Smoothed) -> Smoothed:
     """The view before, with what is known of the one after it."""
     expected = after.expected
     assert expected is not None
-    gain = before.covariance @ expected.step.T @ np.linalg.pinv(expected.covariance)
-    mean = before.mean + gain @ (later.mean - expected.mean)
-    covariance = before.covariance + gain @ (later.covariance - expected.covariance) @ gain.T
+    gain = expected.cross @ np.linalg.pinv(expected.covariance)
+    mean = expected.mean_before + gain @ (later.mean - expected.mean)
+    covariance = expected.covariance_before
+    covariance = covariance + gain @ (later.covariance - expected.covariance) @ gain.T
     return Smoothed(mean, np.asarray((covariance + covariance.T) / 2), later.belief)
