@@ -207,7 +207,8 @@ def test_a_told_start_needs_no_search(localizer):
         (g, replace(t, prior=told if not n else None), p) for n, (g, t, p) in enumerate(views(4))
     ]
     rows = followed(Tracker(localizer), localizer, seen)
-    assert rows[0][0] < 15 and rows[0][1] > 0.9
+    assert rows[0][0] < 15 and rows[0][1] == pytest.approx(0.8)
+    assert rows[-1][1] > 0.9 and rows[-1][2] == "tracking"
     unused = Tracker(localizer, use_prior=False)
     followed(unused, localizer, seen[:1])
     assert all(each.parent == -1 for each in unused.mixture.hypotheses)
@@ -344,3 +345,55 @@ def test_odometry_refuses_views_without_common_ground():
     assert moved_between(first, nan, 0.01, np.array([1e-3, 4e-4])) is None
     blank = Footprint.of(np.full((240, 320), 90, np.uint8), WIDE, later, first.pixel_m)
     assert blank is None or moved_between(first, blank, 0.01, np.array([1e-3, 4e-4])) is None
+
+
+def test_a_fixed_lag_uses_the_views_after_each(localizer):
+    seen = list(views(16))
+    whole = Tracker(localizer, hindsight=True)
+    lagged = Tracker(localizer, hindsight=True, lag=3)
+    for tracker in (whole, lagged):
+        followed(tracker, localizer, seen)
+    found, all_of_them = lagged.in_hindsight(), whole.in_hindsight()
+    assert len(found) == len(all_of_them) == 16
+    off = [
+        np.hypot(*(place_of(localizer, a) - place_of(localizer, b)))
+        for a, b in zip(found, all_of_them, strict=True)
+    ]
+    assert max(off[-4:]) == 0 and max(off[4:]) < 5
+    errors = [np.hypot(*(place_of(localizer, a) - s[2])) for a, s in zip(found, seen, strict=True)]
+    assert max(errors) < 8
+    at_once = Tracker(localizer, hindsight=True, lag=0)
+    rows = followed(at_once, localizer, seen[:6])
+    for now, then in zip(rows, at_once.in_hindsight(), strict=True):
+        assert place_of(localizer, now[3]) == pytest.approx(place_of(localizer, then), abs=3.0)
+
+
+def test_gnss_of_a_first_leg_teaches_the_mount(localizer):
+    """Positions put beside what is seen: 5 deg of pitch are 13 m from 150 m."""
+    frame = localizer.sheet.frame
+    tracker = Tracker(localizer, every_prior=True)
+    seen = []
+    for grey, told, place in views(10, lean=(5.0, 0.0), year=lit):
+        lat, lon = frame.latlon_from_en(place)
+        seen.append((grey, replace(told, prior=Prior(float(lat), float(lon), 2.0)), place))
+    rows = followed(tracker, localizer, seen)
+    evidence = rows[-1][3].evidence
+    assert evidence["pitch_bias_deg"] == pytest.approx(5.0, abs=1.2)
+    assert evidence["pitch_bias_std_deg"] < 1.5
+
+
+def test_the_radius_grows_with_the_height(localizer):
+    high = Camera(320, 240, 200 * 2000 / AGL_M, 200 * 2000 / AGL_M, 160.0, 120.0)
+    grey, told, _ = next(iter(views(1)))
+    found = Tracker(localizer).locate(grey, high, replace(told, agl_m=2000.0))
+    assert found.radius_m == pytest.approx(50.0, rel=0.1)
+    low = Tracker(localizer).locate(grey, WIDE, told)
+    assert low.radius_m == localizer.registration.radius_m
+
+
+def test_a_heading_told_the_wrong_way_round_makes_no_track(localizer):
+    """Ground looks alike turned by half: views fit somewhere, one by one, and are not believed."""
+    tracker = Tracker(localizer)
+    rows = followed(tracker, localizer, views(24, heading_off=180.0))
+    assert not any(row[1] > 0.8 and row[0] > 35 for row in rows)
+    assert all(row[2] == "searching" for row in rows)

@@ -259,3 +259,113 @@ def test_within_is_the_share_of_a_round_gaussian():
         told = within(np.zeros(8), covariance, 15.0, np.array(middle))
         assert told == pytest.approx(share, abs=tolerance)
     assert within(np.zeros(8), covariance, 15.0, np.array([500.0, 0.0])) == 0
+
+
+def test_a_way_that_cannot_be_is_not_followed():
+    """A cloud that moves over the ground: told velocity says that the camera's way is wrong."""
+    flight, mixture, _ = flown(5)
+    before = None
+    for _ in range(12):
+        flight.moved()
+        wrong = CameraWay(3 * SPEED, np.eye(2) * 0.25, 80.0)
+        mixture.predict(1.0, ToldVelocity(SPEED, before, 1.0), wrong)
+        before = SPEED
+        mixture.update(flight.told(), [])
+    estimate = mixture.estimate(RADIUS_M)
+    assert off_m(mixture, flight) < 25 or estimate.confidence < 0.5
+
+
+def test_a_sudden_turn_is_followed_where_no_velocity_is_told():
+    flight, mixture, _ = flown(6)
+    for _ in range(4):
+        way = np.array([-14.0, 9.0])
+        flight.place = flight.place + way
+        cos, sin = math.cos(-BIAS[0]), math.sin(-BIAS[0])
+        told = np.array([[cos, sin], [-sin, cos]]) @ way * math.exp(-BIAS[1])
+        mixture.predict(1.0, camera=CameraWay(told, np.eye(2) * 0.25, 80.0))
+        mixture.update(flight.told(), [])
+    assert off_m(mixture, flight) < 10
+
+
+def test_a_told_velocity_that_is_off_for_long_is_learnt():
+    """Dead reckoning through 30 s without a view: the told wind is wrong by 1.8 m/s all along."""
+    flight, mixture, before = Flight(7), Mixture(MODEL, EXTENT), None
+    told = SPEED + np.array([1.5, -1.0])
+    for second in range(90):
+        way = flight.moved()
+        seen = second < 60
+        mixture.predict(1.0, ToldVelocity(told, before, 1.5), way if seen else None)
+        before = told
+        if seen:
+            mixture.update(flight.told(), [flight.sighting(4.0)])
+    estimate = mixture.estimate(RADIUS_M)
+    error = estimate.mean[:2] - flight.place
+    assert np.hypot(*error) < 20 < 30 * 1.8
+    assert error @ np.linalg.solve(estimate.covariance[:2, :2], error) < 14
+
+
+def test_a_place_that_is_known_well_is_not_merged_into_a_wide_guess():
+    flight, mixture, _ = flown(8)
+    mixture.predict(60.0)
+    mixture.update(flight.told(), [flight.sighting(-2.0)])
+    std = [math.sqrt(np.trace(each.covariance[:2, :2])) for each in mixture.hypotheses]
+    assert min(std) < 20 and max(std) > 100
+
+
+@pytest.mark.parametrize(("lean_deg", "found"), [(0.0, 0.0), (7.0, 7.0)])
+def test_a_mount_is_good_unless_views_say_otherwise(lean_deg, found):
+    bias = np.array([0.0, 0.0, math.radians(lean_deg), 0.0])
+    flight, mixture = Flight(9, bias=bias), Mixture(MODEL, EXTENT)
+    for view in range(15):
+        if view:
+            mixture.predict(1.0, camera=flight.moved())
+        mixture.update(flight.told(), [flight.sighting(5.0)])
+    lean = math.degrees(mixture.estimate(RADIUS_M).mean[6])
+    assert lean == pytest.approx(found, abs=1.0)
+
+
+def test_how_a_view_leans_is_no_evidence_for_its_place():
+    """Views of elsewhere that lean as expected are not believed for that."""
+    flight, mixture = Flight(10), Mixture(MODEL, EXTENT)
+    false = flight.place + np.array([300.0, 0.0])
+    for view in range(8):
+        if view:
+            way = flight.moved()
+            mixture.predict(1.0, camera=way)
+            false = false + SPEED
+        mixture.update(flight.told(), [flight.sighting(-6.0, false)], 0.15)
+    assert mixture.estimate(RADIUS_M).confidence < 0.5
+
+
+def test_after_a_while_without_views_one_is_no_track():
+    flight, mixture, _ = flown(11)
+    for _ in range(8):
+        flight.moved(20.0)
+        mixture.predict(20.0)
+        mixture.update(flight.told(), [])
+        mixture.estimate(RADIUS_M)
+    assert mixture.estimate(RADIUS_M).state is State.LOST
+    mixture.update(flight.told(), [flight.sighting(7.0)])
+    assert mixture.estimate(RADIUS_M).state is not State.TRACKING
+    mixture.predict(1.0, camera=flight.moved())
+    mixture.update(flight.told(), [flight.sighting(7.0)])
+    assert mixture.estimate(RADIUS_M).state is State.TRACKING
+
+
+def test_measured_positions_teach_the_mount():
+    """Views that show no lean of their own: where they are put beside GNSS tells it."""
+    bias = np.array([0.0, 0.0, math.radians(5.0), 0.0])
+    flight, mixture = Flight(12, bias=bias), Mixture(MODEL, EXTENT)
+    weak, height_m = math.radians(20.0), 100.0
+    for view in range(25):
+        if view:
+            mixture.predict(1.0, camera=flight.moved())
+        mixture.told_position(flight.place + flight.rng.normal(0, 3, 2), 3.0)
+        spread = np.diag([4.0, 4.0, 1e-4, 1e-4, weak**2, weak**2])
+        spread[0, 0] += (height_m * weak) ** 2
+        spread[0, 4] = spread[4, 0] = -height_m * weak**2
+        # Taken as level the view lies ahead of where it was taken.
+        ahead = np.array([height_m * bias[2], 0, 0, 0, 0, 0])
+        mean = np.concatenate([flight.place, np.zeros(4)]) + ahead
+        mixture.update(flight.told(), [Sighting(mean, spread, 5.0)])
+    assert math.degrees(mixture.estimate(RADIUS_M).mean[6]) == pytest.approx(5.0, abs=1.0)

@@ -27,7 +27,7 @@ from orthonav.track.mixture import within
 from orthonav.track.model import HEADING, LEAN, SCALE
 from orthonav.track.smooth import History, Smoothed
 
-LOCAL_SHARE = 0.8
+LOCAL_SHARE = 0.75
 """Belief in one place from which on views are looked for around it only."""
 LOCAL_SIGMAS = 4.0
 MIN_LOCAL_M = 30.0
@@ -37,6 +37,8 @@ LONGEST_GAP_S = 600.0
 UNKNOWN_STEP_S = 1.0
 """Time that is taken to have passed where the clock stands still or jumps back."""
 WORTH_LOG_ODDS = -12.0
+NEAR_SHARE = 0.05
+"""Places nearer to each other than this share of the view's side are one."""
 RADIUS_SHARE = 0.025
 """Of the height, the least radius that a confidence is about: what an angle of 1.4 deg makes."""
 VELOCITY_STD_MPS = 1.0
@@ -78,6 +80,7 @@ class Tracker:
         self._time_ns: int | None = None
         self._before: Footprint | None = None
         self._velocity: Array | None = None
+        self._start_was_told = False
         self._use_prior, self._every_prior = use_prior, every_prior
         self._history = History() if hindsight else None
         self._lag = lag
@@ -182,6 +185,7 @@ class Tracker:
         if self._time_ns is None:
             self._time_ns, self._before = telemetry.time_ns, now
             if prior is not None:
+                self._start_was_told = True
                 self.mixture.start(*self._place(prior))
             return 0.0
         seconds = (telemetry.time_ns - self._time_ns) / 1e9
@@ -257,7 +261,7 @@ class Tracker:
         self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry, overlap: float
     ) -> NoFix | None:
         """Look for the view and hand what it may be to the mixture; why not, if it cannot be."""
-        expected = self.mixture.estimate(self._radius_m(telemetry))
+        expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
         bias, spread = self.mixture.bias()
         corrected = _known(_corrected(telemetry, bias), spread)
         view = self._registration.prepared(grey, camera, corrected, self._heading_known)
@@ -268,7 +272,9 @@ class Tracker:
         if prior is None or self._registration.touches_map(prior, view):
             found = self._registration.best(view, prior)
             if found is not None:
-                sightings = self._sightings(grey, camera, corrected, view, found, bias)
+                area = math.inf if searched is None else math.pi * searched[1] ** 2
+                share = min(area / self.mixture.area_m2, 1.0)
+                sightings = self._sightings(grey, camera, corrected, view, found, bias, share)
         told = Told(
             math.radians(telemetry.yaw_deg) if self._heading_known else None,
             math.radians(telemetry.pitch_deg),
@@ -282,6 +288,8 @@ class Tracker:
         """The part of the map to look at: around the track where that is nearly certain."""
         if expected is None or expected.confidence < LOCAL_SHARE:
             return None, None
+        if expected.state is State.SEARCHING and not self._start_was_told:
+            return None, None  # what is not confirmed must stand against the whole map
         spread = float(np.linalg.eigvalsh(expected.covariance[:2, :2])[-1])
         reach = max(LOCAL_SIGMAS * math.sqrt(spread), MIN_LOCAL_M)
         if 4 * reach**2 > self.mixture.area_m2 / 4:
@@ -297,34 +305,51 @@ class Tracker:
         view: PreparedFootprint,
         found: Registered,
         bias: Array,
+        looked_at: float,
     ) -> list[Sighting]:
         made = []
-        for log_odds, pose in self._places(found):
+        for log_odds, alone, pose in self._places(found, NEAR_SHARE * view.side_px, looked_at):
             placed = levelled(self._registration, grey, camera, telemetry, view, pose)
             if placed is None:
                 continue
             mean = placed.mean.copy()
             mean[3] += bias[1]
-            made.append(Sighting(mean, placed.covariance, log_odds))
+            made.append(Sighting(mean, placed.covariance, log_odds, alone))
         return made
 
-    def _places(self, found: Registered) -> list[tuple[float, Pose]]:
-        """Places with their log odds: the best, and those that were finished beside it."""
-        best = found.evidence()
-        out = [(_log_odds(self._confidence(best)), found.placed.pose)]
-        for score, placed in found.finalists:
-            if placed.pose == found.finalists[0][1].pose:
+    def _places(
+        self, found: Registered, near_px: float, looked_at: float
+    ) -> list[tuple[float, float, Pose]]:
+        """Places with their log odds, and how likely each is by the view alone: the best, and those
+        that were finished beside it and are farther than `near_px` from it.
+
+        Where only a share of the map was `looked_at`, few rivals were found and chance is lower:
+        the odds are those of somebody who knows only that it is there, or, if that is less, of
+        somebody who looked everywhere and found elsewhere what chance makes.
+        """
+        best, chances = found.evidence(), self._confidence.chances
+        least = {"rival": chances.total, "look_rival": chances.look, "fine_rival": chances.fine}
+        out: list[tuple[float, float, Pose]] = []
+        for score, placed in ((found.score, found.placed), *found.finalists):
+            pose = placed.pose
+            if any(math.hypot(p.x_px - pose.x_px, p.y_px - pose.y_px) < near_px for *_, p in out):
                 continue
-            share = score / max(found.score, 1e-6)
-            evidence = {
-                "strength": score,
-                "rival": found.score,
-                "look": found.look_score * share,
-                "look_rival": found.look_score,
-            }
-            log_odds = _log_odds(self._confidence(evidence))
-            if log_odds > WORTH_LOG_ODDS:
-                out.append((log_odds, placed.pose))
+            evidence = dict(best)
+            if out:
+                share = score / max(found.score, 1e-6)
+                evidence = {
+                    "strength": score,
+                    "rival": found.score,
+                    "look": found.look_score * share,
+                    "look_rival": found.look_score,
+                }
+            there = _log_odds(self._confidence(evidence)) + math.log(looked_at)
+            for name in least.keys() & evidence.keys():
+                evidence[name] = max(evidence[name], least[name])
+            alone = self._confidence(evidence)
+            log_odds = min(there, _log_odds(alone))
+            if not out or log_odds > WORTH_LOG_ODDS:
+                out.append((log_odds, alone, pose))
         return out
 
     def _fix(

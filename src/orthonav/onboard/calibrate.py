@@ -19,7 +19,9 @@ MIN_VIEWS = 5
 MOVED_DEG, MOVED_SIGMAS = 2.0, 3.0
 """A mount that differs by more than both from what it is in the end has moved meanwhile."""
 MAD_TO_STD = 1.4826
+LEAST_LEAN_DEG = 0.1
 STD_FLOOR = {"heading_deg": 0.2, "log_scale": 0.003, "pitch_deg": 0.3, "roll_deg": 0.3}
+_LASTING = ("pitch_deg", "roll_deg")
 _EVIDENCE = {
     "heading_deg": "heading_bias_deg",
     "log_scale": "log_scale_bias",
@@ -58,8 +60,9 @@ def calibrated(results: Sequence[ViewResult]) -> Calibration:
     }
     begin = max(_still_from(values[name], spreads[name]) for name in ("pitch_deg", "roll_deg"))
     begin = min(begin, len(sure) - MIN_VIEWS)
+    kept = slice(begin, None)
     biases = {
-        name: _bias(values[name][begin:], spreads[name][begin:], STD_FLOOR[name])
+        name: _bias(values[name][kept], spreads[name][kept], STD_FLOOR[name], name in _LASTING)
         for name in _EVIDENCE
     }
     mount = Mount(**biases, views=len(sure) - begin)
@@ -82,28 +85,34 @@ def _still_from(values: Array, spreads: Array) -> int:
     return int(np.flatnonzero(far)[-1]) + 1 if far.any() else 0
 
 
-def _bias(values: Array, spreads: Array, floor: float) -> Bias:
-    """Median, how well it is known, and the scatter around it."""
+def _bias(values: Array, spreads: Array, floor: float, lasting: bool) -> Bias:
+    """Median, how well it is known, and the scatter around it.
+
+    What is `lasting` in the track is known as well as the track knew it; what scatters from view to
+    view, as well as the mean of so many views, fewer where neighbours err alike.
+    """
     middle = float(np.median(values))
     off = values - middle
     scatter = MAD_TO_STD * float(np.median(np.abs(off)))
+    if lasting:
+        return Bias(middle, max(floor, float(np.median(spreads))), scatter)
     energy = float(off @ off)
     alike = float(off[1:] @ off[:-1]) / energy if energy > 0 else 0.0
     alike = min(max(alike, 0.0), 0.99)
     mean_std = scatter * math.sqrt((1 + alike) / (1 - alike) / len(values))
-    # No view knows it better than the track did where it knew it best.
-    std = max(floor, min(math.hypot(mean_std, float(spreads.min())), float(np.median(spreads))))
-    return Bias(middle, std, scatter)
+    return Bias(middle, max(floor, mean_std), scatter)
 
 
-def model_of(mount: Mount, model: Model | None = None) -> Model:
-    """The model of a flight whose told values were corrected by a mount."""
+def model_of(mount: Mount) -> Model:
+    """The model of a flight whose told values are corrected by a mount: no better known than that,
+    and not off by something else."""
     heading, lean = mount.heading_deg, max(mount.pitch_deg.std, mount.roll_deg.std)
+    lean_rad = math.radians(max(lean, LEAST_LEAN_DEG))
     return replace(
-        model or Model(),
+        Model().with_mount(lean_rad),
         heading_rad=math.radians(max(heading.std, heading.scatter, 1.0)),
         log_scale=max(mount.log_scale.std, mount.log_scale.scatter, 0.01),
-        lean_rad=math.radians(max(lean, 0.5)),
+        off_mount=0.0,
     )
 
 

@@ -50,13 +50,19 @@ TOLD_SHARE = 0.9
 """Belief in a position that was told before anything was seen."""
 SURE = 0.9
 LIKELY = 0.5
-CONFIRMED = 1.4
-"""Views' worth of new ground that must have been recognized before a track is one."""
+CONFIRMED = 1.0
+"""Views' worth of new ground that must have been recognized before a track is one, each counted by
+how much likelier than not its view alone was placed rightly: no single view makes a track, and
+views that fit only because they were looked for there do not either."""
+MOST_OF_ONE = 0.95
+UNCONFIRMED = 0.8
+"""More confidence is not stated before."""
 WHAT_DIFFERS = np.ix_([0, 1, 2, 3, 6, 7], [0, 1, 2, 3, 6, 7])
 """Of the covariances of two hypotheses: position, velocity and lean."""
+MOST_SIGHTED = 3.0
 WIDE_M, FORGOTTEN = 50.0, 0.5
-"""A track whose position is known less well than this counts but half, every time, of what was
-recognized before: after a while it must be confirmed anew."""
+"""More is not remembered, and half of it is forgotten with every view at which the position is
+known less well than this: after a while a track must be confirmed anew."""
 GATE = 36.0
 POSE = slice(2, 4)
 """Heading and scale in what a sighting says."""
@@ -106,12 +112,13 @@ class Estimate:
 @dataclass(frozen=True, eq=False)
 class _Reading:
     """What a view says of the state (6,), its covariance (6, 6), and the log of what it is worth:
-    odds over the density of places, headings and scales that are only alike."""
+    odds over the density of places, headings and scales that are only alike; `recognized`: how
+    much new ground that is, in views."""
 
     seen: Array
     noise: Array
     log_odds: float
-    newness: float
+    recognized: float
 
 
 class Mixture:
@@ -124,7 +131,7 @@ class Mixture:
         self.area_m2 = float(np.prod(self._extent[2:] - self._extent[:2]))
         self.hypotheses: list[Hypothesis] = []
         self.elsewhere = 1.0
-        self._tracked = False
+        self._state = State.SEARCHING
         self._numbers = 0
 
     def start(self, mean_en_m: Array, std_m: float) -> None:
@@ -254,8 +261,12 @@ class Mixture:
         self.hypotheses = _merged(sorted(made, key=lambda each: -each.share))
         self._settle()
 
-    def estimate(self, radius_m: float) -> Estimate | None:
-        """The best cluster, None where there is no hypothesis at all."""
+    def estimate(self, radius_m: float, *, between_views: bool = False) -> Estimate | None:
+        """The best cluster, None where there is no hypothesis at all.
+
+        The state changes with it, unless it is asked for `between_views`: before the view that
+        has just come was looked for.
+        """
         if not self.hypotheses:
             return None
         best = self._best(radius_m)
@@ -263,9 +274,11 @@ class Mixture:
         mean, covariance = _moments(near)
         confidence = min(self._inside(radius_m, mean[POSITION]), 1.0)
         sighted = max(each.sighted for each in near)
-        state = self._state(confidence, sighted)
-        self._tracked = self._tracked or state is State.TRACKING
-        return Estimate(mean, covariance, confidence, state)
+        if not between_views:
+            self._state = self._next_state(confidence, sighted)
+        if self._state is not State.TRACKING:
+            confidence = min(confidence, UNCONFIRMED)
+        return Estimate(mean, covariance, confidence, self._state)
 
     def _best(self, radius_m: float) -> Hypothesis:
         """The hypothesis with most belief around it."""
@@ -287,12 +300,12 @@ class Mixture:
         mean, covariance = _moments(self.hypotheses)
         return mean[4:], covariance[4:, 4:]
 
-    def _state(self, confidence: float, sighted: float) -> State:
+    def _next_state(self, confidence: float, sighted: float) -> State:
         if confidence >= SURE and sighted >= CONFIRMED:
             return State.TRACKING
-        if not self._tracked:
-            return State.SEARCHING
-        return State.TRACKING if confidence >= LIKELY else State.LOST
+        if self._state is State.TRACKING and confidence < LIKELY:
+            return State.LOST
+        return self._state
 
     def _on_map(self, mean: Array) -> bool:
         inside = (mean[:2] >= self._extent[:2]) & (mean[:2] <= self._extent[2:])
@@ -334,7 +347,9 @@ class Mixture:
         _, log_det = np.linalg.slogdet(2 * math.pi * noise)
         odds = newness * (min(sighting.log_odds, MAX_LOG_ODDS) + wide)
         odds += (1 - newness) * float(log_det) / 2 - len(SEEN) / 2 * math.log(newness)
-        return _Reading(seen, noise / newness + anew, odds, newness)
+        return _Reading(
+            seen, noise / newness + anew, odds, min(newness * sighting.alone, MOST_OF_ONE)
+        )
 
     def _seen(self, each: Hypothesis, seen: "_Reading") -> Hypothesis | None:
         """The hypothesis after a sighting, weighed; None where they have nothing in common."""
@@ -351,7 +366,7 @@ class Mixture:
             share=each.share * math.exp(min(log_weight, 60.0)),
             mean=mean,
             covariance=covariance,
-            sighted=each.sighted + seen.newness,
+            sighted=min(each.sighted + seen.recognized, MOST_SIGHTED),
             number=self._numbers,
         )
 
@@ -365,7 +380,8 @@ class Mixture:
         """How likely a mount is good, or off; mean and covariance of somebody anywhere with it."""
         off = self.model.off_mount
         yield 1 - off, *self._nowhere()
-        yield off, *self._nowhere(self.model.off_lean_rad)
+        if off > 0:
+            yield off, *self._nowhere(self.model.off_lean_rad)
 
     def _born(self, seen: "_Reading") -> Iterator[Hypothesis]:
         """The hypotheses that the aircraft was elsewhere, and is here."""
@@ -376,7 +392,7 @@ class Mixture:
             mean, covariance = updated(mean, covariance, seen.seen, spread)
             share *= self.elsewhere * math.exp(min(log_weight, 60.0))
             self._numbers += 1
-            yield Hypothesis(share, mean, covariance, seen.newness, self._numbers)
+            yield Hypothesis(share, mean, covariance, seen.recognized, self._numbers)
 
     def _from(self, each: Hypothesis, expected: Expected, share: float) -> Hypothesis:
         self._numbers += 1

@@ -63,7 +63,7 @@ class Model:
     slip: float = 0.01
     turn: float = 0.03
     miss: float = 0.5
-    lost: float = 1e-3
+    lost: float = 3e-3
 
     def at_height(self, agl_m: float) -> "Model":
         """The same, with a mount as good as flying at that height asks for.
@@ -72,7 +72,10 @@ class Model:
         what is `MOUNT_M` on the ground, within `MOUNT_RAD`.
         """
         low, high = MOUNT_RAD
-        lean_rad = min(max(MOUNT_M / max(agl_m, 1e-3), low), high)
+        return self.with_mount(min(max(MOUNT_M / max(agl_m, 1e-3), low), high))
+
+    def with_mount(self, lean_rad: float) -> "Model":
+        """The same, with a mount that is off by so much, and drifts accordingly."""
         return replace(self, lean_rad=lean_rad, lean_walk=LEAN_WALK_SHARE * lean_rad)
 
     def initial_bias(self, lean_rad: float | None = None) -> Array:
@@ -108,12 +111,14 @@ class Sighting:
 
     `mean` (6,): metres east and north, heading (rad), log scale, pitch and roll (rad);
     `covariance` (6, 6). `log_odds`: natural logarithm of the odds that this is the place, for
-    somebody who knows only that it lies somewhere on the map.
+    somebody who knows only that it lies somewhere on the map. `alone`: the probability that the
+    view is placed rightly, by itself.
     """
 
     mean: Array
     covariance: Array
     log_odds: float
+    alone: float = 1.0
 
 
 def reading(model: Model, told: Told, sighting: Sighting) -> tuple[Array, Array, Array]:
