@@ -14,6 +14,7 @@ import pytest
 
 from orthonav.errors import MissingExtraError
 from orthonav.evaluate import plots
+from orthonav.evaluate.ground import Background
 from orthonav.evaluate.metrics import compare, measure
 from orthonav.evaluate.report import (
     FlightReport,
@@ -54,9 +55,9 @@ def made_flight(n: int, share_fixed: float = 0.9, name: str = "flight", seed: in
     return FlightReport(name, comparison, measure(comparison))
 
 
-def noisy_background() -> plots.Background:
+def noisy_background() -> Background:
     grey = np.random.default_rng(5).integers(0, 256, (900, 1700), dtype=np.uint8)
-    return plots.Background(grey, -250.0, -450.0, 1450.0, 450.0)
+    return Background(grey, -250.0, -450.0, 1450.0, 450.0)
 
 
 class Page(HTMLParser):
@@ -216,9 +217,7 @@ def test_the_background_lies_where_it_says() -> None:
     grey = np.full((100, 100), 255, dtype=np.uint8)
     grey[:20, :20] = 0  # north-west corner
     image = decoded(
-        plots.map_picture(
-            flight.comparison, 15.0, plots.Background(grey, -50.0, -380.0, 1250.0, 300.0)
-        )
+        plots.map_picture(flight.comparison, 15.0, Background(grey, -50.0, -380.0, 1250.0, 300.0))
     )
     rows, columns = np.nonzero(np.abs(image - 115).max(axis=2) < 6)  # black, made pale
     assert rows.size > 1000
@@ -229,7 +228,7 @@ def test_the_background_lies_where_it_says() -> None:
     "extent", [(-9e3, -9e3, -8e3, -8e3), (0.0, 0.0, 1.0, 1.0), (-1e5, -1e5, 1e5, 1e5)]
 )
 def test_a_background_beside_the_flight_or_far_larger_does_no_harm(extent: tuple) -> None:
-    background = plots.Background(np.zeros((50, 40), np.uint8), *extent)
+    background = Background(np.zeros((50, 40), np.uint8), *extent)
     decoded(plots.map_picture(made_flight(5).comparison, 15.0, background))
 
 

@@ -1,4 +1,4 @@
-"""Small figures that the evaluation is made of: shares, percentiles, intervals."""
+"""Small figures that the evaluation is made of: shares, percentiles, intervals, runs."""
 
 import math
 from collections.abc import Sequence
@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 _Z95 = 1.959963984540054  # two-sided 95 % of a normal distribution
 
@@ -48,6 +49,12 @@ def frozen(values: FloatArray | Sequence[float]) -> FloatArray:
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array
+
+
+def runs(flags: BoolArray) -> list[tuple[int, int]]:
+    """Start and stop of each run of true flags."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def or_none(value: float | np.floating) -> float | None:

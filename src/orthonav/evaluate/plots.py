@@ -4,13 +4,20 @@ Right and wrong differ by colour and by mark.
 """
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from orthonav.evaluate.canvas import DPI, GREY, INK, OFFSET, RIGHT, TRUTH, WRONG, halo, png
+from orthonav.evaluate.canvas import DPI, GREY, OFFSET, RIGHT, TRUTH, WRONG, halo, png
+from orthonav.evaluate.figures import runs
+from orthonav.evaluate.ground import (
+    Background,
+    draw_background,
+    draw_north,
+    draw_scale_bar,
+    inside_box,
+    view_box,
+)
 from orthonav.evaluate.metrics import Comparison, CriterionCurve, Metrics
 
 if TYPE_CHECKING:
@@ -29,22 +36,7 @@ LABELS = {
 }
 MAIN = ("confidence", 0.9)
 """The criterion and threshold that people ask for first."""
-_BACKGROUND_LEVELS = 16  # few grey levels keep the PNG small
 _NO_FIX_SHADE = "#EFE6C8"
-
-
-@dataclass(frozen=True, eq=False)
-class Background:
-    """A grey picture under the map: `grey` (rows, columns) uint8, north up.
-
-    Its outer edges are in metres east and north in the plane of the comparison it is drawn under.
-    """
-
-    grey: NDArray[np.uint8]
-    west_m: float
-    south_m: float
-    east_m: float
-    north_m: float
 
 
 def map_picture(
@@ -54,19 +46,19 @@ def map_picture(
 
     Fixes far outside the flight are not shown themselves, only their lines to the edge.
     """
-    box = _view_box(comparison, radius_m)
+    box = view_box(comparison, radius_m)
     width_m, height_m = box[1] - box[0], box[3] - box[2]
     scale = 7.5 / max(width_m, height_m)
     size_in = (max(scale * width_m, 3.0) + 1.0, max(scale * height_m, 3.0) + 1.0)
 
     def draw(axes: "Axes") -> None:
         if background is not None:
-            _draw_background(axes, background, box)
+            draw_background(axes, background, box)
         _draw_positions(axes, comparison, radius_m, box)
         axes.set(xlim=box[:2], ylim=box[2:], aspect="equal")
         axes.set(xlabel="east (m)", ylabel="north (m)")
-        _draw_scale_bar(axes, box)
-        _draw_north(axes)
+        draw_scale_bar(axes, box)
+        draw_north(axes)
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
 
     return png(size_in, draw)
@@ -130,7 +122,7 @@ def along_picture(comparison: Comparison, radius_m: float) -> bytes:
         errors_m = comparison.errors_m
         views = np.arange(1, errors_m.size + 1)
         shown_m = np.maximum(errors_m, 0.01)  # a log axis has no zero; NaN stays NaN
-        for i, (start, stop) in enumerate(_runs(np.isnan(errors_m))):
+        for i, (start, stop) in enumerate(runs(np.isnan(errors_m))):
             label = "no fix" if i == 0 else "_nolegend_"
             axes.axvspan(start + 0.5, stop + 0.5, color=_NO_FIX_SHADE, linewidth=0, label=label)
         axes.plot(views, shown_m, color="#BBBBBB", linewidth=0.9, zorder=2)
@@ -170,65 +162,10 @@ def _draw_positions(
     }
     axes.plot(*truth[~none].T, ".", color=TRUTH, markersize=3, zorder=7, label="truth")
     axes.plot(*fixes[right].T, "o", color=RIGHT, markersize=5.5, zorder=5, label="right fix")
-    outside = wrong & ~_inside(fixes, box)
+    outside = wrong & ~inside_box(fixes, box)
     label = "wrong fix" + (f" ({int(outside.sum())} outside)" if outside.any() else "")
     axes.plot(*fixes[wrong].T, "X", color=WRONG, markersize=6.5, zorder=6, label=label)
     axes.plot(*truth[none].T, color=TRUTH, markersize=4.5, label="truth, no fix", **ring)
-
-
-def _draw_background(axes: "Axes", background: Background, box: tuple[float, ...]) -> None:
-    """The part of the picture that is seen, pale and in few grey levels."""
-    rows, columns = background.grey.shape
-    west, south = background.west_m, background.south_m
-    east_step = (background.east_m - west) / columns
-    north_step = (background.north_m - south) / rows
-    left, right = (int(np.clip((x - west) / east_step, 0, columns)) for x in box[:2])
-    below, above = (int(np.clip((y - south) / north_step, 0, rows)) for y in box[2:])
-    right, above = min(right + 1, columns), min(above + 1, rows)
-    seen = background.grey[rows - above : rows - below, left:right]
-    if seen.size == 0:
-        return
-    step = max(1, math.ceil(max(seen.shape) / (7.5 * DPI)))
-    seen = seen[: seen.shape[0] // step * step, : seen.shape[1] // step * step]
-    coarse = seen.reshape(seen.shape[0] // step, step, -1, step).mean(axis=(1, 3))
-    levels = np.round(coarse / 255 * (_BACKGROUND_LEVELS - 1)) / (_BACKGROUND_LEVELS - 1)
-    extent = (
-        west + left * east_step,
-        west + (left + coarse.shape[1] * step) * east_step,
-        south + (above - coarse.shape[0] * step) * north_step,
-        south + above * north_step,
-    )
-    axes.imshow(
-        0.45 + 0.55 * levels, cmap="gray", vmin=0, vmax=1, extent=extent, interpolation="nearest"
-    )
-    axes.grid(visible=False)
-
-
-def _draw_scale_bar(axes: "Axes", box: tuple[float, ...]) -> None:
-    width_m, height_m = box[1] - box[0], box[3] - box[2]
-    length_m = _round_length(0.25 * min(width_m, height_m))
-    x, y = box[0] + 0.04 * width_m, box[2] + 0.04 * height_m
-    for width, colour in ((6, "white"), (3, INK)):
-        axes.plot([x, x + length_m], [y, y], color=colour, linewidth=width, zorder=8)
-    text = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
-    backing = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5}
-    axes.annotate(
-        text, (x + length_m / 2, y), (0, 6), **OFFSET, ha="center", zorder=8, bbox=backing
-    )
-
-
-def _draw_north(axes: "Axes") -> None:
-    axes.annotate(
-        "N",
-        xy=(0.965, 0.975),
-        xytext=(0.965, 0.89),
-        xycoords="axes fraction",
-        ha="center",
-        weight="bold",
-        zorder=8,
-        arrowprops={"arrowstyle": "-|>", "color": INK, "linewidth": 1.6, "shrinkA": 1},
-        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5},
-    )
 
 
 def _draw_criterion(axes: "Axes", curve: CriterionCurve) -> None:
@@ -281,39 +218,3 @@ def _draw_main(axes: "Axes", at: tuple[float, float], colour: str) -> None:
     axes.plot([at[0], at[0], 0], [0, at[1], at[1]], linestyle=(0, (1, 2)), **lead)
     ring: dict[str, Any] = {"markerfacecolor": "none", "markeredgewidth": 1.5, "zorder": 4}
     axes.plot(*at, "o", markersize=12, markeredgecolor=colour, **ring)
-
-
-def _view_box(comparison: Comparison, radius_m: float) -> tuple[float, float, float, float]:
-    """West, east, south, north: the flight, and what of its fixes is near to it."""
-    truth, fixes = comparison.truth_en_m, comparison.fix_en_m
-    low, high = truth.min(axis=0), truth.max(axis=0)
-    reach = max(float((high - low).max()) * 0.35, 5 * radius_m)
-    near = _inside(fixes, (low[0] - reach, high[0] + reach, low[1] - reach, high[1] + reach))
-    seen = np.concatenate([truth, fixes[near]])
-    low, high = seen.min(axis=0), seen.max(axis=0)
-    side = max(float((high - low).max()), 4 * radius_m)
-    middle = (low + high) / 2
-    half = np.maximum((high - low) / 2 + 0.06 * side, 0.3 * side)
-    west, south = (float(value) for value in middle - half)
-    east, north = (float(value) for value in middle + half)
-    return west, east, south, north
-
-
-def _inside(positions_en_m: NDArray[np.float64], box: tuple[float, ...]) -> NDArray[np.bool_]:
-    east, north = positions_en_m.T
-    inside: NDArray[np.bool_] = (
-        (box[0] <= east) & (east <= box[1]) & (box[2] <= north) & (north <= box[3])
-    )
-    return inside
-
-
-def _round_length(length_m: float) -> float:
-    """The largest 1, 2 or 5 times a power of ten that is not above `length_m`."""
-    power = 10.0 ** math.floor(math.log10(length_m))
-    return max(factor * power for factor in (1, 2, 5) if factor * power <= length_m * (1 + 1e-9))
-
-
-def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Start and stop of each run of true flags."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -20,6 +20,7 @@ from orthonav.evaluate.calibration_report import (
 )
 from orthonav.evaluate.contact_sheet import Row, row_text, sheet_picture
 from orthonav.evaluate.figures import or_none, percent_text, plain_text
+from orthonav.evaluate.ground import Background
 from orthonav.evaluate.metrics import (
     Comparison,
     Metrics,
@@ -37,9 +38,9 @@ from orthonav.evaluate.page import (
     picture,
 )
 from orthonav.evaluate.track import Track
-from orthonav.evaluate.track_plots import (
+from orthonav.evaluate.track_plots import track_pictures
+from orthonav.evaluate.track_report import (
     track_lines,
-    track_pictures,
     track_rows,
     track_to_json,
     tracks_to_json,
@@ -66,14 +67,14 @@ _N_WORST = 10
 class FlightReport:
     """One evaluated flight: its name, its results beside the truth, and the figures of those.
 
-    `background` is in the plane of `comparison`; see `orthonav.evaluate.plots.Background`. `track`
+    `background` is in the plane of `comparison`; see `orthonav.evaluate.ground.Background`. `track`
     is None where views were placed one by one, `worst` empty where pictures were not asked for.
     """
 
     name: str
     comparison: Comparison
     metrics: Metrics
-    background: plots.Background | None = None
+    background: Background | None = None
     track: Track | None = None
     worst: tuple[Row, ...] = ()
 

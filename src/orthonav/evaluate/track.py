@@ -16,12 +16,19 @@ from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from orthonav.evaluate.calibration import is_covariance, nees_bound, normalized_squared
-from orthonav.evaluate.figures import FloatArray, frozen, mean, percentile, share
+from orthonav.evaluate.figures import (
+    BoolArray,
+    FloatArray,
+    frozen,
+    mean,
+    percentile,
+    runs,
+    share,
+)
 from orthonav.evaluate.metrics import FAR_M, Comparison
 from orthonav.publish.jsonl import STATES
 from orthonav.records import Fix, ViewResult
 
-BoolArray = NDArray[np.bool_]
 SURE = 0.9
 """A fix of at least this confidence is believed."""
 RADII_M = (25.0, 60.0)
@@ -114,8 +121,10 @@ class Track:
     first confirmed fix: tracking, with a position. `share_of_views` and `share_of_time` are by
     state. `unsure` is without a confident fix (not tracking, or confidence below `SURE`), over the
     whole flight; `unsure_after` from the first confirmed fix on. A view is sure and wrong where its
-    confidence is at least `SURE` or it is tracking, and it errs by more than `far_m`; a false lock
-    is a stretch of such views. `along` and `across` are of the tracking views.
+    confidence is at least `SURE` or it is tracking, and it errs by more than `FAR_M`, the radius
+    asked for and the radius that its own fix states; `far_m` is the larger of the first two, the
+    least of them all. A false lock is a stretch of such views. `along` and `across` are of the
+    tracking views.
     """
 
     n_views: int
@@ -159,7 +168,9 @@ def measure_track(
     confirmed = tracking & np.array([isinstance(result.outcome, Fix) for result in results])
     first = int(np.argmax(confirmed)) if confirmed.any() else len(results)
     far_m = max(FAR_M, radius_m)
-    wrong = (sure | tracking)[rows] & (comparison.errors_m > far_m)
+    wrong = (sure | tracking)[rows] & (
+        comparison.errors_m > np.fmax(far_m, comparison.own_radius_m)
+    )
     unsure = ~(tracking & sure)
     found = first < len(results)
     series = _series(comparison, [results[i] for i in rows], seconds_s[rows])
@@ -280,12 +291,6 @@ def effective_number(whitened: FloatArray) -> float:
         return float(n)
     tau = np.mean([_autocorrelation_time(part) for part in whitened.T])
     return float(np.clip(n / tau, 1.0, n))
-
-
-def runs(flags: BoolArray) -> list[tuple[int, int]]:
-    """Start and stop of each run of true flags."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def _autocorrelation_time(part: FloatArray) -> float:

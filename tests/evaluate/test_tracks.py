@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from conftest import textured
+from helpers import textured
 from orthonav.cli import main
 from orthonav.errors import FlightError
 from orthonav.evaluate.contact_sheet import Row, row_text, sheet_picture, worst_first, worst_rows
@@ -38,8 +38,8 @@ from orthonav.evaluate.track_plots import (
     error_picture,
     track_map_picture,
     track_pictures,
-    track_rows,
 )
+from orthonav.evaluate.track_report import track_rows
 from orthonav.flight.writer import FlightWriter
 from orthonav.geo.camera import Camera, camera_from_en
 from orthonav.geo.frames import LocalFrame
@@ -65,6 +65,7 @@ def flown(
     times_ns=None,
     unknown=(),
     local=CENTRE,
+    own_radius_m=35.0,
 ) -> tuple[Comparison, list[ViewResult]]:
     """Views 10 m and 1 s apart to the east, off by `errors_en_m`, None for no fix; `unknown` have
     no truth."""
@@ -73,7 +74,7 @@ def flown(
     if way_en_m is None:
         way_en_m = np.stack([10.0 * np.arange(n), np.zeros(n)], axis=1)
     times_ns = [10**9 * i for i in range(n)] if times_ns is None else times_ns
-    sure = np.broadcast_to(confidence, n)
+    sure, radii_m = np.broadcast_to(confidence, n), np.broadcast_to(own_radius_m, n)
     truth, results = {}, []
     for i, (error, at) in enumerate(zip(errors_en_m, way_en_m, strict=True)):
         lat, lon = local.latlon_from_en(np.array(at, dtype=float))
@@ -83,7 +84,7 @@ def flown(
         if error is not None:
             fix_lat, fix_lon = local.latlon_from_en(np.add(at, error))
             where = float(fix_lat), float(fix_lon), cov_en_m2
-            outcome = Fix(*where, float(sure[i]), 35.0, 90.0, 100.0, LEARNT)
+            outcome = Fix(*where, float(sure[i]), float(radii_m[i]), 90.0, 100.0, LEARNT)
         results.append(ViewResult(f"{i:04d}.jpg", times_ns[i], outcome, 10.0, states[i]))
     return compare(truth, results, local), results
 
@@ -226,6 +227,17 @@ def test_false_locks_are_stretches_that_are_sure_or_tracking_and_far_off() -> No
     assert track.false_lock_longest_s == 3.0  # 17 s to 20 s
     wide = by_hand(radius_m=65.0)
     assert (wide.far_m, wide.n_sure_wrong, wide.n_false_locks) == (65.0, 2, 2)
+
+
+def test_a_fix_that_states_a_larger_radius_is_held_to_that() -> None:
+    """Those of high flights do: 60 m off is no false lock where 70 m were stated."""
+    errors = [(60.0, 0.0), (60.0, 0.0), (60.0, 0.0), (80.0, 0.0), (20.0, 0.0), None]
+    radii_m = [70.0, 50.0, 10.0, 70.0, 10.0, 70.0]
+    track = tracked(errors, "tracking", own_radius_m=radii_m)
+    assert (track.far_m, track.n_sure_wrong, track.n_false_locks) == (35.0, 3, 1)
+    nowhere = tracked(errors, "tracking", own_radius_m=math.nan)
+    assert (nowhere.far_m, nowhere.n_sure_wrong) == (35.0, 4)
+    assert tracked(errors, "tracking", own_radius_m=radii_m, radius_m=75.0).n_sure_wrong == 1
 
 
 # Along and across.
