@@ -4,18 +4,18 @@ import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 # Before NumPy and PyTorch are loaded: tests run side by side.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 # As the program does: FFmpeg reads it once, and otherwise writes lines of its own to stderr.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**28))
 
 import cv2
-import numpy as np
 import pytest
 
+from helpers import Done, textured
 from orthonav.cli import main
 from orthonav.flight import open_flight, read_truth
 from orthonav.geo.camera import Camera
@@ -92,16 +92,6 @@ def truth_en_m(flight_path, localizer):
     return {name: localizer.sheet.frame.en_from_latlon(*latlon) for name, latlon in truth.items()}
 
 
-def textured(shape=(400, 400), seed=0):
-    """A picture (H, W) uint8 of blots of many sizes, unlike itself everywhere."""
-    rng = np.random.default_rng(seed)
-    total = np.zeros(shape, dtype=np.float32)
-    for sigma in (1.5, 4.0, 12.0):
-        blots = cv2.GaussianBlur(rng.normal(size=shape).astype(np.float32), (0, 0), sigma)
-        total += (blots / blots.std()).reshape(shape)
-    return np.clip(128 + 32 * total, 1, 255).astype(np.uint8)
-
-
 @pytest.fixture(scope="session")
 def make_ortho():
     """Function that writes a picture (H, W) as an orthophoto in Lambert-93, 1 m a pixel."""
@@ -138,14 +128,6 @@ def names_in():
         return sorted(str(path.relative_to(folder)) for path in Path(folder).rglob("*"))
 
     return names
-
-
-class Done(NamedTuple):
-    """What a command gave: exit code, stdout and stderr, those of C libraries included."""
-
-    code: int
-    out: str
-    err: str
 
 
 @pytest.fixture

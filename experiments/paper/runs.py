@@ -71,6 +71,7 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
         opened,
         registration=method.registration,
         position="peak" if method.registration else "best",
+        flying=False,
     )
     made = head(place, scene, before)
     made |= {"method": asdict(method), **built, **_sizes(opened)}
@@ -205,7 +206,7 @@ def _chance(grounds: list[views.Ground], centres_en_m: NDArray[np.float32]) -> f
 
 def _rules(scene: Scene, opened: MapFile, setting: Setting) -> dict[str, Any]:
     """Positions by each rule, with scalar product and cosine, on the same embeddings."""
-    localizer = Localizer(opened, registration=False)
+    localizer = Localizer(opened, registration=False, flying=False)
     agl_m, gsd_m = scene.trajectory.agl_m, localizer.grid.gsd_m
     camera, telemetry = views.camera_of(agl_m, gsd_m), views.told(agl_m)
     made: dict[str, Any] = {}

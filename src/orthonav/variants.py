@@ -43,12 +43,17 @@ def make_variant(table: Table, text: str) -> Any:
     return _construct(table, name, values)
 
 
-def variant_from_recipe(table: Table, recipe: Any) -> Any:
-    """The variant that `variant_recipe` wrote down; raises `VariantError` if it does not fit."""
+def variant_from_recipe(table: Table, recipe: Any, *, flying: bool = False) -> Any:
+    """The variant that `variant_recipe` wrote down; raises `VariantError` if it does not fit.
+
+    With `flying`, variants that may not fly are refused before anything of theirs is loaded.
+    """
     if not isinstance(recipe, dict) or not isinstance(recipe.get("name"), str):
         raise VariantError(f"expected a variant with a name, got {recipe!r}")
     if recipe["name"] not in table:
         raise VariantError(f"unknown variant '{recipe['name']}'; this program is too old for it")
+    if flying and not table[recipe["name"]].flies:
+        raise VariantError(f"'{recipe['name']}' does not fly, it is for experiments only")
     fields = {key: value for key, value in recipe.items() if key != "name"}
     return _construct(table, recipe["name"], fields)
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from maps import arrays, manifest, put_together, taken_apart
 
-from conftest import textured
+from helpers import textured
 from orthonav.errors import MapFileError
 from orthonav.geo.grid import TileGrid
 from orthonav.mapfile import GreyLayer, open_map, write_map

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from conftest import textured
+from helpers import textured
 from orthonav import represent
 from orthonav.confidence.logistic import FEATURES
 from orthonav.errors import AreaError, MissingFileError, OrthonavError, OutputError, VariantError

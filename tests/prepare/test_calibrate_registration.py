@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from conftest import textured
+from helpers import textured
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.registration import RegistrationLocalizer

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from conftest import textured
+from helpers import textured
 from orthonav.prepare.change import changed
 from orthonav.register.evidence import evidence
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from conftest import textured
+from helpers import textured
 from orthonav.cli import main
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic

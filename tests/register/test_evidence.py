@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from conftest import textured
+from helpers import textured
 from orthonav.register.evidence import CHANNELS, COARSE, FINE, GROUPS, EvidenceRecipe, evidence
 
 RECIPES = {"fine": FINE, "coarse": COARSE}

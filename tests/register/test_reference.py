@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import Sheet
 
-from conftest import textured
+from helpers import textured
 from orthonav.register import reference as module
 from orthonav.register.evidence import COARSE, FINE, evidence
 from orthonav.register.reference import Reference

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from conftest import textured
+from helpers import textured
 from orthonav.errors import AreaError, FlightError
 from orthonav.flight import open_flight, read_image, read_truth
 from orthonav.geo.area import Area

@@ -3,9 +3,14 @@
 import argparse
 import logging
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from orthonav.cli.common import print_json, progress
+from orthonav.cli.flown import take_flown, tell_whether_as_flown
 from orthonav.cli.source import add_source, open_told
+
+if TYPE_CHECKING:
+    from orthonav.records import ViewResult
 
 log = logging.getLogger(__name__)
 
@@ -78,28 +83,40 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="mount.json",
         help="what `orthonav calibrate` found: told heading, height and lean are corrected by it",
     )
+    parser.add_argument(
+        "--as-flown",
+        action="store_true",
+        help="of a flight log: with the options that it was flown with",
+    )
+    parser.add_argument(
+        "--require-signed",
+        type=Path,
+        metavar="public.pem",
+        help="refuse a map that was not signed with this key (see `orthonav sign`)",
+    )
     add_source(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
 def run(options: argparse.Namespace) -> None:
     """Localize and write one line per view."""
-    import numpy as np
-
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
-    from orthonav.flight.mount import read_mount
     from orthonav.localizer import Localizer
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
+    from orthonav.mapfile.signature import require_signature
     from orthonav.onboard.calibrate import Mounted, model_of
     from orthonav.onboard.run import Locator, SingleViews, in_hindsight, localize_flight
     from orthonav.publish.jsonl import write_results
-    from orthonav.records import Fix
     from orthonav.search.position import check_rule
 
     if options.lag is not None and not (options.hindsight and options.lag >= 0):
         raise VariantError("--lag is a number of views, for --hindsight")
+    if options.require_signed:
+        require_signature(options.map, options.require_signed)
+    flight = open_told(options.flight, options)
+    mount = take_flown(options, flight)
     accept = Acceptance.parse(options.accept) if options.accept else None
     localizer = Localizer(
         open_map(options.map),
@@ -110,12 +127,10 @@ def run(options: argparse.Namespace) -> None:
         raise VariantError("lowe_ratio compares tiles: give --registration off with it")
     if localizer.registration is None and options.registration == "on":
         log.warning("the map has no registration layer: positions at tile level only")
-    flight = open_told(options.flight, options)
     how = {
         "use_prior": options.prior == "telemetry",
         "heading_known": options.heading == "known",
     }
-    mount = read_mount(options.mount) if options.mount else None
     locator: Locator = SingleViews(localizer, **how)
     tracker = None
     if options.track or options.hindsight:
@@ -135,7 +150,18 @@ def run(options: argparse.Namespace) -> None:
                 shown("localize", min(1.0, len(results) / flight.expected))
     if tracker is not None and options.hindsight:
         results = in_hindsight(tracker, results, accept)
+    else:
+        tell_whether_as_flown(flight, results)
     write_results(options.out, results)
+    _tell(options, results)
+
+
+def _tell(options: argparse.Namespace, results: "list[ViewResult]") -> None:
+    """Print the summary."""
+    import numpy as np
+
+    from orthonav.records import Fix
+
     fixes = sum(isinstance(result.outcome, Fix) for result in results)
     latencies = np.array([result.latency_ms for result in results])
     latencies = latencies[np.isfinite(latencies)]

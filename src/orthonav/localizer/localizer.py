@@ -35,13 +35,20 @@ class Localizer:
     """Places views on one map. Cheap to make, safe to share between threads once warm."""
 
     def __init__(
-        self, opened: MapFile, *, registration: bool = True, position: PositionRule = "peak"
+        self,
+        opened: MapFile,
+        *,
+        registration: bool = True,
+        position: PositionRule = "peak",
+        flying: bool = True,
     ) -> None:
         """Take an opened map; raises `MapFileError` if it cannot be flown with this program.
 
         Without `registration`, or where the map has no registration layer, views are placed by
-        their tiles only; `position` is then how scores of tiles become a position. Raises
-        `MissingExtraError` where the map's encoder needs onnxruntime and it is not installed.
+        their tiles only; `position` is then how scores of tiles become a position. Without
+        `flying`, maps are taken too that look at what is too slow to fly: for experiments with maps
+        of one's own, for theirs load networks of this machine. Raises `MissingExtraError` where the
+        map's encoder needs onnxruntime and it is not installed.
         """
         manifest = opened.manifest
         if len(manifest.sheets) != 1:
@@ -52,7 +59,7 @@ class Localizer:
         embeddings = opened.array("sheet0/embeddings", np.float16, 2)
         try:
             self.representation = variant_from_recipe(
-                represent.TABLE, manifest.recipe.get("represent")
+                represent.TABLE, manifest.recipe.get("represent"), flying=flying
             )
             self.embedder = embedder_of(
                 manifest.recipe.get("embed"),
@@ -144,9 +151,11 @@ class Localizer:
 
     def embedded(self, views: list[Rectified]) -> NDArray[np.float32]:
         """Embeddings (Q, D) of rectified views."""
-        maps = [self.representation(view.grey, view.valid) for view in views]
         return np.stack(
-            [self.embedder.view(one, view.valid) for one, view in zip(maps, views, strict=True)]
+            [
+                self.embedder.view(self.representation(view.grey, view.valid), view.valid)
+                for view in views
+            ]
         )
 
     def match(self, queries: NDArray[np.float32], rows: NDArray[np.intp] | None = None) -> Match:

@@ -190,7 +190,7 @@ def _decode_grey(jpeg: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.
     limit = MAX_CHUNK_BYTES_PER_PX * height * width + _CHUNK_HEADER_BYTES
     if jpeg.size > limit:
         raise MapFileError(f"{jpeg.size} bytes for {height} x {width} px")
-    found = _jpeg_frame(jpeg.tobytes())
+    found = jpeg_frame(jpeg.tobytes())
     if found != (8, height, width, 1):
         got = (
             "something else" if found is None else "{} bits, {} x {} px, {} channels".format(*found)
@@ -205,7 +205,7 @@ def _decode_grey(jpeg: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.
     return np.asarray(grey, dtype=np.uint8)
 
 
-def _jpeg_frame(data: bytes) -> tuple[int, int, int, int] | None:
+def jpeg_frame(data: bytes) -> tuple[int, int, int, int] | None:
     """Bits, rows, columns and channels that a baseline JPEG declares; None if it is none."""
     if not (data.startswith(_SOI) and data.endswith(_EOI)):
         return None

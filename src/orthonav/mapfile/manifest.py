@@ -23,6 +23,8 @@ MIN_CHUNK_PX, MAX_CHUNK_PX = 16, 1024
 CODEC = "jpeg"
 MAX_DIGITS = 20
 """More than any number in a map needs, and few enough for every one to be a float."""
+MIN_HEADING_STEP_DEG = 0.5
+"""Finer than any method needs: every heading tried is a picture in memory."""
 
 
 @dataclass(frozen=True)
@@ -199,13 +201,24 @@ class Manifest:
             recipe=_get(plain, "recipe", dict),
             sheets=tuple(SheetInfo.from_plain(sheet) for sheet in sheets),
             imagery=tuple(item for item in _get(plain, "imagery", list) if isinstance(item, dict)),
-            view=_get(plain, "view", dict),
+            view=_view(plain),
             confidence=confidence if isinstance(confidence, dict) else None,
             radius_m=_number(plain, "radius_m"),
             created_by=str(plain.get("created_by", "")),
             registration=registration if isinstance(registration, dict) else None,
             parts=_get(plain, "parts", dict),
         )
+
+
+def _view(plain: Any) -> dict[str, Any]:
+    """What a view must bring, with headings that are not too many to be tried."""
+    view: dict[str, Any] = _get(plain, "view", dict)
+    if not MIN_HEADING_STEP_DEG <= _number(view, "heading_step_deg") <= 360:
+        raise MapFileError(
+            f"manifest of the map: heading_step_deg must be {MIN_HEADING_STEP_DEG} to 360, "
+            f"got {view['heading_step_deg']!r:.80}"
+        )
+    return view
 
 
 def _integer(text: str) -> int:

@@ -1,5 +1,6 @@
 """What people record, read as flights: photographs, videos, ROS recordings, autopilots' logs."""
 
+from orthonav.sources.flightlog import LoggedFlight
 from orthonav.sources.importing import Imported, import_flight
 from orthonav.sources.opening import open_source, source_kind
 from orthonav.sources.options import KINDS, ROLES, SourceOptions
@@ -9,6 +10,7 @@ __all__ = [
     "KINDS",
     "ROLES",
     "Imported",
+    "LoggedFlight",
     "Recording",
     "SourceOptions",
     "SourceView",

@@ -5,6 +5,7 @@ outer corner: theirs plus half a pixel is ours.
 """
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,24 @@ from orthonav.flight import read_camera
 from orthonav.geo.camera import Camera
 from orthonav.sources.guard import needed
 
-MAX_BYTES = 10_000_000
+MAX_BYTES = 1_000_000
+MAX_EVENTS = 20_000
+MAX_DEPTH = 20
+MAX_VALUE_CHARS = 10_000
+MAX_OPENINGS = 5000
 _BROWN = ("", "brown", "plumb_bob", "rational_polynomial", "radtan", "none")
 _FISHEYE = ("equidistant", "fisheye")
-_BROKEN = (ValueError, KeyError, TypeError, AttributeError, OverflowError, IndexError)
+_BROKEN = (
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    IndexError,
+    RecursionError,
+)
+# What opens another level, for OpenCV: -- and a:b: do, too; a minus before a number does not.
+_OPENING = re.compile(r"[\[{<:]|-(?![\d.])")
 
 
 def read_camera_file(path: Path) -> Camera:
@@ -79,9 +94,32 @@ def camera_from_numbers(
 def _yaml(text: str) -> Any:
     yaml = needed("yaml", "camera files in YAML")
     try:
+        _check_events(yaml, text)
         return yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise CameraError(f"camera file is no YAML ({error.__class__.__name__})") from error
+
+
+def _check_events(yaml: Any, text: str) -> None:
+    """Raises `CameraError` where YAML holds what no camera needs, before anything is made of it.
+
+    Aliases of aliases grow without end, nesting goes as deep as the stack, and some numbers (those
+    with colons) take time with the square of their length.
+    """
+    depth = 0
+    for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
+        if getattr(event, "anchor", None) is not None:
+            raise CameraError("camera file has anchors or aliases: write the values out")
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        long = isinstance(event, yaml.ScalarEvent) and len(event.value) > MAX_VALUE_CHARS
+        if depth > MAX_DEPTH or count > MAX_EVENTS or long:
+            raise CameraError(
+                f"camera file has more than {MAX_EVENTS} parts, {MAX_DEPTH} levels or "
+                f"{MAX_VALUE_CHARS} characters in one value"
+            )
 
 
 def _plain(plain: Any) -> Camera:
@@ -116,6 +154,9 @@ def _kalibr(plain: Mapping[str, Any]) -> Camera:
 
 
 def _opencv(text: str) -> Camera:
+    # OpenCV ends the program where nesting is deeper than the stack.
+    if sum(1 for _ in _OPENING.finditer(text)) > MAX_OPENINGS:
+        raise CameraError(f"camera file has more than {MAX_OPENINGS} parts")
     try:
         storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
         try:

@@ -7,6 +7,7 @@ from pathlib import Path
 from orthonav.errors import FlightError, MissingFileError
 from orthonav.flight import FlightFolder, open_flight, read_truth
 from orthonav.sources.cameras import read_camera_file
+from orthonav.sources.flightlog import is_flight_log, open_flight_log
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.photos import open_photos, photo_paths
 from orthonav.sources.recording import Recording, SourceView, as_told, fitted
@@ -18,7 +19,7 @@ _TS_PACKET_BYTES = 188
 
 
 def open_source(path: Path, options: SourceOptions | None = None) -> Recording:
-    """Open what somebody recorded: a flight folder, photographs, a video, ROS messages.
+    """Open what somebody recorded: a flight folder, photographs, a video, ROS messages, our log.
 
     Raises `MissingFileError`, `FlightError`, `CameraError` or `MissingExtraError`.
     """
@@ -34,24 +35,30 @@ def open_source(path: Path, options: SourceOptions | None = None) -> Recording:
         return _flight(open_flight(path), options)
     if kind == "photos":
         return open_photos(path, options)
+    if kind == "log":
+        return open_flight_log(path, options)
     return open_video(path, options) if kind == "video" else open_ros(path, options)
 
 
 def source_kind(path: Path) -> str:
-    """`flight`, `photos`, `video` or `ros`, by content; `FlightError` where it is none of them."""
+    """`flight`, `photos`, `video`, `ros` or `log`, by content; `FlightError` where it is none."""
     if path.is_dir():
         if (path / "flight.json").exists() or (path / "telemetry.csv").exists():
             return "flight"
         if (path / "metadata.yaml").exists():
             return "ros"
+        if is_flight_log(path):
+            return "log"
         if photo_paths(path):
             return "photos"
         raise FlightError(
-            "expected a flight folder (flight.json), photographs or a ROS 2 bag (metadata.yaml), "
-            f"found none: {path}"
+            "expected a flight folder (flight.json), photographs, a ROS 2 bag (metadata.yaml) or a "
+            f"flight log, found none: {path}"
         )
     if path.stat().st_size == 0:
         raise FlightError(f"source is empty: {path}")
+    if is_flight_log(path):
+        return "log"
     if bag_suffix(path) is not None:
         return "ros"
     if _is_video(path):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from orthonav.errors import FlightError
 
-KINDS = ("flight", "photos", "video", "ros")
+KINDS = ("flight", "photos", "video", "ros", "log")
 ROLES = ("image", "camera_info", "attitude", "velocity", "position", "height")
 
 

@@ -22,6 +22,7 @@ from orthonav.sources.logs import read_log
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.recording import Recording, SourceView, check_overlap, fitted, known_at
 from orthonav.sources.ros_images import camera_of_info, grey_of_image
+from orthonav.sources.ros_limits import bound_inflation, check_held
 from orthonav.sources.ros_topics import Topics, find_topics
 from orthonav.sources.ros_track import read_track, stamp_ns
 from orthonav.sources.track import Track
@@ -73,6 +74,7 @@ def _opened(path: Path) -> Iterator[Any]:
     """A reader of the recording, whatever its file is called."""
     highlevel = needed("rosbags.highlevel", "ROS recordings")
     typesys = needed("rosbags.typesys", "ROS recordings")
+    bound_inflation()
     with contextlib.ExitStack() as stack:
         stack.enter_context(reading("ROS recording", path))
         named = path
@@ -81,7 +83,9 @@ def _opened(path: Path) -> Iterator[Any]:
             named = Path(folder) / f"recording{suffix}"  # the library goes by the ending
             named.symlink_to(path.resolve())
         known = typesys.get_typestore(typesys.Stores.LATEST)  # for old bags without definitions
-        yield stack.enter_context(highlevel.AnyReader([named], default_typestore=known))
+        reader = stack.enter_context(highlevel.AnyReader([named], default_typestore=known))
+        check_held(reader.readers)
+        yield reader
 
 
 def _first_image(reader: Any, topics: Topics, path: Path) -> tuple[tuple[int, int], int, int]:

@@ -50,11 +50,13 @@ TOLD_SHARE = 0.9
 """Belief in a position that was told before anything was seen."""
 SURE = 0.9
 LIKELY = 0.5
-CONFIRMED = 1.0
+CONFIRMED = 0.8
 """Views' worth of new ground that must have been recognized before a track is one, each counted by
-how much likelier than not its view alone was placed rightly: no single view makes a track, and
-views that fit only because they were looked for there do not either."""
-MOST_OF_ONE = 0.95
+how likely its view alone was placed rightly: no single view makes a track, and views that fit only
+because they were looked for there do not either."""
+TRUSTED = (0.1, 0.5)
+"""Views whose own probability is below the first do not count, above the second fully."""
+MOST_OF_ONE = 0.75
 UNCONFIRMED = 0.8
 """More confidence is not stated before."""
 WHAT_DIFFERS = np.ix_([0, 1, 2, 3, 6, 7], [0, 1, 2, 3, 6, 7])
@@ -348,7 +350,7 @@ class Mixture:
         odds = newness * (min(sighting.log_odds, MAX_LOG_ODDS) + wide)
         odds += (1 - newness) * float(log_det) / 2 - len(SEEN) / 2 * math.log(newness)
         return _Reading(
-            seen, noise / newness + anew, odds, min(newness * sighting.alone, MOST_OF_ONE)
+            seen, noise / newness + anew, odds, min(newness * _trust(sighting.alone), MOST_OF_ONE)
         )
 
     def _seen(self, each: Hypothesis, seen: "_Reading") -> Hypothesis | None:
@@ -426,6 +428,11 @@ def _merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
         sighted = sum(each.share * each.sighted for each in group) / share
         kept.append(replace(first, share=share, mean=mean, covariance=covariance, sighted=sighted))
     return kept
+
+
+def _trust(alone: float) -> float:
+    low, high = TRUSTED
+    return min(max((alone - low) / (high - low), 0.0), 1.0)
 
 
 def _divergence(one: Hypothesis, heavier: Hypothesis, inverse: Array) -> float:

@@ -1,6 +1,7 @@
 """Camera files of other programs, as those programs write them."""
 
 import json
+from copy import deepcopy
 
 import cv2
 import numpy as np
@@ -58,7 +59,7 @@ def kalibr(path, model="radtan", distortion=BROWN[:4], names=("cam0",), **change
         "resolution": [640, 480],
         "rostopic": "/cam0/image_raw",
     }
-    path.write_text(yaml.safe_dump({name: one | changes for name in names}))
+    path.write_text(yaml.safe_dump({name: deepcopy(one | changes) for name in names}))
     return path
 
 

@@ -1,0 +1,36 @@
+"""`orthonav sign`: sign a map, or make a key for it."""
+
+import argparse
+from pathlib import Path
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("map", type=Path, metavar="MAP.onav", nargs="?")
+    how = parser.add_mutually_exclusive_group(required=True)
+    how.add_argument("--key", type=Path, metavar="private.pem", help="Ed25519 private key (PEM)")
+    how.add_argument(
+        "--new-key",
+        type=Path,
+        metavar="DIR",
+        help="write a new private.pem and public.pem there (and sign the map with it, if given)",
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Write a key, a signature, or both."""
+    from orthonav.errors import MapFileError
+    from orthonav.mapfile.signature import PRIVATE_NAME, PUBLIC_NAME, new_key, sign_map
+
+    key = options.key
+    if options.new_key is not None:
+        made = new_key(options.new_key)
+        print(
+            f"key {made}: keep {options.new_key / PRIVATE_NAME} secret, give "
+            f"{options.new_key / PUBLIC_NAME} to those who fly"
+        )
+        key = options.new_key / PRIVATE_NAME
+    if options.map is not None:
+        print(f"written to {sign_map(options.map, key)}")
+    elif options.key is not None:
+        raise MapFileError("name the map that is to be signed")

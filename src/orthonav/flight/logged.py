@@ -1,0 +1,357 @@
+"""The messages of a flight log, written and read side by side.
+
+A flight log is one or more MCAP files (`docs/flights.md`). Each message is JSON, so that it can be
+read without us, but pictures: base64 would hide their bytes from the compression of the chunks, so
+they are in the encoding of ROS 2 (CDR), of which Foxglove knows the schema by name. Numbers that
+JSON has no words for are the texts `NaN`, `Infinity` and `-Infinity`, as in JSON of Protocol
+Buffers; all others come back bit for bit.
+"""
+
+import json
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from orthonav.errors import CameraError, FlightError
+from orthonav.geo.camera import Camera
+from orthonav.records import Fix, Prior, Telemetry
+
+PROFILE = "orthonav"
+"""The profile in the header of an MCAP file that says it is ours."""
+FORMAT = 1
+MAX_CHUNK_BYTES = 128 * 2**20
+"""No chunk is larger, uncompressed; readers refuse those that claim to be."""
+MAX_PICTURE_BYTES = MAX_CHUNK_BYTES // 2
+MAX_JSON_BYTES = 2**20
+FRAME_ID = "camera"
+PICTURES = ("full", "thumbnail", "none", "dropped", "bad")
+"""What became of a view's picture: logged, logged small, not asked for, no time or room for it,
+or the camera gave none that can be used."""
+
+_WORDS = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
+_TIME = {
+    "type": "object",
+    "title": "time",
+    "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+}
+_NUMBER, _TEXT, _OBJECT = {"type": "number"}, {"type": "string"}, {"type": "object"}
+_INTEGER = {"type": "integer"}
+
+
+def _numbers(count: int | None = None) -> dict[str, Any]:
+    sized = {} if count is None else {"minItems": count, "maxItems": count}
+    return {"type": "array", "items": _NUMBER, **sized}
+
+
+def _schema(title: str, required: Mapping[str, Any], optional: Mapping[str, Any]) -> str:
+    schema = {"title": title, "type": "object", "properties": {**required, **optional}}
+    return json.dumps({**schema, "required": list(required)})
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One kind of message: its name, its schema, and how schema and message are encoded."""
+
+    name: str
+    schema: str
+    text: str
+    schema_encoding: str = "jsonschema"
+    encoding: str = "json"
+
+
+_IMAGE = """builtin_interfaces/Time timestamp
+string frame_id
+uint8[] data
+string format
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+_IMAGE_NAME = "foxglove_msgs/msg/CompressedImage"
+_TOLD = ("yaw_deg", "pitch_deg", "roll_deg", "agl_m")
+_TOLD_OR_NOT = tuple(each.name for each in fields(Telemetry) if each.type == float | None)
+
+SESSION = Topic(
+    "/orthonav/session",
+    "orthonav.Session",
+    _schema(
+        "orthonav.Session",
+        {"format": _INTEGER, "run": _TEXT, "version": _TEXT, "views": _TEXT, "camera": _OBJECT},
+        {"map": _OBJECT, "options": _OBJECT},
+    ),
+)
+VIEW = Topic("/orthonav/view", _IMAGE_NAME, _IMAGE, "ros2msg", "cdr")
+THUMBNAIL = Topic("/orthonav/thumbnail", _IMAGE_NAME, _IMAGE, "ros2msg", "cdr")
+TELEMETRY = Topic(
+    "/orthonav/telemetry",
+    "orthonav.Telemetry",
+    _schema(
+        "orthonav.Telemetry",
+        {
+            "timestamp": _TIME,
+            "index": _INTEGER,
+            "number": _INTEGER,
+            "frame": _TEXT,
+            "time_ns": _INTEGER,
+            "picture": _TEXT,
+            **dict.fromkeys(_TOLD, _NUMBER),
+        },
+        {**dict.fromkeys(_TOLD_OR_NOT, _NUMBER), "prior": _OBJECT, "vel_en_mps": _numbers()},
+    ),
+)
+RESULT = Topic(
+    "/orthonav/result",
+    "orthonav.Result",
+    _schema(
+        "orthonav.Result",
+        {"frame": _TEXT, "time_s": _NUMBER, "status": _TEXT, "evidence": _OBJECT},
+        {
+            **dict.fromkeys(("lat_deg", "lon_deg", "confidence", "radius_m"), _NUMBER),
+            **dict.fromkeys(("heading_deg", "agl_m", "latency_ms"), _NUMBER),
+            **dict.fromkeys(("reason", "detail", "state"), _TEXT),
+        },
+    ),
+)
+POSITION = Topic(
+    "/orthonav/position",
+    "foxglove.LocationFix",
+    _schema(
+        "foxglove.LocationFix",
+        {
+            "timestamp": _TIME,
+            "frame_id": _TEXT,
+            "latitude": _NUMBER,
+            "longitude": _NUMBER,
+            "altitude": _NUMBER,
+            "position_covariance": _numbers(9),
+            "position_covariance_type": _INTEGER,
+        },
+        {},
+    ),
+)
+CAMERA = Topic(
+    "/orthonav/camera",
+    "foxglove.CameraCalibration",
+    _schema(
+        "foxglove.CameraCalibration",
+        {"timestamp": _TIME, "frame_id": _TEXT, "width": _INTEGER, "height": _INTEGER},
+        {
+            "distortion_model": _TEXT,
+            "D": _numbers(),
+            "K": _numbers(9),
+            "R": _numbers(9),
+            "P": _numbers(12),
+        },
+    ),
+)
+HEALTH = Topic("/orthonav/health", "orthonav.Health", _schema("orthonav.Health", {}, {}))
+TOPICS = (SESSION, VIEW, THUMBNAIL, TELEMETRY, RESULT, POSITION, CAMERA, HEALTH)
+
+NO_ALTITUDE_M2 = 1e8
+"""Variance up of a position: a fix says nothing of the altitude, which is written as 0."""
+_COVARIANCE_KNOWN = 3
+
+
+@dataclass(frozen=True)
+class LoggedView:
+    """What a log says of a view.
+
+    `index` counts the views of the log from 0 without gaps and is the sequence number of all its
+    messages; `number` is the runner's, which counts pictures that were passed over too. `frame`:
+    its name. `picture`: one of `PICTURES`.
+    """
+
+    index: int
+    number: int
+    frame: str
+    telemetry: Telemetry
+    picture: str
+
+
+def to_json(plain: Any) -> bytes:
+    """Strict JSON of plain values. Raises `ValueError` or `TypeError` where it cannot be."""
+    return json.dumps(_worded(plain), allow_nan=False, separators=(",", ":")).encode("ascii")
+
+
+def from_json(data: bytes) -> dict[str, Any]:
+    """The object that `to_json` wrote, words for numbers left as they are. Raises `FlightError`."""
+    if len(data) > MAX_JSON_BYTES:
+        raise FlightError(f"message of the log has {len(data)} bytes")
+    try:
+        plain = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise FlightError(f"message of the log is not JSON ({error})") from error
+    if not isinstance(plain, dict):
+        raise FlightError("message of the log is not a JSON object")
+    return plain
+
+
+def telemetry_message(view: LoggedView) -> bytes:
+    """The message of `TELEMETRY`."""
+    told = view.telemetry
+    plain = {
+        "timestamp": stamp(told.time_ns),
+        "index": int(view.index),
+        "number": int(view.number),
+        "frame": view.frame,
+        "time_ns": int(told.time_ns),
+        "picture": view.picture,
+        **{name: float(getattr(told, name)) for name in _TOLD},
+        **{name: _float_or_none(getattr(told, name)) for name in _TOLD_OR_NOT},
+        "prior": told.prior and {name: float(v) for name, v in asdict(told.prior).items()},
+        "vel_en_mps": told.vel_en_mps and [float(value) for value in told.vel_en_mps],
+    }
+    return to_json(plain)
+
+
+def view_of(data: bytes) -> LoggedView:
+    """What a message of `TELEMETRY` says. Raises `FlightError`."""
+    plain = from_json(data)
+    try:
+        prior, velocity = plain["prior"], plain["vel_en_mps"]
+        told = {name: _number(plain[name]) for name in _TOLD}
+        told_or_not: dict[str, Any] = {
+            name: None if plain.get(name) is None else _number(plain[name]) for name in _TOLD_OR_NOT
+        }
+        names = ("lat_deg", "lon_deg", "std_m")
+        telemetry = Telemetry(
+            time_ns=_integer(plain["time_ns"]),
+            **told,
+            **told_or_not,
+            prior=None if prior is None else Prior(*(_number(prior[name]) for name in names)),
+            vel_en_mps=None if velocity is None else _pair(velocity),
+        )
+        index, number = _integer(plain["index"]), _integer(plain["number"])
+        frame, picture = plain["frame"], plain["picture"]
+        if not isinstance(frame, str) or picture not in PICTURES:
+            raise ValueError("frame or picture is not what it should be")
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise FlightError(f"telemetry of the log is broken ({error!r:.120})") from error
+    return LoggedView(index, number, frame, telemetry, picture)
+
+
+def camera_plain(camera: Camera) -> dict[str, Any]:
+    """A camera as in `flight.json`, exactly."""
+    return asdict(camera)
+
+
+def camera_of(plain: Any) -> Camera:
+    """Inverse of `camera_plain`. Raises `FlightError` or `CameraError`."""
+    try:
+        return Camera(
+            width_px=_integer(plain["width_px"]),
+            height_px=_integer(plain["height_px"]),
+            **{name: _number(plain[name]) for name in ("fx_px", "fy_px", "cx_px", "cy_px")},
+            distortion=tuple(_number(value) for value in plain["distortion"]),
+            model=str(plain["model"]),
+        )
+    except CameraError:
+        raise
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise FlightError(f"camera of the log is broken ({error!r:.120})") from error
+
+
+def calibration_message(camera: Camera, time_ns: int) -> bytes:
+    """The message of `CAMERA`: principal point from the centre of the first pixel, as OpenCV."""
+    cx, cy = camera.cx_px - 0.5, camera.cy_px - 0.5
+    rows = [camera.fx_px, 0.0, cx], [0.0, camera.fy_px, cy], [0.0, 0.0, 1.0]
+    fisheye = camera.model == "fisheye"
+    lens = [float(value) for value in camera.distortion]
+    plain = {
+        "timestamp": stamp(time_ns),
+        "frame_id": FRAME_ID,
+        "width": camera.width_px,
+        "height": camera.height_px,
+        "distortion_model": "kannala_brandt" if fisheye else "plumb_bob",
+        "D": lens + [0.0] * ((4 if fisheye else 5) - len(lens)),
+        "K": [value for row in rows for value in row],
+        "R": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        "P": [value for row in rows for value in (*row, 0.0)],
+    }
+    return to_json(plain)
+
+
+def position_message(fix: Fix, time_ns: int) -> bytes:
+    """The message of `POSITION`; raises `ValueError` where a value is not finite."""
+    (ee, en), (ne, nn) = fix.cov_en_m2.tolist()
+    plain = {
+        "timestamp": stamp(time_ns),
+        "frame_id": FRAME_ID,
+        "latitude": float(fix.lat_deg),
+        "longitude": float(fix.lon_deg),
+        "altitude": 0.0,
+        "position_covariance": [ee, en, 0.0, ne, nn, 0.0, 0.0, 0.0, NO_ALTITUDE_M2],
+        "position_covariance_type": _COVARIANCE_KNOWN,
+    }
+    return json.dumps(plain, allow_nan=False).encode("ascii")
+
+
+def stamp(time_ns: int) -> dict[str, int]:
+    """Seconds and nanoseconds, as Foxglove wants them: not before 1970."""
+    sec, nsec = divmod(max(0, int(time_ns)), 10**9)
+    return {"sec": sec, "nsec": nsec}
+
+
+def picture_message(data: bytes, kind: str, time_ns: int) -> bytes:
+    """The message of `VIEW` and `THUMBNAIL` (CDR, little endian): `data` encoded as `kind`."""
+    sec, nsec = divmod(max(0, int(time_ns)), 10**9)
+    out = bytearray(b"\0\1\0\0")
+    out += struct.pack("<II", sec & 0xFFFFFFFF, nsec)
+    for value in (FRAME_ID.encode() + b"\0", data, kind.encode() + b"\0"):
+        out += bytes(-len(out) % 4)
+        out += struct.pack("<I", len(value)) + value
+    return bytes(out)
+
+
+def picture_of(message: bytes) -> tuple[bytes, str]:
+    """The encoded picture in a message of `VIEW` and its kind. Raises `FlightError`."""
+    values, at = [], 12
+    for _ in range(3):
+        at += -at % 4
+        length = int.from_bytes(message[at : at + 4], "little")
+        value = message[at + 4 : at + 4 + length]
+        if message[:4] != b"\0\1\0\0" or len(value) != length or at + 4 > len(message):
+            raise FlightError("picture of the log is broken")
+        values.append(value)
+        at += 4 + length
+    return values[1], values[2].rstrip(b"\0").decode("latin-1")
+
+
+def _worded(value: Any) -> Any:
+    """Plain values with words for what is not finite."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    if isinstance(value, Mapping):
+        return {str(key): _worded(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_worded(each) for each in value]
+    return value
+
+
+def _float_or_none(value: float | None) -> float | None:
+    return None if value is None else float(value)
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, str):
+        return _WORDS[value]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{value!r:.40} is no number")
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError(f"{value!r:.40} is beyond float64")
+    return number
+
+
+def _integer(value: Any) -> int:
+    if type(value) is not int or abs(value) >= 2**63:
+        raise TypeError(f"{value!r:.40} is no integer of 64 bits")
+    return value
+
+
+def _pair(values: Any) -> tuple[float, float]:
+    first, second = values
+    return _number(first), _number(second)

@@ -1,0 +1,389 @@
+"""The flight log: what was seen, known and answered, in MCAP files that can be flown again.
+
+The flight never waits for it. What is logged goes into a bounded queue; a thread encodes it and
+writes a chunk about once a second, each whole on the disk before the next. Where the thread falls
+behind or the disk is full, pictures are left out first and everything else last, it is counted,
+and the flight goes on. `docs/flights.md` describes the files, `orthonav.sources` reads them.
+"""
+
+import contextlib
+import logging
+import math
+import os
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav import __version__
+from orthonav.errors import CameraError, MissingExtraError, OutputError
+from orthonav.flight.logged import (
+    CAMERA,
+    FORMAT,
+    HEALTH,
+    MAX_JSON_BYTES,
+    MAX_PICTURE_BYTES,
+    POSITION,
+    RESULT,
+    SESSION,
+    TELEMETRY,
+    THUMBNAIL,
+    VIEW,
+    LoggedView,
+    calibration_message,
+    camera_plain,
+    picture_message,
+    position_message,
+    telemetry_message,
+    to_json,
+)
+from orthonav.flight.png import lossless_png
+from orthonav.geo.camera import Camera
+from orthonav.publish.jsonl import result_to_json
+from orthonav.records import Fix, Telemetry, ViewResult
+from orthonav.sources.recording import fitted
+
+if TYPE_CHECKING:
+    from orthonav.onboard.segment import Message, Segment
+
+log = logging.getLogger(__name__)
+
+Views = Literal["none", "thumbnails", "full"]
+CHUNK_S = 1.0
+CHUNK_BYTES = 8 * 2**20
+"""A chunk ends with the view that makes it larger."""
+SEGMENT_BYTES = 256 * 2**20
+QUEUE_BYTES = 64 * 2**20
+SPARE_BYTES = 16 * 2**20
+"""Of the queue, for all that is no picture."""
+QUEUE_MESSAGES = 10_000
+LARGEST_BYTES = MAX_PICTURE_BYTES - 2**20
+"""Of a picture; the rest is for what is around it."""
+FILES_KEPT = 8
+"""Into how many files `max_bytes` is cut at least."""
+PAUSE_S = 30.0
+"""Without pictures after one could not be written."""
+THUMBNAIL_PX, THUMBNAIL_QUALITY = 320, 60
+RESULTS_LATE = 1000
+"""So many views may come before the result of one."""
+CLOSE_S = 30.0
+Grey = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class _Waiting:
+    """What is still to be encoded: `size_bytes` is what it holds while it waits."""
+
+    make: "Callable[[], list[Message]]"
+    size_bytes: int
+    has_view: bool = False
+
+
+class FlightLog:
+    """A log that is being written; every method returns at once and none raises.
+
+    `lost`: how many pictures (`views`) and other messages (`messages`) were left out so far.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        camera: Camera,
+        map_info: Mapping[str, Any],
+        *,
+        views: Views = "full",
+        max_bytes: int | None = None,
+        segment_bytes: int | None = None,
+        chunk_s: float = CHUNK_S,
+    ) -> None:
+        """Write `NAME_0001.mcap` and so on beside `path`, which is `NAME.mcap`.
+
+        `map_info` is best that of `orthonav.mapfile.signature.map_info`. `views`: which pictures
+        are kept; a flight is flown again from full ones only. All files of this name take
+        `max_bytes` at most, the oldest go; each is at most `segment_bytes` large (256 MB, or an
+        eighth of `max_bytes`), unless a single chunk is larger. `chunk_s`: seconds between chunks,
+        which is what a power cut takes. Numbers go on after those of files that are there.
+        Raises `OutputError` where the folder cannot be written and `MissingExtraError`.
+        """
+        try:
+            import orthonav.onboard.segment  # noqa: F401  loads mcap
+        except ImportError as error:
+            raise MissingExtraError(
+                f"a flight log needs mcap: pip install 'orthonav[autopilot]' ({error})"
+            ) from error
+        path = Path(path)
+        self._folder, self._name = path.parent, path.stem if path.suffix == ".mcap" else path.name
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot write ({error.strerror}): {self._folder}") from error
+        if not os.access(self._folder, os.W_OK):
+            raise OutputError(f"cannot write (no permission): {self._folder}")
+        self.lost = {"views": 0, "messages": 0}
+        self._camera, self._views = camera, views
+        self._max_bytes = max_bytes
+        most = SEGMENT_BYTES if max_bytes is None else min(SEGMENT_BYTES, max_bytes // FILES_KEPT)
+        self._segment_bytes = segment_bytes or most
+        self._chunk_s = chunk_s
+        self._session: dict[str, Any] = {
+            "format": FORMAT,
+            "run": os.urandom(8).hex(),  # tells files of two runs of one name apart
+            "version": __version__,
+            "views": views,
+            "camera": camera_plain(camera),
+            "map": dict(map_info),
+            "options": {},
+        }
+        self._time_ns = 0
+        self._indices: dict[str, int] = {}
+        self._index = 0
+        self._sized = False
+        self._segment: Segment | None = None
+        self._no_views_until = -math.inf
+        self._told = False
+        self._queue: list[_Waiting] = []
+        self._queued_bytes = 0
+        self._closing = False
+        self._change = threading.Condition()
+        self._thread = threading.Thread(target=self._work, name="flight log", daemon=True)
+        self._thread.start()
+
+    def options(self, options: Mapping[str, Any]) -> None:
+        """How the flight is flown, as the command line of `orthonav localize` says it.
+
+        Keys that a replay knows: `heading` ("known", "unknown"), `prior` ("telemetry", "none"),
+        `registration` ("on", "off"), `position`, `accept` (text or None), `track` (bool) and
+        `mount` (None, or `dataclasses.asdict` of a `Mount`). Others are kept.
+        """
+        try:
+            session = {**self._session, "options": dict(options)}
+            to_json(session)  # what cannot be written must not keep the rest from being written
+        except Exception as error:
+            self._lose("messages", error)
+            return
+        self._session = session
+        self._add(lambda: [self._session_message(session)], 1000)
+
+    def view(self, number: int, frame: str, grey: Grey | None, telemetry: Telemetry) -> None:
+        """A view before it is placed: `grey` (H, W), None where the camera gave no usable one.
+
+        `number` is the runner's own; `telemetry` is what the locator is told, ahead of any mount.
+        The picture is copied. The first one settles the size of the camera, all others must have
+        its size to be flown again.
+        """
+        time_ns = self._time_ns = telemetry.time_ns
+        if grey is not None and not self._sized:
+            self._fit(grey.shape)
+        index, self._index = self._index, self._index + 1
+        self._indices[frame] = index
+        while len(self._indices) > RESULTS_LATE:
+            self._indices.pop(next(iter(self._indices)))
+        picture = "none" if grey is not None else "bad"
+        seen = LoggedView(index, number, frame, telemetry, picture)
+        if grey is None or self._views == "none":
+            self._add(lambda: [_telemetry(seen, time_ns)], 1000)
+            return
+        if self._views == "full" and self._has_room(grey.nbytes):
+            kept = np.array(grey, dtype=np.uint8, order="C")
+            self._add(lambda: _full(seen, kept), kept.nbytes, has_view=True)
+        elif self._views == "full":
+            self._lose("views", "the writer falls behind, or a picture is too large")
+            seen = replace(seen, picture="dropped")
+            self._add(lambda: [_telemetry(seen, time_ns)], 1000)
+        else:
+            small = _thumbnail(grey)
+            self._add(lambda: _with_thumbnail(seen, small), small.nbytes)
+
+    def result(self, result: ViewResult) -> None:
+        """What came out for a view."""
+        index = self._indices.get(result.frame, 0)
+        self._add(lambda: _result(result, index), 1000)
+
+    def health(self, health: Mapping[str, Any]) -> None:
+        """How the flight is doing: any plain values; what the log lost is added as `log_lost`."""
+        try:
+            data = to_json({**health, "log_lost": dict(self.lost)})
+        except Exception as error:
+            self._lose("messages", error)
+            return
+        time_ns = self._time_ns
+        self._add(lambda: [_message(HEALTH, time_ns, data)], len(data))
+
+    def close(self) -> None:
+        """Write what is waiting and end the file; waits for it, half a minute at most."""
+        with self._change:
+            self._closing = True
+            self._change.notify()
+        self._thread.join(CLOSE_S)
+        if self._thread.is_alive():
+            log.warning("the flight log could not be ended in %.0f s", CLOSE_S)
+
+    def _fit(self, shape: tuple[int, ...]) -> None:
+        """Make the camera that of the pictures, as the runner does."""
+        self._sized = True
+        try:
+            camera = fitted(self._camera, shape[1], shape[0], "the flight log")
+        except CameraError as error:
+            log.warning("%s", error)
+            return
+        if camera == self._camera:
+            return
+        self._camera = camera
+        session = self._session = {**self._session, "camera": camera_plain(self._camera)}
+        self._add(lambda: [self._session_message(session)], 1000)
+
+    def _has_room(self, size_bytes: int) -> bool:
+        with self._change:
+            waiting = self._queued_bytes if self._queue else 0
+            return size_bytes <= LARGEST_BYTES and waiting + size_bytes <= QUEUE_BYTES
+
+    def _add(
+        self, make: "Callable[[], list[Message]]", size_bytes: int, *, has_view: bool = False
+    ) -> None:
+        with self._change:
+            room = self._queued_bytes + size_bytes <= QUEUE_BYTES + SPARE_BYTES
+            if not self._closing and room and len(self._queue) < QUEUE_MESSAGES:
+                self._queue.append(_Waiting(make, size_bytes, has_view))
+                self._queued_bytes += size_bytes
+                if self._queued_bytes >= CHUNK_BYTES:
+                    self._change.notify()
+                return
+        self._lose("messages", "the writer falls behind, or the log is closed")
+        if has_view:
+            self._lose("views", "the writer falls behind, or the log is closed")
+
+    def _lose(self, what: str, why: object, count: int = 1) -> None:
+        with self._change:
+            self.lost[what] += count
+            told, self._told = self._told, True
+        if not told:  # once: what is lost is counted
+            log.warning("the flight log loses %s (%s): %s", what, why, self._folder)
+
+    # What follows runs in the thread.
+
+    def _work(self) -> None:
+        while True:
+            with self._change:
+                self._change.wait_for(
+                    lambda: self._closing or self._queued_bytes >= CHUNK_BYTES, self._chunk_s
+                )
+                taken, self._queue, self._queued_bytes = self._queue, [], 0
+                closing = self._closing
+            try:
+                self._write([message for each in taken for message in self._made(each)])
+                if closing:
+                    self._end_segment()
+            except Exception as error:  # whatever it is, it must not end the log
+                self._lose("messages", repr(error), len(taken))
+                self._segment = None
+            if closing:
+                return
+
+    def _made(self, waiting: _Waiting) -> "list[Message]":
+        try:
+            return waiting.make()
+        except Exception as error:
+            self._lose("views" if waiting.has_view else "messages", repr(error))
+            return []
+
+    def _write(self, messages: "list[Message]") -> None:
+        """Write a chunk; without its pictures where that fails."""
+        views = sum(message.is_view for message in messages)
+        if views and time.monotonic() < self._no_views_until:
+            self._lose("views", "no room", views)
+            messages, views = [each for each in messages if not each.is_view], 0
+        if not messages or self._put(messages):
+            return
+        if views:
+            self._no_views_until = time.monotonic() + PAUSE_S
+            self._lose("views", "no room", views)
+            messages = [each for each in messages if not each.is_view]
+            if not messages or self._put(messages):
+                return
+        self._lose("messages", "no room", len(messages))
+
+    def _put(self, messages: "list[Message]") -> bool:
+        from orthonav.onboard.segment import next_segment
+
+        size = sum(len(message.data) + 100 for message in messages)
+        try:
+            segment = self._segment
+            if segment is not None and segment.finished_bytes + size > self._segment_bytes:
+                self._end_segment()
+            if self._segment is None:
+                needed = max(self._segment_bytes, size)
+                self._segment = next_segment(self._folder, self._name, needed, self._max_bytes)
+                messages = [*self._head(), *messages]
+            self._segment.write(messages)
+        except OSError as error:
+            log.debug("flight log: %s", error)
+            self._segment = None
+            return False
+        return True
+
+    def _end_segment(self) -> None:
+        segment, self._segment = self._segment, None
+        if segment is not None:
+            try:
+                segment.finish()
+            except OSError as error:
+                log.debug("flight log ends without an index: %s", error)
+
+    def _head(self) -> "list[Message]":
+        """What every file begins with."""
+        camera = _message(CAMERA, self._time_ns, calibration_message(self._camera, self._time_ns))
+        return [self._session_message(self._session), camera]
+
+    def _session_message(self, session: dict[str, Any]) -> "Message":
+        return _message(SESSION, self._time_ns, to_json(session))
+
+
+def _message(topic: Any, time_ns: int, data: bytes, index: int = 0) -> "Message":
+    from orthonav.onboard.segment import Message
+
+    limit = MAX_PICTURE_BYTES if topic in (VIEW, THUMBNAIL) else MAX_JSON_BYTES
+    if len(data) > limit:
+        raise ValueError(f"{len(data)} bytes for {topic.name}")
+    return Message(topic, time_ns, data, index)
+
+
+def _telemetry(seen: LoggedView, time_ns: int) -> "Message":
+    return _message(TELEMETRY, time_ns, telemetry_message(seen), seen.index)
+
+
+def _full(seen: LoggedView, grey: Grey) -> "list[Message]":
+    time_ns = seen.telemetry.time_ns
+    data = picture_message(lossless_png(grey), "png", time_ns)
+    picture = _message(VIEW, time_ns, data, seen.index)
+    return [_telemetry(replace(seen, picture="full"), time_ns), picture]
+
+
+def _thumbnail(grey: Grey) -> Grey:
+    share = min(1.0, THUMBNAIL_PX / max(grey.shape))
+    size = tuple(max(1, round(share * side)) for side in grey.shape[::-1])
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _with_thumbnail(seen: LoggedView, small: Grey) -> "list[Message]":
+    time_ns = seen.telemetry.time_ns
+    options = [int(cv2.IMWRITE_JPEG_QUALITY), THUMBNAIL_QUALITY]
+    done, jpeg = cv2.imencode(".jpg", small, options)
+    told = _telemetry(replace(seen, picture="thumbnail" if done else "none"), time_ns)
+    data = picture_message(jpeg.tobytes() if done else b"", "jpeg", time_ns)
+    return [told, _message(THUMBNAIL, time_ns, data, seen.index)] if done else [told]
+
+
+def _result(result: ViewResult, index: int) -> "list[Message]":
+    line = result_to_json(result).encode("ascii")
+    messages = [_message(RESULT, result.time_ns, line, index)]
+    if isinstance(result.outcome, Fix):
+        with contextlib.suppress(ValueError):  # a number that is none
+            data = position_message(result.outcome, result.time_ns)
+            messages.append(_message(POSITION, result.time_ns, data, index))
+    return messages

@@ -1,0 +1,149 @@
+"""Chunks of an MCAP file that may be cut anywhere, damaged, or made by somebody who means harm.
+
+Libraries that read MCAP believe what records say of themselves. Here every length is held against
+a limit and the file before anything is allocated for it, and chunks that are damaged are passed
+over. The format: https://mcap.dev/spec.
+"""
+
+import io
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from orthonav.flight.logged import MAX_CHUNK_BYTES
+from orthonav.sources.guard import needed
+
+MAGIC = b"\x89MCAP0\r\n"
+_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 1, 2, 3, 4, 5, 6, 15
+_RECORD_BYTES, _MESSAGE_BYTES = 9, 22
+MAX_TOPIC_BYTES = 1000
+WHAT = "flight logs"
+
+
+@dataclass(frozen=True)
+class Found:
+    """A message in a chunk: its topic and encodings, its number, and where its data lies there."""
+
+    topic: str
+    number: int
+    first: int
+    last: int
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """A whole chunk: where it begins in the file, and what is in it, uncompressed."""
+
+    offset: int
+    data: bytes
+
+
+@dataclass
+class Walk:
+    """What became of a file: bytes behind the last whole record, damaged chunks, a proper end."""
+
+    lost_bytes: int = 0
+    damaged: int = 0
+    ended: bool = False
+
+
+def profile_of(path: Path) -> str | None:
+    """The profile in the header of an MCAP file; None where it is none."""
+    with path.open("rb") as stream:
+        head = stream.read(64)
+    at = len(MAGIC)
+    if not head.startswith(MAGIC) or head[at : at + 1] != bytes([_HEADER]):
+        return None
+    at += _RECORD_BYTES
+    length = int.from_bytes(head[at : at + 4], "little")
+    profile = head[at + 4 : at + 4 + length]
+    return profile.decode("latin-1") if len(profile) == length else None
+
+
+def chunks(path: Path, walk: Walk) -> Iterator[Chunk]:
+    """The chunks of a file from its start, up to its end or where it was cut; fills in `walk`."""
+    with path.open("rb") as stream:
+        size = stream.seek(0, io.SEEK_END)
+        at = stream.seek(len(MAGIC))
+        while at + _RECORD_BYTES <= size:
+            stream.seek(at)
+            head = stream.read(_RECORD_BYTES)
+            opcode, length = head[0], int.from_bytes(head[1:], "little")
+            if opcode in (_DATA_END, _FOOTER):
+                walk.ended = True
+                return
+            if opcode == 0 or length > size - at - _RECORD_BYTES:
+                break
+            if opcode == _CHUNK:
+                data = _inflated(stream, length)
+                if data is None:
+                    walk.damaged += 1
+                else:
+                    yield Chunk(at, data)
+            at += _RECORD_BYTES + length
+        walk.lost_bytes = max(0, size - at)
+
+
+def chunk_at(path: Path, offset: int) -> bytes | None:
+    """What is in the chunk that begins at `offset`, None where it is damaged."""
+    with path.open("rb") as stream:
+        stream.seek(offset)
+        head = stream.read(_RECORD_BYTES)
+        if len(head) < _RECORD_BYTES or head[0] != _CHUNK:
+            return None
+        return _inflated(stream, int.from_bytes(head[1:], "little"))
+
+
+def messages(chunk: Chunk, channels: dict[int, str]) -> Iterator[Found]:
+    """The messages of a chunk; channels it tells of are added to `channels`, id to topic."""
+    data, at = chunk.data, 0
+    while at + _RECORD_BYTES <= len(data):
+        opcode = data[at]
+        first = at + _RECORD_BYTES
+        last = first + int.from_bytes(data[at + 1 : first], "little")
+        if last > len(data) or opcode not in (_SCHEMA, _CHANNEL, _MESSAGE):
+            return
+        if opcode == _CHANNEL and last - first >= 8:
+            named = first + 8 + int.from_bytes(data[first + 4 : first + 8], "little")
+            if named <= min(last, first + 8 + MAX_TOPIC_BYTES):
+                topic = data[first + 8 : named].decode("utf-8", "replace")
+                channels[int.from_bytes(data[first : first + 2], "little")] = topic
+        elif opcode == _MESSAGE and last - first >= _MESSAGE_BYTES:
+            topic = channels.get(int.from_bytes(data[first : first + 2], "little"), "")
+            number = int.from_bytes(data[first + 2 : first + 6], "little")
+            yield Found(topic, number, first + _MESSAGE_BYTES, last)
+        at = last
+
+
+def _inflated(stream: BinaryIO, length: int) -> bytes | None:
+    """What is in the chunk record of `length` bytes that follows, None where it is damaged."""
+    if not 40 <= length <= MAX_CHUNK_BYTES + 1000:
+        return None
+    body = stream.read(length)
+    size, crc = int.from_bytes(body[16:24], "little"), int.from_bytes(body[24:28], "little")
+    named = 32 + int.from_bytes(body[28:32], "little")
+    kind, first = body[32:named], named + 8
+    last = first + int.from_bytes(body[named:first], "little")
+    if named > 64 or last > len(body) or size > MAX_CHUNK_BYTES:
+        return None
+    data: bytes | None = body[first:last] if kind == b"" else None
+    if kind == b"zstd":
+        data = _zstd(body[first:last], size)
+    if data is None or len(data) != size or (crc and zlib.crc32(data) != crc):
+        return None
+    return data
+
+
+def _zstd(data: bytes, size: int) -> bytes | None:
+    """`data` uncompressed, where its frame says that it takes `size` bytes and no more."""
+    zstandard = needed("zstandard", WHAT)
+    try:
+        told = zstandard.get_frame_parameters(data)
+        if told.content_size != size or told.window_size > 2 * MAX_CHUNK_BYTES:
+            return None
+        plain = zstandard.ZstdDecompressor().decompress(data, max_output_size=max(1, size))
+    except zstandard.ZstdError:
+        return None
+    return bytes(plain)

@@ -1,0 +1,87 @@
+"""What compressed ROS recordings may become in memory.
+
+`rosbags` inflates a chunk whole and then compares its size with what it claimed. Its tables of what
+inflates are replaced by ones that stop there. The chunks of MCAP whose times overlap are held at
+once: what they claim together is bounded before one of them is read. What is refused is told by
+`ValueError`, as `rosbags` tells of damage, for `guard.reading` to name the file.
+"""
+
+import bz2
+from collections.abc import Iterable
+from typing import Any
+
+from orthonav.flight.logged import MAX_CHUNK_BYTES
+from orthonav.sources.guard import needed
+
+MAX_HELD_BYTES = 2**30
+WHAT = "ROS recordings"
+
+
+def bound_inflation() -> None:
+    """From now on `rosbags` inflates no chunk beyond its claim, or beyond `MAX_CHUNK_BYTES`."""
+    mcap = needed("rosbags.rosbag2.storage_mcap", WHAT)
+    mcap.DECOMPRESSORS.update(lz4=_lz4, zstd=_zstd)
+    bag = needed("rosbags.rosbag1.reader", WHAT)
+    bag.decompressors.update(lz4=lambda data: _lz4(data, MAX_CHUNK_BYTES), bz2=_bz2)
+
+
+def check_held(readers: Iterable[Any]) -> None:
+    """Raises `ValueError` where chunks claim too much, one by one or those of the same time.
+
+    `readers` are those of an opened recording (`AnyReader.readers`).
+    """
+    for reader in readers:
+        storage = getattr(reader, "storage", None)  # none of a bag of ROS 1: one chunk at a time
+        for one in getattr(storage, "storages", [storage]):
+            chunks = getattr(one, "chunks", [])
+            _require(max((chunk.uncompressed_size for chunk in chunks), default=0))
+            if (held := _most_held(chunks)) > MAX_HELD_BYTES:
+                raise ValueError(
+                    f"chunks of the same time claim {held} bytes, more than {MAX_HELD_BYTES}"
+                )
+
+
+def _most_held(chunks: Iterable[Any]) -> int:
+    """The most bytes of chunks that cover one moment."""
+    edges = []
+    for chunk in chunks:
+        start, end = chunk.message_start_time, chunk.message_end_time
+        edges += [(start, 0, chunk.uncompressed_size)]
+        edges += [(max(start, end), 1, -chunk.uncompressed_size)]
+    held = most = 0
+    for _, _, step in sorted(edges):
+        held += step
+        most = max(most, held)
+    return most
+
+
+def _require(size: int) -> None:
+    if size > MAX_CHUNK_BYTES:
+        raise ValueError(f"a chunk claims {size} bytes, more than {MAX_CHUNK_BYTES}")
+
+
+def _zstd(data: bytes, size: int) -> bytes:
+    _require(size)
+    decompressor = needed("zstandard", WHAT).ZstdDecompressor(max_window_size=2 * MAX_CHUNK_BYTES)
+    with decompressor.stream_reader(data) as stream:
+        return bytes(stream.read(size + 1))
+
+
+def _lz4(data: bytes, size: int) -> bytes:
+    _require(size)
+    return _whole(needed("lz4.frame", WHAT).LZ4FrameDecompressor(), data, size)
+
+
+def _bz2(data: bytes) -> bytes:
+    return _whole(bz2.BZ2Decompressor(), data, MAX_CHUNK_BYTES)
+
+
+def _whole(decompressor: Any, data: bytes, size: int) -> bytes:
+    """`data` inflated; raises `ValueError` where that takes more than `size` bytes, or it is cut.
+
+    A byte more is asked for than there may be: an end behind exactly `size` bytes is seen then.
+    """
+    plain: bytes = decompressor.decompress(data, max_length=size + 1)
+    if len(plain) > size or not decompressor.eof:
+        raise ValueError(f"a chunk is cut, or takes more than the {size} bytes it may")
+    return plain

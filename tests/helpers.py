@@ -1,0 +1,24 @@
+"""What many tests import. Not in `conftest.py`: any folder may have one of its own."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+
+def textured(shape=(400, 400), seed=0):
+    """A picture (H, W) uint8 of blots of many sizes, unlike itself everywhere."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros(shape, dtype=np.float32)
+    for sigma in (1.5, 4.0, 12.0):
+        blots = cv2.GaussianBlur(rng.normal(size=shape).astype(np.float32), (0, 0), sigma)
+        total += (blots / blots.std()).reshape(shape)
+    return np.clip(128 + 32 * total, 1, 255).astype(np.uint8)
+
+
+class Done(NamedTuple):
+    """What a command gave: exit code, stdout and stderr, those of C libraries included."""
+
+    code: int
+    out: str
+    err: str

@@ -1,0 +1,172 @@
+"""Files made to do harm: refused in one line, before they take memory or load anything."""
+
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from orthonav.errors import CameraError, FlightError, MapFileError
+from orthonav.flight import decode_image
+from orthonav.localizer import Localizer
+from orthonav.mapfile import open_map, write_map
+from orthonav.sources.cameras import read_camera_file
+
+GOLDEN = Path(__file__).parent / "data" / "golden_v1.onav"
+MEMORY_BYTES = 3 * 2**29
+"""Address space of a command that refuses; a picture of 2^30 pixels needs more."""
+
+
+def changed(path, parts=None, **changes):
+    """The golden map with other parts or other entries of its manifest, its sums right."""
+    opened = open_map(GOLDEN)
+    arrays = {name: np.array(part) for name, part in opened.arrays.items()} | (parts or {})
+    write_map(path, replace(opened.manifest, **changes), arrays)
+    return path
+
+
+def refused(*arguments):
+    """What a command of its own with little memory says on stderr, one line."""
+    limit = lambda: resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))  # noqa: E731
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("OPENCV")}
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys, orthonav.cli as cli; sys.exit(cli.main())", *arguments],
+        env=kept | {"OPENBLAS_NUM_THREADS": "1"},
+        preexec_fn=limit,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 1 and done.stdout == ""
+    told = [line for line in done.stderr.splitlines() if line.startswith("orthonav: error: ")]
+    assert len(told) == 1 and "Traceback" not in done.stderr
+    return told[0]
+
+
+def claiming(width, height, suffix):
+    """A picture of 16 x 16 px whose header claims another size."""
+    data = bytearray(cv2.imencode(suffix, np.zeros((16, 16), np.uint8))[1].tobytes())
+    if suffix == ".png":
+        data[16:24] = width.to_bytes(4, "big") + height.to_bytes(4, "big")
+        data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
+    else:
+        at = data.index(b"\xff\xc0") + 5
+        data[at : at + 4] = height.to_bytes(2, "big") + width.to_bytes(2, "big")
+    return bytes(data)
+
+
+# Pictures.
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+@pytest.mark.parametrize("side", [17_000, 32_000])
+def test_pictures_that_claim_gigapixels(flight_path, tmp_path, suffix, side):
+    flight = shutil.copytree(flight_path, tmp_path / "flight")
+    (flight / "frames" / "0001.jpg").write_bytes(claiming(side, side, suffix))
+    told = refused("localize", GOLDEN, flight, "--out", tmp_path / "fixes.jsonl", "-q")
+    assert "image of the flight cannot be decoded" in told and "0001.jpg" in told
+
+
+def test_the_limit_of_pixels_holds_in_tests_too():
+    with pytest.raises(FlightError, match="cannot be decoded"):
+        decode_image(claiming(17_000, 17_000, ".jpg"), "a.jpg")
+
+
+# Maps.
+
+
+def test_a_preview_that_claims_gigapixels(tmp_path, run):
+    for side in (400, 17_000):
+        preview = np.frombuffer(claiming(side, side, ".jpg"), np.uint8)
+        path = changed(tmp_path / "a.onav", {"sheet0/preview_jpeg": preview})
+        fixes, truth = tmp_path / "fixes.jsonl", tmp_path / "truth.csv"
+        done = run("evaluate", fixes, "--truth", truth, "--map", path)
+        assert done.code == 1 and "preview cannot be decoded" in done.err
+    png = np.frombuffer(cv2.imencode(".png", np.zeros((16, 16), np.uint8))[1], np.uint8)
+    path = changed(tmp_path / "b.onav", {"sheet0/preview_jpeg": png})
+    assert "preview" in run("evaluate", fixes, "--truth", truth, "--map", path).err
+
+
+@pytest.mark.parametrize("step", [1e-9, 0.4999, 0.0, -6.0, 361.0, 1e300, None, "6", True])
+def test_headings_that_are_too_many(tmp_path, step):
+    view = {**open_map(GOLDEN).manifest.view, "heading_step_deg": step}
+    with pytest.raises(MapFileError, match="heading_step_deg"):
+        open_map(changed(tmp_path / "a.onav", view=view))
+
+
+def test_headings_that_are_many_but_not_too_many(tmp_path):
+    view = {**open_map(GOLDEN).manifest.view, "heading_step_deg": 0.5}
+    Localizer(open_map(changed(tmp_path / "a.onav", view=view)), registration=False)
+
+
+def test_a_map_of_what_does_not_fly(tmp_path, flight_path, monkeypatch):
+    """Refused before anything of it is loaded, weights least of all."""
+    monkeypatch.setitem(sys.modules, "orthonav.neural.sam", None)
+    recipe = dict(open_map(GOLDEN).manifest.recipe)
+    recipe["represent"] = {"name": "sam", "weights": str(tmp_path / "weights.pth")}
+    path = changed(tmp_path / "a.onav", recipe=recipe)
+    for registration in (True, False):
+        with pytest.raises(MapFileError, match="'sam' does not fly"):
+            Localizer(open_map(path), registration=registration)
+    with pytest.raises(ImportError, match="sam"):
+        Localizer(open_map(path), flying=False)
+    told = refused("localize", path, flight_path, "--out", tmp_path / "fixes.jsonl")
+    assert "map cannot be flown ('sam' does not fly" in told
+
+
+# Camera files.
+
+
+LAUGHS = "a: &a [x, x]\n" + "".join(
+    f"{each}: &{each} [{', '.join(8 * [f'*{before}'])}]\n"
+    for before, each in zip("abcdefgh", "bcdefghi", strict=True)
+)
+CAMERAS = {
+    "laughs": (LAUGHS, "anchors or aliases"),
+    "only an anchor": ("a: &a 1\n", "anchors or aliases"),
+    "only an alias": ("a: *a\n", "anchors or aliases"),
+    "deep": ("a: " + "[" * 1000, "20 levels"),
+    "deep list": ("- " * 1000, "20 levels"),
+    "many": ("[" + "1," * 30_000 + "1]", "20000 parts"),
+    "long number": ("a: " + "1:" * 30_000 + "1", "10000 characters"),
+    "large": ("#" * 1_000_001, "larger than 1 MB"),
+    "deep JSON": ('{"a":' * 100_000, "RecursionError"),
+}
+
+
+@pytest.mark.parametrize("how", CAMERAS)
+def test_camera_files(tmp_path, how):
+    text, message = CAMERAS[how]
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    with pytest.raises(CameraError, match=message) as caught:
+        read_camera_file(path)
+    assert str(path) in str(caught.value)
+
+
+OPENCV = {
+    "lists": "%YAML:1.0\n---\na: " + "[" * 400_000,
+    "mappings": "%YAML:1.0\n---\na: " + "{b:" * 200_000,
+    "dashes": "%YAML:1.0\n---\na:\n   " + "- " * 400_000 + "1\n",
+    "dashes close together": "%YAML:1.0\n---\na:\n   " + "-" * 900_000 + "1\n",
+    "colons": "%YAML:1.0\n---\n" + "a:" * 400_000 + "1\n",
+    "JSON": '{"opencv-matrix": ' + "[" * 400_000,
+    "XML": '<opencv_storage type_id="opencv-matrix">' + "<a>" * 300_000,
+}
+
+
+@pytest.mark.parametrize("how", OPENCV)
+def test_camera_files_that_are_too_deep_for_opencv(tmp_path, flight_path, how):
+    """It ends the process otherwise: so in one of its own."""
+    path = tmp_path / "camera.yaml"
+    path.write_text(OPENCV[how])
+    out = tmp_path / "out"
+    told = refused("import", flight_path, "--camera", path, "--out", out)
+    assert "camera file has more than 5000 parts" in told and not out.exists()
