@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import Done, textured
+from helpers import Done, textured
 from orthonav import __version__
 from orthonav.cli import COMMANDS, main
 from orthonav.mapfile import open_map
@@ -191,6 +191,31 @@ def test_localize_as_a_track(run, map_path, flight_path, out):
         assert lines[0]["status"] == "fix" and "heading_bias_deg" in lines[0]["evidence"]
     off = run("localize", map_path, few, *to, "--track", "--registration", "off")
     refused(off, "registration layer")
+
+
+def test_calibrate_and_fly_with_it(run, map_path, flight_path, out):
+    mount, fixes, few = out / "mount.json", out / "fixes.jsonl", out / "flight"
+    shutil.copytree(flight_path, few)
+    lines = (few / "telemetry.csv").read_text().splitlines()[:25]
+    (few / "telemetry.csv").write_text("\n".join(lines) + "\n")
+    done = run("calibrate", map_path, few, "--out", mount, "--json")
+    assert (done.code, done.err) == (0, "")
+    plain = json.loads(done.out)
+    assert abs(plain["heading_deg"]["value"]) < 8 and 5 <= plain["views"] <= 24
+    gnss = ["--gnss", few / "truth.csv", "--gnss-std-m", "2"]
+    told = run("calibrate", map_path, few, "--out", mount, *gnss)
+    assert told.code == 0 and "pitch, deg" in told.out and str(mount) in told.out
+    to = ["--out", fixes, "--mount", mount]
+    assert run("localize", map_path, few, *to, "--hindsight", "--lag", "2").code == 0
+    turned = json.loads(mount.read_text())
+    turned["heading_deg"]["value"] = 90.0
+    mount.write_text(json.dumps(turned))
+    assert run("localize", map_path, few, *to).code == 0
+    found = [result.outcome for result in read_results(fixes)]
+    assert not any(isinstance(each, Fix) and each.confidence > 0.9 for each in found)
+    refused(run("localize", map_path, few, "--out", fixes, "--mount", fixes), "mount file")
+    refused(run("localize", map_path, few, "--out", fixes, "--lag", "2"), "--hindsight")
+    refused(run("calibrate", map_path, few, "--out", mount, "--gnss-std-m", "0"), "above 0")
 
 
 def test_evaluate(run, fixes_path, truth_path, map_path, out, names_in):

@@ -18,9 +18,12 @@ COMMANDS = {
     "demo": "whole story on a generated area: build, fly, report",
     "build": "make a map from orthophotos",
     "info": "print what is in a map",
+    "sign": "sign a map, or make a key for it",
+    "verify": "check a map and its signature",
     "import": "write photographs, a video or a ROS recording as a flight folder",
     "calibrate": "find out what is wrong with what a flight tells: mount, compass, height",
     "localize": "find where the views of a flight were taken",
+    "fly": "beside an autopilot: positions from a live camera as messages",
     "evaluate": "compare fixes with the truth",
     "simulate": "fly over an orthophoto of another year",
     "landscape": "generate an area: orthophotos of a landscape at several dates",
@@ -33,6 +36,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # errors are told once, by us
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    # Read once, when OpenCV is loaded: a few bytes must not become a picture of gigabytes.
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**28))
     arguments = list(sys.argv[1:] if argv is None else argv)
     verbose = False
     try:

@@ -1,0 +1,161 @@
+"""A stand-in for an autopilot: tells the telemetry of a flight folder, prints what it is told.
+
+    python examples/simulated_autopilot.py flight --url 127.0.0.1:14550
+
+beside
+
+    orthonav fly area.onav --camera flight --file-clock autopilot --autopilot udpin:14550
+
+It answers TIMESYNC, sends HEARTBEAT, ATTITUDE, DISTANCE_SENSOR and LOCAL_POSITION_NED over UDP, and
+compares the positions it gets with the truth of the folder, where that is there. Its clock begins
+at 0 where the times of the folder do. Needs pymavlink.
+"""
+
+import argparse
+import contextlib
+import csv
+import json
+import math
+import socket
+import time
+from pathlib import Path
+
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+
+EARTH_M = 6_371_000.0
+
+
+def read(path, columns):
+    """Columns of a CSV as arrays by name."""
+    with path.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    return {
+        name: np.array([float(row[name]) for row in rows]) for name in columns if name in rows[0]
+    }
+
+
+class Autopilot:
+    """Plays a flight folder over UDP."""
+
+    def __init__(self, folder, address, pace, rate_hz):
+        names = ("time_s", "yaw_deg", "pitch_deg", "roll_deg", "agl_m", "vel_east_mps")
+        self.told = read(folder / "telemetry.csv", (*names, "vel_north_mps"))
+        truth = folder / "truth.csv"
+        self.truth = read(truth, ("lat_deg", "lon_deg")) if truth.is_file() else None
+        self.yaw_rad = np.unwrap(np.radians(self.told["yaw_deg"]))
+        self.pace, self.interval_s = pace, 1 / rate_hz
+        self.mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+        self.mav.robust_parsing = True
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        self.address, self.begin_s = address, None
+        self.got = []
+
+    def boot_s(self):
+        """Seconds since it was switched on."""
+        return time.monotonic() - self.begin_s
+
+    def send(self, message):
+        """One datagram."""
+        with contextlib.suppress(ConnectionRefusedError):  # orthonav is not up yet
+            self.socket.sendto(message.pack(self.mav), self.address)
+        self.mav.seq = (self.mav.seq + 1) % 256
+
+    def at(self, name, when_s):
+        """A column at a time of the folder."""
+        column = self.yaw_rad if name == "yaw_rad" else self.told[name]
+        return float(np.interp(when_s, self.told["time_s"], column))
+
+    def tell(self):
+        """Telemetry of now."""
+        boot_s = self.boot_s()
+        when_s, boot_ms = boot_s * self.pace, round(boot_s * 1000)
+        pitch, roll = (math.radians(self.at(n, when_s)) for n in ("pitch_deg", "roll_deg"))
+        yaw = math.remainder(self.at("yaw_rad", when_s), math.tau)
+        self.send(mavlink.MAVLink_attitude_message(boot_ms, roll, pitch, yaw, 0, 0, 0))
+        slant_m = self.at("agl_m", when_s) / (math.cos(pitch) * math.cos(roll))
+        distance = min(round(slant_m * 100), 65_534)
+        self.send(
+            mavlink.MAVLink_distance_sensor_message(boot_ms, 1, 65_535, distance, 0, 0, 25, 255)
+        )
+        if "vel_east_mps" in self.told:
+            north, east = self.at("vel_north_mps", when_s), self.at("vel_east_mps", when_s)
+            self.send(mavlink.MAVLink_local_position_ned_message(boot_ms, 0, 0, 0, north, east, 0))
+
+    def listen(self):
+        """Whatever has come."""
+        while True:
+            try:
+                data = self.socket.recv(65_536)
+            except (BlockingIOError, ConnectionRefusedError):
+                return
+            for message in self.mav.parse_buffer(data) or []:
+                self.take(message)
+
+    def take(self, message):
+        """One message of orthonav."""
+        kind = message.get_type()
+        if kind == "TIMESYNC" and message.tc1 == 0:
+            boot_ns = round(self.boot_s() * 1e9)
+            self.send(mavlink.MAVLink_timesync_message(boot_ns, message.ts1))
+        elif kind == "STATUSTEXT":
+            print(f"{self.boot_s():8.2f} s  {message.text}", flush=True)
+        elif kind in ("GLOBAL_POSITION_SENSOR", "GPS_INPUT"):
+            age_s = getattr(message, "processing_time", 0) / 1e6
+            exposed_s = (self.boot_s() - age_s) * self.pace
+            off_m = self.error_m(message.lat * 1e-7, message.lon * 1e-7, exposed_s)
+            self.got.append((self.boot_s(), age_s, off_m))
+            print(f"{self.boot_s():8.2f} s  {kind} {off_m:6.1f} m off, {age_s * 1e3:4.0f} ms old")
+
+    def error_m(self, lat_deg, lon_deg, when_s):
+        """From the truth at a time, NaN without one."""
+        if self.truth is None:
+            return math.nan
+        times = self.told["time_s"]
+        north = lat_deg - np.interp(when_s, times, self.truth["lat_deg"])
+        east = lon_deg - np.interp(when_s, times, self.truth["lon_deg"])
+        east *= math.cos(math.radians(lat_deg))
+        return float(np.hypot(north, east) * math.radians(EARTH_M))
+
+    def fly(self, tail_s):
+        """Until the folder ends."""
+        self.begin_s, due_s, beat_s = time.monotonic(), 0.0, 0.0
+        end_s = float(self.told["time_s"][-1]) / self.pace + tail_s
+        while self.boot_s() < end_s:
+            if self.boot_s() >= beat_s:
+                beat_s += 1.0
+                self.send(mavlink.MAVLink_heartbeat_message(1, 12, 0, 0, 4, 3))
+            if self.boot_s() >= due_s:
+                due_s += self.interval_s
+                self.tell()
+            self.listen()
+            time.sleep(0.002)
+
+
+def main():
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("flight", type=Path)
+    parser.add_argument("--url", default="127.0.0.1:14550", help="where orthonav listens")
+    parser.add_argument("--pace", type=float, default=1.0, help="as that of orthonav fly")
+    parser.add_argument("--rate-hz", type=float, default=50.0, help="of the attitude")
+    parser.add_argument("--tail-s", type=float, default=2.0, help="how long to stay on after")
+    parser.add_argument("--json", type=Path, help="seconds, age and error of what was got")
+    options = parser.parse_args()
+    host, _, port = options.url.rpartition(":")
+    autopilot = Autopilot(options.flight, (host, int(port)), options.pace, options.rate_hz)
+    autopilot.fly(options.tail_s)
+    if autopilot.got:
+        _, ages_s, errors_m = np.array(autopilot.got).T
+        print(
+            f"{len(ages_s)} positions; age p50 {np.percentile(ages_s, 50) * 1e3:.0f} ms, "
+            f"p99 {np.percentile(ages_s, 99) * 1e3:.0f} ms; "
+            f"error p50 {np.nanmedian(errors_m):.1f} m, largest {np.nanmax(errors_m):.1f} m"
+        )
+    if options.json:
+        options.json.write_text(json.dumps(autopilot.got), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

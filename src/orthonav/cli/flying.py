@@ -1,0 +1,247 @@
+"""`orthonav fly`, put together from its options. Loaded when a flight begins, not for `--help`."""
+
+import argparse
+import importlib
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from orthonav.confidence.accept import Acceptance
+from orthonav.errors import CameraError, OutputError, VariantError
+from orthonav.files import require_file
+from orthonav.flight import read_camera
+from orthonav.flight.mount import Mount, read_mount
+from orthonav.geo.camera import Camera
+from orthonav.localizer import Localizer
+from orthonav.localizer.tracker import Tracker
+from orthonav.mapfile import open_map
+from orthonav.onboard import cameras
+from orthonav.onboard.calibrate import Mounted, model_of
+from orthonav.onboard.cameras import CameraThread
+from orthonav.onboard.fly import FlyOptions, LogSink, Runner
+from orthonav.onboard.health import Notifier, SecondLook
+from orthonav.onboard.link import AutopilotLink, LinkThread
+from orthonav.onboard.outputs import (
+    KINDS,
+    JsonOut,
+    MessageOptions,
+    Messenger,
+    NmeaOut,
+    open_sink,
+)
+from orthonav.onboard.ports import transport_opener
+from orthonav.onboard.publisher import Publisher
+from orthonav.onboard.run import Locator
+from orthonav.onboard.state import boot_id, load, prior_of
+from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
+from orthonav.publish.estimate import SURE, Clock
+from orthonav.publish.gate import Gate, GateRules
+from orthonav.publish.local import Origin
+from orthonav.publish.mavlink import Signing, signing_timestamp
+from orthonav.publish.nmea import Quality
+from orthonav.records import Prior
+from orthonav.sources.cameras import read_camera_file
+
+
+def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitStack) -> Runner:
+    """Everything that flies, put together; what runs beside is stopped with `stack`."""
+    clocks = Clocks()
+    accept = Acceptance.parse(options.accept)
+    least = accept.threshold if accept.criterion == "confidence" else SURE
+    camera = _camera(options)
+    mount = read_mount(options.mount) if options.mount else None
+    localizer = Localizer(open_map(options.map))
+    heading_known = options.heading == "known"
+    tracker = Tracker(
+        localizer, heading_known=heading_known, model=model_of(mount) if mount else None
+    )
+    locator: Locator = Mounted(tracker, mount) if mount else tracker
+    link = _link(options, clocks)
+    publisher = _publisher(options, clocks, link, least)
+    if link is not None:
+        stack.callback(LinkThread(link).stop)
+    source = _source(options, clocks, link, camera, stopping)
+    thread = CameraThread(source, stopping)
+    stack.callback(thread.stop)
+    fly = FlyOptions(
+        mount_deg=tuple(options.mount_deg),
+        mount=mount,
+        heading_known=heading_known,
+        deadline_s=options.deadline_ms / 1e3,
+        telemetry_wait_s=options.telemetry_wait_ms / 1e3,
+        recorded=options.telemetry == "recorded",
+        accept=accept if accept.criterion != "confidence" else None,
+        min_confidence=least,
+        map_path=options.map,
+        state_path=options.state,
+        told=_told(options, mount),
+    )
+    return Runner(
+        thread.newest,
+        camera,
+        locator,
+        publisher,
+        fly,
+        clocks,
+        link=link,
+        sink=_sink(options, camera),
+        second_look=SecondLook(localizer, least),
+        start=_start(options, clocks),
+        notifier=Notifier(),
+    )
+
+
+def _camera(options: argparse.Namespace) -> Camera:
+    if options.camera_file is not None:
+        return read_camera_file(options.camera_file)
+    beside = Path(options.camera) / "flight.json"
+    if not beside.is_file():
+        raise CameraError(f"give --camera-file FILE: a camera does not tell its lens: {beside}")
+    return read_camera(beside)[0]
+
+
+def _source(
+    options: argparse.Namespace,
+    clocks: Clocks,
+    link: AutopilotLink | None,
+    camera: Camera,
+    stopping: threading.Event,
+) -> Any:
+    if cameras.is_live(options.camera):
+        return cameras.LiveCamera(
+            cameras.live_name(options.camera),
+            clocks,
+            latency_s=options.camera_latency_ms / 1e3,
+            size_px=(camera.width_px, camera.height_px),
+        )
+    if not (options.pace > 0 and options.rate_hz_images > 0):
+        raise VariantError("--pace and --rate-hz-images must be above 0")
+    due_ns: Any = cameras.own_pace(clocks, options.pace)
+    if options.file_clock == "autopilot":
+        if link is None:
+            raise VariantError("--file-clock autopilot needs --autopilot")
+        due_ns = cameras.autopilot_pace(link.boot_ns, clocks, options.pace)
+    entries = cameras.recorded_entries(Path(options.camera), options.rate_hz_images)
+    return cameras.Recorded(entries, due_ns, clocks, stopping.is_set)
+
+
+def _link(options: argparse.Namespace, clocks: Clocks) -> AutopilotLink | None:
+    if options.autopilot is None:
+        return None
+    return AutopilotLink(
+        transport_opener(options.autopilot),
+        TelemetryBuffer(heights=options.height or HEIGHT_SOURCES),
+        clocks,
+        system_id=options.system_id,
+        component_id=options.component_id,
+        signing=_signing(options, clocks),
+        silent=options.dry_run,
+    )
+
+
+def _signing(options: argparse.Namespace, clocks: Clocks) -> Signing | None:
+    if options.signing_key is None:
+        return None
+    key = require_file(options.signing_key, "signing key").read_bytes()
+    text = key.strip()
+    if len(key) != 32 and len(text) == 64:
+        try:
+            key = bytes.fromhex(text.decode("ascii"))
+        except ValueError:
+            raise VariantError(f"not hexadecimal: {options.signing_key}") from None
+    saved = load(options.state) if options.state else None
+    stamp = signing_timestamp(clocks.utc_ns())
+    return Signing(key, max(stamp, saved.signing_timestamp_10us + 1 if saved else 0))
+
+
+def _publisher(
+    options: argparse.Namespace, clocks: Clocks, link: AutopilotLink | None, least: float
+) -> Publisher:
+    interval = {}
+    if options.rate_hz is not None:
+        if not options.rate_hz > 0:
+            raise VariantError("--rate-hz must be above 0")
+        interval = dict.fromkeys([*KINDS.values(), "NMEA"], 1 / options.rate_hz)
+    rules = GateRules(least, options.max_std_m, min_interval_s=interval)
+    gate = Gate(rules, clock=Clock.BOOT)  # ours: it judges by the monotonic clock
+    chosen = MessageOptions(
+        kinds=tuple(dict.fromkeys(options.send or ["global-position"])),
+        clock=Clock(options.stamp),
+        sensor_id=options.sensor_id,
+        gps_id=options.gps_id,
+        satellites=options.satellites,
+        hdop_m=options.hdop_m,
+        min_std_m=options.min_std_m,
+        min_confidence=least,
+        origin=Origin(*options.origin) if options.origin else None,
+    )
+    quality = Quality.AUTONOMOUS if options.nmea_as_gps else Quality.ESTIMATED
+    try:
+        nmea = [NmeaOut(open_sink(url), quality=quality) for url in options.nmea]
+        lines = [JsonOut(None if each == "-" else Path(each)) for each in options.json]
+    except OSError as error:
+        raise OutputError(f"cannot be opened for output: {error}") from error
+    messenger = None if link is None else Messenger(chosen, gate, link.send, clocks)
+    return Publisher(
+        gate,
+        clocks,
+        messenger=messenger,
+        link=link,
+        nmea=nmea,
+        lines=lines,
+        min_confidence=least,
+    )
+
+
+def _start(options: argparse.Namespace, clocks: Clocks) -> Callable[[], Prior | None]:
+    """Where the flight begins: what was saved if it is fresh, else what was told, else anywhere."""
+
+    told = Prior(*options.start) if options.start else None
+    if told and not (abs(told.lat_deg) <= 90 and abs(told.lon_deg) <= 180 and told.std_m > 0):
+        raise VariantError("--start needs a latitude, a longitude and metres above 0")
+    saved = load(options.state) if options.state else None
+
+    def prior() -> Prior | None:
+        if saved is None:
+            return told
+        age_s = saved.age_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
+        return prior_of(saved, age_s, options.state_max_age_s) or told
+
+    return prior
+
+
+def _sink(options: argparse.Namespace, camera: Camera) -> LogSink | None:
+    if options.log is None:
+        return None
+
+    module = importlib.import_module("orthonav.onboard.log")  # only where it is asked for
+    info = importlib.import_module("orthonav.mapfile.signature").map_info(options.map)
+    most = None if options.log_max_mb is None else round(options.log_max_mb * 1e6)
+    made: LogSink = module.FlightLog(
+        options.log, camera, info, views=options.log_views, max_bytes=most
+    )
+    return made
+
+
+def _told(options: argparse.Namespace, mount: Mount | None) -> dict[str, Any]:
+    """How the flight is flown, as a replay reads it, and the command line beside it.
+
+    Of files it has the names: what is in a key file is written nowhere.
+    """
+    line = {
+        name: [str(each) for each in value] if isinstance(value, list | tuple) else str(value)
+        for name, value in vars(options).items()
+        if value is not None
+    }
+    return {
+        "heading": options.heading,
+        "prior": "telemetry",
+        "registration": "on",
+        "accept": None,
+        "track": True,
+        "mount": None if mount is None else asdict(mount),
+        "fly": line,
+    }

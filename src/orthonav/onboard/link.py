@@ -1,0 +1,426 @@
+"""The link to the autopilot: bytes in and out, telemetry kept, clocks compared, heartbeats sent.
+
+What comes in is decoded by pymavlink (extra `autopilot`);
+what goes out is packed by `orthonav.publish.mavlink`.
+"""
+
+import importlib
+import logging
+import math
+import select
+import threading
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from orthonav.errors import MissingExtraError
+from orthonav.onboard.ports import Transport
+from orthonav.onboard.telemetry import Clocks, ClockSync, TelemetryBuffer, Told, wxyz_of_angles
+from orthonav.publish.estimate import EstimateError
+from orthonav.publish.local import Autopilot, Origin
+from orthonav.publish.mavlink import (
+    COMPONENT_ID,
+    Message,
+    Packer,
+    Signing,
+    Target,
+    dialect,
+    signing_timestamp,
+)
+
+log = logging.getLogger(__name__)
+RETRY_S = (0.5, 1.0, 2.0, 5.0)
+"""Pauses before a port is opened again."""
+HEARTBEAT_NS, TIMESYNC_NS, RESIGN_NS = 10**9, 10**9, 10 * 10**9
+_MOST_READS = 200
+_BOARD, _NO_AUTOPILOT, _AUTOPILOT_COMPONENT = 18, 8, 1
+_KINDS = {3: Autopilot.ARDUPILOT, 12: Autopilot.PX4}
+_DOWNWARD = 25
+_FAR_NS = 60 * 10**9
+
+
+@dataclass(frozen=True)
+class LinkStatus:
+    """What the link knows of itself: ages in seconds (infinite: never), counts since the start."""
+
+    is_open: bool
+    heard_age_s: float
+    attitude_age_s: float
+    synced: bool
+    jumps: int
+    errors: int
+    target: Target | None
+    kind: Autopilot | None
+
+
+class AutopilotLink:
+    """Talks to one autopilot. Mutable; safe between the thread that polls it and the runner."""
+
+    def __init__(
+        self,
+        opener: Callable[[], Transport],
+        buffer: TelemetryBuffer,
+        clocks: Clocks,
+        *,
+        system_id: int | None = None,
+        component_id: int = COMPONENT_ID,
+        signing: Signing | None = None,
+        silent: bool = False,
+    ) -> None:
+        """`system_id` is that of the autopilot, by default of the first that is heard. With
+        `signing` what comes in must be signed with the same key. `silent`: nothing is sent.
+
+        Raises `MissingExtraError` where pymavlink is missing or too old.
+        """
+        dialect()
+        self._opener, self._clocks = opener, clocks
+        self.buffer, self.sync = buffer, ClockSync()
+        self._lock = threading.RLock()
+        self._wanted, self._component_id, self._silent = system_id, component_id, silent
+        self._signing = signing
+        self._incoming = _decoder(signing)
+        self._transport: Transport | None = None
+        self._retry_ns, self._failures = 0, 0
+        self.target: Target | None = None
+        self.kind: Autopilot | None = None
+        self.origin: Origin | None = None
+        self.system_status = 1  # MAV_STATE_BOOT
+        self.counts: Counter[str] = Counter()
+        self._heard_ns: int | None = None
+        self._attitude_ns: int | None = None
+        self._asked: list[int] = []
+        self._due = {"heartbeat": 0, "timesync": 0}
+        self._packer: Packer | None = None
+        self._sequence, self._packed, self._resign_ns = 0, 0, 0
+
+    def poll(self, timeout_s: float = 0.0) -> int:
+        """Read what has come, waiting at most so long for it; send what is due.
+
+        The number of messages that were understood.
+        """
+        transport = self._opened()
+        if transport is None:
+            return 0
+        if timeout_s > 0:
+            select.select([transport.fileno()], [], [], timeout_s)
+        understood = 0
+        with self._lock:
+            try:
+                for _ in range(_MOST_READS):
+                    data = transport.read()
+                    if not data:
+                        break
+                    understood += self._take(data, self._clocks.mono_ns())
+            except OSError as error:
+                self._lost(error)
+        self._send_due()
+        return understood
+
+    def send(self, message: Message) -> bool:
+        """Pack and send one message; whether a port was open for it."""
+        with self._lock:
+            if self._silent or self._transport is None:
+                return False
+            try:
+                self._transport.write(self._frame(message))
+            except OSError as error:
+                self._lost(error)
+                return False
+            return True
+
+    def covers(self, exposed_ns: int) -> bool:
+        """Whether an attitude after a moment of our clock has come."""
+        with self._lock:
+            newest, offset = self.buffer.newest_ns, self.sync.offset_ns
+            return newest is not None and offset is not None and newest >= exposed_ns + offset
+
+    def told_at(self, exposed_ns: int) -> Told:
+        """What the autopilot told of a moment of our clock."""
+        with self._lock:
+            if self.sync.offset_ns is None:
+                return Told(None)
+            return self.buffer.at(exposed_ns + self.sync.offset_ns)
+
+    def boot_ns(self, mono_ns: int) -> int | None:
+        """A moment of our clock by the autopilot's, None while that is not known."""
+        with self._lock:
+            return None if self.sync.offset_ns is None else mono_ns + self.sync.offset_ns
+
+    def status(self) -> LinkStatus:
+        """How the link is."""
+        with self._lock:
+            now_ns = self._clocks.mono_ns()
+            return LinkStatus(
+                is_open=self._transport is not None,
+                heard_age_s=_age_s(now_ns, self._heard_ns),
+                attitude_age_s=_age_s(now_ns, self._attitude_ns),
+                synced=self.sync.is_exact,
+                jumps=self.sync.jumps,
+                errors=self.counts["error"],
+                target=self.target,
+                kind=self.kind,
+            )
+
+    def signing_now(self) -> int | None:
+        """The timestamp of the last signature, None where nothing is signed."""
+        with self._lock:
+            return None if self._signing is None else self._signing.timestamp_10us + self._packed
+
+    def close(self) -> None:
+        """Close the port."""
+        with self._lock:
+            if self._transport is not None:
+                self._transport.close()
+                self._transport = None
+
+    def _opened(self) -> Transport | None:
+        if self._transport is not None:
+            return self._transport
+        now_ns = self._clocks.mono_ns()
+        if now_ns < self._retry_ns:
+            return None
+        try:
+            opened = self._opener()
+        except OSError as error:
+            self._lost(error)
+            return None
+        with self._lock:
+            self._transport, self._failures = opened, 0
+        return opened
+
+    def _lost(self, error: OSError) -> None:
+        """The port is gone; it is opened again after a pause."""
+        with self._lock:
+            if self.counts["error"] == 0 or self._transport is not None:
+                log.warning("link to the autopilot: %s", error)
+            self.counts["error"] += 1
+            self.close()
+            pause_s = RETRY_S[min(self._failures, len(RETRY_S) - 1)]
+            self._failures += 1
+            self._retry_ns = self._clocks.mono_ns() + round(pause_s * 1e9)
+
+    def _frame(self, message: Message) -> bytes:
+        now_ns = self._clocks.mono_ns()
+        if self._packer is None or (self._signing is not None and now_ns >= self._resign_ns):
+            if self._signing is not None:  # signatures keep up with the time
+                before = self._signing.timestamp_10us + self._packed
+                stamp = max(signing_timestamp(self._clocks.utc_ns()), before)
+                self._signing = replace(self._signing, timestamp_10us=stamp)
+            system_id = self.target.system_id if self.target else self._wanted or 1
+            self._packer = Packer(
+                system_id, self._component_id, sequence=self._sequence, signing=self._signing
+            )
+            self._packed, self._resign_ns = 0, now_ns + RESIGN_NS
+        frame = self._packer.pack(message)
+        self._sequence, self._packed = (self._sequence + 1) % 256, self._packed + 1
+        return frame
+
+    def _take(self, data: bytes, now_ns: int) -> int:
+        understood = 0
+        try:
+            messages = self._incoming.parse_buffer(bytearray(data)) or []
+        except Exception as error:  # what comes in may be anything
+            log.debug("not understood: %s", error)
+            self.counts["damaged"] += 1
+            seen = self._incoming.signing.stream_timestamps
+            self._incoming = _decoder(self._signing)
+            self._incoming.signing.stream_timestamps = seen
+            return 0
+        for message in messages:
+            if message.get_type() == "BAD_DATA":
+                self.counts["damaged"] += 1
+            elif self._is_autopilot(message):
+                self._heard_ns = now_ns
+                if self._transport is not None:
+                    self._transport.heard()
+                self._dispatch(message, now_ns)
+                understood += 1
+        return understood
+
+    def _is_autopilot(self, message: Message) -> bool:
+        """Whether it comes from the autopilot; the first heartbeat of one says who that is."""
+        system_id = message.get_srcSystem()
+        if self.target is not None:
+            return bool(
+                system_id == self.target.system_id
+                and message.get_srcComponent() == self.target.component_id
+            )
+        heartbeat = message.get_type() == "HEARTBEAT" and message.autopilot != _NO_AUTOPILOT
+        if not heartbeat or self._wanted not in (None, system_id) or system_id == 0:
+            return False
+        self.target = Target(system_id, message.get_srcComponent() or _AUTOPILOT_COMPONENT)
+        self._packer = None
+        return True
+
+    def _dispatch(self, message: Message, now_ns: int) -> None:
+        handler = _HANDLERS.get(message.get_type())
+        if handler is not None:
+            self.counts[message.get_type()] += 1
+            handler(self, message, now_ns)
+
+    def _timed(self, boot_ms: int, now_ns: int) -> int:
+        """The time of a message in ns, of which the clocks learn."""
+        boot_ns = int(boot_ms) * 1_000_000
+        if self.sync.heard(now_ns, boot_ns):
+            self.buffer.clear()
+        return boot_ns
+
+    def _arrived(self, now_ns: int) -> int | None:
+        return None if self.sync.offset_ns is None else now_ns + self.sync.offset_ns
+
+    def _heartbeat(self, message: Message, now_ns: int) -> None:
+        self.kind = _KINDS.get(message.autopilot, self.kind)
+
+    def _attitude(self, message: Message, now_ns: int) -> None:
+        time_ns = self._timed(message.time_boot_ms, now_ns)
+        angles = message.roll, message.pitch, message.yaw
+        if all(map(math.isfinite, angles)):
+            self.buffer.add_attitude(time_ns, wxyz_of_angles(*angles).tolist())
+            self._attitude_ns = now_ns
+
+    def _quaternion(self, message: Message, now_ns: int) -> None:
+        time_ns = self._timed(message.time_boot_ms, now_ns)
+        self.buffer.add_attitude(time_ns, (message.q1, message.q2, message.q3, message.q4))
+        self._attitude_ns = now_ns
+
+    def _global_position(self, message: Message, now_ns: int) -> None:
+        time_ns = self._timed(message.time_boot_ms, now_ns)
+        self.buffer.add_height("home", time_ns, message.relative_alt * 1e-3)
+
+    def _local_position(self, message: Message, now_ns: int) -> None:
+        time_ns = self._timed(message.time_boot_ms, now_ns)
+        self.buffer.add_local(time_ns, (message.vx, message.vy, message.vz), message.z)
+
+    def _altitude(self, message: Message, now_ns: int) -> None:
+        """Its time may be since 1970: then that of arrival counts."""
+        arrived_ns, told_ns = self._arrived(now_ns), int(message.time_usec) * 1000
+        if arrived_ns is None:
+            return
+        time_ns = told_ns if abs(told_ns - arrived_ns) < _FAR_NS else arrived_ns
+        if message.altitude_terrain > -1000:  # below that it stands for "not known"
+            self.buffer.add_height("terrain", time_ns, message.altitude_terrain)
+        self.buffer.add_height("relative", time_ns, message.altitude_relative)
+
+    def _distance(self, message: Message, now_ns: int) -> None:
+        within = message.min_distance < message.current_distance < message.max_distance
+        if message.orientation == _DOWNWARD and within:
+            time_ns = self._timed(message.time_boot_ms, now_ns)
+            self.buffer.add_distance(time_ns, message.current_distance * 1e-2)
+
+    def _rangefinder(self, message: Message, now_ns: int) -> None:
+        arrived_ns = self._arrived(now_ns)
+        if arrived_ns is not None and message.distance > 0:
+            self.buffer.add_distance(arrived_ns, message.distance)
+
+    def _system_time(self, message: Message, now_ns: int) -> None:
+        self._timed(message.time_boot_ms, now_ns)
+
+    def _origin(self, message: Message, now_ns: int) -> None:
+        try:
+            self.origin = Origin(
+                message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
+            )
+        except EstimateError:
+            self.counts["damaged"] += 1
+
+    def _timesync(self, message: Message, now_ns: int) -> None:
+        if message.tc1 == 0:  # asks us: our clock is the one that messages are stamped with
+            self.send(dialect().MAVLink_timesync_message(self._clocks.utc_ns(), message.ts1))
+        elif message.ts1 in self._asked:
+            self._asked.remove(message.ts1)
+            if self.sync.exchange(message.ts1, now_ns, message.tc1):
+                self.buffer.clear()
+
+    def _send_due(self) -> None:
+        now_ns = self._clocks.mono_ns()
+        with self._lock:
+            if now_ns >= self._due["heartbeat"]:
+                self._due["heartbeat"] = now_ns + HEARTBEAT_NS
+                self.send(
+                    dialect().MAVLink_heartbeat_message(
+                        _BOARD, _NO_AUTOPILOT, 0, 0, self.system_status, 3
+                    )
+                )
+            if now_ns >= self._due["timesync"] and self.target is not None:
+                self._due["timesync"] = now_ns + TIMESYNC_NS
+                self._asked = [*self._asked[-4:], now_ns]
+                self.send(dialect().MAVLink_timesync_message(0, now_ns))
+
+
+_HANDLERS: dict[str, Callable[[AutopilotLink, Message, int], None]] = {
+    "HEARTBEAT": AutopilotLink._heartbeat,
+    "ATTITUDE": AutopilotLink._attitude,
+    "ATTITUDE_QUATERNION": AutopilotLink._quaternion,
+    "GLOBAL_POSITION_INT": AutopilotLink._global_position,
+    "LOCAL_POSITION_NED": AutopilotLink._local_position,
+    "ALTITUDE": AutopilotLink._altitude,
+    "DISTANCE_SENSOR": AutopilotLink._distance,
+    "RANGEFINDER": AutopilotLink._rangefinder,
+    "SYSTEM_TIME": AutopilotLink._system_time,
+    "GPS_GLOBAL_ORIGIN": AutopilotLink._origin,
+    "TIMESYNC": AutopilotLink._timesync,
+}
+
+
+class LinkThread:
+    """Polls a link until it is stopped."""
+
+    def __init__(self, link: AutopilotLink) -> None:
+        self._link, self._stop = link, threading.Event()
+        self._thread = threading.Thread(target=self._run, name="autopilot link", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                if self._link.poll(0.02) == 0 and not self._link.status().is_open:
+                    self._stop.wait(0.1)
+            except Exception:  # one odd message never ends a flight
+                log.exception("link to the autopilot")
+                self._stop.wait(0.1)
+
+    def stop(self) -> None:
+        """Stop and close the port."""
+        self._stop.set()
+        self._thread.join(2.0)
+        self._link.close()
+
+
+def _decoder(signing: Signing | None) -> Any:
+    """A decoder of what comes in: the larger dialect, which has RANGEFINDER too."""
+    try:
+        module = importlib.import_module("pymavlink.dialects.v20.ardupilotmega")
+    except ImportError as error:
+        raise MissingExtraError(
+            f"a link to an autopilot needs pymavlink: pip install 'orthonav[autopilot]' ({error})"
+        ) from error
+    decoder = module.MAVLink(None)
+    decoder.robust_parsing = True
+    if signing is not None:
+        decoder.signing.secret_key = signing.secret_key
+        decoder.signing.timestamp = signing.timestamp_10us  # recordings of before are refused
+        decoder.check_signature = _forgetful(decoder)
+    return decoder
+
+
+def _forgetful(decoder: Any) -> Callable[..., bool]:
+    """The decoder's check of signatures, that learns nothing from those that are wrong.
+
+    pymavlink notes a timestamp before it looks at the signature: one forged message from the
+    future would end the link.
+    """
+    whole = decoder.check_signature
+
+    def check(*arguments: Any) -> bool:
+        before = dict(decoder.signing.stream_timestamps)
+        sound = bool(whole(*arguments))
+        if not sound:
+            decoder.signing.stream_timestamps = before
+        return sound
+
+    return check
+
+
+def _age_s(now_ns: int, then_ns: int | None) -> float:
+    return math.inf if then_ns is None else (now_ns - then_ns) / 1e9

@@ -1,0 +1,361 @@
+"""Where positions go: messages on the autopilot's link, NMEA, lines of JSON."""
+
+import errno
+import json
+import math
+import socket
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol, TextIO
+
+from orthonav.errors import VariantError
+from orthonav.onboard.ports import Descriptor, device_baud, host_port, open_serial
+from orthonav.onboard.telemetry import Clocks, Told
+from orthonav.publish.estimate import SURE, Clock, EstimateError, NavigationEstimate
+from orthonav.publish.gate import Gate
+from orthonav.publish.jsonl import result_to_json
+from orthonav.publish.local import Autopilot, Origin
+from orthonav.publish.mavlink import (
+    AUTOPILOT,
+    Message,
+    Target,
+    external_position_estimate,
+    global_position_sensor,
+    gps_input,
+)
+from orthonav.publish.mavlink_local import (
+    LocalPose,
+    odometry,
+    set_gps_global_origin,
+    vision_position_estimate,
+)
+from orthonav.publish.nmea import Quality, gga, gst, rmc
+from orthonav.records import ViewResult
+
+KINDS = {
+    "global-position": "GLOBAL_POSITION_SENSOR",
+    "gps-input": "GPS_INPUT",
+    "odometry": "ODOMETRY",
+    "vision": "VISION_POSITION_ESTIMATE",
+    "external-position": "EXTERNAL_POSITION_ESTIMATE",
+}
+LOCAL = ("odometry", "vision")
+ATTITUDE_STD_RAD = (math.radians(1.0), math.radians(1.0), math.radians(3.0))
+DOWN_STD_M, VEL_DOWN_STD_MPS = 3.0, 0.5
+ORIGIN_NS = 2 * 10**9
+_MOST_CLIENTS, _CLIENT_BYTES = 8, 8192
+
+
+@dataclass(frozen=True)
+class MessageOptions:
+    """Which messages are sent (`KINDS`), and how; the rest is told in docs/autopilots.md."""
+
+    kinds: tuple[str, ...] = ("global-position",)
+    clock: Clock = Clock.UTC
+    sensor_id: int = 1
+    gps_id: int = 0
+    satellites: int = 0
+    hdop_m: float | None = None
+    min_std_m: float = 0.0
+    min_confidence: float = SURE
+    autopilot: Autopilot | None = None
+    origin: Origin | None = None
+
+    def __post_init__(self) -> None:
+        unknown = [kind for kind in self.kinds if kind not in KINDS]
+        if unknown:
+            raise VariantError(f"messages are {', '.join(KINDS)}, got '{unknown[0]}'")
+
+
+class Messenger:
+    """Makes the messages of one view and sends those that are due. Mutable."""
+
+    def __init__(
+        self, options: MessageOptions, gate: Gate, send: Callable[[Message], bool], clocks: Clocks
+    ) -> None:
+        """`gate` is the one that admitted the estimates; `send` says whether a port was open."""
+        self.options, self._gate, self._send, self._clocks = options, gate, send, clocks
+        self.not_made: Counter[str] = Counter()
+        self._origin_due_ns = 0
+
+    def publish(
+        self,
+        estimate: NavigationEstimate,
+        told: Told,
+        *,
+        exposed_ns: int,
+        boot_ns: int | None,
+        target: Target | None,
+        kind: Autopilot | None,
+        origin: Origin | None,
+    ) -> tuple[str, ...]:
+        """Names of what was sent. `exposed_ns` is the exposure by our clock, `boot_ns` by the
+        autopilot's; `target`, `kind` and `origin` are what it told of itself."""
+        sent = []
+        for name in self.options.kinds:
+            now_ns = self._clocks.mono_ns()
+            stamped = replace(estimate, boot_ns=boot_ns, processing_s=(now_ns - exposed_ns) / 1e9)
+            try:
+                made = self._make(name, stamped, told, target or AUTOPILOT, kind, origin)
+            except EstimateError as error:
+                self.not_made[f"{KINDS[name]}: {error}"[:200]] += 1
+                continue
+            if self._gate.due(KINDS[name], now_ns) and self._send(made):
+                sent.append(KINDS[name])
+        return tuple(sent)
+
+    def send_origin(self, known: Origin | None, target: Target | None) -> None:
+        """Tell the autopilot the origin of its local frame until it says that it has one."""
+        now_ns, told = self._clocks.mono_ns(), self.options.origin
+        wanted = any(kind in LOCAL for kind in self.options.kinds)
+        if not wanted or told is None or known is not None or now_ns < self._origin_due_ns:
+            return
+        self._origin_due_ns = now_ns + ORIGIN_NS
+        system_id = (target or AUTOPILOT).system_id
+        self._send(set_gps_global_origin(told, target_system=system_id))
+
+    def _make(
+        self,
+        name: str,
+        estimate: NavigationEstimate,
+        told: Told,
+        target: Target,
+        kind: Autopilot | None,
+        origin: Origin | None,
+    ) -> Message:
+        chosen = self.options
+        clock, least, floor = chosen.clock, chosen.min_confidence, chosen.min_std_m
+        if name == "global-position":
+            return global_position_sensor(
+                estimate,
+                clock=clock,
+                sensor_id=chosen.sensor_id,
+                target=target,
+                min_std_m=floor,
+                min_confidence=least,
+            )
+        if name == "gps-input":
+            return gps_input(
+                estimate,
+                clock=clock,
+                gps_id=chosen.gps_id,
+                satellites=chosen.satellites,
+                hdop_m=chosen.hdop_m,
+                min_std_m=floor,
+                min_confidence=least,
+            )
+        if name == "external-position":
+            return external_position_estimate(
+                estimate, clock=clock, target=target, min_std_m=floor, min_confidence=least
+            )
+        make = odometry if name == "odometry" else vision_position_estimate
+        pose = _pose(told, origin)
+        kind = chosen.autopilot or kind or Autopilot.PX4
+        return make(estimate, pose, kind, clock=clock, min_std_m=floor, min_confidence=least)
+
+
+def _pose(told: Told, origin: Origin | None) -> LocalPose:
+    if origin is None:
+        raise EstimateError("the autopilot has not told the origin of its local frame")
+    return LocalPose(
+        origin,
+        down_m=told.down_m,
+        down_std_m=DOWN_STD_M,
+        attitude_rad=told.attitude_rad(),
+        attitude_std_rad=ATTITUDE_STD_RAD,
+        vel_down_mps=told.velocity_ned_mps[2],
+        vel_down_std_mps=VEL_DOWN_STD_MPS,
+    )
+
+
+class Sink(Protocol):
+    """Takes bytes and never waits. Raises `OSError` where they could not be taken."""
+
+    def write(self, data: bytes) -> None:
+        """Take them."""
+
+    def close(self) -> None:
+        """No more will come."""
+
+
+class UdpSink:
+    """Datagrams to one address."""
+
+    def __init__(self, address: tuple[str, int]) -> None:
+        self._address = address
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+
+    def write(self, data: bytes) -> None:
+        """One datagram; that nobody listens is no error."""
+        try:
+            self._socket.sendto(data, self._address)
+        except (BlockingIOError, ConnectionRefusedError):
+            return
+
+    def close(self) -> None:
+        """See `Sink.close`."""
+        self._socket.close()
+
+
+class TcpSink:
+    """Listens, and sends the same to all who connected; who does not read is let go."""
+
+    def __init__(self, address: tuple[str, int]) -> None:
+        self._listening = socket.create_server(address)
+        self._listening.setblocking(False)
+        self._clients: list[socket.socket] = []
+
+    @property
+    def port(self) -> int:
+        """The port it listens at."""
+        return int(self._listening.getsockname()[1])
+
+    def write(self, data: bytes) -> None:
+        """To each client, whole or not at all."""
+        try:
+            while len(self._clients) < _MOST_CLIENTS:
+                client, _ = self._listening.accept()
+                client.setblocking(False)
+                client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _CLIENT_BYTES)
+                self._clients.append(client)
+        except BlockingIOError:
+            pass
+        for client in list(self._clients):
+            try:
+                whole = client.send(data) == len(data)
+            except OSError:
+                whole = False
+            if not whole:
+                client.close()
+                self._clients.remove(client)
+
+    def close(self) -> None:
+        """See `Sink.close`."""
+        for each in (*self._clients, self._listening):
+            each.close()
+
+
+class SerialSink:
+    """A serial port that is opened when something is to be sent, and anew where it was lost."""
+
+    def __init__(self, device: str, baud: int) -> None:
+        self._device, self._baud = device, baud
+        self._port: Descriptor | None = open_serial(device, baud)
+
+    def write(self, data: bytes) -> None:
+        """See `Sink.write`."""
+        if self._port is None:
+            self._port = open_serial(self._device, self._baud)
+        try:
+            self._port.write(data)
+        except OSError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """See `Sink.close`."""
+        if self._port is not None:
+            self._port.close()
+            self._port = None
+
+
+def open_sink(url: str) -> Sink:
+    """`udp:HOST:PORT`, `tcp-listen:[HOST:]PORT` (the loopback unless a host is told) or
+    `serial:DEVICE:BAUD`. Raises `VariantError`, or `OSError` where it cannot be opened."""
+    kind, _, rest = url.partition(":")
+    if kind == "udp":
+        return UdpSink(host_port(rest, url))
+    if kind == "tcp-listen":
+        return TcpSink(host_port(rest, url))
+    if kind == "serial":
+        return SerialSink(*device_baud(rest, url))
+    raise VariantError(
+        f"NMEA goes to udp:HOST:PORT, tcp-listen:[HOST:]PORT or serial:DEVICE:BAUD, got '{url}'"
+    )
+
+
+class NmeaOut:
+    """GGA, RMC and GST of every view to one sink, also those that say "no position"."""
+
+    def __init__(
+        self, sink: Sink, *, talker: str = "GP", quality: Quality = Quality.ESTIMATED
+    ) -> None:
+        self._sink, self._talker, self._quality = sink, talker, quality
+
+    def write(
+        self, estimate: NavigationEstimate | None, utc_ns: int, min_confidence: float
+    ) -> None:
+        """One view, which without an estimate was at `utc_ns`. Raises `OSError`."""
+        sentences = [
+            make(
+                estimate,
+                talker=self._talker,
+                quality=self._quality,
+                utc_ns=utc_ns,
+                min_confidence=min_confidence,
+            )
+            for make in (gga, rmc)
+        ]
+        sentences.append(
+            gst(estimate, talker=self._talker, utc_ns=utc_ns, min_confidence=min_confidence)
+        )
+        self._sink.write(b"".join(sentences))
+
+    def close(self) -> None:
+        """Close the sink."""
+        self._sink.close()
+
+
+class JsonOut:
+    """One line per view as in `fixes.jsonl`, with `age_ms`, `sent` and `withheld`; lines that
+    begin with `health` between them."""
+
+    def __init__(self, path: Path | None, stream: TextIO | None = None) -> None:
+        """Append to a file, or write to `stream` (stdout) where `path` is None."""
+        self._path = path
+        self._stream: TextIO | None = stream or sys.stdout
+        if path is not None:
+            self._stream = path.open("a", encoding="ascii")
+
+    def view(
+        self, result: ViewResult, age_ms: float, sent: Sequence[str], withheld: str | None
+    ) -> None:
+        """One view. Raises `OSError`."""
+        more = {"age_ms": round(age_ms, 3), "sent": list(sent), "withheld": withheld}
+        self._write(result_to_json(result)[:-1] + ", " + json.dumps(more)[1:])
+
+    def health(self, plain: dict[str, object]) -> None:
+        """One line of health. Raises `OSError`."""
+        self._write(json.dumps(plain, allow_nan=False))
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._path is not None and self._stream is not None:
+            self._stream.close()
+
+    def _write(self, line: str) -> None:
+        if self._stream is None and self._path is not None:  # once more, after a disk was full
+            self._stream = self._path.open("a", encoding="ascii")
+            self._stream.write("\n")
+        if self._stream is None:
+            raise OSError(errno.EPIPE, "nobody reads stdout any more")
+        try:
+            self._stream.write(line + "\n")
+            self._stream.flush()
+        except OSError:
+            stream, self._stream = self._stream, None
+            if self._path is not None:
+                _let_go(stream)
+            raise
+
+
+def _let_go(stream: TextIO) -> None:
+    """Close a file whose disk is full, without what it still holds."""
+    try:
+        stream.close()
+    except OSError:
+        return

@@ -1,0 +1,183 @@
+"""Ports for bytes: UDP, TCP, serial. Opened here and nowhere else, never waiting."""
+
+import errno
+import os
+import select
+import socket
+import termios
+import time
+import tty
+from collections.abc import Callable
+from typing import Protocol
+
+from orthonav.errors import VariantError
+
+LOOPBACK = "127.0.0.1"
+DEFAULT_BAUD = 57_600
+_MAX_BYTES = 4096
+
+
+class Transport(Protocol):
+    """Bytes in and out, never waiting. Both raise `OSError` where the port is gone."""
+
+    def fileno(self) -> int:
+        """For `select`."""
+
+    def read(self) -> bytes:
+        """What has come, empty where nothing has."""
+
+    def write(self, data: bytes) -> None:
+        """Send one message; dropped where nobody is known to send it to."""
+
+    def heard(self) -> None:
+        """What was read last is from the autopilot."""
+
+    def close(self) -> None:
+        """Close the port."""
+
+
+class Udp:
+    """UDP: listens where `peer` is None and answers whom it heard the autopilot from."""
+
+    def __init__(self, bind: tuple[str, int] | None, peer: tuple[str, int] | None) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._peer, self._candidate, self._fixed = peer, peer, peer is not None
+        try:
+            if bind is not None:
+                self._socket.bind(bind)
+        except OSError:
+            self._socket.close()
+            raise
+
+    def fileno(self) -> int:
+        """See `Transport.fileno`."""
+        return self._socket.fileno()
+
+    def read(self) -> bytes:
+        """One datagram. That nobody listens at the other end is no error: it may come up."""
+        try:
+            data, self._candidate = self._socket.recvfrom(65_536)
+        except (BlockingIOError, InterruptedError, ConnectionRefusedError):
+            return b""
+        return data
+
+    def heard(self) -> None:
+        """Answer there from now on."""
+        if not self._fixed:
+            self._peer = self._candidate
+
+    def write(self, data: bytes) -> None:
+        """One datagram to the peer."""
+        if self._peer is not None:
+            try:
+                self._socket.sendto(data, self._peer)
+            except (BlockingIOError, ConnectionRefusedError):
+                return
+
+    def close(self) -> None:
+        """See `Transport.close`."""
+        self._socket.close()
+
+
+class Descriptor:
+    """A TCP connection or a serial port: a stream behind a file descriptor."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        os.set_blocking(fd, False)
+
+    def fileno(self) -> int:
+        """See `Transport.fileno`."""
+        return self._fd
+
+    def read(self) -> bytes:
+        """What has come; an end of the stream is an `OSError`."""
+        try:
+            data = os.read(self._fd, _MAX_BYTES)
+        except BlockingIOError:
+            return b""
+        if not data:
+            raise ConnectionResetError(errno.ECONNRESET, "the other end closed")
+        return data
+
+    def heard(self) -> None:
+        """There is one peer only."""
+
+    def write(self, data: bytes) -> None:
+        """Send all or nothing: half a message would spoil the one after it."""
+        try:
+            sent = os.write(self._fd, data)
+            deadline = time.monotonic() + 0.1
+            while sent < len(data) and time.monotonic() < deadline:
+                select.select([], [self._fd], [], 0.02)
+                sent += os.write(self._fd, data[sent:])
+        except BlockingIOError:
+            return  # the buffer is full: a position that waits is no use
+
+    def close(self) -> None:
+        """See `Transport.close`."""
+        os.close(self._fd)
+
+
+def open_serial(device: str, baud: int) -> Descriptor:
+    """A serial port, raw, 8N1. Raises `VariantError` for a speed that it cannot have."""
+    speed = getattr(termios, f"B{baud}", None)
+    if speed is None:
+        raise VariantError(f"a serial port cannot run at {baud} baud: {device}")
+    fd = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        tty.setraw(fd)
+        settings = termios.tcgetattr(fd)
+        settings[2] = (settings[2] | termios.CLOCAL | termios.CREAD) & ~termios.CRTSCTS
+        settings[4] = settings[5] = speed
+        termios.tcsetattr(fd, termios.TCSANOW, settings)
+    except (termios.error, OSError) as error:
+        os.close(fd)
+        raise OSError(errno.EIO, f"not a serial port ({error})", device) from error
+    return Descriptor(fd)
+
+
+def _open_tcp(host: str, port: int) -> Descriptor:
+    with socket.create_connection((host, port), timeout=2.0) as connection:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return Descriptor(os.dup(connection.fileno()))
+
+
+def transport_opener(url: str) -> Callable[[], Transport]:
+    """What opens a connection string of pymavlink: `udpin:[HOST:]PORT`, `udpout:HOST:PORT`,
+    `tcp:HOST:PORT`, `[serial:]DEVICE[:BAUD]`. Listening is on the loopback unless HOST is told.
+
+    Raises `VariantError` for anything else.
+    """
+    kind, _, rest = url.partition(":")
+    if kind in ("udpin", "udp"):
+        bind = host_port(rest, url)
+        return lambda: Udp(bind, None)
+    if kind == "udpout":
+        peer = host_port(rest, url)
+        return lambda: Udp(None, peer)
+    if kind == "tcp":
+        there = host_port(rest, url)
+        return lambda: _open_tcp(*there)
+    device, baud = device_baud(rest if kind == "serial" else url, url)
+    return lambda: open_serial(device, baud)
+
+
+def host_port(text: str, url: str) -> tuple[str, int]:
+    """HOST:PORT, the host being the loopback where it is left out."""
+    host, _, port = text.rpartition(":")
+    if not (port.isascii() and port.isdigit() and 0 <= int(port) <= 65_535):
+        raise VariantError(f"expected HOST:PORT, such as {LOOPBACK}:14550: '{url}'")
+    return host or LOOPBACK, int(port)
+
+
+def device_baud(text: str, url: str) -> tuple[str, int]:
+    """DEVICE[:BAUD] of a serial port."""
+    device, _, baud = text.replace(",", ":").partition(":")
+    if not device.startswith("/") or not (baud == "" or baud.isdigit()):
+        raise VariantError(
+            "expected udpin:[HOST:]PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/DEVICE:BAUD, "
+            f"got '{url}'"
+        )
+    return device, int(baud) if baud else DEFAULT_BAUD

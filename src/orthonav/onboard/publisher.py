@@ -1,0 +1,95 @@
+"""From the result of one view to everyone who wants to know: messages, NMEA, lines."""
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.outputs import JsonOut, Messenger, NmeaOut
+from orthonav.onboard.telemetry import Clocks, Told
+from orthonav.publish.estimate import SURE, Clock, NavigationEstimate, estimate_from_result
+from orthonav.publish.gate import Gate
+from orthonav.records import ViewResult
+
+log = logging.getLogger(__name__)
+
+
+class Publisher:
+    """Results to everyone who wants them. Mutable."""
+
+    def __init__(
+        self,
+        gate: Gate,
+        clocks: Clocks,
+        *,
+        messenger: Messenger | None = None,
+        link: AutopilotLink | None = None,
+        nmea: Sequence[NmeaOut] = (),
+        lines: Sequence[JsonOut] = (),
+        min_confidence: float = SURE,
+    ) -> None:
+        self.gate, self._clocks = gate, clocks
+        self.messenger, self._link = messenger, link
+        self._nmea, self._lines, self._least = nmea, lines, min_confidence
+        self.failed = 0
+
+    def publish(
+        self, result: ViewResult, exposed_ns: int, told: Told, *, judged: bool
+    ) -> tuple[str, ...]:
+        """Send what may be sent of a view; the names of the messages.
+
+        Only views that were handed to the locator (`judged`) can bring a position: what a track
+        foretells where nothing was seen is no measurement.
+        """
+        estimate, withheld = None, None
+        if judged:
+            now_ns = self._clocks.mono_ns()
+            by_our_clock = replace(result, time_ns=exposed_ns)
+            ahead_ns = self._clocks.utc_ns() - now_ns
+            made = estimate_from_result(by_our_clock, clock=Clock.BOOT, utc_minus_boot_ns=ahead_ns)
+            before = self.gate.withheld.copy()
+            estimate = self.gate.admit(made, now_ns)
+            withheld = next(iter(self.gate.withheld - before), None)
+        sent: tuple[str, ...] = ()
+        if estimate is not None and self.messenger is not None and self._link is not None:
+            sent = self._send(estimate, exposed_ns, told)
+        self._tell_nmea(estimate)
+        age_ms = (self._clocks.mono_ns() - exposed_ns) / 1e6
+        self._each(self._lines, lambda out: out.view(result, age_ms, sent, withheld))
+        return sent
+
+    def health(self, plain: dict[str, Any]) -> None:
+        """A line of health for those who read lines."""
+        self._each(self._lines, lambda out: out.health(plain))
+
+    def close(self) -> None:
+        """No more will come."""
+        self._each([*self._nmea, *self._lines], lambda out: out.close())
+
+    def _send(self, estimate: NavigationEstimate, exposed_ns: int, told: Told) -> tuple[str, ...]:
+        if self.messenger is None or self._link is None:
+            return ()
+        return self.messenger.publish(
+            estimate,
+            told,
+            exposed_ns=exposed_ns,
+            boot_ns=self._link.boot_ns(exposed_ns),
+            target=self._link.target,
+            kind=self._link.kind,
+            origin=self._link.origin,
+        )
+
+    def _tell_nmea(self, estimate: NavigationEstimate | None) -> None:
+        if self._nmea and self.gate.due("NMEA", self._clocks.mono_ns()):
+            utc_ns = self._clocks.utc_ns()
+            self._each(self._nmea, lambda out: out.write(estimate, utc_ns, self._least))
+
+    def _each(self, outs: Sequence[Any], call: Callable[[Any], None]) -> None:
+        for out in outs:
+            try:
+                call(out)
+            except (OSError, ValueError) as error:
+                if self.failed == 0:
+                    log.warning("output: %s", error)
+                self.failed += 1

@@ -1,0 +1,284 @@
+"""Pictures: the newest one, when it was exposed, and cameras that misbehave."""
+
+import threading
+
+import cv2
+import numpy as np
+import pytest
+from standin import MS, UTC_NS, S, Time, write_flight
+
+from orthonav.errors import FlightError, MissingFileError
+from orthonav.geo.camera import Camera
+from orthonav.onboard.cameras import (
+    CameraGoneError,
+    CameraThread,
+    Entry,
+    FrozenCheck,
+    LiveCamera,
+    Newest,
+    Picture,
+    Recorded,
+    autopilot_pace,
+    is_live,
+    live_name,
+    own_pace,
+    read_into,
+    recorded_entries,
+)
+from orthonav.records import Telemetry
+
+
+def noisy(seed, shape=(240, 320)):
+    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+
+
+def picture(number, grey=None):
+    return Picture(number, str(number), number * S, number * S, grey)
+
+
+class Device:
+    """A camera as OpenCV gives it."""
+
+    def __init__(self, frames):
+        self.frames, self.released, self.settings = list(frames), False, {}
+
+    def isOpened(self):
+        return not (len(self.frames) == 1 and isinstance(self.frames[0], str))
+
+    def grab(self):
+        return bool(self.frames) and not isinstance(self.frames[0], str)
+
+    def retrieve(self):
+        frame = self.frames.pop(0)
+        return frame is not None, frame
+
+    def set(self, name, value):
+        self.settings[name] = value
+
+    def release(self):
+        self.released = True
+
+
+def test_who_asks_gets_the_newest():
+    newest = Newest()
+    for number in range(5):
+        newest.put(picture(number))
+    assert newest.take(0).number == 4
+    assert newest.take(0) is None
+    assert (newest.taken, newest.replaced, newest.is_over) == (5, 4, False)
+    newest.put(picture(5))
+    newest.end()
+    assert not newest.is_over and newest.take(1).number == 5 and newest.is_over
+
+
+def test_who_asks_waits_for_one():
+    newest = Newest()
+    threading.Timer(0.05, newest.put, [picture(7)]).start()
+    assert newest.take(5).number == 7
+
+
+def test_exposure_of_a_live_camera_is_arrival_less_its_latency():
+    time = Time()
+    device = Device([noisy(0), np.dstack([noisy(1)] * 3), None])
+    camera = LiveCamera(
+        0, time.clocks, latency_s=0.08, size_px=(320, 240), capture=lambda _: device
+    )
+    first = camera.read()
+    assert first.exposed_ns == time.now_ns - 80 * MS
+    assert first.time_ns == UTC_NS + first.exposed_ns
+    time.go(1.0)
+    time.utc_ahead_ns += 3600 * S  # the clock is set while we fly
+    second = camera.read()
+    assert second.time_ns - first.time_ns == S
+    np.testing.assert_array_equal(second.grey, noisy(1))
+    third = camera.read()
+    assert third.grey is None and third.problem.reason == "bad_image"
+    assert device.settings[cv2.CAP_PROP_FRAME_WIDTH] == 320
+
+
+def test_a_camera_that_stops_comes_back():
+    time, opened = Time(), []
+    lives = [[noisy(0), "dead"], ["absent"], ["absent"], [noisy(1), noisy(2), "dead"]]
+
+    def capture(_):
+        opened.append(Device(lives[len(opened)] if len(opened) < len(lives) else ["absent"]))
+        return opened[-1]
+
+    newest, pauses = Newest(), []
+    camera = LiveCamera(0, time.clocks, capture=capture)
+    read_into(newest, camera, lambda: len(opened) > 5, pauses.append)
+    assert newest.taken == 3 and newest.outages == 2
+    assert pauses[:3] == [0.5, 1.0, 2.0] and pauses[3] == 0.5
+    assert all(each.released for each in opened)
+    assert newest.take(0).number == 3 and newest.is_over
+
+
+def test_a_driver_with_a_fault_is_asked_again(caplog):
+    class Odd:
+        asked = closed = 0
+
+        def read(self):
+            self.asked += 1
+            if self.asked < 4:
+                raise ZeroDivisionError("driver")
+            return picture(1) if self.asked == 4 else None
+
+        def close(self):
+            self.closed += 1
+
+    newest, odd = Newest(), Odd()
+    read_into(newest, odd, lambda: False, lambda _: None)
+    assert (newest.taken, newest.outages, odd.closed) == (1, 1, 4)
+    assert caplog.text.count("Traceback") == 1
+
+
+def entries(*times_s):
+    return iter([Entry(f"{t}", round(t * S), lambda: noisy(0)) for t in times_s])
+
+
+@pytest.mark.parametrize("pace", [1.0, 4.0])
+def test_a_recording_comes_at_its_own_pace(pace):
+    time = Time()
+    source = Recorded(
+        entries(50.0, 50.5, 53.0), own_pace(time.clocks, pace), time.clocks, lambda: False
+    )
+    begin, seen = time.now_ns, []
+    while (one := source.read()) is not None:
+        assert time.now_ns >= one.exposed_ns
+        seen.append(((one.exposed_ns - begin) / S, one.time_ns / S))
+    assert seen == [(0.0, 50.0), (0.5 / pace, 50.5), (3.0 / pace, 53.0)]
+
+
+def test_a_recording_may_keep_to_the_clock_of_the_autopilot():
+    time = Time()
+    offset = [None]
+
+    def boot_ns(mono_ns):
+        if time.now_ns > 101 * S:  # not heard before
+            offset[0] = -95 * S
+        return None if offset[0] is None else mono_ns + offset[0]
+
+    due_ns = autopilot_pace(boot_ns, time.clocks, 2.0)
+    source = Recorded(entries(14.0, 15.0), due_ns, time.clocks, lambda: False)
+    assert [source.read().exposed_ns for _ in range(2)] == [102 * S, 102 * S + S // 2]
+
+
+def test_a_recording_can_be_stopped():
+    time = Time()
+    source = Recorded(entries(0.0, 9e9), own_pace(time.clocks, 1.0), time.clocks, lambda: True)
+    assert source.read() is None
+
+
+def test_flight_folders_keep_their_times_and_telemetry(tmp_path):
+    camera = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
+    rows = [Telemetry(n * S + n, 10.0 * n, 1.0, -2.0, 100.0 + n) for n in range(3)]
+    write_flight(tmp_path, camera, [(noisy(n), row) for n, row in enumerate(rows)])
+    told = list(recorded_entries(tmp_path, 1.0))
+    assert [each.time_ns for each in told] == [row.time_ns for row in rows]
+    assert [each.telemetry for each in told] == rows
+    np.testing.assert_array_equal(told[2].load(), noisy(2))
+
+
+def test_a_half_written_picture_is_told(tmp_path):
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"{number}.jpg"), noisy(number))
+    whole = (tmp_path / "1.jpg").read_bytes()
+    (tmp_path / "1.jpg").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "note.txt").write_text("no picture")
+    time = Time()
+    told = recorded_entries(tmp_path, 4.0)
+    source = Recorded(told, own_pace(time.clocks, 1.0), time.clocks, lambda: False)
+    seen = [source.read() for _ in range(4)]
+    assert [each and each.frame for each in seen] == ["0.jpg", "1.jpg", "2.jpg", None]
+    assert seen[1].grey is None and seen[1].problem.reason == "bad_image"
+    assert "cut short" in seen[1].problem.detail
+    assert seen[2].exposed_ns - seen[0].exposed_ns == S // 2
+    (tmp_path / "0.jpg").unlink()
+    assert (
+        Recorded(
+            iter([Entry("0.jpg", 0, (tmp_path / "0.jpg").read_bytes)]),
+            own_pace(time.clocks, 1.0),
+            time.clocks,
+            lambda: False,
+        )
+        .read()
+        .problem.reason
+        == "bad_image"
+    )
+
+
+def test_a_video_has_times_of_its_own(tmp_path):
+    path = tmp_path / "flight.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (320, 240))
+    for number in range(4):
+        writer.write(np.dstack([np.full((240, 320), 40 * number, np.uint8)] * 3))
+    writer.release()
+    told = list(recorded_entries(path, 1.0))
+    assert [each.time_ns for each in told] == [0, S // 10, S // 5, 3 * S // 10]
+    assert [round(float(each.load().mean()) / 40) for each in told] == [0, 1, 2, 3]
+
+
+def test_what_is_no_camera_is_refused(tmp_path):
+    with pytest.raises(MissingFileError):
+        recorded_entries(tmp_path / "nothing", 1.0)
+    with pytest.raises(FlightError, match="no pictures"):
+        recorded_entries(tmp_path, 1.0)
+    (tmp_path / "x.mp4").write_bytes(b"no video")
+    with pytest.raises(FlightError, match="video"):
+        recorded_entries(tmp_path / "x.mp4", 1.0)
+
+
+def test_a_device_that_is_not_there_is_gone_for_now():
+    with pytest.raises(CameraGoneError):
+        LiveCamera(4242, Time().clocks).read()
+
+
+def test_names_of_live_cameras():
+    live = ["0", "/dev/video2", "rtsp://camera/1", "http://camera/live.mjpg"]
+    assert all(map(is_live, live)) and not any(map(is_live, ["flight", "a.mp4", "/tmp/a"]))
+    assert [live_name(each) for each in live[:3]] == [0, 2, "rtsp://camera/1"]
+
+
+def ground(seed=0):
+    return cv2.GaussianBlur(noisy(seed, (480, 640)), (0, 0), 4)
+
+
+def sensed(scene, seed):
+    noise = np.random.default_rng(seed).normal(0, 1.0, scene.shape)
+    return np.clip(scene + noise, 0, 255).astype(np.uint8)
+
+
+def test_the_same_picture_again_is_frozen_to_the_bit_or_nearly():
+    scene = ground()
+    check = FrozenCheck()
+    assert not check.is_repeat(scene)
+    assert check.is_repeat(scene.copy()) and check.is_repeat(scene.copy())
+    assert check.repeats == 2
+    nearly = scene.copy()
+    nearly[::7, ::7] += 1  # compressed anew
+    assert check.is_repeat(nearly)
+    assert not check.is_repeat(ground(1)) and check.repeats == 0
+
+
+def test_a_hover_is_not_frozen():
+    """The same scene with the noise of a good sensor, one grey level."""
+    scene, check = ground(), FrozenCheck()
+    assert not any(check.is_repeat(sensed(scene, seed)) for seed in range(10))
+
+
+def test_a_moving_view_is_not_frozen():
+    scene, check = ground(), FrozenCheck()
+    assert not any(check.is_repeat(scene[:, i : i + 500]) for i in range(5))
+    assert not check.is_repeat(scene[:100, :500])  # another size
+
+
+def test_a_camera_reads_in_a_thread(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), noisy(0))
+    time, stopping = Time(), threading.Event()
+    source = Recorded(
+        recorded_entries(tmp_path, 1.0), own_pace(time.clocks, 1.0), time.clocks, stopping.is_set
+    )
+    thread = CameraThread(source, stopping)
+    assert thread.newest.take(5).frame == "a.png"
+    thread.stop()
+    assert thread.newest.is_over

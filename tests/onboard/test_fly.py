@@ -1,0 +1,694 @@
+"""The runner: every fault that a flight brings, and a flight over UDP from end to end."""
+
+import json
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from blots import AGL_M, GROUND, map_of_blots, ortho_of_blots, rendered
+from standin import (
+    MS,
+    UTC_NS,
+    Autopilot,
+    FakeLocator,
+    LiveAutopilot,
+    Port,
+    S,
+    Time,
+    fix,
+    write_flight,
+)
+
+from orthonav.cli import main
+from orthonav.errors import CameraError
+from orthonav.geo.camera import Camera
+from orthonav.onboard import state as states
+from orthonav.onboard.cameras import Newest, Picture
+from orthonav.onboard.fly import FlyOptions, Runner
+from orthonav.onboard.health import Level, SecondLook
+from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.outputs import JsonOut, MessageOptions, Messenger
+from orthonav.onboard.publisher import Publisher
+from orthonav.onboard.telemetry import TelemetryBuffer
+from orthonav.publish.estimate import Clock
+from orthonav.publish.gate import Gate, GateRules
+from orthonav.publish.jsonl import result_from_json
+from orthonav.records import Fix, NoFix, Prior, Telemetry
+
+CAMERA = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
+AHEAD_NS = -90 * S
+
+
+class KeptLog:
+    """A log that keeps what it is told; it fails where it should."""
+
+    def __init__(self):
+        self.calls, self.broken, self.lost = [], None, {"views": 0}
+
+    def __getattr__(self, name):
+        def call(*arguments):
+            if self.broken:
+                raise self.broken
+            self.calls.append((name, arguments))
+
+        return call
+
+    def named(self, name):
+        return [arguments for called, arguments in self.calls if called == name]
+
+
+class Flight:
+    """A runner among stand-ins, at the pace of the test: one view in a tenth of a second."""
+
+    def __init__(self, tmp_path, locator=None, rules=None, **options):
+        self.time, self.port, self.autopilot = Time(), Port(), Autopilot()
+        clocks = self.time.clocks
+        self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)
+        self.gate = Gate(rules or GateRules(), Clock.BOOT)
+        messages = MessageOptions(("global-position", "gps-input"))
+        self.lines = tmp_path / "lines.jsonl"
+        publisher = Publisher(
+            self.gate,
+            clocks,
+            messenger=Messenger(messages, self.gate, self.link.send, clocks),
+            link=self.link,
+            lines=[JsonOut(self.lines)],
+        )
+        self.locator, self.newest, self.log = locator or FakeLocator(), Newest(), KeptLog()
+        rest = {name: options.pop(name) for name in ("second_look", "start") if name in options}
+        options = FlyOptions(**options)
+        self.runner = Runner(
+            self.newest,
+            CAMERA,
+            self.locator,
+            publisher,
+            options,
+            clocks,
+            link=self.link,
+            sink=self.log,
+            **rest,
+        )
+        self.number, self.yaw_deg, self.agl_m, self.talks = 0, 30.0, 100.0, True
+        self.rng = np.random.default_rng(0)
+        self.hear(self.autopilot.heartbeat())
+
+    def hear(self, *frames):
+        self.port.coming.extend(frames)
+        self.link.poll()
+
+    def talk(self):
+        """The autopilot says what it knows and answers what it is asked."""
+        now = self.time.now_ns + AHEAD_NS
+        asked = self.port.sent("TIMESYNC") if not self.port.broken else []
+        answers = [  # as if the way there took as long as the way back
+            self.autopilot.say("timesync", (now + each["ts1"] + AHEAD_NS) // 2, each["ts1"])
+            for each in asked
+        ]
+        attitude = self.autopilot.attitude(now, yaw_deg=self.yaw_deg)
+        self.hear(self.autopilot.home(now, self.agl_m), attitude, *answers)
+
+    def view(self, grey=None, age_s=0.05, wait_s=0.1):
+        """One more view; what came of it."""
+        self.time.go(wait_s)
+        if self.talks:
+            self.talk()
+        if grey is None:
+            grey = self.rng.integers(0, 256, (240, 320), dtype=np.uint8)
+        problem = None
+        if isinstance(grey, NoFix):
+            grey, problem = None, grey
+        self.number += 1
+        exposed = self.time.now_ns - round(age_s * S)
+        time_ns = UTC_NS + exposed
+        self.newest.put(Picture(self.number, f"{self.number:06d}", exposed, time_ns, grey, problem))
+        return self.runner.step(0)
+
+    def views(self, count, **options):
+        return [self.view(**options) for _ in range(count)]
+
+    def health(self):
+        """Level and reasons when the next second is over."""
+        before = self.runner.health
+        while self.runner.health is before:
+            self.time.go(0.1)
+            self.link.poll()
+            self.runner.step(0)
+        return self.runner.health
+
+    def reasons(self):
+        return set(self.health().reasons)
+
+    def written(self):
+        return [json.loads(line) for line in self.lines.read_text().splitlines()]
+
+
+@pytest.fixture
+def begin(tmp_path):
+    """Function that begins a flight, which is ended after the test."""
+    made = []
+
+    def flight(*arguments, **options):
+        made.append(Flight(tmp_path, *arguments, **options))
+        return made[-1]
+
+    yield flight
+    for each in made:
+        each.runner._publisher.close()
+
+
+@pytest.fixture
+def flight(begin, tmp_path):
+    """A flight that has been well for six seconds."""
+    made = begin(map_path=tmp_path)
+    made.views(60)
+    made.port.gone.clear()
+    return made
+
+
+def reason_of(result):
+    return result.outcome.reason if isinstance(result.outcome, NoFix) else "fix"
+
+
+def test_all_is_well(flight):
+    assert flight.health().level is Level.OK
+    flight.time.go(1.0)
+    flight.talk()
+    flight.link.poll()
+    assert flight.link.system_status == 4
+
+
+def test_a_view_becomes_a_message(flight):
+    flight.locator.outcome = lambda grey, camera, told: fix(48.1234567, -4.3210987)
+    result = flight.view(age_s=0.05)
+    read = {each["name"]: each for each in flight.port.sent()}
+    for name in ("GLOBAL_POSITION_SENSOR", "GPS_INPUT"):
+        assert (read[name]["lat"], read[name]["lon"]) == (481234567, -43210987)
+    exposed = flight.time.now_ns - 50 * MS
+    assert read["GPS_INPUT"]["time_usec"] == (UTC_NS + exposed) // 1000
+    assert read["GLOBAL_POSITION_SENSOR"]["processing_time"] == 50_000
+    line = [each for each in flight.written() if "frame" in each][-1]
+    assert line["frame"] == result.frame and line["age_ms"] == pytest.approx(50.0)
+    assert line["sent"] == ["GLOBAL_POSITION_SENSOR", "GPS_INPUT"]
+
+
+def test_the_view_is_told_what_was_at_its_exposure(flight):
+    flight.yaw_deg = 30.0
+    flight.view()
+    flight.yaw_deg = 40.0
+    flight.view(age_s=0.05)  # half way
+    assert flight.locator.seen[-1].yaw_deg == pytest.approx(35.0, abs=0.01)
+    assert flight.locator.seen[-1].agl_m == pytest.approx(100.0)
+
+
+def test_every_view_is_logged_before_it_is_placed_with_what_it_is_told(flight):
+    before = len(flight.log.calls)
+    flight.view()
+    names = [name for name, _ in flight.log.calls[before:]]
+    assert names[:2] == ["view", "result"]
+    number, frame, grey, telemetry = flight.log.named("view")[-1]
+    assert telemetry is flight.locator.seen[-1] and grey.shape == (240, 320)
+    assert (number, frame) == (61, "000061")
+    assert flight.log.named("result")[-1][0].frame == frame
+
+
+def test_old_views_are_dropped_and_counted(flight):
+    seen = len(flight.locator.seen)
+    assert flight.views(40, age_s=0.6) == [None] * 40
+    assert len(flight.locator.seen) == seen and flight.runner.tally.total["late"] == 40
+    assert "slow" in flight.reasons() and flight.port.sent("GPS_INPUT") == []
+
+
+def test_a_slow_processor_degrades_and_what_is_late_is_not_sent(flight):
+    def slow(grey, camera, told):
+        for _ in range(12):
+            flight.time.go(0.1)
+            flight.talk()
+        return fix()
+
+    flight.locator.outcome = slow
+    flight.views(10)
+    assert flight.gate.withheld["stale"] == 10 and "slow" in flight.reasons()
+    assert flight.port.sent("GLOBAL_POSITION_SENSOR") == []
+
+
+def test_one_failure_is_one_no_fix(flight, caplog):
+    whole = flight.locator.outcome
+
+    def failing(grey, camera, told):
+        flight.locator.outcome = whole
+        raise np.linalg.LinAlgError("singular")
+
+    flight.locator.outcome = failing
+    assert [reason_of(each) for each in flight.views(3)] == ["internal_error", "fix", "fix"]
+    health = flight.health()
+    assert (health.level, health.reasons) == (Level.DEGRADED, ("internal_error",))
+
+
+def test_failures_at_every_view_are_a_failure(flight, caplog):
+    def failing(grey, camera, told):
+        raise ValueError("odd")
+
+    flight.locator.outcome = failing
+    flight.views(110)
+    assert flight.health().level is Level.FAILED
+
+
+def test_a_frozen_camera_is_no_hover(flight):
+    """The tracker never sees the picture again, nothing is sent, and health says why."""
+    grey = flight.rng.integers(0, 256, (240, 320), dtype=np.uint8)
+    flight.view(grey)
+    seen = len(flight.locator.seen)
+    flight.port.gone.clear()
+    results = flight.views(30, grey=grey)
+    assert {reason_of(each) for each in results} == {"frozen_picture"}
+    assert len(flight.locator.seen) == seen and flight.port.sent("GPS_INPUT") == []
+    assert "frozen_picture" in flight.reasons()
+    assert flight.runner.tally.total["frozen"] == 30
+    assert reason_of(flight.views(2)[1]) == "fix"
+
+
+BAD = {
+    "bad_image": NoFix("bad_image", "cut short"),
+    "too_dark": np.zeros((240, 320), np.uint8),
+    "too_bright": np.full((240, 320), 255, np.uint8),
+    "blank": np.full((240, 320), 120, np.uint8),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_pictures_that_show_nothing_bring_nothing(flight, kind):
+    seen = len(flight.locator.seen)
+    results = flight.views(30, grey=BAD[kind])
+    assert {reason_of(each) for each in results} == {kind}
+    assert len(flight.locator.seen) == seen
+    assert flight.port.sent("GLOBAL_POSITION_SENSOR") == []
+    assert "bad_pictures" in flight.reasons()
+    flight.view()
+    assert flight.gate.resets == 0  # a blink is no jump
+
+
+def test_a_picture_of_another_shape_fails_and_one_of_another_size_does_not(flight):
+    cameras = []
+
+    def outcome(grey, camera, told):
+        cameras.append(camera)
+        return fix()
+
+    flight.locator.outcome = outcome
+    assert reason_of(flight.view(flight.rng.integers(0, 256, (480, 640), np.uint8))) == "fix"
+    assert (cameras[0].width_px, cameras[0].fx_px) == (640, 400.0)
+    wrong = flight.view(flight.rng.integers(0, 256, (240, 240), np.uint8))
+    assert reason_of(wrong) == "wrong_camera" and "calibrate" in wrong.outcome.detail
+    assert flight.health().level is Level.FAILED
+
+
+def test_without_telemetry_there_is_no_fix(flight):
+    flight.talks = False
+    results = flight.views(40)
+    assert reason_of(results[0]) == "fix"  # the last attitude holds for a moment
+    assert {reason_of(each) for each in results[3:]} == {"no_telemetry"}
+    assert "yaw_deg" in results[-1].outcome.detail
+    assert {"no_telemetry", "link_down"} & set(flight.health().reasons)
+    assert flight.health().level is Level.FAILED
+    flight.talks = True
+    flight.view()
+    assert reason_of(flight.view()) == "fix"
+
+
+def test_gaps_in_telemetry_are_told(flight):
+    for number in range(60):
+        flight.talks = number % 12 > 8
+        flight.view()
+    assert "telemetry_gaps" in flight.reasons()
+
+
+def test_a_link_that_is_down_comes_up_again(flight):
+    flight.port.broken = OSError("unplugged")
+    flight.views(60)
+    assert "link_down" in flight.reasons() and not flight.link.status().is_open
+    assert flight.runner.tally.total["no_telemetry"] > 0
+    flight.port.broken = None
+    flight.views(70)
+    assert flight.port.sent("GPS_INPUT") != []
+    flight.views(40)
+    assert flight.health().level is Level.OK
+
+
+def test_an_autopilot_that_starts_anew_is_followed(flight):
+    started = flight.time.now_ns
+
+    def talk():
+        now = flight.time.now_ns - started
+        flight.hear(flight.autopilot.home(now, 100.0), flight.autopilot.attitude(now, yaw_deg=77.0))
+
+    flight.talk = talk
+    flight.views(20)
+    assert flight.locator.seen[-1].yaw_deg == pytest.approx(77.0, abs=0.01)
+    assert "clock_jumped" in flight.reasons()
+
+
+@pytest.mark.parametrize("seconds", [3600, -3600])
+def test_a_computer_clock_that_is_set_does_no_harm(flight, seconds):
+    flight.time.utc_ahead_ns += seconds * S
+    flight.port.gone.clear()
+    assert reason_of(flight.view()) == "fix"
+    utc_us = flight.port.sent("GPS_INPUT")[0]["time_usec"]
+    assert utc_us == (flight.time.clocks.utc_ns() - 50 * MS) // 1000
+    assert flight.gate.resets == 0 and "clock_jumped" in flight.reasons()
+    assert {"stale", "out_of_order", "from_the_future"} & set(flight.gate.withheld) == set()
+
+
+def test_heading_and_height_far_from_told_degrade(flight):
+    flight.locator.outcome = lambda grey, camera, told: fix(heading_deg=told.yaw_deg + 35)
+    flight.views(11)
+    assert flight.reasons() == {"heading_off"}
+    flight.locator.outcome = lambda grey, camera, told: fix(
+        heading_deg=told.yaw_deg, agl_m=told.agl_m / 2
+    )
+    flight.views(11)
+    assert flight.reasons() == {"height_off"}
+
+
+@pytest.mark.parametrize(
+    ("yaw_off", "share", "reason"), [(180, 1, "heading_off"), (0, 2, "height_off")]
+)
+def test_why_nothing_is_found_is_looked_at(begin, yaw_off, share, reason):
+    """The track searches in vain; a second look finds the place with another heading or height."""
+
+    class Localizer:
+        def locate(self, grey, camera, told, *, heading_known):
+            right = not heading_known or yaw_off == 0
+            if right and told.agl_m == pytest.approx(100.0 * share, rel=0.01):
+                return fix(heading_deg=told.yaw_deg + yaw_off, agl_m=told.agl_m)
+            return NoFix("not_sure", "")
+
+    locator = FakeLocator(lambda *_: NoFix("searching", ""), "searching")
+    flight = begin(locator, second_look=SecondLook(Localizer(), 0.9, lambda work: work()))
+    flight.views(200)
+    assert flight.reasons() == {"searching", reason}
+    assert flight.port.sent("GPS_INPUT") == []
+
+
+def test_an_unsure_or_lost_track_is_told_and_not_sent(flight):
+    flight.locator.outcome = lambda *_: fix(confidence=0.5)
+    flight.views(110)
+    assert "unsure" in flight.reasons()
+    flight.locator.state_name = "lost"
+    flight.port.gone.clear()
+    flight.views(3)
+    assert "lost" in flight.reasons() and flight.port.sent("GPS_INPUT") == []
+    assert flight.written()[-2]["withheld"] in ("not_tracking", "low_confidence")
+
+
+def test_a_map_that_is_removed_is_noted(begin, tmp_path):
+    path = tmp_path / "area.onav"
+    path.write_bytes(b"map")
+    flight = begin(map_path=path)
+    flight.views(60)
+    assert flight.health().level is Level.OK
+    path.unlink()
+    flight.views(11)
+    assert flight.reasons() == {"map_gone"}
+    path.write_bytes(b"another")  # what flies is still the old one
+    assert flight.health().reasons in ((), ("map_gone",))
+
+
+def test_a_log_that_fails_does_not_end_the_flight(flight):
+    flight.log.broken = OSError(28, "No space left on device")
+    assert {reason_of(each) for each in flight.views(11)} == {"fix"}
+    assert flight.reasons() == {"log_failed"}
+    flight.log.broken = None
+    flight.views(120)
+    assert flight.health().level is Level.OK
+    flight.log.lost = {"views": 3}  # left out by a log that never raises
+    flight.views(11)
+    assert flight.reasons() == {"log_failed"}
+
+
+def test_an_output_that_fails_does_not_end_the_flight(flight, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(JsonOut, "view", full)
+    flight.views(11)
+    assert flight.port.sent("GPS_INPUT") != [] and flight.reasons() == {"output_failed"}
+
+
+def test_a_camera_that_stops_is_told(flight):
+    for _ in range(50):
+        flight.time.go(0.1)
+        flight.talk()
+        flight.runner.step(0)
+    health = flight.health()
+    assert (health.level, health.reasons) == (Level.FAILED, ("no_camera",))
+    flight.newest.outages += 1
+    flight.views(11)
+    assert flight.reasons() == {"camera_lost"}
+
+
+def test_health_goes_to_the_ground_station(flight):
+    flight.views(30, grey=BAD["too_dark"])
+    flight.health()
+    texts = [each["text"].rstrip(b"\0").decode() for each in flight.port.sent("STATUSTEXT")]
+    assert texts == [] or texts[-1].startswith("orthonav DEGRADED")
+    for _ in range(70):
+        flight.view(grey=BAD["too_dark"])
+    heard = flight.written()
+    assert [each for each in heard if each.get("health") == "DEGRADED"]
+    assert flight.link.system_status == Level.DEGRADED.value
+
+
+def test_where_it_is_is_kept_about_once_a_second(begin, tmp_path, monkeypatch):
+    path, saves = tmp_path / "state.json", []
+    whole = states.save
+    monkeypatch.setattr(states, "save", lambda *a: (saves.append(1), whole(*a)))
+    flight = begin(state_path=path)
+    flight.views(60)
+    assert 4 <= len(saves) <= 7
+    saved = states.load(path)
+    assert (saved.lat_deg, saved.lon_deg, saved.std_m) == (48.0, 2.0, pytest.approx(2.0))
+    assert saved.age_s(flight.time.clocks.utc_ns(), flight.time.now_ns, states.boot_id()) < 1.2
+    monkeypatch.setattr(states, "save", lambda *a: (_ for _ in ()).throw(OSError("read only")))
+    flight.views(11)
+    assert flight.reasons() == {"state_not_saved"}
+
+
+def test_the_first_view_is_told_where_to_begin(begin):
+    prior = Prior(48.0, 2.0, 50.0)
+    flight = begin(start=lambda: prior)
+    flight.view(BAD["too_dark"])
+    flight.views(3)
+    assert [each.prior for each in flight.locator.seen] == [prior, None, None]
+
+
+def test_recorded_telemetry_needs_no_autopilot(begin):
+    flight = begin(recorded=True)
+    told = Telemetry(5, 1.0, 2.0, 3.0, 50.0)
+    grey = flight.rng.integers(0, 256, (240, 320), np.uint8)
+    flight.newest.put(Picture(1, "a", flight.time.now_ns, 5, grey, told=told))
+    assert reason_of(flight.runner.step(0)) == "fix" and flight.locator.seen == [told]
+
+
+def test_it_ends_with_the_recording_and_says_so(flight):
+    flight.newest.end()
+    flight.runner.run(threading.Event())
+    assert [name for name, _ in flight.log.calls[-1:]] == ["close"]
+    assert flight.log.named("options")
+
+
+def test_whatever_fails_the_next_view_is_flown(flight, monkeypatch, caplog):
+    whole, calls = flight.runner._publisher.publish, []
+
+    def publish(*arguments, **options):
+        calls.append(1)
+        if len(calls) == 1:
+            raise ValueError("an estimate that cannot be")
+        return whole(*arguments, **options)
+
+    monkeypatch.setattr(flight.runner._publisher, "publish", publish)
+    stopping = threading.Event()
+
+    def take(timeout_s, whole=flight.newest.take):
+        if len(calls) == 2:
+            stopping.set()
+        flight.time.go(0.1)
+        flight.talk()
+        grey = flight.rng.integers(0, 256, (240, 320), dtype=np.uint8)
+        flight.newest.put(Picture(1, "a", flight.time.now_ns, 5, grey))
+        return whole(timeout_s)
+
+    monkeypatch.setattr(flight.newest, "take", take)
+    flight.runner.run(stopping)
+    assert len(calls) >= 2 and flight.runner.tally.total["internal_error"] == 1
+    assert "an estimate that cannot be" in caplog.text
+
+
+def test_a_camera_error_inside_names_the_camera(flight):
+    def wrong(grey, camera, told):
+        raise CameraError("another camera")
+
+    flight.locator.outcome = wrong
+    assert reason_of(flight.view()) == "wrong_camera"
+    assert flight.health().level is Level.FAILED
+
+
+# From here on with a map, over UDP, in real time.
+
+SPEED_MPS, HEADING, EVERY_S, PACE = 14.0, 60.0, 0.5, 5.0
+COUNT = 20
+
+
+@pytest.fixture(scope="module")
+def flown(make_ortho, tmp_path_factory):
+    """A map, a flight folder over it, and the frame of the map."""
+    folder = tmp_path_factory.mktemp("fly")
+    ortho, frame = ortho_of_blots(make_ortho, folder)
+    path = map_of_blots(ortho, folder / "area.onav")
+    rng = np.random.default_rng(0)
+    along = np.array([math.sin(math.radians(HEADING)), math.cos(math.radians(HEADING))])
+    seen, truth = [], {}
+    for number in range(COUNT):
+        place = np.array([-120.0, -80.0]) + number * SPEED_MPS * along
+        grey = rendered(GROUND, place, (HEADING, 0.0, 0.0), AGL_M, CAMERA)
+        grey = np.clip(0.75 * grey + 30 + rng.normal(0, 6, grey.shape), 0, 255).astype(np.uint8)
+        told = Telemetry(round(number * EVERY_S * S), HEADING, 0.0, 0.0, AGL_M)
+        seen.append((grey, told))
+        truth[f"{number:03d}.png"] = place
+    write_flight(folder / "flight", CAMERA, seen)
+    return path, folder / "flight", frame, truth
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def level_flight(autopilot, boot_ns):
+    return [autopilot.distance(boot_ns, AGL_M), autopilot.attitude(boot_ns, yaw_deg=HEADING)]
+
+
+@pytest.fixture
+def autopilot():
+    port = free_port()
+    standin = LiveAutopilot(port, level_flight)
+    standin.port = port
+    standin.start()
+    yield standin
+    standin.stop()
+
+
+def views_in(path):
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    texts = [line for line in path.read_text().splitlines() if '"frame"' in line]
+    return [line for line in lines if "frame" in line], [result_from_json(t) for t in texts]
+
+
+def test_a_flight_from_end_to_end(flown, autopilot, tmp_path, capsys):
+    path, folder, frame, truth = flown
+    lines, state = tmp_path / "lines.jsonl", tmp_path / "state.json"
+    cv2.setNumThreads(1)
+    code = main(
+        [
+            *("fly", str(path), "--camera", str(folder), "--pace", str(PACE)),
+            *("--autopilot", f"udpin:{autopilot.port}", "--file-clock", "own"),
+            *("--send", "global-position", "--send", "gps-input", "--deadline-ms", "1500"),
+            *("--json", str(lines), "--state", str(state)),
+        ]
+    )
+    assert code == 0
+    time.sleep(0.1)
+    told, results = views_in(lines)
+    sent = [each for each, line in zip(results, told, strict=True) if line["sent"]]
+    assert len(sent) >= 6, [line["withheld"] or line["reason"] for line in told]
+    for name in ("GLOBAL_POSITION_SENSOR", "GPS_INPUT"):
+        heard = autopilot.named(name)
+        assert [(m["lat"], m["lon"]) for m in heard] == [
+            (round(r.outcome.lat_deg * 1e7), round(r.outcome.lon_deg * 1e7)) for r in sent
+        ]
+    for each in sent:
+        place = frame.en_from_latlon(each.outcome.lat_deg, each.outcome.lon_deg)
+        assert np.hypot(*(place - truth[each.frame])) < 6
+    ages = [m["processing_time"] / 1e6 for m in autopilot.named("GLOBAL_POSITION_SENSOR")]
+    assert min(ages) > 0 and max(ages) < 1.5
+    assert autopilot.named("HEARTBEAT") and autopilot.named("STATUSTEXT")
+    assert states.load(state).lat_deg == pytest.approx(sent[-1].outcome.lat_deg)
+
+
+def test_killed_and_started_again_it_is_back_soon(flown, autopilot, tmp_path):
+    """A process of its own, killed in flight; the next one begins where that was."""
+    path, folder, _, _ = flown
+    state = tmp_path / "state.json"
+    fast = tmp_path / "flight"
+    fast.symlink_to(folder)
+
+    def start(lines):
+        program = "import sys; from orthonav.cli import main; sys.exit(main(sys.argv[1:]))"
+        arguments = [
+            *("fly", path, "--camera", fast, "--pace", "4", "--state", state, "--json", lines),
+            *("--autopilot", f"udpin:{autopilot.port}", "--deadline-ms", "1500"),
+        ]
+        return subprocess.Popen([sys.executable, "-c", program, *map(str, arguments)])
+
+    def wait_for(condition, seconds):
+        deadline = time.monotonic() + seconds
+        while not condition() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert condition()
+
+    first = start(tmp_path / "1.jsonl")
+    try:
+        wait_for(state.exists, 20)
+    finally:
+        first.send_signal(signal.SIGKILL)
+        first.wait()
+    heard, begin = len(autopilot.named("GLOBAL_POSITION_SENSOR")), time.monotonic()
+    assert heard > 0
+    second = start(tmp_path / "2.jsonl")
+    try:
+        wait_for(lambda: len(autopilot.named("GLOBAL_POSITION_SENSOR")) > heard, 20)
+        took_s = time.monotonic() - begin
+    finally:
+        second.send_signal(signal.SIGTERM)
+        code = second.wait()
+    assert code == 0  # a clean stop
+    assert took_s < 5 * (1 if os.environ.get("PYTEST_XDIST_WORKER") is None else 4)
+
+
+def test_what_cannot_fly_is_said_at_once(flown, run, tmp_path):
+    path, folder, _, _ = flown
+    done = run("fly", path, "--camera", folder)
+    assert (done.code, done.err.count("\n")) == (1, 1) and "--autopilot" in done.err
+    done = run("fly", path, "--camera", "0", "--autopilot", "udpin:0")
+    assert done.code == 1 and "--camera-file" in done.err
+    key = tmp_path / "key"
+    key.write_text("secret words")
+    done = run("fly", path, "--camera", folder, "--autopilot", "udpin:0", "--signing-key", key)
+    assert done.code == 1 and "32 bytes" in done.err and "secret" not in done.err
+    done = run("fly", path, "--camera", folder, "--autopilot", "carrier-pigeon:1")
+    assert done.code == 1 and "udpin" in done.err
+    done = run("fly", path, "--camera", folder, "--autopilot", "udpin:0", "--nmea", "x:1")
+    assert done.code == 1 and "tcp-listen" in done.err
+    done = run("fly", path, "--camera", folder, "--autopilot", "udpin:0", "--start", "1,2")
+    assert done.code == 2 and "LAT,LON,STD_M" in done.err
+
+
+def test_help_is_quick_and_the_flight_needs_neither_torch_nor_gdal():
+    script = (
+        "import sys, orthonav.onboard.fly, orthonav.cli.fly, orthonav.localizer.tracker;"
+        "print({'torch', 'rasterio', 'pyproj', 'mcap'} & set(sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "set()"
+    assert isinstance(fix(), Fix) and Path(__file__).exists()

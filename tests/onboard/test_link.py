@@ -1,0 +1,354 @@
+"""The link: what is heard, what is said, and what happens when it breaks."""
+
+import math
+import os
+import pty
+import socket
+import time
+
+import pytest
+from standin import MS, UTC_NS, Autopilot, Port, S, Time
+
+from orthonav.errors import MissingExtraError, VariantError
+from orthonav.onboard.link import RETRY_S, AutopilotLink, LinkThread
+from orthonav.onboard.ports import Descriptor, Udp, open_serial, transport_opener
+from orthonav.onboard.telemetry import TelemetryBuffer
+from orthonav.publish.local import Autopilot as Kind
+from orthonav.publish.local import Origin
+from orthonav.publish.mavlink import Signing, Target, dialect, signing_timestamp
+from wire import decode
+
+KEY = bytes(range(32))
+AHEAD_NS = -90 * S  # the autopilot was switched on at 90 s of our clock
+
+
+class Flying:
+    """A link between a port and clocks of the test."""
+
+    def __init__(self, **options):
+        self.time, self.port, self.autopilot = Time(), Port(), Autopilot()
+        self.link = AutopilotLink(self.port.open, TelemetryBuffer(), self.time.clocks, **options)
+
+    def boot_ns(self):
+        return self.time.now_ns + AHEAD_NS
+
+    def hear(self, *frames):
+        self.port.coming.extend(frames)
+        return self.link.poll()
+
+    def told(self, **options):
+        return self.link.told_at(self.time.now_ns).telemetry(0, **options)
+
+
+@pytest.fixture
+def flying():
+    made = Flying()
+    made.hear(made.autopilot.heartbeat())
+    made.port.gone.clear()
+    return made
+
+
+def test_the_first_autopilot_that_is_heard_is_ours():
+    flying = Flying()
+    station = Autopilot(255, 190).heartbeat(kind=8)
+    gimbal = Autopilot(1, 154).heartbeat(kind=8)
+    stranger = Autopilot(9).attitude(5 * S)
+    assert flying.hear(station, gimbal, stranger) == 0 and flying.link.target is None
+    assert flying.hear(flying.autopilot.heartbeat(kind=3)) == 1
+    assert (flying.link.target, flying.link.kind) == (Target(1, 1), Kind.ARDUPILOT)
+    assert flying.hear(Autopilot(9).heartbeat(), stranger, Autopilot(1, 2).attitude(5 * S)) == 0
+    assert flying.link.buffer.newest_ns is None
+
+
+def test_another_system_may_be_named():
+    flying = Flying(system_id=7)
+    assert flying.hear(Autopilot(1).heartbeat(), Autopilot(7).heartbeat()) == 1
+    assert flying.link.target == Target(7, 1)
+    flying.time.go(1.5)
+    flying.link.poll()
+    assert {each["from"] for each in flying.port.sent()[1:]} == {(7, 197)}
+
+
+def test_telemetry_at_an_exposure(flying):
+    for _ in range(3):
+        now = flying.boot_ns()
+        flying.hear(
+            flying.autopilot.attitude(now, yaw_deg=30.0 + now / S, pitch_deg=2.0),
+            flying.autopilot.home(now, 80.0),
+            flying.autopilot.local(now, (9.0, 3.0, 0.5), down=-70.0),
+        )
+        flying.time.go(0.1)
+    exposed = flying.time.now_ns - 250 * MS  # between the first and the second
+    told = flying.link.told_at(exposed)
+    assert told.telemetry(1).yaw_deg == pytest.approx(30.0 + (exposed + AHEAD_NS) / S, abs=1e-3)
+    assert (told.height_m, told.height_source) == (pytest.approx(80.0), "home")
+    assert told.telemetry(1).vel_en_mps == pytest.approx((3.0, 9.0))
+    assert told.down_m == pytest.approx(-70.0)
+    assert flying.link.covers(exposed) and not flying.link.covers(flying.time.now_ns + S)
+
+
+def test_heights_of_every_message(flying):
+    now = flying.boot_ns()
+    flying.hear(flying.autopilot.attitude(now, roll_deg=10.0))
+
+    def height(*frames):
+        flying.hear(*frames)
+        told = flying.link.told_at(flying.time.now_ns)
+        return told.height_source, round(told.height_m, 2)
+
+    unknown = -1001.0
+    say = flying.autopilot.say
+    relative = say("altitude", now // 1000, 0, 0, 0, 55.0, unknown, 0)
+    assert height(relative) == ("relative", 55.0)
+    assert height(flying.autopilot.home(now, 60.0)) == ("home", 60.0)
+    flying.time.go(0.02)
+    # stamped since 1970, as some autopilots do
+    since_1970 = say("altitude", (UTC_NS + now) // 1000, 0, 0, 0, 55.0, 42.0, 0)
+    assert height(since_1970) == ("terrain", 42.0)
+    ahead = flying.autopilot.distance(flying.boot_ns(), 7.0, orientation=0)
+    too_far = say("distance_sensor", now // MS, 20, 5000, 5000, 0, 0, 25, 255)
+    assert height(ahead, too_far) == ("terrain", 42.0)
+    down = math.cos(math.radians(10))
+    assert height(say("rangefinder", 50.0, 1.0)) == ("distance", round(50 * down, 2))
+    flying.time.go(0.02)
+    told = flying.autopilot.distance(flying.boot_ns(), 40.0)
+    assert height(told) == ("distance", round(40 * down, 2))
+
+
+def test_attitude_as_a_quaternion(flying):
+    half = math.radians(45.0)
+    values = math.cos(half), 0, 0, math.sin(half), 0, 0, 0
+    flying.hear(flying.autopilot.say("attitude_quaternion", flying.boot_ns() // MS, *values))
+    assert flying.told().yaw_deg == pytest.approx(90.0, abs=1e-3)
+    assert flying.told(mount_deg=(90.0, 0.0, 0.0)).yaw_deg == pytest.approx(180.0, abs=1e-3)
+
+
+def test_damaged_bytes_are_counted_and_survived(flying):
+    good = flying.autopilot.attitude(flying.boot_ns(), yaw_deg=12.0)
+    broken = bytearray(flying.autopilot.attitude(flying.boot_ns(), yaw_deg=99.0))
+    broken[14] ^= 0x55
+    nan = flying.autopilot.attitude(flying.boot_ns(), yaw_deg=math.nan)
+    noise = bytes([0xFD, 250, 0, 0, 1]) + os.urandom(3)
+    flying.hear(bytes(broken), nan, good[:9])
+    flying.hear(good[9:], noise, good * 20)
+    assert flying.told().yaw_deg == pytest.approx(12.0, abs=1e-3)
+    assert flying.link.counts["damaged"] > 0
+
+
+def test_heartbeat_and_timesync_once_a_second(flying):
+    for _ in range(100):
+        flying.time.go(0.05)
+        flying.link.poll()
+    said = flying.port.sent()
+    names = [each["name"] for each in said]
+    assert names.count("HEARTBEAT") == 5 and names.count("TIMESYNC") in (5, 6)
+    beat = said[names.index("HEARTBEAT")]
+    assert (beat["type"], beat["autopilot"], beat["from"]) == (18, 8, (1, 197))
+
+
+def test_clocks_are_compared(flying):
+    for _ in range(5):
+        flying.time.go(1.0)
+        flying.link.poll()
+        asked = flying.port.sent("TIMESYNC")[-1]
+        assert asked["tc1"] == 0
+        flying.time.go(0.004)
+        there = flying.boot_ns()
+        flying.time.go(0.004)
+        flying.hear(flying.autopilot.say("timesync", there, asked["ts1"]))
+    assert flying.link.status().synced
+    assert flying.link.boot_ns(flying.time.now_ns) == pytest.approx(flying.boot_ns(), abs=MS)
+    stranger = flying.autopilot.say("timesync", 1, 12345)  # an answer that nobody asked for
+    flying.hear(stranger)
+    assert flying.link.boot_ns(flying.time.now_ns) == pytest.approx(flying.boot_ns(), abs=MS)
+
+
+def test_the_autopilot_may_compare_too(flying):
+    flying.hear(flying.autopilot.say("timesync", 0, 777))
+    answer = next(each for each in flying.port.sent("TIMESYNC") if each["tc1"])
+    assert answer["ts1"] == 777
+    assert answer["tc1"] == flying.time.clocks.utc_ns()  # the clock that messages are stamped with
+
+
+def test_an_autopilot_that_starts_anew_is_noticed(flying):
+    flying.hear(flying.autopilot.attitude(flying.boot_ns(), yaw_deg=10.0))
+    for number in range(40):
+        flying.time.go(0.05)
+        flying.hear(flying.autopilot.attitude((number + 1) * 50 * MS, yaw_deg=70.0))
+    assert flying.link.status().jumps == 1
+    assert flying.told().yaw_deg == pytest.approx(70.0, abs=1e-3)
+
+
+def test_a_port_that_breaks_is_opened_again(flying):
+    flying.port.broken = OSError("unplugged")
+    assert flying.link.poll() == 0 and not flying.link.status().is_open
+    flying.port.broken = None
+    assert not flying.link.send(dialect().MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+    flying.link.poll()
+    assert flying.port.opened == 1  # not yet
+    flying.time.go(RETRY_S[0])
+    assert flying.hear(flying.autopilot.attitude(flying.boot_ns(), yaw_deg=3.0)) == 1
+    assert flying.port.opened == 2 and flying.told().yaw_deg == pytest.approx(3.0, abs=1e-3)
+
+
+def test_a_port_that_is_not_there_is_asked_for_ever_more_seldom():
+    flying = Flying()
+    flying.port.refuse = True
+    for _ in range(600):
+        flying.link.poll()
+        flying.time.go(0.1)
+    assert 12 <= flying.link.status().errors <= 18 and not flying.link.status().is_open
+    assert flying.link.status().heard_age_s == math.inf
+    flying.port.refuse = False
+    flying.time.go(RETRY_S[-1])
+    assert flying.hear(flying.autopilot.heartbeat()) == 1
+
+
+def test_a_dry_run_says_nothing():
+    flying = Flying(silent=True)
+    flying.hear(flying.autopilot.heartbeat(), flying.autopilot.say("timesync", 0, 7))
+    flying.time.go(5.0)
+    flying.link.poll()
+    assert flying.port.gone == [] and flying.link.target == Target(1, 1)
+
+
+def test_a_signed_link_takes_nothing_unsigned():
+    stamp = signing_timestamp(UTC_NS + 100 * S)
+    flying = Flying(signing=Signing(KEY, stamp))
+    assert flying.hear(Autopilot().heartbeat(), Autopilot(key=bytes(32)).heartbeat()) == 0
+    assert flying.link.target is None
+    signed = Autopilot(key=KEY)
+    frame = signed.heartbeat()
+    assert flying.hear(frame) == 1
+    assert flying.hear(frame) == 0  # said again by somebody who listened
+    flying.port.gone.clear()
+    stamps = []
+    for _ in range(30):
+        flying.time.go(1.0)
+        flying.link.poll()
+        for one in flying.port.gone:
+            assert decode(one)["signed"] == 1
+            stamps.append(int.from_bytes(one[-12:-6], "little"))
+        flying.port.gone.clear()
+    assert stamps == sorted(set(stamps)) and stamps[0] > stamp
+    assert stamps[-1] - stamps[0] > 20 * 100_000  # keeps up with the time
+    assert flying.link.signing_now() >= stamps[-1]
+
+
+def test_the_origin_of_the_autopilot_is_kept(flying):
+    flying.hear(flying.autopilot.say("gps_global_origin", 481000000, 20000000, 120_000))
+    assert flying.link.origin == Origin(48.1, 2.0, 120.0)
+
+
+@pytest.mark.parametrize(
+    ("url", "kind"),
+    [("udpin:127.0.0.1:0", Udp), ("udpin::0", Udp), ("udp:0", Udp), ("udpout:127.0.0.1:9", Udp)],
+)
+def test_connection_strings(url, kind):
+    opened = transport_opener(url)()
+    assert isinstance(opened, kind)
+    assert opened._socket.getsockname()[0] in ("127.0.0.1", "0.0.0.0")
+    if url.startswith("udpin") or url == "udp:0":
+        assert opened._socket.getsockname()[0] == "127.0.0.1"
+    opened.close()
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["", "udpin:", "udpin:x", "udpout:host:99999", "tcp:host", "ttyUSB0", "/dev/ttyS0:fast", "u:1"],
+)
+def test_other_strings_are_refused(url):
+    with pytest.raises(VariantError):
+        transport_opener(url)
+
+
+def test_listening_answers_the_autopilot_only():
+    port = transport_opener("udpin:127.0.0.1:0")()
+    link = AutopilotLink(lambda: port, TelemetryBuffer(), Time().clocks)
+    ours, stranger = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    there = port._socket.getsockname()
+    for each in (ours, stranger):
+        each.settimeout(0.2)
+    stranger.sendto(b"hello", there)
+    ours.sendto(Autopilot().heartbeat(), there)
+    while link.target is None:
+        link.poll(0.1)
+    stranger.sendto(Autopilot(9).heartbeat(), there)
+    link.poll(0.1)
+    link.send(dialect().MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+    assert decode(ours.recv(300))["name"] == "HEARTBEAT"
+    with pytest.raises(TimeoutError):
+        stranger.recv(300)
+    for each in (ours, stranger, link):
+        each.close()
+
+
+def test_a_serial_port_carries_bytes_as_they_are():
+    ours, theirs = pty.openpty()
+    port = open_serial(os.ttyname(theirs), 921600)
+    every = bytes(range(256))
+    port.write(every)
+    got = b""
+    while len(got) < 256:
+        got += os.read(ours, 300)
+    os.write(ours, every)
+    back = b""
+    while len(back) < 256:
+        back += port.read()
+    assert (got, back, port.read()) == (every, every, b"")
+    for fd in (ours, theirs):
+        os.close(fd)
+    with pytest.raises(OSError):
+        for _ in range(3):
+            port.read()
+    port.close()
+    with pytest.raises(VariantError, match="12345 baud"):
+        open_serial("/dev/null", 12345)
+    with pytest.raises(OSError, match="not a serial port"):
+        open_serial("/dev/null", 57600)
+
+
+def test_a_tcp_connection_that_ends_is_an_error():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        host, port = server.getsockname()
+        opened = transport_opener(f"tcp:{host}:{port}")()
+        assert isinstance(opened, Descriptor) and opened.read() == b""
+        there, _ = server.accept()
+        there.sendall(b"abc")
+        there.close()
+        deadline, got = time.monotonic() + 2, b""
+        with pytest.raises(OSError):
+            while time.monotonic() < deadline:
+                got += opened.read()
+        opened.close()
+    assert got == b"abc"
+    with pytest.raises(OSError):
+        transport_opener(f"tcp:{host}:{port}")()
+
+
+def test_a_link_in_a_thread_lives_through_anything(monkeypatch, caplog):
+    port = transport_opener("udpin:127.0.0.1:0")()
+    link = AutopilotLink(lambda: port, TelemetryBuffer(), Time().clocks)
+    whole, calls = link._dispatch, []
+
+    def dispatch(message, now_ns):
+        calls.append(1)
+        if len(calls) == 1:
+            raise ZeroDivisionError("odd message")
+        whole(message, now_ns)
+
+    monkeypatch.setattr(link, "_dispatch", dispatch)
+    thread = LinkThread(link)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        deadline = time.monotonic() + 3
+        while link.counts["HEARTBEAT"] == 0 and time.monotonic() < deadline:
+            out.sendto(Autopilot().heartbeat(), port._socket.getsockname())
+            time.sleep(0.02)
+    thread.stop()
+    assert link.counts["HEARTBEAT"] > 0 and "autopilot" in caplog.text
+
+
+def test_without_pymavlink_it_says_so(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pymavlink.dialects.v20.common", None)
+    with pytest.raises(MissingExtraError, match="autopilot"):
+        AutopilotLink(Port().open, TelemetryBuffer(), Time().clocks)

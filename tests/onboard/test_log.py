@@ -1,0 +1,323 @@
+"""A flight log is whole up to its last chunk, whatever the disk does, and never stops a flight."""
+
+import errno
+import json
+import math
+import os
+import shutil
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from orthonav.errors import OutputError
+from orthonav.geo.camera import Camera
+from orthonav.onboard import log as log_module
+from orthonav.onboard import segment as segment_module
+from orthonav.onboard.log import FlightLog
+from orthonav.records import Fix, NoFix, Prior, Telemetry, ViewResult
+
+CAMERA = Camera(64, 48, 50.5, 50.25, 32.125, 24.0, (0.1, -0.02, 0.001, 0.002))
+MAP = {"name": "area.onav", "manifest_sha256": "0" * 64}
+START_NS = 1_700_000_000_123_456_789
+
+
+def telemetry(index):
+    return Telemetry(START_NS + index * 10**9, 10.0 + index, math.nan, 0.1, 120.0)
+
+
+def picture(index, shape=(48, 64)):
+    return np.random.default_rng(index).integers(0, 256, shape, dtype=np.uint8)
+
+
+def outcome(index, frame):
+    where = Fix(46.5, 2.5 + index * 1e-5, np.array([[4.0, 1.0], [1.0, 9.0]]), 0.9, 15.0, 1.0, 120.0)
+    answer = NoFix("blank", "nothing to see") if index % 5 == 4 else where
+    return ViewResult(frame, START_NS + index * 10**9, answer, 12.5, "tracking")
+
+
+def log_views(log, numbers, shape=(48, 64)):
+    for index in numbers:
+        frame = f"{index:06d}.png"
+        log.view(index, frame, picture(index, shape), telemetry(index))
+        log.result(outcome(index, frame))
+
+
+def begun(folder, **how):
+    log = FlightLog(folder / "flight.mcap", CAMERA, MAP, **{"chunk_s": 0.01, **how})
+    log.options({"heading": "known", "track": True, "accept": None})
+    return log
+
+
+def read(path):
+    """Topic to messages, by the library's own reader."""
+    found = {}
+    with path.open("rb") as stream:
+        for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages(
+            log_time_order=False
+        ):
+            found.setdefault(channel.topic, []).append(message)
+    return found
+
+
+def plain(messages):
+    return [json.loads(message.data) for message in messages]
+
+
+def wait_for(condition):
+    until = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.002)
+
+
+def files_in(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_the_stock_reader_reads_it(tmp_path):
+    log = begun(tmp_path)
+    log_views(log, range(6))
+    log.health({"level": "ok", "share": math.nan})
+    log.close()
+    path = tmp_path / "flight_0001.mcap"
+    found = read(path)
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        assert reader.get_header().profile == "orthonav"
+        counts = reader.get_summary().statistics.channel_message_counts
+        assert sum(counts.values()) == sum(map(len, found.values()))
+    assert len(found["/orthonav/view"]) == len(found["/orthonav/result"]) == 6
+    assert [message.log_time for message in found["/orthonav/view"]] == [
+        START_NS + index * 10**9 for index in range(6)
+    ]
+    assert len(found["/orthonav/position"]) == 5
+    health = plain(found["/orthonav/health"])[-1]
+    assert health == {"level": "ok", "share": "NaN", "log_lost": {"views": 0, "messages": 0}}
+
+
+def test_what_foxglove_requires(tmp_path):
+    """The required fields of its published schemas, and their types."""
+    log = begun(tmp_path)
+    log_views(log, range(1))
+    log.close()
+    found = read(tmp_path / "flight_0001.mcap")
+    stamp = {"sec": START_NS // 10**9, "nsec": START_NS % 10**9}
+    position = plain(found["/orthonav/position"])[0]
+    assert position["timestamp"] == stamp and position["frame_id"] == "camera"
+    assert (position["latitude"], position["longitude"]) == (46.5, 2.5)
+    assert position["altitude"] == 0.0 and position["position_covariance_type"] == 3
+    assert position["position_covariance"] == [4, 1, 0, 1, 9, 0, 0, 0, 1e8]
+    camera = plain(found["/orthonav/camera"])[0]
+    assert (camera["width"], camera["height"]) == (64, 48)
+    assert camera["distortion_model"] == "plumb_bob" and len(camera["D"]) == 5
+    assert camera["K"] == [50.5, 0, 31.625, 0, 50.25, 23.5, 0, 0, 1]
+    assert len(camera["R"]) == 9 and len(camera["P"]) == 12
+    with (tmp_path / "flight_0001.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    schemas = {each.name: each for each in summary.schemas.values()}
+    for name in ("foxglove.LocationFix", "foxglove.CameraCalibration", "orthonav.Telemetry"):
+        text = json.loads(schemas[name].data)
+        assert schemas[name].encoding == "jsonschema" and text["title"] == name
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    image = schemas["foxglove_msgs/msg/CompressedImage"]
+    assert image.encoding == "ros2msg"
+    fields = image.data.decode().partition("====")[0]
+    store.register(get_types_from_msg(fields, image.name))
+    view = store.deserialize_cdr(found["/orthonav/view"][0].data, image.name)
+    assert (view.timestamp.sec, view.timestamp.nanosec) == tuple(stamp.values())
+    assert (view.frame_id, view.format) == ("camera", "png")
+    assert np.array_equal(cv2.imdecode(view.data, cv2.IMREAD_UNCHANGED), picture(0))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 70), (33, 1), (48, 65)])
+def test_pictures_lose_nothing(shape):
+    grey = picture(3, shape)
+    png = log_module.lossless_png(grey)
+    assert np.array_equal(cv2.imdecode(np.frombuffer(png, np.uint8), -1), grey)
+
+
+def test_which_pictures_are_kept(tmp_path):
+    for views in ("none", "thumbnails"):
+        log = begun(tmp_path / views, views=views)
+        log.view(0, "0.png", picture(0, (960, 1280)), telemetry(0))
+        log.view(1, "1.png", None, telemetry(1))
+        log.close()
+        found = read(tmp_path / views / "flight_0001.mcap")
+        told = [each["picture"] for each in plain(found["/orthonav/telemetry"])]
+        assert told == [{"none": "none", "thumbnails": "thumbnail"}[views], "bad"]
+        assert "/orthonav/view" not in found
+        assert len(found.get("/orthonav/thumbnail", [])) == (views == "thumbnails")
+
+
+def test_what_was_written_is_there_before_the_end(tmp_path):
+    """As after a power cut: the file is copied while it grows."""
+    log = begun(tmp_path)
+    log_views(log, range(3))
+    wait_for(lambda: (tmp_path / "flight_0001.mcap").exists())
+    wait_for(lambda: log._segment and log._segment.chunks and not log._queue)
+    shutil.copy(tmp_path / "flight_0001.mcap", tmp_path / "cut.mcap")
+    log.close()
+    from orthonav.sources import open_source
+
+    assert len(list(open_source(tmp_path / "cut.mcap").views)) == 3
+
+
+def test_a_slow_disk_never_stops_the_flight(tmp_path, monkeypatch):
+    monkeypatch.setattr(log_module, "QUEUE_BYTES", 10 * 64 * 48)
+    goes_on, sync = threading.Event(), os.fsync
+
+    def stuck(handle):
+        goes_on.wait(10)
+        sync(handle)
+
+    monkeypatch.setattr(segment_module.os, "fsync", stuck)
+    log = begun(tmp_path)
+    log_views(log, range(1))
+    wait_for(lambda: not log._queue)
+    start = time.perf_counter()
+    log_views(log, range(1, 40))
+    assert time.perf_counter() - start < 1.0
+    goes_on.set()
+    log.close()
+    found = read(tmp_path / "flight_0001.mcap")
+    assert len(found["/orthonav/result"]) == len(found["/orthonav/telemetry"]) == 40
+    dropped = [each["picture"] for each in plain(found["/orthonav/telemetry"])].count("dropped")
+    assert 0 < dropped == log.lost["views"] == 40 - len(found["/orthonav/view"])
+    assert log.lost["messages"] == 0
+
+
+def full_disk(monkeypatch, room_bytes):
+    """A disk with room for so many bytes; cutting a file gives room back. Changeable."""
+    disk = {"room": room_bytes}
+    write, cut = os.write, os.ftruncate
+
+    def limited(handle, data):
+        part = memoryview(data)[: max(0, disk["room"])]
+        if not part:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        disk["room"] -= len(part)
+        return write(handle, part)
+
+    def shortened(handle, size):
+        disk["room"] += os.fstat(handle).st_size - size
+        cut(handle, size)
+
+    monkeypatch.setattr(segment_module.os, "write", limited)
+    monkeypatch.setattr(segment_module.os, "ftruncate", shortened)
+    return disk
+
+
+def test_a_full_disk_takes_pictures_first(tmp_path, monkeypatch):
+    disk = full_disk(monkeypatch, 40_000)
+    log = begun(tmp_path)
+    for index in range(30):
+        log_views(log, [index])
+        wait_for(lambda: not log._queue)
+        time.sleep(0.012)
+    log.close()
+    kept = {}
+    for name in files_in(tmp_path):
+        for topic, messages in read(tmp_path / name).items():
+            kept.setdefault(topic, []).extend(messages)
+    assert log.lost["views"] == 30 - len(kept["/orthonav/view"]) > 10
+    assert len(kept["/orthonav/result"]) > len(kept["/orthonav/view"]) >= 4
+    assert disk["room"] >= 0
+
+
+def test_a_disk_without_any_room_and_then_with_some(tmp_path, monkeypatch):
+    monkeypatch.setattr(log_module, "PAUSE_S", 0.0)
+    disk = full_disk(monkeypatch, 0)
+    log = begun(tmp_path)
+    log_views(log, range(5))
+    wait_for(lambda: log.lost == {"views": 5, "messages": 15})
+    assert files_in(tmp_path) == []
+    disk["room"] = 10**9
+    log_views(log, range(5, 8))
+    log.health({})
+    log.close()
+    found = read(tmp_path / "flight_0001.mcap")
+    assert [message.sequence for message in found["/orthonav/view"]] == [5, 6, 7]
+    assert plain(found["/orthonav/health"])[0]["log_lost"] == log.lost
+    assert log.lost["views"] == 5
+
+
+@pytest.mark.parametrize("code", [errno.EIO, errno.EROFS])
+def test_a_disk_that_fails(tmp_path, monkeypatch, code):
+    def failing(handle, data):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(segment_module.os, "write", failing)
+    log = begun(tmp_path)
+    log_views(log, range(3))
+    log.close()
+    assert log.lost["views"] == 3 and log.lost["messages"] >= 6
+
+
+def test_files_follow_each_other_and_the_oldest_go(tmp_path):
+    most = 400_000
+    log = begun(tmp_path, max_bytes=most, segment_bytes=100_000)
+    for index in range(200):
+        log_views(log, [index])
+        if index % 5 == 0:
+            wait_for(lambda: not log._queue)
+    log.close()
+    files = [tmp_path / name for name in files_in(tmp_path)]
+    assert sum(path.stat().st_size for path in files) <= most
+    assert len(files) >= 2 and files[0].name != "flight_0001.mcap"
+    last = -1
+    for path in files:
+        found = read(path)
+        sessions = plain(found["/orthonav/session"])
+        assert sessions[0]["options"]["heading"] == "known" and sessions[0]["map"] == MAP
+        assert "/orthonav/camera" in found
+        numbers = [message.sequence for message in found["/orthonav/view"]]
+        assert numbers == sorted(numbers) and numbers[0] > last
+        last = numbers[-1]
+    assert last == 199
+
+
+def test_nothing_is_written_over(tmp_path):
+    for first in (0, 5):
+        log = begun(tmp_path)
+        log_views(log, range(first, first + 5))
+        log.close()
+    assert files_in(tmp_path) == ["flight_0001.mcap", "flight_0002.mcap"]
+    sessions = [read(tmp_path / name)["/orthonav/session"] for name in files_in(tmp_path)]
+    assert plain(sessions[0])[0]["run"] != plain(sessions[1])[0]["run"]
+
+
+def test_what_cannot_be_written_is_counted(tmp_path):
+    log = begun(tmp_path)
+    log.health({"a": object()})
+    log.options({"b": {1, 2}})
+    log.view(0, "0.png", np.zeros((4, 4, 3), dtype=np.uint8), telemetry(0))
+    log_views(log, range(1, 3))
+    log.close()
+    log_views(log, range(3, 5))
+    found = read(tmp_path / "flight_0001.mcap")
+    assert len(found["/orthonav/view"]) == 2
+    assert log.lost == {"views": 3, "messages": 6}
+    assert plain(found["/orthonav/session"])[0]["options"]["heading"] == "known"
+
+
+def test_the_camera_is_that_of_the_pictures(tmp_path):
+    log = begun(tmp_path)
+    log.view(0, "0.png", picture(0, (24, 32)), replace_prior(telemetry(0)))
+    log.close()
+    session = plain(read(tmp_path / "flight_0001.mcap")["/orthonav/session"])[-1]
+    assert session["camera"]["width_px"] == 32 and session["camera"]["fx_px"] == 25.25
+
+
+def replace_prior(told):
+    return Telemetry(told.time_ns, 1.0, 2.0, 3.0, 4.0, prior=Prior(1.0, 2.0, 3.0))
+
+
+def test_a_folder_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(OutputError, match="file"):
+        begun(tmp_path / "file")

@@ -1,0 +1,240 @@
+"""What goes out: messages as another decoder reads them, NMEA, lines of JSON."""
+
+import json
+import math
+import os
+import pty
+import socket
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pynmeagps
+import pytest
+from standin import UTC_NS, S, Time, fix
+
+from orthonav.errors import VariantError
+from orthonav.onboard.outputs import (
+    KINDS,
+    JsonOut,
+    MessageOptions,
+    Messenger,
+    NmeaOut,
+    TcpSink,
+    open_sink,
+)
+from orthonav.onboard.telemetry import Told
+from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
+from orthonav.publish.gate import Gate, GateRules
+from orthonav.publish.jsonl import result_from_json
+from orthonav.publish.local import Autopilot, Origin, north_east_m
+from orthonav.publish.mavlink import Packer, Target
+from orthonav.publish.nmea import Quality
+from orthonav.records import NoFix, ViewResult
+from wire import decode
+
+ORIGIN = Origin(48.0, 2.0, 100.0)
+ESTIMATE = NavigationEstimate(
+    48.01, 2.01, np.eye(2) * 9.0, 0.97, utc_ns=UTC_NS, boot_ns=1, vel_en_mps=(3.0, 4.0)
+)
+TOLD = Told(np.eye(3), 100.0, "home", (4.0, 3.0, 0.1), -90.0)
+
+
+class Sending:
+    """A messenger whose link is a list."""
+
+    def __init__(self, *kinds, rules=None, **options):
+        self.time, self.frames, self.open = Time(), [], True
+        self.gate = Gate(rules or GateRules(), Clock.BOOT)
+        options = MessageOptions(kinds=kinds or ("global-position",), **options)
+        self.messenger = Messenger(options, self.gate, self.send, self.time.clocks)
+        self.packer = Packer()
+
+    def send(self, message):
+        self.frames.append(decode(self.packer.pack(message)))
+        return self.open
+
+    def publish(self, estimate=ESTIMATE, told=TOLD, origin=ORIGIN, age_s=0.25, **more):
+        known = {"target": Target(1, 1), "kind": Autopilot.PX4, "boot_ns": 61 * S, **more}
+        exposed = self.time.now_ns - round(age_s * S)
+        return self.messenger.publish(estimate, told, exposed_ns=exposed, origin=origin, **known)
+
+
+def test_every_kind_of_message_says_the_place():
+    sending = Sending(*KINDS)
+    assert sending.publish() == tuple(KINDS.values())
+    read = {each["name"]: each for each in sending.frames}
+    sensor, gps, command = (read[n] for n in ("GLOBAL_POSITION_SENSOR", "GPS_INPUT", "COMMAND_INT"))
+    assert (sensor["lat"], sensor["lon"]) == (gps["lat"], gps["lon"]) == (480100000, 20100000)
+    assert (command["command"], command["x"], command["y"]) == (43003, 480100000, 20100000)
+    assert sensor["eph"] == pytest.approx(3.0) and (gps["vn"], gps["ve"]) == (4.0, 3.0)
+    north, east = north_east_m(ORIGIN, 48.01, 2.01, Autopilot.PX4)
+    for name in ("ODOMETRY", "VISION_POSITION_ESTIMATE"):
+        place = [read[name][axis] for axis in "xyz"]
+        assert place == pytest.approx((north, east, -90.0), rel=1e-5)
+
+
+def test_times_are_those_of_exposure_and_sending():
+    sending = Sending("global-position", "gps-input")
+    sending.publish(age_s=0.25)
+    sensor, gps = sending.frames
+    assert sensor["processing_time"] == 250_000
+    assert (sensor["time_usec"], gps["time_usec"]) == (UTC_NS // 1000 + 250_000, UTC_NS // 1000)
+    boot = Sending("gps-input", clock=Clock.BOOT)
+    boot.publish()
+    assert boot.frames[0]["time_usec"] == 61_000_000 and boot.frames[0]["time_week"] > 2000
+
+
+def test_while_the_clock_of_the_autopilot_is_not_known_nothing_is_stamped_by_it():
+    boot = Sending(clock=Clock.BOOT)
+    assert boot.publish(boot_ns=None) == () and boot.frames == []
+    assert [*boot.messenger.not_made] and "boot" in next(iter(boot.messenger.not_made))
+
+
+def test_local_messages_wait_for_the_origin_and_the_height():
+    sending = Sending("odometry", "global-position")
+    assert sending.publish(origin=None) == ("GLOBAL_POSITION_SENSOR",)
+    assert sending.publish(told=Told(None)) == ("GLOBAL_POSITION_SENSOR",)
+    assert sum(sending.messenger.not_made.values()) == 2
+    assert sending.publish(kind=Autopilot.ARDUPILOT) == tuple(
+        KINDS[kind] for kind in ("odometry", "global-position")
+    )
+    assert sending.frames[-2]["frame_id"] == 20  # as ArduPilot reads it
+
+
+def test_the_origin_is_told_until_it_is_known():
+    sending = Sending("vision", origin=ORIGIN)
+    for _ in range(50):
+        sending.messenger.send_origin(None, Target(3, 1))
+        sending.time.go(0.1)
+    assert [each["latitude"] for each in sending.frames] == [480000000] * 3
+    assert sending.frames[0]["target_system"] == 3
+    sending.messenger.send_origin(ORIGIN, Target(3, 1))
+    other = Sending("gps-input", origin=ORIGIN)
+    other.messenger.send_origin(None, None)
+    assert len(sending.frames) == 3 and other.frames == []
+
+
+def test_a_rate_is_kept():
+    rules = GateRules(min_interval_s={"GPS_INPUT": 0.5})
+    sending = Sending("gps-input", rules=rules)
+    sent = 0
+    for _ in range(100):
+        sent += len(sending.publish())
+        sending.time.go(0.1)
+    assert sent == 20 and sending.gate.withheld["rate:GPS_INPUT"] == 80
+
+
+def test_what_found_no_port_was_not_sent():
+    sending = Sending()
+    sending.open = False
+    assert sending.publish() == ()
+
+
+def test_other_messages_are_refused():
+    with pytest.raises(VariantError, match="global-position"):
+        MessageOptions(kinds=("telepathy",))
+    with pytest.raises(EstimateError):
+        Origin(99.0, 0.0, 0.0)
+
+
+def sentences(data):
+    return [pynmeagps.NMEAReader.parse(line + b"\r\n") for line in data.split(b"\r\n") if line]
+
+
+def test_nmea_over_udp():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
+        heard.bind(("127.0.0.1", 0))
+        heard.settimeout(2)
+        out = NmeaOut(open_sink(f"udp:127.0.0.1:{heard.getsockname()[1]}"))
+        out.write(ESTIMATE, UTC_NS, 0.9)
+        gga, rmc, gst = sentences(heard.recv(500))
+        out.write(None, UTC_NS, 0.9)
+        none, *_ = sentences(heard.recv(500))
+        out.close()
+    assert (gga.msgID, rmc.msgID, gst.msgID) == ("GGA", "RMC", "GST")
+    assert (gga.quality, none.quality) == (6, 0)
+    assert (gga.lat, rmc.lon) == pytest.approx((48.01, 2.01), abs=1e-6)
+    out.close()
+
+
+def test_nmea_over_tcp_to_all_who_read():
+    sink = open_sink("tcp-listen:0")
+    assert isinstance(sink, TcpSink) and sink._listening.getsockname()[0] == "127.0.0.1"
+    out = NmeaOut(sink, talker="GN", quality=Quality.AUTONOMOUS)
+    clients = [socket.create_connection(("127.0.0.1", sink.port)) for _ in range(2)]
+    out.write(ESTIMATE, UTC_NS, 0.9)
+    for client in clients:
+        client.settimeout(2)
+        assert sentences(client.recv(500))[0].quality == 1
+    clients[0].close()
+    for _ in range(2_000):  # the other one does not read any more
+        sink.write(bytes(8000))
+        if not sink._clients:
+            break
+    assert sink._clients == []
+    out.close()
+    clients[1].close()
+
+
+def test_nmea_over_a_serial_port_that_is_unplugged():
+    ours, theirs = pty.openpty()
+    name = os.ttyname(theirs)
+    out = NmeaOut(open_sink(f"serial:{name}:115200"))
+    out.write(ESTIMATE, UTC_NS, 0.9)
+    assert sentences(os.read(ours, 500))[0].quality == 6
+    os.close(theirs)
+    os.close(ours)
+    for _ in range(2):
+        with pytest.raises(OSError):
+            out.write(ESTIMATE, UTC_NS, 0.9)
+    out.close()
+
+
+@pytest.mark.parametrize("url", ["", "udp:here", "http://x", "serial:ttyS0", "tcp-listen:x:y"])
+def test_other_sinks_are_refused(url):
+    with pytest.raises(VariantError):
+        open_sink(url)
+
+
+RESULT = ViewResult("000001", UTC_NS + 5, fix(), 12.5, "tracking")
+
+
+def test_lines_are_those_of_fixes(tmp_path):
+    path = tmp_path / "lines.jsonl"
+    path.write_text("an old line\n")
+    out = JsonOut(path)
+    out.view(RESULT, 40.25, ("GPS_INPUT",), None)
+    out.health({"health": "OK", "reasons": []})
+    out.view(replace(RESULT, outcome=NoFix("frozen_picture", "again")), 1.0, (), "no_fix")
+    out.close()
+    old, first, health, second = path.read_text().splitlines()
+    assert old == "an old line"
+    read = result_from_json(first)
+    assert (read.time_ns, read.outcome.lat_deg) == (UTC_NS + 5, 48.0)
+    assert json.loads(first)["age_ms"] == 40.25 and json.loads(first)["sent"] == ["GPS_INPUT"]
+    assert json.loads(health)["health"] == "OK"
+    assert result_from_json(second).outcome.reason == "frozen_picture"
+
+
+def test_lines_on_stdout(capsys):
+    out = JsonOut(None)
+    out.view(RESULT, math.pi, (), None)
+    out.close()
+    assert json.loads(capsys.readouterr().out)["age_ms"] == 3.142
+    print("stdout is still there", file=sys.stdout)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")  # noqa: PTH110
+def test_a_full_disk_is_told_and_survived(tmp_path):
+    path = tmp_path / "lines.jsonl"
+    path.symlink_to("/dev/full")
+    out = JsonOut(path)
+    for _ in range(3):
+        with pytest.raises(OSError, match="space"):
+            out.view(RESULT, 1.0, (), None)
+    path.unlink()  # room again
+    out.view(RESULT, 2.0, (), None)
+    out.close()
+    lines = [line for line in path.read_text().splitlines() if line]
+    assert [json.loads(line)["age_ms"] for line in lines] == [2.0]

@@ -1,0 +1,193 @@
+"""Telemetry at the exposure, and clocks that agree."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
+from standin import MS, S
+
+from orthonav.onboard.telemetry import ClockSync, Limits, TelemetryBuffer, Told, wxyz_of_angles
+from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
+from orthonav.sources.track import Samples, Track, attitude_of_angles
+
+ANGLES = st.tuples(st.floats(-40, 40), st.floats(-40, 40), st.floats(-180, 180))
+
+
+def attitude(buffer, time_ns, yaw_deg=0.0, pitch_deg=0.0, roll_deg=0.0):
+    buffer.add_attitude(time_ns, wxyz_of_angles(*np.radians([roll_deg, pitch_deg, yaw_deg])))
+
+
+def test_half_way_between_two_attitudes():
+    buffer = TelemetryBuffer()
+    attitude(buffer, 0, yaw_deg=350.0)
+    attitude(buffer, 100 * MS, yaw_deg=20.0)
+    told = buffer.at(50 * MS).telemetry(7)
+    assert told.yaw_deg == pytest.approx(5.0) and told.time_ns == 7
+    assert buffer.at(10 * MS).telemetry(0).yaw_deg == pytest.approx(353.0)
+
+
+@given(ANGLES, ANGLES, st.floats(0, 1), st.booleans())
+def test_between_attitudes_as_scipy_turns(before, after, weight, flipped):
+    buffer = TelemetryBuffer()
+    ends = [wxyz_of_angles(*np.radians(each)) for each in (before, after)]
+    buffer.add_attitude(0, ends[0])
+    buffer.add_attitude(10**8, -ends[1] if flipped else ends[1])
+    turns = Rotation.from_quat(np.array(ends)[:, [1, 2, 3, 0]])
+    if (turns[0].inv() * turns[1]).magnitude() > 3.1:
+        return  # half a turn: both ways are shortest
+    when = round(weight * 10**8)
+    expected = Slerp([0, 1], turns)(when / 10**8).as_matrix()
+    np.testing.assert_allclose(buffer.at(when).ned_from_body, expected, atol=1e-6)
+
+
+@given(ANGLES, st.tuples(*[st.floats(-30, 30)] * 3))
+def test_the_camera_is_as_an_import_of_a_log_would_have_it(angles, mount):
+    roll, pitch, yaw = angles
+    buffer, samples = TelemetryBuffer(), Samples(3)
+    attitude(buffer, 1 * S, yaw, pitch, roll)
+    samples.add(1 * S, yaw, pitch, roll)
+    series = attitude_of_angles(samples, lambda a: enu_from_body_camera(ned_from_angles(a), mount))
+    logged = Track(series).telemetry(1 * S)
+    told = buffer.at(1 * S).telemetry(1 * S, mount)
+    assert (told.pitch_deg, told.roll_deg) == pytest.approx((logged.pitch_deg, logged.roll_deg))
+    assert math.remainder(told.yaw_deg - logged.yaw_deg, 360) == pytest.approx(0, abs=1e-6)
+
+
+def test_gaps_are_not_bridged():
+    limits = Limits(attitude_gap_s=0.5, attitude_hold_s=0.1, slow_gap_s=2.0, slow_hold_s=1.5)
+    buffer = TelemetryBuffer(limits)
+    assert buffer.at(0).ned_from_body is None and buffer.newest_ns is None
+    attitude(buffer, 1 * S)
+    attitude(buffer, 2 * S)
+    buffer.add_height("home", 1 * S, 100.0)
+    buffer.add_height("home", 2 * S, 110.0)
+    assert buffer.at(1 * S - 1).ned_from_body is None
+    gap = buffer.at(1500 * MS)
+    assert gap.ned_from_body is None and gap.height_m == pytest.approx(105.0)
+    assert gap.telemetry(0).missing() == ["yaw_deg", "pitch_deg", "roll_deg"]
+    assert buffer.at(2100 * MS).ned_from_body is not None
+    late = buffer.at(2101 * MS)
+    assert late.ned_from_body is None and late.height_m == 110.0
+    assert math.isnan(buffer.at(3501 * MS).height_m)
+
+
+def test_the_best_height_counts():
+    buffer = TelemetryBuffer()
+    attitude(buffer, 0)
+    buffer.add_height("relative", 0, 1.0)
+    assert buffer.at(0).height_source == "relative"
+    buffer.add_height("home", 0, 2.0)
+    assert (buffer.at(0).height_m, buffer.at(0).height_source) == (2.0, "home")
+    buffer.add_height("terrain", 0, 3.0)
+    buffer.add_height("distance", 10, math.nan)
+    assert buffer.at(0).height_source == "terrain"
+    buffer.add_distance(10, 4.0)
+    assert (buffer.at(10).height_m, buffer.at(10).height_source) == (4.0, "distance")
+    only = TelemetryBuffer(heights=("home",))
+    only.add_height("terrain", 0, 3.0)
+    assert math.isnan(only.at(0).height_m)
+
+
+def test_a_distance_is_taken_along_the_body():
+    buffer = TelemetryBuffer()
+    buffer.add_distance(0, 100.0)  # the lean is not known
+    assert math.isnan(buffer.at(0).height_m)
+    attitude(buffer, 1, pitch_deg=20.0, roll_deg=10.0)
+    buffer.add_distance(1, 100.0)
+    lean = math.cos(math.radians(20)) * math.cos(math.radians(10))
+    assert buffer.at(1).height_m == pytest.approx(100 * lean)
+
+
+def test_velocity_and_height_of_the_local_frame():
+    buffer = TelemetryBuffer()
+    buffer.add_local(0, (10.0, 2.0, -1.0), -50.0)
+    buffer.add_local(1 * S, (12.0, 2.0, math.nan), -50.0)
+    told = buffer.at(0)
+    assert told.telemetry(0).vel_en_mps == (2.0, 10.0)
+    assert (told.velocity_ned_mps[2], told.down_m) == (-1.0, -50.0)
+    assert Told(None).telemetry(0).vel_en_mps is None
+
+
+@pytest.mark.parametrize("wxyz", [(0, 0, 0, 0), (math.nan, 0, 0, 0), (3, 0, 0, 0)])
+def test_what_is_no_attitude_is_dropped(wxyz):
+    buffer = TelemetryBuffer()
+    buffer.add_attitude(0, wxyz)
+    assert buffer.newest_ns is None
+
+
+def test_samples_out_of_order_are_dropped_and_old_ones_forgotten():
+    buffer = TelemetryBuffer(Limits(keep_s=1.0))
+    for number in range(1000):
+        attitude(buffer, number * 10 * MS, yaw_deg=10.0)
+    attitude(buffer, 5 * S, yaw_deg=90.0)
+    assert buffer.newest_ns == 9990 * MS
+    assert buffer.at(5 * S).ned_from_body is None
+    assert buffer.at(9500 * MS).telemetry(0).yaw_deg == pytest.approx(10.0)
+    assert len(buffer._attitude.times) <= 201
+
+
+OFFSET_NS = -37 * S
+
+
+def exchanges(sync, rng, count, offset_ns=OFFSET_NS, start_ns=0, one_sided=False):
+    jumped = False
+    for number in range(count):
+        sent = start_ns + number * S
+        there = round(rng.exponential(3 * MS)) + MS
+        back = MS if one_sided else round(rng.exponential(3 * MS)) + MS
+        jumped |= sync.exchange(sent, sent + there + back, sent + there + offset_ns)
+    return jumped
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_quick_exchanges_count(seed):
+    sync = ClockSync()
+    exchanges(sync, np.random.default_rng(seed), 32)
+    assert sync.is_exact and abs(sync.offset_ns - OFFSET_NS) < MS
+
+
+def test_outliers_are_left_out():
+    sync, rng = ClockSync(), np.random.default_rng(1)
+    exchanges(sync, rng, 10)
+    before = sync.offset_ns
+    for late in (300 * MS, -300 * MS, 10 * S):
+        sync.exchange(20 * S, 20 * S + 2 * MS, 20 * S + OFFSET_NS + late)
+    sync.exchange(20 * S, 30 * S, 25 * S + OFFSET_NS)  # a round trip of 10 s
+    sync.exchange(20 * S, 19 * S, 20 * S + OFFSET_NS)  # answered before it was asked
+    assert (sync.offset_ns, sync.jumps, sync.rejected) == (before, 0, 5)
+
+
+@pytest.mark.parametrize("jump_ns", [5 * S, -5 * S, 60 * MS, -60 * MS, -36 * S])
+def test_a_clock_that_was_set_is_found_out(jump_ns):
+    sync, rng = ClockSync(), np.random.default_rng(2)
+    exchanges(sync, rng, 20)
+    assert exchanges(sync, rng, 8, OFFSET_NS + jump_ns, 20 * S)
+    assert sync.jumps == 1
+    exchanges(sync, rng, 5, OFFSET_NS + jump_ns, 30 * S)
+    assert abs(sync.offset_ns - OFFSET_NS - jump_ns) < 3 * MS
+
+
+@pytest.mark.parametrize("jump_ns", [5 * S, -5 * S])
+def test_messages_tell_a_restart_without_any_exchange(jump_ns):
+    sync, rng = ClockSync(), np.random.default_rng(3)
+    for number in range(100):
+        now = number * 20 * MS
+        sync.heard(now + round(rng.exponential(10 * MS)), now + OFFSET_NS)
+    assert abs(sync.offset_ns - OFFSET_NS) < MS and not sync.is_exact
+    for number in range(100):
+        now = 2 * S + number * 20 * MS
+        sync.heard(now + round(rng.exponential(10 * MS)), now + OFFSET_NS + jump_ns)
+    assert sync.jumps == 1 and abs(sync.offset_ns - OFFSET_NS - jump_ns) < 15 * MS
+
+
+def test_a_queue_that_empties_is_no_jump():
+    """The link stood still for three seconds, then all comes at once."""
+    sync = ClockSync()
+    exchanges(sync, np.random.default_rng(4), 5)
+    before = sync.offset_ns
+    for number in range(150):
+        sync.heard(10 * S + number * MS, 7 * S + number * 20 * MS + OFFSET_NS)
+    assert (sync.jumps, sync.offset_ns) == (0, before)
