@@ -394,6 +394,6 @@ def test_the_radius_grows_with_the_height(localizer):
 def test_a_heading_told_the_wrong_way_round_makes_no_track(localizer):
     """Ground looks alike turned by half: views fit somewhere, one by one, and are not believed."""
     tracker = Tracker(localizer)
-    rows = followed(tracker, localizer, views(24, heading_off=180.0))
+    rows = followed(tracker, localizer, views(14, heading_off=180.0))
     assert not any(row[1] > 0.8 and row[0] > 35 for row in rows)
     assert all(row[2] == "searching" for row in rows)
