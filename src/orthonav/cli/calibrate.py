@@ -1,7 +1,7 @@
 """`orthonav calibrate`: find out what is wrong with what a flight tells, by flying it."""
 
 import argparse
-from dataclasses import fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,16 +84,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _plain(found: "Calibration") -> dict[str, Any]:
-    from orthonav.flight.mount import Bias
-
-    mount = found.mount
-    names = ("heading_deg", "log_scale", "pitch_deg", "roll_deg")
-    plain: dict[str, Any] = {
-        name: {each.name: getattr(getattr(mount, name), each.name) for each in fields(Bias)}
-        for name in names
-    }
-    return plain | {
-        "views": mount.views,
+    return asdict(found.mount) | {
         "first": found.first,
         "last": found.last,
         "moved": found.moved,

@@ -3,7 +3,6 @@
 import argparse
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -111,17 +110,9 @@ def _flown(logged: Any) -> dict[str, Any]:
 
 def _mount(plain: Any) -> "Mount":
     from orthonav.errors import FlightError
-    from orthonav.flight.mount import Bias, Mount
+    from orthonav.flight.mount import BROKEN, mount_from_plain
 
     try:
-        biases = {
-            name: Bias(*(float(plain[name][each]) for each in ("value", "std", "scatter")))
-            for name in ("heading_deg", "log_scale", "pitch_deg", "roll_deg")
-        }
-        mount = Mount(**biases, views=int(plain["views"]))
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        return mount_from_plain(plain)
+    except BROKEN as error:
         raise FlightError(f"flight log has a mount that is none ({error!r:.80})") from error
-    numbers = [value for bias in biases.values() for value in asdict(bias).values()]
-    if not all(abs(number) <= 180 for number in numbers) or abs(mount.log_scale.value) > 1:
-        raise FlightError("flight log has a mount that is none (out of range)")
-    return mount

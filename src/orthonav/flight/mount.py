@@ -5,7 +5,7 @@ Found by flying (`orthonav calibrate`), kept in a small JSON file, used for the 
 
 import json
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from orthonav.records import Telemetry
 
 VERSION = 1
 MAX_BYTES = 100_000
+BROKEN = (KeyError, TypeError, ValueError, OverflowError)
 _LIMITS = {"heading_deg": 180.0, "log_scale": 1.0, "pitch_deg": 60.0, "roll_deg": 60.0}
 
 
@@ -56,10 +57,7 @@ class Mount:
 
 def write_mount(path: Path, mount: Mount) -> None:
     """Write a mount as JSON, whole or not at all."""
-    plain: dict[str, Any] = {"orthonav_mount": VERSION, "views": mount.views}
-    for name in _LIMITS:
-        bias: Bias = getattr(mount, name)
-        plain[name] = {each.name: getattr(bias, each.name) for each in fields(Bias)}
+    plain = {"orthonav_mount": VERSION, **asdict(mount)}
     write_text(path, json.dumps(plain, indent=1, allow_nan=False) + "\n")
 
 
@@ -72,10 +70,15 @@ def read_mount(path: Path) -> Mount:
         plain = json.loads(path.read_text(encoding="utf-8"))
         if plain["orthonav_mount"] != VERSION:
             raise ValueError(f"version {plain['orthonav_mount']}, expected {VERSION}")
-        biases = {name: _bias(plain[name], name) for name in _LIMITS}
-        return Mount(**biases, views=int(plain["views"]))
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OSError) as error:
+        return mount_from_plain(plain)
+    except (*BROKEN, AttributeError, RecursionError, OSError) as error:
         raise FlightError(f"not a mount file of `orthonav calibrate` ({error}): {path}") from error
+
+
+def mount_from_plain(plain: Any) -> Mount:
+    """Inverse of `asdict`, checked; raises one of `BROKEN` where it is no mount."""
+    biases = {name: _bias(plain[name], name) for name in _LIMITS}
+    return Mount(**biases, views=int(plain["views"]))
 
 
 def _bias(plain: dict[str, Any], name: str) -> Bias:
