@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from orthonav.track import CameraWay, Mixture, Model, Sighting, State, Told, ToldVelocity
-from orthonav.track.mixture import within
+from orthonav.track.hypotheses import within
 from orthonav.track.smooth import History
 
 AREA_M2 = 4e6

@@ -23,7 +23,7 @@ from orthonav.records import Fix, NoFix, Prior, Telemetry
 from orthonav.register.pose import Pose
 from orthonav.register.registrar import Registered
 from orthonav.track import Estimate, Mixture, Model, Sighting, State, Told, ToldVelocity
-from orthonav.track.mixture import within
+from orthonav.track.hypotheses import within
 from orthonav.track.model import HEADING, LEAN, SCALE
 from orthonav.track.smooth import History, Smoothed
 

@@ -15,6 +15,7 @@ from enum import Enum
 
 import numpy as np
 
+from orthonav.track.hypotheses import Hypothesis, distance, merged, moments, within
 from orthonav.track.model import (
     LEAN,
     POSITION,
@@ -39,13 +40,10 @@ from orthonav.track.motion import (
     velocity_forgotten,
 )
 
-MAX_HYPOTHESES = 40
 MIN_WAY = 1e-5
 """Less likely ways are not followed."""
 MINOR_SHARE = 1e-4
 """Hypotheses with less belief are not split for what is rare."""
-MIN_SHARE = 1e-7
-MERGE_SIGMAS = 1.0
 TOLD_SHARE = 0.9
 """Belief in a position that was told before anything was seen."""
 SURE = 0.9
@@ -59,8 +57,6 @@ TRUSTED = (0.1, 0.5)
 MOST_OF_ONE = 0.75
 UNCONFIRMED = 0.8
 """More confidence is not stated before."""
-WHAT_DIFFERS = np.ix_([0, 1, 2, 3, 6, 7], [0, 1, 2, 3, 6, 7])
-"""Of the covariances of two hypotheses: position, velocity and lean."""
 MOST_SIGHTED = 3.0
 WIDE_M, FORGOTTEN = 50.0, 0.5
 """More is not remembered, and half of it is forgotten with every view at which the position is
@@ -80,24 +76,6 @@ class State(Enum):
     SEARCHING = "searching"
     TRACKING = "tracking"
     LOST = "lost"
-
-
-@dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """One way things may be.
-
-    Its share of belief, mean (8,), covariance (8, 8), how much new ground was sighted (in views),
-    and its number; the number of what it came from, and what that was expected to become by now:
-    None where it came from nowhere.
-    """
-
-    share: float
-    mean: Array
-    covariance: Array
-    sighted: float
-    number: int
-    parent: int = -1
-    expected: Expected | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +238,7 @@ class Mixture:
         total = sum(each.share for each in made) + self.elsewhere
         self.elsewhere /= total
         made = [replace(each, share=each.share / total) for each in made]
-        self.hypotheses = _merged(sorted(made, key=lambda each: -each.share))
+        self.hypotheses = merged(sorted(made, key=lambda each: -each.share))
         self._settle()
 
     def estimate(self, radius_m: float, *, between_views: bool = False) -> Estimate | None:
@@ -272,8 +250,8 @@ class Mixture:
         if not self.hypotheses:
             return None
         best = self._best(radius_m)
-        near = [each for each in self.hypotheses if _distance(each, best) <= radius_m]
-        mean, covariance = _moments(near)
+        near = [each for each in self.hypotheses if distance(each, best) <= radius_m]
+        mean, covariance = moments(near)
         confidence = min(self._inside(radius_m, mean[POSITION]), 1.0)
         sighted = max(each.sighted for each in near)
         if not between_views:
@@ -299,7 +277,7 @@ class Mixture:
         covariance (4, 4) of heading, log scale, pitch and roll."""
         if not self.hypotheses:
             return np.zeros(4), np.diag(self.model.initial_bias())
-        mean, covariance = _moments(self.hypotheses)
+        mean, covariance = moments(self.hypotheses)
         return mean[4:], covariance[4:, 4:]
 
     def _next_state(self, confidence: float, sighted: float) -> State:
@@ -411,64 +389,6 @@ class Mixture:
         self.elsewhere /= total
 
 
-def _merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
-    """Hypotheses, heaviest first, with those that have become one put together, few kept."""
-    likely = [each for each in ordered[: 4 * MAX_HYPOTHESES] if each.share > MIN_SHARE]
-    left = likely or ordered[:1]  # the last one stays, however unlikely
-    kept: list[Hypothesis] = []
-    while left and len(kept) < MAX_HYPOTHESES:
-        first, rest = left[0], left[1:]
-        inverse = np.asarray(np.linalg.inv(first.covariance[WHAT_DIFFERS]), np.float64)
-        group, left = [first], []
-        for each in rest:
-            alike = _divergence(each, first, inverse) < 2 * MERGE_SIGMAS**2
-            (group if alike else left).append(each)
-        mean, covariance = _moments(group)
-        share = sum(each.share for each in group)
-        sighted = sum(each.share * each.sighted for each in group) / share
-        kept.append(replace(first, share=share, mean=mean, covariance=covariance, sighted=sighted))
-    return kept
-
-
 def _trust(alone: float) -> float:
     low, high = TRUSTED
     return min(max((alone - low) / (high - low), 0.0), 1.0)
-
-
-def _divergence(one: Hypothesis, heavier: Hypothesis, inverse: Array) -> float:
-    """How much is lost (nats, Kullback and Leibler) where a hypothesis becomes part of a heavier
-    one, in position, velocity and lean; `inverse` (6, 6) is that of the heavier one's covariance.
-
-    A place that is known well is not the same as a wide guess around it.
-    """
-    off = (one.mean - heavier.mean)[[0, 1, 2, 3, 6, 7]]
-    turned = inverse @ one.covariance[WHAT_DIFFERS]
-    _, log_det = np.linalg.slogdet(turned)
-    return float(off @ inverse @ off + np.trace(turned) - 6 - log_det) / 2
-
-
-def _moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:
-    """Mean and covariance of several hypotheses taken as one."""
-    shares = np.array([each.share for each in group])
-    shares = shares / shares.sum()
-    means = np.stack([each.mean for each in group])
-    mean = shares @ means
-    off = means - mean
-    covariance = sum(s * each.covariance for s, each in zip(shares, group, strict=True))
-    return mean, np.asarray(covariance + (off * shares[:, None]).T @ off)
-
-
-def _distance(one: Hypothesis, other: Hypothesis) -> float:
-    return float(np.hypot(*(one.mean[POSITION] - other.mean[POSITION])))
-
-
-def within(mean: Array, covariance: Array, radius_m: float, middle: Array | None = None) -> float:
-    """About how much of a state lies within a radius of `middle` (2,), its own mean where None.
-
-    Exact for a round Gaussian around the middle; distance counts as so much more spread.
-    """
-    variance = float(np.trace(covariance[POSITION, POSITION])) / 2
-    away = 0.0 if middle is None else float(np.hypot(*(mean[POSITION] - middle)))
-    if away > radius_m + 3 * math.sqrt(variance):
-        return 0.0
-    return 1 - math.exp(-(radius_m**2) / (2 * variance + away**2 + 1e-9))

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthonav.track.mixture import Hypothesis, Mixture
+from orthonav.track.hypotheses import Hypothesis
+from orthonav.track.mixture import Mixture
 from orthonav.track.model import Array
 
 
