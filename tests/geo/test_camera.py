@@ -17,6 +17,7 @@ from orthonav.geo.camera import (
     distort,
     enu_from_camera,
     footprint_en_m,
+    ground_en_m,
 )
 
 CAMERA = Camera(640, 480, 500.0, 510.0, 321.5, 238.0)
@@ -188,3 +189,16 @@ GOOD = {"width_px": 640, "height_px": 480, "fx_px": 500, "fy_px": 500, "cx_px": 
 def test_impossible_cameras_are_refused(change, message):
     with pytest.raises(CameraError, match=message):
         Camera(**(GOOD | change))
+
+
+@given(yaws, tilts, tilts, st.floats(30, 500), st.just(()) | coefficients)
+def test_ground_points_project_back(yaw, pitch, roll, agl_m, distortion):
+    camera = Camera(640, 480, 500.0, 510.0, 321.5, 238.0, distortion)
+    px = np.array([[320.0, 240.0], [200.0, 100.0], [450.0, 380.0]])
+    ground = ground_en_m(camera, px, yaw, pitch, roll, agl_m)
+    assert px_from_en(camera, yaw, pitch, roll, agl_m, ground) == pytest.approx(px, abs=1e-3)
+
+
+def test_the_sky_is_no_ground():
+    ground = ground_en_m(CAMERA, np.array([[320.0, 0.0], [320.0, 480.0]]), 0.0, 80.0, 0.0, 100.0)
+    assert np.isnan(ground[0]).all() and np.isfinite(ground[1]).all()

@@ -142,7 +142,7 @@ def test_hindsight_calibrates_the_beginning_too(localizer):
         for fix, (_, _, place) in zip(tracker.in_hindsight(), seen, strict=True)
     ]
     assert max(after) < 12 and len(rows) == len(after)
-    assert np.mean(after[:4]) < np.mean([row[0] for row in rows[:4]])
+    assert np.mean(after[:4]) < 6  # 5 deg of pitch are 13 m from 150 m
     with pytest.raises(ValueError, match="no history"):
         Tracker(localizer).in_hindsight()
 
@@ -277,11 +277,10 @@ def test_every_view_has_a_result_and_a_state(localizer, monkeypatch):
 def levelled_twice(localizer, grey, told):
     """A view placed with its lean, and again from the lean that was found."""
     registration = localizer.registration
-    view = registration.prepared(grey, WIDE, told, heading_known=True)
-    pose = registration.best(view, None).placed.pose
     for _ in range(2):
         view = registration.prepared(grey, WIDE, told, heading_known=True)
-        found = levelled(registration, grey, WIDE, told, view, pose)
+        placed = registration.best(view, None).placed
+        found = levelled(registration, grey, WIDE, told, view, placed)
         pitch, roll = np.degrees(found.mean[4:])
         told = replace(told, pitch_deg=pitch, roll_deg=roll)
     return found
@@ -310,8 +309,8 @@ def test_a_narrow_view_knows_less_of_its_lean(localizer):
         told = Telemetry(0, 25.0, 0.0, 0.0, agl_m)
         registration = localizer.registration
         view = registration.prepared(grey, camera, told, heading_known=True)
-        pose = registration.best(view, None).placed.pose
-        found = levelled(registration, grey, camera, told, view, pose)
+        placed = registration.best(view, None).placed
+        found = levelled(registration, grey, camera, told, view, placed)
         std = np.sqrt(np.diag(found.covariance))
         std_deg.append(np.degrees(std[4:]))
         # What the lean is not known to, the position is not either.
@@ -319,8 +318,43 @@ def test_a_narrow_view_knows_less_of_its_lean(localizer):
     assert (std_deg[1] > 3 * std_deg[0]).all() and std_deg[1].max() < 21
 
 
+@pytest.mark.parametrize("heading_deg", [0.0, 130.0])
+def test_position_hangs_on_a_lean_that_was_not_looked_at(localizer, heading_deg):
+    """Told a lean that is off, the view lies elsewhere by just what the covariance says."""
+    registration, place = localizer.registration, np.array([20.0, -35.0])
+    grey = rendered(GROUND, place, (heading_deg, 0.0, 0.0), AGL_M, WIDE)
+    told, found = Telemetry(0, heading_deg, 0.0, 0.0, AGL_M), []
+    for pitch_deg, roll_deg in ((0.0, 0.0), (2.0, 0.0), (0.0, 2.0)):
+        leaning = replace(told, pitch_deg=pitch_deg, roll_deg=roll_deg)
+        view = registration.prepared(grey, WIDE, leaning, heading_known=True)
+        placed = registration.best(view, None).placed
+        worth = np.zeros(2)
+        found.append(levelled(registration, grey, WIDE, leaning, view, placed, worth))
+    level = found[0]
+    assert np.degrees(np.sqrt(np.diag(level.covariance)[4:])) == pytest.approx(20.0)
+    assert np.hypot(*(level.mean[:2] - place)) < 2
+    hangs = level.covariance[:4, 4:] @ np.linalg.inv(level.covariance[4:, 4:])
+    for axis in range(2):
+        expected = level.mean[:4] + hangs[:, axis] * math.radians(2.0)
+        assert found[axis + 1].mean[:2] == pytest.approx(expected[:2], abs=1.5)
+        assert found[axis + 1].mean[2:4] == pytest.approx(expected[2:], abs=0.01)
+
+
+def test_the_pose_of_a_camera_is_the_inverse(localizer):
+    registration = localizer.registration
+    told = Telemetry(0, 33.0, 4.0, -7.0, AGL_M)
+    grey = rendered(GROUND, (20.0, -35.0), (33.0, 4.0, -7.0), AGL_M, WIDE)
+    view = registration.prepared(grey, WIDE, told, heading_known=True)
+    pose = registration.best(view, None).placed.pose
+    place = registration.camera_en_m(view, pose)
+    again = registration.pose_of(view, np.array([*place, pose.turn_rad, pose.log_scale]))
+    assert again.x_px == pytest.approx(pose.x_px) and again.y_px == pytest.approx(pose.y_px)
+
+
+@pytest.mark.parametrize("expected", [None, (0.0, 0.0), (-29.0, 27.0), (300.0, 0.0)])
 @pytest.mark.parametrize("moved", [(18.0, 0.0), (-30.0, 25.0), (0.0, -70.0)])
-def test_odometry_measures_the_way(moved):
+def test_odometry_measures_the_way(moved, expected):
+    """Whatever was expected."""
     rng = np.random.default_rng(7)
     footprints = []
     for number, (place, heading) in enumerate((((0.0, 0.0), 40.0), (moved, 43.0))):
@@ -329,7 +363,9 @@ def test_odometry_measures_the_way(moved):
         told = Telemetry(number * 10**9, heading, 0.0, 0.0, AGL_M)
         pixel_m = footprints[0].pixel_m if footprints else None
         footprints.append(Footprint.of(noisy, WIDE, told, pixel_m))
-    seen = moved_between(*footprints, 0.0, np.array([1e-3, 4e-4]))
+    told_noise = np.array([1e-3, 4e-4])
+    expected = None if expected is None else np.array(expected)
+    seen = moved_between(*footprints, 0.0, told_noise, expected)
     assert seen.way.moved_en_m == pytest.approx(moved, abs=0.7)
     assert 0 < seen.overlap < 1
 

@@ -202,3 +202,17 @@ def footprint_en_m(
     if (enu[:, 2] >= -1e-9).any():
         raise CameraError("the horizon is in the view: it has no footprint on flat ground")
     return np.asarray(enu[:, :2] * (agl_m / -enu[:, 2:3]))
+
+
+def ground_en_m(
+    camera: Camera, px: Array, yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float
+) -> Array:
+    """Where image points (N, 2) lie on flat ground (N, 2), metres from the point below the camera.
+
+    NaN where a point looks at or above the horizon, or where the lens cannot be undone.
+    """
+    plane = (px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
+    rays = np.concatenate([undistort(camera, plane), np.ones((len(px), 1))], axis=1)
+    enu = rays @ enu_from_camera(yaw_deg, pitch_deg, roll_deg).T
+    down = np.where(enu[:, 2:3] < -1e-9, -enu[:, 2:3], np.nan)
+    return np.asarray(enu[:, :2] * (agl_m / down))

@@ -6,6 +6,9 @@ ground: told too little of it, the rectified view is bent against the map. So th
 under a few leans around the expected one, and how well it fits each says which is true. A parabola
 through these scores is what one view knows; of many views together the sum of them (a single peak
 is bent by houses and hills, and most of that differs from view to view).
+
+How position, heading and scale hang on the lean is geometry: the similarity that takes what the
+camera sees of flat ground under one lean to what it sees under another.
 """
 
 import math
@@ -14,10 +17,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.camera import Camera
+from orthonav.geo.camera import Camera, ground_en_m
 from orthonav.localizer.registration import PreparedFootprint, RegistrationLocalizer
 from orthonav.records import Telemetry
-from orthonav.register.pose import Pose
 from orthonav.register.refine import Placed
 
 RIM_PX = 10.0
@@ -28,7 +30,14 @@ NATS_PER_SCORE = 0.4
 """What a unit of the score says of a lean: peaks of single views scatter by more than their
 curvature would have it."""
 WEAK_LEAN_RAD = math.radians(20.0)
+HANG_STEP_RAD = math.radians(0.5)
+SEEN_POINTS = 5
+"""Points of the image across and down that say how the ground seen moves with the lean."""
+STEPS, SMALL_STEP_PX = 3, 0.1
+"""A view under another lean lies where geometry says, nearly: it needs few steps."""
 Array = NDArray[np.float64]
+BOTH: Array = np.ones(2)
+BOTH.flags.writeable = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,36 +59,34 @@ def levelled(
     camera: Camera,
     telemetry: Telemetry,
     view: PreparedFootprint,
-    pose: Pose,
+    placed: Placed,
+    worth: Array = BOTH,
 ) -> Levelled | None:
-    """The view (H, W), prepared as `view` and registered at `pose`, placed with its lean.
+    """The view (H, W), prepared as `view` and `placed` at its final level, with its lean.
 
     The pitch and roll of `telemetry` are those to be expected; a lean that differs by more than a
-    few degrees is found in several views, each from what is known by then. None where the view
-    cannot be looked at under leans around the expected one.
+    few degrees is found in several views, each from what is known by then. What perspective says of
+    the two counts `worth` (2,) times; with 0 it is not looked at, and that lean is known to 20 deg.
+    None where the view cannot be looked at under leans around the expected one.
     """
-    looks = _Looks(registration, grey, camera, telemetry, view.levels.final)
-    middle = looks.placed(view, pose)
+    if placed.covariance is None:
+        placed = registration.registrar.with_covariance(view.templates, view.levels, placed)
     lean = np.radians([telemetry.pitch_deg, telemetry.roll_deg])
-    mean, known, hangs = middle.mean.copy(), np.zeros(2), np.zeros((4, 2))
-    for axis in range(2):
-        after, before = (looks.at(middle, lean, axis, sign * looks.step_rad) for sign in (1, -1))
+    mean, known = _seen_from(registration, view, placed), np.zeros(2)
+    hangs = _hangs(camera, telemetry, mean)
+    if hangs is None:
+        return None
+    looks = _Looks(registration, grey, camera, telemetry, view.levels.final)
+    for axis in np.flatnonzero(worth).tolist():
+        after, before = (looks.score(mean, hangs, lean, axis, sign) for sign in (1, -1))
         if after is None or before is None:
             return None
-        ahead = after.mean - before.mean
-        ahead[2] = math.remainder(ahead[2], 2 * math.pi)
-        hangs[:, axis] = ahead / (2 * looks.step_rad)
-        slope = (after.score - before.score) / (2 * looks.step_rad)
-        bend = 2 * middle.score - after.score - before.score
-        # On a flank it bends less than at the peak: no farther than to the next lean tried.
-        bend = max(bend / looks.step_rad**2, abs(slope) / looks.step_rad)
-        known[axis] = NATS_PER_SCORE * bend
-        move = NATS_PER_SCORE * slope / (known[axis] + WEAK_LEAN_RAD**-2)
+        known[axis], move = looks.judged(placed.score, after, before, float(worth[axis]))
         lean[axis] += move
         mean += hangs[:, axis] * move
     spread = np.diag(1 / (known + WEAK_LEAN_RAD**-2))
     covariance = np.zeros((6, 6))
-    covariance[:4, :4] = looks.covariance(middle) + hangs @ spread @ hangs.T
+    covariance[:4, :4] = registration.covariance(view, placed) + hangs @ spread @ hangs.T
     covariance[:4, 4:] = hangs @ spread
     covariance[4:, :4] = covariance[:4, 4:].T
     covariance[4:, 4:] = spread
@@ -88,18 +95,48 @@ def levelled(
     return Levelled(np.concatenate([mean, lean]), covariance)
 
 
-@dataclass(frozen=True, eq=False)
-class _Look:
-    """A view under some lean: how it was prepared, where placed, and `mean` (4,), the position of
-    the camera (m), heading and log scale."""
+def _seen_from(
+    registration: RegistrationLocalizer, view: PreparedFootprint, placed: Placed
+) -> Array:
+    """Position of the camera (m), heading and log scale (4,) of a placed view."""
+    pose = placed.pose
+    return np.array([*registration.camera_en_m(view, pose), pose.turn_rad, pose.log_scale])
 
-    view: PreparedFootprint
-    placed: Placed
-    mean: Array
 
-    @property
-    def score(self) -> float:
-        return self.placed.score
+def _hangs(camera: Camera, telemetry: Telemetry, mean: Array) -> Array | None:
+    """How camera position (m), heading and log scale change with pitch and roll: (4, 2).
+
+    What the view shows stays where it is on the map. None where too little of it is ground.
+    """
+    share = (np.arange(SEEN_POINTS) + 0.5) / SEEN_POINTS
+    px = np.stack(np.meshgrid(share * camera.width_px, share * camera.height_px), -1).reshape(-1, 2)
+    lean = np.array([telemetry.pitch_deg, telemetry.roll_deg])
+    cos, sin = np.exp(mean[3]) * np.array([math.cos(mean[2]), math.sin(mean[2])])
+    out = np.zeros((4, 2))
+    for axis in range(2):
+        seen = []
+        for sign in (1, -1):
+            leans = lean.copy()
+            leans[axis] += sign * math.degrees(HANG_STEP_RAD)
+            pitch, roll = leans.tolist()
+            seen.append(ground_en_m(camera, px, 0.0, pitch, roll, telemetry.agl_m))
+        both = np.isfinite(seen).all(axis=(0, 2))
+        if both.sum() < SEEN_POINTS:
+            return None
+        after, before = seen[0][both], seen[1][both]
+        right, forward, turn, scale = _similarity(after, before)
+        out[:, axis] = right * cos + forward * sin, forward * cos - right * sin, turn, scale
+    return out / (2 * HANG_STEP_RAD)
+
+
+def _similarity(of: Array, to: Array) -> tuple[float, float, float, float]:
+    """Shift right and forward (m), turn clockwise (rad) and log scale that best take points (N, 2)
+    to others, for small ones."""
+    x, y = of.T
+    one, zero = np.ones(len(of)), np.zeros(len(of))
+    rows = np.stack([np.stack([one, zero, y, x], -1), np.stack([zero, one, -x, y], -1)], axis=1)
+    found, *_ = np.linalg.lstsq(rows.reshape(-1, 4), (to - of).reshape(-1), rcond=None)
+    return tuple(found.tolist())
 
 
 class _Looks:
@@ -119,29 +156,31 @@ class _Looks:
         rim_m = RIM_PX * registration.grid.gsd_m * 2**level
         self.step_rad = min(rim_m / max(telemetry.agl_m * corner**2, 1e-9), MAX_STEP_RAD)
 
-    def at(self, known: _Look, lean_rad: Array, axis: int, more_rad: float) -> _Look | None:
-        """The view leaning more about one axis, its middle starting where it is known to be."""
+    def score(
+        self, mean: Array, hangs: Array, lean_rad: Array, axis: int, sign: int
+    ) -> float | None:
+        """Score of the view leaning one step more about one axis, from where geometry puts it."""
         leans = lean_rad.copy()
-        leans[axis] += more_rad
+        leans[axis] += sign * self.step_rad
         pitch, roll = np.degrees(leans).tolist()
         leaning = replace(self._telemetry, pitch_deg=pitch, roll_deg=roll)
         view = self._registration.prepared(self._grey, self._camera, leaning, heading_known=True)
         if not isinstance(view, PreparedFootprint):
             return None
-        return self.placed(view, known.placed.pose)
-
-    def placed(self, view: PreparedFootprint, pose: Pose) -> _Look:
-        """A prepared view at the best pose near `pose`."""
+        pose = self._registration.pose_of(view, mean + sign * self.step_rad * hangs[:, axis])
         refiner = self._registration.registrar.refiner(
             view.templates, view.levels, view.levels.final
         )
-        placed = refiner.place(pose)
-        place = self._registration.camera_en_m(view, placed.pose)
-        mean = np.array([*place, placed.pose.turn_rad, placed.pose.log_scale])
-        return _Look(view, placed, mean)
+        return refiner.place(pose, STEPS, SMALL_STEP_PX).score
 
-    def covariance(self, look: _Look) -> Array:
-        """Covariance (4, 4) of camera position (m), heading and log scale for a given lean."""
-        view, registrar = look.view, self._registration.registrar
-        placed = registrar.with_covariance(view.templates, view.levels, look.placed)
-        return self._registration.covariance(view, placed)
+    def judged(
+        self, middle: float, after: float, before: float, worth: float
+    ) -> tuple[float, float]:
+        """What the scores under three leans say: inverse variance, and by how much it leans more
+        than expected (rad)."""
+        slope = (after - before) / (2 * self.step_rad)
+        bend = 2 * middle - after - before
+        # On a flank it bends less than at the peak: no farther than to the next lean tried.
+        bend = max(bend / self.step_rad**2, abs(slope) / self.step_rad)
+        known = worth * NATS_PER_SCORE * bend
+        return known, worth * NATS_PER_SCORE * slope / (known + WEAK_LEAN_RAD**-2)

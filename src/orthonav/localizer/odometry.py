@@ -1,7 +1,7 @@
 """How far the aircraft moved between two views, by registering one on the other."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +10,10 @@ from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_footprint
 from orthonav.localizer.rectify import prepare_view, rectify_footprint
 from orthonav.records import Telemetry
+from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
-from orthonav.register.registrar import Levels, PosePrior, Registered, Registrar
+from orthonav.register.refine import Placed
+from orthonav.register.registrar import Levels, PosePrior, Registrar
 from orthonav.register.search import bank, search
 from orthonav.register.template import ViewTemplates, halved
 from orthonav.track import CameraWay
@@ -25,8 +27,11 @@ MIN_SCORE_RATIO = 2.5
 MIN_CORRELATION = 0.4
 """Right ways have 4 and 0.56 at the least on Arroio and generated ground, wrong ones 1.7 and 0.11
 at the most."""
+SURE_CORRELATION = 0.6
+"""A way that is as expected and fits so well is not looked for elsewhere."""
 NOISE_PX, NOISE_SHARE = 0.4, 0.01
 CANDIDATES = 8
+EXPECTED_STEPS = 5
 LEAN_SHARE = 0.6
 """How much of what a wrong lean moves a view stays in the sum of many ways: the next way takes most
 of it back."""
@@ -79,6 +84,20 @@ class Footprint:
     off_deg: float = 0.0
     off_log_scale: float = 0.0
 
+    @property
+    def middle_px(self) -> tuple[float, float]:
+        """Middle of the view, x and y."""
+        rows, cols = self.grey.shape
+        return cols / 2, rows / 2
+
+    @property
+    def en_from_px(self) -> Array:
+        """What takes pixels (x, y) to metres east and north (2, 2), by what was told."""
+        heading = math.radians(self.telemetry.yaw_deg - self.off_deg)
+        cos, sin = math.cos(heading), math.sin(heading)
+        metres = self.pixel_m * math.exp(-self.off_log_scale)
+        return np.array([[cos, -sin], [-sin, -cos]]) * metres
+
     @classmethod
     def of(
         cls,
@@ -119,14 +138,19 @@ class Moved:
 
 
 def moved_between(
-    before: Footprint, now: Footprint, lean_noise_rad: float, told_noise: Array
+    before: Footprint,
+    now: Footprint,
+    lean_noise_rad: float,
+    told_noise: Array,
+    expected_en_m: Array | None = None,
 ) -> Moved | None:
     """The way from one view to the next, both with the same `pixel_m`; None where they do not
     show enough of the same ground to say.
 
     The displacement is turned and scaled as was told of the view before; `lean_noise_rad` is how
     the lean differs from what was told between views, `told_noise` (2,) the variances with which
-    told heading (rad) and log scale do.
+    told heading (rad) and log scale do. A way that is `expected_en_m` (2,) is tried first; it
+    saves the search where it fits, and changes nothing where it does not.
     """
     told_turn = math.radians(now.telemetry.yaw_deg - before.telemetry.yaw_deg)
     if not math.isfinite(told_turn):
@@ -136,19 +160,13 @@ def moved_between(
         max(math.sqrt(2 * told_noise[0]), TURN_STEP_RAD / 3),
         max(math.sqrt(2 * told_noise[1]), SCALE_STEP / 3),
     )
-    found = _registered(before, now, prior)
-    if found is None or found.peak_ratio < MIN_SCORE_RATIO:
+    placed = _registered(before, now, prior, expected_en_m)
+    if placed is None or placed.weighted < MIN_CORRELATION:
         return None
-    if found.placed.weighted < MIN_CORRELATION:
-        return None
-    pose = found.placed.pose
-    rows, cols = before.grey.shape
-    x, y = pose.map_px(now.camera_px) - [cols / 2, rows / 2] - before.camera_px
-    heading = math.radians(before.telemetry.yaw_deg - before.off_deg)
-    metres = before.pixel_m * math.exp(-before.off_log_scale)
-    right_m, forward_m = float(x) * metres, -float(y) * metres
-    cos, sin = math.cos(heading), math.sin(heading)
-    way = np.array([right_m * cos + forward_m * sin, forward_m * cos - right_m * sin])
+    pose = placed.pose
+    way = before.en_from_px @ (
+        pose.map_px(now.camera_px) - np.array(before.middle_px) - before.camera_px
+    )
     std_m = math.hypot(NOISE_PX * before.pixel_m, NOISE_SHARE * float(np.hypot(*way)))
     variance = std_m**2 + (LEAN_SHARE * now.telemetry.agl_m * lean_noise_rad) ** 2
     told_rad = math.radians(
@@ -161,15 +179,20 @@ def moved_between(
         turned_rad=math.remainder(pose.turn_rad - told_rad, 2 * math.pi),
         scaled=pose.log_scale + now.off_log_scale - before.off_log_scale,
     )
-    return Moved(seen, min(max(found.placed.overlap, 0.0), 1.0))
+    return Moved(seen, min(max(placed.overlap, 0.0), 1.0))
 
 
-def _registered(before: Footprint, now: Footprint, prior: PosePrior) -> Registered | None:
-    """The later view registered on the earlier one."""
+def _registered(
+    before: Footprint, now: Footprint, prior: PosePrior, expected_en_m: Array | None
+) -> Placed | None:
+    """The later view registered on the earlier one, where the best place stands out."""
     templates = ViewTemplates(now.grey, now.valid, 0)
-    rows, cols = before.grey.shape
     side_px = math.sqrt(float(now.valid.sum()))
     levels = Levels.of(side_px, LEVELS)
+    if expected_en_m is not None:
+        placed = _as_expected(before, now, templates, levels, prior, expected_en_m)
+        if placed.weighted >= SURE_CORRELATION:
+            return placed
     reach = _reach_px(before, now)
     tried = bank(
         prior.turn_std_rad,
@@ -181,14 +204,33 @@ def _registered(before: Footprint, now: Footprint, prior: PosePrior) -> Register
     poses = [((prior.turn_rad or 0.0) + turn, scale) for turn, scale in tried.poses]
     level = levels.coarse
     recipe = levels.recipe(level)
-    middle = cols / 2, rows / 2
     registrar = before.registrar
-    window = registrar.part_window(level, recipe, side_px, middle, reach + 2.0 * 2**level)
+    window = registrar.part_window(level, recipe, side_px, before.middle_px, reach + 2.0 * 2**level)
     candidates = search(templates.at(level, recipe), window, poses, CANDIDATES)
     if not candidates:
         return None
     judged = registrar.judged(templates, levels, candidates, level, prior)
-    return registrar.finished(templates, levels, judged, prior, len(candidates))
+    found = registrar.finished(templates, levels, judged, prior, len(candidates))
+    return found.placed if found.peak_ratio >= MIN_SCORE_RATIO else None
+
+
+def _as_expected(
+    before: Footprint,
+    now: Footprint,
+    templates: ViewTemplates,
+    levels: Levels,
+    prior: PosePrior,
+    expected_en_m: Array,
+) -> Placed:
+    """The later view as near as possible to where it should be, refined from coarse to fine."""
+    turned = Pose(0.0, 0.0, prior.turn_rad or 0.0, 0.0)
+    moved_px = np.linalg.solve(before.en_from_px, expected_en_m)
+    x, y = np.array(before.middle_px) + before.camera_px + moved_px - turned.map_px(now.camera_px)
+    pose = replace(turned, x_px=float(x), y_px=float(y))
+    for level in range(levels.look, levels.final - 1, -1):
+        placed = before.registrar.refiner(templates, levels, level).place(pose, EXPECTED_STEPS)
+        pose = placed.pose
+    return placed
 
 
 def _reach_px(before: Footprint, now: Footprint) -> float:

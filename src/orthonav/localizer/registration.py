@@ -359,6 +359,15 @@ class RegistrationLocalizer:
         gsd_m = self.grid.gsd_m
         return np.array([self.grid.west_m + float(x) * gsd_m, self.grid.north_m - float(y) * gsd_m])
 
+    def pose_of(self, view: PreparedFootprint, seen_from: NDArray[np.float64]) -> Pose:
+        """Where a view's window lies if the camera is at (4,): metres east and north, heading
+        (rad) and log scale. The inverse of `camera_en_m`."""
+        east, north, turn, log_scale = seen_from.tolist()
+        x, y = (east - self.grid.west_m), (self.grid.north_m - north)
+        moved = Pose(0.0, 0.0, turn, log_scale).map_px(view.camera_px)
+        gsd_m = self.grid.gsd_m
+        return Pose(x / gsd_m - float(moved[0]), y / gsd_m - float(moved[1]), turn, log_scale)
+
     def covariance(self, view: PreparedFootprint, placed: Placed) -> NDArray[np.float64]:
         """Covariance (4, 4) of the camera's east and north (m), heading (rad) and log scale."""
         assert placed.covariance is not None

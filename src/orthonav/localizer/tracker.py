@@ -20,11 +20,11 @@ from orthonav.localizer.localizer import Localizer
 from orthonav.localizer.odometry import Footprint, Moved, moved_between
 from orthonav.localizer.registration import PreparedFootprint
 from orthonav.records import Fix, NoFix, Prior, Telemetry
-from orthonav.register.pose import Pose
-from orthonav.register.registrar import Registered
+from orthonav.register.refine import Placed
+from orthonav.register.registrar import Registered, apart_px
 from orthonav.track import Estimate, Mixture, Model, Sighting, State, Told, ToldVelocity
 from orthonav.track.hypotheses import within
-from orthonav.track.model import HEADING, LEAN, SCALE
+from orthonav.track.model import HEADING, LEAN, SCALE, VELOCITY
 from orthonav.track.smooth import History, Smoothed
 
 LOCAL_SHARE = 0.75
@@ -33,6 +33,9 @@ LOCAL_SIGMAS = 4.0
 MIN_LOCAL_M = 30.0
 LEAST_NEW = 0.15
 """Share of a view that counts as new although it was seen before: noise, light and lean differ."""
+LEAN_NEW = 0.3
+"""Views' worth of new ground after which perspective is looked at again: of ground that was seen it
+says the same, and it costs as much as all the rest."""
 LONGEST_GAP_S = 600.0
 UNKNOWN_STEP_S = 1.0
 """Time that is taken to have passed where the clock stands still or jumps back."""
@@ -41,6 +44,8 @@ NEAR_SHARE = 0.05
 """Places nearer to each other than this share of the view's side are one."""
 RADIUS_SHARE = 0.025
 """Of the height, the least radius that a confidence is about: what an angle of 1.4 deg makes."""
+KNOWN_MPS = 5.0
+"""A velocity known to so much says where the next view will be."""
 VELOCITY_STD_MPS = 1.0
 VELOCITY_SHARE = 0.02
 Array = NDArray[np.float64]
@@ -80,6 +85,7 @@ class Tracker:
         self._time_ns: int | None = None
         self._before: Footprint | None = None
         self._velocity: Array | None = None
+        self._unlevelled = np.full(2, np.inf)
         self._start_was_told = False
         self._use_prior, self._every_prior = use_prior, every_prior
         self._history = History() if hindsight else None
@@ -104,6 +110,7 @@ class Tracker:
         )
         refused = refused or check_view(grey)
         overlap = self._predict(None if refused else grey, camera, telemetry)
+        self._unlevelled += 1 - overlap
         if refused is None:
             refused = self._observe(grey, camera, telemetry, overlap)
         return self._outcome(telemetry, refused)
@@ -193,9 +200,9 @@ class Tracker:
             seconds = UNKNOWN_STEP_S if seconds <= 0 else LONGEST_GAP_S
         self._time_ns = telemetry.time_ns
         noise = self._told_noise(telemetry)
-        seen = self._seen_way(before, now, noise)
-        self._before = now
         told = self._told_velocity(telemetry)
+        seen = self._seen_way(before, now, noise, self._way(seconds, told))
+        self._before = now
         self.mixture.predict(seconds, told, None if seen is None else seen.way, noise)
         if self._every_prior and prior is not None:
             self.mixture.told_position(*self._place(prior))
@@ -249,13 +256,27 @@ class Tracker:
         told = telemetry.lean_std_deg
         return self.model.lean_noise_rad if told is None else math.radians(told)
 
+    def _way(self, seconds: float, told: ToldVelocity | None) -> Array | None:
+        """Metres east and north (2,) that should have been flown, None where nobody knows."""
+        if told is not None:
+            return told.now_en_mps * seconds
+        best = self.mixture.likeliest
+        if best is None or np.trace(best.covariance[VELOCITY, VELOCITY]) > KNOWN_MPS**2:
+            return None
+        return best.mean[VELOCITY] * seconds
+
     def _seen_way(
-        self, before: Footprint | None, now: Footprint | None, told_noise: Array
+        self,
+        before: Footprint | None,
+        now: Footprint | None,
+        told_noise: Array,
+        expected_en_m: Array | None,
     ) -> Moved | None:
         """The way since the last view by the camera, and how much of it both views showed."""
         if before is None or now is None or before.pixel_m != now.pixel_m:
             return None
-        return moved_between(before, now, self._lean_noise(now.telemetry), told_noise)
+        lean_noise = self._lean_noise(now.telemetry)
+        return moved_between(before, now, lean_noise, told_noise, expected_en_m)
 
     def _observe(
         self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry, overlap: float
@@ -268,21 +289,38 @@ class Tracker:
         if isinstance(view, NoFix):
             return view
         prior, searched = self._where(expected)
-        sightings = []
+        sightings, newness = [], max(1 - overlap, LEAST_NEW)
         if prior is None or self._registration.touches_map(prior, view):
             found = self._registration.best(view, prior)
             if found is not None:
                 area = math.inf if searched is None else math.pi * searched[1] ** 2
                 share = min(area / self.mixture.area_m2, 1.0)
-                sightings = self._sightings(grey, camera, corrected, view, found, bias, share)
+                worth = self._worth_of_lean(newness, math.isfinite(found.fine_score))
+                sightings = self._sightings(
+                    grey, camera, corrected, view, found, bias[1], share, worth
+                )
         told = Told(
             math.radians(telemetry.yaw_deg) if self._heading_known else None,
             math.radians(telemetry.pitch_deg),
             math.radians(telemetry.roll_deg),
             self._lean_noise(telemetry),
         )
-        self.mixture.update(told, sightings, max(1 - overlap, LEAST_NEW), searched)
+        self.mixture.update(told, sightings, newness, searched)
         return None
+
+    def _worth_of_lean(self, newness: float, costly: bool) -> Array:
+        """How much more perspective counts than the view, of which a share `newness` is new, for
+        pitch and roll: by all the ground that is new since it was looked at last.
+
+        0 where that is too little. Views that follow closely have little time: they are looked at
+        for one of the two, and, where the view was `costly` before, later.
+        """
+        due = self._unlevelled >= (2 * LEAN_NEW if costly else LEAN_NEW)
+        if newness < LEAN_NEW:
+            due &= np.arange(2) == np.argmax(self._unlevelled)
+        new = np.where(due, np.minimum(self._unlevelled, 1.0), 0.0)
+        self._unlevelled[due] = 0.0
+        return np.where(due, np.maximum(new, newness) / newness, 0.0)
 
     def _where(self, expected: Estimate | None) -> tuple[Prior | None, tuple[Array, float] | None]:
         """The part of the map to look at: around the track where that is nearly certain."""
@@ -304,22 +342,25 @@ class Tracker:
         telemetry: Telemetry,
         view: PreparedFootprint,
         found: Registered,
-        bias: Array,
+        log_scale: float,
         looked_at: float,
+        worth: Array,
     ) -> list[Sighting]:
+        """What the view may be, `log_scale` of its height corrected already, its perspective
+        counted `worth` (2,) times."""
         made = []
-        for log_odds, alone, pose in self._places(found, NEAR_SHARE * view.side_px, looked_at):
-            placed = levelled(self._registration, grey, camera, telemetry, view, pose)
-            if placed is None:
+        for log_odds, alone, placed in self._places(found, NEAR_SHARE * view.side_px, looked_at):
+            seen = levelled(self._registration, grey, camera, telemetry, view, placed, worth)
+            if seen is None:
                 continue
-            mean = placed.mean.copy()
-            mean[3] += bias[1]
-            made.append(Sighting(mean, placed.covariance, log_odds, alone))
+            mean = seen.mean.copy()
+            mean[3] += log_scale
+            made.append(Sighting(mean, seen.covariance, log_odds, alone))
         return made
 
     def _places(
         self, found: Registered, near_px: float, looked_at: float
-    ) -> list[tuple[float, float, Pose]]:
+    ) -> list[tuple[float, float, Placed]]:
         """Places with their log odds, and how likely each is by the view alone: the best, and those
         that were finished beside it and are farther than `near_px` from it.
 
@@ -329,10 +370,9 @@ class Tracker:
         """
         best, chances = found.evidence(), self._confidence.chances
         least = {"rival": chances.total, "look_rival": chances.look, "fine_rival": chances.fine}
-        out: list[tuple[float, float, Pose]] = []
+        out: list[tuple[float, float, Placed]] = []
         for score, placed in ((found.score, found.placed), *found.finalists):
-            pose = placed.pose
-            if any(math.hypot(p.x_px - pose.x_px, p.y_px - pose.y_px) < near_px for *_, p in out):
+            if any(apart_px(placed, other) < near_px for *_, other in out):
                 continue
             evidence = dict(best)
             if out:
@@ -349,7 +389,7 @@ class Tracker:
             alone = self._confidence(evidence)
             log_odds = min(there, _log_odds(alone))
             if not out or log_odds > WORTH_LOG_ODDS:
-                out.append((log_odds, alone, pose))
+                out.append((log_odds, alone, placed))
         return out
 
     def _fix(

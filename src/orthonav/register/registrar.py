@@ -213,7 +213,7 @@ class Registrar:
         elsewhere = [
             value
             for value, each in zip(values, judged, strict=True)
-            if _apart(each, judged[best]) > exclusion
+            if apart_px(each, judged[best]) > exclusion
         ]
         return values[best], max(elsewhere, default=0.0)
 
@@ -255,8 +255,8 @@ class Registrar:
         ]
         totals.sort(key=lambda pair: -pair[0])
         score, best = totals[0]
-        nearest = min(judged, key=lambda each: _apart(each, best))
-        others = [each for each in judged if _apart(each, best) > exclusion]
+        nearest = min(judged, key=lambda each: apart_px(each, best))
+        others = [each for each in judged if apart_px(each, best) > exclusion]
         return Registered(
             placed=self.with_covariance(templates, levels, best),
             score=score,
@@ -352,13 +352,13 @@ def _distinct(placed: list[Placed], count: int, apart: float) -> list[Placed]:
     """The first `count` that are farther than `apart` (pixels of level 0) from each other."""
     kept: list[Placed] = []
     for each in placed:
-        if all(_apart(each, other) > apart for other in kept):
+        if all(apart_px(each, other) > apart for other in kept):
             kept.append(each)
         if len(kept) == count:
             break
     return kept
 
 
-def _apart(one: Placed, other: Placed) -> float:
+def apart_px(one: Placed, other: Placed) -> float:
     """Distance of two places in pixels of level 0."""
     return math.hypot(one.pose.x_px - other.pose.x_px, one.pose.y_px - other.pose.y_px)

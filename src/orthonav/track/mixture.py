@@ -260,6 +260,11 @@ class Mixture:
             confidence = min(confidence, UNCONFIRMED)
         return Estimate(mean, covariance, confidence, self._state)
 
+    @property
+    def likeliest(self) -> Hypothesis | None:
+        """The single hypothesis with most belief."""
+        return self.hypotheses[0] if self.hypotheses else None
+
     def _best(self, radius_m: float) -> Hypothesis:
         """The hypothesis with most belief around it."""
         heaviest = self.hypotheses[:8]
