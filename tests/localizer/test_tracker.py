@@ -147,6 +147,27 @@ def test_hindsight_calibrates_the_beginning_too(localizer):
         Tracker(localizer).in_hindsight()
 
 
+@pytest.mark.parametrize("std_m, whole", [(20.0, False), (40.0, False), (400.0, True)])
+def test_a_told_start_is_searched_around_however_wide(localizer, monkeypatch, std_m, whole):
+    tracker, priors = Tracker(localizer), []
+    best = localizer.registration.best
+
+    def noted(view, prior):
+        priors.append(prior)
+        return best(view, prior)
+
+    monkeypatch.setattr(localizer.registration, "best", noted)
+    lat, lon = localizer.sheet.frame.latlon_from_en(np.array([-150.0, -120.0]))
+    prior = Prior(float(lat), float(lon), std_m)
+    rows = []
+    for grey, told, place in views(5):
+        found = tracker.locate(grey, WIDE, replace(told, prior=prior))
+        rows.append(np.hypot(*(place_of(localizer, found) - place)))
+    assert (priors[0] is None) == whole and max(rows) < 15
+    speed = found.evidence["vel_std_mps"]
+    assert 0 < speed < 30
+
+
 def out_and_back():
     """Places and headings of a flight that leaves the map to the east for 12 s and comes back."""
     place = np.array([60.0, -40.0])

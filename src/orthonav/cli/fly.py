@@ -192,6 +192,12 @@ def _add_flight(group: Any) -> None:
         metavar="MS",
         help="views older than this when their turn comes are dropped (default 500)",
     )
+    group.add_argument(
+        "--require-signed",
+        type=Path,
+        metavar="PUBLIC.pem",
+        help="do not fly by a map unless it was signed with this key (`orthonav sign`)",
+    )
     group.add_argument("--log", type=Path, metavar="FILE.mcap", help="what is needed for a replay")
     group.add_argument(
         "--log-max-mb", type=float, metavar="MB", help="of the log: its oldest files go"

@@ -49,6 +49,10 @@ from orthonav.sources.cameras import read_camera_file
 def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitStack) -> Runner:
     """Everything that flies, put together; what runs beside is stopped with `stack`."""
     clocks = Clocks()
+    if options.require_signed:  # cryptography is loaded only where it is asked for
+        importlib.import_module("orthonav.mapfile.signature").require_signature(
+            options.map, options.require_signed
+        )
     accept = Acceptance.parse(options.accept)
     least = accept.threshold if accept.criterion == "confidence" else SURE
     camera = _camera(options)

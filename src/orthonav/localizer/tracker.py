@@ -324,10 +324,15 @@ class Tracker:
 
     def _where(self, expected: Estimate | None) -> tuple[Prior | None, tuple[Array, float] | None]:
         """The part of the map to look at: around the track where that is nearly certain."""
-        if expected is None or expected.confidence < LOCAL_SHARE:
+        if expected is None:
             return None, None
-        if expected.state is State.SEARCHING and not self._start_was_told:
-            return None, None  # what is not confirmed must stand against the whole map
+        likely = expected.confidence
+        if expected.state is State.SEARCHING:
+            if not self._start_was_told:
+                return None, None  # what is not confirmed must stand against the whole map
+            likely = expected.belief  # however wide it was told
+        if likely < LOCAL_SHARE:
+            return None, None
         spread = float(np.linalg.eigvalsh(expected.covariance[:2, :2])[-1])
         reach = max(LOCAL_SIGMAS * math.sqrt(spread), MIN_LOCAL_M)
         if 4 * reach**2 > self.mixture.area_m2 / 4:
@@ -412,6 +417,7 @@ class Tracker:
             **_stds(covariance),
             "vel_east_mps": float(mean[2]),
             "vel_north_mps": float(mean[3]),
+            "vel_std_mps": math.sqrt(float(np.linalg.eigvalsh(covariance[VELOCITY, VELOCITY])[-1])),
             **more,
         }
         return Fix(

@@ -136,8 +136,7 @@ def estimate_from_result(
     `result.time_ns` is the time of exposure by `clock`; with `utc_minus_boot_ns` the other clock's
     follows. `processing_s` is the time from exposure to handing over, by default the latency of the
     fix alone: add what reading the camera took. The altitude and its standard deviation are the
-    autopilot's own, if it should hear them back; a fix has none. The velocity is that of a track,
-    which does not tell how good it is.
+    autopilot's own, if it should hear them back; a fix has none. The velocity is that of a track.
     """
     fix = result.outcome
     if not isinstance(fix, Fix):
@@ -157,6 +156,7 @@ def estimate_from_result(
         alt_amsl_m=alt_amsl_m,
         alt_std_m=alt_std_m,
         vel_en_mps=_velocity(fix) if result.state is not None else None,
+        vel_cov_en=_velocity_covariance(fix) if result.state is not None else None,
         heading_deg=fix.heading_deg,
         state=result.state,
         reset_counter=reset_counter,
@@ -194,3 +194,9 @@ def _velocity(fix: Fix) -> tuple[float, float] | None:
     east = fix.evidence.get("vel_east_mps", math.nan)
     north = fix.evidence.get("vel_north_mps", math.nan)
     return (east, north) if math.isfinite(east) and math.isfinite(north) else None
+
+
+def _velocity_covariance(fix: Fix) -> NDArray[np.float64] | None:
+    """Of a track, which tells the standard deviation along the worst direction."""
+    std_mps = fix.evidence.get("vel_std_mps", math.nan)
+    return np.eye(2) * std_mps**2 if math.isfinite(std_mps) else None

@@ -81,12 +81,14 @@ class State(Enum):
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """Where the aircraft is: mean (8,) and covariance (8, 8) of the best cluster of hypotheses,
-    the probability that it is within the radius asked for, and the state of the track."""
+    the probability that it is within the radius asked for, the state of the track, and the belief
+    in all of the cluster, however wide."""
 
     mean: Array
     covariance: Array
     confidence: float
     state: State
+    belief: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,7 +260,8 @@ class Mixture:
             self._state = self._next_state(confidence, sighted)
         if self._state is not State.TRACKING:
             confidence = min(confidence, UNCONFIRMED)
-        return Estimate(mean, covariance, confidence, self._state)
+        belief = sum(each.share for each in near)
+        return Estimate(mean, covariance, confidence, self._state, belief)
 
     @property
     def likeliest(self) -> Hypothesis | None:
