@@ -7,6 +7,7 @@ import os
 import shutil
 import threading
 import time
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -95,7 +96,7 @@ def test_the_stock_reader_reads_it(tmp_path):
     assert [message.log_time for message in found["/orthonav/view"]] == [
         START_NS + index * 10**9 for index in range(6)
     ]
-    assert len(found["/orthonav/position"]) == 5
+    assert len(found["/orthonav/position"]) == len(found["/orthonav/navsatfix"]) == 5
     health = plain(found["/orthonav/health"])[-1]
     assert health == {"level": "ok", "share": "NaN", "log_lost": {"views": 0, "messages": 0}}
 
@@ -132,6 +133,32 @@ def test_what_foxglove_requires(tmp_path):
     assert (view.timestamp.sec, view.timestamp.nanosec) == tuple(stamp.values())
     assert (view.frame_id, view.format) == ("camera", "png")
     assert np.array_equal(cv2.imdecode(view.data, cv2.IMREAD_UNCHANGED), picture(0))
+    navsat = store.deserialize_cdr(
+        found["/orthonav/navsatfix"][0].data, "sensor_msgs/msg/NavSatFix"
+    )
+    assert (navsat.header.stamp.sec, navsat.header.stamp.nanosec) == tuple(stamp.values())
+    assert navsat.header.frame_id == "camera" and navsat.status.service == 0
+    assert (navsat.latitude, navsat.longitude) == (46.5, 2.5) and math.isnan(navsat.altitude)
+    assert navsat.position_covariance.tolist() == [4, 1, 0, 1, 9, 0, 0, 0, 1e8]
+    assert navsat.position_covariance_type == 3
+    text = schemas["sensor_msgs/msg/NavSatFix"].data.decode()
+    for name, (_, fields) in get_types_from_msg(text, "sensor_msgs/msg/NavSatFix").items():
+        assert fields == store.fielddefs[name][1]
+
+
+@pytest.mark.parametrize(
+    "confidence, state, status",
+    [(0.95, "tracking", 0), (0.95, None, 0), (0.95, "searching", -1), (0.5, None, -1)],
+)
+def test_only_what_is_sure_is_a_fix_for_ros(tmp_path, confidence, state, status):
+    log, result = begun(tmp_path), outcome(0, "0.png")
+    placed = replace(result.outcome, confidence=confidence)
+    log.result(replace(result, outcome=placed, state=state))
+    log.close()
+    (message,) = read(tmp_path / "flight_0001.mcap")["/orthonav/navsatfix"]
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    read_back = store.deserialize_cdr(message.data, "sensor_msgs/msg/NavSatFix")
+    assert read_back.status.status == status
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 70), (33, 1), (48, 65)])
@@ -213,7 +240,7 @@ def full_disk(monkeypatch, room_bytes):
 
 
 def test_a_full_disk_takes_pictures_first(tmp_path, monkeypatch):
-    disk = full_disk(monkeypatch, 40_000)
+    disk = full_disk(monkeypatch, 44_000)
     log = begun(tmp_path)
     for index in range(30):
         log_views(log, [index])
@@ -234,7 +261,7 @@ def test_a_disk_without_any_room_and_then_with_some(tmp_path, monkeypatch):
     disk = full_disk(monkeypatch, 0)
     log = begun(tmp_path)
     log_views(log, range(5))
-    wait_for(lambda: log.lost == {"views": 5, "messages": 15})
+    wait_for(lambda: log.lost == {"views": 5, "messages": 19})
     assert files_in(tmp_path) == []
     disk["room"] = 10**9
     log_views(log, range(5, 8))

@@ -71,6 +71,26 @@ int32 sec
 uint32 nanosec
 """
 _IMAGE_NAME = "foxglove_msgs/msg/CompressedImage"
+_NAVSAT = """std_msgs/Header header
+sensor_msgs/NavSatStatus status
+float64 latitude
+float64 longitude
+float64 altitude
+float64[9] position_covariance
+uint8 position_covariance_type
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+================================================================================
+MSG: sensor_msgs/NavSatStatus
+int8 status
+uint16 service
+"""
 _TOLD = ("yaw_deg", "pitch_deg", "roll_deg", "agl_m")
 _TOLD_OR_NOT = tuple(each.name for each in fields(Telemetry) if each.type == float | None)
 
@@ -132,6 +152,7 @@ POSITION = Topic(
         {},
     ),
 )
+NAVSAT = Topic("/orthonav/navsatfix", "sensor_msgs/msg/NavSatFix", _NAVSAT, "ros2msg", "cdr")
 CAMERA = Topic(
     "/orthonav/camera",
     "foxglove.CameraCalibration",
@@ -148,11 +169,12 @@ CAMERA = Topic(
     ),
 )
 HEALTH = Topic("/orthonav/health", "orthonav.Health", _schema("orthonav.Health", {}, {}))
-TOPICS = (SESSION, VIEW, THUMBNAIL, TELEMETRY, RESULT, POSITION, CAMERA, HEALTH)
+TOPICS = (SESSION, VIEW, THUMBNAIL, TELEMETRY, RESULT, POSITION, NAVSAT, CAMERA, HEALTH)
 
 NO_ALTITUDE_M2 = 1e8
 """Variance up of a position: a fix says nothing of the altitude, which is written as 0."""
 _COVARIANCE_KNOWN = 3
+_STATUS_FIX, _STATUS_NO_FIX = 0, -1
 
 
 @dataclass(frozen=True)
@@ -287,6 +309,27 @@ def position_message(fix: Fix, time_ns: int) -> bytes:
         "position_covariance_type": _COVARIANCE_KNOWN,
     }
     return json.dumps(plain, allow_nan=False).encode("ascii")
+
+
+def navsat_message(fix: Fix, time_ns: int, *, sure: bool) -> bytes:
+    """The message of `NAVSAT` (CDR, little endian), status "no fix" unless `sure`.
+
+    Raises `ValueError` where a value is not finite. The altitude is NaN, as is usual where it is
+    not known.
+    """
+    (ee, en), (ne, nn) = fix.cov_en_m2.tolist()
+    place = float(fix.lat_deg), float(fix.lon_deg)
+    if not all(map(math.isfinite, (*place, ee, en, ne, nn))):
+        raise ValueError("position is not finite")
+    sec, nsec = divmod(max(0, int(time_ns)), 10**9)
+    name = FRAME_ID.encode() + b"\0"
+    out = bytearray(struct.pack("<III", sec & 0xFFFFFFFF, nsec, len(name)) + name)
+    out += struct.pack("<b", _STATUS_FIX if sure else _STATUS_NO_FIX)
+    out += bytes(-len(out) % 2) + struct.pack("<H", 0)  # no satellite service
+    out += bytes(-len(out) % 8)
+    out += struct.pack("<3d", *place, math.nan)
+    out += struct.pack("<9d", ee, en, 0.0, ne, nn, 0.0, 0.0, 0.0, NO_ALTITUDE_M2)
+    return b"\0\1\0\0" + bytes(out) + struct.pack("<B", _COVARIANCE_KNOWN)
 
 
 def stamp(time_ns: int) -> dict[str, int]:

@@ -29,6 +29,7 @@ from orthonav.flight.logged import (
     HEALTH,
     MAX_JSON_BYTES,
     MAX_PICTURE_BYTES,
+    NAVSAT,
     POSITION,
     RESULT,
     SESSION,
@@ -38,6 +39,7 @@ from orthonav.flight.logged import (
     LoggedView,
     calibration_message,
     camera_plain,
+    navsat_message,
     picture_message,
     position_message,
     telemetry_message,
@@ -45,6 +47,7 @@ from orthonav.flight.logged import (
 )
 from orthonav.flight.png import lossless_png
 from orthonav.geo.camera import Camera
+from orthonav.publish.estimate import SURE
 from orthonav.publish.jsonl import result_to_json
 from orthonav.records import Fix, Telemetry, ViewResult
 from orthonav.sources.recording import fitted
@@ -386,4 +389,7 @@ def _result(result: ViewResult, index: int) -> "list[Message]":
         with contextlib.suppress(ValueError):  # a number that is none
             data = position_message(result.outcome, result.time_ns)
             messages.append(_message(POSITION, result.time_ns, data, index))
+            sure = result.outcome.confidence >= SURE and result.state in (None, "tracking")
+            data = navsat_message(result.outcome, result.time_ns, sure=sure)
+            messages.append(_message(NAVSAT, result.time_ns, data, index))
     return messages
