@@ -1,5 +1,6 @@
 """The track of simulated sightings: found, followed, lost, found again, and honest all along."""
 
+import functools
 import math
 from dataclasses import replace
 
@@ -75,9 +76,15 @@ def flown(seed, views=60, false_share=0.3, model=MODEL, history=None):
     return flight, mixture, rows
 
 
+@functools.cache
+def known(seed):
+    """A flight that is only looked at: its mixture at the end and its rows."""
+    return flown(seed)[1:]
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_a_flight_is_found_and_followed(seed):
-    _, _, rows = flown(seed)
+    _, rows = known(seed)
     errors = np.hypot([row[0] for row in rows], [row[1] for row in rows])
     assert errors[10:].max() < 15 and np.median(errors[10:]) < 4
     assert rows[-1][3].state is State.TRACKING
@@ -85,7 +92,7 @@ def test_a_flight_is_found_and_followed(seed):
 
 
 def test_what_is_wrong_with_what_is_told_is_learnt():
-    learnt = np.array([flown(seed)[1].estimate(RADIUS_M).mean[4:] for seed in range(8)])
+    learnt = np.array([known(seed)[0].estimate(RADIUS_M).mean[4:] for seed in range(8)])
     assert (np.abs(learnt.mean(axis=0) - BIAS) < [0.01, 0.01, 0.012, 0.012]).all()
 
 
@@ -369,3 +376,16 @@ def test_measured_positions_teach_the_mount():
         mean = np.concatenate([flight.place, np.zeros(4)]) + ahead
         mixture.update(flight.told(), [Sighting(mean, spread, 5.0)])
     assert math.degrees(mixture.estimate(RADIUS_M).mean[6]) == pytest.approx(5.0, abs=1.0)
+
+
+def test_a_measured_position_is_believed_where_nothing_led_there():
+    """Views of places that no aircraft flies between, each with its GNSS."""
+    mixture = Mixture(MODEL, EXTENT)
+    for place in ([-700.0, 300.0], [650.0, 500.0], [100.0, -800.0]):
+        mixture.predict(1.0)
+        mixture.told_position(np.array(place), 3.0)
+        found = mixture.estimate(RADIUS_M)
+        assert np.hypot(*(found.mean[:2] - place)) < 5 and found.confidence > 0.5
+        assert sum(each.share for each in mixture.hypotheses) + mixture.elsewhere == pytest.approx(
+            1
+        )

@@ -118,14 +118,16 @@ class Mixture:
 
     def start(self, mean_en_m: Array, std_m: float) -> None:
         """Begin with a position (2,) that was told, good to `std_m` per axis."""
-        self.hypotheses = []
-        for share, mean, covariance in self._mounts():
+        self.hypotheses = list(self._told(mean_en_m, std_m, TOLD_SHARE))
+        self.elsewhere = 1 - TOLD_SHARE
+
+    def _told(self, mean_en_m: Array, std_m: float, share: float) -> Iterator[Hypothesis]:
+        """Hypotheses, together of belief `share`, of an aircraft that is where it was told."""
+        for mount, mean, covariance in self._mounts():
             mean[POSITION] = mean_en_m
             covariance[POSITION, POSITION] = np.eye(2) * std_m**2
             self._numbers += 1
-            told = Hypothesis(TOLD_SHARE * share, mean, covariance, 0.0, self._numbers)
-            self.hypotheses.append(told)
-        self.elsewhere = 1 - TOLD_SHARE
+            yield Hypothesis(share * mount, mean, covariance, 0.0, self._numbers)
 
     def told_position(self, mean_en_m: Array, std_m: float) -> None:
         """Take in a position (2,) that was measured otherwise, good to `std_m` per axis."""
@@ -144,8 +146,13 @@ class Mixture:
                     each, share=share, mean=each.mean + gain @ off, covariance=(after + after.T) / 2
                 )
             )
-        self.hypotheses = made
+        # If it was anywhere else on the map, it is here too.
         self.elsewhere /= self.area_m2
+        made += self._told(mean_en_m, std_m, TOLD_SHARE * self.elsewhere)
+        self.elsewhere *= 1 - TOLD_SHARE
+        self.hypotheses = made
+        self._settle()
+        self.hypotheses = merged(sorted(self.hypotheses, key=lambda each: -each.share))
         self._settle()
 
     def predict(
