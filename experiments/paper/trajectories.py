@@ -1,11 +1,13 @@
 """The paper's Table 1: trajectories A to D, their search bands and overlaps; and how it is cut.
 
-The paper does not state the ground resolution of its tiles: 0.2 m is taken for A, 1 m for B and D,
-2 m for C, so that a tile of 256 px is about what a camera sees from 40, 2000 and 4000 m.
+The table itself, and the ground resolution taken where the paper states none, are those of the
+presets (`orthonav.geo.routes.presets`).
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
+
+from orthonav.geo.routes import presets
 
 TILE_PX = 256
 VIEW_ROOM = 1.5
@@ -50,12 +52,7 @@ class Trajectory:
         return self.length_m + slack_m, self.band_m + slack_m
 
 
-TABLE_1 = {
-    "A": Trajectory("A", 40, 150, 10, 0.995, 0.2),
-    "B": Trajectory("B", 2000, 12_000, 1000, 0.875, 1.0),
-    "C": Trajectory("C", 4000, 50_000, 5000, 0.875, 2.0),
-    "D": Trajectory("D", 2000, 2000, 2000, 0.875, 1.0),
-}
+TABLE_1 = {name: Trajectory(*astuple(column)) for name, column in presets.TABLE_1.items()}
 REDUCED_M = {"A": (150, 1), "B": (3000, 300), "C": (5000, 1000), "D": (1000, 1000)}
 """Length and search band where hours are not to be had."""
 

@@ -75,6 +75,33 @@ def test_band_is_as_wide_as_asked_in_true_metres():
     assert area.contains(points).tolist() == [True, False]
 
 
+def test_each_leg_has_its_own_band():
+    corner = ((46.5, 2.5), (46.52, 2.5), (46.52, 2.54))
+    area = Area.from_route(Route(corner, leg_bands_m=(100, None)), band_m=600)
+    line = area.route.points_en_m(area.frame)
+    west, _, east, north = area.extent_en_m
+    assert line[0, 0] - west == pytest.approx(300, abs=1)  # the corner belongs to both legs
+    assert (east - line[2, 0], north - line[:, 1].max()) == pytest.approx((300, 300), abs=1)
+    first = (line[0] + line[1]) / 2
+    points = first + np.array([[49.0, 0], [51, 0], [-49, 0], [-51, 0]])
+    assert area.contains(points).tolist() == [True, False, True, False]
+    second = (line[1] + line[2]) / 2
+    points = second + np.array([[0, 299.0], [0, 301]])
+    assert area.contains(points).tolist() == [True, False]
+    assert area.contains(points, margin_m=2).all()
+
+
+def test_a_band_is_needed_where_a_leg_has_none():
+    route = Route(((46.5, 2.5), (46.51, 2.5), (46.51, 2.51)), leg_bands_m=(100, None))
+    with pytest.raises(AreaError, match="width of its search band"):
+        Area.from_route(route)
+    whole = Route(route.waypoints, leg_bands_m=(100, 300))
+    assert Area.from_route(whole) == Area.from_route(whole, None)
+    same = Area.from_route(Route(route.waypoints, leg_bands_m=(200, 200)))
+    plain = Area.from_route(Route(route.waypoints), 200)
+    assert (same.frame, same.extent_en_m) == (plain.frame, plain.extent_en_m)
+
+
 @given(
     routes(),
     st.floats(50, 800),

@@ -10,17 +10,24 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from pyproj import Geod
 
 from orthonav.errors import MissingFileError, RouteError
 from orthonav.geo import route as route_module
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.route import (
+    Height,
     Route,
     along_polyline_en_m,
+    beyond_bands_m,
     distance_to_polyline_m,
+    leg_lengths_m,
     read_route,
+    within_bands,
 )
+from orthonav.geo.routes.geojson import read_geojson, to_geojson
 
+GEOD = Geod(ellps="WGS84")
 WAYPOINTS = ((46.5, 2.5), (46.51, 2.53), (46.49, 2.55))
 LINE = {"type": "LineString", "coordinates": [[lon, lat] for lat, lon in WAYPOINTS]}
 HIGH_LINE = LINE | {"coordinates": [[*point, 120.0] for point in LINE["coordinates"]]}
@@ -66,8 +73,10 @@ def test_geojson_is_read(tmp_path, document, suffix):
     [
         "lat_deg,lon_deg\n46.5,2.5\n46.51,2.53\n46.49,2.55\n",
         "\ufeffname,lon_deg,lat_deg\r\nA,2.5,46.5\r\nB,2.53,46.51\r\nC,2.55,46.49\r\n",
+        "Latitude; Longitude\n46,5; 2,5\n46,51; 2,53\n46,49; 2,55\n",
+        "lon\tlat\talt\n2.5\t46.5\t120\n2.53\t46.51\t\n2.55\t46.49\t90\n",
     ],
-    ids=["plain", "spreadsheet"],
+    ids=["plain", "spreadsheet", "decimal commas", "tabs"],
 )
 def test_csv_is_read(tmp_path, text):
     path = tmp_path / "route.csv"
@@ -75,16 +84,112 @@ def test_csv_is_read(tmp_path, text):
     assert read_route(path).waypoints == WAYPOINTS
 
 
+def test_columns_say_heights_and_bands(tmp_path):
+    path = tmp_path / "route.csv"
+    path.write_text("lat,lon,agl_m,band_m\n46.5,2.5,120,400\n46.51,2.53,,\n46.49,2.55,100,9\n")
+    route = read_route(path)
+    assert route.heights == (Height(120, "agl"), None, Height(100, "agl"))
+    assert route.leg_bands_m == (400, None)  # the last row begins no leg
+    assert route.bands_m(300) == (400, 300) and route.bands_m(None) is None
+    path.write_text("lat,lon,alt,band_m\n46.5,2.5,120,400\n")
+    assert read_route(path) == Route(((46.5, 2.5),), (Height(120),), (400,))
+
+
+def test_properties_say_heights_bands_and_names(tmp_path):
+    path = tmp_path / "route.json"
+    own = {"name": "east", "band_m": [300, None], "height_frame": "amsl", "home_amsl_m": 250}
+    path.write_text(json.dumps(feature(HIGH_LINE) | {"properties": own}))
+    heights = (Height(120, "amsl"),) * 3
+    assert read_route(path) == Route(WAYPOINTS, heights, (300, None), "east", 250)
+    path.write_text(json.dumps(feature(LINE) | {"properties": {"band_m": 200}}))
+    assert read_route(path).leg_bands_m == (200, 200)
+
+
+@pytest.mark.parametrize(
+    "own, message",
+    [
+        ({"band_m": [1, 2, 3]}, "3 bands for 2 legs"),
+        ({"band_m": "wide"}, "band_m must be a number"),
+        ({"band_m": -1}, "wider than 0"),
+        ({"height_frame": "sea"}, "above one of agl, home, amsl"),
+        ({"height_frame": ["agl"]}, "1 entries for 3 waypoints"),
+        ({"home_amsl_m": True}, "home_amsl_m must be a number"),
+    ],
+)
+def test_properties_that_make_no_sense_are_refused(tmp_path, own, message):
+    path = tmp_path / "route.geojson"
+    path.write_text(json.dumps(feature(HIGH_LINE) | {"properties": own}))
+    with pytest.raises(RouteError, match=message):
+        read_route(path)
+
+
+def test_lines_are_picked_by_name(tmp_path, caplog):
+    path = tmp_path / "a#b.geojson"
+    both = collection(LINE, OTHER_LINE)
+    path.write_text(json.dumps(both))
+    assert read_route(path).waypoints == WAYPOINTS and "2 lines without names" in caplog.text
+    both["features"][1]["properties"] = {"name": "x#/y"}
+    path.write_text(json.dumps(both))
+    assert read_route(Path(f"{path}#x#/y")).waypoints[0] == (9, 9)
+    with pytest.raises(RouteError, match="2 lines; name one as FILE#NAME: '', 'x#/y'"):
+        read_route(path)
+    with pytest.raises(RouteError, match=r"0 lines are named 'z'; the file holds '', 'x#/y'"):
+        read_route(Path(f"{path}#z"))
+
+
+def test_a_multilinestring_is_one_line(tmp_path):
+    path = tmp_path / "a.geojson"
+    points = LINE["coordinates"]
+    parts = {"type": "MultiLineString", "coordinates": [points[:1], points[1:]]}
+    path.write_text(json.dumps(parts))
+    assert read_route(path).waypoints == WAYPOINTS
+
+
+heights = st.none() | st.builds(
+    Height, st.floats(-500, 9000), st.sampled_from([None, "agl", "home", "amsl"])
+)
+degrees = st.tuples(st.floats(-90, 90), st.floats(-180, 180))
+
+
+@st.composite
+def whole_routes(draw):
+    count = draw(st.integers(1, 6))
+    high = draw(st.booleans())
+    bands = st.none() | st.floats(1, 5000)
+    return Route(
+        tuple(draw(st.lists(degrees, min_size=count, max_size=count))),
+        tuple(draw(heights.filter(bool)) for _ in range(count)) if high else (),
+        tuple(draw(bands) for _ in range(max(1, count - 1))) if draw(st.booleans()) else (),
+        draw(st.none() | st.text(min_size=1)),
+        draw(st.none() | st.floats(-400, 5000)),
+    )
+
+
+@given(st.lists(whole_routes(), min_size=1, max_size=3))
+def test_what_is_written_as_geojson_is_read_again(routes):
+    assert read_geojson(to_geojson(routes).encode()) == routes
+
+
+@given(st.sampled_from(sorted(route_module._READERS)), st.binary(max_size=200))
+def test_no_bytes_make_a_reader_fail_in_another_way(suffix, content):
+    try:
+        found = route_module._READERS[suffix](content)
+    except (RouteError, *route_module._BROKEN):
+        return
+    assert found
+
+
 @pytest.mark.parametrize(
     "name, content, message",
     [
-        ("a.geojson", b"", "cannot be read"),
+        ("a.geojson", b"", "is empty"),
         ("a.geojson", b"{", "cannot be read"),
-        ("a.geojson", b"\xff\xfe\x00", "cannot be read"),
+        ("a.geojson", b"\xff\xfe\x00", "no text in UTF-8"),
         ("a.geojson", b"[" * 100_000, "cannot be read"),
-        ("a.geojson", b"[1, 2]", "no LineString"),
+        ("a.geojson", b"[1, 2]", "must be a JSON object, got list"),
+        ("a.geojson", b"{}", "no LineString; it holds None"),
         ("a.geojson", b'{"type": "FeatureCollection", "features": 5}', "cannot be read"),
-        ("a.geojson", json.dumps(collection(POINT, None)).encode(), "no LineString"),
+        ("a.geojson", json.dumps(collection(POINT, None)).encode(), "it holds Point"),
         ("a.geojson", b'{"type": "LineString"}', "cannot be read"),
         ("a.geojson", b'{"type": "LineString", "coordinates": []}', "no waypoints"),
         ("a.geojson", b'{"type": "LineString", "coordinates": [[1], [2]]}', "as numbers"),
@@ -98,14 +203,20 @@ def test_csv_is_read(tmp_path, text):
         ("a.geojson", b'{"type": "LineString", "coordinates": [[NaN, 1]]}', "not a latitude"),
         ("a.geojson", b'{"coordinates": [[1%s, 1]], "type": "LineString"}' % (b"0" * 400), "read"),
         ("a.geojson", b'{"type": "LineString", "coordinates": [[1, 91]]}', "not a latitude"),
-        ("a.csv", b"", "columns lat_deg,lon_deg"),
-        ("a.csv", b"lat,lon\n1,2\n", "columns lat_deg,lon_deg"),
+        ("a.csv", b"", "is empty"),
+        ("a.csv", b" \n ", "is empty"),
+        ("a.csv", b"x,y\n1,2\n", "columns lat_deg,lon_deg .* got x,y"),
+        ("a.csv", b"PNG\0\0\0\n\0", "route table cannot be read|columns"),
+        ("a.csv", b"lat,lon,alt\n1,2,1e9\n", "height of a waypoint must be within"),
+        ("a.csv", b"lat,lon,band_m\n1,2,0\n1,3,\n", "band of a leg must be wider than 0"),
+        ("a.csv", b"lat,lon\n" + b"1,2\n" * 100_001, "100,001 waypoints, at most 100,000"),
+        ("a.csv", b"lat,lon\n1,361\n", "not a latitude"),
         ("a.csv", b"lat_deg,lon_deg\n", "no waypoints"),
         ("a.csv", b"lat_deg,lon_deg\n46.5\n", "cannot be read"),
         ("a.csv", b"lat_deg,lon_deg\n46.5,east\n", "cannot be read"),
-        ("a.csv", b"lat_deg,lon_deg\n46.5,inf\n", "not a latitude"),
+        ("a.csv", b"lat_deg,lon_deg\n46.5,inf\n", "row 2, lon_deg must be a number, got 'inf'"),
         ("a.csv", b"lat_deg,lon_deg\n" + b"4" * 200_000 + b",2\n", "cannot be read"),
-        ("a.gpx", b"<gpx/>", "must be .geojson, .json or .csv, got '.gpx'"),
+        ("a.shp", b"", "must be one of .geojson, .*, .gpx, got '.shp'"),
     ],
 )
 def test_bad_files_are_named(tmp_path, name, content, message):
@@ -133,7 +244,7 @@ def test_a_file_that_may_not_be_read_is_named(tmp_path, monkeypatch):
     def refuse(*args, **kwargs):
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_text", refuse)
+    monkeypatch.setattr(Path, "read_bytes", refuse)
     with pytest.raises(MissingFileError, match="cannot be read"):
         read_route(path)
 
@@ -143,6 +254,36 @@ def test_distances_are_those_of_shapely(line, points):
     geometry = shapely.LineString(line) if len(line) > 1 else shapely.Point(line[0])
     expected = shapely.distance(geometry, shapely.points(points))
     np.testing.assert_allclose(distance_to_polyline_m(points, line), expected, atol=1e-6)
+
+
+@given(polylines(least=2), arrays(float, (8, 2), elements=st.floats(-6000, 6000)), st.data())
+def test_bands_are_those_of_shapely(line, points, data):
+    bands = data.draw(arrays(float, len(line) - 1, elements=st.floats(1, 3000)))
+    legs = [shapely.LineString(line[leg : leg + 2]) for leg in range(len(line) - 1)]
+    each = [
+        shapely.distance(leg, shapely.points(points)) - b / 2
+        for leg, b in zip(legs, bands, strict=True)
+    ]
+    beyond = beyond_bands_m(points, line, bands)
+    np.testing.assert_allclose(beyond, np.min(each, axis=0), atol=1e-6)
+
+
+@given(polylines(), st.integers(0, 2**32 - 1), st.floats(-50, 300), st.sampled_from([3, 300]))
+def test_points_within_bands_are_those_that_are_not_beyond(line, seed, margin_m, count):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-6000, 6000, (count, 2))
+    bands = rng.uniform(1, 3000, max(1, len(line) - 1))
+    expected = beyond_bands_m(points, line, bands) <= margin_m
+    assert np.array_equal(within_bands(points, line, bands, margin_m), expected)
+
+
+@pytest.mark.parametrize("reach_deg, tolerance", [(1, 5e-6), (25, 5e-3)])
+@given(st.floats(-60, 60), st.floats(-180, 180), st.floats(-1, 1), st.floats(-1, 1))
+def test_legs_are_as_long_as_geodesics(reach_deg, tolerance, lat, lon, dlat, dlon):
+    there = lat + dlat * reach_deg, lon + dlon * reach_deg
+    expected = GEOD.inv(lon, lat, there[1], there[0])[2]
+    (found,) = leg_lengths_m(Route(((lat, lon), there)))
+    assert found == pytest.approx(expected, rel=tolerance, abs=1e-3)
 
 
 @given(polylines(least=2), st.floats(1, 500))

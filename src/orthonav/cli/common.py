@@ -10,6 +10,11 @@ from typing import Any
 
 from tqdm import tqdm
 
+ROUTE_HELP = (
+    "planned route: GeoJSON, CSV, KML or KMZ, GPX, a plan of QGroundControl or a waypoint file "
+    "(FILE#NAME where it holds several), or a trajectory of the paper: paper:B@46.6,1.9[,BEARING]"
+)
+
 
 class Progress:
     """Progress bars by stage on a terminal; silent elsewhere or when quiet."""

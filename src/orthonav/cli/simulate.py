@@ -3,14 +3,14 @@
 import argparse
 from pathlib import Path
 
-from orthonav.cli.common import add_orthos, print_json, progress
+from orthonav.cli.common import ROUTE_HELP, add_orthos, print_json, progress
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     add_orthos(parser, "orthophoto to fly over, of another year than the map's")
     where = parser.add_mutually_exclusive_group(required=True)
-    where.add_argument("--route", type=Path, help="route to fly (GeoJSON or CSV lat_deg,lon_deg)")
+    where.add_argument("--route", type=Path, help=ROUTE_HELP)
     where.add_argument("--random", type=int, metavar="N", help="N random places and headings")
     parser.add_argument(
         "--agl-m",

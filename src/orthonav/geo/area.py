@@ -1,13 +1,14 @@
 """The reference area: where the aircraft may be, so where tile centres must lie."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import AreaError
 from orthonav.geo.frames import MAX_SHEET_M, LocalFrame
-from orthonav.geo.route import Route, distance_to_polyline_m
+from orthonav.geo.route import Route, within_bands
 
 Extent = tuple[float, float, float, float]
 
@@ -16,8 +17,9 @@ Extent = tuple[float, float, float, float]
 class Area:
     """A reference area in its own local plane.
 
-    `extent_en_m` is (west, south, east, north) in metres of `frame`. With `route` and `band_m`
-    the area is the search band, `band_m` metres across, around the route; else the whole extent.
+    `extent_en_m` is (west, south, east, north) in metres of `frame`. With `route` the area is the
+    search band around it: each leg's own width, `band_m` metres where a leg has none; else it is
+    the whole extent.
     """
 
     frame: LocalFrame
@@ -62,29 +64,44 @@ class Area:
         return cls(frame, _checked((float(west), float(south), float(east), float(north))))
 
     @classmethod
-    def from_route(cls, route: Route, band_m: float) -> "Area":
-        """Search band `band_m` metres across, around `route`."""
-        if not (np.isfinite(band_m) and band_m > 0):
+    def from_route(cls, route: Route, band_m: float | None = None) -> "Area":
+        """Search band around `route`, `band_m` metres across where its legs do not say otherwise.
+
+        Raises `AreaError` where a leg has no band, and where one sheet cannot hold them all.
+        """
+        if band_m is not None and not (np.isfinite(band_m) and band_m > 0):
             raise AreaError(f"search band must be wider than 0 m, got {band_m}")
+        bands_m = route.bands_m(band_m)
+        if bands_m is None:
+            raise AreaError("a route needs the width of its search band in metres (--band-m)")
         lat_lon = np.array(route.waypoints)
         box = cls.from_outline(lat_lon[:, 0], lat_lon[:, 1])
-        west, south, east, north = box.extent_en_m
-        half = band_m / 2
-        extent = _checked((west - half, south - half, east + half, north + half))
-        return cls(box.frame, extent, route, band_m)
+        line = route.points_en_m(box.frame)
+        ends = line[1:] if len(line) > 1 else line
+        half = np.array(bands_m)[:, None] / 2
+        west, south = (np.minimum(line[: len(ends)], ends) - half).min(axis=0)
+        east, north = (np.maximum(line[: len(ends)], ends) + half).max(axis=0)
+        extent = _checked((float(west), float(south), float(east), float(north)))
+        return cls(box.frame, extent, route, band_m or 0.0)
 
     def contains(
         self, points_en_m: NDArray[np.float64], margin_m: float = 0.0
     ) -> NDArray[np.bool_]:
         """Which of `(N, 2)` local points lie inside, or at most `margin_m` outside."""
         if self.route is not None:
-            line = self.route.points_en_m(self.frame)
-            distance = distance_to_polyline_m(points_en_m, line)
-            return np.asarray(distance <= self.band_m / 2 + margin_m)
+            return within_bands(points_en_m, *self._bands, margin_m)
         west, south, east, north = self.extent_en_m
         low = np.array([west, south]) - margin_m
         high = np.array([east, north]) + margin_m
         return np.asarray(((points_en_m >= low) & (points_en_m <= high)).all(axis=1))
+
+    @cached_property
+    def _bands(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The route's vertices (M, 2) in the plane, and the width of each leg's band."""
+        assert self.route is not None
+        bands_m = self.route.bands_m(self.band_m or None)
+        assert bands_m is not None
+        return self.route.points_en_m(self.frame), np.array(bands_m)
 
 
 def _checked(extent: Extent) -> Extent:
@@ -93,6 +110,7 @@ def _checked(extent: Extent) -> Extent:
     if across > MAX_SHEET_M:
         raise AreaError(
             f"area is {across / 1000:.1f} km across, a sheet holds at most "
-            f"{MAX_SHEET_M / 1000:.0f} km; build it in parts with --bounds or --route"
+            f"{MAX_SHEET_M / 1000:.0f} km; build it in parts with --bounds or --route "
+            "(orthonav plan cuts it into sheets)"
         )
     return extent

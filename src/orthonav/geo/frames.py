@@ -106,6 +106,26 @@ class LocalFrame:
         )
 
 
+def distances_m(from_latlon_deg: ArrayLike, to_latlon_deg: ArrayLike) -> Array:
+    """Distances (N,) in metres between places (N, 2) in degrees, along the ellipsoid.
+
+    The chord turned into the arc of a normal section at the middle latitude: right to a millionth
+    up to 300 km, to a few thousandths up to some 5,000 km.
+    """
+    start = np.radians(np.asarray(from_latlon_deg, dtype=np.float64).reshape(-1, 2))
+    end = np.radians(np.asarray(to_latlon_deg, dtype=np.float64).reshape(-1, 2))
+    chord = _ecef(end[:, 0], end[:, 1]) - _ecef(start[:, 0], start[:, 1])
+    lat = (start[:, 0] + end[:, 0]) / 2
+    sin2 = np.sin(lat) ** 2
+    prime = WGS84_A_M / np.sqrt(1 - WGS84_E2 * sin2)
+    meridian = prime * (1 - WGS84_E2) / (1 - WGS84_E2 * sin2)
+    turn = (end[:, 1] - start[:, 1] + np.pi) % (2 * np.pi) - np.pi
+    azimuth = np.arctan2(turn * np.cos(lat), end[:, 0] - start[:, 0])
+    radius = 1 / (np.cos(azimuth) ** 2 / meridian + np.sin(azimuth) ** 2 / prime)
+    half = np.linalg.norm(chord, axis=1) / (2 * radius)
+    return np.asarray(2 * radius * np.arcsin(np.minimum(half, 1.0)))
+
+
 def _ecef(lat: ArrayLike, lon: ArrayLike) -> Array:
     """Earth-centred `(..., 3)` metres of a point on the ellipsoid, angles in radians."""
     lat, lon = np.asarray(lat, dtype=np.float64), np.asarray(lon, dtype=np.float64)

@@ -1,121 +1,200 @@
-"""A planned route, and the search band around it.
+"""A planned route: read from the files of planners, and its geometry.
 
-Read from GeoJSON (first LineString found) or CSV with columns `lat_deg,lon_deg`.
+Formats are told by the file's name; each has a module in `orthonav.geo.routes`.
 """
 
 import csv
-import json
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+import logging
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import MissingFileError, RouteError
-from orthonav.geo.frames import LocalFrame
+from orthonav.geo.frames import distances_m
+from orthonav.geo.routes.delimited import read_delimited
+from orthonav.geo.routes.geojson import read_geojson, routes_of
+from orthonav.geo.routes.gpx import read_gpx
+from orthonav.geo.routes.kml import read_kml, read_kmz
+from orthonav.geo.routes.presets import PREFIX, preset
+from orthonav.geo.routes.qgc_plan import is_plan, plan_route, read_plan
+from orthonav.geo.routes.record import Height, Route
+from orthonav.geo.routes.values import json_object
+from orthonav.geo.routes.wpl import is_wpl, read_wpl
+
+__all__ = [
+    "Height",
+    "Route",
+    "along_polyline_en_m",
+    "beyond_bands_m",
+    "distance_to_polyline_m",
+    "leg_lengths_m",
+    "read_route",
+    "within_bands",
+]
 
 MAX_ROUTE_BYTES = 50_000_000
+_PAIRS_AT_ONCE = 2**18
+_FEW_POINTS = 64
+_BROKEN = (ValueError, LookupError, TypeError, OverflowError, RecursionError, csv.Error)
+
+log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Route:
-    """Waypoints of the planned trajectory as `(lat_deg, lon_deg)`, at least one."""
+def _read_json(data: bytes) -> list[Route]:
+    plain = json_object(data)
+    return [plan_route(plain)] if is_plan(plain) else routes_of(plain)
 
-    waypoints: tuple[tuple[float, float], ...]
 
-    def __post_init__(self) -> None:
-        if not self.waypoints:
-            raise RouteError("route has no waypoints")
-        for lat, lon in self.waypoints:
-            if not (math.isfinite(lat) and math.isfinite(lon) and abs(lat) <= 90):
-                raise RouteError(
-                    f"waypoint is not a latitude and longitude in degrees: {lat}, {lon}"
-                )
+def _read_text(data: bytes) -> list[Route]:
+    return read_wpl(data) if is_wpl(data) else read_delimited(data)
 
-    def points_en_m(self, frame: LocalFrame) -> NDArray[np.float64]:
-        """Waypoints as local `(N, 2)` metres of `frame`."""
-        lat_lon = np.array(self.waypoints, dtype=np.float64)
-        return frame.en_from_latlon(lat_lon[:, 0], lat_lon[:, 1])
+
+_READERS: dict[str, Callable[[bytes], list[Route]]] = {
+    ".geojson": read_geojson,
+    ".json": _read_json,
+    ".csv": _read_text,
+    ".tsv": _read_text,
+    ".txt": _read_text,
+    ".waypoints": read_wpl,
+    ".plan": read_plan,
+    ".kml": read_kml,
+    ".kmz": read_kmz,
+    ".gpx": read_gpx,
+}
 
 
 def read_route(path: Path) -> Route:
-    """Read a route from a `.geojson`/`.json` or `.csv` file.
+    """Read a route from a file of one of the formats in `docs/routes.md`.
 
-    Raises `MissingFileError` or `RouteError` (naming what was expected).
+    `FILE#NAME` picks a line by its name where a file holds several; `paper:B@46.6,1.9,30` is a
+    preset. Raises `MissingFileError` or `RouteError` (naming what came and what was expected).
     """
-    path = Path(path)
+    if str(path).startswith(PREFIX):
+        return preset(str(path))
+    path, name = _name_apart(Path(path))
     if not path.is_file():
         raise MissingFileError(f"route file does not exist: {path}")
     if path.stat().st_size > MAX_ROUTE_BYTES:
         raise RouteError(f"route file is larger than {MAX_ROUTE_BYTES // 10**6} MB: {path}")
-    readers = {".geojson": _read_geojson, ".json": _read_geojson, ".csv": _read_csv}
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        raise RouteError(f"route must be .geojson, .json or .csv, got '{path.suffix}': {path}")
+    suffix = path.suffix.lower()
+    if suffix not in _READERS:
+        raise RouteError(f"route must be one of {', '.join(_READERS)}, got '{path.suffix}': {path}")
     try:
-        return Route(tuple(reader(path.read_text(encoding="utf-8-sig"))))
+        found = _READERS[suffix](path.read_bytes())
+        return _chosen(found, name, first=suffix in (".geojson", ".json"))
     except RouteError as error:
         raise RouteError(f"{error}: {path}") from error
-    except (ValueError, LookupError, TypeError, OverflowError, RecursionError, csv.Error) as error:
+    except _BROKEN as error:
         raise RouteError(f"route cannot be read ({error!r}): {path}") from error
     except OSError as error:
         raise MissingFileError(f"route file cannot be read ({error.strerror}): {path}") from error
 
 
-def _read_geojson(text: str) -> list[tuple[float, float]]:
-    for geometry in _geometries(json.loads(text)):
-        if geometry.get("type") == "LineString":
-            return [_lat_lon_deg(point) for point in geometry["coordinates"]]
-    raise RouteError("GeoJSON holds no LineString")
+def _name_apart(path: Path) -> tuple[Path, str | None]:
+    """The file and the name after its `#`; a file whose own name has one is taken whole."""
+    text = str(path)
+    if path.exists():
+        return path, None
+    for at, letter in enumerate(text):
+        if letter == "#" and Path(text[:at]).is_file():
+            return Path(text[:at]), text[at + 1 :]
+    return path, None
 
 
-def _lat_lon_deg(point: Any) -> tuple[float, float]:
-    """Latitude and longitude of a GeoJSON position, which must be numbers: `"12"` is not 1, 2."""
-    numbers = isinstance(point, list) and all(type(value) in (int, float) for value in point[:2])
-    if not numbers or len(point) < 2:
-        raise RouteError(
-            f"GeoJSON position must be [longitude, latitude] as numbers, got {point!r:.80}"
-        )
-    return float(point[1]), float(point[0])
+def _chosen(found: list[Route], name: str | None, first: bool) -> Route:
+    """The line of that name, else the only one.
+
+    With `first` that of several which have no names, with a warning. Raises `RouteError`, which
+    lists the names.
+    """
+    names = ", ".join(repr(route.name or "")[:60] for route in found[:20])
+    if name is not None:
+        named = [route for route in found if route.name == name]
+        if len(named) != 1:
+            raise RouteError(f"{len(named)} lines are named {name!r:.60}; the file holds {names}")
+        return named[0]
+    if len(found) > 1:
+        if not first or any(route.name for route in found):
+            raise RouteError(f"file holds {len(found)} lines; name one as FILE#NAME: {names}")
+        log.warning("route file holds %d lines without names: the first is taken", len(found))
+    return found[0]
 
 
-def _geometries(node: Any) -> Iterator[dict[str, Any]]:
-    """Geometries of a GeoJSON object, depth first, without recursion."""
-    stack = [node]
-    while stack:
-        item = stack.pop()
-        if not isinstance(item, dict):
-            continue
-        stack.extend(reversed(item.get("features") or item.get("geometries") or []))
-        if item.get("type") == "Feature":
-            stack.append(item.get("geometry"))
-        yield item
-
-
-def _read_csv(text: str) -> list[tuple[float, float]]:
-    reader = csv.DictReader(text.splitlines())
-    if not {"lat_deg", "lon_deg"} <= set(reader.fieldnames or ()):
-        raise RouteError("route CSV needs the columns lat_deg,lon_deg")
-    return [(float(row["lat_deg"]), float(row["lon_deg"])) for row in reader]
+def leg_lengths_m(route: Route) -> NDArray[np.float64]:
+    """Length in metres of each leg of a route, along the ellipsoid; `[0]` for one waypoint."""
+    places = np.array(route.waypoints)
+    return distances_m(places[:-1], places[1:]) if len(places) > 1 else np.zeros(1)
 
 
 def distance_to_polyline_m(
     points_en_m: NDArray[np.float64], line_en_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Shortest distance in metres of `(N, 2)` points to a polyline of `(M, 2)` vertices, M >= 1."""
+    return beyond_bands_m(points_en_m, line_en_m, np.zeros(max(1, len(line_en_m) - 1)))
+
+
+def beyond_bands_m(
+    points_en_m: NDArray[np.float64],
+    line_en_m: NDArray[np.float64],
+    bands_m: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """How far `(N, 2)` points lie outside the bands of a polyline's legs; inside it is below 0.
+
+    `line_en_m` has `(M, 2)` vertices, M >= 1, `bands_m` the full width of the band of each of its
+    max(1, M - 1) legs. It is the least, over the legs, of the distance to the leg less half its
+    band.
+    """
+    starts = line_en_m[:-1] if len(line_en_m) > 1 else line_en_m
+    legs = (line_en_m[1:] if len(line_en_m) > 1 else line_en_m) - starts
+    length2 = np.maximum((legs**2).sum(axis=1), np.finfo(np.float64).tiny)
+    best = np.full(len(points_en_m), np.inf)
+    at_once = max(1, _PAIRS_AT_ONCE // max(1, len(points_en_m)))
+    for first in range(0, len(legs), at_once):
+        some = slice(first, first + at_once)
+        east, north = (points_en_m[:, axis, None] - starts[some, axis] for axis in (0, 1))
+        along = (east * legs[some, 0] + north * legs[some, 1]) / length2[some]
+        np.clip(along, 0, 1, out=along)
+        east -= along * legs[some, 0]
+        north -= along * legs[some, 1]
+        beyond = np.hypot(east, north) - bands_m[some] / 2
+        np.minimum(best, beyond.min(axis=1), out=best)
+    return best
+
+
+def within_bands(
+    points_en_m: NDArray[np.float64],
+    line_en_m: NDArray[np.float64],
+    bands_m: NDArray[np.float64],
+    margin_m: float,
+) -> NDArray[np.bool_]:
+    """Which of `(N, 2)` points lie in the band of a leg or at most `margin_m` beside it.
+
+    As `beyond_bands_m`, but for many points and legs it looks only at those that are near.
+    """
+    if len(points_en_m) <= _FEW_POINTS:
+        return np.asarray(beyond_bands_m(points_en_m, line_en_m, bands_m) <= margin_m)
+    order = np.argsort(points_en_m[:, 0], kind="stable")
+    x, y = points_en_m[order].T
     starts = line_en_m[:-1] if len(line_en_m) > 1 else line_en_m
     ends = line_en_m[1:] if len(line_en_m) > 1 else line_en_m
-    best = np.full(len(points_en_m), np.inf)
-    for start, end in zip(starts, ends, strict=True):
-        leg = end - start
-        length2 = float(leg @ leg)
-        along = (points_en_m - start) @ leg / length2 if length2 > 0 else np.zeros(len(points_en_m))
-        foot = start + np.clip(along, 0, 1)[:, None] * leg
-        best = np.minimum(best, np.linalg.norm(points_en_m - foot, axis=1))
-    return best
+    reach = bands_m / 2 + margin_m
+    low, high = np.minimum(starts, ends) - reach[:, None], np.maximum(starts, ends) + reach[:, None]
+    first = np.searchsorted(x, low[:, 0], side="left").tolist()
+    last = np.searchsorted(x, high[:, 0], side="right").tolist()
+    inside = np.zeros(len(x), dtype=np.bool_)
+    for leg in np.flatnonzero(reach >= 0).tolist():
+        some = slice(first[leg], last[leg])
+        near = np.flatnonzero(~inside[some] & (y[some] >= low[leg, 1]) & (y[some] <= high[leg, 1]))
+        if len(near):
+            near += first[leg]
+            points = np.stack([x[near], y[near]], axis=1)
+            vertices = np.stack([starts[leg], ends[leg]])
+            inside[near] = beyond_bands_m(points, vertices, bands_m[leg : leg + 1]) <= margin_m
+    found = np.empty_like(inside)
+    found[order] = inside
+    return found
 
 
 def along_polyline_en_m(

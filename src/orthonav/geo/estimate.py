@@ -1,0 +1,91 @@
+"""What a map will need before it is built: tiles, size and time, from grid and area alone."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthonav.geo.area import Area, Extent
+from orthonav.geo.grid import TileGrid
+
+TILE_BYTES = 273.0
+"""Embedding and centre of a tile: docs/benchmarks.md, 4.26 MB for 15,601 tiles."""
+LAYER_BYTES_PER_PX = 0.15, 0.35
+"""Registration layer, all levels together: docs/map-format.md, least and most of real imagery."""
+BUILD_FIXED_S = 40.0
+BUILD_S_PER_MPX = 1.4
+"""Measured on one core of a shared Xeon at 2 GHz, generated landscape, 1 m, default build: 47 s for
+2 x 2 km, 64 s for 4 x 4 km, 183 s for 10 x 10 km. What is fixed is the learning of
+confidences."""
+_PAIRS = 1_000_000_000
+_MOST_POINTS = 200_000
+_LEAST_POINTS = 2_500
+
+
+@dataclass(frozen=True)
+class MapEstimate:
+    """What a map of one sheet will need.
+
+    `area_km2` is the area of tile centres, `imagery_km2` that of the pixels under the tiles.
+    `map_mb` is the least and most size of the file, `build_s` the time that the default build
+    takes on one core of a desktop, with registration; networks take hours more.
+    """
+
+    area_km2: float
+    imagery_km2: float
+    tiles: int
+    map_mb: tuple[float, float]
+    build_s: float
+
+
+def estimate_map(
+    area: Area, *, gsd_m: float, tile_px: int, overlap: float, registration: bool = True
+) -> MapEstimate:
+    """Estimate of the map that `orthonav build` would make of an area.
+
+    Tiles are counted where that is cheap, else measured on a sample (within 2 %). All ground is
+    taken to have imagery. Raises `AreaError` as `TileGrid.covering` does.
+    """
+    grid = TileGrid.covering(area.extent_en_m, gsd_m=gsd_m, tile_px=tile_px, overlap=overlap)
+    half_m, centre_m = grid.tile_m / 2, (grid.tile_m - grid.stride_m) / 2
+    raster = (
+        grid.west_m,
+        grid.north_m - grid.height_px * gsd_m,
+        grid.west_m + grid.width_px * gsd_m,
+        grid.north_m,
+    )
+    centres = tuple(np.array(raster) + np.array([1, 1, -1, -1]) * centre_m)
+    reach_m = grid.stride_m * math.sqrt(0.5)
+    tiles = round(grid.rows * grid.cols * _share(area, centres, reach_m, (grid.rows, grid.cols)))
+    imagery_m2 = grid.width_px * grid.height_px * gsd_m**2 * _share(area, raster, half_m)
+    pixels = imagery_m2 / gsd_m**2
+    layer = [pixels * each / 1e6 if registration else 0.0 for each in LAYER_BYTES_PER_PX]
+    embeddings = tiles * TILE_BYTES / 1e6
+    return MapEstimate(
+        area_km2=tiles * grid.stride_m**2 / 1e6,
+        imagery_km2=imagery_m2 / 1e6,
+        tiles=tiles,
+        map_mb=(embeddings + layer[0], embeddings + layer[1]),
+        build_s=BUILD_FIXED_S + BUILD_S_PER_MPX * pixels / 1e6,
+    )
+
+
+def _share(
+    area: Area, box_en_m: Extent, margin_m: float, cells: tuple[int, int] | None = None
+) -> float:
+    """Share of a box (west, south, east, north) that lies in the area or within a margin of it.
+
+    Told by the middles of its `cells` (rows, columns), or of fewer where that is dear.
+    """
+    if area.route is None:
+        return 1.0
+    room = min(_MOST_POINTS, max(_LEAST_POINTS, _PAIRS // area.route.legs))
+    west, south, east, north = box_en_m
+    if cells is None or cells[0] * cells[1] > room:
+        rows = max(1, min(room, round(math.sqrt(room * (north - south) / (east - west)))))
+        cells = rows, max(1, room // rows)
+    rows, cols = cells
+    x = west + (np.arange(cols) + 0.5) * (east - west) / cols
+    y = north - (np.arange(rows) + 0.5) * (north - south) / rows
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    return float(area.contains(points, margin_m).mean())

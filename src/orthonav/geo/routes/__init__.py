@@ -1,0 +1,1 @@
+"""Reading and writing routes: one module per file format, all giving `Route`."""

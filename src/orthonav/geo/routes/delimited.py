@@ -1,0 +1,92 @@
+"""Routes as tables: CSV with comma, semicolon or tab, one waypoint a row."""
+
+import csv
+from typing import Any
+
+from orthonav.errors import RouteError
+from orthonav.geo.routes.record import Height, HeightFrame, Route
+from orthonav.geo.routes.values import decoded, parsed
+
+_LAT = ("lat_deg", "lat", "latitude", "latitude_deg")
+_LON = ("lon_deg", "lon", "lng", "long", "longitude", "longitude_deg")
+_HEIGHTS: tuple[tuple[HeightFrame | None, tuple[str, ...]], ...] = (
+    ("agl", ("agl_m", "agl")),
+    ("home", ("home_m", "height_above_home_m")),
+    ("amsl", ("amsl_m", "amsl", "altitude_amsl_m")),
+    (None, ("alt_m", "alt", "altitude_m", "altitude", "height_m", "height", "ele")),
+)
+_BAND = ("band_m",)
+
+
+def read_delimited(data: bytes) -> list[Route]:
+    """The route of a table with a header, whose band is that of the leg which begins at the row.
+
+    Raises `RouteError`.
+    """
+    text = decoded(data)
+    header = text.split("\n", 1)[0]
+    delimiter = max(",;\t", key=header.count)
+    try:
+        reader = csv.DictReader(text.splitlines(), delimiter=delimiter, skipinitialspace=True)
+        names = {str(name).strip().lower(): name for name in reader.fieldnames or ()}
+        rows = list(reader)
+    except csv.Error as error:
+        raise RouteError(f"route table cannot be read ({error})") from error
+    lat, lon = _column(names, _LAT), _column(names, _LON)
+    if lat is None or lon is None:
+        raise RouteError(
+            "route CSV needs the columns lat_deg,lon_deg (or lat,lon or latitude,longitude), got "
+            f"{','.join(names) or 'none'!s:.80}"
+        )
+    comma = delimiter != ","  # then a comma in a number is a decimal comma
+    points = [
+        tuple(_number(row, column, number, comma) for column in (lat, lon))
+        for number, row in enumerate(rows, 2)
+    ]
+    return [
+        Route(
+            tuple((lat_deg, lon_deg) for lat_deg, lon_deg in points),
+            _heights(names, rows, comma),
+            _bands_m(names, rows, comma),
+        )
+    ]
+
+
+def _heights(
+    names: dict[str, Any], rows: list[dict[str, Any]], comma: bool
+) -> tuple[Height | None, ...]:
+    for frame, aliases in _HEIGHTS:
+        column = _column(names, aliases)
+        if column is not None:
+            found = [_optional(row, column, line, comma) for line, row in enumerate(rows, 2)]
+            heights = tuple(None if value is None else Height(value, frame) for value in found)
+            return heights if any(heights) else ()
+    return ()
+
+
+def _bands_m(
+    names: dict[str, Any], rows: list[dict[str, Any]], comma: bool
+) -> tuple[float | None, ...]:
+    column = _column(names, _BAND)
+    if column is None:
+        return ()
+    bands = [_optional(row, column, line, comma) for line, row in enumerate(rows, 2)]
+    return tuple(bands[:-1] if len(bands) > 1 else bands)
+
+
+def _column(names: dict[str, Any], aliases: tuple[str, ...]) -> Any:
+    """The header's own spelling of the first alias it has, None where it has none."""
+    return next((names[alias] for alias in aliases if alias in names), None)
+
+
+def _optional(row: dict[str, Any], column: Any, line: int, comma: bool) -> float | None:
+    if not (row.get(column) or "").strip():
+        return None
+    return _number(row, column, line, comma)
+
+
+def _number(row: dict[str, Any], column: Any, line: int, comma: bool) -> float:
+    text = row.get(column) or ""
+    if comma and "." not in text:
+        text = text.replace(",", ".")
+    return parsed(text, f"route table cannot be read: row {line}, {column}")

@@ -1,0 +1,108 @@
+"""Routes as KML (OGC 07-147r2, and Google's gx:Track) and KMZ, which is KML in a zip archive."""
+
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from io import BytesIO
+from xml.etree.ElementTree import Element
+
+from orthonav.errors import RouteError
+from orthonav.geo.routes.markup import read_markup, text_of
+from orthonav.geo.routes.record import Height, HeightFrame, Route
+from orthonav.geo.routes.values import parsed
+
+MAX_KML_BYTES = 50_000_000
+MAX_MEMBERS = 10_000
+_HEIGHT_FRAMES: dict[str, HeightFrame] = {"absolute": "amsl", "relativeToGround": "agl"}
+"""Other altitude modes, and none at all, say that the altitude is to be ignored."""
+_POINTLESS = ("Point", "Polygon", "LinearRing", "Model")
+_END = struct.Struct("<4s4H2LH")
+_Place = tuple[float, float, Height | None]
+
+
+def read_kmz(data: bytes) -> list[Route]:
+    """Lines and tracks of the archive's `doc.kml`, else of its only KML file.
+
+    Raises `RouteError`, also on archives that would unpack to more than `MAX_KML_BYTES`.
+    """
+    _check_archive(data)
+    try:
+        with zipfile.ZipFile(BytesIO(data)) as archive:
+            names = [name for name in archive.namelist() if name.lower().endswith(".kml")]
+            chosen = [name for name in names if name.lower() == "doc.kml"] or names
+            if len(chosen) != 1:
+                raise RouteError(f"KMZ must hold one KML file, got {len(chosen)}")
+            with archive.open(chosen[0]) as member:
+                text = member.read(MAX_KML_BYTES + 1)
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError) as error:
+        raise RouteError(f"KMZ is no whole zip archive ({error})") from error
+    except (NotImplementedError, RuntimeError, ValueError) as error:  # encrypted, odd compression
+        if isinstance(error, RouteError):
+            raise
+        raise RouteError(f"KMZ cannot be unpacked ({error})") from error
+    if len(text) > MAX_KML_BYTES:
+        raise RouteError(f"KML in the KMZ is larger than {MAX_KML_BYTES // 10**6} MB")
+    return read_kml(text)
+
+
+def read_kml(data: bytes) -> list[Route]:
+    """Lines and tracks of all placemarks, those of one placemark joined. Raises `RouteError`."""
+    root = read_markup(data, "KML")
+    if root.tag != "kml":
+        raise RouteError(f"KML must begin with <kml>, got <{root.tag:.40}>")
+    found = [route for mark in root.iter("Placemark") for route in _routes(mark)]
+    if found:
+        return found
+    kinds = sorted({each.tag for mark in root.iter("Placemark") for each in mark.iter()})
+    held = [kind for kind in kinds if kind in _POINTLESS] or ["no placemark with a geometry"]
+    raise RouteError(f"KML holds no LineString and no gx:Track; it holds {', '.join(held)}")
+
+
+def _routes(mark: Element) -> list[Route]:
+    places = [
+        place
+        for element in mark.iter()
+        if element.tag in ("LineString", "Track")
+        for place in (_line(element) if element.tag == "LineString" else _track(element))
+    ]
+    if not places:
+        return []
+    heights = tuple(height for _, _, height in places)
+    waypoints = tuple((lat, lon) for lat, lon, _ in places)
+    return [Route(waypoints, heights if any(heights) else (), name=text_of(mark, "name"))]
+
+
+def _line(element: Element) -> Iterator[_Place]:
+    """Positions of `lon,lat[,alt]` tuples between spaces; spaces after commas are forgiven."""
+    frame = _HEIGHT_FRAMES.get(text_of(element, "altitudeMode") or "")
+    text = re.sub(r"\s*,\s*", ",", text_of(element, "coordinates") or "")
+    for position in text.split():
+        yield _place(position.split(","), frame, position)
+
+
+def _track(element: Element) -> Iterator[_Place]:
+    frame = _HEIGHT_FRAMES.get(text_of(element, "altitudeMode") or "")
+    for coordinates in element.iter("coord"):
+        text = (coordinates.text or "").strip()
+        if text:  # the schema allows gaps
+            yield _place(text.split(), frame, text)
+
+
+def _place(values: list[str], frame: HeightFrame | None, text: str) -> _Place:
+    if not 2 <= len(values) <= 3:
+        raise RouteError(f"KML position must be longitude,latitude[,altitude], got {text!r:.60}")
+    lon, lat, *rest = (parsed(value, "KML position") for value in values)
+    height = Height(rest[0], frame) if rest and frame is not None else None
+    return lat, lon, height
+
+
+def _check_archive(data: bytes) -> None:
+    """Refuse archives with so many members that their list alone would fill memory."""
+    at = data.rfind(b"PK\x05\x06")
+    if at < 0 or len(data) - at < _END.size:
+        raise RouteError("KMZ is no whole zip archive (its end is missing)")
+    members = _END.unpack_from(data, at)[4]
+    if members > MAX_MEMBERS or data[max(0, at - 20) : at].startswith(b"PK\x06\x07"):
+        raise RouteError(f"KMZ has more than {MAX_MEMBERS:,} members")

@@ -1,0 +1,71 @@
+"""XML of unknown origin, read without what can harm: no DTD, so no entities and no other files."""
+
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.parsers import expat
+
+from orthonav.errors import RouteError
+
+MAX_ELEMENTS = 1_000_000
+MAX_DEPTH = 100
+
+
+def read_markup(data: bytes, kind: str) -> Element:
+    """The root of a document, whose tags have lost their namespaces.
+
+    `kind` is what the document should be, for messages. Raises `RouteError` on what is no XML, has
+    a DOCTYPE, or more than `MAX_ELEMENTS` elements or `MAX_DEPTH` levels.
+    """
+    if not data.strip():
+        raise RouteError(f"{kind} file is empty")
+    builder = _Builder(kind)
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartDoctypeDeclHandler = builder.doctype
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.text
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        raise RouteError(f"{kind} file is no well-formed XML ({error})") from error
+    except (ValueError, LookupError) as error:  # an encoding that nobody knows
+        raise RouteError(f"{kind} file cannot be read ({error})") from error
+    return builder.tree.close()
+
+
+def local_name(tag: str) -> str:
+    """A tag without its prefix: `gx:Track` is Track."""
+    return tag.rpartition(":")[2]
+
+
+def text_of(element: Element, tag: str) -> str | None:
+    """Text of the first child with a tag, None where there is none or it is empty."""
+    return (element.findtext(tag) or "").strip() or None
+
+
+class _Builder:
+    """Makes a tree of what the parser reports, within limits."""
+
+    def __init__(self, kind: str) -> None:
+        self.tree = TreeBuilder()
+        self._kind = kind
+        self._count = self._depth = 0
+
+    def doctype(self, *_: object) -> None:
+        raise RouteError(f"{self._kind} file has a DOCTYPE, which is not read; remove it")
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        self._count += 1
+        self._depth += 1
+        if self._count > MAX_ELEMENTS or self._depth > MAX_DEPTH:
+            raise RouteError(
+                f"{self._kind} file has more than {MAX_ELEMENTS:,} elements or {MAX_DEPTH} levels"
+            )
+        self.tree.start(local_name(tag), attributes)
+
+    def end(self, tag: str) -> None:
+        self._depth -= 1
+        self.tree.end(local_name(tag))
+
+    def text(self, data: str) -> None:
+        self.tree.data(data)

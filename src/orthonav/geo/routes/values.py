@@ -1,0 +1,55 @@
+"""Numbers and texts as route files hold them."""
+
+import json
+import math
+from typing import Any
+
+from orthonav.errors import RouteError
+
+
+def number(value: Any, what: str) -> float:
+    """A finite JSON number; a text such as `"12"` or true is none. Raises `RouteError`."""
+    if type(value) not in (int, float) or not math.isfinite(value):
+        raise RouteError(f"{what} must be a number, got {value!r:.80}")
+    return float(value)
+
+
+def number_or_none(value: Any, what: str) -> float | None:
+    """As `number`; None for null, NaN and what is not there."""
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return None
+    return number(value, what)
+
+
+def parsed(text: str, what: str) -> float:
+    """The number that a text holds. Raises `RouteError`; NaN and infinity are none."""
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise RouteError(f"{what} must be a number, got {text!r:.80}") from error
+    if not math.isfinite(value):
+        raise RouteError(f"{what} must be a number, got {text!r:.80}")
+    return value
+
+
+def decoded(data: bytes) -> str:
+    """Text of UTF-8 bytes, with or without a byte order mark. Raises `RouteError`."""
+    if not data.strip():
+        raise RouteError("route file is empty")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise RouteError("route file is no text in UTF-8; is it of the kind its name says?") from (
+            error
+        )
+
+
+def json_object(data: bytes) -> dict[str, Any]:
+    """The object that a JSON document is. Raises `RouteError`."""
+    try:
+        plain = json.loads(decoded(data))
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise RouteError(f"route cannot be read as JSON ({error})") from error
+    if not isinstance(plain, dict):
+        raise RouteError(f"route must be a JSON object, got {type(plain).__name__}")
+    return plain

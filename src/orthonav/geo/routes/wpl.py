@@ -1,0 +1,58 @@
+"""Waypoint files of Mission Planner and other ground stations: text that begins "QGC WPL 110".
+
+A line an item, twelve numbers: index, current, frame, command, four parameters, latitude,
+longitude, altitude, autocontinue (mavlink.io, "Mission Plain-Text File Format"). In version 110 the
+first item is the planned home position, in the older 120 of QGroundControl there is none
+(QGroundControl, `MissionController::_loadTextMissionFile`).
+"""
+
+from orthonav.errors import RouteError
+from orthonav.geo.routes.mission import Home, Item, route_of
+from orthonav.geo.routes.record import Route
+from orthonav.geo.routes.values import decoded, parsed
+
+_COLUMNS = 12
+_MAGIC = b"QGC WPL"
+
+
+def is_wpl(data: bytes) -> bool:
+    """Whether a file begins like a waypoint file."""
+    return data.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(_MAGIC)
+
+
+def read_wpl(data: bytes) -> list[Route]:
+    """The route of a waypoint file. Raises `RouteError`."""
+    lines = decoded(data).strip().splitlines()
+    version = lines[0].split()
+    if version not in (["QGC", "WPL", "110"], ["QGC", "WPL", "120"]):
+        raise RouteError(f"waypoint file must begin with 'QGC WPL 110', got {lines[0]!r:.60}")
+    items = [
+        _item(line.split(), number)
+        for number, line in enumerate(lines[1:], 2)
+        if line.strip() and not line.startswith("#")
+    ]
+    home = None
+    if version[2] == "110" and items:
+        first, *items = items
+        if first.lat_deg or first.lon_deg:
+            home = Home(first.lat_deg or 0.0, first.lon_deg or 0.0, first.height_m)
+    return [route_of(items, home)]
+
+
+def _item(values: list[str], line: int) -> Item:
+    if len(values) != _COLUMNS:
+        raise RouteError(
+            f"line {line} of the waypoint file has {len(values)} values, expected {_COLUMNS}"
+        )
+    frame, command = (_whole(values[index], line) for index in (2, 3))
+    lat_deg, lon_deg, height_m = (
+        parsed(values[index], f"line {line}, column {index + 1}") for index in (8, 9, 10)
+    )
+    return Item(command, frame, lat_deg, lon_deg, height_m)
+
+
+def _whole(text: str, line: int) -> int:
+    value = parsed(text, f"line {line}: frame and command")
+    if value != int(value):
+        raise RouteError(f"line {line}: frame and command must be whole numbers, got {text!r:.40}")
+    return int(value)

@@ -1,0 +1,186 @@
+"""Areas too large for one sheet, cut into parts that each fit.
+
+A map holds one sheet, so each part becomes a map of its own. Neighbours touch: a map's tiles reach
+half a tile beyond its area, so a view near the border lies wholly on one of the two.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import AreaError
+from orthonav.geo.area import Area, Extent
+from orthonav.geo.frames import MAX_SHEET_M, WGS84_A_M
+from orthonav.geo.route import Height, Route, leg_lengths_m
+
+MAX_SHEETS = 10_000
+_DEGREE_M = 110_574.0
+"""A degree of latitude at its shortest, at the equator."""
+_LON_DEGREE_M = 111_320.0
+_TRIES = 4
+
+
+def sheets_of_bounds(bounds_deg: Extent) -> list[Extent]:
+    """Boxes (west, south, east, north in degrees) that each fit a sheet and together are the box.
+
+    Rows of equal height, from south to north, each cut into as many equal boxes as its width asks
+    for, from west to east. Raises `AreaError` for what is no box, or more than `MAX_SHEETS` boxes.
+    """
+    west, south, east, north = bounds_deg
+    if west > east + 180:  # across the antimeridian, as in GeoJSON (RFC 7946, 5.2)
+        east += 360
+    if not (np.isfinite(bounds_deg).all() and west < east <= west + 360 and south < north):
+        raise AreaError(
+            "bounds must be west,south,east,north in degrees with west < east and south < north, "
+            f"got {','.join(map(str, bounds_deg))}"
+        )
+    if max(abs(south), abs(north)) > 89.5 or abs(west) > 360:
+        raise AreaError(f"bounds must lie within 89.5 deg of the equator, got {bounds_deg}")
+    zone = math.sin(math.radians(north)) - math.sin(math.radians(south))
+    least = math.radians(east - west) * zone * WGS84_A_M**2 / MAX_SHEET_M**2
+    if least > MAX_SHEETS:
+        raise _too_many(round(least))
+    rows = max(1, int((north - south) * _DEGREE_M / MAX_SHEET_M))
+    while True:
+        edges = np.linspace(south, north, rows + 1).tolist()
+        found = [_row(west, low, east, high) for low, high in itertools.pairwise(edges)]
+        if all(found):
+            break
+        rows += 1
+    sheets = [sheet for row in found for sheet in row]
+    if len(sheets) > MAX_SHEETS:
+        raise _too_many(len(sheets))
+    return sheets
+
+
+def _row(west: float, south: float, east: float, north: float) -> list[Extent]:
+    """Boxes of a row, none where no width makes them fit, for the row is too high."""
+    widest = 0.0 if south <= 0 <= north else min(abs(south), abs(north))
+    width_m = (east - west) * _LON_DEGREE_M * math.cos(math.radians(widest))
+    least = max(1, int(width_m / MAX_SHEET_M))
+    for count in range(least, least + _TRIES):
+        edges = np.linspace(west, east, count + 1).tolist()
+        boxes = [
+            (_wrapped(left), south, _wrapped(right), north)
+            for left, right in itertools.pairwise(edges)
+        ]
+        if _box_fits((edges[0], south, edges[1], north)):
+            return boxes
+    return []
+
+
+def _box_fits(bounds_deg: Extent) -> bool:
+    try:
+        Area.from_bounds(bounds_deg)
+    except AreaError:
+        return False
+    return True
+
+
+def _wrapped(lon_deg: float) -> float:
+    """A longitude within 180 degrees; those that are stay as they are."""
+    return lon_deg if abs(lon_deg) <= 180 else (lon_deg + 180) % 360 - 180
+
+
+def sheets_of_route(route: Route, band_m: float | None) -> list[Route]:
+    """Parts of a route, in order, whose search bands each fit a sheet.
+
+    Cut at waypoints, each part as long as fits; a leg that is too long for a sheet is cut into
+    equal pieces on the great circle. Each part begins where the one before ends. Parts of a route
+    that is cut are named sheet-1, sheet-2 and so on. Raises `AreaError`.
+    """
+    bands_m = route.bands_m(band_m)
+    if bands_m is None or _route_fits(route, band_m):
+        Area.from_route(route, band_m)  # says what is missing
+        return [route]
+    if max(bands_m) >= MAX_SHEET_M:
+        raise AreaError(
+            f"search band of {max(bands_m):.0f} m is as wide as a sheet, {MAX_SHEET_M:.0f} m"
+        )
+    cut = _with_short_legs(route, bands_m)
+    parts: list[Route] = []
+    first = 0
+    while first < cut.legs:
+        last = _last_that_fits(cut, first, band_m)
+        parts.append(cut.part(first, last, f"sheet-{len(parts) + 1}"))
+        first = last
+    return parts
+
+
+def _route_fits(route: Route, band_m: float | None) -> bool:
+    try:
+        Area.from_route(route, band_m)
+    except AreaError:
+        return False
+    return True
+
+
+def _last_that_fits(route: Route, first: int, band_m: float | None) -> int:
+    """The last waypoint such that the legs from `first` to it fit a sheet, at least one leg."""
+    step, last = 1, first + 1
+    while last + step < len(route.waypoints) and _route_fits(
+        route.part(first, last + step), band_m
+    ):
+        last += step
+        step *= 2
+    while step > 0:
+        if last + step < len(route.waypoints) and _route_fits(
+            route.part(first, last + step), band_m
+        ):
+            last += step
+        step //= 2
+    return last
+
+
+def _with_short_legs(route: Route, bands_m: tuple[float, ...]) -> Route:
+    """The same way with more waypoints, so that each leg alone fits a sheet."""
+    waypoints, heights = [route.waypoints[0]], list(route.heights[:1])
+    leg_bands: list[float | None] = []
+    lengths_m = leg_lengths_m(route)
+    for leg, (start, end) in enumerate(zip(route.waypoints, route.waypoints[1:], strict=False)):
+        pieces = math.ceil(lengths_m[leg] / (0.99 * (MAX_SHEET_M - bands_m[leg])))
+        if pieces <= 1 or _route_fits(Route((start, end)), bands_m[leg]):
+            pieces = 1  # most legs, without looking closer
+        if len(waypoints) + pieces > MAX_SHEETS + len(route.waypoints):
+            raise _too_many(pieces)
+        shares = [number / pieces for number in range(1, pieces)]
+        waypoints += [*_on_great_circle(start, end, shares), end]
+        if route.heights:
+            below, above = route.heights[leg], route.heights[leg + 1]
+            heights += [*(_between(below, above, share) for share in shares), above]
+        if route.leg_bands_m:
+            leg_bands += [route.leg_bands_m[leg]] * pieces
+    return replace(
+        route, waypoints=tuple(waypoints), heights=tuple(heights), leg_bands_m=tuple(leg_bands)
+    )
+
+
+def _between(below: Height | None, above: Height | None, share: float) -> Height | None:
+    if below is None or above is None or below.frame != above.frame:
+        return None
+    return Height(below.height_m + share * (above.height_m - below.height_m), below.frame)
+
+
+def _on_great_circle(
+    start: tuple[float, float], end: tuple[float, float], shares: list[float]
+) -> Iterator[tuple[float, float]]:
+    one, other = _direction(start), _direction(end)
+    angle = math.atan2(float(np.linalg.norm(np.cross(one, other))), float(one @ other))
+    if shares and math.sin(angle) < 1e-6:
+        raise AreaError(f"leg from {start} to {end} goes half around the Earth: add waypoints")
+    for share in shares:
+        x, y, z = math.sin((1 - share) * angle) * one + math.sin(share * angle) * other
+        yield math.degrees(math.atan2(z, math.hypot(x, y))), math.degrees(math.atan2(y, x))
+
+
+def _direction(place: tuple[float, float]) -> NDArray[np.float64]:
+    lat, lon = (math.radians(value) for value in place)
+    return np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
+
+
+def _too_many(count: int) -> AreaError:
+    return AreaError(f"area needs {count:,} sheets, at most {MAX_SHEETS:,} are cut")

@@ -1,0 +1,162 @@
+"""Camera, height and map that suit each other; height above terrain."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from orthonav.errors import CameraError, RouteError
+from orthonav.geo.camera import Camera, footprint_en_m
+from orthonav.geo.frames import LocalFrame
+from orthonav.geo.planning import (
+    FINEST_IMAGERY_M,
+    LEAST_TILE_SHARE,
+    ViewPlan,
+    rate_cautions,
+    suited_map,
+    suited_tile_px,
+    view_cautions,
+)
+from orthonav.geo.route import Height, Route
+from orthonav.geo.terrain import profile, terrain_cautions
+
+CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
+
+
+def codes(found):
+    return [each.code for each in found]
+
+
+def test_the_view_is_the_footprint():
+    view = ViewPlan.of(CAMERA, 500)
+    corners = footprint_en_m(CAMERA, 0, 0, 0, 500)
+    assert (view.width_m, view.height_m) == pytest.approx(tuple(np.ptp(corners, axis=0)))
+    assert view.gsd_m == 0.5 and view.short_m == 480
+    assert view.spacing_m == pytest.approx(192)
+    assert view.across_px(2) == pytest.approx(math.sqrt(640 * 480) / 2)
+    assert view.tile_share(480) == 1 and view.tile_share(960) == pytest.approx(1 / 3)
+    with pytest.raises(CameraError, match="height above ground"):
+        ViewPlan.of(CAMERA, math.nan)
+
+
+@given(
+    st.floats(1, 50_000),
+    st.integers(64, 6000),
+    st.integers(64, 6000),
+    st.floats(0.3, 5),
+)
+def test_the_map_that_is_advised_is_good_for_the_view(agl_m, width_px, height_px, focal):
+    camera = Camera(width_px, height_px, focal * width_px, focal * width_px, 10.0, 10.0)
+    view = ViewPlan.of(camera, agl_m)
+    gsd_m, tile_px = suited_map(view)
+    assert gsd_m >= 0.995 * max(FINEST_IMAGERY_M, view.gsd_m)
+    said = set(codes(view_cautions(view, gsd_m, tile_px)))
+    assert not said & {"too_coarse", "fine_imagery"}
+    if tile_px == 256:
+        assert said <= {"low"} and view.across_px(gsd_m) >= 256
+    if "part_of_tile" in said or "tile_too_large" in said:
+        assert tile_px == 64 and view.short_m < 64 * gsd_m
+    assert suited_tile_px(view, gsd_m) == tile_px
+
+
+@pytest.mark.parametrize(
+    "agl_m, gsd_m, tile_px, expected",
+    [
+        (500, 1.8, 256, []),
+        (500, 1.0, 256, []),
+        (500, 4.0, 256, ["few_pixels", "tile_too_large"]),
+        (500, 3.0, 256, ["part_of_tile"]),
+        (500, 0.1, 256, ["too_coarse", "fine_imagery"]),
+        (50, 0.2, 128, ["low"]),
+        (50, 5.0, 256, ["low", "too_small", "tile_too_large"]),
+    ],
+)
+def test_what_speaks_against_a_map(agl_m, gsd_m, tile_px, expected):
+    view = ViewPlan.of(CAMERA, agl_m)
+    assert codes(view_cautions(view, gsd_m, tile_px)) == expected
+    assert view.tile_share(gsd_m * tile_px) < LEAST_TILE_SHARE or "tile_too_large" not in expected
+
+
+def test_speed_asks_for_views():
+    view = ViewPlan.of(CAMERA, 50)
+    assert rate_cautions(view, 100) == []
+    (caution,) = rate_cautions(view, 400)
+    assert caution.code == "fast" and "21 views a second" in caution.text
+
+
+FRAME = LocalFrame(46.5, 2.5)
+ENDS = np.array([[0.0, 0.0], [0.0, 4000.0], [2000.0, 4000.0]])
+PLACES = tuple(zip(*(each.tolist() for each in FRAME.latlon_from_en(ENDS)), strict=True))
+
+
+def slope(lat, lon):
+    """300 m above the sea at the first waypoint, 5 m more every 100 m to the north."""
+    return 300 + FRAME.en_from_latlon(lat, lon)[..., 1] * 0.05
+
+
+@pytest.mark.parametrize(
+    "heights, agl_m, expected",
+    [
+        ((), 400, [(400, 400), (400, 400)]),
+        ((Height(700, "amsl"),) * 3, None, [(200, 400), (200, 200)]),
+        ((Height(400, "home"),) * 3, None, [(200, 400), (200, 200)]),
+        ((Height(400, "agl"),) * 3, None, [(400, 400), (400, 400)]),
+        ((Height(700, "amsl"), Height(900, "amsl"), None), 150, [(400, 400), (150, 150)]),
+        ((Height(400), Height(400), Height(400)), 250, [(250, 250), (250, 250)]),
+    ],
+)
+def test_height_above_ground_leg_by_leg(heights, agl_m, expected):
+    legs = profile(Route(PLACES, heights), (100.0, 100.0), agl_m, 200.0, slope)
+    assert [leg.length_m for leg in legs] == pytest.approx([4000, 2000], abs=0.1)
+    assert [leg.ground_m for leg in legs] == [
+        pytest.approx((300, 500), abs=0.1),
+        pytest.approx((500, 500), abs=0.1),
+    ]
+    for leg, over in zip(legs, expected, strict=True):
+        assert leg.agl_m == pytest.approx(over, abs=0.2)
+    assert legs[0].relief == pytest.approx(10 / expected[0][0], rel=0.15)
+
+
+def test_home_is_where_the_plan_says():
+    route = Route(PLACES, (Height(100, "home"),) * 3, home_amsl_m=700)
+    assert profile(route, (1.0, 1.0), None, 0.0, slope)[1].agl_m == pytest.approx(
+        (300, 300), abs=0.1
+    )
+
+
+def test_hills_and_collisions_are_told():
+    route = Route(PLACES, (Height(450, "amsl"),) * 3)
+    low = profile(route, (10.0, 10.0), None, 100.0, slope)
+    assert codes(terrain_cautions(low)) == ["ground"]
+    bent = profile(Route(PLACES), (10.0, 10.0), 80, 200.0, slope)
+    (caution,) = terrain_cautions(bent)
+    assert caution.code == "relief" and "13% of the height on legs 1, 2" in caution.text
+    beside = profile(Route(PLACES), (10_000.0, 10.0), 80, 0.0, slope)
+    assert terrain_cautions(beside) == []
+    landing = Route(PLACES, (Height(0, "home"), Height(300, "home"), Height(300, "home")))
+    assert codes(terrain_cautions(profile(landing, (9.0, 9.0), None, 100.0, slope))) == ["relief"]
+
+
+def test_a_hill_beside_the_leg_counts_within_the_band():
+    def wall(lat, lon):
+        return np.where(FRAME.en_from_latlon(lat, lon)[..., 0] > 500, 100.0, 0.0)
+
+    route = Route(PLACES[:2])
+    assert profile(route, (890.0,), 300, 100.0, wall)[0].relief == 0
+    (leg,) = profile(route, (960.0,), 300, 100.0, wall)
+    assert leg.relief == pytest.approx(1 / 3, rel=0.01) and leg.agl_m == (300, 300)
+
+
+def test_what_is_not_known_is_told():
+    with pytest.raises(RouteError, match=r"leg 1 is flown.*--agl-m"):
+        profile(Route(PLACES), (1.0, 1.0), None, 10.0, slope)
+    nowhere = lambda lat, lon: np.full(lat.shape, np.nan)  # noqa: E731
+    with pytest.raises(RouteError, match="does not reach leg 1"):
+        profile(Route(PLACES), (1.0, 1.0), 100, 10.0, nowhere)
+
+
+def test_a_single_waypoint_has_a_profile():
+    (leg,) = profile(Route(PLACES[:1]), (100.0,), 100, 50.0, slope)
+    assert leg.length_m == 0 and leg.agl_m == (100, 100)

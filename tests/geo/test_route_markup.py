@@ -1,0 +1,184 @@
+"""Routes as KML, KMZ and GPX, and what such files can do to a reader."""
+
+import struct
+import zipfile
+from io import BytesIO
+
+import pytest
+
+from orthonav.errors import RouteError
+from orthonav.geo.route import Height, read_route
+from orthonav.geo.routes import kml, markup
+
+PLACES = ((46.5, 2.5), (46.51, 2.53), (46.49, 2.55))
+LINE = "<coordinates>\n 2.5,46.5,120 2.53,46.51,130\n\t2.55,46.49,140 </coordinates>"
+TRACK = (
+    "<gx:Track><when>2024-01-01T00:00:00Z</when><gx:coord>2.5 46.5 120</gx:coord>"
+    "<gx:coord/><gx:coord>2.53 46.51 130</gx:coord><gx:coord>2.55 46.49 140</gx:coord></gx:Track>"
+)
+
+
+def kml_of(*marks, namespaces=True):
+    spaces = 'xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2"'
+    inner = "".join(
+        f"<Placemark><name>{name}</name>{geometry}</Placemark>" for name, geometry in marks
+    )
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n'
+        f"<kml {spaces if namespaces else ''}><Document><Folder>{inner}</Folder></Document></kml>"
+    )
+
+
+def line(mode=None, coordinates=LINE):
+    told = f"<altitudeMode>{mode}</altitudeMode>" if mode else ""
+    return f"<LineString><tessellate>1</tessellate>{told}{coordinates}</LineString>"
+
+
+def archive(*members):
+    out = BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as zipped:
+        for name, text in members:
+            zipped.writestr(name, text)
+    return out.getvalue()
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read(content, name):
+        path = tmp_path / name.partition("#")[0]
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return read_route(tmp_path / name)
+
+    return read
+
+
+@pytest.mark.parametrize(
+    "geometry, frame",
+    [
+        (line(), None),
+        (line("clampToGround"), None),
+        (line("relativeToGround"), "agl"),
+        (line("absolute"), "amsl"),
+        (TRACK, None),
+        (TRACK.replace("<when>", "<altitudeMode>absolute</altitudeMode><when>"), "amsl"),
+        (f"<gx:MultiTrack>{TRACK}</gx:MultiTrack>", None),
+    ],
+)
+@pytest.mark.parametrize("namespaces", [True, False])
+def test_lines_and_tracks_of_kml(read, geometry, frame, namespaces):
+    point = ("start", "<Point><coordinates>1,2,0</coordinates></Point>")
+    route = read(kml_of(point, ("way", geometry), namespaces=namespaces), "a.kml")
+    assert route.waypoints == PLACES and route.name == "way"
+    told = tuple(Height(metres, frame) for metres in (120, 130, 140))
+    assert route.heights == (told if frame else ())
+
+
+def test_lines_of_one_placemark_are_joined_and_placemarks_picked_by_name(read):
+    halves = (
+        "<coordinates>2.5, 46.5 2.53, 46.51</coordinates>",
+        "<coordinates>2.55,46.49</coordinates>",
+    )
+    both = "".join(line(coordinates=half) for half in halves)
+    text = kml_of(
+        ("way", f"<MultiGeometry>{both}</MultiGeometry>"), ("é & b".replace("&", "&amp;"), TRACK)
+    )
+    assert read(text, "a.kml#way").waypoints == PLACES
+    assert read(text, "a.kml#é & b").waypoints == PLACES
+    with pytest.raises(RouteError, match="2 lines; name one as FILE#NAME: 'way', 'é & b'"):
+        read(text, "a.kml")
+
+
+def test_kmz_is_kml_in_an_archive(read):
+    text = kml_of(("way", line()))
+    assert read(archive(("doc.kml", text), ("files/b.kml", "<x/>")), "a.kmz").waypoints == PLACES
+    assert read(archive(("way.KML", text), ("a.png", "x")), "a.kmz").waypoints == PLACES
+
+
+GPX = """<?xml version="1.0"?>
+<gpx version="1.1" creator="test" xmlns="http://www.topografix.com/GPX/1/1">
+<wpt lat="1" lon="1"/>{}</gpx>"""
+POINTS = '<{0} lat="46.5" lon="2.5"><ele>120</ele></{0}><{0} lat="46.51" lon="2.53"/>'
+LAST = '<{0} lat="46.49" lon="2.55"><time>2024-01-01T00:00:00Z</time></{0}>'
+ROUTE = "<rte><name>planned</name>" + (POINTS + LAST).format("rtept") + "</rte>"
+SEGMENTS = (
+    f"<trk><name>flown</name><trkseg>{POINTS}</trkseg><trkseg/><trkseg>{LAST}</trkseg></trk>"
+).format("trkpt")
+
+
+@pytest.mark.parametrize("inner, name", [(ROUTE, "planned"), (SEGMENTS, "flown")])
+@pytest.mark.parametrize("version", ["1/0", "1/1"])
+def test_routes_and_tracks_of_gpx(read, inner, name, version):
+    route = read(GPX.format(inner).replace("1/1", version), "a.gpx")
+    assert route.waypoints == PLACES and route.name == name
+    assert route.heights == (Height(120, "amsl"), None, None)
+
+
+def test_a_route_comes_before_a_track_and_names_choose(read):
+    assert read(GPX.format(SEGMENTS + ROUTE), "a.gpx").name == "planned"
+    two = GPX.format(ROUTE + ROUTE.replace("planned", "other"))
+    assert read(two, "a.gpx#other").name == "other"
+    with pytest.raises(RouteError, match="'planned', 'other'"):
+        read(two, "a.gpx")
+
+
+BOMB = '<!DOCTYPE lolz [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]><kml>&b;</kml>'
+OUTSIDE = '<!DOCTYPE kml SYSTEM "file:///etc/passwd"><kml/>'
+
+
+@pytest.mark.parametrize(
+    "name, content, message",
+    [
+        ("a.kml", "", "KML file is empty"),
+        ("a.kml", "<kml>", "no well-formed XML"),
+        ("a.kml", b"\x89PNG\r\n\x1a\n", "no well-formed XML"),
+        ("a.kml", '<?xml version="1.0" encoding="klingon"?><kml/>', "KML file"),
+        ("a.kml", BOMB, "has a DOCTYPE"),
+        ("a.kml", OUTSIDE, "has a DOCTYPE"),
+        ("a.gpx", OUTSIDE.replace("<kml/>", "<gpx/>"), "has a DOCTYPE"),
+        ("a.kml", "<kml>" + "<a>" * 100, "more than .* 100 levels"),
+        ("a.kml", "<gpx/>", "must begin with <kml>, got <gpx>"),
+        ("a.kml", "<kml/>", "holds no placemark with a geometry"),
+        ("a.kml", kml_of(("a", "<Point/>"), ("b", "<Polygon/>")), "it holds Point, Polygon"),
+        ("a.kml", kml_of(("a", line(coordinates=""))), "no LineString"),
+        ("a.kml", kml_of(("a", line(coordinates=LINE.replace("46.51", "x")))), "must be a number"),
+        ("a.kml", kml_of(("a", line(coordinates=LINE.replace("46.51", "96")))), "not a latitude"),
+        ("a.kml", kml_of(("a", line(coordinates=LINE.replace(",46.51", "")))), "not a latitude"),
+        ("a.kml", kml_of(("a", line(coordinates=LINE.replace(",130", ",1,1")))), "longitude,lat"),
+        ("a.kmz", b"PK\x03\x04 cut off", "no whole zip archive"),
+        ("a.kmz", archive(("a.txt", "x")), "one KML file, got 0"),
+        ("a.kmz", archive(("a.kml", "<kml/>"), ("b.kml", "<kml/>")), "one KML file, got 2"),
+        ("a.kmz", archive(("a.kml", "<kml/>" * 50))[:-60], "zip archive"),
+        ("a.gpx", "<kml/>", "must begin with <gpx>"),
+        ("a.gpx", GPX.format(""), "only 1 waypoints .wpt. without an order"),
+        ("a.gpx", "<gpx/>", "it holds nothing else"),
+        ("a.gpx", GPX.format("<rte/><trk><trkseg/></trk>"), "no route"),
+        ("a.gpx", GPX.format(ROUTE.replace('lat="46.51"', "")), "GPX point has no lat"),
+        ("a.gpx", GPX.format(ROUTE.replace("46.51", "nan")), "GPX lat must be a number"),
+        ("a.gpx", GPX.format(ROUTE.replace(">120<", ">high<")), "GPX ele must be a number"),
+    ],
+)
+def test_broken_and_harmful_files_are_refused(read, name, content, message):
+    with pytest.raises(RouteError, match=message):
+        read(content, name)
+
+
+def test_what_unpacks_to_too_much_is_refused(read, monkeypatch):
+    monkeypatch.setattr(kml, "MAX_KML_BYTES", 1000)
+    with pytest.raises(RouteError, match="KML in the KMZ is larger than"):
+        read(archive(("doc.kml", "<kml>" + " " * 100_000 + "</kml>")), "a.kmz")
+    monkeypatch.setattr(markup, "MAX_ELEMENTS", 10)
+    with pytest.raises(RouteError, match="more than 10 elements"):
+        read("<gpx>" + "<a/>" * 10 + "</gpx>", "a.gpx")
+
+
+def test_archives_of_many_members_or_with_a_password_are_refused(read):
+    whole = archive(("doc.kml", kml_of(("way", line()))))
+    at = whole.rindex(b"PK\x05\x06")
+    many = whole[: at + 8] + struct.pack("<2H", 20_000, 20_000) + whole[at + 12 :]
+    with pytest.raises(RouteError, match="more than 10,000 members"):
+        read(many, "a.kmz")
+    flag = whole.rindex(b"PK\x01\x02") + 8
+    locked = bytearray(whole)
+    locked[flag] |= 1
+    with pytest.raises(RouteError, match="cannot be unpacked"):
+        read(bytes(locked), "a.kmz")

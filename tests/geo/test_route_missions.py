@@ -1,0 +1,225 @@
+"""Missions as ground stations write them: plans of QGroundControl, waypoint files."""
+
+import json
+
+import pytest
+
+from orthonav.errors import RouteError
+from orthonav.geo.route import Height, Route, read_route
+
+HOME = [47.3977419, 8.545594, 487.989]
+A, B, C = (47.40, 8.55), (47.41, 8.56), (47.42, 8.57)
+
+
+def simple(command, place=(None, None), height=None, frame=3, **more):
+    params = [0, 0, 0, None, *place, height]
+    item = {"type": "SimpleItem", "command": command, "frame": frame, "params": params}
+    return item | {"autoContinue": True, "doJumpId": 1} | more
+
+
+def transects(kind, points, camera=None, **more):
+    inner = {
+        "CameraCalc": camera or {"DistanceToSurface": 60, "DistanceToSurfaceRelative": True},
+        "VisualTransectPoints": [list(point) for point in points],
+        "Items": [],
+        "version": 1,
+    }
+    return {
+        "type": "ComplexItem",
+        "complexItemType": kind,
+        "TransectStyleComplexItem": inner,
+        "version": 2,
+        **more,
+    }
+
+
+def plan(*items, home=HOME):
+    mission = {"items": list(items), "plannedHomePosition": home, "version": 2}
+    return {"fileType": "Plan", "groundStation": "QGroundControl", "mission": mission, "version": 1}
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read(document, name="a.plan"):
+        path = tmp_path / name
+        text = document if isinstance(document, str) else json.dumps(document)
+        path.write_text(text)
+        return read_route(path)
+
+    return read
+
+
+@pytest.mark.parametrize("name", ["a.plan", "a.json"])
+def test_waypoints_of_a_plan(read, name):
+    route = read(
+        plan(
+            simple(22, A, 50),
+            simple(178, height=5),  # speed
+            simple(16, B, 60, frame=0),
+            simple(206),  # camera
+            simple(195, (1.0, 1.0), 3, frame=0),  # region of interest
+            simple(82, C, 70, frame=10),
+            simple(21, A, 0),
+        ),
+        name,
+    )
+    assert route.waypoints == (A, B, C, A)
+    frames = ("home", 50), ("amsl", 60), ("agl", 70), ("home", 0)
+    assert route.heights == tuple(Height(height, frame) for frame, height in frames)
+    assert route.home_amsl_m == HOME[2] and route.leg_bands_m == ()
+
+
+def test_a_plan_goes_home_and_takes_off_there(read):
+    home = (HOME[0], HOME[1])
+    route = read(plan(simple(22, height=50), simple(16, A, 50), simple(20), simple(16, B, 1)))
+    assert route.waypoints == (home, A, home)
+    assert route.heights == (None, Height(50, "home"), None)
+    assert read(plan(simple(16, A, 5), simple(20), home=[0, 0, 0])).waypoints == (A,)
+    assert read(plan(simple(16, A), simple(17, (0, 0), 5), simple(16, B))).waypoints == (A, B)
+
+
+def test_heights_above_terrain_that_a_plan_summed_up_itself(read):
+    route = read(plan(simple(16, A, 512.5, frame=0, AltitudeMode=3, Altitude=40)))
+    assert route.heights == (Height(40, "agl"),)
+    old = {"type": "SimpleItem", "command": 16, "frame": 3, "coordinate": [*A, 33], "param1": 0}
+    assert read(plan(old)).heights == (Height(33, "home"),)
+
+
+@pytest.mark.parametrize(
+    "camera, frame",
+    [
+        ({"DistanceToSurface": 60, "DistanceToSurfaceRelative": True}, "home"),
+        ({"DistanceToSurface": 60, "DistanceToSurfaceRelative": False}, "amsl"),
+        ({"DistanceToSurface": 60, "DistanceMode": 1}, "home"),
+        ({"DistanceToSurface": 60, "DistanceMode": 2}, "amsl"),
+        ({"DistanceToSurface": 60, "DistanceMode": 3}, "agl"),
+        ({"DistanceToSurface": 60, "DistanceMode": 4}, "agl"),
+    ],
+)
+def test_a_survey_is_flown_along_its_transects(read, camera, frame):
+    polygon = [list(A), list(B), list(C)]
+    route = read(plan(transects("survey", (A, C, B), camera, polygon=polygon)))
+    assert route.waypoints == (A, C, B)
+    assert route.heights == (Height(60, frame),) * 3 and route.leg_bands_m == ()
+
+
+def test_terrain_of_an_older_survey(read):
+    survey = transects("survey", (A, B))
+    survey["TransectStyleComplexItem"]["FollowTerrain"] = True
+    assert read(plan(survey)).heights == (Height(60, "agl"),) * 2
+
+
+def test_a_corridor_has_a_band_of_its_own(read):
+    corridor = transects("CorridorScan", (A, B, C), CorridorWidth=50, polyline=[list(A), list(C)])
+    other = transects("CorridorScan", (C, A), CorridorWidth=70, EntryPoint=0)
+    route = read(plan(simple(16, C, 9), corridor, other, simple(16, B, 9)))
+    assert route.waypoints == (C, A, B, C, C, A, B)
+    assert route.leg_bands_m == (None, 50, 50, None, 70, None)
+    assert route.bands_m(300) == (300, 50, 50, 300, 70, 300)
+    along = transects("CorridorScan", (A, B), CorridorWidth=0)  # flown over the line itself
+    assert read(plan(along)).leg_bands_m == ()
+
+
+@pytest.mark.parametrize("kind", ["fwLandingPattern", "vtolLandingPattern"])
+@pytest.mark.parametrize("approach", ["landingApproachCoordinate", "loiterCoordinate"])
+def test_a_landing_pattern_is_flown_to_its_end(read, kind, approach):
+    landing = {
+        "type": "ComplexItem",
+        "complexItemType": kind,
+        approach: [*B, 40],
+        "landCoordinate": [*C, 0],
+        "altitudesAreRelative": False,
+    }
+    route = read(plan(simple(16, A, 50), landing))
+    assert route.waypoints == (A, B, C)
+    assert route.heights[1:] == (Height(40, "amsl"), Height(0, "amsl"))
+
+
+@pytest.mark.parametrize(
+    "document, message",
+    [
+        ("", "is empty"),
+        ("{", "cannot be read as JSON"),
+        ("[]", "must be a JSON object"),
+        ({"fileType": "Parameters"}, "fileType 'Plan', got 'Parameters'"),
+        ({"fileType": "Plan"}, "must hold a mission"),
+        ({"fileType": "Plan", "mission": {"items": 3}}, "list of items"),
+        (plan(), "no waypoint with a place"),
+        (plan(simple(206)), "no waypoint with a place"),
+        (plan(3), "item 1 of the plan must be an object"),
+        (plan({"type": "Other"}), "SimpleItem or a ComplexItem, got 'Other'"),
+        (plan(simple(16, A) | {"params": [1, 2]}), "item 1 of the plan must have 7 params"),
+        (plan(simple(16, ("47", 8))), "params must be a number, got '47'"),
+        (plan(simple(16, A, frame=1)), "MAV_FRAME 1; expected a global one"),
+        (plan(simple("16", A)), "command must be a number"),
+        (plan(simple(16, (91, 8), 5)), "not a latitude"),
+        (plan(simple(16, A, 1e9)), "height of a waypoint"),
+        (plan(home=["x", 8, 0]), "plannedHomePosition must be a number"),
+        (
+            plan(simple(16, A), {"type": "ComplexItem", "complexItemType": "StructureScan"}),
+            "item 2 of the plan is a 'StructureScan': only surveys, .*take it out",
+        ),
+        (plan(transects("survey", ())), "item 1 of the plan .survey. has no Visual"),
+        (plan({"type": "ComplexItem", "complexItemType": "survey"}), "no VisualTransectPoints"),
+        (plan(transects("survey", ((1,),))), r"must be \[latitude, longitude\]"),
+        (plan(transects("CorridorScan", (A, B), CorridorWidth=-5)), "band of a leg must be wider"),
+        (
+            plan({"type": "ComplexItem", "complexItemType": "fwLandingPattern"}),
+            r"\(fwLandingPattern\) must be \[latitude",
+        ),
+    ],
+)
+def test_plans_that_are_none_are_refused(read, document, message):
+    with pytest.raises(RouteError, match=message):
+        read(document)
+
+
+WPL = """QGC WPL 110
+0\t1\t0\t16\t0\t0\t0\t0\t47.39\t8.54\t488\t1
+# a comment
+1\t0\t3\t22\t15\t0\t0\t0\t0\t0\t50\t1
+2\t0\t3\t16\t0\t0\t0\t0\t47.40\t8.55\t60\t1
+3\t0\t3\t178\t0\t12\t0\t0\t0\t0\t0\t1
+4\t0\t10\t82\t0\t0\t0\t0\t47.41\t8.56\t70\t1
+5\t0\t0\t18\t3\t0\t0\t0\t47.42\t8.57\t600\t1
+6\t0\t3\t17\t0\t0\t0\t0\t0\t0\t70\t1
+7\t0\t3\t177\t2\t3\t0\t0\t0\t0\t0\t1
+8\t0\t0\t20\t0\t0\t0\t0\t0\t0\t0\t1
+"""
+
+
+@pytest.mark.parametrize("name", ["a.waypoints", "a.txt", "a.TXT", "a.csv"])
+def test_a_waypoint_file(read, name):
+    home = (47.39, 8.54)
+    route = read(WPL, name)
+    assert route.waypoints == (home, A, B, C, home)
+    heights = Height(60, "home"), Height(70, "agl"), Height(600, "amsl")
+    assert route == Route(route.waypoints, (None, *heights, None), home_amsl_m=488)
+    assert read(WPL.replace("\t", " ").replace("\n", "\r\n"), name) == route
+
+
+def test_older_waypoint_files_have_no_home(read):
+    text = WPL.replace("110", "120").split("\n6\t")[0]
+    assert read(text, "a.txt").waypoints == ((47.39, 8.54), A, B, C)
+    nowhere = WPL.replace("47.39\t8.54\t488", "0\t0\t0")
+    assert read(nowhere, "a.txt").waypoints == (A, B, C)
+    assert read(nowhere, "a.txt").home_amsl_m is None
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("", "is empty"),
+        ("QGC WPL 110\n", "no waypoint with a place"),
+        ("QGC WPL 100\n1", "must begin with 'QGC WPL 110', got 'QGC WPL 100'"),
+        ("QGC WPL 110\n1\t2\n", "line 2 of the waypoint file has 2 values, expected 12"),
+        (WPL.replace("47.40", "north"), "line 5, column 9 must be a number"),
+        (WPL.replace("47.40", "nan"), "line 5, column 9 must be a number"),
+        (WPL.replace("47.40", "470"), "not a latitude"),
+        (WPL.replace("\t82\t", "\t82.5\t"), "line 7: frame and command must be whole"),
+        (WPL.replace("4\t0\t10", "4\t0\t1"), "MAV_FRAME 1"),
+    ],
+)
+def test_waypoint_files_that_are_none_are_refused(read, text, message):
+    with pytest.raises(RouteError, match=message):
+        read(text, "a.waypoints")

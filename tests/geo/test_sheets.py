@@ -1,0 +1,128 @@
+"""Areas too large for a sheet: the parts fit, and together they are the whole."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from orthonav.errors import AreaError
+from orthonav.geo.area import Area
+from orthonav.geo.frames import MAX_SHEET_M
+from orthonav.geo.route import Height, Route, leg_lengths_m, read_route
+from orthonav.geo.sheets import sheets_of_bounds, sheets_of_route
+
+
+def across_m(area):
+    west, south, east, north = area.extent_en_m
+    return max(east - west, north - south)
+
+
+@settings(max_examples=40)
+@given(
+    st.floats(-80, 78),
+    st.floats(-180, 178),
+    st.floats(0.01, 2),
+    st.floats(0.01, 3),
+    st.floats(0, 1),
+    st.floats(0, 1),
+)
+def test_boxes_fit_and_hold_every_place(south, west, height, width, up, right):
+    sheets = sheets_of_bounds((west, south, west + width, south + height))
+    assert max(across_m(Area.from_bounds(sheet)) for sheet in sheets) <= MAX_SHEET_M
+    lat, lon = south + up * height, west + right * width
+    lon = lon - 360 if lon > 180 else lon
+    inside = [
+        low - 1e-9 <= lat <= high + 1e-9
+        and left - 1e-9 <= lon + 360 * (lon < left - 180) <= right + 360 * (right < left) + 1e-9
+        for left, low, right, high in sheets
+    ]
+    assert any(inside)
+    size_deg2 = sum((e - w) % 360 * (n - s) for w, s, e, n in sheets)
+    assert size_deg2 == pytest.approx(width * height, rel=1e-6)
+
+
+def test_a_box_that_fits_stays_as_it_is():
+    assert sheets_of_bounds((2.4, 46.4, 2.6, 46.6)) == [(2.4, 46.4, 2.6, 46.6)]
+    assert len(sheets_of_bounds((2.0, 46.0, 3.0, 47.0))) == 6
+    sheets = sheets_of_bounds((179.5, -17.5, -179.5, -17.0))
+    edges = np.array([(west, east) for west, _, east, _ in sheets[:3]])
+    third = 179.5 + 1 / 3
+    np.testing.assert_allclose(edges, [(179.5, third), (third, -third), (-third, -179.5)])
+
+
+@pytest.mark.parametrize(
+    "bounds, message",
+    [
+        ((3, 1, 2, 2), "west < east"),
+        ((1, 2, 2, 1), "south < north"),
+        ((1, 1, np.nan, 2), "bounds must be"),
+        ((1, 89, 2, 90), "within 89.5 deg"),
+        ((-180, -80, 180, 80), "at most 10,000"),
+    ],
+)
+def test_bounds_that_cannot_be_cut_are_refused(bounds, message):
+    with pytest.raises(AreaError, match=message):
+        sheets_of_bounds(bounds)
+
+
+steps = st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6))
+
+
+@settings(max_examples=40)
+@given(st.floats(-60, 60), st.floats(-180, 180), st.lists(steps, min_size=1, max_size=6), st.data())
+def test_parts_of_a_route_fit_and_follow_each_other(lat, lon, turns, data):
+    places = np.cumsum([(lat, lon), *turns], axis=0)
+    places[:, 0] = np.clip(places[:, 0], -80, 80)
+    bands = data.draw(st.lists(st.floats(10, 9000), min_size=len(turns), max_size=len(turns)))
+    heights = tuple(Height(100.0 * each, "agl") for each in range(len(places)))
+    route = Route(tuple(map(tuple, places.tolist())), heights, tuple(bands))
+    parts = sheets_of_route(route, None)
+    assert max(across_m(Area.from_route(part)) for part in parts) <= MAX_SHEET_M
+    for before, after in pairwise(parts):
+        assert before.waypoints[-1] == after.waypoints[0]
+        assert before.heights[-1] == after.heights[0]
+        whole = before.waypoints + after.waypoints[1:2]
+        with pytest.raises(AreaError):  # each part as long as fits
+            longer = before.leg_bands_m + after.leg_bands_m[:1]
+            Area.from_route(Route(whole, leg_bands_m=longer))
+    if len(parts) == 1:
+        assert parts == [route]
+    found = [place for part in parts for place in part.waypoints]
+    assert [place for place in found if place in route.waypoints][-1] == route.waypoints[-1]
+    assert set(route.waypoints) <= set(found)
+    length = sum(leg_lengths_m(part).sum() for part in parts)
+    assert length == pytest.approx(leg_lengths_m(route).sum(), rel=1e-3)
+    assert {band for part in parts for band in part.leg_bands_m} == set(bands)
+
+
+def test_a_leg_longer_than_a_sheet_is_cut():
+    parts = sheets_of_route(read_route("paper:C@46.6,1.9"), None)
+    assert [part.name for part in parts] == ["sheet-1", "sheet-2"]
+    assert [leg_lengths_m(part).sum() for part in parts] == pytest.approx(
+        [25_000, 25_000], rel=1e-3
+    )
+    assert {height for part in parts for height in part.heights} == {Height(4000, "agl")}
+    whole = sheets_of_route(read_route("paper:C@46.6,1.9,45"), None)  # its corners are nearer
+    assert len(whole) == 1
+
+
+def test_many_waypoints_are_cut_quickly():
+    lat = np.linspace(46, 50, 20_000)
+    route = Route(tuple((value, 2.0) for value in lat.tolist()))
+    parts = sheets_of_route(route, 1000)
+    assert len(parts) == 10 and sum(part.legs for part in parts) == route.legs
+
+
+@pytest.mark.parametrize(
+    "route, band_m, message",
+    [
+        (Route(((46, 2), (47, 3))), None, "width of its search band"),
+        (Route(((46, 2), (47, 3))), 50_000, "as wide as a sheet"),
+        (Route(((0, 0), (0, 180))), 100, "half around the Earth"),
+    ],
+)
+def test_routes_that_cannot_be_cut_are_refused(route, band_m, message):
+    with pytest.raises(AreaError, match=message):
+        sheets_of_route(route, band_m)

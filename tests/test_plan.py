@@ -1,0 +1,199 @@
+"""`orthonav plan`: routes, views, maps, sheets and terrain, as text and as JSON."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from pyproj import Transformer
+
+from orthonav.cli.dem import read_dem
+from orthonav.errors import ImageryError, MissingFileError
+from orthonav.geo.frames import LocalFrame
+from orthonav.geo.route import Height, Route, read_route
+from orthonav.mapfile import open_map
+
+FRAME = LocalFrame(46.5, 2.5)
+CORNERS_EN_M = [(-1500.0, -1500.0), (-1500.0, 1500.0), (1500.0, 1500.0)]
+
+
+def places_of(points_en_m, frame=FRAME):
+    return tuple(zip(*(each.tolist() for each in frame.latlon_from_en(points_en_m)), strict=True))
+
+
+@pytest.fixture
+def camera(tmp_path):
+    path = tmp_path / "flight.json"
+    plain = {"width_px": 1280, "height_px": 960, "fx_px": 1000, "fy_px": 1000}
+    path.write_text(json.dumps({"camera": plain | {"cx_px": 640, "cy_px": 480}}))
+    return path
+
+
+@pytest.fixture
+def dem(tmp_path):
+    """Terrain of 6 x 6 km, 300 m high in the middle, 5 m more every 100 m to the north."""
+    import rasterio
+    from rasterio.transform import Affine
+
+    path = tmp_path / "dem.tif"
+    north = 3000 - 10.0 * (np.arange(600) + 0.5)
+    heights = np.repeat((300 + 0.05 * north)[:, None], 600, axis=1).astype(np.float32)
+    heights[:5, :5] = -9999
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        count=1,
+        height=600,
+        width=600,
+        dtype="float32",
+        crs=FRAME.proj4,
+        transform=Affine(10, 0, -3000, 0, -10, 3000),
+        nodata=-9999,
+    ) as data:
+        data.write(heights[None])
+    return path
+
+
+@pytest.fixture
+def table(tmp_path):
+    """An L of 3 + 3 km, flown 700 m above the sea, the first leg with a band of its own."""
+    path = tmp_path / "route.csv"
+    rows = [f"{lat},{lon},700" for lat, lon in places_of(CORNERS_EN_M)]
+    lines = [f"{row},{band}" for row, band in zip(rows, (300, "", ""), strict=True)]
+    path.write_text("\n".join(["lat,lon,amsl_m,band_m", *lines]))
+    return path
+
+
+def test_a_plan_for_people(run, camera, table, dem, tmp_path):
+    out = tmp_path / "route.geojson"
+    done = run(
+        "plan", "--route", table, "--band-m", 500, "--camera", camera, "--agl-m", 400,
+        "--speed-mps", 25, "--dem", dem, "--out", out,
+    )  # fmt: skip
+    assert (done.code, done.err) == (0, "")
+    assert "3 waypoints, 6.00 km, 240 s, heights above amsl, 1 leg with a band" in done.out
+    assert "512 x 384 m from 400 m, 0.4 m a pixel" in done.out
+    assert "--gsd-m 1.5 --tile-px 256" in done.out
+    assert "225..375      325..475" in done.out and "sheets" not in done.out
+    assert read_route(out) == read_route(table)
+
+
+def test_a_plan_for_programs(run, camera, table, dem):
+    done = run(
+        "plan", "--route", table, "--band-m", 500, "--camera", camera, "--agl-m", 400,
+        "--dem", dem, "--json",
+    )  # fmt: skip
+    plain = json.loads(done.out)
+    assert plain["route"]["length_m"] == pytest.approx(6000, abs=1)
+    assert plain["route"]["heights_above"] == ["amsl"]
+    assert plain["view"]["across_px"] == pytest.approx(
+        plain["view"]["width_m"] * 0.75**0.5 / 1.5, 0.01
+    )
+    made = plain["map"]
+    assert made["tiles"] > 400 and made["map_mb"][0] < made["map_mb"][1]
+    assert made["area_km2"] < made["imagery_km2"] and len(made["sheets"]) == 1
+    legs = plain["terrain"]
+    assert legs[1]["agl_m"] == pytest.approx([325, 325], abs=1)
+    assert legs[0]["relief"] == pytest.approx(0.05 * 384 / 325, rel=0.1)
+    assert [each["code"] for each in plain["cautions"]] == ["relief"]
+
+
+def test_the_height_is_that_of_the_route_over_terrain(run, camera, table, dem):
+    sizes = ["--band-m", 500, "--camera", camera, "--json"]
+    plain = json.loads(run("plan", "--route", table, "--dem", dem, *sizes).out)
+    assert plain["view"]["agl_m"] == pytest.approx(325, abs=1)
+    assert run("plan", "--route", table, *sizes).code == 1  # above the sea says nothing alone
+    plain = json.loads(run("plan", "--route", "paper:A@46.5,2.5", *sizes).out)
+    assert plain["view"]["agl_m"] == 40 and plain["map"]["tile_px"] == 128
+    assert [each["code"] for each in plain["cautions"]] == ["low"]
+
+
+def test_a_large_area_is_cut_into_sheets(run, camera, tmp_path):
+    out = tmp_path / "c.geojson"
+    done = run("plan", "--route", "paper:C@46.6,1.9", "--camera", camera, "--out", out)
+    assert done.code == 0 and f"--route {out}#sheet-2" in done.out
+    assert read_route(f"{out}#sheet-2").heights == (Height(4000, "agl"),) * 2
+    done = run("plan", "--bounds=-1,46,1,47", "--gsd-m", 2, "--json")
+    sheets = json.loads(done.out)["map"]["sheets"]
+    assert len(sheets) == 12 and sheets[0]["bounds_deg"] == [-1, 46, -0.5, 46.333333]
+    text = run("plan", "--bounds=-1,46,2,47", "--gsd-m", 2, "--no-registration").out
+    assert "--bounds=-1,46,-0.4,46.333333" in text and ".. and 3 more (--json)" in text
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["--route", "paper:B@46.6,1.9"], "--gsd-m), or with what"),
+        (["--route", "none.kml", "--gsd-m", 1], "does not exist: none.kml"),
+        (["--bounds", "1,46,2,47", "--gsd-m", 1, "--band-m", 5], "need a route"),
+        (["--bounds", "1,46,2,47", "--gsd-m", 0], "ground resolution must be above 0"),
+        (["--bounds", "2,46,1,47", "--gsd-m", 1], "west < east"),
+        (["--route", "TABLE", "--gsd-m", 1], "width of its search band"),
+        (["--route", "TABLE", "--band-m", 99, "--camera", "CAMERA"], "needs the height above"),
+        (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--speed-mps", 0], "speed must be above"),
+        (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--dem", "none.tif"], "none.tif"),
+        (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--dem", "DEM"], "beside the terrain"),
+    ],
+)
+def test_what_cannot_be_planned_is_told(run, table, camera, dem, arguments, message):
+    files = {"TABLE": table, "CAMERA": camera, "DEM": dem}
+    done = run("plan", *(files.get(argument, argument) for argument in arguments))
+    assert done.code == 1 and message in done.err and done.out == ""
+
+
+def test_wrong_usage(run):
+    assert run("plan").code == 2
+    assert run("plan", "--route", "a.csv", "--bounds", "1,2,3,4").code == 2
+
+
+def test_help_loads_no_heavy_library():
+    script = "import sys; from orthonav.cli import main\ntry: main(['plan', '--help'])\n"
+    script += "except SystemExit: print({'numpy', 'cv2', 'rasterio'} & set(sys.modules))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.startswith("usage: orthonav plan") and done.stdout.endswith("set()\n")
+
+
+def test_terrain_is_read_where_it_is(dem, tmp_path):
+    ground = read_dem(dem, Route(places_of(CORNERS_EN_M)), 100)
+    east, north = np.meshgrid(np.linspace(-1500, 1500, 7), np.linspace(-1500, 1500, 7))
+    lat, lon = FRAME.latlon_from_en(np.stack([east.ravel(), north.ravel()], axis=1))
+    np.testing.assert_allclose(ground(lat, lon), 300 + 0.05 * north.ravel(), atol=0.05)
+    far = FRAME.latlon_from_en(np.array([[-2990.0, 2990.0], [9000.0, 0.0]]))
+    assert np.isnan(ground(*far)).all()  # no data, and beyond
+    with pytest.raises(MissingFileError, match="terrain file does not exist"):
+        read_dem(tmp_path / "none.tif", Route(((46.5, 2.5),)), 10)
+    (tmp_path / "broken.tif").write_bytes(b"II*\0")
+    with pytest.raises(ImageryError, match="terrain cannot be read"):
+        read_dem(tmp_path / "broken.tif", Route(((46.5, 2.5),)), 10)
+
+
+def test_the_bands_of_a_route_are_built_and_it_is_flown(run, make_ortho, tmp_path):
+    """The tiles of the map are those that the plan counted; `simulate` reads the same file."""
+    ortho = make_ortho(tmp_path / "past.tif", gsd_m=2.0)  # 800 m across
+    lon, lat = Transformer.from_crs(2154, 4326, always_xy=True).transform(700_400, 6_599_600)
+    frame = LocalFrame(lat, lon)
+    places = places_of([(-150.0, -150.0), (-150.0, 150.0), (150.0, 150.0)], frame)
+    path = tmp_path / "route.gpx"
+    points = "".join(f'<rtept lat="{lat}" lon="{lon}"/>' for lat, lon in places)
+    path.write_text(f"<gpx><rte>{points}</rte></gpx>")
+    table = tmp_path / "route.csv"
+    rows = [f"{lat};{lon};{band}" for (lat, lon), band in zip(places, (40, 120, ""), strict=True)]
+    table.write_text("\n".join(["lat;lon;band_m", *rows]))
+    sizes = ["--gsd-m", 2, "--tile-px", 64, "--overlap", 0.75]
+    planned = run("plan", "--route", table, *sizes, "--json")
+    made = run(
+        "build", "--ortho", ortho, "--route", table, *sizes, "--no-registration",
+        "--out", tmp_path / "a.onav",
+    )  # fmt: skip
+    assert (made.code, made.err) == (0, "")
+    sheet = open_map(tmp_path / "a.onav").manifest.sheets[0]
+    assert sheet.tiles == json.loads(planned.out)["map"]["tiles"]
+    flown = run(
+        "simulate", "--ortho", ortho, "--route", path, "--agl-m", 60, "--spacing-m", 100,
+        "--out", tmp_path / "flight", "--json",
+    )  # fmt: skip
+    assert json.loads(flown.out)["views"] == 7
