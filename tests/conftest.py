@@ -1,7 +1,9 @@
 """What many tests share: a generated area at two dates, a map of it, a flight over it."""
 
+import fcntl
 import logging
 import os
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,19 +42,46 @@ class SmallArea:
 
 
 @pytest.fixture(scope="session")
-def area(tmp_path_factory):
+def made_once(tmp_path_factory):
+    """Function that gives a folder which `make` fills, once for all processes that run tests."""
+    root = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        root = root.parent
+
+    def made(name, make):
+        folder, done = root / f"{name}-of-all", root / f"{name}-done"
+        with (root / f"{name}-lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not done.exists():
+                shutil.rmtree(folder, ignore_errors=True)  # of one that failed
+                folder.mkdir()
+                make(folder)
+                done.touch()
+        return folder
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def area(made_once):
     """Orthophotos of 1.2 x 1.0 km at 1 m, of two dates; not to be changed."""
-    folder = tmp_path_factory.mktemp("area")
-    dates = generate_area(folder, size_m=(1200.0, 1000.0), dates=DEFAULT_DATES[:2], seed=SEED)
+
+    def make(folder):
+        generate_area(folder, size_m=(1200.0, 1000.0), dates=DEFAULT_DATES[:2], seed=SEED)
+
+    dates = sorted(made_once("area", make).iterdir())
     return SmallArea(*dates, camera=Camera(320, 240, 250.0, 250.0, 160.0, 120.0), agl_m=375.0)
 
 
 @pytest.fixture(scope="session")
-def map_path(area, tmp_path_factory):
+def map_path(area, made_once):
     """A map of the first date: tiles of 128 px of 2.5 m; not to be changed."""
-    path = tmp_path_factory.mktemp("map") / "area.onav"
-    build_map(BuildRequest([area.past], path, tile_px=128, gsd_m=2.5, calibration_views=24))
-    return path
+
+    def make(folder):
+        out = folder / "area.onav"
+        build_map(BuildRequest([area.past], out, tile_px=128, gsd_m=2.5, calibration_views=24))
+
+    return made_once("map", make) / "area.onav"
 
 
 @pytest.fixture(scope="session")
@@ -62,21 +91,23 @@ def localizer(map_path):
 
 
 @pytest.fixture(scope="session")
-def flight_path(area, tmp_path_factory):
+def flight_path(area, made_once):
     """A flight of 30 views of the second date, with errors and no prior; not to be changed."""
-    path = tmp_path_factory.mktemp("flights") / "flight"
-    errors = Errors(yaw_std_deg=4.0, agl_std=0.03, lean_std_deg=3.0)
-    request = SimulateRequest(
-        [area.present],
-        path,
-        random=30,
-        agl_m=area.agl_m,
-        camera=area.camera,
-        errors=errors,
-        seed=SEED,
-    )
-    simulate_flight(request)
-    return path
+
+    def make(folder):
+        errors = Errors(yaw_std_deg=4.0, agl_std=0.03, lean_std_deg=3.0)
+        request = SimulateRequest(
+            [area.present],
+            folder / "flight",
+            random=30,
+            agl_m=area.agl_m,
+            camera=area.camera,
+            errors=errors,
+            seed=SEED,
+        )
+        simulate_flight(request)
+
+    return made_once("flight", make) / "flight"
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,6 @@
 """What many tests import. Not in `conftest.py`: any folder may have one of its own."""
 
+import functools
 from typing import NamedTuple
 
 import cv2
@@ -8,6 +9,11 @@ import numpy as np
 
 def textured(shape=(400, 400), seed=0):
     """A picture (H, W) uint8 of blots of many sizes, unlike itself everywhere."""
+    return _textured(tuple(shape), seed).copy()
+
+
+@functools.lru_cache(maxsize=16)
+def _textured(shape, seed):
     rng = np.random.default_rng(seed)
     total = np.zeros(shape, dtype=np.float32)
     for sigma in (1.5, 4.0, 12.0):

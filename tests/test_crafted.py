@@ -1,5 +1,7 @@
 """Files made to do harm: refused in one line, before they take memory or load anything."""
 
+import itertools
+import json
 import os
 import resource
 import shutil
@@ -32,22 +34,36 @@ def changed(path, parts=None, **changes):
     return path
 
 
-def refused(*arguments):
-    """What a command of its own with little memory says on stderr, one line."""
+MANY = """
+import json, sys
+import orthonav.cli as cli
+
+for arguments in json.loads(sys.argv[1]):
+    print(f"ended with {cli.main(arguments)}", file=sys.stderr)
+"""
+
+
+def refused(*commands):
+    """What commands in a process of their own with little memory say on stderr, a line each."""
     limit = lambda: resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))  # noqa: E731
     kept = {name: value for name, value in os.environ.items() if not name.startswith("OPENCV")}
     done = subprocess.run(
-        [sys.executable, "-c", "import sys, orthonav.cli as cli; sys.exit(cli.main())", *arguments],
+        [sys.executable, "-c", MANY, json.dumps([[*map(str, each)] for each in commands])],
         env=kept | {"OPENBLAS_NUM_THREADS": "1"},
         preexec_fn=limit,
         capture_output=True,
         text=True,
         timeout=60,
     )
-    assert done.returncode == 1 and done.stdout == ""
-    told = [line for line in done.stderr.splitlines() if line.startswith("orthonav: error: ")]
-    assert len(told) == 1 and "Traceback" not in done.stderr
-    return told[0]
+    assert done.returncode == 0 and done.stdout == "" and "Traceback" not in done.stderr
+    *parts, last = done.stderr.split("ended with 1\n")
+    assert len(parts) == len(commands) and last == ""
+    errors = [
+        [line for line in part.splitlines() if line.startswith("orthonav: error: ")]
+        for part in parts
+    ]
+    assert all(len(lines) == 1 for lines in errors)
+    return [lines[0] for lines in errors]
 
 
 def claiming(width, height, suffix):
@@ -65,13 +81,14 @@ def claiming(width, height, suffix):
 # Pictures.
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".png"])
-@pytest.mark.parametrize("side", [17_000, 32_000])
-def test_pictures_that_claim_gigapixels(flight_path, tmp_path, suffix, side):
-    flight = shutil.copytree(flight_path, tmp_path / "flight")
-    (flight / "frames" / "0001.jpg").write_bytes(claiming(side, side, suffix))
-    told = refused("localize", GOLDEN, flight, "--out", tmp_path / "fixes.jsonl", "-q")
-    assert "image of the flight cannot be decoded" in told and "0001.jpg" in told
+def test_pictures_that_claim_gigapixels(flight_path, tmp_path):
+    commands = []
+    for suffix, side in itertools.product((".jpg", ".png"), (17_000, 32_000)):
+        flight = shutil.copytree(flight_path, tmp_path / f"{side}{suffix}")
+        (flight / "frames" / "0001.jpg").write_bytes(claiming(side, side, suffix))
+        commands.append(("localize", GOLDEN, flight, "--out", tmp_path / "fixes.jsonl", "-q"))
+    for told in refused(*commands):
+        assert "image of the flight cannot be decoded" in told and "0001.jpg" in told
 
 
 def test_the_limit_of_pixels_holds_in_tests_too():
@@ -117,7 +134,7 @@ def test_a_map_of_what_does_not_fly(tmp_path, flight_path, monkeypatch):
             Localizer(open_map(path), registration=registration)
     with pytest.raises(ImportError, match="sam"):
         Localizer(open_map(path), flying=False)
-    told = refused("localize", path, flight_path, "--out", tmp_path / "fixes.jsonl")
+    (told,) = refused(("localize", path, flight_path, "--out", tmp_path / "fixes.jsonl"))
     assert "map cannot be flown ('sam' does not fly" in told
 
 
@@ -162,11 +179,12 @@ OPENCV = {
 }
 
 
-@pytest.mark.parametrize("how", OPENCV)
-def test_camera_files_that_are_too_deep_for_opencv(tmp_path, flight_path, how):
+def test_camera_files_that_are_too_deep_for_opencv(tmp_path, flight_path):
     """It ends the process otherwise: so in one of its own."""
-    path = tmp_path / "camera.yaml"
-    path.write_text(OPENCV[how])
-    out = tmp_path / "out"
-    told = refused("import", flight_path, "--camera", path, "--out", out)
-    assert "camera file has more than 5000 parts" in told and not out.exists()
+    out, commands = tmp_path / "out", []
+    for how, text in OPENCV.items():
+        path = tmp_path / f"{how}.yaml"
+        path.write_text(text)
+        commands.append(("import", flight_path, "--camera", path, "--out", out))
+    for how, told in zip(OPENCV, refused(*commands), strict=True):
+        assert "camera file has more than 5000 parts" in told and how in told and not out.exists()

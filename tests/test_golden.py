@@ -112,7 +112,7 @@ def test_the_view_is_placed_where_it_was(golden, maker):
 def test_the_same_imagery_gives_the_same_bytes_twice(tmp_path, maker):
     """Not those of the stored file: other machines round otherwise, and methods get better."""
     maker.write_ortho(tmp_path / "golden.tif", maker.ground())
-    request = {"gsd_m": 1.0, "tile_px": 96, "method": "gradient:dims=16"}
+    request = {"gsd_m": 1.0, "tile_px": 96, "method": "gradient:dims=16", "calibration_views": 4}
     paths = [tmp_path / "a.onav", tmp_path / "b.onav"]
     for path in paths:
         build_map(BuildRequest([tmp_path / "golden.tif"], path, **request))

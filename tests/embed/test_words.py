@@ -1,5 +1,6 @@
 """Bags of visual words: frequencies of known features, and places told apart by them."""
 
+import functools
 import json
 import pickle
 import subprocess
@@ -27,6 +28,7 @@ needs_faiss = pytest.mark.skipif(
 )
 
 
+@functools.cache
 def area(seed=0, size=700):
     """A picture of blots of many sizes, unlike itself everywhere."""
     rng = np.random.default_rng(seed)
@@ -34,7 +36,9 @@ def area(seed=0, size=700):
     for sigma in (1.5, 3.0, 8.0):
         blots = cv2.GaussianBlur(rng.normal(size=(size, size)).astype(np.float32), (0, 0), sigma)
         total += blots / blots.std()
-    return np.clip(128 + 32 * total, 0, 255).astype(np.uint8)
+    grey = np.clip(128 + 32 * total, 0, 255).astype(np.uint8)
+    grey.flags.writeable = False
+    return grey
 
 
 def tiles(grey, size=128, step=96):

@@ -90,7 +90,7 @@ def test_the_page_needs_nothing_from_outside(tmp_path: Path) -> None:
     assert all(image["alt"] for image in page.images)
 
 
-def test_the_page_says_the_figures_and_what_it_was_made_from(tmp_path: Path) -> None:
+def test_the_page_says_the_figures_and_what_it_was_made_from(tmp_path: Path, only_new) -> None:
     flight = made_flight(50)
     made_from = MadeFrom(
         map_name="brest.onav",
@@ -111,7 +111,7 @@ def test_the_page_says_the_figures_and_what_it_was_made_from(tmp_path: Path) -> 
     assert "Lowe&#x27;s ratio" in html
 
 
-def test_text_is_escaped(tmp_path: Path) -> None:
+def test_text_is_escaped(tmp_path: Path, coarse) -> None:
     nasty = '<img src=x onerror="1">&$\\frac'
     flight = made_flight(12, name=nasty)
     frames = (f"{nasty}\udcff", *flight.comparison.frames[1:])
@@ -127,7 +127,7 @@ def test_a_long_flight_over_a_noisy_background_stays_small(tmp_path: Path) -> No
     assert write_report(tmp_path, [flight]).stat().st_size < 1_000_000
 
 
-def test_several_flights_have_a_total(tmp_path: Path) -> None:
+def test_several_flights_have_a_total(tmp_path: Path, only_new) -> None:
     flights = [made_flight(30, name="one"), made_flight(20, name="two", seed=4)]
     whole = total(flights)
     assert whole.n_views == 50
@@ -146,7 +146,7 @@ def test_flights_at_different_radii_have_no_total() -> None:
         table([])
 
 
-def test_a_flight_without_any_fix_is_reported(tmp_path: Path) -> None:
+def test_a_flight_without_any_fix_is_reported(tmp_path: Path, coarse) -> None:
     flight = made_flight(6, share_fixed=0.0)
     html = write_report(tmp_path, [flight]).read_text("utf-8")
     assert "No view has a fix" in html
@@ -156,12 +156,12 @@ def test_a_flight_without_any_fix_is_reported(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("share_fixed", [0.0, 1.0])
-def test_a_flight_of_one_view_can_be_drawn(tmp_path: Path, share_fixed: float) -> None:
+def test_a_flight_of_one_view_can_be_drawn(tmp_path: Path, share_fixed: float, coarse) -> None:
     html = write_report(tmp_path, [made_flight(1, share_fixed)]).read_text("utf-8")
     assert len(Page(html).images) == PICTURES_PER_FLIGHT
 
 
-def test_unmatched_views_are_said(tmp_path: Path) -> None:
+def test_unmatched_views_are_said(tmp_path: Path, only_new) -> None:
     flight = made_flight(10)
     comparison = replace(flight.comparison, n_without_truth=3, n_without_result=2)
     flight = FlightReport("f", comparison, measure(comparison))

@@ -104,19 +104,6 @@ def drawn(n=200, seed=0, alike=0.0):
     return white @ np.linalg.cholesky(COV).T
 
 
-@pytest.fixture
-def coarse(monkeypatch) -> None:
-    """Pictures of few pixels, which is fast."""
-    monkeypatch.setattr("orthonav.evaluate.canvas.DPI", 20)
-
-
-@pytest.fixture
-def only_new(monkeypatch, coarse) -> None:
-    """Only pictures of tracks and of worst views are drawn."""
-    for name in ("plots.png", "calibration_plots.png", "calibration_plots.figure_png"):
-        monkeypatch.setattr(f"orthonav.evaluate.{name}", lambda *_: b"")
-
-
 # Consistency.
 
 

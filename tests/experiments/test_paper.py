@@ -92,7 +92,9 @@ def scene(area):
 
 @pytest.fixture(scope="module")
 def made(place, scene):
-    return runs.run(place, scene, Method("gradient", "gradient", "gradient"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("orthonav.prepare.calibrate.CROPS", 8)  # no confidence is looked at
+        return runs.run(place, scene, Method("gradient", "gradient", "gradient"))
 
 
 def test_map_covers_the_search_band(place, scene, made):

@@ -3,6 +3,8 @@
 The views are rendered by code that shares nothing with the program.
 """
 
+import functools
+
 import cv2
 import numpy as np
 import pyproj
@@ -47,16 +49,22 @@ def as_grey(values):
     return np.rint(np.clip(values, 0, 255)).astype(np.uint8)
 
 
-def rendered(ground, place_en_m, attitude, agl_m=AGL_M, camera=CAMERA):
-    """What the camera sees (H, W) uint8: forward-right-down body, Z-Y-X angles."""
+@functools.lru_cache(maxsize=8)
+def rays(camera):
+    """Where its pixels look, (H W, 3) forward, right, down."""
     cols, rows = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
     matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
     seen = np.stack([cols, rows], axis=-1).reshape(-1, 1, 2)
     lens = np.array(camera.distortion or (0.0, 0, 0, 0))
     right, down = cv2.undistortPoints(seen, matrix, lens)[:, 0].T
-    body = np.stack([-down, right, np.ones_like(right)], axis=-1)
-    ned = Rotation.from_euler("ZYX", attitude, degrees=True).apply(body)
-    north, east = (np.reshape(ned[:, i] / ned[:, 2] * agl_m, cols.shape) for i in (0, 1))
+    return np.stack([-down, right, np.ones_like(right)], axis=-1)
+
+
+def rendered(ground, place_en_m, attitude, agl_m=AGL_M, camera=CAMERA):
+    """What the camera sees (H, W) uint8: forward-right-down body, Z-Y-X angles."""
+    shape = camera.height_px, camera.width_px
+    ned = Rotation.from_euler("ZYX", attitude, degrees=True).apply(rays(camera))
+    north, east = (np.reshape(ned[:, i] / ned[:, 2] * agl_m, shape) for i in (0, 1))
     return as_grey(ground(place_en_m[0] + east, place_en_m[1] + north))
 
 

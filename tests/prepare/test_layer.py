@@ -217,14 +217,14 @@ def ortho(make_ortho, tmp_path_factory):
 
 
 def built(ortho, folder, name="map.onav", **request):
-    request = {"tile_px": 64, "overlap": 0.75, **request}
+    request = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2, **request}
     build_map(BuildRequest([ortho], folder / name, **request))
     return open_map(folder / name)
 
 
 @pytest.mark.parametrize("block_px", [1024, 150])
 def test_a_map_carries_its_imagery(ortho, tmp_path, monkeypatch, block_px):
-    monkeypatch.setattr("orthonav.prepare.build.BLOCK_PX", block_px)
+    monkeypatch.setattr("orthonav.prepare.sheet.BLOCK_PX", block_px)
     opened = built(ortho, tmp_path)
     sheet, layer = opened.manifest.sheets[0], GreyLayer.of(opened)
     with Mosaic.open([ortho]).grid_sheet(sheet.frame, sheet.grid) as raster:
@@ -295,6 +295,7 @@ def test_info_tells_of_the_layer(ortho, tmp_path, capsys):
 
 def test_the_command_can_leave_it_out(ortho, tmp_path, capsys):
     arguments = ["--ortho", str(ortho), "--tile-px", "64", "--overlap", "0.75", "-q"]
+    arguments += ["--calibration-views", "2"]
     out = tmp_path / "map.onav"
     assert main(["build", *arguments, "--no-registration", "--out", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["registration"] is None

@@ -43,6 +43,12 @@ def route_of(frame, *points_en_m):
     return Route(tuple(zip(*(c.tolist() for c in frame.latlon_from_en(points_en_m)), strict=True)))
 
 
+@pytest.fixture(scope="module")
+def exact(area, tmp_path_factory):
+    """A long flight without errors, and its true places."""
+    return flown(area, tmp_path_factory.mktemp("exact") / "f", random=180, seed=9)
+
+
 def ground_at(area, frame, place_en_m, gsd_m=1.0):
     """The orthophoto (S, S) around a place."""
     half = SIZE_PX * gsd_m / 2
@@ -91,12 +97,11 @@ def test_the_picture_shows_the_ground_at_the_truth(area, plane, tmp_path, camera
         assert np.hypot(*found[:, 2]) < 0.1 and alike > 0.9
 
 
-def test_errors_have_the_stated_size(area, plane, tmp_path):
+def test_errors_have_the_stated_size(area, plane, exact, tmp_path):
     """The same seed without errors is the same flight, told exactly."""
-    count = 180
     errors = Errors(yaw_std_deg=4.0, agl_std=0.05, tilt_std_deg=1.5, prior_std_m=30.0)
-    exact, truth = flown(area, tmp_path / "exact", random=count, seed=9)
-    erring, same = flown(area, tmp_path / "erring", random=count, errors=errors, seed=9)
+    exact, truth = exact
+    erring, same = flown(area, tmp_path / "f", random=len(truth), errors=errors, seed=9)
     assert truth == same
     pairs = [(a.telemetry, b.telemetry) for a, b in zip(exact.views, erring.views, strict=True)]
     yaw = np.array([(b.yaw_deg - a.yaw_deg + 180) % 360 - 180 for a, b in pairs])
@@ -115,13 +120,13 @@ def test_errors_have_the_stated_size(area, plane, tmp_path):
 
 
 def test_leaning_is_true_and_told(area, tmp_path):
-    flight, _ = flown(area, tmp_path / "f", random=150, errors=Errors(lean_std_deg=3.0))
+    flight, _ = flown(area, tmp_path / "f", random=100, errors=Errors(lean_std_deg=3.0))
     tilt = np.array([[v.telemetry.pitch_deg, v.telemetry.roll_deg] for v in flight.views])
     assert tilt.std() == pytest.approx(3.0, rel=0.15) and np.abs(tilt).max() <= 7.5
 
 
-def test_places_and_headings_are_anywhere(area, plane, tmp_path):
-    flight, truth = flown(area, tmp_path / "f", random=200)
+def test_places_and_headings_are_anywhere(plane, exact):
+    flight, truth = exact
     places = np.array([plane.frame.en_from_latlon(*value) for value in truth.values()])
     for step in (1.0, 8.0, 16.0, 40.0):
         rest = places.ravel() % step / step
