@@ -50,5 +50,9 @@ class OutputError(OrthonavError, OSError):
     """A result could not be written (disk full, no permission); nothing was left behind."""
 
 
+class FetchError(OrthonavError, OSError):
+    """Imagery could not be fetched: a service refused, has no such layer, or sent what is none."""
+
+
 class MissingExtraError(OrthonavError, ImportError):
     """An optional dependency is needed for this and is not installed."""

@@ -16,6 +16,8 @@ from orthonav.errors import OrthonavError
 
 COMMANDS = {
     "demo": "whole story on a generated area: build, fly, report",
+    "plan": "what a route, a camera and a height ask of a map",
+    "fetch": "get orthophotos of an area from open services",
     "build": "make a map from orthophotos",
     "info": "print what is in a map",
     "sign": "sign a map, or make a key for it",
@@ -25,6 +27,7 @@ COMMANDS = {
     "localize": "find where the views of a flight were taken",
     "fly": "beside an autopilot: positions from a live camera as messages",
     "evaluate": "compare fixes with the truth",
+    "view": "show a run in the browser: track, views beside the map, health; also while it flies",
     "simulate": "fly over an orthophoto of another year",
     "landscape": "generate an area: orthophotos of a landscape at several dates",
 }

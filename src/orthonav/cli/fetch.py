@@ -1,0 +1,313 @@
+"""`orthonav fetch`: get orthophotos of an area from open services."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from orthonav.cli.common import ROUTE_HELP, bounds, print_json, progress
+from orthonav.errors import FetchError
+
+if TYPE_CHECKING:
+    from orthonav.fetch import FetchRequest, Wish
+    from orthonav.geo.area import Area
+
+PACKAGE = "ign-package:"
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    _add_area(parser)
+    parser.add_argument(
+        "--source",
+        metavar="NAME[:YEAR]|PROTOCOL:ADDRESS",
+        help="a service by name, such as ign:2021, or wmts|wms|xyz|tms|stac|cog:https://..., or "
+        "ign-package:D003:2013 for all of a department (--out is a folder then)",
+    )
+    parser.add_argument("--list", action="store_true", help="list the services known by name")
+    parser.add_argument("--out", type=Path, metavar="ORTHO.tif")
+    parser.add_argument(
+        "--dry-run", action="store_true", help="say what it would cost, fetch nothing"
+    )
+    _add_choices(parser)
+    _add_terms(parser)
+    _add_politeness(parser)
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+
+
+def _add_area(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "area", nargs="?", metavar="ROUTE|W,S,E,N", help="planned route, or an area in degrees"
+    )
+    parser.add_argument("--route", type=Path, help=ROUTE_HELP)
+    parser.add_argument(
+        "--bounds",
+        type=bounds,
+        metavar="W,S,E,N",
+        help="area in degrees; write --bounds=W,S,E,N where W is negative",
+    )
+    parser.add_argument(
+        "--band-m", type=float, help="width of the search band of legs that have none of their own"
+    )
+    parser.add_argument(
+        "--margin-m", type=float, default=200.0, help="fetched around the area (default 200)"
+    )
+
+
+def _add_choices(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("which imagery")
+    group.add_argument(
+        "--gsd-m",
+        type=float,
+        help="ground resolution, metres per pixel: the service's next finer one, or exactly this "
+        "from a WMS (default 0.5; the files' own from stac and cog)",
+    )
+    group.add_argument("--zoom", help="zoom level or tile matrix instead of --gsd-m")
+    group.add_argument("--layer", help="layer of the service")
+    group.add_argument("--style", help="style of the layer")
+    group.add_argument("--format", help="such as image/jpeg or image/png")
+    group.add_argument("--crs", help="coordinate system, such as EPSG:2154, if there is a choice")
+    group.add_argument("--matrix-set", help="tile matrix set of a WMTS")
+    group.add_argument("--time", help="time, or interval A/B of a STAC, in ISO 8601")
+    group.add_argument("--wms-version", choices=("1.1.1", "1.3.0"), help="(default 1.3.0)")
+    group.add_argument("--tile-px", type=int, help="width of tiles (xyz, tms), of pictures (wms)")
+    group.add_argument("--max-zoom", type=int, help="deepest zoom that there is (xyz, tms)")
+    group.add_argument("--subdomains", default="abc", help="what {s} may be (default abc)")
+    group.add_argument("--collection", help="collection of a STAC")
+    group.add_argument("--asset", help="file of each item of a STAC")
+    group.add_argument("--bands", help="bands of files, such as 1,2,3 (stac, cog)")
+    group.add_argument(
+        "--nodata-colour",
+        choices=("black", "white"),
+        help="large patches of exactly this colour are no imagery",
+    )
+
+
+def _add_terms(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("what the file says of itself, where the name does not")
+    group.add_argument("--date", help="date of the imagery: YYYY, YYYY-MM, YYYY-MM-DD, or A/B")
+    group.add_argument("--licence", help="licence of the imagery")
+    group.add_argument("--attribution", help="who must be named")
+    group.add_argument("--compress", choices=("jpeg", "deflate"), default="jpeg")
+    group.add_argument("--quality", type=int, default=90, help="of JPEG, 1 to 100 (default 90)")
+
+
+def _add_politeness(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("how the service is asked")
+    group.add_argument(
+        "--key-env", metavar="VARIABLE", help="environment variable with the key for {key}"
+    )
+    group.add_argument("--parallel", type=int, default=4, help="requests at once (default 4)")
+    group.add_argument("--per-second", type=float, help="requests a second (default 10)")
+    group.add_argument("--retries", type=int, default=5, help="after a failure (default 5)")
+    group.add_argument("--max-tiles", type=int, default=50_000, help="(default 50000)")
+    group.add_argument("--max-mb", type=float, default=4000.0, help="(default 4000)")
+    group.add_argument(
+        "--allow-holes", action="store_true", help="write the file although tiles failed"
+    )
+    group.add_argument(
+        "--cache",
+        type=Path,
+        metavar="DIR",
+        help="keep what comes there (default: beside --out, removed in the end)",
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Fetch and print a summary, or print the services that are known."""
+    if options.list:
+        _print_presets(options.json)
+        return
+    if options.source is None or (options.out is None and not options.dry_run):
+        raise FetchError("name a --source (--list shows those known by name) and an --out")
+    if options.source.startswith(PACKAGE):
+        _run_package(options)
+        return
+    from orthonav.fetch import estimate_fetch, fetch
+
+    request = _request(options)
+    if options.dry_run:
+        estimate = estimate_fetch(request)
+        print_json(vars(estimate) | {"about": vars(estimate.about)}) if options.json else print(
+            f"would fetch {estimate.text()}"
+        )
+        return
+    with progress(options) as shown:
+        result = fetch(
+            request,
+            shown,
+            lambda estimate: _say(options, f"fetching {estimate.text()}"),
+        )
+    plain = {"out": str(options.out), **result.describe()}
+    if options.json:
+        print_json(plain)
+    else:
+        print(_summary(plain))
+
+
+def _request(options: argparse.Namespace) -> "FetchRequest":
+    from orthonav.fetch import FetchRequest, Limits, Packing, parse_source
+
+    if not (1 <= options.parallel <= 16 and 1 <= options.quality <= 100 and options.retries >= 0):
+        raise FetchError("--parallel is 1 to 16, --quality 1 to 100, --retries 0 or more")
+    rate = options.per_second if options.per_second is not None else 10.0
+    if not 0 < rate <= 50:
+        raise FetchError(f"--per-second is above 0 and at most 50, got {rate:g}")
+    spec = parse_source(
+        options.source,
+        _wish(options),
+        date=options.date,
+        licence=options.licence,
+        attribution=options.attribution,
+        key_env=options.key_env,
+    )
+    return FetchRequest(
+        spec=spec,
+        area=_area(options),
+        out=options.out or Path("none.tif"),
+        margin_m=options.margin_m,
+        packing=Packing(options.compress, options.quality),
+        cache=options.cache,
+        max_tiles=options.max_tiles,
+        max_mb=options.max_mb,
+        allow_holes=options.allow_holes,
+        limits=Limits(parallel=options.parallel, per_second=rate, attempts=options.retries + 1),
+    )
+
+
+def _wish(options: argparse.Namespace) -> "Wish":
+    from orthonav.fetch import Wish
+
+    if options.gsd_m is not None and not 0 < options.gsd_m < 1000:
+        raise FetchError(f"--gsd-m must be above 0, got {options.gsd_m:g}")
+    return Wish(
+        layer=options.layer,
+        style=options.style,
+        format=options.format,
+        crs=options.crs.upper() if options.crs else None,
+        matrix_set=options.matrix_set,
+        zoom=options.zoom,
+        gsd_m=options.gsd_m,
+        time=options.time,
+        tile_px=options.tile_px,
+        max_zoom=options.max_zoom,
+        empty=options.nodata_colour,
+        collection=options.collection,
+        asset=options.asset,
+        bands=_bands(options.bands),
+        version=options.wms_version,
+        subdomains=options.subdomains,
+    )
+
+
+def _bands(text: str | None) -> tuple[int, ...] | None:
+    if text is None:
+        return None
+    parts = text.split(",")
+    if not all(part.strip().isdecimal() and int(part) > 0 for part in parts):
+        raise FetchError(f"--bands are numbers from 1, such as 1,2,3, got '{text}'")
+    return tuple(int(part) for part in parts)
+
+
+def _area(options: argparse.Namespace) -> "Area":
+    from orthonav.geo.area import Area
+    from orthonav.geo.route import read_route
+
+    route, box = options.route, options.bounds
+    if options.area is not None:
+        if route is not None or box is not None:
+            raise FetchError("name the area once: as ROUTE or W,S,E,N, --route or --bounds")
+        if options.area.count(",") == 3 and not Path(options.area).exists():
+            try:
+                box = bounds(options.area)
+            except argparse.ArgumentTypeError as error:
+                raise FetchError(str(error)) from None
+        else:
+            route = Path(options.area)
+    if (route is None) == (box is None):
+        raise FetchError("name one area: a route file, or W,S,E,N in degrees")
+    if box is not None:
+        return Area.from_bounds(box)
+    return Area.from_route(read_route(route), options.band_m)
+
+
+def _run_package(options: argparse.Namespace) -> None:
+    from orthonav.fetch.client import Client
+    from orthonav.fetch.package import (
+        ATTRIBUTION,
+        LIMITS,
+        download_package,
+        find_package,
+        package_files,
+        parse_package,
+    )
+
+    zone, year, kind = parse_package(options.source.removeprefix(PACKAGE))
+    with Client(LIMITS) as client:
+        package = find_package(client, zone, year, kind)
+        files = package_files(client, package)
+        megabytes = sum(file.size_bytes or 0 for file in files) / 1e6
+        _say(options, f"{package.name}: {len(files)} files, {megabytes:.0f} MB")
+        paths = []
+        if not options.dry_run:
+            with progress(options) as shown:
+                paths = download_package(client, files, options.out, shown)
+    plain = {
+        "package": package.name,
+        "date": package.date,
+        "attribution": ATTRIBUTION,
+        "files": [str(path) for path in paths],
+        "megabytes": round(megabytes, 3),
+    }
+    if options.json:
+        print_json(plain)
+    elif paths:
+        print(f"{package.name} ({ATTRIBUTION}); unpack it with: 7z x {paths[0]}")
+
+
+def _say(options: argparse.Namespace, text: str) -> None:
+    if not options.quiet:
+        print(text, file=sys.stderr)
+
+
+def _summary(plain: dict[str, object]) -> str:
+    failed = plain["failed"]
+    assert isinstance(failed, dict)
+    holes = {
+        "not covered": plain["not_covered"],
+        "blank": plain["blank"],
+        "placeholders": plain["placeholders"],
+        "failed": sum(failed.values()),
+    }
+    missing = ", ".join(f"{count} {what}" for what, count in holes.items() if count) or "none"
+    lines = {
+        "file": plain["out"],
+        "size": f"{plain['width_px']} x {plain['height_px']} px of {plain['gsd_m']} m",
+        "tiles": f"{plain['tiles']}, {plain['from_cache']} of them from the cache",
+        "missing": missing,
+        "layer": plain["layer"],
+        "date": plain["date"] or "unknown",
+        "licence": plain["licence"] or "unknown: ask the service before you pass imagery on",
+        "attribution": plain["attribution"] or "unknown",
+        "note": plain["note"],
+    }
+    return "\n".join(f"{name:<12}{value}" for name, value in lines.items() if value)
+
+
+def _print_presets(as_json: bool) -> None:
+    from orthonav.fetch.presets import presets
+
+    if as_json:
+        print_json(
+            [
+                {**vars(preset), "layers": [vars(layer) for layer in preset.layers.values()]}
+                for preset in presets().values()
+            ]
+        )
+        return
+    for preset in presets().values():
+        print(f"{preset.name}: {preset.title} ({preset.country})")
+        print(f"  {', '.join(preset.layers)}")
+        print(f"  {preset.licence}; {preset.attribution}")
+        if preset.key_env:
+            print(f"  wants a key in {preset.key_env}")

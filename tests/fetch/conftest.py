@@ -1,0 +1,114 @@
+"""Fetching in tests: without pauses, from servers on the loopback, and a real WMTS and WMS."""
+
+import io
+import warnings
+from socketserver import ThreadingMixIn
+from threading import Thread
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
+
+import ground
+import pytest
+import servers
+from servers import QUICK
+
+from orthonav.fetch import FetchRequest, Packing, Wish, fetch, parse_source
+from orthonav.geo.area import Area
+
+MAPPROXY = """
+services:
+  wms:
+    srs: ['EPSG:3857', 'EPSG:2154', 'EPSG:4326', 'EPSG:3035', 'EPSG:32631']
+    image_formats: ['image/png', 'image/jpeg']
+    versions: ['1.1.1', '1.3.0']
+  wmts: {kvp: true, restful: true}
+layers:
+  - {name: ortho, title: Ortho, sources: [ground]}
+  - {name: tiles, title: Tiles, tile_sources: [in_mercator, in_lambert, in_utm]}
+caches:
+  in_mercator: {grids: [mercator], sources: [ground], disable_storage: true}
+  in_lambert: {grids: [lambert], sources: [ground], disable_storage: true}
+  in_utm: {grids: [utm], sources: [ground], disable_storage: true}
+sources:
+  ground:
+    type: wms
+    req: {url: 'UPSTREAM', layers: ground, format: image/png}
+    wms_opts: {version: 1.1.1}
+grids:
+  mercator: {base: GLOBAL_WEBMERCATOR}
+  lambert:
+    {srs: 'EPSG:2154', bbox: [0, 6000000, 1300000, 7200000], origin: nw, res: [16, 8, 4, 2, 1, 0.5]}
+  utm: {srs: 'EPSG:32631', bbox: [100000, 4900000, 900000, 5500000], origin: nw, res: [8, 4, 2, 1]}
+globals:
+  cache: {base_dir: 'CACHE', meta_size: [1, 1], meta_buffer: 0}
+"""
+
+
+class Quiet(WSGIRequestHandler):
+    def log_message(self, *args):
+        pass
+
+
+class Threaded(ThreadingMixIn, WSGIServer):
+    daemon_threads = True
+
+
+@pytest.fixture(scope="session")
+def mapproxy(tmp_path_factory):
+    """Address of a MapProxy that serves the ground as WMTS and WMS."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from mapproxy.wsgiapp import make_wsgi_app
+
+        with servers.serving(servers.wms_map) as upstream:
+            folder = tmp_path_factory.mktemp("mapproxy")
+            told = MAPPROXY.replace("UPSTREAM", f"{upstream.url}/map")
+            (folder / "proxy.yaml").write_text(told.replace("CACHE", str(folder / "cache")))
+            app = make_wsgi_app(str(folder / "proxy.yaml"))
+            http = make_server("127.0.0.1", 0, app, Threaded, Quiet)
+            thread = Thread(target=http.serve_forever, args=(0.01,), daemon=True)
+            thread.start()
+            yield f"http://127.0.0.1:{http.server_address[1]}"
+            http.shutdown()
+            http.server_close()
+            thread.join()
+
+
+@pytest.fixture
+def take(tmp_path):
+    """Function that fetches the square around the middle and returns the result and the file."""
+
+    def taken(source, half_m=110.0, out="ortho.tif", limits=QUICK, told=None, **rest):
+        asked = {name: rest.pop(name) for name in list(rest) if name in Wish.__dataclass_fields__}
+        asked.setdefault("gsd_m", 1.0)
+        spec = parse_source(source, Wish(**asked), **(told or {}))
+        request = FetchRequest(
+            spec=spec,
+            area=rest.pop("area", None) or Area.from_bounds(ground.bounds(half_m)),
+            out=tmp_path / out,
+            margin_m=rest.pop("margin_m", 0.0),
+            packing=rest.pop("packing", Packing("deflate")),
+            limits=limits,
+            **rest,
+        )
+        return fetch(request), request.out
+
+    return taken
+
+
+@pytest.fixture(scope="session")
+def cog_bytes(tmp_path_factory):
+    """A cloud-optimized file of the ground in UTM, 500 m across at 1 m, as bytes."""
+    path = ground.write_tif(
+        tmp_path_factory.mktemp("cog") / "ground.tif", "EPSG:32631", size=500, driver="COG"
+    )
+    return io.BytesIO(path.read_bytes()).getvalue()
+
+
+@pytest.fixture
+def names_below():
+    """Function that lists everything below a folder, hidden temporaries included."""
+
+    def names(folder):
+        return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+    return names

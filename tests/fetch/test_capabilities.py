@@ -1,0 +1,184 @@
+"""Documents in the form that real services send are understood, down to the address of a tile.
+
+Written by hand to the form that the services document, with the quirks that public code works
+around: limits of zooms, names of grids, rows before columns, rounded scales.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthonav.errors import FetchError
+from orthonav.fetch import wms, wmts
+from orthonav.fetch.crs import MERCATOR_HALF_M
+from orthonav.fetch.documents import check_xml
+from orthonav.fetch.presets import presets
+from orthonav.fetch.service import About, Wish
+from orthonav.fetch.wms import wms_cells
+from orthonav.fetch.wmts_tiles import wmts_tiles
+from orthonav.geo.frames import LocalFrame
+
+FOLDER = Path(__file__).parent / "capabilities"
+ABOUT = About("", "")
+PLACES = {
+    "ign": LocalFrame(46.5, 3.0),
+    "pdok": LocalFrame(52.1, 5.1),
+    "swisstopo": LocalFrame(46.95, 7.45),
+    "basemap": LocalFrame(48.2, 16.4),
+}
+
+
+def document(name):
+    body = (FOLDER / f"{name}.xml").read_bytes()
+    check_xml(body)
+    return body
+
+
+def tiles(name, wish, url="https://a.example/wmts"):
+    service = wmts.read_capabilities(document(f"{name}_wmts"), url)
+    return wmts_tiles(service, wish, PLACES.get(name, PLACES["ign"]), ABOUT)
+
+
+def of_preset(name, id_, **rest):
+    preset = presets()[name]
+    return Wish(**rest).over(preset.wish(preset.layer(id_)))
+
+
+def test_ign_by_parameters():
+    source = tiles("ign", of_preset("ign", "2021", gsd_m=0.25))
+    assert source.url_of(363000, 265000) == (
+        "https://data.geopf.fr/wmts?SERVICE=WMTS&REQUEST=GetTile&VERSION=1.0.0"
+        "&LAYER=ORTHOIMAGERY.ORTHOPHOTOS2021&STYLE=normal&FORMAT=image/jpeg"
+        "&TILEMATRIXSET=PM_0_19&TILEMATRIX=19&TILEROW=363000&TILECOL=265000"
+    )
+    assert source.grid.res_x == 2 * MERCATOR_HALF_M / 256 / 2**19
+    row0, col0, row1, col1 = source.grid.limits
+    assert 0 < row0 < row1 < 2**19 and 0 < col0 < col1 < 2**19  # the layer's own
+
+
+def test_ign_limits_of_zooms_and_styles():
+    assert "TILEMATRIX=18" in tiles("ign", of_preset("ign", "2000-2005")).url_of(1, 1)
+    with pytest.raises(FetchError, match=r"no zoom 19; there is 6 .*18 \(0.411 m\)"):
+        tiles("ign", of_preset("ign", "2000-2005", zoom="19"))
+    with pytest.raises(FetchError, match=r"the finest is 0.411 m"):
+        tiles("ign", of_preset("ign", "2000-2005", gsd_m=0.2))
+    old = tiles("ign", of_preset("ign", "1965-1980", gsd_m=1.0))
+    assert "STYLE=BDORTHOHISTORIQUE&FORMAT=image/png" in old.url_of(1, 1)
+    with pytest.raises(FetchError, match="no style normal; there is BDORTHOHISTORIQUE"):
+        tiles("ign", of_preset("ign", "1965-1980", style="normal"))
+
+
+def test_a_year_that_is_not_there_tells_which_are():
+    words = "no layer ORTHOIMAGERY.ORTHOPHOTOS2020; there is .*ORTHOPHOTOS2021"
+    with pytest.raises(FetchError, match=words):
+        tiles("ign", of_preset("ign", "2020"))
+    with pytest.raises(FetchError, match=r"ign has no '1999'; there is .*1950-1965.*2021"):
+        presets()["ign"].layer("1999")
+
+
+def test_a_preferred_style_that_is_not_there_gives_way():
+    wish = Wish(layer="ORTHOIMAGERY.ORTHOPHOTOS2021", usual_style="BDORTHOHISTORIQUE")
+    assert "STYLE=normal" in tiles("ign", wish).url_of(1, 1)
+
+
+def test_pdok_by_templates_in_both_grids():
+    source = tiles("pdok", of_preset("pdok", "2022"))
+    assert source.url_of(7, 5) == (
+        "https://service.pdok.nl/hwh/luchtfotorgb/wmts/v1_0/2022_ortho25/EPSG:3857/18/5/7.jpeg"
+    )
+    national = tiles("pdok", of_preset("pdok", "2022", crs="EPSG:28992", gsd_m=0.25))
+    assert national.url_of(7, 5).endswith("/2022_ortho25/EPSG:28992/14/5/7.jpeg")
+    assert national.grid.res_x == pytest.approx(0.21, rel=1e-9)
+    assert national.grid.corner(0, 0) == (-285401.92, 903401.92)
+
+
+def test_swisstopo_by_time_and_on_https():
+    where = "https://wmts.geo.admin.ch/EPSG/3857/1.0.0/WMTSCapabilities.xml"
+    source = tiles("swisstopo", of_preset("swissimage", "2021", gsd_m=0.12), where)
+    assert source.url_of(7, 5) == (
+        "https://wmts.geo.admin.ch/1.0.0/ch.swisstopo.swissimage-product/default/2021/3857/20/5/7.jpeg"
+    )
+    current = tiles("swisstopo", of_preset("swissimage", None), where)
+    assert "/ch.swisstopo.swissimage/default/current/3857/" in current.url_of(1, 1)
+    with pytest.raises(FetchError, match="no time 1999; there is 2020, 2021, 2022, 2023, current"):
+        tiles("swisstopo", of_preset("swissimage", "2021", time="1999"), where)
+
+
+def test_basemap_rows_before_columns_and_rounded_scales():
+    source = tiles("basemap", of_preset("basemap-at", None, gsd_m=0.25))
+    assert source.url_of(7, 5) == (
+        "https://mapsneu.wien.gv.at/basemap/bmaporthofoto30cm/normal/google3857/19/7/5.jpeg"
+    )
+    assert source.grid.res_x == 2 * MERCATOR_HALF_M / 256 / 2**19  # not 0.1 m off at Vienna
+    assert source.grid.corner(0, 0) == (-MERCATOR_HALF_M, MERCATOR_HALF_M)
+
+
+def test_a_grid_in_degrees_has_the_latitude_first():
+    source = tiles("degrees", Wish(gsd_m=1.0))
+    assert source.grid.corner(0, 0) == (-180.0, 90.0)
+    assert source.grid.res_x == pytest.approx(360 / 512 / 2**16, rel=1e-8)
+
+
+def test_ign_wms_in_lambert():
+    service = wms.read_capabilities(document("ign_wms"), "https://data.geopf.fr/wms-r/wms")
+    source = wms_cells(service, of_preset("ign-wms", "2021", gsd_m=0.5), PLACES["ign"], ABOUT)
+    assert source.url_of(-12891, 1367) == (
+        "https://data.geopf.fr/wms-r/wms?SERVICE=WMS&VERSION=1.3.0&REQUEST=GetMap"
+        "&LAYERS=ORTHOIMAGERY.ORTHOPHOTOS2021&STYLES=&CRS=EPSG:2154&WIDTH=1024&HEIGHT=1024"
+        "&FORMAT=image/jpeg&TRANSPARENT=FALSE&BBOX=699904,6599680,700416,6600192"
+    )
+    degrees = of_preset("ign-wms", "2021", crs="EPSG:4326", format="image/png")
+    source = wms_cells(service, degrees, PLACES["ign"], ABOUT)
+    south, west, _, _ = map(
+        float, source.url_of(*cell_at(source, 3.0, 46.5))[-80:].split("=")[-1].split(",")
+    )
+    assert west == pytest.approx(3.0, abs=0.01) and south == pytest.approx(46.5, abs=0.01)
+
+
+def cell_at(source, x, y):
+    grid = source.grid
+    col = np.floor((x - grid.west) / (grid.cell_w_px * grid.res_x))
+    row = np.floor((grid.north - y) / (grid.cell_h_px * grid.res_y))
+    return int(row), int(col)
+
+
+def test_an_old_wms_with_times():
+    service = wms.read_capabilities(document("old_wms"), "http://maps.example/wms")
+    wish = Wish(layer="ortho", time="2018", gsd_m=0.5)
+    source = wms_cells(service, wish, LocalFrame(51.5, 8.0), ABOUT)
+    url = source.url_of(0, 0)
+    assert url.startswith("http://maps.example/cgi?map=/srv/ortho.map&SERVICE=WMS&VERSION=1.1.1")
+    assert "SRS=EPSG:25832" in url and "TIME=2018" in url
+    with pytest.raises(FetchError, match="no time 2019; there is 2015, 2018, 2021"):
+        wms_cells(service, Wish(layer="ortho", time="2019"), LocalFrame(51.5, 8.0), ABOUT)
+
+
+BOMB = b"""<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "bbbbbbbbbb"><!ENTITY c "&b;&b;&b;">]>
+<Capabilities version="1.0.0">&c;</Capabilities>"""
+OUTSIDE = b"""<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/passwd">]>
+<Capabilities version="1.0.0">&b;</Capabilities>"""
+
+
+@pytest.mark.parametrize(
+    "body, words",
+    [
+        (BOMB, "entities"),
+        (BOMB.decode().encode("utf-16"), "entities|not an XML"),
+        (OUTSIDE, "entities"),
+        (b"<a>" * 200 + b"</a>" * 200, "too deep"),
+        (b"<html><p>no", "not an XML"),
+        (b"", "not an XML"),
+    ],
+)
+def test_documents_that_may_do_harm_are_refused(body, words):
+    with pytest.raises(FetchError, match=words):
+        check_xml(body)
+
+
+@pytest.mark.parametrize("body", [b"<a/>", b"<WMS_Capabilities version='2.0'/>"])
+def test_other_documents_are_told(body):
+    with pytest.raises(FetchError, match=r"cannot be read|lists no layer"):
+        wmts.read_capabilities(body, "http://a/b")
+    with pytest.raises(FetchError, match=r"1\.1\.1 and 1\.3\.0 are known"):
+        wms.read_capabilities(body, "http://a/b")

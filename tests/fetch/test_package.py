@@ -1,0 +1,172 @@
+"""Packages of a department: listed page by page, downloaded by ranges, gone on with, checked."""
+
+import hashlib
+import os
+from xml.sax.saxutils import escape
+
+import pytest
+import servers
+
+from orthonav.errors import FetchError, OutputError
+from orthonav.fetch import package
+from orthonav.fetch.client import Client
+from orthonav.fetch.package import (
+    PackageFile,
+    download_package,
+    find_package,
+    package_files,
+    parse_package,
+)
+
+FEED = (
+    '<?xml version="1.0" encoding="UTF-8"?><feed xmlns="http://www.w3.org/2005/Atom" '
+    'xmlns:gpf_dl="https://data.geopf.fr/annexes/ressources/xsd/gpf_dl.xsd" '
+    'gpf_dl:page="{page}" gpf_dl:pagesize="2" gpf_dl:pagecount="{pages}">{entries}</feed>'
+)
+NAMES = [
+    ("BDORTHO_2-0_RVB-0M50_JP2-E080_LAMB93_D003_2013-01-01", "D003", "2013-01-01"),
+    ("BDORTHO_2-0_IRC-0M50_JP2-E080_LAMB93_D003_2013-01-01", "D003", "2013-01-01"),
+    ("BDORTHO_2-0_RVB-0M20_JP2-E080_LAMB93_D003_2022-01-01", "D003", "2022-01-01"),
+    ("BDORTHO_1-0_RVB-0M50_JP2-E080_LAMB93_D003_2022-01-01", "D003", "2022-01-01"),
+    ("BDORTHO_2-0_GRAPHE-MOSAIQUAGE_LAMB93_D003_2022-01-01", "D003", "2022-01-01"),
+    ("BDORTHO_2-0_RVB-0M20_JP2-E080_LAMB93_D075_2022-01-01", "D075", "2022-01-01"),
+]
+PARTS = {f"x.7z.{n:03d}": os.urandom(size) for n, size in ((1, 5000), (2, 5000), (3, 700))}
+LIMITS = servers.QUICK
+
+
+def entry(title, url, *, zone="", date="", kind="application/atom+xml", length="", md5=""):
+    extra = f'<gpf_dl:zone term="{zone}" label="{zone}"/>' if zone else ""
+    extra += f"<gpf_dl:editionDate>{date}</gpf_dl:editionDate>" if date else ""
+    extra += f"<content>{md5}</content>" if md5 else ""
+    size = f' gpf_dl:length="{length}"' if length else ""
+    link = f'<link href="{url}" type="{kind}"{size}/>'
+    return f"<entry><title>{escape(title)}</title>{link}{extra}</entry>"
+
+
+def service(url, *, parts=None, changed=None):
+    """The download service: packages two a page, files with length and sum."""
+    parts = PARTS if parts is None else parts
+    plain = servers.files({f"/dl/{name}": body for name, body in (changed or parts).items()})
+
+    def answer(asked):
+        page = int(asked.query.get("PAGE", 1))
+        if asked.path == "/resource/BDORTHO":
+            chosen = NAMES[2 * page - 2 : 2 * page]
+            entries = "".join(
+                entry(n, f"{url[0]}/resource/BDORTHO/{n}", zone=z, date=d) for n, z, d in chosen
+            )
+            return servers.Answer(FEED.format(page=page, pages=3, entries=entries).encode())
+        if asked.path.startswith("/resource/BDORTHO/"):
+            entries = entry("x.md5", f"{url[0]}/dl/x.md5", kind="text/plain", length="99")
+            for name, body in parts.items():
+                told = {"length": str(len(body)), "md5": hashlib.md5(body).hexdigest()}
+                entries += entry(name, f"{url[0]}/dl/{name}", kind="application/x-7z", **told)
+            return servers.Answer(FEED.format(page=1, pages=1, entries=entries).encode())
+        return plain(asked)
+
+    return answer
+
+
+@pytest.fixture
+def serving():
+    """Function that serves packages and gives the server."""
+
+    def made(**rest):
+        url = []
+        manager = servers.serving(service(url, **rest))
+        server = manager.__enter__()
+        url.append(server.url)
+        managers.append(manager)
+        return server
+
+    managers = []
+    yield made
+    for manager in managers:
+        manager.__exit__(None, None, None)
+
+
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        ("D003:2013", ("D003", "2013", "RVB")),
+        ("3:2013", None),
+        ("03:2013:irc", ("D003", "2013", "IRC")),
+        ("2A:2021", ("D02A", "2021", "RVB")),
+        ("D02A:2021", ("D02A", "2021", "RVB")),
+        ("971:2022", ("D971", "2022", "RVB")),
+        ("D003", None),
+        ("D003:13", None),
+        ("../etc:2013", None),
+    ],
+)
+def test_what_names_a_package(text, expected):
+    if expected is None:
+        with pytest.raises(FetchError, match="such as D003:2013"):
+            parse_package(text)
+    else:
+        assert parse_package(text) == expected
+
+
+def test_the_finest_package_of_a_year(serving):
+    server = serving()
+    with Client(LIMITS) as client:
+        assert find_package(client, "D003", "2022", service=server.url).name == NAMES[2][0]
+        assert find_package(client, "D003", "2013", "IRC", server.url).name == NAMES[1][0]
+        with pytest.raises(FetchError, match="no RVB package of D003 of 2019; there is 2013, 2022"):
+            find_package(client, "D003", "2019", service=server.url)
+    assert {asked.query["ZONE"] for asked in server.log} == {"D003"}
+    assert all(int(asked.query["LIMIT"]) <= 50 for asked in server.log)
+
+
+def fetched(server, folder, **rest):
+    with Client(LIMITS) as client:
+        found = find_package(client, "D003", "2013", service=server.url)
+        files = package_files(client, found)
+        assert [file.name for file in files] == list(PARTS)
+        return download_package(client, files, folder, lambda stage, share: None, **rest)
+
+
+def test_files_come_whole_and_are_not_asked_for_again(serving, tmp_path, monkeypatch):
+    monkeypatch.setattr(package, "PART_BYTES", 1000)
+    server = serving()
+    paths = fetched(server, tmp_path / "out")
+    assert {path.name: path.read_bytes() for path in paths} == PARTS
+    before = sum(asked.path.startswith("/dl/") for asked in server.log)
+    assert before == 5 + 5 + 1
+    fetched(server, tmp_path / "out")
+    assert sum(asked.path.startswith("/dl/") for asked in server.log) == before
+
+
+def test_half_a_file_is_gone_on_with(serving, tmp_path, monkeypatch):
+    monkeypatch.setattr(package, "PART_BYTES", 1000)
+    server = serving()
+    (tmp_path / "x.7z.001").write_bytes(PARTS["x.7z.001"])
+    (tmp_path / "x.7z.002.part").write_bytes(PARTS["x.7z.002"][:4321])
+    paths = fetched(server, tmp_path)
+    assert {path.name: path.read_bytes() for path in paths} == PARTS
+    asked = [a.headers["Range"] for a in server.log if a.path.endswith(".002")]
+    assert asked == ["bytes=4321-5320"]
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_another_file_than_was_told_is_refused(serving, tmp_path):
+    other = PARTS | {"x.7z.002": os.urandom(5000)}
+    with pytest.raises(FetchError, match="another MD5 sum"):
+        fetched(serving(changed=other), tmp_path / "a")
+    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["x.7z.001"]
+    longer = PARTS | {"x.7z.002": os.urandom(5001)}
+    with pytest.raises(FetchError, match="5001 bytes, not 5000"):
+        fetched(serving(changed=longer), tmp_path / "b")
+
+
+def test_names_that_lead_elsewhere_are_refused(serving):
+    server = serving(parts={"..%2F..%2Fevil.7z": b"x"})
+    with Client(LIMITS) as client, pytest.raises(FetchError, match="not taken"):
+        package_files(client, find_package(client, "D003", "2013", service=server.url))
+
+
+def test_a_disk_that_is_too_small_is_told_before(tmp_path):
+    files = [PackageFile("a.7z", "http://127.0.0.1:1/a.7z", 10**18, None)]
+    with Client(LIMITS) as client, pytest.raises(OutputError, match="disk is too small"):
+        download_package(client, files, tmp_path, lambda stage, share: None)

@@ -1,0 +1,143 @@
+"""The services known by name: whole, of open terms, and as the documentation says."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from orthonav.errors import FetchError
+from orthonav.fetch import Wish, parse_source
+from orthonav.fetch.presets import CURRENT, PROTOCOLS, find_preset, presets
+from orthonav.fetch.sources import check_date
+from orthonav.fetch.urls import checked_url
+
+DOCUMENTATION = Path(__file__).parents[2] / "docs" / "imagery.md"
+LAYERS = [(p.name, layer.id) for p in presets().values() for layer in p.layers.values()]
+
+
+@pytest.mark.parametrize("name", presets())
+def test_a_service_is_described_whole(name):
+    preset = presets()[name]
+    assert re.fullmatch(r"[a-z][a-z0-9-]+", name) and name not in PROTOCOLS
+    assert preset.protocol in PROTOCOLS and preset.title and preset.country
+    for url in (preset.url, preset.licence_url, preset.source_page):
+        assert checked_url(url.replace("{key}", "0")).startswith("https://")
+    assert preset.licence and preset.attribution
+    assert ("{key}" in preset.url) == (preset.key_env is not None)
+    assert preset.crs is None or re.fullmatch(r"EPSG:\d+", preset.crs)
+    assert preset.protocol != "stac" or preset.collection
+    assert preset.layers and preset.empty in (None, "black", "white")
+
+
+@pytest.mark.parametrize("name, id_", LAYERS)
+def test_a_layer_is_described_whole(name, id_):
+    preset = presets()[name]
+    layer = preset.layers[id_]
+    assert "{" not in f"{layer}" and 0.05 <= layer.gsd_m <= 1
+    assert layer.layer or preset.protocol == "stac"
+    assert 0 <= (layer.min_zoom or 0) <= (layer.max_zoom or 22) <= 22
+    if layer.date is None:
+        assert id_ == CURRENT
+    else:
+        check_date(layer.date)
+        assert layer.date.partition("/")[0] in id_
+    environ = {preset.key_env: "x" * 8} if preset.key_env else {}
+    source = name if id_ == CURRENT else f"{name}:{id_}"
+    spec = parse_source(source, Wish(), environ=environ)
+    assert spec.about.licence and spec.about.attribution and spec.about.date == layer.date
+    assert spec.wish.layer == (layer.layer or None)
+
+
+def test_express_layers_warn_that_they_are_no_other_date():
+    for name in ("ign", "ign-wms"):
+        for id_, layer in presets()[name].layers.items():
+            if "express" in id_:
+                assert "no other date" in layer.note
+                assert "no other date" in parse_source(f"{name}:{id_}", Wish()).about.note
+
+
+def test_names_that_are_not_known_list_those_that_are():
+    with pytest.raises(FetchError, match=r"no service is known as 'ing'; there is .*ign"):
+        find_preset("ing")
+    with pytest.raises(FetchError, match="say what kind of service it is"):
+        parse_source("https://a.example/wmts", Wish())
+    with pytest.raises(FetchError, match=r"name a year: naip:YEAR; there is 2010"):
+        parse_source("naip", Wish())
+
+
+def test_what_the_user_says_goes_first():
+    spec = parse_source(
+        "ign:2021",
+        Wish(style="other", crs="EPSG:2154", gsd_m=1.0),
+        date="2021-07",
+        licence="mine",
+        attribution="me",
+    )
+    assert spec.wish.style == "other" and spec.wish.crs == "EPSG:2154" and spec.wish.gsd_m == 1.0
+    assert (spec.about.date, spec.about.licence, spec.about.attribution) == (
+        "2021-07",
+        "mine",
+        "me",
+    )
+
+
+def test_keys_come_from_the_environment_only():
+    with pytest.raises(FetchError, match="variable DATAFORSYNINGEN_TOKEN"):
+        parse_source("dataforsyningen", Wish(), environ={})
+    spec = parse_source("dataforsyningen", Wish(), environ={"DATAFORSYNINGEN_TOKEN": "abcdef"})
+    assert "abcdef" not in repr(spec) and spec.secrets[0].value == "abcdef"
+    with pytest.raises(FetchError, match="--key-env"):
+        parse_source("wmts:https://a.example/?token={key}", Wish(), environ={})
+    with pytest.raises(FetchError, match=r"needs \{key\} in the address"):
+        parse_source("wmts:https://a.example/", Wish(), key_env="K", environ={"K": "abcd"})
+    literal = parse_source("wms:https://a.example/?apikey=abcdef", Wish(), environ={})
+    assert "abcdef" not in repr(literal) and literal.url == "https://a.example/?apikey={key}"
+
+
+@pytest.mark.parametrize("date", ["21", "2021-13", "2021-02-40", "June", "2021/2022/2023", ""])
+def test_dates_are_checked(date):
+    with pytest.raises(FetchError, match="date must be"):
+        parse_source("ign", Wish(), date=date)
+
+
+@pytest.mark.parametrize(
+    "source", ["wmts:file:///etc/passwd", "cog:/etc/passwd", "xyz:ftp://a/{z}/{x}/{y}", "stac:x"]
+)
+def test_only_http_is_a_source(source):
+    with pytest.raises(FetchError, match="only http"):
+        parse_source(source, Wish())
+
+
+def test_the_documentation_lists_the_same_services():
+    text = DOCUMENTATION.read_text(encoding="utf-8")
+    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| `")]
+    listed = {row[0].strip("`"): row for row in rows if row[0].strip("`") in presets()}
+    assert set(listed) == set(presets())
+    for name, preset in presets().items():
+        _, country, protocol, ids, gsds, licence, attribution = (
+            cell.strip() for cell in listed[name]
+        )
+        assert country == preset.country and protocol == preset.protocol.upper()
+        assert ids.replace("`", "") == table_ids(preset)
+        assert gsds == " to ".join(f"{g:g}" for g in extremes(preset))
+        assert licence == preset.licence and attribution == preset.attribution
+
+
+def extremes(preset):
+    gsds = sorted({layer.gsd_m for layer in preset.layers.values()})
+    return gsds if len(gsds) == 1 else [gsds[0], gsds[-1]]
+
+
+def table_ids(preset):
+    """Ids in order, with runs of years as FIRST to LAST."""
+    shown, run = [], []
+    for id_ in [*preset.layers, ""]:
+        if id_.isdecimal() and (not run or int(id_) == int(run[-1]) + 1):
+            run.append(id_)
+            continue
+        if run:
+            shown.append(run[0] if len(run) == 1 else f"{run[0]} to {run[-1]}")
+        run = [id_] if id_.isdecimal() else []
+        if id_ and not id_.isdecimal():
+            shown.append(id_)
+    return ", ".join(shown)

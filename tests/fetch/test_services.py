@@ -1,0 +1,162 @@
+"""What comes from a real WMTS and WMS is the ground, in its place to a twentieth of a pixel."""
+
+import ground
+import numpy as np
+import pytest
+import rasterio
+import servers
+
+from orthonav.errors import AreaError, FetchError
+from orthonav.geo.area import Area
+from orthonav.imagery.source import open_source
+
+MAX_OFF_PX = 0.05
+
+
+def placed(path, crs):
+    """Check that a file shows the ground where it says."""
+    with rasterio.open(path) as data:
+        assert data.crs.to_string() == crs
+    shift, worst, valid = ground.offset_px(path)
+    assert np.abs(shift).max() < MAX_OFF_PX
+    return worst, valid
+
+
+@pytest.mark.parametrize("way", ["/service", "/wmts/1.0.0/WMTSCapabilities.xml"])
+def test_wmts_by_parameters_and_by_templates(mapproxy, take, way):
+    result, path = take(f"wmts:{mapproxy}{way}", layer="tiles")
+    worst, valid = placed(path, "EPSG:3857")
+    assert worst <= 1 and valid == 1.0
+    assert result.counts.pictures == result.estimate.tiles and not result.fetched.failed
+    assert result.estimate.gsd_m == pytest.approx(0.822, abs=0.01)  # zoom 17 at 46.5 N
+
+
+@pytest.mark.parametrize("crs, gsd_m", [("EPSG:2154", 1.0), ("EPSG:32631", 1.0)])
+def test_wmts_in_other_grids(mapproxy, take, crs, gsd_m):
+    _, path = take(f"wmts:{mapproxy}/service", layer="tiles", crs=crs, gsd_m=gsd_m)
+    worst, _ = placed(path, crs)
+    assert worst <= 1
+    with rasterio.open(path) as data:
+        assert data.res == pytest.approx((gsd_m, gsd_m), abs=1e-12)
+
+
+@pytest.mark.parametrize("version", ["1.1.1", "1.3.0"])
+@pytest.mark.parametrize("crs", ["EPSG:3857", "EPSG:2154", "EPSG:3035", "EPSG:4326"])
+def test_wms_in_every_axis_order(mapproxy, take, version, crs):
+    """3035 and 4326 have the northing first, which 1.3.0 follows and 1.1.1 does not."""
+    source = f"wms:{mapproxy}/service"
+    _, path = take(
+        source, layer="ortho", format="image/png", crs=crs, version=version, tile_px=128, half_m=70
+    )
+    worst, valid = placed(path, crs)
+    assert worst <= 1.5 and valid == 1.0
+    assert open_source(path).gsd_m == pytest.approx(1.0, rel=0.01)
+
+
+def test_wms_chooses_utm_and_jpeg_by_itself(mapproxy, take):
+    _, path = take(f"wms:{mapproxy}/service", layer="ortho", gsd_m=0.5, half_m=60, tile_px=256)
+    worst, _ = placed(path, "EPSG:32631")
+    assert worst <= 12  # JPEG
+    with rasterio.open(path) as data:
+        assert data.res == (0.5, 0.5)
+
+
+def test_tiles_of_the_web_grid(take):
+    with servers.serving(servers.tiles) as server:
+        _, path = take(f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png")
+    worst, _ = placed(path, "EPSG:3857")
+    assert worst <= 1
+
+
+def test_rows_from_the_south_quadkeys_and_large_tiles(take):
+    from orthonav.fetch.xyz import quadkey
+
+    def answer(asked):
+        kind, *rest = asked.path.strip("/").split("/")
+        if kind == "q":
+            key = rest[0]
+            zoom = len(key)
+            col = int("".join(str(int(digit) & 1) for digit in key), 2)
+            row = int("".join(str(int(digit) >> 1) for digit in key), 2)
+            assert quadkey(zoom, row, col) == key
+        else:
+            zoom, col, row = (int(part.partition("@")[0].partition(".")[0]) for part in rest)
+            row = 2**zoom - 1 - row if kind == "tms" else row
+        size = 512 if "@2x" in asked.path else 256
+        return servers.Answer(ground.encoded(ground.mercator_tile(zoom, row, col, size)))
+
+    with servers.serving(answer) as server:
+        for number, source in enumerate(
+            [
+                f"tms:{server.url}/tms/{{z}}/{{x}}/{{y}}.png",
+                f"xyz:{server.url}/tms/{{z}}/{{x}}/{{-y}}.png",
+                f"xyz:{server.url}/q/{{q}}",
+                f"xyz:{server.url}/xyz/{{z}}/{{x}}/{{y}}{{r}}.png",
+            ]
+        ):
+            _, path = take(source, out=f"{number}.tif", half_m=60)
+            placed(path, "EPSG:3857")
+        assert {asked.path[-7:] for asked in server.log if asked.path.startswith("/xyz")} == {
+            "@2x.png"
+        }
+
+
+def test_a_band_around_a_route_leaves_the_rest_out(take, tmp_path):
+    from orthonav.geo.route import Route
+
+    west, south, east, north = ground.bounds(500)
+    route = Route(((south, west), (north, east)))
+    with servers.serving(servers.tiles) as server:
+        source = f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png"
+        result, path = take(source, area=Area.from_route(route, 60.0))
+    _, _, valid = ground.offset_px(path)
+    assert 0.1 < valid < 0.6 and result.valid_share == 1.0
+    with rasterio.open(path) as data:
+        line = np.linspace(0, 1, 50)
+        for share in line:
+            x, y = ground.Transformer.from_crs("EPSG:4326", "EPSG:3857", always_xy=True).transform(
+                west + share * (east - west), south + share * (north - south)
+            )
+            row, col = data.index(x, y)
+            assert data.dataset_mask(window=((row, row + 1), (col, col + 1)))[0, 0] == 255
+
+
+@pytest.mark.parametrize(
+    "wish, words",
+    [
+        ({"layer": "orto"}, "no layer orto; there is ortho"),
+        ({"layer": None}, "name one with --layer"),
+        ({"style": "winter"}, "no style winter"),
+        ({"crs": "EPSG:3006"}, "does not come in EPSG:3006; there is"),
+        ({"format": "image/webp"}, "no format image/webp; there is image/jpeg, image/png"),
+        ({"version": "1.0.0"}, "1.1.1 and 1.3.0 are known"),
+        ({"time": "2021"}, "no time 2021"),
+    ],
+)
+def test_what_a_wms_does_not_have_is_listed(mapproxy, take, wish, words):
+    with pytest.raises(FetchError, match=words):
+        take(f"wms:{mapproxy}/service", **{"layer": "ortho"} | wish)
+
+
+@pytest.mark.parametrize(
+    "wish, words",
+    [
+        ({"layer": "tile"}, "no layer tile; there is tiles"),
+        ({"style": "winter"}, "no style winter; there is default"),
+        ({"crs": "EPSG:3006"}, "does not come in EPSG:3006; there is"),
+        ({"matrix_set": "PM"}, "no grid PM; there is .*lambert"),
+        ({"zoom": "33"}, r"no zoom 33; there is 00 \(.*19 \(0.206 m"),
+        ({"crs": "EPSG:32631", "gsd_m": 0.2}, "the finest is 1 m"),
+        ({"time": "2021"}, "no time to choose"),
+        ({"format": "image/jpeg"}, "no format image/jpeg; there is image/png"),
+    ],
+)
+def test_what_a_wmts_does_not_have_is_listed(mapproxy, take, wish, words):
+    with pytest.raises(FetchError, match=words):
+        take(f"wmts:{mapproxy}/service", **{"layer": "tiles"} | wish)
+
+
+def test_an_area_outside_the_grid(mapproxy, take):
+    area = Area.from_bounds((50.0, 46.0, 50.01, 46.01))
+    with pytest.raises((AreaError, FetchError), match="outside"):
+        take(f"wmts:{mapproxy}/service", layer="tiles", crs="EPSG:32631", area=area)
