@@ -5,8 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from orthonav.geo.camera import Camera
+from orthonav.localizer import checks
 from orthonav.localizer.checks import check_rectified, check_telemetry, check_view
 from orthonav.localizer.rectify import Rectified
 from orthonav.records import Telemetry
@@ -112,6 +115,14 @@ def checks_of(low, high, share=0.5):
 )
 def test_views_that_show_nothing(low, high, share, expected):
     assert reason(check_view(checks_of(low, high, share))) == expected
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 40), st.integers(2, 256))
+def test_levels_are_counted_as_numpy_does(seed, rows, cols, levels):
+    values = np.random.default_rng(seed).integers(0, levels, (rows, cols)).astype(np.uint8)
+    counts = np.bincount(values.reshape(-1), minlength=256)
+    for percent in (1, 50, 99):
+        assert checks._percentile(counts, percent) == pytest.approx(np.percentile(values, percent))
 
 
 def test_a_few_hot_pixels_make_no_view():

@@ -56,6 +56,28 @@ def test_the_camera_is_as_an_import_of_a_log_would_have_it(angles, mount):
     assert math.remainder(told.yaw_deg - logged.yaw_deg, 360) == pytest.approx(0, abs=1e-6)
 
 
+@pytest.mark.parametrize("every_ms, known", [(20, True), (50, True), (100, False)])
+def test_a_little_ahead_of_attitudes_that_come_closely(every_ms, known):
+    """A view need not wait for the next one; it turns on as it turned."""
+    buffer = TelemetryBuffer(Limits(attitude_ahead_s=0.03))
+    for number in range(5):
+        attitude(buffer, number * every_ms * MS, yaw_deg=number * every_ms * 0.1)
+    last_ns = 4 * every_ms * MS
+    assert buffer.covered_ns == last_ns + (30 * MS if known else 0)
+    told = buffer.at(last_ns + 20 * MS).telemetry(0)
+    expected = (4 * every_ms + (20 if known else 0)) * 0.1  # else as it was last
+    assert told.yaw_deg == pytest.approx(expected, abs=1e-6)
+    later = buffer.at(last_ns + 50 * MS).telemetry(0)
+    assert later.yaw_deg == pytest.approx(4 * every_ms * 0.1)
+
+
+def test_nothing_is_known_ahead_of_nothing():
+    buffer = TelemetryBuffer()
+    assert buffer.covered_ns is None
+    attitude(buffer, 0)
+    assert buffer.covered_ns == 0
+
+
 def test_gaps_are_not_bridged():
     limits = Limits(attitude_gap_s=0.5, attitude_hold_s=0.1, slow_gap_s=2.0, slow_hold_s=1.5)
     buffer = TelemetryBuffer(limits)

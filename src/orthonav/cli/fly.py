@@ -209,6 +209,7 @@ def _add_flight(group: Any) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Fly until SIGTERM, SIGINT or the end of a recording."""
+    import gc
     import signal
     import threading
 
@@ -224,7 +225,11 @@ def run(options: argparse.Namespace) -> None:
             before[number] = signal.signal(number, lambda *_: stopping.set())
     try:
         with ExitStack() as stack:
-            runner(options, stopping, stack).run(stopping)
+            made = runner(options, stopping, stack)
+            gc.collect()
+            gc.freeze()  # what is loaded stays: looking through it takes as long as a view
+            stack.callback(gc.unfreeze)
+            made.run(stopping)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -6,6 +6,7 @@ with four numbers of the angle off the optical axis. Both as OpenCV writes them.
 """
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,8 @@ Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
 _STEPS = 50
 _CLOSE = 1e-9
+_EXACT = 1e-14
+"""Of all points: no step would change them any more."""
 
 
 def brown_distort(distortion: Numbers, xy: Array) -> Array:
@@ -38,6 +41,8 @@ def brown_undistort(distortion: Numbers, xy: Array) -> Array:
             dxy = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
             dyy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
             error = _brown(distortion, ideal) - xy
+            if np.abs(error).max(initial=0.0) < _EXACT:
+                break  # NaN never is: points beyond the lens take all steps
             step = np.stack(
                 [
                     dyy * error[..., 0] - dxy * error[..., 1],
@@ -73,6 +78,8 @@ def fisheye_undistort(distortion: Numbers, xy: Array) -> Array:
     with np.errstate(all="ignore"):
         for _ in range(_STEPS):  # Newton's, kept inside a bracket: far out the slope may vanish
             error = polynomial(angle) - radius
+            if np.abs(error).max(initial=0.0) < _EXACT:
+                break
             low, high = np.where(error < 0, angle, low), np.where(error >= 0, angle, high)
             newton = angle - error / slope(angle)
             angle = np.where((newton >= low) & (newton <= high), newton, (low + high) / 2)
@@ -95,6 +102,7 @@ def _brown(distortion: Numbers, xy: Array) -> Array:
     )
 
 
+@lru_cache(maxsize=16)
 def _fold_r2(k1: float, k2: float, k3: float) -> float:
     """Squared radius at which the radial model stops growing; infinite where it never does."""
     inverse = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])  # of 1 / r2: the leading 1 keeps it sound

@@ -45,8 +45,11 @@ def check_telemetry(
 def check_view(grey: NDArray[np.uint8]) -> NoFix | None:
     """Why a view (H, W) shows nothing: too dark, too bright, blank; None if it shows something."""
     sample = grey[::_SAMPLE_STEP_PX, ::_SAMPLE_STEP_PX]
-    low, high = (float(value) for value in np.percentile(sample, [1, 99]))
-    std = float(sample.std())
+    counts = np.bincount(sample.reshape(-1), minlength=256)
+    low, high = (_percentile(counts, percent) for percent in (1, 99))
+    levels, size = np.arange(256), int(counts.sum())
+    mean = float(counts @ levels) / size
+    std = math.sqrt(max(float(counts @ levels**2) / size - mean**2, 0.0))
     if high < DARK_LEVEL:
         return NoFix("too_dark", f"99 % of the view is darker than {high:.0f} of 255")
     if low > BRIGHT_LEVEL:
@@ -54,6 +57,14 @@ def check_view(grey: NDArray[np.uint8]) -> NoFix | None:
     if std < MIN_STD:
         return NoFix("blank", f"grey levels differ by {std:.1f} of 255 only (standard deviation)")
     return None
+
+
+def _percentile(counts: NDArray[np.intp], percent: float) -> float:
+    """As `np.percentile` of the levels that were counted, in a tenth of the time."""
+    upto = np.cumsum(counts)
+    at = percent / 100 * (int(upto[-1]) - 1)
+    below, above = np.searchsorted(upto, [math.floor(at), math.ceil(at)], side="right").tolist()
+    return float(below + (at - math.floor(at)) * (above - below))
 
 
 def check_rectified(view: Rectified, min_valid_share: float) -> NoFix | None:

@@ -46,7 +46,7 @@ from orthonav.sources.recording import fitted
 log = logging.getLogger(__name__)
 TICK_NS = 10**9
 UTC_JUMP_NS = 200_000_000
-_WAIT_S = 0.005
+_WAIT_S = 0.001
 Grey = NDArray[np.uint8]
 
 

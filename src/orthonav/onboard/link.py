@@ -130,9 +130,9 @@ class AutopilotLink:
             return True
 
     def covers(self, exposed_ns: int) -> bool:
-        """Whether an attitude after a moment of our clock has come."""
+        """Whether the attitude at a moment of our clock is known."""
         with self._lock:
-            newest, offset = self.buffer.newest_ns, self.sync.offset_ns
+            newest, offset = self.buffer.covered_ns, self.sync.offset_ns
             return newest is not None and offset is not None and newest >= exposed_ns + offset
 
     def told_at(self, exposed_ns: int) -> Told:

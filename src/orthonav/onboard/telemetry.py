@@ -46,6 +46,7 @@ class Limits:
     keep_s: float = 10.0
     attitude_gap_s: float = 0.5
     attitude_hold_s: float = 0.1
+    attitude_ahead_s: float = 0.03
     slow_gap_s: float = 2.0
     slow_hold_s: float = 1.5
 
@@ -117,6 +118,18 @@ class _Line:
             return None
         return self.values[after - 1], self.values[after], (time_ns - start) / way
 
+    def ahead(self, time_ns: int, most_ns: int) -> tuple[Array, Array, float] | None:
+        """The last two values and a weight above 1 for a moment a little after them."""
+        if not self.covered_ns(most_ns) >= time_ns > self.times[-1]:
+            return None
+        way = self.times[-1] - self.times[-2]
+        return self.values[-2], self.values[-1], 1 + (time_ns - self.times[-1]) / way
+
+    def covered_ns(self, most_ns: int) -> int:
+        """Up to when values are known: a little longer than told where they come closely."""
+        close = len(self.times) > 1 and self.times[-1] - self.times[-2] <= 2 * most_ns
+        return self.times[-1] + (most_ns if close else 0)
+
     def at(self, time_ns: int) -> Array | None:
         """Linear between samples; None in gaps."""
         found = self.around(time_ns)
@@ -181,9 +194,16 @@ class TelemetryBuffer:
         """Time of the last attitude, None where there is none."""
         return self._attitude.times[-1] if self._attitude.times else None
 
+    @property
+    def covered_ns(self) -> int | None:
+        """Up to when the attitude is known: a little longer than told, None where there is none."""
+        return self._attitude.covered_ns(self._ahead_ns) if self._attitude.times else None
+
     def at(self, time_ns: int) -> Told:
         """What was told of a moment, between samples by the shortest turn and a straight line."""
         found = self._attitude.around(time_ns)
+        if found is not None and time_ns > self._attitude.times[-1]:
+            found = self._attitude.ahead(time_ns, self._ahead_ns) or found
         turn = None
         if found is not None:
             before, after, weight = found
@@ -199,6 +219,10 @@ class TelemetryBuffer:
             return Told(turn, height, source)
         north, east, down, below = local.tolist()
         return Told(turn, height, source, (north, east, down), below)
+
+    @property
+    def _ahead_ns(self) -> int:
+        return round(self.limits.attitude_ahead_s * 1e9)
 
     @property
     def _keep_ns(self) -> int:
