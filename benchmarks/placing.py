@@ -144,7 +144,7 @@ def _other(task: Task) -> Placer:
     picture = posed.Picture.read(Path(task.map_path), Path(task.pixels), task.factor)
     method: Any
     if task.method == SIFT:
-        method = posed.Sift(picture)
+        method = posed.Keypoints(picture)
     else:
         surfaces: dict[str, Callable[[], Any]] = {
             TEMPLATE: lambda: posed.TemplateSurface(picture, False),

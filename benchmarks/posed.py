@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,6 +28,8 @@ Place = NDArray[np.float64] | None
 TURN_STEP_DEG, SCALE_STEP, SIGMAS = 8.0, 0.13, 3.0
 SCALE_STD = 0.1
 LEVELS_MI = 6
+MAP_ORB, VIEW_ORB = 40_000, 2_000
+"""Keypoints of ORB that are kept of 4 km2 of map, and of a view."""
 LOWE, MIN_INLIERS, RANSAC_PX, BORDER_PX = 0.75, 8, 4.0, 9
 TOLD = "told pose"
 
@@ -245,30 +248,44 @@ class MutualSurface:
         return np.asarray(total, np.float32)
 
 
-class Sift:
-    """SIFT of the told view against keypoints of the whole map, ratio test, RANSAC similarity."""
+class Keypoints:
+    """SIFT or ORB of the told view against keypoints of the map, ratio test, RANSAC similarity.
 
-    def __init__(self, picture: Picture) -> None:
-        self._picture = picture
-        self._sift = cv2.SIFT_create()  # type: ignore[attr-defined]
-        self._points, descriptors = self._features(picture.grey, picture.valid)
-        self._matcher = cv2.FlannBasedMatcher({"algorithm": 1, "trees": 5}, {"checks": 64})
-        self._matcher.add([descriptors])
-        self._matcher.train()
+    With `near_m` only keypoints so near to the place that `locate` is told are compared, one by
+    one; without, all those of the map, by an index that is made once.
+    """
 
-    def locate(self, camera: Camera, view: View, heading_known: bool) -> Place:
+    def __init__(self, picture: Picture, *, orb: bool = False, near_m: float | None = None) -> None:
+        self._picture, self._near_m = picture, near_m
+        self._detector: Any = cv2.SIFT_create()  # type: ignore[attr-defined]
+        index: dict[str, Any] = {"algorithm": 1, "trees": 5}
+        if orb:
+            self._detector = cv2.ORB_create(nfeatures=MAP_ORB)  # type: ignore[attr-defined]
+            index = {"algorithm": 6, "table_number": 6, "key_size": 12, "multi_probe_level": 1}
+        self._points, self._descriptors = self._features(picture.grey, picture.valid)
+        self._norm = cv2.NORM_HAMMING if orb else cv2.NORM_L2
+        self._matcher: Any = cv2.FlannBasedMatcher(index, {"checks": 64})
+        if near_m is None:
+            self._matcher.add([self._descriptors])
+            self._matcher.train()
+        if orb:
+            self._detector.setMaxFeatures(VIEW_ORB)
+
+    def locate(
+        self, camera: Camera, view: View, heading_known: bool, near_en_m: Place = None
+    ) -> Place:
         """Where the middle of the view falls; none with too few inliers. No heading is needed."""
         seen = next(posed(camera, view, self._picture.gsd_m, [(0.0, 1.0)]))
         points, descriptors = self._features(seen.grey, seen.valid)
         if len(points) < MIN_INLIERS:
             return None
-        pairs = self._matcher.knnMatch(descriptors, k=2)
+        theirs, pairs = self._pairs(descriptors, near_en_m)
         good = [a for a, b in (p for p in pairs if len(p) == 2) if a.distance < LOWE * b.distance]
         if len(good) < MIN_INLIERS:
             return None
         matrix, inliers = cv2.estimateAffinePartial2D(
             points[[match.queryIdx for match in good]],
-            self._points[[match.trainIdx for match in good]],
+            theirs[[match.trainIdx for match in good]],
             method=cv2.RANSAC,
             ransacReprojThreshold=RANSAC_PX,
         )
@@ -277,12 +294,24 @@ class Sift:
         centre = matrix @ [*(np.array(seen.grey.shape[::-1]) / 2), 1.0]
         return np.asarray(self._picture.place_en_m(*centre) - seen.offset_en_m)
 
+    def _pairs(
+        self, descriptors: NDArray[Any], near_en_m: Place
+    ) -> tuple[NDArray[np.float64], Any]:
+        """Keypoints of the map (N, 2) that are compared, and the two likest of each of ours."""
+        if self._near_m is None or near_en_m is None:
+            return self._points, self._matcher.knnMatch(descriptors, k=2)
+        grid, gsd_m = self._picture.grid, self._picture.gsd_m
+        col, row = (near_en_m - [grid.west_m, grid.north_m]) / [gsd_m, -gsd_m]
+        near = np.hypot(*(self._points - [col, row]).T) * gsd_m <= self._near_m
+        each: Any = cv2.BFMatcher(self._norm)
+        return self._points[near], each.knnMatch(descriptors, self._descriptors[near], k=2)
+
     def _features(
         self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    ) -> tuple[NDArray[np.float64], NDArray[Any]]:
         kernel = np.ones((BORDER_PX, BORDER_PX), np.uint8)
         mask = cv2.erode(valid.astype(np.uint8), kernel, borderValue=1)
-        keypoints, descriptors = self._sift.detectAndCompute(grey, mask)
+        keypoints, descriptors = self._detector.detectAndCompute(grey, mask)
         return np.array([k.pt for k in keypoints]).reshape(-1, 2) + 0.5, descriptors
 
 

@@ -25,6 +25,8 @@ PACKAGES = (
     "scipy",
     "opencv-python-headless",
     "safetensors",
+    "pymavlink",
+    "mcap",
     "rasterio",
     "torch",
     "onnx",
@@ -148,6 +150,8 @@ TARGETS = (
         "map at 1 m, 256 px tiles, 87.5 % overlap, less registration layer, MB per km2",
         0.3,
     ),
+    ("onboard_p99_ms", "exposure to message at 5 Hz, 1280 x 960 px, one core, p99 ms", 60.0),
+    ("onboard_peak_mb", "resident memory in flight, largest, MB", 350.0),
 )
 
 

@@ -92,7 +92,7 @@ def measure(place: Workplace) -> Section:
     section = Section("Registration beside other methods")
     past, present = place.area(SIDE_M, 1.0, [PAST, PRESENT])
     map_path = place.map(past)
-    pixels = _stored(past, map_path, place.scratch)
+    pixels = stored(past, map_path, place.scratch)
     known, unknown = (12, 4) if place.quick else (100, 25)
     scenes = (
         ("heading off by 10 deg, height by 10 % (sd)", KNOWN, True, known),
@@ -112,7 +112,7 @@ def measure(place: Workplace) -> Section:
     return section
 
 
-def _stored(past: Path, map_path: Path, scratch: Path) -> Path:
+def stored(past: Path, map_path: Path, scratch: Path) -> Path:
     """The orthophoto in the map's own raster, for processes that have no GDAL."""
     localizer = Localizer(open_map(map_path), registration=False)
     grid = localizer.grid

@@ -14,6 +14,7 @@ from benchmarks import (
     building,
     comparison,
     growth,
+    onboard,
     per_view,
     processes,
     search_scale,
@@ -34,6 +35,7 @@ SECTIONS: dict[str, Callable[[Workplace], Section]] = {
     "growth": growth.measure,
     "spent": spent.measure,
     "track": tracking.measure,
+    "onboard": onboard.measure,
 }
 
 

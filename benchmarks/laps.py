@@ -1,0 +1,170 @@
+"""Flights that are played in real time: one lap is rendered and kept, and flown round and round."""
+
+import csv
+import hashlib
+import math
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+
+import orthonav.simulate as simulate
+from benchmarks.inputs import FLIGHT_SEED, Workplace
+from orthonav.flight import read_truth
+from orthonav.geo import camera, lens
+from orthonav.geo.camera import Camera
+from orthonav.geo.frames import LocalFrame
+from orthonav.geo.route import Route
+from orthonav.simulate import render
+from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+
+CAMERA = Camera(
+    1280, 960, 1000.0, 1000.0, 646.0, 474.0, distortion=(-0.12, 0.05, 0.0005, -0.0003, 0.0)
+)
+"""A wide board camera: 65 x 51 deg, and a lens that bends the rim by 17 px."""
+SMALL_CAMERA = Camera(640, 480, 500.0, 500.0, 323.0, 237.0)
+AGL_M, SPEED_MPS = 250.0, 25.0
+HALF_M, TURN_RADIUS_M = 300.0, 120.0
+LINE_EN_M = ((0, 1), (1, 1), (1, -1), (-1, -1), (-1, 1), (0, 1))
+"""Corners of a lap in `HALF_M` from the middle of the map; it ends where it begins."""
+ERRORS = Errors(
+    yaw_std_deg=0.5,
+    agl_std=0.01,
+    lean_std_deg=1.0,
+    yaw_bias_deg=3.0,
+    agl_bias=0.03,
+    pitch_bias_deg=0.5,
+    velocity_drift=0.02,
+)
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Lap:
+    """How a lap is flown: by which camera, at how many views a second. Short: a side and a half."""
+
+    camera: Camera
+    rate_hz: float
+    short: bool = False
+
+    @property
+    def corners_en_m(self) -> Array:
+        """Corners (N, 2) of its route."""
+        line = LINE_EN_M[-3:] if self.short else LINE_EN_M
+        return np.array(line, np.float64) * HALF_M
+
+
+def rendered(place: Workplace, ortho: Path, frame: LocalFrame, lap: Lap) -> Path:
+    """The flight folder of a lap, kept until its settings or the simulator change."""
+    settings = repr((lap, lap.corners_en_m.tolist(), AGL_M, SPEED_MPS, TURN_RADIUS_M, ERRORS))
+    digest = hashlib.sha256(settings.encode() + ortho.parent.name.encode())
+    digest.update(_sources())
+    folder = place.kept / f"lap-{lap.camera.width_px}-{digest.hexdigest()[:8]}"
+    if not folder.is_dir():
+        lat, lon = frame.latlon_from_en(lap.corners_en_m)
+        request = SimulateRequest(
+            [ortho],
+            folder,
+            route=Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True))),
+            agl_m=AGL_M,
+            spacing_m=SPEED_MPS / lap.rate_hz,
+            speed_mps=SPEED_MPS,
+            camera=lap.camera,
+            errors=ERRORS,
+            seed=FLIGHT_SEED,
+            turn_radius_m=TURN_RADIUS_M,
+        )
+        with patch.object(render, "undistort", _kept(camera.undistort)):
+            simulate_flight(request)
+    return folder
+
+
+def _kept(undistort: Callable[[Camera, Array], Array]) -> Callable[[Camera, Array], Array]:
+    """The lens undone for all pixels takes seconds, and is the same for every view."""
+    found: dict[tuple[Camera, int], Array] = {}
+
+    def once(camera: Camera, xy: Array) -> Array:
+        key = camera, len(xy)
+        if key not in found:
+            found[key] = undistort(camera, xy)
+        return found[key]
+
+    return once
+
+
+def _sources() -> bytes:
+    """Digest of what makes the pictures."""
+    digest = hashlib.sha256()
+    paths = sorted(Path(str(simulate.__file__)).parent.glob("*.py"))
+    for path in [*paths, Path(camera.__file__), Path(lens.__file__)]:
+        digest.update(path.read_bytes())
+    return digest.digest()
+
+
+def played(
+    lap: Path, out: Path, views: int, *, every: int = 1, first: int = 0, lead_s: float = 0.0
+) -> Path:
+    """A flight folder of so many views of a lap, `every` so many, round and round.
+
+    It begins with view `first`, at `lead_s`. Its pictures are those of the lap, under a name for
+    each round, so an hour takes no more room than a lap.
+    """
+    rows, truth = _read(lap / "telemetry.csv"), _read(lap / "truth.csv")
+    times_s = np.array([float(row["time_s"]) for row in rows])
+    period_s = float(times_s[-1]) + _closing_m(lap) / SPEED_MPS
+    shutil.rmtree(out, ignore_errors=True)
+    (out / "frames").mkdir(parents=True)
+    told, true = [], []
+    for number in range(views):
+        turn, index = divmod(first + number * every, len(rows))
+        frame = f"{turn:04d}/{rows[index]['frame']}"
+        time_s = lead_s + turn * period_s + float(times_s[index] - times_s[first])
+        told.append({**rows[index], "frame": frame, "time_s": f"{time_s:.9f}"})
+        true.append({**truth[index], "frame": frame})
+        link = out / "frames" / f"{turn:04d}"
+        if not link.is_symlink():
+            link.symlink_to((lap / "frames").resolve(), target_is_directory=True)
+    _write(out / "telemetry.csv", told)
+    _write(out / "truth.csv", true)
+    shutil.copyfile(lap / "flight.json", out / "flight.json")
+    return out
+
+
+def rest_of(folder: Path, out: Path, from_s: float) -> Path:
+    """The views of a played flight from a time on: what a camera started then sees."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    rows = [row for row in _read(folder / "telemetry.csv") if float(row["time_s"]) >= from_s]
+    _write(out / "telemetry.csv", rows)
+    shutil.copyfile(folder / "flight.json", out / "flight.json")
+    (out / "frames").symlink_to((folder / "frames").resolve(), target_is_directory=True)
+    return out
+
+
+def views_of(folder: Path) -> int:
+    """How many views a flight folder has."""
+    return len(_read(folder / "telemetry.csv"))
+
+
+def _closing_m(lap: Path) -> float:
+    """From the last view of a lap to its first."""
+    places = list(read_truth(lap / "truth.csv").values())
+    last = LocalFrame(*places[0]).en_from_latlon(*places[-1])
+    return math.hypot(*last.tolist())
+
+
+def _read(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def _write(path: Path, rows: Sequence[dict[str, str]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)

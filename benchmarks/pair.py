@@ -1,0 +1,288 @@
+"""`orthonav fly` in a process of its own on one core, beside a stand-in for the autopilot."""
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.flight import open_flight, read_truth
+from orthonav.geo.frames import LocalFrame
+
+POSITION = "GLOBAL_POSITION_SENSOR"
+TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Cores:
+    """Where what is measured runs, and where all the rest does; the same one if there is one."""
+
+    flying: int
+    other: int
+
+    @classmethod
+    def chosen(cls) -> "Cores":
+        """Of those that this process may use, the last and the first."""
+        allowed = sorted(os.sched_getaffinity(0))
+        return cls(allowed[-1], allowed[0])
+
+
+@contextlib.contextmanager
+def on_core(core: int) -> Iterator[None]:
+    """This thread, and what it starts meanwhile, on one core."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {core})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def free_port() -> int:
+    """A UDP port of the loopback that nobody uses."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class StandIn:
+    """The stand-in's process, and all it has heard so far."""
+
+    def __init__(self, flight: Path, port: int, core: int, pace: float = 1.0) -> None:
+        """Returns when its clock has begun."""
+        self.flight, self.pace = flight, pace
+        self.heard: list[dict[str, Any]] = []
+        command = [sys.executable, "-m", "benchmarks.standin", str(flight), str(port)]
+        with on_core(core):
+            self._process = subprocess.Popen(
+                [*command, "--pace", str(pace)], stdout=subprocess.PIPE, text=True
+            )
+        out = self._process.stdout
+        assert out is not None
+        begun = json.loads(out.readline())
+        self.begin_ns, self.utc_ahead_ns = int(begun["begin_ns"]), int(begun["utc_ahead_ns"])
+        self._change = threading.Condition()
+        self._thread = threading.Thread(target=self._read, args=(out,), daemon=True)
+        self._thread.start()
+
+    def _read(self, out: IO[str]) -> None:
+        for line in out:
+            with self._change:
+                self.heard.append(json.loads(line))
+                self._change.notify()
+
+    def position_after(self, mono_ns: int, timeout_s: float) -> int | None:
+        """When the first position came after a moment, waiting so long; None if none did."""
+
+        def found() -> list[int]:
+            return [
+                m["at_ns"] for m in self.heard if m["name"] == POSITION and m["at_ns"] > mono_ns
+            ]
+
+        with self._change:
+            self._change.wait_for(found, timeout_s)
+            return next(iter(found()), None)
+
+    def mono_ns(self, flight_s: float) -> int:
+        """When a time of the flight is, by the monotonic clock."""
+        return self.begin_ns + round(flight_s / self.pace * 1e9)
+
+    def wait_until(self, flight_s: float) -> None:
+        """Sleep until a time of the flight."""
+        time.sleep(max(0.0, (self.mono_ns(flight_s) - time.monotonic_ns()) / 1e9))
+
+    def stop(self) -> None:
+        """End it; what it heard stays."""
+        self._process.terminate()
+        self._process.wait(10)
+        self._thread.join(10)
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+    def __enter__(self) -> "StandIn":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A process at a moment: memory, processor time, and how long its first thread was ready to
+    run and had to wait; `core_s` is what the core did for all processes."""
+
+    at_ns: int
+    rss_mb: float
+    peak_mb: float
+    cpu_s: float
+    waited_s: float
+    core_s: float
+
+
+@dataclass
+class Fly:
+    """`orthonav fly` with these arguments on one core."""
+
+    arguments: Sequence[str]
+    core: int
+    errors: Path
+    samples: list[Sample] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        program = Path(sys.executable).with_name("orthonav")
+        script = [str(program)] if program.is_file() else [sys.executable, "-m", "orthonav"]
+        with on_core(self.core), self.errors.open("ab") as errors:
+            self.started_ns = time.monotonic_ns()
+            self.process = subprocess.Popen(
+                [*script, "fly", *self.arguments], stdout=subprocess.DEVNULL, stderr=errors
+            )
+
+    def watch(self, until_ns: int | None = None, every_s: float = 1.0) -> None:
+        """Take a sample each second until it ends, or until a moment."""
+        while self.process.poll() is None:
+            left_s = every_s if until_ns is None else (until_ns - time.monotonic_ns()) / 1e9
+            if left_s <= 0:
+                return
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(min(every_s, left_s))
+            made = sample(self.process.pid, self.core)
+            if made is not None:
+                self.samples.append(made)
+
+    def kill(self) -> None:
+        """At once, as when power fails."""
+        self.process.kill()
+        self.process.wait(10)
+
+    def stop(self) -> int:
+        """As systemd stops it; the exit code."""
+        self.process.send_signal(signal.SIGTERM)
+        try:
+            return self.process.wait(40)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            raise
+
+    def __enter__(self) -> "Fly":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self.process.poll() is None:
+            self.kill()
+
+
+def sample(pid: int, core: int) -> Sample | None:
+    """A process now; None where it has ended."""
+    at_ns = time.monotonic_ns()
+    try:
+        status = Path(f"/proc/{pid}/status").read_text().splitlines()
+        stat = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        waited = int(Path(f"/proc/{pid}/schedstat").read_text().split()[1])
+    except (OSError, IndexError):
+        return None
+    kb = {line.split(":")[0]: int(line.split()[1]) for line in status if line.startswith("Vm")}
+    if "VmRSS" not in kb:
+        return None
+    cpu_s = (int(stat[11]) + int(stat[12])) / TICKS_PER_S
+    rss_mb, peak_mb = (kb[name] * 1024 / 1e6 for name in ("VmRSS", "VmHWM"))
+    return Sample(at_ns, rss_mb, peak_mb, cpu_s, waited / 1e9, _core_s(core))
+
+
+def _core_s(core: int) -> float:
+    """What a core has worked so far: all but idle and waiting for disks."""
+    for line in Path("/proc/stat").read_text().splitlines():
+        name, *values = line.split()
+        if name == f"cpu{core}":
+            ticks = [int(value) for value in values[:8]]
+            return (sum(ticks) - ticks[3] - ticks[4]) / TICKS_PER_S
+    raise RuntimeError(f"this system does not tell what core {core} does")
+
+
+@dataclass(frozen=True, eq=False)
+class Arrivals:
+    """Positions that the stand-in heard (N,): which view, from its exposure to the message's
+    arrival, how far it is from the truth, how far off the exposure was that the message told."""
+
+    view: NDArray[np.intp]
+    latency_ms: Array
+    error_m: Array
+    clock_ms: Array
+
+    @classmethod
+    def of(cls, standin: StandIn) -> "Arrivals":
+        """Everything heard so far; `flight` is played by the stand-in."""
+        flight = open_flight(standin.flight)
+        times_s = np.array([view.telemetry.time_ns / 1e9 for view in flight.views])
+        truth = read_truth(standin.flight / "truth.csv")
+        places = [truth[view.frame] for view in flight.views]
+        rows = []
+        for message in standin.heard:
+            if message["name"] != POSITION:
+                continue
+            sent_us = message["time_usec"]  # of this message; exposure is before it by its age
+            told_ns = (sent_us - message["processing_time"]) * 1000 - standin.utc_ahead_ns
+            told_s = (told_ns - standin.begin_ns) / 1e9 * standin.pace
+            view = int(np.abs(times_s - told_s).argmin())
+            exposed_ns = standin.mono_ns(float(times_s[view]))
+            off = LocalFrame(*places[view]).en_from_latlon(
+                message["lat"] * 1e-7, message["lon"] * 1e-7
+            )
+            latency_ms, clock_ms = (
+                (message["at_ns"] - exposed_ns) / 1e6,
+                (told_ns - exposed_ns) / 1e6,
+            )
+            rows.append((view, latency_ms, float(np.hypot(*off)), clock_ms))
+        columns = np.array(rows, np.float64).reshape(-1, 4)
+        return cls(columns[:, 0].astype(np.intp), *columns[:, 1:].T)
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """What the program itself wrote: ages (ms) of all views and of those that were sent, its last
+    line of health, and for how many lines each reason of health was there."""
+
+    ages_ms: Array
+    sent_ages_ms: Array
+    health: dict[str, Any]
+    reasons: Counter[str]
+
+    @classmethod
+    def read(cls, path: Path) -> "Lines":
+        """The file of `--json`; a line that was cut off by a kill is left out."""
+        ages, sent, health = [], [], {}
+        reasons: Counter[str] = Counter()
+        for text in path.read_text("ascii").splitlines() if path.is_file() else ():
+            with contextlib.suppress(ValueError):
+                line = json.loads(text)
+                if "health" in line:
+                    health = line
+                    reasons.update(line["reasons"])
+                    continue
+                ages.append(line["age_ms"])
+                if line["sent"]:
+                    sent.append(line["age_ms"])
+        return cls(np.array(ages, np.float64), np.array(sent, np.float64), health, reasons)
