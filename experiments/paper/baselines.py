@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 from benchmarks.flights import View
-from benchmarks.posed import BestOfPoses, MutualSurface, Picture, Sift, TemplateSurface
+from benchmarks.posed import BestOfPoses, Keypoints, MutualSurface, Picture, TemplateSurface
 from benchmarks.record import provenance
 from numpy.typing import NDArray
 
@@ -57,7 +57,7 @@ BASELINES = (
     ),
     Baseline("Canny edges matched", _told(lambda picture: TemplateSurface(picture, True))),
     Baseline("grey levels matched", _told(lambda picture: TemplateSurface(picture, False))),
-    Baseline("SIFT, ratio test, RANSAC", Sift),
+    Baseline("SIFT, ratio test, RANSAC", Keypoints),
 )
 
 
