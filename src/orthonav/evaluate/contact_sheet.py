@@ -183,7 +183,7 @@ def _view_patch(
 
     Raises `FlightError` where there is none, with why.
     """
-    told = _as_fixed(view.telemetry, result)
+    told = as_fixed(view.telemetry, result)
     refused = check_telemetry(told, camera, math.inf, heading_known=True)
     if refused is not None:
         raise FlightError(refused.detail)
@@ -208,7 +208,7 @@ def _view_patch(
     return side_m, made.offset_en_m, Patch(np.ma.masked_where(~made.valid, made.grey), extent_m)
 
 
-def _as_fixed(told: Telemetry, result: ViewResult) -> Telemetry:
+def as_fixed(told: Telemetry, result: ViewResult) -> Telemetry:
     """Heading, height and lean as the fix has them, as told where it does not say."""
     fix = result.outcome
     if not isinstance(fix, Fix):

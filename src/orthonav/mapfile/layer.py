@@ -145,6 +145,20 @@ class GreyLayer:
                 valid[target] = True if chunk[1] is None else chunk[1][inside]
         return grey, valid
 
+    def jpeg(self, level: int, chunk_row: int, chunk_col: int) -> bytes | None:
+        """The JPEG of a chunk as it is stored, checked; None unless all of the chunk is valid.
+
+        Raises `IndexError` where there is no such chunk, `MapFileError` where it is damaged.
+        """
+        rows, cols = self.shape(level)
+        side = self._table.chunk_px
+        if not (0 <= chunk_row * side < rows and 0 <= chunk_col * side < cols):
+            raise IndexError(f"level {level} has no chunk {chunk_row}, {chunk_col}")
+        chunk = self._chunk(level, chunk_row, chunk_col)
+        if chunk is None or chunk[1] is not None:
+            return None
+        return self._jpegs.blob(self._table.number(level, chunk_row, chunk_col)).tobytes()
+
     def _chunk(self, level: int, chunk_row: int, chunk_col: int) -> Chunk | None:
         """A chunk, decoded now or before; None where no pixel of it is valid."""
         number = self._table.number(level, chunk_row, chunk_col)

@@ -88,7 +88,7 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
     """
     if options.telemetry is not None:
         raise FlightError(f"a flight log has telemetry of its own: no --telemetry: {path}")
-    files = _files_of_run(path)
+    files = files_of_run(path)
     index = _Index()
     for file in files:
         _read_file(file, index)
@@ -115,11 +115,11 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
     )
 
 
-def _files_of_run(path: Path) -> list[Path]:
+def files_of_run(path: Path) -> list[Path]:
     """The files of one run in order: of a folder, or from the one that is named."""
     if path.is_dir():
         files = [file for file in path.glob("*.mcap") if profile_of(file) == PROFILE]
-        found = {file: run for file in sorted(files, key=_order) if (run := _run_of(file))}
+        found = {file: run for file in sorted(files, key=_order) if (run := run_of(file))}
         runs = {run: file for file, run in reversed(found.items())}
         if len(runs) > 1:
             names = ", ".join(sorted(file.name for file in runs.values())[:5])
@@ -128,7 +128,7 @@ def _files_of_run(path: Path) -> list[Path]:
             )
         return list(found)
     match = _NUMBERED.fullmatch(path.name)
-    run = _run_of(path)
+    run = run_of(path)
     if match is None or run is None:
         return [path]
     name, number = match[1], int(match[2])
@@ -137,7 +137,7 @@ def _files_of_run(path: Path) -> list[Path]:
         other = _NUMBERED.fullmatch(file.name)
         if other and other[1] == name and int(other[2]) > number and profile_of(file) == PROFILE:
             later.append(file)
-    return [path, *(file for file in sorted(later, key=_order) if _run_of(file) == run)]
+    return [path, *(file for file in sorted(later, key=_order) if run_of(file) == run)]
 
 
 def _order(path: Path) -> tuple[str, int]:
@@ -145,7 +145,7 @@ def _order(path: Path) -> tuple[str, int]:
     return (match[1], int(match[2])) if match else (path.name, 0)
 
 
-def _run_of(path: Path) -> str | None:
+def run_of(path: Path) -> str | None:
     """The run that a file is of; None where no chunk tells."""
     for chunk in chunks(path, Walk()):
         for found in messages(chunk, {}):

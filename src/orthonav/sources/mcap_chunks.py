@@ -42,8 +42,13 @@ class Chunk:
 
 @dataclass
 class Walk:
-    """What became of a file: bytes behind the last whole record, damaged chunks, a proper end."""
+    """What became of a file: bytes behind the last whole record, damaged chunks, a proper end.
 
+    `next_offset` is where the first record begins that was not told of: a file that grows is gone
+    on with there.
+    """
+
+    next_offset: int = len(MAGIC)
     lost_bytes: int = 0
     damaged: int = 0
     ended: bool = False
@@ -63,10 +68,13 @@ def profile_of(path: Path) -> str | None:
 
 
 def chunks(path: Path, walk: Walk) -> Iterator[Chunk]:
-    """The chunks of a file from its start, up to its end or where it was cut; fills in `walk`."""
+    """The chunks of a file, up to its end or where it was cut; fills in `walk`.
+
+    They begin where `walk` ended before: with a new one at the start of the file.
+    """
     with path.open("rb") as stream:
         size = stream.seek(0, io.SEEK_END)
-        at = stream.seek(len(MAGIC))
+        at = walk.next_offset
         while at + _RECORD_BYTES <= size:
             stream.seek(at)
             head = stream.read(_RECORD_BYTES)
@@ -76,13 +84,14 @@ def chunks(path: Path, walk: Walk) -> Iterator[Chunk]:
                 return
             if opcode == 0 or length > size - at - _RECORD_BYTES:
                 break
+            walk.next_offset = at + _RECORD_BYTES + length
             if opcode == _CHUNK:
                 data = _inflated(stream, length)
                 if data is None:
                     walk.damaged += 1
                 else:
                     yield Chunk(at, data)
-            at += _RECORD_BYTES + length
+            at = walk.next_offset
         walk.lost_bytes = max(0, size - at)
 
 

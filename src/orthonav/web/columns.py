@@ -1,0 +1,121 @@
+"""Results as columns of short numbers, so that many thousand views fit into one answer.
+
+Lengths and positions are rounded to what a screen can show. What is not known is None.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.evaluate.calibration import is_covariance
+from orthonav.evaluate.metrics import FAR_M
+from orthonav.evaluate.track import SURE
+from orthonav.publish.jsonl import STATES
+from orthonav.records import Fix, ViewResult
+from orthonav.web.ground import Ground
+
+Array = NDArray[np.float64]
+FAR_AWAY_PX = 1e9
+"""A place farther off than that is on no map: not drawn."""
+
+
+def columns_of(
+    results: Sequence[ViewResult],
+    first_ns: int,
+    truth: Mapping[str, tuple[float, float]],
+    ground: Ground,
+    radius_m: float,
+) -> dict[str, list[Any]]:
+    """The columns of `results`, in order; times count from `first_ns`.
+
+    `frame`, `t` (seconds), `x`, `y` (of the fix) and `tx`, `ty` (of the truth) in pixels of the
+    sheet, `err` (m), `conf`, `radius` (m, its own), `a`, `b` (axes of one standard deviation, m)
+    and `turn` (of the longer one, degrees counter-clockwise from east), `head` (deg), `agl` (m),
+    `ms`, `state` (number in `STATES`, -1 for none), `reason` ("" for a fix), `wrong` (1: tracking
+    or sure, and off by more than 35 m, the radius asked for and its own).
+    """
+    fixes = [r.outcome if isinstance(r.outcome, Fix) else None for r in results]
+    fix_en_m = _places([None if f is None else (f.lat_deg, f.lon_deg) for f in fixes], ground)
+    truth_en_m = _places([truth.get(r.frame) for r in results], ground)
+    error_m = np.hypot(*(fix_en_m - truth_en_m).T)
+    own_m = np.array([math.nan if f is None else f.radius_m for f in fixes], dtype=np.float64)
+    sure = [
+        f is not None and (f.confidence >= SURE or r.state == "tracking")
+        for f, r in zip(fixes, results, strict=True)
+    ]
+    wrong = np.array(sure, dtype=bool) & (error_m > np.fmax(max(FAR_M, radius_m), own_m))
+    axes_m, turn_deg = _ellipses(fixes)
+    x, y = _drawn(fix_en_m, ground)
+    tx, ty = _drawn(truth_en_m, ground)
+    return {
+        "frame": [r.frame for r in results],
+        "t": [round((r.time_ns - first_ns) / 1e9, 3) for r in results],
+        "x": _rounded(x, 2),
+        "y": _rounded(y, 2),
+        "tx": _rounded(tx, 2),
+        "ty": _rounded(ty, 2),
+        "err": _rounded(error_m, 2),
+        "conf": _each(fixes, "confidence", 4),
+        "radius": _rounded(own_m, 1),
+        "a": _rounded(axes_m[:, 1], 2),
+        "b": _rounded(axes_m[:, 0], 2),
+        "turn": _rounded(turn_deg, 1),
+        "head": _each(fixes, "heading_deg", 1),
+        "agl": _each(fixes, "agl_m", 1),
+        "ms": _rounded(np.array([r.latency_ms for r in results], dtype=np.float64), 1),
+        "state": [-1 if r.state is None else STATES.index(r.state) for r in results],
+        "reason": [_reason(r) for r in results],
+        "wrong": [int(each) for each in wrong],
+    }
+
+
+def _places(latlon_deg: Sequence[tuple[float, float] | None], ground: Ground) -> Array:
+    """Places (N, 2) in the plane of the sheet, NaN where there is none."""
+    en_m = np.full((len(latlon_deg), 2), math.nan)
+    known = [i for i, at in enumerate(latlon_deg) if at and all(map(math.isfinite, at))]
+    if known:
+        lat, lon = np.array([latlon_deg[i] for i in known], dtype=np.float64).T
+        en_m[known] = ground.frame.en_from_latlon(lat, lon)
+    return en_m
+
+
+def _drawn(en_m: Array, ground: Ground) -> tuple[Array, Array]:
+    px = ground.px_from_en(en_m)
+    px[~(np.abs(px) < FAR_AWAY_PX).all(axis=1)] = math.nan
+    return px[:, 0], px[:, 1]
+
+
+def _ellipses(fixes: Sequence[Fix | None]) -> tuple[Array, Array]:
+    """Standard deviations (N, 2) along both axes, the shorter first, and how the longer lies."""
+    cov = np.full((len(fixes), 2, 2), math.nan)
+    for i, fix in enumerate(fixes):
+        if fix is not None and np.shape(fix.cov_en_m2) == (2, 2):
+            cov[i] = fix.cov_en_m2
+    axes, turn = np.full((len(fixes), 2), math.nan), np.full(len(fixes), math.nan)
+    usable = is_covariance(cov)
+    if usable.any():
+        sizes, ways = np.linalg.eigh(cov[usable])
+        axes[usable] = np.sqrt(np.maximum(sizes, 0.0))
+        turn[usable] = np.degrees(np.arctan2(ways[:, 1, 1], ways[:, 0, 1])) % 180.0
+    return axes, turn
+
+
+def _each(fixes: Sequence[Fix | None], name: str, decimals: int) -> list[float | None]:
+    values = [math.nan if fix is None else getattr(fix, name) for fix in fixes]
+    return _rounded(np.array(values, dtype=np.float64), decimals)
+
+
+def _rounded(values: Array, decimals: int) -> list[float | None]:
+    return [
+        round(value, decimals) if math.isfinite(value) else None
+        for value in np.asarray(values).tolist()
+    ]
+
+
+def _reason(result: ViewResult) -> str:
+    if isinstance(result.outcome, Fix):
+        return ""
+    return result.outcome.reason or "not_said"

@@ -1,0 +1,123 @@
+"""From the names on the command line to a run."""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from orthonav.errors import FlightError, MissingFileError
+from orthonav.flight import read_truth
+from orthonav.mapfile import open_map
+from orthonav.mapfile.signature import map_digest
+from orthonav.sources.flightlog import is_flight_log
+from orthonav.web.feed import Feed, LineFeed
+from orthonav.web.ground import Ground
+from orthonav.web.logs import LogReader
+from orthonav.web.pictures import FolderPictures, NoPictures, Pictures
+from orthonav.web.run import Run, Told
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ViewRequest:
+    """What is to be shown: see the arguments of `orthonav view`."""
+
+    run: Path
+    map_path: Path
+    flight: Path | None = None
+    truth: Path | None = None
+    radius_m: float = 15.0
+    live: bool = False
+
+
+def open_run(request: ViewRequest) -> Run:
+    """The run, read as far as it is there. What people should know of it is logged.
+
+    Raises an `OrthonavError` where something that was named is missing or broken.
+    """
+    if not 0 < request.radius_m < 1e7:
+        raise FlightError(f"radius must be above 0 m, got {request.radius_m}")
+    ground = Ground(open_map(request.map_path))
+    feed = _feed(request)
+    pictures = _pictures(request, feed)
+    truth, truth_name = _truth(request)
+    told = Told(
+        name=request.run.name or str(request.run),
+        map_name=request.map_path.name,
+        pictures=_pictures_name(request, pictures),
+        truth=truth_name,
+        live=request.live,
+    )
+    run = Run(told, feed, pictures, ground, truth, request.radius_m)
+    for problem in run.problems:
+        log.warning("%s", problem)
+    _warn(request, run, feed, truth)
+    return run
+
+
+def is_log(path: Path) -> bool:
+    """Whether this names a flight log, which may still be to come."""
+    if path.exists():
+        return is_flight_log(path)
+    return path.suffix == ".mcap"
+
+
+def _feed(request: ViewRequest) -> Feed:
+    path = request.run
+    if request.live and not path.exists() and not path.parent.is_dir():
+        raise MissingFileError(f"folder of the run does not exist: {path.parent}")
+    if is_log(path) or (request.live and path.is_dir()):
+        return LogReader(path, live=request.live)
+    if path.is_dir():
+        raise FlightError(f"expected fixes.jsonl or a flight log, got a folder of neither: {path}")
+    return LineFeed(path, live=request.live)
+
+
+def _pictures(request: ViewRequest, feed: Feed) -> Pictures:
+    path = request.flight
+    if path is None:
+        return feed if isinstance(feed, LogReader) else NoPictures()
+    if not path.exists() and not request.live:
+        raise MissingFileError(f"flight does not exist: {path}")
+    if is_log(path):
+        reader = LogReader(path, live=request.live)
+        reader.poll()
+        return reader
+    if path.is_file():
+        raise FlightError(
+            f"expected a flight folder or a flight log; write others as a folder with `orthonav "
+            f"import`: {path}"
+        )
+    return FolderPictures(path)
+
+
+def _truth(request: ViewRequest) -> tuple[Mapping[str, tuple[float, float]], str]:
+    """True positions and where they come from: as told, else those of the flight folder."""
+    if request.truth is not None:
+        return read_truth(request.truth), request.truth.name
+    if request.flight is not None and (request.flight / "truth.csv").is_file():
+        path = request.flight / "truth.csv"
+        return read_truth(path), f"{request.flight.name}/{path.name}"
+    return {}, ""
+
+
+def _pictures_name(request: ViewRequest, pictures: Pictures) -> str:
+    if isinstance(pictures, NoPictures):
+        return ""
+    return (request.flight or request.run).name
+
+
+def _warn(
+    request: ViewRequest, run: Run, feed: Feed, truth: Mapping[str, tuple[float, float]]
+) -> None:
+    """What is probably a mistake."""
+    flown = feed.session.get("map") if isinstance(feed, LogReader) else None
+    if isinstance(flown, dict) and flown.get("manifest_sha256") != map_digest(request.map_path):
+        log.warning("flown with another map (%.80s): %s", flown.get("name"), request.map_path)
+    if not run.count:
+        return
+    if truth and not run.any_known("tx"):
+        log.warning("no view of the run has a true position in %s", run.told.truth)
+    if run.any_known("x") and not run.any_on_map():
+        log.warning("no position of the run lies on this map: %s", request.map_path)

@@ -1,0 +1,212 @@
+// The selected view beside the map where it was put and where it was taken, and laid over both, to
+// judge by eye: fainter and stronger, or blinking.
+
+import { getJson, mapUrl, rawUrl, viewUrl } from "./api.js";
+import { L, at } from "./map.js";
+import { SAID, clock, metres, number } from "./look.js";
+
+const BLINK_MS = 600; // slower than three flashes a second
+const WAIT_MS = 90; // while stepping fast, pictures are not asked for
+
+export class Compare {
+  constructor(map, store, root) {
+    Object.assign(this, { map, store });
+    this.find = (id) => root.getElementById(id);
+    map.createPane("views").style.zIndex = 350; // above tiles, below marks
+    this.over = null;
+    this.visible = true;
+    this.asked = 0;
+    this.find("opacity").addEventListener("input", () => this.#fade());
+    this.find("on-map").addEventListener("change", () => this.#fade());
+    this.find("blink").addEventListener("click", () => this.blink());
+  }
+
+  /** Shows the selected view. */
+  show() {
+    const i = this.store.selected;
+    if (i < 0) return;
+    this.find("chosen-name").textContent = `${i + 1} of ${this.store.count}: ${this.store.columns.frame[i]}`;
+    clearTimeout(this.timer);
+    const soon = performance.now() - (this.changed ?? 0) < 250;
+    this.changed = performance.now();
+    this.timer = setTimeout(() => this.#load(i), soon ? WAIT_MS : 0);
+  }
+
+  async #load(i) {
+    const asked = ++this.asked;
+    let detail;
+    try {
+      detail = await getJson(`api/views/${i}`);
+    } catch (error) {
+      detail = { why_no_window: error.message };
+    }
+    if (asked !== this.asked) return; // another was selected meanwhile
+    this.detail = detail;
+    this.#pictures(i, detail);
+    this.#known(detail);
+  }
+
+  #pictures(i, detail) {
+    const { generation, columns: c } = this.store;
+    const { window } = detail;
+    const [placed, taken] = [Number.isFinite(c.x[i]), Number.isFinite(c.tx[i])];
+    this.find("compare").hidden = !window;
+    this.find("no-compare").hidden = Boolean(window);
+    this.find("overlay").hidden = !window || !(placed || taken);
+    this.over?.remove();
+    this.over = null;
+    if (!window) {
+      this.find("no-compare").querySelector("p").textContent = `No picture from above: ${detail.why_no_window}.`;
+      this.#raw(i, detail);
+      return;
+    }
+    const name = c.frame[i];
+    this.#image("img-view", viewUrl(i, generation), `View ${name} seen from above, north up`);
+    this.find("figure-fix").hidden = !placed;
+    // Near to the fix it would be the same picture again.
+    const apart = taken && !(c.err[i] <= this.store.run.radius_m);
+    this.find("figure-truth").hidden = !apart;
+    if (placed) {
+      this.#image("img-fix", mapUrl(i, "fix", generation), "Map where the view was put");
+      this.#image("img-over", viewUrl(i, generation), "");
+    }
+    if (apart) this.#image("img-truth", mapUrl(i, "truth", generation), "Map where the view was taken");
+    this.#crosses(i, window);
+    this.#layOver(placed ? [c.x[i], c.y[i]] : [c.tx[i], c.ty[i]], window, viewUrl(i, generation), placed || taken);
+  }
+
+  #image(id, url, alt) {
+    const image = this.find(id);
+    image.alt = alt;
+    image.src = url;
+  }
+
+  /** The picture as it was taken, where it cannot be laid on the ground. */
+  #raw(i, detail) {
+    const image = this.find("img-raw");
+    image.hidden = !("told" in detail);
+    if (image.hidden) return;
+    image.onerror = () => { image.hidden = true; };
+    image.alt = "The view as it was taken";
+    image.src = rawUrl(i, this.store.generation);
+  }
+
+  /** Marks the places below the camera, which a camera that leans does not see in the middle. */
+  #crosses(i, window) {
+    const { columns: c, run } = this.store;
+    const [east, north] = window.offset_en_m.map((value) => value / window.side_m);
+    const pixels = window.side_m / run.sheet.gsd_m;
+    const [right, down] = [(c.tx[i] - c.x[i]) / pixels, (c.ty[i] - c.y[i]) / pixels];
+    this.#cross("put", 0.5 - east, 0.5 + north);
+    this.#cross("ring", 0.5 - east + right, 0.5 + north + down);
+    this.#cross("taken", 0.5 - east, 0.5 + north);
+  }
+
+  /** Puts a mark at a place of its picture, told in shares of its side. */
+  #cross(id, x, y) {
+    const cross = this.find(id);
+    cross.hidden = !(x > 0 && x < 1 && y > 0 && y < 1);
+    cross.style.left = `${100 * x}%`;
+    // The picture is square and as wide as its figure; the caption below it is not counted.
+    cross.style.top = `${y * cross.parentElement.clientWidth}px`;
+  }
+
+  #layOver([x, y], window, url, known) {
+    if (!known) return;
+    const { gsd_m: gsd } = this.store.run.sheet;
+    const [col, row] = [x + window.offset_en_m[0] / gsd, y - window.offset_en_m[1] / gsd];
+    const half = window.side_m / gsd / 2;
+    const bounds = L.latLngBounds(at(col - half, row - half), at(col + half, row + half));
+    this.over = L.imageOverlay(url, bounds, { pane: "views", alt: "" });
+    this.#fade();
+  }
+
+  #fade() {
+    const share = this.visible ? this.find("opacity").value / 100 : 0;
+    this.find("img-over").style.opacity = share;
+    this.find("opacity").setAttribute("aria-valuetext", `${this.find("opacity").value} percent`);
+    if (!this.over) return;
+    if (this.find("on-map").checked) this.over.addTo(this.map).setOpacity(share);
+    else this.over.remove();
+  }
+
+  /** Makes the view over the map stronger or fainter by some per cent. */
+  fadeBy(percent) {
+    this.find("opacity").value = Number(this.find("opacity").value) + percent;
+    this.#fade();
+  }
+
+  /** Lays the view on the large map or takes it away. */
+  toggleOnMap() {
+    this.find("on-map").click();
+  }
+
+  /** Begins or ends to blink. */
+  blink() {
+    const button = this.find("blink");
+    const on = button.getAttribute("aria-pressed") !== "true";
+    button.setAttribute("aria-pressed", String(on));
+    clearInterval(this.blinking);
+    this.visible = true;
+    if (on) {
+      if (this.find("opacity").value < 60) this.find("opacity").value = 100;
+      this.blinking = setInterval(() => { this.visible = !this.visible; this.#fade(); }, BLINK_MS);
+    }
+    this.#fade();
+  }
+
+  /** Moves the map to the selected view, closely. */
+  zoomTo() {
+    const { columns: c, selected: i, run } = this.store;
+    const side = this.detail?.window?.side_m ?? 400;
+    const place = Number.isFinite(c.x[i]) ? [c.x[i], c.y[i]] : [c.tx[i], c.ty[i]];
+    if (!place.every(Number.isFinite)) return;
+    const half = (0.75 * side) / run.sheet.gsd_m;
+    this.map.fitBounds(L.latLngBounds(at(place[0] - half, place[1] - half), at(place[0] + half, place[1] + half)));
+  }
+
+  #known(detail) {
+    const rows = [["time", detail.time_s && `${detail.time_s} s`], ["state", detail.state]];
+    if ("lat_deg" in detail) rows.push(["position", place(detail.lat_deg, detail.lon_deg)]);
+    if ("true_lat_deg" in detail) rows.push(["true position", place(detail.true_lat_deg, detail.true_lon_deg)]);
+    if (detail.reason) rows.push(["no fix", `${detail.reason}: ${detail.detail}`]);
+    for (const [name, value] of Object.entries(detail.told ?? {})) rows.push([`told ${name}`, number(value ?? NaN, 3)]);
+    for (const [name, value] of Object.entries(detail.evidence ?? {})) {
+      rows.push([name, value === null ? "–" : String(Number(value.toPrecision(5)))]);
+    }
+    this.find("known").replaceChildren(...rows.filter(([, said]) => said).flatMap(([name, said]) => {
+      const [term, value] = [document.createElement("dt"), document.createElement("dd")];
+      [term.textContent, value.textContent] = [name, said];
+      return [term, value];
+    }));
+  }
+}
+
+const place = (lat, lon) => `${lat.toFixed(7)}, ${lon.toFixed(7)}`;
+
+/** The selected view in a sentence, for eyes and screen readers. */
+export function sentence(store, i) {
+  const c = store.columns;
+  const parts = [store.rising ? clock(c.t[i]) : `view ${i + 1}`];
+  const health = healthAt(store, i);
+  if (c.reason[i]) parts.push(`no fix: ${c.reason[i]}`);
+  else parts.push(SAID[store.state(i)]);
+  if (Number.isFinite(c.err[i])) parts.push(`error ${metres(c.err[i])}`);
+  if (c.wrong[i]) parts.push("SURE AND WRONG");
+  if (Number.isFinite(c.conf[i])) parts.push(`confidence ${number(c.conf[i], 3)} within ${metres(c.radius[i])}`);
+  if (Number.isFinite(c.a[i])) parts.push(`σ ${metres(c.a[i])}`);
+  if (Number.isFinite(c.head[i])) parts.push(`heading ${number(c.head[i], 1)}°, ${metres(c.agl[i])} high`);
+  if (Number.isFinite(c.ms[i])) parts.push(`${number(c.ms[i], 0)} ms`);
+  if (health && health.level !== "OK") parts.push(`health ${health.level}: ${health.reasons.join(", ")}`);
+  return parts.join(", ");
+}
+
+/** The line of health that held when a view came out, undefined where there is none. */
+export function healthAt(store, i) {
+  let found;
+  for (const line of store.health) {
+    if (line.view > i) break;
+    found = line;
+  }
+  return found;
+}

@@ -1,0 +1,202 @@
+// The page: what is where, and who tells whom.
+
+import { follow, getJson, getNews } from "./api.js";
+import { Chart } from "./chart.js";
+import { Compare, sentence } from "./compare.js";
+import { HealthPart } from "./health.js";
+import { listen } from "./keys.js";
+import { List } from "./list.js";
+import { MARKS, SAID, metres, share, watchColours } from "./look.js";
+import { at, fitRun, makeMap, showCursor } from "./map.js";
+import { Chosen, Marks } from "./marks.js";
+import { Store } from "./store.js";
+
+const PLAY_MS = 120;
+const find = (id) => document.getElementById(id);
+
+async function begin() {
+  const run = await getJson("api/run");
+  const store = new Store(run);
+  document.title = `${run.name} – orthonav view`;
+  find("run-name").textContent = run.name;
+  find("about").textContent = about(run);
+  const map = makeMap("map", run.sheet);
+  const marks = new Marks(store).addTo(map);
+  const parts = {
+    store, map, marks,
+    chosen: new Chosen(map, store),
+    compare: new Compare(map, store, document),
+    chart: new Chart(store, find("chart")),
+    list: new List(store, document),
+    health: new HealthPart(store, document),
+  };
+  watchColours(() => { marks.later(); parts.chosen.draw(); parts.chart.draw(); drawLegend(store); });
+  showCursor(map, run.sheet, store, find("cursor"));
+  map.on("click", ({ containerPoint }) => {
+    const found = marks.nearest(containerPoint);
+    if (found >= 0) store.select(found, "map");
+  });
+  tie(parts);
+  const play = makePlay(store);
+  steps(parts, play);
+  const news = await getNews(0, 0, 0);
+  store.take(news);
+  drawProblems(news.problems);
+  fitRun(map, store);
+  if (run.live) live(parts);
+}
+
+/** Draws what an event of the store changes. */
+function tie({ store, map, marks, chosen, compare, chart, list, health }) {
+  store.addEventListener("data", ({ detail }) => {
+    find("scrub").max = Math.max(store.count - 1, 0);
+    if (detail.added || detail.anew) {
+      marks.later();
+      chart.draw();
+      list.drawChoices();
+      list.draw();
+      drawFigures(store);
+      drawLegend(store);
+    }
+    health.draw();
+  });
+  store.addEventListener("filter", () => { marks.later(); chart.draw(); list.draw(); });
+  store.addEventListener("select", ({ detail }) => {
+    const i = store.selected;
+    chosen.draw();
+    compare.show();
+    chart.drawNow();
+    list.mark(true);
+    find("scrub").value = i;
+    find("scrub").setAttribute("aria-valuetext", `view ${i + 1}: ${sentence(store, i)}`);
+    say(sentence(store, i));
+    if (detail.by !== "newest" && detail.by !== "") find("newest").checked = i === store.count - 1;
+    if (find("follow-view").checked || detail.by === "list") keepSeen(map, store);
+  });
+}
+
+let saying = 0;
+/** The sentence for eyes at once; screen readers hear it when stepping pauses. */
+function say(text) {
+  find("said").setAttribute("aria-busy", "true");
+  find("said").textContent = text;
+  clearTimeout(saying);
+  saying = setTimeout(() => find("said").setAttribute("aria-busy", "false"), 400);
+}
+
+/** Moves the map only where the selected view is not well inside. */
+function keepSeen(map, { columns: c, selected: i }) {
+  const place = Number.isFinite(c.x[i]) ? [c.x[i], c.y[i]] : [c.tx[i], c.ty[i]];
+  if (!place.every(Number.isFinite)) return;
+  if (!map.getBounds().pad(-0.15).contains(at(...place))) map.panTo(at(...place), { animate: false });
+}
+
+function makePlay(store) {
+  let timer = 0;
+  const button = find("play");
+  return (on = !timer) => {
+    clearInterval(timer);
+    timer = 0;
+    if (on) {
+      timer = setInterval(() => {
+        const before = store.selected;
+        store.step(1);
+        if (store.selected === before) { clearInterval(timer); timer = 0; button.setAttribute("aria-pressed", "false"); }
+      }, PLAY_MS);
+    }
+    button.setAttribute("aria-pressed", String(on));
+  };
+}
+
+function steps({ store, map, compare, chart }, play) {
+  const click = (id, action) => find(id).addEventListener("click", action);
+  click("first", () => store.step(-store.count));
+  click("before", () => store.step(-1));
+  click("after", () => store.step(1));
+  click("last", () => store.step(store.count));
+  click("play", () => play());
+  click("zoom-in", () => chart.zoom(0.5));
+  click("zoom-out", () => chart.zoom(2));
+  click("help-open", () => find("help").showModal());
+  find("scrub").addEventListener("input", () => store.select(Number(find("scrub").value), "scrub"));
+  listen(store, {
+    play: () => play(),
+    blink: () => compare.blink(),
+    fade: (percent) => compare.fadeBy(percent),
+    onMap: () => compare.toggleOnMap(),
+    zoom: () => compare.zoomTo(),
+    whole: () => fitRun(map, store),
+    help: () => find("help").showModal(),
+  }, document);
+}
+
+/** Follows a run that is being flown. */
+function live({ store, map }) {
+  find("newest-label").hidden = false;
+  find("follow-view").checked = true;
+  const badge = find("live");
+  badge.hidden = false;
+  let fitted = store.count > 0;
+  const lost = (yes) => {
+    badge.className = `badge ${yes ? "bad" : "good"}`;
+    badge.textContent = yes ? "server does not answer" : store.count ? "live" : "live: waiting for the first view";
+  };
+  lost(false);
+  follow(() => [store.generation, store.count, store.health.length], (news) => {
+    store.take(news);
+    drawProblems(news.problems);
+    if (find("newest").checked) store.select(store.count - 1, "newest");
+    if (!fitted && store.count) { fitRun(map, store); fitted = true; }
+  }, lost);
+  if (find("newest").checked) store.select(store.count - 1, "newest");
+}
+
+function drawProblems(problems) {
+  find("problems").hidden = !problems.length;
+  const text = problems.join("  ·  ");
+  if (find("problems").textContent !== text) find("problems").textContent = text;
+}
+
+function drawFigures(store) {
+  const { stats, count, run } = store;
+  const errors = store.columns.err.filter((v) => v >= 0).sort((p, q) => p - q);
+  const quantile = (share) => errors[Math.min(errors.length - 1, Math.floor(share * errors.length))];
+  const rows = [["views", count], ["with a fix", share(stats.fixes, count)]];
+  if (stats.withTruth) {
+    rows.push([`within ${metres(run.radius_m)}`, share(stats.right, stats.withTruth)]);
+    rows.push(["median error", metres(quantile(0.5) ?? NaN)], ["95 %", metres(quantile(0.95) ?? NaN)]);
+    rows.push(["sure and wrong", stats.wrong]);
+  }
+  find("figures").replaceChildren(...rows.map(([name, value]) => {
+    const [part, term, figure] = ["div", "dt", "dd"].map((tag) => document.createElement(tag));
+    [term.textContent, figure.textContent] = [name, value];
+    part.append(term, figure);
+    return part;
+  }));
+}
+
+function drawLegend(store) {
+  const states = new Set();
+  for (let i = 0; i < store.count; i++) states.add(store.state(i));
+  const rows = Object.keys(SAID).filter((state) => states.has(state) && state !== "none")
+    .map((state) => [MARKS[state], SAID[state], `var(--${state})`]);
+  if (store.stats.withTruth) rows.push(["—", "truth", "var(--truth)"], ["◯", "sure and wrong", "var(--wrong)"]);
+  find("legend").replaceChildren(...rows.map(([mark, said, paint]) => {
+    const [part, sign] = [document.createElement("span"), document.createElement("i")];
+    [sign.textContent, sign.style.color] = [mark, paint];
+    part.append(sign, said);
+    return part;
+  }));
+}
+
+function about(run) {
+  const parts = [`orthonav ${run.version}`, `map ${run.map_name}`];
+  parts.push(run.pictures ? `pictures ${run.pictures}` : "no pictures (--flight)");
+  parts.push(run.truth ? `truth ${run.truth}` : "no truth (--truth)");
+  return parts.join(", ");
+}
+
+begin().catch((error) => {
+  find("problems").hidden = false;
+  find("problems").textContent = `The run cannot be shown: ${error.message}`;
+});

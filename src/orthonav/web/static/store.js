@@ -1,0 +1,145 @@
+// The views of the run, which is selected, and which are shown. Tells others by events:
+// "data" (more views, or all anew), "select", "filter".
+
+const NUMBERS = ["x", "y", "tx", "ty", "err", "conf", "radius", "a", "b", "turn", "head", "agl", "ms"];
+export const SURE = 0.9;
+
+export class Store extends EventTarget {
+  constructor(run) {
+    super();
+    this.run = run;
+    this.generation = 0;
+    this.which = "all";
+    this.order = "time";
+    this.named = "";
+    this.selected = -1;
+    this.clear();
+  }
+
+  clear() {
+    this.count = 0;
+    this.columns = {};
+    this.health = [];
+    this.reasons = new Map();
+    this.shown = []; // indices in order of time
+    this.listed = []; // the same in the order of the list
+    this.isShown = [];
+    this.rising = true;
+    this.stats = { fixes: 0, wrong: 0, right: 0, withTruth: 0 };
+  }
+
+  /** Takes an answer of api/news. */
+  take(news) {
+    const anew = news.generation !== this.generation;
+    if (anew) {
+      this.clear();
+      this.generation = news.generation;
+      this.selected = -1;
+    }
+    const added = news.columns.frame?.length ?? 0;
+    for (const [name, values] of Object.entries(news.columns)) {
+      const known = NUMBERS.includes(name) ? values.map((v) => v ?? NaN) : values;
+      const column = (this.columns[name] ??= []);
+      for (const value of known) column.push(value);
+    }
+    this.health.push(...news.health);
+    const first = this.count;
+    this.count += added;
+    for (let i = first; i < this.count; i++) this.#count(i);
+    if (!added && !anew && !news.health.length) return;
+    if (added || anew) this.#filter(first);
+    this.dispatchEvent(new CustomEvent("data", { detail: { first, added, anew } }));
+    if (this.selected < 0 && this.count) this.select(0);
+  }
+
+  #count(i) {
+    const c = this.columns;
+    if (c.reason[i]) this.reasons.set(c.reason[i], (this.reasons.get(c.reason[i]) ?? 0) + 1);
+    else this.stats.fixes += 1;
+    this.stats.wrong += c.wrong[i];
+    this.stats.right += c.err[i] <= this.run.radius_m ? 1 : 0;
+    this.stats.withTruth += Number.isNaN(c.tx[i]) ? 0 : 1;
+    if (i && c.t[i] < c.t[i - 1]) this.rising = false;
+  }
+
+  /** Where a view lies in time: seconds, or its number where times do not rise. */
+  time(i) {
+    return this.rising ? this.columns.t[i] : i;
+  }
+
+  /** The state of a view: searching, tracking, lost, alone (placed for itself) or none. */
+  state(i) {
+    if (this.columns.reason[i]) return "none";
+    const state = this.columns.state[i];
+    return state < 0 ? "alone" : this.run.states[state];
+  }
+
+  select(i, by = "") {
+    if (!this.count) return;
+    const index = Math.min(Math.max(i, 0), this.count - 1);
+    if (index === this.selected) return;
+    this.selected = index;
+    this.dispatchEvent(new CustomEvent("select", { detail: { by } }));
+  }
+
+  /** Selects the shown view that is `count` further on in time, or the last there is. */
+  step(count) {
+    if (!this.shown.length) return;
+    let at = this.shown.findIndex((i) => i >= this.selected);
+    if (at < 0) at = this.shown.length;
+    if (count > 0 && this.shown[at] !== this.selected) at -= 1;
+    const next = Math.min(Math.max(at + count, 0), this.shown.length - 1);
+    this.select(this.shown[next], "step");
+  }
+
+  /** Selects the next (1) or previous (-1) view of the list. */
+  stepList(count) {
+    if (!this.listed.length) return;
+    const at = this.listed.indexOf(this.selected);
+    const next = at < 0 ? 0 : Math.min(Math.max(at + count, 0), this.listed.length - 1);
+    this.select(this.listed[next], "list");
+  }
+
+  show({ which = this.which, order = this.order, named = this.named }) {
+    Object.assign(this, { which, order, named });
+    this.#filter(0);
+    this.dispatchEvent(new Event("filter"));
+  }
+
+  #filter(first) {
+    const keep = this.#rule();
+    if (first === 0) [this.shown, this.isShown] = [[], []];
+    for (let i = first; i < this.count; i++) {
+      this.isShown[i] = keep(i);
+      if (this.isShown[i]) this.shown.push(i);
+    }
+    this.listed = this.#ordered();
+  }
+
+  #rule() {
+    const c = this.columns;
+    const [kind, value] = this.which.split(/:(.*)/s);
+    const rules = {
+      all: () => true,
+      fix: (i) => !c.reason[i],
+      none: (i) => Boolean(c.reason[i]),
+      wrong: (i) => c.wrong[i] === 1,
+      far: (i) => c.err[i] > this.run.radius_m,
+      doubt: (i) => !c.reason[i] && !(c.conf[i] >= SURE),
+      state: (i) => this.state(i) === value,
+      reason: (i) => c.reason[i] === value,
+    };
+    const rule = rules[kind] ?? rules.all;
+    const named = this.named.toLowerCase();
+    return named ? (i) => rule(i) && c.frame[i].toLowerCase().includes(named) : rule;
+  }
+
+  #ordered() {
+    if (this.order === "time") return this.shown;
+    const c = this.columns;
+    const key = { error: (i) => -c.err[i], doubt: (i) => c.conf[i], spread: (i) => -c.a[i] }[this.order];
+    const values = this.shown.map((i) => [i, key(i)]);
+    values.sort((p, q) => (Number.isNaN(p[1]) ? 1 : 0) - (Number.isNaN(q[1]) ? 1 : 0) || p[1] - q[1] || p[0] - q[0]);
+    return values.map(([i]) => i);
+  }
+}

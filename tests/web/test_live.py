@@ -1,0 +1,224 @@
+"""A run is followed while it is flown, whatever its file goes through."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+from blots import CAMERA
+from small_run import result
+
+from orthonav.errors import FlightError, MissingFileError
+from orthonav.onboard.log import FlightLog
+from orthonav.onboard.outputs import JsonOut
+from orthonav.publish.jsonl import result_to_json
+from orthonav.records import Telemetry
+from orthonav.web import feed as feed_module
+from orthonav.web import logs as logs_module
+from orthonav.web.feed import LineFeed
+from orthonav.web.logs import LogReader
+from orthonav.web.opening import ViewRequest, open_run
+
+HEALTH = {"health": "DEGRADED", "reasons": ["searching"], "utc_s": 1.5, "counts": {"taken": 3}}
+
+
+def line(i):
+    return result_to_json(result(i)) + "\n"
+
+
+@pytest.fixture
+def fixes(tmp_path):
+    return tmp_path / "live.jsonl"
+
+
+@pytest.fixture(autouse=True)
+def no_waiting(monkeypatch):
+    monkeypatch.setattr(logs_module, "LOOK_FOR_FILES_S", 0.0)
+
+
+def test_a_file_that_grows(fixes):
+    """Half a line is waited for; what came is told once."""
+    feed = LineFeed(fixes, live=True)
+    assert feed.poll().results == []
+    fixes.write_text(line(0) + line(1)[:40])
+    assert [each.frame for each in feed.poll().results] == [result(0).frame]
+    with fixes.open("a") as out:
+        out.write(line(1)[40:] + line(2))
+    assert [each.frame for each in feed.poll().results] == [result(1).frame, result(2).frame]
+    assert feed.poll().results == []
+
+
+def test_what_the_runner_writes(fixes):
+    """Views with more than `fixes.jsonl` has, and health between them."""
+    feed = LineFeed(fixes, live=True)
+    out = JsonOut(fixes)
+    out.view(result(0), 12.0, ["global-position"], None)
+    out.health(HEALTH)
+    out.view(result(1), 12.0, [], "not_sure")
+    batch = feed.poll()
+    assert len(batch.results) == 2 and batch.problems == []
+    assert batch.health[0][0] == 1
+    assert batch.health[0][1] == {
+        "level": "DEGRADED",
+        "reasons": ["searching"],
+        "utc_s": 1.5,
+        "counts": {"taken": 3},
+    }
+    out.close()
+
+
+def test_a_file_that_is_begun_anew(fixes):
+    feed = LineFeed(fixes, live=True)
+    fixes.write_text(line(0) + line(1))
+    assert not feed.poll().restarted
+    fixes.write_text(line(2))
+    batch = feed.poll()
+    assert batch.restarted and [each.frame for each in batch.results] == [result(2).frame]
+
+
+def test_broken_lines_are_told_of_and_left_out(fixes):
+    fixes.write_text(line(0) + '{"frame": 3\n{"health": 4}\n\xff\n\n' + line(1))
+    batch = LineFeed(fixes).poll()
+    assert len(batch.results) == 2 and len(batch.problems) == 1
+    assert "line 2 is left out" in batch.problems[0]
+
+
+def test_lines_and_files_beyond_reason(fixes, monkeypatch):
+    fixes.write_text(line(0) + "x" * (feed_module.MAX_LINE_BYTES + 10) + "\n" + line(1))
+    assert len(LineFeed(fixes).poll().results) == 2
+    monkeypatch.setattr(feed_module, "MAX_VIEWS", 1)
+    with pytest.raises(FlightError, match="more than 1 views"):
+        LineFeed(fixes).poll()
+
+
+def test_a_run_tells_news_and_begins_anew(fixes, small):
+    run = open_run(ViewRequest(fixes, small.map_path, live=True))
+    assert run.news(0, 0, 0)["count"] == 0
+    fixes.write_text(line(0) + json.dumps(HEALTH) + "\n" + line(1))
+    news = run.news(1, 0, 0)
+    assert (news["first"], news["count"], news["health"][0]["view"]) == (0, 2, 1)
+    with fixes.open("a") as out:
+        out.write(line(2))
+    later = run.news(news["generation"], 2, 1)
+    assert later["first"] == 2 and later["columns"]["t"] == [2] and later["health"] == []
+    fixes.write_text(line(3))
+    anew = run.news(news["generation"], 3, 1)
+    assert anew["generation"] != news["generation"] and anew["first"] == 0 and anew["count"] == 1
+    fixes.write_text("")
+    fixes.write_text("\n")
+    assert run.news(anew["generation"], 1, 0)["count"] == 0
+
+
+def test_a_file_that_goes_away_is_told_of(fixes, small):
+    fixes.write_text(line(0))
+    run = open_run(ViewRequest(fixes, small.map_path, live=True))
+    fixes.unlink()
+    fixes.mkdir()
+    news = run.news(1, 0, 0)
+    assert news["count"] == 1 and "is a folder" in news["problems"][0]
+
+
+def told(i):
+    return Telemetry((100 + i) * 10**9, 40.0 + 10 * i, 4.0, -3.0, 60.0)
+
+
+def write_log(folder, numbers, *, views="full", close=True):
+    log = FlightLog(folder / "flight.mcap", CAMERA, {"name": "x"}, views=views, chunk_s=0.01)
+    fly(log, numbers)
+    if close:
+        log.close()
+    return log
+
+
+def fly(log, numbers):
+    for i in numbers:
+        grey = np.random.default_rng(i).integers(0, 256, (240, 320), dtype=np.uint8)
+        log.view(i, result(i).frame, grey, told(i))
+        log.result(result(i))
+        log.health(HEALTH)
+
+
+def gathered(reader, count):
+    """So many results and lines of health; the log is written by a thread of its own."""
+    results, health = [], []
+    until = time.monotonic() + 20
+    while (len(results) < count or len(health) < count) and time.monotonic() < until:
+        batch = reader.poll()
+        results, health = results + batch.results, health + batch.health
+        time.sleep(0.005)
+    assert len(results) == count
+    return results, health
+
+
+def test_a_log_while_it_is_written(tmp_path):
+    reader = LogReader(tmp_path / "flight.mcap", live=True)
+    assert reader.poll().results == []
+    log = write_log(tmp_path, range(2), close=False)
+    first, _ = gathered(reader, 2)
+    assert [each.frame for each in first] == [result(0).frame, result(1).frame]
+    fly(log, range(2, 4))
+    log.close()
+    later, health = gathered(reader, 2)
+    assert [each.frame for each in later] == [result(2).frame, result(3).frame]
+    assert [before for before, _ in health] == [3, 4]
+    shot = reader.shot(result(3).frame)
+    assert shot.camera == CAMERA and shot.telemetry == told(3)
+    expected = np.random.default_rng(3).integers(0, 256, (240, 320), dtype=np.uint8)
+    assert np.array_equal(shot.load(), expected)
+
+
+def test_thumbnails_are_shown_too(tmp_path, small):
+    write_log(tmp_path, range(2), views="thumbnails")
+    run = open_run(ViewRequest(tmp_path, small.map_path))
+    detail = run.detail(1)
+    assert detail["window"]["side_m"] > 0 and run.view_png(1).startswith(b"\x89PNG")
+    assert run.news(0, 0, 0)["health"][0]["level"] == "DEGRADED"
+
+
+def test_a_log_without_pictures_says_so(tmp_path, small):
+    write_log(tmp_path, range(2), views="none")
+    run = open_run(ViewRequest(tmp_path / "flight_0001.mcap", small.map_path))
+    assert run.detail(0)["why_no_window"] == "the log keeps no pictures"
+    assert run.count == 2
+
+
+def test_another_flight_of_that_name(tmp_path):
+    """Live, the newest is followed; else one must be named."""
+    write_log(tmp_path, range(2))
+    reader = LogReader(tmp_path / "flight.mcap", live=True)
+    assert len(reader.poll().results) == 2
+    write_log(tmp_path, range(2, 5))
+    batch = reader.poll()
+    assert batch.restarted and len(batch.results) == 3
+    with pytest.raises(FlightError, match="flights"):
+        LogReader(tmp_path / "flight.mcap").poll()
+    assert len(LogReader(tmp_path / "flight_0001.mcap").poll().results) == 2
+
+
+def test_files_deleted_to_make_room_are_not_missed(tmp_path):
+    log = write_log(tmp_path, range(2))
+    reader = LogReader(tmp_path, live=True)
+    assert log and len(reader.poll().results) == 2
+    (tmp_path / "flight_0001.mcap").unlink()
+    batch = reader.poll()
+    assert not batch.restarted and batch.results == []
+    with pytest.raises(FlightError, match="cannot be read"):
+        reader.shot(result(0).frame).load()
+
+
+def test_pictures_of_a_log_beside_fixes(tmp_path, small):
+    write_log(tmp_path, range(2))
+    run = open_run(ViewRequest(small.fixes, small.map_path, flight=tmp_path))
+    assert "window" in run.detail(0)
+    assert run.detail(5)["why_no_window"] == "this view is not in the log"
+
+
+def test_a_log_that_is_not_there(tmp_path):
+    with pytest.raises(MissingFileError, match="does not exist"):
+        LogReader(tmp_path / "flight.mcap").poll()
+
+
+def test_the_map_that_was_flown_with_is_compared(tmp_path, small, caplog):
+    write_log(tmp_path, range(1))
+    open_run(ViewRequest(tmp_path, small.map_path))
+    assert "flown with another map" in caplog.text

@@ -1,0 +1,251 @@
+"""The server answers what the page asks for, only that, and only to the page."""
+
+import http.client
+import json
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from blots import GROUND
+from small_run import (
+    CHUNK_PX,
+    FRAME,
+    GSD_M,
+    NO_FIX,
+    NORTH_M,
+    PLACES_EN_M,
+    WEST_M,
+    WRONG,
+    name,
+    plane,
+    serving,
+    write_small_map,
+)
+
+from orthonav.errors import MissingExtraError, OutputError
+from orthonav.web.assets import load_assets
+from orthonav.web.opening import ViewRequest, open_run
+from orthonav.web.server import Pages, Server
+
+
+def as_json(reply):
+    status, headers, body = reply
+    assert status == 200 and headers["content-type"] == "application/json"
+    return json.loads(body)
+
+
+def as_picture(reply):
+    status, headers, body = reply
+    assert status == 200 and headers["content-type"].startswith("image/")
+    return cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def test_the_summary_says_what_is_shown(ask):
+    told = as_json(ask("/api/run"))
+    assert told["name"] == "fixes.jsonl" and told["map_name"] == "area.onav"
+    assert told["pictures"] == "flight" and told["truth"] == "flight/truth.csv"
+    assert told["states"] == ["searching", "tracking", "lost"] and not told["live"]
+    sheet = told["sheet"]
+    assert (sheet["west_m"], sheet["north_m"], sheet["gsd_m"]) == (WEST_M, NORTH_M, GSD_M)
+    assert sheet["tiles"]["side_px"] == CHUNK_PX and sheet["tiles"]["levels"][0] == [620, 700]
+
+
+def test_views_come_as_columns(ask):
+    news = as_json(ask("/api/news?generation=0&views=0&health=0"))
+    columns = news["columns"]
+    assert news["count"] == 6 and {len(column) for column in columns.values()} == {6}
+    assert columns["frame"] == [name(i) for i in range(6)]
+    assert columns["t"] == [0, 1, 2, 3, 4, 5] and columns["head"][1] == 50
+    assert columns["reason"][NO_FIX] == "blank" and columns["x"][NO_FIX] is None
+    assert columns["err"][0] == 0 and columns["err"][WRONG] == 60
+    assert columns["wrong"] == [0, 0, 0, 1, 0, 0] and columns["state"] == [1] * 6
+    sizes = np.sqrt(np.linalg.eigvalsh([[9.0, 4.0], [4.0, 16.0]]))
+    assert (columns["b"][0], columns["a"][0]) == pytest.approx(sizes, abs=0.01)
+    assert columns["turn"][0] == pytest.approx(np.degrees(np.arctan2(8, -7)) / 2, abs=0.1)
+    later = as_json(ask(f"/api/news?generation={news['generation']}&views=4&health=0"))
+    assert later["first"] == 4 and later["columns"]["frame"] == [name(4), name(5)]
+
+
+def test_places_are_pixels_of_the_sheet(ask):
+    """Truth and fixes lie where the plane of the map has them; rows count southwards."""
+    columns = as_json(ask("/api/news"))["columns"]
+    for i, (east, north) in enumerate(PLACES_EN_M):
+        at = (east - WEST_M) / GSD_M, (NORTH_M - north) / GSD_M
+        assert (columns["tx"][i], columns["ty"][i]) == pytest.approx(at, abs=0.02)
+    assert columns["x"][WRONG] == pytest.approx(columns["tx"][WRONG] - 60 / GSD_M, abs=0.02)
+
+
+def test_a_tile_is_the_chunk_of_its_place(ask):
+    """The pixel of a tile shows the ground at its place, on every level."""
+    for level, col, row in ((0, 1, 0), (0, 2, 1), (1, 0, 1), (2, 0, 0)):
+        tile = as_picture(ask(f"/tiles/{level}/{col}/{row}"))
+        height, width = tile.shape[:2]
+        east, north = plane(1024 >> level, 1024 >> level, level)
+        part = np.s_[row * CHUNK_PX :, col * CHUNK_PX :]
+        expected = GROUND(east[part][:height, :width], north[part][:height, :width])
+        if tile.ndim == 3:  # with a mask
+            seen, tile = tile[..., 3] > 0, tile[..., 0]
+        else:
+            seen = np.ones(tile.shape, bool)
+        off = np.abs(tile - np.clip(expected, 0, 255))[seen]
+        assert seen.any() and np.mean(off) < 6 + 3 * level
+
+
+def test_tiles_at_the_border_and_without_imagery(ask):
+    full = ask("/tiles/0/0/0")
+    assert full[1]["content-type"] == "image/jpeg" and "max-age" in full[1]["cache-control"]
+    edge = as_picture(ask("/tiles/0/2/1"))
+    assert edge.shape[:2] == (256, 700 - 512)
+    masked = ask("/tiles/0/2/2")
+    assert masked[1]["content-type"] == "image/png"
+    alpha = as_picture(masked)[..., 3]
+    assert alpha.shape == (620 - 512, 700 - 512)
+    assert alpha[:8].min() == 255 and alpha[-100:, -150:].max() == 0
+
+
+def test_a_view_lies_on_the_map_where_its_fix_has_it(ask):
+    """Turned by the heading and leaning, a right one shows the ground of the map, a wrong not."""
+    for i in (0, WRONG):
+        window = as_json(ask(f"/api/views/{i}"))["window"]
+        view = as_picture(ask(f"/api/views/{i}/view.png"))
+        put = as_picture(ask(f"/api/views/{i}/map-fix.png"))
+        taken = as_picture(ask(f"/api/views/{i}/map-truth.png"))
+        assert view.shape == (window["size_px"], window["size_px"], 4)
+        assert window["side_m"] / window["size_px"] <= GSD_M
+        seen = view[..., 3] > 0
+        assert 0.3 < seen.mean() < 0.9
+        grey = view[..., 0][seen]
+        at_truth = np.corrcoef(grey, np.atleast_3d(taken)[..., 0][seen])[0, 1]
+        at_fix = np.corrcoef(grey, np.atleast_3d(put)[..., 0][seen])[0, 1]
+        assert at_truth > 0.97
+        assert at_fix > 0.97 if i == 0 else at_fix < 0.4
+
+
+def test_the_detail_says_all(ask):
+    told = as_json(ask("/api/views/0"))
+    assert told["time_s"] == "100.000000000" and told["evidence"] == {"score": 0.5}
+    assert told["told"]["pitch_deg"] == 4.0
+    assert FRAME.en_from_latlon(told["lat_deg"], told["lon_deg"]) == pytest.approx(
+        PLACES_EN_M[0], abs=1e-3
+    )
+    nothing = as_json(ask(f"/api/views/{NO_FIX}"))
+    assert nothing["reason"] == "blank" and "window" in nothing and "lat_deg" not in nothing
+    assert ask(f"/api/views/{NO_FIX}/map-fix.png")[0] == 404
+    assert as_picture(ask(f"/api/views/{NO_FIX}/raw.jpg")).shape == (240, 320)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/nothing",
+        "/static/",
+        "/static/../server.py",
+        "/static/%2e%2e/server.py",
+        "/static/..%2fserver.py",
+        "/static//etc/passwd",
+        "//etc/passwd",
+        "/leaflet/../__init__.py",
+        "/leaflet/leaflet.js",
+        "/tiles/0/99/0",
+        "/tiles/99/0/0",
+        "/tiles/-1/0/0",
+        "/tiles/0/0/0/../../..",
+        "/api/views/6",
+        "/api/views/-1",
+        "/api/views/12345678901234567890",
+        "/api/views/0/map-elsewhere.png",
+        "/preview.jpg",
+        "/api/views/0/view.png/..",
+    ],
+)
+def test_nothing_else_is_served(ask, path):
+    status, _, body = ask(path)
+    assert status == 404 and len(body) < 200 and b"Traceback" not in body
+
+
+@pytest.mark.parametrize("query", ["views=x", "views=-1", "health=1e9", "views=" + "9" * 40])
+def test_a_query_that_is_none(ask, query):
+    assert ask(f"/api/news?{query}")[0] == 400
+    assert ask("/api/news?" + "a=1&" * 50)[0] == 400
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "127.0.0.1.evil.example:80", "localhost.evil.example", "", "192.0.2.7"]
+)
+def test_another_host_name_is_refused(ask, server, host):
+    """A page of another site whose name was made to lead here sees nothing."""
+    status, _, body = ask("/api/run", Host=host)
+    assert status == 421 and b"fixes" not in body
+    assert ask("/api/run", "POST", Host=host)[0] == 421
+
+
+def test_own_names_are_served(ask, server):
+    for host in (f"127.0.0.1:{server.port}", "localhost", "LOCALHOST:99", "[::1]:8080"):
+        assert ask("/api/run", Host=host)[0] == 200
+
+
+def test_a_request_without_host_is_refused(server):
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
+    connection.putrequest("GET", "/api/run", skip_host=True)
+    connection.endheaders()
+    assert connection.getresponse().status == 421
+    connection.close()
+
+
+def test_pages_of_other_sites_get_nothing(ask):
+    for path in ("/api/run", "/static/main.js", "/tiles/0/0/0"):
+        assert ask(path, Sec_Fetch_Site="cross-site")[0] == 403
+        assert ask(path, Sec_Fetch_Site="same-site")[0] == 403
+        status, headers, _ = ask(path, Sec_Fetch_Site="same-origin", Origin="http://evil.example")
+        assert status == 200 and not [h for h in headers if h.startswith("access-control")]
+        assert headers["cross-origin-resource-policy"] == "same-origin"
+    assert ask("/", Sec_Fetch_Site="cross-site")[0] == 200  # a link may be followed
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS"])
+def test_it_only_reads(ask, method):
+    status, headers, _ = ask("/api/run", method)
+    assert status == 405 and headers["allow"] == "GET, HEAD"
+    assert ask("/api/run", "HEAD")[::2] == (200, b"")
+
+
+def test_open_to_others_only_where_asked(opened):
+    with serving(opened) as server:
+        assert server.only_loopback and server.url() == f"http://127.0.0.1:{server.port}/"
+        assert not server.allows("192.0.2.7")
+    with Server(Pages(opened, {}), host="0.0.0.0") as server:
+        assert not server.only_loopback
+        assert server.allows("192.0.2.7:80") and not server.allows("evil.example")
+
+
+def test_a_port_that_is_taken(opened, server):
+    with pytest.raises(OutputError, match="cannot listen"):
+        Server(Pages(opened, {}), port=server.port)
+
+
+def test_without_leaflet_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "xstatic.pkg.leaflet", None)
+    with pytest.raises(MissingExtraError, match=r"orthonav\[web\]"):
+        load_assets()
+
+
+def test_a_map_without_layer_shows_its_preview(small, tmp_path):
+    path = write_small_map(tmp_path / "plain.onav", layer=False)
+    run = open_run(ViewRequest(small.fixes, path, flight=small.flight))
+    pages = Pages(run, {})
+    assert json.loads(pages.answer("/api/run").data)["sheet"]["tiles"] is None
+    assert pages.answer("/preview.jpg").media_type == "image/jpeg"
+    assert pages.answer("/tiles/0/0/0").status == 404
+    cut = pages.answer("/api/views/0/map-truth.png").data
+    view = cv2.imdecode(np.frombuffer(pages.answer("/api/views/0/view.png").data, np.uint8), -1)
+    ground = cv2.imdecode(np.frombuffer(cut, np.uint8), 0)
+    seen = view[..., 3] > 0
+    assert np.corrcoef(view[..., 0][seen], ground[seen])[0, 1] > 0.9
+
+
+def test_without_a_flight_the_rest_works(small):
+    run = open_run(ViewRequest(small.fixes, small.map_path))
+    told = run.detail(0)
+    assert "--flight" in told["why_no_window"] and run.told.pictures == run.told.truth == ""
+    assert run.news(0, 0, 0)["columns"]["err"] == [None] * 6

@@ -1,0 +1,100 @@
+"""`orthonav view` as it is typed."""
+
+import signal
+import subprocess
+import sys
+import urllib.request
+
+import pytest
+
+from orthonav.cli import view as view_module
+from orthonav.publish.jsonl import write_results
+from orthonav.records import Fix, ViewResult
+
+
+def refused(done, *words):
+    assert done.code == 1 and done.out == ""
+    assert done.err.startswith("orthonav: error: ") and done.err.count("\n") == 1
+    for word in words:
+        assert word in done.err
+
+
+@pytest.fixture
+def served(monkeypatch):
+    """The command ends where it would begin to serve."""
+
+    def stop(self, poll_interval):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("orthonav.web.server.Server.serve_forever", stop)
+
+
+def test_it_prints_the_address_and_ends(run, small, served):
+    done = run("view", small.fixes, "--map", small.map_path, "--flight", small.flight)
+    assert done.code == 0 and done.err == ""
+    first, last = done.out.splitlines()
+    assert first.startswith("http://127.0.0.1:") and last == "ended"
+
+
+def test_listening_to_others_is_warned_about(run, small, served):
+    done = run("view", small.fixes, "--map", small.map_path, "--host", "0.0.0.0")
+    assert done.code == 0 and "whoever reaches this computer" in done.err
+
+
+def test_no_browser_but_on_a_terminal(run, small, served, monkeypatch):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert run("view", small.fixes, "--map", small.map_path).code == 0
+    assert opened == []
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    assert run("view", small.fixes, "--map", small.map_path, "--no-browser").code == 0
+    assert opened == [] and view_module._has_screen()
+
+
+def test_what_is_missing_or_broken_is_said_before(run, small, served, tmp_path):
+    fixes, area = small.fixes, small.map_path
+    refused(run("view", tmp_path / "none.jsonl", "--map", area), "none.jsonl")
+    refused(run("view", tmp_path / "none.mcap", "--map", area), "flight log does not exist")
+    refused(run("view", fixes, "--map", tmp_path / "none.onav"), "none.onav")
+    refused(run("view", fixes, "--map", fixes), "not an orthonav map")
+    refused(run("view", tmp_path, "--map", area), "folder of neither")
+    refused(run("view", fixes, "--map", area, "--flight", tmp_path / "none"), "flight does not")
+    refused(run("view", fixes, "--map", area, "--flight", area), "orthonav import")
+    refused(run("view", fixes, "--map", area, "--truth", tmp_path / "none.csv"), "truth does not")
+    refused(run("view", fixes, "--map", area, "--radius-m", "-1"), "radius")
+    refused(run("view", fixes, "--map", area, "--host", "192.0.2.1"), "cannot listen")
+    far = tmp_path / "none" / "live.jsonl"
+    refused(run("view", far, "--map", area, "--live"), "folder of the run does not exist")
+    empty = tmp_path / "empty.jsonl"
+    empty.write_text("{}\n")
+    refused(run("view", empty, "--map", area), "run has no views", "line 1")
+    assert run("view", fixes, "--map", area, "--port", "99999").code == 2
+    assert run("view", fixes, "--map", area, "--port", "x").code == 2
+
+
+def test_what_is_probably_a_mistake_is_warned_about(run, small, served, tmp_path):
+    truth = tmp_path / "truth.csv"
+    truth.write_text("frame,lat_deg,lon_deg\nother.png,46.5,2.5\n")
+    done = run("view", small.fixes, "--map", small.map_path, "--truth", truth)
+    assert done.code == 0 and "no view of the run has a true position" in done.err
+    away = tmp_path / "away.jsonl"
+    cov = [[4.0, 0.0], [0.0, 4.0]]
+    write_results(away, [ViewResult("a.png", 0, Fix(10.0, 10.0, cov, 0.9, 35.0, 0.0, 9.0), 1.0)])
+    done = run("view", away, "--map", small.map_path)
+    assert done.code == 0 and "no position of the run lies on this map" in done.err
+
+
+def test_a_real_one_serves_until_it_is_ended(small):
+    script = "import sys, orthonav.cli as cli; sys.exit(cli.main())"
+    command = [sys.executable, "-c", script, "view", small.fixes, "--map", small.map_path]
+    popen = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        address = popen.stdout.readline().split()[0]
+        with urllib.request.urlopen(address + "api/run", timeout=20) as reply:
+            assert reply.status == 200
+        popen.send_signal(signal.SIGTERM)
+        out, err = popen.communicate(timeout=20)
+    finally:
+        popen.kill()
+    assert (popen.returncode, out, err) == (0, "ended\n", "")
