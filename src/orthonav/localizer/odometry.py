@@ -31,7 +31,7 @@ SURE_CORRELATION = 0.6
 """A way that is as expected and fits so well is not looked for elsewhere."""
 NOISE_PX, NOISE_SHARE = 0.4, 0.01
 CANDIDATES = 8
-EXPECTED_STEPS = 5
+EXPECTED_STEPS, SMALL_STEP_PX = 5, 0.1
 LEAN_SHARE = 0.6
 """How much of what a wrong lean moves a view stays in the sum of many ways: the next way takes most
 of it back."""
@@ -228,7 +228,8 @@ def _as_expected(
     x, y = np.array(before.middle_px) + before.camera_px + moved_px - turned.map_px(now.camera_px)
     pose = replace(turned, x_px=float(x), y_px=float(y))
     for level in range(levels.look, levels.final - 1, -1):
-        placed = before.registrar.refiner(templates, levels, level).place(pose, EXPECTED_STEPS)
+        refiner = before.registrar.refiner(templates, levels, level)
+        placed = refiner.place(pose, EXPECTED_STEPS, SMALL_STEP_PX)
         pose = placed.pose
     return placed
 
