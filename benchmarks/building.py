@@ -1,4 +1,7 @@
-"""Building maps: speed, memory and size. Each build is a process of its own, on all cores."""
+"""Building maps: speed, memory and size. Each build is a process of its own, with one worker.
+
+`benchmarks.corridor` measures several.
+"""
 
 import json
 import subprocess
@@ -57,7 +60,7 @@ def measure(place: Workplace) -> Section:
     header = ["area", "km2", "tiles", "wall s", "p10..p90", "km2/s", "tiles/s"]
     header += ["peak MB", "map MB", "layer MB", "MB/km2"]
     absent = () if naip(NAIP_PAST) else (NAIP_ABSENT,)
-    note = f"256 px tiles, 87.5 % overlap, n = {place.repeats} processes each, all cores"
+    note = f"256 px tiles, 87.5 % overlap, n = {place.repeats} processes each, one worker"
     section.tables = [
         Table("Build: whole", header, rows, (note, *absent)),
         Table("Build: seconds by stage", ("area", *STAGES), stages, STAGE_NOTES),

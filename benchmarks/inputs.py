@@ -41,7 +41,7 @@ class Workplace:
 
     def area(self, side_m: int, gsd_m: float, dates: Sequence[landscape.Epoch]) -> list[Path]:
         """Orthophotos of a generated square; made anew when the generator has changed."""
-        name = f"{_generator()}-{side_m}m-{gsd_m:g}m"
+        name = f"{generator_digest()}-{side_m}m-{gsd_m:g}m"
         paths = [self.kept / name / f"{date.name}.tif" for date in dates]
         missing = [date for date, path in zip(dates, paths, strict=True) if not path.is_file()]
         if missing:
@@ -102,7 +102,7 @@ NAIP_ABSENT = (
 NAIP_PAST, NAIP_PRESENT = "20090818.tif", "20180716.tif"
 
 
-def _generator() -> str:
+def generator_digest() -> str:
     """Short digest of the generator's sources."""
     folder = Path(landscape.__file__).parent
     digest = hashlib.sha256()

@@ -336,7 +336,8 @@ def test_build_refuses(run, ortho, out, names_in, make_ortho, tmp_path):
     route.write_text("lat_deg,lon_deg\n46.0,3.0\n46.001,3.0\n")
     good, small = ["--ortho", ortho], SMALL_MAP
     refused(built("--ortho", tmp_path / "no.tif"), "does not exist", "no.tif")
-    refused(built("--ortho", tmp_path), "does not exist", str(tmp_path))
+    (tmp_path / "empty").mkdir()
+    refused(built("--ortho", tmp_path / "empty"), "no orthophotos", str(tmp_path / "empty"))
     refused(built("--ortho", text, *small), "text.tif")
     refused(built("--ortho", cut, *small), "cut.tif")
     refused(built("--ortho", no_crs, *small), "coordinate reference system", "no_crs.tif")

@@ -350,7 +350,7 @@ def test_a_later_file_fills_the_holes_of_the_first(tmp_path):
 
 
 def test_more_files_than_are_kept_open(tmp_path, monkeypatch):
-    monkeypatch.setattr("orthonav.imagery.mosaic.MAX_OPEN", 2)
+    monkeypatch.setattr("orthonav.imagery.raster.MAX_OPEN", 2)
     paths = []
     for index in range(5):
         strip = np.full((3, 24, SIZE), 50 * index, np.uint8)

@@ -31,9 +31,8 @@ def refused(path, message):
 
 
 def test_a_file_that_is_missing(tmp_path):
-    for path in (tmp_path / "none.tif", tmp_path):
-        with pytest.raises(MissingFileError, match="does not exist"):
-            Mosaic.open([path])
+    with pytest.raises(MissingFileError, match="does not exist"):
+        Mosaic.open([tmp_path / "none.tif"])
 
 
 def test_no_file_at_all():
@@ -77,13 +76,6 @@ def test_metres_called_degrees(ortho):
 def test_degrees_across_the_antimeridian(ortho, west_deg):
     transform = Affine(1e-4, 0, west_deg, 0, -1e-4, -17)
     refused(write(ortho, SCENE, crs="EPSG:4326", transform=transform), "beyond longitude 180")
-
-
-def test_8_and_16_bit_are_not_mixed(tmp_path):
-    shallow = write(tmp_path / "a.tif", SCENE)
-    deep = write(tmp_path / "b.tif", SCENE.astype(np.uint16))
-    with pytest.raises(ImageryError, match="cannot be mixed"):
-        Mosaic.open([shallow, deep])
 
 
 @pytest.mark.parametrize("dtype, nodata", [("uint16", 0), ("float32", -1), ("float32", np.nan)])
@@ -191,36 +183,37 @@ def test_a_file_that_vanishes_is_named(ortho):
         sheet.read(0, 0, 50, 50)
 
 
-HUGE_PX = 20_000
+HUGE_PX = 12_000
 READ_HUGE = """
     import sys
     from pathlib import Path
     from orthonav.geo.frames import LocalFrame
     from orthonav.imagery.mosaic import Mosaic
 
-    path, gsd_m, step = Path(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])
-    across = int(4000 / gsd_m)
-    mosaic = Mosaic.open([path])
-    sheet = mosaic.sheet(
-        LocalFrame(46.5, 3.0), west_m=-2000, north_m=2000, width_px=across, height_px=across,
-        gsd_m=gsd_m,
-    )
-    valid = read = 0
-    with sheet:
-        for row in range(0, across, 1024 * step):
-            for col in range(0, across, 1024 * step):
-                width, height = min(1024, across - col), min(1024, across - row)
-                pixels = sheet.read(col, row, width, height)
-                valid, read = valid + int(pixels.valid.sum()), read + width * height
+    mosaic = Mosaic.open([Path(sys.argv[1])])
+    for pair in sys.argv[2:]:
+        gsd_m, step = float(pair.split(",")[0]), int(pair.split(",")[1])
+        across = int(2400 / gsd_m)
+        sheet = mosaic.sheet(
+            LocalFrame(46.5, 3.0), west_m=-1200, north_m=1200, width_px=across, height_px=across,
+            gsd_m=gsd_m,
+        )
+        valid = read = 0
+        with sheet:
+            for row in range(0, across, 1024 * step):
+                for col in range(0, across, 1024 * step):
+                    width, height = min(1024, across - col), min(1024, across - row)
+                    pixels = sheet.read(col, row, width, height)
+                    valid, read = valid + int(pixels.valid.sum()), read + width * height
+        print(valid / read)
     # Not `ru_maxrss`, which also remembers the memory of the process that started this one.
-    status = Path("/proc/self/status").read_text()
-    print(valid / read, status.split("VmHWM:")[1].split()[0])
+    print(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
 """
 
 
 @pytest.fixture(scope="module", params=["colours", "palette"])
 def huge(request, tmp_path_factory):
-    """A 20,000 x 20,000 px orthophoto at 0.2 m, 1.2 GB when unpacked."""
+    """A 12,000 x 12,000 px orthophoto at 0.2 m, 430 MB when unpacked."""
     path = tmp_path_factory.mktemp("huge") / "huge.tif"
     bands = 3 if request.param == "colours" else 1
     block = smooth_scene(2000)[:bands]
@@ -247,14 +240,13 @@ def huge(request, tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("gsd_m, step", [(0.2, 7), (1.0, 2), (4.0, 1)])
-def test_memory_is_bounded_whatever_the_file(huge, gsd_m, step):
+def test_memory_is_bounded_whatever_the_file(huge):
     """Windows of 1024 px: some at 0.2 m, a quarter of all at 1 m, at 4 m the file in one piece."""
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(READ_HUGE), str(huge), str(gsd_m), str(step)],
+        [sys.executable, "-c", textwrap.dedent(READ_HUGE), huge, "0.2,7", "1.0,2", "4.0,1"],
         capture_output=True,
         text=True,
         check=True,
     )
-    share, peak_kib = map(float, done.stdout.split())
-    assert share > 0.2 and peak_kib < 1e6
+    *shares, peak_kib = map(float, done.stdout.split())
+    assert len(shares) == 3 and min(shares) > 0.2 and peak_kib < 4.5e5

@@ -40,19 +40,23 @@ def frame(ortho):
 
 @pytest.fixture(autouse=True)
 def fewer_crops(map_path, monkeypatch):
-    """Calibration from an eighth of the crops, but for the map that all tests share."""
+    """Calibration from few crops and views, but for the map that all tests share."""
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 24)
+    monkeypatch.setattr("orthonav.prepare.calibrate_registration.MIN_RIGHT", 1)
 
 
 @pytest.fixture
 def calibrated(fewer_crops, monkeypatch):
-    """What to ask for where the confidence itself is looked at, which takes longer."""
+    """More crops, where the confidence itself is looked at."""
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 48)
-    return {"calibration_views": 24}
+
+
+WITH_LAYER = {"registration": True, "calibration_views": 2}
 
 
 def built(ortho, folder, name="map.onav", **request):
-    request = {"tile_px": 64, "overlap": 0.75, "calibration_views": 8, **request}
+    """A map, without the registration layer, whose calibration takes longest, unless told."""
+    request = {"tile_px": 64, "overlap": 0.75, "registration": False, **request}
     orthos = ortho if isinstance(ortho, list) else [ortho]
     build_map(BuildRequest(orthos, folder / name, **request))
     return open_map(folder / name)
@@ -89,12 +93,12 @@ def random_points(west_m, south_m, east_m, north_m, count=2000):
 
 
 REQUESTS = {
-    "plain": {},
+    "plain": WITH_LAYER,
     "gray": {"edges": "gray"},
     "canny": {"edges": "canny:low=50,high=120"},
     "64 dims": {"method": "gradient:dims=64"},
     "both": {"method": "gradient:dims=32,cells=16", "edges": "canny"},
-    "seed": {"seed": 5},
+    "seed": {**WITH_LAYER, "seed": 5, "calibration_views": 8},
 }
 
 
@@ -123,8 +127,8 @@ def test_one_channel_is_compared_on_finer_cells(ortho, tmp_path, edges):
 
 
 def test_another_seed_changes_the_calibration_only(ortho, tmp_path, calibrated):
-    a = built(ortho, tmp_path, "a.onav", **calibrated)
-    b = built(ortho, tmp_path, "b.onav", **calibrated, seed=1)
+    a = built(ortho, tmp_path, "a.onav", **WITH_LAYER)
+    b = built(ortho, tmp_path, "b.onav", **WITH_LAYER, seed=1)
     assert a.manifest.confidence and b.manifest.confidence
     for name, part in a.arrays.items():
         np.testing.assert_array_equal(part, b.arrays[name])
@@ -201,7 +205,7 @@ def test_the_finest_orthophoto_gives_the_resolution(make_ortho, tmp_path):
 
 def test_blocks_do_not_matter(ortho, tmp_path, monkeypatch):
     whole = built(ortho, tmp_path, "a.onav")
-    monkeypatch.setattr("orthonav.prepare.build.BLOCK_PX", 150)
+    monkeypatch.setattr("orthonav.prepare.sheet.BLOCK_PX", 150)
     blocks = built(ortho, tmp_path, "b.onav")
     scores = np.einsum(
         "nd,nd->n",
@@ -213,7 +217,8 @@ def test_blocks_do_not_matter(ortho, tmp_path, monkeypatch):
 
 def test_the_manifest(ortho, tmp_path):
     calls = []
-    request = BuildRequest([ortho], tmp_path / "deep" / "map.onav", tile_px=64)
+    out = tmp_path / "deep" / "map.onav"
+    request = BuildRequest([ortho], out, tile_px=64, calibration_views=4)
     result = build_map(request, lambda stage, share: calls.append((stage, share)))
     manifest = open_map(request.out).manifest
     assert manifest == result.manifest and result.size_bytes == request.out.stat().st_size
@@ -313,7 +318,7 @@ def test_a_full_disk_leaves_nothing_new(ortho, tmp_path, names_in, monkeypatch, 
         out.write_bytes(old)
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OutputError, match="disk full"):
-        built(ortho, out.parent)
+        built(ortho, out.parent, **WITH_LAYER)
     assert names_in(out.parent) == ([] if old is None else ["map.onav"])
     assert old is None or out.read_bytes() == old
 
@@ -380,7 +385,7 @@ def test_confidence_is_a_probability_whatever_the_evidence(localizer):
 
 
 def test_the_error_told_is_of_the_order_of_the_grid(map_path, ortho, tmp_path, calibrated):
-    for opened in (open_map(map_path), built(ortho, tmp_path, **calibrated)):
+    for opened in (open_map(map_path), built(ortho, tmp_path)):
         grid = opened.manifest.sheets[0].grid
         assert grid.gsd_m <= opened.manifest.view["position_std_m"] < grid.stride_m / 2
 

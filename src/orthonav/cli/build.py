@@ -65,8 +65,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--work",
         type=Path,
         metavar="DIR",
-        help="keep checkpoints and pictures of a network's learning there; a build that was "
-        "interrupted goes on from them",
+        help="keep finished blocks, and checkpoints and pictures of a network's learning, there; "
+        "a build that was interrupted goes on from them (default: the blocks of a large area in "
+        "MAP.onav.work until the map is written)",
+    )
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="threads that read imagery (default: one per core)"
     )
     parser.add_argument("--out", type=Path, required=True, metavar="MAP.onav")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -95,6 +99,7 @@ def run(options: argparse.Namespace) -> None:
         other_dates=options.other_date,
         calibration_views=options.calibration_views,
         work=options.work,
+        workers=options.workers,
     )
     with progress(options) as shown:
         result = build_map(request, shown)

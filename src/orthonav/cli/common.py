@@ -71,12 +71,14 @@ def print_json(plain: Any) -> None:
 
 
 def add_orthos(parser: argparse.ArgumentParser, what: str) -> None:
-    """`--ortho FILE`, which may come several times."""
+    """`--ortho FILE|FOLDER ..`, which may come several times."""
     parser.add_argument(
         "--ortho",
-        action="append",
+        action="extend",
+        nargs="+",
         required=True,
         type=Path,
         metavar="FILE",
-        help=f"{what}; may be given several times, the first covers the next",
+        help=f"{what}, or folder of such, of which the newest covers the others; may be given "
+        "several times, the first covers the next",
     )

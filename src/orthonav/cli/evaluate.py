@@ -162,12 +162,13 @@ def _names(paths: list[Path]) -> list[str]:
 
 def _write_report(out: Path, flights: list[Any], opened: "MapFile | None") -> None:
     from orthonav import __version__
-    from orthonav.cli.info import recipe_text
+    from orthonav.cli.info import imagery_text, recipe_text
     from orthonav.evaluate.report import MadeFrom, write_report
 
     made_from = MadeFrom(
         map_name=opened.path.name if opened else "",
         recipe=recipe_text(opened.manifest.recipe) if opened else "",
+        imagery=imagery_text(opened.manifest.imagery) if opened else "",
         flight=", ".join(flight.name for flight in flights),
         command=" ".join(["orthonav", *sys.argv[1:]]),
         version=__version__,

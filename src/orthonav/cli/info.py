@@ -1,6 +1,7 @@
 """`orthonav info`: print what is in a map."""
 
 import argparse
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -124,10 +125,15 @@ def summary_text(plain: dict[str, Any]) -> str:
         )
     lines.append(f"grey       {_registration_text(plain['registration'])}")
     for source in plain["imagery"]:
-        date = source.get("date") or "date unknown"
+        dates = [source[key] for key in ("date_from", "date") if source.get(key)]
+        files = f"{source['files']} files  " if source.get("files") else ""
         lines.append(
-            f"imagery    {source.get('name')}  {date}  {source.get('gsd_m')} m  {source.get('crs')}"
+            f"imagery    {source.get('name')}  {files}{' to '.join(dates) or 'date unknown'}  "
+            f"{source.get('gsd_m')} m  {source.get('crs')}"
         )
+        terms = [source[key] for key in ("attribution", "licence") if source.get(key)]
+        if terms:
+            lines.append(f"           {', '.join(map(str, terms))}")
     calibrated = "probability of an error below" if plain["calibrated"] else "none, for"
     lines.append(f"confidence {calibrated} {plain['radius_m']:g} m")
     if "build_s" in plain:
@@ -159,3 +165,14 @@ def recipe_text(recipe: dict[str, Any]) -> str:
         )
         parts.append(f"{name} {title}:{values}" if values else f"{name} {title}")
     return ", ".join(parts) + f", overlap {recipe.get('overlap')}"
+
+
+def imagery_text(imagery: Iterable[Mapping[str, Any]]) -> str:
+    """Names, dates and attributions of what a map was made of, on one line."""
+    parts = []
+    for source in imagery:
+        dates = [str(source[key]) for key in ("date_from", "date") if source.get(key)]
+        terms = [str(source[key]) for key in ("attribution", "licence") if source.get(key)]
+        said = " ".join([str(source.get("name")), *dates])
+        parts.append(f"{said} ({', '.join(terms)})" if terms else said)
+    return "; ".join(parts[:20])

@@ -8,6 +8,9 @@ give every way in which places differ an equal say. Similarity is the scalar pro
 vectors.
 """
 
+import contextlib
+import math
+import mmap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,6 +28,7 @@ PART_NOISE = 2.0
 SOLVER_STEPS = 6
 SHARE_ROUNDING = 1e-3
 TINY = np.float32(1e-30)
+SPARSE_BYTES = 32 * 2**20
 
 
 @dataclass(frozen=True)
@@ -66,14 +70,19 @@ class CellSheet:
     def __init__(self, layout: CellLayout, height_px: int, width_px: int, channels: int) -> None:
         shape = (layout.samples(height_px), layout.samples(width_px))
         self.layout = layout
-        self.means = np.zeros((*shape, channels), dtype=np.float32)
-        self.valid = np.zeros(shape, dtype=np.float32)
+        self.means = _sparse_zeros((*shape, channels))
+        self.valid = _sparse_zeros(shape)
 
     def fill(
         self, row_px: int, col_px: int, maps: NDArray[np.float32], valid: NDArray[np.bool_]
     ) -> None:
         """Take in maps (C, H, W) and valid (H, W) of the block that starts at a sampled pixel."""
-        means, share = cell_means(maps, valid, self.layout)
+        self.put(row_px, col_px, *cell_means(maps, valid, self.layout))
+
+    def put(
+        self, row_px: int, col_px: int, means: NDArray[np.float32], share: NDArray[np.float32]
+    ) -> None:
+        """Take in the `cell_means` of such a block."""
         row, col = row_px // self.layout.spacing_px, col_px // self.layout.spacing_px
         part = np.s_[row : row + share.shape[0], col : col + share.shape[1]]
         self.means[part], self.valid[part] = means, share
@@ -88,6 +97,21 @@ class CellSheet:
             cells = self.valid[(row[:, None] + reach)[:, :, None], (col[:, None] + reach)[:, None]]
             out[part] = cells.mean(axis=(1, 2))
         return out
+
+
+def _sparse_zeros(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Zeros of which only what is written takes memory: a corridor fills little of its box.
+
+    NumPy asks for huge pages, of which one number would take megabytes.
+    """
+    size = math.prod(shape)
+    if 4 * size < SPARSE_BYTES:
+        return np.zeros(shape, dtype=np.float32)
+    pages = mmap.mmap(-1, 4 * size)
+    if hasattr(mmap, "MADV_NOHUGEPAGE"):
+        with contextlib.suppress(OSError):  # a kernel without them
+            pages.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.frombuffer(pages, dtype=np.float32).reshape(shape)
 
 
 def pooled_features(

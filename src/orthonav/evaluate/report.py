@@ -85,6 +85,7 @@ class MadeFrom:
 
     map_name: str = ""
     recipe: str = ""
+    imagery: str = ""
     flight: str = ""
     command: str = ""
     version: str = ""
@@ -369,6 +370,7 @@ def _made_from(made_from: MadeFrom) -> str:
     said = {
         "map": made_from.map_name,
         "recipe": made_from.recipe,
+        "imagery": made_from.imagery,
         "flight": made_from.flight,
         "command": made_from.command,
         "orthonav": made_from.version,

@@ -1,10 +1,12 @@
 """One orthophoto file: is it usable, where does it lie, which of its bands are used?"""
 
 import logging
-import re
-import warnings
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -12,14 +14,19 @@ from numpy.typing import NDArray
 
 from orthonav.errors import ImageryError, MissingExtraError, MissingFileError
 from orthonav.geo.frames import LocalFrame
+from orthonav.imagery.names import date_of, system_of, tab_transform
 
 try:
     import rasterio
     from rasterio._err import CPLE_BaseError
+    from rasterio.crs import CRS
     from rasterio.enums import ColorInterp
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+    from rasterio.errors import RasterioError
+    from rasterio.transform import Affine
     from rasterio.warp import transform as transform_coordinates
     from rasterio.windows import Window
+
+    from orthonav.imagery.quiet import quiet
 except ImportError as error:  # pragma: no cover - depends on the installation
     raise MissingExtraError(
         "reading orthophotos needs rasterio; install it with: pip install 'orthonav[geo]'"
@@ -28,38 +35,62 @@ except ImportError as error:  # pragma: no cover - depends on the installation
 OUTLINE_POINTS = 21
 ALPHA_SAMPLE_PX = 512
 ALPHA_WINDOWS = 8
+ALPHA_CHECKS = 16
 MAX_PARTLY_CLEAR = 0.05
-_DATE_TAGS = ("TIFFTAG_DATETIME", "ACQUISITION_DATE", "ACQUISITIONDATE", "DATE")
-_DATE_IN_NAME = re.compile(  # not 2000x2000, nor 2000px
-    r"(?<!\d)(?<!\dx)(19\d\d|20[0-3]\d)(?:[-_]?(0[1-9]|1[0-2])(?:[-_]?([0-3]\d))?)?"
-    r"(?![\dx]|[-_ ]?px)",
-    re.IGNORECASE,
-)
-
+HEIGHT_TYPES = ("float32", "float64", "int16", "int32")
+MIN_SIDE_PX = 16
+OPENED_AT_ONCE = 8
+TERMS = {
+    "attribution": ("ORTHONAV_ATTRIBUTION", "TIFFTAG_COPYRIGHT"),
+    "licence": ("ORTHONAV_LICENCE",),
+    "source": ("ORTHONAV_SOURCE",),
+    "layer": ("ORTHONAV_LAYER",),
+    "dates": ("ORTHONAV_DATES",),
+}
+"""Tags of a file that travel into the map, by the key they have there."""
+MAX_TERM = 300
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What is known of one orthophoto file without reading it whole.
+    """What is known of one orthophoto without reading it whole.
 
-    `bands` are the 1-based indexes used (one for grey, three for red, green, blue);
-    `outline_latlon_deg` is the (N, 2) border; `gsd_m` the ground resolution at the centre;
-    `palette` the (N, 3) colours of a colour-mapped image; `false_alpha` tells that the band the
-    file calls alpha is a picture, such as near infrared, so it says nothing of what is missing.
+    `name` is what GDAL opens: the path, or a table in it. `transform` and `system` (its CRS) are
+    the raster's own or, where it has none, those that its names and sidecars tell (`is_named` for
+    the system). `bands` are the
+    1-based indexes used (one for grey, three for red, green, blue); `outline_latlon_deg` is the
+    (N, 2) border; `gsd_m` the ground resolution at the centre; `palette` the (N, 3) colours of a
+    colour-mapped image; `false_alpha` tells that the band the file calls alpha is a picture, such
+    as near infrared, so it says nothing of what is missing; `folder` is the one it was found in
+    where a folder was named; `stamp` size and time of its files; `terms` what the file says of
+    where it is from and under which terms, by the keys of `TERMS`.
     """
 
     path: Path
+    name: str
     bands: tuple[int, ...]
     dtype: str
     width_px: int
     height_px: int
     crs: str
+    system: Any
+    is_named: bool
+    transform: Affine
     gsd_m: float
     outline_latlon_deg: NDArray[np.float64]
     date: str | None
     palette: NDArray[np.uint8] | None = None
+    marked_alpha: bool = False
     false_alpha: bool = False
+    folder: Path | None = None
+    stamp: tuple[tuple[str, int, int], ...] = ()
+    terms: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def colours(self) -> int:
+        """Bands of the picture it gives: 1 for grey, 3 for colours."""
+        return 3 if self.palette is not None else len(self.bands)
 
     def describe(self) -> dict[str, Any]:
         """What the map's manifest keeps of this source."""
@@ -71,57 +102,158 @@ class Source:
             "width_px": self.width_px,
             "height_px": self.height_px,
             "dtype": self.dtype,
+            **self.terms,
         }
 
 
+class UnfitError(ImageryError):
+    """A raster that is no orthophoto: a small picture, heights, nothing that tells where it is."""
+
+
 def open_source(path: Path) -> Source:
-    """Inspect an orthophoto.
+    """Inspect an orthophoto: of several tables of a GeoPackage the first.
 
     Raises `MissingFileError`, or `ImageryError` for a file GDAL cannot read, without a
     georeference, or without usable bands.
     """
-    path = Path(path)
+    return open_sources([path])[0][0]
+
+
+def open_sources(
+    paths: Sequence[Path], folder: Path | None = None
+) -> tuple[list[Source], list[str]]:
+    """Inspect orthophotos, several at a time; a file may hold several.
+
+    With `folder`, the one that was named rather than the files, rasters that are no orthophotos
+    are left out: the second list tells why, one line each. Raises as `open_source` does.
+    """
+    sources: list[Source] = []
+    unfit: list[str] = []
+    with quiet(), ThreadPoolExecutor(OPENED_AT_ONCE) as pool:
+        found = [pool.submit(_opened, Path(path), folder) for path in paths]
+        try:
+            for each in found:
+                try:
+                    sources += each.result()
+                except UnfitError as error:
+                    if folder is None:
+                        raise
+                    unfit.append(str(error))
+        finally:
+            pool.shutdown(cancel_futures=True)
+        sources = _without_false_alpha(sources)
+    named = Counter(source.crs for source in sources if source.is_named)
+    for system, count in named.items():
+        log.warning("files have no coordinate system; taken from their names: %d %s", count, system)
+    return sources, unfit
+
+
+def _opened(path: Path, folder: Path | None) -> list[Source]:
     if not path.is_file():
         raise MissingFileError(f"orthophoto does not exist: {path}")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as dataset:
-                return _inspect(path, dataset)
+        with rasterio.open(path) as dataset:
+            tables = list(dataset.subdatasets) if dataset.count == 0 else []
+            if not tables:
+                return [_inspect(path, dataset, folder)]
+        found = []
+        for table in tables:
+            with rasterio.open(table) as dataset:
+                found.append(_inspect(path, dataset, folder))
+        return found
     except RasterioError as error:
         raise unreadable(path, error) from error
 
 
-def _inspect(path: Path, dataset: Any) -> Source:
+def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
+    names = _names_of(path, folder)
+    if folder is not None and dataset.crs is None and _transform(path, dataset).is_identity:
+        raise UnfitError(f"raster has nothing that tells where it is: {path}")
+    system = _system(path, dataset, names)
+    transform = _transform(path, dataset)
+    if transform.is_identity or transform.determinant == 0:
+        raise ImageryError(f"orthophoto has no georeference (geotransform or world file): {path}")
+    if dataset.count < 1 or dataset.dtypes[0].startswith(("complex", "c")):
+        raise ImageryError(f"orthophoto has no band of real numbers: {path}")
+    if dataset.width < MIN_SIDE_PX or dataset.height < MIN_SIDE_PX:
+        raise UnfitError(
+            f"orthophoto is only {dataset.width} x {dataset.height} px, too small to use: {path}"
+        )
+    bands = _bands(dataset)
+    if folder is not None and len(bands) == 1 and dataset.dtypes[0] in HEIGHT_TYPES:
+        raise UnfitError(f"raster of one band of {dataset.dtypes[0]} may be heights: {path}")
+    palette = _palette(dataset) if dataset.colorinterp[0] == ColorInterp.palette else None
+    outline, gsd_m = _outline(path, dataset, system, transform)
+    return Source(
+        path=path,
+        name=str(dataset.name),
+        bands=bands,
+        dtype=str(dataset.dtypes[bands[0] - 1]),
+        width_px=dataset.width,
+        height_px=dataset.height,
+        crs=system.to_string(),
+        system=system,
+        is_named=dataset.crs is None or not (dataset.crs.is_projected or dataset.crs.is_geographic),
+        transform=transform,
+        gsd_m=gsd_m,
+        outline_latlon_deg=outline,
+        date=date_of(dataset.tags(), names),
+        palette=palette,
+        marked_alpha=ColorInterp.alpha in dataset.colorinterp and dataset.count > 1,
+        folder=folder,
+        stamp=_stamp(path, dataset),
+        terms=_terms(dataset.tags()),
+    )
+
+
+def _terms(tags: Mapping[str, str]) -> Mapping[str, str]:
+    """Licence, attribution and source of a file, as `orthonav fetch` writes them, else its
+    copyright; each cut to `MAX_TERM` letters."""
+    found = {}
+    for key, names in TERMS.items():
+        text = next((tags[name].strip() for name in names if tags.get(name, "").strip()), "")
+        if text:
+            found[key] = " ".join(text.split())[:MAX_TERM]
+    return MappingProxyType(found)
+
+
+def _names_of(path: Path, folder: Path | None) -> list[str]:
+    """Names that may tell of a file: its own, then of the folders up to the one that was named."""
+    names = [path.stem]
+    if folder is not None:
+        above = path.parent.resolve().relative_to(folder.resolve()).parts
+        names += [*reversed(above), folder.resolve().name]
+    return names
+
+
+def _system(path: Path, dataset: Any, names: Sequence[str]) -> Any:
+    if dataset.crs is not None and (dataset.crs.is_projected or dataset.crs.is_geographic):
+        return dataset.crs
+    told = system_of(names)
+    if told is not None:
+        return CRS.from_user_input(told)
     if dataset.crs is None:
         raise ImageryError(
             "orthophoto has no coordinate reference system; assign the one it was made in "
             f"(for example: gdal_edit.py -a_srs EPSG:2154 FILE): {path}"
         )
-    if dataset.transform.is_identity or dataset.transform.determinant == 0:
-        raise ImageryError(f"orthophoto has no georeference (geotransform or world file): {path}")
-    if dataset.count < 1 or dataset.dtypes[0].startswith(("complex", "c")):
-        raise ImageryError(f"orthophoto has no band of real numbers: {path}")
-    if dataset.width < 16 or dataset.height < 16:
-        raise ImageryError(
-            f"orthophoto is only {dataset.width} x {dataset.height} px, too small to use: {path}"
-        )
-    bands = _bands(dataset)
-    palette = _palette(dataset) if dataset.colorinterp[0] == ColorInterp.palette else None
-    outline = _outline_latlon_deg(path, dataset)
-    return Source(
-        path=path,
-        bands=bands,
-        dtype=str(dataset.dtypes[bands[0] - 1]),
-        width_px=dataset.width,
-        height_px=dataset.height,
-        crs=dataset.crs.to_string(),
-        gsd_m=_gsd_m(dataset),
-        outline_latlon_deg=outline,
-        date=_date(path, dataset),
-        palette=palette,
-        false_alpha=_has_false_alpha(path, dataset),
-    )
+    return dataset.crs
+
+
+def _transform(path: Path, dataset: Any) -> Affine:
+    transform = dataset.transform
+    if transform.is_identity:
+        sidecar = tab_transform(path)
+        transform = transform if sidecar is None else Affine(*sidecar)
+    return transform
+
+
+def _stamp(path: Path, dataset: Any) -> tuple[tuple[str, int, int], ...]:
+    """Path, size and time of change in ns of the file, and of those that a virtual one names."""
+    files = [path, *(dataset.files if dataset.driver == "VRT" else ())]
+    known = {str(Path(file).resolve()) for file in files}
+    found = [(name, Path(name).stat()) for name in sorted(known) if Path(name).is_file()]
+    return tuple((name, about.st_size, about.st_mtime_ns) for name, about in found)
 
 
 def _bands(dataset: Any) -> tuple[int, ...]:
@@ -135,21 +267,43 @@ def _bands(dataset: Any) -> tuple[int, ...]:
     return tuple(colours[:3]) if len(colours) >= 3 else tuple(colours[:1])
 
 
-def _has_false_alpha(path: Path, dataset: Any) -> bool:
+def _without_false_alpha(sources: list[Source]) -> list[Source]:
+    """The sources, told whether their band marked alpha is no mask.
+
+    Of many alike the first few tell for all: they come from one maker.
+    """
+    verdicts: dict[Any, list[bool]] = {}
+    checked = []
+    for source in sources:
+        if source.marked_alpha:
+            alike = (source.folder, source.path.parent, source.bands, source.dtype, source.crs)
+            told = verdicts.setdefault(alike, [])
+            if len(told) < ALPHA_CHECKS:
+                told.append(_has_false_alpha(source))
+            source = replace(
+                source, false_alpha=told[-1] if len(told) < ALPHA_CHECKS else any(told)
+            )
+        checked.append(source)
+    return checked
+
+
+def _has_false_alpha(source: Source) -> bool:
     """Whether the band marked alpha, as GDAL marks the fourth of four by default, is no mask.
 
     A mask is clear or opaque nearly everywhere; a picture holds every value between.
     """
-    if ColorInterp.alpha not in dataset.colorinterp or dataset.count < 2:
-        return False
-    values = _sample(dataset, dataset.colorinterp.index(ColorInterp.alpha) + 1)
+    try:
+        with rasterio.open(source.name) as dataset:
+            values = _sample(dataset, dataset.colorinterp.index(ColorInterp.alpha) + 1)
+    except RasterioError as error:
+        raise unreadable(source.path, error) from error
     partly = float(((values != 0) & (values != values.max())).mean())
     if partly <= MAX_PARTLY_CLEAR:
         return False
     log.info(
         "band marked alpha is no mask (%.0f %% of it is neither clear nor opaque); ignored: %s",
         100 * partly,
-        path,
+        source.path,
     )
     return True
 
@@ -181,55 +335,41 @@ def _palette(dataset: Any) -> NDArray[np.uint8]:
     return table
 
 
-def _outline_latlon_deg(path: Path, dataset: Any) -> NDArray[np.float64]:
+def _outline(
+    path: Path, dataset: Any, system: Any, transform: Affine
+) -> tuple[NDArray[np.float64], float]:
+    """The border (N, 2), latitude and longitude in degrees, and the ground resolution in metres.
+
+    That is the square root of the ground area of the central pixel.
+    """
     share = np.linspace(0, 1, OUTLINE_POINTS)
     zero, one = np.zeros(OUTLINE_POINTS), np.ones(OUTLINE_POINTS)
+    middle_col, middle_row = dataset.width / 2, dataset.height / 2
     cols = np.concatenate([share, share, zero, one]) * dataset.width
     rows = np.concatenate([zero, one, share, share]) * dataset.height
+    x, y = transform * (
+        np.append(cols, middle_col + np.array([0, 1, 0])),
+        np.append(rows, middle_row + np.array([0, 0, 1])),
+    )
     try:
-        latlon = _latlon_deg(dataset, cols, rows)
+        lon, lat = transform_coordinates(system, "EPSG:4326", x, y)[:2]
     except CPLE_BaseError as error:  # a local or engineering system: nowhere on Earth
         raise ImageryError(
             "orthophoto's coordinate system cannot be turned into latitude, longitude; assign the "
             f"one it was made in (for example: gdal_edit.py -a_srs EPSG:2154 FILE): {path}"
         ) from error
+    latlon = np.stack([np.asarray(lat, dtype=float), np.asarray(lon, dtype=float)], axis=1)
     if not np.isfinite(latlon).all() or np.abs(latlon[:, 0]).max() > 90:
         raise ImageryError(f"orthophoto's border cannot be turned into latitude, longitude: {path}")
-    if dataset.crs.is_geographic and max(-dataset.bounds.left, dataset.bounds.right) > 180 + 1e-6:
+    if system.is_geographic and max(-float(x.min()), float(x.max())) > 180 + 1e-6:
         raise ImageryError(
             "orthophoto in degrees lies beyond longitude 180, where GDAL reads one side only; "
             f"reproject it to metres, such as UTM (gdalwarp -t_srs EPSG:32760): {path}"
         )
-    return latlon
-
-
-def _latlon_deg(
-    dataset: Any, cols: NDArray[np.float64], rows: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    x, y = dataset.transform * (cols, rows)
-    lon, lat = transform_coordinates(dataset.crs, "EPSG:4326", x, y)[:2]
-    return np.stack([np.asarray(lat, dtype=float), np.asarray(lon, dtype=float)], axis=1)
-
-
-def _gsd_m(dataset: Any) -> float:
-    """Square root of the ground area of the central pixel."""
-    col, row = dataset.width / 2, dataset.height / 2
-    latlon = _latlon_deg(dataset, np.array([col, col + 1, col]), np.array([row, row, row + 1]))
-    frame = LocalFrame(float(latlon[0, 0]), float(latlon[0, 1]))
-    corner = frame.en_from_latlon(latlon[:, 0], latlon[:, 1])
+    frame = LocalFrame(float(latlon[-3, 0]), float(latlon[-3, 1]))
+    corner = frame.en_from_latlon(latlon[-3:, 0], latlon[-3:, 1])
     right, down = corner[1] - corner[0], corner[2] - corner[0]
-    return float(np.sqrt(abs(right[0] * down[1] - right[1] * down[0])))
-
-
-def _date(path: Path, dataset: Any) -> str | None:
-    """Date of acquisition as YYYY[-MM[-DD]], from the file's tags or else its name."""
-    tags = dataset.tags()
-    candidates = [str(tags[tag]).replace(":", "-") for tag in _DATE_TAGS if tag in tags]
-    for text in [*candidates, path.stem]:
-        found = _DATE_IN_NAME.search(text)
-        if found:
-            return "-".join(part for part in found.groups() if part)
-    return None
+    return latlon[:-3], float(np.sqrt(abs(right[0] * down[1] - right[1] * down[0])))
 
 
 def unreadable(path: Path, error: Exception) -> ImageryError:

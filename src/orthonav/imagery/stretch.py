@@ -1,17 +1,21 @@
-"""Pixels of more than 8 bits made into 8 bits, all orthophotos of a map alike."""
+"""Pixels of more than 8 bits made into 8 bits, all orthophotos of one kind alike."""
 
-import warnings
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.errors import RasterioError
 
 from orthonav.errors import ImageryError
+from orthonav.imagery.quiet import quiet
 from orthonav.imagery.source import Source, unreadable
 from orthonav.imagery.thin import read_mask
+
+log = logging.getLogger(__name__)
 
 SAMPLE_PX = 512
 SAMPLED_SOURCES = 12
@@ -31,20 +35,30 @@ class Stretch:
         return np.asarray(np.clip(np.nan_to_num(scaled) + 0.5, 0, 255), dtype=np.uint8)
 
 
-def sample_stretch(sources: list[Source]) -> Stretch | None:
-    """Common stretch of sources that are not 8 bit; None where all are 8 bit.
+def sample_stretches(sources: Sequence[Source]) -> tuple[Stretch | None, ...]:
+    """The stretch of each source: None for 8 bit, else common to all that are alike.
 
-    From the 0.5 and 99.5 percentiles of valid pixels in a thinned read of up to 12 sources.
-    Raises `ImageryError` where 8-bit and other files are mixed, no source can be read or no pixel
-    is valid.
+    Alike are those of one type and number of bands, ground resolution and coordinate system: the
+    files of one product. From the 0.5 and 99.5 percentiles of valid pixels in a thinned read of up
+    to 12 of them. Raises `ImageryError` where none can be read or no pixel is valid.
     """
-    deep = [source.dtype != "uint8" for source in sources]
-    if not any(deep):
-        return None
-    if not all(deep):
-        raise ImageryError(
-            "orthophotos of 8 bit and of more bits cannot be mixed in one map; convert one kind"
-        )
+    alike: dict[Any, list[int]] = {}
+    for index, source in enumerate(sources):
+        if source.dtype != "uint8" and source.palette is None:
+            kind = source.dtype, source.colours, round(source.gsd_m, 2), source.crs
+            alike.setdefault(kind, []).append(index)
+    found: list[Stretch | None] = [None] * len(sources)
+    for members in alike.values():
+        stretch = _common([sources[index] for index in members])
+        for index in members:
+            found[index] = stretch
+    deep = sum(len(members) for members in alike.values())
+    if len(alike) > 1 or 0 < deep < len(sources):
+        log.warning("orthophotos of several kinds of pixels: each kind is made into 8 bits alone")
+    return tuple(found)
+
+
+def _common(sources: list[Source]) -> Stretch:
     values = []
     broken: ImageryError | None = None
     for source in sources[:: max(1, -(-len(sources) // SAMPLED_SOURCES))]:
@@ -63,11 +77,9 @@ def sample_stretch(sources: list[Source]) -> Stretch | None:
 
 def _valid_values(source: Source) -> NDArray[Any]:
     """Finite values (N,) of valid pixels of a thinned read."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(source.path) as data:
-            shape = (min(SAMPLE_PX, data.height), min(SAMPLE_PX, data.width))
-            pixels = data.read(list(source.bands), out_shape=(len(source.bands), *shape))
-            valid = read_mask(data, source, out_shape=shape) > 0
+    with quiet(), rasterio.open(source.name) as data:
+        shape = (min(SAMPLE_PX, data.height), min(SAMPLE_PX, data.width))
+        pixels = data.read(list(source.bands), out_shape=(len(source.bands), *shape))
+        valid = read_mask(data, source, out_shape=shape) > 0
     sampled = pixels[:, valid].ravel()
     return np.asarray(sampled[np.isfinite(sampled)])

@@ -1,13 +1,11 @@
 """Reading windows of one orthophoto file, thinned to about a wanted resolution."""
 
-import warnings
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rasterio.enums import MaskFlags, Resampling
-from rasterio.errors import NodataShadowWarning
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
@@ -30,7 +28,8 @@ def read_thinned(
     window = _aligned(window, factor, dataset)
     # GDAL averages the numbers of a palette, and leaves out what the alpha band says is missing.
     if factor > 1 and (source.palette is not None or source.false_alpha):
-        values, mask = _averaged_in_strips(dataset, source, window, factor)
+        values, share = _averaged_in_strips(dataset, source, window, factor)
+        mask = np.rint(share * 255).astype(np.uint8)
         scale = Affine.scale(factor)
     else:
         shape = (max(1, round(window.height / factor)), max(1, round(window.width / factor)))
@@ -40,8 +39,31 @@ def read_thinned(
     return (
         values,
         mask,
-        dataset.transform * Affine.translation(window.col_off, window.row_off) * scale,
+        source.transform * Affine.translation(window.col_off, window.row_off) * scale,
     )
+
+
+def cells_of(
+    dataset: Any, source: Source, at: tuple[int, int], shape: tuple[int, int], factor: int
+) -> tuple[NDArray[Any], NDArray[np.float32]]:
+    """Means (C, h, w) of squares of `factor` pixels, and the share (h, w) of each that is valid.
+
+    The first begins at column and row `at`, which may lie outside; what does counts as not valid.
+    """
+    (col, row), (rows, cols) = at, shape
+    left, top = max(col, 0), max(row, 0)
+    right, bottom = (
+        min(col + cols * factor, source.width_px),
+        min(row + rows * factor, source.height_px),
+    )
+    window = Window(left, top, right - left, bottom - top)
+    whole = (right - left, bottom - top) == (cols * factor, rows * factor)
+    plain = source.palette is None and not source.false_alpha
+    if factor == 1 or (whole and plain):
+        how = Resampling.nearest if factor == 1 else Resampling.average
+        values, mask = _read(dataset, source, window, shape, how)
+        return values, np.asarray(mask / np.float32(255), dtype=np.float32)
+    return _averaged_in_strips(dataset, source, window, factor, (left - col, top - row))
 
 
 def _read(
@@ -64,46 +86,53 @@ def _read(
 
 def read_mask(dataset: Any, source: Source, **how: Any) -> NDArray[np.uint8]:
     """Mask (h, w), 0 for nodata to 255; `how` is passed to rasterio (`out_shape` is needed)."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NodataShadowWarning)
-        if not source.false_alpha:
-            return np.asarray(dataset.dataset_mask(**how), dtype=np.uint8)
-        if MaskFlags.alpha in dataset.mask_flag_enums[source.bands[0] - 1]:
-            return np.full(how["out_shape"], 255, dtype=np.uint8)
-        bands = list(source.bands)
-        masks = dataset.read_masks(bands, **how | {"out_shape": (len(bands), *how["out_shape"])})
+    if not source.false_alpha:
+        return np.asarray(dataset.dataset_mask(**how), dtype=np.uint8)
+    if MaskFlags.alpha in dataset.mask_flag_enums[source.bands[0] - 1]:
+        return np.full(how["out_shape"], 255, dtype=np.uint8)
+    bands = list(source.bands)
+    masks = dataset.read_masks(bands, **how | {"out_shape": (len(bands), *how["out_shape"])})
     return np.asarray(masks.max(axis=0), dtype=np.uint8)
 
 
 def _averaged_in_strips(
-    dataset: Any, source: Source, window: Window, factor: int
-) -> tuple[NDArray[Any], NDArray[np.uint8]]:
-    """Means over squares of `factor` pixels of what is valid, and the valid share as 0..255."""
-    rows, cols = -(-window.height // factor), -(-window.width // factor)
+    dataset: Any, source: Source, window: Window, factor: int, lead_px: tuple[int, int] = (0, 0)
+) -> tuple[NDArray[Any], NDArray[np.float32]]:
+    """Means over squares of `factor` pixels of what is valid, and the valid share, 0 to 1.
+
+    The first squares begin `lead_px` columns and rows before the window.
+    """
+    ahead, above = lead_px
+    rows, cols = -(-(above + window.height) // factor), -(-(ahead + window.width) // factor)
     strip_rows = max(1, STRIP_BYTES // (_STRIP_PIXEL_BYTES * cols * factor**2))
     values: list[NDArray[Any]] = []
-    masks: list[NDArray[np.uint8]] = []
+    shares: list[NDArray[np.float32]] = []
     for row in range(0, rows, strip_rows):
-        top = row * factor
-        height = min(strip_rows * factor, window.height - top)
+        top = max(0, row * factor - above)
+        height = min((row + strip_rows) * factor - above, window.height) - top
         strip = Window(window.col_off, window.row_off + top, window.width, height)
         pixels, mask = _read(dataset, source, strip, (height, window.width))
-        share = _square_means((mask > 0).astype(np.float32), factor)
+        lead = (ahead, above if row == 0 else 0)
+        share = _square_means((mask > 0).astype(np.float32), factor, lead)
         means = [
-            _square_means(np.where(mask > 0, band, 0).astype(np.float32), factor) for band in pixels
+            _square_means(np.where(mask > 0, band, 0).astype(np.float32), factor, lead)
+            for band in pixels
         ]
         whole = pixels.dtype.kind in "iu"
         mean = np.stack(means) / np.maximum(share, 1e-6)
         values.append((np.rint(mean) if whole else mean).astype(pixels.dtype))
-        masks.append(np.rint(share * 255).astype(np.uint8))
-    return np.concatenate(values, axis=1), np.concatenate(masks)
+        shares.append(share)
+    return np.concatenate(values, axis=1), np.concatenate(shares)
 
 
-def _square_means(band: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
-    """Means over squares of `factor` pixels; what is missing of the last ones counts as 0."""
-    bottom, right = -band.shape[0] % factor, -band.shape[1] % factor
-    if bottom or right:
-        band = np.pad(band, ((0, bottom), (0, right)))
+def _square_means(
+    band: NDArray[np.float32], factor: int, lead_px: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Means over squares of `factor` pixels; what is missing of the outer ones counts as 0."""
+    left, top = lead_px
+    bottom, right = -(top + band.shape[0]) % factor, -(left + band.shape[1]) % factor
+    if left or top or bottom or right:
+        band = np.pad(band, ((top, bottom), (left, right)))
     size = (band.shape[1] // factor, band.shape[0] // factor)
     return np.asarray(cv2.resize(band, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
 

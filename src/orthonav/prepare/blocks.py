@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
-from orthonav.imagery.mosaic import Pixels, SheetRaster
+from orthonav.imagery.mosaic import GreyPixels, SheetRaster
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,11 @@ class Block:
         reach_px = np.hypot(self.height, self.width) / 2 + grid.tile_px + grid.stride_px
         return bool(area.contains(np.array([[east_m, north_m]]), reach_px * grid.gsd_m)[0])
 
+    def within(self, other: "Block") -> tuple[slice, slice]:
+        """Its rows and columns in the pixels of another block that holds it."""
+        row, col = self.row - other.row, self.col - other.col
+        return slice(row, row + self.height), slice(col, col + self.width)
+
     def cut(self, side_px: int) -> Iterator["Block"]:
         """Its parts between the multiples of `side_px` of the raster."""
         bottom, right = self.row + self.height, self.col + self.width
@@ -45,15 +50,9 @@ class BlockPixels:
     """Pixels of a block and of a margin around it; the block begins at (`top`, `left`) in them."""
 
     block: Block
-    pixels: Pixels
+    pixels: GreyPixels
     top: int
     left: int
-
-    def within(self, block: Block) -> tuple[slice, slice]:
-        """Rows and columns in the pixels of a part of the block."""
-        row = block.row - self.block.row + self.top
-        col = block.col - self.block.col + self.left
-        return slice(row, row + block.height), slice(col, col + block.width)
 
     def part(self, beyond_px: int = 0) -> tuple[slice, slice]:
         """Rows and columns of the block in the pixels, `beyond_px` more to south and east."""
@@ -71,13 +70,21 @@ def blocks_of(grid: TileGrid, side_px: int) -> Iterator[Block]:
             yield Block(row, col, height, width)
 
 
-def read_block(raster: SheetRaster, block: Block, margin_px: int) -> BlockPixels:
-    """Read a block with up to `margin_px` around it, less where the raster ends."""
-    top, left = min(margin_px, block.row), min(margin_px, block.col)
-    bottom = min(margin_px, raster.height_px - block.row - block.height)
-    right = min(margin_px, raster.width_px - block.col - block.width)
+def margins(grid: TileGrid, block: Block, margin_px: int) -> tuple[int, int, int, int]:
+    """Top, left, bottom, right: up to `margin_px` around a block, less where the raster ends."""
+    return (
+        min(margin_px, block.row),
+        min(margin_px, block.col),
+        min(margin_px, grid.height_px - block.row - block.height),
+        min(margin_px, grid.width_px - block.col - block.width),
+    )
+
+
+def read_block(raster: SheetRaster, grid: TileGrid, block: Block, margin_px: int) -> BlockPixels:
+    """Read a block with `margins` around it."""
+    top, left, bottom, right = margins(grid, block, margin_px)
     width, height = left + block.width + right, top + block.height + bottom
-    pixels = raster.read(block.col - left, block.row - top, width, height)
+    pixels = raster.read_grey(block.col - left, block.row - top, width, height)
     return BlockPixels(block, pixels, top, left)
 
 
@@ -89,16 +96,27 @@ class Preview:
         height, width = grid.height_px * self._scale, grid.width_px * self._scale
         self._grey = np.zeros((max(1, round(height)), max(1, round(width))), np.uint8)
 
-    def add(self, read: BlockPixels) -> None:
-        """Take in a block."""
-        block, (rows, cols) = read.block, self._grey.shape
+    def small(self, read: BlockPixels) -> NDArray[np.uint8]:
+        """What it needs of a block: (h, w), nothing where that is less than a pixel."""
+        y0, y1, x0, x1 = self._edges(read.block)
+        if y1 <= y0 or x1 <= x0:
+            return np.zeros((0, 0), np.uint8)
+        grey = read.pixels.grey[read.part()]
+        small = cv2.resize(grey, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
+        return np.asarray(small, dtype=np.uint8)
+
+    def put(self, block: Block, small: NDArray[np.uint8]) -> None:
+        """Take in what `small` made of a block."""
+        if small.size:
+            y0, y1, x0, x1 = self._edges(block)
+            self._grey[y0:y1, x0:x1] = small
+
+    def _edges(self, block: Block) -> tuple[int, int, int, int]:
+        """Top, bottom, left, right of a block in the picture."""
+        rows, cols = self._grey.shape
         y0, y1 = (round(edge * self._scale) for edge in (block.row, block.row + block.height))
         x0, x1 = (round(edge * self._scale) for edge in (block.col, block.col + block.width))
-        y1, x1 = min(y1, rows), min(x1, cols)
-        if y1 > y0 and x1 > x0:
-            grey = read.pixels.grey[read.part()]
-            small = cv2.resize(grey, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
-            self._grey[y0:y1, x0:x1] = small
+        return y0, min(y1, rows), x0, min(x1, cols)
 
     def jpeg(self) -> NDArray[np.uint8]:
         """The picture as bytes of a JPEG."""

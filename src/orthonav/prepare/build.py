@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__, embed, represent
-from orthonav.embed.cells import MICRO, CellLayout
 from orthonav.embed.contract import ViewEmbedder
 from orthonav.embed.network import TripletRecipe
-from orthonav.embed.whitened import CellSheet, WhitenedRecipe, learn
+from orthonav.embed.whitened import WhitenedRecipe, learn
 from orthonav.errors import AreaError, OutputError, VariantError
 from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
@@ -30,7 +29,6 @@ from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import Manifest, SheetInfo
 from orthonav.mapfile.reader import MapFile
 from orthonav.mapfile.writer import write_map
-from orthonav.prepare.blocks import BlockPixels, Preview, blocks_of, read_block
 from orthonav.prepare.calibrate import (
     CROPS,
     RADIUS_STRIDES,
@@ -40,19 +38,18 @@ from orthonav.prepare.calibrate import (
     calibrate,
 )
 from orthonav.prepare.calibrate_registration import FLOOR_PX, calibrate_registration
-from orthonav.prepare.encoders import learn_encoder
-from orthonav.prepare.layer import CHUNK_PX, GreyLayerWriter
+from orthonav.prepare.encoders import EncoderRecipe, learn_encoder
+from orthonav.prepare.layout import grid_of, tiles_of
 from orthonav.prepare.methods import method_recipe, stored_representation, usual_edges
 from orthonav.prepare.pictures import SheetPictures, read_pictures
+from orthonav.prepare.sheet import SheetReader
 from orthonav.search.exact import ExactIndex
 from orthonav.search.peak import TileNeighbours
 from orthonav.variants import make_variant, variant_recipe
 
 log = logging.getLogger(__name__)
 
-BLOCK_PX = 1024
-PREVIEW_PX = 384
-MIN_TILE_VALID_SHARE = 0.5
+MAX_WORKERS = 64
 MIN_VIEW_VALID_SHARE = 0.4
 HEADING_STEP_DEG = 6.0
 SEARCH_MS = 100.0
@@ -67,12 +64,14 @@ Progress = Callable[[str, float], None]
 @dataclass(frozen=True)
 class BuildRequest:
     """What to build. `bounds_deg` is west, south, east, north; with neither it nor a route, the
-    whole imagery is the area. `gsd_m` None takes that of the finest orthophoto. With
-    `registration` the map carries the grey picture that places views below tile size;
-    `other_dates` are orthophotos of the same ground to learn the confidence from, besides
-    `calibration_views` views made of the reference itself; a triplet network learns from them too.
-    `edges` None is what suits the method; `work` keeps checkpoints of networks, from which a build
-    that was interrupted goes on."""
+    whole imagery is the area. `band_m` is for the legs of the route that have no band of their own.
+    `gsd_m` None takes that of the finest orthophoto. With `registration` the map carries the grey
+    picture that places views below tile size; `other_dates` are orthophotos of the same ground to
+    learn the confidence from, besides `calibration_views` views made of the reference itself; a
+    triplet network learns from them too. `edges` None is what suits the method. `work` is a folder
+    for checkpoints of networks and finished blocks, from which a build that was interrupted goes
+    on; without it the blocks of a large map are kept in `OUT.work` until it is written. `workers`
+    threads read the imagery, None: one for each core."""
 
     orthos: Sequence[Path]
     out: Path
@@ -89,6 +88,7 @@ class BuildRequest:
     other_dates: Sequence[Path] = ()
     calibration_views: int = 48
     work: Path | None = None
+    workers: int | None = None
 
 
 @dataclass(frozen=True)
@@ -109,12 +109,12 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     representation = make_variant(represent.TABLE, request.edges or usual_edges(request.method))
     recipe = method_recipe(request.method, representation)
     mosaic = Mosaic.open(request.orthos)
-    inputs = [*request.orthos, *request.other_dates]
-    if any(request.out.exists() and request.out.samefile(path) for path in inputs):
-        raise OutputError(f"the map would replace an orthophoto; name another file: {request.out}")
     mosaic_of_dates = [Mosaic.open([path]) for path in request.other_dates]
+    inputs = [source.path for each in (mosaic, *mosaic_of_dates) for source in each.sources]
+    if request.out.exists() and any(request.out.samefile(path) for path in inputs):
+        raise OutputError(f"the map would replace an orthophoto; name another file: {request.out}")
     area = _area(request, mosaic)
-    grid = _grid(request, area, mosaic)
+    grid = grid_of(area, mosaic.gsd_m, request.gsd_m, request.tile_px, request.overlap)
     if request.seed < 0:
         raise VariantError(f"seed must be 0 or more, got {request.seed}")
     if not 1 <= request.calibration_views <= MAX_CALIBRATION_VIEWS:
@@ -122,34 +122,46 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
             f"calibration views must be 1 to {MAX_CALIBRATION_VIEWS}, "
             f"got {request.calibration_views}"
         )
-    sampler = CropSampler(grid.tile_px, request.seed)
-    layer = GreyLayerWriter(grid.height_px, grid.width_px) if request.registration else None
-    pictures = None
-    if not isinstance(recipe, WhitenedRecipe):
-        pictures = SheetPictures(grid, representation)
-    cells, preview = _read_cells(
-        mosaic, area, grid, representation, sampler, layer, pictures, report
+    if request.workers is not None and not 1 <= request.workers <= MAX_WORKERS:
+        raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {request.workers}")
+    pictures = None if isinstance(recipe, WhitenedRecipe) else SheetPictures(grid, representation)
+    reader = SheetReader(
+        mosaic,
+        area,
+        grid,
+        representation,
+        CropSampler(grid.tile_px, request.seed),
+        registration=request.registration,
+        pictures=pictures,
     )
-    tiles_rc = _tiles(area, grid, cells)
-    tiles_px = tiles_rc * grid.stride_px
-    embedder: ViewEmbedder
-    report("learn", 0.0)
-    if isinstance(recipe, WhitenedRecipe):
-        embedder = whitened = learn(recipe, cells, tiles_px)
-        embeddings = whitened.tiles(cells, tiles_px)
-    else:
-        assert pictures is not None
-        dates = [
-            read_pictures(date, area, grid, representation, report)
-            for date in (mosaic_of_dates if isinstance(recipe, TripletRecipe) else ())
-        ]
-        embedder, embeddings = learn_encoder(
-            recipe, pictures, dates, tiles_px, representation, request.seed, request.work, report
-        )
-    report("learn", 1.0)
+    with reader.kept(*_folders(request)) as kept:
+        reader.read(report, request.workers, kept)
+        manifest, arrays = _learnt(request, recipe, mosaic, mosaic_of_dates, reader, report)
+        written = write_map(request.out, manifest, arrays)
+    return BuildResult(written, request.out.stat().st_size)
+
+
+def _folders(request: BuildRequest) -> tuple[Path, Path | None]:
+    """Where finished blocks are kept: beside the map, and in the work folder if one was named."""
+    beside = request.out.with_name(f"{request.out.name}.work")
+    return beside, None if request.work is None else request.work / f"blocks-{request.out.name}"
+
+
+def _learnt(
+    request: BuildRequest,
+    recipe: WhitenedRecipe | EncoderRecipe,
+    mosaic: Mosaic,
+    other_dates: Sequence[Mosaic],
+    read: SheetReader,
+    report: Progress,
+) -> tuple[Manifest, dict[str, NDArray[Any]]]:
+    """Manifest and arrays of the map of a sheet that was read."""
+    area, grid, representation = read.area, read.grid, read.representation
+    tiles_rc = tiles_of(area, grid, read.cells)
     centres = grid.centres_en_m(tiles_rc).astype(np.float32)
+    embedder, embeddings = _embedded(request, recipe, tiles_rc, other_dates, read, report)
     calibration = calibrate(
-        sampler,
+        read.sampler,
         grid,
         representation,
         embedder,
@@ -161,42 +173,64 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     )
     if calibration.confidence is None:
         log.warning("too little imagery to calibrate: fixes on this map will have no confidence")
-    grey, grey_parts = (None, {}) if layer is None else layer.finish()
+    grey, grey_parts = (None, {}) if read.layer is None else read.layer.finish()
     area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
     sheet = SheetInfo(area.frame, grid, len(tiles_rc), area_km2, grey)
     manifest = _manifest(request, mosaic, sheet, representation, embedder, calibration)
     arrays: dict[str, NDArray[Any]] = {
         "sheet0/centres_en_m": centres,
         "sheet0/embeddings": embeddings,
-        "sheet0/preview_jpeg": preview,
+        "sheet0/preview_jpeg": read.preview.jpeg(),
         **{f"embed/{name}": array for name, array in embedder.parts().items()},
         **grey_parts,
     }
     if grey is not None:
-        registration = _registration(
-            request,
-            mosaic_of_dates,
-            area,
-            manifest,
-            arrays,
-            sampler,
-            representation,
-            embedder,
+        registration = _registration(request, other_dates, manifest, arrays, read, embedder, report)
+        manifest = replace(manifest, registration=registration)
+    return manifest, arrays
+
+
+def _embedded(
+    request: BuildRequest,
+    recipe: WhitenedRecipe | EncoderRecipe,
+    tiles_rc: NDArray[np.intp],
+    other_dates: Sequence[Mosaic],
+    read: SheetReader,
+    report: Progress,
+) -> tuple[ViewEmbedder, NDArray[np.float16]]:
+    """What embeds views, learnt from the tiles, and the tiles' embeddings (N, D)."""
+    tiles_px = tiles_rc * read.grid.stride_px
+    report("learn", 0.0)
+    embedder: ViewEmbedder
+    if isinstance(recipe, WhitenedRecipe):
+        embedder = whitened = learn(recipe, read.cells, tiles_px)
+        embeddings = whitened.tiles(read.cells, tiles_px)
+    else:
+        assert read.pictures is not None
+        dates = [
+            read_pictures(date, read.area, read.grid, read.representation, report)
+            for date in (other_dates if isinstance(recipe, TripletRecipe) else ())
+        ]
+        embedder, embeddings = learn_encoder(
+            recipe,
+            read.pictures,
+            dates,
+            tiles_px,
+            read.representation,
+            request.seed,
+            request.work,
             report,
         )
-        manifest = replace(manifest, registration=registration)
-    written = write_map(request.out, manifest, arrays)
-    return BuildResult(written, request.out.stat().st_size)
+    report("learn", 1.0)
+    return embedder, embeddings
 
 
 def _registration(
     request: BuildRequest,
     other_dates: Sequence[Mosaic],
-    area: Area,
     manifest: Manifest,
     arrays: dict[str, NDArray[Any]],
-    sampler: CropSampler,
-    representation: Any,
+    read: SheetReader,
     embedder: ViewEmbedder,
     report: Progress,
 ) -> dict[str, Any]:
@@ -211,17 +245,21 @@ def _registration(
         arrays["sheet0/centres_en_m"],
         ExactIndex(arrays["sheet0/embeddings"]),
         embedder,
-        representation,
+        read.representation,
         TileNeighbours(sheet.grid, arrays["sheet0/centres_en_m"]),
     )
     localizer = RegistrationLocalizer(
         sheet, layer, None, radius_m, FLOOR_PX, propose, last_ms=SEARCH_MS
     )
-    later = [crop for each in other_dates for crop in _crops_of(each, area, sheet.grid, sampler)]
+    later = [
+        crop
+        for each in other_dates
+        for crop in _crops_of(each, read.area, sheet.grid, read.sampler)
+    ]
     if other_dates and not later:
         log.warning("the other dates do not cover the area: nothing can be learnt from them")
     learnt = calibrate_registration(
-        localizer, sampler.crops, later, request.calibration_views, request.seed, report
+        localizer, read.sampler.crops, later, request.calibration_views, request.seed, report
     )
     if learnt.confidence is None:
         log.warning("too little imagery to calibrate registration: fixes will have no confidence")
@@ -239,7 +277,7 @@ def _crops_of(mosaic: Mosaic, area: Area, grid: TileGrid, sampler: CropSampler) 
         for crop in sampler.crops:
             size = crop.grey.shape[0]
             col, row = round(crop.col_px - size / 2), round(crop.row_px - size / 2)
-            pixels = raster.read(col, row, size, size)
+            pixels = raster.read_grey(col, row, size, size)
             if pixels.valid.all() and pixels.grey.std() > 1:
                 found.append(Crop(pixels.grey, crop.row_px, crop.col_px))
     return found
@@ -249,8 +287,6 @@ def _area(request: BuildRequest, mosaic: Mosaic) -> Area:
     if request.route is not None and request.bounds_deg is not None:
         raise AreaError("give a route with a band, or bounds, not both")
     if request.route is not None:
-        if request.band_m is None:
-            raise AreaError("a route needs the width of its search band in metres (--band-m)")
         return Area.from_route(request.route, request.band_m)
     if request.band_m is not None:
         raise AreaError("a search band needs a route (--route)")
@@ -258,119 +294,6 @@ def _area(request: BuildRequest, mosaic: Mosaic) -> Area:
         return Area.from_bounds(request.bounds_deg)
     outline = mosaic.outline_latlon_deg
     return Area.from_outline(outline[:, 0], outline[:, 1])
-
-
-def _grid(request: BuildRequest, area: Area, mosaic: Mosaic) -> TileGrid:
-    """The tile grid; refuses tiles larger than an area that is not the band of a route."""
-    gsd_m = _rounded(mosaic.gsd_m) if request.gsd_m is None else request.gsd_m
-    overlap = _whole_cells(request.tile_px, request.overlap)
-    grid = TileGrid.covering(
-        area.extent_en_m, gsd_m=gsd_m, tile_px=request.tile_px, overlap=overlap
-    )
-    west, south, east, north = area.extent_en_m
-    side_m = min(east - west, north - south)
-    if area.route is None and side_m < 0.999 * grid.tile_m:
-        raise AreaError(
-            f"a tile of {grid.tile_px} px is {grid.tile_m:.0f} m wide, larger than the area, "
-            f"{east - west:.0f} x {north - south:.0f} m; use smaller tiles, a finer ground "
-            "resolution or a larger area"
-        )
-    if gsd_m < 0.8 * mosaic.gsd_m:
-        log.warning(
-            "ground resolution of %.3g m is finer than the imagery's %.3g m", gsd_m, mosaic.gsd_m
-        )
-    return grid
-
-
-def _rounded(gsd_m: float) -> float:
-    """Ground resolution as people state it: 5.002 is 5, 0.2431 stays 0.243."""
-    for digits in (1, 2, 3):
-        rounded = float(f"{gsd_m:.{digits}g}")
-        if abs(rounded / gsd_m - 1) < 0.005:
-            return rounded
-    return float(f"{gsd_m:.4g}")
-
-
-def _whole_cells(tile_px: int, overlap: float) -> float:
-    """The overlap that makes tiles whole micro-cells apart, where they are at least one apart.
-
-    Tiles then share all their cells; memory would grow with the square of what is left over.
-    """
-    micro_px = max(1, tile_px // MICRO)
-    stride_px = tile_px * (1 - overlap)
-    if not micro_px <= stride_px <= tile_px:
-        return overlap
-    return 1 - round(stride_px / micro_px) * micro_px / tile_px
-
-
-def _read_cells(
-    mosaic: Mosaic,
-    area: Area,
-    grid: TileGrid,
-    representation: Any,
-    sampler: CropSampler,
-    layer: GreyLayerWriter | None,
-    pictures: SheetPictures | None,
-    report: Progress,
-) -> tuple[CellSheet, NDArray[np.uint8]]:
-    """Micro-cell means of the whole sheet, and a small grey picture of it as JPEG bytes.
-
-    The sampler and the layer take in what they need as the blocks pass by.
-    """
-    layout = CellLayout.for_tiles(grid.tile_px, grid.stride_px)
-    cells = CellSheet(layout, grid.height_px, grid.width_px, representation.channels)
-    preview = Preview(grid, PREVIEW_PX)
-    # Cells that begin in a block may end beyond it, within the margin.
-    beyond_px = layout.micro_px - layout.spacing_px
-    margin_px = layout.micro_px + representation.margin_px
-    side_px = -(-max(BLOCK_PX, 2 * grid.tile_px) // layout.micro_px) * layout.micro_px
-    blocks = [block for block in blocks_of(grid, side_px) if block.may_matter(area, grid)]
-    total_px = sum(block.height * block.width for block in blocks)
-    with mosaic.grid_sheet(area.frame, grid) as raster:
-        for done, block in enumerate(blocks):
-            read = read_block(raster, block, margin_px)
-            grey, valid = read.pixels.grey, read.pixels.valid
-            if valid.any():
-                part = read.part(beyond_px)
-                maps = representation(grey, valid)
-                cells.fill(block.row, block.col, maps[:, part[0], part[1]], valid[part])
-                if pictures is not None:
-                    pictures.fill(read, maps)
-            share = block.height * block.width / total_px
-            sampler.offer(grey, valid, block.row - read.top, block.col - read.left, share)
-            preview.add(read)
-            if layer is not None:
-                _add_to_layer(layer, read, area, grid)
-            report("imagery", (done + 1) / len(blocks))
-    if not cells.valid.any():
-        raise AreaError("the area has no imagery: it lies outside the orthophotos or is all nodata")
-    return cells, preview.jpeg()
-
-
-def _add_to_layer(layer: GreyLayerWriter, read: BlockPixels, area: Area, grid: TileGrid) -> None:
-    """Hand a block to the layer, less the chunks that are too far from the route."""
-    for chunk in read.block.cut(CHUNK_PX):
-        if chunk.may_matter(area, grid):
-            where = read.within(chunk)
-            layer.add(chunk.row, chunk.col, read.pixels.grey[where], read.pixels.valid[where])
-
-
-def _tiles(area: Area, grid: TileGrid, cells: CellSheet) -> NDArray[np.intp]:
-    """Grid rows and columns (N, 2) of the tiles that lie in the area and have imagery."""
-    rows, cols = np.mgrid[: grid.rows, : grid.cols]
-    tiles = np.stack([rows.ravel(), cols.ravel()], axis=1).astype(np.intp)
-    reach_m = grid.stride_m * np.sqrt(0.5)
-    tiles = tiles[area.contains(grid.centres_en_m(tiles), reach_m)]
-    share = cells.valid_share(tiles * grid.stride_px)
-    if not (share >= MIN_TILE_VALID_SHARE).any():
-        best = share.max(initial=0.0)
-        raise AreaError(
-            f"no tile of {grid.tile_px} px ({grid.tile_m:.0f} m) has imagery under at least "
-            f"{MIN_TILE_VALID_SHARE:.0%} of it (best {best:.0%}): the area lies outside the "
-            "orthophotos, or tiles are larger than the imagery; use smaller tiles or a finer "
-            "ground resolution"
-        )
-    return tiles[share >= MIN_TILE_VALID_SHARE]
 
 
 def _manifest(
@@ -390,7 +313,7 @@ def _manifest(
             "seed": request.seed,
         },
         sheets=(sheet,),
-        imagery=tuple(source.describe() for source in mosaic.sources),
+        imagery=mosaic.describe(),
         view={
             "heading_step_deg": HEADING_STEP_DEG,
             "min_valid_share": MIN_VIEW_VALID_SHARE,

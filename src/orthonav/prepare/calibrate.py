@@ -60,29 +60,46 @@ class CropSampler:
         self.size_px = round(tile_px * CROP_TILES)
         self.crops: list[Crop] = []
 
-    def offer(
-        self,
-        grey: NDArray[np.uint8],
-        valid: NDArray[np.bool_],
-        row_px: int,
-        col_px: int,
-        share: float,
-    ) -> None:
-        """Take some crops from a block whose first pixel is (row_px, col_px) of the sheet.
+    def places(self, height: int, width: int, share: float) -> NDArray[np.intp]:
+        """First pixels (row, col), (N, 2), of crops to be cut from a block of imagery, at random.
 
-        `share` is the part of all imagery offered that this block is.
+        `share` is the part of all imagery that this block is. They do not depend on what it shows,
+        so that blocks may be read in any order once places were drawn for all.
         """
-        height, width = grey.shape
-        size = min(height, width, self.size_px)
+        size = self._crop_px(height, width)
         if size < self._tile_px:
-            return
-        for _ in range(self._rng.poisson(2.0 * CROPS * share)):
-            row = int(self._rng.integers(0, height - size + 1))
-            col = int(self._rng.integers(0, width - size + 1))
+            return np.zeros((0, 2), np.intp)
+        drawn = [
+            [self._rng.integers(0, height - size + 1), self._rng.integers(0, width - size + 1)]
+            for _ in range(self._rng.poisson(2.0 * CROPS * share))
+        ]
+        return np.array(drawn, np.intp).reshape(-1, 2)
+
+    def cut(
+        self, grey: NDArray[np.uint8], valid: NDArray[np.bool_], places: NDArray[np.intp]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
+        """Crops (N, S, S) of a block at those of the places that show something, and which."""
+        size = self._crop_px(*grey.shape)
+        crops = np.zeros((len(places), size, size), np.uint8)
+        kept: list[tuple[int, int]] = []
+        for row, col in places:
             part = np.s_[row : row + size, col : col + size]
-            if valid[part].all() and grey[part].std() > 1 and len(self.crops) < 2 * CROPS:
-                half = size / 2
-                self.crops.append(Crop(grey[part].copy(), row_px + row + half, col_px + col + half))
+            if valid[part].all() and grey[part].std() > 1:
+                crops[len(kept)] = grey[part]
+                kept.append((row, col))
+        return crops[: len(kept)], np.array(kept, np.intp).reshape(-1, 2)
+
+    def take(
+        self, crops: NDArray[np.uint8], places: NDArray[np.intp], row_px: int, col_px: int
+    ) -> None:
+        """Keep the crops of a block whose first pixel is (row_px, col_px) of the sheet."""
+        for grey, (row, col) in zip(crops, places.tolist(), strict=True):
+            if len(self.crops) < 2 * CROPS:
+                half = grey.shape[0] / 2
+                self.crops.append(Crop(grey.copy(), row_px + row + half, col_px + col + half))
+
+    def _crop_px(self, height: int, width: int) -> int:
+        return min(height, width, self.size_px)
 
 
 def calibrate(

@@ -17,21 +17,27 @@ from numpy.typing import NDArray
 from orthonav.confidence.registered import Chances, RegisteredConfidence, fit_registered
 from orthonav.geo.camera import Camera
 from orthonav.geo.grid import TileGrid
-from orthonav.localizer.registration import RegistrationLocalizer
+from orthonav.localizer.registration import PRIOR_SIGMAS, RegistrationLocalizer
 from orthonav.prepare.calibrate import Crop
 from orthonav.prepare.change import changed
-from orthonav.records import NoFix, Telemetry
+from orthonav.records import NoFix, Prior, Telemetry
 
 YAW_STD_DEG = 5.0
 AGL_STD = 0.05
 FOCAL_PX = 1000.0
 SIDES = (0.55, 1.0)
 """Long side of a view, from and to, in tiles; the short side is three quarters of it."""
-MIN_RIGHT = 10
+MIN_RIGHT, ENOUGH_RIGHT = 10, 12
+MORE_VIEWS = 3
+"""Where fewer than the least are right, up to so many times as many views are tried."""
 FLOOR_PX = 0.6
 """Standard deviation per axis, in pixels, with which orthophotos of two dates usually agree."""
 FLOOR_LIMITS_PX = (0.25, 3.0)
 MIRRORED_WEIGHT = 1.0
+WHOLE_PX, SEARCHED_PX = 6144, 4096
+"""Maps larger than a square of the first are searched in a square of the second for each view: on
+a map of 50 x 5 km the whole took 7 GB and minutes a view, and of views changed as much as these too
+few were found to learn from (4 of 24 on 10 x 5 km; 9 of 24 in the square)."""
 FALLBACK_CHANCE = 40.0
 USUAL_FINE, USUAL_FINE_VIEWS = 1.45, 8.0
 """With one more level chance scores so many times as much; that counts like so many views."""
@@ -52,6 +58,9 @@ class _Outcome:
     mirrored: bool
     other_date: bool
 
+    def is_right(self, radius_px: float) -> bool:
+        return not self.mirrored and float(np.hypot(*self.error_px)) <= radius_px
+
 
 def calibrate_registration(
     localizer: RegistrationLocalizer,
@@ -63,19 +72,36 @@ def calibrate_registration(
 ) -> RegistrationCalibration:
     """Place changed, mirrored and other-date views and fit the confidence to the outcome."""
     rng = np.random.default_rng([seed, 3])
-    chosen = [crops[i] for i in rng.permutation(len(crops))[:views]]
+    order = rng.permutation(len(crops))
+    chosen = [crops[i] for i in order[:views]]
     later = [other_dates[i] for i in rng.permutation(len(other_dates))[:views]]
     work = [(crop, False, False) for crop in chosen] + [(crop, False, True) for crop in later]
     work += [(crop, True, False) for crop in (later or chosen)[: views // 2]]
-    outcomes = []
-    for done, (crop, mirror, other_date) in enumerate(work):
+    radius_px = localizer.radius_m / localizer.grid.gsd_m
+    outcomes: list[_Outcome] = []
+
+    def place(crop: Crop, mirror: bool, other_date: bool) -> None:
         # What replaces parts of a view is mirrored: as it is, it would be found where it is from.
         stranger = crops[int(rng.integers(len(crops)))].grey[:, ::-1]
         outcome = _placed(rng, localizer, crop, stranger, mirror, other_date)
         if outcome is not None:
             outcomes.append(outcome)
+
+    for done, each in enumerate(work):
+        place(*each)
         report("calibrate registration", (done + 1) / len(work))
-    return _fitted(outcomes, localizer.radius_m / localizer.grid.gsd_m)
+    # On a large map few are placed right: some more, rather than no confidence at all.
+    wanted = ENOUGH_RIGHT if _right(outcomes, radius_px) < MIN_RIGHT else 0
+    spare = order[views : (1 + MORE_VIEWS) * views] if views >= MIN_RIGHT else order[:0]
+    for index in spare:
+        if _right(outcomes, radius_px) >= wanted:
+            break
+        place(crops[index], False, False)
+    return _fitted(outcomes, radius_px)
+
+
+def _right(outcomes: Sequence[_Outcome], radius_px: float) -> int:
+    return sum(each.is_right(radius_px) for each in outcomes)
 
 
 def _placed(
@@ -92,11 +118,26 @@ def _placed(
         picture = changed(rng, picture, stranger)
     view, camera, telemetry = _view(rng, picture, localizer.grid)
     prepared = localizer.prepared(view, camera, telemetry, True)
-    best = None if isinstance(prepared, NoFix) else localizer.best(prepared, None)
+    prior = _prior(rng, localizer, crop)
+    best = None if isinstance(prepared, NoFix) else localizer.best(prepared, prior)
     if best is None:
         return None
     error = np.array([best.placed.pose.x_px - crop.col_px, best.placed.pose.y_px - crop.row_px])
     return _Outcome(best.evidence(), error, mirror, other_date)
+
+
+def _prior(rng: np.random.Generator, localizer: RegistrationLocalizer, crop: Crop) -> Prior | None:
+    """The square of a large map that is searched, with the crop somewhere in its middle half.
+
+    None for all of the map.
+    """
+    grid = localizer.grid
+    if grid.height_px * grid.width_px <= WHOLE_PX**2:
+        return None
+    col, row = np.array([crop.col_px, crop.row_px]) + rng.uniform(-0.25, 0.25, 2) * SEARCHED_PX
+    place = np.array([grid.west_m + col * grid.gsd_m, grid.north_m - row * grid.gsd_m])
+    lat, lon = localizer.sheet.frame.latlon_from_en(place)
+    return Prior(float(lat), float(lon), SEARCHED_PX / 2 * grid.gsd_m / PRIOR_SIGMAS)
 
 
 def _view(

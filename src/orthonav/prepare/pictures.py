@@ -11,7 +11,7 @@ from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.neural.tiles import SheetTiles
-from orthonav.prepare.blocks import BlockPixels, blocks_of, read_block
+from orthonav.prepare.blocks import Block, BlockPixels, blocks_of, read_block
 from orthonav.represent.gray import Gray
 
 BLOCK_PX = 1024
@@ -37,14 +37,24 @@ class SheetPictures:
         self._valid = np.zeros(shape, np.bool_)
         self._grey = None if self.is_grey else np.zeros(shape, np.uint8)
 
-    def fill(self, read: BlockPixels, maps: NDArray[np.float32]) -> None:
-        """Take in a block, whose representation with its margin is `maps` (1, H, W)."""
-        block, part = read.block, read.part()
-        where = np.s_[block.row : block.row + block.height, block.col : block.col + block.width]
-        self._pixels[0][where] = np.rint(maps[0][part] * self._scale)
-        self._valid[where] = read.pixels.valid[part]
+    def parts(self, read: BlockPixels, maps: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
+        """What is kept of a block, whose representation with its margin is `maps` (1, H, W)."""
+        part = read.part()
+        parts: dict[str, NDArray[Any]] = {
+            "pixels": np.rint(maps[0][part] * self._scale).astype(np.uint8),
+            "pixels_valid": read.pixels.valid[part],
+        }
         if self._grey is not None:
-            self._grey[where] = read.pixels.grey[part]
+            parts["pixels_grey"] = read.pixels.grey[part]
+        return parts
+
+    def put(self, block: Block, parts: dict[str, NDArray[Any]]) -> None:
+        """Take in a block's `parts`."""
+        where = np.s_[block.row : block.row + block.height, block.col : block.col + block.width]
+        self._pixels[0][where] = parts["pixels"]
+        self._valid[where] = parts["pixels_valid"]
+        if self._grey is not None:
+            self._grey[where] = parts["pixels_grey"]
 
     def tiles(self, tiles_px: NDArray[np.intp]) -> SheetTiles:
         """Tiles whose first pixels (row, col) are given (N, 2)."""
@@ -64,8 +74,9 @@ def read_pictures(
     blocks = [block for block in blocks_of(grid, BLOCK_PX) if block.may_matter(area, grid)]
     with mosaic.grid_sheet(area.frame, grid) as raster:
         for done, block in enumerate(blocks):
-            read = read_block(raster, block, representation.margin_px)
+            read = read_block(raster, grid, block, representation.margin_px)
             if read.pixels.valid.any():
-                pictures.fill(read, representation(read.pixels.grey, read.pixels.valid))
+                maps = representation(read.pixels.grey, read.pixels.valid)
+                pictures.put(block, pictures.parts(read, maps))
             report("other date", (done + 1) / len(blocks))
     return pictures

@@ -1,0 +1,130 @@
+"""Finished blocks of a build, kept in a folder, from which an interrupted build goes on.
+
+A block is one file: arrays in NumPy's own container (a ZIP whose checksums are verified), written
+to a temporary name and renamed. Its name holds a digest of everything that determines it, so what
+belongs to another request, to imagery that has changed or to another version is never used.
+"""
+
+import contextlib
+import hashlib
+import json
+import logging
+import re
+import shutil
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import AreaError, OutputError
+from orthonav.files import replacing
+from orthonav.prepare.blocks import Block
+
+log = logging.getLogger(__name__)
+
+FORMAT = 1
+_OURS = re.compile(r"\.?r\d+-c\d+-[0-9a-f]{24}\.npz(\..*\.tmp\.npz)?")
+
+
+def digest(values: Any) -> str:
+    """SHA-256 of plain values as canonical JSON."""
+    text = json.dumps(values, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+class KeptBlocks:
+    """The folder; it appears with the first block. May be shared between threads.
+
+    As a context manager around a build: the blocks go when it is done, and where its area can never
+    be built; on any other error or interrupt they stay, and the log says so.
+    """
+
+    def __init__(self, folder: Path, request: str, needed_bytes: int) -> None:
+        """`request` is a digest of what all blocks depend on, `needed_bytes` what they will take.
+
+        Raises `OutputError` where the disk has not so much room.
+        """
+        self._folder = folder
+        self._request = request
+        self._names: dict[Block, str] = {}
+        parent = next(each for each in [folder, *folder.absolute().parents] if each.exists())
+        room = shutil.disk_usage(parent).free + sum(path.stat().st_size for path in self._files())
+        if room < needed_bytes:
+            raise OutputError(
+                f"finished blocks are kept until the map is written and need about "
+                f"{needed_bytes / 1e6:.0f} MB, of which {room / 1e6:.0f} MB are free; make room or "
+                f"name a folder elsewhere (--work): {folder}"
+            )
+        log.info("finished blocks are kept in %s: about %.0f MB", folder, needed_bytes / 1e6)
+
+    def __enter__(self) -> "KeptBlocks":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: Any
+    ) -> None:
+        if error is None or isinstance(error, AreaError):
+            self.discard()
+        elif count := len(self._files()):
+            log.warning(
+                "%d finished blocks are kept; the same build goes on from there: %s",
+                count,
+                self._folder,
+            )
+
+    def begin(self, blocks: Sequence[tuple[Block, Any]]) -> int:
+        """Say which blocks will be asked for, each with what it alone depends on.
+
+        Removes files of other builds; returns how many of the blocks are there.
+        """
+        self._names = {
+            block: f"r{block.row}-c{block.col}-{digest([FORMAT, self._request, own])[:24]}.npz"
+            for block, own in blocks
+        }
+        wanted = set(self._names.values())
+        there = 0
+        for path in self._files():
+            if path.name in wanted:
+                there += 1
+            else:
+                path.unlink(missing_ok=True)
+        return there
+
+    def load(self, block: Block) -> dict[str, NDArray[Any]] | None:
+        """The arrays of a block, None where it is not there or is damaged."""
+        path = self._folder / self._names[block]
+        try:
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+                return {name: stored[name] for name in stored.files}
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            log.warning("kept block is damaged (%s) and is made anew: %s", error, path)
+            return None
+
+    def keep(self, block: Block, parts: dict[str, NDArray[Any]]) -> None:
+        """Write a finished block. Raises `OutputError` where that fails, with no half of it."""
+        path = self._folder / self._names[block]
+        try:
+            with replacing(path) as temporary:
+                np.savez(temporary, **parts)  # type: ignore[arg-type]
+        except OutputError as error:
+            raise OutputError(
+                f"{error}; blocks finished before it are kept and used by the next build like "
+                "this; a folder elsewhere can be named (--work)"
+            ) from error
+
+    def discard(self) -> None:
+        """Remove the blocks, and the folder where nothing else is in it."""
+        for path in self._files():
+            path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # not there, or not only ours
+            self._folder.rmdir()
+
+    def _files(self) -> list[Path]:
+        if not self._folder.is_dir():
+            return []
+        return [path for path in self._folder.iterdir() if _OURS.fullmatch(path.name)]

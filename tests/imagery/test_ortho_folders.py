@@ -1,0 +1,327 @@
+"""A folder as its producer hands it out is an orthophoto; what is in it that is none is told."""
+
+import numpy as np
+import pytest
+import rasterio
+import rasterio.shutil
+from geotiffs import placed, read, smooth_scene, write
+from rasterio.drivers import raster_driver_extensions
+from rasterio.enums import ColorInterp
+from rasterio.transform import Affine
+
+from orthonav.cli import main
+from orthonav.errors import ImageryError
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.imagery.names import date_of, system_of, tab_transform
+from orthonav.mapfile import open_map
+from orthonav.prepare import BuildRequest, build_map
+
+SCENE = smooth_scene(200)
+PACKAGE = "BDORTHO_2-0_RVB-1M00_JP2-E080_LAMB93_D003_2013-01-01"
+TILES = f"{PACKAGE}/ORTHOHR/1_DONNEES_LIVRAISON_2013-11-00100/BDO_RVB_1M00_JP2-E080_LAMB93_D03-2013"
+
+
+def tiles(
+    folder,
+    suffix=".tif",
+    name="tile_{0}_{1}",
+    side=100,
+    scene=SCENE,
+    size=200,
+    is_placed=True,
+    **more,
+):
+    """The scene in four files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for row in range(0, size, side):
+        for col in range(0, size, side):
+            part = np.ascontiguousarray(scene[:, row : row + side, col : col + side])
+            here = (
+                placed(size=size) * Affine.translation(col, row) if is_placed else Affine.identity()
+            )
+            path = folder / (name.format(row // side, col // side) + suffix)
+            paths.append(write(path, part, transform=here, **more))
+    return paths
+
+
+@pytest.fixture
+def whole(tmp_path):
+    """The picture of the scene when it is one file."""
+    return read(
+        write(
+            tmp_path / "whole" / "a.tif" if False else tmp_path / "a.tif",
+            SCENE,
+            transform=placed(size=200),
+        ),
+        190,
+    )
+
+
+def ign(folder, **more):
+    """A package of BD ORTHO: JPEG 2000, no system in the files, sidecars and other things."""
+    if "jp2" not in raster_driver_extensions():
+        pytest.skip("this GDAL has no JPEG 2000 driver (JP2OpenJPEG)")
+    name = "03-2013-{1:04}-66{0:02}-LA93-1M00-E080"
+    options = {"driver": "JP2OpenJPEG", "quality": 100, "reversible": "YES", "crs": None} | more
+    paths = tiles(folder / TILES, ".jp2", name, **options)
+    above = folder / PACKAGE / "ORTHOHR" / "3_SUPPLEMENTS_LIVRAISON_2013-11-00100"
+    above.mkdir()
+    for extra in ("dalles.shp", "dalles.dbf", "lisez-moi.pdf"):
+        (above / extra).write_bytes(b"other")
+    write(above / "assemblage_03.tif", SCENE, crs=None, transform=Affine.identity())
+    return paths
+
+
+def test_a_package_of_bd_ortho(tmp_path, whole, caplog):
+    ign(tmp_path / "ign")
+    with caplog.at_level("INFO"):
+        mosaic = Mosaic.open([tmp_path / "ign"])
+    assert len(mosaic.sources) == 4 and {source.date for source in mosaic.sources} == {"2013"}
+    assert {source.crs for source in mosaic.sources} == {"EPSG:2154"}
+    assert "EPSG:2154" in caplog.text and "4 orthophotos" in caplog.text
+    (told,) = mosaic.describe()
+    assert told["name"] == "ign" and told["files"] == 4 and told["date"] == "2013"
+    pixels = read(tmp_path / "ign", 190)
+    np.testing.assert_array_equal(pixels.valid, whole.valid)
+    assert np.abs(pixels.rgb.astype(int) - whole.rgb).max() <= 2
+
+
+@pytest.mark.parametrize("part", [PACKAGE, TILES])
+def test_any_folder_of_the_package_may_be_named(tmp_path, part):
+    ign(tmp_path)
+    (told,) = Mosaic.open([tmp_path / part]).describe()
+    assert told["date"] == "2013" and told["crs"] == "EPSG:2154" and told["files"] == 4
+
+
+def test_sidecars_of_mapinfo_place_jpeg_2000(tmp_path, whole):
+    """Neither a geotransform nor a system in the files."""
+    paths = ign(tmp_path / "ign", is_placed=False)
+    corners = [placed(size=200) * (col, row) for row in (0, 100) for col in (0, 100)]
+    for path, (x, y) in zip(paths, corners, strict=True):
+        for extra in path.parent.glob(f"{path.name}.aux.xml"):
+            extra.unlink()
+        lines = "".join(
+            f"  ({x + col * placed(size=200).a!r},{y + row * placed(size=200).e!r}) ({col},{row}) "
+            f'Label "Pt {number}",\n'
+            for number, (col, row) in enumerate([(0, 0), (100, 0), (100, 100), (0, 100)], 1)
+        )
+        text = f'!table\n!version 300\nDefinition Table\n  File "{path.name}"\n  Type "RASTER"\n'
+        path.with_suffix(".tab").write_text(f"{text}{lines}  CoordSys Earth Projection 3, 33\n")
+    pixels = read(tmp_path / "ign", 190)
+    np.testing.assert_array_equal(pixels.valid, whole.valid)
+    assert np.abs(pixels.rgb.astype(int) - whole.rgb).max() <= 2
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "(1,2) (0,0)", "(1,1) (0,0)\n" * 5, "(0,0) (0,0)\n(9,0) (1,0)\n(0,9) (0,1)\n(0,0) (1,1)"],
+)
+def test_sidecars_that_place_nothing(tmp_path, text):
+    (tmp_path / "a.tab").write_text(text)
+    assert tab_transform(tmp_path / "a.jp2") is None and tab_transform(tmp_path / "b.jp2") is None
+
+
+@pytest.mark.parametrize(
+    "names, date, system",
+    [
+        (["03-2013-0712-6600-LA93-0M50-E080"], "2013", "EPSG:2154"),
+        (["2A-2019-1165-6110-LA93-0M20-E080"], "2019", "EPSG:2154"),
+        (["tile", "OHR_RVB_0M20_JP2-E080_LAMB93_D03-2022"], "2022", "EPSG:2154"),
+        (["tile", PACKAGE], "2013", "EPSG:2154"),
+        (["974-2017-0340-7650-x"], "2017", None),
+        (["BDORTHO_2-0_RVB-0M20_JP2-E080_RGR92UTM40S_D974_2017-01-01"], "2017", "EPSG:2975"),
+        (["LAMB93X", "XLA93", "BLA93", "lamb93"], None, None),
+        (["swissimage-dop10_2022_2600-1200_0.1_2056"], "2022", None),
+        (["m_4710060_ne_14_060_20200715"], "2020-07-15", None),
+        (["tile_7", "ortho_2019"], "2019", None),
+        (["ortho_2019_00"], "2019", None),
+    ],
+)
+def test_what_names_tell(names, date, system):
+    assert date_of({}, names) == date and system_of(names) == system
+
+
+def test_a_folder_of_several_years(tmp_path):
+    """The newest covers the others; from when to when is in the manifest."""
+    for year, level in ((2015, 50), (2021, 150), (2018, 100)):
+        flat = np.full((3, 200, 200), level, np.uint8)
+        tiles(tmp_path / "f", name=f"{year}_{{0}}_{{1}}", scene=flat)
+    mosaic = Mosaic.open([tmp_path / "f"])
+    assert (read(tmp_path / "f", 150).rgb[5:-5, 5:-5] == 150).all()
+    (told,) = mosaic.describe()
+    assert (told["date_from"], told["date"], told["files"]) == ("2015", "2021", 12)
+    assert "width_px" not in told
+
+
+def test_what_is_skipped_and_why(tmp_path, caplog):
+    folder = tmp_path / "f"
+    tiles(folder / "deep" / "er")
+    for name in ("a.tif.ovr", "a.tif.aux.xml", "a.tif.msk", "a.tfw", "notes.txt", ".hidden.tif"):
+        (folder / name).write_bytes(b"?")
+    (folder / "old.ecw").write_bytes(b"?")
+    (folder / "rest.7z.001").write_bytes(b"?")
+    write(folder / "tile_thumb.tif", SCENE, transform=placed(size=200))
+    write(folder / "heights.tif", SCENE[:1].astype(np.float32), transform=placed(size=200))
+    write(folder / "figure.tif", SCENE, crs=None, transform=Affine.identity())
+    (folder / "photo.jpg").write_bytes(b"?")
+    with caplog.at_level("INFO"):
+        mosaic = Mosaic.open([folder])
+    assert [source.path.name for source in mosaic.sources] == [
+        f"tile_{row}_{col}.tif" for row in (0, 1) for col in (0, 1)
+    ]
+    for told in ("1 archives", "1 ECW", "1 thumbnails", "1 pictures without", "2 rasters that are"):
+        assert told in caplog.text
+    assert "heights" in caplog.text and "unpack them first" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "names, message",
+    [
+        ([], "seen: nothing"),
+        (["a.txt", "b.txt", "c.shp"], r"seen: 2 \.txt, 1 \.shp"),
+        (["x.ecw"], "1 ECW files, which GDAL as installed cannot read"),
+        (
+            [f"{PACKAGE}.7z.00{part}" for part in (2, 1)],
+            r"2 files of archives.*7z x '.*\.7z\.001' -o",
+        ),
+        (["x.zip"], r"1 files of archives.*unzip '.*x\.zip' -d "),
+        (["x.png"], "1 pictures without a world file"),
+    ],
+)
+def test_a_folder_without_orthophotos(tmp_path, names, message):
+    for name in names:
+        (tmp_path / name).write_bytes(b"?")
+    with pytest.raises(ImageryError, match=message):
+        Mosaic.open([tmp_path])
+
+
+def test_broken_files_in_a_folder_are_errors(tmp_path):
+    paths = tiles(tmp_path / "f")
+    paths[2].write_bytes(paths[2].read_bytes()[:200])
+    with pytest.raises(ImageryError, match="cannot be read"):
+        read(tmp_path / "f", 190)
+    paths[2].write_bytes(b"nothing")
+    with pytest.raises(ImageryError, match=r"cannot be read.*tile_1_0\.tif"):
+        Mosaic.open([tmp_path / "f"])
+    write(paths[2], SCENE, crs=None, transform=placed(size=200))
+    with pytest.raises(ImageryError, match=r"no coordinate reference.*tile_1_0\.tif"):
+        Mosaic.open([tmp_path / "f"])
+
+
+def test_world_files(tmp_path, whole):
+    """PNG and JPEG of Lambert-93 by their names, and a TIFF with a world file."""
+    flat = write(tmp_path / "flat.tif", SCENE, crs=None, transform=Affine.identity())
+    corner = placed(size=200)
+    world = [corner.a, 0, 0, corner.e, corner.c + corner.a / 2, corner.f + corner.e / 2]
+    for name, driver, sidecar in (
+        ("a_LA93.png", "PNG", ".pgw"),
+        ("a_LA93.jpg", "JPEG", ".jgw"),
+        ("a_LA93.tif", "GTiff", ".tfw"),
+    ):
+        folder = tmp_path / driver
+        folder.mkdir()
+        more = {"PROFILE": "BASELINE"} if driver == "GTiff" else {}
+        rasterio.shutil.copy(flat, folder / name, driver=driver, **more)
+        (folder / f"{name}.aux.xml").unlink(missing_ok=True)
+        (folder / name).with_suffix(sidecar).write_text("\n".join(map(repr, world)))
+        pixels = read(folder, 190)
+        np.testing.assert_array_equal(pixels.valid, whole.valid)
+        off = np.abs(pixels.rgb.astype(int) - whole.rgb)
+        assert off.mean() < (4 if driver == "JPEG" else 0.1)
+
+
+@pytest.mark.parametrize("driver, suffix", [("MBTiles", ".mbtiles"), ("GPKG", ".gpkg")])
+def test_tile_stores_are_read_at_their_finest(tmp_path, driver, suffix):
+    if suffix[1:] not in raster_driver_extensions():
+        pytest.skip(f"this GDAL has no {driver} driver")
+    scene = smooth_scene(700)
+    source = write(
+        tmp_path / "a.tif", scene, crs="EPSG:3857", transform=placed("EPSG:3857", size=700)
+    )
+    path = tmp_path / "store" / f"2020{suffix}"
+    path.parent.mkdir()
+    rasterio.shutil.copy(source, path, driver=driver, TILE_FORMAT="PNG")
+    with rasterio.open(path, "r+") as data:
+        data.build_overviews([2, 4])
+    mosaic = Mosaic.open([path.parent])
+    (store,) = mosaic.sources
+    assert store.gsd_m < 1.1 and store.date == "2020" and store.bands == (1, 2, 3)
+    one, other = read(source, 300), read(path.parent, 300)
+    assert other.valid.all()
+    off = np.abs(one.rgb.astype(int) - other.rgb)
+    assert off.mean() < 6  # GDAL resamples into the store's own zoom levels
+
+
+def test_all_tables_of_a_geopackage(tmp_path):
+    if "gpkg" not in raster_driver_extensions():
+        pytest.skip("this GDAL has no GPKG driver")
+    path = tmp_path / "two.gpkg"
+    for number, col in enumerate((0, 100)):
+        part = np.ascontiguousarray(SCENE[:, :, col : col + 100])
+        here = placed("EPSG:32631", size=200) * Affine.translation(col, 0)
+        tif = write(tmp_path / f"{number}.tif", part, crs="EPSG:32631", transform=here)
+        more = {"APPEND_SUBDATASET": "YES"} if number else {}
+        rasterio.shutil.copy(
+            tif, path, driver="GPKG", RASTER_TABLE=f"t{number}", TILE_FORMAT="PNG", **more
+        )
+    mosaic = Mosaic.open([path])
+    assert [source.width_px for source in mosaic.sources] == [100, 100]
+    assert read(path, 150).valid.all()
+
+
+def test_naip_swissimage_and_drones(tmp_path):
+    """Four bands in UTM, Swiss LV95, 16 bits with an alpha band: as they come, in one folder."""
+    rgb = [ColorInterp.red, ColorInterp.green, ColorInterp.blue]
+    kinds = {
+        "m_4710060_ne_14_060_20200715.tif": (
+            "EPSG:32631",
+            np.concatenate([SCENE, 255 - SCENE[:1]]),
+            {},
+        ),
+        "dop_2056.tif": ("EPSG:2056", SCENE, {}),
+        "drone.tif": (
+            "EPSG:32631",
+            np.concatenate([SCENE * np.uint16(90), np.where(SCENE[:1] > 0, 65535, 0)]).astype(
+                np.uint16
+            ),
+            {"colours": [*rgb, ColorInterp.alpha]},
+        ),
+    }
+    for name, (crs, bands, more) in kinds.items():
+        folder = tmp_path / name[:4]
+        folder.mkdir()
+        write(folder / name, bands, crs=crs, transform=placed(crs, size=200), **more)
+        pixels = read(folder, 150)
+        assert pixels.valid.all() and pixels.grey.std() > 25, name
+    assert read(tmp_path / "m_47", 150).valid.all()
+    mixed = Mosaic.open([tmp_path / name[:4] for name in kinds])
+    assert len(mixed.sources) == 3 and len(mixed.describe()) == 3
+
+
+def test_build_from_a_folder(tmp_path, capsys):
+    folder = tmp_path / "ortho_2019"
+    tiles(folder, side=130, size=390, scene=smooth_scene(390))
+    out = tmp_path / "map.onav"
+    more = [
+        "--tile-px",
+        "64",
+        "--overlap",
+        "0.5",
+        "--calibration-views",
+        "2",
+        "--workers",
+        "2",
+        "-q",
+    ]
+    assert main(["build", "--ortho", str(folder), *more, "--out", str(out)]) == 0
+    assert "9 files" in capsys.readouterr().out
+    (told,) = open_map(out).manifest.imagery
+    assert told["name"] == "ortho_2019" and told["date"] == "2019" and told["files"] == 9
+    one = tmp_path / "one.onav"
+    whole = write(tmp_path / "whole.tif", smooth_scene(390), transform=placed(size=390))
+    build_map(BuildRequest([whole], one, tile_px=64, overlap=0.5, calibration_views=2))
+    first, second = (
+        open_map(each).arrays["sheet0/embeddings"].astype(float) for each in (out, one)
+    )
+    assert np.einsum("nd,nd->n", first, second).min() > 0.99

@@ -1,0 +1,235 @@
+"""Many orthophotos that lie side by side are one picture: no seam shows where they meet."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import rasterio
+from geotiffs import FRAME, LAMBERT, placed, read, sheet_of, smooth_scene, write
+from rasterio.transform import Affine
+
+from orthonav.geo.frames import LocalFrame
+from orthonav.imagery.lattice import Decoded
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.imagery.quiet import quiet
+from orthonav.imagery.thin import cells_of
+
+BREST = LocalFrame(48.39, -4.49)  # Lambert-93 is turned by -5.4 degrees here
+
+
+def rough_scene(size, seed=0):
+    """Waves with noise on them (3, size, size): resampling shows at every pixel."""
+    noise = np.random.default_rng(seed).integers(-40, 40, (3, size, size))
+    return np.clip(smooth_scene(size) + noise, 1, 255).astype(np.uint8)
+
+
+def cut(folder, scene, transform, side, make=write, **more):
+    """The scene in files of `side` pixels, less where it ends."""
+    folder.mkdir(exist_ok=True)
+    paths = []
+    for row in range(0, scene.shape[1], side):
+        for col in range(0, scene.shape[2], side):
+            part = np.ascontiguousarray(scene[:, row : row + side, col : col + side])
+            here = transform * Affine.translation(col, row)
+            paths.append(make(folder / f"{row:04}-{col:04}.tif", part, transform=here, **more))
+    return paths
+
+
+@pytest.mark.parametrize("frame", [FRAME, BREST], ids=["straight", "turned"])
+@pytest.mark.parametrize(
+    "source_gsd_m, gsd_m, side",
+    [
+        (1.0, 1.0, 50),
+        (1.0, 0.8, 37),
+        (1.0, 1.7, 50),
+        (0.2, 1.0, 220),  # cells of 5 pixels end where the files do
+        (0.2, 0.5, 220),  # of 3 pixels they would not: 2 are taken
+        (0.2, 0.6, 220),
+        (0.2, 1.0, 223),  # nothing fits
+        (0.25, 1.3, 187),
+    ],
+)
+def test_a_raster_that_was_cut_is_read_as_if_whole(tmp_path, frame, source_gsd_m, gsd_m, side):
+    size = round(130 / source_gsd_m)
+    transform = placed(LAMBERT, source_gsd_m, size, frame=frame)
+    scene = rough_scene(size)
+    whole = read(write(tmp_path / "whole.tif", scene, transform=transform), 90, gsd_m, frame)
+    parts = read(cut(tmp_path / "cut", scene, transform, side), 90, gsd_m, frame)
+    inner = np.s_[3:-3, 3:-3] if gsd_m * 90 > 125 else np.s_[:]
+    np.testing.assert_array_equal(parts.valid[inner], whole.valid[inner])
+    both = parts.valid & whole.valid
+    off = np.abs(parts.rgb.astype(int) - whole.rgb)[both]
+    alike = gsd_m not in (0.5, 0.6)  # averaged by 2 rather than 3
+    assert off.mean() < (0.2 if alike else 5) and off.max() <= (3 if alike else 40)
+    assert both.mean() > 0.65
+
+
+@pytest.mark.parametrize("window", [(0, 0, 90, 90), (0, 40, 80, 9)])
+@pytest.mark.parametrize("side, gsd_m", [(220, 1.0), (223, 1.0)])
+def test_holes_and_bit_depths_survive_the_seams(tmp_path, window, side, gsd_m):
+    size = 650
+    transform = placed(LAMBERT, 0.2, size, frame=BREST)
+    scene = rough_scene(size).astype(np.uint16) * 200
+    scene[:, 280:380, 250:420] = 0  # nodata, across several files
+    whole = write(tmp_path / "whole.tif", scene, transform=transform, nodata=0)
+    parts = cut(tmp_path / "cut", scene, transform, side, nodata=0)
+    found = []
+    for paths in (whole, parts):
+        with sheet_of(paths, 90, gsd_m, BREST) as sheet:
+            found.append(sheet.read(*window))
+    one, many = found
+    assert (one.valid != many.valid).mean() < 0.01
+    assert 0.5 < one.valid.mean() < 0.98
+    off = np.abs(one.rgb.astype(int) - many.rgb)[one.valid & many.valid]
+    assert off.mean() < 1.5  # files are not stretched alike: fewer pixels are sampled
+
+
+def test_palettes_and_false_alpha_are_cut_too(tmp_path):
+    size = 400
+    transform = placed(LAMBERT, 0.25, size, frame=BREST)
+    scene = rough_scene(size)
+
+    def palette(path, part, **more):
+        with rasterio.open(write(path, part[:1], **more), "r+") as data:
+            data.write_colormap(1, {value: (value, 255 - value, 9, 255) for value in range(256)})
+        return path
+
+    def infrared(path, part, **more):  # GDAL calls the fourth band alpha
+        return write(path, np.concatenate([part, 255 - part[:1]]), **more)
+
+    for make in (palette, infrared):
+        whole = read(make(tmp_path / "whole.tif", scene, transform=transform), 80, 1.0, BREST)
+        parts = read(cut(tmp_path / make.__name__, scene, transform, 100, make), 80, 1.0, BREST)
+        assert whole.valid.all() and parts.valid.all()
+        assert np.abs(parts.rgb.astype(int) - whole.rgb).max() <= 2
+
+
+@pytest.mark.parametrize("shift_px", [0.5, 0.25])
+@pytest.mark.parametrize("frame", [FRAME, BREST], ids=["straight", "turned"])
+def test_no_gap_between_files_that_share_no_lattice(tmp_path, frame, shift_px):
+    """They meet, but on pixels of their own."""
+    bands, base = np.full((3, 130, 130), 90, np.uint8), placed(size=130, frame=frame)
+    left = base * Affine.translation(-70, 0)
+    right = base * Affine.translation(60, shift_px)
+    paths = [
+        write(tmp_path / "left.tif", bands, transform=left),
+        write(tmp_path / "right.tif", bands * 2, transform=right),
+    ]
+    pixels = read(paths, 90, 1.0, frame)
+    assert pixels.valid[2:-2, 2:-2].all()
+    values = pixels.rgb[2:-2, 2:-2]
+    assert set(np.unique(values[:, :20])) == {90} and set(np.unique(values[:, -20:])) == {180}
+    assert values.min() >= 80 and values.max() <= 190
+
+
+def test_resolutions_and_systems_meet_without_a_gap(tmp_path):
+    """Lambert-93 at 1 m beside UTM at 0.5 m, which covers a little of it."""
+    grey = np.full((3, 130, 130), 90, np.uint8)
+    left = placed(size=130, frame=FRAME) * Affine.translation(-65, 0)
+    fine = np.full((3, 300, 300), 180, np.uint8)
+    utm = placed("EPSG:32631", 0.5, 300, frame=FRAME) * Affine.translation(140, 0)
+    paths = [
+        write(tmp_path / "a.tif", grey, transform=left),
+        write(tmp_path / "b.tif", fine, crs="EPSG:32631", transform=utm),
+    ]
+    for order in (paths, paths[::-1]):
+        pixels = read(order, 90)
+        assert pixels.valid[2:-2, 2:-2].all()
+        assert set(np.unique(pixels.rgb[:, :25])) == {90}
+        assert set(np.unique(pixels.rgb[:, -25:])) == {180}
+
+
+def test_what_is_named_first_covers_what_it_shares_a_lattice_with(tmp_path):
+    base = placed(size=100)
+    paths = [
+        write(
+            tmp_path / f"{level}.tif",
+            np.full((3, 100, 100), level, np.uint8),
+            transform=base * Affine.translation(col, 0),
+        )
+        for level, col in ((50, 0), (100, 30), (200, -30))
+    ]
+    for order, middle in ((paths, 50), (paths[::-1], 200), (paths[1:] + paths[:1], 100)):
+        assert (read(order, 60).rgb[10:-10, 28:32] == middle).all()
+    other = write(
+        tmp_path / "between.tif",
+        np.full((3, 100, 100), 150, np.uint8),
+        transform=base * Affine.translation(0.5, 0.5),
+    )
+    pixels = read([paths[1], other, paths[0]], 60)  # of one lattice, but something comes between
+    assert (pixels.rgb[10:-10, 3:8] == 150).all()
+
+
+def test_8_and_16_bit_are_mixed(tmp_path, caplog):
+    scene = smooth_scene()
+    shallow = write(tmp_path / "a.tif", scene, transform=placed() * Affine.translation(-60, 0))
+    deep = (scene.astype(np.uint16) - 30) * 300
+    paths = [
+        shallow,
+        write(tmp_path / "b.tif", deep, transform=placed() * Affine.translation(60, 0)),
+    ]
+    mosaic = Mosaic.open(paths)
+    assert mosaic.stretches[0] is None and mosaic.stretches[1] == mosaic.stretch is not None
+    assert "8 bits alone" in caplog.text
+    pixels = read(paths, 100)
+    assert pixels.valid[2:-2, 2:-2].all()
+    assert pixels.rgb[:, :45].std() > 20 and pixels.rgb[:, -45:].std() > 20
+
+
+def test_grey_is_that_of_the_colours(tmp_path):
+    size = 260
+    path = write(tmp_path / "a.tif", smooth_scene(size), transform=placed(gsd_m=0.5, size=size))
+    with sheet_of(path, 100) as sheet:
+        colour, grey = sheet.read(0, 0, 100, 100), sheet.read_grey(0, 0, 100, 100)
+    assert np.abs(colour.grey.astype(int) - grey.grey).max() <= 1
+    np.testing.assert_array_equal(colour.valid, grey.valid)
+
+
+def test_files_that_a_window_depends_on(tmp_path):
+    paths = cut(tmp_path, smooth_scene(120), placed(), 30)
+    with sheet_of(paths, 100) as sheet:
+        (few,) = [{name for stamp in sheet.stamps(5, 5, 8, 8) for name, _, _ in stamp}]
+        assert few == {str(paths[0].resolve())}
+        assert len(sheet.stamps(0, 0, 100, 100)) == 16 and not sheet.stamps(300, 0, 10, 10)
+
+
+def test_hidden_files_are_not_read_and_shared_ones_once(tmp_path, monkeypatch):
+    """Two years of the same tiles, read by two threads."""
+    transform, counted = placed(size=120), []
+    for year in ("2021", "2015"):
+        cut(tmp_path / year, smooth_scene(120), transform, 30)
+
+    def counting(dataset, source, *arguments):
+        counted.append(source.path)
+        return cells_of(dataset, source, *arguments)
+
+    monkeypatch.setattr("orthonav.imagery.lattice.cells_of", counting)
+    mosaic = Mosaic.open([tmp_path / "2021", tmp_path / "2015"])
+    place = {"west_m": -45, "north_m": 45, "width_px": 90, "height_px": 90, "gsd_m": 1.0}
+
+    def read(col):
+        with mosaic.sheet(FRAME, **place, threads=1) as sheet:
+            return [sheet.read(col, row, 45, 30).valid.all() for row in (0, 30, 60)]
+
+    with quiet(), ThreadPoolExecutor(2) as pool:
+        assert all(all(each) for each in pool.map(read, [0, 45]))
+    assert len(counted) == len(set(counted)) == 16
+    assert {path.parent.name for path in counted} == {"2021"}
+
+
+def test_what_is_kept_has_a_limit():
+    kept, reads = Decoded(limit_bytes=25_000), []
+
+    def reader(number):
+        def read():
+            reads.append(number)
+            return np.zeros((3, 40, 40), np.uint8), np.zeros((40, 40), np.float32)
+
+        return read
+
+    for number in (1, 2, 1, 3, 1, 2):
+        kept.get((number, 1), reader(number))
+    assert reads == [1, 2, 3, 2]
+    kept.begin((2, 1), reader(2))
+    kept.begin((9, 1), reader(9))
+    assert reads == [1, 2, 3, 2, 9]

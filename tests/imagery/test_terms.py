@@ -1,0 +1,40 @@
+"""Who made the imagery and under which terms travels from the file into the map."""
+
+import json
+
+import numpy as np
+import rasterio
+
+from orthonav.cli.info import imagery_text
+from orthonav.imagery.source import open_source
+
+TAGS = {
+    "ORTHONAV_ATTRIBUTION": "IGN,  BD\nORTHO",
+    "ORTHONAV_LICENCE": "Licence Ouverte 2.0",
+    "ORTHONAV_SOURCE": "https://example.org/wmts",
+    "ORTHONAV_DATES": "2021/2023",
+    "TIFFTAG_COPYRIGHT": "somebody",
+}
+
+
+def ortho(path, tags):
+    made = rasterio.transform.from_origin(500_000, 5_150_000, 1, 1)
+    how = {"width": 64, "height": 64, "count": 1, "dtype": "uint8", "crs": "EPSG:32631"}
+    with rasterio.open(path, "w", driver="GTiff", transform=made, **how) as data:
+        data.write(np.full((1, 64, 64), 90, np.uint8))
+        data.update_tags(**tags)
+    return open_source(path).describe()
+
+
+def test_terms_of_a_fetched_file(tmp_path):
+    told = ortho(tmp_path / "recent_2021.tif", TAGS)
+    assert told["attribution"] == "IGN, BD ORTHO" and told["licence"] == "Licence Ouverte 2.0"
+    assert told["source"] == "https://example.org/wmts" and told["dates"] == "2021/2023"
+    assert "layer" not in told and json.loads(json.dumps(told)) == told
+    assert imagery_text([told]) == "recent_2021.tif 2021 (IGN, BD ORTHO, Licence Ouverte 2.0)"
+
+
+def test_copyright_where_nothing_else_is_said_and_long_texts_are_cut(tmp_path):
+    told = ortho(tmp_path / "a.tif", {"TIFFTAG_COPYRIGHT": "x" * 1000})
+    assert told["attribution"] == "x" * 300
+    assert not {"attribution", "licence"} & set(ortho(tmp_path / "b.tif", {}))
