@@ -50,7 +50,7 @@ def test_a_sample_tells_nearly_the_same(monkeypatch):
 def test_large_and_small_maps_take_the_time_that_was_measured():
     box = Area.from_bounds((2.435, 46.455, 2.565, 46.545))  # 10 x 10 km
     made = estimate_map(box, gsd_m=1.0, tile_px=256, overlap=0.875)
-    assert made.build_s == pytest.approx(183, rel=0.1)
+    assert made.build_s == pytest.approx(93, rel=0.1)
     single = Area.from_route(read_route("paper:A@46.5,2.5"))
     assert estimate_map(single, gsd_m=0.2, tile_px=256, overlap=0.875).build_s < 60
 

@@ -1,5 +1,6 @@
 """Views on a map whose ground is known everywhere: found to a fraction of a pixel, or refused."""
 
+import importlib
 import math
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -239,6 +240,30 @@ def test_a_prior_near_the_truth_changes_nothing(localizer, plain, std_m):
     fix = localizer.locate(grey, CAMERA, told, prior=prior)
     assert place_of(localizer, fix) == pytest.approx(place_of(localizer, free), abs=0.1)
     assert fix.evidence["strength"] == pytest.approx(free.evidence["strength"], rel=0.02)
+
+
+def test_a_map_too_large_to_be_searched_whole_needs_a_prior(localizer, plain, monkeypatch):
+    """Memory has a bound: by tiles if views are as large, else not at all."""
+    grey, told, place, free = plain
+    module = importlib.import_module("orthonav.localizer.registration")
+    rows, cols = localizer.registration.registrar.reference.shape(0)
+    monkeypatch.setattr(module, "MAX_SEARCH_PX", 40_000)
+    asked = []
+    whole = localizer.registration.registrar.whole_window
+    monkeypatch.setattr(
+        localizer.registration.registrar,
+        "whole_window",
+        lambda *window: asked.append(window[0]) or whole(*window),
+    )
+    alone = localizer.locate(grey, CAMERA, told)
+    assert not [level for level in asked if (rows >> level) * (cols >> level) > 40_000]
+    assert isinstance(alone, Fix) or (alone.reason == "no_match" and "prior" in alone.detail)
+    fix = localizer.locate(grey, CAMERA, told, prior=prior_at(localizer, place, 5.0))
+    assert place_of(localizer, fix) == pytest.approx(place_of(localizer, free), abs=0.1)
+    monkeypatch.setattr(localizer.registration, "propose", None)
+    monkeypatch.setattr(module, "MAX_SEARCH_PX", 100)
+    nothing = localizer.locate(grey, CAMERA, told)
+    assert nothing.reason == "no_match" and "prior" in nothing.detail
 
 
 def test_a_prior_keeps_the_fix_near_it(localizer, plain):

@@ -58,6 +58,9 @@ PIXEL_MS = 5.5e-7
 LOOK_MS = 14.0
 LAST_MS = 900.0
 """What searches cost on one core of a desktop, roughly: to choose between them, no more."""
+MAX_SEARCH_PX = 8_000_000
+"""Windows larger than this (some 300 MB) are not searched by FFT: on such a map views are found by
+tiles, or with a prior."""
 
 
 class _Sure(NamedTuple):
@@ -128,7 +131,10 @@ class RegistrationLocalizer:
             return NoFix("outside_map", "the map does not reach to where the prior says")
         best = self.best(view, prior)
         if best is None:
-            return NoFix("no_match", "no place of the map could be compared with the view")
+            detail = "no place of the map could be compared with the view"
+            if prior is None:
+                detail += "; a large map needs a prior, or views as large as its tiles"
+            return NoFix("no_match", detail)
         return self._fix(view, best, telemetry)
 
     def prepared(
@@ -237,10 +243,10 @@ class RegistrationLocalizer:
             coarse_ms = self._search_ms(view, prior, coarse, len(poses))
             rows = self._tiles(view, prior)
             ways = sorted([(coarse_ms, False), (self._tiles_ms(view, rows, len(poses)), True)])
-            # The cheapest always, whatever it costs; a second one only where it can be afforded.
+            # The cheapest if it can be done at all; a second one only where it can be afforded.
             dearest = 0.0 if look_ms <= self._last_ms else self._last_ms
             for number, (cost_ms, from_tiles) in enumerate(ways):
-                if number and cost_ms > dearest:
+                if math.isinf(cost_ms) or (number and cost_ms > dearest):
                     break
                 if from_tiles and self.propose is not None:
                     yield coarse, self.propose.candidates(view.rectified_at(0), poses, rows)
@@ -282,6 +288,8 @@ class RegistrationLocalizer:
         if prior is not None or min(rows, cols) < 3 * side:
             rows, cols = round(rows + side), round(cols + side)
         pixels = float(rows * cols)
+        if pixels > MAX_SEARCH_PX:
+            return math.inf
         return poses * (POSE_MS + PIXEL_MS * pixels * math.log2(pixels))
 
     def _searched(
