@@ -216,11 +216,14 @@ def test_blocks_do_not_matter(ortho, tmp_path, monkeypatch):
 
 
 def test_the_manifest(ortho, tmp_path):
-    calls = []
+    calls, told = [], []
     out = tmp_path / "deep" / "map.onav"
     request = BuildRequest([ortho], out, tile_px=64, calibration_views=4)
-    result = build_map(request, lambda stage, share: calls.append((stage, share)))
+    result = build_map(request, lambda stage, share: calls.append((stage, share)), told.append)
     manifest = open_map(request.out).manifest
+    (line,) = told
+    tiles = int(line.partition(" tiles of 64 px")[0].split(", ")[1].replace(",", ""))
+    assert tiles == pytest.approx(manifest.sheets[0].tiles, rel=0.03)
     assert manifest == result.manifest and result.size_bytes == request.out.stat().st_size
     assert manifest.imagery[0]["date"] == "2019-06" and manifest.imagery[0]["name"] == ortho.name
     assert manifest.radius_m == RADIUS_STRIDES * manifest.sheets[0].grid.stride_m

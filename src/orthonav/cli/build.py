@@ -1,10 +1,14 @@
 """`orthonav build`: make a map from orthophotos."""
 
 import argparse
+import logging
+import sys
 import time
 from pathlib import Path
 
 from orthonav.cli.common import ROUTE_HELP, add_orthos, bounds, print_json, progress
+
+log = logging.getLogger(__name__)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -101,8 +105,10 @@ def run(options: argparse.Namespace) -> None:
         work=options.work,
         workers=options.workers,
     )
+    quiet = options.quiet or not sys.stderr.isatty()
+    tell = log.info if quiet else lambda line: print(line, file=sys.stderr)
     with progress(options) as shown:
-        result = build_map(request, shown)
+        result = build_map(request, shown, tell)
     plain = summary(result.manifest, result.size_bytes, options.out)
     plain["build_s"] = round(time.perf_counter() - start, 3)
     if options.json:

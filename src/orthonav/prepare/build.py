@@ -20,6 +20,7 @@ from orthonav.embed.network import TripletRecipe
 from orthonav.embed.whitened import WhitenedRecipe, learn
 from orthonav.errors import AreaError, OutputError, VariantError
 from orthonav.geo.area import Area
+from orthonav.geo.estimate import estimate_map
 from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
@@ -99,11 +100,16 @@ class BuildResult:
     size_bytes: int
 
 
-def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildResult:
+def build_map(
+    request: BuildRequest,
+    progress: Progress | None = None,
+    tell: Callable[[str], None] = log.info,
+) -> BuildResult:
     """Build a map and write it to `request.out`, whole or not at all.
 
-    The same request gives the same bytes. `progress` is called with a stage and its share done.
-    Raises `MissingFileError`, `ImageryError`, `AreaError`, `VariantError` or `OutputError`.
+    The same request gives the same bytes. `progress` is called with a stage and its share done,
+    `tell` once with what will be built. Raises `MissingFileError`, `ImageryError`, `AreaError`,
+    `VariantError` or `OutputError`.
     """
     report = progress or (lambda stage, share: None)
     representation = make_variant(represent.TABLE, request.edges or usual_edges(request.method))
@@ -125,6 +131,7 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
     if request.workers is not None and not 1 <= request.workers <= MAX_WORKERS:
         raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {request.workers}")
     pictures = None if isinstance(recipe, WhitenedRecipe) else SheetPictures(grid, representation)
+    tell(_announced(area, grid, request))
     reader = SheetReader(
         mosaic,
         area,
@@ -139,6 +146,24 @@ def build_map(request: BuildRequest, progress: Progress | None = None) -> BuildR
         manifest, arrays = _learnt(request, recipe, mosaic, mosaic_of_dates, reader, report)
         written = write_map(request.out, manifest, arrays)
     return BuildResult(written, request.out.stat().st_size)
+
+
+def _announced(area: Area, grid: TileGrid, request: BuildRequest) -> str:
+    """What is about to be built, in a line."""
+    need = estimate_map(
+        area,
+        gsd_m=grid.gsd_m,
+        tile_px=grid.tile_px,
+        overlap=1 - grid.stride_px / grid.tile_px,
+        registration=request.registration,
+    )
+    least, most = need.map_mb
+    size = f"{most:.1f} MB" if most - least < 0.1 else f"{least:.1f} to {most:.1f} MB"
+    more = "" if request.method.startswith("gradient") else ", and learning the network"
+    return (
+        f"about {need.area_km2:.1f} km2, {need.tiles:,} tiles of {grid.tile_px} px at "
+        f"{grid.gsd_m:g} m, a map of {size}, {need.build_s / 60:.1f} min on one core{more}"
+    )
 
 
 def _folders(request: BuildRequest) -> tuple[Path, Path | None]:
