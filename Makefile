@@ -43,7 +43,7 @@ $(BIN)/python:
 	@sh tools/make_venv.sh "$(PYTHON)" "$(VENV)"
 
 $(VENV)/.run-installed: $(DEPENDS) | $(BIN)/python
-	$(PIP) -e ".[geo,report]"
+	$(PIP) -e ".[geo,report,fetch,web]"
 	@touch $@
 
 $(VENV)/.dev-installed: $(DEPENDS) | $(BIN)/python

@@ -6,7 +6,7 @@ import sys
 import time
 from pathlib import Path
 
-from orthonav.cli.common import ROUTE_HELP, add_orthos, bounds, print_json, progress
+from orthonav.cli.common import add_area, add_orthos, print_json, progress
 
 log = logging.getLogger(__name__)
 
@@ -14,17 +14,7 @@ log = logging.getLogger(__name__)
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     add_orthos(parser, "orthophoto (any georeferenced raster that GDAL reads)")
-    area = parser.add_mutually_exclusive_group()
-    area.add_argument("--route", type=Path, help=ROUTE_HELP)
-    area.add_argument(
-        "--bounds",
-        type=bounds,
-        metavar="W,S,E,N",
-        help="area in degrees; write --bounds=W,S,E,N where W is negative",
-    )
-    parser.add_argument(
-        "--band-m", type=float, help="width of the search band of legs that have none of their own"
-    )
+    add_area(parser, parser.add_mutually_exclusive_group())
     parser.add_argument(
         "--gsd-m", type=float, help="ground resolution, metres per pixel (default: the imagery's)"
     )

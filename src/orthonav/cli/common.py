@@ -65,6 +65,20 @@ def bounds(text: str) -> tuple[float, float, float, float]:
     return west, south, east, north
 
 
+def add_area(parser: argparse.ArgumentParser, group: Any) -> None:
+    """`--route` and `--bounds` to a group (or the parser), `--band-m` beside them."""
+    group.add_argument("--route", type=Path, help=ROUTE_HELP)
+    group.add_argument(
+        "--bounds",
+        type=bounds,
+        metavar="W,S,E,N",
+        help="area in degrees; write --bounds=W,S,E,N where W is negative",
+    )
+    parser.add_argument(
+        "--band-m", type=float, help="width of the search band of legs that have none of their own"
+    )
+
+
 def print_json(plain: Any) -> None:
     """One JSON document on stdout."""
     print(json.dumps(plain, indent=1, allow_nan=False))

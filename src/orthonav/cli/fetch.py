@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.common import ROUTE_HELP, bounds, print_json, progress
+from orthonav.cli.common import add_area, bounds, print_json, progress
 from orthonav.errors import FetchError
 
 if TYPE_CHECKING:
@@ -39,16 +39,7 @@ def _add_area(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "area", nargs="?", metavar="ROUTE|W,S,E,N", help="planned route, or an area in degrees"
     )
-    parser.add_argument("--route", type=Path, help=ROUTE_HELP)
-    parser.add_argument(
-        "--bounds",
-        type=bounds,
-        metavar="W,S,E,N",
-        help="area in degrees; write --bounds=W,S,E,N where W is negative",
-    )
-    parser.add_argument(
-        "--band-m", type=float, help="width of the search band of legs that have none of their own"
-    )
+    add_area(parser, parser)
     parser.add_argument(
         "--margin-m", type=float, default=200.0, help="fetched around the area (default 200)"
     )

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import ROUTE_HELP, bounds, print_json
+from orthonav.cli.common import add_area, print_json
 
 if TYPE_CHECKING:
     from orthonav.geo.area import Area
@@ -15,17 +15,7 @@ if TYPE_CHECKING:
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    area = parser.add_mutually_exclusive_group(required=True)
-    area.add_argument("--route", type=Path, help=ROUTE_HELP)
-    area.add_argument(
-        "--bounds",
-        type=bounds,
-        metavar="W,S,E,N",
-        help="area in degrees; write --bounds=W,S,E,N where W is negative",
-    )
-    parser.add_argument(
-        "--band-m", type=float, help="width of the search band of legs that have none of their own"
-    )
+    add_area(parser, parser.add_mutually_exclusive_group(required=True))
     parser.add_argument(
         "--camera",
         type=Path,

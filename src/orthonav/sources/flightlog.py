@@ -161,7 +161,7 @@ def _read_file(path: Path, index: _Index) -> None:
             index.messages += 1
             try:
                 _take(found, chunk, path, index)
-            except _NewerError:
+            except NewerFormatError:
                 raise
             except FlightError:
                 broken += 1
@@ -189,18 +189,24 @@ def _take(found: Found, chunk: Chunk, path: Path, index: _Index) -> None:
         index.session = _session(chunk.data[found.first : found.last], path)
 
 
-class _NewerError(FlightError):
+class NewerFormatError(FlightError):
     """A log of a format that this program does not know."""
 
 
-def _session(data: bytes, path: Path) -> dict[str, Any]:
+def session_of(data: bytes, path: Path) -> dict[str, Any]:
+    """What a log says of its flight. Raises `NewerFormatError`, or `FlightError` where broken."""
     plain = from_json(data)
     number = plain.get("format")
     if isinstance(number, int) and number > FORMAT:
-        raise _NewerError(
+        raise NewerFormatError(
             f"flight log has format {number!s:.20}, this program reads up to {FORMAT}; update "
             f"orthonav: {path}"
         )
+    return plain
+
+
+def _session(data: bytes, path: Path) -> dict[str, Any]:
+    plain = session_of(data, path)
     if not isinstance(plain.get("camera"), dict):
         raise FlightError("session of the log is broken")
     return plain

@@ -12,7 +12,6 @@ from typing import Any
 from orthonav.errors import FlightError, MissingFileError, OrthonavError
 from orthonav.flight import decode_image
 from orthonav.flight.logged import (
-    FORMAT,
     HEALTH,
     MAX_JSON_BYTES,
     RESULT,
@@ -29,7 +28,13 @@ from orthonav.flight.logged import (
 from orthonav.flight.png import grey_of_png
 from orthonav.geo.camera import Camera
 from orthonav.publish.jsonl import result_from_json
-from orthonav.sources.flightlog import files_of_run, is_flight_log, run_of
+from orthonav.sources.flightlog import (
+    NewerFormatError,
+    files_of_run,
+    is_flight_log,
+    run_of,
+    session_of,
+)
 from orthonav.sources.mcap_chunks import Chunk, Found, Walk, chunk_at, chunks, messages
 from orthonav.web.feed import MAX_HEALTH, MAX_VIEWS, Batch, checked_health
 from orthonav.web.pictures import Grey, Shot
@@ -140,7 +145,7 @@ class LogReader:
     def _try(self, found: Found, chunk: Chunk, path: Path, batch: Batch) -> None:
         try:
             self._take(found, chunk, path, batch)
-        except _EndError:
+        except (_EndError, NewerFormatError):
             raise
         except (OrthonavError, UnicodeDecodeError) as error:
             self._broken += 1
@@ -158,7 +163,7 @@ class LogReader:
             view = view_of(data)
             self._views.setdefault(view.frame, view)
         elif found.topic == SESSION.name:
-            self.session = _session(data, path)
+            self.session = session_of(data, path)
             self.camera = camera_of(self.session.get("camera"))
         elif found.topic == RESULT.name and len(data) <= MAX_JSON_BYTES:
             batch.results.append(result_from_json(data.decode("utf-8")))
@@ -194,17 +199,6 @@ class LogReader:
 
 class _EndError(FlightError):
     """A log that cannot be gone on with."""
-
-
-def _session(data: bytes, path: Path) -> dict[str, Any]:
-    plain = from_json(data)
-    number = plain.get("format")
-    if isinstance(number, int) and number > FORMAT:
-        raise _EndError(
-            f"flight log has format {number!s:.20}, this program reads up to {FORMAT}; update "
-            f"orthonav: {path}"
-        )
-    return plain
 
 
 def run_files(path: Path, *, live: bool) -> list[Path]:
