@@ -619,7 +619,7 @@ def test_a_flight_from_end_to_end(flown, autopilot, tmp_path, capsys):
         assert np.hypot(*(place - truth[each.frame])) < 6
     ages = [m["processing_time"] / 1e6 for m in autopilot.named("GLOBAL_POSITION_SENSOR")]
     assert min(ages) > 0 and max(ages) < 1.5
-    assert autopilot.named("HEARTBEAT") and autopilot.named("STATUSTEXT")
+    assert autopilot.named("HEARTBEAT") and autopilot.named("TIMESYNC")
     assert states.load(state).lat_deg == pytest.approx(sent[-1].outcome.lat_deg)
 
 

@@ -251,6 +251,7 @@ class AutopilotLink:
             return False
         self.target = Target(system_id, message.get_srcComponent() or _AUTOPILOT_COMPONENT)
         self._packer = None
+        self._due = dict.fromkeys(self._due, 0)  # it hears of us, and is asked its time, at once
         return True
 
     def _dispatch(self, message: Message, now_ns: int) -> None:
