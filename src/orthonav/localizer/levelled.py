@@ -72,7 +72,7 @@ def levelled(
     if placed.covariance is None:
         placed = registration.registrar.with_covariance(view.templates, view.levels, placed)
     lean = np.radians([telemetry.pitch_deg, telemetry.roll_deg])
-    mean, known = _seen_from(registration, view, placed), np.zeros(2)
+    mean, known = registration.seen_from(view, placed.pose), np.zeros(2)
     hangs = _hangs(camera, telemetry, mean)
     if hangs is None:
         return None
@@ -93,14 +93,6 @@ def levelled(
     if not np.isfinite(covariance).all():
         return None
     return Levelled(np.concatenate([mean, lean]), covariance)
-
-
-def _seen_from(
-    registration: RegistrationLocalizer, view: PreparedFootprint, placed: Placed
-) -> Array:
-    """Position of the camera (m), heading and log scale (4,) of a placed view."""
-    pose = placed.pose
-    return np.array([*registration.camera_en_m(view, pose), pose.turn_rad, pose.log_scale])
 
 
 def _hangs(camera: Camera, telemetry: Telemetry, mean: Array) -> Array | None:

@@ -367,9 +367,14 @@ class RegistrationLocalizer:
         gsd_m = self.grid.gsd_m
         return np.array([self.grid.west_m + float(x) * gsd_m, self.grid.north_m - float(y) * gsd_m])
 
+    def seen_from(self, view: PreparedFootprint, pose: Pose) -> NDArray[np.float64]:
+        """Where the camera of a view at `pose` is (4,): metres east and north, heading (rad) and
+        log scale."""
+        return np.array([*self.camera_en_m(view, pose), pose.turn_rad, pose.log_scale])
+
     def pose_of(self, view: PreparedFootprint, seen_from: NDArray[np.float64]) -> Pose:
         """Where a view's window lies if the camera is at (4,): metres east and north, heading
-        (rad) and log scale. The inverse of `camera_en_m`."""
+        (rad) and log scale. The inverse of `seen_from`."""
         east, north, turn, log_scale = seen_from.tolist()
         x, y = (east - self.grid.west_m), (self.grid.north_m - north)
         moved = Pose(0.0, 0.0, turn, log_scale).map_px(view.camera_px)

@@ -18,10 +18,10 @@ from orthonav.localizer.checks import check_telemetry, check_view
 from orthonav.localizer.levelled import levelled
 from orthonav.localizer.localizer import Localizer
 from orthonav.localizer.odometry import Footprint, Moved, moved_between
+from orthonav.localizer.places import places_of
 from orthonav.localizer.registration import PreparedFootprint
 from orthonav.records import Fix, NoFix, Prior, Telemetry
-from orthonav.register.refine import Placed
-from orthonav.register.registrar import Registered, apart_px
+from orthonav.register.registrar import Registered
 from orthonav.track import Estimate, Mixture, Model, Sighting, State, Told, ToldVelocity
 from orthonav.track.hypotheses import within
 from orthonav.track.model import HEADING, LEAN, SCALE, VELOCITY
@@ -39,7 +39,6 @@ says the same, and it costs as much as all the rest."""
 LONGEST_GAP_S = 600.0
 UNKNOWN_STEP_S = 1.0
 """Time that is taken to have passed where the clock stands still or jumps back."""
-WORTH_LOG_ODDS = -12.0
 NEAR_SHARE = 0.05
 """Places nearer to each other than this share of the view's side are one."""
 RADIUS_SHARE = 0.025
@@ -354,7 +353,9 @@ class Tracker:
         """What the view may be, `log_scale` of its height corrected already, its perspective
         counted `worth` (2,) times."""
         made = []
-        for log_odds, alone, placed in self._places(found, NEAR_SHARE * view.side_px, looked_at):
+        for log_odds, alone, placed in places_of(
+            found, self._confidence, NEAR_SHARE * view.side_px, looked_at
+        ):
             seen = levelled(self._registration, grey, camera, telemetry, view, placed, worth)
             if seen is None:
                 continue
@@ -362,40 +363,6 @@ class Tracker:
             mean[3] += log_scale
             made.append(Sighting(mean, seen.covariance, log_odds, alone))
         return made
-
-    def _places(
-        self, found: Registered, near_px: float, looked_at: float
-    ) -> list[tuple[float, float, Placed]]:
-        """Places with their log odds, and how likely each is by the view alone: the best, and those
-        that were finished beside it and are farther than `near_px` from it.
-
-        Where only a share of the map was `looked_at`, few rivals were found and chance is lower:
-        the odds are those of somebody who knows only that it is there, or, if that is less, of
-        somebody who looked everywhere and found elsewhere what chance makes.
-        """
-        best, chances = found.evidence(), self._confidence.chances
-        least = {"rival": chances.total, "look_rival": chances.look, "fine_rival": chances.fine}
-        out: list[tuple[float, float, Placed]] = []
-        for score, placed in ((found.score, found.placed), *found.finalists):
-            if any(apart_px(placed, other) < near_px for *_, other in out):
-                continue
-            evidence = dict(best)
-            if out:
-                share = score / max(found.score, 1e-6)
-                evidence = {
-                    "strength": score,
-                    "rival": found.score,
-                    "look": found.look_score * share,
-                    "look_rival": found.look_score,
-                }
-            there = _log_odds(self._confidence(evidence)) + math.log(looked_at)
-            for name in least.keys() & evidence.keys():
-                evidence[name] = max(evidence[name], least[name])
-            alone = self._confidence(evidence)
-            log_odds = min(there, _log_odds(alone))
-            if not out or log_odds > WORTH_LOG_ODDS:
-                out.append((log_odds, alone, placed))
-        return out
 
     def _fix(
         self,
@@ -461,8 +428,3 @@ def _corrected(telemetry: Telemetry, bias: Array) -> Telemetry:
         pitch_deg=telemetry.pitch_deg + pitch_deg,
         roll_deg=telemetry.roll_deg + roll_deg,
     )
-
-
-def _log_odds(confidence: float) -> float:
-    inside = min(max(confidence, 1e-12), 1 - 1e-12)
-    return math.log(inside / (1 - inside))
