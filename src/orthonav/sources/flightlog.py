@@ -31,7 +31,16 @@ from orthonav.geo.camera import Camera
 from orthonav.publish.jsonl import result_from_json
 from orthonav.records import ViewResult
 from orthonav.sources.cameras import read_camera_file
-from orthonav.sources.mcap_chunks import Chunk, Found, Walk, chunk_at, chunks, messages, profile_of
+from orthonav.sources.mcap_chunks import (
+    Chunk,
+    Found,
+    LastChunk,
+    Place,
+    Walk,
+    chunks,
+    messages,
+    profile_of,
+)
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.recording import Grey, Recording, SourceView, as_told, fitted
 
@@ -53,23 +62,13 @@ class LoggedFlight(Recording):
     results: Callable[[], Iterator[ViewResult]] = lambda: iter(())
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Where the data of a message lies: in a chunk of a file."""
-
-    path: Path
-    offset: int
-    first: int
-    last: int
-
-
 @dataclass
 class _Index:
     """What is found in going through the files once."""
 
     session: dict[str, Any] = field(default_factory=dict)
     views: list[LoggedView] = field(default_factory=list)
-    pictures: dict[int, _Place] = field(default_factory=dict)
+    pictures: dict[int, Place] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     messages: int = 0
 
@@ -181,7 +180,7 @@ def _read_file(path: Path, index: _Index) -> None:
 
 def _take(found: Found, chunk: Chunk, path: Path, index: _Index) -> None:
     if found.topic == VIEW.name:
-        place = _Place(path, chunk.offset, found.first, found.last)
+        place = Place(path, chunk.offset, found.first, found.last)
         index.pictures.setdefault(found.number, place)
     elif found.topic == TELEMETRY.name:
         index.views.append(view_of(chunk.data[found.first : found.last]))
@@ -284,10 +283,9 @@ def _stream(
 class _Pictures:
     """Reads pictures when they are asked for; holds the chunk of the last one."""
 
-    def __init__(self, places: Mapping[int, _Place], camera: Camera) -> None:
+    def __init__(self, places: Mapping[int, Place], camera: Camera) -> None:
         self._places, self._camera = places, camera
-        self._held: tuple[Path, int] | None = None
-        self._data = b""
+        self._chunk = LastChunk()
 
     def where(self, index: int) -> str:
         place = self._places.get(index)
@@ -298,15 +296,7 @@ class _Pictures:
         place = self._places.get(index)
         if place is None:
             raise FlightError(f"the camera gave no usable picture in flight: {where}")
-        if self._held != (place.path, place.offset):
-            try:
-                data = chunk_at(place.path, place.offset)
-            except OSError as error:
-                raise FlightError(
-                    f"flight log cannot be read ({error.strerror}): {where}"
-                ) from error
-            self._held, self._data = (place.path, place.offset), data or b""
-        message = self._data[place.first : place.last]
+        message = self._chunk.message(place, where)
         try:
             data, kind = picture_of(message)
         except FlightError as error:

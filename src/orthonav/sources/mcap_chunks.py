@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from orthonav.errors import FlightError
 from orthonav.flight.logged import MAX_CHUNK_BYTES
 from orthonav.sources.guard import needed
 
@@ -103,6 +104,39 @@ def chunk_at(path: Path, offset: int) -> bytes | None:
         if len(head) < _RECORD_BYTES or head[0] != _CHUNK:
             return None
         return _inflated(stream, int.from_bytes(head[1:], "little"))
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the data of a message lies: in a chunk of a file."""
+
+    path: Path
+    offset: int
+    first: int
+    last: int
+
+
+class LastChunk:
+    """Data of messages by their place; holds the chunk of the last one. Mutable, one thread."""
+
+    def __init__(self) -> None:
+        self._held: tuple[Path, int] | None = None
+        self._data = b""
+
+    def message(self, place: Place, where: str) -> bytes:
+        """The data at a place, cut short where the chunk is damaged.
+
+        Raises `FlightError`, which names `where`, for a file that cannot be read.
+        """
+        if self._held != (place.path, place.offset):
+            try:
+                data = chunk_at(place.path, place.offset)
+            except OSError as error:
+                raise FlightError(
+                    f"flight log cannot be read ({error.strerror}): {where}"
+                ) from error
+            self._held, self._data = (place.path, place.offset), data or b""
+        return self._data[place.first : place.last]
 
 
 def messages(chunk: Chunk, channels: dict[int, str]) -> Iterator[Found]:

@@ -35,7 +35,7 @@ from orthonav.sources.flightlog import (
     run_of,
     session_of,
 )
-from orthonav.sources.mcap_chunks import Chunk, Found, Walk, chunk_at, chunks, messages
+from orthonav.sources.mcap_chunks import Chunk, Found, LastChunk, Place, Walk, chunks, messages
 from orthonav.web.feed import MAX_HEALTH, MAX_VIEWS, Batch, checked_health
 from orthonav.web.pictures import Grey, Shot
 
@@ -58,13 +58,9 @@ class _File:
 
 
 @dataclass(frozen=True)
-class _Place:
-    """Where the data of a picture lies: in a chunk of a file."""
+class _Picture(Place):
+    """Where the data of a picture lies, and whether it is the whole view or a thumbnail."""
 
-    path: Path
-    offset: int
-    first: int
-    last: int
     whole: bool
 
 
@@ -82,15 +78,14 @@ class LogReader:
         self._names: set[Path] = set()
         self._run: str | None = None
         self._looked_s = -LOOK_FOR_FILES_S
-        self._held: tuple[Path, int] | None = None
-        self._data = b""
+        self._chunk = LastChunk()
         self._begin()
 
     def _begin(self) -> None:
         self.camera: Camera | None = None
         self.session: dict[str, Any] = {}
         self._views: dict[str, LoggedView] = {}
-        self._places: dict[int, _Place] = {}
+        self._places: dict[int, _Picture] = {}
         self._results, self._health, self._broken = 0, 0, 0
 
     def poll(self) -> Batch:
@@ -155,7 +150,7 @@ class LogReader:
     def _take(self, found: Found, chunk: Chunk, path: Path, batch: Batch) -> None:
         if found.topic in (VIEW.name, THUMBNAIL.name):
             whole = found.topic == VIEW.name
-            place = _Place(path, chunk.offset, found.first, found.last, whole)
+            place = _Picture(path, chunk.offset, found.first, found.last, whole)
             self._places.setdefault(found.number, place)
             return
         data = chunk.data[found.first : found.last]
@@ -175,7 +170,7 @@ class LogReader:
         if max(self._results, len(self._views), len(self._places)) > MAX_VIEWS:
             raise _EndError(f"more than {MAX_VIEWS} views: {path}")
 
-    def _grey(self, place: _Place, camera: Camera, frame: str) -> Grey:
+    def _grey(self, place: _Picture, camera: Camera, frame: str) -> Grey:
         data, kind = picture_of(self._message(place))
         where = f"view {frame} of {place.path}"
         if place.whole and kind == "png":
@@ -184,17 +179,9 @@ class LogReader:
             raise FlightError(f"picture is of an unknown kind: {where}")
         return decode_image(data, where)
 
-    def _message(self, place: _Place) -> bytes:
+    def _message(self, place: _Picture) -> bytes:
         with self._lock:
-            if self._held != (place.path, place.offset):
-                try:
-                    data = chunk_at(place.path, place.offset)
-                except OSError as error:
-                    raise FlightError(
-                        f"flight log cannot be read ({error.strerror}): {place.path}"
-                    ) from error
-                self._held, self._data = (place.path, place.offset), data or b""
-            return self._data[place.first : place.last]
+            return self._chunk.message(place, str(place.path))
 
 
 class _EndError(FlightError):
