@@ -2,23 +2,26 @@
 
 import pytest
 
-CALIBRATION = ("calibration_plots.png", "calibration_plots.figure_png")
+from orthonav.report import Drawing
+
+CALIBRATION = ("calibration_plots.draw_axes", "calibration_plots.draw_figure")
+NOTHING = Drawing(b"", "", (1.0, 1.0))
 
 
 @pytest.fixture
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures of few pixels, which is fast."""
-    monkeypatch.setattr("orthonav.evaluate.canvas.DPI", 20)
+    monkeypatch.setattr("orthonav.report.canvas.DPI", 20)
 
 
 @pytest.fixture
 def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures of accuracy are not drawn."""
-    monkeypatch.setattr("orthonav.evaluate.plots.png", lambda *_: b"")
+    monkeypatch.setattr("orthonav.evaluate.plots.draw_axes", lambda *_: NOTHING)
 
 
 @pytest.fixture
 def only_new(monkeypatch: pytest.MonkeyPatch, coarse: None, no_plots: None) -> None:
     """Only pictures of tracks and of worst views are drawn."""
     for name in CALIBRATION:
-        monkeypatch.setattr(f"orthonav.evaluate.{name}", lambda *_: b"")
+        monkeypatch.setattr(f"orthonav.evaluate.{name}", lambda *_: NOTHING)

@@ -28,8 +28,9 @@ from orthonav.evaluate.calibration_report import (
     consistency_to_json,
 )
 from orthonav.evaluate.figures import wilson
+from orthonav.evaluate.flights import FlightReport, metrics_to_json, summary
 from orthonav.evaluate.metrics import Comparison, compare, criterion_rows, measure, pool, wrong_key
-from orthonav.evaluate.report import FlightReport, metrics_to_json, summary, write_report
+from orthonav.evaluate.report import write_report
 from orthonav.geo.frames import LocalFrame
 from orthonav.publish.jsonl import result_from_json, result_to_json
 from orthonav.records import Fix, ViewResult
@@ -390,8 +391,8 @@ def test_pictures_are_drawn_and_alike(n: int) -> None:
     cov = np.tile(64.0 * np.eye(2), (n, 1, 1))
     consistency = check_covariance(np.reshape(offsets, (-1, 2)), cov, own_m, 15.0)
     for draw in (lambda: reliability_picture(calibration), lambda: nees_picture(consistency)):
-        png = draw()
-        assert png.startswith(b"\x89PNG") and (n != 1 or png == draw())
+        drawing = draw()
+        assert drawing.png.startswith(b"\x89PNG") and (n != 1 or drawing == draw())
 
 
 def test_errors_beyond_all_measure_can_be_drawn() -> None:
@@ -399,4 +400,4 @@ def test_errors_beyond_all_measure_can_be_drawn() -> None:
     found = check_covariance(np.ones((2, 2)), cov, np.full(2, RADIUS_M), 15.0)
     assert found.nees.tolist()[1] == math.inf
     assert consistency_to_json(found)["nees_mean"] is None
-    assert nees_picture(found).startswith(b"\x89PNG")
+    assert nees_picture(found).png.startswith(b"\x89PNG")

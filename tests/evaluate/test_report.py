@@ -14,18 +14,12 @@ import pytest
 
 from orthonav.errors import MissingExtraError
 from orthonav.evaluate import plots
-from orthonav.evaluate.ground import Background
+from orthonav.evaluate.flights import FlightReport, metrics_to_json, table, total
 from orthonav.evaluate.metrics import compare, measure
-from orthonav.evaluate.report import (
-    FlightReport,
-    MadeFrom,
-    metrics_to_json,
-    table,
-    total,
-    write_report,
-)
+from orthonav.evaluate.report import MadeFrom, write_report
 from orthonav.geo.frames import LocalFrame
 from orthonav.records import Fix, NoFix, ViewResult
+from orthonav.report import Background, Drawing
 
 CENTRE = LocalFrame(48.0, -4.5)
 PICTURES_PER_FLIGHT = 6
@@ -82,7 +76,7 @@ def test_the_page_needs_nothing_from_outside(tmp_path: Path) -> None:
     html = path.read_text(encoding="utf-8")
     page = Page(html)
     assert path == tmp_path / "report" / "index.html"
-    assert [p.name for p in path.parent.iterdir()] == ["index.html"]
+    assert sorted(p.name for p in path.parent.iterdir()) == ["figures", "index.html"]
     assert not re.search(r"https?:|url\(|@import|//www", html)
     assert not {"script", "link", "iframe", "object"} & set(page.tags)
     assert len(page.images) == PICTURES_PER_FLIGHT
@@ -191,8 +185,8 @@ def test_json_values_are_strict_and_named() -> None:
     assert {row["name"] for row in values["criteria"]} == set(values["curves"])
 
 
-def decoded(png: bytes) -> np.ndarray:
-    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+def decoded(drawing: Drawing) -> np.ndarray:
+    image = cv2.imdecode(np.frombuffer(drawing.png, np.uint8), cv2.IMREAD_COLOR)
     assert image is not None
     return image[..., ::-1].astype(int)
 
@@ -234,7 +228,7 @@ def test_a_background_beside_the_flight_or_far_larger_does_no_harm(extent: tuple
 
 def test_the_same_flight_gives_the_same_picture() -> None:
     flight = made_flight(20)
-    assert plots.along_picture(flight.comparison, 15.0) == plots.along_picture(
+    assert plots.over_time_picture(flight.comparison, 15.0) == plots.over_time_picture(
         flight.comparison, 15.0
     )
 

@@ -15,15 +15,9 @@ from helpers import textured
 from orthonav.cli import main
 from orthonav.errors import FlightError
 from orthonav.evaluate.contact_sheet import Row, row_text, sheet_picture, worst_first, worst_rows
+from orthonav.evaluate.flights import FlightReport, flights_to_json, metrics_to_json, summary
 from orthonav.evaluate.metrics import Comparison, compare, measure
-from orthonav.evaluate.page import SAID_STYLE
-from orthonav.evaluate.report import (
-    FlightReport,
-    flights_to_json,
-    metrics_to_json,
-    summary,
-    write_report,
-)
+from orthonav.evaluate.report import write_report
 from orthonav.evaluate.track import (
     Track,
     check_consistency,
@@ -36,8 +30,8 @@ from orthonav.evaluate.track import (
 from orthonav.evaluate.track_plots import (
     STATE_STYLES,
     error_picture,
+    track_figures,
     track_map_picture,
-    track_pictures,
 )
 from orthonav.evaluate.track_report import track_rows
 from orthonav.flight.writer import FlightWriter
@@ -48,6 +42,7 @@ from orthonav.mapfile import open_map
 from orthonav.mapfile.layer import GreyLayer
 from orthonav.publish.jsonl import write_results
 from orthonav.records import Fix, NoFix, Telemetry, ViewResult
+from orthonav.report import SAID_STYLE, Drawing
 
 CENTRE = LocalFrame(48.0, -4.5)
 COV = np.array([[25.0, 12.0], [12.0, 16.0]])
@@ -302,9 +297,9 @@ def test_odd_tracks_are_measured(errors, states, named) -> None:
 def test_odd_tracks_are_drawn(errors, states, named, coarse) -> None:
     comparison, results = flown(errors, states, **named)
     track = measure_track(comparison, results, 15.0)
-    for png, alt, said in track_pictures(comparison, track, 15.0, None):
-        decoded(png)
-        assert alt and said and "nan" not in alt
+    for figure in track_figures(comparison, track, 15.0, None):
+        decoded(figure.drawing)
+        assert figure.alt and figure.caption and "nan" not in figure.alt
 
 
 def test_what_is_not_defined_is_none() -> None:
@@ -359,7 +354,7 @@ def test_views_placed_one_by_one_are_reported_as_before(tmp_path: Path, only_new
     assert flights_to_json([flight]) == metrics_to_json(flight.metrics)
     assert "track" not in summary([flight])
     html = write_report(tmp_path, [flight]).read_text("utf-8")
-    assert "Track" not in html and SAID_STYLE not in html and html.count("<figure>") == 6
+    assert "Track" not in html and SAID_STYLE not in html and html.count("<figure") == 6
 
 
 def test_several_flights_tell_what_adds_up() -> None:
@@ -386,8 +381,8 @@ def test_several_flights_tell_what_adds_up() -> None:
     assert "track of long:" in said and "track of single:" not in said
 
 
-def decoded(png: bytes) -> np.ndarray:
-    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+def decoded(drawing: Drawing) -> np.ndarray:
+    image = cv2.imdecode(np.frombuffer(drawing.png, np.uint8), cv2.IMREAD_COLOR)
     assert image is not None
     return image[..., ::-1].astype(int)
 
@@ -605,7 +600,7 @@ def test_evaluate_a_track(golden_flight, tmp_path: Path, capsys, only_new) -> No
     assert (track["first_view"], track["first_s"], track["n_false_locks"]) == (2, 1.0, 1)
     assert isinstance(track["first_view"], int)
     html = (report / "index.html").read_text("utf-8")
-    assert html.count("<figure>") == 11 and "the worst views. 0003.jpg" in html
+    assert html.count("<figure") == 11 and "The worst views. 0003.jpg" in html
     assert SAID_STYLE in html
 
 

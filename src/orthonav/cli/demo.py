@@ -68,14 +68,9 @@ def _is_earlier_demo(out: Path) -> bool:
 def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[Any, str]:
     from orthonav.cli.evaluate import map_background
     from orthonav.cli.info import recipe_text, summary, summary_text
+    from orthonav.evaluate.flights import FlightReport, metrics_to_json, table
     from orthonav.evaluate.metrics import compare, measure
-    from orthonav.evaluate.report import (
-        FlightReport,
-        MadeFrom,
-        metrics_to_json,
-        table,
-        write_report,
-    )
+    from orthonav.evaluate.report import MadeFrom, write_report
     from orthonav.flight import open_flight, read_truth
     from orthonav.geo.route import read_route
     from orthonav.localizer import Localizer

@@ -13,13 +13,13 @@ MAX_PREVIEW_PX = 384
 
 if TYPE_CHECKING:
     from orthonav.evaluate.contact_sheet import Row
-    from orthonav.evaluate.ground import Background
+    from orthonav.evaluate.flights import FlightReport
     from orthonav.evaluate.metrics import Comparison
-    from orthonav.evaluate.report import FlightReport
     from orthonav.flight import FlightFolder
     from orthonav.mapfile.layer import GreyLayer
     from orthonav.mapfile.reader import MapFile
     from orthonav.records import ViewResult
+    from orthonav.report import Background
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +43,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="metrics.json",
         help="write metrics as JSON, to stdout where no file is named",
     )
-    parser.add_argument("--report", type=Path, metavar="REPORT/", help="write an HTML report")
+    parser.add_argument(
+        "--report",
+        type=Path,
+        metavar="REPORT/",
+        help="write an HTML report, and its figures beside it as SVG and PNG",
+    )
     parser.add_argument("--map", type=Path, metavar="MAP.onav", help="background of the report")
     parser.add_argument(
         "--flight",
@@ -58,7 +63,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Measure, print the table, write what was asked for."""
     from orthonav.errors import FlightError
-    from orthonav.evaluate.report import flights_to_json, summary, table
+    from orthonav.evaluate.flights import flights_to_json, summary, table
     from orthonav.files import write_text
     from orthonav.mapfile import open_map
 
@@ -101,8 +106,8 @@ def _check_flights(options: argparse.Namespace) -> None:
 
 def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[FlightReport]":
     """Every flight beside its truth, and its worst views where their pictures were given."""
+    from orthonav.evaluate.flights import FlightReport
     from orthonav.evaluate.metrics import compare, measure
-    from orthonav.evaluate.report import FlightReport
     from orthonav.evaluate.track import measure_track
     from orthonav.flight import open_flight, read_truth
     from orthonav.publish.jsonl import read_results
@@ -182,8 +187,8 @@ def map_background(opened: "MapFile") -> "Background":
     import numpy as np
 
     from orthonav.errors import MapFileError
-    from orthonav.evaluate.ground import Background
     from orthonav.mapfile.layer import jpeg_frame
+    from orthonav.report import Background
 
     data = opened.array("sheet0/preview_jpeg", np.uint8, 1)
     found = jpeg_frame(data.tobytes())

@@ -12,20 +12,30 @@ from orthonav.evaluate.calibration import (
     Consistency,
     nees_bound,
 )
-from orthonav.evaluate.canvas import GREY, OFFSET, RIGHT, SOFT, WRONG, figure_png, halo, png
+from orthonav.report.canvas import (
+    BACKING,
+    GREY,
+    OFFSET,
+    RIGHT,
+    SOFT,
+    WRONG,
+    Drawing,
+    draw_axes,
+    draw_figure,
+)
 
 if TYPE_CHECKING:
+    from matplotlib import figure as mpl
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _SIDE: dict[str, Any] = {"fontsize": 9, "color": "#777777", "style": "italic"}
 _NEES_AXIS = (0.01, 1e4)  # its edges at the widest; 1 in 200 of consistent fixes lie below
 
 
-def reliability_picture(calibration: Calibration) -> bytes:
+def reliability_picture(calibration: Calibration) -> Drawing:
     """Share right over stated confidence per bin, with Wilson's 95 %; below it fixes per bin."""
 
-    def draw(figure: "Figure") -> None:
+    def draw(figure: "mpl.Figure") -> None:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
         above.plot([0, 1], [0, 1], color=GREY, linestyle=(0, (4, 3)), linewidth=1.2)
         above.text(0.03, 0.96, "too cautious", va="top", **_SIDE)
@@ -35,17 +45,17 @@ def reliability_picture(calibration: Calibration) -> bytes:
             _draw_bins(above, filled)
             _draw_verdict(above, calibration)
         else:
-            above.text(0.5, 0.5, "no fix has a confidence", ha="center", bbox=_BACKING)
-        above.set(xlim=(0, 1), ylim=(-0.02, 1.04))
+            above.text(0.5, 0.5, "no fix has a confidence", ha="center", bbox=BACKING)
+        above.set(xlim=(-0.015, 1.015), ylim=(-0.02, 1.04))
         above.set(ylabel="share with an error\nwithin the stated radius")
         _draw_counts(below, calibration)
         below.set(xlabel="stated confidence")
         figure.align_ylabels()
 
-    return figure_png((6.2, 5.0), draw)
+    return draw_figure((6.2, 5.0), draw)
 
 
-def nees_picture(consistency: Consistency) -> bytes:
+def nees_picture(consistency: Consistency) -> Drawing:
     """Share of right fixes below each normalized error squared, beside chi-square of 2 dof."""
 
     def draw(axes: "Axes") -> None:
@@ -66,7 +76,7 @@ def nees_picture(consistency: Consistency) -> bytes:
             _draw_summary(axes, consistency)
         else:
             said = "no right fix has a usable covariance"
-            axes.text(0.5, 0.5, said, ha="center", transform=axes.transAxes, bbox=_BACKING)
+            axes.text(0.5, 0.5, said, ha="center", transform=axes.transAxes, bbox=BACKING)
         axes.text(0.02, 0.955, "too cautious", va="top", transform=axes.transAxes, **_SIDE)
         axes.text(0.98, 0.04, "too sure", ha="right", transform=axes.transAxes, **_SIDE)
         axes.set(xscale="log", xlim=(_NEES_AXIS[0], high), ylim=(0, 104))
@@ -76,10 +86,7 @@ def nees_picture(consistency: Consistency) -> bytes:
         axes.xaxis.set_minor_formatter("")
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
 
-    return png((6.2, 5.0), draw)
-
-
-_BACKING: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 4}
+    return draw_axes((6.2, 5.0), draw)
 
 
 def _draw_bins(axes: "Axes", filled: list[Bin]) -> None:
@@ -98,7 +105,7 @@ def _draw_bins(axes: "Axes", filled: list[Bin]) -> None:
 
 def _draw_verdict(axes: "Axes", calibration: Calibration) -> None:
     text = (
-        f"ECE {calibration.ece:.3f}   Brier {calibration.brier:.3f}\n"
+        f"ECE {calibration.ece:.3f} · Brier {calibration.brier:.3f}\n"
         f"stated {calibration.mean_confidence:.2f}, right {calibration.share_right:.2f} on average"
     )
     axes.set_title(text, fontsize=9, color=SOFT, linespacing=1.4)
@@ -136,9 +143,8 @@ def _draw_levels(axes: "Axes", consistency: Consistency) -> None:
         bound, found = nees_bound(level), 100 * consistency.within[level]
         axes.plot([bound] * 2, [0, 104], color=GREY, linewidth=0.9, zorder=1.5)
         name = f"{100 * level:g} % bound"
-        axes.annotate(
-            name, (bound, 0), (-10, 4), **{**OFFSET, "fontsize": 8}, rotation=90, color=SOFT
-        ).set_path_effects(halo())
+        looks: dict[str, Any] = {"rotation": 90, "color": SOFT, "bbox": BACKING}
+        axes.annotate(name, (bound, 0), (-12, 4), **{**OFFSET, "fontsize": 8}, **looks)
         axes.plot(bound, found, "o", color=WRONG, markersize=6, markeredgecolor="white", zorder=5)
 
 

@@ -4,12 +4,11 @@ from dataclasses import asdict
 
 from orthonav.evaluate import calibration_plots
 from orthonav.evaluate.calibration import NEES_LEVELS, Calibration, Consistency, nees_bound
-from orthonav.evaluate.figures import or_none, percent_text, plain_text
+from orthonav.evaluate.figures import or_none
 from orthonav.evaluate.metrics import CriterionRow, Metrics, wrong_key
-from orthonav.evaluate.page import html_table
-
-Picture = tuple[bytes, str, str]
-"""PNG, text for who cannot see it, caption."""
+from orthonav.report.figures import Figure
+from orthonav.report.numbers import percent_text, plain_text
+from orthonav.report.page import html_table
 
 
 def row_to_json(row: CriterionRow) -> dict[str, object]:
@@ -73,20 +72,22 @@ def calibration_lines(metrics: Metrics) -> list[str]:
     ]
 
 
-def calibration_pictures(metrics: Metrics) -> tuple[Picture, Picture]:
+def calibration_figures(metrics: Metrics) -> tuple[Figure, Figure]:
     """Reliability diagram and covariance plot."""
     return (
-        (
-            calibration_plots.reliability_picture(metrics.calibration),
+        Figure(
+            "reliability",
             f"Reliability diagram of confidence: {_confidence_said(metrics)}",
             "Share of right fixes over the confidence they state, with 95 % intervals (Wilson); "
             "dashed: as stated; orange: the gap. Below: fixes per bin.",
+            calibration_plots.reliability_picture(metrics.calibration),
         ),
-        (
-            calibration_plots.nees_picture(metrics.consistency),
+        Figure(
+            "covariance",
             f"Errors of right fixes against covariance: {_covariance_said(metrics.consistency)}",
             "Errors of right fixes in units of their covariance C; dashed: as they should be; "
             "shaded: where 95 % of samples of this size stay.",
+            calibration_plots.nees_picture(metrics.consistency),
         ),
     )
 
@@ -128,7 +129,7 @@ def criteria_html(metrics: Metrics, labels: dict[str, str]) -> str:
         )
         for row in metrics.criteria
     ]
-    return html_table(header, rows)
+    return html_table(header, rows, label="confidence criteria")
 
 
 def _confidence_said(metrics: Metrics) -> str:
@@ -182,7 +183,7 @@ def _bins_table(calibration: Calibration) -> str:
         )
         for b in calibration.bins
     ]
-    return html_table(header, rows)
+    return html_table(header, rows, label="confidence against shares of right fixes")
 
 
 def _levels_table(consistency: Consistency) -> str:
@@ -191,4 +192,4 @@ def _levels_table(consistency: Consistency) -> str:
         (f"{100 * level:g} %", f"{nees_bound(level):.2f}", percent_text(level), percent_text(share))
         for level, share in consistency.within.items()
     ]
-    return html_table(header, rows)
+    return html_table(header, rows, label="covariance against errors")

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from orthonav.errors import FlightError
 from orthonav.evaluate.calibration import is_covariance
-from orthonav.evaluate.canvas import INK, RIGHT, SOFT, WRONG, figure_png, halo
 from orthonav.evaluate.metrics import Comparison
 from orthonav.flight.recording import Flight, View
 from orthonav.geo.camera import Camera
@@ -23,6 +22,7 @@ from orthonav.localizer.checks import check_telemetry
 from orthonav.localizer.rectify import prepare_view, rectify
 from orthonav.records import Fix, Telemetry, ViewResult
 from orthonav.register.reference import GreyPyramid
+from orthonav.report.canvas import BACKING, INK, RIGHT, SOFT, WRONG, Drawing, draw_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -113,8 +113,8 @@ def worst_first(
     return fixes[:count]
 
 
-def sheet_picture(rows: Sequence[Row]) -> bytes:
-    """The rows as one PNG: view, map at the estimate, map at the truth; a note where none."""
+def sheet_picture(rows: Sequence[Row]) -> Drawing:
+    """The rows as one drawing: view, map at the estimate, map at the truth; a note where none."""
 
     def draw(figure: "Figure") -> None:
         if not rows:
@@ -126,7 +126,7 @@ def sheet_picture(rows: Sequence[Row]) -> bytes:
         for part, row in zip(parts, rows, strict=True):
             _draw_row(part, row)
 
-    return figure_png((9.6, 3.5 * max(len(rows), 0.4)), draw)
+    return draw_figure((9.6, 3.5 * max(len(rows), 0.4)), draw)
 
 
 def row_text(row: Row) -> str:
@@ -135,7 +135,7 @@ def row_text(row: Row) -> str:
     known.append(f"sigma {row.sigma_m:.1f} m" if math.isfinite(row.sigma_m) else "sigma not known")
     sure = math.isfinite(row.confidence)
     known.append(f"confidence {row.confidence:.3f}" if sure else "confidence not known")
-    return "   ".join(known + [row.state] * bool(row.state))
+    return " · ".join(known + [row.state] * bool(row.state))
 
 
 def _row(
@@ -284,7 +284,7 @@ def _draw_patch(axes: "Axes", row: Row, patch: Patch) -> None:
         extent=patch.extent_m,
         vmin=float(low),
         vmax=max(float(high), float(low) + 1.0),
-        interpolation="nearest",
+        interpolation="none",
     )
     (east, north), half = row.centre_en_m, row.side_m / 2
     axes.set(xlim=(east - half, east + half), ylim=(north - half, north + half), aspect="equal")
@@ -293,7 +293,7 @@ def _draw_patch(axes: "Axes", row: Row, patch: Patch) -> None:
         (0.02, 0.03),
         xycoords="axes fraction",
         fontsize=8,
-        path_effects=halo(),
+        bbox=BACKING,
     )
 
 

@@ -60,13 +60,3 @@ def runs(flags: BoolArray) -> list[tuple[int, int]]:
 def or_none(value: float | np.floating) -> float | None:
     """`value` for strict JSON, which knows neither NaN nor infinity."""
     return float(value) if math.isfinite(value) else None
-
-
-def percent_text(value: float) -> str:
-    """A share as `12.3 %`, and `-` where it is not defined."""
-    return f"{100 * value:.1f} %" if math.isfinite(value) else "-"
-
-
-def plain_text(value: float) -> str:
-    """A number without unit, with three decimals, and `-` where it is not defined."""
-    return f"{value:.3f}" if math.isfinite(value) else "-"

@@ -1,4 +1,4 @@
-"""Pictures of an evaluation as PNG bytes: map, error curve, criteria, errors along the flight.
+"""Pictures of an evaluation: map, error curve, criteria, errors over time.
 
 Right and wrong differ by colour and by mark.
 """
@@ -8,17 +8,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthonav.evaluate.canvas import DPI, GREY, OFFSET, RIGHT, TRUTH, WRONG, halo, png
-from orthonav.evaluate.figures import runs
-from orthonav.evaluate.ground import (
-    Background,
-    draw_background,
-    draw_north,
-    draw_scale_bar,
-    inside_box,
-    view_box,
-)
+from orthonav.evaluate.figures import BoolArray, FloatArray, runs
 from orthonav.evaluate.metrics import Comparison, CriterionCurve, Metrics
+from orthonav.evaluate.track import seconds_since_first
+from orthonav.report.canvas import (
+    BACKING,
+    GREY,
+    OFFSET,
+    RIGHT,
+    SOFT,
+    TRUTH,
+    WRONG,
+    Drawing,
+    draw_axes,
+)
+from orthonav.report.ground import Background, draw_map, map_size_in
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,30 +45,22 @@ _NO_FIX_SHADE = "#EFE6C8"
 
 def map_picture(
     comparison: Comparison, radius_m: float, background: Background | None = None
-) -> bytes:
+) -> Drawing:
     """True positions and fixes from above, a line from each truth to its fix; north is up.
 
     Fixes far outside the flight are not shown themselves, only their lines to the edge.
     """
     box = view_box(comparison, radius_m)
-    width_m, height_m = box[1] - box[0], box[3] - box[2]
-    scale = 7.5 / max(width_m, height_m)
-    size_in = (max(scale * width_m, 3.0) + 1.0, max(scale * height_m, 3.0) + 1.0)
 
     def draw(axes: "Axes") -> None:
-        if background is not None:
-            draw_background(axes, background, box)
+        draw_map(axes, box, background)
         _draw_positions(axes, comparison, radius_m, box)
-        axes.set(xlim=box[:2], ylim=box[2:], aspect="equal")
-        axes.set(xlabel="east (m)", ylabel="north (m)")
-        draw_scale_bar(axes, box)
-        draw_north(axes)
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
 
-    return png(size_in, draw)
+    return draw_axes(map_size_in(box, 7.5), draw)
 
 
-def error_curve_picture(comparison: Comparison, metrics: Metrics) -> bytes:
+def error_curve_picture(comparison: Comparison, metrics: Metrics) -> Drawing:
     """Share of all views with a fix within an error, over that error; the radius marked."""
 
     def draw(axes: "Axes") -> None:
@@ -78,7 +74,7 @@ def error_curve_picture(comparison: Comparison, metrics: Metrics) -> bytes:
         axes.step(x, [*shares, shares[-1]], where="post", color=RIGHT, linewidth=2)
         axes.axhline(100 * metrics.coverage, color=GREY, linestyle=(0, (4, 3)), linewidth=1)
         coverage = f"{100 * metrics.coverage:.0f} % of views have a fix"
-        axes.annotate(coverage, (low, 100 * metrics.coverage), (6, 4), **OFFSET, color="#555555")
+        axes.annotate(coverage, (low, 100 * metrics.coverage), (6, 4), **OFFSET, color=SOFT)
         axes.axvline(radius_m, color=WRONG, linewidth=1.2)
         axes.plot([radius_m], [100 * metrics.accuracy], "o", color=WRONG, zorder=5)
         lift = -14 if metrics.accuracy > 0.15 else 18  # clear of the axis, and of the other note
@@ -89,10 +85,10 @@ def error_curve_picture(comparison: Comparison, metrics: Metrics) -> bytes:
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter("")
 
-    return png((6.2, 4.0), draw)
+    return draw_axes((6.2, 4.0), draw)
 
 
-def criteria_picture(metrics: Metrics) -> bytes:
+def criteria_picture(metrics: Metrics) -> Drawing:
     """Share of views kept against accuracy among them, per criterion; its thresholds marked."""
 
     def draw(axes: "Axes") -> None:
@@ -112,36 +108,75 @@ def criteria_picture(metrics: Metrics) -> bytes:
         else:
             axes.text(51, 50 + min(bottom, 85.0) / 2, "no fix has a criterion", ha="center")
 
-    return png((6.2, 4.0), draw)
+    return draw_axes((6.2, 4.0), draw)
 
 
-def along_picture(comparison: Comparison, radius_m: float) -> bytes:
-    """Error of each view in the order of the flight; views without a fix are shaded."""
+def over_time_picture(comparison: Comparison, radius_m: float) -> Drawing:
+    """Error of each view over time, or in their order; views without a fix are shaded."""
 
     def draw(axes: "Axes") -> None:
         errors_m = comparison.errors_m
-        views = np.arange(1, errors_m.size + 1)
+        x, name, edges = _time_axis(comparison)
         shown_m = np.maximum(errors_m, 0.01)  # a log axis has no zero; NaN stays NaN
         for i, (start, stop) in enumerate(runs(np.isnan(errors_m))):
             label = "no fix" if i == 0 else "_nolegend_"
-            axes.axvspan(start + 0.5, stop + 0.5, color=_NO_FIX_SHADE, linewidth=0, label=label)
-        axes.plot(views, shown_m, color="#BBBBBB", linewidth=0.9, zorder=2)
+            axes.axvspan(edges[start], edges[stop], color=_NO_FIX_SHADE, linewidth=0, label=label)
+        axes.plot(x, shown_m, color="#BBBBBB", linewidth=0.9, zorder=2)
         right = errors_m <= radius_m
         wrong = errors_m > radius_m
         marks: dict[str, Any] = {"linestyle": "none", "markersize": 4.5, "zorder": 3}
-        axes.plot(views[right], shown_m[right], "o", color=RIGHT, label="right", **marks)
-        axes.plot(views[wrong], shown_m[wrong], "X", color=WRONG, label="wrong", **marks)
+        axes.plot(x[right], shown_m[right], "o", color=RIGHT, label=_if("right", right), **marks)
+        axes.plot(x[wrong], shown_m[wrong], "X", color=WRONG, label=_if("wrong", wrong), **marks)
         axes.axhline(radius_m, color=WRONG, linewidth=1.2, label=f"{radius_m:g} m")
         finite = shown_m[np.isfinite(shown_m)]
         low = min([radius_m / 10, *finite]) / 1.5
         high = max([radius_m * 10, *finite]) * 1.5
-        axes.set(yscale="log", ylim=(low, high), xlim=(0.5, errors_m.size + 0.5))
-        axes.set(xlabel="view, in order of the flight", ylabel="error (m)")
+        axes.set(yscale="log", ylim=(low, high), xlim=(edges[0], edges[-1]))
+        axes.set(xlabel=name, ylabel="error (m)")
         axes.yaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_minor_formatter("")
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
 
-    return png((10.5, 3.4), draw)
+    return draw_axes((10.5, 3.4), draw)
+
+
+def _time_axis(comparison: Comparison) -> tuple[FloatArray, str, FloatArray]:
+    """Where views lie (N,), the name of the axis, and the edges between views (N + 1,)."""
+    x, name = seconds_since_first(comparison.time_ns), "time since the first view (s)"
+    if not np.isfinite(x).all():
+        x, name = np.arange(1.0, x.size + 1), "view, in order of the flight"
+    half = float(np.median(np.diff(x))) / 2 if x.size > 1 else 0.5
+    half = max(half, 1e-3)
+    edges = np.concatenate([[x[0] - half], (x[1:] + x[:-1]) / 2, [x[-1] + half]])
+    return x, name, edges
+
+
+def _if(label: str, shown: BoolArray) -> str:
+    """A name for the legend where there is something to name."""
+    return label if shown.any() else "_nolegend_"
+
+
+def view_box(comparison: Comparison, radius_m: float) -> tuple[float, float, float, float]:
+    """West, east, south, north: the flight, and what of its fixes is near to it."""
+    truth, fixes = comparison.truth_en_m, comparison.fix_en_m
+    low, high = truth.min(axis=0), truth.max(axis=0)
+    reach = max(float((high - low).max()) * 0.35, 5 * radius_m)
+    near = inside_box(fixes, (low[0] - reach, high[0] + reach, low[1] - reach, high[1] + reach))
+    seen = np.concatenate([truth, fixes[near]])
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    side = max(float((high - low).max()), 4 * radius_m)
+    middle = (low + high) / 2
+    half = np.maximum((high - low) / 2 + 0.06 * side, 0.3 * side)
+    west, south = (float(value) for value in middle - half)
+    east, north = (float(value) for value in middle + half)
+    return west, east, south, north
+
+
+def inside_box(positions_en_m: FloatArray, box: tuple[float, ...]) -> BoolArray:
+    """Which of positions (N, 2) lie in a box: west, east, south, north."""
+    east, north = positions_en_m.T
+    inside: BoolArray = (box[0] <= east) & (east <= box[1]) & (box[2] <= north) & (north <= box[3])
+    return inside
 
 
 def _draw_positions(
@@ -160,12 +195,14 @@ def _draw_positions(
         "markerfacecolor": "white",
         "zorder": 4,
     }
-    axes.plot(*truth[~none].T, ".", color=TRUTH, markersize=3, zorder=7, label="truth")
-    axes.plot(*fixes[right].T, "o", color=RIGHT, markersize=5.5, zorder=5, label="right fix")
+    axes.plot(*truth[~none].T, ".", color=TRUTH, markersize=3, zorder=7, label=_if("truth", ~none))
+    axes.plot(
+        *fixes[right].T, "o", color=RIGHT, markersize=5.5, zorder=5, label=_if("right fix", right)
+    )
     outside = wrong & ~inside_box(fixes, box)
     label = "wrong fix" + (f" ({int(outside.sum())} outside)" if outside.any() else "")
-    axes.plot(*fixes[wrong].T, "X", color=WRONG, markersize=6.5, zorder=6, label=label)
-    axes.plot(*truth[none].T, color=TRUTH, markersize=4.5, label="truth, no fix", **ring)
+    axes.plot(*fixes[wrong].T, "X", color=WRONG, markersize=6.5, zorder=6, label=_if(label, wrong))
+    axes.plot(*truth[none].T, color=TRUTH, markersize=4.5, label=_if("truth, no fix", none), **ring)
 
 
 def _draw_criterion(axes: "Axes", curve: CriterionCurve) -> None:
@@ -186,7 +223,7 @@ def _draw_thresholds(axes: "Axes", metrics: Metrics) -> None:
     rows = [row for row in metrics.criteria if math.isfinite(row.accuracy)]
     rows.sort(key=lambda row: list(CURVE_STYLES).index(row.name))
     spots = [(100 * row.share_kept, 100 * row.accuracy) for row in rows]
-    at_pt = axes.transData.transform(np.reshape(spots, (-1, 2))) * 72 / DPI
+    at_pt = axes.transData.transform(np.reshape(spots, (-1, 2))) * 72 / axes.figure.dpi
     taken = [(x - 5, y - 5, x + 5, y + 5) for x, y in at_pt]
     for row, spot, (x, y) in zip(rows, spots, at_pt, strict=True):
         colour, _, mark, _ = CURVE_STYLES[row.name]
@@ -202,8 +239,8 @@ def _draw_thresholds(axes: "Axes", metrics: Metrics) -> None:
         place = (free or places)[0]
         taken.append(boxes[place])
         weight = "bold" if main else "normal"
-        note = axes.annotate(text, spot, place, **OFFSET, color=colour, weight=weight, zorder=5)
-        note.set_path_effects(halo())
+        looks: dict[str, Any] = {"color": colour, "weight": weight, "zorder": 3, "bbox": BACKING}
+        axes.annotate(text, spot, place, **OFFSET, **looks)
 
 
 def _overlap(one: tuple[float, ...], other: tuple[float, ...]) -> bool:

@@ -1,4 +1,4 @@
-"""Pictures of a track as PNG bytes.
+"""Pictures of a track.
 
 States differ by colour and by mark.
 """
@@ -10,23 +10,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthonav.evaluate.calibration import is_covariance, nees_bound
-from orthonav.evaluate.calibration_report import Picture
-from orthonav.evaluate.canvas import GREY, RIGHT, SOFT, TRUTH, WRONG, figure_png, png
 from orthonav.evaluate.figures import FloatArray, runs
-from orthonav.evaluate.ground import (
-    Background,
-    draw_background,
-    draw_north,
-    draw_scale_bar,
-    view_box,
-)
 from orthonav.evaluate.metrics import Comparison
+from orthonav.evaluate.plots import view_box
 from orthonav.evaluate.track import SURE, Series, Track
 from orthonav.evaluate.track_report import consistency_said, spread_said
+from orthonav.report.canvas import (
+    GREY,
+    RIGHT,
+    SOFT,
+    TRUTH,
+    WRONG,
+    Drawing,
+    draw_axes,
+    draw_figure,
+)
+from orthonav.report.figures import Figure
+from orthonav.report.ground import Background, draw_map, map_size_in
 
 if TYPE_CHECKING:
+    from matplotlib import figure as mpl
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 STATE_STYLES = {
     "searching": ("#E69F00", "^"),
@@ -39,41 +43,45 @@ _ERROR_FLOOR_M = 0.1  # a log axis has no zero
 _LEGEND: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "frameon": False}
 
 
-def track_pictures(
+def track_figures(
     comparison: Comparison, track: Track, radius_m: float, background: Background | None
-) -> list[Picture]:
+) -> list[Figure]:
     """Track on the map; error, state and confidence; errors along and across; what was learnt."""
     series, found = track.series, track.consistency
-    pictures = [
-        (
-            track_map_picture(comparison, series, radius_m, background),
+    figures = [
+        Figure(
+            "track-map",
             f"Track of {track.n_compared} views with a true position, coloured by state",
             "From above, north up: the true way, and where the track had the aircraft. Ellipses "
             f"hold 95 %; a line leads to the truth from what is more than {radius_m:g} m off.",
+            track_map_picture(comparison, series, radius_m, background),
         ),
-        (
-            error_picture(comparison, series, radius_m),
+        Figure(
+            "track-error",
             f"Error and its own bounds over time, state and confidence; {consistency_said(found)}",
             "Error against what the track says of it (longer axis of the covariance), state, and "
             "confidence.",
+            error_picture(comparison, series, radius_m),
         ),
-        (
-            signed_picture(series),
+        Figure(
+            "track-ahead-and-right",
             f"Errors ahead of the truth: {spread_said(track.along)}; "
             f"to the right of it: {spread_said(track.across)}",
             "Errors ahead and to the right of the truth. What is wrong with heading or mount "
             "stays the same here, wherever the aircraft flies.",
+            signed_picture(series),
         ),
     ]
     if any(np.isfinite(values).any() for values in series.biases.values()):
-        pictures.append(
-            (
-                biases_picture(series),
+        figures.append(
+            Figure(
+                "track-learnt",
                 "What the track learnt to be wrong with told heading, height and lean, over time",
                 "What was learnt to be wrong with what is told: to be added to it.",
+                biases_picture(series),
             )
         )
-    return pictures
+    return figures
 
 
 def track_map_picture(
@@ -81,18 +89,14 @@ def track_map_picture(
     series: Series,
     radius_m: float,
     background: Background | None = None,
-) -> bytes:
+) -> Drawing:
     """True way, estimates coloured by state, 95 % ellipses of some, lines from wrong ones."""
     box = view_box(comparison, radius_m)
-    width_m, height_m = box[1] - box[0], box[3] - box[2]
-    scale = 8.5 / max(width_m, height_m)
-    size_in = (max(scale * width_m, 4.0) + 1.0, max(scale * height_m, 3.0) + 1.0)
     wrong = comparison.errors_m > radius_m
     size = 7.0 if len(series.states) < 120 else 5.0
 
     def draw(axes: "Axes") -> None:
-        if background is not None:
-            draw_background(axes, background, box)
+        draw_map(axes, box, background)
         lines = np.full((3 * int(wrong.sum()), 2), np.nan)  # truth, estimate, pen up
         lines[0::3], lines[1::3] = comparison.truth_en_m[wrong], comparison.fix_en_m[wrong]
         axes.plot(*lines.T, color=WRONG, linewidth=1.8 if wrong.sum() < 30 else 0.9, zorder=3)
@@ -105,22 +109,18 @@ def track_map_picture(
             if here.any():
                 at = comparison.fix_en_m[here].T
                 axes.plot(*at, mark, color=colour, linestyle="none", label=state, **marks)
-        axes.set(xlim=box[:2], ylim=box[2:], aspect="equal")
-        axes.set(xlabel="east (m)", ylabel="north (m)")
-        draw_scale_bar(axes, box)
-        draw_north(axes)
         axes.legend(ncols=4, **_LEGEND)
 
-    return png(size_in, draw)
+    return draw_axes(map_size_in(box, 8.5, (4.0, 3.0)), draw)
 
 
 _TRUTH: dict[str, Any] = {"color": TRUTH, "linewidth": 1.4, "markersize": 2.5, "zorder": 4}
 
 
-def error_picture(comparison: Comparison, series: Series, radius_m: float) -> bytes:
+def error_picture(comparison: Comparison, series: Series, radius_m: float) -> Drawing:
     """Error with 1 sigma and 95 % of its own, state as a band, confidence; one time axis."""
 
-    def draw(figure: "Figure") -> None:
+    def draw(figure: "mpl.Figure") -> None:
         above, band, below = figure.subplots(3, 1, sharex=True, height_ratios=(6, 0.5, 2))
         x, name = _axis(series)
         _draw_errors(above, x, comparison.errors_m, series, radius_m)
@@ -132,13 +132,13 @@ def error_picture(comparison: Comparison, series: Series, radius_m: float) -> by
         below.set_xlim(*_limits(x))
         figure.align_ylabels([above, below])
 
-    return figure_png((10.5, 5.2), draw)
+    return draw_figure((10.5, 5.2), draw)
 
 
-def signed_picture(series: Series) -> bytes:
+def signed_picture(series: Series) -> Drawing:
     """Errors ahead of and to the right of the truth over time; the scale is that of tracking."""
 
-    def draw(figure: "Figure") -> None:
+    def draw(figure: "mpl.Figure") -> None:
         parts = figure.subplots(2, 1, sharex=True)
         x, name = _axis(series)
         tracking = np.array([state == "tracking" for state in series.states])
@@ -162,10 +162,10 @@ def signed_picture(series: Series) -> bytes:
         parts[1].set(xlabel=name)
         parts[1].set_xlim(*_limits(x))
 
-    return figure_png((6.2, 4.6), draw)
+    return draw_figure((6.2, 4.6), draw)
 
 
-def biases_picture(series: Series) -> bytes:
+def biases_picture(series: Series) -> Drawing:
     """What was learnt to be wrong with heading, height and lean, over time; only what is there."""
     scale = 100.0 * np.expm1(np.clip(series.biases["log_scale_bias"], -5.0, 5.0))
     lean = {
@@ -179,7 +179,7 @@ def biases_picture(series: Series) -> bytes:
     ]
     panels = [p for p in panels if any(np.isfinite(v).any() for v in p[1].values())]
 
-    def draw(figure: "Figure") -> None:
+    def draw(figure: "mpl.Figure") -> None:
         parts = np.atleast_1d(np.asarray(figure.subplots(len(panels), 1, sharex=True)))
         x, name = _axis(series)
         for axes, (said, curves) in zip(parts, panels, strict=True):
@@ -193,7 +193,7 @@ def biases_picture(series: Series) -> bytes:
         parts[-1].set_xlim(*_limits(x))
         figure.align_ylabels()
 
-    return figure_png((6.2, 4.6), draw)
+    return draw_figure((6.2, 4.6), draw)
 
 
 def _draw_ellipses(

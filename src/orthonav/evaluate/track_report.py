@@ -5,10 +5,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from orthonav.evaluate.calibration import nees_bound
-from orthonav.evaluate.figures import FloatArray, or_none, percent_text
+from orthonav.evaluate.figures import FloatArray, or_none
 from orthonav.evaluate.metrics import radius_key
 from orthonav.evaluate.track import Consistency, Longest, Series, Spread, Track
 from orthonav.publish.jsonl import STATES
+from orthonav.report.numbers import percent_text
 
 
 def track_rows(track: Track) -> tuple[tuple[str, str], ...]:

@@ -1,4 +1,4 @@
-"""Maps of an evaluation: what part is seen, the picture below, scale bar and north arrow."""
+"""Maps in reports: the picture below, scale bar and north arrow."""
 
 import math
 from dataclasses import dataclass
@@ -7,21 +7,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.evaluate.canvas import DPI, INK, OFFSET
-from orthonav.evaluate.figures import BoolArray, FloatArray
-from orthonav.evaluate.metrics import Comparison
+from orthonav.report.canvas import BACKING, INK, OFFSET
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _BACKGROUND_LEVELS = 16  # few grey levels keep the PNG small
+_BACKGROUND_MOST_PX = 825  # along its longer side; finer ones are made coarser
 
 
 @dataclass(frozen=True, eq=False)
 class Background:
     """A grey picture under the map: `grey` (rows, columns) uint8, north up.
 
-    Its outer edges are in metres east and north in the plane of the comparison it is drawn under.
+    Its outer edges are in metres east and north in the plane of what is drawn over it.
     """
 
     grey: NDArray[np.uint8]
@@ -31,27 +30,26 @@ class Background:
     north_m: float
 
 
-def view_box(comparison: Comparison, radius_m: float) -> tuple[float, float, float, float]:
-    """West, east, south, north: the flight, and what of its fixes is near to it."""
-    truth, fixes = comparison.truth_en_m, comparison.fix_en_m
-    low, high = truth.min(axis=0), truth.max(axis=0)
-    reach = max(float((high - low).max()) * 0.35, 5 * radius_m)
-    near = inside_box(fixes, (low[0] - reach, high[0] + reach, low[1] - reach, high[1] + reach))
-    seen = np.concatenate([truth, fixes[near]])
-    low, high = seen.min(axis=0), seen.max(axis=0)
-    side = max(float((high - low).max()), 4 * radius_m)
-    middle = (low + high) / 2
-    half = np.maximum((high - low) / 2 + 0.06 * side, 0.3 * side)
-    west, south = (float(value) for value in middle - half)
-    east, north = (float(value) for value in middle + half)
-    return west, east, south, north
+def draw_map(axes: "Axes", box: tuple[float, ...], background: Background | None = None) -> None:
+    """The ground of a map: axes in metres, north up, the picture below, scale bar and arrow.
+
+    `box` is what is seen: west, east, south, north in metres.
+    """
+    if background is not None:
+        draw_background(axes, background, box)
+    axes.set(xlim=box[:2], ylim=box[2:], aspect="equal")
+    axes.set(xlabel="east (m)", ylabel="north (m)")
+    draw_scale_bar(axes, box)
+    draw_north(axes)
 
 
-def inside_box(positions_en_m: FloatArray, box: tuple[float, ...]) -> BoolArray:
-    """Which of positions (N, 2) lie in a box: west, east, south, north."""
-    east, north = positions_en_m.T
-    inside: BoolArray = (box[0] <= east) & (east <= box[1]) & (box[2] <= north) & (north <= box[3])
-    return inside
+def map_size_in(
+    box: tuple[float, ...], longest_in: float, least_in: tuple[float, float] = (3.0, 3.0)
+) -> tuple[float, float]:
+    """Width and height in inches of a drawing of `box`, an inch for the axes included."""
+    width_m, height_m = box[1] - box[0], box[3] - box[2]
+    scale = longest_in / max(width_m, height_m)
+    return max(scale * width_m, least_in[0]) + 1.0, max(scale * height_m, least_in[1]) + 1.0
 
 
 def draw_background(axes: "Axes", background: Background, box: tuple[float, ...]) -> None:
@@ -66,7 +64,7 @@ def draw_background(axes: "Axes", background: Background, box: tuple[float, ...]
     seen = background.grey[rows - above : rows - below, left:right]
     if seen.size == 0:
         return
-    step = max(1, math.ceil(max(seen.shape) / (7.5 * DPI)))
+    step = max(1, math.ceil(max(seen.shape) / _BACKGROUND_MOST_PX))
     seen = seen[: seen.shape[0] // step * step, : seen.shape[1] // step * step]
     coarse = seen.reshape(seen.shape[0] // step, step, -1, step).mean(axis=(1, 3))
     levels = np.round(coarse / 255 * (_BACKGROUND_LEVELS - 1)) / (_BACKGROUND_LEVELS - 1)
@@ -77,7 +75,7 @@ def draw_background(axes: "Axes", background: Background, box: tuple[float, ...]
         south + above * north_step,
     )
     axes.imshow(
-        0.45 + 0.55 * levels, cmap="gray", vmin=0, vmax=1, extent=extent, interpolation="nearest"
+        0.45 + 0.55 * levels, cmap="gray", vmin=0, vmax=1, extent=extent, interpolation="none"
     )
     axes.grid(visible=False)
 
@@ -90,9 +88,8 @@ def draw_scale_bar(axes: "Axes", box: tuple[float, ...]) -> None:
     for width, colour in ((6, "white"), (3, INK)):
         axes.plot([x, x + length_m], [y, y], color=colour, linewidth=width, zorder=8)
     text = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
-    backing = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5}
     axes.annotate(
-        text, (x + length_m / 2, y), (0, 6), **OFFSET, ha="center", zorder=8, bbox=backing
+        text, (x + length_m / 2, y), (0, 6), **OFFSET, ha="center", zorder=8, bbox=BACKING
     )
 
 
@@ -107,7 +104,7 @@ def draw_north(axes: "Axes") -> None:
         weight="bold",
         zorder=8,
         arrowprops={"arrowstyle": "-|>", "color": INK, "linewidth": 1.6, "shrinkA": 1},
-        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5},
+        bbox=BACKING,
     )
 
 

@@ -1,0 +1,166 @@
+"""Evaluated flights: their figures as a table, as lines for a terminal and as JSON values."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from orthonav.evaluate.calibration_report import (
+    calibration_lines,
+    calibration_to_json,
+    consistency_to_json,
+    row_to_json,
+)
+from orthonav.evaluate.contact_sheet import Row
+from orthonav.evaluate.figures import or_none
+from orthonav.evaluate.metrics import Comparison, Metrics, measure, pool, radius_key
+from orthonav.evaluate.track import Track
+from orthonav.evaluate.track_report import track_lines, track_to_json, tracks_to_json
+from orthonav.report.ground import Background
+from orthonav.report.numbers import measure_text, percent_text
+
+_COLUMNS = (
+    "flight",
+    "views",
+    "fixes",
+    "coverage",
+    "right",  # named after the radius
+    "of fixes",
+    "median m",
+    "95 % m",
+    "mean m",
+    "max m",
+    "latency ms",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class FlightReport:
+    """One evaluated flight: its name, its results beside the truth, and the figures of those.
+
+    `background` is in the plane of `comparison`; see `orthonav.report.ground.Background`. `track`
+    is None where views were placed one by one, `worst` empty where pictures were not asked for.
+    """
+
+    name: str
+    comparison: Comparison
+    metrics: Metrics
+    background: Background | None = None
+    track: Track | None = None
+    worst: tuple[Row, ...] = ()
+
+
+def total(flights: Sequence[FlightReport]) -> Metrics:
+    """Figures of all views of all flights together.
+
+    Raises `ValueError` for no flight, and where flights were measured at different radii.
+    """
+    if len({flight.metrics.radius_m for flight in flights}) != 1:
+        raise ValueError("a total needs at least one flight, and one radius for all of them")
+    if len(flights) == 1:
+        return flights[0].metrics
+    first = flights[0].metrics
+    return measure(pool([f.comparison for f in flights]), first.radius_m, list(first.acc_at_m))
+
+
+def table(flights: Sequence[FlightReport]) -> str:
+    """The figures in aligned columns for a terminal: a row per flight, and a total of several."""
+    rows = [table_header(flights), *table_rows(flights)]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(_COLUMNS))]
+    lines = []
+    for row in rows:
+        first, *others = zip(row, widths, strict=True)
+        cells = [first[0].ljust(first[1]), *(text.rjust(width) for text, width in others)]
+        lines.append("  ".join(cells).rstrip())
+    if len(flights) > 1:
+        lines.insert(-1, "-" * max(map(len, lines)))
+    return "\n".join(lines)
+
+
+def metrics_to_json(metrics: Metrics) -> dict[str, object]:
+    """`metrics` as values for strict JSON; what is not defined becomes None."""
+    return {
+        "n_views": metrics.n_views,
+        "n_fixes": metrics.n_fixes,
+        "n_without_truth": metrics.n_without_truth,
+        "n_without_result": metrics.n_without_result,
+        "radius_m": metrics.radius_m,
+        "coverage": or_none(metrics.coverage),
+        **{radius_key(r): or_none(share) for r, share in metrics.acc_at_m.items()},
+        **{f"fixes_{radius_key(r)}": or_none(s) for r, s in metrics.acc_fixes_at_m.items()},
+        "error_median_m": or_none(metrics.error_median_m),
+        "error_p95_m": or_none(metrics.error_p95_m),
+        "error_mean_m": or_none(metrics.error_mean_m),
+        "error_max_m": or_none(metrics.error_max_m),
+        "latency_median_ms": or_none(metrics.latency_median_ms),
+        "latency_p95_ms": or_none(metrics.latency_p95_ms),
+        "reasons": dict(metrics.reasons),
+        "criteria": [row_to_json(row) for row in metrics.criteria],
+        "curves": {
+            curve.name: {
+                "threshold": [or_none(value) for value in curve.thresholds],
+                "share_kept": curve.share_kept.tolist(),
+                "accuracy": curve.accuracy.tolist(),
+            }
+            for curve in metrics.curves
+        },
+        "calibration": calibration_to_json(metrics.calibration),
+        "covariance": consistency_to_json(metrics.consistency),
+    }
+
+
+def flights_to_json(flights: Sequence[FlightReport]) -> dict[str, Any]:
+    """The figures of all flights together, and of several also of each, for strict JSON.
+
+    A track's figures are those of its flight: only what adds up is told of several. Raises
+    `ValueError` as `total` does.
+    """
+    plain = metrics_to_json(total(flights))
+    if len(flights) == 1:
+        track = flights[0].track
+        return plain if track is None else {**plain, "track": track_to_json(track)}
+    tracks = [flight.track for flight in flights if flight.track is not None]
+    if tracks:
+        plain["track"] = tracks_to_json(tracks)
+    plain["flights"] = {flight.name: flights_to_json([flight]) for flight in flights}
+    return plain
+
+
+def summary(flights: Sequence[FlightReport]) -> str:
+    """How far confidence and covariance can be believed, in lines for a terminal, of all flights;
+    and how each track held.
+
+    Raises `ValueError` as `total` does.
+    """
+    lines = calibration_lines(total(flights))
+    for flight in flights:
+        if flight.track is not None:
+            lines += track_lines(flight.track, flight.name if len(flights) > 1 else "")
+    return "\n".join(lines)
+
+
+def table_header(flights: Sequence[FlightReport]) -> list[str]:
+    """Names of the columns."""
+    radius_m = total(flights).radius_m
+    return [f"acc@{radius_m:g} m" if name == "right" else name for name in _COLUMNS]
+
+
+def table_rows(flights: Sequence[FlightReport]) -> list[list[str]]:
+    """A row per flight, and the total of several."""
+    rows = [_row(flight.name, flight.metrics) for flight in flights]
+    return rows if len(flights) == 1 else [*rows, _row("total", total(flights))]
+
+
+def _row(name: str, metrics: Metrics) -> list[str]:
+    return [
+        " ".join(name.split()),
+        str(metrics.n_views),
+        str(metrics.n_fixes),
+        percent_text(metrics.coverage),
+        percent_text(metrics.accuracy),
+        percent_text(metrics.accuracy_of_fixes),
+        measure_text(metrics.error_median_m),
+        measure_text(metrics.error_p95_m),
+        measure_text(metrics.error_mean_m),
+        measure_text(metrics.error_max_m),
+        measure_text(metrics.latency_median_ms),
+    ]

@@ -1,0 +1,127 @@
+"""What all drawings share: colours, style, and the way to PNG and SVG.
+
+Drawn on matplotlib's own canvases without pyplot, so nothing global is kept and no display needed.
+Colours are those of Okabe and Ito, told apart by everyone.
+"""
+
+import io
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import MissingExtraError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+RIGHT, WRONG, TRUTH, GREY, INK = "#0072B2", "#D55E00", "#1A1A1A", "#8C8C8C", "#222222"
+SOFT = "#555555"
+DPI = 220
+"""Of the PNG: twice what a screen shows in the page, and enough for a paper."""
+MOST_POINTS = 20_000
+"""Lines of more points are pixels in the SVG too, which would be too large to open."""
+OFFSET: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9}
+"""Of a note beside a point: its place is in points from there."""
+BACKING: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5}
+"""Box (`bbox`) that keeps a text readable on what is below it, and a text in the SVG."""
+_STYLE: dict[Any, Any] = {
+    "font.size": 10,
+    "axes.edgecolor": GREY,
+    "axes.labelcolor": INK,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.color": "#E3E3E3",
+    "grid.linewidth": 0.8,
+    "text.color": INK,
+    "xtick.color": "#555555",
+    "ytick.color": "#555555",
+    "legend.frameon": True,
+    "legend.framealpha": 0.9,
+    "legend.edgecolor": "#DDDDDD",
+    "legend.fontsize": 9,
+    "svg.fonttype": "none",  # text stays text
+    "svg.hashsalt": "orthonav",  # names inside the file are the same every time
+}
+_NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+_NO_METADATA = {"Date": None, "Creator": None}
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """One drawing in both forms: a PNG of `DPI` with a palette, and SVG text.
+
+    `size_in` is width and height in inches. The same drawing gives the same bytes.
+    """
+
+    png: bytes
+    svg: str
+    size_in: tuple[float, float]
+
+
+def draw_axes(size_in: tuple[float, float], draw: "Callable[[Axes], None]") -> Drawing:
+    """What `draw` puts on one pair of axes; `size_in` in inches. Raises as `draw_figure` does."""
+    return draw_figure(size_in, lambda figure: draw(figure.add_subplot()))
+
+
+def draw_figure(size_in: tuple[float, float], draw: "Callable[[Figure], None]") -> Drawing:
+    """What `draw` puts on a figure of matplotlib of `size_in` inches.
+
+    Raises `MissingExtraError` without matplotlib.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtraError(
+            "pictures need matplotlib, which is not installed: pip install 'orthonav[report]'"
+        ) from error
+    svg = io.StringIO()
+    with _own_style():
+        figure = Figure(figsize=size_in, dpi=DPI, layout="constrained")
+        canvas: Any = FigureCanvasAgg(figure)
+        draw(figure)
+        canvas.draw()
+        png = _png(np.asarray(canvas.buffer_rgba()))
+        figure.set_layout_engine("none")  # both forms are laid out alike, and once
+        _limit_points(figure)
+        figure.savefig(svg, format="svg", dpi=DPI, metadata=_NO_METADATA)
+    return Drawing(png, _NOT_XML.sub("\ufffd", svg.getvalue()), size_in)
+
+
+def _png(rgba: NDArray[np.uint8]) -> bytes:
+    """An opaque picture (H, W, 4) as PNG with a palette."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    image = Image.fromarray(rgba).convert("RGB").quantize(colors=256)
+    image.save(out, format="PNG", compress_level=6, dpi=(DPI, DPI))
+    return out.getvalue()
+
+
+def _limit_points(figure: "Figure") -> None:
+    """Lines of many points become pixels."""
+    for line in (line for axes in figure.axes for line in axes.lines):
+        if np.size(line.get_xdata()) > MOST_POINTS:
+            line.set_rasterized(True)
+
+
+@contextmanager
+def _own_style() -> Iterator[None]:
+    """matplotlib's defaults and our style, whatever the user's own settings are."""
+    import matplotlib
+
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        # A name in a script that the font of the PNG lacks is shown as boxes there.
+        warnings.filterwarnings("ignore", "Glyph .* missing from")
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_STYLE)
+        yield

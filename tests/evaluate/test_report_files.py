@@ -1,0 +1,135 @@
+"""The folder of a report: the page, and its figures beside it."""
+
+import itertools
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthonav.errors import MissingExtraError, OutputError
+from orthonav.evaluate.flights import FlightReport
+from orthonav.evaluate.metrics import compare, measure
+from orthonav.evaluate.report import write_report
+from orthonav.geo.frames import LocalFrame
+from orthonav.records import Fix, NoFix, ViewResult
+from orthonav.report.figures import LIST
+
+CENTRE = LocalFrame(48.0, -4.5)
+GENERAL = {"map", "error-over-time", "error-curve", "kept-against-accuracy"}
+OF_ALL = {"error-curve", "kept-against-accuracy", "reliability", "covariance"}
+
+
+def flown(name: str, times_ns: tuple[int, ...] = tuple(range(0, 12_000_000_000, 1_000_000_000))):
+    """A flight to the east, every fourth view without a fix."""
+    truth, results = {}, []
+    for i, time_ns in enumerate(times_ns):
+        lat, lon = (float(x) for x in CENTRE.latlon_from_en(np.array([20.0 * i, 0.0])))
+        truth[f"{i}.jpg"] = (lat, lon)
+        fix = Fix(lat + 1e-5, lon, np.eye(2), 0.9, 15.0, 0.0, 100.0, {"peak_ratio": 1.4})
+        outcome = NoFix("blank", "") if i % 4 == 3 else fix
+        results.append(ViewResult(f"{i}.jpg", time_ns, outcome, 40.0))
+    comparison = compare(truth, results, CENTRE)
+    return FlightReport(name, comparison, measure(comparison))
+
+
+def stems(folder: Path) -> set[str]:
+    found = {path.name for path in (folder / "figures").iterdir()} - {LIST}
+    pairs = {Path(name).stem for name in found}
+    assert found == {f"{stem}.{kind}" for stem in pairs for kind in ("svg", "png")}
+    return pairs
+
+
+def test_every_figure_of_the_page_is_a_file(tmp_path: Path, coarse) -> None:
+    page = write_report(tmp_path, [flown("one")]).read_text("utf-8")
+    assert stems(tmp_path) == GENERAL | OF_ALL
+    assert page.count("<img") == len(GENERAL | OF_ALL)
+    for tag in re.findall(r"<img[^>]{0,400}", page):
+        assert re.match(r'<img alt="one: [^"]{20,}" width="\d+" height="\d+" src="data:', tag)
+
+
+def test_figures_are_alike_in_every_run(tmp_path: Path, coarse) -> None:
+    for folder in ("a", "b"):
+        write_report(tmp_path / folder, [flown("one")])
+    a, b = ({p.name: p.read_bytes() for p in (tmp_path / x).rglob("*.*g")} for x in "ab")
+    assert a == b and len(a) == 12
+    pages = [(tmp_path / x / "index.html").read_bytes() for x in "ab"]
+    assert pages[0] == pages[1]
+
+
+def test_files_of_several_flights_carry_their_names(tmp_path: Path, only_new) -> None:
+    flights = [flown("../x"), flown("a b"), flown("all flights")]
+    page = write_report(tmp_path / "report", flights).read_text("utf-8")
+    each = GENERAL | OF_ALL
+    assert stems(tmp_path / "report") == {
+        *(f"{name}--{figure}" for name in ("x", "a-b", "all-flights") for figure in each),
+        *(f"all-flights-2--{figure}" for figure in OF_ALL),
+    }
+    assert [path.name for path in tmp_path.iterdir()] == ["report"]
+    for place in re.findall(r'href="#([^"]+)"', page):
+        assert page.count(f'id="{place}"') == 1
+    assert page.count('href="#') == 4
+
+
+def test_a_rerun_leaves_no_stale_figures_and_all_other_files(tmp_path: Path, only_new) -> None:
+    write_report(tmp_path, [flown("one"), flown("two")])
+    (tmp_path / "figures" / "paper.svg").write_text("mine")
+    (tmp_path / "notes.txt").write_text("mine")
+    write_report(tmp_path, [flown("one")])
+    (tmp_path / "figures" / "paper.svg").rename(tmp_path / "paper.svg")
+    assert stems(tmp_path) == GENERAL | OF_ALL
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["figures", "index.html", "notes.txt", "paper.svg"]
+
+
+def test_a_page_stays_as_it_is_where_figures_cannot_be_written(tmp_path: Path, only_new) -> None:
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "map.png").write_bytes(b"mine")
+    (tmp_path / "index.html").write_text("before")
+    with pytest.raises(OutputError, match=r"map\.png"):
+        write_report(tmp_path, [flown("one")])
+    assert (tmp_path / "index.html").read_text() == "before"
+
+
+def test_nothing_is_written_without_matplotlib(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(MissingExtraError, match=r"orthonav\[report\]"):
+        write_report(tmp_path / "report", [flown("one")])
+    assert not list(tmp_path.iterdir())
+
+
+def test_headings_are_in_order_and_tables_have_names(tmp_path: Path, only_new) -> None:
+    page = write_report(tmp_path, [flown("one"), flown("two")]).read_text("utf-8")
+    levels = [int(level) for level in re.findall(r"<h(\d)", page)]
+    assert levels[0] == 1 and levels.count(1) == 1
+    assert all(after - before <= 1 for before, after in itertools.pairwise(levels))
+    assert (
+        'aria-label="table"' not in page and page.count("<table>") == page.count("aria-label") - 1
+    )
+    assert "<header" in page and "Evaluation of 2 flights" in page
+
+
+@pytest.mark.parametrize(
+    ("times_ns", "said"),
+    [
+        ((0, 500_000_000, 2_000_000_000, 3_000_000_000), "time since the first view (s)"),
+        ((3, 2, 1, 0), "view, in order of the flight"),
+        ((7,), "time since the first view (s)"),
+    ],
+)
+def test_errors_are_over_time_where_it_is_known(tmp_path: Path, times_ns, said, coarse) -> None:
+    write_report(tmp_path, [flown("one", times_ns)])
+    svg = (tmp_path / "figures" / "error-over-time.svg").read_text()
+    assert f">{said}<" in svg
+    assert (">no fix<" in svg) == (len(times_ns) == 4)
+
+
+def test_the_legend_names_what_is_there(tmp_path: Path, coarse) -> None:
+    flight = flown("one")
+    far = replace(flight, metrics=measure(flight.comparison, 0.5))
+    for folder, made, there in (("right", flight, "right fix"), ("wrong", far, "wrong fix")):
+        write_report(tmp_path / folder, [made])
+        svg = (tmp_path / folder / "figures" / "map.svg").read_text()
+        assert [name for name in ("right fix", "wrong fix") if f">{name}<" in svg] == [there]

@@ -1,0 +1,276 @@
+"""Pieces of report pages, drawings in both forms, and figures as files."""
+
+import errno
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+import pytest
+
+from orthonav.errors import MissingExtraError, OutputError
+from orthonav.report import (
+    Background,
+    Drawing,
+    Figure,
+    cards,
+    definitions,
+    document,
+    draw_axes,
+    draw_map,
+    figure_html,
+    file_names,
+    html_table,
+    map_size_in,
+    measure_text,
+    notes,
+    pictures,
+    write_figures,
+    write_page,
+)
+from orthonav.report.figures import LIST
+
+
+def figure(name: str, content: str = "a") -> Figure:
+    drawing = Drawing(f"png {content}".encode(), f"<svg>{content}</svg>", (6.2, 4.0))
+    return Figure(name, f"alt of {name}", f"caption of {name}", drawing)
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in (folder / "figures").iterdir())
+
+
+def drawn_map() -> Drawing:
+    box = (0.0, 900.0, 0.0, 600.0)
+    background = Background(np.full((60, 90), 200, np.uint8), *(box[0], box[2], box[1], box[3]))
+
+    def draw(axes) -> None:
+        draw_map(axes, box, background)
+        axes.plot([100, 800], [100, 500], label="way < 1 & more")
+        axes.legend()
+
+    return draw_axes(map_size_in(box, 4.0), draw)
+
+
+# Drawings.
+
+
+def test_a_drawing_has_both_forms_and_its_text_is_text() -> None:
+    drawing = drawn_map()
+    image = cv2.imdecode(np.frombuffer(drawing.png, np.uint8), cv2.IMREAD_COLOR)
+    assert drawing.size_in == (5.0, 4.0)
+    assert image.shape == (880, 1100, 3)
+    found = ElementTree.fromstring(drawing.svg).iter("{http://www.w3.org/2000/svg}text")
+    texts = ["".join(each.itertext()) for each in found]
+    assert {"N", "100 m", "east (m)", "way < 1 & more"} <= set(texts)
+
+
+def test_drawings_are_alike_in_every_process() -> None:
+    code = (
+        "import hashlib, sys; sys.path.insert(0, sys.argv[1]); import test_report_pieces as tests;"
+        "d = tests.drawn_map(); print(hashlib.sha256(d.png + d.svg.encode()).hexdigest())"
+    )
+    runs = [
+        subprocess.run(
+            [sys.executable, "-c", code, str(Path(__file__).parent)],
+            check=True,
+            capture_output=True,
+            env={"PYTHONHASHSEED": seed, "SOURCE_DATE_EPOCH": seed},
+            text=True,
+        ).stdout
+        for seed in ("1", "2")
+    ]
+    assert runs[0] == runs[1] and len(runs[0]) == 65
+    assert "date" not in drawn_map().svg.lower()
+
+
+def test_a_drawing_of_very_many_points_stays_small() -> None:
+    random = np.random.default_rng(1).random((2, 60_000))
+    drawing = draw_axes((4.0, 3.0), lambda axes: axes.plot(*random, "."))
+    assert len(drawing.svg) < 400_000 and "<image" in drawing.svg
+
+
+def test_texts_that_xml_does_not_know_do_no_harm() -> None:
+    drawing = draw_axes((3.0, 2.0), lambda axes: axes.set_title("a\x01b 日本", parse_math=False))
+    assert "日本" in "".join(ElementTree.fromstring(drawing.svg).itertext())
+
+
+def test_without_matplotlib_the_remedy_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("matplotlib.figure", "matplotlib.backends.backend_agg"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'orthonav\[report\]'"):
+        draw_axes((1.0, 1.0), lambda axes: None)
+
+
+def test_importing_does_not_import_matplotlib() -> None:
+    code = "import sys, orthonav.report; assert not {'matplotlib', 'PIL', 'cv2'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# Files.
+
+
+def test_figures_are_written_with_a_list_that_sha256sum_reads(tmp_path: Path) -> None:
+    paths = write_figures(tmp_path / "new" / "report", [figure("map"), figure("error-curve")])
+    assert [path.name for path in paths] == [
+        *("map.svg", "map.png"),
+        *("error-curve.svg", "error-curve.png"),
+    ]
+    assert paths[0].read_text() == "<svg>a</svg>" and paths[1].read_bytes() == b"png a"
+    listed = (paths[0].parent / LIST).read_text().splitlines()
+    found = [f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.name}" for p in paths]
+    assert sorted(listed) == sorted(found)
+
+
+def test_a_rerun_replaces_figures_and_removes_stale_ones(tmp_path: Path) -> None:
+    write_figures(tmp_path, [figure("map"), figure("old")])
+    (tmp_path / "figures" / "notes.txt").write_text("mine")
+    (tmp_path / "figures" / "mine.png").write_bytes(b"mine")
+    write_figures(tmp_path, [figure("map", "b")])
+    assert names(tmp_path) == ["map.png", "map.svg", "mine.png", "notes.txt", LIST]
+    assert (tmp_path / "figures" / "map.svg").read_text() == "<svg>b</svg>"
+
+
+def test_a_stale_figure_that_was_changed_is_kept(tmp_path: Path) -> None:
+    write_figures(tmp_path, [figure("map"), figure("old")])
+    (tmp_path / "figures" / "old.svg").write_text("drawn over by hand")
+    write_figures(tmp_path, [figure("map")])
+    assert names(tmp_path) == ["map.png", "map.svg", "old.svg", LIST]
+
+
+@pytest.mark.parametrize("before", [[], [figure("map")]])
+def test_a_file_that_is_not_ours_is_not_written_over(tmp_path: Path, before) -> None:
+    write_figures(tmp_path, [figure("other"), *before])
+    (tmp_path / "figures" / "map.svg").write_text("drawn by hand")
+    kept = names(tmp_path)
+    with pytest.raises(OutputError, match=r"not written by orthonav.*map\.svg$"):
+        write_figures(tmp_path, [figure("map", "b"), figure("new")])
+    assert names(tmp_path) == kept
+    assert (tmp_path / "figures" / "map.svg").read_text() == "drawn by hand"
+
+
+def test_links_are_not_ours(tmp_path: Path) -> None:
+    write_figures(tmp_path, [figure("map")])
+    outside = tmp_path / "outside.svg"
+    (tmp_path / "figures" / "map.svg").rename(outside)
+    (tmp_path / "figures" / "map.svg").symlink_to(outside)
+    with pytest.raises(OutputError, match=r"map\.svg"):
+        write_figures(tmp_path, [figure("map", "b")])
+    write_figures(tmp_path, [figure("new")])
+    assert outside.read_text() == "<svg>a</svg>"
+    assert (tmp_path / "figures" / "map.svg").is_symlink()
+
+
+def test_a_list_of_others_leads_nowhere(tmp_path: Path) -> None:
+    victim = tmp_path / "victim.svg"
+    victim.write_text("kept")
+    total = hashlib.sha256(b"kept").hexdigest()
+    (tmp_path / "figures").mkdir()
+    lines = f"{total}  ../victim.svg\n{total}  {victim}\n\xff\n{total}  .\n"
+    (tmp_path / "figures" / LIST).write_text(lines, encoding="latin-1")
+    write_figures(tmp_path, [figure("map")])
+    assert victim.read_text() == "kept"
+
+
+@pytest.mark.parametrize("fails_at", [1, 3, 5])
+def test_where_there_is_no_room_all_stays_as_it_was(tmp_path: Path, monkeypatch, fails_at) -> None:
+    write_page(tmp_path, "before", [figure("a"), figure("stale")])
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
+    written = []
+
+    def failing(self: Path, data: bytes) -> int:
+        written.append(self)
+        if len(written) == fails_at:
+            raise OSError(errno.ENOSPC, "no space")
+        with self.open("wb") as stream:
+            return stream.write(data)
+
+    monkeypatch.setattr(Path, "write_bytes", failing)
+    with pytest.raises(OutputError, match="disk full"):
+        write_page(tmp_path, "after", [figure("a", "b"), figure("c", "b")])
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
+
+
+def test_a_run_that_was_cut_off_can_be_repeated(tmp_path: Path, monkeypatch) -> None:
+    write_figures(tmp_path, [figure("a"), figure("stale")])
+    renamed, replace = [], Path.replace
+
+    def failing(self: Path, target: Path) -> Path:
+        renamed.append(target)
+        if len(renamed) == 4:
+            raise KeyboardInterrupt
+        return replace(self, target)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "replace", failing)
+        with pytest.raises(KeyboardInterrupt):
+            write_figures(tmp_path, [figure("a", "b"), figure("c", "b")])
+    assert not [name for name in names(tmp_path) if name.startswith(".")]
+    assert len(names(tmp_path)) > 5
+    write_figures(tmp_path, [figure("a", "c"), figure("c", "c")])
+    assert names(tmp_path) == ["a.png", "a.svg", "c.png", "c.svg", LIST]
+
+
+def test_where_the_folder_cannot_be_it_is_said(tmp_path: Path) -> None:
+    (tmp_path / "figures").write_text("a file")
+    with pytest.raises(OutputError, match="figures"):
+        write_figures(tmp_path, [figure("map")])
+
+
+@pytest.mark.parametrize("name", ["", "../x", "a/b", ".hidden", "a b", "é", "-x", "a\n"])
+def test_names_that_are_no_file_names_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ValueError, match="plain file name"):
+        write_figures(tmp_path, [figure(name)])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_name_is_given_once(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="same name"):
+        write_figures(tmp_path, [figure("map"), figure("Map")])
+
+
+def test_nothing_is_written_for_no_figures(tmp_path: Path) -> None:
+    assert write_figures(tmp_path, []) == []
+    assert not list(tmp_path.iterdir())
+
+
+def test_names_of_files_are_safe_and_differ() -> None:
+    given = ["../x", "a b", "a  b", "A-B", "Île d'Yeu", "", "..", "é\udcff/\0", "日本", "x" * 300]
+    made = file_names(given)
+    assert made[:5] == ["x", "a-b", "a-b-2", "A-B-3", "Ile-d-Yeu"]
+    assert made[5:9] == ["flight", "flight-2", "e", "flight-3"] and len(made[9]) == 80
+    assert len({name.lower() for name in made}) == len(given)
+    assert not [name for name in made if "--" in name]
+    assert file_names(["a", "a", "a-2"]) == ["a", "a-2", "a-2-2"]
+
+
+# The page.
+
+
+def test_a_page_is_whole_and_its_text_is_escaped() -> None:
+    nasty = '<b onclick="x">&'
+    body = "".join(
+        (
+            cards([(nasty, nasty)]),
+            notes([nasty]),
+            html_table((nasty,), [(nasty,)], label=nasty),
+            definitions({nasty: nasty}),
+            pictures([figure_html(Figure("map", nasty, nasty, figure("map").drawing), broad=True)]),
+        )
+    )
+    page = document(nasty, body, kind=nasty)
+    assert "<b onclick" not in page and 'x"' not in page.replace("x&quot;", "")
+    assert page.count("<h1>") == 1 and '<html lang="en">' in page
+    assert page.index("<header") < page.index("<main>") < page.index("<h1>")
+    assert 'width="682" height="440"' in page and 'class="broad"' in page
+    assert "@media print" in page and "prefers-color-scheme: dark" in page
+
+
+@pytest.mark.parametrize(
+    ("value", "said"), [(1.26, "1.3 m"), (99.96, "100.0 m"), (123.4, "123 m"), (np.nan, "-")]
+)
+def test_measures_have_as_many_decimals_as_say_something(value: float, said: str) -> None:
+    assert measure_text(value, " m") == said
