@@ -34,6 +34,8 @@ PACKAGES = (
     "faiss-cpu",
     "scikit-image",
     "transformers",
+    "playwright",
+    "XStatic-Leaflet",
 )
 WILSON_Z = 1.2816
 """For 80 % intervals of shares, so that their p10 and p90 mean what those of timings mean."""

@@ -21,6 +21,7 @@ from benchmarks import (
     side_by_side,
     spent,
     tracking,
+    view_page,
 )
 from benchmarks.inputs import Workplace
 from benchmarks.record import Section, provenance, save, targets_table
@@ -36,6 +37,7 @@ SECTIONS: dict[str, Callable[[Workplace], Section]] = {
     "spent": spent.measure,
     "track": tracking.measure,
     "onboard": onboard.measure,
+    "page": view_page.measure,
 }
 
 

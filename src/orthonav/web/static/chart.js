@@ -1,10 +1,11 @@
 // The course of the run: error beside what the fixes say of themselves, confidence, state, health,
 // over time. The slider below it is the same for keyboards and screen readers.
 
-import { clock, colour, metres, stepOf } from "./look.js";
+import { Squares, clock, colour, metres, stepOf } from "./look.js";
 import { SURE } from "./store.js";
 
 const LEFT = 52;
+const MANY = 800;
 const BAND = 9;
 const GAP = 5;
 const FLOOR_M = 0.1; // a log axis has no zero
@@ -122,15 +123,25 @@ export class Chart {
     this.drawNow();
   }
 
-  /** Calls `mark` with every view that is seen, those that are not shown first. */
-  #each(mark) {
+  /** A point for every view that has a value, those that are not shown first, and faint. */
+  #points(context, values, y, kindOf) {
+    const { count, isShown } = this.store;
+    const side = count > MANY ? 2.6 : 4;
     for (const shown of [false, true]) {
-      for (let i = 0; i < this.store.count; i++) {
-        if (this.store.isShown[i] !== shown) continue;
+      const drawn = new Squares(this.box.clientWidth, this.box.clientHeight, 1);
+      context.globalAlpha = shown ? 1 : 0.15;
+      let last = "";
+      for (let i = 0; i < count; i++) {
         const x = this.xs[i];
-        if (x >= LEFT - 2 && x <= LEFT + this.width + 2) mark(i, x, shown);
+        if (isShown[i] !== shown || !(values[i] >= 0) || x < LEFT - 2 || x > LEFT + this.width + 2) continue;
+        const [at, kind] = [y(values[i]), kindOf(i)];
+        if (drawn.has(x, at, kind)) continue;
+        if (kind !== last) context.fillStyle = colour(kind);
+        last = kind;
+        context.fillRect(x - side / 2, at - side / 2, side, side);
       }
     }
+    context.globalAlpha = 1;
   }
 
   #errors(context, top, bottom) {
@@ -148,14 +159,8 @@ export class Chart {
     this.#lines(context, [this.store.run.radius_m], y, colour("wrong"), []);
     this.#lines(context, [0.1, 1, 10, 100, 1000, 10000].filter((v) => share(v) >= 0 && share(v) <= 1),
       y, colour("line"), [], metres);
-        this.#area(context, c.a, y, bottom);
-    this.#each((i, x, shown) => {
-      if (!(c.err[i] >= 0)) return;
-      context.globalAlpha = shown ? 1 : 0.15;
-      context.fillStyle = c.wrong[i] ? colour("wrong") : colour("ink");
-      context.fillRect(x - 1.2, Math.max(y(c.err[i]), top) - 1.2, 2.6, 2.6);
-    });
-    context.globalAlpha = 1;
+    this.#area(context, c.a, y, bottom);
+    this.#points(context, c.err, (v) => Math.max(y(v), top), (i) => (c.wrong[i] ? "wrong" : "ink"));
     this.#label(context, withTruth ? "error; shaded: 1 σ as stated" : "1 σ as stated", top + 10, LEFT + 5);
   }
 
@@ -180,13 +185,7 @@ export class Chart {
     const y = (v) => bottom - v * (bottom - top);
     this.#lines(context, [0, 1], y, colour("line"), []);
     this.#lines(context, [SURE], y, colour("soft"), [4, 3], () => "0.9");
-    this.#each((i, x, shown) => {
-      if (Number.isNaN(c.conf[i])) return;
-      context.globalAlpha = shown ? 1 : 0.15;
-      context.fillStyle = colour(this.store.state(i));
-      context.fillRect(x - 1.2, y(c.conf[i]) - 1.2, 2.6, 2.6);
-    });
-    context.globalAlpha = 1;
+    this.#points(context, c.conf, y, (i) => this.store.state(i));
     this.#label(context, "confidence", bottom - 3, LEFT + 5);
   }
 

@@ -32,6 +32,18 @@ export class Compare {
     this.timer = setTimeout(() => this.#load(i), soon ? WAIT_MS : 0);
   }
 
+  /** Shows none. */
+  clear() {
+    clearTimeout(this.timer);
+    this.asked += 1; // what is still to come is of a view that is gone
+    this.detail = undefined;
+    this.over?.remove();
+    this.over = null;
+    for (const part of ["compare", "no-compare", "overlay"]) this.find(part).hidden = true;
+    this.find("known").replaceChildren();
+    this.find("chosen-name").textContent = "No view yet";
+  }
+
   async #load(i) {
     const asked = ++this.asked;
     let detail;

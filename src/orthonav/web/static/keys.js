@@ -2,6 +2,7 @@
 // way of speech input.
 
 const TYPES = "input:not([type=range]):not([type=checkbox]), textarea, select";
+const MOVED_BY_KEYS = "#map, #opacity"; // the slider of the course is the same as the course
 const STORED = "orthonav-keys";
 
 export function listen(store, actions, root) {
@@ -32,7 +33,7 @@ export function listen(store, actions, root) {
     if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return;
     if (root.querySelector("dialog[open]") || event.target.closest(TYPES)) return;
     const moves = event.key.length > 1;
-    if (moves && event.target.closest("#map")) return; // they move the map
+    if (moves && event.target.closest(MOVED_BY_KEYS)) return;
     if (!moves && !box.checked) return;
     if (event.key === " " && event.target.closest("button, summary, input")) return;
     const action = keys[event.key];

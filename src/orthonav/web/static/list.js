@@ -2,7 +2,7 @@
 
 import { MARKS, SAID, clock, metres, number } from "./look.js";
 
-const PAGE = 60;
+const PAGE = 40;
 
 export class List {
   constructor(store, root) {

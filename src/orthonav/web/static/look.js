@@ -47,6 +47,25 @@ export function drawMark(context, state, x, y, size) {
   }
 }
 
+const KINDS = [...Object.keys(MARKS), "wrong", "ink"];
+
+/** Of many thousand marks most lie on others that look the same: one in a small square is enough. */
+export class Squares {
+  constructor(width, height, side) {
+    Object.assign(this, { side, across: Math.ceil(width / side) + 1 });
+    this.last = new Uint8Array(this.across * (Math.ceil(height / side) + 1));
+  }
+
+  /** Whether the last mark in the square of a point was of this kind; it is from now on. */
+  has(x, y, kind) {
+    const square = Math.floor(y / this.side) * this.across + Math.floor(x / this.side);
+    const code = KINDS.indexOf(kind) + 1;
+    if (this.last[square] === code) return true;
+    this.last[square] = code; // outside it is ignored
+    return false;
+  }
+}
+
 /** A length in metres with as many digits as say something. */
 export function metres(value) {
   if (!Number.isFinite(value)) return "–";

@@ -59,6 +59,7 @@ function tie({ store, map, marks, chosen, compare, chart, list, health }) {
       drawLegend(store);
     }
     health.draw();
+    if (detail.anew && !store.count) nothing({ chosen, compare });
   });
   store.addEventListener("filter", () => { marks.later(); chart.draw(); list.draw(); });
   store.addEventListener("select", ({ detail }) => {
@@ -73,6 +74,16 @@ function tie({ store, map, marks, chosen, compare, chart, list, health }) {
     if (detail.by !== "newest" && detail.by !== "") find("newest").checked = i === store.count - 1;
     if (find("follow-view").checked || detail.by === "list") keepSeen(map, store);
   });
+}
+
+/** A run that is begun anew, and has no view yet. */
+function nothing({ chosen, compare }) {
+  chosen.draw();
+  compare.clear();
+  find("chart-now").getContext("2d").reset();
+  find("scrub").value = 0;
+  find("scrub").removeAttribute("aria-valuetext");
+  say("");
 }
 
 let saying = 0;
@@ -159,7 +170,7 @@ function drawProblems(problems) {
 
 function drawFigures(store) {
   const { stats, count, run } = store;
-  const errors = store.columns.err.filter((v) => v >= 0).sort((p, q) => p - q);
+  const errors = (store.columns.err ?? []).filter((v) => v >= 0).sort((p, q) => p - q);
   const quantile = (share) => errors[Math.min(errors.length - 1, Math.floor(share * errors.length))];
   const rows = [["views", count], ["with a fix", share(stats.fixes, count)]];
   if (stats.withTruth) {

@@ -2,12 +2,14 @@
 // Leaflet for each of many thousand views would be too slow.
 
 import { L, at } from "./map.js";
-import { colour, drawMark } from "./look.js";
+import { Squares, colour, drawMark } from "./look.js";
 
 const BOUND_95 = Math.sqrt(-2 * Math.log(0.05)); // chi-square, two degrees of freedom
 const MOST_ELLIPSES = 120;
 const TOUCH_PX = 22;
 const PAD = 0.15;
+const MANY = 800;
+const SQUARE_PX = 2;
 
 export const Marks = L.Layer.extend({
   initialize(store) { this._store = store; },
@@ -75,25 +77,28 @@ export const Marks = L.Layer.extend({
     if (!count) return;
     this._line(context, view, c.tx, c.ty);
     this._ellipses(context, view);
-    const size = count > 4000 ? 2.2 : count > 800 ? 3 : 4;
+    const size = count > 4000 ? 2.2 : count > MANY ? 3 : 4;
+    const rings = new Path2D(); // drawn at once and above all: one by one takes longer
     for (const faded of [true, false]) {
       context.globalAlpha = faded ? 0.22 : 1;
       let last = "";
+      const drawn = new Squares(view.width, view.height, SQUARE_PX);
       for (let i = 0; i < count; i++) {
         if (this._store.isShown[i] === faded) continue;
         const [x, y] = [view.x + c.x[i] * view.scale, view.y + c.y[i] * view.scale];
         if (!(x > -9 && y > -9 && x < view.width + 9 && y < view.height + 9)) continue;
         const state = this._store.state(i);
+        const ringed = c.wrong[i] && !faded;
+        if (count > MANY && !ringed && drawn.has(x, y, state)) continue;
         if (state !== last) context.fillStyle = context.strokeStyle = colour(state);
         last = state;
         drawMark(context, state, x, y, size);
-        if (c.wrong[i] && !faded) {
-          this._wrong(context, view, i, x, y, size);
-          last = "";
-        }
+        if (ringed) this._ring(rings, view, i, x, y, size);
       }
     }
     context.globalAlpha = 1;
+    [context.lineWidth, context.strokeStyle] = [1.8, colour("wrong")];
+    context.stroke(rings);
   },
 
   /** The way that was really flown; not joined where it is not known. */
@@ -116,14 +121,12 @@ export const Marks = L.Layer.extend({
   },
 
   /** Sure and wrong: a ring, and a line to where it was really taken. */
-  _wrong(context, view, i, x, y, size) {
+  _ring(rings, view, i, x, y, size) {
     const c = this._store.columns;
-    [context.lineWidth, context.strokeStyle] = [1.8, colour("wrong")];
-    context.beginPath();
-    context.arc(x, y, size + 3.5, 0, 2 * Math.PI);
-    context.moveTo(x, y);
-    context.lineTo(view.x + c.tx[i] * view.scale, view.y + c.ty[i] * view.scale);
-    context.stroke();
+    rings.moveTo(x + size + 3.5, y);
+    rings.arc(x, y, size + 3.5, 0, 2 * Math.PI);
+    rings.moveTo(x, y);
+    rings.lineTo(view.x + c.tx[i] * view.scale, view.y + c.ty[i] * view.scale);
   },
 
   /** 95 % ellipses of what is seen, of some where many are. */
