@@ -19,6 +19,7 @@ COMMANDS = {
     "plan": "what a route, a camera and a height ask of a map",
     "fetch": "get orthophotos of an area from open services",
     "build": "make a map from orthophotos",
+    "check": "before the flight: where can it be localized, and will the route be flown well?",
     "info": "print what is in a map",
     "sign": "sign a map, or make a key for it",
     "verify": "check a map and its signature",
@@ -34,7 +35,10 @@ COMMANDS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code: 0 done, 1 a known error, 2 wrong usage."""
+    """Run the command line; returns the exit code: 0 done, 1 a known error, 2 wrong usage.
+
+    Commands that judge return others, see their help.
+    """
     # Matrices here are small: more BLAS threads only wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # errors are told once, by us
@@ -50,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
         logging.getLogger("rasterio").setLevel(logging.CRITICAL)
         with _terminable():
-            _module(options.command).run(options)
+            status: int | None = _module(options.command).run(options)
             sys.stdout.flush()
     except OrthonavError as error:
         return _failed(_one_line(error), verbose)
@@ -63,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _failed(_one_line(error), verbose)
     except MemoryError:
         return _failed("out of memory", verbose)
-    return 0
+    return status or 0
 
 
 @contextmanager

@@ -1,0 +1,117 @@
+"""How much of what a picture of the ground shows will still be there in another year.
+
+Long lines with contrast last (roads, hedges, borders of fields); fine texture without direction
+does not (crops, crowns of trees). How much they do was learnt on generated landscapes of several
+seeds, dates and resolutions alone (`python -m experiments.persistence`), never on real imagery:
+predictions for real imagery are predictions.
+"""
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from itertools import combinations_with_replacement
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.register.evidence import FINE, evidence
+
+Array = NDArray[np.float32]
+PATCH_PX = 24
+"""Side of the ground over which persistence is told, in pixels of the level it is told at."""
+MARGIN_PX = 40
+"""How far a pixel's grey level reaches into what is told, about."""
+LEAST, MOST = 0.005, 0.95
+_TENSORS = ((1.0, 11), (1.0, 21), (2.0, 29))
+"""Blur before the gradient (standard deviation) and window of the structure tensor, in pixels."""
+_BROAD_PX, _BROADER_PX = 7, 29
+MODEL = "persistence.json"
+
+
+@dataclass(frozen=True, eq=False)
+class PersistenceModel:
+    """Ridge regression on all products of two features, standardized by `mean` and `spread`.
+
+    `weights` (F,) belong to `terms` of the features (`features`), the resolution among them.
+    """
+
+    mean: NDArray[np.float64]
+    spread: NDArray[np.float64]
+    weights: NDArray[np.float64]
+
+    def __call__(self, features: Array) -> Array:
+        """Expected correlation of gradients (..) with those of another year, 0 to 1."""
+        told = terms((features - self.mean) / self.spread) @ self.weights
+        return np.asarray(np.clip(told, LEAST, MOST), dtype=np.float32)
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for a file."""
+        return {name: [float(f"{x:.6g}") for x in value] for name, value in vars(self).items()}
+
+    @classmethod
+    def from_plain(cls, plain: Any) -> "PersistenceModel":
+        """Inverse of `to_plain`."""
+        return cls(
+            *(np.array(plain[name], dtype=np.float64) for name in ("mean", "spread", "weights"))
+        )
+
+
+@cache
+def usual_model() -> PersistenceModel:
+    """The model that comes with the program."""
+    text = resources.files(__package__).joinpath(MODEL).read_text(encoding="utf-8")
+    return PersistenceModel.from_plain(json.loads(text)["model"])
+
+
+def terms(scaled: NDArray[Any]) -> NDArray[Any]:
+    """1, features (.., F) and all products of two of them."""
+    count = scaled.shape[-1]
+    pairs = combinations_with_replacement(range(count), 2)
+    products = [scaled[..., i] * scaled[..., j] for i, j in pairs]
+    ones = np.ones(scaled.shape[:-1], scaled.dtype)
+    return np.stack([ones, *(scaled[..., i] for i in range(count)), *products], axis=-1)
+
+
+def features(grey: NDArray[np.uint8], gsd_m: float, every_px: int = 8) -> Array:
+    """Features (h, w, F) of grey (H, W) at every `every_px` pixels, first at half of that.
+
+    Each is of the `PATCH_PX` around: how much gradients agree in direction, their energy, fine and
+    middling detail, evidence of registration, and the resolution `gsd_m` in metres per pixel.
+    """
+    picture = grey.astype(np.float32)
+    found = []
+    for blur, side_px in _TENSORS:
+        agreement, energy = _structure(picture, blur, side_px)
+        found += [_mean(agreement), np.log(_mean(energy) + np.float32(1e-2))]
+    broad, broader = (cv2.blur(picture, (side, side)) for side in (_BROAD_PX, _BROADER_PX))
+    found += [
+        np.log(_mean(np.abs(a - b)) + np.float32(0.1))
+        for a, b in ((picture, broad), (broad, broader))
+    ]
+    told = evidence(grey, np.ones(grey.shape, np.bool_), FINE)
+    found.append(_mean(told[..., 0] ** 2 + told[..., 1] ** 2))
+    half = every_px // 2
+    thin = [each[half::every_px, half::every_px] for each in found]
+    resolution = np.full_like(thin[0], np.log2(gsd_m))
+    return np.stack([*thin, resolution], axis=-1)
+
+
+def _structure(picture: Array, blur: float, side_px: int) -> tuple[Array, Array]:
+    """Coherence (0..1) and energy (H, W) of the structure tensor."""
+    smooth = cv2.GaussianBlur(picture, (0, 0), blur)
+    east, south = (cv2.Sobel(smooth, cv2.CV_32F, *way, scale=1 / 8) for way in ((1, 0), (0, 1)))
+
+    def around(values: Any) -> Array:
+        return np.asarray(cv2.blur(values, (side_px, side_px)), np.float32)
+
+    xx, yy, xy = around(east * east), around(south * south), around(east * south)
+    energy = xx + yy
+    difference = np.sqrt((xx - yy) ** 2 + 4 * xy**2)
+    return np.asarray(difference / (energy + np.float32(1e-3))), energy
+
+
+def _mean(values: Any) -> Array:
+    return np.asarray(cv2.blur(values, (PATCH_PX, PATCH_PX)), dtype=np.float32)

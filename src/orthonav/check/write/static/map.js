@@ -1,0 +1,191 @@
+// The map, in metres of the sheet's plane: a Leaflet "latitude" is north, a "longitude" east.
+
+const at = ([east, north]) => L.latLng(north, east);
+const NEAR_PX = 14;
+const FINEST = 3;
+
+function boundsOf([west, south, east, north]) {
+  return L.latLngBounds(at([west, south]), at([east, north]));
+}
+
+/** A plane with distances in metres, so that the scale bar is true. */
+const PLANE = L.extend({}, L.CRS.Simple, { distance: (p, q) => Math.hypot(p.lat - q.lat, p.lng - q.lng) });
+
+function makeMap() {
+  const map = L.map("map", {
+    crs: PLANE, maxZoom: FINEST, minZoom: -12, zoomSnap: 0.25, zoomDelta: 1, attributionControl: false,
+    scrollWheelZoom: false, keyboardPanDelta: 60,
+  });
+  const whole = boundsOf(data.box);
+  map.fitBounds(whole);
+  map.setMinZoom(Math.floor(map.getZoom()) - 1);
+  map.setMaxBounds(whole.pad(0.6));
+  for (const [name, order] of [["ground", 200], ["cells", 250]]) map.createPane(name).style.zIndex = order;
+  const ground = document.getElementById("check-ground");
+  L.imageOverlay(ground.src, boundsOf(data.ground), { pane: "ground", alt: "" }).addTo(map);
+  L.control.scale({ imperial: false, maxWidth: 150 }).addTo(map);
+  map.on("focus", () => map.scrollWheelZoom.enable()); // else the wheel moves the page
+  map.on("blur", () => map.scrollWheelZoom.disable());
+  document.getElementById("whole").addEventListener("click", () => map.fitBounds(whole));
+  return map;
+}
+
+/** A picture of a layer, a pixel per cell; cells that are not known are clear. */
+function pictureOf(name) {
+  const canvas = document.createElement("canvas");
+  [canvas.width, canvas.height] = [cells.cols, cells.rows];
+  const context = canvas.getContext("2d");
+  const picture = context.createImageData(cells.cols, cells.rows);
+  for (let i = 0; i < cells.cols * cells.rows; i++) {
+    const value = grids[name](i);
+    if (Number.isNaN(value)) continue;
+    picture.data.set([...colourAt(shadeOf(name, value)), 255], 4 * i);
+  }
+  context.putImageData(picture, 0, 0);
+  return canvas.toDataURL();
+}
+
+function addCells(map) {
+  const { west_m: west, north_m: north, side_m: side, rows, cols } = cells;
+  const bounds = boundsOf([west, north - rows * side, west + cols * side, north]);
+  const [choice, opacity] = [document.getElementById("layer"), document.getElementById("opacity")];
+  const overlay = L.imageOverlay(pictureOf(choice.value || "probability"), bounds, {
+    pane: "cells", className: "cells-picture", alt: "",
+  }).addTo(map);
+  const change = () => {
+    overlay.setOpacity(choice.value ? opacity.value / 100 : 0);
+    if (choice.value) overlay.setUrl(pictureOf(choice.value));
+    showLegend(choice.value);
+  };
+  choice.addEventListener("change", change);
+  opacity.addEventListener("input", () => overlay.setOpacity(choice.value ? opacity.value / 100 : 0));
+  change();
+}
+
+function numbered(place, text, kind, said, chosen) {
+  const side = text.length > 2 ? 30 : 25;
+  const icon = L.divIcon({ className: `mark ${kind}`, html: make("span", text), iconSize: [side, side] });
+  const above = kind === "lost" ? 1000 : 0;
+  const marker = L.marker(at(place), { icon, title: said, alt: said, riseOnHover: true, zIndexOffset: above });
+  marker.on("click", () => chosen());
+  marker.on("add", () => {
+    const element = marker.getElement();
+    element.setAttribute("aria-label", said);
+    element.addEventListener("keydown", (event) => {
+      if (!["Enter", " "].includes(event.key)) return;
+      event.preventDefault();
+      chosen();
+    });
+  });
+  return marker;
+}
+
+function addRoute(map) {
+  const group = L.layerGroup().addTo(map);
+  const quiet = { interactive: false, lineCap: "round", lineJoin: "round" };
+  for (const [colour, weight] of [["#fff", 4], ["#1a1a1a", 1.5]]) {
+    L.polygon(data.band.map((ring) => ring.map(at)), { ...quiet, color: colour, weight, fill: false }).addTo(group);
+  }
+  const line = route.en.map(at);
+  L.polyline(line, { ...quiet, color: "#fff", weight: 10 }).addTo(group);
+  for (const [risk, first, last] of route.pieces) {
+    const { colour, width, dash } = data.risks[risk];
+    const style = { ...quiet, color: colour, weight: width, dashArray: dash.length ? dash.join(" ") : null };
+    L.polyline(line.slice(first, last + 1), { ...style, lineCap: "butt" }).addTo(group);
+  }
+  for (const place of data.waypoints) {
+    L.circleMarker(at(place), { ...quiet, radius: 4, color: "#1a1a1a", weight: 2, fillColor: "#fff", fillOpacity: 1 }).addTo(group);
+  }
+  for (const blind of data.blind) {
+    if (blind.en.length < 2) continue;
+    L.polyline(blind.en.map(at), { ...quiet, color: "#1a1a1a", weight: 2.5 }).addTo(group);
+    const middle = nearestAlong((blind.start_m + blind.end_m) / 2);
+    const kind = blind.bearable ? "blind" : "lost";
+    numbered(route.en[middle], String(blind.number), kind, blind.said, () => {
+      lookAlong(middle, false);
+      tell(blind.said);
+    }).addTo(group);
+  }
+  return group;
+}
+
+/** The point of the route nearest to a distance from its start. */
+function nearestAlong(distance) {
+  let [low, high] = [0, route.distance_m.length - 1];
+  while (high - low > 1) {
+    const middle = (low + high) >> 1;
+    if (route.distance_m[middle] < distance) low = middle;
+    else high = middle;
+  }
+  return distance - route.distance_m[low] < route.distance_m[high] - distance ? low : high;
+}
+
+function addLookalikes(map) {
+  const group = L.layerGroup().addTo(map);
+  for (const { number, ends, within_prior: near, said } of data.lookalikes) {
+    L.polyline(ends.map(at), { color: "#8a2f63", weight: 2, dashArray: "3 6", interactive: false }).addTo(group);
+    ends.forEach((place, i) => {
+      const kind = near ? "twin near" : "twin";
+      numbered(place, `${number}${"ab"[i]}`, kind, said, () => { look(...place, -1, false); tell(said); }).addTo(group);
+    });
+  }
+  return group;
+}
+
+function toggle(id, map, group) {
+  document.getElementById(id)?.addEventListener("change", (event) => {
+    if (event.target.checked) group.addTo(map);
+    else group.remove();
+  });
+}
+
+/** The point of the route within reach of a place on the screen, -1 if none is. */
+function routeNear(map, { lat, lng }) {
+  if (!route) return -1;
+  const metresPerPx = 1 / map.getZoomScale(map.getZoom(), 0);
+  let [best, least] = [-1, (NEAR_PX * metresPerPx) ** 2];
+  route.en.forEach(([east, north], i) => {
+    const far = (east - lng) ** 2 + (north - lat) ** 2;
+    if (far < least) [best, least] = [i, far];
+  });
+  return best;
+}
+
+function lookFromMap(map) {
+  const choose = (latlng) => {
+    const index = routeNear(map, latlng);
+    if (index >= 0) lookAlong(index);
+    else look(latlng.lng, latlng.lat);
+  };
+  map.on("click", ({ latlng }) => choose(latlng));
+  map.on("mousemove", ({ latlng }) => {
+    const index = routeNear(map, latlng);
+    if (index >= 0) lookAlong(index, false);
+  });
+  map.getContainer().addEventListener("keydown", (event) => {
+    if (event.target !== map.getContainer() || !["Enter", " "].includes(event.key)) return;
+    event.preventDefault();
+    choose(map.getCenter());
+  });
+}
+
+function showLooked(map) {
+  const side = cells.side_m;
+  const square = L.rectangle(boundsOf([0, 0, side, side]), { color: "#fff", weight: 3, fill: false, interactive: false });
+  const inner = L.rectangle(boundsOf([0, 0, side, side]), { color: "#000", weight: 1.2, fill: false, interactive: false });
+  const dot = L.circleMarker([0, 0], { radius: 7, color: "#fff", weight: 3, fillColor: "#1a1a1a", fillOpacity: 1, interactive: false });
+  listeners.push(({ east, north, index }) => {
+    const cell = cellAt(east, north);
+    for (const each of [square, inner]) {
+      if (cell < 0) each.remove();
+      else {
+        const west = cells.west_m + (cell % cells.cols) * side;
+        const top = cells.north_m - Math.floor(cell / cells.cols) * side;
+        each.setBounds(boundsOf([west, top - side, west + side, top])).addTo(map);
+      }
+    }
+    if (index < 0) dot.remove();
+    else dot.setLatLng(at([east, north])).addTo(map);
+    if (index >= 0 && !map.getBounds().contains(at([east, north]))) map.panTo(at([east, north]), { animate: false });
+  });
+}

@@ -1,0 +1,215 @@
+"""Checks made up for tests of what is written: nothing here was predicted."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+
+from orthonav.check.outcome import (
+    About,
+    Along,
+    Alternative,
+    Cells,
+    CheckResult,
+    Conditions,
+    Envelope,
+    Lookalike,
+    Reason,
+    Stretch,
+    Verdict,
+    Word,
+)
+
+EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)> & ünïcode \u202e'
+CONDITIONS = Conditions(
+    width_m=240.0,
+    height_m=180.0,
+    agl_m=200.0,
+    yaw_std_deg=5.0,
+    agl_std=0.05,
+    prior_std_m=150.0,
+    accept=0.9,
+    radius_m=35.0,
+    speed_mps=22.0,
+    drift=0.02,
+)
+GO = Verdict(Word.GO, (Reason("sure", "Nearly all of the route is sure.", Word.GO),))
+NO_GO = Verdict(
+    Word.NO_GO,
+    (
+        Reason("lost", "In stretch 3 dead reckoning drifts farther than is allowed.", Word.NO_GO),
+        Reason("dates", "Only the map's own date was tried.", Word.MARGINAL),
+        Reason("mean", "The mean probability is high.", Word.GO),
+    ),
+)
+
+
+def made_cells(rows, cols, side_m, seed=1, west_m=None, north_m=None):
+    """Cells of smooth random probabilities around the origin."""
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(size=(rows + 12, cols + 12))
+    smooth = sum(np.roll(noise, (i, j), (0, 1)) for i in range(-4, 5) for j in range(-4, 5)) / 9
+    probability = 1 / (1 + np.exp(-(1.6 + 2.2 * smooth[6:-6, 6:-6])))
+    spread = 0.12 * np.sqrt(probability * (1 - probability)) * 2
+    return Cells(
+        west_m=-cols * side_m / 2 if west_m is None else west_m,
+        north_m=rows * side_m / 2 if north_m is None else north_m,
+        side_m=side_m,
+        probability=probability,
+        low=np.clip(probability - spread, 0, 1),
+        high=np.clip(probability + spread, 0, 1),
+        error_m=2 + 12 * (1 - probability),
+        wrong=0.03 * (1 - probability),
+        trials=rng.integers(4, 20, (rows, cols)).astype(np.int32),
+        texture=np.clip(probability + 0.1 * rng.normal(size=(rows, cols)), 0, 1),
+    )
+
+
+def lost_in(cells, mask):
+    """The same cells with nothing known where `mask` is."""
+    hole = np.where(mask, np.nan, 1.0)
+    names = ("probability", "low", "high", "error_m", "wrong", "texture")
+    values = {name: getattr(cells, name) * hole for name in names}
+    trials = np.where(mask, 0, cells.trials).astype(np.int32)
+    return Cells(cells.west_m, cells.north_m, cells.side_m, trials=trials, **values)
+
+
+def stretches_of(distance_m, probability, speed_mps, drift):
+    """Runs of low probability; what they drift is allowed up to 25 m."""
+    low = np.concatenate([[False], probability < 0.5, [False]])
+    edges = np.flatnonzero(np.diff(low.astype(int))).reshape(-1, 2)
+    last = len(distance_m) - 1
+    return tuple(
+        Stretch(
+            start_m=float(distance_m[first]),
+            end_m=float(distance_m[min(end, last)]),
+            start_s=float(distance_m[first] / speed_mps),
+            end_s=float(distance_m[min(end, last)] / speed_mps),
+            probability=float(probability[first:end].mean()),
+            drift_m=float(5 + drift * (distance_m[min(end, last)] - distance_m[first])),
+            allowed_m=25.0,
+            ends_lost=bool(end > last),
+        )
+        for first, end in edges
+    )
+
+
+def along_of(cells, waypoints, step_m=25.0):
+    legs = np.hypot(*np.diff(waypoints, axis=0).T)
+    ends = np.concatenate([[0.0], np.cumsum(legs)])
+    distance = np.linspace(0, ends[-1], max(2, round(ends[-1] / step_m)))
+    points = np.stack([np.interp(distance, ends, axis) for axis in waypoints.T], axis=1)
+    rows = ((cells.north_m - points[:, 1]) / cells.side_m).astype(int)
+    cols = ((points[:, 0] - cells.west_m) / cells.side_m).astype(int)
+    rows = np.clip(rows, 0, cells.probability.shape[0] - 1)
+    cols = np.clip(cols, 0, cells.probability.shape[1] - 1)
+    probability = cells.probability[rows, cols]
+    drift = np.zeros(len(distance))
+    for i in range(1, len(drift)):
+        flown = drift[i - 1] + 0.02 * (distance[i] - distance[i - 1])
+        share = probability[i] if np.isfinite(probability[i]) else 0
+        drift[i] = share * 6 + (1 - share) * flown
+    return Along(
+        distance_m=distance,
+        points_en_m=points,
+        probability=probability,
+        across_low=np.maximum(probability - 0.15, 0),
+        error_m=cells.error_m[rows, cols],
+        drift_m=drift,
+    )
+
+
+def envelope():
+    yaw, agl = np.arange(-20, 21, 5.0), np.array([-0.2, -0.1, -0.05, 0, 0.05, 0.1, 0.2])
+    share = 0.9 * np.exp(-((yaw[:, None] / 14) ** 2) - (agl / 0.13) ** 2)
+    share[0, 0] = np.nan
+    return Envelope(yaw, agl, share, 5.0, -0.05, 0.05)
+
+
+def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", route="", **changed):
+    """A check of cells, along a route where there is one."""
+    along = None if waypoints is None else along_of(cells, waypoints)
+    stretches = () if along is None else stretches_of(along.distance_m, along.probability, 22, 0.02)
+    known = np.isfinite(cells.probability)
+    here = frame.latlon_from_en(np.array([[0.0, 0.0], [400.0, 250.0], [-300.0, 100.0]]))
+    places = list(zip(*here, strict=True))
+    lookalikes = (
+        Lookalike(places[0], places[1], math.hypot(400, 250), 0.91, 14, True),
+        Lookalike(places[0], places[2], math.hypot(300, 100), 0.62, 9, False),
+    )
+    parts = {
+        "about": About(
+            map_name=name,
+            imagery="2016-07.tif 2016-07-15, 1.0 m",
+            recipe="gradient, 256 px",
+            other_date="2021-10.tif",
+            route_name=route,
+            command=f"orthonav check {name}",
+            version="0.1.0",
+            terms=("© IGN, Licence Ouverte 2.0",),
+        ),
+        "conditions": CONDITIONS,
+        "verdict": NO_GO,
+        "area_km2": float(known.sum() * cells.side_m**2 / 1e6),
+        "mean": float(cells.probability[known].mean()) if known.any() else math.nan,
+        "second_date": True,
+        "along": along,
+        "route_en_m": waypoints,
+        "band_m": band_m,
+        "stretches": stretches,
+        "lookalikes": lookalikes,
+        "envelope": envelope(),
+        "alternatives": (
+            Alternative("agl_m", 120.0, 0.71),
+            Alternative("agl_m", 200.0, 0.83, True),
+            Alternative("agl_m", 300.0, 0.9),
+            Alternative("band_m", 500.0, 0.84),
+            Alternative("band_m", 1000.0, 0.83, True),
+        ),
+    }
+    return CheckResult(frame=frame, cells=cells, **{**parts, **changed})
+
+
+def tiny(frame):
+    """A map of 0.5 km2, without a route."""
+    return made_check(frame, made_cells(14, 14, 50.0), verdict=GO, second_date=False)
+
+
+def small_route(frame, **changed):
+    """A route of some kilometres that ends in a blind stretch, in a band of 300 m."""
+    cells = made_cells(20, 20, 50.0, seed=3)
+    cells.probability[:, 17:] = 0.2
+    cells.low[:, 17:] = 0.1
+    cells.high[:, 17:] = 0.35
+    waypoints = np.array([(-420.0, -400.0), (-100.0, 300.0), (150.0, -350.0), (440.0, 350.0)])
+    return made_check(frame, cells, waypoints, 300.0, route="north loop", **changed)
+
+
+def long_route(frame):
+    """60 km2: 50 km in a band of 1 km."""
+    cells = made_cells(140, 200, 100.0, seed=5)
+    waypoints = np.array(
+        [
+            (-9000.0, -5500.0),
+            (8500.0, -4800.0),
+            (8800.0, 500.0),
+            (-8200.0, 900.0),
+            (-8000.0, 5600.0),
+        ]
+    )
+    east = cells.west_m + (np.arange(200) + 0.5) * 100
+    north = cells.north_m - (np.arange(140) + 0.5) * 100
+    far = np.full((140, 200), np.inf)
+    for a, b in pairwise(waypoints):
+        grid = np.stack(np.meshgrid(east, north), axis=-1)
+        t = np.clip(((grid - a) @ (b - a)) / ((b - a) @ (b - a)), 0, 1)
+        far = np.minimum(far, np.linalg.norm(grid - a - t[..., None] * (b - a), axis=-1))
+    return made_check(frame, lost_in(cells, far > 600), waypoints, 1000.0, route="valley run")
+
+
+def nearly_empty(frame):
+    """Nothing known but in a few cells."""
+    cells = made_cells(20, 20, 50.0)
+    mask = np.ones((20, 20), dtype=bool)
+    mask[3, 4:6] = False
+    return made_check(frame, lost_in(cells, mask), envelope=None, lookalikes=(), alternatives=())

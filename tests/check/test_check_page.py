@@ -1,0 +1,318 @@
+"""The page of a check asks for nothing, says all of it, and works in a real browser."""
+
+import base64
+import hashlib
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from types import SimpleNamespace
+
+import made_check
+import numpy as np
+import pytest
+from made_check import EVIL, small_route
+
+from orthonav.check.write import ground, write_check
+from orthonav.check.write.ground import MOST_PX, ground_below, seen_box
+from orthonav.check.write.leaflet import load_leaflet
+from orthonav.check.write.numbers import place_polynomial
+from orthonav.check.write.risk import CIVIDIS, colour_at, pieces
+from orthonav.geo.frames import LocalFrame
+from orthonav.mapfile import open_map
+
+VOID = {"meta", "img", "input", "br"}
+TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
+
+
+class Page(HTMLParser):
+    """Elements with attributes, and the text of scripts and styles."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements, self.inside, self._open = [], {"script": [], "style": []}, []
+        self.feed(text)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        if tag not in VOID:
+            self._open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag, self.getpos()
+
+    def handle_data(self, data):
+        if self._open and self._open[-1] in self.inside:
+            self.inside[self._open[-1]].append(data)
+
+
+@pytest.fixture(scope="module")
+def opened(map_path):
+    return open_map(map_path)
+
+
+@pytest.fixture(scope="module")
+def frame(opened):
+    return opened.manifest.sheets[0].frame
+
+
+@pytest.fixture(scope="module")
+def folder(opened, frame, tmp_path_factory):
+    """Checks of all kinds, and one whose names are markup, by name."""
+    root = tmp_path_factory.mktemp("checks")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("orthonav.report.canvas.DPI", 20)
+        for kind in ("tiny", "small_route", "long_route", "nearly_empty"):
+            write_check(getattr(made_check, kind)(frame), opened, root / kind)
+        about = replace(made_check.tiny(frame).about, map_name=EVIL, route_name=EVIL)
+        write_check(small_route(frame, about=about), opened, root / "evil")
+    return root
+
+
+@pytest.fixture(scope="module")
+def page(folder):
+    return Page((folder / "small_route" / "index.html").read_text(encoding="utf-8"))
+
+
+def test_nothing_is_asked_for(page):
+    for tag, attributes in page.elements:
+        assert tag not in ("link", "iframe", "object", "base")
+        for name in ("src", "href", "srcset", "data"):
+            assert attributes.get(name, "data:").startswith(("data:", "#")), (tag, name)
+        assert "style" not in attributes and not [n for n in attributes if n.startswith("on")]
+    for text in page.inside["style"]:
+        assert "@import" not in text
+        assert all(each.startswith("data:") for each in re.findall(r"url\(([^)]*)\)", text))
+    assert "sourceMappingURL" not in "".join(page.inside["script"])
+
+
+def test_the_policy_names_each_script_and_style(page):
+    (policy,) = [
+        a["content"] for t, a in page.elements if a.get("http-equiv") == "Content-Security-Policy"
+    ]
+    assert "default-src 'none'" in policy and "unsafe" not in policy
+    kinds = [a.get("type") for t, a in page.elements if t == "script"]
+    run = [text for kind, text in zip(kinds, page.inside["script"], strict=True) if kind is None]
+    assert len(run) == 2
+    for text in [*run, *page.inside["style"]]:
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in policy
+
+
+def test_what_the_script_is_given_is_json(folder):
+    for name in ("tiny", "small_route", "long_route", "nearly_empty", "evil"):
+        page = Page((folder / name / "index.html").read_text(encoding="utf-8"))
+        plain = json.loads(page.inside["script"][0])
+        rows, cols = plain["cells"]["rows"], plain["cells"]["cols"]
+        shares = base64.b64decode(plain["cells"]["shares"]["probability"])
+        assert len(shares) == rows * cols
+        assert (plain["route"] is None) == (name in ("tiny", "nearly_empty"))
+
+
+def test_shares_survive_the_bytes(page, frame):
+    cells = json.loads(page.inside["script"][0])["cells"]
+    told = np.frombuffer(base64.b64decode(cells["shares"]["low"]), np.uint8) / cells["steps"]
+    result = small_route(frame)
+    np.testing.assert_allclose(told, result.cells.low.ravel(), atol=0.0021)
+    error = np.frombuffer(base64.b64decode(cells["words"]["error_m"]), "<u2") / 10
+    np.testing.assert_allclose(error, result.cells.error_m.ravel(), atol=0.051)
+
+
+def test_all_sections_are_there(page, folder):
+    text = (folder / "small_route" / "index.html").read_text(encoding="utf-8")
+    for said in ("NO-GO", "Blind stretches", "Lookalikes", "How to read this", "Fine up to"):
+        assert said in text
+    assert "© IGN, Licence Ouverte 2.0" in text
+    assert sum(t == "h1" for t, _ in page.elements) == 1
+    images = [a for t, a in page.elements if t == "img" and "alt" in a]
+    assert sum(bool(each["alt"]) for each in images) == 3
+    assert "Blind stretches" not in (folder / "tiny" / "index.html").read_text(encoding="utf-8")
+
+
+def test_places_are_right_to_centimetres():
+    frame = LocalFrame(60.0, 10.0)
+    box = (-24_000.0, -24_000.0, 24_000.0, 24_000.0)
+    told = place_polynomial(frame, box)
+    en_m = np.random.default_rng(1).uniform(-24_000, 24_000, (500, 2))
+    u, v = ((en_m - told["middle"]) / told["half"]).T
+    terms = np.stack([u**i * v**j for i, j in told["powers"]])
+    back = frame.en_from_latlon(np.array(told["lat"]) @ terms, np.array(told["lon"]) @ terms)
+    assert np.abs(back - en_m).max() < 0.2
+
+
+def test_the_picture_lies_where_the_map_does(opened, frame):
+    result = made_check.tiny(frame)
+    found = ground_below(opened, seen_box(result))
+    west, south, east, north = found.box
+    rows, cols = found.grey.shape
+    assert max(rows, cols) <= MOST_PX
+    assert (east - west) / cols == pytest.approx((north - south) / rows, rel=0.01)
+    assert found.jpeg()[:2] == b"\xff\xd8"
+
+
+def test_a_map_without_a_layer_shows_its_preview(opened, frame, monkeypatch):
+    monkeypatch.setattr(ground, "GreyLayer", SimpleNamespace(of=lambda _: None))
+    found = ground_below(opened, seen_box(made_check.tiny(frame)))
+    grid = opened.manifest.sheets[0].grid
+    assert found.box[0] == grid.west_m and found.box[3] == grid.north_m
+    assert max(found.grey.shape) <= 384
+
+
+def test_far_too_large_a_level_is_read_in_strips(monkeypatch):
+    whole = np.random.default_rng(1).integers(0, 255, (700, 900), dtype=np.uint8)
+
+    def read(level, row, col, height, width):
+        assert height * width < 300_000
+        part = whole[row : row + height, col : col + width]
+        return part.copy(), np.ones(part.shape, bool)
+
+    monkeypatch.setattr(ground, "_MOST_READ_PX", 300)
+    found = ground._read(SimpleNamespace(read=read), 0, (0, 0, 700, 900))
+    assert found.shape == (233, 300)
+    assert abs(float(found.mean()) - float(whole.mean())) < 1
+
+
+def test_pictures_of_noise_stay_small():
+    noise = np.random.default_rng(1).integers(0, 255, (1300, 2000), dtype=np.uint8)
+    assert len(ground.Ground(noise, (0.0, 0.0, 1.0, 1.0)).jpeg()) <= ground.MOST_BYTES
+
+
+def test_pieces_take_the_worse_end():
+    assert pieces(np.array([0.95, 0.93, 0.6, 0.95, np.nan])) == [
+        (0, 0, 1),
+        (2, 1, 3),
+        (4, 3, 4),
+    ]
+    assert (colour_at(0), colour_at(1)) == (CIVIDIS[0], CIVIDIS[-1])
+
+
+def test_leaflet_brings_its_licence():
+    assert "Leaflet" in load_leaflet().script[:200] and "url(images" not in load_leaflet().style
+
+
+# In a browser
+
+
+@pytest.fixture(scope="module")
+def browser():
+    pytest.importorskip("playwright.sync_api")
+    from benchmarks.browser import HOW_TO_GET_ONE, chromium, started
+
+    if chromium() is None:
+        pytest.skip(HOW_TO_GET_ONE)
+    with started() as found:
+        yield found
+
+
+@pytest.fixture
+def visit(browser, folder):
+    """Function that opens the page of a check; in the end nothing was wrong, nothing asked for."""
+    contexts, wrong = [], []
+
+    def opened(name, **options):
+        context = browser.new_context(**{"viewport": {"width": 1366, "height": 900}, **options})
+        contexts.append(context)
+        found = context.new_page()
+        path = folder / name / "index.html"
+        found.on("console", lambda message: wrong.append(message.text))
+        found.on("pageerror", lambda error: wrong.append(str(error)))
+        found.on("dialog", lambda dialog: wrong.append(dialog.message))
+        context.route(
+            re.compile("^(?!data:)(?!.*index.html$)"), lambda route: wrong.append(route.request.url)
+        )
+        found.goto(path.as_uri())
+        return found
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert wrong == []
+
+
+@pytest.mark.parametrize("name", ["tiny", "small_route", "long_route", "nearly_empty", "evil"])
+def test_the_page_comes_alive(visit, name):
+    page = visit(name)
+    assert page.locator("html.live").count() == 1
+    assert page.locator("#map .leaflet-image-layer").count() == 2
+    assert page.locator("#map .leaflet-control-scale-line").inner_text()
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    for name in ("low", "error_m", "wrong", "texture", ""):
+        page.select_option("#layer", name)
+
+
+def test_profile_and_map_are_linked(visit):
+    page = visit("small_route")
+    page.locator("#profile").scroll_into_view_if_needed()
+    box = page.locator("#profile").bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 50)
+    assert "along the route" in page.locator("#figures").inner_text()
+    assert page.locator("#said").inner_text() == ""  # passing over it is not told aloud
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 50)
+    assert "along the route" in page.locator("#said").inner_text()
+    assert page.locator("#profile .cursor").count() == 1
+    before = page.locator("#along").input_value()
+    page.locator("#along").press("ArrowRight")
+    assert int(page.locator("#along").input_value()) == int(before) + 1
+    assert "probability" in page.locator("#along").get_attribute("aria-valuetext")
+    # And from the map to the profile.
+    page.locator("#map").scroll_into_view_if_needed()
+    dot = page.locator("#map path[fill='#1a1a1a']").bounding_box()
+    there = page.locator("#along").input_value()
+    page.locator("#along").fill("0")
+    page.locator("#map").scroll_into_view_if_needed()
+    page.mouse.move(dot["x"] + dot["width"] / 2, dot["y"] + dot["height"] / 2)
+    assert abs(int(page.locator("#along").input_value()) - int(there)) <= 1
+
+
+def test_keys_reach_everything(visit):
+    page = visit("small_route")
+    page.focus("#map")
+    page.keyboard.press("Enter")
+    assert "place:" in page.locator("#said").inner_text()
+    mark = page.locator(".mark", has_text="2").last
+    first = page.locator(".mark").first
+    assert mark.get_attribute("aria-label")
+    first.focus()
+    page.keyboard.press("Enter")
+    assert page.locator("#said").inner_text() == first.get_attribute("aria-label")
+
+
+def test_the_panel_says_what_is_in_the_cell(visit, frame):
+    page = visit("tiny")
+    page.focus("#map")
+    page.keyboard.press("Enter")
+    said = page.locator("#said").inner_text()
+    result = made_check.tiny(frame)
+    middle = result.cells.probability[6:8, 6:8].ravel()
+    told = float(re.search(r"probability: (\d+) %", said)[1]) / 100
+    assert np.abs(middle - told).min() < 0.008
+    lat, lon = map(float, re.search(r"place: ([-\d.]+), ([-\d.]+)", said).groups())
+    assert np.abs(frame.en_from_latlon(lat, lon)).max() < 15
+
+
+@pytest.mark.parametrize(
+    "options",
+    [TABLET, {"color_scheme": "dark"}, {"viewport": {"width": 390, "height": 800}}],
+    ids=["tablet", "dark", "phone"],
+)
+def test_other_screens(visit, options):
+    page = visit("small_route", **options)
+    assert page.locator("html.live").count() == 1
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_without_scripts_figures_are_shown(visit):
+    page = visit("small_route", java_script_enabled=False)
+    assert page.locator(".still-part img").count() == 2
+    assert page.locator(".still-part img").first.is_visible()
+    assert not page.locator("#map").is_visible()
+
+
+def test_rules_of_accessibility(visit):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    for options in ({}, {"color_scheme": "dark"}):
+        page = visit("small_route", bypass_csp=True, **options)
+        found = axe.run(page).response["violations"]
+        assert [(each["id"], each["nodes"][0]["html"]) for each in found] == []
