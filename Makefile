@@ -3,6 +3,7 @@
 # make lint    style, types, import layers
 # make bench   measure speed, memory and accuracy beside what a user would pick instead
 # make paper   the tables of the paper in the reduced setting, less than an hour
+# make docs    the documentation as a site in site/, to be opened without a server
 # make clean   remove .venv and what was made here
 
 PYTHON ?= python3
@@ -11,7 +12,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 DEPENDS := pyproject.toml constraints.txt
 
-.PHONY: demo test test-slow lint format bench paper clean
+.PHONY: demo test test-slow lint format bench paper docs clean
 
 demo: $(VENV)/.run-installed
 	$(BIN)/orthonav demo --out demo
@@ -39,6 +40,11 @@ paper: $(VENV)/.dev-installed
 	$(BIN)/python -m experiments.paper
 	$(BIN)/python -m experiments.paper report
 
+docs: $(VENV)/.docs-installed
+	$(BIN)/python tools/docs/pictures.py
+	$(BIN)/python -m sphinx -W --keep-going -n -q -b html docs site
+	@echo "open site/index.html"
+
 $(BIN)/python:
 	@sh tools/make_venv.sh "$(PYTHON)" "$(VENV)"
 
@@ -50,5 +56,9 @@ $(VENV)/.dev-installed: $(DEPENDS) | $(BIN)/python
 	$(PIP) -e ".[dev]"
 	@touch $@ $(VENV)/.run-installed
 
+$(VENV)/.docs-installed: $(VENV)/.dev-installed
+	$(PIP) -e ".[dev,docs]"
+	@touch $@
+
 clean:
-	rm -rf $(VENV) demo bench_results paper_results .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) demo site docs/pictures bench_results paper_results .mypy_cache .ruff_cache .pytest_cache .hypothesis

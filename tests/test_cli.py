@@ -20,6 +20,7 @@ from orthonav.cli import COMMANDS, main
 from orthonav.mapfile import open_map
 from orthonav.publish.jsonl import read_results
 from orthonav.records import Fix
+from orthonav.report import Drawing
 
 WHOLE_MAP = ["--tile-px", "64", "--overlap", "0.75", "--calibration-views", "6"]
 SMALL_MAP = ["--tile-px", "64", "--overlap", "0.75", "--no-registration"]
@@ -91,8 +92,9 @@ def shorten(flight, views):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Reports have no pictures, which take longest."""
-    for name in ("plots.png", "calibration_plots.png", "calibration_plots.figure_png"):
-        monkeypatch.setattr(f"orthonav.evaluate.{name}", lambda *_: b"")
+    nothing = Drawing(b"", "", (1.0, 1.0))
+    for name in ("plots.draw_axes", "calibration_plots.draw_axes", "calibration_plots.draw_figure"):
+        monkeypatch.setattr(f"orthonav.evaluate.{name}", lambda *_: nothing)
 
 
 @pytest.fixture(scope="module")
@@ -235,7 +237,9 @@ def test_evaluate(run, fixes_path, truth_path, map_path, out, names_in):
         *("--json", out / "metrics.json", "--report", out / "report"),
     )
     assert (done.code, done.err) == (0, "") and "fixes" in done.out and "index.html" in done.out
-    assert names_in(out) == ["metrics.json", "report", "report/index.html"]
+    names = [name for name in names_in(out) if not name.startswith("report/figures/")]
+    assert names == ["metrics.json", "report", "report/figures", "report/index.html"]
+    assert (out / "report" / "figures" / "error-curve.svg").is_file()
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["n_views"] == 30 and metrics["radius_m"] == 40
     assert metrics["acc_at_15m"] <= metrics["acc_at_40m"] and metrics["acc_at_40m"] >= 0.9

@@ -42,6 +42,14 @@ class CameraError(OrthonavError, ValueError):
     """Camera parameters are impossible or do not belong to the images."""
 
 
+class CheckError(OrthonavError, ValueError):
+    """A check was asked for under conditions that cannot be: a share above 1, a negative seed."""
+
+
+class WorkerError(OrthonavError, RuntimeError):
+    """A process that was to do part of the work ended on its own: killed, or out of memory."""
+
+
 class VariantError(OrthonavError, ValueError):
     """An unknown method, representation or parameter was named."""
 

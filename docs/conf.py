@@ -1,0 +1,69 @@
+"""How Sphinx builds the documentation site (`make docs`). Warnings are errors there."""
+
+import sys
+from pathlib import Path
+
+DOCS = Path(__file__).resolve().parent
+sys.path.insert(0, str(DOCS.parent / "tools" / "docs"))
+
+from orthonav import __version__  # noqa: E402
+
+project = "orthonav"
+author = "the authors of orthonav"
+project_copyright = "the authors of orthonav. Apache License 2.0"
+version = release = __version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "commands", "optional_pictures"]
+exclude_patterns = ["pictures"]
+source_suffix = {".md": "markdown"}
+highlight_language = "none"  # most blocks without a language are commands and what they print
+
+# Pages are read on the repository's host too: plain Markdown, fences only for what Sphinx makes.
+myst_enable_extensions = ["colon_fence"]
+myst_heading_anchors = 3  # as the host makes them
+suppress_warnings = ["myst.header"]  # a page may begin its sections at any level
+
+# Docstrings are prose with names in single backticks.
+default_role = "literal"
+autoclass_content = "both"
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_preserve_defaults = True
+autodoc_mock_imports = ["torch", "transformers", "faiss", "onnx"]  # learning; not needed to be read
+add_module_names = False
+python_use_unqualified_type_names = True
+toc_object_entries_show_parents = "hide"
+
+# Every name must lead somewhere, but for those of other projects: the site is built without a
+# network, so their inventories are not at hand.
+nitpicky = True
+nitpick_ignore_regex = [
+    (r"py:.*", r"(?!orthonav\b).*"),
+    # Values that are handed on between parts, not documented on pages of their own.
+    (r"py:class", r"orthonav\.(confidence|embed\.cells|search\.peak|track\.hypotheses)\..*"),
+    (r"py:class", r"orthonav\.sources\.track\..*"),
+]
+
+
+def _readable(_app, _what, _name, _obj, _options, lines):
+    """Docstrings are prose: a vertical bar in them is a formula's, not a substitution."""
+    for row, line in enumerate(lines):
+        pieces = line.split("`")
+        pieces[::2] = [piece.replace("|", "\\|") for piece in pieces[::2]]
+        lines[row] = "`".join(pieces)
+
+
+def setup(app):
+    """Tell Sphinx what to do with docstrings."""
+    app.connect("autodoc-process-docstring", _readable)
+
+
+html_theme = "furo"
+html_title = f"orthonav {release}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_copy_source = False
+html_show_sourcelink = False
+html_use_index = True
+html_theme_options = {"top_of_page_buttons": []}

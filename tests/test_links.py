@@ -1,0 +1,68 @@
+"""Links between pages lead to files and headings that are there, on the host as in the site."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
+LINK = re.compile(r"!?\[(?:[^\]\[]|\[[^\]]*\])*\]\(([^)\s]+)\)")
+MADE = "docs/pictures/"
+"""Made by `make docs`; in no checkout."""
+
+
+def prose(page):
+    """Text of a page without its code."""
+    text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+    return re.sub(r"`[^`\n]*`", lambda code: re.sub(r"[\[\]()]", "", code[0]), text)
+
+
+def anchors(page):
+    """What headings are called in an address."""
+    headings = re.findall(r"^#{1,6} +(.+)$", prose(page), flags=re.MULTILINE)
+    plain = [re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings]
+    return {heading.strip().replace(" ", "-") for heading in plain}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    for link in LINK.findall(prose(page)):
+        if re.match(r"[a-z]+:", link):
+            continue
+        name, _, heading = link.partition("#")
+        target = (page.parent / name).resolve() if name else page
+        if target.relative_to(ROOT).as_posix().startswith(MADE):
+            continue
+        assert target.is_file(), f"{link} leads nowhere"
+        assert not heading or heading in anchors(target), f"{link}: no such heading"
+
+
+def test_every_page_is_in_the_contents():
+    docs = ROOT / "docs"
+    told = "\n".join(
+        (docs / name).read_text("utf-8") for name in ("index.md", "reference/python.md")
+    )
+    missing = [
+        page.name
+        for page in docs.rglob("*.md")
+        if page.name != "index.md" and not re.search(rf"\b{page.stem}(>|$)", told, re.MULTILINE)
+    ]
+    assert missing == []
+
+
+def test_pictures_that_are_shown_are_made():
+    made = (ROOT / "tools" / "docs" / "pictures.py").read_text("utf-8")
+    for page in PAGES:
+        for link in LINK.findall(prose(page)):
+            if "pictures/" in link:
+                stem = Path(link).stem
+                assert f'"{stem}' in made, f"{page.name} shows {link}"
+
+
+def test_lines_of_the_pages_that_were_written_for_the_site():
+    docs = ROOT / "docs"
+    pages = [*docs.glob("tutorials/*.md"), *docs.glob("reference/*.md"), docs / "index.md"]
+    for page in pages:
+        text = re.sub(r"^\|.*$", "", page.read_text("utf-8"), flags=re.MULTILINE)
+        assert max(map(len, text.splitlines())) <= 120, page

@@ -1,0 +1,145 @@
+"""Tutorials do not rot: their commands are understood, what they print is what they show."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+from console import ELIDED, NOT_RUN, calls, check_page, is_as_shown, masked, read_steps, run_steps
+
+from orthonav.cli import COMMANDS, _parser
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+EXAMPLES = ROOT / "examples"
+
+
+def called(page):
+    return [
+        (step, words)
+        for step in read_steps(page.read_text("utf-8"))
+        for words in calls(step.command)
+    ]
+
+
+def test_there_is_a_tutorial_for_each_kind_of_user():
+    assert [page.stem for page in PAGES] == ["integrator", "operator", "researcher"]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_command_is_understood(page, monkeypatch):
+    count = 0
+    for _, words in called(page):
+        if words[0] == "orthonav":
+            arguments = words[1:]
+        elif words[1:2] == ["$checkout/examples/own_representation.py"]:
+            arguments = words[2:]
+        else:
+            continue
+        if arguments[0] == "check" and "check" not in COMMANDS:
+            continue  # still to come
+        count += 1
+        assert _parser(arguments).parse_args(arguments).command == arguments[0]
+    assert count > 5
+
+
+def test_commands_of_experiments_are_understood():
+    from experiments.paper.__main__ import _parser as experiments_parser
+
+    found = [
+        words[words.index("experiments.paper") + 1 :]
+        for page in PAGES
+        for _, words in called(page)
+        if "experiments.paper" in words
+    ]
+    assert len(found) == 2
+    for arguments in found:
+        assert experiments_parser().parse_args(arguments).out == Path("paper")
+
+
+def test_the_example_that_is_shown_is_the_example():
+    """The code of the researcher's tutorial stands in the example, word for word."""
+    text = (ROOT / "docs" / "tutorials" / "researcher.md").read_text("utf-8")
+    shown = text.split("```python\n")[1].split("```")[0]
+    assert shown.strip() in (EXAMPLES / "own_representation.py").read_text("utf-8")
+
+
+def test_the_example_adds_a_representation(textured_grey):
+    import numpy as np
+
+    from orthonav import represent
+    from orthonav.variants import make_variant
+
+    spec = importlib.util.spec_from_file_location("own", EXAMPLES / "own_representation.py")
+    own = importlib.util.module_from_spec(spec)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(represent, "TABLE", dict(represent.TABLE))
+        patch.setitem(__import__("sys").modules, "own", own)
+        spec.loader.exec_module(own)
+        variant = make_variant(represent.TABLE, "laplace:sigma_px=1.5")
+    valid = np.ones(textured_grey.shape, bool)
+    valid[:, :20] = False
+    out = variant(textured_grey, valid)
+    assert out.shape == (1, *textured_grey.shape) and out.dtype == np.float32
+    assert not out[:, :, :20].any() and out[:, :, 60:].any()
+
+
+@pytest.fixture
+def textured_grey():
+    from helpers import textured
+
+    return textured()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_tutorial_runs_and_prints_what_it_shows(page, tmp_path):
+    steps = [
+        step
+        for step in read_steps(page.read_text("utf-8"))
+        if step.is_run and ("check" in COMMANDS or not step.command.startswith("orthonav check"))
+    ]
+    assert check_page(page, tmp_path, steps) == []
+
+
+def test_steps_of_a_page():
+    said = ["a", "```console", "$ one \\", "    two | three > file", "said", "$ four", "```", "b"]
+    after = [NOT_RUN, "", "```console", "$ five & six", "```", "```text", "$ not this", "```"]
+    text = "\n".join([*said, *after])
+    first, second, third = read_steps(text)
+    assert (first.command, first.shown) == ("one \\\n    two | three > file", ("said",))
+    assert (second.command, second.shown, second.is_run) == ("four", (), True)
+    assert (third.command, third.is_run) == ("five & six", False)
+    assert list(calls(first.command)) == [["one", "two"], ["three"]]
+    assert list(calls(third.command)) == [["five"], ["six"]]
+
+
+def test_a_block_begins_with_a_command():
+    with pytest.raises(ValueError, match="line 2: expected a command"):
+        read_steps("```console\nno command\n```")
+
+
+@pytest.mark.parametrize(
+    "shown, printed, is_same",
+    [
+        (["a  1.5 m"], ["a 22 m"], True),
+        (["a 1"], ["b 1"], False),
+        (["a", ELIDED], ["a", "b", "c"], True),
+        ([ELIDED, "c"], ["a", "b", "c"], True),
+        ([ELIDED, "c"], ["c", "b"], False),
+        (["a" + " " + ELIDED], ["a and more"], True),
+        ([], ["a"], False),
+    ],
+)
+def test_what_is_printed_is_as_shown(shown, printed, is_same):
+    assert is_as_shown(tuple(shown), tuple(printed)) is is_same
+
+
+def test_numbers_are_not_compared():
+    assert masked("  -1,234.5 m   of 2") == "# m of #"
+
+
+def test_steps_run_in_one_shell(tmp_path):
+    steps = read_steps("```console\n$ name=x\n$ echo $name > f; cat f\n$ printf end\n```")
+    assert [told.lines for told in run_steps(steps, tmp_path)] == [(), ("x",), ("end",)]
+    with pytest.raises(RuntimeError, match="'false' ended with 1"):
+        run_steps(read_steps("```console\n$ false\n```"), tmp_path)

@@ -1,0 +1,269 @@
+"""Makes the pictures of the documentation by running the tutorial of the operator.
+
+    python tools/docs/pictures.py [--force]
+
+They go to docs/pictures, and are made again only where the commands, the program or this script
+changed. Pages of the program are photographed with chromium; where there is none, those pictures
+are left out (see `optional_pictures`).
+"""
+
+import argparse
+import hashlib
+import json
+import math
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import matplotlib.figure
+import numpy as np
+import pyproj
+import rasterio
+from console import ROOT, Step, check_page, read_steps
+from matplotlib.patches import Ellipse
+from rasterio.windows import Window
+
+from orthonav import represent
+from orthonav.cli import COMMANDS
+from orthonav.flight import FlightFolder, open_flight, read_image, read_truth
+from orthonav.geo.camera import footprint_en_m
+from orthonav.localizer import prepare_view, rectify
+from orthonav.records import Telemetry
+from orthonav.variants import make_variant
+
+TUTORIAL = ROOT / "docs" / "tutorials" / "operator.md"
+PICTURES = ROOT / "docs" / "pictures"
+MADE_FROM = "made_from.txt"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+PAST, PRESENT = "area/2016-07.tif", "area/2021-10.tif"
+SHOWN_EN_PX = (560, 300, 640)
+"""What of the area is shown of two dates: column, row and side."""
+TILE_EN_PX = (690, 420, 256)
+"""The tile whose representations are shown."""
+WINDOW_M, ZOOM_M = 460.0, 36.0
+TRUE, FIXED = "#E69F00", "#0072B2"
+SIGMAS_95 = math.sqrt(-2 * math.log(0.05))
+BROWSER_S = 90
+OPTIONS: dict[str, dict[str, Any]] = {"jpg": {"quality": 88, "optimize": True}, "png": {}}
+
+
+def main() -> int:
+    """Make what is out of date."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--force", action="store_true", help="make them in any case")
+    options = parser.parse_args()
+    steps = [step for step in read_steps(TUTORIAL.read_text("utf-8")) if _can_run(step)]
+    digest = _digest(steps)
+    stamp = PICTURES / MADE_FROM
+    if not options.force and stamp.is_file() and stamp.read_text("utf-8") == digest:
+        return 0
+    shutil.rmtree(PICTURES, ignore_errors=True)
+    PICTURES.mkdir(parents=True)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        print(f"running {TUTORIAL.relative_to(ROOT)} for its pictures", flush=True)
+        differences = check_page(TUTORIAL, folder, steps)
+        if differences:
+            print("\n".join(differences), file=sys.stderr)
+            print("printed otherwise than shown: python tools/docs/console.py --update PAGE")
+            return 1
+        _draw(folder)
+        _photograph(folder)
+    stamp.write_text(digest, "utf-8")
+    return 0
+
+
+def _can_run(step: Step) -> bool:
+    """Whether a step is for us, and its command is there: `check` is still to come."""
+    return step.is_run and ("check" in COMMANDS or not step.command.startswith("orthonav check"))
+
+
+def _digest(steps: list[Step]) -> str:
+    """What the pictures are made from, in one word."""
+    made = hashlib.sha256(json.dumps([[step.command, step.shown] for step in steps]).encode())
+    sources = [*ROOT.glob("src/orthonav/**/*"), *Path(__file__).parent.glob("*.py")]
+    for path in sorted(sources):
+        if path.is_file() and "__pycache__" not in path.parts:
+            made.update(path.read_bytes())
+    return made.hexdigest()
+
+
+def _draw(folder: Path) -> None:
+    """All that needs no browser."""
+    _figure("landscape.jpg", (9, 4.7), lambda figure: _draw_landscape(figure, folder))
+    _figure("evidence.jpg", (9, 6.5), lambda figure: _draw_evidence(figure, folder))
+    _figure("fix.jpg", (9, 9.2), lambda figure: _draw_fix(figure, folder))
+    for name in ("error-curve", "reliability", "map"):
+        shutil.copy(folder / "report" / "figures" / f"{name}.png", PICTURES)
+    shutil.copy(folder / "tracked" / "figures" / "worst-views.png", PICTURES)
+
+
+def _figure(name: str, size_in: tuple[float, float], draw: Callable[[Any], None]) -> None:
+    figure = matplotlib.figure.Figure(size_in, layout="constrained")
+    draw(figure)
+    figure.savefig(PICTURES / name, dpi=150, facecolor="white", pil_kwargs=OPTIONS[name[-3:]])
+
+
+def _read(path: Path, left: float, top: float, side: float) -> np.ndarray:
+    """Colours (H, W, 3) of a square window of an orthophoto, in pixels."""
+    with rasterio.open(path) as data:
+        window = Window(round(left), round(top), round(side), round(side))
+        return np.moveaxis(data.read((1, 2, 3), window=window, boundless=True), 0, -1)
+
+
+def _show(axes: Any, picture: np.ndarray, title: str, **more: Any) -> None:
+    axes.imshow(picture, **more)
+    axes.set_title(title, fontsize=11)
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
+def _draw_landscape(figure: Any, folder: Path) -> None:
+    shown = ((PAST, "July 2016: the map"), (PRESENT, "October 2021: the flight"))
+    for axes, (name, title) in zip(figure.subplots(1, 2), shown, strict=True):
+        _show(axes, _read(folder / name, *SHOWN_EN_PX), title)
+
+
+def _draw_evidence(figure: Any, folder: Path) -> None:
+    """A tile at both dates: grey levels, Canny edges, oriented gradients."""
+    for row, (name, year) in enumerate(((PAST, "2016"), (PRESENT, "2021"))):
+        grey = cv2.cvtColor(_read(folder / name, *TILE_EN_PX), cv2.COLOR_RGB2GRAY)
+        valid = np.ones(grey.shape, bool)
+        edges = make_variant(represent.TABLE, "canny")(grey, valid)[0]
+        gradients = make_variant(represent.TABLE, "gradient")(grey, valid)
+        turn = np.arctan2(gradients[2], gradients[1]) % (2 * np.pi)
+        value = np.clip(gradients[0] / np.percentile(gradients[0], 97), 0, 1)
+        planes = (turn / (2 * np.pi) * 179, np.full(grey.shape, 200), value * 255)
+        hsv = np.dstack(planes).astype(np.uint8)
+        axes = figure.add_subplot(2, 3, 3 * row + 1)
+        _show(axes, grey, f"{year}, grey levels", cmap="gray")
+        _show(figure.add_subplot(2, 3, 3 * row + 2), edges, f"{year}, Canny edges", cmap="gray")
+        axes = figure.add_subplot(2, 3, 3 * row + 3)
+        _show(axes, cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB), f"{year}, oriented gradients")
+
+
+def _draw_fix(figure: Any, folder: Path) -> None:
+    """One view: as taken, turned north, where it was put on the map, and that place from near."""
+    flight = open_flight(folder / "flight")
+    fix, told = _usual_fix(folder, flight)
+    picture = read_image(folder / "flight" / "frames" / fix["frame"])
+    place = _Place(folder / PAST, fix)
+    taken, north, wide, near = figure.subplots(2, 2).ravel()
+    _show(taken, picture, "the view, October 2021", cmap="gray")
+    _show(
+        north,
+        _north_up(picture, flight, fix, told),
+        "turned north, at the map's scale",
+        cmap="gray",
+    )
+    true_en_m = place.en_of(*read_truth(folder / "flight" / "truth.csv")[fix["frame"]])
+    _show_place(wide, place, WINDOW_M, "where it was put on the map of July 2016")
+    outline = footprint_en_m(flight.camera, fix["heading_deg"], 0.0, 0.0, fix["agl_m"])
+    wide.plot(*np.vstack([outline, outline[:1]]).T, color=FIXED, linewidth=2)
+    wide.plot(0, 0, "+", color=FIXED, markersize=16, markeredgewidth=2.5)
+    title = f"from near: {math.hypot(*true_en_m):.1f} m off, confidence {fix['confidence']:.2f}"
+    _show_place(near, place, ZOOM_M, title)
+    values, vectors = np.linalg.eigh(np.array(fix["cov_en_m2"]))
+    sides = 2 * SIGMAS_95 * np.sqrt(values)
+    turn = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
+    near.add_patch(Ellipse((0, 0), sides[1], sides[0], angle=turn, fill=False, color=FIXED, lw=2))
+    near.plot(0, 0, "+", color=FIXED, markersize=18, markeredgewidth=2.5, label="fix, 95 % ellipse")
+    near.plot(*true_en_m, "o", color=TRUE, markersize=10, label="truth")
+    near.legend(loc="lower right")
+
+
+class _Place:
+    """The surroundings of a fix on an orthophoto, metres east and north of it."""
+
+    def __init__(self, ortho: Path, fix: dict[str, Any]) -> None:
+        self.ortho = ortho
+        with rasterio.open(ortho) as data:
+            self.to_crs = pyproj.Transformer.from_crs("EPSG:4326", data.crs, always_xy=True)
+            self.transform = data.transform
+        self.x_m, self.y_m = self.to_crs.transform(fix["lon_deg"], fix["lat_deg"])
+
+    def en_of(self, lat_deg: float, lon_deg: float) -> tuple[float, float]:
+        x_m, y_m = self.to_crs.transform(lon_deg, lat_deg)
+        return x_m - self.x_m, y_m - self.y_m
+
+    def window(self, side_m: float) -> np.ndarray:
+        column, row = ~self.transform @ (self.x_m, self.y_m)
+        side = side_m / self.transform.a
+        return _read(self.ortho, column - side / 2, row - side / 2, side)
+
+
+def _show_place(axes: Any, place: _Place, side_m: float, title: str) -> None:
+    half = side_m / 2
+    _show(axes, place.window(side_m), title, extent=(-half, half, -half, half))
+
+
+def _usual_fix(folder: Path, flight: FlightFolder) -> tuple[dict[str, Any], Telemetry]:
+    """A sure fix of which most of the views are like: that of the median error ellipse."""
+    lines = (folder / "fixes.jsonl").read_text("utf-8").splitlines()
+    told = {view.frame: view.telemetry for view in flight.views}
+    fixes = [fix for fix in map(json.loads, lines) if (fix["confidence"] or 0) > 0.98]
+    fixes = [fix for fix in fixes if 20 < fix["heading_deg"] % 90 < 70] or fixes
+    fixes.sort(key=lambda fix: np.trace(fix["cov_en_m2"]))
+    fix = fixes[len(fixes) // 2]
+    return fix, told[fix["frame"]]
+
+
+def _north_up(
+    picture: np.ndarray, flight: FlightFolder, fix: dict[str, Any], told: Telemetry
+) -> np.ndarray:
+    """A view as the map would show it, by the heading and height of its fix."""
+    prepared = prepare_view(picture, flight.camera, fix["agl_m"], 1.0)
+    turned = rectify(
+        prepared,
+        yaw_deg=fix["heading_deg"],
+        pitch_deg=told.pitch_deg,
+        roll_deg=told.roll_deg,
+        agl_m=fix["agl_m"],
+        gsd_m=1.0,
+        size_px=round(WINDOW_M),
+    )
+    return np.where(turned.valid, turned.grey, 255)
+
+
+def _photograph(folder: Path) -> None:
+    """Pages of the program, where there is a browser."""
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        print("no chromium: pages of the program are not shown", flush=True)
+        return
+    report = folder / "check" / "index.html"
+    if report.is_file():
+        _shoot(browser, report.as_uri(), PICTURES / "check.png", (1180, 1100))
+    command = [Path(sys.executable).with_name("orthonav"), "view", "tracked.jsonl"]
+    command += ["--map", "area.onav", "--flight", "flight", "--no-browser"]
+    server = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, encoding="utf-8")
+    try:
+        address = (server.stdout.readline() if server.stdout else "").split()
+        if address:
+            _shoot(browser, address[0], PICTURES / "view.png", (1366, 900))
+    finally:
+        server.send_signal(signal.SIGINT)
+        server.wait(timeout=BROWSER_S)
+
+
+def _shoot(browser: str, address: str, out: Path, size_px: tuple[int, int]) -> None:
+    """A picture of a page; a browser that fails costs the picture, not the site."""
+    with tempfile.TemporaryDirectory() as profile:
+        command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+        command += [f"--user-data-dir={profile}", f"--window-size={size_px[0]},{size_px[1]}"]
+        command += ["--virtual-time-budget=8000", f"--screenshot={out}", address]
+        try:
+            subprocess.run(command, capture_output=True, timeout=BROWSER_S, check=True)
+        except (subprocess.SubprocessError, OSError) as error:
+            print(f"{out.name} is left out: {error}", file=sys.stderr)
+            out.unlink(missing_ok=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
