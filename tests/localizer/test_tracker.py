@@ -141,7 +141,7 @@ def test_hindsight_calibrates_the_beginning_too(localizer):
         np.hypot(*(place_of(localizer, fix) - place))
         for fix, (_, _, place) in zip(tracker.in_hindsight(), seen, strict=True)
     ]
-    assert max(after) < 12 and len(rows) == len(after)
+    assert max(after) < 15 and len(rows) == len(after)
     assert np.mean(after[:4]) < 6  # 5 deg of pitch are 13 m from 150 m
     with pytest.raises(ValueError, match="no history"):
         Tracker(localizer).in_hindsight()
@@ -389,6 +389,27 @@ def test_odometry_measures_the_way(moved, expected):
     seen = moved_between(*footprints, 0.0, told_noise, expected)
     assert seen.way.moved_en_m == pytest.approx(moved, abs=0.7)
     assert 0 < seen.overlap < 1
+
+
+def test_odometry_sees_two_views_by_the_same_knowledge():
+    """A lean that was learnt between two views, and the noise of the last heading, are no way."""
+    moved, lean = (18.0, -12.0), np.radians([5.0, -4.0])
+    told = [Telemetry(n * 10**9, yaw, 0.0, 0.0, AGL_M) for n, yaw in enumerate((350.0, 147.0))]
+    first, second = (
+        rendered(GROUND, place, (heading, *np.degrees(lean)), AGL_M, WIDE)
+        for place, heading in (((0.0, 0.0), 0.0), (moved, 150.0))
+    )
+    known = np.array([math.radians(11.0), 0.0, *lean])
+    before = Footprint.of(first, WIDE, told[0], None)
+    now = Footprint.of(second, WIDE, told[1], before.pixel_m, known)
+    noise = np.array([math.radians(5.0) ** 2, 1e-4])
+    seen = moved_between(before.by(known), now, 0.0, noise)
+    turn = math.radians(10.0)  # what is wrong with the first heading bends the way
+    bent = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ moved
+    assert seen.way.moved_en_m == pytest.approx(bent, abs=1.5)
+    assert math.degrees(seen.way.turned_rad) == pytest.approx(-7.0, abs=1.0)
+    apart = moved_between(before, now, 0.0, noise)
+    assert apart is None or np.hypot(*(apart.way.moved_en_m - bent)) > 8
 
 
 def test_odometry_refuses_views_without_common_ground():

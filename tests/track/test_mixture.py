@@ -294,6 +294,19 @@ def test_a_sudden_turn_is_followed_where_no_velocity_is_told():
     assert off_m(mixture, flight) < 10
 
 
+def test_a_turn_that_nobody_saw_is_thought_of():
+    """Else the place that it led to would be put down to a mount that was knocked."""
+    _, mixture, _ = flown(6)
+    speeds_mps = [math.sqrt(each.covariance[2, 2]) for each in mixture.hypotheses]
+    assert max(speeds_mps) < 5
+    mixture.predict(2.4)
+    wide = [each for each in mixture.hypotheses if each.covariance[2, 2] > 25.0**2]
+    assert 0.02 < sum(each.share for each in wide) < 0.1
+    for _ in range(60):
+        mixture.predict(0.2)
+    assert len(mixture.hypotheses) < 200
+
+
 def test_a_told_velocity_that_is_off_for_long_is_learnt():
     """Dead reckoning through 30 s without a view: the told wind is wrong by 1.8 m/s all along."""
     flight, mixture, before = Flight(7), Mixture(MODEL, EXTENT), None

@@ -35,7 +35,24 @@ EXPECTED_STEPS, SMALL_STEP_PX = 5, 0.1
 LEAN_SHARE = 0.6
 """How much of what a wrong lean moves a view stays in the sum of many ways: the next way takes most
 of it back."""
+SAME_BIAS = np.array([math.inf, 0.01, math.radians(0.1), math.radians(0.1)])
+"""Differences of heading, log scale, pitch and roll for which a view is not rectified anew. A
+heading needs none: views are rectified with it up."""
 Array = NDArray[np.float64]
+NO_BIAS: Array = np.zeros(4)
+
+
+def corrected_by(telemetry: Telemetry, bias: Array) -> Telemetry:
+    """What is told, less what is known to be wrong with it (4,): heading (rad), log scale, pitch
+    and roll (rad)."""
+    yaw_deg, pitch_deg, roll_deg = np.degrees(bias[[0, 2, 3]]).tolist()
+    return replace(
+        telemetry,
+        yaw_deg=telemetry.yaw_deg + yaw_deg,
+        agl_m=telemetry.agl_m * math.exp(bias[1]),
+        pitch_deg=telemetry.pitch_deg + pitch_deg,
+        roll_deg=telemetry.roll_deg + roll_deg,
+    )
 
 
 class _Picture:
@@ -71,8 +88,8 @@ class Footprint:
     """A view as odometry sees it: rectified, heading up, `pixel_m` per pixel.
 
     `camera_px` is where the camera is from the middle, x to the right and y down; `telemetry` what
-    it was rectified with. What was told is less by what was known to be wrong with it: `off_deg`
-    of heading, `off_log_scale` of height.
+    it was rectified with: what was told, less what was known to be wrong with it, `bias` (4,) of
+    heading, log scale, pitch and roll. `view` is what it was made of.
     """
 
     registrar: Registrar
@@ -81,8 +98,8 @@ class Footprint:
     pixel_m: float
     camera_px: Array
     telemetry: Telemetry
-    off_deg: float = 0.0
-    off_log_scale: float = 0.0
+    bias: Array
+    view: tuple[NDArray[np.uint8], Camera, Telemetry]
 
     @property
     def middle_px(self) -> tuple[float, float]:
@@ -93,9 +110,9 @@ class Footprint:
     @property
     def en_from_px(self) -> Array:
         """What takes pixels (x, y) to metres east and north (2, 2), by what was told."""
-        heading = math.radians(self.telemetry.yaw_deg - self.off_deg)
+        heading = math.radians(self.view[2].yaw_deg)
         cos, sin = math.cos(heading), math.sin(heading)
-        metres = self.pixel_m * math.exp(-self.off_log_scale)
+        metres = self.pixel_m * math.exp(-self.bias[1])
         return np.array([[cos, -sin], [-sin, -cos]]) * metres
 
     @classmethod
@@ -105,11 +122,11 @@ class Footprint:
         camera: Camera,
         telemetry: Telemetry,
         pixel_m: float | None,
-        *,
-        off_deg: float = 0.0,
-        off_log_scale: float = 0.0,
+        bias: Array = NO_BIAS,
     ) -> "Footprint | None":
-        """A view (H, W) with its telemetry, None where it shows too little."""
+        """A view (H, W) with what was told of it, None where it shows too little."""
+        view = (grey, camera, telemetry)
+        telemetry = corrected_by(telemetry, bias)
         side_m = camera.gsd_m(telemetry.agl_m) * math.sqrt(camera.width_px * camera.height_px)
         pixel_m = pixel_m or side_m / VIEW_PX
         made = rectify_footprint(
@@ -124,9 +141,17 @@ class Footprint:
             return None
         camera_px = np.array([-made.offset_en_m[0], made.offset_en_m[1]]) / pixel_m
         registrar = Registrar(Reference(_Picture(made.grey, made.valid)))
-        return cls(
-            registrar, made.grey, made.valid, pixel_m, camera_px, telemetry, off_deg, off_log_scale
-        )
+        return cls(registrar, made.grey, made.valid, pixel_m, camera_px, telemetry, bias, view)
+
+    def by(self, bias: Array) -> "Footprint | None":
+        """The same view by what is known now to be wrong with what is told.
+
+        Two views must be seen by the same: else what was learnt between them, a lean most of all,
+        would look like a way gone.
+        """
+        if (np.abs(bias - self.bias)[1:] > SAME_BIAS[1:]).any():
+            return Footprint.of(*self.view, self.pixel_m, bias)
+        return replace(self, telemetry=corrected_by(self.view[2], bias), bias=bias)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,15 +194,13 @@ def moved_between(
     )
     std_m = math.hypot(NOISE_PX * before.pixel_m, NOISE_SHARE * float(np.hypot(*way)))
     variance = std_m**2 + (LEAN_SHARE * now.telemetry.agl_m * lean_noise_rad) ** 2
-    told_rad = math.radians(
-        (now.telemetry.yaw_deg - now.off_deg) - (before.telemetry.yaw_deg - before.off_deg)
-    )
+    told_rad = math.radians(now.view[2].yaw_deg - before.view[2].yaw_deg)
     seen = CameraWay(
         way,
         np.eye(2) * variance,
         reach_m=_reach_px(before, now) * before.pixel_m,
         turned_rad=math.remainder(pose.turn_rad - told_rad, 2 * math.pi),
-        scaled=pose.log_scale + now.off_log_scale - before.off_log_scale,
+        scaled=pose.log_scale + float(now.bias[1] - before.bias[1]),
     )
     return Moved(seen, min(max(placed.overlap, 0.0), 1.0))
 

@@ -17,7 +17,7 @@ from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_telemetry, check_view
 from orthonav.localizer.levelled import levelled
 from orthonav.localizer.localizer import Localizer
-from orthonav.localizer.odometry import Footprint, Moved, moved_between
+from orthonav.localizer.odometry import Footprint, Moved, corrected_by, moved_between
 from orthonav.localizer.places import places_of
 from orthonav.localizer.registration import PreparedFootprint
 from orthonav.records import Fix, NoFix, Prior, Telemetry
@@ -183,7 +183,9 @@ class Tracker:
         """Move the track to the time of this view; the share of it that was seen before."""
         before, now = self._before, None
         if grey is not None and self._heading_known:
-            now = self._footprint(grey, camera, telemetry, before)
+            bias, _ = self.mixture.bias()
+            before = None if before is None else before.by(bias)
+            now = self._footprint(grey, camera, telemetry, before, bias)
         prior = telemetry.prior if self._use_prior or self._every_prior else None
         if self._usual_model and math.isfinite(telemetry.agl_m):
             self._usual_model = False
@@ -227,16 +229,14 @@ class Tracker:
         camera: Camera,
         telemetry: Telemetry,
         before: Footprint | None,
+        bias: Array,
     ) -> Footprint | None:
         """The view for odometry, in pixels of the one before unless they differ too much."""
-        bias, _ = self.mixture.bias()
-        known = {"off_deg": math.degrees(bias[0]), "off_log_scale": float(bias[1])}
-        corrected = _corrected(telemetry, bias)
         if before is not None:
-            made = Footprint.of(grey, camera, corrected, before.pixel_m, **known)
+            made = Footprint.of(grey, camera, telemetry, before.pixel_m, bias)
             if made is None or made.grey.size < 4 * before.grey.size:
                 return made
-        return Footprint.of(grey, camera, corrected, None, **known)
+        return Footprint.of(grey, camera, telemetry, None, bias)
 
     def _told_velocity(self, telemetry: Telemetry) -> ToldVelocity | None:
         """The told velocity beside that of the view before, None where none is told."""
@@ -283,7 +283,7 @@ class Tracker:
         """Look for the view and hand what it may be to the mixture; why not, if it cannot be."""
         expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
         bias, spread = self.mixture.bias()
-        corrected = _known(_corrected(telemetry, bias), spread)
+        corrected = _known(corrected_by(telemetry, bias), spread)
         view = self._registration.prepared(grey, camera, corrected, self._heading_known)
         if isinstance(view, NoFix):
             return view
@@ -416,15 +416,3 @@ def _known(corrected: Telemetry, spread: Array) -> Telemetry:
     """Told values with how well they are known by now, which says how widely to look."""
     heading, scale = np.sqrt(np.diag(spread)[:2]).tolist()
     return replace(corrected, yaw_std_deg=math.degrees(heading), agl_std_m=scale * corrected.agl_m)
-
-
-def _corrected(telemetry: Telemetry, bias: Array) -> Telemetry:
-    """What is told, less what is known to be wrong with it."""
-    yaw_deg, pitch_deg, roll_deg = np.degrees(bias[[0, 2, 3]]).tolist()
-    return replace(
-        telemetry,
-        yaw_deg=telemetry.yaw_deg + yaw_deg,
-        agl_m=telemetry.agl_m * math.exp(bias[1]),
-        pitch_deg=telemetry.pitch_deg + pitch_deg,
-        roll_deg=telemetry.roll_deg + roll_deg,
-    )

@@ -44,6 +44,8 @@ MIN_WAY = 1e-5
 """Less likely ways are not followed."""
 MINOR_SHARE = 1e-4
 """Hypotheses with less belief are not split for what is rare."""
+MAJOR_SHARE = 0.05
+"""The same where views show nothing, for there hypotheses are not merged."""
 TOLD_SHARE = 0.9
 """Belief in a position that was told before anything was seen."""
 SURE = 0.9
@@ -193,7 +195,12 @@ class Mixture:
         model, likely = self.model, 1 - self.model.slip
         slipped = predicted(model, each.mean, each.covariance, seconds, told, told_noise)
         if camera is None:
-            yield 1.0, slipped
+            chance = 0.0
+            if told is None and each.share >= MAJOR_SHARE:  # nobody saw it, nobody told it
+                chance = 1 - (1 - model.turn) ** seconds
+                free = velocity_forgotten(model, each.covariance)
+                yield chance, predicted(model, each.mean, free, seconds, told, told_noise)
+            yield 1.0 - chance, slipped
             return
         # A wrong way lies anywhere that it was looked for.
         wrong = math.log(model.slip / (math.pi * camera.reach_m**2))
