@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 from benchmarks.inputs import REAL_DATA
 from benchmarks.record import Table, provenance
 from orthonav.check.outcome import Cells
-from orthonav.check.run import CheckRequest, check_map
+from orthonav.check.request import CheckRequest
+from orthonav.check.run import check_map
 from orthonav.flight import open_flight, read_truth
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map

@@ -25,6 +25,7 @@ def small_demo(area, monkeypatch):
     turns = tuple((east * 0.45, north * 0.35) for east, north in demo.TURNS_EN_M)
     monkeypatch.setattr(demo, "TURNS_EN_M", turns)
     monkeypatch.setattr(demo, "SPACING_M", 80.0)
+    monkeypatch.setattr(demo, "CHECK_EFFORT", 0.05)
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 48)
     monkeypatch.setattr("orthonav.prepare.calibrate_registration.MIN_RIGHT", 1)
     quicker = functools.partial(BuildRequest, calibration_views=6)
@@ -35,9 +36,11 @@ def test_the_demo(small_demo, tmp_path, capsys, names_in):
     out = tmp_path / "demo"
     assert main(["demo", "--out", str(out)]) == 0
     told = capsys.readouterr()
-    assert f"{out}/report/index.html" in told.out and "4/4" in told.err
+    assert f"{out}/report/index.html" in told.out and "5/5" in told.err
+    assert f"{out}/check/index.html" in told.out and "expected to be placed" in told.out
+    assert json.loads((out / "check" / "check.json").read_text())["route"]["name"] == "demo"
     names = [name for name in names_in(out) if not name.startswith(("flight/", "."))]
-    assert {"area.onav", "demo.json", "fixes.jsonl", "flight", "report"} <= set(names)
+    assert {"area.onav", "demo.json", "check", "fixes.jsonl", "flight", "report"} <= set(names)
     metrics = json.loads((out / "demo.json").read_text())
     assert metrics["n_views"] > 15 and metrics["coverage"] > 0.9
     page = (out / "report" / "index.html").read_text()

@@ -90,5 +90,5 @@ def test_importing_has_no_side_effect(tmp_path, names_in):
 
 def test_help_loads_no_heavy_library(tmp_path):
     assert "COMMAND" in fresh(HELP, "--help", cwd=tmp_path)
-    for command in ("build", "import", "localize", "demo"):
+    for command in ("build", "check", "import", "localize", "demo"):
         assert f"orthonav {command}" in fresh(HELP, command, "--help", cwd=tmp_path)

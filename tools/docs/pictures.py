@@ -30,7 +30,6 @@ from matplotlib.patches import Ellipse
 from rasterio.windows import Window
 
 from orthonav import represent
-from orthonav.cli import COMMANDS
 from orthonav.flight import FlightFolder, open_flight, read_image, read_truth
 from orthonav.geo.camera import footprint_en_m
 from orthonav.localizer import prepare_view, rectify
@@ -58,7 +57,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--force", action="store_true", help="make them in any case")
     options = parser.parse_args()
-    steps = [step for step in read_steps(TUTORIAL.read_text("utf-8")) if _can_run(step)]
+    steps = [step for step in read_steps(TUTORIAL.read_text("utf-8")) if step.is_run]
     digest = _digest(steps)
     stamp = PICTURES / MADE_FROM
     if not options.force and stamp.is_file() and stamp.read_text("utf-8") == digest:
@@ -77,11 +76,6 @@ def main() -> int:
         _photograph(folder)
     stamp.write_text(digest, "utf-8")
     return 0
-
-
-def _can_run(step: Step) -> bool:
-    """Whether a step is for us, and its command is there: `check` is still to come."""
-    return step.is_run and ("check" in COMMANDS or not step.command.startswith("orthonav check"))
 
 
 def _digest(steps: list[Step]) -> str:

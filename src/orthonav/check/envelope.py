@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.check.outcome import Alternative, Envelope
-from orthonav.check.trials import Trial, TrialPlan
+from orthonav.check.trials import Trial
+from orthonav.check.views import TrialPlan
 
 Array = NDArray[np.float64]
 YAW_OFF_DEG = (0.0, 5.0, 10.0, 15.0, 20.0)

@@ -5,7 +5,7 @@ ground there is expected to last: a logistic regression over all trials of the m
 as a beta distribution, the regression counting as `PRIOR_TRIALS`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +30,8 @@ JEFFREYS = 0.3
 """So many good and bad trials more keep the interval off 0 and 1."""
 ENOUGH, FAR = 0.05, 4.0
 """With less than this weight around, trials so many times as far count too."""
+SAME_SEEN = 0.12
+"""Standard deviation of the weights over the share of a view that lies on the map."""
 RIDGE = 1e-2
 _PAIRS_AT_ONCE = 2**20
 
@@ -47,6 +49,10 @@ class Estimate:
     weight: Array
 
 
+def _all_seen(points_en_m: Array) -> Array:
+    return np.ones(len(points_en_m))
+
+
 class Field:
     """What trials say of places."""
 
@@ -60,8 +66,13 @@ class Field:
         spacing_m: float,
         other_date: Sequence[Trial] = (),
         least_error_m: float = 0.0,
+        seen: Callable[[Array], Array] = _all_seen,
     ) -> None:
-        """`trials` of the map's own ground, `other_date` of pictures of another date."""
+        """`trials` of the map's own ground, `other_date` of pictures of another date.
+
+        `seen` tells of places (N, 2) which share of a view there lies on the map (N,): trials count
+        for places where it is about the same.
+        """
         every = [*trials, *other_date]
         self._points = np.array([each.en_m for each in every], np.float64).reshape(-1, 2)
         self._error = np.array([each.error_m for each in every], np.float64)
@@ -71,6 +82,7 @@ class Field:
         self._weight = np.array([1.0] * len(trials) + [OTHER_DATE_WEIGHT] * len(other_date))
         self._bandwidth_m = max(BANDWIDTH_VIEWS * view_side_m, BANDWIDTH_SPACINGS * spacing_m)
         self._least_error_m = least_error_m
+        self._seen_at, self._seen = seen, seen(self._points)
         self._lasting = self._lasting_of(trials, other_date)
         self._expected = self._regression()
 
@@ -85,12 +97,13 @@ class Field:
 
     def _regression(self) -> Array:
         """The probability that is expected of every trial by how much lasts."""
-        mean = float(np.average(self.right, weights=self._weight))
+        # Of n out of n nobody knows that it is always so.
+        mean = (self.right @ self._weight + 0.5) / (self._weight.sum() + 1)
         if self.right.all() or not self.right.any() or len(self.right) < 20:
-            return np.full(len(self.right), mean)
-        told = np.log(self._lasting)[:, None]
-        bias, (slope,) = fit_weights(told, self.right, self._weight, RIDGE)
-        return np.asarray(1 / (1 + np.exp(-(bias + slope * told[:, 0]))))
+            return np.full(len(self.right), float(mean))
+        told = np.stack([np.log(self._lasting), self._seen], axis=1)
+        bias, slopes = fit_weights(told, self.right, self._weight, RIDGE)
+        return np.asarray(1 / (1 + np.exp(-(bias + told @ slopes))))
 
     def at(self, points_en_m: Array) -> Estimate:
         """What the trials say of places (N, 2)."""
@@ -105,13 +118,15 @@ class Field:
         from scipy.stats import beta
 
         square = ((points[:, None] - self._points[None]) ** 2).sum(axis=-1)
+        off = (self._seen_at(points)[:, None] - self._seen[None]) * self._bandwidth_m / SAME_SEEN
+        square += off**2
         near = np.exp(-square / (2 * self._bandwidth_m**2)) * self._weight
         total = near.sum(axis=1)
         # Far from all trials the nearest few still say what kind of ground it is.
         wide = np.exp(-square / (2 * (FAR * self._bandwidth_m) ** 2)) * self._weight + 1e-12
         kind = np.where((total > ENOUGH)[:, None], near, wide)
         kind /= kind.sum(axis=1, keepdims=True)
-        expected = kind @ self._expected
+        expected = np.clip(kind @ self._expected, 0.0, 1.0)  # rounding
         good = PRIOR_TRIALS * expected + near @ self.right
         bad = PRIOR_TRIALS * (1 - expected) + near @ ~self.right
         probability = good / (good + bad)

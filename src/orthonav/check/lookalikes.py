@@ -39,7 +39,9 @@ def found_lookalikes(
     A view that was put elsewhere makes a pair with where it was put; one that was put right with
     its best rival, where that comes close.
     """
-    pairs = [pair for each in trials if (pair := _pair(each, radius_m)) is not None]
+    # Nearer than a quarter of a view is the same place, if not well placed.
+    far_m = max(radius_m, view_side_m / 4)
+    pairs = [pair for each in trials if (pair := _pair(each, far_m)) is not None]
     pairs.sort(key=lambda pair: -pair.likeness)
     groups: list[list[_Pair]] = []
     for pair in pairs:
@@ -54,10 +56,10 @@ def found_lookalikes(
     return tuple(_told(group, frame, prior_std_m) for group in groups[:MOST])
 
 
-def _pair(trial: Trial, radius_m: float) -> _Pair | None:
+def _pair(trial: Trial, far_m: float) -> _Pair | None:
     if not math.isfinite(trial.error_m):
         return None
-    if trial.error_m > radius_m:
+    if trial.error_m > far_m:
         return _Pair(trial.en_m, trial.found_en_m, 1.0, trial.confidence >= SURE)
     if math.isfinite(trial.rival_share) and trial.rival_share >= LIKE:
         return _Pair(trial.en_m, trial.rival_en_m, min(trial.rival_share, 1.0), False)

@@ -18,8 +18,12 @@ CELLS_PER_VIEW = 4.0
 LEAST_TRIALS, MOST_TRIALS = 240, 1500
 TRIALS_PER_VIEW = 4.0
 """Trials per ground that a view covers, within those limits."""
+FEWEST_TRIALS = 40
+"""Whatever the effort."""
 MASK_PX = 2048
 _TRIES = 6
+_PROBES_ACROSS, _PROBES_PER_BAND, _MOST_PROBES = 400, 4, 1_000_000
+_MOST_DRAWN = 1_000_000
 
 Array = NDArray[np.float64]
 
@@ -51,6 +55,22 @@ class Ground:
         inside = (rows >= 0) & (cols >= 0) & (rows < height) & (cols < width)
         found = np.zeros(len(points_en_m), np.bool_)
         found[inside] = self.valid[rows[inside], cols[inside]]
+        return found
+
+    def seen(self, points_en_m: Array, side_m: float) -> Array:
+        """Share (N,) that the map shows of what views of a side see from over points (N, 2)."""
+        side = max(1, round(side_m / self.pixel_m))
+        shown = cv2.blur(
+            np.pad(self.valid.astype(np.float32), side),
+            (side, side),
+            borderType=cv2.BORDER_CONSTANT,
+        )
+        cols = (points_en_m[:, 0] - self.west_m) / self.pixel_m + side
+        rows = (self.north_m - points_en_m[:, 1]) / self.pixel_m + side
+        height, width = shown.shape
+        inside = (rows >= 0) & (cols >= 0) & (rows < height) & (cols < width)
+        found = np.zeros(len(points_en_m))
+        found[inside] = shown[rows[inside].astype(int), cols[inside].astype(int)]
         return found
 
     def share_shown(self, lattice: "Lattice") -> Array:
@@ -132,16 +152,25 @@ def checked_extent(ground: Ground, area: Area | None) -> Extent:
     """
     if area is None:
         return ground.extent_en_m
-    west, south, east, north = area.extent_en_m
-    probe = Lattice.over(area.extent_en_m, max(east - west, north - south) / 400)
-    points = probe.centres_en_m
-    inside = points[area.contains(points)]
-    if not ground.shown(inside).any():
+    if not looked_at_m2(ground, area):
         raise AreaError(
             "the route's band lies nowhere on the map: another map, or latitude and longitude "
             "exchanged?"
         )
     return area.extent_en_m
+
+
+def looked_at_m2(ground: Ground, area: Area | None) -> float:
+    """How much of the ground that a map shows lies in an area; all of it without one."""
+    if area is None:
+        return ground.area_m2
+    west, south, east, north = area.extent_en_m
+    side_m = max(east - west, north - south) / _PROBES_ACROSS
+    if area.route is not None:
+        side_m = min(side_m, min(area.route.bands_m(area.band_m) or (1.0,)) / _PROBES_PER_BAND)
+    side_m = max(side_m, math.sqrt((east - west) * (north - south) / _MOST_PROBES))
+    points = Lattice.over(area.extent_en_m, side_m).centres_en_m
+    return float((area.contains(points) & ground.shown(points)).sum()) * side_m**2
 
 
 def cell_side_m(area_m2: float, view_side_m: float) -> float:
@@ -158,18 +187,12 @@ def trial_places(
     rng: np.random.Generator,
 ) -> Array:
     """Places (N, 2) spread evenly at random over the ground that is looked at."""
-    wanted_m2 = ground.area_m2
-    if area is not None:
-        probe = Lattice.over(
-            extent, math.sqrt((extent[2] - extent[0]) * (extent[3] - extent[1])) / 200
-        )
-        points = probe.centres_en_m
-        here = area.contains(points) & ground.shown(points)
-        wanted_m2 = float(here.sum()) * probe.side_m**2
+    wanted_m2 = looked_at_m2(ground, area)
     per_view = wanted_m2 / view_side_m**2
     count = min(max(TRIALS_PER_VIEW * per_view, LEAST_TRIALS), MOST_TRIALS) * effort
-    side_m = math.sqrt(max(wanted_m2, 1.0) / max(count, 1.0))
-    lattice = Lattice.over(extent, side_m)
+    side_m = math.sqrt(wanted_m2 / max(count, FEWEST_TRIALS))
+    all_m2 = (extent[2] - extent[0]) * (extent[3] - extent[1])
+    lattice = Lattice.over(extent, max(side_m, math.sqrt(all_m2 / _MOST_DRAWN)))
     points = lattice.drawn(rng)
     good = _good(points, ground, area)
     for _ in range(_TRIES):  # cells on the border: another point of theirs may be good

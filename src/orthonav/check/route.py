@@ -2,7 +2,7 @@
 placed."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,20 +26,27 @@ Told = Callable[[Array], tuple[Array, Array]]
 
 
 def predicted_along(
-    area: Area, band_m: float, view_side_m: float, conditions: Conditions, told: Told
+    area: Area,
+    bands_m: Sequence[float],
+    view_side_m: float,
+    conditions: Conditions,
+    told: Told,
 ) -> Along:
-    """Predictions along the route of an area, `band_m` wide where a leg does not say otherwise."""
+    """Predictions along the route of an area; `bands_m` is the width of the band of every leg."""
     assert area.route is not None
     line = area.route.points_en_m(area.frame)
-    length_m = float(np.hypot(*np.diff(line, axis=0).T).sum())
+    ends_m = np.cumsum(np.hypot(*np.diff(line, axis=0).T))
+    length_m = float(ends_m[-1]) if len(ends_m) else 0.0
     step_m = max(view_side_m / POINTS_PER_VIEW, length_m / MOST_POINTS)
     points, course_deg = along_polyline_en_m(line, max(step_m, 1e-6))
     distance_m = np.minimum(np.arange(len(points)) * step_m, length_m)
     middle, error = told(points)
     course = np.radians(course_deg)
     across = np.stack([np.cos(course), -np.sin(course)], axis=1)
-    half = np.linspace(-0.5, 0.5, ACROSS) * band_m
-    lowest = np.min([told(points + off * across)[0] for off in half], axis=0)
+    leg = np.minimum(np.searchsorted(ends_m, distance_m), len(bands_m) - 1)
+    across *= np.asarray(bands_m, np.float64)[leg, None]
+    shares = np.linspace(-0.5, 0.5, ACROSS)
+    lowest = np.min([told(points + share * across)[0] for share in shares], axis=0)
     drift = expected_drift(distance_m, middle, error, conditions.drift, view_side_m)
     return Along(distance_m, points, middle, np.minimum(lowest, middle), error, drift)
 

@@ -4,6 +4,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,6 @@ from orthonav.check.estimate import Estimate, Field
 from orthonav.check.lookalikes import found_lookalikes
 from orthonav.check.ortho import check_same_ground
 from orthonav.check.outcome import (
-    About,
     Along,
     Alternative,
     Cells,
@@ -28,90 +28,50 @@ from orthonav.check.outcome import (
     Conditions,
     Envelope,
 )
-from orthonav.check.places import Ground, Lattice, cell_side_m, checked_extent, trial_places
+from orthonav.check.places import (
+    Ground,
+    Lattice,
+    cell_side_m,
+    checked_extent,
+    looked_at_m2,
+    trial_places,
+)
+from orthonav.check.request import CheckRequest
 from orthonav.check.route import blind_stretches, predicted_along
-from orthonav.check.trials import Trial, TrialPlan, run_many
+from orthonav.check.trials import Trial, run_many
 from orthonav.check.verdict import Findings, verdict_of
+from orthonav.check.views import LEAST_VALID, TrialPlan
 from orthonav.errors import AreaError, CameraError, MapFileError
 from orthonav.geo.area import Area
-from orthonav.geo.camera import Camera
-from orthonav.geo.route import Route
+from orthonav.geo.route import distance_to_polyline_m
+from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
-from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.reader import MapFile
 
 Array = NDArray[np.float64]
-DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
-"""A field of view of 65 by 51 degrees."""
-DEFAULT_SPEED_MPS = 20.0
-DEFAULT_DRIFT = 0.03
-"""Dead reckoning without GNSS: metres of error per metre flown. With the wind known from before and
-an airspeed sensor 2 to 5 % are usual."""
-DEFAULT_PRIOR_STD_M = 150.0
-DEFAULT_RELIEF_M = 3.0
 BAND_PRIORS = 4.0
 """Where no band is told it is so many standard deviations of the prior wide."""
 ENVELOPE_PLACES = 16
 HEIGHT_PLACES = 30
 BANDS = (0.25, 0.5)
 LEAST_TRIALS = 20
-NOTHING_SAID = About("", "", "")
+LEAST_BAND_VIEWS = 0.5
+"""Bands are looked at so many sides of a view wide, at least."""
+MOST_OBLONG = 8.0
+"""A view is at most so many times as long as wide."""
+LEAST_SHOWN = 0.25
+"""Cells of which the map shows less than this share are beyond it."""
+MOST_CELLS_AROUND = 250_000
+"""Cells of the box around a band, most of them empty."""
 Report = Callable[[str, float], None]
-
-
-@dataclass(frozen=True)
-class CheckRequest:
-    """What to check: a map for views of `camera` from `agl_m` above ground.
-
-    Without `agl_m` it is the height at which the shorter side of a view covers a tile of the map.
-    `band_m` is for legs of `route` that do not say theirs. `other_date` is an orthophoto of the
-    same ground that is not in the map. Standard deviations as in `orthonav.check.outcome`.
-    `relief_m` is that of the height of houses and trees, which lean in pictures from low;
-    `effort` multiplies the number of trials; `workers` None: one process per core.
-    """
-
-    map_path: Path
-    route: Route | None = None
-    band_m: float | None = None
-    other_date: Path | None = None
-    camera: Camera = DEFAULT_CAMERA
-    agl_m: float | None = None
-    yaw_std_deg: float | None = 5.0
-    agl_std: float = 0.05
-    prior_std_m: float | None = DEFAULT_PRIOR_STD_M
-    accept: float = 0.9
-    speed_mps: float = DEFAULT_SPEED_MPS
-    drift: float = DEFAULT_DRIFT
-    relief_m: float = DEFAULT_RELIEF_M
-    effort: float = 1.0
-    extras: bool = True
-    workers: int | None = None
-    seed: int = 1
-    about: About = NOTHING_SAID
-
-    def __post_init__(self) -> None:
-        """Raises `CameraError` or `AreaError` on impossible numbers."""
-        limits: dict[str, tuple[float | None, float, float, str]] = {
-            "height above ground": (self.agl_m, 1.0, 50_000.0, "m"),
-            "yaw_std_deg": (self.yaw_std_deg, 0.0, 90.0, "deg"),
-            "agl_std": (self.agl_std, 0.0, 0.5, "(a share of the height: 0.05 is 5 %)"),
-            "prior_std_m": (self.prior_std_m, 0.0, 1e6, "m"),
-            "accept": (self.accept, 0.01, 0.999, ""),
-            "speed_mps": (self.speed_mps, 0.1, 10_000.0, "m/s"),
-            "drift": (self.drift, 0.0, 1.0, "(a share of the way: 0.03 is 3 %)"),
-            "relief_m": (self.relief_m, 0.0, 1000.0, "m"),
-            "effort": (self.effort, 0.05, 50.0, ""),
-        }
-        for name, (value, low, high, unit) in limits.items():
-            if value is not None and not low <= value <= high:
-                raise CameraError(f"{name} must be {low:g} to {high:g} {unit}, got {value}".strip())
 
 
 def check_map(request: CheckRequest, report: Report | None = None) -> tuple[CheckResult, MapFile]:
     """Check a map; `report` is told what is done and how far, 0..1.
 
-    Raises `MapFileError` where the map cannot be checked and `AreaError` where the route or the
-    other date lie elsewhere.
+    Raises `MapFileError` where the map cannot be checked, `AreaError` where the route or the other
+    date lie elsewhere or views are too large for the map, `CameraError` where they are too oblong,
+    `WorkerError` where a process ended on its own.
     """
     told = report or (lambda what, share: None)
     opened = open_map(request.map_path)
@@ -129,16 +89,15 @@ class _Check:
     def __post_init__(self) -> None:
         if len(self.opened.manifest.sheets) != 1:
             raise MapFileError(f"this program checks maps of one sheet: {self.opened.path}")
-        layer = GreyLayer.of(self.opened)
-        if layer is None:
+        registration = Localizer(self.opened).registration
+        if registration is None:
             raise MapFileError(
                 f"only maps with a registration layer can be checked: {self.opened.path}"
             )
-        self.sheet = self.opened.manifest.sheets[0]
-        self.ground = Ground.of(layer, self.sheet.grid)
-        plain = self.opened.manifest.registration or {}
-        self.radius_m = float(plain.get("radius_m", 10 * self.sheet.grid.gsd_m))
-        self.calibrated = plain.get("confidence") is not None
+        self.sheet = registration.sheet
+        self.ground = Ground.of(registration.registrar.reference.pyramid, self.sheet.grid)
+        self.radius_m, self.floor_px = registration.radius_m, registration.floor_px
+        self.calibrated = registration.confidence is not None
         self.plan = self._plan()
         self.conditions = self._conditions()
         self.area = self._area()
@@ -152,7 +111,7 @@ class _Check:
         if agl_m is None:
             tile_m = self.sheet.grid.tile_m
             agl_m = tile_m / min(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px)
-        return TrialPlan(
+        plan = TrialPlan(
             request.map_path,
             camera,
             agl_m,
@@ -163,6 +122,15 @@ class _Check:
             request.relief_m,
             request.seed,
         )
+        sides_m = sorted((plan.width_m, plan.height_m))
+        if sides_m[1] > MOST_OBLONG * sides_m[0]:
+            raise CameraError(
+                f"views must be at most {MOST_OBLONG:g} times as long as wide, this camera's see "
+                f"{plan.width_m:.4g} x {plan.height_m:.4g} m"
+            )
+        if LEAST_VALID * math.hypot(*sides_m) ** 2 > self.ground.area_m2:
+            raise AreaError(f"views do not fit on the map: {_too_large(plan)}")
+        return plan
 
     def _conditions(self) -> Conditions:
         request, plan = self.request, self.plan
@@ -185,19 +153,29 @@ class _Check:
         if self.request.route is None or self.request.band_m is not None:
             return self.request.band_m
         prior_m = self.request.prior_std_m
-        return 4 * self.plan.side_m if prior_m is None else max(BAND_PRIORS * prior_m, 1.0)
+        if prior_m is None:
+            return BAND_PRIORS * self.plan.side_m
+        return max(BAND_PRIORS * prior_m, LEAST_BAND_VIEWS * self.plan.side_m)
 
     def _area(self) -> Area | None:
         route = self.request.route
         if route is None:
             return None
-        made = Area.from_route(route, self.band_m)
+        Area.from_route(route, self.band_m)  # raises what is wrong with it
         # The same route in the plane of the map.
         line = route.points_en_m(self.sheet.frame)
-        half = max(route.bands_m(self.band_m) or (0.0,)) / 2
+        least_m = LEAST_BAND_VIEWS * self.plan.side_m
+        bands_m = tuple(max(each, least_m) for each in self._leg_bands_m)
+        half = max(bands_m) / 2
         (west, south), (east, north) = line.min(axis=0) - half, line.max(axis=0) + half
         extent = (float(west), float(south), float(east), float(north))
-        return Area(self.sheet.frame, extent, route, made.band_m)
+        return Area(self.sheet.frame, extent, replace(route, leg_bands_m=bands_m), half * 2)
+
+    @property
+    def _leg_bands_m(self) -> tuple[float, ...]:
+        """Width of the band of every leg of the route."""
+        route = self.request.route
+        return () if route is None else route.bands_m(self.band_m) or ()
 
     def result(self) -> CheckResult:
         """All of it."""
@@ -205,7 +183,7 @@ class _Check:
         side_m = self.plan.side_m
         places = trial_places(self.ground, self.area, self.extent, side_m, self.request.effort, rng)
         own, other, envelope, heights = self._trials(places, rng)
-        spacing_m = math.sqrt(self._looked_at_m2() / max(len(own), 1))
+        spacing_m = math.sqrt(self._looked_at_m2 / max(len(own), 1))
         told = Field(
             own,
             radius_m=self.radius_m,
@@ -214,6 +192,7 @@ class _Check:
             spacing_m=spacing_m,
             other_date=other,
             least_error_m=self._floor_m(),
+            seen=lambda points: self.ground.seen(points, side_m),
         )
         cells = self._cells(told, own)
         along = self._along(told)
@@ -247,7 +226,7 @@ class _Check:
         if self.request.route is not None:
             route_en_m = self.request.route.points_en_m(self.sheet.frame)
         planned = kept_share(own, self.request.accept, self.radius_m)
-        alternatives = self._alternatives(heights, planned, told)
+        alternatives = self._alternatives(heights, planned, cells)
         return CheckResult(
             about=self.request.about,
             conditions=self.conditions,
@@ -266,20 +245,13 @@ class _Check:
             alternatives=alternatives,
         )
 
+    @cached_property
     def _looked_at_m2(self) -> float:
-        if self.area is None:
-            return self.ground.area_m2
-        west, south, east, north = self.extent
-        probe = Lattice.over(self.extent, math.sqrt((east - west) * (north - south)) / 200)
-        points = probe.centres_en_m
-        here = self.area.contains(points) & self.ground.shown(points)
-        return float(here.sum()) * probe.side_m**2
+        return looked_at_m2(self.ground, self.area)
 
     def _floor_m(self) -> float:
         """Error of a fix that trials do not show: how well orthophotos of two dates agree."""
-        plain = self.opened.manifest.registration or {}
-        floor_px = float(plain.get("position_floor_px", 0.6))
-        return floor_px * self.sheet.grid.gsd_m * math.sqrt(2)
+        return self.floor_px * self.sheet.grid.gsd_m * math.sqrt(2)
 
     def _trials(
         self, places: Array, rng: np.random.Generator
@@ -293,9 +265,11 @@ class _Check:
         other = first[1] if self.request.other_date is not None else []
         if len(own) < LEAST_TRIALS:
             raise AreaError(
-                f"only {len(own)} of {len(places)} trial views fit on the map: a view from "
-                f"{plan.agl_m:.0f} m sees {plan.width_m:.0f} x {plan.height_m:.0f} m; fly lower, "
-                "or build a larger map"
+                f"only {len(own)} of {len(places)} trial views fit on the map: {_too_large(plan)}"
+            )
+        if self.request.other_date is not None and not other:
+            raise AreaError(
+                f"the other date shows no ground where the check looks: {self.request.other_date}"
             )
         if not self.request.extras:
             return own, other, None, []
@@ -326,13 +300,12 @@ class _Check:
     @property
     def _workers(self) -> int:
         if self.request.workers is not None:
-            return max(1, self.request.workers)
+            return self.request.workers
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
 
-    def _told(self, told: Field, points: Array) -> Estimate:
+    def _told(self, told: Field, points: Array, shown: NDArray[np.bool_]) -> Estimate:
         """Estimates at places; probability 0 where the map shows nothing."""
-        found = told.at(points)
-        off = ~self.ground.shown(points)
+        found, off = told.at(points), ~shown
         for name in ("probability", "low", "high", "wrong"):
             getattr(found, name)[off] = 0.0
         found.error_m[off] = np.nan
@@ -340,20 +313,25 @@ class _Check:
 
     def _cells(self, told: Field, own: Sequence[Trial]) -> Cells:
         west, south, east, north = self.extent
-        side_m = cell_side_m((east - west) * (north - south), self.plan.side_m)
+        around_m2 = (east - west) * (north - south)
+        side_m = cell_side_m(around_m2, self.plan.side_m)
         if self.area is not None:
-            side_m = cell_side_m(self._looked_at_m2(), self.plan.side_m)
+            side_m = cell_side_m(self._looked_at_m2, self.plan.side_m)
+            side_m = max(side_m, math.sqrt(around_m2 / MOST_CELLS_AROUND))
         lattice = Lattice.over(self.extent, side_m)
         points = lattice.centres_en_m
         shape = (lattice.rows, lattice.cols)
-        here = self.ground.share_shown(lattice).ravel() > 0.25
+        here = shown = self.ground.share_shown(lattice).ravel() > LEAST_SHOWN
         if self.area is not None:
-            here = self.area.contains(points)
-        found = self._told(told, points[here])
+            # A band that is narrower than a cell still runs through cells.
+            bands_m = self.area.route.bands_m(None) if self.area.route else None
+            narrowest_m = min(bands_m or (0.0,))
+            here = self.area.contains(points, max(0.0, (side_m - narrowest_m) / 2))
+        found = self._told(told, points[here], shown[here])
         tried = np.zeros(shape, np.int32)
         for each in own:
-            col = int((each.en_m[0] - lattice.west_m) / side_m)
-            row = int((lattice.north_m - each.en_m[1]) / side_m)
+            col = math.floor((each.en_m[0] - lattice.west_m) / side_m)
+            row = math.floor((lattice.north_m - each.en_m[1]) / side_m)
             if 0 <= row < shape[0] and 0 <= col < shape[1]:
                 tried[row, col] += 1
 
@@ -380,19 +358,44 @@ class _Check:
             return None
 
         def at(points: Array) -> tuple[Array, Array]:
-            found = self._told(told, points)
+            found = self._told(told, points, self.ground.shown(points))
             return found.probability, found.error_m
 
-        band_m = max(self.area.route.bands_m(self.band_m) or (0.0,)) if self.area.route else 0.0
-        return predicted_along(self.area, band_m, self.plan.side_m, self.conditions, at)
+        side_m = self.plan.side_m
+        return predicted_along(self.area, self._leg_bands_m, side_m, self.conditions, at)
 
     def _alternatives(
-        self, heights: list[list[Trial]], planned: float, told: Field
+        self, heights: list[list[Trial]], planned: float, cells: Cells
     ) -> tuple[Alternative, ...]:
         made: tuple[Alternative, ...] = ()
         if heights:
             made = heights_of(self.plan, heights, planned, self.request.accept, self.radius_m)
-        return made
+        return made + self._bands(cells)
+
+    def _bands(self, cells: Cells) -> tuple[Alternative, ...]:
+        """What narrower bands would come to, where the whole route has one."""
+        widths = set(self._leg_bands_m)
+        if self.area is None or self.area.route is None or len(widths) != 1:
+            return ()
+        rows, cols = cells.probability.shape
+        lattice = Lattice(cells.west_m, cells.north_m, cells.side_m, rows, cols)
+        line = self.area.route.points_en_m(self.area.frame)
+        away_m = distance_to_polyline_m(lattice.centres_en_m, line)
+        told = cells.probability.ravel()
+        found = []
+        for width_m, part in ((part * max(widths), part) for part in (*BANDS, 1.0)):
+            inside = (away_m <= max(width_m, cells.side_m) / 2) & np.isfinite(told)
+            if inside.any() and width_m > cells.side_m:
+                mean = float(told[inside].mean())
+                found.append(Alternative("band_m", width_m, mean, chosen=part == 1.0))
+        return tuple(found) if len(found) > 1 else ()
+
+
+def _too_large(plan: TrialPlan) -> str:
+    return (
+        f"a view from {plan.agl_m:.0f} m sees {plan.width_m:.0f} x {plan.height_m:.0f} m; fly "
+        "lower, or build a larger map"
+    )
 
 
 def _with_other(plan: TrialPlan, other: Path) -> TrialPlan:

@@ -63,11 +63,12 @@ def _trust(found: Findings) -> list[Reason]:
 
 def _mean(found: Findings) -> list[Reason]:
     where = "along the route" if found.along is not None else "on the map"
-    text = f"a single view gives a correct, confident fix with {found.mean:.0%} {where}"
     if found.mean >= GO_MEAN:
+        text = f"a single view gives a correct, confident fix with {found.mean:.0%} {where}"
         return [Reason("fixes", text, Word.GO)]
+    text = f"a single view gives a correct, confident fix with only {found.mean:.0%} {where}"
     word = Word.NO_GO if found.mean < NO_GO_MEAN else Word.MARGINAL
-    return [Reason("few_fixes", f"only {text.replace('a single', 'one')}", word)]
+    return [Reason("few_fixes", text, word)]
 
 
 def _route(found: Findings) -> list[Reason]:

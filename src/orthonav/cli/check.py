@@ -1,6 +1,7 @@
 """`orthonav check`: before the flight: where could views be placed, and would a route be flown?"""
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,7 +10,7 @@ from orthonav.cli.common import ROUTE_HELP, print_json, progress
 
 if TYPE_CHECKING:
     from orthonav.check.outcome import About
-    from orthonav.check.run import CheckRequest
+    from orthonav.check.request import CheckRequest
     from orthonav.geo.camera import Camera
     from orthonav.geo.route import Route
 
@@ -56,6 +57,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--effort", type=float, default=1.0, help="times as many trials: finer, slower (default 1)"
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="leave out other errors of heading and other heights"
     )
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
     parser.add_argument("--seed", type=int, default=1, help="of the trials (default 1)")
@@ -121,7 +125,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _request(options: argparse.Namespace) -> "CheckRequest":
-    from orthonav.check.run import DEFAULT_CAMERA, CheckRequest
+    from orthonav.check.request import DEFAULT_CAMERA, CheckRequest
     from orthonav.geo.route import read_route
     from orthonav.sources.cameras import read_camera_file
 
@@ -147,6 +151,7 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         drift=options.drift,
         relief_m=options.relief_m,
         effort=options.effort,
+        extras=not options.quick,
         workers=options.workers,
         seed=options.seed,
         about=_about(options, route),
@@ -179,7 +184,7 @@ def _about(options: argparse.Namespace, route: "Route | None") -> "About":
         recipe=recipe_text(manifest.recipe),
         other_date="" if options.ortho is None else options.ortho.name,
         route_name="" if route is None else route.name or Path(options.route).name,
-        command=" ".join(["orthonav", *sys.argv[1:]]),
+        command=shlex.join(["orthonav", *sys.argv[1:]]),
         version=__version__,
         terms=tuple(dict.fromkeys(terms)),
     )

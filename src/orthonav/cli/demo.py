@@ -16,6 +16,8 @@ MARKER = "demo.json"
 HEIGHT_M = 270.0
 SPACING_M = 24.0
 RADIUS_M = 15.0
+CHECKED_BAND_M = 300.0
+CHECK_EFFORT = 0.5
 # The route in metres east and north of the area's centre, for a size of 2 km.
 TURNS_EN_M = (
     (-720, -720),
@@ -49,8 +51,21 @@ def run(options: argparse.Namespace) -> None:
     if options.json:
         print_json(plain)
         return
-    print(text)
-    print(f"\ndone in {time.perf_counter() - start:.0f} s; open {options.out}/report/index.html")
+    print(f"{text}\n\ndone in {time.perf_counter() - start:.0f} s")
+    print(_how_to_look(options.out))
+
+
+def _how_to_look(out: Path) -> str:
+    """What was made, and how to open it."""
+    look = f"orthonav view {out}/fixes.jsonl --map {out}/area.onav --flight {out}/flight"
+    return "\n".join(
+        (
+            "open in a browser:",
+            f"  {out}/check/index.html    before the flight: where it can be flown by the map",
+            f"  {out}/report/index.html   after it: errors, confidence, worst views",
+            f"step through the views:\n  {look}",
+        )
+    )
 
 
 def _is_earlier_demo(out: Path) -> bool:
@@ -60,7 +75,7 @@ def _is_earlier_demo(out: Path) -> bool:
     except (OSError, ValueError):
         return False
     names = {path.name for path in out.iterdir()}
-    known = {MARKER, "area.onav", "fixes.jsonl", "flight", "report", "route.geojson"}
+    known = {MARKER, "area.onav", "check", "fixes.jsonl", "flight", "report", "route.geojson"}
     made = isinstance(plain, dict) and plain.get("made_by") == "orthonav demo"
     return made and all(name in known or name.endswith(".tif") for name in names)
 
@@ -81,21 +96,23 @@ def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[
     from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
     from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
 
-    _say(options, f"1/4 generating 2 x 2 km at two dates (seed {options.seed})")
+    _say(options, f"1/5 generating 2 x 2 km at two dates (seed {options.seed})")
     past, present = generate_area(
         folder,
         dates=DEFAULT_DATES[:2],
         seed=options.seed,
         progress=lambda share: shown("landscape", share),
     )
-    _say(options, f"2/4 building the map from {past.name}")
+    _say(options, f"2/5 building the map from {past.name}")
     map_path = folder / "area.onav"
     built = build_map(BuildRequest([past], map_path), shown)
     opened = open_map(map_path)
     frame = opened.manifest.sheets[0].frame
     route = folder / "route.geojson"
     _write_route(route, frame.latlon_from_en(TURNS_EN_M))
-    _say(options, f"3/4 flying over {present.name}, heading off by 5 deg, height by 5 %")
+    _say(options, f"3/5 checking, from {past.name} alone, where the route can be flown by the map")
+    checked = _checked(folder, map_path, route, shown)
+    _say(options, f"4/5 flying over {present.name}, heading off by 5 deg, height by 5 %")
     request = SimulateRequest(
         [present],
         folder / "flight",
@@ -106,7 +123,7 @@ def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[
         seed=options.seed,
     )
     simulate_flight(request, lambda share: shown("simulate", share))
-    _say(options, "4/4 localizing every view anywhere on the map")
+    _say(options, "5/5 localizing every view anywhere on the map")
     results = []
     flight = open_flight(request.out)
     for result in localize_flight(SingleViews(Localizer(opened), use_prior=False), flight):
@@ -125,8 +142,44 @@ def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[
         version=str(about["created_by"]),
     )
     write_report(folder / "report", [shown_flight], made_from)
-    lines = [summary_text(about), "", table([shown_flight]), "", *_criteria_lines(metrics)]
+    lines = [summary_text(about), "", f"check      {checked}", ""]
+    lines += [table([shown_flight]), "", *_criteria_lines(metrics)]
     return metrics_to_json(metrics), "\n".join(lines)
+
+
+def _checked(folder: Path, map_path: Path, route: Path, shown: Progress) -> str:
+    """What the check predicts of the route, in a line; its report is in `check`."""
+    from orthonav import __version__
+    from orthonav.check.outcome import About
+    from orthonav.check.request import CheckRequest
+    from orthonav.check.run import check_map
+    from orthonav.check.write import write_check
+    from orthonav.cli.info import imagery_text, recipe_text
+    from orthonav.geo.route import read_route
+    from orthonav.mapfile import open_map
+
+    manifest = open_map(map_path).manifest
+    request = CheckRequest(
+        map_path,
+        route=read_route(route),
+        band_m=CHECKED_BAND_M,
+        agl_m=HEIGHT_M,
+        effort=CHECK_EFFORT,
+        extras=False,
+        about=About(
+            map_path.name,
+            imagery_text(manifest.imagery),
+            recipe_text(manifest.recipe),
+            route_name="demo",
+            command="orthonav demo",
+            version=__version__,
+        ),
+    )
+    result, opened = check_map(request, shown)
+    write_check(result, opened, folder / "check")
+    assert result.along is not None
+    mean, word = float(result.along.probability.mean()), result.verdict.word.value
+    return f"{word}: {mean:.0%} of views along the route are expected to be placed"
 
 
 def _criteria_lines(metrics: "Metrics") -> list[str]:

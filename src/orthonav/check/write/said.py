@@ -16,6 +16,8 @@ AREA_VERDICTS = {
     Word.NO_GO: "Do not rely on this map: read why.",
 }
 WHAT = {"agl_m": "height above ground", "band_m": "width of the band"}
+CLEARLY = 0.05
+"""Less than this is chance: few trials stand behind an alternative."""
 
 
 def verdict_said(result: CheckResult) -> str:
@@ -123,7 +125,7 @@ def better_said(alternatives: tuple[Alternative, ...], what: str) -> str:
     if not known or chosen is None:
         return ""
     best = max(known, key=lambda each: each.probability)
-    if best.probability < chosen.probability + 0.005:
+    if best.probability < chosen.probability + CLEARLY:
         return f"No other {what_text(what)} that was tried is better than {value_text(chosen)}."
     return (
         f"A {what_text(what)} of {value_text(best)} instead of {value_text(chosen)} would be "

@@ -1,0 +1,40 @@
+"""Trials made up for tests: nothing here was tried."""
+
+import math
+
+from orthonav.check.outcome import Conditions
+from orthonav.check.trials import Trial
+
+NOWHERE = (math.nan, math.nan)
+CONDITIONS = Conditions(
+    width_m=120.0,
+    height_m=90.0,
+    agl_m=100.0,
+    yaw_std_deg=5.0,
+    agl_std=0.05,
+    prior_std_m=50.0,
+    accept=0.9,
+    radius_m=35.0,
+    speed_mps=20.0,
+    drift=0.03,
+)
+
+
+def right(en_m, *, error_m=2.0, index=0, confidence=0.99, expected=0.5, rival=NOWHERE, share=None):
+    """A trial that was put `error_m` east of where it was."""
+    found = (en_m[0] + error_m, en_m[1])
+    share = math.nan if share is None else share
+    return Trial(index, tuple(en_m), error_m, confidence, expected, found, rival, share)
+
+
+def lost(en_m, *, index=0, expected=0.5):
+    """A trial that was put nowhere."""
+    return Trial(index, tuple(en_m), math.nan, 0.0, expected, NOWHERE, NOWHERE, math.nan)
+
+
+def elsewhere(en_m, found_en_m, *, confidence=0.99, index=0, expected=0.5):
+    """A trial that was put where it was not."""
+    error_m = math.dist(en_m, found_en_m)
+    return Trial(
+        index, tuple(en_m), error_m, confidence, expected, tuple(found_en_m), NOWHERE, math.nan
+    )

@@ -1,0 +1,86 @@
+"""Pictures of another year keep what lasts and lose what does not."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from helpers import textured
+from orthonav.check.change import Severity, another_year, leaning
+
+SIZE = 192
+MILD = Severity(field=0.0, view=0.0, shift=0.0)
+
+
+def kept(one, other):
+    """Correlation of gradients whatever their sign: of squared complex numbers."""
+    squares = []
+    for picture in (one, other):
+        south, east = np.gradient(picture.astype(float))
+        squares.append(((east + 1j * south) ** 2)[8:-8, 8:-8])
+    first, second = (each / np.maximum(np.abs(each), 1.0) for each in squares)
+    return float((first * second.conj()).real.mean())
+
+
+def changed(lasting, seed=1, grey=None, stranger=None):
+    grey = textured((SIZE, SIZE), 5) if grey is None else grey
+    stranger = textured((SIZE, SIZE), 6) if stranger is None else stranger
+    persistence = [np.full((SIZE, SIZE), lasting, np.float32)] * 3
+    return another_year(np.random.default_rng(seed), grey, stranger, persistence, MILD)
+
+
+def test_the_more_lasts_the_more_is_kept():
+    grey = textured((SIZE, SIZE), 5)
+    told = [np.mean([kept(grey, changed(each, seed)) for seed in range(3)]) for each in LASTING]
+    assert told[0] < 0.1 and told[-1] > 0.5
+    assert all(np.diff(told) > 0)
+
+
+LASTING = (0.01, 0.3, 0.6, 0.95)
+
+
+def test_what_lasts_is_kept_where_it_does():
+    grey = textured((SIZE, SIZE), 5)
+    lasting = np.where(np.arange(SIZE) < SIZE // 2, 0.9, 0.02).astype(np.float32)
+    persistence = [np.broadcast_to(lasting, (SIZE, SIZE))] * 3
+    stranger = textured((SIZE, SIZE), 6)
+    made = another_year(np.random.default_rng(2), grey, stranger, persistence, MILD)
+    west, east = np.s_[:, : SIZE // 2], np.s_[:, SIZE // 2 :]
+    assert kept(grey[west], made[west]) > 0.3 > 0.15 > kept(grey[east], made[east])
+
+
+def test_what_comes_instead_stays_mirrored():
+    """It is turned, never flipped again: then it would be found where it is from."""
+    ground = textured((SIZE, SIZE), 7)
+    made = changed(0.005, stranger=ground[:, ::-1])
+    turned = [np.rot90(ground, times) for times in range(4)]
+    mirrored = [np.rot90(ground[:, ::-1], times) for times in range(4)]
+    assert max(kept(each, made) for each in turned) < 0.1
+    assert max(kept(each, made) for each in mirrored) > 0.4
+
+
+def test_the_same_every_time_and_nothing_touched():
+    grey, stranger = textured((SIZE, SIZE), 5), textured((SIZE, SIZE), 6)
+    before = grey.copy(), stranger.copy()
+    first, second = (changed(0.4, 3, grey, stranger) for _ in range(2))
+    assert_array_equal(first, second)
+    assert (changed(0.4, 4) != first).any()
+    assert_array_equal(grey, before[0])
+    assert_array_equal(stranger, before[1])
+    assert first.dtype == np.uint8 and first.shape == grey.shape
+
+
+@pytest.mark.parametrize("grey", [0, 255])
+def test_blank_ground(grey):
+    blank = np.full((SIZE, SIZE), grey, np.uint8)
+    made = changed(0.5, grey=blank, stranger=blank)
+    assert made.shape == blank.shape and made.std() < 60
+
+
+def test_what_stands_leans_away_from_the_middle():
+    grey = textured((SIZE, SIZE), 5)
+    upright = leaning(np.random.default_rng(1), grey, 0.0, 15.0)
+    assert_array_equal(upright, grey)
+    leant = leaning(np.random.default_rng(1), grey, 4.0, 15.0)
+    off = np.abs(leant.astype(int) - grey)
+    middle, rim = np.s_[SIZE // 2 - 8 : SIZE // 2 + 8], np.s_[:24]
+    assert off[middle, middle].mean() < 0.3 * off[rim, rim].mean()

@@ -1,0 +1,431 @@
+"""The whole check: of a small map with trials, and with trials made up; then as a command."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rasterio
+from made_trials import lost, right
+
+from orthonav.check import run as check_run
+from orthonav.check.outcome import Word
+from orthonav.check.request import CheckRequest
+from orthonav.check.run import check_map
+from orthonav.check.verdict import Verdict
+from orthonav.check.write import to_json
+from orthonav.cli import main
+from orthonav.errors import AreaError, CameraError, CheckError, MapFileError, MissingFileError
+from orthonav.geo.camera import Camera
+from orthonav.geo.route import Route
+from orthonav.mapfile import open_map
+
+CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+
+
+@pytest.fixture(scope="module")
+def opened(half_blank):
+    return open_map(half_blank.map)
+
+
+@pytest.fixture(scope="module")
+def frame(opened):
+    return opened.manifest.sheets[0].frame
+
+
+def route_of(frame, points_en_m, bands_m=()):
+    lat, lon = frame.latlon_from_en(np.array(points_en_m, float))
+    return Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)), leg_bands_m=tuple(bands_m))
+
+
+def halves(cells):
+    """Mean probability well inside the west and the east half of the map."""
+    cols = np.arange(cells.probability.shape[1]) + 0.5
+    east_m = cells.west_m + cols * cells.side_m
+    west, east = (east_m < -80) & (east_m > -400), (east_m > 80) & (east_m < 400)
+    inner = cells.probability[2:-2]
+    return float(np.nanmean(inner[:, west])), float(np.nanmean(inner[:, east]))
+
+
+# With trials.
+
+
+@pytest.fixture(scope="module")
+def tried(half_blank):
+    """The map checked with its own date alone."""
+    said = []
+    request = CheckRequest(
+        half_blank.map,
+        camera=CAMERA,
+        agl_m=130.0,
+        prior_std_m=50.0,
+        effort=0.05,
+        extras=False,
+        workers=1,
+    )
+    result, _ = check_map(request, lambda what, share: said.append((what, share)))
+    return result, said
+
+
+def test_the_half_that_shows_something_is_where_views_are_placed(tried):
+    result, said = tried
+    west, east = halves(result.cells)
+    assert west > 0.5 and east < 0.3 and west > 2 * east
+    assert east < result.mean < west
+    assert {what for what, _ in said} == {"trials"} and said[-1][1] == 1.0
+
+
+def test_what_a_check_tells(tried):
+    result, _ = tried
+    cells = result.cells
+    assert not result.second_date and result.area_km2 == pytest.approx(0.54, rel=0.15)
+    assert result.along is None and result.envelope is None and result.stretches == ()
+    assert 30 <= cells.trials.sum() <= 60
+    assert cells.side_m == pytest.approx(math.hypot(166.4, 0) * math.sqrt(0.75) / 4, rel=0.01)
+    known = np.isfinite(cells.probability)
+    assert known.mean() > 0.8
+    assert (cells.low <= cells.probability)[known].all()
+    assert (cells.probability <= cells.high)[known].all()
+    assert (cells.error_m[known & (cells.probability > 0)] < 20).all()
+    json.loads(to_json(result))
+
+
+# With trials made up.
+
+
+def made_up(work, workers, report):
+    """Views of the west are placed, of the east not; of another date nowhere."""
+    found = []
+    for plan, places in work:
+        west = [place[0] < 0 and plan.other_path is None for place in places]
+        found.append(
+            [
+                (right if good else lost)(tuple(place), index=i, expected=0.6 if good else 0.1)
+                for i, (place, good) in enumerate(zip(places, west, strict=True))
+            ]
+        )
+    return found
+
+
+@pytest.fixture
+def untried(monkeypatch):
+    monkeypatch.setattr(check_run, "run_many", made_up)
+
+
+@pytest.fixture
+def checked(untried, half_blank):
+    """Function that checks the map with made-up trials."""
+
+    def check(**changed):
+        told = {"camera": CAMERA, "agl_m": 130.0, "prior_std_m": 50.0, "effort": 0.5}
+        return check_map(CheckRequest(half_blank.map, **(told | changed)))[0]
+
+    return check
+
+
+def test_the_same_check_twice(checked, frame):
+    route = route_of(frame, [[-300, 0], [300, 100]])
+    one, other = (to_json(checked(route=route)) for _ in range(2))
+    assert one == other and one != to_json(checked(route=route, seed=2))
+
+
+def test_another_date_is_used(checked, half_blank):
+    alone, both = checked(), checked(other_date=half_blank.present)
+    assert not alone.second_date and both.second_date
+    assert halves(alone.cells)[0] > 0.8 > 0.5 > halves(both.cells)[0]
+
+
+def test_a_route_over_both_halves(checked, frame):
+    result = checked(route=route_of(frame, [[-350, 0], [350, 0]]), band_m=200.0)
+    along = result.along
+    assert along.probability[0] > 0.8 and along.probability[-1] < 0.2
+    assert len(result.stretches) == 1 and result.stretches[0].ends_lost
+    assert result.stretches[0].start_m == pytest.approx(350, abs=100)
+    assert result.verdict.word is not Word.GO and result.band_m == 200.0
+    cells, west = result.cells, result.cells.west_m
+    assert west == pytest.approx(-450, abs=1) and cells.north_m == pytest.approx(100, abs=1)
+    corners = cells.probability[[0, 0, -1, -1], [0, -1, 0, -1]]
+    assert np.isnan(corners).all()  # of the box, outside the round ends of the band
+
+
+def test_a_route_that_leaves_the_map(checked, frame):
+    result = checked(route=route_of(frame, [[-300, 0], [-1500, 0]]), band_m=100.0)
+    along = result.along
+    assert along.probability[0] > 0.8 and along.probability[-1] == 0
+    assert np.isnan(along.error_m[-1]) and np.isfinite(along.drift_m).all()
+    assert "outside_map" in {each.code for each in result.verdict.reasons}
+    assert (result.cells.probability[:, 0] == 0).any()
+
+
+@pytest.mark.parametrize(
+    "points, changed",
+    [
+        ([[-200, 0]], {}),
+        ([[-200, 0], [-200, 0]], {}),
+        ([[-200, 0], [-199, 0]], {"band_m": 0.01}),
+        ([[-400, 0], [400, 0]], {"prior_std_m": 0.0}),
+        ([[-300, -200], [300, 200]], {"band_m": 3.0}),
+        ([[-200, 0], [200, 0]], {"band_m": 5000.0}),
+        ([[-200, 0], [200, 0]], {"prior_std_m": None}),
+        ([[-200, 0], [200, 0]], {"yaw_std_deg": None, "agl_std": 0.0}),
+        ([[-9000, 0], [9000, 0]], {"band_m": 20.0}),
+        ([[-200, 0], [200, 0]], {"agl_m": 1.0, "effort": 0.05}),
+        ([[-200, 0], [200, 0]], {"agl_m": 20.0, "effort": 5.0}),
+    ],
+    ids=lambda each: str(each) if isinstance(each, dict) else f"{len(each)} from {each[0][0]}",
+)
+def test_odd_routes(checked, frame, points, changed):
+    result = checked(route=route_of(frame, points), **changed)
+    cells, along = result.cells, result.along
+    assert np.isfinite(cells.probability).any() and cells.trials.sum() >= 20
+    assert np.isfinite(along.probability).all() and np.isfinite(along.drift_m).all()
+    assert (along.across_low <= along.probability).all()
+    assert cells.probability.size < 300_000
+    json.loads(to_json(result))
+
+
+def test_legs_with_bands_of_their_own(checked, frame):
+    route = route_of(frame, [[-300, -150], [-300, 150], [300, 150]], [100.0, 240.0])
+    result = checked(route=route)
+    cells = result.cells
+    assert cells.west_m == pytest.approx(-420, abs=1) and result.band_m == 200.0
+
+    def known(east, north):
+        row, col = (cells.north_m - north) / cells.side_m, (east - cells.west_m) / cells.side_m
+        return bool(np.isfinite(cells.probability[int(row), int(col)]))
+
+    assert known(-300, -100) and not known(-220, -100)
+    assert known(0, 150) and known(0, 60) and not known(0, 0)
+
+
+def test_holes_are_told(untried, half_blank, opened, tmp_path, monkeypatch):
+    """The map shows a strip only: around it nothing is known, in a band the chance is none."""
+    whole = check_run.Ground.of
+
+    def holed(layer, grid):
+        ground = whole(layer, grid)
+        valid = ground.valid.copy()
+        valid[: len(valid) // 2] = False
+        return replace(ground, valid=valid)
+
+    monkeypatch.setattr(check_run.Ground, "of", holed)
+    request = CheckRequest(half_blank.map, camera=CAMERA, agl_m=130.0, prior_std_m=50.0)
+    cells = check_map(request)[0].cells
+    assert cells.north_m < 30 and np.nanmax(cells.probability) > 0.8
+    frame = opened.manifest.sheets[0].frame
+    banded = replace(request, route=route_of(frame, [[-200, -200], [-200, 200]]), band_m=100.0)
+    result = check_map(banded)[0]
+    assert result.along.probability[0] > 0.8 and result.along.probability[-1] == 0
+    middle = result.cells.probability[:, result.cells.probability.shape[1] // 2]
+    assert (middle[:4] == 0).all() and (middle[-4:] > 0.5).all()
+
+
+def test_a_map_without_confidence_is_no_go(untried, half_blank, opened, monkeypatch):
+    plain = dict(opened.manifest.registration) | {"confidence": None}
+    bare = replace(opened, manifest=replace(opened.manifest, registration=plain))
+    monkeypatch.setattr(check_run, "open_map", lambda path: bare)
+    result, _ = check_map(CheckRequest(half_blank.map, camera=CAMERA, agl_m=130.0))
+    assert result.verdict.word is Word.NO_GO
+    assert result.verdict.reasons[0].code == "no_confidence"
+
+
+def test_a_map_without_registration(half_blank, opened, monkeypatch):
+    sheet = replace(opened.manifest.sheets[0], grey=None)
+    bare = replace(opened, manifest=replace(opened.manifest, sheets=(sheet,)))
+    monkeypatch.setattr(check_run, "open_map", lambda path: bare)
+    with pytest.raises(MapFileError, match="registration layer"):
+        check_map(CheckRequest(half_blank.map))
+
+
+def test_envelope_and_heights(checked):
+    result = checked()
+    assert result.envelope is not None and result.envelope.share.max() == 1.0
+    assert [each.chosen for each in result.alternatives] == [False, False, True, False, False]
+    without = checked(extras=False)
+    assert without.envelope is None and without.alternatives == ()
+    assert to_json(without) != to_json(result)
+    np.testing.assert_array_equal(without.cells.probability, result.cells.probability)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"agl_m": 0.5},
+        {"agl_m": 60_000.0},
+        {"agl_m": math.nan},
+        {"yaw_std_deg": -1.0},
+        {"yaw_std_deg": math.inf},
+        {"agl_std": 5.0},
+        {"prior_std_m": -1.0},
+        {"accept": 0.0},
+        {"accept": 1.0},
+        {"speed_mps": 0.0},
+        {"drift": -0.1},
+        {"drift": 3.0},
+        {"relief_m": -1.0},
+        {"effort": 0.0},
+        {"effort": 1e9},
+        {"workers": 0},
+        {"seed": -1},
+    ],
+    ids=str,
+)
+def test_impossible_conditions(half_blank, changed):
+    with pytest.raises(CheckError, match="must be"):
+        CheckRequest(half_blank.map, **changed)
+
+
+def test_views_that_fit_on_no_map(checked, frame):
+    with pytest.raises(AreaError, match="do not fit on the map"):
+        checked(agl_m=50_000.0)
+    wide = checked(agl_m=None, camera=Camera(65_535, 65_535, 500.0, 500.0, 1.0, 1.0))
+    assert wide.conditions.width_m == pytest.approx(128.0)
+    with pytest.raises(CameraError, match="long as wide"):
+        checked(camera=Camera(65_535, 1, 1000.0, 1000.0, 1.0, 1.0))
+    many = checked(camera=Camera(65_535, 49_151, 51_200.0, 51_200.0, 32_768.0, 24_576.0))
+    assert many.conditions.width_m == pytest.approx(166.4, abs=0.1)
+
+
+def test_routes_that_are_elsewhere(checked, frame):
+    for points in ([[20_000, 0], [20_500, 0]], [[-200, 5000]]):
+        with pytest.raises(AreaError, match="nowhere on the map"):
+            checked(route=route_of(frame, points))
+    with pytest.raises(AreaError, match="nowhere on the map"):
+        checked(route=Route(((-40.0, 170.0), (-40.0, 170.01))))
+    with pytest.raises(AreaError, match="wider than 0 m"):
+        checked(route=route_of(frame, [[-200, 0], [200, 0]]), band_m=-5.0)
+    with pytest.raises(AreaError, match="km across"):
+        checked(route=route_of(frame, [[-40_000, 0], [40_000, 0]]))
+
+
+def test_another_date_that_shows_nothing_here(half_blank, checked, monkeypatch):
+    def none_of_other(work, workers, report):
+        found = made_up(work, workers, report)
+        return [
+            [] if plan.other_path else each for (plan, _), each in zip(work, found, strict=True)
+        ]
+
+    monkeypatch.setattr(check_run, "run_many", none_of_other)
+    with pytest.raises(AreaError, match="no ground where the check looks"):
+        checked(other_date=half_blank.present)
+
+
+def test_too_few_trials(checked, monkeypatch):
+    monkeypatch.setattr(check_run, "run_many", lambda work, *_: [[] for _ in work])
+    with pytest.raises(AreaError, match=r"only 0 of \d+ trial views fit on the map"):
+        checked()
+
+
+# As a command.
+
+
+@pytest.fixture
+def route_path(frame, tmp_path):
+    lat, lon = frame.latlon_from_en(np.array([[-350.0, -50.0], [-100.0, 60.0]]))
+    path = tmp_path / "route.csv"
+    rows = [f"{a:.7f},{b:.7f}" for a, b in zip(lat, lon, strict=True)]
+    path.write_text("\n".join(["lat_deg,lon_deg", *rows, ""]))
+    return path
+
+
+VIEWS = ("--agl-m", "170", "--prior-std-m", "50", "--workers", "1")
+
+
+def test_command(run, untried, half_blank, route_path, tmp_path):
+    out = tmp_path / "report"
+    told = run(
+        *("check", half_blank.map, "--route", route_path, "--ortho", half_blank.present),
+        *(*VIEWS, "--effort", "0.05", "--json", tmp_path / "said.json", "--out", out),
+    )
+    assert told.code in (0, 3, 4) and told.err == ""
+    assert f"report: {out / 'index.html'}" in told.out
+    names = {path.name for path in out.iterdir()}
+    assert {"index.html", "check.json", "check.tif", "check.gpkg", "check.qml", "figures"} == names
+    plain = json.loads((out / "check.json").read_text())
+    assert plain == json.loads((tmp_path / "said.json").read_text())
+    assert plain["verdict"]["exit_code"] == told.code
+    assert plain["about"]["other_date"] == half_blank.present.name
+    assert plain["conditions"]["agl_m"] == 170
+    with rasterio.open(out / "check.tif") as raster:
+        assert raster.shape == (plain["cells"]["rows"], plain["cells"]["cols"])
+
+
+@pytest.fixture
+def unwritten(untried, monkeypatch):
+    """Nothing is written."""
+    monkeypatch.setattr("orthonav.check.write.write_check", lambda result, opened, out: out)
+
+
+@pytest.mark.parametrize("word", list(Word), ids=lambda word: word.value)
+def test_exit_codes(run, unwritten, half_blank, tmp_path, monkeypatch, word):
+    judge = check_run.verdict_of
+    monkeypatch.setattr(check_run, "verdict_of", lambda found: Verdict(word, judge(found).reasons))
+    told = run("check", half_blank.map, *VIEWS, "--json", "--out", tmp_path / "report")
+    assert (told.code, told.err) == (word.exit_code, "")
+    assert json.loads(told.out)["verdict"]["word"] == word.value
+
+
+def test_unknowns(run, unwritten, half_blank, tmp_path):
+    told = run(
+        *("check", half_blank.map, "--heading", "unknown", "--prior", "none", "--agl-m", "170"),
+        *("--json", "--out", tmp_path / "report"),
+    )
+    conditions = json.loads(told.out)["conditions"]
+    assert conditions["yaw_std_deg"] is None and conditions["prior_std_m"] is None
+
+
+def test_the_height_of_a_route(run, unwritten, half_blank, route_path, tmp_path):
+    """The lowest above ground, landings left out; --agl-m comes before it."""
+    route = tmp_path / "high.csv"
+    lines = route_path.read_text().splitlines()
+    heights = [",agl_m", ",150", ",180"]
+    route.write_text("\n".join(line + add for line, add in zip(lines, heights, strict=True)) + "\n")
+    found = []
+    for more in ((), ("--agl-m", "160")):
+        told = run(
+            *("check", half_blank.map, "--route", route, *more, "--json"),
+            *("--out", tmp_path / "report"),
+        )
+        found.append(json.loads(told.out)["conditions"]["agl_m"])
+    assert found == [150, 160]
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        (["--accept", "1.5"], "accept must be"),
+        (["--seed", "-3"], "seed must be"),
+        (["--workers", "0"], "workers must be"),
+        (["--effort", "0"], "effort must be"),
+        (["--route", "no.geojson"], "no.geojson"),
+        (["--ortho", "no.tif"], "no.tif"),
+        (["--camera", "no.json"], "no.json"),
+        (["--agl-m", "40000"], "do not fit on the map"),
+        (["--route", "paper:A@10,10"], "nowhere on the map"),
+    ],
+    ids=lambda each: " ".join(each) if isinstance(each, list) else "",
+)
+def test_bad_input_is_one_line(run, half_blank, tmp_path, names_in, options, said):
+    told = run("check", half_blank.map, *options, "--out", tmp_path / "report")
+    assert told.code == 1 and told.out == "" and told.err.count("\n") == 1
+    assert told.err.startswith("orthonav: error: ") and said in told.err
+    assert names_in(tmp_path) == []
+
+
+def test_a_map_that_is_none(run, tmp_path):
+    told = run("check", tmp_path / "no.onav", "--out", tmp_path / "report")
+    assert told.code == 1 and "no.onav" in told.err
+    with pytest.raises(MissingFileError):
+        check_map(CheckRequest(tmp_path / "no.onav"))
+
+
+def test_an_interrupt_writes_nothing(run, half_blank, tmp_path, names_in, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(check_run, "run_many", interrupted)
+    told = run("check", half_blank.map, *VIEWS, "--out", tmp_path / "report")
+    assert (told.code, told.err) == (1, "orthonav: error: interrupted; nothing was written\n")
+    assert names_in(tmp_path) == []
+    assert main(["check", str(half_blank.map), "--out", str(tmp_path / "report")]) == 1

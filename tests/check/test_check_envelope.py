@@ -1,0 +1,85 @@
+"""How far heading and height may be off, from trials."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_trials import lost, right
+
+from orthonav.check.envelope import (
+    AGL_OFF,
+    HEIGHTS,
+    STILL_FINE,
+    YAW_OFF_DEG,
+    envelope_of,
+    envelope_work,
+    heights_of,
+    heights_work,
+    kept_share,
+)
+from orthonav.check.views import TrialPlan
+from orthonav.geo.camera import Camera
+
+PLAN = TrialPlan(Path("a.onav"), Camera(640, 480, 600.0, 600.0, 320.0, 240.0), 100.0)
+PLACES = np.zeros((20, 2))
+MIDDLE = AGL_OFF.index(0.0)
+
+
+def trials(share):
+    """20 trials of which so many are right."""
+    count = round(20 * share)
+    return [right((0, 0))] * count + [lost((0, 0))] * (20 - count)
+
+
+def envelope(shares):
+    shares = np.broadcast_to(shares, (len(YAW_OFF_DEG), len(AGL_OFF)))
+    return envelope_of([trials(each) for each in shares.ravel()], 0.9, 35.0)
+
+
+def test_work_is_at_the_same_places_for_every_error():
+    work = envelope_work(PLAN, PLACES)
+    assert len(work) == len(YAW_OFF_DEG) * len(AGL_OFF)
+    assert [(plan.yaw_off_deg, plan.agl_off) for plan, _ in work][: len(AGL_OFF)] == [
+        (0.0, off) for off in AGL_OFF
+    ]
+    assert all(places is PLACES and plan.seed == PLAN.seed for plan, places in work)
+
+
+def test_errors_are_fine_up_to_the_first_that_is_not():
+    shares = np.full((len(YAW_OFF_DEG), len(AGL_OFF)), 0.9)
+    shares[2, MIDDLE] = 0.9 * STILL_FINE - 0.1
+    shares[0, -1] = shares[0, 0] = 0.1
+    found = envelope(shares)
+    assert found.fine_yaw_deg == YAW_OFF_DEG[1]
+    assert (found.fine_agl_low, found.fine_agl_high) == (AGL_OFF[1], AGL_OFF[-2])
+    np.testing.assert_allclose(found.share, shares, atol=0.03)
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_all_errors_are_fine(share):
+    found = envelope(share)
+    assert found.fine_yaw_deg == YAW_OFF_DEG[-1]
+    assert (found.fine_agl_low, found.fine_agl_high) == (AGL_OFF[0], AGL_OFF[-1])
+
+
+def test_where_nothing_is_found_no_error_is_fine():
+    found = envelope(0.0)
+    assert (found.fine_yaw_deg, found.fine_agl_low, found.fine_agl_high) == (0.0, 0.0, 0.0)
+
+
+def test_heights():
+    work = heights_work(PLAN, PLACES)
+    assert [plan.agl_m for plan, _ in work] == [100.0 * part for part in HEIGHTS]
+    shares = [0.1 * (i + 1) for i in range(len(HEIGHTS))]
+    found = heights_of(PLAN, [trials(each) for each in shares], 0.7, 0.9, 35.0)
+    assert [each.value for each in found] == sorted([100.0, *(100.0 * part for part in HEIGHTS)])
+    chosen = [each for each in found if each.chosen]
+    assert [(each.value, each.probability) for each in chosen] == [(100.0, 0.7)]
+    assert found[0].probability == pytest.approx(0.1)
+
+
+def test_kept_are_the_confident_and_right():
+    some = [right((0, 0)), right((0, 0), error_m=40.0), right((0, 0), confidence=0.8), lost((0, 0))]
+    assert kept_share(some, 0.9, 35.0) == 0.25
+    assert math.isnan(kept_share([], 0.9, 35.0))

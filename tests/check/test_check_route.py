@@ -1,0 +1,172 @@
+"""Along a route: probability, drift, blind stretches."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_trials import CONDITIONS
+
+from orthonav.check.outcome import Along
+from orthonav.check.route import BLIND, blind_stretches, expected_drift, predicted_along
+from orthonav.geo.area import Area
+from orthonav.geo.frames import LocalFrame
+from orthonav.geo.route import Route
+
+FRAME = LocalFrame(46.0, 3.0)
+SIDE_M = 100.0
+
+
+def area_of(points_en_m, band_m=200.0):
+    lat, lon = FRAME.latlon_from_en(np.array(points_en_m, float))
+    route = Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True)))
+    return Area(FRAME, (-5000.0, -5000.0, 5000.0, 5000.0), route, band_m)
+
+
+def flown(chances, errors_m, drift, side_m, times, seed):
+    """Root mean square error at every view of many flights, view by view."""
+    rng = np.random.default_rng(seed)
+    error = np.full(times, errors_m[0])
+    squares = []
+    for i, (chance, error_m) in enumerate(zip(chances, errors_m, strict=True)):
+        if i:
+            error = error + drift * side_m
+        error = np.where(rng.random(times) < chance, error_m, error)
+        squares.append(np.mean(error**2))
+    return np.sqrt(squares)
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.lists(st.tuples(st.floats(0, 1), st.floats(0, 12)), min_size=2, max_size=25))
+def test_drift_is_that_of_many_flights(views):
+    chances, errors = (np.array(each) for each in zip(*views, strict=True))
+    distance = np.arange(len(views)) * SIDE_M
+    found = expected_drift(distance, chances, errors, 0.05, SIDE_M)
+    truth = flown(chances, errors, 0.05, SIDE_M, 40_000, seed=1)
+    np.testing.assert_allclose(found, truth, rtol=0.04, atol=0.1)
+
+
+def test_without_fixes_drift_grows_with_the_way():
+    distance = np.arange(0, 2001, 25.0)
+    found = expected_drift(distance, np.zeros(81), np.full(81, np.nan), 0.03, SIDE_M)
+    np.testing.assert_allclose(found, 0.03 * distance, atol=1e-6)
+
+
+def test_sure_fixes_leave_their_own_error():
+    distance = np.arange(0, 2001, 25.0)
+    found = expected_drift(distance, np.ones(81), np.full(81, 4.0), 0.03, SIDE_M)
+    np.testing.assert_allclose(found, 4.0)
+
+
+def test_a_single_point_has_no_drift():
+    assert expected_drift(np.zeros(1), np.array([0.3]), np.array([5.0]), 0.03, SIDE_M) == [5.0]
+
+
+def even(points):
+    return np.full(len(points), 0.8), np.full(len(points), 3.0)
+
+
+def test_along_a_route():
+    along = predicted_along(
+        area_of([[0, 0], [1000, 0], [1000, 500]]), [200.0] * 2, SIDE_M, CONDITIONS, even
+    )
+    assert along.distance_m[0] == 0 and np.diff(along.distance_m) == pytest.approx(SIDE_M / 4)
+    assert along.distance_m[-1] == pytest.approx(1500, abs=SIDE_M / 4)
+    np.testing.assert_allclose(along.points_en_m[0], [0, 0], atol=0.01)
+    at_corner = np.hypot(*(along.points_en_m - [1000, 0]).T).argmin()
+    assert along.distance_m[at_corner] == pytest.approx(1000, abs=SIDE_M / 4)
+    assert (along.across_low == 0.8).all() and (along.drift_m < 4.2).all()
+
+
+def test_the_worst_over_the_width_of_every_leg():
+    """Ground is blind more than 80 m north of a way to the east, and east of one to the north."""
+
+    def told(points):
+        bad = (points[:, 1] > 80) & (points[:, 0] < 900)
+        bad |= (points[:, 0] > 1080) & (points[:, 1] > 250)
+        return np.where(bad, 0.1, 0.9), np.full(len(points), 3.0)
+
+    area = area_of([[0, 0], [1000, 0], [1000, 800]])
+    early = slice(4, 20)
+    for bands, first, last in (
+        ((200, 100), 0.1, 0.9),
+        ((100, 200), 0.9, 0.1),
+        ((90, 90), 0.9, 0.9),
+    ):
+        along = predicted_along(area, bands, SIDE_M, CONDITIONS, told)
+        late = along.distance_m > 1400
+        assert (along.across_low[early] == first).all() and (along.across_low[late] == last).all()
+        assert (along.probability[early] == 0.9).all()
+
+
+@pytest.mark.parametrize(
+    "points", [[[30, 40]], [[30, 40], [30, 40]]], ids=["one", "twice the same"]
+)
+def test_a_route_of_one_place(points):
+    along = predicted_along(area_of(points), [100.0], SIDE_M, CONDITIONS, even)
+    assert along.distance_m.tolist() == [0.0] and along.probability.tolist() == [0.8]
+    np.testing.assert_allclose(along.points_en_m, [[30, 40]], atol=0.01)
+    assert blind_stretches(along, CONDITIONS, SIDE_M) == ()
+
+
+def test_very_long_and_very_short_routes():
+    long = predicted_along(area_of([[0, 0], [4900, 0]]), [100.0], 0.5, CONDITIONS, even)
+    assert len(long.distance_m) <= 4001 and np.isfinite(long.drift_m).all()
+    short = predicted_along(area_of([[0, 0], [3, 0]]), [100.0], SIDE_M, CONDITIONS, even)
+    assert len(short.distance_m) == 1
+
+
+def along_of(probability, step_m=25.0):
+    """A straight way east with these probabilities."""
+    probability = np.array(probability, float)
+    distance = np.arange(len(probability)) * step_m
+    points = np.stack([distance, np.zeros_like(distance)], axis=1)
+    error = np.full_like(distance, 3.0)
+    return Along(distance, points, probability, probability, error, error)
+
+
+GOOD, BAD = [0.9] * 8, [0.2] * 12
+
+
+def test_blind_stretches():
+    along = along_of(GOOD + BAD + GOOD + BAD + [0.9])
+    first, second = blind_stretches(along, CONDITIONS, SIDE_M)
+    assert (first.start_m, first.end_m) == (200, 500) and (second.start_m, second.end_m) == (
+        700,
+        1000,
+    )
+    assert (first.start_s, first.end_s) == (10, 25) and first.length_m == 300
+    assert first.probability == pytest.approx(0.2) and first.drift_m == pytest.approx(9)
+    assert first.allowed_m == CONDITIONS.prior_std_m and first.bearable and second.bearable
+
+
+@pytest.mark.parametrize(
+    "probability, expected",
+    [
+        (GOOD, []),
+        (GOOD + BAD[:3] + GOOD, []),
+        (GOOD + BAD[:4] + GOOD, [(200.0, 300.0, False)]),
+        (BAD + GOOD, [(0.0, 300.0, False)]),
+        (GOOD + BAD, [(200.0, 475.0, True)]),
+        (BAD, [(0.0, 275.0, True)]),
+        ([BLIND] * 9, []),
+    ],
+    ids=["none", "shorter than a view", "a view", "at first", "at last", "all", "on the border"],
+)
+def test_where_stretches_begin_and_end(probability, expected):
+    found = blind_stretches(along_of(probability), CONDITIONS, SIDE_M)
+    assert [(each.start_m, each.end_m, each.ends_lost) for each in found] == expected
+
+
+def test_what_dead_reckoning_bears():
+    far = along_of(GOOD + [0.1] * 100 + GOOD)
+    (stretch,) = blind_stretches(far, CONDITIONS, SIDE_M)
+    assert stretch.drift_m == pytest.approx(75) and not stretch.bearable
+    (stretch,) = blind_stretches(far, replace(CONDITIONS, prior_std_m=80.0), SIDE_M)
+    assert stretch.bearable
+    (stretch,) = blind_stretches(far, replace(CONDITIONS, prior_std_m=None), SIDE_M)
+    assert stretch.bearable and math.isinf(stretch.allowed_m)
+    (stretch,) = blind_stretches(along_of(GOOD + BAD), CONDITIONS, SIDE_M)
+    assert not stretch.bearable

@@ -1,0 +1,194 @@
+"""Views that are made and placed before the flight, by the very localizer that flies."""
+
+import math
+import multiprocessing
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from orthonav.check import trials, views
+from orthonav.check.ortho import OrthoPyramid, check_same_ground
+from orthonav.check.persistence import MARGIN_PX
+from orthonav.check.trials import Trier, run_many, run_trials
+from orthonav.check.views import TrialPlan
+from orthonav.errors import AreaError, MapFileError, MissingFileError, WorkerError
+from orthonav.geo.camera import Camera
+from orthonav.localizer import Localizer
+from orthonav.mapfile import open_map
+from orthonav.prepare import BuildRequest, build_map
+
+CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+WEST = np.array([[-250.0, 60.0], [-180.0, -90.0], [-300.0, 120.0], [-220.0, 0.0], [-330.0, -60.0]])
+EAST = np.array([[200.0, 60.0], [250.0, -90.0], [300.0, 120.0]])
+
+
+@pytest.fixture(scope="module")
+def plan(half_blank):
+    """Views of 154 x 115 m, searched in a part of the map."""
+    return TrialPlan(half_blank.map, CAMERA, 120.0, prior_std_m=40.0)
+
+
+@pytest.fixture(scope="module")
+def exact(plan, half_blank):
+    """Views of the map's own orthophoto as it is, of which everything is told right."""
+    changed = {"other_path": half_blank.past, "yaw_std_deg": 0.5, "agl_std": 0.0}
+    return TrialPlan(**(vars(plan) | changed))
+
+
+@pytest.fixture(scope="module")
+def registration(half_blank):
+    return Localizer(open_map(half_blank.map)).registration
+
+
+def plain(found):
+    """What can be compared, NaN included."""
+    return [[repr(trial) for trial in each] for each in found]
+
+
+def test_unchanged_views_are_found_where_they_were_made(exact):
+    found = run_trials(exact, WEST, 1)
+    assert len(found) == len(WEST)
+    for trial, place in zip(found, WEST, strict=True):
+        assert math.dist(trial.en_m, place) < 0.75  # of whole pixels
+        assert trial.error_m < 0.3 and trial.confidence > 0.9
+        assert math.isnan(trial.expected)
+        assert trial.error_m == pytest.approx(math.dist(trial.en_m, trial.found_en_m))
+
+
+@pytest.mark.parametrize(
+    "changed", [{"yaw_std_deg": None}, {"prior_std_m": None}, {"relief_m": 3.0}]
+)
+def test_so_are_they_with_less_known(exact, changed):
+    found = run_trials(TrialPlan(**(vars(exact) | changed)), WEST[:2], 1)
+    assert all(trial.error_m < 3.0 and trial.confidence > 0.9 for trial in found)
+
+
+def test_wrong_heading_and_height_are_told(plan):
+    """What is told is off, not the view: with enough of it nothing is found."""
+    off = TrialPlan(**(vars(plan) | {"yaw_off_deg": 60.0, "agl_off": -0.4}))
+    assert max(trial.confidence for trial in run_trials(off, WEST[:3], 1)) < 0.5
+
+
+def test_views_of_another_year_of_blank_ground_are_not_found(plan):
+    west, east = run_trials(plan, WEST, 1), run_trials(plan, EAST, 1)
+    assert min(trial.expected for trial in west) > max(trial.expected for trial in east)
+    assert max(trial.confidence for trial in east) < 0.9
+    assert all(0 < trial.expected < 1 for trial in [*west, *east])
+
+
+def test_places_off_the_map_are_left_out(plan):
+    places = np.array([[-250.0, 60.0], [9e4, 0.0], [-1e7, 1e7], [0.0, 600.0]])
+    found = run_trials(plan, places, 1)
+    assert [trial.index for trial in found] == [0]
+
+
+def test_told_positions_far_from_the_map(plan):
+    """A prior that is off by far more than the map is wide is no error."""
+    wild = TrialPlan(**(vars(plan) | {"prior_std_m": 1e6}))
+    (trial,) = run_trials(wild, WEST[:1], 1)
+    assert 0 <= trial.confidence <= 1
+    none = TrialPlan(**(vars(plan) | {"prior_std_m": 0.0}))
+    assert len(run_trials(none, WEST[:1], 1)) == 1
+
+
+def test_the_same_whatever_the_number_of_workers(plan, half_blank, monkeypatch):
+    """And of another date: what is beside a trial changes nothing."""
+    monkeypatch.setattr(trials, "AT_ONCE", 2)
+    other = TrialPlan(**(vars(plan) | {"other_path": half_blank.present, "seed": 2}))
+    places = np.concatenate([WEST[:3], EAST[:2], [[9e4, 0]], EAST[:2] - 30])
+    work = [(plan, places), (other, places)]
+    assert len(places) * 2 >= 4 * trials.AT_ONCE
+    shares = []
+    alone = run_many(work, 1)
+    together = run_many(work, 2, shares.append)
+    assert plain(alone) == plain(together) and len(alone[0]) == len(places) - 1
+    assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) == 2 * len(places)
+    assert plain([run_trials(plan, places[:3], 1)]) == plain([alone[0][:3]])
+    assert multiprocessing.active_children() == []
+
+
+@pytest.mark.parametrize("how", ["killed", "interrupted"])
+def test_workers_leave_nobody_behind(plan, how):
+    def stop(_):
+        if how == "interrupted":
+            raise KeyboardInterrupt
+        for child in multiprocessing.active_children():
+            os.kill(child.pid, signal.SIGKILL)
+
+    expected = {"killed": WorkerError, "interrupted": KeyboardInterrupt}[how]
+    with pytest.raises(expected) as raised:
+        run_many([(plan, np.tile(EAST, (16, 1)))], 2, stop)
+    assert how != "killed" or "--workers" in str(raised.value)
+    for _ in range(50):  # those that were killed are collected
+        if not multiprocessing.active_children():
+            break
+        time.sleep(0.1)
+    assert multiprocessing.active_children() == []
+
+
+def test_a_map_without_registration(half_blank, tmp_path, monkeypatch):
+    path = tmp_path / "tiles.onav"
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 24)
+    build_map(BuildRequest([half_blank.past], path, tile_px=128, overlap=0.5, registration=False))
+    with pytest.raises(MapFileError, match="registration layer"):
+        Trier([TrialPlan(path, CAMERA, 120.0)])
+
+
+def test_pictures_know_where_their_middle_is(plan, registration):
+    layer = registration.registrar.reference.pyramid
+    pictures = views.Pictures(layer, registration)
+    grid = registration.grid
+    for level in (0, 1):
+        grey, valid, middle = pictures.around(WEST[0], 60, level)
+        unit_m = grid.gsd_m * 2**level
+        assert grey.shape == valid.shape == (60 + 2 * MARGIN_PX,) * 2 and valid.all()
+        assert np.abs(middle - WEST[0]).max() <= unit_m / 2 + 1e-9
+        col = round((middle[0] - grid.west_m) / unit_m - 30)
+        row = round((grid.north_m - middle[1]) / unit_m - 30)
+        inner = grey[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
+        np.testing.assert_array_equal(inner, layer.read(level, row, col, 60, 60)[0])
+    assert pictures.around(np.array([1e6, 0.0]), 60, 0) is None
+
+
+def test_strangers_are_mirrored_ground(registration):
+    layer = registration.registrar.reference.pyramid
+    pictures = views.Pictures(layer, registration)
+    rng = np.random.default_rng(1)
+    found = pictures.stranger(rng, 200, 0)
+    rng = np.random.default_rng(1)
+    rows, cols = layer.shape(0)
+    row, col = int(rng.integers(0, rows - 200)), int(rng.integers(0, cols - 200))
+    grey, valid = layer.read(0, row, col, 200, 200)
+    assert not valid.all() or (found[:, ::-1] == grey).all()
+    whole = pictures.stranger(rng, 3000, 0)  # larger than the map
+    assert whole.shape == (3000, 3000) and whole[-1, -1] == 128
+
+
+def test_another_date_lies_on_the_map(half_blank, registration):
+    """The map's own orthophoto, read as another date, is the picture of the map."""
+    layer = registration.registrar.reference.pyramid
+    pyramid = OrthoPyramid(half_blank.past, registration.sheet, layer.levels)
+    try:
+        for level in (0, 1, 2):
+            assert pyramid.shape(level) == layer.shape(level)
+            part = (level, 200 >> level, 160 >> level, 200 >> level, 160 >> level)
+            (one, valid), (other, _) = pyramid.read(*part), layer.read(*part)
+            assert valid.all()
+            same = np.corrcoef(one.ravel(), other.ravel())[0, 1]
+            for shift in (1, -1):
+                moved = np.roll(one, shift, axis=1)
+                assert same > 0.97 > np.corrcoef(moved.ravel(), other.ravel())[0, 1]
+        grey, valid = pyramid.read(0, -500, -500, 100, 100)
+        assert not valid.any() and not grey.any()
+    finally:
+        pyramid.close()
+
+
+def test_another_date_of_other_ground(registration, make_ortho, tmp_path):
+    with pytest.raises(AreaError, match="no ground of the map"):
+        check_same_ground(make_ortho(tmp_path / "far.tif"), registration.sheet)
+    with pytest.raises(MissingFileError):
+        check_same_ground(tmp_path / "none.tif", registration.sheet)

@@ -1,0 +1,150 @@
+"""Go, marginal or no-go: every rule alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_trials import CONDITIONS
+
+from orthonav.check.outcome import Along, Lookalike, Stretch, Word
+from orthonav.check.verdict import Findings, verdict_of
+
+ZEROS = np.zeros(11)
+ALONG = Along(
+    np.linspace(0, 5000, 11), np.zeros((11, 2)), ZEROS + 0.9, ZEROS + 0.8, ZEROS + 3, ZEROS + 8
+)
+FINE = Findings(
+    conditions=CONDITIONS,
+    mean=0.9,
+    calibrated=True,
+    wrong=0,
+    trials=1000,
+    outside=0.0,
+    along=None,
+    stretches=(),
+    lookalikes=(),
+)
+FLOWN = replace(FINE, along=ALONG)
+
+
+def judged(findings):
+    """The verdict, and what each of its reasons says."""
+    verdict = verdict_of(findings)
+    ranks = [(Word.NO_GO, Word.MARGINAL, Word.GO).index(each.word) for each in verdict.reasons]
+    assert ranks == sorted(ranks) and verdict.word is verdict.reasons[0].word
+    assert all(each.text and "nan" not in each.text for each in verdict.reasons)
+    return verdict.word, {each.code: each.word for each in verdict.reasons}
+
+
+def stretch(length_m, drift_m, *, ends_lost=False, allowed_m=50.0, start_m=1000.0):
+    end_m = start_m + length_m
+    return Stretch(
+        start_m, end_m, start_m / 20, end_m / 20, 0.2, drift_m, allowed_m, ends_lost=ends_lost
+    )
+
+
+def test_all_is_well():
+    assert judged(FINE) == (Word.GO, {"fixes": Word.GO})
+    assert judged(FLOWN) == (Word.GO, {"fixes": Word.GO, "drift": Word.GO})
+
+
+def test_exit_codes():
+    assert {word: word.exit_code for word in Word} == {Word.GO: 0, Word.MARGINAL: 3, Word.NO_GO: 4}
+
+
+@pytest.mark.parametrize(
+    "mean, code, word",
+    [
+        (0.6, "fixes", Word.GO),
+        (0.59, "few_fixes", Word.MARGINAL),
+        (0.2, "few_fixes", Word.MARGINAL),
+        (0.19, "few_fixes", Word.NO_GO),
+        (0.0, "few_fixes", Word.NO_GO),
+    ],
+)
+def test_mean_probability(mean, code, word):
+    assert judged(replace(FINE, mean=mean)) == (word, {code: word})
+
+
+def test_a_map_without_confidence_is_not_flown():
+    word, reasons = judged(replace(FLOWN, calibrated=False))
+    assert word is Word.NO_GO and reasons["no_confidence"] is Word.NO_GO
+
+
+@pytest.mark.parametrize(
+    "wrong, trials, expected",
+    [
+        (1, 10, None),
+        (2, 1000, None),
+        (5, 1000, Word.MARGINAL),
+        (19, 1000, Word.MARGINAL),
+        (20, 1000, Word.NO_GO),
+        (0, 0, None),
+    ],
+)
+def test_wrong_with_confidence(wrong, trials, expected):
+    word, reasons = judged(replace(FINE, wrong=wrong, trials=trials))
+    assert reasons.get("wrong") is expected and word is (expected or Word.GO)
+
+
+@pytest.mark.parametrize(
+    "outside, expected",
+    [(0.0, None), (0.004, None), (0.05, Word.MARGINAL), (0.11, Word.NO_GO), (1.0, Word.NO_GO)],
+)
+def test_a_route_beyond_the_map(outside, expected):
+    word, reasons = judged(replace(FLOWN, outside=outside))
+    assert reasons.get("outside_map") is expected and word is (expected or Word.GO)
+
+
+@pytest.mark.parametrize(
+    "drift_m, prior_std_m, expected",
+    [
+        (50.0, 50.0, Word.GO),
+        (51.0, 50.0, Word.MARGINAL),
+        (101.0, 50.0, Word.NO_GO),
+        (5000.0, None, Word.GO),
+    ],
+)
+def test_expected_drift(drift_m, prior_std_m, expected):
+    drift = np.where(np.arange(11) == 4, drift_m, 3.0)
+    along = replace(ALONG, drift_m=drift)
+    conditions = replace(CONDITIONS, prior_std_m=prior_std_m)
+    findings = replace(FINE, along=along, conditions=conditions)
+    assert judged(findings) == (expected, {"fixes": Word.GO, "drift": expected})
+    assert any("2.0 km" in each.text for each in verdict_of(findings).reasons)
+
+
+@pytest.mark.parametrize(
+    "stretches, expected, said",
+    [
+        ((stretch(400, 12),), Word.GO, "one blind stretch of 400 m (20 s) from 1.0 km on: dead"),
+        ((stretch(400, 12), stretch(900, 27)), Word.GO, "2 blind stretches, the longest 900 m"),
+        ((stretch(2000, 60),), Word.MARGINAL, "dead reckoning drifts 60 m"),
+        ((stretch(4000, 120),), Word.NO_GO, "off by 120 m after 4000 m"),
+        ((stretch(400, 12, ends_lost=True),), Word.MARGINAL, "the route ends in one"),
+        ((stretch(400, 12), stretch(4000, 120)), Word.NO_GO, "2 blind stretches"),
+        ((stretch(9000, 270, allowed_m=float("inf")),), Word.GO, "bridges"),
+    ],
+    ids=["one", "two", "long", "longer", "at the end", "one of two", "whole map searched"],
+)
+def test_blind_stretches(stretches, expected, said):
+    findings = replace(FLOWN, stretches=stretches)
+    word, reasons = judged(findings)
+    assert word is expected and reasons["blind"] is expected
+    assert any(said in each.text for each in verdict_of(findings).reasons)
+
+
+def test_lookalikes_are_told_and_no_more():
+    like = Lookalike((46.0, 3.0), (46.01, 3.0), 1100.0, 0.9, 4, True)
+    some = (like, replace(like, within_prior=False), replace(like, trials=1))
+    assert judged(replace(FINE, lookalikes=some)) == (
+        Word.GO,
+        {"fixes": Word.GO, "lookalikes": Word.GO},
+    )
+    assert judged(replace(FINE, lookalikes=some[1:])) == (Word.GO, {"fixes": Word.GO})
+
+
+def test_the_worst_reason_decides():
+    findings = replace(FLOWN, mean=0.3, outside=0.5, calibrated=False)
+    word, reasons = judged(findings)
+    assert word is Word.NO_GO and reasons["few_fixes"] is Word.MARGINAL and len(reasons) == 4
