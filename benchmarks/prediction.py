@@ -119,7 +119,7 @@ def main() -> None:
         }
         maps = {each.map: _map(files[each.map], Path(folder)) for each in chosen}
         jobs = [
-            (each, maps[each.map], files[each.views], Path(folder) / f"flight{i}", options.views)
+            (each, maps[each.map], files[each.views], Path(folder) / f"flight{i}", options)
             for i, each in enumerate(chosen)
         ]
         found = []
@@ -147,6 +147,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m benchmarks.prediction", description=__doc__.splitlines()[0]
     )
     parser.add_argument("--views", type=int, default=240, help="views per scene (default 240)")
+    parser.add_argument("--effort", type=float, default=1.0, help="of the checks (default 1)")
     parser.add_argument("--only", nargs="+", choices=GROUPS, help="only these")
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="scenes at a time")
     parser.add_argument("--out", type=Path, help="folder for JSON, Markdown and a picture")
@@ -182,10 +183,10 @@ def _map(ortho: Path, folder: Path) -> Path:
     return path
 
 
-def _compared(job: tuple[Scene, Path, Path, Path, int]) -> Outcome:
+def _compared(job: tuple[Scene, Path, Path, Path, argparse.Namespace]) -> Outcome:
     """Prediction and outcome of one scene."""
     cv2.setNumThreads(1)
-    scene, map_path, views, folder, count = job
+    scene, map_path, views, folder, options = job
     opened = open_map(map_path)
     gsd_m = opened.manifest.sheets[0].grid.gsd_m
     prior_m = PRIOR_PX * gsd_m
@@ -193,7 +194,9 @@ def _compared(job: tuple[Scene, Path, Path, Path, int]) -> Outcome:
     if scene.width_px:
         errors = Errors(yaw_std_deg=YAW_STD_DEG, agl_std=AGL_STD)
         simulate_flight(
-            SimulateRequest([views], folder, random=count, agl_m=agl_m, errors=errors, seed=7)
+            SimulateRequest(
+                [views], folder, random=options.views, agl_m=agl_m, errors=errors, seed=7
+            )
         )
     else:
         folder, prior_m = views, 100.0
@@ -210,6 +213,7 @@ def _compared(job: tuple[Scene, Path, Path, Path, int]) -> Outcome:
         accept=ACCEPT,
         relief_m=scene.relief_m,
         extras=False,
+        effort=options.effort,
         workers=1,
     )
     cells = check_map(request)[0].cells
@@ -333,7 +337,8 @@ def _scenes_table(found: Sequence[Outcome], options: argparse.Namespace) -> Tabl
     notes = (
         f"share of views with a correct fix of confidence {ACCEPT:g} or more; predicted from the "
         "map's date alone",
-        f"{options.views} views per orthophoto, heading off by {YAW_STD_DEG:g} deg, height by "
+        f"checks of effort {options.effort:g}; {options.views} views per orthophoto, heading off "
+        f"by {YAW_STD_DEG:g} deg, height by "
         f"{AGL_STD:.0%}, prior off by {PRIOR_PX:g} px of the map (flights: 100 m), standard "
         f"deviations; cells of {VIEWS_PER_CELL} views on average, stretches of as many",
         f"all cells: correlation {whole['correlation']}, predicted less measured "

@@ -30,12 +30,13 @@ class Severity:
 
     field: float = 0.2
     view: float = 0.08
-    shift: float = 0.15
+    shift: float = 0.0
 
 
 USUAL = Severity()
-"""Chosen on generated landscapes (seeds 11 to 13, views 100, 160 and 240 pixels across): predicted
-and measured shares agree there within 0.07 in every fifth."""
+"""The spreads were chosen on generated landscapes (seeds 11 to 13, views 100, 160 and 240 pixels
+across). Without a shift predictions are 0.06 below what is measured there; a shift of 0.1 would
+halve that, and make those of real imagery too high."""
 
 
 def another_year(

@@ -57,7 +57,7 @@ class Cells:
     `probability` of a correct, confident fix of one view anywhere in the cell, `low` and `high` an
     80 % interval of it; `error_m` expected error (root mean square, metres) of such a fix;
     `wrong` share of trials that were confident and wrong; `trials` how many views were tried;
-    `texture` 0..1, the share of ground that shows structure of the kind that lasts.
+    `texture` 0..1, how much of what the ground shows is expected to last in another year.
     """
 
     west_m: float
@@ -142,7 +142,7 @@ class Envelope:
     """Share (A, B) of correct, confident fixes over errors of heading (A,) and height (B,).
 
     Errors are those of one view, beyond what is told; `agl_off` is a share of the height. `fine` is
-    the largest of each at which the share stays at 85 % or more of that without error.
+    the largest of each alone at which the share stays at 85 % or more of that without error.
     """
 
     yaw_off_deg: Array
@@ -199,8 +199,9 @@ class About:
 class CheckResult:
     """All that a check found. `along` is None without a route, `envelope` where none was asked for.
 
-    `route_en_m` (M, 2) are its waypoints. `second_date` is whether views of another date were tried
-    too. `area_km2` is what was checked, `mean` the mean probability over it.
+    `route_en_m` (M, 2) are its waypoints, `band_m` the width of its widest band. `second_date` is
+    whether views of another date were tried too. `area_km2` is what was checked, `mean` the mean
+    probability over it.
     """
 
     about: About

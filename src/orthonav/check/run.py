@@ -118,7 +118,6 @@ class _Check:
             request.yaw_std_deg,
             request.agl_std,
             request.prior_std_m,
-            request.accept,
             request.relief_m,
             request.seed,
         )
@@ -238,7 +237,7 @@ class _Check:
             second_date=bool(other),
             along=along,
             route_en_m=route_en_m,
-            band_m=self.band_m,
+            band_m=None if self.area is None else self.area.band_m,
             stretches=stretches,
             lookalikes=lookalikes,
             envelope=envelope,
@@ -362,7 +361,9 @@ class _Check:
             return found.probability, found.error_m
 
         side_m = self.plan.side_m
-        return predicted_along(self.area, self._leg_bands_m, side_m, self.conditions, at)
+        made = predicted_along(self.area, self._leg_bands_m, side_m, self.conditions, at)
+        found = self._told(told, made.points_en_m, self.ground.shown(made.points_en_m))
+        return replace(made, low=found.low, high=found.high)
 
     def _alternatives(
         self, heights: list[list[Trial]], planned: float, cells: Cells

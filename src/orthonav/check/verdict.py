@@ -125,5 +125,6 @@ def _alike(found: Findings) -> list[Reason]:
     near = [each for each in found.lookalikes if each.within_prior and each.trials > 1]
     if not near:
         return []
-    text = f"{len(near)} pairs of places within the prior look alike: one view may not tell them "
+    pairs = f"{len(near)} pairs" if len(near) > 1 else "one pair"
+    text = f"{pairs} of places within the prior look alike: one view may not tell them "
     return [Reason("lookalikes", f"{text}apart (they cost fixes, see the list)", Word.GO)]

@@ -38,7 +38,6 @@ class TrialPlan:
     yaw_std_deg: float | None = 5.0
     agl_std: float = 0.05
     prior_std_m: float | None = None
-    accept: float = 0.9
     relief_m: float = 0.0
     seed: int = 1
     severity: Severity = USUAL
@@ -48,7 +47,7 @@ class TrialPlan:
 
     @property
     def width_m(self) -> float:
-        """Long and short side of what is seen, in metres."""
+        """Side of what is seen along the rows of the picture, in metres."""
         return self.agl_m * self.camera.width_px / self.camera.fx_px
 
     @property

@@ -27,7 +27,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--band-m",
         type=float,
         help="width of the band around the route, where its legs have none of their own "
-        "(default: four standard deviations of the prior)",
+        "(default: four standard deviations of the prior, half a view at least)",
     )
     parser.add_argument(
         "--ortho",
@@ -41,8 +41,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--agl-m",
         type=float,
-        help="height above ground (default: the lowest that the route says, else that from which a "
-        "view covers a tile of the map)",
+        help="height above ground (default: the lowest above ground that the route says, else that "
+        "from which the shorter side of a view covers a tile of the map)",
     )
     _add_errors(parser)
     parser.add_argument("--speed-mps", type=float, default=20.0, help="over ground (default 20)")
@@ -64,7 +64,11 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
     parser.add_argument("--seed", type=int, default=1, help="of the trials (default 1)")
     parser.add_argument(
-        "--json", nargs="?", const="-", metavar="FILE", help="what check.json says, to stdout too"
+        "--json",
+        nargs="?",
+        const="-",
+        metavar="FILE",
+        help="what check.json says, to stdout instead of the text, or to a file too",
     )
 
 
@@ -80,13 +84,14 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--agl-std", type=float, default=0.05, help="of the height, a share of it (default 0.05)"
     )
-    parser.add_argument(
+    prior = parser.add_mutually_exclusive_group()
+    prior.add_argument(
         "--prior-std-m",
         type=float,
         default=150.0,
         help="error of the position that is known when a view comes (default 150)",
     )
-    parser.add_argument(
+    prior.add_argument(
         "--prior",
         choices=("known", "none"),
         default="known",
@@ -126,9 +131,12 @@ def run(options: argparse.Namespace) -> int:
 
 def _request(options: argparse.Namespace) -> "CheckRequest":
     from orthonav.check.request import DEFAULT_CAMERA, CheckRequest
+    from orthonav.errors import CheckError
     from orthonav.geo.route import read_route
     from orthonav.sources.cameras import read_camera_file
 
+    if options.band_m is not None and options.route is None:
+        raise CheckError("--band-m is the band around a route: give --route too")
     route = read_route(options.route) if options.route else None
     camera: Camera = DEFAULT_CAMERA
     if options.camera is not None:

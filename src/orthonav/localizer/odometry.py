@@ -151,7 +151,9 @@ class Footprint:
         """
         if (np.abs(bias - self.bias)[1:] > SAME_BIAS[1:]).any():
             return Footprint.of(*self.view, self.pixel_m, bias)
-        return replace(self, telemetry=corrected_by(self.view[2], bias), bias=bias)
+        # Rectified with the heading up, so that only this need not be what it was.
+        kept = np.array([bias[0], *self.bias[1:]])
+        return replace(self, telemetry=corrected_by(self.view[2], kept), bias=kept)
 
 
 @dataclass(frozen=True, eq=False)

@@ -322,8 +322,8 @@ def _how_to_read(result: CheckResult) -> str:
         "A probability is that of one single view, taken anywhere in a cell under the conditions "
         f"below: that orthonav places it with a confidence of {conditions.accept:g} or more, and "
         f"not farther than {metres_text(conditions.radius_m)} from where it was taken. It was "
-        f"predicted from views made of imagery, not flown.{own} Low and high bound 80 % of what "
-        "the trials allow for: few trials, wide bounds.",
+        f"predicted from views made of imagery, not flown.{own} Low and high hold 80 %: few trials "
+        "make them wide, and years that differ.",
         "A flight takes many views, so a place of probability 0.5 is passed with a fix soon; what "
         "matters is how far the aircraft flies without one. A stretch is blind where a view is "
         "unlikely to be placed; what dead reckoning drifts meanwhile must stay below what is "

@@ -15,7 +15,7 @@ BANDS = {
     "error_m": "expected error of such a fix, root mean square, metres",
     "wrong": "share of trials that were confident and wrong",
     "trials": "how many views were tried",
-    "texture": "share of ground with structure that lasts",
+    "texture": "how much of what the ground shows is expected to last, 0 to 1",
 }
 """Bands in order: name, which is their description in the file, and what it says."""
 

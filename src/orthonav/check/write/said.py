@@ -74,8 +74,8 @@ def fine_said(envelope: Envelope) -> str:
         return "How far told heading and height may be off is not known."
     return (
         f"Fine up to {envelope.fine_yaw_deg:g}° of error in heading, and with a height that is "
-        f"told {100 * low:.0f} % too low to {100 * high:.0f} % too high: within that, the share of "
-        "correct, confident fixes stays at 85 % or more of the one without error."
+        f"told {100 * low:.0f} % too low to {100 * high:.0f} % too high: with either alone, the "
+        "share of correct, confident fixes stays at 85 % or more of the one without error."
     )
 
 
