@@ -216,7 +216,8 @@ class Trier:
     ) -> Trial | None:
         registration = self._registration
         # One finer than views are finished at: doubtful ones are looked at there too.
-        level = max(view_levels(plan, registration).final - 1, 0)
+        final = view_levels(plan, registration).final
+        level = max(final - 1, 0)
         gsd_m = registration.grid.gsd_m * 2**level
         size = math.ceil(math.hypot(plan.width_m, plan.height_m) / gsd_m) + 4
         made = pictures.around(en_m, size, level)
@@ -228,8 +229,7 @@ class Trier:
         picture = np.where(valid[inner], grey[inner], stranger)
         expected = math.nan
         if plan.other_path is None:
-            finer = level < view_levels(plan, registration).final
-            lasting = [each[inner] for each in told_persistence(grey, gsd_m, int(finer))]
+            lasting = [each[inner] for each in told_persistence(grey, gsd_m, final - level)]
             expected = float(np.mean([each.mean() for each in lasting[:2]]))
             picture = another_year(rng, picture, stranger, lasting, plan.severity)
         if plan.relief_m > 0:

@@ -8,9 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import print_json
 
-MAX_PREVIEW_PX = 384
-"""No map carries a larger preview (`docs/map-format.md`)."""
-
 if TYPE_CHECKING:
     from orthonav.evaluate.contact_sheet import Row
     from orthonav.evaluate.flights import FlightReport
@@ -183,22 +180,12 @@ def _write_report(out: Path, flights: list[Any], opened: "MapFile | None") -> No
 
 def map_background(opened: "MapFile") -> "Background":
     """The small picture of the area that a map carries; raises `MapFileError` where it is none."""
-    import cv2
-    import numpy as np
-
-    from orthonav.errors import MapFileError
-    from orthonav.mapfile.layer import jpeg_frame
+    from orthonav.mapfile.layer import preview
     from orthonav.report import Background
 
-    data = opened.array("sheet0/preview_jpeg", np.uint8, 1)
-    found = jpeg_frame(data.tobytes())
-    small = found is not None and max(found[1:3]) <= MAX_PREVIEW_PX
-    grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if small else None
-    if grey is None:
-        raise MapFileError(f"map's preview cannot be decoded: {opened.path}")
     grid = opened.manifest.sheets[0].grid
     return Background(
-        np.asarray(grey, dtype=np.uint8),
+        preview(opened),
         west_m=grid.west_m,
         south_m=grid.north_m - grid.height_px * grid.gsd_m,
         east_m=grid.west_m + grid.width_px * grid.gsd_m,

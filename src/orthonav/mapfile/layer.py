@@ -20,6 +20,8 @@ from orthonav.mapfile.manifest import GreyInfo
 from orthonav.mapfile.reader import MapFile
 
 CACHE_BYTES = 64 * 2**20
+MAX_PREVIEW_PX = 384
+"""No map carries a larger preview (`docs/map-format.md`)."""
 MAX_CHUNK_BYTES_PER_PX = 4
 _CHUNK_HEADER_BYTES = 4096
 _SOI, _EOI = b"\xff\xd8", b"\xff\xd9"
@@ -233,6 +235,18 @@ def jpeg_frame(data: bytes) -> tuple[int, int, int, int] | None:
             return None
         at += 2 + length
     return None
+
+
+def preview(opened: MapFile) -> NDArray[np.uint8]:
+    """The small grey picture (rows, cols) of the first sheet; raises `MapFileError` where it is
+    none."""
+    data = opened.array("sheet0/preview_jpeg", np.uint8, 1)
+    found = jpeg_frame(data.tobytes())
+    small = found is not None and max(found[1:3]) <= MAX_PREVIEW_PX
+    grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if small else None
+    if grey is None:
+        raise MapFileError(f"map's preview cannot be decoded: {opened.path}")
+    return np.asarray(grey, dtype=np.uint8)
 
 
 def _decode_mask(mask: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.bool_]:

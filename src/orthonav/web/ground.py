@@ -16,13 +16,11 @@ from orthonav.errors import CameraError, FlightError, MapFileError
 from orthonav.geo.camera import Camera, axis_on_ground_en_m, footprint_en_m
 from orthonav.localizer.checks import check_telemetry
 from orthonav.localizer.rectify import MAX_REACH, prepare_view, rectify
-from orthonav.mapfile.layer import GreyLayer, jpeg_frame
+from orthonav.mapfile.layer import MAX_PREVIEW_PX, GreyLayer, jpeg_frame
 from orthonav.mapfile.reader import MapFile
 from orthonav.records import Telemetry
 from orthonav.web.pictures import Grey
 
-MAX_PREVIEW_PX = 384
-"""No map carries a larger preview (`docs/map-format.md`)."""
 LEAST_PX, MOST_PX = 256, 1024
 """Pixels across a window of ground: those of the map, but no fewer and no more than that."""
 MARGIN = 1.02

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from orthonav.check.outcome import CheckResult
 from orthonav.errors import MapFileError
-from orthonav.mapfile.layer import GreyLayer, jpeg_frame
+from orthonav.mapfile.layer import GreyLayer, preview
 from orthonav.mapfile.reader import MapFile
 from orthonav.report import Background
 
@@ -19,7 +19,6 @@ MOST_BYTES = 1_300_000
 _MARGIN = 0.04
 _PAPER = 226
 """Grey where there is no imagery: the page lies light below it in the dark too."""
-_MAX_PREVIEW_PX = 384  # no map carries a larger one (docs/map-format.md)
 _MOST_READ_PX = 4096
 _QUALITIES = (72, 60, 45, 30, 15)
 
@@ -142,13 +141,7 @@ def _resized(grey: Grey, size: tuple[int, int]) -> Grey:
 
 
 def _preview(opened: MapFile) -> Ground:
-    data = opened.array("sheet0/preview_jpeg", np.uint8, 1)
-    found = jpeg_frame(data.tobytes())
-    small = found is not None and max(found[1:3]) <= _MAX_PREVIEW_PX
-    grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if small else None
-    if grey is None:
-        raise MapFileError(f"map's preview cannot be decoded: {opened.path}")
     grid = opened.manifest.sheets[0].grid
     east_m = grid.west_m + grid.width_px * grid.gsd_m
     south_m = grid.north_m - grid.height_px * grid.gsd_m
-    return Ground(np.asarray(grey, dtype=np.uint8), (grid.west_m, south_m, east_m, grid.north_m))
+    return Ground(preview(opened), (grid.west_m, south_m, east_m, grid.north_m))
