@@ -64,3 +64,12 @@ class FetchError(OrthonavError, OSError):
 
 class MissingExtraError(OrthonavError, ImportError):
     """An optional dependency is needed for this and is not installed."""
+
+
+class AtlasError(OrthonavError, ValueError):
+    """An atlas cannot be used as asked: its catalogue and files disagree, its recipe is another,
+    a sheet is damaged or half there."""
+
+
+class StorageError(OrthonavError, OSError):
+    """The place where an atlas lies cannot be reached, read or written: address, credentials."""

@@ -41,7 +41,7 @@ class Command(SphinxDirective):
         if not hasattr(self.env, "orthonav_commands"):
             self.env.orthonav_commands = set()
         self.env.orthonav_commands.add(name)
-        return self.parse("\n".join(_markdown(name, command_parser(name))))
+        return self.parse("\n".join(_markdown(name, COMMANDS[name], command_parser(name))))
 
     def parse(self, text: str) -> list[nodes.Node]:
         """Nodes of Markdown."""
@@ -59,8 +59,7 @@ def command_parser(name: str) -> argparse.ArgumentParser:
     raise LookupError(name)
 
 
-def _markdown(name: str, parser: argparse.ArgumentParser) -> Iterator[str]:
-    text = COMMANDS[name]
+def _markdown(name: str, text: str, parser: argparse.ArgumentParser) -> Iterator[str]:
     yield from (f"{text[0].upper()}{text[1:]}.", "", "```text", _usage(parser), "```", "")
     yield from (f":::{{program}} orthonav {name}", ":::", "")
     for group in parser._action_groups:
@@ -72,7 +71,18 @@ def _markdown(name: str, parser: argparse.ArgumentParser) -> Iterator[str]:
         if not usual:
             yield from (f"**{(group.title or '').capitalize()}**", "")
         for action in actions:
-            yield from _option(parser, action)
+            if isinstance(action, argparse._SubParsersAction):
+                yield from _actions_of(name, action)
+            else:
+                yield from _option(parser, action)
+
+
+def _actions_of(name: str, action: argparse._SubParsersAction) -> Iterator[str]:
+    """The commands of a command, each as a command."""
+    for choice in action._choices_actions:
+        full = f"{name} {choice.dest}"
+        yield from (f"**orthonav {full}**", "")
+        yield from _markdown(full, choice.help or "", action.choices[choice.dest])
 
 
 def _option(parser: argparse.ArgumentParser, action: argparse.Action) -> Iterator[str]:

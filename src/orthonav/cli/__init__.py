@@ -19,6 +19,7 @@ COMMANDS = {
     "plan": "what a route, a camera and a height ask of a map",
     "fetch": "get orthophotos of an area from open services",
     "build": "make a map from orthophotos",
+    "atlas": "many sheets as one: what is in it, is it whole, cut a map, add and take out",
     "check": "before the flight: where can it be localized, and will the route be flown well?",
     "info": "print what is in a map",
     "sign": "sign a map, or make a key for it",

@@ -1,14 +1,23 @@
-"""`orthonav build`: make a map from orthophotos."""
+"""`orthonav build`: make a map, or the sheets of an atlas, from orthophotos."""
 
 import argparse
-import logging
-import sys
 import time
 from pathlib import Path
 
+from orthonav.cli import build_atlas
 from orthonav.cli.common import add_area, add_orthos, print_json, progress
 
-log = logging.getLogger(__name__)
+RECIPE = (
+    "gsd_m",
+    "tile_px",
+    "overlap",
+    "method",
+    "edges",
+    "seed",
+    "registration",
+    "calibration_views",
+)
+"""Options that are fields of `BuildRequest` and of `AtlasRecipe`; None where not given."""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -18,13 +27,10 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--gsd-m", type=float, help="ground resolution, metres per pixel (default: the imagery's)"
     )
-    parser.add_argument("--tile-px", type=int, default=256, help="width of a tile (default 256)")
-    parser.add_argument(
-        "--overlap", type=float, default=0.875, help="share common to neighbours (default 0.875)"
-    )
+    parser.add_argument("--tile-px", type=int, help="width of a tile (default 256)")
+    parser.add_argument("--overlap", type=float, help="share common to neighbours (default 0.875)")
     parser.add_argument(
         "--method",
-        default="gradient",
         help="embedding, name:field=value,...: gradient (default), autoencoder, triplet or bovw",
     )
     parser.add_argument(
@@ -32,11 +38,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="what is compared: gradient, gray, canny (e.g. canny:low=100,high=200), segments or "
         "sam:weights=PATH (default: gradient; canny for autoencoder, gray for triplet and bovw)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of what is drawn (default 0)")
+    parser.add_argument("--seed", type=int, help="seed of what is drawn (default 0)")
     parser.add_argument(
         "--no-registration",
         dest="registration",
-        action="store_false",
+        action="store_const",
+        const=False,
         help="leave out the grey picture of the area: a smaller map, positions at tile level only",
     )
     parser.add_argument(
@@ -51,7 +58,6 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--calibration-views",
         type=int,
-        default=48,
         metavar="N",
         help="views made of the orthophoto to learn the confidence from (default 48)",
     )
@@ -64,14 +70,23 @@ def add(parser: argparse.ArgumentParser) -> None:
         "MAP.onav.work until the map is written)",
     )
     parser.add_argument(
-        "--workers", type=int, metavar="N", help="threads that read imagery (default: one per core)"
+        "--workers",
+        type=int,
+        metavar="N",
+        help="threads that read imagery (default: one per core); of an atlas, sheets at a time",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="MAP.onav")
+    target = parser.add_mutually_exclusive_group(required=True)
+    target.add_argument("--out", type=Path, metavar="MAP.onav")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    build_atlas.add(parser, target)
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace) -> int:
     """Build and print a summary."""
+    recipe = {name: value for name in RECIPE if (value := getattr(options, name)) is not None}
+    if options.atlas is not None:
+        return build_atlas.run(options, recipe)
+    build_atlas.refuse(options)
     from orthonav.cli.info import summary, summary_text
     from orthonav.geo.route import read_route
     from orthonav.prepare import BuildRequest, build_map
@@ -83,25 +98,17 @@ def run(options: argparse.Namespace) -> None:
         bounds_deg=options.bounds,
         route=read_route(options.route) if options.route else None,
         band_m=options.band_m,
-        gsd_m=options.gsd_m,
-        tile_px=options.tile_px,
-        overlap=options.overlap,
-        method=options.method,
-        edges=options.edges,
-        seed=options.seed,
-        registration=options.registration,
         other_dates=options.other_date,
-        calibration_views=options.calibration_views,
         work=options.work,
         workers=options.workers,
+        **recipe,
     )
-    quiet = options.quiet or not sys.stderr.isatty()
-    tell = log.info if quiet else lambda line: print(line, file=sys.stderr)
     with progress(options) as shown:
-        result = build_map(request, shown, tell)
+        result = build_map(request, shown, build_atlas.teller(options))
     plain = summary(result.manifest, result.size_bytes, options.out)
     plain["build_s"] = round(time.perf_counter() - start, 3)
     if options.json:
         print_json(plain)
     else:
         print(summary_text(plain))
+    return 0

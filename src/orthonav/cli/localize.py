@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("map", type=Path, metavar="MAP.onav")
+    parser.add_argument("map", metavar="MAP.onav", help="map, or with --atlas an atlas")
     parser.add_argument(
         "flight",
         type=Path,
@@ -25,6 +25,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="flight folder, photographs, video or ROS recording, as for `orthonav import`",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="fixes.jsonl")
+    parser.add_argument(
+        "--atlas",
+        action="store_true",
+        help="the first argument is an atlas (folder or URL), of which nothing is known before: "
+        "no prior is used, and only what several views agree on is a fix",
+    )
     parser.add_argument(
         "--heading",
         choices=("known", "unknown"),
@@ -100,6 +106,14 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Localize and write one line per view."""
+    if options.atlas:
+        _on_atlas(options)
+    else:
+        options.map = Path(options.map)
+        _on_map(options)
+
+
+def _on_map(options: argparse.Namespace) -> None:
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
     from orthonav.localizer import Localizer
@@ -152,6 +166,50 @@ def run(options: argparse.Namespace) -> None:
         results = in_hindsight(tracker, results, accept)
     else:
         tell_whether_as_flown(flight, results)
+    write_results(options.out, results)
+    _tell(options, results)
+
+
+def _on_atlas(options: argparse.Namespace) -> None:
+    """Without a prior: only what views agree on is a fix."""
+    from orthonav.atlas.catalog import Atlas
+    from orthonav.atlas.ground import Ground
+    from orthonav.atlas.lookup import AtlasLookup
+    from orthonav.atlas.lost import LostLocator
+    from orthonav.confidence.accept import Acceptance
+    from orthonav.errors import VariantError
+    from orthonav.onboard.run import localize_flight
+    from orthonav.publish.jsonl import write_results
+
+    asked = [
+        name
+        for name in ("track", "hindsight", "mount", "as_flown", "require_signed")
+        if getattr(options, name)
+    ]
+    if asked or options.registration == "off":
+        named = ", ".join(f"--{name.replace('_', '-')}" for name in asked) or "--registration off"
+        raise VariantError(f"{named} is for a map: cut one out of the atlas (orthonav atlas cut)")
+    accept = Acceptance.parse(options.accept) if options.accept else None
+    if accept and accept.criterion == "lowe_ratio":
+        raise VariantError("lowe_ratio compares tiles: it is for a map, with --registration off")
+    flight = open_told(options.flight, options)
+    results = []
+    with AtlasLookup(Atlas.open(options.map)) as lookup, progress(options) as shown:
+        if lookup.unknown:
+            log.warning(
+                "%d sheets are not in the index, so nothing is found there; bring it up to date "
+                "with 'orthonav atlas index'",
+                len(lookup.unknown),
+            )
+        locator = LostLocator(
+            Ground(lookup.atlas), lookup, heading_known=options.heading == "known"
+        )
+        for result in localize_flight(
+            locator, flight, skip_bad_images=options.skip_bad_images, accept=accept
+        ):
+            results.append(result)
+            if flight.expected:
+                shown("localize", min(1.0, len(results) / flight.expected))
     write_results(options.out, results)
     _tell(options, results)
 

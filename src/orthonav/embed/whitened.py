@@ -11,12 +11,14 @@ vectors.
 import contextlib
 import math
 import mmap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from orthonav.embed.cells import MICRO, CellLayout, cell_means
@@ -29,6 +31,7 @@ SOLVER_STEPS = 6
 SHARE_ROUNDING = 1e-3
 TINY = np.float32(1e-30)
 SPARSE_BYTES = 32 * 2**20
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -89,14 +92,31 @@ class CellSheet:
 
     def valid_share(self, tiles_px: NDArray[np.intp]) -> NDArray[np.float64]:
         """Share of valid pixels of each tile whose first pixel (row, col) is in (N, 2)."""
-        step, spacing = self.layout.step, self.layout.spacing_px
-        reach = np.arange(MICRO) * step
         out = np.empty(len(tiles_px))
         for part in _chunks(len(tiles_px)):
-            row, col = (tiles_px[part] // spacing).T
-            cells = self.valid[(row[:, None] + reach)[:, :, None], (col[:, None] + reach)[:, None]]
-            out[part] = cells.mean(axis=(1, 2))
+            cells = self.micro_cells(self.valid[..., None], tiles_px[part])
+            out[part] = cells[..., 0].mean(axis=(1, 2))
         return out
+
+    def micro_cells(
+        self, samples: NDArray[np.float32], tiles_px: NDArray[np.intp]
+    ) -> NDArray[np.float32]:
+        """Those of the samples (h, w, C) of the sheet that are a tile's, (N, MICRO, MICRO, C).
+
+        Raises `IndexError` for tiles that reach beyond the sheet.
+        """
+        step = self.layout.step
+        height, width = (size - (MICRO - 1) * step for size in samples.shape[:2])
+        down, right, deep = samples.strides
+        # A view of all tiles: taken from it rows of cells are copied whole, four times as fast.
+        windows = np.lib.stride_tricks.as_strided(
+            samples,
+            (max(0, height), max(0, width), MICRO, MICRO, samples.shape[2]),
+            (down, right, down * step, right * step, deep),
+            writeable=False,
+        )
+        row, col = (tiles_px // self.layout.spacing_px).T
+        return np.asarray(windows[row, col])
 
 
 def _sparse_zeros(shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -121,13 +141,9 @@ def pooled_features(
 
     A weight is the share of a cell that is valid; features are normalized cell by cell.
     """
-    step, spacing = sheet.layout.step, sheet.layout.spacing_px
-    reach = np.arange(MICRO) * step
-    row, col = (tiles_px // spacing).T
-    index = (row[:, None] + reach)[:, :, None], (col[:, None] + reach)[:, None]
-    features = _normalized(recipe, _pooled(recipe, sheet.means[index]))
+    features = _normalized(recipe, _pooled_tiles(recipe, sheet, tiles_px))
     count, channels = len(tiles_px), features.shape[-1]
-    valid = sheet.valid[index][..., None]
+    valid = sheet.micro_cells(sheet.valid[..., None], tiles_px)
     if valid.min() >= 1:
         weights = np.ones((1, 1), dtype=np.float32)
         return features.reshape(count, -1), np.broadcast_to(weights, (count, features[0].size))
@@ -159,6 +175,29 @@ def _pooled(recipe: WhitenedRecipe, micro: NDArray[np.float32]) -> NDArray[np.fl
     return np.ascontiguousarray(cols.transpose(0, 1, 3, 2))
 
 
+def _pooled_tiles(
+    recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp]
+) -> NDArray[np.float32]:
+    """Cells (N, cells, cells, C) of tiles; what those beside each other share is summed once."""
+    step, cells, channels = sheet.layout.step, recipe.cells, sheet.means.shape[2]
+    reach = (MICRO - 1) * step + 1
+    row, col = (tiles_px // sheet.layout.spacing_px).T
+    out = np.empty((len(tiles_px), cells, cells, channels), dtype=np.float32)
+    for some in np.split(np.arange(len(row)), np.flatnonzero(np.diff(row)) + 1):
+        first, last = int(col[some].min()), int(col[some].max()) + reach
+        strip = sheet.means[row[some[0]] : row[some[0]] + reach : step, first:last]
+        if strip.shape[:2] != (MICRO, last - first) or last - first > len(some) * reach:
+            # Far apart they share nothing (or a tile lies beyond the sheet).
+            out[some] = _pooled(recipe, sheet.micro_cells(sheet.means, tiles_px[some]))
+            continue
+        down = recipe.pooling @ strip.reshape(MICRO, -1)
+        down = down.reshape(cells, -1, channels).swapaxes(0, 1).reshape(-1, cells * channels)
+        windows = sliding_window_view(down, reach, axis=0)[col[some] - first, :, ::step]
+        across = recipe.pooling @ windows.swapaxes(1, 2)
+        out[some] = across.reshape(-1, cells, cells, channels).swapaxes(1, 2)
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class WhitenedEmbedder:
     """A learnt whitened embedding.
@@ -183,13 +222,29 @@ class WhitenedEmbedder:
         """Numbers per embedding."""
         return int(self.basis.shape[1])
 
-    def tiles(self, sheet: CellSheet, tiles_px: NDArray[np.intp]) -> NDArray[np.float16]:
-        """Unit embeddings (N, D) of tiles whose first pixels (row, col) are given (N, 2)."""
+    def tiles(
+        self, sheet: CellSheet, tiles_px: NDArray[np.intp], workers: int = 1
+    ) -> NDArray[np.float16]:
+        """Unit embeddings (N, D) of tiles whose first pixels (row, col) are given (N, 2).
+
+        They are the same for any number of threads (`workers`).
+        """
         out = np.empty((len(tiles_px), self.dims), dtype=np.float16)
-        for part in _chunks(len(tiles_px)):
+        _ = self._mean, self._basis  # made before threads ask for them
+
+        def fill(part: slice) -> None:
             features, weights = pooled_features(self.recipe, sheet, tiles_px[part])
-            out[part] = _unit(((features - self._mean) * weights) @ self._basis)
+            out[part] = self.features(features, weights)
+
+        for _ in _worked(fill, len(tiles_px), workers):
+            pass
         return out
+
+    def features(
+        self, features: NDArray[np.float32], weights: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Unit embeddings (N, D) of tiles of which `pooled_features` are known, (N, F) each."""
+        return _unit(((features - self._mean) * weights) @ self._basis)
 
     def view(self, maps: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Unit embedding (D,) of a view's representation (C, S, S); zero for an empty one.
@@ -297,27 +352,48 @@ def _dots(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np
     return np.asarray(np.einsum("qd,qd->q", first, second)[:, None])
 
 
-def learn(recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp]) -> WhitenedEmbedder:
+def learn(
+    recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp], workers: int = 1
+) -> WhitenedEmbedder:
     """Learn mean and whitening from the tiles (N, 2) of the reference area.
 
     At most `MAX_LEARNT_TILES` of them, evenly taken, are used. Fewer than `dims` components are
-    kept where the tiles do not span more.
+    kept where the tiles do not span more. The same is learnt by any number of threads (`workers`).
     """
     taken = tiles_px[:: max(1, -(-len(tiles_px) // MAX_LEARNT_TILES))]
+
+    def sums(part: slice) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        features, weights = pooled_features(recipe, sheet, taken[part])
+        total = np.einsum("nf,nf->f", features, weights, dtype=np.float64)
+        return total, weights.sum(axis=0, dtype=np.float64)
+
+    def products(part: slice) -> NDArray[np.float64]:
+        features, weights = pooled_features(recipe, sheet, taken[part])
+        centred = (features - mean.astype(np.float32)) * weights
+        return np.asarray((centred.T @ centred).astype(np.float64))
+
     total: Any = 0.0
     weight: Any = 1e-9
-    for features, weights in _features(recipe, sheet, taken):
-        total = total + np.einsum("nf,nf->f", features, weights, dtype=np.float64)
-        weight = weight + weights.sum(axis=0, dtype=np.float64)
+    for some, their_weight in _worked(sums, len(taken), workers):
+        total, weight = total + some, weight + their_weight
     mean = (total / weight).astype(np.float16)
     scatter: Any = 0.0
-    for features, weights in _features(recipe, sheet, taken):
-        centred = (features - mean.astype(np.float32)) * weights
-        scatter = scatter + (centred.T @ centred).astype(np.float64)
-    variances, vectors = np.linalg.eigh(scatter / len(taken))
+    for product in _worked(products, len(taken), workers):
+        scatter = scatter + product
+    return whitening(recipe, mean, scatter, len(taken))
+
+
+def whitening(
+    recipe: WhitenedRecipe,
+    mean: NDArray[np.float16],
+    scatter: NDArray[np.float64],
+    count: int,
+) -> WhitenedEmbedder:
+    """The embedding that whitens `count` features of mean (F,) and scatter matrix (F, F)."""
+    variances, vectors = np.linalg.eigh(scatter / count)
     variances, vectors = variances[::-1], vectors[:, ::-1]
     kept = int(np.count_nonzero(variances[: recipe.dims] > 1e-6 * max(variances[0], 1e-12)))
-    kept = max(1, min(kept, len(taken)))
+    kept = max(1, min(kept, count))
     scale = 1 / np.sqrt(np.maximum(variances[:kept], 1e-12))
     basis = vectors[:, :kept] * (scale / scale.max())
     # The sign of an eigenvector is arbitrary: the largest entry is made positive.
@@ -326,11 +402,13 @@ def learn(recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp]) 
     return WhitenedEmbedder(recipe, mean, basis.astype(np.float16))
 
 
-def _features(
-    recipe: WhitenedRecipe, sheet: CellSheet, tiles_px: NDArray[np.intp]
-) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    for part in _chunks(len(tiles_px)):
-        yield pooled_features(recipe, sheet, tiles_px[part])
+def _worked(work: Callable[[slice], Made], count: int, workers: int) -> Iterator[Made]:
+    """What `work` makes of some tiles at a time, in their order, by so many threads."""
+    if workers <= 1:
+        yield from map(work, _chunks(count))
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        yield from pool.map(work, _chunks(count))
 
 
 def _chunks(count: int) -> Iterator[slice]:

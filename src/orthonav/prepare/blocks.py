@@ -98,10 +98,13 @@ class Preview:
 
     def small(self, read: BlockPixels) -> NDArray[np.uint8]:
         """What it needs of a block: (h, w), nothing where that is less than a pixel."""
-        y0, y1, x0, x1 = self._edges(read.block)
+        return self.small_of(read.block, read.pixels.grey[read.part()])
+
+    def small_of(self, block: Block, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The same from a picture of the block at its resolution or a coarser one."""
+        y0, y1, x0, x1 = self._edges(block)
         if y1 <= y0 or x1 <= x0:
             return np.zeros((0, 0), np.uint8)
-        grey = read.pixels.grey[read.part()]
         small = cv2.resize(grey, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
         return np.asarray(small, dtype=np.uint8)
 

@@ -39,6 +39,7 @@ from orthonav.prepare.calibrate import (
     calibrate,
 )
 from orthonav.prepare.calibrate_registration import FLOOR_PX, calibrate_registration
+from orthonav.prepare.cellparts import cell_parts
 from orthonav.prepare.encoders import EncoderRecipe, learn_encoder
 from orthonav.prepare.layout import grid_of, tiles_of
 from orthonav.prepare.methods import method_recipe, stored_representation, usual_edges
@@ -72,7 +73,8 @@ class BuildRequest:
     triplet network learns from them too. `edges` None is what suits the method. `work` is a folder
     for checkpoints of networks and finished blocks, from which a build that was interrupted goes
     on; without it the blocks of a large map are kept in `OUT.work` until it is written. `workers`
-    threads read the imagery, None: one for each core."""
+    threads read the imagery, None: one for each core. With `cells` the map carries what new tiles
+    are embedded from without the imagery (method gradient only): for sheets of an atlas."""
 
     orthos: Sequence[Path]
     out: Path
@@ -90,6 +92,7 @@ class BuildRequest:
     calibration_views: int = 48
     work: Path | None = None
     workers: int | None = None
+    cells: bool = False
 
 
 @dataclass(frozen=True)
@@ -209,6 +212,8 @@ def _learnt(
         **{f"embed/{name}": array for name, array in embedder.parts().items()},
         **grey_parts,
     }
+    if request.cells and isinstance(recipe, WhitenedRecipe):
+        arrays |= cell_parts(read.cells)
     if grey is not None:
         registration = _registration(request, other_dates, manifest, arrays, read, embedder, report)
         manifest = replace(manifest, registration=registration)

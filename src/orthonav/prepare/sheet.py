@@ -18,6 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 import rasterio
+from numpy.typing import NDArray
 
 from orthonav import __version__, represent
 from orthonav.embed.cells import CellLayout, cell_means
@@ -27,7 +28,7 @@ from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
 from orthonav.imagery.mosaic import Mosaic, SheetRaster
 from orthonav.imagery.quiet import quiet
-from orthonav.prepare.blocks import Block, BlockPixels, Preview, blocks_of, margins, read_block
+from orthonav.prepare.blocks import Block, Preview, blocks_of, margins, read_block
 from orthonav.prepare.calibrate import CropSampler
 from orthonav.prepare.kept import KeptBlocks, digest
 from orthonav.prepare.layer import CHUNK_PX, GreyLayerWriter, Parts, compressed_block
@@ -149,7 +150,7 @@ class SheetReader:
         return variant_recipe(represent.TABLE, self.representation)
 
     def _drawn_jobs(self) -> list[Job]:
-        side_px = _block_side_px(self.grid.tile_px, self._layout.micro_px)
+        side_px = block_side_px(self.grid.tile_px, self._layout.micro_px)
         blocks = [
             block
             for block in blocks_of(self.grid, side_px)
@@ -187,32 +188,9 @@ class SheetReader:
         places = np.array(job.places, np.intp).reshape(-1, 2)
         parts["crops"], parts["crop_places"] = self.sampler.cut(grey, valid, places)
         if self.layer is not None:
-            parts |= self._layer_parts(read)
+            part = read.part()
+            parts |= layer_parts(self.area, self.grid, job.block, grey[part], valid[part])
         return parts
-
-    def _layer_parts(self, read: BlockPixels) -> Parts:
-        """What the layer needs: compressed where chunks do not go on in other blocks.
-
-        Chunks that are too far from the route are left out.
-        """
-        block, part = read.block, read.part()
-        grey, valid = read.pixels.grey[part].copy(), read.pixels.valid[part].copy()
-        for chunk in block.cut(CHUNK_PX):
-            if not chunk.may_matter(self.area, self.grid):
-                where = chunk.within(block)
-                grey[where], valid[where] = 0, False
-        if self._whole_chunks(block):
-            return compressed_block(grey, valid)
-        return {"grey": grey, "valid": valid}
-
-    def _whole_chunks(self, block: Block) -> bool:
-        bottom, right = block.row + block.height, block.col + block.width
-        return (
-            block.row % CHUNK_PX == 0
-            and block.col % CHUNK_PX == 0
-            and (bottom % CHUNK_PX == 0 or bottom == self.grid.height_px)
-            and (right % CHUNK_PX == 0 or right == self.grid.width_px)
-        )
 
     def _take(self, job: Job, parts: Parts) -> None:
         if not parts:
@@ -224,10 +202,8 @@ class SheetReader:
             self.pictures.put(block, parts)
         top, left = margins(self.grid, block, self._margin_px)[:2]
         self.sampler.take(parts["crops"], parts["crop_places"], block.row - top, block.col - left)
-        if self.layer is not None and "jpeg" in parts:
-            self.layer.add_block(block.row, block.col, parts)
-        elif self.layer is not None:
-            self.layer.add(block.row, block.col, parts["grey"], parts["valid"])
+        if self.layer is not None:
+            put_layer_parts(self.layer, block, parts)
 
     def _request(self) -> str:
         """Digest of what every block depends on, the programs that make it included."""
@@ -261,7 +237,42 @@ class SheetReader:
         return found
 
 
-def _block_side_px(tile_px: int, micro_px: int) -> int:
+def layer_parts(
+    area: Area, grid: TileGrid, block: Block, grey: NDArray[np.uint8], valid: NDArray[np.bool_]
+) -> Parts:
+    """What the layer needs of a block: compressed where chunks do not go on in other blocks.
+
+    Chunks that are too far from the route are left out.
+    """
+    grey, valid = grey.copy(), valid.copy()
+    for chunk in block.cut(CHUNK_PX):
+        if not chunk.may_matter(area, grid):
+            where = chunk.within(block)
+            grey[where], valid[where] = 0, False
+    if _whole_chunks(grid, block):
+        return compressed_block(grey, valid)
+    return {"grey": grey, "valid": valid}
+
+
+def _whole_chunks(grid: TileGrid, block: Block) -> bool:
+    bottom, right = block.row + block.height, block.col + block.width
+    return (
+        block.row % CHUNK_PX == 0
+        and block.col % CHUNK_PX == 0
+        and (bottom % CHUNK_PX == 0 or bottom == grid.height_px)
+        and (right % CHUNK_PX == 0 or right == grid.width_px)
+    )
+
+
+def put_layer_parts(layer: GreyLayerWriter, block: Block, parts: Parts) -> None:
+    """Hand what `layer_parts` made of a block to a layer."""
+    if "jpeg" in parts:
+        layer.add_block(block.row, block.col, parts)
+    else:
+        layer.add(block.row, block.col, parts["grey"], parts["valid"])
+
+
+def block_side_px(tile_px: int, micro_px: int) -> int:
     """Width of a block: whole micro-cells, and whole chunks of the layer where those fit."""
     least = max(BLOCK_PX, 2 * tile_px)
     step = math.lcm(micro_px, CHUNK_PX)

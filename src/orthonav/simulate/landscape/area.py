@@ -30,7 +30,7 @@ def generate_area(
 ) -> list[Path]:
     """Write one orthophoto `out_dir/<date name>.tif` per date and return their paths.
 
-    size_m: (east, north) extent; rounded up to whole pixels. gsd_m: metres per pixel, 0.2..5.
+    size_m: (east, north) extent; rounded up to whole pixels. gsd_m: metres per pixel, 0.2..10.
     The lower left corner is `ORIGIN_M` in EPSG:2154. `progress` is called with 0..1. Files are
     tiled RGB uint8, written window by window, so memory does not grow with the area.
     Raises `AreaError` on impossible sizes, `MissingExtraError` without rasterio and `OutputError`

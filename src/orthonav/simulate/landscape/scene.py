@@ -27,7 +27,7 @@ from orthonav.simulate.landscape.window import Box, Window, chunks
 ORIGIN_M = (652000.0, 6862000.0)
 """Lambert-93 (EPSG:2154) east and north of the landscape's origin."""
 
-GSD_RANGE_M = (0.2, 5.0)
+GSD_RANGE_M = (0.2, 10.0)
 """Finest and coarsest ground resolution that can be drawn."""
 
 _CHUNK_PX = 1024
@@ -57,7 +57,7 @@ class Landscape:
         """Return the picture (H, W, 3) RGB of the ground whose upper left corner is given.
 
         west_m, north_m: outer corner of the first pixel in EPSG:2154, metres.
-        gsd_m: metres on the ground per pixel, 0.2..5. The same ground looks the same in every
+        gsd_m: metres on the ground per pixel, 0.2..10. The same ground looks the same in every
         window whose pixels lie on the same grid. Raises `AreaError` on impossible sizes.
         """
         if width_px < 1 or height_px < 1:

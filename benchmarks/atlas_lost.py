@@ -1,0 +1,221 @@
+"""Lost in 2,500 km2: flights of five views from anywhere, heading unknown, atlas of another year.
+
+    python -m benchmarks.atlas_lost --work DIR [--trials 100] [--elsewhere 50]
+
+Makes the generated area at 8 m (40 minutes on one core), its atlas of 36 sheets and its index (10
+minutes), each once and kept in DIR; then flies. A second row flies over mirrored imagery, which is
+nowhere in the atlas: every fix of it is wrong.
+"""
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from pyproj import Transformer
+
+from benchmarks.record import Section, Table, number, provenance, save
+from orthonav.atlas.build import AtlasRequest, build_atlas
+from orthonav.atlas.catalog import Atlas
+from orthonav.atlas.cluster import PlainRunner
+from orthonav.atlas.ground import Ground
+from orthonav.atlas.lookup import AtlasLookup
+from orthonav.atlas.lost import LostLocator
+from orthonav.geo.camera import Camera
+from orthonav.geo.frames import distances_m
+from orthonav.records import Fix, Telemetry
+from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
+
+SIDE_M, GSD_M, SEED = 50_000.0, 8.0, 21
+PAST, PRESENT = DEFAULT_DATES[2], DEFAULT_DATES[0]
+RECIPE = {"gsd_m": GSD_M, "tile_px": 128, "sheet_km": 10.0}
+VIEWS, EVERY_S = 5, 15.0
+VIEW_PX, AGL_M = (160, 120), 1500.0
+"""Of a pixel of 8 m each: 1280 x 960 m."""
+SPEEDS_MPS = (20.0, 60.0)
+AGL_STD, AGL_JITTER = 0.03, 0.01
+TURN_STD_RAD = 0.15
+EDGE_PX = 300
+RIGHT_M = 80.0
+"""Ten pixels, what the sheets' confidence speaks of."""
+SURE = 0.9
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One view of one flight: error of its fix in m (NaN: none), confidence, time."""
+
+    flight: int
+    view: int
+    error_m: float
+    confidence: float
+    latency_ms: float
+
+
+def prepared(work: Path) -> tuple[Path, Path]:
+    """The view year's orthophoto and the atlas of the other year, made where they are missing."""
+    for date in (PAST, PRESENT):
+        if not (work / f"{date.name}.tif").is_file():
+            _say(f"{date.name}: generating {SIDE_M / 1000:.0f} x {SIDE_M / 1000:.0f} km")
+            generate_area(work, size_m=(SIDE_M, SIDE_M), gsd_m=GSD_M, dates=[date], seed=SEED)
+    atlas = work / "atlas"
+    request = AtlasRequest(str(atlas), [work / f"{PRESENT.name}.tif"], RECIPE)
+    with PlainRunner() as runner:
+        build_atlas(request, runner, tell=_say)
+    return work / f"{PAST.name}.tif", atlas
+
+
+def flights(
+    ortho: Path, count: int, seed: int, *, mirrored: bool
+) -> Iterator[list[tuple[NDArray[np.uint8], Telemetry, tuple[float, float]]]]:
+    """Flights over an orthophoto: views (H, W), what is told of them, and where they were taken.
+
+    Of mirrored imagery the places are those of the mirror image, which are nowhere.
+    """
+    with rasterio.open(ortho) as opened:
+        colours, transform = opened.read([1, 2, 3]), opened.transform
+        to_latlon = Transformer.from_crs(opened.crs, 4326, always_xy=True)
+    bands = np.ascontiguousarray(colours.transpose(1, 2, 0))
+    grey = np.asarray(cv2.cvtColor(bands, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    if mirrored:
+        grey = np.ascontiguousarray(grey[:, ::-1])
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        heading, speed = rng.uniform(0, 2 * math.pi), rng.uniform(*SPEEDS_MPS)
+        place = rng.uniform(EDGE_PX, np.array(grey.shape[::-1]) - EDGE_PX)
+        scale = rng.normal(0, AGL_STD)
+        views = []
+        for view in range(VIEWS):
+            told_m = AGL_M * math.exp(scale + rng.normal(0, AGL_JITTER))
+            east, north = transform * (place + 0.5)
+            lon, lat = to_latlon.transform(east, north)
+            telemetry = Telemetry(round(view * EVERY_S * 1e9), math.nan, 0.0, 0.0, told_m)
+            views.append((_cut(grey, place, heading), telemetry, (lat, lon)))
+            step_px = speed * EVERY_S / GSD_M
+            place = place + step_px * np.array([math.sin(heading), -math.cos(heading)])
+            heading += rng.normal(0, TURN_STD_RAD)
+        yield views
+
+
+def _cut(grey: NDArray[np.uint8], place: NDArray[np.float64], heading: float) -> NDArray[np.uint8]:
+    cos, sin = math.cos(heading), math.sin(heading)
+    linear = np.array([[cos, -sin], [sin, cos]])
+    move = place - linear @ ((np.array(VIEW_PX) - 1) / 2)
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    view = cv2.warpAffine(grey, np.column_stack([linear, move]), VIEW_PX, flags=flags)
+    return np.asarray(view, dtype=np.uint8)
+
+
+def flown(ortho: Path, atlas: Path, count: int, seed: int, *, mirrored: bool) -> list[Outcome]:
+    """Every view of every flight, placed without a prior."""
+    width, height = VIEW_PX
+    focal_px = AGL_M / GSD_M
+    camera = Camera(width, height, focal_px, focal_px, width / 2, height / 2)
+    outcomes = []
+    with AtlasLookup(Atlas.open(atlas)) as lookup:
+        ground = Ground(lookup.atlas)
+        for number_, flight in enumerate(flights(ortho, count, seed, mirrored=mirrored)):
+            locator = LostLocator(ground, lookup)
+            for view, (grey, telemetry, truth) in enumerate(flight):
+                start = time.perf_counter()
+                outcome = locator.locate(grey, camera, telemetry)
+                latency_ms = (time.perf_counter() - start) * 1e3
+                error_m = confidence = math.nan
+                if isinstance(outcome, Fix):
+                    place = (outcome.lat_deg, outcome.lon_deg)
+                    error_m = math.inf if mirrored else float(distances_m([place], [truth])[0])
+                    confidence = outcome.confidence
+                outcomes.append(Outcome(number_, view, error_m, confidence, latency_ms))
+            _say(f"flight {number_ + 1} of {count}: {_told(outcomes[-VIEWS:])}")
+    return outcomes
+
+
+def _told(views: list[Outcome]) -> str:
+    return " ".join(
+        "-" if math.isnan(each.error_m) else f"{each.error_m:.0f}m({each.confidence:.2f})"
+        for each in views
+    )
+
+
+def row(name: str, outcomes: list[Outcome]) -> list[str]:
+    """One row of the table."""
+    trials = sorted({each.flight for each in outcomes})
+    first = {}
+    for each in outcomes:
+        if each.confidence >= SURE and each.flight not in first:
+            first[each.flight] = each
+    right = sum(each.error_m <= RIGHT_M for each in first.values())
+    fixes = [each for each in outcomes if not math.isnan(each.error_m)]
+    sure = [each for each in fixes if each.confidence >= SURE]
+    wrong = sum(each.error_m > RIGHT_M for each in sure)
+    errors = [each.error_m for each in sure if each.error_m <= RIGHT_M]
+    views = [each.view + 1 for each in first.values() if each.error_m <= RIGHT_M]
+    latency = [each.latency_ms for each in outcomes]
+    return [
+        name,
+        str(len(trials)),
+        f"{right} ({right / len(trials):.0%})",
+        number(float(np.median(views))) if views else "-",
+        f"{wrong} of {len(sure)}",
+        f"{sum(each.error_m > RIGHT_M for each in fixes)} of {len(fixes)}",
+        number(float(np.median(errors))) if errors else "-",
+        f"{np.median(latency) / 1e3:.1f} ({np.quantile(latency, 0.9) / 1e3:.1f})",
+    ]
+
+
+def main() -> int:
+    """Run and write table and JSON beside those of the other benchmarks."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.atlas_lost", description=__doc__)
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--trials", type=int, default=100)
+    parser.add_argument("--elsewhere", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path("bench_results"))
+    options = parser.parse_args()
+    cv2.setNumThreads(1)
+    started, start = provenance("atlas-lost"), time.perf_counter()
+    ortho, atlas = prepared(options.work)
+    found = flown(ortho, atlas, options.trials, options.seed, mirrored=False)
+    rows = [row("another year", found)]
+    if options.elsewhere:
+        elsewhere = flown(ortho, atlas, options.elsewhere, options.seed + 1, mirrored=True)
+        rows.append(row("elsewhere (mirrored)", elsewhere))
+        found += elsewhere
+    section = Section("Lost in 2,500 km2")
+    section.tables.append(
+        Table(
+            f"{VIEWS} views {EVERY_S:.0f} s apart, {VIEW_PX[0]} x {VIEW_PX[1]} px of {GSD_M:g} m, "
+            "any place, heading unknown, atlas of another year",
+            (
+                *("views of", "flights", "right when first sure", "at view (median)"),
+                *("sure and wrong", "all fixes wrong", "error m (median)", "s a view (p90)"),
+            ),
+            rows,
+            (
+                f"Right: within {RIGHT_M:.0f} m (10 px). Sure: confidence of {SURE:g} or more. "
+                f"Generated area, seed {SEED}; flights, seed {options.seed}.",
+            ),
+        )
+    )
+    print(section.markdown())
+    wall_s = time.perf_counter() - start
+    save(options.out, [section], started, wall_s=wall_s, latest=False)
+    path = options.out / "atlas-lost-views.json"
+    path.write_text(json.dumps([vars(each) for each in found]).replace("NaN", "null"))
+    return 0
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,217 @@
+"""Coarse tiles of a sheet: what the index of an atlas is made of.
+
+Wide tiles at low resolution, as features before any learning: what is learnt of them belongs to
+the index of the whole atlas. Tiles belong to the sheet in whose lattice box their centre lies, and
+reach half a tile beyond it, so that every place of the atlas lies within half a stride of a centre.
+"""
+
+import errno
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from orthonav import represent
+from orthonav.atlas.recipe import CoarseRecipe
+from orthonav.embed.cells import MICRO
+from orthonav.embed.whitened import WhitenedRecipe, pooled_features
+from orthonav.errors import AreaError, AtlasError, OutputError
+from orthonav.files import replacing, require_file
+from orthonav.geo.area import Area, Extent
+from orthonav.geo.grid import TileGrid
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.prepare.calibrate import CropSampler
+from orthonav.prepare.sheet import SheetReader
+from orthonav.variants import make_variant
+
+FORMAT = "orthonav-coarse"
+SCHEMA = 1
+METADATA_KEY = "orthonav"
+EDGES = "gradient"
+"""What coarse tiles and the views looked for among them show, whatever the maps are made of."""
+POOLING = WhitenedRecipe()
+MIN_VALID_SHARE = 0.5
+MAX_TILES = 1_000_000
+"""Of a sheet: one of 45 km with tiles 50 m apart has 800,000."""
+MAX_FEATURES = 16_384
+FULL = 255
+"""A cell that is valid everywhere."""
+_CHUNK_TILES = 512
+_SLACK_DEG = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseTiles:
+    """Coarse tiles of a sheet, in the order of rows from north to south; arrays are read-only.
+
+    `centres_latlon_deg` (N, 2) float64; `features` (N, F) float16, F being cells x cells x
+    channels; `valid` (N, cells x cells) uint8, 255 where all of a cell shows imagery. `bounds_deg`
+    is the sheet's box. N is 0 where the sheet has no tile with enough imagery under it.
+    """
+
+    recipe: CoarseRecipe
+    bounds_deg: Extent
+    centres_latlon_deg: NDArray[np.float64]
+    features: NDArray[np.float16]
+    valid: NDArray[np.uint8]
+
+    @property
+    def weights(self) -> NDArray[np.float32]:
+        """The valid share (N, F) of the cell that each feature belongs to."""
+        share = self.valid.astype(np.float32) / FULL
+        return np.repeat(share, self.features.shape[1] // max(1, self.valid.shape[1]), axis=1)
+
+
+def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> CoarseTiles:
+    """The coarse tiles whose centres lie in a box, read from the imagery with one thread.
+
+    Raises `AreaError` for impossible recipes, `ImageryError` where the imagery cannot be read.
+    """
+    area = Area.from_bounds(bounds_deg)
+    grid = TileGrid.covering(
+        area.extent_en_m, gsd_m=recipe.gsd_m, tile_px=recipe.tile_px, overlap=recipe.overlap
+    )
+    representation = make_variant(represent.TABLE, EDGES)
+    reader = SheetReader(
+        mosaic, area, grid, representation, _NoCrops(recipe.tile_px, 0), registration=False
+    )
+    rows, cols = np.mgrid[: grid.rows, : grid.cols]
+    tiles = np.stack([rows.ravel(), cols.ravel()], axis=1).astype(np.intp)
+    latlon = np.stack(area.frame.latlon_from_en(grid.centres_en_m(tiles)), axis=1)
+    inside = _inside(latlon, bounds_deg)
+    tiles, latlon = tiles[inside], latlon[inside]
+    try:
+        reader.read(lambda stage, share: None, workers=1)
+    except AreaError:  # no pixel of imagery
+        tiles, latlon = tiles[:0], latlon[:0]
+    first_px = tiles * grid.stride_px
+    enough = reader.cells.valid_share(first_px) >= MIN_VALID_SHARE
+    first_px, latlon = first_px[enough], latlon[enough]
+    features = np.zeros((len(first_px), POOLING.cells**2 * representation.channels), np.float16)
+    valid = np.zeros((len(first_px), POOLING.cells**2), np.uint8)
+    for start in range(0, len(first_px), _CHUNK_TILES):
+        part = slice(start, start + _CHUNK_TILES)
+        values, weights = pooled_features(POOLING, reader.cells, first_px[part])
+        features[part] = values
+        valid[part] = np.rint(weights[:, :: representation.channels] * FULL)
+    return CoarseTiles(recipe, bounds_deg, latlon, features, valid)
+
+
+def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path: Path) -> int:
+    """Write the coarse tiles of a box to `path`, whole or not at all; returns how many there are.
+
+    The same bytes every time. Raises as `make_coarse`, and `OutputError`.
+    """
+    made = make_coarse(mosaic, bounds_deg, recipe)
+    arrays = {
+        "centres_latlon_deg": made.centres_latlon_deg,
+        "features": made.features,
+        "valid": made.valid,
+    }
+    with replacing(path) as temporary:
+        try:
+            contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+            save_file(contiguous, temporary, metadata={METADATA_KEY: _told(made)})
+        except SafetensorError as error:
+            if f"os error {errno.ENOSPC}" in str(error):
+                raise OSError(errno.ENOSPC, "disk full") from error
+            raise OutputError(f"coarse tiles cannot be written ({error}): {path}") from error
+    return len(made.valid)
+
+
+def read_coarse(path: Path) -> CoarseTiles:
+    """The coarse tiles in a file, all of it checked.
+
+    Raises `MissingFileError`, and `AtlasError` where it is not what `write_coarse` writes.
+    """
+    path = require_file(path, "coarse tiles")
+    try:
+        with safe_open(path, framework="numpy") as stored:
+            told = (stored.metadata() or {}).get(METADATA_KEY)
+            names = set(stored.keys())
+            if told is None or names != {"centres_latlon_deg", "features", "valid"}:
+                raise AtlasError(f"not coarse tiles of an atlas: {path}")
+            arrays = {name: stored.get_tensor(name) for name in sorted(names)}
+        recipe, bounds_deg = _about(told)
+        return _checked(recipe, bounds_deg, arrays)
+    except AtlasError as error:
+        raise AtlasError(f"{error}: {path}") from error
+    except (SafetensorError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise AtlasError(f"coarse tiles are damaged ({error}): {path}") from error
+
+
+class _NoCrops(CropSampler):
+    """Nothing is calibrated here."""
+
+    def places(self, height: int, width: int, share: float) -> NDArray[np.intp]:
+        """None."""
+        return np.zeros((0, 2), np.intp)
+
+
+def _inside(latlon_deg: NDArray[np.float64], bounds_deg: Extent) -> NDArray[np.bool_]:
+    """Which of the places (N, 2) lie in a box; what lies on its border belongs to south or west."""
+    west, south, east, north = bounds_deg
+    lat, turned = latlon_deg[:, 0], (latlon_deg[:, 1] - west) % 360
+    return np.asarray((lat >= south) & (lat < north) & (turned < (east - west)))
+
+
+def _told(made: CoarseTiles) -> str:
+    plain = {
+        "format": FORMAT,
+        "schema": SCHEMA,
+        "recipe": asdict(made.recipe),
+        "edges": EDGES,
+        "cells": POOLING.cells,
+        "bounds_deg": list(made.bounds_deg),
+    }
+    return json.dumps(plain, sort_keys=True, separators=(",", ":"))
+
+
+def _about(told: str) -> tuple[CoarseRecipe, Extent]:
+    plain: Any = json.loads(told)
+    if plain["format"] != FORMAT:
+        raise AtlasError("not coarse tiles of an atlas")
+    if plain["schema"] != SCHEMA:
+        raise AtlasError(f"coarse tiles of schema {plain['schema']!r:.20}, this program reads 1")
+    if (plain["edges"], plain["cells"]) != (EDGES, POOLING.cells):
+        raise AtlasError("coarse tiles were made of something that this program cannot compare")
+    recipe = CoarseRecipe(**plain["recipe"])
+    numbers = [recipe.gsd_m, recipe.tile_px, recipe.overlap, *plain["bounds_deg"]]
+    usable = asdict(recipe) == plain["recipe"] and 0 <= recipe.overlap < 1
+    usable = usable and all(isinstance(n, int | float) and math.isfinite(n) for n in numbers)
+    if not usable or recipe.gsd_m <= 0 or recipe.tile_px % MICRO or recipe.tile_px < MICRO:
+        raise AtlasError("coarse tiles have an impossible recipe")
+    west, south, east, north = (float(value) for value in plain["bounds_deg"])
+    return recipe, (west, south, east, north)
+
+
+def _checked(recipe: CoarseRecipe, bounds_deg: Extent, arrays: dict[str, Any]) -> CoarseTiles:
+    centres, features, valid = (arrays[n] for n in ("centres_latlon_deg", "features", "valid"))
+    count = len(valid) if valid.ndim == 2 else -1
+    right = (
+        (centres.dtype, features.dtype, valid.dtype) == (np.float64, np.float16, np.uint8)
+        and 0 <= count <= MAX_TILES
+        and centres.shape == (count, 2)
+        and valid.shape[1] == POOLING.cells**2
+        and features.ndim == 2
+        and len(features) == count
+        and valid.shape[1] <= features.shape[1] <= MAX_FEATURES
+        and features.shape[1] % valid.shape[1] == 0
+    )
+    if not right:
+        raise AtlasError("coarse tiles are damaged (arrays do not fit together)")
+    if not (np.isfinite(features).all() and np.isfinite(centres).all()):
+        raise AtlasError("coarse tiles are damaged (not finite)")
+    west, south, east, north = bounds_deg
+    slack = west - _SLACK_DEG, south - _SLACK_DEG, east + 2 * _SLACK_DEG, north + 2 * _SLACK_DEG
+    if not _inside(centres, slack).all():
+        raise AtlasError("coarse tiles are damaged (centres lie outside their sheet)")
+    for array in (centres, features, valid):
+        array.flags.writeable = False
+    return CoarseTiles(recipe, bounds_deg, centres, features, valid)

@@ -1,0 +1,142 @@
+"""Where an atlas reaches: which sheets an area lacks, and whether its route is on what there is."""
+
+import logging
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.atlas.catalog import Atlas
+from orthonav.atlas.warp import Source
+from orthonav.embed.whitened import CellSheet
+from orthonav.errors import AreaError, AtlasError
+from orthonav.geo.area import Area, Extent
+from orthonav.geo.grid import TileGrid
+from orthonav.geo.world import WorldSheets
+from orthonav.prepare.layout import MIN_TILE_VALID_SHARE
+
+log = logging.getLogger(__name__)
+
+MOST_PLACES = 20_000
+EDGE_POINTS = 33
+NAMED = 8
+"""So many missing sheets are named in a message."""
+Array = NDArray[np.float64]
+
+
+def box_deg(area: Area, margin_m: float) -> Extent:
+    """West, south, east, north in degrees of an area and a margin around it."""
+    west, south, east, north = area.extent_en_m
+    x = np.linspace(west - margin_m, east + margin_m, EDGE_POINTS)
+    y = np.linspace(south - margin_m, north + margin_m, EDGE_POINTS)
+    edge = np.concatenate(
+        [np.stack(np.broadcast_arrays(x, each), 1) for each in (y[0], y[-1])]
+        + [np.stack(np.broadcast_arrays(each, y), 1) for each in (x[0], x[-1])]
+    )
+    lat, lon = area.frame.latlon_from_en(edge)
+    lon = lon - 360 * np.round((lon - area.frame.lon_deg) / 360)
+    left, right = ((float(each) + 180) % 360 - 180 for each in (lon.min(), lon.max()))
+    return left, float(lat.min()), right, float(lat.max())
+
+
+def require_sheets(atlas: Atlas, found: Sequence[object]) -> None:
+    """Raise `AreaError` saying what the atlas covers where no sheet was found."""
+    if found:
+        return
+    sheets = atlas.sheets().values()
+    if not sheets:
+        raise AreaError(f"the atlas has no sheets yet: {atlas.url}")
+    boxes = np.array([sheet.bounds_deg for sheet in sheets])
+    west, south = boxes[:, :2].min(axis=0)
+    east, north = boxes[:, 2:].max(axis=0)
+    raise AreaError(
+        f"the area lies outside the atlas, whose {len(boxes)} sheets lie within "
+        f"{west:.4f},{south:.4f},{east:.4f},{north:.4f} (west, south, east, north): {atlas.url}"
+    )
+
+
+def check_covered(
+    area: Area,
+    grid: TileGrid,
+    sources: Sequence[Source],
+    lattice: WorldSheets,
+    allow_holes: bool,
+) -> None:
+    """Warn where sheets under an area are missing; `AtlasError` where the route lies on them.
+
+    `allow_holes` makes that a warning too. Raises `AreaError` where no part is covered.
+    """
+    tiles = _some_tiles(area, grid)
+    lat, lon = area.frame.latlon_from_en(grid.centres_en_m(tiles))
+    covered = _covered(sources, lat, lon)
+    if not covered.any():
+        raise AreaError("no part of the area lies on a sheet of the atlas")
+    names = _missing(lattice, lat[~covered], lon[~covered])
+    route_lat, route_lon = area.frame.latlon_from_en(_route_en_m(area, grid))
+    on_route = ~_covered(sources, route_lat, route_lon)
+    if on_route.any() and not allow_holes:
+        under = _missing(lattice, route_lat[on_route], route_lon[on_route])
+        raise AtlasError(
+            f"{on_route.mean():.0%} of the route lies on sheets that the atlas lacks "
+            f"({under}); add them, or allow holes (--allow-holes)"
+        )
+    if names:
+        log.warning(
+            "%.3g %% of the area lies on sheets that the atlas lacks: %s",
+            100 * float((~covered).mean()),
+            names,
+        )
+
+
+def check_shown(area: Area, grid: TileGrid, cells: CellSheet, allow_holes: bool) -> None:
+    """Warn where an area has no imagery though it has sheets; `AtlasError` where the route is so.
+
+    `allow_holes` makes that a warning too.
+    """
+    share = cells.valid_share(_some_tiles(area, grid) * grid.stride_px)
+    empty = float((share < MIN_TILE_VALID_SHARE).mean())
+    if empty > 0:
+        log.warning("%.3g %% of the area has no imagery in the atlas", 100 * empty)
+    route = grid.tiles_rc(_route_en_m(area, grid)).clip(0, [grid.rows - 1, grid.cols - 1])
+    bare = cells.valid_share(route * grid.stride_px) < MIN_TILE_VALID_SHARE
+    if bare.any() and not allow_holes:
+        raise AtlasError(
+            f"{bare.mean():.0%} of the route has no imagery in the atlas; "
+            "add some, or allow holes (--allow-holes)"
+        )
+
+
+def _covered(sources: Sequence[Source], lat: Array, lon: Array) -> NDArray[np.bool_]:
+    covered = np.zeros(len(lat), dtype=np.bool_)
+    for source in sources:
+        covered |= source.covers(lat, lon)
+    return covered
+
+
+def _missing(lattice: WorldSheets, lat: Array, lon: Array) -> str:
+    names = sorted(
+        {lattice.name_at(*place) for place in zip(lat.tolist(), lon.tolist(), strict=True)}
+    )
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
+
+
+def _some_tiles(area: Area, grid: TileGrid) -> NDArray[np.intp]:
+    """Tiles (N, 2) in an area, all or evenly taken; at least the one nearest its middle."""
+    step = max(1, int(np.ceil(np.sqrt(grid.rows * grid.cols / MOST_PLACES))))
+    tiles = np.mgrid[0 : grid.rows : step, 0 : grid.cols : step].reshape(2, -1).T.astype(np.intp)
+    inside = area.contains(grid.centres_en_m(tiles), grid.stride_m * np.sqrt(0.5))
+    return tiles[inside] if inside.any() else tiles[len(tiles) // 2 :][:1]
+
+
+def _route_en_m(area: Area, grid: TileGrid) -> Array:
+    """Points (N, 2) along the route, a quarter of a tile apart; none where there is no route."""
+    if area.route is None:
+        return np.zeros((0, 2))
+    line = area.route.points_en_m(area.frame)
+    parts = [line[:1]]
+    for start, end in pairwise(line):
+        count = max(1, int(np.ceil(np.hypot(*(end - start)) / (grid.tile_m / 4))))
+        parts.append(start + (end - start) * (np.arange(count)[:, None] + 1) / count)
+    return np.concatenate(parts)

@@ -1,0 +1,58 @@
+"""Folders for what is being made; what killed processes have left of them goes with the next."""
+
+import contextlib
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+from orthonav.errors import OutputError
+
+try:
+    import fcntl
+except ImportError:  # not a Unix: what was killed is left to the system
+    fcntl = None  # type: ignore[assignment]
+
+PREFIX = "orthonav-sheet-"
+_LOCK = "in-use"
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """A new folder, removed afterwards; those that killed processes have left go first.
+
+    It lies where the system keeps temporary files (`TMPDIR`). Raises `OutputError`.
+    """
+    root = Path(tempfile.gettempdir())
+    _remove_abandoned(root)
+    try:
+        folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=root))
+    except OSError as error:
+        raise OutputError(f"no temporary folder can be made ({error.strerror}): {root}") from error
+    lock = None
+    try:
+        lock = _locked(folder)
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        if lock is not None:
+            lock.close()
+
+
+def _locked(folder: Path) -> IO[str] | None:
+    """A lock that the system lets go when this process ends, however it does."""
+    if fcntl is None:
+        return None
+    lock = (folder / f".{_LOCK}").open("w")
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    (folder / f".{_LOCK}").rename(folder / _LOCK)  # others only see it once it is locked
+    return lock
+
+
+def _remove_abandoned(root: Path) -> None:
+    for path in root.glob(f"{PREFIX}*/{_LOCK}") if fcntl is not None else ():
+        with contextlib.suppress(OSError), path.open("r+") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(path.parent, ignore_errors=True)

@@ -1,0 +1,272 @@
+"""Sheets of an atlas as one source of pixels and cells for another plane.
+
+Within a block of a kilometre two planes differ by a shift, a turn of less than a degree and
+millimetres, so a block is made of each sheet under it by one affine. The sheet whose box of the
+lattice holds a place is asked first; where it shows nothing, those that reach over their border.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.embed.cells import CellLayout
+from orthonav.errors import AtlasError, MapFileError
+from orthonav.geo.area import Extent
+from orthonav.geo.frames import LocalFrame
+from orthonav.geo.grid import TileGrid
+from orthonav.mapfile.layer import GreyLayer
+from orthonav.prepare.blocks import Block
+from orthonav.prepare.cellparts import StoredCells
+from orthonav.represent.gradients import HARMONICS
+
+KERNEL_PX = 3
+"""What interpolation looks at beyond the pixels it is asked for, and one more for rounding."""
+EDGE_POINTS = 17
+FILL_PX = 5
+OWN_BONUS = 0.01
+"""A cell is taken from the sheet that shows most of it; the one that owns it wins by so much."""
+_SHIFT = 6
+Array = NDArray[np.float64]
+Pixels = tuple[NDArray[np.uint8], NDArray[np.bool_]]
+Cells = tuple[NDArray[np.float32], NDArray[np.float32]]
+Made = TypeVar("Made")
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A sheet that is cut from. `bounds_deg` is its box of the lattice."""
+
+    name: str
+    bounds_deg: Extent
+    frame: LocalFrame
+    grid: TileGrid
+    layer: GreyLayer
+    cells: StoredCells
+
+    def covers(self, lat_deg: Array, lon_deg: Array) -> NDArray[np.bool_]:
+        """Which places (N,) lie on its raster."""
+        points = self.frame.en_from_latlon(lat_deg, lon_deg)
+        px = (points - [self.grid.west_m, self.grid.north_m]) * [1, -1] / self.grid.gsd_m
+        return np.asarray(((px >= 0) & (px <= [self.grid.width_px, self.grid.height_px])).all(-1))
+
+    def outline_deg(self) -> tuple[Array, Array]:
+        """Latitudes and longitudes around its box, dense enough for straight lines between."""
+        west, south, east, north = self.bounds_deg
+        share = np.linspace(0, 1, EDGE_POINTS)[:-1]
+        lon, lat = west + (east - west) * share, south + (north - south) * share
+        fixed = np.ones(len(share))
+        return (
+            np.concatenate([fixed * south, lat, fixed * north, lat[::-1] + lat[1] - lat[0]]),
+            np.concatenate([lon, fixed * east, lon[::-1] + lon[1] - lon[0], fixed * west]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Warp:
+    """One source seen from the raster of another grid."""
+
+    source: Source
+    frame: LocalFrame
+    grid: TileGrid
+    turns: bool
+    """Whether numbers of cells are harmonics of a direction, to be turned with the plane."""
+
+    def reaches(self, block: Block) -> bool:
+        """Whether any of a block may lie on the source's raster."""
+        left, top, right, bottom = self._box_px
+        return (
+            block.col < right
+            and block.row < bottom
+            and block.col + block.width > left
+            and block.row + block.height > top
+        )
+
+    def affine(self, block: Block) -> Array:
+        """The source's pixels of a block's, (2, 3), by outer corners: pixel-is-area."""
+        corners = _corners(block)
+        there = self._source_px(corners)
+        design = np.column_stack([corners - corners[0], np.ones(len(corners))])
+        solved = np.linalg.lstsq(design, there, rcond=None)[0].T
+        solved[:, 2] -= solved[:, :2] @ corners[0]
+        return np.asarray(solved)
+
+    def owned(self, block: Block, layout: CellLayout | None = None) -> NDArray[np.bool_]:
+        """Which pixels of a block, or the cells that begin in it, lie in the source's own box."""
+        spacing, middle = (1, 0.5) if layout is None else (layout.spacing_px, layout.micro_px / 2)
+        shape = -(-block.height // spacing), -(-block.width // spacing)
+        # Of pixel or cell 0, 0 the middle is where OpenCV has its corner.
+        points = (self._outline_px - [block.col + middle, block.row + middle]) / spacing
+        points = np.rint(points * 2**_SHIFT).astype(np.int32)
+        mask = np.zeros(shape, dtype=np.uint8)
+        cv2.fillPoly(mask, [points], 1, lineType=cv2.LINE_8, shift=_SHIFT)
+        return mask.astype(np.bool_)
+
+    def grey(self, block: Block) -> Pixels:
+        """Grey and valid (H, W) of a block, 0 where not valid."""
+        affine = self.affine(block)
+        matrix = _by_middles(affine, block, 1, 0.5)
+        size = block.width, block.height
+        top, left, height, width = _window(matrix, size)
+        grey, valid = self._read(lambda: self.source.layer.read(0, top, left, height, width))
+        shape = block.height, block.width
+        if not valid.any():
+            return np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
+        matrix[:, 2] -= [left, top]
+        whole = bool(valid.all())
+        if not whole:  # what lies beyond the imagery must not darken its edge
+            grown = cv2.dilate(grey, np.ones((FILL_PX, FILL_PX), np.uint8))
+            grey = np.where(valid, grey, grown).astype(np.uint8)
+        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        made = cv2.warpAffine(grey, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        if whole:
+            return np.asarray(made, np.uint8), np.ones(shape, np.bool_)
+        mask = valid.astype(np.uint8) * 255
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        kept = cv2.warpAffine(mask, matrix, size, flags=flags) >= 254
+        return np.where(kept, made, 0).astype(np.uint8), np.asarray(kept, np.bool_)
+
+    def cells(self, block: Block, layout: CellLayout) -> Cells:
+        """Means (h, w, C) and shares (h, w) of the cells that begin in a block."""
+        spacing, middle = layout.spacing_px, layout.micro_px / 2
+        rows, cols = -(-block.height // spacing), -(-block.width // spacing)
+        matrix = _by_middles(self.affine(block), block, spacing, middle)
+        top, left, height, width = _window(matrix, (cols, rows))
+        means, share = self._read(lambda: self.source.cells.read(top, left, height, width))
+        matrix[:, 2] -= [left, top]
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        planes = [
+            cv2.warpAffine(np.ascontiguousarray(plane), matrix, (cols, rows), flags=flags)
+            for plane in (*np.moveaxis(means, 2, 0), share)
+        ]
+        made = np.stack(planes[:-1], axis=2).astype(np.float32)
+        if self.turns:
+            _turn(made, math.atan2(matrix[1, 0], matrix[0, 0]))
+        return made, np.asarray(planes[-1], np.float32)
+
+    def _read(self, read: Callable[[], Made]) -> Made:
+        try:
+            return read()
+        except MapFileError as error:
+            raise AtlasError(
+                f"sheet {self.source.name} is damaged, build it anew ({error})"
+            ) from error
+
+    def _source_px(self, target_px: Array) -> Array:
+        """Pixels (N, 2), column and row, of the source under pixels of the grid."""
+        grid, source = self.grid, self.source
+        places = [grid.west_m, grid.north_m] + target_px * [grid.gsd_m, -grid.gsd_m]
+        points = source.frame.en_from_latlon(*self.frame.latlon_from_en(places))
+        corner = [source.grid.west_m, source.grid.north_m]
+        return np.asarray((points - corner) / [source.grid.gsd_m, -source.grid.gsd_m])
+
+    @cached_property
+    def _outline_px(self) -> Array:
+        """The source's box in pixels of the grid."""
+        return self._grid_px(*self.source.outline_deg())
+
+    @cached_property
+    def _box_px(self) -> tuple[float, float, float, float]:
+        """Left, top, right, bottom of the source's raster in pixels of the grid."""
+        grid = self.source.grid
+        corners = _corners(Block(0, 0, grid.height_px, grid.width_px))
+        places = [grid.west_m, grid.north_m] + corners * [grid.gsd_m, -grid.gsd_m]
+        points = self._grid_px(*self.source.frame.latlon_from_en(places))
+        (left, top), (right, bottom) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+        return left - 1, top - 1, right + 1, bottom + 1
+
+    def _grid_px(self, lat_deg: Array, lon_deg: Array) -> Array:
+        corner = [self.grid.west_m, self.grid.north_m]
+        points = self.frame.en_from_latlon(lat_deg, lon_deg)
+        return np.asarray((points - corner) / [self.grid.gsd_m, -self.grid.gsd_m])
+
+
+def joined_grey(warps: Sequence[Warp], block: Block) -> Pixels:
+    """Grey and valid (H, W) of a block from the sources that reach it."""
+    grey = np.zeros((block.height, block.width), dtype=np.uint8)
+    valid = np.zeros(grey.shape, dtype=np.bool_)
+    owners = [(warp, warp.owned(block)) for warp in warps]
+    for own in (True, False):
+        for warp, mask in owners:
+            wanted = ~valid & mask if own else ~(valid | mask)
+            part = _around(wanted)
+            if part is None:
+                continue
+            rows, cols = part
+            size = rows.stop - rows.start, cols.stop - cols.start
+            some, there = warp.grey(Block(block.row + rows.start, block.col + cols.start, *size))
+            taken = there & wanted[part]
+            np.copyto(grey[part], some, where=taken)
+            valid[part] |= taken
+    return grey, valid
+
+
+def _around(wanted: NDArray[np.bool_]) -> tuple[slice, slice] | None:
+    """Rows and columns of the smallest box around what is wanted (H, W); None of nothing."""
+    rows, cols = (np.flatnonzero(wanted.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return None
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+
+
+def joined_cells(warps: Sequence[Warp], block: Block, layout: CellLayout) -> Cells:
+    """Means (h, w, C) and shares (h, w) of the cells that begin in a block, from one or more
+    sources that reach it."""
+    owners = [(warp, warp.owned(block, layout)) for warp in warps]
+    owners.sort(key=lambda each: not each[1].any())
+    means, share = owners[0][0].cells(block, layout)
+    best = share + np.float32(OWN_BONUS) * owners[0][1]
+    for warp, mask in owners[1:]:
+        if best.min() >= 1:
+            break
+        some, their_share = warp.cells(block, layout)
+        rank = their_share + np.float32(OWN_BONUS) * mask
+        better = rank > best
+        means[better], share[better] = some[better], their_share[better]
+        best = np.maximum(best, rank)
+    return means, share
+
+
+def _turn(means: NDArray[np.float32], angle_rad: float) -> None:
+    """Turn harmonics of directions back by the angle by which the source is turned, in place."""
+    for k in range(1, HARMONICS + 1):
+        cos, sin = np.float32(math.cos(2 * k * angle_rad)), np.float32(math.sin(2 * k * angle_rad))
+        real, imaginary = means[..., 2 * k - 1].copy(), means[..., 2 * k].copy()
+        means[..., 2 * k - 1] = real * cos + imaginary * sin
+        means[..., 2 * k] = imaginary * cos - real * sin
+
+
+def _corners(block: Block) -> Array:
+    right, bottom = block.col + block.width, block.row + block.height
+    return np.array(
+        [[block.col, block.row], [right, block.row], [block.col, bottom], [right, bottom]], float
+    )
+
+
+def _applied(affine: Array, points: Array) -> Array:
+    return np.asarray(points @ affine[:, :2].T + affine[:, 2])
+
+
+def _by_middles(affine: Array, block: Block, spacing: int, middle: float) -> Array:
+    """The affine between numbers of pixels (or cells) whose middles lie `middle` px into them.
+
+    Number 0, 0 is the block's first; in the source that of its raster.
+    """
+    linear = affine[:, :2]
+    first = linear @ [block.col + middle, block.row + middle] + affine[:, 2] - middle
+    return np.column_stack([linear, first / spacing])
+
+
+def _window(matrix: Array, size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Top, left, height and width in the source of what a picture of `size` (w, h) needs."""
+    cols, rows = size
+    corners = np.array([[0, 0], [cols - 1, 0], [0, rows - 1], [cols - 1, rows - 1]], float)
+    there = _applied(matrix, corners)
+    left, top = (int(value) for value in np.floor(there.min(axis=0)) - KERNEL_PX)
+    right, bottom = (int(value) for value in np.ceil(there.max(axis=0)) + KERNEL_PX)
+    return top, left, bottom - top + 1, right - left + 1

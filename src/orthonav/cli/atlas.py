@@ -1,0 +1,242 @@
+"""`orthonav atlas`: what is in an atlas, whether it is whole, and changing it."""
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orthonav.cli.common import add_area, print_json, progress
+
+if TYPE_CHECKING:
+    from orthonav.atlas.catalog import Atlas, Sheet
+
+NOT_WHOLE = 3
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command: one of its own for each thing to do."""
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("-v", "--verbose", action="store_true", default=argparse.SUPPRESS)
+    common.add_argument("-q", "--quiet", action="store_true", default=argparse.SUPPRESS)
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+
+    def action(name: str, text: str) -> argparse.ArgumentParser:
+        found = actions.add_parser(name, help=text, description=text, parents=[common])
+        found.add_argument("atlas", metavar="ATLAS", help="folder or URL: s3://, gs://, abfs://")
+        return found
+
+    info = action("info", "print what is in an atlas")
+    info.add_argument("--json", action="store_true", help="print as JSON")
+    check = action("check", "is it whole? exit 0 yes, 3 no: what is wrong is listed")
+    check.add_argument(
+        "--deep", action="store_true", help="read every file, check its checksum and its recipe"
+    )
+    check.add_argument(
+        "--clean",
+        action="store_true",
+        help="remove what was left over by builds that were interrupted",
+    )
+    check.add_argument(
+        "--min-age-h",
+        type=float,
+        default=24.0,
+        metavar="H",
+        help="remove nothing younger: a build puts files before it names them (%(default)g)",
+    )
+    check.add_argument("--json", action="store_true", help="print as JSON")
+    copied = action("add", "copy sheets of another atlas of the same recipe into this one")
+    copied.add_argument("source", metavar="FROM", help="folder or URL of the other atlas")
+    copied.add_argument("--sheets", nargs="+", metavar="SHEET", help="only these")
+    copied.add_argument(
+        "--replace", action="store_true", help="take those of FROM where both have a sheet"
+    )
+    retire = action("retire", "take sheets out of an atlas")
+    retire.add_argument("sheets", nargs="+", metavar="SHEET", help="name, as r001526c001392")
+    index = action("index", "make what places views in the whole atlas, or bring it up to date")
+    index.add_argument("--anew", action="store_true", help="all of it, as if there were none")
+    cut = action("cut", "write one map of a route or a box, as it would be built from the imagery")
+    add_area(cut, cut.add_mutually_exclusive_group(required=True))
+    cut.add_argument("--out", type=Path, required=True, metavar="MAP.onav")
+    cut.add_argument("--workers", type=int, metavar="N", help="threads that read (one per core)")
+    cut.add_argument(
+        "--allow-holes", action="store_true", help="also where sheets under the route are missing"
+    )
+
+
+def run(options: argparse.Namespace) -> int | None:
+    """Do what was asked for."""
+    actions = {
+        "info": _info,
+        "check": _check,
+        "add": _add,
+        "retire": _retire,
+        "index": _index,
+        "cut": _cut,
+    }
+    return actions[options.action](options)
+
+
+def _info(options: argparse.Namespace) -> None:
+    from orthonav.atlas.catalog import Atlas
+
+    plain = summary(Atlas.open(options.atlas))
+    if options.json:
+        print_json(plain)
+    else:
+        print(summary_text(plain))
+
+
+def summary(atlas: "Atlas") -> dict[str, Any]:
+    """What people ask of an atlas, as plain values."""
+    sheets = list(atlas.sheets().values())
+    dates = sorted({date for sheet in sheets for date in sheet.dates})
+    sources = {}
+    for source in (source for sheet in sheets for source in sheet.imagery):
+        told = {key: source.get(key) for key in ("name", "attribution", "licence")}
+        sources[tuple(map(str, told.values()))] = told
+    size = sum(sheet.size_bytes for sheet in sheets)
+    area_km2 = sum(sheet.area_km2 for sheet in sheets)
+    return {
+        "atlas": str(atlas.store),
+        "sheets": len(sheets),
+        "tiles": sum(sheet.tiles for sheet in sheets),
+        "area_km2": round(area_km2, 4),
+        "bytes": size,
+        "mb_per_km2": round(size / 1e6 / area_km2, 4) if area_km2 > 0 else None,
+        "bounds_deg": _bounds(sheets),
+        "date_from": dates[0] if dates else None,
+        "date": dates[-1] if dates else None,
+        "recipe": atlas.recipe.to_plain(),
+        "imagery": [sources[key] for key in sorted(sources)],
+        "made_by": sorted({" ".join(each) for sheet in sheets for each in sheet.made_by.items()}),
+        "names": [sheet.id for sheet in sheets],
+    }
+
+
+def _bounds(sheets: Iterable["Sheet"]) -> list[float] | None:
+    """West, south, east, north of all sheets; not the shortest way across the antimeridian."""
+    boxes = [sheet.bounds_deg for sheet in sheets]
+    if not boxes:
+        return None
+    west, south, east, north = zip(*boxes, strict=True)
+    return [round(value, 7) for value in (min(west), min(south), max(east), max(north))]
+
+
+def summary_text(plain: dict[str, Any]) -> str:
+    """The same for people."""
+    recipe = dict(plain["recipe"])
+    coarse = recipe.pop("coarse")
+    values = ", ".join(f"{name} {value}" for name, value in recipe.items() if value is not None)
+    lines = [
+        f"atlas      {plain['atlas']}",
+        f"sheets     {plain['sheets']} of {recipe['sheet_km']:g} km, {plain['tiles']} tiles",
+        f"area       {plain['area_km2']:.2f} km2 of tile centres",
+        f"size       {plain['bytes'] / 1e6:.3f} MB, {plain['mb_per_km2'] or 0:.3f} MB per km2",
+        f"recipe     {values}",
+    ]
+    if coarse:
+        of_coarse = ", ".join(f"{name} {value}" for name, value in coarse.items())
+        lines.append(f"coarse     {of_coarse}")
+    if plain["bounds_deg"]:
+        west, south, east, north = plain["bounds_deg"]
+        lines.append(
+            f"bounds     {west:.4f},{south:.4f},{east:.4f},{north:.4f} (W,S,E,N in degrees)"
+        )
+    dates = dict.fromkeys(str(plain[key]) for key in ("date_from", "date") if plain[key])
+    lines.append(f"dates      {' to '.join(dates) or 'unknown'}")
+    for source in plain["imagery"][:20]:
+        terms = [str(source[key]) for key in ("attribution", "licence") if source[key]]
+        lines.append(f"imagery    {', '.join([str(source['name']), *terms])}")
+    if len(plain["imagery"]) > 20:
+        lines.append(f"           and {len(plain['imagery']) - 20} more (--json lists all)")
+    return "\n".join(lines)
+
+
+def _check(options: argparse.Namespace) -> int:
+    from orthonav.atlas.catalog import Atlas
+    from orthonav.atlas.integrity import check_atlas
+
+    atlas = Atlas.open(options.atlas)
+    with progress(options) as shown:
+        found = check_atlas(
+            atlas,
+            options.deep,
+            shown,
+            clean=options.clean,
+            min_age_s=options.min_age_h * 3600,
+        )
+    left = [problem for problem in found if not problem.removed]
+    if options.json:
+        print_json(
+            {
+                "atlas": str(atlas.store),
+                "whole": not left,
+                "deep": options.deep,
+                "problems": [vars(problem) for problem in found],
+            }
+        )
+    else:
+        for problem in found:
+            done = " (put right)" if problem.removed else ""
+            print(f"{problem.kind:15} {problem.name}: {problem.detail}{done}")
+        said = f"{len(left)} problems" if left else "whole"
+        print(f"{said}{'' if options.deep else ', by names and sizes'}: {atlas.store}")
+    return NOT_WHOLE if left else 0
+
+
+def _add(options: argparse.Namespace) -> None:
+    from orthonav.atlas.catalog import Atlas, copy_sheets
+
+    source = Atlas.open(options.source)
+    atlas = Atlas.open_or_create(options.atlas, source.recipe)
+    with progress(options) as shown:
+        put, kept = copy_sheets(source, atlas, options.sheets, options.replace, shown)
+    print(f"{len(put)} sheets added, {len(kept)} kept as they were: {atlas.store}")
+
+
+def _retire(options: argparse.Namespace) -> None:
+    from orthonav.atlas.catalog import Atlas
+
+    atlas = Atlas.open(options.atlas)
+    for sheet in dict.fromkeys(options.sheets):
+        atlas.retire(sheet)
+        print(f"retired    {sheet}")
+    atlas.snapshot()
+
+
+def _index(options: argparse.Namespace) -> None:
+    from orthonav.atlas.catalog import Atlas
+    from orthonav.atlas.index import make_index
+
+    atlas = Atlas.open(options.atlas)
+    with progress(options) as shown:
+        made = make_index(atlas, progress=shown, anew=options.anew)
+    if made is None:
+        print(f"no sheet has coarse tiles, so there is nothing to index: {atlas.store}")
+        return
+    rows = sum(part.rows for shard in made.shards for part in shard.parts if not part.retired)
+    size = sum(asset.size_bytes for asset in made.files.values())
+    print(f"{rows} tiles of {len(made.sheets)} sheets, {size / 1e6:.3f} MB: {atlas.store}")
+
+
+def _cut(options: argparse.Namespace) -> None:
+    from orthonav.atlas.catalog import Atlas
+    from orthonav.atlas.cut import cut_map
+    from orthonav.cli.info import summary as map_summary
+    from orthonav.cli.info import summary_text as map_text
+    from orthonav.geo.route import read_route
+
+    atlas = Atlas.open(options.atlas)
+    route = None if options.route is None else read_route(options.route)
+    with progress(options) as shown:
+        result = cut_map(
+            atlas,
+            options.out,
+            route=route,
+            band_m=options.band_m,
+            bounds_deg=options.bounds,
+            workers=options.workers,
+            allow_holes=options.allow_holes,
+            progress=shown,
+        )
+    print(map_text(map_summary(result.manifest, result.size_bytes, options.out)))

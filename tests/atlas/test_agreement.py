@@ -1,0 +1,124 @@
+"""Views agree where an aircraft can have flown; one alone is never enough."""
+
+import math
+
+import numpy as np
+import pytest
+
+from orthonav.atlas.agreement import (
+    CHANCE,
+    FORGOTTEN_NATS,
+    MIN_VIEWS,
+    Agreement,
+    Seen,
+)
+from orthonav.geo.frames import LocalFrame
+
+FRAME = LocalFrame(46.5, 2.0)
+SIDE_M = 1000.0
+
+
+def seen(east_m, north_m, log_odds, key=0, turn_deg=90.0, log_scale=0.0):
+    lat, lon = FRAME.latlon_from_en([east_m, north_m])
+    return Seen(float(lat), float(lon), math.radians(turn_deg), log_scale, log_odds, key)
+
+
+def flown(*views, every_s=20.0, chance=CHANCE):
+    agreement = Agreement()
+    for number, places in enumerate(views):
+        agreement.see(places, round(number * every_s * 1e9), SIDE_M, chance)
+    return agreement
+
+
+def test_nothing_is_known_at_first():
+    agreement = Agreement()
+    assert agreement.best is None
+    assert agreement.probability == 0.0
+    assert not agreement.agreed
+
+
+def test_one_view_alone_is_no_fix_however_sure():
+    agreement = flown([seen(0, 0, 50.0)])
+    assert not agreement.agreed
+    assert agreement.best is not None and agreement.best.views == 1.0
+
+
+def test_two_views_of_new_ground_that_fit_are_one():
+    agreement = flown([seen(0, 0, 2.0)], [seen(900, 0, 2.0)])
+    assert agreement.agreed
+    assert agreement.probability > 0.9
+    assert agreement.best.views >= MIN_VIEWS
+
+
+def test_two_unlikely_views_that_fit_say_more_than_each():
+    apart = flown([seen(0, 0, -1.0)], [seen(50_000, 0, -1.0)])
+    together = flown([seen(0, 0, -1.0)], [seen(900, 0, -1.0)])
+    assert together.probability > apart.probability + 0.2
+    assert not apart.agreed
+
+
+@pytest.mark.parametrize(
+    "second",
+    [
+        seen(20_000, 0, 4.0),  # faster than anything flies
+        seen(900, 0, 4.0, log_scale=1.0),  # another height altogether
+    ],
+    ids=["too far", "other scale"],
+)
+def test_what_cannot_be_flown_does_not_agree(second):
+    assert not flown([seen(0, 0, 4.0)], [second]).agreed
+
+
+def test_a_heading_that_cannot_have_turned_so_far_does_not_agree():
+    agreement = flown([seen(0, 0, 4.0)], [seen(50, 0, 4.0, turn_deg=270.0)], every_s=1.0)
+    assert not agreement.agreed
+
+
+def test_views_of_the_same_ground_count_little():
+    hovering = flown(*([seen(0, 0, 3.0)] for _ in range(5)), every_s=0.2)
+    assert hovering.best.views < MIN_VIEWS
+    assert not hovering.agreed
+
+
+def test_places_that_fit_no_more_than_chance_do_not_add_up():
+    alone = flown([seen(0, 0, -2.0)])
+    again = flown([seen(0, 0, -2.0)], [seen(900, 0, -2.0)], chance=1.0)
+    assert again.probability < alone.probability + 0.05
+
+
+def test_a_view_elsewhere_costs_the_hypothesis_and_is_no_fix():
+    before = flown([seen(0, 0, 3.0)], [seen(900, 0, 3.0)])
+    after = flown([seen(0, 0, 3.0)], [seen(900, 0, 3.0)], [seen(40_000, 9_000, 3.0)])
+    assert before.agreed
+    assert not after.agreed
+    assert after.probability < before.probability
+
+
+def test_a_view_that_shows_nothing_is_no_fix_but_forgets_nothing():
+    agreement = flown([seen(0, 0, 3.0)], [seen(900, 0, 3.0)], [])
+    assert not agreement.agreed
+    agreement.see([seen(2700, 0, 3.0)], round(60e9), SIDE_M, CHANCE)
+    assert agreement.agreed
+
+
+def test_what_was_long_believed_is_given_up_after_some_views():
+    views = [[seen(800 * number, 0, 5.0)] for number in range(20)]
+    elsewhere = [[seen(60_000 + 800 * number, 30_000, 5.0)] for number in range(8)]
+    agreement = flown(*views, *elsewhere)
+    assert agreement.agreed
+    there = FRAME.en_from_latlon(agreement.best.last.lat_deg, agreement.best.last.lon_deg)
+    assert np.hypot(*(there - [60_000 + 800 * 7, 30_000])) < 10
+    assert max(each.log_odds for each in agreement.hypotheses) <= FORGOTTEN_NATS + 1e-9
+
+
+def test_speed_is_learnt_and_expected():
+    agreement = flown([seen(0, 0, 3.0)], [seen(900, 0, 3.0)])
+    lat, lon = agreement.best.expected(round(40e9))
+    assert FRAME.en_from_latlon(lat, lon) == pytest.approx([1800, 0], abs=2)
+    assert agreement.best.reach_m(round(40e9)) < 700
+
+
+def test_hypotheses_stay_few():
+    rng = np.random.default_rng(1)
+    crowd = [[seen(*rng.uniform(-40_000, 40_000, 2), -2.0, key) for key in range(40)]] * 3
+    assert len(flown(*crowd).hypotheses) <= 12

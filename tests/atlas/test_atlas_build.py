@@ -1,0 +1,401 @@
+"""An atlas is built sheet by sheet: what is finished stays, what fails is named, bytes agree."""
+
+import errno
+import json
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthonav.atlas import build as building
+from orthonav.atlas import scratch, tasks
+from orthonav.atlas.build import AtlasRequest, build_atlas, build_sheet
+from orthonav.atlas.catalog import Atlas
+from orthonav.atlas.cluster import PlainRunner
+from orthonav.atlas.coarse import read_coarse
+from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
+from orthonav.atlas.tasks import Imagery, plan_sheets, request_digest, versions
+from orthonav.errors import AreaError, AtlasError, StorageError, WorkerError
+from orthonav.geo.route import Route
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.mapfile import open_map
+
+COARSE = CoarseRecipe(gsd_m=4.0, tile_px=32, overlap=0.5)
+SMALL = {
+    "sheet_km": 0.3,
+    "tile_px": 64,
+    "overlap": 0.5,
+    "calibration_views": 1,
+    "coarse": {"gsd_m": 4.0, "tile_px": 32, "overlap": 0.5},
+}
+COUNT = 8
+"""Sheets that the orthophoto lies on."""
+RECIPE = AtlasRecipe(**{"gsd_m": 1.0, **SMALL, "coarse": COARSE})
+
+
+@pytest.fixture(autouse=True)
+def fewer_crops(monkeypatch):
+    """Calibration from few crops: it takes longest."""
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 4)
+    monkeypatch.setattr("orthonav.prepare.calibrate_registration.MIN_RIGHT", 1)
+
+
+@pytest.fixture(scope="module")
+def ortho(make_ortho, tmp_path_factory):
+    """An orthophoto of 400 x 400 m at 1 m, all valid."""
+    return make_ortho(tmp_path_factory.mktemp("ortho") / "2019-06.tif")
+
+
+@pytest.fixture(scope="module")
+def built(ortho, tmp_path_factory):
+    """An atlas of it, which nobody changes, and what building it came to."""
+    place = tmp_path_factory.mktemp("built") / "atlas"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("orthonav.prepare.calibrate.CROPS", 4)
+        return place, made(place, ortho)
+
+
+def made(place, *orthos, **request):
+    request = {"recipe": SMALL, "index": False, **request}
+    with PlainRunner() as runner:
+        return build_atlas(AtlasRequest(str(place), orthos, **request), runner)
+
+
+def content(place):
+    """All files of an atlas by name."""
+    paths = sorted(path for path in Path(place).rglob("*") if path.is_file())
+    return {str(path.relative_to(place)): path.read_bytes() for path in paths}
+
+
+def test_an_atlas_holds_a_map_and_coarse_tiles_for_each_sheet(built, ortho):
+    place, result = built
+    sheets = Atlas.open(place).sheets()
+    assert list(sheets) == list(result.built) and len(sheets) == COUNT and result.is_complete
+    mosaic = Mosaic.open([ortho])
+    atlas = Atlas.open(place)
+    for name, sheet in sheets.items():
+        opened = open_map(atlas.path(sheet))
+        west, south, east, north = RECIPE.sheets.bounds_deg(name)
+        assert sheet.bounds_deg == (west, south, east, north)
+        assert sheet.tiles == opened.manifest.sheets[0].tiles > 0
+        assert opened.manifest.recipe["overlap"] == 0.5
+        coarse = read_coarse(atlas.path(sheet, "coarse"))
+        assert coarse.recipe == COARSE and len(coarse.valid) > 0
+        assert sheet.dates == ("2019-06",) and sheet.made_by == versions()
+        assert sheet.imagery == mosaic.describe()
+    assert result.tiles == sum(sheet.tiles for sheet in sheets.values())
+    assert result.size_bytes == sum(sheet.size_bytes for sheet in sheets.values())
+    assert result.cpu_s > 0 and result.peak_bytes > 10**7
+    told = result.to_plain(cpu_hour_price=36.0)
+    assert told["cost"] == pytest.approx(result.core_s / 100, abs=1e-4)
+    assert told["sheets_per_hour"] > 0 and told["mb_per_km2"] > 0
+
+
+def test_nothing_in_an_atlas_tells_where_or_when_it_was_made(built, ortho, tmp_path):
+    place, _ = built
+    elsewhere = tmp_path / "other place" / ortho.name
+    elsewhere.parent.mkdir()
+    shutil.copy2(ortho, elsewhere)
+    made(tmp_path / "again", elsewhere)
+    assert content(tmp_path / "again") == content(place)
+    assert not any(str(ortho.parent).encode() in data for data in content(place).values())
+
+
+def test_what_is_there_is_kept_and_what_is_not_is_built(built, ortho, tmp_path):
+    place = Path(shutil.copytree(built[0], tmp_path / "atlas"))
+    again = made(place, ortho)
+    assert (again.built, again.kept) == ((), built[1].built) and again.is_complete
+    assert again.to_plain()["mb_per_km2"] is None
+    lost = sorted((place / "items").iterdir())[1]
+    lost.unlink()
+    again = made(place, ortho)
+    assert again.built == (lost.name.partition(".")[0],) and len(again.kept) == COUNT - 1
+    assert content(place) == content(built[0])
+
+
+def test_an_interrupt_keeps_what_is_finished(built, ortho, tmp_path):
+    place = tmp_path / "atlas"
+
+    def progress(stage, share):
+        if share >= 0.5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), PlainRunner() as runner:
+        build_atlas(AtlasRequest(str(place), [ortho], SMALL, index=False), runner, progress)
+    assert len(Atlas.open(place).sheets()) == COUNT / 2
+    assert len(made(place, ortho).built) == COUNT / 2
+    assert content(place) == content(built[0])
+
+
+def test_sheets_made_otherwise_are_refused_or_replaced(built, make_ortho, ortho, tmp_path):
+    place = Path(shutil.copytree(built[0], tmp_path / "atlas"))
+    changed = make_ortho(tmp_path / ortho.name, np.full((400, 400), 90, np.uint8))
+    changed.write_bytes(ortho.read_bytes())
+    os.utime(changed, (1e9, 1e9))
+    before = content(place)
+    with pytest.raises(AtlasError, match=r"8 of 8 sheets .*imagery has changed.*--replace") as told:
+        made(place, changed)
+    assert built[1].built[0] in str(told.value) and content(place) == before
+    result = made(place, changed, replace=True)
+    assert len(result.built) == COUNT
+    assert {sheet.revision for sheet in Atlas.open(place).sheets().values()} == {2}
+    # The pictures are the same: so are the maps.
+    after = content(place)
+    assert [n for n in after if n.startswith("sheets")] == [
+        n for n in before if n.startswith("sheets")
+    ]
+    assert made(place, changed, replace=True).kept == result.built
+
+
+def test_other_recipes_are_refused_by_what_differs(built, ortho):
+    before = content(built[0])
+    with pytest.raises(AtlasError, match=r"tile_px: 64, not 96"):
+        made(built[0], ortho, recipe={"tile_px": 96})
+    with pytest.raises(AtlasError, match=r"coarse: .*'overlap': 0.5.*, not .*0.75"):
+        made(built[0], ortho, recipe={"coarse": {"overlap": 0.75}})
+    assert made(built[0], ortho, recipe={}).kept == built[1].built, "an atlas knows its own"
+    assert content(built[0]) == before
+
+
+@pytest.mark.parametrize(
+    "recipe",
+    [{"tile_px": 50}, {"tile_px": 2048}, {"overlap": 1.0}, {"coarse": {"tile_px": 33}}],
+)
+def test_impossible_recipes_leave_no_atlas(ortho, tmp_path, recipe):
+    with pytest.raises((AreaError, AtlasError)):
+        made(tmp_path / "atlas", ortho, recipe={**SMALL, **recipe})
+    assert not (tmp_path / "atlas").exists()
+    with pytest.raises(AtlasError, match="impossible"):
+        made(tmp_path / "atlas", ortho, recipe={**SMALL, "colour": 3})
+
+
+def test_sheets_without_imagery_are_empty(make_ortho, tmp_path):
+    grey = np.random.default_rng(0).integers(1, 255, (700, 300)).astype(np.uint8)
+    grey[:500] = 0
+    ortho = make_ortho(tmp_path / "half.tif", grey, nodata=0)
+    result = made(tmp_path / "atlas", ortho)
+    assert result.empty and result.built and result.is_complete
+    assert set(Atlas.open(tmp_path / "atlas").sheets()) == set(result.built)
+
+
+def test_other_versions_are_refused(ortho, tmp_path):
+    task = plan_sheets(str(tmp_path), RECIPE, Mosaic.open([ortho]), [ortho])[0]
+    other = replace(task, made_by={**task.made_by, "numpy": "1.0"})
+    with pytest.raises(WorkerError, match=rf"numpy {np.__version__}, not 1.0"):
+        build_sheet(other)
+
+    class Mixed(PlainRunner):
+        def everywhere(self, probe):
+            return [("here", probe()), ("node-7", {**probe(), "gdal": "3.1"})]
+
+    request = AtlasRequest(str(tmp_path / "atlas"), [ortho], SMALL)
+    with pytest.raises(WorkerError, match=r"node-7 has other versions.*gdal 3.1, not"):
+        build_atlas(request, Mixed())
+    assert not (tmp_path / "atlas").exists()
+
+
+def test_a_worker_that_sees_other_imagery_refuses(ortho, tmp_path):
+    copy = Path(shutil.copy2(ortho, tmp_path))
+    task = plan_sheets(str(tmp_path), RECIPE, Mosaic.open([copy]), [copy])[0]
+    os.utime(copy, (5, 5))
+    with pytest.raises(AtlasError, match="imagery has changed"):
+        build_sheet(task)
+
+
+def test_a_sheet_that_fails_is_named_and_the_others_are_built(
+    ortho, tmp_path, monkeypatch, run, built
+):
+    """Full while the map of one sheet is copied; a bug while another is built."""
+    full, broken = built[1].built[:2]
+    copied, make = shutil.copyfile, building.build_map
+
+    def copy(source, to):
+        if Path(source).name == f"{full}.onav":
+            Path(to).write_bytes(b"half")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return copied(source, to)
+
+    def build(request, **more):
+        if request.out.stem == broken:
+            raise ZeroDivisionError("a bug")
+        return make(request, **more)
+
+    monkeypatch.setattr(shutil, "copyfile", copy)
+    monkeypatch.setattr(building, "build_map", build)
+    place = tmp_path / "atlas"
+    arguments = ["build", "--atlas", place, "--ortho", ortho, "--no-index", "--json"]
+    arguments += ["--sheet-km", 0.3, "--tile-px", 64, "--overlap", 0.5, "--calibration-views", 1]
+    arguments += ["--coarse-gsd-m", 4, "--coarse-tile-px", 32, "--coarse-overlap", 0.5]
+    done = run(*arguments)
+    assert done.code == 1
+    assert f"error: sheet {full}: StorageError" in done.err and "full" in done.err
+    assert f"error: sheet {broken}: ZeroDivisionError" in done.err
+    told = json.loads(done.out)
+    assert [each["sheet"] for each in told["failed"]] == [full, broken]
+    assert told["built"] == COUNT - 2
+    there = [name for name in content(place) if full in name or broken in name]
+    assert all(name.startswith("coarse/") for name in there), "whole, and named by no item"
+    monkeypatch.undo()
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 4)
+    assert run(*arguments).code == 0
+    assert content(place) == content(built[0])
+
+
+def test_a_disk_that_stays_full_ends_the_build(ortho, tmp_path, monkeypatch):
+    def full(task):
+        raise StorageError("disk full")
+
+    monkeypatch.setattr(building, "build_sheet", full)
+    monkeypatch.setattr(building, "GIVE_UP_AFTER", 2)
+    result = made(tmp_path / "atlas", ortho)
+    assert len(result.failed) == 2 and result.untried == COUNT - 2 and not result.is_complete
+
+
+def test_sheets_count_where_snapshot_and_index_cannot_be_written(
+    built, ortho, tmp_path, monkeypatch
+):
+    def full(atlas):
+        raise StorageError("disk full")
+
+    place = shutil.copytree(built[0], tmp_path / "atlas")
+    monkeypatch.setattr(Atlas, "snapshot", full)
+    result = made(place, ortho)
+    assert result.kept == built[1].built and result.finish_error == "disk full"
+    assert not result.is_complete
+
+
+def test_the_index_is_made_at_the_end(built, ortho, tmp_path):
+    pytest.importorskip("faiss")
+    place = Path(shutil.copytree(built[0], tmp_path / "atlas"))
+    result = made(place, ortho, index=True)
+    assert result.finish_error is None and any((place / "index").iterdir())
+
+
+def test_only_sheets_of_the_area_are_planned(ortho, built):
+    mosaic = Mosaic.open([ortho])
+    names = built[1].built
+
+    def planned(**area):
+        found = plan_sheets("atlas", RECIPE, mosaic, [ortho], **area)
+        return tuple(task.sheet for task in found)
+
+    west, south, east, north = RECIPE.sheets.bounds_deg(names[0])
+    assert planned() == names
+    assert planned(bounds_deg=(west, south, east, north)) == names[:1], "neighbours only touch"
+    assert planned(bounds_deg=(-175.0, -80.0, 175.0, 80.0)) == names
+    middle = (south + north) / 2
+    route = Route(((middle, west + 1e-4), (middle, east - 1e-4)))
+    assert planned(route=route, band_m=10.0) == names[:1]
+    assert planned(route=route, band_m=1500.0) == names
+    for area in ({"bounds_deg": (10.0, 10.0, 11.0, 11.0)}, {"band_m": 5.0}):
+        with pytest.raises(AreaError):
+            planned(**area)
+
+
+def test_a_task_names_the_files_that_its_sheet_shows(make_ortho, tmp_path):
+    """So that neither its map nor its digest changes with imagery that lies elsewhere."""
+    import rasterio
+    from rasterio.transform import Affine
+
+    near = make_ortho(tmp_path / "near.tif")
+    far = make_ortho(tmp_path / "far.tif")
+    with rasterio.open(far, "r+") as data:
+        data.transform = Affine(1, 0, 702_000, 0, -1, 6_600_000)
+    both = plan_sheets("atlas", RECIPE, Mosaic.open([near, far]), [near, far])
+    alone = plan_sheets("atlas", RECIPE, Mosaic.open([near]), [near])
+    by_name = {task.sheet: task for task in both}
+    assert [by_name[task.sheet] for task in alone] == alone
+    assert {task.orthos for task in both} == {(near,), (far,)}
+
+
+def test_a_digest_is_of_recipe_versions_and_imagery_but_not_of_folders(ortho, tmp_path):
+    def told(*paths, recipe=RECIPE, made_by=None):
+        return request_digest(recipe, Mosaic.open(list(paths)), made_by or versions())
+
+    copy = Path(shutil.copy2(ortho, tmp_path / ortho.name))
+    other = Path(shutil.copy2(ortho, tmp_path / "other.tif"))
+    assert told(copy) == told(ortho)
+    different = {
+        told(ortho),
+        told(other),
+        told(ortho, other),
+        told(other, ortho),
+        told(ortho, recipe=replace(RECIPE, seed=1)),
+        told(ortho, made_by={**versions(), "opencv": "3"}),
+    }
+    assert len(different) == 6
+
+
+def test_imagery_across_the_antimeridian_has_sheets_on_both_sides(ortho):
+    source = Mosaic.open([ortho]).sources[0]
+    lat = np.array([10.0, 10.0, 10.001, 10.001])
+    lon = np.array([179.999, -179.999, -179.999, 179.999])
+    moved = replace(source, outline_latlon_deg=np.stack([lat, lon], axis=1))
+    imagery = Imagery(Mosaic((moved,), (None,)))
+    found = sorted(imagery.sheets(RECIPE))
+    edges = {RECIPE.sheets.bounds_deg(name)[0] for name in found}
+    assert -180.0 in edges and max(edges) > 179.99
+    for name in found:
+        assert imagery.under(RECIPE.sheets.bounds_deg(name), 10.0).sources == (moved,)
+    assert imagery.under((10.0, 10.0, 10.01, 10.01), 10.0).sources == ()
+
+
+def test_folders_of_killed_processes_are_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with scratch.scratch_folder() as first:
+        dead = tmp_path / f"{scratch.PREFIX}dead"
+        dead.mkdir()
+        (dead / "in-use").touch()
+        strange = tmp_path / f"{scratch.PREFIX}being-made"
+        strange.mkdir()
+        with scratch.scratch_folder() as second:
+            assert sorted(tmp_path.iterdir()) == sorted([first, second, strange])
+    assert list(tmp_path.iterdir()) == [strange]
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (["--out", "a.onav", "--replace"], "--replace is for an atlas"),
+        (["--out", "a.onav", "--no-index"], "--no-index is for an atlas"),
+        (["--out", "a.onav", "--coarse-gsd-m", "4"], "--coarse-gsd-m is for an atlas"),
+        (["--out", "a.onav", "--cluster", "local"], "--cluster is for an atlas"),
+        (["--atlas", "a", "--work", "w"], "--work is for a single map"),
+        (["--atlas", "a", "--other-date", "b.tif"], "--other-date is for a single map"),
+        (["--atlas", "a", "--no-coarse", "--coarse-gsd-m", "4"], "say nothing else"),
+        (["--atlas", "a", "--sheet-km", "0.001"], "must be 0.2 to"),
+        (["--atlas", "a", "--cluster", "local", "--workers", "0"], "workers must be 1 or more"),
+    ],
+)
+def test_options_that_do_not_go_together(run, ortho, tmp_path, monkeypatch, options, why):
+    monkeypatch.chdir(tmp_path)
+    done = run("build", "--ortho", ortho, *options)
+    assert done.code == 1 and why in done.err and not list(tmp_path.iterdir())
+
+
+def test_sheets_are_not_learnt_by_torchrun(run, ortho, monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert "torchrun is for a single map" in run("build", "--ortho", ortho, "--atlas", "a").err
+
+
+def test_a_build_has_one_target(run, ortho):
+    assert run("build", "--ortho", ortho).code == 2
+    assert run("build", "--ortho", ortho, "--out", "a.onav", "--atlas", "a").code == 2
+
+
+def test_ending_a_build_says_how_to_go_on(run, ortho, tmp_path, monkeypatch):
+    def interrupted(task):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(building, "build_sheet", interrupted)
+    done = run("build", "--atlas", tmp_path / "atlas", "--ortho", ortho, "--tile-px", "64")
+    assert done.code == 1 and "goes on from there" in done.err
+
+
+def test_the_usual_resolution_is_that_of_the_imagery(ortho, tmp_path):
+    request = AtlasRequest(str(tmp_path / "atlas"), [ortho])
+    assert building.recipe_for(request, Mosaic.open([ortho])) == AtlasRecipe(gsd_m=1.0)
+    assert tasks.margin_m(AtlasRecipe(gsd_m=1.0, coarse=None)) == 320.0

@@ -1,0 +1,526 @@
+"""The catalogue of an atlas: canonical, checked, and whole whenever somebody is killed."""
+
+import copy
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import fsspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from orthonav.atlas.catalog import Atlas, NewSheet, copy_sheets
+from orthonav.atlas.integrity import check_atlas
+from orthonav.atlas.item import Asset, Sheet, canonical, read_item
+from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
+from orthonav.atlas.store import Store
+from orthonav.errors import AreaError, AtlasError, MissingFileError, StorageError
+
+RECIPE = AtlasRecipe(gsd_m=1.0)
+HERE = RECIPE.sheets.name_at(46.6, 1.9)
+EAST = RECIPE.sheets.name_at(46.6, 2.1)
+
+
+def described(sheet=HERE, request="request 1", **others):
+    """What is told of a sheet."""
+    told = NewSheet(
+        id=sheet,
+        bounds_deg=RECIPE.sheets.bounds_deg(sheet),
+        gsd_m=1.0,
+        tiles=12,
+        area_km2=3.25,
+        dates=("2020-06-14",),
+        imagery=({"name": "BD ORTHO", "date": "2020-06-14", "attribution": "IGN"},),
+        request=request,
+        made_by={"orthonav": "1.0"},
+    )
+    return replace(told, **others)
+
+
+@pytest.fixture
+def files(tmp_path):
+    """Function that gives the files of a sheet with some content."""
+
+    def make(content="one"):
+        made = {key: tmp_path / f"{key} {content}" for key in ("map", "coarse")}
+        for key, path in made.items():
+            path.write_text(f"{key} of {content}")
+        return made
+
+    return make
+
+
+@pytest.fixture(params=["folder", "memory"])
+def atlas(request, tmp_path):
+    """An empty atlas, near and far."""
+    url = tmp_path / "atlas" if request.param == "folder" else "memory://test/atlas"
+    yield Atlas.create(url, RECIPE, cache=tmp_path / "cache")
+    fsspec.filesystem("memory").store.clear()
+
+
+@pytest.fixture
+def far(tmp_path):
+    """An empty atlas in memory, as in object storage."""
+    yield Atlas.create("memory://test/atlas", RECIPE, cache=tmp_path / "cache")
+    fsspec.filesystem("memory").store.clear()
+
+
+@pytest.fixture
+def near(tmp_path):
+    """An empty atlas in a folder."""
+    return Atlas.create(tmp_path / "atlas", RECIPE)
+
+
+def contents(url):
+    """Every file of a local atlas."""
+    return {
+        str(path.relative_to(url)): path.read_bytes()
+        for path in Path(url).rglob("*")
+        if path.is_file()
+    }
+
+
+def test_a_sheet_that_is_put_is_read_back(atlas, files):
+    sheet = atlas.put(HERE, files(), described())
+    again = Atlas.open(atlas.url, cache=atlas.store.cache)
+    assert again.recipe == RECIPE and again.sheets() == {HERE: sheet} == atlas.sheets()
+    assert sheet.revision == 1 and sheet.made_by == {"orthonav": "1.0"}
+    assert sheet.size_bytes == len("map of one") + len("coarse of one")
+    assert again.path(sheet).read_text() == "map of one"
+    assert again.path(sheet, "coarse").read_text() == "coarse of one"
+    assert again.path(sheet).suffix == ".onav"
+    with pytest.raises(AtlasError, match="has no index"):
+        again.path(sheet, "index")
+    assert check_atlas(again) == []
+
+
+def test_the_same_again_writes_nothing(atlas, files, monkeypatch):
+    atlas.put(HERE, files(), described())
+    for name in ("put", "write", "remove"):
+        monkeypatch.setattr(Store, name, lambda *_: pytest.fail("nothing to do"))
+    assert atlas.put(HERE, files(), described()).revision == 1
+
+
+@pytest.mark.parametrize(("content", "request_"), [("two", "request 1"), ("one", "request 2")])
+def test_a_sheet_is_replaced(atlas, files, content, request_):
+    atlas.put(HERE, files(), described())
+    atlas.put(EAST, files("east"), described(EAST))
+    sheet = atlas.put(HERE, files(content), described(request=request_))
+    assert sheet.revision == 2
+    again = Atlas.open(atlas.url, cache=atlas.store.cache)
+    assert list(again.sheets()) == [HERE, EAST] and again.sheets()[HERE] == sheet
+    assert again.path(sheet).read_text() == f"map of {content}"
+    assert [len(atlas.store.names(name)) for name in ("items", "sheets", "coarse")] == [2, 2, 2]
+    assert check_atlas(again) == []
+
+
+def test_a_sheet_is_retired(atlas, files):
+    atlas.put(HERE, files(), described())
+    atlas.put(EAST, files(), described(EAST))
+    atlas.retire(HERE)
+    assert list(atlas.sheets()) == [EAST] == list(atlas.sheets(refresh=True))
+    assert check_atlas(atlas) == []
+    with pytest.raises(AtlasError, match=f"has no sheet '{HERE}'"):
+        atlas.retire(HERE)
+
+
+def test_the_same_atlas_byte_for_byte(tmp_path, files):
+    def make(url, order):
+        atlas = Atlas.create(url, RECIPE)
+        for sheet in order:
+            atlas.put(sheet, files(sheet), described(sheet))
+        atlas.snapshot()
+        return contents(url)
+
+    assert make(tmp_path / "a", [HERE, EAST]) == make(tmp_path / "b", [EAST, HERE])
+
+
+def test_what_is_put_must_fit(near, files, tmp_path):
+    with pytest.raises(AtlasError, match="does not lie where the atlas has it"):
+        near.put(HERE, files(), described(bounds_deg=(1.0, 46.0, 1.1, 46.1)))
+    with pytest.raises(AtlasError, match="no sheet of 10 km is named 'r999999c000000'"):
+        near.put("r999999c000000", files(), described(id="r999999c000000"))
+    with pytest.raises(AtlasError, match="described is sheet"):
+        near.put(HERE, files(), described(EAST))
+    with pytest.raises(AtlasError, match="'model'"):
+        near.put(HERE, {**files(), "model": tmp_path / "x"}, described())
+    with pytest.raises(AtlasError, match="names no map"):
+        near.put(HERE, {"coarse": files()["coarse"]}, described())
+    with pytest.raises(AtlasError, match="cannot be written into the catalogue"):
+        near.put(HERE, files(), described(area_km2=float("nan")))
+    with pytest.raises(AtlasError, match="not an item of orthonav"):
+        near.put(HERE, files(), described(tiles=0))
+    with pytest.raises(MissingFileError, match="cannot be read"):
+        near.put(HERE, {"map": tmp_path / "none.onav"}, described())
+    assert near.sheets() == {} and list(contents(near.url)) == ["atlas.json"]
+
+
+def test_beginning_and_opening(tmp_path):
+    with pytest.raises(AtlasError, match=r"no atlas: it has no atlas\.json"):
+        Atlas.open(tmp_path / "none")
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "inner").mkdir()
+    with pytest.raises(AtlasError, match="holds other things"):
+        Atlas.create(tmp_path / "photos", RECIPE)
+    url = tmp_path / "atlas"
+    assert Atlas.open_or_create(url, RECIPE).recipe == RECIPE
+    assert Atlas.open_or_create(url, RECIPE).recipe == RECIPE
+    with pytest.raises(AtlasError, match="there is an atlas already"):
+        Atlas.create(url, RECIPE)
+    with pytest.raises(AtlasError, match=r"made alike.*gsd_m: 1\.0, not 0\.5.*seed: 0, not 3"):
+        Atlas.open_or_create(url, replace(RECIPE, gsd_m=0.5, seed=3))
+    with pytest.raises(AtlasError, match="coarse"):
+        Atlas.open_or_create(url, replace(RECIPE, coarse=CoarseRecipe(gsd_m=4.0)))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda text: text[:-5], "damaged"),
+        (lambda text: text.replace("orthonav-atlas", "other"), "not an atlas of orthonav"),
+        (lambda text: text.replace('"schema":1', '"schema":2'), "update orthonav"),
+        (lambda text: text.replace('"schema":1', '"schema":"1"'), "impossible schema"),
+        (lambda text: text.replace('"gsd_m":1.0', '"gsd_m":NaN'), "recipe of the atlas"),
+        (lambda text: text.replace('"seed":0,', ""), "recipe of the atlas cannot be read"),
+        (lambda text: text.replace("Licences", "No licences"), "altered"),
+        (lambda text: "[" * 100_000, "damaged"),
+        (lambda text: '{"type":' + "9" * 5000 + "}", "damaged"),
+        (lambda text: "", "damaged"),
+        (lambda text: "[]", "not an atlas of orthonav"),
+    ],
+)
+def test_a_catalogue_that_was_altered(near, change, words):
+    path = Path(near.url) / "atlas.json"
+    path.write_text(change(path.read_text()))
+    with pytest.raises(AtlasError, match=words):
+        Atlas.open(near.url)
+
+
+def altered(item, path, value):
+    """The item with one value changed."""
+    item = copy.deepcopy(item)
+    *parents, last = path
+    inner = item
+    for key in parents:
+        inner = inner[key]
+    inner[last] = value
+    return item
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("id",), "../x"),
+        (("id",), EAST),
+        (("type",), "Thing"),
+        (("bbox",), [1, 2, 3]),
+        (("bbox",), [2.0, 46.0, 1.0, 47.0]),
+        (("bbox",), ["a", 46.0, 1.0, 47.0]),
+        (("geometry", "coordinates"), []),
+        (("collection",), "other"),
+        (("properties", "gsd"), 0.0),
+        (("properties", "gsd"), True),
+        (("properties", "datetime"), None),
+        (("properties", "orthonav:sheet"), None),
+        (("properties", "orthonav:sheet", "schema"), 2),
+        (("properties", "orthonav:sheet", "revision"), 0),
+        (("properties", "orthonav:sheet", "revision"), True),
+        (("properties", "orthonav:sheet", "tiles"), 1.5),
+        (("properties", "orthonav:sheet", "dates"), [2020]),
+        (("properties", "orthonav:sheet", "imagery"), ["x"]),
+        (("properties", "orthonav:sheet", "made_by"), {"a": 1}),
+        (("properties", "orthonav:sheet", "more"), 1),
+        (("assets", "map", "href"), "../../../etc/passwd"),
+        (("assets", "map", "href"), f"../sheets/{EAST}.000000000000.onav"),
+        (("assets", "map", "file:size"), -1),
+        (("assets", "map", "file:checksum"), "1220" + "g" * 64),
+        (("assets", "model"), {}),
+        (("assets",), {}),
+        (("assets", "map"), None),
+        (("links",), []),
+    ],
+)
+def test_items_of_strangers_are_refused(near, files, path, value):
+    """The file name agrees with the content, so that what is told is all that can be wrong."""
+    item = altered(near.put(HERE, files(), described()).to_item(), path, value)
+    data = canonical(item)
+    name = f"{HERE}.0002.{hashlib.sha256(data).hexdigest()[:12]}.json"
+    near.store.write(f"items/{name}", data)
+    with pytest.raises(AtlasError, match=f"items/{HERE}"):
+        near.sheets(refresh=True)
+    with pytest.raises(AtlasError, match=r"atlas check.*atlas retire"):
+        Atlas.open(near.url).sheets()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda data: data[:-1],
+        lambda data: data.replace(b"IGN", b"NGI"),
+        lambda data: data + b"\n",
+        lambda data: data.replace(b'"tiles":12', b'"tiles":11,"tiles":12'),
+        lambda data: data.replace(b"3.25", b"Infinity"),
+        lambda data: data.replace(b"3.25", b"1e999"),
+        lambda data: b"[" * 100_000,
+        lambda data: b"\xff",
+        lambda data: b"",
+        lambda data: b"null",
+        lambda data: b" " * (2**20 + 1),
+    ],
+)
+def test_an_item_that_is_damaged(near, files, change):
+    sheet = near.put(HERE, files(), described())
+    path = Path(near.url, "items", sheet.item_name)
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(AtlasError, match=f"items/{HERE}"):
+        near.sheets(refresh=True)
+    assert [each.kind for each in check_atlas(near)] == ["damaged item"]
+    near.put(HERE, files("two"), described())
+    assert near.sheets(refresh=True)[HERE].revision == 2
+    near.retire(HERE)
+    assert near.sheets(refresh=True) == {}
+
+
+class Killed(BaseException):
+    """As if the process ended here."""
+
+
+def killed_at(monkeypatch, step, error):
+    """Everything that changes the store fails from its `step`-th half-step on: before, after."""
+    count = iter(range(10**6))
+
+    def failing(act):
+        def acted(*arguments):
+            if next(count) >= step:
+                raise error
+            act(*arguments)
+            if next(count) >= step:
+                raise error
+
+        return acted
+
+    for name in ("put", "write", "remove"):
+        monkeypatch.setattr(Store, name, failing(getattr(Store, name)))
+
+
+@pytest.mark.parametrize("error", [Killed(), StorageError("disk full")], ids=["kill", "full"])
+@pytest.mark.parametrize("act", ["put", "replace", "retire"])
+def test_a_kill_at_any_step_leaves_what_was_or_what_is_to_be(near, files, monkeypatch, act, error):
+    near.put(EAST, files("east"), described(EAST))
+    before = [] if act == "put" else [near.put(HERE, files(), described())]
+    saved = Path(near.url).with_name("saved")
+    shutil.copytree(near.url, saved)
+
+    def change(atlas):
+        if act == "retire":
+            atlas.retire(HERE)
+        else:
+            atlas.put(HERE, files("two"), described(request="request 2"))
+
+    for step in range(100):
+        shutil.rmtree(near.url)
+        shutil.copytree(saved, near.url)
+        with monkeypatch.context() as patch:
+            killed_at(patch, step, error)
+            try:
+                change(Atlas.open(near.url))
+                break
+            except type(error):
+                pass
+        again = Atlas.open(near.url)
+        found = again.sheets().get(HERE)
+        assert again.path(again.sheets()[EAST]).read_text() == "map of east"
+        if found is not None:
+            content = "one" if found in before else "two"
+            assert again.path(found).read_text() == f"map of {content}"
+            assert again.path(found, "coarse").read_text() == f"coarse of {content}"
+        else:
+            assert act != "replace"
+        kinds = {problem.kind for problem in check_atlas(again)}
+        assert kinds <= {"orphan", "second revision"}
+        assert all(each.removed for each in check_atlas(again, clean=True, min_age_s=0))
+        assert check_atlas(again) == [] and again.sheets(refresh=True).get(HERE) == found
+        if found is not None or act != "retire":
+            change(again)
+        assert (HERE in again.sheets(refresh=True)) == (act != "retire")
+    assert step == {"put": 6, "replace": 12, "retire": 6}[act]
+    assert check_atlas(near) == []
+
+
+MANY = """
+import sys
+from pathlib import Path
+from orthonav.atlas.catalog import Atlas, NewSheet
+
+url, files, number = sys.argv[1:]
+atlas = Atlas.open_or_create(url, __import__("orthonav.atlas.recipe").atlas.recipe.AtlasRecipe(1.0))
+for step in range(6):
+    sheet = atlas.recipe.sheets.name_at(46.0 + 0.2 * step, 2.0 + 0.3 * int(number))
+    path = Path(files, sheet)
+    path.write_text(f"map of {sheet}")
+    bounds = atlas.recipe.sheets.bounds_deg(sheet)
+    told = NewSheet(sheet, bounds, 1.0, 5, 1.0, (), (), "request", {})
+    atlas.put(sheet, {"map": path}, told)
+"""
+
+
+def test_many_processes_put_sheets_at_once(tmp_path):
+    arguments = [sys.executable, "-c", MANY, str(tmp_path / "atlas"), str(tmp_path)]
+    started = [subprocess.Popen([*arguments, str(number)]) for number in range(3)]
+    assert [process.wait(60) for process in started] == [0, 0, 0]
+    atlas = Atlas.open(tmp_path / "atlas")
+    assert len(atlas.sheets()) == 18 and check_atlas(atlas) == []
+    assert all(
+        atlas.path(each).read_text() == f"map of {each.id}" for each in atlas.sheets().values()
+    )
+
+
+@pytest.mark.parametrize("at", ["put", "write"])
+@pytest.mark.parametrize("mine", ["one", "two", "three", "four"])
+def test_the_same_sheet_at_once_is_one_of_them(near, files, monkeypatch, at, mine):
+    """Another process replaces a sheet while this one does; content `one` is there before."""
+    near.put(HERE, files("one"), described())
+    other = Atlas.open(near.url)
+    act, done = getattr(Store, at), []
+
+    def interrupted(*arguments):
+        if not done:
+            done.append(True)
+            other.put(HERE, files("three"), described(request="request 3"))
+        act(*arguments)
+
+    monkeypatch.setattr(Store, at, interrupted)
+    given_back = near.put(HERE, files(mine), described(request=f"request {mine}"))
+    again = Atlas.open(near.url)
+    assert again.sheets()[HERE] == given_back
+    assert again.path(given_back).read_text() in (f"map of {mine}", "map of three")
+    assert check_atlas(again) == []
+
+
+def test_the_snapshot_saves_reading_and_is_never_the_truth(far, files, monkeypatch):
+    atlas = far
+    for sheet in (HERE, EAST):
+        atlas.put(sheet, files(sheet), described(sheet))
+    atlas.snapshot()
+    there = dict(atlas.sheets())
+    features = json.loads(atlas.store.read("items.geojson"))["features"]
+    assert features[0]["assets"]["map"]["href"] == f"./{there[HERE].assets['map'].name}"
+    read = []
+    act = Store.read_many
+    monkeypatch.setattr(
+        Store, "read_many", lambda self, names: act(self, [read.append(n) or n for n in names])
+    )
+    assert Atlas.open(atlas.url).sheets() == there
+    assert read == ["atlas.json", "items.geojson"]
+    there[HERE] = atlas.put(HERE, files("new"), described())
+    assert Atlas.open(atlas.url).sheets() == there
+    for damaged in (b"", b"{}", b"[]", b'{"features":[1,{}]}', b'{"features":[{"links":[1]}]}'):
+        atlas.store.write("items.geojson", damaged)
+        assert Atlas.open(atlas.url).sheets() == there
+
+
+def test_items_are_stac(near, files):
+    from pystac import Collection, Item, STACObjectType
+    from pystac.errors import STACValidationError
+    from pystac.validation.stac_validator import JsonSchemaSTACValidator
+
+    sheet = near.put(HERE, files(), described())
+    item = Item.from_file(str(Path(near.url, "items", sheet.item_name)))
+    collection = Collection.from_file(str(Path(near.url, "atlas.json")))
+    validator = JsonSchemaSTACValidator()  # it brings the schemas of 1.1, which asks for no less
+    for plain, kind in (
+        (sheet.to_item(), STACObjectType.ITEM),
+        (Sheet.of(described(dates=("2020",)), 1, sheet.assets).to_item(), STACObjectType.ITEM),
+        (json.loads(near.store.read("atlas.json")), STACObjectType.COLLECTION),
+    ):
+        assert validator.validate_core({**plain, "stac_version": "1.1.0"}, kind, "1.1.0")
+        with pytest.raises(STACValidationError):
+            validator.validate_core({**plain, "links": 1, "stac_version": "1.1.0"}, kind, "1.1.0")
+    assert item.id == HERE and item.datetime.isoformat() == "2020-06-14T00:00:00+00:00"
+    assert Path(item.assets["map"].get_absolute_href()) == near.path(sheet)
+    assert item.get_parent().id == collection.id == item.collection_id
+    assert item.assets["map"].extra_fields["file:size"] == sheet.assets["map"].size_bytes
+    multihash = bytes.fromhex(item.assets["map"].extra_fields["file:checksum"])
+    assert multihash[:2] == b"\x12\x20" and multihash[2:].hex() == sheet.assets["map"].sha256
+
+
+@pytest.mark.parametrize(
+    ("dates", "times"),
+    [
+        ((), {"datetime": "1970-01-01T00:00:00Z", "orthonav:date_known": False}),
+        (("soon", "2020-13"), {"datetime": "1970-01-01T00:00:00Z", "orthonav:date_known": False}),
+        (("2020-06-14", "2020-06-14"), {"datetime": "2020-06-14T00:00:00Z"}),
+        (("2020",), ("2020-01-01T00:00:00Z", "2020-12-31T23:59:59Z")),
+        (("2024-02",), ("2024-02-01T00:00:00Z", "2024-02-29T23:59:59Z")),
+        (("2021-12", "2019-03-04"), ("2019-03-04T00:00:00Z", "2021-12-31T23:59:59Z")),
+        (("9999",), ("9999-01-01T00:00:00Z", "9999-12-31T23:59:59Z")),
+    ],
+)
+def test_times_as_stac_has_them(dates, times):
+    asset = Asset(f"sheets/{HERE}.{'0' * 12}.onav", 1, "0" * 64)
+    sheet = Sheet.of(described(dates=dates), 1, {"map": asset})
+    found = {k: v for k, v in sheet.to_item()["properties"].items() if "date" in k}
+    if isinstance(times, tuple):
+        times = {"datetime": None, "start_datetime": times[0], "end_datetime": times[1]}
+    assert found == times
+    assert read_item(sheet.item_name, canonical(sheet.to_item())) == sheet
+
+
+@pytest.fixture(scope="module")
+def wide(tmp_path_factory):
+    """An atlas of sheets on both sides of the antimeridian, at a pole and around one place."""
+    folder = tmp_path_factory.mktemp("wide")
+    recipe = AtlasRecipe(gsd_m=10.0, sheet_km=40.0)
+    atlas = Atlas.create(folder / "atlas", recipe)
+    (folder / "map").write_bytes(b"map")
+    boxes = [(1.0, 46.0, 2.5, 47.0), (179.5, -17.0, -179.5, -16.5), (0.0, 89.9, 10.0, 90.0)]
+    for sheet in {each for box in boxes for each in recipe.sheets.over(box)}:
+        told = replace(described(), id=sheet, bounds_deg=recipe.sheets.bounds_deg(sheet))
+        atlas.put(sheet, {"map": folder / "map"}, told)
+    return atlas
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.sampled_from([(1.7, 46.5), (179.9, -16.8), (-179.9, -16.7), (5.0, 89.99), (100.0, 0.0)]),
+    st.floats(-1, 1),
+    st.floats(-1, 1),
+    st.floats(0, 1),
+    st.floats(0, 1),
+)
+def test_sheets_over_a_box_are_those_of_the_lattice(wide, place, right, up, width, height):
+    west, south = place[0] + right, min(90.0, place[1] + up)
+    east, north = west + width, min(90.0, south + height)
+    box = tuple(lon - 360 if lon > 180 else lon for lon in (west, east))
+    box = (box[0], south, box[1], north)
+    expected = set(wide.recipe.sheets.over(box)) & set(wide.sheets())
+    assert {sheet.id for sheet in wide.over(box)} == expected
+
+
+def test_boxes_that_are_none(wide):
+    with pytest.raises(AreaError, match="bounds must be"):
+        wide.over((1.0, 47.0, 2.0, 46.0))
+
+
+def test_sheets_of_another_atlas(tmp_path, files, near):
+    source = Atlas.create(tmp_path / "source", RECIPE)
+    for sheet in (HERE, EAST):
+        source.put(sheet, files(sheet), described(sheet))
+    assert copy_sheets(source, near, [EAST]) == ([EAST], [])
+    assert copy_sheets(source, near) == ([HERE], [EAST])
+    assert contents(near.url) == {**contents(source.url), **contents(near.url)}
+    source.put(HERE, files("new"), described())
+    assert copy_sheets(source, near) == ([], [HERE, EAST])
+    assert copy_sheets(source, near, replace=True) == ([HERE], [EAST])
+    assert near.path(near.sheets()[HERE]).read_text() == "map of new"
+    assert check_atlas(near) == []
+    with pytest.raises(AtlasError, match="has no sheet 'x'"):
+        copy_sheets(source, near, ["x"])
+    other = Atlas.create(tmp_path / "other", replace(RECIPE, overlap=0.5))
+    with pytest.raises(AtlasError, match=r"overlap: 0\.5, not 0\.875"):
+        copy_sheets(source, other)

@@ -1,0 +1,188 @@
+"""The same atlas by Ray: on a cluster of this machine, with processes and the driver killed."""
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthonav.atlas.build import AtlasRequest, build_atlas
+from orthonav.atlas.catalog import Atlas
+from orthonav.atlas.cluster import Failure, PlainRunner, RayRunner, attempted
+from orthonav.errors import MissingExtraError, WorkerError
+
+SMALL = {
+    "sheet_km": 0.3,
+    "tile_px": 64,
+    "overlap": 0.5,
+    "calibration_views": 1,
+    "coarse": {"gsd_m": 4.0, "tile_px": 32, "overlap": 0.5},
+}
+LONGER = {**SMALL, "calibration_views": 96}
+"""A sheet takes about a second."""
+START_S, END_S = 60.0, 240.0
+
+
+@pytest.fixture(scope="module")
+def ray():
+    """Ray, ended whatever happens; what it leaves open as it ends is its own."""
+    ray = pytest.importorskip("ray")
+    logging.getLogger("ray").setLevel(logging.ERROR)
+    yield ray
+    ray.shutdown()
+
+
+@pytest.fixture(scope="module")
+def ortho(make_ortho, tmp_path_factory):
+    """An orthophoto of 400 x 400 m at 1 m, all valid."""
+    return make_ortho(tmp_path_factory.mktemp("ortho") / "2019-06.tif")
+
+
+def content(place):
+    """All files of an atlas by name."""
+    paths = sorted(path for path in Path(place).rglob("*") if path.is_file())
+    return {str(path.relative_to(place)): path.read_bytes() for path in paths}
+
+
+def plain(place, ortho, recipe):
+    with PlainRunner() as runner:
+        request = AtlasRequest(str(place), [ortho], recipe, index=False)
+        return build_atlas(request, runner)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_a_cluster_of_this_machine_builds_the_same_atlas(ray, ortho, tmp_path, monkeypatch):
+    monkeypatch.setattr("orthonav.atlas.cluster.STOP_S", 0.5)
+    alone = plain(tmp_path / "alone", ortho, SMALL)
+    before = signal.getsignal(signal.SIGTERM)
+    with RayRunner(workers=2) as runner:
+        assert signal.getsignal(signal.SIGTERM) is before
+        request = AtlasRequest(str(tmp_path / "shared"), [ortho], SMALL, index=False)
+        shared = build_atlas(request, runner)
+        assert (shared.built, shared.tiles) == (alone.built, alone.tiles)
+        assert content(tmp_path / "shared") == content(tmp_path / "alone")
+        assert shared.peak_bytes > 10**7
+        # Each item fails or not by itself; waiting ones are never begun when the run is ended.
+        made = dict(runner.run(np.reciprocal, [1.0, "no number", 2.0]))
+        assert (made[1.0], made[2.0]) == (1.0, 0.5)
+        assert isinstance(made["no number"], Failure)
+        run = runner.run(time.sleep, [0.0, 30.0, 30.0, 30.0])
+        assert next(run) == (0.0, None)
+        started_s = time.monotonic()
+        run.close()
+        assert time.monotonic() - started_s < 10
+        [(name, limits)] = runner.everywhere(os.getcwd)
+        assert name and limits
+    assert not ray.is_initialized()
+
+
+def test_what_fails_is_told_as_a_value():
+    assert attempted(float, "2") == 2.0
+    told = attempted(float, "two")
+    assert (told.kind, "could not convert" in told.text) == ("ValueError", True)
+    assert "float" not in told.kind and told.trace
+
+    def exhausted(item):
+        raise MemoryError
+
+    def refused(item):
+        raise WorkerError("no")
+
+    assert attempted(exhausted, 1) == Failure("MemoryError", "out of memory")
+    assert attempted(refused, 1) == Failure("WorkerError", "no")
+
+
+def test_ray_is_asked_for_only_where_it_is_needed(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingExtraError, match=r"orthonav\[cluster\]"):
+        RayRunner().__enter__()
+    with pytest.raises(WorkerError, match="workers must be 1 or more"):
+        RayRunner(workers=0)
+
+
+@pytest.fixture
+def two_nodes(ray):
+    """A cluster of two nodes of one core each, on this machine."""
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(
+        initialize_head=True,
+        head_node_args={"num_cpus": 1, "object_store_memory": 100 * 2**20},
+    )
+    cluster.add_node(num_cpus=1, object_store_memory=100 * 2**20)
+    cluster.wait_for_nodes()
+    yield cluster
+    ray.shutdown()
+    cluster.shutdown()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_workers_that_are_killed_are_made_up_for(two_nodes, ortho, tmp_path):
+    alone = plain(tmp_path / "alone", ortho, LONGER)
+    killed = []
+
+    def progress(stage, share):
+        """Kill what is at a sheet, after the first and after the third sheet."""
+        if share > 2 * len(killed) / 8:
+            for pid in at_work()[:1]:
+                os.kill(pid, signal.SIGKILL)
+                killed.append(pid)
+
+    with RayRunner(two_nodes.address) as runner:
+        assert runner.at_once == 2
+        request = AtlasRequest(str(tmp_path / "shared"), [ortho], LONGER, index=False)
+        shared = build_atlas(request, runner, progress)
+        assert len(runner.everywhere(os.getpid)) == 2
+    assert len(killed) >= 2
+    assert shared.is_complete and shared.built == alone.built
+    assert content(tmp_path / "shared") == content(tmp_path / "alone")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.parametrize("with_", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_a_driver_that_is_killed_goes_on_when_run_again(two_nodes, ortho, tmp_path, with_):
+    place = tmp_path / "shared"
+    command = [sys.executable, "-m", "orthonav", "build", "--atlas", place, "--ortho", ortho]
+    command += ["--sheet-km", "0.3", "--tile-px", "64", "--overlap", "0.5", "--no-index"]
+    command += ["--calibration-views", "96", "--coarse-gsd-m", "4", "--coarse-tile-px", "32"]
+    command += ["--coarse-overlap", "0.5", "--cluster", two_nodes.address]
+    driver = subprocess.Popen(list(map(str, command)), stderr=subprocess.PIPE, text=True)
+    deadline_s = time.monotonic() + START_S
+    while not list(place.glob("items/*.json")) and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    driver.send_signal(with_)
+    _, said = driver.communicate(timeout=START_S)
+    assert driver.returncode == (-signal.SIGKILL if with_ == signal.SIGKILL else 1), said
+    assert with_ == signal.SIGKILL or "interrupted; the sheets that are finished are kept" in said
+    there = len(Atlas.open(place).sheets())
+    assert 1 <= there < 8
+    again = subprocess.run(
+        list(map(str, command)), capture_output=True, text=True, timeout=END_S, check=False
+    )
+    assert again.returncode == 0, again.stderr
+    assert f"{8 - there} built, {there} kept" in again.stdout or there < 7
+    plain(tmp_path / "alone", ortho, LONGER)
+    assert content(place) == content(tmp_path / "alone")
+
+
+def at_work():
+    """Processes of Ray that are at an item."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = path.read_bytes()
+        except OSError:
+            continue
+        if words.startswith(b"ray::attempted"):
+            found.append(int(path.parent.name))
+    return sorted(found)

@@ -1,0 +1,184 @@
+"""Coarse tiles of a sheet: where they lie, what they say, and that nothing else is read as such."""
+
+import json
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from orthonav import represent
+from orthonav.atlas.coarse import POOLING, make_coarse, read_coarse, write_coarse
+from orthonav.atlas.recipe import CoarseRecipe
+from orthonav.embed.cells import MICRO, CellLayout
+from orthonav.embed.whitened import CellSheet, pooled_features
+from orthonav.errors import AtlasError, MissingFileError
+from orthonav.geo.frames import LocalFrame
+from orthonav.geo.world import WorldSheets
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.variants import make_variant
+
+RECIPE = CoarseRecipe(gsd_m=1.0, tile_px=64, overlap=0.5)
+WORLD = WorldSheets(250.0)
+
+
+@pytest.fixture(scope="module")
+def mosaic(make_ortho, tmp_path_factory):
+    """Imagery of 800 x 800 m."""
+    rng = np.random.default_rng(3)
+    grey = np.kron(rng.integers(20, 235, (80, 80)), np.ones((10, 10))).astype(np.uint8)
+    return Mosaic.open([make_ortho(tmp_path_factory.mktemp("ortho") / "wide.tif", grey)])
+
+
+@pytest.fixture(scope="module")
+def middle(mosaic):
+    """Latitude and longitude of its centre."""
+    outline = mosaic.outline_latlon_deg
+    return (outline.min(axis=0) + outline.max(axis=0)) / 2
+
+
+@pytest.fixture(scope="module")
+def box_deg(middle):
+    """A sheet in the middle of it."""
+    return WORLD.bounds_deg(WORLD.name_at(*middle))
+
+
+@pytest.fixture(scope="module")
+def stored(mosaic, box_deg, tmp_path_factory):
+    """The file with its coarse tiles."""
+    path = tmp_path_factory.mktemp("coarse") / "sheet.safetensors"
+    assert write_coarse(mosaic, box_deg, RECIPE, path) > 20
+    return path
+
+
+def test_what_is_written_is_read_and_the_same_every_time(mosaic, box_deg, stored, tmp_path):
+    made, read = make_coarse(mosaic, box_deg, RECIPE), read_coarse(stored)
+    assert (read.recipe, read.bounds_deg) == (RECIPE, box_deg)
+    for name in ("centres_latlon_deg", "features", "valid"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(made, name))
+        assert not getattr(read, name).flags.writeable
+    assert read.weights.shape == read.features.shape and read.weights.min() == 1
+    write_coarse(mosaic, box_deg, RECIPE, tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == stored.read_bytes()
+
+
+def test_every_place_is_within_half_a_stride_of_one_centre_of_its_sheet_or_the_next(mosaic, middle):
+    """Neighbouring sheets together leave no gap, and no tile belongs to two."""
+    frame = LocalFrame(float(middle[0]), float(middle[1]))
+    lat, lon = frame.latlon_from_en(
+        np.array([[dx, dy] for dx in (-150, 150) for dy in (-150, 150)])
+    )
+    names = {WORLD.name_at(*place) for place in zip(lat.tolist(), lon.tolist(), strict=True)}
+    tiles = [make_coarse(mosaic, WORLD.bounds_deg(name), RECIPE) for name in sorted(names)]
+    for name, made in zip(sorted(names), tiles, strict=True):
+        assert {WORLD.name_at(*place) for place in made.centres_latlon_deg.tolist()} == {name}
+    centres = np.concatenate([made.centres_latlon_deg for made in tiles])
+    centres = frame.en_from_latlon(centres[:, 0], centres[:, 1])
+    places = np.random.default_rng(1).uniform(-140, 140, (2000, 2))
+    away = np.abs(places[:, None] - centres[None]).max(axis=2).min(axis=1)
+    half_m = RECIPE.tile_px * RECIPE.gsd_m * (1 - RECIPE.overlap) / 2
+    assert away.max() < 1.02 * half_m, "meridians lean, so a sheet is no exact square"
+
+
+def test_features_are_those_of_the_pixels_there(mosaic, box_deg, stored):
+    """Against one tile read and pooled on its own."""
+    read = read_coarse(stored)
+    index = len(read.valid) // 2
+    size = RECIPE.tile_px
+    representation = make_variant(represent.TABLE, "gradient")
+    margin = representation.margin_px
+    # In the plane of the sheet: another would turn the pixels a little.
+    west, south, east, north = box_deg
+    frame = LocalFrame(round((south + north) / 2, 7), round((west + east) / 2, 7))
+    east_m, north_m = frame.en_from_latlon(*read.centres_latlon_deg[index])
+    whole = size + 2 * margin
+    with mosaic.sheet(
+        frame,
+        west_m=float(east_m) - whole / 2,
+        north_m=float(north_m) + whole / 2,
+        width_px=whole,
+        height_px=whole,
+        gsd_m=RECIPE.gsd_m,
+    ) as raster:
+        pixels = raster.read_grey(0, 0, whole, whole)
+    maps = representation(pixels.grey, pixels.valid)[:, margin:-margin, margin:-margin]
+    sheet = CellSheet(CellLayout(size // MICRO, size // MICRO), size, size, len(maps))
+    sheet.fill(0, 0, maps, np.ones((size, size), bool))
+    features, _ = pooled_features(POOLING, sheet, np.zeros((1, 2), np.intp))
+    assert np.abs(features[0] - read.features[index].astype(np.float32)).max() < 0.02
+
+
+def test_tiles_with_too_little_imagery_are_left_out(mosaic, middle, tmp_path):
+    outline = mosaic.outline_latlon_deg
+    corner = WORLD.bounds_deg(WORLD.name_at(*outline.max(axis=0)))
+    made = make_coarse(mosaic, corner, RECIPE)
+    assert made.valid.min(initial=255) < 255 and (made.valid.mean(axis=1) > 0.45 * 255).all()
+    assert made.weights.shape == made.features.shape
+    nowhere = WORLD.bounds_deg(WORLD.name_at(middle[0] + 1, middle[1]))
+    assert write_coarse(mosaic, nowhere, RECIPE, tmp_path / "none.safetensors") == 0
+    assert len(read_coarse(tmp_path / "none.safetensors").features) == 0
+
+
+def test_what_is_no_coarse_tiles_is_refused(stored, tmp_path):
+    data, path = stored.read_bytes(), tmp_path / "bad.safetensors"
+    for broken in (b"", b"hello", data[:-1], data[: len(data) // 2], data + b"0", b"{" + data):
+        path.write_bytes(broken)
+        with pytest.raises(AtlasError, match=r"bad\.safetensors"):
+            read_coarse(path)
+    with pytest.raises(MissingFileError):
+        read_coarse(tmp_path / "absent.safetensors")
+
+
+def _without(name):
+    return lambda arrays, told: arrays.pop(name)
+
+
+def _array(name, change):
+    def changed(arrays, told):
+        arrays[name] = np.ascontiguousarray(change(arrays[name]))
+
+    return changed
+
+
+def _told(**more):
+    return lambda arrays, told: told.update(more)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        _without("valid"),
+        _array("features", lambda a: a.astype(np.float32)),
+        _array("features", lambda a: a[:-1]),
+        _array("features", lambda a: a[:, :-1]),
+        _array("features", lambda a: np.full_like(a, np.inf)),
+        _array("centres_latlon_deg", lambda a: a + 0.1),
+        _array("centres_latlon_deg", lambda a: a * np.nan),
+        _array("centres_latlon_deg", lambda a: a[:, :1]),
+        _array("valid", lambda a: a[:, :32]),
+        _array("valid", lambda a: a.reshape(-1)),
+        _told(format="other"),
+        _told(schema=2),
+        _told(schema=None),
+        _told(edges="canny"),
+        _told(recipe={"gsd_m": 1}),
+        _told(recipe={"gsd_m": -1.0, "tile_px": 64, "overlap": 0.5}),
+        _told(recipe={"gsd_m": 1.0, "tile_px": 33, "overlap": 0.5}),
+        _told(recipe={"gsd_m": "1", "tile_px": 64, "overlap": 0.5}),
+        _told(bounds_deg=[1, 2, 3]),
+        _told(bounds_deg=None),
+    ],
+)
+def test_what_was_altered_is_refused(stored, tmp_path, change):
+    arrays = load_file(stored)
+    told = _metadata(stored)
+    change(arrays, told)
+    path = tmp_path / "altered.safetensors"
+    save_file(arrays, path, metadata={"orthonav": json.dumps(told)})
+    with pytest.raises(AtlasError, match=r"altered\.safetensors"):
+        read_coarse(path)
+
+
+def _metadata(path):
+    data = path.read_bytes()
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    return json.loads(header["__metadata__"]["orthonav"])

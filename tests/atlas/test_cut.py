@@ -1,0 +1,352 @@
+"""A map that is cut out of an atlas shows what its sheets show, and flies."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors import SafetensorError
+
+from helpers import textured
+from orthonav.atlas.catalog import Atlas, NewSheet
+from orthonav.atlas.coverage import box_deg, check_shown
+from orthonav.atlas.cut import cut_map
+from orthonav.atlas.recipe import AtlasRecipe
+from orthonav.embed.cells import CellLayout
+from orthonav.embed.stored import embedder_of
+from orthonav.embed.whitened import CellSheet
+from orthonav.errors import AreaError, AtlasError, OutputError, StorageError, VariantError
+from orthonav.geo.area import Area
+from orthonav.geo.camera import Camera
+from orthonav.geo.frames import LocalFrame
+from orthonav.geo.route import Route
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.localizer import Localizer
+from orthonav.mapfile import GreyLayer, open_map, write_map
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.prepare.layout import grid_of
+from orthonav.records import Fix, Telemetry
+from orthonav.represent.gradients import OrientedGradients
+
+RECIPE = AtlasRecipe(
+    gsd_m=1.0, tile_px=64, overlap=0.75, calibration_views=2, sheet_km=0.3, coarse=None
+)
+SIDE_PX = 1100
+LAYOUT = CellLayout(2, 2)
+
+
+@pytest.fixture(scope="module")
+def ortho(make_ortho, tmp_path_factory):
+    return make_ortho(tmp_path_factory.mktemp("ortho") / "2019-06.tif", textured((SIDE_PX,) * 2))
+
+
+@pytest.fixture(scope="module")
+def middle(ortho):
+    """The plane around a corner of sheets: two to the south, two or three to the north of it."""
+    lat, lon = Mosaic.open([ortho]).outline_latlon_deg.mean(axis=0)
+    west, south, _, _ = RECIPE.sheets.bounds_deg(RECIPE.sheets.name_at(lat, lon))
+    west, _, _, north = RECIPE.sheets.bounds_deg(RECIPE.sheets.name_at(2 * south - lat, lon))
+    return LocalFrame(north, west)
+
+
+@pytest.fixture(scope="module")
+def names(middle):
+    """The sheets around that corner."""
+    found = sorted(RECIPE.sheets.over(bounds_around(middle, 190)))
+    assert len(found) in (4, 5)
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(ortho, names, tmp_path_factory):
+    """An atlas of them, not to be changed."""
+    folder = tmp_path_factory.mktemp("atlas") / "atlas"
+    atlas = Atlas.create(str(folder), RECIPE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("orthonav.prepare.calibrate.CROPS", 12)
+        patch.setattr("orthonav.prepare.calibrate_registration.MIN_RIGHT", 1)
+        for name in names:
+            put(atlas, name, built(ortho, name, folder.parent / "sheet.onav"))
+    return folder
+
+
+def built(ortho, name, out, **request):
+    request = {"cells": True, "calibration_views": RECIPE.calibration_views, **request}
+    bounds = RECIPE.sheets.bounds_deg(name)
+    told = {"tile_px": RECIPE.tile_px, "overlap": RECIPE.overlap, "gsd_m": RECIPE.gsd_m, **request}
+    build_map(BuildRequest([ortho], out, bounds_deg=bounds, **told))
+    return out
+
+
+def put(atlas, name, path):
+    manifest = open_map(path).manifest
+    sheet = manifest.sheets[0]
+    bounds = RECIPE.sheets.bounds_deg(name)
+    dates = tuple(str(each["date"]) for each in manifest.imagery)
+    facts = (bounds, 1.0, sheet.tiles, sheet.area_km2, dates, manifest.imagery)
+    return atlas.put(name, {"map": path}, NewSheet(name, *facts, "asked", {"orthonav": "test"}))
+
+
+@pytest.fixture
+def atlas(folder, tmp_path):
+    """A copy of the atlas, to be changed."""
+    return Atlas.open(str(shutil.copytree(folder, tmp_path / "atlas")))
+
+
+def bounds_around(frame, half_m):
+    lat, lon = frame.latlon_from_en([[-half_m, -half_m], [half_m, half_m]])
+    return float(lon[0]), float(lat[0]), float(lon[1]), float(lat[1])
+
+
+def line(frame, *points_en_m):
+    return Route(tuple(zip(*(c.tolist() for c in frame.latlon_from_en(points_en_m)), strict=True)))
+
+
+@pytest.fixture(scope="module")
+def cut(folder, middle, tmp_path_factory):
+    """A map across all of these sheets."""
+    out = tmp_path_factory.mktemp("cut") / "cut.onav"
+    cut_map(Atlas.open(str(folder)), out, bounds_deg=bounds_around(middle, 150), workers=1)
+    return open_map(out)
+
+
+def sheet_file(atlas, name):
+    return Path(atlas.url) / atlas.sheets()[name].assets["map"].name
+
+
+def test_threads_do_not_change_the_map(folder, cut, middle, tmp_path, names_in):
+    again = tmp_path / "again.onav"
+    stages = []
+    cut_map(
+        Atlas.open(str(folder)),
+        again,
+        bounds_deg=bounds_around(middle, 150),
+        workers=3,
+        progress=lambda stage, share: stages.append((stage, share)),
+    )
+    assert again.read_bytes() == cut.path.read_bytes()
+    assert names_in(tmp_path) == ["again.onav"]
+    assert stages[0] == ("sheets", 0) and stages[-1] == ("learn", 1)
+
+
+def test_it_shows_the_ground_of_its_sheets_in_its_own_plane(cut, ortho):
+    sheet = cut.manifest.sheets[0]
+    shape = sheet.grid.height_px, sheet.grid.width_px
+    with Mosaic.open([ortho]).grid_sheet(sheet.frame, sheet.grid) as raster:
+        truth = raster.read_grey(0, 0, *shape[::-1])
+    grey, valid = GreyLayer.of(cut).read(0, 0, 0, *shape)
+    assert valid.all() and sheet.grey.valid_px == valid.size
+    off = np.abs(grey.astype(int) - truth.grey)
+    assert off.mean() < 6 and np.corrcoef(grey.ravel(), truth.grey.ravel())[0, 1] > 0.97
+    shifted = np.abs(grey[:, 1:].astype(int) - truth.grey[:, :-1])
+    assert shifted.mean() > 2 * off.mean()
+
+
+def test_its_tiles_are_those_that_the_imagery_would_give(cut, ortho):
+    sheet = cut.manifest.sheets[0]
+    height, width = sheet.grid.height_px, sheet.grid.width_px
+    with Mosaic.open([ortho]).grid_sheet(sheet.frame, sheet.grid) as raster:
+        truth = raster.read_grey(0, 0, width, height)
+    maps = OrientedGradients()(truth.grey, truth.valid)
+    cells = CellSheet(LAYOUT, height, width, len(maps))
+    cells.fill(0, 0, maps, truth.valid)
+    parts = cut.arrays
+    embedder = embedder_of(
+        cut.manifest.recipe["embed"], lambda name, dtype, ndim: parts[f"embed/{name}"], len(maps)
+    )
+    tiles_px = sheet.grid.tiles_rc(parts["sheet0/centres_en_m"]) * sheet.grid.stride_px
+    expected = embedder.tiles(cells, tiles_px).astype(np.float32)
+    alike = np.sum(expected * parts["sheet0/embeddings"], axis=1)
+    assert sheet.tiles == sheet.grid.rows * sheet.grid.cols
+    assert alike.min() > 0.9 and np.median(alike) > 0.97
+
+
+@pytest.mark.parametrize("registration", [True, False])
+def test_views_are_placed_across_the_borders_of_sheets(cut, ortho, registration):
+    sheet = cut.manifest.sheets[0]
+    localizer = Localizer(cut, registration=registration)
+    camera = Camera(64, 64, 64.0, 64.0, 32.0, 32.0)
+    for east_m, north_m in ((0.0, 0.0), (-90.0, 20.0), (60.0, -100.0)):
+        col, row = round(east_m - sheet.grid.west_m), round(sheet.grid.north_m - north_m)
+        with Mosaic.open([ortho]).grid_sheet(sheet.frame, sheet.grid) as raster:
+            view = raster.read_grey(col - 32, row - 32, 64, 64).grey
+        told = Telemetry(time_ns=0, yaw_deg=0.0, pitch_deg=0.0, roll_deg=0.0, agl_m=64.0)
+        fix = localizer.locate(view, camera, told)
+        assert isinstance(fix, Fix)
+        place = sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
+        where = sheet.grid.west_m + col, sheet.grid.north_m - row
+        assert np.hypot(*(place - where)) < (2 if registration else 12)
+
+
+def test_the_manifest_says_what_it_was_cut_from(cut, folder, names):
+    manifest, atlas = cut.manifest, Atlas.open(str(folder))
+    sheets = [open_map(sheet_file(atlas, name)).manifest for name in names]
+    assert set(manifest.recipe["cut_from"]) == set(names)
+    assert manifest.recipe["embed"] == sheets[0].recipe["embed"]
+    assert [source["date"] for source in manifest.imagery] == ["2019-06"]
+    assert manifest.radius_m == sheets[0].radius_m
+    assert manifest.view["position_std_m"] == max(s.view["position_std_m"] for s in sheets)
+    assert manifest.registration["radius_m"] == 35.0
+    assert not any(name.startswith("sheet0/cells") for name in cut.arrays)
+
+
+def test_imagery_of_all_sheets_is_named_once(atlas, names, middle, tmp_path):
+    opened = open_map(sheet_file(atlas, names[1]))
+    older = {**opened.manifest.imagery[0], "name": "older.tif", "date": "2011"}
+    imagery = (older, *opened.manifest.imagery)
+    write_map(tmp_path / "s.onav", replace(opened.manifest, imagery=imagery), opened.arrays)
+    put(atlas, names[1], tmp_path / "s.onav")
+    done = cut_map(atlas, tmp_path / "o.onav", bounds_deg=bounds_around(middle, 60), workers=1)
+    assert [each["date"] for each in done.manifest.imagery] == ["2011", "2019-06"]
+
+
+def test_a_band_leaves_out_what_is_far_from_it(folder, middle, tmp_path):
+    route = line(middle, [-150, -150], [150, 150])
+    done = cut_map(Atlas.open(str(folder)), tmp_path / "o.onav", route=route, band_m=40, workers=1)
+    sheet = done.manifest.sheets[0]
+    assert sheet.tiles < 0.7 * sheet.grid.rows * sheet.grid.cols
+    area = Area.from_route(route, 40)
+    centres = open_map(tmp_path / "o.onav").arrays["sheet0/centres_en_m"].astype(float)
+    assert area.contains(centres, sheet.grid.stride_m).all()
+
+
+def test_a_missing_sheet_beside_the_route_is_a_warning(atlas, names, middle, tmp_path, caplog):
+    atlas.retire(names[3])
+    here = middle.en_from_latlon(*centre_of(names[0]))
+    route = line(middle, 1.2 * here, 0.5 * here)
+    done = cut_map(atlas, tmp_path / "o.onav", route=route, band_m=600, workers=1)
+    assert "the atlas lacks" in caplog.text and names[3] in caplog.text
+    sheet = done.manifest.sheets[0]
+    assert sheet.tiles < 0.9 * sheet.grid.rows * sheet.grid.cols
+
+
+def test_a_missing_sheet_under_the_route_is_an_error(atlas, names, middle, tmp_path, names_in):
+    atlas.retire(names[3])
+    there = middle.en_from_latlon(*centre_of(names[3]))
+    request = {"route": line(middle, -there, there), "band_m": 40, "workers": 1}
+    with pytest.raises(AtlasError, match=rf"{names[3]}.*--allow-holes"):
+        cut_map(atlas, tmp_path / "out" / "o.onav", **request)
+    assert not (tmp_path / "out").exists()
+    done = cut_map(atlas, tmp_path / "o.onav", allow_holes=True, **request)
+    assert done.manifest.sheets[0].tiles > 0
+
+
+def centre_of(name):
+    west, south, east, north = RECIPE.sheets.bounds_deg(name)
+    return (south + north) / 2, (west + east) / 2
+
+
+def test_imagery_that_is_missing_under_the_route_is_an_error(middle, caplog):
+    area = Area.from_route(line(middle, [-150, 0], [150, 0]), 200)
+    grid = grid_of(area, 1.0, 1.0, RECIPE.tile_px, RECIPE.overlap)
+    cells = CellSheet(LAYOUT, grid.height_px, grid.width_px, 7)
+    cells.valid[:, : cells.valid.shape[1] // 2] = 1
+    with pytest.raises(AtlasError, match="of the route has no imagery"):
+        check_shown(area, grid, cells, allow_holes=False)
+    check_shown(area, grid, cells, allow_holes=True)
+    assert "of the area has no imagery" in caplog.text
+    cells.valid[:] = 1
+    check_shown(area, grid, cells, allow_holes=False)
+
+
+def test_outside_of_the_atlas(folder, names, tmp_path):
+    atlas = Atlas.open(str(folder))
+    with pytest.raises(AreaError, match=f"{len(names)} sheets lie within"):
+        cut_map(atlas, tmp_path / "o.onav", bounds_deg=(12.0, 50.0, 12.01, 50.01))
+    empty = Atlas.create(str(tmp_path / "empty"), RECIPE)
+    with pytest.raises(AreaError, match="no sheets yet"):
+        cut_map(empty, tmp_path / "o.onav", bounds_deg=(12.0, 50.0, 12.01, 50.01))
+
+
+@pytest.mark.parametrize(
+    ("lacking", "said"), [("sheet0/cells", "no cells"), ("sheet0/grey", "no registration layer")]
+)
+def test_sheets_that_cannot_be_cut_from(atlas, names, middle, tmp_path, lacking, said):
+    opened = open_map(sheet_file(atlas, names[2]))
+    kept = {name: part for name, part in opened.arrays.items() if not name.startswith(lacking)}
+    manifest = opened.manifest
+    if lacking.endswith("grey"):
+        manifest = replace(manifest, sheets=(replace(manifest.sheets[0], grey=None),))
+    write_map(tmp_path / "s.onav", manifest, kept)
+    put(atlas, names[2], tmp_path / "s.onav")
+    with pytest.raises(AtlasError, match=rf"{names[2]} has {said}.*build it anew"):
+        cut_map(atlas, tmp_path / "o.onav", bounds_deg=bounds_around(middle, 100), workers=1)
+
+
+@pytest.mark.parametrize("change", ["recipe", "grid", "method"])
+def test_sheets_of_another_make_are_refused(atlas, names, middle, tmp_path, change):
+    opened = open_map(sheet_file(atlas, sorted(names)[1]))
+    manifest = opened.manifest
+    if change == "grid":
+        sheet = manifest.sheets[0]
+        grid = replace(sheet.grid, gsd_m=1.5)
+        manifest = replace(manifest, sheets=(replace(sheet, grid=grid),))
+    elif change == "recipe":
+        other = {**manifest.recipe["represent"], "sigma_px": 2.0}
+        manifest = replace(manifest, recipe={**manifest.recipe, "represent": other})
+    else:
+        manifest = replace(manifest, recipe={**manifest.recipe, "embed": {"name": "bovw"}})
+    write_map(tmp_path / "s.onav", manifest, opened.arrays)
+    put(atlas, sorted(names)[1], tmp_path / "s.onav")
+    with pytest.raises(AtlasError, match=sorted(names)[1]):
+        cut_map(atlas, tmp_path / "o.onav", bounds_deg=bounds_around(middle, 100), workers=1)
+
+
+def test_a_damaged_sheet_is_named(atlas, names, middle, tmp_path):
+    path = sheet_file(atlas, names[1])
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 255
+    path.write_bytes(data)
+    with pytest.raises(StorageError, match=names[1]):
+        cut_map(atlas, tmp_path / "o.onav", bounds_deg=bounds_around(middle, 100), workers=1)
+
+
+def test_a_damaged_chunk_is_found_by_any_thread(atlas, names, middle, tmp_path):
+    opened = open_map(sheet_file(atlas, names[1]))
+    parts = {name: part.copy() for name, part in opened.arrays.items()}
+    parts["sheet0/grey/bytes"][:] = 7
+    write_map(tmp_path / "s.onav", opened.manifest, parts)
+    put(atlas, names[1], tmp_path / "s.onav")
+    with pytest.raises(AtlasError, match=rf"sheet {names[1]} is damaged"):
+        cut_map(atlas, tmp_path / "o.onav", bounds_deg=bounds_around(middle, 100), workers=2)
+
+
+def test_a_full_disk_leaves_nothing(folder, middle, tmp_path, monkeypatch, names_in):
+    def full(*arguments, **named):
+        raise SafetensorError("I/O error: No space left on device (os error 28)")
+
+    monkeypatch.setattr("orthonav.mapfile.writer.save_file", full)
+    with pytest.raises(OutputError, match="disk full"):
+        cut_map(
+            Atlas.open(str(folder)),
+            tmp_path / "o.onav",
+            bounds_deg=bounds_around(middle, 60),
+            workers=1,
+        )
+    assert names_in(tmp_path) == []
+
+
+def test_what_is_asked_for_must_make_sense(folder, middle, tmp_path):
+    atlas, out = Atlas.open(str(folder)), tmp_path / "o.onav"
+    bounds = bounds_around(middle, 60)
+    with pytest.raises(AreaError, match="give one of them"):
+        cut_map(atlas, out)
+    with pytest.raises(AreaError, match="give one of them"):
+        cut_map(atlas, out, bounds_deg=bounds, route=line(middle, [0, 0], [50, 0]))
+    with pytest.raises(AreaError, match="needs a route"):
+        cut_map(atlas, out, bounds_deg=bounds, band_m=50)
+    with pytest.raises(AreaError, match="larger than the area"):
+        cut_map(atlas, out, bounds_deg=bounds_around(middle, 20))
+    with pytest.raises(VariantError, match="workers"):
+        cut_map(atlas, out, bounds_deg=bounds, workers=0)
+    own = sheet_file(atlas, next(iter(atlas.sheets())))
+    with pytest.raises(OutputError, match="replace a sheet"):
+        cut_map(atlas, own, bounds_deg=bounds, workers=1)
+
+
+def test_the_box_of_an_area_goes_across_the_antimeridian():
+    area = Area.from_bounds((179.99, 10.0, -179.99, 10.02))
+    west, south, east, north = box_deg(area, 100.0)
+    assert 179.98 < west < 179.99 and -179.99 < east < -179.98
+    assert 9.99 < south < 10.0 and 10.02 < north < 10.03

@@ -1,0 +1,344 @@
+"""What is wrong with an atlas is found, what is left over goes, and nothing else does."""
+
+import hashlib
+import json
+import os
+import shutil
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import fsspec
+import pytest
+
+from orthonav.atlas.catalog import Atlas, NewSheet
+from orthonav.atlas.index import IndexManifest, Part, ShardInfo
+from orthonav.atlas.integrity import check_atlas
+from orthonav.atlas.item import Asset, Sheet, canonical
+from orthonav.atlas.recipe import AtlasRecipe
+from orthonav.atlas.store import Store
+from orthonav.atlas.vectors import VectorRecipe
+from orthonav.cli import main
+from orthonav.errors import AtlasError
+from orthonav.mapfile import open_map
+
+RECIPE = AtlasRecipe(gsd_m=2.5, tile_px=128, calibration_views=24, coarse=None)
+PLACES = [(46.6, 1.9), (46.6, 2.1)]
+HERE, EAST = (RECIPE.sheets.name_at(*place) for place in PLACES)
+DAYS_S = 24 * 3600
+
+
+def described(sheet, tiles=7, dates=("2020-06-14",)):
+    """What is told of a sheet."""
+    imagery = ({"name": "BD ORTHO", "attribution": "IGN", "licence": "Etalab-2.0"},)
+    bounds = RECIPE.sheets.bounds_deg(sheet)
+    return NewSheet(sheet, bounds, 2.5, tiles, 3.25, dates, imagery, "r", {"orthonav": "1.0"})
+
+
+@pytest.fixture(params=["folder", "memory"])
+def place(request, tmp_path):
+    """Where an atlas may lie."""
+    yield str(tmp_path / "atlas") if request.param == "folder" else "memory://test/atlas"
+    fsspec.filesystem("memory").store.clear()
+
+
+def two_sheets(url, tmp_path):
+    """An atlas of two sheets whose maps are none."""
+    atlas = Atlas.create(url, RECIPE, cache=tmp_path / "cache")
+    for sheet in (HERE, EAST):
+        (tmp_path / "file").write_text(f"map of {sheet}")
+        atlas.put(sheet, {"map": tmp_path / "file"}, described(sheet))
+    return atlas
+
+
+@pytest.fixture
+def atlas(place, tmp_path):
+    """An atlas of two sheets, near and far."""
+    return two_sheets(place, tmp_path)
+
+
+@pytest.fixture
+def near(tmp_path):
+    """The same in a folder."""
+    return two_sheets(tmp_path / "atlas", tmp_path)
+
+
+def found(atlas, **how):
+    """Kinds and names of what is wrong."""
+    return [(problem.kind, problem.name) for problem in check_atlas(atlas, **how)]
+
+
+def test_a_whole_atlas(atlas):
+    assert check_atlas(atlas) == [] == check_atlas(atlas, clean=True, min_age_s=0)
+    atlas.snapshot()
+    assert check_atlas(atlas) == []
+
+
+def test_files_that_are_missing_or_half_there(atlas, tmp_path):
+    here, east = (atlas.sheets()[name].assets["map"].name for name in (HERE, EAST))
+    atlas.store.remove(here)
+    atlas.store.write(east, b"map")
+    wrong = [("missing file", here), ("wrong size", east)]
+    assert found(atlas) == wrong == found(atlas, clean=True, min_age_s=0)
+    (tmp_path / "file").write_text(f"map of {HERE}")
+    atlas.put(HERE, {"map": tmp_path / "file"}, described(HERE))  # building it again heals it
+    assert found(atlas) == wrong[1:]
+
+
+def test_content_that_changed_is_found_by_looking_inside(atlas):
+    name = atlas.sheets()[HERE].assets["map"].name
+    atlas.store.write(name, b"m" * atlas.store.size(name))
+    assert found(atlas) == []
+    assert ("wrong checksum", name) in found(atlas, deep=True)
+
+
+def test_what_is_left_over_goes_when_it_is_old(atlas):
+    orphan = f"sheets/{HERE}.0123456789ab.onav"
+    half = f"sheets/.{HERE}.0123456789ab.onav.a1b2c3d4.tmp.onav"
+    names = {orphan: "orphan", half: "leftover", ".atlas.json.a1b2c3d4e5f6.tmp": "leftover"}
+    names[f"coarse/{EAST}.0123456789ab.safetensors"] = "orphan"
+    for name in [*names, "notes.txt", "sheets/notes.onav", "items/.DS_Store"]:
+        atlas.store.write(name, b"x")
+    expected = sorted((kind, name) for name, kind in names.items())
+    assert sorted(found(atlas)) == expected
+    young = check_atlas(atlas, clean=True)
+    assert [each.detail.rpartition("; ")[2] for each in young] == ["too young to be removed"] * 4
+    assert sorted(found(atlas)) == expected
+    gone = check_atlas(atlas, clean=True, min_age_s=-5)
+    assert len(gone) == 4 and all(each.removed for each in gone)
+    assert found(atlas) == [] and atlas.store.read("sheets/notes.onav") == b"x"
+    assert len(atlas.sheets(refresh=True)) == 2
+
+
+def test_the_age_of_files_in_a_folder(near):
+    orphan = Path(near.url, "sheets", f"{HERE}.0123456789ab.onav")
+    orphan.touch()
+    os.utime(orphan, (time.time() - 2 * DAYS_S,) * 2)
+    assert [each.removed for each in check_atlas(near, clean=True)] == [True]
+    assert not orphan.exists()
+
+
+def second_revision(atlas, missing=False):
+    """As if a process had ended before it removed the revision that it replaced."""
+    old = atlas.sheets()[HERE]
+    asset = replace(old.assets["map"], sha256="ab" * 32, size_bytes=3)
+    asset = replace(asset, name=f"sheets/{HERE}.abababababab.onav")
+    new = Sheet.of(described(HERE), 2, {"map": asset})
+    if not missing:
+        atlas.store.write(asset.name, b"new")
+    atlas.store.write(f"items/{new.item_name}", canonical(new.to_item()))
+    return old, new
+
+
+def test_a_revision_that_was_replaced(atlas):
+    old, new = second_revision(atlas)
+    assert atlas.sheets(refresh=True)[HERE] == new
+    assert found(atlas) == [("second revision", f"items/{old.item_name}")]
+    gone = check_atlas(atlas, clean=True, min_age_s=-5)
+    assert [each.kind for each in gone] == ["second revision", "orphan"]
+    assert found(atlas) == [] and atlas.sheets(refresh=True)[HERE] == new
+    assert len(atlas.store.names("sheets")) == 2
+
+
+def test_a_revision_stays_while_what_replaced_it_is_not_whole(atlas):
+    old, new = second_revision(atlas, missing=True)
+    wrong = [
+        ("second revision", f"items/{old.item_name}"),
+        ("missing file", new.assets["map"].name),
+    ]
+    assert found(atlas, clean=True, min_age_s=-5) == wrong == found(atlas)
+
+
+def test_files_of_items_that_cannot_be_read_stay(near):
+    path = Path(near.url, "items", near.sheets()[HERE].item_name)
+    path.write_bytes(path.read_bytes()[:-2])
+    assert found(near, clean=True, min_age_s=-5) == [("damaged item", f"items/{path.name}")]
+    assert len(near.store.names("sheets")) == 2
+    near.retire(HERE)
+    assert [kind for kind, _ in found(near, clean=True, min_age_s=-5)] == ["orphan"]
+    assert found(near) == [] and list(near.sheets(refresh=True)) == [EAST]
+
+
+def test_a_sheet_of_another_lattice(near):
+    told = replace(near.sheets()[HERE], bounds_deg=RECIPE.sheets.bounds_deg(EAST))
+    sheet = Sheet.of(told, 2, told.assets)
+    near.store.write(f"items/{sheet.item_name}", canonical(sheet.to_item()))
+    kinds = [kind for kind, _ in found(near)]
+    assert kinds == ["second revision", "damaged item"]
+
+
+def test_a_snapshot_that_is_stale_is_written_anew(atlas):
+    atlas.snapshot()
+    atlas.retire(EAST)
+    assert found(atlas) == [("stale snapshot", "items.geojson")]
+    assert [each.removed for each in check_atlas(atlas, clean=True)] == [True]
+    assert found(atlas) == []
+
+
+def test_an_index_that_is_stale_or_damaged(atlas):
+    asset = Asset("index/a.npy", 3, hashlib.sha256(b"abc").hexdigest())
+    shard = ShardInfo("a", 0, (Part(HERE, "ab" * 32, 5),))
+    manifest = IndexManifest(VectorRecipe(dims=64), (shard,), {"a.npy": asset})
+    atlas.store.write("index/index.json", manifest.to_json())
+    atlas.store.write("index/.a.npy.a1b2c3d4.tmp.npy", b"a")
+    stale = [("stale index", "index/index.json")]  # no sheet has coarse tiles (any more)
+    half = [("leftover", "index/.a.npy.a1b2c3d4.tmp.npy")]
+    assert found(atlas, clean=True, min_age_s=-5) == [*half, ("missing file", asset.name), *stale]
+    atlas.store.write(asset.name, b"ab")
+    assert found(atlas) == [("wrong size", asset.name), *stale]
+    atlas.store.write(asset.name, b"abd")
+    assert found(atlas) == stale
+    assert ("wrong checksum", asset.name) in found(atlas, deep=True)
+    elsewhere = replace(manifest, files={"a.npy": replace(asset, name="../../etc/passwd")})
+    atlas.store.write("index/index.json", elsewhere.to_json())
+    assert found(atlas) == [("damaged file", "index/index.json"), *stale]
+    atlas.store.write("index/index.json", b"{}")
+    assert found(atlas) == [("damaged file", "index/index.json")]
+
+
+def test_a_sheet_finished_meanwhile_is_no_orphan(near, monkeypatch):
+    """Its files are listed, then its item is written."""
+    act = Store.names
+    first = [{name: size for name, size in act(near.store, "items").items() if EAST in name}]
+
+    def names(self, folder="", prefix=""):
+        return first.pop() if folder == "items" and first else act(self, folder, prefix)
+
+    monkeypatch.setattr(Store, "names", names)
+    assert found(near, clean=True, min_age_s=-5) == []
+
+
+def test_a_full_disk_is_said(near, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("orthonav.atlas.places.shutil.copyfile", full)
+    assert main(["atlas", "add", near.url + "2", near.url, "-q"]) == 1
+
+
+@pytest.fixture
+def real(map_path, tmp_path, place):
+    """Function that puts a real map into an atlas of a recipe."""
+
+    def make(recipe, tiles=None):
+        atlas = Atlas.create(place, recipe, cache=tmp_path / "cache")
+        told = described(HERE, open_map(map_path).manifest.sheets[0].tiles if tiles is None else 1)
+        atlas.put(HERE, {"map": map_path}, told)
+        return atlas
+
+    return make
+
+
+def test_maps_are_opened_and_compared(real):
+    assert check_atlas(real(RECIPE), deep=True) == []
+
+
+def test_maps_of_another_recipe_are_found(real):
+    recipe = replace(RECIPE, gsd_m=2.0, tile_px=64, method="bovw", registration=False, seed=4)
+    (problem,) = check_atlas(real(recipe, tiles=1), deep=True)
+    assert problem.kind == "other recipe" and problem.name.startswith("sheets/")
+    for words in (
+        "gsd_m: 2.5, not 2.0",
+        "tile_px: 128, not 64",
+        "method: gradient, not bovw",
+        "edges: gradient, not gray",
+        "registration: True, not False",
+        "seed: 0, not 4",
+        "tiles (of its item)",
+    ):
+        assert words in problem.detail
+
+
+def test_what_is_no_map_is_found(near, tmp_path):
+    kinds = [(each.kind, each.detail) for each in check_atlas(near, deep=True)]
+    assert [kind for kind, _ in kinds] == ["damaged file"] * 2
+    assert "not an orthonav map" in kinds[0][1]
+    (tmp_path / "file").write_text("coarse")
+    near.put(HERE, {"map": tmp_path / "file", "coarse": tmp_path / "file"}, described(HERE))
+    problems = check_atlas(near, deep=True)
+    assert [each.name.partition("/")[0] for each in problems] == ["coarse", "sheets", "sheets"]
+    assert {each.kind for each in problems} == {"damaged file"}
+
+
+def run(capfd, *arguments):
+    """A command: exit code, what it printed."""
+    code = main(["atlas", *map(str, arguments), "-q"])
+    return code, capfd.readouterr()
+
+
+def test_info(near, capfd):
+    code, done = run(capfd, "info", near.url)
+    assert code == 0 and "sheets     2 of 10 km, 14 tiles" in done.out
+    for words in ("6.50 km2", "gsd_m 2.5", "2020-06-14", "BD ORTHO, IGN, Etalab-2.0"):
+        assert words in done.out
+    code, done = run(capfd, "info", near.url, "--json")
+    plain = json.loads(done.out)
+    assert plain["sheets"] == 2 and plain["names"] == [HERE, EAST] and plain["area_km2"] == 6.5
+    assert plain["bytes"] == 2 * len("map of r000000c000000")
+    assert plain["recipe"] == RECIPE.to_plain() and plain["made_by"] == ["orthonav 1.0"]
+    west, south, east, north = plain["bounds_deg"]
+    assert all(west < lon < east and south < lat < north for lat, lon in PLACES)
+
+
+def test_info_of_nothing(tmp_path, capfd):
+    code, done = run(capfd, "info", tmp_path)
+    assert code == 1 and done.err.startswith("orthonav: error: no atlas")
+    Atlas.create(tmp_path / "atlas", RECIPE)
+    code, done = run(capfd, "info", tmp_path / "atlas")
+    assert code == 0 and "dates      unknown" in done.out and "sheets     0" in done.out
+
+
+def test_check(near, capfd):
+    code, done = run(capfd, "check", near.url)
+    assert (code, done.out) == (0, f"whole, by names and sizes: {near.url}\n")
+    near.store.remove(near.sheets()[HERE].assets["map"].name)
+    near.store.write(".atlas.json.a1b2c3d4.tmp.json", b"")
+    code, done = run(capfd, "check", near.url, "--clean", "--min-age-h", "-1")
+    assert code == 3 and "missing file    sheets/" in done.out and "1 problems" in done.out
+    assert "(put right)" in done.out
+    code, done = run(capfd, "check", near.url, "--json", "--deep")
+    plain = json.loads(done.out)
+    assert code == 3 and not plain["whole"] and plain["deep"]
+    assert {each["kind"] for each in plain["problems"]} == {"damaged file", "missing file"}
+
+
+def test_add_and_retire(near, tmp_path, capfd):
+    copy = tmp_path / "copy"
+    code, done = run(capfd, "add", copy, near.url, "--sheets", EAST)
+    assert (code, done.out) == (0, f"1 sheets added, 0 kept as they were: {copy}\n")
+    code, done = run(capfd, "add", copy, near.url, "--replace")
+    assert done.out.startswith("1 sheets added, 1 kept")
+    assert list(Atlas.open(copy).sheets()) == [HERE, EAST] and found(Atlas.open(copy)) == []
+    code, done = run(capfd, "retire", copy, HERE, EAST)
+    assert code == 0 and Atlas.open(copy).sheets() == {} and found(Atlas.open(copy)) == []
+    code, done = run(capfd, "retire", copy, HERE)
+    assert code == 1 and "has no sheet" in done.err
+    shutil.rmtree(copy)
+    Atlas.create(copy, replace(RECIPE, seed=1))
+    code, done = run(capfd, "add", copy, near.url)
+    assert code == 1 and "seed: 1, not 0" in done.err
+
+
+def test_index_and_cut_are_asked_for_as_told(near, capfd, monkeypatch):
+    code, done = run(capfd, "index", near.url)
+    assert code == 0 and "nothing to index" in done.out
+    asked = {}
+
+    def cut(atlas, out, **how):
+        asked.update(how, url=atlas.url, out=out)
+        raise AtlasError("sheets are missing")
+
+    monkeypatch.setattr("orthonav.atlas.cut.cut_map", cut)
+    told = ["--bounds", "1.8,46.5,1.9,46.6", "--out", "MAP.onav", "--workers", "2"]
+    code, done = run(capfd, "cut", near.url, *told)
+    assert code == 1 and "sheets are missing" in done.err
+    assert asked.pop("progress") is not None
+    assert asked == {
+        "url": near.url,
+        "out": Path("MAP.onav"),
+        "route": None,
+        "band_m": None,
+        "bounds_deg": (1.8, 46.5, 1.9, 46.6),
+        "workers": 2,
+        "allow_holes": False,
+    }

@@ -1,0 +1,49 @@
+"""A recipe from a stranger is a recipe, or an error that says why not."""
+
+import pytest
+
+from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
+from orthonav.errors import AtlasError
+
+RECIPE = AtlasRecipe(gsd_m=1.0)
+
+
+def test_a_recipe_comes_back_as_it_was():
+    for recipe in (RECIPE, AtlasRecipe(2.5, coarse=None), AtlasRecipe(8, coarse=CoarseRecipe(4.0))):
+        assert AtlasRecipe.from_plain(recipe.to_plain()) == recipe
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("gsd_m", "abc"),
+        ("gsd_m", 0.0),
+        ("gsd_m", float("nan")),
+        ("tile_px", -3),
+        ("tile_px", 2.5),
+        ("tile_px", True),
+        ("overlap", 1.0),
+        ("sheet_km", 1e6),
+        ("method", 7),
+        ("registration", "yes"),
+        ("coarse", {"width": 3}),
+        ("coarse", {"gsd_m": -8.0, "tile_px": 128, "overlap": 0.5}),
+        ("coarse", 5),
+    ],
+    ids=str,
+)
+def test_what_is_no_recipe_is_refused(name, value):
+    with pytest.raises(AtlasError, match="recipe"):
+        AtlasRecipe.from_plain({**RECIPE.to_plain(), name: value})
+
+
+def test_a_field_that_is_missing_is_refused():
+    plain = RECIPE.to_plain()
+    del plain["seed"]
+    with pytest.raises(AtlasError, match="seed"):
+        AtlasRecipe.from_plain(plain)
+
+
+def test_differences_are_named():
+    assert RECIPE.differences(AtlasRecipe(gsd_m=2.0)) == ["gsd_m: 1.0, not 2.0"]
+    assert RECIPE.differences(RECIPE) == []

@@ -1,0 +1,337 @@
+"""The place of an atlas: whole files or none, nothing outside it, and failures said in words."""
+
+import errno
+import hashlib
+import os
+import pickle
+import sys
+import time
+
+import fsspec
+import pytest
+from fsspec.implementations.local import LocalFileSystem
+
+from orthonav.atlas import cache as cache_module
+from orthonav.atlas.cache import cache_folder
+from orthonav.atlas.store import Store
+from orthonav.errors import MissingExtraError, StorageError
+
+
+class Trouble(LocalFileSystem):
+    """A far file system that shows halves of files, and fails when told: operation to error."""
+
+    protocol = "trouble"
+    fails = {}  # noqa: RUF012
+
+    @classmethod
+    def _strip_protocol(cls, path):
+        return super()._strip_protocol(str(path).removeprefix("trouble://"))
+
+    def _may_fail(self, operation):
+        if operation in self.fails:
+            raise self.fails[operation]
+
+    def ls(self, path, detail=False, **kwargs):
+        self._may_fail("ls")
+        return super().ls(path, detail, **kwargs)
+
+    def info(self, path, **kwargs):
+        self._may_fail("info")
+        return super().info(path, **kwargs)
+
+    def put_file(self, lpath, rpath, **kwargs):
+        super().put_file(lpath, rpath, **kwargs)
+        self._may_fail("put_file")
+
+    def pipe_file(self, path, value, **kwargs):
+        super().pipe_file(path, value[: len(value) // 2], **kwargs)
+        self._may_fail("pipe_file")
+        super().pipe_file(path, value, **kwargs)
+
+    def mv(self, path1, path2, **kwargs):
+        self._may_fail("mv")
+        super().mv(path1, path2, **kwargs)
+
+    def get_file(self, rpath, lpath, **kwargs):
+        self._may_fail("get_file")
+        super().get_file(rpath, lpath, **kwargs)
+
+
+@pytest.fixture(autouse=True)
+def trouble(monkeypatch):
+    """The far file system `trouble://`; give it errors to raise."""
+    monkeypatch.setattr(Trouble, "fails", {})
+    fsspec.register_implementation("trouble", Trouble, clobber=True)
+    return Trouble.fails
+
+
+@pytest.fixture(autouse=True)
+def no_memory_left():
+    """What a test leaves in `memory://` is gone after it."""
+    yield
+    fsspec.filesystem("memory").store.clear()
+
+
+@pytest.fixture(params=["folder", "memory", "trouble"])
+def store(request, tmp_path):
+    """An empty place, near and far, with a cache of its own."""
+    root = tmp_path / "atlas"
+    url = {"folder": str(root), "memory": "memory://test/atlas", "trouble": f"trouble://{root}"}
+    return Store.open(url[request.param], cache=tmp_path / "cache")
+
+
+def sha256(data):
+    return hashlib.sha256(data).hexdigest()
+
+
+def test_what_is_put_is_there(store, tmp_path):
+    (tmp_path / "file").write_bytes(b"some map")
+    store.put(tmp_path / "file", "sheets/a.onav")
+    store.write("items/b.1.json", b"{}")
+    store.write("items/c.1.json", b"[1]")
+    store.write("items/c.1.json", b"[1, 2]")
+    store.write("atlas.json", b"")
+    assert store.names() == {"atlas.json": 0}
+    assert list(store.names("items").items()) == [("b.1.json", 2), ("c.1.json", 6)]
+    assert store.names("items", "c.") == {"c.1.json": 6}
+    assert store.names("coarse") == {} == store.names("coarse", "c")
+    assert store.size("sheets/a.onav") == 8
+    assert store.size("sheets") is None is store.size("sheets/b.onav")
+    assert store.read("items/c.1.json") == b"[1, 2]"
+    both = store.read_many(["items/c.1.json", "sheets/a.onav"])
+    assert both == {"items/c.1.json": b"[1, 2]", "sheets/a.onav": b"some map"}
+    assert store.read_many([]) == {}
+    assert 0 <= store.age_s("atlas.json") + 1 < 60
+    store.remove("items/c.1.json")
+    store.remove("items/c.1.json")
+    assert store.names("items") == {"b.1.json": 2}
+
+
+def test_reading_has_a_limit_and_says_what_is_missing(store):
+    store.write("items.geojson", b"12345")
+    with pytest.raises(StorageError, match="larger than such a file may be"):
+        store.read("items.geojson", limit_bytes=4)
+    with pytest.raises(StorageError, match=r"no such file: .*items/none\.json"):
+        store.read("items/none.json")
+    with pytest.raises(StorageError, match="none"):
+        store.read_many(["items.geojson", "items/none.json"])
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("../x", "/etc/passwd", "items/../../x", "a//b", "items/", "", ".", "..", "a\\b", "a\0"),
+        *("s3://other/x", "a b", "ü", "x" * 300),
+    ],
+)
+def test_nothing_outside_the_atlas_is_named(store, name, tmp_path):
+    (tmp_path / "file").touch()
+    for act in (
+        lambda: store.read(name),
+        lambda: store.read_many([name, "items/a"]),
+        lambda: store.size(name),
+        lambda: store.age_s(name),
+        lambda: store.fetch(name, 1, "0" * 64),
+        lambda: store.download(name, tmp_path / "out"),
+        lambda: store.put(tmp_path / "file", name),
+        lambda: store.write(name, b""),
+        lambda: store.remove(name),
+    ):
+        with pytest.raises(StorageError, match="not a name of a file in an atlas"):
+            act()
+
+
+def test_links_do_not_lead_out(tmp_path):
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "x").write_bytes(b"mine")
+    store = Store.open(str(tmp_path / "atlas"))
+    store.write("coarse/x", b"1")
+    (tmp_path / "atlas" / "sheets").symlink_to(outside)
+    (tmp_path / "atlas" / "coarse" / "y").symlink_to(outside / "x")
+    for act in (
+        lambda: store.names("sheets"),
+        lambda: store.read("sheets/x"),
+        lambda: store.write("sheets/x", b""),
+        lambda: store.remove("sheets/x"),
+        lambda: store.read("coarse/y"),
+        lambda: store.fetch("coarse/y", 4, sha256(b"mine")),
+    ):
+        with pytest.raises(StorageError, match="leads out of the atlas"):
+            act()
+    store.remove("coarse/y")
+    assert store.names("coarse") == {"x": 1} and (outside / "x").read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize("step", ["pipe_file", "mv"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "full")])
+def test_far_files_are_whole_or_not_there(trouble, tmp_path, step, error):
+    store = Store.open(f"trouble://{tmp_path}/atlas")
+    store.write("items/a", b"old")
+    trouble[step] = error
+    with pytest.raises((KeyboardInterrupt, StorageError)):
+        store.write("items/a", b"newer")
+    trouble.clear()
+    assert store.names("items") == {"a": 3} and store.read("items/a") == b"old"
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "full")])
+def test_near_files_are_whole_or_not_there(tmp_path, monkeypatch, error):
+    store = Store.open(str(tmp_path / "atlas"))
+    store.write("items/a", b"old")
+
+    def half(source, to):
+        to.write_bytes(b"ne")
+        raise error
+
+    monkeypatch.setattr("orthonav.atlas.places.shutil.copyfile", half)
+    with pytest.raises((KeyboardInterrupt, StorageError)) as caught:
+        store.put(tmp_path, "items/a")
+    assert "full" in str(caught.value) or isinstance(error, KeyboardInterrupt)
+    assert store.names("items") == {"a": 3} and store.read("items/a") == b"old"
+
+
+def _of_boto(name, status=None):
+    error = type(name, (Exception,), {})(f"what {name} says")
+    if status:
+        error.response = {"ResponseMetadata": {"HTTPStatusCode": status}}
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (PermissionError("Access Denied"), "not permitted, or credentials refused (Access Denied)"),
+        (_of_boto("NoCredentialsError"), "no credentials that are accepted"),
+        (_of_boto("ClientError", 403), "credentials refused"),
+        (_of_boto("EndpointConnectionError"), "cannot be reached"),
+        (ConnectionRefusedError("refused"), "cannot be reached"),
+        (TimeoutError(), "cannot be reached (TimeoutError)"),
+        (OSError(errno.ENOSPC, "full"), "disk full"),
+        (OSError(errno.EROFS, "read-only"), "can only be read"),
+        (RuntimeError("odd\nthing"), "RuntimeError: odd thing"),
+    ],
+)
+def test_failures_are_said_in_words(trouble, tmp_path, error, words):
+    store = Store.open(f"trouble://{tmp_path}/atlas", cache=tmp_path / "cache")
+    store.write("items/a", b"12")
+    trouble.update(dict.fromkeys(("ls", "info", "get_file", "mv"), error))
+    for act in (
+        lambda: store.names("items"),
+        lambda: store.size("items/a"),
+        lambda: store.read("items/a"),
+        lambda: store.fetch("items/a", 2, sha256(b"12")),
+        lambda: store.write("items/a", b"13"),
+    ):
+        with pytest.raises(StorageError) as caught:
+            act()
+        assert words in str(caught.value) and "trouble://" in str(caught.value)
+    assert not [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
+
+
+def test_a_bucket_that_is_not_there(trouble, tmp_path):
+    store = Store.open(f"trouble://{tmp_path}/atlas")
+    trouble["mv"] = FileNotFoundError("The specified bucket does not exist")
+    with pytest.raises(StorageError, match=r"no such file, folder or bucket \(The specified buck"):
+        store.write("atlas.json", b"{}")
+
+
+def test_what_must_be_installed(monkeypatch):
+    monkeypatch.setitem(sys.modules, "adlfs", None)
+    with pytest.raises(MissingExtraError, match=r"abfs:// needs adlfs.* pip install adlfs"):
+        Store.open("abfs://container/atlas")
+    with pytest.raises(StorageError, match=r"cannot be one .*nosuch"):
+        Store.open("nosuch://bucket/atlas")
+    monkeypatch.setitem(sys.modules, "fsspec", None)
+    with pytest.raises(MissingExtraError, match=r"orthonav\[atlas\]"):
+        Store.open("s3://bucket/atlas")
+    Store.open("file:///folders/need/nothing")
+
+
+def test_passwords_are_not_shown(monkeypatch):
+    store = Store.open("memory://me:secret@host/atlas")
+    assert str(store) == "memory://me@host/atlas"
+    with pytest.raises(StorageError) as caught:
+        store.read("items/a")
+    assert "secret" not in str(caught.value)
+
+
+def test_a_store_goes_to_other_processes(store):
+    store.write("items/a", b"12")
+    again = pickle.loads(pickle.dumps(store))
+    assert (again.url, again.cache, again.read("items/a")) == (store.url, store.cache, b"12")
+
+
+@pytest.fixture
+def far(tmp_path):
+    """A far place with a file in it, and its cache."""
+    store = Store.open("memory://test/atlas", cache=tmp_path / "cache")
+    store.write("sheets/a.onav", b"map of a")
+    return store
+
+
+def test_far_files_are_copied_once(far, tmp_path, monkeypatch):
+    path = far.fetch("sheets/a.onav", 8, sha256(b"map of a"))
+    assert path.read_bytes() == b"map of a" and path.suffix == ".onav"
+    assert path.is_relative_to(tmp_path / "cache")
+    monkeypatch.setattr(Store, "download", lambda *_: pytest.fail("was there already"))
+    assert far.fetch("sheets/a.onav", 8, sha256(b"map of a")) == path
+
+
+def test_a_copy_that_was_cut_is_fetched_again(far):
+    path = far.fetch("sheets/a.onav", 8, sha256(b"map of a"))
+    path.write_bytes(b"map")
+    assert far.fetch("sheets/a.onav", 8, sha256(b"map of a")).read_bytes() == b"map of a"
+
+
+def test_what_is_not_as_the_catalogue_says_is_refused(store):
+    store.write("sheets/a.onav", b"map of a")
+    with pytest.raises(StorageError, match=r"half there or altered: 8 bytes, the catalogue says 9"):
+        store.fetch("sheets/a.onav", 9, sha256(b"map of a"))
+    with pytest.raises(StorageError, match="damaged or altered"):
+        store.fetch("sheets/a.onav", 8, sha256(b"map of b"))
+    with pytest.raises(StorageError, match="no such file"):
+        store.fetch("sheets/b.onav", 8, sha256(b"map of b"))
+    assert store.cache is not None
+    assert not [path for path in store.cache.rglob("*") if path.is_file()]
+
+
+def test_near_files_are_read_where_they_lie(tmp_path):
+    store = Store.open(str(tmp_path))
+    store.write("sheets/a.onav", b"map of a")
+    path = store.fetch("sheets/a.onav", 8, sha256(b"map of a"))
+    assert path == tmp_path / "sheets" / "a.onav"
+    path.write_bytes(b"map of b")
+    os.utime(path, (1, 1))
+    with pytest.raises(StorageError, match="damaged or altered"):
+        store.fetch("sheets/a.onav", 8, sha256(b"map of a"))
+
+
+def test_what_was_not_used_for_longest_leaves_the_cache(far, monkeypatch):
+    monkeypatch.setenv("ORTHONAV_CACHE_GB", "25e-9")  # three files of 8 bytes
+    monkeypatch.setattr(cache_module, "GRACE_S", 50)
+    paths = {}
+    for number, name in enumerate("bcd"):
+        data = f"map of {name}".encode()
+        far.write(f"sheets/{name}.onav", data)
+        paths[name] = far.fetch(f"sheets/{name}.onav", 8, sha256(data))
+        os.utime(paths[name], (time.time() - 1000 + number,) * 2)
+    far.fetch("sheets/b.onav", 8, sha256(b"map of b"))  # used again
+    far.fetch("sheets/a.onav", 8, sha256(b"map of a"))
+    assert [name for name, path in paths.items() if path.exists()] == ["b", "d"]
+    monkeypatch.setenv("ORTHONAV_CACHE_GB", "1e-9")
+    far.write("sheets/e.onav", b"map of e")
+    far.fetch("sheets/e.onav", 8, sha256(b"map of e"))
+    left = [name for name, path in paths.items() if path.exists()]
+    assert left == ["b"]  # used a moment ago: somebody is about to open it
+
+
+def test_where_the_cache_is(monkeypatch, tmp_path, far):
+    monkeypatch.setenv("ORTHONAV_CACHE", str(tmp_path / "own"))
+    assert cache_folder() == tmp_path / "own"
+    monkeypatch.delenv("ORTHONAV_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_folder() == tmp_path / "orthonav" / "atlas"
+    monkeypatch.setenv("ORTHONAV_CACHE_GB", "much")
+    with pytest.raises(StorageError, match="must be a number, got 'much'"):
+        far.fetch("sheets/a.onav", 8, sha256(b"map of a"))

@@ -1,0 +1,134 @@
+"""Means of cells as parts of a map: close to what they were, and refused where they do not fit."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from helpers import textured
+from orthonav.embed.cells import CellLayout
+from orthonav.embed.whitened import CellSheet, WhitenedRecipe, learn
+from orthonav.errors import MapFileError
+from orthonav.geo.grid import TileGrid
+from orthonav.mapfile.reader import MapFile
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.prepare.cellparts import StoredCells, cell_parts
+from orthonav.represent.gradients import OrientedGradients
+
+GRID = TileGrid(0.0, 0.0, 1.0, 128, 32, 6, 5)
+LAYOUT = CellLayout(4, 4)
+
+
+@pytest.fixture(scope="module")
+def cells():
+    """Cells of a picture of which a corner is not valid."""
+    grey = textured((GRID.height_px, GRID.width_px))
+    valid = np.ones(grey.shape, bool)
+    valid[:50, :70] = False
+    made = CellSheet(LAYOUT, *grey.shape, 7)
+    made.fill(0, 0, OrientedGradients()(grey, valid), valid)
+    return made
+
+
+def opened(parts):
+    manifest = SimpleNamespace(sheets=[SimpleNamespace(grid=GRID)])
+    return MapFile(Path("a.onav"), 0, manifest, parts)
+
+
+def stored(cells, **changes):
+    parts = {**cell_parts(cells), **changes}
+    found = StoredCells.of(opened(parts), LAYOUT, cells.means.shape[2])
+    assert found is not None
+    return found
+
+
+def test_means_come_back_as_they_were(cells):
+    means, share = stored(cells).read(0, 0, *cells.valid.shape)
+    largest = np.abs(cells.means).max(axis=2, keepdims=True)
+    assert (np.abs(means - cells.means) <= largest * 0.0045 + 1e-6).all()
+    assert np.abs(share - cells.valid).max() <= 1 / 255
+    assert ((share == 1) == (cells.valid == 1)).all() and (share[:10, :10] == 0).all()
+
+
+def test_tiles_are_embedded_as_from_the_imagery(cells):
+    tiles_px = np.mgrid[:6, :5].reshape(2, -1).T * 32
+    embedder = learn(WhitenedRecipe(dims=16), cells, tiles_px)
+    again = CellSheet(LAYOUT, GRID.height_px, GRID.width_px, 7)
+    again.put(0, 0, *stored(cells).read(0, 0, *cells.valid.shape))
+    alike = embedder.tiles(cells, tiles_px).astype(float) * embedder.tiles(again, tiles_px)
+    assert alike.sum(axis=1).min() > 0.999
+
+
+def test_threads_learn_and_embed_the_same(cells, monkeypatch):
+    monkeypatch.setattr("orthonav.embed.whitened.CHUNK_TILES", 4)
+    tiles_px = np.mgrid[:6, :5].reshape(2, -1).T * 32
+    one, three = (learn(WhitenedRecipe(dims=16), cells, tiles_px, each) for each in (1, 3))
+    assert np.array_equal(one.mean, three.mean) and np.array_equal(one.basis, three.basis)
+    assert np.array_equal(one.tiles(cells, tiles_px), one.tiles(cells, tiles_px, 3))
+
+
+@pytest.mark.parametrize("step", [1, 2, 3])
+def test_cells_of_tiles_are_those_of_the_sheet(step):
+    sheet = CellSheet(CellLayout(4 * step, 4), 4 * (32 * step + 20), 4 * (32 * step + 9), 2)
+    sheet.means[:] = np.random.default_rng(0).random(sheet.means.shape)
+    tiles_px = np.array([[0, 0], [4, 12], [20, 8]])
+    reach = np.arange(32) * step
+    row, col = (tiles_px // 4).T
+    expected = sheet.means[(row[:, None] + reach)[:, :, None], (col[:, None] + reach)[:, None]]
+    assert np.array_equal(sheet.micro_cells(sheet.means, tiles_px), expected)
+    with pytest.raises(IndexError):
+        sheet.micro_cells(sheet.means, np.array([[400, 0]]))
+
+
+def test_windows_may_reach_beyond_the_sheet(cells):
+    found = stored(cells)
+    rows, cols = cells.valid.shape
+    means, share = found.read(rows - 3, -2, 8, 10)
+    whole, _ = found.read(0, 0, rows, cols)
+    assert np.array_equal(means[:3, 2:], whole[-3:, :8])
+    assert not means[3:].any() and not share[3:].any() and not share[:, :2].any()
+    for outside in ((-9, 0, 4, 4), (0, cols, 4, 4), (0, 0, 0, 0)):
+        means, share = found.read(*outside)
+        assert means.shape == (*outside[2:], 7) and not means.any() and not share.any()
+
+
+def test_shares_are_kept_only_where_something_is_missing(cells):
+    assert set(cell_parts(cells)) == {f"sheet0/cells/{n}" for n in ("codes", "scale", "valid")}
+    whole = CellSheet(LAYOUT, GRID.height_px, GRID.width_px, 7)
+    whole.valid[:] = 1
+    parts = cell_parts(whole)
+    assert set(parts) == {"sheet0/cells/codes", "sheet0/cells/scale"}
+    means, share = stored(whole).read(0, 0, 4, 4)
+    assert (share == 1).all() and not means.any()
+
+
+def test_one_channel_is_kept_as_well():
+    grey = CellSheet(LAYOUT, GRID.height_px, GRID.width_px, 1)
+    grey.means[:] = np.random.default_rng(0).random(grey.means.shape)
+    grey.valid[:] = 1
+    means, _ = stored(grey).read(0, 0, *grey.valid.shape)
+    assert np.abs(means - grey.means).max() < 0.002
+
+
+@pytest.mark.parametrize("name", ["codes", "scale", "valid"])
+def test_cells_that_are_not_those_of_the_grid_are_refused(cells, name):
+    part = cell_parts(cells)[f"sheet0/cells/{name}"]
+    for other in (part[:-1], part.astype(np.float32), part[0]):
+        with pytest.raises(MapFileError, match="cells"):
+            stored(cells, **{f"sheet0/cells/{name}": other})
+    with pytest.raises(MapFileError, match="cells"):
+        StoredCells.of(opened(cell_parts(cells)), LAYOUT, 3)
+
+
+def test_maps_carry_cells_only_where_asked(make_ortho, tmp_path, monkeypatch):
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 4)
+    ortho = make_ortho(tmp_path / "2019-06.tif", textured((200, 200)))
+    made = {}
+    for cells in (False, True):
+        out = tmp_path / f"{cells}.onav"
+        request = {"tile_px": 64, "overlap": 0.75, "registration": False}
+        made[cells] = build_map(BuildRequest([ortho], out, cells=cells, **request)).manifest
+    without, with_cells = (set(made[each].parts) for each in (False, True))
+    assert {name.rpartition("/")[0] for name in with_cells - without} == {"sheet0/cells"}
+    assert all(made[True].parts[name] == made[False].parts[name] for name in without)
