@@ -11,6 +11,8 @@ from pathlib import Path
 import cv2
 
 from benchmarks import (
+    atlas_build,
+    atlas_search,
     building,
     comparison,
     growth,
@@ -38,6 +40,8 @@ SECTIONS: dict[str, Callable[[Workplace], Section]] = {
     "track": tracking.measure,
     "onboard": onboard.measure,
     "page": view_page.measure,
+    "atlas-build": atlas_build.measure,
+    "atlas-search": atlas_search.measure,
 }
 
 

@@ -51,6 +51,7 @@ def test_the_demo(small_demo, tmp_path, capsys, names_in):
     assert "<script src" not in page and "@import" not in page
 
 
+@pytest.mark.slow
 def test_the_demo_may_be_repeated_but_replaces_nothing_else(
     small_demo, tmp_path, capsys, names_in, monkeypatch
 ):

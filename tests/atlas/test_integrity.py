@@ -293,7 +293,7 @@ def test_check(near, capfd):
     assert (code, done.out) == (0, f"whole, by names and sizes: {near.url}\n")
     near.store.remove(near.sheets()[HERE].assets["map"].name)
     near.store.write(".atlas.json.a1b2c3d4.tmp.json", b"")
-    code, done = run(capfd, "check", near.url, "--clean", "--min-age-h", "-1")
+    code, done = run(capfd, "check", near.url, "--clean", "--min-age-h", "0")
     assert code == 3 and "missing file    sheets/" in done.out and "1 problems" in done.out
     assert "(put right)" in done.out
     code, done = run(capfd, "check", near.url, "--json", "--deep")

@@ -13,7 +13,7 @@ from orthonav.atlas.build import AtlasRequest, build_atlas
 from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.cluster import PlainRunner
 from orthonav.atlas.ground import Ground
-from orthonav.atlas.index import MANIFEST, make_index, read_manifest, stale_sheets
+from orthonav.atlas.index import MANIFEST, IndexManifest, make_index, read_manifest, stale_sheets
 from orthonav.atlas.lookup import AtlasLookup
 from orthonav.atlas.lost import LostLocator, _against
 from orthonav.atlas.recipe import CoarseRecipe
@@ -22,7 +22,7 @@ from orthonav.flight.folder import open_flight
 from orthonav.geo.frames import distances_m
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
-from orthonav.onboard.run import localize_flight
+from orthonav.onboard.run import localize_flight, locate_view
 from orthonav.records import Fix, NoFix
 from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 
@@ -173,6 +173,29 @@ def test_a_sheet_that_goes_is_masked_and_one_that_comes_is_added(atlas, tmp_path
         assert not lookup.unknown
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda plain: plain["shards"][0].update(name="../../../tmp/x"), "name"),
+        (lambda plain: plain["shards"][0].update(base=-5), "shard"),
+        (lambda plain: plain["shards"][0]["parts"][0].update(rows=2.5), "rows"),
+        (lambda plain: _asset(plain).update(size_bytes="x"), "size"),
+        (lambda plain: _asset(plain).update(sha256="../../../etc/passwd"), "sha256"),
+        (lambda plain: plain.update(shards=7), "cannot be read"),
+    ],
+    ids=["name", "base", "rows", "size", "sha256", "shards"],
+)
+def test_an_index_of_a_stranger_is_checked(atlas, change, words):
+    plain = json.loads(atlas.store.read(MANIFEST))
+    change(plain)
+    with pytest.raises(AtlasError, match=words):
+        IndexManifest.from_json(json.dumps(plain).encode())
+
+
+def _asset(plain):
+    return plain["files"]["trained.safetensors"]
+
+
 def test_no_index_and_a_damaged_one_are_named(atlas, tmp_path):
     shutil.copytree(atlas.url, tmp_path / "copy")
     damaged = Atlas.open(tmp_path / "copy")
@@ -196,13 +219,31 @@ def test_an_index_cannot_name_files_elsewhere(atlas, tmp_path, name):
         AtlasLookup(crafted)
 
 
+def evidence(**values):
+    return {
+        "strength": 50.0,
+        "rival": 10.0,
+        "look": 20.0,
+        "look_rival": 5.0,
+        "fine": np.nan,
+        "fine_rival": np.nan,
+        **values,
+    }
+
+
 def test_the_best_elsewhere_in_the_atlas_is_the_rival():
-    one = {"strength": 50.0, "rival": 10.0, "look": 20.0, "look_rival": 5.0, "fine": np.nan}
-    other = {"strength": 30.0, "look": 4.0, "fine": 40.0}
-    found = _against({**one, "fine_rival": np.nan}, [other])
+    found = _against(evidence(), [evidence(strength=30.0, look=4.0, fine=40.0)])
     assert found["rival"] == 30.0
     assert found["look_rival"] == 5.0
     assert np.isnan(found["fine_rival"])
+
+
+def test_the_finest_level_does_not_speak_against_a_rival_not_looked_at_there():
+    doubtful = evidence(strength=60.0, fine=90.0, fine_rival=20.0)
+    found = _against(doubtful, [evidence(strength=60.0), evidence(strength=20.0, fine=30.0)])
+    assert np.isnan(found["fine"]) and np.isnan(found["fine_rival"])
+    both = _against(doubtful, [evidence(strength=60.0, fine=80.0)])
+    assert (both["fine"], both["fine_rival"]) == (90.0, 80.0)
 
 
 def test_localize_takes_an_atlas(atlas, flown, tmp_path, run):
@@ -215,6 +256,25 @@ def test_localize_takes_an_atlas(atlas, flown, tmp_path, run):
     refused = run("localize", "--atlas", atlas.url, flown, "--out", out, "--track")
     assert refused.code == 1
     assert "--track" in refused.err
+
+
+def test_telemetry_that_is_nonsense_ends_nothing(atlas, flown):
+    flight = open_flight(flown)
+    view = next(iter(flight.views))
+    for change in (
+        {"agl_m": np.nan},
+        {"agl_m": -5.0},
+        {"pitch_deg": 80.0},
+        {"yaw_std_deg": -5.0, "yaw_deg": 10.0},
+        {"lean_std_deg": np.nan},
+    ):
+        telemetry = dataclasses.replace(view.telemetry, **change)
+        with AtlasLookup(atlas) as lookup:
+            locator = LostLocator(Ground(atlas), lookup, heading_known="yaw_std_deg" in change)
+            outcome, _ = locate_view(locator, view.grey(), flight.camera, telemetry)
+        assert isinstance(outcome, NoFix)
+        assert outcome.reason != "internal_error"
+        assert locator.state_name == "searching"
 
 
 def test_blank_views_are_refused_and_end_nothing(atlas, flown):

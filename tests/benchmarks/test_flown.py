@@ -160,6 +160,7 @@ def test_a_wheel_in_a_word(wheel, told):
     assert install._kind(wheel) == told
 
 
+@pytest.mark.slow
 def test_samples_become_a_csv_and_a_picture(tmp_path):
     hours = np.linspace(0.01, 1, 40)
     samples = [soak.Sample(n * 10**9, 200.0, 210.0, 0.5 * n, 0.0, n) for n in range(40)]

@@ -302,6 +302,7 @@ def test_without_faiss_the_extra_is_named(monkeypatch):
 # SuperPoint.
 
 
+@pytest.mark.slow
 def test_superpoint_words(tmp_path):
     pytest.importorskip("faiss")
     pytest.importorskip("torch")

@@ -348,6 +348,7 @@ torch.distributed.destroy_process_group()
 """
 
 
+@pytest.mark.slow
 def test_two_processes_learn_one_network(tmp_path):
     """Started as torchrun starts them; each writes the network it ends with."""
     with socket.socket() as free:

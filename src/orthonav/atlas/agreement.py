@@ -25,6 +25,14 @@ SCALE_SLACK = 0.12
 """How far heading and scale of two views of one hypothesis may be from each other."""
 CLIMB_PER_S = 0.02
 MIN_NEW = 0.15
+"""Share of a view that must be new ground for it to count at all: hovering proves nothing."""
+ANCHORS = 30
+"""Places that counted and are remembered: circling over them proves nothing more."""
+MAX_REACH_M = 5_000.0
+"""A hypothesis that may be farther from where it was is forgotten: no gap is bridged blindly."""
+MIN_VELOCITY_S = 0.5
+AGILE_MPS = 10.0
+"""Views closer in time say nothing of the velocity; it may change by so much and by half."""
 MISSED = 1.6
 """Nats that a view of new ground costs a hypothesis of which it does not speak."""
 CHANCE = 0.05
@@ -59,12 +67,18 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A chain of places; `last` is the latest, seen at `time_ns`, `views` what agrees in views."""
+    """A chain of places; `last` is the latest, seen at `time_ns`.
+
+    `views` is what agrees, in views of new ground; `worth` the log odds that the latest view alone
+    gave it; `anchors` latitudes and longitudes of views that counted; `missed` views since.
+    """
 
     last: Seen
     time_ns: int
     log_odds: float
     views: float
+    worth: float
+    anchors: tuple[tuple[float, float], ...]
     velocity_en_mps: NDArray[np.float64] | None = None
     missed: int = 0
 
@@ -73,7 +87,8 @@ class Hypothesis:
         dt_s = max(0.0, (time_ns - self.time_ns) / 1e9)
         speed = MAX_SPEED_MPS
         if self.velocity_en_mps is not None:
-            speed = min(speed, 0.5 * float(np.hypot(*self.velocity_en_mps)) + 5.0)
+            told = float(np.hypot(*self.velocity_en_mps))
+            speed = min(speed, (0.5 + self.missed) * told + AGILE_MPS)
         return SLACK_M + speed * dt_s
 
     def expected(self, time_ns: int) -> tuple[float, float]:
@@ -116,14 +131,19 @@ class Agreement:
         expects the view: the share that was looked at there of all that was looked at.
         """
         gain = math.log(FOUND / min(max(chance, CHANCE), FOUND))
-        made = [Hypothesis(each, time_ns, min(each.log_odds, MAX_LOG_ODDS), 1.0) for each in seen]
+        made: list[Hypothesis] = []
+        speaking = [each for each in seen if _worth(each, gain) > 0]
         for old in self.hypotheses:
+            if time_ns < old.time_ns or old.reach_m(time_ns) > MAX_REACH_M:
+                continue
             made += [
                 _followed(old, each, time_ns, side_m, gain)
-                for each in seen
+                for each in speaking
                 if old.fits(each, time_ns)
             ]
             made.append(replace(old, log_odds=old.log_odds - MISSED, missed=old.missed + 1))
+        # Last, for of two that say the same the one that is older comes first.
+        made += [_begun(each, time_ns) for each in seen]
         kept = _distinct(made, side_m)
         # Taken from all alike: what is not remembered must not make them equal.
         beyond = max(0.0, kept[0].log_odds - FORGOTTEN_NATS) if kept else 0.0
@@ -143,27 +163,64 @@ class Agreement:
         return float(np.exp(odds[1] - np.logaddexp.reduce(odds)))
 
     @property
+    def confidence(self) -> float:
+        """Probability that the latest view is where the likeliest hypothesis has it: no more than
+        the view itself says where it was expected."""
+        best = self.best
+        if best is None:
+            return 0.0
+        return min(self.probability, 1 / (1 + math.exp(-best.worth)))
+
+    @property
     def agreed(self) -> bool:
         """Whether enough views speak for the likeliest, the latest among them."""
         best = self.best
         return best is not None and best.views >= MIN_VIEWS and best.missed == 0
 
 
+def _worth(seen: Seen, gain: float) -> float:
+    """What a view found where it was expected says, in nats."""
+    return min(seen.log_odds, MAX_LOG_ODDS) + gain
+
+
+def _begun(seen: Seen, time_ns: int) -> Hypothesis:
+    odds = min(seen.log_odds, MAX_LOG_ODDS)
+    return Hypothesis(seen, time_ns, odds, 1.0, odds, ((seen.lat_deg, seen.lon_deg),))
+
+
 def _followed(old: Hypothesis, seen: Seen, time_ns: int, side_m: float, gain: float) -> Hypothesis:
+    place = seen.lat_deg, seen.lon_deg
+    nearest_m = float(distances_m([place] * len(old.anchors), old.anchors).min())
+    new = min(1.0, nearest_m / max(side_m, 1.0))
+    anchors = (*old.anchors, place)[-ANCHORS:]
+    if new < MIN_NEW:
+        new, anchors = 0.0, old.anchors
+    worth = _worth(seen, gain)
+    return Hypothesis(
+        last=seen,
+        time_ns=time_ns,
+        log_odds=max(old.log_odds + new * worth, min(seen.log_odds, MAX_LOG_ODDS)),
+        views=old.views + new,
+        worth=worth,
+        anchors=anchors,
+        velocity_en_mps=_velocity(old, seen, (time_ns - old.time_ns) / 1e9),
+    )
+
+
+def _velocity(old: Hypothesis, seen: Seen, dt_s: float) -> NDArray[np.float64] | None:
+    """Metres per second east and north from the last place to this one."""
+    if dt_s < MIN_VELOCITY_S:
+        return old.velocity_en_mps
     frame = LocalFrame(old.last.lat_deg, old.last.lon_deg)
-    moved = frame.en_from_latlon(seen.lat_deg, seen.lon_deg)
-    dt_s = (time_ns - old.time_ns) / 1e9
-    velocity = moved / dt_s if dt_s > 0 else old.velocity_en_mps
-    new = min(1.0, max(MIN_NEW, float(np.hypot(*moved)) / max(side_m, 1.0)))
-    worth = min(seen.log_odds, MAX_LOG_ODDS) + gain
-    odds = old.log_odds + new * worth
-    return Hypothesis(seen, time_ns, odds, old.views + new, velocity)
+    velocity = frame.en_from_latlon(seen.lat_deg, seen.lon_deg) / dt_s
+    speed = float(np.hypot(*velocity))
+    return np.asarray(velocity * min(1.0, MAX_SPEED_MPS / max(speed, 1e-9)))
 
 
 def _distinct(made: Sequence[Hypothesis], side_m: float) -> list[Hypothesis]:
     """The likeliest of those that say the same, best first, without those that are hopeless."""
     kept: list[Hypothesis] = []
-    for each in sorted(made, key=lambda one: -one.log_odds):
+    for each in sorted(made, key=lambda one: (-one.log_odds, -one.views)):
         if kept and each.log_odds < kept[0].log_odds - HOPELESS:
             break
         place = (each.last.lat_deg, each.last.lon_deg)

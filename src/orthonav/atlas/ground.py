@@ -10,10 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.atlas.catalog import Atlas
+from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.errors import AtlasError, MapFileError
 from orthonav.geo.camera import Camera
+from orthonav.geo.frames import LocalFrame
 from orthonav.localizer import Localizer
-from orthonav.localizer.registration import PreparedFootprint, RegistrationLocalizer
+from orthonav.localizer.registration import (
+    PRIOR_SIGMAS,
+    PreparedFootprint,
+    RegistrationLocalizer,
+)
 from orthonav.mapfile import open_map
 from orthonav.records import NoFix, Prior, Telemetry
 from orthonav.register.pose import Pose
@@ -21,13 +27,15 @@ from orthonav.register.registrar import Registered
 
 log = logging.getLogger(__name__)
 
-MAX_OPEN = 12
+MAX_OPEN = 16
 """Sheets kept open: their decoded pictures take up to 64 MB each."""
+BORDER_SHARE = 0.25
+"""A sheet is looked at where the middle of a view may lie so much of its side beyond its box."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a view may have been taken: camera, heading of the view's top, scale.
+    """Where a view may have been taken: camera, middle of what it sees, heading of its top, scale.
 
     `turn_std_rad` and `reach_m` say how far from there it is worth looking. `log_scale` is the
     logarithm of true over told height.
@@ -35,6 +43,7 @@ class Place:
 
     lat_deg: float
     lon_deg: float
+    middle_latlon_deg: tuple[float, float]
     turn_rad: float
     log_scale: float
     reach_m: float
@@ -52,7 +61,8 @@ class Sighting:
     log_scale: float
     covariance: NDArray[np.float64]
     evidence: Mapping[str, float]
-    sheet: str
+    confidence: RegisteredConfidence | None
+    radius_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,23 +80,47 @@ class Ground:
     def __init__(self, atlas: Atlas) -> None:
         self.atlas = atlas
         self._names = atlas.recipe.sheets
-        self._open: OrderedDict[str, RegistrationLocalizer | None] = OrderedDict()
+        self._open: OrderedDict[str, RegistrationLocalizer] = OrderedDict()
+        self._absent: set[str] = set()
 
-    def at(self, lat_deg: float, lon_deg: float) -> tuple[str, RegistrationLocalizer | None]:
-        """The sheet that a place lies on, and what registers there; None where there is none.
+    def register(self, view: ViewOnGround, place: Place, side_m: float) -> Sighting | None:
+        """The best place of a view `side_m` wide around a place, None where it cannot be compared.
 
-        Raises `StorageError` where the sheet cannot be fetched. A sheet that is damaged counts as
-        absent and is told of once.
+        On every sheet that may hold the middle of the view: sheets reach half a tile beyond their
+        box. Raises `StorageError` where one cannot be fetched.
         """
-        name = self._names.name_at(lat_deg, lon_deg)
-        if name in self._open:
-            self._open.move_to_end(name)
-            return name, self._open[name]
-        found = self._opened(name)
-        self._open[name] = found
-        while len(self._open) > MAX_OPEN:
-            self._open.popitem(last=False)
-        return name, found
+        best: Sighting | None = None
+        for name in self._near(place, side_m):
+            sheet = self._at(name)
+            found = None if sheet is None else _registered(sheet, view, place)
+            if found and (not best or found.evidence["strength"] > best.evidence["strength"]):
+                best = found
+        return best
+
+    def _near(self, place: Place, side_m: float) -> list[str]:
+        """Names of the sheets within reach of the middle of a view."""
+        lat, lon = place.middle_latlon_deg
+        frame = LocalFrame(lat, lon)
+        reach_m = place.reach_m + BORDER_SHARE * side_m
+        corners = np.array([[-reach_m, -reach_m], [reach_m, reach_m]])
+        lats, lons = frame.latlon_from_en(corners)
+        box = float(lons[0]), float(lats[0]), float(lons[1]), float(lats[1])
+        return list(self._names.over(box))
+
+    def _at(self, name: str) -> RegistrationLocalizer | None:
+        """What registers on a sheet, None where there is none or it is damaged: told once."""
+        if name in self._absent:
+            return None
+        if name not in self._open:
+            found = self._opened(name)
+            if found is None:
+                self._absent.add(name)
+                return None
+            self._open[name] = found
+            while len(self._open) > MAX_OPEN:
+                self._open.popitem(last=False)
+        self._open.move_to_end(name)
+        return self._open[name]
 
     def _opened(self, name: str) -> RegistrationLocalizer | None:
         sheet = self.atlas.sheets().get(name)
@@ -98,27 +132,22 @@ class Ground:
             log.warning("sheet %s cannot be used: %s", name, error)
             return None
 
-    def register(self, view: ViewOnGround, place: Place) -> Sighting | None:
-        """The best place of a view around a place, None where nothing can be compared."""
-        name, sheet = self.at(place.lat_deg, place.lon_deg)
-        if sheet is None:
-            return None
-        told = replace(view.telemetry, yaw_deg=math.degrees(place.turn_rad))
-        prepared = sheet.prepared(view.grey, view.camera, told, True)
-        if isinstance(prepared, NoFix):
-            return None
-        prior = replace(prepared.prior, turn_rad=place.turn_rad, turn_std_rad=place.turn_std_rad)
-        prepared = replace(prepared, prior=prior)
-        within = Prior(place.lat_deg, place.lon_deg, place.reach_m / 3)
-        if not sheet.touches_map(within, prepared):
-            return None
-        best = sheet.best(prepared, within)
-        return None if best is None else _sighting(name, sheet, prepared, best)
+
+def _registered(sheet: RegistrationLocalizer, view: ViewOnGround, place: Place) -> Sighting | None:
+    told = replace(view.telemetry, yaw_deg=math.degrees(place.turn_rad))
+    prepared = sheet.prepared(view.grey, view.camera, told, True)
+    if isinstance(prepared, NoFix):
+        return None
+    prior = replace(prepared.prior, turn_rad=place.turn_rad, turn_std_rad=place.turn_std_rad)
+    prepared = replace(prepared, prior=prior)
+    within = Prior(place.lat_deg, place.lon_deg, place.reach_m / PRIOR_SIGMAS)
+    if not sheet.touches_map(within, prepared):
+        return None
+    best = sheet.best(prepared, within)
+    return None if best is None else _sighting(sheet, prepared, best)
 
 
-def _sighting(
-    name: str, sheet: RegistrationLocalizer, view: PreparedFootprint, best: Registered
-) -> Sighting:
+def _sighting(sheet: RegistrationLocalizer, view: PreparedFootprint, best: Registered) -> Sighting:
     pose: Pose = best.placed.pose
     lat, lon = sheet.sheet.frame.latlon_from_en(sheet.camera_en_m(view, pose))
     return Sighting(
@@ -128,5 +157,6 @@ def _sighting(
         log_scale=pose.log_scale,
         covariance=sheet.covariance(view, best.placed),
         evidence=best.evidence(),
-        sheet=name,
+        confidence=sheet.confidence,
+        radius_m=sheet.radius_m,
     )

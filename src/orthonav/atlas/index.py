@@ -8,6 +8,7 @@ checksums and is written last: without it there is no index.
 
 import hashlib
 import json
+import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -44,6 +45,10 @@ MANY_TILES, MANY_DIMS = 3_000_000, 64
 """Of more tiles than this so many components are kept: half the time and memory of a search."""
 MIN_TILES = 16
 MAX_MANIFEST_BYTES = 64 * 2**20
+MAX_ROWS = 10**6
+"""Of a sheet."""
+_NAME = re.compile(r"[a-z0-9][a-z0-9.-]{0,80}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
 Progress = Callable[[str, float], None]
 
 
@@ -109,25 +114,41 @@ class IndexManifest:
             plain: Any = json.loads(data)
             if plain["format"] != FORMAT or plain["schema"] != SCHEMA:
                 raise ValueError(f"format {plain['format']!r:.40}, schema {plain['schema']!r:.20}")
-            shards = tuple(
-                ShardInfo(
-                    str(shard["name"]),
-                    int(shard["base"]),
-                    tuple(Part(**part) for part in shard["parts"]),
-                )
-                for shard in plain["shards"]
-            )
-            files = {_safe(name): Asset(**asset) for name, asset in plain["files"].items()}
-            made = cls(VectorRecipe(**plain["recipe"]), shards, files)
-            if any(not part.rows >= 0 for shard in shards for part in shard.parts):
-                raise ValueError("rows below 0")
+            shards = tuple(_shard_info(shard) for shard in plain["shards"])
+            files = {_safe(name): _file(asset) for name, asset in plain["files"].items()}
+            first = 0
+            for shard in shards:
+                if shard.base != first:
+                    raise ValueError(f"shard {shard.name} begins at {shard.base}, not at {first}")
+                first += shard.rows
+            return cls(VectorRecipe(**plain["recipe"]), shards, files)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise AtlasError(f"index of the atlas cannot be read ({error})") from error
-        return made
 
 
-def _safe(name: str) -> str:
-    if Path(name).name != name or name.startswith("."):
+def _shard_info(plain: Any) -> ShardInfo:
+    parts = tuple(Part(**part) for part in plain["parts"])
+    for part in parts:
+        if type(part.rows) is not int or not 0 <= part.rows <= MAX_ROWS:
+            raise ValueError(f"rows of a sheet are {part.rows!r:.40}")
+        if type(part.sheet) is not str or type(part.retired) is not bool:
+            raise ValueError(f"a part of a shard is {part!r:.80}")
+    if type(plain["base"]) is not int:
+        raise ValueError(f"base of a shard is {plain['base']!r:.40}")
+    return ShardInfo(_safe(plain["name"]), plain["base"], parts)
+
+
+def _file(plain: Any) -> Asset:
+    asset = Asset(**plain)
+    if type(asset.size_bytes) is not int or asset.size_bytes < 0:
+        raise ValueError(f"size of a file is {asset.size_bytes!r:.40}")
+    if type(asset.sha256) is not str or not _SHA256.fullmatch(asset.sha256):
+        raise ValueError(f"sha256 of a file is {asset.sha256!r:.80}")
+    return asset
+
+
+def _safe(name: Any) -> str:
+    if type(name) is not str or not _NAME.fullmatch(name):
         raise ValueError(f"no name of a file of an index: {name!r:.60}")
     return name
 

@@ -30,11 +30,13 @@ from orthonav.variants import make_variant
 
 PER_POSE = 60
 """Tiles looked at for each pose."""
-RERANK = 300
-PROBED_SHARES = ((10**6, 0.4), (10**7, 0.2))
-"""Share of all lists that are searched where there are no more tiles than this."""
-LEAST_SHARE = 0.1
+EFFORTS = ((10**6, 0.4, 300), (3 * 10**7, 0.25, 800))
+MOST_EFFORT = 0.085, 1500
+"""Share of all lists that are searched, and tiles compared as they are stored, where there are no
+more tiles than the first: what finds 98 % of what exact search finds among 10^7 tiles, 95 % among
+10^8 (`python -m benchmarks.atlas_search`)."""
 APART_STRIDES = 1.5
+MAX_LAT_DEG = 89.8
 
 
 class AtlasLookup:
@@ -65,10 +67,15 @@ class AtlasLookup:
         self._representation = make_variant(represent.TABLE, EDGES)
         names = [shard.name for shard in manifest.shards]
         self._index = ShardedIndex.open(folder, names)
+        told = [(each.shard.base, each.shard.rows) for each in self._index.shards]
+        if told != [(shard.base, shard.rows) for shard in manifest.shards]:
+            raise AtlasError(f"index of the atlas does not fit together: {atlas.url}")
         self._manifest = manifest
         self._places = [_places(folder, manifest, number) for number in range(len(names))]
-        share = next((s for most, s in PROBED_SHARES if len(self._index) <= most), LEAST_SHARE)
-        self.probes = max(1, round(share * manifest.recipe.lists))
+        tiles = len(self._index)
+        efforts = (effort for most, *effort in EFFORTS if tiles <= most)
+        share, rerank = next(efforts, MOST_EFFORT)
+        self.probes, self.rerank = max(1, round(share * manifest.recipe.lists)), int(rerank)
         if self._embedder.dims != self._index.trained.dims:
             raise AtlasError(f"index of the atlas does not fit together: {atlas.url}")
 
@@ -110,7 +117,7 @@ class AtlasLookup:
         if exact:
             scores, ids = self._index.exact(queries, per_pose)
         else:
-            scores, ids = self._index.search(queries, per_pose, self.probes, RERANK)
+            scores, ids = self._index.search(queries, per_pose, self.probes, self.rerank)
         pose_of = np.repeat(np.arange(len(poses)), per_pose)
         flat_scores, flat_ids = scores.reshape(-1), ids.reshape(-1)
         order = np.argsort(-flat_scores, kind="stable")
@@ -133,7 +140,7 @@ class AtlasLookup:
         for shard, places in zip(self._manifest.shards, self._places, strict=True):
             if shard.base <= number < shard.base + shard.rows:
                 lat, lon = places[number - shard.base].tolist()
-                return lat, lon
+                return (lat, lon) if abs(lat) <= MAX_LAT_DEG and abs(lon) <= 180 else None
         return None
 
 

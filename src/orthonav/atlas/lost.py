@@ -15,11 +15,17 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.atlas.agreement import Agreement, Hypothesis, Seen
+from orthonav.atlas.agreement import (
+    MAX_REACH_M,
+    MIN_VIEWS,
+    Agreement,
+    Hypothesis,
+    Seen,
+)
 from orthonav.atlas.ground import Ground, Place, Sighting, ViewOnGround
 from orthonav.atlas.recipe import CoarseRecipe
 from orthonav.confidence.registered import USUAL_BIAS, USUAL_WEIGHTS, RegisteredConfidence
-from orthonav.errors import AtlasError
+from orthonav.errors import CameraError
 from orthonav.geo.camera import Camera
 from orthonav.geo.frames import LocalFrame, distances_m
 from orthonav.localizer.checks import check_footprint, check_telemetry, check_view
@@ -27,23 +33,29 @@ from orthonav.localizer.rectify import Rectified, prepare_view, rectify_footprin
 from orthonav.localizer.registration import USUAL_CHANCES
 from orthonav.records import Fix, NoFix, Telemetry
 
-CANDIDATES = 40
+CANDIDATES = 24
 """Places of the whole atlas that are registered."""
 TURN_STEP_DEG = 8.0
 LOG_SCALES = (-0.06, 0.06)
 """Headings and scales under which coarse tiles are looked for."""
 KNOWN_SIGMAS = 2.0
-DEFAULT_YAW_STD_DEG = 7.0
+DEFAULT_YAW_STD_DEG, MIN_YAW_STD_DEG = 7.0, 2.0
 REACH_STRIDES = 0.8
 TURN_STD_RAD = math.radians(4.0)
 VIEW_TILES = (0.6, 2.5)
 """Sides of views, in coarse tiles, of which a tile says enough."""
-FOLLOWED = 4
-"""Hypotheses whose next view is looked for where it is expected."""
+FOLLOWED, FOLLOWED_NATS = 4, 4.0
+"""Hypotheses whose next view is looked for where it is expected: so many, no less likely than the
+best by more than this."""
 RIVAL_SHARE = 0.25
 """A rival lies farther from a place than this share of the view's side."""
-SURE_VIEWS, SURE = 2.5, 0.98
-"""A hypothesis this sure is followed without looking through the whole atlas."""
+SURE_VIEWS, SURE, SURE_REACH_M = 2.5, 0.97, 600.0
+"""A hypothesis this sure, and this sure of where the view is, is followed without looking through
+the whole atlas."""
+WHOLE_EVERY = 5
+"""So many views in a row; then it is looked through again."""
+LIKELY = 0.5
+"""Less likely places are no fix."""
 MAX_CONFIDENCE = 0.999
 LEAST = 1e-5
 USUAL_CONFIDENCE = RegisteredConfidence(USUAL_BIAS, USUAL_WEIGHTS, USUAL_CHANCES)
@@ -82,24 +94,34 @@ class LostLocator:
         self._ground, self._lookup = ground, lookup
         self._heading_known = heading_known
         self._agreement = Agreement()
+        self._seen_last = False
+        self._since_whole = 0
 
     @property
     def state_name(self) -> str | None:
         """`searching` until views agree, then `tracking`, `lost` where the latest does not."""
         best = self._agreement.best
-        if best is None or (best.views < SURE_VIEWS and not self._agreement.agreed):
+        if best is None or best.views < MIN_VIEWS:
             return "searching"
-        return "tracking" if self._agreement.agreed else "lost"
+        return "tracking" if self._agreement.agreed and self._seen_last else "lost"
 
     def passed(self, camera: Camera, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """Nothing is known of a view that cannot be used."""
+        self._seen_last = False
         return reason
 
     def locate(self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry) -> Fix | NoFix:
         """Where `grey` (H, W) was taken, once views agree; until then what is missing.
 
-        Raises `StorageError` where the sheets cannot be fetched.
+        Raises `CameraError` where the image is not the camera's, `StorageError` where the sheets
+        cannot be fetched.
         """
+        self._seen_last = False
+        if grey.shape != (camera.height_px, camera.width_px):
+            raise CameraError(
+                f"camera is {camera.width_px} x {camera.height_px} px, "
+                f"the image is {grey.shape[1]} x {grey.shape[0]} px"
+            )
         recipe = self._lookup.recipe
         refused = check_telemetry(telemetry, camera, recipe.gsd_m, self._heading_known)
         refused = refused or check_view(grey)
@@ -121,97 +143,109 @@ class LostLocator:
 
     def _placed(self, view: ViewOnGround, coarse: Rectified, side_m: float) -> Fix | NoFix:
         time_ns = view.telemetry.time_ns
-        expected = self._expected(view, time_ns)
-        local_m2 = sum(math.pi * place.reach_m**2 for place in expected)
-        sightings = [self._ground.register(view, place) for place in expected]
-        searched_m2 = local_m2
-        if not self._is_sure():
-            places = self._candidates(view, coarse)
-            searched_m2 += sum(math.pi * place.reach_m**2 for place in places)
-            sightings += [self._ground.register(view, place) for place in places]
-        found = _distinct([each for each in sightings if each is not None], side_m)
+        places = expected = self._expected(view, coarse, time_ns)
+        if self._is_sure(time_ns, side_m):
+            self._since_whole += 1
+        else:
+            self._since_whole = 0
+            places = [*expected, *self._candidates(view, coarse)]
+        made = (self._ground.register(view, place, side_m) for place in places)
+        found = _distinct([each for each in made if each is not None], side_m)
         seen = [
-            Seen(one.lat_deg, one.lon_deg, one.turn_rad, one.log_scale, odds, key)
+            Seen(one.lat_deg, one.lon_deg, one.turn_rad, one.log_scale, _log_odds(key, found), key)
             for key, one in enumerate(found)
-            if (odds := self._log_odds(key, found)) is not None
         ]
-        chance = local_m2 / searched_m2 if searched_m2 else 1.0
-        if self._is_sure():
-            chance = 0.0  # nothing else was looked at; its own odds are against chance
+        # Where only what was expected was looked at, all of it lies there.
+        all_m2 = _searched_m2(places)
+        chance = _searched_m2(expected) / all_m2 if all_m2 else 1.0
         self._agreement.see(seen, time_ns, side_m, chance)
         return self._outcome(found, view)
 
-    def _is_sure(self) -> bool:
+    def _is_sure(self, time_ns: int, side_m: float) -> bool:
+        """Whether it is enough to look where the view is expected; not for ever."""
         best = self._agreement.best
         return (
             best is not None
             and self._agreement.agreed
             and best.views >= SURE_VIEWS
-            and self._agreement.probability >= SURE
+            and self._agreement.confidence >= SURE
+            and best.reach_m(time_ns) <= max(side_m, SURE_REACH_M)
+            and self._since_whole < WHOLE_EVERY
         )
 
-    def _expected(self, view: ViewOnGround, time_ns: int) -> list[Place]:
+    def _expected(self, view: ViewOnGround, coarse: Rectified, time_ns: int) -> list[Place]:
         """Where hypotheses expect the view."""
         found = []
-        for each in self._agreement.hypotheses[:FOLLOWED]:
-            lat, lon = each.expected(time_ns)
+        hypotheses = self._agreement.hypotheses[:FOLLOWED]
+        for each in hypotheses:
+            if each.log_odds < hypotheses[0].log_odds - FOLLOWED_NATS:
+                break
+            reach_m = each.reach_m(time_ns)
+            if time_ns < each.time_ns or reach_m > MAX_REACH_M:
+                continue
             turn, std = each.last.turn_rad, each.turn_std_rad(time_ns)
             if self._heading_known:
-                turn, std = math.radians(view.telemetry.yaw_deg), self._yaw_std_rad(view.telemetry)
-            reach_m = each.reach_m(time_ns)
-            found.append(Place(lat, lon, turn, each.last.log_scale, reach_m, std))
+                turn = math.radians(view.telemetry.yaw_deg)
+                std = _yaw_std_rad(view.telemetry)
+            camera = each.expected(time_ns)
+            scale = each.last.log_scale
+            middle = _moved(camera, coarse, turn, scale, 1.0)
+            found.append(Place(*camera, middle, turn, scale, reach_m, std))
         return found
-
-    def _yaw_std_rad(self, telemetry: Telemetry) -> float:
-        told = telemetry.yaw_std_deg
-        usable = told is not None and math.isfinite(told)
-        return math.radians(told if usable and told is not None else DEFAULT_YAW_STD_DEG)
 
     def _candidates(self, view: ViewOnGround, coarse: Rectified) -> list[Place]:
         """Places of the whole atlas that are like the view."""
         headings = np.arange(0.0, 360.0, TURN_STEP_DEG)
         if self._heading_known:
-            reach = KNOWN_SIGMAS * math.degrees(self._yaw_std_rad(view.telemetry))
+            reach = KNOWN_SIGMAS * math.degrees(_yaw_std_rad(view.telemetry))
             steps = math.floor(min(180.0, reach) / TURN_STEP_DEG + 0.5)
             headings = view.telemetry.yaw_deg + TURN_STEP_DEG * np.arange(-steps, steps + 1)
         poses = [(math.radians(turn), scale) for turn in headings.tolist() for scale in LOG_SCALES]
         recipe = self._lookup.recipe
         reach_m = REACH_STRIDES * recipe.tile_m * (1 - recipe.overlap)
-        return [
-            _camera_place(each, coarse, reach_m)
-            for each in self._lookup.candidates(coarse, poses, CANDIDATES)
-        ]
-
-    def _log_odds(self, key: int, found: Sequence[Sighting]) -> float | None:
-        """Log odds of one of the places of a view against all the others, best first."""
-        one = found[key]
-        _, sheet = self._ground.at(one.lat_deg, one.lon_deg)
-        if sheet is None:
-            return None
-        rivals = [each.evidence for place, each in enumerate(found) if place != key]
-        evidence = _against(one.evidence, rivals)
-        confidence = sheet.confidence or USUAL_CONFIDENCE
-        likely = min(max(confidence(evidence), LEAST), 1 - LEAST)
-        return math.log(likely / (1 - likely))
+        found = []
+        for each in self._lookup.candidates(coarse, poses, CANDIDATES):
+            middle = each.lat_deg, each.lon_deg
+            camera = _moved(middle, coarse, each.turn_rad, each.log_scale, -1.0)
+            found.append(
+                Place(*camera, middle, each.turn_rad, each.log_scale, reach_m, TURN_STD_RAD)
+            )
+        return found
 
     def _outcome(self, found: Sequence[Sighting], view: ViewOnGround) -> Fix | NoFix:
-        best = self._agreement.best
+        agreement = self._agreement
+        best = agreement.best
         if best is None:
             return NoFix("no_match", "no place of the atlas could be compared with the view")
-        probability = self._agreement.probability
-        if not self._agreement.agreed:
+        confidence = min(agreement.confidence, MAX_CONFIDENCE)
+        if not agreement.agreed or confidence < LIKELY:
             return NoFix(
                 "searching",
-                f"{len(self._agreement.hypotheses)} places are possible; the likeliest is held by "
+                f"{len(agreement.hypotheses)} places are possible; the likeliest is held by "
                 f"{best.views:.1f} views",
             )
-        return _fix(found[best.last.key], best, probability, view, self._radius_m(best))
+        self._seen_last = True
+        return _fix(found[best.last.key], best, confidence, view)
 
-    def _radius_m(self, best: Hypothesis) -> float:
-        _, sheet = self._ground.at(best.last.lat_deg, best.last.lon_deg)
-        if sheet is None:
-            raise AtlasError("a sheet that was just used is gone")
-        return sheet.radius_m
+
+def _searched_m2(places: Sequence[Place]) -> float:
+    return sum(math.pi * place.reach_m**2 for place in places)
+
+
+def _yaw_std_rad(telemetry: Telemetry) -> float:
+    told = telemetry.yaw_std_deg
+    if told is None or not math.isfinite(told):
+        told = DEFAULT_YAW_STD_DEG
+    return math.radians(min(max(told, MIN_YAW_STD_DEG), 180.0))
+
+
+def _log_odds(key: int, found: Sequence[Sighting]) -> float:
+    """Log odds of one of the places of a view against all the others, strongest first."""
+    one = found[key]
+    rivals = [each.evidence for place, each in enumerate(found) if place != key]
+    confidence = one.confidence or USUAL_CONFIDENCE
+    likely = min(max(confidence(_against(one.evidence, rivals)), LEAST), 1 - LEAST)
+    return math.log(likely / (1 - likely))
 
 
 def _rectified(
@@ -228,17 +262,15 @@ def _rectified(
     )
 
 
-def _camera_place(candidate: Candidate, view: Rectified, reach_m: float) -> Place:
-    """Where the camera is if the middle of the view lies where a candidate says."""
-    cos, sin = math.cos(candidate.turn_rad), math.sin(candidate.turn_rad)
-    ahead = view.offset_en_m * math.exp(candidate.log_scale)
-    east = cos * ahead[0] + sin * ahead[1]
-    north = cos * ahead[1] - sin * ahead[0]
-    frame = LocalFrame(candidate.lat_deg, candidate.lon_deg)
-    lat, lon = frame.latlon_from_en(np.array([-east, -north]))
-    return Place(
-        float(lat), float(lon), candidate.turn_rad, candidate.log_scale, reach_m, TURN_STD_RAD
-    )
+def _moved(
+    place: tuple[float, float], view: Rectified, turn_rad: float, log_scale: float, way: float
+) -> tuple[float, float]:
+    """From the camera to the middle of what it sees (`way` 1), or back (-1); degrees."""
+    cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+    ahead = view.offset_en_m * math.exp(log_scale) * way
+    moved = np.array([cos * ahead[0] + sin * ahead[1], cos * ahead[1] - sin * ahead[0]])
+    lat, lon = LocalFrame(*place).latlon_from_en(moved)
+    return float(lat), float(lon)
 
 
 def _distinct(sightings: Sequence[Sighting], side_m: float) -> list[Sighting]:
@@ -255,20 +287,27 @@ def _distinct(sightings: Sequence[Sighting], side_m: float) -> list[Sighting]:
 def _against(
     evidence: Mapping[str, float], rivals: Sequence[Mapping[str, float]]
 ) -> dict[str, float]:
-    """The evidence of a place with the best elsewhere in the whole atlas as its rival."""
+    """The evidence of a place with the best elsewhere in the whole atlas as its rival.
+
+    The finest level says something only where the strongest rival was looked at there too.
+    """
     made = dict(evidence)
-    for rival, value in (("rival", "strength"), ("look_rival", "look"), ("fine_rival", "fine")):
-        others = [each[value] for each in rivals if math.isfinite(each[value])]
-        made[rival] = max([made[rival], *others]) if math.isfinite(made[rival]) else made[rival]
+    for rival, value in (("rival", "strength"), ("look_rival", "look")):
+        made[rival] = max([made[rival], *(each[value] for each in rivals)])
+    strongest = max(rivals, key=lambda each: each["strength"], default=None)
+    if strongest is None or not math.isfinite(made["fine"]):
+        return made
+    if math.isfinite(strongest["fine"]):
+        made["fine_rival"] = max(made["fine_rival"], strongest["fine"])
+    else:
+        made["fine"] = made["fine_rival"] = math.nan
     return made
 
 
-def _fix(
-    one: Sighting, best: Hypothesis, probability: float, view: ViewOnGround, radius_m: float
-) -> Fix:
+def _fix(one: Sighting, best: Hypothesis, confidence: float, view: ViewOnGround) -> Fix:
     covariance = np.array(one.covariance[:2, :2])
     lean_std_deg = view.telemetry.lean_std_deg
-    if lean_std_deg is not None:
+    if lean_std_deg is not None and math.isfinite(lean_std_deg):
         covariance += np.eye(2) * (view.telemetry.agl_m * math.radians(lean_std_deg)) ** 2
     covariance.flags.writeable = False
     evidence = {**one.evidence, "views": best.views, "log_odds": best.log_odds}
@@ -276,8 +315,8 @@ def _fix(
         lat_deg=one.lat_deg,
         lon_deg=one.lon_deg,
         cov_en_m2=covariance,
-        confidence=min(probability, MAX_CONFIDENCE),
-        radius_m=radius_m,
+        confidence=confidence,
+        radius_m=one.radius_m,
         heading_deg=math.degrees(one.turn_rad) % 360,
         agl_m=view.telemetry.agl_m * math.exp(one.log_scale),
         evidence=MappingProxyType(evidence),

@@ -87,11 +87,11 @@ class VectorRecipe:
 
     @classmethod
     def for_count(cls, count: int, dims: int, seed: int = 0) -> "VectorRecipe":
-        """What suits `count` vectors: lists of some hundreds to 1500."""
+        """What suits `count` vectors: lists of up to 1600, 4 bits for every two numbers."""
         list_bits = 4
         while list_bits < 16 and count > 800 * 2 ** (list_bits + 1):
             list_bits += 2
-        quantizers = next((m for m in (32, 24, 16, 8, 4, 2) if dims % m == 0), 2)
+        quantizers = dims // 2 if dims % 4 == 0 else 2
         return cls(dims, list_bits, quantizers, seed)
 
     @property

@@ -1,6 +1,7 @@
 """`orthonav atlas`: what is in an atlas, whether it is whole, and changing it."""
 
 import argparse
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,7 +39,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     check.add_argument(
         "--min-age-h",
-        type=float,
+        type=_hours,
         default=24.0,
         metavar="H",
         help="remove nothing younger: a build puts files before it names them (%(default)g)",
@@ -61,6 +62,17 @@ def add(parser: argparse.ArgumentParser) -> None:
     cut.add_argument(
         "--allow-holes", action="store_true", help="also where sheets under the route are missing"
     )
+
+
+def _hours(text: str) -> float:
+    """Hours, none of them negative."""
+    try:
+        hours = float(text)
+    except ValueError:
+        hours = math.nan
+    if not (math.isfinite(hours) and hours >= 0):
+        raise argparse.ArgumentTypeError(f"expected hours of 0 or more, got '{text}'")
+    return hours
 
 
 def run(options: argparse.Namespace) -> int | None:

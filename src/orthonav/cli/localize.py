@@ -183,9 +183,10 @@ def _on_atlas(options: argparse.Namespace) -> None:
 
     asked = [
         name
-        for name in ("track", "hindsight", "mount", "as_flown", "require_signed")
-        if getattr(options, name)
+        for name in ("track", "hindsight", "mount", "as_flown", "require_signed", "lag")
+        if getattr(options, name) not in (None, False)
     ]
+    asked += ["position"] if options.position != "peak" else []
     if asked or options.registration == "off":
         named = ", ".join(f"--{name.replace('_', '-')}" for name in asked) or "--registration off"
         raise VariantError(f"{named} is for a map: cut one out of the atlas (orthonav atlas cut)")
