@@ -147,6 +147,7 @@ def test_a_run_says_what_it_was_and_is_not_run_twice(place, scene, made, monkeyp
     assert runs.run(place, scene, Method("gradient", "gradient", "gradient")) == written
 
 
+@pytest.mark.slow
 def test_runs_side_by_side_say_what_went_wrong(place, scene, made, tmp_path):
     method = Method("gradient", "gradient", "gradient")
     missing = replace(scene, name="none", past=tmp_path / "none.tif")

@@ -240,6 +240,7 @@ def huge(request, tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_memory_is_bounded_whatever_the_file(huge):
     """Windows of 1024 px: some at 0.2 m, a quarter of all at 1 m, at 4 m the file in one piece."""
     done = subprocess.run(

@@ -272,6 +272,7 @@ def test_suppression_is_that_of_opencv():
     assert suppressed(corners, scores, 0.5) == list(expected)
 
 
+@pytest.mark.slow
 def test_pixels_are_those_of_the_librarys_processor():
     processing = pytest.importorskip("transformers.models.sam.image_processing_pil_sam")
     for shape in ((100, 256), (256, 200), (1500, 700)):

@@ -215,7 +215,7 @@ def test_geotiff_says_where_and_when(tmp_path: Path):
         {"size_m": (float("nan"), 100.0)},
         {"size_m": (float("inf"), 100.0)},
         {"gsd_m": 0.1},
-        {"gsd_m": 6.0},
+        {"gsd_m": 11.0},
         {"gsd_m": float("nan")},
         {"dates": []},
         {"dates": [SUMMER, SUMMER]},

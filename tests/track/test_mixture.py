@@ -96,6 +96,7 @@ def test_what_is_wrong_with_what_is_told_is_learnt():
     assert (np.abs(learnt.mean(axis=0) - BIAS) < [0.01, 0.01, 0.012, 0.012]).all()
 
 
+@pytest.mark.slow
 def test_normalized_errors_are_those_of_its_covariance():
     """Chi-square of two: mean 2. 95 % bounds of the mean over independent flights."""
     values = []

@@ -402,6 +402,7 @@ def test_a_run_is_followed_from_before_its_beginning(visit, small, tmp_path):
         assert page.locator("#said").inner_text() == ""
 
 
+@pytest.mark.slow
 def test_ten_thousand_views(visit, small, tmp_path):
     """All are drawn; the page stays small and the list is a part of them."""
     written = write_long_run(tmp_path, MANY, FRAME, (0.0, 0.0), 130.0)
