@@ -23,6 +23,7 @@ from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.coarse import POOLING, CoarseTiles, read_coarse
 from orthonav.atlas.item import Asset, Sheet
 from orthonav.atlas.shards import TRAINED_NAME, ShardWriter, retire_rows
+from orthonav.atlas.store import digest_of
 from orthonav.atlas.vectors import MAX_LEARNT, Trained, VectorRecipe, train
 from orthonav.embed.whitened import WhitenedEmbedder, whitening
 from orthonav.errors import AtlasError
@@ -411,6 +412,4 @@ def fetch_files(atlas: Atlas, manifest: IndexManifest, folder: Path, *, copy: bo
 
 
 def _asset(path: Path) -> Asset:
-    with path.open("rb") as stream:
-        sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
-    return Asset(f"{FOLDER}/{path.name}", path.stat().st_size, sha256)
+    return Asset(f"{FOLDER}/{path.name}", path.stat().st_size, digest_of(path))

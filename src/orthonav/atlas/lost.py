@@ -25,10 +25,9 @@ from orthonav.atlas.agreement import (
 from orthonav.atlas.ground import Ground, Place, Sighting, ViewOnGround
 from orthonav.atlas.recipe import CoarseRecipe
 from orthonav.confidence.registered import USUAL_BIAS, USUAL_WEIGHTS, RegisteredConfidence
-from orthonav.errors import CameraError
 from orthonav.geo.camera import Camera
 from orthonav.geo.frames import LocalFrame, distances_m
-from orthonav.localizer.checks import check_footprint, check_telemetry, check_view
+from orthonav.localizer.checks import check_footprint, check_telemetry, check_view, require_camera
 from orthonav.localizer.rectify import Rectified, prepare_view, rectify_footprint
 from orthonav.localizer.registration import USUAL_CHANCES
 from orthonav.records import Fix, NoFix, Telemetry
@@ -117,11 +116,7 @@ class LostLocator:
         cannot be fetched.
         """
         self._seen_last = False
-        if grey.shape != (camera.height_px, camera.width_px):
-            raise CameraError(
-                f"camera is {camera.width_px} x {camera.height_px} px, "
-                f"the image is {grey.shape[1]} x {grey.shape[0]} px"
-            )
+        require_camera(grey, camera)
         recipe = self._lookup.recipe
         refused = check_telemetry(telemetry, camera, recipe.gsd_m, self._heading_known)
         refused = refused or check_view(grey)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.errors import CameraError
 from orthonav.geo.camera import Camera, enu_from_camera
 from orthonav.localizer.rectify import Rectified
 from orthonav.records import NoFix, Telemetry
@@ -16,6 +17,15 @@ DARK_LEVEL = 16.0
 BRIGHT_LEVEL = 250.0
 MIN_STD = 3.0
 _SAMPLE_STEP_PX = 8
+
+
+def require_camera(grey: NDArray[np.uint8], camera: Camera) -> None:
+    """Raise `CameraError` where a view (H, W) is not of the camera's size."""
+    if grey.shape != (camera.height_px, camera.width_px):
+        raise CameraError(
+            f"camera is {camera.width_px} x {camera.height_px} px, "
+            f"the image is {grey.shape[1]} x {grey.shape[0]} px"
+        )
 
 
 def check_telemetry(

@@ -10,9 +10,9 @@ from orthonav import represent
 from orthonav.confidence.logistic import LogisticConfidence
 from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.embed.stored import embedder_of
-from orthonav.errors import CameraError, MapFileError, VariantError
+from orthonav.errors import MapFileError, VariantError
 from orthonav.geo.camera import Camera
-from orthonav.localizer.checks import check_rectified, check_telemetry, check_view
+from orthonav.localizer.checks import check_rectified, check_telemetry, check_view, require_camera
 from orthonav.localizer.match import Match, TileMatcher
 from orthonav.localizer.propose import TileProposer
 from orthonav.localizer.rectify import PreparedView, Rectified, prepare_view, rectify
@@ -112,11 +112,7 @@ class Localizer:
         `CameraError` if the camera is not that of the image; everything else that is wrong with a
         view makes a `NoFix`.
         """
-        if grey.shape != (camera.height_px, camera.width_px):
-            raise CameraError(
-                f"camera is {camera.width_px} x {camera.height_px} px, "
-                f"the image is {grey.shape[1]} x {grey.shape[0]} px"
-            )
+        require_camera(grey, camera)
         refused = check_telemetry(telemetry, camera, self.grid.gsd_m, heading_known)
         refused = refused or check_view(grey)
         if refused is not None:

@@ -12,9 +12,9 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import CameraError, MapFileError
+from orthonav.errors import MapFileError
 from orthonav.geo.camera import Camera
-from orthonav.localizer.checks import check_telemetry, check_view
+from orthonav.localizer.checks import check_telemetry, check_view, require_camera
 from orthonav.localizer.levelled import levelled
 from orthonav.localizer.localizer import Localizer
 from orthonav.localizer.odometry import Footprint, Moved, corrected_by, moved_between
@@ -99,11 +99,7 @@ class Tracker:
         A view that shows nothing moves the track on by what is known of the velocity. Raises
         `CameraError` if the camera is not that of the image.
         """
-        if grey.shape != (camera.height_px, camera.width_px):
-            raise CameraError(
-                f"camera is {camera.width_px} x {camera.height_px} px, "
-                f"the image is {grey.shape[1]} x {grey.shape[0]} px"
-            )
+        require_camera(grey, camera)
         refused = check_telemetry(
             telemetry, camera, self._localizer.grid.gsd_m, self._heading_known
         )
