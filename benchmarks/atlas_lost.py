@@ -94,10 +94,10 @@ def flights(
         scale = rng.normal(0, AGL_STD)
         views = []
         for view in range(VIEWS):
-            told_m = AGL_M * math.exp(scale + rng.normal(0, AGL_JITTER))
+            reported_m = AGL_M * math.exp(scale + rng.normal(0, AGL_JITTER))
             east, north = transform * (place + 0.5)
             lon, lat = to_latlon.transform(east, north)
-            telemetry = Telemetry(round(view * EVERY_S * 1e9), math.nan, 0.0, 0.0, told_m)
+            telemetry = Telemetry(round(view * EVERY_S * 1e9), math.nan, 0.0, 0.0, reported_m)
             views.append((_cut(grey, place, heading), telemetry, (lat, lon)))
             step_px = speed * EVERY_S / GSD_M
             place = place + step_px * np.array([math.sin(heading), -math.cos(heading)])

@@ -96,7 +96,7 @@ def _notes(tiles: int) -> tuple[str, ...]:
     return (
         "ms: from the decoded picture to a place, one core, warm; tracked: `Tracker` on views "
         "that follow each other at 5 Hz, shares once it is tracking; the others: each view for "
-        "itself, rectified by orthonav's code under the told heading, height and lean",
+        "itself, rectified by orthonav's code under the told heading, height and tilt",
         "SIFT, ORB: keypoints of the map (1 m) made once; whole map: FLANN; around the true place "
         "(as if it were known): one by one; ratio 0.75, RANSAC similarity, fewer than 8 inliers "
         "are no answer",

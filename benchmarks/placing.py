@@ -22,7 +22,7 @@ TEMPLATE, CANNY, PHASE, MUTUAL, SIFT = "template", "canny", "phase", "mutual", "
 @dataclass(frozen=True)
 class Task:
     """What to place and how: `pixels` and `factor` (map pixels averaged to one) are for methods
-    that are not orthonav's, `told_only` tries no other pose than the told one."""
+    that are not orthonav's, `telemetry_only` tries no other pose than the told one."""
 
     method: str
     map_path: str
@@ -31,7 +31,7 @@ class Task:
     use_prior: bool = False
     pixels: str = ""
     factor: int = 1
-    told_only: bool = False
+    telemetry_only: bool = False
     views: int | None = None
 
 
@@ -152,7 +152,7 @@ def _other(task: Task) -> Placer:
             PHASE: lambda: posed.PhaseSurface(picture),
             MUTUAL: lambda: posed.MutualSurface(picture),
         }
-        method = posed.BestOfPoses(picture, surfaces[task.method](), task.told_only)
+        method = posed.BestOfPoses(picture, surfaces[task.method](), task.telemetry_only)
 
     def place(camera: Any, view: Any) -> Any:
         return method.locate(camera, view, task.heading_known)

@@ -111,8 +111,8 @@ Surface = Callable[[Rectified], Array]
 class BestOfPoses:
     """The highest value of a surface over all poses."""
 
-    def __init__(self, picture: Picture, surface: Surface, told_only: bool) -> None:
-        self._picture, self._surface, self._told_only = picture, surface, told_only
+    def __init__(self, picture: Picture, surface: Surface, telemetry_only: bool) -> None:
+        self._picture, self._surface, self._told_only = picture, surface, telemetry_only
 
     def locate(self, camera: Camera, view: View, heading_known: bool) -> Place:
         """East and north (2,) of the camera in the sheet."""

@@ -58,11 +58,11 @@ class Verdict:
         return np.asarray(self.confidence >= SURE)
 
     @property
-    def wrong_kept(self) -> int:
+    def wrong_accepted(self) -> int:
         """Views kept that are wrong by more than `FAR_M`."""
         return int((self.kept & (self.errors_m > FAR_M)).sum())
 
-    def kept_of_right(self, radius_m: float) -> float:
+    def accepted_of_right(self, radius_m: float) -> float:
         """Share of the right ones that is kept; NaN where none is right."""
         right = self.within(radius_m)
         return float(self.kept[right].mean()) if right.any() else math.nan

@@ -45,7 +45,7 @@ class Baseline:
 
 
 def _told(surface: Callable[[Picture], Any]) -> Callable[[Picture], Any]:
-    return lambda picture: BestOfPoses(picture, surface(picture), told_only=True)
+    return lambda picture: BestOfPoses(picture, surface(picture), telemetry_only=True)
 
 
 BASELINES = (

@@ -33,7 +33,7 @@ class Telemetry:
     (positive pitch looks ahead, positive roll looks left); `agl_m` is the height above ground.
     NaN stands for "not known". Velocities are over ground, true east and north.
     The `_std` ones are standard deviations of what is told, from view to view, None where not
-    known: `lean_std_deg` of pitch and of roll, `vel_std_mps` per axis.
+    known: `tilt_std_deg` of pitch and of roll, `vel_std_mps` per axis.
     """
 
     time_ns: int
@@ -45,7 +45,7 @@ class Telemetry:
     agl_std_m: float | None = None
     prior: Prior | None = None
     vel_en_mps: tuple[float, float] | None = None
-    lean_std_deg: float | None = None
+    tilt_std_deg: float | None = None
     vel_std_mps: float | None = None
 
     def missing(self) -> list[str]:

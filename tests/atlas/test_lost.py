@@ -266,7 +266,7 @@ def test_telemetry_that_is_nonsense_ends_nothing(atlas, flown):
         {"agl_m": -5.0},
         {"pitch_deg": 80.0},
         {"yaw_std_deg": -5.0, "yaw_deg": 10.0},
-        {"lean_std_deg": np.nan},
+        {"tilt_std_deg": np.nan},
     ):
         telemetry = dataclasses.replace(view.telemetry, **change)
         with AtlasLookup(atlas) as lookup:

@@ -115,7 +115,7 @@ def test_a_mounted_locator_is_told_the_truth():
 
 def test_a_known_mount_is_believed_as_well_as_it_is_known():
     model = model_of(MOUNT)
-    assert model.lean_rad == pytest.approx(math.radians(0.8))
+    assert model.tilt_rad == pytest.approx(math.radians(0.8))
     assert model.heading_rad == pytest.approx(math.radians(1.0))
     assert model.log_scale == 0.02 and model.accel_mps2 == Model().accel_mps2
     assert model.off_mount == 0.0

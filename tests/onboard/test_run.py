@@ -155,8 +155,8 @@ def test_the_prior_is_used_only_where_it_should_be(localizer, short):
 
 def test_the_heading_may_be_unknown(localizer, short):
     views = [replace(v, telemetry=replace(v.telemetry, yaw_deg=math.nan)) for v in short.views[:3]]
-    told = localize_flight(SingleViews(localizer), short, views=views)
-    assert set(outcomes(told)) == {"missing_telemetry"}
+    telemetry = localize_flight(SingleViews(localizer), short, views=views)
+    assert set(outcomes(telemetry)) == {"missing_telemetry"}
     untold = localize_flight(SingleViews(localizer, heading_known=False), short, views=views)
     assert set(outcomes(untold)) == {"fix"}
 

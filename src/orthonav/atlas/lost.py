@@ -139,7 +139,7 @@ class LostLocator:
     def _placed(self, view: ViewOnGround, coarse: Rectified, side_m: float) -> Fix | NoFix:
         time_ns = view.telemetry.time_ns
         places = expected = self._expected(view, coarse, time_ns)
-        if self._is_sure(time_ns, side_m):
+        if self._is_confident(time_ns, side_m):
             self._since_whole += 1
         else:
             self._since_whole = 0
@@ -156,7 +156,7 @@ class LostLocator:
         self._agreement.see(seen, time_ns, side_m, chance)
         return self._outcome(found, view)
 
-    def _is_sure(self, time_ns: int, side_m: float) -> bool:
+    def _is_confident(self, time_ns: int, side_m: float) -> bool:
         """Whether it is enough to look where the view is expected; not for ever."""
         best = self._agreement.best
         return (
@@ -301,9 +301,9 @@ def _against(
 
 def _fix(one: Sighting, best: Hypothesis, confidence: float, view: ViewOnGround) -> Fix:
     covariance = np.array(one.covariance[:2, :2])
-    lean_std_deg = view.telemetry.lean_std_deg
-    if lean_std_deg is not None and math.isfinite(lean_std_deg):
-        covariance += np.eye(2) * (view.telemetry.agl_m * math.radians(lean_std_deg)) ** 2
+    tilt_std_deg = view.telemetry.tilt_std_deg
+    if tilt_std_deg is not None and math.isfinite(tilt_std_deg):
+        covariance += np.eye(2) * (view.telemetry.agl_m * math.radians(tilt_std_deg)) ** 2
     covariance.flags.writeable = False
     evidence = {**one.evidence, "views": best.views, "log_odds": best.log_odds}
     return Fix(

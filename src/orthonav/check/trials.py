@@ -20,13 +20,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.check.change import another_year, leaning
+from orthonav.check.change import another_year, tilted
 from orthonav.check.ortho import OrthoPyramid
 from orthonav.check.persistence import MARGIN_PX
 from orthonav.check.views import (
     Pictures,
     TrialPlan,
-    told_persistence,
+    reported_persistence,
     view_levels,
     view_of,
 )
@@ -229,12 +229,12 @@ class Trier:
         picture = np.where(valid[inner], grey[inner], stranger)
         expected = math.nan
         if plan.other_path is None:
-            lasting = [each[inner] for each in told_persistence(grey, gsd_m, final - level)]
+            lasting = [each[inner] for each in reported_persistence(grey, gsd_m, final - level)]
             expected = float(np.mean([each.mean() for each in lasting[:2]]))
             picture = another_year(rng, picture, stranger, lasting, plan.severity)
         if plan.relief_m > 0:
             rim_px = plan.relief_m * size / 2 / plan.agl_m
-            picture = leaning(rng, picture, rim_px, RELIEF_CHANGES_M / gsd_m)
+            picture = tilted(rng, picture, rim_px, RELIEF_CHANGES_M / gsd_m)
         view, camera, telemetry = view_of(rng, plan, picture, gsd_m)
         return self._placed(rng, plan, index, place, view, camera, telemetry, expected)
 

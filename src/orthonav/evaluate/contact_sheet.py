@@ -58,7 +58,7 @@ class Row:
     """One view: its figures, and three pictures of ground `side_m` metres wide around a position.
 
     `shift_en_m` (2,) leads from the true to the estimated position, `centre_en_m` (2,) from a
-    position to the middle of the pictures: a camera that leans looks beside itself. Where a
+    position to the middle of the pictures: a camera that tilts looks beside itself. Where a
     picture is None, `why_not` or `why_no_map` says why.
     """
 
@@ -209,12 +209,12 @@ def _view_patch(
 
 
 def as_fixed(told: Telemetry, result: ViewResult) -> Telemetry:
-    """Heading, height and lean as the fix has them, as told where it does not say."""
+    """Heading, height and tilt as the fix has them, as told where it does not say."""
     fix = result.outcome
     if not isinstance(fix, Fix):
         return told
-    lean = [fix.evidence.get(name, 0.0) for name in ("pitch_bias_deg", "roll_bias_deg")]
-    pitch, roll = (value if math.isfinite(value) else 0.0 for value in lean)
+    tilt = [fix.evidence.get(name, 0.0) for name in ("pitch_bias_deg", "roll_bias_deg")]
+    pitch, roll = (value if math.isfinite(value) else 0.0 for value in tilt)
     return replace(
         told,
         yaw_deg=fix.heading_deg if math.isfinite(fix.heading_deg) else told.yaw_deg,

@@ -76,7 +76,7 @@ def track_figures(
         figures.append(
             Figure(
                 "track-learnt",
-                "What the track learnt to be wrong with told heading, height and lean, over time",
+                "What the track learnt to be wrong with told heading, height and tilt, over time",
                 "What was learnt to be wrong with what is told: to be added to it.",
                 biases_picture(series),
             )
@@ -166,16 +166,16 @@ def signed_picture(series: Series) -> Drawing:
 
 
 def biases_picture(series: Series) -> Drawing:
-    """What was learnt to be wrong with heading, height and lean, over time; only what is there."""
+    """What was learnt to be wrong with heading, height and tilt, over time; only what is there."""
     scale = 100.0 * np.expm1(np.clip(series.biases["log_scale_bias"], -5.0, 5.0))
-    lean = {
+    tilt = {
         "pitch": series.biases["pitch_bias_deg"],
         "roll": series.biases["roll_bias_deg"],
     }
     panels: list[tuple[str, dict[str, FloatArray]]] = [
         ("heading (deg)", {"": series.biases["heading_bias_deg"]}),
         ("height (%)", {"": scale}),
-        ("lean (deg)", lean),
+        ("tilt (deg)", tilt),
     ]
     panels = [p for p in panels if any(np.isfinite(v).any() for v in p[1].values())]
 

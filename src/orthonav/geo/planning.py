@@ -121,7 +121,7 @@ def view_cautions(view: ViewPlan, gsd_m: float, tile_px: int) -> list[Caution]:
             Caution(
                 "low",
                 f"a view is only {view.short_m:.0f} m across: over forest or one large field it "
-                "shows nothing that lasts, and trees and houses lean by much; fly higher",
+                "shows nothing that lasts, and trees and houses tilt by much; fly higher",
             )
         )
     if coarser > MOST_COARSER:

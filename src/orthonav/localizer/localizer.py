@@ -161,7 +161,7 @@ class Localizer:
     def _allowed(
         self, prior: Prior | None, offsets_en_m: list[NDArray[np.float64]]
     ) -> NDArray[np.intp] | None:
-        """Rows of tiles that the camera may look at: around the prior, moved by where it leans."""
+        """Rows of tiles that the camera may look at: around the prior, moved by where it tilts."""
         if prior is None:
             return None
         offset = np.mean(offsets_en_m, axis=0)

@@ -94,7 +94,7 @@ def rectify_footprint(
     """Rectify what the camera sees, its own heading up, sides whole multiples of `multiple_px`.
 
     What is left over of the sides is cut off, so that a vertical view has no pixels not seen.
-    Where the view reaches far out to one side (it leans), no more than `MAX_REACH` times the half
+    Where the view reaches far out to one side (it tilts), no more than `MAX_REACH` times the half
     sides of a vertical view are kept on either side of the optical axis. The `offset_en_m` is that
     of a heading of 0.
     """
@@ -172,7 +172,7 @@ def _remapped(
         part = np.array([[1 / NODE_PX, 0, 0], [0, 1 / NODE_PX, 0]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         index = cv2.warpAffine(nodes.astype(np.float32), part, (width, height), flags=flags)
-    else:  # the view leans far, or the horizon or the end of the lens lies within
+    else:  # the view tilts far, or the horizon or the end of the lens lies within
         sides = [np.arange(0.5, side, dtype=np.float64) for side in shape]
         index = (_seen_px(camera, camera_from_window, *sides) - 0.5).astype(np.float32)
     x, y = cv2.split(np.asarray(index, np.float32))

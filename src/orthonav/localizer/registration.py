@@ -49,7 +49,7 @@ STAGE_CANDIDATES = 8
 MIN_CANDIDATES = 6
 CANDIDATE_SHARE = 0.5
 MIN_VIEW_PX = 24.0
-MIN_LEAN_COS = 0.5
+MIN_TILT_COS = 0.5
 USUAL_CHANCES = Chances(32.0, 15.0, 48.0)
 DOUBT = 0.01
 """Views of this confidence to one less it are looked at one level finer."""
@@ -142,11 +142,11 @@ class RegistrationLocalizer:
     ) -> PreparedFootprint | NoFix:
         """The view rectified to the level where it is finished, heading up, all that it sees."""
         agl_m = telemetry.agl_m
-        lean = math.cos(math.radians(telemetry.pitch_deg)) * math.cos(
+        tilt = math.cos(math.radians(telemetry.pitch_deg)) * math.cos(
             math.radians(telemetry.roll_deg)
         )
         # The area seen grows with the inverse cube of the cosine, as far as it is looked at.
-        nominal_m = (agl_m / max(lean, MIN_LEAN_COS) ** 1.5) * math.sqrt(
+        nominal_m = (agl_m / max(tilt, MIN_TILT_COS) ** 1.5) * math.sqrt(
             camera.width_px * camera.height_px / (camera.fx_px * camera.fy_px)
         )
         levels = Levels.of(nominal_m / self.grid.gsd_m, self.registrar.reference.levels)
@@ -189,7 +189,7 @@ class RegistrationLocalizer:
             enough = SURE_AT_LOOK if level == view.levels.look else SURE
             if judged and self._looks_sure(view, judged, enough):
                 best = self._finished(view, judged, candidates)
-                if self._is_sure(best, enough):
+                if self._is_confident(best, enough):
                     return best
         if not judged:
             return None
@@ -210,7 +210,7 @@ class RegistrationLocalizer:
         best, rival = self.registrar.standing(view.templates, judged, view.prior)
         return best > enough.strength * self._chances.look and best > enough.look_ratio * rival
 
-    def _is_sure(self, best: Registered, enough: _Sure) -> bool:
+    def _is_confident(self, best: Registered, enough: _Sure) -> bool:
         if best.score <= enough.strength * self._chances.total:
             return False
         return best.look_ratio > enough.look_ratio and best.peak_ratio > enough.peak_ratio
@@ -328,10 +328,10 @@ class RegistrationLocalizer:
 
     def _reach_px(self, view: PreparedFootprint, prior: Prior) -> float:
         """How far from there the middle of the view may lie."""
-        lean = float(np.hypot(*view.camera_px))
+        tilt = float(np.hypot(*view.camera_px))
         turn = 2.0 if view.prior.turn_rad is None else 2 * view.prior.turn_std_rad
         reach = PRIOR_SIGMAS * max(prior.std_m, 0.0) / self.grid.gsd_m
-        return float(reach + lean * min(turn, 1.0) + 2.0 * 2**view.levels.coarse)
+        return float(reach + tilt * min(turn, 1.0) + 2.0 * 2**view.levels.coarse)
 
     def touches_map(self, prior: Prior, view: PreparedFootprint) -> bool:
         """Whether any of the map lies where the prior allows the view to be."""
@@ -344,9 +344,9 @@ class RegistrationLocalizer:
         placed = best.placed
         lat, lon = self.sheet.frame.latlon_from_en(self.camera_en_m(view, placed.pose))
         covariance = self.covariance(view, placed)[:2, :2]
-        if telemetry.lean_std_deg is not None:
-            lean_m = telemetry.agl_m * math.radians(telemetry.lean_std_deg)
-            covariance = covariance + np.eye(2) * lean_m**2
+        if telemetry.tilt_std_deg is not None:
+            tilt_m = telemetry.agl_m * math.radians(telemetry.tilt_std_deg)
+            covariance = covariance + np.eye(2) * tilt_m**2
         covariance.flags.writeable = False
         evidence = best.evidence()
         confidence = math.nan if self.confidence is None else self.confidence(evidence)

@@ -19,7 +19,7 @@ MIN_VIEWS = 5
 MOVED_DEG, MOVED_SIGMAS = 2.0, 3.0
 """A mount that differs by more than both from what it is in the end has moved meanwhile."""
 MAD_TO_STD = 1.4826
-LEAST_LEAN_DEG = 0.1
+LEAST_TILT_DEG = 0.1
 STD_FLOOR = {"heading_deg": 0.2, "log_scale": 0.003, "pitch_deg": 0.3, "roll_deg": 0.3}
 _LASTING = ("pitch_deg", "roll_deg")
 _EVIDENCE = {
@@ -48,7 +48,7 @@ def calibrated(results: Sequence[ViewResult]) -> Calibration:
     views do not matter; their standard deviation counts views that err alike as fewer.
     Raises `FlightError` where fewer than `MIN_VIEWS` views are confident.
     """
-    sure = [each for each in results if _is_sure(each)]
+    sure = [each for each in results if _is_confident(each)]
     if len(sure) < MIN_VIEWS:
         raise FlightError(
             f"{len(sure)} of {len(results)} views have a confidence of {SURE}; a calibration needs "
@@ -69,7 +69,7 @@ def calibrated(results: Sequence[ViewResult]) -> Calibration:
     return Calibration(mount, sure[begin].frame, sure[-1].frame, begin > 0)
 
 
-def _is_sure(result: ViewResult) -> bool:
+def _is_confident(result: ViewResult) -> bool:
     fix = result.outcome
     return isinstance(fix, Fix) and fix.confidence >= SURE and "pitch_bias_deg" in fix.evidence
 
@@ -106,10 +106,10 @@ def _bias(values: Array, spreads: Array, floor: float, lasting: bool) -> Bias:
 def model_of(mount: Mount) -> Model:
     """The model of a flight whose told values are corrected by a mount: no better known than that,
     and not off by something else."""
-    heading, lean = mount.heading_deg, max(mount.pitch_deg.std, mount.roll_deg.std)
-    lean_rad = math.radians(max(lean, LEAST_LEAN_DEG))
+    heading, tilt = mount.heading_deg, max(mount.pitch_deg.std, mount.roll_deg.std)
+    tilt_rad = math.radians(max(tilt, LEAST_TILT_DEG))
     return replace(
-        Model().with_mount(lean_rad),
+        Model().with_mount(tilt_rad),
         heading_rad=math.radians(max(heading.std, heading.scatter, 1.0)),
         log_scale=max(mount.log_scale.std, mount.log_scale.scatter, 0.01),
         off_mount=0.0,

@@ -123,7 +123,7 @@ class Runner:
         self._notifier = notifier or Notifier("")
         self.tally, self._teller, self._frozen = Tally(), Teller(), FrozenCheck()
         self.health: Health | None = None
-        self._begun_ns = self._sure_ns = clocks.mono_ns()
+        self._begun_ns = self._confident_ns = clocks.mono_ns()
         self._tick_ns = 0
         self._picture_ns: int | None = None
         self._last: states.Saved | None = None
@@ -227,7 +227,7 @@ class Runner:
             return
         if result.state not in (None, "tracking"):
             return
-        self._sure_ns = self._clocks.mono_ns()
+        self._confident_ns = self._clocks.mono_ns()
         self._count("sure")
         mount = self.options.mount
         self._off = offsets(fix, mount.corrected(telemetry) if mount else telemetry)
@@ -356,7 +356,7 @@ class Runner:
             picture_age_s=(now_ns - picture_ns) / 1e9,
             telemetry_age_s=link.attitude_age_s if link and uses_link else 0.0,
             link_age_s=link.heard_age_s if link else 0.0,
-            unsure_s=(now_ns - self._sure_ns) / 1e9,
+            low_confidence_s=(now_ns - self._confident_ns) / 1e9,
             latency_s=self.tally.latency_s(0.95),
             state=state,
             synced=link.synced if link else True,

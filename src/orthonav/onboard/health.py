@@ -66,7 +66,7 @@ class HealthLimits:
     picture_age_s: float = 3.0
     telemetry_age_s: float = 3.0
     link_age_s: float = 5.0
-    unsure_s: float = 10.0
+    low_confidence_s: float = 10.0
     latency_s: float = 0.5
     share: float = 0.2
     """Share of the pictures in the window that may be unusable, late, or without telemetry."""
@@ -91,7 +91,7 @@ class Snapshot:
     picture_age_s: float = 0.0
     telemetry_age_s: float = 0.0
     link_age_s: float = 0.0
-    unsure_s: float = 0.0
+    low_confidence_s: float = 0.0
     latency_s: float = 0.0
     state: str | None = "tracking"
     synced: bool = True
@@ -118,7 +118,8 @@ def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
         "height_off": abs(seen.log_scale_off) > limits.log_scale,
         "lost": seen.state == "lost",
         "searching": seen.state == "searching",
-        "unsure": seen.state not in ("lost", "searching") and seen.unsure_s > limits.unsure_s,
+        "unsure": seen.state not in ("lost", "searching")
+        and seen.low_confidence_s > limits.low_confidence_s,
         "frozen_picture": count["frozen"] > many,
         "bad_pictures": count["bad_picture"] > many,
         "telemetry_gaps": count["no_telemetry"] > many and not failed["no_telemetry"],

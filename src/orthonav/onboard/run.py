@@ -113,11 +113,11 @@ def localize_flight(
         )
 
 
-def in_hindsight(
+def smoothed_track(
     tracker: Tracker, results: Sequence[ViewResult], accept: Acceptance | None
 ) -> list[ViewResult]:
     """Results of a whole flight again, every view placed by all of them."""
-    placed = [_finite(outcome) for outcome in tracker.in_hindsight()]
+    placed = [_finite(outcome) for outcome in tracker.smoothed_track()]
     chosen = placed if accept is None else [accept(outcome) for outcome in placed]
     return [
         replace(result, outcome=outcome) for result, outcome in zip(results, chosen, strict=True)

@@ -156,15 +156,15 @@ def _view(
     matrix = np.column_stack([linear, move])
     view = cv2.warpAffine(picture, matrix, (width, height), flags=flags)
     agl_m = FOCAL_PX * grid.gsd_m
-    told_m = agl_m * max(0.5, 1 + rng.normal(0, AGL_STD))
+    reported_m = agl_m * max(0.5, 1 + rng.normal(0, AGL_STD))
     telemetry = Telemetry(
         time_ns=0,
         yaw_deg=yaw_deg + rng.normal(0, YAW_STD_DEG),
         pitch_deg=0.0,
         roll_deg=0.0,
-        agl_m=told_m,
+        agl_m=reported_m,
         yaw_std_deg=YAW_STD_DEG,
-        agl_std_m=AGL_STD * told_m,
+        agl_std_m=AGL_STD * reported_m,
     )
     camera = Camera(width, height, FOCAL_PX, FOCAL_PX, width / 2, height / 2)
     return np.asarray(view, dtype=np.uint8), camera, telemetry

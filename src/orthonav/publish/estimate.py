@@ -108,7 +108,7 @@ class NavigationEstimate:
         major = error_ellipse(self.cov_en_m2)[0]
         return major if math.isnan(major) else max(major, min_std_m)
 
-    def is_sure(self, min_confidence: float = SURE) -> bool:
+    def is_confident(self, min_confidence: float = SURE) -> bool:
         """Whether this may be told as a position.
 
         Confident enough (an unknown confidence is not), with a covariance, and tracking where it

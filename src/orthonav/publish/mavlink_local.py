@@ -20,7 +20,7 @@ from orthonav.publish.mavlink import (
     dialect,
     float32,
     microseconds,
-    require_sure,
+    require_confident,
 )
 
 _LOCAL_NED, _BODY_FRD, _LOCAL_FRD = 1, 12, 20
@@ -66,7 +66,7 @@ def odometry(
     the confidence in per cent. Raises `EstimateError` where something needed is not known, or the
     estimate is not sure.
     """
-    require_sure(estimate, min_confidence, "ODOMETRY")
+    require_confident(estimate, min_confidence, "ODOMETRY")
     position, variance = _position(estimate, pose, autopilot, min_std_m, "ODOMETRY")
     velocity_ned = _velocity_ned(estimate, pose)
     frames = (_LOCAL_NED, _LOCAL_NED)
@@ -117,7 +117,7 @@ def vision_position_estimate(
     Raises `EstimateError` where height or attitude is not known (the message has no mark for that)
     or the estimate is not sure.
     """
-    require_sure(estimate, min_confidence, "VISION_POSITION_ESTIMATE")
+    require_confident(estimate, min_confidence, "VISION_POSITION_ESTIMATE")
     (x, y, z), variance = _position(estimate, pose, autopilot, min_std_m, "this message")
     if not all(map(math.isfinite, pose.attitude_rad)):
         raise EstimateError("VISION_POSITION_ESTIMATE needs the attitude: hand in the autopilot's")

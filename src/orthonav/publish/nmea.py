@@ -122,7 +122,7 @@ def _when_and_whether(
 ) -> tuple[int | None, bool]:
     if estimate is None:
         return utc_ns, False
-    return estimate.utc_ns, estimate.is_sure(min_confidence)
+    return estimate.utc_ns, estimate.is_confident(min_confidence)
 
 
 def _place(estimate: NavigationEstimate) -> list[str]:

@@ -44,7 +44,7 @@ class Window:
 def window_of(told: Telemetry, camera: Camera, gsd_m: float) -> Window:
     """The square that holds what a view saw. Raises `FlightError` where it saw no ground we know.
 
-    Where it leans far out, no more than `MAX_REACH` times the half side of a vertical view is kept
+    Where it tilts far out, no more than `MAX_REACH` times the half side of a vertical view is kept
     on either side of the optical axis.
     """
     refused = check_telemetry(told, camera, math.inf, heading_known=True)

@@ -134,8 +134,8 @@ def _profile(result: CheckResult, along: Along) -> Figure:
     summary = summarize(result)
     return Figure(
         "profile",
-        f"Probability and expected drift along the route; {share_text(summary.sure_share)} of it "
-        f"at {SURE:g} or more, {len(result.stretches)} blind stretches",
+        f"Probability and expected drift along the route; {share_text(summary.confident_share)} of "
+        f"it at {SURE:g} or more, {len(result.stretches)} blind stretches",
         "Probability along the route with its 80 % interval and the lowest across the band; below, "
         "how far the position may be off (one standard deviation). Shaded: blind stretches.",
         draw_figure((10.0, 5.0), lambda figure: _draw_profile(figure, result, along)),

@@ -137,7 +137,7 @@ def _cards(result: CheckResult) -> str:
     if result.along is not None:
         shown.append(
             (
-                share_text(summary.sure_share),
+                share_text(summary.confident_share),
                 f"of {metres_text(summary.route_m)} at {SURE:g} or more",
             )
         )

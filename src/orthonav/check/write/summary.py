@@ -17,13 +17,13 @@ SURE = 0.9
 class Summary:
     """Figures of a check; those of the route are NaN or None where there is none.
 
-    `sure_share` is the share of the route's length with a probability of `SURE` or more, `error_m`
-    the root mean square error expected of a correct fix, along the route or over the map.
+    `confident_share` is the share of the route's length with a probability of `SURE` or more,
+    `error_m` the root mean square error expected of a correct fix, along the route or over the map.
     """
 
     route_m: float
     route_s: float
-    sure_share: float
+    confident_share: float
     error_m: float
     longest: Stretch | None
     unbearable: int
@@ -42,7 +42,7 @@ def summarize(result: CheckResult) -> Summary:
     return Summary(
         route_m=length_m,
         route_s=length_m / result.conditions.speed_mps,
-        sure_share=float(weights[sure].sum() / weights.sum()) if known.any() else math.nan,
+        confident_share=float(weights[sure].sum() / weights.sum()) if known.any() else math.nan,
         error_m=_rms(along.error_m, weights * np.nan_to_num(along.probability)),
         longest=max(result.stretches, key=lambda each: each.length_m, default=None),
         unbearable=sum(not each.bearable for each in result.stretches),

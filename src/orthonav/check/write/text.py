@@ -59,7 +59,7 @@ def _figures(result: CheckResult) -> list[tuple[str, str]]:
             (
                 "route",
                 f"{metres_text(summary.route_m)}, {seconds_text(summary.route_s)}; "
-                f"{share_text(summary.sure_share)} of it at {SURE:g} or more",
+                f"{share_text(summary.confident_share)} of it at {SURE:g} or more",
             )
         ]
     rows.append(("error", f"{metres_text(summary.error_m)} expected of a correct fix"))

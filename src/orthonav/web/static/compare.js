@@ -103,7 +103,7 @@ export class Compare {
     image.src = rawUrl(i, this.store.generation);
   }
 
-  /** Marks the places below the camera, which a camera that leans does not see in the middle. */
+  /** Marks the places below the camera, which a camera that tilts does not see in the middle. */
   #crosses(i, window) {
     const { columns: c, run } = this.store;
     const [east, north] = window.offset_en_m.map((value) => value / window.side_m);
