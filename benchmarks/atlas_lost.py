@@ -31,7 +31,7 @@ from orthonav.atlas.lookup import AtlasLookup
 from orthonav.atlas.lost import LostLocator
 from orthonav.geo.camera import Camera
 from orthonav.geo.frames import distances_m
-from orthonav.records import Fix, Telemetry
+from orthonav.records import CONFIDENT, Fix, Telemetry
 from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
 
 SIDE_M, GSD_M, SEED = 50_000.0, 8.0, 21
@@ -46,7 +46,6 @@ TURN_STD_RAD = 0.15
 EDGE_PX = 300
 RIGHT_M = 80.0
 """Ten pixels, what the sheets' confidence speaks of."""
-SURE = 0.9
 
 
 @dataclass(frozen=True)
@@ -150,11 +149,11 @@ def row(name: str, outcomes: list[Outcome]) -> list[str]:
     trials = sorted({each.flight for each in outcomes})
     first = {}
     for each in outcomes:
-        if each.confidence >= SURE and each.flight not in first:
+        if each.confidence >= CONFIDENT and each.flight not in first:
             first[each.flight] = each
     right = sum(each.error_m <= RIGHT_M for each in first.values())
     fixes = [each for each in outcomes if not math.isnan(each.error_m)]
-    sure = [each for each in fixes if each.confidence >= SURE]
+    sure = [each for each in fixes if each.confidence >= CONFIDENT]
     wrong = sum(each.error_m > RIGHT_M for each in sure)
     errors = [each.error_m for each in sure if each.error_m <= RIGHT_M]
     views = [each.view + 1 for each in first.values() if each.error_m <= RIGHT_M]
@@ -200,7 +199,7 @@ def main() -> int:
             ),
             rows,
             (
-                f"Right: within {RIGHT_M:.0f} m (10 px). Sure: confidence of {SURE:g} or more. "
+                f"Right: within {RIGHT_M:.0f} m (10 px). Confident: {CONFIDENT:g} or more. "
                 f"Generated area, seed {SEED}; flights, seed {options.seed}.",
             ),
         )

@@ -56,7 +56,7 @@ SCATTER = Errors(
 )
 GAP_M, JUMP_M = 3000.0, 2000.0
 """What a kidnapped flight leaves out at least: so much of the way, and so far as the crow flies."""
-SURE, RIGHT_M, DIVERGED_M, DIVERGED_VIEWS = 0.9, 35.0, 60.0, 10
+CONFIDENT, RIGHT_M, DIVERGED_M, DIVERGED_VIEWS = 0.9, 35.0, 60.0, 10
 SEED = 100
 Array = NDArray[np.float64]
 HEADER = (
@@ -321,7 +321,7 @@ class Figures:
             errors,
             nees,
             np.array([view["state"] == "tracking" for view in views]),
-            np.array([(view["confidence"] or 0.0) >= SURE for view in views]),
+            np.array([(view["confidence"] or 0.0) >= CONFIDENT for view in views]),
             radius,
             np.array([view["ms"] for view in views]),
         )

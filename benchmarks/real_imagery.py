@@ -23,7 +23,7 @@ from benchmarks.inputs import REAL_DATA
 from benchmarks.negatives import SHARES, Sources, negatives
 from benchmarks.placing import row_of
 from benchmarks.record import Table, number, provenance
-from benchmarks.verdicts import FAR_M, SURE, Verdict, percent
+from benchmarks.verdicts import CONFIDENT, FAR_M, Verdict, percent
 from orthonav.flight import open_flight, read_truth
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
@@ -38,7 +38,7 @@ NAIP_VIEWS = ("naip_nd/20120731.tif", "naip_nd/20150926.tif", "naip_nd/20180716.
 SZADA = ("szada_1", "szada_5", "szada_7", "szada_mosaic")
 GROUPS = ("naip", "airchange", "taichung", "arroio", "negatives")
 HEADER = (
-    *("map", "views", "n", "near", "35 m", "median m", f"kept at {SURE:g} of right"),
+    *("map", "views", "n", "near", "35 m", "median m", f"kept at {CONFIDENT:g} of right"),
     *("wrong kept", "ECE", "NEES", "ms", "p99 ms"),
 )
 
@@ -199,8 +199,8 @@ def _notes(options: argparse.Namespace) -> tuple[str, ...]:
         "random places; recorded flights as they are: Taichung's camera tilts up to 9 deg more "
         "than told and its height is about 12 % off, Arroio's truth is good to 7 to 10 m and its "
         "map's position is nominal",
-        f"near: share of all views within the radius in brackets; kept: confidence of {SURE:g} or "
-        f"more, of the views within {FAR_M:g} m; wrong kept: by more than {FAR_M:g} m, of all kept",
+        f"near: share of all views within the radius in brackets; accepted: confidence of {CONFIDENT:g} "
+        f"or more, of the views within {FAR_M:g} m; wrong accepted: by more than {FAR_M:g} m, of all accepted",
         "ECE: expected calibration error at the map's own radius; NEES: mean normalized error "
         "squared of right fixes, 2 if the covariance is theirs; ms: decoded picture to fix, one "
         "core, warm",
@@ -254,13 +254,19 @@ def _refusals(bench: Bench) -> Table:
         "2012, 2015 and 2018; forest and water: windows of real imagery, stretched to the view; "
         "refused outright: no fix at all, with a reason",
     )
-    header = ("negatives", "n", "refused outright", "confidence 0.5 or more", f"{SURE:g} or more")
+    header = (
+        "negatives",
+        "n",
+        "refused outright",
+        "confidence 0.5 or more",
+        f"{CONFIDENT:g} or more",
+    )
     return Table("Views that are not on the map", (*header, "highest"), rows, notes)
 
 
 def _refused(kind: str, confidence: np.ndarray) -> list[str]:
     known = confidence[~np.isnan(confidence)]
-    counts = [str(int((known >= limit).sum())) for limit in (0.5, SURE)]
+    counts = [str(int((known >= limit).sum())) for limit in (0.5, CONFIDENT)]
     highest = number(float(known.max())) if known.size else "-"
     refused = str(len(confidence) - len(known))
     return [kind, str(len(confidence)), refused, *counts, highest]

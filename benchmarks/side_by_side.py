@@ -23,7 +23,7 @@ from benchmarks.placing import (
 )
 from benchmarks.posed import LEVELS_MI, poses
 from benchmarks.record import Section, Table, number
-from benchmarks.verdicts import SURE, Verdict, from_placed, percent
+from benchmarks.verdicts import CONFIDENT, Verdict, from_placed, percent
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
@@ -32,7 +32,7 @@ SIDE_M = 2000
 RADII_M = (15.0, 35.0)
 HEADER = (
     *("method", "pixels m", "poses", "15 m", "35 m", "median m"),
-    *("ms", "p99 ms", "peak MB", f"kept at {SURE:g}", "wrong kept", "ECE"),
+    *("ms", "p99 ms", "peak MB", f"kept at {CONFIDENT:g}", "wrong kept", "ECE"),
 )
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from orthonav.evaluate.calibration import calibrate, check_covariance
 
-SURE, FAR_M = 0.9, 35.0
+CONFIDENT, FAR_M = 0.9, 35.0
 Array = NDArray[np.float64]
 
 
@@ -54,8 +54,8 @@ class Verdict:
 
     @property
     def kept(self) -> NDArray[np.bool_]:
-        """(N,) whether the stated confidence is at least `SURE`."""
-        return np.asarray(self.confidence >= SURE)
+        """(N,) whether the stated confidence is at least `CONFIDENT`."""
+        return np.asarray(self.confidence >= CONFIDENT)
 
     @property
     def wrong_accepted(self) -> int:

@@ -8,6 +8,11 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.geo.camera import Camera
+
+CONFIDENT = 0.9
+"""A fix of at least this confidence counts as confident: the default of publishing and reports."""
+
 Evidence = Mapping[str, float]
 """Named numbers that say why a fix should be believed or not; see `docs/design.md`."""
 
@@ -57,6 +62,20 @@ class Telemetry:
             "agl_m": self.agl_m,
         }
         return [name for name, value in named.items() if not math.isfinite(value)]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What the camera saw at one exposure, and the telemetry of that time.
+
+    `grey`: grey levels (H, W), uint8, as recorded: not undistorted, not rectified.
+    `camera`: calibration of the camera at the size of `grey`.
+    `telemetry`: reported heading, tilt, height, velocity and prior position at the exposure.
+    """
+
+    grey: NDArray[np.uint8]
+    camera: Camera
+    telemetry: Telemetry
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,7 +48,7 @@ FOLLOWED, FOLLOWED_NATS = 4, 4.0
 best by more than this."""
 RIVAL_SHARE = 0.25
 """A rival lies farther from a place than this share of the view's side."""
-SURE_VIEWS, SURE, SURE_REACH_M = 2.5, 0.97, 600.0
+SURE_VIEWS, CONFIDENT, SURE_REACH_M = 2.5, 0.97, 600.0
 """A hypothesis this sure, and this sure of where the view is, is followed without looking through
 the whole atlas."""
 WHOLE_EVERY = 5
@@ -163,7 +163,7 @@ class LostLocator:
             best is not None
             and self._agreement.agreed
             and best.views >= SURE_VIEWS
-            and self._agreement.confidence >= SURE
+            and self._agreement.confidence >= CONFIDENT
             and best.reach_m(time_ns) <= max(side_m, SURE_REACH_M)
             and self._since_whole < WHOLE_EVERY
         )

@@ -27,10 +27,8 @@ from orthonav.evaluate.figures import (
 )
 from orthonav.evaluate.metrics import FAR_M, Comparison
 from orthonav.publish.jsonl import STATES
-from orthonav.records import Fix, ViewResult
+from orthonav.records import CONFIDENT, Fix, ViewResult
 
-SURE = 0.9
-"""A fix of at least this confidence is believed."""
 RADII_M = (25.0, 60.0)
 COURSE_M = 5.0
 """Courses are taken between places usually at least so far apart."""
@@ -120,11 +118,11 @@ class Track:
     `first_view` (1 is the first view of the flight) and `first_s` (seconds since it) are of the
     first confirmed fix: tracking, with a position. `share_of_views` and `share_of_time` are by
     state. `low_confidence` is the time without a confident fix (not tracking, or confidence below
-    `SURE`), over the whole flight; `low_confidence_after` from the first confirmed fix on. A view
-    is confident and wrong where its confidence is at least `SURE` or it is tracking, and it errs by
-    more than `FAR_M`, the radius asked for and the radius that its own fix states; `far_m` is the
-    larger of the first two, the least of them all. A false lock is a stretch of such views. `along`
-    and `across` are of the tracking views.
+    `CONFIDENT`), over the whole flight; `low_confidence_after` from the first confirmed fix on. A
+    view is confident and wrong where its confidence is at least `CONFIDENT` or it is tracking, and
+    it errs by more than `FAR_M`, the radius asked for and the radius that its own fix states;
+    `far_m` is the larger of the first two, the least of them all. A false lock is a stretch of such
+    views. `along` and `across` are of the tracking views.
     """
 
     n_views: int
@@ -163,7 +161,7 @@ def measure_track(
     states = np.array([result.state or "" for result in results])
     seconds_s = seconds_since_first([result.time_ns for result in results])
     path_m = _path_m(comparison.truth_en_m, rows, len(results))
-    sure = np.array([_confidence(result) >= SURE for result in results])
+    sure = np.array([_confidence(result) >= CONFIDENT for result in results])
     tracking = states == "tracking"
     confirmed = tracking & np.array([isinstance(result.outcome, Fix) for result in results])
     first = int(np.argmax(confirmed)) if confirmed.any() else len(results)

@@ -13,8 +13,9 @@ from orthonav.evaluate.calibration import is_covariance, nees_bound
 from orthonav.evaluate.figures import FloatArray, runs
 from orthonav.evaluate.metrics import Comparison
 from orthonav.evaluate.plots import view_box
-from orthonav.evaluate.track import SURE, Series, Track
+from orthonav.evaluate.track import Series, Track
 from orthonav.evaluate.track_report import consistency_said, spread_said
+from orthonav.records import CONFIDENT
 from orthonav.report.canvas import (
     GREY,
     RIGHT,
@@ -127,7 +128,7 @@ def error_picture(comparison: Comparison, series: Series, radius_m: float) -> Dr
         _draw_states(band, x, series.states)
         confidence = comparison.criteria["confidence"]
         below.plot(x, confidence, ".-", color=RIGHT, linewidth=1.0, markersize=3)
-        below.axhline(SURE, color=GREY, linestyle=(0, (4, 3)), linewidth=1)
+        below.axhline(CONFIDENT, color=GREY, linestyle=(0, (4, 3)), linewidth=1)
         below.set(ylim=(-0.05, 1.08), ylabel="confidence", xlabel=name)
         below.set_xlim(*_limits(x))
         figure.align_ylabels([above, below])

@@ -63,7 +63,7 @@ MAX_SEARCH_PX = 8_000_000
 tiles, or with a prior."""
 
 
-class _Sure(NamedTuple):
+class _ClearMargin(NamedTuple):
     """A view this far above chance and above its rivals is not searched again."""
 
     strength: float
@@ -71,8 +71,8 @@ class _Sure(NamedTuple):
     peak_ratio: float
 
 
-SURE = _Sure(2.2, 1.9, 1.9)
-SURE_AT_LOOK = _Sure(1.8, 1.5, 1.5)
+CLEAR = _ClearMargin(2.2, 1.9, 1.9)
+CLEAR_AT_JUDGED = _ClearMargin(1.8, 1.5, 1.5)
 """Less is enough where the level that misses least was searched, if only in part."""
 
 
@@ -186,7 +186,7 @@ class RegistrationLocalizer:
             )
             candidates += len(found)
             best = None
-            enough = SURE_AT_LOOK if level == view.levels.look else SURE
+            enough = CLEAR_AT_JUDGED if level == view.levels.look else CLEAR
             if judged and self._looks_sure(view, judged, enough):
                 best = self._finished(view, judged, candidates)
                 if self._is_confident(best, enough):
@@ -205,12 +205,14 @@ class RegistrationLocalizer:
     ) -> Registered:
         return self.registrar.finished(view.templates, view.levels, judged, view.prior, candidates)
 
-    def _looks_sure(self, view: PreparedFootprint, judged: list[Placed], enough: _Sure) -> bool:
+    def _looks_sure(
+        self, view: PreparedFootprint, judged: list[Placed], enough: _ClearMargin
+    ) -> bool:
         """Whether finishing the best of them may end the search."""
         best, rival = self.registrar.standing(view.templates, judged, view.prior)
         return best > enough.strength * self._chances.look and best > enough.look_ratio * rival
 
-    def _is_confident(self, best: Registered, enough: _Sure) -> bool:
+    def _is_confident(self, best: Registered, enough: _ClearMargin) -> bool:
         if best.score <= enough.strength * self._chances.total:
             return False
         return best.look_ratio > enough.look_ratio and best.peak_ratio > enough.peak_ratio

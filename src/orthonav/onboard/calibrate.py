@@ -11,10 +11,9 @@ from orthonav.errors import FlightError
 from orthonav.flight.mount import Bias, Mount
 from orthonav.geo.camera import Camera
 from orthonav.onboard.run import Locator
-from orthonav.records import Fix, NoFix, Telemetry, ViewResult
+from orthonav.records import CONFIDENT, Fix, NoFix, Telemetry, ViewResult
 from orthonav.track import Model
 
-SURE = 0.9
 MIN_VIEWS = 5
 MOVED_DEG, MOVED_SIGMAS = 2.0, 3.0
 """A mount that differs by more than both from what it is in the end has moved meanwhile."""
@@ -51,8 +50,8 @@ def calibrated(results: Sequence[ViewResult]) -> Calibration:
     sure = [each for each in results if _is_confident(each)]
     if len(sure) < MIN_VIEWS:
         raise FlightError(
-            f"{len(sure)} of {len(results)} views have a confidence of {SURE}; a calibration needs "
-            f"{MIN_VIEWS}: is it the right map, camera and height?"
+            f"{len(sure)} of {len(results)} views have a confidence of {CONFIDENT}; a calibration "
+            f"needs {MIN_VIEWS}: is it the right map, camera and height?"
         )
     values = {name: _column(sure, key) for name, key in _EVIDENCE.items()}
     spreads = {
@@ -71,7 +70,7 @@ def calibrated(results: Sequence[ViewResult]) -> Calibration:
 
 def _is_confident(result: ViewResult) -> bool:
     fix = result.outcome
-    return isinstance(fix, Fix) and fix.confidence >= SURE and "pitch_bias_deg" in fix.evidence
+    return isinstance(fix, Fix) and fix.confidence >= CONFIDENT and "pitch_bias_deg" in fix.evidence
 
 
 def _column(sure: Sequence[ViewResult], key: str) -> Array:

@@ -37,9 +37,9 @@ from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.run import Locator, locate_view
 from orthonav.onboard.telemetry import Clocks, Told
-from orthonav.publish.estimate import SURE, error_ellipse
+from orthonav.publish.estimate import error_ellipse
 from orthonav.publish.mavlink import dialect
-from orthonav.records import Fix, NoFix, Prior, Telemetry, ViewResult
+from orthonav.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, ViewResult
 from orthonav.sources.attitude import LOOKS_DOWN, Angles
 from orthonav.sources.recording import fitted
 
@@ -91,7 +91,7 @@ class FlyOptions:
     telemetry_wait_s: float = 0.15
     recorded: bool = False
     accept: Acceptance | None = None
-    min_confidence: float = SURE
+    min_confidence: float = CONFIDENT
     map_path: Path | None = None
     state_path: Path | None = None
     told: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))

@@ -15,13 +15,13 @@ from typing import Any
 
 from orthonav.errors import MissingExtraError
 from orthonav.publish.estimate import (
-    SURE,
     Clock,
     EstimateError,
     NavigationEstimate,
     error_ellipse,
 )
 from orthonav.publish.gpstime import gps_time
+from orthonav.records import CONFIDENT
 
 Message = Any
 """A `MAVLink_message` of pymavlink, which brings no types."""
@@ -125,7 +125,7 @@ def global_position_sensor(
     sensor_id: int = 1,
     target: Target = AUTOPILOT,
     min_std_m: float = 0.0,
-    min_confidence: float = SURE,
+    min_confidence: float = CONFIDENT,
 ) -> Message:
     """GLOBAL_POSITION_SENSOR (message 296): a position from map matching, at the time it was sent.
 
@@ -161,7 +161,7 @@ def gps_input(
     hdop_m: float | None = None,
     send_yaw: bool = False,
     min_std_m: float = 0.0,
-    min_confidence: float = SURE,
+    min_confidence: float = CONFIDENT,
 ) -> Message:
     """GPS_INPUT (message 232): the position in the clothes of a GPS receiver, stamped at exposure.
 
@@ -211,7 +211,7 @@ def external_position_estimate(
     clock: Clock = Clock.UTC,
     target: Target = AUTOPILOT,
     min_std_m: float = 0.0,
-    min_confidence: float = SURE,
+    min_confidence: float = CONFIDENT,
 ) -> Message:
     """MAV_CMD_EXTERNAL_POSITION_ESTIMATE (43003) as COMMAND_INT: a single fix while dead reckoning.
 

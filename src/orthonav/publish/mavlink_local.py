@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.publish.estimate import SURE, Clock, EstimateError, NavigationEstimate
+from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
 from orthonav.publish.local import Autopilot, Origin, north_east_m
 from orthonav.publish.mavlink import (
     Message,
@@ -22,6 +22,7 @@ from orthonav.publish.mavlink import (
     microseconds,
     require_confident,
 )
+from orthonav.records import CONFIDENT
 
 _LOCAL_NED, _BODY_FRD, _LOCAL_FRD = 1, 12, 20
 _ESTIMATOR_VISION = 2
@@ -56,7 +57,7 @@ def odometry(
     *,
     clock: Clock = Clock.UTC,
     min_std_m: float = 0.0,
-    min_confidence: float = SURE,
+    min_confidence: float = CONFIDENT,
 ) -> Message:
     """ODOMETRY (message 331) as `autopilot` reads it, at the time of exposure.
 
@@ -110,7 +111,7 @@ def vision_position_estimate(
     *,
     clock: Clock = Clock.UTC,
     min_std_m: float = 0.0,
-    min_confidence: float = SURE,
+    min_confidence: float = CONFIDENT,
 ) -> Message:
     """VISION_POSITION_ESTIMATE (message 102): north, east, down and attitude, stamped at exposure.
 

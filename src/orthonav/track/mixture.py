@@ -15,6 +15,7 @@ from enum import Enum
 
 import numpy as np
 
+from orthonav.records import CONFIDENT
 from orthonav.track.hypotheses import Hypothesis, distance, merged, moments, within
 from orthonav.track.model import (
     POSITION,
@@ -48,7 +49,6 @@ MAJOR_SHARE = 0.05
 """The same where views show nothing, for there hypotheses are not merged."""
 TOLD_SHARE = 0.9
 """Belief in a position that was told before anything was seen."""
-SURE = 0.9
 LIKELY = 0.5
 CONFIRMED = 0.8
 """Views' worth of new ground that must have been recognized before a track is one, each counted by
@@ -303,7 +303,7 @@ class Mixture:
         return mean[4:], covariance[4:, 4:]
 
     def _next_state(self, confidence: float, sighted: float) -> State:
-        if confidence >= SURE and sighted >= CONFIRMED:
+        if confidence >= CONFIDENT and sighted >= CONFIRMED:
             return State.TRACKING
         if self._state is State.TRACKING and confidence < LIKELY:
             return State.LOST

@@ -7,17 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.check.outcome import Along, CheckResult, Stretch
+from orthonav.records import CONFIDENT
 
 Array = NDArray[np.float64]
-SURE = 0.9
-"""From this probability on a place of the route counts as sure."""
 
 
 @dataclass(frozen=True)
 class Summary:
     """Figures of a check; those of the route are NaN or None where there is none.
 
-    `confident_share` is the share of the route's length with a probability of `SURE` or more,
+    `confident_share` is the share of the route's length with a probability of `CONFIDENT` or more,
     `error_m` the root mean square error expected of a correct fix, along the route or over the map.
     """
 
@@ -38,7 +37,7 @@ def summarize(result: CheckResult) -> Summary:
     length_m = float(along.distance_m[-1] - along.distance_m[0])
     weights = stood_for_m(along.distance_m)
     known = np.isfinite(along.probability)
-    sure = np.where(known, along.probability, 0.0) >= SURE
+    sure = np.where(known, along.probability, 0.0) >= CONFIDENT
     return Summary(
         route_m=length_m,
         route_s=length_m / result.conditions.speed_mps,
