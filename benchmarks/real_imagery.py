@@ -199,8 +199,9 @@ def _notes(options: argparse.Namespace) -> tuple[str, ...]:
         "random places; recorded flights as they are: Taichung's camera tilts up to 9 deg more "
         "than told and its height is about 12 % off, Arroio's truth is good to 7 to 10 m and its "
         "map's position is nominal",
-        f"near: share of all views within the radius in brackets; accepted: confidence of {CONFIDENT:g} "
-        f"or more, of the views within {FAR_M:g} m; wrong accepted: by more than {FAR_M:g} m, of all accepted",
+        "near: share of all views within the radius in brackets; accepted: confidence of "
+        f"{CONFIDENT:g} or more, of the views within {FAR_M:g} m; wrong accepted: by more than "
+        f"{FAR_M:g} m, of all accepted",
         "ECE: expected calibration error at the map's own radius; NEES: mean normalized error "
         "squared of right fixes, 2 if the covariance is theirs; ms: decoded picture to fix, one "
         "core, warm",
