@@ -12,6 +12,18 @@ from orthonav.cli.source import add_source, open_source
 if TYPE_CHECKING:
     from orthonav.records import ViewResult
 
+EVERYDAY = (
+    "--heading",
+    "--prior",
+    "--track",
+    "--smooth",
+    "--accept",
+    "--mount",
+    "--atlas",
+    "--camera",
+    "--json",
+)
+
 log = logging.getLogger(__name__)
 
 
