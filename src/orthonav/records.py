@@ -14,7 +14,7 @@ CONFIDENT = 0.9
 """A fix of at least this confidence counts as confident: the default of publishing and reports."""
 
 Evidence = Mapping[str, float]
-"""Named numbers that say why a fix should be believed or not; see `docs/design.md`."""
+"""Named numbers that say why a fix should be believed or not; see `docs/reference/formats.md`."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Flight folders: views, telemetry, camera and, where known, truth. Format: design section 5."""
+"""Flight folders: views, telemetry, camera and, where known, truth. Format: docs/reference/formats.md."""
 
 from orthonav.flight.folder import (
     FlightFolder,

@@ -1,7 +1,7 @@
 """Camera, height and map chosen to suit each other, and what speaks against a choice.
 
 The rules are those of the program: what a view must cover to be searched (`orthonav.localizer`),
-and at which size it is registered well (docs/design.md, section 7, points 1 and 10).
+and at which size it is registered well (docs/decisions/registration.md).
 """
 
 import math
