@@ -51,7 +51,7 @@ VIEWS_PER_CELL = 15
 LEAST_PER_CELL = 8
 PRIOR_PX = 60.0
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0001)
-CONFIDENT, POOR = 0.9, 0.7
+CONFIDENT = 0.9
 Array = NDArray[np.float64]
 
 
