@@ -31,7 +31,7 @@ from orthonav.atlas.lookup import AtlasLookup
 from orthonav.atlas.lost import LostLocator
 from orthonav.geo.camera import Camera
 from orthonav.geo.frames import distances_m
-from orthonav.records import CONFIDENT, Fix, Telemetry
+from orthonav.records import CONFIDENT, Fix, Telemetry, View
 from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
 
 SIDE_M, GSD_M, SEED = 50_000.0, 8.0, 21
@@ -125,7 +125,7 @@ def flown(ortho: Path, atlas: Path, count: int, seed: int, *, mirrored: bool) ->
             locator = LostLocator(ground, lookup)
             for view, (grey, telemetry, truth) in enumerate(flight):
                 start = time.perf_counter()
-                outcome = locator.locate(grey, camera, telemetry)
+                outcome = locator.locate(View(grey, camera, telemetry))
                 latency_ms = (time.perf_counter() - start) * 1e3
                 error_m = confidence = math.nan
                 if isinstance(outcome, Fix):

@@ -29,7 +29,7 @@ from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import SingleViews, localize_flight, locate_view
 from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import Fix, Telemetry
+from orthonav.records import Fix, Telemetry, View
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
 DATA = Path(os.environ.get("ORTHONAV_DATA", REAL_DATA))
@@ -242,7 +242,7 @@ def _refusals(bench: Bench) -> Table:
             agl_std_m=options.agl_std * agl_m,
         )
         alone = SingleViews(localizer, use_prior=False)
-        outcome, took_ms = locate_view(alone, picture, DEFAULT_CAMERA, told)
+        outcome, took_ms = locate_view(alone, View(picture, DEFAULT_CAMERA, told))
         stated[kind].append(outcome.confidence if isinstance(outcome, Fix) else np.nan)
         times_ms.append(took_ms)
     rows = [_refused(kind, np.array(values)) for kind, values in stated.items()]

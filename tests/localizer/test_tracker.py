@@ -16,7 +16,7 @@ from orthonav.localizer.odometry import Footprint, moved_between
 from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import localize_flight, smoothed_track
-from orthonav.records import Fix, NoFix, Prior, Telemetry
+from orthonav.records import Fix, NoFix, Prior, Telemetry, View
 
 WIDE = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
 SPEED_MPS = 14.0
@@ -93,7 +93,7 @@ def followed(tracker, localizer, seen):
     """Errors in m, confidences, states and fixes of a flight."""
     rows = []
     for grey, telemetry, place in seen:
-        found = tracker.locate(grey, WIDE, telemetry)
+        found = tracker.locate(View(grey, WIDE, telemetry))
         error = np.inf
         if isinstance(found, Fix):
             error = float(np.hypot(*(place_of(localizer, found) - place)))
@@ -125,7 +125,7 @@ def test_wrong_heading_height_and_mount_are_learnt(localizer):
     assert evidence["log_scale_bias"] == pytest.approx(math.log(1.05), abs=0.02)
     assert evidence["pitch_bias_deg"] == pytest.approx(5.0, abs=1.5)
     assert evidence["roll_bias_deg"] == pytest.approx(-2.0, abs=1.5)
-    alone = [localizer.locate(grey, WIDE, telemetry) for grey, telemetry, _ in seen[12:]]
+    alone = [localizer.locate(View(grey, WIDE, telemetry)) for grey, telemetry, _ in seen[12:]]
     single = [
         np.hypot(*(place_of(localizer, a) - s[2])) for a, s in zip(alone, seen[12:], strict=True)
     ]
@@ -161,7 +161,7 @@ def test_a_told_start_is_searched_around_however_wide(localizer, monkeypatch, st
     prior = Prior(float(lat), float(lon), std_m)
     rows = []
     for grey, telemetry, place in views(5):
-        found = tracker.locate(grey, WIDE, replace(telemetry, prior=prior))
+        found = tracker.locate(View(grey, WIDE, replace(telemetry, prior=prior)))
         rows.append(np.hypot(*(place_of(localizer, found) - place)))
     assert (priors[0] is None) == whole and max(rows) < 15
     speed = found.evidence["vel_std_mps"]
@@ -192,7 +192,7 @@ def test_without_anything_to_see_it_is_lost_and_found_again(localizer):
     followed(tracker, localizer, views(12))
     white, spread = np.full((240, 320), 255, np.uint8), []
     for number in range(12, 60):
-        found = tracker.locate(white, WIDE, Telemetry(number * 10**9, 60.0, 0, 0, AGL_M))
+        found = tracker.locate(View(white, WIDE, Telemetry(number * 10**9, 60.0, 0, 0, AGL_M)))
         spread.append(float(np.trace(found.cov_en_m2)))
     assert tracker.state_name == "lost" and found.confidence < 0.3
     assert spread[-1] > 50 * spread[0]
@@ -247,7 +247,7 @@ def test_unknown_heading_is_tracked(localizer):
 def test_a_wrong_camera_is_refused(localizer):
     grey, telemetry, _ = next(iter(views(1)))
     with pytest.raises(CameraError, match="320 x 240"):
-        Tracker(localizer).locate(grey, replace(WIDE, width_px=640), telemetry)
+        Tracker(localizer).locate(View(grey, replace(WIDE, width_px=640), telemetry))
 
 
 def test_a_map_without_a_layer_is_refused(map_path):
@@ -262,10 +262,10 @@ class Recorded:
     camera, note, expected = WIDE, "", 0
 
     def __init__(self, seen, broken=()):
-        self.views = [View(n, g, t, n in broken) for n, (g, t, _) in enumerate(seen)]
+        self.views = [MemoryView(n, g, t, n in broken) for n, (g, t, _) in enumerate(seen)]
 
 
-class View:
+class MemoryView:
     def __init__(self, number, grey, telemetry, broken):
         self.frame, self.where, self.telemetry = f"{number}.png", "memory", telemetry
         self._grey, self._broken = grey, broken
@@ -302,9 +302,9 @@ def levelled_twice(localizer, grey, telemetry):
     """A view placed with its tilt, and again from the tilt that was found."""
     registration = localizer.registration
     for _ in range(2):
-        view = registration.prepared(grey, WIDE, telemetry, heading_known=True)
+        view = registration.prepared(View(grey, WIDE, telemetry), heading_known=True)
         placed = registration.best(view, None).placed
-        found = levelled(registration, grey, WIDE, telemetry, view, placed)
+        found = levelled(registration, View(grey, WIDE, telemetry), view, placed)
         pitch, roll = np.degrees(found.mean[4:])
         telemetry = replace(telemetry, pitch_deg=pitch, roll_deg=roll)
     return found
@@ -332,9 +332,9 @@ def test_a_narrow_view_knows_less_of_its_tilt(localizer):
         grey = changed(rendered(GROUND, (20.0, -35.0), (25.0, 0.0, 0.0), agl_m, camera), rng)
         telemetry = Telemetry(0, 25.0, 0.0, 0.0, agl_m)
         registration = localizer.registration
-        view = registration.prepared(grey, camera, telemetry, heading_known=True)
+        view = registration.prepared(View(grey, camera, telemetry), heading_known=True)
         placed = registration.best(view, None).placed
-        found = levelled(registration, grey, camera, telemetry, view, placed)
+        found = levelled(registration, View(grey, camera, telemetry), view, placed)
         std = np.sqrt(np.diag(found.covariance))
         std_deg.append(np.degrees(std[4:]))
         # What the tilt is not known to, the position is not either.
@@ -350,10 +350,10 @@ def test_position_hangs_on_a_tilt_that_was_not_looked_at(localizer, heading_deg)
     telemetry, found = Telemetry(0, heading_deg, 0.0, 0.0, AGL_M), []
     for pitch_deg, roll_deg in ((0.0, 0.0), (2.0, 0.0), (0.0, 2.0)):
         tilted = replace(telemetry, pitch_deg=pitch_deg, roll_deg=roll_deg)
-        view = registration.prepared(grey, WIDE, tilted, heading_known=True)
+        view = registration.prepared(View(grey, WIDE, tilted), heading_known=True)
         placed = registration.best(view, None).placed
         worth = np.zeros(2)
-        found.append(levelled(registration, grey, WIDE, tilted, view, placed, worth))
+        found.append(levelled(registration, View(grey, WIDE, tilted), view, placed, worth))
     level = found[0]
     assert np.degrees(np.sqrt(np.diag(level.covariance)[4:])) == pytest.approx(20.0)
     assert np.hypot(*(level.mean[:2] - place)) < 2
@@ -368,7 +368,7 @@ def test_the_pose_of_a_camera_is_the_inverse(localizer):
     registration = localizer.registration
     telemetry = Telemetry(0, 33.0, 4.0, -7.0, AGL_M)
     grey = rendered(GROUND, (20.0, -35.0), (33.0, 4.0, -7.0), AGL_M, WIDE)
-    view = registration.prepared(grey, WIDE, telemetry, heading_known=True)
+    view = registration.prepared(View(grey, WIDE, telemetry), heading_known=True)
     pose = registration.best(view, None).placed.pose
     place = registration.camera_en_m(view, pose)
     again = registration.pose_of(view, np.array([*place, pose.turn_rad, pose.log_scale]))
@@ -386,7 +386,7 @@ def test_odometry_measures_the_way(moved, expected):
         noisy = np.clip(grey + rng.normal(0, 5, grey.shape), 0, 255).astype(np.uint8)
         telemetry = Telemetry(number * 10**9, heading, 0.0, 0.0, AGL_M)
         pixel_m = footprints[0].pixel_m if footprints else None
-        footprints.append(Footprint.of(noisy, WIDE, telemetry, pixel_m))
+        footprints.append(Footprint.of(View(noisy, WIDE, telemetry), pixel_m))
     telemetry_noise = np.array([1e-3, 4e-4])
     expected = None if expected is None else np.array(expected)
     seen = moved_between(*footprints, 0.0, telemetry_noise, expected)
@@ -403,8 +403,8 @@ def test_odometry_sees_two_views_by_the_same_knowledge():
         for place, heading in (((0.0, 0.0), 0.0), (moved, 150.0))
     )
     known = np.array([math.radians(11.0), 0.0, *tilt])
-    before = Footprint.of(first, WIDE, telemetry[0], None)
-    now = Footprint.of(second, WIDE, telemetry[1], before.pixel_m, known)
+    before = Footprint.of(View(first, WIDE, telemetry[0]), None)
+    now = Footprint.of(View(second, WIDE, telemetry[1]), before.pixel_m, known)
     noise = np.array([math.radians(5.0) ** 2, 1e-4])
     seen = moved_between(before.by(known), now, 0.0, noise)
     turn = math.radians(10.0)  # what is wrong with the first heading bends the way
@@ -417,14 +417,16 @@ def test_odometry_sees_two_views_by_the_same_knowledge():
 
 def test_odometry_refuses_views_without_common_ground():
     telemetry = Telemetry(0, 0.0, 0.0, 0.0, AGL_M)
-    first = Footprint.of(rendered(GROUND, (0, 0), (0, 0, 0), AGL_M, WIDE), WIDE, telemetry, None)
+    first = Footprint.of(
+        View(rendered(GROUND, (0, 0), (0, 0, 0), AGL_M, WIDE), WIDE, telemetry), None
+    )
     later = replace(telemetry, time_ns=2 * 10**9)
     other = rendered(OTHER, (0, 0), (0, 0, 0), AGL_M, WIDE)
-    second = Footprint.of(other, WIDE, later, first.pixel_m)
+    second = Footprint.of(View(other, WIDE, later), first.pixel_m)
     assert moved_between(first, second, 0.01, np.array([1e-3, 4e-4])) is None
-    nan = Footprint.of(other, WIDE, replace(later, yaw_deg=math.nan), first.pixel_m)
+    nan = Footprint.of(View(other, WIDE, replace(later, yaw_deg=math.nan)), first.pixel_m)
     assert moved_between(first, nan, 0.01, np.array([1e-3, 4e-4])) is None
-    blank = Footprint.of(np.full((240, 320), 90, np.uint8), WIDE, later, first.pixel_m)
+    blank = Footprint.of(View(np.full((240, 320), 90, np.uint8), WIDE, later), first.pixel_m)
     assert blank is None or moved_between(first, blank, 0.01, np.array([1e-3, 4e-4])) is None
 
 
@@ -466,9 +468,9 @@ def test_gnss_of_a_first_leg_teaches_the_mount(localizer):
 def test_the_radius_grows_with_the_height(localizer):
     high = Camera(320, 240, 200 * 2000 / AGL_M, 200 * 2000 / AGL_M, 160.0, 120.0)
     grey, telemetry, _ = next(iter(views(1)))
-    found = Tracker(localizer).locate(grey, high, replace(telemetry, agl_m=2000.0))
+    found = Tracker(localizer).locate(View(grey, high, replace(telemetry, agl_m=2000.0)))
     assert found.radius_m == pytest.approx(50.0, rel=0.1)
-    low = Tracker(localizer).locate(grey, WIDE, telemetry)
+    low = Tracker(localizer).locate(View(grey, WIDE, telemetry))
     assert low.radius_m == localizer.registration.radius_m
 
 

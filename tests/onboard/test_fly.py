@@ -186,7 +186,7 @@ def test_all_is_well(flight):
 
 
 def test_a_view_becomes_a_message(flight):
-    flight.locator.outcome = lambda grey, camera, telemetry: fix(48.1234567, -4.3210987)
+    flight.locator.outcome = lambda view: fix(48.1234567, -4.3210987)
     result = flight.view(age_s=0.05)
     read = {each["name"]: each for each in flight.port.sent()}
     for name in ("GLOBAL_POSITION_SENSOR", "GPS_INPUT"):
@@ -227,7 +227,7 @@ def test_old_views_are_dropped_and_counted(flight):
 
 
 def test_a_slow_processor_degrades_and_what_is_late_is_not_sent(flight):
-    def slow(grey, camera, telemetry):
+    def slow(view):
         for _ in range(12):
             flight.time.go(0.1)
             flight.talk()
@@ -242,7 +242,7 @@ def test_a_slow_processor_degrades_and_what_is_late_is_not_sent(flight):
 def test_one_failure_is_one_no_fix(flight, caplog):
     whole = flight.locator.outcome
 
-    def failing(grey, camera, telemetry):
+    def failing(view):
         flight.locator.outcome = whole
         raise np.linalg.LinAlgError("singular")
 
@@ -253,7 +253,7 @@ def test_one_failure_is_one_no_fix(flight, caplog):
 
 
 def test_failures_at_every_view_are_a_failure(flight, caplog):
-    def failing(grey, camera, telemetry):
+    def failing(view):
         raise ValueError("odd")
 
     flight.locator.outcome = failing
@@ -298,8 +298,8 @@ def test_pictures_that_show_nothing_bring_nothing(flight, kind):
 def test_a_picture_of_another_shape_fails_and_one_of_another_size_does_not(flight):
     cameras = []
 
-    def outcome(grey, camera, telemetry):
-        cameras.append(camera)
+    def outcome(view):
+        cameras.append(view.camera)
         return fix()
 
     flight.locator.outcome = outcome
@@ -367,11 +367,11 @@ def test_a_computer_clock_that_is_set_does_no_harm(flight, seconds):
 
 
 def test_heading_and_height_far_from_told_degrade(flight):
-    flight.locator.outcome = lambda grey, camera, telemetry: fix(heading_deg=telemetry.yaw_deg + 35)
+    flight.locator.outcome = lambda view: fix(heading_deg=view.telemetry.yaw_deg + 35)
     flight.views(11)
     assert flight.reasons() == {"heading_off"}
-    flight.locator.outcome = lambda grey, camera, telemetry: fix(
-        heading_deg=telemetry.yaw_deg, agl_m=telemetry.agl_m / 2
+    flight.locator.outcome = lambda view: fix(
+        heading_deg=view.telemetry.yaw_deg, agl_m=view.telemetry.agl_m / 2
     )
     flight.views(11)
     assert flight.reasons() == {"height_off"}
@@ -384,7 +384,8 @@ def test_why_nothing_is_found_is_looked_at(begin, yaw_off, share, reason):
     """The track searches in vain; a second look finds the place with another heading or height."""
 
     class Localizer:
-        def locate(self, grey, camera, telemetry, *, heading_known):
+        def locate(self, view, *, heading_known):
+            telemetry = view.telemetry
             right = not heading_known or yaw_off == 0
             if right and telemetry.agl_m == pytest.approx(100.0 * share, rel=0.01):
                 return fix(heading_deg=telemetry.yaw_deg + yaw_off, agl_m=telemetry.agl_m)
@@ -532,7 +533,7 @@ def test_whatever_fails_the_next_view_is_flown(flight, monkeypatch, caplog):
 
 
 def test_a_camera_error_inside_names_the_camera(flight):
-    def wrong(grey, camera, telemetry):
+    def wrong(view):
         raise CameraError("another camera")
 
     flight.locator.outcome = wrong

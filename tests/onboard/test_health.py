@@ -24,7 +24,7 @@ from orthonav.onboard.health import (
     judge,
     offsets,
 )
-from orthonav.records import NoFix, Telemetry
+from orthonav.records import NoFix, Telemetry, View
 
 GOOD = Snapshot(60.0, {"taken": 50, "processed": 50, "sure": 50}, latency_s=0.1)
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
@@ -148,7 +148,8 @@ class Guessing:
     def __init__(self, heading_deg=10.0, agl_m=100.0):
         self.heading_deg, self.agl_m, self.asked = heading_deg, agl_m, []
 
-    def locate(self, grey, camera, telemetry, *, heading_known):
+    def locate(self, view, *, heading_known):
+        telemetry = view.telemetry
         self.asked.append((heading_known, telemetry.agl_m))
         right = not heading_known or abs(telemetry.yaw_deg - self.heading_deg) < 20
         if right and 0.8 < telemetry.agl_m / self.agl_m < 1.25:
@@ -166,7 +167,7 @@ def test_a_second_look_says_what_is_told_wrong(heading, height, off):
         np.zeros((240, 320), np.uint8),
     )
     for number in range(int(4 * LOOK_AFTER_S)):
-        second.look(grey, CAMERA, TOLD, False, number * S)
+        second.look(View(grey, CAMERA, TOLD), False, number * S)
     found = second.offsets(number * S)
     assert (abs(found[0]), found[1]) == pytest.approx(off, abs=1e-3)
     assert second.offsets(round((number + NOTE_S + LOOK_AFTER_S) * S)) == (0.0, 0.0)
@@ -176,8 +177,8 @@ def test_nobody_looks_twice_while_all_is_well():
     guessing = Guessing()
     second, grey = SecondLook(guessing, 0.9, at_once), np.zeros((240, 320), np.uint8)
     for number in range(100):
-        second.look(grey, CAMERA, TOLD, number % 4 != 0, number * S)
+        second.look(View(grey, CAMERA, TOLD), number % 4 != 0, number * S)
     assert guessing.asked == [] and second.offsets(100 * S) == (0.0, 0.0)
     for number in range(100, 118):
-        second.look(grey, CAMERA, replace(TOLD, agl_m=300.0), False, number * S)
+        second.look(View(grey, CAMERA, replace(TOLD, agl_m=300.0)), False, number * S)
     assert guessing.asked == [(False, 300.0), (True, 150.0), (True, 600.0)]

@@ -19,7 +19,7 @@ from orthonav.imagery.mosaic import Mosaic
 from orthonav.mapfile import open_map
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.prepare.calibrate import RADIUS_STRIDES
-from orthonav.records import Fix, Telemetry
+from orthonav.records import Fix, Telemetry, View
 
 CAMERA = Camera(256, 256, 256.0, 256.0, 128.0, 128.0)
 """It sees as many metres of ground as it is above it."""
@@ -360,7 +360,7 @@ def own_views(localizer, path, mirrored=False, count=30):
                 continue
             grey = cv2.resize(pixels.grey, (256, 256), interpolation=cv2.INTER_AREA)
             grey = np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey
-            fix = localizer.locate(grey, CAMERA, Telemetry(0, 0.0, 0.0, 0.0, float(size)))
+            fix = localizer.locate(View(grey, CAMERA, Telemetry(0, 0.0, 0.0, 0.0, float(size))))
             assert isinstance(fix, Fix)
             fixes.append(fix)
             truth.append(corner + np.array([col + size / 2, -(row + size / 2)]))

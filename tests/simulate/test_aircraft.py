@@ -1,6 +1,7 @@
 """Simulated flights of a real aircraft: wind, odometry, biases, clouds, ground beyond the map."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from orthonav.geo.area import Area
 from orthonav.geo.camera import Camera
 from orthonav.geo.route import Route, distance_to_polyline_m
 from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import prepare_view, rectify
+from orthonav.localizer import downsampled, rectify
+from orthonav.records import View
 from orthonav.simulate.clouds import Clouds
 from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.simulate.ground import reflected
@@ -151,15 +153,13 @@ def test_the_mount_tilts_more_than_told(fly, ortho, frame):
     def alike(view, pitch_deg, roll_deg):
         """Correlation of the levelled view with the orthophoto where it should lie."""
         telemetry, size_px = view.telemetry, 64
-        levelled = rectify(
-            prepare_view(read_image(view.path), SEEN, telemetry.agl_m, 1.0),
-            yaw_deg=telemetry.yaw_deg,
+        corrected = replace(
+            telemetry,
             pitch_deg=telemetry.pitch_deg + pitch_deg,
             roll_deg=telemetry.roll_deg + roll_deg,
-            agl_m=telemetry.agl_m,
-            gsd_m=1.0,
-            size_px=size_px,
         )
+        seen = View(read_image(view.path), SEEN, corrected)
+        levelled = rectify(downsampled(seen, 1.0), gsd_m=1.0, size_px=size_px)
         west, north = (
             frame.en_from_latlon(*truth[view.frame])
             + levelled.offset_en_m

@@ -14,7 +14,8 @@ from orthonav.geo.area import Area
 from orthonav.geo.camera import Camera
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import prepare_view, rectify
+from orthonav.localizer import downsampled, rectify
+from orthonav.records import View
 from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.simulate.render import ViewEffects
 
@@ -76,16 +77,8 @@ def test_the_picture_shows_the_ground_at_the_truth(area, plane, tmp_path, camera
     )
     for view in flight.views:
         telemetry = view.telemetry
-        prepared = prepare_view(read_image(view.path), camera, telemetry.agl_m, 1.0)
-        rectified = rectify(
-            prepared,
-            yaw_deg=telemetry.yaw_deg,
-            pitch_deg=telemetry.pitch_deg,
-            roll_deg=telemetry.roll_deg,
-            agl_m=telemetry.agl_m,
-            gsd_m=1.0,
-            size_px=SIZE_PX,
-        )
+        seen = View(read_image(view.path), camera, telemetry)
+        rectified = rectify(downsampled(seen, 1.0), gsd_m=1.0, size_px=SIZE_PX)
         place = plane.frame.en_from_latlon(*truth[view.frame]) + rectified.offset_en_m
         ground = ground_at(area, plane.frame, place)
         assert rectified.valid.all()

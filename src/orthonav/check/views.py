@@ -12,7 +12,7 @@ from orthonav.check.change import USUAL, Severity
 from orthonav.check.persistence import MARGIN_PX, features, usual_model
 from orthonav.geo.camera import Camera
 from orthonav.localizer.registration import RegistrationLocalizer
-from orthonav.records import Telemetry
+from orthonav.records import Telemetry, View
 from orthonav.register.reference import GreyPyramid
 from orthonav.register.registrar import Levels
 
@@ -131,8 +131,8 @@ class Pictures:
 
 def view_of(
     rng: np.random.Generator, plan: TrialPlan, picture: NDArray[np.uint8], gsd_m: float
-) -> tuple[NDArray[np.uint8], Camera, Telemetry]:
-    """A vertical view of the middle of a picture under any heading, and what is told of it."""
+) -> View:
+    """A vertical view of the middle of a picture under any heading."""
     size = picture.shape[0]
     width = max(8, round(plan.width_m / gsd_m))
     height = max(8, round(plan.height_m / gsd_m))
@@ -170,4 +170,4 @@ def view_of(
         agl_std_m=plan.agl_std * reported_m,
     )
     camera = Camera(width, height, focal, focal, width / 2, height / 2)
-    return np.asarray(view, dtype=np.uint8), camera, telemetry
+    return View(np.asarray(view, dtype=np.uint8), camera, telemetry)

@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.camera import Camera, ground_en_m
-from orthonav.localizer.registration import PreparedFootprint, RegistrationLocalizer
-from orthonav.records import Telemetry
+from orthonav.geo.camera import ground_en_m
+from orthonav.localizer.registration import PreparedView, RegistrationLocalizer
+from orthonav.records import View
 from orthonav.register.refine import Placed
 
 RIM_PX = 10.0
@@ -55,28 +55,26 @@ class Levelled:
 
 def levelled(
     registration: RegistrationLocalizer,
-    grey: NDArray[np.uint8],
-    camera: Camera,
-    telemetry: Telemetry,
-    view: PreparedFootprint,
+    view: View,
+    prepared: PreparedView,
     placed: Placed,
     worth: Array = BOTH,
 ) -> Levelled | None:
-    """The view (H, W), prepared as `view` and `placed` at its final level, with its tilt.
+    """The view, prepared as `prepared` and `placed` at its final level, with its tilt.
 
-    The pitch and roll of `telemetry` are those to be expected; a tilt that differs by more than a
+    The pitch and roll of its telemetry are those to be expected; a tilt that differs by more than a
     few degrees is found in several views, each from what is known by then. What perspective says of
     the two counts `worth` (2,) times; with 0 it is not looked at, and that tilt is known to 20 deg.
     None where the view cannot be looked at under tilts around the expected one.
     """
     if placed.covariance is None:
-        placed = registration.registrar.with_covariance(view.templates, view.levels, placed)
-    tilt = np.radians([telemetry.pitch_deg, telemetry.roll_deg])
-    mean, known = registration.seen_from(view, placed.pose), np.zeros(2)
-    hangs = _hangs(camera, telemetry, mean)
+        placed = registration.registrar.with_covariance(prepared.templates, prepared.levels, placed)
+    tilt = np.radians([view.telemetry.pitch_deg, view.telemetry.roll_deg])
+    mean, known = registration.seen_from(prepared, placed.pose), np.zeros(2)
+    hangs = _hangs(view, mean)
     if hangs is None:
         return None
-    looks = _Looks(registration, grey, camera, telemetry, view.levels.final)
+    looks = _Looks(registration, view, prepared.levels.final)
     for axis in np.flatnonzero(worth).tolist():
         after, before = (looks.score(mean, hangs, tilt, axis, sign) for sign in (1, -1))
         if after is None or before is None:
@@ -86,7 +84,7 @@ def levelled(
         mean += hangs[:, axis] * move
     spread = np.diag(1 / (known + WEAK_TILT_RAD**-2))
     covariance = np.zeros((6, 6))
-    covariance[:4, :4] = registration.covariance(view, placed) + hangs @ spread @ hangs.T
+    covariance[:4, :4] = registration.covariance(prepared, placed) + hangs @ spread @ hangs.T
     covariance[:4, 4:] = hangs @ spread
     covariance[4:, :4] = covariance[:4, 4:].T
     covariance[4:, 4:] = spread
@@ -95,11 +93,12 @@ def levelled(
     return Levelled(np.concatenate([mean, tilt]), covariance)
 
 
-def _hangs(camera: Camera, telemetry: Telemetry, mean: Array) -> Array | None:
+def _hangs(view: View, mean: Array) -> Array | None:
     """How camera position (m), heading and log scale change with pitch and roll: (4, 2).
 
     What the view shows stays where it is on the map. None where too little of it is ground.
     """
+    camera, telemetry = view.camera, view.telemetry
     share = (np.arange(SEEN_POINTS) + 0.5) / SEEN_POINTS
     px = np.stack(np.meshgrid(share * camera.width_px, share * camera.height_px), -1).reshape(-1, 2)
     tilt = np.array([telemetry.pitch_deg, telemetry.roll_deg])
@@ -134,16 +133,9 @@ def _similarity(of: Array, to: Array) -> tuple[float, float, float, float]:
 class _Looks:
     """Looks at one view under several tilts."""
 
-    def __init__(
-        self,
-        registration: RegistrationLocalizer,
-        grey: NDArray[np.uint8],
-        camera: Camera,
-        telemetry: Telemetry,
-        level: int,
-    ) -> None:
-        self._registration, self._grey, self._camera = registration, grey, camera
-        self._telemetry = telemetry
+    def __init__(self, registration: RegistrationLocalizer, view: View, level: int) -> None:
+        self._registration, self._view = registration, view
+        camera, telemetry = view.camera, view.telemetry
         corner = math.hypot(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px) / 2
         rim_m = RIM_PX * registration.grid.gsd_m * 2**level
         self.step_rad = min(rim_m / max(telemetry.agl_m * corner**2, 1e-9), MAX_STEP_RAD)
@@ -155,9 +147,10 @@ class _Looks:
         tilts = tilt_rad.copy()
         tilts[axis] += sign * self.step_rad
         pitch, roll = np.degrees(tilts).tolist()
-        tilted = replace(self._telemetry, pitch_deg=pitch, roll_deg=roll)
-        view = self._registration.prepared(self._grey, self._camera, tilted, heading_known=True)
-        if not isinstance(view, PreparedFootprint):
+        telemetry = replace(self._view.telemetry, pitch_deg=pitch, roll_deg=roll)
+        tilted = replace(self._view, telemetry=telemetry)
+        view = self._registration.prepared(tilted, heading_known=True)
+        if not isinstance(view, PreparedView):
             return None
         pose = self._registration.pose_of(view, mean + sign * self.step_rad * hangs[:, axis])
         refiner = self._registration.registrar.refiner(

@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_footprint
-from orthonav.localizer.rectify import prepare_view, rectify_footprint
-from orthonav.records import Telemetry
+from orthonav.localizer.rectify import downsampled, rectify_footprint
+from orthonav.records import Telemetry, View
 from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
 from orthonav.register.refine import Placed
@@ -99,7 +98,7 @@ class Footprint:
     camera_px: Array
     telemetry: Telemetry
     bias: Array
-    view: tuple[NDArray[np.uint8], Camera, Telemetry]
+    view: View
 
     @property
     def middle_px(self) -> tuple[float, float]:
@@ -110,7 +109,7 @@ class Footprint:
     @property
     def en_from_px(self) -> Array:
         """What takes pixels (x, y) to metres east and north (2, 2), by what was told."""
-        heading = math.radians(self.view[2].yaw_deg)
+        heading = math.radians(self.view.telemetry.yaw_deg)
         cos, sin = math.cos(heading), math.sin(heading)
         metres = self.pixel_m * math.exp(-self.bias[1])
         return np.array([[cos, -sin], [-sin, -cos]]) * metres
@@ -118,22 +117,16 @@ class Footprint:
     @classmethod
     def of(
         cls,
-        grey: NDArray[np.uint8],
-        camera: Camera,
-        telemetry: Telemetry,
+        view: View,
         pixel_m: float | None,
         bias: Array = NO_BIAS,
     ) -> "Footprint | None":
-        """A view (H, W) with what was told of it, None where it shows too little."""
-        view = (grey, camera, telemetry)
-        telemetry = corrected_by(telemetry, bias)
+        """A view for odometry, None where it shows too little."""
+        camera, telemetry = view.camera, corrected_by(view.telemetry, bias)
         side_m = camera.gsd_m(telemetry.agl_m) * math.sqrt(camera.width_px * camera.height_px)
         pixel_m = pixel_m or side_m / VIEW_PX
         made = rectify_footprint(
-            prepare_view(grey, camera, telemetry.agl_m, pixel_m),
-            pitch_deg=telemetry.pitch_deg,
-            roll_deg=telemetry.roll_deg,
-            agl_m=telemetry.agl_m,
+            downsampled(replace(view, telemetry=telemetry), pixel_m),
             gsd_m=pixel_m,
             multiple_px=2 ** (LEVELS - 1),
         )
@@ -150,10 +143,10 @@ class Footprint:
         would look like a way gone.
         """
         if (np.abs(bias - self.bias)[1:] > SAME_BIAS[1:]).any():
-            return Footprint.of(*self.view, self.pixel_m, bias)
+            return Footprint.of(self.view, self.pixel_m, bias)
         # Rectified with the heading up, so that only this need not be what it was.
         kept = np.array([bias[0], *self.bias[1:]])
-        return replace(self, telemetry=corrected_by(self.view[2], kept), bias=kept)
+        return replace(self, telemetry=corrected_by(self.view.telemetry, kept), bias=kept)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +189,7 @@ def moved_between(
     )
     std_m = math.hypot(NOISE_PX * before.pixel_m, NOISE_SHARE * float(np.hypot(*way)))
     variance = std_m**2 + (TILT_SHARE * now.telemetry.agl_m * tilt_noise_rad) ** 2
-    reported_rad = math.radians(now.view[2].yaw_deg - before.view[2].yaw_deg)
+    reported_rad = math.radians(now.view.telemetry.yaw_deg - before.view.telemetry.yaw_deg)
     seen = CameraDisplacement(
         way,
         np.eye(2) * variance,

@@ -13,14 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import MapFileError
-from orthonav.geo.camera import Camera
-from orthonav.localizer.checks import check_telemetry, check_view, require_camera
+from orthonav.localizer.checks import check_view
 from orthonav.localizer.levelled import levelled
 from orthonav.localizer.localizer import Localizer
 from orthonav.localizer.odometry import Footprint, Moved, corrected_by, moved_between
 from orthonav.localizer.places import places_of
-from orthonav.localizer.registration import PreparedFootprint
-from orthonav.records import Fix, NoFix, Prior, Telemetry
+from orthonav.localizer.registration import PreparedView
+from orthonav.records import Fix, NoFix, Prior, Telemetry, View
 from orthonav.register.registrar import Registered
 from orthonav.track import Estimate, Mixture, Model, ReportedVelocity, Sighting, State, Told
 from orthonav.track.hypotheses import within
@@ -93,31 +92,27 @@ class Tracker:
         self._lagged: list[Fix | NoFix] = []
         self.state = State.SEARCHING
 
-    def locate(self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry) -> Fix | NoFix:
-        """Where the aircraft is, with this view (H, W) and all before it.
+    def locate(self, view: View) -> Fix | NoFix:
+        """Where the aircraft is, with this view and all before it.
 
         A view that shows nothing moves the track on by what is known of the velocity. Raises
         `CameraError` if the camera is not that of the image.
         """
-        require_camera(grey, camera)
-        refused = check_telemetry(
-            telemetry, camera, self._localizer.grid.gsd_m, self._heading_known
-        )
-        refused = refused or check_view(grey)
-        overlap = self._predict(None if refused else grey, camera, telemetry)
+        refused = check_view(view, self._localizer.grid.gsd_m, self._heading_known)
+        overlap = self._predict(None if refused else view, view.telemetry)
         self._unlevelled += 1 - overlap
         if refused is None:
-            refused = self._observe(grey, camera, telemetry, overlap)
-        return self._outcome(telemetry, refused)
+            refused = self._observe(view, overlap)
+        return self._outcome(view.telemetry, refused)
 
     @property
     def state_name(self) -> str:
         """The state as `fixes.jsonl` has it."""
         return self.state.value
 
-    def passed(self, camera: Camera, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+    def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """Where the aircraft is at a view whose picture cannot be used, for `reason`."""
-        self._predict(None, camera, telemetry)
+        self._predict(None, telemetry)
         return self._outcome(telemetry, reason)
 
     def smoothed_track(self) -> list[Fix | NoFix]:
@@ -173,15 +168,13 @@ class Tracker:
                 self._lagged.append(self._smoothed_fix(smoothed, self._seen[-self._lag - 1]))
         return outcome
 
-    def _predict(
-        self, grey: NDArray[np.uint8] | None, camera: Camera, telemetry: Telemetry
-    ) -> float:
+    def _predict(self, view: View | None, telemetry: Telemetry) -> float:
         """Move the track to the time of this view; the share of it that was seen before."""
         before, now = self._before, None
-        if grey is not None and self._heading_known:
+        if view is not None and self._heading_known:
             bias, _ = self.mixture.bias()
             before = None if before is None else before.by(bias)
-            now = self._footprint(grey, camera, telemetry, before, bias)
+            now = self._footprint(view, before, bias)
         prior = telemetry.prior if self._use_prior or self._every_prior else None
         if self._usual_model and math.isfinite(telemetry.agl_m):
             self._usual_model = False
@@ -221,18 +214,16 @@ class Tracker:
 
     def _footprint(
         self,
-        grey: NDArray[np.uint8],
-        camera: Camera,
-        telemetry: Telemetry,
+        view: View,
         before: Footprint | None,
         bias: Array,
     ) -> Footprint | None:
         """The view for odometry, in pixels of the one before unless they differ too much."""
         if before is not None:
-            made = Footprint.of(grey, camera, telemetry, before.pixel_m, bias)
+            made = Footprint.of(view, before.pixel_m, bias)
             if made is None or made.grey.size < 4 * before.grey.size:
                 return made
-        return Footprint.of(grey, camera, telemetry, None, bias)
+        return Footprint.of(view, None, bias)
 
     def _reported_velocity(self, telemetry: Telemetry) -> ReportedVelocity | None:
         """The told velocity beside that of the view before, None where none is told."""
@@ -273,27 +264,24 @@ class Tracker:
         tilt_noise = self._tilt_noise(now.telemetry)
         return moved_between(before, now, tilt_noise, telemetry_noise, expected_en_m)
 
-    def _observe(
-        self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry, overlap: float
-    ) -> NoFix | None:
+    def _observe(self, view: View, overlap: float) -> NoFix | None:
         """Look for the view and hand what it may be to the mixture; why not, if it cannot be."""
+        telemetry = view.telemetry
         expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
         bias, spread = self.mixture.bias()
-        corrected = _known(corrected_by(telemetry, bias), spread)
-        view = self._registration.prepared(grey, camera, corrected, self._heading_known)
-        if isinstance(view, NoFix):
-            return view
+        corrected = replace(view, telemetry=_known(corrected_by(telemetry, bias), spread))
+        prepared = self._registration.prepared(corrected, self._heading_known)
+        if isinstance(prepared, NoFix):
+            return prepared
         prior, searched = self._where(expected)
         sightings, newness = [], max(1 - overlap, LEAST_NEW)
-        if prior is None or self._registration.touches_map(prior, view):
-            found = self._registration.best(view, prior)
+        if prior is None or self._registration.touches_map(prior, prepared):
+            found = self._registration.best(prepared, prior)
             if found is not None:
                 area = math.inf if searched is None else math.pi * searched[1] ** 2
                 share = min(area / self.mixture.area_m2, 1.0)
                 worth = self._worth_of_tilt(newness, math.isfinite(found.fine_score))
-                sightings = self._sightings(
-                    grey, camera, corrected, view, found, bias[1], share, worth
-                )
+                sightings = self._sightings(corrected, prepared, found, bias[1], share, worth)
         told = Told(
             math.radians(telemetry.yaw_deg) if self._heading_known else None,
             math.radians(telemetry.pitch_deg),
@@ -337,10 +325,8 @@ class Tracker:
 
     def _sightings(
         self,
-        grey: NDArray[np.uint8],
-        camera: Camera,
-        telemetry: Telemetry,
-        view: PreparedFootprint,
+        view: View,
+        prepared: PreparedView,
         found: Registered,
         log_scale: float,
         looked_at: float,
@@ -350,9 +336,9 @@ class Tracker:
         counted `worth` (2,) times."""
         made = []
         for log_odds, alone, placed in places_of(
-            found, self._confidence, NEAR_SHARE * view.side_px, looked_at
+            found, self._confidence, NEAR_SHARE * prepared.side_px, looked_at
         ):
-            seen = levelled(self._registration, grey, camera, telemetry, view, placed, worth)
+            seen = levelled(self._registration, view, prepared, placed, worth)
             if seen is None:
                 continue
             mean = seen.mean.copy()

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from orthonav.errors import FlightError
 from orthonav.flight.mount import Bias, Mount
-from orthonav.geo.camera import Camera
 from orthonav.onboard.run import Locator
-from orthonav.records import CONFIDENT, Fix, NoFix, Telemetry, ViewResult
+from orthonav.records import CONFIDENT, Fix, NoFix, Telemetry, View, ViewResult
 from orthonav.track import Model
 
 MIN_VIEWS = 5
@@ -125,13 +124,13 @@ class Mounted:
     locator: Locator
     mount: Mount
 
-    def locate(self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry) -> Fix | NoFix:
+    def locate(self, view: View) -> Fix | NoFix:
         """See `Locator.locate`."""
-        return self.locator.locate(grey, camera, self.mount.corrected(telemetry))
+        return self.locator.locate(replace(view, telemetry=self.mount.corrected(view.telemetry)))
 
-    def passed(self, camera: Camera, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+    def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """See `Locator.passed`."""
-        return self.locator.passed(camera, self.mount.corrected(telemetry), reason)
+        return self.locator.passed(self.mount.corrected(telemetry), reason)
 
     @property
     def state_name(self) -> str | None:

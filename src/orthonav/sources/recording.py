@@ -20,7 +20,7 @@ DECIMALS = 8
 
 @dataclass(frozen=True, eq=False)
 class SourceView:
-    """One view of a source: an `orthonav.flight.View` that also knows what is written of it.
+    """One view of a source: a `RecordedView` that also knows what is written of it.
 
     `frame` ends as its picture is to be written; `data` gives the picture as it was encoded, None
     where it was not; `load` decodes it.
