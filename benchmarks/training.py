@@ -22,16 +22,13 @@ import numpy as np
 from benchmarks.child import peak_memory_mb
 from benchmarks.record import Section, Table, number, provenance, save
 
-PLAIN = {"bf16": False, "channels_last": False, "fused": False, "keep_memory": False}
+PLAIN = {"bf16": False, "fused": False, "keep_memory": False}
 MEANS: dict[str, dict[str, bool]] = {
     "plain float32": PLAIN,
     "+ fused optimizer": {**PLAIN, "fused": True},
     "+ memory kept": {**PLAIN, "fused": True, "keep_memory": True},
-    "+ channels last": {**PLAIN, "fused": True, "keep_memory": True, "channels_last": True},
-    "+ bfloat16": {"bf16": True, "channels_last": True, "fused": True, "keep_memory": True},
+    "+ bfloat16": {"bf16": True, "fused": True, "keep_memory": True},
 }
-COMPILED = "+ torch.compile"
-MEANS[COMPILED] = {**MEANS["+ bfloat16"], "compile": True}
 WHOLE = "+ bfloat16"
 LOSSES = "losses"
 PRECISIONS = "precisions"
@@ -50,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     start = time.perf_counter()
     started = provenance("training")
-    wanted = options.only or [name for name in PARTS if options.compile or name != COMPILED]
+    wanted = options.only or PARTS
     section = Section("Learning the auto-encoder")
     rows = [name for name in wanted if name in MEANS]
     if rows:
@@ -72,7 +69,6 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m benchmarks.training", description=str(__doc__).splitlines()[0]
     )
     parser.add_argument("--steps", type=int, default=5, help="timed steps per row")
-    parser.add_argument("--compile", action="store_true", help="torch.compile too (minutes)")
     parser.add_argument("--only", nargs="+", choices=PARTS, help="only these rows")
     parser.add_argument(
         "--out", type=Path, default=Path("bench_results"), help="folder (default bench_results)"

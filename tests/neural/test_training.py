@@ -306,7 +306,7 @@ def test_triplets_need_positives():
 
 def test_fast_means_learn_the_same_up_to_rounding(tmp_path):
     recipe = dataclasses.replace(AUTO, epochs=8)
-    plain = Means(bf16=False, channels_last=False, fused=False, keep_memory=False, device="cpu")
+    plain = Means(bf16=False, fused=False, keep_memory=False, device="cpu")
     fast = dataclasses.replace(QUICK, bf16=True)
     learn(recipe, tmp_path / "plain", means=plain)
     learn(recipe, tmp_path / "fast", means=fast)

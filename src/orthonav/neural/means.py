@@ -1,4 +1,11 @@
-"""How learning is made fast: precision, memory, processes. What is learnt stays the same."""
+"""How learning is made fast: precision, memory, processes. What is learnt stays the same.
+
+Tensors stay contiguous (NCHW) on every device. In `channels_last` oneDNN writes past a buffer in the
+backward pass of strided 1 x 1 convolutions with fewer channels than its block: the short cuts of a
+narrow ResNet. On processors with AVX2 only, the gradients are then wrong, or the process crashes or
+hangs (oneDNN issue 6035, present in PyTorch 2.13.0). The gain was small: docs/benchmarks.md.
+`torch.compile` is not used, because on a CPU it chooses `channels_last` by itself.
+"""
 
 import contextlib
 import ctypes
@@ -17,19 +24,16 @@ from torch.nn.parallel import DistributedDataParallel
 class Means:
     """How learning is made fast; what is learnt stays the same up to rounding.
 
-    `bf16`: mixed precision, None where the processor multiplies bfloat16 itself. `channels_last`:
-    memory layout of convolutions. `fused`: the optimizer's step in one pass over memory.
-    `keep_memory`: freed memory stays with the process (Linux, CPU). `compile`: `torch.compile`,
-    which needs a C++ compiler. `chunk`: most tiles of a triplet batch held for gradients at once;
-    batch norms are then taken over each chunk. `workers`: threads that make batches.
-    `save_every_s`: least time between checkpoints, s. `device`: None for a GPU where there is one.
+    `bf16`: mixed precision, None where the processor multiplies bfloat16 itself. `fused`: the
+    optimizer's step in one pass over memory. `keep_memory`: freed memory stays with the process
+    (Linux, CPU). `chunk`: most tiles of a triplet batch held for gradients at once; batch norms are
+    then taken over each chunk. `workers`: threads that make batches. `save_every_s`: least time
+    between checkpoints, s. `device`: None for a GPU where there is one.
     """
 
     bf16: bool | None = None
-    channels_last: bool = True
     fused: bool = True
     keep_memory: bool = True
-    compile: bool = False
     chunk: int = 128
     workers: int = 2
     save_every_s: float = 300.0
@@ -65,12 +69,12 @@ def uses_bf16(means: Means, device: torch.device) -> bool:
     return any(bool(able.get(name)) for name in ("avx512_bf16", "amx_bf16", "bf16"))
 
 
-def wrapped(model: nn.Module, device: torch.device, means: Means, world: World) -> nn.Module:
-    """The model as it is run: compiled if wanted, with gradients averaged over processes."""
-    if world.size > 1:
-        ids = [world.local_rank] if device.type == "cuda" else None
-        model = DistributedDataParallel(model, device_ids=ids)
-    return torch.compile(model) if means.compile else model  # type: ignore[return-value]
+def wrapped(model: nn.Module, device: torch.device, world: World) -> nn.Module:
+    """The model as it is run: of several processes, with gradients averaged over them."""
+    if world.size == 1:
+        return model
+    ids = [world.local_rank] if device.type == "cuda" else None
+    return DistributedDataParallel(model, device_ids=ids)
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ batch, gradients are averaged, the first one writes. Negatives and the statistic
 are those of a process's own part.
 """
 
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -40,6 +41,8 @@ from orthonav.neural.means import (
 )
 from orthonav.neural.tiles import SheetTiles, epoch_batches, made_ahead
 from orthonav.neural.triplet import Positive, Triplets
+
+log = logging.getLogger(__name__)
 
 CALIBRATION_TILES, HELD_OUT_TILES = 64, 32
 SETTLING_BATCHES = 32
@@ -170,15 +173,16 @@ def train(
     several processes all read the checkpoint, so `work` must be a folder that all see.
     """
     device = device_of(means, world)
-    layout = torch.channels_last if means.channels_last else torch.contiguous_format
-    task.model.to(device=device, memory_format=layout)  # type: ignore[call-overload]
+    bf16 = uses_bf16(means, device)
+    precision = "bfloat16" if bf16 else "float32"
+    log.info("learning on %s in %s, contiguous tensors (NCHW)", device, precision)
+    task.model.to(device)
     state = State(task.model, recipe, fused=means.fused)
     known_by = fingerprint(recipe, tiles, dates, seed, means, world)
     store = Store(work, known_by, means.save_every_s)
     store.load(state, device)
-    run = wrapped(task.model, device, means, world)
-    bf16 = uses_bf16(means, device)
-    feed = _Feed(task, recipe.batch, seed, len(tiles), device, layout, bf16, means, world)
+    run = wrapped(task.model, device, world)
+    feed = _Feed(task, recipe.batch, seed, len(tiles), device, bf16, means, world)
     writer = store if world.rank == 0 else None
     if writer:
         writer.clear()
@@ -245,7 +249,6 @@ class _Feed:
     seed: int
     count: int
     device: torch.device
-    layout: torch.memory_format
     bf16: bool
     means: Means
     world: World
@@ -261,7 +264,7 @@ class _Feed:
         plan = epoch_batches(self.count, self.batch, self.seed, epoch, rank=rank, processes=size)
         make = partial(self.task.arrays, epoch)
         for arrays in made_ahead(make, plan[first:end], self.means.workers):
-            yield [_on(self.device, array, self.layout) for array in arrays]
+            yield [torch.from_numpy(np.ascontiguousarray(a)).to(self.device) for a in arrays]
 
     def mixed(self) -> torch.autocast:
         """Mixed precision where it is wanted."""
@@ -304,10 +307,3 @@ def _settle(feed: _Feed) -> None:
     if feed.world.size > 1:
         for values in model.buffers():
             distributed.broadcast(values, 0)
-
-
-def _on(device: torch.device, array: NDArray[Any], layout: torch.memory_format) -> Tensor:
-    tensor = torch.from_numpy(np.ascontiguousarray(array))
-    if tensor.ndim == 4:
-        return tensor.to(device, memory_format=layout)
-    return tensor.to(device)
