@@ -1,4 +1,4 @@
-"""Flight folders: views, telemetry, camera and, where known, truth. Format: docs/reference/formats.md."""
+"""Flight folders: views, telemetry, camera and, where known, truth (docs/reference/formats.md)."""
 
 from orthonav.flight.folder import (
     FlightFolder,
