@@ -31,7 +31,7 @@ from orthonav.atlas.lookup import AtlasLookup
 from orthonav.atlas.lost import LostLocator
 from orthonav.geo.camera import Camera
 from orthonav.geo.frames import distances_m
-from orthonav.records import Fix, Telemetry
+from orthonav.records import CONFIDENT, Fix, Telemetry, View
 from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
 
 SIDE_M, GSD_M, SEED = 50_000.0, 8.0, 21
@@ -46,7 +46,6 @@ TURN_STD_RAD = 0.15
 EDGE_PX = 300
 RIGHT_M = 80.0
 """Ten pixels, what the sheets' confidence speaks of."""
-SURE = 0.9
 
 
 @dataclass(frozen=True)
@@ -94,10 +93,10 @@ def flights(
         scale = rng.normal(0, AGL_STD)
         views = []
         for view in range(VIEWS):
-            told_m = AGL_M * math.exp(scale + rng.normal(0, AGL_JITTER))
+            reported_m = AGL_M * math.exp(scale + rng.normal(0, AGL_JITTER))
             east, north = transform * (place + 0.5)
             lon, lat = to_latlon.transform(east, north)
-            telemetry = Telemetry(round(view * EVERY_S * 1e9), math.nan, 0.0, 0.0, told_m)
+            telemetry = Telemetry(round(view * EVERY_S * 1e9), math.nan, 0.0, 0.0, reported_m)
             views.append((_cut(grey, place, heading), telemetry, (lat, lon)))
             step_px = speed * EVERY_S / GSD_M
             place = place + step_px * np.array([math.sin(heading), -math.cos(heading)])
@@ -126,7 +125,7 @@ def flown(ortho: Path, atlas: Path, count: int, seed: int, *, mirrored: bool) ->
             locator = LostLocator(ground, lookup)
             for view, (grey, telemetry, truth) in enumerate(flight):
                 start = time.perf_counter()
-                outcome = locator.locate(grey, camera, telemetry)
+                outcome = locator.locate(View(grey, camera, telemetry))
                 latency_ms = (time.perf_counter() - start) * 1e3
                 error_m = confidence = math.nan
                 if isinstance(outcome, Fix):
@@ -150,11 +149,11 @@ def row(name: str, outcomes: list[Outcome]) -> list[str]:
     trials = sorted({each.flight for each in outcomes})
     first = {}
     for each in outcomes:
-        if each.confidence >= SURE and each.flight not in first:
+        if each.confidence >= CONFIDENT and each.flight not in first:
             first[each.flight] = each
     right = sum(each.error_m <= RIGHT_M for each in first.values())
     fixes = [each for each in outcomes if not math.isnan(each.error_m)]
-    sure = [each for each in fixes if each.confidence >= SURE]
+    sure = [each for each in fixes if each.confidence >= CONFIDENT]
     wrong = sum(each.error_m > RIGHT_M for each in sure)
     errors = [each.error_m for each in sure if each.error_m <= RIGHT_M]
     views = [each.view + 1 for each in first.values() if each.error_m <= RIGHT_M]
@@ -200,7 +199,7 @@ def main() -> int:
             ),
             rows,
             (
-                f"Right: within {RIGHT_M:.0f} m (10 px). Sure: confidence of {SURE:g} or more. "
+                f"Right: within {RIGHT_M:.0f} m (10 px). Confident: {CONFIDENT:g} or more. "
                 f"Generated area, seed {SEED}; flights, seed {options.seed}.",
             ),
         )

@@ -13,12 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.flights import View
-from orthonav.geo.camera import Camera
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.localizer import Localizer
-from orthonav.localizer.rectify import Rectified, prepare_view
-from orthonav.records import Fix
+from orthonav.localizer.rectify import RectifiedView, downsampled
+from orthonav.records import Fix, View
 from orthonav.represent.canny import Canny
 
 JPEG_QUALITY = 90
@@ -35,7 +33,7 @@ class Method(Protocol):
     name: str
     carried: tuple[str, int]
 
-    def locate(self, camera: Camera, view: View) -> Place:
+    def locate(self, view: View) -> Place:
         """East and north (2,) of the camera in the sheet, None for no answer."""
         ...
 
@@ -48,9 +46,9 @@ class Orthonav:
         self.carried = ("map", size_bytes)
         self._localizer = localizer
 
-    def locate(self, camera: Camera, view: View) -> Place:
+    def locate(self, view: View) -> Place:
         """The fix, whatever its confidence."""
-        found = self._localizer.locate(view.grey, camera, view.telemetry)
+        found = self._localizer.locate(view)
         if not isinstance(found, Fix):
             return None
         return self._localizer.sheet.frame.en_from_latlon(found.lat_deg, found.lon_deg)
@@ -78,11 +76,11 @@ class Reference:
             localizer, np.where(pixels.valid, pixels.grey, mean).astype(np.uint8), pixels.valid
         )
 
-    def rectified(self, camera: Camera, view: View, turns_deg: Sequence[float]) -> list[Rectified]:
+    def rectified(self, view: View, turns_deg: Sequence[float]) -> list[RectifiedView]:
         """The view as orthonav would rectify it, under the told heading and turns from it."""
-        told = view.telemetry
-        prepared = prepare_view(view.grey, camera, told.agl_m, self.localizer.grid.gsd_m)
-        return [self.localizer.rectified(prepared, told, told.yaw_deg + turn) for turn in turns_deg]
+        yaw_deg = view.telemetry.yaw_deg
+        smaller = downsampled(view, self.localizer.grid.gsd_m)
+        return [self.localizer.rectified(smaller, yaw_deg + turn) for turn in turns_deg]
 
     def place_en_m(self, col_px: float, row_px: float) -> NDArray[np.float64]:
         """Where a pixel coordinate (outer corner of the first pixel: 0, 0) lies in the sheet."""
@@ -128,9 +126,9 @@ class TemplateMatch:
         else:
             self.carried = ("orthophoto, grey JPEG", reference.jpeg_bytes)
 
-    def locate(self, camera: Camera, view: View) -> Place:
+    def locate(self, view: View) -> Place:
         """The highest correlation anywhere."""
-        views = self.reference.rectified(camera, view, self.turns_deg)
+        views = self.reference.rectified(view, self.turns_deg)
         middle = views[0].grey.shape[0] // 2
         half = min(_seen_half_px(one.valid) for one in views)
         part = np.s_[middle - half : middle + half, middle - half : middle + half]
@@ -160,9 +158,9 @@ class SiftMatch:
         self._matcher.train()
         self.carried = ("keypoints, 136 bytes each", 136 * len(points))
 
-    def locate(self, camera: Camera, view: View) -> Place:
+    def locate(self, view: View) -> Place:
         """Where the centre of the view falls; none with fewer than `MIN_INLIERS` inliers."""
-        seen = self._reference.rectified(camera, view, [0.0])[0]
+        seen = self._reference.rectified(view, [0.0])[0]
         points, descriptors = self._features(seen.grey, seen.valid)
         if len(points) < 2:
             return None

@@ -156,11 +156,11 @@ def _results(place: Workplace, scene: Scene, methods: Sequence[Method]) -> list[
 
 def _run(method: Method, flight: Flight, localizer: Localizer) -> Result:
     errors_m, times_ms = [], []
-    method.locate(flight.camera, flight.views[0])  # warm-up
-    for view in flight.views:
-        place, took_s = timed(method.locate, flight.camera, view)
+    method.locate(flight.views[0].view)  # warm-up
+    for flown in flight.views:
+        place, took_s = timed(method.locate, flown.view)
         times_ms.append(1e3 * took_s)
-        truth = localizer.sheet.frame.en_from_latlon(*view.truth_latlon_deg)
+        truth = localizer.sheet.frame.en_from_latlon(*flown.truth_latlon_deg)
         errors_m.append(np.inf if place is None else float(np.hypot(*(place - truth))))
     return Result(method, np.array(errors_m), np.array(times_ms), localizer.grid.stride_m)
 

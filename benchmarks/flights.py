@@ -4,22 +4,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from orthonav.flight import open_flight, read_truth
 from orthonav.flight.folder import read_image
 from orthonav.geo.camera import Camera
-from orthonav.records import Telemetry
+from orthonav.records import View
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """A picture `grey` (H, W), what was told with it, and where it was taken."""
+class FlownView:
+    """A view of a flight, the file of its picture, and where it was taken."""
 
     path: Path
-    grey: NDArray[np.uint8]
-    telemetry: Telemetry
+    view: View
     truth_latlon_deg: tuple[float, float]
 
 
@@ -29,15 +25,19 @@ class Flight:
 
     folder: Path
     camera: Camera
-    views: tuple[View, ...]
+    views: tuple[FlownView, ...]
 
 
-def read_views(folder: Path) -> tuple[Camera, Iterator[View]]:
+def read_views(folder: Path) -> tuple[Camera, Iterator[FlownView]]:
     """The camera of a flight folder and its views, each read when it is asked for."""
     recorded = open_flight(folder)
     truth = read_truth(folder / "truth.csv")
     views = (
-        View(view.path, read_image(view.path), view.telemetry, truth[view.frame])
-        for view in recorded.views
+        FlownView(
+            each.path,
+            View(read_image(each.path), recorded.camera, each.telemetry),
+            truth[each.frame],
+        )
+        for each in recorded.views
     )
     return recorded.camera, views

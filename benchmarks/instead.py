@@ -23,7 +23,7 @@ TRACK, SIFT, ORB, ENCODER = "track", "sift", "orb", "encoder"
 NEAR_M = 300.0
 TILE_PX, DIMS, WARM_UP = 256, 1024, 3
 OPENCV = ("opencv-python-headless", "numpy")
-Placer = Callable[[Any, Any], Any]
+Placer = Callable[[Any], Any]
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def _notes(tiles: int) -> tuple[str, ...]:
     return (
         "ms: from the decoded picture to a place, one core, warm; tracked: `Tracker` on views "
         "that follow each other at 5 Hz, shares once it is tracking; the others: each view for "
-        "itself, rectified by orthonav's code under the told heading, height and lean",
+        "itself, rectified by orthonav's code under the told heading, height and tilt",
         "SIFT, ORB: keypoints of the map (1 m) made once; whole map: FLANN; around the true place "
         "(as if it were known): one by one; ratio 0.75, RANSAC similarity, fewer than 8 inliers "
         "are no answer",
@@ -126,9 +126,10 @@ def run(task: Task) -> dict[str, Any]:
     import cv2
 
     from benchmarks.child import peak_memory_mb
-    from benchmarks.flights import View
+    from benchmarks.flights import FlownView
     from orthonav.flight import open_flight, read_truth
     from orthonav.mapfile import open_map
+    from orthonav.records import View
 
     cv2.setNumThreads(1)
     cv2.setRNGSeed(0)
@@ -139,13 +140,15 @@ def run(task: Task) -> dict[str, Any]:
     errors_m: list[float | None] = []
     times_ms: list[float] = []
     for number, one in enumerate(islice(flight.views, 0, task.views * task.every, task.every)):
-        view = View(one.path, one.grey(), one.telemetry, truth[one.frame])
+        flown = FlownView(
+            one.path, View(one.grey(), flight.camera, one.telemetry), truth[one.frame]
+        )
         start = time.perf_counter()
-        found = place(flight.camera, view)
+        found = place(flown)
         took_ms = 1e3 * (time.perf_counter() - start)
         if number < WARM_UP or found is SEARCHING:
             continue
-        there = frame.en_from_latlon(*view.truth_latlon_deg)
+        there = frame.en_from_latlon(*flown.truth_latlon_deg)
         errors_m.append(None if found is None else math.hypot(*(found - there).tolist()))
         times_ms.append(took_ms)
     return {"ms": times_ms, "errors_m": errors_m, "peak_mb": peak_memory_mb(), "tiles": tiles}
@@ -166,9 +169,9 @@ def _method(task: Task, frame: Any) -> tuple[Placer, int]:
     picture = posed.Picture.read(Path(task.map_path), Path(task.pixels), 1)
     keypoints = posed.Keypoints(picture, orb=task.method == ORB, near_m=task.near_m)
 
-    def place(camera: Any, view: Any) -> Any:
-        near = frame.en_from_latlon(*view.truth_latlon_deg) if task.near_m else None
-        return keypoints.locate(camera, view, True, near)
+    def place(flown: Any) -> Any:
+        near = frame.en_from_latlon(*flown.truth_latlon_deg) if task.near_m else None
+        return keypoints.locate(flown.view, True, near)
 
     return place, 0
 
@@ -181,8 +184,8 @@ def _track(task: Task, frame: Any) -> Placer:
 
     tracker = Tracker(Localizer(open_map(Path(task.map_path))))
 
-    def place(camera: Any, view: Any) -> Any:
-        found = tracker.locate(view.grey, camera, view.telemetry)
+    def place(flown: Any) -> Any:
+        found = tracker.locate(flown.view)
         if tracker.state_name != "tracking":
             return SEARCHING
         return (
@@ -196,7 +199,7 @@ def _encoder(task: Task) -> tuple[Placer, int]:
     import numpy as np
     import torch
 
-    from orthonav.localizer.rectify import prepare_view, rectify
+    from orthonav.localizer.rectify import downsampled, rectify
     from orthonav.mapfile import open_map
     from orthonav.neural.autoencoder import AutoEncoder
     from orthonav.represent.canny import Canny
@@ -210,17 +213,8 @@ def _encoder(task: Task) -> tuple[Placer, int]:
     embeddings = rng.standard_normal((sheet.tiles, DIMS), dtype=np.float32)
     edges_of = Canny()
 
-    def place(camera: Any, view: Any) -> Any:
-        told = view.telemetry
-        seen = rectify(
-            prepare_view(view.grey, camera, told.agl_m, gsd_m),
-            yaw_deg=told.yaw_deg,
-            pitch_deg=told.pitch_deg,
-            roll_deg=told.roll_deg,
-            agl_m=told.agl_m,
-            gsd_m=gsd_m,
-            size_px=TILE_PX,
-        )
+    def place(flown: Any) -> Any:
+        seen = rectify(downsampled(flown.view, gsd_m), gsd_m=gsd_m, size_px=TILE_PX)
         edges = edges_of(seen.grey, seen.valid)[:1].astype(np.float32)
         with torch.inference_mode():
             made = encoder(torch.from_numpy(edges[None])).numpy()[0]

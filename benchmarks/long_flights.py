@@ -52,11 +52,11 @@ LEG_M, SHARPEST_DEG = (3000.0, 9000.0), 120.0
 WIND_MPS, DRIFT, CLOUD_SHARE = 8.0, 0.02, 0.15
 YAW_BIAS_DEG, AGL_BIAS = 3.0, 0.05
 SCATTER = Errors(
-    yaw_std_deg=1.0, agl_std=0.01, tilt_std_deg=0.2, lean_std_deg=2.0, velocity_drift=DRIFT
+    yaw_std_deg=1.0, agl_std=0.01, tilt_std_deg=0.2, attitude_std_deg=2.0, velocity_drift=DRIFT
 )
 GAP_M, JUMP_M = 3000.0, 2000.0
 """What a kidnapped flight leaves out at least: so much of the way, and so far as the crow flies."""
-SURE, RIGHT_M, DIVERGED_M, DIVERGED_VIEWS = 0.9, 35.0, 60.0, 10
+CONFIDENT, RIGHT_M, DIVERGED_M, DIVERGED_VIEWS = 0.9, 35.0, 60.0, 10
 SEED = 100
 Array = NDArray[np.float64]
 HEADER = (
@@ -321,7 +321,7 @@ class Figures:
             errors,
             nees,
             np.array([view["state"] == "tracking" for view in views]),
-            np.array([(view["confidence"] or 0.0) >= SURE for view in views]),
+            np.array([(view["confidence"] or 0.0) >= CONFIDENT for view in views]),
             radius,
             np.array([view["ms"] for view in views]),
         )
@@ -441,7 +441,7 @@ def _notes(km: float) -> tuple[str, ...]:
         f"the map's; wind {WIND_MPS:g} m/s; told velocity off by {DRIFT:.0%} of scale and "
         f"{DRIFT:g} rad; heading by {YAW_BIAS_DEG:g} deg, drawn once per flight, and "
         f"{SCATTER.yaw_std_deg:g} deg at every view; height by {AGL_BIAS:.0%} and "
-        f"{SCATTER.agl_std:.0%}; lean {SCATTER.lean_std_deg:g} deg, told with an error of "
+        f"{SCATTER.agl_std:.0%}; tilt {SCATTER.attitude_std_deg:g} deg, told with an error of "
         f"{SCATTER.tilt_std_deg:g} deg (all standard deviations); clouds over {CLOUD_SHARE:.0%} of "
         "the way; no prior, whole map, one core",
         f"kidnapped: {GAP_M / 1000:g} km or more left out in the middle, no velocity told; gap: "

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, Workplace
 from benchmarks.instead import beside
-from benchmarks.laps import CAMERA, Lap, played, rendered, rest_of, views_of
-from benchmarks.pair import Arrivals, Cores, Fly, Lines, StandIn, free_port, on_core
+from benchmarks.looped_flight import CAMERA, LoopedFlight, played, rendered, rest_of, views_of
+from benchmarks.pair import Arrivals, Cores, FakeAutopilot, Fly, Lines, free_port, on_core
 from benchmarks.record import Section, Table, number
 from orthonav.mapfile import open_map
 
@@ -66,7 +66,7 @@ def measure(place: Workplace) -> Section:
     past, present = place.area(SIDE_M, 1.0, [PAST, PRESENT])
     map_path = place.map(past)
     frame = open_map(map_path).manifest.sheets[0].frame
-    lap = rendered(place, present, frame, Lap(CAMERA, CAMERA_HZ, short=place.quick))
+    lap = rendered(place, present, frame, LoopedFlight(CAMERA, CAMERA_HZ, short=place.quick))
     scene = Scene(map_path, lap, Cores.chosen(), place.scratch, place.quick)
     with on_core(scene.cores.other):
         flown = {rate_hz: _flown(scene, rate_hz) for rate_hz in RATES_HZ}
@@ -84,11 +84,11 @@ def _flown(scene: Scene, rate_hz: int) -> Flown:
     port = free_port()
     arguments = scene.arguments(name, folder, port)
     errors = scene.scratch / f"{name}-errors.txt"
-    with StandIn(folder, port, scene.cores.other) as standin:
+    with FakeAutopilot(folder, port, scene.cores.other) as fake_autopilot:
         with Fly(arguments, scene.cores.flying, errors) as fly:
-            fly.watch(standin.mono_ns(LEAD_S + views / rate_hz + 30))
-        _say(f"{rate_hz} Hz flown, {len(standin.heard)} messages")
-    return Flown(views, Arrivals.of(standin), Lines.read(scene.lines(name)), fly)
+            fly.watch(fake_autopilot.mono_ns(LEAD_S + views / rate_hz + 30))
+        _say(f"{rate_hz} Hz flown, {len(fake_autopilot.heard)} messages")
+    return Flown(views, Arrivals.of(fake_autopilot), Lines.read(scene.lines(name)), fly)
 
 
 def _latency(section: Section, flown: dict[int, Flown]) -> Table:
@@ -170,7 +170,9 @@ def _load(section: Section, scene: Scene, flown: dict[int, Flown]) -> Table:
     )
     header += ("RSS late MB", "peak MB", "error p50 m", "p95 m", "max m", "clock ms")
     cores = scene.cores
-    apart = "" if cores.flying != cores.other else "; there is one core: the stand-in shares it"
+    apart = (
+        "" if cores.flying != cores.other else "; there is one core: the fake autopilot shares it"
+    )
     notes = (
         "others: what else ran on that core; waited: how long the thread that places views was "
         f"ready to run and had to wait, for others or for its own process{apart}",
@@ -228,22 +230,22 @@ def _start(scene: Scene, heading: str, index: int, count: int) -> tuple[float, f
     folder = played(scene.lap, scene.scratch / name, views, every=every, first=first)
     port, errors = free_port(), scene.scratch / f"{name}-errors.txt"
     more = ["--heading", heading]
-    with StandIn(folder, port, scene.cores.other) as standin:
-        standin.wait_until(1.0)
+    with FakeAutopilot(folder, port, scene.cores.other) as fake_autopilot:
+        fake_autopilot.wait_until(1.0)
         camera = rest_of(folder, scene.scratch / f"{name}-camera", 1.0)
         arguments = [*scene.arguments(name, camera, port), *more]
         with Fly(arguments, scene.cores.flying, errors) as fly:
-            at_ns = standin.position_after(fly.started_ns, most_s)
+            at_ns = fake_autopilot.position_after(fly.started_ns, most_s)
             if at_ns is None:
                 return np.inf, None
             cold_s = (at_ns - fly.started_ns) / 1e9
             time.sleep(FLOWN_ON_S)
             fly.kill()
-        flight_s = (time.monotonic_ns() - standin.begin_ns) / 1e9
+        flight_s = (time.monotonic_ns() - fake_autopilot.begin_ns) / 1e9
         camera = rest_of(folder, scene.scratch / f"{name}-again", flight_s)
         arguments = [*scene.arguments(name, camera, port), *more]
         with Fly(arguments, scene.cores.flying, errors) as fly:
-            at_ns = standin.position_after(fly.started_ns, MOST_WAIT_S["known"])
+            at_ns = fake_autopilot.position_after(fly.started_ns, MOST_WAIT_S["known"])
             again_s = np.inf if at_ns is None else (at_ns - fly.started_ns) / 1e9
     return cold_s, again_s
 

@@ -1,4 +1,4 @@
-"""`orthonav fly` in a process of its own on one core, beside a stand-in for the autopilot."""
+"""`orthonav fly` in a process of its own on one core, beside a fake autopilot for the autopilot."""
 
 import contextlib
 import json
@@ -59,14 +59,14 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-class StandIn:
-    """The stand-in's process, and all it has heard so far."""
+class FakeAutopilot:
+    """The fake autopilot's process, and all it has heard so far."""
 
     def __init__(self, flight: Path, port: int, core: int, pace: float = 1.0) -> None:
         """Returns when its clock has begun."""
         self.flight, self.pace = flight, pace
         self.heard: list[dict[str, Any]] = []
-        command = [sys.executable, "-m", "benchmarks.standin", str(flight), str(port)]
+        command = [sys.executable, "-m", "benchmarks.fake_autopilot", str(flight), str(port)]
         with on_core(core):
             self._process = subprocess.Popen(
                 [*command, "--pace", str(pace)], stdout=subprocess.PIPE, text=True
@@ -113,7 +113,7 @@ class StandIn:
         if self._process.stdout is not None:
             self._process.stdout.close()
 
-    def __enter__(self) -> "StandIn":
+    def __enter__(self) -> "FakeAutopilot":
         return self
 
     def __exit__(
@@ -224,7 +224,7 @@ def _core_s(core: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Arrivals:
-    """Positions that the stand-in heard (N,): which view, from its exposure to the message's
+    """Positions that the fake autopilot heard (N,): which view, from its exposure to the message's
     arrival, how far it is from the truth, how far off the exposure was that the message told."""
 
     view: NDArray[np.intp]
@@ -233,27 +233,29 @@ class Arrivals:
     clock_ms: Array
 
     @classmethod
-    def of(cls, standin: StandIn) -> "Arrivals":
-        """Everything heard so far; `flight` is played by the stand-in."""
-        flight = open_flight(standin.flight)
+    def of(cls, fake_autopilot: FakeAutopilot) -> "Arrivals":
+        """Everything heard so far; `flight` is played by the fake autopilot."""
+        flight = open_flight(fake_autopilot.flight)
         times_s = np.array([view.telemetry.time_ns / 1e9 for view in flight.views])
-        truth = read_truth(standin.flight / "truth.csv")
+        truth = read_truth(fake_autopilot.flight / "truth.csv")
         places = [truth[view.frame] for view in flight.views]
         rows = []
-        for message in standin.heard:
+        for message in fake_autopilot.heard:
             if message["name"] != POSITION:
                 continue
             sent_us = message["time_usec"]  # of this message; exposure is before it by its age
-            told_ns = (sent_us - message["processing_time"]) * 1000 - standin.utc_ahead_ns
-            told_s = (told_ns - standin.begin_ns) / 1e9 * standin.pace
-            view = int(np.abs(times_s - told_s).argmin())
-            exposed_ns = standin.mono_ns(float(times_s[view]))
+            reported_ns = (
+                sent_us - message["processing_time"]
+            ) * 1000 - fake_autopilot.utc_ahead_ns
+            progress_s = (reported_ns - fake_autopilot.begin_ns) / 1e9 * fake_autopilot.pace
+            view = int(np.abs(times_s - progress_s).argmin())
+            exposed_ns = fake_autopilot.mono_ns(float(times_s[view]))
             off = LocalFrame(*places[view]).en_from_latlon(
                 message["lat"] * 1e-7, message["lon"] * 1e-7
             )
             latency_ms, clock_ms = (
                 (message["at_ns"] - exposed_ns) / 1e6,
-                (told_ns - exposed_ns) / 1e6,
+                (reported_ns - exposed_ns) / 1e6,
             )
             rows.append((view, latency_ms, float(np.hypot(*off)), clock_ms))
         columns = np.array(rows, np.float64).reshape(-1, 4)

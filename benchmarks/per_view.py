@@ -7,15 +7,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from benchmarks.flights import View
+from benchmarks.flights import FlownView
 from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, USUAL_ERRORS, Workplace
 from benchmarks.machine import timed
 from benchmarks.record import Section, Table, timing_cells
 from orthonav.flight.folder import read_image
-from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
 from orthonav.localizer.localizer import UNKNOWN_HEADING_STEP_DEG
-from orthonav.localizer.rectify import prepare_view
+from orthonav.localizer.rectify import downsampled
 from orthonav.mapfile import open_map
 
 REPEATS = 3
@@ -46,10 +45,10 @@ def measure(place: Workplace) -> Section:
     flight = place.fly(present, place.views, USUAL_ERRORS)
     times_s: dict[str, list[float]] = defaultdict(list)
     for view in flight.views[:3]:  # warm-up
-        _once(localizer, whole, flight.camera, view, defaultdict(list))
+        _once(localizer, whole, view, defaultdict(list))
     for view in flight.views:
         for _ in range(REPEATS):
-            _once(localizer, whole, flight.camera, view, times_s)
+            _once(localizer, whole, view, times_s)
     tiles = len(localizer.centres_en_m)
     data = f"generated {side_m / 1000:g} x {side_m / 1000:g} km, {tiles} tiles"
     rows = []
@@ -73,8 +72,7 @@ def measure(place: Workplace) -> Section:
 def _once(
     localizer: Localizer,
     whole: Localizer,
-    camera: Camera,
-    view: View,
+    flown: FlownView,
     times_s: dict[str, list[float]],
 ) -> None:
     """Run one view through every stage, then whole by tiles only, then by the default."""
@@ -84,21 +82,21 @@ def _once(
         times_s[name].append(took_s)
         return made
 
-    told, gsd_m = view.telemetry, localizer.grid.gsd_m
-    stage("decode", read_image, view.path)
-    thinned = stage("thin", prepare_view, view.grey, camera, told.agl_m, gsd_m)
+    view = flown.view
+    stage("decode", read_image, flown.path)
+    smaller = stage("thin", downsampled, view, localizer.grid.gsd_m)
     queries = []
     for turn_deg in (-6.0, 0.0, 6.0):
-        seen = stage("rectify", localizer.rectified, thinned, told, told.yaw_deg + turn_deg)
+        seen = stage("rectify", localizer.rectified, smaller, view.telemetry.yaw_deg + turn_deg)
         maps = stage("represent", localizer.representation, seen.grey, seen.valid)
         queries.append(stage("embed", localizer.embedder.view, maps, seen.valid))
     stacked = np.stack(queries)
     stage("search", localizer.index.scores, stacked)
     stage("match", localizer.match, stacked)
-    stage("locate", localizer.locate, view.grey, camera, told)
+    stage("locate", localizer.locate, view)
     if len(times_s["unknown"]) * REPEATS < len(times_s["locate"]):
         unknown = partial(localizer.locate, heading_known=False)
-        stage("unknown", unknown, view.grey, camera, told)
-        stage("default", whole.locate, view.grey, camera, told)
+        stage("unknown", unknown, view)
+        stage("default", whole.locate, view)
         unknown = partial(whole.locate, heading_known=False)
-        stage("default unknown", unknown, view.grey, camera, told)
+        stage("default unknown", unknown, view)

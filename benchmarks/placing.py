@@ -22,7 +22,7 @@ TEMPLATE, CANNY, PHASE, MUTUAL, SIFT = "template", "canny", "phase", "mutual", "
 @dataclass(frozen=True)
 class Task:
     """What to place and how: `pixels` and `factor` (map pixels averaged to one) are for methods
-    that are not orthonav's, `told_only` tries no other pose than the told one."""
+    that are not orthonav's, `telemetry_only` tries no other pose than the told one."""
 
     method: str
     map_path: str
@@ -31,7 +31,7 @@ class Task:
     use_prior: bool = False
     pixels: str = ""
     factor: int = 1
-    told_only: bool = False
+    telemetry_only: bool = False
     views: int | None = None
 
 
@@ -62,19 +62,19 @@ def run(task: Task) -> dict[str, Any]:
 
     cv2.setNumThreads(1)
     cv2.setRNGSeed(0)
-    camera, views = read_views(Path(task.flight))
+    _, views = read_views(Path(task.flight))
     start = time.perf_counter()
     place = _method(task)
     opened_ms = 1e3 * (time.perf_counter() - start)
     frame = open_map(Path(task.map_path)).manifest.sheets[0].frame
     cold_ms, rows = math.nan, []
-    for number, view in enumerate(views):
+    for number, flown in enumerate(views):
         if number == task.views:
             break
         if number == 0:
-            cold_ms = _timed(place, camera, view)[1]
-        found, took_ms = _timed(place, camera, view)
-        rows.append([*row_of(found, frame, view.truth_latlon_deg), took_ms])
+            cold_ms = _timed(place, flown.view)[1]
+        found, took_ms = _timed(place, flown.view)
+        rows.append([*row_of(found, frame, flown.truth_latlon_deg), took_ms])
     return {
         "rows": rows,
         "opened_ms": opened_ms,
@@ -83,12 +83,12 @@ def run(task: Task) -> dict[str, Any]:
     }
 
 
-Placer = Callable[[Any, Any], Any]
+Placer = Callable[[Any], Any]
 
 
-def _timed(place: Placer, camera: Any, view: Any) -> tuple[Any, float]:
+def _timed(place: Placer, view: Any) -> tuple[Any, float]:
     start = time.perf_counter()
-    found = place(camera, view)
+    found = place(view)
     return found, 1e3 * (time.perf_counter() - start)
 
 
@@ -120,11 +120,9 @@ def _orthonav(task: Task) -> Placer:
     if task.method == REGISTRATION:
         without_tiles(localizer)
 
-    def place(camera: Any, view: Any) -> Any:
+    def place(view: Any) -> Any:
         return localizer.locate(
-            view.grey,
-            camera,
-            view.telemetry,
+            view,
             prior=view.telemetry.prior if task.use_prior else None,
             heading_known=task.heading_known,
         )
@@ -152,10 +150,10 @@ def _other(task: Task) -> Placer:
             PHASE: lambda: posed.PhaseSurface(picture),
             MUTUAL: lambda: posed.MutualSurface(picture),
         }
-        method = posed.BestOfPoses(picture, surfaces[task.method](), task.told_only)
+        method = posed.BestOfPoses(picture, surfaces[task.method](), task.telemetry_only)
 
-    def place(camera: Any, view: Any) -> Any:
-        return method.locate(camera, view, task.heading_known)
+    def place(view: Any) -> Any:
+        return method.locate(view, task.heading_known)
 
     return place
 

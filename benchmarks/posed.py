@@ -7,7 +7,7 @@ the answer. Nothing here needs the orthophoto's file: processes measure their me
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.flights import View
-from orthonav.geo.camera import Camera
 from orthonav.geo.grid import TileGrid
-from orthonav.localizer.rectify import Rectified, prepare_view, rectify
+from orthonav.localizer.rectify import RectifiedView, downsampled, rectify
 from orthonav.mapfile import open_map
+from orthonav.records import View
 from orthonav.register.search import bank
 from orthonav.represent.canny import Canny
 
@@ -83,44 +82,39 @@ def poses(heading_known: bool, yaw_std_deg: float | None) -> list[tuple[float, f
     return [(math.degrees(turn), math.exp(log_scale)) for turn, log_scale in made.poses]
 
 
-def posed(
-    camera: Camera, view: View, gsd_m: float, tried: list[tuple[float, float]]
-) -> Iterator[Rectified]:
+def posed(view: View, gsd_m: float, tried: list[tuple[float, float]]) -> Iterator[RectifiedView]:
     """All that the camera sees, north up, under each of the poses."""
-    told = view.telemetry
-    prepared = prepare_view(view.grey, camera, told.agl_m, gsd_m)
+    camera, told = view.camera, view.telemetry
+    smaller = downsampled(view, gsd_m)
     yaw_deg = told.yaw_deg if math.isfinite(told.yaw_deg) else 0.0
     across = math.hypot(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px)
     for turn_deg, factor in tried:
         agl_m = told.agl_m * factor
+        telemetry = replace(told, yaw_deg=yaw_deg + turn_deg, agl_m=agl_m)
         yield rectify(
-            prepared,
-            yaw_deg=yaw_deg + turn_deg,
-            pitch_deg=told.pitch_deg,
-            roll_deg=told.roll_deg,
-            agl_m=agl_m,
+            replace(smaller, telemetry=telemetry),
             gsd_m=gsd_m,
             size_px=2 * math.ceil(across * agl_m / gsd_m / 2),
         )
 
 
-Surface = Callable[[Rectified], Array]
+Surface = Callable[[RectifiedView], Array]
 """How well a rectified view (S, S) fits with its corner on each pixel: (h, w)."""
 
 
 class BestOfPoses:
     """The highest value of a surface over all poses."""
 
-    def __init__(self, picture: Picture, surface: Surface, told_only: bool) -> None:
-        self._picture, self._surface, self._told_only = picture, surface, told_only
+    def __init__(self, picture: Picture, surface: Surface, telemetry_only: bool) -> None:
+        self._picture, self._surface, self._told_only = picture, surface, telemetry_only
 
-    def locate(self, camera: Camera, view: View, heading_known: bool) -> Place:
+    def locate(self, view: View, heading_known: bool) -> Place:
         """East and north (2,) of the camera in the sheet."""
         tried = poses(heading_known, view.telemetry.yaw_std_deg)
         if self._told_only:
             tried = [(0.0, 1.0)]
         best, place = -math.inf, None
-        for seen in posed(camera, view, self._picture.gsd_m, tried):
+        for seen in posed(view, self._picture.gsd_m, tried):
             surface = self._surface(seen)
             _, value, _, (col, row) = cv2.minMaxLoc(surface)
             if value > best:
@@ -146,11 +140,11 @@ class _Spectra:
         self._padded[:height, :width] = 0
         return np.asarray(made, np.float32)
 
-    def holds(self, seen: Rectified) -> bool:
+    def holds(self, seen: RectifiedView) -> bool:
         """Whether a view fits on the map."""
         return bool(min(self._shape) > seen.grey.shape[0])
 
-    def surface(self, one: Array, other: Array, seen: Rectified) -> Array:
+    def surface(self, one: Array, other: Array, seen: RectifiedView) -> Array:
         """Correlation (h, w) from two spectra, for every place of the view's corner."""
         product = cv2.mulSpectrums(one, other, 0, conjB=True)
         made = cv2.idft(product, flags=cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)
@@ -175,7 +169,7 @@ class TemplateSurface:
         self._spectra = _Spectra(picture.grey.shape[:2])
         self._map, self._squared = self._spectra.of(plane), self._spectra.of(plane**2)
 
-    def __call__(self, seen: Rectified) -> Array:
+    def __call__(self, seen: RectifiedView) -> Array:
         """Correlation coefficients (h, w)."""
         if not self._spectra.holds(seen):
             return _NOWHERE
@@ -198,7 +192,7 @@ class PhaseSurface:
         self._spectra = _Spectra(picture.grey.shape[:2])
         self._map = self._whitened(grey - grey.mean())
 
-    def __call__(self, seen: Rectified) -> Array:
+    def __call__(self, seen: RectifiedView) -> Array:
         """Heights (h, w) of the phase correlation."""
         if not self._spectra.holds(seen):
             return _NOWHERE
@@ -226,7 +220,7 @@ class MutualSurface:
         classes = _classes(picture.grey, picture.valid)
         self._map = [self._spectra.of(classes == k) for k in range(LEVELS_MI)]
 
-    def __call__(self, seen: Rectified) -> Array:
+    def __call__(self, seen: RectifiedView) -> Array:
         """Nats (h, w)."""
         if not self._spectra.holds(seen):
             return _NOWHERE
@@ -271,11 +265,9 @@ class Keypoints:
         if orb:
             self._detector.setMaxFeatures(VIEW_ORB)
 
-    def locate(
-        self, camera: Camera, view: View, heading_known: bool, near_en_m: Place = None
-    ) -> Place:
+    def locate(self, view: View, heading_known: bool, near_en_m: Place = None) -> Place:
         """Where the middle of the view falls; none with too few inliers. No heading is needed."""
-        seen = next(posed(camera, view, self._picture.gsd_m, [(0.0, 1.0)]))
+        seen = next(posed(view, self._picture.gsd_m, [(0.0, 1.0)]))
         points, descriptors = self._features(seen.grey, seen.valid)
         if len(points) < MIN_INLIERS:
             return None

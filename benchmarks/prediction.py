@@ -51,7 +51,7 @@ VIEWS_PER_CELL = 15
 LEAST_PER_CELL = 8
 PRIOR_PX = 60.0
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0001)
-SURE, POOR = 0.9, 0.7
+CONFIDENT = 0.9
 Array = NDArray[np.float64]
 
 
@@ -291,7 +291,7 @@ def totals(found: Sequence[Outcome]) -> dict[str, Any]:
         if inside.any():
             off = np.average(told[inside] - measured[inside], weights=views[inside])
             error += abs(float(off)) * float(views[inside].sum() / views.sum())
-    sure = told > SURE
+    sure = told > CONFIDENT
     return {
         "cells": len(told),
         "correlation": round(float(np.corrcoef(told, measured)[0, 1]), 3),
@@ -343,7 +343,7 @@ def _scenes_table(found: Sequence[Outcome], options: argparse.Namespace) -> Tabl
         f"deviations; cells of {VIEWS_PER_CELL} views on average, stretches of as many",
         f"all cells: correlation {whole['correlation']}, predicted less measured "
         f"{whole['bias']:+}, calibration error {whole['calibration_error']} over fifths; "
-        f"{whole['sure_cells']} cells predicted above {SURE:g}, the least of them measured "
+        f"{whole['sure_cells']} cells predicted above {CONFIDENT:g}, the least of them measured "
         f"{'-' if worst is None else worst}",
     )
     return Table("Predicted and measured fixes", header, [_row(each) for each in found], notes)

@@ -1,6 +1,6 @@
-"""How views of another date are placed, and strangers refused, on optional real imagery.
+"""How views of another date are placed, and negatives refused, on optional real imagery.
 
-`python -m benchmarks.real_imagery [--views 200] [--strangers 2000] [--seed 1] [--only NAME ..]
+`python -m benchmarks.real_imagery [--views 200] [--negatives 2000] [--seed 1] [--only NAME ..]
 [--out FILE.md]` builds maps as `orthonav build` does, flies over other dates at random places, or
 replays recorded flights, and prints Markdown tables. Looked for in `../shared/data` beside the
 checkout or in the folder that ORTHONAV_DATA names; what is absent is left out, with a line that
@@ -20,25 +20,25 @@ import cv2
 import numpy as np
 
 from benchmarks.inputs import REAL_DATA
+from benchmarks.negatives import SHARES, Sources, negatives
 from benchmarks.placing import row_of
 from benchmarks.record import Table, number, provenance
-from benchmarks.strangers import SHARES, Sources, strangers
-from benchmarks.verdicts import FAR_M, SURE, Verdict, percent
+from benchmarks.verdicts import CONFIDENT, FAR_M, Verdict, percent
 from orthonav.flight import open_flight, read_truth
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import SingleViews, localize_flight, locate_view
 from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import Fix, Telemetry
+from orthonav.records import Fix, Telemetry, View
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
 DATA = Path(os.environ.get("ORTHONAV_DATA", REAL_DATA))
 NAIP_MAP = "naip_nd/20090818.tif"
 NAIP_VIEWS = ("naip_nd/20120731.tif", "naip_nd/20150926.tif", "naip_nd/20180716.tif")
 SZADA = ("szada_1", "szada_5", "szada_7", "szada_mosaic")
-GROUPS = ("naip", "airchange", "taichung", "arroio", "strangers")
+GROUPS = ("naip", "airchange", "taichung", "arroio", "negatives")
 HEADER = (
-    *("map", "views", "n", "near", "35 m", "median m", f"kept at {SURE:g} of right"),
+    *("map", "views", "n", "near", "35 m", "median m", f"kept at {CONFIDENT:g} of right"),
     *("wrong kept", "ECE", "NEES", "ms", "p99 ms"),
 )
 
@@ -117,7 +117,7 @@ def main() -> None:
             tables.append(
                 Table("Views of another date, real imagery", HEADER, rows, _notes(options))
             )
-        if "strangers" in (options.only or GROUPS) and _there(NAIP_MAP, *_stranger_files()):
+        if "negatives" in (options.only or GROUPS) and _there(NAIP_MAP, *_negative_files()):
             tables.append(_refusals(bench))
     load = " ".join(f"{value:.2f}" for value in os.getloadavg())
     head = f"commit {about['commit'][:10]}, sources {about['sources']}, {about['cpu']}, load {load}"
@@ -132,7 +132,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m benchmarks.real_imagery", description=__doc__.splitlines()[0]
     )
     parser.add_argument("--views", type=int, default=200, help="views per simulated flight")
-    parser.add_argument("--strangers", type=int, default=2000, help="views that must be refused")
+    parser.add_argument("--negatives", type=int, default=2000, help="views that must be refused")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="+", choices=GROUPS, help="only these")
     parser.add_argument("--yaw-std-deg", type=float, default=10.0)
@@ -181,8 +181,8 @@ def _row(scene: Scene, verdict: Verdict) -> list[str]:
         f"{percent(float(verdict.within(scene.near_m).mean()), 1)} ({scene.near_m:g} m)",
         percent(float(verdict.within(FAR_M).mean()), 1),
         number(verdict.median_m),
-        percent(verdict.kept_of_right(FAR_M), 1),
-        f"{verdict.wrong_kept} of {int(verdict.kept.sum())}",
+        percent(verdict.accepted_of_right(FAR_M), 1),
+        f"{verdict.wrong_accepted} of {int(verdict.kept.sum())}",
         f"{verdict.ece:.3f}",
         number(verdict.nees_mean),
         number(float(np.median(verdict.times_ms))),
@@ -196,18 +196,19 @@ def _notes(options: argparse.Namespace) -> tuple[str, ...]:
     return (
         f"whole map, no prior, seed {options.seed}; simulated flights: heading off by "
         f"{options.yaw_std_deg:g} deg and height by {options.agl_std:.0%} (standard deviations), "
-        "random places; recorded flights as they are: Taichung's camera leans up to 9 deg more "
+        "random places; recorded flights as they are: Taichung's camera tilts up to 9 deg more "
         "than told and its height is about 12 % off, Arroio's truth is good to 7 to 10 m and its "
         "map's position is nominal",
-        f"near: share of all views within the radius in brackets; kept: confidence of {SURE:g} or "
-        f"more, of the views within {FAR_M:g} m; wrong kept: by more than {FAR_M:g} m, of all kept",
+        "near: share of all views within the radius in brackets; accepted: confidence of "
+        f"{CONFIDENT:g} or more, of the views within {FAR_M:g} m; wrong accepted: by more than "
+        f"{FAR_M:g} m, of all accepted",
         "ECE: expected calibration error at the map's own radius; NEES: mean normalized error "
         "squared of right fixes, 2 if the covariance is theirs; ms: decoded picture to fix, one "
         "core, warm",
     )
 
 
-def _stranger_files() -> list[str]:
+def _negative_files() -> list[str]:
     return [
         *NAIP_VIEWS,
         *(f"airchange/{name}_{date}.tif" for name in SZADA for date in "ab"),
@@ -230,7 +231,7 @@ def _refusals(bench: Bench) -> Table:
     size = DEFAULT_CAMERA.height_px, DEFAULT_CAMERA.width_px
     stated: dict[str, list[float]] = {kind: [] for kind in SHARES}
     times_ms = []
-    for kind, picture in strangers(sources, options.strangers, size, options.seed):
+    for kind, picture in negatives(sources, options.negatives, size, options.seed):
         told = Telemetry(
             time_ns=0,
             yaw_deg=float(rng.uniform(0, 360)),
@@ -241,7 +242,7 @@ def _refusals(bench: Bench) -> Table:
             agl_std_m=options.agl_std * agl_m,
         )
         alone = SingleViews(localizer, use_prior=False)
-        outcome, took_ms = locate_view(alone, picture, DEFAULT_CAMERA, told)
+        outcome, took_ms = locate_view(alone, View(picture, DEFAULT_CAMERA, told))
         stated[kind].append(outcome.confidence if isinstance(outcome, Fix) else np.nan)
         times_ms.append(took_ms)
     rows = [_refused(kind, np.array(values)) for kind, values in stated.items()]
@@ -254,13 +255,19 @@ def _refusals(bench: Bench) -> Table:
         "2012, 2015 and 2018; forest and water: windows of real imagery, stretched to the view; "
         "refused outright: no fix at all, with a reason",
     )
-    header = ("strangers", "n", "refused outright", "confidence 0.5 or more", f"{SURE:g} or more")
+    header = (
+        "negatives",
+        "n",
+        "refused outright",
+        "confidence 0.5 or more",
+        f"{CONFIDENT:g} or more",
+    )
     return Table("Views that are not on the map", (*header, "highest"), rows, notes)
 
 
 def _refused(kind: str, confidence: np.ndarray) -> list[str]:
     known = confidence[~np.isnan(confidence)]
-    counts = [str(int((known >= limit).sum())) for limit in (0.5, SURE)]
+    counts = [str(int((known >= limit).sum())) for limit in (0.5, CONFIDENT)]
     highest = number(float(known.max())) if known.size else "-"
     refused = str(len(confidence) - len(known))
     return [kind, str(len(confidence)), refused, *counts, highest]

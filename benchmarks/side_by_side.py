@@ -23,7 +23,7 @@ from benchmarks.placing import (
 )
 from benchmarks.posed import LEVELS_MI, poses
 from benchmarks.record import Section, Table, number
-from benchmarks.verdicts import SURE, Verdict, from_placed, percent
+from benchmarks.verdicts import CONFIDENT, Verdict, from_placed, percent
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
@@ -32,7 +32,7 @@ SIDE_M = 2000
 RADII_M = (15.0, 35.0)
 HEADER = (
     *("method", "pixels m", "poses", "15 m", "35 m", "median m"),
-    *("ms", "p99 ms", "peak MB", f"kept at {SURE:g}", "wrong kept", "ECE"),
+    *("ms", "p99 ms", "peak MB", f"kept at {CONFIDENT:g}", "wrong kept", "ECE"),
 )
 
 
@@ -43,7 +43,7 @@ class Entrant:
     name: str
     method: str
     factor: int = 1
-    told_only: bool = False
+    telemetry_only: bool = False
 
     @property
     def own(self) -> bool:
@@ -64,7 +64,7 @@ KNOWN = (
     Entrant("mutual information, pose bank", MUTUAL, 8),
     Entrant("SIFT, ratio test, RANSAC", SIFT),
 )
-UNKNOWN = tuple(each for each in KNOWN if not each.told_only)
+UNKNOWN = tuple(each for each in KNOWN if not each.telemetry_only)
 NOTES = (
     "all views of a scene are the same for all methods; whole map, no prior; shares count every "
     "view, whatever its confidence, and a view without an answer as wrong; median m: of all "
@@ -104,7 +104,9 @@ def measure(place: Workplace) -> Section:
         verdicts = []
         for each in entrants:
             told = placed(
-                replace(task, method=each.method, factor=each.factor, told_only=each.told_only)
+                replace(
+                    task, method=each.method, factor=each.factor, telemetry_only=each.telemetry_only
+                )
             )
             verdicts.append((each, from_placed(told), float(told["peak_mb"])))
             print(f"        {title}: {each.name} done", file=sys.stderr, flush=True)
@@ -141,7 +143,9 @@ def _table(
             section.add_share(f"{name}: within {radius_m:g} m", hits, data=data, seed=FLIGHT_SEED)
         time = section.add(f"{name}: time", "ms", verdict.times_ms, data=data, seed=FLIGHT_SEED)
         section.add(f"{name}: peak memory", "MB", [peak_mb], data=data, seed=FLIGHT_SEED)
-        count = "own" if each.own else "1" if each.told_only or each.method == SIFT else str(tried)
+        count = (
+            "own" if each.own else "1" if each.telemetry_only or each.method == SIFT else str(tried)
+        )
         rows.append(
             [
                 each.name,
@@ -165,4 +169,4 @@ def _stated(verdict: Verdict) -> list[str]:
     """Kept, wrong among them, ECE; dashes where no confidence is stated."""
     if not verdict.states_confidence:
         return ["-", "-", "-"]
-    return [percent(float(verdict.kept.mean())), str(verdict.wrong_kept), f"{verdict.ece:.3f}"]
+    return [percent(float(verdict.kept.mean())), str(verdict.wrong_accepted), f"{verdict.ece:.3f}"]

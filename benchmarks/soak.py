@@ -1,7 +1,7 @@
 """`python -m benchmarks.soak [--minutes 60] [--pace 3]`: an hour of flight, watching the memory.
 
-`orthonav fly` on one core beside a stand-in for the autopilot, round and round over a generated
-area, at increased speed. Writes resident memory each second (CSV), its picture (PNG) and a table.
+`orthonav fly` on one core beside a fake autopilot, on a looped flight over a generated area,
+at increased speed. Writes resident memory each second (CSV), its picture (PNG) and a table.
 """
 
 import argparse
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from scipy.stats import linregress
 
 from benchmarks.inputs import FLIGHT_SEED, PAST, PRESENT, Workplace
-from benchmarks.laps import SMALL_CAMERA, Lap, played, rendered
-from benchmarks.pair import Arrivals, Cores, Fly, Lines, Sample, StandIn, free_port, on_core
+from benchmarks.looped_flight import SMALL_CAMERA, LoopedFlight, played, rendered
+from benchmarks.pair import Arrivals, Cores, FakeAutopilot, Fly, Lines, Sample, free_port, on_core
 from benchmarks.record import Section, Table, number, provenance, save
 from orthonav.mapfile import open_map
 
@@ -91,7 +91,7 @@ def soak(place: Workplace, minutes: float, pace: float) -> Soaked:
     past, present = place.area(SIDE_M, 1.0, [PAST, PRESENT])
     map_path, cores, port = place.map(past), Cores.chosen(), free_port()
     frame = open_map(map_path).manifest.sheets[0].frame
-    lap = rendered(place, present, frame, Lap(SMALL_CAMERA, RATE_HZ))
+    lap = rendered(place, present, frame, LoopedFlight(SMALL_CAMERA, RATE_HZ))
     views, scratch = round(minutes * 60 * RATE_HZ), place.scratch
     folder = played(lap, scratch / "flight", views, lead_s=LEAD_S * pace)
     lines = scratch / "lines.jsonl"
@@ -99,19 +99,23 @@ def soak(place: Workplace, minutes: float, pace: float) -> Soaked:
     command += ["--pace", str(pace), "--autopilot", f"udpin:{port}", "--json", str(lines)]
     command += ["--log", str(scratch / "log.mcap"), "--log-views", "thumbnails"]
     command += ["--log-max-mb", str(LOG_MB), "--state", str(scratch / "state.json")]
-    with on_core(cores.other), StandIn(folder, port, cores.other, pace) as standin:
+    with on_core(cores.other), FakeAutopilot(folder, port, cores.other, pace) as fake_autopilot:
         with Fly(command, cores.flying, scratch / "errors.txt") as fly:
-            fly.watch(standin.mono_ns(LEAD_S * pace + minutes * 60) + 120 * 10**9)
+            fly.watch(fake_autopilot.mono_ns(LEAD_S * pace + minutes * 60) + 120 * 10**9)
         print((scratch / "errors.txt").read_text(), file=sys.stderr, end="")
-    samples = [each for each in fly.samples if each.at_ns > standin.mono_ns(LEAD_S * pace)]
-    hours = np.array([(s.at_ns - standin.mono_ns(LEAD_S * pace)) for s in samples]) / 3.6e12 * pace
+    samples = [each for each in fly.samples if each.at_ns > fake_autopilot.mono_ns(LEAD_S * pace)]
+    hours = (
+        np.array([(s.at_ns - fake_autopilot.mono_ns(LEAD_S * pace)) for s in samples])
+        / 3.6e12
+        * pace
+    )
     return Soaked(
         views=views,
         pace=pace,
         exit_code=fly.process.returncode or 0,
         hours=hours,
         samples=samples,
-        arrivals=Arrivals.of(standin),
+        arrivals=Arrivals.of(fake_autopilot),
         lines=Lines.read(lines),
         log_bytes=[path.stat().st_size for path in sorted(scratch.glob("log_*.mcap"))],
     )

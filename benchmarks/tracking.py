@@ -27,7 +27,7 @@ HEADER = (
     *("area km2", "views", "way", "ms", "p99 ms", "first view ms", "found at view"),
     *("15 m", "median m", "sure and wrong"),
 )
-SURE, RIGHT_M = 0.9, 15.0
+CONFIDENT, RIGHT_M = 0.9, 15.0
 
 
 def measure(place: Workplace) -> Section:
@@ -84,7 +84,9 @@ def _row(
     results = list(localize_flight(locator, open_flight(folder)))
     truth = read_truth(folder / "truth.csv")
     errors = np.array([_error_m(each, localizer, truth[each.frame]) for each in results])
-    sure = np.array([isinstance(r.outcome, Fix) and r.outcome.confidence >= SURE for r in results])
+    sure = np.array(
+        [isinstance(r.outcome, Fix) and r.outcome.confidence >= CONFIDENT for r in results]
+    )
     times = np.array([each.latency_ms for each in results])
     tracking = [number for number, r in enumerate(results) if r.state in (None, "tracking")]
     first = tracking[0] if tracking else len(results)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from orthonav.evaluate.calibration import calibrate, check_covariance
 
-SURE, FAR_M = 0.9, 35.0
+CONFIDENT, FAR_M = 0.9, 35.0
 Array = NDArray[np.float64]
 
 
@@ -54,15 +54,15 @@ class Verdict:
 
     @property
     def kept(self) -> NDArray[np.bool_]:
-        """(N,) whether the stated confidence is at least `SURE`."""
-        return np.asarray(self.confidence >= SURE)
+        """(N,) whether the stated confidence is at least `CONFIDENT`."""
+        return np.asarray(self.confidence >= CONFIDENT)
 
     @property
-    def wrong_kept(self) -> int:
+    def wrong_accepted(self) -> int:
         """Views kept that are wrong by more than `FAR_M`."""
         return int((self.kept & (self.errors_m > FAR_M)).sum())
 
-    def kept_of_right(self, radius_m: float) -> float:
+    def accepted_of_right(self, radius_m: float) -> float:
         """Share of the right ones that is kept; NaN where none is right."""
         right = self.within(radius_m)
         return float(self.kept[right].mean()) if right.any() else math.nan

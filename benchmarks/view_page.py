@@ -86,7 +86,7 @@ def write_long_run(
 ) -> LongRun:
     """Laps that wander, a view a second: most fixes right, some wrong and sure, some views without.
 
-    `reach_m`: how far from the middle, in metres, the laps go.
+    `reach_m`: how far from the middle, in metres, the looped_flight go.
     """
     rng = np.random.default_rng(SEED)
     angle = np.linspace(0.0, 2 * np.pi * count / 900, count)

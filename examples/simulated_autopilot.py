@@ -1,4 +1,4 @@
-"""A stand-in for an autopilot: tells the telemetry of a flight folder, prints what it is told.
+"""A fake autopilot: sends the telemetry of a flight folder and prints what it receives.
 
     python examples/simulated_autopilot.py flight --url 127.0.0.1:14550
 

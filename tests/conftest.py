@@ -95,7 +95,7 @@ def flight_path(area, made_once):
     """A flight of 30 views of the second date, with errors and no prior; not to be changed."""
 
     def make(folder):
-        errors = Errors(yaw_std_deg=4.0, agl_std=0.03, lean_std_deg=3.0)
+        errors = Errors(yaw_std_deg=4.0, agl_std=0.03, attitude_std_deg=3.0)
         request = SimulateRequest(
             [area.present],
             folder / "flight",

@@ -176,8 +176,10 @@ def test_localize(run, map_path, flight_path, out, names_in):
     lines = [json.loads(line) for line in (out / "fixes.jsonl").read_text().splitlines()]
     assert [line["frame"] for line in lines] == [f"{n:04d}.jpg" for n in range(1, 31)]
     assert {line["status"] for line in lines} == {"fix"}
-    told = run("localize", map_path, flight_path, "--out", out / "fixes.jsonl", "--prior", "none")
-    assert told.code == 0 and "30 views: 30 fixes" in told.out
+    telemetry = run(
+        "localize", map_path, flight_path, "--out", out / "fixes.jsonl", "--prior", "none"
+    )
+    assert telemetry.code == 0 and "30 views: 30 fixes" in telemetry.out
 
 
 def test_localize_without_heading(run, map_path, flight_path, out):
@@ -198,7 +200,7 @@ def test_localize_as_a_track(run, map_path, flight_path, out):
     (few / "frames" / "0003.jpg").write_bytes(b"no picture")
     to = ["--out", out / "fixes.jsonl", "--json", "-q"]
     refused(run("localize", map_path, few, *to, "--track"), "0003.jpg")
-    for how in ("--track", "--hindsight"):
+    for how in ("--track", "--smooth"):
         done = run("localize", map_path, few, *to, how, "--skip-bad-images")
         assert done.code == 0, done.err
         lines = [json.loads(line) for line in (out / "fixes.jsonl").read_text().splitlines()]
@@ -219,7 +221,7 @@ def test_calibrate_and_fly_with_it(run, map_path, flight_path, out):
     plain = json.loads(mount.read_text())
     assert abs(plain["heading_deg"]["value"]) < 8 and 5 <= plain["views"] <= 16
     to = ["--out", fixes, "--mount", mount]
-    assert run("localize", map_path, few, *to, "--hindsight", "--lag", "2").code == 0
+    assert run("localize", map_path, few, *to, "--smooth", "--lag", "2").code == 0
     turned = json.loads(mount.read_text())
     turned["heading_deg"]["value"] = 90.0
     mount.write_text(json.dumps(turned))
@@ -227,7 +229,7 @@ def test_calibrate_and_fly_with_it(run, map_path, flight_path, out):
     found = [result.outcome for result in read_results(fixes)]
     assert not any(isinstance(each, Fix) and each.confidence > 0.9 for each in found)
     refused(run("localize", map_path, few, "--out", fixes, "--mount", fixes), "mount file")
-    refused(run("localize", map_path, few, "--out", fixes, "--lag", "2"), "--hindsight")
+    refused(run("localize", map_path, few, "--out", fixes, "--lag", "2"), "--smooth")
     refused(run("calibrate", map_path, few, "--out", mount, "--gnss-std-m", "0"), "above 0")
 
 

@@ -15,7 +15,7 @@ from orthonav.geo.grid import TileGrid
 from orthonav.localizer import Localizer
 from orthonav.mapfile import GreyInfo, GreyLayer, SheetInfo, open_map
 from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import Fix
+from orthonav.records import Fix, View
 
 DATA = Path(__file__).parent / "data"
 SHEET = SheetInfo(
@@ -101,7 +101,7 @@ def test_the_layer_shows_the_ground(golden, maker):
 
 def test_the_view_is_placed_where_it_was(golden, maker):
     grey = read_image(DATA / "golden_view.png")
-    fix = Localizer(golden).locate(grey, maker.CAMERA, maker.TELEMETRY)
+    fix = Localizer(golden).locate(View(grey, maker.CAMERA, maker.TELEMETRY))
     assert isinstance(fix, Fix)
     off_m = SHEET.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
     off_m = off_m - SHEET.frame.en_from_latlon(*FIX_DEG)

@@ -17,7 +17,8 @@ def called(page):
     return [
         (step, words)
         for step in read_steps(page.read_text("utf-8"))
-        for words in calls(step.command)
+        for command in step.commands
+        for words in calls(command)
     ]
 
 
@@ -31,7 +32,7 @@ def test_every_command_is_understood(page, monkeypatch):
     for _, words in called(page):
         if words[0] == "orthonav":
             arguments = words[1:]
-        elif words[1:2] == ["$checkout/examples/own_representation.py"]:
+        elif words[1:2] == ["../examples/own_representation.py"]:
             arguments = words[2:]
         else:
             continue
@@ -92,24 +93,36 @@ def textured_grey():
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_every_tutorial_runs_and_prints_what_it_shows(page, tmp_path):
     steps = [step for step in read_steps(page.read_text("utf-8")) if step.is_run]
-    assert check_page(page, tmp_path, steps) == []
+    assert check_page(page, tmp_path / "tutorial", steps) == []
 
 
 def test_steps_of_a_page():
-    said = ["a", "```console", "$ one \\", "    two | three > file", "said", "$ four", "```", "b"]
-    after = [NOT_RUN, "", "```console", "$ five & six", "```", "```text", "$ not this", "```"]
-    text = "\n".join([*said, *after])
-    first, second, third = read_steps(text)
-    assert (first.command, first.shown) == ("one \\\n    two | three > file", ("said",))
-    assert (second.command, second.shown, second.is_run) == ("four", (), True)
+    page = [
+        "a",
+        "```bash",
+        "one \\",
+        "    two | three > file",
+        "four",
+        "```",
+        "",
+        "```text",
+        "out",
+        "```",
+    ]
+    page += ["b", "```bash", "silent", "```", "text", "```text", "no output", "```"]
+    page += [NOT_RUN, "", "```bash", "five & six", "```"]
+    first, second, third = read_steps("\n".join(page))
+    assert first.commands == ("one \\\n    two | three > file", "four")
+    assert (first.shown, page[first.first : first.end], first.is_run) == (("out",), ["out"], True)
+    assert (second.command, second.shown, second.is_run) == ("silent", (), True)
     assert (third.command, third.is_run) == ("five & six", False)
-    assert list(calls(first.command)) == [["one", "two"], ["three"]]
+    assert list(calls(first.commands[0])) == [["one", "two"], ["three"]]
     assert list(calls(third.command)) == [["five"], ["six"]]
 
 
-def test_a_block_begins_with_a_command():
-    with pytest.raises(ValueError, match="line 2: expected a command"):
-        read_steps("```console\nno command\n```")
+def test_a_block_holds_a_command():
+    with pytest.raises(ValueError, match="line 1: a block without a command"):
+        read_steps("```bash\n\n```")
 
 
 @pytest.mark.parametrize(
@@ -133,7 +146,7 @@ def test_numbers_are_not_compared():
 
 
 def test_steps_run_in_one_shell(tmp_path):
-    steps = read_steps("```console\n$ name=x\n$ echo $name > f; cat f\n$ printf end\n```")
-    assert [told.lines for told in run_steps(steps, tmp_path)] == [(), ("x",), ("end",)]
+    steps = read_steps("```bash\nname=x\necho $name > f; cat f\n```\n\n```bash\nprintf end\n```")
+    assert [printed.lines for printed in run_steps(steps, tmp_path)] == [("x",), ("end",)]
     with pytest.raises(RuntimeError, match="'false' ended with 1"):
-        run_steps(read_steps("```console\n$ false\n```"), tmp_path)
+        run_steps(read_steps("```bash\nfalse\ntrue\n```"), tmp_path)

@@ -13,7 +13,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from benchmarks.flights import View
 from benchmarks.posed import BestOfPoses, Keypoints, MutualSurface, Picture, TemplateSurface
 from benchmarks.record import provenance
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from experiments.paper.scenes import Scene
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
+from orthonav.records import View
 
 MAP_OF = "gradient-gradient"
 """The baselines get the plane and pixels of this run's map."""
@@ -45,7 +45,7 @@ class Baseline:
 
 
 def _told(surface: Callable[[Picture], Any]) -> Callable[[Picture], Any]:
-    return lambda picture: BestOfPoses(picture, surface(picture), told_only=True)
+    return lambda picture: BestOfPoses(picture, surface(picture), telemetry_only=True)
 
 
 BASELINES = (
@@ -102,8 +102,8 @@ def _placed(
             grey = views.view_of(ground, camera, agl_m, gsd_m)
             start = time.perf_counter()
             grey = sobel(grey) if baseline.sobel else grey
-            view = View(scene.present, grey, telemetry, (0.0, 0.0))
-            found = method.locate(camera, view, True)
+            view = View(grey, camera, telemetry)
+            found = method.locate(view, True)
             times_ms.append(1e3 * (time.perf_counter() - start))
             away = None if found is None else float(np.hypot(*(found - ground.truth_en_m)))
             errors[name].append(away)

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
 from orthonav.localizer.match import TileMatcher
-from orthonav.localizer.rectify import prepare_view
+from orthonav.localizer.rectify import downsampled
 from orthonav.mapfile import MapFile
-from orthonav.records import Telemetry
+from orthonav.records import View
 from orthonav.search.position import RULES
 
 SIMILARITIES = ("product", "cosine")
@@ -23,19 +22,15 @@ SIMILARITIES = ("product", "cosine")
 def compared(
     localizer: Localizer,
     opened: MapFile,
-    greys: list[NDArray[np.uint8]],
-    camera: Camera,
-    telemetry: Telemetry,
+    views: list[View],
     truths_en_m: list[NDArray[np.float64]],
 ) -> dict[str, list[float]]:
-    """Errors in m of views (H, W), by "similarity rule"; the same embeddings serve all."""
+    """Errors in m of views, by "similarity rule"; the same embeddings serve all."""
     gsd_m = localizer.grid.gsd_m
     queries = []
-    for grey in greys:
-        prepared = prepare_view(grey, camera, telemetry.agl_m, gsd_m)
-        queries.append(
-            localizer.embedded([localizer.rectified(prepared, telemetry, telemetry.yaw_deg)])
-        )
+    for view in views:
+        smaller = downsampled(view, gsd_m)
+        queries.append(localizer.embedded([localizer.rectified(smaller, view.telemetry.yaw_deg)]))
     centres = localizer.centres_en_m
     tiles = opened.array("sheet0/embeddings", np.float16, 2)
     made = {}

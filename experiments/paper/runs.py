@@ -26,7 +26,7 @@ from orthonav.files import write_text
 from orthonav.localizer import Localizer
 from orthonav.mapfile import MapFile, open_map
 from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import Fix
+from orthonav.records import Fix, View
 
 ACCURACY_M = 15.0
 SWEPT_ON = "B"
@@ -159,7 +159,7 @@ def _placed(
     def locate(ground: views.Ground, **wrong: float) -> list[float]:
         grey = views.view_of(ground, camera, agl_m, gsd_m, **wrong)
         start = time.perf_counter()
-        found = localizer.locate(grey, camera, telemetry)
+        found = localizer.locate(View(grey, camera, telemetry))
         times_ms.append(1e3 * (time.perf_counter() - start))
         if not isinstance(found, Fix):
             return [float("nan")] * (2 + len(EVIDENCE))
@@ -211,9 +211,12 @@ def _rules(scene: Scene, opened: MapFile, setting: Setting) -> dict[str, Any]:
     camera, telemetry = views.camera_of(agl_m, gsd_m), views.told(agl_m)
     made: dict[str, Any] = {}
     for name, grounds in placements(scene, localizer, setting.views):
-        greys = [views.view_of(ground, camera, agl_m, gsd_m) for ground in grounds]
+        seen = [
+            View(views.view_of(ground, camera, agl_m, gsd_m), camera, telemetry)
+            for ground in grounds
+        ]
         truths = [ground.truth_en_m for ground in grounds]
-        made[name] = compared(localizer, opened, greys, camera, telemetry, truths)
+        made[name] = compared(localizer, opened, seen, truths)
     return made
 
 

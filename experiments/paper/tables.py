@@ -8,6 +8,7 @@ from benchmarks.record import Table, number
 
 from experiments.paper import published
 from experiments.paper.results import Result, ceiling, confident, kept_at, read, share
+from orthonav.records import CONFIDENT
 
 FAMILIES = {
     "bovw": "Bag of Words",
@@ -22,8 +23,6 @@ EDGES = {
     "sam": "Segment Anything",
     "gradient": "gradients",
 }
-SURE = 0.9
-"""Confidence from which a registered position is believed."""
 
 
 def report(out: Path, setting: str) -> Path | None:
@@ -155,10 +154,12 @@ def _is_papers_best(each: Result) -> bool:
 
 def _choice_row(scene: str, each: Result) -> list[str]:
     plain, right = each.plain, each.right("grid")
-    name, threshold = ("confidence", SURE) if each.registration else ("lowe_ratio", published.LOWE)
+    name, threshold = (
+        ("confidence", CONFIDENT) if each.registration else ("lowe_ratio", published.LOWE)
+    )
     found, kept = confident(right, each.column("grid", name), threshold)
     shares = [each.accuracy("grid"), each.accuracy("anywhere"), each.right_tile("anywhere")]
-    criterion = f"confidence {SURE}" if each.registration else f"Lowe {published.LOWE}"
+    criterion = f"confidence {CONFIDENT}" if each.registration else f"Lowe {published.LOWE}"
     figures = [plain["learn_s"], plain["mb_per_km2"], plain["encoder_mb"], plain["view_ms"]]
     both = f"{percent(found)} / {percent(kept)}"
     cells = [_name(each), EDGES[each.edges], *map(percent, shares), criterion, both]

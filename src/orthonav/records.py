@@ -8,8 +8,13 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.geo.camera import Camera
+
+CONFIDENT = 0.9
+"""A fix of at least this confidence counts as confident: the default of publishing and reports."""
+
 Evidence = Mapping[str, float]
-"""Named numbers that say why a fix should be believed or not; see `docs/design.md`."""
+"""Named numbers that say why a fix should be believed or not; see `docs/reference/formats.md`."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +38,7 @@ class Telemetry:
     (positive pitch looks ahead, positive roll looks left); `agl_m` is the height above ground.
     NaN stands for "not known". Velocities are over ground, true east and north.
     The `_std` ones are standard deviations of what is told, from view to view, None where not
-    known: `lean_std_deg` of pitch and of roll, `vel_std_mps` per axis.
+    known: `tilt_std_deg` of pitch and of roll, `vel_std_mps` per axis.
     """
 
     time_ns: int
@@ -45,7 +50,7 @@ class Telemetry:
     agl_std_m: float | None = None
     prior: Prior | None = None
     vel_en_mps: tuple[float, float] | None = None
-    lean_std_deg: float | None = None
+    tilt_std_deg: float | None = None
     vel_std_mps: float | None = None
 
     def missing(self) -> list[str]:
@@ -57,6 +62,20 @@ class Telemetry:
             "agl_m": self.agl_m,
         }
         return [name for name, value in named.items() if not math.isfinite(value)]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What the camera saw at one exposure, and the telemetry of that time.
+
+    `grey`: grey levels (H, W), uint8, as recorded: not undistorted, not rectified.
+    `camera`: calibration of the camera at the size of `grey`.
+    `telemetry`: reported heading, tilt, height, velocity and prior position at the exposure.
+    """
+
+    grey: NDArray[np.uint8]
+    camera: Camera
+    telemetry: Telemetry
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,7 +76,7 @@ def test_every_place_is_within_half_a_stride_of_one_centre_of_its_sheet_or_the_n
     places = np.random.default_rng(1).uniform(-140, 140, (2000, 2))
     away = np.abs(places[:, None] - centres[None]).max(axis=2).min(axis=1)
     half_m = RECIPE.tile_px * RECIPE.gsd_m * (1 - RECIPE.overlap) / 2
-    assert away.max() < 1.02 * half_m, "meridians lean, so a sheet is no exact square"
+    assert away.max() < 1.02 * half_m, "meridians tilt, so a sheet is no exact square"
 
 
 def test_features_are_those_of_the_pixels_there(mosaic, box_deg, stored):

@@ -26,7 +26,7 @@ from orthonav.localizer import Localizer
 from orthonav.mapfile import GreyLayer, open_map, write_map
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.prepare.layout import grid_of
-from orthonav.records import Fix, Telemetry
+from orthonav.records import Fix, Telemetry, View
 from orthonav.represent.gradients import OrientedGradients
 
 RECIPE = AtlasRecipe(
@@ -74,8 +74,13 @@ def folder(ortho, names, tmp_path_factory):
 def built(ortho, name, out, **request):
     request = {"cells": True, "calibration_views": RECIPE.calibration_views, **request}
     bounds = RECIPE.sheets.bounds_deg(name)
-    told = {"tile_px": RECIPE.tile_px, "overlap": RECIPE.overlap, "gsd_m": RECIPE.gsd_m, **request}
-    build_map(BuildRequest([ortho], out, bounds_deg=bounds, **told))
+    telemetry = {
+        "tile_px": RECIPE.tile_px,
+        "overlap": RECIPE.overlap,
+        "gsd_m": RECIPE.gsd_m,
+        **request,
+    }
+    build_map(BuildRequest([ortho], out, bounds_deg=bounds, **telemetry))
     return out
 
 
@@ -171,8 +176,8 @@ def test_views_are_placed_across_the_borders_of_sheets(cut, ortho, registration)
         col, row = round(east_m - sheet.grid.west_m), round(sheet.grid.north_m - north_m)
         with Mosaic.open([ortho]).grid_sheet(sheet.frame, sheet.grid) as raster:
             view = raster.read_grey(col - 32, row - 32, 64, 64).grey
-        told = Telemetry(time_ns=0, yaw_deg=0.0, pitch_deg=0.0, roll_deg=0.0, agl_m=64.0)
-        fix = localizer.locate(view, camera, told)
+        telemetry = Telemetry(time_ns=0, yaw_deg=0.0, pitch_deg=0.0, roll_deg=0.0, agl_m=64.0)
+        fix = localizer.locate(View(view, camera, telemetry))
         assert isinstance(fix, Fix)
         place = sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)
         where = sheet.grid.west_m + col, sheet.grid.north_m - row

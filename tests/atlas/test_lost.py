@@ -23,7 +23,7 @@ from orthonav.geo.frames import distances_m
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.onboard.run import localize_flight, locate_view
-from orthonav.records import Fix, NoFix
+from orthonav.records import Fix, NoFix, View
 from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 
 RECIPE = {
@@ -103,7 +103,7 @@ def test_views_of_elsewhere_are_never_sure(atlas, flown):
         locator = LostLocator(Ground(atlas), lookup)
         for view in itertools.islice(flight.views, 3):
             mirrored = np.ascontiguousarray(view.grey()[:, ::-1])
-            outcome = locator.locate(mirrored, flight.camera, view.telemetry)
+            outcome = locator.locate(View(mirrored, flight.camera, view.telemetry))
             assert not (isinstance(outcome, Fix) and outcome.confidence > 0.8)
 
 
@@ -127,7 +127,7 @@ def test_the_index_finds_what_comparing_all_tiles_finds(atlas, flown):
 def _coarse(view, flight, lookup):
     from orthonav.atlas.lost import _rectified
 
-    return _rectified(view.grey(), flight.camera, view.telemetry, lookup.recipe.gsd_m)
+    return _rectified(View(view.grey(), flight.camera, view.telemetry), lookup.recipe.gsd_m)
 
 
 def test_views_of_another_scale_are_refused_in_words(atlas, flown):
@@ -135,7 +135,7 @@ def test_views_of_another_scale_are_refused_in_words(atlas, flown):
     view = next(iter(flight.views))
     low = dataclasses.replace(view.telemetry, agl_m=60.0)
     with AtlasLookup(atlas) as lookup:
-        outcome = LostLocator(Ground(atlas), lookup).locate(view.grey(), flight.camera, low)
+        outcome = LostLocator(Ground(atlas), lookup).locate(View(view.grey(), flight.camera, low))
     assert isinstance(outcome, NoFix)
     assert outcome.reason in {"wrong_scale", "too_small"}
 
@@ -266,12 +266,12 @@ def test_telemetry_that_is_nonsense_ends_nothing(atlas, flown):
         {"agl_m": -5.0},
         {"pitch_deg": 80.0},
         {"yaw_std_deg": -5.0, "yaw_deg": 10.0},
-        {"lean_std_deg": np.nan},
+        {"tilt_std_deg": np.nan},
     ):
         telemetry = dataclasses.replace(view.telemetry, **change)
         with AtlasLookup(atlas) as lookup:
             locator = LostLocator(Ground(atlas), lookup, heading_known="yaw_std_deg" in change)
-            outcome, _ = locate_view(locator, view.grey(), flight.camera, telemetry)
+            outcome, _ = locate_view(locator, View(view.grey(), flight.camera, telemetry))
         assert isinstance(outcome, NoFix)
         assert outcome.reason != "internal_error"
         assert locator.state_name == "searching"
@@ -283,6 +283,8 @@ def test_blank_views_are_refused_and_end_nothing(atlas, flown):
     grey = np.zeros_like(view.grey())
     with AtlasLookup(atlas) as lookup:
         locator = LostLocator(Ground(atlas), lookup)
-        assert locator.locate(grey, flight.camera, view.telemetry).reason == "too_dark"
+        assert locator.locate(View(grey, flight.camera, view.telemetry)).reason == "too_dark"
         noise = cv2.randu(np.zeros_like(grey), 0, 255)
-        assert isinstance(locator.locate(np.asarray(noise), flight.camera, view.telemetry), NoFix)
+        assert isinstance(
+            locator.locate(View(np.asarray(noise), flight.camera, view.telemetry)), NoFix
+        )

@@ -10,8 +10,8 @@ import time
 import cv2
 import numpy as np
 import pytest
-from benchmarks.laps import played, rest_of, views_of
-from benchmarks.pair import Arrivals, Fly, Lines, StandIn, free_port, on_core, sample
+from benchmarks.looped_flight import played, rest_of, views_of
+from benchmarks.pair import Arrivals, FakeAutopilot, Fly, Lines, free_port, on_core, sample
 from pymavlink.dialects.v20 import common as mavlink
 
 from benchmarks import install, soak
@@ -30,16 +30,16 @@ def lap(tmp_path_factory):
         k: 5.0 for k in ("fx_px", "fy_px", "cx_px", "cy_px")
     }
     (folder / "flight.json").write_text(json.dumps({"camera": camera}))
-    told = ["frame,time_s,yaw_deg,pitch_deg,roll_deg,agl_m,vel_east_mps,vel_north_mps"]
+    telemetry = ["frame,time_s,yaw_deg,pitch_deg,roll_deg,agl_m,vel_east_mps,vel_north_mps"]
     true = ["frame,lat_deg,lon_deg"]
     for index in range(VIEWS):
         name, angle = f"{index:02d}.png", math.tau * index / VIEWS
         cv2.imwrite(str(folder / "frames" / name), np.full((6, 8), index, np.uint8))
         radius_m = SPEED_MPS * STEP_S / (2 * math.sin(math.pi / VIEWS))
         lat, lon = FRAME.latlon_from_en(radius_m * np.array([math.sin(angle), math.cos(angle)]))
-        told.append(f"{name},{index * STEP_S:.3f},{90.0 + index},0,0,{100.0 + index},25,0")
+        telemetry.append(f"{name},{index * STEP_S:.3f},{90.0 + index},0,0,{100.0 + index},25,0")
         true.append(f"{name},{float(lat):.9f},{float(lon):.9f}")
-    (folder / "telemetry.csv").write_text("\n".join(told) + "\n")
+    (folder / "telemetry.csv").write_text("\n".join(telemetry) + "\n")
     (folder / "truth.csv").write_text("\n".join(true) + "\n")
     return folder
 
@@ -76,22 +76,22 @@ def test_the_stand_in_tells_telemetry_and_arrivals_are_timed(lap, tmp_path):
         ours.settimeout(10)
         reader = mavlink.MAVLink(None)
         core = min(os.sched_getaffinity(0))
-        with StandIn(folder, port, core) as standin:
+        with FakeAutopilot(folder, port, core) as fake_autopilot:
             kinds = set()
             while kinds < {"HEARTBEAT", "ATTITUDE", "DISTANCE_SENSOR", "LOCAL_POSITION_NED"}:
                 data, address = ours.recvfrom(1000)
                 kinds |= {each.get_type() for each in reader.parse_buffer(data)}
             lat, lon = list(read_truth(folder / "truth.csv").values())[2]
-            standin.wait_until(0.5 + 0.08)
-            age_s = (time.monotonic_ns() - standin.mono_ns(0.5)) / 1e9
+            fake_autopilot.wait_until(0.5 + 0.08)
+            age_s = (time.monotonic_ns() - fake_autopilot.mono_ns(0.5)) / 1e9
             message = mavlink.MAVLink_global_position_sensor_message(
                 0, 0, 1, round(time.time() * 1e6), round(age_s * 1e6), 1, 0,
                 round((lat - 3 / 111_194.9) * 1e7), round(lon * 1e7), 0, 0, 2.0, 0,
             )  # fmt: skip
             ours.sendto(message.pack(mavlink.MAVLink(None, 1, 197)), address)
-            came_ns = standin.position_after(standin.begin_ns, 10)
+            came_ns = fake_autopilot.position_after(fake_autopilot.begin_ns, 10)
         assert came_ns is not None
-        arrivals = Arrivals.of(standin)
+        arrivals = Arrivals.of(fake_autopilot)
     assert arrivals.view.tolist() == [2]
     assert arrivals.latency_ms[0] == pytest.approx(age_s * 1e3, abs=60)
     assert arrivals.error_m[0] == pytest.approx(3.0, abs=0.1)
@@ -148,7 +148,7 @@ def test_packages_that_are_needed_are_added_up():
 
 
 @pytest.mark.parametrize(
-    ("wheel", "told"),
+    ("wheel", "telemetry"),
     [
         ("tqdm-4.70.1-py3-none-any.whl", "pure"),
         ("lz4-4.4.5-cp311-cp311-manylinux2014_aarch64.manylinux_2_17_aarch64.whl",
@@ -156,8 +156,8 @@ def test_packages_that_are_needed_are_added_up():
         (None, "NONE"),
     ],
 )  # fmt: skip
-def test_a_wheel_in_a_word(wheel, told):
-    assert install._kind(wheel) == told
+def test_a_wheel_in_a_word(wheel, telemetry):
+    assert install._kind(wheel) == telemetry
 
 
 @pytest.mark.slow

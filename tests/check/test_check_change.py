@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from helpers import textured
-from orthonav.check.change import Severity, another_year, leaning
+from orthonav.check.change import Severity, another_year, tilted
 
 SIZE = 192
 MILD = Severity(field=0.0, view=0.0, shift=0.0)
@@ -76,11 +76,11 @@ def test_blank_ground(grey):
     assert made.shape == blank.shape and made.std() < 60
 
 
-def test_what_stands_leans_away_from_the_middle():
+def test_what_stands_tilts_away_from_the_middle():
     grey = textured((SIZE, SIZE), 5)
-    upright = leaning(np.random.default_rng(1), grey, 0.0, 15.0)
+    upright = tilted(np.random.default_rng(1), grey, 0.0, 15.0)
     assert_array_equal(upright, grey)
-    leant = leaning(np.random.default_rng(1), grey, 4.0, 15.0)
+    leant = tilted(np.random.default_rng(1), grey, 4.0, 15.0)
     off = np.abs(leant.astype(int) - grey)
     middle, rim = np.s_[SIZE // 2 - 8 : SIZE // 2 + 8], np.s_[:24]
     assert off[middle, middle].mean() < 0.3 * off[rim, rim].mean()

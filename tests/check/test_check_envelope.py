@@ -12,11 +12,11 @@ from orthonav.check.envelope import (
     HEIGHTS,
     STILL_FINE,
     YAW_OFF_DEG,
+    accepted_share,
     envelope_of,
     envelope_work,
     heights_of,
     heights_work,
-    kept_share,
 )
 from orthonav.check.views import TrialPlan
 from orthonav.geo.camera import Camera
@@ -81,5 +81,5 @@ def test_heights():
 
 def test_kept_are_the_confident_and_right():
     some = [right((0, 0)), right((0, 0), error_m=40.0), right((0, 0), confidence=0.8), lost((0, 0))]
-    assert kept_share(some, 0.9, 35.0) == 0.25
-    assert math.isnan(kept_share([], 0.9, 35.0))
+    assert accepted_share(some, 0.9, 35.0) == 0.25
+    assert math.isnan(accepted_share([], 0.9, 35.0))

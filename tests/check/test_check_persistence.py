@@ -16,7 +16,7 @@ from orthonav.check.persistence import (
     terms,
     usual_model,
 )
-from orthonav.check.views import LEVELS_TOLD, told_persistence
+from orthonav.check.views import LEVELS_TOLD, reported_persistence
 
 SIZE = 256
 
@@ -43,13 +43,13 @@ def roads_and_houses(seed=1):
 
 @pytest.mark.parametrize("gsd_m", [0.5, 1.0, 2.0])
 def test_roads_and_houses_last_longer_than_crops(gsd_m):
-    roads, fields = (told_persistence(each, gsd_m)[0] for each in (roads_and_houses(), crops()))
+    roads, fields = (reported_persistence(each, gsd_m)[0] for each in (roads_and_houses(), crops()))
     assert roads.mean() > 1.5 * fields.mean() and roads.mean() > 0.1
 
 
 def test_what_lasts_is_told_where_it_is():
     both = np.where(np.arange(SIZE) < SIZE // 2, roads_and_houses(), crops()).astype(np.uint8)
-    told = told_persistence(both, 1.0)[0]
+    told = reported_persistence(both, 1.0)[0]
     reach = MARGIN_PX
     assert told[:, : SIZE // 2 - reach].mean() > 1.5 * told[:, SIZE // 2 + reach :].mean()
 
@@ -66,17 +66,17 @@ def test_far_pixels_change_nothing():
 
 @pytest.mark.parametrize("grey", [0, 128, 255])
 def test_blank_ground_has_finite_persistence(grey):
-    for told in told_persistence(np.full((120, 130), grey, np.uint8), 1.0):
+    for told in reported_persistence(np.full((120, 130), grey, np.uint8), 1.0):
         assert told.shape == (120, 130) and told.dtype == np.float32
         assert np.isfinite(told).all() and told.min() >= LEAST and told.max() <= MOST
 
 
 def test_levels():
     large = np.tile(crops(), (2, 2))
-    assert len(told_persistence(large, 1.0)) == LEVELS_TOLD
-    tiny = told_persistence(crops()[:90, :90], 1.0)
+    assert len(reported_persistence(large, 1.0)) == LEVELS_TOLD
+    tiny = reported_persistence(crops()[:90, :90], 1.0)
     assert tiny and all(each.shape == (90, 90) for each in tiny)
-    later = told_persistence(large, 0.5, first=1)
+    later = reported_persistence(large, 0.5, first=1)
     assert len(later) == LEVELS_TOLD and later[0] is later[1]
 
 

@@ -17,7 +17,7 @@ from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
 from orthonav.mapfile import GreyLayer, open_map
 from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import Fix, Telemetry
+from orthonav.records import Fix, Telemetry, View
 
 HERE = Path(__file__).parent
 MAP, VIEW = HERE / "golden_v1.onav", HERE / "golden_view.png"
@@ -75,7 +75,7 @@ def main() -> None:
     assert done
     VIEW.write_bytes(encoded.tobytes())
     opened = open_map(MAP)
-    fix = Localizer(opened).locate(view_of(grey), CAMERA, TELEMETRY)
+    fix = Localizer(opened).locate(View(view_of(grey), CAMERA, TELEMETRY))
     assert isinstance(fix, Fix)
     sheet = opened.manifest.sheets[0]
     found = sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg)

@@ -129,7 +129,7 @@ def test_without_turn_or_scale_it_is_the_slow_path(place):
 
 @pytest.mark.parametrize("name, least", [("gray", 0.98), ("canny", 0.5)])
 def test_one_channel_is_only_turned(name, least):
-    """Which edges Canny finds depends on their direction: there the bank is a poor stand-in."""
+    """Which edges Canny finds depends on their direction: there the bank is a poor substitute."""
     place = Place(name, cells=16)
     likeness = place.likeness(*place.view(0.4, 0.0), random_poses(30, scale=0.13))
     assert np.median(likeness) > least

@@ -257,10 +257,10 @@ def test_rows_say_how_many_are_kept_right_and_far_off() -> None:
     values = np.array([0.95, 0.6, 0.92, 0.3])
     known = replace(comparison, criteria={**comparison.criteria, "confidence": values})
     rows = {r.threshold: r for r in criterion_rows(known, 32.0) if r.name == "confidence"}
-    assert (rows[0.5].n_kept, rows[0.5].n_right, rows[0.5].n_far) == (3, 2, 1)
-    assert (rows[0.9].n_kept, rows[0.9].n_right, rows[0.9].n_far) == (2, 1, 1)
+    assert (rows[0.5].n_accepted, rows[0.5].n_right, rows[0.5].n_far) == (3, 2, 1)
+    assert (rows[0.9].n_accepted, rows[0.9].n_right, rows[0.9].n_far) == (2, 1, 1)
     assert (rows[0.9].recall, rows[0.9].share_far) == (0.5, 0.5)
-    assert (rows[0.99].recall, rows[0.99].n_kept) == (0.0, 0)
+    assert (rows[0.99].recall, rows[0.99].n_accepted) == (0.0, 0)
     assert math.isnan(rows[0.99].share_far)
     farther = {r.threshold: r for r in criterion_rows(known, 32.0, 50.0) if r.name == "confidence"}
     assert (farther[0.5].n_far, farther[0.5].far_m) == (0, 50.0)
@@ -294,9 +294,9 @@ def test_json_names_and_keeps_what_was_there() -> None:
     assert row == {
         "name": "confidence",
         "threshold": 0.9,
-        "share_kept": 1.0,
+        "share_accepted": 1.0,
         "accuracy": 0.25,
-        "n_kept": 4,
+        "n_accepted": 4,
         "n_right": 1,
         "share_of_right_kept": 1.0,
         "n_wrong_by_35m": 2,

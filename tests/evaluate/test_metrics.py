@@ -86,7 +86,7 @@ def test_error_and_latency_figures() -> None:
 def test_criteria_keep_views_at_or_above_a_threshold() -> None:
     rows = {(r.name, r.threshold): r for r in measure(three_fixes()).criteria}
     assert len(rows) == sum(map(len, CRITERIA.values()))
-    kept = {key: (row.share_kept, row.accuracy) for key, row in rows.items()}
+    kept = {key: (row.share_accepted, row.accuracy) for key, row in rows.items()}
     assert kept["lowe_ratio", 1.13] == (0.25, 1.0)
     assert kept["peak_ratio", 1.05] == (0.75, 2 / 3)
     assert kept["peak_ratio", 1.13] == (0.5, 1.0)
@@ -100,14 +100,14 @@ def test_criteria_keep_views_at_or_above_a_threshold() -> None:
 def test_a_criterion_that_no_view_has_is_not_defined() -> None:
     comparison = compare(truth_of(TRUTH_EN_M), [fix("a", (0.0, 0.0), confidence=1.0)])
     row = next(r for r in measure(comparison).criteria if r.name == "lowe_ratio")
-    assert math.isnan(row.share_kept) and math.isnan(row.accuracy)
+    assert math.isnan(row.share_accepted) and math.isnan(row.accuracy)
     assert criterion_curve(comparison, "lowe_ratio", 15.0).thresholds.size == 0
 
 
 def test_a_curve_keeps_equal_values_together() -> None:
     curve = criterion_curve(three_fixes(), "confidence", 15.0)
     assert curve.thresholds.tolist() == [0.95, 0.6]
-    assert curve.share_kept.tolist() == [0.25, 0.75]
+    assert curve.share_accepted.tolist() == [0.25, 0.75]
     assert curve.accuracy.tolist() == [1.0, 2 / 3]
 
 
@@ -204,9 +204,9 @@ def test_curves_and_rows_agree_and_shares_grow(views: list[tuple[float, float | 
     fields["criteria"] = {"peak_ratio": values, "lowe_ratio": nothing, "confidence": nothing}
     comparison = Comparison(**fields)
     curve = criterion_curve(comparison, "peak_ratio", 15.0)
-    assert np.all(np.diff(curve.share_kept) > 0) and np.all(np.diff(curve.thresholds) < 0)
+    assert np.all(np.diff(curve.share_accepted) > 0) and np.all(np.diff(curve.thresholds) < 0)
     for threshold, share, accuracy in zip(
-        curve.thresholds, curve.share_kept, curve.accuracy, strict=True
+        curve.thresholds, curve.share_accepted, curve.accuracy, strict=True
     ):
         kept = [error for error, value in views if value is not None and value >= threshold]
         assert share == pytest.approx(len(kept) / n)

@@ -56,7 +56,7 @@ def flown(
     *,
     cov_en_m2=COV,
     confidence=0.95,
-    way_en_m=None,
+    displacement_en_m=None,
     times_ns=None,
     unknown=(),
     local=CENTRE,
@@ -66,12 +66,12 @@ def flown(
     no truth."""
     n = len(errors_en_m)
     states = [states] * n if isinstance(states, str | None) else states
-    if way_en_m is None:
-        way_en_m = np.stack([10.0 * np.arange(n), np.zeros(n)], axis=1)
+    if displacement_en_m is None:
+        displacement_en_m = np.stack([10.0 * np.arange(n), np.zeros(n)], axis=1)
     times_ns = [10**9 * i for i in range(n)] if times_ns is None else times_ns
     sure, radii_m = np.broadcast_to(confidence, n), np.broadcast_to(own_radius_m, n)
     truth, results = {}, []
-    for i, (error, at) in enumerate(zip(errors_en_m, way_en_m, strict=True)):
+    for i, (error, at) in enumerate(zip(errors_en_m, displacement_en_m, strict=True)):
         lat, lon = local.latlon_from_en(np.array(at, dtype=float))
         if i not in unknown:
             truth[f"{i:04d}.jpg"] = (float(lat), float(lon))
@@ -195,20 +195,23 @@ def test_states_by_view_and_by_the_time_until_the_next() -> None:
 def test_longest_without_a_confident_fix() -> None:
     track = by_hand()
     # views 4 to 6: tracking but unsure, then lost, until view 7
-    assert (track.unsure.seconds_s, track.unsure.way_m) == (12.0, pytest.approx(30.0, abs=0.01))
-    assert track.unsure_after == track.unsure
+    assert (track.low_confidence.seconds_s, track.low_confidence.path_m) == (
+        12.0,
+        pytest.approx(30.0, abs=0.01),
+    )
+    assert track.low_confidence_after == track.low_confidence
     start = tracked([None] * 5 + [(1.0, 0.0)] * 2, ["searching"] * 5 + ["tracking"] * 2)
-    assert start.unsure.way_m == pytest.approx(50.0, abs=0.01)
-    assert (start.unsure_after.seconds_s, start.unsure_after.way_m) == (0.0, 0.0)
+    assert start.low_confidence.path_m == pytest.approx(50.0, abs=0.01)
+    assert (start.low_confidence_after.seconds_s, start.low_confidence_after.path_m) == (0.0, 0.0)
 
 
 def test_false_locks_are_stretches_that_are_sure_or_tracking_and_far_off() -> None:
     track = by_hand()
     # view 1 sure; view 4 tracking; views 7 and 8 both; view 5 and 9 are neither
-    assert (track.far_m, track.n_sure_wrong, track.n_false_locks) == (35.0, 4, 3)
+    assert (track.far_m, track.n_confident_wrong, track.n_false_locks) == (35.0, 4, 3)
     assert track.false_lock_longest_s == 3.0  # 17 s to 20 s
     wide = by_hand(radius_m=65.0)
-    assert (wide.far_m, wide.n_sure_wrong, wide.n_false_locks) == (65.0, 2, 2)
+    assert (wide.far_m, wide.n_confident_wrong, wide.n_false_locks) == (65.0, 2, 2)
 
 
 def test_a_fix_that_states_a_larger_radius_is_held_to_that() -> None:
@@ -216,10 +219,10 @@ def test_a_fix_that_states_a_larger_radius_is_held_to_that() -> None:
     errors = [(60.0, 0.0), (60.0, 0.0), (60.0, 0.0), (80.0, 0.0), (20.0, 0.0), None]
     radii_m = [70.0, 50.0, 10.0, 70.0, 10.0, 70.0]
     track = tracked(errors, "tracking", own_radius_m=radii_m)
-    assert (track.far_m, track.n_sure_wrong, track.n_false_locks) == (35.0, 3, 1)
+    assert (track.far_m, track.n_confident_wrong, track.n_false_locks) == (35.0, 3, 1)
     nowhere = tracked(errors, "tracking", own_radius_m=math.nan)
-    assert (nowhere.far_m, nowhere.n_sure_wrong) == (35.0, 4)
-    assert tracked(errors, "tracking", own_radius_m=radii_m, radius_m=75.0).n_sure_wrong == 1
+    assert (nowhere.far_m, nowhere.n_confident_wrong) == (35.0, 4)
+    assert tracked(errors, "tracking", own_radius_m=radii_m, radius_m=75.0).n_confident_wrong == 1
 
 
 # Along and across.
@@ -230,7 +233,7 @@ def test_ahead_and_right_are_positive_whatever_the_course() -> None:
     course = np.stack([np.sin(angle), np.cos(angle)], axis=1)  # from north, clockwise
     way = 300.0 * np.stack([1 - np.cos(angle), np.sin(angle)], axis=1)
     right = np.stack([course[:, 1], -course[:, 0]], axis=1)
-    track = tracked(4.0 * course - 2.0 * right, "tracking", way_en_m=way)
+    track = tracked(4.0 * course - 2.0 * right, "tracking", displacement_en_m=way)
     inner = slice(1, -1)  # one-sided at the ends
     np.testing.assert_allclose(track.series.along_m[inner], 4.0, atol=0.02)
     np.testing.assert_allclose(track.series.across_m[inner], -2.0, atol=0.02)
@@ -244,7 +247,9 @@ def test_standing_still_has_no_course_and_dense_views_have_one() -> None:
     course = course_en(np.stack([east, np.zeros(16)], axis=1))
     assert np.isnan(course[10:]).all()
     np.testing.assert_allclose(course[:10], [[1.0, 0.0]] * 10)
-    track = tracked([(3.0, 1.0)] * 16, "tracking", way_en_m=np.stack([east, 0 * east], axis=1))
+    track = tracked(
+        [(3.0, 1.0)] * 16, "tracking", displacement_en_m=np.stack([east, 0 * east], axis=1)
+    )
     assert track.along.n_views == 10
     random = np.random.default_rng(0)
     dense = np.stack([np.arange(400) * 0.2, random.normal(0.0, 0.1, 400)], axis=1)
@@ -266,7 +271,7 @@ def test_standing_still_has_no_course_and_dense_views_have_one() -> None:
         ([(1.0, 0.0)] * 5, "tracking", {"times_ns": [0, 1, math.nan, 3, 4]}),
         ([(1.0, 0.0)] * 5, "tracking", {"times_ns": [5, 4, 3, 2, 1]}),
         ([(1.0, 0.0)] * 5, "lost", {"times_ns": [7] * 5}),
-        ([(1.0, 0.0)] * 5, "tracking", {"way_en_m": np.zeros((5, 2))}),
+        ([(1.0, 0.0)] * 5, "tracking", {"displacement_en_m": np.zeros((5, 2))}),
         ([(1.0, 0.0)] * 5, ["tracking", None, "lost", None, "searching"], {"unknown": (0, 1, 3)}),
         ([(1.0, 0.0)] * 5, "tracking", {"confidence": math.nan, "unknown": (0, 4)}),
         ([(1.0, 0.0)] * 5, "tracking", {"cov_en_m2": np.full((2, 2), math.nan)}),
@@ -310,7 +315,7 @@ def test_what_is_not_defined_is_none() -> None:
     assert found["first_view"] is None and found["first_s"] is None
     assert found["after"]["n_views"] == 0 and found["after"]["acc_at_15m"] is None
     assert set(found["share_of_time"].values()) == {None}
-    assert found["unsure"] == {"seconds_s": None, "way_m": pytest.approx(20.0, abs=0.01)}
+    assert found["low_confidence"] == {"seconds_s": None, "path_m": pytest.approx(20.0, abs=0.01)}
     assert found["along"]["rms_m"] is None and found["consistency"]["verdict"] is None
     assert found["over_time"]["sigma_m"] == [None] * 3
 
@@ -470,15 +475,15 @@ def seen_from(ground: np.ndarray, at_en_m, attitude) -> np.ndarray:
 
 
 def contact(errors, states=None, **named) -> list[Row]:
-    """Rows of views 40 m apart above a textured ground, turned by 90 deg, leaning by 8 deg."""
+    """Rows of views 40 m apart above a textured ground, turned by 90 deg, tilted by 8 deg."""
     ground = textured((400, 400), 3)
     n = len(errors)
     way = np.stack([40.0 * np.arange(n) - 60.0, np.full(n, 10.0)], axis=1)
-    comparison, results = flown(errors, states, way_en_m=way, **named)
+    comparison, results = flown(errors, states, displacement_en_m=way, **named)
     attitude = 90.0, 8.0, 0.0, 100.0
-    told = Telemetry(0, 84.0, 8.0, 0.0, 108.0)  # heading and height are those of the fix
+    telemetry = Telemetry(0, 84.0, 8.0, 0.0, 108.0)  # heading and height are those of the fix
     views = [
-        Picture(result.frame, told, seen_from(ground, at, attitude))
+        Picture(result.frame, telemetry, seen_from(ground, at, attitude))
         for result, at in zip(results, way, strict=True)
     ]
     return worst_rows(comparison, results, Seen(views), Ground(ground), GRID)
@@ -536,13 +541,13 @@ def test_a_view_that_cannot_be_shown_says_why(coarse) -> None:
     huge = replace(results[4].outcome, agl_m=1e7)
     results[4] = replace(results[4], outcome=huge)
     results[3] = replace(results[3], outcome=replace(results[3].outcome, agl_m=math.nan))
-    told = Telemetry(0, 90.0, 0.0, 0.0, 100.0)
+    telemetry = Telemetry(0, 90.0, 0.0, 0.0, 100.0)
     grey = np.zeros((120, 160), np.uint8)
     views = [
-        Picture("0000.jpg", told, None),
-        Picture("0001.jpg", told, grey[:50]),
-        Picture("0003.jpg", replace(told, agl_m=math.nan), grey),
-        Picture("0004.jpg", told, grey),
+        Picture("0000.jpg", telemetry, None),
+        Picture("0001.jpg", telemetry, grey[:50]),
+        Picture("0003.jpg", replace(telemetry, agl_m=math.nan), grey),
+        Picture("0004.jpg", telemetry, grey),
     ]
     rows = {row.frame: row for row in worst_rows(comparison, results, Seen(views), ground, GRID)}
     why = [rows[f"{i:04d}.jpg"].why_not for i in range(5)]
@@ -567,7 +572,7 @@ def golden_flight(tmp_path_factory) -> tuple[Path, Path]:
     errors = [(60.0, 0.0), (2.0, 1.0), (-3.0, 1.0), (1.0, -4.0)]
     states = ["searching", *["tracking"] * 3]
     way = np.array([(-60.0 + 30 * i, 0.0) for i in range(4)])
-    _, results = flown(errors, states, way_en_m=way, local=sheet.frame)
+    _, results = flown(errors, states, displacement_en_m=way, local=sheet.frame)
     (folder / "flight").mkdir()
     writer = FlightWriter(folder / "flight", Camera(96, 96, 96.0, 96.0, 48.0, 48.0), "")
     for result, (east, north) in zip(results, way, strict=True):
@@ -583,8 +588,8 @@ def golden_flight(tmp_path_factory) -> tuple[Path, Path]:
 
 def evaluated(golden_flight, *more, capsys) -> tuple[int, str, str]:
     flight, fixes = golden_flight
-    told = ["evaluate", fixes, "--truth", flight / "truth.csv", *more]
-    code = main([str(each) for each in told])
+    telemetry = ["evaluate", fixes, "--truth", flight / "truth.csv", *more]
+    code = main([str(each) for each in telemetry])
     said = capsys.readouterr()
     return code, said.out, said.err
 

@@ -18,6 +18,7 @@ from orthonav.geo.frames import LocalFrame
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
+from orthonav.records import View
 
 SMALL = replace(TABLE_1["B"], name="B", length_m=320.0, band_m=288.0)
 
@@ -120,7 +121,7 @@ def test_views_show_the_ground_of_the_map_pixel_by_pixel(place, scene, made):
     camera = views.camera_of(SMALL.agl_m, 1.0)
     for ground in seen["grid"]:
         grey = views.view_of(ground, camera, SMALL.agl_m, 1.0)
-        found = localizer.locate(grey, camera, views.told(SMALL.agl_m))
+        found = localizer.locate(View(grey, camera, views.told(SMALL.agl_m)))
         error = localizer.sheet.frame.en_from_latlon(found.lat_deg, found.lon_deg)
         assert np.hypot(*(error - ground.truth_en_m)) < 3
         lower = views.view_of(ground, camera, SMALL.agl_m, 1.0, drop_m=200)

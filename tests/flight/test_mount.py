@@ -20,11 +20,11 @@ def test_a_mount_comes_back(tmp_path):
 
 
 def test_told_values_are_corrected():
-    told = Telemetry(5, 350.0, 1.0, 2.0, 100.0, vel_en_mps=(1.0, 2.0), lean_std_deg=0.5)
-    found = MOUNT.corrected(told)
+    telemetry = Telemetry(5, 350.0, 1.0, 2.0, 100.0, vel_en_mps=(1.0, 2.0), tilt_std_deg=0.5)
+    found = MOUNT.corrected(telemetry)
     assert (found.yaw_deg, found.pitch_deg, found.roll_deg) == (354.0, 7.5, 0.75)
     assert found.agl_m == pytest.approx(100 * math.exp(-0.1))
-    assert (found.time_ns, found.vel_en_mps, found.lean_std_deg) == (5, (1.0, 2.0), 0.5)
+    assert (found.time_ns, found.vel_en_mps, found.tilt_std_deg) == (5, (1.0, 2.0), 0.5)
 
 
 def test_what_is_not_told_stays_so():

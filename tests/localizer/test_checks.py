@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from orthonav.geo.camera import Camera
 from orthonav.localizer import checks
-from orthonav.localizer.checks import check_rectified, check_telemetry, check_view
-from orthonav.localizer.rectify import Rectified
+from orthonav.localizer.checks import check_picture, check_rectified, check_telemetry
+from orthonav.localizer.rectify import RectifiedView
 from orthonav.records import Telemetry
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
@@ -114,7 +114,7 @@ def checks_of(low, high, share=0.5):
     ],
 )
 def test_views_that_show_nothing(low, high, share, expected):
-    assert reason(check_view(checks_of(low, high, share))) == expected
+    assert reason(check_picture(checks_of(low, high, share))) == expected
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 40), st.integers(2, 256))
@@ -128,18 +128,18 @@ def test_levels_are_counted_as_numpy_does(seed, rows, cols, levels):
 def test_a_few_hot_pixels_make_no_view():
     grey = np.zeros((240, 320), np.uint8)
     grey[100:104, 100:108] = 255
-    assert reason(check_view(grey)) == "too_dark"
-    assert reason(check_view(255 - grey)) == "too_bright"
+    assert reason(check_picture(grey)) == "too_dark"
+    assert reason(check_picture(255 - grey)) == "too_bright"
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 500), (33, 32)])
 def test_small_views_are_no_error(shape):
-    assert reason(check_view(np.full(shape, 99, np.uint8))) == "blank"
+    assert reason(check_picture(np.full(shape, 99, np.uint8))) == "blank"
 
 
 def rectified(valid, grey=None):
     grey = checks_of(40, 200)[:240, :240] if grey is None else grey
-    return Rectified(grey, valid, np.zeros(2))
+    return RectifiedView(grey, valid, np.zeros(2))
 
 
 @pytest.mark.parametrize("seen, expected", [(0, "too_small"), (23, "too_small"), (24, None)])

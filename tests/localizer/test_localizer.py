@@ -17,7 +17,7 @@ from orthonav.geo.camera import Camera
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
-from orthonav.records import Fix, NoFix, Prior, Telemetry
+from orthonav.records import Fix, NoFix, Prior, Telemetry, View
 from orthonav.simulate.render import ViewEffects, render_view
 
 EVIDENCE = {"score", "margin", "lowe_ratio", "peak_ratio", "tiles_searched", "valid_share"}
@@ -35,7 +35,8 @@ def views(flight):
 def fixes(views, flight, localizer):
     """Their fixes, without any prior."""
     return {
-        name: localizer.locate(grey, flight.camera, told) for name, (grey, told) in views.items()
+        name: localizer.locate(View(grey, flight.camera, telemetry))
+        for name, (grey, telemetry) in views.items()
     }
 
 
@@ -135,10 +136,10 @@ def same(one, other):
 def test_the_same_view_gives_the_same_fix(fixes, views, flight, localizer, map_path):
     fresh = Localizer(open_map(map_path), registration=False)
     for name in list(fixes)[:6]:
-        grey, told = views[name]
+        grey, telemetry = views[name]
         kept = grey.copy()
-        assert same(localizer.locate(grey, flight.camera, told), fixes[name])
-        assert same(fresh.locate(grey, flight.camera, told), fixes[name])
+        assert same(localizer.locate(View(grey, flight.camera, telemetry)), fixes[name])
+        assert same(fresh.locate(View(grey, flight.camera, telemetry)), fixes[name])
         np.testing.assert_array_equal(grey, kept)
 
 
@@ -147,24 +148,26 @@ def test_threads_may_share_a_localizer(fixes, views, flight, map_path):
         open_map(map_path), registration=False
     )  # cold, so that the caches are filled by both at once
     with ThreadPoolExecutor(4) as pool:
-        found = pool.map(lambda item: fresh.locate(item[0], flight.camera, item[1]), views.values())
+        found = pool.map(
+            lambda item: fresh.locate(View(item[0], flight.camera, item[1])), views.values()
+        )
         assert all(same(one, fix) for one, fix in zip(found, fixes.values(), strict=True))
 
 
 def test_a_prior_elsewhere_is_outside_the_map(views, flight, localizer, good):
-    grey, told = views[good]
+    grey, telemetry = views[good]
     for place in ([50_000.0, 0.0], [0.0, -3000.0]):
         outcome = localizer.locate(
-            grey, flight.camera, told, prior=prior_at(localizer, place, 100.0)
+            View(grey, flight.camera, telemetry), prior=prior_at(localizer, place, 100.0)
         )
         assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
 
 
 def test_a_prior_near_the_truth_changes_nothing(views, fixes, flight, localizer, good, truth_en_m):
-    grey, told = views[good]
+    grey, telemetry = views[good]
     for std_m in (50.0, 150.0, 1e5):
         prior = prior_at(localizer, truth_en_m[good], std_m)
-        fix = localizer.locate(grey, flight.camera, told, prior=prior)
+        fix = localizer.locate(View(grey, flight.camera, telemetry), prior=prior)
         assert place_en_m(localizer, fix) == pytest.approx(
             place_en_m(localizer, fixes[good]), abs=1e-6
         )
@@ -174,36 +177,38 @@ def test_a_prior_near_the_truth_changes_nothing(views, fixes, flight, localizer,
 
 
 def test_a_prior_lets_no_tile_through_that_is_too_far(views, flight, localizer, good, truth_en_m):
-    grey, told = views[good]
+    grey, telemetry = views[good]
     wrong = truth_en_m[good] + [-400.0 if truth_en_m[good][0] > 0 else 400.0, 0.0]
     std_m = 40.0
-    fix = localizer.locate(grey, flight.camera, told, prior=prior_at(localizer, wrong, std_m))
+    fix = localizer.locate(
+        View(grey, flight.camera, telemetry), prior=prior_at(localizer, wrong, std_m)
+    )
     reach_m = 3 * std_m + localizer.grid.stride_m
     assert error_m(localizer, fix, wrong) <= reach_m + localizer.grid.stride_m
     inside = np.linalg.norm(localizer.centres_en_m - wrong, axis=1) <= reach_m
-    # The gate is a little wider where the camera leans and the heading is uncertain.
+    # The gate is a little wider where the camera tilts and the heading is uncertain.
     assert inside.sum() <= fix.evidence["tiles_searched"] <= 1.2 * inside.sum()
 
 
 def test_a_narrow_prior_does_not_make_sure(views, flight, localizer, truth_en_m):
     """Mirrored views show no place of the map, so no prior may make them look right."""
     sure = []
-    for name, (grey, told) in views.items():
+    for name, (grey, telemetry) in views.items():
         mirrored = np.ascontiguousarray(grey[:, ::-1])
         prior = prior_at(localizer, truth_en_m[name], 5.0)
-        fix = localizer.locate(mirrored, flight.camera, told, prior=prior)
+        fix = localizer.locate(View(mirrored, flight.camera, telemetry), prior=prior)
         sure.append(isinstance(fix, Fix) and fix.confidence >= 0.9)
     assert np.mean(sure) <= 0.1
 
 
 def test_the_prior_is_of_the_aircraft_not_of_what_it_sees(views, flight, localizer, good):
     """A camera that looks far ahead sees ground outside a narrow prior: that must be allowed."""
-    grey, told = views[good]
-    ahead = replace(told, pitch_deg=40.0, yaw_std_deg=0.0)
-    free = localizer.locate(grey, flight.camera, ahead)
+    grey, telemetry = views[good]
+    ahead = replace(telemetry, pitch_deg=40.0, yaw_std_deg=0.0)
+    free = localizer.locate(View(grey, flight.camera, ahead))
     assert isinstance(free, Fix)
     prior = Prior(free.lat_deg, free.lon_deg, 1.0)
-    gated = localizer.locate(grey, flight.camera, ahead, prior=prior)
+    gated = localizer.locate(View(grey, flight.camera, ahead), prior=prior)
     assert isinstance(gated, Fix)
     assert (gated.lat_deg, gated.lon_deg) == (free.lat_deg, free.lon_deg)
 
@@ -215,9 +220,9 @@ def test_a_prior_helps(views, flight, localizer, fixes, truth_en_m):
 
     gated = {
         name: localizer.locate(
-            grey, flight.camera, told, prior=prior_at(localizer, truth_en_m[name], 60.0)
+            View(grey, flight.camera, telemetry), prior=prior_at(localizer, truth_en_m[name], 60.0)
         )
-        for name, (grey, told) in views.items()
+        for name, (grey, telemetry) in views.items()
     }
     assert right(gated) >= right(fixes) and right(gated) >= 28
 
@@ -226,9 +231,9 @@ def test_a_prior_helps(views, flight, localizer, fixes, truth_en_m):
 def test_a_prior_without_width_still_reaches_a_stride(
     views, flight, localizer, good, truth_en_m, std_m
 ):
-    grey, told = views[good]
+    grey, telemetry = views[good]
     prior = prior_at(localizer, truth_en_m[good], std_m)
-    fix = localizer.locate(grey, flight.camera, told, prior=prior)
+    fix = localizer.locate(View(grey, flight.camera, telemetry), prior=prior)
     assert isinstance(fix, Fix) and 1 <= fix.evidence["tiles_searched"] <= 5
 
 
@@ -236,8 +241,8 @@ def test_a_prior_without_width_still_reaches_a_stride(
     "prior", [Prior(math.nan, 3.0, 50.0), Prior(46.0, math.nan, 50.0), Prior(46.0, 3.0, math.nan)]
 )
 def test_a_prior_that_is_not_known_is_no_crash(views, flight, localizer, good, prior):
-    grey, told = views[good]
-    outcome = localizer.locate(grey, flight.camera, told, prior=prior)
+    grey, telemetry = views[good]
+    outcome = localizer.locate(View(grey, flight.camera, telemetry), prior=prior)
     assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
 
 
@@ -245,25 +250,25 @@ def test_unknown_heading(ground, localizer):
     places = [(-150.0, 40.0), (60.0, -30.0), (170.0, 100.0), (0.0, 0.0), (-60.0, -90.0)]
     found = 0
     for place in places:
-        grey, told = ground.view(*place, yaw_deg=137.0)
-        told = replace(told, yaw_deg=math.nan)
-        fix = localizer.locate(grey, ground.camera, told, heading_known=False)
+        grey, telemetry = ground.view(*place, yaw_deg=137.0)
+        telemetry = replace(telemetry, yaw_deg=math.nan)
+        fix = localizer.locate(View(grey, ground.camera, telemetry), heading_known=False)
         assert isinstance(fix, Fix)
         right = error_m(localizer, fix, np.array(place)) <= localizer.grid.stride_m
         found += right
         if right:
             assert abs((fix.heading_deg - 137 + 180) % 360 - 180) <= 8
-        refused = localizer.locate(grey, ground.camera, told)
+        refused = localizer.locate(View(grey, ground.camera, telemetry))
         assert refused.reason == "missing_telemetry" and "yaw_deg" in refused.detail
     assert found >= 4
 
 
 def test_a_told_heading_is_believed_only_as_far_as_it_errs(ground, localizer):
     place = (60.0, -30.0)
-    grey, told = ground.view(*place, yaw_deg=40.0)
-    off = replace(told, yaw_deg=65.0)
-    sure = localizer.locate(grey, ground.camera, replace(off, yaw_std_deg=1.0))
-    unsure = localizer.locate(grey, ground.camera, replace(off, yaw_std_deg=20.0))
+    grey, telemetry = ground.view(*place, yaw_deg=40.0)
+    off = replace(telemetry, yaw_deg=65.0)
+    sure = localizer.locate(View(grey, ground.camera, replace(off, yaw_std_deg=1.0)))
+    unsure = localizer.locate(View(grey, ground.camera, replace(off, yaw_std_deg=20.0)))
     assert sure.heading_deg == pytest.approx(65.0, abs=6.1)
     assert unsure.heading_deg == pytest.approx(40.0, abs=6.1)
     assert error_m(localizer, unsure, np.array(place)) <= localizer.grid.stride_m
@@ -271,16 +276,16 @@ def test_a_told_heading_is_believed_only_as_far_as_it_errs(ground, localizer):
 
 @pytest.mark.parametrize("std_deg", [math.nan, math.inf, -3.0, 0.0, 1e9])
 def test_an_odd_error_of_the_heading_is_no_crash(ground, localizer, std_deg):
-    grey, told = ground.view(60.0, -30.0, yaw_deg=40.0)
-    fix = localizer.locate(grey, ground.camera, replace(told, yaw_std_deg=std_deg))
+    grey, telemetry = ground.view(60.0, -30.0, yaw_deg=40.0)
+    fix = localizer.locate(View(grey, ground.camera, replace(telemetry, yaw_std_deg=std_deg)))
     assert error_m(localizer, fix, np.array([60.0, -30.0])) <= localizer.grid.stride_m
 
 
 @pytest.mark.parametrize("yaw_deg", [-360.0, 360.0, 3600.0])
 def test_a_full_turn_changes_nothing(ground, localizer, yaw_deg):
-    grey, told = ground.view(-60.0, 20.0, yaw_deg=30.0)
-    turned = replace(told, yaw_deg=30.0 + yaw_deg)
-    one, other = (localizer.locate(grey, ground.camera, t) for t in (told, turned))
+    grey, telemetry = ground.view(-60.0, 20.0, yaw_deg=30.0)
+    turned = replace(telemetry, yaw_deg=30.0 + yaw_deg)
+    one, other = (localizer.locate(View(grey, ground.camera, t)) for t in (telemetry, turned))
     assert place_en_m(localizer, one) == pytest.approx(place_en_m(localizer, other), abs=0.5)
     assert one.heading_deg == pytest.approx(other.heading_deg, abs=1e-6)
 
@@ -288,32 +293,32 @@ def test_a_full_turn_changes_nothing(ground, localizer, yaw_deg):
 @pytest.mark.parametrize("attitude", [(0, 15, -10), (75, 15, -10), (200, -12, 14), (0, 0, 25)])
 def test_tilt_is_compensated(ground, localizer, attitude):
     place = np.array([40.0, -10.0])
-    level = localizer.locate(*args_of(ground, place, (attitude[0], 0, 0)))
-    leaning = localizer.locate(*args_of(ground, place, attitude))
+    level = localizer.locate(View(*args_of(ground, place, (attitude[0], 0, 0))))
+    tilted = localizer.locate(View(*args_of(ground, place, attitude)))
     assert error_m(localizer, level, place) <= localizer.grid.stride_m
-    apart = place_en_m(localizer, level) - place_en_m(localizer, leaning)
+    apart = place_en_m(localizer, level) - place_en_m(localizer, tilted)
     assert np.abs(apart).max() <= localizer.grid.stride_m
 
 
 def args_of(ground, place, attitude):
-    grey, told = ground.view(*place, *map(float, attitude))
-    return grey, ground.camera, told
+    grey, telemetry = ground.view(*place, *map(float, attitude))
+    return grey, ground.camera, telemetry
 
 
 def test_a_lens_is_undone(ground, localizer):
     lens = replace(ground.camera, distortion=(-0.3, 0.08, 0.001, -0.001))
-    grey, told = ground.view(40.0, -10.0, camera=lens)
-    fix = localizer.locate(grey, lens, told)
+    grey, telemetry = ground.view(40.0, -10.0, camera=lens)
+    fix = localizer.locate(View(grey, lens, telemetry))
     assert error_m(localizer, fix, np.array([40.0, -10.0])) <= localizer.grid.stride_m
-    plain = localizer.locate(ground.view(40.0, -10.0)[0], ground.camera, told)
+    plain = localizer.locate(View(ground.view(40.0, -10.0)[0], ground.camera, telemetry))
     assert fix.evidence["score"] == pytest.approx(plain.evidence["score"], abs=0.02)
 
 
 def test_a_fine_picture_of_the_same_ground(ground, localizer):
     """Five times as many pixels, thinned before they are compared."""
     fine = ground.camera.resized(1600, 1200)
-    grey, told = ground.view(40.0, -10.0, camera=fine)
-    fix = localizer.locate(grey, fine, told)
+    grey, telemetry = ground.view(40.0, -10.0, camera=fine)
+    fix = localizer.locate(View(grey, fine, telemetry))
     assert error_m(localizer, fix, np.array([40.0, -10.0])) <= localizer.grid.stride_m
 
 
@@ -337,8 +342,8 @@ REFUSED_TELEMETRY = [
 
 @pytest.mark.parametrize("changes, reason", REFUSED_TELEMETRY)
 def test_telemetry_that_makes_no_fix(views, flight, localizer, good, changes, reason):
-    grey, told = views[good]
-    outcome = localizer.locate(grey, flight.camera, replace(told, **changes))
+    grey, telemetry = views[good]
+    outcome = localizer.locate(View(grey, flight.camera, replace(telemetry, **changes)))
     assert isinstance(outcome, NoFix) and outcome.reason == reason
     assert outcome.detail and "\n" not in outcome.detail
 
@@ -356,7 +361,7 @@ def test_telemetry_that_makes_no_fix(views, flight, localizer, good, changes, re
 def test_pictures_that_make_no_fix(localizer, grey, reason):
     height, width = grey.shape
     camera = Camera(width, height, 250.0, 250.0, width / 2, height / 2)
-    outcome = localizer.locate(grey, camera, Telemetry(0, 0.0, 0.0, 0.0, 300.0))
+    outcome = localizer.locate(View(grey, camera, Telemetry(0, 0.0, 0.0, 0.0, 300.0)))
     assert isinstance(outcome, NoFix) and outcome.reason == reason
 
 
@@ -364,15 +369,15 @@ def test_a_picture_with_detail_only_where_it_is_not_compared(localizer):
     grey = np.full((240, 960), 128, np.uint8)
     grey[:, :200] = np.random.default_rng(0).integers(0, 255, (240, 200))
     camera = Camera(960, 240, 250.0, 250.0, 480.0, 120.0)
-    outcome = localizer.locate(grey, camera, Telemetry(0, 0.0, 0.0, 0.0, 300.0))
+    outcome = localizer.locate(View(grey, camera, Telemetry(0, 0.0, 0.0, 0.0, 300.0)))
     assert isinstance(outcome, NoFix) and outcome.reason == "blank"
 
 
 @pytest.mark.parametrize("shape", [(240, 319), (320, 240), (480, 640)])
 def test_a_camera_of_another_size_is_an_error(localizer, flight, shape):
-    told = Telemetry(0, 0.0, 0.0, 0.0, 300.0)
+    telemetry = Telemetry(0, 0.0, 0.0, 0.0, 300.0)
     with pytest.raises(CameraError, match=f"320 x 240 px, the image is {shape[1]} x {shape[0]}"):
-        localizer.locate(np.zeros(shape, np.uint8), flight.camera, told)
+        localizer.locate(View(np.zeros(shape, np.uint8), flight.camera, telemetry))
 
 
 anything = st.floats(allow_nan=True, allow_infinity=True)
@@ -383,7 +388,7 @@ def mostly(usual):
     return st.one_of(usual, usual, usual, usual, usual, anything)
 
 
-told = st.builds(
+telemetry = st.builds(
     Telemetry,
     time_ns=st.just(0),
     yaw_deg=mostly(st.floats(-400, 400)),
@@ -407,10 +412,10 @@ priors = st.none() | st.builds(
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
-@given(telemetry=told, prior=priors, heading_known=st.booleans() | st.just(True))
+@given(telemetry=telemetry, prior=priors, heading_known=st.booleans() | st.just(True))
 def test_no_telemetry_raises(localizer, views, flight, good, telemetry, prior, heading_known):
     outcome = localizer.locate(
-        views[good][0], flight.camera, telemetry, prior=prior, heading_known=heading_known
+        View(views[good][0], flight.camera, telemetry), prior=prior, heading_known=heading_known
     )
     if isinstance(outcome, NoFix):
         assert outcome.reason and outcome.detail

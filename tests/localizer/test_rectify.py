@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from orthonav.geo.camera import Camera
-from orthonav.localizer.rectify import PreparedView, prepare_view, rectify
+from orthonav.localizer.rectify import downsampled, rectify
+from orthonav.records import Telemetry, View
 
 AGL_M, GSD_M, SIZE_PX = 100.0, 0.5, 160
 PLAIN = Camera(320, 240, 240.0, 240.0, 160.0, 120.0)
@@ -111,9 +112,8 @@ def seen_px(camera, attitude, east_m, north_m, agl_m=AGL_M):
 
 def tilted_and_prepared(grey, camera, attitude, gsd_m=GSD_M, size_px=SIZE_PX, agl_m=AGL_M):
     yaw, pitch, roll = attitude
-    view = prepare_view(grey, camera, agl_m, gsd_m)
-    pose = {"yaw_deg": yaw, "pitch_deg": pitch, "roll_deg": roll, "agl_m": agl_m}
-    return rectify(view, **pose, gsd_m=gsd_m, size_px=size_px)
+    view = View(grey, camera, Telemetry(0, yaw, pitch, roll, agl_m))
+    return rectify(downsampled(view, gsd_m), gsd_m=gsd_m, size_px=size_px)
 
 
 def shift_px(found, expected, where):
@@ -210,7 +210,8 @@ def test_fine_views_are_thinned_without_aliasing_or_shift(lens, size):
 )
 def test_thinning_is_by_whole_numbers(agl_m, gsd_m, expected):
     """A pixel covers 0.417 m; a view is never thinned below 8 px."""
-    view = prepare_view(np.zeros((240, 320), np.uint8), PLAIN, agl_m, gsd_m)
+    grey = np.zeros((240, 320), np.uint8)
+    view = downsampled(View(grey, PLAIN, Telemetry(0, 0.0, 0.0, 0.0, agl_m)), gsd_m)
     assert view.grey.shape[::-1] == expected
     assert (view.camera.width_px, view.camera.height_px) == expected
     factor = 1 if expected == (320, 240) else int(gsd_m / PLAIN.gsd_m(agl_m))
@@ -223,11 +224,8 @@ def test_the_view_given_is_not_changed():
     grey.flags.writeable = False
     kept = grey.copy()
     tilted_and_prepared(grey, PLAIN, (37, 8, -6), gsd_m=2.0)
-    view = PreparedView(grey, PLAIN)
-    first, second = (
-        rectify(view, yaw_deg=5, pitch_deg=0, roll_deg=0, agl_m=AGL_M, gsd_m=1.0, size_px=64)
-        for _ in range(2)
-    )
+    view = View(grey, PLAIN, Telemetry(0, 5.0, 0.0, 0.0, AGL_M))
+    first, second = (rectify(view, gsd_m=1.0, size_px=64) for _ in range(2))
     assert np.array_equal(first.grey, second.grey) and np.array_equal(grey, kept)
 
 
@@ -237,15 +235,12 @@ def test_a_lens_at_some_pixels_is_as_good_as_at_all(monkeypatch, lens, attitude)
     """Not to the bit: no pixel is taken from farther than a fiftieth of one away."""
     grey = np.random.default_rng(3).integers(0, 256, (240, 320)).astype(np.float32)
     grey = cv2.GaussianBlur(grey, (0, 0), 1.5)
-    view = PreparedView(
-        (40 * (grey - 100) / grey.std() / 2 + 120).clip(0, 255).astype(np.uint8), LENSES[lens]
-    )
-    yaw, pitch, roll = attitude
-    how = dict(yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll, agl_m=100.0, gsd_m=0.5, size_px=240)
-    quick = rectify(view, **how)
+    grey = (40 * (grey - 100) / grey.std() / 2 + 120).clip(0, 255).astype(np.uint8)
+    view = View(grey, LENSES[lens], Telemetry(0, *attitude, 100.0))
+    quick = rectify(view, gsd_m=0.5, size_px=240)
     module = importlib.import_module("orthonav.localizer.rectify")
     monkeypatch.setattr(module, "_is_smooth", lambda *_: False)
-    exact = rectify(view, **how)
+    exact = rectify(view, gsd_m=0.5, size_px=240)
     assert (quick.valid != exact.valid).mean() < 2e-3
     both = quick.valid & exact.valid
     off = np.abs(quick.grey.astype(int) - exact.grey)[both]

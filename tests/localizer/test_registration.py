@@ -26,7 +26,7 @@ from orthonav.mapfile import GreyLayer, open_map
 from orthonav.mapfile.layer import part_names
 from orthonav.onboard.run import SingleViews, locate_view
 from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import Fix, NoFix, Prior, Telemetry
+from orthonav.records import Fix, NoFix, Prior, Telemetry, View
 
 LENS = replace(CAMERA, distortion=(-0.25, 0.06, 0.001, -0.002))
 EVIDENCE = {"score", "strength", "rival", "look", "look_rival", "peak_ratio", "look_ratio"}
@@ -78,7 +78,7 @@ def located(
 ):
     """Where a view is placed whose telemetry is right."""
     grey = rendered(GROUND, place_en_m, attitude, agl_m, camera)
-    return localizer.locate(grey, camera, telemetry(*attitude, agl_m), **keywords)
+    return localizer.locate(View(grey, camera, telemetry(*attitude, agl_m)), **keywords)
 
 
 PLACES = [(-120.0, 95.0), (60.3, -110.7), (133.1, 140.2), (-30.0, 5.5), (10.0, -80.0)]
@@ -91,7 +91,7 @@ def plain(localizer):
     place = np.array([40.0, -25.0])
     grey, told = rendered(GROUND, place, (33.0, 0.0, 0.0)), telemetry(33.0)
     grey.flags.writeable = False
-    return grey, told, place, localizer.locate(grey, CAMERA, told)
+    return grey, told, place, localizer.locate(View(grey, CAMERA, told))
 
 
 @pytest.mark.parametrize("place, yaw_deg", list(zip(PLACES, HEADINGS, strict=True)))
@@ -101,7 +101,7 @@ def test_a_view_is_placed_to_a_fraction_of_a_pixel(localizer, place, yaw_deg):
     agl_m = AGL_M * rng.uniform(0.85, 1.15)
     grey = rendered(GROUND, place, (yaw_deg, 0, 0), agl_m)
     told = telemetry(yaw_deg + rng.normal(0, 4), agl_m=agl_m * rng.normal(1, 0.04))
-    fix = localizer.locate(grey, CAMERA, told)
+    fix = localizer.locate(View(grey, CAMERA, told))
     assert error_m(localizer, fix, place) < 0.1
     assert abs(turned_deg(fix.heading_deg, yaw_deg)) < 0.1 and 0 <= fix.heading_deg < 360
     assert fix.agl_m == pytest.approx(agl_m, rel=0.002)
@@ -134,7 +134,7 @@ def test_another_floor_widens_the_covariance(localizer, map_path, plain):
     wide = Localizer(open_map(map_path))
     floors_m2 = (wide.registration.floor_px * wide.grid.gsd_m) ** 2, (3 * wide.grid.gsd_m) ** 2
     wide.registration.floor_px = 3.0
-    widened = wide.locate(grey, CAMERA, told).cov_en_m2 - fix.cov_en_m2
+    widened = wide.locate(View(grey, CAMERA, told)).cov_en_m2 - fix.cov_en_m2
     np.testing.assert_allclose(widened, np.eye(2) * (floors_m2[1] - floors_m2[0]), atol=1e-6)
 
 
@@ -146,7 +146,7 @@ def test_a_view_blurred_by_motion_is_known_across_it_only(map_path, yaw_deg, alo
     exact = Localizer(open_map(map_path))
     exact.registration.floor_px = 0.0
     grey = cv2.blur(rendered(GROUND, (0.0, 0.0), (yaw_deg, 0.0, 0.0)), (1, 25))
-    fix = exact.locate(grey, CAMERA, telemetry(float(yaw_deg)))
+    fix = exact.locate(View(grey, CAMERA, telemetry(float(yaw_deg))))
     assert error_m(exact, fix, (0.0, 0.0)) < 1.0
     _, axes = np.linalg.eigh(fix.cov_en_m2)
     assert abs(axes[:, 1] @ along) / np.hypot(*along) > 0.95
@@ -168,7 +168,7 @@ def test_the_place_is_that_of_the_camera(localizer, attitude):
 def test_a_tilted_view_whose_heading_and_height_are_told_wrong(localizer):
     place, yaw_deg = np.array([15.0, -40.0]), 140.0
     grey = rendered(GROUND, place, (yaw_deg, 10.0, -8.0), 160.0)
-    fix = localizer.locate(grey, CAMERA, telemetry(yaw_deg + 5, 10.0, -8.0, 150.0))
+    fix = localizer.locate(View(grey, CAMERA, telemetry(yaw_deg + 5, 10.0, -8.0, 150.0)))
     assert error_m(localizer, fix, place) < 0.15
     assert abs(turned_deg(fix.heading_deg, yaw_deg)) < 0.1
     assert fix.agl_m == pytest.approx(160.0, rel=0.002)
@@ -180,7 +180,7 @@ def test_a_lens_is_undone(localizer, attitude):
     assert error_m(localizer, fix, (25.0, 60.0)) < 0.15
     assert fix.evidence["score"] > 0.85
     grey = rendered(GROUND, (25.0, 60.0), attitude, camera=LENS)
-    unknown = localizer.locate(grey, CAMERA, telemetry(*attitude))
+    unknown = localizer.locate(View(grey, CAMERA, telemetry(*attitude)))
     assert not isinstance(unknown, Fix) or unknown.evidence["score"] < fix.evidence["score"] - 0.05
 
 
@@ -205,30 +205,30 @@ def test_unknown_heading(localizer, yaw_deg):
     place = np.array([-60.0, 50.0])
     grey = rendered(GROUND, place, (yaw_deg, 5.0, -4.0))
     told = telemetry(math.nan, 5.0, -4.0)
-    fix = localizer.locate(grey, CAMERA, told, heading_known=False)
+    fix = localizer.locate(View(grey, CAMERA, told), heading_known=False)
     assert error_m(localizer, fix, place) < 0.15 and fix.confidence > 0.9
     assert abs(turned_deg(fix.heading_deg, yaw_deg)) < 0.1
-    refused = localizer.locate(grey, CAMERA, told)
+    refused = localizer.locate(View(grey, CAMERA, told))
     assert isinstance(refused, NoFix) and refused.reason == "missing_telemetry"
     near = localizer.locate(
-        grey, CAMERA, told, heading_known=False, prior=prior_at(localizer, place, 20.0)
+        View(grey, CAMERA, told), heading_known=False, prior=prior_at(localizer, place, 20.0)
     )
     assert error_m(localizer, near, place) < 0.15
 
 
 def test_a_heading_told_wrong_is_not_believed_beyond_its_error(localizer):
     grey = rendered(GROUND, (60.0, -30.0), (40.0, 0.0, 0.0))
-    unsure = localizer.locate(grey, CAMERA, telemetry(75.0, yaw_std_deg=25.0))
+    unsure = localizer.locate(View(grey, CAMERA, telemetry(75.0, yaw_std_deg=25.0)))
     assert error_m(localizer, unsure, (60.0, -30.0)) < 0.15
     assert abs(turned_deg(unsure.heading_deg, 40.0)) < 0.1
-    sure = localizer.locate(grey, CAMERA, telemetry(75.0, yaw_std_deg=1.0))
+    sure = localizer.locate(View(grey, CAMERA, telemetry(75.0, yaw_std_deg=1.0)))
     assert not isinstance(sure, Fix) or sure.confidence < 0.5
 
 
 def test_a_height_told_wrong_is_made_up_for(localizer):
     grey = rendered(GROUND, (60.0, -30.0), (40.0, 0.0, 0.0))
     told = telemetry(40.0, agl_m=AGL_M / 0.82, agl_std_m=20.0)
-    fix = localizer.locate(grey, CAMERA, told)
+    fix = localizer.locate(View(grey, CAMERA, told))
     assert error_m(localizer, fix, (60.0, -30.0)) < 0.15
     assert fix.agl_m == pytest.approx(AGL_M, rel=0.002)
 
@@ -237,7 +237,7 @@ def test_a_height_told_wrong_is_made_up_for(localizer):
 def test_a_prior_near_the_truth_changes_nothing(localizer, plain, std_m):
     grey, told, place, free = plain
     prior = prior_at(localizer, place + np.array([0.6, -0.6]) * std_m, std_m)
-    fix = localizer.locate(grey, CAMERA, told, prior=prior)
+    fix = localizer.locate(View(grey, CAMERA, told), prior=prior)
     assert place_of(localizer, fix) == pytest.approx(place_of(localizer, free), abs=0.1)
     assert fix.evidence["strength"] == pytest.approx(free.evidence["strength"], rel=0.02)
 
@@ -255,21 +255,21 @@ def test_a_map_too_large_to_be_searched_whole_needs_a_prior(localizer, plain, mo
         "whole_window",
         lambda *window: asked.append(window[0]) or whole(*window),
     )
-    alone = localizer.locate(grey, CAMERA, told)
+    alone = localizer.locate(View(grey, CAMERA, told))
     assert not [level for level in asked if (rows >> level) * (cols >> level) > 40_000]
     assert isinstance(alone, Fix) or (alone.reason == "no_match" and "prior" in alone.detail)
-    fix = localizer.locate(grey, CAMERA, told, prior=prior_at(localizer, place, 5.0))
+    fix = localizer.locate(View(grey, CAMERA, told), prior=prior_at(localizer, place, 5.0))
     assert place_of(localizer, fix) == pytest.approx(place_of(localizer, free), abs=0.1)
     monkeypatch.setattr(localizer.registration, "propose", None)
     monkeypatch.setattr(module, "MAX_SEARCH_PX", 100)
-    nothing = localizer.locate(grey, CAMERA, told)
+    nothing = localizer.locate(View(grey, CAMERA, told))
     assert nothing.reason == "no_match" and "prior" in nothing.detail
 
 
 def test_a_prior_keeps_the_fix_near_it(localizer, plain):
     grey, told, place, free = plain
     wrong = place + np.array([-180.0, 120.0])
-    fix = localizer.locate(grey, CAMERA, told, prior=prior_at(localizer, wrong, 20.0))
+    fix = localizer.locate(View(grey, CAMERA, told), prior=prior_at(localizer, wrong, 20.0))
     if isinstance(fix, Fix):
         assert np.abs(place_of(localizer, fix) - wrong).max() < 3 * 20.0 + 25.0
         assert fix.confidence < 0.5 < free.confidence
@@ -281,9 +281,7 @@ def test_the_prior_is_of_the_aircraft_not_of_what_it_sees(localizer):
     told = telemetry(45.0, 30.0, yaw_std_deg=1.0)
     for heading_known in (True, False):
         fix = localizer.locate(
-            grey,
-            CAMERA,
-            told,
+            View(grey, CAMERA, told),
             prior=prior_at(localizer, place, 2.0),
             heading_known=heading_known,
         )
@@ -293,7 +291,7 @@ def test_the_prior_is_of_the_aircraft_not_of_what_it_sees(localizer):
 @pytest.mark.parametrize("away_en_m", [(50_000.0, 0.0), (0.0, -3000.0), (-900.0, 900.0)])
 def test_a_prior_outside_is_outside_the_map(localizer, plain, away_en_m):
     outcome = localizer.locate(
-        plain[0], CAMERA, plain[1], prior=prior_at(localizer, away_en_m, 100.0)
+        View(plain[0], CAMERA, plain[1]), prior=prior_at(localizer, away_en_m, 100.0)
     )
     assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
 
@@ -302,7 +300,7 @@ def test_a_prior_outside_is_outside_the_map(localizer, plain, away_en_m):
     "prior", [Prior(math.nan, 3.0, 50.0), Prior(46.0, math.nan, 50.0), Prior(46.5, 3.0, math.nan)]
 )
 def test_a_prior_that_is_not_known_is_no_crash(localizer, plain, prior):
-    outcome = localizer.locate(plain[0], CAMERA, plain[1], prior=prior)
+    outcome = localizer.locate(View(plain[0], CAMERA, plain[1]), prior=prior)
     assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
 
 
@@ -346,7 +344,7 @@ STRANGERS = {
 )
 def test_a_view_of_elsewhere_is_not_believed(localizer, name, heading_known):
     told = telemetry(33.0)
-    outcome = localizer.locate(STRANGERS[name](), CAMERA, told, heading_known=heading_known)
+    outcome = localizer.locate(View(STRANGERS[name](), CAMERA, told), heading_known=heading_known)
     assert isinstance(outcome, NoFix) or outcome.confidence < 0.5
 
 
@@ -354,7 +352,7 @@ def test_a_narrow_prior_does_not_make_sure(localizer):
     """With hardly any place to choose from, a wrong one does not look right."""
     for place in ((40.0, -25.0), (-100.0, 60.0)):
         prior = prior_at(localizer, np.array(place), 3.0)
-        outcome = localizer.locate(mirrored(place), CAMERA, telemetry(33.0), prior=prior)
+        outcome = localizer.locate(View(mirrored(place), CAMERA, telemetry(33.0)), prior=prior)
         assert isinstance(outcome, NoFix) or outcome.confidence < 0.7
 
 
@@ -372,8 +370,8 @@ def same(one, other):
 def test_the_same_view_gives_the_same_fix(localizer, map_path, plain):
     grey, told, _, fix = plain
     kept = grey.copy()
-    assert same(localizer.locate(grey, CAMERA, told), fix)
-    assert same(Localizer(open_map(map_path)).locate(grey, CAMERA, told), fix)
+    assert same(localizer.locate(View(grey, CAMERA, told)), fix)
+    assert same(Localizer(open_map(map_path)).locate(View(grey, CAMERA, told)), fix)
     np.testing.assert_array_equal(grey, kept)
 
 
@@ -382,10 +380,10 @@ def test_threads_may_share_a_localizer(localizer, map_path):
         (rendered(GROUND, place, (yaw, 4.0, 0.0)), telemetry(yaw + 2, 4.0))
         for place, yaw in zip(PLACES[:4], HEADINGS[:4], strict=True)
     ]
-    alone = [localizer.locate(grey, CAMERA, told) for grey, told in views]
+    alone = [localizer.locate(View(grey, CAMERA, told)) for grey, told in views]
     cold = Localizer(open_map(map_path))
     with ThreadPoolExecutor(2) as pool:
-        shared = list(pool.map(lambda view: cold.locate(view[0], CAMERA, view[1]), views))
+        shared = list(pool.map(lambda view: cold.locate(View(view[0], CAMERA, view[1])), views))
     assert all(same(one, other) for one, other in zip(alone, shared, strict=True))
 
 
@@ -394,7 +392,7 @@ REFUSED = {
     "no pitch": ({"pitch_deg": math.nan}, "missing_telemetry"),
     "no height": ({"agl_m": math.nan}, "missing_telemetry"),
     "below ground": ({"agl_m": -3.0}, "bad_height"),
-    "leaning": ({"roll_deg": 60.0}, "extreme_tilt"),
+    "tilted": ({"roll_deg": 60.0}, "extreme_tilt"),
     "far up": ({"agl_m": 1e6}, "too_coarse"),
     "on the ground": ({"agl_m": 5.0}, "too_small"),
     "tiny height": ({"agl_m": 1e-300}, "too_small"),
@@ -403,7 +401,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("changes, reason", REFUSED.values(), ids=REFUSED.keys())
 def test_telemetry_that_makes_no_fix(localizer, plain, changes, reason):
-    outcome = localizer.locate(plain[0], CAMERA, replace(plain[1], **changes))
+    outcome = localizer.locate(View(plain[0], CAMERA, replace(plain[1], **changes)))
     assert isinstance(outcome, NoFix) and outcome.reason == reason
     assert outcome.detail and "\n" not in outcome.detail
 
@@ -421,7 +419,7 @@ def test_telemetry_that_makes_no_fix(localizer, plain, changes, reason):
 def test_pictures_that_make_no_fix(localizer, grey, reason):
     height, width = grey.shape
     camera = Camera(width, height, 250.0, 250.0, width / 2, height / 2)
-    outcome = localizer.locate(grey, camera, telemetry())
+    outcome = localizer.locate(View(grey, camera, telemetry()))
     assert isinstance(outcome, NoFix) and outcome.reason == reason
 
 
@@ -439,7 +437,7 @@ ODD = {
 @pytest.mark.parametrize("changes", ODD.values(), ids=ODD.keys())
 def test_odd_telemetry_is_no_crash(localizer, plain, changes):
     grey, told, place, _ = plain
-    fix = localizer.locate(grey, CAMERA, replace(told, **changes))
+    fix = localizer.locate(View(grey, CAMERA, replace(told, **changes)))
     assert error_m(localizer, fix, place) < 0.5 and 0 <= fix.heading_deg < 360
 
 
@@ -453,7 +451,7 @@ def test_without_registration_it_is_placed_by_its_tiles(localizer, map_path, pla
     grey, told, place, fix = plain
     coarse = Localizer(open_map(map_path), registration=False)
     assert coarse.registration is None
-    tiled = coarse.locate(grey, CAMERA, told)
+    tiled = coarse.locate(View(grey, CAMERA, told))
     assert error_m(coarse, tiled, place) < coarse.grid.stride_m
     assert "lowe_ratio" in tiled.evidence and "strength" not in tiled.evidence
     assert tiled.radius_m == coarse.radius_m and tiled.agl_m == told.agl_m
@@ -470,7 +468,7 @@ def test_a_map_without_the_layer_is_flown_by_its_tiles(ortho, tmp_path, plain):
     assert GreyLayer.of(opened) is None and opened.manifest.registration is None
     made = Localizer(opened)
     assert made.registration is None
-    fix = made.locate(plain[0], CAMERA, plain[1])
+    fix = made.locate(View(plain[0], CAMERA, plain[1]))
     assert error_m(made, fix, plain[2]) < made.grid.stride_m
 
 
@@ -489,7 +487,7 @@ def damaged(map_path, folder):
 
 def test_a_damaged_layer_is_no_fix(map_path, tmp_path, plain, caplog):
     broken = Localizer(damaged(map_path, tmp_path))
-    outcome, latency_ms = locate_view(SingleViews(broken), plain[0], CAMERA, plain[1])
+    outcome, latency_ms = locate_view(SingleViews(broken), View(plain[0], CAMERA, plain[1]))
     assert isinstance(outcome, NoFix) and outcome.reason == "internal_error"
     assert "damaged" in outcome.detail and latency_ms > 0
     assert any(record.exc_info for record in caplog.records)
@@ -500,5 +498,5 @@ def test_noise_and_light_move_it_little(localizer):
     for place, yaw_deg in zip(PLACES[:4], HEADINGS[:4], strict=True):
         clean = rendered(GROUND, place, (yaw_deg, 0.0, 0.0)).astype(float)
         light = np.linspace(0.6, 1.1, 320)[None] * clean + rng.normal(0, 10, clean.shape)
-        fix = localizer.locate(as_grey(light), CAMERA, telemetry(yaw_deg + 3))
+        fix = localizer.locate(View(as_grey(light), CAMERA, telemetry(yaw_deg + 3)))
         assert error_m(localizer, fix, place) < 0.3 and fix.confidence > 0.9

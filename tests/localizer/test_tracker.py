@@ -15,8 +15,8 @@ from orthonav.localizer.levelled import levelled
 from orthonav.localizer.odometry import Footprint, moved_between
 from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import open_map
-from orthonav.onboard.run import in_hindsight, localize_flight
-from orthonav.records import Fix, NoFix, Prior, Telemetry
+from orthonav.onboard.run import localize_flight, smoothed_track
+from orthonav.records import Fix, NoFix, Prior, Telemetry, View
 
 WIDE = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
 SPEED_MPS = 14.0
@@ -68,7 +68,7 @@ def views(
     *,
     where=None,
     heading_off=0.0,
-    lean=(0.0, 0.0),
+    tilt=(0.0, 0.0),
     scale=1.0,
     seed=0,
     year=changed,
@@ -78,11 +78,11 @@ def views(
     """Grey views, what is told of them, and where they were taken."""
     rng = np.random.default_rng(seed)
     for number, (place, heading) in enumerate(where or legs(count, **legs_)):
-        grey = rendered(GROUND, place, (heading, *lean), AGL_M * scale, WIDE)
-        told = Telemetry(
+        grey = rendered(GROUND, place, (heading, *tilt), AGL_M * scale, WIDE)
+        telemetry = Telemetry(
             every_s * number * 10**9, heading - heading_off + rng.normal(0, 1.0), 0.0, 0.0, AGL_M
         )
-        yield year(grey, rng), told, place
+        yield year(grey, rng), telemetry, place
 
 
 def place_of(localizer, fix):
@@ -92,8 +92,8 @@ def place_of(localizer, fix):
 def followed(tracker, localizer, seen):
     """Errors in m, confidences, states and fixes of a flight."""
     rows = []
-    for grey, told, place in seen:
-        found = tracker.locate(grey, WIDE, told)
+    for grey, telemetry, place in seen:
+        found = tracker.locate(View(grey, WIDE, telemetry))
         error = np.inf
         if isinstance(found, Fix):
             error = float(np.hypot(*(place_of(localizer, found) - place)))
@@ -116,7 +116,7 @@ def test_wrong_heading_height_and_mount_are_learnt(localizer):
     tracker = Tracker(localizer)
     seen = list(
         views(
-            0, where=spots(24), year=lit, every_s=60, heading_off=6.0, lean=(5.0, -2.0), scale=1.05
+            0, where=spots(24), year=lit, every_s=60, heading_off=6.0, tilt=(5.0, -2.0), scale=1.05
         )
     )
     rows = followed(tracker, localizer, seen)
@@ -125,7 +125,7 @@ def test_wrong_heading_height_and_mount_are_learnt(localizer):
     assert evidence["log_scale_bias"] == pytest.approx(math.log(1.05), abs=0.02)
     assert evidence["pitch_bias_deg"] == pytest.approx(5.0, abs=1.5)
     assert evidence["roll_bias_deg"] == pytest.approx(-2.0, abs=1.5)
-    alone = [localizer.locate(grey, WIDE, told) for grey, told, _ in seen[12:]]
+    alone = [localizer.locate(View(grey, WIDE, telemetry)) for grey, telemetry, _ in seen[12:]]
     single = [
         np.hypot(*(place_of(localizer, a) - s[2])) for a, s in zip(alone, seen[12:], strict=True)
     ]
@@ -134,17 +134,17 @@ def test_wrong_heading_height_and_mount_are_learnt(localizer):
 
 
 def test_hindsight_calibrates_the_beginning_too(localizer):
-    tracker = Tracker(localizer, hindsight=True)
-    seen = list(views(24, lean=(5.0, 0.0)))
+    tracker = Tracker(localizer, smooth=True)
+    seen = list(views(24, tilt=(5.0, 0.0)))
     rows = followed(tracker, localizer, seen)
     after = [
         np.hypot(*(place_of(localizer, fix) - place))
-        for fix, (_, _, place) in zip(tracker.in_hindsight(), seen, strict=True)
+        for fix, (_, _, place) in zip(tracker.smoothed_track(), seen, strict=True)
     ]
     assert max(after) < 15 and len(rows) == len(after)
     assert np.mean(after[:4]) < 6  # 5 deg of pitch are 13 m from 150 m
     with pytest.raises(ValueError, match="no history"):
-        Tracker(localizer).in_hindsight()
+        Tracker(localizer).smoothed_track()
 
 
 @pytest.mark.parametrize("std_m, whole", [(20.0, False), (40.0, False), (400.0, True)])
@@ -160,8 +160,8 @@ def test_a_told_start_is_searched_around_however_wide(localizer, monkeypatch, st
     lat, lon = localizer.sheet.frame.latlon_from_en(np.array([-150.0, -120.0]))
     prior = Prior(float(lat), float(lon), std_m)
     rows = []
-    for grey, told, place in views(5):
-        found = tracker.locate(grey, WIDE, replace(told, prior=prior))
+    for grey, telemetry, place in views(5):
+        found = tracker.locate(View(grey, WIDE, replace(telemetry, prior=prior)))
         rows.append(np.hypot(*(place_of(localizer, found) - place)))
     assert (priors[0] is None) == whole and max(rows) < 15
     speed = found.evidence["vel_std_mps"]
@@ -192,13 +192,13 @@ def test_without_anything_to_see_it_is_lost_and_found_again(localizer):
     followed(tracker, localizer, views(12))
     white, spread = np.full((240, 320), 255, np.uint8), []
     for number in range(12, 60):
-        found = tracker.locate(white, WIDE, Telemetry(number * 10**9, 60.0, 0, 0, AGL_M))
+        found = tracker.locate(View(white, WIDE, Telemetry(number * 10**9, 60.0, 0, 0, AGL_M)))
         spread.append(float(np.trace(found.cov_en_m2)))
     assert tracker.state_name == "lost" and found.confidence < 0.3
     assert spread[-1] > 50 * spread[0]
     later = (
-        (grey, replace(told, time_ns=told.time_ns + 60 * 10**9), place)
-        for grey, told, place in views(12, start=(60.0, 0.0), turn_at=3)
+        (grey, replace(telemetry, time_ns=telemetry.time_ns + 60 * 10**9), place)
+        for grey, telemetry, place in views(12, start=(60.0, 0.0), turn_at=3)
     )
     rows = followed(tracker, localizer, later)
     assert rows[-1][2] == "tracking" and rows[-1][0] < 8
@@ -207,14 +207,16 @@ def test_without_anything_to_see_it_is_lost_and_found_again(localizer):
 def test_views_that_show_nothing_are_flown_through(localizer):
     tracker = Tracker(localizer)
     rows = []
-    for number, (grey, told, place) in enumerate(views(20)):
+    for number, (grey, telemetry, place) in enumerate(views(20)):
         if number in (8, 9, 10):
             grey = np.full_like(grey, 255)
         if number == 12:
-            told = replace(told, agl_m=math.nan)
+            telemetry = replace(telemetry, agl_m=math.nan)
         if number == 14:
-            told = replace(told, time_ns=told.time_ns - 3 * 10**9)  # a clock that jumps
-        rows += followed(tracker, localizer, [(grey, told, place)])
+            telemetry = replace(
+                telemetry, time_ns=telemetry.time_ns - 3 * 10**9
+            )  # a clock that jumps
+        rows += followed(tracker, localizer, [(grey, telemetry, place)])
     errors = [row[0] for row in rows]
     assert max(errors[5:8]) < 6 and max(errors[8:11]) < 30 and max(errors[15:]) < 8
     variance = [float(np.trace(row[3].cov_en_m2)) for row in rows]
@@ -223,9 +225,10 @@ def test_views_that_show_nothing_are_flown_through(localizer):
 
 def test_a_told_start_needs_no_search(localizer):
     lat, lon = localizer.sheet.frame.latlon_from_en((-160.0, -120.0))
-    told = Prior(float(lat), float(lon), 15.0)
+    telemetry = Prior(float(lat), float(lon), 15.0)
     seen = [
-        (g, replace(t, prior=told if not n else None), p) for n, (g, t, p) in enumerate(views(4))
+        (g, replace(t, prior=telemetry if not n else None), p)
+        for n, (g, t, p) in enumerate(views(4))
     ]
     rows = followed(Tracker(localizer), localizer, seen)
     assert rows[0][0] < 15 and rows[0][1] == pytest.approx(0.8)
@@ -242,9 +245,9 @@ def test_unknown_heading_is_tracked(localizer):
 
 
 def test_a_wrong_camera_is_refused(localizer):
-    grey, told, _ = next(iter(views(1)))
+    grey, telemetry, _ = next(iter(views(1)))
     with pytest.raises(CameraError, match="320 x 240"):
-        Tracker(localizer).locate(grey, replace(WIDE, width_px=640), told)
+        Tracker(localizer).locate(View(grey, replace(WIDE, width_px=640), telemetry))
 
 
 def test_a_map_without_a_layer_is_refused(map_path):
@@ -259,10 +262,10 @@ class Recorded:
     camera, note, expected = WIDE, "", 0
 
     def __init__(self, seen, broken=()):
-        self.views = [View(n, g, t, n in broken) for n, (g, t, _) in enumerate(seen)]
+        self.views = [MemoryView(n, g, t, n in broken) for n, (g, t, _) in enumerate(seen)]
 
 
-class View:
+class MemoryView:
     def __init__(self, number, grey, telemetry, broken):
         self.frame, self.where, self.telemetry = f"{number}.png", "memory", telemetry
         self._grey, self._broken = grey, broken
@@ -277,7 +280,7 @@ class View:
 
 def test_every_view_has_a_result_and_a_state(localizer, monkeypatch):
     seen = list(views(9))
-    tracker = Tracker(localizer, hindsight=True)
+    tracker = Tracker(localizer, smooth=True)
     whole = tracker._observe
 
     def sometimes(*arguments):
@@ -291,66 +294,66 @@ def test_every_view_has_a_result_and_a_state(localizer, monkeypatch):
     assert [result.frame for result in results] == [f"{n}.png" for n in range(9)]
     assert results[-1].state == "tracking" and isinstance(results[3].outcome, Fix)
     assert isinstance(results[5].outcome, Fix)
-    again = in_hindsight(tracker, results, None)
+    again = smoothed_track(tracker, results, None)
     assert len(again) == 9 and all(isinstance(each.outcome, Fix | NoFix) for each in again)
 
 
-def levelled_twice(localizer, grey, told):
-    """A view placed with its lean, and again from the lean that was found."""
+def levelled_twice(localizer, grey, telemetry):
+    """A view placed with its tilt, and again from the tilt that was found."""
     registration = localizer.registration
     for _ in range(2):
-        view = registration.prepared(grey, WIDE, told, heading_known=True)
+        view = registration.prepared(View(grey, WIDE, telemetry), heading_known=True)
         placed = registration.best(view, None).placed
-        found = levelled(registration, grey, WIDE, told, view, placed)
+        found = levelled(registration, View(grey, WIDE, telemetry), view, placed)
         pitch, roll = np.degrees(found.mean[4:])
-        told = replace(told, pitch_deg=pitch, roll_deg=roll)
+        telemetry = replace(telemetry, pitch_deg=pitch, roll_deg=roll)
     return found
 
 
-@pytest.mark.parametrize("lean_deg", [(0.0, 0.0), (7.0, 0.0), (-5.0, 4.0), (2.0, -6.0)])
-def test_lean_is_seen_in_the_perspective(localizer, lean_deg):
+@pytest.mark.parametrize("tilt_deg", [(0.0, 0.0), (7.0, 0.0), (-5.0, 4.0), (2.0, -6.0)])
+def test_tilt_is_seen_in_the_perspective(localizer, tilt_deg):
     places = np.random.default_rng(5).uniform(-100, 100, (8, 2))
     means, offs = [], []
     for seed, place in enumerate(places):
         rng = np.random.default_rng(seed)
-        grey = changed(rendered(GROUND, place, (25.0, *lean_deg), AGL_M, WIDE), rng)
+        grey = changed(rendered(GROUND, place, (25.0, *tilt_deg), AGL_M, WIDE), rng)
         found = levelled_twice(localizer, grey, Telemetry(0, 25.0, 0.0, 0.0, AGL_M))
-        truth = np.array([*place, math.radians(25.0), 0.0, *np.radians(lean_deg)])
+        truth = np.array([*place, math.radians(25.0), 0.0, *np.radians(tilt_deg)])
         means.append(np.degrees(found.mean[4:]))
         offs.append((found.mean - truth) / np.sqrt(np.diag(found.covariance)))
-    assert np.mean(means, axis=0) == pytest.approx(lean_deg, abs=1.0)
+    assert np.mean(means, axis=0) == pytest.approx(tilt_deg, abs=1.0)
     assert (np.abs(offs) < 3.5).all() and np.sqrt(np.mean(np.square(offs), axis=0)).max() < 1.5
 
 
-def test_a_narrow_view_knows_less_of_its_lean(localizer):
+def test_a_narrow_view_knows_less_of_its_tilt(localizer):
     std_deg, rng = [], np.random.default_rng(11)
     for focal_px, agl_m in ((200.0, 150.0), (2000.0, 1500.0)):
         camera = Camera(320, 240, focal_px, focal_px, 160.0, 120.0)
         grey = changed(rendered(GROUND, (20.0, -35.0), (25.0, 0.0, 0.0), agl_m, camera), rng)
-        told = Telemetry(0, 25.0, 0.0, 0.0, agl_m)
+        telemetry = Telemetry(0, 25.0, 0.0, 0.0, agl_m)
         registration = localizer.registration
-        view = registration.prepared(grey, camera, told, heading_known=True)
+        view = registration.prepared(View(grey, camera, telemetry), heading_known=True)
         placed = registration.best(view, None).placed
-        found = levelled(registration, grey, camera, told, view, placed)
+        found = levelled(registration, View(grey, camera, telemetry), view, placed)
         std = np.sqrt(np.diag(found.covariance))
         std_deg.append(np.degrees(std[4:]))
-        # What the lean is not known to, the position is not either.
+        # What the tilt is not known to, the position is not either.
         assert std[:2].max() > 0.7 * agl_m * std[4:].max()
     assert (std_deg[1] > 3 * std_deg[0]).all() and std_deg[1].max() < 21
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 130.0])
-def test_position_hangs_on_a_lean_that_was_not_looked_at(localizer, heading_deg):
-    """Told a lean that is off, the view lies elsewhere by just what the covariance says."""
+def test_position_hangs_on_a_tilt_that_was_not_looked_at(localizer, heading_deg):
+    """Told a tilt that is off, the view lies elsewhere by just what the covariance says."""
     registration, place = localizer.registration, np.array([20.0, -35.0])
     grey = rendered(GROUND, place, (heading_deg, 0.0, 0.0), AGL_M, WIDE)
-    told, found = Telemetry(0, heading_deg, 0.0, 0.0, AGL_M), []
+    telemetry, found = Telemetry(0, heading_deg, 0.0, 0.0, AGL_M), []
     for pitch_deg, roll_deg in ((0.0, 0.0), (2.0, 0.0), (0.0, 2.0)):
-        leaning = replace(told, pitch_deg=pitch_deg, roll_deg=roll_deg)
-        view = registration.prepared(grey, WIDE, leaning, heading_known=True)
+        tilted = replace(telemetry, pitch_deg=pitch_deg, roll_deg=roll_deg)
+        view = registration.prepared(View(grey, WIDE, tilted), heading_known=True)
         placed = registration.best(view, None).placed
         worth = np.zeros(2)
-        found.append(levelled(registration, grey, WIDE, leaning, view, placed, worth))
+        found.append(levelled(registration, View(grey, WIDE, tilted), view, placed, worth))
     level = found[0]
     assert np.degrees(np.sqrt(np.diag(level.covariance)[4:])) == pytest.approx(20.0)
     assert np.hypot(*(level.mean[:2] - place)) < 2
@@ -363,9 +366,9 @@ def test_position_hangs_on_a_lean_that_was_not_looked_at(localizer, heading_deg)
 
 def test_the_pose_of_a_camera_is_the_inverse(localizer):
     registration = localizer.registration
-    told = Telemetry(0, 33.0, 4.0, -7.0, AGL_M)
+    telemetry = Telemetry(0, 33.0, 4.0, -7.0, AGL_M)
     grey = rendered(GROUND, (20.0, -35.0), (33.0, 4.0, -7.0), AGL_M, WIDE)
-    view = registration.prepared(grey, WIDE, told, heading_known=True)
+    view = registration.prepared(View(grey, WIDE, telemetry), heading_known=True)
     pose = registration.best(view, None).placed.pose
     place = registration.camera_en_m(view, pose)
     again = registration.pose_of(view, np.array([*place, pose.turn_rad, pose.log_scale]))
@@ -381,27 +384,27 @@ def test_odometry_measures_the_way(moved, expected):
     for number, (place, heading) in enumerate((((0.0, 0.0), 40.0), (moved, 43.0))):
         grey = rendered(GROUND, place, (heading, 0, 0), AGL_M, WIDE)
         noisy = np.clip(grey + rng.normal(0, 5, grey.shape), 0, 255).astype(np.uint8)
-        told = Telemetry(number * 10**9, heading, 0.0, 0.0, AGL_M)
+        telemetry = Telemetry(number * 10**9, heading, 0.0, 0.0, AGL_M)
         pixel_m = footprints[0].pixel_m if footprints else None
-        footprints.append(Footprint.of(noisy, WIDE, told, pixel_m))
-    told_noise = np.array([1e-3, 4e-4])
+        footprints.append(Footprint.of(View(noisy, WIDE, telemetry), pixel_m))
+    telemetry_noise = np.array([1e-3, 4e-4])
     expected = None if expected is None else np.array(expected)
-    seen = moved_between(*footprints, 0.0, told_noise, expected)
+    seen = moved_between(*footprints, 0.0, telemetry_noise, expected)
     assert seen.way.moved_en_m == pytest.approx(moved, abs=0.7)
     assert 0 < seen.overlap < 1
 
 
 def test_odometry_sees_two_views_by_the_same_knowledge():
-    """A lean that was learnt between two views, and the noise of the last heading, are no way."""
-    moved, lean = (18.0, -12.0), np.radians([5.0, -4.0])
-    told = [Telemetry(n * 10**9, yaw, 0.0, 0.0, AGL_M) for n, yaw in enumerate((350.0, 147.0))]
+    """A tilt that was learnt between two views, and the noise of the last heading, are no way."""
+    moved, tilt = (18.0, -12.0), np.radians([5.0, -4.0])
+    telemetry = [Telemetry(n * 10**9, yaw, 0.0, 0.0, AGL_M) for n, yaw in enumerate((350.0, 147.0))]
     first, second = (
-        rendered(GROUND, place, (heading, *np.degrees(lean)), AGL_M, WIDE)
+        rendered(GROUND, place, (heading, *np.degrees(tilt)), AGL_M, WIDE)
         for place, heading in (((0.0, 0.0), 0.0), (moved, 150.0))
     )
-    known = np.array([math.radians(11.0), 0.0, *lean])
-    before = Footprint.of(first, WIDE, told[0], None)
-    now = Footprint.of(second, WIDE, told[1], before.pixel_m, known)
+    known = np.array([math.radians(11.0), 0.0, *tilt])
+    before = Footprint.of(View(first, WIDE, telemetry[0]), None)
+    now = Footprint.of(View(second, WIDE, telemetry[1]), before.pixel_m, known)
     noise = np.array([math.radians(5.0) ** 2, 1e-4])
     seen = moved_between(before.by(known), now, 0.0, noise)
     turn = math.radians(10.0)  # what is wrong with the first heading bends the way
@@ -413,25 +416,27 @@ def test_odometry_sees_two_views_by_the_same_knowledge():
 
 
 def test_odometry_refuses_views_without_common_ground():
-    told = Telemetry(0, 0.0, 0.0, 0.0, AGL_M)
-    first = Footprint.of(rendered(GROUND, (0, 0), (0, 0, 0), AGL_M, WIDE), WIDE, told, None)
-    later = replace(told, time_ns=2 * 10**9)
+    telemetry = Telemetry(0, 0.0, 0.0, 0.0, AGL_M)
+    first = Footprint.of(
+        View(rendered(GROUND, (0, 0), (0, 0, 0), AGL_M, WIDE), WIDE, telemetry), None
+    )
+    later = replace(telemetry, time_ns=2 * 10**9)
     other = rendered(OTHER, (0, 0), (0, 0, 0), AGL_M, WIDE)
-    second = Footprint.of(other, WIDE, later, first.pixel_m)
+    second = Footprint.of(View(other, WIDE, later), first.pixel_m)
     assert moved_between(first, second, 0.01, np.array([1e-3, 4e-4])) is None
-    nan = Footprint.of(other, WIDE, replace(later, yaw_deg=math.nan), first.pixel_m)
+    nan = Footprint.of(View(other, WIDE, replace(later, yaw_deg=math.nan)), first.pixel_m)
     assert moved_between(first, nan, 0.01, np.array([1e-3, 4e-4])) is None
-    blank = Footprint.of(np.full((240, 320), 90, np.uint8), WIDE, later, first.pixel_m)
+    blank = Footprint.of(View(np.full((240, 320), 90, np.uint8), WIDE, later), first.pixel_m)
     assert blank is None or moved_between(first, blank, 0.01, np.array([1e-3, 4e-4])) is None
 
 
 def test_a_fixed_lag_uses_the_views_after_each(localizer):
     seen = list(views(16))
-    whole = Tracker(localizer, hindsight=True)
-    lagged = Tracker(localizer, hindsight=True, lag=3)
+    whole = Tracker(localizer, smooth=True)
+    lagged = Tracker(localizer, smooth=True, lag=3)
     for tracker in (whole, lagged):
         followed(tracker, localizer, seen)
-    found, all_of_them = lagged.in_hindsight(), whole.in_hindsight()
+    found, all_of_them = lagged.smoothed_track(), whole.smoothed_track()
     assert len(found) == len(all_of_them) == 16
     off = [
         np.hypot(*(place_of(localizer, a) - place_of(localizer, b)))
@@ -440,9 +445,9 @@ def test_a_fixed_lag_uses_the_views_after_each(localizer):
     assert max(off[-4:]) == 0 and max(off[4:]) < 5
     errors = [np.hypot(*(place_of(localizer, a) - s[2])) for a, s in zip(found, seen, strict=True)]
     assert max(errors) < 8
-    at_once = Tracker(localizer, hindsight=True, lag=0)
+    at_once = Tracker(localizer, smooth=True, lag=0)
     rows = followed(at_once, localizer, seen[:6])
-    for now, then in zip(rows, at_once.in_hindsight(), strict=True):
+    for now, then in zip(rows, at_once.smoothed_track(), strict=True):
         assert place_of(localizer, now[3]) == pytest.approx(place_of(localizer, then), abs=3.0)
 
 
@@ -451,9 +456,9 @@ def test_gnss_of_a_first_leg_teaches_the_mount(localizer):
     frame = localizer.sheet.frame
     tracker = Tracker(localizer, every_prior=True)
     seen = []
-    for grey, told, place in views(10, lean=(5.0, 0.0), year=lit):
+    for grey, telemetry, place in views(10, tilt=(5.0, 0.0), year=lit):
         lat, lon = frame.latlon_from_en(place)
-        seen.append((grey, replace(told, prior=Prior(float(lat), float(lon), 2.0)), place))
+        seen.append((grey, replace(telemetry, prior=Prior(float(lat), float(lon), 2.0)), place))
     rows = followed(tracker, localizer, seen)
     evidence = rows[-1][3].evidence
     assert evidence["pitch_bias_deg"] == pytest.approx(5.0, abs=1.2)
@@ -462,10 +467,10 @@ def test_gnss_of_a_first_leg_teaches_the_mount(localizer):
 
 def test_the_radius_grows_with_the_height(localizer):
     high = Camera(320, 240, 200 * 2000 / AGL_M, 200 * 2000 / AGL_M, 160.0, 120.0)
-    grey, told, _ = next(iter(views(1)))
-    found = Tracker(localizer).locate(grey, high, replace(told, agl_m=2000.0))
+    grey, telemetry, _ = next(iter(views(1)))
+    found = Tracker(localizer).locate(View(grey, high, replace(telemetry, agl_m=2000.0)))
     assert found.radius_m == pytest.approx(50.0, rel=0.1)
-    low = Tracker(localizer).locate(grey, WIDE, told)
+    low = Tracker(localizer).locate(View(grey, WIDE, telemetry))
     assert low.radius_m == localizer.registration.radius_m
 
 

@@ -134,7 +134,7 @@ def test_a_learning_killed_within_an_epoch_does_not_begin_it_again(
     recipe, at, tmp_path, monkeypatch
 ):
     whole = learn(recipe, tmp_path / "whole")
-    monkeypatch.setattr(training, "TOLD_EVERY_S", 0)
+    monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
     with pytest.raises(Killed):
         learn(recipe, tmp_path / "killed", report=kill_at(at))
     told = []
@@ -172,7 +172,7 @@ def test_a_kill_in_the_middle_of_writing_leaves_the_checkpoint_before(tmp_path, 
     command = [sys.executable, "-c", KILLED, str(Path(__file__).parent), str(tmp_path)]
     assert subprocess.run(command, timeout=60).returncode == -signal.SIGKILL
     assert len(list(tmp_path.glob(".checkpoint*"))) == 1
-    monkeypatch.setattr(training, "TOLD_EVERY_S", 0)
+    monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
     told = []
     learn(AUTO, tmp_path, report=lambda text, share: told.append(text))
     assert told[0].startswith("epoch 2 of 3, batch 2 of 4")  # five were written
@@ -183,7 +183,7 @@ def test_a_kill_in_the_middle_of_writing_leaves_the_checkpoint_before(tmp_path, 
 
 
 def test_long_epochs_tell_how_far_they_are(monkeypatch):
-    monkeypatch.setattr(training, "TOLD_EVERY_S", 0)
+    monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
     told = []
     learn(AUTO, report=lambda text, share: told.append((text, share)))
     assert [text.partition(", loss")[0] for text, _ in told[:5]] == [
@@ -226,7 +226,7 @@ def test_pictures_show_the_progress(tmp_path):
 
 def test_pictures_do_not_wait_for_a_long_first_epoch(tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoints, "SHOWN_AFTER_S", (0.0,))
-    monkeypatch.setattr(training, "TOLD_EVERY_S", 0)
+    monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
     with pytest.raises(Killed):
         learn(AUTO, tmp_path, means=RARELY_SAVED, report=kill_at("epoch 1 of 3, batch 2"))
     assert {path.name for path in tmp_path.iterdir()} == {"history.json", "loss.png", "tiles.png"}

@@ -9,7 +9,7 @@ import pytest
 from orthonav.errors import FlightError
 from orthonav.flight.mount import Bias, Mount
 from orthonav.onboard.calibrate import Mounted, calibrated, model_of
-from orthonav.records import Fix, NoFix, Telemetry, ViewResult
+from orthonav.records import Fix, NoFix, Telemetry, View, ViewResult
 from orthonav.track import Model
 
 TRUE = {"heading_bias": 4.0, "log_scale_bias": -0.1, "pitch_bias": 6.0, "roll_bias": -1.0}
@@ -89,11 +89,11 @@ class Told:
     def __init__(self):
         self.told = []
 
-    def locate(self, grey, camera, telemetry):
-        self.told.append(telemetry)
+    def locate(self, view):
+        self.told.append(view.telemetry)
         return NoFix("test", "nothing was looked at")
 
-    def passed(self, camera, telemetry, reason):
+    def passed(self, telemetry, reason):
         self.told.append(telemetry)
         return reason
 
@@ -106,16 +106,16 @@ MOUNT = Mount(
 def test_a_mounted_locator_is_told_the_truth():
     locator = Told()
     mounted, telemetry = Mounted(locator, MOUNT), Telemetry(0, 10.0, 0.0, 1.0, 100.0)
-    mounted.locate(np.zeros((4, 4), np.uint8), None, telemetry)
+    mounted.locate(View(np.zeros((4, 4), np.uint8), None, telemetry))
     reason = NoFix("bad_image", "it is broken")
-    assert mounted.passed(None, telemetry, reason) is reason
+    assert mounted.passed(telemetry, reason) is reason
     assert [(t.yaw_deg, t.pitch_deg, t.roll_deg) for t in locator.told] == [(14.0, 6.5, 0.0)] * 2
     assert mounted.state_name == "tracking"
 
 
 def test_a_known_mount_is_believed_as_well_as_it_is_known():
     model = model_of(MOUNT)
-    assert model.lean_rad == pytest.approx(math.radians(0.8))
+    assert model.tilt_rad == pytest.approx(math.radians(0.8))
     assert model.heading_rad == pytest.approx(math.radians(1.0))
     assert model.log_scale == 0.02 and model.accel_mps2 == Model().accel_mps2
     assert model.off_mount == 0.0

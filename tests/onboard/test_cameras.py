@@ -5,7 +5,7 @@ import threading
 import cv2
 import numpy as np
 import pytest
-from standin import MS, UTC_NS, S, Time, write_flight
+from fake_autopilot import MS, UTC_NS, S, Time, write_flight
 
 from orthonav.errors import FlightError, MissingFileError
 from orthonav.geo.camera import Camera
@@ -173,10 +173,10 @@ def test_flight_folders_keep_their_times_and_telemetry(tmp_path):
     camera = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
     rows = [Telemetry(n * S + n, 10.0 * n, 1.0, -2.0, 100.0 + n) for n in range(3)]
     write_flight(tmp_path, camera, [(noisy(n), row) for n, row in enumerate(rows)])
-    told = list(recorded_entries(tmp_path, 1.0))
-    assert [each.time_ns for each in told] == [row.time_ns for row in rows]
-    assert [each.telemetry for each in told] == rows
-    np.testing.assert_array_equal(told[2].load(), noisy(2))
+    telemetry = list(recorded_entries(tmp_path, 1.0))
+    assert [each.time_ns for each in telemetry] == [row.time_ns for row in rows]
+    assert [each.telemetry for each in telemetry] == rows
+    np.testing.assert_array_equal(telemetry[2].load(), noisy(2))
 
 
 def test_a_half_written_picture_is_told(tmp_path):
@@ -186,8 +186,8 @@ def test_a_half_written_picture_is_told(tmp_path):
     (tmp_path / "1.jpg").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "note.txt").write_text("no picture")
     time = Time()
-    told = recorded_entries(tmp_path, 4.0)
-    source = Recorded(told, own_pace(time.clocks, 1.0), time.clocks, lambda: False)
+    telemetry = recorded_entries(tmp_path, 4.0)
+    source = Recorded(telemetry, own_pace(time.clocks, 1.0), time.clocks, lambda: False)
     seen = [source.read() for _ in range(4)]
     assert [each and each.frame for each in seen] == ["0.jpg", "1.jpg", "2.jpg", None]
     assert seen[1].grey is None and seen[1].problem.reason == "bad_image"
@@ -213,9 +213,9 @@ def test_a_video_has_times_of_its_own(tmp_path):
     for number in range(4):
         writer.write(np.dstack([np.full((240, 320), 40 * number, np.uint8)] * 3))
     writer.release()
-    told = list(recorded_entries(path, 1.0))
-    assert [each.time_ns for each in told] == [0, S // 10, S // 5, 3 * S // 10]
-    assert [round(float(each.load().mean()) / 40) for each in told] == [0, 1, 2, 3]
+    telemetry = list(recorded_entries(path, 1.0))
+    assert [each.time_ns for each in telemetry] == [0, S // 10, S // 5, 3 * S // 10]
+    assert [round(float(each.load().mean()) / 40) for each in telemetry] == [0, 1, 2, 3]
 
 
 def test_what_is_no_camera_is_refused(tmp_path):

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from blots import AGL_M, GROUND, map_of_blots, ortho_of_blots, rendered
-from standin import (
+from fake_autopilot import (
     MS,
     UTC_NS,
     Autopilot,
@@ -47,7 +47,7 @@ CAMERA = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
 AHEAD_NS = -90 * S
 
 
-class KeptLog:
+class BoundedLog:
     """A log that keeps what it is told; it fails where it should."""
 
     def __init__(self):
@@ -82,7 +82,7 @@ class Flight:
             link=self.link,
             lines=[JsonOut(self.lines)],
         )
-        self.locator, self.newest, self.log = locator or FakeLocator(), Newest(), KeptLog()
+        self.locator, self.newest, self.log = locator or FakeLocator(), Newest(), BoundedLog()
         rest = {name: options.pop(name) for name in ("second_look", "start") if name in options}
         options = FlyOptions(**options)
         self.runner = Runner(
@@ -186,7 +186,7 @@ def test_all_is_well(flight):
 
 
 def test_a_view_becomes_a_message(flight):
-    flight.locator.outcome = lambda grey, camera, told: fix(48.1234567, -4.3210987)
+    flight.locator.outcome = lambda view: fix(48.1234567, -4.3210987)
     result = flight.view(age_s=0.05)
     read = {each["name"]: each for each in flight.port.sent()}
     for name in ("GLOBAL_POSITION_SENSOR", "GPS_INPUT"):
@@ -227,7 +227,7 @@ def test_old_views_are_dropped_and_counted(flight):
 
 
 def test_a_slow_processor_degrades_and_what_is_late_is_not_sent(flight):
-    def slow(grey, camera, told):
+    def slow(view):
         for _ in range(12):
             flight.time.go(0.1)
             flight.talk()
@@ -242,7 +242,7 @@ def test_a_slow_processor_degrades_and_what_is_late_is_not_sent(flight):
 def test_one_failure_is_one_no_fix(flight, caplog):
     whole = flight.locator.outcome
 
-    def failing(grey, camera, told):
+    def failing(view):
         flight.locator.outcome = whole
         raise np.linalg.LinAlgError("singular")
 
@@ -253,7 +253,7 @@ def test_one_failure_is_one_no_fix(flight, caplog):
 
 
 def test_failures_at_every_view_are_a_failure(flight, caplog):
-    def failing(grey, camera, told):
+    def failing(view):
         raise ValueError("odd")
 
     flight.locator.outcome = failing
@@ -298,8 +298,8 @@ def test_pictures_that_show_nothing_bring_nothing(flight, kind):
 def test_a_picture_of_another_shape_fails_and_one_of_another_size_does_not(flight):
     cameras = []
 
-    def outcome(grey, camera, told):
-        cameras.append(camera)
+    def outcome(view):
+        cameras.append(view.camera)
         return fix()
 
     flight.locator.outcome = outcome
@@ -367,11 +367,11 @@ def test_a_computer_clock_that_is_set_does_no_harm(flight, seconds):
 
 
 def test_heading_and_height_far_from_told_degrade(flight):
-    flight.locator.outcome = lambda grey, camera, told: fix(heading_deg=told.yaw_deg + 35)
+    flight.locator.outcome = lambda view: fix(heading_deg=view.telemetry.yaw_deg + 35)
     flight.views(11)
     assert flight.reasons() == {"heading_off"}
-    flight.locator.outcome = lambda grey, camera, told: fix(
-        heading_deg=told.yaw_deg, agl_m=told.agl_m / 2
+    flight.locator.outcome = lambda view: fix(
+        heading_deg=view.telemetry.yaw_deg, agl_m=view.telemetry.agl_m / 2
     )
     flight.views(11)
     assert flight.reasons() == {"height_off"}
@@ -384,10 +384,11 @@ def test_why_nothing_is_found_is_looked_at(begin, yaw_off, share, reason):
     """The track searches in vain; a second look finds the place with another heading or height."""
 
     class Localizer:
-        def locate(self, grey, camera, told, *, heading_known):
+        def locate(self, view, *, heading_known):
+            telemetry = view.telemetry
             right = not heading_known or yaw_off == 0
-            if right and told.agl_m == pytest.approx(100.0 * share, rel=0.01):
-                return fix(heading_deg=told.yaw_deg + yaw_off, agl_m=told.agl_m)
+            if right and telemetry.agl_m == pytest.approx(100.0 * share, rel=0.01):
+                return fix(heading_deg=telemetry.yaw_deg + yaw_off, agl_m=telemetry.agl_m)
             return NoFix("not_sure", "")
 
     locator = FakeLocator(lambda *_: NoFix("searching", ""), "searching")
@@ -491,10 +492,10 @@ def test_the_first_view_is_told_where_to_begin(begin):
 
 def test_recorded_telemetry_needs_no_autopilot(begin):
     flight = begin(recorded=True)
-    told = Telemetry(5, 1.0, 2.0, 3.0, 50.0)
+    telemetry = Telemetry(5, 1.0, 2.0, 3.0, 50.0)
     grey = flight.rng.integers(0, 256, (240, 320), np.uint8)
-    flight.newest.put(Picture(1, "a", flight.time.now_ns, 5, grey, told=told))
-    assert reason_of(flight.runner.step(0)) == "fix" and flight.locator.seen == [told]
+    flight.newest.put(Picture(1, "a", flight.time.now_ns, 5, grey, telemetry=telemetry))
+    assert reason_of(flight.runner.step(0)) == "fix" and flight.locator.seen == [telemetry]
 
 
 def test_it_ends_with_the_recording_and_says_so(flight):
@@ -532,7 +533,7 @@ def test_whatever_fails_the_next_view_is_flown(flight, monkeypatch, caplog):
 
 
 def test_a_camera_error_inside_names_the_camera(flight):
-    def wrong(grey, camera, told):
+    def wrong(view):
         raise CameraError("another camera")
 
     flight.locator.outcome = wrong
@@ -559,8 +560,8 @@ def flown(make_ortho, tmp_path_factory):
         place = np.array([-120.0, -80.0]) + number * SPEED_MPS * along
         grey = rendered(GROUND, place, (HEADING, 0.0, 0.0), AGL_M, CAMERA)
         grey = np.clip(0.75 * grey + 30 + rng.normal(0, 6, grey.shape), 0, 255).astype(np.uint8)
-        told = Telemetry(round(number * EVERY_S * S), HEADING, 0.0, 0.0, AGL_M)
-        seen.append((grey, told))
+        telemetry = Telemetry(round(number * EVERY_S * S), HEADING, 0.0, 0.0, AGL_M)
+        seen.append((grey, telemetry))
         truth[f"{number:03d}.png"] = place
     write_flight(folder / "flight", CAMERA, seen)
     return path, folder / "flight", frame, truth
@@ -579,11 +580,11 @@ def level_flight(autopilot, boot_ns):
 @pytest.fixture
 def autopilot():
     port = free_port()
-    standin = LiveAutopilot(port, level_flight)
-    standin.port = port
-    standin.start()
-    yield standin
-    standin.stop()
+    fake_autopilot = LiveAutopilot(port, level_flight)
+    fake_autopilot.port = port
+    fake_autopilot.start()
+    yield fake_autopilot
+    fake_autopilot.stop()
 
 
 def views_in(path):
@@ -606,9 +607,9 @@ def test_a_flight_from_end_to_end(flown, autopilot, tmp_path, capsys):
     )
     assert code == 0
     time.sleep(0.1)
-    told, results = views_in(lines)
-    sent = [each for each, line in zip(results, told, strict=True) if line["sent"]]
-    assert len(sent) >= 6, [line["withheld"] or line["reason"] for line in told]
+    telemetry, results = views_in(lines)
+    sent = [each for each, line in zip(results, telemetry, strict=True) if line["sent"]]
+    assert len(sent) >= 6, [line["withheld"] or line["reason"] for line in telemetry]
     for name in ("GLOBAL_POSITION_SENSOR", "GPS_INPUT"):
         heard = autopilot.named(name)
         assert [(m["lat"], m["lon"]) for m in heard] == [

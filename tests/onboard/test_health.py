@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from standin import S, fix
+from fake_autopilot import S, fix
 
 from orthonav.geo.camera import Camera
 from orthonav.onboard.health import (
@@ -24,7 +24,7 @@ from orthonav.onboard.health import (
     judge,
     offsets,
 )
-from orthonav.records import NoFix, Telemetry
+from orthonav.records import NoFix, Telemetry, View
 
 GOOD = Snapshot(60.0, {"taken": 50, "processed": 50, "sure": 50}, latency_s=0.1)
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
@@ -45,7 +45,7 @@ FAULTS = {
     "height_off": (replace(GOOD, log_scale_off=math.log(0.5)), Level.DEGRADED),
     "lost": (replace(GOOD, state="lost"), Level.DEGRADED),
     "searching": (replace(GOOD, state="searching"), Level.DEGRADED),
-    "unsure": (replace(GOOD, unsure_s=11.0), Level.DEGRADED),
+    "unsure": (replace(GOOD, low_confidence_s=11.0), Level.DEGRADED),
     "frozen_picture": (counted(frozen=20), Level.DEGRADED),
     "bad_pictures": (counted(bad_picture=20), Level.DEGRADED),
     "telemetry_gaps": (counted(no_telemetry=20), Level.DEGRADED),
@@ -100,12 +100,12 @@ def test_texts_fit_a_statustext():
 
 def test_changes_are_told_at_most_every_five_seconds():
     teller, good, bad = Teller(), Health(Level.OK), Health(Level.DEGRADED, ("lost",))
-    told = [
+    telemetry = [
         (second, health.level.name)
         for second in range(20)
         if teller.due(health := bad if second in (1, 3, 4) or second > 11 else good, second * S)
     ]
-    assert told == [(0, "OK"), (12, "DEGRADED")]
+    assert telemetry == [(0, "OK"), (12, "DEGRADED")]
 
 
 def test_counts_are_those_of_the_window():
@@ -148,10 +148,11 @@ class Guessing:
     def __init__(self, heading_deg=10.0, agl_m=100.0):
         self.heading_deg, self.agl_m, self.asked = heading_deg, agl_m, []
 
-    def locate(self, grey, camera, told, *, heading_known):
-        self.asked.append((heading_known, told.agl_m))
-        right = not heading_known or abs(told.yaw_deg - self.heading_deg) < 20
-        if right and 0.8 < told.agl_m / self.agl_m < 1.25:
+    def locate(self, view, *, heading_known):
+        telemetry = view.telemetry
+        self.asked.append((heading_known, telemetry.agl_m))
+        right = not heading_known or abs(telemetry.yaw_deg - self.heading_deg) < 20
+        if right and 0.8 < telemetry.agl_m / self.agl_m < 1.25:
             return fix(heading_deg=self.heading_deg, agl_m=self.agl_m)
         return NoFix("not_sure", "")
 
@@ -166,7 +167,7 @@ def test_a_second_look_says_what_is_told_wrong(heading, height, off):
         np.zeros((240, 320), np.uint8),
     )
     for number in range(int(4 * LOOK_AFTER_S)):
-        second.look(grey, CAMERA, TOLD, False, number * S)
+        second.look(View(grey, CAMERA, TOLD), False, number * S)
     found = second.offsets(number * S)
     assert (abs(found[0]), found[1]) == pytest.approx(off, abs=1e-3)
     assert second.offsets(round((number + NOTE_S + LOOK_AFTER_S) * S)) == (0.0, 0.0)
@@ -176,8 +177,8 @@ def test_nobody_looks_twice_while_all_is_well():
     guessing = Guessing()
     second, grey = SecondLook(guessing, 0.9, at_once), np.zeros((240, 320), np.uint8)
     for number in range(100):
-        second.look(grey, CAMERA, TOLD, number % 4 != 0, number * S)
+        second.look(View(grey, CAMERA, TOLD), number % 4 != 0, number * S)
     assert guessing.asked == [] and second.offsets(100 * S) == (0.0, 0.0)
     for number in range(100, 118):
-        second.look(grey, CAMERA, replace(TOLD, agl_m=300.0), False, number * S)
+        second.look(View(grey, CAMERA, replace(TOLD, agl_m=300.0)), False, number * S)
     assert guessing.asked == [(False, 300.0), (True, 150.0), (True, 600.0)]

@@ -7,7 +7,7 @@ import socket
 import time
 
 import pytest
-from standin import MS, UTC_NS, Autopilot, Port, S, Time
+from fake_autopilot import MS, UTC_NS, Autopilot, Port, S, Time
 
 from orthonav.errors import MissingExtraError, VariantError
 from orthonav.onboard.link import RETRY_S, AutopilotLink, LinkThread
@@ -36,7 +36,7 @@ class Flying:
         self.port.coming.extend(frames)
         return self.link.poll()
 
-    def told(self, **options):
+    def telemetry(self, **options):
         return self.link.told_at(self.time.now_ns).telemetry(0, **options)
 
 
@@ -79,11 +79,13 @@ def test_telemetry_at_an_exposure(flying):
         )
         flying.time.go(0.1)
     exposed = flying.time.now_ns - 250 * MS  # between the first and the second
-    told = flying.link.told_at(exposed)
-    assert told.telemetry(1).yaw_deg == pytest.approx(30.0 + (exposed + AHEAD_NS) / S, abs=1e-3)
-    assert (told.height_m, told.height_source) == (pytest.approx(80.0), "home")
-    assert told.telemetry(1).vel_en_mps == pytest.approx((3.0, 9.0))
-    assert told.down_m == pytest.approx(-70.0)
+    telemetry = flying.link.told_at(exposed)
+    assert telemetry.telemetry(1).yaw_deg == pytest.approx(
+        30.0 + (exposed + AHEAD_NS) / S, abs=1e-3
+    )
+    assert (telemetry.height_m, telemetry.height_source) == (pytest.approx(80.0), "home")
+    assert telemetry.telemetry(1).vel_en_mps == pytest.approx((3.0, 9.0))
+    assert telemetry.down_m == pytest.approx(-70.0)
     assert flying.link.covers(exposed) and not flying.link.covers(flying.time.now_ns + S)
 
 
@@ -93,8 +95,8 @@ def test_heights_of_every_message(flying):
 
     def height(*frames):
         flying.hear(*frames)
-        told = flying.link.told_at(flying.time.now_ns)
-        return told.height_source, round(told.height_m, 2)
+        telemetry = flying.link.told_at(flying.time.now_ns)
+        return telemetry.height_source, round(telemetry.height_m, 2)
 
     unknown = -1001.0
     say = flying.autopilot.say
@@ -111,16 +113,16 @@ def test_heights_of_every_message(flying):
     down = math.cos(math.radians(10))
     assert height(say("rangefinder", 50.0, 1.0)) == ("distance", round(50 * down, 2))
     flying.time.go(0.02)
-    told = flying.autopilot.distance(flying.boot_ns(), 40.0)
-    assert height(told) == ("distance", round(40 * down, 2))
+    telemetry = flying.autopilot.distance(flying.boot_ns(), 40.0)
+    assert height(telemetry) == ("distance", round(40 * down, 2))
 
 
 def test_attitude_as_a_quaternion(flying):
     half = math.radians(45.0)
     values = math.cos(half), 0, 0, math.sin(half), 0, 0, 0
     flying.hear(flying.autopilot.say("attitude_quaternion", flying.boot_ns() // MS, *values))
-    assert flying.told().yaw_deg == pytest.approx(90.0, abs=1e-3)
-    assert flying.told(mount_deg=(90.0, 0.0, 0.0)).yaw_deg == pytest.approx(180.0, abs=1e-3)
+    assert flying.telemetry().yaw_deg == pytest.approx(90.0, abs=1e-3)
+    assert flying.telemetry(mount_deg=(90.0, 0.0, 0.0)).yaw_deg == pytest.approx(180.0, abs=1e-3)
 
 
 def test_damaged_bytes_are_counted_and_survived(flying):
@@ -131,7 +133,7 @@ def test_damaged_bytes_are_counted_and_survived(flying):
     noise = bytes([0xFD, 250, 0, 0, 1]) + os.urandom(3)
     flying.hear(bytes(broken), nan, good[:9])
     flying.hear(good[9:], noise, good * 20)
-    assert flying.told().yaw_deg == pytest.approx(12.0, abs=1e-3)
+    assert flying.telemetry().yaw_deg == pytest.approx(12.0, abs=1e-3)
     assert flying.link.counts["damaged"] > 0
 
 
@@ -176,7 +178,7 @@ def test_an_autopilot_that_starts_anew_is_noticed(flying):
         flying.time.go(0.05)
         flying.hear(flying.autopilot.attitude((number + 1) * 50 * MS, yaw_deg=70.0))
     assert flying.link.status().jumps == 1
-    assert flying.told().yaw_deg == pytest.approx(70.0, abs=1e-3)
+    assert flying.telemetry().yaw_deg == pytest.approx(70.0, abs=1e-3)
 
 
 def test_a_port_that_breaks_is_opened_again(flying):
@@ -188,7 +190,7 @@ def test_a_port_that_breaks_is_opened_again(flying):
     assert flying.port.opened == 1  # not yet
     flying.time.go(RETRY_S[0])
     assert flying.hear(flying.autopilot.attitude(flying.boot_ns(), yaw_deg=3.0)) == 1
-    assert flying.port.opened == 2 and flying.told().yaw_deg == pytest.approx(3.0, abs=1e-3)
+    assert flying.port.opened == 2 and flying.telemetry().yaw_deg == pytest.approx(3.0, abs=1e-3)
 
 
 def test_a_port_that_is_not_there_is_asked_for_ever_more_seldom():

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pynmeagps
 import pytest
-from standin import UTC_NS, S, Time, fix
+from fake_autopilot import UTC_NS, S, Time, fix
 
 from orthonav.errors import VariantError
 from orthonav.onboard.outputs import (
@@ -54,10 +54,12 @@ class Sending:
         self.frames.append(decode(self.packer.pack(message)))
         return self.open
 
-    def publish(self, estimate=ESTIMATE, told=TOLD, origin=ORIGIN, age_s=0.25, **more):
+    def publish(self, estimate=ESTIMATE, telemetry=TOLD, origin=ORIGIN, age_s=0.25, **more):
         known = {"target": Target(1, 1), "kind": Autopilot.PX4, "boot_ns": 61 * S, **more}
         exposed = self.time.now_ns - round(age_s * S)
-        return self.messenger.publish(estimate, told, exposed_ns=exposed, origin=origin, **known)
+        return self.messenger.publish(
+            estimate, telemetry, exposed_ns=exposed, origin=origin, **known
+        )
 
 
 def test_every_kind_of_message_says_the_place():
@@ -94,7 +96,7 @@ def test_while_the_clock_of_the_autopilot_is_not_known_nothing_is_stamped_by_it(
 def test_local_messages_wait_for_the_origin_and_the_height():
     sending = Sending("odometry", "global-position")
     assert sending.publish(origin=None) == ("GLOBAL_POSITION_SENSOR",)
-    assert sending.publish(told=Told(None)) == ("GLOBAL_POSITION_SENSOR",)
+    assert sending.publish(telemetry=Told(None)) == ("GLOBAL_POSITION_SENSOR",)
     assert sum(sending.messenger.not_made.values()) == 2
     assert sending.publish(kind=Autopilot.ARDUPILOT) == tuple(
         KINDS[kind] for kind in ("odometry", "global-position")

@@ -11,7 +11,7 @@ from orthonav.errors import CameraError, FlightError, MissingFileError
 from orthonav.flight import open_flight, read_image
 from orthonav.localizer import Localizer
 from orthonav.onboard.run import SingleViews, localize_flight, locate_view
-from orthonav.records import Fix, NoFix, Prior
+from orthonav.records import Fix, NoFix, Prior, View
 
 VIEWS = 8
 
@@ -155,8 +155,8 @@ def test_the_prior_is_used_only_where_it_should_be(localizer, short):
 
 def test_the_heading_may_be_unknown(localizer, short):
     views = [replace(v, telemetry=replace(v.telemetry, yaw_deg=math.nan)) for v in short.views[:3]]
-    told = localize_flight(SingleViews(localizer), short, views=views)
-    assert set(outcomes(told)) == {"missing_telemetry"}
+    telemetry = localize_flight(SingleViews(localizer), short, views=views)
+    assert set(outcomes(telemetry)) == {"missing_telemetry"}
     untold = localize_flight(SingleViews(localizer, heading_known=False), short, views=views)
     assert set(outcomes(untold)) == {"fix"}
 
@@ -164,7 +164,7 @@ def test_the_heading_may_be_unknown(localizer, short):
 def test_one_view_is_the_same_as_in_a_flight(localizer, short):
     view = short.views[0]
     alone, grey = SingleViews(localizer), read_image(view.path)
-    outcome, latency_ms = locate_view(alone, grey, short.camera, view.telemetry)
+    outcome, latency_ms = locate_view(alone, View(grey, short.camera, view.telemetry))
     flown = next(localize_flight(SingleViews(localizer), short)).outcome
     assert isinstance(outcome, Fix) and latency_ms > 0
     assert (outcome.lat_deg, outcome.lon_deg) == (flown.lat_deg, flown.lon_deg)

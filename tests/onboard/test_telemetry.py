@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from fake_autopilot import MS, S
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
-from standin import MS, S
 
 from orthonav.onboard.telemetry import ClockSync, Limits, TelemetryBuffer, Told, wxyz_of_angles
 from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
@@ -24,8 +24,8 @@ def test_half_way_between_two_attitudes():
     buffer = TelemetryBuffer()
     attitude(buffer, 0, yaw_deg=350.0)
     attitude(buffer, 100 * MS, yaw_deg=20.0)
-    told = buffer.at(50 * MS).telemetry(7)
-    assert told.yaw_deg == pytest.approx(5.0) and told.time_ns == 7
+    telemetry = buffer.at(50 * MS).telemetry(7)
+    assert telemetry.yaw_deg == pytest.approx(5.0) and telemetry.time_ns == 7
     assert buffer.at(10 * MS).telemetry(0).yaw_deg == pytest.approx(353.0)
 
 
@@ -51,9 +51,11 @@ def test_the_camera_is_as_an_import_of_a_log_would_have_it(angles, mount):
     samples.add(1 * S, yaw, pitch, roll)
     series = attitude_of_angles(samples, lambda a: enu_from_body_camera(ned_from_angles(a), mount))
     logged = Track(series).telemetry(1 * S)
-    told = buffer.at(1 * S).telemetry(1 * S, mount)
-    assert (told.pitch_deg, told.roll_deg) == pytest.approx((logged.pitch_deg, logged.roll_deg))
-    assert math.remainder(told.yaw_deg - logged.yaw_deg, 360) == pytest.approx(0, abs=1e-6)
+    telemetry = buffer.at(1 * S).telemetry(1 * S, mount)
+    assert (telemetry.pitch_deg, telemetry.roll_deg) == pytest.approx(
+        (logged.pitch_deg, logged.roll_deg)
+    )
+    assert math.remainder(telemetry.yaw_deg - logged.yaw_deg, 360) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("every_ms, known", [(20, True), (50, True), (100, False)])
@@ -64,9 +66,9 @@ def test_a_little_ahead_of_attitudes_that_come_closely(every_ms, known):
         attitude(buffer, number * every_ms * MS, yaw_deg=number * every_ms * 0.1)
     last_ns = 4 * every_ms * MS
     assert buffer.covered_ns == last_ns + (30 * MS if known else 0)
-    told = buffer.at(last_ns + 20 * MS).telemetry(0)
+    telemetry = buffer.at(last_ns + 20 * MS).telemetry(0)
     expected = (4 * every_ms + (20 if known else 0)) * 0.1  # else as it was last
-    assert told.yaw_deg == pytest.approx(expected, abs=1e-6)
+    assert telemetry.yaw_deg == pytest.approx(expected, abs=1e-6)
     later = buffer.at(last_ns + 50 * MS).telemetry(0)
     assert later.yaw_deg == pytest.approx(4 * every_ms * 0.1)
 
@@ -115,21 +117,21 @@ def test_the_best_height_counts():
 
 def test_a_distance_is_taken_along_the_body():
     buffer = TelemetryBuffer()
-    buffer.add_distance(0, 100.0)  # the lean is not known
+    buffer.add_distance(0, 100.0)  # the tilt is not known
     assert math.isnan(buffer.at(0).height_m)
     attitude(buffer, 1, pitch_deg=20.0, roll_deg=10.0)
     buffer.add_distance(1, 100.0)
-    lean = math.cos(math.radians(20)) * math.cos(math.radians(10))
-    assert buffer.at(1).height_m == pytest.approx(100 * lean)
+    tilt = math.cos(math.radians(20)) * math.cos(math.radians(10))
+    assert buffer.at(1).height_m == pytest.approx(100 * tilt)
 
 
 def test_velocity_and_height_of_the_local_frame():
     buffer = TelemetryBuffer()
     buffer.add_local(0, (10.0, 2.0, -1.0), -50.0)
     buffer.add_local(1 * S, (12.0, 2.0, math.nan), -50.0)
-    told = buffer.at(0)
-    assert told.telemetry(0).vel_en_mps == (2.0, 10.0)
-    assert (told.velocity_ned_mps[2], told.down_m) == (-1.0, -50.0)
+    telemetry = buffer.at(0)
+    assert telemetry.telemetry(0).vel_en_mps == (2.0, 10.0)
+    assert (telemetry.velocity_ned_mps[2], telemetry.down_m) == (-1.0, -50.0)
     assert Told(None).telemetry(0).vel_en_mps is None
 
 

@@ -23,7 +23,7 @@ from orthonav.imagery.mosaic import Mosaic
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.prepare.blocks import Block
 from orthonav.prepare.calibrate import CropSampler
-from orthonav.prepare.kept import KeptBlocks
+from orthonav.prepare.kept import BlockCache
 from orthonav.prepare.layout import grid_of
 from orthonav.prepare.parallel import AHEAD, in_order
 from orthonav.prepare.pictures import SheetPictures
@@ -305,7 +305,7 @@ def test_too_little_room_is_told_before_anything_is_read(ortho, tmp_path, monkey
 
 
 def test_a_block_without_imagery_is_kept_too(tmp_path):
-    kept = KeptBlocks(tmp_path / "work", "request", 0)
+    kept = BlockCache(tmp_path / "work", "request", 0)
     block = Block(0, 0, 8, 8)
     assert kept.begin([(block, None)]) == 0 and kept.load(block) is None
     kept.keep(block, {})

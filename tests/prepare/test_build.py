@@ -19,7 +19,7 @@ from orthonav.imagery.mosaic import Mosaic
 from orthonav.mapfile import open_map
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.prepare.calibrate import RADIUS_STRIDES
-from orthonav.records import Fix, Telemetry
+from orthonav.records import Fix, Telemetry, View
 
 CAMERA = Camera(256, 256, 256.0, 256.0, 128.0, 128.0)
 """It sees as many metres of ground as it is above it."""
@@ -122,8 +122,8 @@ def test_the_recipe_is_in_the_map(ortho, tmp_path):
 def test_one_channel_is_compared_on_finer_cells(ortho, tmp_path, edges):
     chosen = built(ortho, tmp_path, edges=edges).manifest.recipe["embed"]["cells"]
     assert chosen == (8 if edges == "gradient" else 16)
-    told = built(ortho, tmp_path, "told.onav", edges=edges, method="gradient:cells=4")
-    assert told.manifest.recipe["embed"]["cells"] == 4
+    telemetry = built(ortho, tmp_path, "told.onav", edges=edges, method="gradient:cells=4")
+    assert telemetry.manifest.recipe["embed"]["cells"] == 4
 
 
 def test_another_seed_changes_the_calibration_only(ortho, tmp_path, calibrated):
@@ -190,8 +190,8 @@ def test_imagery_with_a_hole_is_covered_around_it(make_ortho, tmp_path, frame):
 
 
 @pytest.mark.parametrize("told, expected", [(None, 1.0), (0.5, 0.5), (1.7, 1.7), (2.0, 2.0)])
-def test_ground_resolution(ortho, tmp_path, told, expected):
-    grid = built(ortho, tmp_path, gsd_m=told, tile_px=32).manifest.sheets[0].grid
+def test_ground_resolution(ortho, tmp_path, telemetry, expected):
+    grid = built(ortho, tmp_path, gsd_m=telemetry, tile_px=32).manifest.sheets[0].grid
     assert grid.gsd_m == expected and grid.stride_m == 8 * expected
 
 
@@ -216,12 +216,12 @@ def test_blocks_do_not_matter(ortho, tmp_path, monkeypatch):
 
 
 def test_the_manifest(ortho, tmp_path):
-    calls, told = [], []
+    calls, telemetry = [], []
     out = tmp_path / "deep" / "map.onav"
     request = BuildRequest([ortho], out, tile_px=64, calibration_views=4)
-    result = build_map(request, lambda stage, share: calls.append((stage, share)), told.append)
+    result = build_map(request, lambda stage, share: calls.append((stage, share)), telemetry.append)
     manifest = open_map(request.out).manifest
-    (line,) = told
+    (line,) = telemetry
     tiles = int(line.partition(" tiles of 64 px")[0].split(", ")[1].replace(",", ""))
     assert tiles == pytest.approx(manifest.sheets[0].tiles, rel=0.03)
     assert manifest == result.manifest and result.size_bytes == request.out.stat().st_size
@@ -360,7 +360,7 @@ def own_views(localizer, path, mirrored=False, count=30):
                 continue
             grey = cv2.resize(pixels.grey, (256, 256), interpolation=cv2.INTER_AREA)
             grey = np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey
-            fix = localizer.locate(grey, CAMERA, Telemetry(0, 0.0, 0.0, 0.0, float(size)))
+            fix = localizer.locate(View(grey, CAMERA, Telemetry(0, 0.0, 0.0, 0.0, float(size))))
             assert isinstance(fix, Fix)
             fixes.append(fix)
             truth.append(corner + np.array([col + size / 2, -(row + size / 2)]))
@@ -395,7 +395,7 @@ def test_the_error_told_is_of_the_order_of_the_grid(map_path, ortho, tmp_path, c
 
 def test_slow_representations_are_calibrated_on_fewer_crops(ortho, tmp_path, monkeypatch):
     """Where one takes minutes; counted by what is told of the progress."""
-    told = {}
+    telemetry = {}
     for name in ("canny", "slow"):
         if name == "slow":
             table = {**represent.TABLE, "canny": replace(represent.TABLE["canny"], flies=False)}
@@ -411,5 +411,5 @@ def test_slow_representations_are_calibrated_on_fewer_crops(ortho, tmp_path, mon
             [ortho], tmp_path / f"{name}.onav", tile_px=64, edges="canny", registration=False
         )
         build_map(request, tell)
-        told[name] = len(shares)
-    assert told["slow"] == 6 < told["canny"]
+        telemetry[name] = len(shares)
+    assert telemetry["slow"] == 6 < telemetry["canny"]

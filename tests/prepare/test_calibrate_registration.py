@@ -127,8 +127,8 @@ def verdicts(localizer, confidence, crops, mirrored):
     said, off = [], []
     for crop in crops:
         picture = np.ascontiguousarray(crop.grey[:, ::-1]) if mirrored else crop.grey
-        view, camera, telemetry = module._view(rng, picture, localizer.grid)
-        best = localizer.best(localizer.prepared(view, camera, telemetry, True), None)
+        view = module._view(rng, picture, localizer.grid)
+        best = localizer.best(localizer.prepared(view, True), None)
         said.append(confidence(best.evidence()))
         pose = best.placed.pose
         off.append(np.hypot(pose.x_px - crop.col_px, pose.y_px - crop.row_px))
@@ -149,9 +149,10 @@ def test_views_made_of_crops_are_vertical_and_told_roughly(localizer):
     crop = crops_of(GREY, 1)[0]
     off = []
     for _ in range(60):
-        view, camera, telemetry = module._view(rng, crop.grey, localizer.grid)
-        assert view.shape == (camera.height_px, camera.width_px) and view.dtype == np.uint8
-        assert 0.5 * TILE_PX < camera.width_px <= TILE_PX and view.std() > 5
+        view = module._view(rng, crop.grey, localizer.grid)
+        grey, camera, telemetry = view.grey, view.camera, view.telemetry
+        assert grey.shape == (camera.height_px, camera.width_px) and grey.dtype == np.uint8
+        assert 0.5 * TILE_PX < camera.width_px <= TILE_PX and grey.std() > 5
         assert telemetry.pitch_deg == telemetry.roll_deg == 0
         off.append(telemetry.agl_m / camera.fx_px / localizer.grid.gsd_m - 1)
     assert 0.5 * module.AGL_STD < np.std(off) < 1.5 * module.AGL_STD

@@ -104,7 +104,7 @@ def test_what_is_no_covariance_has_no_accuracy(cov: list[list[float]]) -> None:
     estimate = replace(PLAIN, cov_en_m2=np.array(cov))
     assert all(map(math.isnan, error_ellipse(estimate.cov_en_m2)))
     assert math.isnan(estimate.horizontal_std_m(3.0))
-    assert not estimate.is_sure()
+    assert not estimate.is_confident()
 
 
 def test_the_accuracy_is_that_of_the_worst_direction_and_not_below_the_least() -> None:
@@ -126,7 +126,7 @@ def test_the_accuracy_is_that_of_the_worst_direction_and_not_below_the_least() -
     ],
 )
 def test_sure_is_confident_and_tracking(confidence: float, state: str | None, sure: bool) -> None:
-    assert replace(PLAIN, confidence=confidence, state=state).is_sure() is sure
+    assert replace(PLAIN, confidence=confidence, state=state).is_confident() is sure
 
 
 @pytest.mark.parametrize(

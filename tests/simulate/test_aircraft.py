@@ -1,6 +1,7 @@
 """Simulated flights of a real aircraft: wind, odometry, biases, clouds, ground beyond the map."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from orthonav.geo.area import Area
 from orthonav.geo.camera import Camera
 from orthonav.geo.route import Route, distance_to_polyline_m
 from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import prepare_view, rectify
+from orthonav.localizer import downsampled, rectify
+from orthonav.records import View
 from orthonav.simulate.clouds import Clouds
 from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.simulate.ground import reflected
@@ -59,7 +61,7 @@ def fly(ortho, frame, tmp_path):
     return flown
 
 
-def told_by(flight, *fields):
+def telemetry_path(flight, *fields):
     return np.array([[getattr(v.telemetry, name) for name in fields] for v in flight.views])
 
 
@@ -81,7 +83,7 @@ def test_a_flight_without_the_new_options_is_what_it_was(area, tmp_path):
     )
     simulate_flight(request)
     lines = (tmp_path / "f/telemetry.csv").read_text().splitlines()
-    assert lines[0].endswith("prior_std_m,lean_std_deg")
+    assert lines[0].endswith("prior_std_m,tilt_std_deg")
     assert lines[1] == "0001.jpg,0,344.838,0.245,1.841,102.234,5,5,48.85912509,2.34941189,40,1"
     assert lines[4] == "0004.jpg,6,353.495,2.995,0.282,106.121,5,5,48.86032265,2.34959257,40,1"
 
@@ -90,24 +92,24 @@ def test_in_wind_the_aircraft_keeps_its_route_and_crabs(fly, frame):
     flight, truth = fly(wind=Wind(10.0, 270.0), spacing_m=25.0, errors=Errors(velocity_drift=0.0))
     places = np.array([frame.en_from_latlon(*truth[view.frame]) for view in flight.views])
     assert distance_to_polyline_m(places, CORNERS).max() < 0.05
-    seconds = told_by(flight, "time_ns")[:, 0] / 1e9
+    seconds = telemetry_path(flight, "time_ns")[:, 0] / 1e9
     assert np.diff(seconds) == pytest.approx(1.0)
     north = places[:, 1] < 99
-    yaw = (told_by(flight, "yaw_deg")[:, 0] + 180) % 360 - 180
+    yaw = (telemetry_path(flight, "yaw_deg")[:, 0] + 180) % 360 - 180
     assert yaw[north].mean() == pytest.approx(-math.degrees(math.asin(0.4)), abs=6)
     assert yaw[~north] == pytest.approx(90, abs=15)
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     assert steps[~north[1:]][1:].min() > 29 and steps[north[1:]].max() < 25
-    told = told_by(flight, "vel_en_mps")[:, 0]
-    assert told[1:] == pytest.approx(np.diff(places, axis=0), abs=0.01)
+    telemetry = telemetry_path(flight, "vel_en_mps")[:, 0]
+    assert telemetry[1:] == pytest.approx(np.diff(places, axis=0), abs=0.01)
 
 
 def test_odometry_drifts_and_is_told(fly, frame, tmp_path):
     exact, truth = fly("exact", errors=Errors(velocity_drift=0.0), spacing_m=80.0, seed=2)
     erring, same = fly("erring", errors=Errors(velocity_drift=0.1), spacing_m=80.0, seed=2)
     assert truth == same
-    true, told = (told_by(flight, "vel_en_mps")[:, 0] for flight in (exact, erring))
-    ratio = np.linalg.norm(told, axis=1) / np.linalg.norm(true, axis=1) - 1
+    true, telemetry = (telemetry_path(flight, "vel_en_mps")[:, 0] for flight in (exact, erring))
+    ratio = np.linalg.norm(telemetry, axis=1) / np.linalg.norm(true, axis=1) - 1
     assert 0.001 < np.abs(ratio).mean() < 0.3 and np.abs(np.diff(ratio)).max() < 0.05
     header = (tmp_path / "erring/telemetry.csv").read_text().splitlines()[0]
     assert header.endswith("vel_east_mps,vel_north_mps")
@@ -115,7 +117,7 @@ def test_odometry_drifts_and_is_told(fly, frame, tmp_path):
 
 def test_turns_are_arcs(fly, frame):
     flight, truth = fly(turn_radius_m=100.0, spacing_m=20.0)
-    yaw = told_by(flight, "yaw_deg")[:, 0]
+    yaw = telemetry_path(flight, "yaw_deg")[:, 0]
     turned = (np.diff(yaw) + 180) % 360 - 180
     assert turned.sum() == pytest.approx(90, abs=0.1)
     assert np.abs(turned).max() < 1.1 * math.degrees(20 / 100)
@@ -129,35 +131,35 @@ def test_biases_are_told_wrong_all_along(fly):
     bias = Errors(*[5.0, 0.05, 1.0, 2.0, 40.0], yaw_bias_deg=-4.0, agl_bias=0.08)
     erring, same = fly("erring", errors=bias, spacing_m=100.0, seed=3)
     assert truth == same
-    off = told_by(erring, "yaw_deg", "agl_m") - told_by(exact, "yaw_deg", "agl_m")
+    off = telemetry_path(erring, "yaw_deg", "agl_m") - telemetry_path(exact, "yaw_deg", "agl_m")
     assert (off[:, 0] + 180) % 360 - 180 == pytest.approx(-4)
     assert off[:, 1] == pytest.approx(8)
     rest = ("pitch_deg", "roll_deg", "yaw_std_deg", "agl_std_m", "time_ns")
-    assert (told_by(erring, *rest) == told_by(exact, *rest)).all()
+    assert (telemetry_path(erring, *rest) == telemetry_path(exact, *rest)).all()
     for a, b in zip(pictures(exact), pictures(erring), strict=True):
         assert (a == b).all()
 
 
-def test_the_mount_leans_more_than_told(fly, ortho, frame):
+def test_the_mount_tilts_more_than_told(fly, ortho, frame):
     """A view shows the ground at the truth if it is levelled with the bias too."""
-    bias = Errors(lean_std_deg=1.0, pitch_bias_deg=4.0, roll_bias_deg=-3.0)
-    straight, truth = fly("straight", camera=SEEN, errors=Errors(lean_std_deg=1.0))
-    leaning, same = fly("leaning", camera=SEEN, errors=bias)
+    bias = Errors(attitude_std_deg=1.0, pitch_bias_deg=4.0, roll_bias_deg=-3.0)
+    straight, truth = fly("straight", camera=SEEN, errors=Errors(attitude_std_deg=1.0))
+    tilted, same = fly("tilted", camera=SEEN, errors=bias)
     rest = ("yaw_deg", "pitch_deg", "roll_deg", "agl_m")
-    assert truth == same and (told_by(straight, *rest) == told_by(leaning, *rest)).all()
+    assert (
+        truth == same and (telemetry_path(straight, *rest) == telemetry_path(tilted, *rest)).all()
+    )
 
     def alike(view, pitch_deg, roll_deg):
         """Correlation of the levelled view with the orthophoto where it should lie."""
-        told, size_px = view.telemetry, 64
-        levelled = rectify(
-            prepare_view(read_image(view.path), SEEN, told.agl_m, 1.0),
-            yaw_deg=told.yaw_deg,
-            pitch_deg=told.pitch_deg + pitch_deg,
-            roll_deg=told.roll_deg + roll_deg,
-            agl_m=told.agl_m,
-            gsd_m=1.0,
-            size_px=size_px,
+        telemetry, size_px = view.telemetry, 64
+        corrected = replace(
+            telemetry,
+            pitch_deg=telemetry.pitch_deg + pitch_deg,
+            roll_deg=telemetry.roll_deg + roll_deg,
         )
+        seen = View(read_image(view.path), SEEN, corrected)
+        levelled = rectify(downsampled(seen, 1.0), gsd_m=1.0, size_px=size_px)
         west, north = (
             frame.en_from_latlon(*truth[view.frame])
             + levelled.offset_en_m
@@ -168,7 +170,7 @@ def test_the_mount_leans_more_than_told(fly, ortho, frame):
             ground = raster.read(0, 0, size_px, size_px).grey
         return np.corrcoef(levelled.grey.ravel(), ground.ravel())[0, 1]
 
-    for view in leaning.views[::8]:
+    for view in tilted.views[::8]:
         assert alike(view, 4.0, -3.0) > 0.98 and alike(view, 0.0, 0.0) < 0.8
     assert alike(straight.views[0], 0.0, 0.0) > 0.98
 
@@ -179,7 +181,7 @@ def test_clouds_hide_some_views_and_leave_the_others(fly):
     hidden, same = fly("hidden", **kinds, cloud_share=0.4)
     assert truth == same
     fields = ("yaw_deg", "time_ns", "agl_m")
-    assert (told_by(clear, *fields) == told_by(hidden, *fields)).all()
+    assert (telemetry_path(clear, *fields) == telemetry_path(hidden, *fields)).all()
     pairs = list(zip(pictures(clear), pictures(hidden), strict=True))
     clouds = Clouds(len(pairs), 0.4, 3)
     degree = np.array([clouds.degree(number) for number in range(len(pairs))])
@@ -291,8 +293,8 @@ def test_the_command(run, ortho, frame, tmp_path):
         *fly, *biases, *wind, *rest, "--beyond", "--spacing-m", "300", "--out", tmp_path / "f"
     )
     assert done.code == 0 and "views written" in done.out
-    told = open_flight(tmp_path / "f").views[0].telemetry
-    assert told.vel_en_mps is not None and told.agl_m == pytest.approx(105)
+    telemetry = open_flight(tmp_path / "f").views[0].telemetry
+    assert telemetry.vel_en_mps is not None and telemetry.agl_m == pytest.approx(105)
     done = run(*fly, "--wind-mps", "30", "--out", tmp_path / "g")
     assert done.code == 1 and "too strong for an airspeed of 25 m/s" in done.err
     done = run(*fly, "--wind-from-deg", "30", "--out", tmp_path / "g")

@@ -14,7 +14,8 @@ from orthonav.geo.area import Area
 from orthonav.geo.camera import Camera
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
-from orthonav.localizer import prepare_view, rectify
+from orthonav.localizer import downsampled, rectify
+from orthonav.records import View
 from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.simulate.render import ViewEffects
 
@@ -64,28 +65,20 @@ def ground_at(area, frame, place_en_m, gsd_m=1.0):
 
 
 @pytest.mark.parametrize("camera", [SEEN, LENS, FISH], ids=["pinhole", "lens", "fisheye"])
-@pytest.mark.parametrize("lean_std_deg", [0.0, 6.0])
-def test_the_picture_shows_the_ground_at_the_truth(area, plane, tmp_path, camera, lean_std_deg):
+@pytest.mark.parametrize("attitude_std_deg", [0.0, 6.0])
+def test_the_picture_shows_the_ground_at_the_truth(area, plane, tmp_path, camera, attitude_std_deg):
     flight, truth = flown(
         area,
         tmp_path / "f",
         camera=camera,
         agl_m=150.0,
-        errors=Errors(lean_std_deg=lean_std_deg),
+        errors=Errors(attitude_std_deg=attitude_std_deg),
         seed=4,
     )
     for view in flight.views:
-        told = view.telemetry
-        prepared = prepare_view(read_image(view.path), camera, told.agl_m, 1.0)
-        rectified = rectify(
-            prepared,
-            yaw_deg=told.yaw_deg,
-            pitch_deg=told.pitch_deg,
-            roll_deg=told.roll_deg,
-            agl_m=told.agl_m,
-            gsd_m=1.0,
-            size_px=SIZE_PX,
-        )
+        telemetry = view.telemetry
+        seen = View(read_image(view.path), camera, telemetry)
+        rectified = rectify(downsampled(seen, 1.0), gsd_m=1.0, size_px=SIZE_PX)
         place = plane.frame.en_from_latlon(*truth[view.frame]) + rectified.offset_en_m
         ground = ground_at(area, plane.frame, place)
         assert rectified.valid.all()
@@ -119,8 +112,8 @@ def test_errors_have_the_stated_size(area, plane, exact, tmp_path):
     assert all(a.prior is None for a, _ in pairs)
 
 
-def test_leaning_is_true_and_told(area, tmp_path):
-    flight, _ = flown(area, tmp_path / "f", random=100, errors=Errors(lean_std_deg=3.0))
+def test_tilted_is_true_and_told(area, tmp_path):
+    flight, _ = flown(area, tmp_path / "f", random=100, errors=Errors(attitude_std_deg=3.0))
     tilt = np.array([[v.telemetry.pitch_deg, v.telemetry.roll_deg] for v in flight.views])
     assert tilt.std() == pytest.approx(3.0, rel=0.15) and np.abs(tilt).max() <= 7.5
 

@@ -155,10 +155,10 @@ angles = st.floats(-180, 180), st.floats(-30, 30), st.floats(-30, 30)
 
 
 @given(st.tuples(*angles), st.tuples(st.floats(-10, 10), st.floats(-10, 10)))
-def test_the_mount_leans_in_the_aircraft(attitude, lean):
+def test_the_mount_tilts_in_the_aircraft(attitude, tilt):
     """Against SciPy's rotations."""
     aircraft = Rotation.from_euler("ZYX", attitude, degrees=True)
-    camera = Rotation.from_euler("ZYX", (0, *lean), degrees=True)
+    camera = Rotation.from_euler("ZYX", (0, *tilt), degrees=True)
     axis_ned = (aircraft * camera).apply([0, 0, 1])
-    axis_enu = enu_from_camera(*mounted(attitude, *lean))[:, 2]
+    axis_enu = enu_from_camera(*mounted(attitude, *tilt))[:, 2]
     assert axis_enu == pytest.approx([axis_ned[1], axis_ned[0], -axis_ned[2]], abs=1e-9)

@@ -47,12 +47,12 @@ def camera_file(path, **changes):
 def packet(maker=DJI, as_elements=False, **values):
     prefix, uri = maker
     if as_elements:
-        told = "".join(
+        telemetry = "".join(
             f"<{prefix}:{name}>{value}</{prefix}:{name}>" for name, value in values.items()
         )
-        return XMP.format(prefix=prefix, uri=uri, attributes="", elements=told)
-    told = "\n".join(f'{prefix}:{name}="{value}"' for name, value in values.items())
-    return XMP.format(prefix=prefix, uri=uri, attributes=told, elements="")
+        return XMP.format(prefix=prefix, uri=uri, attributes="", elements=telemetry)
+    telemetry = "\n".join(f'{prefix}:{name}="{value}"' for name, value in values.items())
+    return XMP.format(prefix=prefix, uri=uri, attributes=telemetry, elements="")
 
 
 def dji(yaw=30.0, pitch=-90.0, roll=0.0, height=120.5):

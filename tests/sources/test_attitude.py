@@ -59,12 +59,12 @@ def test_a_gimbal_that_is_upside_down_is_turned():
 
 @given(angles, st.floats(-89, 30), st.floats(-20, 20))
 def test_a_gimbals_roll_turns_the_picture_about_its_axis(yaw, pitch, roll):
-    """Right-handed about the axis: with positive roll the top of the image leans to the right."""
+    """Right-handed about the axis: with positive roll the top of the image tilts to the right."""
     straight, rolled = (enu_from_gimbal_camera([yaw, pitch, angle]) for angle in (0.0, roll))
     np.testing.assert_allclose(rolled[:, 2], straight[:, 2], atol=1e-12)
     right, top = straight[:, 0], -straight[:, 1]
-    lean = math.radians(roll)
-    expected = math.cos(lean) * top + math.sin(lean) * right
+    tilt = math.radians(roll)
+    expected = math.cos(tilt) * top + math.sin(tilt) * right
     np.testing.assert_allclose(-rolled[:, 1], expected, atol=1e-12)
 
 
@@ -97,7 +97,7 @@ def test_mounts(mount, axis, top):
     np.testing.assert_allclose(found, [axis, top], atol=1e-12)
 
 
-def test_the_mount_leans_with_the_body():
+def test_the_mount_tilts_with_the_body():
     """Right wing down, a camera that looks down looks left; seen from above at heading 0: west."""
     axis, _ = sight(enu_from_body_camera(ned_from_angles([0, 0, 20]), (0.0, 0.0, 0.0)))
     np.testing.assert_allclose(axis, level(270, -70), atol=1e-12)

@@ -110,8 +110,8 @@ MAKERS = {
 @pytest.mark.parametrize("kind", MAKERS)
 def test_a_source_is_localized_as_its_import_is(run, kind, tmp_path, camera):
     source = MAKERS[kind](tmp_path)
-    told = ["--camera", camera]
-    code, out, err = run("import", source, "--out", tmp_path / "flight", *told, "--json")
+    telemetry = ["--camera", camera]
+    code, out, err = run("import", source, "--out", tmp_path / "flight", *telemetry, "--json")
     assert (code, err) == (0, "")
     plain = json.loads(out)
     assert plain["kind"] == {"bag": "ros", "db3": "ros", "mcap": "ros"}.get(kind, kind)
@@ -119,7 +119,7 @@ def test_a_source_is_localized_as_its_import_is(run, kind, tmp_path, camera):
     flight = open_flight(tmp_path / "flight")
     assert flight.camera == Camera(**SIDES) and len(flight.views) == 2
     results = []
-    for name, path, more in (("a", source, told), ("b", tmp_path / "flight", [])):
+    for name, path, more in (("a", source, telemetry), ("b", tmp_path / "flight", [])):
         fixes = tmp_path / f"{name}.jsonl"
         assert run("localize", MAP, path, "--out", fixes, *more)[0] == 0
         lines = [json.loads(line) for line in fixes.read_text().splitlines()]

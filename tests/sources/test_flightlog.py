@@ -44,7 +44,7 @@ from orthonav.onboard.log import FlightLog
 from orthonav.onboard.run import locate_view
 from orthonav.onboard.segment import Segment
 from orthonav.publish.jsonl import read_results, result_to_json
-from orthonav.records import NoFix, Prior, Telemetry, ViewResult
+from orthonav.records import NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.sources import SourceOptions, open_source, source_kind
 from orthonav.sources import flightlog as flightlog_module
 
@@ -142,7 +142,7 @@ def flown(localizer, flight, folder, mount=None, **how):
         if number == 3:  # the camera sees it worse than any file says
             known = replace(known, yaw_std_deg=0.1 + 0.2, prior=Prior(46.5, 1 / 3, 1e9))
         log.view(number * 2, view.frame, grey, known)  # every other picture was passed over
-        outcome, latency_ms = locate_view(locator, grey, flight.camera, known)
+        outcome, latency_ms = locate_view(locator, View(grey, flight.camera, known))
         result = ViewResult(view.frame, known.time_ns, outcome, latency_ms, locator.state_name)
         log.result(result)
         results.append(result)

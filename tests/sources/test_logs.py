@@ -54,9 +54,9 @@ def test_attitude_of_a_camera_that_looks_down_is_that_of_the_body(log):
     """In UTC by the GPS; a hundredth of a degree is what DataFlash holds."""
     track = read_log(log, DOWN)
     for t, yaw, pitch, roll in flown():
-        told = angles_at(track.attitude, (START_S * 1000 + round(t * 1000)) * 10**6)
-        assert turned(told[0], yaw) == pytest.approx(0, abs=0.02)
-        assert told[1:] == pytest.approx((pitch, roll), abs=0.02)
+        telemetry = angles_at(track.attitude, (START_S * 1000 + round(t * 1000)) * 10**6)
+        assert turned(telemetry[0], yaw) == pytest.approx(0, abs=0.02)
+        assert telemetry[1:] == pytest.approx((pitch, roll), abs=0.02)
     between = angles_at(track.attitude, START_S * 10**9 + 2_550_000_000)  # across north
     assert turned(between[0], 350 + 4 * 2.55) == pytest.approx(0, abs=0.02)
 
@@ -84,10 +84,12 @@ def test_heights_are_of_the_distance_sensor_where_it_is_sound(kind, early, late,
 
 def test_the_mount_turns_the_camera(log):
     right = read_log(log, (90.0, 0.0, 0.0))
-    told = angles_at(right.attitude, START_S * 10**9)
+    telemetry = angles_at(right.attitude, START_S * 10**9)
     _, yaw, _, roll = next(flown())
-    assert turned(told[0], yaw + 90) == pytest.approx(0, abs=0.1)
-    assert told[1:] == pytest.approx((-roll, 0), abs=0.1)  # right wing down: lower top of the image
+    assert turned(telemetry[0], yaw + 90) == pytest.approx(0, abs=0.1)
+    assert telemetry[1:] == pytest.approx(
+        (-roll, 0), abs=0.1
+    )  # right wing down: lower top of the image
 
 
 def test_newer_px4_names(tmp_path):
@@ -175,16 +177,16 @@ def test_photographs_with_a_log(photographs, log, tmp_path):
     done = import_flight(open_source(photographs, options), tmp_path / "flight")
     assert (done.views, done.complete, done.with_truth) == (3, 3, 3)
     for view, second in zip(open_source(photographs, options).views, (0, 2, 4), strict=True):
-        told = view.telemetry
-        assert told.time_ns == (START_S + second + 2) * 10**9
-        assert turned(told.yaw_deg, 350 + 4 * (second + 2)) == pytest.approx(0, abs=0.02)
-        assert told.prior.std_m == 20 and math.isfinite(told.agl_m)
+        telemetry = view.telemetry
+        assert telemetry.time_ns == (START_S + second + 2) * 10**9
+        assert turned(telemetry.yaw_deg, 350 + 4 * (second + 2)) == pytest.approx(0, abs=0.02)
+        assert telemetry.prior.std_m == 20 and math.isfinite(telemetry.agl_m)
 
 
 def test_views_after_the_end_of_a_log_are_not_made_up(photographs, log, tmp_path):
     options = SourceOptions(telemetry=log, time_offset_s=7.0)
-    told = [view.telemetry.missing() for view in open_source(photographs, options).views]
-    assert told[0] == told[1] == [] and len(told[2]) == 4
+    telemetry = [view.telemetry.missing() for view in open_source(photographs, options).views]
+    assert telemetry[0] == telemetry[1] == [] and len(telemetry[2]) == 4
 
 
 def test_a_log_of_another_flight_is_refused(photographs, log, tmp_path):

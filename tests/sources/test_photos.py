@@ -55,10 +55,16 @@ def test_a_folder_of_dji(folder, tmp_path):
     assert (done.views, done.complete, done.with_truth, done.broken) == (3, 3, 3, 0)
     flight = open_flight(tmp_path / "flight")
     assert [view.frame for view in flight.views] == ["c.jpg", "sub/b.jpg", "a.jpg"]
-    told = flight.views[1].telemetry
-    assert told.time_ns == (START_S + 1) * 10**9 + 250_000_000
-    assert (told.yaw_deg, told.pitch_deg, told.roll_deg) == pytest.approx((31, 10, 0))
-    assert told.agl_m == 120.5 and told.vel_en_mps == (-1.25, 3.5) and told.prior is None
+    telemetry = flight.views[1].telemetry
+    assert telemetry.time_ns == (START_S + 1) * 10**9 + 250_000_000
+    assert (telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg) == pytest.approx(
+        (31, 10, 0)
+    )
+    assert (
+        telemetry.agl_m == 120.5
+        and telemetry.vel_en_mps == (-1.25, 3.5)
+        and telemetry.prior is None
+    )
     truth = read_truth(tmp_path / "flight/truth.csv")
     assert truth["sub/b.jpg"] == pytest.approx((46.501, -0.25), abs=1e-7)
     copied = tmp_path / "flight/frames/sub/b.jpg"
@@ -72,8 +78,8 @@ def test_the_camera_is_that_of_the_focal_length(folder):
         camera.fx_px == camera.fy_px == pytest.approx(24 * math.hypot(64, 48) / math.hypot(36, 24))
     )
     assert (camera.cx_px, camera.cy_px) == (32, 24)
-    told = open_source(folder, SourceOptions(sensor_width_mm=13.2)).camera
-    assert told.fx_px == pytest.approx(8.8 / 13.2 * 64)
+    telemetry = open_source(folder, SourceOptions(sensor_width_mm=13.2)).camera
+    assert telemetry.fx_px == pytest.approx(8.8 / 13.2 * 64)
 
 
 def test_the_focal_length_by_the_resolution_of_the_sensor(tmp_path):
@@ -106,9 +112,12 @@ def test_the_position_may_be_told_as_a_prior(folder):
 def test_xmp_in_every_form(tmp_path, suffix, as_elements):
     values = {"GimbalYawDegree": "-12.5", "GimbalPitchDegree": "-70.0", "GimbalRollDegree": "0.0"}
     xmp = packet(as_elements=as_elements, **values)
-    told = read_photo(photo(tmp_path / f"a.{suffix}", xmp=xmp))
-    assert attitude_of(told.rotation) == pytest.approx((347.5, 20, 0))
-    assert math.isnan(told.height_m) and (told.width_px, told.height_px) == (WIDTH, HEIGHT)
+    telemetry = read_photo(photo(tmp_path / f"a.{suffix}", xmp=xmp))
+    assert attitude_of(telemetry.rotation) == pytest.approx((347.5, 20, 0))
+    assert math.isnan(telemetry.height_m) and (telemetry.width_px, telemetry.height_px) == (
+        WIDTH,
+        HEIGHT,
+    )
 
 
 def test_autel(tmp_path):
@@ -119,16 +128,16 @@ def test_autel(tmp_path):
         GimbalRollDegree="0.0",
         RelativeAltitude="80.25",
     )
-    told = read_photo(photo(tmp_path / "a.jpg", xmp=xmp, make="Autel Robotics"))
-    assert attitude_of(told.rotation) == pytest.approx((90, 0, 0), abs=1e-6)
-    assert told.height_m == 80.25
+    telemetry = read_photo(photo(tmp_path / "a.jpg", xmp=xmp, make="Autel Robotics"))
+    assert attitude_of(telemetry.rotation) == pytest.approx((90, 0, 0), abs=1e-6)
+    assert telemetry.height_m == 80.25
 
 
 @pytest.mark.parametrize("make, roll", [("Sony", 4), ("senseFly", -4), ("Parrot", 4)])
 def test_angles_as_pix4d_names_them(tmp_path, make, roll):
     xmp = packet(PIX4D, Yaw="200.0", Pitch="6.0", Roll="4.0")
-    told = read_photo(photo(tmp_path / "a.jpg", xmp=xmp, make=make))
-    assert attitude_of(told.rotation) == pytest.approx((200, 6, roll))
+    telemetry = read_photo(photo(tmp_path / "a.jpg", xmp=xmp, make=make))
+    assert attitude_of(telemetry.rotation) == pytest.approx((200, 6, roll))
 
 
 @pytest.mark.parametrize(
@@ -150,30 +159,33 @@ def test_angles_as_pix4d_names_them(tmp_path, make, roll):
     ],
 )
 def test_times(tmp_path, time, more, gps, seconds, known):
-    told = read_photo(photo(tmp_path / "a.jpg", time, more=more, gps=gps))
-    assert told.time_ns == START_S * 10**9 + round(seconds * 1e9) and told.zone_known == known
+    telemetry = read_photo(photo(tmp_path / "a.jpg", time, more=more, gps=gps))
+    assert (
+        telemetry.time_ns == START_S * 10**9 + round(seconds * 1e9)
+        and telemetry.zone_known == known
+    )
 
 
 @pytest.mark.parametrize("lat, lon", [(46.5, 2.5), (-33.9, 151.2), (10.0, -179.5)])
 def test_places(tmp_path, lat, lon):
-    told = read_photo(photo(tmp_path / "a.jpg", gps=place(lat, lon)))
-    assert told.latlon_deg == pytest.approx((lat, lon), abs=1e-7) and told.alt_m == 400
+    telemetry = read_photo(photo(tmp_path / "a.jpg", gps=place(lat, lon)))
+    assert telemetry.latlon_deg == pytest.approx((lat, lon), abs=1e-7) and telemetry.alt_m == 400
 
 
 @pytest.mark.parametrize("maker", [DJI, AUTEL])
 @pytest.mark.parametrize("name", ["GpsLongitude", "GpsLongtitude"])
 def test_the_position_of_xmp_is_the_better_one(tmp_path, maker, name):
     xmp = packet(maker, GpsLatitude="+29.282190206", **{name: "-94.922448090"})
-    told = read_photo(photo(tmp_path / "a.jpg", gps=place(29.28, -94.92), xmp=xmp))
-    assert told.latlon_deg == (29.282190206, -94.92244809)
+    telemetry = read_photo(photo(tmp_path / "a.jpg", gps=place(29.28, -94.92), xmp=xmp))
+    assert telemetry.latlon_deg == (29.282190206, -94.92244809)
 
 
 def test_the_time_of_exposure_is_the_better_one(tmp_path):
     xmp = packet(UTCAtExposure="2023-11-14T22:13:20.073960")
-    told = read_photo(
+    telemetry = read_photo(
         photo(tmp_path / "a.jpg", "2023:11:14 23:13:20", more={OFFSET: None}, xmp=xmp)
     )
-    assert told.time_ns == START_S * 10**9 + 73_960_000 and told.zone_known
+    assert telemetry.time_ns == START_S * 10**9 + 73_960_000 and telemetry.zone_known
     wrong = packet(UTCAtExposure="2023-99-14T22:13:20")
     assert read_photo(photo(tmp_path / "b.jpg", xmp=wrong)).time_ns == START_S * 10**9
 
@@ -185,8 +197,8 @@ def test_what_is_not_told_is_not_known(tmp_path):
     assert view.truth_latlon_deg is None and view.telemetry.vel_en_mps is None
     photo(tmp_path / "q/a.jpg", gps=place(46.5, 2.5, alt=400.0))
     options = SourceOptions(ground_alt_m=290.0, looks_down=True)
-    told = next(open_source(tmp_path / "q", options).views).telemetry
-    assert told.missing() == ["yaw_deg"] and told.agl_m == 110.0
+    telemetry = next(open_source(tmp_path / "q", options).views).telemetry
+    assert telemetry.missing() == ["yaw_deg"] and telemetry.agl_m == 110.0
 
 
 def test_what_is_broken_is_left_out_and_said(folder, tmp_path):

@@ -38,11 +38,11 @@ def test_every_format(tmp_path, form):
     assert (done.views, done.complete, done.with_truth, done.broken) == (4, 4, 4, 0)
     written = open_flight(tmp_path / "out")
     assert (written.camera.fx_px, written.camera.cx_px, written.camera.cy_px) == (60, 32, 24)
-    told = written.views[0].telemetry
-    assert told.time_ns == MIDDLE  # of the stamp, not of the recording
-    assert told.yaw_deg == pytest.approx(355) and told.agl_m == 85
-    assert (told.pitch_deg, told.roll_deg) == pytest.approx((0, 0), abs=1e-6)
-    east, north = told.vel_en_mps
+    telemetry = written.views[0].telemetry
+    assert telemetry.time_ns == MIDDLE  # of the stamp, not of the recording
+    assert telemetry.yaw_deg == pytest.approx(355) and telemetry.agl_m == 85
+    assert (telemetry.pitch_deg, telemetry.roll_deg) == pytest.approx((0, 0), abs=1e-6)
+    east, north = telemetry.vel_en_mps
     heading = math.radians(355)
     assert (east, north) == pytest.approx((5 * math.sin(heading), 5 * math.cos(heading)))
     for view, step in zip(written.views, (5, 15, 25, 35), strict=True):
@@ -201,8 +201,8 @@ def test_topics_as_told(tmp_path, messages, topics):
     path = record(tmp_path / "flight", topics, messages)
     with pytest.raises(FlightError, match=r"found /cam/image_raw, /other/image_raw; give --topic"):
         open_source(path)
-    told = SourceOptions(topics={"image": "/cam/image_raw", "attitude": "/odom"})
-    recording = open_source(path, told)
+    telemetry = SourceOptions(topics={"image": "/cam/image_raw", "attitude": "/odom"})
+    recording = open_source(path, telemetry)
     assert "attitude /odom" in recording.note and len(list(recording.views)) == 4
     for role, name, error in (
         ("image", "/none", "no messages on /none; there are /cam/camera_info"),
@@ -216,8 +216,10 @@ def test_without_attitude_nothing_is_made_up(tmp_path, messages, topics):
     del topics["/imu/data"], topics["/odom"]
     recording = open_source(record(tmp_path / "flight", topics, messages))
     assert recording.warnings == ("no topic tells the attitude of the aircraft",)
-    told = next(recording.views).telemetry
-    assert told.missing() == ["yaw_deg", "pitch_deg", "roll_deg"] and told.vel_en_mps is None
+    telemetry = next(recording.views).telemetry
+    assert (
+        telemetry.missing() == ["yaw_deg", "pitch_deg", "roll_deg"] and telemetry.vel_en_mps is None
+    )
 
 
 def test_no_fix_is_no_position(tmp_path, messages, topics):
@@ -253,8 +255,8 @@ def test_a_camera_file_and_a_log_may_stand_in(tmp_path, messages, topics):
     camera = camera_file(tmp_path / "camera.json", width_px=128, height_px=96)
     recording = open_source(path, SourceOptions(camera=camera, telemetry=log))
     assert recording.camera.width_px == 64
-    told = next(recording.views).telemetry
-    assert told.missing() == [] and told.yaw_deg == pytest.approx(352)
+    telemetry = next(recording.views).telemetry
+    assert telemetry.missing() == [] and telemetry.yaw_deg == pytest.approx(352)
 
 
 @pytest.mark.parametrize("form", [*FORMATS, "file"])
@@ -270,8 +272,8 @@ def test_a_damaged_recording_is_one_error(tmp_path, form, how, capfd):
     )
     with pytest.raises(FlightError) as caught:
         import_flight(open_source(path), tmp_path / "out")
-    told = str(caught.value)
-    assert "\n" not in told and str(path) in told and len(told) < 600
+    telemetry = str(caught.value)
+    assert "\n" not in telemetry and str(path) in telemetry and len(telemetry) < 600
     assert not (tmp_path / "out").exists()
 
 

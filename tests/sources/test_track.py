@@ -12,7 +12,7 @@ from orthonav.geo.camera import enu_from_camera
 from orthonav.records import Prior
 from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
 from orthonav.sources.options import SourceOptions
-from orthonav.sources.recording import as_told, check_overlap, fitted
+from orthonav.sources.recording import check_overlap, fitted, with_options
 from orthonav.sources.track import GAP_NS, Samples, Track, angles_at, attitude_of_angles
 
 S = 10**9
@@ -22,7 +22,9 @@ def attitudes(*samples):
     collected = Samples(3)
     for time_s, *angles in samples:
         collected.add(round(time_s * S), *angles)
-    return attitude_of_angles(collected, lambda told: enu_from_body_camera(ned_from_angles(told)))
+    return attitude_of_angles(
+        collected, lambda telemetry: enu_from_body_camera(ned_from_angles(telemetry))
+    )
 
 
 @pytest.mark.parametrize(
@@ -110,10 +112,15 @@ def test_the_better_height_counts_where_it_is_there():
 
 def test_what_the_options_add():
     telemetry = Track(None).telemetry(0)
-    told = as_told(telemetry, (46.0, 2.0), SourceOptions(prior_std_m=30.0, looks_down=True))
-    assert told.prior == Prior(46.0, 2.0, 30.0) and (told.pitch_deg, told.roll_deg) == (0, 0)
-    assert math.isnan(told.yaw_deg)
-    assert as_told(telemetry, None, SourceOptions(prior_std_m=30.0)).prior is None
+    telemetry = with_options(
+        telemetry, (46.0, 2.0), SourceOptions(prior_std_m=30.0, looks_down=True)
+    )
+    assert telemetry.prior == Prior(46.0, 2.0, 30.0) and (
+        telemetry.pitch_deg,
+        telemetry.roll_deg,
+    ) == (0, 0)
+    assert math.isnan(telemetry.yaw_deg)
+    assert with_options(telemetry, None, SourceOptions(prior_std_m=30.0)).prior is None
 
 
 @pytest.mark.parametrize(

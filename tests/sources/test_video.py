@@ -75,10 +75,10 @@ def test_a_table_beside_the_video(tmp_path):
         "0,350,1,0,100,3,5,0,46.5,2.5\n2,10,3,0,104,3,5,2,46.502,2.5\n3,10,3,0,104,,,,,\n"
     )
     views = list(open_source(path, options(path)).views)
-    told = views[1].telemetry
-    assert (told.pitch_deg, told.agl_m) == pytest.approx((2, 102), abs=0.02)
-    assert (told.yaw_deg + 180) % 360 == pytest.approx(180, abs=0.02)
-    assert told.yaw_std_deg == 3 and told.vel_en_mps == (5.0, 1.0)
+    telemetry = views[1].telemetry
+    assert (telemetry.pitch_deg, telemetry.agl_m) == pytest.approx((2, 102), abs=0.02)
+    assert (telemetry.yaw_deg + 180) % 360 == pytest.approx(180, abs=0.02)
+    assert telemetry.yaw_std_deg == 3 and telemetry.vel_en_mps == (5.0, 1.0)
     assert views[1].truth_latlon_deg == pytest.approx((46.501, 2.5))
     assert views[2].telemetry.agl_m == 104
     (tmp_path / "a.csv").write_text("time_s,pitch_deg,roll_deg\n0,0,0\n1,0,0\nx,0,0\n")
@@ -139,9 +139,9 @@ def test_dialects(tmp_path, dialect, encoding):
     path = subtitles(tmp_path / "a.srt", [text, text], encoding=encoding)
     first, second = blocks(path.read_bytes())
     assert (first.start_ns, first.end_ns, second.end_ns) == (0, 10**8, 2 * 10**8)
-    told = (first.lat_deg, first.lon_deg, first.height_m, first.alt_m)
-    told += (first.yaw_deg, first.pitch_deg, first.roll_deg)
-    assert told == pytest.approx(expected, nan_ok=True)
+    telemetry = (first.lat_deg, first.lon_deg, first.height_m, first.alt_m)
+    telemetry += (first.yaw_deg, first.pitch_deg, first.roll_deg)
+    assert telemetry == pytest.approx(expected, nan_ok=True)
 
 
 def test_windows_lines_and_long_times(tmp_path):
@@ -165,8 +165,8 @@ def test_without_gimbal_angles_nothing_is_made_up(tmp_path):
     texts = ["GPS(2.5,46.5,16) BAROMETER:91.9"] * 30
     subtitles(tmp_path / "a.srt", texts)
     camera_file(tmp_path / "camera.json")
-    told = next(open_source(path, options(path)).views).telemetry
-    assert told.missing() == ["yaw_deg", "pitch_deg", "roll_deg"] and told.agl_m == 91.9
+    telemetry = next(open_source(path, options(path)).views).telemetry
+    assert telemetry.missing() == ["yaw_deg", "pitch_deg", "roll_deg"] and telemetry.agl_m == 91.9
     level = next(open_source(path, options(path, looks_down=True)).views).telemetry
     assert level.missing() == ["yaw_deg"]
 

@@ -7,7 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthonav.track import CameraWay, Mixture, Model, Sighting, State, Told, ToldVelocity
+from orthonav.track import (
+    CameraDisplacement,
+    Mixture,
+    Model,
+    ReportedVelocity,
+    Sighting,
+    State,
+    Told,
+)
 from orthonav.track.hypotheses import within
 from orthonav.track.smooth import History
 
@@ -36,19 +44,19 @@ class Flight:
         cos, sin = math.cos(-self.bias[0]), math.sin(-self.bias[0])
         told = np.array([[cos, sin], [-sin, cos]]) @ way * math.exp(-self.bias[1])
         noisy = told + self.rng.normal(0, 0.5, 2)
-        return CameraWay(noisy, np.eye(2) * 0.25, 80.0)
+        return CameraDisplacement(noisy, np.eye(2) * 0.25, 80.0)
 
     def told(self):
         """What instruments say: level and north, where the truth is the biases and noise."""
         return Told(0.0, 0.0, 0.0)
 
     def sighting(self, log_odds=4.0, at=None):
-        """The view's own place, or a false one: lean and position err together."""
+        """The view's own place, or a false one: tilt and position err together."""
         spread = np.diag([4.0, 4.0, 1e-4, 1e-4, 4e-4, 4e-4])
         spread[0, 4] = spread[4, 0] = 0.7 * math.sqrt(4.0 * 4e-4)
         error = self.rng.multivariate_normal(np.zeros(6), spread)
         error[:2] += self.rng.normal(0, self.model.sighting_noise_m, 2)
-        error[4:] += self.rng.normal(0, self.model.lean_noise_rad, 2)
+        error[4:] += self.rng.normal(0, self.model.tilt_noise_rad, 2)
         mean = np.concatenate([self.place if at is None else at, self.bias]) + error
         return Sighting(mean, spread, log_odds)
 
@@ -251,7 +259,7 @@ def test_unknown_heading_is_followed():
     for view in range(30):
         if view:
             seen = flight.moved()
-            mixture.predict(1.0, ToldVelocity(seen.moved_en_m, None, 0.7))
+            mixture.predict(1.0, ReportedVelocity(seen.moved_en_m, None, 0.7))
         sighting = flight.sighting(2.0)
         turned = sighting.mean + np.array([0, 0, 2.2, 0, 0, 0])
         mixture.update(Told(None, 0.0, 0.0), [replace(sighting, mean=turned)])
@@ -275,8 +283,8 @@ def test_a_way_that_cannot_be_is_not_followed():
     before = None
     for _ in range(12):
         flight.moved()
-        wrong = CameraWay(3 * SPEED, np.eye(2) * 0.25, 80.0)
-        mixture.predict(1.0, ToldVelocity(SPEED, before, 1.0), wrong)
+        wrong = CameraDisplacement(3 * SPEED, np.eye(2) * 0.25, 80.0)
+        mixture.predict(1.0, ReportedVelocity(SPEED, before, 1.0), wrong)
         before = SPEED
         mixture.update(flight.told(), [])
     estimate = mixture.estimate(RADIUS_M)
@@ -290,7 +298,7 @@ def test_a_sudden_turn_is_followed_where_no_velocity_is_told():
         flight.place = flight.place + way
         cos, sin = math.cos(-BIAS[0]), math.sin(-BIAS[0])
         told = np.array([[cos, sin], [-sin, cos]]) @ way * math.exp(-BIAS[1])
-        mixture.predict(1.0, camera=CameraWay(told, np.eye(2) * 0.25, 80.0))
+        mixture.predict(1.0, camera=CameraDisplacement(told, np.eye(2) * 0.25, 80.0))
         mixture.update(flight.told(), [])
     assert off_m(mixture, flight) < 10
 
@@ -315,7 +323,7 @@ def test_a_told_velocity_that_is_off_for_long_is_learnt():
     for second in range(90):
         way = flight.moved()
         seen = second < 60
-        mixture.predict(1.0, ToldVelocity(told, before, 1.5), way if seen else None)
+        mixture.predict(1.0, ReportedVelocity(told, before, 1.5), way if seen else None)
         before = told
         if seen:
             mixture.update(flight.told(), [flight.sighting(4.0)])
@@ -333,20 +341,20 @@ def test_a_place_that_is_known_well_is_not_merged_into_a_wide_guess():
     assert min(std) < 20 and max(std) > 100
 
 
-@pytest.mark.parametrize(("lean_deg", "found"), [(0.0, 0.0), (7.0, 7.0)])
-def test_a_mount_is_good_unless_views_say_otherwise(lean_deg, found):
-    bias = np.array([0.0, 0.0, math.radians(lean_deg), 0.0])
+@pytest.mark.parametrize(("tilt_deg", "found"), [(0.0, 0.0), (7.0, 7.0)])
+def test_a_mount_is_good_unless_views_say_otherwise(tilt_deg, found):
+    bias = np.array([0.0, 0.0, math.radians(tilt_deg), 0.0])
     flight, mixture = Flight(9, bias=bias), Mixture(MODEL, EXTENT)
     for view in range(15):
         if view:
             mixture.predict(1.0, camera=flight.moved())
         mixture.update(flight.told(), [flight.sighting(5.0)])
-    lean = math.degrees(mixture.estimate(RADIUS_M).mean[6])
-    assert lean == pytest.approx(found, abs=1.0)
+    tilt = math.degrees(mixture.estimate(RADIUS_M).mean[6])
+    assert tilt == pytest.approx(found, abs=1.0)
 
 
-def test_how_a_view_leans_is_no_evidence_for_its_place():
-    """Views of elsewhere that lean as expected are not believed for that."""
+def test_how_a_view_tilts_is_no_evidence_for_its_place():
+    """Views of elsewhere that tilt as expected are not believed for that."""
     flight, mixture = Flight(10), Mixture(MODEL, EXTENT)
     false = flight.place + np.array([300.0, 0.0])
     for view in range(8):
@@ -374,7 +382,7 @@ def test_after_a_while_without_views_one_is_no_track():
 
 
 def test_measured_positions_teach_the_mount():
-    """Views that show no lean of their own: where they are put beside GNSS tells it."""
+    """Views that show no tilt of their own: where they are put beside GNSS tells it."""
     bias = np.array([0.0, 0.0, math.radians(5.0), 0.0])
     flight, mixture = Flight(12, bias=bias), Mixture(MODEL, EXTENT)
     weak, height_m = math.radians(20.0), 100.0

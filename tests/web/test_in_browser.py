@@ -115,7 +115,7 @@ def test_the_worst_view_with_its_pictures_and_numbers(page, small, ask):
     east_m, north_m = FRAME.en_from_latlon(fix["lat_deg"], fix["lon_deg"])
     error_m = np.hypot(east_m - PLACES_EN_M[WRONG][0], north_m - PLACES_EN_M[WRONG][1])
     for part in (
-        f"tracking, error {error_m:.1f} m, SURE AND WRONG",
+        f"tracking, error {error_m:.1f} m, CONFIDENT AND WRONG",
         f"confidence {fix['confidence']:.3f} within {fix['radius_m']:.1f} m",
         f"\N{GREEK SMALL LETTER SIGMA} {spread_m:.1f} m, heading {fix['heading_deg']:.1f}°",
         f"{fix['agl_m']:.1f} m high",

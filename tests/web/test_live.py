@@ -118,7 +118,7 @@ def test_a_file_that_goes_away_is_told_of(fixes, small):
     assert news["count"] == 1 and "is a folder" in news["problems"][0]
 
 
-def told(i):
+def telemetry(i):
     return Telemetry((100 + i) * 10**9, 40.0 + 10 * i, 4.0, -3.0, 60.0)
 
 
@@ -133,7 +133,7 @@ def write_log(folder, numbers, *, views="full", close=True):
 def fly(log, numbers):
     for i in numbers:
         grey = np.random.default_rng(i).integers(0, 256, (240, 320), dtype=np.uint8)
-        log.view(i, result(i).frame, grey, told(i))
+        log.view(i, result(i).frame, grey, telemetry(i))
         log.result(result(i))
         log.health(HEALTH)
 
@@ -162,7 +162,7 @@ def test_a_log_while_it_is_written(tmp_path):
     assert [each.frame for each in later] == [result(2).frame, result(3).frame]
     assert [before for before, _ in health] == [3, 4]
     shot = reader.shot(result(3).frame)
-    assert shot.camera == CAMERA and shot.telemetry == told(3)
+    assert shot.camera == CAMERA and shot.telemetry == telemetry(3)
     expected = np.random.default_rng(3).integers(0, 256, (240, 320), dtype=np.uint8)
     assert np.array_equal(shot.load(), expected)
 

@@ -105,7 +105,7 @@ def test_tiles_at_the_border_and_without_imagery(ask):
 
 
 def test_a_view_lies_on_the_map_where_its_fix_has_it(ask):
-    """Turned by the heading and leaning, a right one shows the ground of the map, a wrong not."""
+    """Turned by the heading and tilted, a right one shows the ground of the map, a wrong not."""
     for i in (0, WRONG):
         window = as_json(ask(f"/api/views/{i}"))["window"]
         view = as_picture(ask(f"/api/views/{i}/view.png"))

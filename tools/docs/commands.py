@@ -16,7 +16,7 @@ from sphinx.util.docutils import SphinxDirective
 from orthonav.cli import COMMANDS, _parser
 
 log = logging.getLogger(__name__)
-EVERYWHERE = ("--help", "--verbose", "--quiet")
+EVERYWHERE = ("--help", "--help-all", "--verbose", "--quiet")
 """Options of every command: described once, at the top of the page."""
 USAGE_COLUMNS = 84
 
@@ -53,7 +53,7 @@ class Command(SphinxDirective):
 
 def command_parser(name: str) -> argparse.ArgumentParser:
     """The parser of one command, with all its arguments."""
-    for action in _parser([name])._actions:
+    for action in _parser([name, "--help-all"])._actions:
         if isinstance(action, argparse._SubParsersAction):
             return action.choices[name]
     raise LookupError(name)

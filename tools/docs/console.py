@@ -1,12 +1,13 @@
-"""The console blocks of a tutorial: reading them, running them, writing what they print.
+"""The commands of a tutorial: reading them, running them, writing what they print.
 
     python tools/docs/console.py docs/tutorials/operator.md            run it in an empty folder
     python tools/docs/console.py --update docs/tutorials/operator.md   and write what was printed
 
-A block is a fence of the language `console`: a command after `$ `, on further lines while they end
-with a backslash, and below it what it prints. A line of `...` stands for any lines left out, ` ...`
-at the end of one for the rest of it. Blocks after `<!-- not run -->` are for the reader alone: they
-wait for a person, a network or hours.
+A fence of the language `bash` holds commands, each on one line or on several that end with a
+backslash, so that a reader can copy it. A fence of the language `text` right below holds what they
+print. A line of `...` there stands for any lines left out, ` ...` at the end of one for the rest of
+it. Blocks after `<!-- not run -->` are for the reader alone: they wait for a person, a network or
+hours.
 """
 
 import argparse
@@ -32,18 +33,26 @@ LIMIT_S = 1800
 
 @dataclass(frozen=True)
 class Step:
-    """One command of a tutorial, what is shown below it, and where it stands (lines from 0)."""
+    """A block of commands and the output shown below it.
 
-    command: str
+    `first` and `end` are the lines (from 0) of the shown output; equal, where none is shown.
+    """
+
+    commands: tuple[str, ...]
     shown: tuple[str, ...]
     first: int
     end: int
     is_run: bool
 
+    @property
+    def command(self) -> str:
+        """All commands as one text."""
+        return "\n".join(self.commands)
+
 
 @dataclass(frozen=True)
 class Printed:
-    """What a step printed, stdout and stderr together, and the code it ended with."""
+    """Output of a step, stdout and stderr together, and the exit code of its last command."""
 
     lines: tuple[str, ...]
     code: int
@@ -53,33 +62,46 @@ def read_steps(text: str) -> list[Step]:
     """All steps of a page, in order."""
     lines = text.splitlines()
     steps: list[Step] = []
-    for begin, end in _blocks(lines):
+    for begin, end in _blocks(lines, "```bash"):
         is_run = NOT_RUN not in [line for line in lines[max(0, begin - 3) : begin - 1] if line]
-        row = begin
-        while row < end:
-            if not lines[row].startswith("$ "):
-                raise ValueError(f"line {row + 1}: expected a command after '$ '")
-            last = row
-            while lines[last].endswith("\\"):
-                last += 1
-            after = last + 1
-            while after < end and not lines[after].startswith("$ "):
-                after += 1
-            command = "\n".join([lines[row][2:], *lines[row + 1 : last + 1]])
-            steps.append(Step(command, tuple(lines[last + 1 : after]), last + 1, after, is_run))
-            row = after
+        first, last = _output_after(lines, end)
+        commands = tuple(_commands(lines[begin:end]))
+        if not commands:
+            raise ValueError(f"line {begin}: a block without a command")
+        steps.append(Step(commands, tuple(lines[first:last]), first, last, is_run))
     return steps
 
 
-def _blocks(lines: list[str]) -> Iterator[tuple[int, int]]:
-    """First line after the opening fence, and the closing fence, of each console block."""
+def _blocks(lines: list[str], fence: str) -> Iterator[tuple[int, int]]:
+    """First line after the opening fence, and the closing fence, of each block."""
     begin = None
     for row, line in enumerate(lines):
-        if line == "```console":
+        if begin is None and line == fence:
             begin = row + 1
         elif line.startswith("```") and begin is not None:
             yield begin, row
             begin = None
+
+
+def _output_after(lines: list[str], fence: int) -> tuple[int, int]:
+    """Lines of the `text` block that follows a closing fence, with only blank lines between."""
+    row = fence + 1
+    while row < len(lines) and not lines[row].strip():
+        row += 1
+    if row < len(lines) and lines[row] == "```text":
+        return row + 1, next(at for at in range(row + 1, len(lines)) if lines[at] == "```")
+    return fence, fence
+
+
+def _commands(lines: list[str]) -> Iterator[str]:
+    """Commands, each with the lines it continues on."""
+    command: list[str] = []
+    for line in lines:
+        command.append(line)
+        if not line.endswith("\\"):
+            if "".join(command).strip():
+                yield "\n".join(command)
+            command = []
 
 
 def calls(command: str) -> Iterator[list[str]]:
@@ -105,9 +127,10 @@ def calls(command: str) -> Iterator[list[str]]:
 
 
 def run_steps(steps: list[Step], folder: Path) -> list[Printed]:
-    """Run steps in a folder as one shell session; raises `RuntimeError` where one fails."""
-    script = "\n".join(f"{step.command}\nprintf '\\n{MARK} %d\\n' $?" for step in steps) + "\n"
-    told = subprocess.run(
+    """Run steps in a folder as one shell session; raises `RuntimeError` where a command fails."""
+    commands = [command for step in steps for command in step.commands]
+    script = "\n".join(f"{command}\nprintf '\\n{MARK} %d\\n' $?" for command in commands) + "\n"
+    done = subprocess.run(
         ["bash", "-c", script],
         cwd=folder,
         env=_environment(),
@@ -118,22 +141,36 @@ def run_steps(steps: list[Step], folder: Path) -> list[Printed]:
         timeout=LIMIT_S,
         check=False,
     )
-    pieces = re.split(rf"\n{MARK} (\d+)\n", "\n" + told.stdout)
-    printed = []
-    for step, text, code in zip(steps, pieces[0::2], pieces[1::2], strict=False):
-        printed.append(Printed(tuple(text.strip("\n").splitlines()), int(code)))
-        allowed = VERDICTS if step.command.startswith("orthonav check") else (0,)
+    pieces = re.split(rf"\n{MARK} (\d+)\n", "\n" + done.stdout)
+    outputs = []
+    for command, text, code in zip(commands, pieces[0::2], pieces[1::2], strict=False):
+        outputs.append(Printed(tuple(text.strip("\n").splitlines()), int(code)))
+        allowed = VERDICTS if command.startswith("orthonav check") else (0,)
         if int(code) not in allowed:
-            raise RuntimeError(f"'{step.command}' ended with {code}:\n{text.strip()}")
-    if len(printed) < len(steps):
-        raise RuntimeError(f"'{steps[len(printed)].command}' ended the shell")
-    return printed
+            raise RuntimeError(f"'{command}' ended with {code}:\n{text.strip()}")
+    if len(outputs) < len(commands):
+        raise RuntimeError(f"'{commands[len(outputs)]}' ended the shell")
+    ordered = iter(outputs)
+    return [_joined([next(ordered) for _ in step.commands]) for step in steps]
+
+
+def _joined(outputs: list[Printed]) -> Printed:
+    return Printed(tuple(line for each in outputs for line in each.lines), outputs[-1].code)
 
 
 def _environment() -> dict[str, str]:
     """The environment of a reader who activated this interpreter's environment."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
-    return {**os.environ, "PATH": path, "COLUMNS": "100", "checkout": str(ROOT)}
+    return {**os.environ, "PATH": path, "COLUMNS": "100"}
+
+
+def _link_checkout(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    targets = {".venv": Path(sys.prefix), "examples": ROOT / "examples"}
+    for name, target in {**targets, "experiments": ROOT / "experiments"}.items():
+        link = folder.parent / name
+        if not link.exists():
+            link.symlink_to(target)
 
 
 def is_as_shown(shown: tuple[str, ...], lines: tuple[str, ...]) -> bool:
@@ -155,35 +192,42 @@ def masked(line: str) -> str:
 
 
 def check_page(page: Path, folder: Path, steps: list[Step] | None = None) -> list[str]:
-    """Run a tutorial in a folder; what was printed otherwise than shown, a line for each step."""
+    """Run a tutorial in a folder; one message for each step that did not print what is shown.
+
+    The folder stands for one inside the checkout: links to what a tutorial uses of the checkout
+    are made beside it.
+    """
+    _link_checkout(folder)
     wanted = [step for step in steps or read_steps(page.read_text("utf-8")) if step.is_run]
     return [
-        f"{page.name}:{step.first + 1}: '{step.command}' printed\n" + "\n".join(told.lines)
-        for step, told in zip(wanted, run_steps(wanted, folder), strict=True)
-        if not is_as_shown(step.shown, told.lines)
+        f"{page.name}:{step.first + 1}: '{step.command}' printed\n" + "\n".join(printed.lines)
+        for step, printed in zip(wanted, run_steps(wanted, folder), strict=True)
+        if not is_as_shown(step.shown, printed.lines)
     ]
 
 
 def update_page(page: Path, folder: Path) -> None:
-    """Run a tutorial and write what it printed; what is shown in part stays as it is."""
+    """Run a tutorial and write what it printed; output shown in part stays as it is."""
+    _link_checkout(folder)
     lines = page.read_text("utf-8").splitlines()
     wanted = [step for step in read_steps(page.read_text("utf-8")) if step.is_run]
-    for step, told in reversed(list(zip(wanted, run_steps(wanted, folder), strict=True))):
-        if not any(line.endswith(ELIDED) for line in step.shown):
-            lines[step.first : step.end] = told.lines
+    for step, printed in reversed(list(zip(wanted, run_steps(wanted, folder), strict=True))):
+        if step.shown and not any(line.endswith(ELIDED) for line in step.shown):
+            lines[step.first : step.end] = printed.lines
     page.write_text("\n".join(lines) + "\n", "utf-8")
 
 
 def main() -> int:
-    """Run or update pages; 1 where something is printed otherwise than shown."""
+    """Run or update pages; 1 where the output differs from what is shown."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("page", type=Path)
     parser.add_argument("--update", action="store_true", help="write what is printed into the page")
     parser.add_argument("--folder", type=Path, help="default: a temporary one")
     options = parser.parse_args()
     with contextlib.ExitStack() as stack:
-        folder = options.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        folder.mkdir(parents=True, exist_ok=True)
+        folder = options.folder
+        if folder is None:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "tutorial"
         if options.update:
             update_page(options.page, folder)
             return 0

@@ -65,7 +65,7 @@ def main() -> int:
     shutil.rmtree(PICTURES, ignore_errors=True)
     PICTURES.mkdir(parents=True)
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+        folder = Path(name) / "tutorial"
         print(f"running {TUTORIAL.relative_to(ROOT)} for its pictures", flush=True)
         differences = check_page(TUTORIAL, folder, steps)
         if differences:

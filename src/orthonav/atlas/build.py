@@ -53,7 +53,7 @@ __all__ = [
 
 log = logging.getLogger(__name__)
 
-TOLD_EVERY_S = 10.0
+PROGRESS_EVERY_S = 10.0
 GIVE_UP_AFTER = 8
 """So many sheets in a row that could not be stored end a build: the disk is full, or away."""
 LEARNT = ("autoencoder", "triplet")
@@ -233,7 +233,7 @@ def _work(
     tell: Callable[[str], None],
 ) -> None:
     """Have the sheets built; `tally` knows what came of them."""
-    told_s = time.monotonic()
+    progress_s = time.monotonic()
     in_a_row = 0
     gpu = recipe.method.partition(":")[0] in LEARNT
     finished = runner.run(build_sheet, todo, gpu=gpu)
@@ -251,8 +251,8 @@ def _work(
             tell(f"{in_a_row} sheets in a row could not be stored: the others are not tried")
             getattr(finished, "close", lambda: None)()
             return
-        if time.monotonic() - told_s >= TOLD_EVERY_S:
-            told_s = time.monotonic()
+        if time.monotonic() - progress_s >= PROGRESS_EVERY_S:
+            progress_s = time.monotonic()
             tell(tally.line())
 
 

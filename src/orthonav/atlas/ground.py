@@ -12,16 +12,15 @@ from numpy.typing import NDArray
 from orthonav.atlas.catalog import Atlas
 from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.errors import AtlasError, MapFileError
-from orthonav.geo.camera import Camera
 from orthonav.geo.frames import LocalFrame
 from orthonav.localizer import Localizer
 from orthonav.localizer.registration import (
     PRIOR_SIGMAS,
-    PreparedFootprint,
+    PreparedView,
     RegistrationLocalizer,
 )
 from orthonav.mapfile import open_map
-from orthonav.records import NoFix, Prior, Telemetry
+from orthonav.records import NoFix, Prior, View
 from orthonav.register.pose import Pose
 from orthonav.register.registrar import Registered
 
@@ -65,15 +64,6 @@ class Sighting:
     radius_m: float
 
 
-@dataclass(frozen=True, eq=False)
-class ViewOnGround:
-    """A view and what is told of it, to be registered on any sheet."""
-
-    grey: NDArray[np.uint8]
-    camera: Camera
-    telemetry: Telemetry
-
-
 class Ground:
     """Sheets of an atlas with registration layers. Not to be shared between threads."""
 
@@ -83,7 +73,7 @@ class Ground:
         self._open: OrderedDict[str, RegistrationLocalizer] = OrderedDict()
         self._absent: set[str] = set()
 
-    def register(self, view: ViewOnGround, place: Place, side_m: float) -> Sighting | None:
+    def register(self, view: View, place: Place, side_m: float) -> Sighting | None:
         """The best place of a view `side_m` wide around a place, None where it cannot be compared.
 
         On every sheet that may hold the middle of the view: sheets reach half a tile beyond their
@@ -133,9 +123,9 @@ class Ground:
             return None
 
 
-def _registered(sheet: RegistrationLocalizer, view: ViewOnGround, place: Place) -> Sighting | None:
+def _registered(sheet: RegistrationLocalizer, view: View, place: Place) -> Sighting | None:
     told = replace(view.telemetry, yaw_deg=math.degrees(place.turn_rad))
-    prepared = sheet.prepared(view.grey, view.camera, told, True)
+    prepared = sheet.prepared(replace(view, telemetry=told), True)
     if isinstance(prepared, NoFix):
         return None
     prior = replace(prepared.prior, turn_rad=place.turn_rad, turn_std_rad=place.turn_std_rad)
@@ -147,7 +137,7 @@ def _registered(sheet: RegistrationLocalizer, view: ViewOnGround, place: Place) 
     return None if best is None else _sighting(sheet, prepared, best)
 
 
-def _sighting(sheet: RegistrationLocalizer, view: PreparedFootprint, best: Registered) -> Sighting:
+def _sighting(sheet: RegistrationLocalizer, view: PreparedView, best: Registered) -> Sighting:
     pose: Pose = best.placed.pose
     lat, lon = sheet.sheet.frame.latlon_from_en(sheet.camera_en_m(view, pose))
     return Sighting(

@@ -25,7 +25,7 @@ from orthonav.atlas.vector_search import ShardedIndex
 from orthonav.embed.bank import embed_poses
 from orthonav.errors import AtlasError
 from orthonav.geo.frames import distances_m
-from orthonav.localizer.rectify import Rectified
+from orthonav.localizer.rectify import RectifiedView
 from orthonav.variants import make_variant
 
 PER_POSE = 60
@@ -88,7 +88,9 @@ class AtlasLookup:
     def __len__(self) -> int:
         return len(self._index)
 
-    def queries(self, view: Rectified, poses: Sequence[tuple[float, float]]) -> NDArray[np.float32]:
+    def queries(
+        self, view: RectifiedView, poses: Sequence[tuple[float, float]]
+    ) -> NDArray[np.float32]:
         """Vectors (Q, D) of a view at the resolution of the coarse tiles, under poses."""
         embedded = embed_poses(
             self._embedder,
@@ -102,7 +104,7 @@ class AtlasLookup:
 
     def candidates(
         self,
-        view: Rectified,
+        view: RectifiedView,
         poses: Sequence[tuple[float, float]],
         count: int,
         *,

@@ -13,7 +13,6 @@ from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthonav.atlas.agreement import (
     MAX_REACH_M,
@@ -22,15 +21,14 @@ from orthonav.atlas.agreement import (
     Hypothesis,
     Seen,
 )
-from orthonav.atlas.ground import Ground, Place, Sighting, ViewOnGround
+from orthonav.atlas.ground import Ground, Place, Sighting
 from orthonav.atlas.recipe import CoarseRecipe
 from orthonav.confidence.registered import USUAL_BIAS, USUAL_WEIGHTS, RegisteredConfidence
-from orthonav.geo.camera import Camera
 from orthonav.geo.frames import LocalFrame, distances_m
-from orthonav.localizer.checks import check_footprint, check_telemetry, check_view, require_camera
-from orthonav.localizer.rectify import Rectified, prepare_view, rectify_footprint
+from orthonav.localizer.checks import check_footprint, check_view
+from orthonav.localizer.rectify import RectifiedView, downsampled, rectify_footprint
 from orthonav.localizer.registration import USUAL_CHANCES
-from orthonav.records import Fix, NoFix, Telemetry
+from orthonav.records import Fix, NoFix, Telemetry, View
 
 CANDIDATES = 24
 """Places of the whole atlas that are registered."""
@@ -48,7 +46,7 @@ FOLLOWED, FOLLOWED_NATS = 4, 4.0
 best by more than this."""
 RIVAL_SHARE = 0.25
 """A rival lies farther from a place than this share of the view's side."""
-SURE_VIEWS, SURE, SURE_REACH_M = 2.5, 0.97, 600.0
+SURE_VIEWS, CONFIDENT, SURE_REACH_M = 2.5, 0.97, 600.0
 """A hypothesis this sure, and this sure of where the view is, is followed without looking through
 the whole atlas."""
 WHOLE_EVERY = 5
@@ -81,7 +79,7 @@ class Lookup(Protocol):
         """How they were cut."""
 
     def candidates(
-        self, view: Rectified, poses: Sequence[tuple[float, float]], count: int
+        self, view: RectifiedView, poses: Sequence[tuple[float, float]], count: int
     ) -> list[Candidate]:
         """Tiles most like the view under some of the poses, best first, apart from each other."""
 
@@ -104,29 +102,27 @@ class LostLocator:
             return "searching"
         return "tracking" if self._agreement.agreed and self._seen_last else "lost"
 
-    def passed(self, camera: Camera, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+    def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """Nothing is known of a view that cannot be used."""
         self._seen_last = False
         return reason
 
-    def locate(self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry) -> Fix | NoFix:
-        """Where `grey` (H, W) was taken, once views agree; until then what is missing.
+    def locate(self, view: View) -> Fix | NoFix:
+        """Where a view was taken, once views agree; until then what is missing.
 
         Raises `CameraError` where the image is not the camera's, `StorageError` where the sheets
         cannot be fetched.
         """
         self._seen_last = False
-        require_camera(grey, camera)
         recipe = self._lookup.recipe
-        refused = check_telemetry(telemetry, camera, recipe.gsd_m, self._heading_known)
-        refused = refused or check_view(grey)
+        refused = check_view(view, recipe.gsd_m, self._heading_known)
         if refused is not None:
             return refused
-        view = _rectified(grey, camera, telemetry, recipe.gsd_m)
-        refused = check_footprint(view, 1.0, MIN_VIEW_PX)
+        coarse = _rectified(view, recipe.gsd_m)
+        refused = check_footprint(coarse, 1.0, MIN_VIEW_PX)
         if refused is not None:
             return refused
-        side_m = math.sqrt(float(view.valid.sum())) * recipe.gsd_m
+        side_m = math.sqrt(float(coarse.valid.sum())) * recipe.gsd_m
         least, most = (share * recipe.tile_m for share in VIEW_TILES)
         if not least <= side_m <= most:
             return NoFix(
@@ -134,12 +130,12 @@ class LostLocator:
                 f"view is {side_m:.0f} m wide; the coarse tiles of this atlas are for views of "
                 f"{least:.0f} to {most:.0f} m",
             )
-        return self._placed(ViewOnGround(grey, camera, telemetry), view, side_m)
+        return self._placed(view, coarse, side_m)
 
-    def _placed(self, view: ViewOnGround, coarse: Rectified, side_m: float) -> Fix | NoFix:
+    def _placed(self, view: View, coarse: RectifiedView, side_m: float) -> Fix | NoFix:
         time_ns = view.telemetry.time_ns
         places = expected = self._expected(view, coarse, time_ns)
-        if self._is_sure(time_ns, side_m):
+        if self._is_confident(time_ns, side_m):
             self._since_whole += 1
         else:
             self._since_whole = 0
@@ -156,19 +152,19 @@ class LostLocator:
         self._agreement.see(seen, time_ns, side_m, chance)
         return self._outcome(found, view)
 
-    def _is_sure(self, time_ns: int, side_m: float) -> bool:
+    def _is_confident(self, time_ns: int, side_m: float) -> bool:
         """Whether it is enough to look where the view is expected; not for ever."""
         best = self._agreement.best
         return (
             best is not None
             and self._agreement.agreed
             and best.views >= SURE_VIEWS
-            and self._agreement.confidence >= SURE
+            and self._agreement.confidence >= CONFIDENT
             and best.reach_m(time_ns) <= max(side_m, SURE_REACH_M)
             and self._since_whole < WHOLE_EVERY
         )
 
-    def _expected(self, view: ViewOnGround, coarse: Rectified, time_ns: int) -> list[Place]:
+    def _expected(self, view: View, coarse: RectifiedView, time_ns: int) -> list[Place]:
         """Where hypotheses expect the view."""
         found = []
         hypotheses = self._agreement.hypotheses[:FOLLOWED]
@@ -188,7 +184,7 @@ class LostLocator:
             found.append(Place(*camera, middle, turn, scale, reach_m, std))
         return found
 
-    def _candidates(self, view: ViewOnGround, coarse: Rectified) -> list[Place]:
+    def _candidates(self, view: View, coarse: RectifiedView) -> list[Place]:
         """Places of the whole atlas that are like the view."""
         headings = np.arange(0.0, 360.0, TURN_STEP_DEG)
         if self._heading_known:
@@ -207,7 +203,7 @@ class LostLocator:
             )
         return found
 
-    def _outcome(self, found: Sequence[Sighting], view: ViewOnGround) -> Fix | NoFix:
+    def _outcome(self, found: Sequence[Sighting], view: View) -> Fix | NoFix:
         agreement = self._agreement
         best = agreement.best
         if best is None:
@@ -243,22 +239,13 @@ def _log_odds(key: int, found: Sequence[Sighting]) -> float:
     return math.log(likely / (1 - likely))
 
 
-def _rectified(
-    grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry, gsd_m: float
-) -> Rectified:
+def _rectified(view: View, gsd_m: float) -> RectifiedView:
     """The view at the resolution of the coarse tiles, its own heading up."""
-    return rectify_footprint(
-        prepare_view(grey, camera, telemetry.agl_m, gsd_m),
-        pitch_deg=telemetry.pitch_deg,
-        roll_deg=telemetry.roll_deg,
-        agl_m=telemetry.agl_m,
-        gsd_m=gsd_m,
-        multiple_px=1,
-    )
+    return rectify_footprint(downsampled(view, gsd_m), gsd_m=gsd_m, multiple_px=1)
 
 
 def _moved(
-    place: tuple[float, float], view: Rectified, turn_rad: float, log_scale: float, way: float
+    place: tuple[float, float], view: RectifiedView, turn_rad: float, log_scale: float, way: float
 ) -> tuple[float, float]:
     """From the camera to the middle of what it sees (`way` 1), or back (-1); degrees."""
     cos, sin = math.cos(turn_rad), math.sin(turn_rad)
@@ -299,11 +286,11 @@ def _against(
     return made
 
 
-def _fix(one: Sighting, best: Hypothesis, confidence: float, view: ViewOnGround) -> Fix:
+def _fix(one: Sighting, best: Hypothesis, confidence: float, view: View) -> Fix:
     covariance = np.array(one.covariance[:2, :2])
-    lean_std_deg = view.telemetry.lean_std_deg
-    if lean_std_deg is not None and math.isfinite(lean_std_deg):
-        covariance += np.eye(2) * (view.telemetry.agl_m * math.radians(lean_std_deg)) ** 2
+    tilt_std_deg = view.telemetry.tilt_std_deg
+    if tilt_std_deg is not None and math.isfinite(tilt_std_deg):
+        covariance += np.eye(2) * (view.telemetry.agl_m * math.radians(tilt_std_deg)) ** 2
     covariance.flags.writeable = False
     evidence = {**one.evidence, "views": best.views, "log_odds": best.log_odds}
     return Fix(

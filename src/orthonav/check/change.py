@@ -78,21 +78,21 @@ def another_year(
     return np.asarray(np.clip(noisy, 0, 255), dtype=np.uint8)
 
 
-def leaning(
+def tilted(
     rng: np.random.Generator, grey: NDArray[np.uint8], relief_px: float, flat: float
 ) -> NDArray[np.uint8]:
-    """`grey` (S, S) as seen from low above its middle, where what stands on the ground leans away.
+    """`grey` (S, S) as seen from low above its middle, where what stands on the ground tilts away.
 
-    `relief_px` is the standard deviation of how far it leans at the rim of the picture; heights
+    `relief_px` is the standard deviation of how far it tilts at the rim of the picture; heights
     change over `flat` pixels.
     """
     size = grey.shape[0]
     cells = int(np.clip(size / max(flat, 1.0), 2, 96))
     along = np.linspace(-1, 1, size, dtype=np.float32)
-    lean = relief_px * _normal(rng, size, cells)
+    tilt = relief_px * _normal(rng, size, cells)
     index = np.arange(size, dtype=np.float32)
-    cols = index[None, :] - lean * along[None, :]
-    rows = index[:, None] - lean * along[:, None]
+    cols = index[None, :] - tilt * along[None, :]
+    rows = index[:, None] - tilt * along[:, None]
     moved = cv2.remap(grey, cols, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     return np.asarray(moved, dtype=np.uint8)
 

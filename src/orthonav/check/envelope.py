@@ -33,7 +33,7 @@ def envelope_work(plan: TrialPlan, places_en_m: Array) -> Work:
 
 def envelope_of(found: Sequence[Sequence[Trial]], accept: float, radius_m: float) -> Envelope:
     """From the outcome of `envelope_work`."""
-    shares = [kept_share(trials, accept, radius_m) for trials in found]
+    shares = [accepted_share(trials, accept, radius_m) for trials in found]
     share = np.array(shares, np.float64).reshape(len(YAW_OFF_DEG), len(AGL_OFF))
     middle = AGL_OFF.index(0.0)
     least = STILL_FINE * share[0, middle]
@@ -64,14 +64,14 @@ def heights_of(
 ) -> tuple[Alternative, ...]:
     """From the outcome of `heights_work`, and what was found at the `planned` height."""
     others = [
-        Alternative("agl_m", plan.agl_m * part, kept_share(trials, accept, radius_m))
+        Alternative("agl_m", plan.agl_m * part, accepted_share(trials, accept, radius_m))
         for part, trials in zip(HEIGHTS, found, strict=True)
     ]
     chosen = Alternative("agl_m", plan.agl_m, planned, chosen=True)
     return tuple(sorted([*others, chosen], key=lambda each: each.value))
 
 
-def kept_share(trials: Sequence[Trial], accept: float, radius_m: float) -> float:
+def accepted_share(trials: Sequence[Trial], accept: float, radius_m: float) -> float:
     """Share of trials that were confident and right; NaN of none."""
     kept = [each.confidence >= accept and each.error_m <= radius_m for each in trials]
     return float(np.mean(kept)) if kept else float("nan")

@@ -13,7 +13,7 @@ from orthonav.geo.frames import LocalFrame
 LIKE = 0.8
 """A place elsewhere is alike where its score reaches this share of that of the right one."""
 MOST = 40
-SURE = 0.5
+_WRONG_CONFIDENCE = 0.5
 """One trial is enough where it was put elsewhere with this confidence; else it may be chance, and
 another must say the same."""
 
@@ -60,7 +60,7 @@ def _pair(trial: Trial, far_m: float) -> _Pair | None:
     if not math.isfinite(trial.error_m):
         return None
     if trial.error_m > far_m:
-        return _Pair(trial.en_m, trial.found_en_m, 1.0, trial.confidence >= SURE)
+        return _Pair(trial.en_m, trial.found_en_m, 1.0, trial.confidence >= _WRONG_CONFIDENCE)
     if math.isfinite(trial.rival_share) and trial.rival_share >= LIKE:
         return _Pair(trial.en_m, trial.rival_en_m, min(trial.rival_share, 1.0), False)
     return None

@@ -26,7 +26,7 @@ class CheckRequest:
     Without `agl_m` it is the height at which the shorter side of a view covers a tile of the map.
     `band_m` is for legs of `route` that do not say theirs. `other_date` is an orthophoto of the
     same ground that is not in the map. Standard deviations as in `orthonav.check.outcome`.
-    `relief_m` is that of the height of houses and trees, which lean in pictures from low;
+    `relief_m` is that of the height of houses and trees, which tilt in pictures from low;
     `effort` multiplies the number of trials; `workers` None: one process per core.
     """
 

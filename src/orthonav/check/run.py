@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.check.envelope import (
+    accepted_share,
     envelope_of,
     envelope_work,
     heights_of,
     heights_work,
-    kept_share,
 )
 from orthonav.check.estimate import Estimate, Field
 from orthonav.check.lookalikes import found_lookalikes
@@ -224,7 +224,7 @@ class _Check:
         route_en_m = None
         if self.request.route is not None:
             route_en_m = self.request.route.points_en_m(self.sheet.frame)
-        planned = kept_share(own, self.request.accept, self.radius_m)
+        planned = accepted_share(own, self.request.accept, self.radius_m)
         alternatives = self._alternatives(heights, planned, cells)
         return CheckResult(
             about=self.request.about,

@@ -20,21 +20,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.check.change import another_year, leaning
+from orthonav.check.change import another_year, tilted
 from orthonav.check.ortho import OrthoPyramid
 from orthonav.check.persistence import MARGIN_PX
 from orthonav.check.views import (
     Pictures,
     TrialPlan,
-    told_persistence,
+    reported_persistence,
     view_levels,
     view_of,
 )
 from orthonav.errors import MapFileError, WorkerError
-from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
-from orthonav.records import NoFix, Prior, Telemetry
+from orthonav.records import NoFix, Prior, View
 from orthonav.register.registrar import apart_px
 
 AT_ONCE = 8
@@ -229,14 +228,14 @@ class Trier:
         picture = np.where(valid[inner], grey[inner], stranger)
         expected = math.nan
         if plan.other_path is None:
-            lasting = [each[inner] for each in told_persistence(grey, gsd_m, final - level)]
+            lasting = [each[inner] for each in reported_persistence(grey, gsd_m, final - level)]
             expected = float(np.mean([each.mean() for each in lasting[:2]]))
             picture = another_year(rng, picture, stranger, lasting, plan.severity)
         if plan.relief_m > 0:
             rim_px = plan.relief_m * size / 2 / plan.agl_m
-            picture = leaning(rng, picture, rim_px, RELIEF_CHANGES_M / gsd_m)
-        view, camera, telemetry = view_of(rng, plan, picture, gsd_m)
-        return self._placed(rng, plan, index, place, view, camera, telemetry, expected)
+            picture = tilted(rng, picture, rim_px, RELIEF_CHANGES_M / gsd_m)
+        view = view_of(rng, plan, picture, gsd_m)
+        return self._placed(rng, plan, index, place, view, expected)
 
     def _placed(
         self,
@@ -244,9 +243,7 @@ class Trier:
         plan: TrialPlan,
         index: int,
         place_en_m: NDArray[np.float64],
-        view: NDArray[np.uint8],
-        camera: Camera,
-        telemetry: Telemetry,
+        view: View,
         expected: float,
     ) -> Trial:
         registration = self._registration
@@ -257,7 +254,7 @@ class Trier:
             told = place_en_m + rng.normal(0, plan.prior_std_m, 2)
             lat, lon = registration.sheet.frame.latlon_from_en(told)
             prior = Prior(float(lat), float(lon), plan.prior_std_m)
-        prepared = registration.prepared(view, camera, telemetry, plan.yaw_std_deg is not None)
+        prepared = registration.prepared(view, plan.yaw_std_deg is not None)
         best = None
         if not isinstance(prepared, NoFix) and (
             prior is None or registration.touches_map(prior, prepared)

@@ -12,7 +12,7 @@ from orthonav.check.change import USUAL, Severity
 from orthonav.check.persistence import MARGIN_PX, features, usual_model
 from orthonav.geo.camera import Camera
 from orthonav.localizer.registration import RegistrationLocalizer
-from orthonav.records import Telemetry
+from orthonav.records import Telemetry, View
 from orthonav.register.reference import GreyPyramid
 from orthonav.register.registrar import Levels
 
@@ -28,7 +28,7 @@ class TrialPlan:
     """How views are made: `camera` at `agl_m`, what is told wrongly (standard deviations), `seed`.
 
     `yaw_std_deg` None: heading unknown. `relief_m` is the standard deviation of the height of what
-    stands on the ground and leans in views from low. `yaw_off_deg`, to either side at random, and
+    stands on the ground and tilts in views from low. `yaw_off_deg`, to either side at random, and
     `agl_off` (a share) are added to the errors of what is told.
     """
 
@@ -61,7 +61,7 @@ class TrialPlan:
         return math.sqrt(self.width_m * self.height_m)
 
 
-def told_persistence(
+def reported_persistence(
     grey: NDArray[np.uint8], gsd_m: float, first: int = 0
 ) -> list[NDArray[np.float32]]:
     """Persistence (H, W) of a picture at its own resolution, half of it, and a quarter.
@@ -131,8 +131,8 @@ class Pictures:
 
 def view_of(
     rng: np.random.Generator, plan: TrialPlan, picture: NDArray[np.uint8], gsd_m: float
-) -> tuple[NDArray[np.uint8], Camera, Telemetry]:
-    """A vertical view of the middle of a picture under any heading, and what is told of it."""
+) -> View:
+    """A vertical view of the middle of a picture under any heading."""
     size = picture.shape[0]
     width = max(8, round(plan.width_m / gsd_m))
     height = max(8, round(plan.height_m / gsd_m))
@@ -159,15 +159,15 @@ def view_of(
     yaw_error = sign * plan.yaw_off_deg
     if yaw_std is not None:
         yaw_error += float(rng.normal(0, yaw_std))
-    told_m = plan.agl_m * max(0.5, 1 + plan.agl_off + float(rng.normal(0, plan.agl_std)))
+    reported_m = plan.agl_m * max(0.5, 1 + plan.agl_off + float(rng.normal(0, plan.agl_std)))
     telemetry = Telemetry(
         time_ns=0,
         yaw_deg=yaw_deg + yaw_error,
         pitch_deg=0.0,
         roll_deg=0.0,
-        agl_m=told_m,
+        agl_m=reported_m,
         yaw_std_deg=yaw_std,
-        agl_std_m=plan.agl_std * told_m,
+        agl_std_m=plan.agl_std * reported_m,
     )
     camera = Camera(width, height, focal, focal, width / 2, height / 2)
-    return np.asarray(view, dtype=np.uint8), camera, telemetry
+    return View(np.asarray(view, dtype=np.uint8), camera, telemetry)

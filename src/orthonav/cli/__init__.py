@@ -1,4 +1,8 @@
-"""The command line. Each command is one module with `add` (its arguments) and `run`."""
+"""The command line. Each command is one module with `add` (its arguments) and `run`.
+
+A module with many options names the everyday ones in `EVERYDAY`; `--help` shows those, and
+`--help-all` shows every option.
+"""
 
 import argparse
 import importlib
@@ -100,8 +104,29 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
     for name, text in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text, parents=[common])
         if name in arguments:
-            _module(name).add(command)
+            module = _module(name)
+            module.add(command)
+            if everyday := getattr(module, "EVERYDAY", ()):
+                _shorten_help(command, everyday, show_all="--help-all" in arguments)
     return parser
+
+
+def _shorten_help(
+    command: argparse.ArgumentParser, everyday: Sequence[str], *, show_all: bool
+) -> None:
+    """Add `--help-all`; without it, hide the options that are neither required nor everyday."""
+    command.add_argument("--help-all", action="help", help="show all options and exit")
+    shown = {*everyday, "--help", "--help-all", "--verbose", "--quiet"}
+    hidden = [
+        action
+        for action in command._actions
+        if action.option_strings and not action.required and shown.isdisjoint(action.option_strings)
+    ]
+    if show_all:
+        return
+    for action in hidden:
+        action.help = argparse.SUPPRESS
+    command.epilog = f"{len(hidden)} more options: {command.prog} --help-all"
 
 
 def _module(command: str) -> ModuleType:

@@ -7,6 +7,7 @@ from pathlib import Path
 from orthonav.cli import build_atlas
 from orthonav.cli.common import add_area, add_orthos, print_json, progress
 
+EVERYDAY = ("--route", "--bounds", "--band-m", "--gsd-m", "--other-date", "--work", "--json")
 RECIPE = (
     "gsd_m",
     "tile_px",

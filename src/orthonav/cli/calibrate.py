@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import print_json, progress
-from orthonav.cli.source import add_source, open_told
+from orthonav.cli.source import add_source, open_source
 
 if TYPE_CHECKING:
     from orthonav.onboard.calibrate import Calibration
@@ -40,7 +40,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Track the flight, place its views in hindsight, and keep what they agree on."""
+    """Track the flight, place its views smoothed, and keep what they agree on."""
     from orthonav.errors import FlightError
     from orthonav.flight import read_truth
     from orthonav.flight.mount import write_mount
@@ -49,12 +49,12 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
     from orthonav.onboard.calibrate import calibrated
-    from orthonav.onboard.run import in_hindsight, localize_flight
+    from orthonav.onboard.run import localize_flight, smoothed_track
     from orthonav.records import Prior
 
     if not 0 < options.gnss_std_m < 1e5:
         raise FlightError(f"--gnss-std-m must be above 0, got {options.gnss_std_m}")
-    flight = open_told(options.flight, options)
+    flight = open_source(options.flight, options)
     places = read_truth(options.gnss) if options.gnss else {}
     told = {frame: Prior(*place, options.gnss_std_m) for frame, place in places.items()}
     views = (Retold(v, replace(v.telemetry, prior=told.get(v.frame))) for v in flight.views)
@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> None:
         heading_known=options.heading == "known",
         use_prior=bool(options.gnss),
         every_prior=bool(options.gnss),
-        hindsight=True,
+        smooth=True,
     )
     results = []
     with progress(options) as shown:
@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> None:
             results.append(result)
             if flight.expected:
                 shown("calibrate", min(1.0, len(results) / flight.expected))
-    found = calibrated(in_hindsight(tracker, results, None))
+    found = calibrated(smoothed_track(tracker, results, None))
     write_mount(options.out, found.mount)
     if options.json:
         print_json(_plain(found))

@@ -101,7 +101,7 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
         "--relief-m",
         type=float,
         default=3.0,
-        help="standard deviation of the height of houses and trees, which lean in views from low "
+        help="standard deviation of the height of houses and trees, which tilt in views from low "
         "(default 3)",
     )
 

@@ -185,10 +185,10 @@ def _checked(folder: Path, map_path: Path, route: Path, shown: Progress) -> str:
 def _criteria_lines(metrics: "Metrics") -> list[str]:
     """What trusting only confident fixes would keep."""
     return [
-        f"confidence >= {row.threshold:g}: {row.share_kept:.0%} of views kept, "
+        f"confidence >= {row.threshold:g}: {row.share_accepted:.0%} of views kept, "
         f"{row.accuracy:.1%} of them within {metrics.radius_m:g} m"
         for row in metrics.criteria
-        if row.name == "confidence" and row.share_kept > 0
+        if row.name == "confidence" and row.share_accepted > 0
     ]
 
 

@@ -37,7 +37,7 @@ def take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | Non
     _check_map(options, flight.session.get("map"))
     flown = _flown(flight.session.get("options"))
     told: dict[str, Any] = {name: getattr(options, name) for name in (*_CHOICES, "accept")}
-    told["track"] = options.track or options.hindsight
+    told["track"] = options.track or options.smooth
     told["mount"] = mount
     differ = [name for name in told if name in flown and flown[name] != told[name]]
     if options.as_flown:

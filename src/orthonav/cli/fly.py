@@ -6,6 +6,19 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+EVERYDAY = (
+    "--camera-file",
+    "--mount",
+    "--autopilot",
+    "--send",
+    "--nmea",
+    "--accept",
+    "--dry-run",
+    "--heading",
+    "--start",
+    "--state",
+    "--log",
+)
 SEND = ("global-position", "gps-input", "odometry", "vision", "external-position")
 HEIGHTS = ("distance", "terrain", "home", "relative")
 

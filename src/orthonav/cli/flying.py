@@ -37,12 +37,12 @@ from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.run import Locator
 from orthonav.onboard.state import boot_id, load, prior_of
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
-from orthonav.publish.estimate import SURE, Clock
+from orthonav.publish.estimate import Clock
 from orthonav.publish.gate import Gate, GateRules
 from orthonav.publish.local import Origin
 from orthonav.publish.mavlink import Signing, signing_timestamp
 from orthonav.publish.nmea import Quality
-from orthonav.records import Prior
+from orthonav.records import CONFIDENT, Prior
 from orthonav.sources.cameras import read_camera_file
 
 
@@ -54,7 +54,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
             options.map, options.require_signed
         )
     accept = Acceptance.parse(options.accept)
-    least = accept.threshold if accept.criterion == "confidence" else SURE
+    least = accept.threshold if accept.criterion == "confidence" else CONFIDENT
     camera = _camera(options)
     mount = read_mount(options.mount) if options.mount else None
     localizer = Localizer(open_map(options.map))

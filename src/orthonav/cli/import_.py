@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from orthonav.cli.common import print_json, progress
-from orthonav.cli.source import add_source, open_told
+from orthonav.cli.source import add_source, open_source
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
     """Import and say what was written."""
     from orthonav.sources import import_flight
 
-    recording = open_told(options.source, options)
+    recording = open_source(options.source, options)
     with progress(options) as shown:
         done = import_flight(
             recording, options.out, options.jpeg_quality, lambda share: shown("import", share)

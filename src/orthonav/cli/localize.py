@@ -7,10 +7,22 @@ from typing import TYPE_CHECKING
 
 from orthonav.cli.common import print_json, progress
 from orthonav.cli.flown import take_flown, tell_whether_as_flown
-from orthonav.cli.source import add_source, open_told
+from orthonav.cli.source import add_source, open_source
 
 if TYPE_CHECKING:
     from orthonav.records import ViewResult
+
+EVERYDAY = (
+    "--heading",
+    "--prior",
+    "--track",
+    "--smooth",
+    "--accept",
+    "--mount",
+    "--atlas",
+    "--camera",
+    "--json",
+)
 
 log = logging.getLogger(__name__)
 
@@ -73,7 +85,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="follow the aircraft: every position rests on all views before it",
     )
     parser.add_argument(
-        "--hindsight",
+        "--smooth",
         action="store_true",
         help="track, then place every view by all views of the flight, also those after it",
     )
@@ -81,13 +93,13 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--lag",
         type=int,
         metavar="VIEWS",
-        help="with --hindsight: only so many views after each one (default: all)",
+        help="with --smooth: only so many views after each one (default: all)",
     )
     parser.add_argument(
         "--mount",
         type=Path,
         metavar="mount.json",
-        help="what `orthonav calibrate` found: told heading, height and lean are corrected by it",
+        help="what `orthonav calibrate` found: told heading, height and tilt are corrected by it",
     )
     parser.add_argument(
         "--as-flown",
@@ -121,15 +133,15 @@ def _on_map(options: argparse.Namespace) -> None:
     from orthonav.mapfile import open_map
     from orthonav.mapfile.signature import require_signature
     from orthonav.onboard.calibrate import Mounted, model_of
-    from orthonav.onboard.run import Locator, SingleViews, in_hindsight, localize_flight
+    from orthonav.onboard.run import Locator, SingleViews, localize_flight, smoothed_track
     from orthonav.publish.jsonl import write_results
     from orthonav.search.position import check_rule
 
-    if options.lag is not None and not (options.hindsight and options.lag >= 0):
-        raise VariantError("--lag is a number of views, for --hindsight")
+    if options.lag is not None and not (options.smooth and options.lag >= 0):
+        raise VariantError("--lag is a number of views, for --smooth")
     if options.require_signed:
         require_signature(options.map, options.require_signed)
-    flight = open_told(options.flight, options)
+    flight = open_source(options.flight, options)
     mount = take_flown(options, flight)
     accept = Acceptance.parse(options.accept) if options.accept else None
     localizer = Localizer(
@@ -147,10 +159,10 @@ def _on_map(options: argparse.Namespace) -> None:
     }
     locator: Locator = SingleViews(localizer, **how)
     tracker = None
-    if options.track or options.hindsight:
+    if options.track or options.smooth:
         model = model_of(mount) if mount else None
         locator = tracker = Tracker(
-            localizer, hindsight=options.hindsight, lag=options.lag, model=model, **how
+            localizer, smooth=options.smooth, lag=options.lag, model=model, **how
         )
     if mount:
         locator = Mounted(locator, mount)
@@ -162,8 +174,8 @@ def _on_map(options: argparse.Namespace) -> None:
             results.append(result)
             if flight.expected:
                 shown("localize", min(1.0, len(results) / flight.expected))
-    if tracker is not None and options.hindsight:
-        results = in_hindsight(tracker, results, accept)
+    if tracker is not None and options.smooth:
+        results = smoothed_track(tracker, results, accept)
     else:
         tell_whether_as_flown(flight, results)
     write_results(options.out, results)
@@ -183,7 +195,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
 
     asked = [
         name
-        for name in ("track", "hindsight", "mount", "as_flown", "require_signed", "lag")
+        for name in ("track", "smooth", "mount", "as_flown", "require_signed", "lag")
         if getattr(options, name) not in (None, False)
     ]
     asked += ["position"] if options.position != "peak" else []
@@ -193,7 +205,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
     accept = Acceptance.parse(options.accept) if options.accept else None
     if accept and accept.criterion == "lowe_ratio":
         raise VariantError("lowe_ratio compares tiles: it is for a map, with --registration off")
-    flight = open_told(options.flight, options)
+    flight = open_source(options.flight, options)
     results = []
     with AtlasLookup(Atlas.open(options.map)) as lookup, progress(options) as shown:
         if lookup.unknown:

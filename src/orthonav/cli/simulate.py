@@ -40,7 +40,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     errors.add_argument("--yaw-std-deg", type=float, default=0.0, help="heading")
     errors.add_argument("--agl-std", type=float, default=0.0, help="height, as a share: 0.05")
     errors.add_argument("--tilt-std-deg", type=float, default=0.0, help="told pitch and roll")
-    errors.add_argument("--lean-std-deg", type=float, default=0.0, help="true pitch and roll")
+    errors.add_argument("--attitude-std-deg", type=float, default=0.0, help="true pitch and roll")
     errors.add_argument("--prior-std-m", type=float, help="tell a position with this error")
     errors.add_argument(
         "--velocity-drift",
@@ -53,10 +53,10 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--agl-bias", type=float, default=0.0, help="height told too large, as a share: 0.05"
     )
     biases.add_argument(
-        "--pitch-bias-deg", type=float, default=0.0, help="the camera leans more than told"
+        "--pitch-bias-deg", type=float, default=0.0, help="the camera tilts more than told"
     )
     biases.add_argument(
-        "--roll-bias-deg", type=float, default=0.0, help="the camera leans more than told"
+        "--roll-bias-deg", type=float, default=0.0, help="the camera tilts more than told"
     )
     effects = parser.add_argument_group("faults of the picture")
     effects.add_argument(
@@ -96,7 +96,7 @@ def run(options: argparse.Namespace) -> None:
             yaw_std_deg=options.yaw_std_deg,
             agl_std=options.agl_std,
             tilt_std_deg=options.tilt_std_deg,
-            lean_std_deg=options.lean_std_deg,
+            attitude_std_deg=options.attitude_std_deg,
             prior_std_m=options.prior_std_m,
             yaw_bias_deg=options.yaw_bias_deg,
             agl_bias=options.agl_bias,

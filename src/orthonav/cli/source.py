@@ -84,7 +84,7 @@ def add_source(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def open_told(path: Path, options: argparse.Namespace) -> "Recording":
+def open_source(path: Path, options: argparse.Namespace) -> "Recording":
     """The source of the command line, opened; its warnings are logged."""
     from orthonav.sources import SourceOptions, open_source
 

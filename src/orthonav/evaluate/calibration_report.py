@@ -16,9 +16,9 @@ def row_to_json(row: CriterionRow) -> dict[str, object]:
     return {
         "name": row.name,
         "threshold": row.threshold,
-        "share_kept": or_none(row.share_kept),
+        "share_accepted": or_none(row.share_accepted),
         "accuracy": or_none(row.accuracy),
-        "n_kept": row.n_kept,
+        "n_accepted": row.n_accepted,
         "n_right": row.n_right,
         "share_of_right_kept": or_none(row.recall),
         f"n_{wrong_key(row.far_m)}": row.n_far,
@@ -121,11 +121,11 @@ def criteria_html(metrics: Metrics, labels: dict[str, str]) -> str:
         (
             labels[row.name],
             f"{row.threshold:g}",
-            str(row.n_kept),
-            percent_text(row.share_kept),
+            str(row.n_accepted),
+            percent_text(row.share_accepted),
             percent_text(row.accuracy),
             percent_text(row.recall),
-            percent_text(row.share_far) + (f" ({row.n_far})" if row.n_kept else ""),
+            percent_text(row.share_far) + (f" ({row.n_far})" if row.n_accepted else ""),
         )
         for row in metrics.criteria
     ]
@@ -163,9 +163,9 @@ def _covariance_said(consistency: Consistency) -> str:
 
 def _kept(row: CriterionRow, radius_m: float) -> str:
     return (
-        f"{percent_text(row.share_kept)} of views kept, {percent_text(row.accuracy)} of them "
+        f"{percent_text(row.share_accepted)} of views kept, {percent_text(row.accuracy)} of them "
         f"within {radius_m:g} m ({percent_text(row.recall)} of all that are); "
-        f"{row.n_far} of {row.n_kept} wrong by more than {row.far_m:g} m "
+        f"{row.n_far} of {row.n_accepted} wrong by more than {row.far_m:g} m "
         f"({percent_text(row.share_far)})"
     )
 

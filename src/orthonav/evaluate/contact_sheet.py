@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from orthonav.errors import FlightError
 from orthonav.evaluate.calibration import is_covariance
 from orthonav.evaluate.metrics import Comparison
-from orthonav.flight.recording import Flight, View
+from orthonav.flight.recording import Flight, RecordedView
 from orthonav.geo.camera import Camera
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.checks import check_telemetry
-from orthonav.localizer.rectify import prepare_view, rectify
-from orthonav.records import Fix, Telemetry, ViewResult
+from orthonav.localizer.rectify import downsampled, rectify
+from orthonav.records import Fix, Telemetry, View, ViewResult
 from orthonav.register.reference import GreyPyramid
 from orthonav.report.canvas import BACKING, INK, RIGHT, SOFT, WRONG, Drawing, draw_figure
 
@@ -58,7 +58,7 @@ class Row:
     """One view: its figures, and three pictures of ground `side_m` metres wide around a position.
 
     `shift_en_m` (2,) leads from the true to the estimated position, `centre_en_m` (2,) from a
-    position to the middle of the pictures: a camera that leans looks beside itself. Where a
+    position to the middle of the pictures: a camera that tilts looks beside itself. Where a
     picture is None, `why_not` or `why_no_map` says why.
     """
 
@@ -142,7 +142,7 @@ def _row(
     comparison: Comparison,
     place: int,
     result: ViewResult,
-    view: View | None,
+    view: RecordedView | None,
     flight: Flight,
     pyramid: GreyPyramid,
     grid: TileGrid,
@@ -177,7 +177,7 @@ def _row(
 
 
 def _view_patch(
-    view: View, camera: Camera, result: ViewResult
+    view: RecordedView, camera: Camera, result: ViewResult
 ) -> tuple[float, NDArray[np.float64], Patch]:
     """Width of the picture in metres, its middle from the camera (2,), and the picture.
 
@@ -194,11 +194,7 @@ def _view_patch(
     side_m = MARGIN * longer_m
     gsd_m = side_m / SIDE_PX
     made = rectify(
-        prepare_view(grey, camera, told.agl_m, gsd_m),
-        yaw_deg=told.yaw_deg,
-        pitch_deg=told.pitch_deg,
-        roll_deg=told.roll_deg,
-        agl_m=told.agl_m,
+        downsampled(View(grey, camera, told), gsd_m),
         gsd_m=gsd_m,
         size_px=SIDE_PX,
     )
@@ -209,12 +205,12 @@ def _view_patch(
 
 
 def as_fixed(told: Telemetry, result: ViewResult) -> Telemetry:
-    """Heading, height and lean as the fix has them, as told where it does not say."""
+    """Heading, height and tilt as the fix has them, as told where it does not say."""
     fix = result.outcome
     if not isinstance(fix, Fix):
         return told
-    lean = [fix.evidence.get(name, 0.0) for name in ("pitch_bias_deg", "roll_bias_deg")]
-    pitch, roll = (value if math.isfinite(value) else 0.0 for value in lean)
+    tilt = [fix.evidence.get(name, 0.0) for name in ("pitch_bias_deg", "roll_bias_deg")]
+    pitch, roll = (value if math.isfinite(value) else 0.0 for value in tilt)
     return replace(
         told,
         yaw_deg=fix.heading_deg if math.isfinite(fix.heading_deg) else told.yaw_deg,

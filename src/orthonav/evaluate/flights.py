@@ -98,7 +98,7 @@ def metrics_to_json(metrics: Metrics) -> dict[str, object]:
         "curves": {
             curve.name: {
                 "threshold": [or_none(value) for value in curve.thresholds],
-                "share_kept": curve.share_kept.tolist(),
+                "share_accepted": curve.share_accepted.tolist(),
                 "accuracy": curve.accuracy.tolist(),
             }
             for curve in metrics.curves

@@ -66,16 +66,16 @@ class Comparison:
 class CriterionRow:
     """What is left at one threshold: share of all views kept, and share of those that are right.
 
-    Of the `n_kept` views kept, `n_right` are right and `n_far` are wrong by more than `far_m`;
+    Of the `n_accepted` views kept, `n_right` are right and `n_far` are wrong by more than `far_m`;
     `share_far` is their share, `recall` the share of all right fixes that is kept. Shares are NaN
     where no view has the criterion, those of the kept also where no view is kept.
     """
 
     name: str
     threshold: float
-    share_kept: float
+    share_accepted: float
     accuracy: float
-    n_kept: int
+    n_accepted: int
     n_right: int
     recall: float
     far_m: float
@@ -89,7 +89,7 @@ class CriterionCurve:
 
     name: str
     thresholds: FloatArray
-    share_kept: FloatArray
+    share_accepted: FloatArray
     accuracy: FloatArray
 
 
@@ -274,12 +274,12 @@ def criterion_curve(comparison: Comparison, name: str, radius_m: float) -> Crite
     n_right = np.cumsum(comparison.errors_m[known][order] <= radius_m)
     last = np.ones(ordered.size, dtype=bool)
     last[:-1] = ordered[1:] != ordered[:-1]
-    n_kept = np.flatnonzero(last) + 1
+    n_accepted = np.flatnonzero(last) + 1
     return CriterionCurve(
         name=name,
         thresholds=frozen(ordered[last]),
-        share_kept=frozen(n_kept / max(values.size, 1)),
-        accuracy=frozen(n_right[last] / n_kept),
+        share_accepted=frozen(n_accepted / max(values.size, 1)),
+        accuracy=frozen(n_right[last] / n_accepted),
     )
 
 
@@ -296,21 +296,21 @@ def _criterion_row(
     values, errors_m = comparison.criteria[name], comparison.errors_m
     known = bool(np.any(~np.isnan(values)))
     kept = values >= threshold  # NaN is never kept
-    n_kept = int(np.count_nonzero(kept))
+    n_accepted = int(np.count_nonzero(kept))
     n_right = int(np.count_nonzero(errors_m[kept] <= radius_m))
     n_far = int(np.count_nonzero(errors_m[kept] > far_m))
     n_all_right = int(np.count_nonzero(errors_m <= radius_m))
     return CriterionRow(
         name=name,
         threshold=threshold,
-        share_kept=share(n_kept, values.size) if known else math.nan,
-        accuracy=share(n_right, n_kept),
-        n_kept=n_kept,
+        share_accepted=share(n_accepted, values.size) if known else math.nan,
+        accuracy=share(n_right, n_accepted),
+        n_accepted=n_accepted,
         n_right=n_right,
         recall=share(n_right, n_all_right) if known else math.nan,
         far_m=float(far_m),
         n_far=n_far,
-        share_far=share(n_far, n_kept),
+        share_far=share(n_far, n_accepted),
     )
 
 

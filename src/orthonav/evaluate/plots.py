@@ -96,7 +96,7 @@ def criteria_picture(metrics: Metrics) -> Drawing:
         for curve in drawn:
             _draw_criterion(axes, curve)
         # the first few views make wild shares: they do not set the scale
-        tails = [curve.accuracy[curve.share_kept >= 0.05] for curve in drawn]
+        tails = [curve.accuracy[curve.share_accepted >= 0.05] for curve in drawn]
         lowest = min((float(tail.min()) for tail in tails if tail.size), default=0.0)
         bottom = max(0.0, math.floor(lowest * 10 - 0.5) * 10)
         axes.set(xlim=(0, 102), ylim=(min(bottom, 85.0), 101.5))
@@ -208,7 +208,7 @@ def _draw_positions(
 def _draw_criterion(axes: "Axes", curve: CriterionCurve) -> None:
     colour, line, _, order = CURVE_STYLES[curve.name]
     axes.plot(
-        100 * curve.share_kept,
+        100 * curve.share_accepted,
         100 * curve.accuracy,
         color=colour,
         linestyle=line,
@@ -222,7 +222,7 @@ def _draw_thresholds(axes: "Axes", metrics: Metrics) -> None:
     """A mark and a number for each threshold; numbers keep clear of each other and of marks."""
     rows = [row for row in metrics.criteria if math.isfinite(row.accuracy)]
     rows.sort(key=lambda row: list(CURVE_STYLES).index(row.name))
-    spots = [(100 * row.share_kept, 100 * row.accuracy) for row in rows]
+    spots = [(100 * row.share_accepted, 100 * row.accuracy) for row in rows]
     at_pt = axes.transData.transform(np.reshape(spots, (-1, 2))) * 72 / axes.figure.dpi
     taken = [(x - 5, y - 5, x + 5, y + 5) for x, y in at_pt]
     for row, spot, (x, y) in zip(rows, spots, at_pt, strict=True):

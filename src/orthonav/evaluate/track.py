@@ -27,10 +27,8 @@ from orthonav.evaluate.figures import (
 )
 from orthonav.evaluate.metrics import FAR_M, Comparison
 from orthonav.publish.jsonl import STATES
-from orthonav.records import Fix, ViewResult
+from orthonav.records import CONFIDENT, Fix, ViewResult
 
-SURE = 0.9
-"""A fix of at least this confidence is believed."""
 RADII_M = (25.0, 60.0)
 COURSE_M = 5.0
 """Courses are taken between places usually at least so far apart."""
@@ -70,7 +68,7 @@ class Longest:
     """The longest of several stretches in seconds and in metres of true way: two may hold these."""
 
     seconds_s: float
-    way_m: float
+    path_m: float
 
 
 @dataclass(frozen=True)
@@ -119,12 +117,12 @@ class Track:
 
     `first_view` (1 is the first view of the flight) and `first_s` (seconds since it) are of the
     first confirmed fix: tracking, with a position. `share_of_views` and `share_of_time` are by
-    state. `unsure` is without a confident fix (not tracking, or confidence below `SURE`), over the
-    whole flight; `unsure_after` from the first confirmed fix on. A view is sure and wrong where its
-    confidence is at least `SURE` or it is tracking, and it errs by more than `FAR_M`, the radius
-    asked for and the radius that its own fix states; `far_m` is the larger of the first two, the
-    least of them all. A false lock is a stretch of such views. `along` and `across` are of the
-    tracking views.
+    state. `low_confidence` is the time without a confident fix (not tracking, or confidence below
+    `CONFIDENT`), over the whole flight; `low_confidence_after` from the first confirmed fix on. A
+    view is confident and wrong where its confidence is at least `CONFIDENT` or it is tracking, and
+    it errs by more than `FAR_M`, the radius asked for and the radius that its own fix states;
+    `far_m` is the larger of the first two, the least of them all. A false lock is a stretch of such
+    views. `along` and `across` are of the tracking views.
     """
 
     n_views: int
@@ -135,10 +133,10 @@ class Track:
     share_of_views: Mapping[str, float]
     share_of_time: Mapping[str, float]
     n_lost: int
-    unsure: Longest
-    unsure_after: Longest
+    low_confidence: Longest
+    low_confidence_after: Longest
     far_m: float
-    n_sure_wrong: int
+    n_confident_wrong: int
     n_false_locks: int
     false_lock_longest_s: float
     along: Spread
@@ -162,8 +160,8 @@ def measure_track(
     rows = np.array([number[frame] for frame in comparison.frames], dtype=np.intp)
     states = np.array([result.state or "" for result in results])
     seconds_s = seconds_since_first([result.time_ns for result in results])
-    way_m = _way_m(comparison.truth_en_m, rows, len(results))
-    sure = np.array([_confidence(result) >= SURE for result in results])
+    path_m = _path_m(comparison.truth_en_m, rows, len(results))
+    sure = np.array([_confidence(result) >= CONFIDENT for result in results])
     tracking = states == "tracking"
     confirmed = tracking & np.array([isinstance(result.outcome, Fix) for result in results])
     first = int(np.argmax(confirmed)) if confirmed.any() else len(results)
@@ -171,7 +169,7 @@ def measure_track(
     wrong = (sure | tracking)[rows] & (
         comparison.errors_m > np.fmax(far_m, comparison.own_radius_m)
     )
-    unsure = ~(tracking & sure)
+    low_confidence = ~(tracking & sure)
     found = first < len(results)
     series = _series(comparison, [results[i] for i in rows], seconds_s[rows])
     return Track(
@@ -183,10 +181,10 @@ def measure_track(
         share_of_views=_shares(states, np.ones(len(states))),
         share_of_time=_shares(states, _until_next(seconds_s)),
         n_lost=len(runs(states == "lost")),
-        unsure=_longest(unsure, seconds_s, way_m),
-        unsure_after=_longest(unsure[first:], seconds_s[first:], way_m[first:]),
+        low_confidence=_longest(low_confidence, seconds_s, path_m),
+        low_confidence_after=_longest(low_confidence[first:], seconds_s[first:], path_m[first:]),
         far_m=far_m,
-        n_sure_wrong=int(np.count_nonzero(wrong)),
+        n_confident_wrong=int(np.count_nonzero(wrong)),
         n_false_locks=len(runs(wrong)),
         false_lock_longest_s=_longest_stretch(wrong, seconds_s[rows]),
         along=_spread(series.along_m[tracking[rows]]),
@@ -222,14 +220,14 @@ def course_en(truth_en_m: FloatArray) -> FloatArray:
     last, reach = len(number) - 1, 1
     while True:
         ends = np.minimum(number + reach, last), np.maximum(number - reach, 0)
-        way_m = truth_en_m[ends[0]] - truth_en_m[ends[1]]
-        length_m = np.hypot(way_m[:, 0], way_m[:, 1])
+        path_m = truth_en_m[ends[0]] - truth_en_m[ends[1]]
+        length_m = np.hypot(path_m[:, 0], path_m[:, 1])
         if 2 * reach > last // 4 or np.median(length_m) >= COURSE_M:
             break
         reach *= 2
     moves = length_m >= STILL_M
-    course = np.full(way_m.shape, math.nan)
-    course[moves] = way_m[moves] / length_m[moves, None]
+    course = np.full(path_m.shape, math.nan)
+    course[moves] = path_m[moves] / length_m[moves, None]
     return course
 
 
@@ -312,7 +310,7 @@ def _confidence(result: ViewResult) -> float:
     return result.outcome.confidence if isinstance(result.outcome, Fix) else math.nan
 
 
-def _way_m(truth_en_m: FloatArray, rows: NDArray[np.intp], n: int) -> FloatArray:
+def _path_m(truth_en_m: FloatArray, rows: NDArray[np.intp], n: int) -> FloatArray:
     """(n,) metres flown until each result, by the true positions of the results `rows`."""
     steps_m = [float(np.hypot(*(b - a))) for a, b in pairwise(truth_en_m)]
     flown_m = np.concatenate([[0.0], np.cumsum(steps_m)])
@@ -338,10 +336,10 @@ def _longest_stretch(flags: BoolArray, until: FloatArray) -> float:
     return float(max(steps, default=0.0 if np.isfinite(until).all() else math.nan))
 
 
-def _longest(flags: BoolArray, seconds_s: FloatArray, way_m: FloatArray) -> Longest:
+def _longest(flags: BoolArray, seconds_s: FloatArray, path_m: FloatArray) -> Longest:
     if not flags.size:
         return Longest(math.nan, math.nan)
-    return Longest(_longest_stretch(flags, seconds_s), _longest_stretch(flags, way_m))
+    return Longest(_longest_stretch(flags, seconds_s), _longest_stretch(flags, path_m))
 
 
 def _after(errors_m: FloatArray, radius_m: float) -> After:

@@ -13,8 +13,9 @@ from orthonav.evaluate.calibration import is_covariance, nees_bound
 from orthonav.evaluate.figures import FloatArray, runs
 from orthonav.evaluate.metrics import Comparison
 from orthonav.evaluate.plots import view_box
-from orthonav.evaluate.track import SURE, Series, Track
+from orthonav.evaluate.track import Series, Track
 from orthonav.evaluate.track_report import consistency_said, spread_said
+from orthonav.records import CONFIDENT
 from orthonav.report.canvas import (
     GREY,
     RIGHT,
@@ -76,7 +77,7 @@ def track_figures(
         figures.append(
             Figure(
                 "track-learnt",
-                "What the track learnt to be wrong with told heading, height and lean, over time",
+                "What the track learnt to be wrong with told heading, height and tilt, over time",
                 "What was learnt to be wrong with what is told: to be added to it.",
                 biases_picture(series),
             )
@@ -127,7 +128,7 @@ def error_picture(comparison: Comparison, series: Series, radius_m: float) -> Dr
         _draw_states(band, x, series.states)
         confidence = comparison.criteria["confidence"]
         below.plot(x, confidence, ".-", color=RIGHT, linewidth=1.0, markersize=3)
-        below.axhline(SURE, color=GREY, linestyle=(0, (4, 3)), linewidth=1)
+        below.axhline(CONFIDENT, color=GREY, linestyle=(0, (4, 3)), linewidth=1)
         below.set(ylim=(-0.05, 1.08), ylabel="confidence", xlabel=name)
         below.set_xlim(*_limits(x))
         figure.align_ylabels([above, below])
@@ -166,16 +167,16 @@ def signed_picture(series: Series) -> Drawing:
 
 
 def biases_picture(series: Series) -> Drawing:
-    """What was learnt to be wrong with heading, height and lean, over time; only what is there."""
+    """What was learnt to be wrong with heading, height and tilt, over time; only what is there."""
     scale = 100.0 * np.expm1(np.clip(series.biases["log_scale_bias"], -5.0, 5.0))
-    lean = {
+    tilt = {
         "pitch": series.biases["pitch_bias_deg"],
         "roll": series.biases["roll_bias_deg"],
     }
     panels: list[tuple[str, dict[str, FloatArray]]] = [
         ("heading (deg)", {"": series.biases["heading_bias_deg"]}),
         ("height (%)", {"": scale}),
-        ("lean (deg)", lean),
+        ("tilt (deg)", tilt),
     ]
     panels = [p for p in panels if any(np.isfinite(v).any() for v in p[1].values())]
 

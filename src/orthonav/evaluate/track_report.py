@@ -32,13 +32,13 @@ def track_rows(track: Track) -> tuple[tuple[str, str], ...]:
         ("states", _states_said(track)),
         (
             "longest without a confident fix",
-            f"{_longest_said(track.unsure)}; from the first confirmed fix on "
-            f"{_longest_said(track.unsure_after)}",
+            f"{_longest_said(track.low_confidence)}; from the first confirmed fix on "
+            f"{_longest_said(track.low_confidence_after)}",
         ),
         (
             "false locks",
             f"{track.n_false_locks}, the longest {_s(track.false_lock_longest_s)}; "
-            f"{track.n_sure_wrong} views sure and more than {far} (and their own radius) off",
+            f"{track.n_confident_wrong} views sure and more than {far} (and their own radius) off",
         ),
         ("ahead of the truth", spread_said(track.along)),
         ("right of the truth", spread_said(track.across)),
@@ -117,9 +117,9 @@ def tracks_to_json(tracks: Sequence[Track]) -> dict[str, object]:
         },
         "share_of_views": shares,
         "n_lost": sum(track.n_lost for track in tracks),
-        "unsure_seconds_s_max": _most(track.unsure.seconds_s for track in tracks),
-        "unsure_way_m_max": _most(track.unsure.way_m for track in tracks),
-        "n_sure_wrong": sum(track.n_sure_wrong for track in tracks),
+        "low_confidence_seconds_s_max": _most(track.low_confidence.seconds_s for track in tracks),
+        "low_confidence_path_m_max": _most(track.low_confidence.path_m for track in tracks),
+        "n_confident_wrong": sum(track.n_confident_wrong for track in tracks),
         "n_false_locks": sum(track.n_false_locks for track in tracks),
         "false_lock_longest_s": _most(track.false_lock_longest_s for track in tracks),
     }
@@ -133,7 +133,7 @@ def _states_said(track: Track) -> str:
 
 
 def _longest_said(longest: Longest) -> str:
-    return f"{_s(longest.seconds_s)}, {_m(longest.way_m)}"
+    return f"{_s(longest.seconds_s)}, {_m(longest.path_m)}"
 
 
 def spread_said(spread: Spread) -> str:

@@ -1,4 +1,4 @@
-"""Flight folders: views, telemetry, camera and, where known, truth. Format: design section 5."""
+"""Flight folders: views, telemetry, camera and, where known, truth (docs/reference/formats.md)."""
 
 from orthonav.flight.folder import (
     FlightFolder,
@@ -9,7 +9,7 @@ from orthonav.flight.folder import (
     read_image,
     read_truth,
 )
-from orthonav.flight.recording import Flight, View
+from orthonav.flight.recording import Flight, RecordedView
 from orthonav.flight.writer import FlightWriter
 
 __all__ = [
@@ -17,7 +17,7 @@ __all__ = [
     "FlightFolder",
     "FlightView",
     "FlightWriter",
-    "View",
+    "RecordedView",
     "decode_image",
     "open_flight",
     "read_camera",

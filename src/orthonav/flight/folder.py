@@ -27,7 +27,7 @@ OPTIONAL_COLUMNS = (
     "prior_std_m",
     "vel_east_mps",
     "vel_north_mps",
-    "lean_std_deg",
+    "tilt_std_deg",
     "vel_std_mps",
 )
 MAX_TEXT_BYTES = 500_000_000
@@ -214,7 +214,7 @@ def _telemetry(row: Mapping[str, str], time_ns: int) -> Telemetry:
         agl_m=number_of(row["agl_m"]),
         yaw_std_deg=_optional(row, "yaw_std_deg"),
         agl_std_m=_optional(row, "agl_std_m"),
-        lean_std_deg=_optional(row, "lean_std_deg"),
+        tilt_std_deg=_optional(row, "tilt_std_deg"),
         vel_std_mps=_optional(row, "vel_std_mps"),
         prior=Prior(prior[0] or 0.0, prior[1] or 0.0, prior[2] or 0.0) if usable else None,
         vel_en_mps=None if None in velocity else (velocity[0] or 0.0, velocity[1] or 0.0),

@@ -11,7 +11,7 @@ from orthonav.geo.camera import Camera
 from orthonav.records import Telemetry
 
 
-class View(Protocol):
+class RecordedView(Protocol):
     """One view: its name, what was known at exposure, and its picture when it is asked for."""
 
     @property
@@ -42,7 +42,7 @@ class Flight(Protocol):
         """What people should know of the flight."""
 
     @property
-    def views(self) -> Iterable[View]:
+    def views(self) -> Iterable[RecordedView]:
         """The views, from the first; each is read when it comes."""
 
     @property
@@ -54,19 +54,19 @@ class Flight(Protocol):
 class Retold:
     """A view of which something else was known."""
 
-    view: View
+    view: RecordedView
     telemetry: Telemetry
 
     @property
     def frame(self) -> str:
-        """See `View.frame`."""
+        """See `RecordedView.frame`."""
         return self.view.frame
 
     @property
     def where(self) -> str:
-        """See `View.where`."""
+        """See `RecordedView.where`."""
         return self.view.where
 
     def grey(self) -> NDArray[np.uint8]:
-        """See `View.grey`."""
+        """See `RecordedView.grey`."""
         return self.view.grey()

@@ -104,7 +104,7 @@ def _columns(telemetry: Telemetry) -> dict[str, Any]:
         "prior_std_m": prior and prior.std_m,
         "vel_east_mps": velocity and velocity[0],
         "vel_north_mps": velocity and velocity[1],
-        "lean_std_deg": telemetry.lean_std_deg,
+        "tilt_std_deg": telemetry.tilt_std_deg,
         "vel_std_mps": telemetry.vel_std_mps,
     }
 

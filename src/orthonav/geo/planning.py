@@ -1,7 +1,7 @@
 """Camera, height and map chosen to suit each other, and what speaks against a choice.
 
 The rules are those of the program: what a view must cover to be searched (`orthonav.localizer`),
-and at which size it is registered well (docs/design.md, section 7, points 1 and 10).
+and at which size it is registered well (docs/decisions/registration.md).
 """
 
 import math
@@ -121,7 +121,7 @@ def view_cautions(view: ViewPlan, gsd_m: float, tile_px: int) -> list[Caution]:
             Caution(
                 "low",
                 f"a view is only {view.short_m:.0f} m across: over forest or one large field it "
-                "shows nothing that lasts, and trees and houses lean by much; fly higher",
+                "shows nothing that lasts, and trees and houses tilt by much; fly higher",
             )
         )
     if coarser > MOST_COARSER:

@@ -14,7 +14,7 @@ from orthonav.geo.area import Extent
 from orthonav.geo.frames import MAX_SHEET_M
 
 LARGEST_SIDE_M = 0.9 * MAX_SHEET_M
-"""The box around a sheet is wider than the sheet itself where meridians lean."""
+"""The box around a sheet is wider than the sheet itself where meridians tilt."""
 SMALLEST_SIDE_M = 200.0
 _MERIDIAN_DEGREE_M = 111_695.0
 """A degree of latitude at its longest, at a pole."""

@@ -7,14 +7,13 @@ allows, and say how sure that is.
 
 from orthonav.localizer.localizer import Localizer
 from orthonav.localizer.match import Match, TileMatcher
-from orthonav.localizer.rectify import PreparedView, Rectified, prepare_view, rectify
+from orthonav.localizer.rectify import RectifiedView, downsampled, rectify
 
 __all__ = [
     "Localizer",
     "Match",
-    "PreparedView",
-    "Rectified",
+    "RectifiedView",
     "TileMatcher",
-    "prepare_view",
+    "downsampled",
     "rectify",
 ]

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from orthonav.errors import CameraError
 from orthonav.geo.camera import Camera, enu_from_camera
-from orthonav.localizer.rectify import Rectified
-from orthonav.records import NoFix, Telemetry
+from orthonav.localizer.rectify import RectifiedView
+from orthonav.records import NoFix, Telemetry, View
 
 MAX_TILT_DEG = 45.0
 MIN_SIDE_PX = 32
@@ -19,13 +19,19 @@ MIN_STD = 3.0
 _SAMPLE_STEP_PX = 8
 
 
-def require_camera(grey: NDArray[np.uint8], camera: Camera) -> None:
-    """Raise `CameraError` where a view (H, W) is not of the camera's size."""
+def check_view(view: View, gsd_m: float, heading_known: bool) -> NoFix | None:
+    """Why a view cannot be placed on a map of resolution `gsd_m`; None if it can be tried.
+
+    Raises `CameraError` where the picture is not of the camera's size.
+    """
+    grey, camera = view.grey, view.camera
     if grey.shape != (camera.height_px, camera.width_px):
         raise CameraError(
             f"camera is {camera.width_px} x {camera.height_px} px, "
             f"the image is {grey.shape[1]} x {grey.shape[0]} px"
         )
+    refused = check_telemetry(view.telemetry, camera, gsd_m, heading_known)
+    return refused or check_picture(grey)
 
 
 def check_telemetry(
@@ -42,7 +48,7 @@ def check_telemetry(
     if tilt_deg > MAX_TILT_DEG:
         return NoFix(
             "extreme_tilt",
-            f"camera leans {tilt_deg:.0f} deg, at most {MAX_TILT_DEG:.0f} can be used",
+            f"camera tilts {tilt_deg:.0f} deg, at most {MAX_TILT_DEG:.0f} can be used",
         )
     if min(camera.width_px, camera.height_px) < MIN_SIDE_PX:
         return NoFix("too_small", f"view is {camera.width_px} x {camera.height_px} px")
@@ -52,7 +58,7 @@ def check_telemetry(
     return None
 
 
-def check_view(grey: NDArray[np.uint8]) -> NoFix | None:
+def check_picture(grey: NDArray[np.uint8]) -> NoFix | None:
     """Why a view (H, W) shows nothing: too dark, too bright, blank; None if it shows something."""
     sample = grey[::_SAMPLE_STEP_PX, ::_SAMPLE_STEP_PX]
     counts = np.bincount(sample.reshape(-1), minlength=256)
@@ -77,7 +83,7 @@ def _percentile(counts: NDArray[np.intp], percent: float) -> float:
     return float(below + (at - math.floor(at)) * (above - below))
 
 
-def check_rectified(view: Rectified, min_valid_share: float) -> NoFix | None:
+def check_rectified(view: RectifiedView, min_valid_share: float) -> NoFix | None:
     """Why too little of a tile is seen; None if enough is."""
     share = float(view.valid.mean())
     if share < min_valid_share or share == 0:
@@ -90,7 +96,7 @@ def check_rectified(view: Rectified, min_valid_share: float) -> NoFix | None:
     return None
 
 
-def check_footprint(view: Rectified, pixel: float, min_side_px: float) -> NoFix | None:
+def check_footprint(view: RectifiedView, pixel: float, min_side_px: float) -> NoFix | None:
     """Why a rectified footprint shows too little; None if enough.
 
     `pixel` is the size of its pixels in pixels of the map, `min_side_px` the least side, in those.

@@ -1,6 +1,7 @@
 """From one view to a fix."""
 
 import math
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -11,16 +12,15 @@ from orthonav.confidence.logistic import LogisticConfidence
 from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.embed.stored import embedder_of
 from orthonav.errors import MapFileError, VariantError
-from orthonav.geo.camera import Camera
-from orthonav.localizer.checks import check_rectified, check_telemetry, check_view, require_camera
+from orthonav.localizer.checks import check_rectified, check_view
 from orthonav.localizer.match import Match, TileMatcher
 from orthonav.localizer.propose import TileProposer
-from orthonav.localizer.rectify import PreparedView, Rectified, prepare_view, rectify
+from orthonav.localizer.rectify import RectifiedView, downsampled, rectify
 from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import SheetInfo
 from orthonav.mapfile.reader import MapFile
-from orthonav.records import Fix, NoFix, Prior, Telemetry
+from orthonav.records import Fix, NoFix, Prior, Telemetry, View
 from orthonav.search.exact import rows_within
 from orthonav.search.position import PositionRule
 from orthonav.variants import variant_from_recipe
@@ -98,54 +98,43 @@ class Localizer:
 
     def locate(
         self,
-        grey: NDArray[np.uint8],
-        camera: Camera,
-        telemetry: Telemetry,
+        view: View,
         *,
         prior: Prior | None = None,
         heading_known: bool = True,
     ) -> Fix | NoFix:
-        """Where `grey` (H, W) was taken.
+        """Where a view was taken.
 
         `prior` limits the search to the tiles within three standard deviations of it. With
-        `heading_known` false all headings are tried and `telemetry.yaw_deg` may be NaN. Raises
+        `heading_known` false all headings are tried and the reported heading may be NaN. Raises
         `CameraError` if the camera is not that of the image; everything else that is wrong with a
         view makes a `NoFix`.
         """
-        require_camera(grey, camera)
-        refused = check_telemetry(telemetry, camera, self.grid.gsd_m, heading_known)
-        refused = refused or check_view(grey)
+        refused = check_view(view, self.grid.gsd_m, heading_known)
         if refused is not None:
             return refused
         if self.registration is not None:
-            return self.registration.locate(grey, camera, telemetry, prior, heading_known)
-        headings = self._headings_deg(telemetry, heading_known)
-        prepared = prepare_view(grey, camera, telemetry.agl_m, self.grid.gsd_m)
-        rectified = [self.rectified(prepared, telemetry, heading) for heading in headings]
+            return self.registration.locate(view, prior, heading_known)
+        headings = self._headings_deg(view.telemetry, heading_known)
+        smaller = downsampled(view, self.grid.gsd_m)
+        rectified = [self.rectified(smaller, heading) for heading in headings]
         refused = check_rectified(rectified[len(headings) // 2], self._min_valid_share)
         if refused is not None:
             return refused
-        rows = self._allowed(prior, [view.offset_en_m for view in rectified])
+        rows = self._allowed(prior, [each.offset_en_m for each in rectified])
         if rows is not None and rows.size == 0:
             return NoFix("outside_map", "no tile of the map lies where the prior says")
         match = self.match(self.embedded(rectified), rows)
         if not math.isfinite(match.evidence["score"]):
             return NoFix("internal_error", "the map's embeddings are not finite")
-        return self._fix(match, rectified[match.query], headings[match.query], telemetry)
+        return self._fix(match, rectified[match.query], headings[match.query], view.telemetry)
 
-    def rectified(self, view: PreparedView, telemetry: Telemetry, heading_deg: float) -> Rectified:
+    def rectified(self, view: View, heading_deg: float) -> RectifiedView:
         """The view as one tile of the map would look, under a heading."""
-        return rectify(
-            view,
-            yaw_deg=heading_deg,
-            pitch_deg=telemetry.pitch_deg,
-            roll_deg=telemetry.roll_deg,
-            agl_m=telemetry.agl_m,
-            gsd_m=self.grid.gsd_m,
-            size_px=self.grid.tile_px,
-        )
+        turned = replace(view, telemetry=replace(view.telemetry, yaw_deg=heading_deg))
+        return rectify(turned, gsd_m=self.grid.gsd_m, size_px=self.grid.tile_px)
 
-    def embedded(self, views: list[Rectified]) -> NDArray[np.float32]:
+    def embedded(self, views: list[RectifiedView]) -> NDArray[np.float32]:
         """Embeddings (Q, D) of rectified views."""
         return np.stack(
             [
@@ -161,7 +150,7 @@ class Localizer:
     def _allowed(
         self, prior: Prior | None, offsets_en_m: list[NDArray[np.float64]]
     ) -> NDArray[np.intp] | None:
-        """Rows of tiles that the camera may look at: around the prior, moved by where it leans."""
+        """Rows of tiles that the camera may look at: around the prior, moved by where it tilts."""
         if prior is None:
             return None
         offset = np.mean(offsets_en_m, axis=0)
@@ -181,7 +170,9 @@ class Localizer:
         side = math.floor(HEADING_SIGMAS * std / self._step_deg + 0.5)
         return [telemetry.yaw_deg + k * self._step_deg for k in range(-side, side + 1)]
 
-    def _fix(self, match: Match, view: Rectified, heading_deg: float, telemetry: Telemetry) -> Fix:
+    def _fix(
+        self, match: Match, view: RectifiedView, heading_deg: float, telemetry: Telemetry
+    ) -> Fix:
         # The tile shows the ground where the camera looks; the aircraft is `offset` before that.
         centre = self.centres_en_m[match.tile].astype(np.float64)
         position = centre + match.shift_en_m - view.offset_en_m

@@ -6,17 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_footprint
-from orthonav.localizer.rectify import prepare_view, rectify_footprint
-from orthonav.records import Telemetry
+from orthonav.localizer.rectify import downsampled, rectify_footprint
+from orthonav.records import Telemetry, View
 from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
 from orthonav.register.refine import Placed
 from orthonav.register.registrar import Levels, PosePrior, Registrar
 from orthonav.register.search import bank, search
 from orthonav.register.template import ViewTemplates, halved
-from orthonav.track import CameraWay
+from orthonav.track import CameraDisplacement
 
 VIEW_PX = 160
 """Views are compared at about so many pixels across."""
@@ -32,8 +31,8 @@ SURE_CORRELATION = 0.6
 NOISE_PX, NOISE_SHARE = 0.4, 0.01
 CANDIDATES = 8
 EXPECTED_STEPS, SMALL_STEP_PX = 5, 0.1
-LEAN_SHARE = 0.6
-"""How much of what a wrong lean moves a view stays in the sum of many ways: the next way takes most
+TILT_SHARE = 0.6
+"""How much of what a wrong tilt moves a view stays in the sum of many ways: the next way takes most
 of it back."""
 SAME_BIAS = np.array([math.inf, 0.01, math.radians(0.1), math.radians(0.1)])
 """Differences of heading, log scale, pitch and roll for which a view is not rectified anew. A
@@ -99,7 +98,7 @@ class Footprint:
     camera_px: Array
     telemetry: Telemetry
     bias: Array
-    view: tuple[NDArray[np.uint8], Camera, Telemetry]
+    view: View
 
     @property
     def middle_px(self) -> tuple[float, float]:
@@ -110,7 +109,7 @@ class Footprint:
     @property
     def en_from_px(self) -> Array:
         """What takes pixels (x, y) to metres east and north (2, 2), by what was told."""
-        heading = math.radians(self.view[2].yaw_deg)
+        heading = math.radians(self.view.telemetry.yaw_deg)
         cos, sin = math.cos(heading), math.sin(heading)
         metres = self.pixel_m * math.exp(-self.bias[1])
         return np.array([[cos, -sin], [-sin, -cos]]) * metres
@@ -118,22 +117,16 @@ class Footprint:
     @classmethod
     def of(
         cls,
-        grey: NDArray[np.uint8],
-        camera: Camera,
-        telemetry: Telemetry,
+        view: View,
         pixel_m: float | None,
         bias: Array = NO_BIAS,
     ) -> "Footprint | None":
-        """A view (H, W) with what was told of it, None where it shows too little."""
-        view = (grey, camera, telemetry)
-        telemetry = corrected_by(telemetry, bias)
+        """A view for odometry, None where it shows too little."""
+        camera, telemetry = view.camera, corrected_by(view.telemetry, bias)
         side_m = camera.gsd_m(telemetry.agl_m) * math.sqrt(camera.width_px * camera.height_px)
         pixel_m = pixel_m or side_m / VIEW_PX
         made = rectify_footprint(
-            prepare_view(grey, camera, telemetry.agl_m, pixel_m),
-            pitch_deg=telemetry.pitch_deg,
-            roll_deg=telemetry.roll_deg,
-            agl_m=telemetry.agl_m,
+            downsampled(replace(view, telemetry=telemetry), pixel_m),
             gsd_m=pixel_m,
             multiple_px=2 ** (LEVELS - 1),
         )
@@ -146,46 +139,46 @@ class Footprint:
     def by(self, bias: Array) -> "Footprint | None":
         """The same view by what is known now to be wrong with what is told.
 
-        Two views must be seen by the same: else what was learnt between them, a lean most of all,
+        Two views must be seen by the same: else what was learnt between them, a tilt most of all,
         would look like a way gone.
         """
         if (np.abs(bias - self.bias)[1:] > SAME_BIAS[1:]).any():
-            return Footprint.of(*self.view, self.pixel_m, bias)
+            return Footprint.of(self.view, self.pixel_m, bias)
         # Rectified with the heading up, so that only this need not be what it was.
         kept = np.array([bias[0], *self.bias[1:]])
-        return replace(self, telemetry=corrected_by(self.view[2], kept), bias=kept)
+        return replace(self, telemetry=corrected_by(self.view.telemetry, kept), bias=kept)
 
 
 @dataclass(frozen=True, eq=False)
 class Moved:
     """A displacement, and the share of the later view that the earlier one showed too."""
 
-    way: CameraWay
+    way: CameraDisplacement
     overlap: float
 
 
 def moved_between(
     before: Footprint,
     now: Footprint,
-    lean_noise_rad: float,
-    told_noise: Array,
+    tilt_noise_rad: float,
+    telemetry_noise: Array,
     expected_en_m: Array | None = None,
 ) -> Moved | None:
     """The way from one view to the next, both with the same `pixel_m`; None where they do not
     show enough of the same ground to say.
 
-    The displacement is turned and scaled as was told of the view before; `lean_noise_rad` is how
-    the lean differs from what was told between views, `told_noise` (2,) the variances with which
-    told heading (rad) and log scale do. A way that is `expected_en_m` (2,) is tried first; it
-    saves the search where it fits, and changes nothing where it does not.
+    The displacement is turned and scaled as was told of the view before; `tilt_noise_rad` is how
+    the tilt differs from what was told between views, `telemetry_noise` (2,) the variances with
+    which reported heading (rad) and log scale do. A way that is `expected_en_m` (2,) is tried
+    first; it saves the search where it fits, and changes nothing where it does not.
     """
-    told_turn = math.radians(now.telemetry.yaw_deg - before.telemetry.yaw_deg)
-    if not math.isfinite(told_turn):
+    reported_turn = math.radians(now.telemetry.yaw_deg - before.telemetry.yaw_deg)
+    if not math.isfinite(reported_turn):
         return None
     prior = PosePrior(
-        math.remainder(told_turn, 2 * math.pi),
-        max(math.sqrt(2 * told_noise[0]), TURN_STEP_RAD / 3),
-        max(math.sqrt(2 * told_noise[1]), SCALE_STEP / 3),
+        math.remainder(reported_turn, 2 * math.pi),
+        max(math.sqrt(2 * telemetry_noise[0]), TURN_STEP_RAD / 3),
+        max(math.sqrt(2 * telemetry_noise[1]), SCALE_STEP / 3),
     )
     placed = _registered(before, now, prior, expected_en_m)
     if placed is None or placed.weighted < MIN_CORRELATION:
@@ -195,13 +188,13 @@ def moved_between(
         pose.map_px(now.camera_px) - np.array(before.middle_px) - before.camera_px
     )
     std_m = math.hypot(NOISE_PX * before.pixel_m, NOISE_SHARE * float(np.hypot(*way)))
-    variance = std_m**2 + (LEAN_SHARE * now.telemetry.agl_m * lean_noise_rad) ** 2
-    told_rad = math.radians(now.view[2].yaw_deg - before.view[2].yaw_deg)
-    seen = CameraWay(
+    variance = std_m**2 + (TILT_SHARE * now.telemetry.agl_m * tilt_noise_rad) ** 2
+    reported_rad = math.radians(now.view.telemetry.yaw_deg - before.view.telemetry.yaw_deg)
+    seen = CameraDisplacement(
         way,
         np.eye(2) * variance,
         reach_m=_reach_px(before, now) * before.pixel_m,
-        turned_rad=math.remainder(pose.turn_rad - told_rad, 2 * math.pi),
+        turned_rad=math.remainder(pose.turn_rad - reported_rad, 2 * math.pi),
         scaled=pose.log_scale + float(now.bias[1] - before.bias[1]),
     )
     return Moved(seen, min(max(placed.overlap, 0.0), 1.0))

@@ -10,7 +10,7 @@ from orthonav.embed.bank import embed_poses
 from orthonav.embed.contract import ViewEmbedder
 from orthonav.embed.whitened import WhitenedEmbedder
 from orthonav.geo.grid import TileGrid
-from orthonav.localizer.rectify import Rectified
+from orthonav.localizer.rectify import RectifiedView
 from orthonav.register.pose import Pose
 from orthonav.register.search import Candidate
 from orthonav.search.exact import ExactIndex, top_tiles
@@ -62,7 +62,7 @@ class TileProposer:
         return REPRESENT_MS + poses * (POSE_MS + SCORE_MS * tiles * self.embedder.dims)
 
     def candidates(
-        self, view: Rectified, poses: list[tuple[float, float]], rows: NDArray[np.intp] | None
+        self, view: RectifiedView, poses: list[tuple[float, float]], rows: NDArray[np.intp] | None
     ) -> list[Candidate]:
         """Candidates for a view rectified heading-up at the map's resolution, among tiles `rows`.
 

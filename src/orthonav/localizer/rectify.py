@@ -18,6 +18,7 @@ from orthonav.geo.camera import (
     distort,
     footprint_en_m,
 )
+from orthonav.records import View
 
 MAX_REACH = 2.0
 EDGE_PX = 1e-6
@@ -27,16 +28,8 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedView:
-    """A view thinned so that its pixels are not much finer than the map's, and its camera."""
-
-    grey: NDArray[np.uint8]
-    camera: Camera
-
-
-@dataclass(frozen=True, eq=False)
-class Rectified:
-    """A rectified view.
+class RectifiedView:
+    """A view as a vertical, north-up or heading-up picture at one ground resolution.
 
     `grey` (H, W) uint8 and `valid` (H, W) bool, grey 0 where not valid; `offset_en_m` where the
     centre of the window lies, metres east and north of the camera.
@@ -47,58 +40,43 @@ class Rectified:
     offset_en_m: Array
 
 
-def prepare_view(
-    grey: NDArray[np.uint8], camera: Camera, agl_m: float, gsd_m: float
-) -> PreparedView:
-    """Average the view down by whole numbers towards `gsd_m`, so that resampling cannot alias."""
+def downsampled(view: View, gsd_m: float) -> View:
+    """The view averaged down by whole numbers towards `gsd_m`, so that resampling cannot alias."""
+    camera, agl_m = view.camera, view.telemetry.agl_m
     factor = int(gsd_m / max(camera.gsd_m(agl_m), 1e-9))  # heights may be absurd, not yet refused
     width, height = camera.width_px // max(1, factor), camera.height_px // max(1, factor)
     if factor < 2 or width < 8 or height < 8:
-        return PreparedView(grey, camera)
+        return view
     # Whole multiples only: what is left over at the right and below is not worth a slower path.
     whole = replace(camera, width_px=width * factor, height_px=height * factor)
-    used = grey[: whole.height_px, : whole.width_px]
+    used = view.grey[: whole.height_px, : whole.width_px]
     thinned = cv2.resize(used, (width, height), interpolation=cv2.INTER_AREA)
-    return PreparedView(np.asarray(thinned, dtype=np.uint8), whole.resized(width, height))
+    grey = np.asarray(thinned, dtype=np.uint8)
+    return replace(view, grey=grey, camera=whole.resized(width, height))
 
 
-def rectify(
-    view: PreparedView,
-    *,
-    yaw_deg: float,
-    pitch_deg: float,
-    roll_deg: float,
-    agl_m: float,
-    gsd_m: float,
-    size_px: int,
-) -> Rectified:
-    """Rectify a square of `size_px` pixels around the place where the optical axis meets ground.
+def rectify(view: View, *, gsd_m: float, size_px: int) -> RectifiedView:
+    """A square of `size_px` pixels, north up, around the point where the optical axis meets ground.
 
     The axis must point below the horizon. Pixels that the camera did not see are not valid.
     """
-    offset = np.array(axis_on_ground_en_m(yaw_deg, pitch_deg, roll_deg, agl_m))
-    attitude = yaw_deg, pitch_deg, roll_deg, agl_m
+    telemetry = view.telemetry
+    attitude = telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
+    offset = np.array(axis_on_ground_en_m(*attitude))
     grey, valid = _window(view, attitude, offset, gsd_m, (size_px, size_px))
-    return Rectified(grey, valid, offset)
+    return RectifiedView(grey, valid, offset)
 
 
-def rectify_footprint(
-    view: PreparedView,
-    *,
-    pitch_deg: float,
-    roll_deg: float,
-    agl_m: float,
-    gsd_m: float,
-    multiple_px: int,
-) -> Rectified:
+def rectify_footprint(view: View, *, gsd_m: float, multiple_px: int) -> RectifiedView:
     """Rectify what the camera sees, its own heading up, sides whole multiples of `multiple_px`.
 
     What is left over of the sides is cut off, so that a vertical view has no pixels not seen.
-    Where the view reaches far out to one side (it leans), no more than `MAX_REACH` times the half
+    Where the view reaches far out to one side (it tilts), no more than `MAX_REACH` times the half
     sides of a vertical view are kept on either side of the optical axis. The `offset_en_m` is that
     of a heading of 0.
     """
-    camera = view.camera
+    camera, telemetry = view.camera, view.telemetry
+    pitch_deg, roll_deg, agl_m = telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
     axis = np.array(axis_on_ground_en_m(0.0, pitch_deg, roll_deg, agl_m))
     half_m = np.array([camera.width_px / camera.fx_px, camera.height_px / camera.fy_px]) * agl_m / 2
     low, high = axis - MAX_REACH * half_m, axis + MAX_REACH * half_m
@@ -113,11 +91,11 @@ def rectify_footprint(
     middle = (low + high) / 2
     attitude = 0.0, pitch_deg, roll_deg, agl_m
     grey, valid = _window(view, attitude, middle, gsd_m, (height, width))
-    return Rectified(grey, valid, middle)
+    return RectifiedView(grey, valid, middle)
 
 
 def _window(
-    view: PreparedView,
+    view: View,
     attitude: tuple[float, float, float, float],
     middle_en_m: Array,
     gsd_m: float,
@@ -136,7 +114,7 @@ def _window(
 
 
 def _warped(
-    view: PreparedView, camera_from_window: Array, shape: tuple[int, int], corners: Array
+    view: View, camera_from_window: Array, shape: tuple[int, int], corners: Array
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """The fast path: no distortion, no horizon, so one homography does it."""
     size = shape[1], shape[0]
@@ -160,7 +138,7 @@ def _warped(
 
 
 def _remapped(
-    view: PreparedView, camera_from_window: Array, shape: tuple[int, int]
+    view: View, camera_from_window: Array, shape: tuple[int, int]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """The general path: every pixel through lens and horizon."""
     camera = view.camera
@@ -172,7 +150,7 @@ def _remapped(
         part = np.array([[1 / NODE_PX, 0, 0], [0, 1 / NODE_PX, 0]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         index = cv2.warpAffine(nodes.astype(np.float32), part, (width, height), flags=flags)
-    else:  # the view leans far, or the horizon or the end of the lens lies within
+    else:  # the view tilts far, or the horizon or the end of the lens lies within
         sides = [np.arange(0.5, side, dtype=np.float64) for side in shape]
         index = (_seen_px(camera, camera_from_window, *sides) - 0.5).astype(np.float32)
     x, y = cv2.split(np.asarray(index, np.float32))

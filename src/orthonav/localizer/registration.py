@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.confidence.registered import Chances, RegisteredConfidence
-from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_footprint
 from orthonav.localizer.propose import TileProposer
-from orthonav.localizer.rectify import Rectified, prepare_view, rectify_footprint
+from orthonav.localizer.rectify import RectifiedView, downsampled, rectify_footprint
 from orthonav.mapfile.manifest import SheetInfo
-from orthonav.records import Fix, NoFix, Prior, Telemetry
+from orthonav.records import Fix, NoFix, Prior, Telemetry, View
 from orthonav.register.pose import Pose
 from orthonav.register.reference import GreyPyramid, Reference
 from orthonav.register.refine import Placed
@@ -49,7 +48,7 @@ STAGE_CANDIDATES = 8
 MIN_CANDIDATES = 6
 CANDIDATE_SHARE = 0.5
 MIN_VIEW_PX = 24.0
-MIN_LEAN_COS = 0.5
+MIN_TILT_COS = 0.5
 USUAL_CHANCES = Chances(32.0, 15.0, 48.0)
 DOUBT = 0.01
 """Views of this confidence to one less it are looked at one level finer."""
@@ -63,7 +62,7 @@ MAX_SEARCH_PX = 8_000_000
 tiles, or with a prior."""
 
 
-class _Sure(NamedTuple):
+class _ClearMargin(NamedTuple):
     """A view this far above chance and above its rivals is not searched again."""
 
     strength: float
@@ -71,19 +70,19 @@ class _Sure(NamedTuple):
     peak_ratio: float
 
 
-SURE = _Sure(2.2, 1.9, 1.9)
-SURE_AT_LOOK = _Sure(1.8, 1.5, 1.5)
+CLEAR = _ClearMargin(2.2, 1.9, 1.9)
+CLEAR_AT_JUDGED = _ClearMargin(1.8, 1.5, 1.5)
 """Less is enough where the level that misses least was searched, if only in part."""
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedFootprint:
+class PreparedView:
     """A view made ready: its templates, levels, and where the camera is seen from its middle.
 
     `rectified_at` makes the view at the ground resolution of a level.
     """
 
-    rectified_at: Callable[[int], Rectified]
+    rectified_at: Callable[[int], RectifiedView]
     templates: ViewTemplates
     levels: Levels
     side_px: float
@@ -115,51 +114,40 @@ class RegistrationLocalizer:
         self.propose = propose
         self.floor_px, self._last_ms = floor_px, last_ms
 
-    def locate(
-        self,
-        grey: NDArray[np.uint8],
-        camera: Camera,
-        telemetry: Telemetry,
-        prior: Prior | None,
-        heading_known: bool,
-    ) -> Fix | NoFix:
-        """Where a view (H, W) was taken; checks of view and telemetry have been made."""
-        view = self.prepared(grey, camera, telemetry, heading_known)
-        if isinstance(view, NoFix):
-            return view
-        if prior is not None and not self.touches_map(prior, view):
+    def locate(self, view: View, prior: Prior | None, heading_known: bool) -> Fix | NoFix:
+        """Where a view was taken; checks of view and telemetry have been made."""
+        prepared = self.prepared(view, heading_known)
+        if isinstance(prepared, NoFix):
+            return prepared
+        if prior is not None and not self.touches_map(prior, prepared):
             return NoFix("outside_map", "the map does not reach to where the prior says")
-        best = self.best(view, prior)
+        best = self.best(prepared, prior)
         if best is None:
             detail = "no place of the map could be compared with the view"
             if prior is None:
                 detail += "; a large map needs a prior, or views as large as its tiles"
             return NoFix("no_match", detail)
-        return self._fix(view, best, telemetry)
+        return self._fix(prepared, best, view.telemetry)
 
-    def prepared(
-        self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry, heading_known: bool
-    ) -> PreparedFootprint | NoFix:
+    def prepared(self, view: View, heading_known: bool) -> PreparedView | NoFix:
         """The view rectified to the level where it is finished, heading up, all that it sees."""
+        camera, telemetry = view.camera, view.telemetry
         agl_m = telemetry.agl_m
-        lean = math.cos(math.radians(telemetry.pitch_deg)) * math.cos(
+        tilt = math.cos(math.radians(telemetry.pitch_deg)) * math.cos(
             math.radians(telemetry.roll_deg)
         )
         # The area seen grows with the inverse cube of the cosine, as far as it is looked at.
-        nominal_m = (agl_m / max(lean, MIN_LEAN_COS) ** 1.5) * math.sqrt(
+        nominal_m = (agl_m / max(tilt, MIN_TILT_COS) ** 1.5) * math.sqrt(
             camera.width_px * camera.height_px / (camera.fx_px * camera.fy_px)
         )
         levels = Levels.of(nominal_m / self.grid.gsd_m, self.registrar.reference.levels)
         gsd_m = self.grid.gsd_m * 2**levels.final
         reduce = levels.coarse - levels.final
 
-        def rectified_at(finest: int) -> Rectified:
+        def rectified_at(finest: int) -> RectifiedView:
             finest_m = self.grid.gsd_m * 2**finest
             return rectify_footprint(
-                prepare_view(grey, camera, agl_m, finest_m),
-                pitch_deg=telemetry.pitch_deg,
-                roll_deg=telemetry.roll_deg,
-                agl_m=agl_m,
+                downsampled(view, finest_m),
                 gsd_m=finest_m,
                 multiple_px=2 ** max(0, reduce + levels.final - finest),
             )
@@ -173,9 +161,9 @@ class RegistrationLocalizer:
         offset = rectified.offset_en_m / self.grid.gsd_m
         side_px = math.sqrt(float(rectified.valid.sum())) * gsd_m / self.grid.gsd_m
         camera_px = np.array([-offset[0], offset[1]])
-        return PreparedFootprint(rectified_at, templates, levels, side_px, camera_px, pose_prior)
+        return PreparedView(rectified_at, templates, levels, side_px, camera_px, pose_prior)
 
-    def best(self, view: PreparedFootprint, prior: Prior | None) -> Registered | None:
+    def best(self, view: PreparedView, prior: Prior | None) -> Registered | None:
         """The best place over all ways of search that had to be tried."""
         judged: list[Placed] = []
         best: Registered | None = None
@@ -186,10 +174,10 @@ class RegistrationLocalizer:
             )
             candidates += len(found)
             best = None
-            enough = SURE_AT_LOOK if level == view.levels.look else SURE
+            enough = CLEAR_AT_JUDGED if level == view.levels.look else CLEAR
             if judged and self._looks_sure(view, judged, enough):
                 best = self._finished(view, judged, candidates)
-                if self._is_sure(best, enough):
+                if self._is_confident(best, enough):
                     return best
         if not judged:
             return None
@@ -200,17 +188,15 @@ class RegistrationLocalizer:
         finer = ViewTemplates(made.grey, made.valid, view.levels.final - 1)
         return self.registrar.deepened(view.templates, finer, view.levels, best)
 
-    def _finished(
-        self, view: PreparedFootprint, judged: list[Placed], candidates: int
-    ) -> Registered:
+    def _finished(self, view: PreparedView, judged: list[Placed], candidates: int) -> Registered:
         return self.registrar.finished(view.templates, view.levels, judged, view.prior, candidates)
 
-    def _looks_sure(self, view: PreparedFootprint, judged: list[Placed], enough: _Sure) -> bool:
+    def _looks_sure(self, view: PreparedView, judged: list[Placed], enough: _ClearMargin) -> bool:
         """Whether finishing the best of them may end the search."""
         best, rival = self.registrar.standing(view.templates, judged, view.prior)
         return best > enough.strength * self._chances.look and best > enough.look_ratio * rival
 
-    def _is_sure(self, best: Registered, enough: _Sure) -> bool:
+    def _is_confident(self, best: Registered, enough: _ClearMargin) -> bool:
         if best.score <= enough.strength * self._chances.total:
             return False
         return best.look_ratio > enough.look_ratio and best.peak_ratio > enough.peak_ratio
@@ -226,7 +212,7 @@ class RegistrationLocalizer:
         return self.confidence.chances if self.confidence else USUAL_CHANCES
 
     def _ways(
-        self, view: PreparedFootprint, prior: Prior | None
+        self, view: PreparedView, prior: Prior | None
     ) -> Iterator[tuple[int, list[Candidate]]]:
         """Candidates and the level they were found at, by the cheapest way first.
 
@@ -258,7 +244,7 @@ class RegistrationLocalizer:
                 if stage:
                     yield look, self._searched(view, prior, look, stage, STAGE_CANDIDATES)
 
-    def _tiles(self, view: PreparedFootprint, prior: Prior | None) -> NDArray[np.intp] | None:
+    def _tiles(self, view: PreparedView, prior: Prior | None) -> NDArray[np.intp] | None:
         """Rows of the tiles that the prior allows, None for all."""
         if prior is None or self.propose is None:
             return None
@@ -268,18 +254,14 @@ class RegistrationLocalizer:
         reach_m = self._reach_px(view, prior) * grid.gsd_m + grid.stride_m
         return rows_within(self.propose.centres_en_m, centre, reach_m)
 
-    def _tiles_ms(
-        self, view: PreparedFootprint, rows: NDArray[np.intp] | None, poses: int
-    ) -> float:
+    def _tiles_ms(self, view: PreparedView, rows: NDArray[np.intp] | None, poses: int) -> float:
         """What candidates from tiles cost; infinite where there can be none."""
         if self.propose is None or not self.propose.fits(view.side_px):
             return math.inf
         tiles = len(self.propose.centres_en_m) if rows is None else len(rows)
         return self.propose.cost_ms(poses, tiles) if tiles else math.inf
 
-    def _search_ms(
-        self, view: PreparedFootprint, prior: Prior | None, level: int, poses: int
-    ) -> float:
+    def _search_ms(self, view: PreparedView, prior: Prior | None, level: int, poses: int) -> float:
         rows, cols = self.registrar.reference.shape(level)
         if prior is not None:
             across = 2 * self._reach_px(view, prior) / 2**level
@@ -294,7 +276,7 @@ class RegistrationLocalizer:
 
     def _searched(
         self,
-        view: PreparedFootprint,
+        view: PreparedView,
         prior: Prior | None,
         level: int,
         poses: list[tuple[float, float]],
@@ -315,7 +297,7 @@ class RegistrationLocalizer:
         worth = sum(each.score >= CANDIDATE_SHARE * found[0].score for each in found)
         return found[: max(worth, MIN_CANDIDATES)]
 
-    def _prior_px(self, prior: Prior, view: PreparedFootprint) -> tuple[float, float]:
+    def _prior_px(self, prior: Prior, view: PreparedView) -> tuple[float, float]:
         """Where the middle of the view should lie by the prior, x and y at level 0."""
         east, north = self.sheet.frame.en_from_latlon(prior.lat_deg, prior.lon_deg)
         x = (float(east) - self.grid.west_m) / self.grid.gsd_m
@@ -326,27 +308,27 @@ class RegistrationLocalizer:
         moved = np.array([[cos, -sin], [sin, cos]]) @ view.camera_px
         return x - float(moved[0]), y - float(moved[1])
 
-    def _reach_px(self, view: PreparedFootprint, prior: Prior) -> float:
+    def _reach_px(self, view: PreparedView, prior: Prior) -> float:
         """How far from there the middle of the view may lie."""
-        lean = float(np.hypot(*view.camera_px))
+        tilt = float(np.hypot(*view.camera_px))
         turn = 2.0 if view.prior.turn_rad is None else 2 * view.prior.turn_std_rad
         reach = PRIOR_SIGMAS * max(prior.std_m, 0.0) / self.grid.gsd_m
-        return float(reach + lean * min(turn, 1.0) + 2.0 * 2**view.levels.coarse)
+        return float(reach + tilt * min(turn, 1.0) + 2.0 * 2**view.levels.coarse)
 
-    def touches_map(self, prior: Prior, view: PreparedFootprint) -> bool:
+    def touches_map(self, prior: Prior, view: PreparedView) -> bool:
         """Whether any of the map lies where the prior allows the view to be."""
         x, y = self._prior_px(prior, view)
         reach = self._reach_px(view, prior)
         rows, cols = self.registrar.reference.shape(0)
         return -reach < x < cols + reach and -reach < y < rows + reach
 
-    def _fix(self, view: PreparedFootprint, best: Registered, telemetry: Telemetry) -> Fix:
+    def _fix(self, view: PreparedView, best: Registered, telemetry: Telemetry) -> Fix:
         placed = best.placed
         lat, lon = self.sheet.frame.latlon_from_en(self.camera_en_m(view, placed.pose))
         covariance = self.covariance(view, placed)[:2, :2]
-        if telemetry.lean_std_deg is not None:
-            lean_m = telemetry.agl_m * math.radians(telemetry.lean_std_deg)
-            covariance = covariance + np.eye(2) * lean_m**2
+        if telemetry.tilt_std_deg is not None:
+            tilt_m = telemetry.agl_m * math.radians(telemetry.tilt_std_deg)
+            covariance = covariance + np.eye(2) * tilt_m**2
         covariance.flags.writeable = False
         evidence = best.evidence()
         confidence = math.nan if self.confidence is None else self.confidence(evidence)
@@ -361,18 +343,18 @@ class RegistrationLocalizer:
             evidence=MappingProxyType(evidence),
         )
 
-    def camera_en_m(self, view: PreparedFootprint, pose: Pose) -> NDArray[np.float64]:
+    def camera_en_m(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
         """Metres east and north (2,) of the camera where a view's window lies at `pose`."""
         x, y = pose.map_px(view.camera_px)
         gsd_m = self.grid.gsd_m
         return np.array([self.grid.west_m + float(x) * gsd_m, self.grid.north_m - float(y) * gsd_m])
 
-    def seen_from(self, view: PreparedFootprint, pose: Pose) -> NDArray[np.float64]:
+    def seen_from(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
         """Where the camera of a view at `pose` is (4,): metres east and north, heading (rad) and
         log scale."""
         return np.array([*self.camera_en_m(view, pose), pose.turn_rad, pose.log_scale])
 
-    def pose_of(self, view: PreparedFootprint, seen_from: NDArray[np.float64]) -> Pose:
+    def pose_of(self, view: PreparedView, seen_from: NDArray[np.float64]) -> Pose:
         """Where a view's window lies if the camera is at (4,): metres east and north, heading
         (rad) and log scale. The inverse of `seen_from`."""
         east, north, turn, log_scale = seen_from.tolist()
@@ -381,7 +363,7 @@ class RegistrationLocalizer:
         gsd_m = self.grid.gsd_m
         return Pose(x / gsd_m - float(moved[0]), y / gsd_m - float(moved[1]), turn, log_scale)
 
-    def covariance(self, view: PreparedFootprint, placed: Placed) -> NDArray[np.float64]:
+    def covariance(self, view: PreparedView, placed: Placed) -> NDArray[np.float64]:
         """Covariance (4, 4) of the camera's east and north (m), heading (rad) and log scale."""
         assert placed.covariance is not None
         moved = placed.pose.linear @ view.camera_px

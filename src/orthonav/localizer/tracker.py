@@ -13,18 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import MapFileError
-from orthonav.geo.camera import Camera
-from orthonav.localizer.checks import check_telemetry, check_view, require_camera
+from orthonav.localizer.checks import check_view
 from orthonav.localizer.levelled import levelled
 from orthonav.localizer.localizer import Localizer
 from orthonav.localizer.odometry import Footprint, Moved, corrected_by, moved_between
 from orthonav.localizer.places import places_of
-from orthonav.localizer.registration import PreparedFootprint
-from orthonav.records import Fix, NoFix, Prior, Telemetry
+from orthonav.localizer.registration import PreparedView
+from orthonav.records import Fix, NoFix, Prior, Telemetry, View
 from orthonav.register.registrar import Registered
-from orthonav.track import Estimate, Mixture, Model, Sighting, State, Told, ToldVelocity
+from orthonav.track import Estimate, Mixture, Model, ReportedVelocity, Sighting, State, Told
 from orthonav.track.hypotheses import within
-from orthonav.track.model import HEADING, LEAN, SCALE, VELOCITY
+from orthonav.track.model import HEADING, SCALE, TILT, VELOCITY
 from orthonav.track.smooth import History, Smoothed
 
 LOCAL_SHARE = 0.75
@@ -32,8 +31,8 @@ LOCAL_SHARE = 0.75
 LOCAL_SIGMAS = 4.0
 MIN_LOCAL_M = 30.0
 LEAST_NEW = 0.15
-"""Share of a view that counts as new although it was seen before: noise, light and lean differ."""
-LEAN_NEW = 0.3
+"""Share of a view that counts as new although it was seen before: noise, light and tilt differ."""
+TILT_NEW = 0.3
 """Views' worth of new ground after which perspective is looked at again: of ground that was seen it
 says the same, and it costs as much as all the rest."""
 LONGEST_GAP_S = 600.0
@@ -61,13 +60,13 @@ class Tracker:
         heading_known: bool = True,
         use_prior: bool = True,
         every_prior: bool = False,
-        hindsight: bool = False,
+        smooth: bool = False,
         lag: int | None = None,
     ) -> None:
         """With `use_prior` the flight begins where the first view's prior says; with `every_prior`
         those of all views are measured positions, such as GNSS.
 
-        With `hindsight` what is needed for `in_hindsight` is kept: every view by all, or, with
+        With `smooth` what is needed for `smoothed_track` is kept: every view by all, or, with
         `lag`, by those before it and so many after it.
         Raises `MapFileError` where the map has no registration layer or no confidence.
         """
@@ -85,53 +84,49 @@ class Tracker:
         self._before: Footprint | None = None
         self._velocity: Array | None = None
         self._unlevelled = np.full(2, np.inf)
-        self._start_was_told = False
+        self._start_was_reported = False
         self._use_prior, self._every_prior = use_prior, every_prior
-        self._history = History() if hindsight else None
+        self._history = History() if smooth else None
         self._lag = lag
         self._seen: list[tuple[Fix | NoFix, Telemetry]] = []
         self._lagged: list[Fix | NoFix] = []
         self.state = State.SEARCHING
 
-    def locate(self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry) -> Fix | NoFix:
-        """Where the aircraft is, with this view (H, W) and all before it.
+    def locate(self, view: View) -> Fix | NoFix:
+        """Where the aircraft is, with this view and all before it.
 
         A view that shows nothing moves the track on by what is known of the velocity. Raises
         `CameraError` if the camera is not that of the image.
         """
-        require_camera(grey, camera)
-        refused = check_telemetry(
-            telemetry, camera, self._localizer.grid.gsd_m, self._heading_known
-        )
-        refused = refused or check_view(grey)
-        overlap = self._predict(None if refused else grey, camera, telemetry)
+        refused = check_view(view, self._localizer.grid.gsd_m, self._heading_known)
+        overlap = self._predict(None if refused else view, view.telemetry)
         self._unlevelled += 1 - overlap
         if refused is None:
-            refused = self._observe(grey, camera, telemetry, overlap)
-        return self._outcome(telemetry, refused)
+            refused = self._observe(view, overlap)
+        return self._outcome(view.telemetry, refused)
 
     @property
     def state_name(self) -> str:
         """The state as `fixes.jsonl` has it."""
         return self.state.value
 
-    def passed(self, camera: Camera, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+    def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """Where the aircraft is at a view whose picture cannot be used, for `reason`."""
-        self._predict(None, camera, telemetry)
+        self._predict(None, telemetry)
         return self._outcome(telemetry, reason)
 
-    def in_hindsight(self) -> list[Fix | NoFix]:
+    def smoothed_track(self) -> list[Fix | NoFix]:
         """Where the aircraft was at each view so far, by views after it too."""
         if self._history is None:
             raise ValueError("this tracker keeps no history")
         left = len(self._seen) - len(self._lagged)
         smoothed = self._history.smoothed(left) if left else []
         return self._lagged + [
-            self._with_hindsight(*pair)
+            self._smoothed_fix(*pair)
             for pair in zip(smoothed, self._seen[len(self._lagged) :], strict=True)
         ]
 
-    def _with_hindsight(
+    def _smoothed_fix(
         self, smoothed: Smoothed | None, seen: tuple[Fix | NoFix, Telemetry]
     ) -> Fix | NoFix:
         """A view by those after it; as it was at the time where those know less of it.
@@ -170,18 +165,16 @@ class Tracker:
             self._seen.append((outcome, telemetry))
             if self._lag is not None and len(self._seen) > self._lag:
                 smoothed = self._history.smoothed(self._lag + 1)[0]
-                self._lagged.append(self._with_hindsight(smoothed, self._seen[-self._lag - 1]))
+                self._lagged.append(self._smoothed_fix(smoothed, self._seen[-self._lag - 1]))
         return outcome
 
-    def _predict(
-        self, grey: NDArray[np.uint8] | None, camera: Camera, telemetry: Telemetry
-    ) -> float:
+    def _predict(self, view: View | None, telemetry: Telemetry) -> float:
         """Move the track to the time of this view; the share of it that was seen before."""
         before, now = self._before, None
-        if grey is not None and self._heading_known:
+        if view is not None and self._heading_known:
             bias, _ = self.mixture.bias()
             before = None if before is None else before.by(bias)
-            now = self._footprint(grey, camera, telemetry, before, bias)
+            now = self._footprint(view, before, bias)
         prior = telemetry.prior if self._use_prior or self._every_prior else None
         if self._usual_model and math.isfinite(telemetry.agl_m):
             self._usual_model = False
@@ -189,15 +182,15 @@ class Tracker:
         if self._time_ns is None:
             self._time_ns, self._before = telemetry.time_ns, now
             if prior is not None:
-                self._start_was_told = True
+                self._start_was_reported = True
                 self.mixture.start(*self._place(prior))
             return 0.0
         seconds = (telemetry.time_ns - self._time_ns) / 1e9
         if not 0 < seconds < LONGEST_GAP_S:
             seconds = UNKNOWN_STEP_S if seconds <= 0 else LONGEST_GAP_S
         self._time_ns = telemetry.time_ns
-        noise = self._told_noise(telemetry)
-        told = self._told_velocity(telemetry)
+        noise = self._telemetry_noise(telemetry)
+        told = self._reported_velocity(telemetry)
         seen = self._seen_way(before, now, noise, self._way(seconds, told))
         self._before = now
         self.mixture.predict(seconds, told, None if seen is None else seen.way, noise)
@@ -210,9 +203,9 @@ class Tracker:
         frame = self._localizer.sheet.frame
         return frame.en_from_latlon(prior.lat_deg, prior.lon_deg), max(prior.std_m, 1.0)
 
-    def _told_noise(self, telemetry: Telemetry) -> Array:
+    def _telemetry_noise(self, telemetry: Telemetry) -> Array:
         """Variances (2,) of told heading and log scale from view to view, as told or as usual."""
-        noise = self.model.told_noise.copy()
+        noise = self.model.telemetry_noise.copy()
         if telemetry.yaw_std_deg is not None:
             noise[0] = math.radians(telemetry.yaw_std_deg) ** 2
         if telemetry.agl_std_m is not None and telemetry.agl_m > 0:
@@ -221,20 +214,18 @@ class Tracker:
 
     def _footprint(
         self,
-        grey: NDArray[np.uint8],
-        camera: Camera,
-        telemetry: Telemetry,
+        view: View,
         before: Footprint | None,
         bias: Array,
     ) -> Footprint | None:
         """The view for odometry, in pixels of the one before unless they differ too much."""
         if before is not None:
-            made = Footprint.of(grey, camera, telemetry, before.pixel_m, bias)
+            made = Footprint.of(view, before.pixel_m, bias)
             if made is None or made.grey.size < 4 * before.grey.size:
                 return made
-        return Footprint.of(grey, camera, telemetry, None, bias)
+        return Footprint.of(view, None, bias)
 
-    def _told_velocity(self, telemetry: Telemetry) -> ToldVelocity | None:
+    def _reported_velocity(self, telemetry: Telemetry) -> ReportedVelocity | None:
         """The told velocity beside that of the view before, None where none is told."""
         before, told = self._velocity, telemetry.vel_en_mps
         self._velocity = None
@@ -244,14 +235,14 @@ class Tracker:
         std = telemetry.vel_std_mps
         if std is None or not std > 0:
             std = VELOCITY_STD_MPS + VELOCITY_SHARE * float(np.hypot(*now))
-        return ToldVelocity(now, before, std)
+        return ReportedVelocity(now, before, std)
 
-    def _lean_noise(self, telemetry: Telemetry) -> float:
+    def _tilt_noise(self, telemetry: Telemetry) -> float:
         """How far told pitch and roll are off from view to view (rad), as told or as usual."""
-        told = telemetry.lean_std_deg
-        return self.model.lean_noise_rad if told is None else math.radians(told)
+        told = telemetry.tilt_std_deg
+        return self.model.tilt_noise_rad if told is None else math.radians(told)
 
-    def _way(self, seconds: float, told: ToldVelocity | None) -> Array | None:
+    def _way(self, seconds: float, told: ReportedVelocity | None) -> Array | None:
         """Metres east and north (2,) that should have been flown, None where nobody knows."""
         if told is not None:
             return told.now_en_mps * seconds
@@ -264,54 +255,51 @@ class Tracker:
         self,
         before: Footprint | None,
         now: Footprint | None,
-        told_noise: Array,
+        telemetry_noise: Array,
         expected_en_m: Array | None,
     ) -> Moved | None:
         """The way since the last view by the camera, and how much of it both views showed."""
         if before is None or now is None or before.pixel_m != now.pixel_m:
             return None
-        lean_noise = self._lean_noise(now.telemetry)
-        return moved_between(before, now, lean_noise, told_noise, expected_en_m)
+        tilt_noise = self._tilt_noise(now.telemetry)
+        return moved_between(before, now, tilt_noise, telemetry_noise, expected_en_m)
 
-    def _observe(
-        self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry, overlap: float
-    ) -> NoFix | None:
+    def _observe(self, view: View, overlap: float) -> NoFix | None:
         """Look for the view and hand what it may be to the mixture; why not, if it cannot be."""
+        telemetry = view.telemetry
         expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
         bias, spread = self.mixture.bias()
-        corrected = _known(corrected_by(telemetry, bias), spread)
-        view = self._registration.prepared(grey, camera, corrected, self._heading_known)
-        if isinstance(view, NoFix):
-            return view
+        corrected = replace(view, telemetry=_known(corrected_by(telemetry, bias), spread))
+        prepared = self._registration.prepared(corrected, self._heading_known)
+        if isinstance(prepared, NoFix):
+            return prepared
         prior, searched = self._where(expected)
         sightings, newness = [], max(1 - overlap, LEAST_NEW)
-        if prior is None or self._registration.touches_map(prior, view):
-            found = self._registration.best(view, prior)
+        if prior is None or self._registration.touches_map(prior, prepared):
+            found = self._registration.best(prepared, prior)
             if found is not None:
                 area = math.inf if searched is None else math.pi * searched[1] ** 2
                 share = min(area / self.mixture.area_m2, 1.0)
-                worth = self._worth_of_lean(newness, math.isfinite(found.fine_score))
-                sightings = self._sightings(
-                    grey, camera, corrected, view, found, bias[1], share, worth
-                )
+                worth = self._worth_of_tilt(newness, math.isfinite(found.fine_score))
+                sightings = self._sightings(corrected, prepared, found, bias[1], share, worth)
         told = Told(
             math.radians(telemetry.yaw_deg) if self._heading_known else None,
             math.radians(telemetry.pitch_deg),
             math.radians(telemetry.roll_deg),
-            self._lean_noise(telemetry),
+            self._tilt_noise(telemetry),
         )
         self.mixture.update(told, sightings, newness, searched)
         return None
 
-    def _worth_of_lean(self, newness: float, costly: bool) -> Array:
+    def _worth_of_tilt(self, newness: float, costly: bool) -> Array:
         """How much more perspective counts than the view, of which a share `newness` is new, for
         pitch and roll: by all the ground that is new since it was looked at last.
 
         0 where that is too little. Views that follow closely have little time: they are looked at
         for one of the two, and, where the view was `costly` before, later.
         """
-        due = self._unlevelled >= (2 * LEAN_NEW if costly else LEAN_NEW)
-        if newness < LEAN_NEW:
+        due = self._unlevelled >= (2 * TILT_NEW if costly else TILT_NEW)
+        if newness < TILT_NEW:
             due &= np.arange(2) == np.argmax(self._unlevelled)
         new = np.where(due, np.minimum(self._unlevelled, 1.0), 0.0)
         self._unlevelled[due] = 0.0
@@ -323,7 +311,7 @@ class Tracker:
             return None, None
         likely = expected.confidence
         if expected.state is State.SEARCHING:
-            if not self._start_was_told:
+            if not self._start_was_reported:
                 return None, None  # what is not confirmed must stand against the whole map
             likely = expected.belief  # however wide it was told
         if likely < LOCAL_SHARE:
@@ -337,10 +325,8 @@ class Tracker:
 
     def _sightings(
         self,
-        grey: NDArray[np.uint8],
-        camera: Camera,
-        telemetry: Telemetry,
-        view: PreparedFootprint,
+        view: View,
+        prepared: PreparedView,
         found: Registered,
         log_scale: float,
         looked_at: float,
@@ -350,9 +336,9 @@ class Tracker:
         counted `worth` (2,) times."""
         made = []
         for log_odds, alone, placed in places_of(
-            found, self._confidence, NEAR_SHARE * view.side_px, looked_at
+            found, self._confidence, NEAR_SHARE * prepared.side_px, looked_at
         ):
-            seen = levelled(self._registration, grey, camera, telemetry, view, placed, worth)
+            seen = levelled(self._registration, view, prepared, placed, worth)
             if seen is None:
                 continue
             mean = seen.mean.copy()
@@ -371,7 +357,7 @@ class Tracker:
         lat, lon = self._localizer.sheet.frame.latlon_from_en(mean[:2])
         spread = covariance[:2, :2] + np.eye(2) * self.model.map_m**2
         spread.flags.writeable = False
-        pitch, roll = np.degrees(mean[LEAN])
+        pitch, roll = np.degrees(mean[TILT])
         evidence = {
             "heading_bias_deg": math.degrees(mean[HEADING]),
             "log_scale_bias": float(mean[SCALE]),

@@ -46,7 +46,7 @@ log = logging.getLogger(__name__)
 
 CALIBRATION_TILES, HELD_OUT_TILES = 64, 32
 SETTLING_BATCHES = 32
-TOLD_EVERY_S = 2.0
+PROGRESS_EVERY_S = 2.0
 
 Report = Callable[[str, float], None]
 
@@ -214,18 +214,18 @@ class _Pauses:
         self._state, self._tiles = state, tiles
         self._epochs, self._batches = epochs, batches
         self._report, self._writer = report, writer
-        self._told_s = time.monotonic()
+        self._progress_s = time.monotonic()
 
     def after_batch(self) -> None:
         """Tell and write if it is time; what ends an epoch is left to `after_epoch`."""
         epoch, done = len(self._state.history), len(self._state.losses)
         if done == self._batches:
             return
-        if time.monotonic() - self._told_s >= TOLD_EVERY_S:
+        if time.monotonic() - self._progress_s >= PROGRESS_EVERY_S:
             at = f"epoch {epoch + 1} of {self._epochs}, batch {done} of {self._batches}"
             share = (epoch + done / self._batches) / self._epochs
             self._report(f"{at}, loss {float(self._state.losses[-1]):.5g}", share)
-            self._told_s = time.monotonic()
+            self._progress_s = time.monotonic()
         if self._writer:
             self._writer.after_batch(self._state, self._tiles)
 
@@ -235,7 +235,7 @@ class _Pauses:
         done = len(history)
         text = f"epoch {done} of {self._epochs}, loss {history[-1]:.5g}"
         self._report(text, done / self._epochs)
-        self._told_s = time.monotonic()
+        self._progress_s = time.monotonic()
         if self._writer:
             self._writer.after_epoch(self._state, self._tiles, last=done == self._epochs)
 

@@ -9,17 +9,15 @@ from numpy.typing import NDArray
 
 from orthonav.errors import FlightError
 from orthonav.flight.mount import Bias, Mount
-from orthonav.geo.camera import Camera
 from orthonav.onboard.run import Locator
-from orthonav.records import Fix, NoFix, Telemetry, ViewResult
+from orthonav.records import CONFIDENT, Fix, NoFix, Telemetry, View, ViewResult
 from orthonav.track import Model
 
-SURE = 0.9
 MIN_VIEWS = 5
 MOVED_DEG, MOVED_SIGMAS = 2.0, 3.0
 """A mount that differs by more than both from what it is in the end has moved meanwhile."""
 MAD_TO_STD = 1.4826
-LEAST_LEAN_DEG = 0.1
+LEAST_TILT_DEG = 0.1
 STD_FLOOR = {"heading_deg": 0.2, "log_scale": 0.003, "pitch_deg": 0.3, "roll_deg": 0.3}
 _LASTING = ("pitch_deg", "roll_deg")
 _EVIDENCE = {
@@ -48,11 +46,11 @@ def calibrated(results: Sequence[ViewResult]) -> Calibration:
     views do not matter; their standard deviation counts views that err alike as fewer.
     Raises `FlightError` where fewer than `MIN_VIEWS` views are confident.
     """
-    sure = [each for each in results if _is_sure(each)]
+    sure = [each for each in results if _is_confident(each)]
     if len(sure) < MIN_VIEWS:
         raise FlightError(
-            f"{len(sure)} of {len(results)} views have a confidence of {SURE}; a calibration needs "
-            f"{MIN_VIEWS}: is it the right map, camera and height?"
+            f"{len(sure)} of {len(results)} views have a confidence of {CONFIDENT}; a calibration "
+            f"needs {MIN_VIEWS}: is it the right map, camera and height?"
         )
     values = {name: _column(sure, key) for name, key in _EVIDENCE.items()}
     spreads = {
@@ -69,9 +67,9 @@ def calibrated(results: Sequence[ViewResult]) -> Calibration:
     return Calibration(mount, sure[begin].frame, sure[-1].frame, begin > 0)
 
 
-def _is_sure(result: ViewResult) -> bool:
+def _is_confident(result: ViewResult) -> bool:
     fix = result.outcome
-    return isinstance(fix, Fix) and fix.confidence >= SURE and "pitch_bias_deg" in fix.evidence
+    return isinstance(fix, Fix) and fix.confidence >= CONFIDENT and "pitch_bias_deg" in fix.evidence
 
 
 def _column(sure: Sequence[ViewResult], key: str) -> Array:
@@ -106,10 +104,10 @@ def _bias(values: Array, spreads: Array, floor: float, lasting: bool) -> Bias:
 def model_of(mount: Mount) -> Model:
     """The model of a flight whose told values are corrected by a mount: no better known than that,
     and not off by something else."""
-    heading, lean = mount.heading_deg, max(mount.pitch_deg.std, mount.roll_deg.std)
-    lean_rad = math.radians(max(lean, LEAST_LEAN_DEG))
+    heading, tilt = mount.heading_deg, max(mount.pitch_deg.std, mount.roll_deg.std)
+    tilt_rad = math.radians(max(tilt, LEAST_TILT_DEG))
     return replace(
-        Model().with_mount(lean_rad),
+        Model().with_mount(tilt_rad),
         heading_rad=math.radians(max(heading.std, heading.scatter, 1.0)),
         log_scale=max(mount.log_scale.std, mount.log_scale.scatter, 0.01),
         off_mount=0.0,
@@ -126,13 +124,13 @@ class Mounted:
     locator: Locator
     mount: Mount
 
-    def locate(self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry) -> Fix | NoFix:
+    def locate(self, view: View) -> Fix | NoFix:
         """See `Locator.locate`."""
-        return self.locator.locate(grey, camera, self.mount.corrected(telemetry))
+        return self.locator.locate(replace(view, telemetry=self.mount.corrected(view.telemetry)))
 
-    def passed(self, camera: Camera, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+    def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """See `Locator.passed`."""
-        return self.locator.passed(camera, self.mount.corrected(telemetry), reason)
+        return self.locator.passed(self.mount.corrected(telemetry), reason)
 
     @property
     def state_name(self) -> str | None:

@@ -20,7 +20,7 @@ from orthonav.confidence.accept import Acceptance
 from orthonav.errors import CameraError
 from orthonav.flight.mount import Mount
 from orthonav.geo.camera import Camera
-from orthonav.localizer.checks import check_view
+from orthonav.localizer.checks import check_picture
 from orthonav.onboard import state as states
 from orthonav.onboard.cameras import FrozenCheck, Newest, Picture
 from orthonav.onboard.health import (
@@ -37,9 +37,9 @@ from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.run import Locator, locate_view
 from orthonav.onboard.telemetry import Clocks, Told
-from orthonav.publish.estimate import SURE, error_ellipse
+from orthonav.publish.estimate import error_ellipse
 from orthonav.publish.mavlink import dialect
-from orthonav.records import Fix, NoFix, Prior, Telemetry, ViewResult
+from orthonav.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.sources.attitude import LOOKS_DOWN, Angles
 from orthonav.sources.recording import fitted
 
@@ -91,7 +91,7 @@ class FlyOptions:
     telemetry_wait_s: float = 0.15
     recorded: bool = False
     accept: Acceptance | None = None
-    min_confidence: float = SURE
+    min_confidence: float = CONFIDENT
     map_path: Path | None = None
     state_path: Path | None = None
     told: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
@@ -123,7 +123,7 @@ class Runner:
         self._notifier = notifier or Notifier("")
         self.tally, self._teller, self._frozen = Tally(), Teller(), FrozenCheck()
         self.health: Health | None = None
-        self._begun_ns = self._sure_ns = clocks.mono_ns()
+        self._begun_ns = self._confident_ns = clocks.mono_ns()
         self._tick_ns = 0
         self._picture_ns: int | None = None
         self._last: states.Saved | None = None
@@ -186,19 +186,19 @@ class Runner:
             self._log(lambda sink: sink.result(result))
             self._publisher.publish(result, picture.exposed_ns, told, judged=False)
             return result
-        return self._placed(picture, picture.grey, camera, telemetry, told)
+        return self._placed(picture, View(picture.grey, camera, telemetry), told)
 
-    def _placed(
-        self, picture: Picture, grey: Grey, camera: Camera, telemetry: Telemetry, told: Told
-    ) -> ViewResult:
+    def _placed(self, picture: Picture, view: View, told: Told) -> ViewResult:
         """A view that can be placed: logged, located, published."""
         if self._start is not None:
             prior, self._start = self._start(), None
-            telemetry = replace(telemetry, prior=prior or telemetry.prior)
-        self._log(lambda sink: sink.view(picture.number, picture.frame, grey, telemetry))
+            telemetry = replace(view.telemetry, prior=prior or view.telemetry.prior)
+            view = replace(view, telemetry=telemetry)
+        telemetry = view.telemetry
+        self._log(lambda sink: sink.view(picture.number, picture.frame, view.grey, telemetry))
         outcome: Fix | NoFix
         try:
-            outcome, latency_ms = locate_view(self._locator, grey, camera, telemetry)
+            outcome, latency_ms = locate_view(self._locator, view)
         except CameraError as error:  # on a recorded flight an error, here it must not end
             outcome = self._refusal("wrong_camera", "wrong_camera", str(error))
             latency_ms = math.nan
@@ -217,7 +217,7 @@ class Runner:
         if self._second is not None:
             corrected = self.options.mount.corrected(telemetry) if self.options.mount else telemetry
             found = result.state not in ("searching", "lost") and isinstance(outcome, Fix)
-            self._second.look(grey, camera, corrected, found, now_ns)
+            self._second.look(replace(view, telemetry=corrected), found, now_ns)
         return result
 
     def _note(self, result: ViewResult, telemetry: Telemetry, exposed_ns: int) -> None:
@@ -227,7 +227,7 @@ class Runner:
             return
         if result.state not in (None, "tracking"):
             return
-        self._sure_ns = self._clocks.mono_ns()
+        self._confident_ns = self._clocks.mono_ns()
         self._count("sure")
         mount = self.options.mount
         self._off = offsets(fix, mount.corrected(telemetry) if mount else telemetry)
@@ -248,7 +248,7 @@ class Runner:
         if picture.grey is None:
             self._count("bad_picture")
             return picture.problem or NoFix("bad_image", "picture could not be decoded")
-        shown = check_view(picture.grey)
+        shown = check_picture(picture.grey)
         repeat = self._frozen.is_repeat(picture.grey)
         if shown is not None:
             self._count("bad_picture")
@@ -356,7 +356,7 @@ class Runner:
             picture_age_s=(now_ns - picture_ns) / 1e9,
             telemetry_age_s=link.attitude_age_s if link and uses_link else 0.0,
             link_age_s=link.heard_age_s if link else 0.0,
-            unsure_s=(now_ns - self._sure_ns) / 1e9,
+            low_confidence_s=(now_ns - self._confident_ns) / 1e9,
             latency_s=self.tally.latency_s(0.95),
             state=state,
             synced=link.synced if link else True,

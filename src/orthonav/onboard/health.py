@@ -16,11 +16,9 @@ from enum import Enum
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
-from orthonav.geo.camera import Camera
 from orthonav.localizer.localizer import Localizer
-from orthonav.records import Fix, Telemetry
+from orthonav.records import Fix, Telemetry, View
 
 log = logging.getLogger(__name__)
 WINDOW_S = 10.0
@@ -66,7 +64,7 @@ class HealthLimits:
     picture_age_s: float = 3.0
     telemetry_age_s: float = 3.0
     link_age_s: float = 5.0
-    unsure_s: float = 10.0
+    low_confidence_s: float = 10.0
     latency_s: float = 0.5
     share: float = 0.2
     """Share of the pictures in the window that may be unusable, late, or without telemetry."""
@@ -91,7 +89,7 @@ class Snapshot:
     picture_age_s: float = 0.0
     telemetry_age_s: float = 0.0
     link_age_s: float = 0.0
-    unsure_s: float = 0.0
+    low_confidence_s: float = 0.0
     latency_s: float = 0.0
     state: str | None = "tracking"
     synced: bool = True
@@ -118,7 +116,8 @@ def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
         "height_off": abs(seen.log_scale_off) > limits.log_scale,
         "lost": seen.state == "lost",
         "searching": seen.state == "searching",
-        "unsure": seen.state not in ("lost", "searching") and seen.unsure_s > limits.unsure_s,
+        "unsure": seen.state not in ("lost", "searching")
+        and seen.low_confidence_s > limits.low_confidence_s,
         "frozen_picture": count["frozen"] > many,
         "bad_pictures": count["bad_picture"] > many,
         "telemetry_gaps": count["no_telemetry"] > many and not failed["no_telemetry"],
@@ -243,9 +242,7 @@ class SecondLook:
         self._number = 0
         self._found: tuple[int, float, float] | None = None
 
-    def look(
-        self, grey: NDArray[np.uint8], camera: Camera, told: Telemetry, found: bool, now_ns: int
-    ) -> None:
+    def look(self, view: View, found: bool, now_ns: int) -> None:
         """Hand in every view and whether the track has a place; now and then one is looked at."""
         if found or self._since_ns is None:
             self._since_ns = now_ns
@@ -256,11 +253,12 @@ class SecondLook:
         self._since_ns = now_ns
         heading_known, share = self.GUESSES[self._number % len(self.GUESSES)]
         self._number += 1
-        guess = replace(told, agl_m=told.agl_m * share)
+        told = view.telemetry
+        guess = replace(view, telemetry=replace(told, agl_m=told.agl_m * share))
 
         def look() -> None:
             try:
-                seen = self._localizer.locate(grey, camera, guess, heading_known=heading_known)
+                seen = self._localizer.locate(guess, heading_known=heading_known)
                 if isinstance(seen, Fix) and seen.confidence >= self._least:
                     self._found = (now_ns, *offsets(seen, told))
             except Exception:  # nothing depends on it

@@ -295,10 +295,10 @@ class AutopilotLink:
 
     def _altitude(self, message: Message, now_ns: int) -> None:
         """Its time may be since 1970: then that of arrival counts."""
-        arrived_ns, told_ns = self._arrived(now_ns), int(message.time_usec) * 1000
+        arrived_ns, reported_ns = self._arrived(now_ns), int(message.time_usec) * 1000
         if arrived_ns is None:
             return
-        time_ns = told_ns if abs(told_ns - arrived_ns) < _FAR_NS else arrived_ns
+        time_ns = reported_ns if abs(reported_ns - arrived_ns) < _FAR_NS else arrived_ns
         if message.altitude_terrain > -1000:  # below that it stands for "not known"
             self.buffer.add_height("terrain", time_ns, message.altitude_terrain)
         self.buffer.add_height("relative", time_ns, message.altitude_relative)

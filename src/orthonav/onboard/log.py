@@ -47,9 +47,8 @@ from orthonav.flight.logged import (
 )
 from orthonav.flight.png import lossless_png
 from orthonav.geo.camera import Camera
-from orthonav.publish.estimate import SURE
 from orthonav.publish.jsonl import result_to_json
-from orthonav.records import Fix, Telemetry, ViewResult
+from orthonav.records import CONFIDENT, Fix, Telemetry, ViewResult
 from orthonav.sources.recording import fitted
 
 if TYPE_CHECKING:
@@ -389,7 +388,7 @@ def _result(result: ViewResult, index: int) -> "list[Message]":
         with contextlib.suppress(ValueError):  # a number that is none
             data = position_message(result.outcome, result.time_ns)
             messages.append(_message(POSITION, result.time_ns, data, index))
-            sure = result.outcome.confidence >= SURE and result.state in (None, "tracking")
+            sure = result.outcome.confidence >= CONFIDENT and result.state in (None, "tracking")
             data = navsat_message(result.outcome, result.time_ns, sure=sure)
             messages.append(_message(NAVSAT, result.time_ns, data, index))
     return messages

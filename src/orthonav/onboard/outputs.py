@@ -14,7 +14,7 @@ from typing import Protocol, TextIO
 from orthonav.errors import VariantError
 from orthonav.onboard.ports import Descriptor, device_baud, host_port, open_serial
 from orthonav.onboard.telemetry import Clocks, Told
-from orthonav.publish.estimate import SURE, Clock, EstimateError, NavigationEstimate
+from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
 from orthonav.publish.gate import Gate
 from orthonav.publish.jsonl import result_to_json
 from orthonav.publish.local import Autopilot, Origin
@@ -33,7 +33,7 @@ from orthonav.publish.mavlink_local import (
     vision_position_estimate,
 )
 from orthonav.publish.nmea import Quality, gga, gst, rmc
-from orthonav.records import ViewResult
+from orthonav.records import CONFIDENT, ViewResult
 
 KINDS = {
     "global-position": "GLOBAL_POSITION_SENSOR",
@@ -60,7 +60,7 @@ class MessageOptions:
     satellites: int = 0
     hdop_m: float | None = None
     min_std_m: float = 0.0
-    min_confidence: float = SURE
+    min_confidence: float = CONFIDENT
     autopilot: Autopilot | None = None
     origin: Origin | None = None
 

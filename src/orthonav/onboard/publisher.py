@@ -8,9 +8,9 @@ from typing import Any
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.outputs import JsonOut, Messenger, NmeaOut
 from orthonav.onboard.telemetry import Clocks, Told
-from orthonav.publish.estimate import SURE, Clock, NavigationEstimate, estimate_from_result
+from orthonav.publish.estimate import Clock, NavigationEstimate, estimate_from_result
 from orthonav.publish.gate import Gate
-from orthonav.records import ViewResult
+from orthonav.records import CONFIDENT, ViewResult
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +27,7 @@ class Publisher:
         link: AutopilotLink | None = None,
         nmea: Sequence[NmeaOut] = (),
         lines: Sequence[JsonOut] = (),
-        min_confidence: float = SURE,
+        min_confidence: float = CONFIDENT,
     ) -> None:
         self.gate, self._clocks = gate, clocks
         self.messenger, self._link = messenger, link

@@ -8,15 +8,13 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthonav.confidence.accept import Acceptance
 from orthonav.errors import CameraError, FlightError
-from orthonav.flight.recording import Flight, View
-from orthonav.geo.camera import Camera
+from orthonav.flight.recording import Flight, RecordedView
 from orthonav.localizer.localizer import Localizer
 from orthonav.localizer.tracker import Tracker
-from orthonav.records import Fix, NoFix, Telemetry, ViewResult
+from orthonav.records import Fix, NoFix, Telemetry, View, ViewResult
 
 log = logging.getLogger(__name__)
 
@@ -24,10 +22,10 @@ log = logging.getLogger(__name__)
 class Locator(Protocol):
     """What places the views of one flight: each for itself, or as a track."""
 
-    def locate(self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry) -> Fix | NoFix:
-        """Where `grey` (H, W) was taken. Raises `CameraError` where the camera is another."""
+    def locate(self, view: View) -> Fix | NoFix:
+        """Where a view was taken. Raises `CameraError` where its picture has another size."""
 
-    def passed(self, camera: Camera, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+    def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """What is known at a view whose picture cannot be used, for `reason`."""
 
     @property
@@ -44,36 +42,32 @@ class SingleViews:
     heading_known: bool = True
     state_name: str | None = None
 
-    def locate(self, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry) -> Fix | NoFix:
+    def locate(self, view: View) -> Fix | NoFix:
         """See `Localizer.locate`."""
         return self.localizer.locate(
-            grey,
-            camera,
-            telemetry,
-            prior=telemetry.prior if self.use_prior else None,
+            view,
+            prior=view.telemetry.prior if self.use_prior else None,
             heading_known=self.heading_known,
         )
 
-    def passed(self, camera: Camera, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+    def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """Nothing."""
         return reason
 
 
-def locate_view(
-    locator: Locator, grey: NDArray[np.uint8], camera: Camera, telemetry: Telemetry
-) -> tuple[Fix | NoFix, float]:
+def locate_view(locator: Locator, view: View) -> tuple[Fix | NoFix, float]:
     """Place one view; whatever goes wrong inside is a `NoFix`. Also the time taken, in ms.
 
     Raises `CameraError` only: a camera of another size is wrong for the whole flight.
     """
     start = time.perf_counter()
     try:
-        outcome = locator.locate(grey, camera, telemetry)
+        outcome = locator.locate(view)
     except CameraError:
         raise
     except Exception as error:  # One bad view never ends a flight.
         log.exception("view could not be processed")
-        outcome = _passed(locator, camera, telemetry, _internal(error))
+        outcome = _passed(locator, view.telemetry, _internal(error))
     return _finite(outcome), (time.perf_counter() - start) * 1e3
 
 
@@ -83,7 +77,7 @@ def localize_flight(
     *,
     skip_bad_images: bool = False,
     accept: Acceptance | None = None,
-    views: Iterable[View] | None = None,
+    views: Iterable[RecordedView] | None = None,
 ) -> Iterator[ViewResult]:
     """Results for the views of a recorded flight, in order, as they are computed.
 
@@ -99,11 +93,12 @@ def localize_flight(
             if not skip_bad_images:
                 raise
             reason = NoFix("bad_image", str(error))
-            outcome = _finite(_passed(locator, flight.camera, view.telemetry, reason))
+            outcome = _finite(_passed(locator, view.telemetry, reason))
             latency_ms = math.nan
         else:
             try:
-                outcome, latency_ms = locate_view(locator, grey, flight.camera, view.telemetry)
+                seen = View(grey, flight.camera, view.telemetry)
+                outcome, latency_ms = locate_view(locator, seen)
             except CameraError as error:
                 raise CameraError(f"{error}: {view.where}") from error
         if accept is not None:
@@ -113,20 +108,20 @@ def localize_flight(
         )
 
 
-def in_hindsight(
+def smoothed_track(
     tracker: Tracker, results: Sequence[ViewResult], accept: Acceptance | None
 ) -> list[ViewResult]:
     """Results of a whole flight again, every view placed by all of them."""
-    placed = [_finite(outcome) for outcome in tracker.in_hindsight()]
+    placed = [_finite(outcome) for outcome in tracker.smoothed_track()]
     chosen = placed if accept is None else [accept(outcome) for outcome in placed]
     return [
         replace(result, outcome=outcome) for result, outcome in zip(results, chosen, strict=True)
     ]
 
 
-def _passed(locator: Locator, camera: Camera, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
+def _passed(locator: Locator, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
     try:
-        return locator.passed(camera, telemetry, reason)
+        return locator.passed(telemetry, reason)
     except Exception as error:
         log.exception("view could not be passed over")
         return _internal(error)

@@ -74,7 +74,7 @@ class Told:
         return roll, pitch, yaw
 
     def telemetry(self, time_ns: int, mount_deg: Angles = LOOKS_DOWN) -> Telemetry:
-        """Heading, lean and height of the camera in its mount, `time_ns` being what is written."""
+        """Heading, tilt and height of the camera in its mount, `time_ns` being what is written."""
         yaw = pitch = roll = math.nan
         if self.ned_from_body is not None:
             yaw, pitch, roll = attitude_of(enu_from_body_camera(self.ned_from_body, mount_deg))
@@ -285,7 +285,7 @@ class ClockSync:
         """Whether the offset rests on exchanges and not on arrival alone."""
         return bool(self._exact)
 
-    def exchange(self, sent_ns: int, received_ns: int, told_ns: int) -> bool:
+    def exchange(self, sent_ns: int, received_ns: int, reported_ns: int) -> bool:
         """One exchange: sent and answered by our clock, what the autopilot's said between.
 
         Whether the clocks were found to have jumped.
@@ -294,7 +294,7 @@ class ClockSync:
         if not 0 <= trip_ns <= self.LONGEST_NS:
             self.rejected += 1
             return False
-        offset_ns = told_ns - (sent_ns + received_ns) // 2
+        offset_ns = reported_ns - (sent_ns + received_ns) // 2
         if self._exact and abs(offset_ns - self._now()) > max(self.OUTLIER_NS, trip_ns):
             self.rejected += 1
             return self._suspect(received_ns, offset_ns, self.OUTLIER_NS)
@@ -305,9 +305,9 @@ class ClockSync:
         self.exchanged_ns = received_ns
         return False
 
-    def heard(self, arrived_ns: int, told_ns: int) -> bool:
+    def heard(self, arrived_ns: int, reported_ns: int) -> bool:
         """A message that carries its time. Whether the clocks were found to have jumped."""
-        offset_ns = told_ns - arrived_ns
+        offset_ns = reported_ns - arrived_ns
         if self.offset_ns is not None and abs(offset_ns - self._now()) > self.JUMP_NS:
             return self._suspect(arrived_ns, offset_ns, self.OUTLIER_NS * 5)
         if not self._exact:

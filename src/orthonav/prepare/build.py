@@ -59,7 +59,7 @@ SEARCH_MS = 100.0
 MAX_CALIBRATION_VIEWS = 2 * CROPS
 RADIUS_PX = 10.0
 MIN_RADIUS_M = 35.0
-"""A registered view is right within so many pixels or metres: cameras lean more than told."""
+"""A registered view is right within so many pixels or metres: cameras tilt more than told."""
 Progress = Callable[[str, float], None]
 
 

@@ -20,7 +20,7 @@ from orthonav.geo.grid import TileGrid
 from orthonav.localizer.registration import PRIOR_SIGMAS, RegistrationLocalizer
 from orthonav.prepare.calibrate import Crop
 from orthonav.prepare.change import changed
-from orthonav.records import NoFix, Prior, Telemetry
+from orthonav.records import NoFix, Prior, Telemetry, View
 
 YAW_STD_DEG = 5.0
 AGL_STD = 0.05
@@ -116,8 +116,7 @@ def _placed(
     picture = np.ascontiguousarray(crop.grey[:, ::-1]) if mirror else crop.grey
     if not other_date:
         picture = changed(rng, picture, stranger)
-    view, camera, telemetry = _view(rng, picture, localizer.grid)
-    prepared = localizer.prepared(view, camera, telemetry, True)
+    prepared = localizer.prepared(_view(rng, picture, localizer.grid), True)
     prior = _prior(rng, localizer, crop)
     best = None if isinstance(prepared, NoFix) else localizer.best(prepared, prior)
     if best is None:
@@ -140,10 +139,8 @@ def _prior(rng: np.random.Generator, localizer: RegistrationLocalizer, crop: Cro
     return Prior(float(lat), float(lon), SEARCHED_PX / 2 * grid.gsd_m / PRIOR_SIGMAS)
 
 
-def _view(
-    rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid
-) -> tuple[NDArray[np.uint8], Camera, Telemetry]:
-    """A vertical view of the middle of a picture, and what its telemetry would tell."""
+def _view(rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid) -> View:
+    """A vertical view of the middle of a picture, with errors of heading and height."""
     size = picture.shape[0]
     longest = min(grid.tile_px, int(size / 1.27))  # its diagonal fits into the picture
     width = max(16, round(longest * rng.uniform(*SIDES)))
@@ -156,18 +153,18 @@ def _view(
     matrix = np.column_stack([linear, move])
     view = cv2.warpAffine(picture, matrix, (width, height), flags=flags)
     agl_m = FOCAL_PX * grid.gsd_m
-    told_m = agl_m * max(0.5, 1 + rng.normal(0, AGL_STD))
+    reported_m = agl_m * max(0.5, 1 + rng.normal(0, AGL_STD))
     telemetry = Telemetry(
         time_ns=0,
         yaw_deg=yaw_deg + rng.normal(0, YAW_STD_DEG),
         pitch_deg=0.0,
         roll_deg=0.0,
-        agl_m=told_m,
+        agl_m=reported_m,
         yaw_std_deg=YAW_STD_DEG,
-        agl_std_m=AGL_STD * told_m,
+        agl_std_m=AGL_STD * reported_m,
     )
     camera = Camera(width, height, FOCAL_PX, FOCAL_PX, width / 2, height / 2)
-    return np.asarray(view, dtype=np.uint8), camera, telemetry
+    return View(np.asarray(view, dtype=np.uint8), camera, telemetry)
 
 
 def _fitted(outcomes: Sequence[_Outcome], radius_px: float) -> RegistrationCalibration:

@@ -35,7 +35,7 @@ def digest(values: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-class KeptBlocks:
+class BlockCache:
     """The folder; it appears with the first block. May be shared between threads.
 
     As a context manager around a build: the blocks go when it is done, and where its area can never
@@ -60,7 +60,7 @@ class KeptBlocks:
             )
         log.info("finished blocks are kept in %s: about %.0f MB", folder, needed_bytes / 1e6)
 
-    def __enter__(self) -> "KeptBlocks":
+    def __enter__(self) -> "BlockCache":
         return self
 
     def __exit__(

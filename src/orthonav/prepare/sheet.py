@@ -30,7 +30,7 @@ from orthonav.imagery.mosaic import Mosaic, SheetRaster
 from orthonav.imagery.quiet import quiet
 from orthonav.prepare.blocks import Block, Preview, blocks_of, margins, read_block
 from orthonav.prepare.calibrate import CropSampler
-from orthonav.prepare.kept import KeptBlocks, digest
+from orthonav.prepare.kept import BlockCache, digest
 from orthonav.prepare.layer import CHUNK_PX, GreyLayerWriter, Parts, compressed_block
 from orthonav.prepare.parallel import in_order
 from orthonav.prepare.pictures import SheetPictures
@@ -99,7 +99,7 @@ class SheetReader:
         self,
         report: Callable[[str, float], None],
         workers: int | None = None,
-        kept: KeptBlocks | None = None,
+        kept: BlockCache | None = None,
     ) -> None:
         """Read all blocks with so many threads (None: all cores), less those that were kept.
 
@@ -128,7 +128,7 @@ class SheetReader:
                 "the area has no imagery: it lies outside the orthophotos or is all nodata"
             )
 
-    def kept(self, beside: Path, folder: Path | None) -> AbstractContextManager[KeptBlocks | None]:
+    def kept(self, beside: Path, folder: Path | None) -> AbstractContextManager[BlockCache | None]:
         """Where finished blocks are kept: in `folder` if there is one, else, if many, `beside`.
 
         Raises `OutputError` where there is no room for them.
@@ -136,7 +136,7 @@ class SheetReader:
         pixels = sum(job.block.height * job.block.width for job in self._jobs)
         worthwhile = folder is not None or len(self._jobs) >= MIN_KEPT_BLOCKS
         needed_bytes = round(KEPT_BYTES_PER_PX * pixels) if worthwhile else 0
-        kept = KeptBlocks(folder or beside, self._request(), needed_bytes)
+        kept = BlockCache(folder or beside, self._request(), needed_bytes)
         if not worthwhile:
             kept.discard()  # what an earlier request for the same map has left
             return nullcontext()
@@ -165,7 +165,7 @@ class SheetReader:
             jobs.append(Job(block, tuple((int(row), int(col)) for row, col in places)))
         return jobs
 
-    def _kept_or_made(self, raster: SheetRaster, job: Job, kept: KeptBlocks | None) -> Parts:
+    def _kept_or_made(self, raster: SheetRaster, job: Job, kept: BlockCache | None) -> Parts:
         parts = None if kept is None else kept.load(job.block)
         if parts is None:
             parts = self._made(raster, job)

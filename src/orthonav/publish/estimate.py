@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import OrthonavError
-from orthonav.records import Fix, ViewResult
+from orthonav.records import CONFIDENT, Fix, ViewResult
 
-SURE = 0.9
-"""Confidence from which a position is told as one, unless the user sets another."""
 _ROUNDING = 1e-9
 """Share by which an eigenvalue may fall below zero before a covariance is no covariance."""
 
@@ -108,7 +106,7 @@ class NavigationEstimate:
         major = error_ellipse(self.cov_en_m2)[0]
         return major if math.isnan(major) else max(major, min_std_m)
 
-    def is_sure(self, min_confidence: float = SURE) -> bool:
+    def is_confident(self, min_confidence: float = CONFIDENT) -> bool:
         """Whether this may be told as a position.
 
         Confident enough (an unknown confidence is not), with a covariance, and tracking where it

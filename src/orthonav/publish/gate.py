@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from orthonav.geo.frames import LocalFrame
 from orthonav.publish.estimate import (
-    SURE,
     Clock,
     EstimateError,
     NavigationEstimate,
     error_ellipse,
 )
+from orthonav.records import CONFIDENT
 
 FUTURE_S = 0.1
 """An exposure may lie this far after now before the clocks are said to disagree."""
@@ -48,7 +48,7 @@ class GateRules:
     Raises `EstimateError` for limits that are not positive, or a confidence beyond 0 to 1.
     """
 
-    min_confidence: float = SURE
+    min_confidence: float = CONFIDENT
     max_std_m: float = 50.0
     max_age_s: float = 1.0
     min_interval_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))

@@ -15,13 +15,13 @@ from typing import Any
 
 from orthonav.errors import MissingExtraError
 from orthonav.publish.estimate import (
-    SURE,
     Clock,
     EstimateError,
     NavigationEstimate,
     error_ellipse,
 )
 from orthonav.publish.gpstime import gps_time
+from orthonav.records import CONFIDENT
 
 Message = Any
 """A `MAVLink_message` of pymavlink, which brings no types."""
@@ -125,7 +125,7 @@ def global_position_sensor(
     sensor_id: int = 1,
     target: Target = AUTOPILOT,
     min_std_m: float = 0.0,
-    min_confidence: float = SURE,
+    min_confidence: float = CONFIDENT,
 ) -> Message:
     """GLOBAL_POSITION_SENSOR (message 296): a position from map matching, at the time it was sent.
 
@@ -134,7 +134,7 @@ def global_position_sensor(
     """
     if not 1 <= sensor_id <= 255:
         raise EstimateError(f"sensor_id must be 1 to 255, got {sensor_id}")
-    sure = estimate.is_sure(min_confidence)
+    sure = estimate.is_confident(min_confidence)
     return dialect().MAVLink_global_position_sensor_message(
         target_system=target.system_id,
         target_component=target.component_id,
@@ -161,7 +161,7 @@ def gps_input(
     hdop_m: float | None = None,
     send_yaw: bool = False,
     min_std_m: float = 0.0,
-    min_confidence: float = SURE,
+    min_confidence: float = CONFIDENT,
 ) -> Message:
     """GPS_INPUT (message 232): the position in the clothes of a GPS receiver, stamped at exposure.
 
@@ -172,7 +172,7 @@ def gps_input(
     horizontal accuracy; else it is ignored. `send_yaw` tells the heading as that of the vehicle:
     right only where the top of the image is its nose.
     """
-    sure = estimate.is_sure(min_confidence)
+    sure = estimate.is_confident(min_confidence)
     eph_m = estimate.horizontal_std_m(min_std_m)
     speed_std_mps = _speed_std_mps(estimate)
     flags = _ignored(estimate, speed_std_mps, hdop_m) if sure else _IGNORE_ALL
@@ -211,14 +211,14 @@ def external_position_estimate(
     clock: Clock = Clock.UTC,
     target: Target = AUTOPILOT,
     min_std_m: float = 0.0,
-    min_confidence: float = SURE,
+    min_confidence: float = CONFIDENT,
 ) -> Message:
     """MAV_CMD_EXTERNAL_POSITION_ESTIMATE (43003) as COMMAND_INT: a single fix while dead reckoning.
 
     `transmission_time` is the time of sending, begun again every `WRAP_S`. Raises `EstimateError`
     where the estimate is not sure: the command has no way to say so.
     """
-    require_sure(estimate, min_confidence, "MAV_CMD_EXTERNAL_POSITION_ESTIMATE")
+    require_confident(estimate, min_confidence, "MAV_CMD_EXTERNAL_POSITION_ESTIMATE")
     wrapped_ns = estimate.sent_ns(clock) % round(WRAP_S * 1e9)
     return dialect().MAVLink_command_int_message(
         target_system=target.system_id,
@@ -237,9 +237,9 @@ def external_position_estimate(
     )
 
 
-def require_sure(estimate: NavigationEstimate, min_confidence: float, message: str) -> None:
+def require_confident(estimate: NavigationEstimate, min_confidence: float, message: str) -> None:
     """Raise `EstimateError` unless the estimate is sure: `message` cannot say "no position"."""
-    if not estimate.is_sure(min_confidence):
+    if not estimate.is_confident(min_confidence):
         raise EstimateError(
             f"{message} has no way to say that a position is not sure (confidence "
             f"{estimate.confidence:.3g}, state {estimate.state}, standard deviation "

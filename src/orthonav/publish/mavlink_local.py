@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.publish.estimate import SURE, Clock, EstimateError, NavigationEstimate
+from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
 from orthonav.publish.local import Autopilot, Origin, north_east_m
 from orthonav.publish.mavlink import (
     Message,
@@ -20,8 +20,9 @@ from orthonav.publish.mavlink import (
     dialect,
     float32,
     microseconds,
-    require_sure,
+    require_confident,
 )
+from orthonav.records import CONFIDENT
 
 _LOCAL_NED, _BODY_FRD, _LOCAL_FRD = 1, 12, 20
 _ESTIMATOR_VISION = 2
@@ -56,7 +57,7 @@ def odometry(
     *,
     clock: Clock = Clock.UTC,
     min_std_m: float = 0.0,
-    min_confidence: float = SURE,
+    min_confidence: float = CONFIDENT,
 ) -> Message:
     """ODOMETRY (message 331) as `autopilot` reads it, at the time of exposure.
 
@@ -66,7 +67,7 @@ def odometry(
     the confidence in per cent. Raises `EstimateError` where something needed is not known, or the
     estimate is not sure.
     """
-    require_sure(estimate, min_confidence, "ODOMETRY")
+    require_confident(estimate, min_confidence, "ODOMETRY")
     position, variance = _position(estimate, pose, autopilot, min_std_m, "ODOMETRY")
     velocity_ned = _velocity_ned(estimate, pose)
     frames = (_LOCAL_NED, _LOCAL_NED)
@@ -110,14 +111,14 @@ def vision_position_estimate(
     *,
     clock: Clock = Clock.UTC,
     min_std_m: float = 0.0,
-    min_confidence: float = SURE,
+    min_confidence: float = CONFIDENT,
 ) -> Message:
     """VISION_POSITION_ESTIMATE (message 102): north, east, down and attitude, stamped at exposure.
 
     Raises `EstimateError` where height or attitude is not known (the message has no mark for that)
     or the estimate is not sure.
     """
-    require_sure(estimate, min_confidence, "VISION_POSITION_ESTIMATE")
+    require_confident(estimate, min_confidence, "VISION_POSITION_ESTIMATE")
     (x, y, z), variance = _position(estimate, pose, autopilot, min_std_m, "this message")
     if not all(map(math.isfinite, pose.attitude_rad)):
         raise EstimateError("VISION_POSITION_ESTIMATE needs the attitude: hand in the autopilot's")

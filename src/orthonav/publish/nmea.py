@@ -10,7 +10,8 @@ import math
 from datetime import UTC, datetime, timedelta
 from enum import Enum
 
-from orthonav.publish.estimate import SURE, EstimateError, NavigationEstimate, error_ellipse
+from orthonav.publish.estimate import EstimateError, NavigationEstimate, error_ellipse
+from orthonav.records import CONFIDENT
 
 MPS_PER_KNOT = 1852 / 3600
 MAX_LENGTH = 82
@@ -40,7 +41,7 @@ def gga(
     quality: Quality = Quality.ESTIMATED,
     utc_ns: int | None = None,
     hdop_m: float | None = None,
-    min_confidence: float = SURE,
+    min_confidence: float = CONFIDENT,
 ) -> bytes:
     """GGA: time, position, quality, altitude above mean sea level where known.
 
@@ -66,7 +67,7 @@ def rmc(
     talker: str = "GP",
     quality: Quality = Quality.ESTIMATED,
     utc_ns: int | None = None,
-    min_confidence: float = SURE,
+    min_confidence: float = CONFIDENT,
 ) -> bytes:
     """RMC: time and date, status, position, speed in knots and course where velocity is known."""
     time_ns, sure = _when_and_whether(estimate, utc_ns, min_confidence)
@@ -84,7 +85,7 @@ def gst(
     *,
     talker: str = "GP",
     utc_ns: int | None = None,
-    min_confidence: float = SURE,
+    min_confidence: float = CONFIDENT,
 ) -> bytes:
     """GST: one-sigma error ellipse (m, direction of the long axis from true north) and standard
     deviations of latitude, longitude and altitude in m. There are no ranges, so no RMS of them."""
@@ -122,7 +123,7 @@ def _when_and_whether(
 ) -> tuple[int | None, bool]:
     if estimate is None:
         return utc_ns, False
-    return estimate.utc_ns, estimate.is_sure(min_confidence)
+    return estimate.utc_ns, estimate.is_confident(min_confidence)
 
 
 def _place(estimate: NavigationEstimate) -> list[str]:

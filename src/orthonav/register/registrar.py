@@ -117,7 +117,7 @@ class Registered:
         return self.score / max(self.rival, 1e-6)
 
     def evidence(self) -> dict[str, float]:
-        """The numbers behind a fix, as `docs/design.md` lists them."""
+        """The numbers behind a fix, as `docs/reference/formats.md` lists them."""
         gradient, grey = self.placed.correlations
         return {
             "score": self.placed.weighted,

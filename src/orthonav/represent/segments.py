@@ -1,4 +1,4 @@
-"""Boundaries of a classical graph-based segmentation: a light stand-in for Segment Anything.
+"""Boundaries of a classical graph-based segmentation: a light substitute for Segment Anything.
 
 Di Piazza et al. 2024, section 4, compare Canny with the boundaries of Segment Anything, which is
 far too heavy for an aircraft. This one asks the same question (where do regions meet?) of the

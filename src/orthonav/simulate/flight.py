@@ -34,21 +34,22 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Errors:
-    """What the telemetry gets wrong, and how the camera leans.
+    """What the telemetry gets wrong, and how the camera tilts.
 
     `_std` is the standard deviation of what is drawn anew at every view: `agl_std` a share of the
-    height; `lean_std_deg` true pitch and roll, which are told; `tilt_std_deg` the error of the told
-    ones. `prior_std_m` None tells no prior. What is wrong all along: `yaw_bias_deg` and `agl_bias`
-    (a share) are added to what is told; the camera is mounted so that in the aircraft it leans by
-    `pitch_bias_deg` and `roll_bias_deg` more than told. The standard deviations that are told are
-    those of the scatter alone. `velocity_drift` is the standard deviation of the scale (a share)
-    and the direction (rad) of the told velocity, see `motion.drifting`; None tells no velocity.
+    height; `attitude_std_deg` true pitch and roll, which are reported; `tilt_std_deg` the error of
+    the reported ones. `prior_std_m` None tells no prior. What is wrong all along: `yaw_bias_deg`
+    and `agl_bias` (a share) are added to what is told; the camera is mounted so that in the
+    aircraft it tilts by `pitch_bias_deg` and `roll_bias_deg` more than told. The standard
+    deviations that are told are those of the scatter alone. `velocity_drift` is the standard
+    deviation of the scale (a share) and the direction (rad) of the told velocity, see
+    `motion.drifting`; None tells no velocity.
     """
 
     yaw_std_deg: float = 0.0
     agl_std: float = 0.0
     tilt_std_deg: float = 0.0
-    lean_std_deg: float = 0.0
+    attitude_std_deg: float = 0.0
     prior_std_m: float | None = None
     yaw_bias_deg: float = 0.0
     agl_bias: float = 0.0
@@ -61,7 +62,7 @@ class Errors:
             "yaw_std_deg": 180.0,
             "agl_std": 0.5,
             "tilt_std_deg": 20.0,
-            "lean_std_deg": 20.0,
+            "attitude_std_deg": 20.0,
             "prior_std_m": 1e6,
             "velocity_drift": 0.5,
         }
@@ -118,7 +119,7 @@ class SimulateRequest:
 
 @dataclass(frozen=True)
 class _Pose:
-    """Where and how the camera is; what a faultless autopilot would tell of that is `told_deg`:
+    """Where and how the camera is; what a faultless autopilot would tell of that is `reported_deg`:
     heading, pitch and roll of the aircraft."""
 
     position_en_m: Array
@@ -127,8 +128,8 @@ class _Pose:
     roll_deg: float
     agl_m: float
     time_s: float
-    told_deg: tuple[float, float, float]
-    told_en_mps: tuple[float, float] | None = None
+    reported_deg: tuple[float, float, float]
+    reported_en_mps: tuple[float, float] | None = None
 
     @property
     def attitude(self) -> tuple[float, float, float, float]:
@@ -257,7 +258,7 @@ def _poses(
         rng = np.random.default_rng([request.seed, 0, number])
         for _ in range(TRIES_PER_VIEW):
             place = rng.uniform([west, south], [east, north])
-            pose = _leaning(request, rng, place, rng.uniform(0, 360), agl_m, number * 1.0)
+            pose = _tilted(request, rng, place, rng.uniform(0, 360), agl_m, number * 1.0)
             if _sees_ground(coverage, request.camera, pose):
                 yield pose
                 break
@@ -273,11 +274,11 @@ def _route_poses(
     request: SimulateRequest, route: Route, area: Area, agl_m: float, coverage: Coverage
 ) -> Iterator[_Pose]:
     way = _way(request, route.points_en_m(area.frame))
-    velocities = _told_velocities(request, way)
+    velocities = _reported_velocities(request, way)
     for number, (place, heading) in enumerate(zip(way.places_en_m, way.headings_deg, strict=True)):
         rng = np.random.default_rng([request.seed, 0, number])
         time_s, told = float(way.times_s[number]), velocities[number]
-        pose = _leaning(request, rng, place, float(heading), agl_m, time_s, told)
+        pose = _tilted(request, rng, place, float(heading), agl_m, time_s, told)
         if not request.beyond and not _sees_ground(coverage, request.camera, pose):
             lat, lon = area.frame.latlon_from_en(place)
             raise AreaError(
@@ -303,7 +304,7 @@ def _way(request: SimulateRequest, line_en_m: Array) -> Way:
     return way
 
 
-def _told_velocities(request: SimulateRequest, way: Way) -> list[tuple[float, float] | None]:
+def _reported_velocities(request: SimulateRequest, way: Way) -> list[tuple[float, float] | None]:
     drift = request.errors.velocity_drift
     if drift is None:
         return [None] * len(way.places_en_m)
@@ -312,20 +313,20 @@ def _told_velocities(request: SimulateRequest, way: Way) -> list[tuple[float, fl
     return [(round(float(east), 4), round(float(north), 4)) for east, north in told]
 
 
-def _leaning(
+def _tilted(
     request: SimulateRequest,
     rng: np.random.Generator,
     place: Array,
     yaw_deg: float,
     agl_m: float,
     time_s: float,
-    told_en_mps: tuple[float, float] | None = None,
+    reported_en_mps: tuple[float, float] | None = None,
 ) -> _Pose:
     errors = request.errors
-    lean = np.clip(rng.normal(0, 1, 2), -2.5, 2.5) * errors.lean_std_deg
-    told = (float(yaw_deg), float(lean[0]), float(lean[1]))
+    tilt = np.clip(rng.normal(0, 1, 2), -2.5, 2.5) * errors.attitude_std_deg
+    told = (float(yaw_deg), float(tilt[0]), float(tilt[1]))
     true = mounted(told, *errors.mount_deg) if any(errors.mount_deg) else told
-    return _Pose(place, *true, agl_m, time_s, told, told_en_mps)
+    return _Pose(place, *true, agl_m, time_s, told, reported_en_mps)
 
 
 def _corners_en_m(camera: Camera, pose: _Pose) -> Array:
@@ -354,7 +355,7 @@ def _picture(
 def _told(request: SimulateRequest, area: Area, pose: _Pose, rng: np.random.Generator) -> Telemetry:
     """Telemetry of a pose with its errors."""
     errors, height = request.errors, 1 + request.errors.agl_bias
-    yaw_deg, pitch_deg, roll_deg = pose.told_deg
+    yaw_deg, pitch_deg, roll_deg = pose.reported_deg
     yaw_deg += errors.yaw_bias_deg
     prior = None
     if errors.prior_std_m is not None:
@@ -369,7 +370,7 @@ def _told(request: SimulateRequest, area: Area, pose: _Pose, rng: np.random.Gene
         agl_m=round(pose.agl_m * max(0.05, height + rng.normal(0, 1) * errors.agl_std), 3),
         yaw_std_deg=errors.yaw_std_deg or None,
         agl_std_m=errors.agl_std * pose.agl_m or None,
-        lean_std_deg=errors.tilt_std_deg or None,
+        tilt_std_deg=errors.tilt_std_deg or None,
         prior=prior,
-        vel_en_mps=pose.told_en_mps,
+        vel_en_mps=pose.reported_en_mps,
     )

@@ -196,10 +196,10 @@ def _arc(before: Array, corner: Array, after: Array, radius_m: float) -> Array:
 def mounted(
     attitude_deg: tuple[float, float, float], pitch_deg: float, roll_deg: float
 ) -> tuple[float, float, float]:
-    """Heading, pitch and roll of a camera that leans in an aircraft of that attitude."""
+    """Heading, pitch and roll of a camera that tilts in an aircraft of that attitude."""
     level = enu_from_camera(0.0, 0.0, 0.0)
-    leaning = enu_from_camera(0.0, pitch_deg, roll_deg)
-    return attitude_of(enu_from_camera(*attitude_deg) @ level.T @ leaning)
+    tilted = enu_from_camera(0.0, pitch_deg, roll_deg)
+    return attitude_of(enu_from_camera(*attitude_deg) @ level.T @ tilted)
 
 
 def _direction(course_deg: float) -> Array:

@@ -42,7 +42,7 @@ from orthonav.sources.mcap_chunks import (
     profile_of,
 )
 from orthonav.sources.options import SourceOptions
-from orthonav.sources.recording import Grey, Recording, SourceView, as_told, fitted
+from orthonav.sources.recording import Grey, Recording, SourceView, fitted, with_options
 
 MAX_VIEWS = 500_000
 """Ten a second for 14 hours; a small file can claim far more."""
@@ -273,7 +273,7 @@ def _stream(
         where = f"view {view.frame} of {pictures.where(view.index)}"
         yield SourceView(
             frame=view.frame,
-            telemetry=as_told(view.telemetry, None, options),
+            telemetry=with_options(view.telemetry, None, options),
             truth_latlon_deg=None,
             where=where,
             load=partial(pictures.grey, view.index, where),

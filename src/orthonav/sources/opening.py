@@ -10,7 +10,7 @@ from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.flightlog import is_flight_log, open_flight_log
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.photos import open_photos, photo_paths
-from orthonav.sources.recording import Recording, SourceView, as_told, fitted
+from orthonav.sources.recording import Recording, SourceView, fitted, with_options
 from orthonav.sources.ros import bag_suffix, open_ros
 from orthonav.sources.video import open_video
 
@@ -113,7 +113,7 @@ def _flight_views(
         known = truth.get(view.frame)
         yield SourceView(
             frame=view.frame,
-            telemetry=as_told(view.telemetry, known, options),
+            telemetry=with_options(view.telemetry, known, options),
             truth_latlon_deg=known,
             where=view.where,
             load=view.grey,

@@ -18,11 +18,11 @@ from orthonav.sources.options import SourceOptions
 from orthonav.sources.recording import (
     Recording,
     SourceView,
-    as_told,
     check_overlap,
     fitted,
     known_at,
     rounded,
+    with_options,
 )
 from orthonav.sources.track import Track
 
@@ -120,7 +120,7 @@ def _views(
     for one in taken:
         if track is None:
             truth = one.photo.latlon_deg
-            telemetry = rounded(as_told(_told(one, options), truth, options))
+            telemetry = rounded(with_options(_told(one, options), truth, options))
         else:
             telemetry, truth = known_at(track, one.time_ns, options)
         yield SourceView(

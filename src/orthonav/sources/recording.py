@@ -20,7 +20,7 @@ DECIMALS = 8
 
 @dataclass(frozen=True, eq=False)
 class SourceView:
-    """One view of a source: an `orthonav.flight.View` that also knows what is written of it.
+    """One view of a source: a `RecordedView` that also knows what is written of it.
 
     `frame` ends as its picture is to be written; `data` gives the picture as it was encoded, None
     where it was not; `load` decodes it.
@@ -56,7 +56,7 @@ class Recording:
         return self.stream()
 
 
-def as_told(
+def with_options(
     telemetry: Telemetry, truth_latlon_deg: tuple[float, float] | None, options: SourceOptions
 ) -> Telemetry:
     """The telemetry with what the options add: the recorded position as a prior, a level camera."""
@@ -91,7 +91,7 @@ def known_at(
     """Telemetry and true position at a moment of the track's own clock."""
     truth = track.latlon_deg(time_ns)
     telemetry = track.telemetry(time_ns, options.ground_alt_m)
-    return rounded(as_told(telemetry, truth, options)), truth
+    return rounded(with_options(telemetry, truth, options)), truth
 
 
 def fitted(camera: Camera, width_px: int, height_px: int, where: str) -> Camera:

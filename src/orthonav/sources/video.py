@@ -49,12 +49,12 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
         raise CameraError(f"a video does not tell its camera; give --camera FILE: {path}")
     camera = fitted(read_camera_file(options.camera), width, height, str(path))
     last_ns = round((frames - 1) / fps * 1e9) if fps > 0 and frames > 0 else 0
-    track, told_by = _track(path, last_ns, options)
+    track, telemetry_path = _track(path, last_ns, options)
     return Recording(
         kind="video",
         path=path,
         camera=camera,
-        note=f"video {path.name}, telemetry of {told_by.name}",
+        note=f"video {path.name}, telemetry of {telemetry_path.name}",
         expected=math.floor(last_ns / 1e9 * options.rate_hz) + 1 if last_ns else 0,
         stream=partial(_views, path, track, options),
     )
@@ -63,21 +63,21 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
 def _track(path: Path, last_ns: int, options: SourceOptions) -> tuple[Track, Path]:
     """The telemetry of a video and the file it is from."""
     beside = [path.with_suffix(suffix) for suffix in SIDECARS]
-    told_by = options.telemetry or next((one for one in beside if one.is_file()), None)
-    if told_by is None:
+    telemetry_path = options.telemetry or next((one for one in beside if one.is_file()), None)
+    if telemetry_path is None:
         raise FlightError(
             f"no telemetry beside the video ({path.stem}.srt or .csv); give --telemetry: {path}"
         )
-    track = read_log(told_by, options.mount_deg)
+    track = read_log(telemetry_path, options.mount_deg)
     start_ns = track.origin_ns + options.time_offset_ns
-    check_overlap(track, start_ns, start_ns + last_ns, told_by)
+    check_overlap(track, start_ns, start_ns + last_ns, telemetry_path)
     short_ns = start_ns + last_ns - end_ns(track)
-    if log_kind(told_by) in ("srt", "table") and short_ns > _SHORT_NS:
+    if log_kind(telemetry_path) in ("srt", "table") and short_ns > _SHORT_NS:
         raise FlightError(
             f"telemetry ends {short_ns / 1e9:.1f} s before the video of {last_ns / 1e9:.1f} s: "
-            f"{told_by}"
+            f"{telemetry_path}"
         )
-    return track, told_by
+    return track, telemetry_path
 
 
 def _views(path: Path, track: Track, options: SourceOptions) -> Iterator[SourceView]:

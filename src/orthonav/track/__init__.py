@@ -2,15 +2,15 @@
 
 from orthonav.track.mixture import Estimate, Mixture, State
 from orthonav.track.model import Model, Sighting, Told
-from orthonav.track.motion import CameraWay, ToldVelocity
+from orthonav.track.motion import CameraDisplacement, ReportedVelocity
 
 __all__ = [
-    "CameraWay",
+    "CameraDisplacement",
     "Estimate",
     "Mixture",
     "Model",
+    "ReportedVelocity",
     "Sighting",
     "State",
     "Told",
-    "ToldVelocity",
 ]

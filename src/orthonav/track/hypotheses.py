@@ -13,7 +13,7 @@ MAX_HYPOTHESES = 40
 MIN_SHARE = 1e-7
 MERGE_SIGMAS = 1.0
 WHAT_DIFFERS = np.ix_([0, 1, 2, 3, 6, 7], [0, 1, 2, 3, 6, 7])
-"""Of the covariances of two hypotheses: position, velocity and lean."""
+"""Of the covariances of two hypotheses: position, velocity and tilt."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ def merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
 
 def _divergence(one: Hypothesis, heavier: Hypothesis, inverse: Array) -> float:
     """How much is lost (nats, Kullback and Leibler) where a hypothesis becomes part of a heavier
-    one, in position, velocity and lean; `inverse` (6, 6) is that of the heavier one's covariance.
+    one, in position, velocity and tilt; `inverse` (6, 6) is that of the heavier one's covariance.
 
     A place that is known well is not the same as a wide guess around it.
     """

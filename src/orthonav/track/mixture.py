@@ -15,12 +15,13 @@ from enum import Enum
 
 import numpy as np
 
+from orthonav.records import CONFIDENT
 from orthonav.track.hypotheses import Hypothesis, distance, merged, moments, within
 from orthonav.track.model import (
-    LEAN,
     POSITION,
     SEEN,
     STATE,
+    TILT,
     Array,
     Model,
     Sighting,
@@ -30,12 +31,12 @@ from orthonav.track.model import (
     updated,
 )
 from orthonav.track.motion import (
-    CameraWay,
+    CameraDisplacement,
     Expected,
-    ToldVelocity,
+    ReportedVelocity,
+    after_bias_jump,
     by_camera,
     held_to_map,
-    knocked,
     predicted,
     velocity_forgotten,
 )
@@ -48,7 +49,6 @@ MAJOR_SHARE = 0.05
 """The same where views show nothing, for there hypotheses are not merged."""
 TOLD_SHARE = 0.9
 """Belief in a position that was told before anything was seen."""
-SURE = 0.9
 LIKELY = 0.5
 CONFIRMED = 0.8
 """Views' worth of new ground that must have been recognized before a track is one, each counted by
@@ -160,16 +160,16 @@ class Mixture:
     def predict(
         self,
         seconds: float,
-        told: ToldVelocity | None = None,
-        camera: CameraWay | None = None,
-        told_noise: Array | None = None,
+        told: ReportedVelocity | None = None,
+        camera: CameraDisplacement | None = None,
+        telemetry_noise: Array | None = None,
     ) -> None:
         """Let time pass; `told` is what instruments say of the way gone, `camera` what views say.
 
-        `told_noise` (2,): variances with which told heading (rad) and log scale scatter from view
-        to view, those of the model where None.
+        `telemetry_noise` (2,): variances with which reported heading (rad) and log scale scatter
+        from view to view, those of the model where None.
         """
-        noise = self.model.told_noise if told_noise is None else told_noise
+        noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
         kept = 1 - self.model.lost
         made = []
         for each in self.hypotheses:
@@ -183,27 +183,27 @@ class Mixture:
         self,
         each: Hypothesis,
         seconds: float,
-        told: ToldVelocity | None,
-        camera: CameraWay | None,
-        told_noise: Array,
+        told: ReportedVelocity | None,
+        camera: CameraDisplacement | None,
+        telemetry_noise: Array,
     ) -> Iterator[tuple[float, Expected]]:
         """Where a hypothesis may be next, and how likely: as the camera saw it, or not so.
 
         What the camera saw is weighed by what was expected: of a way that nothing else tells, it
         may also be that the aircraft turned as nobody expected.
         """
-        model, likely = self.model, 1 - self.model.slip
-        slipped = predicted(model, each.mean, each.covariance, seconds, told, told_noise)
+        model, likely = self.model, 1 - self.model.odometry_outlier
+        slipped = predicted(model, each.mean, each.covariance, seconds, told, telemetry_noise)
         if camera is None:
             chance = 0.0
             if told is None and each.share >= MAJOR_SHARE:  # nobody saw it, nobody told it
                 chance = 1 - (1 - model.turn) ** seconds
                 free = velocity_forgotten(model, each.covariance)
-                yield chance, predicted(model, each.mean, free, seconds, told, told_noise)
+                yield chance, predicted(model, each.mean, free, seconds, told, telemetry_noise)
             yield 1.0 - chance, slipped
             return
         # A wrong way lies anywhere that it was looked for.
-        wrong = math.log(model.slip / (math.pi * camera.reach_m**2))
+        wrong = math.log(model.odometry_outlier / (math.pi * camera.reach_m**2))
         ways = [(wrong, slipped)]
         turns = [(likely, each.covariance)]
         if each.share < MINOR_SHARE:
@@ -214,7 +214,7 @@ class Mixture:
                 (likely * model.turn, velocity_forgotten(model, each.covariance)),
             ]
         for share, covariance in turns:
-            turned = predicted(model, each.mean, covariance, seconds, told, told_noise, camera)
+            turned = predicted(model, each.mean, covariance, seconds, told, telemetry_noise, camera)
             seen, log_fit = by_camera(turned, camera)
             ways.append((math.log(share) + log_fit, seen))
         best = max(log_share for log_share, _ in ways)
@@ -245,7 +245,7 @@ class Mixture:
             if searched is not None:
                 looked_at &= bool(np.hypot(*(each.mean[:2] - searched[0])) < searched[1])
             made.append(replace(each, share=each.share * (missed if looked_at else 1.0)))
-            for start in self._or_knocked(each):
+            for start in self._with_bias_jump(each):
                 for seen in readings:
                     split = self._seen(start, seen)
                     if split is not None:
@@ -303,7 +303,7 @@ class Mixture:
         return mean[4:], covariance[4:, 4:]
 
     def _next_state(self, confidence: float, sighted: float) -> State:
-        if confidence >= SURE and sighted >= CONFIRMED:
+        if confidence >= CONFIDENT and sighted >= CONFIRMED:
             return State.TRACKING
         if self._state is State.TRACKING and confidence < LIKELY:
             return State.LOST
@@ -313,12 +313,12 @@ class Mixture:
         inside = (mean[:2] >= self._extent[:2]) & (mean[:2] <= self._extent[2:])
         return bool(inside.all())
 
-    def _or_knocked(self, each: Hypothesis) -> list[Hypothesis]:
+    def _with_bias_jump(self, each: Hypothesis) -> list[Hypothesis]:
         """A hypothesis as it is, and as it is if the camera was knocked since the last view."""
-        rare = self.model.knocked
+        rare = self.model.bias_jump
         if each.expected is None or each.share < MINOR_SHARE:
             return [each]
-        expected = knocked(self.model, each.expected)
+        expected = after_bias_jump(self.model, each.expected)
         other = replace(
             each,
             share=each.share * rare,
@@ -338,11 +338,11 @@ class Mixture:
         seen, noise, anew = reading(self.model, told, sighting)
         own = np.diag(noise)[POSE] + self.model.initial_bias()[:2]
         wide = math.log(self.area_m2) + float(np.log(SEARCHED_SIGMAS * np.sqrt(own)).sum())
-        # A view leans as mounts do wherever it is put: that is no evidence for a place.
-        leans = noise[4:, 4:] + anew[4:, 4:]
+        # A view tilts as mounts do wherever it is put: that is no evidence for a place.
+        tilts = noise[4:, 4:] + anew[4:, 4:]
         wide -= math.log(
             sum(
-                share * math.exp(log_density(seen[4:], leans + covariance[LEAN, LEAN]))
+                share * math.exp(log_density(seen[4:], tilts + covariance[TILT, TILT]))
                 for share, _, covariance in self._mounts()
             )
         )
@@ -372,10 +372,10 @@ class Mixture:
             number=self._numbers,
         )
 
-    def _nowhere(self, lean_rad: float | None = None) -> tuple[Array, Array]:
+    def _nowhere(self, tilt_rad: float | None = None) -> tuple[Array, Array]:
         """Mean (8,) and covariance (8, 8) of an aircraft that may be anywhere on the map."""
         place, speed = self.area_m2, self.model.speed_mps**2
-        variances = [place, place, speed, speed, *self.model.initial_bias(lean_rad)]
+        variances = [place, place, speed, speed, *self.model.initial_bias(tilt_rad)]
         return np.zeros(STATE), np.diag(np.array(variances))
 
     def _mounts(self) -> Iterator[tuple[float, Array, Array]]:
@@ -383,7 +383,7 @@ class Mixture:
         off = self.model.off_mount
         yield 1 - off, *self._nowhere()
         if off > 0:
-            yield off, *self._nowhere(self.model.off_lean_rad)
+            yield off, *self._nowhere(self.model.off_tilt_rad)
 
     def _born(self, seen: "_Reading") -> Iterator[Hypothesis]:
         """The hypotheses that the aircraft was elsewhere, and is here."""

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 STATE = 8
-POSITION, VELOCITY, HEADING, SCALE, LEAN = slice(0, 2), slice(2, 4), 4, 5, slice(6, 8)
+POSITION, VELOCITY, HEADING, SCALE, TILT = slice(0, 2), slice(2, 4), 4, 5, slice(6, 8)
 HEADING_FLOOR_RAD, SCALE_FLOOR = math.radians(0.3), 0.004
 MOUNT_M, MOUNT_RAD = 10.0, (math.radians(0.5), math.radians(1.5))
-LEAN_WALK_SHARE = 1 / 30
+TILT_WALK_SHARE = 1 / 30
 """Of how far a mount may be off is how far it drifts, per root of a second."""
 SEEN = [0, 1, 4, 5, 6, 7]
 """Which of the state a sighting speaks of."""
@@ -27,40 +27,39 @@ class Model:
     """How aircraft and instruments behave.
 
     `speed_mps`: standard deviation of an unknown velocity per axis; `accel_mps2`: of what changes
-    it; `told_velocity_s`: for how long a told one is off by about the same. `heading_rad`,
-    `log_scale`, `lean_rad`: how wrong the told values may be all along; `heading_noise_rad`,
-    `log_scale_noise`, `lean_noise_rad`: how they scatter from view to view; the `_walk` ones how
+    it; `reported_velocity_s`: for how long a told one is off by about the same. `heading_rad`,
+    `log_scale`, `tilt_rad`: how wrong the told values may be all along; `heading_noise_rad`,
+    `log_scale_noise`, `tilt_noise_rad`: how they scatter from view to view; the `_walk` ones how
     the former drift, per root of a second. `sighting_noise_m`: what maps of two dates disagree by
-    beyond what registration knows, which counts `sighting_growth` times; `map_m`: how far a map
-    may be displaced as a whole.
-    `off_mount`: how likely the mount is not as good as `lean_rad` but off by `off_lean_rad`.
-    `slip`: how likely a way between two views is wrong though it looks right: clouds that move, a
-    field that repeats. `turn`: how likely the velocity changes by more than `accel_mps2` says.
-    `knocked`: how likely heading, scale and lean are suddenly wrong by something else than before:
-    a gimbal that moved (by `off_lean_rad`), a compass that was reset. `miss`: how likely a view
-    of ground that is on the map shows nothing that can be found. `lost`: how likely the track went
-    wrong since the last view.
+    beyond what registration knows, which counts `sighting_growth` times; `map_m`: how far a map may
+    be displaced as a whole. `off_mount`: how likely the mount is not as good as `tilt_rad` but off
+    by `off_tilt_rad`. `odometry_outlier`: probability that a displacement between two views is
+    wrong though it looks right: moving clouds, a field that repeats. `turn`: how likely the
+    velocity changes by more than `accel_mps2` says. `bias_jump`: probability that the biases of
+    heading, scale and tilt jump: a gimbal that moved (by `off_tilt_rad`), a compass that was reset.
+    `miss`: how likely a view of ground that is on the map shows nothing that can be found. `lost`:
+    how likely the track went wrong since the last view.
     """
 
     speed_mps: float = 30.0
     accel_mps2: float = 4.0
-    told_velocity_s: float = 120.0
+    reported_velocity_s: float = 120.0
     heading_rad: float = math.radians(7.0)
     heading_noise_rad: float = math.radians(2.0)
     heading_walk: float = math.radians(0.05)
     log_scale: float = 0.08
     log_scale_noise: float = 0.02
     log_scale_walk: float = 5e-4
-    lean_rad: float = math.radians(0.5)
-    off_lean_rad: float = math.radians(6.0)
+    tilt_rad: float = math.radians(0.5)
+    off_tilt_rad: float = math.radians(6.0)
     off_mount: float = 0.03
-    lean_noise_rad: float = math.radians(0.7)
-    lean_walk: float = math.radians(0.01)
+    tilt_noise_rad: float = math.radians(0.7)
+    tilt_walk: float = math.radians(0.01)
     sighting_noise_m: float = 2.0
     map_m: float = 3.0
     sighting_growth: float = 2.0
-    knocked: float = 0.01
-    slip: float = 0.01
+    bias_jump: float = 0.01
+    odometry_outlier: float = 0.01
     turn: float = 0.03
     miss: float = 0.5
     lost: float = 3e-3
@@ -74,23 +73,23 @@ class Model:
         low, high = MOUNT_RAD
         return self.with_mount(min(max(MOUNT_M / max(agl_m, 1e-3), low), high))
 
-    def with_mount(self, lean_rad: float) -> "Model":
+    def with_mount(self, tilt_rad: float) -> "Model":
         """The same, with a mount that is off by so much, and drifts accordingly."""
-        return replace(self, lean_rad=lean_rad, lean_walk=LEAN_WALK_SHARE * lean_rad)
+        return replace(self, tilt_rad=tilt_rad, tilt_walk=TILT_WALK_SHARE * tilt_rad)
 
-    def initial_bias(self, lean_rad: float | None = None) -> Array:
+    def initial_bias(self, tilt_rad: float | None = None) -> Array:
         """Variances (4,) of heading, log scale, pitch and roll before anything is seen."""
-        lean = self.lean_rad if lean_rad is None else lean_rad
-        return np.square([self.heading_rad, self.log_scale, lean, lean])
+        tilt = self.tilt_rad if tilt_rad is None else tilt_rad
+        return np.square([self.heading_rad, self.log_scale, tilt, tilt])
 
     @property
-    def told_noise(self) -> Array:
+    def telemetry_noise(self) -> Array:
         """Variances (2,) with which told heading and log scale scatter from view to view."""
         return np.square([self.heading_noise_rad, self.log_scale_noise])
 
     def drift(self, seconds: float) -> Array:
         """Variances (4,) that are added to those of the biases in so many seconds."""
-        walk = [self.heading_walk, self.log_scale_walk, self.lean_walk, self.lean_walk]
+        walk = [self.heading_walk, self.log_scale_walk, self.tilt_walk, self.tilt_walk]
         return np.square(walk) * max(seconds, 0.0)
 
 
@@ -102,7 +101,7 @@ class Told:
     heading_rad: float | None
     pitch_rad: float
     roll_rad: float
-    lean_noise_rad: float | None = None
+    tilt_noise_rad: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,13 +124,13 @@ def reading(model: Model, told: Told, sighting: Sighting) -> tuple[Array, Array,
     """What a sighting says of the state (6,), in the order of `SEEN`, and two covariances (6, 6):
     of how map and view err, and of what is told anew at every view."""
     noise = sighting.covariance.copy()
-    lean = slice(4, 6)
-    by_lean = noise[:2, lean] @ np.linalg.solve(noise[lean, lean], noise[lean, :2])
-    noise[:2, :2] += (model.sighting_growth - 1) * (noise[:2, :2] - by_lean)
+    tilt = slice(4, 6)
+    by_tilt = noise[:2, tilt] @ np.linalg.solve(noise[tilt, tilt], noise[tilt, :2])
+    noise[:2, :2] += (model.sighting_growth - 1) * (noise[:2, :2] - by_tilt)
     floor = [model.sighting_noise_m] * 2 + [HEADING_FLOOR_RAD, SCALE_FLOOR]
     noise[range(4), range(4)] += np.square(floor)
-    told_lean = model.lean_noise_rad if told.lean_noise_rad is None else told.lean_noise_rad
-    anew = np.diag(np.square([0.0, 0.0, 0.0, 0.0, told_lean, told_lean]))
+    reported_tilt = model.tilt_noise_rad if told.tilt_noise_rad is None else told.tilt_noise_rad
+    anew = np.diag(np.square([0.0, 0.0, 0.0, 0.0, reported_tilt, reported_tilt]))
     seen = sighting.mean.copy()
     if told.heading_rad is None:
         seen[2] = 0.0

@@ -21,7 +21,7 @@ TOLD_JITTER = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class ToldVelocity:
+class ReportedVelocity:
     """Velocity over ground as told, m/s east and north (2,): since the last view, and the one
     `before` (None where none was told then). It is off by `std_mps` per axis, and by about the
     same for a while."""
@@ -32,7 +32,7 @@ class ToldVelocity:
 
 
 @dataclass(frozen=True, eq=False)
-class CameraWay:
+class CameraDisplacement:
     """Movement since the last view as the camera saw it.
 
     `moved_en_m` (2,) is turned by the told heading and scaled by the told height of the view
@@ -77,22 +77,22 @@ def predicted(
     mean: Array,
     covariance: Array,
     seconds: float,
-    told: ToldVelocity | None,
-    told_noise: Array,
-    camera: CameraWay | None = None,
+    told: ReportedVelocity | None,
+    telemetry_noise: Array,
+    camera: CameraDisplacement | None = None,
 ) -> Expected:
     """What a state is expected to be after so many seconds, by what is told of the way, else by its
     velocity.
 
-    `told_noise` (2,) are the variances with which told heading and log scale scatter from view to
-    view: what was wrong with the last ones says that much less of these, unless the camera saw how
-    they changed. How far it went by the `camera` is not in this: see `by_camera`.
+    `telemetry_noise` (2,) are the variances with which reported heading and log scale scatter from
+    view to view: what was wrong with the last ones says that much less of these, unless the camera
+    saw how they changed. How far it went by the `camera` is not in this: see `by_camera`.
     """
     after, step = mean.copy(), np.eye(STATE)
     noise = np.zeros((STATE, STATE))
     noise[range(4, 8), range(4, 8)] = model.drift(seconds)
     if camera is None:
-        noise[[HEADING, SCALE], [HEADING, SCALE]] += told_noise
+        noise[[HEADING, SCALE], [HEADING, SCALE]] += telemetry_noise
     else:
         after[[HEADING, SCALE]] += [camera.turned_rad, camera.scaled]
         noise[HEADING, HEADING] += camera.turned_std_rad**2
@@ -106,7 +106,7 @@ def predicted(
         like_before = 0.0
         after[VELOCITY] = told.now_en_mps
         if told.before_en_mps is not None and covariance[2, 2] < (3 * told.std_mps) ** 2:
-            like_before = math.exp(-seconds / model.told_velocity_s)
+            like_before = math.exp(-seconds / model.reported_velocity_s)
             after[VELOCITY] += like_before * (mean[VELOCITY] - told.before_en_mps)
         after[POSITION] += seconds * after[VELOCITY]
         step[VELOCITY, VELOCITY] = like_before * np.eye(2)
@@ -128,7 +128,7 @@ def _add(noise: Array, position: float, both: float, velocity: float) -> None:
         noise[axis + 2, axis + 2] += velocity
 
 
-def by_camera(expected: Expected, way: CameraWay) -> tuple[Expected, float]:
+def by_camera(expected: Expected, way: CameraDisplacement) -> tuple[Expected, float]:
     """The same with the way that the camera saw, and the log density of that way.
 
     The way is a measurement of the position now less that before (stochastic cloning, Roumeliotis
@@ -181,6 +181,6 @@ def held_to_map(model: Model, expected: Expected, area_m2: float) -> Expected:
     return expected.without(slice(0, 4), np.repeat([area_m2, model.speed_mps**2], 2))
 
 
-def knocked(model: Model, expected: Expected) -> Expected:
-    """The same where heading, scale and lean are no longer what they were."""
-    return expected.without(slice(4, 8), model.initial_bias(model.off_lean_rad))
+def after_bias_jump(model: Model, expected: Expected) -> Expected:
+    """The same where heading, scale and tilt are no longer what they were."""
+    return expected.without(slice(4, 8), model.initial_bias(model.off_tilt_rad))

@@ -1,4 +1,4 @@
-"""Hindsight: what a whole flight says of each of its views.
+"""Smoothing: what a whole flight says of each of its views.
 
 The hypotheses that were right in the end are followed back to where they came from, and every view
 learns from those after it (Rauch, Tung and Striebel 1965). Where a track began anew, so does this.

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from orthonav.evaluate.calibration import is_covariance
 from orthonav.evaluate.metrics import FAR_M
-from orthonav.evaluate.track import SURE
 from orthonav.publish.jsonl import STATES
-from orthonav.records import Fix, ViewResult
+from orthonav.records import CONFIDENT, Fix, ViewResult
 from orthonav.web.ground import Ground
 
 Array = NDArray[np.float64]
@@ -43,7 +42,7 @@ def columns_of(
     error_m = np.hypot(*(fix_en_m - truth_en_m).T)
     own_m = np.array([math.nan if f is None else f.radius_m for f in fixes], dtype=np.float64)
     sure = [
-        f is not None and (f.confidence >= SURE or r.state == "tracking")
+        f is not None and (f.confidence >= CONFIDENT or r.state == "tracking")
         for f, r in zip(fixes, results, strict=True)
     ]
     wrong = np.array(sure, dtype=bool) & (error_m > np.fmax(max(FAR_M, radius_m), own_m))

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from orthonav.errors import CameraError, FlightError, MapFileError
 from orthonav.geo.camera import Camera, axis_on_ground_en_m, footprint_en_m
 from orthonav.localizer.checks import check_telemetry
-from orthonav.localizer.rectify import MAX_REACH, prepare_view, rectify
+from orthonav.localizer.rectify import MAX_REACH, downsampled, rectify
 from orthonav.mapfile.layer import MAX_PREVIEW_PX, GreyLayer, jpeg_frame
 from orthonav.mapfile.reader import MapFile
-from orthonav.records import Telemetry
+from orthonav.records import Telemetry, View
 from orthonav.web.pictures import Grey
 
 LEAST_PX, MOST_PX = 256, 1024
@@ -44,7 +44,7 @@ class Window:
 def window_of(told: Telemetry, camera: Camera, gsd_m: float) -> Window:
     """The square that holds what a view saw. Raises `FlightError` where it saw no ground we know.
 
-    Where it leans far out, no more than `MAX_REACH` times the half side of a vertical view is kept
+    Where it tilts far out, no more than `MAX_REACH` times the half side of a vertical view is kept
     on either side of the optical axis.
     """
     refused = check_telemetry(told, camera, math.inf, heading_known=True)
@@ -73,11 +73,7 @@ def view_png(grey: Grey, told: Telemetry, camera: Camera, window: Window) -> byt
         raise FlightError("the picture is not of the proportions of the camera")
     gsd_m = window.side_m / window.size_px
     made = rectify(
-        prepare_view(grey, camera.resized(width, height), told.agl_m, gsd_m),
-        yaw_deg=told.yaw_deg,
-        pitch_deg=told.pitch_deg,
-        roll_deg=told.roll_deg,
-        agl_m=told.agl_m,
+        downsampled(View(grey, camera.resized(width, height), told), gsd_m),
         gsd_m=gsd_m,
         size_px=window.size_px,
     )

@@ -10,7 +10,8 @@ from orthonav.check.write.ground import Box, Ground, seen_box
 from orthonav.check.write.risk import ALL_RISKS, pieces
 from orthonav.check.write.said import fine_said, share_text
 from orthonav.check.write.shapes import stretch_en_m
-from orthonav.check.write.summary import SURE, interval_along, summarize
+from orthonav.check.write.summary import interval_along, summarize
+from orthonav.records import CONFIDENT
 from orthonav.report import Figure, draw_axes, draw_figure, draw_map, map_size_in
 from orthonav.report.canvas import BACKING, GREY, INK, OFFSET, RIGHT, SOFT, WRONG
 
@@ -134,8 +135,8 @@ def _profile(result: CheckResult, along: Along) -> Figure:
     summary = summarize(result)
     return Figure(
         "profile",
-        f"Probability and expected drift along the route; {share_text(summary.sure_share)} of it "
-        f"at {SURE:g} or more, {len(result.stretches)} blind stretches",
+        f"Probability and expected drift along the route; {share_text(summary.confident_share)} of "
+        f"it at {CONFIDENT:g} or more, {len(result.stretches)} blind stretches",
         "Probability along the route with its 80 % interval and the lowest across the band; below, "
         "how far the position may be off (one standard deviation). Shaded: blind stretches.",
         draw_figure((10.0, 5.0), lambda figure: _draw_profile(figure, result, along)),
@@ -149,7 +150,7 @@ def _draw_profile(figure: "mpl.Figure", result: CheckResult, along: Along) -> No
     above.fill_between(x, low, high, color=RIGHT, alpha=0.18, linewidth=0, label="80 % interval")
     above.plot(x, along.across_low, color=SOFT, linewidth=0.9, label="lowest across the band")
     above.plot(x, along.probability, color=RIGHT, linewidth=1.6, label="probability")
-    above.axhline(SURE, color=GREY, linestyle=(0, (4, 3)), linewidth=1)
+    above.axhline(CONFIDENT, color=GREY, linestyle=(0, (4, 3)), linewidth=1)
     above.set(ylim=(0, 1.02), ylabel="probability")
     above.legend(ncols=3, loc="lower right")
     below.plot(x, along.drift_m, color=WRONG, linewidth=1.6, label="position")

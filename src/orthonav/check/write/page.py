@@ -26,7 +26,8 @@ from orthonav.check.write.said import (
     verdict_said,
     what_text,
 )
-from orthonav.check.write.summary import SURE, summarize
+from orthonav.check.write.summary import summarize
+from orthonav.records import CONFIDENT
 from orthonav.report import (
     SAID_STYLE,
     STYLE,
@@ -137,8 +138,8 @@ def _cards(result: CheckResult) -> str:
     if result.along is not None:
         shown.append(
             (
-                share_text(summary.sure_share),
-                f"of {metres_text(summary.route_m)} at {SURE:g} or more",
+                share_text(summary.confident_share),
+                f"of {metres_text(summary.route_m)} at {CONFIDENT:g} or more",
             )
         )
         shown.append(_longest(result))

@@ -98,7 +98,7 @@ def _summary(result: CheckResult) -> Plain:
         "second_date": bool(result.second_date),
         "route_m": _rounded(summary.route_m, _METRES),
         "route_s": _rounded(summary.route_s, _METRES),
-        "route_share_from_0_9": _rounded(summary.sure_share, _SHARE),
+        "route_share_from_0_9": _rounded(summary.confident_share, _SHARE),
         "blind_stretches": len(result.stretches),
         "unbearable_stretches": summary.unbearable,
         "longest_stretch": longest,

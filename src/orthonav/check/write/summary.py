@@ -7,23 +7,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.check.outcome import Along, CheckResult, Stretch
+from orthonav.records import CONFIDENT
 
 Array = NDArray[np.float64]
-SURE = 0.9
-"""From this probability on a place of the route counts as sure."""
 
 
 @dataclass(frozen=True)
 class Summary:
     """Figures of a check; those of the route are NaN or None where there is none.
 
-    `sure_share` is the share of the route's length with a probability of `SURE` or more, `error_m`
-    the root mean square error expected of a correct fix, along the route or over the map.
+    `confident_share` is the share of the route's length with a probability of `CONFIDENT` or more,
+    `error_m` the root mean square error expected of a correct fix, along the route or over the map.
     """
 
     route_m: float
     route_s: float
-    sure_share: float
+    confident_share: float
     error_m: float
     longest: Stretch | None
     unbearable: int
@@ -38,11 +37,11 @@ def summarize(result: CheckResult) -> Summary:
     length_m = float(along.distance_m[-1] - along.distance_m[0])
     weights = stood_for_m(along.distance_m)
     known = np.isfinite(along.probability)
-    sure = np.where(known, along.probability, 0.0) >= SURE
+    sure = np.where(known, along.probability, 0.0) >= CONFIDENT
     return Summary(
         route_m=length_m,
         route_s=length_m / result.conditions.speed_mps,
-        sure_share=float(weights[sure].sum() / weights.sum()) if known.any() else math.nan,
+        confident_share=float(weights[sure].sum() / weights.sum()) if known.any() else math.nan,
         error_m=_rms(along.error_m, weights * np.nan_to_num(along.probability)),
         longest=max(result.stretches, key=lambda each: each.length_m, default=None),
         unbearable=sum(not each.bearable for each in result.stretches),

@@ -12,7 +12,8 @@ from orthonav.check.write.said import (
     share_text,
     verdict_said,
 )
-from orthonav.check.write.summary import SURE, summarize
+from orthonav.check.write.summary import summarize
+from orthonav.records import CONFIDENT
 
 MOST_STRETCHES = 8
 _MOST_REASONS = 5
@@ -59,7 +60,7 @@ def _figures(result: CheckResult) -> list[tuple[str, str]]:
             (
                 "route",
                 f"{metres_text(summary.route_m)}, {seconds_text(summary.route_s)}; "
-                f"{share_text(summary.sure_share)} of it at {SURE:g} or more",
+                f"{share_text(summary.confident_share)} of it at {CONFIDENT:g} or more",
             )
         ]
     rows.append(("error", f"{metres_text(summary.error_m)} expected of a correct fix"))

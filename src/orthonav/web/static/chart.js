@@ -2,7 +2,7 @@
 // over time. The slider below it is the same for keyboards and screen readers.
 
 import { Squares, clock, colour, metres, stepOf } from "./look.js";
-import { SURE } from "./store.js";
+import { CONFIDENT } from "./store.js";
 
 const LEFT = 52;
 const MANY = 800;
@@ -184,7 +184,7 @@ export class Chart {
     const c = this.store.columns;
     const y = (v) => bottom - v * (bottom - top);
     this.#lines(context, [0, 1], y, colour("line"), []);
-    this.#lines(context, [SURE], y, colour("soft"), [4, 3], () => "0.9");
+    this.#lines(context, [CONFIDENT], y, colour("soft"), [4, 3], () => "0.9");
     this.#points(context, c.conf, y, (i) => this.store.state(i));
     this.#label(context, "confidence", bottom - 3, LEFT + 5);
   }

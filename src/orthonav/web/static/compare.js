@@ -103,7 +103,7 @@ export class Compare {
     image.src = rawUrl(i, this.store.generation);
   }
 
-  /** Marks the places below the camera, which a camera that leans does not see in the middle. */
+  /** Marks the places below the camera, which a camera that tilts does not see in the middle. */
   #crosses(i, window) {
     const { columns: c, run } = this.store;
     const [east, north] = window.offset_en_m.map((value) => value / window.side_m);
@@ -204,7 +204,7 @@ export function sentence(store, i) {
   if (c.reason[i]) parts.push(`no fix: ${c.reason[i]}`);
   else parts.push(SAID[store.state(i)]);
   if (Number.isFinite(c.err[i])) parts.push(`error ${metres(c.err[i])}`);
-  if (c.wrong[i]) parts.push("SURE AND WRONG");
+  if (c.wrong[i]) parts.push("CONFIDENT AND WRONG");
   if (Number.isFinite(c.conf[i])) parts.push(`confidence ${number(c.conf[i], 3)} within ${metres(c.radius[i])}`);
   if (Number.isFinite(c.a[i])) parts.push(`σ ${metres(c.a[i])}`);
   if (Number.isFinite(c.head[i])) parts.push(`heading ${number(c.head[i], 1)}°, ${metres(c.agl[i])} high`);

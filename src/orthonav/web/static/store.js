@@ -2,7 +2,7 @@
 // "data" (more views, or all anew), "select", "filter".
 
 const NUMBERS = ["x", "y", "tx", "ty", "err", "conf", "radius", "a", "b", "turn", "head", "agl", "ms"];
-export const SURE = 0.9;
+export const CONFIDENT = 0.9;
 
 export class Store extends EventTarget {
   constructor(run) {
@@ -125,7 +125,7 @@ export class Store extends EventTarget {
       none: (i) => Boolean(c.reason[i]),
       wrong: (i) => c.wrong[i] === 1,
       far: (i) => c.err[i] > this.run.radius_m,
-      doubt: (i) => !c.reason[i] && !(c.conf[i] >= SURE),
+      doubt: (i) => !c.reason[i] && !(c.conf[i] >= CONFIDENT),
       state: (i) => this.state(i) === value,
       reason: (i) => c.reason[i] === value,
     };

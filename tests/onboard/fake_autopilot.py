@@ -183,17 +183,17 @@ def write_flight(folder, camera, views):
 
 
 class FakeLocator:
-    """Answers every view with what `outcome(grey, camera, telemetry)` gives."""
+    """Answers every view with what `outcome(view)` gives."""
 
     def __init__(self, outcome=None, state="tracking"):
         self.outcome = outcome or (
-            lambda grey, camera, told: fix(heading_deg=told.yaw_deg, agl_m=told.agl_m)
+            lambda view: fix(heading_deg=view.telemetry.yaw_deg, agl_m=view.telemetry.agl_m)
         )
         self.state_name, self.seen = state, []
 
-    def locate(self, grey, camera, telemetry):
-        self.seen.append(telemetry)
-        return self.outcome(grey, camera, telemetry)
+    def locate(self, view):
+        self.seen.append(view.telemetry)
+        return self.outcome(view)
 
-    def passed(self, camera, telemetry, reason):
+    def passed(self, telemetry, reason):
         return reason

@@ -1,9 +1,9 @@
 """A process that stands in for an autopilot: tells the telemetry of a flight, and what it hears.
 
-`python -m benchmarks.standin FLIGHT PORT [--pace N]` prints a line of JSON for every message that
-comes, with the time it came by the monotonic clock, which all processes of a machine share. What it
-hears is decoded from the definitions of MAVLink by the reader that the tests use, which shares
-nothing with what sends. Its clock since boot begins where the times of the flight do.
+`python -m benchmarks.fake_autopilot FLIGHT PORT [--pace N]` prints a line of JSON for every message
+that arrives, with its arrival time on the monotonic clock, which all processes of a machine share.
+What it hears is decoded from the definitions of MAVLink by the reader that the tests use, which
+shares nothing with what sends. Its clock since boot begins where the times of the flight do.
 """
 
 import argparse
@@ -140,7 +140,7 @@ def _text(value: bytes) -> str:
 
 def main() -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.standin")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.fake_autopilot")
     parser.add_argument("flight", type=Path)
     parser.add_argument("port", type=int)
     parser.add_argument("--pace", type=float, default=1.0)

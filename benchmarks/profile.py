@@ -73,12 +73,12 @@ def _accounts(
     localizer: Localizer, flight: Flight, known: bool, searches: dict[Search, int]
 ) -> list[_Account]:
     first = flight.views[0]
-    localizer.locate(first.grey, flight.camera, first.telemetry, heading_known=known)  # warm-up
+    localizer.locate(first.view, heading_known=known)  # warm-up
     accounts = []
-    for view in flight.views:
+    for flown in flight.views:
         with _watched(_Account()) as account:
             locate = account.around(lambda *a, **k: REST, localizer.locate)
-            locate(view.grey, flight.camera, view.telemetry, heading_known=known)
+            locate(flown.view, heading_known=known)
         accounts.append(account)
         for each in account.searches:
             searches[each] += 1

@@ -34,7 +34,7 @@ LINE_EN_M = ((0, 1), (1, 1), (1, -1), (-1, -1), (-1, 1), (0, 1))
 ERRORS = Errors(
     yaw_std_deg=0.5,
     agl_std=0.01,
-    lean_std_deg=1.0,
+    tilt_std_deg=1.0,
     yaw_bias_deg=3.0,
     agl_bias=0.03,
     pitch_bias_deg=0.5,
@@ -45,7 +45,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Lap:
+class LoopedFlight:
     """How a lap is flown: by which camera, at how many views a second. Short: a side and a half."""
 
     camera: Camera
@@ -59,7 +59,7 @@ class Lap:
         return np.array(line, np.float64) * HALF_M
 
 
-def rendered(place: Workplace, ortho: Path, frame: LocalFrame, lap: Lap) -> Path:
+def rendered(place: Workplace, ortho: Path, frame: LocalFrame, lap: LoopedFlight) -> Path:
     """The flight folder of a lap, kept until its settings or the simulator change."""
     settings = repr((lap, lap.corners_en_m.tolist(), AGL_M, SPEED_MPS, TURN_RADIUS_M, ERRORS))
     digest = hashlib.sha256(settings.encode() + ortho.parent.name.encode())

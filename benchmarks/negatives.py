@@ -29,7 +29,7 @@ FOREST_SHARE = 0.03
 
 @dataclass(frozen=True)
 class Sources:
-    """Real imagery that strangers are made of. `water` needs near infrared as its fourth band."""
+    """Real imagery that negatives are made of. `water` needs near infrared as its fourth band."""
 
     other_places: Sequence[Path]
     mirrored_flights: Sequence[Path]
@@ -37,7 +37,7 @@ class Sources:
     forest: Path
 
 
-def strangers(
+def negatives(
     sources: Sources, count: int, size: tuple[int, int], seed: int
 ) -> Iterator[tuple[str, Grey]]:
     """About `count` pictures of `size` (height, width) in the proportions of `SHARES`."""
