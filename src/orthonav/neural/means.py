@@ -1,10 +1,10 @@
 """How learning is made fast: precision, memory, processes. What is learnt stays the same.
 
 Tensors stay contiguous (NCHW) on every device. In `channels_last` oneDNN writes past a buffer in
-the backward pass of strided 1 x 1 convolutions with fewer channels than its block: those of a
-narrow ResNet. On processors with AVX2 only, gradients are then wrong, or the process crashes or
-hangs (oneDNN issue 6035, present in PyTorch 2.13.0). The gain was small: docs/benchmarks.md.
-`torch.compile` is not used, because on a CPU it chooses `channels_last` by itself.
+the backward pass of strided 1 x 1 convolutions with fewer channels than its block: the short cuts
+of a narrow ResNet. On processors with AVX2 only, the gradients are then wrong, or the process
+crashes or hangs (oneDNN issue 6035, present in PyTorch 2.13.0). The gain was small:
+docs/benchmarks.md. `torch.compile` is not used, because on a CPU it chooses `channels_last` itself.
 """
 
 import contextlib
