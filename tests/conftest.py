@@ -17,7 +17,6 @@ os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**28))
 import cv2
 import pytest
 
-from absent import pytest_make_collect_report, pytest_runtest_makereport  # noqa: F401
 from helpers import Done, textured
 from orthonav.cli import main
 from orthonav.flight import open_flight, read_truth
@@ -25,6 +24,7 @@ from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 
+pytest_plugins = ["absent"]
 SEED = 2
 cv2.setNumThreads(1)  # tests run side by side
 
