@@ -23,7 +23,10 @@ LOOPBACK_ONLY = """<CycloneDDS><Domain><General><AllowMulticast>false</AllowMult
 <NetworkInterface address="127.0.0.1"/></Interfaces></General><Discovery><ParticipantIndex>auto
 </ParticipantIndex><Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 """Configuration of Cyclone DDS for ROS_LOCALHOST_ONLY=1."""
-_POLICIES = {2: "durability", 4: "deadline", 6: "ownership", 8: "liveliness", 11: "reliability"}
+_POLICIES = {
+    **{2: "durability", 4: "deadline", 6: "ownership", 8: "liveliness", 11: "reliability"},
+    24: "type consistency (message definitions of another distribution: set ROS_DISTRO)",
+}
 _BLOCK_NS = 10_000_000
 Handler = Callable[[Any, bytes], None]
 
@@ -181,7 +184,7 @@ class Node:
             return []
 
     def _qos_problem(self, topic: str, status: Any, other: str) -> None:
-        if status.total_count > 0:
+        if status.total_count > 0 and topic not in self.problems:
             policy = _POLICIES.get(status.last_policy_id, f"policy {status.last_policy_id}")
             self._problem(topic, f"{other} has QoS that does not match ours: {policy}")
 
