@@ -20,6 +20,7 @@ pytest.importorskip("cyclonedds", reason="the extra ros2 (cyclonedds) is not ins
 import ros2_types as ros
 from bags import Messages, record
 from blots import AGL_M, CAMERA, GROUND, map_of_blots, ortho_of_blots, rendered
+from mcap.reader import make_reader
 from recorders import picture
 from ros2_peer import BEST_EFFORT, RELIABLE, TRANSIENT_LOCAL, Peer, environment, wait_for
 from rosbags.highlevel import AnyReader
@@ -696,9 +697,9 @@ def test_a_bag_replayed_in_real_time_is_flown(flown, env, peer, tmp_path, sim_ti
     sent = [line for line in told if "frame" in line and line["sent"]]
     assert len(sent) == len(fixes) and all(line["confidence"] >= 0.9 for line in sent)
     assert {each.status[0].hardware_id for each in peer.heard("/diagnostics")} == {"orthonav"}
-    with AnyReader([next(tmp_path.glob("log_*.mcap"))]) as reader:
-        gnss = [c for c in reader.connections if c.topic == "/orthonav/gnss"]
-        (first, *_) = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(gnss)]
+    with next(tmp_path.glob("log_*.mcap")).open("rb") as stream:
+        gnss = make_reader(stream).iter_messages(topics=["/orthonav/gnss"])
+        first = ros.NavSatFix.deserialize(next(gnss)[2].data)
     assert (first.latitude, first.longitude) == (10.0, 20.0)
 
 

@@ -31,7 +31,8 @@ def ros2_module(name: str) -> Any:
     except ImportError as error:
         package = name.partition(".")[0]
         raise MissingExtraError(
-            f"--ros2 needs {package}: pip install 'orthonav[ros2]' ({error})"
+            f"--ros2 needs {package}: pip install 'orthonav[ros2]', on x86-64 with Python 3.11 to "
+            f"3.13 (docs/ros2.md says what to do elsewhere) ({error})"
         ) from error
 
 
