@@ -20,6 +20,7 @@ pytest.importorskip("cyclonedds", reason="the extra ros2 (cyclonedds) is not ins
 import ros2_types as ros
 from bags import Messages, record
 from blots import AGL_M, CAMERA, GROUND, map_of_blots, ortho_of_blots, rendered
+from cyclonedds.idl import make_idl_struct
 from mcap.reader import make_reader
 from recorders import picture
 from ros2_peer import BEST_EFFORT, RELIABLE, TRANSIENT_LOCAL, Peer, environment, wait_for
@@ -416,6 +417,43 @@ def test_qos_that_does_not_match_is_named(peer, reading, caplog):
     assert "QoS" in caplog.text
 
 
+def test_definitions_of_another_distribution_are_named_and_can_be_chosen(
+    peer, reading, monkeypatch, caplog
+):
+    """A range of Humble has no variance: as bytes it would be cut short."""
+    humble = make_idl_struct(
+        "Range",
+        ros.name("sensor_msgs", "Range"),
+        {f.name: f.type for f in dataclasses.fields(ros.Range) if f.name != "variance"},
+    )
+    peer.advertise("/range", humble)
+    flying = reading()
+
+    def found():
+        flying.node.spin(0.02)
+        flying.node.check_graph()
+        return flying.node.problems.get("/range")
+
+    assert "ROS_DISTRO" in wait_for(found, 10) and "ROS_DISTRO" in caplog.text
+    monkeypatch.setenv("ROS_DISTRO", "humble")
+    flying = Reading(os.environ)
+    matched(peer, flying)
+    now_ns = time.time_ns()
+    values = dataclasses.asdict(ranged(now_ns, 80.0))
+    del values["variance"]
+    peer.advertise("/imu/data", ros.Imu)
+    matched(peer, flying)
+    peer.write("/imu/data", imu(now_ns))
+    wait_for(lambda: flying.node.spin(0.02), 5)
+    peer.write("/range", humble(**{**values, "header": ros.Header(stamp(now_ns), "range")}))
+    peer.advertise("/cam/image_raw", ros.Image)
+    matched(peer, flying)
+    peer.write("/cam/image_raw", image(now_ns))
+    seen = flying.read()
+    flying.node.close()
+    assert seen.told.agl_m == pytest.approx(80.0)
+
+
 # Out of the program.
 
 
@@ -703,10 +741,14 @@ def test_a_bag_replayed_in_real_time_is_flown(flown, env, peer, tmp_path, sim_ti
     assert (first.latitude, first.longitude) == (10.0, 20.0)
 
 
-def test_no_camera_info_is_said_and_sigterm_ends_it(flown, env, tmp_path):
+def test_no_camera_info_is_said_and_sigterm_ends_it(flown, env, peer, tmp_path):
+    """On the loopback by ROS_LOCALHOST_ONLY, as ROS users ask for it."""
     errors = tmp_path / "errors"
-    running = process(env, errors, "fly", flown[0], "--ros2", "--ros-args", *REMAPPED)
+    peer.advertise("/cam/image_raw", ros.Image)
+    local = {**env, "CYCLONEDDS_URI": "", "ROS_LOCALHOST_ONLY": "1"}
+    running = process(local, errors, "fly", flown[0], "--ros2", "--ros-args", *REMAPPED)
     try:
+        wait_for(peer.matched, 60, "fly joins the graph")
         wait_for(lambda: "no message on /cam/camera_info" in errors.read_text(), 60)
     finally:
         code = stopped(running)

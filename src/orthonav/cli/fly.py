@@ -180,7 +180,8 @@ def _add_outputs(group: Any) -> None:
         "--origin",
         type=numbers(3, "LAT,LON,ALT_M"),
         metavar="LAT,LON,ALT_M",
-        help="sent where the autopilot has no origin, for odometry and vision",
+        help="sent where the autopilot has no origin, for odometry and vision; with --ros2 the "
+        "origin of the map frame",
     )
     group.add_argument("--dry-run", action="store_true", help="send nothing to the autopilot")
 

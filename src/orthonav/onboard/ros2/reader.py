@@ -28,6 +28,8 @@ FAR_NS = 2 * TIME_NS
 """Pictures whose stamps are farther than this from now are of another clock."""
 REMIND_S = 10.0
 """Seconds between two lines about what is being waited for."""
+MOST_LINES = 100
+"""Different lines about messages that are logged: whoever sends them chooses what is in them."""
 _SPIN_S = 0.05
 _TELEMETRY_DEPTH = 200
 IMAGES = {"raw": "sensor_msgs/msg/Image", "compressed": "sensor_msgs/msg/CompressedImage"}
@@ -274,6 +276,6 @@ class Ros2Reader:
             log.warning("waiting: %s", text)
 
     def _say_once(self, text: str) -> None:
-        if text not in self._said:
+        if text not in self._said and len(self._said) < MOST_LINES:
             self._said.add(text)
             log.warning("%s", text)
