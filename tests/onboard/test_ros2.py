@@ -225,8 +225,8 @@ def test_a_picture_comes_with_the_telemetry_of_its_exposure(peer, reading):
     turn = Rotation.from_euler("ZYX", (60.0, 3.0, -2.0), degrees=True)
     down = np.diag([1.0, -1, -1]) @ np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]])
     expected = attitude_of(turn.as_matrix() @ down)  # camera x right, y back, z down
-    told = (seen.told.yaw_deg, seen.told.pitch_deg, seen.told.roll_deg)
-    assert told == pytest.approx(expected, abs=1e-6)
+    angles = (seen.told.yaw_deg, seen.told.pitch_deg, seen.told.roll_deg)
+    assert angles == pytest.approx(expected, abs=1e-6)
     assert seen.told.yaw_deg == pytest.approx(30.0, abs=0.2)  # ENU 60 deg is heading 30
     tilt = turn.apply([0.0, 0.0, 1.0])[2]
     assert seen.told.agl_m == pytest.approx(80.0 * tilt, abs=1e-3)
@@ -303,8 +303,8 @@ def test_without_telemetry_a_picture_comes_all_the_same_and_says_so(peer, readin
     flying = reading()
     matched(peer, flying)
     peer.write("/cam/image_raw", image(time.time_ns()))
-    told = flying.read().told
-    assert set(told.missing()) == {"yaw_deg", "pitch_deg", "roll_deg", "agl_m"}
+    telemetry = flying.read().told
+    assert set(telemetry.missing()) == {"yaw_deg", "pitch_deg", "roll_deg", "agl_m"}
 
 
 def test_an_imu_without_orientation_is_no_attitude(peer, reading):
@@ -532,8 +532,8 @@ def test_a_position_goes_out_as_fix_and_pose(peer, publishing):
     turn = pose.pose.pose.orientation
     flu = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
     forward_ned, left_ned = ned @ [1.0, 0, 0], ned @ [0.0, -1, 0]
-    for axis, told in (([1, 0, 0], forward_ned), ([0, 1, 0], left_ned)):
-        assert flu.apply(axis) == pytest.approx([told[1], told[0], -told[2]], abs=1e-12)
+    for axis, ned_axis in (([1, 0, 0], forward_ned), ([0, 1, 0], left_ned)):
+        assert flu.apply(axis) == pytest.approx([ned_axis[1], ned_axis[0], -ned_axis[2]], abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -705,10 +705,10 @@ def test_a_bag_replayed_in_real_time_is_flown(flown, env, peer, tmp_path, sim_ti
     peer.subscribe("/orthonav/pose", ros.PoseWithCovarianceStamped)
     peer.subscribe("/diagnostics", ros.DiagnosticArray)
     peer.subscribe("/orthonav/origin", ros.GeoPointStamped, RELIABLE, TRANSIENT_LOCAL)
-    errors, lines, kept = (tmp_path / name for name in ("errors", "lines.jsonl", "log.mcap"))
+    errors, lines, flight_log = (tmp_path / name for name in ("errors", "lines.jsonl", "log.mcap"))
     running = process(
         *(env, errors, "fly", path, "--ros2", "--deadline-ms", "1500"),
-        *("--json", lines, "--log", kept, "--ros-args", *REMAPPED),
+        *("--json", lines, "--log", flight_log, "--ros-args", *REMAPPED),
         *("-p", f"use_sim_time:={str(sim_time).lower()}"),
     )
     try:
@@ -731,8 +731,8 @@ def test_a_bag_replayed_in_real_time_is_flown(flown, env, peer, tmp_path, sim_ti
         assert np.hypot(*(there - place)) < 6  # and nowhere near what the GNSS receiver says
         where = pose.pose.pose.position
         assert (where.x, where.y) == pytest.approx(there.tolist(), abs=1e-3)
-    told = [json.loads(line) for line in lines.read_text().splitlines()]
-    sent = [line for line in told if "frame" in line and line["sent"]]
+    written = [json.loads(line) for line in lines.read_text().splitlines()]
+    sent = [line for line in written if "frame" in line and line["sent"]]
     assert len(sent) == len(fixes) and all(line["confidence"] >= 0.9 for line in sent)
     assert {each.status[0].hardware_id for each in peer.heard("/diagnostics")} == {"orthonav"}
     with next(tmp_path.glob("log_*.mcap")).open("rb") as stream:
