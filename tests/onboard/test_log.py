@@ -240,7 +240,7 @@ def full_disk(monkeypatch, room_bytes):
 
 
 def test_a_full_disk_takes_pictures_first(tmp_path, monkeypatch):
-    disk = full_disk(monkeypatch, 44_000)
+    disk = full_disk(monkeypatch, 45_000)
     log = begun(tmp_path)
     for index in range(30):
         log_views(log, [index])

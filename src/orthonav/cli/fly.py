@@ -43,6 +43,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=Path, metavar="MAP.onav")
     _add_camera(parser.add_argument_group("camera"))
     _add_autopilot(parser.add_argument_group("autopilot"))
+    _add_ros2(parser.add_argument_group("ROS 2"))
     _add_outputs(parser.add_argument_group("what is sent"))
     _add_flight(parser.add_argument_group("flight"))
 
@@ -50,7 +51,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 def _add_camera(group: Any) -> None:
     group.add_argument(
         "--camera",
-        required=True,
         metavar="SOURCE",
         help="/dev/video0 or 0, rtsp:// or http:// stream, video, folder of images, flight folder",
     )
@@ -130,6 +130,22 @@ def _add_autopilot(group: Any) -> None:
     )
 
 
+def _add_ros2(group: Any) -> None:
+    group.add_argument(
+        "--ros2",
+        action="store_true",
+        help="camera, telemetry and positions as topics of ROS 2, instead of --camera and "
+        "--autopilot (docs/ros2.md)",
+    )
+    group.add_argument(
+        "--ros-args",
+        nargs=argparse.REMAINDER,
+        default=[],
+        metavar="ARGS",
+        help="last: -r FROM:=TO, -r __ns:=/NAMESPACE, -r __node:=NAME, -p NAME:=VALUE",
+    )
+
+
 def _add_outputs(group: Any) -> None:
     group.add_argument(
         "--send",
@@ -177,7 +193,8 @@ def _add_outputs(group: Any) -> None:
         "--origin",
         type=numbers(3, "LAT,LON,ALT_M"),
         metavar="LAT,LON,ALT_M",
-        help="sent where the autopilot has no origin, for odometry and vision",
+        help="sent where the autopilot has no origin, for odometry and vision; with --ros2 the "
+        "origin of the map frame",
     )
     group.add_argument("--dry-run", action="store_true", help="send nothing to the autopilot")
 
@@ -229,7 +246,13 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.cli.flying import runner
     from orthonav.errors import VariantError
 
-    if options.autopilot is None and options.telemetry == "autopilot":
+    if options.ros2 and (options.camera or options.autopilot):
+        raise VariantError("--ros2 replaces --camera and --autopilot: give one or the other")
+    if options.ros_args and not options.ros2:
+        raise VariantError("--ros-args needs --ros2")
+    if not options.ros2 and options.camera is None:
+        raise VariantError("give --camera SOURCE, or --ros2 for pictures from a ROS 2 topic")
+    if not options.ros2 and options.autopilot is None and options.telemetry == "autopilot":
         raise VariantError("give --autopilot URL, or --telemetry recorded to try without one")
     stopping = threading.Event()
     before = {}

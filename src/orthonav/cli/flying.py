@@ -33,7 +33,7 @@ from orthonav.onboard.outputs import (
     open_sink,
 )
 from orthonav.onboard.ports import transport_opener
-from orthonav.onboard.publisher import Publisher
+from orthonav.onboard.publisher import PositionOutput, Publisher
 from orthonav.onboard.run import Locator
 from orthonav.onboard.state import boot_id, load, prior_of
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
@@ -55,7 +55,6 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         )
     accept = Acceptance.parse(options.accept)
     least = accept.threshold if accept.criterion == "confidence" else CONFIDENT
-    camera = _camera(options)
     mount = read_mount(options.mount) if options.mount else None
     localizer = Localizer(open_map(options.map))
     heading_known = options.heading == "known"
@@ -64,10 +63,13 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     )
     locator: Locator = Mounted(tracker, mount) if mount else tracker
     link = _link(options, clocks)
-    publisher = _publisher(options, clocks, link, least)
+    source, camera, graph = _inputs(options, clocks, link, stopping, stack, localizer, least)
+    publisher = _publisher(options, clocks, link, least, graph)
     if link is not None:
         stack.callback(LinkThread(link).stop)
-    source = _source(options, clocks, link, camera, stopping)
+    sink = _sink(options, camera)
+    if options.ros2 and sink is not None:
+        source.log_gnss = sink.gnss
     thread = CameraThread(source, stopping)
     stack.callback(thread.stop)
     fly = FlyOptions(
@@ -76,7 +78,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         heading_known=heading_known,
         deadline_s=options.deadline_ms / 1e3,
         telemetry_wait_s=options.telemetry_wait_ms / 1e3,
-        recorded=options.telemetry == "recorded",
+        recorded=options.ros2 or options.telemetry == "recorded",
         accept=accept if accept.criterion != "confidence" else None,
         min_confidence=least,
         map_path=options.map,
@@ -91,11 +93,30 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         fly,
         clocks,
         link=link,
-        sink=_sink(options, camera),
+        sink=sink,
         second_look=SecondLook(localizer, least),
         start=_start(options, clocks),
         notifier=Notifier(),
     )
+
+
+def _inputs(
+    options: argparse.Namespace,
+    clocks: Clocks,
+    link: AutopilotLink | None,
+    stopping: threading.Event,
+    stack: ExitStack,
+    localizer: Localizer,
+    least: float,
+) -> tuple[Any, Camera, PositionOutput | None]:
+    """The source of pictures, its camera, and where positions go that is joined to it."""
+    if not options.ros2:
+        camera = _camera(options)
+        return _source(options, clocks, link, camera, stopping), camera, None
+    ros2 = importlib.import_module("orthonav.cli.flying_ros2")  # only where it is asked for
+    frame = localizer.sheet.frame
+    source, graph = ros2.joined(options, clocks, stopping, stack, frame, least)
+    return source, _camera(options) if options.camera_file else source.wait_for_camera(), graph
 
 
 def _camera(options: argparse.Namespace) -> Camera:
@@ -162,13 +183,17 @@ def _signing(options: argparse.Namespace, clocks: Clocks) -> Signing | None:
 
 
 def _publisher(
-    options: argparse.Namespace, clocks: Clocks, link: AutopilotLink | None, least: float
+    options: argparse.Namespace,
+    clocks: Clocks,
+    link: AutopilotLink | None,
+    least: float,
+    graph: PositionOutput | None,
 ) -> Publisher:
     interval = {}
     if options.rate_hz is not None:
         if not options.rate_hz > 0:
             raise VariantError("--rate-hz must be above 0")
-        interval = dict.fromkeys([*KINDS.values(), "NMEA"], 1 / options.rate_hz)
+        interval = dict.fromkeys([*KINDS.values(), "NMEA", "ROS2"], 1 / options.rate_hz)
     rules = GateRules(least, options.max_std_m, min_interval_s=interval)
     gate = Gate(rules, clock=Clock.BOOT)  # ours: it judges by the monotonic clock
     chosen = MessageOptions(
@@ -196,6 +221,7 @@ def _publisher(
         link=link,
         nmea=nmea,
         lines=lines,
+        graph=graph,
         min_confidence=least,
     )
 

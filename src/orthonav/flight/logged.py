@@ -168,8 +168,9 @@ CAMERA = Topic(
         },
     ),
 )
+GNSS = Topic("/orthonav/gnss", "sensor_msgs/msg/NavSatFix", _NAVSAT, "ros2msg", "cdr")
 HEALTH = Topic("/orthonav/health", "orthonav.Health", _schema("orthonav.Health", {}, {}))
-TOPICS = (SESSION, VIEW, THUMBNAIL, TELEMETRY, RESULT, POSITION, NAVSAT, CAMERA, HEALTH)
+TOPICS = (SESSION, VIEW, THUMBNAIL, TELEMETRY, RESULT, POSITION, NAVSAT, GNSS, CAMERA, HEALTH)
 
 NO_ALTITUDE_M2 = 1e8
 """Variance up of a position: a fix says nothing of the altitude, which is written as 0."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from orthonav.errors import CameraError, FlightError, MissingFileError
 from orthonav.flight import decode_image, open_flight
-from orthonav.onboard.telemetry import Clocks
+from orthonav.onboard.telemetry import Clocks, Told
 from orthonav.records import NoFix, Telemetry
 
 log = logging.getLogger(__name__)
@@ -37,7 +37,8 @@ class Picture:
     """One picture: `grey` (H, W), or `problem` where it could not be decoded.
 
     `exposed_ns` is the exposure by our monotonic clock; `time_ns` what is written of it: UTC of a
-    live camera, the recording's own time else. `told` is what a recording knew of it.
+    live camera, the recording's own time else. `told` is the telemetry that came with it, from a
+    recording or from ROS, and `reported` the attitude of the vehicle behind that.
     """
 
     number: int
@@ -47,6 +48,7 @@ class Picture:
     grey: Grey | None
     problem: NoFix | None = None
     told: Telemetry | None = None
+    reported: Told | None = None
 
 
 class CameraGoneError(CameraError):

@@ -69,6 +69,9 @@ class LogSink(Protocol):
     def health(self, told: dict[str, Any]) -> None:
         """How the flight is going."""
 
+    def gnss(self, time_ns: int, cdr: bytes) -> None:
+        """A `sensor_msgs/NavSatFix` of a GNSS receiver, as it was received."""
+
     def close(self) -> None:
         """The flight is over."""
 
@@ -80,8 +83,8 @@ class FlyOptions:
     `mount_deg`: yaw, pitch, roll of the camera in the body; `mount`: what calibration found, for
     second looks (the locator corrects by itself). `deadline_s`: older views are dropped.
     `telemetry_wait_s`: how long a view waits for the telemetry after its exposure. `recorded`:
-    telemetry is that of the recording. `accept`: a criterion beside the gate's. `map_path`,
-    `state_path`: files to look after.
+    telemetry comes with the picture, from a recording or from ROS. `accept`: a criterion beside the
+    gate's. `map_path`, `state_path`: files to look after.
     """
 
     mount_deg: Angles = LOOKS_DOWN
@@ -262,7 +265,7 @@ class Runner:
         """What is told of the exposure; waits a little for what comes after it."""
         if self.options.recorded or self._link is None:
             nothing = Telemetry(picture.time_ns, math.nan, math.nan, math.nan, math.nan)
-            return Told(None), picture.told or nothing
+            return picture.reported or Told(None), picture.told or nothing
         until_ns = self._clocks.mono_ns() + round(self.options.telemetry_wait_s * 1e9)
         while not self._link.covers(picture.exposed_ns) and self._clocks.mono_ns() < until_ns:
             self._clocks.sleep(_WAIT_S)

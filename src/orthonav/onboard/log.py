@@ -26,6 +26,7 @@ from orthonav.errors import CameraError, MissingExtraError, OutputError
 from orthonav.flight.logged import (
     CAMERA,
     FORMAT,
+    GNSS,
     HEALTH,
     MAX_JSON_BYTES,
     MAX_PICTURE_BYTES,
@@ -216,6 +217,10 @@ class FlightLog:
             return
         time_ns = self._time_ns
         self._add(lambda: [_message(HEALTH, time_ns, data)], len(data))
+
+    def gnss(self, time_ns: int, cdr: bytes) -> None:
+        """A `sensor_msgs/NavSatFix` (CDR) of a GNSS receiver, as it was received at `time_ns`."""
+        self._add(lambda: [_message(GNSS, time_ns, cdr)], len(cdr))
 
     def close(self) -> None:
         """Write what is waiting and end the file; waits for it, half a minute at most."""

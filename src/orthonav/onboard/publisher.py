@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.outputs import JsonOut, Messenger, NmeaOut
@@ -13,6 +13,21 @@ from orthonav.publish.gate import Gate
 from orthonav.records import CONFIDENT, ViewResult
 
 log = logging.getLogger(__name__)
+
+
+class PositionOutput(Protocol):
+    """Takes estimates that passed the gate, and the health. Raises `OSError` or `ValueError`."""
+
+    def position(
+        self, estimate: NavigationEstimate, reported: Told, stamp_ns: int
+    ) -> tuple[str, ...]:
+        """Send one position; the names of the messages. `stamp_ns`: the picture's own time."""
+
+    def health(self, plain: dict[str, Any]) -> None:
+        """Send the health."""
+
+    def close(self) -> None:
+        """No more will come."""
 
 
 class Publisher:
@@ -27,11 +42,13 @@ class Publisher:
         link: AutopilotLink | None = None,
         nmea: Sequence[NmeaOut] = (),
         lines: Sequence[JsonOut] = (),
+        graph: PositionOutput | None = None,
         min_confidence: float = CONFIDENT,
     ) -> None:
         self.gate, self._clocks = gate, clocks
         self.messenger, self._link = messenger, link
         self._nmea, self._lines, self._least = nmea, lines, min_confidence
+        self._graph = [graph] if graph is not None else []
         self.failed = 0
 
     def publish(
@@ -54,18 +71,20 @@ class Publisher:
         sent: tuple[str, ...] = ()
         if estimate is not None and self.messenger is not None and self._link is not None:
             sent = self._send(estimate, exposed_ns, told)
+        if estimate is not None:
+            sent += self._to_graph(estimate, told, result.time_ns)
         self._tell_nmea(estimate)
         age_ms = (self._clocks.mono_ns() - exposed_ns) / 1e6
         self._each(self._lines, lambda out: out.view(result, age_ms, sent, withheld))
         return sent
 
     def health(self, plain: dict[str, Any]) -> None:
-        """A line of health for those who read lines."""
-        self._each(self._lines, lambda out: out.health(plain))
+        """The health for those who read lines or ROS topics."""
+        self._each([*self._lines, *self._graph], lambda out: out.health(plain))
 
     def close(self) -> None:
         """No more will come."""
-        self._each([*self._nmea, *self._lines], lambda out: out.close())
+        self._each([*self._nmea, *self._lines, *self._graph], lambda out: out.close())
 
     def _send(self, estimate: NavigationEstimate, exposed_ns: int, told: Told) -> tuple[str, ...]:
         if self.messenger is None or self._link is None:
@@ -79,6 +98,16 @@ class Publisher:
             kind=self._link.kind,
             origin=self._link.origin,
         )
+
+    def _to_graph(
+        self, estimate: NavigationEstimate, reported: Told, stamp_ns: int
+    ) -> tuple[str, ...]:
+        sent: list[str] = []
+        if self._graph and self.gate.due("ROS2", self._clocks.mono_ns()):
+            self._each(
+                self._graph, lambda out: sent.extend(out.position(estimate, reported, stamp_ns))
+            )
+        return tuple(sent)
 
     def _tell_nmea(self, estimate: NavigationEstimate | None) -> None:
         if self._nmea and self.gate.due("NMEA", self._clocks.mono_ns()):

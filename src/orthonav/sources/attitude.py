@@ -48,6 +48,22 @@ def enu_from_ros_camera(enu_from_flu: Array, mount_deg: Angles) -> Array:
     return np.asarray(enu_from_flu @ _FRD_FROM_FLU @ _frd_from_camera(mount_deg))
 
 
+def ned_wxyz_from_ros(wxyz: ArrayLike) -> Array | None:
+    """The attitude (4,) w, x, y, z from forward-right-down to north-east-down of one as ROS writes
+    it (REP 103): from forward-left-up to east-north-up. None where `wxyz` is not a rotation."""
+    rotations, _ = rotations_of_wxyz(np.asarray(wxyz, dtype=np.float64).reshape(1, 4))
+    if not len(rotations):
+        return None
+    xyzw = Rotation.from_matrix(_ENU_FROM_NED.T @ rotations[0] @ _FRD_FROM_FLU).as_quat()
+    return np.asarray(xyzw[[3, 0, 1, 2]])
+
+
+def ros_xyzw_from_ned(ned_from_frd: Array) -> Array:
+    """The inverse, of a rotation (3, 3): x, y, z, w from forward-left-up to east-north-up."""
+    enu_from_flu = _ENU_FROM_NED @ ned_from_frd @ _FRD_FROM_FLU
+    return np.asarray(Rotation.from_matrix(enu_from_flu).as_quat())
+
+
 def rotations_of_wxyz(wxyz: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Rotations (N, 3, 3) of those quaternions (N, 4) that are one, and which are (N,) bool.
 

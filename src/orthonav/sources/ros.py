@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import CameraError, FlightError
-from orthonav.flight import decode_image
 from orthonav.geo.camera import Camera
 from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.guard import needed, reading
 from orthonav.sources.logs import read_log
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.recording import Recording, SourceView, check_overlap, fitted, known_at
-from orthonav.sources.ros_images import camera_of_info, grey_of_image
+from orthonav.sources.ros_images import camera_of_info, grey_of_message
 from orthonav.sources.ros_limits import bound_inflation, check_held
 from orthonav.sources.ros_topics import Topics, find_topics
 from orthonav.sources.ros_track import read_track, stamp_ns
@@ -94,7 +93,7 @@ def _first_image(reader: Any, topics: Topics, path: Path) -> tuple[tuple[int, in
     for _, time_ns, raw in reader.messages(connections=topics.of(topics.image)):
         try:
             message = reader.deserialize(raw, topics.image.msgtype)
-            grey = _grey(message, topics.image.msgtype, "the last")
+            grey = grey_of_message(message, "the last")
         except Exception as error:  # a broken one is counted when its turn comes
             told = f"{type(error).__name__}: {error}"
             continue
@@ -140,7 +139,7 @@ def _view(
     try:
         image = reader.deserialize(raw, kind)
         time_ns = stamp_ns(image, time_ns)
-        load = partial(_grey, image, kind, where)
+        load = partial(grey_of_message, image, where)
         if kind == _COMPRESSED:
             encoded = np.asarray(image.data, dtype=np.uint8).tobytes()
             starts = (name for start, name in _ENDINGS.items() if encoded.startswith(start))
@@ -149,12 +148,6 @@ def _view(
         load = partial(_broken, f"{type(error).__name__}: {error}", where)
     telemetry, truth = known_at(track, time_ns + options.time_offset_ns, options)
     return SourceView(f"{number:06d}{ending}", telemetry, truth, where, load, data)
-
-
-def _grey(message: Any, kind: str, where: str) -> NDArray[np.uint8]:
-    if kind == _COMPRESSED:
-        return decode_image(np.asarray(message.data, dtype=np.uint8).tobytes(), where)
-    return grey_of_image(message, where)
 
 
 def _broken(told: str, where: str) -> NDArray[np.uint8]:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import CameraError, FlightError
+from orthonav.flight import decode_image
 from orthonav.geo.camera import Camera
 from orthonav.sources.cameras import camera_from_numbers
 
@@ -29,6 +30,16 @@ _TO_GREY: dict[str, tuple[int, int, int | None]] = {
         for width in (1, 2)
     },
 }
+
+
+def grey_of_message(message: Any, where: str) -> Grey:
+    """Grey levels (H, W) uint8 of a `sensor_msgs/Image` or `CompressedImage`.
+
+    Raises `FlightError` where it cannot be decoded.
+    """
+    if hasattr(message, "encoding"):
+        return grey_of_image(message, where)
+    return decode_image(np.asarray(message.data, dtype=np.uint8).tobytes(), where)
 
 
 def grey_of_image(message: Any, where: str) -> Grey:

@@ -43,6 +43,37 @@ def stamp_ns(message: Any, recorded_ns: int) -> int:
     return stamped or recorded_ns
 
 
+def attitude_of_message(message: Any) -> tuple[float, float, float, float] | None:
+    """The orientation w, x, y, z in a `sensor_msgs/Imu`, `nav_msgs/Odometry` or
+    `geometry_msgs/PoseStamped`: from forward-left-up to east-north-up (REP 103).
+
+    None for an `Imu` that says it has none.
+    """
+    if hasattr(message, "orientation_covariance"):
+        if message.orientation_covariance[0] == -1:
+            return None
+        turn = message.orientation
+    elif hasattr(message.pose, "pose"):
+        turn = message.pose.pose.orientation
+    else:
+        turn = message.pose.orientation
+    return float(turn.w), float(turn.x), float(turn.y), float(turn.z)
+
+
+def height_of_message(message: Any) -> float | None:
+    """Metres above ground of a `sensor_msgs/Range`, `mavros_msgs/Altitude` or a plain number.
+
+    None for a range outside the limits of its sensor.
+    """
+    if hasattr(message, "range"):
+        sound = message.min_range <= message.range <= message.max_range
+        return float(message.range) if sound else None
+    if hasattr(message, "bottom_clearance"):
+        clearance = message.bottom_clearance
+        return float(clearance if math.isfinite(clearance) else message.relative)
+    return float(message.data)
+
+
 def _messages(reader: Reader, topics: Topics, connection: Any) -> Iterator[tuple[int, Any]]:
     """Time of the stamp, else of recording, and message; what is broken is left out."""
     for one, recorded_ns, raw in reader.messages(connections=topics.of(connection)):
@@ -56,15 +87,9 @@ def _messages(reader: Reader, topics: Topics, connection: Any) -> Iterator[tuple
 def _attitude(reader: Reader, topics: Topics, connection: Any, mount_deg: Angles) -> Series | None:
     samples = Samples(4)
     for time_ns, message in _messages(reader, topics, connection):
-        if connection.msgtype == "sensor_msgs/msg/Imu":
-            if message.orientation_covariance[0] == -1:  # so a message says "none"
-                continue
-            turn = message.orientation
-        elif connection.msgtype == "nav_msgs/msg/Odometry":
-            turn = message.pose.pose.orientation
-        else:
-            turn = message.pose.orientation
-        samples.add(time_ns, turn.w, turn.x, turn.y, turn.z)
+        turn = attitude_of_message(message)
+        if turn is not None:
+            samples.add(time_ns, *turn)
     times, wxyz = samples.arrays()
     enu_from_flu, sound = rotations_of_wxyz(wxyz)
     return attitude_series(times[sound], enu_from_ros_camera(enu_from_flu, mount_deg))
@@ -88,13 +113,8 @@ def _collected(
 
 
 def _height(message: Any) -> tuple[float, ...] | None:
-    if hasattr(message, "range"):
-        sound = message.min_range <= message.range <= message.max_range
-        return (message.range,) if sound else None
-    if hasattr(message, "bottom_clearance"):
-        clearance = message.bottom_clearance
-        return (clearance if math.isfinite(clearance) else message.relative,)
-    return (message.data,)
+    height = height_of_message(message)
+    return None if height is None else (height,)
 
 
 def _velocity(message: Any) -> tuple[float, ...] | None:
