@@ -21,14 +21,14 @@ import ros2_types as ros
 from bags import Messages, record
 from blots import AGL_M, CAMERA, GROUND, map_of_blots, ortho_of_blots, rendered
 from cyclonedds.idl import make_idl_struct
+from fake_autopilot import Time
+from fake_autopilot import fix as fix_of
 from mcap.reader import make_reader
 from recorders import picture
 from ros2_peer import BEST_EFFORT, RELIABLE, TRANSIENT_LOCAL, Peer, environment, wait_for
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
-from standin import Time
-from standin import fix as fix_of
 
 from orthonav.errors import CameraError
 from orthonav.geo.camera import attitude_of
@@ -225,11 +225,11 @@ def test_a_picture_comes_with_the_telemetry_of_its_exposure(peer, reading):
     turn = Rotation.from_euler("ZYX", (60.0, 3.0, -2.0), degrees=True)
     down = np.diag([1.0, -1, -1]) @ np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]])
     expected = attitude_of(turn.as_matrix() @ down)  # camera x right, y back, z down
-    angles = (seen.told.yaw_deg, seen.told.pitch_deg, seen.told.roll_deg)
+    angles = (seen.telemetry.yaw_deg, seen.telemetry.pitch_deg, seen.telemetry.roll_deg)
     assert angles == pytest.approx(expected, abs=1e-6)
-    assert seen.told.yaw_deg == pytest.approx(30.0, abs=0.2)  # ENU 60 deg is heading 30
+    assert seen.telemetry.yaw_deg == pytest.approx(30.0, abs=0.2)  # ENU 60 deg is heading 30
     tilt = turn.apply([0.0, 0.0, 1.0])[2]
-    assert seen.told.agl_m == pytest.approx(80.0 * tilt, abs=1e-3)
+    assert seen.telemetry.agl_m == pytest.approx(80.0 * tilt, abs=1e-3)
 
 
 def test_a_live_view_is_that_of_a_recorded_bag(peer, reading, tmp_path):
@@ -260,7 +260,7 @@ def test_a_live_view_is_that_of_a_recorded_bag(peer, reading, tmp_path):
     live = flying.read()
     assert np.array_equal(live.grey, recorded.grey())
     for name in ("yaw_deg", "pitch_deg", "roll_deg", "agl_m"):
-        assert getattr(live.told, name) == pytest.approx(
+        assert getattr(live.telemetry, name) == pytest.approx(
             getattr(recorded.telemetry, name), abs=1e-9
         )
     assert live.time_ns == recorded.telemetry.time_ns
@@ -303,7 +303,7 @@ def test_without_telemetry_a_picture_comes_all_the_same_and_says_so(peer, readin
     flying = reading()
     matched(peer, flying)
     peer.write("/cam/image_raw", image(time.time_ns()))
-    telemetry = flying.read().told
+    telemetry = flying.read().telemetry
     assert set(telemetry.missing()) == {"yaw_deg", "pitch_deg", "roll_deg", "agl_m"}
 
 
@@ -316,7 +316,7 @@ def test_an_imu_without_orientation_is_no_attitude(peer, reading):
     raw.orientation_covariance = [-1.0] + [0.0] * 8
     peer.write("/imu/data", raw)
     peer.write("/cam/image_raw", image(now_ns))
-    assert math.isnan(flying.read().told.yaw_deg)
+    assert math.isnan(flying.read().telemetry.yaw_deg)
 
 
 def test_stamps_that_go_back(peer, reading, caplog):
@@ -330,7 +330,7 @@ def test_stamps_that_go_back(peer, reading, caplog):
     assert flying.read(1.0) is None and "go back" in caplog.text
     send_view(peer, now_ns - 60 * S)  # a bag that begins again
     again = flying.read()
-    assert again.time_ns == first.time_ns - 60 * S and again.told.missing() == []
+    assert again.time_ns == first.time_ns - 60 * S and again.telemetry.missing() == []
     assert "went back by" in caplog.text and "use_sim_time" in caplog.text
 
 
@@ -343,7 +343,7 @@ def test_simulated_time_is_that_of_the_clock(peer, reading):
     wait_for(lambda: flying.node.spin(0.02) >= 0 and flying.reader.now_ns() > 0, 5)
     send_view(peer, then_ns)
     seen = flying.read()
-    assert seen.time_ns == then_ns - 10**7 and seen.told.missing() == []
+    assert seen.time_ns == then_ns - 10**7 and seen.telemetry.missing() == []
     assert 0 <= (time.monotonic_ns() - seen.exposed_ns) / 1e9 < 5
     assert then_ns <= flying.reader.now_ns() < then_ns + 10 * S
 
@@ -451,7 +451,7 @@ def test_definitions_of_another_distribution_are_named_and_can_be_chosen(
     peer.write("/cam/image_raw", image(now_ns))
     seen = flying.read()
     flying.node.close()
-    assert seen.told.agl_m == pytest.approx(80.0)
+    assert seen.telemetry.agl_m == pytest.approx(80.0)
 
 
 # Out of the program.

@@ -15,8 +15,9 @@ from orthonav.flight.logged import NO_ALTITUDE_M2
 from orthonav.geo.frames import LocalFrame
 from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.telemetry import Told
-from orthonav.publish.estimate import SURE, NavigationEstimate
-from orthonav.publish.mavlink import require_sure
+from orthonav.publish.estimate import NavigationEstimate
+from orthonav.publish.mavlink import require_confident
+from orthonav.records import CONFIDENT
 from orthonav.sources.attitude import ros_xyzw_from_ned
 
 NOT_MEASURED_RAD2 = math.pi**2
@@ -36,7 +37,7 @@ class Ros2Publisher:
         now_ns: Callable[[], int],
         *,
         min_std_m: float = 0.0,
-        min_confidence: float = SURE,
+        min_confidence: float = CONFIDENT,
         silent: bool = False,
     ) -> None:
         """`origin` is the zero of the map frame; `now_ns` reads ROS time; `min_std_m` is the least
@@ -62,7 +63,7 @@ class Ros2Publisher:
         self, estimate: NavigationEstimate, reported: Told, stamp_ns: int
     ) -> tuple[str, ...]:
         """See `PositionOutput.position`; raises `EstimateError` for a low confidence too."""
-        require_sure(estimate, self._least, "NavSatFix")
+        require_confident(estimate, self._least, "NavSatFix")
         if self._silent:
             return ()
         cov = floored(np.asarray(estimate.cov_en_m2), self._floor_m)
