@@ -37,7 +37,7 @@ class Picture:
     """One picture: `grey` (H, W), or `problem` where it could not be decoded.
 
     `exposed_ns` is the exposure by our monotonic clock; `time_ns` what is written of it: UTC of a
-    live camera, the recording's own time else. `told` is the telemetry that came with it, from a
+    live camera, the recording's own time else. `telemetry` is what came with it, from a
     recording or from ROS, and `reported` the attitude of the vehicle behind that.
     """
 
@@ -47,7 +47,7 @@ class Picture:
     time_ns: int
     grey: Grey | None
     problem: NoFix | None = None
-    told: Telemetry | None = None
+    telemetry: Telemetry | None = None
     reported: Told | None = None
 
 

@@ -265,7 +265,7 @@ class Runner:
         """What is told of the exposure; waits a little for what comes after it."""
         if self.options.recorded or self._link is None:
             nothing = Telemetry(picture.time_ns, math.nan, math.nan, math.nan, math.nan)
-            return picture.reported or Told(None), picture.told or nothing
+            return picture.reported or Told(None), picture.telemetry or nothing
         until_ns = self._clocks.mono_ns() + round(self.options.telemetry_wait_s * 1e9)
         while not self._link.covers(picture.exposed_ns) and self._clocks.mono_ns() < until_ns:
             self._clocks.sleep(_WAIT_S)
