@@ -4,7 +4,6 @@ Runners know nothing of sheets: they take a function and items, and give what ca
 finished. An item that fails becomes a `Failure` and the others go on.
 """
 
-import importlib
 import itertools
 import logging
 import os
@@ -17,7 +16,8 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
-from orthonav.errors import MissingExtraError, OrthonavError, WorkerError
+from orthonav.errors import OrthonavError, WorkerError
+from orthonav.extras import needed
 from orthonav.prepare.sheet import usable_cores
 
 log = logging.getLogger(__name__)
@@ -247,10 +247,4 @@ def _called(probe: Callable[[], Made]) -> Made:
 def _imported() -> Any:
     # Read when Ray is loaded: it would tell its makers that it runs.
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    try:
-        return importlib.import_module("ray")
-    except ImportError as error:
-        raise MissingExtraError(
-            "building on several cores or machines needs Ray, which is not installed: "
-            "pip install 'orthonav[cluster]'"
-        ) from error
+    return needed("ray", "cluster", "building on several cores or machines")

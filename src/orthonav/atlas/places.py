@@ -16,6 +16,7 @@ from typing import Any, Protocol
 
 from orthonav.atlas.trouble import PACKAGES
 from orthonav.errors import MissingExtraError, StorageError
+from orthonav.extras import needed
 from orthonav.files import replacing
 
 _OBJECT_STORES = {"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oci", "oss", "memory"}
@@ -224,13 +225,7 @@ class Far:
 
 
 def _open(url: str, protocol: str) -> tuple[Any, str]:
-    try:
-        import fsspec
-    except ImportError as error:
-        raise MissingExtraError(
-            "an atlas elsewhere than in a folder needs fsspec, which is not installed: "
-            "pip install 'orthonav[atlas]'"
-        ) from error
+    fsspec = needed("fsspec", "atlas", "an atlas in object storage")
     try:
         fsspec.get_filesystem_class(protocol)
         fs, path = fsspec.core.url_to_fs(url)
@@ -238,7 +233,7 @@ def _open(url: str, protocol: str) -> tuple[Any, str]:
         raise StorageError(f"an address that cannot be one ({error}): {protocol}://") from error
     except ImportError as error:
         package = PACKAGES.get(protocol)
-        needed = package or f"a package that is not installed ({error})"
+        wanted = package or f"a package that is not installed ({error})"
         how = f", which is not installed: pip install {package}" if package else ""
-        raise MissingExtraError(f"an atlas at {protocol}:// needs {needed}{how}") from error
+        raise MissingExtraError(f"an atlas at {protocol}:// needs {wanted}{how}") from error
     return fs, path

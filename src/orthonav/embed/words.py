@@ -21,7 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MissingExtraError, VariantError
+from orthonav.errors import VariantError
+from orthonav.extras import needed
 
 CHUNK_FEATURES = 4096
 SAMPLES_PER_WORD = 40
@@ -303,18 +304,10 @@ def _clustered(
 
 
 def _faiss() -> Any:
-    try:
-        with warnings.catch_warnings():
-            # SWIG's types, at import, in some versions
-            warnings.filterwarnings(
-                "ignore", "builtin type .* has no __module__", DeprecationWarning
-            )
-            return importlib.import_module("faiss")
-    except ImportError as error:
-        raise MissingExtraError(
-            "learning visual words needs faiss, which is not installed: "
-            "pip install 'orthonav[train]'"
-        ) from error
+    with warnings.catch_warnings():
+        # SWIG's types, at import, in some versions
+        warnings.filterwarnings("ignore", "builtin type .* has no __module__", DeprecationWarning)
+        return needed("faiss", "train", "learning visual words")
 
 
 def pictures_of(greys: Iterable[Grey]) -> Iterator[tuple[Grey, Mask]]:

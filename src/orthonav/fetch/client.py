@@ -14,7 +14,8 @@ from typing import Any, TypeVar
 from urllib.parse import quote, urljoin
 
 from orthonav import __version__
-from orthonav.errors import FetchError, MissingExtraError
+from orthonav.errors import FetchError
+from orthonav.extras import missing_extra
 from orthonav.fetch.politeness import Limits, Stopped, Turns, backoff_s, retry_after_s
 from orthonav.fetch.urls import KEY, Secret, checked_url, host_of, origin_of, shown
 
@@ -22,9 +23,7 @@ try:
     import requests
     import urllib3
 except ImportError as error:  # pragma: no cover - depends on the installation
-    raise MissingExtraError(
-        "fetching imagery needs requests; install it with: pip install 'orthonav[geo,fetch]'"
-    ) from error
+    raise missing_extra("fetching imagery", "fetch", "requests", error) from error
 
 USER_AGENT = f"orthonav/{__version__} (fetches orthophotos for one area; +orthonav fetch)"
 AGAIN = frozenset({408, 425, 429, 500, 502, 503, 504})

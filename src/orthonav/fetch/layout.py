@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import FetchError, MissingExtraError
+from orthonav.errors import FetchError
+from orthonav.extras import needed
 from orthonav.fetch.remote import Range, RemoteFile
 from orthonav.fetch.urls import shown
 
@@ -49,13 +50,7 @@ class Page:
 
 def read_layout(remote: RemoteFile) -> list[Page]:
     """All pages of a file. Raises `FetchError` where it is no TIFF that can be read by blocks."""
-    try:
-        import tifffile
-    except ImportError as error:
-        raise MissingExtraError(
-            "reading files on servers needs tifffile; install it with: "
-            "pip install 'orthonav[geo,fetch]'"
-        ) from error
+    tifffile = needed("tifffile", "fetch", "reading files on servers")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -14,15 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MissingExtraError
+from orthonav.extras import missing_extra
 from orthonav.fetch.client import BadReplyError, Reply, told
 
 try:
     from PIL import Image, UnidentifiedImageError
 except ImportError as error:  # pragma: no cover - depends on the installation
-    raise MissingExtraError(
-        "fetching imagery needs pillow; install it with: pip install 'orthonav[geo,fetch]'"
-    ) from error
+    raise missing_extra("fetching imagery", "fetch", "PIL", error) from error
 
 FORMATS = ("JPEG", "PNG", "WEBP")
 _JPEG_END = b"\xff\xd9"

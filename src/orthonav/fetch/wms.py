@@ -10,7 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from orthonav.errors import FetchError, MissingExtraError
+from orthonav.errors import FetchError
+from orthonav.extras import needed
 from orthonav.fetch.client import Client
 from orthonav.fetch.crs import epsg_name, ground_scale, north_first
 from orthonav.fetch.documents import get_xml, parse_xml
@@ -63,12 +64,7 @@ def read_capabilities(
     document: bytes, url: str, redacted: Callable[[str], str] = lambda text: text
 ) -> Wms:
     """What a capabilities document, checked before, says. Raises `FetchError`."""
-    try:
-        from owslib.wms import WebMapService
-    except ImportError as error:
-        raise MissingExtraError(
-            "reading capabilities needs OWSLib; install it with: pip install 'orthonav[geo,fetch]'"
-        ) from error
+    owslib = needed("owslib.wms", "fetch", "reading capabilities")
     root = parse_xml(document)
     version = root.get("version", "")
     if version not in _VERSIONS:
@@ -76,7 +72,7 @@ def read_capabilities(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = WebMapService(url, version=version, xml=document)
+            found = owslib.WebMapService(url, version=version, xml=document)
             get_map = found.getOperationByName("GetMap")
             layers = {
                 name: layer

@@ -10,7 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from orthonav.errors import FetchError, MissingExtraError
+from orthonav.errors import FetchError
+from orthonav.extras import needed
 from orthonav.fetch.client import Client
 from orthonav.fetch.crs import (
     MERCATOR_HALF_M,
@@ -77,16 +78,11 @@ def read_capabilities(
     document: bytes, url: str, redacted: Callable[[str], str] = lambda text: text
 ) -> Wmts:
     """What a capabilities document, checked before, says. Raises `FetchError`."""
-    try:
-        from owslib.wmts import WebMapTileService
-    except ImportError as error:
-        raise MissingExtraError(
-            "reading capabilities needs OWSLib; install it with: pip install 'orthonav[geo,fetch]'"
-        ) from error
+    owslib = needed("owslib.wmts", "fetch", "reading capabilities")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = WebMapTileService(url, xml=document)
+            found = owslib.WebMapTileService(url, xml=document)
             sets = {
                 name: tuple(_matrices(name, matrix_set))
                 for name, matrix_set in found.tilematrixsets.items()

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import ImageryError, MissingExtraError, MissingFileError
+from orthonav.errors import ImageryError, MissingFileError
+from orthonav.extras import missing_extra
 from orthonav.geo.frames import LocalFrame
 from orthonav.imagery.names import date_of, system_of, tab_transform
 
@@ -28,9 +29,7 @@ try:
 
     from orthonav.imagery.quiet import quiet
 except ImportError as error:  # pragma: no cover - depends on the installation
-    raise MissingExtraError(
-        "reading orthophotos needs rasterio; install it with: pip install 'orthonav[geo]'"
-    ) from error
+    raise missing_extra("reading orthophotos", "geo", "rasterio", error) from error
 
 OUTLINE_POINTS = 21
 ALPHA_SAMPLE_PX = 512

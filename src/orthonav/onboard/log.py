@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__
-from orthonav.errors import CameraError, MissingExtraError, OutputError
+from orthonav.errors import CameraError, OutputError
+from orthonav.extras import needed
 from orthonav.flight.logged import (
     CAMERA,
     FORMAT,
@@ -114,12 +115,7 @@ class FlightLog:
         which is what a power cut takes. Numbers go on after those of files that are there.
         Raises `OutputError` where the folder cannot be written and `MissingExtraError`.
         """
-        try:
-            import orthonav.onboard.segment  # noqa: F401  loads mcap
-        except ImportError as error:
-            raise MissingExtraError(
-                f"a flight log needs mcap: pip install 'orthonav[autopilot]' ({error})"
-            ) from error
+        needed("mcap", "autopilot", "a flight log")
         path = Path(path)
         self._folder, self._name = path.parent, path.stem if path.suffix == ".mcap" else path.name
         try:

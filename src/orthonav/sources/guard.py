@@ -1,25 +1,19 @@
 """Libraries that are loaded when they are needed, and what they raise turned into one line."""
 
 import contextlib
-import importlib
 import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from orthonav.errors import FlightError, MissingExtraError, OrthonavError
+from orthonav import extras
+from orthonav.errors import FlightError, OrthonavError
 
 
 def needed(module: str, what: str) -> Any:
     """The module of that name. Raises `MissingExtraError` naming the extra that brings it."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        package = module.partition(".")[0]
-        raise MissingExtraError(
-            f"reading {what} needs {package}: pip install 'orthonav[flights]' ({error})"
-        ) from error
+    return extras.needed(module, "flights", f"reading {what}")
 
 
 @contextlib.contextmanager
