@@ -18,10 +18,8 @@ _REQUIREMENT = re.compile(r"\s*([\w.-]+)\s*(?:\[([^\]]*)\])?([^;]*)(?:;(.*))?")
 _OF_EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
 _MODULES = {
     "faiss-cpu": "faiss",
-    "import-linter": "importlinter",
     "opencv-python-headless": "cv2",
     "pillow": "PIL",
-    "pytest-xdist": "xdist",
     "pyyaml": "yaml",
     "scikit-image": "skimage",
     "xstatic-leaflet": "xstatic.pkg.leaflet",
@@ -59,11 +57,6 @@ def _requirements() -> dict[str, list[tuple[str, str, str]]]:
         of = _OF_EXTRA.search(marker)
         found.setdefault(of[1] if of else "", []).append((name, extras, asked.strip(" ()")))
     return found
-
-
-def extras() -> tuple[str, ...]:
-    """Names of all extras, as pyproject.toml orders them; none where run from the sources only."""
-    return tuple(name for name in _requirements() if name)
 
 
 def packages(extra: str = "") -> tuple[Package, ...]:
@@ -111,7 +104,8 @@ def needed(module: str, extra: str, what: str) -> Any:
 def missing_extra(what: str, extra: str, module: str, error: Exception) -> MissingExtraError:
     """The error to raise where importing `module` of an extra failed with `error`."""
     top = module.partition(".")[0]
-    package = next((name for name, of in _MODULES.items() if of.partition(".")[0] == top), top)
+    names = (package.name for package in packages(extra))
+    package = next((name for name in names if module_of(name).partition(".")[0] == top), top)
     return MissingExtraError(f"{what} needs {package}: {pip_line(extra)} ({error})")
 
 

@@ -15,7 +15,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
 
-from orthonav import __version__
+from orthonav.cli.needs import require_extras
+from orthonav.cli.version import show_version
 from orthonav.errors import OrthonavError
 
 COMMANDS = {
@@ -53,12 +54,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     verbose = False
     try:
+        if "--version" in arguments and COMMANDS.keys().isdisjoint(arguments):
+            return show_version(arguments)
         options = _parser(arguments).parse_args(arguments)
         verbose = options.verbose
         level = logging.DEBUG if verbose else logging.ERROR if options.quiet else logging.WARNING
         logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
         logging.getLogger("rasterio").setLevel(logging.CRITICAL)
         with _terminable():
+            require_extras(options.command)
             status: int | None = _module(options.command).run(options)
             sys.stdout.flush()
     except OrthonavError as error:
@@ -96,7 +100,12 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         "orthophoto of another year.",
         epilog="orthonav COMMAND --help tells more.",
     )
-    parser.add_argument("--version", action="version", version=f"orthonav {__version__}")
+    parser.add_argument(
+        "--version",
+        action="store_true",
+        help="print the version; with --verbose (or --json) also what is installed, what is "
+        "missing for which command, and the processor's abilities",
+    )
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("-v", "--verbose", action="store_true", help="say more, on stderr")
     common.add_argument("-q", "--quiet", action="store_true", help="errors only, no progress")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from orthonav.cli.common import print_json, progress
 from orthonav.cli.flown import take_flown, tell_whether_as_flown
+from orthonav.cli.needs import require_extras
 from orthonav.cli.source import add_source, open_source
 
 if TYPE_CHECKING:
@@ -184,6 +185,7 @@ def _on_map(options: argparse.Namespace) -> None:
 
 def _on_atlas(options: argparse.Namespace) -> None:
     """Without a prior: only what views agree on is a fix."""
+    require_extras("localize --atlas")
     from orthonav.atlas.catalog import Atlas
     from orthonav.atlas.ground import Ground
     from orthonav.atlas.lookup import AtlasLookup

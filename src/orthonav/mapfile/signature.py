@@ -239,5 +239,5 @@ def _crypto() -> tuple[Any, Any, Any]:
         from cryptography.hazmat.primitives import serialization
         from cryptography.hazmat.primitives.asymmetric import ed25519
     except ImportError as error:
-        raise missing_extra("signing and verifying", "signing", "cryptography", error) from error
+        raise missing_extra("a signature", "signing", "cryptography", error) from error
     return InvalidSignature, serialization, ed25519
