@@ -5,13 +5,14 @@
     python tools/try_wheel.py --all       # PyTorch and Ray too: gigabytes
     python tools/try_wheel.py --dist DIR  # keep sdist and wheel there
 
-The wheel is built from the sdist, so the sdist suffices. The core runs in an environment without any
-extra. Each extra is installed into an environment of its own and runs one command. Versions are those
-of constraints.txt. Needs a package index, and git for the list of files that the sdist must hold.
+The sdist is built from a copy of what git tracks, and the wheel from the sdist. The core runs in an
+environment without any extra. Each extra is installed into an environment of its own and runs one
+command. Versions are those of constraints.txt. Needs a package index and git.
 """
 
 import argparse
 import json
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -99,7 +100,11 @@ def build(folder: Path, dist: Path) -> tuple[Path, Path]:
     if dist.is_dir() and any(dist.iterdir()):
         raise SystemExit(f"--dist must be new or empty: {dist}")
     python = environment(folder / "tools", "build", "twine")
-    step("build", python, "-m", "build", "--outdir", dist, ROOT, cwd=folder)
+    source = folder / "source"
+    for name in tracked_files():  # nothing is written into the checkout
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(ROOT / name, source / name)
+    step("build", python, "-m", "build", "--outdir", dist, source, cwd=folder)
     made = sorted(dist.iterdir())
     step("twine check", python, "-m", "twine", "check", "--strict", *made, cwd=folder)
     (sdist,) = (path for path in made if path.name.endswith(".tar.gz"))

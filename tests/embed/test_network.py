@@ -122,7 +122,7 @@ def test_without_onnxruntime_the_error_says_what_to_install(monkeypatch):
 
     made = embedder()
     monkeypatch.setattr(builtins, "__import__", refusing)
-    with pytest.raises(MissingExtraError, match=r"pip install orthonav\[neural\]"):
+    with pytest.raises(MissingExtraError, match=r"pip install 'orthonav\[neural\]'"):
         made.views(maps(1))
 
 
