@@ -1,9 +1,10 @@
 """Build sdist and wheel, check them, and try the wheel in empty environments, one per extra.
 
-    python tools/try_wheel.py             # the core and every extra of at most some 200 MB
-    python tools/try_wheel.py --core      # the core only
-    python tools/try_wheel.py --all       # PyTorch and Ray too: gigabytes
-    python tools/try_wheel.py --dist DIR  # keep sdist and wheel there
+    python tools/try_wheel.py                      # the core and every extra of some 300 MB at most
+    python tools/try_wheel.py --extras             # the core, and geo, which makes the map
+    python tools/try_wheel.py --extras fetch web   # these too
+    python tools/try_wheel.py --all                # PyTorch and Ray too: gigabytes
+    python tools/try_wheel.py --dist DIR           # keep sdist and wheel there
 
 The sdist is built from a copy of what git tracks, and the wheel from the sdist. The core runs in an
 environment without any extra. Each extra is installed into an environment of its own and runs one
@@ -49,7 +50,7 @@ COMMANDS: dict[str, Sequence[str]] = {
     "autopilot": (
         f"fly {MAP} --camera {FLIGHT} --telemetry recorded --pace 100 --json - --log run.mcap",
     ),
-    "flights": (f"import {FLIGHT}/frames --camera {FLIGHT}/flight.json --out imported",),
+    "flights": ("import run_0001.mcap --out imported",),
     "signing": (f"sign {MAP} --new-key keys", f"verify {MAP} --public-key keys/public.pem"),
     "fetch": ("fetch --list",),
     "segments": (f"{BUILD} --edges segments --out segments.onav",),
@@ -70,8 +71,16 @@ BESIDE = {"segments": ("geo",), "train": ("geo",)}
 def main(arguments: Sequence[str] | None = None) -> int:
     """Build, check, install and run; returns the exit code, 1 where something is amiss."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    parser.add_argument("--core", action="store_true", help="no extra but geo, which makes the map")
-    parser.add_argument("--all", action="store_true", help=f"also {' and '.join(LARGE)}")
+    tried = [extra for extra in COMMANDS | SCRIPTS if extra not in ("", "geo")]
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument(
+        "--extras",
+        nargs="*",
+        choices=tried,
+        default=[extra for extra in tried if extra not in LARGE],
+        help=f"beside geo, which makes the map (default: all but {' and '.join(LARGE)})",
+    )
+    which.add_argument("--all", dest="extras", action="store_const", const=tried, help="all extras")
     parser.add_argument("--dist", type=Path, help="folder for sdist and wheel, new or empty")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="orthonav-wheel-") as name:
@@ -87,8 +96,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         work.mkdir()
         try_extra("geo", wheel, folder, work)
         try_core(wheel, folder, work)
-        for extra in () if options.core else COMMANDS | SCRIPTS:
-            if extra not in ("", "geo") and (options.all or extra not in LARGE):
+        for extra in tried:  # in the order of the table
+            if extra in options.extras:
                 try_extra(extra, wheel, folder, work)
     untried = set(EXTRAS) - set(COMMANDS | SCRIPTS)
     assert not untried, f"no command is tried for {sorted(untried)}"
