@@ -60,6 +60,7 @@ CORE_COMMANDS = {
     "localize MAP FLIGHT --require-signed MAP --out new.jsonl": "signing",
     "fly MAP --camera FLIGHT --autopilot udpin:127.0.0.1:0 --dry-run": "autopilot",
     "fly MAP --camera FLIGHT --telemetry recorded --log new.mcap": "autopilot",
+    "fly MAP --ros2 --dry-run": "ros2",
     "evaluate FIXES --truth FLIGHT/truth.csv --report new": "report",
     "view FIXES --map MAP --no-browser": "web",
 }

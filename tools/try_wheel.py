@@ -60,6 +60,7 @@ COMMANDS: dict[str, Sequence[str]] = {
 }
 """Commands tried with an extra, in this order; later ones use what earlier ones made."""
 SCRIPTS = {
+    "ros2": "import cyclonedds.domain, rosbags.typesys",
     "web": "from orthonav.web.assets import load_assets; assert '/' in load_assets()",
     "neural": "import onnxruntime; assert onnxruntime.get_available_providers()",
 }

@@ -26,6 +26,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "localize, fly --require-signed": ("signing",),
     "localize, import, calibrate: photographs, ROS, logs": ("flights",),
     "fly --autopilot, --log": ("autopilot",),
+    "fly --ros2": ("ros2",),
     "evaluate --report": ("report",),
 }
 """Extras by command, or by command with an option or an input."""
