@@ -7,7 +7,8 @@
 
 The stored map and flight lie in `tests/data/golden_flight` beside `fixes.json`; `--make` makes
 them from a generated area. The same bytes go to every machine: imagery and maps made on two
-machines may differ in the last digits. Exit code 1 where a fix is more than 1 cm off.
+machines may differ in the last digits. Exit code 1 where a single view is more than 1 cm off, or
+a track more than 5 cm: see `LIMITS_M`.
 """
 
 import argparse
@@ -33,8 +34,10 @@ from orthonav.onboard.run import SingleViews, in_hindsight, localize_flight
 from orthonav.records import Fix, ViewResult
 
 STORED = Path(__file__).resolve().parents[2] / "tests" / "data" / "golden_flight"
-RUNS = ("views", "any_heading", "track", "smoothed")
-LIMIT_M = 0.01
+LIMITS_M = {"views": 0.01, "any_heading": 0.01, "track": 0.05, "smoothed": 0.05}
+"""By run. A track carries rounding on from view to view: a heading reported 0.00001 deg larger
+moves it by 3 cm on one and the same machine."""
+RUNS = tuple(LIMITS_M)
 PACKAGES = ("numpy", "scipy", "opencv-python-headless")
 Places = dict[str, list[float] | str]
 """By frame: metres east and north of the map's centre, to 0.1 mm, or why there is no fix."""
@@ -56,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         write_text(STORED / "fixes.json", json.dumps(made, indent=1) + "\n")
     print("this machine:", made["machine"])
     stored = json.loads(against.read_text(encoding="utf-8")) if against else made
-    print("compared with:", stored["machine"])
+    print("compared with:", stored["machine"] if against else "nothing: give --against")
     return int(not all([_compared(name, made, stored) for name in made["runs"]]))
 
 
@@ -147,7 +150,9 @@ def _imagery(folder: Path) -> list[Path]:
 def _localized(options: argparse.Namespace) -> dict[str, Places]:
     flight = open_flight(options.flight or STORED / "flight")
     if not options.rebuild:
-        return {run: places(options.map or STORED / "area.onav", flight, run) for run in options.run}
+        return {
+            run: places(options.map or STORED / "area.onav", flight, run) for run in options.run
+        }
     with tempfile.TemporaryDirectory() as folder:
         rebuilt = Path(folder) / "area.onav"
         build(_imagery(Path(folder))[0], rebuilt)
@@ -171,9 +176,9 @@ def _compared(name: str, made: Mapping[str, Any], stored: Mapping[str, Any]) -> 
     same = "same hash" if digest(here) == digest(there) else f"there {digest(there)}"
     print(
         f"{name:12s} {found:3d} of {len(here)} views placed, {digest(here)} ({same}), "
-        f"at most {1000 * off_m:.1f} mm apart: {'ok' if off_m <= LIMIT_M else 'DIFFERENT'}"
+        f"at most {1000 * off_m:.1f} mm apart: {'ok' if off_m <= LIMITS_M[name] else 'DIFFERENT'}"
     )
-    return off_m <= LIMIT_M
+    return off_m <= LIMITS_M[name]
 
 
 def _compare_maps(here: Path, there: Path) -> None:
