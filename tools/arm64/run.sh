@@ -56,19 +56,18 @@ orthonav() { emulated -c 'import sys; from orthonav.cli import main; sys.exit(ma
 asked() { [ "$step" = all ] || [ "$step" = "$1" ]; }
 
 cd "$checkout"
-asked fixes && emulated tools/platforms/fixes.py "$@"
-asked fly && {
-    # Slower than the flight was: an emulated view takes seconds.
-    orthonav fly "$golden/area.onav" --camera "$golden/flight" --telemetry recorded --pace 0.05 \
-        --dry-run --autopilot udpin:0 --json "$work/fly.jsonl" &
-    flying=$!
-    sleep "${FLY_S:-120}"
-    kill -TERM $flying
-    wait $flying  # ends with 0: the flight was ended cleanly
+if asked fixes; then emulated tools/platforms/fixes.py "$@"; fi
+if asked fly; then
+    # Slower than it was flown: an emulated view takes seconds. It ends where the flight ends.
+    orthonav fly "$golden/area.onav" --camera "$golden/flight" --telemetry recorded --pace 0.2 \
+        --dry-run --autopilot udpin:0 --json "$work/fly.jsonl"
     emulated -c "import collections, json; lines = map(json.loads, open('$work/fly.jsonl'))
 print('flown:', collections.Counter(line.get('status', 'health') for line in lines))"
-}
-asked tests && emulated -m pytest -p no:cacheprovider --durations=0 ${@:-tests/geo tests/flight \
-    tests/mapfile tests/register tests/track tests/publish tests/localizer tests/test_golden.py}
+fi
+if asked tests; then
+    [ $# -gt 0 ] || set -- -m "not slow" tests/geo tests/flight tests/mapfile tests/register \
+        tests/track tests/publish tests/localizer tests/test_golden.py
+    emulated -m pytest -p no:cacheprovider --durations=10 "$@"
+fi
 if [ "$step" = rebuild ]; then emulated tools/platforms/fixes.py --rebuild --run views; fi
 if [ "$step" = python ]; then emulated "$@"; fi
