@@ -5,10 +5,13 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from collections import Counter
 from pathlib import Path
 
 import pytest
+
+import absent
 
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = sorted(Path(__file__).parent.rglob("*.py"))
@@ -59,3 +62,19 @@ def test_a_run_ends_with_the_name_of_the_test_that_crashed_or_hung(fault, tmp_pa
     assert done.returncode == 1, done.stdout
     assert re.search(r"^FAILED test_fourth.py::test_broken", done.stdout, re.MULTILINE)
     assert re.search(r"^1 failed, [1-9] passed", done.stdout, re.MULTILINE)
+
+
+def test_only_what_is_absent_skips_a_test(monkeypatch):
+    monkeypatch.setattr(absent, "ABSENT", {"torch": "train"})
+    assert absent._reason("E   ModuleNotFoundError: No module named 'torch.nn'")
+    assert absent._reason(
+        "Done(code=1, err=\"learning needs PyTorch: pip install 'orthonav[train]'\")"
+    )
+    assert absent._reason("E   ModuleNotFoundError: No module named 'rasterio'") is None
+    assert absent._reason("pip install 'orthonav[geo]'") is None
+    assert absent._reason("AssertionError: assert 1 == 2") is None
+
+
+def test_every_absent_module_is_named_with_an_extra_that_exists():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    assert set(absent.EXTRA_OF.values()) <= set(project["optional-dependencies"])
