@@ -35,6 +35,7 @@ MADE_BY_BUILD = ("PKG-INFO", "setup.cfg", "src/orthonav.egg-info/")
 
 ORTHO, MAP, FLIGHT, FIXES = "land/2016-07.tif", "area.onav", "flight", "fixes.jsonl"
 BUILD = f"build --ortho {ORTHO} --tile-px 128 --overlap 0.75 --calibration-views 20"
+ATLAS = f"build --ortho {ORTHO} --tile-px 128 --coarse-gsd-m 2 --coarse-tile-px 64"
 COMMANDS: dict[str, Sequence[str]] = {
     "geo": (
         "landscape --out land --size-m 600 600 --gsd-m 1",
@@ -54,8 +55,8 @@ COMMANDS: dict[str, Sequence[str]] = {
     "signing": (f"sign {MAP} --new-key keys", f"verify {MAP} --public-key keys/public.pem"),
     "fetch": ("fetch --list",),
     "segments": (f"{BUILD} --edges segments --out segments.onav",),
-    "atlas": (f"build --ortho {ORTHO} --atlas atlas --tile-px 128", "atlas check atlas --deep"),
-    "cluster": (f"build --ortho {ORTHO} --atlas cluster --tile-px 128 --cluster local",),
+    "atlas": (f"{ATLAS} --atlas atlas", "atlas check atlas --deep"),
+    "cluster": (f"{ATLAS} --atlas cluster --cluster local",),
     "train": (f"{BUILD} --method bovw --out words.onav",),
 }
 """Commands tried with an extra, in this order; later ones use what earlier ones made."""
