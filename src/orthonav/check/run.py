@@ -95,7 +95,7 @@ class _Check:
                 f"only maps with a registration layer can be checked: {self.opened.path}"
             )
         self.sheet = registration.sheet
-        self.ground = Ground.of(registration.registrar.reference.pyramid, self.sheet.grid)
+        self.ground = Ground.of(registration.pyramid, self.sheet.grid)
         self.radius_m, self.floor_px = registration.radius_m, registration.floor_px
         self.calibrated = registration.confidence is not None
         self.plan = self._plan()

@@ -86,7 +86,7 @@ def reported_persistence(
 
 def view_levels(plan: TrialPlan, registration: RegistrationLocalizer) -> Levels:
     """The levels of the map that views are placed at."""
-    levels = registration.registrar.reference.levels
+    levels = registration.pyramid.levels
     return Levels.of(plan.side_m / registration.grid.gsd_m, levels)
 
 
