@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
+from orthonav.cores import usable_cores
 from orthonav.errors import MissingExtraError, OrthonavError, WorkerError
-from orthonav.prepare.sheet import usable_cores
 
 log = logging.getLogger(__name__)
 

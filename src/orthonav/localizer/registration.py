@@ -22,7 +22,7 @@ from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import SheetInfo
 from orthonav.mapfile.reader import MapFile
 from orthonav.records import PRIOR_SIGMAS, Fix, NoFix, Prior, Telemetry, View
-from orthonav.register.pose import Pose
+from orthonav.register.pose import Pose, rotation
 from orthonav.register.reference import GreyPyramid, Reference
 from orthonav.register.refine import Placed
 from orthonav.register.registrar import Registered, Registrar
@@ -258,8 +258,7 @@ class RegistrationLocalizer:
         y = (self.grid.north_m - float(north)) / self.grid.gsd_m
         if view.prior.turn_rad is None:
             return x, y
-        cos, sin = math.cos(view.prior.turn_rad), math.sin(view.prior.turn_rad)
-        moved = np.array([[cos, -sin], [sin, cos]]) @ view.camera_px
+        moved = rotation(view.prior.turn_rad) @ view.camera_px
         return x - float(moved[0]), y - float(moved[1])
 
     def _reach_px(self, view: PreparedView, prior: Prior) -> float:

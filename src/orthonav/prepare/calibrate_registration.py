@@ -21,6 +21,7 @@ from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.prepare.calibrate import Crop
 from orthonav.prepare.change import changed
 from orthonav.records import PRIOR_SIGMAS, NoFix, Prior, Telemetry, View
+from orthonav.register.pose import rotation
 
 YAW_STD_DEG = 5.0
 AGL_STD = 0.05
@@ -146,8 +147,7 @@ def _view(rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid) 
     width = max(16, round(longest * rng.uniform(*SIDES)))
     height = max(12, round(width * 0.75))
     yaw_deg = rng.uniform(0, 360)
-    cos, sin = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
-    linear = np.array([[cos, -sin], [sin, cos]])
+    linear = rotation(math.radians(yaw_deg))
     move = np.full(2, (size - 1) / 2) - linear @ [(width - 1) / 2, (height - 1) / 2]
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     matrix = np.column_stack([linear, move])
