@@ -383,7 +383,7 @@ def test_confidence_is_a_probability_whatever_the_evidence(localizer):
     rng = np.random.default_rng(0)
     for scale in (0, 1, 1e3, 1e300):
         for values in rng.uniform(-1, 1, (20, len(FEATURES))) * scale:
-            confidence = localizer.confidence(dict(zip(FEATURES, values, strict=True)))
+            confidence = localizer.tiles.confidence(dict(zip(FEATURES, values, strict=True)))
             assert 0 <= confidence <= 1
 
 

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
+from orthonav.cores import usable_cores
 from orthonav.errors import OrthonavError, WorkerError
 from orthonav.extras import needed
-from orthonav.prepare.sheet import usable_cores
 
 log = logging.getLogger(__name__)
 

@@ -14,13 +14,12 @@ from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.errors import AtlasError, MapFileError
 from orthonav.geo.frames import LocalFrame
 from orthonav.localizer import Localizer
+from orthonav.localizer.prepared import PreparedView
 from orthonav.localizer.registration import (
-    PRIOR_SIGMAS,
-    PreparedView,
     RegistrationLocalizer,
 )
 from orthonav.mapfile import open_map
-from orthonav.records import NoFix, Prior, View
+from orthonav.records import PRIOR_SIGMAS, NoFix, Prior, View
 from orthonav.register.pose import Pose
 from orthonav.register.registrar import Registered
 
@@ -125,16 +124,12 @@ class Ground:
 
 def _registered(sheet: RegistrationLocalizer, view: View, place: Place) -> Sighting | None:
     told = replace(view.telemetry, yaw_deg=math.degrees(place.turn_rad))
-    prepared = sheet.prepared(replace(view, telemetry=told), True)
-    if isinstance(prepared, NoFix):
-        return None
-    prior = replace(prepared.prior, turn_rad=place.turn_rad, turn_std_rad=place.turn_std_rad)
-    prepared = replace(prepared, prior=prior)
     within = Prior(place.lat_deg, place.lon_deg, place.reach_m / PRIOR_SIGMAS)
-    if not sheet.touches_map(within, prepared):
+    heading = place.turn_rad, place.turn_std_rad
+    seen = sheet.register(replace(view, telemetry=told), within, heading_std_rad=heading)
+    if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
         return None
-    best = sheet.best(prepared, within)
-    return None if best is None else _sighting(sheet, prepared, best)
+    return _sighting(sheet, seen.prepared, seen.found)
 
 
 def _sighting(sheet: RegistrationLocalizer, view: PreparedView, best: Registered) -> Sighting:

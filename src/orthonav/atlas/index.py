@@ -25,7 +25,7 @@ from orthonav.atlas.item import Asset, Sheet
 from orthonav.atlas.shards import TRAINED_NAME, ShardWriter, retire_rows
 from orthonav.atlas.store import digest_of
 from orthonav.atlas.vectors import MAX_LEARNT, Trained, VectorRecipe, train
-from orthonav.embed.whitened import WhitenedEmbedder, whitening
+from orthonav.embed.whitened import Made, WhitenedEmbedder, Work, learn_in_two_passes
 from orthonav.errors import AtlasError
 from orthonav.files import replacing
 
@@ -352,20 +352,12 @@ def _groups(sheets: Sequence[Sheet], counts: Sequence[int]) -> list[list[Sheet]]
 
 
 def _learnt(batches: Callable[[], Iterator[_Batch]], dims: int) -> WhitenedEmbedder:
-    """Whitening of features, which are gone through twice, to at most `dims` components."""
-    total: Any = 0.0
-    weight: Any = 1e-9
-    for features, weights in batches():
-        total = total + (features * weights).sum(axis=0, dtype=np.float64)
-        weight = weight + weights.sum(axis=0, dtype=np.float64)
-    mean = (total / weight).astype(np.float16)
-    scatter: Any = 0.0
-    count = 0
-    for features, weights in batches():
-        centred = (features - mean.astype(np.float32)) * weights
-        scatter = scatter + (centred.T @ centred).astype(np.float64)
-        count += len(features)
-    embedder = whitening(POOLING, mean, scatter, count)
+    """Whitening of features to at most `dims` components."""
+
+    def over_batches(work: Work[Made]) -> Iterator[Made]:
+        return (work(features, weights) for features, weights in batches())
+
+    embedder = learn_in_two_passes(POOLING, over_batches)
     dims = min(dims, embedder.dims)
     dims -= dims % 2  # quantizers look at either half
     return replace(embedder, basis=np.ascontiguousarray(embedder.basis[:, :dims]))

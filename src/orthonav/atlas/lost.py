@@ -23,12 +23,16 @@ from orthonav.atlas.agreement import (
 )
 from orthonav.atlas.ground import Ground, Place, Sighting
 from orthonav.atlas.recipe import CoarseRecipe
-from orthonav.confidence.registered import USUAL_BIAS, USUAL_WEIGHTS, RegisteredConfidence
+from orthonav.confidence.registered import (
+    USUAL_BIAS,
+    USUAL_CHANCES,
+    USUAL_WEIGHTS,
+    RegisteredConfidence,
+)
 from orthonav.geo.frames import LocalFrame, distances_m
 from orthonav.localizer.checks import check_footprint, check_view
 from orthonav.localizer.rectify import RectifiedView, downsampled, rectify_footprint
-from orthonav.localizer.registration import USUAL_CHANCES
-from orthonav.records import Fix, NoFix, Telemetry, View
+from orthonav.records import DEFAULT_YAW_STD_DEG, MIN_YAW_STD_DEG, Fix, NoFix, Telemetry, View
 
 CANDIDATES = 24
 """Places of the whole atlas that are registered."""
@@ -36,7 +40,6 @@ TURN_STEP_DEG = 8.0
 LOG_SCALES = (-0.06, 0.06)
 """Headings and scales under which coarse tiles are looked for."""
 KNOWN_SIGMAS = 2.0
-DEFAULT_YAW_STD_DEG, MIN_YAW_STD_DEG = 7.0, 2.0
 REACH_STRIDES = 0.8
 TURN_STD_RAD = math.radians(4.0)
 VIEW_TILES = (0.6, 2.5)

@@ -1,7 +1,6 @@
 """Orthophotos resampled into a sheet's plane, read by windows."""
 
 import math
-import os
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -20,6 +19,7 @@ from rasterio.warp import reproject
 from rasterio.warp import transform as transform_coordinates
 from rasterio.windows import Window
 
+from orthonav.cores import usable_cores
 from orthonav.geo.frames import LocalFrame
 from orthonav.imagery.lattice import Lattice
 from orthonav.imagery.quiet import quiet
@@ -85,7 +85,7 @@ class SheetRaster:
         self._frame = frame
         self._transform = Affine(gsd_m, 0, west_m, 0, -gsd_m, north_m)
         self._gsd_m = gsd_m
-        self._threads = threads or os.cpu_count() or 1
+        self._threads = threads or usable_cores()
         self.width_px, self.height_px = width_px, height_px
         self._boxes_px = self._boxes()
         self._open: OrderedDict[int, Any] = OrderedDict()

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.embed.network import AutoEncoderRecipe, NetworkEmbedder, TripletRecipe
-from orthonav.embed.words import WordsEmbedder, WordsRecipe, learn_words
+from orthonav.embed.words import WordsEmbedder, WordsRecipe
 from orthonav.errors import VariantError
 from orthonav.extras import needed
 from orthonav.neural.tiles import SheetTiles
+from orthonav.neural.words import learn_words
 from orthonav.prepare.change import changed
 from orthonav.prepare.pictures import SheetPictures
 
