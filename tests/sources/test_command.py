@@ -14,8 +14,8 @@ from recorders import START_S, camera_file, packet, photo, subtitles, tlog, vide
 
 from orthonav.cli import main
 from orthonav.flight import FlightWriter, open_flight, read_image
+from orthonav.flight.fixes import read_results
 from orthonav.geo.camera import Camera
-from orthonav.publish.jsonl import read_results
 from orthonav.records import Fix, Telemetry
 
 DATA = Path(__file__).parents[1] / "data"

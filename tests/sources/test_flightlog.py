@@ -19,6 +19,7 @@ from mcap.writer import CompressionType, Writer
 from orthonav.errors import FlightError, OrthonavError
 from orthonav.flight import open_flight, read_image
 from orthonav.flight import png as png_module
+from orthonav.flight.fixes import read_results, result_to_json
 from orthonav.flight.logged import (
     PROFILE,
     SESSION,
@@ -43,7 +44,6 @@ from orthonav.onboard.calibrate import Mounted, model_of
 from orthonav.onboard.log import FlightLog
 from orthonav.onboard.run import locate_view
 from orthonav.onboard.segment import Segment
-from orthonav.publish.jsonl import read_results, result_to_json
 from orthonav.records import NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.sources import SourceOptions, open_source, source_kind
 from orthonav.sources import flightlog as flightlog_module

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from orthonav import __version__
 from orthonav.errors import CameraError, OutputError
 from orthonav.extras import needed
+from orthonav.flight.fixes import result_to_json
 from orthonav.flight.logged import (
     CAMERA,
     FORMAT,
@@ -49,7 +50,6 @@ from orthonav.flight.logged import (
 )
 from orthonav.flight.png import lossless_png
 from orthonav.geo.camera import Camera
-from orthonav.publish.jsonl import result_to_json
 from orthonav.records import CONFIDENT, Fix, Telemetry, ViewResult
 from orthonav.sources.recording import fitted
 

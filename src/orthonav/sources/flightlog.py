@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from orthonav.errors import CameraError, FlightError
+from orthonav.flight.fixes import result_from_json
 from orthonav.flight.logged import (
     FORMAT,
     MAX_JSON_BYTES,
@@ -28,7 +29,6 @@ from orthonav.flight.logged import (
 )
 from orthonav.flight.png import grey_of_png
 from orthonav.geo.camera import Camera
-from orthonav.publish.jsonl import result_from_json
 from orthonav.records import ViewResult
 from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.mcap_chunks import (

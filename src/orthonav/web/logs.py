@@ -11,6 +11,7 @@ from typing import Any
 
 from orthonav.errors import FlightError, MissingFileError, OrthonavError
 from orthonav.flight import decode_image
+from orthonav.flight.fixes import result_from_json
 from orthonav.flight.logged import (
     HEALTH,
     MAX_JSON_BYTES,
@@ -27,7 +28,6 @@ from orthonav.flight.logged import (
 )
 from orthonav.flight.png import grey_of_png
 from orthonav.geo.camera import Camera
-from orthonav.publish.jsonl import result_from_json
 from orthonav.sources.flightlog import (
     NewerFormatError,
     files_of_run,
