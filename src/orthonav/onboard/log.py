@@ -390,6 +390,6 @@ def _result(result: ViewResult, index: int) -> "list[Message]":
             data = position_message(result.outcome, result.time_ns)
             messages.append(_message(POSITION, result.time_ns, data, index))
             sure = result.outcome.confidence >= CONFIDENT and result.state in (None, "tracking")
-            data = navsat_message(result.outcome, result.time_ns, sure=sure)
+            data = navsat_message(result.outcome, result.time_ns, confident=sure)
             messages.append(_message(NAVSAT, result.time_ns, data, index))
     return messages
