@@ -156,6 +156,13 @@ def test_what_a_wmts_does_not_have_is_listed(mapproxy, take, options, words):
         take(f"wmts:{mapproxy}/service", **{"layer": "tiles"} | options)
 
 
+def test_swapped_bounds_are_named(mapproxy, take):
+    west, south, east, north = terrain.bounds(60)
+    area = Area.from_bounds((south, west, north, east))
+    with pytest.raises(AreaError, match="latitude and longitude seem to be swapped"):
+        take(f"wmts:{mapproxy}/service", layer="tiles", crs="EPSG:32631", area=area)
+
+
 def test_an_area_outside_the_grid(mapproxy, take):
     area = Area.from_bounds((50.0, 46.0, 50.01, 46.01))
     with pytest.raises((AreaError, FetchError), match="outside"):

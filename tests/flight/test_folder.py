@@ -261,6 +261,7 @@ def test_a_camera_file_that_is_none(folder, text):
         ("frame,lat_deg,lon_deg\na.png,46\n", "line 2 has too few fields"),
         ("frame,lat_deg,lon_deg\na.png,46,2\na.png,46,2\n", "line 3: frame a.png appears twice"),
         ("frame,lat_deg,lon_deg\na.png,91,2\n", "line 2: not a latitude and longitude"),
+        ("frame,lat_deg,lon_deg\na.png,121.5,24\n", "line 2: .* seem to be swapped"),
         ("frame,lat_deg,lon_deg\na.png,46,nan\n", "line 2: not a latitude and longitude"),
         ("frame,lat_deg,lon_deg\na.png,,2\n", "line 2: not a latitude and longitude"),
     ],

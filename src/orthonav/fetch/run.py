@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from orthonav.errors import FetchError, OutputError
+from orthonav.errors import AreaError, FetchError, OutputError
 from orthonav.fetch.cache import FileCache
 from orthonav.fetch.client import Client
 from orthonav.fetch.download import FetchedCells, fetch_cells
@@ -20,6 +20,7 @@ from orthonav.fetch.sources import SourceSpec, open_cells
 from orthonav.fetch.write import CellCounts, Packing, write_mosaic
 from orthonav.files import Progress, no_progress
 from orthonav.geo.area import Area
+from orthonav.geo.swapped import swapped_hint
 
 DEFAULT_MAX_TILES = 50_000
 """About 200 km2 at 0.5 m: more than a flight needs, less than a service minds."""
@@ -166,7 +167,7 @@ def _planned(client: Client, request: FetchRequest) -> tuple[CellSource, Selecti
     if not (math.isfinite(request.margin_m) and request.margin_m >= 0):
         raise FetchError(f"margin must be 0 m or more, got {request.margin_m}")
     source = open_cells(client, request.spec, request.area)
-    selection = select(source.grid, request.area, request.margin_m)
+    selection = _selected(source, request)
     height, width = selection.shape_px
     tiles = len(selection.cells)
     size = tiles * source.cell_bytes
@@ -179,6 +180,26 @@ def _planned(client: Client, request: FetchRequest) -> tuple[CellSource, Selecti
         tiles, selection.gsd_m, width, height, size / 1e6, seconds / 60, source.provenance
     )
     return source, selection, estimate
+
+
+def _selected(source: CellSource, request: FetchRequest) -> Selection:
+    """The cells of the area. Raises `AreaError`, which names swapped coordinates as the cause."""
+    frame = request.area.frame
+
+    def covered(lat_deg: float, lon_deg: float) -> bool:
+        half_deg = 1e-4
+        place = (lon_deg - half_deg, lat_deg - half_deg, lon_deg + half_deg, lat_deg + half_deg)
+        try:
+            select(source.grid, Area.from_bounds(place), 0.0)
+        except (AreaError, FetchError):
+            return False
+        return True
+
+    try:
+        return select(source.grid, request.area, request.margin_m)
+    except AreaError as error:
+        hint = swapped_hint(frame.lat_deg, frame.lon_deg, covered)
+        raise AreaError(f"{error}{hint}") from None
 
 
 def _refuse_large(request: FetchRequest, estimate: CostEstimate) -> None:

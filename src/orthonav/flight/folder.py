@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from orthonav.errors import CameraError, FlightError, MissingFileError
 from orthonav.files import require_file
 from orthonav.geo.camera import Camera
+from orthonav.geo.swapped import swapped_hint
 from orthonav.records import Prior, Telemetry
 
 TELEMETRY_COLUMNS = ("frame", "time_s", "yaw_deg", "pitch_deg", "roll_deg", "agl_m")
@@ -146,7 +147,8 @@ def read_truth(path: Path) -> dict[str, tuple[float, float]]:
     for line, row in _rows(path, ("frame", "lat_deg", "lon_deg")):
         lat, lon = number_of(row["lat_deg"]), number_of(row["lon_deg"])
         if not (abs(lat) <= 90 and abs(lon) <= 360):
-            raise FlightError(f"line {line}: not a latitude and longitude in degrees: {path}")
+            hint = swapped_hint(lat, lon)
+            raise FlightError(f"line {line}: not a latitude and longitude in degrees{hint}: {path}")
         if row["frame"] in truth:
             raise FlightError(f"line {line}: frame {row['frame']} appears twice: {path}")
         truth[row["frame"]] = (lat, lon)
@@ -198,6 +200,9 @@ def _views(telemetry: Path, frames: Path) -> Iterator[FlightView]:
         image = frames / frame
         if not _is_file(image):
             raise FlightError(f"telemetry line {line} names an image that does not exist: {image}")
+        prior = number_of(row.get("prior_lat_deg")), number_of(row.get("prior_lon_deg"))
+        if hint := swapped_hint(*prior):
+            raise FlightError(f"line {line}: prior position is out of range{hint}: {telemetry}")
         yield FlightView(frame, image, _telemetry(row, time_ns))
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from orthonav.errors import FlightError
 from orthonav.flight.folder import number_of, time_ns_of
+from orthonav.geo.swapped import swapped_hint
 from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
 from orthonav.sources.track import RecordedTrack, Samples, TimeSeries, attitude_of_angles
 
@@ -42,8 +43,13 @@ def read_table(path: Path) -> RecordedTrack:
                     raise FlightError(f"line {reader.line_num}: time_s is not a time: {path}")
                 angles = (number_of(row.get(f"{name}_deg")) for name in ("yaw", "pitch", "roll"))
                 attitude.add(time_ns, *angles)
-                place = number_of(row.get("lat_deg")), number_of(row.get("lon_deg"))
-                position.add(time_ns, *place, math.nan)
+                latlon = number_of(row.get("lat_deg")), number_of(row.get("lon_deg"))
+                prior = number_of(row.get("prior_lat_deg")), number_of(row.get("prior_lon_deg"))
+                if hint := swapped_hint(*latlon) or swapped_hint(*prior):
+                    raise FlightError(
+                        f"line {reader.line_num}: position is out of range{hint}: {path}"
+                    )
+                position.add(time_ns, *latlon, math.nan)
                 for name, columns in _NAMES.items():
                     others[name].add(time_ns, *(number_of(row.get(column)) for column in columns))
     except (UnicodeDecodeError, csv.Error) as error:
