@@ -110,7 +110,7 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     from orthonav.evaluate.metrics import compare, measure
     from orthonav.evaluate.track import measure_track
     from orthonav.flight import open_flight, read_truth
-    from orthonav.publish.jsonl import read_results
+    from orthonav.flight.fixes import read_results
 
     local = opened.manifest.sheets[0].frame if opened else None
     background = map_background(opened) if opened else None

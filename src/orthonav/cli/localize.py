@@ -129,13 +129,13 @@ def run(options: argparse.Namespace) -> None:
 def _on_map(options: argparse.Namespace) -> None:
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
+    from orthonav.flight.fixes import write_results
     from orthonav.localizer import Localizer
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
     from orthonav.mapfile.signature import require_signature
     from orthonav.onboard.calibrate import Mounted, model_of
     from orthonav.onboard.run import Locator, SingleViews, localize_flight, smoothed_track
-    from orthonav.publish.jsonl import write_results
     from orthonav.search.position import check_rule
 
     if options.lag is not None and not (options.smooth and options.lag >= 0):
@@ -192,8 +192,8 @@ def _on_atlas(options: argparse.Namespace) -> None:
     from orthonav.atlas.lost import LostLocator
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
+    from orthonav.flight.fixes import write_results
     from orthonav.onboard.run import localize_flight
-    from orthonav.publish.jsonl import write_results
 
     asked = [
         name

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from orthonav import __version__
 from orthonav.errors import CameraError, OutputError
 from orthonav.extras import needed
+from orthonav.flight.fixes import result_to_json
 from orthonav.flight.logged import (
     CAMERA,
     FORMAT,
@@ -49,7 +50,6 @@ from orthonav.flight.logged import (
 )
 from orthonav.flight.png import lossless_png
 from orthonav.geo.camera import Camera
-from orthonav.publish.jsonl import result_to_json
 from orthonav.records import CONFIDENT, Fix, Telemetry, ViewResult
 from orthonav.sources.recording import fitted
 
@@ -390,6 +390,6 @@ def _result(result: ViewResult, index: int) -> "list[Message]":
             data = position_message(result.outcome, result.time_ns)
             messages.append(_message(POSITION, result.time_ns, data, index))
             sure = result.outcome.confidence >= CONFIDENT and result.state in (None, "tracking")
-            data = navsat_message(result.outcome, result.time_ns, sure=sure)
+            data = navsat_message(result.outcome, result.time_ns, confident=sure)
             messages.append(_message(NAVSAT, result.time_ns, data, index))
     return messages
