@@ -66,7 +66,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         logging.getLogger("matplotlib").setLevel(logging.ERROR)
         _print_any_letter()
         with _terminable():
-            require_extras(options.command)
+            if not getattr(options, "list", False):  # lists presets, which need no extra
+                require_extras(options.command)
             status: int | None = _module(options.command).run(options)
             sys.stdout.flush()
     except OrthonavError as error:
