@@ -250,12 +250,12 @@ def test_cameras_that_cannot_be(folder, changes):
     ],
     ids=lambda changes: str(changes)[:30],
 )
-def test_cameras_that_are_none(folder, changes):
+def test_invalid_cameras_are_rejected(folder, changes):
     refused(camera(folder, **changes), "expected {camera", names="flight.json")
 
 
 @pytest.mark.parametrize("text", ["", "{", "null", "5", "[]", "{}", '{"camera": 5}', "[" * 10**5])
-def test_a_camera_file_that_is_none(folder, text):
+def test_invalid_camera_files_are_rejected(folder, text):
     (folder / "flight.json").write_text(text)
     refused(folder, "expected {camera.*as JSON", names="flight.json")
 

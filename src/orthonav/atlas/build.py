@@ -34,6 +34,7 @@ from orthonav.atlas.tasks import (
     versions,
 )
 from orthonav.errors import AreaError, AtlasError, OrthonavError, WorkerError
+from orthonav.files import Progress
 from orthonav.geo.area import Area, Extent
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.route import Route
@@ -58,7 +59,6 @@ GIVE_UP_AFTER = 8
 """So many sheets in a row that could not be stored end a build: the disk is full, or away."""
 LEARNT = ("autoencoder", "triplet")
 """Methods that a GPU speeds up."""
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)

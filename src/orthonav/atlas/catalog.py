@@ -5,7 +5,7 @@ content and never change. So a kill at any moment leaves the sheets that were fi
 files that nobody names, which `orthonav.atlas.integrity` finds.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from orthonav.atlas.item import (
@@ -25,13 +25,13 @@ from orthonav.atlas.listing import ITEMS, SNAPSHOT, read_items, read_some, snaps
 from orthonav.atlas.recipe import FORMAT, SCHEMA, AtlasRecipe
 from orthonav.atlas.store import Store, digest_of
 from orthonav.errors import AreaError, AtlasError, MissingFileError
+from orthonav.files import Progress
 from orthonav.geo.area import Extent
 
 __all__ = ["Asset", "Atlas", "NewSheet", "Sheet", "copy_sheets"]
 
 CATALOG = "atlas.json"
 _SAME_PLACE_DEG = 1e-9
-Progress = Callable[[str, float], None]
 
 
 class Atlas:

@@ -22,6 +22,7 @@ from orthonav.cores import usable_cores
 from orthonav.embed.cells import CellLayout
 from orthonav.embed.whitened import CellSheet, WhitenedRecipe, learn
 from orthonav.errors import AreaError, OutputError, VariantError
+from orthonav.files import Progress
 from orthonav.geo.area import Area, Extent
 from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
@@ -43,7 +44,6 @@ from orthonav.represent.gradients import OrientedGradients
 
 COARSER = 4
 """The preview is made of blocks at so much coarser a resolution."""
-Progress = Callable[[str, float], None]
 
 
 def cut_map(

@@ -27,7 +27,7 @@ from orthonav.atlas.store import digest_of
 from orthonav.atlas.vectors import MAX_LEARNT, Trained, VectorRecipe, train
 from orthonav.embed.whitened import Made, WhitenedEmbedder, Work, learn_in_two_passes
 from orthonav.errors import AtlasError
-from orthonav.files import replacing
+from orthonav.files import Progress, replacing
 
 FOLDER = "index"
 MANIFEST = f"{FOLDER}/index.json"
@@ -50,7 +50,6 @@ MAX_ROWS = 10**6
 """Of a sheet."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9.-]{0,80}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)

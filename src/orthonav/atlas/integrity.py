@@ -2,7 +2,7 @@
 
 import re
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +22,7 @@ from orthonav.atlas.listing import (
 from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.atlas.store import Store, digest_of
 from orthonav.errors import AtlasError, MapFileError
+from orthonav.files import Progress
 from orthonav.mapfile import Manifest, open_map
 from orthonav.prepare.methods import usual_edges
 
@@ -30,7 +31,6 @@ MIN_AGE_S = 24 * 3600.0
 _LEFTOVER = re.compile(r"\..+\.[A-Za-z0-9_]{8,12}\.tmp(\.[A-Za-z0-9]+)?")
 _FOLDERS = [folder for folder, _, _ in ASSETS.values()]
 _CLOSE = 1e-6
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """The check of a map: where could views be placed, and would a route be flown well?"""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -42,6 +42,7 @@ from orthonav.check.verdict import Findings, verdict_of
 from orthonav.check.views import LEAST_VALID, TrialPlan
 from orthonav.cores import usable_cores
 from orthonav.errors import AreaError, CameraError, MapFileError
+from orthonav.files import Progress
 from orthonav.geo.area import Area
 from orthonav.geo.route import distance_to_polyline_m
 from orthonav.localizer import Localizer
@@ -63,10 +64,9 @@ LEAST_SHOWN = 0.25
 """Cells of which the map shows less than this share are beyond it."""
 MOST_CELLS_AROUND = 250_000
 """Cells of the box around a band, most of them empty."""
-Report = Callable[[str, float], None]
 
 
-def check_map(request: CheckRequest, report: Report | None = None) -> tuple[CheckResult, MapFile]:
+def check_map(request: CheckRequest, report: Progress | None = None) -> tuple[CheckResult, MapFile]:
     """Check a map; `report` is told what is done and how far, 0..1.
 
     Raises `MapFileError` where the map cannot be checked, `AreaError` where the route or the other
@@ -82,7 +82,7 @@ def check_map(request: CheckRequest, report: Report | None = None) -> tuple[Chec
 class _Check:
     request: CheckRequest
     opened: MapFile
-    report: Report
+    report: Progress
     ground: Ground = field(init=False)
     area: Area | None = field(init=False)
 

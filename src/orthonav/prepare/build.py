@@ -19,6 +19,7 @@ from orthonav.embed.contract import ViewEmbedder
 from orthonav.embed.network import TripletRecipe
 from orthonav.embed.whitened import WhitenedRecipe, learn
 from orthonav.errors import AreaError, OutputError, VariantError
+from orthonav.files import Progress
 from orthonav.geo.area import Area
 from orthonav.geo.estimate import estimate_map
 from orthonav.geo.grid import TileGrid
@@ -59,7 +60,6 @@ MAX_CALIBRATION_VIEWS = 2 * CROPS
 RADIUS_PX = 10.0
 MIN_RADIUS_M = 35.0
 """A registered view is right within so many pixels or metres: cameras tilt more than told."""
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)

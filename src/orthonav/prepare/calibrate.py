@@ -7,7 +7,6 @@ mirror image of another. Both are searched, and a logistic regression learns whi
 This is cautious rather than exact: it knows no second date.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from orthonav.confidence.logistic import FEATURES, LogisticConfidence, fit_logistic
 from orthonav.embed.contract import ViewEmbedder
+from orthonav.files import Progress
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.match import TileMatcher
 
@@ -110,7 +110,7 @@ def calibrate(
     embeddings: NDArray[np.float16],
     centres_en_m: NDArray[np.float32],
     heading_step_deg: float,
-    report: Callable[[str, float], None],
+    report: Progress,
     *,
     slow: bool = False,
 ) -> Calibration:

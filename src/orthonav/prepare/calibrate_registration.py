@@ -7,7 +7,7 @@ All are placed by the very localizer that flies; a logistic regression learns wh
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.confidence.registered import Chances, RegisteredConfidence, fit_registered
+from orthonav.files import Progress
 from orthonav.geo.camera import Camera
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.registration import RegistrationLocalizer
@@ -69,7 +70,7 @@ def calibrate_registration(
     other_dates: Sequence[Crop],
     views: int,
     seed: int,
-    report: Callable[[str, float], None],
+    report: Progress,
 ) -> RegistrationCalibration:
     """Place changed, mirrored and other-date views and fit the confidence to the outcome."""
     rng = np.random.default_rng([seed, 3])

@@ -13,6 +13,7 @@ from orthonav.embed.network import AutoEncoderRecipe, NetworkEmbedder, TripletRe
 from orthonav.embed.words import WordsEmbedder, WordsRecipe
 from orthonav.errors import VariantError
 from orthonav.extras import needed
+from orthonav.files import Progress
 from orthonav.neural.tiles import SheetTiles
 from orthonav.neural.words import learn_words
 from orthonav.prepare.change import changed
@@ -28,7 +29,6 @@ network that begins with them learns a third as much in its first 300 batches.""
 
 EncoderRecipe = AutoEncoderRecipe | TripletRecipe | WordsRecipe
 Encoder = NetworkEmbedder | WordsEmbedder
-Report = Callable[[str, float], None]
 
 
 def learn_encoder(
@@ -39,7 +39,7 @@ def learn_encoder(
     representation: Any,
     seed: int,
     work: Path | None,
-    report: Report,
+    report: Progress,
 ) -> tuple[Encoder, NDArray[np.float16]]:
     """Learn from the reference tiles and embed them: the embedder and embeddings (N, D).
 
@@ -67,7 +67,7 @@ def learn_encoder(
     return encoder, _embedded(encoder, tiles, report)
 
 
-def _told(report: Report, text: str, share: float) -> None:
+def _told(report: Progress, text: str, share: float) -> None:
     log.info("%s", text)
     report("learn", share)
 
@@ -92,7 +92,7 @@ def _changed_tiles(
     return positive
 
 
-def _embedded(encoder: Encoder, tiles: SheetTiles, report: Report) -> NDArray[np.float16]:
+def _embedded(encoder: Encoder, tiles: SheetTiles, report: Progress) -> NDArray[np.float16]:
     out = np.empty((len(tiles), encoder.dims), np.float16)
     for start in range(0, len(tiles), BATCH_TILES):
         indices = np.arange(start, min(start + BATCH_TILES, len(tiles)))

@@ -1,12 +1,12 @@
 """The representation of a whole sheet, kept in bytes: what encoders of pictures learn from."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import VariantError
+from orthonav.files import Progress
 from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
 from orthonav.imagery.mosaic import Mosaic
@@ -67,7 +67,7 @@ def read_pictures(
     area: Area,
     grid: TileGrid,
     representation: Any,
-    report: Callable[[str, float], None],
+    report: Progress,
 ) -> SheetPictures:
     """What another date shows of a sheet."""
     pictures = SheetPictures(grid, representation)
