@@ -11,7 +11,7 @@ vectors.
 import contextlib
 import math
 import mmap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,6 +32,7 @@ SHARE_ROUNDING = 1e-3
 TINY = np.float32(1e-30)
 SPARSE_BYTES = 32 * 2**20
 Made = TypeVar("Made")
+Part = TypeVar("Part")
 
 
 @dataclass(frozen=True)
@@ -236,7 +237,7 @@ class WhitenedEmbedder:
             features, weights = pooled_features(self.recipe, sheet, tiles_px[part])
             out[part] = self.features(features, weights)
 
-        for _ in _worked(fill, len(tiles_px), workers):
+        for _ in _worked(fill, _chunks(len(tiles_px)), workers):
             pass
         return out
 
@@ -357,33 +358,54 @@ def learn(
 ) -> WhitenedEmbedder:
     """Learn mean and whitening from the tiles (N, 2) of the reference area.
 
-    At most `MAX_LEARNT_TILES` of them, evenly taken, are used. Fewer than `dims` components are
-    kept where the tiles do not span more. The same is learnt by any number of threads (`workers`).
+    At most `MAX_LEARNT_TILES` of them, evenly spaced, are used. Fewer than `dims` components are
+    learnt where the tiles do not span more. The result is the same for any number of threads
+    (`workers`).
     """
     taken = tiles_px[:: max(1, -(-len(tiles_px) // MAX_LEARNT_TILES))]
+    return learn_from(
+        recipe,
+        list(_chunks(len(taken))),
+        lambda part: pooled_features(recipe, sheet, taken[part]),
+        workers,
+    )
 
-    def sums(part: slice) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        features, weights = pooled_features(recipe, sheet, taken[part])
+
+def learn_from(
+    recipe: WhitenedRecipe,
+    parts: Sequence[Part],
+    features_of: Callable[[Part], tuple[NDArray[np.float32], NDArray[np.float32]]],
+    workers: int = 1,
+) -> WhitenedEmbedder:
+    """Learn mean and whitening from features and weights (n, F) of parts of the reference tiles.
+
+    `features_of` gives those of a part, as `pooled_features`; it is called twice for every part,
+    by several threads where `workers` is above 1.
+    """
+
+    def sums(part: Part) -> tuple[int, NDArray[np.float64], NDArray[np.float64]]:
+        features, weights = features_of(part)
         total = np.einsum("nf,nf->f", features, weights, dtype=np.float64)
-        return total, weights.sum(axis=0, dtype=np.float64)
+        return len(features), total, weights.sum(axis=0, dtype=np.float64)
 
-    def products(part: slice) -> NDArray[np.float64]:
-        features, weights = pooled_features(recipe, sheet, taken[part])
+    def products(part: Part) -> NDArray[np.float64]:
+        features, weights = features_of(part)
         centred = (features - mean.astype(np.float32)) * weights
         return np.asarray((centred.T @ centred).astype(np.float64))
 
     total: Any = 0.0
     weight: Any = 1e-9
-    for some, their_weight in _worked(sums, len(taken), workers):
-        total, weight = total + some, weight + their_weight
+    count = 0
+    for number, some, their_weight in _worked(sums, parts, workers):
+        count, total, weight = count + number, total + some, weight + their_weight
     mean = (total / weight).astype(np.float16)
     scatter: Any = 0.0
-    for product in _worked(products, len(taken), workers):
+    for product in _worked(products, parts, workers):
         scatter = scatter + product
-    return whitening(recipe, mean, scatter, len(taken))
+    return _whitening(recipe, mean, scatter, count)
 
 
-def whitening(
+def _whitening(
     recipe: WhitenedRecipe,
     mean: NDArray[np.float16],
     scatter: NDArray[np.float64],
@@ -402,13 +424,15 @@ def whitening(
     return WhitenedEmbedder(recipe, mean, basis.astype(np.float16))
 
 
-def _worked(work: Callable[[slice], Made], count: int, workers: int) -> Iterator[Made]:
-    """What `work` makes of some tiles at a time, in their order, by so many threads."""
+def _worked(
+    work: Callable[[Part], Made], parts: Iterable[Part], workers: int
+) -> Iterator[Made]:
+    """The results of `work` for each part, in order, by `workers` threads."""
     if workers <= 1:
-        yield from map(work, _chunks(count))
+        yield from map(work, parts)
         return
     with ThreadPoolExecutor(workers) as pool:
-        yield from pool.map(work, _chunks(count))
+        yield from pool.map(work, parts)
 
 
 def _chunks(count: int) -> Iterator[slice]:

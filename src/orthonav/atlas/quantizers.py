@@ -1,11 +1,9 @@
-"""Search among up to hundreds of millions of unit vectors by scalar product.
+"""The quantizers of the vector index: how unit vectors are assigned to lists and coded.
 
-Vectors fall into lists (an inverted multi-index: Babenko and Lempitsky, CVPR 2012) and are scanned
-as codes of 4 bits per quantizer (product quantization: Jegou, Douze and Schmid, PAMI 2011; the
-scan: Andre, Kermarrec and Le Scouarnec, VLDB 2015), both by FAISS; the best few hundred are then
-compared as they are stored. `train` makes what all shards share; a shard depends on nothing else,
-so shards are added, replaced and retired one by one (`orthonav.atlas.shards`) and searched together
-(`orthonav.atlas.vector_search`).
+Lists are an inverted multi-index (Babenko and Lempitsky, CVPR 2012). Codes have 4 bits per
+quantizer (product quantization: Jegou, Douze and Schmid, PAMI 2011; fast scan: Andre, Kermarrec and
+Le Scouarnec, VLDB 2015). Both are computed by FAISS. All shards of an index share one set of
+quantizers (`train`) and depend on nothing else, so they can be added and removed one by one.
 """
 
 import json
@@ -24,24 +22,25 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from orthonav.errors import AtlasError, MissingExtraError
-from orthonav.files import replacing
 
 Array = NDArray[np.float32]
 
-MAX_LEARNT = 200_000
-"""Vectors that quantizers are learnt from."""
+QUANTIZERS_NAME = "quantizers.safetensors"
+MAX_TRAINING_VECTORS = 200_000
+"""Vectors that quantizers are trained on, as in `python -m benchmarks.atlas_search`."""
 POINTS_PER_CENTROID = 256
+"""Training vectors per list centre: FAISS's own default for k-means."""
 ROUNDS = 12
+"""Iterations of k-means, as in `python -m benchmarks.atlas_search`."""
 CODE_BITS = 4
+"""Bits per quantizer: what the fast scan of FAISS supports."""
 BLOCK = 32
-"""Codes that FAISS scans together; a list takes room for a multiple of them."""
-SCAN_ONE = 10
-"""FAISS's way of scanning that is fastest for one query at a time."""
+"""Codes that FAISS scans together; the room of a list is a multiple of it."""
 FORMAT = "orthonav-vectors"
 
 
 def faiss() -> Any:
-    """The module, or `MissingExtraError`."""
+    """The module FAISS; raises `MissingExtraError` where it is not installed."""
     try:
         return import_module("faiss")
     except ImportError as error:
@@ -52,7 +51,7 @@ def faiss() -> Any:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """FAISS on one thread: with more, sums may come out in another order."""
+    """FAISS on one thread: with more threads sums are added in a varying order."""
     module = faiss()
     threads = module.omp_get_max_threads()
     module.omp_set_num_threads(1)
@@ -64,10 +63,13 @@ def one_thread() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class VectorRecipe:
-    """How vectors are listed and coded.
+    """How vectors are assigned to lists and coded.
 
-    `dims`: numbers per vector. `list_bits`: there are 2 to the power of it lists, half of the bits
-    from either half of the numbers. `quantizers`: codes of 4 bits per vector.
+    `dims`: components per vector, even.
+    `list_bits`: there are 2 ** `list_bits` lists, half of the bits from either half of a vector;
+    even, 2 to 20.
+    `quantizers`: codes of 4 bits per vector; even, divides `dims`.
+    `seed`: seed of k-means.
     """
 
     dims: int
@@ -87,7 +89,7 @@ class VectorRecipe:
 
     @classmethod
     def for_count(cls, count: int, dims: int, seed: int = 0) -> "VectorRecipe":
-        """What suits `count` vectors: lists of up to 1600, 4 bits for every two numbers."""
+        """The recipe for `count` vectors: lists of up to 1600, 4 bits for every two components."""
         list_bits = 4
         while list_bits < 16 and count > 800 * 2 ** (list_bits + 1):
             list_bits += 2
@@ -106,69 +108,63 @@ class VectorRecipe:
 
 
 @dataclass(frozen=True, eq=False)
-class Trained:
-    """What all shards share.
+class Quantizers:
+    """The trained quantizers that all shards of an index share.
 
-    `turn` (D, D) rotates vectors so that every quantizer has as much to say; `halves`
-    (2, sqrt(lists), D / 2) are centres of lists, one of each half; `codebook`
-    (quantizers, 16, D / quantizers) codes what is left.
+    `recipe`: how they were made.
+    `rotation` (D, D): rotates vectors so that variance is spread evenly over the quantizers.
+    `halves` (2, sqrt(lists), D / 2): list centres of each half of a rotated vector.
+    `codebook` (quantizers, 16, D / quantizers): codes of the residual.
     """
 
     recipe: VectorRecipe
-    turn: Array
+    rotation: Array
     halves: Array
     codebook: Array
 
-    @property
-    def dims(self) -> int:
-        """Numbers per vector."""
-        return self.recipe.dims
-
     @cached_property
     def digest(self) -> str:
-        """Short digest: shards made with another training are refused."""
+        """Short digest of all arrays."""
         return sha256(self._bytes()).hexdigest()[:16]
 
     def save(self, path: Path) -> None:
-        """Write to `path` (safetensors), whole or not at all."""
-        with replacing(path) as temporary:
-            temporary.write_bytes(self._bytes())
+        """Write to `path` (safetensors)."""
+        path.write_bytes(self._bytes())
 
     @classmethod
-    def load(cls, path: Path) -> "Trained":
+    def load(cls, path: Path) -> "Quantizers":
         """Read what `save` wrote; raises `AtlasError`."""
         try:
             with safe_open(path, framework="numpy") as stored:
-                said = (stored.metadata() or {}).get(FORMAT, "")
-                recipe = VectorRecipe(**json.loads(said))
-                made = cls(recipe, *(stored.get_tensor(name) for name in _parts(recipe)))
+                recipe = VectorRecipe(**json.loads((stored.metadata() or {}).get(FORMAT, "")))
+                made = cls(recipe, *(stored.get_tensor(name) for name in _shapes(recipe)))
         except (OSError, SafetensorError, ValueError, TypeError) as error:
             raise AtlasError(f"quantizers of an index cannot be read ({error}): {path}") from error
-        for name, shape in _parts(recipe).items():
+        for name, shape in _shapes(recipe).items():
             array = getattr(made, name)
             if array.shape != shape or array.dtype != np.float32:
                 raise AtlasError(f"{name} of an index must be {shape}, got {array.shape}: {path}")
         return made
 
     def _bytes(self) -> bytes:
-        arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _parts(self.recipe)}
-        told = json.dumps(asdict(self.recipe), sort_keys=True)
-        return bytes(save(arrays, metadata={FORMAT: told}))
+        arrays = {name: np.ascontiguousarray(getattr(self, name)) for name in _shapes(self.recipe)}
+        recipe = json.dumps(asdict(self.recipe), sort_keys=True)
+        return bytes(save(arrays, metadata={FORMAT: recipe}))
 
-    def turned(self, vectors: Array) -> Array:
-        """Vectors (N, D) as lists and codes see them."""
-        return np.ascontiguousarray(np.asarray(vectors, dtype=np.float32) @ self.turn)
+    def rotated(self, vectors: Array) -> Array:
+        """Vectors (N, D) in the axes of lists and codes."""
+        return np.ascontiguousarray(np.asarray(vectors, dtype=np.float32) @ self.rotation)
 
-    def nearest_lists(self, turned: Array, probes: int) -> tuple[NDArray[np.int64], Array]:
+    def nearest_lists(self, rotated: Array, probes: int) -> tuple[NDArray[np.int64], Array]:
         """The `probes` lists (Q, probes) whose centres have the highest scalar products with
-        turned queries (Q, D), in the order of lists, and those products (Q, probes)."""
-        half = self.dims // 2
+        rotated queries (Q, D), in the order of list numbers, and those products (Q, probes)."""
+        half = self.recipe.dims // 2
         probes = min(probes, self.recipe.lists)
-        lists = np.empty((len(turned), probes), dtype=np.int64)
-        scores = np.empty((len(turned), probes), dtype=np.float32)
+        lists = np.empty((len(rotated), probes), dtype=np.int64)
+        scores = np.empty((len(rotated), probes), dtype=np.float32)
         side = self.halves.shape[1]
         first, second = _pairs(side, probes)
-        products = turned[:, :half] @ self.halves[0].T, turned[:, half:] @ self.halves[1].T
+        products = rotated[:, :half] @ self.halves[0].T, rotated[:, half:] @ self.halves[1].T
         for query, (low, high) in enumerate(zip(*products, strict=True)):
             lows, highs = np.argsort(-low), np.argsort(-high)
             sums = low[lows][first] + high[highs][second]
@@ -181,7 +177,7 @@ class Trained:
         return lists, scores
 
     def empty_index(self) -> Any:
-        """A FAISS index (IndexIVFPQFastScan) that knows the quantizers and holds nothing."""
+        """An empty FAISS index (IndexIVFPQFastScan) with these quantizers."""
         module, recipe = faiss(), self.recipe
         coarse = module.MultiIndexQuantizer(recipe.dims, 2, recipe.list_bits // 2)
         module.copy_array_to_vector(self.halves.reshape(-1), coarse.pq.centroids)
@@ -201,11 +197,11 @@ class Trained:
         return index
 
 
-def _parts(recipe: VectorRecipe) -> dict[str, tuple[int, ...]]:
-    """Arrays of `Trained` and their shapes."""
+def _shapes(recipe: VectorRecipe) -> dict[str, tuple[int, ...]]:
+    """Shapes of the arrays of `Quantizers` by name."""
     dims, quantizers = recipe.dims, recipe.quantizers
     return {
-        "turn": (dims, dims),
+        "rotation": (dims, dims),
         "halves": (2, 2 ** (recipe.list_bits // 2), dims // 2),
         "codebook": (quantizers, 2**CODE_BITS, dims // quantizers),
     }
@@ -213,56 +209,57 @@ def _parts(recipe: VectorRecipe) -> dict[str, tuple[int, ...]]:
 
 @lru_cache(maxsize=16)
 def _pairs(side: int, count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Ranks in either half of all pairs that may be among the `count` with the highest sums.
+    """Ranks in either half of all pairs that can be among the `count` pairs with highest sums.
 
-    Of a pair of ranks (i, j), from 1, no fewer than i * j pairs are as good or better.
+    At least i * j pairs are as good as or better than the pair of ranks (i, j), counted from 1.
     """
     ranks = np.arange(1, side + 1)
     first, second = np.nonzero(np.multiply.outer(ranks, ranks) <= count)
     return first, second
 
 
-def train(sample: NDArray[np.floating[Any]], recipe: VectorRecipe) -> Trained:
-    """Learn from a sample (N, D) of the vectors what lists and codes are made with.
+def train(sample: NDArray[np.floating[Any]], recipe: VectorRecipe) -> Quantizers:
+    """Train quantizers on a sample (N, D) of the vectors; the same sample gives the same bytes.
 
-    At most `MAX_LEARNT` of them, evenly taken. The same sample gives the same bytes. Raises
-    `AtlasError` where there are fewer vectors than centres.
+    At most `MAX_TRAINING_VECTORS` evenly spaced vectors are used. Raises `AtlasError` where there
+    are fewer vectors than centres.
     """
     if sample.ndim != 2 or sample.shape[1] != recipe.dims:
         raise AtlasError(f"vectors must be (N, {recipe.dims}), got {sample.shape}")
     least = max(2 ** (recipe.list_bits // 2), 2**CODE_BITS)
     if len(sample) < least:
         raise AtlasError(f"an index with these lists needs {least} vectors, got {len(sample)}")
-    taken = np.asarray(sample[:: max(1, -(-len(sample) // MAX_LEARNT))], dtype=np.float32)
-    turn = _turn(taken, recipe.quantizers)
-    turned = np.ascontiguousarray(taken @ turn)
+    step = max(1, -(-len(sample) // MAX_TRAINING_VECTORS))
+    taken = np.asarray(sample[::step], dtype=np.float32)
+    rotation = _rotation(taken, recipe.quantizers)
+    rotated = np.ascontiguousarray(taken @ rotation)
     with one_thread():
-        halves = _centres(turned, 2, recipe.list_bits // 2, recipe.seed)
-        left = turned - _reconstructed(turned, halves)
-        codebook = _centres(left, recipe.quantizers, CODE_BITS, recipe.seed)
-    return Trained(recipe, turn, halves, codebook)
+        halves = _centres(rotated, 2, recipe.list_bits // 2, recipe.seed)
+        residual = rotated - _nearest_centres(rotated, halves)
+        codebook = _centres(residual, recipe.quantizers, CODE_BITS, recipe.seed)
+    return Quantizers(recipe, rotation, halves, codebook)
 
 
-def _turn(vectors: Array, groups: int) -> Array:
-    """Rotation (D, D) to principal axes, dealt out so that each group's variances have a like
-    product (Ge et al., Optimized Product Quantization, CVPR 2013, section 3.3)."""
+def _rotation(vectors: Array, groups: int) -> Array:
+    """Rotation (D, D) to principal axes, assigned so that the products of the groups' variances
+    are similar (Ge et al., Optimized Product Quantization, CVPR 2013, section 3.3)."""
     wide = vectors.astype(np.float64)
     variances, axes = np.linalg.eigh(wide.T @ wide / len(wide))
     variances, axes = variances[::-1], axes[:, ::-1]
     largest = np.abs(axes).argmax(axis=0)
     axes = axes * np.sign(axes[largest, np.arange(len(axes))])
     room = len(axes) // groups
-    dealt: list[list[int]] = [[] for _ in range(groups)]
+    assigned: list[list[int]] = [[] for _ in range(groups)]
     weight = np.zeros(groups)
     logs = np.log(np.maximum(variances, 1e-9 * variances[0]))
     logs -= logs.min() - 1e-3
     for axis, log in enumerate(logs):
-        open_groups = [group for group in range(groups) if len(dealt[group]) < room]
-        # The two halves, too, are to have as much to say: groups are filled from either in turn.
+        open_groups = [group for group in range(groups) if len(assigned[group]) < room]
+        # The two halves are balanced as well: groups are filled from either half in turn.
         least = min(open_groups, key=lambda group: (weight[group], _interleaved(group, groups)))
-        dealt[least].append(axis)
+        assigned[least].append(axis)
         weight[least] += log
-    order = [axis for group in dealt for axis in group]
+    order = [axis for group in assigned for axis in group]
     return np.ascontiguousarray(axes[:, order], dtype=np.float32)
 
 
@@ -290,7 +287,7 @@ def _centres(vectors: Array, parts: int, bits: int, seed: int) -> Array:
     return centres
 
 
-def _reconstructed(vectors: Array, centres: Array) -> Array:
+def _nearest_centres(vectors: Array, centres: Array) -> Array:
     """Vectors (N, D) with each part replaced by its nearest centre."""
     module = faiss()
     out = np.empty_like(vectors)
