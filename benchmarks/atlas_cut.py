@@ -31,7 +31,7 @@ from benchmarks.corridor import BAND_M, GSD_M, LAMBERT, route_of
 from benchmarks.inputs import LANDSCAPE_SEED, PAST, generator_digest
 from benchmarks.record import Section, Table, number, provenance, save
 from orthonav import __version__
-from orthonav.atlas.catalog import Atlas, NewSheet
+from orthonav.atlas.catalog import Atlas, SheetDescription
 from orthonav.atlas.coverage import box_deg
 from orthonav.atlas.cut import cut_map
 from orthonav.atlas.recipe import AtlasRecipe
@@ -123,7 +123,7 @@ def _filled(folder: Path, base: Path, km: float) -> Path:
         bounds = sheets.bounds_deg(name)
         if _near(area, bounds):
             moved = folder.parent / "moved.onav"
-            atlas.put(name, {"map": moved}, _moved(opened, name, bounds, moved))
+            atlas.put({"map": moved}, _moved(opened, name, bounds, moved))
             moved.unlink()
     (folder / "complete").touch()
     return folder
@@ -135,7 +135,7 @@ def _near(area: Area, bounds: Extent) -> bool:
     return bool(area.contains(middle[None], 1000 * SHEET_KM)[0])
 
 
-def _moved(opened: MapFile, name: str, bounds: Extent, out: Path) -> NewSheet:
+def _moved(opened: MapFile, name: str, bounds: Extent, out: Path) -> SheetDescription:
     """Write the map as if its middle were that of other bounds."""
     west, south, east, north = bounds
     sheet = opened.manifest.sheets[0]
@@ -145,7 +145,7 @@ def _moved(opened: MapFile, name: str, bounds: Extent, out: Path) -> NewSheet:
     imagery = manifest.imagery
     dates = tuple(str(each["date"]) for each in imagery)
     made_by = {"orthonav": __version__}
-    return NewSheet(
+    return SheetDescription(
         name, bounds, GSD_M, sheet.tiles, sheet.area_km2, dates, imagery, "benchmark", made_by
     )
 

@@ -25,10 +25,10 @@ from pyproj import Transformer
 from benchmarks.record import Section, Table, number, provenance, save
 from orthonav.atlas.build import AtlasRequest, build_atlas
 from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.cluster import PlainRunner
-from orthonav.atlas.ground import Ground
-from orthonav.atlas.lookup import AtlasLookup
-from orthonav.atlas.lost import LostLocator
+from orthonav.atlas.cluster import SerialRunner
+from orthonav.atlas.locate import AtlasLocator
+from orthonav.atlas.sheet_registration import SheetRegistrar
+from orthonav.atlas.tile_search import TileSearch
 from orthonav.geo.camera import Camera
 from orthonav.geo.frames import distances_m
 from orthonav.records import CONFIDENT, Fix, Telemetry, View
@@ -67,8 +67,8 @@ def prepared(work: Path) -> tuple[Path, Path]:
             generate_area(work, size_m=(SIDE_M, SIDE_M), gsd_m=GSD_M, dates=[date], seed=SEED)
     atlas = work / "atlas"
     request = AtlasRequest(str(atlas), [work / f"{PRESENT.name}.tif"], RECIPE)
-    with PlainRunner() as runner:
-        build_atlas(request, runner, tell=_say)
+    with SerialRunner() as runner:
+        build_atlas(request, runner, report=_say)
     return work / f"{PAST.name}.tif", atlas
 
 
@@ -119,10 +119,10 @@ def flown(ortho: Path, atlas: Path, count: int, seed: int, *, mirrored: bool) ->
     focal_px = AGL_M / GSD_M
     camera = Camera(width, height, focal_px, focal_px, width / 2, height / 2)
     outcomes = []
-    with AtlasLookup(Atlas.open(atlas)) as lookup:
-        ground = Ground(lookup.atlas)
+    with TileSearch(Atlas.open(atlas)) as lookup:
+        ground = SheetRegistrar(lookup.atlas)
         for number_, flight in enumerate(flights(ortho, count, seed, mirrored=mirrored)):
-            locator = LostLocator(ground, lookup)
+            locator = AtlasLocator(ground, lookup)
             for view, (grey, telemetry, truth) in enumerate(flight):
                 start = time.perf_counter()
                 outcome = locator.locate(View(grey, camera, telemetry))

@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from orthonav.atlas.shards import TRAINED_NAME, ShardWriter
+from orthonav.atlas.vectors import MAX_LEARNT, VectorRecipe, faiss, train
 
 from benchmarks.atlas_fields import Fields, drawn_ids
 from benchmarks.inputs import Workplace
 from benchmarks.record import Section, Table, number, provenance
-from orthonav.atlas.shards import TRAINED_NAME, ShardWriter
 from orthonav.atlas.vector_search import ShardedIndex
-from orthonav.atlas.vectors import MAX_LEARNT, VectorRecipe, faiss, train
 
 QUERIES = 500
 K = 10

@@ -13,7 +13,7 @@ import pytest
 
 from orthonav.atlas.build import AtlasRequest, build_atlas
 from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.cluster import Failure, PlainRunner, RayRunner, attempted
+from orthonav.atlas.cluster import Failure, RayRunner, SerialRunner, attempted
 from orthonav.errors import MissingExtraError, WorkerError
 
 SMALL = {
@@ -50,7 +50,7 @@ def content(place):
 
 
 def plain(place, ortho, recipe):
-    with PlainRunner() as runner:
+    with SerialRunner() as runner:
         request = AtlasRequest(str(place), [ortho], recipe, index=False)
         return build_atlas(request, runner)
 
@@ -152,7 +152,7 @@ def test_workers_that_are_killed_are_made_up_for(two_nodes, ortho, tmp_path):
 @pytest.mark.parametrize("with_", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_a_driver_that_is_killed_goes_on_when_run_again(two_nodes, ortho, tmp_path, with_):
     place = tmp_path / "shared"
-    command = [sys.executable, "-m", "orthonav", "build", "--atlas", place, "--ortho", ortho]
+    command = [sys.executable, "-m", "orthonav", "atlas", "build", place, "--ortho", ortho]
     command += ["--sheet-km", "0.3", "--tile-px", "64", "--overlap", "0.5", "--no-index"]
     command += ["--calibration-views", "96", "--coarse-gsd-m", "4", "--coarse-tile-px", "32"]
     command += ["--coarse-overlap", "0.5", "--cluster", two_nodes.address]
@@ -163,14 +163,14 @@ def test_a_driver_that_is_killed_goes_on_when_run_again(two_nodes, ortho, tmp_pa
     driver.send_signal(with_)
     _, said = driver.communicate(timeout=START_S)
     assert driver.returncode == (-signal.SIGKILL if with_ == signal.SIGKILL else 1), said
-    assert with_ == signal.SIGKILL or "interrupted; the sheets that are finished are kept" in said
+    assert with_ == signal.SIGKILL or "interrupted; finished sheets are kept" in said
     there = len(Atlas.open(place).sheets())
     assert 1 <= there < 8
     again = subprocess.run(
         list(map(str, command)), capture_output=True, text=True, timeout=END_S, check=False
     )
     assert again.returncode == 0, again.stderr
-    assert f"{8 - there} built, {there} kept" in again.stdout or there < 7
+    assert f"{8 - there} built, {there} unchanged" in again.stdout or there < 7
     plain(tmp_path / "alone", ortho, LONGER)
     assert content(place) == content(tmp_path / "alone")
 

@@ -9,7 +9,7 @@ import pytest
 from safetensors import SafetensorError
 
 from helpers import textured
-from orthonav.atlas.catalog import Atlas, NewSheet
+from orthonav.atlas.catalog import Atlas, SheetDescription
 from orthonav.atlas.coverage import box_deg, check_shown
 from orthonav.atlas.cut import cut_map
 from orthonav.atlas.recipe import AtlasRecipe
@@ -90,7 +90,7 @@ def put(atlas, name, path):
     bounds = RECIPE.sheets.bounds_deg(name)
     dates = tuple(str(each["date"]) for each in manifest.imagery)
     facts = (bounds, 1.0, sheet.tiles, sheet.area_km2, dates, manifest.imagery)
-    return atlas.put(name, {"map": path}, NewSheet(name, *facts, "asked", {"orthonav": "test"}))
+    return atlas.put({"map": path}, SheetDescription(name, *facts, "asked", {"orthonav": "test"}))
 
 
 @pytest.fixture
@@ -117,7 +117,7 @@ def cut(folder, middle, tmp_path_factory):
 
 
 def sheet_file(atlas, name):
-    return Path(atlas.url) / atlas.sheets()[name].assets["map"].name
+    return Path(atlas.url) / atlas.sheets()[name].files["map"].name
 
 
 def test_threads_do_not_change_the_map(folder, cut, middle, tmp_path, names_in):
@@ -275,7 +275,7 @@ def test_sheets_that_cannot_be_cut_from(atlas, names, middle, tmp_path, lacking,
         manifest = replace(manifest, sheets=(replace(manifest.sheets[0], grey=None),))
     write_map(tmp_path / "s.onav", manifest, kept)
     put(atlas, names[2], tmp_path / "s.onav")
-    with pytest.raises(AtlasError, match=rf"{names[2]} has {said}.*build it anew"):
+    with pytest.raises(AtlasError, match=rf"{names[2]} has {said}.*rebuild it"):
         cut_map(atlas, tmp_path / "o.onav", bounds_deg=bounds_around(middle, 100), workers=1)
 
 

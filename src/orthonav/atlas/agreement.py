@@ -161,9 +161,7 @@ class Agreement:
                 for each in supporting
                 if chain.reaches(each, time_ns)
             ]
-            made.append(
-                replace(chain, log_odds=chain.log_odds - MISSED, missed=chain.missed + 1)
-            )
+            made.append(replace(chain, log_odds=chain.log_odds - MISSED, missed=chain.missed + 1))
         # New chains come last: of two equal chains the older one comes first.
         made += [_begun(each, time_ns) for each in places]
         chains = _distinct(made, side_m)

@@ -265,7 +265,7 @@ def _other_versions(name: str, differences: Sequence[str]) -> str:
 
 
 def _finish(atlas: Atlas, index: bool, progress: Progress) -> str | None:
-    """Write snapshot and index; the error where that fails, as the sheets are there all the same."""
+    """Write snapshot and index; the error where that fails, which loses no sheet."""
     try:
         atlas.snapshot()
         if index:

@@ -35,9 +35,7 @@ def cache_limit_bytes() -> int:
     try:
         return int(float(gigabytes) * 1e9) if gigabytes else LIMIT_BYTES
     except (ValueError, OverflowError) as error:
-        raise StorageError(
-            f"ORTHONAV_CACHE_GB must be a number, got {gigabytes!r:.40}"
-        ) from error
+        raise StorageError(f"ORTHONAV_CACHE_GB must be a number, got {gigabytes!r:.40}") from error
 
 
 class ContentCache:
@@ -51,7 +49,7 @@ class ContentCache:
         self.limit_bytes = limit_bytes
 
     def get(self, sha256: str, suffix: str, size: int, fill: Callable[[Path], None]) -> Path:
-        """The file with that content; where it is missing, `fill` writes it, verified, to a path."""
+        """The file with that content; if missing, `fill` writes it, verified, to a path."""
         path = self.folder / sha256[:2] / f"{sha256}{suffix}"
         with storage_errors(str(self.folder), "write to the cache of the atlas (ORTHONAV_CACHE)"):
             if path.is_file() and path.stat().st_size == size:

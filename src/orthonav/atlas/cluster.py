@@ -142,7 +142,7 @@ class RayRunner:
     def run(
         self, work: Callable[[Item], Made], items: Sequence[Item], *, gpu: bool = False
     ) -> Iterator[tuple[Item, Made | Failure]]:
-        """Items as they are finished; items whose process died are tried again `RETRIES` times."""
+        """Items as they finish; items whose process died are tried again `RETRIES` times."""
         has_gpu = gpu and self._ray.cluster_resources().get("GPU", 0) >= 1
         task = self._task(num_cpus=1, num_gpus=1 if has_gpu else 0)
         waiting = iter(items)
@@ -177,7 +177,7 @@ class RayRunner:
             return Failure(WorkerError.__name__, text, str(error))
 
     def _stop(self, refs: list[Any]) -> None:
-        """Stop running items: first by request, so that they remove temporary files, then by force."""
+        """Stop running items: by request, so that they remove temporary files, then by force."""
         if not refs:
             return
         for ref in refs:

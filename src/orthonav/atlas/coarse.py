@@ -186,8 +186,8 @@ def _parsed(metadata: str) -> tuple[CoarseRecipe, Extent]:
         raise AtlasError(f"coarse tiles of schema {plain['schema']!r:.20}, this program reads 1")
     if (plain["edges"], plain["cells"]) != (EDGES, POOLING.cells):
         raise AtlasError(
-            f"coarse tiles show {plain['edges']!r:.40} in {plain['cells']!r:.20} cells, this program "
-            f"compares {EDGES} in {POOLING.cells}"
+            f"coarse tiles show {plain['edges']!r:.40} in {plain['cells']!r:.20} cells, "
+            f"this program compares {EDGES} in {POOLING.cells}"
         )
     recipe = CoarseRecipe(**plain["recipe"])
     numbers = [recipe.gsd_m, recipe.tile_px, recipe.overlap, *plain["bounds_deg"]]

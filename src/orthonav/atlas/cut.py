@@ -57,7 +57,7 @@ def cut_map(
     allow_holes: bool = False,
     progress: Progress | None = None,
 ) -> BuildResult:
-    """Cut the map of a route with its band, or of bounds, and write it to `out`, whole or not at all.
+    """Cut the map of a route with its band, or of bounds, and write it to `out` as a whole.
 
     Missing sheets under the route are an error unless `allow_holes`; other missing sheets are a
     warning. Raises `AreaError` for areas outside the atlas, `AtlasError` where sheets are damaged

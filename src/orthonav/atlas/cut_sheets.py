@@ -39,7 +39,7 @@ class CutSheet:
 
 
 def opened_sheets(atlas: Atlas, sheets: Sequence[Sheet], grid: TileGrid) -> list[CutSheet]:
-    """Open and verify sheets. Raises `AtlasError` where one is damaged or differs from the others."""
+    """Open and verify sheets. Raises `AtlasError` where one is damaged or differs from others."""
     found: list[CutSheet] = []
     for sheet in sheets:
         try:
@@ -141,7 +141,8 @@ def _check_alike(opened: MapFile, sheet: Sheet, grid: TileGrid, first: Manifest 
         if first is not None and manifest.recipe.get(name) != first.recipe.get(name):
             raise AtlasError(
                 f"sheet {sheet.id} was made differently from the others ({name}: "
-                f"{manifest.recipe.get(name)}, not {first.recipe.get(name)}); {REBUILD}: {opened.path}"
+                f"{manifest.recipe.get(name)}, not {first.recipe.get(name)}); {REBUILD}: "
+                f"{opened.path}"
             )
 
 

@@ -127,9 +127,7 @@ class _IndexBuilder:
         )
         step = max(1, total // MAX_TRAINING_VECTORS)
         sample = [vectors_of(embedder, self._features(sheet, step)) for sheet in sheets]
-        quantizers = train(
-            np.concatenate(sample), VectorRecipe.for_count(total, embedder.dims)
-        )
+        quantizers = train(np.concatenate(sample), VectorRecipe.for_count(total, embedder.dims))
         quantizers.save(self._folder / QUANTIZERS_NAME)
         shards: list[ShardInfo] = []
         for group in _groups(sheets, counts):
@@ -137,9 +135,7 @@ class _IndexBuilder:
             shards.append(self._shard(group, base, embedder, quantizers))
         return self._put(quantizers.recipe, shards, {})
 
-    def update(
-        self, before: IndexManifest, new: Sequence[Sheet], stale: set[str]
-    ) -> IndexManifest:
+    def update(self, before: IndexManifest, new: Sequence[Sheet], stale: set[str]) -> IndexManifest:
         """`before` with a shard of the new sheets and the rows of stale sheets retired."""
         fetch_files(self._atlas, before, self._folder)
         embedder = load_whitening(self._folder / WHITENING_NAME)
@@ -198,9 +194,7 @@ class _IndexBuilder:
         """Put the new files into the atlas, then the manifest; remove files not used any more."""
         store = self._atlas.store
         files = {
-            path.name: StoredFile(
-                f"{FOLDER}/{path.name}", path.stat().st_size, digest_of(path)
-            )
+            path.name: StoredFile(f"{FOLDER}/{path.name}", path.stat().st_size, digest_of(path))
             for path in sorted(self._folder.iterdir())
         }
         for name, file in files.items():

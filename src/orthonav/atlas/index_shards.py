@@ -114,7 +114,9 @@ class OpenShard:
                 f"{dims} float16; rebuild the index: {path}"
             )
         if self.places_deg.shape != (info.rows, 2) or self.places_deg.dtype != np.float64:
-            raise AtlasError(f"places of shard {info.name} are damaged; rebuild the index: {folder}")
+            raise AtlasError(
+                f"places of shard {info.name} are damaged; rebuild the index: {folder}"
+            )
         self._dims, self._offset = dims, path.stat().st_size - vectors.nbytes
         self._file = os.open(path, os.O_RDONLY)
         weakref.finalize(self, os.close, self._file)

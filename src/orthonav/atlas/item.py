@@ -9,7 +9,6 @@ has 140,000). Tests validate items and catalogue with it.
 
 import hashlib
 import json
-import math
 import re
 from calendar import monthrange
 from collections.abc import Mapping

@@ -135,9 +135,7 @@ def _registered(
     prepared = sheet.prepared(replace(view, telemetry=telemetry), True)
     if isinstance(prepared, NoFix):
         return None
-    pose_prior = replace(
-        prepared.prior, turn_rad=region.turn_rad, turn_std_rad=region.turn_std_rad
-    )
+    pose_prior = replace(prepared.prior, turn_rad=region.turn_rad, turn_std_rad=region.turn_std_rad)
     prepared = replace(prepared, prior=pose_prior)
     prior = Prior(region.lat_deg, region.lon_deg, region.reach_m / PRIOR_SIGMAS)
     if not sheet.touches_map(prior, prepared):

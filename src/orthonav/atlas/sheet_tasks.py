@@ -265,7 +265,7 @@ def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Pa
 
 
 def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None:
-    """Raise `AtlasError` naming the sheets that are in the atlas (`known`) and were made otherwise."""
+    """Raise `AtlasError` naming the sheets of the atlas (`known`) that were made otherwise."""
     other = [task for task in tasks if not is_same(task, known)]
     if not other:
         return

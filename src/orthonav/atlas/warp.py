@@ -92,8 +92,8 @@ class Warp:
         )
 
     def affine(self, block: Block) -> Array:
-        """Affine (2, 3) from pixels of the grid to pixels of the sheet, pixel-is-area, fitted to the
-        corners of a block."""
+        """Affine (2, 3) from pixels of the grid to pixels of the sheet (pixel-is-area), fitted to
+        the corners of a block."""
         corners = _corners(block)
         there = self._source_px(corners)
         design = np.column_stack([corners - corners[0], np.ones(len(corners))])
@@ -212,7 +212,7 @@ def joined_grey(warps: Sequence[Warp], block: Block) -> Pixels:
 
 
 def _around(wanted: NDArray[np.bool_]) -> tuple[slice, slice] | None:
-    """Rows and columns of the smallest box around the true pixels of a mask (H, W), None if none."""
+    """Rows and columns of the smallest box around the true pixels of a mask (H, W), or None."""
     rows, cols = (np.flatnonzero(wanted.any(axis=axis)) for axis in (1, 0))
     if not len(rows):
         return None
@@ -268,7 +268,7 @@ def _by_middles(affine: Array, block: Block, spacing: int, middle: float) -> Arr
 
 
 def _window(matrix: Array, size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Top, left, height and width of the part of the sheet that a picture of `size` (w, h) needs."""
+    """Top, left, height and width of the part of the sheet that `size` (w, h) pixels need."""
     cols, rows = size
     corners = np.array([[0, 0], [cols - 1, 0], [0, rows - 1], [cols - 1, rows - 1]], float)
     there = _applied(matrix, corners)

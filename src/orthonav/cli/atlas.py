@@ -55,12 +55,16 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     retire = action("retire", "take sheets out of an atlas")
     retire.add_argument("sheets", nargs="+", metavar="SHEET", help="name, as r001526c001392")
-    index = action("index", "make the index that finds views without a prior, or bring it up to date")
+    index = action(
+        "index", "make the index that finds views without a prior, or bring it up to date"
+    )
     index.add_argument("--rebuild", action="store_true", help="rebuild all of it")
     cut = action("cut", "cut the map of a route or of bounds out of an atlas")
     add_area(cut, cut.add_mutually_exclusive_group(required=True))
     cut.add_argument("--out", type=Path, required=True, metavar="MAP.onav")
-    cut.add_argument("--workers", type=int, metavar="N", help="threads that read sheets (default: one per core)")
+    cut.add_argument(
+        "--workers", type=int, metavar="N", help="threads that read sheets (default: one per core)"
+    )
     cut.add_argument(
         "--allow-holes", action="store_true", help="cut although sheets under the route are missing"
     )

@@ -58,7 +58,6 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
-
 def add_recipe(parser: argparse._ActionsContainer) -> None:
     """The options of `RECIPE`."""
     parser.add_argument(

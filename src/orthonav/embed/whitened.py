@@ -424,9 +424,7 @@ def _whitening(
     return WhitenedEmbedder(recipe, mean, basis.astype(np.float16))
 
 
-def _worked(
-    work: Callable[[Part], Made], parts: Iterable[Part], workers: int
-) -> Iterator[Made]:
+def _worked(work: Callable[[Part], Made], parts: Iterable[Part], workers: int) -> Iterator[Made]:
     """The results of `work` for each part, in order, by `workers` threads."""
     if workers <= 1:
         yield from map(work, parts)
