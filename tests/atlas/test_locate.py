@@ -37,7 +37,7 @@ RECIPE = {
 }
 
 
-CANDIDATES = 8
+CANDIDATES = 6
 """Registering candidates takes most of the time."""
 
 
@@ -50,7 +50,8 @@ def fewer_candidates(monkeypatch):
 def atlas(area, tmp_path_factory):
     """An atlas of the first date with its index; read-only."""
     place = tmp_path_factory.mktemp("located") / "atlas"
-    with SerialRunner() as runner:
+    with pytest.MonkeyPatch.context() as patch, SerialRunner() as runner:
+        patch.setattr("orthonav.prepare.calibrate.CROPS", 24)  # most of the time of a sheet
         built = build_atlas(AtlasRequest(str(place), [area.past], RECIPE), runner)
     assert not built.failed
     return Atlas.open(place)
