@@ -14,8 +14,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from orthonav.errors import MissingExtraError, OrthonavError, WorkerError
 from orthonav.prepare.sheet import usable_cores
@@ -54,50 +53,20 @@ class Failure:
     trace: str = ""
 
 
-class TaskRunner(Protocol):
-    """A context manager that runs tasks."""
-
-    @property
-    def at_once(self) -> int:
-        """Number of items that run at the same time."""
-        ...
-
-    def everywhere(self, probe: Callable[[], Made]) -> list[tuple[str, Made | Failure]]:
-        """The result of a function on every machine, each with the machine's name."""
-        ...
-
-    def run(
-        self, work: Callable[[Item], Made], items: Sequence[Item], *, gpu: bool = False
-    ) -> Iterator[tuple[Item, Made | Failure]]:
-        """Each item with its result, when it is finished; closing the iterator stops the rest.
-
-        With `gpu` each item has a GPU to itself, where there are any.
-        """
-        ...
-
-    def __enter__(self) -> "TaskRunner": ...
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None: ...
-
-
 class SerialRunner:
     """Runs items in this process, one after the other."""
 
     at_once = 1
+    """Number of items that run at the same time."""
 
     def everywhere(self, probe: Callable[[], Made]) -> list[tuple[str, Made | Failure]]:
-        """The result of the function in this process."""
+        """The result of a function on every machine, each with the machine's name: here on one."""
         return [("this machine", probe())]
 
     def run(
         self, work: Callable[[Item], Made], items: Sequence[Item], *, gpu: bool = False
     ) -> Iterator[tuple[Item, Made | Failure]]:
-        """Items with their results, in order."""
+        """Each item with its result, in order; `gpu` has no effect."""
         for item in items:
             yield item, attempted(work, item)
 
@@ -142,7 +111,11 @@ class RayRunner:
     def run(
         self, work: Callable[[Item], Made], items: Sequence[Item], *, gpu: bool = False
     ) -> Iterator[tuple[Item, Made | Failure]]:
-        """Items as they finish; items whose process died are tried again `RETRIES` times."""
+        """Each item with its result, when it is finished; closing the iterator stops the others.
+
+        With `gpu` each item has a GPU to itself, where there are any. Items whose process died are
+        tried again `RETRIES` times.
+        """
         has_gpu = gpu and self._ray.cluster_resources().get("GPU", 0) >= 1
         task = self._task(num_cpus=1, num_gpus=1 if has_gpu else 0)
         waiting = iter(items)
@@ -215,6 +188,10 @@ class RayRunner:
     def __exit__(self, *_: object) -> None:
         if not self._was_there:
             self._ray.shutdown()
+
+
+TaskRunner = SerialRunner | RayRunner
+"""A context manager that runs tasks."""
 
 
 def attempted(work: Callable[[Item], Made], item: Item) -> Made | Failure:

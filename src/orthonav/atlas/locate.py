@@ -9,14 +9,12 @@ agree become fixes (`orthonav.atlas.agreement`).
 import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Protocol
 
 import numpy as np
 
 from orthonav.atlas.agreement import MAX_REACH_M, MIN_VIEWS, Agreement, Chain, PlaceEvidence
-from orthonav.atlas.recipe import CoarseRecipe
 from orthonav.atlas.sheet_registration import SearchRegion, SheetMatch, SheetRegistrar
-from orthonav.atlas.tile_search import TileMatch
+from orthonav.atlas.tile_search import TileSearch
 from orthonav.confidence.registered import USUAL_BIAS, USUAL_WEIGHTS, RegisteredConfidence
 from orthonav.geo.frames import LocalFrame, distances_m
 from orthonav.localizer.checks import check_footprint, check_view
@@ -62,24 +60,11 @@ MIN_VIEW_PX = 24.0
 """Least side of a view at the resolution of the coarse tiles, in pixels."""
 
 
-class CoarseSearch(Protocol):
-    """Search among the coarse tiles of an atlas (`orthonav.atlas.tile_search`)."""
-
-    @property
-    def recipe(self) -> CoarseRecipe:
-        """The recipe of the tiles."""
-
-    def matches(
-        self, view: RectifiedView, poses: Sequence[tuple[float, float]], count: int
-    ) -> list[TileMatch]:
-        """The tiles most similar to a view, best first."""
-
-
 class AtlasLocator:
     """Places the views of one flight. Mutable; not to be shared between threads."""
 
     def __init__(
-        self, registrar: SheetRegistrar, search: CoarseSearch, *, heading_known: bool = False
+        self, registrar: SheetRegistrar, search: TileSearch, *, heading_known: bool = False
     ) -> None:
         self._registrar, self._search = registrar, search
         self._heading_known = heading_known

@@ -9,7 +9,7 @@ the mean in the range of evidence that decides.
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -28,22 +28,7 @@ tiles; for registered views strength over chance, over the best rival, and the f
 Evidence = Mapping[str, float]
 
 
-class Confidence(Protocol):
-    """A logistic regression on evidence."""
-
-    @property
-    def bias(self) -> float:
-        """Logit without evidence."""
-
-    @property
-    def weights(self) -> tuple[float, ...]:
-        """Weight of each feature."""
-
-    def __call__(self, evidence: Evidence) -> float:
-        """Probability that a fix is right."""
-
-
-Kind = TypeVar("Kind", bound=Confidence)
+Confidence = TypeVar("Confidence", LogisticConfidence, RegisteredConfidence)
 
 
 def pooled_tiles(
@@ -97,7 +82,10 @@ def _mean(
 
 
 def _excess(
-    pooled: Kind, confidences: Sequence[Kind], shares: Sequence[float], evidence: Sequence[Evidence]
+    pooled: Confidence,
+    confidences: Sequence[Confidence],
+    shares: Sequence[float],
+    evidence: Sequence[Evidence],
 ) -> float:
     """Greatest excess of one confidence over the mean of others, as a logit; at least 0."""
     own = np.array([pooled(each) for each in evidence])
