@@ -148,8 +148,8 @@ def test_a_view_without_a_match_is_no_fix_and_keeps_the_chains():
 
 def test_a_long_chain_is_given_up_after_some_views():
     views = [[seen(800 * number, 0, 5.0)] for number in range(20)]
-    elsewhere = [[seen(60_000 + 800 * number, 30_000, 5.0)] for number in range(8)]
-    agreement = flown(*views, *elsewhere)
+    other_place = [[seen(60_000 + 800 * number, 30_000, 5.0)] for number in range(8)]
+    agreement = flown(*views, *other_place)
     assert agreement.agreed
     there = FRAME.en_from_latlon(agreement.best.last.lat_deg, agreement.best.last.lon_deg)
     assert np.hypot(*(there - [60_000 + 800 * 7, 30_000])) < 10

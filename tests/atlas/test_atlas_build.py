@@ -96,17 +96,17 @@ def test_an_atlas_holds_a_map_and_coarse_tiles_for_each_sheet(built, ortho):
     assert plain["sheets_per_hour"] > 0 and plain["mb_per_km2"] > 0
 
 
-def test_nothing_in_an_atlas_tells_where_or_when_it_was_made(built, ortho, tmp_path):
+def test_an_atlas_does_not_depend_on_place_and_time_of_building(built, ortho, tmp_path):
     place, _ = built
-    elsewhere = tmp_path / "other place" / ortho.name
-    elsewhere.parent.mkdir()
-    shutil.copy2(ortho, elsewhere)
-    made(tmp_path / "again", elsewhere)
+    other_place = tmp_path / "other place" / ortho.name
+    other_place.parent.mkdir()
+    shutil.copy2(ortho, other_place)
+    made(tmp_path / "again", other_place)
     assert content(tmp_path / "again") == content(place)
     assert not any(str(ortho.parent).encode() in data for data in content(place).values())
 
 
-def test_what_is_there_is_kept_and_what_is_not_is_built(built, ortho, tmp_path):
+def test_present_sheets_are_unchanged_and_missing_ones_are_built(built, ortho, tmp_path):
     place = Path(shutil.copytree(built[0], tmp_path / "atlas"))
     again = made(place, ortho)
     assert (again.built, again.unchanged) == ((), built[1].built) and again.is_complete
@@ -118,7 +118,7 @@ def test_what_is_there_is_kept_and_what_is_not_is_built(built, ortho, tmp_path):
     assert content(place) == content(built[0])
 
 
-def test_an_interrupt_keeps_what_is_finished(built, ortho, tmp_path):
+def test_an_interrupt_keeps_finished_sheets(built, ortho, tmp_path):
     place = tmp_path / "atlas"
 
     def progress(stage, share):
@@ -138,9 +138,11 @@ def test_sheets_made_otherwise_are_refused_or_replaced(built, make_ortho, ortho,
     changed.write_bytes(ortho.read_bytes())
     os.utime(changed, (1e9, 1e9))
     before = content(place)
-    with pytest.raises(AtlasError, match=r"8 of 8 sheets .*imagery has changed.*--replace") as told:
+    with pytest.raises(
+        AtlasError, match=r"8 of 8 sheets .*imagery has changed.*--replace"
+    ) as caught:
         made(place, changed)
-    assert built[1].built[0] in str(told.value) and content(place) == before
+    assert built[1].built[0] in str(caught.value) and content(place) == before
     result = made(place, changed, replace=True)
     assert len(result.built) == COUNT
     assert {sheet.revision for sheet in Atlas.open(place).sheets().values()} == {2}
@@ -152,7 +154,7 @@ def test_sheets_made_otherwise_are_refused_or_replaced(built, make_ortho, ortho,
     assert made(place, changed, replace=True).unchanged == result.built
 
 
-def test_other_recipes_are_refused_by_what_differs(built, ortho):
+def test_other_recipes_are_refused_with_the_differences(built, ortho):
     before = content(built[0])
     with pytest.raises(AtlasError, match=r"tile_px: 64, not 96"):
         made(built[0], ortho, recipe={"tile_px": 96})
@@ -235,9 +237,9 @@ def test_a_sheet_that_fails_is_named_and_the_others_are_built(
     assert done.code == 1
     assert f"error: sheet {full}: StorageError" in done.err and "full" in done.err
     assert f"error: sheet {broken}: ZeroDivisionError" in done.err
-    told = json.loads(done.out)
-    assert [each["sheet"] for each in told["failed"]] == [full, broken]
-    assert told["built"] == COUNT - 2
+    summary = json.loads(done.out)
+    assert [each["sheet"] for each in summary["failed"]] == [full, broken]
+    assert summary["built"] == COUNT - 2
     there = [name for name in content(place) if full in name or broken in name]
     assert all(name.startswith("coarse/") for name in there), "whole, and named by no item"
     monkeypatch.undo()
@@ -298,7 +300,7 @@ def test_only_sheets_of_the_area_are_planned(ortho, built):
 
 
 def test_a_task_names_the_files_that_its_sheet_shows(make_ortho, tmp_path):
-    """So that neither its map nor its digest changes with imagery that lies elsewhere."""
+    """So that neither its map nor its digest changes with imagery outside it."""
     import rasterio
     from rasterio.transform import Affine
 
@@ -314,19 +316,19 @@ def test_a_task_names_the_files_that_its_sheet_shows(make_ortho, tmp_path):
 
 
 def test_a_digest_is_of_recipe_versions_and_imagery_but_not_of_folders(ortho, tmp_path):
-    def told(*paths, recipe=RECIPE, made_by=None):
+    def digest_of(*paths, recipe=RECIPE, made_by=None):
         return request_digest(recipe, Mosaic.open(list(paths)), made_by or versions())
 
     copy = Path(shutil.copy2(ortho, tmp_path / ortho.name))
     other = Path(shutil.copy2(ortho, tmp_path / "other.tif"))
-    assert told(copy) == told(ortho)
+    assert digest_of(copy) == digest_of(ortho)
     different = {
-        told(ortho),
-        told(other),
-        told(ortho, other),
-        told(other, ortho),
-        told(ortho, recipe=replace(RECIPE, seed=1)),
-        told(ortho, made_by={**versions(), "opencv": "3"}),
+        digest_of(ortho),
+        digest_of(other),
+        digest_of(ortho, other),
+        digest_of(other, ortho),
+        digest_of(ortho, recipe=replace(RECIPE, seed=1)),
+        digest_of(ortho, made_by={**versions(), "opencv": "3"}),
     }
     assert len(different) == 6
 
@@ -385,7 +387,7 @@ def test_the_help_of_a_build_is_grouped(run):
         assert f"\n{group}" in done.out
 
 
-def test_ending_a_build_says_how_to_go_on(run, ortho, tmp_path, monkeypatch):
+def test_an_interrupted_build_says_how_to_resume(run, ortho, tmp_path, monkeypatch):
     def interrupted(task):
         raise KeyboardInterrupt
 
@@ -394,7 +396,7 @@ def test_ending_a_build_says_how_to_go_on(run, ortho, tmp_path, monkeypatch):
     assert done.code == 1 and "rerun to resume" in done.err
 
 
-def test_the_usual_resolution_is_that_of_the_imagery(ortho, tmp_path):
+def test_the_default_resolution_is_that_of_the_imagery(ortho, tmp_path):
     request = AtlasRequest(str(tmp_path / "atlas"), [ortho])
     assert building.recipe_for(request, Mosaic.open([ortho])) == AtlasRecipe(gsd_m=1.0)
     assert tasks.margin_m(AtlasRecipe(gsd_m=1.0, coarse=None)) == 320.0

@@ -99,7 +99,7 @@ def test_a_sheet_that_is_put_is_read_back(atlas, files):
     assert check_atlas(again) == []
 
 
-def test_the_same_again_writes_nothing(atlas, files, monkeypatch):
+def test_putting_the_same_sheet_again_writes_nothing(atlas, files, monkeypatch):
     atlas.put(files(), described())
     for name in ("put", "write", "remove"):
         monkeypatch.setattr(Store, name, lambda *_: pytest.fail("nothing to do"))
@@ -140,7 +140,7 @@ def test_the_same_atlas_byte_for_byte(tmp_path, files):
     assert make(tmp_path / "a", [HERE, EAST]) == make(tmp_path / "b", [EAST, HERE])
 
 
-def test_what_is_put_must_fit(near, files, tmp_path):
+def test_sheets_that_do_not_fit_are_refused(near, files, tmp_path):
     with pytest.raises(AtlasError, match="the lattice of the atlas has"):
         near.put(files(), described(bounds_deg=(1.0, 46.0, 1.1, 46.1)))
     with pytest.raises(AtlasError, match="no sheet of 10 km is named 'r999999c000000'"):
@@ -158,7 +158,7 @@ def test_what_is_put_must_fit(near, files, tmp_path):
     assert near.sheets() == {} and list(contents(near.url)) == ["atlas.json"]
 
 
-def test_beginning_and_opening(tmp_path):
+def test_creating_and_opening(tmp_path):
     with pytest.raises(AtlasError, match=r"no atlas: it has no atlas\.json"):
         Atlas.open(tmp_path / "none")
     (tmp_path / "photos").mkdir()
@@ -192,7 +192,7 @@ def test_beginning_and_opening(tmp_path):
         (lambda text: "[]", "not an atlas of orthonav"),
     ],
 )
-def test_a_catalogue_that_was_altered(near, change, words):
+def test_an_altered_catalogue_is_refused(near, change, words):
     path = Path(near.url) / "atlas.json"
     path.write_text(change(path.read_text()))
     with pytest.raises(AtlasError, match=words):
@@ -243,8 +243,8 @@ def altered(item, path, value):
         (("links",), []),
     ],
 )
-def test_items_of_strangers_are_refused(near, files, path, value):
-    """The file name agrees with the content, so that what is told is all that can be wrong."""
+def test_untrusted_items_are_refused(near, files, path, value):
+    """The file name agrees with the content, so only the content can be wrong."""
     item = altered(near.put(files(), described()).to_item(), path, value)
     data = canonical(item)
     name = f"{HERE}.0002.{hashlib.sha256(data).hexdigest()[:12]}.json"
@@ -271,7 +271,7 @@ def test_items_of_strangers_are_refused(near, files, path, value):
         lambda data: b" " * (2**20 + 1),
     ],
 )
-def test_an_item_that_is_damaged(near, files, change):
+def test_damaged_items_are_reported_and_can_be_replaced(near, files, change):
     sheet = near.put(files(), described())
     path = Path(near.url, "items", sheet.item_name)
     path.write_bytes(change(path.read_bytes()))
@@ -308,7 +308,7 @@ def killed_at(monkeypatch, step, error):
 
 @pytest.mark.parametrize("error", [Killed(), StorageError("disk full")], ids=["kill", "full"])
 @pytest.mark.parametrize("act", ["put", "replace", "retire"])
-def test_a_kill_at_any_step_leaves_what_was_or_what_is_to_be(near, files, monkeypatch, act, error):
+def test_a_kill_at_any_step_leaves_the_old_or_the_new_sheet(near, files, monkeypatch, act, error):
     near.put(files("east"), described(EAST))
     before = [] if act == "put" else [near.put(files(), described())]
     saved = Path(near.url).with_name("saved")
@@ -362,8 +362,8 @@ for step in range(6):
     path = Path(files, sheet)
     path.write_text(f"map of {sheet}")
     bounds = atlas.recipe.sheets.bounds_deg(sheet)
-    told = SheetDescription(sheet, bounds, 1.0, 5, 1.0, (), (), "request", {})
-    atlas.put({"map": path}, told)
+    description = SheetDescription(sheet, bounds, 1.0, 5, 1.0, (), (), "request", {})
+    atlas.put({"map": path}, description)
 """
 
 
@@ -380,7 +380,7 @@ def test_many_processes_put_sheets_at_once(tmp_path):
 
 @pytest.mark.parametrize("at", ["put", "write"])
 @pytest.mark.parametrize("mine", ["one", "two", "three", "four"])
-def test_the_same_sheet_at_once_is_one_of_them(near, files, monkeypatch, at, mine):
+def test_concurrent_revisions_leave_one_of_them(near, files, monkeypatch, at, mine):
     """Another process replaces a sheet while this one does; content `one` is there before."""
     near.put(files("one"), described())
     other = Atlas.open(near.url)
@@ -400,7 +400,7 @@ def test_the_same_sheet_at_once_is_one_of_them(near, files, monkeypatch, at, min
     assert check_atlas(again) == []
 
 
-def test_the_snapshot_saves_reading_and_is_never_the_truth(far, files, monkeypatch):
+def test_the_snapshot_saves_reading_and_items_are_decisive(far, files, monkeypatch):
     atlas = far
     for sheet in (HERE, EAST):
         atlas.put(files(sheet), described(sheet))
@@ -459,7 +459,7 @@ def test_items_are_stac(near, files):
         (("9999",), ("9999-01-01T00:00:00Z", "9999-12-31T23:59:59Z")),
     ],
 )
-def test_times_as_stac_has_them(dates, times):
+def test_dates_become_times_of_stac(dates, times):
     asset = StoredFile(f"sheets/{HERE}.{'0' * 12}.onav", 1, "0" * 64)
     sheet = Sheet.of(described(dates=dates), 1, {"map": asset})
     found = {k: v for k, v in sheet.to_item()["properties"].items() if "date" in k}
@@ -478,8 +478,8 @@ def wide(tmp_path_factory):
     (folder / "map").write_bytes(b"map")
     boxes = [(1.0, 46.0, 2.5, 47.0), (179.5, -17.0, -179.5, -16.5), (0.0, 89.9, 10.0, 90.0)]
     for sheet in {each for box in boxes for each in recipe.sheets.over(box)}:
-        told = replace(described(), id=sheet, bounds_deg=recipe.sheets.bounds_deg(sheet))
-        atlas.put({"map": folder / "map"}, told)
+        description = replace(described(), id=sheet, bounds_deg=recipe.sheets.bounds_deg(sheet))
+        atlas.put({"map": folder / "map"}, description)
     return atlas
 
 
@@ -500,12 +500,12 @@ def test_sheets_over_a_box_are_those_of_the_lattice(wide, place, right, up, widt
     assert {sheet.id for sheet in wide.over(box)} == expected
 
 
-def test_boxes_that_are_none(wide):
+def test_invalid_boxes_are_refused(wide):
     with pytest.raises(AreaError, match="bounds must be"):
         wide.over((1.0, 47.0, 2.0, 46.0))
 
 
-def test_sheets_of_another_atlas(tmp_path, files, near):
+def test_sheets_are_copied_from_another_atlas(tmp_path, files, near):
     source = Atlas.create(tmp_path / "source", RECIPE)
     for sheet in (HERE, EAST):
         source.put(files(sheet), described(sheet))

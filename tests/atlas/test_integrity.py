@@ -29,7 +29,7 @@ DAYS_S = 24 * 3600
 
 
 def described(sheet, tiles=7, dates=("2020-06-14",)):
-    """What is told of a sheet."""
+    """The description of a sheet."""
     imagery = ({"name": "BD ORTHO", "attribution": "IGN", "licence": "Etalab-2.0"},)
     bounds = RECIPE.sheets.bounds_deg(sheet)
     return SheetDescription(
@@ -70,13 +70,13 @@ def found(atlas, **how):
     return [(problem.kind, problem.name) for problem in check_atlas(atlas, **how)]
 
 
-def test_a_whole_atlas(atlas):
+def test_a_whole_atlas_has_no_problems(atlas):
     assert check_atlas(atlas) == [] == check_atlas(atlas, clean=True, min_age_s=0)
     atlas.snapshot()
     assert check_atlas(atlas) == []
 
 
-def test_files_that_are_missing_or_half_there(atlas, tmp_path):
+def test_missing_and_incomplete_files_are_found(atlas, tmp_path):
     here, east = (atlas.sheets()[name].files["map"].name for name in (HERE, EAST))
     atlas.store.remove(here)
     atlas.store.write(east, b"map")
@@ -87,14 +87,14 @@ def test_files_that_are_missing_or_half_there(atlas, tmp_path):
     assert found(atlas) == wrong[1:]
 
 
-def test_content_that_changed_is_found_by_looking_inside(atlas):
+def test_altered_content_is_found_by_a_deep_check(atlas):
     name = atlas.sheets()[HERE].files["map"].name
     atlas.store.write(name, b"m" * atlas.store.size(name))
     assert found(atlas) == []
     assert ("wrong checksum", name) in found(atlas, deep=True)
 
 
-def test_what_is_left_over_goes_when_it_is_old(atlas):
+def test_old_leftovers_are_removed(atlas):
     orphan = f"sheets/{HERE}.0123456789ab.onav"
     half = f"sheets/.{HERE}.0123456789ab.onav.a1b2c3d4.tmp.onav"
     names = {orphan: "orphan", half: "leftover", ".atlas.json.a1b2c3d4e5f6.tmp": "leftover"}
@@ -112,7 +112,7 @@ def test_what_is_left_over_goes_when_it_is_old(atlas):
     assert len(atlas.sheets(refresh=True)) == 2
 
 
-def test_the_age_of_files_in_a_folder(near):
+def test_the_age_of_local_files(near):
     orphan = Path(near.url, "sheets", f"{HERE}.0123456789ab.onav")
     orphan.touch()
     os.utime(orphan, (time.time() - 2 * DAYS_S,) * 2)
@@ -132,7 +132,7 @@ def second_revision(atlas, missing=False):
     return old, new
 
 
-def test_a_revision_that_was_replaced(atlas):
+def test_a_replaced_revision_is_removed(atlas):
     old, new = second_revision(atlas)
     assert atlas.sheets(refresh=True)[HERE] == new
     assert found(atlas) == [("second revision", f"items/{old.item_name}")]
@@ -142,7 +142,7 @@ def test_a_revision_that_was_replaced(atlas):
     assert len(atlas.store.names("sheets")) == 2
 
 
-def test_a_revision_stays_while_what_replaced_it_is_not_whole(atlas):
+def test_a_revision_stays_while_its_replacement_is_incomplete(atlas):
     old, new = second_revision(atlas, missing=True)
     wrong = [
         ("second revision", f"items/{old.item_name}"),
@@ -151,7 +151,7 @@ def test_a_revision_stays_while_what_replaced_it_is_not_whole(atlas):
     assert found(atlas, clean=True, min_age_s=-5) == wrong == found(atlas)
 
 
-def test_files_of_items_that_cannot_be_read_stay(near):
+def test_files_of_unreadable_items_stay(near):
     path = Path(near.url, "items", near.sheets()[HERE].item_name)
     path.write_bytes(path.read_bytes()[:-2])
     assert found(near, clean=True, min_age_s=-5) == [("damaged item", f"items/{path.name}")]
@@ -161,15 +161,15 @@ def test_files_of_items_that_cannot_be_read_stay(near):
     assert found(near) == [] and list(near.sheets(refresh=True)) == [EAST]
 
 
-def test_a_sheet_of_another_lattice(near):
-    told = replace(near.sheets()[HERE], bounds_deg=RECIPE.sheets.bounds_deg(EAST))
-    sheet = Sheet.of(told, 2, told.files)
+def test_a_sheet_of_another_lattice_is_found(near):
+    description = replace(near.sheets()[HERE], bounds_deg=RECIPE.sheets.bounds_deg(EAST))
+    sheet = Sheet.of(description, 2, description.files)
     near.store.write(f"items/{sheet.item_name}", canonical(sheet.to_item()))
     kinds = [kind for kind, _ in found(near)]
     assert kinds == ["second revision", "damaged item"]
 
 
-def test_a_snapshot_that_is_stale_is_written_anew(atlas):
+def test_a_stale_snapshot_is_rewritten(atlas):
     atlas.snapshot()
     atlas.retire(EAST)
     assert found(atlas) == [("stale snapshot", "items.geojson")]
@@ -177,7 +177,7 @@ def test_a_snapshot_that_is_stale_is_written_anew(atlas):
     assert found(atlas) == []
 
 
-def test_an_index_that_is_stale_or_damaged(atlas):
+def test_a_stale_or_damaged_index_is_found(atlas):
     asset = StoredFile("index/a.npy", 3, hashlib.sha256(b"abc").hexdigest())
     shard = ShardInfo("a", 0, (Part(HERE, "ab" * 32, 5),))
     manifest = IndexManifest(VectorRecipe(dims=64), (shard,), {"a.npy": asset})
@@ -191,8 +191,8 @@ def test_an_index_that_is_stale_or_damaged(atlas):
     atlas.store.write(asset.name, b"abd")
     assert found(atlas) == stale
     assert ("wrong checksum", asset.name) in found(atlas, deep=True)
-    elsewhere = replace(manifest, files={"a.npy": replace(asset, name="../../etc/passwd")})
-    atlas.store.write("index/index.json", elsewhere.to_json())
+    outside = replace(manifest, files={"a.npy": replace(asset, name="../../etc/passwd")})
+    atlas.store.write("index/index.json", outside.to_json())
     assert found(atlas) == [("damaged file", "index/index.json"), *stale]
     atlas.store.write("index/index.json", b"{}")
     assert found(atlas) == [("damaged file", "index/index.json")]
@@ -210,7 +210,7 @@ def test_a_sheet_finished_meanwhile_is_no_orphan(near, monkeypatch):
     assert found(near, clean=True, min_age_s=-5) == []
 
 
-def test_a_full_disk_is_said(near, monkeypatch):
+def test_a_full_disk_is_reported(near, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
@@ -224,8 +224,10 @@ def real(map_path, tmp_path, place):
 
     def make(recipe, tiles=None):
         atlas = Atlas.create(place, recipe, cache=tmp_path / "cache")
-        told = described(HERE, open_map(map_path).manifest.sheets[0].tiles if tiles is None else 1)
-        atlas.put({"map": map_path}, told)
+        description = described(
+            HERE, open_map(map_path).manifest.sheets[0].tiles if tiles is None else 1
+        )
+        atlas.put({"map": map_path}, description)
         return atlas
 
     return make
@@ -251,7 +253,7 @@ def test_maps_of_another_recipe_are_found(real):
         assert words in problem.detail
 
 
-def test_what_is_no_map_is_found(near, tmp_path):
+def test_files_that_are_not_maps_are_found(near, tmp_path):
     kinds = [(each.kind, each.detail) for each in check_atlas(near, deep=True)]
     assert [kind for kind, _ in kinds] == ["damaged file"] * 2
     assert "not an orthonav map" in kinds[0][1]
@@ -282,7 +284,7 @@ def test_info(near, capfd):
     assert all(west < lon < east and south < lat < north for lat, lon in PLACES)
 
 
-def test_info_of_nothing(tmp_path, capfd):
+def test_info_of_an_empty_folder_and_an_empty_atlas(tmp_path, capfd):
     code, done = run(capfd, "info", tmp_path)
     assert code == 1 and done.err.startswith("orthonav: error: no atlas")
     Atlas.create(tmp_path / "atlas", RECIPE)
@@ -321,7 +323,7 @@ def test_add_and_retire(near, tmp_path, capfd):
     assert code == 1 and "seed: 1, not 0" in done.err
 
 
-def test_index_and_cut_are_asked_for_as_told(near, capfd, monkeypatch):
+def test_options_reach_index_and_cut(near, capfd, monkeypatch):
     code, done = run(capfd, "index", near.url)
     assert code == 0 and "nothing to index" in done.out
     asked = {}
@@ -331,8 +333,8 @@ def test_index_and_cut_are_asked_for_as_told(near, capfd, monkeypatch):
         raise AtlasError("sheets are missing")
 
     monkeypatch.setattr("orthonav.atlas.cut.cut_map", cut)
-    told = ["--bounds", "1.8,46.5,1.9,46.6", "--out", "MAP.onav", "--workers", "2"]
-    code, done = run(capfd, "cut", near.url, *told)
+    options = ["--bounds", "1.8,46.5,1.9,46.6", "--out", "MAP.onav", "--workers", "2"]
+    code, done = run(capfd, "cut", near.url, *options)
     assert code == 1 and "sheets are missing" in done.err
     assert asked.pop("progress") is not None
     assert asked == {

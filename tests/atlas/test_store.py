@@ -18,7 +18,7 @@ from orthonav.errors import MissingExtraError, StorageError
 
 
 class Trouble(LocalFileSystem):
-    """A far file system that shows halves of files, and fails when told: operation to error."""
+    """A remote file system that shows incomplete files, and fails as `fails` says."""
 
     protocol = "trouble"
     fails = {}  # noqa: RUF012
@@ -229,14 +229,14 @@ def test_failures_are_reported_with_their_cause(trouble, tmp_path, error, words)
     assert not [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
 
 
-def test_a_bucket_that_is_not_there(trouble, tmp_path):
+def test_a_missing_bucket_is_named(trouble, tmp_path):
     store = Store(f"trouble://{tmp_path}/atlas")
     trouble["mv"] = FileNotFoundError("The specified bucket does not exist")
     with pytest.raises(StorageError, match=r"no such file, folder or bucket \(The specified buck"):
         store.write("atlas.json", b"{}")
 
 
-def test_what_must_be_installed(monkeypatch):
+def test_missing_packages_are_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "adlfs", None)
     with pytest.raises(MissingExtraError, match=r"abfs:// needs adlfs.* pip install adlfs"):
         Store("abfs://container/atlas")
@@ -256,7 +256,7 @@ def test_passwords_are_not_shown(monkeypatch):
     assert "secret" not in str(caught.value)
 
 
-def test_a_store_goes_to_other_processes(store):
+def test_a_store_can_be_pickled(store):
     store.write("items/a", b"12")
     again = pickle.loads(pickle.dumps(store))
     assert (again.url, again.cache, again.read("items/a")) == (store.url, store.cache, b"12")
@@ -270,7 +270,7 @@ def far(tmp_path):
     return store
 
 
-def test_far_files_are_copied_once(far, tmp_path, monkeypatch):
+def test_remote_files_are_copied_once(far, tmp_path, monkeypatch):
     path = far.fetch("sheets/a.onav", 8, sha256(b"map of a"))
     assert path.read_bytes() == b"map of a" and path.suffix == ".onav"
     assert path.is_relative_to(tmp_path / "cache")
@@ -278,13 +278,13 @@ def test_far_files_are_copied_once(far, tmp_path, monkeypatch):
     assert far.fetch("sheets/a.onav", 8, sha256(b"map of a")) == path
 
 
-def test_a_copy_that_was_cut_is_fetched_again(far):
+def test_an_incomplete_copy_is_fetched_again(far):
     path = far.fetch("sheets/a.onav", 8, sha256(b"map of a"))
     path.write_bytes(b"map")
     assert far.fetch("sheets/a.onav", 8, sha256(b"map of a")).read_bytes() == b"map of a"
 
 
-def test_what_is_not_as_the_catalogue_says_is_refused(store):
+def test_files_that_differ_from_the_catalogue_are_refused(store):
     store.write("sheets/a.onav", b"map of a")
     with pytest.raises(StorageError, match=r"incomplete or altered: 8 bytes, the catalogue has 9"):
         store.fetch("sheets/a.onav", 9, sha256(b"map of a"))
@@ -296,7 +296,7 @@ def test_what_is_not_as_the_catalogue_says_is_refused(store):
     assert not [path for path in store.cache.rglob("*") if path.is_file()]
 
 
-def test_near_files_are_read_where_they_lie(tmp_path):
+def test_local_files_are_not_copied(tmp_path):
     store = Store(str(tmp_path))
     store.write("sheets/a.onav", b"map of a")
     path = store.fetch("sheets/a.onav", 8, sha256(b"map of a"))
@@ -307,7 +307,7 @@ def test_near_files_are_read_where_they_lie(tmp_path):
         store.fetch("sheets/a.onav", 8, sha256(b"map of a"))
 
 
-def test_what_was_not_used_for_longest_leaves_the_cache(far, monkeypatch):
+def test_the_least_recently_used_files_leave_the_cache(far, monkeypatch):
     monkeypatch.setenv("ORTHONAV_CACHE_GB", "25e-9")  # three files of 8 bytes
     monkeypatch.setattr(cache_module, "GRACE_S", 50)
     paths = {}
@@ -326,7 +326,7 @@ def test_what_was_not_used_for_longest_leaves_the_cache(far, monkeypatch):
     assert left == ["b"]  # used a moment ago: somebody is about to open it
 
 
-def test_where_the_cache_is(monkeypatch, tmp_path, far):
+def test_the_folder_of_the_cache(monkeypatch, tmp_path, far):
     monkeypatch.setenv("ORTHONAV_CACHE", str(tmp_path / "own"))
     assert cache_folder() == tmp_path / "own"
     monkeypatch.delenv("ORTHONAV_CACHE")
