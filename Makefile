@@ -1,5 +1,6 @@
 # make demo    install into .venv and run the whole story on a generated area
-# make test    install and run the tests
+# make test    install and run the tests; `make test EXTRAS=test` without PyTorch and Ray, whose tests
+#              are then skipped by name
 # make lint    style, types, import layers
 # make bench   measure speed, memory and accuracy beside what a user would pick instead
 # make paper   the tables of the paper in the reduced setting, less than an hour
@@ -9,7 +10,9 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+PIP := sh tools/install.sh $(BIN)/python
+PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile -rfEs
+EXTRAS ?= dev
 DEPENDS := pyproject.toml constraints.txt
 
 .PHONY: demo test test-slow lint format bench paper docs clean
@@ -17,11 +20,12 @@ DEPENDS := pyproject.toml constraints.txt
 demo: $(VENV)/.run-installed
 	$(BIN)/orthonav demo --out demo
 
-test: $(VENV)/.dev-installed
-	$(BIN)/python -m pytest -n auto --dist loadfile
+test: $(VENV)/.$(EXTRAS)-installed
+	$(PYTEST)
 
+# Minutes each: their limits are longer.
 test-slow: $(VENV)/.dev-installed
-	$(BIN)/python -m pytest -n auto --dist loadfile -m "slow or not slow"
+	$(PYTEST) -m "slow or not slow" -o timeout=1800 -o faulthandler_timeout=1900
 
 lint: $(VENV)/.dev-installed
 	$(BIN)/ruff check .
@@ -50,15 +54,20 @@ $(BIN)/python:
 	@sh tools/make_venv.sh "$(PYTHON)" "$(VENV)"
 
 $(VENV)/.run-installed: $(DEPENDS) | $(BIN)/python
-	$(PIP) -e ".[geo,report,fetch,web]"
+	$(PIP) geo,report,fetch,web
 	@touch $@
 
 $(VENV)/.dev-installed: $(DEPENDS) | $(BIN)/python
-	$(PIP) -e ".[dev]"
+	$(PIP) dev
 	@touch $@ $(VENV)/.run-installed
 
 $(VENV)/.docs-installed: $(VENV)/.dev-installed
-	$(PIP) -e ".[dev,docs]"
+	$(PIP) dev,docs
+	@touch $@
+
+# What EXTRAS asks for
+$(VENV)/.%-installed: $(DEPENDS) | $(BIN)/python
+	$(PIP) $*
 	@touch $@
 
 clean:

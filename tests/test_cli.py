@@ -17,8 +17,8 @@ import pytest
 from helpers import Done, textured
 from orthonav import __version__
 from orthonav.cli import COMMANDS, main
+from orthonav.flight.fixes import read_results
 from orthonav.mapfile import open_map
-from orthonav.publish.jsonl import read_results
 from orthonav.records import Fix
 from orthonav.report import Drawing
 

@@ -1,9 +1,19 @@
-"""Tests run together, however they are chosen: folders are not packages, so names are for all."""
+"""Tests run together, however they are chosen: names are for all. And every run ends."""
 
+import os
 import re
+import shlex
+import subprocess
+import sys
+import tomllib
 from collections import Counter
 from pathlib import Path
 
+import pytest
+
+import absent
+
+ROOT = Path(__file__).resolve().parents[1]
 TESTS = sorted(Path(__file__).parent.rglob("*.py"))
 
 
@@ -16,3 +26,55 @@ def test_nothing_is_imported_from_conftest():
     """Any folder may have one of its own, and the last one loaded is what the name means."""
     importing = re.compile(r"^\s*(from|import) conftest", re.MULTILINE)
     assert [path.name for path in TESTS if importing.search(path.read_text("utf-8"))] == []
+
+
+FAULTS = {
+    "crash": "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
+    "sleep": "import time; time.sleep(1000)",
+    # No signal reaches Python while this runs.
+    "deaf": "import itertools; sum(itertools.repeat(1))",
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_run_ends_with_the_name_of_the_test_that_crashed_or_hung(fault, tmp_path):
+    """Under the command of `make test` and the project's own options, but for shorter limits."""
+    quick = "def test_one(): pass\ndef test_two(): pass\n"
+    for name in ("first", "second", "third"):
+        (tmp_path / f"test_{name}.py").write_text(quick)
+    broken = (
+        f"def test_before(): pass\ndef test_broken(): {FAULTS[fault]}\ndef test_after(): pass\n"
+    )
+    (tmp_path / "test_fourth.py").write_text(broken)
+    makefile = (ROOT / "Makefile").read_text("utf-8")
+    options = re.search(r"^PYTEST := \$\(BIN\)/python (.*)$", makefile, re.MULTILINE)
+    assert options
+    command = [sys.executable, *shlex.split(options[1]), "-p", "no:cacheprovider"]
+    limits = ["-o", "timeout=2", "-o", "faulthandler_timeout=4"]
+    done = subprocess.run(
+        [*command, "-c", str(ROOT / "pyproject.toml"), *limits, "--rootdir", ".", "."],
+        cwd=tmp_path,
+        env={**os.environ, "PYTEST_XDIST_AUTO_NUM_WORKERS": "2"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 1, done.stdout
+    assert re.search(r"^FAILED test_fourth.py::test_broken", done.stdout, re.MULTILINE)
+    assert re.search(r"^1 failed, [1-9] passed", done.stdout, re.MULTILINE)
+
+
+def test_only_what_is_absent_skips_a_test(monkeypatch):
+    monkeypatch.setattr(absent, "ABSENT", {"torch": "train"})
+    assert absent._reason("E   ModuleNotFoundError: No module named 'torch.nn'")
+    assert absent._reason(
+        "Done(code=1, err=\"learning needs PyTorch: pip install 'orthonav[train]'\")"
+    )
+    assert absent._reason("E   ModuleNotFoundError: No module named 'rasterio'") is None
+    assert absent._reason("pip install 'orthonav[geo]'") is None
+    assert absent._reason("AssertionError: assert 1 == 2") is None
+
+
+def test_every_absent_module_is_named_with_an_extra_that_exists():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    assert set(absent.EXTRA_OF.values()) <= set(project["optional-dependencies"])

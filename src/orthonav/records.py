@@ -13,6 +13,21 @@ from orthonav.geo.camera import Camera
 CONFIDENT = 0.9
 """A fix of at least this confidence counts as confident: the default of publishing and reports."""
 
+PRIOR_SIGMAS = 3.0
+"""A prior position limits the search to so many of its standard deviations: 1.1 % of a round
+Gaussian lies outside."""
+DEFAULT_YAW_STD_DEG = 7.0
+"""Standard deviation of a reported heading that comes without one: magnetic compasses of the
+recorded flights are off by several degrees (docs/tracking.md)."""
+MIN_YAW_STD_DEG = 2.0
+"""Least deviation of a reported heading that searches allow for."""
+TILE_YAW_STD_DEG = 5.0
+"""The same default where views are placed by their tiles alone. It differs on purpose: 5 deg make
+three headings 6 deg apart, which is what docs/decisions/embedding.md measured; 7 deg would make
+five, and change every figure of the embedding alone."""
+DEFAULT_AGL_STD = 0.08
+"""Standard deviation of a reported height that comes without one, over the height."""
+
 Evidence = Mapping[str, float]
 """Named numbers that say why a fix should be believed or not; see `docs/reference/formats.md`."""
 

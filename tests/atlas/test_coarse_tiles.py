@@ -50,9 +50,7 @@ def stored(mosaic, box_deg, tmp_path_factory):
     return path
 
 
-def test_coarse_tiles_are_read_back_and_reproducible(
-    mosaic, box_deg, stored, tmp_path
-):
+def test_coarse_tiles_are_read_back_and_reproducible(mosaic, box_deg, stored, tmp_path):
     made, read = make_coarse(mosaic, box_deg, RECIPE), read_coarse(stored)
     assert (read.recipe, read.bounds_deg) == (RECIPE, box_deg)
     for name in ("centres_latlon_deg", "features", "valid"):

@@ -138,7 +138,7 @@ def test_a_map_without_registration(half_blank, tmp_path, monkeypatch):
 
 
 def test_pictures_know_where_their_middle_is(plan, registration):
-    layer = registration.registrar.reference.pyramid
+    layer = registration.pyramid
     pictures = views.Pictures(layer, registration)
     grid = registration.grid
     for level in (0, 1):
@@ -154,7 +154,7 @@ def test_pictures_know_where_their_middle_is(plan, registration):
 
 
 def test_strangers_are_mirrored_ground(registration):
-    layer = registration.registrar.reference.pyramid
+    layer = registration.pyramid
     pictures = views.Pictures(layer, registration)
     rng = np.random.default_rng(1)
     found = pictures.stranger(rng, 200, 0)
@@ -169,7 +169,7 @@ def test_strangers_are_mirrored_ground(registration):
 
 def test_another_date_lies_on_the_map(half_blank, registration):
     """The map's own orthophoto, read as another date, is the picture of the map."""
-    layer = registration.registrar.reference.pyramid
+    layer = registration.pyramid
     pyramid = OrthoPyramid(half_blank.past, registration.sheet, layer.levels)
     try:
         for level in (0, 1, 2):

@@ -31,8 +31,8 @@ from orthonav.evaluate.figures import wilson
 from orthonav.evaluate.flights import FlightReport, metrics_to_json, summary
 from orthonav.evaluate.metrics import Comparison, compare, criterion_rows, measure, pool, wrong_key
 from orthonav.evaluate.report import write_report
+from orthonav.flight.fixes import result_from_json, result_to_json
 from orthonav.geo.frames import LocalFrame
-from orthonav.publish.jsonl import result_from_json, result_to_json
 from orthonav.records import Fix, ViewResult
 
 RADIUS_M = 20.0

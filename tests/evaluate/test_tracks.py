@@ -34,13 +34,13 @@ from orthonav.evaluate.track_plots import (
     track_map_picture,
 )
 from orthonav.evaluate.track_report import track_rows
+from orthonav.flight.fixes import write_results
 from orthonav.flight.writer import FlightWriter
 from orthonav.geo.camera import Camera, camera_from_en
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.grid import TileGrid
 from orthonav.mapfile import open_map
 from orthonav.mapfile.layer import GreyLayer
-from orthonav.publish.jsonl import write_results
 from orthonav.records import Fix, NoFix, Telemetry, ViewResult
 from orthonav.report import SAID_STYLE, Drawing
 

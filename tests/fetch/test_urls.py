@@ -29,9 +29,9 @@ def test_what_is_no_address_is_refused(url):
 
 
 def test_refusals_show_no_password():
-    with pytest.raises(FetchError) as told:
+    with pytest.raises(FetchError) as raised:
         urls.checked_url("https://me:hunter2@a.example/x")
-    assert "hunter2" not in str(told.value)
+    assert "hunter2" not in str(raised.value)
 
 
 @pytest.mark.parametrize(

@@ -170,7 +170,7 @@ def test_what_is_skipped_and_why(tmp_path, caplog):
     assert [source.path.name for source in mosaic.sources] == [
         f"tile_{row}_{col}.tif" for row in (0, 1) for col in (0, 1)
     ]
-    for told in ("1 archives", "1 ECW", "1 thumbnails", "1 pictures without", "2 rasters that are"):
+    for told in ("1 archives", "1 ECW", "1 thumbnails", "1 images without", "2 rasters that are"):
         assert told in caplog.text
     assert "heights" in caplog.text and "unpack them first" in caplog.text
 
@@ -183,10 +183,10 @@ def test_what_is_skipped_and_why(tmp_path, caplog):
         (["x.ecw"], "1 ECW files, which GDAL as installed cannot read"),
         (
             [f"{PACKAGE}.7z.00{part}" for part in (2, 1)],
-            r"2 files of archives.*7z x '.*\.7z\.001' -o",
+            r"archives \(2 files\).*7z x '.*\.7z\.001' -o",
         ),
-        (["x.zip"], r"1 files of archives.*unzip '.*x\.zip' -d "),
-        (["x.png"], "1 pictures without a world file"),
+        (["x.zip"], r"archives \(1 files\).*unzip '.*x\.zip' -d "),
+        (["x.png"], "1 images without a world file"),
     ],
 )
 def test_a_folder_without_orthophotos(tmp_path, names, message):

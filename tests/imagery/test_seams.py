@@ -9,7 +9,7 @@ from geotiffs import FRAME, LAMBERT, placed, read, sheet_of, smooth_scene, write
 from rasterio.transform import Affine
 
 from orthonav.geo.frames import LocalFrame
-from orthonav.imagery.lattice import Decoded
+from orthonav.imagery.lattice import CellCache
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.imagery.quiet import quiet
 from orthonav.imagery.thin import cells_of
@@ -170,7 +170,7 @@ def test_8_and_16_bit_are_mixed(tmp_path, caplog):
     ]
     mosaic = Mosaic.open(paths)
     assert mosaic.stretches[0] is None and mosaic.stretches[1] == mosaic.stretch is not None
-    assert "8 bits alone" in caplog.text
+    assert "8 bits separately" in caplog.text
     pixels = read(paths, 100)
     assert pixels.valid[2:-2, 2:-2].all()
     assert pixels.rgb[:, :45].std() > 20 and pixels.rgb[:, -45:].std() > 20
@@ -218,7 +218,7 @@ def test_hidden_files_are_not_read_and_shared_ones_once(tmp_path, monkeypatch):
 
 
 def test_what_is_kept_has_a_limit():
-    kept, reads = Decoded(limit_bytes=25_000), []
+    kept, reads = CellCache(limit_bytes=25_000), []
 
     def reader(number):
         def read():

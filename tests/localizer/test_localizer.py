@@ -185,7 +185,7 @@ def test_a_prior_lets_no_tile_through_that_is_too_far(views, flight, localizer, 
     )
     reach_m = 3 * std_m + localizer.grid.stride_m
     assert error_m(localizer, fix, wrong) <= reach_m + localizer.grid.stride_m
-    inside = np.linalg.norm(localizer.centres_en_m - wrong, axis=1) <= reach_m
+    inside = np.linalg.norm(localizer.tiles.centres_en_m - wrong, axis=1) <= reach_m
     # The gate is a little wider where the camera tilts and the heading is uncertain.
     assert inside.sum() <= fix.evidence["tiles_searched"] <= 1.2 * inside.sum()
 

@@ -1,6 +1,5 @@
 """Views on a map whose ground is known everywhere: found to a fraction of a pixel, or refused."""
 
-import importlib
 import math
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -245,9 +244,9 @@ def test_a_prior_near_the_truth_changes_nothing(localizer, plain, std_m):
 def test_a_map_too_large_to_be_searched_whole_needs_a_prior(localizer, plain, monkeypatch):
     """Memory has a bound: by tiles if views are as large, else not at all."""
     grey, told, place, free = plain
-    module = importlib.import_module("orthonav.localizer.registration")
-    rows, cols = localizer.registration.registrar.reference.shape(0)
-    monkeypatch.setattr(module, "MAX_SEARCH_PX", 40_000)
+    plan = localizer.registration.plan
+    rows, cols = localizer.registration.pyramid.shape(0)
+    monkeypatch.setattr(localizer.registration, "plan", replace(plan, max_search_px=40_000))
     asked = []
     whole = localizer.registration.registrar.whole_window
     monkeypatch.setattr(
@@ -261,7 +260,7 @@ def test_a_map_too_large_to_be_searched_whole_needs_a_prior(localizer, plain, mo
     fix = localizer.locate(View(grey, CAMERA, told), prior=prior_at(localizer, place, 5.0))
     assert place_of(localizer, fix) == pytest.approx(place_of(localizer, free), abs=0.1)
     monkeypatch.setattr(localizer.registration, "propose", None)
-    monkeypatch.setattr(module, "MAX_SEARCH_PX", 100)
+    monkeypatch.setattr(localizer.registration, "plan", replace(plan, max_search_px=100))
     nothing = localizer.locate(View(grey, CAMERA, told))
     assert nothing.reason == "no_match" and "prior" in nothing.detail
 

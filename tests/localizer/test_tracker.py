@@ -11,8 +11,8 @@ from blots import AGL_M, GROUND, Ground, map_of_blots, ortho_of_blots, rendered
 from orthonav.errors import CameraError, MapFileError
 from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
-from orthonav.localizer.levelled import levelled
-from orthonav.localizer.odometry import Footprint, moved_between
+from orthonav.localizer.odometry import OdometryView, displacement
+from orthonav.localizer.tilt import with_tilt
 from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import localize_flight, smoothed_track
@@ -281,14 +281,14 @@ class MemoryView:
 def test_every_view_has_a_result_and_a_state(localizer, monkeypatch):
     seen = list(views(9))
     tracker = Tracker(localizer, smooth=True)
-    whole = tracker._observe
+    whole = tracker._update
 
     def sometimes(*arguments):
         if tracker._time_ns == 5 * 10**9:
             raise RuntimeError("a bug")
         return whole(*arguments)
 
-    monkeypatch.setattr(tracker, "_observe", sometimes)
+    monkeypatch.setattr(tracker, "_update", sometimes)
     flight = Recorded(seen, broken=(3,))
     results = list(localize_flight(tracker, flight, skip_bad_images=True))
     assert [result.frame for result in results] == [f"{n}.png" for n in range(9)]
@@ -298,13 +298,13 @@ def test_every_view_has_a_result_and_a_state(localizer, monkeypatch):
     assert len(again) == 9 and all(isinstance(each.outcome, Fix | NoFix) for each in again)
 
 
-def levelled_twice(localizer, grey, telemetry):
+def tilt_estimated_twice(localizer, grey, telemetry):
     """A view placed with its tilt, and again from the tilt that was found."""
     registration = localizer.registration
     for _ in range(2):
         view = registration.prepared(View(grey, WIDE, telemetry), heading_known=True)
         placed = registration.best(view, None).placed
-        found = levelled(registration, View(grey, WIDE, telemetry), view, placed)
+        found = with_tilt(registration, View(grey, WIDE, telemetry), view, placed)
         pitch, roll = np.degrees(found.mean[4:])
         telemetry = replace(telemetry, pitch_deg=pitch, roll_deg=roll)
     return found
@@ -317,7 +317,7 @@ def test_tilt_is_seen_in_the_perspective(localizer, tilt_deg):
     for seed, place in enumerate(places):
         rng = np.random.default_rng(seed)
         grey = changed(rendered(GROUND, place, (25.0, *tilt_deg), AGL_M, WIDE), rng)
-        found = levelled_twice(localizer, grey, Telemetry(0, 25.0, 0.0, 0.0, AGL_M))
+        found = tilt_estimated_twice(localizer, grey, Telemetry(0, 25.0, 0.0, 0.0, AGL_M))
         truth = np.array([*place, math.radians(25.0), 0.0, *np.radians(tilt_deg)])
         means.append(np.degrees(found.mean[4:]))
         offs.append((found.mean - truth) / np.sqrt(np.diag(found.covariance)))
@@ -334,7 +334,7 @@ def test_a_narrow_view_knows_less_of_its_tilt(localizer):
         registration = localizer.registration
         view = registration.prepared(View(grey, camera, telemetry), heading_known=True)
         placed = registration.best(view, None).placed
-        found = levelled(registration, View(grey, camera, telemetry), view, placed)
+        found = with_tilt(registration, View(grey, camera, telemetry), view, placed)
         std = np.sqrt(np.diag(found.covariance))
         std_deg.append(np.degrees(std[4:]))
         # What the tilt is not known to, the position is not either.
@@ -353,7 +353,7 @@ def test_position_hangs_on_a_tilt_that_was_not_looked_at(localizer, heading_deg)
         view = registration.prepared(View(grey, WIDE, tilted), heading_known=True)
         placed = registration.best(view, None).placed
         worth = np.zeros(2)
-        found.append(levelled(registration, View(grey, WIDE, tilted), view, placed, worth))
+        found.append(with_tilt(registration, View(grey, WIDE, tilted), view, placed, worth))
     level = found[0]
     assert np.degrees(np.sqrt(np.diag(level.covariance)[4:])) == pytest.approx(20.0)
     assert np.hypot(*(level.mean[:2] - place)) < 2
@@ -386,11 +386,11 @@ def test_odometry_measures_the_way(moved, expected):
         noisy = np.clip(grey + rng.normal(0, 5, grey.shape), 0, 255).astype(np.uint8)
         telemetry = Telemetry(number * 10**9, heading, 0.0, 0.0, AGL_M)
         pixel_m = footprints[0].pixel_m if footprints else None
-        footprints.append(Footprint.of(View(noisy, WIDE, telemetry), pixel_m))
+        footprints.append(OdometryView.of(View(noisy, WIDE, telemetry), pixel_m))
     telemetry_noise = np.array([1e-3, 4e-4])
     expected = None if expected is None else np.array(expected)
-    seen = moved_between(*footprints, 0.0, telemetry_noise, expected)
-    assert seen.way.moved_en_m == pytest.approx(moved, abs=0.7)
+    seen = displacement(*footprints, 0.0, telemetry_noise, expected)
+    assert seen.displacement.moved_en_m == pytest.approx(moved, abs=0.7)
     assert 0 < seen.overlap < 1
 
 
@@ -403,31 +403,31 @@ def test_odometry_sees_two_views_by_the_same_knowledge():
         for place, heading in (((0.0, 0.0), 0.0), (moved, 150.0))
     )
     known = np.array([math.radians(11.0), 0.0, *tilt])
-    before = Footprint.of(View(first, WIDE, telemetry[0]), None)
-    now = Footprint.of(View(second, WIDE, telemetry[1]), before.pixel_m, known)
+    before = OdometryView.of(View(first, WIDE, telemetry[0]), None)
+    now = OdometryView.of(View(second, WIDE, telemetry[1]), before.pixel_m, known)
     noise = np.array([math.radians(5.0) ** 2, 1e-4])
-    seen = moved_between(before.by(known), now, 0.0, noise)
+    seen = displacement(before.corrected(known), now, 0.0, noise)
     turn = math.radians(10.0)  # what is wrong with the first heading bends the way
     bent = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ moved
-    assert seen.way.moved_en_m == pytest.approx(bent, abs=1.5)
-    assert math.degrees(seen.way.turned_rad) == pytest.approx(-7.0, abs=1.0)
-    apart = moved_between(before, now, 0.0, noise)
-    assert apart is None or np.hypot(*(apart.way.moved_en_m - bent)) > 8
+    assert seen.displacement.moved_en_m == pytest.approx(bent, abs=1.5)
+    assert math.degrees(seen.displacement.turned_rad) == pytest.approx(-7.0, abs=1.0)
+    apart = displacement(before, now, 0.0, noise)
+    assert apart is None or np.hypot(*(apart.displacement.moved_en_m - bent)) > 8
 
 
 def test_odometry_refuses_views_without_common_ground():
     telemetry = Telemetry(0, 0.0, 0.0, 0.0, AGL_M)
-    first = Footprint.of(
+    first = OdometryView.of(
         View(rendered(GROUND, (0, 0), (0, 0, 0), AGL_M, WIDE), WIDE, telemetry), None
     )
     later = replace(telemetry, time_ns=2 * 10**9)
     other = rendered(OTHER, (0, 0), (0, 0, 0), AGL_M, WIDE)
-    second = Footprint.of(View(other, WIDE, later), first.pixel_m)
-    assert moved_between(first, second, 0.01, np.array([1e-3, 4e-4])) is None
-    nan = Footprint.of(View(other, WIDE, replace(later, yaw_deg=math.nan)), first.pixel_m)
-    assert moved_between(first, nan, 0.01, np.array([1e-3, 4e-4])) is None
-    blank = Footprint.of(View(np.full((240, 320), 90, np.uint8), WIDE, later), first.pixel_m)
-    assert blank is None or moved_between(first, blank, 0.01, np.array([1e-3, 4e-4])) is None
+    second = OdometryView.of(View(other, WIDE, later), first.pixel_m)
+    assert displacement(first, second, 0.01, np.array([1e-3, 4e-4])) is None
+    nan = OdometryView.of(View(other, WIDE, replace(later, yaw_deg=math.nan)), first.pixel_m)
+    assert displacement(first, nan, 0.01, np.array([1e-3, 4e-4])) is None
+    blank = OdometryView.of(View(np.full((240, 320), 90, np.uint8), WIDE, later), first.pixel_m)
+    assert blank is None or displacement(first, blank, 0.01, np.array([1e-3, 4e-4])) is None
 
 
 def test_a_fixed_lag_uses_the_views_after_each(localizer):

@@ -29,6 +29,7 @@ from fake_autopilot import (
 
 from orthonav.cli import main
 from orthonav.errors import CameraError
+from orthonav.flight.fixes import result_from_json
 from orthonav.geo.camera import Camera
 from orthonav.onboard import state as states
 from orthonav.onboard.cameras import Newest, Picture
@@ -40,7 +41,6 @@ from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.telemetry import TelemetryBuffer
 from orthonav.publish.estimate import Clock
 from orthonav.publish.gate import Gate, GateRules
-from orthonav.publish.jsonl import result_from_json
 from orthonav.records import Fix, NoFix, Prior, Telemetry
 
 CAMERA = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)

@@ -14,6 +14,7 @@ import pytest
 from fake_autopilot import UTC_NS, S, Time, fix
 
 from orthonav.errors import VariantError
+from orthonav.flight.fixes import result_from_json
 from orthonav.onboard.outputs import (
     KINDS,
     JsonOut,
@@ -26,7 +27,6 @@ from orthonav.onboard.outputs import (
 from orthonav.onboard.telemetry import Told
 from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
 from orthonav.publish.gate import Gate, GateRules
-from orthonav.publish.jsonl import result_from_json
 from orthonav.publish.local import Autopilot, Origin, north_east_m
 from orthonav.publish.mavlink import Packer, Target
 from orthonav.publish.nmea import Quality

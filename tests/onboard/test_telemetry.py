@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from orthonav.onboard.telemetry import ClockSync, Limits, TelemetryBuffer, Told, wxyz_of_angles
 from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
-from orthonav.sources.track import Samples, Track, attitude_of_angles
+from orthonav.sources.track import RecordedTrack, Samples, attitude_of_angles
 
 ANGLES = st.tuples(st.floats(-40, 40), st.floats(-40, 40), st.floats(-180, 180))
 
@@ -50,7 +50,7 @@ def test_the_camera_is_as_an_import_of_a_log_would_have_it(angles, mount):
     attitude(buffer, 1 * S, yaw, pitch, roll)
     samples.add(1 * S, yaw, pitch, roll)
     series = attitude_of_angles(samples, lambda a: enu_from_body_camera(ned_from_angles(a), mount))
-    logged = Track(series).telemetry(1 * S)
+    logged = RecordedTrack(series).telemetry(1 * S)
     telemetry = buffer.at(1 * S).telemetry(1 * S, mount)
     assert (telemetry.pitch_deg, telemetry.roll_deg) == pytest.approx(
         (logged.pitch_deg, logged.roll_deg)

@@ -189,9 +189,9 @@ def test_imagery_with_a_hole_is_covered_around_it(make_ortho, tmp_path, frame):
     assert farthest_m(np.array([[215 - 200, 200 - 225.0]]), opened, frame)[0] > stride_m
 
 
-@pytest.mark.parametrize("told, expected", [(None, 1.0), (0.5, 0.5), (1.7, 1.7), (2.0, 2.0)])
-def test_ground_resolution(ortho, tmp_path, telemetry, expected):
-    grid = built(ortho, tmp_path, gsd_m=telemetry, tile_px=32).manifest.sheets[0].grid
+@pytest.mark.parametrize("asked, expected", [(None, 1.0), (0.5, 0.5), (1.7, 1.7), (2.0, 2.0)])
+def test_ground_resolution(ortho, tmp_path, asked, expected):
+    grid = built(ortho, tmp_path, gsd_m=asked, tile_px=32).manifest.sheets[0].grid
     assert grid.gsd_m == expected and grid.stride_m == 8 * expected
 
 
@@ -383,7 +383,7 @@ def test_confidence_is_a_probability_whatever_the_evidence(localizer):
     rng = np.random.default_rng(0)
     for scale in (0, 1, 1e3, 1e300):
         for values in rng.uniform(-1, 1, (20, len(FEATURES))) * scale:
-            confidence = localizer.confidence(dict(zip(FEATURES, values, strict=True)))
+            confidence = localizer.tiles.confidence(dict(zip(FEATURES, values, strict=True)))
             assert 0 <= confidence <= 1
 
 

@@ -61,7 +61,9 @@ def localizer():
     grid = TileGrid(-half_m, half_m, 1.0, TILE_PX, 16, 12, 12)
     assert grid.width_px == grid.height_px == SIDE_PX
     sheet = SheetInfo(LocalFrame(46.5, 2.5), grid, 144, 0.06)
-    return RegistrationLocalizer(sheet, Pyramid(GREY), None, 10.0, FLOOR_PX)
+    return RegistrationLocalizer(
+        sheet, Pyramid(GREY), confidence=None, radius_m=10.0, floor_px=FLOOR_PX
+    )
 
 
 @pytest.fixture(autouse=True)

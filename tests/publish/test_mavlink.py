@@ -456,7 +456,7 @@ def test_without_pymavlink_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -
 
 def test_localizing_does_not_load_pymavlink() -> None:
     script = (
-        "import sys, orthonav.cli, orthonav.onboard.run, orthonav.publish.jsonl, "
+        "import sys, orthonav.cli, orthonav.onboard.run, orthonav.flight.fixes, "
         "orthonav.publish.gate, orthonav.publish.mavlink_local, orthonav.publish.nmea\n"
         "assert not [name for name in sys.modules if name.startswith('pymavlink')]"
     )

@@ -14,8 +14,8 @@ from recorders import START_S, camera_file, packet, photo, subtitles, tlog, vide
 
 from orthonav.cli import main
 from orthonav.flight import FlightWriter, open_flight, read_image
+from orthonav.flight.fixes import read_results
 from orthonav.geo.camera import Camera
-from orthonav.publish.jsonl import read_results
 from orthonav.records import Fix, Telemetry
 
 DATA = Path(__file__).parents[1] / "data"
@@ -147,14 +147,14 @@ def test_a_flight_may_be_given_another_camera_but_no_log(run, tmp_path):
     assert run("import", source, "--out", tmp_path / "flight", "--camera", other)[0] == 0
     assert open_flight(tmp_path / "flight").camera.distortion == (0.01, 0, 0, 0)
     code, _, err = run("import", source, "--out", tmp_path / "b", "--telemetry", other)
-    assert code == 1 and "telemetry of its own" in err
+    assert code == 1 and "its own telemetry" in err
 
 
 def test_a_flight_is_localized_whatever_its_truth(run, tmp_path):
     source = folder_of(tmp_path / "recorded")
     (source / "truth.csv").write_text("frame,lat_deg,lon_deg\n0.png,north,east\n")
     code, out, err = run("localize", MAP, source, "--out", tmp_path / "fixes.jsonl")
-    assert code == 0 and "2 fixes" in out and "truth is left out: line 2" in err
+    assert code == 0 and "2 fixes" in out and "truth is ignored: line 2" in err
 
 
 def test_what_is_doubtful_is_said(run, tmp_path):
@@ -199,9 +199,9 @@ def short_film(folder):
 BROKEN = {
     "nothing": (lambda folder: folder / "none", "does not exist"),
     "empty file": (lambda folder: written(folder / "a.mp4", b""), "source is empty"),
-    "empty folder": (lambda folder: (folder / "e").mkdir() or folder / "e", "found none"),
+    "empty folder": (lambda folder: (folder / "e").mkdir() or folder / "e", "flight log:"),
     "text": (lambda folder: written(folder / "a.mp4", b"words " * 99), "expected a video"),
-    "a log": (lambda folder: tlog(folder / "a.tlog"), "goes with --telemetry"),
+    "a log": (lambda folder: tlog(folder / "a.tlog"), "belongs to --telemetry"),
     "video cut": (lambda folder: truncated(video(folder / "a.mkv")), "a.mkv"),
     "short subtitles": (short_film, "telemetry ends"),
     "mcap cut": (lambda folder: truncated(bag(folder / "b", "file")), "ROS recording cannot be"),

@@ -19,6 +19,7 @@ from mcap.writer import CompressionType, Writer
 from orthonav.errors import FlightError, OrthonavError
 from orthonav.flight import open_flight, read_image
 from orthonav.flight import png as png_module
+from orthonav.flight.fixes import read_results, result_to_json
 from orthonav.flight.logged import (
     PROFILE,
     SESSION,
@@ -43,7 +44,6 @@ from orthonav.onboard.calibrate import Mounted, model_of
 from orthonav.onboard.log import FlightLog
 from orthonav.onboard.run import locate_view
 from orthonav.onboard.segment import Segment
-from orthonav.publish.jsonl import read_results, result_to_json
 from orthonav.records import NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.sources import SourceOptions, open_source, source_kind
 from orthonav.sources import flightlog as flightlog_module
@@ -282,7 +282,7 @@ def test_two_flights_in_a_folder(tmp_path):
 @pytest.mark.parametrize("views", ["none", "thumbnails"])
 def test_a_log_without_pictures_says_so(tmp_path, run, views):
     path = short_log(tmp_path, views=views)
-    with pytest.raises(FlightError, match=f"no full pictures \\(views: {views}\\)"):
+    with pytest.raises(FlightError, match=f"no full images \\(views: {views}\\)"):
         open_source(path)
     done = run("import", path, "--out", tmp_path / "flight")
     assert done.code == 1 and done.err.count("\n") == 1
@@ -296,7 +296,7 @@ def test_a_picture_that_was_bad_in_flight_is_bad_again(tmp_path):
     opened = open_source(tmp_path / "flight_0001.mcap")
     first, second = opened.views
     assert first.grey().shape == (48, 64) and opened.warnings == ()
-    with pytest.raises(FlightError, match="no usable picture"):
+    with pytest.raises(FlightError, match="no usable image"):
         second.grey()
 
 
@@ -304,7 +304,7 @@ def test_a_view_without_its_picture_is_left_out(tmp_path):
     messages = [session(), told(), shown(), told(1, "b.png", "dropped"), told(2, "c.png"), shown(2)]
     opened = open_source(crafted(tmp_path / "a.mcap", messages))
     assert [view.frame for view in opened.views] == ["a.png", "c.png"]
-    assert opened.warnings[0].startswith("1 views were not kept")
+    assert opened.warnings[0].startswith("1 views lack a full image")
 
 
 # Cut anywhere
@@ -406,7 +406,7 @@ def test_bombs_do_not_go_off(tmp_path, content, how):
     path = tmp_path / "flight_0001.mcap"
     path.write_bytes(header() + BOMBS[how])
     tracemalloc.start()
-    with pytest.raises(FlightError, match="no chunk of the flight log is whole"):
+    with pytest.raises(FlightError, match="no chunk of the flight log is complete"):
         open_source(path)
     assert tracemalloc.get_traced_memory()[1] < 20e6
     tracemalloc.stop()
@@ -477,13 +477,13 @@ def test_messages_that_hold_no_picture(tmp_path, data):
 def test_no_frame_leads_out_of_its_folder(tmp_path, run, names_in, frame):
     crafted(tmp_path / "a.mcap", [session(), told(frame=frame), shown()])
     done = run("import", tmp_path / "a.mcap", "--out", tmp_path / "in" / "flight")
-    assert done.code == 1 and done.err.count("\n") == 1 and "no name of a view" in done.err
+    assert done.code == 1 and done.err.count("\n") == 1 and "not a valid name of a view" in done.err
     assert [name for name in names_in(tmp_path) if not name.startswith(("a.mcap", "in"))] == []
 
 
 def test_a_frame_that_comes_twice(tmp_path):
     messages = [session(), told(), shown(), told(1), shown(1)]
-    with pytest.raises(FlightError, match="comes twice"):
+    with pytest.raises(FlightError, match="appears twice"):
         open_source(crafted(tmp_path / "a.mcap", messages))
 
 
@@ -569,7 +569,7 @@ def test_only_our_logs_are_taken_for_logs(tmp_path, content):
 def test_what_goes_with_a_log(tmp_path, content):
     path = tmp_path / "flight_0001.mcap"
     path.write_bytes(content[0])
-    with pytest.raises(FlightError, match="no --telemetry"):
+    with pytest.raises(FlightError, match="leave out --telemetry"):
         open_source(path, SourceOptions(telemetry=path))
     camera = tmp_path / "camera.json"
     camera.write_text(json.dumps({"camera": {**camera_plain(CAMERA), "fx_px": 77.0}}))

@@ -23,7 +23,7 @@ def test_what_a_library_raises_is_one_line(tmp_path):
         == f"log cannot be read (KeyError: 'first line\\nsecond line'): {tmp_path}"
     )
     with (
-        pytest.raises(FlightError, match="MemoryError: no more is known"),
+        pytest.raises(FlightError, match="MemoryError: no details"),
         reading("log", tmp_path),
     ):
         raise MemoryError

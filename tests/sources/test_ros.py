@@ -137,7 +137,7 @@ def test_padded_rows_and_big_ends(messages):
 @pytest.mark.parametrize(
     "changes, error",
     [
-        ({"encoding": "yuv422"}, "'yuv422' is not known"),
+        ({"encoding": "yuv422"}, "'yuv422' is not supported"),
         ({"data": np.zeros(10, np.uint8)}, "cut short"),
         ({"step": 3}, "cut short"),
         ({"height": 0}, "has no size"),
@@ -205,7 +205,7 @@ def test_topics_as_told(tmp_path, messages, topics):
     recording = open_source(path, telemetry)
     assert "attitude /odom" in recording.note and len(list(recording.views)) == 4
     for role, name, error in (
-        ("image", "/none", "no messages on /none; there are /cam/camera_info"),
+        ("image", "/none", "no messages on /none; available: /cam/camera_info"),
         ("image", "/imu/data", "carries sensor_msgs/msg/Imu; image is one of"),
     ):
         with pytest.raises(FlightError, match=error):
@@ -215,7 +215,7 @@ def test_topics_as_told(tmp_path, messages, topics):
 def test_without_attitude_nothing_is_made_up(tmp_path, messages, topics):
     del topics["/imu/data"], topics["/odom"]
     recording = open_source(record(tmp_path / "flight", topics, messages))
-    assert recording.warnings == ("no topic tells the attitude of the aircraft",)
+    assert recording.warnings == ("no topic has the attitude of the aircraft",)
     telemetry = next(recording.views).telemetry
     assert (
         telemetry.missing() == ["yaw_deg", "pitch_deg", "roll_deg"] and telemetry.vel_en_mps is None

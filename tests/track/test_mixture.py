@@ -11,10 +11,10 @@ from orthonav.track import (
     CameraDisplacement,
     Mixture,
     Model,
+    ReportedAttitude,
     ReportedVelocity,
     Sighting,
     State,
-    Told,
 )
 from orthonav.track.hypotheses import within
 from orthonav.track.smooth import History
@@ -48,7 +48,7 @@ class Flight:
 
     def told(self):
         """What instruments say: level and north, where the truth is the biases and noise."""
-        return Told(0.0, 0.0, 0.0)
+        return ReportedAttitude(0.0, 0.0, 0.0)
 
     def sighting(self, log_odds=4.0, at=None):
         """The view's own place, or a false one: tilt and position err together."""
@@ -262,7 +262,7 @@ def test_unknown_heading_is_followed():
             mixture.predict(1.0, ReportedVelocity(seen.moved_en_m, None, 0.7))
         sighting = flight.sighting(2.0)
         turned = sighting.mean + np.array([0, 0, 2.2, 0, 0, 0])
-        mixture.update(Told(None, 0.0, 0.0), [replace(sighting, mean=turned)])
+        mixture.update(ReportedAttitude(None, 0.0, 0.0), [replace(sighting, mean=turned)])
     assert off_m(mixture, flight) < 25
 
 
@@ -389,7 +389,7 @@ def test_measured_positions_teach_the_mount():
     for view in range(25):
         if view:
             mixture.predict(1.0, camera=flight.moved())
-        mixture.told_position(flight.place + flight.rng.normal(0, 3, 2), 3.0)
+        mixture.measure_position(flight.place + flight.rng.normal(0, 3, 2), 3.0)
         spread = np.diag([4.0, 4.0, 1e-4, 1e-4, weak**2, weak**2])
         spread[0, 0] += (height_m * weak) ** 2
         spread[0, 4] = spread[4, 0] = -height_m * weak**2
@@ -405,7 +405,7 @@ def test_a_measured_position_is_believed_where_nothing_led_there():
     mixture = Mixture(MODEL, EXTENT)
     for place in ([-700.0, 300.0], [650.0, 500.0], [100.0, -800.0]):
         mixture.predict(1.0)
-        mixture.told_position(np.array(place), 3.0)
+        mixture.measure_position(np.array(place), 3.0)
         found = mixture.estimate(RADIUS_M)
         assert np.hypot(*(found.mean[:2] - place)) < 5 and found.confidence > 0.5
         assert sum(each.share for each in mixture.hypotheses) + mixture.elsewhere == pytest.approx(

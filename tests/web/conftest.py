@@ -10,7 +10,7 @@ sys.path.append(str(Path(__file__).parents[1] / "localizer"))  # blots.py: the k
 
 from small_run import PLACES_EN_M, Small, result, serving, write_small_flight, write_small_map
 
-from orthonav.publish.jsonl import write_results
+from orthonav.flight.fixes import write_results
 from orthonav.web.opening import ViewRequest, open_run
 
 

@@ -11,7 +11,7 @@ from browsing import LAPTOP, TABLET, Visit, painted
 from playwright.sync_api import expect
 from small_run import CHUNK_PX, FRAME, GSD_M, PLACES_EN_M, WRONG, name, result, serving
 
-from orthonav.publish.jsonl import result_to_json
+from orthonav.flight.fixes import result_to_json
 from orthonav.web.opening import ViewRequest, open_run
 
 COUNT = len(PLACES_EN_M)

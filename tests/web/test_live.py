@@ -9,9 +9,9 @@ from blots import CAMERA
 from small_run import result
 
 from orthonav.errors import FlightError, MissingFileError
+from orthonav.flight.fixes import result_to_json
 from orthonav.onboard.log import FlightLog
 from orthonav.onboard.outputs import JsonOut
-from orthonav.publish.jsonl import result_to_json
 from orthonav.records import Telemetry
 from orthonav.web import feed as feed_module
 from orthonav.web import logs as logs_module

@@ -8,7 +8,7 @@ import urllib.request
 import pytest
 
 from orthonav.cli import view as view_module
-from orthonav.publish.jsonl import write_results
+from orthonav.flight.fixes import write_results
 from orthonav.records import Fix, ViewResult
 
 

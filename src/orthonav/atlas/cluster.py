@@ -4,7 +4,6 @@ A runner takes a function and items and yields the result of each item when it i
 that fails gives a `Failure`, and the others continue.
 """
 
-import importlib
 import itertools
 import logging
 import os
@@ -16,8 +15,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from orthonav.errors import MissingExtraError, OrthonavError, WorkerError
-from orthonav.prepare.sheet import usable_cores
+from orthonav.cores import usable_cores
+from orthonav.errors import OrthonavError, WorkerError
+from orthonav.extras import needed
 
 log = logging.getLogger(__name__)
 
@@ -226,10 +226,4 @@ def _called(probe: Callable[[], Made]) -> Made:
 def _imported() -> Any:
     # Read when Ray is imported: it turns Ray's usage reports off.
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    try:
-        return importlib.import_module("ray")
-    except ImportError as error:
-        raise MissingExtraError(
-            "building on several cores or machines needs Ray, which is not installed: "
-            "pip install 'orthonav[cluster]'"
-        ) from error
+    return needed("ray", "cluster", "building on several cores or machines")

@@ -18,6 +18,7 @@ from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.coverage import box_deg, check_covered, check_shown, require_sheets
 from orthonav.atlas.cut_sheets import CutSheet, opened_sheets, pooled_manifest, recipes
 from orthonav.atlas.warp import Warp, joined_cells, joined_grey
+from orthonav.cores import usable_cores
 from orthonav.embed.cells import CellLayout
 from orthonav.embed.whitened import CellSheet, WhitenedRecipe, learn
 from orthonav.errors import AreaError, OutputError, VariantError
@@ -37,7 +38,6 @@ from orthonav.prepare.sheet import (
     block_side_px,
     layer_parts,
     put_layer_parts,
-    usable_cores,
 )
 from orthonav.represent.gradients import OrientedGradients
 

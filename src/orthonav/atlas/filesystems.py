@@ -17,6 +17,7 @@ from typing import Any
 
 from orthonav.atlas.storage_errors import PACKAGES
 from orthonav.errors import MissingExtraError, StorageError
+from orthonav.extras import needed
 from orthonav.files import replacing
 
 _OBJECT_STORES = {"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oci", "oss", "memory"}
@@ -201,13 +202,7 @@ class RemoteFiles:
 
 
 def _open(url: str, protocol: str) -> tuple[Any, str]:
-    try:
-        import fsspec
-    except ImportError as error:
-        raise MissingExtraError(
-            "an atlas that is not in a local folder needs fsspec, which is not installed: "
-            "pip install 'orthonav[atlas]'"
-        ) from error
+    fsspec = needed("fsspec", "atlas", "an atlas in object storage")
     try:
         fsspec.get_filesystem_class(protocol)
         fs, path = fsspec.core.url_to_fs(url)
@@ -215,7 +210,7 @@ def _open(url: str, protocol: str) -> tuple[Any, str]:
         raise StorageError(f"invalid address ({error}): {protocol}://") from error
     except ImportError as error:
         package = PACKAGES.get(protocol)
-        needed = package or f"a package that is not installed ({error})"
+        wanted = package or f"a package that is not installed ({error})"
         how = f", which is not installed: pip install {package}" if package else ""
-        raise MissingExtraError(f"an atlas at {protocol}:// needs {needed}{how}") from error
+        raise MissingExtraError(f"an atlas at {protocol}:// needs {wanted}{how}") from error
     return fs, path

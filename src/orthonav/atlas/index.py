@@ -38,7 +38,7 @@ from orthonav.atlas.quantizers import (
     train,
 )
 from orthonav.atlas.store import digest_of
-from orthonav.embed.whitened import WhitenedEmbedder, learn_from
+from orthonav.embed.whitened import Made, WhitenedEmbedder, Work, learn_in_two_passes
 from orthonav.errors import AtlasError
 
 WHITENING_NAME = "whitening.safetensors"
@@ -119,9 +119,11 @@ class _IndexBuilder:
             )
         step = max(1, total // MAX_TRAINING_TILES)
         dims = POOLING.dims if total <= MANY_TILES else MANY_DIMS
-        embedder = _shortened(
-            learn_from(POOLING, sheets, lambda sheet: self._features(sheet, step)), dims
-        )
+
+        def over_sheets(work: Work[Made]) -> Iterator[Made]:
+            return (work(*self._features(sheet, step)) for sheet in sheets)
+
+        embedder = _shortened(learn_in_two_passes(POOLING, over_sheets), dims)
         (self._folder / WHITENING_NAME).write_bytes(
             save(embedder.parts(), metadata={"orthonav": FORMAT})
         )

@@ -15,12 +15,16 @@ import numpy as np
 from orthonav.atlas.agreement import MAX_REACH_M, MIN_VIEWS, Agreement, Chain, PlaceEvidence
 from orthonav.atlas.sheet_registration import SearchRegion, SheetMatch, SheetRegistrar
 from orthonav.atlas.tile_search import TileSearch
-from orthonav.confidence.registered import USUAL_BIAS, USUAL_WEIGHTS, RegisteredConfidence
+from orthonav.confidence.registered import (
+    USUAL_BIAS,
+    USUAL_CHANCES,
+    USUAL_WEIGHTS,
+    RegisteredConfidence,
+)
 from orthonav.geo.frames import LocalFrame, distances_m
 from orthonav.localizer.checks import check_footprint, check_view
 from orthonav.localizer.rectify import RectifiedView, downsampled, rectify_footprint
-from orthonav.localizer.registration import USUAL_CHANCES
-from orthonav.records import Fix, NoFix, Telemetry, View
+from orthonav.records import DEFAULT_YAW_STD_DEG, MIN_YAW_STD_DEG, Fix, NoFix, Telemetry, View
 
 # Values without another source: `python -m benchmarks.atlas_lost`.
 CANDIDATES = 24
@@ -31,8 +35,6 @@ LOG_SCALES = (-0.06, 0.06)
 view has a pose that is off by 4 deg and 6 % at most, for scales within 12 %."""
 KNOWN_SIGMAS = 2.0
 """Standard deviations of a reported heading that are searched to either side."""
-DEFAULT_YAW_STD_DEG, MIN_YAW_STD_DEG = 7.0, 2.0
-"""Assumed and least standard deviation of a reported heading."""
 REACH_STRIDES = 0.8
 """Strides of the coarse tiles around a candidate that are searched: more than half a diagonal."""
 TURN_STD_RAD = math.radians(4.0)

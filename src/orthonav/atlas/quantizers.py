@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from hashlib import sha256
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,8 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from orthonav.errors import AtlasError, MissingExtraError
+from orthonav.errors import AtlasError
+from orthonav.extras import needed
 
 Array = NDArray[np.float32]
 
@@ -42,12 +42,7 @@ FORMAT = "orthonav-vectors"
 
 def faiss() -> Any:
     """The module FAISS; raises `MissingExtraError` where it is not installed."""
-    try:
-        return import_module("faiss")
-    except ImportError as error:
-        raise MissingExtraError(
-            "searching an atlas needs faiss, which is not installed: pip install 'orthonav[atlas]'"
-        ) from error
+    return needed("faiss", "atlas", "searching an atlas")
 
 
 @contextmanager

@@ -14,9 +14,9 @@ from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.errors import AtlasError, MapFileError
 from orthonav.geo.frames import LocalFrame
 from orthonav.localizer import Localizer
-from orthonav.localizer.registration import PRIOR_SIGMAS, RegistrationLocalizer
+from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.mapfile import open_map
-from orthonav.records import NoFix, Prior, View
+from orthonav.records import PRIOR_SIGMAS, NoFix, Prior, View
 
 log = logging.getLogger(__name__)
 
@@ -132,17 +132,12 @@ def _registered(
     sheet: RegistrationLocalizer, view: View, region: SearchRegion
 ) -> SheetMatch | None:
     telemetry = replace(view.telemetry, yaw_deg=math.degrees(region.turn_rad))
-    prepared = sheet.prepared(replace(view, telemetry=telemetry), True)
-    if isinstance(prepared, NoFix):
-        return None
-    pose_prior = replace(prepared.prior, turn_rad=region.turn_rad, turn_std_rad=region.turn_std_rad)
-    prepared = replace(prepared, prior=pose_prior)
     prior = Prior(region.lat_deg, region.lon_deg, region.reach_m / PRIOR_SIGMAS)
-    if not sheet.touches_map(prior, prepared):
+    heading = region.turn_rad, region.turn_std_rad
+    seen = sheet.register(replace(view, telemetry=telemetry), prior, heading_std_rad=heading)
+    if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
         return None
-    best = sheet.best(prepared, prior)
-    if best is None:
-        return None
+    prepared, best = seen.prepared, seen.found
     pose = best.placed.pose
     lat, lon = sheet.sheet.frame.latlon_from_en(sheet.camera_en_m(prepared, pose))
     return SheetMatch(

@@ -1,7 +1,6 @@
 """The check of a map: where could views be placed, and would a route be flown well?"""
 
 import math
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -41,6 +40,7 @@ from orthonav.check.route import blind_stretches, predicted_along
 from orthonav.check.trials import Trial, run_many
 from orthonav.check.verdict import Findings, verdict_of
 from orthonav.check.views import LEAST_VALID, TrialPlan
+from orthonav.cores import usable_cores
 from orthonav.errors import AreaError, CameraError, MapFileError
 from orthonav.geo.area import Area
 from orthonav.geo.route import distance_to_polyline_m
@@ -95,7 +95,7 @@ class _Check:
                 f"only maps with a registration layer can be checked: {self.opened.path}"
             )
         self.sheet = registration.sheet
-        self.ground = Ground.of(registration.registrar.reference.pyramid, self.sheet.grid)
+        self.ground = Ground.of(registration.pyramid, self.sheet.grid)
         self.radius_m, self.floor_px = registration.radius_m, registration.floor_px
         self.calibrated = registration.confidence is not None
         self.plan = self._plan()
@@ -300,7 +300,7 @@ class _Check:
     def _workers(self) -> int:
         if self.request.workers is not None:
             return self.request.workers
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
+        return usable_cores()
 
     def _told(self, told: Field, points: Array, shown: NDArray[np.bool_]) -> Estimate:
         """Estimates at places; probability 0 where the map shows nothing."""

@@ -180,7 +180,7 @@ class Trier:
                 f"only maps with a registration layer can be checked: {plans[0].map_path}"
             )
         self._registration = registration
-        self._own = Pictures(registration.registrar.reference.pyramid, registration)
+        self._own = Pictures(registration.pyramid, registration)
         self._plans = plans
         self._others: dict[Path, tuple[OrthoPyramid, Pictures]] = {}
 
@@ -200,7 +200,7 @@ class Trier:
 
     def _other(self, path: Path) -> "Pictures":
         if path not in self._others:
-            pyramid = self._registration.registrar.reference.pyramid
+            pyramid = self._registration.pyramid
             other = OrthoPyramid(path, self._registration.sheet, pyramid.levels)
             self._others[path] = other, Pictures(other, self._registration)
         return self._others[path][1]
@@ -254,14 +254,10 @@ class Trier:
             told = place_en_m + rng.normal(0, plan.prior_std_m, 2)
             lat, lon = registration.sheet.frame.latlon_from_en(told)
             prior = Prior(float(lat), float(lon), plan.prior_std_m)
-        prepared = registration.prepared(view, plan.yaw_std_deg is not None)
-        best = None
-        if not isinstance(prepared, NoFix) and (
-            prior is None or registration.touches_map(prior, prepared)
-        ):
-            best = registration.best(prepared, prior)
-        if best is None or isinstance(prepared, NoFix):
+        seen = registration.register(view, prior, plan.yaw_std_deg is not None)
+        if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
             return Trial(index, here, math.nan, 0.0, expected, nowhere, nowhere, math.nan)
+        prepared, best = seen.prepared, seen.found
         confidence = registration.confidence
         sure = 0.0 if confidence is None else confidence(best.evidence())
         found = registration.camera_en_m(prepared, best.placed.pose)

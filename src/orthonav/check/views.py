@@ -13,6 +13,7 @@ from orthonav.check.persistence import MARGIN_PX, features, usual_model
 from orthonav.geo.camera import Camera
 from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.records import Telemetry, View
+from orthonav.register.pose import rotation
 from orthonav.register.reference import GreyPyramid
 from orthonav.register.registrar import Levels
 
@@ -86,7 +87,7 @@ def reported_persistence(
 
 def view_levels(plan: TrialPlan, registration: RegistrationLocalizer) -> Levels:
     """The levels of the map that views are placed at."""
-    levels = registration.registrar.reference.levels
+    levels = registration.pyramid.levels
     return Levels.of(plan.side_m / registration.grid.gsd_m, levels)
 
 
@@ -137,8 +138,7 @@ def view_of(
     width = max(8, round(plan.width_m / gsd_m))
     height = max(8, round(plan.height_m / gsd_m))
     yaw_deg = float(rng.uniform(0, 360))
-    cos, sin = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
-    linear = np.array([[cos, -sin], [sin, cos]])
+    linear = rotation(math.radians(yaw_deg))
     move = np.full(2, (size - 1) / 2) - linear @ [(width - 1) / 2, (height - 1) / 2]
     camera_gsd_m = plan.camera.gsd_m(plan.agl_m)
     if camera_gsd_m > gsd_m:

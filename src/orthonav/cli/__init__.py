@@ -6,6 +6,7 @@ A module with many options names the everyday ones in `EVERYDAY`; `--help` shows
 
 import argparse
 import importlib
+import io
 import logging
 import os
 import signal
@@ -15,7 +16,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
 
-from orthonav import __version__
+from orthonav.cli.needs import require_extras
+from orthonav.cli.version import show_version
 from orthonav.errors import OrthonavError
 
 COMMANDS = {
@@ -53,12 +55,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     verbose = False
     try:
+        if "--version" in arguments and COMMANDS.keys().isdisjoint(arguments):
+            return show_version(arguments)
         options = _parser(arguments).parse_args(arguments)
         verbose = options.verbose
         level = logging.DEBUG if verbose else logging.ERROR if options.quiet else logging.WARNING
         logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
         logging.getLogger("rasterio").setLevel(logging.CRITICAL)
+        # Where the home cannot be written it keeps its fonts elsewhere: nothing to be done.
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)
+        _print_any_letter()
         with _terminable():
+            require_extras(options.command)
             status: int | None = _module(options.command).run(options)
             sys.stdout.flush()
     except OrthonavError as error:
@@ -68,11 +76,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except UnicodeEncodeError as error:
+        letters = f"{error.object[error.start : error.end]!a:.40}"
+        return _failed(
+            f"a name has letters ({letters}) that the locale cannot express: set PYTHONUTF8=1",
+            verbose,
+        )
     except OSError as error:  # a disk or a device that fails where nobody expected it
         return _failed(_one_line(error), verbose)
     except MemoryError:
         return _failed("out of memory", verbose)
     return status or 0
+
+
+def _print_any_letter() -> None:
+    """Names with letters that the locale lacks are printed escaped, as on stderr."""
+    out = sys.stdout
+    if isinstance(out, io.TextIOWrapper) and out.encoding.lower() not in ("utf-8", "utf8"):
+        out.reconfigure(errors="backslashreplace")
 
 
 @contextmanager
@@ -96,7 +117,12 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         "orthophoto of another year.",
         epilog="orthonav COMMAND --help tells more.",
     )
-    parser.add_argument("--version", action="version", version=f"orthonav {__version__}")
+    parser.add_argument(
+        "--version",
+        action="store_true",
+        help="print the version; with --verbose (or --json) also what is installed, what is "
+        "missing for which command, and the processor's abilities",
+    )
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("-v", "--verbose", action="store_true", help="say more, on stderr")
     common.add_argument("-q", "--quiet", action="store_true", help="errors only, no progress")

@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.errors import FlightError
     from orthonav.flight import read_truth
     from orthonav.flight.mount import write_mount
-    from orthonav.flight.recording import Retold
+    from orthonav.flight.recording import WithTelemetry
     from orthonav.localizer import Localizer
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> None:
     flight = open_source(options.flight, options)
     places = read_truth(options.gnss) if options.gnss else {}
     told = {frame: Prior(*place, options.gnss_std_m) for frame, place in places.items()}
-    views = (Retold(v, replace(v.telemetry, prior=told.get(v.frame))) for v in flight.views)
+    views = (WithTelemetry(v, replace(v.telemetry, prior=told.get(v.frame))) for v in flight.views)
     tracker = Tracker(
         Localizer(open_map(options.map)),
         heading_known=options.heading == "known",

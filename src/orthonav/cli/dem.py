@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import ImageryError, MissingExtraError, MissingFileError
+from orthonav.errors import ImageryError, MissingFileError
+from orthonav.extras import missing_extra
 from orthonav.geo.route import Route, leg_lengths_m
 from orthonav.geo.terrain import Ground
 
@@ -27,9 +28,7 @@ def read_dem(path: Path, route: Route, margin_m: float) -> Ground:
         from rasterio._err import CPLE_BaseError
         from rasterio.errors import RasterioError
     except ImportError as error:
-        raise MissingExtraError(
-            "reading terrain needs rasterio; install it with: pip install 'orthonav[geo]'"
-        ) from error
+        raise missing_extra("reading terrain", "geo", "rasterio", error) from error
     if not path.is_file():
         raise MissingFileError(f"terrain file does not exist: {path}")
     try:

@@ -87,12 +87,12 @@ def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[
     from orthonav.evaluate.metrics import compare, measure
     from orthonav.evaluate.report import MadeFrom, write_report
     from orthonav.flight import open_flight, read_truth
+    from orthonav.flight.fixes import write_results
     from orthonav.geo.route import read_route
     from orthonav.localizer import Localizer
     from orthonav.mapfile import open_map
     from orthonav.onboard.run import SingleViews, localize_flight
     from orthonav.prepare import BuildRequest, build_map
-    from orthonav.publish.jsonl import write_results
     from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
     from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
 

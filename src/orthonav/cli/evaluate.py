@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import print_json
+from orthonav.cli.needs import require_extras
 
 if TYPE_CHECKING:
     from orthonav.evaluate.contact_sheet import Row
@@ -70,6 +71,8 @@ def run(options: argparse.Namespace) -> None:
         )
     if not 0 < options.radius_m < 1e7:
         raise FlightError(f"radius must be above 0 m, got {options.radius_m}")
+    if options.report:
+        require_extras("evaluate --report")
     _check_flights(options)
     opened = open_map(options.map) if options.map else None
     flights = _measured(options, opened)
@@ -107,7 +110,7 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     from orthonav.evaluate.metrics import compare, measure
     from orthonav.evaluate.track import measure_track
     from orthonav.flight import open_flight, read_truth
-    from orthonav.publish.jsonl import read_results
+    from orthonav.flight.fixes import read_results
 
     local = opened.manifest.sheets[0].frame if opened else None
     background = map_background(opened) if opened else None

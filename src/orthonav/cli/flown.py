@@ -73,7 +73,7 @@ def _answer(result: "ViewResult") -> str:
     """A result without the time it took."""
     from dataclasses import replace
 
-    from orthonav.publish.jsonl import result_to_json
+    from orthonav.flight.fixes import result_to_json
 
     return result_to_json(replace(result, latency_ms=0.0))
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from orthonav.cli.common import print_json, progress
 from orthonav.cli.flown import take_flown, tell_whether_as_flown
+from orthonav.cli.needs import require_extras
 from orthonav.cli.source import add_source, open_source
 
 if TYPE_CHECKING:
@@ -128,13 +129,13 @@ def run(options: argparse.Namespace) -> None:
 def _on_map(options: argparse.Namespace) -> None:
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
+    from orthonav.flight.fixes import write_results
     from orthonav.localizer import Localizer
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
     from orthonav.mapfile.signature import require_signature
     from orthonav.onboard.calibrate import Mounted, model_of
     from orthonav.onboard.run import Locator, SingleViews, localize_flight, smoothed_track
-    from orthonav.publish.jsonl import write_results
     from orthonav.search.position import check_rule
 
     if options.lag is not None and not (options.smooth and options.lag >= 0):
@@ -184,14 +185,15 @@ def _on_map(options: argparse.Namespace) -> None:
 
 def _on_atlas(options: argparse.Namespace) -> None:
     """Without a prior: only what views agree on is a fix."""
+    require_extras("localize --atlas")
     from orthonav.atlas.catalog import Atlas
     from orthonav.atlas.locate import AtlasLocator
     from orthonav.atlas.sheet_registration import SheetRegistrar
     from orthonav.atlas.tile_search import TileSearch
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
+    from orthonav.flight.fixes import write_results
     from orthonav.onboard.run import localize_flight
-    from orthonav.publish.jsonl import write_results
 
     asked = [
         name

@@ -38,6 +38,10 @@ class Chances:
             raise VariantError(f"chance values must be above 0 and finite: {self}")
 
 
+USUAL_CHANCES = Chances(32.0, 15.0, 48.0)
+"""Chance values for a map on which none were measured: those of generated landscapes."""
+
+
 @dataclass(frozen=True)
 class RegisteredConfidence:
     """P(right) = 1 / (1 + exp(-(bias + weights . features))).

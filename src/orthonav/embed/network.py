@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MapFileError, MissingExtraError, VariantError
+from orthonav.errors import MapFileError, VariantError
+from orthonav.extras import needed
 
 SIMILARITIES = ("product", "cosine")
 PRECISIONS = ("float32", "float16", "int8")
@@ -220,13 +221,7 @@ class NetworkEmbedder:
 
 
 def _onnxruntime() -> Any:
-    try:
-        import onnxruntime  # type: ignore[import-untyped, import-not-found, unused-ignore]
-    except ImportError as error:
-        raise MissingExtraError(
-            "neural encoders need onnxruntime, which is not installed: pip install orthonav[neural]"
-        ) from error
-    return onnxruntime
+    return needed("onnxruntime", "neural", "running a neural encoder")
 
 
 def check_graph(data: NDArray[np.uint8]) -> None:

@@ -11,11 +11,11 @@ vectors.
 import contextlib
 import math
 import mmap
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -32,7 +32,8 @@ SHARE_ROUNDING = 1e-3
 TINY = np.float32(1e-30)
 SPARSE_BYTES = 32 * 2**20
 Made = TypeVar("Made")
-Part = TypeVar("Part")
+Features = NDArray[np.float32]
+Work = Callable[[Features, Features], Made]
 
 
 @dataclass(frozen=True)
@@ -237,7 +238,7 @@ class WhitenedEmbedder:
             features, weights = pooled_features(self.recipe, sheet, tiles_px[part])
             out[part] = self.features(features, weights)
 
-        for _ in _worked(fill, _chunks(len(tiles_px)), workers):
+        for _ in _worked(fill, len(tiles_px), workers):
             pass
         return out
 
@@ -358,50 +359,47 @@ def learn(
 ) -> WhitenedEmbedder:
     """Learn mean and whitening from the tiles (N, 2) of the reference area.
 
-    At most `MAX_LEARNT_TILES` of them, evenly spaced, are used. Fewer than `dims` components are
-    learnt where the tiles do not span more. The result is the same for any number of threads
-    (`workers`).
+    At most `MAX_LEARNT_TILES` of them, evenly taken, are used. Fewer than `dims` components are
+    kept where the tiles do not span more. The same is learnt by any number of threads (`workers`).
     """
     taken = tiles_px[:: max(1, -(-len(tiles_px) // MAX_LEARNT_TILES))]
-    return learn_from(
-        recipe,
-        list(_chunks(len(taken))),
-        lambda part: pooled_features(recipe, sheet, taken[part]),
-        workers,
-    )
+
+    def over_batches(work: Work[Made]) -> Iterator[Made]:
+        return _worked(
+            lambda part: work(*pooled_features(recipe, sheet, taken[part])), len(taken), workers
+        )
+
+    return learn_in_two_passes(recipe, over_batches)
 
 
-def learn_from(
-    recipe: WhitenedRecipe,
-    parts: Sequence[Part],
-    features_of: Callable[[Part], tuple[NDArray[np.float32], NDArray[np.float32]]],
-    workers: int = 1,
-) -> WhitenedEmbedder:
-    """Learn mean and whitening from features and weights (n, F) of parts of the reference tiles.
+class OverBatches(Protocol):
+    """Runs a function on the features (N, F) and weights (N, F) of every batch, in order."""
 
-    `features_of` gives those of a part, as `pooled_features`; it is called twice for every part,
-    by several threads where `workers` is above 1.
-    """
+    def __call__(self, work: "Work[Made]") -> Iterator[Made]:
+        """What the function makes of each batch."""
 
-    def sums(part: Part) -> tuple[int, NDArray[np.float64], NDArray[np.float64]]:
-        features, weights = features_of(part)
+
+def learn_in_two_passes(recipe: WhitenedRecipe, over_batches: OverBatches) -> WhitenedEmbedder:
+    """The whitening of features that come in batches: one pass for their mean, one for scatter."""
+
+    def sums(features: Features, weights: Features) -> tuple[Any, Any]:
         total = np.einsum("nf,nf->f", features, weights, dtype=np.float64)
-        return len(features), total, weights.sum(axis=0, dtype=np.float64)
-
-    def products(part: Part) -> NDArray[np.float64]:
-        features, weights = features_of(part)
-        centred = (features - mean.astype(np.float32)) * weights
-        return np.asarray((centred.T @ centred).astype(np.float64))
+        return total, weights.sum(axis=0, dtype=np.float64)
 
     total: Any = 0.0
     weight: Any = 1e-9
-    count = 0
-    for number, some, their_weight in _worked(sums, parts, workers):
-        count, total, weight = count + number, total + some, weight + their_weight
+    for some, their_weight in over_batches(sums):
+        total, weight = total + some, weight + their_weight
     mean = (total / weight).astype(np.float16)
+
+    def products(features: Features, weights: Features) -> tuple[Any, int]:
+        centred = (features - mean.astype(np.float32)) * weights
+        return (centred.T @ centred).astype(np.float64), len(features)
+
     scatter: Any = 0.0
-    for product in _worked(products, parts, workers):
-        scatter = scatter + product
+    count = 0
+    for product, size in over_batches(products):
+        scatter, count = scatter + product, count + size
     return _whitening(recipe, mean, scatter, count)
 
 
@@ -424,13 +422,13 @@ def _whitening(
     return WhitenedEmbedder(recipe, mean, basis.astype(np.float16))
 
 
-def _worked(work: Callable[[Part], Made], parts: Iterable[Part], workers: int) -> Iterator[Made]:
-    """The results of `work` for each part, in order, by `workers` threads."""
+def _worked(work: Callable[[slice], Made], count: int, workers: int) -> Iterator[Made]:
+    """What `work` makes of some tiles at a time, in their order, by so many threads."""
     if workers <= 1:
-        yield from map(work, parts)
+        yield from map(work, _chunks(count))
         return
     with ThreadPoolExecutor(workers) as pool:
-        yield from pool.map(work, parts)
+        yield from pool.map(work, _chunks(count))
 
 
 def _chunks(count: int) -> Iterator[slice]:

@@ -26,7 +26,7 @@ from orthonav.evaluate.figures import (
     share,
 )
 from orthonav.evaluate.metrics import FAR_M, Comparison
-from orthonav.publish.jsonl import STATES
+from orthonav.flight.fixes import STATES
 from orthonav.records import CONFIDENT, Fix, ViewResult
 
 RADII_M = (25.0, 60.0)

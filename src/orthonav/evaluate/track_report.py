@@ -8,7 +8,7 @@ from orthonav.evaluate.calibration import nees_bound
 from orthonav.evaluate.figures import FloatArray, or_none
 from orthonav.evaluate.metrics import radius_key
 from orthonav.evaluate.track import Consistency, Longest, Series, Spread, Track
-from orthonav.publish.jsonl import STATES
+from orthonav.flight.fixes import STATES
 from orthonav.report.numbers import percent_text
 
 

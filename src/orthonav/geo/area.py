@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from orthonav.errors import AreaError
 from orthonav.geo.frames import MAX_SHEET_M, LocalFrame
 from orthonav.geo.route import Route, within_bands
+from orthonav.geo.swapped import swapped_hint
 
 Extent = tuple[float, float, float, float]
 
@@ -39,7 +40,13 @@ class Area:
                 f"south < north, got {','.join(map(str, bounds_deg))}"
             )
         if max(abs(south), abs(north)) > 89.9 or east - west > 10 or north - south > 10:
-            raise AreaError(f"bounds are no area a sheet can hold, in degrees: {bounds_deg}")
+            hint = swapped_hint(
+                north if abs(north) > abs(south) else south, max(west, east, key=abs)
+            )
+            raise AreaError(
+                "bounds must be west,south,east,north in degrees, at most 10 degrees across"
+                f"{hint}, got {','.join(map(str, bounds_deg))}"
+            )
         share = np.linspace(0, 1, 33)
         lon = west + (east - west) * share
         lat = south + (north - south) * share

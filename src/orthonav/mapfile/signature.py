@@ -16,7 +16,8 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.errors import MapFileError, MissingExtraError, MissingFileError, OutputError
+from orthonav.errors import MapFileError, MissingFileError, OutputError
+from orthonav.extras import missing_extra
 from orthonav.files import replacing, require_file, write_text
 from orthonav.mapfile.manifest import MAX_MANIFEST_BYTES, Manifest
 from orthonav.mapfile.reader import MAX_HEADER_BYTES, MIN_FILE_BYTES
@@ -238,7 +239,5 @@ def _crypto() -> tuple[Any, Any, Any]:
         from cryptography.hazmat.primitives import serialization
         from cryptography.hazmat.primitives.asymmetric import ed25519
     except ImportError as error:
-        raise MissingExtraError(
-            f"signatures need cryptography: pip install 'orthonav[signing]' ({error})"
-        ) from error
+        raise missing_extra("a signature", "signing", "cryptography", error) from error
     return InvalidSignature, serialization, ed25519

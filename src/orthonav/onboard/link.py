@@ -4,7 +4,6 @@ What comes in is decoded by pymavlink (extra `autopilot`);
 what goes out is packed by `orthonav.publish.mavlink`.
 """
 
-import importlib
 import logging
 import math
 import select
@@ -14,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from orthonav.errors import MissingExtraError
+from orthonav.extras import needed
 from orthonav.onboard.ports import Transport
 from orthonav.onboard.telemetry import Clocks, ClockSync, TelemetryBuffer, Told, wxyz_of_angles
 from orthonav.publish.estimate import EstimateError
@@ -390,12 +389,7 @@ class LinkThread:
 
 def _decoder(signing: Signing | None) -> Any:
     """A decoder of what comes in: the larger dialect, which has RANGEFINDER too."""
-    try:
-        module = importlib.import_module("pymavlink.dialects.v20.ardupilotmega")
-    except ImportError as error:
-        raise MissingExtraError(
-            f"a link to an autopilot needs pymavlink: pip install 'orthonav[autopilot]' ({error})"
-        ) from error
+    module = needed("pymavlink.dialects.v20.ardupilotmega", "autopilot", "a link to an autopilot")
     decoder = module.MAVLink(None)
     decoder.robust_parsing = True
     if signing is not None:

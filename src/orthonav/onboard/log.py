@@ -22,7 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__
-from orthonav.errors import CameraError, MissingExtraError, OutputError
+from orthonav.errors import CameraError, OutputError
+from orthonav.extras import needed
+from orthonav.flight.fixes import result_to_json
 from orthonav.flight.logged import (
     CAMERA,
     FORMAT,
@@ -48,7 +50,6 @@ from orthonav.flight.logged import (
 )
 from orthonav.flight.png import lossless_png
 from orthonav.geo.camera import Camera
-from orthonav.publish.jsonl import result_to_json
 from orthonav.records import CONFIDENT, Fix, Telemetry, ViewResult
 from orthonav.sources.recording import fitted
 
@@ -114,12 +115,7 @@ class FlightLog:
         which is what a power cut takes. Numbers go on after those of files that are there.
         Raises `OutputError` where the folder cannot be written and `MissingExtraError`.
         """
-        try:
-            import orthonav.onboard.segment  # noqa: F401  loads mcap
-        except ImportError as error:
-            raise MissingExtraError(
-                f"a flight log needs mcap: pip install 'orthonav[autopilot]' ({error})"
-            ) from error
+        needed("mcap", "autopilot", "a flight log")
         path = Path(path)
         self._folder, self._name = path.parent, path.stem if path.suffix == ".mcap" else path.name
         try:
@@ -394,6 +390,6 @@ def _result(result: ViewResult, index: int) -> "list[Message]":
             data = position_message(result.outcome, result.time_ns)
             messages.append(_message(POSITION, result.time_ns, data, index))
             sure = result.outcome.confidence >= CONFIDENT and result.state in (None, "tracking")
-            data = navsat_message(result.outcome, result.time_ns, sure=sure)
+            data = navsat_message(result.outcome, result.time_ns, confident=sure)
             messages.append(_message(NAVSAT, result.time_ns, data, index))
     return messages

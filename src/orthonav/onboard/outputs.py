@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Protocol, TextIO
 
 from orthonav.errors import VariantError
+from orthonav.flight.fixes import result_to_json
 from orthonav.onboard.ports import Descriptor, device_baud, host_port, open_serial
 from orthonav.onboard.telemetry import Clocks, Told
 from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
 from orthonav.publish.gate import Gate
-from orthonav.publish.jsonl import result_to_json
 from orthonav.publish.local import Autopilot, Origin
 from orthonav.publish.mavlink import (
     AUTOPILOT,

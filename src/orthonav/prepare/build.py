@@ -24,9 +24,10 @@ from orthonav.geo.estimate import estimate_map
 from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
+from orthonav.localizer.match import TileMatcher
+from orthonav.localizer.plan import SearchPlan
 from orthonav.localizer.propose import TileProposer
 from orthonav.localizer.registration import RegistrationLocalizer
-from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import Manifest, SheetInfo
 from orthonav.mapfile.reader import MapFile
 from orthonav.mapfile.writer import write_map
@@ -45,8 +46,6 @@ from orthonav.prepare.layout import grid_of, tiles_of
 from orthonav.prepare.methods import method_recipe, stored_representation, usual_edges
 from orthonav.prepare.pictures import SheetPictures, read_pictures
 from orthonav.prepare.sheet import SheetReader
-from orthonav.search.exact import ExactIndex
-from orthonav.search.peak import TileNeighbours
 from orthonav.variants import make_variant, variant_recipe
 
 log = logging.getLogger(__name__)
@@ -267,20 +266,15 @@ def _registration(
     """What the manifest says of registration: placed on the map as it will be written."""
     sheet = manifest.sheets[0]
     radius_m = max(RADIUS_PX * sheet.grid.gsd_m, MIN_RADIUS_M)
-    made = MapFile(request.out, 0, manifest, arrays)
-    layer = GreyLayer.of(made)
-    assert layer is not None
-    propose = TileProposer.of(
-        sheet.grid,
-        arrays["sheet0/centres_en_m"],
-        ExactIndex(arrays["sheet0/embeddings"]),
-        embedder,
-        read.representation,
-        TileNeighbours(sheet.grid, arrays["sheet0/centres_en_m"]),
+    unfitted = {"confidence": None, "radius_m": radius_m, "position_floor_px": FLOOR_PX}
+    made = MapFile(request.out, 0, replace(manifest, registration=unfitted), arrays)
+    tiles = TileMatcher(sheet.grid, arrays["sheet0/centres_en_m"], arrays["sheet0/embeddings"])
+    localizer = RegistrationLocalizer.of_map(
+        made,
+        TileProposer.of(tiles, embedder, read.representation),
+        SearchPlan(last_ms=SEARCH_MS),
     )
-    localizer = RegistrationLocalizer(
-        sheet, layer, None, radius_m, FLOOR_PX, propose, last_ms=SEARCH_MS
-    )
+    assert localizer is not None
     later = [
         crop
         for each in other_dates

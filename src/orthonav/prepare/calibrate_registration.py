@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from orthonav.confidence.registered import Chances, RegisteredConfidence, fit_registered
 from orthonav.geo.camera import Camera
 from orthonav.geo.grid import TileGrid
-from orthonav.localizer.registration import PRIOR_SIGMAS, RegistrationLocalizer
+from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.prepare.calibrate import Crop
 from orthonav.prepare.change import changed
-from orthonav.records import NoFix, Prior, Telemetry, View
+from orthonav.records import PRIOR_SIGMAS, NoFix, Prior, Telemetry, View
+from orthonav.register.pose import rotation
 
 YAW_STD_DEG = 5.0
 AGL_STD = 0.05
@@ -116,11 +117,11 @@ def _placed(
     picture = np.ascontiguousarray(crop.grey[:, ::-1]) if mirror else crop.grey
     if not other_date:
         picture = changed(rng, picture, stranger)
-    prepared = localizer.prepared(_view(rng, picture, localizer.grid), True)
-    prior = _prior(rng, localizer, crop)
-    best = None if isinstance(prepared, NoFix) else localizer.best(prepared, prior)
-    if best is None:
+    view = _view(rng, picture, localizer.grid)
+    seen = localizer.register(view, _prior(rng, localizer, crop))
+    if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
         return None
+    best = seen.found
     error = np.array([best.placed.pose.x_px - crop.col_px, best.placed.pose.y_px - crop.row_px])
     return _Outcome(best.evidence(), error, mirror, other_date)
 
@@ -146,8 +147,7 @@ def _view(rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid) 
     width = max(16, round(longest * rng.uniform(*SIDES)))
     height = max(12, round(width * 0.75))
     yaw_deg = rng.uniform(0, 360)
-    cos, sin = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
-    linear = np.array([[cos, -sin], [sin, cos]])
+    linear = rotation(math.radians(yaw_deg))
     move = np.full(2, (size - 1) / 2) - linear @ [(width - 1) / 2, (height - 1) / 2]
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     matrix = np.column_stack([linear, move])

@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.embed.network import AutoEncoderRecipe, NetworkEmbedder, TripletRecipe
-from orthonav.embed.words import WordsEmbedder, WordsRecipe, learn_words
-from orthonav.errors import MissingExtraError, VariantError
+from orthonav.embed.words import WordsEmbedder, WordsRecipe
+from orthonav.errors import VariantError
+from orthonav.extras import needed
 from orthonav.neural.tiles import SheetTiles
+from orthonav.neural.words import learn_words
 from orthonav.prepare.change import changed
 from orthonav.prepare.pictures import SheetPictures
 
@@ -110,11 +112,5 @@ def _embedded(encoder: Encoder, tiles: SheetTiles, report: Report) -> NDArray[np
 
 
 def _training() -> Any:
-    try:
-        importlib.import_module("torch")
-    except ImportError as error:
-        raise MissingExtraError(
-            "learning a network needs PyTorch, which is not installed: "
-            "pip install 'orthonav[train]'"
-        ) from error
+    needed("torch", "train", "learning a network")
     return importlib.import_module("orthonav.neural.training")

@@ -8,7 +8,6 @@ from there.
 
 import logging
 import math
-import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ import rasterio
 from numpy.typing import NDArray
 
 from orthonav import __version__, represent
+from orthonav.cores import usable_cores
 from orthonav.embed.cells import CellLayout, cell_means
 from orthonav.embed.whitened import CellSheet
 from orthonav.errors import AreaError
@@ -45,11 +45,6 @@ MIN_KEPT_BLOCKS = 16
 KEPT_BYTES_PER_PX = 1.6
 """Disk for a pixel of a kept block; a corridor of the generated landscape at 1 m took 1.3."""
 MAX_WORKERS = 64
-
-
-def usable_cores() -> int:
-    """Processor cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ is made by a function, bytes by `Packer`, and `orthonav.publish.gate` says what 
 pymavlink (extra `autopilot`) is loaded when the first message is made.
 """
 
-import importlib
 import math
 from dataclasses import dataclass, field
 from typing import Any
 
 from orthonav.errors import MissingExtraError
+from orthonav.extras import needed
 from orthonav.publish.estimate import (
     Clock,
     EstimateError,
@@ -249,12 +249,7 @@ def require_confident(estimate: NavigationEstimate, min_confidence: float, messa
 
 def dialect() -> Any:
     """pymavlink's `common` dialect. Raises `MissingExtraError` where it is missing or too old."""
-    try:
-        module = importlib.import_module("pymavlink.dialects.v20.common")
-    except ImportError as error:
-        raise MissingExtraError(
-            f"messages to autopilots need pymavlink: pip install 'orthonav[autopilot]' ({error})"
-        ) from error
+    module = needed("pymavlink.dialects.v20.common", "autopilot", "sending to an autopilot")
     if not hasattr(module, "MAVLink_global_position_sensor_message"):
         raise MissingExtraError(
             "this pymavlink does not know GLOBAL_POSITION_SENSOR: "

@@ -9,6 +9,12 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
+def rotation(turn_rad: float, scale: float = 1.0) -> Array:
+    """Matrix (2, 2) of a clockwise turn and a scale, for x to the right and y down."""
+    cos, sin = scale * math.cos(turn_rad), scale * math.sin(turn_rad)
+    return np.array([[cos, -sin], [sin, cos]])
+
+
 @dataclass(frozen=True)
 class Pose:
     """Where the middle of a view's window lies on the map, and how it is turned and scaled.
@@ -26,9 +32,7 @@ class Pose:
     @property
     def linear(self) -> Array:
         """Rotation and scale (2, 2) from the view's window to the map."""
-        scale = math.exp(self.log_scale)
-        cos, sin = scale * math.cos(self.turn_rad), scale * math.sin(self.turn_rad)
-        return np.array([[cos, -sin], [sin, cos]])
+        return rotation(self.turn_rad, math.exp(self.log_scale))
 
     def map_px(self, from_middle_px: Array) -> Array:
         """Map coordinates (..., 2) of points given from the middle of the window, level 0 px."""

@@ -126,16 +126,6 @@ def derivatives(channels: Array, mask: Array) -> Array:
     return out
 
 
-def basis_fields(shape: tuple[int, ...]) -> Array:
-    """By how much x and y of each pixel change with those steps: (4, 2, H, W)."""
-    x, y = _from_middle(*shape)
-    out = np.zeros((4, 2, *shape), dtype=np.float32)
-    out[0, 0], out[1, 1] = 1, 1
-    out[2, 0], out[2, 1] = -y, x
-    out[3, 0], out[3, 1] = x, y
-    return out
-
-
 def _from_middle(height: int, width: int) -> tuple[Array, Array]:
     """Centres of pixels from the middle of a window, x (1, W) and y (H, 1)."""
     x = (np.arange(width, dtype=np.float32) + np.float32(0.5 - width / 2))[None]

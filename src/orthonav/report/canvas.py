@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MissingExtraError
+from orthonav.extras import missing_extra
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -81,9 +81,7 @@ def draw_figure(size_in: tuple[float, float], draw: "Callable[[Figure], None]") 
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise MissingExtraError(
-            "pictures need matplotlib, which is not installed: pip install 'orthonav[report]'"
-        ) from error
+        raise missing_extra("drawing figures", "report", "matplotlib", error) from error
     svg = io.StringIO()
     with _own_style():
         figure = Figure(figsize=size_in, dpi=DPI, layout="constrained")

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MissingExtraError, VariantError
+from orthonav.errors import VariantError
+from orthonav.extras import needed
 
 MARGIN_PX = 32
 
@@ -99,11 +100,4 @@ def _filled(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uin
 
 
 def _felzenszwalb() -> Any:
-    try:
-        from skimage.segmentation import felzenszwalb
-    except ImportError as error:
-        raise MissingExtraError(
-            "graph-based segmentation needs scikit-image, which is not installed: "
-            "pip install 'orthonav[segments]'"
-        ) from error
-    return felzenszwalb
+    return needed("skimage.segmentation", "segments", "graph-based segmentation").felzenszwalb

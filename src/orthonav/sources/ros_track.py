@@ -8,17 +8,17 @@ import numpy as np
 
 from orthonav.sources.attitude import Angles, enu_from_ros_camera, rotations_of_wxyz
 from orthonav.sources.ros_topics import Topics
-from orthonav.sources.track import Samples, Series, Track, attitude_series
+from orthonav.sources.track import RecordedTrack, Samples, TimeSeries, attitude_series
 
 Reader = Any
 
 
-def read_track(reader: Reader, topics: Topics, mount_deg: Angles) -> Track:
-    """The track of the topics found; what no topic tells is not in it.
+def read_track(reader: Reader, topics: Topics, mount_deg: Angles) -> RecordedTrack:
+    """The track of the selected topics.
 
-    The attitude is that of the first topic that tells any (raw IMUs do not).
+    The attitude is that of the first topic that has one (raw IMUs do not).
     """
-    attitude: Series | None = None
+    attitude: TimeSeries | None = None
     for connection in topics.attitudes:
         attitude = _attitude(reader, topics, connection, mount_deg)
         if attitude is not None:
@@ -27,7 +27,7 @@ def read_track(reader: Reader, topics: Topics, mount_deg: Angles) -> Track:
     velocity = _collected(reader, topics, "velocity", 2, _velocity)
     position = _collected(reader, topics, "position", 3, _position)
     heights = None if height is None else height.series()
-    return Track(
+    return RecordedTrack(
         attitude=attitude,
         heights=() if heights is None else (heights,),
         position=None if position is None else position.positions(),
@@ -37,7 +37,7 @@ def read_track(reader: Reader, topics: Topics, mount_deg: Angles) -> Track:
 
 
 def stamp_ns(message: Any, recorded_ns: int) -> int:
-    """When a message was stamped, or, where it was not, recorded."""
+    """Time stamp of a message, or the time of its recording where it has none."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     stamped = 0 if stamp is None else int(stamp.sec) * 10**9 + int(stamp.nanosec)
     return stamped or recorded_ns
@@ -75,16 +75,18 @@ def height_of_message(message: Any) -> float | None:
 
 
 def _messages(reader: Reader, topics: Topics, connection: Any) -> Iterator[tuple[int, Any]]:
-    """Time of the stamp, else of recording, and message; what is broken is left out."""
+    """Time and message; damaged messages are skipped."""
     for one, recorded_ns, raw in reader.messages(connections=topics.of(connection)):
         try:
             message = reader.deserialize(raw, one.msgtype)
-        except Exception:  # one broken message is one sample less
+        except Exception:  # a damaged message is one sample less
             continue
         yield stamp_ns(message, recorded_ns), message
 
 
-def _attitude(reader: Reader, topics: Topics, connection: Any, mount_deg: Angles) -> Series | None:
+def _attitude(
+    reader: Reader, topics: Topics, connection: Any, mount_deg: Angles
+) -> TimeSeries | None:
     samples = Samples(4)
     for time_ns, message in _messages(reader, topics, connection):
         turn = attitude_of_message(message)
@@ -118,7 +120,7 @@ def _height(message: Any) -> tuple[float, ...] | None:
 
 
 def _velocity(message: Any) -> tuple[float, ...] | None:
-    """East and north of an odometry, whose twist is in the axes of the body."""
+    """East and north velocity of an odometry, whose twist is in body axes."""
     turn, twist = message.pose.pose.orientation, message.twist.twist.linear
     for enu_from_flu in rotations_of_wxyz(np.array([[turn.w, turn.x, turn.y, turn.z]]))[0]:
         east, north, _ = enu_from_flu @ [twist.x, twist.y, twist.z]

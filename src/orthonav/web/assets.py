@@ -7,6 +7,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from orthonav.errors import MissingExtraError
+from orthonav.extras import missing_extra
 
 _TYPES = {
     "html": "text/html; charset=utf-8",
@@ -61,9 +62,7 @@ def _leaflet() -> Path:
         package = importlib.import_module("xstatic.pkg.leaflet")
         folder = Path(package.BASE_DIR)
     except (ImportError, AttributeError) as error:
-        raise MissingExtraError(
-            "the page needs Leaflet, which is not installed: pip install 'orthonav[web]'"
-        ) from error
+        raise missing_extra("the page in the browser", "web", "xstatic", error) from error
     missing = [name for name in LEAFLET if not (folder / name).is_file()]
     if missing:
         raise MissingExtraError(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from orthonav.evaluate.calibration import is_covariance
 from orthonav.evaluate.metrics import FAR_M
-from orthonav.publish.jsonl import STATES
+from orthonav.flight.fixes import STATES
 from orthonav.records import CONFIDENT, Fix, ViewResult
 from orthonav.web.ground import Ground
 

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from orthonav.errors import FlightError
 from orthonav.files import require_file
-from orthonav.publish.jsonl import result_from_json
+from orthonav.flight.fixes import result_from_json
 from orthonav.records import ViewResult
 
 MAX_LINE_BYTES = 2**20

@@ -11,6 +11,7 @@ from typing import Any
 
 from orthonav.errors import FlightError, MissingFileError, OrthonavError
 from orthonav.flight import decode_image
+from orthonav.flight.fixes import result_from_json
 from orthonav.flight.logged import (
     HEALTH,
     MAX_JSON_BYTES,
@@ -27,7 +28,6 @@ from orthonav.flight.logged import (
 )
 from orthonav.flight.png import grey_of_png
 from orthonav.geo.camera import Camera
-from orthonav.publish.jsonl import result_from_json
 from orthonav.sources.flightlog import (
     NewerFormatError,
     files_of_run,
@@ -35,7 +35,15 @@ from orthonav.sources.flightlog import (
     run_of,
     session_of,
 )
-from orthonav.sources.mcap_chunks import Chunk, Found, LastChunk, Place, Walk, chunks, messages
+from orthonav.sources.mcap_chunks import (
+    Chunk,
+    LastChunk,
+    MessageLocation,
+    MessageSpan,
+    Walk,
+    chunks,
+    messages,
+)
 from orthonav.web.feed import MAX_HEALTH, MAX_VIEWS, Batch, checked_health
 from orthonav.web.pictures import Grey, Shot
 
@@ -58,7 +66,7 @@ class _File:
 
 
 @dataclass(frozen=True)
-class _Picture(Place):
+class _Picture(MessageLocation):
     """Where the data of a picture lies, and whether it is the whole view or a thumbnail."""
 
     whole: bool
@@ -137,7 +145,7 @@ class LogReader:
         if file.walk.damaged > damaged == 0:
             batch.problems.append(f"damaged chunks are left out: {file.path}")
 
-    def _try(self, found: Found, chunk: Chunk, path: Path, batch: Batch) -> None:
+    def _try(self, found: MessageSpan, chunk: Chunk, path: Path, batch: Batch) -> None:
         try:
             self._take(found, chunk, path, batch)
         except (_EndError, NewerFormatError):
@@ -147,7 +155,7 @@ class LogReader:
             if self._broken == 1:
                 batch.problems.append(f"a message is left out ({error}): {path}")
 
-    def _take(self, found: Found, chunk: Chunk, path: Path, batch: Batch) -> None:
+    def _take(self, found: MessageSpan, chunk: Chunk, path: Path, batch: Batch) -> None:
         if found.topic in (VIEW.name, THUMBNAIL.name):
             whole = found.topic == VIEW.name
             place = _Picture(path, chunk.offset, found.first, found.last, whole)

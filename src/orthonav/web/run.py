@@ -11,7 +11,7 @@ import numpy as np
 from orthonav import __version__
 from orthonav.errors import FlightError, OrthonavError
 from orthonav.evaluate.contact_sheet import as_fixed
-from orthonav.publish.jsonl import STATES
+from orthonav.flight.fixes import STATES
 from orthonav.records import Fix, Telemetry, ViewResult
 from orthonav.web.columns import columns_of
 from orthonav.web.feed import Batch, Feed

@@ -13,7 +13,8 @@ from orthonav.check.write.plain import is_check, to_json
 from orthonav.check.write.raster import tif_bytes
 from orthonav.check.write.shapes import layers
 from orthonav.check.write.styles import raster_style
-from orthonav.errors import MissingExtraError, OutputError
+from orthonav.errors import OutputError
+from orthonav.extras import needed
 from orthonav.files import replacing, replacing_folder, write_text
 from orthonav.mapfile.reader import MapFile
 from orthonav.report import write_figures
@@ -69,18 +70,8 @@ def require_free(out: Path) -> None:
         raise OutputError(f"output folder is a file: {out}")
     load_leaflet()
     for module in ("rasterio", "shapely", "pyogrio"):
-        _require(module, "geo")
-    _require("matplotlib", "report")
-
-
-def _require(module: str, extra: str) -> None:
-    try:
-        __import__(module)
-    except ImportError as error:
-        raise MissingExtraError(
-            f"writing a check needs {module}, which is not installed: pip install "
-            f"'orthonav[{extra}]'"
-        ) from error
+        needed(module, "geo", "writing a check")
+    needed("matplotlib", "report", "writing a check")
 
 
 def _foreign(folder: Path) -> str | None:

@@ -10,7 +10,8 @@ import numpy as np
 
 from orthonav.check.write.shapes import Layer
 from orthonav.check.write.styles import layer_styles
-from orthonav.errors import MissingExtraError, OutputError
+from orthonav.errors import OutputError
+from orthonav.extras import missing_extra
 
 _DATE = "2000-01-01T00:00:00.000Z"
 """Stands for the time of writing in the file, so that the same check gives the same bytes."""
@@ -34,9 +35,7 @@ def write_geopackage(path: Path, layers: Sequence[Layer]) -> None:
     try:
         from pyogrio.errors import DataLayerError, DataSourceError, FeatureError
     except ImportError as error:
-        raise MissingExtraError(
-            "writing a check needs pyogrio, which is not installed: pip install 'orthonav[geo]'"
-        ) from error
+        raise missing_extra("writing a check", "geo", "pyogrio", error) from error
     try:
         with _fixed_date():
             for i, layer in enumerate(layers):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from orthonav.errors import MissingExtraError
+from orthonav.extras import missing_extra
 
 _SCRIPT, _STYLE = "leaflet.js", "leaflet.css"
 _PICTURE = re.compile(r"url\((images/[\w-]+\.png)\)")
@@ -30,9 +31,7 @@ def load_leaflet() -> Leaflet:
         style = (folder / _STYLE).read_text(encoding="utf-8")
         style = _PICTURE.sub(lambda found: f"url({_address(folder / found[1])})", style)
     except (ImportError, AttributeError) as error:
-        raise MissingExtraError(
-            "the page needs Leaflet, which is not installed: pip install 'orthonav[web]'"
-        ) from error
+        raise missing_extra("the page of a check", "web", "xstatic", error) from error
     except FileNotFoundError as error:
         raise MissingExtraError(
             f"the Leaflet that is installed lacks {Path(error.filename).name}: "

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from orthonav.check.outcome import CheckResult
-from orthonav.errors import MissingExtraError
+from orthonav.extras import missing_extra
 
 BANDS = {
     "probability": "probability of a correct, confident fix of one view",
@@ -30,9 +30,7 @@ def tif_bytes(result: CheckResult) -> bytes:
         from rasterio import Affine
         from rasterio.io import MemoryFile
     except ImportError as error:
-        raise MissingExtraError(
-            "writing a check needs rasterio, which is not installed: pip install 'orthonav[geo]'"
-        ) from error
+        raise missing_extra("writing a check", "geo", "rasterio", error) from error
     cells = result.cells
     rows, cols = cells.probability.shape
     side = cells.side_m

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthonav.check.outcome import Along, CheckResult
 from orthonav.check.write.risk import ALL_RISKS, risk_of
-from orthonav.errors import MissingExtraError
+from orthonav.extras import needed
 from orthonav.geo.frames import LocalFrame
 
 Array = NDArray[np.float64]
@@ -35,12 +35,7 @@ def layers(result: CheckResult) -> list[Layer]:
 
     Raises `MissingExtraError` without shapely.
     """
-    try:
-        import shapely  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError(
-            "writing a check needs shapely, which is not installed: pip install 'orthonav[geo]'"
-        ) from error
+    needed("shapely", "geo", "writing a check")
     found = [_cells(result)]
     if result.along is not None:
         found += [_route(result, result.along), _blind(result, result.along)]

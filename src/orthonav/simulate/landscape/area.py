@@ -8,7 +8,8 @@ from zlib import crc32
 
 import numpy as np
 
-from orthonav.errors import AreaError, MissingExtraError, OutputError
+from orthonav.errors import AreaError, OutputError
+from orthonav.extras import missing_extra
 from orthonav.files import replacing
 from orthonav.simulate.landscape.epoch import DEFAULT_DATES, Epoch
 from orthonav.simulate.landscape.scene import ORIGIN_M, Landscape, check_gsd
@@ -85,9 +86,7 @@ def _write(
         from rasterio import Affine
         from rasterio.windows import Window
     except ImportError as error:
-        raise MissingExtraError(
-            "writing a generated area needs rasterio: pip install 'orthonav[geo]'"
-        ) from error
+        raise missing_extra("writing a generated area", "geo", "rasterio", error) from error
     width_px, height_px = size_px
     west_m, north_m = ORIGIN_M[0], ORIGIN_M[1] + height_px * gsd_m
     profile: dict[str, Any] = {

@@ -3,20 +3,20 @@
 import io
 import zlib
 
-import ground
 import numpy as np
 import pytest
+import terrain
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from orthonav.fetch.client import BadReplyError, Reply
-from orthonav.fetch.pictures import decode, picture_or_absent
+from orthonav.fetch.client import BadReplyError, HttpReply
+from orthonav.fetch.images import decode, image_or_absent
 
 RNG = np.random.default_rng(0)
 NOISE = RNG.integers(1, 255, (256, 256, 3), dtype=np.uint8)
-PNG = ground.encoded(NOISE)
-JPEG = ground.encoded(NOISE, "JPEG", quality=95, subsampling=0)
+PNG = terrain.encoded(NOISE)
+JPEG = terrain.encoded(NOISE, "JPEG", quality=95, subsampling=0)
 SHAPE = (256, 256)
 WMS_ERROR = b"""<?xml version="1.0"?><ServiceExceptionReport version="1.3.0"
 xmlns="http://www.opengis.net/ogc"><ServiceException code="LayerNotDefined">
@@ -28,12 +28,12 @@ OUT_OF_RANGE = OWS_ERROR.replace(b"InvalidParameterValue", b"TileOutOfRange")
 
 
 def reply(body, status=200, kind="image/png"):
-    return Reply("http://a/b", status, {"content-type": kind}, body)
+    return HttpReply("http://a/b", status, {"content-type": kind}, body)
 
 
-@pytest.mark.parametrize("body", [PNG, JPEG, ground.encoded(NOISE, "WEBP", lossless=True)])
+@pytest.mark.parametrize("body", [PNG, JPEG, terrain.encoded(NOISE, "WEBP", lossless=True)])
 def test_pictures_are_taken_whatever_they_are_called(body):
-    assert picture_or_absent(reply(body, kind="text/plain"), SHAPE, None) == body
+    assert image_or_absent(reply(body, kind="text/plain"), SHAPE, None) == body
     picture = decode(body, SHAPE, None)
     assert picture.bands.shape == (3, *SHAPE) and picture.valid.all() and not picture.blank
     assert np.abs(picture.bands.transpose(1, 2, 0).astype(int) - NOISE).mean() < 30
@@ -43,27 +43,27 @@ def test_pictures_are_taken_whatever_they_are_called(body):
     "body, status, words, again",
     [
         (b"<!DOCTYPE html><html><body>Log in", 200, "page or text .*Log in", True),
-        (b"Quota exceeded", 200, "not a picture", True),
+        (b"Quota exceeded", 200, "not an image", True),
         (b'{"error": "no"}', 200, "page or text", True),
         (WMS_ERROR, 200, "LayerNotDefined Layer ORTHO unknown", True),
         (OWS_ERROR, 400, "HTTP 400 .*Style normal unknown", False),
         (b"no", 401, "HTTP 401", False),
         (b"no", 403, "HTTP 403", False),
-        (b"", 200, "not a picture", True),
+        (b"", 200, "not an image", True),
         (JPEG[:-100], 200, "cut short|broken", True),
         (JPEG[: len(JPEG) // 2], 200, "cut short|broken", True),
         (PNG[: len(PNG) // 2], 200, "broken", True),
-        (PNG[:30], 200, "broken|not a picture", True),
-        (ground.encoded(NOISE[:128]), 200, "256 x 128 px instead of 256 x 256", False),
-        (ground.encoded(np.zeros((1, 1, 3), np.uint8)), 200, "1 x 1 px instead", False),
-        (ground.encoded(NOISE, "GIF"), 200, "not a picture", True),
-        (ground.encoded(NOISE, "TIFF"), 200, "not a picture", True),
+        (PNG[:30], 200, "broken|not an image", True),
+        (terrain.encoded(NOISE[:128]), 200, "256 x 128 px instead of 256 x 256", False),
+        (terrain.encoded(np.zeros((1, 1, 3), np.uint8)), 200, "1 x 1 px instead", False),
+        (terrain.encoded(NOISE, "GIF"), 200, "not an image", True),
+        (terrain.encoded(NOISE, "TIFF"), 200, "not an image", True),
     ],
 )
 def test_everything_else_is_refused(body, status, words, again):
-    with pytest.raises(BadReplyError, match=words) as told:
-        picture_or_absent(reply(body, status), SHAPE, None)
-    assert told.value.again == again and len(str(told.value)) < 500
+    with pytest.raises(BadReplyError, match=words) as raised:
+        image_or_absent(reply(body, status), SHAPE, None)
+    assert raised.value.again == again and len(str(raised.value)) < 500
 
 
 @pytest.mark.parametrize(
@@ -71,35 +71,35 @@ def test_everything_else_is_refused(body, status, words, again):
     [(b"", 204), (b"not found", 404), (b"gone", 410), (OUT_OF_RANGE, 400), (OUT_OF_RANGE, 200)],
 )
 def test_what_the_service_says_is_not_there_is_absent(body, status):
-    assert picture_or_absent(reply(body, status), SHAPE, None) is None
+    assert image_or_absent(reply(body, status), SHAPE, None) is None
 
 
 def test_a_service_of_maps_has_no_tiles_to_miss():
     with pytest.raises(BadReplyError, match="HTTP 404"):
-        picture_or_absent(reply(b"not found", 404), SHAPE, None, tiled=False)
+        image_or_absent(reply(b"not found", 404), SHAPE, None, tiled=False)
 
 
 def test_a_bomb_is_refused_by_its_head():
-    head = bytearray(ground.encoded(np.zeros((16, 16, 3), np.uint8)))
+    head = bytearray(terrain.encoded(np.zeros((16, 16, 3), np.uint8)))
     head[16:24] = (100_000).to_bytes(4, "big") * 2  # width and height of 100000 px
     head[29:33] = zlib.crc32(head[12:29]).to_bytes(4, "big")
     with pytest.raises(BadReplyError, match=r"100000 x 100000|broken"):
-        picture_or_absent(reply(bytes(head)), SHAPE, None)
+        image_or_absent(reply(bytes(head)), SHAPE, None)
 
 
 @pytest.mark.parametrize("level, blank", [(0, True), (255, True), (1, False), (128, False)])
 def test_pictures_of_nothing(level, blank):
-    body = ground.encoded(np.full((256, 256, 3), level, np.uint8))
+    body = terrain.encoded(np.full((256, 256, 3), level, np.uint8))
     assert decode(body, SHAPE, None).blank == blank
 
 
 def test_clear_pixels_are_not_valid():
     clear = np.dstack([NOISE, np.full(SHAPE, 255, np.uint8)])
     clear[:100, :, 3] = 0
-    picture = decode(ground.encoded(clear), SHAPE, None)
+    picture = decode(terrain.encoded(clear), SHAPE, None)
     assert not picture.valid[:100].any() and picture.valid[100:].all()
     clear[..., 3] = 0
-    assert decode(ground.encoded(clear), SHAPE, None).blank
+    assert decode(terrain.encoded(clear), SHAPE, None).blank
 
 
 def test_a_palette_with_a_clear_colour():
@@ -126,9 +126,9 @@ def test_large_patches_of_a_colour_of_nothing(colour, level):
     scene = NOISE.copy()
     scene[:, :100] = level  # the edge of the coverage
     scene[200:210, 200:210] = level  # a roof, or a shadow
-    picture = decode(ground.encoded(scene), SHAPE, colour)
+    picture = decode(terrain.encoded(scene), SHAPE, colour)
     assert not picture.valid[:, :100].any() and picture.valid[:, 100:].all()
-    assert decode(ground.encoded(scene), SHAPE, None).valid.all()
+    assert decode(terrain.encoded(scene), SHAPE, None).valid.all()
 
 
 @given(st.binary(max_size=300), st.integers(0, 20), st.sampled_from([PNG, JPEG]))
@@ -136,6 +136,6 @@ def test_damaged_bytes_raise_nothing_else(noise, cut, whole):
     at = len(whole) * cut // 20
     for body in (noise, whole[:at] + noise, whole[:at] + noise + whole[at + len(noise) :]):
         try:
-            picture_or_absent(reply(body), SHAPE, "black")
+            image_or_absent(reply(body), SHAPE, "black")
         except BadReplyError:
             continue

@@ -1,9 +1,8 @@
-"""`fixes.jsonl`, written and read side by side: one JSON object per view, in order of the flight.
+"""`fixes.jsonl`, written and read: one JSON object per view, in order of the flight.
 
 The keys of a line and their order are those of `KEYS`; those of a track end with `TRACK_KEYS`.
-Numbers that are not known (NaN, infinite) are written as null and read as NaN. `time_s` is written
-with all nine decimals that differ from zero, so that nanoseconds since 1970 survive, which a
-float64 of seconds cannot hold.
+Unknown numbers (NaN, infinite) are written as null and read as NaN. `time_s` is written with up to
+nine decimals, so that nanoseconds since 1970 are exact, which a float64 of seconds cannot hold.
 """
 
 import json
@@ -38,7 +37,7 @@ KEYS = (
     "latency_ms",
 )
 TRACK_KEYS = (
-    "tracked",  # true: the position rests on all views so far, not on this one alone
+    "tracked",  # true: the position is estimated from all views so far
     "state",  # "searching", "tracking" or "lost"
 )
 STATES = ("searching", "tracking", "lost")
@@ -65,10 +64,10 @@ def result_to_json(result: ViewResult) -> str:
 
 
 def result_from_json(line: str) -> ViewResult:
-    """The result that one line of `fixes.jsonl` stands for.
+    """The result in one line of `fixes.jsonl`.
 
-    Keys that are not in `KEYS` are passed over, and so are positions of a line without a fix.
-    Raises `FlightError` where the line is not strict JSON, a key is missing or of a wrong type.
+    Keys that are not in `KEYS` are ignored, and so are positions of a line without a fix.
+    Raises `FlightError` where the line is not strict JSON, a key is missing or has a wrong type.
     """
     try:
         values = json.loads(line, parse_float=Decimal, parse_constant=_refuse_constant)
@@ -93,10 +92,10 @@ def write_results(path: Path, results: Iterable[ViewResult]) -> None:
 
 
 def read_results(path: Path) -> list[ViewResult]:
-    """All results in `path`, in its order; empty lines are passed over.
+    """All results in `path`, in its order; empty lines are skipped.
 
-    Raises `MissingFileError` where there is no such file, and `FlightError` naming the line at the
-    first one that is broken.
+    Raises `MissingFileError` where there is no such file, and `FlightError` with the number of the
+    first invalid line.
     """
     path = require_file(path, "file of fixes")
     results = []

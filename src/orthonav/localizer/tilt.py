@@ -1,14 +1,14 @@
-"""A registered view placed anew together with how its camera tilts.
+"""The tilt of a registered view, from perspective.
 
-Autopilots and gimbals say how the camera tilts to a degree or a few; where a mount is off, every
-fix is off by the height times that angle. A camera that tilts sees near ground larger than far
-ground: told too little of it, the rectified view is bent against the map. So the view is rectified
-under a few tilts around the expected one, and how well it fits each says which is true. A parabola
-through these scores is what one view knows; of many views together the sum of them (a single peak
-is bent by houses and hills, and most of that differs from view to view).
+Autopilots and gimbals report pitch and roll to a degree or a few; where a mount is misaligned,
+every fix is off by the height times that angle. A tilted camera sees near ground larger than far
+ground: rectified with the wrong tilt, the view is distorted against the map. So the view is
+rectified under a few tilts around the expected one, and the score under each is a profile of the
+tilt. A parabola through the scores is the information of one view; over many views the parabolas
+add up (single peaks are biased by houses and hills, mostly differently from view to view).
 
-How position, heading and scale hang on the tilt is geometry: the similarity that takes what the
-camera sees of flat ground under one tilt to what it sees under another.
+The derivatives of position, heading and scale with respect to the tilt are geometry: the similarity
+between what the camera sees of flat ground under two tilts.
 """
 
 import math
@@ -18,85 +18,90 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.geo.camera import ground_en_m
-from orthonav.localizer.registration import PreparedView, RegistrationLocalizer
+from orthonav.localizer.prepared import PreparedView
+from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.records import View
 from orthonav.register.refine import Placed
 
 RIM_PX = 10.0
-"""Tilts are tried so far from the expected one that the corner of the view moves by so many pixels:
-scores that near to a peak are too bent to say where the middle of it is."""
+"""Tilts are tried at such a distance from the expected one that the corner of the view moves by so
+many pixels: closer to the peak the profile is dominated by single objects."""
 MAX_STEP_RAD = math.radians(6.0)
+"""Largest such distance."""
 NATS_PER_SCORE = 0.4
-"""What a unit of the score says of a tilt: peaks of single views scatter by more than their
-curvature would have it."""
+"""Information of a unit of the score about a tilt: peaks of single views scatter by more than their
+curvature implies (docs/decisions/tracking.md, 3)."""
 WEAK_TILT_RAD = math.radians(20.0)
-HANG_STEP_RAD = math.radians(0.5)
+"""Standard deviation of a tilt that the view does not show."""
+DERIVATIVE_STEP_RAD = math.radians(0.5)
+"""Step of the numerical derivatives with respect to the tilt."""
 SEEN_POINTS = 5
-"""Points of the image across and down that say how the ground seen moves with the tilt."""
+"""Image points across and down from which these derivatives are computed."""
 STEPS, SMALL_STEP_PX = 3, 0.1
-"""A view under another tilt lies where geometry says, nearly: it needs few steps."""
+"""Refinement of a view under another tilt: geometry predicts its place, so few steps suffice."""
 Array = NDArray[np.float64]
 BOTH: Array = np.ones(2)
 BOTH.flags.writeable = False
 
 
 @dataclass(frozen=True, eq=False)
-class Levelled:
-    """Where a view was taken, how it was turned and how it tilts.
+class TiltedPlace:
+    """The position of a view with its heading, scale and tilt.
 
     `mean` (6,): metres east and north of the sheet's origin, heading (rad), log scale (of true over
-    told height), pitch and roll (rad); `covariance` (6, 6) of them, of what the view itself says: a
-    tilt that it does not show is known to 20 deg.
+    reported height), pitch and roll (rad). `covariance` (6, 6): of what the view itself shows; a
+    tilt that it does not show has a standard deviation of 20 deg.
     """
 
     mean: Array
     covariance: Array
 
 
-def levelled(
+def with_tilt(
     registration: RegistrationLocalizer,
     view: View,
     prepared: PreparedView,
     placed: Placed,
-    worth: Array = BOTH,
-) -> Levelled | None:
-    """The view, prepared as `prepared` and `placed` at its final level, with its tilt.
+    weights: Array = BOTH,
+) -> TiltedPlace | None:
+    """A placed view with its tilt from perspective.
 
-    The pitch and roll of its telemetry are those to be expected; a tilt that differs by more than a
-    few degrees is found in several views, each from what is known by then. What perspective says of
-    the two counts `worth` (2,) times; with 0 it is not looked at, and that tilt is known to 20 deg.
-    None where the view cannot be looked at under tilts around the expected one.
+    `prepared` is made of `view`, `placed` its place at the final level. The pitch and roll of its
+    telemetry are the expected ones; a tilt that differs by more than a few degrees takes several
+    views, each starting from the estimate so far. `weights` (2,) multiply the information about
+    pitch and roll; with 0 that angle is not examined. None where the view cannot be rectified under
+    tilts around the expected one.
     """
     if placed.covariance is None:
         placed = registration.registrar.with_covariance(prepared.templates, prepared.levels, placed)
     tilt = np.radians([view.telemetry.pitch_deg, view.telemetry.roll_deg])
     mean, known = registration.seen_from(prepared, placed.pose), np.zeros(2)
-    hangs = _hangs(view, mean)
-    if hangs is None:
+    slopes = _derivatives(view, mean)
+    if slopes is None:
         return None
-    looks = _Looks(registration, view, prepared.levels.final)
-    for axis in np.flatnonzero(worth).tolist():
-        after, before = (looks.score(mean, hangs, tilt, axis, sign) for sign in (1, -1))
+    profile = _TiltProfile(registration, view, prepared.levels.final)
+    for axis in np.flatnonzero(weights).tolist():
+        after, before = (profile.score(mean, slopes, tilt, axis, sign) for sign in (1, -1))
         if after is None or before is None:
             return None
-        known[axis], move = looks.judged(placed.score, after, before, float(worth[axis]))
+        known[axis], move = profile.fitted(placed.score, after, before, float(weights[axis]))
         tilt[axis] += move
-        mean += hangs[:, axis] * move
+        mean += slopes[:, axis] * move
     spread = np.diag(1 / (known + WEAK_TILT_RAD**-2))
     covariance = np.zeros((6, 6))
-    covariance[:4, :4] = registration.covariance(prepared, placed) + hangs @ spread @ hangs.T
-    covariance[:4, 4:] = hangs @ spread
+    covariance[:4, :4] = registration.covariance(prepared, placed) + slopes @ spread @ slopes.T
+    covariance[:4, 4:] = slopes @ spread
     covariance[4:, :4] = covariance[:4, 4:].T
     covariance[4:, 4:] = spread
     if not np.isfinite(covariance).all():
         return None
-    return Levelled(np.concatenate([mean, tilt]), covariance)
+    return TiltedPlace(np.concatenate([mean, tilt]), covariance)
 
 
-def _hangs(view: View, mean: Array) -> Array | None:
-    """How camera position (m), heading and log scale change with pitch and roll: (4, 2).
+def _derivatives(view: View, mean: Array) -> Array | None:
+    """Derivatives (4, 2) of camera position (m), heading and log scale by pitch and roll.
 
-    What the view shows stays where it is on the map. None where too little of it is ground.
+    The ground seen stays at its place on the map. None where too little of the view is ground.
     """
     camera, telemetry = view.camera, view.telemetry
     share = (np.arange(SEEN_POINTS) + 0.5) / SEEN_POINTS
@@ -108,7 +113,7 @@ def _hangs(view: View, mean: Array) -> Array | None:
         seen = []
         for sign in (1, -1):
             tilts = tilt.copy()
-            tilts[axis] += sign * math.degrees(HANG_STEP_RAD)
+            tilts[axis] += sign * math.degrees(DERIVATIVE_STEP_RAD)
             pitch, roll = tilts.tolist()
             seen.append(ground_en_m(camera, px, 0.0, pitch, roll, telemetry.agl_m))
         both = np.isfinite(seen).all(axis=(0, 2))
@@ -117,12 +122,14 @@ def _hangs(view: View, mean: Array) -> Array | None:
         after, before = seen[0][both], seen[1][both]
         right, forward, turn, scale = _similarity(after, before)
         out[:, axis] = right * cos + forward * sin, forward * cos - right * sin, turn, scale
-    return out / (2 * HANG_STEP_RAD)
+    return out / (2 * DERIVATIVE_STEP_RAD)
 
 
 def _similarity(of: Array, to: Array) -> tuple[float, float, float, float]:
-    """Shift right and forward (m), turn clockwise (rad) and log scale that best take points (N, 2)
-    to others, for small ones."""
+    """The similarity between points (N, 2) and others close by, by least squares.
+
+    Shift right and forward (m), clockwise rotation (rad) and log scale.
+    """
     x, y = of.T
     one, zero = np.ones(len(of)), np.zeros(len(of))
     rows = np.stack([np.stack([one, zero, y, x], -1), np.stack([zero, one, -x, y], -1)], axis=1)
@@ -130,8 +137,8 @@ def _similarity(of: Array, to: Array) -> tuple[float, float, float, float]:
     return tuple(found.tolist())
 
 
-class _Looks:
-    """Looks at one view under several tilts."""
+class _TiltProfile:
+    """The score of one view under several tilts."""
 
     def __init__(self, registration: RegistrationLocalizer, view: View, level: int) -> None:
         self._registration, self._view = registration, view
@@ -141,9 +148,9 @@ class _Looks:
         self.step_rad = min(rim_m / max(telemetry.agl_m * corner**2, 1e-9), MAX_STEP_RAD)
 
     def score(
-        self, mean: Array, hangs: Array, tilt_rad: Array, axis: int, sign: int
+        self, mean: Array, slopes: Array, tilt_rad: Array, axis: int, sign: int
     ) -> float | None:
-        """Score of the view tilted one step more about one axis, from where geometry puts it."""
+        """Score with one step more of tilt about one axis, refined from the predicted place."""
         tilts = tilt_rad.copy()
         tilts[axis] += sign * self.step_rad
         pitch, roll = np.degrees(tilts).tolist()
@@ -152,20 +159,20 @@ class _Looks:
         view = self._registration.prepared(tilted, heading_known=True)
         if not isinstance(view, PreparedView):
             return None
-        pose = self._registration.pose_of(view, mean + sign * self.step_rad * hangs[:, axis])
+        pose = self._registration.pose_of(view, mean + sign * self.step_rad * slopes[:, axis])
         refiner = self._registration.registrar.refiner(
             view.templates, view.levels, view.levels.final
         )
         return refiner.place(pose, STEPS, SMALL_STEP_PX).score
 
-    def judged(
+    def fitted(
         self, middle: float, after: float, before: float, worth: float
     ) -> tuple[float, float]:
-        """What the scores under three tilts say: inverse variance, and by how much it tilts more
-        than expected (rad)."""
+        """Inverse variance and peak of a parabola through the scores under three tilts; the peak
+        is measured from the expected tilt (rad)."""
         slope = (after - before) / (2 * self.step_rad)
         bend = 2 * middle - after - before
-        # On a flank it bends less than at the peak: no farther than to the next tilt tried.
+        # The curvature is less on a flank than at the peak: no farther than to the next tilt.
         bend = max(bend / self.step_rad**2, abs(slope) / self.step_rad)
         known = worth * NATS_PER_SCORE * bend
         return known, worth * NATS_PER_SCORE * slope / (known + WEAK_TILT_RAD**-2)

@@ -1,8 +1,8 @@
-"""Is an answer the picture that was asked for? Everything else is refused, by name of the fault.
+"""Checks that an answer is the image that was requested; everything else is refused by its fault.
 
-A service may answer 200 with a page, an error in XML, a tile of another size, half a file, or a
-placeholder. Each would become a wrong place in a map, so nothing is taken on trust: the format is
-told by the bytes, the size is checked before anything is unpacked, and half a file is an error.
+A service may answer 200 with a web page, an error in XML, a tile of another size, half a file, or a
+placeholder. Each would become a wrong area in a map. So the format is read from the bytes, the size
+is checked before anything is decoded, and half a file is an error.
 """
 
 import io
@@ -14,20 +14,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MissingExtraError
-from orthonav.fetch.client import BadReplyError, Reply, told
+from orthonav.extras import missing_extra
+from orthonav.fetch.client import BadReplyError, HttpReply, excerpt
 
 try:
     from PIL import Image, UnidentifiedImageError
 except ImportError as error:  # pragma: no cover - depends on the installation
-    raise MissingExtraError(
-        "fetching imagery needs pillow; install it with: pip install 'orthonav[geo,fetch]'"
-    ) from error
+    raise missing_extra("fetching imagery", "fetch", "PIL", error) from error
 
 FORMATS = ("JPEG", "PNG", "WEBP")
 _JPEG_END = b"\xff\xd9"
 MIN_EMPTY_PX = 4096
-"""A patch of the colour of nothing counts as nothing from this size: 64 x 64 px."""
+"""Smallest patch of the empty colour that is masked, 64 x 64 px: larger than a roof or shadow."""
 _EMPTY_COLOURS = {"black": 0, "white": 255}
 _NOT_COVERED = re.compile(
     r"TileOutOfRange|no data found|out of (the )?(range|bounds|extent)|not covered", re.IGNORECASE
@@ -39,7 +37,7 @@ Array = NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class CellPixels:
     """Pixels of a cell: `bands` (C, H, W) and `valid` (H, W) bool."""
 
     bands: Array
@@ -47,7 +45,7 @@ class Picture:
 
     @property
     def blank(self) -> bool:
-        """Whether nothing is there: no valid pixel, or the whole of one pure black or white."""
+        """Whether there is no imagery: no valid pixel, or pure black or white throughout."""
         if not self.valid.any():
             return True
         first = self.bands[:, 0, 0]
@@ -56,18 +54,18 @@ class Picture:
         return bool((self.bands == first[:, None, None]).all())
 
 
-def picture_or_absent(
-    reply: Reply, shape_px: tuple[int, int], empty: str | None, *, tiled: bool = True
+def image_or_absent(
+    reply: HttpReply, shape_px: tuple[int, int], empty: str | None, *, tiled: bool = True
 ) -> bytes | None:
-    """The body of an answer that is a picture of this shape (height, width); None where the
-    service says that it has nothing there, which one that is not `tiled` does not do with 404.
+    """The body of an answer that is an image of this shape (height, width).
 
-    Raises `BadReplyError` for everything else, naming what came.
+    None where the service reports that it has no imagery there; 404 means that only for a `tiled`
+    service. Raises `BadReplyError` for everything else, with the content that came.
     """
     if reply.status == 204 or (tiled and reply.status in (404, 410)):
         return None
     if reply.status != 200:
-        words = exception_text(reply) or told(reply)
+        words = exception_text(reply) or excerpt(reply)
         if reply.status == 400 and _NOT_COVERED.search(words):
             return None
         raise BadReplyError(
@@ -78,45 +76,44 @@ def picture_or_absent(
         if words and _NOT_COVERED.search(words):
             return None
         what = "an error of the service" if words else "a page or text"
-        raise BadReplyError(f"{what} instead of a picture ({words or told(reply)})")
+        raise BadReplyError(f"{what} instead of an image ({words or excerpt(reply)})")
     decode(reply.body, shape_px, empty)
     return reply.body
 
 
-def decode(body: bytes, shape_px: tuple[int, int], empty: str | None) -> Picture:
-    """Red, green, blue and what is valid of a picture of exactly this shape (height, width).
+def decode(body: bytes, shape_px: tuple[int, int], empty: str | None) -> CellPixels:
+    """Red, green, blue and validity of an image of exactly this shape (height, width).
 
-    Clear pixels are not valid; with `empty` ("black" or "white"), large patches of exactly that
-    colour are not either. Raises `BadReplyError` where it is no such picture, or half of one.
+    Transparent pixels are invalid; with `empty` ("black" or "white"), large patches of exactly that
+    colour are too. Raises `BadReplyError` where it is not such an image, or half of one.
     """
     height, width = shape_px
     try:
-        with Image.open(io.BytesIO(body), formats=FORMATS) as image:  # reads the head only
+        with Image.open(io.BytesIO(body), formats=FORMATS) as image:  # reads only the head
             if image.size != (width, height):
                 raise BadReplyError(
-                    f"picture of {image.size[0]} x {image.size[1]} px instead of "
-                    f"{width} x {height}",
+                    f"image of {image.size[0]} x {image.size[1]} px instead of {width} x {height}",
                     again=False,
                 )
             if image.format == "JPEG" and _JPEG_END not in body[-64:]:
-                raise BadReplyError("picture is cut short")
+                raise BadReplyError("image is cut short")
             rgb, alpha = _channels(image)
     except BadReplyError:
         raise
     except UnidentifiedImageError:
-        raise BadReplyError("not a picture (JPEG, PNG or WebP)") from None
+        raise BadReplyError("not an image (JPEG, PNG or WebP)") from None
     except (OSError, ValueError, SyntaxError, Warning, Image.DecompressionBombError) as error:
-        raise BadReplyError(f"picture is broken ({_words(error)})") from None
+        raise BadReplyError(f"image is broken ({_words(error)})") from None
     valid = np.ones((height, width), dtype=bool) if alpha is None else alpha > 0
     if empty is not None:
         valid &= ~_empty_patches(rgb, _EMPTY_COLOURS[empty])
-    return Picture(np.ascontiguousarray(rgb.transpose(2, 0, 1)), valid)
+    return CellPixels(np.ascontiguousarray(rgb.transpose(2, 0, 1)), valid)
 
 
 def _channels(image: Any) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-    """Red, green, blue (H, W, 3) and the alpha (H, W), if there is one."""
+    """Red, green, blue (H, W, 3), and alpha (H, W) if there is one."""
     if image.mode not in ("1", "L", "LA", "P", "RGB", "RGBA"):
-        raise BadReplyError(f"picture of an unknown kind ({image.mode})", again=False)
+        raise BadReplyError(f"image of an unknown kind ({image.mode})", again=False)
     if image.mode in ("LA", "RGBA") or "transparency" in image.info:
         pixels = np.asarray(image.convert("RGBA"))
         return pixels[..., :3], pixels[..., 3]
@@ -130,12 +127,12 @@ def _empty_patches(rgb: NDArray[np.uint8], level: int) -> NDArray[np.bool_]:
         return np.zeros(pure.shape, dtype=bool)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(pure, connectivity=4)
     large = stats[:, cv2.CC_STAT_AREA] >= MIN_EMPTY_PX
-    large[0] = False  # what is not of that colour
+    large[0] = False  # the other colours
     return np.asarray(large[labels])
 
 
-def exception_text(reply: Reply) -> str:
-    """What an exception report of a WMS or WMTS says, or nothing."""
+def exception_text(reply: HttpReply) -> str:
+    """Code and text of an exception report of a WMS or WMTS; empty for anything else."""
     text = reply.body[:20_000].decode("utf-8", errors="replace")
     if "Exception" not in text:
         return ""
@@ -147,8 +144,8 @@ def exception_text(reply: Reply) -> str:
     return "".join(c for c in joined if c.isprintable())[:300]
 
 
-def _looks_like_text(reply: Reply) -> bool:
-    """By its first letter: what an answer calls itself is often wrong."""
+def _looks_like_text(reply: HttpReply) -> bool:
+    """By its first character, because media types are often wrong."""
     return reply.body[:256].lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"<", b"{")
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.errors import FlightError, MissingFileError
-from orthonav.publish.jsonl import (
+from orthonav.flight.fixes import (
     KEYS,
     read_results,
     result_from_json,
