@@ -317,7 +317,7 @@ def test_a_turn_that_nobody_saw_is_thought_of():
 
 
 def test_the_bias_of_a_reported_velocity_is_estimated():
-    """Dead reckoning through 30 s without a view: the reported wind is wrong by 1.8 m/s all along."""
+    """Dead reckoning through 30 s without a view: the reported wind is wrong by 1.8 m/s."""
     flight, mixture, before = Flight(7), Mixture(MODEL, EXTENT), None
     reported = SPEED + np.array([1.5, -1.0])
     for second in range(90):

@@ -65,7 +65,7 @@ def bounds(text: str) -> tuple[float, float, float, float]:
     return west, south, east, north
 
 
-def add_area(parser: argparse.ArgumentParser, group: Any) -> None:
+def add_area(parser: argparse._ActionsContainer, group: Any) -> None:
     """`--route` and `--bounds` to a group (or the parser), `--band-m` beside them."""
     group.add_argument("--route", type=Path, help=ROUTE_HELP)
     group.add_argument(

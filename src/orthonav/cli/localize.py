@@ -187,9 +187,9 @@ def _on_atlas(options: argparse.Namespace) -> None:
     """Without a prior: only what views agree on is a fix."""
     require_extras("localize --atlas")
     from orthonav.atlas.catalog import Atlas
-    from orthonav.atlas.ground import Ground
-    from orthonav.atlas.lookup import AtlasLookup
-    from orthonav.atlas.lost import LostLocator
+    from orthonav.atlas.locate import AtlasLocator
+    from orthonav.atlas.sheet_registration import SheetRegistrar
+    from orthonav.atlas.tile_search import TileSearch
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
     from orthonav.flight.fixes import write_results
@@ -209,15 +209,15 @@ def _on_atlas(options: argparse.Namespace) -> None:
         raise VariantError("lowe_ratio compares tiles: it is for a map, with --registration off")
     flight = open_source(options.flight, options)
     results = []
-    with AtlasLookup(Atlas.open(options.map)) as lookup, progress(options) as shown:
-        if lookup.unknown:
+    with TileSearch(Atlas.open(options.map)) as search, progress(options) as shown:
+        if search.unknown:
             log.warning(
                 "%d sheets are not in the index, so nothing is found there; bring it up to date "
                 "with 'orthonav atlas index'",
-                len(lookup.unknown),
+                len(search.unknown),
             )
-        locator = LostLocator(
-            Ground(lookup.atlas), lookup, heading_known=options.heading == "known"
+        locator = AtlasLocator(
+            SheetRegistrar(search.atlas), search, heading_known=options.heading == "known"
         )
         for result in localize_flight(
             locator, flight, skip_bad_images=options.skip_bad_images, accept=accept
