@@ -71,7 +71,7 @@ def test_scripts_find_their_elements(page):
 
 
 def test_everything_can_be_reached_and_has_a_name(page):
-    """Controls have a label, pictures an alternative; parts are landmarks with a name."""
+    """Controls have a label, images an alternative; parts are landmarks with a name."""
     labelled = set(named(page, "for"))
     for tag, attributes in page.elements:
         if tag in ("input", "select") and attributes.get("type") != "checkbox":

@@ -142,9 +142,7 @@ class MapCrops:
         return np.ascontiguousarray(grey[:, ::-1])
 
 
-def view_of(
-    rng: np.random.Generator, plan: TrialPlan, picture: Grey, gsd_m: float
-) -> View:
+def view_of(rng: np.random.Generator, plan: TrialPlan, picture: Grey, gsd_m: float) -> View:
     """A vertical view of the middle of a picture with a random heading."""
     size = picture.shape[0]
     width = max(8, round(plan.width_m / gsd_m))

@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING
 
 from orthonav.cli.common import ROUTE_HELP, print_json, progress
 
-EVERYDAY = ("--route", "--band-m", "--ortho", "--camera", "--agl-m", "--quick", "--json")
+EVERYDAY = (
+    *("--route", "--band-m", "--ortho", "--camera", "--agl-m"),
+    *("--yaw-std-deg", "--heading", "--prior-std-m", "--prior", "--quick", "--json"),
+)
 
 if TYPE_CHECKING:
     from orthonav.check.outcome import Provenance

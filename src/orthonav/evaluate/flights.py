@@ -62,7 +62,9 @@ def total(flights: Sequence[FlightReport]) -> Metrics:
     if len(flights) == 1:
         return flights[0].metrics
     first = flights[0].metrics
-    return measure(pool([f.comparison for f in flights]), first.radius_m, list(first.acc_at_m))
+    pooled = pool([flight.comparison for flight in flights])
+    distance_m = first.standard.distance_m
+    return measure(pooled, first.radius_m, list(first.acc_at_m), rpe_distance_m=distance_m)
 
 
 def table(flights: Sequence[FlightReport]) -> str:

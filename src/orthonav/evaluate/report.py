@@ -225,7 +225,7 @@ def _named(drawn: _Drawn, name: str, file_name: str) -> _Drawn:
 
 
 def _worst(comparison: Comparison, metrics: Metrics) -> list[tuple[str, ...]]:
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for i in worst_views(comparison, _N_WORST):
         east_m, north_m = comparison.fix_en_m[i] - comparison.truth_en_m[i]
         right = comparison.errors_m[i] <= metrics.radius_m

@@ -37,9 +37,7 @@ def leaflet_files(*names: str) -> list[Path]:
     try:
         folder = Path(importlib.import_module("xstatic.pkg.leaflet").BASE_DIR)
     except (ImportError, AttributeError) as error:
-        raise MissingExtraError(
-            "the map of the page needs Leaflet, which is not installed: pip install 'orthonav[web]'"
-        ) from error
+        raise missing_extra("the map of the page", "web", "xstatic", error) from error
     missing = [name for name in names if not (folder / name).is_file()]
     if missing:
         raise MissingExtraError(
