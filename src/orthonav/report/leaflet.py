@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from orthonav.errors import MissingExtraError
+from orthonav.extras import missing_extra
 from orthonav.report.page import data_url
 
 _IMAGE = re.compile(r"url\((images/[\w-]+\.png)\)")
