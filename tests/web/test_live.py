@@ -80,7 +80,7 @@ def test_broken_lines_are_reported_and_skipped(fixes):
     fixes.write_text(line(0) + '{"frame": 3\n{"health": 4}\n\xff\n\n' + line(1))
     batch = LineFeed(fixes).poll()
     assert len(batch.results) == 2 and len(batch.problems) == 1
-    assert "line 2 is left out" in batch.problems[0]
+    assert "line 2 was skipped" in batch.problems[0]
 
 
 def test_lines_and_files_beyond_reason(fixes, monkeypatch):
@@ -218,7 +218,7 @@ def test_a_log_that_is_not_there(tmp_path):
         LogReader(tmp_path / "flight.mcap").poll()
 
 
-def test_the_map_that_was_flown_with_is_compared(tmp_path, small, caplog):
+def test_another_map_than_that_of_the_flight_is_reported(tmp_path, small, caplog):
     write_log(tmp_path, range(1))
     open_run(ViewRequest(tmp_path, small.map_path))
-    assert "flown with another map" in caplog.text
+    assert "the flight used another map" in caplog.text
