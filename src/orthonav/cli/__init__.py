@@ -153,7 +153,8 @@ def _shorten_help(
         return
     for action in hidden:
         action.help = argparse.SUPPRESS
-    command.epilog = f"{len(hidden)} more options: {command.prog} --help-all"
+    more = f"{len(hidden)} more options: {command.prog} --help-all"
+    command.epilog = f"{command.epilog}; {more}" if command.epilog else more
 
 
 def _module(command: str) -> ModuleType:

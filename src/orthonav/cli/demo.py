@@ -61,7 +61,7 @@ def _how_to_look(out: Path) -> str:
     return "\n".join(
         (
             "open in a browser:",
-            f"  {out}/check/index.html    before the flight: where it can be flown by the map",
+            f"  {out}/check/index.html    before the flight: can the route be flown with this map?",
             f"  {out}/report/index.html   after it: errors, confidence, worst views",
             f"step through the views:\n  {look}",
         )
@@ -110,7 +110,7 @@ def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[
     frame = opened.manifest.sheets[0].frame
     route = folder / "route.geojson"
     _write_route(route, frame.latlon_from_en(TURNS_EN_M))
-    _say(options, f"3/5 checking, from {past.name} alone, where the route can be flown by the map")
+    _say(options, f"3/5 checking, from {past.name} alone, whether the route can be flown with the map")
     checked = _checked(folder, map_path, route, shown)
     _say(options, f"4/5 flying over {present.name}, heading off by 5 deg, height by 5 %")
     request = SimulateRequest(
@@ -150,7 +150,7 @@ def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[
 def _checked(folder: Path, map_path: Path, route: Path, shown: Progress) -> str:
     """What the check predicts of the route, in a line; its report is in `check`."""
     from orthonav import __version__
-    from orthonav.check.outcome import About
+    from orthonav.check.outcome import Provenance
     from orthonav.check.request import CheckRequest
     from orthonav.check.run import check_map
     from orthonav.check.write import write_check
@@ -166,7 +166,7 @@ def _checked(folder: Path, map_path: Path, route: Path, shown: Progress) -> str:
         agl_m=HEIGHT_M,
         effort=CHECK_EFFORT,
         extras=False,
-        about=About(
+        about=Provenance(
             map_path.name,
             imagery_text(manifest.imagery),
             recipe_text(manifest.recipe),
