@@ -20,8 +20,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         "run",
         type=Path,
         metavar="RUN",
-        help="fixes.jsonl, what `orthonav fly --json` writes, or a flight log (a file, its folder, "
-        "or the name given to --log)",
+        help="fixes.jsonl, what `orthonav fly --jsonl` writes, or a flight log (a file, its "
+        "folder, or the name given to --log)",
     )
     parser.add_argument("--map", type=Path, required=True, metavar="MAP.onav")
     parser.add_argument(

@@ -39,7 +39,7 @@ class Feed(Protocol):
 
 
 class LineFeed:
-    """`fixes.jsonl`, or what `orthonav fly --json` writes: results, and health between them.
+    """`fixes.jsonl`, or what `orthonav fly --jsonl` writes: results, and health between them.
 
     Lines that are neither are passed over and told of: a flight log of a disk that was full is
     better than none. With `live` the file may not be there yet, and its last line may not be whole.
