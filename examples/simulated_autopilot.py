@@ -4,7 +4,7 @@
 
 beside
 
-    orthonav fly area.onav --camera flight --file-clock autopilot --autopilot udpin:14550
+    orthonav fly area.onav flight --file-clock autopilot --autopilot udpin:14550
 
 It answers TIMESYNC, sends HEARTBEAT, ATTITUDE, DISTANCE_SENSOR and LOCAL_POSITION_NED over UDP, and
 compares the positions it gets with the truth of the folder, where that is there. Its clock begins

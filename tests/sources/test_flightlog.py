@@ -40,7 +40,7 @@ from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import open_map
 from orthonav.mapfile.signature import map_info
 from orthonav.onboard import log as log_module
-from orthonav.onboard.calibrate import Mounted, model_of
+from orthonav.onboard.calibrate import MountCorrected, model_of
 from orthonav.onboard.log import FlightLog
 from orthonav.onboard.run import locate_view
 from orthonav.onboard.segment import Segment
@@ -128,7 +128,7 @@ def flown(localizer, flight, folder, mount=None, **how):
     """Fly as the runner does, logging; what came out."""
     locator = Tracker(localizer, model=model_of(mount) if mount else None)
     if mount:
-        locator = Mounted(locator, mount)
+        locator = MountCorrected(locator, mount)
     info = map_info(localizer_path(localizer))
     log = FlightLog(folder / "flight.mcap", flight.camera, info, chunk_s=0.05, **how)
     plain = None if mount is None else {

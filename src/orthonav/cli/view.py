@@ -21,7 +21,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "run",
         type=Path,
         metavar="RUN",
-        help="fixes.jsonl, the output of `orthonav fly --json`, or a flight log (file, folder, or "
+        help="fixes.jsonl, the output of `orthonav fly --jsonl`, or a flight log (file, folder, or "
         "the name given to --log)",
     )
     parser.add_argument("--map", type=Path, required=True, metavar="MAP.onav")

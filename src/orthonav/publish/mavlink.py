@@ -134,7 +134,7 @@ def global_position_sensor(
     """
     if not 1 <= sensor_id <= 255:
         raise EstimateError(f"sensor_id must be 1 to 255, got {sensor_id}")
-    sure = estimate.is_confident(min_confidence)
+    confident = estimate.is_confident(min_confidence)
     return dialect().MAVLink_global_position_sensor_message(
         target_system=target.system_id,
         target_component=target.component_id,
@@ -142,12 +142,12 @@ def global_position_sensor(
         time_usec=microseconds(estimate.sent_ns(clock)),
         processing_time=clamped(estimate.processing_s * 1e6, 0, _UINT32_MAX),
         source=_SOURCE_VISION,
-        flags=0 if sure else _UNHEALTHY,
-        lat=deg_e7(estimate.lat_deg) if sure else _INT32_MAX,
-        lon=deg_e7(estimate.lon_deg) if sure else _INT32_MAX,
+        flags=0 if confident else _UNHEALTHY,
+        lat=deg_e7(estimate.lat_deg) if confident else _INT32_MAX,
+        lon=deg_e7(estimate.lon_deg) if confident else _INT32_MAX,
         alt_ellipsoid=math.nan,
         alt=float32(estimate.alt_amsl_m),
-        eph=float32(estimate.horizontal_std_m(min_std_m)) if sure else math.nan,
+        eph=float32(estimate.horizontal_std_m(min_std_m)) if confident else math.nan,
         epv=float32(estimate.alt_std_m) if math.isfinite(estimate.alt_amsl_m) else math.nan,
     )
 
@@ -172,10 +172,10 @@ def gps_input(
     horizontal accuracy; else it is ignored. `send_yaw` tells the heading as that of the vehicle:
     right only where the top of the image is its nose.
     """
-    sure = estimate.is_confident(min_confidence)
+    confident = estimate.is_confident(min_confidence)
     eph_m = estimate.horizontal_std_m(min_std_m)
     speed_std_mps = _speed_std_mps(estimate)
-    flags = _ignored(estimate, speed_std_mps, hdop_m) if sure else _IGNORE_ALL
+    flags = _ignored(estimate, speed_std_mps, hdop_m) if confident else _IGNORE_ALL
     week, week_ms = (0, 0) if estimate.utc_ns is None else gps_time(estimate.utc_ns)
     vel_east, vel_north = estimate.vel_en_mps or (0.0, 0.0)
 
@@ -188,9 +188,9 @@ def gps_input(
         ignore_flags=flags,
         time_week_ms=week_ms,
         time_week=clamped(week, 0, _UINT16_MAX),
-        fix_type=_FIX_3D if sure else _NO_FIX,
-        lat=deg_e7(estimate.lat_deg) if sure else 0,
-        lon=deg_e7(estimate.lon_deg) if sure else 0,
+        fix_type=_FIX_3D if confident else _NO_FIX,
+        lat=deg_e7(estimate.lat_deg) if confident else 0,
+        lon=deg_e7(estimate.lon_deg) if confident else 0,
         alt=unless(_IGNORE_ALT, estimate.alt_amsl_m),
         hdop=unless(_IGNORE_HDOP, _hdop(eph_m, hdop_m), UNKNOWN_DOP),
         vdop=UNKNOWN_DOP,
@@ -201,7 +201,7 @@ def gps_input(
         horiz_accuracy=unless(_IGNORE_HORIZ_ACC, eph_m),
         vert_accuracy=unless(_IGNORE_VERT_ACC, estimate.alt_std_m),
         satellites_visible=clamped(satellites, 0, 255),
-        yaw=_yaw_cdeg(estimate.heading_deg) if send_yaw and sure else 0,
+        yaw=_yaw_cdeg(estimate.heading_deg) if send_yaw and confident else 0,
     )
 
 

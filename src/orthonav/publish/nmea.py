@@ -48,8 +48,8 @@ def gga(
     `utc_ns` is the time of a sentence without an estimate. With `hdop_m`, metres per unit, a
     dilution of precision is made up of the horizontal accuracy. Satellites in use are 00.
     """
-    time_ns, sure = _when_and_whether(estimate, utc_ns, min_confidence)
-    if estimate is None or not sure:
+    time_ns, confident = _when_and_whether(estimate, utc_ns, min_confidence)
+    if estimate is None or not confident:
         return _sentence(talker, ["GGA", _time(time_ns), *_NO_PLACE, "0", "00", *[""] * 7])
     altitude, hdop = _altitude(estimate.alt_amsl_m), ""
     if hdop_m is not None:
@@ -70,8 +70,8 @@ def rmc(
     min_confidence: float = CONFIDENT,
 ) -> bytes:
     """RMC: time and date, status, position, speed in knots and course where velocity is known."""
-    time_ns, sure = _when_and_whether(estimate, utc_ns, min_confidence)
-    if estimate is None or not sure:
+    time_ns, confident = _when_and_whether(estimate, utc_ns, min_confidence)
+    if estimate is None or not confident:
         fields = ["V", *_NO_PLACE, "", "", _date(time_ns), "", "", "N"]
     else:
         _, status, mode = quality.value
@@ -89,8 +89,8 @@ def gst(
 ) -> bytes:
     """GST: one-sigma error ellipse (m, direction of the long axis from true north) and standard
     deviations of latitude, longitude and altitude in m. There are no ranges, so no RMS of them."""
-    time_ns, sure = _when_and_whether(estimate, utc_ns, min_confidence)
-    if estimate is None or not sure:
+    time_ns, confident = _when_and_whether(estimate, utc_ns, min_confidence)
+    if estimate is None or not confident:
         return _sentence(talker, ["GST", _time(time_ns), *[""] * 7])
     major, minor, direction_deg = error_ellipse(estimate.cov_en_m2)
     direction = f"{round(direction_deg, 1) % 180.0:.1f}"

@@ -41,7 +41,7 @@ class Feed(Protocol):
 
 
 class LineFeed:
-    """`fixes.jsonl`, or the output of `orthonav fly --json`: results, and health between them.
+    """`fixes.jsonl`, or the output of `orthonav fly --jsonl`: results, and health between them.
 
     Lines that are neither are skipped and reported: a file that a full disk cut short is better
     than none. With `live` the file need not exist yet, and its last line may be incomplete.

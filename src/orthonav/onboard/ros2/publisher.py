@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from orthonav.flight.logged import NO_ALTITUDE_M2
 from orthonav.geo.frames import LocalFrame
 from orthonav.onboard.ros2.node import Node
-from orthonav.onboard.telemetry import Told
+from orthonav.onboard.telemetry import VehicleState
 from orthonav.publish.estimate import NavigationEstimate
 from orthonav.publish.mavlink import require_confident
 from orthonav.records import CONFIDENT
@@ -60,7 +60,7 @@ class Ros2Publisher:
         self._send_origin()
 
     def position(
-        self, estimate: NavigationEstimate, reported: Told, stamp_ns: int
+        self, estimate: NavigationEstimate, vehicle: VehicleState, stamp_ns: int
     ) -> tuple[str, ...]:
         """See `PositionOutput.position`; raises `EstimateError` for a low confidence too."""
         require_confident(estimate, self._least, "NavSatFix")
@@ -69,7 +69,7 @@ class Ros2Publisher:
         cov = floored(np.asarray(estimate.cov_en_m2), self._floor_m)
         self._fix.write(self._navsatfix(estimate, cov, stamp_ns))
         east, north = self._frame.en_from_latlon(estimate.lat_deg, estimate.lon_deg).tolist()
-        turn = orientation(reported)
+        turn = orientation(vehicle)
         self._pose.write(self._posed((east, north), cov, turn, stamp_ns))
         sent = ["NavSatFix", "PoseWithCovarianceStamped"]
         if self._transform is not None:
@@ -175,8 +175,8 @@ def floored(cov_en_m2: Array, min_std_m: float) -> Array:
     return np.asarray(vectors @ np.diag(np.maximum(values, min_std_m**2)) @ vectors.T)
 
 
-def orientation(reported: Told) -> Array:
+def orientation(vehicle: VehicleState) -> Array:
     """The reported attitude as ROS writes it: x, y, z, w; no turn where it is not known."""
-    if reported.ned_from_body is None:
+    if vehicle.ned_from_body is None:
         return np.array([0.0, 0.0, 0.0, 1.0])
-    return ros_xyzw_from_ned(reported.ned_from_body)
+    return ros_xyzw_from_ned(vehicle.ned_from_body)

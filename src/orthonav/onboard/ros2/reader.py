@@ -1,4 +1,4 @@
-"""Pictures of a ROS 2 graph with the telemetry of their exposure: a `Source` for the runner.
+"""Pictures of a ROS 2 graph with the telemetry of their exposure: a `ImageSource` for the runner.
 
 A picture waits a little for the attitude that follows its exposure. Times are ROS time, as the
 header stamps have it; a message without a stamp counts as of its arrival.
@@ -12,7 +12,7 @@ from typing import Any
 
 from orthonav.errors import CameraError, FlightError
 from orthonav.geo.camera import Camera
-from orthonav.onboard.cameras import Picture
+from orthonav.onboard.cameras import CameraImage
 from orthonav.onboard.ros2.messages import TIME_NS
 from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer
@@ -96,17 +96,17 @@ class Ros2Reader:
                 raise CameraError(f"{self._camera_error}: {self._info_topic}")
             if self._camera is not None:
                 return self._camera
-            self._remind(f"no message on {self._info_topic}; or give --camera-file FILE")
+            self._remind(f"no message on {self._info_topic}; or give --camera FILE")
         raise CameraError(
-            f"stopped before a camera_info came; give --camera-file FILE: {self._info_topic}"
+            f"stopped before a camera_info came; give --camera FILE: {self._info_topic}"
         )
 
-    def read(self) -> Picture | None:
-        """See `Source.read`."""
+    def read(self) -> CameraImage | None:
+        """See `ImageSource.read`."""
         while not self._stopped():
             self._spin()
             if self._images and self._is_ready(self._images[0]):
-                return self._picture(self._images.popleft())
+                return self._camera_image(self._images.popleft())
             if self._node.arguments.parameters.use_sim_time and self._clock is None:
                 self._remind("use_sim_time is true and nothing came on /clock")
             elif not self._images and self._number == 0:
@@ -114,7 +114,7 @@ class Ros2Reader:
         return None
 
     def close(self) -> None:
-        """See `Source.close`; the node is closed by its owner."""
+        """See `ImageSource.close`; the node is closed by its owner."""
 
     def now_ns(self) -> int:
         """ROS time; 0 while `/clock` is awaited, as ROS has it."""
@@ -233,7 +233,7 @@ class Ros2Reader:
             return True
         return self._clocks.mono_ns() - image.arrived_ns >= self._wait_ns
 
-    def _picture(self, image: _Waiting) -> Picture:
+    def _camera_image(self, image: _Waiting) -> CameraImage:
         self._number += 1
         exposed_ns = image.stamp_ns - (self._ahead_ns() or 0)
         off_s = (self._clocks.mono_ns() - exposed_ns) / 1e9
@@ -248,16 +248,16 @@ class Ros2Reader:
         except FlightError as error:
             problem = NoFix("bad_image", str(error))
             self._say_once(str(error))
-        reported = self._buffer.at(image.stamp_ns)
-        return Picture(
+        vehicle = self._buffer.at(image.stamp_ns)
+        return CameraImage(
             self._number,
             f"{image.stamp_ns}",
             exposed_ns,
             image.stamp_ns,
             grey,
             problem,
-            reported.telemetry(image.stamp_ns, self._mount_deg),
-            reported,
+            vehicle.telemetry(image.stamp_ns, self._mount_deg),
+            vehicle,
         )
 
     def _restart(self, what: str, back_ns: int) -> None:
