@@ -110,7 +110,7 @@ def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[
     frame = opened.manifest.sheets[0].frame
     route = folder / "route.geojson"
     _write_route(route, frame.latlon_from_en(TURNS_EN_M))
-    _say(options, f"3/5 checking, from {past.name} alone, whether the route can be flown with the map")
+    _say(options, f"3/5 checking, from {past.name} alone, whether this route can be flown")
     checked = _checked(folder, map_path, route, shown)
     _say(options, f"4/5 flying over {present.name}, heading off by 5 deg, height by 5 %")
     request = SimulateRequest(
