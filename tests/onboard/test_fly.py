@@ -389,7 +389,7 @@ def test_why_nothing_is_found_is_looked_at(begin, yaw_off, share, reason):
             right = not heading_known or yaw_off == 0
             if right and telemetry.agl_m == pytest.approx(100.0 * share, rel=0.01):
                 return fix(heading_deg=telemetry.yaw_deg + yaw_off, agl_m=telemetry.agl_m)
-            return NoFix("not_sure", "")
+            return NoFix("low_confidence", "")
 
     locator = FakeLocator(lambda *_: NoFix("searching", ""), "searching")
     flight = begin(locator, second_look=SecondLook(Localizer(), 0.9, lambda work: work()))
