@@ -101,9 +101,15 @@ def followed(tracker, localizer, seen):
     return rows
 
 
-def test_a_flight_is_followed(localizer):
-    tracker = Tracker(localizer)
-    rows = followed(tracker, localizer, views(22))
+@pytest.fixture(scope="module")
+def usual(localizer):
+    """A flight of 22 views, its tracker with history, and what came out; not to be changed."""
+    seen, tracker = list(views(22)), Tracker(localizer, smooth=True)
+    return seen, tracker, followed(tracker, localizer, seen)
+
+
+def test_a_flight_is_followed(usual):
+    rows = usual[2]
     errors = np.array([row[0] for row in rows])
     assert [row[2] for row in rows[10:]] == ["tracking"] * 12
     assert errors[4:].max() < 6 and all(row[1] > 0.9 for row in rows[10:])
@@ -432,14 +438,12 @@ def test_odometry_refuses_views_without_common_ground():
     assert blank is None or displacement(first, blank, 0.01, np.array([1e-3, 4e-4])) is None
 
 
-def test_a_fixed_lag_uses_the_views_after_each(localizer):
-    seen = list(views(16))
-    whole = Tracker(localizer, smooth=True)
+def test_a_fixed_lag_uses_the_views_after_each(localizer, usual):
+    seen, whole, _ = usual
     lagged = Tracker(localizer, smooth=True, lag=3)
-    for tracker in (whole, lagged):
-        followed(tracker, localizer, seen)
+    followed(lagged, localizer, seen)
     found, all_of_them = lagged.smoothed_track(), whole.smoothed_track()
-    assert len(found) == len(all_of_them) == 16
+    assert len(found) == len(all_of_them) == 22
     off = [
         np.hypot(*(place_of(localizer, a) - place_of(localizer, b)))
         for a, b in zip(found, all_of_them, strict=True)

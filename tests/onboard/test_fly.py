@@ -394,7 +394,7 @@ def test_a_wrong_heading_or_height_is_diagnosed_while_nothing_is_found(
             right = not heading_known or yaw_off == 0
             if right and telemetry.agl_m == pytest.approx(100.0 * share, rel=0.01):
                 return fix(heading_deg=telemetry.yaw_deg + yaw_off, agl_m=telemetry.agl_m)
-            return NoFix("not_sure", "")
+            return NoFix("low_confidence", "")
 
     locator = FakeLocator(lambda *_: NoFix("searching", ""), "searching")
     flight = begin(locator, diagnosis=TelemetryDiagnosis(Localizer(), 0.9, lambda work: work()))

@@ -154,7 +154,7 @@ class TrueTelemetryOnly:
         right = not heading_known or abs(telemetry.yaw_deg - self.heading_deg) < 20
         if right and 0.8 < telemetry.agl_m / self.agl_m < 1.25:
             return fix(heading_deg=self.heading_deg, agl_m=self.agl_m)
-        return NoFix("not_sure", "")
+        return NoFix("low_confidence", "")
 
 
 @pytest.mark.parametrize(

@@ -86,13 +86,14 @@ def flown(seed, views=60, false_share=0.3, model=MODEL, history=None):
 
 @functools.cache
 def known(seed):
-    """A flight that is only looked at: its mixture at the end and its rows."""
-    return flown(seed)[1:]
+    """A flight shared by tests that only read it: its mixture at the end, rows and history."""
+    history = History()
+    return *flown(seed, history=history)[1:], history
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_flight_is_found_and_followed(seed):
-    _, rows = known(seed)
+    _, rows, _ = known(seed)
     errors = np.hypot([row[0] for row in rows], [row[1] for row in rows])
     assert errors[10:].max() < 15 and np.median(errors[10:]) < 4
     assert rows[-1][3].state is State.TRACKING
@@ -181,7 +182,7 @@ def test_a_kidnapped_aircraft_is_found_again():
 def test_false_places_that_come_and_go_are_not_followed():
     """Views of nowhere on the map, each with a place that it is somewhat like."""
     confident = 0
-    for seed in range(4):
+    for seed in range(3):
         flight, mixture = Flight(seed), Mixture(MODEL, EXTENT)
         for _ in range(30):
             mixture.predict(1.0, camera=flight.moved())
@@ -218,9 +219,8 @@ def test_a_reported_start_holds_until_views_contradict_it():
 
 def test_smoothing_reduces_error_and_covariance():
     before, after, ratios = [], [], []
-    for seed in range(6):
-        history = History()
-        _, _, rows = flown(seed, history=history)
+    for seed in range(5):
+        _, rows, history = known(seed)
         smoothed = history.smoothed()
         assert len(smoothed) == len(rows) and None not in smoothed
         pairs = list(zip(rows, smoothed, strict=True))[5:]  # before, it may not be found yet

@@ -54,7 +54,7 @@ def test_what_the_runner_writes(fixes):
     out = JsonOut(fixes)
     out.view(result(0), 12.0, ["global-position"], None)
     out.health(HEALTH)
-    out.view(result(1), 12.0, [], "not_sure")
+    out.view(result(1), 12.0, [], "low_confidence")
     batch = feed.poll()
     assert len(batch.results) == 2 and batch.problems == []
     assert batch.health[0][0] == 1

@@ -3,7 +3,7 @@
 A pixel with gradient magnitude m and direction t contributes m * exp(2ik t), k = 0..3:
 the Fourier series of an orientation histogram in which a direction and its opposite are one (an
 edge keeps its place when its contrast flips between seasons). Sums over a cell of these seven
-numbers say the same as a histogram of orientations with soft bins, without any binning.
+numbers carry the information of a histogram of orientations with soft bins, without any binning.
 """
 
 from dataclasses import dataclass
