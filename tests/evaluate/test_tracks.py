@@ -615,7 +615,7 @@ def test_evaluate_refuses_a_flight_without_map_or_report(golden_flight, tmp_path
         (("--flight", flight), "--map and --report"),
         (("--flight", flight, "--map", GOLDEN), "--map and --report"),
         (("--flight", flight, "--report", tmp_path / "r"), "--map and --report"),
-        (("--flight", flight, "--flight", flight, *both), "as many --flight"),
+        (("--flight", flight, "--flight", flight, *both), "give --flight once per file"),
         (("--flight", tmp_path / "none", *both), "does not exist"),
     ):
         code, said, wrong = evaluated(golden_flight, *more, capsys=capsys)

@@ -20,7 +20,7 @@ from orthonav.report.leaflet import load_leaflet
 
 PAGE, JSON, TIF, GEOJSON = "index.html", "check.json", "check.tif", "check.geojson"
 _SIDECAR = "check.tif.aux.xml"
-"""GIS programs leave it beside a raster that they open."""
+"""Written by GIS programs that open the raster."""
 _OURS = {
     *(PAGE, JSON, TIF, GEOJSON, _SIDECAR, FOLDER, f"{FOLDER}/{LIST}"),
     *(f"{FOLDER}/{name}.{kind}" for name in FIGURE_NAMES for kind in ("svg", "png")),
