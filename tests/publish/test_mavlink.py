@@ -227,7 +227,9 @@ def test_a_single_fix_is_a_command() -> None:
 
 
 @pytest.mark.parametrize("estimate", LOW_CONFIDENCE)
-def test_messages_that_cannot_mark_low_confidence_are_not_made(estimate: NavigationEstimate) -> None:
+def test_messages_that_cannot_mark_low_confidence_are_not_made(
+    estimate: NavigationEstimate,
+) -> None:
     for make in (
         lambda: external_position_estimate(estimate),
         lambda: odometry(estimate, POSE, Autopilot.PX4),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from orthonav.cli.common import ROUTE_HELP, print_json, progress
 
 EVERYDAY = (
-    *("--route", "--band-m", "--ortho", "--camera", "--agl-m"),
+    *("--route", "--band-m", "--other-date", "--camera", "--agl-m"),
     *("--yaw-std-deg", "--heading", "--prior-std-m", "--prior", "--quick", "--json"),
 )
 
@@ -35,9 +35,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         "(default: four standard deviations of the prior, at least half a view)",
     )
     parser.add_argument(
-        "--ortho",
+        "--other-date",
         type=Path,
-        metavar="OTHER_YEAR.tif",
+        metavar="TIF",
         help="orthophoto of a second date, not in the map: improves the prediction",
     )
     parser.add_argument(
@@ -52,11 +52,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     _add_errors(parser)
     _add_effort(parser)
     parser.add_argument(
-        "--json",
-        nargs="?",
-        const="-",
-        metavar="FILE",
-        help="write check.json also to a file, or to stdout instead of the text",
+        "--json", action="store_true", help="print the content of check.json instead of the text"
     )
 
 
@@ -89,7 +85,10 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
         help="standard deviation of the prior position, per axis (default 150)",
     )
     prior.add_argument(
-        "--prior", choices=("known", "none"), default="known", help="none: search the whole map"
+        "--prior",
+        choices=("telemetry", "none"),
+        default="telemetry",
+        help="none: search the whole map",
     )
     parser.add_argument(
         "--relief-m",
@@ -106,7 +105,10 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
         help="error of dead reckoning per metre flown without a fix (default 0.03)",
     )
     parser.add_argument(
-        "--accept", type=float, default=0.9, help="confidence that a fix needs (default 0.9)"
+        "--min-confidence",
+        type=float,
+        default=0.9,
+        help="confidence that a fix needs to be accepted (default 0.9)",
     )
 
 
@@ -127,18 +129,15 @@ def run(options: argparse.Namespace) -> int:
 
     from orthonav.check.run import check_map
     from orthonav.check.write import require_free, to_json, verdict_text, write_check
-    from orthonav.files import write_text
 
     require_free(options.out)
     request = _request(options)
     with progress(options) as shown:
         result, opened = check_map(request, shown)
     page = write_check(result, opened, options.out)
-    if options.json == "-":
+    if options.json:
         print_json(json.loads(to_json(result)))
     else:
-        if options.json:
-            write_text(Path(options.json), to_json(result))
         print(verdict_text(result))
         print(f"\nreport: {page}")
     return result.verdict.word.exit_code
@@ -163,13 +162,13 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         map_path=options.map,
         route=route,
         band_m=options.band_m,
-        other_date=options.ortho,
+        other_date=options.other_date,
         camera=camera,
         agl_m=agl_m,
         yaw_std_deg=None if options.heading == "unknown" else options.yaw_std_deg,
         agl_std=options.agl_std,
         prior_std_m=None if options.prior == "none" else options.prior_std_m,
-        accept=options.accept,
+        accept=options.min_confidence,
         speed_mps=options.speed_mps,
         drift=options.drift,
         relief_m=options.relief_m,
@@ -205,7 +204,7 @@ def _provenance(options: argparse.Namespace, route: "Route | None") -> "Provenan
         map_name=options.map.name,
         imagery=imagery_text(manifest.imagery),
         recipe=recipe_text(manifest.recipe),
-        other_date="" if options.ortho is None else options.ortho.name,
+        other_date="" if options.other_date is None else options.other_date.name,
         route_name="" if route is None else route.name or Path(options.route).name,
         command=shlex.join(["orthonav", *sys.argv[1:]]),
         version=__version__,
