@@ -148,14 +148,14 @@ def test_what_is_kept_is_bounded(opened, decoded):
     for _ in range(2):
         for level in range(3):
             whole(layer, level)
-            assert 0 < layer.cached_bytes <= 3 * 2 * CHUNK_PX**2
+            assert 0 < layer._cache.held_bytes <= 3 * 2 * CHUNK_PX**2
     before = len(decoded)
     whole(layer, 2)
     assert len(decoded) == before  # the last used are those kept
     none = GreyLayer.of(opened, cache_bytes=0)
     first, again = whole(none, 0), whole(none, 0)
     np.testing.assert_array_equal(first[0], again[0])
-    assert none.cached_bytes == 0
+    assert none._cache.held_bytes == 0
 
 
 def test_the_chunk_used_longest_ago_goes_first(opened, decoded):
@@ -189,7 +189,7 @@ def test_threads_may_share_it(opened):
             grey = layer.read(0, row, col, 40, 40)[0]
             wanted = expected[row : row + 40, col : col + 40]
             np.testing.assert_array_equal(grey[: wanted.shape[0], : wanted.shape[1]], wanted)
-        return layer.cached_bytes
+        return layer._cache.held_bytes
 
     with ThreadPoolExecutor(4) as pool:
         assert max(pool.map(check, range(4))) <= 4 * CHUNK_PX**2

@@ -17,7 +17,7 @@ from orthonav.localizer import downsampled, rectify
 from orthonav.records import View
 from orthonav.simulate.clouds import Clouds
 from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
-from orthonav.simulate.ground import reflected
+from orthonav.simulate.imagery import reflected
 from orthonav.simulate.motion import Wind
 from orthonav.simulate.render import ViewEffects
 
@@ -236,7 +236,7 @@ REFUSED = {
     "clouds": ({"cloud_share": 1.1}, "cloud_share must be 0 to 1"),
     "cloud nan": ({"cloud_share": math.nan}, "cloud_share must be 0 to 1"),
     "spacing": ({"spacing_m": math.inf}, "above 0"),
-    "speed": ({"speed_mps": math.nan}, "above 0"),
+    "speed": ({"airspeed_mps": math.nan}, "above 0"),
 }
 
 

@@ -157,7 +157,7 @@ def test_a_route(area, plane, tmp_path):
         random=None,
         route=route_of(plane.frame, *corners),
         spacing_m=50.0,
-        speed_mps=20.0,
+        airspeed_mps=20.0,
     )
     places = np.array([plane.frame.en_from_latlon(*truth[view.frame]) for view in flight.views])
     assert len(places) == 17 and places[0] == pytest.approx(corners[0], abs=0.01)
@@ -170,7 +170,7 @@ def test_a_route(area, plane, tmp_path):
 
 def test_a_route_without_spacing_has_a_view_a_second(area, plane, tmp_path):
     route = route_of(plane.frame, [-100.0, 0.0], [100.0, 0.0])
-    flight, _ = flown(area, tmp_path / "f", random=None, route=route, speed_mps=40.0)
+    flight, _ = flown(area, tmp_path / "f", random=None, route=route, airspeed_mps=40.0)
     assert len(flight.views) == 6
     assert [view.telemetry.time_ns for view in flight.views] == [n * 10**9 for n in range(6)]
 
@@ -238,7 +238,9 @@ def test_leaving_the_imagery_is_refused(area, plane, tmp_path, names_in):
     assert names_in(tmp_path) == []
 
 
-@pytest.mark.parametrize("spacing", [{"spacing_m": 0.0}, {"spacing_m": -5.0}, {"speed_mps": 0.0}])
+@pytest.mark.parametrize(
+    "spacing", [{"spacing_m": 0.0}, {"spacing_m": -5.0}, {"airspeed_mps": 0.0}]
+)
 def test_impossible_spacing_is_refused(area, plane, tmp_path, names_in, spacing):
     route = route_of(plane.frame, [0.0, 0.0], [100.0, 0.0])
     with pytest.raises(FlightError, match="above 0"):

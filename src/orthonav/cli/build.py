@@ -22,30 +22,37 @@ RECIPE = (
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     add_orthos(parser, "orthophoto (any georeferenced raster that GDAL reads)")
     add_area(parser, parser.add_mutually_exclusive_group())
     parser.add_argument(
-        "--gsd-m", type=float, help="ground resolution, metres per pixel (default: the imagery's)"
+        "--gsd-m", type=float, help="ground resolution, metres per pixel (default: of the imagery)"
     )
     parser.add_argument("--tile-px", type=int, help="width of a tile (default 256)")
-    parser.add_argument("--overlap", type=float, help="share common to neighbours (default 0.875)")
+    parser.add_argument(
+        "--overlap",
+        type=float,
+        metavar="SHARE",
+        help="overlap of neighbouring tiles, as a share of their width (default 0.875)",
+    )
     parser.add_argument(
         "--method",
-        help="embedding, name:field=value,...: gradient (default), autoencoder, triplet or bovw",
+        metavar="NAME[:FIELD=VALUE,..]",
+        help="embedding: gradient (default), autoencoder, triplet or bovw",
     )
     parser.add_argument(
         "--edges",
-        help="what is compared: gradient, gray, canny (e.g. canny:low=100,high=200), segments or "
+        metavar="NAME[:FIELD=VALUE,..]",
+        help="image representation: gradient, gray, canny (canny:low=100,high=200), segments or "
         "sam:weights=PATH (default: gradient; canny for autoencoder, gray for triplet and bovw)",
     )
-    parser.add_argument("--seed", type=int, help="seed of what is drawn (default 0)")
+    parser.add_argument("--seed", type=int, help="seed of all random draws (default 0)")
     parser.add_argument(
         "--no-registration",
         dest="registration",
         action="store_const",
         const=False,
-        help="leave out the grey picture of the area: a smaller map, positions at tile level only",
+        help="omit the registration layer: a smaller map, with positions at tile level only",
     )
     parser.add_argument(
         "--other-date",
@@ -53,22 +60,22 @@ def add(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="TIF",
-        help="orthophoto of the same ground of another year: the confidence and the covariance "
-        "are learnt from it (may be given again; it does not become part of the map)",
+        help="orthophoto of the same area at another date, from which the confidence and the "
+        "covariance are calibrated; not part of the map (may be repeated)",
     )
     parser.add_argument(
         "--calibration-views",
         type=int,
         metavar="N",
-        help="views made of the orthophoto to learn the confidence from (default 48)",
+        help="views generated from the orthophoto to calibrate the confidence (default 48)",
     )
     parser.add_argument(
         "--work",
         type=Path,
         metavar="DIR",
-        help="keep finished blocks, and checkpoints and pictures of a network's learning, there; "
-        "a build that was interrupted goes on from them (default: the blocks of a large area in "
-        "MAP.onav.work until the map is written)",
+        help="folder for finished blocks and for training checkpoints; rerun an interrupted build "
+        "with it to resume (default: blocks of a large area in MAP.onav.work until the map is "
+        "written)",
     )
     parser.add_argument(
         "--workers",
@@ -77,13 +84,13 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="threads that read imagery (default: one per core); of an atlas, sheets at a time",
     )
     target = parser.add_mutually_exclusive_group(required=True)
-    target.add_argument("--out", type=Path, metavar="MAP.onav")
+    target.add_argument("--out", type=Path, metavar="MAP.onav", help="map file to write")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     build_atlas.add(parser, target)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Build and print a summary."""
+    """Build the map and print a summary."""
     recipe = {name: value for name in RECIPE if (value := getattr(options, name)) is not None}
     if options.atlas is not None:
         return build_atlas.run(options, recipe)
