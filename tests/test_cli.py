@@ -553,7 +553,7 @@ def test_simulate_refuses(run, ortho, out, names_in, make_ortho, tmp_path):
     random, low = ["--random", "3"], ["--agl-m", "60"]
     refused(simulated(*random, "--agl-m", "9000"), "fly lower")
     refused(simulated(*random, "--agl-m", "-5"), "height")
-    refused(simulated("--random", "0"), "number of random places")
+    refused(simulated("--random", "0"), "number of random positions")
     refused(simulated("--route", route, *low), "within the imagery")
     refused(simulated("--route", route, *low, "--spacing-m", "0"), "above 0")
     refused(simulated("--route", tmp_path / "no.csv", *low), "does not exist")

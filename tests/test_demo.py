@@ -37,7 +37,7 @@ def test_the_demo(small_demo, tmp_path, capsys, names_in):
     assert main(["demo", "--out", str(out)]) == 0
     told = capsys.readouterr()
     assert f"{out}/report/index.html" in told.out and "5/5" in told.err
-    assert f"{out}/check/index.html" in told.out and "expected to be placed" in told.out
+    assert f"{out}/check/index.html" in told.out and "expected to give a correct" in told.out
     assert json.loads((out / "check" / "check.json").read_text())["route"]["name"] == "demo"
     names = [name for name in names_in(out) if not name.startswith(("flight/", "."))]
     assert {"area.onav", "demo.json", "check", "fixes.jsonl", "flight", "report"} <= set(names)

@@ -52,13 +52,13 @@ def ortho(make_ortho, tmp_path_factory):
 @pytest.fixture
 def reads(monkeypatch):
     """Blocks that were read from imagery rather than taken from what was kept."""
-    made, counted = SheetReader._made, []
+    made, counted = SheetReader._read_block, []
 
     def counting(reader, raster, job):
         counted.append((job.block.row, job.block.col))
         return made(reader, raster, job)
 
-    monkeypatch.setattr(SheetReader, "_made", counting)
+    monkeypatch.setattr(SheetReader, "_read_block", counting)
     return counted
 
 

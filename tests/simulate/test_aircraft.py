@@ -200,7 +200,7 @@ def test_beyond_the_imagery_the_ground_is_mirrored(fly, frame):
     assert len(views) == 8
     for view in views:
         assert view.std() > 4 and (view == 0).mean() < 0.03
-    with pytest.raises(AreaError, match="wholly within"):
+    with pytest.raises(AreaError, match="completely within"):
         fly("not", corners=OUT, camera=SEEN, spacing_m=90.0)
     inside, _ = fly("inside", corners=[[0.0, 0.0], [280.0, 16.0]], camera=SEEN, spacing_m=90.0)
     for a, b in zip(views, pictures(inside), strict=False):
@@ -230,8 +230,8 @@ def test_mirrors_at_both_ends():
 
 REFUSED = {
     "gale": ({"wind": Wind(25.0)}, "too strong"),
-    "turn": ({"turn_radius_m": -1.0}, "radius of turns"),
-    "turn nan": ({"turn_radius_m": math.nan}, "radius of turns"),
+    "turn": ({"turn_radius_m": -1.0}, "turn radius"),
+    "turn nan": ({"turn_radius_m": math.nan}, "turn radius"),
     "cloud": ({"cloud_share": -0.1}, "cloud_share must be 0 to 1"),
     "clouds": ({"cloud_share": 1.1}, "cloud_share must be 0 to 1"),
     "cloud nan": ({"cloud_share": math.nan}, "cloud_share must be 0 to 1"),

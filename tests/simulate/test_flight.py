@@ -213,13 +213,13 @@ def test_effects_change_the_picture_as_stated(area, tmp_path):
     assert np.ptp(np.log(gains)) > 0.1
 
 
-LEAVES = "does not lie wholly within the imagery"
+LEAVES = "does not lie completely within the imagery"
 REFUSED = {
     "too high": ({"agl_m": 5000.0}, AreaError, "fly lower"),
     "too low": ({"agl_m": 0.1}, FlightError, "1 to 50,000"),
     "nan": ({"agl_m": math.nan}, FlightError, "1 to 50,000"),
-    "none": ({"random": 0}, FlightError, "number of random places"),
-    "neither": ({"random": None}, FlightError, "one of them"),
+    "none": ({"random": 0}, FlightError, "number of random positions"),
+    "neither": ({"random": None}, FlightError, "either a route or"),
 }
 
 

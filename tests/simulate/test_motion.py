@@ -80,7 +80,7 @@ def test_wind_stronger_than_the_airspeed_is_refused(speed):
 
 @pytest.mark.parametrize("wind", [(-1.0, 0.0), (math.nan, 0.0), (5.0, math.nan), (5.0, 1e9)])
 def test_impossible_wind_is_refused(wind):
-    with pytest.raises(FlightError, match="wind must"):
+    with pytest.raises(FlightError, match=r"wind (direction )?must"):
         Wind(*wind)
 
 

@@ -80,9 +80,9 @@ def build_map(
 ) -> BuildResult:
     """Build a map and write it to `request.out`, complete or not at all.
 
-    Equal requests give equal bytes. `progress` is called with a stage and its finished share (0..1),
-    `announce` once with the estimated size and duration. Raises `MissingFileError`, `ImageryError`,
-    `AreaError`, `VariantError` or `OutputError`.
+    Equal requests give equal bytes. `progress` is called with a stage and its finished share
+    (0..1), `announce` once with the estimated size and duration. Raises `MissingFileError`,
+    `ImageryError`, `AreaError`, `VariantError` or `OutputError`.
     """
     progress = progress or (lambda stage, share: None)
     inputs = BuildInputs.open(request)

@@ -88,7 +88,7 @@ class CropSampler:
     def cut(
         self, grey: NDArray[np.uint8], valid: NDArray[np.bool_], places: NDArray[np.intp]
     ) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-        """Crops (N, S, S) of a block at valid positions with contrast, and these positions (N, 2)."""
+        """Crops (N, S, S) of a block at valid positions with contrast; these positions (N, 2)."""
         size = self._crop_px(*grey.shape)
         crops = np.zeros((len(places), size, size), np.uint8)
         found: list[tuple[int, int]] = []

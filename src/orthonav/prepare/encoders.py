@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 BATCH_TILES = 64
 MAX_WORD_TILES = 2000
 MOST_REPLACED, MOST_MIXED = 0.35, 0.4
-"""Change of the positives of a triplet. It is weaker than in calibration: with the stronger change a
+"""Change of the positives of a triplet, weaker than in calibration: with the stronger change a
 network learned a third as much in its first 300 batches."""
 
 EncoderRecipe = AutoEncoderRecipe | TripletRecipe | WordsRecipe

@@ -94,7 +94,7 @@ class GroundImagery:
     mirror_px: tuple[int, int, int, int] | None = None
 
     def window(self, corners_en_m: Array, margin_px: int) -> tuple[NDArray[np.uint8], Array]:
-        """Pixels (H, W, 3) under the quadrilateral (4, 2), and the position (2,) of their corner."""
+        """Pixels (H, W, 3) under a quadrilateral (4, 2), and the position (2,) of their corner."""
         cols = (corners_en_m[:, 0] - self.west_m) / self.gsd_m
         rows = (self.north_m - corners_en_m[:, 1]) / self.gsd_m
         left, top = math.floor(cols.min()) - margin_px, math.floor(rows.min()) - margin_px
