@@ -15,6 +15,7 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**28))
 
 import cv2
+import hypothesis
 import pytest
 
 from helpers import Done, textured
@@ -27,6 +28,9 @@ from orthonav.mapfile import open_map
 pytest_plugins = ["absent"]
 SEED = 2
 cv2.setNumThreads(1)  # tests run side by side
+# A slow or busy machine fails no test: the time limit of a whole test is in pyproject.toml.
+hypothesis.settings.register_profile("orthonav", deadline=None)
+hypothesis.settings.load_profile("orthonav")
 
 
 @dataclass(frozen=True)

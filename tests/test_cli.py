@@ -536,7 +536,7 @@ def test_evaluate_refuses(run, fixes_path, truth_path, out, names_in, tmp_path, 
     refused(evaluated(truth_path, truth_path), "line 1")
     refused(evaluated(fixes_path, fixes_path), "columns are missing")
     refused(evaluated(fixes_path, other), "same flight")
-    refused(evaluated(fixes_path, truth_path, "--truth", other), "as many --truth")
+    refused(evaluated(fixes_path, truth_path, "--truth", other), "give --truth once per file")
     refused(evaluated(fixes_path, truth_path, "--radius-m", "0"), "radius")
     refused(evaluated(fixes_path, truth_path, "--radius-m", "nan"), "radius")
     (out / "file").write_text("in the way")

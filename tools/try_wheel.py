@@ -28,7 +28,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 CONSTRAINTS = ROOT / "constraints.txt"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-EXTRAS = [name for name in PROJECT["optional-dependencies"] if name not in ("dev", "docs")]
+EXTRAS = [name for name in PROJECT["optional-dependencies"] if name not in ("dev", "docs", "test")]
 LARGE = ("train", "cluster")
 """Extras that bring gigabytes (PyTorch) or hundreds of MB (Ray): only with --all."""
 MADE_BY_BUILD = ("PKG-INFO", "setup.cfg", "src/orthonav.egg-info/")

@@ -60,7 +60,7 @@ def test_pictures_are_taken_whatever_they_are_called(body):
         (terrain.encoded(NOISE, "TIFF"), 200, "not an image", True),
     ],
 )
-def test_everything_else_is_refused(body, status, words, again):
+def test_other_answers_are_rejected(body, status, words, again):
     with pytest.raises(BadReplyError, match=words) as raised:
         image_or_absent(reply(body, status), SHAPE, None)
     assert raised.value.again == again and len(str(raised.value)) < 500
@@ -70,7 +70,7 @@ def test_everything_else_is_refused(body, status, words, again):
     "body, status",
     [(b"", 204), (b"not found", 404), (b"gone", 410), (OUT_OF_RANGE, 400), (OUT_OF_RANGE, 200)],
 )
-def test_what_the_service_says_is_not_there_is_absent(body, status):
+def test_reported_gaps_are_absent(body, status):
     assert image_or_absent(reply(body, status), SHAPE, None) is None
 
 
@@ -79,7 +79,7 @@ def test_a_service_of_maps_has_no_tiles_to_miss():
         image_or_absent(reply(b"not found", 404), SHAPE, None, tiled=False)
 
 
-def test_a_bomb_is_refused_by_its_head():
+def test_a_bomb_is_rejected_by_its_head():
     head = bytearray(terrain.encoded(np.zeros((16, 16, 3), np.uint8)))
     head[16:24] = (100_000).to_bytes(4, "big") * 2  # width and height of 100000 px
     head[29:33] = zlib.crc32(head[12:29]).to_bytes(4, "big")

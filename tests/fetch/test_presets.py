@@ -16,7 +16,7 @@ LAYERS = [(p.name, layer.id) for p in presets().values() for layer in p.layers.v
 
 
 @pytest.mark.parametrize("name", presets())
-def test_a_service_is_described_whole(name):
+def test_a_service_is_complete(name):
     preset = presets()[name]
     assert re.fullmatch(r"[a-z][a-z0-9-]+", name) and name not in PROTOCOLS
     assert preset.protocol in PROTOCOLS and preset.title and preset.country
@@ -34,7 +34,7 @@ def test_a_service_is_described_whole(name):
 
 
 @pytest.mark.parametrize("name, id_", LAYERS)
-def test_a_layer_is_described_whole(name, id_):
+def test_a_layer_is_complete(name, id_):
     preset = presets()[name]
     layer = preset.layers[id_]
     assert "{" not in f"{layer}" and 0.05 <= layer.gsd_m <= 1
@@ -68,7 +68,7 @@ def test_express_layers_warn_that_they_are_no_other_date():
                 )
 
 
-def test_names_that_are_not_known_list_those_that_are():
+def test_unknown_names_list_the_known_ones():
     with pytest.raises(FetchError, match=r"unknown service 'ing'; available: .*ign"):
         find_preset("ing")
     with pytest.raises(FetchError, match="write the protocol"):
@@ -77,7 +77,7 @@ def test_names_that_are_not_known_list_those_that_are():
         parse_source("naip", ImageryOptions())
 
 
-def test_what_the_user_says_goes_first():
+def test_options_of_the_user_take_precedence():
     spec = parse_source(
         "ign:2021",
         ImageryOptions(style="other", crs="EPSG:2154", gsd_m=1.0),

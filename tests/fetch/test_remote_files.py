@@ -61,7 +61,7 @@ def test_overviews_serve_coarser_pixels(take, placed, cog_bytes, gsd_m, res):
     placed(path, worst=30)  # averages of four
 
 
-def test_masks_travel(take, tmp_path):
+def test_masks_are_preserved(take, tmp_path):
     hole = np.s_[200:300, 220:280]
     body = terrain.write_tif(
         tmp_path / "hole.tif", UTM, hole=hole, size=500, driver="COG"
@@ -89,7 +89,7 @@ def test_bands_are_chosen(take, tmp_path, bands, wanted, count):
         assert data.count == count and data.compression.name.lower() == "jpeg"
 
 
-def test_an_area_beside_the_file(take, cog_bytes):
+def test_an_area_outside_the_file(take, cog_bytes):
     area = Area.from_bounds((3.5, 46.5, 3.501, 46.501))
     words = "no imagery of this area"
     with servers.serving(servers.files({"/a.tif": cog_bytes})) as server:
@@ -205,7 +205,7 @@ def test_a_static_catalogue(take, placed, catalogue):
     assert terrain.tags(path)["ACQUISITION_DATE"] == "2021-06-15"
 
 
-def test_a_file_off_the_grid_is_resampled_and_said_to_be(take, placed, catalogue):
+def test_a_file_off_the_grid_is_resampled_and_the_note_says_so(take, placed, catalogue):
     with servers.serving(servers.files(static(catalogue))) as server:
         result, path = take(f"stac:{server.url}/cat.json", gsd_m=None)
     assert "1 of 3 files resampled" in result.estimate.provenance.note
@@ -277,7 +277,7 @@ def test_signed_files(catalogue, tmp_path):
         ({"asset": "visual"}, "no asset visual; available: data"),
     ],
 )
-def test_what_a_catalogue_does_not_have(take, catalogue, options, words):
+def test_missing_catalogue_items_are_an_error(take, catalogue, options, words):
     answer = servers.files(static(catalogue))
     with servers.serving(answer) as server, pytest.raises(FetchError, match=words):
         take(f"stac:{server.url}/cat.json", gsd_m=None, **options)
@@ -287,7 +287,7 @@ def test_what_a_catalogue_does_not_have(take, catalogue, options, words):
     "body, words",
     [(b"<html>", "not JSON"), (b"[1]", "not a JSON object"), (b"{}", "no imagery of the area")],
 )
-def test_what_is_no_catalogue(take, body, words):
+def test_invalid_catalogues_are_rejected(take, body, words):
     answer = servers.files({"/c.json": body})
     with servers.serving(answer) as server, pytest.raises(FetchError, match=words):
         take(f"stac:{server.url}/c.json", gsd_m=None)

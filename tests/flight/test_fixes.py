@@ -116,7 +116,7 @@ def test_no_fix_has_a_reason_and_no_position() -> None:
     assert values["evidence"] == {"spread": 0.5}
 
 
-def test_nanoseconds_since_1970_are_kept() -> None:
+def test_nanoseconds_since_1970_are_exact() -> None:
     time_ns = 1_767_225_600_123_456_789
     line = result_to_json(ViewResult("a", time_ns, NoFix("blank", ""), 1.0))
     assert '"time_s": 1767225600.123456789,' in line
@@ -144,7 +144,7 @@ def test_extra_keys_and_positions_without_a_fix_are_passed_over(tmp_path: Path) 
     assert isinstance(no_fix, NoFix) and no_fix.reason == "blank" and no_fix.detail == ""
 
 
-def test_a_missing_file_is_said(tmp_path: Path) -> None:
+def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(MissingFileError, match=r"fixes\.jsonl"):
         read_results(tmp_path / "fixes.jsonl")
 

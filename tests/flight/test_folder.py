@@ -128,11 +128,17 @@ def test_spreadsheets_are_read(folder):
     assert view.telemetry.missing() == ["pitch_deg", "roll_deg"]
 
 
-@pytest.mark.parametrize("values", ["nan,2,3", "46,,3", "46,2,", "91,2,3", "46,361,3", "46,2,inf"])
-def test_half_a_prior_is_none(folder, values):
+@pytest.mark.parametrize("values", ["nan,2,3", "46,,3", "46,2,", "91,92,3", "46,361,3", "46,2,inf"])
+def test_an_incomplete_prior_is_ignored(folder, values):
     text = f"{HEADER},prior_lat_deg,prior_lon_deg,prior_std_m,vel_east_mps\n{ROW},{values},1\n"
     view = open_flight(telemetry(folder, text)).views[0]
     assert view.telemetry.prior is None and view.telemetry.vel_en_mps is None
+
+
+def test_a_swapped_prior_is_named(folder):
+    text = f"{HEADER},prior_lat_deg,prior_lon_deg,prior_std_m\n{ROW},121.5,24,30\n"
+    with pytest.raises(FlightError, match=r"line 2: prior .* seem to be swapped"):
+        open_flight(telemetry(folder, text))
 
 
 def test_views_in_subfolders(folder):
@@ -244,12 +250,12 @@ def test_cameras_that_cannot_be(folder, changes):
     ],
     ids=lambda changes: str(changes)[:30],
 )
-def test_cameras_that_are_none(folder, changes):
+def test_invalid_cameras_are_rejected(folder, changes):
     refused(camera(folder, **changes), "expected {camera", names="flight.json")
 
 
 @pytest.mark.parametrize("text", ["", "{", "null", "5", "[]", "{}", '{"camera": 5}', "[" * 10**5])
-def test_a_camera_file_that_is_none(folder, text):
+def test_invalid_camera_files_are_rejected(folder, text):
     (folder / "flight.json").write_text(text)
     refused(folder, "expected {camera.*as JSON", names="flight.json")
 

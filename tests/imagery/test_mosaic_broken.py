@@ -136,7 +136,7 @@ def made(kind, ortho):
 
 @pytest.mark.parametrize("kept", [0.1, 0.5, 0.95])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_file_that_was_cut_short_is_never_read_as_if_whole(ortho, kind, kept):
+def test_an_incomplete_file_is_an_error(ortho, kind, kept):
     path = made(kind, ortho)
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])

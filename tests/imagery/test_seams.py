@@ -49,7 +49,7 @@ def cut(folder, scene, transform, side, make=write, **more):
         (0.25, 1.3, 187),
     ],
 )
-def test_a_raster_that_was_cut_is_read_as_if_whole(tmp_path, frame, source_gsd_m, gsd_m, side):
+def test_a_raster_cut_into_files_is_read_as_the_whole(tmp_path, frame, source_gsd_m, gsd_m, side):
     size = round(130 / source_gsd_m)
     transform = placed(LAMBERT, source_gsd_m, size, frame=frame)
     scene = rough_scene(size)
@@ -217,7 +217,7 @@ def test_hidden_files_are_not_read_and_shared_ones_once(tmp_path, monkeypatch):
     assert {path.parent.name for path in counted} == {"2021"}
 
 
-def test_what_is_kept_has_a_limit():
+def test_the_cache_has_a_limit():
     kept, reads = CellCache(limit_bytes=25_000), []
 
     def reader(number):

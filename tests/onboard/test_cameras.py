@@ -11,19 +11,19 @@ from orthonav.errors import FlightError, MissingFileError
 from orthonav.geo.camera import Camera
 from orthonav.onboard.cameras import (
     CameraGoneError,
+    CameraImage,
     CameraThread,
-    Entry,
     FrozenCheck,
     LiveCamera,
-    Newest,
-    Picture,
-    Recorded,
+    NewestImage,
+    Playback,
+    RecordedImage,
     autopilot_pace,
     is_live,
     live_name,
     own_pace,
     read_into,
-    recorded_entries,
+    recorded_images,
 )
 from orthonav.records import Telemetry
 
@@ -32,8 +32,8 @@ def noisy(seed, shape=(240, 320)):
     return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
 
-def picture(number, grey=None):
-    return Picture(number, str(number), number * S, number * S, grey)
+def image(number, grey=None):
+    return CameraImage(number, str(number), number * S, number * S, grey)
 
 
 class Device:
@@ -60,20 +60,20 @@ class Device:
 
 
 def test_who_asks_gets_the_newest():
-    newest = Newest()
+    newest = NewestImage()
     for number in range(5):
-        newest.put(picture(number))
+        newest.put(image(number))
     assert newest.take(0).number == 4
     assert newest.take(0) is None
     assert (newest.taken, newest.replaced, newest.is_over) == (5, 4, False)
-    newest.put(picture(5))
+    newest.put(image(5))
     newest.end()
     assert not newest.is_over and newest.take(1).number == 5 and newest.is_over
 
 
 def test_who_asks_waits_for_one():
-    newest = Newest()
-    threading.Timer(0.05, newest.put, [picture(7)]).start()
+    newest = NewestImage()
+    threading.Timer(0.05, newest.put, [image(7)]).start()
     assert newest.take(5).number == 7
 
 
@@ -104,7 +104,7 @@ def test_a_camera_that_stops_comes_back():
         opened.append(Device(lives[len(opened)] if len(opened) < len(lives) else ["absent"]))
         return opened[-1]
 
-    newest, pauses = Newest(), []
+    newest, pauses = NewestImage(), []
     camera = LiveCamera(0, time.clocks, capture=capture)
     read_into(newest, camera, lambda: len(opened) > 5, pauses.append)
     assert newest.taken == 3 and newest.outages == 2
@@ -121,25 +121,25 @@ def test_a_driver_with_a_fault_is_asked_again(caplog):
             self.asked += 1
             if self.asked < 4:
                 raise ZeroDivisionError("driver")
-            return picture(1) if self.asked == 4 else None
+            return image(1) if self.asked == 4 else None
 
         def close(self):
             self.closed += 1
 
-    newest, odd = Newest(), Odd()
+    newest, odd = NewestImage(), Odd()
     read_into(newest, odd, lambda: False, lambda _: None)
     assert (newest.taken, newest.outages, odd.closed) == (1, 1, 4)
     assert caplog.text.count("Traceback") == 1
 
 
 def entries(*times_s):
-    return iter([Entry(f"{t}", round(t * S), lambda: noisy(0)) for t in times_s])
+    return iter([RecordedImage(f"{t}", round(t * S), lambda: noisy(0)) for t in times_s])
 
 
 @pytest.mark.parametrize("pace", [1.0, 4.0])
 def test_a_recording_comes_at_its_own_pace(pace):
     time = Time()
-    source = Recorded(
+    source = Playback(
         entries(50.0, 50.5, 53.0), own_pace(time.clocks, pace), time.clocks, lambda: False
     )
     begin, seen = time.now_ns, []
@@ -159,13 +159,13 @@ def test_a_recording_may_keep_to_the_clock_of_the_autopilot():
         return None if offset[0] is None else mono_ns + offset[0]
 
     due_ns = autopilot_pace(boot_ns, time.clocks, 2.0)
-    source = Recorded(entries(14.0, 15.0), due_ns, time.clocks, lambda: False)
+    source = Playback(entries(14.0, 15.0), due_ns, time.clocks, lambda: False)
     assert [source.read().exposed_ns for _ in range(2)] == [102 * S, 102 * S + S // 2]
 
 
 def test_a_recording_can_be_stopped():
     time = Time()
-    source = Recorded(entries(0.0, 9e9), own_pace(time.clocks, 1.0), time.clocks, lambda: True)
+    source = Playback(entries(0.0, 9e9), own_pace(time.clocks, 1.0), time.clocks, lambda: True)
     assert source.read() is None
 
 
@@ -173,7 +173,7 @@ def test_flight_folders_keep_their_times_and_telemetry(tmp_path):
     camera = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
     rows = [Telemetry(n * S + n, 10.0 * n, 1.0, -2.0, 100.0 + n) for n in range(3)]
     write_flight(tmp_path, camera, [(noisy(n), row) for n, row in enumerate(rows)])
-    telemetry = list(recorded_entries(tmp_path, 1.0))
+    telemetry = list(recorded_images(tmp_path, 1.0))
     assert [each.time_ns for each in telemetry] == [row.time_ns for row in rows]
     assert [each.telemetry for each in telemetry] == rows
     np.testing.assert_array_equal(telemetry[2].load(), noisy(2))
@@ -186,8 +186,8 @@ def test_a_half_written_picture_is_told(tmp_path):
     (tmp_path / "1.jpg").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "note.txt").write_text("no picture")
     time = Time()
-    telemetry = recorded_entries(tmp_path, 4.0)
-    source = Recorded(telemetry, own_pace(time.clocks, 1.0), time.clocks, lambda: False)
+    telemetry = recorded_images(tmp_path, 4.0)
+    source = Playback(telemetry, own_pace(time.clocks, 1.0), time.clocks, lambda: False)
     seen = [source.read() for _ in range(4)]
     assert [each and each.frame for each in seen] == ["0.jpg", "1.jpg", "2.jpg", None]
     assert seen[1].grey is None and seen[1].problem.reason == "bad_image"
@@ -195,8 +195,8 @@ def test_a_half_written_picture_is_told(tmp_path):
     assert seen[2].exposed_ns - seen[0].exposed_ns == S // 2
     (tmp_path / "0.jpg").unlink()
     assert (
-        Recorded(
-            iter([Entry("0.jpg", 0, (tmp_path / "0.jpg").read_bytes)]),
+        Playback(
+            iter([RecordedImage("0.jpg", 0, (tmp_path / "0.jpg").read_bytes)]),
             own_pace(time.clocks, 1.0),
             time.clocks,
             lambda: False,
@@ -213,19 +213,20 @@ def test_a_video_has_times_of_its_own(tmp_path):
     for number in range(4):
         writer.write(np.dstack([np.full((240, 320), 40 * number, np.uint8)] * 3))
     writer.release()
-    telemetry = list(recorded_entries(path, 1.0))
-    assert [each.time_ns for each in telemetry] == [0, S // 10, S // 5, 3 * S // 10]
-    assert [round(float(each.load().mean()) / 40) for each in telemetry] == [0, 1, 2, 3]
+    found = list(recorded_images(path, None))
+    assert [each.time_ns for each in found] == [0, S // 10, S // 5, 3 * S // 10]
+    assert [round(float(each.load().mean()) / 40) for each in found] == [0, 1, 2, 3]
+    assert [each.time_ns for each in recorded_images(path, 5.0)] == [0, S // 5]
 
 
 def test_what_is_no_camera_is_refused(tmp_path):
     with pytest.raises(MissingFileError):
-        recorded_entries(tmp_path / "nothing", 1.0)
-    with pytest.raises(FlightError, match="no pictures"):
-        recorded_entries(tmp_path, 1.0)
+        recorded_images(tmp_path / "nothing", 1.0)
+    with pytest.raises(FlightError, match="no images"):
+        recorded_images(tmp_path, 1.0)
     (tmp_path / "x.mp4").write_bytes(b"no video")
     with pytest.raises(FlightError, match="video"):
-        recorded_entries(tmp_path / "x.mp4", 1.0)
+        recorded_images(tmp_path / "x.mp4", 1.0)
 
 
 def test_a_device_that_is_not_there_is_gone_for_now():
@@ -275,8 +276,8 @@ def test_a_moving_view_is_not_frozen():
 def test_a_camera_reads_in_a_thread(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), noisy(0))
     time, stopping = Time(), threading.Event()
-    source = Recorded(
-        recorded_entries(tmp_path, 1.0), own_pace(time.clocks, 1.0), time.clocks, stopping.is_set
+    source = Playback(
+        recorded_images(tmp_path, 1.0), own_pace(time.clocks, 1.0), time.clocks, stopping.is_set
     )
     thread = CameraThread(source, stopping)
     assert thread.newest.take(5).frame == "a.png"

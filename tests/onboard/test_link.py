@@ -37,7 +37,7 @@ class Flying:
         return self.link.poll()
 
     def telemetry(self, **options):
-        return self.link.told_at(self.time.now_ns).telemetry(0, **options)
+        return self.link.state_at(self.time.now_ns).telemetry(0, **options)
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def test_the_first_autopilot_that_is_heard_is_ours():
     assert flying.hear(flying.autopilot.heartbeat(kind=3)) == 1
     assert (flying.link.target, flying.link.kind) == (Target(1, 1), Kind.ARDUPILOT)
     assert flying.hear(Autopilot(9).heartbeat(), stranger, Autopilot(1, 2).attitude(5 * S)) == 0
-    assert flying.link.buffer.newest_ns is None
+    assert flying.link.buffer.covered_ns is None
 
 
 def test_another_system_may_be_named():
@@ -79,13 +79,11 @@ def test_telemetry_at_an_exposure(flying):
         )
         flying.time.go(0.1)
     exposed = flying.time.now_ns - 250 * MS  # between the first and the second
-    telemetry = flying.link.told_at(exposed)
-    assert telemetry.telemetry(1).yaw_deg == pytest.approx(
-        30.0 + (exposed + AHEAD_NS) / S, abs=1e-3
-    )
-    assert (telemetry.height_m, telemetry.height_source) == (pytest.approx(80.0), "home")
-    assert telemetry.telemetry(1).vel_en_mps == pytest.approx((3.0, 9.0))
-    assert telemetry.down_m == pytest.approx(-70.0)
+    vehicle = flying.link.state_at(exposed)
+    assert vehicle.telemetry(1).yaw_deg == pytest.approx(30.0 + (exposed + AHEAD_NS) / S, abs=1e-3)
+    assert vehicle.height_m == pytest.approx(80.0)
+    assert vehicle.telemetry(1).vel_en_mps == pytest.approx((3.0, 9.0))
+    assert vehicle.down_m == pytest.approx(-70.0)
     assert flying.link.covers(exposed) and not flying.link.covers(flying.time.now_ns + S)
 
 
@@ -95,26 +93,25 @@ def test_heights_of_every_message(flying):
 
     def height(*frames):
         flying.hear(*frames)
-        telemetry = flying.link.told_at(flying.time.now_ns)
-        return telemetry.height_source, round(telemetry.height_m, 2)
+        return round(flying.link.state_at(flying.time.now_ns).height_m, 2)
 
     unknown = -1001.0
     say = flying.autopilot.say
     relative = say("altitude", now // 1000, 0, 0, 0, 55.0, unknown, 0)
-    assert height(relative) == ("relative", 55.0)
-    assert height(flying.autopilot.home(now, 60.0)) == ("home", 60.0)
+    assert height(relative) == 55.0
+    assert height(flying.autopilot.home(now, 60.0)) == 60.0
     flying.time.go(0.02)
     # stamped since 1970, as some autopilots do
     since_1970 = say("altitude", (UTC_NS + now) // 1000, 0, 0, 0, 55.0, 42.0, 0)
-    assert height(since_1970) == ("terrain", 42.0)
+    assert height(since_1970) == 42.0
     ahead = flying.autopilot.distance(flying.boot_ns(), 7.0, orientation=0)
     too_far = say("distance_sensor", now // MS, 20, 5000, 5000, 0, 0, 25, 255)
-    assert height(ahead, too_far) == ("terrain", 42.0)
+    assert height(ahead, too_far) == 42.0
     down = math.cos(math.radians(10))
-    assert height(say("rangefinder", 50.0, 1.0)) == ("distance", round(50 * down, 2))
+    assert height(say("rangefinder", 50.0, 1.0)) == round(50 * down, 2)
     flying.time.go(0.02)
     telemetry = flying.autopilot.distance(flying.boot_ns(), 40.0)
-    assert height(telemetry) == ("distance", round(40 * down, 2))
+    assert height(telemetry) == round(40 * down, 2)
 
 
 def test_attitude_as_a_quaternion(flying):

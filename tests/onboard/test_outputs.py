@@ -24,7 +24,7 @@ from orthonav.onboard.outputs import (
     TcpSink,
     open_sink,
 )
-from orthonav.onboard.telemetry import Told
+from orthonav.onboard.telemetry import VehicleState
 from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
 from orthonav.publish.gate import Gate, GateRules
 from orthonav.publish.local import Autopilot, Origin, north_east_m
@@ -37,7 +37,7 @@ ORIGIN = Origin(48.0, 2.0, 100.0)
 ESTIMATE = NavigationEstimate(
     48.01, 2.01, np.eye(2) * 9.0, 0.97, utc_ns=UTC_NS, boot_ns=1, vel_en_mps=(3.0, 4.0)
 )
-TOLD = Told(np.eye(3), 100.0, "home", (4.0, 3.0, 0.1), -90.0)
+VEHICLE = VehicleState(np.eye(3), 100.0, (4.0, 3.0, 0.1), -90.0)
 
 
 class Sending:
@@ -54,7 +54,7 @@ class Sending:
         self.frames.append(decode(self.packer.pack(message)))
         return self.open
 
-    def publish(self, estimate=ESTIMATE, telemetry=TOLD, origin=ORIGIN, age_s=0.25, **more):
+    def publish(self, estimate=ESTIMATE, telemetry=VEHICLE, origin=ORIGIN, age_s=0.25, **more):
         known = {"target": Target(1, 1), "kind": Autopilot.PX4, "boot_ns": 61 * S, **more}
         exposed = self.time.now_ns - round(age_s * S)
         return self.messenger.publish(
@@ -96,7 +96,7 @@ def test_while_the_clock_of_the_autopilot_is_not_known_nothing_is_stamped_by_it(
 def test_local_messages_wait_for_the_origin_and_the_height():
     sending = Sending("odometry", "global-position")
     assert sending.publish(origin=None) == ("GLOBAL_POSITION_SENSOR",)
-    assert sending.publish(telemetry=Told(None)) == ("GLOBAL_POSITION_SENSOR",)
+    assert sending.publish(telemetry=VehicleState(None)) == ("GLOBAL_POSITION_SENSOR",)
     assert sum(sending.messenger.not_made.values()) == 2
     assert sending.publish(kind=Autopilot.ARDUPILOT) == tuple(
         KINDS[kind] for kind in ("odometry", "global-position")
@@ -208,7 +208,7 @@ def test_lines_are_those_of_fixes(tmp_path):
     out = JsonOut(path)
     out.view(RESULT, 40.25, ("GPS_INPUT",), None)
     out.health({"health": "OK", "reasons": []})
-    out.view(replace(RESULT, outcome=NoFix("frozen_picture", "again")), 1.0, (), "no_fix")
+    out.view(replace(RESULT, outcome=NoFix("frozen_image", "again")), 1.0, (), "no_fix")
     out.close()
     old, first, health, second = path.read_text().splitlines()
     assert old == "an old line"
@@ -216,7 +216,7 @@ def test_lines_are_those_of_fixes(tmp_path):
     assert (read.time_ns, read.outcome.lat_deg) == (UTC_NS + 5, 48.0)
     assert json.loads(first)["age_ms"] == 40.25 and json.loads(first)["sent"] == ["GPS_INPUT"]
     assert json.loads(health)["health"] == "OK"
-    assert result_from_json(second).outcome.reason == "frozen_picture"
+    assert result_from_json(second).outcome.reason == "frozen_image"
 
 
 def test_lines_on_stdout(capsys):

@@ -39,7 +39,7 @@ from orthonav.onboard.ros2.messages import Definitions
 from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.ros2.publisher import Ros2Publisher, floored
 from orthonav.onboard.ros2.reader import Ros2Reader
-from orthonav.onboard.telemetry import Clocks, TelemetryBuffer, Told
+from orthonav.onboard.telemetry import Clocks, TelemetryBuffer, VehicleState
 from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
 from orthonav.publish.gate import Gate, GateRules
 from orthonav.records import ViewResult
@@ -484,7 +484,7 @@ class Publishing:
         self.time.go(0.2)
         exposed_ns = self.time.now_ns - 10**8
         result = ViewResult("a", stamp_ns, outcome, 1.0, "tracking")
-        return self.whole.publish(result, exposed_ns, reported or Told(None), judged=True)
+        return self.whole.publish(result, exposed_ns, reported or VehicleState(None), judged=True)
 
 
 @pytest.fixture
@@ -511,7 +511,7 @@ def test_a_position_goes_out_as_fix_and_pose(peer, publishing):
     flying = publishing()
     ned = Rotation.from_euler("ZYX", (30.0, 5.0, -3.0), degrees=True).as_matrix()
     outcome = fix(lat_deg=47.01, lon_deg=8.02, cov_en_m2=COV)
-    sent = flying.publish(outcome, 7 * S + 5, Told(ned))
+    sent = flying.publish(outcome, 7 * S + 5, VehicleState(ned))
     assert sent == ("NavSatFix", "PoseWithCovarianceStamped")
     (found,) = wait_for(lambda: peer.heard("/orthonav/fix"), 5)
     assert (found.latitude, found.longitude) == (47.01, 8.02) and math.isnan(found.altitude)
@@ -558,7 +558,9 @@ def test_what_the_gate_withholds_never_goes_out(peer, publishing, changes, reaso
 def test_the_publisher_itself_refuses_a_low_confidence(publishing):
     flying = publishing()
     with pytest.raises(EstimateError, match="NavSatFix"):
-        flying.out.position(NavigationEstimate(47.0, 8.0, COV, 0.5, utc_ns=1), Told(None), 1)
+        flying.out.position(
+            NavigationEstimate(47.0, 8.0, COV, 0.5, utc_ns=1), VehicleState(None), 1
+        )
 
 
 def test_a_dry_run_sends_health_and_no_position(peer, publishing):
@@ -708,7 +710,7 @@ def test_a_bag_replayed_in_real_time_is_flown(flown, env, peer, tmp_path, sim_ti
     errors, lines, flight_log = (tmp_path / name for name in ("errors", "lines.jsonl", "log.mcap"))
     running = process(
         *(env, errors, "fly", path, "--ros2", "--deadline-ms", "1500"),
-        *("--json", lines, "--log", flight_log, "--ros-args", *REMAPPED),
+        *("--jsonl", lines, "--log", flight_log, "--ros-args", *REMAPPED),
         *("-p", f"use_sim_time:={str(sim_time).lower()}"),
     )
     try:
@@ -752,13 +754,13 @@ def test_no_camera_info_is_said_and_sigterm_ends_it(flown, env, peer, tmp_path):
         wait_for(lambda: "no message on /cam/camera_info" in errors.read_text(), 60)
     finally:
         code = stopped(running)
-    assert code == 1 and "--camera-file" in errors.read_text().splitlines()[-1]
+    assert code == 1 and "--camera" in errors.read_text().splitlines()[-1]
 
 
 def test_what_cannot_be_flown_together_is_said(flown, run, env):
     path = flown[0]
     for words, said in (
-        (["--ros2", "--camera", "0"], "--ros2 replaces"),
+        (["0", "--ros2"], "--ros2 replaces"),
         (["--ros2", "--autopilot", "udpin:0"], "--ros2 replaces"),
         (["--ros-args", "-r", "a:=b"], "needs --ros2"),
         ([], "--ros2"),

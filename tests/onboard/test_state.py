@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 
 from orthonav.onboard import state
-from orthonav.onboard.state import Saved, boot_id, load, prior_of, save
+from orthonav.onboard.state import SavedState, boot_id, load, prior_of, save
 
 S = 10**9
-SAVED = Saved(48.1, 2.3, 4.0, 1_700_000_000 * S, 500 * S, "run-1", 77)
+SAVED = SavedState(48.1, 2.3, 4.0, 1_700_000_000 * S, 500 * S, "run-1", 77)
 
 
 def test_what_is_saved_comes_back(tmp_path, names_in):
@@ -42,7 +42,7 @@ def test_what_is_old_or_from_the_future_is_not_used(age_s):
 
 
 def test_without_a_position_there_is_no_prior():
-    assert prior_of(Saved(signing_timestamp_10us=5), 1.0, 300.0) is None
+    assert prior_of(SavedState(signing_timestamp_10us=5), 1.0, 300.0) is None
     assert prior_of(replace(SAVED, std_m=math.nan), 1.0, 300.0) is None
 
 

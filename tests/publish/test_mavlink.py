@@ -64,7 +64,7 @@ POSE = LocalPose(
     vel_down_mps=0.1,
     vel_down_std_mps=0.2,
 )
-UNSURE = [
+LOW_CONFIDENCE = [
     replace(ESTIMATE, confidence=0.89),
     replace(ESTIMATE, confidence=math.nan),
     replace(ESTIMATE, state="lost"),
@@ -162,7 +162,7 @@ def test_a_global_position_says_what_is_known() -> None:
     assert high["time_usec"] == 61_580_000
 
 
-@pytest.mark.parametrize("estimate", UNSURE)
+@pytest.mark.parametrize("estimate", LOW_CONFIDENCE)
 def test_an_unsure_global_position_is_none(estimate: NavigationEstimate) -> None:
     """PX4 reads no flag, but takes nothing whose `eph` is not above 0."""
     read = sent(global_position_sensor(estimate))
@@ -194,7 +194,7 @@ def test_a_gps_input_tells_what_is_known() -> None:
     assert sent(gps_input(replace(estimate, vel_en_mps=None)))["ignore_flags"] & 8
 
 
-@pytest.mark.parametrize("estimate", UNSURE)
+@pytest.mark.parametrize("estimate", LOW_CONFIDENCE)
 def test_an_unsure_gps_input_is_no_fix(estimate: NavigationEstimate) -> None:
     read = sent(gps_input(estimate, send_yaw=True, hdop_m=1.0))
     assert (read["fix_type"], read["ignore_flags"]) == (1, 255)
@@ -226,14 +226,16 @@ def test_a_single_fix_is_a_command() -> None:
     assert wrapped["param1"] == pytest.approx(0.02, abs=1e-5)
 
 
-@pytest.mark.parametrize("estimate", UNSURE)
-def test_messages_that_cannot_say_unsure_are_not_made(estimate: NavigationEstimate) -> None:
+@pytest.mark.parametrize("estimate", LOW_CONFIDENCE)
+def test_messages_that_cannot_mark_low_confidence_are_not_made(
+    estimate: NavigationEstimate,
+) -> None:
     for make in (
         lambda: external_position_estimate(estimate),
         lambda: odometry(estimate, POSE, Autopilot.PX4),
         lambda: vision_position_estimate(estimate, POSE, Autopilot.PX4),
     ):
-        with pytest.raises(EstimateError, match="no way to say"):
+        with pytest.raises(EstimateError, match="cannot mark"):
             make()
 
 
@@ -272,14 +274,14 @@ def test_odometry_for_ardupilot_has_its_velocity_in_the_body() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-def test_odometry_leaves_out_what_is_not_known_for_px4_only() -> None:
+def test_unknown_values_of_odometry_are_nan_for_px4_only() -> None:
     bare = LocalPose(POSE.origin, down_m=-120.0, down_std_m=2.0)
     read = sent(odometry(ESTIMATE, bare, Autopilot.PX4))
     assert all(map(math.isnan, read["q"])) and math.isnan(read["vz"])
     assert not math.isnan(read["pose_covariance"][11])
-    with pytest.raises(EstimateError, match="ArduPilot reads attitude and velocity"):
+    with pytest.raises(EstimateError, match="needs attitude and velocity"):
         odometry(ESTIMATE, bare, Autopilot.ARDUPILOT)
-    with pytest.raises(EstimateError, match="ArduPilot reads attitude and velocity"):
+    with pytest.raises(EstimateError, match="needs attitude and velocity"):
         odometry(replace(ESTIMATE, vel_en_mps=None), POSE, Autopilot.ARDUPILOT)
 
 

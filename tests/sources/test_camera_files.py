@@ -140,7 +140,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_no_camera_is_refused(tmp_path, name, capfd):
+def test_invalid_camera_files_are_rejected(tmp_path, name, capfd):
     write, message = REFUSED[name]
     path = write(tmp_path / "camera.yaml")
     with pytest.raises(CameraError, match=message) as caught:

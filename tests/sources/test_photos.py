@@ -92,7 +92,7 @@ def test_the_focal_length_by_the_resolution_of_the_sensor(tmp_path):
     assert read_photo(photo(tmp_path / "c.jpg", more=none)).focal_px is None
 
 
-def test_a_camera_file_is_better(folder, tmp_path):
+def test_a_camera_file_replaces_exif(folder, tmp_path):
     file = camera_file(tmp_path / "c.json", width_px=128, height_px=96, cx_px=66.0)
     recording = open_source(folder, SourceOptions(camera=file))
     assert (recording.camera.width_px, recording.camera.cx_px) == (WIDTH, 33.0)
@@ -102,7 +102,7 @@ def test_a_camera_file_is_better(folder, tmp_path):
         open_source(folder, SourceOptions(camera=wrong))
 
 
-def test_the_position_may_be_told_as_a_prior(folder):
+def test_the_position_may_be_used_as_a_prior(folder):
     view = next(open_source(folder, SourceOptions(prior_std_m=25.0)).views)
     assert view.telemetry.prior == Prior(*view.truth_latlon_deg, 25.0)
 
@@ -190,7 +190,7 @@ def test_the_time_of_exposure_is_the_better_one(tmp_path):
     assert read_photo(photo(tmp_path / "b.jpg", xmp=wrong)).time_ns == START_S * 10**9
 
 
-def test_what_is_not_told_is_not_known(tmp_path):
+def test_missing_metadata_stays_missing(tmp_path):
     photo(tmp_path / "p/a.jpg", gps={1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0)})
     view = next(open_source(tmp_path / "p").views)
     assert view.telemetry.missing() == ["yaw_deg", "pitch_deg", "roll_deg", "agl_m"]
@@ -201,7 +201,7 @@ def test_what_is_not_told_is_not_known(tmp_path):
     assert telemetry.missing() == ["yaw_deg"] and telemetry.agl_m == 110.0
 
 
-def test_what_is_broken_is_left_out_and_said(folder, tmp_path):
+def test_damaged_photographs_are_left_out_with_a_warning(folder, tmp_path):
     (folder / "d.jpg").write_bytes(b"not a picture")
     (folder / "e.jpg").touch()
     photo(folder / "f.jpg", time=None)

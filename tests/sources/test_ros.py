@@ -196,7 +196,7 @@ def test_heights_of_mavros(tmp_path, messages, topics):
     assert views[0].telemetry.agl_m == 105
 
 
-def test_topics_as_told(tmp_path, messages, topics):
+def test_topics_as_requested(tmp_path, messages, topics):
     topics["/other/image_raw"] = [(START_S * 10**9, messages.image(START_S * 10**9, picture(9)))]
     path = record(tmp_path / "flight", topics, messages)
     with pytest.raises(FlightError, match=r"found /cam/image_raw, /other/image_raw; give --topic"):
@@ -296,7 +296,7 @@ def test_pictures_are_not_held(tmp_path, messages):
         tracemalloc.stop()
 
 
-def test_a_bag_without_images_is_refused(tmp_path, messages, topics):
+def test_a_bag_without_images_is_rejected(tmp_path, messages, topics):
     del topics["/cam/image_raw"]
     with pytest.raises(FlightError, match="expected one topic of images, found none"):
         open_source(record(tmp_path / "flight", topics, messages))

@@ -134,7 +134,7 @@ def test_impossible_options_are_refused(change, message):
         SourceOptions(**change)
 
 
-def test_recordings_that_do_not_meet_are_told_apart(tmp_path):
+def test_recordings_that_do_not_overlap_are_an_error(tmp_path):
     track = RecordedTrack(attitudes((10, 0, 0, 0), (20, 0, 0, 0)))
     check_overlap(track, 15 * S, 30 * S, tmp_path)
     with pytest.raises(FlightError, match=r"30\.000 to 40\.000 s, telemetry 10\.000 to 20\.000"):

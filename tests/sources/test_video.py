@@ -204,7 +204,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("how", BROKEN)
-def test_what_is_broken_is_one_error_and_nothing_written(recorded, tmp_path, names_in, how, capfd):
+def test_damaged_video_is_one_error_and_nothing_written(recorded, tmp_path, names_in, how, capfd):
     more = broken(recorded, how)
     before = names_in(tmp_path)
     with pytest.raises(FlightError, match=BROKEN[how]) as caught:

@@ -46,8 +46,8 @@ def ask(server):
     def asked(path, method="GET", **headers):
         connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
         try:
-            told = {key.replace("_", "-"): value for key, value in headers.items()}
-            connection.request(method, path, headers=told)
+            fields = {key.replace("_", "-"): value for key, value in headers.items()}
+            connection.request(method, path, headers=fields)
             reply = connection.getresponse()
             return reply.status, {k.lower(): v for k, v in reply.getheaders()}, reply.read()
         finally:

@@ -43,7 +43,7 @@ if [ ! -e "$work/site/.done" ]; then
     "$work/pip/bin/pip" install --quiet --target "$work/site" --only-binary=:all: \
         --platform manylinux2014_aarch64 --platform manylinux_2_28_aarch64 \
         --implementation cp --python-version "${python#python}" -c "$checkout/constraints.txt" \
-        "$checkout[autopilot,geo,signing]" pytest hypothesis
+        "$checkout[autopilot,geo,signing]" pytest hypothesis pynmeagps
     rm -rf "$work/site/orthonav"  # the checkout itself is run
     touch "$work/site/.done"
 fi
@@ -58,8 +58,9 @@ asked() { [ "$step" = all ] || [ "$step" = "$1" ]; }
 cd "$checkout"
 if asked fixes; then emulated tools/platforms/fixes.py "$@"; fi
 if asked fly; then
+    rm -f "$work/fly.jsonl"  # lines are added to what there is
     # Slower than it was flown: an emulated view takes seconds. It ends where the flight ends.
-    orthonav fly "$golden/area.onav" --camera "$golden/flight" --telemetry recorded --pace 0.2 \
+    orthonav fly "$golden/area.onav" --camera "$golden/flight" --telemetry recorded --pace 0.1 \
         --dry-run --autopilot udpin:0 --json "$work/fly.jsonl"
     emulated -c "import collections, json; lines = map(json.loads, open('$work/fly.jsonl'))
 print('flown:', collections.Counter(line.get('status', 'health') for line in lines))"

@@ -30,7 +30,7 @@ from orthonav.flight import Flight, open_flight
 from orthonav.localizer import Localizer
 from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import open_map
-from orthonav.onboard.run import SingleViews, in_hindsight, localize_flight
+from orthonav.onboard.run import SingleViews, localize_flight, smoothed_track
 from orthonav.records import Fix, ViewResult
 
 STORED = Path(__file__).resolve().parents[2] / "tests" / "data" / "golden_flight"
@@ -77,10 +77,10 @@ def places(map_path: Path, flight: Flight, run: str) -> Places:
         single = SingleViews(localizer, heading_known=run == "views")
         results = list(localize_flight(single, flight))
     else:
-        tracker = Tracker(localizer, hindsight=run == "smoothed")
+        tracker = Tracker(localizer, smooth=run == "smoothed")
         results = list(localize_flight(tracker, flight))
         if run == "smoothed":
-            results = in_hindsight(tracker, results, None)
+            results = smoothed_track(tracker, results, None)
     return {result.frame: _place(result, localizer) for result in results}
 
 

@@ -27,13 +27,13 @@ COMMANDS = {
     "build": "make a map from orthophotos",
     "atlas": "many sheets as one: what is in it, is it whole, cut a map, add and take out",
     "check": "before the flight: where can it be localized, and will the route be flown well?",
-    "info": "print what is in a map",
-    "sign": "sign a map, or make a key for it",
-    "verify": "check a map and its signature",
+    "info": "print the contents of a map",
+    "sign": "sign a map, or create a signing key",
+    "verify": "check the signature and the contents of a map",
     "import": "write photographs, a video or a ROS recording as a flight folder",
-    "calibrate": "find out what is wrong with what a flight tells: mount, compass, height",
-    "localize": "find where the views of a flight were taken",
-    "fly": "beside an autopilot: positions from a live camera as messages",
+    "calibrate": "estimate constant errors of mount, compass and height from a flight",
+    "localize": "find the positions of the views of a flight",
+    "fly": "send position fixes from a live camera to an autopilot",
     "evaluate": "compare fixes with the truth",
     "view": "show a run in the browser: track, views beside the map, health; also while it flies",
     "simulate": "fly over an orthophoto of another year",
@@ -66,7 +66,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         logging.getLogger("matplotlib").setLevel(logging.ERROR)
         _print_any_letter()
         with _terminable():
-            require_extras(options.command)
+            if not getattr(options, "list", False):  # lists presets, which need no extra
+                require_extras(options.command)
             status: int | None = _module(options.command).run(options)
             sys.stdout.flush()
     except OrthonavError as error:
@@ -152,7 +153,8 @@ def _shorten_help(
         return
     for action in hidden:
         action.help = argparse.SUPPRESS
-    command.epilog = f"{len(hidden)} more options: {command.prog} --help-all"
+    more = f"{len(hidden)} more options: {command.prog} --help-all"
+    command.epilog = f"{command.epilog}; {more}" if command.epilog else more
 
 
 def _module(command: str) -> ModuleType:

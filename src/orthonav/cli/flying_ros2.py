@@ -1,4 +1,4 @@
-"""`orthonav fly --ros2`: the node with its reader and publisher, from the options."""
+"""`orthonav fly --ros2`: the node with its reader and publisher, made from the options."""
 
 import argparse
 import os
@@ -21,10 +21,10 @@ def joined(
     frame: LocalFrame,
     min_confidence: float,
 ) -> tuple[Ros2Reader, Ros2Publisher]:
-    """A reader and a publisher of one node, which leaves the graph with `stack`.
+    """Reader and publisher of a new node; `stack` closes the node.
 
-    `frame` is the plane of the map: its centre is the origin of the map frame unless `--origin`
-    names another.
+    `frame` is the local frame of the map; its centre is the origin of the ROS map frame unless
+    `--origin` is given.
     """
     node = Node(ros_arguments(options.ros_args, os.environ))
     stack.callback(node.close)

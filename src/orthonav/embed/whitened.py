@@ -4,7 +4,7 @@ Cells of a tile overlap (each pixel belongs to up to four, with triangular weigh
 shift or turn of the view moves energy gradually from one cell to the next. Each cell is divided
 by its own norm: contrast differs between years, directions do not. Principal components of the
 reference tiles, each divided by its standard deviation (whitening, Jegou and Chum, ECCV 2012),
-give every way in which places differ an equal say. Similarity is the scalar product of unit
+give all directions of variation the same weight. Similarity is the scalar product of unit
 vectors.
 """
 
@@ -25,12 +25,20 @@ from orthonav.embed.cells import MICRO, CellLayout, cell_means
 from orthonav.errors import VariantError
 
 CHUNK_TILES = 512
+"""Tiles worked on at once: 0.9 MB of features, which stays in the cache."""
 MAX_LEARNT_TILES = 20_000
+"""Tiles from which a whitening is learnt, at most: 44 for each of 448 features."""
 PART_NOISE = 2.0
+"""Noise of the conditional mean where cells are missing, over the smallest variance kept; chosen
+with docs/decisions/embedding.md."""
 SOLVER_STEPS = 6
+"""Steps of conjugate gradients for the same, over many poses."""
 SHARE_ROUNDING = 1e-3
+"""A cell seen to this much less than the whole counts as whole: resampling rounds."""
 TINY = np.float32(1e-30)
+"""Guards divisions by zero."""
 SPARSE_BYTES = 32 * 2**20
+"""Larger arrays of a sheet take memory only where they are written."""
 Made = TypeVar("Made")
 Features = NDArray[np.float32]
 Work = Callable[[Features, Features], Made]

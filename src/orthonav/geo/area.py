@@ -43,9 +43,7 @@ class Area:
                 f"south < north, got {','.join(map(str, bounds_deg))}"
             )
         if max(abs(south), abs(north)) > 89.9 or east - west > 10 or north - south > 10:
-            hint = swapped_hint(
-                north if abs(north) > abs(south) else south, max(west, east, key=abs)
-            )
+            hint = swapped_hint(max(south, north, key=abs), max(west, east, key=abs))
             raise AreaError(
                 "bounds must be west,south,east,north in degrees, at most 10 degrees across"
                 f"{hint}, got {','.join(map(str, bounds_deg))}"

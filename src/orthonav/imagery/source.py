@@ -57,38 +57,46 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What is known of one orthophoto without reading it whole.
-
-    `name` is what GDAL opens: the path, or a table in it. `transform` and `system` (its CRS) are
-    the raster's own or, where it has none, those that its names and sidecars tell (`is_named` for
-    the system). `bands` are the
-    1-based indexes used (one for grey, three for red, green, blue); `outline_latlon_deg` is the
-    (N, 2) border; `gsd_m` the ground resolution at the centre; `palette` the (N, 3) colours of a
-    colour-mapped image; `false_alpha` tells that the band the file calls alpha is a picture, such
-    as near infrared, so it says nothing of what is missing; `folder` is the one it was found in
-    where a folder was named; `stamp` size and time of its files; `terms` what the file says of
-    where it is from and under which terms, by the keys of `TERMS`.
-    """
+    """Metadata of one orthophoto."""
 
     path: Path
+    """The file."""
     name: str
+    """What GDAL opens: the path, or a table in the file."""
     bands: tuple[int, ...]
+    """Bands that are used, from 1: one for grey, three for red, green, blue."""
     dtype: str
+    """Pixel type."""
     width_px: int
+    """Columns."""
     height_px: int
+    """Rows."""
     crs: str
+    """Coordinate system as text."""
     system: Any
+    """The same as rasterio's CRS."""
     is_named: bool
+    """Whether the coordinate system was taken from names because the file has none."""
     transform: Affine
+    """From column, row to coordinates, of the raster or of a sidecar."""
     gsd_m: float
+    """Ground resolution at the centre, metres per pixel."""
     outline_latlon_deg: NDArray[np.float64]
+    """The border (N, 2), latitude and longitude in degrees."""
     date: str | None
+    """Date of acquisition, YYYY[-MM[-DD]]."""
     palette: NDArray[np.uint8] | None = None
+    """Colours (N, 3) of a colour-mapped image."""
     marked_alpha: bool = False
+    """Whether a band is marked as alpha."""
     false_alpha: bool = False
+    """Whether that band is an image, such as near infrared, and not a mask."""
     folder: Path | None = None
+    """The folder given by the user that it was found in."""
     stamp: tuple[tuple[str, int, int], ...] = ()
+    """Path, size and modification time in ns of its files."""
     terms: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    """Origin and terms, by the keys of `TERMS`."""
 
     @property
     def colours(self) -> int:

@@ -63,7 +63,7 @@ class TileMatcher:
         Evidence: `score` (best scalar product), `margin` (its lead over the best score farther
         than half a tile away), `lowe_ratio`, `peak_ratio` (the same with that exclusion). Rivals
         are sought beyond `rows` too, on up to `BACKGROUND_TILES` tiles of the whole map: a
-        narrow prior leaves no rival of its own, and that must not look like certainty.
+        narrow prior leaves no rival of its own, and that must not appear as certainty.
         """
         searched = None
         if rows is not None:

@@ -166,7 +166,7 @@ def _remapped(
 def _is_smooth(index: Array, shape: tuple[int, ...]) -> bool:
     """Whether straight lines between nodes (H, W, 2) miss by less than `NODE_ERROR_PX` in the view.
 
-    Between every other node they miss by four times as much, which the nodes between tell.
+    Between every other node they miss by four times as much, which the skipped nodes show.
     """
     odd = [side // 2 * 2 - 1 for side in index.shape[:2]]
     even = index[: odd[0] : 2, : odd[1] : 2]

@@ -18,6 +18,7 @@ from orthonav import __version__, embed, represent
 from orthonav.embed.contract import ViewEmbedder
 from orthonav.embed.network import TripletRecipe
 from orthonav.embed.whitened import WhitenedRecipe, learn
+from orthonav.files import Progress
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.localizer.match import TileMatcher
 from orthonav.localizer.plan import SearchPlan
@@ -57,7 +58,6 @@ RADIUS_PX = 10.0
 MIN_RADIUS_M = 35.0
 """A registered view is correct within this many pixels or metres, whichever is more: unreported
 tilt alone displaces views by metres."""
-Progress = Callable[[str, float], None]
 Arrays = dict[str, NDArray[Any]]
 
 

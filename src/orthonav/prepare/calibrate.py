@@ -7,7 +7,6 @@ searched, and a logistic regression is fitted to the outcome. The result is cons
 exact, because no second date is used.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from orthonav.confidence.logistic import FEATURES, LogisticConfidence, fit_logistic
 from orthonav.embed.contract import ViewEmbedder
+from orthonav.files import Progress
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.match import TileMatcher
 
@@ -120,7 +120,7 @@ def calibrate(
     embeddings: NDArray[np.float16],
     centres_en_m: NDArray[np.float32],
     heading_step_deg: float,
-    progress: Callable[[str, float], None],
+    progress: Progress,
     *,
     slow: bool = False,
 ) -> TileCalibration:

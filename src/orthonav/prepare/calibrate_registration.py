@@ -7,7 +7,7 @@ a logistic regression is fitted to the outcome.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.confidence.registered import Chances, RegisteredConfidence, fit_registered
+from orthonav.files import Progress
 from orthonav.geo.camera import Camera
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.registration import RegistrationLocalizer
@@ -78,7 +79,7 @@ def calibrate_registration(
     other_dates: Sequence[Crop],
     views: int,
     seed: int,
-    progress: Callable[[str, float], None],
+    progress: Progress,
 ) -> RegistrationCalibration:
     """Locate changed, mirrored and other-date views and fit the confidence to the outcome."""
     rng = np.random.default_rng([seed, 3])

@@ -13,6 +13,7 @@ from orthonav.embed.network import AutoEncoderRecipe, NetworkEmbedder, TripletRe
 from orthonav.embed.words import WordsEmbedder, WordsRecipe
 from orthonav.errors import VariantError
 from orthonav.extras import needed
+from orthonav.files import Progress
 from orthonav.neural.tiles import SheetTiles
 from orthonav.neural.words import learn_words
 from orthonav.prepare.change import changed
@@ -28,7 +29,6 @@ network learned a third as much in its first 300 batches."""
 
 EncoderRecipe = AutoEncoderRecipe | TripletRecipe | WordsRecipe
 Encoder = NetworkEmbedder | WordsEmbedder
-Progress = Callable[[str, float], None]
 
 
 def learn_encoder(

@@ -1,12 +1,12 @@
 """The representation of a whole sheet in bytes, from which encoders of images learn."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import VariantError
+from orthonav.files import Progress
 from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
 from orthonav.imagery.mosaic import Mosaic
@@ -67,7 +67,7 @@ def read_pictures(
     area: Area,
     grid: TileGrid,
     representation: Any,
-    progress: Callable[[str, float], None],
+    progress: Progress,
 ) -> SheetPictures:
     """Images of the tiles of a sheet at another date."""
     pictures = SheetPictures(grid, representation)

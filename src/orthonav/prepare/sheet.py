@@ -24,6 +24,7 @@ from orthonav.cores import usable_cores
 from orthonav.embed.cells import CellLayout, cell_means
 from orthonav.embed.whitened import CellSheet
 from orthonav.errors import AreaError
+from orthonav.files import Progress
 from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
 from orthonav.imagery.mosaic import Mosaic, SheetRaster
@@ -95,7 +96,7 @@ class SheetReader:
 
     def read(
         self,
-        progress: Callable[[str, float], None],
+        progress: Progress,
         workers: int | None = None,
         cache: BlockCache | None = None,
     ) -> None:

@@ -21,7 +21,7 @@ class Pose:
 
     `x_px, y_px`: columns and rows of the map at level 0, pixel-is-area, y to the south;
     `turn_rad`: heading of the top of the window, clockwise from north; `log_scale`: natural
-    logarithm of the true over the assumed ground resolution (and so of true over told height).
+    logarithm of the true over the assumed ground resolution (and so of true over reported height).
     """
 
     x_px: float
@@ -52,7 +52,7 @@ class Pose:
 def even_scale(log_scale: float) -> float:
     """Factor of correlation times root of pixels that makes scores of chance alike at any scale.
 
-    A view that is magnified touches more pixels of the map, but says no more; measured on mirrored
-    views, chance grows with about the root of the scale.
+    A view that is magnified touches more pixels of the map, without more information; on mirrored
+    views chance grows with about the root of the scale (docs/decisions/registration.md, 1).
     """
     return math.exp(log_scale / 2)

@@ -23,6 +23,7 @@ from orthonav.register.template import Template, energy_of, turn_planes
 
 Array = NDArray[np.float32]
 ENERGY_FLOOR = 0.3
+"""Share of the typical energy added to the local one, so that blank ground is not amplified."""
 
 
 @dataclass(frozen=True, eq=False)

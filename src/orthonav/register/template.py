@@ -1,4 +1,4 @@
-"""A view made ready for registration, at each level it is looked at."""
+"""A view as templates: its evidence at every level of the map that registration uses."""
 
 import math
 from dataclasses import dataclass

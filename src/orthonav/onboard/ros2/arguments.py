@@ -59,11 +59,11 @@ class RosArguments:
 
     @property
     def full_name(self) -> str:
-        """The name of the node with its namespace."""
+        """Name of the node with its namespace."""
         return f"{self.namespace.rstrip('/')}/{self.node}"
 
     def expanded(self, name: str) -> str:
-        """The absolute form of a relative, private (`~/x`) or absolute name.
+        """Absolute form of a relative, private (`~/x`) or absolute name.
 
         Raises `VariantError` where it is no name of ROS 2.
         """
@@ -74,7 +74,7 @@ class RosArguments:
         return name if name.startswith("/") else f"{self.namespace.rstrip('/')}/{name}"
 
     def resolved(self, name: str) -> str:
-        """The absolute name of a topic after remapping; the first rule that matches counts."""
+        """Absolute name of a topic after remapping; the first matching rule applies."""
         full = self.expanded(name)
         for before, after in self.rules:
             if self.expanded(before) == full:
@@ -83,7 +83,7 @@ class RosArguments:
 
 
 def ros_arguments(words: Sequence[str], environment: Mapping[str, str]) -> RosArguments:
-    """The arguments that follow `--ros-args`, and what the environment says.
+    """Arguments after `--ros-args`, and variables of the environment.
 
     Reads `-r FROM:=TO` (`--remap`; `__node`, `__name` and `__ns` too) and `-p NAME:=VALUE`
     (`--param`), `ROS_DOMAIN_ID`, `ROS_NAMESPACE`, `ROS_LOCALHOST_ONLY`,
@@ -121,7 +121,7 @@ def ros_arguments(words: Sequence[str], environment: Mapping[str, str]) -> RosAr
     )
     for rule in rules:
         for name in rule:
-            made.expanded(name)  # a rule that can never match is an error now, not a silence later
+            made.expanded(name)  # raise for a rule that can never match
     return made
 
 

@@ -14,21 +14,21 @@ from numpy.typing import NDArray
 from orthonav.flight.logged import NO_ALTITUDE_M2
 from orthonav.geo.frames import LocalFrame
 from orthonav.onboard.ros2.node import Node
-from orthonav.onboard.telemetry import Told
+from orthonav.onboard.telemetry import VehicleState
 from orthonav.publish.estimate import NavigationEstimate
 from orthonav.publish.mavlink import require_confident
 from orthonav.records import CONFIDENT
 from orthonav.sources.attitude import ros_xyzw_from_ned
 
 NOT_MEASURED_RAD2 = math.pi**2
-"""Variance of an angle that is not measured: any angle is as likely."""
+"""Variance of an angle that is not measured: (180 deg)^2."""
 _STATUS_FIX, _COVARIANCE_KNOWN = 0, 3
 _LEVELS = {"OK": 0, "DEGRADED": 1, "FAILED": 2}
 Array = NDArray[np.float64]
 
 
 class Ros2Publisher:
-    """Sends what passed the gate. The origin is latched: who subscribes later receives it too."""
+    """Publishes positions that passed the gate. The origin is latched for later subscribers."""
 
     def __init__(
         self,
@@ -40,8 +40,8 @@ class Ros2Publisher:
         min_confidence: float = CONFIDENT,
         silent: bool = False,
     ) -> None:
-        """`origin` is the zero of the map frame; `now_ns` reads ROS time; `min_std_m` is the least
-        standard deviation along any direction that is sent; `silent`: send no positions."""
+        """`origin`: origin of the map frame. `now_ns`: reads ROS time. `min_std_m`: lower bound of
+        the standard deviation in any direction. `silent`: send no positions."""
         self._node, self._frame, self._now_ns = node, origin, now_ns
         self._floor_m, self._least, self._silent = min_std_m, min_confidence, silent
         resolved = node.arguments.resolved
@@ -60,7 +60,7 @@ class Ros2Publisher:
         self._send_origin()
 
     def position(
-        self, estimate: NavigationEstimate, reported: Told, stamp_ns: int
+        self, estimate: NavigationEstimate, vehicle: VehicleState, stamp_ns: int
     ) -> tuple[str, ...]:
         """See `PositionOutput.position`; raises `EstimateError` for a low confidence too."""
         require_confident(estimate, self._least, "NavSatFix")
@@ -69,7 +69,7 @@ class Ros2Publisher:
         cov = floored(np.asarray(estimate.cov_en_m2), self._floor_m)
         self._fix.write(self._navsatfix(estimate, cov, stamp_ns))
         east, north = self._frame.en_from_latlon(estimate.lat_deg, estimate.lon_deg).tolist()
-        turn = orientation(reported)
+        turn = orientation(vehicle)
         self._pose.write(self._posed((east, north), cov, turn, stamp_ns))
         sent = ["NavSatFix", "PoseWithCovarianceStamped"]
         if self._transform is not None:
@@ -78,7 +78,7 @@ class Ros2Publisher:
         return tuple(sent)
 
     def health(self, plain: dict[str, Any]) -> None:
-        """See `PositionOutput.health`; what is wrong with our topics is beside it."""
+        """See `PositionOutput.health`; it also lists problems of the topics."""
         new = self._node.definitions.new
         problems = {f"topic {name}": text for name, text in self._node.problems.items()}
         damaged = {f"damaged on {name}": n for name, n in self._node.undecodable.items()}
@@ -117,7 +117,7 @@ class Ros2Publisher:
         )
 
     def _navsatfix(self, estimate: NavigationEstimate, cov: Array, stamp_ns: int) -> Any:
-        """Latitude and longitude; the altitude is NaN, and no satellite service was used."""
+        """Latitude and longitude; the altitude is NaN, and the satellite service is 0."""
         definitions = self._node.definitions
         full = np.zeros((3, 3))
         full[:2, :2], full[2, 2] = cov, NO_ALTITUDE_M2
@@ -135,8 +135,8 @@ class Ros2Publisher:
     def _posed(
         self, position_en_m: tuple[float, float], cov: Array, turn: Array, stamp_ns: int
     ) -> Any:
-        """East and north are measured; z is 0 and the orientation the reported one, with variances
-        that say so. Order: x, y, z, rotations about X, Y, Z."""
+        """Pose whose x and y are measured. z is 0 and the orientation is the reported one, both
+        with large variances. Order: x, y, z, rotations about X, Y, Z."""
         definitions = self._node.definitions
         full = np.diag([0.0, 0, NO_ALTITUDE_M2, *[NOT_MEASURED_RAD2] * 3])
         full[:2, :2] = cov
@@ -170,13 +170,13 @@ class Ros2Publisher:
 
 
 def floored(cov_en_m2: Array, min_std_m: float) -> Array:
-    """The covariance (2, 2) with at least `min_std_m` as standard deviation in every direction."""
+    """Covariance (2, 2) with a standard deviation of at least `min_std_m` in every direction."""
     values, vectors = np.linalg.eigh(cov_en_m2)
     return np.asarray(vectors @ np.diag(np.maximum(values, min_std_m**2)) @ vectors.T)
 
 
-def orientation(reported: Told) -> Array:
-    """The reported attitude as ROS writes it: x, y, z, w; no turn where it is not known."""
-    if reported.ned_from_body is None:
+def orientation(vehicle: VehicleState) -> Array:
+    """Reported attitude as a ROS quaternion x, y, z, w; the identity where it is not known."""
+    if vehicle.ned_from_body is None:
         return np.array([0.0, 0.0, 0.0, 1.0])
-    return ros_xyzw_from_ned(reported.ned_from_body)
+    return ros_xyzw_from_ned(vehicle.ned_from_body)

@@ -1,7 +1,7 @@
-"""Pictures of a ROS 2 graph with the telemetry of their exposure: a `Source` for the runner.
+"""Images of a ROS 2 graph with the telemetry of their exposure: an `ImageSource` for the runner.
 
-A picture waits a little for the attitude that follows its exposure. Times are ROS time, as the
-header stamps have it; a message without a stamp counts as of its arrival.
+An image waits a little for the attitude that follows its exposure. Times are ROS time, that of the
+header stamps; for a message without a stamp the time of arrival is used.
 """
 
 import logging
@@ -12,7 +12,7 @@ from typing import Any
 
 from orthonav.errors import CameraError, FlightError
 from orthonav.geo.camera import Camera
-from orthonav.onboard.cameras import Picture
+from orthonav.onboard.cameras import CameraImage
 from orthonav.onboard.ros2.messages import TIME_NS
 from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer
@@ -23,13 +23,13 @@ from orthonav.sources.ros_track import attitude_of_message, height_of_message, s
 
 log = logging.getLogger(__name__)
 JUMP_NS = TIME_NS
-"""Stamps that go back by more begin anew: a simulation was reset, or a bag began again."""
+"""Stamps that go back by more show a restart: a simulation was reset, or a bag played again."""
 FAR_NS = 2 * TIME_NS
-"""Pictures whose stamps are farther than this from now are of another clock."""
+"""Images whose stamps differ from now by more are stamped by another clock."""
 REMIND_S = 10.0
-"""Seconds between two lines about what is being waited for."""
+"""Seconds between two log lines about a missing input."""
 MOST_LINES = 100
-"""Different lines about messages that are logged: whoever sends them chooses what is in them."""
+"""Largest number of different log lines about messages, whose contents are untrusted."""
 _SPIN_S = 0.05
 _TELEMETRY_DEPTH = 200
 IMAGES = {"raw": "sensor_msgs/msg/Image", "compressed": "sensor_msgs/msg/CompressedImage"}
@@ -37,9 +37,10 @@ IMAGES = {"raw": "sensor_msgs/msg/Image", "compressed": "sensor_msgs/msg/Compres
 
 @dataclass(frozen=True)
 class GnssSample:
-    """What a GNSS receiver reported. For comparison only: it is never a source of our positions.
+    """Position of a GNSS receiver, for comparison only: it is never a source of our positions.
 
-    `status` is that of `sensor_msgs/NavSatStatus`: below 0 there is no fix.
+    `time_ns`: ROS time. `lat_deg`, `lon_deg`, `alt_m`: WGS84. `status`: that of
+    `sensor_msgs/NavSatStatus`; below 0 there is no fix.
     """
 
     time_ns: int
@@ -86,9 +87,9 @@ class Ros2Reader:
         self._subscribe()
 
     def wait_for_camera(self) -> Camera:
-        """The camera of the first `camera_info`; waits for it, and says so, until stopped.
+        """Camera of the first `camera_info`; waits for it until stopped, and logs that.
 
-        Raises `CameraError` where it is not calibrated, or where the flight was stopped first.
+        Raises `CameraError` where it is not calibrated, or where the flight was stopped before.
         """
         while not self._stopped():
             self._spin()
@@ -96,17 +97,17 @@ class Ros2Reader:
                 raise CameraError(f"{self._camera_error}: {self._info_topic}")
             if self._camera is not None:
                 return self._camera
-            self._remind(f"no message on {self._info_topic}; or give --camera-file FILE")
+            self._remind(f"no message on {self._info_topic}; or give --camera FILE")
         raise CameraError(
-            f"stopped before a camera_info came; give --camera-file FILE: {self._info_topic}"
+            f"stopped before a camera_info came; give --camera FILE: {self._info_topic}"
         )
 
-    def read(self) -> Picture | None:
-        """See `Source.read`."""
+    def read(self) -> CameraImage | None:
+        """See `ImageSource.read`."""
         while not self._stopped():
             self._spin()
             if self._images and self._is_ready(self._images[0]):
-                return self._picture(self._images.popleft())
+                return self._camera_image(self._images.popleft())
             if self._node.arguments.parameters.use_sim_time and self._clock is None:
                 self._remind("use_sim_time is true and nothing came on /clock")
             elif not self._images and self._number == 0:
@@ -114,10 +115,10 @@ class Ros2Reader:
         return None
 
     def close(self) -> None:
-        """See `Source.close`; the node is closed by its owner."""
+        """See `ImageSource.close`; the node is closed by its owner."""
 
     def now_ns(self) -> int:
-        """ROS time; 0 while `/clock` is awaited, as ROS has it."""
+        """ROS time; 0 before the first `/clock`, as ROS defines it."""
         ahead_ns = self._ahead_ns()
         return 0 if ahead_ns is None else self._clocks.mono_ns() + ahead_ns
 
@@ -153,13 +154,13 @@ class Ros2Reader:
             self._node.check_graph()
 
     def _ahead_ns(self) -> int | None:
-        """ROS time minus our monotonic clock; None while `/clock` is awaited."""
+        """ROS time minus our monotonic clock; None before the first `/clock`."""
         if not self._node.arguments.parameters.use_sim_time:
             return self._clocks.utc_ns() - self._clocks.mono_ns()
         return None if self._clock is None else self._clock[0] - self._clock[1]
 
     def _stamp(self, message: Any) -> int | None:
-        """Time of a message: its stamp, else its arrival; None while ROS time is not known."""
+        """Time of a message: its stamp, else its arrival; None while ROS time is unknown."""
         ahead_ns = self._ahead_ns()
         if ahead_ns is None:
             return None
@@ -172,7 +173,7 @@ class Ros2Reader:
         self._clock = time_ns, self._clocks.mono_ns()
 
     def _take_image(self, message: Any, cdr: bytes) -> None:
-        """Keep the image that waits and the newest one."""
+        """Keep the oldest waiting image and the newest one."""
         time_ns = self._stamp(message)
         if time_ns is None:
             return
@@ -187,7 +188,7 @@ class Ros2Reader:
         self._images.append(_Waiting(message, time_ns, self._clocks.mono_ns()))
 
     def _take_camera_info(self, message: Any, cdr: bytes) -> None:
-        """The first one counts: the camera of a flight does not change."""
+        """Use the first one: the camera does not change in flight."""
         if self._camera is None:
             try:
                 self._camera = camera_of_info(message)
@@ -233,7 +234,7 @@ class Ros2Reader:
             return True
         return self._clocks.mono_ns() - image.arrived_ns >= self._wait_ns
 
-    def _picture(self, image: _Waiting) -> Picture:
+    def _camera_image(self, image: _Waiting) -> CameraImage:
         self._number += 1
         exposed_ns = image.stamp_ns - (self._ahead_ns() or 0)
         off_s = (self._clocks.mono_ns() - exposed_ns) / 1e9
@@ -248,20 +249,20 @@ class Ros2Reader:
         except FlightError as error:
             problem = NoFix("bad_image", str(error))
             self._say_once(str(error))
-        reported = self._buffer.at(image.stamp_ns)
-        return Picture(
+        vehicle = self._buffer.at(image.stamp_ns)
+        return CameraImage(
             self._number,
             f"{image.stamp_ns}",
             exposed_ns,
             image.stamp_ns,
             grey,
             problem,
-            reported.telemetry(image.stamp_ns, self._mount_deg),
-            reported,
+            vehicle.telemetry(image.stamp_ns, self._mount_deg),
+            vehicle,
         )
 
     def _restart(self, what: str, back_ns: int) -> None:
-        """Time went back: what was known of later times is of another run."""
+        """Discard telemetry and images: time went back, they belong to an earlier run."""
         log.warning("ROS time went back by %.1f s (%s); telemetry is cleared", back_ns / 1e9, what)
         self._buffer.clear()
         self._images.clear()

@@ -1,4 +1,4 @@
-"""Where the pictures of views come from, and what was known of each."""
+"""Images of views with their telemetry and camera, by the name of the view."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,9 +18,10 @@ Grey = NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One view: what was known at exposure, its camera, and its picture when it is asked for.
+    """One recorded view; its image is loaded on demand.
 
-    `load` gives (H, W) uint8, perhaps a smaller one of the same view; it raises `FlightError`.
+    `telemetry`: at exposure; `camera`: calibration.
+    `load`: returns the image (H, W) uint8, perhaps reduced; raises `FlightError`.
     """
 
     telemetry: Telemetry
@@ -28,24 +29,24 @@ class Shot:
     load: Callable[[], Grey]
 
 
-class Pictures(Protocol):
-    """Pictures by the name of their view."""
+class ViewImages(Protocol):
+    """A source of images."""
 
     def shot(self, frame: str) -> Shot:
-        """Raises `FlightError` where this view has none, saying why."""
+        """The view `frame`; raises `FlightError` with the reason where it has no image."""
         ...
 
 
-class NoPictures:
-    """Only results are known."""
+class NoImages:
+    """No images, only results."""
 
     def shot(self, frame: str) -> Shot:
-        """See `Pictures.shot`."""
-        raise FlightError("no pictures were given: name the flight with --flight")
+        """See `ViewImages.shot`."""
+        raise FlightError("there are no images; name the flight with --flight")
 
 
-class FolderPictures:
-    """Those of a flight folder."""
+class FolderImages:
+    """Images of a flight folder."""
 
     def __init__(self, path: Path) -> None:
         """Raises as `open_flight` does."""
@@ -54,7 +55,7 @@ class FolderPictures:
         self._views = {view.frame: view for view in folder.views}
 
     def shot(self, frame: str) -> Shot:
-        """See `Pictures.shot`."""
+        """See `ViewImages.shot`."""
         view = self._views.get(frame)
         if view is None:
             raise FlightError("this view is not in the flight")

@@ -1,4 +1,4 @@
-"""What is to be built: the sheets of an area that have imagery, each as a task of its own."""
+"""The sheets of an area that have imagery, each as a task for a worker."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -13,6 +13,8 @@ import rasterio
 from numpy.typing import NDArray
 
 from orthonav import __version__
+from orthonav.atlas.coverage import box_around, turned
+from orthonav.atlas.item import Sheet
 from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.embed.cells import CellLayout
 from orthonav.errors import AreaError, AtlasError
@@ -25,19 +27,25 @@ from orthonav.prepare.block_cache import digest
 from orthonav.prepare.layout import grid_of
 
 MARGIN_PX = 64
-"""Pixels beyond the tiles that may still matter to them, and some."""
+"""Pixels beyond a tile that gradients and resampling use, and some more."""
 TOUCH_DEG = 1e-9
-"""Boxes that have less than this in common only touch."""
+"""Boxes that overlap by less than this only touch: a tenth of a millimetre."""
 _POINTS = 17
+"""Points along a side of a sheet at which it is compared with a search band."""
 
 
 @dataclass(frozen=True)
 class SheetTask:
-    """A sheet to be built, with all that a worker on another machine has to know.
+    """A sheet to be built, with all that a worker on another machine needs.
 
-    `request` is a digest of what the sheet depends on, see `request_digest`; `orthos` are those of
-    the files and folders named that may show it, `imagery` and `dates` what the catalogue says of
-    them; `made_by` are the versions that must make it, see `versions`.
+    `sheet`: name.
+    `bounds_deg`: its box in the lattice: west, south, east, north.
+    `atlas`: folder or URL of the atlas.
+    `orthos`: the files and folders that may show it.
+    `recipe`: how it is made.
+    `request`: digest of what the sheet depends on (`request_digest`).
+    `imagery`, `dates`: description of the orthophotos for the catalogue.
+    `made_by`: the versions that must make it (`versions`).
     """
 
     sheet: str
@@ -52,7 +60,7 @@ class SheetTask:
 
 
 def versions() -> dict[str, str]:
-    """What determines the bytes of a map, on machines alike."""
+    """The versions that determine the bytes of a map."""
     return {
         "orthonav": __version__,
         "numpy": np.__version__,
@@ -63,7 +71,7 @@ def versions() -> dict[str, str]:
 
 
 def version_differences(wanted: Mapping[str, str], found: Mapping[str, str]) -> list[str]:
-    """What differs, each as `name this, not that`."""
+    """The differences, each as `name this, not that`."""
     return [
         f"{name} {found.get(name, 'absent')}, not {version}"
         for name, version in wanted.items()
@@ -81,10 +89,10 @@ def plan_sheets(
     route: Route | None = None,
     band_m: float | None = None,
 ) -> list[SheetTask]:
-    """A task for each sheet that imagery may touch, from south to north, from west to east.
+    """A task for each sheet of an area that imagery may touch, from south to north, west to east.
 
-    Of an area, or of all the imagery where none is told. Raises `AreaError` where there is no
-    sheet, and for recipes by which no sheet could be built.
+    Without bounds and route the area is all imagery. Raises `AreaError` where there is no sheet,
+    and for recipes by which no sheet could be built.
     """
     imagery = Imagery(mosaic)
     names = sorted(_names(recipe, imagery, bounds_deg, route, band_m))
@@ -115,8 +123,8 @@ def plan_sheets(
 def request_digest(recipe: AtlasRecipe, part: Mosaic, made_by: Mapping[str, str]) -> str:
     """Digest of what a sheet depends on: recipe, versions, and the imagery under it.
 
-    Of each file its name, size and second of change, in the order in which they cover each other,
-    but not where it lies: another machine may see it elsewhere.
+    Each file counts with its name, size and second of change, in the order in which files cover
+    each other; its folder does not count, as it may differ between machines.
     """
     stamps = [
         [Path(name).name, size, changed_ns // 10**9]
@@ -127,7 +135,7 @@ def request_digest(recipe: AtlasRecipe, part: Mosaic, made_by: Mapping[str, str]
 
 
 def margin_m(recipe: AtlasRecipe) -> float:
-    """How far beyond its box a sheet may look."""
+    """Width of the margin around its box on which a sheet may depend."""
     reach_m = (recipe.tile_px + MARGIN_PX) * recipe.gsd_m
     if recipe.coarse is None:
         return reach_m
@@ -135,34 +143,34 @@ def margin_m(recipe: AtlasRecipe) -> float:
 
 
 class Imagery:
-    """Where the sources of a mosaic lie, to be asked many times."""
+    """The sources of a mosaic by place."""
 
     def __init__(self, mosaic: Mosaic) -> None:
         self.mosaic = mosaic
 
     def under(self, bounds_deg: Extent, reach_m: float) -> Mosaic:
-        """The sources that may show a box or what is less than `reach_m` from it."""
-        west, south, east, north = _wider(bounds_deg, reach_m)
+        """The sources that may show a box and a margin of `reach_m` around it."""
+        west, south, east, north = box_around(Area.from_bounds(bounds_deg), reach_m)
         boxes = self._boxes
         middle = (west + east) / 2
         shift = 360 * np.round((middle - (boxes[:, 0] + boxes[:, 2]) / 2) / 360)
         near = (boxes[:, 0] + shift < east) & (boxes[:, 2] + shift > west)
         near &= (boxes[:, 1] < north) & (boxes[:, 3] > south)
-        kept = np.flatnonzero(near).tolist()
-        sources = tuple(self.mosaic.sources[index] for index in kept)
-        return Mosaic(sources, tuple(self.mosaic.stretches[index] for index in kept))
+        chosen = np.flatnonzero(near).tolist()
+        sources = tuple(self.mosaic.sources[index] for index in chosen)
+        return Mosaic(sources, tuple(self.mosaic.stretches[index] for index in chosen))
 
     def sheets(self, recipe: AtlasRecipe) -> set[str]:
-        """Names of the sheets that the box around some source touches."""
+        """Names of the sheets that the boxes of the sources touch."""
         found: set[str] = set()
         for west, south, east, north in self._boxes.tolist():
-            around = _turned(west) if east - west < 360 else -180.0
+            around = turned(west) if east - west < 360 else -180.0
             found.update(recipe.sheets.over((around, south, around + east - west, north)))
         return found
 
     @cached_property
     def _boxes(self) -> NDArray[np.float64]:
-        """West, south, east, north (N, 4) in degrees; east may lie beyond 180."""
+        """West, south, east, north (N, 4) in degrees; east may be above 180."""
         outlines = [source.outline_latlon_deg for source in self.mosaic.sources]
         boxes = []
         for outline in outlines:
@@ -190,20 +198,20 @@ def _names(
         if not (west != east and south < north):
             raise AreaError(f"bounds are empty: {','.join(map(str, bounds_deg))}")
         asked = (west, south, east + 360 if east < west else east, north)
-        return {name for name in there if _have_common(recipe.sheets.bounds_deg(name), asked)}
+        return {name for name in there if _overlap(recipe.sheets.bounds_deg(name), asked)}
     return there if route is None else set(_along(recipe, route, band_m, there))
 
 
 def _along(
     recipe: AtlasRecipe, route: Route, band_m: float | None, there: set[str]
 ) -> Iterator[str]:
-    """Those of the sheets that the search band of a route crosses, some by a hair not."""
+    """The sheets that the search band of a route crosses, and some that it nearly touches."""
     world = recipe.sheets
     for part in sheets_of_route(route, band_m):
         area = Area.from_route(part, band_m)
-        west, south, east, north = _box_around(area, 0.0)
-        turned = _turned(west)
-        for name in there.intersection(world.over((turned, south, turned + east - west, north))):
+        west, south, east, north = box_around(area, 0.0)
+        first = turned(west)
+        for name in there.intersection(world.over((first, south, first + east - west, north))):
             box_deg = world.bounds_deg(name)
             lon, lat = np.meshgrid(
                 np.linspace(box_deg[0], box_deg[2], _POINTS),
@@ -214,43 +222,18 @@ def _along(
                 yield name
 
 
-def _have_common(box_deg: Extent, other: Extent) -> bool:
-    """Whether two boxes have more than an edge in common."""
+def _overlap(box_deg: Extent, other: Extent) -> bool:
+    """Whether two boxes share more than an edge."""
     west, south, east, north = box_deg
     shift = 360 * round(((other[0] + other[2]) / 2 - (west + east) / 2) / 360)
     across = min(east + shift, other[2]) - max(west + shift, other[0])
     return across > TOUCH_DEG and min(north, other[3]) - max(south, other[1]) > TOUCH_DEG
 
 
-def _turned(lon_deg: float) -> float:
-    """A longitude from -180, without 180."""
-    return (lon_deg + 180) % 360 - 180
-
-
-def _wider(bounds_deg: Extent, reach_m: float) -> Extent:
-    """The box around all that a sheet of a box, and what is less than `reach_m` from it, covers."""
-    return _box_around(Area.from_bounds(bounds_deg), reach_m)
-
-
-def _box_around(area: Area, reach_m: float) -> Extent:
-    west, south, east, north = area.extent_en_m
-    share = np.linspace(0, 1, 2 * _POINTS)
-    x = west - reach_m + (east - west + 2 * reach_m) * share
-    y = south - reach_m + (north - south + 2 * reach_m) * share
-    left, right = np.full(len(share), x[0]), np.full(len(share), x[-1])
-    below, above = np.full(len(share), y[0]), np.full(len(share), y[-1])
-    border = np.stack(
-        [np.concatenate([x, x, left, right]), np.concatenate([below, above, y, y])], axis=1
-    )
-    lat, lon = area.frame.latlon_from_en(border)
-    lon = lon - 360 * np.round((lon - area.frame.lon_deg) / 360)
-    return float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())
-
-
 def _require_possible(recipe: AtlasRecipe, bounds_deg: Extent, imagery_gsd_m: float) -> None:
-    """Raises `AreaError` for recipes by which this sheet cannot be built, whatever lies under it.
+    """Raise `AreaError` for recipes by which this sheet cannot be built with any imagery.
 
-    What a worker still finds impossible is then that there is no imagery.
+    An `AreaError` of a worker then means that there is no imagery.
     """
     area = Area.from_bounds(bounds_deg)
     grid = grid_of(
@@ -268,10 +251,10 @@ def _require_possible(recipe: AtlasRecipe, bounds_deg: Extent, imagery_gsd_m: fl
 
 
 def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Path, ...]:
-    """The files and folders named by which a worker reads the same picture as from all of them.
+    """The files and folders that a worker needs to read the same pixels as from all of them.
 
-    How values are stretched to 8 bits, and whether a fourth band is a mask, is told by many files
-    together: then all are named.
+    All of them where the stretch to 8 bits, or whether a fourth band is a mask, was derived from
+    many files together.
     """
     common = any(each is not None for each in mosaic.stretches)
     if common or any(source.marked_alpha for source in mosaic.sources):
@@ -281,29 +264,26 @@ def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Pa
     return tuple(path for path in orthos if path in needed or path in folders)
 
 
-def refuse_differences(tasks: Sequence[SheetTask], known: Mapping[str, Any]) -> None:
-    """Raises `AtlasError` naming sheets that are in the atlas and were made otherwise.
-
-    `known` are the sheets of the atlas by name.
-    """
+def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None:
+    """Raise `AtlasError` naming the sheets of the atlas (`known`) that were made otherwise."""
     other = [task for task in tasks if not is_same(task, known)]
     if not other:
         return
     why = sorted(
-        {line for task in other for line in _differences(task, known[task.sheet])},
+        {
+            line
+            for task in other
+            for line in version_differences(task.made_by, known[task.sheet].made_by)
+            or ["their imagery has changed"]
+        }
     )
     named = ", ".join(task.sheet for task in other[:5]) + (", .." if len(other) > 5 else "")
     raise AtlasError(
         f"{len(other)} of {len(tasks)} sheets are in the atlas and were made otherwise "
-        f"({'; '.join(why[:4])}): {named}; build them anew with --replace"
+        f"({'; '.join(why[:4])}): {named}; rebuild them with --replace"
     )
 
 
-def is_same(task: SheetTask, known: Mapping[str, Any]) -> bool:
-    """Whether a task is new to the atlas or done."""
+def is_same(task: SheetTask, known: Mapping[str, Sheet]) -> bool:
+    """Whether the sheet of a task is not in the atlas, or is there as the task would make it."""
     return task.sheet not in known or known[task.sheet].request == task.request
-
-
-def _differences(task: SheetTask, known: Any) -> list[str]:
-    made_by = version_differences(task.made_by, known.made_by)
-    return made_by or ["their imagery has changed"]

@@ -1,7 +1,8 @@
-"""The two kinds of place an atlas can lie in: a folder, and a file system reached through fsspec.
+"""The file systems of an atlas: a local folder, and fsspec for object storage and servers.
 
-Names are those of files in the atlas (`folder/file`), checked already. Errors are those of the
-system; `orthonav.atlas.store` says them in words.
+Names are those of files in the atlas (`folder/file`), already checked. Errors are those of the
+system; `orthonav.atlas.store` converts them. The folder does not go through fsspec: its local
+file system neither syncs files to disk before it renames them nor refuses links that lead outside.
 """
 
 import contextlib
@@ -12,55 +13,28 @@ import uuid
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from orthonav.atlas.trouble import PACKAGES
+from orthonav.atlas.storage_errors import PACKAGES
 from orthonav.errors import MissingExtraError, StorageError
 from orthonav.extras import needed
 from orthonav.files import replacing
 
 _OBJECT_STORES = {"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oci", "oss", "memory"}
-"""There a file appears when all of it has arrived; elsewhere it is moved to where it belongs."""
+"""There a file appears when it is complete; elsewhere it is moved to its name."""
 _FINDS_BY_PREFIX = {"s3", "s3a", "gs", "gcs"}
-_OVERWRITES_WHEN_TOLD = {"abfs", "abfss", "az"}
+_NEEDS_OVERWRITE = {"abfs", "abfss", "az"}
+"""Protocols that refuse to replace a file unless `overwrite` is passed."""
 
 
-class Place(Protocol):
-    """What both can do."""
-
-    def names(self, folder: str, prefix: str) -> dict[str, int]:
-        """File names in a folder that begin with `prefix`, and sizes; empty where it is not."""
-
-    def size(self, name: str) -> int | None:
-        """Bytes of a file, None where it is not there."""
-
-    def changed_s(self, name: str) -> float | None:
-        """When a file was written, as seconds since 1970; None where nobody knows."""
-
-    def read(self, names: Sequence[str]) -> dict[str, bytes]:
-        """Contents of files."""
-
-    def get(self, name: str, path: Path) -> None:
-        """Copy a file to a local path."""
-
-    def put(self, path: Path, name: str) -> None:
-        """Copy a local file to a name, whole or not at all."""
-
-    def write(self, name: str, data: bytes) -> None:
-        """Write a file, whole or not at all."""
-
-    def remove(self, name: str) -> None:
-        """Remove a file that may be there."""
-
-
-class Folder:
-    """A folder of this machine. Links that lead out of it are refused."""
+class LocalFolder:
+    """A folder of this machine. Links that lead outside it are refused."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
 
     def path(self, name: str, follow: bool = True) -> Path:
-        """Where a file lies; without `follow` it may itself be a link to anywhere."""
+        """The path of a file; without `follow` the file itself may be a link to anywhere."""
         path = self.root.joinpath(*name.split("/")) if name else self.root
         real = path.resolve() if follow or not name else path.parent.resolve()
         if not real.is_relative_to(self.root.resolve()):
@@ -68,7 +42,7 @@ class Folder:
         return path
 
     def names(self, folder: str, prefix: str) -> dict[str, int]:
-        """See `Place`."""
+        """Names and sizes of the files in a folder; empty where there is no such folder."""
         found = {}
         try:
             with os.scandir(self.path(folder)) as entries:
@@ -81,16 +55,16 @@ class Folder:
         return found
 
     def size(self, name: str) -> int | None:
-        """See `Place`."""
+        """Bytes of a file, None where it does not exist."""
         path = self.path(name)
         return path.stat().st_size if path.is_file() else None
 
-    def changed_s(self, name: str) -> float | None:
-        """See `Place`."""
+    def modified_s(self, name: str) -> float | None:
+        """When a file was written, seconds since 1970; None where unknown."""
         return self.path(name, follow=False).lstat().st_mtime
 
     def read(self, names: Sequence[str]) -> dict[str, bytes]:
-        """See `Place`."""
+        """Contents of files."""
         folders = {name.rpartition("/")[0] for name in names}
         real = {folder: self.path(folder).resolve() for folder in folders}
         found = {}
@@ -101,26 +75,29 @@ class Folder:
         return found
 
     def get(self, name: str, path: Path) -> None:
-        """See `Place`."""
+        """Copy a file to a local path."""
         shutil.copyfile(self.path(name), path)
 
     def put(self, path: Path, name: str) -> None:
-        """See `Place`."""
+        """Copy a local file to a name, whole or not at all."""
         with replacing(self.path(name)) as temporary:
             shutil.copyfile(path, temporary)
 
     def write(self, name: str, data: bytes) -> None:
-        """See `Place`."""
+        """Write a file, whole or not at all."""
         with replacing(self.path(name)) as temporary:
             temporary.write_bytes(data)
 
     def remove(self, name: str) -> None:
-        """See `Place`."""
+        """Remove a file if it exists."""
         self.path(name, follow=False).unlink(missing_ok=True)
 
 
-class Far:
-    """A file system of fsspec. Each thread and process opens its own."""
+class RemoteFiles:
+    """A file system of fsspec, with the methods of `LocalFolder`.
+
+    Each thread and process opens its own.
+    """
 
     def __init__(self, url: str, protocol: str) -> None:
         self._url = url
@@ -129,7 +106,7 @@ class Far:
         self._opened()
 
     def names(self, folder: str, prefix: str) -> dict[str, int]:
-        """See `Place`."""
+        """See `LocalFolder.names`."""
         fs, path = self._at(folder)
         fs.invalidate_cache()
         try:
@@ -147,7 +124,7 @@ class Far:
         return sizes
 
     def size(self, name: str) -> int | None:
-        """See `Place`."""
+        """See `LocalFolder.size`."""
         fs, path = self._at(name)
         fs.invalidate_cache()
         try:
@@ -156,8 +133,8 @@ class Far:
             return None
         return int(info["size"]) if info["type"] == "file" else None
 
-    def changed_s(self, name: str) -> float | None:
-        """See `Place`."""
+    def modified_s(self, name: str) -> float | None:
+        """See `LocalFolder.modified_s`."""
         fs, path = self._at(name)
         try:
             when = fs.modified(path)
@@ -168,7 +145,7 @@ class Far:
         return float(when) if isinstance(when, int | float) else None
 
     def read(self, names: Sequence[str]) -> dict[str, bytes]:
-        """See `Place`."""
+        """See `LocalFolder.read`; many files are read at the same time."""
         if not names:
             return {}
         fs = self._opened()[0]
@@ -177,39 +154,39 @@ class Far:
         return {name: found[path] for name, path in zip(names, paths, strict=True)}
 
     def get(self, name: str, path: Path) -> None:
-        """See `Place`."""
+        """See `LocalFolder.get`."""
         fs, far_path = self._at(name)
         fs.get_file(far_path, str(path))
 
     def put(self, path: Path, name: str) -> None:
-        """See `Place`."""
-        more = {"overwrite": True} if self._protocol in _OVERWRITES_WHEN_TOLD else {}
-        self._place(name, lambda fs, far_path: fs.put_file(str(path), far_path, **more))
+        """See `LocalFolder.put`."""
+        more = {"overwrite": True} if self._protocol in _NEEDS_OVERWRITE else {}
+        self._send(name, lambda fs, far_path: fs.put_file(str(path), far_path, **more))
 
     def write(self, name: str, data: bytes) -> None:
-        """See `Place`."""
-        self._place(name, lambda fs, far_path: fs.pipe_file(far_path, data))
+        """See `LocalFolder.write`."""
+        self._send(name, lambda fs, far_path: fs.pipe_file(far_path, data))
 
     def remove(self, name: str) -> None:
-        """See `Place`."""
+        """See `LocalFolder.remove`."""
         fs, path = self._at(name)
         with contextlib.suppress(FileNotFoundError):
             fs.rm_file(path)
 
-    def _place(self, name: str, send: Callable[[Any, str], None]) -> None:
+    def _send(self, name: str, send: Callable[[Any, str], None]) -> None:
         fs, path = self._at(name)
         if self._protocol in _OBJECT_STORES:
             send(fs, path)
             return
         folder, _, file = path.rpartition("/")
         fs.makedirs(folder, exist_ok=True)
-        aside = f"{folder}/.{file}.{uuid.uuid4().hex[:12]}.tmp"
+        temporary = f"{folder}/.{file}.{uuid.uuid4().hex[:12]}.tmp"
         try:
-            send(fs, aside)
-            fs.mv(aside, path)
+            send(fs, temporary)
+            fs.mv(temporary, path)
         except BaseException:
             with contextlib.suppress(Exception):
-                fs.rm_file(aside)
+                fs.rm_file(temporary)
             raise
 
     def _at(self, name: str) -> tuple[Any, str]:
@@ -230,7 +207,7 @@ def _open(url: str, protocol: str) -> tuple[Any, str]:
         fsspec.get_filesystem_class(protocol)
         fs, path = fsspec.core.url_to_fs(url)
     except ValueError as error:
-        raise StorageError(f"an address that cannot be one ({error}): {protocol}://") from error
+        raise StorageError(f"invalid address ({error}): {protocol}://") from error
     except ImportError as error:
         package = PACKAGES.get(protocol)
         wanted = package or f"a package that is not installed ({error})"

@@ -1,4 +1,4 @@
-"""What file systems raise, said in words: unreachable, refused, full, not there, not installed."""
+"""Errors of file systems as `StorageError` with the cause: unreachable, refused, full, missing."""
 
 import errno
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ PACKAGES = {
     "smb": "smbprotocol",
     "webdav": "webdav4",
 }
-"""What to install for a protocol of fsspec."""
+"""The package to install for a protocol of fsspec."""
 _CREDENTIALS = {
     "ClientAuthenticationError",
     "CredentialRetrievalError",
@@ -52,15 +52,16 @@ _UNREACHABLE = {
     "ServiceResponseError",
     "gaierror",
 }
-_REFUSED_ANSWERS = {401, 403}
-_MAX_SAID = 300
+_REFUSED = {401, 403}
+_MAX_TEXT = 300
 
 
 @contextmanager
-def told(place: str, doing: str) -> Iterator[None]:
-    """Errors inside become `StorageError` that names `place` (shown to people) and what was done.
+def storage_errors(place: str, action: str) -> Iterator[None]:
+    """Turn errors raised inside into `StorageError` with the cause.
 
-    The libraries behind raise what they like, so everything is taken that is not ours already.
+    `place`: address to show to people, without a password. `action`: what was attempted, a verb and
+    its object. Every exception is converted: the libraries behind fsspec raise many kinds.
     """
     try:
         yield
@@ -69,29 +70,29 @@ def told(place: str, doing: str) -> Iterator[None]:
             raise
         raise StorageError(str(error)) from error
     except Exception as error:
-        raise StorageError(f"cannot {doing}: {_words(error)}: {place}") from error
+        raise StorageError(f"cannot {action}: {_cause(error)}: {place}") from error
 
 
-def _words(error: Exception) -> str:
+def _cause(error: Exception) -> str:
     chain = list(_chain(error))
     names = {kind.__name__ for each in chain for kind in type(each).__mro__}
-    said = " ".join(str(error).split())[:_MAX_SAID] or type(error).__name__
+    text = " ".join(str(error).split())[:_MAX_TEXT] or type(error).__name__
     numbers = {each.errno for each in chain if isinstance(each, OSError)}
     if numbers & {errno.ENOSPC, errno.EDQUOT}:
-        return "disk full; free some of it"
+        return "disk full; free some space"
     if names & _CREDENTIALS:
-        return f"no credentials that are accepted ({said}); give those of the storage, see its docs"
+        return f"no valid credentials ({text}); set those of the storage, see its documentation"
     if errno.EROFS in numbers:
-        return "it can only be read there"
-    if "PermissionError" in names or any(_answer(each) in _REFUSED_ANSWERS for each in chain):
-        return f"not permitted, or credentials refused ({said})"
+        return "the file system is read-only"
+    if "PermissionError" in names or any(_status(each) in _REFUSED for each in chain):
+        return f"not permitted, or credentials refused ({text})"
     if any(isinstance(each, FileNotFoundError) for each in chain):
-        return f"there is no such file, folder or bucket ({said})"
+        return f"no such file, folder or bucket ({text})"
     if names & _UNREACHABLE or any(
         isinstance(each, ConnectionError | TimeoutError) for each in chain
     ):
-        return f"it cannot be reached ({said}); is the address right, is there a network?"
-    return f"{type(error).__name__}: {said}"
+        return f"it cannot be reached ({text}); check the address and the network"
+    return f"{type(error).__name__}: {text}"
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:
@@ -102,7 +103,7 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-def _answer(error: BaseException) -> int | None:
+def _status(error: BaseException) -> int | None:
     """The HTTP status that an error of boto, Google or Azure carries."""
     response = getattr(error, "response", None)
     if isinstance(response, dict):

@@ -1,4 +1,4 @@
-"""Maps in reports: the picture below, scale bar and north arrow."""
+"""Maps in figures: background image, scale bar and north arrow."""
 
 import math
 from dataclasses import dataclass
@@ -13,14 +13,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _BACKGROUND_LEVELS = 16  # few grey levels keep the PNG small
-_BACKGROUND_MOST_PX = 825  # along its longer side; finer ones are made coarser
+_BACKGROUND_MAX_PX = 825  # along its longer side; finer ones are made coarser
 
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """A grey picture under the map: `grey` (rows, columns) uint8, north up.
+    """A grey image behind a map, north up.
 
-    Its outer edges are in metres east and north in the plane of what is drawn over it.
+    `grey`: (rows, columns), uint8.
+    `west_m`, `south_m`, `east_m`, `north_m`: outer edges in the plane of the map.
     """
 
     grey: NDArray[np.uint8]
@@ -31,9 +32,9 @@ class Background:
 
 
 def draw_map(axes: "Axes", box: tuple[float, ...], background: Background | None = None) -> None:
-    """The ground of a map: axes in metres, north up, the picture below, scale bar and arrow.
+    """Draw the base of a map: axes in metres, background image, scale bar and north arrow.
 
-    `box` is what is seen: west, east, south, north in metres.
+    `box` is the visible part: west, east, south, north in metres.
     """
     if background is not None:
         draw_background(axes, background, box)
@@ -53,7 +54,7 @@ def map_size_in(
 
 
 def draw_background(axes: "Axes", background: Background, box: tuple[float, ...]) -> None:
-    """The part of the picture that is seen, pale and in few grey levels."""
+    """Draw the visible part of the background, pale and in few grey levels."""
     rows, columns = background.grey.shape
     west, south = background.west_m, background.south_m
     east_step = (background.east_m - west) / columns
@@ -64,7 +65,7 @@ def draw_background(axes: "Axes", background: Background, box: tuple[float, ...]
     seen = background.grey[rows - above : rows - below, left:right]
     if seen.size == 0:
         return
-    step = max(1, math.ceil(max(seen.shape) / _BACKGROUND_MOST_PX))
+    step = max(1, math.ceil(max(seen.shape) / _BACKGROUND_MAX_PX))
     seen = seen[: seen.shape[0] // step * step, : seen.shape[1] // step * step]
     coarse = seen.reshape(seen.shape[0] // step, step, -1, step).mean(axis=(1, 3))
     levels = np.round(coarse / 255 * (_BACKGROUND_LEVELS - 1)) / (_BACKGROUND_LEVELS - 1)
@@ -81,7 +82,7 @@ def draw_background(axes: "Axes", background: Background, box: tuple[float, ...]
 
 
 def draw_scale_bar(axes: "Axes", box: tuple[float, ...]) -> None:
-    """A bar of a round length in the corner at the bottom left."""
+    """Draw a scale bar of a round length at the bottom left."""
     width_m, height_m = box[1] - box[0], box[3] - box[2]
     length_m = _round_length(0.25 * min(width_m, height_m))
     x, y = box[0] + 0.04 * width_m, box[2] + 0.04 * height_m
@@ -94,7 +95,7 @@ def draw_scale_bar(axes: "Axes", box: tuple[float, ...]) -> None:
 
 
 def draw_north(axes: "Axes") -> None:
-    """An arrow to the north in the corner at the top right."""
+    """Draw a north arrow at the top right."""
     axes.annotate(
         "N",
         xy=(0.965, 0.975),

@@ -1,15 +1,15 @@
-"""Confidences of a map that is cut from several: those of its sheets, pooled, not learnt anew.
+"""The confidence of a map cut from several sheets: pooled from theirs, not learnt again.
 
-Where on the cut map a view was taken is not known, so what is known of a fix is the mean of what
-its sheets would say, each by its share of the map. A logistic regression cannot say just that: the
-pooled one has the sheets' mean weights, and a bias so low that over all evidence that decides, it
-is nowhere surer than that mean.
+Where on the cut map a view was taken is not known, so the confidence of a fix is the mean of the
+sheets' confidences, weighted by their shares of the map. A logistic regression cannot represent
+that mean exactly. The pooled one has the mean weights, and a bias so low that it nowhere exceeds
+the mean in the range of evidence that decides.
 """
 
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,42 +17,27 @@ from orthonav.confidence.logistic import LogisticConfidence
 from orthonav.confidence.registered import CHANCES, Chances, RegisteredConfidence
 
 DECIDING = 0.5, 0.99
-"""Fixes are withheld or kept by thresholds in this range of probabilities."""
+"""Thresholds of acceptance lie in this range of probabilities."""
 SCORES = np.linspace(0.05, 1.0, 20)
 MARGINS = np.linspace(0.0, 0.6, 13)
 STRENGTHS = np.exp(np.linspace(0.0, 2.0, 9))
 RATIOS = np.exp(np.linspace(0.0, 1.4, 8))
 LOOKS = np.exp(np.linspace(0.0, 1.4, 5))
-"""Evidence at which the pooled confidence is held against the sheets': scores and their leads; of
-registered views the strength over chance, and over the best elsewhere."""
+"""Evidence at which the pooled confidence is compared with the sheets': scores and margins of
+tiles; for registered views strength over chance, over the best rival, and the finer look."""
 Evidence = Mapping[str, float]
 
 
-class Confidence(Protocol):
-    """A logistic regression on evidence."""
-
-    @property
-    def bias(self) -> float:
-        """What it says of no evidence, as a logit."""
-
-    @property
-    def weights(self) -> tuple[float, ...]:
-        """Of each feature."""
-
-    def __call__(self, evidence: Evidence) -> float:
-        """Probability that a fix is right."""
-
-
-Kind = TypeVar("Kind", bound=Confidence)
+Confidence = TypeVar("Confidence", LogisticConfidence, RegisteredConfidence)
 
 
 def pooled_tiles(
     confidences: Sequence[LogisticConfidence], shares: Sequence[float], more_tiles: float
 ) -> LogisticConfidence | None:
-    """Confidence of tile search on a map made of sheets in these shares; None of none.
+    """Confidence of tile search on a map made of sheets in these shares; None without sheets.
 
-    `more_tiles` is how many times as many tiles the map has as its sheets: so many times as many
-    may look like a view by chance, and the odds of the best are as much lower.
+    `more_tiles`: tiles of the map over tiles of a sheet. As many times more tiles resemble a view
+    by chance, and the odds of the best tile are lower by that factor.
     """
     if not confidences:
         return None
@@ -65,9 +50,9 @@ def pooled_tiles(
 def pooled_registered(
     confidences: Sequence[RegisteredConfidence], shares: Sequence[float]
 ) -> RegisteredConfidence | None:
-    """Confidence of registered views on a map made of sheets in these shares; None of none.
+    """Confidence of registered views on a map made of sheets in these shares; None without sheets.
 
-    Chance is what it is on the sheet where it is highest.
+    The scores of chance are those of the sheet where they are highest.
     """
     if not confidences:
         return None
@@ -97,9 +82,12 @@ def _mean(
 
 
 def _excess(
-    pooled: Kind, confidences: Sequence[Kind], shares: Sequence[float], evidence: Sequence[Evidence]
+    pooled: Confidence,
+    confidences: Sequence[Confidence],
+    shares: Sequence[float],
+    evidence: Sequence[Evidence],
 ) -> float:
-    """How much surer one confidence is than the mean of others, at most, as a logit; at least 0."""
+    """Greatest excess of one confidence over the mean of others, as a logit; at least 0."""
     own = np.array([pooled(each) for each in evidence])
     theirs = np.array([[single(each) for each in evidence] for single in confidences])
     mean = np.average(theirs, axis=0, weights=shares)

@@ -1,4 +1,4 @@
-"""All items of an atlas at once: as files, and as the snapshot that saves reading them."""
+"""Reading all items of an atlas: from their files, or from the snapshot that holds them all."""
 
 import logging
 from collections.abc import Iterable, Mapping
@@ -20,15 +20,18 @@ log = logging.getLogger(__name__)
 
 ITEMS, SNAPSHOT = "items", "items.geojson"
 MAX_SNAPSHOT_BYTES = 2**30
+"""A guard for memory: 500,000 items of 2 kB."""
 MAX_ITEMS = 10**6
+"""A guard for memory: seven times the sheets of a country at 20 cm (docs/country.md)."""
 _READ_AT_ONCE = 1000
+"""One page of a listing of S3."""
 
 
 def read_items(store: Store) -> tuple[dict[str, Sheet], dict[str, str]]:
-    """All items by file name, and by file name what is wrong with those that are damaged.
+    """All items by file name, and the errors of damaged items by file name.
 
-    Where a sheet has several, the last in the order of names counts. Of a far atlas, items in the
-    snapshot are not read one by one; it is checked like them.
+    Where a sheet has several items, the last in the order of names is current. Items of a remote
+    atlas that are in the snapshot are not read one by one; they are checked in the same way.
     """
     names = {name: size for name, size in store.names(ITEMS).items() if split_name(name)}
     if len(names) > MAX_ITEMS:
@@ -39,15 +42,15 @@ def read_items(store: Store) -> tuple[dict[str, Sheet], dict[str, str]]:
 
 
 def snapshot_of(sheets: Iterable[Sheet]) -> bytes:
-    """A STAC item collection; references are from where it lies, not from the items' folder."""
+    """A STAC item collection, with references relative to the root of the atlas."""
     items = [_moved(sheet.to_item(), "../", "./") for sheet in sheets]
     return canonical({"type": "FeatureCollection", "features": items})
 
 
 def _read_snapshot(store: Store, names: Mapping[str, int]) -> dict[str, Sheet]:
-    """Those sheets of the snapshot whose items are there; none where it is missing or damaged."""
-    asks = len(names) > 1 and not store.is_local  # in a folder, items are as fast
-    size = store.size(SNAPSHOT) if asks else None
+    """The sheets of the snapshot whose items exist; none where it is missing or damaged."""
+    wanted = len(names) > 1 and not store.is_local  # items of a folder are read as fast
+    size = store.size(SNAPSHOT) if wanted else None
     if size is None or size > MAX_SNAPSHOT_BYTES:
         return {}
     try:
@@ -66,10 +69,10 @@ def _read_snapshot(store: Store, names: Mapping[str, int]) -> dict[str, Sheet]:
 
 
 def read_some(store: Store, names: Mapping[str, int]) -> tuple[dict[str, Sheet], dict[str, str]]:
-    """Like `read_items`, of those file names (and sizes) only."""
+    """As `read_items`, for items of these file names (and sizes) only."""
     found: dict[str, Sheet] = {}
     broken = {
-        name: f"larger than an item may be ({size} bytes): {ITEMS}/{name}"
+        name: f"{size} bytes, at most {MAX_ITEM_BYTES} are allowed: {ITEMS}/{name}"
         for name, size in names.items()
         if size > MAX_ITEM_BYTES
     }
@@ -86,7 +89,7 @@ def read_some(store: Store, names: Mapping[str, int]) -> tuple[dict[str, Sheet],
 
 
 def _contents(store: Store, paths: list[str]) -> dict[str, bytes]:
-    """Contents of files; those that another process removed meanwhile are left out."""
+    """Contents of files; files that another process has removed meanwhile are left out."""
     try:
         return store.read_many(paths)
     except StorageError:
@@ -98,7 +101,7 @@ def _contents(store: Store, paths: list[str]) -> dict[str, bytes]:
 
 
 def _moved(item: Mapping[str, Any], old: str, new: str) -> dict[str, Any]:
-    """The item with its references as seen from another folder."""
+    """The item with its references relative to another folder."""
 
     def moved(entry: Mapping[str, Any]) -> dict[str, Any]:
         return {**entry, "href": new + entry["href"].removeprefix(old)}

@@ -1,7 +1,7 @@
-"""The ground of a map as the page shows it: tiles, windows, and views laid upon it.
+"""The imagery of a map for the page: tiles, crops, and rectified views.
 
-Places of the page are pixels of the sheet's finest level: column and row from the north-west
-corner of its raster, as fractions (pixel-is-area).
+Positions on the page are pixels of the sheet's finest level: fractional column and row from the
+north-west corner of its raster (pixel-is-area).
 """
 
 import math
@@ -19,21 +19,24 @@ from orthonav.localizer.rectify import MAX_REACH, downsampled, rectify
 from orthonav.mapfile.layer import MAX_PREVIEW_PX, GreyLayer, jpeg_frame
 from orthonav.mapfile.reader import MapFile
 from orthonav.records import Telemetry, View
-from orthonav.web.pictures import Grey
+from orthonav.web.images import Grey
 
-LEAST_PX, MOST_PX = 256, 1024
-"""Pixels across a window of ground: those of the map, but no fewer and no more than that."""
+MIN_PX, MAX_PX = 256, 1024
+"""Limits of the pixels across a window: what a screen shows."""
 MARGIN = 1.02
+"""Width of a window relative to the footprint."""
 MAX_READ_PX = 4096
+"""Limit of a window of the map, about 16 MB."""
 Mask = NDArray[np.bool_]
 _QUICK = [int(cv2.IMWRITE_PNG_COMPRESSION), 1]
 
 
 @dataclass(frozen=True)
-class Window:
-    """A square of ground of `size_px` pixels, north up, `side_m` wide.
+class GroundWindow:
+    """A square of ground, north up.
 
-    Its middle lies `offset_en_m` east and north of the place below the camera.
+    `side_m`: its width; `size_px`: pixels across.
+    `offset_en_m`: its middle, east and north of the point below the camera.
     """
 
     side_m: float
@@ -41,39 +44,39 @@ class Window:
     offset_en_m: tuple[float, float]
 
 
-def window_of(told: Telemetry, camera: Camera, gsd_m: float) -> Window:
-    """The square that holds what a view saw. Raises `FlightError` where it saw no ground we know.
+def window_of(telemetry: Telemetry, camera: Camera, gsd_m: float) -> GroundWindow:
+    """The square that holds the footprint of a view. Raises `FlightError` where it is unknown.
 
-    Where it tilts far out, no more than `MAX_REACH` times the half side of a vertical view is kept
-    on either side of the optical axis.
+    With a large tilt it is limited to `MAX_REACH` times the half side of a vertical view around the
+    optical axis.
     """
-    refused = check_telemetry(told, camera, math.inf, heading_known=True)
+    refused = check_telemetry(telemetry, camera, math.inf, heading_known=True)
     if refused is not None:
         raise FlightError(refused.detail)
-    attitude = told.yaw_deg, told.pitch_deg, told.roll_deg, told.agl_m
+    attitude = telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
     axis = axis_on_ground_en_m(*attitude)
     half_m = math.hypot(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px) / 2
-    reach_m = MAX_REACH * half_m * told.agl_m
+    reach_m = MAX_REACH * half_m * telemetry.agl_m
     try:
         corners = footprint_en_m(camera, *attitude)
         reach_m = min(reach_m, float(np.abs(corners - np.array(axis)).max()))
     except CameraError:
-        pass  # the horizon is in the view: as far as it may reach
+        pass  # the horizon is visible: keep the limit
     side_m = 2 * MARGIN * reach_m
     if not side_m < 1e6:
-        raise FlightError(f"so wide a view is not shown: {side_m:.3g} m")
-    size_px = min(max(math.ceil(side_m / gsd_m), LEAST_PX), MOST_PX)
-    return Window(side_m, size_px, axis)
+        raise FlightError(f"the view is too wide to show: {side_m:.3g} m")
+    size_px = min(max(math.ceil(side_m / gsd_m), MIN_PX), MAX_PX)
+    return GroundWindow(side_m, size_px, axis)
 
 
-def view_png(grey: Grey, told: Telemetry, camera: Camera, window: Window) -> bytes:
-    """A view as if it had been taken straight from above, in its window; transparent elsewhere."""
+def view_png(grey: Grey, telemetry: Telemetry, camera: Camera, window: GroundWindow) -> bytes:
+    """A view rectified to nadir in its window, transparent outside."""
     height, width = grey.shape
     if abs(height * camera.width_px - width * camera.height_px) > max(height, width) * 4:
-        raise FlightError("the picture is not of the proportions of the camera")
+        raise FlightError("the image does not have the proportions of the calibration")
     gsd_m = window.side_m / window.size_px
     made = rectify(
-        downsampled(View(grey, camera.resized(width, height), told), gsd_m),
+        downsampled(View(grey, camera.resized(width, height), telemetry), gsd_m),
         gsd_m=gsd_m,
         size_px=window.size_px,
     )
@@ -87,21 +90,21 @@ def png(grey: Grey, valid: Mask) -> bytes:
         picture = np.dstack([grey, grey, grey, valid.astype(np.uint8) * 255])
     done, data = cv2.imencode(".png", picture, _QUICK)
     if not done:
-        raise FlightError("the picture cannot be encoded")
+        raise FlightError("the image cannot be encoded")
     return data.tobytes()
 
 
 def small_jpeg(grey: Grey, side_px: int = 640) -> bytes:
-    """A picture as it was taken, no larger than `side_px`."""
+    """An image as recorded, no larger than `side_px`."""
     share = min(1.0, side_px / max(grey.shape))
     size = max(1, round(share * grey.shape[1])), max(1, round(share * grey.shape[0]))
     done, data = cv2.imencode(".jpg", cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
     if not done:
-        raise FlightError("the picture cannot be encoded")
+        raise FlightError("the image cannot be encoded")
     return data.tobytes()
 
 
-class Ground:
+class SheetImagery:
     """The first sheet of a map: its grey layer, or its preview where it has none."""
 
     def __init__(self, opened: MapFile) -> None:
@@ -120,7 +123,7 @@ class Ground:
             self._small = np.asarray(decoded, dtype=np.uint8)
 
     def plain(self) -> dict[str, Any]:
-        """What the page must know of the sheet to draw it."""
+        """Geometry of the sheet and its tiles, for the page."""
         grid, grey = self.grid, self.sheet.grey
         tiles = None
         if self._layer is not None and grey is not None:
@@ -139,13 +142,13 @@ class Ground:
         }
 
     def px_from_en(self, en_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Columns and rows (..., 2) of places (..., 2) in the plane of the sheet."""
+        """Columns and rows (..., 2) of positions (..., 2) in the plane of the sheet."""
         grid = self.grid
         east, north = en_m[..., 0], en_m[..., 1]
         return np.stack([east - grid.west_m, grid.north_m - north], axis=-1) / grid.gsd_m
 
     def tile(self, level: int, col: int, row: int) -> tuple[bytes, str] | None:
-        """A chunk of the layer and its media type; None where nothing of it is valid.
+        """A chunk of the layer and its media type; None where it has no imagery.
 
         Raises `IndexError` where there is no such tile and `MapFileError` where it is damaged.
         """
@@ -160,8 +163,8 @@ class Ground:
         grey, valid = self._layer.read(level, row * side, col * side, *size)
         return (png(grey, valid), "image/png") if valid.any() else None
 
-    def crop_png(self, middle_en_m: tuple[float, float], window: Window) -> bytes:
-        """The map in a window about a place, transparent where there is no imagery."""
+    def crop_png(self, middle_en_m: tuple[float, float], window: GroundWindow) -> bytes:
+        """The map in a window around a position, transparent where there is no imagery."""
         grey, valid = self.crop(middle_en_m, window.side_m, window.size_px)
         return png(grey, valid)
 
@@ -196,14 +199,14 @@ class Ground:
         return np.asarray(drawn, dtype=np.uint8), np.asarray(seen > 0, dtype=np.bool_)
 
     def _level(self, step_m: float) -> int:
-        """The coarsest level that is as fine as `step_m`."""
+        """The coarsest level that is at least as fine as `step_m`."""
         if self._layer is None:
             return 0
         fine = math.floor(math.log2(max(step_m / self.grid.gsd_m, 1.0)) + 1e-6)
         return min(fine, self._layer.levels - 1)
 
     def _steps_m(self, level: int) -> tuple[float, float]:
-        """Metres that a column and a row of a level are wide."""
+        """Size in metres of a pixel of a level, east and north."""
         grid = self.grid
         if self._layer is not None:
             return grid.gsd_m * 2**level, grid.gsd_m * 2**level
