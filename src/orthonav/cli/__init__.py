@@ -20,11 +20,14 @@ from orthonav.cli.needs import require_extras
 from orthonav.cli.version import show_version
 from orthonav.errors import OrthonavError
 
+UNITS = frozenset(("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz"))
+"""Last words of option names that are units."""
+
 COMMANDS = {
-    "demo": "whole story on a generated area: build, fly, report",
-    "plan": "what a route, a camera and a height ask of a map",
+    "demo": "generate an area, build, check, fly, localize and report",
+    "plan": "derive map requirements from a route, a camera and a height",
     "fetch": "get orthophotos of an area from open services",
-    "build": "make a map from orthophotos",
+    "build": "build a map from orthophotos",
     "atlas": "many sheets as one: what is in it, is it whole, cut a map, add and take out",
     "check": "before the flight: where can it be localized, and will the route be flown well?",
     "info": "print the contents of a map",
@@ -36,8 +39,8 @@ COMMANDS = {
     "fly": "send position fixes from a live camera to an autopilot",
     "evaluate": "compare fixes with the truth",
     "view": "show a run in the browser: track, views beside the map, health; also while it flies",
-    "simulate": "fly over an orthophoto of another year",
-    "landscape": "generate an area: orthophotos of a landscape at several dates",
+    "simulate": "simulate a flight over an orthophoto of another year",
+    "landscape": "generate orthophotos of one area at three dates",
 }
 
 
@@ -116,7 +119,7 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         prog="orthonav",
         description="Position fixes for aircraft without GNSS, from a downward camera and an "
         "orthophoto of another year.",
-        epilog="orthonav COMMAND --help tells more.",
+        epilog="Options of a command: orthonav COMMAND --help",
     )
     parser.add_argument(
         "--version",
@@ -133,9 +136,24 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         if name in arguments:
             module = _module(name)
             module.add(command)
+            _name_units(command)
             if everyday := getattr(module, "EVERYDAY", ()):
                 _shorten_help(command, everyday, show_all="--help-all" in arguments)
     return parser
+
+
+def _name_units(command: argparse.ArgumentParser) -> None:
+    """Name numbers in the help by the unit that ends their option: `--agl-m M`; integers N."""
+    for action in command._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for sub_command in action.choices.values():
+                _name_units(sub_command)
+        elif action.type in (int, float) and action.metavar is None:
+            unit = action.option_strings[0].rpartition("-")[2] if action.option_strings else ""
+            if unit in UNITS:
+                action.metavar = unit.upper()
+            elif action.type is int:
+                action.metavar = "N"
 
 
 def _shorten_help(

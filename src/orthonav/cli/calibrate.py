@@ -11,6 +11,8 @@ from orthonav.cli.source import add_source, open_source
 if TYPE_CHECKING:
     from orthonav.onboard.calibrate import MountCalibration
 
+EVERYDAY = ("--gnss", "--gnss-std-m", "--heading", "--camera", "--telemetry", "--json")
+
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""

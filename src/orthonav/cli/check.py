@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from orthonav.cli.common import ROUTE_HELP, print_json, progress
 
 EVERYDAY = (
-    *("--route", "--band-m", "--ortho", "--camera", "--agl-m"),
+    *("--route", "--band-m", "--other-date", "--camera", "--agl-m"),
     *("--yaw-std-deg", "--heading", "--prior-std-m", "--prior", "--quick", "--json"),
 )
 
@@ -27,7 +27,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="REPORT/", help="folder of page, JSON and layers"
     )
-    parser.add_argument("--route", type=Path, help=ROUTE_HELP)
+    parser.add_argument("--route", type=Path, metavar="FILE", help=ROUTE_HELP)
     parser.add_argument(
         "--band-m",
         type=float,
@@ -35,13 +35,16 @@ def add(parser: argparse.ArgumentParser) -> None:
         "(default: four standard deviations of the prior, at least half a view)",
     )
     parser.add_argument(
-        "--ortho",
+        "--other-date",
         type=Path,
-        metavar="OTHER_YEAR.tif",
-        help="orthophoto of a second date, not in the map: improves the prediction",
+        metavar="TIF",
+        help="orthophoto of the same area at another date, not in the map: improves the prediction",
     )
     parser.add_argument(
-        "--camera", type=Path, metavar="FILE", help="flight.json, or a file of OpenCV, ROS, Kalibr"
+        "--camera",
+        type=Path,
+        metavar="FILE",
+        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",
     )
     parser.add_argument(
         "--agl-m",
@@ -51,13 +54,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     _add_errors(parser)
     _add_effort(parser)
-    parser.add_argument(
-        "--json",
-        nargs="?",
-        const="-",
-        metavar="FILE",
-        help="write check.json also to a file, or to stdout instead of the text",
-    )
+    parser.add_argument("--json", action="store_true", help="print check.json instead of the text")
 
 
 def _add_errors(parser: argparse.ArgumentParser) -> None:
@@ -78,6 +75,7 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--agl-std",
         type=float,
+        metavar="SHARE",
         default=0.05,
         help="standard deviation of the reported height, a share of it (default 0.05)",
     )
@@ -89,7 +87,10 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
         help="standard deviation of the prior position, per axis (default 150)",
     )
     prior.add_argument(
-        "--prior", choices=("known", "none"), default="known", help="none: search the whole map"
+        "--prior",
+        choices=("telemetry", "none"),
+        default="telemetry",
+        help="telemetry: search around a prior position (default); none: search the whole map",
     )
     parser.add_argument(
         "--relief-m",
@@ -102,17 +103,26 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--drift",
         type=float,
+        metavar="SHARE",
         default=0.03,
         help="error of dead reckoning per metre flown without a fix (default 0.03)",
     )
     parser.add_argument(
-        "--accept", type=float, default=0.9, help="confidence that a fix needs (default 0.9)"
+        "--min-confidence",
+        type=float,
+        default=0.9,
+        metavar="P",
+        help="confidence from which a fix is used (default 0.9)",
     )
 
 
 def _add_effort(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--effort", type=float, default=1.0, help="factor on the number of trials (default 1)"
+        "--effort",
+        type=float,
+        default=1.0,
+        metavar="FACTOR",
+        help="factor on the number of trials (default 1)",
     )
     parser.add_argument(
         "--quick", action="store_true", help="skip the trials of other errors and other heights"
@@ -127,18 +137,15 @@ def run(options: argparse.Namespace) -> int:
 
     from orthonav.check.run import check_map
     from orthonav.check.write import require_free, to_json, verdict_text, write_check
-    from orthonav.files import write_text
 
     require_free(options.out)
     request = _request(options)
     with progress(options) as shown:
         result, opened = check_map(request, shown)
     page = write_check(result, opened, options.out)
-    if options.json == "-":
+    if options.json:
         print_json(json.loads(to_json(result)))
     else:
-        if options.json:
-            write_text(Path(options.json), to_json(result))
         print(verdict_text(result))
         print(f"\nreport: {page}")
     return result.verdict.word.exit_code
@@ -163,13 +170,13 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         map_path=options.map,
         route=route,
         band_m=options.band_m,
-        other_date=options.ortho,
+        other_date=options.other_date,
         camera=camera,
         agl_m=agl_m,
         yaw_std_deg=None if options.heading == "unknown" else options.yaw_std_deg,
         agl_std=options.agl_std,
         prior_std_m=None if options.prior == "none" else options.prior_std_m,
-        accept=options.accept,
+        accept=options.min_confidence,
         speed_mps=options.speed_mps,
         drift=options.drift,
         relief_m=options.relief_m,
@@ -205,7 +212,7 @@ def _provenance(options: argparse.Namespace, route: "Route | None") -> "Provenan
         map_name=options.map.name,
         imagery=imagery_text(manifest.imagery),
         recipe=recipe_text(manifest.recipe),
-        other_date="" if options.ortho is None else options.ortho.name,
+        other_date="" if options.other_date is None else options.other_date.name,
         route_name="" if route is None else route.name or Path(options.route).name,
         command=shlex.join(["orthonav", *sys.argv[1:]]),
         version=__version__,
