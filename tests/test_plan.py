@@ -137,7 +137,7 @@ def test_a_large_area_is_cut_into_sheets(run, camera, tmp_path):
         (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--dem", "DEM"], "outside the terrain"),
     ],
 )
-def test_what_cannot_be_planned_is_told(run, table, camera, dem, arguments, message):
+def test_impossible_plans_are_refused(run, table, camera, dem, arguments, message):
     files = {"TABLE": table, "CAMERA": camera, "DEM": dem}
     done = run("plan", *(files.get(argument, argument) for argument in arguments))
     assert done.code == 1 and message in done.err and done.out == ""

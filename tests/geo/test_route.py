@@ -171,7 +171,7 @@ def test_what_is_written_as_geojson_is_read_again(routes):
 
 
 @given(st.sampled_from(sorted(route_module._READERS)), st.binary(max_size=200))
-def test_no_bytes_make_a_reader_fail_in_another_way(suffix, content):
+def test_any_bytes_give_a_route_or_a_route_error(suffix, content):
     try:
         found = route_module._READERS[suffix](content)
     except (RouteError, *route_module._BROKEN):

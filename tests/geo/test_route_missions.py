@@ -169,7 +169,7 @@ def test_a_landing_pattern_is_flown_to_its_end(read, kind, approach):
         ),
     ],
 )
-def test_plans_that_are_none_are_refused(read, document, message):
+def test_invalid_plans_are_refused(read, document, message):
     with pytest.raises(RouteError, match=message):
         read(document)
 
@@ -220,6 +220,6 @@ def test_older_waypoint_files_have_no_home(read):
         (WPL.replace("4\t0\t10", "4\t0\t1"), "MAV_FRAME 1"),
     ],
 )
-def test_waypoint_files_that_are_none_are_refused(read, text, message):
+def test_invalid_waypoint_files_are_refused(read, text, message):
     with pytest.raises(RouteError, match=message):
         read(text, "a.waypoints")

@@ -51,7 +51,7 @@ def ortho(make_ortho, tmp_path_factory):
 
 @pytest.fixture
 def reads(monkeypatch):
-    """Blocks that were read from imagery rather than taken from what was kept."""
+    """Blocks that were read from imagery rather than taken from the cache."""
     made, counted = SheetReader._read_block, []
 
     def counting(reader, raster, job):
@@ -110,7 +110,7 @@ def test_how_many_workers_may_be(ortho, tmp_path, workers):
 
 
 @pytest.mark.parametrize("workers", [1, 3])
-def test_an_interrupted_build_goes_on(ortho, tmp_path, reads, names_in, workers, whole):
+def test_an_interrupted_build_resumes(ortho, tmp_path, reads, names_in, workers, whole):
     out = tmp_path / "out" / "map.onav"
     stopped(ortho, out, workers=workers)
     first = len(reads)
@@ -121,7 +121,7 @@ def test_an_interrupted_build_goes_on(ortho, tmp_path, reads, names_in, workers,
     assert names_in(out.parent) == ["map.onav"]
 
 
-def test_pictures_for_networks_are_kept_too(ortho, tmp_path, reads):
+def test_images_for_networks_are_cached_too(ortho, tmp_path, reads):
     mosaic = Mosaic.open([ortho])
     outline = mosaic.outline_latlon_deg
     area = Area.from_outline(outline[:, 0], outline[:, 1])
@@ -167,7 +167,7 @@ KILLED = """
 """
 
 
-def test_a_killed_build_goes_on(ortho, tmp_path, reads, names_in, whole):
+def test_a_killed_build_resumes(ortho, tmp_path, reads, names_in, whole):
     out = tmp_path / "killed.onav"
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(KILLED), ortho, out], check=False)
     assert done.returncode == -signal.SIGKILL and not out.exists()
@@ -228,7 +228,7 @@ def test_changed_imagery_is_read_again_where_it_is_needed(make_ortho, tmp_path, 
     assert fresh.out.read_bytes() == again
 
 
-def test_damaged_blocks_are_made_anew(ortho, tmp_path, reads, caplog, whole):
+def test_damaged_blocks_are_recomputed(ortho, tmp_path, reads, caplog, whole):
     out = tmp_path / "map.onav"
     stopped(ortho, out, after=1.0)
     kept = sorted(Path(f"{out}.work").iterdir())
@@ -239,10 +239,10 @@ def test_damaged_blocks_are_made_anew(ortho, tmp_path, reads, caplog, whole):
     kept[2].write_bytes(b"")
     reads.clear()
     assert built(ortho, out) == whole
-    assert len(reads) == 3 and caplog.text.count("made anew") == 3
+    assert len(reads) == 3 and caplog.text.count("recomputed") == 3
 
 
-def test_few_blocks_are_not_kept(ortho, tmp_path, names_in, monkeypatch):
+def test_few_blocks_are_not_cached(ortho, tmp_path, names_in, monkeypatch):
     out = tmp_path / "map.onav"
     stopped(ortho, out)
     assert len(names_in(tmp_path)) > 2
@@ -278,7 +278,9 @@ def test_an_area_without_tiles_leaves_nothing(ortho, tmp_path, names_in):
     assert names_in(tmp_path) == []
 
 
-def test_a_full_disk_is_told_and_leaves_no_half_block(ortho, tmp_path, monkeypatch, reads, whole):
+def test_a_full_disk_is_an_error_and_leaves_no_partial_block(  # noqa: E501
+    ortho, tmp_path, monkeypatch, reads, whole
+):
     out, sync, count = tmp_path / "map.onav", os.fsync, []
 
     def full(handle):
@@ -297,14 +299,14 @@ def test_a_full_disk_is_told_and_leaves_no_half_block(ortho, tmp_path, monkeypat
     assert built(ortho, out) == whole and (0, 0) not in reads
 
 
-def test_too_little_room_is_told_before_anything_is_read(ortho, tmp_path, monkeypatch, reads):
+def test_too_little_disk_space_is_an_error_before_reading(ortho, tmp_path, monkeypatch, reads):
     monkeypatch.setattr("orthonav.prepare.sheet.CACHED_BYTES_PER_PX", 1e12)
     with pytest.raises(OutputError, match=r"MB are free.*--work"):
         built(ortho, tmp_path / "map.onav")
     assert not reads and not any(tmp_path.iterdir())
 
 
-def test_a_block_without_imagery_is_kept_too(tmp_path):
+def test_a_block_without_imagery_is_cached_too(tmp_path):
     kept = BlockCache(tmp_path / "work", "request", 0)
     block = Block(0, 0, 8, 8)
     assert kept.begin([(block, None)]) == 0 and kept.load(block) is None

@@ -65,7 +65,7 @@ def test_gusts_are_as_strong_and_as_slow_as_documented():
     assert alike == pytest.approx(math.exp(-1), abs=0.12)
 
 
-def test_no_wind_is_the_steady_way():
+def test_no_wind_gives_the_steady_path():
     still, steady = flown(LINE, Wind(0.0)), steady_path(LINE, 100.0, AIRSPEED)
     assert len(still.times_s) == len(steady.times_s)
     assert np.abs(still.places_en_m - steady.places_en_m).max() < 1e-6
@@ -89,7 +89,7 @@ def test_a_flight_that_never_ends_is_cut_short():
     assert len(way.times_s) == 21
 
 
-def test_velocities_add_up_to_the_way():
+def test_velocities_integrate_to_the_path():
     for way in (flown(LINE, Wind(8.0, 100.0)), steady_path(LINE, 70.0, AIRSPEED)):
         steps = way.velocities_en_mps[1:] * np.diff(way.times_s)[:, None]
         assert steps.sum(axis=0) == pytest.approx(way.places_en_m[-1] - way.places_en_m[0])
@@ -97,7 +97,7 @@ def test_velocities_add_up_to_the_way():
         assert 15 < way.velocities_en_mps[0, 1] < 35
 
 
-def test_dead_reckoning_drifts_by_the_stated_share_of_the_way():
+def test_dead_reckoning_drifts_by_the_stated_share_of_the_path():
     true, times = np.tile([15.0, -20.0], (100, 1)), np.arange(100) * 1.0
     way = true.sum(axis=0)
     ends = [drifting(true, times, 0.02, np.random.default_rng(n)).sum(axis=0) for n in range(300)]
