@@ -140,7 +140,9 @@ def main():
     parser.add_argument("--url", default="127.0.0.1:14550", help="where orthonav listens")
     parser.add_argument("--pace", type=float, default=1.0, help="--pace of orthonav fly")
     parser.add_argument("--rate-hz", type=float, default=50.0, help="of the attitude")
-    parser.add_argument("--tail-s", type=float, default=2.0, help="time to continue after the end (s)")
+    parser.add_argument(
+        "--tail-s", type=float, default=2.0, help="time to continue after the end (s)"
+    )
     parser.add_argument("--json", type=Path, help="write time, age and error of positions")
     options = parser.parse_args()
     host, _, port = options.url.rpartition(":")

@@ -28,9 +28,6 @@ from orthonav.mapfile import open_map
 pytest_plugins = ["absent"]
 SEED = 2
 cv2.setNumThreads(1)  # tests run side by side
-# Examples take any time on a busy machine; pytest limits the time of a test.
-hypothesis.settings.register_profile("tests", deadline=None)
-hypothesis.settings.load_profile("tests")
 # A slow or busy machine fails no test: the time limit of a whole test is in pyproject.toml.
 hypothesis.settings.register_profile("orthonav", deadline=None)
 hypothesis.settings.load_profile("orthonav")

@@ -234,7 +234,7 @@ def test_calibrate_and_fly_with_it(run, map_path, flight_path, out):
 def test_evaluate(run, fixes_path, truth_path, map_path, out, names_in):
     done = run(
         *("evaluate", fixes_path, "--truth", truth_path, "--radius-m", "40", "--map", map_path),
-        *("--json", out / "metrics.json", "--report", out / "report"),
+        *("--metrics", out / "metrics.json", "--report", out / "report"),
     )
     assert (done.code, done.err) == (0, "") and "fixes" in done.out and "index.html" in done.out
     names = [name for name in names_in(out) if not name.startswith("report/figures/")]
@@ -243,13 +243,13 @@ def test_evaluate(run, fixes_path, truth_path, map_path, out, names_in):
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["n_views"] == 30 and metrics["radius_m"] == 40
     assert metrics["acc_at_15m"] <= metrics["acc_at_40m"] and metrics["acc_at_40m"] >= 0.9
-    stdout = run("evaluate", fixes_path, "--truth", truth_path, "--json", "-")
+    stdout = run("evaluate", fixes_path, "--truth", truth_path, "--json")
     assert (stdout.code, stdout.err) == (0, "") and json.loads(stdout.out)["radius_m"] == 15
 
 
 def test_evaluate_several(run, fixes_path, truth_path):
     done = run(
-        "evaluate", fixes_path, fixes_path, "--truth", truth_path, "--truth", truth_path, "--json=-"
+        "evaluate", fixes_path, fixes_path, "--truth", truth_path, "--truth", truth_path, "--json"
     )
     plain = json.loads(done.out)
     assert done.code == 0 and plain["n_views"] == 60
@@ -523,7 +523,7 @@ def test_views_without_telemetry_do_not_end_a_flight(run, map_path, flown, out, 
 
 def test_evaluate_refuses(run, fixes_path, truth_path, out, names_in, tmp_path, undrawn):
     def evaluated(fixes, truth, *more):
-        return run("evaluate", fixes, "--truth", truth, "--json", out / "m.json", *more)
+        return run("evaluate", fixes, "--truth", truth, "--metrics", out / "m.json", *more)
 
     broken, other = tmp_path / "broken.jsonl", tmp_path / "other.csv"
     broken.write_text(fixes_path.read_text()[:-20])
@@ -589,7 +589,7 @@ def commands(ortho, map_path, flight_path, fixes_path, truth_path, out):
         ],
         "localize": ["localize", map_path, flight_path, "--out", out / "fixes.jsonl"],
         "evaluate": ["evaluate", fixes_path, "--truth", truth_path, "--report", out / "report"],
-        "metrics": ["evaluate", fixes_path, "--truth", truth_path, "--json", out / "m.json"],
+        "metrics": ["evaluate", fixes_path, "--truth", truth_path, "--metrics", out / "m.json"],
         "landscape": ["landscape", "--out", out / "land", *LANDSCAPE],
     }
 

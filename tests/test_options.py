@@ -8,10 +8,6 @@ from orthonav.cli import COMMANDS, UNITS, _parser
 
 DIFFERENT_METAVARS = {"--out"}
 """The metavar of an output names what each command writes."""
-STATUS_QUO = {
-    "--json": "evaluate writes to a file",
-}
-"""Options that do not follow the rule yet, and why."""
 
 
 def commands(parser, name):
@@ -44,13 +40,7 @@ def value_of(option, action):
     return takes, getattr(action.type, "__name__", None), metavar, choices
 
 
-SHARED = [
-    pytest.param(option, marks=pytest.mark.xfail(reason=STATUS_QUO[option], strict=True))
-    if option in STATUS_QUO
-    else option
-    for option, uses in sorted(OPTIONS.items())
-    if len(uses) > 1
-]
+SHARED = [option for option, uses in sorted(OPTIONS.items()) if len(uses) > 1]
 
 
 @pytest.mark.parametrize("option", SHARED)

@@ -45,7 +45,7 @@ COMMANDS: dict[str, Sequence[str]] = {
     "": (
         f"info {MAP}",
         f"localize {MAP} {FLIGHT} --out {FIXES}",
-        f"evaluate {FIXES} --truth {FLIGHT}/truth.csv --json fixes.json",
+        f"evaluate {FIXES} --truth {FLIGHT}/truth.csv --metrics metrics.json",
     ),
     "report": (f"evaluate {FIXES} --truth {FLIGHT}/truth.csv --report report",),
     "autopilot": (

@@ -364,7 +364,15 @@ def test_the_command_evaluates_several_flights(tmp_path, capsys) -> None:
     paths = [tmp_path / "one.jsonl", tmp_path / "two.jsonl"]
     for path, known in zip(paths, (fix, unsure), strict=True):
         path.write_text(result_to_json(ViewResult("a.jpg", 0, known, 10.0)) + "\n")
-    options = [*map(str, paths), "--truth", str(truth), "--truth", str(truth), "--json", str(out)]
+    options = [
+        *map(str, paths),
+        "--truth",
+        str(truth),
+        "--truth",
+        str(truth),
+        "--metrics",
+        str(out),
+    ]
     assert main(["evaluate", *options]) in (0, None)
     said = capsys.readouterr().out
     assert "confidence: 1 fixes state 0.950" in said and ">= 0.9: 50.0 % of views" in said

@@ -598,7 +598,7 @@ def test_evaluate_a_track(golden_flight, tmp_path: Path, capsys, only_new) -> No
     flight = shutil.copytree(golden_flight[0], tmp_path / "flight")
     (flight / "frames" / "0002.jpg").write_bytes(b"no picture")  # said in its row
     report, out = tmp_path / "report", tmp_path / "metrics.json"
-    more = ("--map", GOLDEN, "--report", report, "--flight", flight, "--json", out)
+    more = ("--map", GOLDEN, "--report", report, "--flight", flight, "--metrics", out)
     code, said, wrong = evaluated(golden_flight, *more, capsys=capsys)
     assert (code, wrong) == (0, "") and "first confirmed fix: view 2 of 4" in said
     track = json.loads(out.read_text())["track"]

@@ -1,4 +1,4 @@
-"""Pictures: the newest one, when it was exposed, and cameras that misbehave."""
+"""Images: the newest one, its time of exposure, and faults of cameras."""
 
 import threading
 
@@ -59,7 +59,7 @@ class Device:
         self.released = True
 
 
-def test_who_asks_gets_the_newest():
+def test_take_returns_the_newest_image():
     newest = NewestImage()
     for number in range(5):
         newest.put(image(number))
@@ -71,13 +71,13 @@ def test_who_asks_gets_the_newest():
     assert not newest.is_over and newest.take(1).number == 5 and newest.is_over
 
 
-def test_who_asks_waits_for_one():
+def test_take_waits_for_an_image():
     newest = NewestImage()
     threading.Timer(0.05, newest.put, [image(7)]).start()
     assert newest.take(5).number == 7
 
 
-def test_exposure_of_a_live_camera_is_arrival_less_its_latency():
+def test_exposure_of_a_live_camera_is_arrival_minus_latency():
     time = Time()
     device = Device([noisy(0), np.dstack([noisy(1)] * 3), None])
     camera = LiveCamera(
@@ -113,7 +113,7 @@ def test_a_camera_that_stops_comes_back():
     assert newest.take(0).number == 3 and newest.is_over
 
 
-def test_a_driver_with_a_fault_is_asked_again(caplog):
+def test_a_camera_is_retried_after_a_fault_of_its_driver(caplog):
     class Odd:
         asked = closed = 0
 
@@ -137,7 +137,7 @@ def entries(*times_s):
 
 
 @pytest.mark.parametrize("pace", [1.0, 4.0])
-def test_a_recording_comes_at_its_own_pace(pace):
+def test_a_recording_is_played_in_real_time(pace):
     time = Time()
     source = Playback(
         entries(50.0, 50.5, 53.0), own_pace(time.clocks, pace), time.clocks, lambda: False
@@ -149,7 +149,7 @@ def test_a_recording_comes_at_its_own_pace(pace):
     assert seen == [(0.0, 50.0), (0.5 / pace, 50.5), (3.0 / pace, 53.0)]
 
 
-def test_a_recording_may_keep_to_the_clock_of_the_autopilot():
+def test_a_recording_can_follow_the_clock_of_the_autopilot():
     time = Time()
     offset = [None]
 
@@ -169,7 +169,7 @@ def test_a_recording_can_be_stopped():
     assert source.read() is None
 
 
-def test_flight_folders_keep_their_times_and_telemetry(tmp_path):
+def test_flight_folders_have_times_and_telemetry(tmp_path):
     camera = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
     rows = [Telemetry(n * S + n, 10.0 * n, 1.0, -2.0, 100.0 + n) for n in range(3)]
     write_flight(tmp_path, camera, [(noisy(n), row) for n, row in enumerate(rows)])
@@ -179,7 +179,7 @@ def test_flight_folders_keep_their_times_and_telemetry(tmp_path):
     np.testing.assert_array_equal(telemetry[2].load(), noisy(2))
 
 
-def test_a_half_written_picture_is_told(tmp_path):
+def test_an_incomplete_image_is_a_bad_image(tmp_path):
     for number in range(3):
         cv2.imwrite(str(tmp_path / f"{number}.jpg"), noisy(number))
     whole = (tmp_path / "1.jpg").read_bytes()
@@ -207,7 +207,7 @@ def test_a_half_written_picture_is_told(tmp_path):
     )
 
 
-def test_a_video_has_times_of_its_own(tmp_path):
+def test_a_video_has_its_own_times_and_can_be_thinned(tmp_path):
     path = tmp_path / "flight.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (320, 240))
     for number in range(4):
@@ -219,7 +219,7 @@ def test_a_video_has_times_of_its_own(tmp_path):
     assert [each.time_ns for each in recorded_images(path, 5.0)] == [0, S // 5]
 
 
-def test_what_is_no_camera_is_refused(tmp_path):
+def test_invalid_sources_are_refused(tmp_path):
     with pytest.raises(MissingFileError):
         recorded_images(tmp_path / "nothing", 1.0)
     with pytest.raises(FlightError, match="no images"):
@@ -229,7 +229,7 @@ def test_what_is_no_camera_is_refused(tmp_path):
         recorded_images(tmp_path / "x.mp4", 1.0)
 
 
-def test_a_device_that_is_not_there_is_gone_for_now():
+def test_a_missing_device_is_gone_for_now():
     with pytest.raises(CameraGoneError):
         LiveCamera(4242, Time().clocks).read()
 
@@ -249,19 +249,19 @@ def sensed(scene, seed):
     return np.clip(scene + noise, 0, 255).astype(np.uint8)
 
 
-def test_the_same_picture_again_is_frozen_to_the_bit_or_nearly():
+def test_an_equal_or_nearly_equal_image_is_frozen():
     scene = ground()
     check = FrozenCheck()
     assert not check.is_repeat(scene)
     assert check.is_repeat(scene.copy()) and check.is_repeat(scene.copy())
     assert check.repeats == 2
     nearly = scene.copy()
-    nearly[::7, ::7] += 1  # compressed anew
+    nearly[::7, ::7] += 1  # compressed again
     assert check.is_repeat(nearly)
     assert not check.is_repeat(ground(1)) and check.repeats == 0
 
 
-def test_a_hover_is_not_frozen():
+def test_hovering_is_not_frozen():
     """The same scene with the noise of a good sensor, one grey level."""
     scene, check = ground(), FrozenCheck()
     assert not any(check.is_repeat(sensed(scene, seed)) for seed in range(10))

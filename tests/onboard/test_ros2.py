@@ -166,7 +166,7 @@ def send_view(peer, now_ns, angles=(90.0, 0.0, 0.0), **changes):
 # Messages on the wire.
 
 
-def test_what_we_encode_the_other_library_decodes_and_the_other_way_round():
+def test_messages_round_trip_through_cyclonedds():
     definitions, rng = Definitions(), np.random.default_rng(0)
     messages = Messages()
     covariance = rng.normal(size=36)
@@ -212,7 +212,7 @@ def test_the_distribution_chooses_the_definitions():
 # Into the program.
 
 
-def test_a_picture_comes_with_the_telemetry_of_its_exposure(peer, reading):
+def test_an_image_has_the_telemetry_of_its_exposure(peer, reading):
     advertised(peer, "/cam/image_raw", "/imu/data", "/range")
     flying = reading()
     matched(peer, flying)
@@ -232,7 +232,7 @@ def test_a_picture_comes_with_the_telemetry_of_its_exposure(peer, reading):
     assert seen.telemetry.agl_m == pytest.approx(80.0 * tilt, abs=1e-3)
 
 
-def test_a_live_view_is_that_of_a_recorded_bag(peer, reading, tmp_path):
+def test_a_live_view_equals_that_of_a_recorded_bag(peer, reading, tmp_path):
     """The same messages, once from a file and once over DDS: the same picture and telemetry."""
     messages = Messages()
     begin_ns = time.time_ns() + S // 2  # plain numbers have no stamp: they must come before
@@ -267,7 +267,7 @@ def test_a_live_view_is_that_of_a_recorded_bag(peer, reading, tmp_path):
     assert camera == open_source(bag).camera
 
 
-def test_compressed_pictures_by_parameter(peer, reading):
+def test_compressed_images_by_parameter(peer, reading):
     advertised(peer, "/cam/image_raw/compressed", "/imu/data", "/range")
     flying = reading("-p", "image_transport:=compressed")
     matched(peer, flying)
@@ -298,7 +298,7 @@ def test_an_image_that_cannot_be_decoded_has_a_reason(peer, reading, changes, sa
     assert said in seen.problem.detail and "/cam/image_raw" in seen.problem.detail
 
 
-def test_without_telemetry_a_picture_comes_all_the_same_and_says_so(peer, reading):
+def test_an_image_without_telemetry_is_delivered(peer, reading):
     advertised(peer, "/cam/image_raw")
     flying = reading()
     matched(peer, flying)
@@ -348,7 +348,7 @@ def test_simulated_time_is_that_of_the_clock(peer, reading):
     assert then_ns <= flying.reader.now_ns() < then_ns + 10 * S
 
 
-def test_no_clock_when_it_is_asked_for_is_said_and_nothing_is_flown(peer, reading, caplog):
+def test_a_missing_clock_is_logged_and_images_are_ignored(peer, reading, caplog):
     advertised(peer, "/cam/image_raw", "/imu/data", "/range")
     flying = reading("-p", "use_sim_time:=true")
     matched(peer, flying)
@@ -367,7 +367,7 @@ def test_a_camera_that_is_not_calibrated_is_refused(peer, reading):
         flying.reader.wait_for_camera()
 
 
-def test_no_camera_info_is_waited_for_and_said(reading, caplog):
+def test_the_wait_for_camera_info_is_logged(reading, caplog):
     flying = reading()
     flying.deadline = time.monotonic() + 1.5
     with pytest.raises(CameraError, match=r"stopped.*/cam/camera_info"):
@@ -375,7 +375,7 @@ def test_no_camera_info_is_waited_for_and_said(reading, caplog):
     assert "no message on /cam/camera_info" in caplog.text
 
 
-def test_gnss_is_kept_apart(peer, reading):
+def test_gnss_is_logged_only(peer, reading):
     advertised(peer, "/gps/fix")
     flying = reading()
     matched(peer, flying)
@@ -507,7 +507,7 @@ def fix(cov_en_m2=COV, **values):
     return dataclasses.replace(fix_of(**values), cov_en_m2=cov_en_m2)
 
 
-def test_a_position_goes_out_as_fix_and_pose(peer, publishing):
+def test_a_position_is_published_as_fix_and_pose(peer, publishing):
     flying = publishing()
     ned = Rotation.from_euler("ZYX", (30.0, 5.0, -3.0), degrees=True).as_matrix()
     outcome = fix(lat_deg=47.01, lon_deg=8.02, cov_en_m2=COV)
@@ -545,7 +545,7 @@ def test_a_position_goes_out_as_fix_and_pose(peer, publishing):
         ({"cov_en_m2": np.full((2, 2), math.nan)}, "no_covariance"),
     ],
 )
-def test_what_the_gate_withholds_never_goes_out(peer, publishing, changes, reason):
+def test_withheld_positions_are_not_published(peer, publishing, changes, reason):
     flying = publishing()
     assert flying.publish(fix(**changes)) == ()
     assert flying.gate.withheld[reason] == 1
@@ -571,14 +571,14 @@ def test_a_dry_run_sends_health_and_no_position(peer, publishing):
     assert peer.heard("/orthonav/fix") == peer.heard("/orthonav/pose") == []
 
 
-def test_a_floor_holds_in_every_direction():
+def test_min_std_m_is_a_bound_in_every_direction():
     assert np.linalg.eigvalsh(floored(COV, 2.5)).tolist() == pytest.approx(
         [2.5**2, np.linalg.eigvalsh(COV)[1]]
     )
     assert floored(COV, 0.0) == pytest.approx(COV)
 
 
-def test_the_origin_is_latched_for_who_comes_late(peer, publishing):
+def test_the_origin_is_latched_for_later_subscribers(peer, publishing):
     publishing()
     peer.subscribe("/orthonav/origin", ros.GeoPointStamped, RELIABLE, TRANSIENT_LOCAL)
     (found,) = wait_for(lambda: peer.heard("/orthonav/origin"), 10)
@@ -743,7 +743,7 @@ def test_a_bag_replayed_in_real_time_is_flown(flown, env, peer, tmp_path, sim_ti
     assert (first.latitude, first.longitude) == (10.0, 20.0)
 
 
-def test_no_camera_info_is_said_and_sigterm_ends_it(flown, env, peer, tmp_path):
+def test_sigterm_ends_the_wait_for_camera_info(flown, env, peer, tmp_path):
     """On the loopback by ROS_LOCALHOST_ONLY, as ROS users ask for it."""
     errors = tmp_path / "errors"
     peer.advertise("/cam/image_raw", ros.Image)
@@ -757,7 +757,7 @@ def test_no_camera_info_is_said_and_sigterm_ends_it(flown, env, peer, tmp_path):
     assert code == 1 and "--camera" in errors.read_text().splitlines()[-1]
 
 
-def test_what_cannot_be_flown_together_is_said(flown, run, env):
+def test_conflicting_options_end_with_one_line(flown, run, env):
     path = flown[0]
     for words, said in (
         (["0", "--ros2"], "--ros2 replaces"),
@@ -780,7 +780,7 @@ def test_a_missing_extra_is_named_in_one_line(flown, env, tmp_path):
     assert errors.read_text().count("\n") == 1
 
 
-def test_what_flies_without_ros_does_not_load_it():
+def test_a_flight_without_ros_does_not_load_it():
     script = (
         "import sys, orthonav.cli.flying\n"
         "print({'cyclonedds', 'rosbags'} & {name.partition('.')[0] for name in sys.modules})"

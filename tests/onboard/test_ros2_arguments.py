@@ -64,14 +64,14 @@ def test_parameters_and_environment():
         (("-p", "image_transport:=theora"), "raw or compressed"),
     ],
 )
-def test_what_cannot_be_is_said(words, said):
+def test_invalid_arguments_are_named(words, said):
     with pytest.raises(VariantError) as error:
         parsed(*words)
     assert said in str(error.value)
 
 
 @pytest.mark.parametrize("text", ["-1", "233", "x", "1.5"])
-def test_a_domain_that_cannot_be(text):
+def test_an_invalid_domain_is_refused(text):
     with pytest.raises(VariantError, match="ROS_DOMAIN_ID"):
         parsed(ROS_DOMAIN_ID=text)
 
@@ -80,7 +80,7 @@ token = st.from_regex(r"[a-z_][a-z0-9_]{0,8}", fullmatch=True)
 
 
 @given(st.lists(token, max_size=3), st.lists(token, min_size=1, max_size=3), token)
-def test_every_expanded_name_is_absolute_and_stays(space, name, node):
+def test_expansion_is_absolute_and_idempotent(space, name, node):
     made = RosArguments(node=node, namespace="/" + "/".join(space))
     for start in ("", "~/", "/"):
         full = made.expanded(start + "/".join(name))

@@ -1,4 +1,4 @@
-"""Telemetry at the exposure, and clocks that agree."""
+"""Telemetry interpolated to the exposure, and the offset of the clocks."""
 
 import math
 
@@ -26,7 +26,7 @@ def attitude(buffer, time_ns, yaw_deg=0.0, pitch_deg=0.0, roll_deg=0.0):
     buffer.add_attitude(time_ns, wxyz_of_angles(*np.radians([roll_deg, pitch_deg, yaw_deg])))
 
 
-def test_half_way_between_two_attitudes():
+def test_attitudes_are_interpolated():
     buffer = TelemetryBuffer()
     attitude(buffer, 0, yaw_deg=350.0)
     attitude(buffer, 100 * MS, yaw_deg=20.0)
@@ -36,7 +36,7 @@ def test_half_way_between_two_attitudes():
 
 
 @given(ANGLES, ANGLES, st.floats(0, 1), st.booleans())
-def test_between_attitudes_as_scipy_turns(before, after, weight, flipped):
+def test_interpolation_equals_scipy_slerp(before, after, weight, flipped):
     buffer = TelemetryBuffer()
     ends = [wxyz_of_angles(*np.radians(each)) for each in (before, after)]
     buffer.add_attitude(0, ends[0])
@@ -50,7 +50,7 @@ def test_between_attitudes_as_scipy_turns(before, after, weight, flipped):
 
 
 @given(ANGLES, st.tuples(*[st.floats(-30, 30)] * 3))
-def test_the_camera_is_as_an_import_of_a_log_would_have_it(angles, mount):
+def test_telemetry_equals_that_of_an_imported_log(angles, mount):
     roll, pitch, yaw = angles
     buffer, samples = TelemetryBuffer(), Samples(3)
     attitude(buffer, 1 * S, yaw, pitch, roll)
@@ -65,7 +65,7 @@ def test_the_camera_is_as_an_import_of_a_log_would_have_it(angles, mount):
 
 
 @pytest.mark.parametrize("every_ms, known", [(20, True), (50, True), (100, False)])
-def test_a_little_ahead_of_attitudes_that_come_closely(every_ms, known):
+def test_dense_attitudes_are_extrapolated_a_little(every_ms, known):
     """A view need not wait for the next one; it turns on as it turned."""
     buffer = TelemetryBuffer(BufferLimits(attitude_ahead_s=0.03))
     for number in range(5):
@@ -79,14 +79,14 @@ def test_a_little_ahead_of_attitudes_that_come_closely(every_ms, known):
     assert later.yaw_deg == pytest.approx(4 * every_ms * 0.1)
 
 
-def test_nothing_is_known_ahead_of_nothing():
+def test_single_attitudes_are_not_extrapolated():
     buffer = TelemetryBuffer()
     assert buffer.covered_ns is None
     attitude(buffer, 0)
     assert buffer.covered_ns == 0
 
 
-def test_gaps_are_not_bridged():
+def test_gaps_are_not_interpolated():
     limits = BufferLimits(attitude_gap_s=0.5, attitude_hold_s=0.1, slow_gap_s=2.0, slow_hold_s=1.5)
     buffer = TelemetryBuffer(limits)
     assert buffer.at(0).ned_from_body is None and buffer.covered_ns is None
@@ -121,7 +121,7 @@ def test_the_best_available_height_is_used():
     assert math.isnan(only.at(0).height_m)
 
 
-def test_a_distance_is_taken_along_the_body():
+def test_a_distance_is_corrected_for_the_tilt():
     buffer = TelemetryBuffer()
     buffer.add_distance(0, 100.0)  # the tilt is not known
     assert math.isnan(buffer.at(0).height_m)
@@ -148,7 +148,7 @@ def test_an_invalid_attitude_is_dropped(wxyz):
     assert buffer.covered_ns is None
 
 
-def test_samples_out_of_order_are_dropped_and_old_ones_forgotten():
+def test_samples_out_of_order_and_old_ones_are_dropped():
     buffer = TelemetryBuffer(BufferLimits(keep_s=1.0))
     for number in range(1000):
         attitude(buffer, number * 10 * MS, yaw_deg=10.0)
@@ -173,13 +173,13 @@ def exchanges(sync, rng, count, offset_ns=OFFSET_NS, start_ns=0, one_sided=False
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_quick_exchanges_count(seed):
+def test_exchanges_with_a_short_round_trip_are_used(seed):
     sync = ClockSync()
     exchanges(sync, np.random.default_rng(seed), 32)
     assert sync.is_exact and abs(sync.offset_ns - OFFSET_NS) < MS
 
 
-def test_outliers_are_left_out():
+def test_outliers_are_ignored():
     sync, rng = ClockSync(), np.random.default_rng(1)
     exchanges(sync, rng, 10)
     before = sync.offset_ns
@@ -191,7 +191,7 @@ def test_outliers_are_left_out():
 
 
 @pytest.mark.parametrize("jump_ns", [5 * S, -5 * S, 60 * MS, -60 * MS, -36 * S])
-def test_a_clock_that_was_set_is_found_out(jump_ns):
+def test_a_clock_that_was_set_is_detected(jump_ns):
     sync, rng = ClockSync(), np.random.default_rng(2)
     exchanges(sync, rng, 20)
     assert exchanges(sync, rng, 8, OFFSET_NS + jump_ns, 20 * S)
@@ -201,7 +201,7 @@ def test_a_clock_that_was_set_is_found_out(jump_ns):
 
 
 @pytest.mark.parametrize("jump_ns", [5 * S, -5 * S])
-def test_messages_tell_a_restart_without_any_exchange(jump_ns):
+def test_a_restart_is_detected_from_timestamps_of_messages(jump_ns):
     sync, rng = ClockSync(), np.random.default_rng(3)
     for number in range(100):
         now = number * 20 * MS

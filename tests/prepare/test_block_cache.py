@@ -278,7 +278,7 @@ def test_an_area_without_tiles_leaves_nothing(ortho, tmp_path, names_in):
     assert names_in(tmp_path) == []
 
 
-def test_a_full_disk_is_an_error_and_leaves_no_partial_block(  # noqa: E501
+def test_a_full_disk_is_an_error_and_leaves_no_partial_block(
     ortho, tmp_path, monkeypatch, reads, whole
 ):
     out, sync, count = tmp_path / "map.onav", os.fsync, []

@@ -1,4 +1,4 @@
-"""What autopilots are told: the record, its accuracy, its clocks, GPS time."""
+"""Estimates: accuracy, clocks, GPS time."""
 
 import math
 from dataclasses import replace
@@ -51,7 +51,7 @@ def test_without_a_fix_there_is_no_estimate() -> None:
 @pytest.mark.parametrize(
     "evidence", [{}, {"vel_east_mps": 1.0}, {**VELOCITY, "vel_east_mps": math.nan}]
 )
-def test_half_a_velocity_is_none(evidence: dict[str, float]) -> None:
+def test_an_incomplete_velocity_is_unknown(evidence: dict[str, float]) -> None:
     made = estimate_from_result(a_result("tracking", **evidence))
     assert made is not None and made.vel_en_mps is None
 
@@ -61,7 +61,7 @@ def test_a_single_view_has_no_velocity() -> None:
     assert made is not None and made.vel_en_mps is None
 
 
-def test_clocks_are_kept_apart() -> None:
+def test_times_of_both_clocks_are_separate() -> None:
     utc = estimate_from_result(a_result())
     boot = estimate_from_result(a_result(), clock=Clock.BOOT, utc_minus_boot_ns=10**18)
     assert utc is not None and boot is not None
@@ -74,9 +74,9 @@ def test_clocks_are_kept_apart() -> None:
 
 def test_an_unknown_latency_is_no_processing_time() -> None:
     made = estimate_from_result(replace(a_result(), latency_ms=math.nan))
-    told = estimate_from_result(a_result(), processing_s=0.25)
+    estimate = estimate_from_result(a_result(), processing_s=0.25)
     assert made is not None and made.processing_s == 0.0
-    assert told is not None and told.processing_s == 0.25
+    assert estimate is not None and estimate.processing_s == 0.25
 
 
 angles = st.floats(0, math.pi)

@@ -38,7 +38,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--other-date",
         type=Path,
         metavar="TIF",
-        help="orthophoto of the same area at another date, not in the map: improves the prediction",
+        help="orthophoto of a second date, not in the map: improves the prediction",
     )
     parser.add_argument(
         "--camera",
@@ -54,7 +54,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     _add_errors(parser)
     _add_effort(parser)
-    parser.add_argument("--json", action="store_true", help="print check.json instead of the text")
+    parser.add_argument(
+        "--json", action="store_true", help="print the content of check.json instead of the text"
+    )
 
 
 def _add_errors(parser: argparse.ArgumentParser) -> None:
@@ -90,7 +92,7 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
         "--prior",
         choices=("telemetry", "none"),
         default="telemetry",
-        help="telemetry: search around a prior position (default); none: search the whole map",
+        help="none: search the whole map",
     )
     parser.add_argument(
         "--relief-m",
@@ -110,9 +112,9 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--min-confidence",
         type=float,
-        default=0.9,
         metavar="P",
-        help="confidence from which a fix is used (default 0.9)",
+        default=0.9,
+        help="confidence that a fix needs to be accepted (default 0.9)",
     )
 
 

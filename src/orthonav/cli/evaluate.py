@@ -41,11 +41,10 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="distance of the relative pose error (default 100)",
     )
     parser.add_argument(
-        "--json",
-        nargs="?",
-        const="-",
-        metavar="metrics.json",
-        help="write the metrics as JSON to a file, or to stdout",
+        "--metrics", type=Path, metavar="metrics.json", help="write the metrics to a file"
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="print the metrics as JSON instead of the table"
     )
     parser.add_argument(
         "--report",
@@ -90,11 +89,11 @@ def run(options: argparse.Namespace) -> None:
     if options.report:
         _write_report(options.report, flights, opened)
     plain = flights_to_json(flights)
-    if options.json == "-":
+    if options.metrics:
+        write_text(options.metrics, json.dumps(plain, indent=1, allow_nan=False) + "\n")
+    if options.json:
         print_json(plain)
         return
-    if options.json:
-        write_text(Path(options.json), json.dumps(plain, indent=1, allow_nan=False) + "\n")
     print(f"{table(flights)}\n\n{summary(flights)}")
     if options.report:
         print(f"report: {options.report / 'index.html'}")

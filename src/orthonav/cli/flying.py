@@ -56,6 +56,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     accept = Acceptance.parse(options.accept)
     least = accept.threshold if accept.criterion == "confidence" else CONFIDENT
     mount = read_mount(options.mount) if options.mount else None
+    camera = _camera(options)
     localizer = Localizer(open_map(options.map))
     heading_known = options.heading == "known"
     tracker = Tracker(
@@ -63,7 +64,8 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     )
     locator: Locator = MountCorrected(tracker, mount) if mount else tracker
     link = _link(options, clocks)
-    source, camera, graph = _inputs(options, clocks, link, stopping, stack, localizer, least)
+    source, graph = _inputs(options, clocks, link, camera, stopping, stack, localizer, least)
+    camera = camera or source.wait_for_camera()
     publisher = _publisher(options, clocks, link, least, graph)
     if link is not None:
         stack.callback(LinkThread(link).stop)
@@ -104,24 +106,27 @@ def _inputs(
     options: argparse.Namespace,
     clocks: Clocks,
     link: AutopilotLink | None,
+    camera: Camera | None,
     stopping: threading.Event,
     stack: ExitStack,
     localizer: Localizer,
     least: float,
-) -> tuple[Any, Camera, PositionOutput | None]:
-    """Source of images, camera, and the output that belongs to the source, if any."""
-    if not options.ros2:
-        camera = _camera(options)
-        return _source(options, clocks, link, camera, stopping), camera, None
+) -> tuple[Any, PositionOutput | None]:
+    """Source of images, and the output that belongs to it, if any."""
+    if camera is not None and not options.ros2:
+        return _source(options, clocks, link, camera, stopping), None
     ros2 = importlib.import_module("orthonav.cli.flying_ros2")  # only where it is asked for
     frame = localizer.sheet.frame
     source, graph = ros2.joined(options, clocks, stopping, stack, frame, least)
-    return source, _camera(options) if options.camera else source.wait_for_camera(), graph
+    return source, graph
 
 
-def _camera(options: argparse.Namespace) -> Camera:
+def _camera(options: argparse.Namespace) -> Camera | None:
+    """Camera of a file; None for that of a ROS 2 topic."""
     if options.camera is not None:
         return read_camera_file(options.camera)
+    if options.ros2:
+        return None
     path = Path(options.source) / "flight.json"
     if not path.is_file():
         raise CameraError(f"no camera calibration: give --camera FILE, or a flight folder: {path}")
