@@ -77,7 +77,7 @@ def test_the_key_is_its_owners_and_stays(keys):
     mode = stat.S_IMODE((keys / "ours" / "private.pem").stat().st_mode)
     assert mode == 0o600
     before = (keys / "ours" / "private.pem").read_bytes()
-    with pytest.raises(OutputError, match="not written over"):
+    with pytest.raises(OutputError, match="holds a key already"):
         new_key(keys / "ours")
     assert (keys / "ours" / "private.pem").read_bytes() == before
 

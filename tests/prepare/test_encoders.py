@@ -84,7 +84,7 @@ def test_registration_works_on_maps_of_other_methods(built, flight_path, method)
     assert np.median(errors) < 15
 
 
-def test_an_interrupted_learning_goes_on(area, tmp_path):
+def test_interrupted_training_resumes(area, tmp_path):
     class Killed(Exception):
         pass
 
@@ -146,7 +146,7 @@ def test_the_same_request_gives_the_same_embeddings(area, tmp_path):
     assert parts[0] == parts[1]
 
 
-def test_a_map_says_nothing_of_the_machine_that_made_it(monkeypatch):
+def test_a_map_does_not_name_the_machine_that_built_it(monkeypatch):
     monkeypatch.setenv("ORTHONAV_SAM_WEIGHTS", "")
     made = make_variant(TABLE, "sam:weights=/home/somebody/sam,cache=/home/somebody/kept,grid=16")
     stored = stored_representation(made)

@@ -193,7 +193,7 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> tuple[int, float, i
         **recipe,
     )
     try:
-        manifest = build_map(request, tell=log.debug).manifest
+        manifest = build_map(request, announce=log.debug).manifest
     except AreaError as error:  # the recipe was tried when the task was made: no imagery
         log.info("%s is empty: %s", task.sheet, error)
         return 0, 0.0, 0

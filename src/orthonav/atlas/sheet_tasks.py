@@ -23,7 +23,7 @@ from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
 from orthonav.geo.sheets import sheets_of_route
 from orthonav.imagery.mosaic import Mosaic
-from orthonav.prepare.kept import digest
+from orthonav.prepare.block_cache import digest
 from orthonav.prepare.layout import grid_of
 
 MARGIN_PX = 64

@@ -20,6 +20,9 @@ from orthonav.cli.needs import require_extras
 from orthonav.cli.version import show_version
 from orthonav.errors import OrthonavError
 
+UNITS = frozenset(("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz"))
+"""Last words of option names that are units."""
+
 COMMANDS = {
     "demo": "generate an area, build a map, simulate a flight, localize it and report",
     "plan": "recommend a map for a route, a camera and a height",
@@ -133,9 +136,24 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         if name in arguments:
             module = _module(name)
             module.add(command)
+            _name_units(command)
             if everyday := getattr(module, "EVERYDAY", ()):
                 _shorten_help(command, everyday, show_all="--help-all" in arguments)
     return parser
+
+
+def _name_units(command: argparse.ArgumentParser) -> None:
+    """Name numbers in the help by the unit that ends their option: `--agl-m M`; integers N."""
+    for action in command._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for sub_command in action.choices.values():
+                _name_units(sub_command)
+        elif action.type in (int, float) and action.metavar is None:
+            unit = action.option_strings[0].rpartition("-")[2] if action.option_strings else ""
+            if unit in UNITS:
+                action.metavar = unit.upper()
+            elif action.type is int:
+                action.metavar = "N"
 
 
 def _shorten_help(

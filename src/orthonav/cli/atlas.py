@@ -61,7 +61,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     index.add_argument("--rebuild", action="store_true", help="rebuild all of it")
     cut = action("cut", "cut the map of a route or of bounds out of an atlas")
     add_area(cut, cut.add_mutually_exclusive_group(required=True))
-    cut.add_argument("--out", type=Path, required=True, metavar="MAP.onav")
+    cut.add_argument(
+        "--out", type=Path, required=True, metavar="MAP.onav", help="map file to write"
+    )
     cut.add_argument(
         "--workers", type=int, metavar="N", help="threads that read sheets (default: one per core)"
     )

@@ -27,25 +27,27 @@ RECIPE = (
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     add_orthos(parser, "orthophoto (any georeferenced raster that GDAL reads)")
     add_area(parser, parser.add_mutually_exclusive_group())
     add_recipe(parser)
-    parser.add_argument("--out", type=Path, required=True, metavar="MAP.onav")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="MAP.onav", help="map file to write"
+    )
     parser.add_argument(
         "--other-date",
         type=Path,
         action="append",
         default=[],
         metavar="TIF",
-        help="orthophoto of the same area of another year: confidence and covariance are learnt "
-        "from it, it does not become part of the map; may be repeated",
+        help="orthophoto of the same area at another date, from which confidence and covariance "
+        "are calibrated; it does not become part of the map; may be repeated",
     )
     parser.add_argument(
         "--work",
         type=Path,
         metavar="DIR",
-        help="folder of finished blocks, and of checkpoints and pictures of a network's training, "
+        help="folder of finished blocks, and of checkpoints and images of a network's training, "
         "from which an interrupted build resumes (default: MAP.onav.work for large areas, removed "
         "when the map is written)",
     )
@@ -61,32 +63,39 @@ def add(parser: argparse.ArgumentParser) -> None:
 def add_recipe(parser: argparse._ActionsContainer) -> None:
     """The options of `RECIPE`."""
     parser.add_argument(
-        "--gsd-m", type=float, help="ground resolution, metres per pixel (default: the imagery's)"
+        "--gsd-m", type=float, help="ground resolution, metres per pixel (default: of the imagery)"
     )
     parser.add_argument("--tile-px", type=int, help="width of a tile (default 256)")
-    parser.add_argument("--overlap", type=float, help="share common to neighbours (default 0.875)")
+    parser.add_argument(
+        "--overlap",
+        type=float,
+        metavar="SHARE",
+        help="overlap of neighbouring tiles, as a share of their width (default 0.875)",
+    )
     parser.add_argument(
         "--method",
-        help="embedding, name:field=value,...: gradient (default), autoencoder, triplet or bovw",
+        metavar="NAME[:FIELD=VALUE,..]",
+        help="embedding: gradient (default), autoencoder, triplet or bovw",
     )
     parser.add_argument(
         "--edges",
-        help="what is compared: gradient, gray, canny (e.g. canny:low=100,high=200), segments or "
+        metavar="NAME[:FIELD=VALUE,..]",
+        help="image representation: gradient, gray, canny (canny:low=100,high=200), segments or "
         "sam:weights=PATH (default: gradient; canny for autoencoder, gray for triplet and bovw)",
     )
-    parser.add_argument("--seed", type=int, help="seed of what is drawn (default 0)")
+    parser.add_argument("--seed", type=int, help="seed of all random draws (default 0)")
     parser.add_argument(
         "--no-registration",
         dest="registration",
         action="store_const",
         const=False,
-        help="leave out the grey picture of the area: a smaller map, positions at tile level only",
+        help="omit the registration layer: a smaller map, with positions at tile level only",
     )
     parser.add_argument(
         "--calibration-views",
         type=int,
         metavar="N",
-        help="simulated views of the orthophoto from which confidence is learnt (default 48)",
+        help="simulated views of the orthophoto for calibrating the confidence (default 48)",
     )
 
 
@@ -103,7 +112,7 @@ def reporter(options: argparse.Namespace) -> Callable[[str], None]:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Build and print a summary."""
+    """Build the map and print a summary."""
     from orthonav.cli.info import summary, summary_text
     from orthonav.geo.route import read_route
     from orthonav.prepare import BuildRequest, build_map

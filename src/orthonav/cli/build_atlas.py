@@ -34,7 +34,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     coarse = parser.add_argument_group("coarse tiles, for views without a prior")
     coarse.add_argument("--coarse-gsd-m", type=float, help="metres per pixel (default 8)")
     coarse.add_argument("--coarse-tile-px", type=int, help="width of a tile (default 128)")
-    coarse.add_argument("--coarse-overlap", type=float, help="overlap of tiles (default 0.875)")
+    coarse.add_argument(
+        "--coarse-overlap", type=float, metavar="SHARE", help="overlap of tiles (default 0.875)"
+    )
     coarse.add_argument("--no-coarse", dest="coarse", action="store_false", help="leave them out")
     coarse.add_argument(
         "--no-index", dest="index", action="store_false", help="do not index them at the end"

@@ -27,7 +27,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="REPORT/", help="folder of page, JSON and layers"
     )
-    parser.add_argument("--route", type=Path, help=ROUTE_HELP)
+    parser.add_argument("--route", type=Path, metavar="FILE", help=ROUTE_HELP)
     parser.add_argument(
         "--band-m",
         type=float,
@@ -41,7 +41,10 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="orthophoto of a second date, not in the map: improves the prediction",
     )
     parser.add_argument(
-        "--camera", type=Path, metavar="FILE", help="flight.json, or a file of OpenCV, ROS, Kalibr"
+        "--camera",
+        type=Path,
+        metavar="FILE",
+        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",
     )
     parser.add_argument(
         "--agl-m",
@@ -74,6 +77,7 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--agl-std",
         type=float,
+        metavar="SHARE",
         default=0.05,
         help="standard deviation of the reported height, a share of it (default 0.05)",
     )
@@ -101,12 +105,14 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--drift",
         type=float,
+        metavar="SHARE",
         default=0.03,
         help="error of dead reckoning per metre flown without a fix (default 0.03)",
     )
     parser.add_argument(
         "--min-confidence",
         type=float,
+        metavar="P",
         default=0.9,
         help="confidence that a fix needs to be accepted (default 0.9)",
     )
@@ -114,7 +120,11 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
 
 def _add_effort(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--effort", type=float, default=1.0, help="factor on the number of trials (default 1)"
+        "--effort",
+        type=float,
+        default=1.0,
+        metavar="FACTOR",
+        help="factor on the number of trials (default 1)",
     )
     parser.add_argument(
         "--quick", action="store_true", help="skip the trials of other errors and other heights"

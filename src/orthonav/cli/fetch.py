@@ -91,7 +91,12 @@ def _add_file(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--date", help="date of the imagery: YYYY, YYYY-MM, YYYY-MM-DD, or A/B")
     group.add_argument("--licence", help="licence of the imagery")
     group.add_argument("--attribution", help="who must be named")
-    group.add_argument("--compress", choices=("jpeg", "deflate"), default="jpeg")
+    group.add_argument(
+        "--compress",
+        choices=("jpeg", "deflate"),
+        default="jpeg",
+        help="compression of the GeoTIFF (default jpeg)",
+    )
     group.add_argument("--quality", type=int, default=90, help="of JPEG, 1 to 100 (default 90)")
     group.add_argument(
         "--allow-holes", action="store_true", help="write the file although tiles failed"
@@ -104,7 +109,9 @@ def _add_requests(parser: argparse.ArgumentParser) -> None:
         "--key-env", metavar="VARIABLE", help="environment variable with the key for {key}"
     )
     group.add_argument("--parallel", type=int, default=4, help="at the same time (default 4)")
-    group.add_argument("--per-second", type=float, help="per second and host (default 10)")
+    group.add_argument(
+        "--per-second", type=float, metavar="N", help="per second and host (default 10)"
+    )
     group.add_argument(
         "--retries", type=int, default=5, help="repetitions after a failure (default 5)"
     )

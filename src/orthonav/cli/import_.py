@@ -10,6 +10,16 @@ from orthonav.cli.source import add_source, open_source
 
 log = logging.getLogger(__name__)
 
+EVERYDAY = (
+    "--kind",
+    "--camera",
+    "--telemetry",
+    "--time-offset-s",
+    "--mount-deg",
+    "--rate-hz",
+    "--json",
+)
+
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""

@@ -24,7 +24,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="fixes.jsonl, the output of `orthonav fly --jsonl`, or a flight log (file, folder, or "
         "the name given to --log)",
     )
-    parser.add_argument("--map", type=Path, required=True, metavar="MAP.onav")
+    parser.add_argument(
+        "--map", type=Path, required=True, metavar="MAP.onav", help="map of the flight"
+    )
     parser.add_argument(
         "--flight",
         type=Path,

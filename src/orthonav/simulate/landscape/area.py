@@ -63,7 +63,7 @@ def generate_area(
 
 
 def _size_px(size_m: tuple[float, float], gsd_m: float) -> tuple[int, int]:
-    """Return (width, height) in pixels; raise `AreaError` where they make no picture."""
+    """Return (width, height) in pixels; raise `AreaError` for an impossible image."""
     check_gsd(gsd_m)
     if not all(isfinite(side) and side > 0.0 for side in size_m):
         raise AreaError(f"size_m must be two finite positive lengths, got {size_m}")
@@ -122,11 +122,11 @@ def _write(
 
 
 def _check_written(path: Path, checksums: list[tuple[Any, int]]) -> None:
-    """Read windows back: GDAL writes its last blocks while closing, and fails there silently."""
+    """Read windows back: GDAL writes its last blocks on closing, and ignores errors there."""
     import rasterio
 
     with rasterio.open(path) as source:
         for window, checksum in checksums:
             picture = np.moveaxis(source.read(window=window), 0, 2)
             if crc32(picture.tobytes()) != checksum:
-                raise OSError("what was written cannot be read back; is the disk full?")
+                raise OSError("the written file cannot be read back; check for a full disk")

@@ -1,8 +1,8 @@
-"""Finished blocks of a build, kept in a folder, from which an interrupted build goes on.
+"""Cache of finished blocks in a folder, from which an interrupted build resumes.
 
 A block is one file: arrays in NumPy's own container (a ZIP whose checksums are verified), written
-to a temporary name and renamed. Its name holds a digest of everything that determines it, so what
-belongs to another request, to imagery that has changed or to another version is never used.
+to a temporary name and renamed. Its name holds a digest of everything that determines it, so blocks
+of another request, of changed imagery or of another version are never used.
 """
 
 import contextlib
@@ -36,16 +36,16 @@ def digest(values: Any) -> str:
 
 
 class BlockCache:
-    """The folder; it appears with the first block. May be shared between threads.
+    """A folder of finished blocks, created with the first block. May be shared between threads.
 
-    As a context manager around a build: the blocks go when it is done, and where its area can never
-    be built; on any other error or interrupt they stay, and the log says so.
+    As a context manager around a build it deletes the blocks when the build succeeds, or fails with
+    an `AreaError`; on any other error or interrupt the blocks stay, and a warning is logged.
     """
 
     def __init__(self, folder: Path, request: str, needed_bytes: int) -> None:
-        """`request` is a digest of what all blocks depend on, `needed_bytes` what they will take.
+        """`request`: digest of the inputs common to all blocks. `needed_bytes`: their total size.
 
-        Raises `OutputError` where the disk has not so much room.
+        Raises `OutputError` if the disk has less free space.
         """
         self._folder = folder
         self._request = request
@@ -54,11 +54,11 @@ class BlockCache:
         room = shutil.disk_usage(parent).free + sum(path.stat().st_size for path in self._files())
         if room < needed_bytes:
             raise OutputError(
-                f"finished blocks are kept until the map is written and need about "
-                f"{needed_bytes / 1e6:.0f} MB, of which {room / 1e6:.0f} MB are free; make room or "
-                f"name a folder elsewhere (--work): {folder}"
+                f"finished blocks need about {needed_bytes / 1e6:.0f} MB until the map is written, "
+                f"but only {room / 1e6:.0f} MB are free; free disk space or name another folder "
+                f"(--work): {folder}"
             )
-        log.info("finished blocks are kept in %s: about %.0f MB", folder, needed_bytes / 1e6)
+        log.info("caching finished blocks in %s: about %.0f MB", folder, needed_bytes / 1e6)
 
     def __enter__(self) -> "BlockCache":
         return self
@@ -70,15 +70,15 @@ class BlockCache:
             self.discard()
         elif count := len(self._files()):
             log.warning(
-                "%d finished blocks are kept; the same build goes on from there: %s",
+                "%d finished blocks are cached; rerun the same build to resume: %s",
                 count,
                 self._folder,
             )
 
     def begin(self, blocks: Sequence[tuple[Block, Any]]) -> int:
-        """Say which blocks will be asked for, each with what it alone depends on.
+        """Register the blocks of a build, each with the inputs that it alone depends on.
 
-        Removes files of other builds; returns how many of the blocks are there.
+        Removes files of other builds; returns the number of cached blocks.
         """
         self._names = {
             block: f"r{block.row}-c{block.col}-{digest([FORMAT, self._request, own])[:24]}.npz"
@@ -94,7 +94,7 @@ class BlockCache:
         return there
 
     def load(self, block: Block) -> dict[str, NDArray[Any]] | None:
-        """The arrays of a block, None where it is not there or is damaged."""
+        """The arrays of a block, None if it is not cached or damaged."""
         path = self._folder / self._names[block]
         try:
             with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
@@ -102,26 +102,26 @@ class BlockCache:
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            log.warning("kept block is damaged (%s) and is made anew: %s", error, path)
+            log.warning("cached block is damaged (%s) and is recomputed: %s", error, path)
             return None
 
-    def keep(self, block: Block, parts: dict[str, NDArray[Any]]) -> None:
-        """Write a finished block. Raises `OutputError` where that fails, with no half of it."""
+    def store(self, block: Block, parts: dict[str, NDArray[Any]]) -> None:
+        """Write a finished block, complete or not at all. Raises `OutputError`."""
         path = self._folder / self._names[block]
         try:
             with replacing(path) as temporary:
                 np.savez(temporary, **parts)  # type: ignore[arg-type]
         except OutputError as error:
             raise OutputError(
-                f"{error}; blocks finished before it are kept and used by the next build like "
-                "this; a folder elsewhere can be named (--work)"
+                f"{error}; earlier blocks stay cached for a rerun of the same build; or name "
+                "another folder (--work)"
             ) from error
 
     def discard(self) -> None:
-        """Remove the blocks, and the folder where nothing else is in it."""
+        """Remove the blocks, and the folder if it is then empty."""
         for path in self._files():
             path.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # not there, or not only ours
+        with contextlib.suppress(OSError):  # missing, or not empty
             self._folder.rmdir()
 
     def _files(self) -> list[Path]:

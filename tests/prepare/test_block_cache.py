@@ -21,9 +21,9 @@ from orthonav.geo.area import Area
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.prepare import BuildRequest, build_map
+from orthonav.prepare.block_cache import BlockCache
 from orthonav.prepare.blocks import Block
 from orthonav.prepare.calibrate import CropSampler
-from orthonav.prepare.kept import BlockCache
 from orthonav.prepare.layout import grid_of
 from orthonav.prepare.parallel import AHEAD, in_order
 from orthonav.prepare.pictures import SheetPictures
@@ -38,7 +38,7 @@ SMALL = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2}
 def small_blocks(monkeypatch):
     """Many small blocks, few crops."""
     monkeypatch.setattr("orthonav.prepare.sheet.BLOCK_PX", 128)
-    monkeypatch.setattr("orthonav.prepare.sheet.MIN_KEPT_BLOCKS", 4)
+    monkeypatch.setattr("orthonav.prepare.sheet.MIN_CACHED_BLOCKS", 4)
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 16)
 
 
@@ -51,14 +51,14 @@ def ortho(make_ortho, tmp_path_factory):
 
 @pytest.fixture
 def reads(monkeypatch):
-    """Blocks that were read from imagery rather than taken from what was kept."""
-    made, counted = SheetReader._made, []
+    """Blocks that were read from imagery rather than taken from the cache."""
+    made, counted = SheetReader._read_block, []
 
     def counting(reader, raster, job):
         counted.append((job.block.row, job.block.col))
         return made(reader, raster, job)
 
-    monkeypatch.setattr(SheetReader, "_made", counting)
+    monkeypatch.setattr(SheetReader, "_read_block", counting)
     return counted
 
 
@@ -110,7 +110,7 @@ def test_how_many_workers_may_be(ortho, tmp_path, workers):
 
 
 @pytest.mark.parametrize("workers", [1, 3])
-def test_an_interrupted_build_goes_on(ortho, tmp_path, reads, names_in, workers, whole):
+def test_an_interrupted_build_resumes(ortho, tmp_path, reads, names_in, workers, whole):
     out = tmp_path / "out" / "map.onav"
     stopped(ortho, out, workers=workers)
     first = len(reads)
@@ -121,7 +121,7 @@ def test_an_interrupted_build_goes_on(ortho, tmp_path, reads, names_in, workers,
     assert names_in(out.parent) == ["map.onav"]
 
 
-def test_pictures_for_networks_are_kept_too(ortho, tmp_path, reads):
+def test_images_for_networks_are_cached_too(ortho, tmp_path, reads):
     mosaic = Mosaic.open([ortho])
     outline = mosaic.outline_latlon_deg
     area = Area.from_outline(outline[:, 0], outline[:, 1])
@@ -137,7 +137,7 @@ def test_pictures_for_networks_are_kept_too(ortho, tmp_path, reads):
         reader = SheetReader(
             mosaic, area, grid, Gray(), sampler, registration=False, pictures=pictures
         )
-        with reader.kept(tmp_path / "beside", kept_in) as kept:
+        with reader.block_cache(tmp_path / "beside", kept_in) as kept:
             reader.read(report, workers, kept)
         tiles = pictures.tiles(np.array([[0, 0], [100, 130], [300, 301]]))
         return tiles.batch(np.arange(3)), len(sampler.crops)
@@ -156,7 +156,7 @@ KILLED = """
     from pathlib import Path
     from orthonav.prepare import BuildRequest, build_map, calibrate, sheet
 
-    sheet.BLOCK_PX, sheet.MIN_KEPT_BLOCKS, calibrate.CROPS = 128, 4, 16
+    sheet.BLOCK_PX, sheet.MIN_CACHED_BLOCKS, calibrate.CROPS = 128, 4, 16
 
     def progress(stage, share):
         if stage == "imagery" and share > 0.6:
@@ -167,7 +167,7 @@ KILLED = """
 """
 
 
-def test_a_killed_build_goes_on(ortho, tmp_path, reads, names_in, whole):
+def test_a_killed_build_resumes(ortho, tmp_path, reads, names_in, whole):
     out = tmp_path / "killed.onav"
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(KILLED), ortho, out], check=False)
     assert done.returncode == -signal.SIGKILL and not out.exists()
@@ -228,7 +228,7 @@ def test_changed_imagery_is_read_again_where_it_is_needed(make_ortho, tmp_path, 
     assert fresh.out.read_bytes() == again
 
 
-def test_damaged_blocks_are_made_anew(ortho, tmp_path, reads, caplog, whole):
+def test_damaged_blocks_are_recomputed(ortho, tmp_path, reads, caplog, whole):
     out = tmp_path / "map.onav"
     stopped(ortho, out, after=1.0)
     kept = sorted(Path(f"{out}.work").iterdir())
@@ -239,20 +239,20 @@ def test_damaged_blocks_are_made_anew(ortho, tmp_path, reads, caplog, whole):
     kept[2].write_bytes(b"")
     reads.clear()
     assert built(ortho, out) == whole
-    assert len(reads) == 3 and caplog.text.count("made anew") == 3
+    assert len(reads) == 3 and caplog.text.count("recomputed") == 3
 
 
-def test_few_blocks_are_not_kept(ortho, tmp_path, names_in, monkeypatch):
+def test_few_blocks_are_not_cached(ortho, tmp_path, names_in, monkeypatch):
     out = tmp_path / "map.onav"
     stopped(ortho, out)
     assert len(names_in(tmp_path)) > 2
-    monkeypatch.setattr("orthonav.prepare.sheet.MIN_KEPT_BLOCKS", 1000)
+    monkeypatch.setattr("orthonav.prepare.sheet.MIN_CACHED_BLOCKS", 1000)
     stopped(ortho, out)
     assert names_in(tmp_path) == []  # not even those of the build before
 
 
 def test_a_work_folder_that_was_named(ortho, tmp_path, names_in, monkeypatch, reads):
-    monkeypatch.setattr("orthonav.prepare.sheet.MIN_KEPT_BLOCKS", 1000)
+    monkeypatch.setattr("orthonav.prepare.sheet.MIN_CACHED_BLOCKS", 1000)
     out, work = tmp_path / "map.onav", tmp_path / "work"
     stopped(ortho, out, work=work)
     assert all(name.startswith("work") for name in names_in(tmp_path))
@@ -278,7 +278,9 @@ def test_an_area_without_tiles_leaves_nothing(ortho, tmp_path, names_in):
     assert names_in(tmp_path) == []
 
 
-def test_a_full_disk_is_told_and_leaves_no_half_block(ortho, tmp_path, monkeypatch, reads, whole):
+def test_a_full_disk_is_an_error_and_leaves_no_partial_block(
+    ortho, tmp_path, monkeypatch, reads, whole
+):
     out, sync, count = tmp_path / "map.onav", os.fsync, []
 
     def full(handle):
@@ -297,18 +299,18 @@ def test_a_full_disk_is_told_and_leaves_no_half_block(ortho, tmp_path, monkeypat
     assert built(ortho, out) == whole and (0, 0) not in reads
 
 
-def test_too_little_room_is_told_before_anything_is_read(ortho, tmp_path, monkeypatch, reads):
-    monkeypatch.setattr("orthonav.prepare.sheet.KEPT_BYTES_PER_PX", 1e12)
+def test_too_little_disk_space_is_an_error_before_reading(ortho, tmp_path, monkeypatch, reads):
+    monkeypatch.setattr("orthonav.prepare.sheet.CACHED_BYTES_PER_PX", 1e12)
     with pytest.raises(OutputError, match=r"MB are free.*--work"):
         built(ortho, tmp_path / "map.onav")
     assert not reads and not any(tmp_path.iterdir())
 
 
-def test_a_block_without_imagery_is_kept_too(tmp_path):
+def test_a_block_without_imagery_is_cached_too(tmp_path):
     kept = BlockCache(tmp_path / "work", "request", 0)
     block = Block(0, 0, 8, 8)
     assert kept.begin([(block, None)]) == 0 and kept.load(block) is None
-    kept.keep(block, {})
+    kept.store(block, {})
     assert kept.load(block) == {} and kept.begin([(block, None)]) == 1
     assert kept.begin([(block, "other")]) == 0 and not any((tmp_path / "work").iterdir())
 

@@ -1,4 +1,4 @@
-"""Colour of the bare ground: parcels with their texture, then water, ways and borders."""
+"""Colour of the ground surface: parcels with their texture, then water, roads and borders."""
 
 from collections.abc import Sequence
 
@@ -9,36 +9,34 @@ from numpy.typing import NDArray
 from orthonav.simulate.landscape.crops import Looks
 from orthonav.simulate.landscape.epoch import Epoch, Season
 from orthonav.simulate.landscape.lines import Line, ribbon
-from orthonav.simulate.landscape.network import Network, Way
+from orthonav.simulate.landscape.network import LineKind, Network
 from orthonav.simulate.landscape.noise import Float32, fractal_grid, key_of
 from orthonav.simulate.landscape.plan import CellPlan
-from orthonav.simulate.landscape.window import Window, box_of
+from orthonav.simulate.landscape.window import PixelWindow, box_of
 
 Mask = NDArray[np.uint8]
 Labels = NDArray[np.int32]
 
 _SURFACE_RGB = {
-    Way.MAIN: (150.0, 149.0, 150.0),
-    Way.MINOR: (164.0, 160.0, 154.0),
-    Way.STREET: (156.0, 154.0, 153.0),
-    Way.TRACK: (186.0, 172.0, 144.0),
+    LineKind.MAIN: (150.0, 149.0, 150.0),
+    LineKind.MINOR: (164.0, 160.0, 154.0),
+    LineKind.STREET: (156.0, 154.0, 153.0),
+    LineKind.TRACK: (186.0, 172.0, 144.0),
 }
 _GRASS_RGB = {
     Season.SPRING: (100.0, 130.0, 70.0),
     Season.SUMMER: (142.0, 142.0, 92.0),
     Season.AUTUMN: (106.0, 120.0, 70.0),
-    Season.WINTER: (112.0, 114.0, 80.0),
 }
 _WATER_RGB = {
     Season.SPRING: (94.0, 104.0, 84.0),
     Season.SUMMER: (64.0, 84.0, 70.0),
     Season.AUTUMN: (62.0, 74.0, 72.0),
-    Season.WINTER: (82.0, 88.0, 84.0),
 }
 _SHORE_RGB = (150.0, 142.0, 112.0)
 
 
-def label_parcels(plans: Sequence[CellPlan], window: Window) -> Labels:
+def label_parcels(plans: Sequence[CellPlan], window: PixelWindow) -> Labels:
     """Return the parcel number (H, W) of every pixel: 1.. in the order of `plans`, 0 for none."""
     labels = np.zeros(window.shape, np.int32)
     number = 1
@@ -50,7 +48,9 @@ def label_parcels(plans: Sequence[CellPlan], window: Window) -> Labels:
     return labels
 
 
-def paint_parcels(labels: Labels, look: Looks, window: Window, seed: int, epoch: Epoch) -> Float32:
+def paint_parcels(
+    labels: Labels, look: Looks, window: PixelWindow, seed: int, epoch: Epoch
+) -> Float32:
     """Return the colour (H, W, 3) of the parcels with patches, grain, rows and lanes."""
     east, north = window.east_m, window.north_m
     soil = fractal_grid(key_of(seed, "soil"), east, north, (310.0, 140.0, 62.0, 28.0), 0.8)
@@ -84,7 +84,7 @@ def _soft_borders(rgb: Float32, labels: Labels) -> Float32:
     return rgb
 
 
-def _rows(labels: Labels, look: Looks, window: Window, wander: Float32) -> Float32:
+def _rows(labels: Labels, look: Looks, window: PixelWindow, wander: Float32) -> Float32:
     """Return the relative brightness (H, W) of rows and tractor lanes."""
     turn = look.row_turn[labels]
     across = turn[..., 0] * window.east_m[None, :] + turn[..., 1] * window.north_m[:, None]
@@ -101,10 +101,10 @@ def _rows(labels: Labels, look: Looks, window: Window, wander: Float32) -> Float
     return np.asarray(rows, np.float32)
 
 
-def paint_ways(
-    rgb: Float32, plans: Sequence[CellPlan], network: Network, window: Window, epoch: Epoch
+def paint_lines(
+    rgb: Float32, plans: Sequence[CellPlan], network: Network, window: PixelWindow, epoch: Epoch
 ) -> Mask:
-    """Draw borders, ways and water into `rgb` (H, W, 3); return where no wood can grow (H, W)."""
+    """Draw borders, roads and water into `rgb` (H, W, 3); return the mask without woods (H, W)."""
     seed = network.seed
     fine = fractal_grid(
         key_of(seed, "ways"), window.east_m, window.north_m, (21.0, 5.0, 2.3, 1.1, 0.5), 0.8
@@ -119,22 +119,22 @@ def paint_ways(
     open_ground = np.zeros(window.shape, np.uint8)
     verge = np.zeros(window.shape, np.uint8)
     for line in lines:
-        if line.way is not Way.NONE:
-            window.fill(verge, line.verge_m, 255 if line.way is not Way.STRIP else 190)
+        if line.kind is not LineKind.NONE:
+            window.fill(verge, line.verge_m, 255 if line.kind is not LineKind.STRIP else 190)
     _blend(rgb, verge, *grass)
-    _blend(rgb, _mask(window, lines, Way.NONE), grass[0] * 0.9, 0.17 * fine, 0.35)
-    track = _mask(window, lines, Way.TRACK)
-    _blend(rgb, track, np.array(_SURFACE_RGB[Way.TRACK], np.float32), 0.15 * fine, 0.85)
-    street = _mask(window, lines, Way.STREET)
-    _blend(rgb, street, np.array(_SURFACE_RGB[Way.STREET], np.float32), 0.08 * fine)
+    _blend(rgb, _mask(window, lines, LineKind.NONE), grass[0] * 0.9, 0.17 * fine, 0.35)
+    track = _mask(window, lines, LineKind.TRACK)
+    _blend(rgb, track, np.array(_SURFACE_RGB[LineKind.TRACK], np.float32), 0.15 * fine, 0.85)
+    street = _mask(window, lines, LineKind.STREET)
+    _blend(rgb, street, np.array(_SURFACE_RGB[LineKind.STREET], np.float32), 0.08 * fine)
     np.maximum(open_ground, street, out=open_ground)
     shore, water = _rivers(network, window, epoch.water_level_m)
     _paint_water(rgb, shore, water, window, seed, epoch)
     np.maximum(open_ground, track, out=open_ground)
     np.maximum(open_ground, shore, out=open_ground)
-    for way in (Way.MINOR, Way.MAIN):
-        road = _mask(window, lines, way)
-        _blend(rgb, road, np.array(_SURFACE_RGB[way], np.float32), 0.08 * fine)
+    for kind in (LineKind.MINOR, LineKind.MAIN):
+        road = _mask(window, lines, kind)
+        _blend(rgb, road, np.array(_SURFACE_RGB[kind], np.float32), 0.08 * fine)
         np.maximum(open_ground, road, out=open_ground)
     shore, water = _ponds(plans, window, epoch.water_level_m)
     _paint_water(rgb, shore, water, window, seed, epoch)
@@ -153,32 +153,32 @@ def _blend(rgb: Float32, mask: Mask, colour: Float32, tone: Float32, strength: f
     rgb[where] = old + alpha * (new - old)
 
 
-def _mask(window: Window, lines: Sequence[Line], way: Way) -> Mask:
+def _mask(window: PixelWindow, lines: Sequence[Line], kind: LineKind) -> Mask:
     """Return the cover (H, W), 0..255, of all surfaces of one kind."""
     mask = np.zeros(window.shape, np.uint8)
     for line in lines:
-        if line.way is way:
+        if line.kind is kind:
             window.fill(mask, line.surface_m, 255)
     return mask
 
 
-def _rivers(network: Network, window: Window, level_m: float) -> tuple[Mask, Mask]:
+def _rivers(network: Network, window: PixelWindow, level_m: float) -> tuple[Mask, Mask]:
     """Return the cover of river banks and of river water."""
     shore, water = np.zeros(window.shape, np.uint8), np.zeros(window.shape, np.uint8)
     west, south, east, north = window.bounds_m
     for line, half_m in network.rivers_in((west - 60.0, south - 60.0, east + 60.0, north + 60.0)):
         near = window.inside(line, 120.0)
-        # whole stretches of 300 m, so that what is drawn does not hang on the window's corner
-        keep = np.flatnonzero(np.convolve(near, np.ones(31), mode="same") > 0.0)
-        if len(keep) < 3:
+        # whole stretches of 300 m, so that the drawing is independent of the window
+        drawn = np.flatnonzero(np.convolve(near, np.ones(31), mode="same") > 0.0)
+        if len(drawn) < 3:
             continue
-        part = slice(int(keep[0]), int(keep[-1]) + 1)
+        part = slice(int(drawn[0]), int(drawn[-1]) + 1)
         window.fill(shore, ribbon(line[part], half_m[part] + 3.0), 255)
         window.fill(water, ribbon(line[part], half_m[part] + level_m), 255)
     return shore, water
 
 
-def _ponds(plans: Sequence[CellPlan], window: Window, level_m: float) -> tuple[Mask, Mask]:
+def _ponds(plans: Sequence[CellPlan], window: PixelWindow, level_m: float) -> tuple[Mask, Mask]:
     """Return the cover of pond shores and of pond water."""
     shore, water = np.zeros(window.shape, np.uint8), np.zeros(window.shape, np.uint8)
     for plan in plans:
@@ -192,7 +192,7 @@ def _ponds(plans: Sequence[CellPlan], window: Window, level_m: float) -> tuple[M
 
 
 def _paint_water(
-    rgb: Float32, shore: Mask, water: Mask, window: Window, seed: int, epoch: Epoch
+    rgb: Float32, shore: Mask, water: Mask, window: PixelWindow, seed: int, epoch: Epoch
 ) -> None:
     if not shore.any():
         return

@@ -1,4 +1,4 @@
-"""The ground to fly over: where imagery lies, and windows of it, mirrored beyond its border."""
+"""Imagery to fly over: its coverage, and windows of it, mirrored beyond its border."""
 
 import math
 from dataclasses import dataclass
@@ -12,11 +12,12 @@ from orthonav.geo.area import Area
 from orthonav.imagery.mosaic import Mosaic, SheetRaster
 
 COVERAGE_PX = 1024
+"""Size of the coverage mask; bounds its memory for any imagery."""
 Array = NDArray[np.float64]
 
 
 class Coverage:
-    """Which places the imagery covers, thinned to at most `COVERAGE_PX` pixels across."""
+    """Mask of the covered area, subsampled to at most `COVERAGE_PX` pixels across."""
 
     def __init__(self, mosaic: Mosaic, area: Area) -> None:
         self._west, south, east, self._north = area.extent_en_m
@@ -35,7 +36,7 @@ class Coverage:
             self._missing = ~raster.read(0, 0, width, height).valid
 
     def whole(self, corners_en_m: Array) -> bool:
-        """Whether imagery lies under all of the quadrilateral (4, 2)."""
+        """Whether imagery covers all of the quadrilateral (4, 2)."""
         x = (corners_en_m[:, 0] - self._west) / self._gsd_m
         y = (self._north - corners_en_m[:, 1]) / self._gsd_m
         height, width = self._missing.shape
@@ -51,9 +52,9 @@ class Coverage:
         return not (part & (inside > 0)).any()
 
     def box_en_m(self) -> tuple[float, float, float, float]:
-        """West, south, east, north of a box with imagery all over it.
+        """West, south, east, north of a box that is fully covered by imagery.
 
-        Raises `AreaError` where imagery is so scattered that none is found.
+        Raises `AreaError` if the imagery is too fragmented.
         """
         height, width = self._missing.shape
         left, top, right, bottom = 0, 0, width, height
@@ -65,10 +66,10 @@ class Coverage:
             worst = int(np.argmax([side.mean() for side in sides]))
             left, top = left + (worst == 0), top + (worst == 1)
             right, bottom = right - (worst == 2), bottom - (worst == 3)
-        # A pixel less on every side: what is thinned is not known to a pixel.
+        # One pixel less on every side, because the mask is subsampled.
         left, top, right, bottom = left + 1, top + 1, right - 1, bottom - 1
         if left >= right or top >= bottom:
-            raise AreaError("imagery has no part without holes to be mirrored beyond its border")
+            raise AreaError("imagery has no part without holes that could be mirrored (--beyond)")
         return (
             self._west + left * self._gsd_m,
             self._north - bottom * self._gsd_m,
@@ -78,11 +79,12 @@ class Coverage:
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
-    """Imagery in a plane, its north-west corner at `west_m, north_m`.
+class GroundImagery:
+    """Imagery in a local plane.
 
-    `mirror_px` is the box (left, top, right, bottom) that is mirrored at its sides to fill what is
-    not covered, None where nothing is filled.
+    `raster`: the resampled imagery. `west_m`, `north_m`: its north-west corner. `gsd_m`: metres per
+    pixel. `mirror_px`: box (left, top, right, bottom) that is mirrored at its sides to fill pixels
+    without imagery, None for no filling.
     """
 
     raster: SheetRaster
@@ -92,7 +94,7 @@ class Ground:
     mirror_px: tuple[int, int, int, int] | None = None
 
     def window(self, corners_en_m: Array, margin_px: int) -> tuple[NDArray[np.uint8], Array]:
-        """Pixels (H, W, 3) under the quadrilateral (4, 2) and the place of their corner (2,)."""
+        """Pixels (H, W, 3) under a quadrilateral (4, 2), and the position (2,) of their corner."""
         cols = (corners_en_m[:, 0] - self.west_m) / self.gsd_m
         rows = (self.north_m - corners_en_m[:, 1]) / self.gsd_m
         left, top = math.floor(cols.min()) - margin_px, math.floor(rows.min()) - margin_px
@@ -117,7 +119,7 @@ class Ground:
 
 
 def reflected(index: NDArray[np.int64], low: int, high: int) -> NDArray[np.int64]:
-    """Indices brought into low..high-1 by mirrors at both ends."""
+    """Indices reflected into low..high-1 at both ends."""
     size = high - low
     folded = (index - low) % (2 * size)
     return np.asarray(low + np.minimum(folded, 2 * size - 1 - folded))
