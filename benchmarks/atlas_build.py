@@ -1,7 +1,7 @@
 """Building an atlas: sheets and km2 per hour with one worker and with several, memory and size.
 
-Each build is the command line in a process of its own; workers are those of Ray on this machine,
-whose start is in the time.
+Each build is the command line in its own process. Workers are those of Ray on this machine; the
+time includes the start of Ray.
 """
 
 import json
@@ -22,14 +22,14 @@ from orthonav.imagery.mosaic import Mosaic
 
 SIDE_M, SHEET_KM = 6000, 1.9
 QUICK_SIDE_M, QUICK_SHEET_KM = 4000, 1.25
-"""Two whole sheets or more lie in a row of the area, wherever the lattice begins."""
+"""At least two whole sheets lie in a row of the area, wherever the lattice begins."""
 INNER = 0.98
-"""Share of the orthophoto's width that is surely covered, however it is turned."""
+"""Share of the orthophoto's width that is covered in spite of its rotation against the lattice."""
 NOTES = (
-    "1 m, 256 px tiles, 87.5 % overlap, coarse tiles, no index; larger sheets cost less: learning "
-    "the confidence takes as long for any",
+    "1 m, 256 px tiles, 87.5 % overlap, coarse tiles, no index; larger sheets cost less, because "
+    "learning the confidence takes as long for any size",
     "km2/h and sheets/h: of the whole command but for loading Python; CPU s and peak: of the "
-    "processes that build, the peak being the most that any of them ever had",
+    "building processes, the peak being the greatest of any of them",
 )
 
 
@@ -44,7 +44,7 @@ def measure(place: Workplace) -> Section:
     data = f"sheets of at most {sheet_km:g} km, 1 m"
     repeats = 1 if place.quick else 2
     rows = []
-    for name, options in _ways():
+    for name, options in _runners():
         runs = [_built(ortho, place.scratch / "atlas", [*area, *options]) for _ in range(repeats)]
         row = [name, str(runs[0]["built"]), number(runs[0]["area_km2"])]
         for key, unit in (
@@ -83,19 +83,19 @@ def _whole_row(ortho: Path, sheet_km: float) -> str:
     return ",".join(map(str, inner))
 
 
-def _ways() -> list[tuple[str, list[str]]]:
+def _runners() -> list[tuple[str, list[str]]]:
     cores = len(os.sched_getaffinity(0))
-    ways = [("1, in the process", []), ("1, Ray", ["--cluster", "local", "--workers", "1"])]
+    runners = [("1, in the process", []), ("1, Ray", ["--cluster", "local", "--workers", "1"])]
     if cores > 1:
-        ways.append((f"{cores}, Ray", ["--cluster", "local", "--workers", str(cores)]))
-    return ways
+        runners.append((f"{cores}, Ray", ["--cluster", "local", "--workers", str(cores)]))
+    return runners
 
 
 def _built(ortho: Path, atlas: Path, options: list[str]) -> dict[str, Any]:
-    """One build from nothing: its own account."""
+    """The summary of one build of a new atlas."""
     shutil.rmtree(atlas, ignore_errors=True)
-    command = [sys.executable, "-m", "orthonav", "build", "--atlas", str(atlas), "--json"]
+    command = [sys.executable, "-m", "orthonav", "atlas", "build", str(atlas), "--json"]
     command += ["--ortho", str(ortho), "--no-index", *options]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    told: dict[str, Any] = json.loads(done.stdout)
-    return told
+    summary: dict[str, Any] = json.loads(done.stdout)
+    return summary

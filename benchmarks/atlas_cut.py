@@ -1,10 +1,10 @@
 """A flight's map cut out of an atlas: 50 x 5 km at 1 m, its time, its memory, and the floor.
 
 `python -m benchmarks.atlas_cut [--quick] [--km 50] [--repeats 3] [--work DIR] [--out DIR]` builds
-one sheet of a generated landscape (kept in the work folder: a minute the first time), fills an
-atlas under the corridor with it, and cuts with 1 and 2 threads, each run in a process of its own.
-Every sheet of the atlas shows the same ground, in its own place: what is cut is as much work as
-from true sheets, but no place to fly.
+one sheet of a generated landscape (in the work folder: a minute the first time), fills an atlas
+under the corridor with copies of it, and cuts with 1 and 2 threads, each run in its own process.
+Every sheet of the atlas shows the same ground in another place: cutting is as much work as from
+real sheets, but the map is not one to fly.
 """
 
 import argparse
@@ -31,7 +31,7 @@ from benchmarks.corridor import BAND_M, GSD_M, LAMBERT, route_of
 from benchmarks.inputs import LANDSCAPE_SEED, PAST, generator_digest
 from benchmarks.record import Section, Table, number, provenance, save
 from orthonav import __version__
-from orthonav.atlas.catalog import Atlas, NewSheet
+from orthonav.atlas.catalog import Atlas, SheetDescription
 from orthonav.atlas.coverage import box_deg
 from orthonav.atlas.cut import cut_map
 from orthonav.atlas.recipe import AtlasRecipe
@@ -45,7 +45,7 @@ from orthonav.prepare.layer import CHUNK_PX, compressed_block
 
 SHEET_KM = 5.0
 WIDER = 1.03
-"""The sheet that is copied is a little larger than its box: boxes farther south are wider."""
+"""The copied sheet is larger than its box by this factor: boxes farther south are wider."""
 TARGET_S = 10.0
 LATLON = "EPSG:4326"
 
@@ -85,7 +85,7 @@ def _recipe() -> AtlasRecipe:
 
 
 def _base(work: Path) -> Path:
-    """The sheet that is copied: a generated square, with cells."""
+    """The sheet that is copied: a generated square."""
     work.mkdir(parents=True, exist_ok=True)
     out = work / f"sheet-{generator_digest()}-{__version__}.onav"
     if out.is_file():
@@ -104,7 +104,7 @@ def _base(work: Path) -> Path:
 
 
 def _box_around(lat: float, lon: float) -> Extent:
-    """As large as the box of the lattice there, and a little larger."""
+    """The box of the lattice there, widened by `WIDER`."""
     sheets = _recipe().sheets
     west, south, east, north = sheets.bounds_deg(sheets.name_at(lat, lon))
     width, height = WIDER * (east - west) / 2, WIDER * (north - south) / 2
@@ -112,7 +112,7 @@ def _box_around(lat: float, lon: float) -> Extent:
 
 
 def _filled(folder: Path, base: Path, km: float) -> Path:
-    """The folder of an atlas that has the sheet in all places under the corridor."""
+    """The folder of an atlas with the sheet in all places under the corridor."""
     if (folder / "complete").is_file():
         return folder
     shutil.rmtree(folder, ignore_errors=True)
@@ -123,7 +123,7 @@ def _filled(folder: Path, base: Path, km: float) -> Path:
         bounds = sheets.bounds_deg(name)
         if _near(area, bounds):
             moved = folder.parent / "moved.onav"
-            atlas.put(name, {"map": moved}, _moved(opened, name, bounds, moved))
+            atlas.put({"map": moved}, _moved(opened, name, bounds, moved))
             moved.unlink()
     (folder / "complete").touch()
     return folder
@@ -135,8 +135,8 @@ def _near(area: Area, bounds: Extent) -> bool:
     return bool(area.contains(middle[None], 1000 * SHEET_KM)[0])
 
 
-def _moved(opened: MapFile, name: str, bounds: Extent, out: Path) -> NewSheet:
-    """Write the map as if its middle were that of other bounds."""
+def _moved(opened: MapFile, name: str, bounds: Extent, out: Path) -> SheetDescription:
+    """Write the map moved to the middle of other bounds."""
     west, south, east, north = bounds
     sheet = opened.manifest.sheets[0]
     frame = LocalFrame((south + north) / 2, (west + east) / 2)
@@ -145,7 +145,7 @@ def _moved(opened: MapFile, name: str, bounds: Extent, out: Path) -> NewSheet:
     imagery = manifest.imagery
     dates = tuple(str(each["date"]) for each in imagery)
     made_by = {"orthonav": __version__}
-    return NewSheet(
+    return SheetDescription(
         name, bounds, GSD_M, sheet.tiles, sheet.area_km2, dates, imagery, "benchmark", made_by
     )
 
@@ -158,7 +158,7 @@ def _measured(folder: Path, base: Path, out: Path, km: float, repeats: int) -> S
         first = first or out.read_bytes()
         if out.read_bytes() != first:
             raise RuntimeError("maps of 1 and 2 threads differ")
-        told = runs[0]
+        first_run = runs[0]
         wall = section.add(f"{workers} threads: wall", "s", [r["wall_s"] for r in runs], data=data)
         cut = section.add(f"{workers} threads: cut", "s", [r["cut_s"] for r in runs], data=data)
         parts = [
@@ -168,9 +168,9 @@ def _measured(folder: Path, base: Path, out: Path, km: float, repeats: int) -> S
         rows.append(
             [
                 f"{workers}",
-                *(number(told["km2"]), number(wall.median), number(cut.median)),
+                *(number(first_run["km2"]), number(wall.median), number(cut.median)),
                 *map(number, parts),
-                *(number(told["peak_mb"]), number(told["map_mb"])),
+                *(number(first_run["peak_mb"]), number(first_run["map_mb"])),
                 "yes" if cut.median < TARGET_S else "NO",
             ]
         )
@@ -184,14 +184,14 @@ def _measured(folder: Path, base: Path, out: Path, km: float, repeats: int) -> S
         f"{size_mb:.0f} MB, every sheet a copy of one in its own place; median of {repeats} runs",
         "wall: the whole process, Python's start and imports included; the maps of all runs are "
         "the same byte for byte",
-        _floor(base, told["valid_mpx"]),
+        _floor(base, first_run["valid_mpx"]),
     )
     section.tables = [Table("Atlas cut", header, rows, notes)]
     return section
 
 
 def _floor(base: Path, mpx: float) -> str:
-    """What decoding, resampling and compressing so many million pixels take on one core."""
+    """Time to decode, resample and compress `mpx` million pixels on one core."""
     cv2.setNumThreads(1)
     layer = GreyLayer.of(open_map(base), cache_bytes=0)
     assert layer is not None
@@ -216,14 +216,14 @@ def _floor(base: Path, mpx: float) -> str:
 
 
 def _cut(folder: Path, out: Path, km: float, workers: int) -> dict[str, Any]:
-    """One cut in a fresh process, and what it tells of itself."""
+    """One cut in a new process, and its own figures."""
     out.unlink(missing_ok=True)
     start = time.perf_counter()
     command = [sys.executable, "-m", "benchmarks.atlas_cut", "--km", str(km), "--child"]
     command += [str(folder), str(out), str(workers)]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-    told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return told | {"wall_s": time.perf_counter() - start}
+    figures: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return figures | {"wall_s": time.perf_counter() - start}
 
 
 def _child(folder: Path, out: Path, workers: int) -> int:

@@ -1,11 +1,11 @@
-"""Vectors like those of an atlas's coarse tiles, as many as wanted, made block by block.
+"""Any number of vectors similar to those of an atlas's coarse tiles, made block by block.
 
-What was measured on NAIP and on a generated landscape (tiles of 128 px, an eighth apart): the
-components of whitened embeddings are normally distributed and of equal variance; the first are
-alike over several tiles, the last not even between neighbours; a view of another year agrees with
-its tile in the first components most. Each component is therefore a field of normal noise over a
-grid of tiles, smoothed by so much, and a vector is made of unit length. What is missing: places
-that repeat (plantations, housing estates), water, seams of imagery.
+Measured on NAIP and on a generated landscape (tiles of 128 px, an eighth apart): the components of
+whitened embeddings are normally distributed with equal variance; the first are correlated over
+several tiles, the last not even between neighbours; a view of another year agrees with its tile
+mostly in the first components. So each component is a field of normal noise over a grid of tiles,
+smoothed accordingly, and vectors are scaled to unit length. Not modelled: repeating places
+(plantations, housing estates), water, seams of imagery.
 """
 
 import math

@@ -1,10 +1,10 @@
-"""Lost in 2,500 km2: flights of five views from anywhere, heading unknown, atlas of another year.
+"""Flights without a prior in 2,500 km2: five views, heading unknown, atlas of another year.
 
-    python -m benchmarks.atlas_lost --work DIR [--trials 100] [--elsewhere 50]
+    python -m benchmarks.atlas_lost --work DIR [--trials 100] [--negatives 50]
 
-Makes the generated area at 8 m (40 minutes on one core), its atlas of 36 sheets and its index (10
-minutes), each once and kept in DIR; then flies. A second row flies over mirrored imagery, which is
-nowhere in the atlas: every fix of it is wrong.
+Generates the area at 8 m (40 minutes on one core), its atlas of 36 sheets and its index (10
+minutes), each once in DIR; then flies. A second row flies over mirrored imagery, which is not in
+the atlas: every fix of it is wrong.
 """
 
 import argparse
@@ -25,10 +25,10 @@ from pyproj import Transformer
 from benchmarks.record import Section, Table, number, provenance, save
 from orthonav.atlas.build import AtlasRequest, build_atlas
 from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.cluster import PlainRunner
-from orthonav.atlas.ground import Ground
-from orthonav.atlas.lookup import AtlasLookup
-from orthonav.atlas.lost import LostLocator
+from orthonav.atlas.cluster import SerialRunner
+from orthonav.atlas.locate import AtlasLocator
+from orthonav.atlas.sheet_registration import SheetRegistrar
+from orthonav.atlas.tile_search import TileSearch
 from orthonav.geo.camera import Camera
 from orthonav.geo.frames import distances_m
 from orthonav.records import CONFIDENT, Fix, Telemetry, View
@@ -39,18 +39,18 @@ PAST, PRESENT = DEFAULT_DATES[2], DEFAULT_DATES[0]
 RECIPE = {"gsd_m": GSD_M, "tile_px": 128, "sheet_km": 10.0}
 VIEWS, EVERY_S = 5, 15.0
 VIEW_PX, AGL_M = (160, 120), 1500.0
-"""Of a pixel of 8 m each: 1280 x 960 m."""
+"""Pixels of 8 m: a view shows 1280 x 960 m."""
 SPEEDS_MPS = (20.0, 60.0)
 AGL_STD, AGL_JITTER = 0.03, 0.01
 TURN_STD_RAD = 0.15
 EDGE_PX = 300
 RIGHT_M = 80.0
-"""Ten pixels, what the sheets' confidence speaks of."""
+"""Ten pixels: the radius of the sheets' confidence."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One view of one flight: error of its fix in m (NaN: none), confidence, time."""
+    """One view of one flight: error of its fix in m (NaN: no fix), confidence, time."""
 
     flight: int
     view: int
@@ -60,24 +60,24 @@ class Outcome:
 
 
 def prepared(work: Path) -> tuple[Path, Path]:
-    """The view year's orthophoto and the atlas of the other year, made where they are missing."""
+    """The orthophoto of the views and the atlas of the other year, made where they are missing."""
     for date in (PAST, PRESENT):
         if not (work / f"{date.name}.tif").is_file():
             _say(f"{date.name}: generating {SIDE_M / 1000:.0f} x {SIDE_M / 1000:.0f} km")
             generate_area(work, size_m=(SIDE_M, SIDE_M), gsd_m=GSD_M, dates=[date], seed=SEED)
     atlas = work / "atlas"
     request = AtlasRequest(str(atlas), [work / f"{PRESENT.name}.tif"], RECIPE)
-    with PlainRunner() as runner:
-        build_atlas(request, runner, tell=_say)
+    with SerialRunner() as runner:
+        build_atlas(request, runner, report=_say)
     return work / f"{PAST.name}.tif", atlas
 
 
 def flights(
     ortho: Path, count: int, seed: int, *, mirrored: bool
 ) -> Iterator[list[tuple[NDArray[np.uint8], Telemetry, tuple[float, float]]]]:
-    """Flights over an orthophoto: views (H, W), what is told of them, and where they were taken.
+    """Flights over an orthophoto: views (H, W), their telemetry, and where they were taken.
 
-    Of mirrored imagery the places are those of the mirror image, which are nowhere.
+    The places of mirrored imagery mean nothing.
     """
     with rasterio.open(ortho) as opened:
         colours, transform = opened.read([1, 2, 3]), opened.transform
@@ -114,15 +114,15 @@ def _cut(grey: NDArray[np.uint8], place: NDArray[np.float64], heading: float) ->
 
 
 def flown(ortho: Path, atlas: Path, count: int, seed: int, *, mirrored: bool) -> list[Outcome]:
-    """Every view of every flight, placed without a prior."""
+    """Locate every view of every flight without a prior."""
     width, height = VIEW_PX
     focal_px = AGL_M / GSD_M
     camera = Camera(width, height, focal_px, focal_px, width / 2, height / 2)
     outcomes = []
-    with AtlasLookup(Atlas.open(atlas)) as lookup:
-        ground = Ground(lookup.atlas)
+    with TileSearch(Atlas.open(atlas)) as search:
+        registrar = SheetRegistrar(search.atlas)
         for number_, flight in enumerate(flights(ortho, count, seed, mirrored=mirrored)):
-            locator = LostLocator(ground, lookup)
+            locator = AtlasLocator(registrar, search)
             for view, (grey, telemetry, truth) in enumerate(flight):
                 start = time.perf_counter()
                 outcome = locator.locate(View(grey, camera, telemetry))
@@ -133,11 +133,11 @@ def flown(ortho: Path, atlas: Path, count: int, seed: int, *, mirrored: bool) ->
                     error_m = math.inf if mirrored else float(distances_m([place], [truth])[0])
                     confidence = outcome.confidence
                 outcomes.append(Outcome(number_, view, error_m, confidence, latency_ms))
-            _say(f"flight {number_ + 1} of {count}: {_told(outcomes[-VIEWS:])}")
+            _say(f"flight {number_ + 1} of {count}: {_shown(outcomes[-VIEWS:])}")
     return outcomes
 
 
-def _told(views: list[Outcome]) -> str:
+def _shown(views: list[Outcome]) -> str:
     return " ".join(
         "-" if math.isnan(each.error_m) else f"{each.error_m:.0f}m({each.confidence:.2f})"
         for each in views
@@ -153,9 +153,9 @@ def row(name: str, outcomes: list[Outcome]) -> list[str]:
             first[each.flight] = each
     right = sum(each.error_m <= RIGHT_M for each in first.values())
     fixes = [each for each in outcomes if not math.isnan(each.error_m)]
-    sure = [each for each in fixes if each.confidence >= CONFIDENT]
-    wrong = sum(each.error_m > RIGHT_M for each in sure)
-    errors = [each.error_m for each in sure if each.error_m <= RIGHT_M]
+    confident = [each for each in fixes if each.confidence >= CONFIDENT]
+    wrong = sum(each.error_m > RIGHT_M for each in confident)
+    errors = [each.error_m for each in confident if each.error_m <= RIGHT_M]
     views = [each.view + 1 for each in first.values() if each.error_m <= RIGHT_M]
     latency = [each.latency_ms for each in outcomes]
     return [
@@ -163,7 +163,7 @@ def row(name: str, outcomes: list[Outcome]) -> list[str]:
         str(len(trials)),
         f"{right} ({right / len(trials):.0%})",
         number(float(np.median(views))) if views else "-",
-        f"{wrong} of {len(sure)}",
+        f"{wrong} of {len(confident)}",
         f"{sum(each.error_m > RIGHT_M for each in fixes)} of {len(fixes)}",
         number(float(np.median(errors))) if errors else "-",
         f"{np.median(latency) / 1e3:.1f} ({np.quantile(latency, 0.9) / 1e3:.1f})",
@@ -175,7 +175,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.atlas_lost", description=__doc__)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--trials", type=int, default=100)
-    parser.add_argument("--elsewhere", type=int, default=50)
+    parser.add_argument("--negatives", type=int, default=50)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("bench_results"))
     options = parser.parse_args()
@@ -184,18 +184,18 @@ def main() -> int:
     ortho, atlas = prepared(options.work)
     found = flown(ortho, atlas, options.trials, options.seed, mirrored=False)
     rows = [row("another year", found)]
-    if options.elsewhere:
-        elsewhere = flown(ortho, atlas, options.elsewhere, options.seed + 1, mirrored=True)
-        rows.append(row("elsewhere (mirrored)", elsewhere))
-        found += elsewhere
-    section = Section("Lost in 2,500 km2")
+    if options.negatives:
+        negatives = flown(ortho, atlas, options.negatives, options.seed + 1, mirrored=True)
+        rows.append(row("negatives (mirrored)", negatives))
+        found += negatives
+    section = Section("Without a prior in 2,500 km2")
     section.tables.append(
         Table(
             f"{VIEWS} views {EVERY_S:.0f} s apart, {VIEW_PX[0]} x {VIEW_PX[1]} px of {GSD_M:g} m, "
             "any place, heading unknown, atlas of another year",
             (
-                *("views of", "flights", "right when first sure", "at view (median)"),
-                *("sure and wrong", "all fixes wrong", "error m (median)", "s a view (p90)"),
+                *("views of", "flights", "right when first confident", "at view (median)"),
+                *("confident and wrong", "all fixes wrong", "error m (median)", "s a view (p90)"),
             ),
             rows,
             (

@@ -1,7 +1,7 @@
 """Search among 10^5 to 10^8 vectors on one core: recall against exact search, time and memory.
 
-`python -m benchmarks.atlas_search --count 1e7 --work DIR` builds an index there (or uses the one
-that is there) and measures it, each setting in a process of its own.
+`python -m benchmarks.atlas_search --count 1e7 --work DIR` builds an index in DIR, or uses the one
+that is there, and measures it, each setting in its own process.
 """
 
 import argparse
@@ -11,36 +11,46 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.atlas_fields import Fields, drawn_ids
 from benchmarks.inputs import Workplace
 from benchmarks.record import Section, Table, number, provenance
-from orthonav.atlas.shards import TRAINED_NAME, ShardWriter
+from orthonav.atlas.index_manifest import Part, ShardInfo
+from orthonav.atlas.index_shards import write_shard
+from orthonav.atlas.quantizers import (
+    MAX_TRAINING_VECTORS,
+    QUANTIZERS_NAME,
+    VectorRecipe,
+    faiss,
+    train,
+)
 from orthonav.atlas.vector_search import ShardedIndex
-from orthonav.atlas.vectors import MAX_LEARNT, VectorRecipe, faiss, train
 
 QUERIES = 500
 K = 10
 RERANK = 1000
+EXACT_ROWS = 16_384
 SHARES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)
 COUNTS = (100_000, 1_000_000)
 PREPARED = (10_000_000, 100_000_000)
 TARGETS = {10_000_000: (0.98, 10.0, 1.0), 100_000_000: (0.95, 30.0, 6.0)}
-"""Of a count: recall@10, median ms and GB of memory."""
+"""Target recall@10, median ms and GB of memory by number of vectors."""
 ABOUT, TRUTH = "about.txt", "truth.npz"
 
 
 @dataclass(frozen=True)
 class Found:
-    """What one setting found: `place` is the share of views whose own tile is among the best 10.
+    """The result of one setting: `place` is the share of views whose own tile is among the best 10.
 
-    `cpu_ms` is the median of processor time, which other processes on the machine hardly change.
+    `cpu_ms` is the median processor time, on which other processes have little influence.
     """
 
     probes: int
@@ -59,41 +69,84 @@ class Found:
 
 
 def build(folder: Path, count: int, recipe: VectorRecipe, fields: Fields, shards: int) -> None:
-    """Write an index of `count` vectors, queries and what exact search finds for them."""
+    """Write an index of `count` vectors, queries, and the result of exact search."""
     folder.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
-    sample = fields.sample(count, MAX_LEARNT)
+    sample = fields.sample(count, MAX_TRAINING_VECTORS)
     made_s = time.perf_counter() - start
-    trained = train(sample, recipe)
-    trained.save(folder / TRAINED_NAME)
+    quantizers = train(sample, recipe)
+    quantizers.save(folder / QUANTIZERS_NAME)
     spent = {"train_s": time.perf_counter() - start - made_s, "make_s": made_s, "write_s": 0.0}
-    edges = [count * number // shards for number in range(shards + 1)]
-    blocks = fields.blocks(count)
-    rest = np.empty((0, fields.dims), dtype=np.float32)
-    for shard in range(shards):
-        left = edges[shard + 1] - edges[shard]
-        start = time.perf_counter()
-        with ShardWriter(folder, f"shard{shard:03}", trained, edges[shard]) as writer:
-            while left:
-                if len(rest) == 0:
-                    began = time.perf_counter()
-                    rest = next(blocks)
-                    spent["make_s"] += time.perf_counter() - began
-                    start += time.perf_counter() - began
-                writer.add(rest[:left])
-                left, rest = left - len(rest[:left]), rest[left:]
-        spent["write_s"] += time.perf_counter() - start
+    source = _Pieces(fields, count)
+    start = time.perf_counter()
+    for info in shard_infos(count, shards):
+        places_deg = np.zeros((info.rows, 2))
+        write_shard(folder, info.name, quantizers, places_deg, source.take(info.rows))
+    spent["write_s"] = time.perf_counter() - start - source.made_s
+    spent["make_s"] += source.made_s
     bytes_on_disk = sum(path.stat().st_size for path in folder.iterdir())
     drawn = drawn_ids(count, QUERIES, fields.seed)
     queries = np.concatenate([fields.queries(block, ids) for block, ids in drawn])
     start = time.perf_counter()
-    scores, ids = ShardedIndex.open(folder).exact(queries, K)
+    scores, ids = exact_search(folder, shard_infos(count, shards), queries, K)
     spent["exact_s"] = time.perf_counter() - start
     own = np.concatenate([ids for _, ids in drawn])
     np.savez(folder / TRUTH, queries=queries, ids=ids, scores=scores, own=own)
     about = {"count": count, "shards": shards, "fields": asdict(fields), "recipe": asdict(recipe)}
-    told = json.dumps({**about, "disk_bytes": bytes_on_disk, **spent})
-    (folder / ABOUT).write_text(told + "\n", encoding="utf-8")
+    text = json.dumps({**about, "disk_bytes": bytes_on_disk, **spent})
+    (folder / ABOUT).write_text(text + "\n", encoding="utf-8")
+
+
+def shard_infos(count: int, shards: int) -> list[ShardInfo]:
+    """Shards of about the same size that together hold `count` vectors."""
+    edges = [count * number // shards for number in range(shards + 1)]
+    return [
+        ShardInfo(f"shard{number:03}", first, (Part("synthetic", "", end - first),))
+        for number, (first, end) in enumerate(pairwise(edges))
+    ]
+
+
+class _Pieces:
+    """Vectors in pieces of any size; `made_s` is the time that making them took."""
+
+    def __init__(self, fields: Fields, count: int) -> None:
+        self._blocks = fields.blocks(count)
+        self._rest = np.empty((0, fields.dims), dtype=np.float32)
+        self.made_s = 0.0
+
+    def take(self, rows: int) -> Iterator[NDArray[np.float32]]:
+        """The next `rows` vectors."""
+        while rows:
+            if len(self._rest) == 0:
+                start = time.perf_counter()
+                self._rest = next(self._blocks)
+                self.made_s += time.perf_counter() - start
+            piece, self._rest = self._rest[:rows], self._rest[rows:]
+            rows -= len(piece)
+            yield piece
+
+
+def exact_search(
+    folder: Path, shards: Sequence[ShardInfo], queries: NDArray[np.float32], k: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Highest products and ids (Q, k), best first, by comparing all stored vectors."""
+    scores = np.full((len(queries), k), -np.inf, dtype=np.float32)
+    ids = np.full((len(queries), k), -1, dtype=np.int64)
+    for info in shards:
+        vectors = np.load(folder / f"{info.name}.vectors.npy", mmap_mode="r")
+        for first in range(0, len(vectors), EXACT_ROWS):
+            block = vectors[first : first + EXACT_ROWS].astype(np.float32)
+            products = np.concatenate([scores, queries @ block.T], axis=1)
+            numbers = np.broadcast_to(
+                np.arange(len(block)) + info.base + first, (len(queries), len(block))
+            )
+            order = np.argpartition(-products, k - 1, axis=1)[:, :k]
+            order = np.take_along_axis(
+                order, np.argsort(-np.take_along_axis(products, order, 1), axis=1), axis=1
+            )
+            scores = np.take_along_axis(products, order, axis=1)
+            ids = np.take_along_axis(np.concatenate([ids, numbers], axis=1), order, axis=1)
+    return scores, ids
 
 
 def find(folder: Path, probes: int, rerank: int) -> Found:
@@ -104,7 +157,8 @@ def find(folder: Path, probes: int, rerank: int) -> Found:
     truth = np.load(folder / TRUTH)
     queries, exact, own = truth["queries"], truth["ids"], truth["own"]
     start = time.perf_counter()
-    index = ShardedIndex.open(folder)
+    about = _about(folder)
+    index = ShardedIndex(folder, shard_infos(about["count"], about["shards"]))
     open_ms = (time.perf_counter() - start) * 1e3
     for query in queries[:20]:
         index.search(query[None], K, probes, rerank)
@@ -145,16 +199,16 @@ def settings(folder: Path, shares: Sequence[float], reranks: Sequence[int]) -> l
             command = [sys.executable, "-m", "benchmarks.atlas_search", "--child", str(folder)]
             command += ["--probes", probes, "--rerank", str(rerank)]
             environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-            said = subprocess.run(
+            child = subprocess.run(
                 command, check=True, capture_output=True, text=True, env=environment
             )
-            found.append(Found(**json.loads(said.stdout)))
-            print(said.stdout.strip(), file=sys.stderr, flush=True)
+            found.append(Found(**json.loads(child.stdout)))
+            print(child.stdout.strip(), file=sys.stderr, flush=True)
     return found
 
 
 def table(folder: Path, found: Sequence[Found]) -> Table:
-    """The settings of an index beside each other."""
+    """The settings of an index as a table."""
     about = _about(folder)
     header = ["lists scanned", "re-ranked", "recall@1", "recall@10", "own tile (exact)"]
     header += ["median ms", "p90", "CPU ms", "ms in batches of 45", "peak MB"]
@@ -239,7 +293,9 @@ def _status_mb(name: str) -> float:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.atlas_search", description=__doc__)
     parser.add_argument("--count", type=float, default=1e5)
-    parser.add_argument("--work", type=Path, help="folder of the index, kept; default: removed")
+    parser.add_argument(
+        "--work", type=Path, help="folder of the index, not removed (default: a temporary one)"
+    )
     parser.add_argument("--dims", type=int, default=Fields.dims)
     parser.add_argument("--power", type=float, default=Fields.power)
     parser.add_argument("--list-bits", type=int)
@@ -268,9 +324,9 @@ def main() -> None:
             build(folder, count, recipe, fields, options.shards)
         found = settings(folder, options.shares, options.rerank)
         print(table(folder, found).markdown())
-        told = {**provenance("atlas-search"), **_about(folder), "found": [*map(asdict, found)]}
+        figures = {**provenance("atlas-search"), **_about(folder), "found": [*map(asdict, found)]}
         out = folder / "figures.txt" if options.work else Path(f"vectors-{count}-figures.json")
-        out.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+        out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     finally:
         if options.work is None:
             shutil.rmtree(folder, ignore_errors=True)

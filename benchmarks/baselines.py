@@ -80,7 +80,7 @@ class Reference:
         """The view as orthonav would rectify it, under the told heading and turns from it."""
         yaw_deg = view.telemetry.yaw_deg
         smaller = downsampled(view, self.localizer.grid.gsd_m)
-        return [self.localizer.rectified(smaller, yaw_deg + turn) for turn in turns_deg]
+        return [self.localizer.tiles.rectified(smaller, yaw_deg + turn) for turn in turns_deg]
 
     def place_en_m(self, col_px: float, row_px: float) -> NDArray[np.float64]:
         """Where a pixel coordinate (outer corner of the first pixel: 0, 0) lies in the sheet."""

@@ -1,9 +1,9 @@
 """`python -m benchmarks.install`: what flies, installed afresh; can a small board have it?
 
 Installs `orthonav[autopilot]` from this checkout into an environment of its own, which is removed
-afterwards, says what that takes and proves that nothing heavy came along. Then asks the package
-index for wheels of the same versions for 64-bit ARM: nothing would have to be compiled there. Needs
-the index, so no test runs it.
+afterwards, lists what each package takes on disk and to download, and proves that nothing heavy
+came along. Then asks the package index for wheels of the same versions for 64-bit ARM: nothing
+would have to be compiled there. Needs the index, so no test runs it.
 """
 
 import argparse
@@ -16,6 +16,7 @@ import tempfile
 import time
 import tomllib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -35,13 +36,32 @@ LOADED = ("orthonav.cli.flying", "orthonav.onboard.fly", "orthonav.onboard.log")
 TOLD = """
 import importlib, importlib.util, json, sys
 from importlib import metadata
-size = lambda d: sum(p.stat().st_size for f in d.files or () if (p := f.locate()).is_file())
-found = [[d.metadata["Name"], d.version, size(d)] for d in metadata.distributions()]
+def size(d, end=""):
+    files = [f.locate() for f in d.files or () if str(f).endswith(end)]
+    return sum(p.stat().st_size for p in files if p.is_file())
+found = [
+    {"name": d.metadata["Name"], "version": d.version, "bytes": size(d), "pyc": size(d, ".pyc")}
+    for d in metadata.distributions()
+]
 for name in sys.argv[1].split(","):
     importlib.import_module(name)
 absent = {name: importlib.util.find_spec(name) is None for name in sys.argv[2].split(",")}
 print(json.dumps({"found": found, "absent": absent}))
 """
+
+
+@dataclass(frozen=True)
+class Package:
+    """An installed package: `bytes` on disk, `pyc` of them compiled bytecode, `wheel` to download.
+
+    `pyc` is not installed by `pip install --no-compile`.
+    """
+
+    name: str
+    version: str
+    bytes: int
+    pyc: int
+    wheel: int
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -56,15 +76,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     section = Section("Installing what flies")
     with tempfile.TemporaryDirectory(prefix="orthonav-install-") as folder:
         told = _installed(Path(folder))
-    packages = sorted(
-        ((name, version, size / 1e6) for name, version, size in told["found"]),
-        key=lambda package: -package[2],
-    )
+    packages = sorted((Package(**found) for found in told["found"]), key=lambda one: -one.bytes)
     wheels = {
-        (name, python): _wheel(name, version, python)
-        for name, version, _ in packages
+        (package.name, python): _wheel(package.name, package.version, python)
+        for package in packages
         for python in options.python
-        if _plain(name) != "orthonav"
+        if _plain(package.name) != "orthonav"
     }
     present = [name for name, absent in told["absent"].items() if not absent]
     section.tables = [_table(section, packages, wheels, options.python, present)]
@@ -76,21 +93,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _installed(folder: Path) -> dict[str, Any]:
-    """Packages with their sizes and what is absent, of a fresh environment."""
+    """Fields of `Package` and what is absent, of a fresh environment."""
     source, environment = folder / "source", folder / "environment"
     source.mkdir()
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "PYPI.md", "LICENSE"):
         shutil.copyfile(ROOT / name, source / name)
     shutil.copytree(ROOT / "src" / "orthonav", source / "src" / "orthonav")  # nothing is built here
     _run(sys.executable, "-m", "venv", "--without-pip", str(environment))
     python = environment / "bin" / "python"
     pip = [sys.executable, "-m", "pip", "--python", str(python), "--disable-pip-version-check"]
+    wheels = ["--find-links", str(folder / "wheels")]
     constraints = ["-c", str(ROOT / "constraints.txt")]
-    _run(*pip, "install", "--quiet", *constraints, f"{source}[{EXTRA}]")
+    _run(*pip, "wheel", "--quiet", *constraints, "-w", wheels[1], f"{source}[{EXTRA}]")
+    _run(*pip, "install", "--quiet", "--no-index", *wheels, f"orthonav[{EXTRA}]")
     _run(str(environment / "bin" / "orthonav"), "fly", "--help")
     told: dict[str, Any] = json.loads(
         _run(str(python), "-c", TOLD, ",".join(LOADED), ",".join(ABSENT))
     )
+    downloads = {
+        _plain(path.name.split("-")[0]): path.stat().st_size
+        for path in (folder / "wheels").iterdir()
+    }
+    for found in told["found"]:
+        found["wheel"] = downloads[_plain(found["name"])]
     return told
 
 
@@ -119,31 +144,57 @@ def _wheel(name: str, version: str, python: str) -> str | None:
 
 def _table(
     section: Section,
-    packages: Sequence[tuple[str, str, float]],
+    packages: Sequence[Package],
     wheels: dict[tuple[str, str], str | None],
     pythons: Sequence[str],
     present: Sequence[str],
 ) -> Table:
+    core = {_plain(name) for name in closure(["orthonav"])}
     rows = []
-    for name, version, size_mb in packages:
-        section.add(f"{name} {version}", "MB", [size_mb], data="site-packages")
-        found = [wheels.get((name, python), "this checkout") for python in pythons]
-        rows.append([name, version, number(size_mb), *(_kind(wheel) for wheel in found)])
-    total_mb = sum(size_mb for *_, size_mb in packages)
-    section.add("all", "MB", [total_mb], data="site-packages")
-    section.facts = {"install_mb": total_mb}
-    rows.append(["**all**", str(len(packages)), number(total_mb), *("" for _ in pythons)])
-    header = ("package", "version", "MB", *(f"ARM, Python {python}" for python in pythons))
+    for package in packages:
+        section.add(
+            f"{package.name} {package.version}", "MB", [package.bytes / 1e6], data="site-packages"
+        )
+        found = [wheels.get((package.name, python), "this checkout") for python in pythons]
+        of = "core" if _plain(package.name) in core else EXTRA
+        kinds = (_kind(wheel) for wheel in found)
+        rows.append([package.name, package.version, of, *_sizes([package]), *kinds])
+    own = [package for package in packages if _plain(package.name) in core]
+    for name, some in (("core", own), ("all", list(packages))):
+        section.add(name, "MB", [sum(each.bytes for each in some) / 1e6], data="site-packages")
+        rows.append([f"**{name}**", str(len(some)), "", *_sizes(some), *("" for _ in pythons)])
+    section.facts = {
+        "install_mb": sum(each.bytes for each in packages) / 1e6,
+        "core_mb": sum(each.bytes for each in own) / 1e6,
+        "bytecode_mb": sum(each.pyc for each in packages) / 1e6,
+    }
+    arm = (f"ARM, Python {python}" for python in pythons)
+    header = ("package", "version", "part", "MB", "bytecode, MB", "wheel, MB", *arm)
+    return Table("Installing what flies", header, rows, _notes(wheels, present))
+
+
+def _sizes(packages: Sequence[Package]) -> list[str]:
+    """On disk, of that bytecode, and to download, in MB."""
+    totals = (
+        sum(each.bytes for each in packages),
+        sum(each.pyc for each in packages),
+        sum(each.wheel for each in packages),
+    )
+    return [number(total / 1e6) for total in totals]
+
+
+def _notes(
+    wheels: dict[tuple[str, str], str | None], present: Sequence[str]
+) -> tuple[str, str, str]:
     missing = sorted({name for (name, _), wheel in wheels.items() if wheel is None})
     heavy = f"PRESENT: {', '.join(present)}" if present else f"absent: {', '.join(ABSENT)}"
-    notes = (
+    return (
         f"`pip install orthonav[{EXTRA}]` from this checkout into an empty environment, versions "
-        "of constraints.txt, compiled .pyc included; no pip, no setuptools",
+        "of constraints.txt; bytecode is compiled by pip, not with `--no-compile`; no pip",
         f"{heavy}; {', '.join(LOADED)} load without them",
         "ARM: the wheel of the same version that pip takes on aarch64 Linux with glibc 2.28; "
         + (f"NONE for {', '.join(missing)}" if missing else "every package has one"),
     )
-    return Table("Installing what flies", header, rows, notes)
 
 
 def _kind(wheel: str | None) -> str:

@@ -170,7 +170,7 @@ def _flown(work: Path, plan: Plan, localizer: Localizer, ortho: Path) -> Path:
             route=Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True))),
             agl_m=AGL_M,
             spacing_m=SPACING_M,
-            speed_mps=SPEED_MPS,
+            airspeed_mps=SPEED_MPS,
             camera=CAMERA,
             errors=errors,
             seed=seed,

@@ -73,7 +73,7 @@ def rendered(place: Workplace, ortho: Path, frame: LocalFrame, lap: LoopedFlight
             route=Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True))),
             agl_m=AGL_M,
             spacing_m=SPEED_MPS / lap.rate_hz,
-            speed_mps=SPEED_MPS,
+            airspeed_mps=SPEED_MPS,
             camera=lap.camera,
             errors=ERRORS,
             seed=FLIGHT_SEED,

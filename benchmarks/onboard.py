@@ -38,15 +38,15 @@ class Scene:
 
     def arguments(self, name: str, camera: Path, port: int) -> list[str]:
         """A command line as on an aircraft, but for the pictures, which come from a folder."""
-        files = {"--json": "lines.jsonl", "--log": "log.mcap", "--state": "state.json"}
-        made = [str(self.map_path), "--camera", str(camera), "--file-clock", "autopilot"]
+        files = {"--jsonl": "lines.jsonl", "--log": "log.mcap", "--state": "state.json"}
+        made = [str(self.map_path), str(camera), "--file-clock", "autopilot"]
         made += ["--autopilot", f"udpin:{port}", "--log-views", "thumbnails"]
         for option, file in files.items():
             made += [option, str(self.scratch / f"{name}-{file}")]
         return made
 
     def lines(self, name: str) -> Path:
-        """What the program wrote with `--json`."""
+        """What the program wrote with `--jsonl`."""
         return self.scratch / f"{name}-lines.jsonl"
 
 

@@ -274,7 +274,7 @@ class Lines:
 
     @classmethod
     def read(cls, path: Path) -> "Lines":
-        """The file of `--json`; a line that was cut off by a kill is left out."""
+        """The file of `--jsonl`; a line that was cut off by a kill is left out."""
         ages, sent, health = [], [], {}
         reasons: Counter[str] = Counter()
         for text in path.read_text("ascii").splitlines() if path.is_file() else ():

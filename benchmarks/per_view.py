@@ -13,8 +13,8 @@ from benchmarks.machine import timed
 from benchmarks.record import Section, Table, timing_cells
 from orthonav.flight.folder import read_image
 from orthonav.localizer import Localizer
-from orthonav.localizer.localizer import UNKNOWN_HEADING_STEP_DEG
 from orthonav.localizer.rectify import downsampled
+from orthonav.localizer.tiles import UNKNOWN_HEADING_STEP_DEG
 from orthonav.mapfile import open_map
 
 REPEATS = 3
@@ -49,7 +49,7 @@ def measure(place: Workplace) -> Section:
     for view in flight.views:
         for _ in range(REPEATS):
             _once(localizer, whole, view, times_s)
-    tiles = len(localizer.centres_en_m)
+    tiles = len(localizer.tiles.centres_en_m)
     data = f"generated {side_m / 1000:g} x {side_m / 1000:g} km, {tiles} tiles"
     rows = []
     for key, text in STAGES.items():
@@ -87,12 +87,14 @@ def _once(
     smaller = stage("thin", downsampled, view, localizer.grid.gsd_m)
     queries = []
     for turn_deg in (-6.0, 0.0, 6.0):
-        seen = stage("rectify", localizer.rectified, smaller, view.telemetry.yaw_deg + turn_deg)
-        maps = stage("represent", localizer.representation, seen.grey, seen.valid)
-        queries.append(stage("embed", localizer.embedder.view, maps, seen.valid))
+        seen = stage(
+            "rectify", localizer.tiles.rectified, smaller, view.telemetry.yaw_deg + turn_deg
+        )
+        maps = stage("represent", localizer.tiles.representation, seen.grey, seen.valid)
+        queries.append(stage("embed", localizer.tiles.embedder.view, maps, seen.valid))
     stacked = np.stack(queries)
-    stage("search", localizer.index.scores, stacked)
-    stage("match", localizer.match, stacked)
+    stage("search", localizer.tiles.matcher.index.scores, stacked)
+    stage("match", localizer.tiles.matcher.match, stacked)
     stage("locate", localizer.locate, view)
     if len(times_s["unknown"]) * REPEATS < len(times_s["locate"]):
         unknown = partial(localizer.locate, heading_known=False)

@@ -96,7 +96,7 @@ def _watched(account: _Account) -> Iterator[_Account]:
 
     clocked = [
         (locate, "prepared", lambda *a, **k: "rectify"),
-        (locate, "_searched", lambda *a, **k: f"search, level {a[3] if len(a) > 3 else '?'}"),
+        (locate, "_searched", lambda *a, **k: f"search, level {a[3].level}"),
         (registrar.Registrar, "judged", lambda *a, **k: VERIFY),
         (registrar.Registrar, "finished", lambda *a, **k: VERIFY),
         (registrar.Registrar, "deepened", lambda *a, **k: VERIFY),

@@ -89,7 +89,7 @@ def _dense_embeddings(ortho: Path, map_path: Path, count: int) -> NDArray[np.flo
     with mosaic.grid_sheet(sheet.frame, grid) as raster:
         pixels = raster.read(0, 0, grid.width_px, grid.height_px)
     layout = CellLayout.for_tiles(tile_px, grid.stride_px)
-    representation = localizer.representation
+    representation = localizer.tiles.representation
     cells = CellSheet(layout, grid.height_px, grid.width_px, representation.channels)
     cells.fill(0, 0, representation(pixels.grey, pixels.valid), pixels.valid)
     tiles = np.indices((grid.rows, grid.cols)).reshape(2, -1).T.astype(np.intp)
@@ -97,5 +97,5 @@ def _dense_embeddings(ortho: Path, map_path: Path, count: int) -> NDArray[np.flo
     taken = np.sort(rng.permutation(len(tiles))[:count])
     if len(taken) < count:
         raise RuntimeError(f"area holds {len(taken)} tiles, {count} are needed: {ortho}")
-    assert isinstance(localizer.embedder, WhitenedEmbedder)
-    return localizer.embedder.tiles(cells, tiles[taken] * grid.stride_px)
+    assert isinstance(localizer.tiles.embedder, WhitenedEmbedder)
+    return localizer.tiles.embedder.tiles(cells, tiles[taken] * grid.stride_px)

@@ -95,8 +95,8 @@ def soak(place: Workplace, minutes: float, pace: float) -> Soaked:
     views, scratch = round(minutes * 60 * RATE_HZ), place.scratch
     folder = played(lap, scratch / "flight", views, lead_s=LEAD_S * pace)
     lines = scratch / "lines.jsonl"
-    command = [str(map_path), "--camera", str(folder), "--file-clock", "autopilot"]
-    command += ["--pace", str(pace), "--autopilot", f"udpin:{port}", "--json", str(lines)]
+    command = [str(map_path), str(folder), "--file-clock", "autopilot"]
+    command += ["--pace", str(pace), "--autopilot", f"udpin:{port}", "--jsonl", str(lines)]
     command += ["--log", str(scratch / "log.mcap"), "--log-views", "thumbnails"]
     command += ["--log-max-mb", str(LOG_MB), "--state", str(scratch / "state.json")]
     with on_core(cores.other), FakeAutopilot(folder, port, cores.other, pace) as fake_autopilot:

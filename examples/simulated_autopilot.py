@@ -4,11 +4,11 @@
 
 beside
 
-    orthonav fly area.onav --camera flight --file-clock autopilot --autopilot udpin:14550
+    orthonav fly area.onav flight --file-clock autopilot --autopilot udpin:14550
 
 It answers TIMESYNC, sends HEARTBEAT, ATTITUDE, DISTANCE_SENSOR and LOCAL_POSITION_NED over UDP, and
-compares the positions it gets with the truth of the folder, where that is there. Its clock begins
-at 0 where the times of the folder do. Needs pymavlink.
+compares the positions that it receives with the truth of the folder, if there is one. Its clock is
+0 at the start of the folder. Needs pymavlink.
 """
 
 import argparse
@@ -40,35 +40,35 @@ class Autopilot:
 
     def __init__(self, folder, address, pace, rate_hz):
         names = ("time_s", "yaw_deg", "pitch_deg", "roll_deg", "agl_m", "vel_east_mps")
-        self.told = read(folder / "telemetry.csv", (*names, "vel_north_mps"))
+        self.telemetry = read(folder / "telemetry.csv", (*names, "vel_north_mps"))
         truth = folder / "truth.csv"
         self.truth = read(truth, ("lat_deg", "lon_deg")) if truth.is_file() else None
-        self.yaw_rad = np.unwrap(np.radians(self.told["yaw_deg"]))
+        self.yaw_rad = np.unwrap(np.radians(self.telemetry["yaw_deg"]))
         self.pace, self.interval_s = pace, 1 / rate_hz
         self.mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         self.mav.robust_parsing = True
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setblocking(False)
         self.address, self.begin_s = address, None
-        self.got = []
+        self.received = []
 
     def boot_s(self):
-        """Seconds since it was switched on."""
+        """Seconds since boot."""
         return time.monotonic() - self.begin_s
 
     def send(self, message):
-        """One datagram."""
+        """Send one message."""
         with contextlib.suppress(ConnectionRefusedError):  # orthonav is not up yet
             self.socket.sendto(message.pack(self.mav), self.address)
         self.mav.seq = (self.mav.seq + 1) % 256
 
     def at(self, name, when_s):
-        """A column at a time of the folder."""
-        column = self.yaw_rad if name == "yaw_rad" else self.told[name]
-        return float(np.interp(when_s, self.told["time_s"], column))
+        """Value of a column at a time of the folder."""
+        column = self.yaw_rad if name == "yaw_rad" else self.telemetry[name]
+        return float(np.interp(when_s, self.telemetry["time_s"], column))
 
-    def tell(self):
-        """Telemetry of now."""
+    def send_telemetry(self):
+        """Send the telemetry of the current time."""
         boot_s = self.boot_s()
         when_s, boot_ms = boot_s * self.pace, round(boot_s * 1000)
         pitch, roll = (math.radians(self.at(n, when_s)) for n in ("pitch_deg", "roll_deg"))
@@ -79,12 +79,12 @@ class Autopilot:
         self.send(
             mavlink.MAVLink_distance_sensor_message(boot_ms, 1, 65_535, distance, 0, 0, 25, 255)
         )
-        if "vel_east_mps" in self.told:
+        if "vel_east_mps" in self.telemetry:
             north, east = self.at("vel_north_mps", when_s), self.at("vel_east_mps", when_s)
             self.send(mavlink.MAVLink_local_position_ned_message(boot_ms, 0, 0, 0, north, east, 0))
 
     def listen(self):
-        """Whatever has come."""
+        """Read all available messages."""
         while True:
             try:
                 data = self.socket.recv(65_536)
@@ -94,7 +94,7 @@ class Autopilot:
                 self.take(message)
 
     def take(self, message):
-        """One message of orthonav."""
+        """Handle one message of orthonav."""
         kind = message.get_type()
         if kind == "TIMESYNC" and message.tc1 == 0:
             boot_ns = round(self.boot_s() * 1e9)
@@ -105,30 +105,30 @@ class Autopilot:
             age_s = getattr(message, "processing_time", 0) / 1e6
             exposed_s = (self.boot_s() - age_s) * self.pace
             off_m = self.error_m(message.lat * 1e-7, message.lon * 1e-7, exposed_s)
-            self.got.append((self.boot_s(), age_s, off_m))
+            self.received.append((self.boot_s(), age_s, off_m))
             print(f"{self.boot_s():8.2f} s  {kind} {off_m:6.1f} m off, {age_s * 1e3:4.0f} ms old")
 
     def error_m(self, lat_deg, lon_deg, when_s):
-        """From the truth at a time, NaN without one."""
+        """Distance from the truth at a time; NaN without truth."""
         if self.truth is None:
             return math.nan
-        times = self.told["time_s"]
+        times = self.telemetry["time_s"]
         north = lat_deg - np.interp(when_s, times, self.truth["lat_deg"])
         east = lon_deg - np.interp(when_s, times, self.truth["lon_deg"])
         east *= math.cos(math.radians(lat_deg))
         return float(np.hypot(north, east) * math.radians(EARTH_M))
 
     def fly(self, tail_s):
-        """Until the folder ends."""
+        """Run until the folder ends."""
         self.begin_s, due_s, beat_s = time.monotonic(), 0.0, 0.0
-        end_s = float(self.told["time_s"][-1]) / self.pace + tail_s
+        end_s = float(self.telemetry["time_s"][-1]) / self.pace + tail_s
         while self.boot_s() < end_s:
             if self.boot_s() >= beat_s:
                 beat_s += 1.0
                 self.send(mavlink.MAVLink_heartbeat_message(1, 12, 0, 0, 4, 3))
             if self.boot_s() >= due_s:
                 due_s += self.interval_s
-                self.tell()
+                self.send_telemetry()
             self.listen()
             time.sleep(0.002)
 
@@ -138,23 +138,25 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("flight", type=Path)
     parser.add_argument("--url", default="127.0.0.1:14550", help="where orthonav listens")
-    parser.add_argument("--pace", type=float, default=1.0, help="as that of orthonav fly")
+    parser.add_argument("--pace", type=float, default=1.0, help="--pace of orthonav fly")
     parser.add_argument("--rate-hz", type=float, default=50.0, help="of the attitude")
-    parser.add_argument("--tail-s", type=float, default=2.0, help="how long to stay on after")
-    parser.add_argument("--json", type=Path, help="seconds, age and error of what was got")
+    parser.add_argument(
+        "--tail-s", type=float, default=2.0, help="time to continue after the end (s)"
+    )
+    parser.add_argument("--json", type=Path, help="write time, age and error of positions")
     options = parser.parse_args()
     host, _, port = options.url.rpartition(":")
     autopilot = Autopilot(options.flight, (host, int(port)), options.pace, options.rate_hz)
     autopilot.fly(options.tail_s)
-    if autopilot.got:
-        _, ages_s, errors_m = np.array(autopilot.got).T
+    if autopilot.received:
+        _, ages_s, errors_m = np.array(autopilot.received).T
         print(
             f"{len(ages_s)} positions; age p50 {np.percentile(ages_s, 50) * 1e3:.0f} ms, "
             f"p99 {np.percentile(ages_s, 99) * 1e3:.0f} ms; "
             f"error p50 {np.nanmedian(errors_m):.1f} m, largest {np.nanmax(errors_m):.1f} m"
         )
     if options.json:
-        options.json.write_text(json.dumps(autopilot.got), encoding="utf-8")
+        options.json.write_text(json.dumps(autopilot.received), encoding="utf-8")
 
 
 if __name__ == "__main__":

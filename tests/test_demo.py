@@ -1,4 +1,4 @@
-"""The demo tells the whole story and leaves a report that needs nothing else."""
+"""The demo runs all steps and leaves self-contained reports."""
 
 import functools
 import json
@@ -22,8 +22,8 @@ def small_demo(area, monkeypatch):
         return [folder / area.past.name, folder / area.present.name]
 
     monkeypatch.setattr(landscape, "generate_area", generate)
-    turns = tuple((east * 0.45, north * 0.35) for east, north in demo.TURNS_EN_M)
-    monkeypatch.setattr(demo, "TURNS_EN_M", turns)
+    turns = tuple((east * 0.45, north * 0.35) for east, north in demo.WAYPOINTS_EN_M)
+    monkeypatch.setattr(demo, "WAYPOINTS_EN_M", turns)
     monkeypatch.setattr(demo, "SPACING_M", 80.0)
     monkeypatch.setattr(demo, "CHECK_EFFORT", 0.05)
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 48)
@@ -37,7 +37,7 @@ def test_the_demo(small_demo, tmp_path, capsys, names_in):
     assert main(["demo", "--out", str(out)]) == 0
     told = capsys.readouterr()
     assert f"{out}/report/index.html" in told.out and "5/5" in told.err
-    assert f"{out}/check/index.html" in told.out and "expected to be placed" in told.out
+    assert f"{out}/check/index.html" in told.out and "expected to give a correct" in told.out
     assert json.loads((out / "check" / "check.json").read_text())["route"]["name"] == "demo"
     names = [name for name in names_in(out) if not name.startswith(("flight/", "."))]
     assert {"area.onav", "demo.json", "check", "fixes.jsonl", "flight", "report"} <= set(names)

@@ -25,7 +25,7 @@ from orthonav.flight import open_flight
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import SingleViews, localize_flight
-from orthonav.publish.jsonl import result_to_json
+from orthonav.flight.fixes import result_to_json
 
 map_path, flight_path = map(pathlib.Path, sys.argv[1:])
 flight = open_flight(flight_path)

@@ -125,19 +125,19 @@ def test_a_large_area_is_cut_into_sheets(run, camera, tmp_path):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["--route", "paper:B@46.6,1.9"], "--gsd-m), or with what"),
+        (["--route", "paper:B@46.6,1.9"], "resolution of the map is unknown"),
         (["--route", "none.kml", "--gsd-m", 1], "does not exist: none.kml"),
         (["--bounds", "1,46,2,47", "--gsd-m", 1, "--band-m", 5], "need a route"),
         (["--bounds", "1,46,2,47", "--gsd-m", 0], "ground resolution must be above 0"),
         (["--bounds", "2,46,1,47", "--gsd-m", 1], "west < east"),
-        (["--route", "TABLE", "--gsd-m", 1], "width of its search band"),
-        (["--route", "TABLE", "--band-m", 99, "--camera", "CAMERA"], "needs the height above"),
+        (["--route", "TABLE", "--gsd-m", 1], "no search band"),
+        (["--route", "TABLE", "--band-m", 99, "--camera", "CAMERA"], "needs a height above"),
         (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--speed-mps", 0], "speed must be above"),
         (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--dem", "none.tif"], "none.tif"),
-        (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--dem", "DEM"], "beside the terrain"),
+        (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--dem", "DEM"], "outside the terrain"),
     ],
 )
-def test_what_cannot_be_planned_is_told(run, table, camera, dem, arguments, message):
+def test_impossible_plans_are_refused(run, table, camera, dem, arguments, message):
     files = {"TABLE": table, "CAMERA": camera, "DEM": dem}
     done = run("plan", *(files.get(argument, argument) for argument in arguments))
     assert done.code == 1 and message in done.err and done.out == ""

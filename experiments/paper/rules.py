@@ -26,12 +26,12 @@ def compared(
     truths_en_m: list[NDArray[np.float64]],
 ) -> dict[str, list[float]]:
     """Errors in m of views, by "similarity rule"; the same embeddings serve all."""
-    gsd_m = localizer.grid.gsd_m
+    placer, gsd_m = localizer.tiles, localizer.grid.gsd_m
     queries = []
     for view in views:
         smaller = downsampled(view, gsd_m)
-        queries.append(localizer.embedded([localizer.rectified(smaller, view.telemetry.yaw_deg)]))
-    centres = localizer.centres_en_m
+        queries.append(placer.embedded([placer.rectified(smaller, view.telemetry.yaw_deg)]))
+    centres = placer.centres_en_m
     tiles = opened.array("sheet0/embeddings", np.float16, 2)
     made = {}
     for similarity in SIMILARITIES:

@@ -171,7 +171,7 @@ def _placed(
     seen = dict(placements(scene, localizer, setting.views))
     for name, grounds in seen.items():
         told["views"][name] = [locate(ground) for ground in grounds]
-        told["chance"][name] = _chance(grounds, localizer.centres_en_m)
+        told["chance"][name] = _chance(grounds, localizer.tiles.centres_en_m)
     told["view_ms"] = statistics.median(times_ms)
     if scene.name == SWEPT_ON:
         count = min(setting.swept, len(seen["grid"]))
@@ -187,7 +187,7 @@ def placements(
     scene: Scene, localizer: Localizer, count: int
 ) -> Iterator[tuple[str, list[views.Ground]]]:
     """Views on the grid and anywhere, at the same places but for where they are snapped to."""
-    centres = localizer.centres_en_m
+    centres = localizer.tiles.centres_en_m
     anywhere = views.places_en_m(centres, count)
     places = {"grid": views.on_grid(anywhere, centres), "anywhere": anywhere}
     for name in views.PLACEMENTS:

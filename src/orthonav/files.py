@@ -10,6 +10,13 @@ from pathlib import Path
 
 from orthonav.errors import MissingFileError, OutputError
 
+Progress = Callable[[str, float], None]
+"""Receives the stage of a long task and the share of it that is done, 0 to 1."""
+
+
+def no_progress(stage: str, share: float) -> None:
+    """Progress that nobody watches."""
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:

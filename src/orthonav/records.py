@@ -1,4 +1,4 @@
-"""The values that cross borders between parts: telemetry, prior, fix, no fix."""
+"""The records that packages exchange: telemetry, view, prior, fix, no fix."""
 
 import math
 from collections.abc import Mapping
@@ -13,15 +13,31 @@ from orthonav.geo.camera import Camera
 CONFIDENT = 0.9
 """A fix of at least this confidence counts as confident: the default of publishing and reports."""
 
+PRIOR_SIGMAS = 3.0
+"""A prior position limits the search to so many of its standard deviations: 1.1 % of a round
+Gaussian lies outside."""
+DEFAULT_YAW_STD_DEG = 7.0
+"""Standard deviation of a reported heading that comes without one: magnetic compasses of the
+recorded flights are off by several degrees (docs/tracking.md)."""
+MIN_YAW_STD_DEG = 2.0
+"""Least deviation of a reported heading that searches allow for."""
+TILE_YAW_STD_DEG = 5.0
+"""The same default where views are placed by their tiles alone. It differs on purpose: 5 deg make
+three headings 6 deg apart, which is what docs/decisions/embedding.md measured; 7 deg would make
+five, and change every figure of the embedding alone."""
+DEFAULT_AGL_STD = 0.08
+"""Standard deviation of a reported height that comes without one, over the height."""
+
 Evidence = Mapping[str, float]
-"""Named numbers that say why a fix should be believed or not; see `docs/reference/formats.md`."""
+"""Named numbers behind the confidence of a fix; see `docs/reference/formats.md`."""
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of the position before looking: a round Gaussian.
+    """The position expected before a search: a round Gaussian.
 
-    `std_m` is the standard deviation per axis in metres; search is cut off at three of them.
+    `lat_deg`, `lon_deg`: its mean, WGS 84. `std_m`: standard deviation per axis, m, 0 or more; the
+    search ends at `PRIOR_SIGMAS` of them.
     """
 
     lat_deg: float
@@ -31,27 +47,30 @@ class Prior:
 
 @dataclass(frozen=True)
 class Telemetry:
-    """What the autopilot knew at the exposure of one view.
-
-    `time_ns` is the time of exposure; `yaw_deg` the heading of the top of the image, clockwise from
-    true north; `pitch_deg` and `roll_deg` are 0, 0 where the optical axis points straight down
-    (positive pitch looks ahead, positive roll looks left); `agl_m` is the height above ground.
-    NaN stands for "not known". Velocities are over ground, true east and north.
-    The `_std` ones are standard deviations of what is told, from view to view, None where not
-    known: `tilt_std_deg` of pitch and of roll, `vel_std_mps` per axis.
-    """
+    """What the autopilot reported for the exposure of one view. NaN and None stand for unknown."""
 
     time_ns: int
+    """Time of exposure, ns."""
     yaw_deg: float
+    """Heading of the top of the picture, clockwise from true north."""
     pitch_deg: float
+    """0 where the optical axis points straight down; positive looks ahead."""
     roll_deg: float
+    """0 where the optical axis points straight down; positive looks left."""
     agl_m: float
+    """Height above ground, above 0."""
     yaw_std_deg: float | None = None
+    """Standard deviation of the heading from view to view; `DEFAULT_YAW_STD_DEG` where None."""
     agl_std_m: float | None = None
+    """The same of the height; `DEFAULT_AGL_STD` of the height where None."""
     prior: Prior | None = None
+    """Expected position."""
     vel_en_mps: tuple[float, float] | None = None
+    """Velocity over ground since the view before, true east and north."""
     tilt_std_deg: float | None = None
+    """Standard deviation of pitch and of roll from view to view; see `orthonav.track.Model`."""
     vel_std_mps: float | None = None
+    """Standard deviation of the velocity per axis; see `orthonav.localizer.tracker`."""
 
     def missing(self) -> list[str]:
         """Names of the fields without which a view cannot be rectified, empty if all are there."""
@@ -80,10 +99,12 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Fix:
-    """Where a view was taken, and how sure that is.
+    """The position from which a view was taken, with its uncertainty.
 
-    `cov_en_m2` is the (2, 2) covariance of east and north in m2; `confidence` the probability that
-    the error is below `radius_m`; `heading_deg` and `agl_m` are the values the position rests on.
+    `lat_deg`, `lon_deg`: WGS 84. `cov_en_m2` (2, 2): covariance of east and north, m2, of a correct
+    fix. `confidence`: probability that the error is below `radius_m`, 0..1, NaN where the map was
+    not calibrated. `heading_deg` (0..360) and `agl_m`: estimated, or as reported where the method
+    does not estimate them. `evidence`: the numbers behind the confidence.
     """
 
     lat_deg: float
@@ -111,10 +132,11 @@ class NoFix:
 
 @dataclass(frozen=True, eq=False)
 class ViewResult:
-    """What came out for one view of a flight: a line of `fixes.jsonl`.
+    """The result for one view of a flight: a line of `fixes.jsonl`.
 
-    `state` is that of the track (`searching`, `tracking`, `lost`), None where views are placed one
-    by one.
+    `frame`: name of the view. `time_ns`: its exposure. `outcome`: the fix, or why there is none.
+    `latency_ms`: time from picture to outcome, NaN where it was not processed. `state`: of the
+    track (`searching`, `tracking`, `lost`), None where views are placed one by one.
     """
 
     frame: str

@@ -1,4 +1,4 @@
-"""Views agree where an aircraft can have flown; one alone is never enough."""
+"""Views agree on places that an aircraft can have flown through; one view is never enough."""
 
 import math
 
@@ -7,10 +7,10 @@ import pytest
 
 from orthonav.atlas.agreement import (
     CHANCE,
-    FORGOTTEN_NATS,
+    MAX_CHAIN_LOG_ODDS,
     MIN_VIEWS,
     Agreement,
-    Seen,
+    PlaceEvidence,
 )
 from orthonav.geo.frames import LocalFrame
 
@@ -20,13 +20,13 @@ SIDE_M = 1000.0
 
 def seen(east_m, north_m, log_odds, key=0, turn_deg=90.0, log_scale=0.0):
     lat, lon = FRAME.latlon_from_en([east_m, north_m])
-    return Seen(float(lat), float(lon), math.radians(turn_deg), log_scale, log_odds, key)
+    return PlaceEvidence(float(lat), float(lon), math.radians(turn_deg), log_scale, log_odds, key)
 
 
 def flown(*views, every_s=20.0, chance=CHANCE):
     agreement = Agreement()
     for number, places in enumerate(views):
-        agreement.see(places, round(number * every_s * 1e9), SIDE_M, chance)
+        agreement.add_view(places, round(number * every_s * 1e9), SIDE_M, chance)
     return agreement
 
 
@@ -37,20 +37,20 @@ def test_nothing_is_known_at_first():
     assert not agreement.agreed
 
 
-def test_one_view_alone_is_no_fix_however_sure():
+def test_one_view_alone_is_never_a_fix():
     agreement = flown([seen(0, 0, 50.0)])
     assert not agreement.agreed
     assert agreement.best is not None and agreement.best.views == 1.0
 
 
-def test_two_views_of_new_ground_that_fit_are_one():
+def test_two_consistent_views_of_new_ground_agree():
     agreement = flown([seen(0, 0, 2.0)], [seen(900, 0, 2.0)])
     assert agreement.agreed
     assert agreement.probability > 0.9
     assert agreement.best.views >= MIN_VIEWS
 
 
-def test_two_unlikely_views_that_fit_say_more_than_each():
+def test_two_consistent_weak_views_are_stronger_than_each():
     apart = flown([seen(0, 0, -1.0)], [seen(50_000, 0, -1.0)])
     together = flown([seen(0, 0, -1.0)], [seen(900, 0, -1.0)])
     assert together.probability > apart.probability + 0.2
@@ -65,7 +65,7 @@ def test_two_unlikely_views_that_fit_say_more_than_each():
     ],
     ids=["too far", "other scale"],
 )
-def test_what_cannot_be_flown_does_not_agree(second):
+def test_places_that_cannot_be_reached_do_not_agree(second):
     assert not flown([seen(0, 0, 4.0)], [second]).agreed
 
 
@@ -74,32 +74,32 @@ def test_a_heading_that_cannot_have_turned_so_far_does_not_agree():
     assert not agreement.agreed
 
 
-def test_hovering_proves_nothing_however_long():
+def test_hovering_is_no_evidence():
     hovering = flown(*([seen(0, 0, 3.0)] for _ in range(100)), every_s=0.2)
     assert hovering.best.views == 1.0
     assert not hovering.agreed
 
 
-def test_circling_over_the_same_ground_proves_nothing_more():
+def test_circling_over_the_same_ground_adds_no_evidence():
     circle = [seen(300 * np.cos(a), 300 * np.sin(a), 3.0) for a in np.arange(0, 60, 0.5)]
     once, often = flown(*([s] for s in circle[:13])), flown(*([s] for s in circle))
     assert often.best.views <= once.best.views + 0.35
 
 
-def test_views_that_speak_against_it_do_not_carry_a_track_on():
+def test_contradicting_views_do_not_extend_a_chain():
     rng = np.random.default_rng(3)
     agreement = flown(*([seen(100 * k, 0, 5.0)] for k in range(30)), every_s=4.0)
     assert agreement.agreed
     for k in range(30, 50):
         place = rng.uniform(-200, 200, 2) + np.array([100.0 * k, 0.0])
-        agreement.see([seen(*place, -3.0)], round(k * 4e9), SIDE_M, 1.0)
+        agreement.add_view([seen(*place, -3.0)], round(k * 4e9), SIDE_M, 1.0)
         assert not agreement.agreed
 
 
-def test_a_view_that_says_little_where_it_was_expected_is_not_sure():
+def test_a_weak_view_at_the_expected_place_lowers_confidence():
     agreement = flown(*([seen(100 * k, 0, 5.0)] for k in range(30)), every_s=4.0)
     assert agreement.confidence > 0.9
-    agreement.see([seen(3000, 0, 0.3)], round(120e9), SIDE_M, 1.0)
+    agreement.add_view([seen(3000, 0, 0.3)], round(120e9), SIDE_M, 1.0)
     assert agreement.confidence < 0.7
 
 
@@ -107,31 +107,31 @@ def test_a_view_that_says_little_where_it_was_expected_is_not_sure():
 def test_no_gap_is_bridged_blindly(time_s):
     agreement = flown(*([seen(900 * k, 0, 5.0)] for k in range(5)))
     assert agreement.agreed
-    agreement.see([seen(4500, 0, 5.0)], round(time_s * 1e9), SIDE_M, CHANCE)
+    agreement.add_view([seen(4500, 0, 5.0)], round(time_s * 1e9), SIDE_M, CHANCE)
     assert not agreement.agreed
     assert agreement.best.views == 1.0
 
 
 def test_views_at_the_same_time_do_not_make_a_velocity():
     agreement = flown([seen(0, 0, 3.0)], [seen(40, 0, 3.0)], every_s=1e-9)
-    assert all(each.velocity_en_mps is None for each in agreement.hypotheses)
+    assert all(each.velocity_en_mps is None for each in agreement.chains)
 
 
 def test_an_aircraft_that_turned_back_is_found_again_two_views_later():
     agreement = flown([seen(0, 0, 5.0)], [seen(600, 0, 5.0)], every_s=20.0)
-    agreement.see([seen(300, 600, 5.0, turn_deg=270.0)], round(40e9), SIDE_M, CHANCE)
-    agreement.see([seen(-300, 600, 5.0, turn_deg=270.0)], round(60e9), SIDE_M, CHANCE)
-    agreement.see([seen(-900, 600, 5.0, turn_deg=270.0)], round(80e9), SIDE_M, CHANCE)
+    agreement.add_view([seen(300, 600, 5.0, turn_deg=270.0)], round(40e9), SIDE_M, CHANCE)
+    agreement.add_view([seen(-300, 600, 5.0, turn_deg=270.0)], round(60e9), SIDE_M, CHANCE)
+    agreement.add_view([seen(-900, 600, 5.0, turn_deg=270.0)], round(80e9), SIDE_M, CHANCE)
     assert agreement.agreed
 
 
-def test_places_that_fit_no_more_than_chance_do_not_add_up():
+def test_places_found_by_chance_do_not_add_up():
     alone = flown([seen(0, 0, -2.0)])
     again = flown([seen(0, 0, -2.0)], [seen(900, 0, -2.0)], chance=1.0)
     assert again.probability < alone.probability + 0.05
 
 
-def test_a_view_elsewhere_costs_the_hypothesis_and_is_no_fix():
+def test_a_view_of_another_place_costs_the_chain_and_is_no_fix():
     before = flown([seen(0, 0, 3.0)], [seen(900, 0, 3.0)])
     after = flown([seen(0, 0, 3.0)], [seen(900, 0, 3.0)], [seen(40_000, 9_000, 3.0)])
     assert before.agreed
@@ -139,31 +139,31 @@ def test_a_view_elsewhere_costs_the_hypothesis_and_is_no_fix():
     assert after.probability < before.probability
 
 
-def test_a_view_that_shows_nothing_is_no_fix_but_forgets_nothing():
+def test_a_view_without_a_match_is_no_fix_and_keeps_the_chains():
     agreement = flown([seen(0, 0, 3.0)], [seen(900, 0, 3.0)], [])
     assert not agreement.agreed
-    agreement.see([seen(2700, 0, 3.0)], round(60e9), SIDE_M, CHANCE)
+    agreement.add_view([seen(2700, 0, 3.0)], round(60e9), SIDE_M, CHANCE)
     assert agreement.agreed
 
 
-def test_what_was_long_believed_is_given_up_after_some_views():
+def test_a_long_chain_is_given_up_after_some_views():
     views = [[seen(800 * number, 0, 5.0)] for number in range(20)]
-    elsewhere = [[seen(60_000 + 800 * number, 30_000, 5.0)] for number in range(8)]
-    agreement = flown(*views, *elsewhere)
+    other_place = [[seen(60_000 + 800 * number, 30_000, 5.0)] for number in range(8)]
+    agreement = flown(*views, *other_place)
     assert agreement.agreed
     there = FRAME.en_from_latlon(agreement.best.last.lat_deg, agreement.best.last.lon_deg)
     assert np.hypot(*(there - [60_000 + 800 * 7, 30_000])) < 10
-    assert max(each.log_odds for each in agreement.hypotheses) <= FORGOTTEN_NATS + 1e-9
+    assert max(each.log_odds for each in agreement.chains) <= MAX_CHAIN_LOG_ODDS + 1e-9
 
 
-def test_speed_is_learnt_and_expected():
+def test_the_next_place_is_expected_from_the_velocity():
     agreement = flown([seen(0, 0, 3.0)], [seen(900, 0, 3.0)])
     lat, lon = agreement.best.expected(round(40e9))
     assert FRAME.en_from_latlon(lat, lon) == pytest.approx([1800, 0], abs=2)
     assert agreement.best.reach_m(round(40e9)) < 720
 
 
-def test_hypotheses_stay_few():
+def test_the_number_of_chains_is_bounded():
     rng = np.random.default_rng(1)
     crowd = [[seen(*rng.uniform(-40_000, 40_000, 2), -2.0, key) for key in range(40)]] * 3
-    assert len(flown(*crowd).hypotheses) <= 12
+    assert len(flown(*crowd).chains) <= 12

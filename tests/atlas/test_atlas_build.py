@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from orthonav.atlas import build as building
-from orthonav.atlas import scratch, tasks
+from orthonav.atlas import scratch
+from orthonav.atlas import sheet_tasks as tasks
 from orthonav.atlas.build import AtlasRequest, build_atlas, build_sheet
 from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.cluster import PlainRunner
+from orthonav.atlas.cluster import SerialRunner
 from orthonav.atlas.coarse import read_coarse
 from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
-from orthonav.atlas.tasks import Imagery, plan_sheets, request_digest, versions
+from orthonav.atlas.sheet_tasks import Imagery, plan_sheets, request_digest, versions
 from orthonav.errors import AreaError, AtlasError, StorageError, WorkerError
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
@@ -60,7 +61,7 @@ def built(ortho, tmp_path_factory):
 
 def made(place, *orthos, **request):
     request = {"recipe": SMALL, "index": False, **request}
-    with PlainRunner() as runner:
+    with SerialRunner() as runner:
         return build_atlas(AtlasRequest(str(place), orthos, **request), runner)
 
 
@@ -86,44 +87,45 @@ def test_an_atlas_holds_a_map_and_coarse_tiles_for_each_sheet(built, ortho):
         assert coarse.recipe == COARSE and len(coarse.valid) > 0
         assert sheet.dates == ("2019-06",) and sheet.made_by == versions()
         assert sheet.imagery == mosaic.describe()
-    assert result.tiles == sum(sheet.tiles for sheet in sheets.values())
-    assert result.size_bytes == sum(sheet.size_bytes for sheet in sheets.values())
-    assert result.cpu_s > 0 and result.peak_bytes > 10**7
-    told = result.to_plain(cpu_hour_price=36.0)
-    assert told["cost"] == pytest.approx(result.core_s / 100, abs=1e-4)
-    assert told["sheets_per_hour"] > 0 and told["mb_per_km2"] > 0
+    plain = result.to_plain(cpu_hour_price=36.0)
+    assert plain["tiles"] == sum(sheet.tiles for sheet in sheets.values())
+    size_bytes = sum(sheet.size_bytes for sheet in sheets.values())
+    assert plain["size_mb"] == pytest.approx(size_bytes / 1e6, abs=1e-4)
+    assert plain["cpu_s"] > 0 and plain["peak_mb"] > 10
+    assert plain["cost"] == pytest.approx(plain["core_s"] / 100, abs=1e-3)
+    assert plain["sheets_per_hour"] > 0 and plain["mb_per_km2"] > 0
 
 
-def test_nothing_in_an_atlas_tells_where_or_when_it_was_made(built, ortho, tmp_path):
+def test_an_atlas_does_not_depend_on_place_and_time_of_building(built, ortho, tmp_path):
     place, _ = built
-    elsewhere = tmp_path / "other place" / ortho.name
-    elsewhere.parent.mkdir()
-    shutil.copy2(ortho, elsewhere)
-    made(tmp_path / "again", elsewhere)
+    other_place = tmp_path / "other place" / ortho.name
+    other_place.parent.mkdir()
+    shutil.copy2(ortho, other_place)
+    made(tmp_path / "again", other_place)
     assert content(tmp_path / "again") == content(place)
     assert not any(str(ortho.parent).encode() in data for data in content(place).values())
 
 
-def test_what_is_there_is_kept_and_what_is_not_is_built(built, ortho, tmp_path):
+def test_present_sheets_are_unchanged_and_missing_ones_are_built(built, ortho, tmp_path):
     place = Path(shutil.copytree(built[0], tmp_path / "atlas"))
     again = made(place, ortho)
-    assert (again.built, again.kept) == ((), built[1].built) and again.is_complete
+    assert (again.built, again.unchanged) == ((), built[1].built) and again.is_complete
     assert again.to_plain()["mb_per_km2"] is None
     lost = sorted((place / "items").iterdir())[1]
     lost.unlink()
     again = made(place, ortho)
-    assert again.built == (lost.name.partition(".")[0],) and len(again.kept) == COUNT - 1
+    assert again.built == (lost.name.partition(".")[0],) and len(again.unchanged) == COUNT - 1
     assert content(place) == content(built[0])
 
 
-def test_an_interrupt_keeps_what_is_finished(built, ortho, tmp_path):
+def test_an_interrupt_keeps_finished_sheets(built, ortho, tmp_path):
     place = tmp_path / "atlas"
 
     def progress(stage, share):
         if share >= 0.5:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt), PlainRunner() as runner:
+    with pytest.raises(KeyboardInterrupt), SerialRunner() as runner:
         build_atlas(AtlasRequest(str(place), [ortho], SMALL, index=False), runner, progress)
     assert len(Atlas.open(place).sheets()) == COUNT / 2
     assert len(made(place, ortho).built) == COUNT / 2
@@ -136,9 +138,11 @@ def test_sheets_made_otherwise_are_refused_or_replaced(built, make_ortho, ortho,
     changed.write_bytes(ortho.read_bytes())
     os.utime(changed, (1e9, 1e9))
     before = content(place)
-    with pytest.raises(AtlasError, match=r"8 of 8 sheets .*imagery has changed.*--replace") as told:
+    with pytest.raises(
+        AtlasError, match=r"8 of 8 sheets .*imagery has changed.*--replace"
+    ) as caught:
         made(place, changed)
-    assert built[1].built[0] in str(told.value) and content(place) == before
+    assert built[1].built[0] in str(caught.value) and content(place) == before
     result = made(place, changed, replace=True)
     assert len(result.built) == COUNT
     assert {sheet.revision for sheet in Atlas.open(place).sheets().values()} == {2}
@@ -147,16 +151,16 @@ def test_sheets_made_otherwise_are_refused_or_replaced(built, make_ortho, ortho,
     assert [n for n in after if n.startswith("sheets")] == [
         n for n in before if n.startswith("sheets")
     ]
-    assert made(place, changed, replace=True).kept == result.built
+    assert made(place, changed, replace=True).unchanged == result.built
 
 
-def test_other_recipes_are_refused_by_what_differs(built, ortho):
+def test_other_recipes_are_refused_with_the_differences(built, ortho):
     before = content(built[0])
     with pytest.raises(AtlasError, match=r"tile_px: 64, not 96"):
         made(built[0], ortho, recipe={"tile_px": 96})
     with pytest.raises(AtlasError, match=r"coarse: .*'overlap': 0.5.*, not .*0.75"):
         made(built[0], ortho, recipe={"coarse": {"overlap": 0.75}})
-    assert made(built[0], ortho, recipe={}).kept == built[1].built, "an atlas knows its own"
+    assert made(built[0], ortho, recipe={}).unchanged == built[1].built, "an atlas knows its own"
     assert content(built[0]) == before
 
 
@@ -187,7 +191,7 @@ def test_other_versions_are_refused(ortho, tmp_path):
     with pytest.raises(WorkerError, match=rf"numpy {np.__version__}, not 1.0"):
         build_sheet(other)
 
-    class Mixed(PlainRunner):
+    class Mixed(SerialRunner):
         def everywhere(self, probe):
             return [("here", probe()), ("node-7", {**probe(), "gdal": "3.1"})]
 
@@ -226,16 +230,16 @@ def test_a_sheet_that_fails_is_named_and_the_others_are_built(
     monkeypatch.setattr(shutil, "copyfile", copy)
     monkeypatch.setattr(building, "build_map", build)
     place = tmp_path / "atlas"
-    arguments = ["build", "--atlas", place, "--ortho", ortho, "--no-index", "--json"]
+    arguments = ["atlas", "build", place, "--ortho", ortho, "--no-index", "--json"]
     arguments += ["--sheet-km", 0.3, "--tile-px", 64, "--overlap", 0.5, "--calibration-views", 1]
     arguments += ["--coarse-gsd-m", 4, "--coarse-tile-px", 32, "--coarse-overlap", 0.5]
     done = run(*arguments)
     assert done.code == 1
     assert f"error: sheet {full}: StorageError" in done.err and "full" in done.err
     assert f"error: sheet {broken}: ZeroDivisionError" in done.err
-    told = json.loads(done.out)
-    assert [each["sheet"] for each in told["failed"]] == [full, broken]
-    assert told["built"] == COUNT - 2
+    summary = json.loads(done.out)
+    assert [each["sheet"] for each in summary["failed"]] == [full, broken]
+    assert summary["built"] == COUNT - 2
     there = [name for name in content(place) if full in name or broken in name]
     assert all(name.startswith("coarse/") for name in there), "whole, and named by no item"
     monkeypatch.undo()
@@ -263,7 +267,7 @@ def test_sheets_count_where_snapshot_and_index_cannot_be_written(
     place = shutil.copytree(built[0], tmp_path / "atlas")
     monkeypatch.setattr(Atlas, "snapshot", full)
     result = made(place, ortho)
-    assert result.kept == built[1].built and result.finish_error == "disk full"
+    assert result.unchanged == built[1].built and result.finish_error == "disk full"
     assert not result.is_complete
 
 
@@ -296,7 +300,7 @@ def test_only_sheets_of_the_area_are_planned(ortho, built):
 
 
 def test_a_task_names_the_files_that_its_sheet_shows(make_ortho, tmp_path):
-    """So that neither its map nor its digest changes with imagery that lies elsewhere."""
+    """So that neither its map nor its digest changes with imagery outside it."""
     import rasterio
     from rasterio.transform import Affine
 
@@ -312,19 +316,19 @@ def test_a_task_names_the_files_that_its_sheet_shows(make_ortho, tmp_path):
 
 
 def test_a_digest_is_of_recipe_versions_and_imagery_but_not_of_folders(ortho, tmp_path):
-    def told(*paths, recipe=RECIPE, made_by=None):
+    def digest_of(*paths, recipe=RECIPE, made_by=None):
         return request_digest(recipe, Mosaic.open(list(paths)), made_by or versions())
 
     copy = Path(shutil.copy2(ortho, tmp_path / ortho.name))
     other = Path(shutil.copy2(ortho, tmp_path / "other.tif"))
-    assert told(copy) == told(ortho)
+    assert digest_of(copy) == digest_of(ortho)
     different = {
-        told(ortho),
-        told(other),
-        told(ortho, other),
-        told(other, ortho),
-        told(ortho, recipe=replace(RECIPE, seed=1)),
-        told(ortho, made_by={**versions(), "opencv": "3"}),
+        digest_of(ortho),
+        digest_of(other),
+        digest_of(ortho, other),
+        digest_of(other, ortho),
+        digest_of(ortho, recipe=replace(RECIPE, seed=1)),
+        digest_of(ortho, made_by={**versions(), "opencv": "3"}),
     }
     assert len(different) == 6
 
@@ -359,43 +363,40 @@ def test_folders_of_killed_processes_are_removed(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        (["--out", "a.onav", "--replace"], "--replace is for an atlas"),
-        (["--out", "a.onav", "--no-index"], "--no-index is for an atlas"),
-        (["--out", "a.onav", "--coarse-gsd-m", "4"], "--coarse-gsd-m is for an atlas"),
-        (["--out", "a.onav", "--cluster", "local"], "--cluster is for an atlas"),
-        (["--atlas", "a", "--work", "w"], "--work is for a single map"),
-        (["--atlas", "a", "--other-date", "b.tif"], "--other-date is for a single map"),
-        (["--atlas", "a", "--no-coarse", "--coarse-gsd-m", "4"], "say nothing else"),
-        (["--atlas", "a", "--sheet-km", "0.001"], "must be 0.2 to"),
-        (["--atlas", "a", "--cluster", "local", "--workers", "0"], "workers must be 1 or more"),
+        (["--no-coarse", "--coarse-gsd-m", "4"], "remove the other --coarse"),
+        (["--sheet-km", "0.001"], "must be 0.2 to"),
+        (["--cluster", "local", "--workers", "0"], "workers must be 1 or more"),
     ],
 )
-def test_options_that_do_not_go_together(run, ortho, tmp_path, monkeypatch, options, why):
+def test_conflicting_or_impossible_options_are_refused(
+    run, ortho, tmp_path, monkeypatch, options, why
+):
     monkeypatch.chdir(tmp_path)
-    done = run("build", "--ortho", ortho, *options)
+    done = run("atlas", "build", "a", "--ortho", ortho, *options)
     assert done.code == 1 and why in done.err and not list(tmp_path.iterdir())
 
 
-def test_sheets_are_not_learnt_by_torchrun(run, ortho, monkeypatch):
+def test_torchrun_is_refused(run, ortho, monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
-    assert "torchrun is for a single map" in run("build", "--ortho", ortho, "--atlas", "a").err
+    assert "torchrun is for a single map" in run("atlas", "build", "a", "--ortho", ortho).err
 
 
-def test_a_build_has_one_target(run, ortho):
-    assert run("build", "--ortho", ortho).code == 2
-    assert run("build", "--ortho", ortho, "--out", "a.onav", "--atlas", "a").code == 2
+def test_the_help_of_a_build_is_grouped(run):
+    done = run("atlas", "build", "--help")
+    for group in ("area", "sheets", "coarse tiles", "workers"):
+        assert f"\n{group}" in done.out
 
 
-def test_ending_a_build_says_how_to_go_on(run, ortho, tmp_path, monkeypatch):
+def test_an_interrupted_build_says_how_to_resume(run, ortho, tmp_path, monkeypatch):
     def interrupted(task):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(building, "build_sheet", interrupted)
-    done = run("build", "--atlas", tmp_path / "atlas", "--ortho", ortho, "--tile-px", "64")
-    assert done.code == 1 and "goes on from there" in done.err
+    done = run("atlas", "build", tmp_path / "atlas", "--ortho", ortho, "--tile-px", "64")
+    assert done.code == 1 and "rerun to resume" in done.err
 
 
-def test_the_usual_resolution_is_that_of_the_imagery(ortho, tmp_path):
+def test_the_default_resolution_is_that_of_the_imagery(ortho, tmp_path):
     request = AtlasRequest(str(tmp_path / "atlas"), [ortho])
     assert building.recipe_for(request, Mosaic.open([ortho])) == AtlasRecipe(gsd_m=1.0)
     assert tasks.margin_m(AtlasRecipe(gsd_m=1.0, coarse=None)) == 320.0

@@ -14,9 +14,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthonav.atlas.catalog import Atlas, NewSheet, copy_sheets
+from orthonav.atlas.catalog import Atlas, SheetDescription, copy_sheets
 from orthonav.atlas.integrity import check_atlas
-from orthonav.atlas.item import Asset, Sheet, canonical, read_item
+from orthonav.atlas.item import Sheet, StoredFile, canonical, read_item
 from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
 from orthonav.atlas.store import Store
 from orthonav.errors import AreaError, AtlasError, MissingFileError, StorageError
@@ -27,8 +27,8 @@ EAST = RECIPE.sheets.name_at(46.6, 2.1)
 
 
 def described(sheet=HERE, request="request 1", **others):
-    """What is told of a sheet."""
-    told = NewSheet(
+    """The description of a sheet."""
+    made = SheetDescription(
         id=sheet,
         bounds_deg=RECIPE.sheets.bounds_deg(sheet),
         gsd_m=1.0,
@@ -39,7 +39,7 @@ def described(sheet=HERE, request="request 1", **others):
         request=request,
         made_by={"orthonav": "1.0"},
     )
-    return replace(told, **others)
+    return replace(made, **others)
 
 
 @pytest.fixture
@@ -86,7 +86,7 @@ def contents(url):
 
 
 def test_a_sheet_that_is_put_is_read_back(atlas, files):
-    sheet = atlas.put(HERE, files(), described())
+    sheet = atlas.put(files(), described())
     again = Atlas.open(atlas.url, cache=atlas.store.cache)
     assert again.recipe == RECIPE and again.sheets() == {HERE: sheet} == atlas.sheets()
     assert sheet.revision == 1 and sheet.made_by == {"orthonav": "1.0"}
@@ -99,18 +99,18 @@ def test_a_sheet_that_is_put_is_read_back(atlas, files):
     assert check_atlas(again) == []
 
 
-def test_the_same_again_writes_nothing(atlas, files, monkeypatch):
-    atlas.put(HERE, files(), described())
+def test_putting_the_same_sheet_again_writes_nothing(atlas, files, monkeypatch):
+    atlas.put(files(), described())
     for name in ("put", "write", "remove"):
         monkeypatch.setattr(Store, name, lambda *_: pytest.fail("nothing to do"))
-    assert atlas.put(HERE, files(), described()).revision == 1
+    assert atlas.put(files(), described()).revision == 1
 
 
 @pytest.mark.parametrize(("content", "request_"), [("two", "request 1"), ("one", "request 2")])
 def test_a_sheet_is_replaced(atlas, files, content, request_):
-    atlas.put(HERE, files(), described())
-    atlas.put(EAST, files("east"), described(EAST))
-    sheet = atlas.put(HERE, files(content), described(request=request_))
+    atlas.put(files(), described())
+    atlas.put(files("east"), described(EAST))
+    sheet = atlas.put(files(content), described(request=request_))
     assert sheet.revision == 2
     again = Atlas.open(atlas.url, cache=atlas.store.cache)
     assert list(again.sheets()) == [HERE, EAST] and again.sheets()[HERE] == sheet
@@ -120,8 +120,8 @@ def test_a_sheet_is_replaced(atlas, files, content, request_):
 
 
 def test_a_sheet_is_retired(atlas, files):
-    atlas.put(HERE, files(), described())
-    atlas.put(EAST, files(), described(EAST))
+    atlas.put(files(), described())
+    atlas.put(files(), described(EAST))
     atlas.retire(HERE)
     assert list(atlas.sheets()) == [EAST] == list(atlas.sheets(refresh=True))
     assert check_atlas(atlas) == []
@@ -133,39 +133,37 @@ def test_the_same_atlas_byte_for_byte(tmp_path, files):
     def make(url, order):
         atlas = Atlas.create(url, RECIPE)
         for sheet in order:
-            atlas.put(sheet, files(sheet), described(sheet))
+            atlas.put(files(sheet), described(sheet))
         atlas.snapshot()
         return contents(url)
 
     assert make(tmp_path / "a", [HERE, EAST]) == make(tmp_path / "b", [EAST, HERE])
 
 
-def test_what_is_put_must_fit(near, files, tmp_path):
-    with pytest.raises(AtlasError, match="does not lie where the atlas has it"):
-        near.put(HERE, files(), described(bounds_deg=(1.0, 46.0, 1.1, 46.1)))
+def test_sheets_that_do_not_fit_are_refused(near, files, tmp_path):
+    with pytest.raises(AtlasError, match="the lattice of the atlas has"):
+        near.put(files(), described(bounds_deg=(1.0, 46.0, 1.1, 46.1)))
     with pytest.raises(AtlasError, match="no sheet of 10 km is named 'r999999c000000'"):
-        near.put("r999999c000000", files(), described(id="r999999c000000"))
-    with pytest.raises(AtlasError, match="described is sheet"):
-        near.put(HERE, files(), described(EAST))
+        near.put(files(), described(id="r999999c000000"))
     with pytest.raises(AtlasError, match="'model'"):
-        near.put(HERE, {**files(), "model": tmp_path / "x"}, described())
+        near.put({**files(), "model": tmp_path / "x"}, described())
     with pytest.raises(AtlasError, match="names no map"):
-        near.put(HERE, {"coarse": files()["coarse"]}, described())
+        near.put({"coarse": files()["coarse"]}, described())
     with pytest.raises(AtlasError, match="cannot be written into the catalogue"):
-        near.put(HERE, files(), described(area_km2=float("nan")))
+        near.put(files(), described(area_km2=float("nan")))
     with pytest.raises(AtlasError, match="not an item of orthonav"):
-        near.put(HERE, files(), described(tiles=0))
+        near.put(files(), described(tiles=0))
     with pytest.raises(MissingFileError, match="cannot be read"):
-        near.put(HERE, {"map": tmp_path / "none.onav"}, described())
+        near.put({"map": tmp_path / "none.onav"}, described())
     assert near.sheets() == {} and list(contents(near.url)) == ["atlas.json"]
 
 
-def test_beginning_and_opening(tmp_path):
+def test_creating_and_opening(tmp_path):
     with pytest.raises(AtlasError, match=r"no atlas: it has no atlas\.json"):
         Atlas.open(tmp_path / "none")
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "inner").mkdir()
-    with pytest.raises(AtlasError, match="holds other things"):
+    with pytest.raises(AtlasError, match="holds other files"):
         Atlas.create(tmp_path / "photos", RECIPE)
     url = tmp_path / "atlas"
     assert Atlas.open_or_create(url, RECIPE).recipe == RECIPE
@@ -194,7 +192,7 @@ def test_beginning_and_opening(tmp_path):
         (lambda text: "[]", "not an atlas of orthonav"),
     ],
 )
-def test_a_catalogue_that_was_altered(near, change, words):
+def test_an_altered_catalogue_is_refused(near, change, words):
     path = Path(near.url) / "atlas.json"
     path.write_text(change(path.read_text()))
     with pytest.raises(AtlasError, match=words):
@@ -245,9 +243,9 @@ def altered(item, path, value):
         (("links",), []),
     ],
 )
-def test_items_of_strangers_are_refused(near, files, path, value):
-    """The file name agrees with the content, so that what is told is all that can be wrong."""
-    item = altered(near.put(HERE, files(), described()).to_item(), path, value)
+def test_untrusted_items_are_refused(near, files, path, value):
+    """The file name agrees with the content, so only the content can be wrong."""
+    item = altered(near.put(files(), described()).to_item(), path, value)
     data = canonical(item)
     name = f"{HERE}.0002.{hashlib.sha256(data).hexdigest()[:12]}.json"
     near.store.write(f"items/{name}", data)
@@ -273,14 +271,14 @@ def test_items_of_strangers_are_refused(near, files, path, value):
         lambda data: b" " * (2**20 + 1),
     ],
 )
-def test_an_item_that_is_damaged(near, files, change):
-    sheet = near.put(HERE, files(), described())
+def test_damaged_items_are_reported_and_can_be_replaced(near, files, change):
+    sheet = near.put(files(), described())
     path = Path(near.url, "items", sheet.item_name)
     path.write_bytes(change(path.read_bytes()))
     with pytest.raises(AtlasError, match=f"items/{HERE}"):
         near.sheets(refresh=True)
     assert [each.kind for each in check_atlas(near)] == ["damaged item"]
-    near.put(HERE, files("two"), described())
+    near.put(files("two"), described())
     assert near.sheets(refresh=True)[HERE].revision == 2
     near.retire(HERE)
     assert near.sheets(refresh=True) == {}
@@ -310,9 +308,9 @@ def killed_at(monkeypatch, step, error):
 
 @pytest.mark.parametrize("error", [Killed(), StorageError("disk full")], ids=["kill", "full"])
 @pytest.mark.parametrize("act", ["put", "replace", "retire"])
-def test_a_kill_at_any_step_leaves_what_was_or_what_is_to_be(near, files, monkeypatch, act, error):
-    near.put(EAST, files("east"), described(EAST))
-    before = [] if act == "put" else [near.put(HERE, files(), described())]
+def test_a_kill_at_any_step_leaves_the_old_or_the_new_sheet(near, files, monkeypatch, act, error):
+    near.put(files("east"), described(EAST))
+    before = [] if act == "put" else [near.put(files(), described())]
     saved = Path(near.url).with_name("saved")
     shutil.copytree(near.url, saved)
 
@@ -320,7 +318,7 @@ def test_a_kill_at_any_step_leaves_what_was_or_what_is_to_be(near, files, monkey
         if act == "retire":
             atlas.retire(HERE)
         else:
-            atlas.put(HERE, files("two"), described(request="request 2"))
+            atlas.put(files("two"), described(request="request 2"))
 
     for step in range(100):
         shutil.rmtree(near.url)
@@ -355,7 +353,7 @@ def test_a_kill_at_any_step_leaves_what_was_or_what_is_to_be(near, files, monkey
 MANY = """
 import sys
 from pathlib import Path
-from orthonav.atlas.catalog import Atlas, NewSheet
+from orthonav.atlas.catalog import Atlas, SheetDescription
 
 url, files, number = sys.argv[1:]
 atlas = Atlas.open_or_create(url, __import__("orthonav.atlas.recipe").atlas.recipe.AtlasRecipe(1.0))
@@ -364,8 +362,8 @@ for step in range(6):
     path = Path(files, sheet)
     path.write_text(f"map of {sheet}")
     bounds = atlas.recipe.sheets.bounds_deg(sheet)
-    told = NewSheet(sheet, bounds, 1.0, 5, 1.0, (), (), "request", {})
-    atlas.put(sheet, {"map": path}, told)
+    description = SheetDescription(sheet, bounds, 1.0, 5, 1.0, (), (), "request", {})
+    atlas.put({"map": path}, description)
 """
 
 
@@ -382,34 +380,34 @@ def test_many_processes_put_sheets_at_once(tmp_path):
 
 @pytest.mark.parametrize("at", ["put", "write"])
 @pytest.mark.parametrize("mine", ["one", "two", "three", "four"])
-def test_the_same_sheet_at_once_is_one_of_them(near, files, monkeypatch, at, mine):
+def test_concurrent_revisions_leave_one_of_them(near, files, monkeypatch, at, mine):
     """Another process replaces a sheet while this one does; content `one` is there before."""
-    near.put(HERE, files("one"), described())
+    near.put(files("one"), described())
     other = Atlas.open(near.url)
     act, done = getattr(Store, at), []
 
     def interrupted(*arguments):
         if not done:
             done.append(True)
-            other.put(HERE, files("three"), described(request="request 3"))
+            other.put(files("three"), described(request="request 3"))
         act(*arguments)
 
     monkeypatch.setattr(Store, at, interrupted)
-    given_back = near.put(HERE, files(mine), described(request=f"request {mine}"))
+    given_back = near.put(files(mine), described(request=f"request {mine}"))
     again = Atlas.open(near.url)
     assert again.sheets()[HERE] == given_back
     assert again.path(given_back).read_text() in (f"map of {mine}", "map of three")
     assert check_atlas(again) == []
 
 
-def test_the_snapshot_saves_reading_and_is_never_the_truth(far, files, monkeypatch):
+def test_the_snapshot_saves_reading_and_items_are_decisive(far, files, monkeypatch):
     atlas = far
     for sheet in (HERE, EAST):
-        atlas.put(sheet, files(sheet), described(sheet))
+        atlas.put(files(sheet), described(sheet))
     atlas.snapshot()
     there = dict(atlas.sheets())
     features = json.loads(atlas.store.read("items.geojson"))["features"]
-    assert features[0]["assets"]["map"]["href"] == f"./{there[HERE].assets['map'].name}"
+    assert features[0]["assets"]["map"]["href"] == f"./{there[HERE].files['map'].name}"
     read = []
     act = Store.read_many
     monkeypatch.setattr(
@@ -417,7 +415,7 @@ def test_the_snapshot_saves_reading_and_is_never_the_truth(far, files, monkeypat
     )
     assert Atlas.open(atlas.url).sheets() == there
     assert read == ["atlas.json", "items.geojson"]
-    there[HERE] = atlas.put(HERE, files("new"), described())
+    there[HERE] = atlas.put(files("new"), described())
     assert Atlas.open(atlas.url).sheets() == there
     for damaged in (b"", b"{}", b"[]", b'{"features":[1,{}]}', b'{"features":[{"links":[1]}]}'):
         atlas.store.write("items.geojson", damaged)
@@ -429,13 +427,13 @@ def test_items_are_stac(near, files):
     from pystac.errors import STACValidationError
     from pystac.validation.stac_validator import JsonSchemaSTACValidator
 
-    sheet = near.put(HERE, files(), described())
+    sheet = near.put(files(), described())
     item = Item.from_file(str(Path(near.url, "items", sheet.item_name)))
     collection = Collection.from_file(str(Path(near.url, "atlas.json")))
     validator = JsonSchemaSTACValidator()  # it brings the schemas of 1.1, which asks for no less
     for plain, kind in (
         (sheet.to_item(), STACObjectType.ITEM),
-        (Sheet.of(described(dates=("2020",)), 1, sheet.assets).to_item(), STACObjectType.ITEM),
+        (Sheet.of(described(dates=("2020",)), 1, sheet.files).to_item(), STACObjectType.ITEM),
         (json.loads(near.store.read("atlas.json")), STACObjectType.COLLECTION),
     ):
         assert validator.validate_core({**plain, "stac_version": "1.1.0"}, kind, "1.1.0")
@@ -444,9 +442,9 @@ def test_items_are_stac(near, files):
     assert item.id == HERE and item.datetime.isoformat() == "2020-06-14T00:00:00+00:00"
     assert Path(item.assets["map"].get_absolute_href()) == near.path(sheet)
     assert item.get_parent().id == collection.id == item.collection_id
-    assert item.assets["map"].extra_fields["file:size"] == sheet.assets["map"].size_bytes
+    assert item.assets["map"].extra_fields["file:size"] == sheet.files["map"].size_bytes
     multihash = bytes.fromhex(item.assets["map"].extra_fields["file:checksum"])
-    assert multihash[:2] == b"\x12\x20" and multihash[2:].hex() == sheet.assets["map"].sha256
+    assert multihash[:2] == b"\x12\x20" and multihash[2:].hex() == sheet.files["map"].sha256
 
 
 @pytest.mark.parametrize(
@@ -461,8 +459,8 @@ def test_items_are_stac(near, files):
         (("9999",), ("9999-01-01T00:00:00Z", "9999-12-31T23:59:59Z")),
     ],
 )
-def test_times_as_stac_has_them(dates, times):
-    asset = Asset(f"sheets/{HERE}.{'0' * 12}.onav", 1, "0" * 64)
+def test_dates_become_times_of_stac(dates, times):
+    asset = StoredFile(f"sheets/{HERE}.{'0' * 12}.onav", 1, "0" * 64)
     sheet = Sheet.of(described(dates=dates), 1, {"map": asset})
     found = {k: v for k, v in sheet.to_item()["properties"].items() if "date" in k}
     if isinstance(times, tuple):
@@ -480,8 +478,8 @@ def wide(tmp_path_factory):
     (folder / "map").write_bytes(b"map")
     boxes = [(1.0, 46.0, 2.5, 47.0), (179.5, -17.0, -179.5, -16.5), (0.0, 89.9, 10.0, 90.0)]
     for sheet in {each for box in boxes for each in recipe.sheets.over(box)}:
-        told = replace(described(), id=sheet, bounds_deg=recipe.sheets.bounds_deg(sheet))
-        atlas.put(sheet, {"map": folder / "map"}, told)
+        description = replace(described(), id=sheet, bounds_deg=recipe.sheets.bounds_deg(sheet))
+        atlas.put({"map": folder / "map"}, description)
     return atlas
 
 
@@ -502,19 +500,19 @@ def test_sheets_over_a_box_are_those_of_the_lattice(wide, place, right, up, widt
     assert {sheet.id for sheet in wide.over(box)} == expected
 
 
-def test_boxes_that_are_none(wide):
+def test_invalid_boxes_are_refused(wide):
     with pytest.raises(AreaError, match="bounds must be"):
         wide.over((1.0, 47.0, 2.0, 46.0))
 
 
-def test_sheets_of_another_atlas(tmp_path, files, near):
+def test_sheets_are_copied_from_another_atlas(tmp_path, files, near):
     source = Atlas.create(tmp_path / "source", RECIPE)
     for sheet in (HERE, EAST):
-        source.put(sheet, files(sheet), described(sheet))
+        source.put(files(sheet), described(sheet))
     assert copy_sheets(source, near, [EAST]) == ([EAST], [])
     assert copy_sheets(source, near) == ([HERE], [EAST])
     assert contents(near.url) == {**contents(source.url), **contents(near.url)}
-    source.put(HERE, files("new"), described())
+    source.put(files("new"), described())
     assert copy_sheets(source, near) == ([], [HERE, EAST])
     assert copy_sheets(source, near, replace=True) == ([HERE], [EAST])
     assert near.path(near.sheets()[HERE]).read_text() == "map of new"

@@ -50,13 +50,15 @@ def stored(mosaic, box_deg, tmp_path_factory):
     return path
 
 
-def test_what_is_written_is_read_and_the_same_every_time(mosaic, box_deg, stored, tmp_path):
+def test_coarse_tiles_are_read_back_and_reproducible(mosaic, box_deg, stored, tmp_path):
     made, read = make_coarse(mosaic, box_deg, RECIPE), read_coarse(stored)
     assert (read.recipe, read.bounds_deg) == (RECIPE, box_deg)
     for name in ("centres_latlon_deg", "features", "valid"):
         np.testing.assert_array_equal(getattr(read, name), getattr(made, name))
         assert not getattr(read, name).flags.writeable
-    assert read.weights.shape == read.features.shape and read.weights.min() == 1
+    features, weights = read.features_of(slice(None, None, 3))
+    np.testing.assert_array_equal(features, read.features[::3])
+    assert weights.shape == features.shape and weights.min() == 1
     write_coarse(mosaic, box_deg, RECIPE, tmp_path / "again.safetensors")
     assert (tmp_path / "again.safetensors").read_bytes() == stored.read_bytes()
 
@@ -112,13 +114,14 @@ def test_tiles_with_too_little_imagery_are_left_out(mosaic, middle, tmp_path):
     corner = WORLD.bounds_deg(WORLD.name_at(*outline.max(axis=0)))
     made = make_coarse(mosaic, corner, RECIPE)
     assert made.valid.min(initial=255) < 255 and (made.valid.mean(axis=1) > 0.45 * 255).all()
-    assert made.weights.shape == made.features.shape
+    _, weights = made.features_of(slice(None))
+    assert weights.shape == made.features.shape
     nowhere = WORLD.bounds_deg(WORLD.name_at(middle[0] + 1, middle[1]))
     assert write_coarse(mosaic, nowhere, RECIPE, tmp_path / "none.safetensors") == 0
     assert len(read_coarse(tmp_path / "none.safetensors").features) == 0
 
 
-def test_what_is_no_coarse_tiles_is_refused(stored, tmp_path):
+def test_other_files_are_refused(stored, tmp_path):
     data, path = stored.read_bytes(), tmp_path / "bad.safetensors"
     for broken in (b"", b"hello", data[:-1], data[: len(data) // 2], data + b"0", b"{" + data):
         path.write_bytes(broken)
@@ -129,18 +132,18 @@ def test_what_is_no_coarse_tiles_is_refused(stored, tmp_path):
 
 
 def _without(name):
-    return lambda arrays, told: arrays.pop(name)
+    return lambda arrays, metadata: arrays.pop(name)
 
 
 def _array(name, change):
-    def changed(arrays, told):
+    def changed(arrays, metadata):
         arrays[name] = np.ascontiguousarray(change(arrays[name]))
 
     return changed
 
 
-def _told(**more):
-    return lambda arrays, told: told.update(more)
+def _with(**more):
+    return lambda arrays, metadata: metadata.update(more)
 
 
 @pytest.mark.parametrize(
@@ -156,24 +159,24 @@ def _told(**more):
         _array("centres_latlon_deg", lambda a: a[:, :1]),
         _array("valid", lambda a: a[:, :32]),
         _array("valid", lambda a: a.reshape(-1)),
-        _told(format="other"),
-        _told(schema=2),
-        _told(schema=None),
-        _told(edges="canny"),
-        _told(recipe={"gsd_m": 1}),
-        _told(recipe={"gsd_m": -1.0, "tile_px": 64, "overlap": 0.5}),
-        _told(recipe={"gsd_m": 1.0, "tile_px": 33, "overlap": 0.5}),
-        _told(recipe={"gsd_m": "1", "tile_px": 64, "overlap": 0.5}),
-        _told(bounds_deg=[1, 2, 3]),
-        _told(bounds_deg=None),
+        _with(format="other"),
+        _with(schema=2),
+        _with(schema=None),
+        _with(edges="canny"),
+        _with(recipe={"gsd_m": 1}),
+        _with(recipe={"gsd_m": -1.0, "tile_px": 64, "overlap": 0.5}),
+        _with(recipe={"gsd_m": 1.0, "tile_px": 33, "overlap": 0.5}),
+        _with(recipe={"gsd_m": "1", "tile_px": 64, "overlap": 0.5}),
+        _with(bounds_deg=[1, 2, 3]),
+        _with(bounds_deg=None),
     ],
 )
-def test_what_was_altered_is_refused(stored, tmp_path, change):
+def test_altered_files_are_refused(stored, tmp_path, change):
     arrays = load_file(stored)
-    told = _metadata(stored)
-    change(arrays, told)
+    metadata = _metadata(stored)
+    change(arrays, metadata)
     path = tmp_path / "altered.safetensors"
-    save_file(arrays, path, metadata={"orthonav": json.dumps(told)})
+    save_file(arrays, path, metadata={"orthonav": json.dumps(metadata)})
     with pytest.raises(AtlasError, match=r"altered\.safetensors"):
         read_coarse(path)
 

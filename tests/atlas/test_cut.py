@@ -9,7 +9,7 @@ import pytest
 from safetensors import SafetensorError
 
 from helpers import textured
-from orthonav.atlas.catalog import Atlas, NewSheet
+from orthonav.atlas.catalog import Atlas, SheetDescription
 from orthonav.atlas.coverage import box_deg, check_shown
 from orthonav.atlas.cut import cut_map
 from orthonav.atlas.recipe import AtlasRecipe
@@ -90,7 +90,7 @@ def put(atlas, name, path):
     bounds = RECIPE.sheets.bounds_deg(name)
     dates = tuple(str(each["date"]) for each in manifest.imagery)
     facts = (bounds, 1.0, sheet.tiles, sheet.area_km2, dates, manifest.imagery)
-    return atlas.put(name, {"map": path}, NewSheet(name, *facts, "asked", {"orthonav": "test"}))
+    return atlas.put({"map": path}, SheetDescription(name, *facts, "asked", {"orthonav": "test"}))
 
 
 @pytest.fixture
@@ -117,7 +117,7 @@ def cut(folder, middle, tmp_path_factory):
 
 
 def sheet_file(atlas, name):
-    return Path(atlas.url) / atlas.sheets()[name].assets["map"].name
+    return Path(atlas.url) / atlas.sheets()[name].files["map"].name
 
 
 def test_threads_do_not_change_the_map(folder, cut, middle, tmp_path, names_in):
@@ -135,7 +135,7 @@ def test_threads_do_not_change_the_map(folder, cut, middle, tmp_path, names_in):
     assert stages[0] == ("sheets", 0) and stages[-1] == ("learn", 1)
 
 
-def test_it_shows_the_ground_of_its_sheets_in_its_own_plane(cut, ortho):
+def test_a_cut_map_shows_its_sheets_in_its_own_plane(cut, ortho):
     sheet = cut.manifest.sheets[0]
     shape = sheet.grid.height_px, sheet.grid.width_px
     with Mosaic.open([ortho]).grid_sheet(sheet.frame, sheet.grid) as raster:
@@ -148,7 +148,7 @@ def test_it_shows_the_ground_of_its_sheets_in_its_own_plane(cut, ortho):
     assert shifted.mean() > 2 * off.mean()
 
 
-def test_its_tiles_are_those_that_the_imagery_would_give(cut, ortho):
+def test_its_tiles_agree_with_those_of_the_imagery(cut, ortho):
     sheet = cut.manifest.sheets[0]
     height, width = sheet.grid.height_px, sheet.grid.width_px
     with Mosaic.open([ortho]).grid_sheet(sheet.frame, sheet.grid) as raster:
@@ -184,7 +184,7 @@ def test_views_are_placed_across_the_borders_of_sheets(cut, ortho, registration)
         assert np.hypot(*(place - where)) < (2 if registration else 12)
 
 
-def test_the_manifest_says_what_it_was_cut_from(cut, folder, names):
+def test_the_manifest_names_the_sheets(cut, folder, names):
     manifest, atlas = cut.manifest, Atlas.open(str(folder))
     sheets = [open_map(sheet_file(atlas, name)).manifest for name in names]
     assert set(manifest.recipe["cut_from"]) == set(names)
@@ -206,7 +206,7 @@ def test_imagery_of_all_sheets_is_named_once(atlas, names, middle, tmp_path):
     assert [each["date"] for each in done.manifest.imagery] == ["2011", "2019-06"]
 
 
-def test_a_band_leaves_out_what_is_far_from_it(folder, middle, tmp_path):
+def test_tiles_outside_the_band_are_left_out(folder, middle, tmp_path):
     route = line(middle, [-150, -150], [150, 150])
     done = cut_map(Atlas.open(str(folder)), tmp_path / "o.onav", route=route, band_m=40, workers=1)
     sheet = done.manifest.sheets[0]
@@ -255,7 +255,7 @@ def test_imagery_that_is_missing_under_the_route_is_an_error(middle, caplog):
     check_shown(area, grid, cells, allow_holes=False)
 
 
-def test_outside_of_the_atlas(folder, names, tmp_path):
+def test_areas_outside_the_atlas_are_refused(folder, names, tmp_path):
     atlas = Atlas.open(str(folder))
     with pytest.raises(AreaError, match=f"{len(names)} sheets lie within"):
         cut_map(atlas, tmp_path / "o.onav", bounds_deg=(12.0, 50.0, 12.01, 50.01))
@@ -267,7 +267,7 @@ def test_outside_of_the_atlas(folder, names, tmp_path):
 @pytest.mark.parametrize(
     ("lacking", "said"), [("sheet0/cells", "no cells"), ("sheet0/grey", "no registration layer")]
 )
-def test_sheets_that_cannot_be_cut_from(atlas, names, middle, tmp_path, lacking, said):
+def test_sheets_without_cells_or_layer_are_refused(atlas, names, middle, tmp_path, lacking, said):
     opened = open_map(sheet_file(atlas, names[2]))
     kept = {name: part for name, part in opened.arrays.items() if not name.startswith(lacking)}
     manifest = opened.manifest
@@ -275,12 +275,12 @@ def test_sheets_that_cannot_be_cut_from(atlas, names, middle, tmp_path, lacking,
         manifest = replace(manifest, sheets=(replace(manifest.sheets[0], grey=None),))
     write_map(tmp_path / "s.onav", manifest, kept)
     put(atlas, names[2], tmp_path / "s.onav")
-    with pytest.raises(AtlasError, match=rf"{names[2]} has {said}.*build it anew"):
+    with pytest.raises(AtlasError, match=rf"{names[2]} has {said}.*rebuild it"):
         cut_map(atlas, tmp_path / "o.onav", bounds_deg=bounds_around(middle, 100), workers=1)
 
 
 @pytest.mark.parametrize("change", ["recipe", "grid", "method"])
-def test_sheets_of_another_make_are_refused(atlas, names, middle, tmp_path, change):
+def test_sheets_of_another_recipe_are_refused(atlas, names, middle, tmp_path, change):
     opened = open_map(sheet_file(atlas, sorted(names)[1]))
     manifest = opened.manifest
     if change == "grid":
@@ -332,7 +332,7 @@ def test_a_full_disk_leaves_nothing(folder, middle, tmp_path, monkeypatch, names
     assert names_in(tmp_path) == []
 
 
-def test_what_is_asked_for_must_make_sense(folder, middle, tmp_path):
+def test_impossible_requests_are_refused(folder, middle, tmp_path):
     atlas, out = Atlas.open(str(folder)), tmp_path / "o.onav"
     bounds = bounds_around(middle, 60)
     with pytest.raises(AreaError, match="give one of them"):

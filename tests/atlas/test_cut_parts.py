@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from orthonav.atlas.pooled import pooled_registered, pooled_tiles
+from orthonav.atlas.pooled_confidence import pooled_registered, pooled_tiles
 from orthonav.atlas.warp import Warp, _turn
 from orthonav.confidence.logistic import LogisticConfidence
 from orthonav.confidence.registered import Chances, RegisteredConfidence
@@ -30,12 +30,12 @@ def test_one_sheet_keeps_its_confidence():
     assert alike.weights == pytest.approx(TILES[0].weights)
 
 
-def test_of_no_sheet_nothing_is_known():
+def test_no_confidence_without_sheets():
     assert pooled_tiles([], [], 1.0) is None
     assert pooled_registered([], []) is None
 
 
-def test_tiles_are_nowhere_surer_than_the_sheets_are_on_average():
+def test_the_confidence_of_tiles_never_exceeds_the_mean_of_the_sheets():
     pooled = pooled_tiles(TILES, SHARES, 1.0)
     for score in np.linspace(0.1, 1, 10):
         for margin in np.linspace(0, min(score, 0.5), 9):
@@ -46,13 +46,13 @@ def test_tiles_are_nowhere_surer_than_the_sheets_are_on_average():
     assert pooled({"score": 0.9, "margin": 0.3}) > 0.9
 
 
-def test_more_tiles_are_more_that_look_alike_by_chance():
+def test_more_tiles_lower_the_odds():
     same, more = (pooled_tiles(TILES, SHARES, times) for times in (1.0, 4.0))
     assert same.bias - more.bias == pytest.approx(math.log(4))
     assert pooled_tiles(TILES, SHARES, 0.25) == same
 
 
-def test_registered_views_are_nowhere_surer_than_the_sheets_are_on_average():
+def test_the_confidence_of_views_never_exceeds_the_mean_of_the_sheets():
     pooled = pooled_registered(REGISTERED, SHARES)
     assert pooled.chances == Chances(49.0, 18.0, 60.0)
     for strength in (50.0, 90.0, 140.0, 300.0):
@@ -66,12 +66,12 @@ def test_registered_views_are_nowhere_surer_than_the_sheets_are_on_average():
             mean = np.average([each(evidence) for each in REGISTERED], weights=SHARES)
             if 0.55 < mean < 0.985:
                 assert pooled(evidence) <= mean + 0.02
-    sure = {"strength": 200.0, "rival": 60.0, "look": 60.0, "look_rival": 20.0}
-    assert pooled(sure) > 0.95
+    clear = {"strength": 200.0, "rival": 60.0, "look": 60.0, "look_rival": 20.0}
+    assert pooled(clear) > 0.95
 
 
 @pytest.mark.parametrize("angle_deg", [-3.0, 0.5, 10.0])
-def test_harmonics_are_turned_with_the_plane(angle_deg):
+def test_harmonics_rotate_with_the_plane(angle_deg):
     """Stripes, and stripes as a plane turned by an angle has them."""
     rows, cols = np.mgrid[:96, :96] - 47.5
     valid = np.ones(rows.shape, bool)
@@ -87,7 +87,7 @@ def test_harmonics_are_turned_with_the_plane(angle_deg):
     assert np.abs(there[0, 0] - means(0)).max() < 0.02 * means(0)[0]
 
 
-def test_a_block_lies_in_another_plane_where_the_earth_says():
+def test_the_affine_agrees_with_the_geodesy():
     """To a fiftieth of a pixel, within a kilometre, between planes 25 km apart."""
 
     class Sheet:

@@ -11,13 +11,13 @@ from pathlib import Path
 import fsspec
 import pytest
 
-from orthonav.atlas.catalog import Atlas, NewSheet
-from orthonav.atlas.index import IndexManifest, Part, ShardInfo
+from orthonav.atlas.catalog import Atlas, SheetDescription
+from orthonav.atlas.index_manifest import IndexManifest, Part, ShardInfo
 from orthonav.atlas.integrity import check_atlas
-from orthonav.atlas.item import Asset, Sheet, canonical
+from orthonav.atlas.item import Sheet, StoredFile, canonical
+from orthonav.atlas.quantizers import VectorRecipe
 from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.atlas.store import Store
-from orthonav.atlas.vectors import VectorRecipe
 from orthonav.cli import main
 from orthonav.errors import AtlasError
 from orthonav.mapfile import open_map
@@ -29,10 +29,12 @@ DAYS_S = 24 * 3600
 
 
 def described(sheet, tiles=7, dates=("2020-06-14",)):
-    """What is told of a sheet."""
+    """The description of a sheet."""
     imagery = ({"name": "BD ORTHO", "attribution": "IGN", "licence": "Etalab-2.0"},)
     bounds = RECIPE.sheets.bounds_deg(sheet)
-    return NewSheet(sheet, bounds, 2.5, tiles, 3.25, dates, imagery, "r", {"orthonav": "1.0"})
+    return SheetDescription(
+        sheet, bounds, 2.5, tiles, 3.25, dates, imagery, "r", {"orthonav": "1.0"}
+    )
 
 
 @pytest.fixture(params=["folder", "memory"])
@@ -47,7 +49,7 @@ def two_sheets(url, tmp_path):
     atlas = Atlas.create(url, RECIPE, cache=tmp_path / "cache")
     for sheet in (HERE, EAST):
         (tmp_path / "file").write_text(f"map of {sheet}")
-        atlas.put(sheet, {"map": tmp_path / "file"}, described(sheet))
+        atlas.put({"map": tmp_path / "file"}, described(sheet))
     return atlas
 
 
@@ -68,31 +70,31 @@ def found(atlas, **how):
     return [(problem.kind, problem.name) for problem in check_atlas(atlas, **how)]
 
 
-def test_a_whole_atlas(atlas):
+def test_a_whole_atlas_has_no_problems(atlas):
     assert check_atlas(atlas) == [] == check_atlas(atlas, clean=True, min_age_s=0)
     atlas.snapshot()
     assert check_atlas(atlas) == []
 
 
-def test_files_that_are_missing_or_half_there(atlas, tmp_path):
-    here, east = (atlas.sheets()[name].assets["map"].name for name in (HERE, EAST))
+def test_missing_and_incomplete_files_are_found(atlas, tmp_path):
+    here, east = (atlas.sheets()[name].files["map"].name for name in (HERE, EAST))
     atlas.store.remove(here)
     atlas.store.write(east, b"map")
     wrong = [("missing file", here), ("wrong size", east)]
     assert found(atlas) == wrong == found(atlas, clean=True, min_age_s=0)
     (tmp_path / "file").write_text(f"map of {HERE}")
-    atlas.put(HERE, {"map": tmp_path / "file"}, described(HERE))  # building it again heals it
+    atlas.put({"map": tmp_path / "file"}, described(HERE))  # building it again heals it
     assert found(atlas) == wrong[1:]
 
 
-def test_content_that_changed_is_found_by_looking_inside(atlas):
-    name = atlas.sheets()[HERE].assets["map"].name
+def test_altered_content_is_found_by_a_deep_check(atlas):
+    name = atlas.sheets()[HERE].files["map"].name
     atlas.store.write(name, b"m" * atlas.store.size(name))
     assert found(atlas) == []
     assert ("wrong checksum", name) in found(atlas, deep=True)
 
 
-def test_what_is_left_over_goes_when_it_is_old(atlas):
+def test_old_leftovers_are_removed(atlas):
     orphan = f"sheets/{HERE}.0123456789ab.onav"
     half = f"sheets/.{HERE}.0123456789ab.onav.a1b2c3d4.tmp.onav"
     names = {orphan: "orphan", half: "leftover", ".atlas.json.a1b2c3d4e5f6.tmp": "leftover"}
@@ -110,7 +112,7 @@ def test_what_is_left_over_goes_when_it_is_old(atlas):
     assert len(atlas.sheets(refresh=True)) == 2
 
 
-def test_the_age_of_files_in_a_folder(near):
+def test_the_age_of_local_files(near):
     orphan = Path(near.url, "sheets", f"{HERE}.0123456789ab.onav")
     orphan.touch()
     os.utime(orphan, (time.time() - 2 * DAYS_S,) * 2)
@@ -121,7 +123,7 @@ def test_the_age_of_files_in_a_folder(near):
 def second_revision(atlas, missing=False):
     """As if a process had ended before it removed the revision that it replaced."""
     old = atlas.sheets()[HERE]
-    asset = replace(old.assets["map"], sha256="ab" * 32, size_bytes=3)
+    asset = replace(old.files["map"], sha256="ab" * 32, size_bytes=3)
     asset = replace(asset, name=f"sheets/{HERE}.abababababab.onav")
     new = Sheet.of(described(HERE), 2, {"map": asset})
     if not missing:
@@ -130,7 +132,7 @@ def second_revision(atlas, missing=False):
     return old, new
 
 
-def test_a_revision_that_was_replaced(atlas):
+def test_a_replaced_revision_is_removed(atlas):
     old, new = second_revision(atlas)
     assert atlas.sheets(refresh=True)[HERE] == new
     assert found(atlas) == [("second revision", f"items/{old.item_name}")]
@@ -140,16 +142,16 @@ def test_a_revision_that_was_replaced(atlas):
     assert len(atlas.store.names("sheets")) == 2
 
 
-def test_a_revision_stays_while_what_replaced_it_is_not_whole(atlas):
+def test_a_revision_stays_while_its_replacement_is_incomplete(atlas):
     old, new = second_revision(atlas, missing=True)
     wrong = [
         ("second revision", f"items/{old.item_name}"),
-        ("missing file", new.assets["map"].name),
+        ("missing file", new.files["map"].name),
     ]
     assert found(atlas, clean=True, min_age_s=-5) == wrong == found(atlas)
 
 
-def test_files_of_items_that_cannot_be_read_stay(near):
+def test_files_of_unreadable_items_stay(near):
     path = Path(near.url, "items", near.sheets()[HERE].item_name)
     path.write_bytes(path.read_bytes()[:-2])
     assert found(near, clean=True, min_age_s=-5) == [("damaged item", f"items/{path.name}")]
@@ -159,15 +161,15 @@ def test_files_of_items_that_cannot_be_read_stay(near):
     assert found(near) == [] and list(near.sheets(refresh=True)) == [EAST]
 
 
-def test_a_sheet_of_another_lattice(near):
-    told = replace(near.sheets()[HERE], bounds_deg=RECIPE.sheets.bounds_deg(EAST))
-    sheet = Sheet.of(told, 2, told.assets)
+def test_a_sheet_of_another_lattice_is_found(near):
+    description = replace(near.sheets()[HERE], bounds_deg=RECIPE.sheets.bounds_deg(EAST))
+    sheet = Sheet.of(description, 2, description.files)
     near.store.write(f"items/{sheet.item_name}", canonical(sheet.to_item()))
     kinds = [kind for kind, _ in found(near)]
     assert kinds == ["second revision", "damaged item"]
 
 
-def test_a_snapshot_that_is_stale_is_written_anew(atlas):
+def test_a_stale_snapshot_is_rewritten(atlas):
     atlas.snapshot()
     atlas.retire(EAST)
     assert found(atlas) == [("stale snapshot", "items.geojson")]
@@ -175,8 +177,8 @@ def test_a_snapshot_that_is_stale_is_written_anew(atlas):
     assert found(atlas) == []
 
 
-def test_an_index_that_is_stale_or_damaged(atlas):
-    asset = Asset("index/a.npy", 3, hashlib.sha256(b"abc").hexdigest())
+def test_a_stale_or_damaged_index_is_found(atlas):
+    asset = StoredFile("index/a.npy", 3, hashlib.sha256(b"abc").hexdigest())
     shard = ShardInfo("a", 0, (Part(HERE, "ab" * 32, 5),))
     manifest = IndexManifest(VectorRecipe(dims=64), (shard,), {"a.npy": asset})
     atlas.store.write("index/index.json", manifest.to_json())
@@ -189,8 +191,8 @@ def test_an_index_that_is_stale_or_damaged(atlas):
     atlas.store.write(asset.name, b"abd")
     assert found(atlas) == stale
     assert ("wrong checksum", asset.name) in found(atlas, deep=True)
-    elsewhere = replace(manifest, files={"a.npy": replace(asset, name="../../etc/passwd")})
-    atlas.store.write("index/index.json", elsewhere.to_json())
+    outside = replace(manifest, files={"a.npy": replace(asset, name="../../etc/passwd")})
+    atlas.store.write("index/index.json", outside.to_json())
     assert found(atlas) == [("damaged file", "index/index.json"), *stale]
     atlas.store.write("index/index.json", b"{}")
     assert found(atlas) == [("damaged file", "index/index.json")]
@@ -208,11 +210,11 @@ def test_a_sheet_finished_meanwhile_is_no_orphan(near, monkeypatch):
     assert found(near, clean=True, min_age_s=-5) == []
 
 
-def test_a_full_disk_is_said(near, monkeypatch):
+def test_a_full_disk_is_reported(near, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("orthonav.atlas.places.shutil.copyfile", full)
+    monkeypatch.setattr("orthonav.atlas.filesystems.shutil.copyfile", full)
     assert main(["atlas", "add", near.url + "2", near.url, "-q"]) == 1
 
 
@@ -222,8 +224,10 @@ def real(map_path, tmp_path, place):
 
     def make(recipe, tiles=None):
         atlas = Atlas.create(place, recipe, cache=tmp_path / "cache")
-        told = described(HERE, open_map(map_path).manifest.sheets[0].tiles if tiles is None else 1)
-        atlas.put(HERE, {"map": map_path}, told)
+        description = described(
+            HERE, open_map(map_path).manifest.sheets[0].tiles if tiles is None else 1
+        )
+        atlas.put({"map": map_path}, description)
         return atlas
 
     return make
@@ -249,12 +253,12 @@ def test_maps_of_another_recipe_are_found(real):
         assert words in problem.detail
 
 
-def test_what_is_no_map_is_found(near, tmp_path):
+def test_files_that_are_not_maps_are_found(near, tmp_path):
     kinds = [(each.kind, each.detail) for each in check_atlas(near, deep=True)]
     assert [kind for kind, _ in kinds] == ["damaged file"] * 2
     assert "not an orthonav map" in kinds[0][1]
     (tmp_path / "file").write_text("coarse")
-    near.put(HERE, {"map": tmp_path / "file", "coarse": tmp_path / "file"}, described(HERE))
+    near.put({"map": tmp_path / "file", "coarse": tmp_path / "file"}, described(HERE))
     problems = check_atlas(near, deep=True)
     assert [each.name.partition("/")[0] for each in problems] == ["coarse", "sheets", "sheets"]
     assert {each.kind for each in problems} == {"damaged file"}
@@ -280,7 +284,7 @@ def test_info(near, capfd):
     assert all(west < lon < east and south < lat < north for lat, lon in PLACES)
 
 
-def test_info_of_nothing(tmp_path, capfd):
+def test_info_of_an_empty_folder_and_an_empty_atlas(tmp_path, capfd):
     code, done = run(capfd, "info", tmp_path)
     assert code == 1 and done.err.startswith("orthonav: error: no atlas")
     Atlas.create(tmp_path / "atlas", RECIPE)
@@ -291,11 +295,11 @@ def test_info_of_nothing(tmp_path, capfd):
 def test_check(near, capfd):
     code, done = run(capfd, "check", near.url)
     assert (code, done.out) == (0, f"whole, by names and sizes: {near.url}\n")
-    near.store.remove(near.sheets()[HERE].assets["map"].name)
+    near.store.remove(near.sheets()[HERE].files["map"].name)
     near.store.write(".atlas.json.a1b2c3d4.tmp.json", b"")
     code, done = run(capfd, "check", near.url, "--clean", "--min-age-h", "0")
     assert code == 3 and "missing file    sheets/" in done.out and "1 problems" in done.out
-    assert "(put right)" in done.out
+    assert "(removed)" in done.out
     code, done = run(capfd, "check", near.url, "--json", "--deep")
     plain = json.loads(done.out)
     assert code == 3 and not plain["whole"] and plain["deep"]
@@ -305,9 +309,9 @@ def test_check(near, capfd):
 def test_add_and_retire(near, tmp_path, capfd):
     copy = tmp_path / "copy"
     code, done = run(capfd, "add", copy, near.url, "--sheets", EAST)
-    assert (code, done.out) == (0, f"1 sheets added, 0 kept as they were: {copy}\n")
+    assert (code, done.out) == (0, f"1 sheets added, 0 unchanged: {copy}\n")
     code, done = run(capfd, "add", copy, near.url, "--replace")
-    assert done.out.startswith("1 sheets added, 1 kept")
+    assert done.out.startswith("1 sheets added, 1 unchanged")
     assert list(Atlas.open(copy).sheets()) == [HERE, EAST] and found(Atlas.open(copy)) == []
     code, done = run(capfd, "retire", copy, HERE, EAST)
     assert code == 0 and Atlas.open(copy).sheets() == {} and found(Atlas.open(copy)) == []
@@ -319,7 +323,7 @@ def test_add_and_retire(near, tmp_path, capfd):
     assert code == 1 and "seed: 1, not 0" in done.err
 
 
-def test_index_and_cut_are_asked_for_as_told(near, capfd, monkeypatch):
+def test_options_reach_index_and_cut(near, capfd, monkeypatch):
     code, done = run(capfd, "index", near.url)
     assert code == 0 and "nothing to index" in done.out
     asked = {}
@@ -329,8 +333,8 @@ def test_index_and_cut_are_asked_for_as_told(near, capfd, monkeypatch):
         raise AtlasError("sheets are missing")
 
     monkeypatch.setattr("orthonav.atlas.cut.cut_map", cut)
-    told = ["--bounds", "1.8,46.5,1.9,46.6", "--out", "MAP.onav", "--workers", "2"]
-    code, done = run(capfd, "cut", near.url, *told)
+    options = ["--bounds", "1.8,46.5,1.9,46.6", "--out", "MAP.onav", "--workers", "2"]
+    code, done = run(capfd, "cut", near.url, *options)
     assert code == 1 and "sheets are missing" in done.err
     assert asked.pop("progress") is not None
     assert asked == {

@@ -1,4 +1,4 @@
-"""A recipe from a stranger is a recipe, or an error that says why not."""
+"""An untrusted recipe is valid, or an error with the reason."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from orthonav.errors import AtlasError
 RECIPE = AtlasRecipe(gsd_m=1.0)
 
 
-def test_a_recipe_comes_back_as_it_was():
+def test_a_recipe_is_read_back():
     for recipe in (RECIPE, AtlasRecipe(2.5, coarse=None), AtlasRecipe(8, coarse=CoarseRecipe(4.0))):
         assert AtlasRecipe.from_plain(recipe.to_plain()) == recipe
 
@@ -32,12 +32,12 @@ def test_a_recipe_comes_back_as_it_was():
     ],
     ids=str,
 )
-def test_what_is_no_recipe_is_refused(name, value):
+def test_impossible_values_are_refused(name, value):
     with pytest.raises(AtlasError, match="recipe"):
         AtlasRecipe.from_plain({**RECIPE.to_plain(), name: value})
 
 
-def test_a_field_that_is_missing_is_refused():
+def test_missing_fields_are_refused():
     plain = RECIPE.to_plain()
     del plain["seed"]
     with pytest.raises(AtlasError, match="seed"):

@@ -1,4 +1,4 @@
-"""The place of an atlas: whole files or none, nothing outside it, and failures said in words."""
+"""The storage of an atlas: whole files or none, nothing outside it, failures with their cause."""
 
 import errno
 import hashlib
@@ -18,7 +18,7 @@ from orthonav.errors import MissingExtraError, StorageError
 
 
 class Trouble(LocalFileSystem):
-    """A far file system that shows halves of files, and fails when told: operation to error."""
+    """A remote file system that shows incomplete files, and fails as `fails` says."""
 
     protocol = "trouble"
     fails = {}  # noqa: RUF012
@@ -77,14 +77,14 @@ def store(request, tmp_path):
     """An empty place, near and far, with a cache of its own."""
     root = tmp_path / "atlas"
     url = {"folder": str(root), "memory": "memory://test/atlas", "trouble": f"trouble://{root}"}
-    return Store.open(url[request.param], cache=tmp_path / "cache")
+    return Store(url[request.param], cache=tmp_path / "cache")
 
 
 def sha256(data):
     return hashlib.sha256(data).hexdigest()
 
 
-def test_what_is_put_is_there(store, tmp_path):
+def test_files_that_are_put_are_there(store, tmp_path):
     (tmp_path / "file").write_bytes(b"some map")
     store.put(tmp_path / "file", "sheets/a.onav")
     store.write("items/b.1.json", b"{}")
@@ -107,9 +107,9 @@ def test_what_is_put_is_there(store, tmp_path):
     assert store.names("items") == {"b.1.json": 2}
 
 
-def test_reading_has_a_limit_and_says_what_is_missing(store):
+def test_reading_has_a_limit_and_names_missing_files(store):
     store.write("items.geojson", b"12345")
-    with pytest.raises(StorageError, match="larger than such a file may be"):
+    with pytest.raises(StorageError, match="at most 4 are allowed"):
         store.read("items.geojson", limit_bytes=4)
     with pytest.raises(StorageError, match=r"no such file: .*items/none\.json"):
         store.read("items/none.json")
@@ -124,7 +124,7 @@ def test_reading_has_a_limit_and_says_what_is_missing(store):
         *("s3://other/x", "a b", "ü", "x" * 300),
     ],
 )
-def test_nothing_outside_the_atlas_is_named(store, name, tmp_path):
+def test_names_outside_the_atlas_are_refused(store, name, tmp_path):
     (tmp_path / "file").touch()
     for act in (
         lambda: store.read(name),
@@ -137,15 +137,15 @@ def test_nothing_outside_the_atlas_is_named(store, name, tmp_path):
         lambda: store.write(name, b""),
         lambda: store.remove(name),
     ):
-        with pytest.raises(StorageError, match="not a name of a file in an atlas"):
+        with pytest.raises(StorageError, match="invalid name of a file in an atlas"):
             act()
 
 
-def test_links_do_not_lead_out(tmp_path):
+def test_links_that_lead_out_are_refused(tmp_path):
     outside = tmp_path / "outside"
     outside.mkdir()
     (outside / "x").write_bytes(b"mine")
-    store = Store.open(str(tmp_path / "atlas"))
+    store = Store(str(tmp_path / "atlas"))
     store.write("coarse/x", b"1")
     (tmp_path / "atlas" / "sheets").symlink_to(outside)
     (tmp_path / "atlas" / "coarse" / "y").symlink_to(outside / "x")
@@ -165,8 +165,8 @@ def test_links_do_not_lead_out(tmp_path):
 
 @pytest.mark.parametrize("step", ["pipe_file", "mv"])
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "full")])
-def test_far_files_are_whole_or_not_there(trouble, tmp_path, step, error):
-    store = Store.open(f"trouble://{tmp_path}/atlas")
+def test_remote_files_are_whole_or_absent(trouble, tmp_path, step, error):
+    store = Store(f"trouble://{tmp_path}/atlas")
     store.write("items/a", b"old")
     trouble[step] = error
     with pytest.raises((KeyboardInterrupt, StorageError)):
@@ -176,15 +176,15 @@ def test_far_files_are_whole_or_not_there(trouble, tmp_path, step, error):
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "full")])
-def test_near_files_are_whole_or_not_there(tmp_path, monkeypatch, error):
-    store = Store.open(str(tmp_path / "atlas"))
+def test_local_files_are_whole_or_absent(tmp_path, monkeypatch, error):
+    store = Store(str(tmp_path / "atlas"))
     store.write("items/a", b"old")
 
     def half(source, to):
         to.write_bytes(b"ne")
         raise error
 
-    monkeypatch.setattr("orthonav.atlas.places.shutil.copyfile", half)
+    monkeypatch.setattr("orthonav.atlas.filesystems.shutil.copyfile", half)
     with pytest.raises((KeyboardInterrupt, StorageError)) as caught:
         store.put(tmp_path, "items/a")
     assert "full" in str(caught.value) or isinstance(error, KeyboardInterrupt)
@@ -202,18 +202,18 @@ def _of_boto(name, status=None):
     ("error", "words"),
     [
         (PermissionError("Access Denied"), "not permitted, or credentials refused (Access Denied)"),
-        (_of_boto("NoCredentialsError"), "no credentials that are accepted"),
+        (_of_boto("NoCredentialsError"), "no valid credentials"),
         (_of_boto("ClientError", 403), "credentials refused"),
         (_of_boto("EndpointConnectionError"), "cannot be reached"),
         (ConnectionRefusedError("refused"), "cannot be reached"),
         (TimeoutError(), "cannot be reached (TimeoutError)"),
         (OSError(errno.ENOSPC, "full"), "disk full"),
-        (OSError(errno.EROFS, "read-only"), "can only be read"),
+        (OSError(errno.EROFS, "read-only"), "read-only"),
         (RuntimeError("odd\nthing"), "RuntimeError: odd thing"),
     ],
 )
-def test_failures_are_said_in_words(trouble, tmp_path, error, words):
-    store = Store.open(f"trouble://{tmp_path}/atlas", cache=tmp_path / "cache")
+def test_failures_are_reported_with_their_cause(trouble, tmp_path, error, words):
+    store = Store(f"trouble://{tmp_path}/atlas", cache=tmp_path / "cache")
     store.write("items/a", b"12")
     trouble.update(dict.fromkeys(("ls", "info", "get_file", "mv"), error))
     for act in (
@@ -229,34 +229,34 @@ def test_failures_are_said_in_words(trouble, tmp_path, error, words):
     assert not [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
 
 
-def test_a_bucket_that_is_not_there(trouble, tmp_path):
-    store = Store.open(f"trouble://{tmp_path}/atlas")
+def test_a_missing_bucket_is_named(trouble, tmp_path):
+    store = Store(f"trouble://{tmp_path}/atlas")
     trouble["mv"] = FileNotFoundError("The specified bucket does not exist")
     with pytest.raises(StorageError, match=r"no such file, folder or bucket \(The specified buck"):
         store.write("atlas.json", b"{}")
 
 
-def test_what_must_be_installed(monkeypatch):
+def test_missing_packages_are_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "adlfs", None)
     with pytest.raises(MissingExtraError, match=r"abfs:// needs adlfs.* pip install adlfs"):
-        Store.open("abfs://container/atlas")
-    with pytest.raises(StorageError, match=r"cannot be one .*nosuch"):
-        Store.open("nosuch://bucket/atlas")
+        Store("abfs://container/atlas")
+    with pytest.raises(StorageError, match=r"invalid address .*nosuch"):
+        Store("nosuch://bucket/atlas")
     monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(MissingExtraError, match=r"orthonav\[atlas\]"):
-        Store.open("s3://bucket/atlas")
-    Store.open("file:///folders/need/nothing")
+        Store("s3://bucket/atlas")
+    Store("file:///folders/need/nothing")
 
 
 def test_passwords_are_not_shown(monkeypatch):
-    store = Store.open("memory://me:secret@host/atlas")
+    store = Store("memory://me:secret@host/atlas")
     assert str(store) == "memory://me@host/atlas"
     with pytest.raises(StorageError) as caught:
         store.read("items/a")
     assert "secret" not in str(caught.value)
 
 
-def test_a_store_goes_to_other_processes(store):
+def test_a_store_can_be_pickled(store):
     store.write("items/a", b"12")
     again = pickle.loads(pickle.dumps(store))
     assert (again.url, again.cache, again.read("items/a")) == (store.url, store.cache, b"12")
@@ -265,12 +265,12 @@ def test_a_store_goes_to_other_processes(store):
 @pytest.fixture
 def far(tmp_path):
     """A far place with a file in it, and its cache."""
-    store = Store.open("memory://test/atlas", cache=tmp_path / "cache")
+    store = Store("memory://test/atlas", cache=tmp_path / "cache")
     store.write("sheets/a.onav", b"map of a")
     return store
 
 
-def test_far_files_are_copied_once(far, tmp_path, monkeypatch):
+def test_remote_files_are_copied_once(far, tmp_path, monkeypatch):
     path = far.fetch("sheets/a.onav", 8, sha256(b"map of a"))
     assert path.read_bytes() == b"map of a" and path.suffix == ".onav"
     assert path.is_relative_to(tmp_path / "cache")
@@ -278,15 +278,15 @@ def test_far_files_are_copied_once(far, tmp_path, monkeypatch):
     assert far.fetch("sheets/a.onav", 8, sha256(b"map of a")) == path
 
 
-def test_a_copy_that_was_cut_is_fetched_again(far):
+def test_an_incomplete_copy_is_fetched_again(far):
     path = far.fetch("sheets/a.onav", 8, sha256(b"map of a"))
     path.write_bytes(b"map")
     assert far.fetch("sheets/a.onav", 8, sha256(b"map of a")).read_bytes() == b"map of a"
 
 
-def test_what_is_not_as_the_catalogue_says_is_refused(store):
+def test_files_that_differ_from_the_catalogue_are_refused(store):
     store.write("sheets/a.onav", b"map of a")
-    with pytest.raises(StorageError, match=r"half there or altered: 8 bytes, the catalogue says 9"):
+    with pytest.raises(StorageError, match=r"incomplete or altered: 8 bytes, the catalogue has 9"):
         store.fetch("sheets/a.onav", 9, sha256(b"map of a"))
     with pytest.raises(StorageError, match="damaged or altered"):
         store.fetch("sheets/a.onav", 8, sha256(b"map of b"))
@@ -296,8 +296,8 @@ def test_what_is_not_as_the_catalogue_says_is_refused(store):
     assert not [path for path in store.cache.rglob("*") if path.is_file()]
 
 
-def test_near_files_are_read_where_they_lie(tmp_path):
-    store = Store.open(str(tmp_path))
+def test_local_files_are_not_copied(tmp_path):
+    store = Store(str(tmp_path))
     store.write("sheets/a.onav", b"map of a")
     path = store.fetch("sheets/a.onav", 8, sha256(b"map of a"))
     assert path == tmp_path / "sheets" / "a.onav"
@@ -307,7 +307,7 @@ def test_near_files_are_read_where_they_lie(tmp_path):
         store.fetch("sheets/a.onav", 8, sha256(b"map of a"))
 
 
-def test_what_was_not_used_for_longest_leaves_the_cache(far, monkeypatch):
+def test_the_least_recently_used_files_leave_the_cache(far, monkeypatch):
     monkeypatch.setenv("ORTHONAV_CACHE_GB", "25e-9")  # three files of 8 bytes
     monkeypatch.setattr(cache_module, "GRACE_S", 50)
     paths = {}
@@ -326,7 +326,7 @@ def test_what_was_not_used_for_longest_leaves_the_cache(far, monkeypatch):
     assert left == ["b"]  # used a moment ago: somebody is about to open it
 
 
-def test_where_the_cache_is(monkeypatch, tmp_path, far):
+def test_the_folder_of_the_cache(monkeypatch, tmp_path, far):
     monkeypatch.setenv("ORTHONAV_CACHE", str(tmp_path / "own"))
     assert cache_folder() == tmp_path / "own"
     monkeypatch.delenv("ORTHONAV_CACHE")

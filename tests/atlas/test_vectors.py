@@ -1,6 +1,6 @@
 """The index of vectors: against exact search, its files, its shards, what is refused."""
 
-import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +8,10 @@ import pytest
 
 pytest.importorskip("faiss")
 
-from orthonav.atlas.shards import TRAINED_NAME, ShardWriter, remove_shard, retire_rows
+from orthonav.atlas.index_manifest import Part, ShardInfo
+from orthonav.atlas.index_shards import write_shard
+from orthonav.atlas.quantizers import QUANTIZERS_NAME, Quantizers, VectorRecipe, train
 from orthonav.atlas.vector_search import ShardedIndex
-from orthonav.atlas.vectors import Trained, VectorRecipe, train
 from orthonav.errors import AtlasError
 
 DIMS, COUNT = 16, 6000
@@ -37,46 +38,53 @@ def vectors() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def trained(vectors: np.ndarray) -> Trained:
+def quantizers(vectors: np.ndarray) -> Quantizers:
     return train(vectors, RECIPE)
 
 
+SHARDS = (
+    ShardInfo("a", 0, (Part("one", "", 1500), Part("two", "", 2500))),
+    ShardInfo("b", 4000, (Part("three", "", 2000),)),
+)
+
+
 @pytest.fixture
-def folder(tmp_path: Path, vectors: np.ndarray, trained: Trained) -> Path:
-    trained.save(tmp_path / TRAINED_NAME)
-    write(tmp_path, "a", trained, 0, vectors[:4000])
-    write(tmp_path, "b", trained, 10_000, vectors[4000:])
+def folder(tmp_path: Path, vectors: np.ndarray, quantizers: Quantizers) -> Path:
+    quantizers.save(tmp_path / QUANTIZERS_NAME)
+    write(tmp_path, "a", quantizers, vectors[:4000])
+    write(tmp_path, "b", quantizers, vectors[4000:])
     return tmp_path
 
 
-def write(folder: Path, name: str, trained: Trained, base: int, vectors: np.ndarray) -> None:
-    with ShardWriter(folder, name, trained, base) as writer:
-        for start in range(0, len(vectors), 1500):
-            writer.add(vectors[start : start + 1500])
+def write(folder: Path, name: str, quantizers: Quantizers, vectors: np.ndarray) -> None:
+    batches = (vectors[start : start + 1500] for start in range(0, len(vectors), 1500))
+    write_shard(folder, name, quantizers, places(len(vectors)), batches)
 
 
-def test_exact_is_exact(folder: Path, vectors: np.ndarray) -> None:
-    queries = seen(vectors)
+def places(count: int) -> np.ndarray:
+    return np.stack([np.arange(count) / 100, -np.arange(count) / 100], axis=1)
+
+
+def exact(vectors: np.ndarray, queries: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """Highest products and rows by comparing all stored vectors."""
     products = queries @ vectors.astype(np.float16).astype(np.float32).T
-    order = np.argsort(-products, axis=1)[:, :10]
-    scores, ids = ShardedIndex.open(folder).exact(queries, 10)
-    np.testing.assert_allclose(scores, np.take_along_axis(products, order, 1), atol=1e-6)
-    assert np.mean(ids == np.where(order >= 4000, order + 6000, order)) > 0.99
+    order = np.argsort(-products, axis=1, kind="stable")[:, :k]
+    return np.take_along_axis(products, order, 1), order
 
 
-def test_finds_what_exact_search_finds(folder: Path, vectors: np.ndarray) -> None:
-    index, queries = ShardedIndex.open(folder), seen(vectors)
-    exact_scores, exact = index.exact(queries, 10)
+def test_search_finds_what_exact_search_finds(folder: Path, vectors: np.ndarray) -> None:
+    index, queries = ShardedIndex(folder, SHARDS), seen(vectors)
+    exact_scores, expected = exact(vectors, queries, 10)
     scores, ids = index.search(queries, 10, probes=64, rerank=400)
-    assert np.mean([np.isin(a, b).mean() for a, b in zip(ids, exact, strict=True)]) > 0.99
-    same = ids == exact
+    assert np.mean([np.isin(a, b).mean() for a, b in zip(ids, expected, strict=True)]) > 0.99
+    same = ids == expected
     np.testing.assert_allclose(scores[same], exact_scores[same], atol=1e-6)
     _, few = index.search(queries, 10, probes=16, rerank=400)
-    assert np.mean([np.isin(a, b).mean() for a, b in zip(few, exact, strict=True)]) > 0.6
+    assert np.mean([np.isin(a, b).mean() for a, b in zip(few, expected, strict=True)]) > 0.6
 
 
 def test_one_query_finds_the_same_as_many(folder: Path, vectors: np.ndarray) -> None:
-    index, queries = ShardedIndex.open(folder), seen(vectors)
+    index, queries = ShardedIndex(folder, SHARDS), seen(vectors)
     scores, ids = index.search(queries, 5, probes=20, rerank=200)
     for query in range(10):
         alone_scores, alone = index.search(queries[query : query + 1], 5, probes=20, rerank=200)
@@ -87,133 +95,115 @@ def test_one_query_finds_the_same_as_many(folder: Path, vectors: np.ndarray) -> 
 def test_same_input_same_bytes(tmp_path: Path, vectors: np.ndarray) -> None:
     for name in ("one", "other"):
         again = train(vectors, RECIPE)
-        again.save(tmp_path / name / TRAINED_NAME)
-        write(tmp_path / name, "a", again, 0, vectors[:4000])
+        write(tmp_path / name, "a", again, vectors[:4000])
+        again.save(tmp_path / name / QUANTIZERS_NAME)
     files = sorted(path.name for path in (tmp_path / "one").iterdir())
-    assert files == ["a.codes", "a.json", "a.lists.npy", "a.vectors.npy", TRAINED_NAME]
+    assert files == ["a.codes", "a.lists.npy", "a.places.npy", "a.vectors.npy", QUANTIZERS_NAME]
     for name in files:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
 
 
-def test_a_shard_does_not_depend_on_blocks(tmp_path: Path, folder: Path, trained: Trained) -> None:
+def test_a_shard_does_not_depend_on_batches(
+    tmp_path: Path, folder: Path, vectors: np.ndarray, quantizers: Quantizers
+) -> None:
     stored = np.load(folder / "a.vectors.npy")
-    with ShardWriter(tmp_path / "again", "a", trained, 0) as writer:
-        writer.add(stored)
+    np.testing.assert_array_equal(stored, vectors[:4000].astype(np.float16))
+    write_shard(tmp_path / "again", "a", quantizers, places(4000), [stored])
     assert (tmp_path / "again" / "a.codes").read_bytes() == (folder / "a.codes").read_bytes()
 
 
-def test_quantizers_survive_saving(tmp_path: Path, trained: Trained) -> None:
-    trained.save(tmp_path / "t")
-    loaded = Trained.load(tmp_path / "t")
-    assert loaded.recipe == trained.recipe
-    assert loaded.digest == trained.digest
-    np.testing.assert_allclose(trained.turn.T @ trained.turn, np.eye(DIMS), atol=1e-5)
+def test_quantizers_survive_saving(tmp_path: Path, quantizers: Quantizers) -> None:
+    quantizers.save(tmp_path / "t")
+    loaded = Quantizers.load(tmp_path / "t")
+    assert loaded.recipe == quantizers.recipe
+    assert loaded.digest == quantizers.digest
+    np.testing.assert_allclose(quantizers.rotation.T @ quantizers.rotation, np.eye(DIMS), atol=1e-5)
 
 
 def test_retired_rows_are_not_found(folder: Path, vectors: np.ndarray) -> None:
+    retired = (
+        replace(SHARDS[0], parts=(replace(SHARDS[0].parts[0], retired=True), SHARDS[0].parts[1])),
+        SHARDS[1],
+    )
     queries = seen(vectors)
-    _, before = ShardedIndex.open(folder).exact(queries, 3)
-    gone = np.unique(before[:, 0])
-    retire_rows(folder, "a", gone[gone < 10_000][:5])
-    retire_rows(folder, "a", gone[gone < 10_000][5:])
-    retire_rows(folder, "b", gone[gone >= 10_000] - 10_000)
-    index = ShardedIndex.open(folder)
-    for _, ids in (index.exact(queries, 3), index.search(queries, 3, 64, 400)):
-        assert not np.isin(ids, gone).any()
-        np.testing.assert_array_equal(ids[:, 0] == before[:, 1], ~np.isin(before[:, 1], gone))
+    _, before = ShardedIndex(folder, SHARDS).search(queries, 3, 64, 400)
+    assert (before[:, 0] < 1500).any()
+    _, ids = ShardedIndex(folder, retired).search(queries, 3, 64, 400)
+    assert ids.min() >= 1500
+    unaffected = (before >= 1500).all(axis=1)
+    np.testing.assert_array_equal(ids[unaffected], before[unaffected])
 
 
-def test_shards_come_and_go(folder: Path, vectors: np.ndarray, trained: Trained) -> None:
-    remove_shard(folder, "a")
-    index = ShardedIndex.open(folder)
-    assert len(index) == 2000
-    assert index.search(vectors[:5], 4, 64, 100)[1].min() >= 10_000
-    remove_shard(folder, "a")
-    write(folder, "b", trained, 500, vectors[:100])
-    _, ids = ShardedIndex.open(folder).search(vectors[:5], 1, 64, 100)
-    np.testing.assert_array_equal(ids[:, 0], 500 + np.arange(5))
+def test_ids_lead_to_vectors_and_places(folder: Path, vectors: np.ndarray) -> None:
+    index = ShardedIndex(folder, SHARDS)
+    assert len(index) == 6000
+    np.testing.assert_allclose(index.vectors(np.array([4001, 7])), vectors[[4001, 7]], atol=1e-3)
+    np.testing.assert_array_equal(index.vectors(np.array([6000]))[0], 0)
+    assert index.place_deg(7) == (0.07, -0.07) and index.place_deg(4001) == (0.01, -0.01)
+    assert index.place_deg(6000) is None
 
 
-def test_fewer_vectors_than_asked_for(
-    tmp_path: Path, vectors: np.ndarray, trained: Trained
+def test_fewer_vectors_than_requested(
+    tmp_path: Path, vectors: np.ndarray, quantizers: Quantizers
 ) -> None:
-    trained.save(tmp_path / TRAINED_NAME)
-    write(tmp_path, "few", trained, 7, vectors[:3])
-    write(tmp_path, "none", trained, 100, vectors[:0])
-    index = ShardedIndex.open(tmp_path)
-    for scores, ids in (index.search(vectors[:2], 5, 64, 10), index.exact(vectors[:2], 5)):
-        assert sorted(ids[0, :3]) == [7, 8, 9]
-        assert (ids[:, 3:] == -1).all() and np.isneginf(scores[:, 3:]).all()
-    np.testing.assert_array_equal(index.vectors(np.array([99]))[0], 0)
-    np.testing.assert_allclose(index.vectors(np.array([9, 7])), vectors[[2, 0]], atol=1e-3)
+    write(tmp_path, "few", quantizers, vectors[:3])
+    write(tmp_path, "none", quantizers, vectors[:0])
+    quantizers.save(tmp_path / QUANTIZERS_NAME)
+    shards = ShardInfo("few", 0, (Part("x", "", 3),)), ShardInfo("none", 3, (Part("y", "", 0),))
+    scores, ids = ShardedIndex(tmp_path, shards).search(vectors[:2], 5, 64, 10)
+    assert sorted(ids[0, :3]) == [0, 1, 2]
+    assert (ids[:, 3:] == -1).all() and np.isneginf(scores[:, 3:]).all()
 
 
-def test_nothing_is_there_after_a_failure(
-    tmp_path: Path, vectors: np.ndarray, trained: Trained
+def test_impossible_vectors_are_refused(
+    tmp_path: Path, vectors: np.ndarray, quantizers: Quantizers
 ) -> None:
-    with pytest.raises(RuntimeError), ShardWriter(tmp_path, "a", trained, 0) as writer:
-        writer.add(vectors[:50])
-        raise RuntimeError
-    assert list(tmp_path.iterdir()) == []
-    with (
-        pytest.raises(AtlasError, match="finite"),
-        ShardWriter(tmp_path, "a", trained, 0) as writer,
+    for batch, words in (
+        (np.full((1, DIMS), np.nan, dtype=np.float32), "finite"),
+        (vectors[:1, :8], "must be"),
+        (vectors[:2], "2 vectors for 1 places"),
     ):
-        writer.add(np.full((1, DIMS), np.nan, dtype=np.float32))
-    with (
-        pytest.raises(AtlasError, match="must be"),
-        ShardWriter(tmp_path, "a", trained, 0) as writer,
-    ):
-        writer.add(vectors[:, :8])
+        with pytest.raises(AtlasError, match=words):
+            write_shard(tmp_path, "a", quantizers, places(1), [batch])
 
 
-@pytest.mark.parametrize("name", ["a.codes", "a.lists.npy", "a.vectors.npy", "a.json"])
+@pytest.mark.parametrize("name", ["a.codes", "a.lists.npy", "a.vectors.npy", "a.places.npy"])
 def test_truncated_files_are_refused(folder: Path, name: str) -> None:
     contents = (folder / name).read_bytes()
     (folder / name).write_bytes(contents[: len(contents) // 2])
     with pytest.raises(AtlasError):
-        ShardedIndex.open(folder)
+        ShardedIndex(folder, SHARDS)
 
 
-@pytest.mark.parametrize("name", ["a.codes", "a.lists.npy", "a.vectors.npy", TRAINED_NAME])
-def test_missing_files_are_told(folder: Path, name: str) -> None:
+@pytest.mark.parametrize("name", ["a.codes", "a.lists.npy", "a.places.npy", QUANTIZERS_NAME])
+def test_missing_files_are_named(folder: Path, name: str) -> None:
     (folder / name).unlink()
     with pytest.raises(AtlasError, match="cannot be read"):
-        ShardedIndex.open(folder)
+        ShardedIndex(folder, SHARDS)
 
 
-def test_damaged_codes_are_told(folder: Path, vectors: np.ndarray) -> None:
+def test_damaged_codes_are_refused(folder: Path, vectors: np.ndarray) -> None:
     size = (folder / "a.codes").stat().st_size
     (folder / "a.codes").write_bytes(b"\x7f" * size)
     with pytest.raises(AtlasError, match="damaged"):
-        ShardedIndex.open(folder).search(vectors[:1], 5, 64, 100)
-
-
-def test_other_quantizers_are_refused(folder: Path, vectors: np.ndarray) -> None:
-    train(vectors[::2], RECIPE).save(folder / TRAINED_NAME)
-    with pytest.raises(AtlasError, match="other quantizers"):
-        ShardedIndex.open(folder)
+        ShardedIndex(folder, SHARDS).search(vectors[:1], 5, 64, 100)
 
 
 def test_damaged_quantizers_are_refused(folder: Path) -> None:
-    (folder / TRAINED_NAME).write_bytes(b"no")
+    (folder / QUANTIZERS_NAME).write_bytes(b"no")
     with pytest.raises(AtlasError, match="cannot be read"):
-        ShardedIndex.open(folder)
+        ShardedIndex(folder, SHARDS)
     with pytest.raises(AtlasError, match="cannot be read"):
-        Trained.load(folder / "absent")
+        Quantizers.load(folder / "absent")
 
 
-def test_ids_must_not_overlap(folder: Path, vectors: np.ndarray, trained: Trained) -> None:
-    write(folder, "c", trained, 3999, vectors[:10])
-    with pytest.raises(AtlasError, match="begin before"):
-        ShardedIndex.open(folder)
-    told = json.loads((folder / "c.json").read_text())
-    (folder / "c.json").write_text(json.dumps({**told, "schema": 2}))
-    with pytest.raises(AtlasError, match="schema 2"):
-        ShardedIndex.open(folder)
+def test_a_shard_of_another_size_is_refused(folder: Path) -> None:
+    other = (replace(SHARDS[0], parts=SHARDS[0].parts[:1]),)
+    with pytest.raises(AtlasError, match="expected 1500 vectors"):
+        ShardedIndex(folder, other)
 
 
-def test_impossible_recipes_are_refused(vectors: np.ndarray) -> None:
+def test_impossible_recipes_are_refused(folder: Path, vectors: np.ndarray) -> None:
     for fields in ({"dims": 15}, {"list_bits": 5}, {"quantizers": 5}, {"list_bits": 40}):
         with pytest.raises(AtlasError):
             VectorRecipe(**{"dims": DIMS, "quantizers": 8, **fields})
@@ -222,7 +212,7 @@ def test_impossible_recipes_are_refused(vectors: np.ndarray) -> None:
     with pytest.raises(AtlasError, match="must be"):
         train(vectors[:, :8], RECIPE)
     with pytest.raises(ValueError, match="queries"):
-        ShardedIndex(train(vectors, RECIPE), []).search(vectors[:1, :8], 1, 1, 1)
+        ShardedIndex(folder, SHARDS).search(vectors[:1, :8], 1, 1, 1)
 
 
 def test_lists_grow_with_the_count() -> None:

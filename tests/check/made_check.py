@@ -1,4 +1,4 @@
-"""Checks made up for tests of what is written: nothing here was predicted."""
+"""Synthetic check results for tests of the output files."""
 
 import math
 from itertools import pairwise
@@ -6,16 +6,16 @@ from itertools import pairwise
 import numpy as np
 
 from orthonav.check.outcome import (
-    About,
     Along,
     Alternative,
+    BlindStretch,
     Cells,
     CheckResult,
     Conditions,
     Envelope,
     Lookalike,
+    Provenance,
     Reason,
-    Stretch,
     Verdict,
     Word,
 )
@@ -33,7 +33,7 @@ CONDITIONS = Conditions(
     speed_mps=22.0,
     drift=0.02,
 )
-GO = Verdict(Word.GO, (Reason("sure", "Nearly all of the route is sure.", Word.GO),))
+GO = Verdict(Word.GO, (Reason("fixes", "A fix is likely along nearly all of the route.", Word.GO),))
 NO_GO = Verdict(
     Word.NO_GO,
     (
@@ -61,14 +61,14 @@ def made_cells(rows, cols, side_m, seed=1, west_m=None, north_m=None):
         error_m=2 + 12 * (1 - probability),
         wrong=0.03 * (1 - probability),
         trials=rng.integers(4, 20, (rows, cols)).astype(np.int32),
-        texture=np.clip(probability + 0.1 * rng.normal(size=(rows, cols)), 0, 1),
+        persistence=np.clip(probability + 0.1 * rng.normal(size=(rows, cols)), 0, 1),
     )
 
 
 def lost_in(cells, mask):
-    """The same cells with nothing known where `mask` is."""
+    """The same cells, unknown where `mask` is set."""
     hole = np.where(mask, np.nan, 1.0)
-    names = ("probability", "low", "high", "error_m", "wrong", "texture")
+    names = ("probability", "low", "high", "error_m", "wrong", "persistence")
     values = {name: getattr(cells, name) * hole for name in names}
     trials = np.where(mask, 0, cells.trials).astype(np.int32)
     return Cells(cells.west_m, cells.north_m, cells.side_m, trials=trials, **values)
@@ -80,7 +80,7 @@ def stretches_of(distance_m, probability, speed_mps, drift):
     edges = np.flatnonzero(np.diff(low.astype(int))).reshape(-1, 2)
     last = len(distance_m) - 1
     return tuple(
-        Stretch(
+        BlindStretch(
             start_m=float(distance_m[first]),
             end_m=float(distance_m[min(end, last)]),
             start_s=float(distance_m[first] / speed_mps),
@@ -113,6 +113,8 @@ def along_of(cells, waypoints, step_m=25.0):
         distance_m=distance,
         points_en_m=points,
         probability=probability,
+        low=cells.low[rows, cols],
+        high=cells.high[rows, cols],
         across_low=np.maximum(probability - 0.15, 0),
         error_m=cells.error_m[rows, cols],
         drift_m=drift,
@@ -138,7 +140,7 @@ def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", rout
         Lookalike(places[0], places[2], math.hypot(300, 100), 0.62, 9, False),
     )
     parts = {
-        "about": About(
+        "about": Provenance(
             map_name=name,
             imagery="2016-07.tif 2016-07-15, 1.0 m",
             recipe="gradient, 256 px",
@@ -208,7 +210,7 @@ def long_route(frame):
 
 
 def nearly_empty(frame):
-    """Nothing known but in a few cells."""
+    """Only a few known cells."""
     cells = made_cells(20, 20, 50.0)
     mask = np.ones((20, 20), dtype=bool)
     mask[3, 4:6] = False

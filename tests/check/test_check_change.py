@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from helpers import textured
-from orthonav.check.change import Severity, another_year, tilted
+from orthonav.check.change import Severity, another_year, displaced
 
 SIZE = 192
 MILD = Severity(field=0.0, view=0.0, shift=0.0)
@@ -21,18 +21,20 @@ def kept(one, other):
     return float((first * second.conj()).real.mean())
 
 
-def changed(lasting, seed=1, grey=None, stranger=None):
+def changed(lasting, seed=1, grey=None, donor=None):
     grey = textured((SIZE, SIZE), 5) if grey is None else grey
-    stranger = textured((SIZE, SIZE), 6) if stranger is None else stranger
+    donor = textured((SIZE, SIZE), 6) if donor is None else donor
     persistence = [np.full((SIZE, SIZE), lasting, np.float32)] * 3
-    return another_year(np.random.default_rng(seed), grey, stranger, persistence, MILD)
+    return another_year(np.random.default_rng(seed), grey, donor, persistence, MILD)
 
 
 def test_the_more_lasts_the_more_is_kept():
     grey = textured((SIZE, SIZE), 5)
-    told = [np.mean([kept(grey, changed(each, seed)) for seed in range(3)]) for each in LASTING]
-    assert told[0] < 0.1 and told[-1] > 0.5
-    assert all(np.diff(told) > 0)
+    correlation = [
+        np.mean([kept(grey, changed(each, seed)) for seed in range(3)]) for each in LASTING
+    ]
+    assert correlation[0] < 0.1 and correlation[-1] > 0.5
+    assert all(np.diff(correlation) > 0)
 
 
 LASTING = (0.01, 0.3, 0.6, 0.95)
@@ -42,8 +44,8 @@ def test_what_lasts_is_kept_where_it_does():
     grey = textured((SIZE, SIZE), 5)
     lasting = np.where(np.arange(SIZE) < SIZE // 2, 0.9, 0.02).astype(np.float32)
     persistence = [np.broadcast_to(lasting, (SIZE, SIZE))] * 3
-    stranger = textured((SIZE, SIZE), 6)
-    made = another_year(np.random.default_rng(2), grey, stranger, persistence, MILD)
+    donor = textured((SIZE, SIZE), 6)
+    made = another_year(np.random.default_rng(2), grey, donor, persistence, MILD)
     west, east = np.s_[:, : SIZE // 2], np.s_[:, SIZE // 2 :]
     assert kept(grey[west], made[west]) > 0.3 > 0.15 > kept(grey[east], made[east])
 
@@ -51,7 +53,7 @@ def test_what_lasts_is_kept_where_it_does():
 def test_what_comes_instead_stays_mirrored():
     """It is turned, never flipped again: then it would be found where it is from."""
     ground = textured((SIZE, SIZE), 7)
-    made = changed(0.005, stranger=ground[:, ::-1])
+    made = changed(0.005, donor=ground[:, ::-1])
     turned = [np.rot90(ground, times) for times in range(4)]
     mirrored = [np.rot90(ground[:, ::-1], times) for times in range(4)]
     assert max(kept(each, made) for each in turned) < 0.1
@@ -59,28 +61,28 @@ def test_what_comes_instead_stays_mirrored():
 
 
 def test_the_same_every_time_and_nothing_touched():
-    grey, stranger = textured((SIZE, SIZE), 5), textured((SIZE, SIZE), 6)
-    before = grey.copy(), stranger.copy()
-    first, second = (changed(0.4, 3, grey, stranger) for _ in range(2))
+    grey, donor = textured((SIZE, SIZE), 5), textured((SIZE, SIZE), 6)
+    before = grey.copy(), donor.copy()
+    first, second = (changed(0.4, 3, grey, donor) for _ in range(2))
     assert_array_equal(first, second)
     assert (changed(0.4, 4) != first).any()
     assert_array_equal(grey, before[0])
-    assert_array_equal(stranger, before[1])
+    assert_array_equal(donor, before[1])
     assert first.dtype == np.uint8 and first.shape == grey.shape
 
 
 @pytest.mark.parametrize("grey", [0, 255])
 def test_blank_ground(grey):
     blank = np.full((SIZE, SIZE), grey, np.uint8)
-    made = changed(0.5, grey=blank, stranger=blank)
+    made = changed(0.5, grey=blank, donor=blank)
     assert made.shape == blank.shape and made.std() < 60
 
 
 def test_what_stands_tilts_away_from_the_middle():
     grey = textured((SIZE, SIZE), 5)
-    upright = tilted(np.random.default_rng(1), grey, 0.0, 15.0)
+    upright = displaced(np.random.default_rng(1), grey, 0.0, 15.0)
     assert_array_equal(upright, grey)
-    leant = tilted(np.random.default_rng(1), grey, 4.0, 15.0)
+    leant = displaced(np.random.default_rng(1), grey, 4.0, 15.0)
     off = np.abs(leant.astype(int) - grey)
     middle, rim = np.s_[SIZE // 2 - 8 : SIZE // 2 + 8], np.s_[:24]
     assert off[middle, middle].mean() < 0.3 * off[rim, rim].mean()

@@ -1,4 +1,4 @@
-"""The whole check: of a small map with trials, and with trials made up; then as a command."""
+"""The whole check of a small map with real and synthetic trials, and as a command."""
 
 import json
 import math
@@ -76,7 +76,7 @@ def test_the_half_that_shows_something_is_where_views_are_placed(tried):
     assert {what for what, _ in said} == {"trials"} and said[-1][1] == 1.0
 
 
-def test_what_a_check_tells(tried):
+def test_the_values_of_a_check(tried):
     result, _ = tried
     cells = result.cells
     assert not result.second_date and result.area_km2 == pytest.approx(0.54, rel=0.15)
@@ -91,11 +91,11 @@ def test_what_a_check_tells(tried):
     json.loads(to_json(result))
 
 
-# With trials made up.
+# With synthetic trials.
 
 
-def made_up(work, workers, report):
-    """Views of the west are placed, of the east not; of another date nowhere."""
+def made_up(work, workers, progress):
+    """Views of the west are placed, those of the east and of a second date are not."""
     found = []
     for plan, places in work:
         west = [place[0] < 0 and plan.other_path is None for place in places]
@@ -118,8 +118,8 @@ def checked(untried, half_blank):
     """Function that checks the map with made-up trials."""
 
     def check(**changed):
-        told = {"camera": CAMERA, "agl_m": 130.0, "prior_std_m": 50.0, "effort": 0.5}
-        return check_map(CheckRequest(half_blank.map, **(told | changed)))[0]
+        usual = {"camera": CAMERA, "agl_m": 130.0, "prior_std_m": 50.0, "effort": 0.5}
+        return check_map(CheckRequest(half_blank.map, **(usual | changed)))[0]
 
     return check
 
@@ -199,9 +199,9 @@ def test_legs_with_bands_of_their_own(checked, frame):
     assert known(0, 150) and known(0, 60) and not known(0, 0)
 
 
-def test_holes_are_told(untried, half_blank, opened, tmp_path, monkeypatch):
-    """The map shows a strip only: around it nothing is known, in a band the chance is none."""
-    whole = check_run.Ground.of
+def test_holes_of_the_map_are_unknown(untried, half_blank, opened, tmp_path, monkeypatch):
+    """The map covers a strip: around it nothing is known, and in a band the probability is 0."""
+    whole = check_run.MapCoverage.of
 
     def holed(layer, grid):
         ground = whole(layer, grid)
@@ -209,7 +209,7 @@ def test_holes_are_told(untried, half_blank, opened, tmp_path, monkeypatch):
         valid[: len(valid) // 2] = False
         return replace(ground, valid=valid)
 
-    monkeypatch.setattr(check_run.Ground, "of", holed)
+    monkeypatch.setattr(check_run.MapCoverage, "of", holed)
     request = CheckRequest(half_blank.map, camera=CAMERA, agl_m=130.0, prior_std_m=50.0)
     cells = check_map(request)[0].cells
     assert cells.north_m < 30 and np.nanmax(cells.probability) > 0.8
@@ -287,11 +287,11 @@ def test_views_that_fit_on_no_map(checked, frame):
     assert many.conditions.width_m == pytest.approx(166.4, abs=0.1)
 
 
-def test_routes_that_are_elsewhere(checked, frame):
+def test_routes_outside_the_map(checked, frame):
     for points in ([[20_000, 0], [20_500, 0]], [[-200, 5000]]):
-        with pytest.raises(AreaError, match="nowhere on the map"):
+        with pytest.raises(AreaError, match="does not touch the map"):
             checked(route=route_of(frame, points))
-    with pytest.raises(AreaError, match="nowhere on the map"):
+    with pytest.raises(AreaError, match="does not touch the map"):
         checked(route=Route(((-40.0, 170.0), (-40.0, 170.01))))
     with pytest.raises(AreaError, match="wider than 0 m"):
         checked(route=route_of(frame, [[-200, 0], [200, 0]]), band_m=-5.0)
@@ -300,14 +300,14 @@ def test_routes_that_are_elsewhere(checked, frame):
 
 
 def test_another_date_that_shows_nothing_here(half_blank, checked, monkeypatch):
-    def none_of_other(work, workers, report):
-        found = made_up(work, workers, report)
+    def none_of_other(work, workers, progress):
+        found = made_up(work, workers, progress)
         return [
             [] if plan.other_path else each for (plan, _), each in zip(work, found, strict=True)
         ]
 
     monkeypatch.setattr(check_run, "run_many", none_of_other)
-    with pytest.raises(AreaError, match="no ground where the check looks"):
+    with pytest.raises(AreaError, match="does not cover the checked area"):
         checked(other_date=half_blank.present)
 
 
@@ -334,17 +334,16 @@ VIEWS = ("--agl-m", "170", "--prior-std-m", "50", "--workers", "1")
 
 def test_command(run, untried, half_blank, route_path, tmp_path):
     out = tmp_path / "report"
-    told = run(
-        *("check", half_blank.map, "--route", route_path, "--ortho", half_blank.present),
-        *(*VIEWS, "--effort", "0.05", "--json", tmp_path / "said.json", "--out", out),
+    done = run(
+        *("check", half_blank.map, "--route", route_path, "--other-date", half_blank.present),
+        *(*VIEWS, "--effort", "0.05", "--out", out),
     )
-    assert told.code in (0, 3, 4) and told.err == ""
-    assert f"report: {out / 'index.html'}" in told.out
+    assert done.code in (0, 3, 4) and done.err == ""
+    assert f"report: {out / 'index.html'}" in done.out
     names = {path.name for path in out.iterdir()}
-    assert {"index.html", "check.json", "check.tif", "check.gpkg", "check.qml", "figures"} == names
+    assert {"index.html", "check.json", "check.tif", "check.geojson", "figures"} == names
     plain = json.loads((out / "check.json").read_text())
-    assert plain == json.loads((tmp_path / "said.json").read_text())
-    assert plain["verdict"]["exit_code"] == told.code
+    assert plain["verdict"]["exit_code"] == done.code
     assert plain["about"]["other_date"] == half_blank.present.name
     assert plain["conditions"]["agl_m"] == 170
     with rasterio.open(out / "check.tif") as raster:
@@ -361,17 +360,17 @@ def unwritten(untried, monkeypatch):
 def test_exit_codes(run, unwritten, half_blank, tmp_path, monkeypatch, word):
     judge = check_run.verdict_of
     monkeypatch.setattr(check_run, "verdict_of", lambda found: Verdict(word, judge(found).reasons))
-    told = run("check", half_blank.map, *VIEWS, "--json", "--out", tmp_path / "report")
-    assert (told.code, told.err) == (word.exit_code, "")
-    assert json.loads(told.out)["verdict"]["word"] == word.value
+    done = run("check", half_blank.map, *VIEWS, "--json", "--out", tmp_path / "report")
+    assert (done.code, done.err) == (word.exit_code, "")
+    assert json.loads(done.out)["verdict"]["word"] == word.value
 
 
 def test_unknowns(run, unwritten, half_blank, tmp_path):
-    told = run(
+    done = run(
         *("check", half_blank.map, "--heading", "unknown", "--prior", "none", "--agl-m", "170"),
         *("--json", "--out", tmp_path / "report"),
     )
-    conditions = json.loads(told.out)["conditions"]
+    conditions = json.loads(done.out)["conditions"]
     assert conditions["yaw_std_deg"] is None and conditions["prior_std_m"] is None
 
 
@@ -383,39 +382,39 @@ def test_the_height_of_a_route(run, unwritten, half_blank, route_path, tmp_path)
     route.write_text("\n".join(line + add for line, add in zip(lines, heights, strict=True)) + "\n")
     found = []
     for more in ((), ("--agl-m", "160")):
-        told = run(
+        done = run(
             *("check", half_blank.map, "--route", route, *more, "--json"),
             *("--out", tmp_path / "report"),
         )
-        found.append(json.loads(told.out)["conditions"]["agl_m"])
+        found.append(json.loads(done.out)["conditions"]["agl_m"])
     assert found == [150, 160]
 
 
 @pytest.mark.parametrize(
     "options, said",
     [
-        (["--accept", "1.5"], "accept must be"),
+        (["--min-confidence", "1.5"], "accept must be"),
         (["--seed", "-3"], "seed must be"),
         (["--workers", "0"], "workers must be"),
         (["--effort", "0"], "effort must be"),
         (["--route", "no.geojson"], "no.geojson"),
-        (["--ortho", "no.tif"], "no.tif"),
+        (["--other-date", "no.tif"], "no.tif"),
         (["--camera", "no.json"], "no.json"),
         (["--agl-m", "40000"], "do not fit on the map"),
-        (["--route", "paper:A@10,10"], "nowhere on the map"),
+        (["--route", "paper:A@10,10"], "does not touch the map"),
     ],
     ids=lambda each: " ".join(each) if isinstance(each, list) else "",
 )
 def test_bad_input_is_one_line(run, half_blank, tmp_path, names_in, options, said):
-    told = run("check", half_blank.map, *options, "--out", tmp_path / "report")
-    assert told.code == 1 and told.out == "" and told.err.count("\n") == 1
-    assert told.err.startswith("orthonav: error: ") and said in told.err
+    done = run("check", half_blank.map, *options, "--out", tmp_path / "report")
+    assert done.code == 1 and done.out == "" and done.err.count("\n") == 1
+    assert done.err.startswith("orthonav: error: ") and said in done.err
     assert names_in(tmp_path) == []
 
 
-def test_a_map_that_is_none(run, tmp_path):
-    told = run("check", tmp_path / "no.onav", "--out", tmp_path / "report")
-    assert told.code == 1 and "no.onav" in told.err
+def test_a_missing_map(run, tmp_path):
+    done = run("check", tmp_path / "no.onav", "--out", tmp_path / "report")
+    assert done.code == 1 and "no.onav" in done.err
     with pytest.raises(MissingFileError):
         check_map(CheckRequest(tmp_path / "no.onav"))
 
@@ -425,7 +424,7 @@ def test_an_interrupt_writes_nothing(run, half_blank, tmp_path, names_in, monkey
         raise KeyboardInterrupt
 
     monkeypatch.setattr(check_run, "run_many", interrupted)
-    told = run("check", half_blank.map, *VIEWS, "--out", tmp_path / "report")
-    assert (told.code, told.err) == (1, "orthonav: error: interrupted; nothing was written\n")
+    done = run("check", half_blank.map, *VIEWS, "--out", tmp_path / "report")
+    assert (done.code, done.err) == (1, "orthonav: error: interrupted; nothing was written\n")
     assert names_in(tmp_path) == []
     assert main(["check", str(half_blank.map), "--out", str(tmp_path / "report")]) == 1

@@ -10,7 +10,7 @@ from made_trials import lost, right
 from orthonav.check.envelope import (
     AGL_OFF,
     HEIGHTS,
-    STILL_FINE,
+    TOLERATED,
     YAW_OFF_DEG,
     accepted_share,
     envelope_of,
@@ -48,24 +48,28 @@ def test_work_is_at_the_same_places_for_every_error():
 
 def test_errors_are_fine_up_to_the_first_that_is_not():
     shares = np.full((len(YAW_OFF_DEG), len(AGL_OFF)), 0.9)
-    shares[2, MIDDLE] = 0.9 * STILL_FINE - 0.1
+    shares[2, MIDDLE] = 0.9 * TOLERATED - 0.1
     shares[0, -1] = shares[0, 0] = 0.1
     found = envelope(shares)
-    assert found.fine_yaw_deg == YAW_OFF_DEG[1]
-    assert (found.fine_agl_low, found.fine_agl_high) == (AGL_OFF[1], AGL_OFF[-2])
+    assert found.tolerated_yaw_deg == YAW_OFF_DEG[1]
+    assert (found.tolerated_agl_low, found.tolerated_agl_high) == (AGL_OFF[1], AGL_OFF[-2])
     np.testing.assert_allclose(found.share, shares, atol=0.03)
 
 
 @pytest.mark.parametrize("share", [0.5, 1.0])
 def test_all_errors_are_fine(share):
     found = envelope(share)
-    assert found.fine_yaw_deg == YAW_OFF_DEG[-1]
-    assert (found.fine_agl_low, found.fine_agl_high) == (AGL_OFF[0], AGL_OFF[-1])
+    assert found.tolerated_yaw_deg == YAW_OFF_DEG[-1]
+    assert (found.tolerated_agl_low, found.tolerated_agl_high) == (AGL_OFF[0], AGL_OFF[-1])
 
 
 def test_where_nothing_is_found_no_error_is_fine():
     found = envelope(0.0)
-    assert (found.fine_yaw_deg, found.fine_agl_low, found.fine_agl_high) == (0.0, 0.0, 0.0)
+    assert (found.tolerated_yaw_deg, found.tolerated_agl_low, found.tolerated_agl_high) == (
+        0.0,
+        0.0,
+        0.0,
+    )
 
 
 def test_heights():

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_trials import elsewhere, lost, right
+from made_trials import lost, misplaced, right
 
 from orthonav.check import estimate
-from orthonav.check.estimate import Field
+from orthonav.check.estimate import Predictor
 
 SIDE_M = 1000.0
 
@@ -16,9 +16,9 @@ def places(count, seed=1):
     return np.random.default_rng(seed).uniform(0, SIDE_M, (count, 2))
 
 
-def field(trials, other_date=(), **changed):
-    told = {"radius_m": 35.0, "accept": 0.9, "view_side_m": 100.0, "spacing_m": 60.0} | changed
-    return Field(trials, other_date=other_date, **told)
+def predictor(trials, other_date=(), **changed):
+    usual = {"radius_m": 35.0, "accept": 0.9, "view_side_m": 100.0, "spacing_m": 60.0} | changed
+    return Predictor(trials, other_date=other_date, **usual)
 
 
 def half_good(count=300):
@@ -33,8 +33,8 @@ WEST, EAST = np.array([[150.0, 500.0]]), np.array([[850.0, 500.0]])
 
 
 def test_places_are_told_by_the_trials_around():
-    told = field(half_good())
-    west, east = told.at(WEST), told.at(EAST)
+    found = predictor(half_good())
+    west, east = found.at(WEST), found.at(EAST)
     assert west.probability[0] > 0.8 and east.probability[0] < 0.25
     assert west.low[0] > east.high[0]
     assert west.weight[0] > 1 and west.wrong[0] == east.wrong[0] == 0
@@ -42,11 +42,11 @@ def test_places_are_told_by_the_trials_around():
 
 def test_doubtful_and_wrong_views_are_no_fixes():
     doubtful = [right(en, confidence=0.5) for en in places(100)]
-    wrong = [elsewhere(en, en + 300.0) for en in places(100)]
+    wrong = [misplaced(en, en + 300.0) for en in places(100)]
     for trials, share in ((doubtful, 0.0), (wrong, 1.0)):
-        told = field(trials).at(WEST)
-        assert told.probability[0] < 0.1 and told.wrong[0] == pytest.approx(share, abs=0.01)
-    assert field(wrong).wrong.sum() == 100 and field(doubtful).right.sum() == 0
+        found = predictor(trials).at(WEST)
+        assert found.probability[0] < 0.1 and found.wrong[0] == pytest.approx(share, abs=0.01)
+    assert predictor(wrong).wrong.sum() == 100 and predictor(doubtful).right.sum() == 0
 
 
 @settings(max_examples=10, deadline=None)
@@ -60,17 +60,17 @@ def test_all_is_in_order_whatever_the_trials(count, kinds, expected, view_side_m
     make = {
         "right": lambda en: right(en, expected=expected),
         "lost": lost,
-        "wrong": lambda en: elsewhere(en, en + 200.0),
+        "wrong": lambda en: misplaced(en, en + 200.0),
     }
     trials = [make[kind](en) for kind, en in zip(kinds, places(count), strict=False)]
     # Near, between, and far from all.
     points = np.concatenate([places(8, seed=3), [[1e5, -1e5]]])
-    told = field(trials, view_side_m=view_side_m).at(points)
-    for each in vars(told).values():
+    found = predictor(trials, view_side_m=view_side_m).at(points)
+    for each in vars(found).values():
         assert each.shape == (9,) and np.isfinite(each).all()
-    assert (told.low >= 0).all() and (told.high <= 1).all()
-    assert (told.low <= told.probability).all() and (told.probability <= told.high).all()
-    assert (told.error_m >= 0).all() and (told.wrong >= 0).all() and (told.wrong <= 1).all()
+    assert (found.low >= 0).all() and (found.high <= 1).all()
+    assert (found.low <= found.probability).all() and (found.probability <= found.high).all()
+    assert (found.error_m >= 0).all() and (found.wrong >= 0).all() and (found.wrong <= 1).all()
 
 
 def test_far_from_trials_what_lasts_there_tells():
@@ -81,16 +81,16 @@ def test_far_from_trials_what_lasts_there_tells():
         lasting = 0.6 if en[1] > SIDE_M / 2 else 0.05
         succeeds = rng.random() < (0.9 if lasting > 0.3 else 0.1)
         trials.append(right(en, expected=lasting) if succeeds else lost(en, expected=lasting))
-    told = field(trials, view_side_m=20.0, spacing_m=10.0)
-    above, below = told.at(np.array([[500.0, 1100.0], [500.0, -100.0]])).probability
+    found = predictor(trials, view_side_m=20.0, spacing_m=10.0)
+    above, below = found.at(np.array([[500.0, 1100.0], [500.0, -100.0]])).probability
     assert above > 0.7 and below < 0.3
 
 
 def test_more_trials_narrow_the_interval():
     widths = []
     for count in (20, 2000):
-        told = field([right(en) if i % 2 else lost(en) for i, en in enumerate(places(count))])
-        found = told.at(np.array([[500.0, 500.0]]))
+        found = predictor([right(en) if i % 2 else lost(en) for i, en in enumerate(places(count))])
+        found = found.at(np.array([[500.0, 500.0]]))
         widths.append(found.high[0] - found.low[0])
     assert widths[1] < 0.7 * widths[0]
     assert widths[1] > 0.15  # years differ, however many trials there are
@@ -99,25 +99,25 @@ def test_more_trials_narrow_the_interval():
 def test_another_date_outweighs_the_map_itself():
     at = places(200)
     own, other = [right(en) for en in at], [lost(en, expected=np.nan) for en in at]
-    alone, both = field(own).at(WEST), field(own, other).at(WEST)
+    alone, both = predictor(own).at(WEST), predictor(own, other).at(WEST)
     assert alone.probability[0] > 0.9
     assert both.probability[0] == pytest.approx(0.25, abs=0.05)
-    assert np.isfinite(both.lasting).all()
+    assert np.isfinite(both.persistence).all()
 
 
 def test_error_of_fixes():
     trials = [right(en, error_m=3.0) for en in places(300)]
-    assert field(trials).at(WEST).error_m[0] == pytest.approx(3.0)
-    assert field(trials, least_error_m=4.0).at(WEST).error_m[0] == pytest.approx(5.0)
+    assert predictor(trials).at(WEST).error_m[0] == pytest.approx(3.0)
+    assert predictor(trials, least_error_m=4.0).at(WEST).error_m[0] == pytest.approx(5.0)
 
 
 def test_no_places_and_many(monkeypatch):
-    told = field(half_good())
-    nothing = told.at(np.zeros((0, 2)))
+    found = predictor(half_good())
+    nothing = found.at(np.zeros((0, 2)))
     assert all(each.shape == (0,) for each in vars(nothing).values())
     points = places(500, seed=5)
-    whole = told.at(points)
+    whole = found.at(points)
     monkeypatch.setattr(estimate, "_PAIRS_AT_ONCE", 700)
-    parts = told.at(points)
+    parts = found.at(points)
     for name, values in vars(whole).items():
         np.testing.assert_allclose(getattr(parts, name), values, rtol=1e-9, err_msg=name)

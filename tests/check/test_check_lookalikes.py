@@ -3,9 +3,9 @@
 import math
 
 import pytest
-from made_trials import elsewhere, lost, right
+from made_trials import lost, misplaced, right
 
-from orthonav.check.lookalikes import LIKE, MOST, found_lookalikes
+from orthonav.check.lookalikes import MAX_PAIRS, SIMILAR, found_lookalikes
 from orthonav.geo.frames import LocalFrame
 
 FRAME = LocalFrame(46.0, 3.0)
@@ -24,17 +24,19 @@ def near(place, east, north=0.0):
 
 def test_good_trials_have_none():
     assert found([]) == ()
-    assert found([right(HERE), lost(THERE), right(THERE, rival=HERE, share=LIKE - 0.01)] * 3) == ()
+    assert (
+        found([right(HERE), lost(THERE), right(THERE, rival=HERE, share=SIMILAR - 0.01)] * 3) == ()
+    )
 
 
 def test_both_ways_are_one_pair():
     trials = [
-        elsewhere(HERE, THERE),
-        elsewhere(near(THERE, 30), near(HERE, -30)),
+        misplaced(HERE, THERE),
+        misplaced(near(THERE, 30), near(HERE, -30)),
         right(near(HERE, 0, 40), rival=THERE, share=0.9),
     ]
     (pair,) = found(trials)
-    assert pair.trials == 3 and pair.likeness == pytest.approx((1 + 1 + 0.9) / 3)
+    assert pair.trials == 3 and pair.similarity == pytest.approx((1 + 1 + 0.9) / 3)
     assert pair.apart_m == pytest.approx(math.dist(HERE, THERE))
     east, north = FRAME.en_from_latlon(*pair.other_latlon_deg)
     assert (east, north) == pytest.approx(THERE, abs=0.01)
@@ -42,37 +44,39 @@ def test_both_ways_are_one_pair():
 
 
 def test_places_farther_than_half_a_view_are_others():
-    trials = [elsewhere(HERE, THERE), elsewhere(near(HERE, 60), THERE)]
+    trials = [misplaced(HERE, THERE), misplaced(near(HERE, 60), THERE)]
     assert len(found(trials)) == 2
-    assert len(found([elsewhere(HERE, THERE), elsewhere(HERE, near(THERE, 0, 60))])) == 2
+    assert len(found([misplaced(HERE, THERE), misplaced(HERE, near(THERE, 0, 60))])) == 2
 
 
 def test_one_doubtful_trial_may_be_chance():
-    doubtful = elsewhere(HERE, THERE, confidence=0.1)
+    doubtful = misplaced(HERE, THERE, confidence=0.1)
     assert found([doubtful]) == ()
     assert found([doubtful, doubtful])[0].trials == 2
-    assert len(found([elsewhere(HERE, THERE, confidence=0.6)])) == 1
+    assert len(found([misplaced(HERE, THERE, confidence=0.6)])) == 1
 
 
 def test_badly_placed_is_not_elsewhere():
     """Beyond the radius but within a quarter of the view it is the same place."""
-    assert found([elsewhere(HERE, near(HERE, 24))] * 3) == ()
-    assert len(found([elsewhere(HERE, near(HERE, 26))] * 3)) == 1
+    assert found([misplaced(HERE, near(HERE, 24))] * 3) == ()
+    assert len(found([misplaced(HERE, near(HERE, 26))] * 3)) == 1
 
 
 def test_those_seen_again_come_first():
     rival = right(near(HERE, 500), rival=near(HERE, 500, 900), share=0.85)
-    (first, second) = found([elsewhere(HERE, THERE), rival, rival])
-    assert (first.trials, second.trials) == (2, 1) and first.likeness < second.likeness
+    (first, second) = found([misplaced(HERE, THERE), rival, rival])
+    assert (first.trials, second.trials) == (2, 1) and first.similarity < second.similarity
 
 
 def test_within_the_prior():
     apart_m = math.dist(HERE, THERE)
-    trials = [elsewhere(HERE, THERE)]
+    trials = [misplaced(HERE, THERE)]
     assert found(trials)[0].within_prior and found(trials, apart_m / 2.9)[0].within_prior
     assert not found(trials, apart_m / 3.1)[0].within_prior
 
 
 def test_there_are_not_too_many():
-    trials = [elsewhere(near(HERE, 300 * i), near(THERE, 300 * i, 2000)) for i in range(MOST + 9)]
-    assert len(found(trials)) == MOST
+    trials = [
+        misplaced(near(HERE, 300 * i), near(THERE, 300 * i, 2000)) for i in range(MAX_PAIRS + 9)
+    ]
+    assert len(found(trials)) == MAX_PAIRS

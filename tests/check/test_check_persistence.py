@@ -1,4 +1,4 @@
-"""What lasts from year to year, as told from one picture."""
+"""Persistence from year to year, predicted from one picture."""
 
 import json
 
@@ -8,21 +8,21 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from orthonav.check.persistence import (
-    LEAST,
     MARGIN_PX,
-    MOST,
+    MAX_PERSISTENCE,
+    MIN_PERSISTENCE,
     PersistenceModel,
+    default_model,
     features,
     terms,
-    usual_model,
 )
-from orthonav.check.views import LEVELS_TOLD, reported_persistence
+from orthonav.check.views import PERSISTENCE_LEVELS, reported_persistence
 
 SIZE = 256
 
 
 def crops(seed=1):
-    """Fine texture without direction."""
+    """Fine persistence without direction."""
     noise = np.random.default_rng(seed).normal(size=(SIZE, SIZE)).astype(np.float32)
     blots = cv2.GaussianBlur(noise, (0, 0), 1.2)
     return np.clip(120 + 12 * blots / blots.std(), 0, 255).astype(np.uint8)
@@ -49,9 +49,9 @@ def test_roads_and_houses_last_longer_than_crops(gsd_m):
 
 def test_what_lasts_is_told_where_it_is():
     both = np.where(np.arange(SIZE) < SIZE // 2, roads_and_houses(), crops()).astype(np.uint8)
-    told = reported_persistence(both, 1.0)[0]
+    predicted = reported_persistence(both, 1.0)[0]
     reach = MARGIN_PX
-    assert told[:, : SIZE // 2 - reach].mean() > 1.5 * told[:, SIZE // 2 + reach :].mean()
+    assert predicted[:, : SIZE // 2 - reach].mean() > 1.5 * predicted[:, SIZE // 2 + reach :].mean()
 
 
 def test_far_pixels_change_nothing():
@@ -66,24 +66,28 @@ def test_far_pixels_change_nothing():
 
 @pytest.mark.parametrize("grey", [0, 128, 255])
 def test_blank_ground_has_finite_persistence(grey):
-    for told in reported_persistence(np.full((120, 130), grey, np.uint8), 1.0):
-        assert told.shape == (120, 130) and told.dtype == np.float32
-        assert np.isfinite(told).all() and told.min() >= LEAST and told.max() <= MOST
+    for predicted in reported_persistence(np.full((120, 130), grey, np.uint8), 1.0):
+        assert predicted.shape == (120, 130) and predicted.dtype == np.float32
+        assert (
+            np.isfinite(predicted).all()
+            and predicted.min() >= MIN_PERSISTENCE
+            and predicted.max() <= MAX_PERSISTENCE
+        )
 
 
 def test_levels():
     large = np.tile(crops(), (2, 2))
-    assert len(reported_persistence(large, 1.0)) == LEVELS_TOLD
+    assert len(reported_persistence(large, 1.0)) == PERSISTENCE_LEVELS
     tiny = reported_persistence(crops()[:90, :90], 1.0)
     assert tiny and all(each.shape == (90, 90) for each in tiny)
     later = reported_persistence(large, 0.5, first=1)
-    assert len(later) == LEVELS_TOLD and later[0] is later[1]
+    assert len(later) == PERSISTENCE_LEVELS and later[0] is later[1]
 
 
 def test_features_and_weights_fit():
     found = features(crops(), 1.0, every_px=16)
     assert found.shape[:2] == (16, 16) and found.dtype == np.float32
-    model = usual_model()
+    model = default_model()
     assert model.mean.shape == model.spread.shape == found.shape[2:]
     assert terms(found).shape[-1] == len(model.weights)
     assert (model.spread > 0).all()
@@ -94,7 +98,7 @@ def test_terms_are_all_products():
 
 
 def test_a_model_survives_a_file():
-    model = usual_model()
+    model = default_model()
     again = PersistenceModel.from_plain(json.loads(json.dumps(model.to_plain())))
     for name in ("mean", "spread", "weights"):
         np.testing.assert_allclose(getattr(again, name), getattr(model, name), rtol=1e-5)

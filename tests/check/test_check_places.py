@@ -1,4 +1,4 @@
-"""Cells and places of trials: where the map shows ground and the band lies."""
+"""Cells and places of trials: where the map shows coverage and the band lies."""
 
 import math
 
@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 
 from orthonav.check.places import (
     FEWEST_TRIALS,
-    LEAST_TRIALS,
-    MOST_CELLS,
-    MOST_TRIALS,
-    Ground,
-    Lattice,
+    MAX_CELLS,
+    MAX_TRIALS,
+    MIN_TRIALS,
+    CellGrid,
+    MapCoverage,
     cell_side_m,
     checked_extent,
-    looked_at_m2,
+    checked_m2,
     trial_places,
 )
 from orthonav.errors import AreaError
@@ -25,7 +25,7 @@ from orthonav.geo.frames import LocalFrame
 from orthonav.geo.route import Route
 
 FRAME = LocalFrame(46.0, 3.0)
-WHOLE = Ground(-1000.0, 1000.0, 2.0, np.ones((1000, 1000), np.bool_))
+WHOLE = MapCoverage(-1000.0, 1000.0, 2.0, np.ones((1000, 1000), np.bool_))
 
 
 def area_of(points_en_m, bands_m):
@@ -44,10 +44,10 @@ metres = st.floats(-5000, 5000)
 @settings(max_examples=40, deadline=None)
 @given(metres, metres, st.floats(1, 3000), st.floats(1, 3000), st.floats(5, 800))
 def test_cells_cover_the_extent_and_no_more(west, north, across, down, side_m):
-    lattice = Lattice.over((west, north - down, west + across, north), side_m)
-    assert lattice.cols * side_m >= across - 1e-6 > (lattice.cols - 1) * side_m - 1e-3
-    assert lattice.rows * side_m >= down - 1e-6 > (lattice.rows - 1) * side_m - 1e-3
-    centres = lattice.centres_en_m.reshape(lattice.rows, lattice.cols, 2)
+    grid = CellGrid.over((west, north - down, west + across, north), side_m)
+    assert grid.cols * side_m >= across - 1e-6 > (grid.cols - 1) * side_m - 1e-3
+    assert grid.rows * side_m >= down - 1e-6 > (grid.rows - 1) * side_m - 1e-3
+    centres = grid.centres_en_m.reshape(grid.rows, grid.cols, 2)
     np.testing.assert_allclose(centres[0, 0], [west + side_m / 2, north - side_m / 2], atol=1e-6)
     assert (np.diff(centres[..., 0], axis=1) > 0).all() and (
         np.diff(centres[..., 1], axis=0) < 0
@@ -55,37 +55,37 @@ def test_cells_cover_the_extent_and_no_more(west, north, across, down, side_m):
 
 
 def test_a_point_is_drawn_in_every_cell():
-    lattice = Lattice.over((0.0, 0.0, 90.0, 60.0), 30.0)
-    off = lattice.drawn(np.random.default_rng(1)) - lattice.centres_en_m
+    grid = CellGrid.over((0.0, 0.0, 90.0, 60.0), 30.0)
+    off = grid.drawn(np.random.default_rng(1)) - grid.centres_en_m
     assert np.abs(off).max() <= 15 and np.ptp(off) > 15
 
 
 def test_pixels_are_areas():
     valid = np.zeros((2, 3), np.bool_)
     valid[1, 2] = True
-    ground = Ground(10.0, 20.0, 4.0, valid)
+    coverage = MapCoverage(10.0, 20.0, 4.0, valid)
     inside = [[18.0, 15.99], [21.99, 12.01]]
     outside = [[17.99, 14], [22.01, 14], [20, 16.01], [20, 11.99], [-1e9, 14], [20, 1e9]]
-    assert ground.shown(np.array(inside)).all() and not ground.shown(np.array(outside)).any()
-    assert ground.extent_en_m == (18.0, 12.0, 22.0, 16.0) and ground.area_m2 == 16.0
+    assert coverage.covers(np.array(inside)).all() and not coverage.covers(np.array(outside)).any()
+    assert coverage.extent_en_m == (18.0, 12.0, 22.0, 16.0) and coverage.area_m2 == 16.0
 
 
-def test_share_shown_is_that_of_every_cell():
+def test_covered_share_of_every_cell():
     valid = np.random.default_rng(1).random((60, 80)) < 0.5
     valid[:, 40:] = False
     valid[30:, :20] = True
-    ground = Ground(0.0, 120.0, 2.0, valid)
-    lattice = Lattice.over((0.0, 0.0, 160.0, 120.0), 20.0)
+    coverage = MapCoverage(0.0, 120.0, 2.0, valid)
+    grid = CellGrid.over((0.0, 0.0, 160.0, 120.0), 20.0)
     expected = valid.reshape(6, 10, 8, 10).mean(axis=(1, 3))
-    np.testing.assert_allclose(ground.share_shown(lattice), expected, atol=0.12)
-    assert (ground.share_shown(lattice)[3:, :2] == 1).all()
-    beyond = Lattice.over((-200.0, 0.0, -40.0, 120.0), 20.0)
-    assert (ground.share_shown(beyond) == 0).all()
+    np.testing.assert_allclose(coverage.cell_share(grid), expected, atol=0.12)
+    assert (coverage.cell_share(grid)[3:, :2] == 1).all()
+    beyond = CellGrid.over((-200.0, 0.0, -40.0, 120.0), 20.0)
+    assert (coverage.cell_share(beyond) == 0).all()
 
 
 def test_a_map_that_shows_nothing():
-    with pytest.raises(AreaError, match="no ground at all"):
-        checked_extent(Ground(0.0, 0.0, 1.0, np.zeros((5, 5), np.bool_)), None)
+    with pytest.raises(AreaError, match="has no imagery"):
+        checked_extent(MapCoverage(0.0, 0.0, 1.0, np.zeros((5, 5), np.bool_)), None)
 
 
 @pytest.mark.parametrize(
@@ -101,33 +101,33 @@ def test_a_map_that_shows_nothing():
 )
 def test_ground_of_a_band(points, bands, expected_m2):
     area = area_of(points, bands)
-    assert looked_at_m2(WHOLE, area) == pytest.approx(expected_m2, rel=0.1)
+    assert checked_m2(WHOLE, area) == pytest.approx(expected_m2, rel=0.1)
     assert checked_extent(WHOLE, area) == area.extent_en_m
 
 
-def test_a_band_elsewhere_is_refused():
-    with pytest.raises(AreaError, match="nowhere on the map"):
+def test_a_band_outside_the_map_is_refused():
+    with pytest.raises(AreaError, match="does not touch the map"):
         checked_extent(WHOLE, area_of([[5000, 0], [6000, 0]], [300.0]))
-    holes = Ground(-1000.0, 1000.0, 2.0, np.zeros((1000, 1000), np.bool_))
-    with pytest.raises(AreaError, match="nowhere on the map"):
+    holes = MapCoverage(-1000.0, 1000.0, 2.0, np.zeros((1000, 1000), np.bool_))
+    with pytest.raises(AreaError, match="does not touch the map"):
         checked_extent(holes, area_of([[0, 0], [100, 0]], [300.0]))
 
 
-def places(area=None, ground=WHOLE, view_side_m=150.0, effort=1.0, seed=1):
-    extent = checked_extent(ground, area)
-    return trial_places(ground, area, extent, view_side_m, effort, np.random.default_rng(seed))
+def places(area=None, coverage=WHOLE, view_side_m=150.0, effort=1.0, seed=1):
+    extent = checked_extent(coverage, area)
+    return trial_places(coverage, area, extent, view_side_m, effort, np.random.default_rng(seed))
 
 
 def test_places_are_spread_over_all_ground():
     found = places(view_side_m=50.0)
-    assert len(found) == pytest.approx(MOST_TRIALS, rel=0.1)
+    assert len(found) == pytest.approx(MAX_TRIALS, rel=0.1)
     counts = np.histogram2d(*found.T, bins=4, range=[[-1000, 1000]] * 2)[0]
     assert counts.min() > 0.7 * counts.mean()
     np.testing.assert_array_equal(found, places(view_side_m=50.0))
     assert (places(view_side_m=50.0, seed=2) != found).any()
 
 
-@pytest.mark.parametrize("effort, expected", [(0.05, FEWEST_TRIALS), (1, LEAST_TRIALS), (5, 1200)])
+@pytest.mark.parametrize("effort, expected", [(0.05, FEWEST_TRIALS), (1, MIN_TRIALS), (5, 1200)])
 def test_effort(effort, expected):
     assert len(places(view_side_m=500.0, effort=effort)) == pytest.approx(expected, rel=0.25)
 
@@ -136,13 +136,13 @@ def test_effort(effort, expected):
 def test_places_lie_in_the_band_and_on_the_map(band_m):
     valid = np.ones((1000, 1000), np.bool_)
     valid[400:600, 300:700] = False
-    ground = Ground(-1000.0, 1000.0, 2.0, valid)
+    coverage = MapCoverage(-1000.0, 1000.0, 2.0, valid)
     area = area_of([[-1500, -900], [900, 800]], [band_m])
-    found = places(area, ground)
-    assert len(found) >= FEWEST_TRIALS and len(found) < 3 * LEAST_TRIALS
-    assert area.contains(found).all() and ground.shown(found).all()
+    found = places(area, coverage)
+    assert len(found) >= FEWEST_TRIALS and len(found) < 3 * MIN_TRIALS
+    assert area.contains(found).all() and coverage.covers(found).all()
 
 
 def test_cells_are_parts_of_a_view_but_not_too_many():
     assert cell_side_m(1e6, 200.0) == 50.0
-    assert 1e10 / cell_side_m(1e10, 200.0) ** 2 == pytest.approx(MOST_CELLS)
+    assert 1e10 / cell_side_m(1e10, 200.0) ** 2 == pytest.approx(MAX_CELLS)

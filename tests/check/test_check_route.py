@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_trials import CONDITIONS
 
+from orthonav.check.estimate import Prediction
 from orthonav.check.outcome import Along
 from orthonav.check.route import BLIND, blind_stretches, expected_drift, predicted_along
 from orthonav.geo.area import Area
@@ -64,8 +65,14 @@ def test_a_single_point_has_no_drift():
     assert expected_drift(np.zeros(1), np.array([0.3]), np.array([5.0]), 0.03, SIDE_M) == [5.0]
 
 
+def predicted(probability, error_m):
+    """A prediction of these values, with an interval of no width."""
+    nothing = np.zeros_like(probability)
+    return Prediction(probability, probability, probability, error_m, nothing, nothing, nothing)
+
+
 def even(points):
-    return np.full(len(points), 0.8), np.full(len(points), 3.0)
+    return predicted(np.full(len(points), 0.8), np.full(len(points), 3.0))
 
 
 def test_along_a_route():
@@ -81,12 +88,12 @@ def test_along_a_route():
 
 
 def test_the_worst_over_the_width_of_every_leg():
-    """Ground is blind more than 80 m north of a way to the east, and east of one to the north."""
+    """The map is bad more than 80 m north of an eastbound leg, and east of a northbound one."""
 
-    def told(points):
+    def predict(points):
         bad = (points[:, 1] > 80) & (points[:, 0] < 900)
         bad |= (points[:, 0] > 1080) & (points[:, 1] > 250)
-        return np.where(bad, 0.1, 0.9), np.full(len(points), 3.0)
+        return predicted(np.where(bad, 0.1, 0.9), np.full(len(points), 3.0))
 
     area = area_of([[0, 0], [1000, 0], [1000, 800]])
     early = slice(4, 20)
@@ -95,7 +102,7 @@ def test_the_worst_over_the_width_of_every_leg():
         ((100, 200), 0.9, 0.1),
         ((90, 90), 0.9, 0.9),
     ):
-        along = predicted_along(area, bands, SIDE_M, CONDITIONS, told)
+        along = predicted_along(area, bands, SIDE_M, CONDITIONS, predict)
         late = along.distance_m > 1400
         assert (along.across_low[early] == first).all() and (along.across_low[late] == last).all()
         assert (along.probability[early] == 0.9).all()
@@ -119,12 +126,12 @@ def test_very_long_and_very_short_routes():
 
 
 def along_of(probability, step_m=25.0):
-    """A straight way east with these probabilities."""
+    """A straight route to the east with these probabilities."""
     probability = np.array(probability, float)
     distance = np.arange(len(probability)) * step_m
     points = np.stack([distance, np.zeros_like(distance)], axis=1)
     error = np.full_like(distance, 3.0)
-    return Along(distance, points, probability, probability, error, error)
+    return Along(distance, points, *[probability] * 4, error, error)
 
 
 GOOD, BAD = [0.9] * 8, [0.2] * 12
@@ -139,7 +146,7 @@ def test_blind_stretches():
     )
     assert (first.start_s, first.end_s) == (10, 25) and first.length_m == 300
     assert first.probability == pytest.approx(0.2) and first.drift_m == pytest.approx(9)
-    assert first.allowed_m == CONDITIONS.prior_std_m and first.bearable and second.bearable
+    assert first.allowed_m == CONDITIONS.prior_std_m and first.recoverable and second.recoverable
 
 
 @pytest.mark.parametrize(
@@ -163,10 +170,10 @@ def test_where_stretches_begin_and_end(probability, expected):
 def test_what_dead_reckoning_bears():
     far = along_of(GOOD + [0.1] * 100 + GOOD)
     (stretch,) = blind_stretches(far, CONDITIONS, SIDE_M)
-    assert stretch.drift_m == pytest.approx(75) and not stretch.bearable
+    assert stretch.drift_m == pytest.approx(75) and not stretch.recoverable
     (stretch,) = blind_stretches(far, replace(CONDITIONS, prior_std_m=80.0), SIDE_M)
-    assert stretch.bearable
+    assert stretch.recoverable
     (stretch,) = blind_stretches(far, replace(CONDITIONS, prior_std_m=None), SIDE_M)
-    assert stretch.bearable and math.isinf(stretch.allowed_m)
+    assert stretch.recoverable and math.isinf(stretch.allowed_m)
     (stretch,) = blind_stretches(along_of(GOOD + BAD), CONDITIONS, SIDE_M)
-    assert not stretch.bearable
+    assert not stretch.recoverable

@@ -1,4 +1,4 @@
-"""Views that are made and placed before the flight, by the very localizer that flies."""
+"""Trial views are made and placed by the localizer that flies."""
 
 import math
 import multiprocessing
@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from orthonav.check import trials, views
-from orthonav.check.ortho import OrthoPyramid, check_same_ground
+from orthonav.check.ortho import OrthoPyramid, require_overlap
 from orthonav.check.persistence import MARGIN_PX
-from orthonav.check.trials import Trier, run_many, run_trials
+from orthonav.check.trials import Trier, run_many
 from orthonav.check.views import TrialPlan
 from orthonav.errors import AreaError, MapFileError, MissingFileError, WorkerError
 from orthonav.geo.camera import Camera
@@ -33,7 +33,7 @@ def plan(half_blank):
 
 @pytest.fixture(scope="module")
 def exact(plan, half_blank):
-    """Views of the map's own orthophoto as it is, of which everything is told right."""
+    """Views of the map's own orthophoto as it is, with exact telemetry."""
     changed = {"other_path": half_blank.past, "yaw_std_deg": 0.5, "agl_std": 0.0}
     return TrialPlan(**(vars(plan) | changed))
 
@@ -43,13 +43,17 @@ def registration(half_blank):
     return Localizer(open_map(half_blank.map)).registration
 
 
+def run_trials(plan, places):
+    return run_many([(plan, places)], 1)[0]
+
+
 def plain(found):
     """What can be compared, NaN included."""
     return [[repr(trial) for trial in each] for each in found]
 
 
 def test_unchanged_views_are_found_where_they_were_made(exact):
-    found = run_trials(exact, WEST, 1)
+    found = run_trials(exact, WEST)
     assert len(found) == len(WEST)
     for trial, place in zip(found, WEST, strict=True):
         assert math.dist(trial.en_m, place) < 0.75  # of whole pixels
@@ -61,19 +65,18 @@ def test_unchanged_views_are_found_where_they_were_made(exact):
 @pytest.mark.parametrize(
     "changed", [{"yaw_std_deg": None}, {"prior_std_m": None}, {"relief_m": 3.0}]
 )
-def test_so_are_they_with_less_known(exact, changed):
-    found = run_trials(TrialPlan(**(vars(exact) | changed)), WEST[:2], 1)
+def test_unchanged_views_are_found_with_less_telemetry(exact, changed):
+    found = run_trials(TrialPlan(**(vars(exact) | changed)), WEST[:2])
     assert all(trial.error_m < 3.0 and trial.confidence > 0.9 for trial in found)
 
 
-def test_wrong_heading_and_height_are_told(plan):
-    """What is told is off, not the view: with enough of it nothing is found."""
+def test_large_errors_of_heading_and_height_prevent_a_fix(plan):
     off = TrialPlan(**(vars(plan) | {"yaw_off_deg": 60.0, "agl_off": -0.4}))
-    assert max(trial.confidence for trial in run_trials(off, WEST[:3], 1)) < 0.5
+    assert max(trial.confidence for trial in run_trials(off, WEST[:3])) < 0.5
 
 
 def test_views_of_another_year_of_blank_ground_are_not_found(plan):
-    west, east = run_trials(plan, WEST, 1), run_trials(plan, EAST, 1)
+    west, east = run_trials(plan, WEST), run_trials(plan, EAST)
     assert min(trial.expected for trial in west) > max(trial.expected for trial in east)
     assert max(trial.confidence for trial in east) < 0.9
     assert all(0 < trial.expected < 1 for trial in [*west, *east])
@@ -81,17 +84,17 @@ def test_views_of_another_year_of_blank_ground_are_not_found(plan):
 
 def test_places_off_the_map_are_left_out(plan):
     places = np.array([[-250.0, 60.0], [9e4, 0.0], [-1e7, 1e7], [0.0, 600.0]])
-    found = run_trials(plan, places, 1)
+    found = run_trials(plan, places)
     assert [trial.index for trial in found] == [0]
 
 
-def test_told_positions_far_from_the_map(plan):
+def test_a_prior_far_from_the_map(plan):
     """A prior that is off by far more than the map is wide is no error."""
     wild = TrialPlan(**(vars(plan) | {"prior_std_m": 1e6}))
-    (trial,) = run_trials(wild, WEST[:1], 1)
+    (trial,) = run_trials(wild, WEST[:1])
     assert 0 <= trial.confidence <= 1
     none = TrialPlan(**(vars(plan) | {"prior_std_m": 0.0}))
-    assert len(run_trials(none, WEST[:1], 1)) == 1
+    assert len(run_trials(none, WEST[:1])) == 1
 
 
 def test_the_same_whatever_the_number_of_workers(plan, half_blank, monkeypatch):
@@ -106,12 +109,12 @@ def test_the_same_whatever_the_number_of_workers(plan, half_blank, monkeypatch):
     together = run_many(work, 2, shares.append)
     assert plain(alone) == plain(together) and len(alone[0]) == len(places) - 1
     assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) == 2 * len(places)
-    assert plain([run_trials(plan, places[:3], 1)]) == plain([alone[0][:3]])
+    assert plain([run_trials(plan, places[:3])]) == plain([alone[0][:3]])
     assert multiprocessing.active_children() == []
 
 
 @pytest.mark.parametrize("how", ["killed", "interrupted"])
-def test_workers_leave_nobody_behind(plan, how):
+def test_workers_always_end(plan, how):
     def stop(_):
         if how == "interrupted":
             raise KeyboardInterrupt
@@ -138,8 +141,8 @@ def test_a_map_without_registration(half_blank, tmp_path, monkeypatch):
 
 
 def test_pictures_know_where_their_middle_is(plan, registration):
-    layer = registration.registrar.reference.pyramid
-    pictures = views.Pictures(layer, registration)
+    layer = registration.pyramid
+    pictures = views.MapCrops(layer, registration)
     grid = registration.grid
     for level in (0, 1):
         grey, valid, middle = pictures.around(WEST[0], 60, level)
@@ -153,23 +156,23 @@ def test_pictures_know_where_their_middle_is(plan, registration):
     assert pictures.around(np.array([1e6, 0.0]), 60, 0) is None
 
 
-def test_strangers_are_mirrored_ground(registration):
-    layer = registration.registrar.reference.pyramid
-    pictures = views.Pictures(layer, registration)
+def test_donors_are_mirrored_ground(registration):
+    layer = registration.pyramid
+    pictures = views.MapCrops(layer, registration)
     rng = np.random.default_rng(1)
-    found = pictures.stranger(rng, 200, 0)
+    found = pictures.donor(rng, 200, 0)
     rng = np.random.default_rng(1)
     rows, cols = layer.shape(0)
     row, col = int(rng.integers(0, rows - 200)), int(rng.integers(0, cols - 200))
     grey, valid = layer.read(0, row, col, 200, 200)
     assert not valid.all() or (found[:, ::-1] == grey).all()
-    whole = pictures.stranger(rng, 3000, 0)  # larger than the map
+    whole = pictures.donor(rng, 3000, 0)  # larger than the map
     assert whole.shape == (3000, 3000) and whole[-1, -1] == 128
 
 
 def test_another_date_lies_on_the_map(half_blank, registration):
     """The map's own orthophoto, read as another date, is the picture of the map."""
-    layer = registration.registrar.reference.pyramid
+    layer = registration.pyramid
     pyramid = OrthoPyramid(half_blank.past, registration.sheet, layer.levels)
     try:
         for level in (0, 1, 2):
@@ -188,7 +191,7 @@ def test_another_date_lies_on_the_map(half_blank, registration):
 
 
 def test_another_date_of_other_ground(registration, make_ortho, tmp_path):
-    with pytest.raises(AreaError, match="no ground of the map"):
-        check_same_ground(make_ortho(tmp_path / "far.tif"), registration.sheet)
+    with pytest.raises(AreaError, match="does not overlap the map"):
+        require_overlap(make_ortho(tmp_path / "far.tif"), registration.sheet)
     with pytest.raises(MissingFileError):
-        check_same_ground(tmp_path / "none.tif", registration.sheet)
+        require_overlap(tmp_path / "none.tif", registration.sheet)

@@ -6,12 +6,19 @@ import numpy as np
 import pytest
 from made_trials import CONDITIONS
 
-from orthonav.check.outcome import Along, Lookalike, Stretch, Word
+from orthonav.check.outcome import Along, BlindStretch, Lookalike, Word
 from orthonav.check.verdict import Findings, verdict_of
 
 ZEROS = np.zeros(11)
 ALONG = Along(
-    np.linspace(0, 5000, 11), np.zeros((11, 2)), ZEROS + 0.9, ZEROS + 0.8, ZEROS + 3, ZEROS + 8
+    np.linspace(0, 5000, 11),
+    np.zeros((11, 2)),
+    probability=ZEROS + 0.9,
+    low=ZEROS + 0.8,
+    high=ZEROS + 0.95,
+    across_low=ZEROS + 0.8,
+    error_m=ZEROS + 3,
+    drift_m=ZEROS + 8,
 )
 FINE = Findings(
     conditions=CONDITIONS,
@@ -28,7 +35,7 @@ FLOWN = replace(FINE, along=ALONG)
 
 
 def judged(findings):
-    """The verdict, and what each of its reasons says."""
+    """The verdict, and the word of each reason."""
     verdict = verdict_of(findings)
     ranks = [(Word.NO_GO, Word.MARGINAL, Word.GO).index(each.word) for each in verdict.reasons]
     assert ranks == sorted(ranks) and verdict.word is verdict.reasons[0].word
@@ -38,12 +45,12 @@ def judged(findings):
 
 def stretch(length_m, drift_m, *, ends_lost=False, allowed_m=50.0, start_m=1000.0):
     end_m = start_m + length_m
-    return Stretch(
+    return BlindStretch(
         start_m, end_m, start_m / 20, end_m / 20, 0.2, drift_m, allowed_m, ends_lost=ends_lost
     )
 
 
-def test_all_is_well():
+def test_go():
     assert judged(FINE) == (Word.GO, {"fixes": Word.GO})
     assert judged(FLOWN) == (Word.GO, {"fixes": Word.GO, "drift": Word.GO})
 
@@ -66,7 +73,7 @@ def test_mean_probability(mean, code, word):
     assert judged(replace(FINE, mean=mean)) == (word, {code: word})
 
 
-def test_a_map_without_confidence_is_not_flown():
+def test_a_map_without_confidence_is_no_go():
     word, reasons = judged(replace(FLOWN, calibrated=False))
     assert word is Word.NO_GO and reasons["no_confidence"] is Word.NO_GO
 
@@ -117,9 +124,13 @@ def test_expected_drift(drift_m, prior_std_m, expected):
 @pytest.mark.parametrize(
     "stretches, expected, said",
     [
-        ((stretch(400, 12),), Word.GO, "one blind stretch of 400 m (20 s) from 1.0 km on: dead"),
-        ((stretch(400, 12), stretch(900, 27)), Word.GO, "2 blind stretches, the longest 900 m"),
-        ((stretch(2000, 60),), Word.MARGINAL, "dead reckoning drifts 60 m"),
+        (
+            (stretch(400, 12),),
+            Word.GO,
+            "One blind stretch of 400 m (20 s), starting at 1.0 km; dead",
+        ),
+        ((stretch(400, 12), stretch(900, 27)), Word.GO, "2 blind stretches, the longest of 900 m"),
+        ((stretch(2000, 60),), Word.MARGINAL, "dead reckoning drifts by 60 m"),
         ((stretch(4000, 120),), Word.NO_GO, "off by 120 m after 4000 m"),
         ((stretch(400, 12, ends_lost=True),), Word.MARGINAL, "the route ends in one"),
         ((stretch(400, 12), stretch(4000, 120)), Word.NO_GO, "2 blind stretches"),
@@ -134,7 +145,7 @@ def test_blind_stretches(stretches, expected, said):
     assert any(said in each.text for each in verdict_of(findings).reasons)
 
 
-def test_lookalikes_are_told_and_no_more():
+def test_lookalikes_never_worsen_the_verdict():
     like = Lookalike((46.0, 3.0), (46.01, 3.0), 1100.0, 0.9, 4, True)
     some = (like, replace(like, within_prior=False), replace(like, trials=1))
     assert judged(replace(FINE, lookalikes=some)) == (
@@ -142,6 +153,19 @@ def test_lookalikes_are_told_and_no_more():
         {"fixes": Word.GO, "lookalikes": Word.GO},
     )
     assert judged(replace(FINE, lookalikes=some[1:])) == (Word.GO, {"fixes": Word.GO})
+
+
+@pytest.mark.parametrize(
+    "mean, text",
+    [
+        (0.85, "One view has an 85 % chance of a confident, correct fix on the map (mean)."),
+        (0.72, "One view has a 72 % chance of a confident, correct fix on the map (mean)."),
+        (0.11, "One view has only an 11 % chance of a confident, correct fix on the map (mean)."),
+        (0.08, "One view has only an 8 % chance of a confident, correct fix on the map (mean)."),
+    ],
+)
+def test_the_chance_of_a_fix_is_a_sentence(mean, text):
+    assert verdict_of(replace(FINE, mean=mean)).reasons[0].text == text
 
 
 def test_the_worst_reason_decides():

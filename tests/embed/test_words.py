@@ -14,10 +14,9 @@ from orthonav.embed.words import (
     WordsEmbedder,
     WordsRecipe,
     describe,
-    learn_words,
-    pictures_of,
 )
 from orthonav.errors import MissingExtraError, VariantError
+from orthonav.neural.words import learn_words
 from orthonav.represent.gray import Gray
 from orthonav.variants import Variant, make_variant, variant_from_recipe, variant_recipe
 
@@ -44,6 +43,11 @@ def area(seed=0, size=700):
 def tiles(grey, size=128, step=96):
     starts = range(0, grey.shape[0] - size + 1, step)
     return [grey[y : y + size, x : x + size] for y in starts for x in starts]
+
+
+def pictures_of(greys):
+    """Pictures that are valid everywhere, as `learn_words` takes them."""
+    return [(grey, everywhere(grey)) for grey in greys]
 
 
 def everywhere(grey):
@@ -246,7 +250,7 @@ def test_learning_is_deterministic_and_seeded(learnt):
 @needs_faiss
 def test_large_samples_are_drawn_evenly(monkeypatch):
     """More descriptors than are wanted: every picture still has its share."""
-    import orthonav.embed.words as words
+    import orthonav.neural.words as words
 
     sample = words._Sample(1000, seed=3)
     for number in range(50):
@@ -286,7 +290,7 @@ def test_learning_reports_and_leaves_out_what_is_not_valid():
     shares, grey = [], area()
     half = everywhere(grey)
     half[:, 350:] = False
-    made = learn_words(WordsRecipe(words=256), [(grey, half)], seed=1, report=shares.append)
+    made = learn_words(WordsRecipe(words=256), [(grey, half)], seed=1, progress=shares.append)
     assert shares == sorted(shares) and shares[-1] == 1 and len(shares) > 5
     painted = np.where(half, grey, 7).astype(np.uint8)
     again = learn_words(WordsRecipe(words=256), [(painted, half)], seed=1)

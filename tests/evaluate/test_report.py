@@ -42,8 +42,8 @@ def made_flight(n: int, share_fixed: float = 0.9, name: str = "flight", seed: in
             fix_lat, fix_lon = (float(value) for value in CENTRE.latlon_from_en(at))
             ratio = 1.05 + random.random() * (0.2 if wrong else 2.0)
             known = {"peak_ratio": ratio, "lowe_ratio": 1.0 + random.random() / 5}
-            sure = min(ratio / 3, 1.0)
-            outcome = Fix(fix_lat, fix_lon, np.eye(2), sure, 15.0, 0.0, 100.0, known)
+            confidence = min(ratio / 3, 1.0)
+            outcome = Fix(fix_lat, fix_lon, np.eye(2), confidence, 15.0, 0.0, 100.0, known)
         results.append(ViewResult(frame, i * 500_000_000, outcome, 40.0 + random.random()))
     comparison = compare(truth, results, CENTRE)
     return FlightReport(name, comparison, measure(comparison))
@@ -84,7 +84,7 @@ def test_the_page_needs_nothing_from_outside(tmp_path: Path) -> None:
     assert all(image["alt"] for image in page.images)
 
 
-def test_the_page_says_the_figures_and_what_it_was_made_from(tmp_path: Path, only_new) -> None:
+def test_the_page_holds_metrics_and_provenance(tmp_path: Path, only_new) -> None:
     flight = made_flight(50)
     made_from = MadeFrom(
         map_name="brest.onav",
@@ -102,7 +102,7 @@ def test_the_page_says_the_figures_and_what_it_was_made_from(tmp_path: Path, onl
     worst = flight.comparison.frames[int(np.nanargmax(flight.comparison.errors_m))]
     assert f"<td>{worst}</td>" in html
     assert "<td>too_dark</td>" in html
-    assert "Lowe&#x27;s ratio" in html
+    assert "Lowe&#39;s ratio" in html
 
 
 def test_text_is_escaped(tmp_path: Path, coarse) -> None:
@@ -155,7 +155,7 @@ def test_a_flight_of_one_view_can_be_drawn(tmp_path: Path, share_fixed: float, c
     assert len(Page(html).images) == PICTURES_PER_FLIGHT
 
 
-def test_unmatched_views_are_said(tmp_path: Path, only_new) -> None:
+def test_unmatched_views_are_reported(tmp_path: Path, only_new) -> None:
     flight = made_flight(10)
     comparison = replace(flight.comparison, n_without_truth=3, n_without_result=2)
     flight = FlightReport("f", comparison, measure(comparison))
@@ -233,7 +233,7 @@ def test_the_same_flight_gives_the_same_picture() -> None:
     )
 
 
-def test_without_matplotlib_the_remedy_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_matplotlib_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'orthonav\[report\]'"):
         plots.map_picture(made_flight(3).comparison, 15.0)
@@ -241,8 +241,8 @@ def test_without_matplotlib_the_remedy_is_said(monkeypatch: pytest.MonkeyPatch) 
 
 def test_importing_the_report_does_not_import_matplotlib() -> None:
     code = (
-        "import sys, orthonav.evaluate.report; "
-        "assert not {'matplotlib', 'PIL', 'torch', 'rasterio', 'pyproj'} & set(sys.modules)"
+        "import sys, orthonav.evaluate.report; unwanted = {'matplotlib', 'jinja2', 'PIL', 'torch', "
+        "'rasterio', 'pyproj'}; assert not unwanted & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 

@@ -19,7 +19,7 @@ from orthonav.evaluate.flights import FlightReport, flights_to_json, metrics_to_
 from orthonav.evaluate.metrics import Comparison, compare, measure
 from orthonav.evaluate.report import write_report
 from orthonav.evaluate.track import (
-    Track,
+    TrackMetrics,
     check_consistency,
     course_en,
     effective_number,
@@ -34,15 +34,15 @@ from orthonav.evaluate.track_plots import (
     track_map_picture,
 )
 from orthonav.evaluate.track_report import track_rows
+from orthonav.flight.fixes import write_results
 from orthonav.flight.writer import FlightWriter
 from orthonav.geo.camera import Camera, camera_from_en
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.grid import TileGrid
 from orthonav.mapfile import open_map
 from orthonav.mapfile.layer import GreyLayer
-from orthonav.publish.jsonl import write_results
 from orthonav.records import Fix, NoFix, Telemetry, ViewResult
-from orthonav.report import SAID_STYLE, Drawing
+from orthonav.report import Drawing
 
 CENTRE = LocalFrame(48.0, -4.5)
 COV = np.array([[25.0, 12.0], [12.0, 16.0]])
@@ -84,7 +84,7 @@ def flown(
     return compare(truth, results, local), results
 
 
-def tracked(*arguments, radius_m=15.0, **named) -> Track:
+def tracked(*arguments, radius_m=15.0, **named) -> TrackMetrics:
     found = measure_track(*flown(*arguments, **named), radius_m)
     assert found is not None
     return found
@@ -102,13 +102,13 @@ def drawn(n=200, seed=0, alike=0.0):
 # Consistency.
 
 
-def test_errors_of_their_own_covariance_are_consistent_and_of_a_quarter_too_sure() -> None:
+def test_errors_of_their_own_covariance_are_consistent_and_of_a_quarter_over_confident() -> None:
     errors = drawn()
     verdicts = {
         scale: tracked(errors, "tracking", cov_en_m2=scale * COV).consistency.verdict
         for scale in (0.25, 1.0, 4.0)
     }
-    assert verdicts == {0.25: "too sure", 1.0: "consistent", 4.0: "too cautious"}
+    assert verdicts == {0.25: "over-confident", 1.0: "consistent", 4.0: "under-confident"}
 
 
 @pytest.mark.parametrize("alike", [0.0, 0.9])
@@ -124,7 +124,7 @@ def test_of_twenty_consistent_tracks_about_one_is_called_otherwise(alike: float)
     mean = np.mean([each.nees_mean for each in found])
     assert mean == pytest.approx(2.0, abs=0.15)
     small = check_consistency(drawn(300, 1, alike), np.tile(COV / 4, (300, 1, 1)))
-    assert small.verdict == "too sure"
+    assert small.verdict == "over-confident"
 
 
 def test_bounds_are_those_of_chi_square() -> None:
@@ -167,7 +167,7 @@ ERRORS = [None, (90.0, 0), (3.0, 0), (4, 0), (40, 0), (50, 0), (5, 0), (0, 70), 
 TIMES_S = [0, 1, 3, 4, 5, 6, 16, 17, 18, 20]
 
 
-def by_hand(**named) -> Track:
+def by_hand(**named) -> TrackMetrics:
     times_ns = [1_700_000_000 * 10**9 + s * 10**9 for s in TIMES_S]
     return tracked(ERRORS, STATES, confidence=SURE, times_ns=times_ns, **named)
 
@@ -205,7 +205,7 @@ def test_longest_without_a_confident_fix() -> None:
     assert (start.low_confidence_after.seconds_s, start.low_confidence_after.path_m) == (0.0, 0.0)
 
 
-def test_false_locks_are_stretches_that_are_sure_or_tracking_and_far_off() -> None:
+def test_false_locks_are_stretches_that_are_confident_or_tracking_and_wrong() -> None:
     track = by_hand()
     # view 1 sure; view 4 tracking; views 7 and 8 both; view 5 and 9 are neither
     assert (track.far_m, track.n_confident_wrong, track.n_false_locks) == (35.0, 4, 3)
@@ -214,7 +214,7 @@ def test_false_locks_are_stretches_that_are_sure_or_tracking_and_far_off() -> No
     assert (wide.far_m, wide.n_confident_wrong, wide.n_false_locks) == (65.0, 2, 2)
 
 
-def test_a_fix_that_states_a_larger_radius_is_held_to_that() -> None:
+def test_a_fix_with_a_larger_radius_is_judged_by_it() -> None:
     """Those of high flights do: 60 m off is no false lock where 70 m were stated."""
     errors = [(60.0, 0.0), (60.0, 0.0), (60.0, 0.0), (80.0, 0.0), (20.0, 0.0), None]
     radii_m = [70.0, 50.0, 10.0, 70.0, 10.0, 70.0]
@@ -238,7 +238,7 @@ def test_ahead_and_right_are_positive_whatever_the_course() -> None:
     np.testing.assert_allclose(track.series.along_m[inner], 4.0, atol=0.02)
     np.testing.assert_allclose(track.series.across_m[inner], -2.0, atol=0.02)
     assert track.along.mean_m == pytest.approx(4.0, abs=0.02)
-    assert track.across.rms_m == pytest.approx(2.0, abs=0.02)
+    assert track.across.rmse_m == pytest.approx(2.0, abs=0.02)
     assert track.across.std_m < 0.1
 
 
@@ -307,7 +307,7 @@ def test_odd_tracks_are_drawn(errors, states, named, coarse) -> None:
         assert figure.alt and figure.caption and "nan" not in figure.alt
 
 
-def test_what_is_not_defined_is_none() -> None:
+def test_undefined_values_are_none() -> None:
     comparison, results = flown([None] * 3, "searching", times_ns=[2, 1, 0])
     track = measure_track(comparison, results, 15.0)
     plain = flights_to_json([FlightReport("f", comparison, measure(comparison), track=track)])
@@ -316,12 +316,12 @@ def test_what_is_not_defined_is_none() -> None:
     assert found["after"]["n_views"] == 0 and found["after"]["acc_at_15m"] is None
     assert set(found["share_of_time"].values()) == {None}
     assert found["low_confidence"] == {"seconds_s": None, "path_m": pytest.approx(20.0, abs=0.01)}
-    assert found["along"]["rms_m"] is None and found["consistency"]["verdict"] is None
+    assert found["along"]["rmse_m"] is None and found["consistency"]["verdict"] is None
     assert found["over_time"]["sigma_m"] == [None] * 3
 
 
 @pytest.mark.parametrize("times", [[math.nan, 1.0], [1.0, math.nan], [2, 1], [3, 3], []])
-def test_times_that_do_not_rise_are_none(times: list) -> None:
+def test_times_that_do_not_rise_are_undefined(times: list) -> None:
     assert np.isnan(seconds_since_first(times)).all()
 
 
@@ -352,17 +352,17 @@ def test_results_of_another_flight_and_duplicate_frames_are_refused() -> None:
 # What is shown.
 
 
-def test_views_placed_one_by_one_are_reported_as_before(tmp_path: Path, only_new) -> None:
+def test_views_placed_one_by_one_have_no_track(tmp_path: Path, only_new) -> None:
     comparison, results = flown([(1.0, 0.0)] * 4, None)
     assert measure_track(comparison, results, 15.0) is None
     flight = FlightReport("f", comparison, measure(comparison))
     assert flights_to_json([flight]) == metrics_to_json(flight.metrics)
     assert "track" not in summary([flight])
     html = write_report(tmp_path, [flight]).read_text("utf-8")
-    assert "Track" not in html and SAID_STYLE not in html and html.count("<figure") == 6
+    assert "Track" not in html and html.count("<figure") == 6
 
 
-def test_several_flights_tell_what_adds_up() -> None:
+def test_several_flights_are_summed_up() -> None:
     flights = []
     for name, errors, states in (
         ("short", [(50.0, 0.0)] * 2, "tracking"),
@@ -535,7 +535,7 @@ def test_the_worst_come_first_and_tracking_before_others() -> None:
     assert has_colour(image, "#0072B2") and has_colour(image, "#D55E00")
 
 
-def test_a_view_that_cannot_be_shown_says_why(coarse) -> None:
+def test_the_reason_is_given_for_a_view_that_cannot_be_shown(coarse) -> None:
     ground = Ground(textured((400, 400), 3))
     comparison, results = flown([(1.0, 0.0)] * 5, None, cov_en_m2=np.ones((2, 2)))
     huge = replace(results[4].outcome, agl_m=1e7)
@@ -555,7 +555,7 @@ def test_a_view_that_cannot_be_shown_says_why(coarse) -> None:
     assert "size" in why[1] and "not in the flight" in why[2] and "agl_m" in why[3]
     assert why[4] == "" and rows["0004.jpg"].at_truth is None
     assert rows["0000.jpg"].view is None and rows["0000.jpg"].at_truth is not None
-    assert "sigma not known" in row_text(rows["0000.jpg"])
+    assert "sigma unknown" in row_text(rows["0000.jpg"])
     decoded(sheet_picture(list(rows.values())[:2]))
     decoded(sheet_picture([]))
 
@@ -598,15 +598,14 @@ def test_evaluate_a_track(golden_flight, tmp_path: Path, capsys, only_new) -> No
     flight = shutil.copytree(golden_flight[0], tmp_path / "flight")
     (flight / "frames" / "0002.jpg").write_bytes(b"no picture")  # said in its row
     report, out = tmp_path / "report", tmp_path / "metrics.json"
-    more = ("--map", GOLDEN, "--report", report, "--flight", flight, "--json", out)
+    more = ("--map", GOLDEN, "--report", report, "--flight", flight, "--metrics", out)
     code, said, wrong = evaluated(golden_flight, *more, capsys=capsys)
-    assert (code, wrong) == (0, "") and "first confirmed fix: at view 2 of 4" in said
+    assert (code, wrong) == (0, "") and "first confirmed fix: view 2 of 4" in said
     track = json.loads(out.read_text())["track"]
     assert (track["first_view"], track["first_s"], track["n_false_locks"]) == (2, 1.0, 1)
     assert isinstance(track["first_view"], int)
     html = (report / "index.html").read_text("utf-8")
     assert html.count("<figure") == 11 and "The worst views. 0003.jpg" in html
-    assert SAID_STYLE in html
 
 
 def test_evaluate_refuses_a_flight_without_map_or_report(golden_flight, tmp_path, capsys) -> None:
@@ -616,7 +615,7 @@ def test_evaluate_refuses_a_flight_without_map_or_report(golden_flight, tmp_path
         (("--flight", flight), "--map and --report"),
         (("--flight", flight, "--map", GOLDEN), "--map and --report"),
         (("--flight", flight, "--report", tmp_path / "r"), "--map and --report"),
-        (("--flight", flight, "--flight", flight, *both), "as many --flight"),
+        (("--flight", flight, "--flight", flight, *both), "give --flight once per file"),
         (("--flight", tmp_path / "none", *both), "does not exist"),
     ):
         code, said, wrong = evaluated(golden_flight, *more, capsys=capsys)
@@ -624,7 +623,7 @@ def test_evaluate_refuses_a_flight_without_map_or_report(golden_flight, tmp_path
     assert not (tmp_path / "r").exists()
 
 
-def test_evaluate_refuses_times_that_are_none(golden_flight, tmp_path: Path, capsys) -> None:
+def test_evaluate_refuses_invalid_times(golden_flight, tmp_path: Path, capsys) -> None:
     flight, fixes = golden_flight
     broken = tmp_path / "fixes.jsonl"
     broken.write_text(fixes.read_text().replace('"time_s": 1.0', '"time_s": null'))

@@ -100,7 +100,7 @@ def made(place, scene):
 
 def test_map_covers_the_search_band(place, scene, made):
     localizer = Localizer(open_map(place.work(scene, "gradient-gradient") / "map.onav"))
-    extent = np.ptp(localizer.centres_en_m, axis=0) + localizer.grid.stride_m
+    extent = np.ptp(localizer.tiles.centres_en_m, axis=0) + localizer.grid.stride_m
     assert extent == pytest.approx([SMALL.length_m, SMALL.band_m], abs=33)
     assert localizer.grid.gsd_m == 1.0
 

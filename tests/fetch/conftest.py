@@ -6,12 +6,12 @@ from socketserver import ThreadingMixIn
 from threading import Thread
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
-import ground
 import pytest
 import servers
+import terrain
 from servers import QUICK
 
-from orthonav.fetch import FetchRequest, Packing, Wish, fetch, parse_source
+from orthonav.fetch import FetchRequest, ImageryOptions, Packing, fetch, parse_source
 from orthonav.geo.area import Area
 
 MAPPROXY = """
@@ -61,8 +61,8 @@ def mapproxy(tmp_path_factory):
 
         with servers.serving(servers.wms_map) as upstream:
             folder = tmp_path_factory.mktemp("mapproxy")
-            told = MAPPROXY.replace("UPSTREAM", f"{upstream.url}/map")
-            (folder / "proxy.yaml").write_text(told.replace("CACHE", str(folder / "cache")))
+            config = MAPPROXY.replace("UPSTREAM", f"{upstream.url}/map")
+            (folder / "proxy.yaml").write_text(config.replace("CACHE", str(folder / "cache")))
             app = make_wsgi_app(str(folder / "proxy.yaml"))
             http = make_server("127.0.0.1", 0, app, Threaded, Quiet)
             thread = Thread(target=http.serve_forever, args=(0.01,), daemon=True)
@@ -77,13 +77,17 @@ def mapproxy(tmp_path_factory):
 def take(tmp_path):
     """Function that fetches the square around the middle and returns the result and the file."""
 
-    def taken(source, half_m=110.0, out="ortho.tif", limits=QUICK, told=None, **rest):
-        asked = {name: rest.pop(name) for name in list(rest) if name in Wish.__dataclass_fields__}
+    def taken(source, half_m=110.0, out="ortho.tif", limits=QUICK, terms=None, **rest):
+        asked = {
+            name: rest.pop(name)
+            for name in list(rest)
+            if name in ImageryOptions.__dataclass_fields__
+        }
         asked.setdefault("gsd_m", 1.0)
-        spec = parse_source(source, Wish(**asked), **(told or {}))
+        spec = parse_source(source, ImageryOptions(**asked), **(terms or {}))
         request = FetchRequest(
             spec=spec,
-            area=rest.pop("area", None) or Area.from_bounds(ground.bounds(half_m)),
+            area=rest.pop("area", None) or Area.from_bounds(terrain.bounds(half_m)),
             out=tmp_path / out,
             margin_m=rest.pop("margin_m", 0.0),
             packing=rest.pop("packing", Packing("deflate")),
@@ -98,8 +102,8 @@ def take(tmp_path):
 @pytest.fixture(scope="session")
 def cog_bytes(tmp_path_factory):
     """A cloud-optimized file of the ground in UTM, 500 m across at 1 m, as bytes."""
-    path = ground.write_tif(
-        tmp_path_factory.mktemp("cog") / "ground.tif", "EPSG:32631", size=500, driver="COG"
+    path = terrain.write_tif(
+        tmp_path_factory.mktemp("cog") / "terrain.tif", "EPSG:32631", size=500, driver="COG"
     )
     return io.BytesIO(path.read_bytes()).getvalue()
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import parse_qsl, urlsplit
 
-import ground
+import terrain
 
-from orthonav.fetch import Limits
+from orthonav.fetch import RequestLimits
 
-QUICK = Limits(parallel=4, per_second=2000, attempts=3, backoff_s=0.01, backoff_max_s=0.02)
+QUICK = RequestLimits(parallel=4, per_second=2000, attempts=3, backoff_s=0.01, backoff_max_s=0.02)
 
 
 @dataclass
@@ -153,12 +153,12 @@ def files(contents, ranges=True):
 def tiles(asked):
     """The ground as web tiles at /Z/X/Y.png."""
     zoom, col, row = (int(part) for part in asked.path.rpartition(".")[0].split("/")[-3:])
-    return Answer(ground.encoded(ground.mercator_tile(zoom, row, col)))
+    return Answer(terrain.encoded(terrain.mercator_tile(zoom, row, col)))
 
 
 def wms_map(asked):
     """GetMap of the ground in any coordinate system, as WMS 1.1.1 (x, y always)."""
     west, south, east, north = (float(v) for v in asked.query["BBOX"].split(","))
     size = int(asked.query["WIDTH"]), int(asked.query["HEIGHT"])
-    pixels = ground.picture(west, south, east, north, *size, asked.query["SRS"])
-    return Answer(ground.encoded(pixels))
+    pixels = terrain.picture(west, south, east, north, *size, asked.query["SRS"])
+    return Answer(terrain.encoded(pixels))

@@ -12,15 +12,15 @@ import pytest
 from orthonav.errors import FetchError
 from orthonav.fetch import wms, wmts
 from orthonav.fetch.crs import MERCATOR_HALF_M
-from orthonav.fetch.documents import check_xml
+from orthonav.fetch.documents import parse_xml
+from orthonav.fetch.options import ImageryOptions, Provenance
 from orthonav.fetch.presets import presets
-from orthonav.fetch.service import About, Wish
 from orthonav.fetch.wms import wms_cells
 from orthonav.fetch.wmts_tiles import wmts_tiles
 from orthonav.geo.frames import LocalFrame
 
 FOLDER = Path(__file__).parent / "capabilities"
-ABOUT = About("", "")
+PROVENANCE = Provenance("", "")
 PLACES = {
     "ign": LocalFrame(46.5, 3.0),
     "pdok": LocalFrame(52.1, 5.1),
@@ -31,18 +31,18 @@ PLACES = {
 
 def document(name):
     body = (FOLDER / f"{name}.xml").read_bytes()
-    check_xml(body)
+    parse_xml(body)
     return body
 
 
-def tiles(name, wish, url="https://a.example/wmts"):
+def tiles(name, options, url="https://a.example/wmts"):
     service = wmts.read_capabilities(document(f"{name}_wmts"), url)
-    return wmts_tiles(service, wish, PLACES.get(name, PLACES["ign"]), ABOUT)
+    return wmts_tiles(service, options, PLACES.get(name, PLACES["ign"]), PROVENANCE)
 
 
 def of_preset(name, id_, **rest):
     preset = presets()[name]
-    return Wish(**rest).over(preset.wish(preset.layer(id_)))
+    return ImageryOptions(**rest).over(preset.layer(id_).options)
 
 
 def test_ign_by_parameters():
@@ -59,27 +59,29 @@ def test_ign_by_parameters():
 
 def test_ign_limits_of_zooms_and_styles():
     assert "TILEMATRIX=18" in tiles("ign", of_preset("ign", "2000-2005")).url_of(1, 1)
-    with pytest.raises(FetchError, match=r"no zoom 19; there is 6 .*18 \(0.411 m\)"):
+    with pytest.raises(FetchError, match=r"no zoom 19; available: 6 .*18 \(0.411 m\)"):
         tiles("ign", of_preset("ign", "2000-2005", zoom="19"))
     with pytest.raises(FetchError, match=r"the finest is 0.411 m"):
         tiles("ign", of_preset("ign", "2000-2005", gsd_m=0.2))
     old = tiles("ign", of_preset("ign", "1965-1980", gsd_m=1.0))
     assert "STYLE=BDORTHOHISTORIQUE&FORMAT=image/png" in old.url_of(1, 1)
-    with pytest.raises(FetchError, match="no style normal; there is BDORTHOHISTORIQUE"):
+    with pytest.raises(FetchError, match="no style normal; available: BDORTHOHISTORIQUE"):
         tiles("ign", of_preset("ign", "1965-1980", style="normal"))
 
 
-def test_a_year_that_is_not_there_tells_which_are():
-    words = "no layer ORTHOIMAGERY.ORTHOPHOTOS2020; there is .*ORTHOPHOTOS2021"
+def test_an_unknown_year_lists_the_available_ones():
+    words = "no layer ORTHOIMAGERY.ORTHOPHOTOS2020; available: .*ORTHOPHOTOS2021"
     with pytest.raises(FetchError, match=words):
         tiles("ign", of_preset("ign", "2020"))
-    with pytest.raises(FetchError, match=r"ign has no '1999'; there is .*1950-1965.*2021"):
+    with pytest.raises(FetchError, match=r"ign has no '1999'; available: .*1950-1965.*2021"):
         presets()["ign"].layer("1999")
 
 
-def test_a_preferred_style_that_is_not_there_gives_way():
-    wish = Wish(layer="ORTHOIMAGERY.ORTHOPHOTOS2021", usual_style="BDORTHOHISTORIQUE")
-    assert "STYLE=normal" in tiles("ign", wish).url_of(1, 1)
+def test_a_preferred_style_that_is_missing_is_ignored():
+    options = ImageryOptions(
+        layer="ORTHOIMAGERY.ORTHOPHOTOS2021", preferred_style="BDORTHOHISTORIQUE"
+    )
+    assert "STYLE=normal" in tiles("ign", options).url_of(1, 1)
 
 
 def test_pdok_by_templates_in_both_grids():
@@ -101,7 +103,9 @@ def test_swisstopo_by_time_and_on_https():
     )
     current = tiles("swisstopo", of_preset("swissimage", None), where)
     assert "/ch.swisstopo.swissimage/default/current/3857/" in current.url_of(1, 1)
-    with pytest.raises(FetchError, match="no time 1999; there is 2020, 2021, 2022, 2023, current"):
+    with pytest.raises(
+        FetchError, match="no time 1999; available: 2020, 2021, 2022, 2023, current"
+    ):
         tiles("swisstopo", of_preset("swissimage", "2021", time="1999"), where)
 
 
@@ -115,21 +119,21 @@ def test_basemap_rows_before_columns_and_rounded_scales():
 
 
 def test_a_grid_in_degrees_has_the_latitude_first():
-    source = tiles("degrees", Wish(gsd_m=1.0))
+    source = tiles("degrees", ImageryOptions(gsd_m=1.0))
     assert source.grid.corner(0, 0) == (-180.0, 90.0)
     assert source.grid.res_x == pytest.approx(360 / 512 / 2**16, rel=1e-8)
 
 
 def test_ign_wms_in_lambert():
     service = wms.read_capabilities(document("ign_wms"), "https://data.geopf.fr/wms-r/wms")
-    source = wms_cells(service, of_preset("ign-wms", "2021", gsd_m=0.5), PLACES["ign"], ABOUT)
+    source = wms_cells(service, of_preset("ign-wms", "2021", gsd_m=0.5), PLACES["ign"], PROVENANCE)
     assert source.url_of(-12891, 1367) == (
         "https://data.geopf.fr/wms-r/wms?SERVICE=WMS&VERSION=1.3.0&REQUEST=GetMap"
         "&LAYERS=ORTHOIMAGERY.ORTHOPHOTOS2021&STYLES=&CRS=EPSG:2154&WIDTH=1024&HEIGHT=1024"
         "&FORMAT=image/jpeg&TRANSPARENT=FALSE&BBOX=699904,6599680,700416,6600192"
     )
     degrees = of_preset("ign-wms", "2021", crs="EPSG:4326", format="image/png")
-    source = wms_cells(service, degrees, PLACES["ign"], ABOUT)
+    source = wms_cells(service, degrees, PLACES["ign"], PROVENANCE)
     south, west, _, _ = map(
         float, source.url_of(*cell_at(source, 3.0, 46.5))[-80:].split("=")[-1].split(",")
     )
@@ -145,13 +149,15 @@ def cell_at(source, x, y):
 
 def test_an_old_wms_with_times():
     service = wms.read_capabilities(document("old_wms"), "http://maps.example/wms")
-    wish = Wish(layer="ortho", time="2018", gsd_m=0.5)
-    source = wms_cells(service, wish, LocalFrame(51.5, 8.0), ABOUT)
+    options = ImageryOptions(layer="ortho", time="2018", gsd_m=0.5)
+    source = wms_cells(service, options, LocalFrame(51.5, 8.0), PROVENANCE)
     url = source.url_of(0, 0)
     assert url.startswith("http://maps.example/cgi?map=/srv/ortho.map&SERVICE=WMS&VERSION=1.1.1")
     assert "SRS=EPSG:25832" in url and "TIME=2018" in url
-    with pytest.raises(FetchError, match="no time 2019; there is 2015, 2018, 2021"):
-        wms_cells(service, Wish(layer="ortho", time="2019"), LocalFrame(51.5, 8.0), ABOUT)
+    with pytest.raises(FetchError, match="no time 2019; available: 2015, 2018, 2021"):
+        wms_cells(
+            service, ImageryOptions(layer="ortho", time="2019"), LocalFrame(51.5, 8.0), PROVENANCE
+        )
 
 
 BOMB = b"""<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "bbbbbbbbbb"><!ENTITY c "&b;&b;&b;">]>
@@ -166,19 +172,30 @@ OUTSIDE = b"""<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/p
         (BOMB, "entities"),
         (BOMB.decode().encode("utf-16"), "entities|not an XML"),
         (OUTSIDE, "entities"),
-        (b"<a>" * 200 + b"</a>" * 200, "too deep"),
         (b"<html><p>no", "not an XML"),
         (b"", "not an XML"),
     ],
 )
-def test_documents_that_may_do_harm_are_refused(body, words):
+def test_harmful_documents_are_rejected(body, words):
     with pytest.raises(FetchError, match=words):
-        check_xml(body)
+        parse_xml(body)
+
+
+def test_a_deeply_nested_document_is_rejected():
+    layers = b"<Layer>" * 5000 + b"</Layer>" * 5000
+    with pytest.raises(FetchError, match="cannot be read"):
+        wms.read_capabilities(
+            b"<WMS_Capabilities version='1.3.0'>" + layers + b"</WMS_Capabilities>", "http://a/b"
+        )
+    with pytest.raises(FetchError, match="cannot be read"):
+        wmts.read_capabilities(
+            b"<Capabilities version='1.0.0'>" + layers + b"</Capabilities>", "http://a/b"
+        )
 
 
 @pytest.mark.parametrize("body", [b"<a/>", b"<WMS_Capabilities version='2.0'/>"])
-def test_other_documents_are_told(body):
+def test_other_documents_are_rejected(body):
     with pytest.raises(FetchError, match=r"cannot be read|lists no layer"):
         wmts.read_capabilities(body, "http://a/b")
-    with pytest.raises(FetchError, match=r"1\.1\.1 and 1\.3\.0 are known"):
+    with pytest.raises(FetchError, match=r"supported versions of WMS are 1\.1\.1 and 1\.3\.0"):
         wms.read_capabilities(body, "http://a/b")

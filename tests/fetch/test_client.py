@@ -1,4 +1,4 @@
-"""Asking over HTTP: what may pass is asked again, what may not ends, keys stay where they are."""
+"""HTTP requests: temporary failures are repeated, others end, keys stay with their origin."""
 
 import gzip
 import logging
@@ -14,7 +14,7 @@ from servers import QUICK
 
 from orthonav.errors import FetchError
 from orthonav.fetch.client import BadReplyError, Client
-from orthonav.fetch.politeness import Limits, Stopped, Turns, backoff_s, retry_after_s
+from orthonav.fetch.politeness import RequestLimits, Stopped, Turns, retry_after_s, retry_policy
 from orthonav.fetch.urls import Secret
 
 SECRET = "s3cr3t-v4lue"
@@ -24,20 +24,20 @@ def body(reply):
     return reply.body if reply.status == 200 else pytest.fail(f"HTTP {reply.status}")
 
 
-def get(answer, limits=QUICK, judge=body, **rest):
+def get(answer, limits=QUICK, check=body, **rest):
     """What comes of one request to a server, and what the server saw."""
     with servers.serving(answer) as server, Client(limits) as client:
-        return client.get(f"{server.url}/one?a=1", judge, **rest), server.log
+        return client.get(f"{server.url}/one?a=1", check, **rest), server.log
 
 
 def failing(answer, words, limits=QUICK, **rest):
-    with pytest.raises(FetchError, match=words) as told:
+    with pytest.raises(FetchError, match=words) as raised:
         get(answer, limits, **rest)
-    assert "127.0.0.1" in str(told.value)
+    assert "127.0.0.1" in str(raised.value)
 
 
 @pytest.mark.parametrize("status", [408, 425, 429, 500, 502, 503, 504])
-def test_what_may_pass_is_asked_again(status):
+def test_temporary_status_is_repeated(status):
     def answer(asked):
         return servers.Answer(b"good" if asked.before else b"no", 200 if asked.before else status)
 
@@ -57,24 +57,24 @@ def test_what_may_pass_is_asked_again(status):
     ],
     ids=["cut short", "reset", "slow", "half packed", "not packed"],
 )
-def test_broken_connections_are_tried_again(first):
-    limits = Limits(per_second=2000, attempts=2, backoff_s=0.01, read_s=0.2)
+def test_broken_connections_are_repeated(first):
+    limits = RequestLimits(per_second=2000, attempts=2, backoff_s=0.01, read_s=0.2)
     found, log = get(lambda asked: servers.Answer(b"good") if asked.before else first, limits)
     assert found == b"good" and len(log) == 2
 
 
-def test_an_end_after_so_many_tries():
+def test_attempts_are_limited():
     asked = []
     failing(lambda a: asked.append(a) or servers.Answer(status=503), "HTTP 503")
     assert len(asked) == QUICK.attempts
 
 
-def test_a_server_that_drips_is_left_in_the_end():
-    limits = Limits(per_second=2000, attempts=1, total_s=0.3)
+def test_a_slow_body_times_out():
+    limits = RequestLimits(per_second=2000, attempts=1, total_s=0.3)
     failing(lambda _: servers.Answer(b"x" * 100, drip_s=0.05), "longer than 0.3 s", limits)
 
 
-def test_retry_after_holds_the_whole_host_back():
+def test_retry_after_pauses_the_host():
     def answer(asked):
         if asked.before:
             return servers.Answer(b"good")
@@ -85,27 +85,33 @@ def test_retry_after_holds_the_whole_host_back():
     assert found == b"good" and time.monotonic() - start >= 0.99
 
 
-def test_retry_after_in_words_of_http():
-    limits = Limits(wait_max_s=60)
+def test_retry_after_as_date_or_seconds():
+    limits = RequestLimits(wait_max_s=60)
     later = format_datetime(datetime.now(UTC) + timedelta(seconds=30), usegmt=True)
     assert 0 < retry_after_s(later, limits) <= 30
     assert retry_after_s("Sat, 01 Jan 2000 00:00:00 GMT", limits) == 0
     assert retry_after_s("7", limits) == 7
     assert retry_after_s(None, limits) is None and retry_after_s("soon", limits) is None
+    assert retry_after_s("9" * 9000, limits) is None
     with pytest.raises(FetchError, match="come back in 3600 s"):
         retry_after_s("3600", limits)
 
 
-def test_backoff_doubles_and_jitters():
-    limits = Limits(backoff_s=1.0, backoff_max_s=10.0)
-    for attempt, longest in ((1, 1), (2, 2), (3, 4), (9, 10)):
-        waits = [backoff_s(limits, attempt) for _ in range(200)]
-        assert longest / 2 <= min(waits) < max(waits) <= longest
-        assert max(waits) - min(waits) > longest / 4
+def test_pauses_double_with_jitter_from_the_first_repetition():
+    limits = RequestLimits(backoff_s=1.0, backoff_max_s=10.0, attempts=20)
+    for failures, least in ((1, 1), (2, 2), (3, 4), (4, 8), (9, 10)):
+        pauses = []
+        for _ in range(100):
+            retry = retry_policy(limits)
+            for _ in range(failures):
+                retry = retry.increment(error=BadReplyError("odd"))
+            pauses.append(retry.get_backoff_time())
+        assert least <= min(pauses) and max(pauses) <= min(least + 1, 10)
+        assert least == 10 or max(pauses) - min(pauses) > 0.5
 
 
-def test_turns_are_given_at_the_rate():
-    turns = Turns(Limits(per_second=100.0))
+def test_requests_are_sent_at_the_rate():
+    turns = Turns(RequestLimits(per_second=100.0))
     start = time.monotonic()
     for _ in range(70):  # 50 at once, 20 at the rate
         turns.wait("a")
@@ -116,8 +122,8 @@ def test_turns_are_given_at_the_rate():
         turns.wait("a")
 
 
-def test_a_wait_ends_when_the_run_does():
-    turns = Turns(Limits())
+def test_a_wait_ends_with_the_run():
+    turns = Turns(RequestLimits())
     ended = []
 
     def waiting():
@@ -132,7 +138,7 @@ def test_a_wait_ends_when_the_run_does():
     assert ended
 
 
-def test_packed_bodies_are_unpacked_and_bursting_ones_refused():
+def test_gzip_is_unpacked_and_bombs_are_rejected():
     packed = {"Content-Encoding": "gzip"}
     found, _ = get(lambda _: servers.Answer(gzip.compress(b"y" * 9999), headers=packed))
     assert found == b"y" * 9999
@@ -159,7 +165,7 @@ def test_bodies_over_the_limit_are_not_read():
     )
 
 
-def test_redirects_are_followed_within_reason():
+def test_redirects_are_followed_within_limits():
     def answer(asked):
         where = {"/one": "/two", "/two": "three"}.get(asked.path)
         if where:
@@ -168,12 +174,12 @@ def test_redirects_are_followed_within_reason():
 
     assert get(answer)[0] == b"/three"
     failing(lambda _: servers.Answer(status=302, headers={"Location": "/one"}), "too many")
-    failing(lambda _: servers.Answer(status=301), "without a place")
+    failing(lambda _: servers.Answer(status=301), "without a Location")
     for place in ("file:///etc/passwd", "ftp://a/b", "http://user:pw@a/b"):
         failing(lambda _, p=place: servers.Answer(status=307, headers={"Location": p}), "redirect")
 
 
-def test_a_judge_may_ask_again_or_not():
+def test_a_check_decides_whether_to_repeat():
     def again(reply):
         raise BadReplyError("odd")
 
@@ -181,13 +187,13 @@ def test_a_judge_may_ask_again_or_not():
         raise BadReplyError("odd", again=False)
 
     asked = []
-    failing(lambda a: asked.append(a) or servers.Answer(b"x"), "odd", judge=again)
+    failing(lambda a: asked.append(a) or servers.Answer(b"x"), "odd", check=again)
     assert len(asked) == QUICK.attempts
-    failing(lambda a: asked.append(a) or servers.Answer(b"x"), "odd", judge=never)
+    failing(lambda a: asked.append(a) or servers.Answer(b"x"), "odd", check=never)
     assert len(asked) == QUICK.attempts + 1
 
 
-def test_no_connection_is_told_in_words():
+def test_no_connection_is_an_error():
     with Client(QUICK) as client, pytest.raises(FetchError, match="connection failed"):
         client.get("http://127.0.0.1:1/x", body)
 
@@ -196,21 +202,21 @@ def keyed(server, *, limits=QUICK):
     return Client(limits, (Secret("{key}", server.url, SECRET),))
 
 
-def test_a_key_is_sent_to_its_server_and_shown_nowhere(caplog):
+def test_a_key_is_sent_to_its_origin_and_never_shown(caplog):
     caplog.set_level(logging.DEBUG)
     with servers.serving(lambda a: servers.Answer(SECRET.encode(), 503)) as server:
-        with keyed(server) as client, pytest.raises(FetchError) as told:
+        with keyed(server) as client, pytest.raises(FetchError) as raised:
             client.get(f"{server.url}/one?token={{key}}", body)
         assert server.log[0].query["TOKEN"] == SECRET
-    assert SECRET not in str(told.value) and "{key}" in str(told.value)
-    chain = told.value
+    assert SECRET not in str(raised.value) and "{key}" in str(raised.value)
+    chain = raised.value
     while chain is not None:  # what -v would print
         assert SECRET not in repr(chain)
         chain = None if chain.__suppress_context__ else chain.__context__
     assert SECRET not in caplog.text and SECRET not in repr(client._secrets)
 
 
-def test_a_key_leaves_its_server_by_no_redirect():
+def test_a_key_does_not_follow_redirects():
     with servers.serving(lambda a: servers.Answer(b"")) as other:
 
         def answer(asked):
@@ -234,6 +240,6 @@ def test_a_key_is_escaped():
 
 
 @pytest.mark.parametrize("url", ["file:///etc/passwd", "ftp://host/a", "/etc/passwd", "http://"])
-def test_only_http_is_asked(url):
+def test_other_schemes_are_rejected(url):
     with Client(QUICK) as client, pytest.raises(FetchError, match="only http"):
         client.get(url, body)

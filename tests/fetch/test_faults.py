@@ -1,4 +1,4 @@
-"""What must never happen is a wrong pixel: every fault of a service ends told, masked or both."""
+"""No fault of a service may become a wrong pixel: each ends in an error, a mask, or both."""
 
 import os
 import signal
@@ -6,24 +6,24 @@ import subprocess
 import sys
 import time
 
-import ground
 import numpy as np
 import pytest
 import rasterio
 import servers
+import terrain
 
 from orthonav.errors import FetchError, OutputError
 from orthonav.fetch.cache import FileCache
 
 NOISE = np.random.default_rng(1).integers(1, 255, (256, 256, 3), dtype=np.uint8)
-PLACEHOLDER = ground.encoded(NOISE)
+PLACEHOLDER = terrain.encoded(NOISE)
 FAULTS = {
     "a page": servers.Answer(b"<html>Log in</html>", kind="text/html"),
     "an error in XML": servers.Answer(
         b"<ServiceExceptionReport><ServiceException>down</ServiceException></ServiceExceptionReport>"
     ),
-    "another size": servers.Answer(ground.encoded(NOISE[:128, :128])),
-    "half a picture": servers.Answer(ground.encoded(NOISE, "JPEG")[:5000]),
+    "another size": servers.Answer(terrain.encoded(NOISE[:128, :128])),
+    "half a picture": servers.Answer(terrain.encoded(NOISE, "JPEG")[:5000]),
     "cut short": servers.Answer(PLACEHOLDER, cut=900),
     "500": servers.Answer(b"oops", 500),
     "403": servers.Answer(b"no", 403),
@@ -35,9 +35,9 @@ FAULTS = {
 ABSENT = {
     "404": servers.Answer(b"not found", 404),
     "204": servers.Answer(b"", 204),
-    "white": servers.Answer(ground.encoded(np.full((256, 256, 3), 255, np.uint8))),
-    "black": servers.Answer(ground.encoded(np.zeros((256, 256, 3), np.uint8), "JPEG")),
-    "clear": servers.Answer(ground.encoded(np.zeros((256, 256, 4), np.uint8))),
+    "white": servers.Answer(terrain.encoded(np.full((256, 256, 3), 255, np.uint8))),
+    "black": servers.Answer(terrain.encoded(np.zeros((256, 256, 3), np.uint8), "JPEG")),
+    "clear": servers.Answer(terrain.encoded(np.zeros((256, 256, 4), np.uint8))),
 }
 
 
@@ -58,19 +58,19 @@ def source(server):
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_lasting_fault_writes_nothing_and_keeps_what_came(take, tmp_path, name):
+def test_a_lasting_fault_writes_nothing_and_can_be_resumed(take, tmp_path, name):
     with servers.serving(tiles_but(FAULTS[name])) as server:
-        with pytest.raises(FetchError, match=r"\d of \d+ tiles failed .*--allow-holes") as told:
+        with pytest.raises(FetchError, match=r"\d of \d+ tiles failed .*--allow-holes") as raised:
             take(source(server))
         assert not (tmp_path / "ortho.tif").exists()
-        assert "ortho.tif.tiles" in str(told.value) and "127.0.0.1" in str(told.value)
+        assert "ortho.tif.tiles" in str(raised.value) and "127.0.0.1" in str(raised.value)
         before = len(server.log)
         server.answer = servers.tiles
-        result, path = take(source(server))  # the same command goes on
+        result, path = take(source(server))  # the same command resumes
         asked_again = {asked.path for asked in server.log[before:]}
     assert len(asked_again) + result.fetched.from_cache == result.estimate.tiles
     assert result.fetched.from_cache > 0
-    shift, worst, valid = ground.offset_px(path)
+    shift, worst, valid = terrain.offset_px(path)
     assert np.abs(shift).max() < 0.05 and worst <= 1 and valid == 1.0
     assert not (tmp_path / "ortho.tif.tiles").exists()
 
@@ -78,53 +78,53 @@ def test_a_lasting_fault_writes_nothing_and_keeps_what_came(take, tmp_path, name
 @pytest.mark.parametrize(
     "name", [n for n in FAULTS if n not in ("403", "another size", "too large")]
 )
-def test_a_passing_fault_is_got_over(take, name):
+def test_a_temporary_fault_is_overcome(take, name):
     with servers.serving(tiles_but(FAULTS[name], lasting=False)) as server:
         result, path = take(source(server))
-    assert not result.fetched.failed and ground.offset_px(path)[1] <= 1
-    assert ground.offset_px(path)[2] == 1.0
+    assert not result.fetched.failed and terrain.offset_px(path)[1] <= 1
+    assert terrain.offset_px(path)[2] == 1.0
 
 
 @pytest.mark.parametrize("name", ["a page", "another size", "500"])
-def test_holes_are_masked_where_they_are_allowed(take, name, caplog):
+def test_allowed_holes_are_masked(take, name, caplog):
     with servers.serving(tiles_but(FAULTS[name])) as server:
         result, path = take(source(server), allow_holes=True)
     failed = result.fetched.failed.total()
     assert failed > 0 and f"{failed} failed" in caplog.text
-    shift, worst, valid = ground.offset_px(path)
+    shift, worst, valid = terrain.offset_px(path)
     assert np.abs(shift).max() < 0.05 and worst <= 1
     assert valid == pytest.approx(1 - failed / result.estimate.tiles) == result.valid_share
 
 
 @pytest.mark.parametrize("name", ABSENT)
-def test_what_is_not_covered_is_masked_and_counted(take, name, caplog):
+def test_missing_imagery_is_masked_and_counted(take, name, caplog):
     with servers.serving(tiles_but(ABSENT[name])) as server:
         result, path = take(source(server))
     plain = result.describe()
     missing = plain["not_covered"] + plain["blank"] + plain["placeholders"]
     assert 0 < missing < plain["tiles"] and not plain["failed"]
     assert plain["valid_share"] == pytest.approx(1 - missing / plain["tiles"], abs=1e-4)
-    assert ground.offset_px(path)[1] <= 1 and "masked" in caplog.text
+    assert terrain.offset_px(path)[1] <= 1 and "masked" in caplog.text
 
 
-def test_one_picture_in_many_places_is_a_placeholder(take):
+def test_identical_tiles_are_placeholders(take):
     with servers.serving(tiles_but(servers.Answer(PLACEHOLDER))) as server:
         result, path = take(source(server))
-    assert result.counts.placeholder > 1
-    assert ground.offset_px(path)[1] <= 1
+    assert result.counts.placeholders > 1
+    assert terrain.offset_px(path)[1] <= 1
 
 
 @pytest.mark.parametrize("name", ABSENT)
-def test_nothing_at_all_is_an_error(take, tmp_path, name):
+def test_no_imagery_at_all_is_an_error(take, tmp_path, name):
     words = "no imagery of this area"
     with servers.serving(lambda _: ABSENT[name]) as server, pytest.raises(FetchError, match=words):
         take(source(server))
     assert not (tmp_path / "ortho.tif").exists()
 
 
-def test_a_service_that_is_down_is_left_soon(take):
+def test_a_service_that_is_down_ends_the_fetch(take):
     with servers.serving(lambda _: servers.Answer(b"no", 401)) as server:
-        with pytest.raises(FetchError, match=r"20 requests in a row failed.*HTTP 401.*kept"):
+        with pytest.raises(FetchError, match=r"20 requests in a row failed.*HTTP 401.*stored"):
             take(source(server), half_m=900)
         assert len(server.log) < 60
 
@@ -152,18 +152,18 @@ def test_a_broken_entry_of_the_cache_is_fetched_again(take, tmp_path):
         before = len(server.log)
         again, path = take(source(server), cache=tmp_path / "cache")
         assert len(server.log) - before == 3 == again.estimate.tiles - again.fetched.from_cache
-    assert ground.offset_px(path)[1] <= 1
+    assert terrain.offset_px(path)[1] <= 1
 
 
-def test_a_cache_may_not_be_any_folder(tmp_path):
+def test_a_folder_with_other_files_is_no_cache(tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
-    with pytest.raises(OutputError, match="holds something else"):
+    with pytest.raises(OutputError, match="holds other files"):
         FileCache(tmp_path)
     assert (tmp_path / "thesis.txt").exists()
 
 
 @pytest.mark.parametrize("out", ["ortho.jpg", "folder.tif"])
-def test_where_nothing_can_be_written_nothing_is_fetched(take, tmp_path, out):
+def test_an_unwritable_output_fetches_nothing(take, tmp_path, out):
     (tmp_path / "folder.tif").mkdir()
     with servers.serving(servers.tiles) as server:
         with pytest.raises((FetchError, OutputError), match=r"\.tif"):
@@ -183,7 +183,7 @@ def command_for(server, bounds, out):
     return [sys.executable, "-c", KILLED, "fetch", *area, "--source", source(server), "--out", out]
 
 
-def test_killed_in_the_middle_and_gone_on(take, tmp_path, names_below):
+def test_a_killed_fetch_resumes(take, tmp_path, names_below):
     """SIGKILL after some tiles; the same fetch then asks only for the rest."""
     out = tmp_path / "ortho.tif"
 
@@ -191,26 +191,26 @@ def test_killed_in_the_middle_and_gone_on(take, tmp_path, names_below):
         return servers.Answer(servers.tiles(asked).body, slow_s=0.02)
 
     with servers.serving(slowly) as server:
-        command = command_for(server, ",".join(map(str, ground.bounds(200))), out)
+        command = command_for(server, ",".join(map(str, terrain.bounds(200))), out)
         with subprocess.Popen([*command, "-q"]) as process:
             while len(server.log) < 12 and process.poll() is None:
                 time.sleep(0.005)
             process.send_signal(signal.SIGKILL)
         assert process.returncode == -signal.SIGKILL and not out.exists()
-        kept = [p for p in (tmp_path / "ortho.tif.tiles").rglob("*") if len(p.name) == 62]
-        assert len(kept) >= 4
+        stored = [p for p in (tmp_path / "ortho.tif.tiles").rglob("*") if len(p.name) == 62]
+        assert len(stored) >= 4
         before = len(server.log)
         result, _ = take(source(server), half_m=200, margin_m=200.0)
         asked = len(server.log) - before
-    assert result.fetched.from_cache == len(kept)
-    assert asked == result.estimate.tiles - len(kept) > 0
-    shift, worst, valid = ground.offset_px(out)
+    assert result.fetched.from_cache == len(stored)
+    assert asked == result.estimate.tiles - len(stored) > 0
+    shift, worst, valid = terrain.offset_px(out)
     assert np.abs(shift).max() < 0.05 and worst <= 1 and valid == 1.0
     assert names_below(tmp_path) == ["ortho.tif"]
 
 
 def test_an_interrupt_leaves_no_half_file(tmp_path):
-    bounds = ",".join(map(str, ground.bounds(200)))
+    bounds = ",".join(map(str, terrain.bounds(200)))
     with servers.serving(lambda _: servers.Answer(PLACEHOLDER, slow_s=5)) as server:
         command = command_for(server, bounds, tmp_path / "o.tif")
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
@@ -218,8 +218,8 @@ def test_an_interrupt_leaves_no_half_file(tmp_path):
                 time.sleep(0.005)
             os.kill(process.pid, signal.SIGTERM)
             assert process.stderr is not None
-            told = process.stderr.read()
-    assert process.returncode == 1 and "interrupted" in told and "Traceback" not in told
+            message = process.stderr.read()
+    assert process.returncode == 1 and "interrupted" in message and "Traceback" not in message
     assert not (tmp_path / "o.tif").exists()
 
 

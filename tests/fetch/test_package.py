@@ -1,4 +1,4 @@
-"""Packages of a department: listed page by page, downloaded by ranges, gone on with, checked."""
+"""Packages of a department: listed page by page, downloaded by ranges, resumed, checked."""
 
 import hashlib
 import os
@@ -60,8 +60,8 @@ def service(url, *, parts=None, changed=None):
         if asked.path.startswith("/resource/BDORTHO/"):
             entries = entry("x.md5", f"{url[0]}/dl/x.md5", kind="text/plain", length="99")
             for name, body in parts.items():
-                told = {"length": str(len(body)), "md5": hashlib.md5(body).hexdigest()}
-                entries += entry(name, f"{url[0]}/dl/{name}", kind="application/x-7z", **told)
+                stated = {"length": str(len(body)), "md5": hashlib.md5(body).hexdigest()}
+                entries += entry(name, f"{url[0]}/dl/{name}", kind="application/x-7z", **stated)
             return servers.Answer(FEED.format(page=1, pages=1, entries=entries).encode())
         return plain(asked)
 
@@ -100,7 +100,7 @@ def serving():
         ("../etc:2013", None),
     ],
 )
-def test_what_names_a_package(text, expected):
+def test_package_names_are_parsed(text, expected):
     if expected is None:
         with pytest.raises(FetchError, match="such as D003:2013"):
             parse_package(text)
@@ -113,7 +113,9 @@ def test_the_finest_package_of_a_year(serving):
     with Client(LIMITS) as client:
         assert find_package(client, "D003", "2022", service=server.url).name == NAMES[2][0]
         assert find_package(client, "D003", "2013", "IRC", server.url).name == NAMES[1][0]
-        with pytest.raises(FetchError, match="no RVB package of D003 of 2019; there is 2013, 2022"):
+        with pytest.raises(
+            FetchError, match="no RVB package of D003 of 2019; available: 2013, 2022"
+        ):
             find_package(client, "D003", "2019", service=server.url)
     assert {asked.query["ZONE"] for asked in server.log} == {"D003"}
     assert all(int(asked.query["LIMIT"]) <= 50 for asked in server.log)
@@ -127,7 +129,7 @@ def fetched(server, folder, **rest):
         return download_package(client, files, folder, lambda stage, share: None, **rest)
 
 
-def test_files_come_whole_and_are_not_asked_for_again(serving, tmp_path, monkeypatch):
+def test_complete_files_are_not_requested_again(serving, tmp_path, monkeypatch):
     monkeypatch.setattr(package, "PART_BYTES", 1000)
     server = serving()
     paths = fetched(server, tmp_path / "out")
@@ -150,9 +152,9 @@ def test_half_a_file_is_gone_on_with(serving, tmp_path, monkeypatch):
     assert not list(tmp_path.glob("*.part"))
 
 
-def test_another_file_than_was_told_is_refused(serving, tmp_path):
+def test_a_wrong_size_or_sum_is_rejected(serving, tmp_path):
     other = PARTS | {"x.7z.002": os.urandom(5000)}
-    with pytest.raises(FetchError, match="another MD5 sum"):
+    with pytest.raises(FetchError, match="another MD5"):
         fetched(serving(changed=other), tmp_path / "a")
     assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["x.7z.001"]
     longer = PARTS | {"x.7z.002": os.urandom(5001)}
@@ -160,13 +162,13 @@ def test_another_file_than_was_told_is_refused(serving, tmp_path):
         fetched(serving(changed=longer), tmp_path / "b")
 
 
-def test_names_that_lead_elsewhere_are_refused(serving):
+def test_names_that_leave_the_folder_are_rejected(serving):
     server = serving(parts={"..%2F..%2Fevil.7z": b"x"})
-    with Client(LIMITS) as client, pytest.raises(FetchError, match="not taken"):
+    with Client(LIMITS) as client, pytest.raises(FetchError, match="unsafe file"):
         package_files(client, find_package(client, "D003", "2013", service=server.url))
 
 
-def test_a_disk_that_is_too_small_is_told_before(tmp_path):
+def test_a_small_disk_is_reported_before_the_download(tmp_path):
     files = [PackageFile("a.7z", "http://127.0.0.1:1/a.7z", 10**18, None)]
     with Client(LIMITS) as client, pytest.raises(OutputError, match="disk is too small"):
         download_package(client, files, tmp_path, lambda stage, share: None)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from orthonav.errors import FetchError
-from orthonav.fetch import Wish, parse_source
+from orthonav.fetch import ImageryOptions, parse_source
 from orthonav.fetch.presets import CURRENT, PROTOCOLS, find_preset, presets
 from orthonav.fetch.sources import check_date
 from orthonav.fetch.urls import checked_url
@@ -16,7 +16,7 @@ LAYERS = [(p.name, layer.id) for p in presets().values() for layer in p.layers.v
 
 
 @pytest.mark.parametrize("name", presets())
-def test_a_service_is_described_whole(name):
+def test_a_service_is_complete(name):
     preset = presets()[name]
     assert re.fullmatch(r"[a-z][a-z0-9-]+", name) and name not in PROTOCOLS
     assert preset.protocol in PROTOCOLS and preset.title and preset.country
@@ -24,18 +24,23 @@ def test_a_service_is_described_whole(name):
         assert checked_url(url.replace("{key}", "0")).startswith("https://")
     assert preset.licence and preset.attribution
     assert ("{key}" in preset.url) == (preset.key_env is not None)
-    assert preset.crs is None or re.fullmatch(r"EPSG:\d+", preset.crs)
-    assert preset.protocol != "stac" or preset.collection
-    assert preset.layers and preset.empty in (None, "black", "white")
+    assert all(
+        re.fullmatch(r"EPSG:\d+", layer.options.crs or "EPSG:1") for layer in preset.layers.values()
+    )
+    assert preset.protocol != "stac" or all(
+        layer.options.collection for layer in preset.layers.values()
+    )
+    assert preset.layers
 
 
 @pytest.mark.parametrize("name, id_", LAYERS)
-def test_a_layer_is_described_whole(name, id_):
+def test_a_layer_is_complete(name, id_):
     preset = presets()[name]
     layer = preset.layers[id_]
     assert "{" not in f"{layer}" and 0.05 <= layer.gsd_m <= 1
-    assert layer.layer or preset.protocol == "stac"
-    assert 0 <= (layer.min_zoom or 0) <= (layer.max_zoom or 22) <= 22
+    assert layer.options.layer or preset.protocol == "stac"
+    assert layer.options.empty in (None, "black", "white")
+    assert 0 <= (layer.options.min_zoom or 0) <= (layer.options.max_zoom or 22) <= 22
     if layer.date is None:
         assert id_ == CURRENT
     else:
@@ -43,9 +48,13 @@ def test_a_layer_is_described_whole(name, id_):
         assert layer.date.partition("/")[0] in id_
     environ = {preset.key_env: "x" * 8} if preset.key_env else {}
     source = name if id_ == CURRENT else f"{name}:{id_}"
-    spec = parse_source(source, Wish(), environ=environ)
-    assert spec.about.licence and spec.about.attribution and spec.about.date == layer.date
-    assert spec.wish.layer == (layer.layer or None)
+    spec = parse_source(source, ImageryOptions(), environ=environ)
+    assert (
+        spec.provenance.licence
+        and spec.provenance.attribution
+        and spec.provenance.date == layer.date
+    )
+    assert spec.options.layer == layer.options.layer
 
 
 def test_express_layers_warn_that_they_are_no_other_date():
@@ -53,28 +62,35 @@ def test_express_layers_warn_that_they_are_no_other_date():
         for id_, layer in presets()[name].layers.items():
             if "express" in id_:
                 assert "no other date" in layer.note
-                assert "no other date" in parse_source(f"{name}:{id_}", Wish()).about.note
+                assert (
+                    "no other date"
+                    in parse_source(f"{name}:{id_}", ImageryOptions()).provenance.note
+                )
 
 
-def test_names_that_are_not_known_list_those_that_are():
-    with pytest.raises(FetchError, match=r"no service is known as 'ing'; there is .*ign"):
+def test_unknown_names_list_the_known_ones():
+    with pytest.raises(FetchError, match=r"unknown service 'ing'; available: .*ign"):
         find_preset("ing")
-    with pytest.raises(FetchError, match="say what kind of service it is"):
-        parse_source("https://a.example/wmts", Wish())
-    with pytest.raises(FetchError, match=r"name a year: naip:YEAR; there is 2010"):
-        parse_source("naip", Wish())
+    with pytest.raises(FetchError, match="write the protocol"):
+        parse_source("https://a.example/wmts", ImageryOptions())
+    with pytest.raises(FetchError, match=r"add a year: naip:YEAR; available: 2010"):
+        parse_source("naip", ImageryOptions())
 
 
-def test_what_the_user_says_goes_first():
+def test_options_of_the_user_take_precedence():
     spec = parse_source(
         "ign:2021",
-        Wish(style="other", crs="EPSG:2154", gsd_m=1.0),
+        ImageryOptions(style="other", crs="EPSG:2154", gsd_m=1.0),
         date="2021-07",
         licence="mine",
         attribution="me",
     )
-    assert spec.wish.style == "other" and spec.wish.crs == "EPSG:2154" and spec.wish.gsd_m == 1.0
-    assert (spec.about.date, spec.about.licence, spec.about.attribution) == (
+    assert (
+        spec.options.style == "other"
+        and spec.options.crs == "EPSG:2154"
+        and spec.options.gsd_m == 1.0
+    )
+    assert (spec.provenance.date, spec.provenance.licence, spec.provenance.attribution) == (
         "2021-07",
         "mine",
         "me",
@@ -82,22 +98,26 @@ def test_what_the_user_says_goes_first():
 
 
 def test_keys_come_from_the_environment_only():
-    with pytest.raises(FetchError, match="variable DATAFORSYNINGEN_TOKEN"):
-        parse_source("dataforsyningen", Wish(), environ={})
-    spec = parse_source("dataforsyningen", Wish(), environ={"DATAFORSYNINGEN_TOKEN": "abcdef"})
+    with pytest.raises(FetchError, match="environment variable DATAFORSYNINGEN_TOKEN"):
+        parse_source("dataforsyningen", ImageryOptions(), environ={})
+    spec = parse_source(
+        "dataforsyningen", ImageryOptions(), environ={"DATAFORSYNINGEN_TOKEN": "abcdef"}
+    )
     assert "abcdef" not in repr(spec) and spec.secrets[0].value == "abcdef"
     with pytest.raises(FetchError, match="--key-env"):
-        parse_source("wmts:https://a.example/?token={key}", Wish(), environ={})
+        parse_source("wmts:https://a.example/?token={key}", ImageryOptions(), environ={})
     with pytest.raises(FetchError, match=r"needs \{key\} in the address"):
-        parse_source("wmts:https://a.example/", Wish(), key_env="K", environ={"K": "abcd"})
-    literal = parse_source("wms:https://a.example/?apikey=abcdef", Wish(), environ={})
+        parse_source(
+            "wmts:https://a.example/", ImageryOptions(), key_env="K", environ={"K": "abcd"}
+        )
+    literal = parse_source("wms:https://a.example/?apikey=abcdef", ImageryOptions(), environ={})
     assert "abcdef" not in repr(literal) and literal.url == "https://a.example/?apikey={key}"
 
 
 @pytest.mark.parametrize("date", ["21", "2021-13", "2021-02-40", "June", "2021/2022/2023", ""])
 def test_dates_are_checked(date):
     with pytest.raises(FetchError, match="date must be"):
-        parse_source("ign", Wish(), date=date)
+        parse_source("ign", ImageryOptions(), date=date)
 
 
 @pytest.mark.parametrize(
@@ -105,7 +125,7 @@ def test_dates_are_checked(date):
 )
 def test_only_http_is_a_source(source):
     with pytest.raises(FetchError, match="only http"):
-        parse_source(source, Wish())
+        parse_source(source, ImageryOptions())
 
 
 def test_the_documentation_lists_the_same_services():

@@ -3,11 +3,11 @@
 import json
 from dataclasses import replace
 
-import ground
 import numpy as np
 import pytest
 import rasterio
 import servers
+import terrain
 from pyproj import Transformer
 
 from orthonav.errors import FetchError
@@ -26,7 +26,7 @@ def placed():
     def check(path, crs=UTM, worst=1.0):
         with rasterio.open(path) as data:
             assert data.crs.to_string() == crs
-        shift, off, valid = ground.offset_px(path)
+        shift, off, valid = terrain.offset_px(path)
         assert np.abs(shift).max() < 0.05 and off <= worst
         return valid
 
@@ -35,15 +35,15 @@ def placed():
 
 def test_a_window_of_a_file_as_it_is(take, placed, cog_bytes):
     with servers.serving(servers.files({"/a.tif": cog_bytes})) as server:
-        result, path = take(f"cog:{server.url}/a.tif", gsd_m=None, told={"date": "2021-07-04"})
+        result, path = take(f"cog:{server.url}/a.tif", gsd_m=None, terms={"date": "2021-07-04"})
         assert all("bytes=" in asked.headers["Range"] for asked in server.log)
     assert placed(path) > 0.4  # the file is smaller than the cell
     assert result.estimate.gsd_m == pytest.approx(1, rel=0.01)
-    assert ground.tags(path)["TIFFTAG_DATETIME"] == "2021:07:04 00:00:00"
+    assert terrain.tags(path)["TIFFTAG_DATETIME"] == "2021:07:04 00:00:00"
 
 
 def test_only_the_bytes_of_the_window_are_fetched(take, placed, tmp_path):
-    large = ground.write_tif(tmp_path / "large.tif", UTM, size=1100, driver="COG").read_bytes()
+    large = terrain.write_tif(tmp_path / "large.tif", UTM, size=1100, driver="COG").read_bytes()
     with servers.serving(servers.files({"/a.tif": large})) as server:
         result, path = take(f"cog:{server.url}/a.tif", gsd_m=None, half_m=20)
     assert placed(path) == 1.0
@@ -54,16 +54,16 @@ def test_only_the_bytes_of_the_window_are_fetched(take, placed, tmp_path):
 def test_overviews_serve_coarser_pixels(take, placed, cog_bytes, gsd_m, res):
     with servers.serving(servers.files({"/a.tif": cog_bytes})) as server:
         _, path = take(f"cog:{server.url}/a.tif", gsd_m=gsd_m)
-        with pytest.raises(FetchError, match="the finest is 1 m; there is 1 m, 2 m"):
+        with pytest.raises(FetchError, match="the finest is 1 m; available: 1 m, 2 m"):
             take(f"cog:{server.url}/a.tif", gsd_m=0.3)
     with rasterio.open(path) as data:
         assert data.res == (res, res)
     placed(path, worst=30)  # averages of four
 
 
-def test_masks_travel(take, tmp_path):
+def test_masks_are_preserved(take, tmp_path):
     hole = np.s_[200:300, 220:280]
-    body = ground.write_tif(
+    body = terrain.write_tif(
         tmp_path / "hole.tif", UTM, hole=hole, size=500, driver="COG"
     ).read_bytes()
     with servers.serving(servers.files({"/a.tif": body})) as server:
@@ -77,7 +77,7 @@ def test_masks_travel(take, tmp_path):
 
 @pytest.mark.parametrize("bands, wanted, count", [(4, None, 3), (4, (4,), 1), (1, None, 1)])
 def test_bands_are_chosen(take, tmp_path, bands, wanted, count):
-    body = ground.write_tif(
+    body = terrain.write_tif(
         tmp_path / "b.tif", UTM, size=300, bands=bands, driver="COG"
     ).read_bytes()
     with servers.serving(servers.files({"/a.tif": body})) as server:
@@ -89,7 +89,7 @@ def test_bands_are_chosen(take, tmp_path, bands, wanted, count):
         assert data.count == count and data.compression.name.lower() == "jpeg"
 
 
-def test_an_area_beside_the_file(take, cog_bytes):
+def test_an_area_outside_the_file(take, cog_bytes):
     area = Area.from_bounds((3.5, 46.5, 3.501, 46.501))
     words = "no imagery of this area"
     with servers.serving(servers.files({"/a.tif": cog_bytes})) as server:
@@ -152,10 +152,10 @@ def test_a_file_that_breaks_while_it_is_read(take, tmp_path, cog_bytes, fault, w
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_remote_files_read_like_local_ones(tmp_path):
+def test_remote_files_read_like_local_ones():
     body = bytes(range(256)) * 2000
     with servers.serving(servers.files({"/f": body})) as server, Client(servers.QUICK) as client:
-        file = RemoteFile(client, f"{server.url}/f", tmp_path / "copy")
+        file = RemoteFile(client, f"{server.url}/f")
         assert file.size == len(body)
         for start, length in (
             (0, 10),
@@ -173,40 +173,42 @@ def catalogue(tmp_path):
     """Files and items of two overlapping squares in one zone, one off the grid, in two years."""
     contents = {}
     for name, shift in (("west_2021", -200), ("east_2021", 200), ("odd_2019", 0.37)):
-        path = ground.write_tif(tmp_path / f"{name}.tif", UTM, size=400, driver="COG", east_m=shift)
+        path = terrain.write_tif(
+            tmp_path / f"{name}.tif", UTM, size=400, driver="COG", east_m=shift
+        )
         contents[f"/{name}.tif"] = path.read_bytes()
         with rasterio.open(path) as data:
             to_degrees = Transformer.from_crs(UTM, "EPSG:4326", always_xy=True)
             box = to_degrees.transform_bounds(*data.bounds)
         time = f"{name[-4:]}-06-{15 if 'w' in name[:1] else 16}T10:00:00Z"
-        contents[name] = ground.item(name, f"./{name}.tif", box, time)
+        contents[name] = terrain.item(name, f"./{name}.tif", box, time)
     return contents
 
 
 def static(catalogue):
     """The same as a static catalogue: root, collection, items."""
-    items = {f"/{k}.json": ground.plain(v) for k, v in catalogue.items() if not k.startswith("/")}
+    items = {f"/{k}.json": terrain.plain(v) for k, v in catalogue.items() if not k.startswith("/")}
     links = [{"rel": "item", "href": f"./{name[1:]}"} for name in items]
     root = {"type": "Catalog", "id": "r", "links": [{"rel": "child", "href": "c.json"}]}
     collection = {"type": "Collection", "id": "c", "links": [*links, {"rel": "root", "href": "/"}]}
     pictures = {k: v for k, v in catalogue.items() if k.startswith("/")}
     return pictures | items | {
-        "/cat.json": ground.plain(root), "/c.json": ground.plain(collection)
+        "/cat.json": terrain.plain(root), "/c.json": terrain.plain(collection)
     }  # fmt: skip
 
 
 def test_a_static_catalogue(take, placed, catalogue):
     with servers.serving(servers.files(static(catalogue))) as server:
         result, path = take(f"stac:{server.url}/cat.json", gsd_m=None, time="2021")
-    assert placed(path) > 0.2 and result.estimate.about.date == "2021-06-15/2021-06-16"
-    assert result.estimate.about.note is None  # as they are: both lie on one grid
-    assert ground.tags(path)["ACQUISITION_DATE"] == "2021-06-15"
+    assert placed(path) > 0.2 and result.estimate.provenance.date == "2021-06-15/2021-06-16"
+    assert result.estimate.provenance.note is None  # as they are: both lie on one grid
+    assert terrain.tags(path)["ACQUISITION_DATE"] == "2021-06-15"
 
 
-def test_a_file_off_the_grid_is_resampled_and_said_to_be(take, placed, catalogue):
+def test_a_file_off_the_grid_is_resampled_and_the_note_says_so(take, placed, catalogue):
     with servers.serving(servers.files(static(catalogue))) as server:
         result, path = take(f"stac:{server.url}/cat.json", gsd_m=None)
-    assert "1 of 3 files resampled" in result.estimate.about.note
+    assert "1 of 3 files resampled" in result.estimate.provenance.note
     placed(path, worst=8)
 
 
@@ -218,20 +220,20 @@ def searching(catalogue, server_url, asked_for):
     def answer(asked):
         if asked.path == "/api/":
             links = [{"rel": "search", "href": "/api/search"}, {"rel": "child", "href": "/none"}]
-            return servers.Answer(ground.plain({"type": "Catalog", "links": links}))
+            return servers.Answer(terrain.plain({"type": "Catalog", "links": links}))
         if asked.path == "/api/search":
-            told = json.loads(asked.body)
-            asked_for.append(told)
+            body = json.loads(asked.body)
+            asked_for.append(body)
             names = sorted(plain)
-            at = names.index(told["token"]) if "token" in told else 0
+            at = names.index(body["token"]) if "token" in body else 0
             page = {"type": "FeatureCollection", "features": [plain[names[at]]]}
             page["features"][0]["assets"]["data"]["href"] = f"{server_url[0]}/{names[at]}.tif"
             if at + 1 < len(names):
                 more = {"rel": "next", "href": "/api/search", "method": "POST", "merge": True}
                 page["links"] = [more | {"body": {"token": names[at + 1]}}]
-            return servers.Answer(ground.plain(page))
+            return servers.Answer(terrain.plain(page))
         if asked.path == "/api/token":
-            return servers.Answer(ground.plain({"token": "se=1&sig=abcdefg"}))
+            return servers.Answer(terrain.plain({"token": "se=1&sig=abcdefg"}))
         return pictures(asked)
 
     return answer
@@ -243,49 +245,49 @@ def test_an_interface_with_a_search_in_pages(take, placed, catalogue):
         url.append(server.url)
         time = "2021-01-01T00:00:00Z/2021-12-31T23:59:59Z"
         result, path = take(f"stac:{server.url}/api/", gsd_m=None, time=time, collection="dop")
-    assert placed(path) > 0.2 and result.counts.pictures >= 1
+    assert placed(path) > 0.2 and result.counts.images >= 1
     assert len(asked_for) == 3
-    for told in asked_for:
-        assert told["collections"] == ["dop"] and told["datetime"] == time
-        west, south, east, north = told["bbox"]
-        assert west < ground.LON_DEG < east and south < ground.LAT_DEG < north
+    for body in asked_for:
+        assert body["collections"] == ["dop"] and body["datetime"] == time
+        west, south, east, north = body["bbox"]
+        assert west < terrain.LON_DEG < east and south < terrain.LAT_DEG < north
 
 
 def test_signed_files(catalogue, tmp_path):
     """A query string that a signing service gives goes to the files' server, and nowhere else."""
-    from orthonav.fetch import FetchRequest, Wish, fetch, parse_source
+    from orthonav.fetch import FetchRequest, ImageryOptions, fetch, parse_source
 
     url = []
     with servers.serving(searching(catalogue, url, [])) as server:
         url.append(server.url)
-        spec = parse_source(f"stac:{server.url}/api/", Wish(time="2021"))
+        spec = parse_source(f"stac:{server.url}/api/", ImageryOptions(time="2021"))
         spec = replace(spec, token_url=f"{server.url}/api/token")
-        area = Area.from_bounds(ground.bounds(100))
+        area = Area.from_bounds(terrain.bounds(100))
         request = FetchRequest(spec, area, tmp_path / "o.tif", margin_m=0, limits=servers.QUICK)
         fetch(request)
         files = [asked for asked in server.log if asked.path.endswith(".tif")]
         assert files and all(asked.query["SIG"] == "abcdefg" for asked in files)
-    assert "abcdefg" not in str(ground.tags(tmp_path / "o.tif"))
+    assert "abcdefg" not in str(terrain.tags(tmp_path / "o.tif"))
 
 
 @pytest.mark.parametrize(
-    "wish, words",
+    "options, words",
     [
-        ({"time": "1999"}, "no picture of the area at 1999"),
-        ({"asset": "visual"}, "no asset visual; there is data"),
+        ({"time": "1999"}, "no imagery of the area at 1999"),
+        ({"asset": "visual"}, "no asset visual; available: data"),
     ],
 )
-def test_what_a_catalogue_does_not_have(take, catalogue, wish, words):
+def test_missing_catalogue_items_are_an_error(take, catalogue, options, words):
     answer = servers.files(static(catalogue))
     with servers.serving(answer) as server, pytest.raises(FetchError, match=words):
-        take(f"stac:{server.url}/cat.json", gsd_m=None, **wish)
+        take(f"stac:{server.url}/cat.json", gsd_m=None, **options)
 
 
 @pytest.mark.parametrize(
     "body, words",
-    [(b"<html>", "not JSON"), (b"[1]", "not a JSON object"), (b"{}", "no picture of the area")],
+    [(b"<html>", "not JSON"), (b"[1]", "not a JSON object"), (b"{}", "no imagery of the area")],
 )
-def test_what_is_no_catalogue(take, body, words):
+def test_invalid_catalogues_are_rejected(take, body, words):
     answer = servers.files({"/c.json": body})
     with servers.serving(answer) as server, pytest.raises(FetchError, match=words):
         take(f"stac:{server.url}/c.json", gsd_m=None)

@@ -1,10 +1,10 @@
 """What comes from a real WMTS and WMS is the ground, in its place to a twentieth of a pixel."""
 
-import ground
 import numpy as np
 import pytest
 import rasterio
 import servers
+import terrain
 
 from orthonav.errors import AreaError, FetchError
 from orthonav.geo.area import Area
@@ -17,7 +17,7 @@ def placed(path, crs):
     """Check that a file shows the ground where it says."""
     with rasterio.open(path) as data:
         assert data.crs.to_string() == crs
-    shift, worst, valid = ground.offset_px(path)
+    shift, worst, valid = terrain.offset_px(path)
     assert np.abs(shift).max() < MAX_OFF_PX
     return worst, valid
 
@@ -27,7 +27,7 @@ def test_wmts_by_parameters_and_by_templates(mapproxy, take, way):
     result, path = take(f"wmts:{mapproxy}{way}", layer="tiles")
     worst, valid = placed(path, "EPSG:3857")
     assert worst <= 1 and valid == 1.0
-    assert result.counts.pictures == result.estimate.tiles and not result.fetched.failed
+    assert result.counts.images == result.estimate.tiles and not result.fetched.failed
     assert result.estimate.gsd_m == pytest.approx(0.822, abs=0.01)  # zoom 17 at 46.5 N
 
 
@@ -83,7 +83,7 @@ def test_rows_from_the_south_quadkeys_and_large_tiles(take):
             zoom, col, row = (int(part.partition("@")[0].partition(".")[0]) for part in rest)
             row = 2**zoom - 1 - row if kind == "tms" else row
         size = 512 if "@2x" in asked.path else 256
-        return servers.Answer(ground.encoded(ground.mercator_tile(zoom, row, col, size)))
+        return servers.Answer(terrain.encoded(terrain.mercator_tile(zoom, row, col, size)))
 
     with servers.serving(answer) as server:
         for number, source in enumerate(
@@ -104,17 +104,17 @@ def test_rows_from_the_south_quadkeys_and_large_tiles(take):
 def test_a_band_around_a_route_leaves_the_rest_out(take, tmp_path):
     from orthonav.geo.route import Route
 
-    west, south, east, north = ground.bounds(500)
+    west, south, east, north = terrain.bounds(500)
     route = Route(((south, west), (north, east)))
     with servers.serving(servers.tiles) as server:
         source = f"xyz:{server.url}/{{z}}/{{x}}/{{y}}.png"
         result, path = take(source, area=Area.from_route(route, 60.0))
-    _, _, valid = ground.offset_px(path)
+    _, _, valid = terrain.offset_px(path)
     assert 0.1 < valid < 0.6 and result.valid_share == 1.0
     with rasterio.open(path) as data:
         line = np.linspace(0, 1, 50)
         for share in line:
-            x, y = ground.Transformer.from_crs("EPSG:4326", "EPSG:3857", always_xy=True).transform(
+            x, y = terrain.Transformer.from_crs("EPSG:4326", "EPSG:3857", always_xy=True).transform(
                 west + share * (east - west), south + share * (north - south)
             )
             row, col = data.index(x, y)
@@ -122,38 +122,45 @@ def test_a_band_around_a_route_leaves_the_rest_out(take, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "wish, words",
+    "options, words",
     [
-        ({"layer": "orto"}, "no layer orto; there is ortho"),
-        ({"layer": None}, "name one with --layer"),
+        ({"layer": "orto"}, "no layer orto; available: ortho"),
+        ({"layer": None}, "choose one with --layer"),
         ({"style": "winter"}, "no style winter"),
-        ({"crs": "EPSG:3006"}, "does not come in EPSG:3006; there is"),
-        ({"format": "image/webp"}, "no format image/webp; there is image/jpeg, image/png"),
-        ({"version": "1.0.0"}, "1.1.1 and 1.3.0 are known"),
+        ({"crs": "EPSG:3006"}, "does not come in EPSG:3006; available:"),
+        ({"format": "image/webp"}, "no format image/webp; available: image/jpeg, image/png"),
+        ({"version": "1.0.0"}, "supported versions of WMS are 1.1.1 and 1.3.0"),
         ({"time": "2021"}, "no time 2021"),
     ],
 )
-def test_what_a_wms_does_not_have_is_listed(mapproxy, take, wish, words):
+def test_what_a_wms_does_not_have_is_listed(mapproxy, take, options, words):
     with pytest.raises(FetchError, match=words):
-        take(f"wms:{mapproxy}/service", **{"layer": "ortho"} | wish)
+        take(f"wms:{mapproxy}/service", **{"layer": "ortho"} | options)
 
 
 @pytest.mark.parametrize(
-    "wish, words",
+    "options, words",
     [
-        ({"layer": "tile"}, "no layer tile; there is tiles"),
-        ({"style": "winter"}, "no style winter; there is default"),
-        ({"crs": "EPSG:3006"}, "does not come in EPSG:3006; there is"),
-        ({"matrix_set": "PM"}, "no grid PM; there is .*lambert"),
-        ({"zoom": "33"}, r"no zoom 33; there is 00 \(.*19 \(0.206 m"),
+        ({"layer": "tile"}, "no layer tile; available: tiles"),
+        ({"style": "winter"}, "no style winter; available: default"),
+        ({"crs": "EPSG:3006"}, "does not come in EPSG:3006; available:"),
+        ({"matrix_set": "PM"}, "no grid PM; available: .*lambert"),
+        ({"zoom": "33"}, r"no zoom 33; available: 00 \(.*19 \(0.206 m"),
         ({"crs": "EPSG:32631", "gsd_m": 0.2}, "the finest is 1 m"),
         ({"time": "2021"}, "no time to choose"),
-        ({"format": "image/jpeg"}, "no format image/jpeg; there is image/png"),
+        ({"format": "image/jpeg"}, "no format image/jpeg; available: image/png"),
     ],
 )
-def test_what_a_wmts_does_not_have_is_listed(mapproxy, take, wish, words):
+def test_what_a_wmts_does_not_have_is_listed(mapproxy, take, options, words):
     with pytest.raises(FetchError, match=words):
-        take(f"wmts:{mapproxy}/service", **{"layer": "tiles"} | wish)
+        take(f"wmts:{mapproxy}/service", **{"layer": "tiles"} | options)
+
+
+def test_swapped_bounds_are_named(mapproxy, take):
+    west, south, east, north = terrain.bounds(60)
+    area = Area.from_bounds((south, west, north, east))
+    with pytest.raises(AreaError, match="latitude and longitude seem to be swapped"):
+        take(f"wmts:{mapproxy}/service", layer="tiles", crs="EPSG:32631", area=area)
 
 
 def test_an_area_outside_the_grid(mapproxy, take):

@@ -23,15 +23,15 @@ from orthonav.fetch import urls
         "http://[a",
     ],
 )
-def test_what_is_no_address_is_refused(url):
+def test_invalid_addresses_are_rejected(url):
     with pytest.raises(FetchError):
         urls.checked_url(url)
 
 
-def test_refusals_show_no_password():
-    with pytest.raises(FetchError) as told:
+def test_errors_show_no_password():
+    with pytest.raises(FetchError) as raised:
         urls.checked_url("https://me:hunter2@a.example/x")
-    assert "hunter2" not in str(told.value)
+    assert "hunter2" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_refusals_show_no_password():
         ("https://a/x?token=", "https://a/x?token=", None),
     ],
 )
-def test_keys_written_into_an_address_are_taken_out(url, plain, key):
+def test_keys_in_an_address_are_extracted(url, plain, key):
     assert urls.without_literal_keys(url) == (plain, key)
 
 

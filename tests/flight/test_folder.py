@@ -128,11 +128,17 @@ def test_spreadsheets_are_read(folder):
     assert view.telemetry.missing() == ["pitch_deg", "roll_deg"]
 
 
-@pytest.mark.parametrize("values", ["nan,2,3", "46,,3", "46,2,", "91,2,3", "46,361,3", "46,2,inf"])
-def test_half_a_prior_is_none(folder, values):
+@pytest.mark.parametrize("values", ["nan,2,3", "46,,3", "46,2,", "91,92,3", "46,361,3", "46,2,inf"])
+def test_an_incomplete_prior_is_ignored(folder, values):
     text = f"{HEADER},prior_lat_deg,prior_lon_deg,prior_std_m,vel_east_mps\n{ROW},{values},1\n"
     view = open_flight(telemetry(folder, text)).views[0]
     assert view.telemetry.prior is None and view.telemetry.vel_en_mps is None
+
+
+def test_a_swapped_prior_is_named(folder):
+    text = f"{HEADER},prior_lat_deg,prior_lon_deg,prior_std_m\n{ROW},121.5,24,30\n"
+    with pytest.raises(FlightError, match=r"line 2: prior .* seem to be swapped"):
+        open_flight(telemetry(folder, text))
 
 
 def test_views_in_subfolders(folder):
@@ -150,15 +156,15 @@ def test_views_in_subfolders(folder):
         (HEADER.upper() + "\n", "columns are missing"),
         (f"{HEADER}\n", "telemetry has no views"),
         (f"{HEADER}\n\n{ROW}\na.png,2,90\n", "line 4 has too few fields"),
-        (f"{HEADER}\n{ROW}\n{ROW}\n", "line 3: frame a.png comes twice"),
+        (f"{HEADER}\n{ROW}\n{ROW}\n", "line 3: frame a.png appears twice"),
         (f"{HEADER}\n../{ROW}\n", r"line 2: '../a.png' is not a name inside frames/"),
         (f"{HEADER}\nx/../../{ROW}\n", "not a name inside"),
         (f"{HEADER}\n/etc/{ROW}\n", "not a name inside"),
         (f"{HEADER}\n..\\{ROW}\n", "not a name inside"),
         (f"{HEADER}\n,1,90,0,0,100\n", "not a name inside"),
-        (f"{HEADER}\na.png,soon,90,0,0,100\n", "line 2: time_s is no time"),
-        (f"{HEADER}\na.png,inf,90,0,0,100\n", "line 2: time_s is no time"),
-        (f"{HEADER}\na.png,1e10,90,0,0,100\n", "line 2: time_s is no time"),
+        (f"{HEADER}\na.png,soon,90,0,0,100\n", "line 2: time_s is not a time"),
+        (f"{HEADER}\na.png,inf,90,0,0,100\n", "line 2: time_s is not a time"),
+        (f"{HEADER}\na.png,1e10,90,0,0,100\n", "line 2: time_s is not a time"),
         (f"{HEADER}\na.png,1,{'9' * 200_000},0,0,100\n", "not a CSV file in UTF-8"),
     ],
 )
@@ -244,12 +250,12 @@ def test_cameras_that_cannot_be(folder, changes):
     ],
     ids=lambda changes: str(changes)[:30],
 )
-def test_cameras_that_are_none(folder, changes):
+def test_invalid_cameras_are_rejected(folder, changes):
     refused(camera(folder, **changes), "expected {camera", names="flight.json")
 
 
 @pytest.mark.parametrize("text", ["", "{", "null", "5", "[]", "{}", '{"camera": 5}', "[" * 10**5])
-def test_a_camera_file_that_is_none(folder, text):
+def test_invalid_camera_files_are_rejected(folder, text):
     (folder / "flight.json").write_text(text)
     refused(folder, "expected {camera.*as JSON", names="flight.json")
 
@@ -259,10 +265,11 @@ def test_a_camera_file_that_is_none(folder, text):
     [
         ("frame,lat_deg\na.png,46\n", "columns are missing: lon_deg"),
         ("frame,lat_deg,lon_deg\na.png,46\n", "line 2 has too few fields"),
-        ("frame,lat_deg,lon_deg\na.png,46,2\na.png,46,2\n", "line 3: frame a.png comes twice"),
-        ("frame,lat_deg,lon_deg\na.png,91,2\n", "line 2: no latitude and longitude"),
-        ("frame,lat_deg,lon_deg\na.png,46,nan\n", "line 2: no latitude and longitude"),
-        ("frame,lat_deg,lon_deg\na.png,,2\n", "line 2: no latitude and longitude"),
+        ("frame,lat_deg,lon_deg\na.png,46,2\na.png,46,2\n", "line 3: frame a.png appears twice"),
+        ("frame,lat_deg,lon_deg\na.png,91,2\n", "line 2: not a latitude and longitude"),
+        ("frame,lat_deg,lon_deg\na.png,121.5,24\n", "line 2: .* seem to be swapped"),
+        ("frame,lat_deg,lon_deg\na.png,46,nan\n", "line 2: not a latitude and longitude"),
+        ("frame,lat_deg,lon_deg\na.png,,2\n", "line 2: not a latitude and longitude"),
     ],
 )
 def test_broken_truth(tmp_path, text, message):

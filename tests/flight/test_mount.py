@@ -1,4 +1,4 @@
-"""A mount: kept, read again, and taken out of what is told."""
+"""A mount is written, read again, and removed from telemetry."""
 
 import json
 import math
@@ -27,7 +27,7 @@ def test_told_values_are_corrected():
     assert (found.time_ns, found.vel_en_mps, found.tilt_std_deg) == (5, (1.0, 2.0), 0.5)
 
 
-def test_what_is_not_told_stays_so():
+def test_unknown_values_stay_unknown():
     found = MOUNT.corrected(Telemetry(0, math.nan, 0.0, 0.0, math.nan))
     assert found.missing() == ["yaw_deg", "agl_m"]
 

@@ -96,6 +96,6 @@ def test_far_away_is_far_away():
 @pytest.mark.parametrize(
     "lat, lon", [(90, 0), (-89.95, 0), (math.nan, 0), (0, math.nan), (0, 361), (math.inf, 0)]
 )
-def test_a_centre_that_is_no_place_is_refused(lat, lon):
+def test_an_invalid_centre_is_refused(lat, lon):
     with pytest.raises(AreaError, match="centre of a sheet"):
         LocalFrame(lat, lon)

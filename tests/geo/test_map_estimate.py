@@ -1,4 +1,4 @@
-"""What a map will need, told before it is built."""
+"""Estimates of maps agree with built maps."""
 
 import math
 
@@ -38,7 +38,7 @@ def test_tiles_of_a_route_are_those_that_are_built():
     assert made.area_km2 < made.imagery_km2
 
 
-def test_a_sample_tells_nearly_the_same(monkeypatch):
+def test_a_sample_agrees_with_the_count(monkeypatch):
     area = Area.from_route(L_ROUTE)
     exact = estimate_map(area, gsd_m=1.0, tile_px=128, overlap=0.75)
     monkeypatch.setattr(estimate, "_MOST_POINTS", 5000)

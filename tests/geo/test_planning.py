@@ -83,7 +83,7 @@ def test_speed_asks_for_views():
     view = ViewPlan.of(CAMERA, 50)
     assert rate_cautions(view, 100) == []
     (caution,) = rate_cautions(view, 400)
-    assert caution.code == "fast" and "21 views a second" in caution.text
+    assert caution.code == "fast" and "21 views per second" in caution.text
 
 
 FRAME = LocalFrame(46.5, 2.5)
@@ -119,14 +119,14 @@ def test_height_above_ground_leg_by_leg(heights, agl_m, expected):
     assert legs[0].relief == pytest.approx(10 / expected[0][0], rel=0.15)
 
 
-def test_home_is_where_the_plan_says():
+def test_home_is_the_planned_home():
     route = Route(PLACES, (Height(100, "home"),) * 3, home_amsl_m=700)
     assert profile(route, (1.0, 1.0), None, 0.0, slope)[1].agl_m == pytest.approx(
         (300, 300), abs=0.1
     )
 
 
-def test_hills_and_collisions_are_told():
+def test_hills_and_collisions_give_cautions():
     route = Route(PLACES, (Height(450, "amsl"),) * 3)
     low = profile(route, (10.0, 10.0), None, 100.0, slope)
     assert codes(terrain_cautions(low)) == ["ground"]
@@ -149,8 +149,8 @@ def test_a_hill_beside_the_leg_counts_within_the_band():
     assert leg.relief == pytest.approx(1 / 3, rel=0.01) and leg.agl_m == (300, 300)
 
 
-def test_what_is_not_known_is_told():
-    with pytest.raises(RouteError, match=r"leg 1 is flown.*--agl-m"):
+def test_unknown_heights_are_refused():
+    with pytest.raises(RouteError, match=r"leg 1 .*--agl-m"):
         profile(Route(PLACES), (1.0, 1.0), None, 10.0, slope)
     nowhere = lambda lat, lon: np.full(lat.shape, np.nan)  # noqa: E731
     with pytest.raises(RouteError, match="does not reach leg 1"):

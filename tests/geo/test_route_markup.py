@@ -10,6 +10,7 @@ from orthonav.errors import RouteError
 from orthonav.geo.route import Height, read_route
 from orthonav.geo.routes import kml, markup
 
+BAD_LATITUDE = "a latitude within 90"
 PLACES = ((46.5, 2.5), (46.51, 2.53), (46.49, 2.55))
 LINE = "<coordinates>\n 2.5,46.5,120 2.53,46.51,130\n\t2.55,46.49,140 </coordinates>"
 TRACK = (
@@ -130,8 +131,8 @@ OUTSIDE = '<!DOCTYPE kml SYSTEM "file:///etc/passwd"><kml/>'
     "name, content, message",
     [
         ("a.kml", "", "KML file is empty"),
-        ("a.kml", "<kml>", "no well-formed XML"),
-        ("a.kml", b"\x89PNG\r\n\x1a\n", "no well-formed XML"),
+        ("a.kml", "<kml>", "not well-formed XML"),
+        ("a.kml", b"\x89PNG\r\n\x1a\n", "not well-formed XML"),
         ("a.kml", '<?xml version="1.0" encoding="klingon"?><kml/>', "KML file"),
         ("a.kml", BOMB, "has a DOCTYPE"),
         ("a.kml", OUTSIDE, "has a DOCTYPE"),
@@ -142,10 +143,10 @@ OUTSIDE = '<!DOCTYPE kml SYSTEM "file:///etc/passwd"><kml/>'
         ("a.kml", kml_of(("a", "<Point/>"), ("b", "<Polygon/>")), "it holds Point, Polygon"),
         ("a.kml", kml_of(("a", line(coordinates=""))), "no LineString"),
         ("a.kml", kml_of(("a", line(coordinates=LINE.replace("46.51", "x")))), "must be a number"),
-        ("a.kml", kml_of(("a", line(coordinates=LINE.replace("46.51", "96")))), "not a latitude"),
-        ("a.kml", kml_of(("a", line(coordinates=LINE.replace(",46.51", "")))), "not a latitude"),
+        ("a.kml", kml_of(("a", line(coordinates=LINE.replace("46.51", "96")))), BAD_LATITUDE),
+        ("a.kml", kml_of(("a", line(coordinates=LINE.replace(",46.51", "")))), BAD_LATITUDE),
         ("a.kml", kml_of(("a", line(coordinates=LINE.replace(",130", ",1,1")))), "longitude,lat"),
-        ("a.kmz", b"PK\x03\x04 cut off", "no whole zip archive"),
+        ("a.kmz", b"PK\x03\x04 cut off", "not a complete zip archive"),
         ("a.kmz", archive(("a.txt", "x")), "one KML file, got 0"),
         ("a.kmz", archive(("a.kml", "<kml/>"), ("b.kml", "<kml/>")), "one KML file, got 2"),
         ("a.kmz", archive(("a.kml", "<kml/>" * 50))[:-60], "zip archive"),

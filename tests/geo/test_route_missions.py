@@ -144,15 +144,15 @@ def test_a_landing_pattern_is_flown_to_its_end(read, kind, approach):
         ({"fileType": "Parameters"}, "fileType 'Plan', got 'Parameters'"),
         ({"fileType": "Plan"}, "must hold a mission"),
         ({"fileType": "Plan", "mission": {"items": 3}}, "list of items"),
-        (plan(), "no waypoint with a place"),
-        (plan(simple(206)), "no waypoint with a place"),
+        (plan(), "no waypoint with a position"),
+        (plan(simple(206)), "no waypoint with a position"),
         (plan(3), "item 1 of the plan must be an object"),
         (plan({"type": "Other"}), "SimpleItem or a ComplexItem, got 'Other'"),
         (plan(simple(16, A) | {"params": [1, 2]}), "item 1 of the plan must have 7 params"),
         (plan(simple(16, ("47", 8))), "params must be a number, got '47'"),
         (plan(simple(16, A, frame=1)), "MAV_FRAME 1; expected a global one"),
         (plan(simple("16", A)), "command must be a number"),
-        (plan(simple(16, (91, 8), 5)), "not a latitude"),
+        (plan(simple(16, (91, 8), 5)), "a latitude within 90"),
         (plan(simple(16, A, 1e9)), "height of a waypoint"),
         (plan(home=["x", 8, 0]), "plannedHomePosition must be a number"),
         (
@@ -169,7 +169,7 @@ def test_a_landing_pattern_is_flown_to_its_end(read, kind, approach):
         ),
     ],
 )
-def test_plans_that_are_none_are_refused(read, document, message):
+def test_invalid_plans_are_refused(read, document, message):
     with pytest.raises(RouteError, match=message):
         read(document)
 
@@ -210,16 +210,16 @@ def test_older_waypoint_files_have_no_home(read):
     "text, message",
     [
         ("", "is empty"),
-        ("QGC WPL 110\n", "no waypoint with a place"),
+        ("QGC WPL 110\n", "no waypoint with a position"),
         ("QGC WPL 100\n1", "must begin with 'QGC WPL 110', got 'QGC WPL 100'"),
         ("QGC WPL 110\n1\t2\n", "line 2 of the waypoint file has 2 values, expected 12"),
         (WPL.replace("47.40", "north"), "line 5, column 9 must be a number"),
         (WPL.replace("47.40", "nan"), "line 5, column 9 must be a number"),
-        (WPL.replace("47.40", "470"), "not a latitude"),
+        (WPL.replace("47.40", "470"), "a latitude within 90"),
         (WPL.replace("\t82\t", "\t82.5\t"), "line 7: frame and command must be whole"),
         (WPL.replace("4\t0\t10", "4\t0\t1"), "MAV_FRAME 1"),
     ],
 )
-def test_waypoint_files_that_are_none_are_refused(read, text, message):
+def test_invalid_waypoint_files_are_refused(read, text, message):
     with pytest.raises(RouteError, match=message):
         read(text, "a.waypoints")

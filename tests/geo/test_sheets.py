@@ -108,7 +108,7 @@ def test_a_leg_longer_than_a_sheet_is_cut():
     assert len(whole) == 1
 
 
-def test_many_waypoints_are_cut_quickly():
+def test_many_waypoints_are_divided_quickly():
     lat = np.linspace(46, 50, 20_000)
     route = Route(tuple((value, 2.0) for value in lat.tolist()))
     parts = sheets_of_route(route, 1000)
@@ -118,9 +118,9 @@ def test_many_waypoints_are_cut_quickly():
 @pytest.mark.parametrize(
     "route, band_m, message",
     [
-        (Route(((46, 2), (47, 3))), None, "width of its search band"),
+        (Route(((46, 2), (47, 3))), None, "no search band"),
         (Route(((46, 2), (47, 3))), 50_000, "as wide as a sheet"),
-        (Route(((0, 0), (0, 180))), 100, "half around the Earth"),
+        (Route(((0, 0), (0, 180))), 100, "half of the Earth"),
     ],
 )
 def test_routes_that_cannot_be_cut_are_refused(route, band_m, message):

@@ -37,7 +37,7 @@ def rgb_nir(path):
 
 
 def rgb_nir_as_gdal_marks_it(path):
-    """GDAL calls the fourth band of four alpha unless told otherwise."""
+    """GDAL marks the fourth of four bands as alpha by default."""
     return write(path, with_band(SCENE, 255 - SCENE[0]))
 
 
@@ -349,7 +349,7 @@ def test_a_later_file_fills_the_holes_of_the_first(tmp_path):
     assert off[clear].max() <= 3
 
 
-def test_more_files_than_are_kept_open(tmp_path, monkeypatch):
+def test_more_files_than_may_be_open(tmp_path, monkeypatch):
     monkeypatch.setattr("orthonav.imagery.raster.MAX_OPEN", 2)
     paths = []
     for index in range(5):

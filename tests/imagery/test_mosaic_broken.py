@@ -36,7 +36,7 @@ def test_a_file_that_is_missing(tmp_path):
 
 
 def test_no_file_at_all():
-    with pytest.raises(ImageryError, match="no orthophoto was named"):
+    with pytest.raises(ImageryError, match="no orthophoto was given"):
         Mosaic.open([])
 
 
@@ -56,7 +56,7 @@ def test_no_geotransform(ortho):
 
 def test_a_local_coordinate_system_is_nowhere_on_earth(ortho):
     crs = 'LOCAL_CS["mine",UNIT["metre",1]]'
-    refused(write(ortho, SCENE, crs=crs), "coordinate system cannot be turned into latitude")
+    refused(write(ortho, SCENE, crs=crs), "coordinate system cannot be converted to latitude")
 
 
 @pytest.mark.parametrize("shape", [(15, 60), (60, 15), (1, 1)])
@@ -69,7 +69,7 @@ def test_complex_numbers(ortho):
 
 
 def test_metres_called_degrees(ortho):
-    refused(write(ortho, SCENE, crs="EPSG:4326"), "border cannot be turned into latitude")
+    refused(write(ortho, SCENE, crs="EPSG:4326"), "border cannot be converted to latitude")
 
 
 @pytest.mark.parametrize("west_deg", [179.999, -180.001, 200.0])
@@ -136,7 +136,7 @@ def made(kind, ortho):
 
 @pytest.mark.parametrize("kept", [0.1, 0.5, 0.95])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_file_that_was_cut_short_is_never_read_as_if_whole(ortho, kind, kept):
+def test_an_incomplete_file_is_an_error(ortho, kind, kept):
     path = made(kind, ortho)
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])

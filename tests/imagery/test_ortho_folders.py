@@ -1,4 +1,4 @@
-"""A folder as its producer hands it out is an orthophoto; what is in it that is none is told."""
+"""A folder as its producer delivers it is an orthophoto; other files in it are skipped."""
 
 import numpy as np
 import pytest
@@ -80,8 +80,8 @@ def test_a_package_of_bd_ortho(tmp_path, whole, caplog):
     assert len(mosaic.sources) == 4 and {source.date for source in mosaic.sources} == {"2013"}
     assert {source.crs for source in mosaic.sources} == {"EPSG:2154"}
     assert "EPSG:2154" in caplog.text and "4 orthophotos" in caplog.text
-    (told,) = mosaic.describe()
-    assert told["name"] == "ign" and told["files"] == 4 and told["date"] == "2013"
+    (entry,) = mosaic.describe()
+    assert entry["name"] == "ign" and entry["files"] == 4 and entry["date"] == "2013"
     pixels = read(tmp_path / "ign", 190)
     np.testing.assert_array_equal(pixels.valid, whole.valid)
     assert np.abs(pixels.rgb.astype(int) - whole.rgb).max() <= 2
@@ -90,8 +90,8 @@ def test_a_package_of_bd_ortho(tmp_path, whole, caplog):
 @pytest.mark.parametrize("part", [PACKAGE, TILES])
 def test_any_folder_of_the_package_may_be_named(tmp_path, part):
     ign(tmp_path)
-    (told,) = Mosaic.open([tmp_path / part]).describe()
-    assert told["date"] == "2013" and told["crs"] == "EPSG:2154" and told["files"] == 4
+    (entry,) = Mosaic.open([tmp_path / part]).describe()
+    assert entry["date"] == "2013" and entry["crs"] == "EPSG:2154" and entry["files"] == 4
 
 
 def test_sidecars_of_mapinfo_place_jpeg_2000(tmp_path, whole):
@@ -149,12 +149,12 @@ def test_a_folder_of_several_years(tmp_path):
         tiles(tmp_path / "f", name=f"{year}_{{0}}_{{1}}", scene=flat)
     mosaic = Mosaic.open([tmp_path / "f"])
     assert (read(tmp_path / "f", 150).rgb[5:-5, 5:-5] == 150).all()
-    (told,) = mosaic.describe()
-    assert (told["date_from"], told["date"], told["files"]) == ("2015", "2021", 12)
-    assert "width_px" not in told
+    (entry,) = mosaic.describe()
+    assert (entry["date_from"], entry["date"], entry["files"]) == ("2015", "2021", 12)
+    assert "width_px" not in entry
 
 
-def test_what_is_skipped_and_why(tmp_path, caplog):
+def test_skipped_files_are_logged_with_reasons(tmp_path, caplog):
     folder = tmp_path / "f"
     tiles(folder / "deep" / "er")
     for name in ("a.tif.ovr", "a.tif.aux.xml", "a.tif.msk", "a.tfw", "notes.txt", ".hidden.tif"):
@@ -170,8 +170,8 @@ def test_what_is_skipped_and_why(tmp_path, caplog):
     assert [source.path.name for source in mosaic.sources] == [
         f"tile_{row}_{col}.tif" for row in (0, 1) for col in (0, 1)
     ]
-    for told in ("1 archives", "1 ECW", "1 thumbnails", "1 pictures without", "2 rasters that are"):
-        assert told in caplog.text
+    for reason in ("1 archives", "1 ECW", "1 thumbnails", "1 images without", "2 rasters that are"):
+        assert reason in caplog.text
     assert "heights" in caplog.text and "unpack them first" in caplog.text
 
 
@@ -183,10 +183,10 @@ def test_what_is_skipped_and_why(tmp_path, caplog):
         (["x.ecw"], "1 ECW files, which GDAL as installed cannot read"),
         (
             [f"{PACKAGE}.7z.00{part}" for part in (2, 1)],
-            r"2 files of archives.*7z x '.*\.7z\.001' -o",
+            r"archives \(2 files\).*7z x '.*\.7z\.001' -o",
         ),
-        (["x.zip"], r"1 files of archives.*unzip '.*x\.zip' -d "),
-        (["x.png"], "1 pictures without a world file"),
+        (["x.zip"], r"archives \(1 files\).*unzip '.*x\.zip' -d "),
+        (["x.png"], "1 images without a world file"),
     ],
 )
 def test_a_folder_without_orthophotos(tmp_path, names, message):
@@ -316,8 +316,8 @@ def test_build_from_a_folder(tmp_path, capsys):
     ]
     assert main(["build", "--ortho", str(folder), *more, "--out", str(out)]) == 0
     assert "9 files" in capsys.readouterr().out
-    (told,) = open_map(out).manifest.imagery
-    assert told["name"] == "ortho_2019" and told["date"] == "2019" and told["files"] == 9
+    (entry,) = open_map(out).manifest.imagery
+    assert entry["name"] == "ortho_2019" and entry["date"] == "2019" and entry["files"] == 9
     one = tmp_path / "one.onav"
     whole = write(tmp_path / "whole.tif", smooth_scene(390), transform=placed(size=390))
     build_map(BuildRequest([whole], one, tile_px=64, overlap=0.5, calibration_views=2))

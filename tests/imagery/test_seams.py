@@ -9,7 +9,7 @@ from geotiffs import FRAME, LAMBERT, placed, read, sheet_of, smooth_scene, write
 from rasterio.transform import Affine
 
 from orthonav.geo.frames import LocalFrame
-from orthonav.imagery.lattice import Decoded
+from orthonav.imagery.lattice import CellCache
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.imagery.quiet import quiet
 from orthonav.imagery.thin import cells_of
@@ -49,7 +49,7 @@ def cut(folder, scene, transform, side, make=write, **more):
         (0.25, 1.3, 187),
     ],
 )
-def test_a_raster_that_was_cut_is_read_as_if_whole(tmp_path, frame, source_gsd_m, gsd_m, side):
+def test_a_raster_cut_into_files_is_read_as_the_whole(tmp_path, frame, source_gsd_m, gsd_m, side):
     size = round(130 / source_gsd_m)
     transform = placed(LAMBERT, source_gsd_m, size, frame=frame)
     scene = rough_scene(size)
@@ -170,7 +170,7 @@ def test_8_and_16_bit_are_mixed(tmp_path, caplog):
     ]
     mosaic = Mosaic.open(paths)
     assert mosaic.stretches[0] is None and mosaic.stretches[1] == mosaic.stretch is not None
-    assert "8 bits alone" in caplog.text
+    assert "8 bits separately" in caplog.text
     pixels = read(paths, 100)
     assert pixels.valid[2:-2, 2:-2].all()
     assert pixels.rgb[:, :45].std() > 20 and pixels.rgb[:, -45:].std() > 20
@@ -217,8 +217,8 @@ def test_hidden_files_are_not_read_and_shared_ones_once(tmp_path, monkeypatch):
     assert {path.parent.name for path in counted} == {"2021"}
 
 
-def test_what_is_kept_has_a_limit():
-    kept, reads = Decoded(limit_bytes=25_000), []
+def test_the_cache_has_a_limit():
+    kept, reads = CellCache(limit_bytes=25_000), []
 
     def reader(number):
         def read():

@@ -27,14 +27,14 @@ def ortho(path, tags):
 
 
 def test_terms_of_a_fetched_file(tmp_path):
-    told = ortho(tmp_path / "recent_2021.tif", TAGS)
-    assert told["attribution"] == "IGN, BD ORTHO" and told["licence"] == "Licence Ouverte 2.0"
-    assert told["source"] == "https://example.org/wmts" and told["dates"] == "2021/2023"
-    assert "layer" not in told and json.loads(json.dumps(told)) == told
-    assert imagery_text([told]) == "recent_2021.tif 2021 (IGN, BD ORTHO, Licence Ouverte 2.0)"
+    entry = ortho(tmp_path / "recent_2021.tif", TAGS)
+    assert entry["attribution"] == "IGN, BD ORTHO" and entry["licence"] == "Licence Ouverte 2.0"
+    assert entry["source"] == "https://example.org/wmts" and entry["dates"] == "2021/2023"
+    assert "layer" not in entry and json.loads(json.dumps(entry)) == entry
+    assert imagery_text([entry]) == "recent_2021.tif 2021 (IGN, BD ORTHO, Licence Ouverte 2.0)"
 
 
-def test_copyright_where_nothing_else_is_said_and_long_texts_are_cut(tmp_path):
-    told = ortho(tmp_path / "a.tif", {"TIFFTAG_COPYRIGHT": "x" * 1000})
-    assert told["attribution"] == "x" * 300
+def test_copyright_without_attribution_and_long_texts_are_cut(tmp_path):
+    entry = ortho(tmp_path / "a.tif", {"TIFFTAG_COPYRIGHT": "x" * 1000})
+    assert entry["attribution"] == "x" * 300
     assert not {"attribution", "licence"} & set(ortho(tmp_path / "b.tif", {}))

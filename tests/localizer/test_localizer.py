@@ -1,4 +1,4 @@
-"""The whole path of one view: found, gated by the prior, or told why not; never an exception."""
+"""The tile localizer: views found, limited by the prior, or refused with a reason."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -73,7 +73,7 @@ class Ground:
         self.mosaic, self.frame = Mosaic.open([area.past]), localizer.sheet.frame
 
     def view(self, east_m, north_m, yaw_deg=0.0, pitch_deg=0.0, roll_deg=0.0, camera=None):
-        """Grey levels of a view from that place, and telemetry that tells all but the place."""
+        """Grey levels of a view from that place, and its telemetry."""
         west, north = east_m - GROUND_M, north_m + GROUND_M
         sheet = self.mosaic.sheet(
             self.frame,
@@ -105,7 +105,7 @@ def test_most_views_of_another_date_are_placed(fixes, localizer, truth_en_m):
     assert np.median(right) > 0.5
 
 
-def test_a_fix_says_what_it_rests_on(fixes, flight, localizer):
+def test_a_fix_states_its_evidence(fixes, flight, localizer):
     for view in flight.views:
         fix = fixes[view.frame]
         assert isinstance(fix, Fix) and set(fix.evidence) >= EVIDENCE
@@ -154,7 +154,7 @@ def test_threads_may_share_a_localizer(fixes, views, flight, map_path):
         assert all(same(one, fix) for one, fix in zip(found, fixes.values(), strict=True))
 
 
-def test_a_prior_elsewhere_is_outside_the_map(views, flight, localizer, good):
+def test_a_prior_outside_the_map(views, flight, localizer, good):
     grey, telemetry = views[good]
     for place in ([50_000.0, 0.0], [0.0, -3000.0]):
         outcome = localizer.locate(
@@ -176,7 +176,7 @@ def test_a_prior_near_the_truth_changes_nothing(views, fixes, flight, localizer,
         assert (searched < localizer.sheet.tiles) == (std_m < 1e5) and searched > 0
 
 
-def test_a_prior_lets_no_tile_through_that_is_too_far(views, flight, localizer, good, truth_en_m):
+def test_tiles_beyond_the_prior_are_not_searched(views, flight, localizer, good, truth_en_m):
     grey, telemetry = views[good]
     wrong = truth_en_m[good] + [-400.0 if truth_en_m[good][0] > 0 else 400.0, 0.0]
     std_m = 40.0
@@ -185,23 +185,25 @@ def test_a_prior_lets_no_tile_through_that_is_too_far(views, flight, localizer, 
     )
     reach_m = 3 * std_m + localizer.grid.stride_m
     assert error_m(localizer, fix, wrong) <= reach_m + localizer.grid.stride_m
-    inside = np.linalg.norm(localizer.centres_en_m - wrong, axis=1) <= reach_m
+    inside = np.linalg.norm(localizer.tiles.centres_en_m - wrong, axis=1) <= reach_m
     # The gate is a little wider where the camera tilts and the heading is uncertain.
     assert inside.sum() <= fix.evidence["tiles_searched"] <= 1.2 * inside.sum()
 
 
-def test_a_narrow_prior_does_not_make_sure(views, flight, localizer, truth_en_m):
+def test_a_narrow_prior_does_not_raise_the_confidence_of_negatives(
+    views, flight, localizer, truth_en_m
+):
     """Mirrored views show no place of the map, so no prior may make them look right."""
-    sure = []
+    confident = []
     for name, (grey, telemetry) in views.items():
         mirrored = np.ascontiguousarray(grey[:, ::-1])
         prior = prior_at(localizer, truth_en_m[name], 5.0)
         fix = localizer.locate(View(mirrored, flight.camera, telemetry), prior=prior)
-        sure.append(isinstance(fix, Fix) and fix.confidence >= 0.9)
-    assert np.mean(sure) <= 0.1
+        confident.append(isinstance(fix, Fix) and fix.confidence >= 0.9)
+    assert np.mean(confident) <= 0.1
 
 
-def test_the_prior_is_of_the_aircraft_not_of_what_it_sees(views, flight, localizer, good):
+def test_the_prior_is_that_of_the_aircraft_not_of_the_ground_seen(views, flight, localizer, good):
     """A camera that looks far ahead sees ground outside a narrow prior: that must be allowed."""
     grey, telemetry = views[good]
     ahead = replace(telemetry, pitch_deg=40.0, yaw_std_deg=0.0)
@@ -240,7 +242,7 @@ def test_a_prior_without_width_still_reaches_a_stride(
 @pytest.mark.parametrize(
     "prior", [Prior(math.nan, 3.0, 50.0), Prior(46.0, math.nan, 50.0), Prior(46.0, 3.0, math.nan)]
 )
-def test_a_prior_that_is_not_known_is_no_crash(views, flight, localizer, good, prior):
+def test_a_nan_prior_is_outside_the_map(views, flight, localizer, good, prior):
     grey, telemetry = views[good]
     outcome = localizer.locate(View(grey, flight.camera, telemetry), prior=prior)
     assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
@@ -263,19 +265,19 @@ def test_unknown_heading(ground, localizer):
     assert found >= 4
 
 
-def test_a_told_heading_is_believed_only_as_far_as_it_errs(ground, localizer):
+def test_headings_are_searched_as_far_as_their_deviation(ground, localizer):
     place = (60.0, -30.0)
     grey, telemetry = ground.view(*place, yaw_deg=40.0)
     off = replace(telemetry, yaw_deg=65.0)
-    sure = localizer.locate(View(grey, ground.camera, replace(off, yaw_std_deg=1.0)))
-    unsure = localizer.locate(View(grey, ground.camera, replace(off, yaw_std_deg=20.0)))
-    assert sure.heading_deg == pytest.approx(65.0, abs=6.1)
-    assert unsure.heading_deg == pytest.approx(40.0, abs=6.1)
-    assert error_m(localizer, unsure, np.array(place)) <= localizer.grid.stride_m
+    narrow = localizer.locate(View(grey, ground.camera, replace(off, yaw_std_deg=1.0)))
+    wide = localizer.locate(View(grey, ground.camera, replace(off, yaw_std_deg=20.0)))
+    assert narrow.heading_deg == pytest.approx(65.0, abs=6.1)
+    assert wide.heading_deg == pytest.approx(40.0, abs=6.1)
+    assert error_m(localizer, wide, np.array(place)) <= localizer.grid.stride_m
 
 
 @pytest.mark.parametrize("std_deg", [math.nan, math.inf, -3.0, 0.0, 1e9])
-def test_an_odd_error_of_the_heading_is_no_crash(ground, localizer, std_deg):
+def test_invalid_heading_deviations_are_tolerated(ground, localizer, std_deg):
     grey, telemetry = ground.view(60.0, -30.0, yaw_deg=40.0)
     fix = localizer.locate(View(grey, ground.camera, replace(telemetry, yaw_std_deg=std_deg)))
     assert error_m(localizer, fix, np.array([60.0, -30.0])) <= localizer.grid.stride_m
@@ -305,7 +307,7 @@ def args_of(ground, place, attitude):
     return grey, ground.camera, telemetry
 
 
-def test_a_lens_is_undone(ground, localizer):
+def test_lens_distortion_is_corrected(ground, localizer):
     lens = replace(ground.camera, distortion=(-0.3, 0.08, 0.001, -0.001))
     grey, telemetry = ground.view(40.0, -10.0, camera=lens)
     fix = localizer.locate(View(grey, lens, telemetry))

@@ -1,6 +1,5 @@
 """Views on a map whose ground is known everywhere: found to a fraction of a pixel, or refused."""
 
-import importlib
 import math
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -89,26 +88,26 @@ HEADINGS = [0.0, 77.0, 181.0, -100.0, 290.0]
 def plain(localizer):
     """A view like any other: grey levels, telemetry, place and fix."""
     place = np.array([40.0, -25.0])
-    grey, told = rendered(GROUND, place, (33.0, 0.0, 0.0)), telemetry(33.0)
+    grey, reported = rendered(GROUND, place, (33.0, 0.0, 0.0)), telemetry(33.0)
     grey.flags.writeable = False
-    return grey, told, place, localizer.locate(View(grey, CAMERA, told))
+    return grey, reported, place, localizer.locate(View(grey, CAMERA, reported))
 
 
 @pytest.mark.parametrize("place, yaw_deg", list(zip(PLACES, HEADINGS, strict=True)))
 def test_a_view_is_placed_to_a_fraction_of_a_pixel(localizer, place, yaw_deg):
-    """Heading and height come out right although they were told wrong."""
+    """Heading and height are estimated, although the reported ones are wrong."""
     rng = np.random.default_rng(abs(int(yaw_deg)))
     agl_m = AGL_M * rng.uniform(0.85, 1.15)
     grey = rendered(GROUND, place, (yaw_deg, 0, 0), agl_m)
-    told = telemetry(yaw_deg + rng.normal(0, 4), agl_m=agl_m * rng.normal(1, 0.04))
-    fix = localizer.locate(View(grey, CAMERA, told))
+    reported = telemetry(yaw_deg + rng.normal(0, 4), agl_m=agl_m * rng.normal(1, 0.04))
+    fix = localizer.locate(View(grey, CAMERA, reported))
     assert error_m(localizer, fix, place) < 0.1
     assert abs(turned_deg(fix.heading_deg, yaw_deg)) < 0.1 and 0 <= fix.heading_deg < 360
     assert fix.agl_m == pytest.approx(agl_m, rel=0.002)
     assert fix.confidence > 0.9 and fix.evidence["score"] > 0.85
 
 
-def test_a_fix_says_what_it_rests_on(localizer, plain):
+def test_a_fix_states_its_evidence(localizer, plain):
     fix = plain[3]
     assert set(fix.evidence) >= EVIDENCE and fix.radius_m == localizer.registration.radius_m
     assert all(math.isfinite(fix.evidence[name]) for name in EVIDENCE)
@@ -130,18 +129,18 @@ def test_covariances_are_symmetric_and_positive(localizer, plain):
 
 
 def test_another_floor_widens_the_covariance(localizer, map_path, plain):
-    grey, told, _, fix = plain
+    grey, reported, _, fix = plain
     wide = Localizer(open_map(map_path))
     floors_m2 = (wide.registration.floor_px * wide.grid.gsd_m) ** 2, (3 * wide.grid.gsd_m) ** 2
     wide.registration.floor_px = 3.0
-    widened = wide.locate(View(grey, CAMERA, told)).cov_en_m2 - fix.cov_en_m2
+    widened = wide.locate(View(grey, CAMERA, reported)).cov_en_m2 - fix.cov_en_m2
     np.testing.assert_allclose(widened, np.eye(2) * (floors_m2[1] - floors_m2[0]), atol=1e-6)
 
 
 @pytest.mark.parametrize(
     "yaw_deg, along", [(0, (0, 1)), (90, (1, 0)), (45, (1, 1)), (-45, (-1, 1))]
 )
-def test_a_view_blurred_by_motion_is_known_across_it_only(map_path, yaw_deg, along):
+def test_motion_blur_widens_the_covariance_along_it(map_path, yaw_deg, along):
     """East and north, with the right sign of what they have in common."""
     exact = Localizer(open_map(map_path))
     exact.registration.floor_px = 0.0
@@ -155,7 +154,7 @@ def test_a_view_blurred_by_motion_is_known_across_it_only(map_path, yaw_deg, alo
 
 
 @pytest.mark.parametrize("attitude", [(0, 10, -8), (75, 10, -8), (200, -12, 9), (310, 0, 20)])
-def test_the_place_is_that_of_the_camera(localizer, attitude):
+def test_the_position_is_that_of_the_camera(localizer, attitude):
     """Not of what it looks at, which lies up to 55 m away."""
     attitude = tuple(map(float, attitude))
     place = np.array([-20.0, 30.0])
@@ -165,7 +164,7 @@ def test_the_place_is_that_of_the_camera(localizer, attitude):
     assert fix.agl_m == pytest.approx(AGL_M, rel=0.002)
 
 
-def test_a_tilted_view_whose_heading_and_height_are_told_wrong(localizer):
+def test_a_tilted_view_with_wrong_heading_and_height(localizer):
     place, yaw_deg = np.array([15.0, -40.0]), 140.0
     grey = rendered(GROUND, place, (yaw_deg, 10.0, -8.0), 160.0)
     fix = localizer.locate(View(grey, CAMERA, telemetry(yaw_deg + 5, 10.0, -8.0, 150.0)))
@@ -175,7 +174,7 @@ def test_a_tilted_view_whose_heading_and_height_are_told_wrong(localizer):
 
 
 @pytest.mark.parametrize("attitude", [(0.0, 0.0, 0.0), (160.0, -9.0, 6.0)])
-def test_a_lens_is_undone(localizer, attitude):
+def test_lens_distortion_is_corrected(localizer, attitude):
     fix = located(localizer, (25.0, 60.0), attitude, LENS)
     assert error_m(localizer, fix, (25.0, 60.0)) < 0.15
     assert fix.evidence["score"] > 0.85
@@ -204,19 +203,19 @@ def test_the_principal_point_need_not_be_the_middle(localizer):
 def test_unknown_heading(localizer, yaw_deg):
     place = np.array([-60.0, 50.0])
     grey = rendered(GROUND, place, (yaw_deg, 5.0, -4.0))
-    told = telemetry(math.nan, 5.0, -4.0)
-    fix = localizer.locate(View(grey, CAMERA, told), heading_known=False)
+    reported = telemetry(math.nan, 5.0, -4.0)
+    fix = localizer.locate(View(grey, CAMERA, reported), heading_known=False)
     assert error_m(localizer, fix, place) < 0.15 and fix.confidence > 0.9
     assert abs(turned_deg(fix.heading_deg, yaw_deg)) < 0.1
-    refused = localizer.locate(View(grey, CAMERA, told))
+    refused = localizer.locate(View(grey, CAMERA, reported))
     assert isinstance(refused, NoFix) and refused.reason == "missing_telemetry"
     near = localizer.locate(
-        View(grey, CAMERA, told), heading_known=False, prior=prior_at(localizer, place, 20.0)
+        View(grey, CAMERA, reported), heading_known=False, prior=prior_at(localizer, place, 20.0)
     )
     assert error_m(localizer, near, place) < 0.15
 
 
-def test_a_heading_told_wrong_is_not_believed_beyond_its_error(localizer):
+def test_headings_are_searched_as_far_as_their_deviation(localizer):
     grey = rendered(GROUND, (60.0, -30.0), (40.0, 0.0, 0.0))
     unsure = localizer.locate(View(grey, CAMERA, telemetry(75.0, yaw_std_deg=25.0)))
     assert error_m(localizer, unsure, (60.0, -30.0)) < 0.15
@@ -225,29 +224,29 @@ def test_a_heading_told_wrong_is_not_believed_beyond_its_error(localizer):
     assert not isinstance(sure, Fix) or sure.confidence < 0.5
 
 
-def test_a_height_told_wrong_is_made_up_for(localizer):
+def test_a_wrong_height_is_corrected(localizer):
     grey = rendered(GROUND, (60.0, -30.0), (40.0, 0.0, 0.0))
-    told = telemetry(40.0, agl_m=AGL_M / 0.82, agl_std_m=20.0)
-    fix = localizer.locate(View(grey, CAMERA, told))
+    reported = telemetry(40.0, agl_m=AGL_M / 0.82, agl_std_m=20.0)
+    fix = localizer.locate(View(grey, CAMERA, reported))
     assert error_m(localizer, fix, (60.0, -30.0)) < 0.15
     assert fix.agl_m == pytest.approx(AGL_M, rel=0.002)
 
 
 @pytest.mark.parametrize("std_m", [5.0, 40.0, 150.0])
 def test_a_prior_near_the_truth_changes_nothing(localizer, plain, std_m):
-    grey, told, place, free = plain
+    grey, reported, place, free = plain
     prior = prior_at(localizer, place + np.array([0.6, -0.6]) * std_m, std_m)
-    fix = localizer.locate(View(grey, CAMERA, told), prior=prior)
+    fix = localizer.locate(View(grey, CAMERA, reported), prior=prior)
     assert place_of(localizer, fix) == pytest.approx(place_of(localizer, free), abs=0.1)
     assert fix.evidence["strength"] == pytest.approx(free.evidence["strength"], rel=0.02)
 
 
 def test_a_map_too_large_to_be_searched_whole_needs_a_prior(localizer, plain, monkeypatch):
     """Memory has a bound: by tiles if views are as large, else not at all."""
-    grey, told, place, free = plain
-    module = importlib.import_module("orthonav.localizer.registration")
-    rows, cols = localizer.registration.registrar.reference.shape(0)
-    monkeypatch.setattr(module, "MAX_SEARCH_PX", 40_000)
+    grey, reported, place, free = plain
+    plan = localizer.registration.plan
+    rows, cols = localizer.registration.pyramid.shape(0)
+    monkeypatch.setattr(localizer.registration, "plan", replace(plan, max_search_px=40_000))
     asked = []
     whole = localizer.registration.registrar.whole_window
     monkeypatch.setattr(
@@ -255,33 +254,33 @@ def test_a_map_too_large_to_be_searched_whole_needs_a_prior(localizer, plain, mo
         "whole_window",
         lambda *window: asked.append(window[0]) or whole(*window),
     )
-    alone = localizer.locate(View(grey, CAMERA, told))
+    alone = localizer.locate(View(grey, CAMERA, reported))
     assert not [level for level in asked if (rows >> level) * (cols >> level) > 40_000]
     assert isinstance(alone, Fix) or (alone.reason == "no_match" and "prior" in alone.detail)
-    fix = localizer.locate(View(grey, CAMERA, told), prior=prior_at(localizer, place, 5.0))
+    fix = localizer.locate(View(grey, CAMERA, reported), prior=prior_at(localizer, place, 5.0))
     assert place_of(localizer, fix) == pytest.approx(place_of(localizer, free), abs=0.1)
     monkeypatch.setattr(localizer.registration, "propose", None)
-    monkeypatch.setattr(module, "MAX_SEARCH_PX", 100)
-    nothing = localizer.locate(View(grey, CAMERA, told))
+    monkeypatch.setattr(localizer.registration, "plan", replace(plan, max_search_px=100))
+    nothing = localizer.locate(View(grey, CAMERA, reported))
     assert nothing.reason == "no_match" and "prior" in nothing.detail
 
 
-def test_a_prior_keeps_the_fix_near_it(localizer, plain):
-    grey, told, place, free = plain
+def test_a_fix_lies_near_its_prior(localizer, plain):
+    grey, reported, place, free = plain
     wrong = place + np.array([-180.0, 120.0])
-    fix = localizer.locate(View(grey, CAMERA, told), prior=prior_at(localizer, wrong, 20.0))
+    fix = localizer.locate(View(grey, CAMERA, reported), prior=prior_at(localizer, wrong, 20.0))
     if isinstance(fix, Fix):
         assert np.abs(place_of(localizer, fix) - wrong).max() < 3 * 20.0 + 25.0
         assert fix.confidence < 0.5 < free.confidence
 
 
-def test_the_prior_is_of_the_aircraft_not_of_what_it_sees(localizer):
+def test_the_prior_is_that_of_the_aircraft_not_of_the_ground_seen(localizer):
     place = np.array([-20.0, -60.0])
     grey = rendered(GROUND, place, (45.0, 30.0, 0.0))
-    told = telemetry(45.0, 30.0, yaw_std_deg=1.0)
+    reported = telemetry(45.0, 30.0, yaw_std_deg=1.0)
     for heading_known in (True, False):
         fix = localizer.locate(
-            View(grey, CAMERA, told),
+            View(grey, CAMERA, reported),
             prior=prior_at(localizer, place, 2.0),
             heading_known=heading_known,
         )
@@ -299,7 +298,7 @@ def test_a_prior_outside_is_outside_the_map(localizer, plain, away_en_m):
 @pytest.mark.parametrize(
     "prior", [Prior(math.nan, 3.0, 50.0), Prior(46.0, math.nan, 50.0), Prior(46.5, 3.0, math.nan)]
 )
-def test_a_prior_that_is_not_known_is_no_crash(localizer, plain, prior):
+def test_a_nan_prior_is_outside_the_map(localizer, plain, prior):
     outcome = localizer.locate(View(plain[0], CAMERA, plain[1]), prior=prior)
     assert isinstance(outcome, NoFix) and outcome.reason == "outside_map"
 
@@ -312,7 +311,7 @@ def test_a_view_half_outside_is_found(localizer, place):
     assert 0.4 < fix.evidence["overlap"] < 0.7 and fix.evidence["agreement"] > 0.9
 
 
-def test_a_view_from_beyond_the_map_is_not_believed(localizer, plain):
+def test_a_view_from_outside_the_map_has_low_confidence(localizer, plain):
     """The ground goes on there, but the map does not."""
     for place in ((-430.0, 60.0), (410.0, 400.0), (30.0, -420.0)):
         outcome = located(localizer, np.array(place), (33.0, 0.0, 0.0))
@@ -329,9 +328,9 @@ def mirrored(place_en_m):
     return np.ascontiguousarray(rendered(GROUND, place_en_m, (33.0, 0.0, 0.0))[:, ::-1])
 
 
-STRANGERS = {
-    "elsewhere": lambda: rendered(Ground(5, 200.0), (0.0, 0.0), (33.0, 0.0, 0.0)),
-    "another elsewhere": lambda: rendered(Ground(6, 200.0), (20.0, 0.0), (33.0, 0.0, 0.0)),
+NEGATIVES = {
+    "another place": lambda: rendered(Ground(5, 200.0), (0.0, 0.0), (33.0, 0.0, 0.0)),
+    "a third place": lambda: rendered(Ground(6, 200.0), (20.0, 0.0), (33.0, 0.0, 0.0)),
     "fine noise": lambda: noise(0.5),
     "coarse noise": lambda: noise(4.0),
     "mirrored": lambda: mirrored((40.0, -25.0)),
@@ -340,15 +339,17 @@ STRANGERS = {
 
 
 @pytest.mark.parametrize(
-    "name, heading_known", [*((name, True) for name in STRANGERS), ("elsewhere", False)]
+    "name, heading_known", [*((name, True) for name in NEGATIVES), ("another place", False)]
 )
-def test_a_view_of_elsewhere_is_not_believed(localizer, name, heading_known):
-    told = telemetry(33.0)
-    outcome = localizer.locate(View(STRANGERS[name](), CAMERA, told), heading_known=heading_known)
+def test_negatives_have_low_confidence(localizer, name, heading_known):
+    reported = telemetry(33.0)
+    outcome = localizer.locate(
+        View(NEGATIVES[name](), CAMERA, reported), heading_known=heading_known
+    )
     assert isinstance(outcome, NoFix) or outcome.confidence < 0.5
 
 
-def test_a_narrow_prior_does_not_make_sure(localizer):
+def test_a_narrow_prior_does_not_raise_the_confidence_of_negatives(localizer):
     """With hardly any place to choose from, a wrong one does not look right."""
     for place in ((40.0, -25.0), (-100.0, 60.0)):
         prior = prior_at(localizer, np.array(place), 3.0)
@@ -368,10 +369,10 @@ def same(one, other):
 
 
 def test_the_same_view_gives_the_same_fix(localizer, map_path, plain):
-    grey, told, _, fix = plain
+    grey, reported, _, fix = plain
     kept = grey.copy()
-    assert same(localizer.locate(View(grey, CAMERA, told)), fix)
-    assert same(Localizer(open_map(map_path)).locate(View(grey, CAMERA, told)), fix)
+    assert same(localizer.locate(View(grey, CAMERA, reported)), fix)
+    assert same(Localizer(open_map(map_path)).locate(View(grey, CAMERA, reported)), fix)
     np.testing.assert_array_equal(grey, kept)
 
 
@@ -380,7 +381,7 @@ def test_threads_may_share_a_localizer(localizer, map_path):
         (rendered(GROUND, place, (yaw, 4.0, 0.0)), telemetry(yaw + 2, 4.0))
         for place, yaw in zip(PLACES[:4], HEADINGS[:4], strict=True)
     ]
-    alone = [localizer.locate(View(grey, CAMERA, told)) for grey, told in views]
+    alone = [localizer.locate(View(grey, CAMERA, reported)) for grey, reported in views]
     cold = Localizer(open_map(map_path))
     with ThreadPoolExecutor(2) as pool:
         shared = list(pool.map(lambda view: cold.locate(View(view[0], CAMERA, view[1])), views))
@@ -435,9 +436,9 @@ ODD = {
 
 
 @pytest.mark.parametrize("changes", ODD.values(), ids=ODD.keys())
-def test_odd_telemetry_is_no_crash(localizer, plain, changes):
-    grey, told, place, _ = plain
-    fix = localizer.locate(View(grey, CAMERA, replace(told, **changes)))
+def test_invalid_deviations_are_tolerated(localizer, plain, changes):
+    grey, reported, place, _ = plain
+    fix = localizer.locate(View(grey, CAMERA, replace(reported, **changes)))
     assert error_m(localizer, fix, place) < 0.5 and 0 <= fix.heading_deg < 360
 
 
@@ -448,13 +449,13 @@ def test_a_strip_of_a_view(localizer):
 
 
 def test_without_registration_it_is_placed_by_its_tiles(localizer, map_path, plain):
-    grey, told, place, fix = plain
+    grey, reported, place, fix = plain
     coarse = Localizer(open_map(map_path), registration=False)
     assert coarse.registration is None
-    tiled = coarse.locate(View(grey, CAMERA, told))
+    tiled = coarse.locate(View(grey, CAMERA, reported))
     assert error_m(coarse, tiled, place) < coarse.grid.stride_m
     assert "lowe_ratio" in tiled.evidence and "strength" not in tiled.evidence
-    assert tiled.radius_m == coarse.radius_m and tiled.agl_m == told.agl_m
+    assert tiled.radius_m == coarse.radius_m and tiled.agl_m == reported.agl_m
     assert error_m(localizer, fix, place) < error_m(coarse, tiled, place)
 
 
@@ -485,7 +486,7 @@ def damaged(map_path, folder):
     return open_map(folder / "damaged.onav")
 
 
-def test_a_damaged_layer_is_no_fix(map_path, tmp_path, plain, caplog):
+def test_a_damaged_layer_gives_no_fix(map_path, tmp_path, plain, caplog):
     broken = Localizer(damaged(map_path, tmp_path))
     outcome, latency_ms = locate_view(SingleViews(broken), View(plain[0], CAMERA, plain[1]))
     assert isinstance(outcome, NoFix) and outcome.reason == "internal_error"
@@ -493,7 +494,7 @@ def test_a_damaged_layer_is_no_fix(map_path, tmp_path, plain, caplog):
     assert any(record.exc_info for record in caplog.records)
 
 
-def test_noise_and_light_move_it_little(localizer):
+def test_noise_and_light_shift_the_position_little(localizer):
     rng = np.random.default_rng(2)
     for place, yaw_deg in zip(PLACES[:4], HEADINGS[:4], strict=True):
         clean = rendered(GROUND, place, (yaw_deg, 0.0, 0.0)).astype(float)

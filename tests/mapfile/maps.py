@@ -1,4 +1,4 @@
-"""A small map, and containers written byte by byte: what a stranger could hand us."""
+"""A small map, and containers written byte by byte, as untrusted files may be."""
 
 import hashlib
 import json

@@ -104,7 +104,7 @@ def test_what_was_written_comes_back(layer):
     assert np.sqrt((error[valid] ** 2).mean()) < 6 and abs(error[valid].mean()) < 0.5
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     level=st.integers(0, 2),
     row=st.integers(-80, 200),
@@ -143,19 +143,19 @@ def test_only_the_chunks_touched_are_decoded_and_once(layer, decoded):
     assert decoded[4:] == [(38, 53)]
 
 
-def test_what_is_kept_is_bounded(opened, decoded):
+def test_the_cache_is_bounded(opened, decoded):
     layer = GreyLayer.of(opened, cache_bytes=3 * 2 * CHUNK_PX**2)
     for _ in range(2):
         for level in range(3):
             whole(layer, level)
-            assert 0 < layer.cached_bytes <= 3 * 2 * CHUNK_PX**2
+            assert 0 < layer._cache.held_bytes <= 3 * 2 * CHUNK_PX**2
     before = len(decoded)
     whole(layer, 2)
     assert len(decoded) == before  # the last used are those kept
     none = GreyLayer.of(opened, cache_bytes=0)
     first, again = whole(none, 0), whole(none, 0)
     np.testing.assert_array_equal(first[0], again[0])
-    assert none.cached_bytes == 0
+    assert none._cache.held_bytes == 0
 
 
 def test_the_chunk_used_longest_ago_goes_first(opened, decoded):
@@ -189,7 +189,7 @@ def test_threads_may_share_it(opened):
             grey = layer.read(0, row, col, 40, 40)[0]
             wanted = expected[row : row + 40, col : col + 40]
             np.testing.assert_array_equal(grey[: wanted.shape[0], : wanted.shape[1]], wanted)
-        return layer.cached_bytes
+        return layer._cache.held_bytes
 
     with ThreadPoolExecutor(4) as pool:
         assert max(pool.map(check, range(4))) <= 4 * CHUNK_PX**2
@@ -288,7 +288,7 @@ def test_missing_parts(made, tmp_path, kind):
 
 
 @pytest.mark.parametrize("changes", [{"levels": 4}, {"levels": 2}, {"chunk_px": 32}], ids=str)
-def test_a_layer_cut_otherwise_than_told(made, tmp_path, changes):
+def test_a_layer_with_other_chunks_than_stated_is_refused(made, tmp_path, changes):
     info, parts = made
     odd = write_layer(tmp_path / "odd.onav", dataclasses.replace(info, **changes), parts)
     with pytest.raises(MapFileError, match="offsets must"):
@@ -422,7 +422,7 @@ def test_a_mask_without_a_picture(made, tmp_path):
         GreyLayer.of(odd).read(0, 0, 0, 10, 10)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(data=st.data())
 def test_whatever_is_done_to_a_chunk_only_our_errors_come_out(data):
     jpeg, mask = bytearray(GOOD), bytearray(zlib.compress(bytes(PACKED)))

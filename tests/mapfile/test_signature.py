@@ -77,7 +77,7 @@ def test_the_key_is_its_owners_and_stays(keys):
     mode = stat.S_IMODE((keys / "ours" / "private.pem").stat().st_mode)
     assert mode == 0o600
     before = (keys / "ours" / "private.pem").read_bytes()
-    with pytest.raises(OutputError, match="not written over"):
+    with pytest.raises(OutputError, match="holds a key already"):
         new_key(keys / "ours")
     assert (keys / "ours" / "private.pem").read_bytes() == before
 
@@ -241,17 +241,17 @@ def test_the_commands(tmp_path, run):
     write_map(path, manifest(), arrays())
     public = tmp_path / "key" / "public.pem"
     assert run("sign", path, "--new-key", tmp_path / "key").code == 0
-    assert "signed and whole" in run("verify", path, "--public-key", public).out
+    assert "signature and contents are valid" in run("verify", path, "--public-key", public).out
     signature_path(path).unlink()
     done = run("localize", path, tmp_path, "--out", tmp_path / "out", "--require-signed", public)
     assert done.code == 1 and "not signed" in done.err and done.err.count("\n") == 1
-    fly = ["fly", path, "--camera", tmp_path, "--telemetry", "recorded", "--require-signed", public]
+    fly = ["fly", path, tmp_path, "--recorded-telemetry", "--require-signed", public]
     done = run(*fly)
     assert done.code == 1 and "not signed" in done.err and done.err.count("\n") == 1
     assert run("sign", path, "--key", tmp_path / "key" / "private.pem").code == 0
     done = run("localize", path, tmp_path, "--out", tmp_path / "out", "--require-signed", public)
     assert "expected a flight folder" in done.err  # the next thing that is wrong
-    assert "--camera-file" in run(*fly).err  # likewise
+    assert "--camera" in run(*fly).err  # likewise
     assert run("sign", "--key", tmp_path / "key" / "private.pem").code == 1
     assert run("sign", path).code == 2
 

@@ -1,6 +1,8 @@
-"""Lets tests of flights use the known ground of `tests/localizer/blots.py`."""
+"""Lets tests of flights use the known ground of `tests/localizer/blots.py`, and recorded bags of
+`tests/sources/bags.py`."""
 
 import sys
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).parents[1] / "localizer"))
+for folder in ("localizer", "sources"):
+    sys.path.append(str(Path(__file__).parents[1] / folder))

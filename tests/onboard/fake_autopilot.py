@@ -1,4 +1,4 @@
-"""Stand-ins for what surrounds the program in flight: clocks, a port, an autopilot, a tracker.
+"""Fake surroundings of a flight: clocks, a port, an autopilot, a tracker.
 
 What the autopilot hears is decoded by `wire`; what it says is encoded by pymavlink.
 """
@@ -24,7 +24,7 @@ UTC_NS = 1_789_000_000 * S
 
 
 class Time:
-    """Clocks that only go on when told, or when somebody sleeps."""
+    """Clocks that advance by `go` or by sleeping only."""
 
     def __init__(self):
         self.now_ns, self.utc_ahead_ns = 100 * S, UTC_NS
@@ -68,8 +68,8 @@ class Port:
     def sent(self, name=None):
         """What was sent so far, decoded; it is asked for once."""
         frames, self.gone = self.gone, []
-        told = [decode(f) for f in frames if int.from_bytes(f[7:10], "little") in TABLES]
-        return [each for each in told if name in (None, each["name"])]
+        messages = [decode(f) for f in frames if int.from_bytes(f[7:10], "little") in TABLES]
+        return [each for each in messages if name in (None, each["name"])]
 
 
 class Autopilot:
@@ -110,13 +110,16 @@ class Autopilot:
 
 
 class LiveAutopilot(threading.Thread):
-    """An autopilot over UDP in real time: `told(boot_ns)` gives frames; what it hears is kept."""
+    """An autopilot over UDP in real time.
 
-    def __init__(self, port, told, rate_hz=50.0):
+    `telemetry(autopilot, boot_ns)` gives the frames to send; `heard` has the received messages.
+    """
+
+    def __init__(self, port, telemetry, rate_hz=50.0):
         super().__init__(daemon=True)
         self.out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.out.settimeout(1 / rate_hz)
-        self.address, self.told = ("127.0.0.1", port), told
+        self.address, self.telemetry = ("127.0.0.1", port), telemetry
         self.autopilot, self.heard, self.stopping = Autopilot(), [], threading.Event()
         self.begin_ns, self.mute = time.monotonic_ns(), False
 
@@ -132,7 +135,7 @@ class LiveAutopilot(threading.Thread):
                 self._send(self.autopilot.heartbeat())
             if now_ns >= due_ns and not self.mute:
                 due_ns = now_ns + S // 50
-                for frame in self.told(self.autopilot, now_ns):
+                for frame in self.telemetry(self.autopilot, now_ns):
                     self._send(frame)
             self._listen()
         self.out.close()
@@ -174,10 +177,10 @@ def write_flight(folder, camera, views):
     (folder / "frames").mkdir(parents=True)
     (folder / "flight.json").write_text(json.dumps({"camera": asdict(camera)}))
     lines = ["frame,time_s,yaw_deg,pitch_deg,roll_deg,agl_m"]
-    for number, (grey, told) in enumerate(views):
+    for number, (grey, telemetry) in enumerate(views):
         cv2.imwrite(str(folder / "frames" / f"{number:03d}.png"), grey)
-        time_s = f"{told.time_ns // S}.{told.time_ns % S:09d}"
-        numbers = told.yaw_deg, told.pitch_deg, told.roll_deg, told.agl_m
+        time_s = f"{telemetry.time_ns // S}.{telemetry.time_ns % S:09d}"
+        numbers = telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
         lines.append(",".join([f"{number:03d}.png", time_s, *map(repr, numbers)]))
     (folder / "telemetry.csv").write_text("\n".join(lines) + "\n")
 

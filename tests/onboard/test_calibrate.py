@@ -1,4 +1,4 @@
-"""From the evidence of a track to a mount, and back into what is told."""
+"""Calibration of a mount from a track, and correction of telemetry with it."""
 
 import math
 from types import MappingProxyType
@@ -8,7 +8,7 @@ import pytest
 
 from orthonav.errors import FlightError
 from orthonav.flight.mount import Bias, Mount
-from orthonav.onboard.calibrate import Mounted, calibrated, model_of
+from orthonav.onboard.calibrate import MountCorrected, calibrate_mount, model_of
 from orthonav.records import Fix, NoFix, Telemetry, View, ViewResult
 from orthonav.track import Model
 
@@ -35,8 +35,8 @@ def flight(count=40, seed=0, true=TRUE, first=0):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_it_finds_what_is_wrong(seed):
-    found = calibrated(flight(seed=seed))
+def test_biases_are_estimated(seed):
+    found = calibrate_mount(flight(seed=seed))
     mount = found.mount
     assert mount.heading_deg.value == pytest.approx(4.0, abs=3 * mount.heading_deg.std)
     assert mount.log_scale.value == pytest.approx(-0.1, abs=3 * mount.log_scale.std)
@@ -45,56 +45,56 @@ def test_it_finds_what_is_wrong(seed):
     assert (mount.views, found.first, found.last, found.moved) == (40, "000.jpg", "039.jpg", False)
 
 
-def test_what_is_known_is_known_better_from_more_views():
-    few, many = (calibrated(flight(count)).mount.heading_deg.std for count in (6, 200))
+def test_more_views_give_a_smaller_standard_deviation():
+    few, many = (calibrate_mount(flight(count)).mount.heading_deg.std for count in (6, 200))
     assert many < few and many >= 0.2
 
 
-def test_errors_that_last_count_as_fewer_views():
+def test_correlated_errors_give_a_larger_standard_deviation():
     rng = np.random.default_rng(1)
     slow = np.repeat(rng.normal(0, 1.5, 8), 10)
     lasting = [view(n, {**TRUE, "heading_bias": 4 + slow[n]}) for n in range(80)]
-    anew = [view(n, {**TRUE, "heading_bias": 4 + rng.normal(0, 3.0)}) for n in range(80)]
-    stds = [calibrated(each).mount.heading_deg.std for each in (lasting, anew)]
+    independent = [view(n, {**TRUE, "heading_bias": 4 + rng.normal(0, 3.0)}) for n in range(80)]
+    stds = [calibrate_mount(each).mount.heading_deg.std for each in (lasting, independent)]
     assert stds[0] / 1.5 > 1.5 * stds[1] / 3.0
 
 
-def test_wild_views_do_not_matter():
+def test_outliers_do_not_change_the_biases():
     results = flight(30)
     results[7] = view(7, {**TRUE, "heading_bias": 120.0})
-    assert calibrated(results).mount.heading_deg.value == pytest.approx(4.0, abs=1.0)
+    assert calibrate_mount(results).mount.heading_deg.value == pytest.approx(4.0, abs=1.0)
 
 
-def test_only_confident_views_count():
+def test_only_confident_views_are_used():
     doubtful = [view(n, {**TRUE, "pitch_bias": 20.0}, confidence=0.5) for n in range(30)]
     missing = [ViewResult("x.jpg", 0, NoFix("blank", "it is blank"), 1.0, "lost")]
-    found = calibrated(doubtful + flight(10, first=30) + missing)
+    found = calibrate_mount(doubtful + flight(10, first=30) + missing)
     assert found.mount.views == 10 and found.mount.pitch_deg.value == pytest.approx(6.0, abs=0.5)
     with pytest.raises(FlightError, match="4 of 35 views"):
-        calibrated(doubtful + flight(4) + missing)
+        calibrate_mount(doubtful + flight(4) + missing)
 
 
-def test_a_mount_that_moved_is_what_it_was_in_the_end():
+def test_a_moved_mount_is_that_at_the_end():
     before = flight(20, true={**TRUE, "pitch_bias": -3.0})
-    found = calibrated(before + flight(20, seed=1, first=20))
+    found = calibrate_mount(before + flight(20, seed=1, first=20))
     assert found.moved and found.first == "020.jpg"
     assert found.mount.pitch_deg.value == pytest.approx(6.0, abs=0.5)
 
 
-class Told:
-    """A locator that remembers what it was told."""
+class VehicleState:
+    """A locator that records the telemetry of its views."""
 
     state_name = "tracking"
 
     def __init__(self):
-        self.told = []
+        self.telemetry = []
 
     def locate(self, view):
-        self.told.append(view.telemetry)
+        self.telemetry.append(view.telemetry)
         return NoFix("test", "nothing was looked at")
 
     def passed(self, telemetry, reason):
-        self.told.append(telemetry)
+        self.telemetry.append(telemetry)
         return reason
 
 
@@ -103,17 +103,19 @@ MOUNT = Mount(
 )
 
 
-def test_a_mounted_locator_is_told_the_truth():
-    locator = Told()
-    mounted, telemetry = Mounted(locator, MOUNT), Telemetry(0, 10.0, 0.0, 1.0, 100.0)
+def test_a_mount_corrected_locator_gets_corrected_telemetry():
+    locator = VehicleState()
+    mounted, telemetry = MountCorrected(locator, MOUNT), Telemetry(0, 10.0, 0.0, 1.0, 100.0)
     mounted.locate(View(np.zeros((4, 4), np.uint8), None, telemetry))
     reason = NoFix("bad_image", "it is broken")
     assert mounted.passed(telemetry, reason) is reason
-    assert [(t.yaw_deg, t.pitch_deg, t.roll_deg) for t in locator.told] == [(14.0, 6.5, 0.0)] * 2
+    assert [(t.yaw_deg, t.pitch_deg, t.roll_deg) for t in locator.telemetry] == [
+        (14.0, 6.5, 0.0)
+    ] * 2
     assert mounted.state_name == "tracking"
 
 
-def test_a_known_mount_is_believed_as_well_as_it_is_known():
+def test_the_model_has_the_deviations_of_the_mount():
     model = model_of(MOUNT)
     assert model.tilt_rad == pytest.approx(math.radians(0.8))
     assert model.heading_rad == pytest.approx(math.radians(1.0))

@@ -1,4 +1,4 @@
-"""Pictures: the newest one, when it was exposed, and cameras that misbehave."""
+"""Images: the newest one, its time of exposure, and faults of cameras."""
 
 import threading
 
@@ -11,19 +11,19 @@ from orthonav.errors import FlightError, MissingFileError
 from orthonav.geo.camera import Camera
 from orthonav.onboard.cameras import (
     CameraGoneError,
+    CameraImage,
     CameraThread,
-    Entry,
     FrozenCheck,
     LiveCamera,
-    Newest,
-    Picture,
-    Recorded,
+    NewestImage,
+    Playback,
+    RecordedImage,
     autopilot_pace,
     is_live,
     live_name,
     own_pace,
     read_into,
-    recorded_entries,
+    recorded_images,
 )
 from orthonav.records import Telemetry
 
@@ -32,8 +32,8 @@ def noisy(seed, shape=(240, 320)):
     return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
 
-def picture(number, grey=None):
-    return Picture(number, str(number), number * S, number * S, grey)
+def image(number, grey=None):
+    return CameraImage(number, str(number), number * S, number * S, grey)
 
 
 class Device:
@@ -59,25 +59,25 @@ class Device:
         self.released = True
 
 
-def test_who_asks_gets_the_newest():
-    newest = Newest()
+def test_take_returns_the_newest_image():
+    newest = NewestImage()
     for number in range(5):
-        newest.put(picture(number))
+        newest.put(image(number))
     assert newest.take(0).number == 4
     assert newest.take(0) is None
     assert (newest.taken, newest.replaced, newest.is_over) == (5, 4, False)
-    newest.put(picture(5))
+    newest.put(image(5))
     newest.end()
     assert not newest.is_over and newest.take(1).number == 5 and newest.is_over
 
 
-def test_who_asks_waits_for_one():
-    newest = Newest()
-    threading.Timer(0.05, newest.put, [picture(7)]).start()
+def test_take_waits_for_an_image():
+    newest = NewestImage()
+    threading.Timer(0.05, newest.put, [image(7)]).start()
     assert newest.take(5).number == 7
 
 
-def test_exposure_of_a_live_camera_is_arrival_less_its_latency():
+def test_exposure_of_a_live_camera_is_arrival_minus_latency():
     time = Time()
     device = Device([noisy(0), np.dstack([noisy(1)] * 3), None])
     camera = LiveCamera(
@@ -104,7 +104,7 @@ def test_a_camera_that_stops_comes_back():
         opened.append(Device(lives[len(opened)] if len(opened) < len(lives) else ["absent"]))
         return opened[-1]
 
-    newest, pauses = Newest(), []
+    newest, pauses = NewestImage(), []
     camera = LiveCamera(0, time.clocks, capture=capture)
     read_into(newest, camera, lambda: len(opened) > 5, pauses.append)
     assert newest.taken == 3 and newest.outages == 2
@@ -113,7 +113,7 @@ def test_a_camera_that_stops_comes_back():
     assert newest.take(0).number == 3 and newest.is_over
 
 
-def test_a_driver_with_a_fault_is_asked_again(caplog):
+def test_a_camera_is_retried_after_a_fault_of_its_driver(caplog):
     class Odd:
         asked = closed = 0
 
@@ -121,25 +121,25 @@ def test_a_driver_with_a_fault_is_asked_again(caplog):
             self.asked += 1
             if self.asked < 4:
                 raise ZeroDivisionError("driver")
-            return picture(1) if self.asked == 4 else None
+            return image(1) if self.asked == 4 else None
 
         def close(self):
             self.closed += 1
 
-    newest, odd = Newest(), Odd()
+    newest, odd = NewestImage(), Odd()
     read_into(newest, odd, lambda: False, lambda _: None)
     assert (newest.taken, newest.outages, odd.closed) == (1, 1, 4)
     assert caplog.text.count("Traceback") == 1
 
 
 def entries(*times_s):
-    return iter([Entry(f"{t}", round(t * S), lambda: noisy(0)) for t in times_s])
+    return iter([RecordedImage(f"{t}", round(t * S), lambda: noisy(0)) for t in times_s])
 
 
 @pytest.mark.parametrize("pace", [1.0, 4.0])
-def test_a_recording_comes_at_its_own_pace(pace):
+def test_a_recording_is_played_in_real_time(pace):
     time = Time()
-    source = Recorded(
+    source = Playback(
         entries(50.0, 50.5, 53.0), own_pace(time.clocks, pace), time.clocks, lambda: False
     )
     begin, seen = time.now_ns, []
@@ -149,7 +149,7 @@ def test_a_recording_comes_at_its_own_pace(pace):
     assert seen == [(0.0, 50.0), (0.5 / pace, 50.5), (3.0 / pace, 53.0)]
 
 
-def test_a_recording_may_keep_to_the_clock_of_the_autopilot():
+def test_a_recording_can_follow_the_clock_of_the_autopilot():
     time = Time()
     offset = [None]
 
@@ -159,35 +159,35 @@ def test_a_recording_may_keep_to_the_clock_of_the_autopilot():
         return None if offset[0] is None else mono_ns + offset[0]
 
     due_ns = autopilot_pace(boot_ns, time.clocks, 2.0)
-    source = Recorded(entries(14.0, 15.0), due_ns, time.clocks, lambda: False)
+    source = Playback(entries(14.0, 15.0), due_ns, time.clocks, lambda: False)
     assert [source.read().exposed_ns for _ in range(2)] == [102 * S, 102 * S + S // 2]
 
 
 def test_a_recording_can_be_stopped():
     time = Time()
-    source = Recorded(entries(0.0, 9e9), own_pace(time.clocks, 1.0), time.clocks, lambda: True)
+    source = Playback(entries(0.0, 9e9), own_pace(time.clocks, 1.0), time.clocks, lambda: True)
     assert source.read() is None
 
 
-def test_flight_folders_keep_their_times_and_telemetry(tmp_path):
+def test_flight_folders_have_times_and_telemetry(tmp_path):
     camera = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
     rows = [Telemetry(n * S + n, 10.0 * n, 1.0, -2.0, 100.0 + n) for n in range(3)]
     write_flight(tmp_path, camera, [(noisy(n), row) for n, row in enumerate(rows)])
-    telemetry = list(recorded_entries(tmp_path, 1.0))
+    telemetry = list(recorded_images(tmp_path, 1.0))
     assert [each.time_ns for each in telemetry] == [row.time_ns for row in rows]
     assert [each.telemetry for each in telemetry] == rows
     np.testing.assert_array_equal(telemetry[2].load(), noisy(2))
 
 
-def test_a_half_written_picture_is_told(tmp_path):
+def test_an_incomplete_image_is_a_bad_image(tmp_path):
     for number in range(3):
         cv2.imwrite(str(tmp_path / f"{number}.jpg"), noisy(number))
     whole = (tmp_path / "1.jpg").read_bytes()
     (tmp_path / "1.jpg").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "note.txt").write_text("no picture")
     time = Time()
-    telemetry = recorded_entries(tmp_path, 4.0)
-    source = Recorded(telemetry, own_pace(time.clocks, 1.0), time.clocks, lambda: False)
+    telemetry = recorded_images(tmp_path, 4.0)
+    source = Playback(telemetry, own_pace(time.clocks, 1.0), time.clocks, lambda: False)
     seen = [source.read() for _ in range(4)]
     assert [each and each.frame for each in seen] == ["0.jpg", "1.jpg", "2.jpg", None]
     assert seen[1].grey is None and seen[1].problem.reason == "bad_image"
@@ -195,8 +195,8 @@ def test_a_half_written_picture_is_told(tmp_path):
     assert seen[2].exposed_ns - seen[0].exposed_ns == S // 2
     (tmp_path / "0.jpg").unlink()
     assert (
-        Recorded(
-            iter([Entry("0.jpg", 0, (tmp_path / "0.jpg").read_bytes)]),
+        Playback(
+            iter([RecordedImage("0.jpg", 0, (tmp_path / "0.jpg").read_bytes)]),
             own_pace(time.clocks, 1.0),
             time.clocks,
             lambda: False,
@@ -207,28 +207,29 @@ def test_a_half_written_picture_is_told(tmp_path):
     )
 
 
-def test_a_video_has_times_of_its_own(tmp_path):
+def test_a_video_has_its_own_times_and_can_be_thinned(tmp_path):
     path = tmp_path / "flight.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (320, 240))
     for number in range(4):
         writer.write(np.dstack([np.full((240, 320), 40 * number, np.uint8)] * 3))
     writer.release()
-    telemetry = list(recorded_entries(path, 1.0))
-    assert [each.time_ns for each in telemetry] == [0, S // 10, S // 5, 3 * S // 10]
-    assert [round(float(each.load().mean()) / 40) for each in telemetry] == [0, 1, 2, 3]
+    found = list(recorded_images(path, None))
+    assert [each.time_ns for each in found] == [0, S // 10, S // 5, 3 * S // 10]
+    assert [round(float(each.load().mean()) / 40) for each in found] == [0, 1, 2, 3]
+    assert [each.time_ns for each in recorded_images(path, 5.0)] == [0, S // 5]
 
 
-def test_what_is_no_camera_is_refused(tmp_path):
+def test_invalid_sources_are_refused(tmp_path):
     with pytest.raises(MissingFileError):
-        recorded_entries(tmp_path / "nothing", 1.0)
-    with pytest.raises(FlightError, match="no pictures"):
-        recorded_entries(tmp_path, 1.0)
+        recorded_images(tmp_path / "nothing", 1.0)
+    with pytest.raises(FlightError, match="no images"):
+        recorded_images(tmp_path, 1.0)
     (tmp_path / "x.mp4").write_bytes(b"no video")
     with pytest.raises(FlightError, match="video"):
-        recorded_entries(tmp_path / "x.mp4", 1.0)
+        recorded_images(tmp_path / "x.mp4", 1.0)
 
 
-def test_a_device_that_is_not_there_is_gone_for_now():
+def test_a_missing_device_is_gone_for_now():
     with pytest.raises(CameraGoneError):
         LiveCamera(4242, Time().clocks).read()
 
@@ -248,19 +249,19 @@ def sensed(scene, seed):
     return np.clip(scene + noise, 0, 255).astype(np.uint8)
 
 
-def test_the_same_picture_again_is_frozen_to_the_bit_or_nearly():
+def test_an_equal_or_nearly_equal_image_is_frozen():
     scene = ground()
     check = FrozenCheck()
     assert not check.is_repeat(scene)
     assert check.is_repeat(scene.copy()) and check.is_repeat(scene.copy())
     assert check.repeats == 2
     nearly = scene.copy()
-    nearly[::7, ::7] += 1  # compressed anew
+    nearly[::7, ::7] += 1  # compressed again
     assert check.is_repeat(nearly)
     assert not check.is_repeat(ground(1)) and check.repeats == 0
 
 
-def test_a_hover_is_not_frozen():
+def test_hovering_is_not_frozen():
     """The same scene with the noise of a good sensor, one grey level."""
     scene, check = ground(), FrozenCheck()
     assert not any(check.is_repeat(sensed(scene, seed)) for seed in range(10))
@@ -275,8 +276,8 @@ def test_a_moving_view_is_not_frozen():
 def test_a_camera_reads_in_a_thread(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), noisy(0))
     time, stopping = Time(), threading.Event()
-    source = Recorded(
-        recorded_entries(tmp_path, 1.0), own_pace(time.clocks, 1.0), time.clocks, stopping.is_set
+    source = Playback(
+        recorded_images(tmp_path, 1.0), own_pace(time.clocks, 1.0), time.clocks, stopping.is_set
     )
     thread = CameraThread(source, stopping)
     assert thread.newest.take(5).frame == "a.png"

@@ -1,4 +1,4 @@
-"""The runner: every fault that a flight brings, and a flight over UDP from end to end."""
+"""The flight loop: every fault of a flight, and a flight over UDP from end to end."""
 
 import json
 import math
@@ -29,26 +29,27 @@ from fake_autopilot import (
 
 from orthonav.cli import main
 from orthonav.errors import CameraError
+from orthonav.flight.fixes import result_from_json
 from orthonav.geo.camera import Camera
+from orthonav.onboard import cameras
 from orthonav.onboard import state as states
-from orthonav.onboard.cameras import Newest, Picture
+from orthonav.onboard.cameras import CameraImage, NewestImage
 from orthonav.onboard.fly import FlyOptions, Runner
-from orthonav.onboard.health import Level, SecondLook
+from orthonav.onboard.health import Level, TelemetryDiagnosis
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.outputs import JsonOut, MessageOptions, Messenger
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.telemetry import TelemetryBuffer
 from orthonav.publish.estimate import Clock
 from orthonav.publish.gate import Gate, GateRules
-from orthonav.publish.jsonl import result_from_json
-from orthonav.records import Fix, NoFix, Prior, Telemetry
+from orthonav.records import CONFIDENT, Fix, NoFix, Prior, Telemetry
 
 CAMERA = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
 AHEAD_NS = -90 * S
 
 
 class BoundedLog:
-    """A log that keeps what it is told; it fails where it should."""
+    """A log that records its calls; with `broken` set it raises."""
 
     def __init__(self):
         self.calls, self.broken, self.lost = [], None, {"views": 0}
@@ -66,7 +67,7 @@ class BoundedLog:
 
 
 class Flight:
-    """A runner among stand-ins, at the pace of the test: one view in a tenth of a second."""
+    """A runner with fake parts and a fake clock: one view every tenth of a second."""
 
     def __init__(self, tmp_path, locator=None, rules=None, **options):
         self.time, self.port, self.autopilot = Time(), Port(), Autopilot()
@@ -82,8 +83,8 @@ class Flight:
             link=self.link,
             lines=[JsonOut(self.lines)],
         )
-        self.locator, self.newest, self.log = locator or FakeLocator(), Newest(), BoundedLog()
-        rest = {name: options.pop(name) for name in ("second_look", "start") if name in options}
+        self.locator, self.newest, self.log = locator or FakeLocator(), NewestImage(), BoundedLog()
+        rest = {name: options.pop(name) for name in ("diagnosis", "start") if name in options}
         options = FlyOptions(**options)
         self.runner = Runner(
             self.newest,
@@ -105,10 +106,10 @@ class Flight:
         self.link.poll()
 
     def talk(self):
-        """The autopilot says what it knows and answers what it is asked."""
+        """The autopilot sends telemetry and answers TIMESYNC."""
         now = self.time.now_ns + AHEAD_NS
         asked = self.port.sent("TIMESYNC") if not self.port.broken else []
-        answers = [  # as if the way there took as long as the way back
+        answers = [  # with equal delays in both directions
             self.autopilot.say("timesync", (now + each["ts1"] + AHEAD_NS) // 2, each["ts1"])
             for each in asked
         ]
@@ -116,7 +117,7 @@ class Flight:
         self.hear(self.autopilot.home(now, self.agl_m), attitude, *answers)
 
     def view(self, grey=None, age_s=0.05, wait_s=0.1):
-        """One more view; what came of it."""
+        """Process one more view; its result."""
         self.time.go(wait_s)
         if self.talks:
             self.talk()
@@ -128,14 +129,16 @@ class Flight:
         self.number += 1
         exposed = self.time.now_ns - round(age_s * S)
         time_ns = UTC_NS + exposed
-        self.newest.put(Picture(self.number, f"{self.number:06d}", exposed, time_ns, grey, problem))
+        self.newest.put(
+            CameraImage(self.number, f"{self.number:06d}", exposed, time_ns, grey, problem)
+        )
         return self.runner.step(0)
 
     def views(self, count, **options):
         return [self.view(**options) for _ in range(count)]
 
     def health(self):
-        """Level and reasons when the next second is over."""
+        """Level and reasons at the end of the next second."""
         before = self.runner.health
         while self.runner.health is before:
             self.time.go(0.1)
@@ -152,7 +155,7 @@ class Flight:
 
 @pytest.fixture
 def begin(tmp_path):
-    """Function that begins a flight, which is ended after the test."""
+    """Function that starts a flight, which ends after the test."""
     made = []
 
     def flight(*arguments, **options):
@@ -166,7 +169,7 @@ def begin(tmp_path):
 
 @pytest.fixture
 def flight(begin, tmp_path):
-    """A flight that has been well for six seconds."""
+    """A flight after six seconds without faults."""
     made = begin(map_path=tmp_path)
     made.views(60)
     made.port.gone.clear()
@@ -177,7 +180,7 @@ def reason_of(result):
     return result.outcome.reason if isinstance(result.outcome, NoFix) else "fix"
 
 
-def test_all_is_well(flight):
+def test_without_faults_health_is_ok(flight):
     assert flight.health().level is Level.OK
     flight.time.go(1.0)
     flight.talk()
@@ -199,7 +202,7 @@ def test_a_view_becomes_a_message(flight):
     assert line["sent"] == ["GLOBAL_POSITION_SENSOR", "GPS_INPUT"]
 
 
-def test_the_view_is_told_what_was_at_its_exposure(flight):
+def test_telemetry_is_interpolated_to_the_exposure(flight):
     flight.yaw_deg = 30.0
     flight.view()
     flight.yaw_deg = 40.0
@@ -208,7 +211,7 @@ def test_the_view_is_told_what_was_at_its_exposure(flight):
     assert flight.locator.seen[-1].agl_m == pytest.approx(100.0)
 
 
-def test_every_view_is_logged_before_it_is_placed_with_what_it_is_told(flight):
+def test_a_view_is_logged_with_its_telemetry_before_it_is_located(flight):
     before = len(flight.log.calls)
     flight.view()
     names = [name for name, _ in flight.log.calls[before:]]
@@ -222,11 +225,11 @@ def test_every_view_is_logged_before_it_is_placed_with_what_it_is_told(flight):
 def test_old_views_are_dropped_and_counted(flight):
     seen = len(flight.locator.seen)
     assert flight.views(40, age_s=0.6) == [None] * 40
-    assert len(flight.locator.seen) == seen and flight.runner.tally.total["late"] == 40
+    assert len(flight.locator.seen) == seen and flight.runner.counter.total["late"] == 40
     assert "slow" in flight.reasons() and flight.port.sent("GPS_INPUT") == []
 
 
-def test_a_slow_processor_degrades_and_what_is_late_is_not_sent(flight):
+def test_a_slow_processor_degrades_and_stale_positions_are_not_sent(flight):
     def slow(view):
         for _ in range(12):
             flight.time.go(0.1)
@@ -239,7 +242,7 @@ def test_a_slow_processor_degrades_and_what_is_late_is_not_sent(flight):
     assert flight.port.sent("GLOBAL_POSITION_SENSOR") == []
 
 
-def test_one_failure_is_one_no_fix(flight, caplog):
+def test_an_internal_error_is_one_no_fix(flight, caplog):
     whole = flight.locator.outcome
 
     def failing(view):
@@ -252,7 +255,7 @@ def test_one_failure_is_one_no_fix(flight, caplog):
     assert (health.level, health.reasons) == (Level.DEGRADED, ("internal_error",))
 
 
-def test_failures_at_every_view_are_a_failure(flight, caplog):
+def test_internal_errors_of_every_view_are_a_failure(flight, caplog):
     def failing(view):
         raise ValueError("odd")
 
@@ -261,17 +264,17 @@ def test_failures_at_every_view_are_a_failure(flight, caplog):
     assert flight.health().level is Level.FAILED
 
 
-def test_a_frozen_camera_is_no_hover(flight):
-    """The tracker never sees the picture again, nothing is sent, and health says why."""
+def test_repeated_images_are_not_located(flight):
+    """The tracker does not get a repeated image, nothing is sent, and health names the reason."""
     grey = flight.rng.integers(0, 256, (240, 320), dtype=np.uint8)
     flight.view(grey)
     seen = len(flight.locator.seen)
     flight.port.gone.clear()
     results = flight.views(30, grey=grey)
-    assert {reason_of(each) for each in results} == {"frozen_picture"}
+    assert {reason_of(each) for each in results} == {"frozen_image"}
     assert len(flight.locator.seen) == seen and flight.port.sent("GPS_INPUT") == []
-    assert "frozen_picture" in flight.reasons()
-    assert flight.runner.tally.total["frozen"] == 30
+    assert "frozen_image" in flight.reasons()
+    assert flight.runner.counter.total["frozen"] == 30
     assert reason_of(flight.views(2)[1]) == "fix"
 
 
@@ -284,18 +287,18 @@ BAD = {
 
 
 @pytest.mark.parametrize("kind", BAD)
-def test_pictures_that_show_nothing_bring_nothing(flight, kind):
+def test_unusable_images_give_no_fix(flight, kind):
     seen = len(flight.locator.seen)
     results = flight.views(30, grey=BAD[kind])
     assert {reason_of(each) for each in results} == {kind}
     assert len(flight.locator.seen) == seen
     assert flight.port.sent("GLOBAL_POSITION_SENSOR") == []
-    assert "bad_pictures" in flight.reasons()
+    assert "bad_images" in flight.reasons()
     flight.view()
-    assert flight.gate.resets == 0  # a blink is no jump
+    assert flight.gate.resets == 0  # an interruption is no jump
 
 
-def test_a_picture_of_another_shape_fails_and_one_of_another_size_does_not(flight):
+def test_an_image_of_other_proportions_fails_and_one_of_another_size_does_not(flight):
     cameras = []
 
     def outcome(view):
@@ -323,18 +326,18 @@ def test_without_telemetry_there_is_no_fix(flight):
     assert reason_of(flight.view()) == "fix"
 
 
-def test_gaps_in_telemetry_are_told(flight):
+def test_gaps_in_telemetry_are_reported(flight):
     for number in range(60):
         flight.talks = number % 12 > 8
         flight.view()
     assert "telemetry_gaps" in flight.reasons()
 
 
-def test_a_link_that_is_down_comes_up_again(flight):
+def test_a_link_that_failed_is_opened_again(flight):
     flight.port.broken = OSError("unplugged")
     flight.views(60)
     assert "link_down" in flight.reasons() and not flight.link.status().is_open
-    assert flight.runner.tally.total["no_telemetry"] > 0
+    assert flight.runner.counter.total["no_telemetry"] > 0
     flight.port.broken = None
     flight.views(70)
     assert flight.port.sent("GPS_INPUT") != []
@@ -342,7 +345,7 @@ def test_a_link_that_is_down_comes_up_again(flight):
     assert flight.health().level is Level.OK
 
 
-def test_an_autopilot_that_starts_anew_is_followed(flight):
+def test_telemetry_after_a_restart_of_the_autopilot_is_used(flight):
     started = flight.time.now_ns
 
     def talk():
@@ -366,22 +369,24 @@ def test_a_computer_clock_that_is_set_does_no_harm(flight, seconds):
     assert {"stale", "out_of_order", "from_the_future"} & set(flight.gate.withheld) == set()
 
 
-def test_heading_and_height_far_from_told_degrade(flight):
+def test_a_large_mismatch_of_heading_or_height_degrades(flight):
     flight.locator.outcome = lambda view: fix(heading_deg=view.telemetry.yaw_deg + 35)
     flight.views(11)
-    assert flight.reasons() == {"heading_off"}
+    assert flight.reasons() == {"heading_mismatch"}
     flight.locator.outcome = lambda view: fix(
         heading_deg=view.telemetry.yaw_deg, agl_m=view.telemetry.agl_m / 2
     )
     flight.views(11)
-    assert flight.reasons() == {"height_off"}
+    assert flight.reasons() == {"height_mismatch"}
 
 
 @pytest.mark.parametrize(
-    ("yaw_off", "share", "reason"), [(180, 1, "heading_off"), (0, 2, "height_off")]
+    ("yaw_off", "share", "reason"), [(180, 1, "heading_mismatch"), (0, 2, "height_mismatch")]
 )
-def test_why_nothing_is_found_is_looked_at(begin, yaw_off, share, reason):
-    """The track searches in vain; a second look finds the place with another heading or height."""
+def test_a_wrong_heading_or_height_is_diagnosed_while_nothing_is_found(
+    begin, yaw_off, share, reason
+):
+    """While the track searches, the diagnosis finds the position with another heading or height."""
 
     class Localizer:
         def locate(self, view, *, heading_known):
@@ -389,19 +394,19 @@ def test_why_nothing_is_found_is_looked_at(begin, yaw_off, share, reason):
             right = not heading_known or yaw_off == 0
             if right and telemetry.agl_m == pytest.approx(100.0 * share, rel=0.01):
                 return fix(heading_deg=telemetry.yaw_deg + yaw_off, agl_m=telemetry.agl_m)
-            return NoFix("not_sure", "")
+            return NoFix("low_confidence", "")
 
     locator = FakeLocator(lambda *_: NoFix("searching", ""), "searching")
-    flight = begin(locator, second_look=SecondLook(Localizer(), 0.9, lambda work: work()))
+    flight = begin(locator, diagnosis=TelemetryDiagnosis(Localizer(), 0.9, lambda work: work()))
     flight.views(200)
     assert flight.reasons() == {"searching", reason}
     assert flight.port.sent("GPS_INPUT") == []
 
 
-def test_an_unsure_or_lost_track_is_told_and_not_sent(flight):
+def test_a_position_of_low_confidence_or_a_lost_track_is_not_sent(flight):
     flight.locator.outcome = lambda *_: fix(confidence=0.5)
     flight.views(110)
-    assert "unsure" in flight.reasons()
+    assert "low_confidence" in flight.reasons()
     flight.locator.state_name = "lost"
     flight.port.gone.clear()
     flight.views(3)
@@ -409,7 +414,7 @@ def test_an_unsure_or_lost_track_is_told_and_not_sent(flight):
     assert flight.written()[-2]["withheld"] in ("not_tracking", "low_confidence")
 
 
-def test_a_map_that_is_removed_is_noted(begin, tmp_path):
+def test_a_removed_map_file_degrades(begin, tmp_path):
     path = tmp_path / "area.onav"
     path.write_bytes(b"map")
     flight = begin(map_path=path)
@@ -417,9 +422,9 @@ def test_a_map_that_is_removed_is_noted(begin, tmp_path):
     assert flight.health().level is Level.OK
     path.unlink()
     flight.views(11)
-    assert flight.reasons() == {"map_gone"}
-    path.write_bytes(b"another")  # what flies is still the old one
-    assert flight.health().reasons in ((), ("map_gone",))
+    assert flight.reasons() == {"map_file_changed"}
+    path.write_bytes(b"another")  # the flight still uses the old one
+    assert flight.health().reasons in ((), ("map_file_changed",))
 
 
 def test_a_log_that_fails_does_not_end_the_flight(flight):
@@ -429,7 +434,7 @@ def test_a_log_that_fails_does_not_end_the_flight(flight):
     flight.log.broken = None
     flight.views(120)
     assert flight.health().level is Level.OK
-    flight.log.lost = {"views": 3}  # left out by a log that never raises
+    flight.log.lost = {"views": 3}  # dropped by a log that never raises
     flight.views(11)
     assert flight.reasons() == {"log_failed"}
 
@@ -443,7 +448,7 @@ def test_an_output_that_fails_does_not_end_the_flight(flight, monkeypatch):
     assert flight.port.sent("GPS_INPUT") != [] and flight.reasons() == {"output_failed"}
 
 
-def test_a_camera_that_stops_is_told(flight):
+def test_a_camera_that_stops_is_a_failure(flight):
     for _ in range(50):
         flight.time.go(0.1)
         flight.talk()
@@ -467,7 +472,7 @@ def test_health_goes_to_the_ground_station(flight):
     assert flight.link.system_status == Level.DEGRADED.value
 
 
-def test_where_it_is_is_kept_about_once_a_second(begin, tmp_path, monkeypatch):
+def test_the_position_is_saved_about_once_a_second(begin, tmp_path, monkeypatch):
     path, saves = tmp_path / "state.json", []
     whole = states.save
     monkeypatch.setattr(states, "save", lambda *a: (saves.append(1), whole(*a)))
@@ -482,7 +487,7 @@ def test_where_it_is_is_kept_about_once_a_second(begin, tmp_path, monkeypatch):
     assert flight.reasons() == {"state_not_saved"}
 
 
-def test_the_first_view_is_told_where_to_begin(begin):
+def test_the_first_located_view_gets_the_start_position(begin):
     prior = Prior(48.0, 2.0, 50.0)
     flight = begin(start=lambda: prior)
     flight.view(BAD["too_dark"])
@@ -494,24 +499,24 @@ def test_recorded_telemetry_needs_no_autopilot(begin):
     flight = begin(recorded=True)
     telemetry = Telemetry(5, 1.0, 2.0, 3.0, 50.0)
     grey = flight.rng.integers(0, 256, (240, 320), np.uint8)
-    flight.newest.put(Picture(1, "a", flight.time.now_ns, 5, grey, telemetry=telemetry))
+    flight.newest.put(CameraImage(1, "a", flight.time.now_ns, 5, grey, telemetry=telemetry))
     assert reason_of(flight.runner.step(0)) == "fix" and flight.locator.seen == [telemetry]
 
 
-def test_it_ends_with_the_recording_and_says_so(flight):
+def test_the_flight_ends_with_the_recording(flight):
     flight.newest.end()
     flight.runner.run(threading.Event())
     assert [name for name, _ in flight.log.calls[-1:]] == ["close"]
     assert flight.log.named("options")
 
 
-def test_whatever_fails_the_next_view_is_flown(flight, monkeypatch, caplog):
+def test_after_an_unexpected_error_the_next_view_is_processed(flight, monkeypatch, caplog):
     whole, calls = flight.runner._publisher.publish, []
 
     def publish(*arguments, **options):
         calls.append(1)
         if len(calls) == 1:
-            raise ValueError("an estimate that cannot be")
+            raise ValueError("an invalid estimate")
         return whole(*arguments, **options)
 
     monkeypatch.setattr(flight.runner._publisher, "publish", publish)
@@ -523,16 +528,16 @@ def test_whatever_fails_the_next_view_is_flown(flight, monkeypatch, caplog):
         flight.time.go(0.1)
         flight.talk()
         grey = flight.rng.integers(0, 256, (240, 320), dtype=np.uint8)
-        flight.newest.put(Picture(1, "a", flight.time.now_ns, 5, grey))
+        flight.newest.put(CameraImage(1, "a", flight.time.now_ns, 5, grey))
         return whole(timeout_s)
 
     monkeypatch.setattr(flight.newest, "take", take)
     flight.runner.run(stopping)
-    assert len(calls) >= 2 and flight.runner.tally.total["internal_error"] == 1
-    assert "an estimate that cannot be" in caplog.text
+    assert len(calls) >= 2 and flight.runner.counter.total["internal_error"] == 1
+    assert "an invalid estimate" in caplog.text
 
 
-def test_a_camera_error_inside_names_the_camera(flight):
+def test_a_camera_error_of_the_locator_is_a_wrong_camera(flight):
     def wrong(view):
         raise CameraError("another camera")
 
@@ -541,9 +546,9 @@ def test_a_camera_error_inside_names_the_camera(flight):
     assert flight.health().level is Level.FAILED
 
 
-# From here on with a map, over UDP, in real time.
+# From here on with a map, over UDP.
 
-SPEED_MPS, HEADING, EVERY_S, PACE = 14.0, 60.0, 0.5, 5.0
+SPEED_MPS, HEADING, EVERY_S = 14.0, 60.0, 0.5
 COUNT = 20
 
 
@@ -593,39 +598,75 @@ def views_in(path):
     return [line for line in lines if "frame" in line], [result_from_json(t) for t in texts]
 
 
-def test_a_flight_from_end_to_end(flown, autopilot, tmp_path, capsys):
+def wait_for(condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert condition()
+
+
+@pytest.fixture
+def paced(monkeypatch):
+    """Function that makes a playback wait until a line was written for every earlier image."""
+
+    def pace_by(lines):
+        def pace(clocks, factor):
+            given = []
+
+            def due_ns(time_ns):
+                written = lines.read_text().count('"frame"') if lines.exists() else 0
+                if written < len(given):
+                    return None
+                given.append(time_ns)
+                return clocks.mono_ns()
+
+            return due_ns
+
+        monkeypatch.setattr(cameras, "own_pace", pace)
+
+    return pace_by
+
+
+def test_a_flight_from_end_to_end(flown, autopilot, paced, tmp_path):
+    """Every image is located, however slow the machine is; only "stale" depends on its speed."""
     path, folder, frame, truth = flown
     lines, state = tmp_path / "lines.jsonl", tmp_path / "state.json"
     cv2.setNumThreads(1)
+    paced(lines)
     code = main(
         [
-            *("fly", str(path), "--camera", str(folder), "--pace", str(PACE)),
-            *("--autopilot", f"udpin:{autopilot.port}", "--file-clock", "own"),
-            *("--send", "global-position", "--send", "gps-input", "--deadline-ms", "1500"),
-            *("--json", str(lines), "--state", str(state)),
+            *("fly", str(path), str(folder), "--autopilot", f"udpin:{autopilot.port}"),
+            *("--deadline-ms", "60000", "--telemetry-wait-ms", "10000"),
+            *("--send", "global-position", "--send", "gps-input"),
+            *("--jsonl", str(lines), "--state", str(state)),
         ]
     )
     assert code == 0
-    time.sleep(0.1)
-    telemetry, results = views_in(lines)
-    sent = [each for each, line in zip(results, telemetry, strict=True) if line["sent"]]
-    assert len(sent) >= 6, [line["withheld"] or line["reason"] for line in telemetry]
-    for name in ("GLOBAL_POSITION_SENSOR", "GPS_INPUT"):
-        heard = autopilot.named(name)
-        assert [(m["lat"], m["lon"]) for m in heard] == [
-            (round(r.outcome.lat_deg * 1e7), round(r.outcome.lon_deg * 1e7)) for r in sent
-        ]
-    for each in sent:
+    written, results = views_in(lines)
+    assert [each.frame for each in results] == sorted(truth)
+    confident = [
+        (line, each)
+        for line, each in zip(written, results, strict=True)
+        if each.state == "tracking" and each.outcome.confidence >= CONFIDENT
+    ]
+    assert len(confident) >= COUNT // 2, [line["withheld"] or line["reason"] for line in written]
+    for line, each in confident:
         place = frame.en_from_latlon(each.outcome.lat_deg, each.outcome.lon_deg)
         assert np.hypot(*(place - truth[each.frame])) < 6
-    ages = [m["processing_time"] / 1e6 for m in autopilot.named("GLOBAL_POSITION_SENSOR")]
-    assert min(ages) > 0 and max(ages) < 1.5
+        assert line["sent"] or line["withheld"] == "stale"
+    sent = [each for line, each in zip(written, results, strict=True) if line["sent"]]
+    for name in ("GLOBAL_POSITION_SENSOR", "GPS_INPUT"):
+        wait_for(lambda name=name: len(autopilot.named(name)) >= len(sent), 10)
+        assert [(m["lat"], m["lon"]) for m in autopilot.named(name)] == [
+            (round(r.outcome.lat_deg * 1e7), round(r.outcome.lon_deg * 1e7)) for r in sent
+        ]
+    assert all(m["processing_time"] > 0 for m in autopilot.named("GLOBAL_POSITION_SENSOR"))
     assert autopilot.named("HEARTBEAT") and autopilot.named("TIMESYNC")
-    assert states.load(state).lat_deg == pytest.approx(sent[-1].outcome.lat_deg)
+    assert states.load(state).lat_deg == pytest.approx(confident[-1][1].outcome.lat_deg)
 
 
-def test_killed_and_started_again_it_is_back_soon(flown, autopilot, tmp_path):
-    """A process of its own, killed in flight; the next one begins where that was."""
+def test_a_killed_flight_continues_from_the_saved_position(flown, autopilot, tmp_path):
+    """A process is killed in flight; the next one starts from the position that it saved."""
     path, folder, _, _ = flown
     state = tmp_path / "state.json"
     fast = tmp_path / "flight"
@@ -634,20 +675,14 @@ def test_killed_and_started_again_it_is_back_soon(flown, autopilot, tmp_path):
     def start(lines):
         program = "import sys; from orthonav.cli import main; sys.exit(main(sys.argv[1:]))"
         arguments = [
-            *("fly", path, "--camera", fast, "--pace", "4", "--state", state, "--json", lines),
+            *("fly", path, fast, "--state", state, "--jsonl", lines),
             *("--autopilot", f"udpin:{autopilot.port}", "--deadline-ms", "1500"),
         ]
         return subprocess.Popen([sys.executable, "-c", program, *map(str, arguments)])
 
-    def wait_for(condition, seconds):
-        deadline = time.monotonic() + seconds
-        while not condition() and time.monotonic() < deadline:
-            time.sleep(0.02)
-        assert condition()
-
     first = start(tmp_path / "1.jsonl")
     try:
-        wait_for(state.exists, 20)
+        wait_for(state.exists)
     finally:
         first.send_signal(signal.SIGKILL)
         first.wait()
@@ -655,32 +690,32 @@ def test_killed_and_started_again_it_is_back_soon(flown, autopilot, tmp_path):
     assert heard > 0
     second = start(tmp_path / "2.jsonl")
     try:
-        wait_for(lambda: len(autopilot.named("GLOBAL_POSITION_SENSOR")) > heard, 20)
+        wait_for(lambda: len(autopilot.named("GLOBAL_POSITION_SENSOR")) > heard)
     finally:
         second.send_signal(signal.SIGTERM)
         code = second.wait()
     assert code == 0  # a clean stop
 
 
-def test_what_cannot_fly_is_said_at_once(flown, run, tmp_path):
+def test_invalid_options_end_with_one_line(flown, run, tmp_path):
     path, folder, _, _ = flown
-    done = run("fly", path, "--camera", folder)
+    done = run("fly", path, folder)
     assert (done.code, done.err.count("\n")) == (1, 1) and "--autopilot" in done.err
-    done = run("fly", path, "--camera", "0", "--autopilot", "udpin:0")
-    assert done.code == 1 and "--camera-file" in done.err
+    done = run("fly", path, "0", "--autopilot", "udpin:0")
+    assert done.code == 1 and "--camera FILE" in done.err
     key = tmp_path / "key"
     key.write_text("secret words")
-    done = run("fly", path, "--camera", folder, "--autopilot", "udpin:0", "--signing-key", key)
+    done = run("fly", path, folder, "--autopilot", "udpin:0", "--signing-key", key)
     assert done.code == 1 and "32 bytes" in done.err and "secret" not in done.err
-    done = run("fly", path, "--camera", folder, "--autopilot", "carrier-pigeon:1")
+    done = run("fly", path, folder, "--autopilot", "carrier-pigeon:1")
     assert done.code == 1 and "udpin" in done.err
-    done = run("fly", path, "--camera", folder, "--autopilot", "udpin:0", "--nmea", "x:1")
+    done = run("fly", path, folder, "--autopilot", "udpin:0", "--nmea", "x:1")
     assert done.code == 1 and "tcp-listen" in done.err
-    done = run("fly", path, "--camera", folder, "--autopilot", "udpin:0", "--start", "1,2")
+    done = run("fly", path, folder, "--autopilot", "udpin:0", "--start", "1,2")
     assert done.code == 2 and "LAT,LON,STD_M" in done.err
 
 
-def test_help_is_quick_and_the_flight_needs_neither_torch_nor_gdal():
+def test_a_flight_loads_neither_torch_nor_gdal():
     script = (
         "import sys, orthonav.onboard.fly, orthonav.cli.fly, orthonav.localizer.tracker;"
         "print({'torch', 'rasterio', 'pyproj', 'mcap'} & set(sys.modules))"

@@ -1,4 +1,4 @@
-"""The link: what is heard, what is said, and what happens when it breaks."""
+"""The link: messages in and out, and failures of the port."""
 
 import math
 import os
@@ -37,7 +37,7 @@ class Flying:
         return self.link.poll()
 
     def telemetry(self, **options):
-        return self.link.told_at(self.time.now_ns).telemetry(0, **options)
+        return self.link.state_at(self.time.now_ns).telemetry(0, **options)
 
 
 @pytest.fixture
@@ -48,19 +48,19 @@ def flying():
     return made
 
 
-def test_the_first_autopilot_that_is_heard_is_ours():
+def test_the_first_autopilot_heard_is_the_target():
     flying = Flying()
     station = Autopilot(255, 190).heartbeat(kind=8)
     gimbal = Autopilot(1, 154).heartbeat(kind=8)
-    stranger = Autopilot(9).attitude(5 * S)
-    assert flying.hear(station, gimbal, stranger) == 0 and flying.link.target is None
+    other = Autopilot(9).attitude(5 * S)
+    assert flying.hear(station, gimbal, other) == 0 and flying.link.target is None
     assert flying.hear(flying.autopilot.heartbeat(kind=3)) == 1
     assert (flying.link.target, flying.link.kind) == (Target(1, 1), Kind.ARDUPILOT)
-    assert flying.hear(Autopilot(9).heartbeat(), stranger, Autopilot(1, 2).attitude(5 * S)) == 0
-    assert flying.link.buffer.newest_ns is None
+    assert flying.hear(Autopilot(9).heartbeat(), other, Autopilot(1, 2).attitude(5 * S)) == 0
+    assert flying.link.buffer.covered_ns is None
 
 
-def test_another_system_may_be_named():
+def test_the_system_id_can_be_chosen():
     flying = Flying(system_id=7)
     assert flying.hear(Autopilot(1).heartbeat(), Autopilot(7).heartbeat()) == 1
     assert flying.link.target == Target(7, 1)
@@ -79,13 +79,11 @@ def test_telemetry_at_an_exposure(flying):
         )
         flying.time.go(0.1)
     exposed = flying.time.now_ns - 250 * MS  # between the first and the second
-    telemetry = flying.link.told_at(exposed)
-    assert telemetry.telemetry(1).yaw_deg == pytest.approx(
-        30.0 + (exposed + AHEAD_NS) / S, abs=1e-3
-    )
-    assert (telemetry.height_m, telemetry.height_source) == (pytest.approx(80.0), "home")
-    assert telemetry.telemetry(1).vel_en_mps == pytest.approx((3.0, 9.0))
-    assert telemetry.down_m == pytest.approx(-70.0)
+    vehicle = flying.link.state_at(exposed)
+    assert vehicle.telemetry(1).yaw_deg == pytest.approx(30.0 + (exposed + AHEAD_NS) / S, abs=1e-3)
+    assert vehicle.height_m == pytest.approx(80.0)
+    assert vehicle.telemetry(1).vel_en_mps == pytest.approx((3.0, 9.0))
+    assert vehicle.down_m == pytest.approx(-70.0)
     assert flying.link.covers(exposed) and not flying.link.covers(flying.time.now_ns + S)
 
 
@@ -95,26 +93,25 @@ def test_heights_of_every_message(flying):
 
     def height(*frames):
         flying.hear(*frames)
-        telemetry = flying.link.told_at(flying.time.now_ns)
-        return telemetry.height_source, round(telemetry.height_m, 2)
+        return round(flying.link.state_at(flying.time.now_ns).height_m, 2)
 
     unknown = -1001.0
     say = flying.autopilot.say
     relative = say("altitude", now // 1000, 0, 0, 0, 55.0, unknown, 0)
-    assert height(relative) == ("relative", 55.0)
-    assert height(flying.autopilot.home(now, 60.0)) == ("home", 60.0)
+    assert height(relative) == 55.0
+    assert height(flying.autopilot.home(now, 60.0)) == 60.0
     flying.time.go(0.02)
     # stamped since 1970, as some autopilots do
     since_1970 = say("altitude", (UTC_NS + now) // 1000, 0, 0, 0, 55.0, 42.0, 0)
-    assert height(since_1970) == ("terrain", 42.0)
+    assert height(since_1970) == 42.0
     ahead = flying.autopilot.distance(flying.boot_ns(), 7.0, orientation=0)
     too_far = say("distance_sensor", now // MS, 20, 5000, 5000, 0, 0, 25, 255)
-    assert height(ahead, too_far) == ("terrain", 42.0)
+    assert height(ahead, too_far) == 42.0
     down = math.cos(math.radians(10))
-    assert height(say("rangefinder", 50.0, 1.0)) == ("distance", round(50 * down, 2))
+    assert height(say("rangefinder", 50.0, 1.0)) == round(50 * down, 2)
     flying.time.go(0.02)
     telemetry = flying.autopilot.distance(flying.boot_ns(), 40.0)
-    assert height(telemetry) == ("distance", round(40 * down, 2))
+    assert height(telemetry) == round(40 * down, 2)
 
 
 def test_attitude_as_a_quaternion(flying):
@@ -125,7 +122,7 @@ def test_attitude_as_a_quaternion(flying):
     assert flying.telemetry(mount_deg=(90.0, 0.0, 0.0)).yaw_deg == pytest.approx(180.0, abs=1e-3)
 
 
-def test_damaged_bytes_are_counted_and_survived(flying):
+def test_damaged_bytes_are_counted_and_skipped(flying):
     good = flying.autopilot.attitude(flying.boot_ns(), yaw_deg=12.0)
     broken = bytearray(flying.autopilot.attitude(flying.boot_ns(), yaw_deg=99.0))
     broken[14] ^= 0x55
@@ -160,19 +157,19 @@ def test_clocks_are_compared(flying):
         flying.hear(flying.autopilot.say("timesync", there, asked["ts1"]))
     assert flying.link.status().synced
     assert flying.link.boot_ns(flying.time.now_ns) == pytest.approx(flying.boot_ns(), abs=MS)
-    stranger = flying.autopilot.say("timesync", 1, 12345)  # an answer that nobody asked for
-    flying.hear(stranger)
+    other = flying.autopilot.say("timesync", 1, 12345)  # an answer without a request
+    flying.hear(other)
     assert flying.link.boot_ns(flying.time.now_ns) == pytest.approx(flying.boot_ns(), abs=MS)
 
 
-def test_the_autopilot_may_compare_too(flying):
+def test_timesync_requests_are_answered(flying):
     flying.hear(flying.autopilot.say("timesync", 0, 777))
     answer = next(each for each in flying.port.sent("TIMESYNC") if each["tc1"])
     assert answer["ts1"] == 777
     assert answer["tc1"] == flying.time.clocks.utc_ns()  # the clock that messages are stamped with
 
 
-def test_an_autopilot_that_starts_anew_is_noticed(flying):
+def test_a_restart_of_the_autopilot_is_detected(flying):
     flying.hear(flying.autopilot.attitude(flying.boot_ns(), yaw_deg=10.0))
     for number in range(40):
         flying.time.go(0.05)
@@ -181,7 +178,7 @@ def test_an_autopilot_that_starts_anew_is_noticed(flying):
     assert flying.telemetry().yaw_deg == pytest.approx(70.0, abs=1e-3)
 
 
-def test_a_port_that_breaks_is_opened_again(flying):
+def test_a_port_that_fails_is_opened_again(flying):
     flying.port.broken = OSError("unplugged")
     assert flying.link.poll() == 0 and not flying.link.status().is_open
     flying.port.broken = None
@@ -193,7 +190,7 @@ def test_a_port_that_breaks_is_opened_again(flying):
     assert flying.port.opened == 2 and flying.telemetry().yaw_deg == pytest.approx(3.0, abs=1e-3)
 
 
-def test_a_port_that_is_not_there_is_asked_for_ever_more_seldom():
+def test_a_missing_port_is_retried_at_growing_intervals():
     flying = Flying()
     flying.port.refuse = True
     for _ in range(600):
@@ -206,7 +203,7 @@ def test_a_port_that_is_not_there_is_asked_for_ever_more_seldom():
     assert flying.hear(flying.autopilot.heartbeat()) == 1
 
 
-def test_a_dry_run_says_nothing():
+def test_a_dry_run_sends_nothing():
     flying = Flying(silent=True)
     flying.hear(flying.autopilot.heartbeat(), flying.autopilot.say("timesync", 0, 7))
     flying.time.go(5.0)
@@ -214,7 +211,7 @@ def test_a_dry_run_says_nothing():
     assert flying.port.gone == [] and flying.link.target == Target(1, 1)
 
 
-def test_a_signed_link_takes_nothing_unsigned():
+def test_a_signed_link_ignores_unsigned_messages():
     stamp = signing_timestamp(UTC_NS + 100 * S)
     flying = Flying(signing=Signing(KEY, stamp))
     assert flying.hear(Autopilot().heartbeat(), Autopilot(key=bytes(32)).heartbeat()) == 0
@@ -237,7 +234,7 @@ def test_a_signed_link_takes_nothing_unsigned():
     assert flying.link.signing_now() >= stamps[-1]
 
 
-def test_the_origin_of_the_autopilot_is_kept(flying):
+def test_the_origin_of_the_autopilot_is_stored(flying):
     flying.hear(flying.autopilot.say("gps_global_origin", 481000000, 20000000, 120_000))
     assert flying.link.origin == Origin(48.1, 2.0, 120.0)
 
@@ -259,29 +256,29 @@ def test_connection_strings(url, kind):
     "url",
     ["", "udpin:", "udpin:x", "udpout:host:99999", "tcp:host", "ttyUSB0", "/dev/ttyS0:fast", "u:1"],
 )
-def test_other_strings_are_refused(url):
+def test_invalid_connection_strings_are_refused(url):
     with pytest.raises(VariantError):
         transport_opener(url)
 
 
-def test_listening_answers_the_autopilot_only():
+def test_a_listening_port_sends_to_the_autopilot_only():
     port = transport_opener("udpin:127.0.0.1:0")()
     link = AutopilotLink(lambda: port, TelemetryBuffer(), Time().clocks)
-    ours, stranger = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    ours, other = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     there = port._socket.getsockname()
-    for each in (ours, stranger):
+    for each in (ours, other):
         each.settimeout(0.2)
-    stranger.sendto(b"hello", there)
+    other.sendto(b"hello", there)
     ours.sendto(Autopilot().heartbeat(), there)
     while link.target is None:
         link.poll(0.1)
-    stranger.sendto(Autopilot(9).heartbeat(), there)
+    other.sendto(Autopilot(9).heartbeat(), there)
     link.poll(0.1)
     link.send(dialect().MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
     assert decode(ours.recv(300))["name"] == "HEARTBEAT"
     with pytest.raises(TimeoutError):
-        stranger.recv(300)
-    for each in (ours, stranger, link):
+        other.recv(300)
+    for each in (ours, other, link):
         each.close()
 
 
@@ -328,7 +325,7 @@ def test_a_tcp_connection_that_ends_is_an_error():
         transport_opener(f"tcp:{host}:{port}")()
 
 
-def test_a_link_in_a_thread_lives_through_anything(monkeypatch, caplog):
+def test_the_link_thread_survives_exceptions(monkeypatch, caplog):
     port = transport_opener("udpin:127.0.0.1:0")()
     link = AutopilotLink(lambda: port, TelemetryBuffer(), Time().clocks)
     whole, calls = link._dispatch, []
@@ -350,7 +347,7 @@ def test_a_link_in_a_thread_lives_through_anything(monkeypatch, caplog):
     assert link.counts["HEARTBEAT"] > 0 and "autopilot" in caplog.text
 
 
-def test_without_pymavlink_it_says_so(monkeypatch):
+def test_missing_pymavlink_is_named(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pymavlink.dialects.v20.common", None)
     with pytest.raises(MissingExtraError, match="autopilot"):
         AutopilotLink(Port().open, TelemetryBuffer(), Time().clocks)

@@ -1,4 +1,4 @@
-"""A flight log is whole up to its last chunk, whatever the disk does, and never stops a flight."""
+"""A flight log is complete up to its last chunk, and never blocks a flight."""
 
 import errno
 import json
@@ -80,7 +80,7 @@ def files_in(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_the_stock_reader_reads_it(tmp_path):
+def test_the_reader_of_mcap_reads_a_log(tmp_path):
     log = begun(tmp_path)
     log_views(log, range(6))
     log.health({"level": "ok", "share": math.nan})
@@ -101,7 +101,7 @@ def test_the_stock_reader_reads_it(tmp_path):
     assert health == {"level": "ok", "share": "NaN", "log_lost": {"views": 0, "messages": 0}}
 
 
-def test_what_foxglove_requires(tmp_path):
+def test_messages_are_as_foxglove_requires(tmp_path):
     """The required fields of its published schemas, and their types."""
     log = begun(tmp_path)
     log_views(log, range(1))
@@ -150,7 +150,7 @@ def test_what_foxglove_requires(tmp_path):
     "confidence, state, status",
     [(0.95, "tracking", 0), (0.95, None, 0), (0.95, "searching", -1), (0.5, None, -1)],
 )
-def test_only_what_is_sure_is_a_fix_for_ros(tmp_path, confidence, state, status):
+def test_only_confident_fixes_have_a_fix_status_for_ros(tmp_path, confidence, state, status):
     log, result = begun(tmp_path), outcome(0, "0.png")
     placed = replace(result.outcome, confidence=confidence)
     log.result(replace(result, outcome=placed, state=state))
@@ -162,26 +162,26 @@ def test_only_what_is_sure_is_a_fix_for_ros(tmp_path, confidence, state, status)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 70), (33, 1), (48, 65)])
-def test_pictures_lose_nothing(shape):
+def test_images_are_stored_without_loss(shape):
     grey = picture(3, shape)
     png = log_module.lossless_png(grey)
     assert np.array_equal(cv2.imdecode(np.frombuffer(png, np.uint8), -1), grey)
 
 
-def test_which_pictures_are_kept(tmp_path):
+def test_views_none_thumbnails_and_full(tmp_path):
     for views in ("none", "thumbnails"):
         log = begun(tmp_path / views, views=views)
         log.view(0, "0.png", picture(0, (960, 1280)), telemetry(0))
         log.view(1, "1.png", None, telemetry(1))
         log.close()
         found = read(tmp_path / views / "flight_0001.mcap")
-        told = [each["picture"] for each in plain(found["/orthonav/telemetry"])]
-        assert told == [{"none": "none", "thumbnails": "thumbnail"}[views], "bad"]
+        found_images = [each["picture"] for each in plain(found["/orthonav/telemetry"])]
+        assert found_images == [{"none": "none", "thumbnails": "thumbnail"}[views], "bad"]
         assert "/orthonav/view" not in found
         assert len(found.get("/orthonav/thumbnail", [])) == (views == "thumbnails")
 
 
-def test_what_was_written_is_there_before_the_end(tmp_path):
+def test_chunks_are_on_disk_before_the_end(tmp_path):
     """As after a power cut: the file is copied while it grows."""
     log = begun(tmp_path)
     log_views(log, range(3))
@@ -194,7 +194,7 @@ def test_what_was_written_is_there_before_the_end(tmp_path):
     assert len(list(open_source(tmp_path / "cut.mcap").views)) == 3
 
 
-def test_a_slow_disk_never_stops_the_flight(tmp_path, monkeypatch):
+def test_a_slow_disk_does_not_block_the_flight(tmp_path, monkeypatch):
     monkeypatch.setattr(log_module, "QUEUE_BYTES", 10 * 64 * 48)
     goes_on, sync = threading.Event(), os.fsync
 
@@ -239,24 +239,24 @@ def full_disk(monkeypatch, room_bytes):
     return disk
 
 
-def test_a_full_disk_takes_pictures_first(tmp_path, monkeypatch):
-    disk = full_disk(monkeypatch, 44_000)
+def test_a_full_disk_drops_images_first(tmp_path, monkeypatch):
+    disk = full_disk(monkeypatch, 45_000)
     log = begun(tmp_path)
     for index in range(30):
         log_views(log, [index])
         wait_for(lambda: not log._queue)
         time.sleep(0.012)
     log.close()
-    kept = {}
+    logged = {}
     for name in files_in(tmp_path):
         for topic, messages in read(tmp_path / name).items():
-            kept.setdefault(topic, []).extend(messages)
-    assert log.lost["views"] == 30 - len(kept["/orthonav/view"]) > 10
-    assert len(kept["/orthonav/result"]) > len(kept["/orthonav/view"]) >= 4
+            logged.setdefault(topic, []).extend(messages)
+    assert log.lost["views"] == 30 - len(logged["/orthonav/view"]) > 10
+    assert len(logged["/orthonav/result"]) > len(logged["/orthonav/view"]) >= 4
     assert disk["room"] >= 0
 
 
-def test_a_disk_without_any_room_and_then_with_some(tmp_path, monkeypatch):
+def test_logging_continues_when_a_full_disk_has_space_again(tmp_path, monkeypatch):
     monkeypatch.setattr(log_module, "PAUSE_S", 0.0)
     disk = full_disk(monkeypatch, 0)
     log = begun(tmp_path)
@@ -285,7 +285,7 @@ def test_a_disk_that_fails(tmp_path, monkeypatch, code):
     assert log.lost["views"] == 3 and log.lost["messages"] >= 6
 
 
-def test_files_follow_each_other_and_the_oldest_go(tmp_path):
+def test_files_are_limited_and_the_oldest_are_deleted(tmp_path):
     most = 400_000
     log = begun(tmp_path, max_bytes=most, segment_bytes=100_000)
     for index in range(200):
@@ -308,7 +308,7 @@ def test_files_follow_each_other_and_the_oldest_go(tmp_path):
     assert last == 199
 
 
-def test_nothing_is_written_over(tmp_path):
+def test_existing_files_are_not_overwritten(tmp_path):
     for first in (0, 5):
         log = begun(tmp_path)
         log_views(log, range(first, first + 5))
@@ -318,7 +318,7 @@ def test_nothing_is_written_over(tmp_path):
     assert plain(sessions[0])[0]["run"] != plain(sessions[1])[0]["run"]
 
 
-def test_what_cannot_be_written_is_counted(tmp_path):
+def test_messages_that_cannot_be_encoded_are_counted(tmp_path):
     log = begun(tmp_path)
     log.health({"a": object()})
     log.options({"b": {1, 2}})
@@ -332,7 +332,7 @@ def test_what_cannot_be_written_is_counted(tmp_path):
     assert plain(found["/orthonav/session"])[0]["options"]["heading"] == "known"
 
 
-def test_the_camera_is_that_of_the_pictures(tmp_path):
+def test_the_camera_has_the_size_of_the_images(tmp_path):
     log = begun(tmp_path)
     log.view(0, "0.png", picture(0, (24, 32)), replace_prior(telemetry(0)))
     log.close()
@@ -340,8 +340,8 @@ def test_the_camera_is_that_of_the_pictures(tmp_path):
     assert session["camera"]["width_px"] == 32 and session["camera"]["fx_px"] == 25.25
 
 
-def replace_prior(told):
-    return Telemetry(told.time_ns, 1.0, 2.0, 3.0, 4.0, prior=Prior(1.0, 2.0, 3.0))
+def replace_prior(telemetry):
+    return Telemetry(telemetry.time_ns, 1.0, 2.0, 3.0, 4.0, prior=Prior(1.0, 2.0, 3.0))
 
 
 def test_a_folder_that_cannot_be_written(tmp_path):

@@ -1,4 +1,4 @@
-"""What goes out: messages as another decoder reads them, NMEA, lines of JSON."""
+"""Outputs: messages as an independent decoder reads them, NMEA, lines of JSON."""
 
 import json
 import math
@@ -14,6 +14,7 @@ import pytest
 from fake_autopilot import UTC_NS, S, Time, fix
 
 from orthonav.errors import VariantError
+from orthonav.flight.fixes import result_from_json
 from orthonav.onboard.outputs import (
     KINDS,
     JsonOut,
@@ -23,10 +24,9 @@ from orthonav.onboard.outputs import (
     TcpSink,
     open_sink,
 )
-from orthonav.onboard.telemetry import Told
+from orthonav.onboard.telemetry import VehicleState
 from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
 from orthonav.publish.gate import Gate, GateRules
-from orthonav.publish.jsonl import result_from_json
 from orthonav.publish.local import Autopilot, Origin, north_east_m
 from orthonav.publish.mavlink import Packer, Target
 from orthonav.publish.nmea import Quality
@@ -37,7 +37,7 @@ ORIGIN = Origin(48.0, 2.0, 100.0)
 ESTIMATE = NavigationEstimate(
     48.01, 2.01, np.eye(2) * 9.0, 0.97, utc_ns=UTC_NS, boot_ns=1, vel_en_mps=(3.0, 4.0)
 )
-TOLD = Told(np.eye(3), 100.0, "home", (4.0, 3.0, 0.1), -90.0)
+VEHICLE = VehicleState(np.eye(3), 100.0, (4.0, 3.0, 0.1), -90.0)
 
 
 class Sending:
@@ -54,7 +54,7 @@ class Sending:
         self.frames.append(decode(self.packer.pack(message)))
         return self.open
 
-    def publish(self, estimate=ESTIMATE, telemetry=TOLD, origin=ORIGIN, age_s=0.25, **more):
+    def publish(self, estimate=ESTIMATE, telemetry=VEHICLE, origin=ORIGIN, age_s=0.25, **more):
         known = {"target": Target(1, 1), "kind": Autopilot.PX4, "boot_ns": 61 * S, **more}
         exposed = self.time.now_ns - round(age_s * S)
         return self.messenger.publish(
@@ -62,7 +62,7 @@ class Sending:
         )
 
 
-def test_every_kind_of_message_says_the_place():
+def test_every_message_has_the_position():
     sending = Sending(*KINDS)
     assert sending.publish() == tuple(KINDS.values())
     read = {each["name"]: each for each in sending.frames}
@@ -87,7 +87,7 @@ def test_times_are_those_of_exposure_and_sending():
     assert boot.frames[0]["time_usec"] == 61_000_000 and boot.frames[0]["time_week"] > 2000
 
 
-def test_while_the_clock_of_the_autopilot_is_not_known_nothing_is_stamped_by_it():
+def test_no_stamp_by_an_unknown_clock_of_the_autopilot():
     boot = Sending(clock=Clock.BOOT)
     assert boot.publish(boot_ns=None) == () and boot.frames == []
     assert [*boot.messenger.not_made] and "boot" in next(iter(boot.messenger.not_made))
@@ -96,7 +96,7 @@ def test_while_the_clock_of_the_autopilot_is_not_known_nothing_is_stamped_by_it(
 def test_local_messages_wait_for_the_origin_and_the_height():
     sending = Sending("odometry", "global-position")
     assert sending.publish(origin=None) == ("GLOBAL_POSITION_SENSOR",)
-    assert sending.publish(telemetry=Told(None)) == ("GLOBAL_POSITION_SENSOR",)
+    assert sending.publish(telemetry=VehicleState(None)) == ("GLOBAL_POSITION_SENSOR",)
     assert sum(sending.messenger.not_made.values()) == 2
     assert sending.publish(kind=Autopilot.ARDUPILOT) == tuple(
         KINDS[kind] for kind in ("odometry", "global-position")
@@ -104,7 +104,7 @@ def test_local_messages_wait_for_the_origin_and_the_height():
     assert sending.frames[-2]["frame_id"] == 20  # as ArduPilot reads it
 
 
-def test_the_origin_is_told_until_it_is_known():
+def test_the_origin_is_sent_until_the_autopilot_reports_one():
     sending = Sending("vision", origin=ORIGIN)
     for _ in range(50):
         sending.messenger.send_origin(None, Target(3, 1))
@@ -117,7 +117,7 @@ def test_the_origin_is_told_until_it_is_known():
     assert len(sending.frames) == 3 and other.frames == []
 
 
-def test_a_rate_is_kept():
+def test_a_rate_limit_is_kept():
     rules = GateRules(min_interval_s={"GPS_INPUT": 0.5})
     sending = Sending("gps-input", rules=rules)
     sent = 0
@@ -127,13 +127,13 @@ def test_a_rate_is_kept():
     assert sent == 20 and sending.gate.withheld["rate:GPS_INPUT"] == 80
 
 
-def test_what_found_no_port_was_not_sent():
+def test_a_message_without_an_open_port_is_not_sent():
     sending = Sending()
     sending.open = False
     assert sending.publish() == ()
 
 
-def test_other_messages_are_refused():
+def test_unknown_messages_are_refused():
     with pytest.raises(VariantError, match="global-position"):
         MessageOptions(kinds=("telepathy",))
     with pytest.raises(EstimateError):
@@ -160,7 +160,7 @@ def test_nmea_over_udp():
     out.close()
 
 
-def test_nmea_over_tcp_to_all_who_read():
+def test_nmea_over_tcp_to_all_clients_that_read():
     sink = open_sink("tcp-listen:0")
     assert isinstance(sink, TcpSink) and sink._listening.getsockname()[0] == "127.0.0.1"
     out = NmeaOut(sink, talker="GN", quality=Quality.AUTONOMOUS)
@@ -194,7 +194,7 @@ def test_nmea_over_a_serial_port_that_is_unplugged():
 
 
 @pytest.mark.parametrize("url", ["", "udp:here", "http://x", "serial:ttyS0", "tcp-listen:x:y"])
-def test_other_sinks_are_refused(url):
+def test_invalid_urls_of_outputs_are_refused(url):
     with pytest.raises(VariantError):
         open_sink(url)
 
@@ -202,13 +202,13 @@ def test_other_sinks_are_refused(url):
 RESULT = ViewResult("000001", UTC_NS + 5, fix(), 12.5, "tracking")
 
 
-def test_lines_are_those_of_fixes(tmp_path):
+def test_lines_extend_those_of_fixes_jsonl(tmp_path):
     path = tmp_path / "lines.jsonl"
     path.write_text("an old line\n")
     out = JsonOut(path)
     out.view(RESULT, 40.25, ("GPS_INPUT",), None)
     out.health({"health": "OK", "reasons": []})
-    out.view(replace(RESULT, outcome=NoFix("frozen_picture", "again")), 1.0, (), "no_fix")
+    out.view(replace(RESULT, outcome=NoFix("frozen_image", "again")), 1.0, (), "no_fix")
     out.close()
     old, first, health, second = path.read_text().splitlines()
     assert old == "an old line"
@@ -216,7 +216,7 @@ def test_lines_are_those_of_fixes(tmp_path):
     assert (read.time_ns, read.outcome.lat_deg) == (UTC_NS + 5, 48.0)
     assert json.loads(first)["age_ms"] == 40.25 and json.loads(first)["sent"] == ["GPS_INPUT"]
     assert json.loads(health)["health"] == "OK"
-    assert result_from_json(second).outcome.reason == "frozen_picture"
+    assert result_from_json(second).outcome.reason == "frozen_image"
 
 
 def test_lines_on_stdout(capsys):
@@ -228,7 +228,7 @@ def test_lines_on_stdout(capsys):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")  # noqa: PTH110
-def test_a_full_disk_is_told_and_survived(tmp_path):
+def test_writing_continues_after_a_full_disk(tmp_path):
     path = tmp_path / "lines.jsonl"
     path.symlink_to("/dev/full")
     out = JsonOut(path)

@@ -1,4 +1,4 @@
-"""A flight goes on whatever one of its views does."""
+"""From views to results: errors of one view do not end a flight."""
 
 import math
 import shutil
@@ -36,7 +36,8 @@ def outcomes(results):
 
 def failing_at(localizer, monkeypatch, number, error):
     """Make the localizer raise `error` inside, at one view."""
-    whole, calls = localizer.match, []
+    matcher = localizer.tiles.matcher
+    whole, calls = matcher.match, []
 
     def match(*arguments, **keywords):
         calls.append(1)
@@ -44,7 +45,7 @@ def failing_at(localizer, monkeypatch, number, error):
             raise error
         return whole(*arguments, **keywords)
 
-    monkeypatch.setattr(localizer, "match", match)
+    monkeypatch.setattr(matcher, "match", match)
 
 
 @pytest.mark.parametrize(
@@ -69,7 +70,7 @@ def test_an_interrupt_ends_it(localizer, short, monkeypatch):
 
 
 @pytest.mark.parametrize("field", ["lat_deg", "lon_deg", "cov_en_m2"])
-def test_a_position_that_is_no_number_is_no_fix(localizer, short, monkeypatch, field):
+def test_a_position_that_is_not_finite_is_no_fix(localizer, short, monkeypatch, field):
     whole = Localizer.locate
 
     def located(self, *arguments, **keywords):
@@ -87,7 +88,7 @@ def test_order_time_and_latency(localizer, short):
     assert all(0 < result.latency_ms < 60_000 for result in results)
 
 
-def test_views_may_come_in_another_order_or_in_part(localizer, short):
+def test_views_can_be_reordered_or_left_out(localizer, short):
     chosen = [short.views[4], short.views[1]]
     results = list(localize_flight(SingleViews(localizer), short, views=chosen))
     assert [result.frame for result in results] == [view.frame for view in chosen]
@@ -129,7 +130,7 @@ def test_a_bad_image_is_an_error_or_skipped(localizer, copied, kind):
     assert path.name in results[2].outcome.detail and math.isnan(results[2].latency_ms)
 
 
-def test_an_image_that_vanishes_is_named(localizer, copied):
+def test_a_missing_image_is_named(localizer, copied):
     flight = open_flight(copied)
     flight.views[0].path.unlink()
     with pytest.raises(MissingFileError, match=flight.views[0].frame):

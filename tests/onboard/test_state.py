@@ -1,4 +1,4 @@
-"""What is kept over a restart."""
+"""The state that is saved for a restart."""
 
 import json
 import math
@@ -7,13 +7,13 @@ from dataclasses import replace
 import pytest
 
 from orthonav.onboard import state
-from orthonav.onboard.state import Saved, boot_id, load, prior_of, save
+from orthonav.onboard.state import SavedState, boot_id, load, prior_of, save
 
 S = 10**9
-SAVED = Saved(48.1, 2.3, 4.0, 1_700_000_000 * S, 500 * S, "run-1", 77)
+SAVED = SavedState(48.1, 2.3, 4.0, 1_700_000_000 * S, 500 * S, "run-1", 77)
 
 
-def test_what_is_saved_comes_back(tmp_path, names_in):
+def test_a_saved_state_is_loaded(tmp_path, names_in):
     path = tmp_path / "state.json"
     assert load(path) is None
     for saved in (SAVED, replace(SAVED, lat_deg=-48.123456789)):
@@ -22,7 +22,7 @@ def test_what_is_saved_comes_back(tmp_path, names_in):
     assert names_in(tmp_path) == ["state.json"]
 
 
-def test_within_a_run_of_the_computer_its_clock_may_be_set():
+def test_the_age_does_not_depend_on_utc_within_one_boot():
     assert SAVED.age_s(0, 503 * S, "run-1") == 3.0
     assert SAVED.age_s(1_700_000_010 * S, 1 * S, "run-2") == 10.0
     assert SAVED.age_s(1_700_000_010 * S, 1 * S, "") == 10.0
@@ -37,12 +37,12 @@ def test_the_prior_grows_with_time():
 
 
 @pytest.mark.parametrize("age_s", [301.0, -1.0, math.nan])
-def test_what_is_old_or_from_the_future_is_not_used(age_s):
+def test_old_or_future_states_are_not_used(age_s):
     assert prior_of(SAVED, age_s, 300.0) is None
 
 
 def test_without_a_position_there_is_no_prior():
-    assert prior_of(Saved(signing_timestamp_10us=5), 1.0, 300.0) is None
+    assert prior_of(SavedState(signing_timestamp_10us=5), 1.0, 300.0) is None
     assert prior_of(replace(SAVED, std_m=math.nan), 1.0, 300.0) is None
 
 
@@ -50,13 +50,13 @@ def test_without_a_position_there_is_no_prior():
     "text",
     ["", "{", "[]", "null", "{}", '{"version": 2}', '{"version": 1, "lat_deg": "x"}', "[" * 9999],
 )
-def test_a_damaged_file_is_none(tmp_path, text):
+def test_a_damaged_file_is_ignored(tmp_path, text):
     path = tmp_path / "state.json"
     path.write_text(text)
     assert load(path) is None
 
 
-def test_a_huge_file_is_none(tmp_path):
+def test_a_huge_file_is_ignored(tmp_path):
     path = tmp_path / "state.json"
     save(path, SAVED)
     plain = json.loads(path.read_text())
@@ -77,6 +77,6 @@ def test_a_write_that_fails_leaves_the_old_one(tmp_path, monkeypatch, names_in):
     assert load(path) == SAVED and names_in(tmp_path) == ["state.json"]
 
 
-def test_a_folder_that_is_not_there_is_an_error(tmp_path):
+def test_a_missing_folder_is_an_error(tmp_path):
     with pytest.raises(OSError):
         save(tmp_path / "nowhere" / "state.json", SAVED)

@@ -55,7 +55,7 @@ WITH_LAYER = {"registration": True, "calibration_views": 2}
 
 
 def built(ortho, folder, name="map.onav", **request):
-    """A map, without the registration layer, whose calibration takes longest, unless told."""
+    """A map; by default without the registration layer, whose calibration takes longest."""
     request = {"tile_px": 64, "overlap": 0.75, "registration": False, **request}
     orthos = ortho if isinstance(ortho, list) else [ortho]
     build_map(BuildRequest(orthos, folder / name, **request))
@@ -122,7 +122,7 @@ def test_the_recipe_is_in_the_map(ortho, tmp_path):
 def test_one_channel_is_compared_on_finer_cells(ortho, tmp_path, edges):
     chosen = built(ortho, tmp_path, edges=edges).manifest.recipe["embed"]["cells"]
     assert chosen == (8 if edges == "gradient" else 16)
-    telemetry = built(ortho, tmp_path, "told.onav", edges=edges, method="gradient:cells=4")
+    telemetry = built(ortho, tmp_path, "stated.onav", edges=edges, method="gradient:cells=4")
     assert telemetry.manifest.recipe["embed"]["cells"] == 4
 
 
@@ -367,7 +367,7 @@ def own_views(localizer, path, mirrored=False, count=30):
     return fixes, np.array(truth)
 
 
-def test_own_views_are_believed_and_mirrored_ones_not(localizer, area):
+def test_own_views_are_confident_and_mirrored_ones_are_not(localizer, area):
     fixes, truth = own_views(localizer, area.past)
     places = [localizer.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg) for fix in fixes]
     errors_m = np.abs(np.array(places) - truth).max(axis=1)
@@ -375,7 +375,7 @@ def test_own_views_are_believed_and_mirrored_ones_not(localizer, area):
     false = np.array([fix.confidence for fix in own_views(localizer, area.past, True)[0]])
     assert (errors_m <= localizer.grid.stride_m).mean() >= 0.95
     assert np.median(own) > 0.8 and np.median(false) < 0.4
-    assert (false[:, None] < own).mean() > 0.97  # nearly every pair is told apart
+    assert (false[:, None] < own).mean() > 0.97  # nearly every pair is separated
     assert np.isfinite(own).all() and own.min() >= 0 and max(own.max(), false.max()) <= 1
 
 
@@ -383,18 +383,18 @@ def test_confidence_is_a_probability_whatever_the_evidence(localizer):
     rng = np.random.default_rng(0)
     for scale in (0, 1, 1e3, 1e300):
         for values in rng.uniform(-1, 1, (20, len(FEATURES))) * scale:
-            confidence = localizer.confidence(dict(zip(FEATURES, values, strict=True)))
+            confidence = localizer.tiles.confidence(dict(zip(FEATURES, values, strict=True)))
             assert 0 <= confidence <= 1
 
 
-def test_the_error_told_is_of_the_order_of_the_grid(map_path, ortho, tmp_path, calibrated):
+def test_the_stated_error_is_of_the_order_of_the_grid(map_path, ortho, tmp_path, calibrated):
     for opened in (open_map(map_path), built(ortho, tmp_path)):
         grid = opened.manifest.sheets[0].grid
         assert grid.gsd_m <= opened.manifest.view["position_std_m"] < grid.stride_m / 2
 
 
 def test_slow_representations_are_calibrated_on_fewer_crops(ortho, tmp_path, monkeypatch):
-    """Where one takes minutes; counted by what is told of the progress."""
+    """For representations that take minutes; counted by the reported progress."""
     telemetry = {}
     for name in ("canny", "slow"):
         if name == "slow":

@@ -61,7 +61,9 @@ def localizer():
     grid = TileGrid(-half_m, half_m, 1.0, TILE_PX, 16, 12, 12)
     assert grid.width_px == grid.height_px == SIDE_PX
     sheet = SheetInfo(LocalFrame(46.5, 2.5), grid, 144, 0.06)
-    return RegistrationLocalizer(sheet, Pyramid(GREY), None, 10.0, FLOOR_PX)
+    return RegistrationLocalizer(
+        sheet, Pyramid(GREY), confidence=None, radius_m=10.0, floor_px=FLOOR_PX
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -109,7 +111,7 @@ def test_no_more_views_are_made_than_asked_for(localizer, monkeypatch):
         assert len(calls) == expected
 
 
-def test_crops_are_untouched_and_progress_is_told(localizer):
+def test_crops_are_unchanged_and_progress_is_reported(localizer):
     crops, calls = crops_of(GREY, 6), []
     kept = [crop.grey.copy() for crop in crops]
     for crop in crops:
@@ -135,7 +137,7 @@ def verdicts(localizer, confidence, crops, mirrored):
     return np.array(said), np.array(off)
 
 
-def test_views_of_the_map_are_believed_and_mirrored_ones_not(localizer, learnt):
+def test_views_of_the_map_are_confident_and_mirrored_ones_are_not(localizer, learnt):
     fresh = crops_of(GREY, 8, seed=9)
     own, off = verdicts(localizer, learnt.confidence, fresh, mirrored=False)
     false, _ = verdicts(localizer, learnt.confidence, fresh, mirrored=True)
@@ -144,7 +146,7 @@ def test_views_of_the_map_are_believed_and_mirrored_ones_not(localizer, learnt):
     assert own.min() > false.max()
 
 
-def test_views_made_of_crops_are_vertical_and_told_roughly(localizer):
+def test_views_of_crops_are_vertical_with_telemetry_errors(localizer):
     rng = np.random.default_rng(1)
     crop = crops_of(GREY, 1)[0]
     off = []
@@ -166,7 +168,7 @@ def test_views_made_of_crops_are_vertical_and_told_roughly(localizer):
         ((6, 3), FLOOR_LIMITS_PX[1]),
     ],
 )
-def test_the_floor_is_how_far_the_other_date_lies_off(localizer, moved_px, expected):
+def test_the_floor_is_the_offset_of_the_other_date(localizer, moved_px, expected):
     later = crops_of(GREY, seed=2, moved_px=moved_px)
     found = calibrated(localizer, crops_of(GREY, 2), later)
     assert found.floor_px == pytest.approx(expected, rel=0.06)
@@ -177,7 +179,7 @@ def test_a_few_views_of_another_date_say_nothing(localizer):
     assert calibrated(localizer, crops_of(GREY, 2), later).floor_px == FLOOR_PX
 
 
-def test_another_place_is_no_other_date(localizer):
+def test_another_place_does_not_count_as_another_date(localizer):
     """What is not found at its place is wrong, not badly registered."""
     later = crops_of(textured((SIDE_PX, SIDE_PX), 7), seed=2)
     assert calibrated(localizer, crops_of(GREY, 2), later).floor_px == FLOOR_PX
@@ -211,7 +213,7 @@ def small(make_ortho, tmp_path, monkeypatch):
     return build
 
 
-def test_a_second_date_tells_the_floor_of_a_map(small):
+def test_a_second_date_sets_the_floor_of_a_map(small):
     """The other picture is the same ground, three pixels to the west and one to the south."""
     grey = small.grey
     plain = small(grey[20:220, 20:220], grey[19:219, 23:223])
@@ -219,14 +221,14 @@ def test_a_second_date_tells_the_floor_of_a_map(small):
     assert plain["confidence"] is not None and plain["radius_m"] > 0
 
 
-def test_a_uniform_map_has_no_confidence_and_says_so(small, caplog):
+def test_a_uniform_map_has_no_confidence_and_a_warning(small, caplog):
     with caplog.at_level(logging.WARNING):
         plain = small(np.full((200, 200), 99, np.uint8))
     assert plain["confidence"] is None and plain["position_floor_px"] == FLOOR_PX
     assert "too little imagery to calibrate registration" in caplog.text
 
 
-def test_a_second_date_that_shows_nothing_is_told(small, caplog):
+def test_a_second_date_without_texture_gives_a_warning(small, caplog):
     with caplog.at_level(logging.WARNING):
         plain = small(small.grey[20:220, 20:220], np.full((200, 200), 99, np.uint8))
     assert plain["position_floor_px"] == FLOOR_PX

@@ -93,7 +93,7 @@ def test_windows_may_reach_beyond_the_sheet(cells):
         assert means.shape == (*outside[2:], 7) and not means.any() and not share.any()
 
 
-def test_shares_are_kept_only_where_something_is_missing(cells):
+def test_shares_are_stored_only_for_incomplete_cells(cells):
     assert set(cell_parts(cells)) == {f"sheet0/cells/{n}" for n in ("codes", "scale", "valid")}
     whole = CellSheet(LAYOUT, GRID.height_px, GRID.width_px, 7)
     whole.valid[:] = 1
@@ -103,7 +103,7 @@ def test_shares_are_kept_only_where_something_is_missing(cells):
     assert (share == 1).all() and not means.any()
 
 
-def test_one_channel_is_kept_as_well():
+def test_one_channel_is_stored_as_well():
     grey = CellSheet(LAYOUT, GRID.height_px, GRID.width_px, 1)
     grey.means[:] = np.random.default_rng(0).random(grey.means.shape)
     grey.valid[:] = 1

@@ -49,7 +49,7 @@ def built(area, tmp_path_factory):
 def test_a_map_of_any_method_flies(built, flight_path, method):
     path = built(method)
     localizer = Localizer(open_map(path), registration=False)
-    assert isinstance(localizer.embedder, METHODS[method])
+    assert isinstance(localizer.tiles.embedder, METHODS[method])
     recipe = open_map(path).manifest.recipe
     assert recipe["method"] == method.partition(":")[0]
     assert recipe["represent"]["name"] == usual_edges(method)
@@ -62,7 +62,7 @@ def test_a_map_of_any_method_flies(built, flight_path, method):
 def test_its_own_tiles_are_found(built):
     """What was embedded at building is what is embedded in flight."""
     localizer = Localizer(open_map(built("bovw:words=256")), registration=False)
-    stored = localizer.index.scores(np.eye(256, dtype=np.float32))
+    stored = localizer.tiles.matcher.index.scores(np.eye(256, dtype=np.float32))
     assert stored.shape == (localizer.sheet.tiles, 256)
     total = stored.sum(axis=1)
     # Frequencies; a tile of bare ground may have no feature at all.
@@ -84,7 +84,7 @@ def test_registration_works_on_maps_of_other_methods(built, flight_path, method)
     assert np.median(errors) < 15
 
 
-def test_an_interrupted_learning_goes_on(area, tmp_path):
+def test_interrupted_training_resumes(area, tmp_path):
     class Killed(Exception):
         pass
 
@@ -146,7 +146,7 @@ def test_the_same_request_gives_the_same_embeddings(area, tmp_path):
     assert parts[0] == parts[1]
 
 
-def test_a_map_says_nothing_of_the_machine_that_made_it(monkeypatch):
+def test_a_map_does_not_name_the_machine_that_built_it(monkeypatch):
     monkeypatch.setenv("ORTHONAV_SAM_WEIGHTS", "")
     made = make_variant(TABLE, "sam:weights=/home/somebody/sam,cache=/home/somebody/kept,grid=16")
     stored = stored_representation(made)

@@ -27,8 +27,8 @@ NAMES = part_names(0)
 
 
 @pytest.fixture(autouse=True)
-def fewer_crops(map_path, monkeypatch):
-    """Calibration from few crops, but for the map that all tests share."""
+def fewer_crops(monkeypatch):
+    """Calibration from few crops."""
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 16)
 
 
@@ -238,7 +238,7 @@ def test_a_map_carries_its_imagery(ortho, tmp_path, monkeypatch, block_px):
     assert max(layer.shape(layer.levels - 1)) <= 64
 
 
-def test_levels_show_the_same_place(ortho, tmp_path):
+def test_levels_are_aligned(ortho, tmp_path):
     layer = GreyLayer.of(built(ortho, tmp_path))
     grey, valid = layer.read(0, 0, 0, *layer.shape(0))
     for level in range(1, layer.levels):
@@ -277,7 +277,7 @@ def test_without_a_layer(ortho, tmp_path):
         np.testing.assert_array_equal(part, with_it.arrays[name])
 
 
-def test_info_tells_of_the_layer(ortho, tmp_path, capsys):
+def test_info_describes_the_layer(ortho, tmp_path, capsys):
     opened = built(ortho, tmp_path)
     grey = opened.manifest.sheets[0].grey
     assert main(["info", str(opened.path), "--json"]) == 0

@@ -1,4 +1,4 @@
-"""What autopilots are told: the record, its accuracy, its clocks, GPS time."""
+"""Estimates: accuracy, clocks, GPS time."""
 
 import math
 from dataclasses import replace
@@ -51,7 +51,7 @@ def test_without_a_fix_there_is_no_estimate() -> None:
 @pytest.mark.parametrize(
     "evidence", [{}, {"vel_east_mps": 1.0}, {**VELOCITY, "vel_east_mps": math.nan}]
 )
-def test_half_a_velocity_is_none(evidence: dict[str, float]) -> None:
+def test_an_incomplete_velocity_is_unknown(evidence: dict[str, float]) -> None:
     made = estimate_from_result(a_result("tracking", **evidence))
     assert made is not None and made.vel_en_mps is None
 
@@ -61,7 +61,7 @@ def test_a_single_view_has_no_velocity() -> None:
     assert made is not None and made.vel_en_mps is None
 
 
-def test_clocks_are_kept_apart() -> None:
+def test_times_of_both_clocks_are_separate() -> None:
     utc = estimate_from_result(a_result())
     boot = estimate_from_result(a_result(), clock=Clock.BOOT, utc_minus_boot_ns=10**18)
     assert utc is not None and boot is not None
@@ -74,9 +74,9 @@ def test_clocks_are_kept_apart() -> None:
 
 def test_an_unknown_latency_is_no_processing_time() -> None:
     made = estimate_from_result(replace(a_result(), latency_ms=math.nan))
-    told = estimate_from_result(a_result(), processing_s=0.25)
+    estimate = estimate_from_result(a_result(), processing_s=0.25)
     assert made is not None and made.processing_s == 0.0
-    assert told is not None and told.processing_s == 0.25
+    assert estimate is not None and estimate.processing_s == 0.25
 
 
 angles = st.floats(0, math.pi)
@@ -100,14 +100,14 @@ def test_a_long_axis_to_the_north_east_points_there() -> None:
 
 
 @pytest.mark.parametrize("cov", [[[1, 0], [0, math.nan]], [[1, 2], [2, 1]], [[-1, 0], [0, -1]]])
-def test_what_is_no_covariance_has_no_accuracy(cov: list[list[float]]) -> None:
+def test_an_invalid_covariance_has_no_standard_deviation(cov: list[list[float]]) -> None:
     estimate = replace(PLAIN, cov_en_m2=np.array(cov))
     assert all(map(math.isnan, error_ellipse(estimate.cov_en_m2)))
     assert math.isnan(estimate.horizontal_std_m(3.0))
     assert not estimate.is_confident()
 
 
-def test_the_accuracy_is_that_of_the_worst_direction_and_not_below_the_least() -> None:
+def test_the_standard_deviation_is_that_of_the_worst_direction_and_at_least_the_minimum() -> None:
     values = np.linalg.eigvalsh(COV)
     assert PLAIN.horizontal_std_m() == pytest.approx(math.sqrt(values[1]))
     assert PLAIN.horizontal_std_m() >= math.sqrt(COV.diagonal().max())
@@ -115,7 +115,7 @@ def test_the_accuracy_is_that_of_the_worst_direction_and_not_below_the_least() -
 
 
 @pytest.mark.parametrize(
-    ("confidence", "state", "sure"),
+    ("confidence", "state", "confident"),
     [
         (0.9, None, True),
         (0.899, None, False),
@@ -125,8 +125,10 @@ def test_the_accuracy_is_that_of_the_worst_direction_and_not_below_the_least() -
         (0.99, "lost", False),
     ],
 )
-def test_sure_is_confident_and_tracking(confidence: float, state: str | None, sure: bool) -> None:
-    assert replace(PLAIN, confidence=confidence, state=state).is_confident() is sure
+def test_a_confident_estimate_is_of_high_confidence_and_tracking(
+    confidence: float, state: str | None, confident: bool
+) -> None:
+    assert replace(PLAIN, confidence=confidence, state=state).is_confident() is confident
 
 
 @pytest.mark.parametrize(
@@ -144,7 +146,7 @@ def test_sure_is_confident_and_tracking(confidence: float, state: str | None, su
         ({"utc_ns": None}, "time of exposure"),
     ],
 )
-def test_what_cannot_be_is_named(change: dict[str, object], said: str) -> None:
+def test_an_invalid_value_is_named(change: dict[str, object], said: str) -> None:
     with pytest.raises(EstimateError, match=said):
         replace(PLAIN, **change)
 

@@ -1,4 +1,4 @@
-"""What may go out: nothing unsure, old or too often, with counts; and when the position jumped."""
+"""The gate: confidence, age and rate of positions, counts of reasons, and jumps."""
 
 import math
 from dataclasses import replace
@@ -42,14 +42,14 @@ def now(seconds: float) -> int:
         ("from_the_future", {}, -0.11),
     ],
 )
-def test_what_must_not_go_out_is_withheld_and_counted(reason, change, later_s) -> None:
+def test_positions_in_doubt_are_withheld_and_counted(reason, change, later_s) -> None:
     gate = Gate()
     assert gate.admit(estimate_at(0.0, **change), now(later_s)) is None
     assert gate.withheld == {reason: 1}
 
 
 @pytest.mark.parametrize("state", [None, "tracking"])
-def test_what_is_sure_and_fresh_passes(state: str | None) -> None:
+def test_a_confident_and_recent_position_passes(state: str | None) -> None:
     gate = Gate()
     passed = gate.admit(estimate_at(0.0, state=state), now(0.9))
     assert passed is not None and passed.reset_counter == 0
@@ -62,7 +62,7 @@ def test_no_fix_is_counted() -> None:
     assert gate.withheld == {"no_fix": 1}
 
 
-def test_the_user_sets_the_least_confidence() -> None:
+def test_min_confidence_can_be_set() -> None:
     strict, lax = Gate(GateRules(min_confidence=0.99)), Gate(GateRules(min_confidence=0.5))
     assert strict.admit(estimate_at(0.0), now(0)) is None
     assert lax.admit(estimate_at(0.0, confidence=0.5), now(0)) is not None
@@ -76,7 +76,7 @@ def test_views_out_of_order_are_withheld() -> None:
     assert gate.withheld == {"out_of_order": 2}
 
 
-def test_a_clock_that_is_set_back_does_not_silence_for_ever() -> None:
+def test_positions_pass_again_after_a_clock_was_set_back() -> None:
     gate = Gate()
     gate.admit(estimate_at(3600.0), now(3600.0))
     passed = gate.admit(estimate_at(0.0), now(0.1))
@@ -100,7 +100,7 @@ def test_a_track_found_again_is_a_reset() -> None:
     assert again is not None and again.reset_counter == 2 == gate.resets
 
 
-def test_doubt_alone_is_no_reset() -> None:
+def test_low_confidence_alone_is_no_reset() -> None:
     gate = Gate()
     for second, confidence in enumerate([0.95, 0.5, 0.95]):
         passed = gate.admit(
@@ -110,7 +110,7 @@ def test_doubt_alone_is_no_reset() -> None:
 
 
 @pytest.mark.parametrize(("jump_m", "resets"), [(20.0, 0), (90.0, 1)])
-def test_a_jump_beyond_what_flight_allows_is_a_reset(jump_m: float, resets: int) -> None:
+def test_a_jump_beyond_the_possible_motion_is_a_reset(jump_m: float, resets: int) -> None:
     """60 m/s for a second and five times 2.8 m are 74 m."""
     gate = Gate()
     gate.admit(estimate_at(0.0), now(0))
@@ -119,7 +119,7 @@ def test_a_jump_beyond_what_flight_allows_is_a_reset(jump_m: float, resets: int)
 
 
 @pytest.mark.parametrize(("jump_m", "resets"), [(0.0, 0), (15.0, 0), (30.0, 1)])
-def test_a_known_velocity_leaves_less_room(jump_m: float, resets: int) -> None:
+def test_a_known_velocity_makes_the_limit_smaller(jump_m: float, resets: int) -> None:
     """30 m/s foretell 30 m; 5 m of acceleration and five times 3 m are 20 m more."""
     gate = Gate()
     moving = {"vel_en_mps": (30.0, 0.0), "state": "tracking"}
@@ -128,7 +128,7 @@ def test_a_known_velocity_leaves_less_room(jump_m: float, resets: int) -> None:
     assert passed is not None and passed.reset_counter == resets
 
 
-def test_noise_as_told_is_no_reset() -> None:
+def test_noise_within_the_covariance_is_no_reset() -> None:
     rng = np.random.default_rng(3)
     cov = np.array([[25.0, 12.0], [12.0, 16.0]])
     gate = Gate()
@@ -139,7 +139,7 @@ def test_noise_as_told_is_no_reset() -> None:
     assert gate.resets == 0
 
 
-def test_the_counter_begins_again_after_255() -> None:
+def test_the_reset_counter_wraps_after_255() -> None:
     gate = Gate()
     for second in range(300):
         passed = gate.admit(estimate_at(second, east_m=500.0 * (second % 2)), now(second))
@@ -156,7 +156,7 @@ def test_poles_and_the_antimeridian_are_no_jump(place: tuple[float, float]) -> N
     assert passed is not None and passed.reset_counter == 0
 
 
-def test_messages_come_no_more_often_than_asked() -> None:
+def test_the_rate_of_messages_is_limited() -> None:
     gate = Gate(GateRules(min_interval_s={"A": 1.0}))
     sent = [gate.due("A", now(0.25 * step)) for step in range(17)]
     assert [step for step, out in enumerate(sent) if out] == [0, 4, 8, 12, 16]
@@ -164,7 +164,7 @@ def test_messages_come_no_more_often_than_asked() -> None:
     assert all(gate.due("B", now(0.0)) for _ in range(3))
 
 
-def test_views_that_come_a_little_unevenly_all_pass() -> None:
+def test_views_with_a_small_jitter_all_pass() -> None:
     rng = np.random.default_rng(1)
     gate = Gate(GateRules(min_interval_s={"A": 0.2}))
     times = 0.2 * np.arange(500) + rng.uniform(-0.004, 0.004, 500)
@@ -172,7 +172,7 @@ def test_views_that_come_a_little_unevenly_all_pass() -> None:
 
 
 @given(st.lists(st.integers(0, 3 * SECOND), min_size=1, max_size=60), st.integers(1, 20))
-def test_over_a_long_time_the_rate_is_kept(steps_ns: list[int], tenths: int) -> None:
+def test_the_long_term_rate_is_kept(steps_ns: list[int], tenths: int) -> None:
     gate = Gate(GateRules(min_interval_s={"A": tenths / 10}))
     times = np.cumsum(steps_ns).tolist()
     sent = [time_ns for time_ns in times if gate.due("A", START_NS + time_ns)]
@@ -181,7 +181,7 @@ def test_over_a_long_time_the_rate_is_kept(steps_ns: list[int], tenths: int) -> 
     assert (len(sent) - 1) * tenths / 10 <= span_s + 0.1 * tenths / 10 + 1e-6
 
 
-def test_a_rate_survives_a_clock_that_is_set_back() -> None:
+def test_the_rate_limit_works_after_a_clock_was_set_back() -> None:
     gate = Gate(GateRules(min_interval_s={"A": 1.0}))
     assert gate.due("A", now(1000.0))
     assert gate.due("A", now(0.0))
@@ -198,6 +198,6 @@ def test_a_rate_survives_a_clock_that_is_set_back() -> None:
         {"jump_sigmas": -1.0},
     ],
 )
-def test_impossible_rules_are_refused(rules: dict) -> None:
+def test_invalid_rules_are_refused(rules: dict) -> None:
     with pytest.raises(EstimateError):
         GateRules(**rules)

@@ -1,4 +1,4 @@
-"""MAVLink messages: as recorded here, and as a decoder reads them that is not pymavlink's.
+"""MAVLink messages: as recorded here, and as a decoder other than pymavlink reads them.
 
 The decoder is that of `wire`.
 """
@@ -64,7 +64,7 @@ POSE = LocalPose(
     vel_down_mps=0.1,
     vel_down_std_mps=0.2,
 )
-UNSURE = [
+LOW_CONFIDENCE = [
     replace(ESTIMATE, confidence=0.89),
     replace(ESTIMATE, confidence=math.nan),
     replace(ESTIMATE, state="lost"),
@@ -126,18 +126,18 @@ MADE = {
 
 
 @pytest.mark.parametrize("name", MADE)
-def test_frames_stay_as_they_are(name: str) -> None:
+def test_frames_equal_recorded_ones(name: str) -> None:
     assert Packer().pack(MADE[name]()).hex() == "".join(GOLDEN[name].split())
 
 
 @pytest.mark.parametrize("name", MADE)
-def test_every_frame_is_sound_for_another_decoder(name: str) -> None:
+def test_an_independent_decoder_reads_every_frame(name: str) -> None:
     message = MADE[name]()
     read = sent(message, sequence=255)
     assert (read["sequence"], read["from"], read["signed"]) == (255, (1, 197), 0)
     for field in message.get_fieldnames():
-        told, found = np.float32(getattr(message, field)), np.float32(read[field])
-        np.testing.assert_array_equal(told, found, err_msg=field)
+        expected, found = np.float32(getattr(message, field)), np.float32(read[field])
+        np.testing.assert_array_equal(expected, found, err_msg=field)
 
 
 def test_the_definitions_have_not_changed() -> None:
@@ -149,7 +149,7 @@ def test_the_definitions_have_not_changed() -> None:
         assert known.unpacker.size == sum(SIZES[kind] * (count or 1) for kind, _, count in fields)
 
 
-def test_a_global_position_says_what_is_known() -> None:
+def test_a_global_position_has_all_known_values() -> None:
     read = sent(global_position_sensor(ESTIMATE, sensor_id=4, target=Target(9, 1)))
     assert (read["target_system"], read["target_component"], read["id"]) == (9, 1, 4)
     assert (read["lat"], read["lon"]) == (481234567, -43210987)
@@ -162,8 +162,8 @@ def test_a_global_position_says_what_is_known() -> None:
     assert high["time_usec"] == 61_580_000
 
 
-@pytest.mark.parametrize("estimate", UNSURE)
-def test_an_unsure_global_position_is_none(estimate: NavigationEstimate) -> None:
+@pytest.mark.parametrize("estimate", LOW_CONFIDENCE)
+def test_a_global_position_of_low_confidence_has_no_position(estimate: NavigationEstimate) -> None:
     """PX4 reads no flag, but takes nothing whose `eph` is not above 0."""
     read = sent(global_position_sensor(estimate))
     assert read["flags"] == 1
@@ -183,7 +183,7 @@ def test_a_gps_input_marks_what_is_not_known() -> None:
     assert (read["time_week"], read["time_week_ms"]) == (2435, (4 * 86400 + 1600 + 18) * 1000 + 123)
 
 
-def test_a_gps_input_tells_what_is_known() -> None:
+def test_a_gps_input_has_all_known_values() -> None:
     estimate = replace(WITH_ALTITUDE, vel_cov_en=np.diag([0.04, 0.09]))
     read = sent(gps_input(estimate, satellites=10, hdop_m=2.0, send_yaw=True))
     assert read["ignore_flags"] == 4 | 16
@@ -194,8 +194,8 @@ def test_a_gps_input_tells_what_is_known() -> None:
     assert sent(gps_input(replace(estimate, vel_en_mps=None)))["ignore_flags"] & 8
 
 
-@pytest.mark.parametrize("estimate", UNSURE)
-def test_an_unsure_gps_input_is_no_fix(estimate: NavigationEstimate) -> None:
+@pytest.mark.parametrize("estimate", LOW_CONFIDENCE)
+def test_a_gps_input_of_low_confidence_is_no_fix(estimate: NavigationEstimate) -> None:
     read = sent(gps_input(estimate, send_yaw=True, hdop_m=1.0))
     assert (read["fix_type"], read["ignore_flags"]) == (1, 255)
     assert [read[field] for field in ("lat", "lon", "alt", "vn", "ve", "yaw")] == [0] * 6
@@ -206,7 +206,7 @@ def test_an_unsure_gps_input_is_no_fix(estimate: NavigationEstimate) -> None:
     ("heading", "yaw"),
     [(0.0, 36000), (359.999, 36000), (90.0, 9000), (-90.0, 27000), (math.nan, 0)],
 )
-def test_north_is_told_apart_from_no_yaw(heading: float, yaw: int) -> None:
+def test_north_differs_from_an_unknown_yaw(heading: float, yaw: int) -> None:
     assert sent(gps_input(replace(ESTIMATE, heading_deg=heading), send_yaw=True))["yaw"] == yaw
 
 
@@ -226,14 +226,16 @@ def test_a_single_fix_is_a_command() -> None:
     assert wrapped["param1"] == pytest.approx(0.02, abs=1e-5)
 
 
-@pytest.mark.parametrize("estimate", UNSURE)
-def test_messages_that_cannot_say_unsure_are_not_made(estimate: NavigationEstimate) -> None:
+@pytest.mark.parametrize("estimate", LOW_CONFIDENCE)
+def test_messages_that_cannot_mark_low_confidence_are_not_made(
+    estimate: NavigationEstimate,
+) -> None:
     for make in (
         lambda: external_position_estimate(estimate),
         lambda: odometry(estimate, POSE, Autopilot.PX4),
         lambda: vision_position_estimate(estimate, POSE, Autopilot.PX4),
     ):
-        with pytest.raises(EstimateError, match="no way to say"):
+        with pytest.raises(EstimateError, match="cannot mark"):
             make()
 
 
@@ -272,14 +274,14 @@ def test_odometry_for_ardupilot_has_its_velocity_in_the_body() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-def test_odometry_leaves_out_what_is_not_known_for_px4_only() -> None:
+def test_unknown_values_of_odometry_are_nan_for_px4_only() -> None:
     bare = LocalPose(POSE.origin, down_m=-120.0, down_std_m=2.0)
     read = sent(odometry(ESTIMATE, bare, Autopilot.PX4))
     assert all(map(math.isnan, read["q"])) and math.isnan(read["vz"])
     assert not math.isnan(read["pose_covariance"][11])
-    with pytest.raises(EstimateError, match="ArduPilot reads attitude and velocity"):
+    with pytest.raises(EstimateError, match="needs attitude and velocity"):
         odometry(ESTIMATE, bare, Autopilot.ARDUPILOT)
-    with pytest.raises(EstimateError, match="ArduPilot reads attitude and velocity"):
+    with pytest.raises(EstimateError, match="needs attitude and velocity"):
         odometry(replace(ESTIMATE, vel_en_mps=None), POSE, Autopilot.ARDUPILOT)
 
 
@@ -291,7 +293,7 @@ def test_local_messages_need_a_height_and_a_position_estimate_its_attitude() -> 
         vision_position_estimate(ESTIMATE, no_attitude, Autopilot.PX4)
 
 
-def test_the_altitude_of_the_estimate_goes_before_that_of_the_pose() -> None:
+def test_the_altitude_of_the_estimate_precedes_that_of_the_pose() -> None:
     read = sent(vision_position_estimate(WITH_ALTITUDE, POSE, Autopilot.ARDUPILOT, min_std_m=50.0))
     assert (read["z"], read["covariance"][11]) == (90.0 - 134.5, 6.25)
     assert read["covariance"][:2] == pytest.approx((2500.0, 0.0), abs=1e-3)
@@ -314,7 +316,7 @@ places = st.tuples(st.floats(-90, 90), st.floats(-180, 180)) | st.sampled_from(
 
 
 @given(places)
-def test_any_place_comes_back_within_a_centimetre(place: tuple[float, float]) -> None:
+def test_any_position_round_trips_within_a_centimetre(place: tuple[float, float]) -> None:
     estimate = replace(ESTIMATE, lat_deg=place[0], lon_deg=place[1])
     reads = [sent(global_position_sensor(estimate)), sent(gps_input(estimate))]
     command = sent(external_position_estimate(estimate))
@@ -328,7 +330,7 @@ spans = st.floats(-1e15, 1e15)
 
 
 @given(anything, anything, anything, anything, spans, st.integers(-(2**80), 2**80))
-def test_nothing_wraps_round(alt, alt_std, east, north, processing_s, utc_ns) -> None:
+def test_values_are_clamped_not_wrapped(alt, alt_std, east, north, processing_s, utc_ns) -> None:
     estimate = replace(
         ESTIMATE,
         alt_amsl_m=alt,
@@ -372,7 +374,7 @@ def px4_place(origin: Origin, north_m: float, east_m: float) -> tuple[float, flo
 
 
 @given(st.floats(-80, 80), st.floats(-180, 180), st.floats(-20_000, 20_000), st.floats(-2e4, 2e4))
-def test_px4_comes_back_to_the_fix(lat: float, lon: float, north: float, east: float) -> None:
+def test_px4_converts_back_to_the_fix(lat: float, lon: float, north: float, east: float) -> None:
     origin = Origin(lat, lon, 0.0)
     place = px4_place(origin, north, east)
     found = north_east_m(origin, *place, Autopilot.PX4)
@@ -380,7 +382,9 @@ def test_px4_comes_back_to_the_fix(lat: float, lon: float, north: float, east: f
 
 
 @given(st.floats(-80, 80), st.floats(-180, 180), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
-def test_ardupilot_counts_degrees(lat: float, lon: float, up: float, right: float) -> None:
+def test_ardupilot_converts_degrees_by_a_constant(
+    lat: float, lon: float, up: float, right: float
+) -> None:
     there = (lon + right + 180) % 360 - 180
     north, east = north_east_m(Origin(lat, lon, 0), lat + up, there, Autopilot.ARDUPILOT)
     per_degree = 1e7 * 0.011131884502145034
@@ -392,7 +396,7 @@ def test_ardupilot_counts_degrees(lat: float, lon: float, up: float, right: floa
 @pytest.mark.parametrize(
     ("autopilot", "miss_m"), [(Autopilot.PX4, 29.7), (Autopilot.ARDUPILOT, 20.5)]
 )
-def test_metres_of_the_ellipsoid_would_come_back_elsewhere(
+def test_ellipsoidal_metres_would_be_converted_to_another_position(
     autopilot: Autopilot, miss_m: float
 ) -> None:
     """What true metres miss by, ten kilometres off in Brittany, in an autopilot's formula."""
@@ -426,7 +430,7 @@ def test_a_wrong_signing_is_refused(wrong: dict) -> None:
         replace(SIGNING, **wrong)
 
 
-def test_numbers_count_on_and_begin_again() -> None:
+def test_sequence_numbers_wrap() -> None:
     packer = Packer(system_id=42, component_id=191, sequence=254)
     reads = [decode(packer.pack(global_position_sensor(ESTIMATE))) for _ in range(4)]
     assert [read["sequence"] for read in reads] == [254, 255, 0, 1]
@@ -443,7 +447,7 @@ def test_numbers_count_on_and_begin_again() -> None:
         lambda: gps_input(replace(ESTIMATE, utc_ns=None)),
     ],
 )
-def test_what_cannot_be_said_is_refused(make) -> None:
+def test_invalid_fields_are_refused(make) -> None:
     with pytest.raises(EstimateError):
         make()
 
@@ -456,7 +460,7 @@ def test_without_pymavlink_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -
 
 def test_localizing_does_not_load_pymavlink() -> None:
     script = (
-        "import sys, orthonav.cli, orthonav.onboard.run, orthonav.publish.jsonl, "
+        "import sys, orthonav.cli, orthonav.onboard.run, orthonav.flight.fixes, "
         "orthonav.publish.gate, orthonav.publish.mavlink_local, orthonav.publish.nmea\n"
         "assert not [name for name in sys.modules if name.startswith('pymavlink')]"
     )

@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.publish.estimate import EstimateError, NavigationEstimate
-from orthonav.publish.nmea import MAX_LENGTH, MPS_PER_KNOT, Quality, checksum, gga, gst, rmc
+from orthonav.publish.nmea import MPS_PER_KNOT, Quality, checksum, gga, gst, rmc
 
+MAX_LENGTH = 82  # characters of a sentence with `$` and the line end, NMEA 0183
 UTC_NS = 1_789_000_000_123_456_789  # 2026-09-10 00:26:40
 ESTIMATE = NavigationEstimate(
     48.1234567,
@@ -25,7 +26,7 @@ ESTIMATE = NavigationEstimate(
     vel_en_mps=(12.0, -3.5),
     state="tracking",
 )
-UNSURE = [
+LOW_CONFIDENCE = [
     None,
     replace(ESTIMATE, confidence=0.89),
     replace(ESTIMATE, confidence=math.nan),
@@ -65,7 +66,7 @@ def read(sentence: bytes) -> pynmeagps.NMEAMessage:
         (gst(None), b"$GPGST,,,,,,,,*57\r\n"),
     ],
 )
-def test_sentences_stay_as_they_are(made: bytes, golden: bytes) -> None:
+def test_sentences_equal_recorded_ones(made: bytes, golden: bytes) -> None:
     assert made == golden
 
 
@@ -90,9 +91,11 @@ def test_pynmeagps_reads_every_field() -> None:
     assert (errors.stdLat, errors.stdLong, errors.stdAlt) == (3.0, 4.0, 2.5)
 
 
-@pytest.mark.parametrize("estimate", UNSURE)
+@pytest.mark.parametrize("estimate", LOW_CONFIDENCE)
 @pytest.mark.parametrize("quality", list(Quality))
-def test_what_is_not_sure_says_so(estimate: NavigationEstimate | None, quality: Quality) -> None:
+def test_low_confidence_is_marked_and_has_no_position(
+    estimate: NavigationEstimate | None, quality: Quality
+) -> None:
     fix, minimum = read(gga(estimate, quality=quality)), read(rmc(estimate, quality=quality))
     errors = read(gst(estimate))
     assert fix.quality == 0
@@ -108,7 +111,7 @@ longitudes = st.floats(-180, 180) | st.sampled_from([180.0, -180.0, 179.99999999
 
 
 @given(latitudes, longitudes)
-def test_any_place_comes_back_within_two_centimetres(lat_deg: float, lon_deg: float) -> None:
+def test_any_position_round_trips_within_two_centimetres(lat_deg: float, lon_deg: float) -> None:
     estimate = replace(ESTIMATE, lat_deg=lat_deg, lon_deg=lon_deg)
     for sentence in (gga(estimate), rmc(estimate)):
         message = read(sentence)
@@ -122,7 +125,7 @@ numbers = st.floats() | st.sampled_from([1e9, -1e9, 1e300, math.nan, math.inf])
 
 
 @given(numbers, numbers, numbers, numbers, st.integers(-(2**70), 2**70))
-def test_nothing_is_too_large_for_a_sentence(
+def test_values_are_limited_to_their_fields(
     altitude: float, deviation: float, east: float, north: float, utc_ns: int
 ) -> None:
     estimate = replace(
@@ -141,7 +144,7 @@ def test_nothing_is_too_large_for_a_sentence(
     assert minimum.cog == "" or 0 <= minimum.cog < 360
 
 
-def test_a_time_that_is_not_known_is_left_out() -> None:
+def test_an_unknown_time_is_an_empty_field() -> None:
     at_boot = replace(ESTIMATE, utc_ns=None, boot_ns=61 * 10**9)
     assert rmc(at_boot).startswith(b"$GPRMC,,V,4807.40740,N")
     assert read(gga(at_boot)).time == ""
@@ -164,7 +167,7 @@ def test_an_unknown_velocity_has_no_speed_and_a_still_one_no_course() -> None:
 
 
 @pytest.mark.parametrize("hdop_m", [0.0, -1.0, math.nan])
-def test_a_dilution_needs_metres(hdop_m: float) -> None:
+def test_hdop_m_must_be_positive(hdop_m: float) -> None:
     with pytest.raises(EstimateError, match="hdop_m"):
         gga(ESTIMATE, hdop_m=hdop_m)
 

@@ -1,9 +1,12 @@
-"""Pieces of report pages, drawings in both forms, and figures as files."""
+"""Report pages, drawings as PNG and SVG, and figures as files."""
 
+import base64
 import errno
 import hashlib
+import re
 import subprocess
 import sys
+from html import unescape
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -16,22 +19,17 @@ from orthonav.report import (
     Background,
     Drawing,
     Figure,
-    cards,
-    definitions,
-    document,
     draw_axes,
     draw_map,
-    figure_html,
     file_names,
-    html_table,
     map_size_in,
     measure_text,
-    notes,
-    pictures,
+    render,
     write_figures,
     write_page,
 )
 from orthonav.report.figures import LIST
+from orthonav.report.page import joined_scripts
 
 
 def figure(name: str, content: str = "a") -> Figure:
@@ -49,7 +47,7 @@ def drawn_map() -> Drawing:
 
     def draw(axes) -> None:
         draw_map(axes, box, background)
-        axes.plot([100, 800], [100, 500], label="way < 1 & more")
+        axes.plot([100, 800], [100, 500], label="path < 1 & more")
         axes.legend()
 
     return draw_axes(map_size_in(box, 4.0), draw)
@@ -65,10 +63,10 @@ def test_a_drawing_has_both_forms_and_its_text_is_text() -> None:
     assert image.shape == (880, 1100, 3)
     found = ElementTree.fromstring(drawing.svg).iter("{http://www.w3.org/2000/svg}text")
     texts = ["".join(each.itertext()) for each in found]
-    assert {"N", "100 m", "east (m)", "way < 1 & more"} <= set(texts)
+    assert {"N", "100 m", "east (m)", "path < 1 & more"} <= set(texts)
 
 
-def test_drawings_are_alike_in_every_process() -> None:
+def test_drawings_are_reproducible() -> None:
     code = (
         "import hashlib, sys; sys.path.insert(0, sys.argv[1]); import test_report_pieces as tests;"
         "d = tests.drawn_map(); print(hashlib.sha256(d.png + d.svg.encode()).hexdigest())"
@@ -93,12 +91,12 @@ def test_a_drawing_of_very_many_points_stays_small() -> None:
     assert len(drawing.svg) < 400_000 and "<image" in drawing.svg
 
 
-def test_texts_that_xml_does_not_know_do_no_harm() -> None:
+def test_characters_that_xml_forbids_are_replaced() -> None:
     drawing = draw_axes((3.0, 2.0), lambda axes: axes.set_title("a\x01b 日本", parse_math=False))
     assert "日本" in "".join(ElementTree.fromstring(drawing.svg).itertext())
 
 
-def test_without_matplotlib_the_remedy_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_matplotlib_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(MissingExtraError, match=r"pip install 'orthonav\[report\]'"):
@@ -106,7 +104,10 @@ def test_without_matplotlib_the_remedy_is_said(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_importing_does_not_import_matplotlib() -> None:
-    code = "import sys, orthonav.report; assert not {'matplotlib', 'PIL', 'cv2'} & set(sys.modules)"
+    code = (
+        "import sys, orthonav.report; unwanted = {'matplotlib', 'jinja2', 'PIL', 'cv2'}; "
+        "assert not unwanted & set(sys.modules)"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
@@ -134,7 +135,7 @@ def test_a_rerun_replaces_figures_and_removes_stale_ones(tmp_path: Path) -> None
     assert (tmp_path / "figures" / "map.svg").read_text() == "<svg>b</svg>"
 
 
-def test_a_stale_figure_that_was_changed_is_kept(tmp_path: Path) -> None:
+def test_a_stale_figure_that_was_changed_stays(tmp_path: Path) -> None:
     write_figures(tmp_path, [figure("map"), figure("old")])
     (tmp_path / "figures" / "old.svg").write_text("drawn over by hand")
     write_figures(tmp_path, [figure("map")])
@@ -146,7 +147,7 @@ def test_a_file_that_is_not_ours_is_not_written_over(tmp_path: Path, before) -> 
     write_figures(tmp_path, [figure("other"), *before])
     (tmp_path / "figures" / "map.svg").write_text("drawn by hand")
     kept = names(tmp_path)
-    with pytest.raises(OutputError, match=r"not written by orthonav.*map\.svg$"):
+    with pytest.raises(OutputError, match=r"orthonav did not write.*map\.svg$"):
         write_figures(tmp_path, [figure("map", "b"), figure("new")])
     assert names(tmp_path) == kept
     assert (tmp_path / "figures" / "map.svg").read_text() == "drawn by hand"
@@ -164,7 +165,7 @@ def test_links_are_not_ours(tmp_path: Path) -> None:
     assert (tmp_path / "figures" / "map.svg").is_symlink()
 
 
-def test_a_list_of_others_leads_nowhere(tmp_path: Path) -> None:
+def test_a_forged_list_removes_nothing(tmp_path: Path) -> None:
     victim = tmp_path / "victim.svg"
     victim.write_text("kept")
     total = hashlib.sha256(b"kept").hexdigest()
@@ -214,7 +215,7 @@ def test_a_run_that_was_cut_off_can_be_repeated(tmp_path: Path, monkeypatch) -> 
     assert names(tmp_path) == ["a.png", "a.svg", "c.png", "c.svg", LIST]
 
 
-def test_where_the_folder_cannot_be_it_is_said(tmp_path: Path) -> None:
+def test_a_file_in_place_of_the_folder_is_reported(tmp_path: Path) -> None:
     (tmp_path / "figures").write_text("a file")
     with pytest.raises(OutputError, match="figures"):
         write_figures(tmp_path, [figure("map")])
@@ -250,27 +251,64 @@ def test_names_of_files_are_safe_and_differ() -> None:
 # The page.
 
 
-def test_a_page_is_whole_and_its_text_is_escaped() -> None:
-    nasty = '<b onclick="x">&'
-    body = "".join(
-        (
-            cards([(nasty, nasty)]),
-            notes([nasty]),
-            html_table((nasty,), [(nasty,)], label=nasty),
-            definitions({nasty: nasty}),
-            pictures([figure_html(Figure("map", nasty, nasty, figure("map").drawing), broad=True)]),
-        )
-    )
-    page = document(nasty, body, kind=nasty)
-    assert "<b onclick" not in page and 'x"' not in page.replace("x&quot;", "")
+PAGE = """{% extends "base.html" %}{% import "macros.html" as m %}{% block body %}
+{{ m.cards([(nasty, nasty)]) }}{{ m.table((nasty,), [(nasty,), (nasty,)], nasty, true) }}
+{{ m.definitions([(nasty, nasty), ("left out", "")], text=true) }}{{ m.figures([figure], 1) }}
+{% endblock %}"""
+
+
+@pytest.fixture
+def rendered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Function that renders a page with every macro."""
+    package = tmp_path / "page_of_a_test"
+    (package / "templates").mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    (package / "templates" / "page.html").write_text(PAGE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def render_page(text: str, **more) -> str:
+        drawn = Figure("map", text, text, figure("map").drawing)
+        values = {"title": text, "kind": text, "nasty": text, "figure": drawn}
+        return render(package.name, "page.html", values, **more)
+
+    return render_page
+
+
+def test_a_page_is_complete_and_its_text_is_escaped(rendered) -> None:
+    page = rendered('<b onclick="x">&')
+    assert "<b onclick" not in page and 'x"' not in page.replace("x&#34;", "")
     assert page.count("<h1>") == 1 and '<html lang="en">' in page
     assert page.index("<header") < page.index("<main>") < page.index("<h1>")
     assert 'width="682" height="440"' in page and 'class="broad"' in page
     assert "@media print" in page and "prefers-color-scheme: dark" in page
+    assert page.count('<tr class="total">') == 1 and "left out" not in page
+
+
+def test_only_the_scripts_and_the_style_of_a_page_may_run(rendered) -> None:
+    page = rendered("a", style="p { color: red; }", scripts=["let x = 1 < 2;"])
+    policy = unescape(re.search(r'Policy" content="([^"]*)"', page)[1])
+    assert "default-src 'none'" in policy and "unsafe" not in policy
+    for kind in ("style", "script"):
+        text = re.search(f"<{kind}>(.*?)</{kind}>", page, re.DOTALL)[1]
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert f"{kind}-src 'sha256-{digest}'" in policy
+    assert "script-src 'none'" in unescape(rendered("a"))
+
+
+def test_without_jinja_the_remedy_is_named(rendered, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "jinja2", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'orthonav\[report\]'"):
+        rendered("a")
+
+
+def test_scripts_of_a_page_are_joined_without_module_syntax() -> None:
+    text = joined_scripts(("format.js", "plane.js", "chart.js"), "orthonav.report", ())
+    assert text.startswith("(() => {") and "function metres(" in text
+    assert not re.search(r"^(export|import)\b", text, re.MULTILINE)
 
 
 @pytest.mark.parametrize(
-    ("value", "said"), [(1.26, "1.3 m"), (99.96, "100.0 m"), (123.4, "123 m"), (np.nan, "-")]
+    ("value", "text"), [(1.26, "1.3 m"), (99.96, "100.0 m"), (123.4, "123 m"), (np.nan, "-")]
 )
-def test_measures_have_as_many_decimals_as_say_something(value: float, said: str) -> None:
-    assert measure_text(value, " m") == said
+def test_measures_have_their_significant_decimals(value: float, text: str) -> None:
+    assert measure_text(value, " m") == text

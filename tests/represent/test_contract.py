@@ -51,7 +51,7 @@ def test_shape_dtype_and_finite(variant, shape):
     assert np.isfinite(out).all()
 
 
-def test_says_something_of_a_picture(variant):
+def test_an_image_gives_a_nonzero_result(variant):
     grey = picture()
     out = variant(grey, everywhere(grey))
     assert (out.reshape(len(out), -1).std(axis=1) > 0).all()
@@ -89,7 +89,7 @@ def test_nothing_valid_is_zero(variant, shape):
     assert not variant(grey, np.zeros(shape, dtype=bool)).any()
 
 
-def test_masked_area_is_zero_and_says_nothing_of_what_lies_under_it(variant):
+def test_masked_pixels_are_zero_and_have_no_influence(variant):
     grey = picture((128, 128))
     valid = everywhere(grey).copy()
     valid[40:90, 50:] = False
@@ -175,7 +175,7 @@ def test_gradients_turn_with_the_picture(quarters):
     np.testing.assert_allclose(turned, expected, atol=1e-3)
 
 
-def test_gradients_mirrored_turn_the_other_way():
+def test_mirrored_gradients_turn_in_the_opposite_direction():
     """A mirror makes the direction t into -t: imaginary parts change sign, real parts stay."""
     sign = np.array([1, 1, -1, 1, -1, 1, -1.0])[:, None, None]
     grey = picture()

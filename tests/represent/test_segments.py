@@ -53,7 +53,7 @@ def test_shape_dtype_and_binary(shape):
     assert set(np.unique(out)) <= {0.0, 1.0}
 
 
-def test_says_something_of_a_picture():
+def test_an_image_gives_a_nonzero_result():
     assert 0.05 < drawn(picture()).mean() < 0.7
 
 
@@ -79,7 +79,7 @@ def test_nothing_valid_is_zero(shape):
     assert not Segments()(picture(shape).reshape(shape), np.zeros(shape, dtype=bool)).any()
 
 
-def test_masked_area_is_zero_and_says_nothing_of_what_lies_under_it():
+def test_masked_pixels_are_zero_and_have_no_influence():
     grey = picture((128, 128))
     valid = everywhere(grey).copy()
     valid[40:90, 50:] = False

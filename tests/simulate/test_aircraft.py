@@ -17,7 +17,7 @@ from orthonav.localizer import downsampled, rectify
 from orthonav.records import View
 from orthonav.simulate.clouds import Clouds
 from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
-from orthonav.simulate.ground import reflected
+from orthonav.simulate.imagery import reflected
 from orthonav.simulate.motion import Wind
 from orthonav.simulate.render import ViewEffects
 
@@ -104,7 +104,7 @@ def test_in_wind_the_aircraft_keeps_its_route_and_crabs(fly, frame):
     assert telemetry[1:] == pytest.approx(np.diff(places, axis=0), abs=0.01)
 
 
-def test_odometry_drifts_and_is_told(fly, frame, tmp_path):
+def test_reported_velocity_drifts(fly, frame, tmp_path):
     exact, truth = fly("exact", errors=Errors(velocity_drift=0.0), spacing_m=80.0, seed=2)
     erring, same = fly("erring", errors=Errors(velocity_drift=0.1), spacing_m=80.0, seed=2)
     assert truth == same
@@ -126,7 +126,7 @@ def test_turns_are_arcs(fly, frame):
     assert inside[(yaw > 5) & (yaw < 85)] == pytest.approx(100, abs=0.5)
 
 
-def test_biases_are_told_wrong_all_along(fly):
+def test_biases_are_constant(fly):
     exact, truth = fly("exact", errors=ALL, spacing_m=100.0, seed=3)
     bias = Errors(*[5.0, 0.05, 1.0, 2.0, 40.0], yaw_bias_deg=-4.0, agl_bias=0.08)
     erring, same = fly("erring", errors=bias, spacing_m=100.0, seed=3)
@@ -140,7 +140,7 @@ def test_biases_are_told_wrong_all_along(fly):
         assert (a == b).all()
 
 
-def test_the_mount_tilts_more_than_told(fly, ortho, frame):
+def test_the_mount_tilt_is_not_reported(fly, ortho, frame):
     """A view shows the ground at the truth if it is levelled with the bias too."""
     bias = Errors(attitude_std_deg=1.0, pitch_bias_deg=4.0, roll_bias_deg=-3.0)
     straight, truth = fly("straight", camera=SEEN, errors=Errors(attitude_std_deg=1.0))
@@ -200,7 +200,7 @@ def test_beyond_the_imagery_the_ground_is_mirrored(fly, frame):
     assert len(views) == 8
     for view in views:
         assert view.std() > 4 and (view == 0).mean() < 0.03
-    with pytest.raises(AreaError, match="wholly within"):
+    with pytest.raises(AreaError, match="completely within"):
         fly("not", corners=OUT, camera=SEEN, spacing_m=90.0)
     inside, _ = fly("inside", corners=[[0.0, 0.0], [280.0, 16.0]], camera=SEEN, spacing_m=90.0)
     for a, b in zip(views, pictures(inside), strict=False):
@@ -230,13 +230,13 @@ def test_mirrors_at_both_ends():
 
 REFUSED = {
     "gale": ({"wind": Wind(25.0)}, "too strong"),
-    "turn": ({"turn_radius_m": -1.0}, "radius of turns"),
-    "turn nan": ({"turn_radius_m": math.nan}, "radius of turns"),
+    "turn": ({"turn_radius_m": -1.0}, "turn radius"),
+    "turn nan": ({"turn_radius_m": math.nan}, "turn radius"),
     "cloud": ({"cloud_share": -0.1}, "cloud_share must be 0 to 1"),
     "clouds": ({"cloud_share": 1.1}, "cloud_share must be 0 to 1"),
     "cloud nan": ({"cloud_share": math.nan}, "cloud_share must be 0 to 1"),
     "spacing": ({"spacing_m": math.inf}, "above 0"),
-    "speed": ({"speed_mps": math.nan}, "above 0"),
+    "speed": ({"airspeed_mps": math.nan}, "above 0"),
 }
 
 
@@ -257,7 +257,7 @@ def test_flights_that_cannot_be(fly, tmp_path, names_in, request_, message):
     ],
     ids=["wind", "turn_radius_m", "beyond", "velocity_drift"],
 )
-def test_random_places_are_no_route(fly, request, request_):
+def test_random_positions_refuse_route_options(fly, request, request_):
     with pytest.raises(FlightError, match=f"{request.node.callspec.id}: only along a route"):
         fly(route=None, random=3, **request_)
 

@@ -91,7 +91,7 @@ def test_the_picture_shows_the_ground_at_the_truth(area, plane, tmp_path, camera
 
 
 def test_errors_have_the_stated_size(area, plane, exact, tmp_path):
-    """The same seed without errors is the same flight, told exactly."""
+    """The same seed without errors is the same flight with exact telemetry."""
     errors = Errors(yaw_std_deg=4.0, agl_std=0.05, tilt_std_deg=1.5, prior_std_m=30.0)
     exact, truth = exact
     erring, same = flown(area, tmp_path / "f", random=len(truth), errors=errors, seed=9)
@@ -112,13 +112,13 @@ def test_errors_have_the_stated_size(area, plane, exact, tmp_path):
     assert all(a.prior is None for a, _ in pairs)
 
 
-def test_tilted_is_true_and_told(area, tmp_path):
+def test_true_tilt_is_reported(area, tmp_path):
     flight, _ = flown(area, tmp_path / "f", random=100, errors=Errors(attitude_std_deg=3.0))
     tilt = np.array([[v.telemetry.pitch_deg, v.telemetry.roll_deg] for v in flight.views])
     assert tilt.std() == pytest.approx(3.0, rel=0.15) and np.abs(tilt).max() <= 7.5
 
 
-def test_places_and_headings_are_anywhere(plane, exact):
+def test_positions_and_headings_are_arbitrary(plane, exact):
     flight, truth = exact
     places = np.array([plane.frame.en_from_latlon(*value) for value in truth.values()])
     for step in (1.0, 8.0, 16.0, 40.0):
@@ -157,7 +157,7 @@ def test_a_route(area, plane, tmp_path):
         random=None,
         route=route_of(plane.frame, *corners),
         spacing_m=50.0,
-        speed_mps=20.0,
+        airspeed_mps=20.0,
     )
     places = np.array([plane.frame.en_from_latlon(*truth[view.frame]) for view in flight.views])
     assert len(places) == 17 and places[0] == pytest.approx(corners[0], abs=0.01)
@@ -170,7 +170,7 @@ def test_a_route(area, plane, tmp_path):
 
 def test_a_route_without_spacing_has_a_view_a_second(area, plane, tmp_path):
     route = route_of(plane.frame, [-100.0, 0.0], [100.0, 0.0])
-    flight, _ = flown(area, tmp_path / "f", random=None, route=route, speed_mps=40.0)
+    flight, _ = flown(area, tmp_path / "f", random=None, route=route, airspeed_mps=40.0)
     assert len(flight.views) == 6
     assert [view.telemetry.time_ns for view in flight.views] == [n * 10**9 for n in range(6)]
 
@@ -213,13 +213,13 @@ def test_effects_change_the_picture_as_stated(area, tmp_path):
     assert np.ptp(np.log(gains)) > 0.1
 
 
-LEAVES = "does not lie wholly within the imagery"
+LEAVES = "does not lie completely within the imagery"
 REFUSED = {
     "too high": ({"agl_m": 5000.0}, AreaError, "fly lower"),
     "too low": ({"agl_m": 0.1}, FlightError, "1 to 50,000"),
     "nan": ({"agl_m": math.nan}, FlightError, "1 to 50,000"),
-    "none": ({"random": 0}, FlightError, "number of random places"),
-    "neither": ({"random": None}, FlightError, "one of them"),
+    "none": ({"random": 0}, FlightError, "number of random positions"),
+    "neither": ({"random": None}, FlightError, "either a route or"),
 }
 
 
@@ -238,7 +238,9 @@ def test_leaving_the_imagery_is_refused(area, plane, tmp_path, names_in):
     assert names_in(tmp_path) == []
 
 
-@pytest.mark.parametrize("spacing", [{"spacing_m": 0.0}, {"spacing_m": -5.0}, {"speed_mps": 0.0}])
+@pytest.mark.parametrize(
+    "spacing", [{"spacing_m": 0.0}, {"spacing_m": -5.0}, {"airspeed_mps": 0.0}]
+)
 def test_impossible_spacing_is_refused(area, plane, tmp_path, names_in, spacing):
     route = route_of(plane.frame, [0.0, 0.0], [100.0, 0.0])
     with pytest.raises(FlightError, match="above 0"):
@@ -292,7 +294,7 @@ def test_a_failure_leaves_nothing(area, tmp_path, names_in, monkeypatch, error, 
     assert len(calls) == 3 and names_in(tmp_path) == []
 
 
-def test_a_folder_in_use_is_kept(area, tmp_path, names_in):
+def test_a_folder_with_other_files_is_not_replaced(area, tmp_path, names_in):
     (tmp_path / "f").mkdir()
     (tmp_path / "f" / "mine").write_text("mine")
     with pytest.raises(OutputError, match="not empty"):
@@ -300,7 +302,7 @@ def test_a_folder_in_use_is_kept(area, tmp_path, names_in):
     assert names_in(tmp_path) == ["f", "f/mine"]
 
 
-def test_progress_is_told(area, tmp_path):
+def test_progress_is_reported(area, tmp_path):
     shares = []
     request = SimulateRequest([area.past], tmp_path / "f", random=4, agl_m=100.0, camera=SMALL)
     assert simulate_flight(request, shares.append) == 4

@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from orthonav.errors import AreaError
-from orthonav.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape, generate_area, render
+from orthonav.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape, generate_area
 from orthonav.simulate.landscape.network import Network
 from orthonav.simulate.landscape.noise import fractal_grid, key_of, noise_at, noise_grid, white_grid
 from orthonav.simulate.landscape.relief import lighting
-from orthonav.simulate.landscape.window import Window
+from orthonav.simulate.landscape.window import PixelWindow
 
 SUMMER, AUTUMN, SPRING = DEFAULT_DATES
 WEST_M, NORTH_M = ORIGIN_M[0] + 600.0, ORIGIN_M[1] + 1500.0
@@ -41,7 +41,7 @@ def pair() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
 
 
 def test_same_seed_same_pixels(pair):
-    again = render(Landscape(1), SUMMER, WEST_M, NORTH_M, 400, 360, 1.0)
+    again = Landscape(1).render(SUMMER, WEST_M, NORTH_M, 400, 360, 1.0)
     assert again.dtype == np.uint8
     assert again.shape == (360, 400, 3)
     assert np.array_equal(again, pair[0])
@@ -112,7 +112,7 @@ def test_dates_differ_but_edges_stay_in_place(pair):
 @pytest.mark.parametrize("date", DEFAULT_DATES)
 def test_shadow_lies_away_from_the_sun_and_is_as_long_as_it_should_be(date, gsd_m):
     size, height_m = int(120 / gsd_m), 12.0
-    window = Window.at(0.0, 0.0, size, size, gsd_m)
+    window = PixelWindow.at(0.0, 0.0, size, size, gsd_m)
     height = np.zeros((size, size), np.float32)
     post = slice(size // 2 - 2, size // 2 + 2)
     height[post, post] = height_m
@@ -180,7 +180,7 @@ def test_noise_has_the_promised_spread():
     assert abs(np.mean(white[1:] * white[:-1])) < 0.02
 
 
-def test_geotiff_says_where_and_when(tmp_path: Path):
+def test_geotiff_has_position_and_date(tmp_path: Path):
     rasterio = pytest.importorskip("rasterio")
     seen: list[float] = []
     paths = generate_area(

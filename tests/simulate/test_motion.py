@@ -19,8 +19,8 @@ from orthonav.simulate.motion import (
     drifting,
     mounted,
     rounded,
-    steady_way,
-    windy_way,
+    steady_path,
+    windy_path,
 )
 
 LINE = np.array([[0.0, 0.0], [0.0, 4000.0], [3000.0, 4000.0], [2000.0, 0.0]])
@@ -29,7 +29,7 @@ AIRSPEED = 25.0
 
 
 def flown(line, wind, spacing_m=100.0, seed=1):
-    return windy_way(line, spacing_m, AIRSPEED, wind, np.random.default_rng(seed), 10**6)
+    return windy_path(line, spacing_m, AIRSPEED, wind, np.random.default_rng(seed), 10**6)
 
 
 def off_course_deg(way, course_deg=0.0):
@@ -65,8 +65,8 @@ def test_gusts_are_as_strong_and_as_slow_as_documented():
     assert alike == pytest.approx(math.exp(-1), abs=0.12)
 
 
-def test_no_wind_is_the_steady_way():
-    still, steady = flown(LINE, Wind(0.0)), steady_way(LINE, 100.0, AIRSPEED)
+def test_no_wind_gives_the_steady_path():
+    still, steady = flown(LINE, Wind(0.0)), steady_path(LINE, 100.0, AIRSPEED)
     assert len(still.times_s) == len(steady.times_s)
     assert np.abs(still.places_en_m - steady.places_en_m).max() < 1e-6
     assert np.abs(still.times_s - steady.times_s).max() < 1e-9
@@ -80,24 +80,24 @@ def test_wind_stronger_than_the_airspeed_is_refused(speed):
 
 @pytest.mark.parametrize("wind", [(-1.0, 0.0), (math.nan, 0.0), (5.0, math.nan), (5.0, 1e9)])
 def test_impossible_wind_is_refused(wind):
-    with pytest.raises(FlightError, match="wind must"):
+    with pytest.raises(FlightError, match=r"wind (direction )?must"):
         Wind(*wind)
 
 
 def test_a_flight_that_never_ends_is_cut_short():
-    way = windy_way(NORTH, 100.0, AIRSPEED, Wind(8.0), np.random.default_rng(0), 20)
+    way = windy_path(NORTH, 100.0, AIRSPEED, Wind(8.0), np.random.default_rng(0), 20)
     assert len(way.times_s) == 21
 
 
-def test_velocities_add_up_to_the_way():
-    for way in (flown(LINE, Wind(8.0, 100.0)), steady_way(LINE, 70.0, AIRSPEED)):
+def test_velocities_integrate_to_the_path():
+    for way in (flown(LINE, Wind(8.0, 100.0)), steady_path(LINE, 70.0, AIRSPEED)):
         steps = way.velocities_en_mps[1:] * np.diff(way.times_s)[:, None]
         assert steps.sum(axis=0) == pytest.approx(way.places_en_m[-1] - way.places_en_m[0])
         assert way.velocities_en_mps[0, 0] == pytest.approx(0, abs=1e-9)
         assert 15 < way.velocities_en_mps[0, 1] < 35
 
 
-def test_dead_reckoning_drifts_by_the_stated_share_of_the_way():
+def test_dead_reckoning_drifts_by_the_stated_share_of_the_path():
     true, times = np.tile([15.0, -20.0], (100, 1)), np.arange(100) * 1.0
     way = true.sum(axis=0)
     ends = [drifting(true, times, 0.02, np.random.default_rng(n)).sum(axis=0) for n in range(300)]

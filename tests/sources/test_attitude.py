@@ -118,7 +118,7 @@ def test_ros_pitch_is_nose_down():
     assert (heading % 360, pitch, roll) == pytest.approx((0, -10, 0), abs=1e-9)
 
 
-def test_what_is_no_rotation_is_not_taken_for_one():
+def test_invalid_rotations_are_rejected():
     wxyz = np.array([[0, 0, 0, 0], [1, 0, 0, 0], [math.nan, 0, 0, 1], [0, 0, 0, 1.0]])
     turns, sound = rotations_of_wxyz(wxyz)
     assert sound.tolist() == [False, True, False, True]

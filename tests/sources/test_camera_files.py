@@ -128,19 +128,19 @@ REFUSED = {
     "two cameras": (lambda p: kalibr(p, names=("cam0", "cam1")), "holds cam0, cam1"),
     "short matrix": (lambda p: ros(p, camera_matrix={"data": [1, 2]}), "9 numbers"),
     "no size": (written("%YAML:1.0\n---\nfx: 1\n"), "lacks camera_matrix"),
-    "not YAML": (written("a: [1, 2"), "no YAML"),
-    "code": (written("!!python/object/apply:os.system ['true']"), "no YAML"),
+    "not YAML": (written("a: [1, 2"), "not YAML"),
+    "code": (written("!!python/object/apply:os.system ['true']"), "not YAML"),
     "a list": (written("- 1\n- 2\n"), "mapping was expected"),
     "nothing": (written(""), "mapping was expected"),
     "other JSON": (written(json.dumps({"a": 1})), "KeyError"),
-    "bytes": (written(b"\xff\xfe\x00\x80"), "no text"),
+    "bytes": (written(b"\xff\xfe\x00\x80"), "not UTF-8 text"),
     "broken OpenCV": (written("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n  rows: x"), "."),
     "negative": (lambda p: kalibr(p, intrinsics=[-1, 1, 1, 1]), "focal length"),
 }
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_no_camera_is_refused(tmp_path, name, capfd):
+def test_invalid_camera_files_are_rejected(tmp_path, name, capfd):
     write, message = REFUSED[name]
     path = write(tmp_path / "camera.yaml")
     with pytest.raises(CameraError, match=message) as caught:

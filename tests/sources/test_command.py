@@ -14,8 +14,8 @@ from recorders import START_S, camera_file, packet, photo, subtitles, tlog, vide
 
 from orthonav.cli import main
 from orthonav.flight import FlightWriter, open_flight, read_image
+from orthonav.flight.fixes import read_results
 from orthonav.geo.camera import Camera
-from orthonav.publish.jsonl import read_results
 from orthonav.records import Fix, Telemetry
 
 DATA = Path(__file__).parents[1] / "data"
@@ -136,9 +136,9 @@ def test_import_of_a_flight_changes_nothing(run, tmp_path):
     assert run("import", source, "--out", tmp_path / "flight")[0] == 0
     for path in source.rglob("*.*"):
         assert (tmp_path / "flight" / path.relative_to(source)).read_bytes() == path.read_bytes()
-    again = run("import", source, "--out", tmp_path / "told", "--prior-std-m", "25")
+    again = run("import", source, "--out", tmp_path / "prior", "--prior-std-m", "25")
     assert again[0] == 0 and "2 views, 2 with heading, tilt and height, 2 with a" in again[1]
-    assert open_flight(tmp_path / "told").views[0].telemetry.prior.std_m == 25
+    assert open_flight(tmp_path / "prior").views[0].telemetry.prior.std_m == 25
 
 
 def test_a_flight_may_be_given_another_camera_but_no_log(run, tmp_path):
@@ -147,17 +147,17 @@ def test_a_flight_may_be_given_another_camera_but_no_log(run, tmp_path):
     assert run("import", source, "--out", tmp_path / "flight", "--camera", other)[0] == 0
     assert open_flight(tmp_path / "flight").camera.distortion == (0.01, 0, 0, 0)
     code, _, err = run("import", source, "--out", tmp_path / "b", "--telemetry", other)
-    assert code == 1 and "telemetry of its own" in err
+    assert code == 1 and "its own telemetry" in err
 
 
 def test_a_flight_is_localized_whatever_its_truth(run, tmp_path):
     source = folder_of(tmp_path / "recorded")
     (source / "truth.csv").write_text("frame,lat_deg,lon_deg\n0.png,north,east\n")
     code, out, err = run("localize", MAP, source, "--out", tmp_path / "fixes.jsonl")
-    assert code == 0 and "2 fixes" in out and "truth is left out: line 2" in err
+    assert code == 0 and "2 fixes" in out and "truth is ignored: line 2" in err
 
 
-def test_what_is_doubtful_is_said(run, tmp_path):
+def test_doubtful_input_causes_a_warning(run, tmp_path):
     for index in range(3):
         photo(tmp_path / f"photos/{index}.jpg", f"2023:11:14 22:13:2{index}", seed=index)
     data = (tmp_path / "photos/1.jpg").read_bytes()
@@ -199,9 +199,9 @@ def short_film(folder):
 BROKEN = {
     "nothing": (lambda folder: folder / "none", "does not exist"),
     "empty file": (lambda folder: written(folder / "a.mp4", b""), "source is empty"),
-    "empty folder": (lambda folder: (folder / "e").mkdir() or folder / "e", "found none"),
+    "empty folder": (lambda folder: (folder / "e").mkdir() or folder / "e", "flight log:"),
     "text": (lambda folder: written(folder / "a.mp4", b"words " * 99), "expected a video"),
-    "a log": (lambda folder: tlog(folder / "a.tlog"), "goes with --telemetry"),
+    "a log": (lambda folder: tlog(folder / "a.tlog"), "belongs to --telemetry"),
     "video cut": (lambda folder: truncated(video(folder / "a.mkv")), "a.mkv"),
     "short subtitles": (short_film, "telemetry ends"),
     "mcap cut": (lambda folder: truncated(bag(folder / "b", "file")), "ROS recording cannot be"),
@@ -211,7 +211,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("how", BROKEN)
-def test_what_is_broken_is_one_line_and_nothing_is_written(run, how, tmp_path, camera, names_in):
+def test_damaged_input_is_one_line_and_nothing_is_written(run, how, tmp_path, camera, names_in):
     make, message = BROKEN[how]
     source = make(tmp_path)
     before = names_in(tmp_path)
@@ -235,7 +235,7 @@ def test_wrong_usage(run, tmp_path, options):
     assert code == 2 and out == "" and "usage: orthonav import" in err
 
 
-def test_the_kind_may_be_told(run, tmp_path, camera):
+def test_the_kind_may_be_given(run, tmp_path, camera):
     source = folder_of(tmp_path / "recorded")
     code, _, err = run("import", source, "--out", tmp_path / "flight", "--kind", "ros")
     assert code == 1 and err.count("\n") == 1
@@ -243,7 +243,7 @@ def test_the_kind_may_be_told(run, tmp_path, camera):
     assert code == 1 and "expected a file" in err
 
 
-def test_an_output_that_is_there_is_kept(run, tmp_path, names_in):
+def test_an_existing_output_is_not_replaced(run, tmp_path, names_in):
     source = folder_of(tmp_path / "recorded")
     before = names_in(tmp_path)
     code, _, err = run("import", source, "--out", source)

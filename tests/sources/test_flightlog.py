@@ -19,6 +19,7 @@ from mcap.writer import CompressionType, Writer
 from orthonav.errors import FlightError, OrthonavError
 from orthonav.flight import open_flight, read_image
 from orthonav.flight import png as png_module
+from orthonav.flight.fixes import read_results, result_to_json
 from orthonav.flight.logged import (
     PROFILE,
     SESSION,
@@ -39,11 +40,10 @@ from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import open_map
 from orthonav.mapfile.signature import map_info
 from orthonav.onboard import log as log_module
-from orthonav.onboard.calibrate import Mounted, model_of
+from orthonav.onboard.calibrate import MountCorrected, model_of
 from orthonav.onboard.log import FlightLog
 from orthonav.onboard.run import locate_view
 from orthonav.onboard.segment import Segment
-from orthonav.publish.jsonl import read_results, result_to_json
 from orthonav.records import NoFix, Prior, Telemetry, View, ViewResult
 from orthonav.sources import SourceOptions, open_source, source_kind
 from orthonav.sources import flightlog as flightlog_module
@@ -111,7 +111,7 @@ def session(**changes):
     return SESSION, 0, to_json({**plain, **changes})
 
 
-def told(index=0, frame="a.png", picture="full"):
+def reported(index=0, frame="a.png", picture="full"):
     view = LoggedView(index, index, frame, telemetry(index), picture)
     return TELEMETRY, index, telemetry_message(view)
 
@@ -128,7 +128,7 @@ def flown(localizer, flight, folder, mount=None, **how):
     """Fly as the runner does, logging; what came out."""
     locator = Tracker(localizer, model=model_of(mount) if mount else None)
     if mount:
-        locator = Mounted(locator, mount)
+        locator = MountCorrected(locator, mount)
     info = map_info(localizer_path(localizer))
     log = FlightLog(folder / "flight.mcap", flight.camera, info, chunk_s=0.05, **how)
     plain = None if mount is None else {
@@ -183,7 +183,7 @@ def test_the_same_fixes_bit_for_bit(full, flight, map_path, tmp_path, run):
     assert "track, mount differed" in done.err and "8 of 8 results are not those" in done.err
 
 
-def test_another_map_is_said(full, flight, map_path, tmp_path, run):
+def test_another_map_causes_a_warning(full, flight, map_path, tmp_path, run):
     flown(full, replace(flight, views=flight.views[:1]), tmp_path)
     info = {"name": "other.onav", "manifest_sha256": "0" * 64}
     log = FlightLog(tmp_path / "b.mcap", flight.camera, info)
@@ -210,8 +210,8 @@ def test_as_flown_is_for_logs(map_path, flight_path, tmp_path, run):
         {"position": {}},
     ],
 )
-def test_options_that_are_none(map_path, tmp_path, run, options):
-    crafted(tmp_path / "a.mcap", [session(options=options), told(), shown()])
+def test_invalid_options_are_rejected(map_path, tmp_path, run, options):
+    crafted(tmp_path / "a.mcap", [session(options=options), reported(), shown()])
     done = run("localize", map_path, tmp_path / "a.mcap", "--as-flown", "--out", tmp_path / "out")
     assert done.code == 1 and done.err.count("\n") == 1 and "flight log has" in done.err
 
@@ -252,7 +252,7 @@ def test_telemetry_comes_back_exactly(time_ns, four, others, prior, velocity):
 # What is missing
 
 
-def test_files_in_order_and_what_is_gone_is_said(tmp_path):
+def test_files_in_order_and_missing_ones_cause_a_warning(tmp_path):
     short_log(tmp_path, range(40), segment_bytes=80_000)
     files = sorted(tmp_path.iterdir())
     assert len(files) >= 3
@@ -280,15 +280,15 @@ def test_two_flights_in_a_folder(tmp_path):
 
 
 @pytest.mark.parametrize("views", ["none", "thumbnails"])
-def test_a_log_without_pictures_says_so(tmp_path, run, views):
+def test_a_log_without_images_is_an_error(tmp_path, run, views):
     path = short_log(tmp_path, views=views)
-    with pytest.raises(FlightError, match=f"no full pictures \\(views: {views}\\)"):
+    with pytest.raises(FlightError, match=f"no full images \\(views: {views}\\)"):
         open_source(path)
     done = run("import", path, "--out", tmp_path / "flight")
     assert done.code == 1 and done.err.count("\n") == 1
 
 
-def test_a_picture_that_was_bad_in_flight_is_bad_again(tmp_path):
+def test_an_image_unusable_in_flight_is_unusable_again(tmp_path):
     log = FlightLog(tmp_path / "flight.mcap", CAMERA, {})
     log.view(0, "0.png", picture(0), telemetry(0))
     log.view(1, "1.png", None, telemetry(1))
@@ -296,21 +296,28 @@ def test_a_picture_that_was_bad_in_flight_is_bad_again(tmp_path):
     opened = open_source(tmp_path / "flight_0001.mcap")
     first, second = opened.views
     assert first.grey().shape == (48, 64) and opened.warnings == ()
-    with pytest.raises(FlightError, match="no usable picture"):
+    with pytest.raises(FlightError, match="no usable image"):
         second.grey()
 
 
-def test_a_view_without_its_picture_is_left_out(tmp_path):
-    messages = [session(), told(), shown(), told(1, "b.png", "dropped"), told(2, "c.png"), shown(2)]
+def test_a_view_without_its_image_is_left_out(tmp_path):
+    messages = [
+        session(),
+        reported(),
+        shown(),
+        reported(1, "b.png", "dropped"),
+        reported(2, "c.png"),
+        shown(2),
+    ]
     opened = open_source(crafted(tmp_path / "a.mcap", messages))
     assert [view.frame for view in opened.views] == ["a.png", "c.png"]
-    assert opened.warnings[0].startswith("1 views were not kept")
+    assert opened.warnings[0].startswith("1 views lack a full image")
 
 
 # Cut anywhere
 
 
-def test_cut_anywhere(tmp_path, content):
+def test_a_log_may_end_anywhere(tmp_path, content):
     data, ends = content
     path = tmp_path / "flight_0001.mcap"
     rng = np.random.default_rng(0)
@@ -331,7 +338,7 @@ def test_cut_anywhere(tmp_path, content):
         assert (len(opened.warnings) == 1) == (cut < ends[-1][0] + 9)
 
 
-def test_no_flipped_bit_is_believed(tmp_path, content):
+def test_flipped_bits_are_detected(tmp_path, content):
     data, _ = content
     path = tmp_path / "flight_0001.mcap"
     rng = np.random.default_rng(1)
@@ -389,9 +396,9 @@ def bomb(size):
 
 BOMB = bomb(2**29)
 BOMBS = {
-    "told": chunk(BOMB, 2**29),
-    "told small": chunk(BOMB, 100),
-    "told huge": chunk(zstandard.compress(b"a" * 100), 2**62),
+    "stated": chunk(BOMB, 2**29),
+    "stated small": chunk(BOMB, 100),
+    "stated huge": chunk(zstandard.compress(b"a" * 100), 2**62),
     "another size": chunk(zstandard.compress(b"a" * 100), 99),
     "no size": chunk(zstandard.ZstdCompressor(write_content_size=False).compress(b"a" * 9), 9),
     "lz4": chunk(b"\x04\x22\x4d\x18" + bytes(40), 100, b"lz4"),
@@ -402,11 +409,11 @@ BOMBS = {
 
 
 @pytest.mark.parametrize("how", BOMBS)
-def test_bombs_do_not_go_off(tmp_path, content, how):
+def test_decompression_bombs_are_rejected(tmp_path, content, how):
     path = tmp_path / "flight_0001.mcap"
     path.write_bytes(header() + BOMBS[how])
     tracemalloc.start()
-    with pytest.raises(FlightError, match="no chunk of the flight log is whole"):
+    with pytest.raises(FlightError, match="no chunk of the flight log is complete"):
         open_source(path)
     assert tracemalloc.get_traced_memory()[1] < 20e6
     tracemalloc.stop()
@@ -438,8 +445,8 @@ PICTURES = {
 
 
 @pytest.mark.parametrize("how", PICTURES)
-def test_pictures_that_are_none(tmp_path, monkeypatch, how):
-    messages = [session(), told(), shown(data=PICTURES[how])]
+def test_invalid_images_are_rejected(tmp_path, monkeypatch, how):
+    messages = [session(), reported(), shown(data=PICTURES[how])]
     (view,) = open_source(crafted(tmp_path / "a.mcap", messages)).views
     if how != "too few rows":  # OpenCV must not even see the others
         monkeypatch.setattr(png_module.cv2, "imdecode", None)
@@ -451,7 +458,7 @@ def test_pictures_that_are_none(tmp_path, monkeypatch, how):
     "data", [b"", b"\0\1\0\0", b"\0\1\0\0" + b"\xff" * 40, b"\0\0\0\0" + bytes(60)]
 )
 def test_messages_that_hold_no_picture(tmp_path, data):
-    messages = [session(), told(), (VIEW, 0, data)]
+    messages = [session(), reported(), (VIEW, 0, data)]
     (view,) = open_source(crafted(tmp_path / "a.mcap", messages)).views
     with pytest.raises(FlightError, match=r"a\.png"):
         view.grey()
@@ -474,16 +481,16 @@ def test_messages_that_hold_no_picture(tmp_path, data):
         "./a.png",
     ],
 )
-def test_no_frame_leads_out_of_its_folder(tmp_path, run, names_in, frame):
-    crafted(tmp_path / "a.mcap", [session(), told(frame=frame), shown()])
+def test_no_frame_leaves_its_folder(tmp_path, run, names_in, frame):
+    crafted(tmp_path / "a.mcap", [session(), reported(frame=frame), shown()])
     done = run("import", tmp_path / "a.mcap", "--out", tmp_path / "in" / "flight")
-    assert done.code == 1 and done.err.count("\n") == 1 and "no name of a view" in done.err
+    assert done.code == 1 and done.err.count("\n") == 1 and "not a valid name of a view" in done.err
     assert [name for name in names_in(tmp_path) if not name.startswith(("a.mcap", "in"))] == []
 
 
 def test_a_frame_that_comes_twice(tmp_path):
-    messages = [session(), told(), shown(), told(1), shown(1)]
-    with pytest.raises(FlightError, match="comes twice"):
+    messages = [session(), reported(), shown(), reported(1), shown(1)]
+    with pytest.raises(FlightError, match="appears twice"):
         open_source(crafted(tmp_path / "a.mcap", messages))
 
 
@@ -501,8 +508,15 @@ def test_a_frame_that_comes_twice(tmp_path):
         b" " * (2**20 + 1),
     ],
 )
-def test_telemetry_that_is_none_is_left_out(tmp_path, data):
-    messages = [session(), told(), shown(), (TELEMETRY, 1, data), told(2, "c.png"), shown(2)]
+def test_invalid_telemetry_is_left_out(tmp_path, data):
+    messages = [
+        session(),
+        reported(),
+        shown(),
+        (TELEMETRY, 1, data),
+        reported(2, "c.png"),
+        shown(2),
+    ]
     opened = open_source(crafted(tmp_path / "a.mcap", messages))
     assert opened.expected == 2 and "1 messages are damaged" in opened.warnings[0]
 
@@ -520,25 +534,25 @@ def test_telemetry_that_is_none_is_left_out(tmp_path, data):
         {"width_px": 2**70},
     ],
 )
-def test_cameras_that_are_none(tmp_path, changes):
+def test_invalid_cameras_are_rejected(tmp_path, changes):
     camera = {**camera_plain(CAMERA), **changes}
     with pytest.raises(OrthonavError, match=r"a\.mcap"):
-        open_source(crafted(tmp_path / "a.mcap", [session(camera=camera), told(), shown()]))
+        open_source(crafted(tmp_path / "a.mcap", [session(camera=camera), reported(), shown()]))
 
 
 def test_a_newer_format_is_named(tmp_path):
-    path = crafted(tmp_path / "a.mcap", [session(format=2), told(), shown()])
+    path = crafted(tmp_path / "a.mcap", [session(format=2), reported(), shown()])
     with pytest.raises(FlightError, match=r"format 2.*update orthonav"):
         open_source(path)
 
 
 def test_more_views_than_anybody_flies(tmp_path, monkeypatch):
     monkeypatch.setattr(flightlog_module, "MAX_VIEWS", 3)
-    messages = [session(), *(told(index, f"{index}.png") for index in range(5)), shown()]
+    messages = [session(), *(reported(index, f"{index}.png") for index in range(5)), shown()]
     with pytest.raises(FlightError, match="more than 3 views"):
         open_source(crafted(tmp_path / "a.mcap", messages))
     monkeypatch.setattr(flightlog_module, "MAX_MESSAGES", 50)
-    messages = [session(), told(), shown(), *[(log_module.HEALTH, 0, b"")] * 60]
+    messages = [session(), reported(), shown(), *[(log_module.HEALTH, 0, b"")] * 60]
     with pytest.raises(FlightError, match="more than 3 views"):
         open_source(crafted(tmp_path / "a.mcap", messages))
 
@@ -554,7 +568,7 @@ def test_zeros_take_no_time(tmp_path, content):
     assert time.process_time() - start < 3
 
 
-def test_only_our_logs_are_taken_for_logs(tmp_path, content):
+def test_only_flight_logs_are_detected_as_logs(tmp_path, content):
     other = crafted(tmp_path / "a.mcap", [session()], profile="ros2")
     assert source_kind(other) == "ros"
     renamed = tmp_path / "flight.bin"
@@ -566,10 +580,10 @@ def test_only_our_logs_are_taken_for_logs(tmp_path, content):
         open_source(empty)
 
 
-def test_what_goes_with_a_log(tmp_path, content):
+def test_options_of_a_log(tmp_path, content):
     path = tmp_path / "flight_0001.mcap"
     path.write_bytes(content[0])
-    with pytest.raises(FlightError, match="no --telemetry"):
+    with pytest.raises(FlightError, match="leave out --telemetry"):
         open_source(path, SourceOptions(telemetry=path))
     camera = tmp_path / "camera.json"
     camera.write_text(json.dumps({"camera": {**camera_plain(CAMERA), "fx_px": 77.0}}))
@@ -585,7 +599,7 @@ def test_results_that_are_broken_are_passed_over(tmp_path):
     log.close()
     (result,) = open_source(tmp_path / "flight_0001.mcap").results()
     assert result.outcome.reason == "blank"
-    messages = [session(), told(), shown(), (log_module.RESULT, 0, b"{}")]
+    messages = [session(), reported(), shown(), (log_module.RESULT, 0, b"{}")]
     assert list(open_source(crafted(tmp_path / "a.mcap", messages)).results()) == []
 
 

@@ -15,7 +15,7 @@ def test_a_library_that_is_missing_is_named(monkeypatch):
         needed("pyulog.core", "PX4 logs")
 
 
-def test_what_a_library_raises_is_one_line(tmp_path):
+def test_exceptions_of_libraries_become_one_line(tmp_path):
     with pytest.raises(FlightError) as caught, reading("log", tmp_path):
         raise KeyError("first line\nsecond line")
     assert (
@@ -23,7 +23,7 @@ def test_what_a_library_raises_is_one_line(tmp_path):
         == f"log cannot be read (KeyError: 'first line\\nsecond line'): {tmp_path}"
     )
     with (
-        pytest.raises(FlightError, match="MemoryError: no more is known"),
+        pytest.raises(FlightError, match="MemoryError: no details"),
         reading("log", tmp_path),
     ):
         raise MemoryError

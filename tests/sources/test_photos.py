@@ -92,17 +92,17 @@ def test_the_focal_length_by_the_resolution_of_the_sensor(tmp_path):
     assert read_photo(photo(tmp_path / "c.jpg", more=none)).focal_px is None
 
 
-def test_a_camera_file_is_better(folder, tmp_path):
+def test_a_camera_file_replaces_exif(folder, tmp_path):
     file = camera_file(tmp_path / "c.json", width_px=128, height_px=96, cx_px=66.0)
     recording = open_source(folder, SourceOptions(camera=file))
     assert (recording.camera.width_px, recording.camera.cx_px) == (WIDTH, 33.0)
     assert EXIF_NOTE not in recording.note and recording.warnings == ()
     wrong = camera_file(tmp_path / "d.json", width_px=128, height_px=72)
-    with pytest.raises(CameraError, match="other proportions"):
+    with pytest.raises(CameraError, match="another aspect ratio"):
         open_source(folder, SourceOptions(camera=wrong))
 
 
-def test_the_position_may_be_told_as_a_prior(folder):
+def test_the_position_may_be_used_as_a_prior(folder):
     view = next(open_source(folder, SourceOptions(prior_std_m=25.0)).views)
     assert view.telemetry.prior == Prior(*view.truth_latlon_deg, 25.0)
 
@@ -190,7 +190,7 @@ def test_the_time_of_exposure_is_the_better_one(tmp_path):
     assert read_photo(photo(tmp_path / "b.jpg", xmp=wrong)).time_ns == START_S * 10**9
 
 
-def test_what_is_not_told_is_not_known(tmp_path):
+def test_missing_metadata_stays_missing(tmp_path):
     photo(tmp_path / "p/a.jpg", gps={1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0)})
     view = next(open_source(tmp_path / "p").views)
     assert view.telemetry.missing() == ["yaw_deg", "pitch_deg", "roll_deg", "agl_m"]
@@ -201,7 +201,7 @@ def test_what_is_not_told_is_not_known(tmp_path):
     assert telemetry.missing() == ["yaw_deg"] and telemetry.agl_m == 110.0
 
 
-def test_what_is_broken_is_left_out_and_said(folder, tmp_path):
+def test_damaged_photographs_are_left_out_with_a_warning(folder, tmp_path):
     (folder / "d.jpg").write_bytes(b"not a picture")
     (folder / "e.jpg").touch()
     photo(folder / "f.jpg", time=None)
@@ -210,9 +210,9 @@ def test_what_is_broken_is_left_out_and_said(folder, tmp_path):
     (folder / "h.jpg").write_bytes(whole[: len(whole) - 300])  # its header can be read
     recording = open_source(folder)
     assert recording.warnings[:3] == (
-        "2 of 8 photographs left out, no readable picture, the first: d.jpg",
+        "2 of 8 photographs left out, not readable, the first: d.jpg",
         "1 of 8 photographs left out, no time in EXIF, the first: f.jpg",
-        "time zone of 1 photographs not in EXIF: taken as UTC",
+        "no time zone in EXIF of 1 photographs: UTC assumed",
     )
     done = import_flight(recording, tmp_path / "flight")
     assert (done.views, done.broken) == (4, 1) and "h.jpg" in done.first_broken
@@ -228,7 +228,7 @@ def test_a_picture_of_another_size_ends_it(folder, tmp_path, names_in):
 
 def test_folders_that_are_no_flight_are_refused(tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(FlightError, match="found none"):
+    with pytest.raises(FlightError, match="flight log:"):
         open_source(tmp_path / "empty")
     photo(tmp_path / "p/a.jpg", time=None)
     with pytest.raises(FlightError, match="no time in EXIF"):

@@ -137,7 +137,7 @@ def test_padded_rows_and_big_ends(messages):
 @pytest.mark.parametrize(
     "changes, error",
     [
-        ({"encoding": "yuv422"}, "'yuv422' is not known"),
+        ({"encoding": "yuv422"}, "'yuv422' is not supported"),
         ({"data": np.zeros(10, np.uint8)}, "cut short"),
         ({"step": 3}, "cut short"),
         ({"height": 0}, "has no size"),
@@ -196,7 +196,7 @@ def test_heights_of_mavros(tmp_path, messages, topics):
     assert views[0].telemetry.agl_m == 105
 
 
-def test_topics_as_told(tmp_path, messages, topics):
+def test_topics_as_requested(tmp_path, messages, topics):
     topics["/other/image_raw"] = [(START_S * 10**9, messages.image(START_S * 10**9, picture(9)))]
     path = record(tmp_path / "flight", topics, messages)
     with pytest.raises(FlightError, match=r"found /cam/image_raw, /other/image_raw; give --topic"):
@@ -205,7 +205,7 @@ def test_topics_as_told(tmp_path, messages, topics):
     recording = open_source(path, telemetry)
     assert "attitude /odom" in recording.note and len(list(recording.views)) == 4
     for role, name, error in (
-        ("image", "/none", "no messages on /none; there are /cam/camera_info"),
+        ("image", "/none", "no messages on /none; available: /cam/camera_info"),
         ("image", "/imu/data", "carries sensor_msgs/msg/Imu; image is one of"),
     ):
         with pytest.raises(FlightError, match=error):
@@ -215,7 +215,7 @@ def test_topics_as_told(tmp_path, messages, topics):
 def test_without_attitude_nothing_is_made_up(tmp_path, messages, topics):
     del topics["/imu/data"], topics["/odom"]
     recording = open_source(record(tmp_path / "flight", topics, messages))
-    assert recording.warnings == ("no topic tells the attitude of the aircraft",)
+    assert recording.warnings == ("no topic has the attitude of the aircraft",)
     telemetry = next(recording.views).telemetry
     assert (
         telemetry.missing() == ["yaw_deg", "pitch_deg", "roll_deg"] and telemetry.vel_en_mps is None
@@ -296,7 +296,7 @@ def test_pictures_are_not_held(tmp_path, messages):
         tracemalloc.stop()
 
 
-def test_a_bag_without_images_is_refused(tmp_path, messages, topics):
+def test_a_bag_without_images_is_rejected(tmp_path, messages, topics):
     del topics["/cam/image_raw"]
     with pytest.raises(FlightError, match="expected one topic of images, found none"):
         open_source(record(tmp_path / "flight", topics, messages))

@@ -30,7 +30,7 @@ def frame_of_zeros(size):
 
 BOMBS = {
     "zstd": zeros(512 * MB, zstandard.ZstdCompressor().compressobj(size=512 * MB)),
-    "zstd of no told size": zeros(512 * MB, zstandard.ZstdCompressor().compressobj()),
+    "zstd without a stated size": zeros(512 * MB, zstandard.ZstdCompressor().compressobj()),
     "lz4": frame_of_zeros(512 * MB),
 }
 

@@ -13,7 +13,7 @@ from orthonav.records import Prior
 from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.recording import check_overlap, fitted, with_options
-from orthonav.sources.track import GAP_NS, Samples, Track, angles_at, attitude_of_angles
+from orthonav.sources.track import GAP_NS, RecordedTrack, Samples, angles_at, attitude_of_angles
 
 S = 10**9
 
@@ -62,7 +62,7 @@ def test_outside_and_in_gaps_nothing_is_known():
     assert not math.isnan(angles_at(series, S)[0])
     for time_ns in (-1, S + 1, 4 * S):
         assert all(math.isnan(angle) for angle in angles_at(series, time_ns))
-    bare = Track(series).telemetry(S // 2)
+    bare = RecordedTrack(series).telemetry(S // 2)
     assert bare.missing() == ["agl_m"] and bare.prior is None and bare.vel_en_mps is None
 
 
@@ -92,7 +92,7 @@ def test_positions_cross_the_180th_meridian():
     samples.add(0, 10.0, 179.9, 100.0)
     samples.add(S, 10.0, -179.9, math.nan)
     samples.add(2 * S, 0.0, 0.0, 0.0)  # "no position"
-    track = Track(None, position=samples.positions())
+    track = RecordedTrack(None, position=samples.positions())
     assert track.latlon_deg(S // 2) == pytest.approx((10, -180))
     assert track.latlon_deg(S)[1] == pytest.approx(-179.9)
     assert track.latlon_deg(S + S // 2) is None
@@ -104,22 +104,18 @@ def test_the_better_height_counts_where_it_is_there():
     other.add(0, 80.0), other.add(2 * S, 80.0)
     place.add(0, 46.0, 2.0, 400.0), place.add(4 * S, 46.0, 2.0, 400.0)
     place.add(2 * S, 46.0, 2.0, 400.0)
-    track = Track(None, (good.series(), other.series()), place.positions())
+    track = RecordedTrack(None, (good.series(), other.series()), place.positions())
     heights = [track.telemetry(t).agl_m for t in (S // 2, 3 * S // 2, 3 * S)]
     assert heights[:2] == [51.0, 80.0] and math.isnan(heights[2])
     assert track.telemetry(3 * S, ground_alt_m=310.0).agl_m == 90.0
 
 
 def test_what_the_options_add():
-    telemetry = Track(None).telemetry(0)
-    telemetry = with_options(
-        telemetry, (46.0, 2.0), SourceOptions(prior_std_m=30.0, looks_down=True)
-    )
-    assert telemetry.prior == Prior(46.0, 2.0, 30.0) and (
-        telemetry.pitch_deg,
-        telemetry.roll_deg,
-    ) == (0, 0)
-    assert math.isnan(telemetry.yaw_deg)
+    telemetry = RecordedTrack(None).telemetry(0)
+    options = SourceOptions(prior_std_m=30.0, looks_down=True)
+    changed = with_options(telemetry, (46.0, 2.0), options)
+    assert changed.prior == Prior(46.0, 2.0, 30.0)
+    assert (changed.pitch_deg, changed.roll_deg) == (0, 0) and math.isnan(changed.yaw_deg)
     assert with_options(telemetry, None, SourceOptions(prior_std_m=30.0)).prior is None
 
 
@@ -138,14 +134,14 @@ def test_impossible_options_are_refused(change, message):
         SourceOptions(**change)
 
 
-def test_recordings_that_do_not_meet_are_told_apart(tmp_path):
-    track = Track(attitudes((10, 0, 0, 0), (20, 0, 0, 0)))
+def test_recordings_that_do_not_overlap_are_an_error(tmp_path):
+    track = RecordedTrack(attitudes((10, 0, 0, 0), (20, 0, 0, 0)))
     check_overlap(track, 15 * S, 30 * S, tmp_path)
     with pytest.raises(FlightError, match=r"30\.000 to 40\.000 s, telemetry 10\.000 to 20\.000"):
         check_overlap(track, 30 * S, 40 * S, tmp_path)
 
 
-def test_cameras_fit_pictures_of_the_same_proportions():
+def test_cameras_fit_images_of_the_same_aspect_ratio():
     from orthonav.errors import CameraError
     from orthonav.geo.camera import Camera
 
@@ -153,5 +149,5 @@ def test_cameras_fit_pictures_of_the_same_proportions():
     assert fitted(camera, 2000, 1500, "x").cx_px == 1005.0
     assert fitted(camera, 4000, 3000, "x") is camera
     assert fitted(camera, 1333, 1000, "x").width_px == 1333  # a third, rounded
-    with pytest.raises(CameraError, match="other proportions"):
+    with pytest.raises(CameraError, match="another aspect ratio"):
         fitted(camera, 4000, 2250, "x")

@@ -190,7 +190,7 @@ def broken(recorded, how):
 
 
 BROKEN = {
-    "no frames": "cannot be opened|holds no frame",
+    "no frames": "cannot be opened|has no frame",
     "cut": r"cut short: \d+ of 30 frames",
     "empty": "source is empty",
     "another kind": "expected a video",
@@ -199,12 +199,12 @@ BROKEN = {
     "empty subtitles": "telemetry log is empty",
     "subtitles of a film": "neither position nor gimbal angles",
     "no subtitles": "no telemetry beside the video",
-    "no overlap": "do not meet",
+    "no overlap": "do not overlap",
 }
 
 
 @pytest.mark.parametrize("how", BROKEN)
-def test_what_is_broken_is_one_error_and_nothing_written(recorded, tmp_path, names_in, how, capfd):
+def test_damaged_video_is_one_error_and_nothing_written(recorded, tmp_path, names_in, how, capfd):
     more = broken(recorded, how)
     before = names_in(tmp_path)
     with pytest.raises(FlightError, match=BROKEN[how]) as caught:
@@ -216,13 +216,13 @@ def test_a_video_needs_a_camera(recorded, tmp_path):
     with pytest.raises(CameraError, match="give --camera"):
         open_source(recorded)
     camera_file(tmp_path / "camera.json", height_px=36)
-    with pytest.raises(CameraError, match="other proportions"):
+    with pytest.raises(CameraError, match="another aspect ratio"):
         open_source(recorded, options(recorded))
 
 
 def test_read_srt_of_what_is_not_text(tmp_path):
     (tmp_path / "a.srt").write_bytes(bytes(range(256)) * 40)
-    with pytest.raises(FlightError, match="no block"):
+    with pytest.raises(FlightError, match="hold no telemetry"):
         read_srt(tmp_path / "a.srt")
 
 

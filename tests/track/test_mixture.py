@@ -11,10 +11,10 @@ from orthonav.track import (
     CameraDisplacement,
     Mixture,
     Model,
+    ReportedAttitude,
     ReportedVelocity,
     Sighting,
     State,
-    Told,
 )
 from orthonav.track.hypotheses import within
 from orthonav.track.smooth import History
@@ -39,16 +39,16 @@ class Flight:
 
     def moved(self, seconds=1.0):
         """A second of flight: what odometry says, turned and scaled by the biases."""
-        way = SPEED * seconds + self.rng.normal(0, 1.0, 2)
-        self.place = self.place + way
+        moved = SPEED * seconds + self.rng.normal(0, 1.0, 2)
+        self.place = self.place + moved
         cos, sin = math.cos(-self.bias[0]), math.sin(-self.bias[0])
-        told = np.array([[cos, sin], [-sin, cos]]) @ way * math.exp(-self.bias[1])
-        noisy = told + self.rng.normal(0, 0.5, 2)
+        reported = np.array([[cos, sin], [-sin, cos]]) @ moved * math.exp(-self.bias[1])
+        noisy = reported + self.rng.normal(0, 0.5, 2)
         return CameraDisplacement(noisy, np.eye(2) * 0.25, 80.0)
 
-    def told(self):
+    def reported(self):
         """What instruments say: level and north, where the truth is the biases and noise."""
-        return Told(0.0, 0.0, 0.0)
+        return ReportedAttitude(0.0, 0.0, 0.0)
 
     def sighting(self, log_odds=4.0, at=None):
         """The view's own place, or a false one: tilt and position err together."""
@@ -74,7 +74,7 @@ def flown(seed, views=60, false_share=0.3, model=MODEL, history=None):
             mixture.predict(1.0, camera=flight.moved())
         false = flight.sighting(-1.0, flight.rng.uniform(-0.5, 0.5, 2) * SIDE_M)
         seen = [false] if flight.rng.random() < false_share else [flight.sighting(2.0), false]
-        mixture.update(flight.told(), seen)
+        mixture.update(flight.reported(), seen)
         estimate = mixture.estimate(RADIUS_M)
         error = estimate.mean[:2] - flight.place
         rows.append((*error, estimate.confidence, estimate))
@@ -86,20 +86,21 @@ def flown(seed, views=60, false_share=0.3, model=MODEL, history=None):
 
 @functools.cache
 def known(seed):
-    """A flight that is only looked at: its mixture at the end and its rows."""
-    return flown(seed)[1:]
+    """A flight shared by tests that only read it: its mixture at the end, rows and history."""
+    history = History()
+    return *flown(seed, history=history)[1:], history
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_flight_is_found_and_followed(seed):
-    _, rows = known(seed)
+    _, rows, _ = known(seed)
     errors = np.hypot([row[0] for row in rows], [row[1] for row in rows])
     assert errors[10:].max() < 15 and np.median(errors[10:]) < 4
     assert rows[-1][3].state is State.TRACKING
     assert np.median([row[2] for row in rows[10:]]) > 0.99
 
 
-def test_what_is_wrong_with_what_is_told_is_learnt():
+def test_telemetry_biases_are_estimated():
     learnt = np.array([known(seed)[0].estimate(RADIUS_M).mean[4:] for seed in range(8)])
     assert (np.abs(learnt.mean(axis=0) - BIAS) < [0.01, 0.01, 0.012, 0.012]).all()
 
@@ -118,11 +119,11 @@ def test_normalized_errors_are_those_of_its_covariance():
 
 def test_one_lucky_view_is_no_track():
     flight, mixture = Flight(1), Mixture(MODEL, EXTENT)
-    mixture.update(flight.told(), [flight.sighting(30.0)])
+    mixture.update(flight.reported(), [flight.sighting(30.0)])
     first = mixture.estimate(RADIUS_M)
     assert first.state is State.SEARCHING and first.confidence < 0.9999
     mixture.predict(1.0, camera=flight.moved())
-    mixture.update(flight.told(), [flight.sighting(3.0)])
+    mixture.update(flight.reported(), [flight.sighting(3.0)])
     assert mixture.estimate(RADIUS_M).state is State.TRACKING
 
 
@@ -132,7 +133,7 @@ def test_views_of_the_same_ground_are_not_new():
     for newness in (0.1, 1.0):
         flight, mixture = Flight(2), Mixture(MODEL, EXTENT)
         for _ in range(5):
-            mixture.update(flight.told(), [flight.sighting(-1.5)], newness)
+            mixture.update(flight.reported(), [flight.sighting(-1.5)], newness)
         believed.append(mixture.estimate(RADIUS_M).confidence)
     assert believed[0] < 0.9 < believed[1]
 
@@ -143,7 +144,7 @@ def test_without_sightings_it_becomes_lost_and_its_covariance_grows():
     states = []
     for _ in range(60):
         mixture.predict(5.0)
-        mixture.update(flight.told(), [])
+        mixture.update(flight.reported(), [])
         estimate = mixture.estimate(RADIUS_M)
         spread.append(np.trace(estimate.covariance[:2, :2]))
         states.append(estimate.state)
@@ -160,7 +161,7 @@ def test_off_the_map_nothing_is_missed():
         for each in mixture.hypotheses
     ]
     for _ in range(5):
-        mixture.update(flight.told(), [])
+        mixture.update(flight.reported(), [])
     assert mixture.estimate(RADIUS_M).confidence == pytest.approx(inside, abs=0.01)
 
 
@@ -170,7 +171,7 @@ def test_a_kidnapped_aircraft_is_found_again():
     states, confident_wrong = [], 0
     for _ in range(25):
         mixture.predict(1.0, camera=flight.moved())
-        mixture.update(flight.told(), [flight.sighting(3.0)])
+        mixture.update(flight.reported(), [flight.sighting(3.0)])
         states.append(mixture.estimate(RADIUS_M).state)
         wrong = off_m(mixture, flight) > RADIUS_M
         confident_wrong += wrong and mixture.estimate(RADIUS_M).confidence > 0.9
@@ -181,28 +182,28 @@ def test_a_kidnapped_aircraft_is_found_again():
 def test_false_places_that_come_and_go_are_not_followed():
     """Views of nowhere on the map, each with a place that it is somewhat like."""
     confident = 0
-    for seed in range(4):
+    for seed in range(3):
         flight, mixture = Flight(seed), Mixture(MODEL, EXTENT)
         for _ in range(30):
             mixture.predict(1.0, camera=flight.moved())
             places = [flight.rng.uniform(-0.5, 0.5, 2) * SIDE_M for _ in range(3)]
             seen = [flight.sighting(flight.rng.normal(-3, 1), place) for place in places]
-            mixture.update(flight.told(), seen)
+            mixture.update(flight.reported(), seen)
             confident += mixture.estimate(RADIUS_M).confidence > 0.9
     assert confident <= 1
 
 
-def test_a_camera_that_was_knocked_is_followed():
+def test_a_bias_jump_is_followed():
     flight, mixture, _ = flown(5)
     flight.bias = flight.bias + np.array([0.0, 0.0, math.radians(9.0), 0.0])
     for _ in range(15):
         mixture.predict(1.0, camera=flight.moved())
-        mixture.update(flight.told(), [flight.sighting(3.0)])
+        mixture.update(flight.reported(), [flight.sighting(3.0)])
     assert off_m(mixture, flight) < 12
     assert mixture.estimate(RADIUS_M).mean[6] > BIAS[2] + 0.05
 
 
-def test_a_told_start_is_believed_until_views_say_otherwise():
+def test_a_reported_start_holds_until_views_contradict_it():
     flight = Flight(6)
     right, wrong = Mixture(MODEL, EXTENT), Mixture(MODEL, EXTENT)
     right.start(flight.place + np.array([10.0, 0.0]), 20.0)
@@ -212,15 +213,14 @@ def test_a_told_start_is_believed_until_views_say_otherwise():
         sighting = flight.sighting(2.0)
         for mixture in (right, wrong):
             mixture.predict(1.0, camera=moved)
-            mixture.update(flight.told(), [sighting])
+            mixture.update(flight.reported(), [sighting])
     assert off_m(right, flight) < 10 and off_m(wrong, flight) < 10
 
 
-def test_hindsight_is_better_and_knows_it():
+def test_smoothing_reduces_error_and_covariance():
     before, after, ratios = [], [], []
-    for seed in range(6):
-        history = History()
-        _, _, rows = flown(seed, history=history)
+    for seed in range(5):
+        _, rows, history = known(seed)
         smoothed = history.smoothed()
         assert len(smoothed) == len(rows) and None not in smoothed
         pairs = list(zip(rows, smoothed, strict=True))[5:]  # before, it may not be found yet
@@ -245,7 +245,7 @@ def test_far_hypotheses_and_gaps_stay_finite():
     flight, mixture, _ = flown(8, views=10)
     for seconds in (0.0, 1e-3, 600.0, 1e5):
         mixture.predict(seconds)
-        mixture.update(flight.told(), [flight.sighting(1.0)])
+        mixture.update(flight.reported(), [flight.sighting(1.0)])
         estimate = mixture.estimate(RADIUS_M)
         assert np.isfinite(estimate.mean).all() and np.isfinite(estimate.covariance).all()
         assert np.linalg.eigvalsh(estimate.covariance).min() > 0
@@ -262,7 +262,7 @@ def test_unknown_heading_is_followed():
             mixture.predict(1.0, ReportedVelocity(seen.moved_en_m, None, 0.7))
         sighting = flight.sighting(2.0)
         turned = sighting.mean + np.array([0, 0, 2.2, 0, 0, 0])
-        mixture.update(Told(None, 0.0, 0.0), [replace(sighting, mean=turned)])
+        mixture.update(ReportedAttitude(None, 0.0, 0.0), [replace(sighting, mean=turned)])
     assert off_m(mixture, flight) < 25
 
 
@@ -272,13 +272,13 @@ def test_within_is_the_share_of_a_round_gaussian():
     drawn = rng.normal(0, 10, (200_000, 2))
     for middle, tolerance in (((0.0, 0.0), 0.003), ((8.0, 0.0), 0.08)):
         share = (np.hypot(*(drawn - middle).T) <= 15).mean()
-        told = within(np.zeros(8), covariance, 15.0, np.array(middle))
-        assert told == pytest.approx(share, abs=tolerance)
+        reported = within(np.zeros(8), covariance, 15.0, np.array(middle))
+        assert reported == pytest.approx(share, abs=tolerance)
     assert within(np.zeros(8), covariance, 15.0, np.array([500.0, 0.0])) == 0
 
 
-def test_a_way_that_cannot_be_is_not_followed():
-    """A cloud that moves over the ground: told velocity says that the camera's way is wrong."""
+def test_odometry_outliers_are_rejected():
+    """A cloud that moves over the ground: the reported velocity contradicts odometry."""
     flight, mixture, _ = flown(5)
     before = None
     for _ in range(12):
@@ -286,25 +286,25 @@ def test_a_way_that_cannot_be_is_not_followed():
         wrong = CameraDisplacement(3 * SPEED, np.eye(2) * 0.25, 80.0)
         mixture.predict(1.0, ReportedVelocity(SPEED, before, 1.0), wrong)
         before = SPEED
-        mixture.update(flight.told(), [])
+        mixture.update(flight.reported(), [])
     estimate = mixture.estimate(RADIUS_M)
     assert off_m(mixture, flight) < 25 or estimate.confidence < 0.5
 
 
-def test_a_sudden_turn_is_followed_where_no_velocity_is_told():
+def test_a_sudden_turn_is_followed_without_reported_velocity():
     flight, mixture, _ = flown(6)
     for _ in range(4):
-        way = np.array([-14.0, 9.0])
-        flight.place = flight.place + way
+        moved = np.array([-14.0, 9.0])
+        flight.place = flight.place + moved
         cos, sin = math.cos(-BIAS[0]), math.sin(-BIAS[0])
-        told = np.array([[cos, sin], [-sin, cos]]) @ way * math.exp(-BIAS[1])
-        mixture.predict(1.0, camera=CameraDisplacement(told, np.eye(2) * 0.25, 80.0))
-        mixture.update(flight.told(), [])
+        reported = np.array([[cos, sin], [-sin, cos]]) @ moved * math.exp(-BIAS[1])
+        mixture.predict(1.0, camera=CameraDisplacement(reported, np.eye(2) * 0.25, 80.0))
+        mixture.update(flight.reported(), [])
     assert off_m(mixture, flight) < 10
 
 
 def test_a_turn_that_nobody_saw_is_thought_of():
-    """Else the place that it led to would be put down to a mount that was knocked."""
+    """Else its effect would be attributed to a bias jump."""
     _, mixture, _ = flown(6)
     speeds_mps = [math.sqrt(each.covariance[2, 2]) for each in mixture.hypotheses]
     assert max(speeds_mps) < 5
@@ -316,17 +316,17 @@ def test_a_turn_that_nobody_saw_is_thought_of():
     assert len(mixture.hypotheses) < 200
 
 
-def test_a_told_velocity_that_is_off_for_long_is_learnt():
-    """Dead reckoning through 30 s without a view: the told wind is wrong by 1.8 m/s all along."""
+def test_the_bias_of_a_reported_velocity_is_estimated():
+    """Dead reckoning through 30 s without a view: the reported wind is wrong by 1.8 m/s."""
     flight, mixture, before = Flight(7), Mixture(MODEL, EXTENT), None
-    told = SPEED + np.array([1.5, -1.0])
+    reported = SPEED + np.array([1.5, -1.0])
     for second in range(90):
-        way = flight.moved()
+        moved = flight.moved()
         seen = second < 60
-        mixture.predict(1.0, ReportedVelocity(told, before, 1.5), way if seen else None)
-        before = told
+        mixture.predict(1.0, ReportedVelocity(reported, before, 1.5), moved if seen else None)
+        before = reported
         if seen:
-            mixture.update(flight.told(), [flight.sighting(4.0)])
+            mixture.update(flight.reported(), [flight.sighting(4.0)])
     estimate = mixture.estimate(RADIUS_M)
     error = estimate.mean[:2] - flight.place
     assert np.hypot(*error) < 20 < 30 * 1.8
@@ -336,7 +336,7 @@ def test_a_told_velocity_that_is_off_for_long_is_learnt():
 def test_a_place_that_is_known_well_is_not_merged_into_a_wide_guess():
     flight, mixture, _ = flown(8)
     mixture.predict(60.0)
-    mixture.update(flight.told(), [flight.sighting(-2.0)])
+    mixture.update(flight.reported(), [flight.sighting(-2.0)])
     std = [math.sqrt(np.trace(each.covariance[:2, :2])) for each in mixture.hypotheses]
     assert min(std) < 20 and max(std) > 100
 
@@ -348,7 +348,7 @@ def test_a_mount_is_good_unless_views_say_otherwise(tilt_deg, found):
     for view in range(15):
         if view:
             mixture.predict(1.0, camera=flight.moved())
-        mixture.update(flight.told(), [flight.sighting(5.0)])
+        mixture.update(flight.reported(), [flight.sighting(5.0)])
     tilt = math.degrees(mixture.estimate(RADIUS_M).mean[6])
     assert tilt == pytest.approx(found, abs=1.0)
 
@@ -359,10 +359,10 @@ def test_how_a_view_tilts_is_no_evidence_for_its_place():
     false = flight.place + np.array([300.0, 0.0])
     for view in range(8):
         if view:
-            way = flight.moved()
-            mixture.predict(1.0, camera=way)
+            moved = flight.moved()
+            mixture.predict(1.0, camera=moved)
             false = false + SPEED
-        mixture.update(flight.told(), [flight.sighting(-6.0, false)], 0.15)
+        mixture.update(flight.reported(), [flight.sighting(-6.0, false)], 0.15)
     assert mixture.estimate(RADIUS_M).confidence < 0.5
 
 
@@ -371,17 +371,17 @@ def test_after_a_while_without_views_one_is_no_track():
     for _ in range(8):
         flight.moved(20.0)
         mixture.predict(20.0)
-        mixture.update(flight.told(), [])
+        mixture.update(flight.reported(), [])
         mixture.estimate(RADIUS_M)
     assert mixture.estimate(RADIUS_M).state is State.LOST
-    mixture.update(flight.told(), [flight.sighting(7.0)])
+    mixture.update(flight.reported(), [flight.sighting(7.0)])
     assert mixture.estimate(RADIUS_M).state is not State.TRACKING
     mixture.predict(1.0, camera=flight.moved())
-    mixture.update(flight.told(), [flight.sighting(7.0)])
+    mixture.update(flight.reported(), [flight.sighting(7.0)])
     assert mixture.estimate(RADIUS_M).state is State.TRACKING
 
 
-def test_measured_positions_teach_the_mount():
+def test_measured_positions_calibrate_the_mount():
     """Views that show no tilt of their own: where they are put beside GNSS tells it."""
     bias = np.array([0.0, 0.0, math.radians(5.0), 0.0])
     flight, mixture = Flight(12, bias=bias), Mixture(MODEL, EXTENT)
@@ -389,23 +389,23 @@ def test_measured_positions_teach_the_mount():
     for view in range(25):
         if view:
             mixture.predict(1.0, camera=flight.moved())
-        mixture.told_position(flight.place + flight.rng.normal(0, 3, 2), 3.0)
+        mixture.measure_position(flight.place + flight.rng.normal(0, 3, 2), 3.0)
         spread = np.diag([4.0, 4.0, 1e-4, 1e-4, weak**2, weak**2])
         spread[0, 0] += (height_m * weak) ** 2
         spread[0, 4] = spread[4, 0] = -height_m * weak**2
         # Taken as level the view lies ahead of where it was taken.
         ahead = np.array([height_m * bias[2], 0, 0, 0, 0, 0])
         mean = np.concatenate([flight.place, np.zeros(4)]) + ahead
-        mixture.update(flight.told(), [Sighting(mean, spread, 5.0)])
+        mixture.update(flight.reported(), [Sighting(mean, spread, 5.0)])
     assert math.degrees(mixture.estimate(RADIUS_M).mean[6]) == pytest.approx(5.0, abs=1.0)
 
 
-def test_a_measured_position_is_believed_where_nothing_led_there():
+def test_a_measured_position_starts_a_new_hypothesis():
     """Views of places that no aircraft flies between, each with its GNSS."""
     mixture = Mixture(MODEL, EXTENT)
     for place in ([-700.0, 300.0], [650.0, 500.0], [100.0, -800.0]):
         mixture.predict(1.0)
-        mixture.told_position(np.array(place), 3.0)
+        mixture.measure_position(np.array(place), 3.0)
         found = mixture.estimate(RADIUS_M)
         assert np.hypot(*(found.mean[:2] - place)) < 5 and found.confidence > 0.5
         assert sum(each.share for each in mixture.hypotheses) + mixture.elsewhere == pytest.approx(

@@ -74,12 +74,12 @@ class Visit:
         expect(self.page.locator("#chosen-name")).to_have_text(re.compile(f"^{i + 1} of {count}:"))
 
     def pictured(self, i):
-        """Waits until the pictures of view `i` are there."""
+        """Waits until the images of view `i` are there."""
         expect(self.page.locator("#img-view")).to_have_attribute("src", re.compile(f"/{i}/view"))
         self.settled()
 
     def settled(self):
-        """Waits until all pictures are there."""
+        """Waits until all images are there."""
         self.until(lambda: self.page.evaluate(SETTLED))
 
     def until(self, holds):

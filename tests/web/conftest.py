@@ -10,7 +10,7 @@ sys.path.append(str(Path(__file__).parents[1] / "localizer"))  # blots.py: the k
 
 from small_run import PLACES_EN_M, Small, result, serving, write_small_flight, write_small_map
 
-from orthonav.publish.jsonl import write_results
+from orthonav.flight.fixes import write_results
 from orthonav.web.opening import ViewRequest, open_run
 
 
@@ -46,8 +46,8 @@ def ask(server):
     def asked(path, method="GET", **headers):
         connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
         try:
-            told = {key.replace("_", "-"): value for key, value in headers.items()}
-            connection.request(method, path, headers=told)
+            fields = {key.replace("_", "-"): value for key, value in headers.items()}
+            connection.request(method, path, headers=fields)
             reply = connection.getresponse()
             return reply.status, {k.lower(): v for k, v in reply.getheaders()}, reply.read()
         finally:

@@ -27,7 +27,7 @@ COV_EN_M2 = np.array([[9.0, 4.0], [4.0, 16.0]])
 PLACES_EN_M = [(-60.0, 20.0), (-30.0, 25.0), (0.0, 30.0), (30.0, 25.0), (60.0, 20.0), (80.0, 0.0)]
 ATTITUDES = [(40.0 + 10 * i, 4.0, -3.0) for i in range(len(PLACES_EN_M))]
 WRONG, NO_FIX = 3, 4
-"""Of the views: one is sure and 60 m off, one has no fix."""
+"""Of the views one is confident and 60 m off, one has no fix."""
 
 
 def name(i):
@@ -73,7 +73,7 @@ def write_small_map(path, *, layer=True):
 
 
 def write_small_flight(folder):
-    """Views of the ground, told exactly; truth beside them."""
+    """Views of the ground, with exact telemetry, and their truth."""
     (folder / "frames").mkdir(parents=True)
     with (folder / "telemetry.csv").open("w", newline="") as telemetry:
         rows = csv.writer(telemetry)

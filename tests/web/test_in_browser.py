@@ -11,7 +11,7 @@ from browsing import LAPTOP, TABLET, Visit, painted
 from playwright.sync_api import expect
 from small_run import CHUNK_PX, FRAME, GSD_M, PLACES_EN_M, WRONG, name, result, serving
 
-from orthonav.publish.jsonl import result_to_json
+from orthonav.flight.fixes import result_to_json
 from orthonav.web.opening import ViewRequest, open_run
 
 COUNT = len(PLACES_EN_M)
@@ -94,23 +94,25 @@ def test_the_run_is_drawn_where_it_is(page, columns):
     assert page.locator("#legend").inner_text().split("\n") == [
         "●tracking",
         "—truth",
-        "◯sure and wrong",
+        "◯confident and wrong",
     ]
     figures = page.locator("#figures").inner_text().replace("\n", " ")
     assert figures.startswith("views 6 with a fix 83.3 % within 15.0 m 66.7 %")
-    assert figures.endswith("sure and wrong 1")
+    assert figures.endswith("confident and wrong 1")
 
 
-def test_the_worst_view_with_its_pictures_and_numbers(page, small, ask):
+def test_the_worst_view_with_its_images_and_values(page, small, ask):
     page.select_option("#order", "error")
     page.chosen(WRONG, COUNT)
     first = page.locator("#list button").first
-    expect(first).to_contain_text(name(WRONG)) and expect(first).to_contain_text("60.0 m sure!")
+    expect(first).to_contain_text(name(WRONG)) and expect(first).to_contain_text(
+        "60.0 m confident!"
+    )
     show_wrong(page)
     assert page.locator("#list button").count() == 1
     assert page.locator("#shown-count").inner_text() == f"1 of {COUNT} views"
     fix = json.loads(small.fixes.read_text().splitlines()[WRONG])
-    said = page.locator("#said").inner_text()
+    said = page.locator("#sentence").inner_text()
     spread_m = np.sqrt(np.linalg.eigvalsh(fix["cov_en_m2"])[-1])
     east_m, north_m = FRAME.en_from_latlon(fix["lat_deg"], fix["lon_deg"])
     error_m = np.hypot(east_m - PLACES_EN_M[WRONG][0], north_m - PLACES_EN_M[WRONG][1])
@@ -158,8 +160,8 @@ def below_the_middle(over):
     return {"x": x - 60, "y": y + 30, "width": 120, "height": 60}
 
 
-def test_stepping_by_keys_is_seen_and_told(page):
-    said = page.locator("#said")
+def test_stepping_by_keys_is_seen_and_announced(page):
+    said = page.locator("#sentence")
     assert said.get_attribute("aria-live") == "polite"
     steps = ["ArrowRight", "ArrowRight", "ArrowLeft", "End", "PageUp", "Home", "PageDown", "n", "p"]
     sentences = set()
@@ -391,7 +393,7 @@ def test_a_run_is_followed_from_before_its_beginning(visit, small, tmp_path):
         page.pictured(3)
         fixes.write_text(lines[4])  # begun anew
         page.chosen(0, 1)
-        expect(page.locator("#said")).to_contain_text("no fix: blank")
+        expect(page.locator("#sentence")).to_contain_text("no fix: blank")
         page.pictured(0)
         expect(page.locator("#figure-fix")).to_be_hidden()
         page.settled()
@@ -399,7 +401,7 @@ def test_a_run_is_followed_from_before_its_beginning(visit, small, tmp_path):
         expect(live).to_have_text("live: waiting for the first view")
         expect(page.locator("#chosen-name")).to_have_text("No view yet")
         expect(page.locator("#compare")).to_be_hidden()
-        assert page.locator("#said").inner_text() == ""
+        assert page.locator("#sentence").inner_text() == ""
 
 
 @pytest.mark.slow

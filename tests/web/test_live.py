@@ -9,9 +9,9 @@ from blots import CAMERA
 from small_run import result
 
 from orthonav.errors import FlightError, MissingFileError
+from orthonav.flight.fixes import result_to_json
 from orthonav.onboard.log import FlightLog
 from orthonav.onboard.outputs import JsonOut
-from orthonav.publish.jsonl import result_to_json
 from orthonav.records import Telemetry
 from orthonav.web import feed as feed_module
 from orthonav.web import logs as logs_module
@@ -33,11 +33,11 @@ def fixes(tmp_path):
 
 @pytest.fixture(autouse=True)
 def no_waiting(monkeypatch):
-    monkeypatch.setattr(logs_module, "LOOK_FOR_FILES_S", 0.0)
+    monkeypatch.setattr(logs_module, "RESCAN_S", 0.0)
 
 
 def test_a_file_that_grows(fixes):
-    """Half a line is waited for; what came is told once."""
+    """Half a line is waited for; each result is delivered once."""
     feed = LineFeed(fixes, live=True)
     assert feed.poll().results == []
     fixes.write_text(line(0) + line(1)[:40])
@@ -54,7 +54,7 @@ def test_what_the_runner_writes(fixes):
     out = JsonOut(fixes)
     out.view(result(0), 12.0, ["global-position"], None)
     out.health(HEALTH)
-    out.view(result(1), 12.0, [], "not_sure")
+    out.view(result(1), 12.0, [], "low_confidence")
     batch = feed.poll()
     assert len(batch.results) == 2 and batch.problems == []
     assert batch.health[0][0] == 1
@@ -76,11 +76,11 @@ def test_a_file_that_is_begun_anew(fixes):
     assert batch.restarted and [each.frame for each in batch.results] == [result(2).frame]
 
 
-def test_broken_lines_are_told_of_and_left_out(fixes):
+def test_broken_lines_are_reported_and_skipped(fixes):
     fixes.write_text(line(0) + '{"frame": 3\n{"health": 4}\n\xff\n\n' + line(1))
     batch = LineFeed(fixes).poll()
     assert len(batch.results) == 2 and len(batch.problems) == 1
-    assert "line 2 is left out" in batch.problems[0]
+    assert "line 2 was skipped" in batch.problems[0]
 
 
 def test_lines_and_files_beyond_reason(fixes, monkeypatch):
@@ -109,7 +109,7 @@ def test_a_run_tells_news_and_begins_anew(fixes, small):
     assert run.news(anew["generation"], 1, 0)["count"] == 0
 
 
-def test_a_file_that_goes_away_is_told_of(fixes, small):
+def test_a_file_that_disappears_is_reported(fixes, small):
     fixes.write_text(line(0))
     run = open_run(ViewRequest(fixes, small.map_path, live=True))
     fixes.unlink()
@@ -175,10 +175,10 @@ def test_thumbnails_are_shown_too(tmp_path, small):
     assert run.news(0, 0, 0)["health"][0]["level"] == "DEGRADED"
 
 
-def test_a_log_without_pictures_says_so(tmp_path, small):
+def test_a_log_without_images_is_reported(tmp_path, small):
     write_log(tmp_path, range(2), views="none")
     run = open_run(ViewRequest(tmp_path / "flight_0001.mcap", small.map_path))
-    assert run.detail(0)["why_no_window"] == "the log keeps no pictures"
+    assert run.detail(0)["why_no_window"] == "the log has no images"
     assert run.count == 2
 
 
@@ -206,7 +206,7 @@ def test_files_deleted_to_make_room_are_not_missed(tmp_path):
         reader.shot(result(0).frame).load()
 
 
-def test_pictures_of_a_log_beside_fixes(tmp_path, small):
+def test_images_of_a_log_for_fixes_of_a_file(tmp_path, small):
     write_log(tmp_path, range(2))
     run = open_run(ViewRequest(small.fixes, small.map_path, flight=tmp_path))
     assert "window" in run.detail(0)
@@ -218,7 +218,7 @@ def test_a_log_that_is_not_there(tmp_path):
         LogReader(tmp_path / "flight.mcap").poll()
 
 
-def test_the_map_that_was_flown_with_is_compared(tmp_path, small, caplog):
+def test_another_map_than_that_of_the_flight_is_reported(tmp_path, small, caplog):
     write_log(tmp_path, range(1))
     open_run(ViewRequest(tmp_path, small.map_path))
-    assert "flown with another map" in caplog.text
+    assert "the flight used another map" in caplog.text

@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 from small_run import FRAME, GSD_M, NORTH_M, WEST_M
 
-from orthonav.web.assets import load_assets
+from orthonav.report.page import static_text
+from orthonav.web.assets import SHARED, load_assets
 
 STATIC = files("orthonav.web").joinpath("static")
 OURS = {entry.name: entry.read_text(encoding="utf-8") for entry in STATIC.iterdir()}
+OURS |= {name: static_text(name) for name in SHARED}
 SCRIPTS = {name: text for name, text in OURS.items() if name.endswith(".js")}
 VOID = {"meta", "link", "img", "input", "br", "hr"}
 NODE = shutil.which("node")
@@ -71,7 +73,7 @@ def test_scripts_find_their_elements(page):
 
 
 def test_everything_can_be_reached_and_has_a_name(page):
-    """Controls have a label, pictures an alternative; parts are landmarks with a name."""
+    """Controls have a label, images an alternative; parts are landmarks with a name."""
     labelled = set(named(page, "for"))
     for tag, attributes in page.elements:
         if tag in ("input", "select") and attributes.get("type") != "checkbox":
@@ -150,7 +152,7 @@ def test_scripts_are_well_formed(tmp_path):
 
 
 @needs_node
-def test_the_pointer_tells_the_place_of_the_plane(tmp_path):
+def test_latitude_and_longitude_of_the_pointer(tmp_path):
     """Pixels to latitude and longitude, as `LocalFrame` has them, to a millimetre."""
     (tmp_path / "plane.mjs").write_text(OURS["plane.js"], encoding="utf-8")
     sheet = {"west_m": WEST_M, "north_m": NORTH_M, "gsd_m": GSD_M}

@@ -42,11 +42,11 @@ def as_picture(reply):
 
 
 def test_the_summary_says_what_is_shown(ask):
-    told = as_json(ask("/api/run"))
-    assert told["name"] == "fixes.jsonl" and told["map_name"] == "area.onav"
-    assert told["pictures"] == "flight" and told["truth"] == "flight/truth.csv"
-    assert told["states"] == ["searching", "tracking", "lost"] and not told["live"]
-    sheet = told["sheet"]
+    found = as_json(ask("/api/run"))
+    assert found["name"] == "fixes.jsonl" and found["map_name"] == "area.onav"
+    assert found["images"] == "flight" and found["truth"] == "flight/truth.csv"
+    assert found["states"] == ["searching", "tracking", "lost"] and not found["live"]
+    sheet = found["sheet"]
     assert (sheet["west_m"], sheet["north_m"], sheet["gsd_m"]) == (WEST_M, NORTH_M, GSD_M)
     assert sheet["tiles"]["side_px"] == CHUNK_PX and sheet["tiles"]["levels"][0] == [620, 700]
 
@@ -123,10 +123,10 @@ def test_a_view_lies_on_the_map_where_its_fix_has_it(ask):
 
 
 def test_the_detail_says_all(ask):
-    told = as_json(ask("/api/views/0"))
-    assert told["time_s"] == "100.000000000" and told["evidence"] == {"score": 0.5}
-    assert told["told"]["pitch_deg"] == 4.0
-    assert FRAME.en_from_latlon(told["lat_deg"], told["lon_deg"]) == pytest.approx(
+    found = as_json(ask("/api/views/0"))
+    assert found["time_s"] == "100.000000000" and found["evidence"] == {"score": 0.5}
+    assert found["telemetry"]["pitch_deg"] == 4.0
+    assert FRAME.en_from_latlon(found["lat_deg"], found["lon_deg"]) == pytest.approx(
         PLACES_EN_M[0], abs=1e-3
     )
     nothing = as_json(ask(f"/api/views/{NO_FIX}"))
@@ -246,6 +246,6 @@ def test_a_map_without_layer_shows_its_preview(small, tmp_path):
 
 def test_without_a_flight_the_rest_works(small):
     run = open_run(ViewRequest(small.fixes, small.map_path))
-    told = run.detail(0)
-    assert "--flight" in told["why_no_window"] and run.told.pictures == run.told.truth == ""
+    found = run.detail(0)
+    assert "--flight" in found["why_no_window"] and run.labels.images == run.labels.truth == ""
     assert run.news(0, 0, 0)["columns"]["err"] == [None] * 6

@@ -8,7 +8,7 @@ import urllib.request
 import pytest
 
 from orthonav.cli import view as view_module
-from orthonav.publish.jsonl import write_results
+from orthonav.flight.fixes import write_results
 from orthonav.records import Fix, ViewResult
 
 
@@ -36,9 +36,9 @@ def test_it_prints_the_address_and_ends(run, small, served):
     assert first.startswith("http://127.0.0.1:") and last == "ended"
 
 
-def test_listening_to_others_is_warned_about(run, small, served):
+def test_a_public_address_is_warned_about(run, small, served):
     done = run("view", small.fixes, "--map", small.map_path, "--host", "0.0.0.0")
-    assert done.code == 0 and "whoever reaches this computer" in done.err
+    assert done.code == 0 and "anyone who can reach this computer" in done.err
 
 
 def test_no_browser_but_on_a_terminal(run, small, served, monkeypatch):
@@ -52,13 +52,13 @@ def test_no_browser_but_on_a_terminal(run, small, served, monkeypatch):
     assert opened == [] and view_module._has_screen()
 
 
-def test_what_is_missing_or_broken_is_said_before(run, small, served, tmp_path):
+def test_missing_and_damaged_files_are_reported_at_start(run, small, served, tmp_path):
     fixes, area = small.fixes, small.map_path
     refused(run("view", tmp_path / "none.jsonl", "--map", area), "none.jsonl")
     refused(run("view", tmp_path / "none.mcap", "--map", area), "flight log does not exist")
     refused(run("view", fixes, "--map", tmp_path / "none.onav"), "none.onav")
     refused(run("view", fixes, "--map", fixes), "not an orthonav map")
-    refused(run("view", tmp_path, "--map", area), "folder of neither")
+    refused(run("view", tmp_path, "--map", area), "got a folder without one")
     refused(run("view", fixes, "--map", area, "--flight", tmp_path / "none"), "flight does not")
     refused(run("view", fixes, "--map", area, "--flight", area), "orthonav import")
     refused(run("view", fixes, "--map", area, "--truth", tmp_path / "none.csv"), "truth does not")

@@ -14,7 +14,6 @@ import argparse
 import contextlib
 import os
 import re
-import shlex
 import subprocess
 import sys
 import tempfile
@@ -102,28 +101,6 @@ def _commands(lines: list[str]) -> Iterator[str]:
             if "".join(command).strip():
                 yield "\n".join(command)
             command = []
-
-
-def calls(command: str) -> Iterator[list[str]]:
-    """The simple commands of a line of shell, as words: split at pipes, `;`, `&&` and `&`."""
-    line = re.sub(r"\d>&\d", "", command.replace("\\\n", " "))
-    lexer = shlex.shlex(line, posix=True, punctuation_chars="|;&<>")
-    lexer.whitespace_split = True
-    words: list[str] = []
-    skipped = False
-    for word in lexer:
-        if word and set(word) <= set("|;&"):
-            if words:
-                yield words
-            words = []
-        elif word and set(word) <= set("<>&"):
-            skipped = True  # the name of a file comes next
-        elif skipped:
-            skipped = False
-        else:
-            words.append(word)
-    if words:
-        yield words
 
 
 def run_steps(steps: list[Step], folder: Path) -> list[Printed]:

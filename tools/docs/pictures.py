@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +33,8 @@ from rasterio.windows import Window
 from orthonav import represent
 from orthonav.flight import FlightFolder, open_flight, read_image, read_truth
 from orthonav.geo.camera import footprint_en_m
-from orthonav.localizer import prepare_view, rectify
-from orthonav.records import Telemetry
+from orthonav.localizer import downsampled, rectify
+from orthonav.records import Telemetry, View
 from orthonav.variants import make_variant
 
 TUTORIAL = ROOT / "docs" / "tutorials" / "operator.md"
@@ -145,14 +146,14 @@ def _draw_evidence(figure: Any, folder: Path) -> None:
 def _draw_fix(figure: Any, folder: Path) -> None:
     """One view: as taken, turned north, where it was put on the map, and that place from near."""
     flight = open_flight(folder / "flight")
-    fix, told = _usual_fix(folder, flight)
+    fix, telemetry = _usual_fix(folder, flight)
     picture = read_image(folder / "flight" / "frames" / fix["frame"])
     place = _Place(folder / PAST, fix)
     taken, north, wide, near = figure.subplots(2, 2).ravel()
     _show(taken, picture, "the view, October 2021", cmap="gray")
     _show(
         north,
-        _north_up(picture, flight, fix, told),
+        _north_up(picture, flight, fix, telemetry),
         "turned north, at the map's scale",
         cmap="gray",
     )
@@ -198,30 +199,23 @@ def _show_place(axes: Any, place: _Place, side_m: float, title: str) -> None:
 
 
 def _usual_fix(folder: Path, flight: FlightFolder) -> tuple[dict[str, Any], Telemetry]:
-    """A sure fix of which most of the views are like: that of the median error ellipse."""
+    """A typical confident fix: that with the median error ellipse."""
     lines = (folder / "fixes.jsonl").read_text("utf-8").splitlines()
-    told = {view.frame: view.telemetry for view in flight.views}
+    reported = {view.frame: view.telemetry for view in flight.views}
     fixes = [fix for fix in map(json.loads, lines) if (fix["confidence"] or 0) > 0.98]
     fixes = [fix for fix in fixes if 20 < fix["heading_deg"] % 90 < 70] or fixes
     fixes.sort(key=lambda fix: np.trace(fix["cov_en_m2"]))
     fix = fixes[len(fixes) // 2]
-    return fix, told[fix["frame"]]
+    return fix, reported[fix["frame"]]
 
 
 def _north_up(
-    picture: np.ndarray, flight: FlightFolder, fix: dict[str, Any], told: Telemetry
+    picture: np.ndarray, flight: FlightFolder, fix: dict[str, Any], reported: Telemetry
 ) -> np.ndarray:
     """A view as the map would show it, by the heading and height of its fix."""
-    prepared = prepare_view(picture, flight.camera, fix["agl_m"], 1.0)
-    turned = rectify(
-        prepared,
-        yaw_deg=fix["heading_deg"],
-        pitch_deg=told.pitch_deg,
-        roll_deg=told.roll_deg,
-        agl_m=fix["agl_m"],
-        gsd_m=1.0,
-        size_px=round(WINDOW_M),
-    )
+    telemetry = replace(reported, yaw_deg=fix["heading_deg"], agl_m=fix["agl_m"])
+    view = downsampled(View(picture, flight.camera, telemetry), 1.0)
+    turned = rectify(view, gsd_m=1.0, size_px=round(WINDOW_M))
     return np.where(turned.valid, turned.grey, 255)
 
 

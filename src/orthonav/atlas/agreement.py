@@ -1,10 +1,9 @@
-"""Agreement of views: one view alone never says where in a country it was taken.
+"""Agreement of views: one view alone never decides where in a country an aircraft is.
 
-Every hypothesis is a chain of places, one for each view that was seen there, which an aircraft can
-have flown. Views that are found where the ones before let expect them speak for it, by the odds
-that each has on its own against the best place elsewhere in the whole atlas, and by how unlikely it
-is that a wrong place lies there by chance. A view counts by the share of it that is new ground:
-what is seen again says the same again.
+A chain is a sequence of places, one per view, that an aircraft can have flown through. A view found
+where a chain expects it supports the chain by its odds against the best other place in the whole
+atlas, and by how unlikely it is that a wrong place lies there by chance. A view counts by the share
+of it that is new ground, because views of the same ground are not independent.
 """
 
 import math
@@ -16,45 +15,57 @@ from numpy.typing import NDArray
 
 from orthonav.geo.frames import LocalFrame, distances_m
 
+# Values without another source were chosen with `python -m benchmarks.atlas_lost`.
 MAX_SPEED_MPS = 120.0
-"""Faster than what flies with a camera like this; nothing slower is ruled out."""
+"""Faster than the aircraft that this program is for; a slower limit would exclude some."""
 SLACK_M = 60.0
+"""Errors of two registered positions, seven pixels of 8 m."""
 TURN_RATE_RAD_S = math.radians(12.0)
+"""Four times a standard-rate turn (3 deg/s)."""
 TURN_SLACK_RAD = math.radians(12.0)
+"""Errors of two registered headings."""
 SCALE_SLACK = 0.12
-"""How far heading and scale of two views of one hypothesis may be from each other."""
+"""Greatest difference of log scale between two views of a chain, besides climbing."""
 CLIMB_PER_S = 0.02
+"""Change of log scale per second: 20 m/s at 1000 m."""
 MIN_NEW = 0.15
-"""Share of a view that must be new ground for it to count at all: hovering proves nothing."""
+"""Share of a view that must be new ground for it to count: hovering proves nothing. The track
+counts views likewise (docs/design.md, section 7)."""
 ANCHORS = 30
 """Places that counted and are remembered: circling over them proves nothing more."""
 MAX_REACH_M = 5_000.0
-"""A hypothesis that may be farther from where it was is forgotten: no gap is bridged blindly."""
+"""A chain whose aircraft may be farther from the expected place is dropped: no gap is bridged
+blindly."""
 MIN_VELOCITY_S = 0.5
+"""Views closer in time do not give a velocity."""
 AGILE_MPS = 10.0
-"""Views closer in time say nothing of the velocity; it may change by so much and by half."""
+"""The velocity may change by so much, and by half, between two views."""
 MISSED = 1.6
-"""Nats that a view of new ground costs a hypothesis of which it does not speak."""
+"""Nats that a view which does not support a chain costs it: exp(-1.6) is 0.2, `1 - FOUND`."""
 CHANCE = 0.05
-"""Least probability that a wrong place lies by chance where a hypothesis expects the view."""
+"""Least probability that a wrong place lies by chance where a chain expects the view."""
 FOUND = 0.8
-"""Probability that a right one is found there."""
+"""Probability that the right place is found where a chain expects the view."""
 MAX_LOG_ODDS = 5.0
-"""No single view is believed more than this."""
-KEPT = 12
+"""No single view counts more than this: odds of 150."""
+MAX_CHAINS = 12
 HOPELESS = 9.0
+"""Chains less likely than the best by more nats are dropped."""
 MIN_VIEWS = 1.7
-"""Views' worth of ground that must agree before anything is called a fix."""
-FORGOTTEN_NATS = 14.0
-"""More is not remembered, so that a hypothesis that became wrong is given up."""
+"""Views of new ground that must agree before there is a fix: two views that overlap by 30 %."""
+MAX_CHAIN_LOG_ODDS = 14.0
+"""Chains remember no more nats, so that a chain that became wrong is given up after some views."""
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """One place where a view may have been taken, as agreement needs it.
+class PlaceEvidence:
+    """One place where a view may have been taken.
 
-    `log_odds` are those of the view on its own, against all other places of the atlas; `key` tells
-    the caller which it is.
+    `lat_deg`, `lon_deg`: place of the camera.
+    `turn_rad`: heading of the top of the view.
+    `log_scale`: logarithm of true over reported height.
+    `log_odds`: of this place against all others of the atlas, from this view alone (nats).
+    `key`: number by which the caller recognizes the place.
     """
 
     lat_deg: float
@@ -66,51 +77,58 @@ class Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """A chain of places; `last` is the latest, seen at `time_ns`.
+class Chain:
+    """A chain of places.
 
-    `views` is what agrees, in views of new ground; `worth` the log odds that the latest view alone
-    gave it; `anchors` latitudes and longitudes of views that counted; `missed` views since.
+    `last`: the latest place.
+    `time_ns`: when it was seen.
+    `log_odds`: of the chain (nats).
+    `views`: how many agree, in views of new ground.
+    `latest_log_odds`: what the latest view alone says of its place (nats).
+    `anchors`: latitudes and longitudes of the views that counted.
+    `velocity_en_mps`: east and north, None where unknown.
+    `missed`: views since the latest place that did not support the chain.
     """
 
-    last: Seen
+    last: PlaceEvidence
     time_ns: int
     log_odds: float
     views: float
-    worth: float
+    latest_log_odds: float
     anchors: tuple[tuple[float, float], ...]
     velocity_en_mps: NDArray[np.float64] | None = None
     missed: int = 0
 
+    def _seconds(self, time_ns: int) -> float:
+        return max(0.0, (time_ns - self.time_ns) / 1e9)
+
     def reach_m(self, time_ns: int) -> float:
-        """How far from where it is expected the aircraft may be."""
-        dt_s = max(0.0, (time_ns - self.time_ns) / 1e9)
+        """How far the aircraft may be from the expected place."""
         speed = MAX_SPEED_MPS
         if self.velocity_en_mps is not None:
-            told = float(np.hypot(*self.velocity_en_mps))
-            speed = min(speed, (0.5 + self.missed) * told + AGILE_MPS)
-        return SLACK_M + speed * dt_s
+            latest = float(np.hypot(*self.velocity_en_mps))
+            speed = min(speed, (0.5 + self.missed) * latest + AGILE_MPS)
+        return SLACK_M + speed * self._seconds(time_ns)
 
     def expected(self, time_ns: int) -> tuple[float, float]:
-        """Latitude and longitude where the aircraft should be."""
+        """Latitude and longitude where the aircraft is expected."""
         if self.velocity_en_mps is None:
             return self.last.lat_deg, self.last.lon_deg
-        dt_s = max(0.0, (time_ns - self.time_ns) / 1e9)
         frame = LocalFrame(self.last.lat_deg, self.last.lon_deg)
-        lat, lon = frame.latlon_from_en(self.velocity_en_mps * dt_s)
+        lat, lon = frame.latlon_from_en(self.velocity_en_mps * self._seconds(time_ns))
         return float(lat), float(lon)
 
     def turn_std_rad(self, time_ns: int) -> float:
-        """How far the heading may have turned, as a standard deviation."""
-        dt_s = max(0.0, (time_ns - self.time_ns) / 1e9)
-        return min(math.pi / 2, (TURN_SLACK_RAD + TURN_RATE_RAD_S * dt_s) / 3)
+        """Standard deviation of the change of heading since the latest place."""
+        turned = TURN_SLACK_RAD + TURN_RATE_RAD_S * self._seconds(time_ns)
+        return min(math.pi / 2, turned / 3)
 
-    def fits(self, seen: Seen, time_ns: int) -> bool:
-        """Whether the aircraft can have come there."""
-        dt_s = max(0.0, (time_ns - self.time_ns) / 1e9)
-        away = distances_m([self.expected(time_ns)], [(seen.lat_deg, seen.lon_deg)])[0]
-        turned = abs(math.remainder(seen.turn_rad - self.last.turn_rad, 2 * math.pi))
-        scaled = abs(seen.log_scale - self.last.log_scale)
+    def reaches(self, place: PlaceEvidence, time_ns: int) -> bool:
+        """Whether the aircraft can have flown to that place."""
+        dt_s = self._seconds(time_ns)
+        away = distances_m([self.expected(time_ns)], [(place.lat_deg, place.lon_deg)])[0]
+        turned = abs(math.remainder(place.turn_rad - self.last.turn_rad, 2 * math.pi))
+        scaled = abs(place.log_scale - self.last.log_scale)
         return bool(
             away <= self.reach_m(time_ns)
             and turned <= TURN_SLACK_RAD + TURN_RATE_RAD_S * dt_s
@@ -119,115 +137,119 @@ class Hypothesis:
 
 
 class Agreement:
-    """The hypotheses of one flight. Mutable; not to be shared between threads."""
+    """The chains of one flight. Mutable; not to be shared between threads."""
 
     def __init__(self) -> None:
-        self.hypotheses: list[Hypothesis] = []
+        self.chains: list[Chain] = []
 
-    def see(self, seen: Sequence[Seen], time_ns: int, side_m: float, chance: float) -> None:
-        """Take in where a view `side_m` wide may have been taken.
+    def add_view(
+        self, places: Sequence[PlaceEvidence], time_ns: int, side_m: float, chance: float
+    ) -> None:
+        """Take in the places where a view `side_m` wide may have been taken.
 
-        `chance` is the probability that the best of wrong places lies by chance where a hypothesis
-        expects the view: the share that was looked at there of all that was looked at.
+        `chance`: probability that the best of the wrong places lies where a chain expects the view,
+        the share of the searched area that was searched there.
         """
         gain = math.log(FOUND / min(max(chance, CHANCE), FOUND))
-        made: list[Hypothesis] = []
-        speaking = [each for each in seen if _worth(each, gain) > 0]
-        for old in self.hypotheses:
-            if time_ns < old.time_ns or old.reach_m(time_ns) > MAX_REACH_M:
+        made: list[Chain] = []
+        supporting = [each for each in places if _support(each, gain) > 0]
+        for chain in self.chains:
+            if time_ns < chain.time_ns or chain.reach_m(time_ns) > MAX_REACH_M:
                 continue
             made += [
-                _followed(old, each, time_ns, side_m, gain)
-                for each in speaking
-                if old.fits(each, time_ns)
+                _extended(chain, each, time_ns, side_m, gain)
+                for each in supporting
+                if chain.reaches(each, time_ns)
             ]
-            made.append(replace(old, log_odds=old.log_odds - MISSED, missed=old.missed + 1))
-        # Last, for of two that say the same the one that is older comes first.
-        made += [_begun(each, time_ns) for each in seen]
-        kept = _distinct(made, side_m)
-        # Taken from all alike: what is not remembered must not make them equal.
-        beyond = max(0.0, kept[0].log_odds - FORGOTTEN_NATS) if kept else 0.0
-        self.hypotheses = [replace(each, log_odds=each.log_odds - beyond) for each in kept]
+            made.append(replace(chain, log_odds=chain.log_odds - MISSED, missed=chain.missed + 1))
+        # New chains come last: of two equal chains the older one comes first.
+        made += [_begun(each, time_ns) for each in places]
+        chains = _distinct(made, side_m)
+        # Subtracted from all alike: the limit must not make them equal.
+        excess = max(0.0, chains[0].log_odds - MAX_CHAIN_LOG_ODDS) if chains else 0.0
+        self.chains = [replace(each, log_odds=each.log_odds - excess) for each in chains]
 
     @property
-    def best(self) -> Hypothesis | None:
-        """The likeliest hypothesis, None where there is none."""
-        return self.hypotheses[0] if self.hypotheses else None
+    def best(self) -> Chain | None:
+        """The likeliest chain, None where there is none."""
+        return self.chains[0] if self.chains else None
 
     @property
     def probability(self) -> float:
-        """That of the likeliest, against all others and against none of them."""
-        if not self.hypotheses:
+        """Probability of the likeliest chain, against the other chains and none of them."""
+        if not self.chains:
             return 0.0
-        odds = np.array([0.0, *(each.log_odds for each in self.hypotheses)])
+        odds = np.array([0.0, *(each.log_odds for each in self.chains)])
         return float(np.exp(odds[1] - np.logaddexp.reduce(odds)))
 
     @property
     def confidence(self) -> float:
-        """Probability that the latest view is where the likeliest hypothesis has it: no more than
-        the view itself says where it was expected."""
+        """Probability that the latest view is where the likeliest chain has it: at most what the
+        view itself says of the expected place."""
         best = self.best
         if best is None:
             return 0.0
-        return min(self.probability, 1 / (1 + math.exp(-best.worth)))
+        return min(self.probability, 1 / (1 + math.exp(-best.latest_log_odds)))
 
     @property
     def agreed(self) -> bool:
-        """Whether enough views speak for the likeliest, the latest among them."""
+        """Whether enough views support the likeliest chain, the latest view among them."""
         best = self.best
         return best is not None and best.views >= MIN_VIEWS and best.missed == 0
 
 
-def _worth(seen: Seen, gain: float) -> float:
-    """What a view found where it was expected says, in nats."""
-    return min(seen.log_odds, MAX_LOG_ODDS) + gain
+def _support(place: PlaceEvidence, gain: float) -> float:
+    """Nats by which a view found at an expected place supports the chain."""
+    return min(place.log_odds, MAX_LOG_ODDS) + gain
 
 
-def _begun(seen: Seen, time_ns: int) -> Hypothesis:
-    odds = min(seen.log_odds, MAX_LOG_ODDS)
-    return Hypothesis(seen, time_ns, odds, 1.0, odds, ((seen.lat_deg, seen.lon_deg),))
+def _begun(place: PlaceEvidence, time_ns: int) -> Chain:
+    odds = min(place.log_odds, MAX_LOG_ODDS)
+    return Chain(place, time_ns, odds, 1.0, odds, ((place.lat_deg, place.lon_deg),))
 
 
-def _followed(old: Hypothesis, seen: Seen, time_ns: int, side_m: float, gain: float) -> Hypothesis:
-    place = seen.lat_deg, seen.lon_deg
-    nearest_m = float(distances_m([place] * len(old.anchors), old.anchors).min())
+def _extended(
+    chain: Chain, place: PlaceEvidence, time_ns: int, side_m: float, gain: float
+) -> Chain:
+    here = place.lat_deg, place.lon_deg
+    nearest_m = float(distances_m([here] * len(chain.anchors), chain.anchors).min())
     new = min(1.0, nearest_m / max(side_m, 1.0))
-    anchors = (*old.anchors, place)[-ANCHORS:]
+    anchors = (*chain.anchors, here)[-ANCHORS:]
     if new < MIN_NEW:
-        new, anchors = 0.0, old.anchors
-    worth = _worth(seen, gain)
-    return Hypothesis(
-        last=seen,
+        new, anchors = 0.0, chain.anchors
+    support = _support(place, gain)
+    return Chain(
+        last=place,
         time_ns=time_ns,
-        log_odds=max(old.log_odds + new * worth, min(seen.log_odds, MAX_LOG_ODDS)),
-        views=old.views + new,
-        worth=worth,
+        log_odds=max(chain.log_odds + new * support, min(place.log_odds, MAX_LOG_ODDS)),
+        views=chain.views + new,
+        latest_log_odds=support,
         anchors=anchors,
-        velocity_en_mps=_velocity(old, seen, (time_ns - old.time_ns) / 1e9),
+        velocity_en_mps=_velocity(chain, place, (time_ns - chain.time_ns) / 1e9),
     )
 
 
-def _velocity(old: Hypothesis, seen: Seen, dt_s: float) -> NDArray[np.float64] | None:
-    """Metres per second east and north from the last place to this one."""
+def _velocity(chain: Chain, place: PlaceEvidence, dt_s: float) -> NDArray[np.float64] | None:
+    """Metres per second east and north from the latest place of a chain to this one."""
     if dt_s < MIN_VELOCITY_S:
-        return old.velocity_en_mps
-    frame = LocalFrame(old.last.lat_deg, old.last.lon_deg)
-    velocity = frame.en_from_latlon(seen.lat_deg, seen.lon_deg) / dt_s
+        return chain.velocity_en_mps
+    frame = LocalFrame(chain.last.lat_deg, chain.last.lon_deg)
+    velocity = frame.en_from_latlon(place.lat_deg, place.lon_deg) / dt_s
     speed = float(np.hypot(*velocity))
     return np.asarray(velocity * min(1.0, MAX_SPEED_MPS / max(speed, 1e-9)))
 
 
-def _distinct(made: Sequence[Hypothesis], side_m: float) -> list[Hypothesis]:
-    """The likeliest of those that say the same, best first, without those that are hopeless."""
-    kept: list[Hypothesis] = []
+def _distinct(made: Sequence[Chain], side_m: float) -> list[Chain]:
+    """The likeliest of the chains that end at the same place, best first, without hopeless ones."""
+    chains: list[Chain] = []
     for each in sorted(made, key=lambda one: (-one.log_odds, -one.views)):
-        if kept and each.log_odds < kept[0].log_odds - HOPELESS:
+        if chains and each.log_odds < chains[0].log_odds - HOPELESS:
             break
         place = (each.last.lat_deg, each.last.lon_deg)
-        others = [(one.last.lat_deg, one.last.lon_deg) for one in kept]
+        others = [(one.last.lat_deg, one.last.lon_deg) for one in chains]
         near = others and distances_m([place] * len(others), others).min() < side_m / 4
         if not near:
-            kept.append(each)
-        if len(kept) == KEPT:
+            chains.append(each)
+        if len(chains) == MAX_CHAINS:
             break
-    return kept
+    return chains

@@ -1,9 +1,8 @@
-"""Building an atlas: every sheet is a task of its own, whoever does it and wherever.
+"""Building an atlas: every sheet is a task of its own, for any worker on any machine.
 
-A sheet is finished when its item is written, so whatever ends a build, by whichever signal, keeps
-what was finished, and the same command goes on from there. The same imagery, recipe and versions
-give the same atlas byte for byte, however many workers there were, on processors that calculate
-alike.
+A sheet is finished when its item is written, so an interrupted build keeps its finished sheets and
+the same command resumes it. The same imagery, recipe and versions give the same atlas byte for
+byte, with any number of workers, on processors that round alike.
 """
 
 import contextlib
@@ -11,29 +10,30 @@ import logging
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from orthonav.atlas.catalog import CATALOG, Atlas, NewSheet
-from orthonav.atlas.cluster import Failure, Runner
+from orthonav.atlas.build_report import BuildReport, SheetResult
+from orthonav.atlas.catalog import CATALOG, Atlas, SheetDescription
+from orthonav.atlas.cluster import Failure, TaskRunner
 from orthonav.atlas.coarse import write_coarse
 from orthonav.atlas.recipe import AtlasRecipe, CoarseRecipe
 from orthonav.atlas.scratch import scratch_folder
-from orthonav.atlas.store import Store
-from orthonav.atlas.tally import AtlasBuilt, SheetDone, Tally
-from orthonav.atlas.tasks import (
+from orthonav.atlas.sheet_tasks import (
     Imagery,
     SheetTask,
     is_same,
     margin_m,
     plan_sheets,
-    refuse_differences,
     request_digest,
+    require_same,
     version_differences,
     versions,
 )
+from orthonav.atlas.store import Store
 from orthonav.errors import AreaError, AtlasError, OrthonavError, WorkerError
+from orthonav.files import Progress
 from orthonav.geo.area import Area, Extent
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.route import Route
@@ -41,35 +41,29 @@ from orthonav.imagery.mosaic import Mosaic
 from orthonav.prepare.build import BuildRequest, build_map
 from orthonav.prepare.layout import grid_of
 
-__all__ = [
-    "AtlasBuilt",
-    "AtlasRequest",
-    "SheetDone",
-    "SheetTask",
-    "build_atlas",
-    "build_sheet",
-    "plan_sheets",
-]
-
 log = logging.getLogger(__name__)
 
 PROGRESS_EVERY_S = 10.0
+"""Between two lines of progress."""
 GIVE_UP_AFTER = 8
-"""So many sheets in a row that could not be stored end a build: the disk is full, or away."""
+"""Sheets in a row that could not be stored, after which a build ends: the disk is full or gone."""
 LEARNT = ("autoencoder", "triplet")
-"""Methods that a GPU speeds up."""
-Progress = Callable[[str, float], None]
+"""Methods for which a worker is given a GPU."""
 
 
 @dataclass(frozen=True)
 class AtlasRequest:
-    """What to build into the atlas at `url`, a folder or an fsspec URL, which need not be there.
+    """What to build into an atlas.
 
-    `recipe` are the fields of `AtlasRecipe` that are asked for; the others are the atlas's own, or
-    the usual ones (`gsd_m`: the imagery's); `coarse` may be some of its own. With neither
-    `bounds_deg` nor `route` all the imagery is the area. Sheets that are there are kept; with
-    `replace` those that were made otherwise are made anew. `index` also makes the index of the
-    coarse tiles.
+    `url`: the atlas, a folder or an fsspec URL, created where it does not exist.
+    `orthos`: files and folders of orthophotos; the first covers the next.
+    `recipe`: fields of `AtlasRecipe` that were requested, `coarse` with some or all of its own; the
+    others are the atlas's, or the defaults (`gsd_m`: that of the imagery).
+    `bounds_deg`: area: west, south, east, north.
+    `route`, `band_m`: area: a search band around a route, in metres. Without bounds or route all
+    imagery is the area.
+    `replace`: rebuild sheets that were made otherwise, instead of refusing them.
+    `index`: also make the index of the coarse tiles.
     """
 
     url: str
@@ -84,24 +78,24 @@ class AtlasRequest:
 
 def build_atlas(
     request: AtlasRequest,
-    runner: Runner,
+    runner: TaskRunner,
     progress: Progress | None = None,
-    tell: Callable[[str], None] = log.info,
-) -> AtlasBuilt:
-    """Build the sheets that are missing, by a runner that was entered, and say what came of them.
+    report: Callable[[str], None] = log.info,
+) -> BuildReport:
+    """Build the missing sheets with a runner that was entered, and report the results.
 
-    A sheet that fails is told of in the result, and the others are built. `progress` is called
-    with a stage and its share done, `tell` with lines for people. Raises `AreaError`,
-    `ImageryError`, `MissingFileError`; `AtlasError` where sheets that are there were made
-    otherwise; `WorkerError` where workers have other versions; `StorageError`.
+    A sheet that fails is listed in the result, and the others are built. `progress` is called
+    with a stage and its share done, `report` with lines for people. Raises `AreaError`,
+    `ImageryError`, `MissingFileError`; `AtlasError` where present sheets were made otherwise;
+    `WorkerError` where workers have other versions; `StorageError`.
     """
+    progress = progress or (lambda stage, share: None)
     started_s = time.monotonic()
-    report = progress or (lambda stage, share: None)
     orthos = [Path(path).absolute() for path in request.orthos]
     mosaic = Mosaic.open(orthos)
     recipe = recipe_for(request, mosaic)
     tasks = plan_sheets(
-        Store.open(request.url).url,
+        Store(request.url).url,
         recipe,
         mosaic,
         orthos,
@@ -113,53 +107,57 @@ def build_atlas(
     atlas = Atlas.open_or_create(request.url, recipe)
     known = atlas.sheets()
     if not request.replace:
-        refuse_differences(tasks, known)
-    todo = [task for task in tasks if task.sheet not in known or not is_same(task, known)]
-    tally = Tally(len(tasks), started_s)
+        require_same(tasks, known)
+    result = BuildReport(atlas.url, len(tasks), started_s)
+    missing = []
     for task in tasks:
         if task.sheet in known and is_same(task, known):
-            tally.take(SheetDone(task.sheet, "kept", area_km2=known[task.sheet].area_km2))
-    tell(_announced(tally, tasks, recipe, runner))
-    _work(todo, recipe, runner, tally, report, tell)
-    whole = request.index and recipe.coarse is not None and not tally.failed
-    tally.finish_error = _finished(atlas, whole, report)
-    return tally.result(atlas.url)
+            area_km2 = known[task.sheet].area_km2
+            result.add(task.sheet, SheetResult(task.sheet, "unchanged", area_km2=area_km2))
+        else:
+            missing.append(task)
+    unchanged = f", {result.done} are there already" if result.done else ""
+    report(
+        f"{len(tasks):,} sheets of at most {recipe.sheet_km:g} km at {recipe.gsd_m:g} m"
+        f"{unchanged}; {len(missing):,} to build, {runner.at_once} at a time"
+    )
+    _build_sheets(missing, recipe, runner, result, progress, report)
+    index = request.index and recipe.coarse is not None and not result.failed
+    result.finish_error = _finish(atlas, index, progress)
+    result.wall_s = time.monotonic() - started_s
+    return result
 
 
 def recipe_for(request: AtlasRequest, mosaic: Mosaic) -> AtlasRecipe:
-    """The recipe asked for. Raises `AtlasError` where it cannot be, or is not the atlas's."""
+    """The requested recipe. Raises `AtlasError` where it is impossible, or not the atlas's."""
     try:
-        if Store.open(request.url).size(CATALOG) is not None:
-            there = Atlas.open(request.url).recipe
-            wanted = replace(there, **_given(request, there.coarse))
-            if differences := there.differences(wanted):
-                raise AtlasError(
-                    "all sheets of an atlas are made alike; this one has "
-                    f"{'; '.join(differences)}: {request.url}"
-                )
+        if Store(request.url).size(CATALOG) is not None:
+            atlas = Atlas.open(request.url)
+            wanted = replace(atlas.recipe, **_requested(request, atlas.recipe.coarse))
+            atlas.require_recipe(wanted)
             return wanted
-        recipe = AtlasRecipe(**{"gsd_m": mosaic.gsd_m, **_given(request, None)})
+        recipe = AtlasRecipe(**{"gsd_m": mosaic.gsd_m, **_requested(request, None)})
         recipe = AtlasRecipe.from_plain(recipe.to_plain())  # checks it
-        if "gsd_m" in request.recipe:
-            return recipe
-        return replace(recipe, gsd_m=_usual_gsd_m(mosaic, recipe))
     except TypeError as error:
         raise AtlasError(f"recipe of the atlas is impossible: {error}") from error
+    if "gsd_m" in request.recipe:
+        return recipe
+    return replace(recipe, gsd_m=_default_gsd_m(mosaic, recipe))
 
 
-def _given(request: AtlasRequest, coarse: CoarseRecipe | None) -> dict[str, Any]:
-    """Fields of the recipe that were asked for; of coarse tiles some may be."""
-    given = dict(request.recipe)
-    if isinstance(given.get("coarse"), Mapping):
-        given["coarse"] = replace(coarse or CoarseRecipe(), **given["coarse"])
-    return given
+def _requested(request: AtlasRequest, coarse: CoarseRecipe | None) -> dict[str, Any]:
+    """The requested fields of the recipe; those of the coarse tiles completed."""
+    fields = dict(request.recipe)
+    if isinstance(fields.get("coarse"), Mapping):
+        fields["coarse"] = replace(coarse or CoarseRecipe(), **fields["coarse"])
+    return fields
 
 
-def build_sheet(task: SheetTask) -> SheetDone:
-    """Build a sheet and put it into the atlas. Depends on nothing but the task and the imagery.
+def build_sheet(task: SheetTask) -> SheetResult:
+    """Build a sheet and put it into the atlas. Depends only on the task and the imagery.
 
-    Raises `AtlasError` where this program's versions or its imagery are not the task's,
-    `ImageryError`, `OutputError`, `StorageError`.
+    Raises `WorkerError` where this program has other versions than the task, `AtlasError` where it
+    sees other imagery, `ImageryError`, `OutputError`, `StorageError`.
     """
     wall_s, cpu_s = time.perf_counter(), time.process_time()
     if differences := version_differences(task.made_by, versions()):
@@ -169,7 +167,7 @@ def build_sheet(task: SheetTask) -> SheetDone:
         raise AtlasError("the imagery has changed, or is not the same on all machines")
     with scratch_folder() as folder:
         tiles, area_km2, size_bytes = _built(task, mosaic, folder)
-    return SheetDone(
+    return SheetResult(
         task.sheet,
         "built" if tiles else "empty",
         cpu_s=time.process_time() - cpu_s,
@@ -183,36 +181,30 @@ def build_sheet(task: SheetTask) -> SheetDone:
 
 def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> tuple[int, float, int]:
     """Tiles, km2 and bytes of a sheet that is now in the atlas; zeros where it has no imagery."""
-    recipe = task.recipe
+    recipe = asdict(task.recipe)
+    del recipe["sheet_km"], recipe["coarse"]
     files = {"map": folder / f"{task.sheet}.onav"}
     request = BuildRequest(
         orthos=task.orthos,
         out=files["map"],
         bounds_deg=task.bounds_deg,
-        gsd_m=recipe.gsd_m,
-        tile_px=recipe.tile_px,
-        overlap=recipe.overlap,
-        method=recipe.method,
-        edges=recipe.edges,
-        seed=recipe.seed,
-        registration=recipe.registration,
-        calibration_views=recipe.calibration_views,
         workers=1,
         cells=True,
+        **recipe,
     )
     try:
-        manifest = build_map(request, tell=log.debug).manifest
-    except AreaError as error:  # the recipe was tried when the task was made: it is the imagery
+        manifest = build_map(request, announce=log.debug).manifest
+    except AreaError as error:  # the recipe was tried when the task was made: no imagery
         log.info("%s is empty: %s", task.sheet, error)
         return 0, 0.0, 0
-    if recipe.coarse is not None:
+    if task.recipe.coarse is not None:
         files["coarse"] = folder / f"{task.sheet}.safetensors"
-        write_coarse(mosaic, task.bounds_deg, recipe.coarse, files["coarse"])
+        write_coarse(mosaic, task.bounds_deg, task.recipe.coarse, files["coarse"])
     info = manifest.sheets[0]
-    described = NewSheet(
+    described = SheetDescription(
         id=task.sheet,
         bounds_deg=task.bounds_deg,
-        gsd_m=recipe.gsd_m,
+        gsd_m=task.recipe.gsd_m,
         tiles=info.tiles,
         area_km2=info.area_km2,
         dates=task.dates,
@@ -220,55 +212,43 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> tuple[int, float, i
         request=task.request,
         made_by=task.made_by,
     )
-    put = Atlas.open(task.atlas).put(task.sheet, files, described)
-    return info.tiles, info.area_km2, put.size_bytes
+    sheet = Atlas.open(task.atlas).put(files, described)
+    return info.tiles, info.area_km2, sheet.size_bytes
 
 
-def _work(
-    todo: Sequence[SheetTask],
+def _build_sheets(
+    tasks: Sequence[SheetTask],
     recipe: AtlasRecipe,
-    runner: Runner,
-    tally: Tally,
-    report: Progress,
-    tell: Callable[[str], None],
+    runner: TaskRunner,
+    result: BuildReport,
+    progress: Progress,
+    report: Callable[[str], None],
 ) -> None:
-    """Have the sheets built; `tally` knows what came of them."""
-    progress_s = time.monotonic()
-    in_a_row = 0
+    """Have the sheets built and add what comes of them to `result`."""
+    reported_s = time.monotonic()
+    not_stored = 0
     gpu = recipe.method.partition(":")[0] in LEARNT
-    finished = runner.run(build_sheet, todo, gpu=gpu)
+    finished = runner.run(build_sheet, tasks, gpu=gpu)
     for task, made in finished:
+        result.add(task.sheet, made)
         if isinstance(made, Failure):
-            tally.fail(task.sheet, made)
             log.info("sheet %s failed: %s: %s", task.sheet, made.kind, made.text)
             log.debug("%s", made.trace)
-            in_a_row = in_a_row + 1 if made.kind in ("StorageError", "OutputError") else 0
+            not_stored = not_stored + 1 if made.kind in ("StorageError", "OutputError") else 0
         else:
-            tally.take(made)
-            in_a_row = 0
-        report("sheets", tally.share)
-        if in_a_row >= GIVE_UP_AFTER:
-            tell(f"{in_a_row} sheets in a row could not be stored: the others are not tried")
+            not_stored = 0
+        progress("sheets", result.share)
+        if not_stored >= GIVE_UP_AFTER:
+            report(f"{not_stored} sheets in a row could not be stored: the others are not tried")
             getattr(finished, "close", lambda: None)()
             return
-        if time.monotonic() - progress_s >= PROGRESS_EVERY_S:
-            progress_s = time.monotonic()
-            tell(tally.line())
+        if time.monotonic() - reported_s >= PROGRESS_EVERY_S:
+            reported_s = time.monotonic()
+            report(result.line())
 
 
-def _announced(
-    tally: Tally, tasks: Sequence[SheetTask], recipe: AtlasRecipe, runner: Runner
-) -> str:
-    left = len(tasks) - tally.done
-    kept = f", {tally.done} are there already" if tally.done else ""
-    return (
-        f"{len(tasks):,} sheets of at most {recipe.sheet_km:g} km at {recipe.gsd_m:g} m{kept}; "
-        f"{left:,} to build, {runner.at_once} at a time"
-    )
-
-
-def _require_same_versions(runner: Runner) -> None:
-    """Raises `WorkerError` naming the difference where a machine would make other bytes."""
+def _require_same_versions(runner: TaskRunner) -> None:
+    """Raise `WorkerError` where a machine has other versions and would make other bytes."""
     wanted = versions()
     for name, found in runner.everywhere(versions):
         if isinstance(found, Failure):
@@ -284,29 +264,29 @@ def _other_versions(name: str, differences: Sequence[str]) -> str:
     )
 
 
-def _finished(atlas: Atlas, index: bool, report: Progress) -> str | None:
-    """Write snapshot and index; what went wrong where they cannot be: the sheets are there."""
+def _finish(atlas: Atlas, index: bool, progress: Progress) -> str | None:
+    """Write snapshot and index; the error where that fails, which loses no sheet."""
     try:
         atlas.snapshot()
         if index:
             from orthonav.atlas.index import make_index  # with FAISS
 
-            make_index(atlas, progress=report)
+            make_index(atlas, progress=progress)
     except OrthonavError as error:
         return str(error)
     return None
 
 
-def _usual_gsd_m(mosaic: Mosaic, recipe: AtlasRecipe) -> float:
-    """The ground resolution of the imagery as people state it."""
+def _default_gsd_m(mosaic: Mosaic, recipe: AtlasRecipe) -> float:
+    """The ground resolution of the imagery, rounded as for a single map."""
     side_m = recipe.sheet_km * 1000
     area = Area(LocalFrame(0.0, 0.0), (0.0, 0.0, side_m, side_m))
     return grid_of(area, mosaic.gsd_m, None, recipe.tile_px, recipe.overlap).gsd_m
 
 
 def _peak_bytes() -> int:
-    """Most memory that this process ever had: it remembers the sheets before, too."""
-    with contextlib.suppress(OSError):  # Linux's own count: the other remembers the parent, too
+    """Greatest memory that this process ever had, earlier sheets included."""
+    with contextlib.suppress(OSError):  # Linux's own count: getrusage's includes the parent's
         status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
         for line in status.splitlines():
             if line.startswith("VmHWM:"):

@@ -1,4 +1,7 @@
-"""Files of a far atlas kept on this machine: named by their content, the least used go first."""
+"""Local copies of files of a remote atlas, named by their content; the least used are removed.
+
+fsspec's own file cache neither verifies contents nor limits its size, so it is not used.
+"""
 
 import logging
 import os
@@ -6,18 +9,19 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from orthonav.atlas.trouble import told
+from orthonav.atlas.storage_errors import storage_errors
 from orthonav.errors import StorageError
 
 log = logging.getLogger(__name__)
 
 LIMIT_BYTES = 20 * 10**9
+"""Some 200 sheets of 100 km2 at 1 m, 70 to 100 MB each (docs/country.md)."""
 GRACE_S = 600.0
-"""Files used since are never removed: somebody is about to open them."""
+"""Files used within this time are not removed: a process may be about to open them."""
 
 
 def cache_folder() -> Path:
-    """Where files are kept: `ORTHONAV_CACHE`, else the user's folder for such things."""
+    """The folder of the cache: `ORTHONAV_CACHE`, otherwise the cache folder of the user."""
     own = os.environ.get("ORTHONAV_CACHE")
     if own:
         return Path(own).expanduser()
@@ -26,18 +30,18 @@ def cache_folder() -> Path:
 
 
 def cache_limit_bytes() -> int:
-    """How much may be kept: `ORTHONAV_CACHE_GB`, else 20 GB. Raises `StorageError`."""
-    told_gb = os.environ.get("ORTHONAV_CACHE_GB")
+    """Size limit of the cache: `ORTHONAV_CACHE_GB`, otherwise 20 GB. Raises `StorageError`."""
+    gigabytes = os.environ.get("ORTHONAV_CACHE_GB")
     try:
-        return int(float(told_gb) * 1e9) if told_gb else LIMIT_BYTES
+        return int(float(gigabytes) * 1e9) if gigabytes else LIMIT_BYTES
     except (ValueError, OverflowError) as error:
-        raise StorageError(f"ORTHONAV_CACHE_GB must be a number, got {told_gb!r:.40}") from error
+        raise StorageError(f"ORTHONAV_CACHE_GB must be a number, got {gigabytes!r:.40}") from error
 
 
 class ContentCache:
-    """A folder of files named by their SHA-256, at most about `limit_bytes` of them.
+    """A folder of files named by their SHA-256, of about `limit_bytes` in all.
 
-    Many processes may use it at once.
+    Several processes may use it at the same time.
     """
 
     def __init__(self, folder: Path, limit_bytes: int = LIMIT_BYTES) -> None:
@@ -45,9 +49,9 @@ class ContentCache:
         self.limit_bytes = limit_bytes
 
     def get(self, sha256: str, suffix: str, size: int, fill: Callable[[Path], None]) -> Path:
-        """The file of that content; `fill` writes it to a path, verified, where it is not here."""
+        """The file with that content; if missing, `fill` writes it, verified, to a path."""
         path = self.folder / sha256[:2] / f"{sha256}{suffix}"
-        with told(str(self.folder), "keep files of the atlas in its cache (ORTHONAV_CACHE)"):
+        with storage_errors(str(self.folder), "write to the cache of the atlas (ORTHONAV_CACHE)"):
             if path.is_file() and path.stat().st_size == size:
                 os.utime(path)  # last used now
                 return path
@@ -56,19 +60,19 @@ class ContentCache:
         return path
 
     def _shrink(self, newest: Path) -> None:
-        """Remove what was not used for longest until the limit holds."""
+        """Remove the least recently used files until the limit holds."""
         files = []
         for path in self.folder.glob("??/*"):
             try:
                 state = path.stat()
-            except FileNotFoundError:  # another process was faster
+            except FileNotFoundError:  # removed by another process
                 continue
             files.append((state.st_mtime, state.st_size, path))
-        too_much = sum(size for _, size, _ in files) - self.limit_bytes
+        excess = sum(size for _, size, _ in files) - self.limit_bytes
         for used, size, path in sorted(files):
-            if too_much <= 0:
+            if excess <= 0:
                 return
             if path != newest and time.time() - used > GRACE_S:
                 path.unlink(missing_ok=True)
-                too_much -= size
+                excess -= size
                 log.debug("cache: removed %s", path.name)

@@ -1,10 +1,9 @@
-"""Where work is done: in this process, or by Ray on all cores of a machine or of many.
+"""Runners of tasks: in this process, or by Ray on all cores of one or many machines.
 
-Runners know nothing of sheets: they take a function and items, and give what came of each as it is
-finished. An item that fails becomes a `Failure` and the others go on.
+A runner takes a function and items and yields the result of each item when it is finished. An item
+that fails gives a `Failure`, and the others continue.
 """
 
-import importlib
 import itertools
 import logging
 import os
@@ -14,11 +13,11 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
-from orthonav.errors import MissingExtraError, OrthonavError, WorkerError
-from orthonav.prepare.sheet import usable_cores
+from orthonav.cores import usable_cores
+from orthonav.errors import OrthonavError, WorkerError
+from orthonav.extras import needed
 
 log = logging.getLogger(__name__)
 
@@ -26,80 +25,52 @@ Item = TypeVar("Item")
 Made = TypeVar("Made")
 
 RETRIES = 3
-"""How often an item is begun again where the process or the machine that was at it has died."""
+"""How often an item is started again where its process or machine died."""
 WINDOW = 2
-"""Items given out at a time for each core: one being made, one waiting."""
+"""Items submitted at a time for each core: one running, one waiting."""
 POLL_S = 1.0
+"""How long is waited for results before free cores are counted again."""
 PROBE_S = 120.0
+"""How long a machine may take to start a process and answer."""
 STOP_S = 15.0
 """How long processes may take to clean up before they are killed."""
 OBJECTS_BYTES = 100 * 2**20
-"""Shared memory of a cluster of this machine: what goes to and fro is small."""
+"""Shared memory of a local cluster; items and results are small."""
 ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
     "OPENCV_LOG_LEVEL": "OFF",
     "OPENCV_IO_MAX_IMAGE_PIXELS": str(2**28),
 }
-"""Of the workers, as the command line sets it for itself."""
+"""Environment of the workers, as the command line sets it for itself."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """What an item failed of: the name of the error and what it says; `trace` for bugs only."""
+    """Why an item failed: name and text of the error, and the traceback of an unexpected one."""
 
     kind: str
     text: str
     trace: str = ""
 
 
-class Runner(Protocol):
-    """A context manager that does work."""
-
-    @property
-    def at_once(self) -> int:
-        """Items that are worked on at the same time."""
-        ...
-
-    def everywhere(self, probe: Callable[[], Made]) -> list[tuple[str, Made | Failure]]:
-        """What a function gives on every machine, each with its name."""
-        ...
-
-    def run(
-        self, work: Callable[[Item], Made], items: Sequence[Item], *, gpu: bool = False
-    ) -> Iterator[tuple[Item, Made | Failure]]:
-        """What comes of each item, as it is finished; ending early ends what is under way.
-
-        With `gpu` each item has one to itself, where there are any.
-        """
-        ...
-
-    def __enter__(self) -> "Runner": ...
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None: ...
-
-
-class PlainRunner:
-    """Everything in this process, one after the other."""
+class SerialRunner:
+    """Runs items in this process, one after the other."""
 
     at_once = 1
+    """Number of items that run at the same time."""
 
     def everywhere(self, probe: Callable[[], Made]) -> list[tuple[str, Made | Failure]]:
-        """What the function gives here."""
+        """The result of a function on every machine, each with the machine's name: here on one."""
         return [("this machine", probe())]
 
     def run(
         self, work: Callable[[Item], Made], items: Sequence[Item], *, gpu: bool = False
     ) -> Iterator[tuple[Item, Made | Failure]]:
-        """In the order of the items."""
+        """Each item with its result, in order; `gpu` has no effect."""
         for item in items:
             yield item, attempted(work, item)
 
-    def __enter__(self) -> "PlainRunner":
+    def __enter__(self) -> "SerialRunner":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -107,9 +78,9 @@ class PlainRunner:
 
 
 class RayRunner:
-    """Work on a Ray cluster: one of this machine, begun and ended here, or the one at an address.
+    """Runs items on a Ray cluster: a local one, started and stopped here, or one at an address.
 
-    `workers` bounds the items at a time, None: as many as there are cores.
+    `workers`: greatest number of items at a time, None: the number of cores.
     """
 
     def __init__(self, address: str | None = None, workers: int | None = None) -> None:
@@ -121,26 +92,30 @@ class RayRunner:
 
     @property
     def at_once(self) -> int:
-        """As many as the cluster has cores now; machines may come and go."""
+        """The number of cores of the cluster at present, at most `workers`."""
         cores = int(self._ray.cluster_resources().get("CPU", 0))
         return max(1, cores if self._workers is None else min(cores, self._workers))
 
     def everywhere(self, probe: Callable[[], Made]) -> list[tuple[str, Made | Failure]]:
-        """What the function gives on every machine that has cores and is there now."""
+        """The result of the function on every machine that has cores and is present now."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-        asked = []
+        probes = []
         for node in self._ray.nodes():
             if node["Alive"] and node["Resources"].get("CPU", 0) >= 1:
                 here = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
                 task = self._task(num_cpus=0, scheduling_strategy=here)
-                asked.append((str(node["NodeManagerHostname"]), task.remote(_called, probe)))
-        return [(name, self._made(ref, PROBE_S)) for name, ref in asked]
+                probes.append((str(node["NodeManagerHostname"]), task.remote(_called, probe)))
+        return [(name, self._made(ref, PROBE_S)) for name, ref in probes]
 
     def run(
         self, work: Callable[[Item], Made], items: Sequence[Item], *, gpu: bool = False
     ) -> Iterator[tuple[Item, Made | Failure]]:
-        """As they are finished; what died with its process is done again, `RETRIES` times."""
+        """Each item with its result, when it is finished; closing the iterator stops the others.
+
+        With `gpu` each item has a GPU to itself, where there are any. Items whose process died are
+        tried again `RETRIES` times.
+        """
         has_gpu = gpu and self._ray.cluster_resources().get("GPU", 0) >= 1
         task = self._task(num_cpus=1, num_gpus=1 if has_gpu else 0)
         waiting = iter(items)
@@ -163,7 +138,7 @@ class RayRunner:
         return self.at_once if self._workers is not None else WINDOW * self.at_once
 
     def _task(self, **options: Any) -> Any:
-        # What an item raises is given back as a value: Ray tries again only where a process died.
+        # Errors of an item are returned as values: Ray tries again only where a process died.
         return self._ray.remote(attempted).options(max_retries=RETRIES, **options)
 
     def _made(self, ref: Any, timeout_s: float | None = None) -> Any:
@@ -171,11 +146,11 @@ class RayRunner:
             return self._ray.get(ref, timeout=timeout_s)
         except self._ray.exceptions.RayError as error:
             why = (str(error).strip().splitlines() or [""])[0]
-            text = f"the process that was at it ended on its own or could not begin ({why:.300})"
+            text = f"its process died or could not be started ({why:.300})"
             return Failure(WorkerError.__name__, text, str(error))
 
     def _stop(self, refs: list[Any]) -> None:
-        """End what is under way: asked first, so that temporary files go, then by force."""
+        """Stop running items: by request, so that they remove temporary files, then by force."""
         if not refs:
             return
         for ref in refs:
@@ -215,8 +190,12 @@ class RayRunner:
             self._ray.shutdown()
 
 
+TaskRunner = SerialRunner | RayRunner
+"""A context manager that runs tasks."""
+
+
 def attempted(work: Callable[[Item], Made], item: Item) -> Made | Failure:
-    """What comes of an item, or of what it failed: one bad item must not end a night's work."""
+    """The result of an item, or its failure: one bad item must not stop the others."""
     try:
         return work(item)
     except OrthonavError as error:
@@ -229,7 +208,7 @@ def attempted(work: Callable[[Item], Made], item: Item) -> Made | Failure:
 
 @contextmanager
 def _own_sigterm() -> Iterator[None]:
-    """Keep what SIGTERM does: Ray would end the program at once."""
+    """Keep the handler of SIGTERM: Ray's own would end the program at once."""
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may change signals
         return
@@ -245,12 +224,6 @@ def _called(probe: Callable[[], Made]) -> Made:
 
 
 def _imported() -> Any:
-    # Read when Ray is loaded: it would tell its makers that it runs.
+    # Read when Ray is imported: it turns Ray's usage reports off.
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    try:
-        return importlib.import_module("ray")
-    except ImportError as error:
-        raise MissingExtraError(
-            "building on several cores or machines needs Ray, which is not installed: "
-            "pip install 'orthonav[cluster]'"
-        ) from error
+    return needed("ray", "cluster", "building on several cores or machines")

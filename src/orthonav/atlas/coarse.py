@@ -1,8 +1,8 @@
-"""Coarse tiles of a sheet: what the index of an atlas is made of.
+"""The coarse tiles of a sheet, from which the index of an atlas is made.
 
-Wide tiles at low resolution, as features before any learning: what is learnt of them belongs to
-the index of the whole atlas. Tiles belong to the sheet in whose lattice box their centre lies, and
-reach half a tile beyond it, so that every place of the atlas lies within half a stride of a centre.
+They are wide tiles at low resolution, stored as features before any learning, because whitening is
+learnt for the whole atlas. A tile belongs to the sheet whose box holds its centre, and may reach
+half a tile beyond the box. So every place of the atlas is within half a stride of a tile centre.
 """
 
 import errno
@@ -34,12 +34,14 @@ FORMAT = "orthonav-coarse"
 SCHEMA = 1
 METADATA_KEY = "orthonav"
 EDGES = "gradient"
-"""What coarse tiles and the views looked for among them show, whatever the maps are made of."""
+"""Representation of coarse tiles and of views searched among them, independent of the maps'."""
 POOLING = WhitenedRecipe()
 MIN_VALID_SHARE = 0.5
+"""Share of a tile that must show imagery, as for the tiles of a map."""
 MAX_TILES = 1_000_000
-"""Of a sheet: one of 45 km with tiles 50 m apart has 800,000."""
+"""Greatest number of a sheet: 45 km with tiles 50 m apart are 800,000."""
 MAX_FEATURES = 16_384
+"""Greatest number per tile: 16 x 16 cells of 64 channels."""
 FULL = 255
 """A cell that is valid everywhere."""
 _CHUNK_TILES = 512
@@ -48,11 +50,13 @@ _SLACK_DEG = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class CoarseTiles:
-    """Coarse tiles of a sheet, in the order of rows from north to south; arrays are read-only.
+    """Coarse tiles of a sheet, in rows from north to south; arrays are read-only.
 
-    `centres_latlon_deg` (N, 2) float64; `features` (N, F) float16, F being cells x cells x
-    channels; `valid` (N, cells x cells) uint8, 255 where all of a cell shows imagery. `bounds_deg`
-    is the sheet's box. N is 0 where the sheet has no tile with enough imagery under it.
+    `recipe`: how they were made.
+    `bounds_deg`: box of the sheet: west, south, east, north.
+    `centres_latlon_deg` (N, 2) float64; N is 0 where no tile shows enough imagery.
+    `features` (N, F) float16: F is cells x cells x channels.
+    `valid` (N, cells x cells) uint8: 255 where all of a cell shows imagery.
     """
 
     recipe: CoarseRecipe
@@ -61,15 +65,16 @@ class CoarseTiles:
     features: NDArray[np.float16]
     valid: NDArray[np.uint8]
 
-    @property
-    def weights(self) -> NDArray[np.float32]:
-        """The valid share (N, F) of the cell that each feature belongs to."""
-        share = self.valid.astype(np.float32) / FULL
-        return np.repeat(share, self.features.shape[1] // max(1, self.valid.shape[1]), axis=1)
+    def features_of(self, tiles: slice) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Features (n, F) of some tiles, and weights (n, F): the valid share of each feature's
+        cell."""
+        share = self.valid[tiles].astype(np.float32) / FULL
+        repeats = self.features.shape[1] // max(1, self.valid.shape[1])
+        return self.features[tiles].astype(np.float32), np.repeat(share, repeats, axis=1)
 
 
 def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> CoarseTiles:
-    """The coarse tiles whose centres lie in a box, read from the imagery with one thread.
+    """The coarse tiles whose centres lie in a box, made from the imagery with one thread.
 
     Raises `AreaError` for impossible recipes, `ImageryError` where the imagery cannot be read.
     """
@@ -104,9 +109,9 @@ def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> Coa
 
 
 def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path: Path) -> int:
-    """Write the coarse tiles of a box to `path`, whole or not at all; returns how many there are.
+    """Write the coarse tiles of a box to `path`, whole or not at all; returns their number.
 
-    The same bytes every time. Raises as `make_coarse`, and `OutputError`.
+    The bytes are the same every time. Raises as `make_coarse`, and `OutputError`.
     """
     made = make_coarse(mosaic, bounds_deg, recipe)
     arrays = {
@@ -117,7 +122,7 @@ def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path:
     with replacing(path) as temporary:
         try:
             contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-            save_file(contiguous, temporary, metadata={METADATA_KEY: _told(made)})
+            save_file(contiguous, temporary, metadata={METADATA_KEY: _metadata(made)})
         except SafetensorError as error:
             if f"os error {errno.ENOSPC}" in str(error):
                 raise OSError(errno.ENOSPC, "disk full") from error
@@ -126,19 +131,19 @@ def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path:
 
 
 def read_coarse(path: Path) -> CoarseTiles:
-    """The coarse tiles in a file, all of it checked.
+    """The coarse tiles in a file, completely checked.
 
-    Raises `MissingFileError`, and `AtlasError` where it is not what `write_coarse` writes.
+    Raises `MissingFileError`, and `AtlasError` where `write_coarse` cannot have written it.
     """
     path = require_file(path, "coarse tiles")
     try:
         with safe_open(path, framework="numpy") as stored:
-            told = (stored.metadata() or {}).get(METADATA_KEY)
+            metadata = (stored.metadata() or {}).get(METADATA_KEY)
             names = set(stored.keys())
-            if told is None or names != {"centres_latlon_deg", "features", "valid"}:
+            if metadata is None or names != {"centres_latlon_deg", "features", "valid"}:
                 raise AtlasError(f"not coarse tiles of an atlas: {path}")
             arrays = {name: stored.get_tensor(name) for name in sorted(names)}
-        recipe, bounds_deg = _about(told)
+        recipe, bounds_deg = _parsed(metadata)
         return _checked(recipe, bounds_deg, arrays)
     except AtlasError as error:
         raise AtlasError(f"{error}: {path}") from error
@@ -147,21 +152,21 @@ def read_coarse(path: Path) -> CoarseTiles:
 
 
 class _NoCrops(CropSampler):
-    """Nothing is calibrated here."""
+    """A sampler without crops: coarse tiles are not calibrated."""
 
     def places(self, height: int, width: int, share: float) -> NDArray[np.intp]:
-        """None."""
+        """No places (0, 2)."""
         return np.zeros((0, 2), np.intp)
 
 
 def _inside(latlon_deg: NDArray[np.float64], bounds_deg: Extent) -> NDArray[np.bool_]:
-    """Which of the places (N, 2) lie in a box; what lies on its border belongs to south or west."""
+    """Which places (N, 2) lie in a box, its southern and western border included."""
     west, south, east, north = bounds_deg
     lat, turned = latlon_deg[:, 0], (latlon_deg[:, 1] - west) % 360
     return np.asarray((lat >= south) & (lat < north) & (turned < (east - west)))
 
 
-def _told(made: CoarseTiles) -> str:
+def _metadata(made: CoarseTiles) -> str:
     plain = {
         "format": FORMAT,
         "schema": SCHEMA,
@@ -173,14 +178,17 @@ def _told(made: CoarseTiles) -> str:
     return json.dumps(plain, sort_keys=True, separators=(",", ":"))
 
 
-def _about(told: str) -> tuple[CoarseRecipe, Extent]:
-    plain: Any = json.loads(told)
+def _parsed(metadata: str) -> tuple[CoarseRecipe, Extent]:
+    plain: Any = json.loads(metadata)
     if plain["format"] != FORMAT:
         raise AtlasError("not coarse tiles of an atlas")
     if plain["schema"] != SCHEMA:
         raise AtlasError(f"coarse tiles of schema {plain['schema']!r:.20}, this program reads 1")
     if (plain["edges"], plain["cells"]) != (EDGES, POOLING.cells):
-        raise AtlasError("coarse tiles were made of something that this program cannot compare")
+        raise AtlasError(
+            f"coarse tiles show {plain['edges']!r:.40} in {plain['cells']!r:.20} cells, "
+            f"this program compares {EDGES} in {POOLING.cells}"
+        )
     recipe = CoarseRecipe(**plain["recipe"])
     numbers = [recipe.gsd_m, recipe.tile_px, recipe.overlap, *plain["bounds_deg"]]
     usable = asdict(recipe) == plain["recipe"] and 0 <= recipe.overlap < 1

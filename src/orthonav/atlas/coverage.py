@@ -1,4 +1,4 @@
-"""Where an atlas reaches: which sheets an area lacks, and whether its route is on what there is."""
+"""Coverage of an area by an atlas: missing sheets, and gaps under the route."""
 
 import logging
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.warp import Source
+from orthonav.atlas.warp import SheetSource
 from orthonav.embed.whitened import CellSheet
 from orthonav.errors import AreaError, AtlasError
 from orthonav.geo.area import Area, Extent
@@ -18,15 +18,18 @@ from orthonav.prepare.layout import MIN_TILE_VALID_SHARE
 
 log = logging.getLogger(__name__)
 
-MOST_PLACES = 20_000
-EDGE_POINTS = 33
+MAX_TILES = 20_000
+"""Tiles of an area that are checked; more are checked at even spacing."""
+EDGE_POINTS = 34
+"""Points along an edge of a box: edges are not straight in degrees."""
 NAMED = 8
-"""So many missing sheets are named in a message."""
+"""Missing sheets named in a message, at most."""
 Array = NDArray[np.float64]
 
 
-def box_deg(area: Area, margin_m: float) -> Extent:
-    """West, south, east, north in degrees of an area and a margin around it."""
+def box_around(area: Area, margin_m: float) -> Extent:
+    """West, south, east, north in degrees of an area and a margin around it; west and east may lie
+    beyond 180 degrees."""
     west, south, east, north = area.extent_en_m
     x = np.linspace(west - margin_m, east + margin_m, EDGE_POINTS)
     y = np.linspace(south - margin_m, north + margin_m, EDGE_POINTS)
@@ -36,12 +39,22 @@ def box_deg(area: Area, margin_m: float) -> Extent:
     )
     lat, lon = area.frame.latlon_from_en(edge)
     lon = lon - 360 * np.round((lon - area.frame.lon_deg) / 360)
-    left, right = ((float(each) + 180) % 360 - 180 for each in (lon.min(), lon.max()))
-    return left, float(lat.min()), right, float(lat.max())
+    return float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())
+
+
+def box_deg(area: Area, margin_m: float) -> Extent:
+    """The same with west and east from -180 to 180; across the antimeridian west is greater."""
+    west, south, east, north = box_around(area, margin_m)
+    return turned(west), south, turned(east), north
+
+
+def turned(lon_deg: float) -> float:
+    """A longitude from -180, without 180."""
+    return (lon_deg + 180) % 360 - 180
 
 
 def require_sheets(atlas: Atlas, found: Sequence[object]) -> None:
-    """Raise `AreaError` saying what the atlas covers where no sheet was found."""
+    """Raise `AreaError` with the extent of the atlas where no sheet was found."""
     if found:
         return
     sheets = atlas.sheets().values()
@@ -59,13 +72,13 @@ def require_sheets(atlas: Atlas, found: Sequence[object]) -> None:
 def check_covered(
     area: Area,
     grid: TileGrid,
-    sources: Sequence[Source],
+    sources: Sequence[SheetSource],
     lattice: WorldSheets,
     allow_holes: bool,
 ) -> None:
-    """Warn where sheets under an area are missing; `AtlasError` where the route lies on them.
+    """Warn where sheets under an area are missing; `AtlasError` where they lie under the route.
 
-    `allow_holes` makes that a warning too. Raises `AreaError` where no part is covered.
+    With `allow_holes` that is a warning too. Raises `AreaError` where no part is covered.
     """
     tiles = _some_tiles(area, grid)
     lat, lon = area.frame.latlon_from_en(grid.centres_en_m(tiles))
@@ -90,9 +103,9 @@ def check_covered(
 
 
 def check_shown(area: Area, grid: TileGrid, cells: CellSheet, allow_holes: bool) -> None:
-    """Warn where an area has no imagery though it has sheets; `AtlasError` where the route is so.
+    """Warn where the sheets under an area show no imagery; `AtlasError` where the route is there.
 
-    `allow_holes` makes that a warning too.
+    With `allow_holes` that is a warning too.
     """
     share = cells.valid_share(_some_tiles(area, grid) * grid.stride_px)
     empty = float((share < MIN_TILE_VALID_SHARE).mean())
@@ -107,7 +120,7 @@ def check_shown(area: Area, grid: TileGrid, cells: CellSheet, allow_holes: bool)
         )
 
 
-def _covered(sources: Sequence[Source], lat: Array, lon: Array) -> NDArray[np.bool_]:
+def _covered(sources: Sequence[SheetSource], lat: Array, lon: Array) -> NDArray[np.bool_]:
     covered = np.zeros(len(lat), dtype=np.bool_)
     for source in sources:
         covered |= source.covers(lat, lon)
@@ -123,15 +136,15 @@ def _missing(lattice: WorldSheets, lat: Array, lon: Array) -> str:
 
 
 def _some_tiles(area: Area, grid: TileGrid) -> NDArray[np.intp]:
-    """Tiles (N, 2) in an area, all or evenly taken; at least the one nearest its middle."""
-    step = max(1, int(np.ceil(np.sqrt(grid.rows * grid.cols / MOST_PLACES))))
+    """Tiles (N, 2) in an area, all or evenly spaced; at least one near its middle."""
+    step = max(1, int(np.ceil(np.sqrt(grid.rows * grid.cols / MAX_TILES))))
     tiles = np.mgrid[0 : grid.rows : step, 0 : grid.cols : step].reshape(2, -1).T.astype(np.intp)
     inside = area.contains(grid.centres_en_m(tiles), grid.stride_m * np.sqrt(0.5))
     return tiles[inside] if inside.any() else tiles[len(tiles) // 2 :][:1]
 
 
 def _route_en_m(area: Area, grid: TileGrid) -> Array:
-    """Points (N, 2) along the route, a quarter of a tile apart; none where there is no route."""
+    """Points (N, 2) along the route, a quarter of a tile apart; empty without a route."""
     if area.route is None:
         return np.zeros((0, 2))
     line = area.route.points_en_m(area.frame)

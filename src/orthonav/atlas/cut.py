@@ -1,8 +1,8 @@
-"""Cutting a flight's map out of an atlas: what its sheets hold, resampled into one new plane.
+"""Cutting a flight's map out of an atlas: the content of its sheets, resampled into one plane.
 
-Nothing of the imagery is needed: the grey picture comes from the sheets' registration layers, new
-tiles are embedded from the means of their cells, and confidences are pooled. Blocks are shared
-among threads; the same atlas gives the same bytes for any number of them.
+The imagery is not needed: the grey picture comes from the registration layers of the sheets, tiles
+are embedded from the cell means of the sheets, and confidences are pooled. The same atlas gives
+the same bytes for any number of threads.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 
 from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.coverage import box_deg, check_covered, check_shown, require_sheets
-from orthonav.atlas.sources import CutFrom, opened_sheets, pooled_manifest, recipes
+from orthonav.atlas.cut_sheets import CutSheet, opened_sheets, pooled_manifest, recipes
 from orthonav.atlas.warp import Warp, joined_cells, joined_grey
+from orthonav.cores import usable_cores
 from orthonav.embed.cells import CellLayout
 from orthonav.embed.whitened import CellSheet, WhitenedRecipe, learn
 from orthonav.errors import AreaError, OutputError, VariantError
+from orthonav.files import Progress
 from orthonav.geo.area import Area, Extent
 from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
@@ -31,19 +33,17 @@ from orthonav.prepare.build import BuildResult
 from orthonav.prepare.layer import GreyLayerWriter, Parts
 from orthonav.prepare.layout import grid_of, tiles_of
 from orthonav.prepare.parallel import in_order
+from orthonav.prepare.request import MAX_WORKERS
 from orthonav.prepare.sheet import (
-    MAX_WORKERS,
     PREVIEW_PX,
     block_side_px,
     layer_parts,
     put_layer_parts,
-    usable_cores,
 )
 from orthonav.represent.gradients import OrientedGradients
 
 COARSER = 4
-"""The preview is made of blocks at so much coarser a resolution."""
-Progress = Callable[[str, float], None]
+"""Factor by which blocks are reduced for the preview."""
 
 
 def cut_map(
@@ -57,40 +57,40 @@ def cut_map(
     allow_holes: bool = False,
     progress: Progress | None = None,
 ) -> BuildResult:
-    """Cut the map of a route with its band, or of bounds, and write it to `out`, whole or not.
+    """Cut the map of a route with its band, or of bounds, and write it to `out` as a whole.
 
-    Sheets that are missing under the route are an error unless `allow_holes`, elsewhere a warning.
-    Raises `AreaError` where the atlas does not reach, `AtlasError` where sheets are damaged or
-    cannot be cut from, `StorageError`, `OutputError`.
+    Missing sheets under the route are an error unless `allow_holes`; other missing sheets are a
+    warning. Raises `AreaError` for areas outside the atlas, `AtlasError` where sheets are damaged
+    or cannot be cut from, `StorageError`, `OutputError`.
     """
     report = progress or (lambda stage, share: None)
     workers = usable_cores() if workers is None else workers
     if not 1 <= workers <= MAX_WORKERS:
         raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {workers}")
     area = _area(route, band_m, bounds_deg)
-    asked = atlas.recipe
-    grid = grid_of(area, asked.gsd_m, asked.gsd_m, asked.tile_px, asked.overlap)
+    common = atlas.recipe
+    grid = grid_of(area, common.gsd_m, common.gsd_m, common.tile_px, common.overlap)
     report("sheets", 0.0)
     sheets = atlas.over(box_deg(area, grid.tile_m))
     require_sheets(atlas, sheets)
     members = opened_sheets(atlas, sheets, grid)
     _check_out(atlas, out, members)
-    check_covered(area, grid, [each.source for each in members], asked.sheets, allow_holes)
+    check_covered(area, grid, [each.source for each in members], common.sheets, allow_holes)
     report("sheets", 1.0)
     recipe, representation = recipes(members[0].manifest)
-    cut = Cut(area, grid, members, representation)
-    cut.read(report, workers)
-    check_shown(area, grid, cut.cells, allow_holes)
-    written = write_map(out, *_learnt(cut, recipe, members, workers, report))
+    cutter = _MapCutter(area, grid, members, representation)
+    cutter.read(report, workers)
+    check_shown(area, grid, cutter.cells, allow_holes)
+    written = write_map(out, *_learnt(cutter, recipe, members, workers, report))
     report("learn", 1.0)
     return BuildResult(written, out.stat().st_size)
 
 
-class Cut:
-    """Collects what the map needs of the sheets under it: `cells`, `layer`, `preview`."""
+class _MapCutter:
+    """Collects cells, grey layer and preview of the map from the sheets under it."""
 
     def __init__(
-        self, area: Area, grid: TileGrid, members: Sequence[CutFrom], representation: Any
+        self, area: Area, grid: TileGrid, members: Sequence[CutSheet], representation: Any
     ) -> None:
         self.area, self.grid = area, grid
         turns = isinstance(representation, OrientedGradients)
@@ -102,7 +102,7 @@ class Cut:
         self.preview = Preview(grid, PREVIEW_PX)
 
     def read(self, report: Progress, workers: int) -> None:
-        """Resample all blocks with so many threads. Raises `AtlasError` for a damaged sheet."""
+        """Resample all blocks with `workers` threads. Raises `AtlasError` for a damaged sheet."""
         side_px = block_side_px(self.grid.tile_px, self._layout.micro_px)
         blocks = [
             block
@@ -124,13 +124,13 @@ class Cut:
             cv2.setNumThreads(threads)
 
     def _made(self, block: Block) -> Parts:
-        """Everything that is kept of a block; nothing that was made before is touched."""
+        """The parts of the map in a block. Called by several threads: changes nothing."""
         warps = [warp for warp in self._warps if warp.reaches(block)]
         grey, valid = joined_grey(warps, block)
         if not valid.any():
             return {}
         means, share = joined_cells(warps, block, self._layout)
-        # Whole numbers of pixels are averaged many times as fast.
+        # A whole factor is many times faster.
         size = max(1, block.width // COARSER), max(1, block.height // COARSER)
         coarse = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
         parts: Parts = {"means": means, "share": share}
@@ -150,7 +150,7 @@ class Cut:
 
 def _area(route: Route | None, band_m: float | None, bounds_deg: Extent | None) -> Area:
     if (route is None) == (bounds_deg is None):
-        raise AreaError("a map is cut by a route with a band, or by bounds: give one of them")
+        raise AreaError("a map is cut for a route with a band, or for bounds: give one of them")
     if route is not None:
         return Area.from_route(route, band_m)
     if band_m is not None:
@@ -159,44 +159,44 @@ def _area(route: Route | None, band_m: float | None, bounds_deg: Extent | None) 
     return Area.from_bounds(bounds_deg)
 
 
-def _check_out(atlas: Atlas, out: Path, members: Sequence[CutFrom]) -> None:
+def _check_out(atlas: Atlas, out: Path, members: Sequence[CutSheet]) -> None:
     if out.exists() and any(out.samefile(atlas.path(each.sheet)) for each in members):
         raise OutputError(f"the map would replace a sheet of the atlas; name another file: {out}")
 
 
 def _learnt(
-    cut: Cut,
+    cutter: _MapCutter,
     recipe: WhitenedRecipe,
-    members: Sequence[CutFrom],
+    members: Sequence[CutSheet],
     workers: int,
     report: Progress,
 ) -> tuple[Manifest, dict[str, NDArray[Any]]]:
     """Manifest and arrays of the map."""
-    area, grid = cut.area, cut.grid
-    tiles_rc = tiles_of(area, grid, cut.cells)
+    area, grid = cutter.area, cutter.grid
+    tiles_rc = tiles_of(area, grid, cutter.cells)
     tiles_px = tiles_rc * grid.stride_px
     report("learn", 0.0)
-    embedder = learn(recipe, cut.cells, tiles_px, workers)
+    embedder = learn(recipe, cutter.cells, tiles_px, workers)
     report("learn", 0.3)
-    embeddings = embedder.tiles(cut.cells, tiles_px, workers)
+    embeddings = embedder.tiles(cutter.cells, tiles_px, workers)
     centres = grid.centres_en_m(tiles_rc)
-    grey, grey_parts = cut.layer.finish()
+    grey, grey_parts = cutter.layer.finish()
     area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
     sheet = SheetInfo(area.frame, grid, len(tiles_rc), area_km2, grey)
     manifest = pooled_manifest(members, _shares(area, centres, members), sheet)
     return manifest, {
         "sheet0/centres_en_m": centres.astype(np.float32),
         "sheet0/embeddings": embeddings,
-        "sheet0/preview_jpeg": cut.preview.jpeg(),
+        "sheet0/preview_jpeg": cutter.preview.jpeg(),
         **{f"embed/{name}": array for name, array in embedder.parts().items()},
         **grey_parts,
     }
 
 
 def _shares(
-    area: Area, centres_en_m: NDArray[np.float64], members: Sequence[CutFrom]
+    area: Area, centres_en_m: NDArray[np.float64], members: Sequence[CutSheet]
 ) -> NDArray[np.float64]:
-    """Share of the tiles that lies in each sheet's own box; alike where none does."""
+    """Share of the tiles in the box of each sheet; equal shares where there are none."""
     lat, lon = area.frame.latlon_from_en(centres_en_m)
     counts = []
     for each in members:

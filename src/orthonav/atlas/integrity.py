@@ -1,18 +1,18 @@
-"""Is an atlas whole? What is missing, half there, damaged, made otherwise, or left over."""
+"""Checking an atlas: missing, incomplete, damaged or leftover files, and other recipes."""
 
 import re
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.coarse import read_coarse
-from orthonav.atlas.index import FOLDER as INDEX
-from orthonav.atlas.index import MANIFEST, read_manifest, stale_sheets
-from orthonav.atlas.item import ASSETS, Asset, Sheet, sheet_of_file, split_name
-from orthonav.atlas.listing import (
+from orthonav.atlas.index_manifest import FOLDER as INDEX
+from orthonav.atlas.index_manifest import MANIFEST, read_manifest, stale_sheets
+from orthonav.atlas.item import FILES, Sheet, StoredFile, sheet_of_file, split_name
+from orthonav.atlas.item_files import (
     ITEMS,
     MAX_SNAPSHOT_BYTES,
     SNAPSHOT,
@@ -22,22 +22,28 @@ from orthonav.atlas.listing import (
 from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.atlas.store import Store, digest_of
 from orthonav.errors import AtlasError, MapFileError
+from orthonav.files import Progress
 from orthonav.mapfile import Manifest, open_map
 from orthonav.prepare.methods import usual_edges
 
 MIN_AGE_S = 24 * 3600.0
-"""What is younger may be of a build that runs: a sheet's files come before its item."""
-_LEFTOVER = re.compile(r"\..+\.[A-Za-z0-9_]{8,12}\.tmp(\.[A-Za-z0-9]+)?")
-_FOLDERS = [folder for folder, _, _ in ASSETS.values()]
+"""Younger files may belong to a running build, which writes the files of a sheet before its item:
+no sheet takes a day."""
+_TEMPORARY = re.compile(r"\..+\.[A-Za-z0-9_]{8,12}\.tmp(\.[A-Za-z0-9]+)?")
+_FOLDERS = [folder for folder, _, _ in FILES.values()]
+_SUFFIXES = {folder: suffix for folder, suffix, _ in FILES.values()}
 _CLOSE = 1e-6
-Progress = Callable[[str, float], None]
+"""Relative difference of numbers of manifest and recipe that is rounding."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing that is wrong: its kind in two words, the file, what there is to know or to do.
+    """One problem of an atlas.
 
-    `removed`: it was left over, and is gone.
+    `kind`: two words, such as `missing file`.
+    `name`: the file.
+    `detail`: cause or remedy.
+    `removed`: whether the problem was removed.
     """
 
     kind: str
@@ -54,55 +60,57 @@ def check_atlas(
     clean: bool = False,
     min_age_s: float = MIN_AGE_S,
 ) -> list[Problem]:
-    """All that is wrong with an atlas, in the order of names; empty where it is whole.
+    """All problems of an atlas by name; empty where it is whole.
 
-    `deep` reads every file, checks its checksum, opens it and compares it with the recipe. `clean`
-    removes what was left over longer than `min_age_s` ago (files that no item names, halves of
-    files, revisions that do not count) and writes a stale snapshot anew; nothing else is touched.
-    Raises `StorageError` where the place fails.
+    `deep` reads every file, verifies its checksum, opens it and compares it with the recipe.
+    `clean` removes leftovers older than `min_age_s` (files that no item names, temporary files,
+    replaced revisions) and rewrites a stale snapshot; nothing else is changed. Raises
+    `StorageError` where the storage fails.
     """
-    report = progress or (lambda stage, share: None)
+    progress = progress or (lambda stage, share: None)
     items, broken = read_items(atlas.store)
     files = _files(atlas.store)
     problems = [Problem("damaged item", f"{ITEMS}/{name}", why) for name, why in broken.items()]
-    current = _that_count(items)
+    current = _current(items)
     not_whole = {found[0] for found in map(split_name, broken) if found}
     for number, (name, sheet) in enumerate(sorted(current.items())):
-        report("check", number / len(current))
-        found = list(_of_sheet(atlas, name, sheet, files, deep))
+        progress("check", number / len(current))
+        found = list(_sheet_problems(atlas, name, sheet, files, deep))
         problems += found
         not_whole |= {sheet.id for _ in found}
     cleaner = _Cleaner(atlas.store, min_age_s if clean else None)
     older = {name: sheet for name, sheet in items.items() if name not in current}
     for name, sheet in older.items():
-        problems.append(cleaner.second_revision(name, sheet, sheet.id not in not_whole))
+        detail = f"revision {sheet.revision} of {sheet.id} was replaced and not removed"
+        whole = sheet.id not in not_whole  # else the old revision is all that there is
+        problems.append(cleaner.leftover(f"{ITEMS}/{name}", "second revision", detail, whole))
     if clean and older:
         items, files = read_items(atlas.store)[0], _files(atlas.store)
-    unnamed = _unnamed(atlas.store, files, items, not_whole)
-    problems += [cleaner.left_over(name, "orphan", "no item names it") for name in unnamed]
+    for name in _orphans(atlas.store, files, items, not_whole):
+        problems.append(cleaner.leftover(name, "orphan", "no item names it"))
     for folder in ("", ITEMS, *_FOLDERS, INDEX):
-        for file in filter(_LEFTOVER.fullmatch, atlas.store.names(folder)):
+        for file in filter(_TEMPORARY.fullmatch, atlas.store.names(folder)):
             name = f"{folder}/{file}" if folder else file
-            problems.append(cleaner.left_over(name, "leftover", "half of a file"))
+            problems.append(cleaner.leftover(name, "leftover", "incomplete file"))
     if not broken:
-        problems += cleaner.snapshot(_that_count(items).values())
+        problems += cleaner.snapshot(_current(items).values())
     if not any(each.kind == "damaged item" for each in problems):
         atlas.sheets(refresh=True)
-        problems += _of_index(atlas, deep)
+        problems += _index_problems(atlas, deep)
     return sorted(problems, key=lambda each: (each.name, each.kind))
 
 
 class _Cleaner:
-    """Says what is left over, and removes it where that was asked for."""
+    """Reports leftovers, and removes them if requested."""
 
     def __init__(self, store: Store, min_age_s: float | None) -> None:
         self._store = store
         self._min_age_s = min_age_s
 
-    def left_over(self, name: str, kind: str, detail: str, may_go: bool = True) -> Problem:
-        """The problem, and the file gone where it is old enough."""
+    def leftover(self, name: str, kind: str, detail: str, removable: bool = True) -> Problem:
+        """The problem; the file is removed if that was requested and it is old enough."""
         problem = Problem(kind, name, detail)
-        if self._min_age_s is None or not may_go:
+        if self._min_age_s is None or not removable:
             return problem
         age_s = self._store.age_s(name)
         if (age_s is None and self._min_age_s > 0) or (age_s or 0) < self._min_age_s:
@@ -110,26 +118,21 @@ class _Cleaner:
         self._store.remove(name)
         return replace(problem, removed=True)
 
-    def second_revision(self, name: str, sheet: Sheet, whole: bool) -> Problem:
-        """An item that a higher revision of its sheet has replaced; goes only if that is whole."""
-        detail = f"revision {sheet.revision} of {sheet.id} was replaced and not removed"
-        return self.left_over(f"{ITEMS}/{name}", "second revision", detail, whole)
-
     def snapshot(self, sheets: Iterable[Sheet]) -> list[Problem]:
-        """A snapshot that is not of these sheets; written anew rather than removed."""
-        should = snapshot_of(sorted(sheets, key=lambda sheet: sheet.id))
+        """A snapshot that does not show these sheets; rewritten if that was requested."""
+        expected = snapshot_of(sorted(sheets, key=lambda sheet: sheet.id))
         size = self._store.size(SNAPSHOT)
         if size is None or (
-            size == len(should) and self._store.read(SNAPSHOT, MAX_SNAPSHOT_BYTES) == should
+            size == len(expected) and self._store.read(SNAPSHOT, MAX_SNAPSHOT_BYTES) == expected
         ):
             return []
         if self._min_age_s is not None:
-            self._store.write(SNAPSHOT, should)
-        detail = "not the sheets that are there; only slower to open"
+            self._store.write(SNAPSHOT, expected)
+        detail = "does not show the present sheets; the atlas opens more slowly"
         return [Problem("stale snapshot", SNAPSHOT, detail, removed=self._min_age_s is not None)]
 
 
-def _that_count(items: Mapping[str, Sheet]) -> dict[str, Sheet]:
+def _current(items: Mapping[str, Sheet]) -> dict[str, Sheet]:
     """The items of the highest revisions."""
     last = {items[name].id: name for name in sorted(items)}
     return {name: items[name] for name in last.values()}
@@ -143,78 +146,75 @@ def _files(store: Store) -> dict[str, int]:
     }
 
 
-def _unnamed(
+def _orphans(
     store: Store, files: Mapping[str, int], items: Mapping[str, Sheet], not_whole: set[str]
 ) -> list[str]:
-    """Files of sheets that no item names; none of a sheet of which an item cannot be read."""
+    """Files of sheets that no item names, except those of sheets with an unreadable item."""
 
-    def left(items: Iterable[Sheet]) -> list[str]:
-        named = {asset.name for sheet in items for asset in sheet.assets.values()}
-        return [name for name in files if _is_of_a_sheet(name) and name not in named]
+    def orphans(items: Iterable[Sheet]) -> list[str]:
+        named = {file.name for sheet in items for file in sheet.files.values()}
+        return [name for name in files if _is_sheet_file(name) and name not in named]
 
-    if not left(items.values()):
+    if not orphans(items.values()):
         return []
     now, broken = read_items(store)  # a sheet may have been finished since
     unread = {found[0] for found in map(split_name, broken) if found}
-    return [name for name in left(now.values()) if sheet_of_file(name) not in unread | not_whole]
+    return [name for name in orphans(now.values()) if sheet_of_file(name) not in unread | not_whole]
 
 
-def _is_of_a_sheet(name: str) -> bool:
-    suffixes = {folder: suffix for folder, suffix, _ in ASSETS.values()}
+def _is_sheet_file(name: str) -> bool:
     folder = name.partition("/")[0]
-    return sheet_of_file(name) is not None and name.endswith(suffixes[folder])
+    return sheet_of_file(name) is not None and name.endswith(_SUFFIXES[folder])
 
 
-def _of_sheet(
+def _sheet_problems(
     atlas: Atlas, name: str, sheet: Sheet, files: Mapping[str, int], deep: bool
 ) -> Iterator[Problem]:
-    """What is wrong with a sheet that counts."""
     try:
         atlas.require_place(sheet)
     except AtlasError as error:
         yield Problem("damaged item", f"{ITEMS}/{name}", str(error))
-    again = f"build sheet {sheet.id} again"
-    for key, asset in sheet.assets.items():
-        size = files.get(asset.name, atlas.store.size(asset.name))
+    remedy = f"build sheet {sheet.id} again"
+    for key, file in sheet.files.items():
+        size = files.get(file.name, atlas.store.size(file.name))
         if size is None and atlas.store.size(f"{ITEMS}/{name}") is None:
-            return  # replaced or retired while the atlas is checked
-        wrong = list(_of_file(atlas.store, asset, size, deep, again))
+            return  # replaced or retired during the check
+        wrong = list(_file_problems(atlas.store, file, size, deep, remedy))
         yield from wrong
         if deep and not wrong:
-            with _here(atlas.store, asset.name) as path:
-                yield from _content(atlas.recipe, sheet, key, asset.name, path)
+            with _local_path(atlas.store, file.name) as path:
+                yield from _content_problems(atlas.recipe, sheet, key, file.name, path)
 
 
-def _of_file(
-    store: Store, asset: Asset, size: int | None, deep: bool, again: str
+def _file_problems(
+    store: Store, file: StoredFile, size: int | None, deep: bool, remedy: str
 ) -> Iterator[Problem]:
-    """What is wrong with a file of that size, seen from outside."""
+    """Problems of a file that is `size` bytes long, None where it is missing."""
     if size is None:
-        yield Problem("missing file", asset.name, again)
-    elif size != asset.size_bytes:
-        yield Problem("wrong size", asset.name, f"{size} of {asset.size_bytes} bytes; {again}")
+        yield Problem("missing file", file.name, remedy)
+    elif size != file.size_bytes:
+        yield Problem("wrong size", file.name, f"{size} of {file.size_bytes} bytes; {remedy}")
     elif deep:
-        with _here(store, asset.name) as path:
-            if digest_of(path) != asset.sha256:
-                yield Problem("wrong checksum", asset.name, again)
+        with _local_path(store, file.name) as path:
+            if digest_of(path) != file.sha256:
+                yield Problem("wrong checksum", file.name, remedy)
 
 
-def _of_index(atlas: Atlas, deep: bool) -> Iterator[Problem]:
-    """What is wrong with the index, which may be made anew at any time."""
-    again = "make the index anew: orthonav atlas index --anew"
+def _index_problems(atlas: Atlas, deep: bool) -> Iterator[Problem]:
+    remedy = "rebuild the index: orthonav atlas index --rebuild"
     try:
         manifest = read_manifest(atlas)
     except AtlasError as error:
-        yield Problem("damaged file", MANIFEST, f"{error}; {again}")
+        yield Problem("damaged file", MANIFEST, f"{error}; {remedy}")
         return
     if manifest is None:
         return
     sizes = atlas.store.names(INDEX)
-    for name, asset in manifest.files.items():
-        if asset.name == f"{INDEX}/{name}":
-            yield from _of_file(atlas.store, asset, sizes.get(name), deep, again)
+    for name, file in manifest.files.items():
+        if file.name == f"{INDEX}/{name}":
+            yield from _file_problems(atlas.store, file, sizes.get(name), deep, remedy)
         else:
-            yield Problem("damaged file", MANIFEST, f"names a file elsewhere; {again}")
+            yield Problem("damaged file", MANIFEST, f"names a file outside the index; {remedy}")
     new, gone = stale_sheets(atlas, manifest)
     if new or gone:
         detail = f"{len(new)} sheets are new or changed, {len(gone)} gone; run orthonav atlas index"
@@ -222,8 +222,8 @@ def _of_index(atlas: Atlas, deep: bool) -> Iterator[Problem]:
 
 
 @contextmanager
-def _here(store: Store, name: str) -> Iterator[Path]:
-    """A file of the atlas on this machine, for as long as it is looked at."""
+def _local_path(store: Store, name: str) -> Iterator[Path]:
+    """A file of the atlas on this machine, while the context lasts."""
     if store.is_local:
         yield Path(store.url, *name.split("/"))
         return
@@ -233,10 +233,10 @@ def _here(store: Store, name: str) -> Iterator[Path]:
         yield path
 
 
-def _content(
+def _content_problems(
     recipe: AtlasRecipe, sheet: Sheet, key: str, name: str, path: Path
 ) -> Iterator[Problem]:
-    """What is wrong inside a file whose checksum is right."""
+    """Problems of the content of a file whose checksum is right."""
     try:
         if key == "map":
             differences = _differences(recipe, sheet, open_map(path).manifest)
@@ -251,7 +251,7 @@ def _content(
 
 
 def _differences(recipe: AtlasRecipe, sheet: Sheet, manifest: Manifest) -> list[str]:
-    """How a map differs from the recipe of its atlas and from its item."""
+    """The differences between a map, the recipe of its atlas and its item."""
     info = manifest.sheets[0]
     represent = manifest.recipe.get("represent")
     pairs = [
@@ -269,12 +269,10 @@ def _differences(recipe: AtlasRecipe, sheet: Sheet, manifest: Manifest) -> list[
         ("sheets", len(manifest.sheets), 1),
         ("tiles (of its item)", info.tiles, sheet.tiles),
     ]
-    return [
-        f"{name}: {mine}, not {theirs}" for name, mine, theirs in pairs if not _same(mine, theirs)
-    ]
+    return [f"{name}: {own}, not {other}" for name, own, other in pairs if not _same(own, other)]
 
 
-def _same(mine: object, theirs: object) -> bool:
-    if isinstance(mine, int | float) and isinstance(theirs, int | float):
-        return abs(mine - theirs) <= _CLOSE * abs(theirs)
-    return mine == theirs
+def _same(own: object, other: object) -> bool:
+    if isinstance(own, int | float) and isinstance(other, int | float):
+        return abs(own - other) <= _CLOSE * abs(other)
+    return own == other

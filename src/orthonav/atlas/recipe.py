@@ -1,4 +1,4 @@
-"""What all sheets of an atlas have in common."""
+"""The recipe that all sheets of an atlas share."""
 
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -12,7 +12,12 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class CoarseRecipe:
-    """Tiles by which a view is looked for in the whole atlas: wide, at low resolution."""
+    """The coarse tiles in which a view is searched in the whole atlas: wide, at low resolution.
+
+    `gsd_m`: metres per pixel, above 0. `tile_px`: width of a tile. `overlap`: share that
+    neighbouring tiles have in common, 0 to below 1; below 0.875 fewer views are found
+    (docs/decisions, the atlas).
+    """
 
     gsd_m: float = 8.0
     tile_px: int = 128
@@ -26,8 +31,12 @@ class CoarseRecipe:
 
 @dataclass(frozen=True)
 class AtlasRecipe:
-    """How every sheet is made; the fields are those of `BuildRequest`. `sheet_km` is the greatest
-    width of a sheet. `coarse` None leaves out what places views in the whole atlas."""
+    """How every sheet is made; fields and defaults not listed here are those of `BuildRequest`.
+
+    `gsd_m`: metres per pixel.
+    `sheet_km`: greatest width of a sheet.
+    `coarse`: recipe of the coarse tiles; None leaves them out, and views then need a prior.
+    """
 
     gsd_m: float
     tile_px: int = 256
@@ -51,7 +60,7 @@ class AtlasRecipe:
 
     @classmethod
     def from_plain(cls, plain: Any) -> "AtlasRecipe":
-        """Inverse of `to_plain`; raises `AtlasError`."""
+        """Inverse of `to_plain`; raises `AtlasError` for unknown fields and impossible values."""
         try:
             values = {each.name: plain[each.name] for each in fields(cls)}
             coarse = values.pop("coarse")
@@ -63,7 +72,7 @@ class AtlasRecipe:
         return recipe
 
     def differences(self, other: "AtlasRecipe") -> list[str]:
-        """What differs, each as `name: this, not that`."""
+        """The fields that differ, each as `name: this, not that`."""
         mine, theirs = self.to_plain(), other.to_plain()
         return [
             f"{name}: {mine[name]}, not {theirs[name]}"
@@ -77,7 +86,7 @@ _FRACTIONS = ("gsd_m", "overlap", "sheet_km")
 
 
 def _require_plain(recipe: AtlasRecipe) -> None:
-    """Raise `ValueError` where a value is of another kind, or impossible."""
+    """Raise `ValueError` where a value has another type, or is impossible."""
     parts: list[tuple[Any, tuple[str, ...], tuple[str, ...]]] = [(recipe, _WHOLE, _FRACTIONS)]
     if recipe.coarse is not None:
         parts.append((recipe.coarse, ("tile_px",), ("gsd_m", "overlap")))

@@ -1,4 +1,4 @@
-"""Folders for what is being made; what killed processes have left of them goes with the next."""
+"""Temporary folders for sheets under construction; folders of killed processes are removed."""
 
 import contextlib
 import shutil
@@ -12,7 +12,7 @@ from orthonav.errors import OutputError
 
 try:
     import fcntl
-except ImportError:  # not a Unix: what was killed is left to the system
+except ImportError:  # not a Unix: the system removes what killed processes left behind
     fcntl = None  # type: ignore[assignment]
 
 PREFIX = "orthonav-sheet-"
@@ -21,9 +21,9 @@ _LOCK = "in-use"
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """A new folder, removed afterwards; those that killed processes have left go first.
+    """A new folder in the system's folder of temporary files (`TMPDIR`), removed afterwards.
 
-    It lies where the system keeps temporary files (`TMPDIR`). Raises `OutputError`.
+    Folders of processes that were killed are removed first. Raises `OutputError`.
     """
     root = Path(tempfile.gettempdir())
     _remove_abandoned(root)
@@ -42,12 +42,12 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def _locked(folder: Path) -> IO[str] | None:
-    """A lock that the system lets go when this process ends, however it does."""
+    """A lock that the system releases when this process ends, in whatever way."""
     if fcntl is None:
         return None
     lock = (folder / f".{_LOCK}").open("w")
     fcntl.flock(lock, fcntl.LOCK_EX)
-    (folder / f".{_LOCK}").rename(folder / _LOCK)  # others only see it once it is locked
+    (folder / f".{_LOCK}").rename(folder / _LOCK)  # visible to others only when locked
     return lock
 
 

@@ -1,8 +1,8 @@
-"""Sheets of an atlas as one source of pixels and cells for another plane.
+"""Resampling the sheets of an atlas into another local plane.
 
-Within a block of a kilometre two planes differ by a shift, a turn of less than a degree and
-millimetres, so a block is made of each sheet under it by one affine. The sheet whose box of the
-lattice holds a place is asked first; where it shows nothing, those that reach over their border.
+Within a block of a kilometre two planes differ by a shift, a rotation of less than a degree and
+millimetres, so each sheet is resampled by one affine per block. A place is taken from the sheet
+whose box holds it; where that sheet shows nothing, from neighbours that reach over their border.
 """
 
 import math
@@ -26,12 +26,16 @@ from orthonav.prepare.cellparts import StoredCells
 from orthonav.represent.gradients import HARMONICS
 
 KERNEL_PX = 3
-"""What interpolation looks at beyond the pixels it is asked for, and one more for rounding."""
+"""Margin of cubic interpolation, 2 pixels, and one more for rounding."""
 EDGE_POINTS = 17
+"""Points along an edge of a box, which is not straight in another plane."""
 FILL_PX = 5
+"""Pixels by which imagery is extended beyond its edge: the kernel of cubic interpolation."""
 OWN_BONUS = 0.01
-"""A cell is taken from the sheet that shows most of it; the one that owns it wins by so much."""
+"""A cell is taken from the sheet that shows most of it; this advantage decides ties for the sheet
+whose box holds it."""
 _SHIFT = 6
+"""Fractional bits of polygon corners in OpenCV."""
 Array = NDArray[np.float64]
 Pixels = tuple[NDArray[np.uint8], NDArray[np.bool_]]
 Cells = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -39,8 +43,8 @@ Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
-    """A sheet that is cut from. `bounds_deg` is its box of the lattice."""
+class SheetSource:
+    """Pixels and cells of a sheet; `bounds_deg` is its box in the lattice."""
 
     name: str
     bounds_deg: Extent
@@ -50,13 +54,13 @@ class Source:
     cells: StoredCells
 
     def covers(self, lat_deg: Array, lon_deg: Array) -> NDArray[np.bool_]:
-        """Which places (N,) lie on its raster."""
+        """Which places (N,) lie on the raster of the sheet."""
         points = self.frame.en_from_latlon(lat_deg, lon_deg)
         px = (points - [self.grid.west_m, self.grid.north_m]) * [1, -1] / self.grid.gsd_m
         return np.asarray(((px >= 0) & (px <= [self.grid.width_px, self.grid.height_px])).all(-1))
 
     def outline_deg(self) -> tuple[Array, Array]:
-        """Latitudes and longitudes around its box, dense enough for straight lines between."""
+        """Latitudes and longitudes of points around its box."""
         west, south, east, north = self.bounds_deg
         share = np.linspace(0, 1, EDGE_POINTS)[:-1]
         lon, lat = west + (east - west) * share, south + (north - south) * share
@@ -69,16 +73,16 @@ class Source:
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """One source seen from the raster of another grid."""
+    """The transformation of one sheet to the raster of another grid."""
 
-    source: Source
+    source: SheetSource
     frame: LocalFrame
     grid: TileGrid
     turns: bool
-    """Whether numbers of cells are harmonics of a direction, to be turned with the plane."""
+    """Whether cells are harmonics of a direction, which rotate with the plane."""
 
     def reaches(self, block: Block) -> bool:
-        """Whether any of a block may lie on the source's raster."""
+        """Whether a block may overlap the raster of the sheet."""
         left, top, right, bottom = self._box_px
         return (
             block.col < right
@@ -88,7 +92,8 @@ class Warp:
         )
 
     def affine(self, block: Block) -> Array:
-        """The source's pixels of a block's, (2, 3), by outer corners: pixel-is-area."""
+        """Affine (2, 3) from pixels of the grid to pixels of the sheet (pixel-is-area), fitted to
+        the corners of a block."""
         corners = _corners(block)
         there = self._source_px(corners)
         design = np.column_stack([corners - corners[0], np.ones(len(corners))])
@@ -97,10 +102,10 @@ class Warp:
         return np.asarray(solved)
 
     def owned(self, block: Block, layout: CellLayout | None = None) -> NDArray[np.bool_]:
-        """Which pixels of a block, or the cells that begin in it, lie in the source's own box."""
+        """Which pixels of a block, or cells that begin in it, lie in the box of the sheet."""
         spacing, middle = (1, 0.5) if layout is None else (layout.spacing_px, layout.micro_px / 2)
         shape = -(-block.height // spacing), -(-block.width // spacing)
-        # Of pixel or cell 0, 0 the middle is where OpenCV has its corner.
+        # OpenCV's coordinates 0, 0 are the middle of pixel or cell 0, 0.
         points = (self._outline_px - [block.col + middle, block.row + middle]) / spacing
         points = np.rint(points * 2**_SHIFT).astype(np.int32)
         mask = np.zeros(shape, dtype=np.uint8)
@@ -108,7 +113,7 @@ class Warp:
         return mask.astype(np.bool_)
 
     def grey(self, block: Block) -> Pixels:
-        """Grey and valid (H, W) of a block, 0 where not valid."""
+        """Grey levels and validity (H, W) of a block; 0 where not valid."""
         affine = self.affine(block)
         matrix = _by_middles(affine, block, 1, 0.5)
         size = block.width, block.height
@@ -119,7 +124,7 @@ class Warp:
             return np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
         matrix[:, 2] -= [left, top]
         whole = bool(valid.all())
-        if not whole:  # what lies beyond the imagery must not darken its edge
+        if not whole:  # zeros beyond the imagery must not darken its edge
             grown = cv2.dilate(grey, np.ones((FILL_PX, FILL_PX), np.uint8))
             grey = np.where(valid, grey, grown).astype(np.uint8)
         flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
@@ -128,11 +133,11 @@ class Warp:
             return np.asarray(made, np.uint8), np.ones(shape, np.bool_)
         mask = valid.astype(np.uint8) * 255
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        kept = cv2.warpAffine(mask, matrix, size, flags=flags) >= 254
-        return np.where(kept, made, 0).astype(np.uint8), np.asarray(kept, np.bool_)
+        shown = cv2.warpAffine(mask, matrix, size, flags=flags) >= 254
+        return np.where(shown, made, 0).astype(np.uint8), np.asarray(shown, np.bool_)
 
     def cells(self, block: Block, layout: CellLayout) -> Cells:
-        """Means (h, w, C) and shares (h, w) of the cells that begin in a block."""
+        """Means (h, w, C) and valid shares (h, w) of the cells that begin in a block."""
         spacing, middle = layout.spacing_px, layout.micro_px / 2
         rows, cols = -(-block.height // spacing), -(-block.width // spacing)
         matrix = _by_middles(self.affine(block), block, spacing, middle)
@@ -154,11 +159,11 @@ class Warp:
             return read()
         except MapFileError as error:
             raise AtlasError(
-                f"sheet {self.source.name} is damaged, build it anew ({error})"
+                f"sheet {self.source.name} is damaged, rebuild it ({error})"
             ) from error
 
     def _source_px(self, target_px: Array) -> Array:
-        """Pixels (N, 2), column and row, of the source under pixels of the grid."""
+        """Pixels (N, 2), column and row, of the sheet at pixels of the grid."""
         grid, source = self.grid, self.source
         places = [grid.west_m, grid.north_m] + target_px * [grid.gsd_m, -grid.gsd_m]
         points = source.frame.en_from_latlon(*self.frame.latlon_from_en(places))
@@ -167,12 +172,12 @@ class Warp:
 
     @cached_property
     def _outline_px(self) -> Array:
-        """The source's box in pixels of the grid."""
+        """The box of the sheet in pixels of the grid."""
         return self._grid_px(*self.source.outline_deg())
 
     @cached_property
     def _box_px(self) -> tuple[float, float, float, float]:
-        """Left, top, right, bottom of the source's raster in pixels of the grid."""
+        """Left, top, right, bottom of the raster of the sheet in pixels of the grid."""
         grid = self.source.grid
         corners = _corners(Block(0, 0, grid.height_px, grid.width_px))
         places = [grid.west_m, grid.north_m] + corners * [grid.gsd_m, -grid.gsd_m]
@@ -187,7 +192,7 @@ class Warp:
 
 
 def joined_grey(warps: Sequence[Warp], block: Block) -> Pixels:
-    """Grey and valid (H, W) of a block from the sources that reach it."""
+    """Grey levels and validity (H, W) of a block from all sheets that reach it."""
     grey = np.zeros((block.height, block.width), dtype=np.uint8)
     valid = np.zeros(grey.shape, dtype=np.bool_)
     owners = [(warp, warp.owned(block)) for warp in warps]
@@ -207,7 +212,7 @@ def joined_grey(warps: Sequence[Warp], block: Block) -> Pixels:
 
 
 def _around(wanted: NDArray[np.bool_]) -> tuple[slice, slice] | None:
-    """Rows and columns of the smallest box around what is wanted (H, W); None of nothing."""
+    """Rows and columns of the smallest box around the true pixels of a mask (H, W), or None."""
     rows, cols = (np.flatnonzero(wanted.any(axis=axis)) for axis in (1, 0))
     if not len(rows):
         return None
@@ -215,8 +220,8 @@ def _around(wanted: NDArray[np.bool_]) -> tuple[slice, slice] | None:
 
 
 def joined_cells(warps: Sequence[Warp], block: Block, layout: CellLayout) -> Cells:
-    """Means (h, w, C) and shares (h, w) of the cells that begin in a block, from one or more
-    sources that reach it."""
+    """Means (h, w, C) and valid shares (h, w) of the cells that begin in a block, from one or more
+    sheets that reach it."""
     owners = [(warp, warp.owned(block, layout)) for warp in warps]
     owners.sort(key=lambda each: not each[1].any())
     means, share = owners[0][0].cells(block, layout)
@@ -233,7 +238,7 @@ def joined_cells(warps: Sequence[Warp], block: Block, layout: CellLayout) -> Cel
 
 
 def _turn(means: NDArray[np.float32], angle_rad: float) -> None:
-    """Turn harmonics of directions back by the angle by which the source is turned, in place."""
+    """Rotate harmonics of directions in place, by the angle between sheet and grid."""
     for k in range(1, HARMONICS + 1):
         cos, sin = np.float32(math.cos(2 * k * angle_rad)), np.float32(math.sin(2 * k * angle_rad))
         real, imaginary = means[..., 2 * k - 1].copy(), means[..., 2 * k].copy()
@@ -253,9 +258,9 @@ def _applied(affine: Array, points: Array) -> Array:
 
 
 def _by_middles(affine: Array, block: Block, spacing: int, middle: float) -> Array:
-    """The affine between numbers of pixels (or cells) whose middles lie `middle` px into them.
+    """The affine between indices of pixels (or cells) whose middles lie `middle` px into them.
 
-    Number 0, 0 is the block's first; in the source that of its raster.
+    Index 0, 0 is the first of the block, and the first of the raster of the sheet.
     """
     linear = affine[:, :2]
     first = linear @ [block.col + middle, block.row + middle] + affine[:, 2] - middle
@@ -263,7 +268,7 @@ def _by_middles(affine: Array, block: Block, spacing: int, middle: float) -> Arr
 
 
 def _window(matrix: Array, size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Top, left, height and width in the source of what a picture of `size` (w, h) needs."""
+    """Top, left, height and width of the part of the sheet that `size` (w, h) pixels need."""
     cols, rows = size
     corners = np.array([[0, 0], [cols - 1, 0], [0, rows - 1], [cols - 1, rows - 1]], float)
     there = _applied(matrix, corners)

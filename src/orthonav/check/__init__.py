@@ -1,1 +1,1 @@
-"""Before the flight: where could views be placed on a map, and would a route be flown well?"""
+"""Pre-flight check: where on a map can views be placed, and can a route be flown with it?"""

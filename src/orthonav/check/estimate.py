@@ -1,12 +1,12 @@
-"""From trials at scattered places to a probability for every place.
+"""From trials at scattered places to a probability of a fix for every place.
 
-What a place is worth is told by the trials around it and, where these are few, by how much of the
-ground there is expected to last: a logistic regression over all trials of the map. Both are joined
-as a beta distribution, the regression counting as `PRIOR_TRIALS`.
+Nearby trials, weighted by distance, are joined with a logistic regression over all trials of the
+map (on persistence and on the part of a view that the map covers) as a beta distribution, in which
+the regression counts as `PRIOR_TRIALS` trials.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,46 +15,49 @@ from orthonav.check.trials import Trial
 from orthonav.confidence.logistic import fit_weights
 
 Array = NDArray[np.float64]
+# Chosen on generated landscapes by the calibration error of `python -m benchmarks.prediction`.
 PRIOR_TRIALS = 3.0
 BANDWIDTH_VIEWS = 0.4
-"""Standard deviation of the weights of trials around a place, in sides of a view."""
+"""Standard deviation of the distance weights, in sides of a view."""
 BANDWIDTH_SPACINGS = 0.9
-"""The least of it, in distances between trials."""
+"""Lower limit of that deviation, in distances between trials."""
 OTHER_DATE_WEIGHT = 3.0
-"""A trial with pictures of another date says as much as so many without."""
+"""Weight of a trial with imagery of a second date, which needs no simulated ageing."""
+SAME_COVERAGE = 0.12
+"""Standard deviation of the weights over the share of a view that the map covers."""
 YEARS_LOGIT = 0.6
-"""How much years differ from each other: standard deviation of the logit, see docs/check.md."""
+"""Standard deviation of the logit from year to year, measured; see docs/check.md."""
 INTERVAL, INTERVAL_SIGMAS = (0.1, 0.9), 1.2816
-"""80 % lie within."""
+"""Ends of the 80 % interval, and the same in standard deviations of a normal distribution."""
 JEFFREYS = 0.3
-"""So many good and bad trials more keep the interval off 0 and 1."""
-ENOUGH, FAR = 0.05, 4.0
-"""With less than this weight around, trials so many times as far count too."""
-SAME_SEEN = 0.12
-"""Standard deviation of the weights over the share of a view that lies on the map."""
+"""Pseudo-counts of good and bad trials that keep the interval off 0 and 1."""
+MIN_WEIGHT, WIDER = 0.05, 4.0
+"""Where nearby trials weigh less than this, the bandwidth is so many times as wide."""
+MIN_REGRESSION = 20
+"""Fewer trials than this do not support a regression."""
 RIDGE = 1e-2
 _PAIRS_AT_ONCE = 2**20
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
-    """At places (N,): see `orthonav.check.outcome.Cells`. `weight` is that of the trials around."""
+class Prediction:
+    """Predictions at places (N,); fields as in `Cells`. `weight` is that of nearby trials."""
 
     probability: Array
     low: Array
     high: Array
     error_m: Array
     wrong: Array
-    lasting: Array
+    persistence: Array
     weight: Array
 
 
-def _all_seen(points_en_m: Array) -> Array:
+def _full_coverage(points_en_m: Array) -> Array:
     return np.ones(len(points_en_m))
 
 
-class Field:
-    """What trials say of places."""
+class Predictor:
+    """Interpolates the outcomes of trials."""
 
     def __init__(
         self,
@@ -66,28 +69,28 @@ class Field:
         spacing_m: float,
         other_date: Sequence[Trial] = (),
         least_error_m: float = 0.0,
-        seen: Callable[[Array], Array] = _all_seen,
+        coverage: Callable[[Array], Array] = _full_coverage,
     ) -> None:
-        """`trials` of the map's own ground, `other_date` of pictures of another date.
+        """`trials` of the map's own imagery, `other_date` of a second date.
 
-        `seen` tells of places (N, 2) which share of a view there lies on the map (N,): trials count
-        for places where it is about the same.
+        `coverage` returns the share (N,) of a view over places (N, 2) that the map covers; trials
+        count for places of similar coverage.
         """
         every = [*trials, *other_date]
         self._points = np.array([each.en_m for each in every], np.float64).reshape(-1, 2)
         self._error = np.array([each.error_m for each in every], np.float64)
-        sure = np.array([each.confidence >= accept for each in every], np.bool_)
+        confident = np.array([each.confidence >= accept for each in every], np.bool_)
         near = np.nan_to_num(self._error, nan=np.inf) <= radius_m
-        self.right, self.wrong = sure & near, sure & ~near
+        self.right, self.wrong = confident & near, confident & ~near
         self._weight = np.array([1.0] * len(trials) + [OTHER_DATE_WEIGHT] * len(other_date))
         self._bandwidth_m = max(BANDWIDTH_VIEWS * view_side_m, BANDWIDTH_SPACINGS * spacing_m)
         self._least_error_m = least_error_m
-        self._seen_at, self._seen = seen, seen(self._points)
-        self._lasting = self._lasting_of(trials, other_date)
+        self._coverage_at, self._coverage = coverage, coverage(self._points)
+        self._persistence = self._persistence_of(trials, other_date)
         self._expected = self._regression()
 
-    def _lasting_of(self, trials: Sequence[Trial], other: Sequence[Trial]) -> Array:
-        """Expected persistence at every trial: of those with other pictures that around them."""
+    def _persistence_of(self, trials: Sequence[Trial], other: Sequence[Trial]) -> Array:
+        """Expected persistence at every trial; a trial of the second date takes the nearest."""
         own = np.array([each.expected for each in trials], np.float64)
         if not other:
             return own
@@ -96,57 +99,62 @@ class Field:
         return np.concatenate([own, own[nearest]])
 
     def _regression(self) -> Array:
-        """The probability that is expected of every trial by how much lasts."""
-        # Of n out of n nobody knows that it is always so.
+        """Probability (N,) of each trial by regression on persistence and coverage."""
+        # n of n trials do not prove a probability of 1.
         mean = (self.right @ self._weight + 0.5) / (self._weight.sum() + 1)
-        if self.right.all() or not self.right.any() or len(self.right) < 20:
+        if self.right.all() or not self.right.any() or len(self.right) < MIN_REGRESSION:
             return np.full(len(self.right), float(mean))
-        told = np.stack([np.log(self._lasting), self._seen], axis=1)
-        bias, slopes = fit_weights(told, self.right, self._weight, RIDGE)
-        return np.asarray(1 / (1 + np.exp(-(bias + told @ slopes))))
+        regressors = np.stack([np.log(self._persistence), self._coverage], axis=1)
+        bias, slopes = fit_weights(regressors, self.right, self._weight, RIDGE)
+        return np.asarray(1 / (1 + np.exp(-(bias + regressors @ slopes))))
 
-    def at(self, points_en_m: Array) -> Estimate:
-        """What the trials say of places (N, 2)."""
+    def at(self, points_en_m: Array) -> Prediction:
+        """Predictions at places (N, 2)."""
         chunk = max(1, _PAIRS_AT_ONCE // max(len(self._points), 1))
-        parts = [
-            self._part(points_en_m[start : start + chunk])
-            for start in range(0, max(len(points_en_m), 1), chunk)
-        ]
-        return Estimate(*(np.concatenate([part[i] for part in parts]) for i in range(7)))
+        starts = range(0, max(len(points_en_m), 1), chunk)
+        parts = [self._part(points_en_m[start : start + chunk]) for start in starts]
+        names = [field.name for field in fields(Prediction)]
+        return Prediction(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
-    def _part(self, points: Array) -> tuple[Array, ...]:
+    def _part(self, points: Array) -> Prediction:
         from scipy.stats import beta
 
-        square = ((points[:, None] - self._points[None]) ** 2).sum(axis=-1)
-        off = (self._seen_at(points)[:, None] - self._seen[None]) * self._bandwidth_m / SAME_SEEN
-        square += off**2
-        near = np.exp(-square / (2 * self._bandwidth_m**2)) * self._weight
+        near = self._weights(points, self._bandwidth_m)
         total = near.sum(axis=1)
-        # Far from all trials the nearest few still say what kind of ground it is.
-        wide = np.exp(-square / (2 * (FAR * self._bandwidth_m) ** 2)) * self._weight + 1e-12
-        kind = np.where((total > ENOUGH)[:, None], near, wide)
+        # Far from all trials the closest few still tell the kind of ground.
+        wide = self._weights(points, WIDER * self._bandwidth_m) + 1e-12
+        kind = np.where((total > MIN_WEIGHT)[:, None], near, wide)
         kind /= kind.sum(axis=1, keepdims=True)
         expected = np.clip(kind @ self._expected, 0.0, 1.0)  # rounding
         good = PRIOR_TRIALS * expected + near @ self.right
         bad = PRIOR_TRIALS * (1 - expected) + near @ ~self.right
         probability = good / (good + bad)
-        ends = (beta.ppf(end, good + JEFFREYS, bad + JEFFREYS) for end in INTERVAL)
+        low, high = (beta.ppf(end, good + JEFFREYS, bad + JEFFREYS) for end in INTERVAL)
         years = INTERVAL_SIGMAS * YEARS_LOGIT
-        low, high = (
-            _widened(probability, end, way) for end, way in zip(ends, (-years, years), strict=True)
-        )
-        low, high = np.minimum(low, probability), np.maximum(high, probability)
         squares = np.where(self.right, np.nan_to_num(self._error) ** 2, 0.0)
         overall = float(squares.sum() / max(self.right.sum(), 1))
         square_error = (near @ squares + overall) / (near @ self.right + 1.0)
-        error = np.sqrt(square_error + self._least_error_m**2)
-        everywhere = float(np.average(self.wrong, weights=self._weight))
-        wrong = (near @ self.wrong + everywhere) / (total + 1.0)
-        return probability, low, high, error, wrong, kind @ self._lasting, total
+        overall_wrong = float(np.average(self.wrong, weights=self._weight))
+        return Prediction(
+            probability=probability,
+            low=np.minimum(_widened(probability, low, -years), probability),
+            high=np.maximum(_widened(probability, high, years), probability),
+            error_m=np.sqrt(square_error + self._least_error_m**2),
+            wrong=(near @ self.wrong + overall_wrong) / (total + 1.0),
+            persistence=kind @ self._persistence,
+            weight=total,
+        )
+
+    def _weights(self, points: Array, bandwidth_m: float) -> Array:
+        """Weights (N, K) of the trials by distance and by similarity of coverage."""
+        square = ((points[:, None] - self._points[None]) ** 2).sum(axis=-1)
+        off = self._coverage_at(points)[:, None] - self._coverage[None]
+        square += (off * self._bandwidth_m / SAME_COVERAGE) ** 2
+        return np.asarray(np.exp(-square / (2 * bandwidth_m**2)) * self._weight)
 
 
 def _widened(middle: Array, end: Array, by_logit: float) -> Array:
-    """An end of an interval moved out for what years differ, both as independent errors."""
+    """`end` of an interval moved outwards by the deviation between years, independent of it."""
 
     def logit(p: Array) -> Array:
         p = np.clip(p, 1e-4, 1 - 1e-4)

@@ -1,4 +1,4 @@
-"""Places of a map that views of one may be put at the other, as trials found them."""
+"""Lookalikes: pairs of places that can be mistaken for each other, as trials found them."""
 
 import math
 from collections.abc import Sequence
@@ -10,20 +10,19 @@ from orthonav.check.outcome import Lookalike
 from orthonav.check.trials import Trial
 from orthonav.geo.frames import LocalFrame
 
-LIKE = 0.8
-"""A place elsewhere is alike where its score reaches this share of that of the right one."""
-MOST = 40
+SIMILAR = 0.8
+"""A rival place is a lookalike when it scores this share of the best place."""
+MAX_PAIRS = 40
 _WRONG_CONFIDENCE = 0.5
-"""One trial is enough where it was put elsewhere with this confidence; else it may be chance, and
-another must say the same."""
+"""One wrong trial of this confidence is enough; otherwise a second trial must agree."""
 
 
 @dataclass(frozen=True)
 class _Pair:
-    here: tuple[float, float]
-    there: tuple[float, float]
-    likeness: float
-    sure: bool
+    place: tuple[float, float]
+    other: tuple[float, float]
+    similarity: float
+    confident: bool
 
 
 def found_lookalikes(
@@ -34,26 +33,25 @@ def found_lookalikes(
     radius_m: float,
     prior_std_m: float | None,
 ) -> tuple[Lookalike, ...]:
-    """Pairs of places, the likest first. Pairs whose ends lie within half a view are one.
+    """Pairs of places, most similar first; pairs whose ends lie within half a view are merged.
 
-    A view that was put elsewhere makes a pair with where it was put; one that was put right with
-    its best rival, where that comes close.
+    A misplaced view pairs its true place with where it was placed; a correctly placed view pairs
+    it with its best rival, if that scores high enough.
     """
-    # Nearer than a quarter of a view is the same place, if not well placed.
+    # Within a quarter of a view it is the same place, only located badly.
     far_m = max(radius_m, view_side_m / 4)
     pairs = [pair for each in trials if (pair := _pair(each, far_m)) is not None]
-    pairs.sort(key=lambda pair: -pair.likeness)
+    pairs.sort(key=lambda pair: -pair.similarity)
     groups: list[list[_Pair]] = []
     for pair in pairs:
-        for group in groups:
-            if _alike(group[0], pair, view_side_m / 2):
-                group.append(pair)
-                break
-        else:
+        group = next((g for g in groups if _same(g[0], pair, view_side_m / 2)), None)
+        if group is None:
             groups.append([pair])
-    groups = [group for group in groups if len(group) > 1 or group[0].sure]
-    groups.sort(key=lambda group: (-min(len(group), 3), -group[0].likeness))
-    return tuple(_told(group, frame, prior_std_m) for group in groups[:MOST])
+        else:
+            group.append(pair)
+    groups = [group for group in groups if len(group) > 1 or group[0].confident]
+    groups.sort(key=lambda group: (-min(len(group), 3), -group[0].similarity))
+    return tuple(_lookalike(group, frame, prior_std_m) for group in groups[:MAX_PAIRS])
 
 
 def _pair(trial: Trial, far_m: float) -> _Pair | None:
@@ -61,30 +59,27 @@ def _pair(trial: Trial, far_m: float) -> _Pair | None:
         return None
     if trial.error_m > far_m:
         return _Pair(trial.en_m, trial.found_en_m, 1.0, trial.confidence >= _WRONG_CONFIDENCE)
-    if math.isfinite(trial.rival_share) and trial.rival_share >= LIKE:
+    if math.isfinite(trial.rival_share) and trial.rival_share >= SIMILAR:
         return _Pair(trial.en_m, trial.rival_en_m, min(trial.rival_share, 1.0), False)
     return None
 
 
-def _alike(one: _Pair, other: _Pair, within_m: float) -> bool:
+def _same(one: _Pair, two: _Pair, within_m: float) -> bool:
     """Whether both ends of two pairs, in either order, lie near each other."""
-    same = max(math.dist(one.here, other.here), math.dist(one.there, other.there))
-    turned = max(math.dist(one.here, other.there), math.dist(one.there, other.here))
-    return min(same, turned) <= within_m
+    straight = max(math.dist(one.place, two.place), math.dist(one.other, two.other))
+    swapped = max(math.dist(one.place, two.other), math.dist(one.other, two.place))
+    return min(straight, swapped) <= within_m
 
 
-def _told(group: Sequence[_Pair], frame: LocalFrame, prior_std_m: float | None) -> Lookalike:
+def _lookalike(group: Sequence[_Pair], frame: LocalFrame, prior_std_m: float | None) -> Lookalike:
     first = group[0]
-    apart_m = math.dist(first.here, first.there)
-    places = []
-    for place in (first.here, first.there):
-        lat, lon = frame.latlon_from_en(np.array(place))
-        places.append((float(lat), float(lon)))
+    apart_m = math.dist(first.place, first.other)
+    lat, lon = frame.latlon_from_en(np.array([first.place, first.other]))
     return Lookalike(
-        places[0],
-        places[1],
-        apart_m,
-        float(np.mean([pair.likeness for pair in group])),
-        len(group),
-        prior_std_m is None or apart_m <= 3 * prior_std_m,
+        place_latlon_deg=(float(lat[0]), float(lon[0])),
+        other_latlon_deg=(float(lat[1]), float(lon[1])),
+        apart_m=apart_m,
+        similarity=float(np.mean([pair.similarity for pair in group])),
+        trials=len(group),
+        within_prior=prior_std_m is None or apart_m <= 3 * prior_std_m,
     )

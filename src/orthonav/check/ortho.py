@@ -1,4 +1,4 @@
-"""An orthophoto of another date as the grey pyramid of a map that is checked."""
+"""An orthophoto of a second date as a grey pyramid in the plane of the checked map."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,11 +15,11 @@ from orthonav.mapfile.manifest import SheetInfo
 class OrthoPyramid:
     """Grey levels of an orthophoto in the plane and at the resolutions of a map's sheet.
 
-    Read when looked at; files stay open until `close`. Not to be shared between threads.
+    Files stay open until `close`. Not safe to share between threads.
     """
 
     def __init__(self, path: Path, sheet: SheetInfo, levels: int) -> None:
-        """Open the file; raises `ImageryError` where it is no orthophoto."""
+        """Open the file; raises `ImageryError` where it is not an orthophoto."""
         self.levels = levels
         self._sheet, self._mosaic = sheet, Mosaic.open([path])
         self._opened: dict[int, SheetRaster] = {}
@@ -53,14 +53,14 @@ class OrthoPyramid:
                 width_px=cols,
                 height_px=rows,
                 gsd_m=grid.gsd_m * 2**level,
-                threads=1,  # of several processes
+                threads=1,  # trials run in several processes
             )
             self._opened[level] = self._stack.enter_context(raster)
         return self._opened[level]
 
 
-def check_same_ground(path: Path, sheet: SheetInfo) -> None:
-    """Raises `AreaError` where an orthophoto shows nothing of a sheet."""
+def require_overlap(path: Path, sheet: SheetInfo) -> None:
+    """Raise `AreaError` where an orthophoto does not overlap a sheet."""
     lat_lon = Mosaic.open([path]).outline_latlon_deg
     points = sheet.frame.en_from_latlon(lat_lon[:, 0], lat_lon[:, 1])
     grid = sheet.grid
@@ -68,4 +68,4 @@ def check_same_ground(path: Path, sheet: SheetInfo) -> None:
     south_m = grid.north_m - grid.height_px * grid.gsd_m
     (west, south), (east, north) = points.min(axis=0), points.max(axis=0)
     if east < grid.west_m or west > east_m or north < south_m or south > grid.north_m:
-        raise AreaError(f"the other date shows no ground of the map: {path}")
+        raise AreaError(f"the orthophoto of the other date does not overlap the map: {path}")

@@ -1,10 +1,10 @@
-"""What a check finds: predictions of places, along a route, and the verdict.
+"""Result types of a check: predictions for places and along a route, and the verdict.
 
-Nothing here computes; `orthonav.check.run` fills these in and `orthonav.check.write` writes them.
-Probabilities are of one single view; NaN where nothing is known (no imagery, outside the band).
+`orthonav.check.run` computes them and `orthonav.check.write` writes them. A probability refers to
+one view; NaN means unknown (no imagery, or outside the band of the route).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -24,18 +24,23 @@ class Word(Enum):
 
     @property
     def exit_code(self) -> int:
-        """Of the command, for scripts: 0 go, 3 marginal, 4 no-go (1 and 2 are errors)."""
+        """Exit status of the command: 0 go, 3 marginal, 4 no-go (1 and 2 are errors)."""
         return {Word.GO: 0, Word.MARGINAL: 3, Word.NO_GO: 4}[self]
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What was checked for: views of `width_m` x `height_m` on the ground, and what is told.
+    """The conditions that a check assumes; defaults are those of `CheckRequest`.
 
-    Standard deviations: `yaw_std_deg` of the told heading (None: unknown), `agl_std` of the told
-    height as a share of it, `prior_std_m` of the told position per axis (None: the whole map is
-    searched). A fix is confident from `accept` on and correct within `radius_m`. `speed_mps` over
-    ground and `drift` (metres of error per metre flown without a fix) are for stretches.
+    `width_m`, `height_m`: footprint of a vertical view on the ground.
+    `agl_m`: height above ground; None: unknown.
+    `yaw_std_deg`: standard deviation of the reported heading; None: heading unknown.
+    `agl_std`: standard deviation of the reported height, as a share of the height.
+    `prior_std_m`: standard deviation of the prior position per axis; None: no prior.
+    `accept`: confidence from which a fix counts as confident, 0 to 1.
+    `radius_m`: largest error of a correct fix, from the map.
+    `speed_mps`: ground speed.
+    `drift`: error of dead reckoning in metres per metre flown without a fix.
     """
 
     width_m: float
@@ -52,12 +57,16 @@ class Conditions:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Predictions of square cells, row 0 in the north; arrays are (rows, cols).
+    """Predictions for square cells; arrays are (rows, cols), row 0 in the north.
 
-    `probability` of a correct, confident fix of one view anywhere in the cell, `low` and `high` an
-    80 % interval of it; `error_m` expected error (root mean square, metres) of such a fix;
-    `wrong` share of trials that were confident and wrong; `trials` how many views were tried;
-    `texture` 0..1, how much of what the ground shows is expected to last in another year.
+    `west_m`, `north_m`: north-west corner in the plane of the map's sheet.
+    `side_m`: side of a cell.
+    `probability`: probability of a correct, confident fix of one view in the cell, 0 to 1.
+    `low`, `high`: 80 % interval of `probability`.
+    `error_m`: expected error of such a fix (root mean square).
+    `wrong`: share of nearby trials that were confident and wrong, 0 to 1.
+    `trials`: number of views tried in the cell, second date excluded.
+    `persistence`: expected correlation of the ground's gradients with another year, 0 to 1.
     """
 
     west_m: float
@@ -69,36 +78,42 @@ class Cells:
     error_m: Array
     wrong: Array
     trials: NDArray[np.int32]
-    texture: Array
+    persistence: Array
 
 
 @dataclass(frozen=True, eq=False)
 class Along:
-    """Predictions at points (N,) along the route, `distance_m` from its start.
+    """Predictions at points (N,) along the route.
 
-    `across_low` is the lowest probability over the width of the band there; `points_en_m` (N, 2).
-    `drift_m` is the position error expected there (one standard deviation) when each fix comes with
-    its probability and dead reckoning drifts in between. `low` and `high` are an 80 % interval of
-    `probability`; where they are not told, those of the cells below are shown.
+    `distance_m`: distance from the start.
+    `points_en_m`: positions (N, 2), east and north in the plane of the map's sheet.
+    `probability`: as for `Cells`; `low`, `high`: its 80 % interval.
+    `across_low`: lowest probability across the band at that point.
+    `error_m`: expected error of a correct fix (root mean square).
+    `drift_m`: expected position error (one standard deviation) when each fix arrives with its
+    probability and dead reckoning drifts in between.
     """
 
     distance_m: Array
     points_en_m: Array
     probability: Array
+    low: Array
+    high: Array
     across_low: Array
     error_m: Array
     drift_m: Array
-    low: Array | None = None
-    high: Array | None = None
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """Part of the route where a view is unlikely to be placed: metres and seconds from its start.
+class BlindStretch:
+    """A part of the route where a fix is unlikely.
 
-    `drift_m` is what dead reckoning may be off by at its end, `allowed_m` how far it may be off
-    there and the next view still be searched in the right place. `ends_lost` where the route ends
-    in it.
+    `start_m`, `end_m`, `start_s`, `end_s`: distance and time from the start of the route.
+    `probability`: mean probability of a fix in it.
+    `drift_m`: error of dead reckoning at its end.
+    `allowed_m`: largest error there at which the next view is still searched in the right place;
+    infinite without a prior.
+    `ends_lost`: the route ends inside the stretch.
     """
 
     start_m: float
@@ -112,51 +127,60 @@ class Stretch:
 
     @property
     def length_m(self) -> float:
-        """How long it is along the route."""
+        """Length along the route."""
         return self.end_m - self.start_m
 
     @property
-    def bearable(self) -> bool:
-        """Whether the aircraft is found again after it."""
+    def recoverable(self) -> bool:
+        """Whether views can be placed again after it."""
         return not self.ends_lost and self.drift_m <= self.allowed_m
 
 
 @dataclass(frozen=True)
 class Lookalike:
-    """Two places that views of one may be put at the other; `likeness` 0..1, `trials` behind it.
+    """Two places that can be mistaken for each other.
 
-    Positions are (latitude, longitude) in degrees. `within_prior` is whether the other lies where a
-    view of the one would be searched.
+    `place_latlon_deg`, `other_latlon_deg`: latitude and longitude.
+    `apart_m`: distance between them.
+    `similarity`: score of the other place as a share of that of the true one, 0 to 1.
+    `trials`: number of trials that found the pair.
+    `within_prior`: a view of one place would also be searched at the other.
     """
 
     place_latlon_deg: tuple[float, float]
     other_latlon_deg: tuple[float, float]
     apart_m: float
-    likeness: float
+    similarity: float
     trials: int
     within_prior: bool
 
 
 @dataclass(frozen=True, eq=False)
 class Envelope:
-    """Share (A, B) of correct, confident fixes over errors of heading (A,) and height (B,).
+    """Share of correct, confident fixes over errors of heading and height.
 
-    Errors are those of one view, beyond what is told; `agl_off` is a share of the height. `fine` is
-    the largest of each alone at which the share stays at 85 % or more of that without error.
+    `yaw_off_deg` (A,): heading errors added to the reported heading.
+    `agl_off` (B,): height errors added to the reported height, as a share of it.
+    `share` (A, B): share of correct, confident fixes.
+    `tolerated_yaw_deg`, `tolerated_agl_low`, `tolerated_agl_high`: largest error of each alone at
+    which the share stays at 85 % or more of the share without error.
     """
 
     yaw_off_deg: Array
     agl_off: Array
     share: Array
-    fine_yaw_deg: float
-    fine_agl_low: float
-    fine_agl_high: float
+    tolerated_yaw_deg: float
+    tolerated_agl_low: float
+    tolerated_agl_high: float
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """What would be if something else were chosen: `what` ("agl_m", "band_m"), its value, and the
-    mean probability along the route or over the map with it."""
+    """The mean probability with another value of one planning parameter.
+
+    `what`: "agl_m" or "band_m"; `value`: its value in metres; `probability`: mean along the route,
+    or over the map; `chosen`: this is the value that was checked.
+    """
 
     what: str
     value: float
@@ -166,7 +190,7 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Reason:
-    """Why the verdict is what it is: a short word for programs, a sentence for people."""
+    """One finding behind the verdict: a stable code for programs, a sentence for people."""
 
     code: str
     text: str
@@ -175,19 +199,22 @@ class Reason:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The worst of its reasons, which come worst first."""
+    """The verdict and its reasons, worst first; the worst reason decides."""
 
     word: Word
     reasons: tuple[Reason, ...]
 
 
 @dataclass(frozen=True)
-class About:
-    """What was checked, as text to show."""
+class Provenance:
+    """What was checked, as text for reports; empty where it does not apply.
 
-    map_name: str
-    imagery: str
-    recipe: str
+    `terms`: attribution and licence of each imagery source.
+    """
+
+    map_name: str = ""
+    imagery: str = ""
+    recipe: str = ""
     other_date: str = ""
     route_name: str = ""
     command: str = ""
@@ -197,14 +224,17 @@ class About:
 
 @dataclass(frozen=True, eq=False)
 class CheckResult:
-    """All that a check found. `along` is None without a route, `envelope` where none was asked for.
+    """Everything that a check found.
 
-    `route_en_m` (M, 2) are its waypoints, `band_m` the width of its widest band. `second_date` is
-    whether views of another date were tried too. `area_km2` is what was checked, `mean` the mean
-    probability over it.
+    `frame`: plane of the map's sheet.
+    `area_km2`: checked area; `mean`: mean probability over it.
+    `second_date`: views of a second date were tried as well.
+    `along`: predictions along the route; None without one.
+    `route_en_m`: waypoints (M, 2); `band_m`: width of the widest band.
+    `envelope`: None where it was not requested.
     """
 
-    about: About
+    about: Provenance
     conditions: Conditions
     frame: LocalFrame
     cells: Cells
@@ -215,7 +245,7 @@ class CheckResult:
     along: Along | None = None
     route_en_m: Array | None = None
     band_m: float | None = None
-    stretches: tuple[Stretch, ...] = ()
+    stretches: tuple[BlindStretch, ...] = ()
     lookalikes: tuple[Lookalike, ...] = ()
     envelope: Envelope | None = None
-    alternatives: tuple[Alternative, ...] = field(default=())
+    alternatives: tuple[Alternative, ...] = ()

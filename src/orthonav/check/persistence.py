@@ -1,9 +1,8 @@
-"""How much of what a picture of the ground shows will still be there in another year.
+"""Persistence: how well the structure of the ground is expected to correlate with another year.
 
-Long lines with contrast last (roads, hedges, borders of fields); fine texture without direction
-does not (crops, crowns of trees). How much they do was learnt on generated landscapes of several
-seeds, dates and resolutions alone (`python -m experiments.persistence`), never on real imagery:
-predictions for real imagery are predictions.
+Long lines with contrast last (roads, hedges, field borders); fine texture without direction does
+not (crops, tree crowns). The regression was trained on generated landscapes of several seeds, dates
+and resolutions (`python -m experiments.persistence`), never on real imagery.
 """
 
 import json
@@ -21,21 +20,24 @@ from orthonav.register.evidence import FINE, evidence
 
 Array = NDArray[np.float32]
 PATCH_PX = 24
-"""Side of the ground over which persistence is told, in pixels of the level it is told at."""
+"""Side of the window over which persistence is averaged, in pixels of its level."""
 MARGIN_PX = 40
-"""How far a pixel's grey level reaches into what is told, about."""
-LEAST, MOST = 0.005, 0.95
+"""How far a grey level influences the features, about: patch, window and blur."""
+MIN_PERSISTENCE, MAX_PERSISTENCE = 0.005, 0.95
+"""Limits of predictions: the range of the training data."""
 _TENSORS = ((1.0, 11), (1.0, 21), (2.0, 29))
 """Blur before the gradient (standard deviation) and window of the structure tensor, in pixels."""
 _BROAD_PX, _BROADER_PX = 7, 29
+"""Boxes between which medium detail lies."""
 MODEL = "persistence.json"
 
 
 @dataclass(frozen=True, eq=False)
 class PersistenceModel:
-    """Ridge regression on all products of two features, standardized by `mean` and `spread`.
+    """Ridge regression on all products of two features.
 
-    `weights` (F,) belong to `terms` of the features (`features`), the resolution among them.
+    `mean`, `spread` (F,): mean and standard deviation of the features over the training data.
+    `weights` (T,): weights of the `terms` of the standardized features.
     """
 
     mean: NDArray[np.float64]
@@ -44,11 +46,11 @@ class PersistenceModel:
 
     def __call__(self, features: Array) -> Array:
         """Expected correlation of gradients (..) with those of another year, 0 to 1."""
-        told = terms((features - self.mean) / self.spread) @ self.weights
-        return np.asarray(np.clip(told, LEAST, MOST), dtype=np.float32)
+        predicted = terms((features - self.mean) / self.spread) @ self.weights
+        return np.asarray(np.clip(predicted, MIN_PERSISTENCE, MAX_PERSISTENCE), dtype=np.float32)
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain values for a file."""
+        """Plain values for a JSON file."""
         return {name: [float(f"{x:.6g}") for x in value] for name, value in vars(self).items()}
 
     @classmethod
@@ -60,8 +62,8 @@ class PersistenceModel:
 
 
 @cache
-def usual_model() -> PersistenceModel:
-    """The model that comes with the program."""
+def default_model() -> PersistenceModel:
+    """The model that is installed with the package."""
     text = resources.files(__package__).joinpath(MODEL).read_text(encoding="utf-8")
     return PersistenceModel.from_plain(json.loads(text)["model"])
 
@@ -76,10 +78,10 @@ def terms(scaled: NDArray[Any]) -> NDArray[Any]:
 
 
 def features(grey: NDArray[np.uint8], gsd_m: float, every_px: int = 8) -> Array:
-    """Features (h, w, F) of grey (H, W) at every `every_px` pixels, first at half of that.
+    """Features (h, w, F) of grey (H, W) every `every_px` pixels, starting at half of that.
 
-    Each is of the `PATCH_PX` around: how much gradients agree in direction, their energy, fine and
-    middling detail, evidence of registration, and the resolution `gsd_m` in metres per pixel.
+    Each is a mean over `PATCH_PX`: coherence of gradients, their energy, fine and medium detail,
+    registration evidence; the last is the resolution `gsd_m` (metres per pixel), as a logarithm.
     """
     picture = grey.astype(np.float32)
     found = []
@@ -91,8 +93,8 @@ def features(grey: NDArray[np.uint8], gsd_m: float, every_px: int = 8) -> Array:
         np.log(_mean(np.abs(a - b)) + np.float32(0.1))
         for a, b in ((picture, broad), (broad, broader))
     ]
-    told = evidence(grey, np.ones(grey.shape, np.bool_), FINE)
-    found.append(_mean(told[..., 0] ** 2 + told[..., 1] ** 2))
+    strength = evidence(grey, np.ones(grey.shape, np.bool_), FINE)
+    found.append(_mean(strength[..., 0] ** 2 + strength[..., 1] ** 2))
     half = every_px // 2
     thin = [each[half::every_px, half::every_px] for each in found]
     resolution = np.full_like(thin[0], np.log2(gsd_m))
@@ -102,7 +104,7 @@ def features(grey: NDArray[np.uint8], gsd_m: float, every_px: int = 8) -> Array:
 def _structure(picture: Array, blur: float, side_px: int) -> tuple[Array, Array]:
     """Coherence (0..1) and energy (H, W) of the structure tensor."""
     smooth = cv2.GaussianBlur(picture, (0, 0), blur)
-    east, south = (cv2.Sobel(smooth, cv2.CV_32F, *way, scale=1 / 8) for way in ((1, 0), (0, 1)))
+    east, south = (cv2.Sobel(smooth, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
 
     def around(values: Any) -> Array:
         return np.asarray(cv2.blur(values, (side_px, side_px)), np.float32)

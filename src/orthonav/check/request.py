@@ -1,33 +1,49 @@
-"""What a check is asked."""
+"""The request of a check, validated."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from orthonav.check.outcome import About
+from orthonav.check.outcome import Provenance
 from orthonav.errors import CheckError
 from orthonav.geo.camera import Camera
 from orthonav.geo.route import Route
+from orthonav.records import CONFIDENT
 
+NO_TEXTS = Provenance()
 DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
-"""A field of view of 65 by 51 degrees."""
+"""A field of view of 65 by 51 degrees, usual for small drones."""
 DEFAULT_SPEED_MPS = 20.0
+"""Cruise speed of a small fixed-wing aircraft."""
 DEFAULT_DRIFT = 0.03
-"""Dead reckoning without GNSS: metres of error per metre flown. With the wind known from before and
-an airspeed sensor 2 to 5 % are usual."""
+"""Dead reckoning with an airspeed sensor and a known wind is usually off by 2 to 5 %."""
 DEFAULT_PRIOR_STD_M = 150.0
+"""About 5 km of dead reckoning at that drift."""
 DEFAULT_RELIEF_M = 3.0
-NOTHING_SAID = About("", "", "")
+"""Height of houses and trees in open country, one standard deviation."""
 
 
 @dataclass(frozen=True)
 class CheckRequest:
-    """What to check: a map for views of `camera` from `agl_m` above ground.
+    """What to check and under which conditions.
 
-    Without `agl_m` it is the height at which the shorter side of a view covers a tile of the map.
-    `band_m` is for legs of `route` that do not say theirs. `other_date` is an orthophoto of the
-    same ground that is not in the map. Standard deviations as in `orthonav.check.outcome`.
-    `relief_m` is that of the height of houses and trees, which tilt in pictures from low;
-    `effort` multiplies the number of trials; `workers` None: one process per core.
+    `map_path`: map file with a registration layer.
+    `route`: planned route; None: the whole map.
+    `band_m`: width of the band for legs without one; None: derived from the prior.
+    `other_date`: orthophoto of the same ground that the map was not built from; optional.
+    `camera`: camera calibration.
+    `agl_m`: height above ground, 1 to 50,000 m; None: the shorter side of a view covers one tile.
+    `yaw_std_deg`: standard deviation of the reported heading, 0 to 90; None: heading unknown.
+    `agl_std`: standard deviation of the reported height, a share of it, 0 to 0.5.
+    `prior_std_m`: standard deviation of the prior position per axis; None: no prior.
+    `accept`: confidence that a fix needs, 0.01 to 0.999.
+    `speed_mps`: ground speed.
+    `drift`: error of dead reckoning per metre flown, 0 to 1.
+    `relief_m`: standard deviation of the height of houses and trees.
+    `effort`: factor on the number of trials, 0.05 to 50.
+    `extras`: also try other errors of heading and height, and other heights.
+    `workers`: processes; None: one per core.
+    `seed`: of the trials.
+    `about`: texts for the report.
     """
 
     map_path: Path
@@ -39,7 +55,7 @@ class CheckRequest:
     yaw_std_deg: float | None = 5.0
     agl_std: float = 0.05
     prior_std_m: float | None = DEFAULT_PRIOR_STD_M
-    accept: float = 0.9
+    accept: float = CONFIDENT
     speed_mps: float = DEFAULT_SPEED_MPS
     drift: float = DEFAULT_DRIFT
     relief_m: float = DEFAULT_RELIEF_M
@@ -47,10 +63,10 @@ class CheckRequest:
     extras: bool = True
     workers: int | None = None
     seed: int = 1
-    about: About = NOTHING_SAID
+    about: Provenance = NO_TEXTS
 
     def __post_init__(self) -> None:
-        """Raises `CheckError` on impossible numbers."""
+        """Raise `CheckError` for values out of range."""
         limits: dict[str, tuple[float | None, float, float, str]] = {
             "height above ground": (self.agl_m, 1.0, 50_000.0, "m"),
             "yaw_std_deg": (self.yaw_std_deg, 0.0, 90.0, "deg"),
@@ -58,7 +74,7 @@ class CheckRequest:
             "prior_std_m": (self.prior_std_m, 0.0, 1e6, "m"),
             "accept": (self.accept, 0.01, 0.999, ""),
             "speed_mps": (self.speed_mps, 0.1, 10_000.0, "m/s"),
-            "drift": (self.drift, 0.0, 1.0, "(a share of the way: 0.03 is 3 %)"),
+            "drift": (self.drift, 0.0, 1.0, "(metres per metre flown: 0.03 is 3 %)"),
             "relief_m": (self.relief_m, 0.0, 1000.0, "m"),
             "effort": (self.effort, 0.05, 50.0, ""),
             "workers": (self.workers, 1, 1000, "processes"),

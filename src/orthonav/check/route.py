@@ -1,5 +1,4 @@
-"""What a check says along a route: probability, drift, and stretches where views are unlikely to be
-placed."""
+"""Predictions along a route: probability, drift, and blind stretches."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -7,22 +6,21 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.check.outcome import Along, Conditions, Stretch
+from orthonav.check.estimate import Prediction
+from orthonav.check.outcome import Along, BlindStretch, Conditions
 from orthonav.geo.area import Area
 from orthonav.geo.route import along_polyline_en_m
 
 Array = NDArray[np.float64]
 BLIND = 0.5
-"""Below this probability of a fix a stretch is blind."""
+"""A stretch is blind below this probability: more likely no fix than a fix."""
 POINTS_PER_VIEW = 4.0
-MOST_POINTS = 4000
+"""Points along the route per side of a view, as many as cells."""
+MAX_POINTS = 4000
 ACROSS = 5
 """Points across the band at every point along it."""
-INDEPENDENT_VIEWS = 1.0
-"""Views say something new when they lie this many sides apart."""
-
-Told = Callable[[Array], tuple[Array, Array]]
-"""Probability and error (N,) at places (N, 2); 0 and NaN beyond the map."""
+NEGLIGIBLE = 1e-9
+"""Chances below this no longer change the expected drift."""
 
 
 def predicted_along(
@@ -30,41 +28,55 @@ def predicted_along(
     bands_m: Sequence[float],
     view_side_m: float,
     conditions: Conditions,
-    told: Told,
+    predict: Callable[[Array], Prediction],
 ) -> Along:
-    """Predictions along the route of an area; `bands_m` is the width of the band of every leg."""
+    """Predictions along the route of an area.
+
+    `bands_m` is the width of the band of every leg; `predict` takes places (N, 2) and returns a
+    probability of 0 and an error of NaN beyond the map.
+    """
     assert area.route is not None
     line = area.route.points_en_m(area.frame)
     ends_m = np.cumsum(np.hypot(*np.diff(line, axis=0).T))
     length_m = float(ends_m[-1]) if len(ends_m) else 0.0
-    step_m = max(view_side_m / POINTS_PER_VIEW, length_m / MOST_POINTS)
+    step_m = max(view_side_m / POINTS_PER_VIEW, length_m / MAX_POINTS)
     points, course_deg = along_polyline_en_m(line, max(step_m, 1e-6))
     distance_m = np.minimum(np.arange(len(points)) * step_m, length_m)
-    middle, error = told(points)
+    middle = predict(points)
     course = np.radians(course_deg)
     across = np.stack([np.cos(course), -np.sin(course)], axis=1)
     leg = np.minimum(np.searchsorted(ends_m, distance_m), len(bands_m) - 1)
     across *= np.asarray(bands_m, np.float64)[leg, None]
     shares = np.linspace(-0.5, 0.5, ACROSS)
-    lowest = np.min([told(points + share * across)[0] for share in shares], axis=0)
-    drift = expected_drift(distance_m, middle, error, conditions.drift, view_side_m)
-    return Along(distance_m, points, middle, np.minimum(lowest, middle), error, drift)
+    lowest = np.min([predict(points + share * across).probability for share in shares], axis=0)
+    return Along(
+        distance_m=distance_m,
+        points_en_m=points,
+        probability=middle.probability,
+        low=middle.low,
+        high=middle.high,
+        across_low=np.minimum(lowest, middle.probability),
+        error_m=middle.error_m,
+        drift_m=expected_drift(
+            distance_m, middle.probability, middle.error_m, conditions.drift, view_side_m
+        ),
+    )
 
 
 def expected_drift(
     distance_m: Array, probability: Array, error_m: Array, drift: float, view_side_m: float
 ) -> Array:
-    """Position error (N,), root mean square, when fixes come as they are predicted.
+    """Expected position error (N,), root mean square, when fixes arrive as predicted.
 
-    A new view every side of a view gives a fix with its probability; between fixes the error grows
-    by `drift` per metre. Before the first view the position is taken as known.
+    An independent view every `view_side_m` gives a fix with its probability; between fixes the
+    error grows by `drift` per metre. The position is known before the first view.
     """
     length_m = float(distance_m[-1])
-    stops = np.arange(0.0, length_m + view_side_m, INDEPENDENT_VIEWS * view_side_m)
+    stops = np.arange(0.0, length_m + view_side_m, view_side_m)
     chance = np.interp(stops, distance_m, probability)
     error = np.interp(stops, distance_m, np.nan_to_num(error_m, nan=0.0))
-    found = np.zeros(len(stops))
-    # Chance that the last fix was k views ago, times the square of the error since then.
+    expected = np.zeros(len(stops))
+    # Chance that the last fix was k views ago, and the square of the error that has grown since.
     since: Array = np.array([1.0])
     grown: Array = np.array([error[0] ** 2])
     for i in range(len(stops)):
@@ -72,49 +84,36 @@ def expected_drift(
             grown = (np.sqrt(grown) + drift * view_side_m) ** 2
         since = np.concatenate([[since.sum() * chance[i]], since * (1 - chance[i])])
         grown = np.concatenate([[error[i] ** 2], grown])
-        keep = since > 1e-9
-        keep[-1] = True
-        since, grown = since[keep], grown[keep]
-        found[i] = math.sqrt(float((since * grown).sum() / since.sum()))
-    return np.interp(distance_m, stops, found)
+        counts = since > NEGLIGIBLE
+        counts[-1] = True
+        since, grown = since[counts], grown[counts]
+        expected[i] = math.sqrt(float((since * grown).sum() / since.sum()))
+    return np.interp(distance_m, stops, expected)
 
 
 def blind_stretches(
     along: Along, conditions: Conditions, view_side_m: float
-) -> tuple[Stretch, ...]:
-    """Where the probability is below `BLIND` for at least one side of a view, in order."""
+) -> tuple[BlindStretch, ...]:
+    """Stretches of at least one side of a view with a probability below `BLIND`, in order."""
     blind = along.probability < BLIND
     edges = np.flatnonzero(np.diff(np.concatenate([[0], blind.astype(int), [0]])))
-    found = []
     last = len(blind) - 1
+    allowed_m = math.inf if conditions.prior_std_m is None else conditions.prior_std_m
+    found = []
     for first, end in edges.reshape(-1, 2):
         start_m = float(along.distance_m[first])
         end_m = float(along.distance_m[min(end, last)])
         if end_m - start_m < view_side_m:
             continue
-        part = slice(first, end)
-        found.append(_stretch(along, part, start_m, end_m, conditions, ends_lost=end > last))
+        stretch = BlindStretch(
+            start_m=start_m,
+            end_m=end_m,
+            start_s=start_m / conditions.speed_mps,
+            end_s=end_m / conditions.speed_mps,
+            probability=float(along.probability[first:end].mean()),
+            drift_m=conditions.drift * (end_m - start_m),
+            allowed_m=allowed_m,
+            ends_lost=bool(end > last),
+        )
+        found.append(stretch)
     return tuple(found)
-
-
-def _stretch(
-    along: Along,
-    part: slice,
-    start_m: float,
-    end_m: float,
-    conditions: Conditions,
-    *,
-    ends_lost: bool,
-) -> Stretch:
-    prior_m = conditions.prior_std_m
-    drift_m = conditions.drift * (end_m - start_m)
-    return Stretch(
-        start_m,
-        end_m,
-        start_m / conditions.speed_mps,
-        end_m / conditions.speed_mps,
-        float(along.probability[part].mean()),
-        drift_m,
-        math.inf if prior_m is None else prior_m,
-        ends_lost=ends_lost,
-    )

@@ -1,11 +1,9 @@
-"""The check of a map: where could views be placed, and would a route be flown well?"""
+"""The check of a map: trials, predictions for all of it and along a route, verdict."""
 
 import math
-import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +15,9 @@ from orthonav.check.envelope import (
     heights_of,
     heights_work,
 )
-from orthonav.check.estimate import Estimate, Field
+from orthonav.check.estimate import Prediction, Predictor
 from orthonav.check.lookalikes import found_lookalikes
-from orthonav.check.ortho import check_same_ground
+from orthonav.check.ortho import require_overlap
 from orthonav.check.outcome import (
     Along,
     Alternative,
@@ -29,19 +27,21 @@ from orthonav.check.outcome import (
     Envelope,
 )
 from orthonav.check.places import (
-    Ground,
-    Lattice,
+    CellGrid,
+    MapCoverage,
     cell_side_m,
     checked_extent,
-    looked_at_m2,
+    checked_m2,
     trial_places,
 )
 from orthonav.check.request import CheckRequest
 from orthonav.check.route import blind_stretches, predicted_along
 from orthonav.check.trials import Trial, run_many
 from orthonav.check.verdict import Findings, verdict_of
-from orthonav.check.views import LEAST_VALID, TrialPlan
+from orthonav.check.views import MIN_VALID, TrialPlan
+from orthonav.cores import usable_cores
 from orthonav.errors import AreaError, CameraError, MapFileError
+from orthonav.files import Progress
 from orthonav.geo.area import Area
 from orthonav.geo.route import distance_to_polyline_m
 from orthonav.localizer import Localizer
@@ -50,60 +50,72 @@ from orthonav.mapfile.reader import MapFile
 
 Array = NDArray[np.float64]
 BAND_PRIORS = 4.0
-"""Where no band is told it is so many standard deviations of the prior wide."""
-ENVELOPE_PLACES = 16
-HEIGHT_PLACES = 30
+"""Width of a band that is not given, in standard deviations of the prior: two to each side."""
+ENVELOPE_PLACES, HEIGHT_PLACES = 16, 30
+"""Places of trials for the envelope (25 at each) and for other heights (4 at each)."""
 BANDS = (0.25, 0.5)
-LEAST_TRIALS = 20
-LEAST_BAND_VIEWS = 0.5
-"""Bands are looked at so many sides of a view wide, at least."""
-MOST_OBLONG = 8.0
-"""A view is at most so many times as long as wide."""
-LEAST_SHOWN = 0.25
-"""Cells of which the map shows less than this share are beyond it."""
-MOST_CELLS_AROUND = 250_000
-"""Cells of the box around a band, most of them empty."""
-Report = Callable[[str, float], None]
+"""Narrower bands that are compared, as parts of the planned one."""
+MIN_TRIALS = 20
+MIN_BAND_VIEWS = 0.5
+"""A band is checked at least so many sides of a view wide."""
+MAX_ASPECT = 8.0
+"""Largest ratio of the sides of a view."""
+MIN_COVERED = 0.25
+"""A cell of which the map covers less than this share counts as outside the map."""
+MAX_CELLS_AROUND = 250_000
+"""Limit of cells in the box around a band, most of them empty."""
 
 
-def check_map(request: CheckRequest, report: Report | None = None) -> tuple[CheckResult, MapFile]:
-    """Check a map; `report` is told what is done and how far, 0..1.
+def check_map(
+    request: CheckRequest, progress: Progress | None = None
+) -> tuple[CheckResult, MapFile]:
+    """Check a map; `progress` is called with the stage and its share done, 0..1.
 
     Raises `MapFileError` where the map cannot be checked, `AreaError` where the route or the other
-    date lie elsewhere or views are too large for the map, `CameraError` where they are too oblong,
-    `WorkerError` where a process ended on its own.
+    date lie outside the map or views are too large for it, `CameraError` for footprints that are
+    too narrow, `WorkerError` where a worker process ended unexpectedly.
     """
-    told = report or (lambda what, share: None)
     opened = open_map(request.map_path)
-    return _Check(request, opened, told).result(), opened
+    return _Check(request, opened, progress or (lambda stage, share: None)).result(), opened
 
 
 @dataclass
 class _Check:
     request: CheckRequest
     opened: MapFile
-    report: Report
-    ground: Ground = field(init=False)
+    progress: Progress
+    coverage: MapCoverage = field(init=False)
     area: Area | None = field(init=False)
 
     def __post_init__(self) -> None:
         if len(self.opened.manifest.sheets) != 1:
-            raise MapFileError(f"this program checks maps of one sheet: {self.opened.path}")
+            raise MapFileError(f"only maps of one sheet can be checked: {self.opened.path}")
         registration = Localizer(self.opened).registration
         if registration is None:
             raise MapFileError(
                 f"only maps with a registration layer can be checked: {self.opened.path}"
             )
         self.sheet = registration.sheet
-        self.ground = Ground.of(registration.registrar.reference.pyramid, self.sheet.grid)
+        self.coverage = MapCoverage.of(registration.pyramid, self.sheet.grid)
         self.radius_m, self.floor_px = registration.radius_m, registration.floor_px
         self.calibrated = registration.confidence is not None
         self.plan = self._plan()
-        self.conditions = self._conditions()
+        self.conditions = Conditions(
+            self.plan.width_m,
+            self.plan.height_m,
+            self.plan.agl_m,
+            self.request.yaw_std_deg,
+            self.request.agl_std,
+            self.request.prior_std_m,
+            self.request.accept,
+            self.radius_m,
+            self.request.speed_mps,
+            self.request.drift,
+        )
         self.area = self._area()
         if self.request.other_date is not None:
-            check_same_ground(self.request.other_date, self.sheet)
-        self.extent = checked_extent(self.ground, self.area)
+            require_overlap(self.request.other_date, self.sheet)
+        self.extent = checked_extent(self.coverage, self.area)
 
     def _plan(self) -> TrialPlan:
         request, camera = self.request, self.request.camera
@@ -121,283 +133,228 @@ class _Check:
             request.relief_m,
             request.seed,
         )
-        sides_m = sorted((plan.width_m, plan.height_m))
-        if sides_m[1] > MOST_OBLONG * sides_m[0]:
+        short_m, long_m = sorted((plan.width_m, plan.height_m))
+        if long_m > MAX_ASPECT * short_m:
             raise CameraError(
-                f"views must be at most {MOST_OBLONG:g} times as long as wide, this camera's see "
-                f"{plan.width_m:.4g} x {plan.height_m:.4g} m"
+                f"a view may be at most {MAX_ASPECT:g} times as long as wide, but with this camera "
+                f"{plan.footprint_text}; check the calibration"
             )
-        if LEAST_VALID * math.hypot(*sides_m) ** 2 > self.ground.area_m2:
-            raise AreaError(f"views do not fit on the map: {_too_large(plan)}")
+        if MIN_VALID * (short_m**2 + long_m**2) > self.coverage.area_m2:
+            raise AreaError(
+                f"views do not fit on the map: {plan.footprint_text}; fly lower, or build a larger "
+                "map"
+            )
         return plan
 
-    def _conditions(self) -> Conditions:
-        request, plan = self.request, self.plan
-        return Conditions(
-            plan.width_m,
-            plan.height_m,
-            plan.agl_m,
-            request.yaw_std_deg,
-            request.agl_std,
-            request.prior_std_m,
-            request.accept,
-            self.radius_m,
-            request.speed_mps,
-            request.drift,
-        )
-
     @property
-    def band_m(self) -> float | None:
-        """Width of the band where legs do not say theirs."""
-        if self.request.route is None or self.request.band_m is not None:
-            return self.request.band_m
-        prior_m = self.request.prior_std_m
-        if prior_m is None:
+    def _band_m(self) -> float | None:
+        """Width of the band for legs without one."""
+        request = self.request
+        if request.route is None or request.band_m is not None:
+            return request.band_m
+        if request.prior_std_m is None:
             return BAND_PRIORS * self.plan.side_m
-        return max(BAND_PRIORS * prior_m, LEAST_BAND_VIEWS * self.plan.side_m)
+        return max(BAND_PRIORS * request.prior_std_m, MIN_BAND_VIEWS * self.plan.side_m)
+
+    @cached_property
+    def _leg_bands_m(self) -> tuple[float, ...]:
+        """Width of the band of every leg of the route."""
+        route = self.request.route
+        return () if route is None else route.bands_m(self._band_m) or ()
 
     def _area(self) -> Area | None:
+        """The band of the route in the plane of the map."""
         route = self.request.route
         if route is None:
             return None
-        Area.from_route(route, self.band_m)  # raises what is wrong with it
-        # The same route in the plane of the map.
+        Area.from_route(route, self._band_m)  # validates the route
         line = route.points_en_m(self.sheet.frame)
-        least_m = LEAST_BAND_VIEWS * self.plan.side_m
-        bands_m = tuple(max(each, least_m) for each in self._leg_bands_m)
+        min_m = MIN_BAND_VIEWS * self.plan.side_m
+        bands_m = tuple(max(each, min_m) for each in self._leg_bands_m)
         half = max(bands_m) / 2
         (west, south), (east, north) = line.min(axis=0) - half, line.max(axis=0) + half
         extent = (float(west), float(south), float(east), float(north))
         return Area(self.sheet.frame, extent, replace(route, leg_bands_m=bands_m), half * 2)
 
-    @property
-    def _leg_bands_m(self) -> tuple[float, ...]:
-        """Width of the band of every leg of the route."""
-        route = self.request.route
-        return () if route is None else route.bands_m(self.band_m) or ()
+    @cached_property
+    def _checked_m2(self) -> float:
+        return checked_m2(self.coverage, self.area)
 
     def result(self) -> CheckResult:
-        """All of it."""
-        rng = np.random.default_rng([self.request.seed, 4])
-        side_m = self.plan.side_m
-        places = trial_places(self.ground, self.area, self.extent, side_m, self.request.effort, rng)
-        own, other, envelope, heights = self._trials(places, rng)
-        spacing_m = math.sqrt(self._looked_at_m2 / max(len(own), 1))
-        told = Field(
+        """Run the trials and derive everything from them."""
+        request, side_m = self.request, self.plan.side_m
+        rng = np.random.default_rng([request.seed, 4])
+        places = trial_places(self.coverage, self.area, self.extent, side_m, request.effort, rng)
+        own, other = self._trials(places)
+        envelope, heights = self._extra_trials(own, rng) if request.extras else (None, [])
+        predictor = Predictor(
             own,
             radius_m=self.radius_m,
-            accept=self.request.accept,
+            accept=request.accept,
             view_side_m=side_m,
-            spacing_m=spacing_m,
+            spacing_m=math.sqrt(self._checked_m2 / max(len(own), 1)),
             other_date=other,
-            least_error_m=self._floor_m(),
-            seen=lambda points: self.ground.seen(points, side_m),
+            # Trials do not show how well orthophotos of two dates agree.
+            least_error_m=self.floor_px * self.sheet.grid.gsd_m * math.sqrt(2),
+            coverage=lambda points: self.coverage.seen_share(points, side_m),
         )
-        cells = self._cells(told, own)
-        along = self._along(told)
-        stretches = () if along is None else blind_stretches(along, self.conditions, side_m)
-        lookalikes = found_lookalikes(
-            [*own, *other],
-            self.sheet.frame,
-            view_side_m=side_m,
-            radius_m=self.radius_m,
-            prior_std_m=self.request.prior_std_m,
-        )
+        cells = self._cells(predictor, own)
+        along = self._along(predictor)
         known = np.isfinite(cells.probability)
-        everywhere = float(cells.probability[known].mean()) if known.any() else 0.0
-        mean = everywhere if along is None else float(along.probability.mean())
-        every = [*own, *other]
-        outside = 0.0
-        if along is not None:
-            outside = float(1 - self.ground.shown(along.points_en_m).mean())
+        mean = float(cells.probability[known].mean()) if known.any() else 0.0
         findings = Findings(
-            self.conditions,
-            mean,
-            self.calibrated,
-            int(told.wrong.sum()),
-            len(every),
-            outside,
-            along,
-            stretches,
-            lookalikes,
+            conditions=self.conditions,
+            mean=mean if along is None else float(along.probability.mean()),
+            calibrated=self.calibrated,
+            wrong=int(predictor.wrong.sum()),
+            trials=len(own) + len(other),
+            outside=0.0 if along is None else self._outside(along),
+            along=along,
+            stretches=() if along is None else blind_stretches(along, self.conditions, side_m),
+            lookalikes=found_lookalikes(
+                [*own, *other],
+                self.sheet.frame,
+                view_side_m=side_m,
+                radius_m=self.radius_m,
+                prior_std_m=request.prior_std_m,
+            ),
         )
-        route_en_m = None
-        if self.request.route is not None:
-            route_en_m = self.request.route.points_en_m(self.sheet.frame)
-        planned = accepted_share(own, self.request.accept, self.radius_m)
-        alternatives = self._alternatives(heights, planned, cells)
+        route = request.route
         return CheckResult(
-            about=self.request.about,
+            about=request.about,
             conditions=self.conditions,
             frame=self.sheet.frame,
             cells=cells,
             verdict=verdict_of(findings),
             area_km2=float(known.sum()) * cells.side_m**2 / 1e6,
-            mean=everywhere,
+            mean=mean,
             second_date=bool(other),
             along=along,
-            route_en_m=route_en_m,
+            route_en_m=None if route is None else route.points_en_m(self.sheet.frame),
             band_m=None if self.area is None else self.area.band_m,
-            stretches=stretches,
-            lookalikes=lookalikes,
+            stretches=findings.stretches,
+            lookalikes=findings.lookalikes,
             envelope=envelope,
-            alternatives=alternatives,
+            alternatives=self._alternatives(heights, own, cells),
         )
 
-    @cached_property
-    def _looked_at_m2(self) -> float:
-        return looked_at_m2(self.ground, self.area)
+    def _outside(self, along: Along) -> float:
+        return float(1 - self.coverage.covers(along.points_en_m).mean())
 
-    def _floor_m(self) -> float:
-        """Error of a fix that trials do not show: how well orthophotos of two dates agree."""
-        return self.floor_px * self.sheet.grid.gsd_m * math.sqrt(2)
-
-    def _trials(
-        self, places: Array, rng: np.random.Generator
-    ) -> tuple[list[Trial], list[Trial], Envelope | None, list[list[Trial]]]:
-        plan = self.plan
+    def _trials(self, places: Array) -> tuple[list[Trial], list[Trial]]:
+        """Trials with the map's imagery, and with that of the second date."""
+        other_date, plan = self.request.other_date, self.plan
         work = [(plan, places)]
-        if self.request.other_date is not None:
-            work.append((_with_other(plan, self.request.other_date), places))
-        first = run_many(work, self._workers, lambda share: self.report("trials", share))
-        own = first[0]
-        other = first[1] if self.request.other_date is not None else []
-        if len(own) < LEAST_TRIALS:
+        if other_date is not None:
+            work.append((replace(plan, other_path=other_date, seed=plan.seed + 1), places))
+        own, *others = run_many(work, self._workers, lambda share: self.progress("trials", share))
+        if len(own) < MIN_TRIALS:
             raise AreaError(
-                f"only {len(own)} of {len(places)} trial views fit on the map: {_too_large(plan)}"
+                f"only {len(own)} of {len(places)} trial views fit on the map: "
+                f"{plan.footprint_text}; fly lower, or build a larger map"
             )
-        if self.request.other_date is not None and not other:
+        if others and not others[0]:
             raise AreaError(
-                f"the other date shows no ground where the check looks: {self.request.other_date}"
+                f"the orthophoto of the other date does not cover the checked area: {other_date}"
             )
-        if not self.request.extras:
-            return own, other, None, []
-        fine = self._found_places(own, rng)
-        spread = np.array([each.en_m for each in own])
-        spread = spread[rng.permutation(len(spread))[:HEIGHT_PLACES]]
-        errors = envelope_work(plan, fine) if len(fine) >= ENVELOPE_PLACES // 2 else []
-        more = run_many(
-            [*errors, *heights_work(plan, spread)],
-            self._workers,
-            lambda share: self.report("envelope", share),
-        )
-        envelope = None
-        if errors:
-            envelope = envelope_of(more[: len(errors)], self.request.accept, self.radius_m)
-        return own, other, envelope, more[len(errors) :]
+        return own, others[0] if others else []
 
-    def _found_places(self, own: Sequence[Trial], rng: np.random.Generator) -> Array:
-        """Places where views were placed well: elsewhere errors of heading change nothing."""
-        good = [
-            each.en_m
-            for each in own
-            if each.confidence >= self.request.accept and each.error_m <= self.radius_m
-        ]
-        order = rng.permutation(len(good))[:ENVELOPE_PLACES]
-        return np.array([good[i] for i in order], np.float64).reshape(-1, 2)
+    def _extra_trials(
+        self, own: Sequence[Trial], rng: np.random.Generator
+    ) -> tuple[Envelope | None, list[list[Trial]]]:
+        """The envelope of errors, and trials from other heights."""
+        accept, radius_m = self.request.accept, self.radius_m
+        # Where views are not placed, errors of heading and height make no difference.
+        placed = [t.en_m for t in own if t.confidence >= accept and t.error_m <= radius_m]
+        order = rng.permutation(len(placed))[:ENVELOPE_PLACES]
+        exact = np.array([placed[i] for i in order], np.float64).reshape(-1, 2)
+        places = np.array([each.en_m for each in own])
+        places = places[rng.permutation(len(places))[:HEIGHT_PLACES]]
+        errors = envelope_work(self.plan, exact) if len(exact) >= ENVELOPE_PLACES // 2 else []
+        found = run_many(
+            [*errors, *heights_work(self.plan, places)],
+            self._workers,
+            lambda share: self.progress("envelope", share),
+        )
+        envelope = envelope_of(found[: len(errors)], accept, radius_m) if errors else None
+        return envelope, found[len(errors) :]
 
     @property
     def _workers(self) -> int:
         if self.request.workers is not None:
             return self.request.workers
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
+        return usable_cores()
 
-    def _told(self, told: Field, points: Array, shown: NDArray[np.bool_]) -> Estimate:
-        """Estimates at places; probability 0 where the map shows nothing."""
-        found, off = told.at(points), ~shown
-        for name in ("probability", "low", "high", "wrong"):
-            getattr(found, name)[off] = 0.0
-        found.error_m[off] = np.nan
+    def _predict(
+        self, predictor: Predictor, points: Array, covered: NDArray[np.bool_]
+    ) -> Prediction:
+        """Predictions for places (N, 2): probability 0 and no error where the map is empty."""
+        found = predictor.at(points)
+        for values in (found.probability, found.low, found.high, found.wrong):
+            values[~covered] = 0.0
+        found.error_m[~covered] = np.nan
         return found
 
-    def _cells(self, told: Field, own: Sequence[Trial]) -> Cells:
+    def _cells(self, predictor: Predictor, own: Sequence[Trial]) -> Cells:
         west, south, east, north = self.extent
         around_m2 = (east - west) * (north - south)
         side_m = cell_side_m(around_m2, self.plan.side_m)
         if self.area is not None:
-            side_m = cell_side_m(self._looked_at_m2, self.plan.side_m)
-            side_m = max(side_m, math.sqrt(around_m2 / MOST_CELLS_AROUND))
-        lattice = Lattice.over(self.extent, side_m)
-        points = lattice.centres_en_m
-        shape = (lattice.rows, lattice.cols)
-        here = shown = self.ground.share_shown(lattice).ravel() > LEAST_SHOWN
+            side_m = cell_side_m(self._checked_m2, self.plan.side_m)
+            side_m = max(side_m, math.sqrt(around_m2 / MAX_CELLS_AROUND))
+        grid = CellGrid.over(self.extent, side_m)
+        points = grid.centres_en_m
+        here = covered = self.coverage.cell_share(grid).ravel() > MIN_COVERED
         if self.area is not None:
-            # A band that is narrower than a cell still runs through cells.
+            # A band that is narrower than a cell still crosses cells.
             bands_m = self.area.route.bands_m(None) if self.area.route else None
             narrowest_m = min(bands_m or (0.0,))
             here = self.area.contains(points, max(0.0, (side_m - narrowest_m) / 2))
-        found = self._told(told, points[here], shown[here])
-        tried = np.zeros(shape, np.int32)
-        for each in own:
-            col = math.floor((each.en_m[0] - lattice.west_m) / side_m)
-            row = math.floor((lattice.north_m - each.en_m[1]) / side_m)
-            if 0 <= row < shape[0] and 0 <= col < shape[1]:
-                tried[row, col] += 1
-
-        def spread(values: Array) -> Array:
+        found = self._predict(predictor, points[here], covered[here])
+        columns = {}
+        for each in fields(found):
             whole = np.full(len(points), np.nan)
-            whole[here] = values
-            return whole.reshape(shape)
+            whole[here] = getattr(found, each.name)
+            columns[each.name] = whole.reshape(grid.rows, grid.cols)
+        del columns["weight"]
+        trials = grid.counts(np.array([each.en_m for each in own]))
+        return Cells(grid.west_m, grid.north_m, side_m, trials=trials, **columns)
 
-        return Cells(
-            lattice.west_m,
-            lattice.north_m,
-            side_m,
-            spread(found.probability),
-            spread(found.low),
-            spread(found.high),
-            spread(found.error_m),
-            spread(found.wrong),
-            tried,
-            spread(found.lasting),
-        )
-
-    def _along(self, told: Field) -> Along | None:
+    def _along(self, predictor: Predictor) -> Along | None:
         if self.area is None:
             return None
 
-        def at(points: Array) -> tuple[Array, Array]:
-            found = self._told(told, points, self.ground.shown(points))
-            return found.probability, found.error_m
+        def predict(points: Array) -> Prediction:
+            return self._predict(predictor, points, self.coverage.covers(points))
 
         side_m = self.plan.side_m
-        made = predicted_along(self.area, self._leg_bands_m, side_m, self.conditions, at)
-        found = self._told(told, made.points_en_m, self.ground.shown(made.points_en_m))
-        return replace(made, low=found.low, high=found.high)
+        return predicted_along(self.area, self._leg_bands_m, side_m, self.conditions, predict)
 
     def _alternatives(
-        self, heights: list[list[Trial]], planned: float, cells: Cells
+        self, heights: list[list[Trial]], own: Sequence[Trial], cells: Cells
     ) -> tuple[Alternative, ...]:
-        made: tuple[Alternative, ...] = ()
+        found: tuple[Alternative, ...] = ()
         if heights:
-            made = heights_of(self.plan, heights, planned, self.request.accept, self.radius_m)
-        return made + self._bands(cells)
+            accept, radius_m = self.request.accept, self.radius_m
+            planned = accepted_share(own, accept, radius_m)
+            found = heights_of(self.plan, heights, planned, accept, radius_m)
+        return found + self._bands(cells)
 
     def _bands(self, cells: Cells) -> tuple[Alternative, ...]:
-        """What narrower bands would come to, where the whole route has one."""
+        """Mean probability in narrower bands, where all legs have the same."""
         widths = set(self._leg_bands_m)
         if self.area is None or self.area.route is None or len(widths) != 1:
             return ()
         rows, cols = cells.probability.shape
-        lattice = Lattice(cells.west_m, cells.north_m, cells.side_m, rows, cols)
+        grid = CellGrid(cells.west_m, cells.north_m, cells.side_m, rows, cols)
         line = self.area.route.points_en_m(self.area.frame)
-        away_m = distance_to_polyline_m(lattice.centres_en_m, line)
-        told = cells.probability.ravel()
+        away_m = distance_to_polyline_m(grid.centres_en_m, line)
+        probability = cells.probability.ravel()
         found = []
-        for width_m, part in ((part * max(widths), part) for part in (*BANDS, 1.0)):
-            inside = (away_m <= max(width_m, cells.side_m) / 2) & np.isfinite(told)
+        for part in (*BANDS, 1.0):
+            width_m = part * max(widths)
+            inside = (away_m <= max(width_m, cells.side_m) / 2) & np.isfinite(probability)
             if inside.any() and width_m > cells.side_m:
-                mean = float(told[inside].mean())
+                mean = float(probability[inside].mean())
                 found.append(Alternative("band_m", width_m, mean, chosen=part == 1.0))
         return tuple(found) if len(found) > 1 else ()
-
-
-def _too_large(plan: TrialPlan) -> str:
-    return (
-        f"a view from {plan.agl_m:.0f} m sees {plan.width_m:.0f} x {plan.height_m:.0f} m; fly "
-        "lower, or build a larger map"
-    )
-
-
-def _with_other(plan: TrialPlan, other: Path) -> TrialPlan:
-    return replace(plan, other_path=other, seed=plan.seed + 1)

@@ -1,7 +1,7 @@
-"""Trials: views of the map's own ground as another year might show it, placed by what flies.
+"""Trials: views of the map's ground as another year might show it, placed by the code that flies.
 
-Each trial draws a place, a heading and what is told wrongly, makes the view and registers it. The
-same is done with pictures of a second date where there is one.
+Each trial draws a place, a heading and errors of the telemetry, makes a view and registers it. With
+an orthophoto of a second date, trials are repeated with views of that.
 """
 
 import math
@@ -20,16 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.check.change import another_year, tilted
+from orthonav.check.change import another_year, displaced
 from orthonav.check.ortho import OrthoPyramid
 from orthonav.check.persistence import MARGIN_PX
-from orthonav.check.views import (
-    Pictures,
-    TrialPlan,
-    reported_persistence,
-    view_levels,
-    view_of,
-)
+from orthonav.check.views import MapCrops, TrialPlan, reported_persistence, view_levels, view_of
 from orthonav.errors import MapFileError, WorkerError
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
@@ -37,17 +31,27 @@ from orthonav.records import NoFix, Prior, View
 from orthonav.register.registrar import apart_px
 
 AT_ONCE = 8
-"""Trials that a worker is handed at a time."""
-RELIEF_CHANGES_M = 15.0
+"""Trials that a worker takes at a time: about a second of work."""
+RELIEF_CELL_M = 15.0
+"""Distance over which the height of objects changes: a house or a group of trees."""
+NOWHERE = (math.nan, math.nan)
+
+Work = tuple[TrialPlan, NDArray[np.float64]]
+"""A plan and the places (N, 2) of its trials, metres in the plane of the map's sheet."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """What came out of one. Positions are metres in the plane of the map's sheet.
+    """The outcome of one trial. Positions are metres in the plane of the map's sheet.
 
-    `confidence` 0 where there was no answer; `expected` is the mean persistence of what was seen;
-    `rival_en_m` the best place elsewhere that was finished and `rival_share` its score as a share
-    of that of the best, NaN where there was none.
+    `index`: number of the place within the plan.
+    `en_m`: true position.
+    `error_m`: error of the fix; NaN without one.
+    `confidence`: of the fix; 0 without one.
+    `expected`: mean persistence of the view; NaN for a second date.
+    `found_en_m`: position of the fix.
+    `rival_en_m`: best other place at least a quarter of a view away.
+    `rival_share`: its score as a share of the best score; NaN without a rival.
     """
 
     index: int
@@ -55,30 +59,18 @@ class Trial:
     error_m: float
     confidence: float
     expected: float
-    found_en_m: tuple[float, float]
-    rival_en_m: tuple[float, float]
-    rival_share: float
-
-
-def run_trials(
-    plan: TrialPlan,
-    places_en_m: NDArray[np.float64],
-    workers: int,
-    report: Callable[[float], None] | None = None,
-) -> list[Trial]:
-    """A trial at each of the places (N, 2), in their order; those off the map are left out."""
-    return run_many([(plan, places_en_m)], workers, report)[0]
+    found_en_m: tuple[float, float] = NOWHERE
+    rival_en_m: tuple[float, float] = NOWHERE
+    rival_share: float = math.nan
 
 
 def run_many(
-    work: Sequence[tuple[TrialPlan, NDArray[np.float64]]],
-    workers: int,
-    report: Callable[[float], None] | None = None,
+    work: Sequence[Work], workers: int, progress: Callable[[float], None] | None = None
 ) -> list[list[Trial]]:
-    """Trials of several plans of one map, each as `run_trials` does; `report` is called with 0..1.
+    """Trials of several plans of one map, in the order of their places; those off it are left out.
 
-    The same whatever the number of `workers`, which are processes. Raises `WorkerError` where one
-    of them ends on its own.
+    `progress` is called with 0..1. The result does not depend on the number of `workers`
+    (processes). Raises `WorkerError` where one of them ends unexpectedly.
     """
     jobs = [
         (number, index, float(east), float(north))
@@ -87,48 +79,45 @@ def run_many(
     ]
     plans = [plan for plan, _ in work]
     found: list[list[Trial]] = [[] for _ in work]
-    for done, (number, trial) in enumerate(_all(plans, jobs, workers)):
+    for done, (number, trial) in enumerate(_run_jobs(plans, jobs, workers)):
         if trial is not None:
             found[number].append(trial)
-        if report is not None:
-            report((done + 1) / len(jobs))
+        if progress is not None:
+            progress((done + 1) / len(jobs))
     return found
 
 
 _Job = tuple[int, int, float, float]
+_Outcome = tuple[int, Trial | None]
 
 
-def _all(
-    plans: list[TrialPlan], jobs: list[_Job], workers: int
-) -> Iterator[tuple[int, Trial | None]]:
+def _run_jobs(plans: list[TrialPlan], jobs: list[_Job], workers: int) -> Iterator[_Outcome]:
     if workers <= 1 or len(jobs) < 4 * AT_ONCE:
         trier = Trier(plans)
         try:
-            for job in jobs:
-                yield trier(job)
+            yield from map(trier, jobs)
         finally:
             trier.close()
         return
-    # Started afresh: forking a process that has threads is not safe.
-    context = get_context("spawn")
+    context = get_context("spawn")  # forking a process with threads is not safe
     workers = min(workers, -(-len(jobs) // AT_ONCE))
-    ended = context.Event()
-    with ProcessPoolExecutor(workers, context, _begin, (plans, ended)) as pool:
+    stop = context.Event()
+    with ProcessPoolExecutor(workers, context, _start_worker, (plans, stop)) as pool:
         try:
-            yield from _handed_out(pool, jobs)
+            yield from _submit(pool, jobs)
         except BrokenProcessPool as error:
             raise WorkerError(
-                f"one of the {workers} processes that try views ended on its own, for want of "
-                "memory perhaps: fewer of them (--workers) need less"
+                f"one of the {workers} worker processes ended unexpectedly, perhaps for lack of "
+                "memory; try fewer (--workers)"
             ) from error
         finally:
-            ended.set()  # what was handed out already is not waited for
+            stop.set()  # do not wait for submitted jobs
             pool.shutdown(cancel_futures=True)
 
 
-def _handed_out(pool: ProcessPoolExecutor, jobs: list[_Job]) -> Iterator[tuple[int, Trial | None]]:
-    """Outcome of all jobs in their order. Workers inherit that Ctrl-C is held back meanwhile: it is
-    for the process that began them."""
+def _submit(pool: ProcessPoolExecutor, jobs: list[_Job]) -> Iterator[_Outcome]:
+    """Outcomes in the order of the jobs. Ctrl-C is blocked while workers start, which inherit that:
+    only the parent handles it."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         return pool.map(_work, jobs, chunksize=AT_ONCE)
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -139,38 +128,38 @@ def _handed_out(pool: ProcessPoolExecutor, jobs: list[_Job]) -> Iterator[tuple[i
 
 
 _plans: list[TrialPlan] = []
-_ended: Event | None = None
+_stop: Event | None = None
 _trier: "Trier | None" = None
 
 
-def _begin(plans: list[TrialPlan], ended: Event) -> None:
-    """Of a worker: it ends with the process that began it, which alone answers to Ctrl-C."""
-    global _ended
-    _ended = ended
+def _start_worker(plans: list[TrialPlan], stop: Event) -> None:
+    """Set up a worker, which ends when its parent does."""
+    global _stop
+    _stop = stop
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
     cv2.setNumThreads(1)
     _plans[:] = plans
 
 
-def _end_with_parent() -> None:
+def _exit_with_parent() -> None:
     parent = parent_process()
     if parent is not None:
         parent.join()
         os._exit(1)
 
 
-def _work(job: _Job) -> tuple[int, Trial | None]:
+def _work(job: _Job) -> _Outcome:
     global _trier
-    if _ended is not None and _ended.is_set():
+    if _stop is not None and _stop.is_set():
         return job[0], None
-    if _trier is None:  # here, so that what goes wrong is told
+    if _trier is None:  # here rather than in `_start_worker`, so that errors reach the parent
         _trier = Trier(_plans)
     return _trier(job)
 
 
 class Trier:
-    """Makes and places views of plans that share a map."""
+    """Runs trials of plans that share a map."""
 
     def __init__(self, plans: Sequence[TrialPlan]) -> None:
         """Open the map; raises `MapFileError` where it has no registration layer."""
@@ -180,60 +169,60 @@ class Trier:
                 f"only maps with a registration layer can be checked: {plans[0].map_path}"
             )
         self._registration = registration
-        self._own = Pictures(registration.registrar.reference.pyramid, registration)
+        self._own = MapCrops(registration.pyramid, registration)
         self._plans = plans
-        self._others: dict[Path, tuple[OrthoPyramid, Pictures]] = {}
+        self._others: dict[Path, tuple[OrthoPyramid, MapCrops]] = {}
 
     def close(self) -> None:
-        """Close the files of other dates."""
+        """Close the files of second dates."""
         for pyramid, _ in self._others.values():
             pyramid.close()
         self._others.clear()
 
     def __call__(self, job: _Job) -> tuple[int, Trial | None]:
-        """The trial of a job: number of the plan, index, metres east and north."""
+        """Run a job: number of the plan, index, metres east and north."""
         number, index, east, north = job
         plan = self._plans[number]
         rng = np.random.default_rng([plan.seed, index])
-        pictures = self._own if plan.other_path is None else self._other(plan.other_path)
-        return number, self._trial(rng, plan, pictures, index, np.array([east, north]))
+        crops = self._own if plan.other_path is None else self._other(plan.other_path)
+        return number, self._trial(rng, plan, crops, index, np.array([east, north]))
 
-    def _other(self, path: Path) -> "Pictures":
+    def _other(self, path: Path) -> MapCrops:
         if path not in self._others:
-            pyramid = self._registration.registrar.reference.pyramid
+            pyramid = self._registration.pyramid
             other = OrthoPyramid(path, self._registration.sheet, pyramid.levels)
-            self._others[path] = other, Pictures(other, self._registration)
+            self._others[path] = other, MapCrops(other, self._registration)
         return self._others[path][1]
 
     def _trial(
         self,
         rng: np.random.Generator,
         plan: TrialPlan,
-        pictures: "Pictures",
+        crops: MapCrops,
         index: int,
         en_m: NDArray[np.float64],
     ) -> Trial | None:
         registration = self._registration
-        # One finer than views are finished at: doubtful ones are looked at there too.
+        # One level finer than the final one, where ambiguous views are registered too.
         final = view_levels(plan, registration).final
         level = max(final - 1, 0)
         gsd_m = registration.grid.gsd_m * 2**level
         size = math.ceil(math.hypot(plan.width_m, plan.height_m) / gsd_m) + 4
-        made = pictures.around(en_m, size, level)
-        if made is None:
+        crop = crops.around(en_m, size, level)
+        if crop is None:
             return None
-        grey, valid, place = made
-        stranger = self._own.stranger(rng, size, level)
+        grey, valid, place = crop
+        donor = self._own.donor(rng, size, level)
         inner = np.s_[MARGIN_PX : MARGIN_PX + size, MARGIN_PX : MARGIN_PX + size]
-        picture = np.where(valid[inner], grey[inner], stranger)
+        picture = np.where(valid[inner], grey[inner], donor)
         expected = math.nan
         if plan.other_path is None:
-            lasting = [each[inner] for each in reported_persistence(grey, gsd_m, final - level)]
-            expected = float(np.mean([each.mean() for each in lasting[:2]]))
-            picture = another_year(rng, picture, stranger, lasting, plan.severity)
+            maps = [each[inner] for each in reported_persistence(grey, gsd_m, final - level)]
+            expected = float(np.mean([each.mean() for each in maps[:2]]))
+            picture = another_year(rng, picture, donor, maps, plan.severity)
         if plan.relief_m > 0:
             rim_px = plan.relief_m * size / 2 / plan.agl_m
-            picture = tilted(rng, picture, rim_px, RELIEF_CHANGES_M / gsd_m)
+            picture = displaced(rng, picture, rim_px, RELIEF_CELL_M / gsd_m)
         view = view_of(rng, plan, picture, gsd_m)
         return self._placed(rng, plan, index, place, view, expected)
 
@@ -248,33 +237,34 @@ class Trier:
     ) -> Trial:
         registration = self._registration
         here = (float(place_en_m[0]), float(place_en_m[1]))
-        nowhere = (math.nan, math.nan)
         prior = None
         if plan.prior_std_m is not None:
-            told = place_en_m + rng.normal(0, plan.prior_std_m, 2)
-            lat, lon = registration.sheet.frame.latlon_from_en(told)
+            at = place_en_m + rng.normal(0, plan.prior_std_m, 2)
+            lat, lon = registration.sheet.frame.latlon_from_en(at)
             prior = Prior(float(lat), float(lon), plan.prior_std_m)
-        prepared = registration.prepared(view, plan.yaw_std_deg is not None)
-        best = None
-        if not isinstance(prepared, NoFix) and (
-            prior is None or registration.touches_map(prior, prepared)
-        ):
-            best = registration.best(prepared, prior)
-        if best is None or isinstance(prepared, NoFix):
-            return Trial(index, here, math.nan, 0.0, expected, nowhere, nowhere, math.nan)
-        confidence = registration.confidence
-        sure = 0.0 if confidence is None else confidence(best.evidence())
+        seen = registration.register(view, prior, plan.yaw_std_deg is not None)
+        if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
+            return Trial(index, here, math.nan, 0.0, expected)
+        prepared, best = seen.prepared, seen.found
         found = registration.camera_en_m(prepared, best.placed.pose)
         rivals = [
             (score, placed)
             for score, placed in best.finalists
             if apart_px(placed, best.placed) * registration.grid.gsd_m > plan.side_m / 4
         ]
-        rival, share = nowhere, math.nan
+        rival, share = NOWHERE, math.nan
         if rivals:
             score, placed = max(rivals, key=lambda each: each[0])
             east, north = registration.camera_en_m(prepared, placed.pose)
             rival, share = (float(east), float(north)), score / max(best.score, 1e-6)
-        error = float(np.hypot(*(found - place_en_m)))
-        at = (float(found[0]), float(found[1]))
-        return Trial(index, here, error, sure, expected, at, rival, share)
+        confidence = registration.confidence
+        return Trial(
+            index=index,
+            en_m=here,
+            error_m=float(np.hypot(*(found - place_en_m))),
+            confidence=0.0 if confidence is None else confidence(best.evidence()),
+            expected=expected,
+            found_en_m=(float(found[0]), float(found[1])),
+            rival_en_m=rival,
+            rival_share=share,
+        )

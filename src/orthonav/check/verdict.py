@@ -1,4 +1,4 @@
-"""Go, marginal or no-go, and why. The rules are those of docs/check.md."""
+"""Go, marginal or no-go, and why. The rules are documented in docs/check.md."""
 
 from dataclasses import dataclass
 
@@ -6,29 +6,37 @@ import numpy as np
 
 from orthonav.check.outcome import (
     Along,
+    BlindStretch,
     Conditions,
     Lookalike,
     Reason,
-    Stretch,
     Verdict,
     Word,
 )
 
+# Thresholds of a planner's judgement, not of a measurement; docs/check.md lists them.
 GO_MEAN, NO_GO_MEAN = 0.6, 0.2
-"""Mean probability of a fix: as good as this is fine, worse than that is not."""
-MOST_OUTSIDE = 0.1
-"""Share of a route that may lie beyond the map, at most."""
-MARGINAL_WRONG, NO_GO_WRONG = 0.005, 0.02
+"""Mean probability of a fix: go from the first on, no-go below the second."""
+GO_OUTSIDE, NO_GO_OUTSIDE = 0.005, 0.1
+"""Share of the route outside the map."""
+GO_WRONG, NO_GO_WRONG = 0.005, 0.02
 """Share of trials that were confident and wrong."""
-TWICE = 2.0
-LEAST_WRONG = 2
-"""One wrong trial alone is no rule."""
+MIN_WRONG = 2
+"""A single wrong trial may be chance."""
+TOO_FAR = 2.0
+"""No-go where a drift is more than so many times the allowed one."""
 _ORDER = (Word.NO_GO, Word.MARGINAL, Word.GO)
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What the verdict is made of. `mean` probability of the route, or of the map without one."""
+    """The input of the verdict.
+
+    `mean`: mean probability along the route, or over the map.
+    `calibrated`: the map carries a confidence model.
+    `wrong`, `trials`: number of confident and wrong trials, and of all.
+    `outside`: share of the route outside the map, 0 to 1.
+    """
 
     conditions: Conditions
     mean: float
@@ -37,94 +45,94 @@ class Findings:
     trials: int
     outside: float
     along: Along | None
-    stretches: tuple[Stretch, ...]
+    stretches: tuple[BlindStretch, ...]
     lookalikes: tuple[Lookalike, ...]
 
 
 def verdict_of(found: Findings) -> Verdict:
     """The worst of all reasons, worst first."""
-    reasons = [*_trust(found), *_mean(found), *_route(found), *_alike(found)]
+    reasons = [*_trust(found), _mean(found)]
+    if found.along is not None:
+        reasons += [*_outside(found.outside), _drift(found, found.along)]
+        reasons += _blind(found.stretches)
+    reasons += _lookalikes(found)
     reasons.sort(key=lambda reason: _ORDER.index(reason.word))
     return Verdict(reasons[0].word, tuple(reasons))
 
 
 def _trust(found: Findings) -> list[Reason]:
     if not found.calibrated:
-        text = "the map carries no confidence of its own (too little could be learnt from it when "
-        text += "it was built), so that no fix would be believed"
-        return [Reason("no_confidence", text, Word.NO_GO)]
+        text = "The map has no confidence model, so no fix would be accepted. Build it from a "
+        return [Reason("no_confidence", f"{text}larger or more varied area.", Word.NO_GO)]
     share = found.wrong / max(found.trials, 1)
-    if found.wrong < LEAST_WRONG or share < MARGINAL_WRONG:
+    if found.wrong < MIN_WRONG or share < GO_WRONG:
         return []
-    word = Word.NO_GO if share >= NO_GO_WRONG else Word.MARGINAL
-    text = f"{found.wrong} of {found.trials} trial views were put in a wrong place with confidence"
-    return [Reason("wrong", text, word)]
+    text = f"{found.wrong} of {found.trials} trial views had a confident fix in a wrong place."
+    return [Reason("wrong", text, Word.NO_GO if share >= NO_GO_WRONG else Word.MARGINAL)]
 
 
-def _mean(found: Findings) -> list[Reason]:
+def _mean(found: Findings) -> Reason:
     where = "along the route" if found.along is not None else "on the map"
-    if found.mean >= GO_MEAN:
-        text = f"a single view gives a correct, confident fix with {found.mean:.0%} {where}"
-        return [Reason("fixes", text, Word.GO)]
-    text = f"a single view gives a correct, confident fix with only {found.mean:.0%} {where}"
-    word = Word.NO_GO if found.mean < NO_GO_MEAN else Word.MARGINAL
-    return [Reason("few_fixes", text, word)]
+    fine = found.mean >= GO_MEAN
+    text = f"One view has {'' if fine else 'only '}{_article(found.mean)} {100 * found.mean:.0f} % "
+    text += f"chance of a confident, correct fix {where} (mean)."
+    if fine:
+        return Reason("fixes", text, Word.GO)
+    return Reason("few_fixes", text, Word.NO_GO if found.mean < NO_GO_MEAN else Word.MARGINAL)
 
 
-def _route(found: Findings) -> list[Reason]:
-    if found.along is None:
+def _article(share: float) -> str:
+    """The article before a spoken percentage: an 8, an 11, an 18, an 80 to 89."""
+    spoken = f"{100 * share:.0f}"
+    return "an" if spoken in ("11", "18") or spoken.startswith("8") else "a"
+
+
+def _outside(share: float) -> list[Reason]:
+    if share <= GO_OUTSIDE:
         return []
-    reasons = []
-    if found.outside > 0.005:
-        word = Word.NO_GO if found.outside > MOST_OUTSIDE else Word.MARGINAL
-        reasons.append(
-            Reason("outside_map", f"{found.outside:.0%} of the route lies beyond the map", word)
-        )
-    return reasons + _drift(found, found.along) + _blind(found.stretches)
+    word = Word.NO_GO if share > NO_GO_OUTSIDE else Word.MARGINAL
+    return [Reason("outside_map", f"{100 * share:.0f} % of the route is outside the map.", word)]
 
 
-def _drift(found: Findings, along: Along) -> list[Reason]:
+def _drift(found: Findings, along: Along) -> Reason:
     allowed_m = found.conditions.prior_std_m
     worst = int(np.argmax(along.drift_m))
     drift_m = float(along.drift_m[worst])
-    text = f"the position is expected to be off by {drift_m:.0f} m at most "
-    text += f"(at {along.distance_m[worst] / 1000:.1f} km)"
+    text = f"The largest expected position error is {drift_m:.0f} m"
+    text += f" (at {along.distance_m[worst] / 1000:.1f} km)"
     if allowed_m is None:
-        return [Reason("drift", text, Word.GO)]
-    text += f", {allowed_m:.0f} m are allowed"
+        return Reason("drift", f"{text}.", Word.GO)
+    text += f"; {allowed_m:.0f} m are allowed."
     if drift_m <= allowed_m:
-        return [Reason("drift", text, Word.GO)]
-    word = Word.NO_GO if drift_m > TWICE * allowed_m else Word.MARGINAL
-    return [Reason("drift", text, word)]
+        return Reason("drift", text, Word.GO)
+    return Reason("drift", text, Word.NO_GO if drift_m > TOO_FAR * allowed_m else Word.MARGINAL)
 
 
-def _blind(stretches: tuple[Stretch, ...]) -> list[Reason]:
-    hard = [each for each in stretches if not each.bearable]
+def _blind(stretches: tuple[BlindStretch, ...]) -> list[Reason]:
     if not stretches:
         return []
     longest = max(stretches, key=lambda each: each.length_m)
-    text = f"{len(stretches)} blind stretches, the longest {longest.length_m:.0f} m "
-    text += f"({longest.end_s - longest.start_s:.0f} s) from {longest.start_m / 1000:.1f} km on"
-    if len(stretches) == 1:
-        text = text.replace("1 blind stretches, the longest", "one blind stretch of")
-    if not hard:
-        return [Reason("blind", f"{text}: dead reckoning bridges it", Word.GO)]
-    worst = max(hard, key=lambda each: each.drift_m)
-    if worst.drift_m > TWICE * worst.allowed_m:
-        end = f"dead reckoning may be off by {worst.drift_m:.0f} m after {worst.length_m:.0f} m"
-        return [Reason("blind", f"{text}; {end}", Word.NO_GO)]
-    end = (
-        "the route ends in one"
-        if worst.ends_lost
-        else f"dead reckoning drifts {worst.drift_m:.0f} m"
+    which = f"{len(stretches)} blind stretches, the longest of"
+    text = f"{'One blind stretch of' if len(stretches) == 1 else which} {longest.length_m:.0f} m "
+    text += (
+        f"({longest.end_s - longest.start_s:.0f} s), starting at {longest.start_m / 1000:.1f} km"
     )
-    return [Reason("blind", f"{text}; {end}", Word.MARGINAL)]
+    hard = [each for each in stretches if not each.recoverable]
+    if not hard:
+        return [Reason("blind", f"{text}; dead reckoning bridges it.", Word.GO)]
+    worst = max(hard, key=lambda each: each.drift_m)
+    if worst.drift_m > TOO_FAR * worst.allowed_m:
+        end = f"dead reckoning may be off by {worst.drift_m:.0f} m after {worst.length_m:.0f} m"
+        return [Reason("blind", f"{text}; {end}.", Word.NO_GO)]
+    end = f"dead reckoning drifts by {worst.drift_m:.0f} m"
+    end = "the route ends in one" if worst.ends_lost else end
+    return [Reason("blind", f"{text}; {end}.", Word.MARGINAL)]
 
 
-def _alike(found: Findings) -> list[Reason]:
+def _lookalikes(found: Findings) -> list[Reason]:
     near = [each for each in found.lookalikes if each.within_prior and each.trials > 1]
     if not near:
         return []
-    pairs = f"{len(near)} pairs" if len(near) > 1 else "one pair"
-    text = f"{pairs} of places within the prior look alike: one view may not tell them "
-    return [Reason("lookalikes", f"{text}apart (they cost fixes, see the list)", Word.GO)]
+    pairs = f"{len(near)} pairs" if len(near) > 1 else "One pair"
+    text = f"{pairs} of places within the prior look alike: a single view may confuse them, which "
+    return [Reason("lookalikes", f"{text}costs fixes (see the list).", Word.GO)]

@@ -1,4 +1,4 @@
-"""The views of trials: cut from the map's own pictures, or from those of another date."""
+"""Trial views, cut from the map's own imagery or from that of a second date."""
 
 import math
 from dataclasses import dataclass
@@ -9,27 +9,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.check.change import USUAL, Severity
-from orthonav.check.persistence import MARGIN_PX, features, usual_model
+from orthonav.check.persistence import MARGIN_PX, default_model, features
 from orthonav.geo.camera import Camera
 from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.records import Telemetry, View
+from orthonav.register.pose import rotation
 from orthonav.register.reference import GreyPyramid
 from orthonav.register.registrar import Levels
 
-EVERY_PX = 8
-LEVELS_TOLD = 3
-"""Persistence is told at every so many pixels, at so many levels."""
-LEAST_VALID = 0.3
-"""Views that see less of the map than this share are not tried: there nothing is found."""
+EVERY_PX, PERSISTENCE_LEVELS = 8, 3
+"""Persistence is computed every so many pixels, at so many levels: coarser detail lasts alike."""
+MIN_VALID = 0.3
+"""Views that see less of the map than this share are skipped: the localizer refuses them."""
+_DONOR_DRAWS = 12
+
+Grey = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class TrialPlan:
-    """How views are made: `camera` at `agl_m`, what is told wrongly (standard deviations), `seed`.
+    """How trial views are made; standard deviations are those of `CheckRequest`.
 
-    `yaw_std_deg` None: heading unknown. `relief_m` is the standard deviation of the height of what
-    stands on the ground and tilts in views from low. `yaw_off_deg`, to either side at random, and
-    `agl_off` (a share) are added to the errors of what is told.
+    `map_path`, `camera`, `agl_m`: what is flown.
+    `yaw_std_deg`, `agl_std`, `prior_std_m`: random errors of the reported values; None: unknown.
+    `relief_m`: standard deviation of the height of objects, which cause relief displacement.
+    `seed`: of all random numbers, together with the number of the trial.
+    `severity`: of the simulated ageing.
+    `other_path`: orthophoto of a second date to cut views from; None: the map's imagery, aged.
+    `yaw_off_deg`: additional heading error, to either side at random.
+    `agl_off`: additional height error, a share of the height.
     """
 
     map_path: Path
@@ -47,36 +55,39 @@ class TrialPlan:
 
     @property
     def width_m(self) -> float:
-        """Side of what is seen along the rows of the picture, in metres."""
+        """Footprint along the rows of the image."""
         return self.agl_m * self.camera.width_px / self.camera.fx_px
 
     @property
     def height_m(self) -> float:
-        """The other side."""
+        """Footprint along the columns of the image."""
         return self.agl_m * self.camera.height_px / self.camera.fy_px
 
     @property
     def side_m(self) -> float:
-        """Root of the area that is seen."""
+        """Side of the square with the area of the footprint."""
         return math.sqrt(self.width_m * self.height_m)
 
+    @property
+    def footprint_text(self) -> str:
+        """The footprint in words, for messages."""
+        return f"a view from {self.agl_m:.0f} m covers {self.width_m:.0f} x {self.height_m:.0f} m"
 
-def reported_persistence(
-    grey: NDArray[np.uint8], gsd_m: float, first: int = 0
-) -> list[NDArray[np.float32]]:
-    """Persistence (H, W) of a picture at its own resolution, half of it, and a quarter.
 
-    That at resolutions finer than that of level `first` is taken to be the same as there.
+def reported_persistence(grey: Grey, gsd_m: float, first: int = 0) -> list[NDArray[np.float32]]:
+    """Persistence maps (H, W) of a picture at its own resolution, half of it, and a quarter.
+
+    Resolutions finer than that of level `first` repeat its values.
     """
-    model = usual_model()
+    model = default_model()
     found: list[NDArray[np.float32]] = []
     picture = grey
     height, width = grey.shape
-    for level in range(LEVELS_TOLD):
+    for level in range(PERSISTENCE_LEVELS):
         if level >= first:
-            told = model(features(picture, gsd_m * 2**level, max(EVERY_PX >> level, 1)))
-            large = cv2.resize(told, (width, height), interpolation=cv2.INTER_LINEAR)
-            found.append(np.asarray(large, np.float32))
+            coarse = model(features(picture, gsd_m * 2**level, max(EVERY_PX >> level, 1)))
+            full = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+            found.append(np.asarray(full, np.float32))
         half = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         picture = np.asarray(half, np.uint8)
         if min(picture.shape) < 2 * MARGIN_PX and found:
@@ -85,29 +96,31 @@ def reported_persistence(
 
 
 def view_levels(plan: TrialPlan, registration: RegistrationLocalizer) -> Levels:
-    """The levels of the map that views are placed at."""
-    levels = registration.registrar.reference.levels
+    """The levels of the map at which views are registered."""
+    levels = registration.pyramid.levels
     return Levels.of(plan.side_m / registration.grid.gsd_m, levels)
 
 
-class Pictures:
-    """The grey pictures of a map, in the plane of the map that is checked."""
+class MapCrops:
+    """Square crops of a grey pyramid, in the plane of the checked map."""
 
     def __init__(self, layer: GreyPyramid, registration: RegistrationLocalizer) -> None:
         self._layer, self._grid = layer, registration.grid
 
     def around(
         self, en_m: NDArray[np.float64], size: int, level: int
-    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float64]] | None:
-        """Grey and valid around a place, `size` pixels of the level and the margin of persistence,
-        and where its middle really is; None where too little of it is on the map."""
+    ) -> tuple[Grey, NDArray[np.bool_], NDArray[np.float64]] | None:
+        """Grey, valid and the exact centre of a crop; None where too little of it is on the map.
+
+        The crop is `size` pixels of the level wide, plus `MARGIN_PX` on each side.
+        """
         unit_m = self._grid.gsd_m * 2**level
         whole = size + 2 * MARGIN_PX
         col = round((en_m[0] - self._grid.west_m) / unit_m - whole / 2)
         row = round((self._grid.north_m - en_m[1]) / unit_m - whole / 2)
         grey, valid = self._layer.read(level, row, col, whole, whole)
         inner = np.s_[MARGIN_PX : MARGIN_PX + size, MARGIN_PX : MARGIN_PX + size]
-        if valid[inner].mean() < LEAST_VALID:
+        if valid[inner].mean() < MIN_VALID:
             return None
         if not valid.all():
             grey = np.where(valid, grey, np.uint8(grey[valid].mean()))
@@ -115,10 +128,10 @@ class Pictures:
         north = self._grid.north_m - (row + whole / 2) * unit_m
         return grey, valid, np.array([east, north])
 
-    def stranger(self, rng: np.random.Generator, size: int, level: int) -> NDArray[np.uint8]:
-        """Mirrored ground (size, size) from anywhere: it must not be found where it is from."""
+    def donor(self, rng: np.random.Generator, size: int, level: int) -> Grey:
+        """Mirrored ground (size, size) of a random place, so that it matches no place."""
         rows, cols = self._layer.shape(level)
-        for _ in range(12):
+        for _ in range(_DONOR_DRAWS):
             row = int(rng.integers(0, max(rows - size, 1)))
             col = int(rng.integers(0, max(cols - size, 1)))
             grey, valid = self._layer.read(level, row, col, size, size)
@@ -129,45 +142,42 @@ class Pictures:
         return np.ascontiguousarray(grey[:, ::-1])
 
 
-def view_of(
-    rng: np.random.Generator, plan: TrialPlan, picture: NDArray[np.uint8], gsd_m: float
-) -> View:
-    """A vertical view of the middle of a picture under any heading."""
+def view_of(rng: np.random.Generator, plan: TrialPlan, picture: Grey, gsd_m: float) -> View:
+    """A vertical view of the middle of a picture with a random heading."""
     size = picture.shape[0]
     width = max(8, round(plan.width_m / gsd_m))
     height = max(8, round(plan.height_m / gsd_m))
     yaw_deg = float(rng.uniform(0, 360))
-    cos, sin = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
-    linear = np.array([[cos, -sin], [sin, cos]])
+    linear = rotation(math.radians(yaw_deg))
     move = np.full(2, (size - 1) / 2) - linear @ [(width - 1) / 2, (height - 1) / 2]
     camera_gsd_m = plan.camera.gsd_m(plan.agl_m)
     if camera_gsd_m > gsd_m:
-        picture = np.asarray(
-            cv2.GaussianBlur(picture, (0, 0), 0.5 * camera_gsd_m / gsd_m), np.uint8
-        )
-    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        blur_px = 0.5 * camera_gsd_m / gsd_m
+        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), blur_px), np.uint8)
     view = cv2.warpAffine(
         picture,
         np.column_stack([linear, move]),
         (width, height),
-        flags=flags,
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REFLECT,
     )
     focal = plan.agl_m / gsd_m
-    yaw_std = plan.yaw_std_deg
-    sign = 1.0 if rng.random() < 0.5 else -1.0
-    yaw_error = sign * plan.yaw_off_deg
-    if yaw_std is not None:
-        yaw_error += float(rng.normal(0, yaw_std))
-    reported_m = plan.agl_m * max(0.5, 1 + plan.agl_off + float(rng.normal(0, plan.agl_std)))
-    telemetry = Telemetry(
+    camera = Camera(width, height, focal, focal, width / 2, height / 2)
+    return View(np.asarray(view, dtype=np.uint8), camera, _telemetry(rng, plan, yaw_deg))
+
+
+def _telemetry(rng: np.random.Generator, plan: TrialPlan, yaw_deg: float) -> Telemetry:
+    """Heading and height with the errors of the plan."""
+    yaw_error_deg = plan.yaw_off_deg if rng.random() < 0.5 else -plan.yaw_off_deg
+    if plan.yaw_std_deg is not None:
+        yaw_error_deg += float(rng.normal(0, plan.yaw_std_deg))
+    agl_m = plan.agl_m * max(0.5, 1 + plan.agl_off + float(rng.normal(0, plan.agl_std)))
+    return Telemetry(
         time_ns=0,
-        yaw_deg=yaw_deg + yaw_error,
+        yaw_deg=yaw_deg + yaw_error_deg,
         pitch_deg=0.0,
         roll_deg=0.0,
-        agl_m=reported_m,
-        yaw_std_deg=yaw_std,
-        agl_std_m=plan.agl_std * reported_m,
+        agl_m=agl_m,
+        yaw_std_deg=plan.yaw_std_deg,
+        agl_std_m=plan.agl_std * agl_m,
     )
-    camera = Camera(width, height, focal, focal, width / 2, height / 2)
-    return View(np.asarray(view, dtype=np.uint8), camera, telemetry)

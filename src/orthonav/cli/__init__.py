@@ -6,6 +6,7 @@ A module with many options names the everyday ones in `EVERYDAY`; `--help` shows
 
 import argparse
 import importlib
+import io
 import logging
 import os
 import signal
@@ -15,27 +16,31 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
 
-from orthonav import __version__
+from orthonav.cli.needs import require_extras
+from orthonav.cli.version import show_version
 from orthonav.errors import OrthonavError
 
+UNITS = frozenset(("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz"))
+"""Last words of option names that are units."""
+
 COMMANDS = {
-    "demo": "whole story on a generated area: build, fly, report",
-    "plan": "what a route, a camera and a height ask of a map",
-    "fetch": "get orthophotos of an area from open services",
-    "build": "make a map from orthophotos",
-    "atlas": "many sheets as one: what is in it, is it whole, cut a map, add and take out",
-    "check": "before the flight: where can it be localized, and will the route be flown well?",
-    "info": "print what is in a map",
-    "sign": "sign a map, or make a key for it",
-    "verify": "check a map and its signature",
-    "import": "write photographs, a video or a ROS recording as a flight folder",
-    "calibrate": "find out what is wrong with what a flight tells: mount, compass, height",
-    "localize": "find where the views of a flight were taken",
-    "fly": "beside an autopilot: positions from a live camera as messages",
+    "demo": "generate an area, build a map, simulate a flight, localize it and report",
+    "plan": "recommend a map for a route, a camera and a height",
+    "fetch": "download orthophotos of an area from open services",
+    "build": "build a map from orthophotos",
+    "atlas": "build, inspect, check and cut an atlas of many sheets",
+    "check": "predict before the flight where views will be localized",
+    "info": "print the contents of a map",
+    "sign": "sign a map, or create a signing key",
+    "verify": "check the signature and the contents of a map",
+    "import": "convert photographs, a video or a ROS recording to a flight folder",
+    "calibrate": "estimate constant errors of mount, compass and height from a flight",
+    "localize": "find the positions of the views of a flight",
+    "fly": "send position fixes from a live camera to an autopilot",
     "evaluate": "compare fixes with the truth",
-    "view": "show a run in the browser: track, views beside the map, health; also while it flies",
-    "simulate": "fly over an orthophoto of another year",
-    "landscape": "generate an area: orthophotos of a landscape at several dates",
+    "view": "show a run in the browser: track, views beside the map, health",
+    "simulate": "simulate a flight over an orthophoto of another year",
+    "landscape": "generate orthophotos of a landscape at several dates",
 }
 
 
@@ -46,19 +51,26 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     # Matrices here are small: more BLAS threads only wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # errors are told once, by us
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # this program reports errors, once
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     # Read once, when OpenCV is loaded: a few bytes must not become a picture of gigabytes.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**28))
     arguments = list(sys.argv[1:] if argv is None else argv)
     verbose = False
     try:
+        if "--version" in arguments and COMMANDS.keys().isdisjoint(arguments):
+            return show_version(arguments)
         options = _parser(arguments).parse_args(arguments)
         verbose = options.verbose
         level = logging.DEBUG if verbose else logging.ERROR if options.quiet else logging.WARNING
         logging.basicConfig(level=level, format="%(levelname)s: %(message)s", stream=sys.stderr)
         logging.getLogger("rasterio").setLevel(logging.CRITICAL)
+        # Where the home cannot be written it keeps its fonts elsewhere: nothing to be done.
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)
+        _print_any_letter()
         with _terminable():
+            if not getattr(options, "list", False):  # lists presets, which need no extra
+                require_extras(options.command)
             status: int | None = _module(options.command).run(options)
             sys.stdout.flush()
     except OrthonavError as error:
@@ -68,11 +80,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except UnicodeEncodeError as error:
+        letters = f"{error.object[error.start : error.end]!a:.40}"
+        return _failed(
+            f"a name has letters ({letters}) that the locale cannot express: set PYTHONUTF8=1",
+            verbose,
+        )
     except OSError as error:  # a disk or a device that fails where nobody expected it
         return _failed(_one_line(error), verbose)
     except MemoryError:
         return _failed("out of memory", verbose)
     return status or 0
+
+
+def _print_any_letter() -> None:
+    """Names with letters that the locale lacks are printed escaped, as on stderr."""
+    out = sys.stdout
+    if isinstance(out, io.TextIOWrapper) and out.encoding.lower() not in ("utf-8", "utf8"):
+        out.reconfigure(errors="backslashreplace")
 
 
 @contextmanager
@@ -94,9 +119,14 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         prog="orthonav",
         description="Position fixes for aircraft without GNSS, from a downward camera and an "
         "orthophoto of another year.",
-        epilog="orthonav COMMAND --help tells more.",
+        epilog="Options of a command: orthonav COMMAND --help",
     )
-    parser.add_argument("--version", action="version", version=f"orthonav {__version__}")
+    parser.add_argument(
+        "--version",
+        action="store_true",
+        help="print the version; with --verbose (or --json) also what is installed, what is "
+        "missing for which command, and the processor's abilities",
+    )
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("-v", "--verbose", action="store_true", help="say more, on stderr")
     common.add_argument("-q", "--quiet", action="store_true", help="errors only, no progress")
@@ -106,9 +136,24 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
         if name in arguments:
             module = _module(name)
             module.add(command)
+            _name_units(command)
             if everyday := getattr(module, "EVERYDAY", ()):
                 _shorten_help(command, everyday, show_all="--help-all" in arguments)
     return parser
+
+
+def _name_units(command: argparse.ArgumentParser) -> None:
+    """Name numbers in the help by the unit that ends their option: `--agl-m M`; integers N."""
+    for action in command._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for sub_command in action.choices.values():
+                _name_units(sub_command)
+        elif action.type in (int, float) and action.metavar is None:
+            unit = action.option_strings[0].rpartition("-")[2] if action.option_strings else ""
+            if unit in UNITS:
+                action.metavar = unit.upper()
+            elif action.type is int:
+                action.metavar = "N"
 
 
 def _shorten_help(
@@ -126,7 +171,8 @@ def _shorten_help(
         return
     for action in hidden:
         action.help = argparse.SUPPRESS
-    command.epilog = f"{len(hidden)} more options: {command.prog} --help-all"
+    more = f"{len(hidden)} more options: {command.prog} --help-all"
+    command.epilog = f"{command.epilog}; {more}" if command.epilog else more
 
 
 def _module(command: str) -> ModuleType:

@@ -1,4 +1,4 @@
-"""`orthonav atlas`: what is in an atlas, whether it is whole, and changing it."""
+"""`orthonav atlas`: build, inspect, check, change and index an atlas, and cut maps out of it."""
 
 import argparse
 import math
@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from orthonav.cli import build_atlas
 from orthonav.cli.common import add_area, print_json, progress
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ NOT_WHOLE = 3
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command: one of its own for each thing to do."""
+    """Arguments of the command and of its actions."""
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("-v", "--verbose", action="store_true", default=argparse.SUPPRESS)
     common.add_argument("-q", "--quiet", action="store_true", default=argparse.SUPPRESS)
@@ -26,46 +27,53 @@ def add(parser: argparse.ArgumentParser) -> None:
         found.add_argument("atlas", metavar="ATLAS", help="folder or URL: s3://, gs://, abfs://")
         return found
 
-    info = action("info", "print what is in an atlas")
+    build_atlas.add(action("build", "build the missing sheets of an atlas, which is created first"))
+    info = action("info", "print the contents of an atlas")
     info.add_argument("--json", action="store_true", help="print as JSON")
-    check = action("check", "is it whole? exit 0 yes, 3 no: what is wrong is listed")
+    check = action("check", "check whether an atlas is whole: exit 0, or 3 and a list of problems")
     check.add_argument(
-        "--deep", action="store_true", help="read every file, check its checksum and its recipe"
+        "--deep", action="store_true", help="read every file, verify its checksum and its recipe"
     )
     check.add_argument(
         "--clean",
         action="store_true",
-        help="remove what was left over by builds that were interrupted",
+        help="remove leftovers of interrupted builds",
     )
     check.add_argument(
         "--min-age-h",
         type=_hours,
         default=24.0,
         metavar="H",
-        help="remove nothing younger: a build puts files before it names them (%(default)g)",
+        help="remove no younger files, which may belong to a running build (default %(default)g)",
     )
     check.add_argument("--json", action="store_true", help="print as JSON")
     copied = action("add", "copy sheets of another atlas of the same recipe into this one")
     copied.add_argument("source", metavar="FROM", help="folder or URL of the other atlas")
-    copied.add_argument("--sheets", nargs="+", metavar="SHEET", help="only these")
+    copied.add_argument("--sheets", nargs="+", metavar="SHEET", help="only these sheets")
     copied.add_argument(
-        "--replace", action="store_true", help="take those of FROM where both have a sheet"
+        "--replace", action="store_true", help="replace sheets that differ from those of FROM"
     )
     retire = action("retire", "take sheets out of an atlas")
     retire.add_argument("sheets", nargs="+", metavar="SHEET", help="name, as r001526c001392")
-    index = action("index", "make what places views in the whole atlas, or bring it up to date")
-    index.add_argument("--anew", action="store_true", help="all of it, as if there were none")
-    cut = action("cut", "write one map of a route or a box, as it would be built from the imagery")
+    index = action(
+        "index", "make the index that finds views without a prior, or bring it up to date"
+    )
+    index.add_argument("--rebuild", action="store_true", help="rebuild all of it")
+    cut = action("cut", "cut the map of a route or of bounds out of an atlas")
     add_area(cut, cut.add_mutually_exclusive_group(required=True))
-    cut.add_argument("--out", type=Path, required=True, metavar="MAP.onav")
-    cut.add_argument("--workers", type=int, metavar="N", help="threads that read (one per core)")
     cut.add_argument(
-        "--allow-holes", action="store_true", help="also where sheets under the route are missing"
+        "--out", type=Path, required=True, metavar="MAP.onav", help="map file to write"
+    )
+    cut.add_argument(
+        "--workers", type=int, metavar="N", help="threads that read sheets (default: one per core)"
+    )
+    cut.add_argument(
+        "--allow-holes", action="store_true", help="cut although sheets under the route are missing"
     )
 
 
 def _hours(text: str) -> float:
-    """Hours, none of them negative."""
+    """Hours of 0 or more."""
     try:
         hours = float(text)
     except ValueError:
@@ -76,8 +84,9 @@ def _hours(text: str) -> float:
 
 
 def run(options: argparse.Namespace) -> int | None:
-    """Do what was asked for."""
+    """Run the action."""
     actions = {
+        "build": build_atlas.run,
         "info": _info,
         "check": _check,
         "add": _add,
@@ -99,13 +108,13 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def summary(atlas: "Atlas") -> dict[str, Any]:
-    """What people ask of an atlas, as plain values."""
+    """Contents, size, dates and recipe of an atlas, as plain values."""
     sheets = list(atlas.sheets().values())
     dates = sorted({date for sheet in sheets for date in sheet.dates})
     sources = {}
     for source in (source for sheet in sheets for source in sheet.imagery):
-        told = {key: source.get(key) for key in ("name", "attribution", "licence")}
-        sources[tuple(map(str, told.values()))] = told
+        terms = {key: source.get(key) for key in ("name", "attribution", "licence")}
+        sources[tuple(map(str, terms.values()))] = terms
     size = sum(sheet.size_bytes for sheet in sheets)
     area_km2 = sum(sheet.area_km2 for sheet in sheets)
     return {
@@ -126,7 +135,7 @@ def summary(atlas: "Atlas") -> dict[str, Any]:
 
 
 def _bounds(sheets: Iterable["Sheet"]) -> list[float] | None:
-    """West, south, east, north of all sheets; not the shortest way across the antimeridian."""
+    """West, south, east, north of all sheets, without crossing the antimeridian."""
     boxes = [sheet.bounds_deg for sheet in sheets]
     if not boxes:
         return None
@@ -135,7 +144,7 @@ def _bounds(sheets: Iterable["Sheet"]) -> list[float] | None:
 
 
 def summary_text(plain: dict[str, Any]) -> str:
-    """The same for people."""
+    """The summary for people."""
     recipe = dict(plain["recipe"])
     coarse = recipe.pop("coarse")
     values = ", ".join(f"{name} {value}" for name, value in recipe.items() if value is not None)
@@ -189,10 +198,10 @@ def _check(options: argparse.Namespace) -> int:
         )
     else:
         for problem in found:
-            done = " (put right)" if problem.removed else ""
+            done = " (removed)" if problem.removed else ""
             print(f"{problem.kind:15} {problem.name}: {problem.detail}{done}")
-        said = f"{len(left)} problems" if left else "whole"
-        print(f"{said}{'' if options.deep else ', by names and sizes'}: {atlas.store}")
+        verdict = f"{len(left)} problems" if left else "whole"
+        print(f"{verdict}{'' if options.deep else ', by names and sizes'}: {atlas.store}")
     return NOT_WHOLE if left else 0
 
 
@@ -202,8 +211,8 @@ def _add(options: argparse.Namespace) -> None:
     source = Atlas.open(options.source)
     atlas = Atlas.open_or_create(options.atlas, source.recipe)
     with progress(options) as shown:
-        put, kept = copy_sheets(source, atlas, options.sheets, options.replace, shown)
-    print(f"{len(put)} sheets added, {len(kept)} kept as they were: {atlas.store}")
+        copied, unchanged = copy_sheets(source, atlas, options.sheets, options.replace, shown)
+    print(f"{len(copied)} sheets added, {len(unchanged)} unchanged: {atlas.store}")
 
 
 def _retire(options: argparse.Namespace) -> None:
@@ -222,12 +231,12 @@ def _index(options: argparse.Namespace) -> None:
 
     atlas = Atlas.open(options.atlas)
     with progress(options) as shown:
-        made = make_index(atlas, progress=shown, anew=options.anew)
+        made = make_index(atlas, progress=shown, rebuild=options.rebuild)
     if made is None:
-        print(f"no sheet has coarse tiles, so there is nothing to index: {atlas.store}")
+        print(f"no sheet has coarse tiles, nothing to index: {atlas.store}")
         return
     rows = sum(part.rows for shard in made.shards for part in shard.parts if not part.retired)
-    size = sum(asset.size_bytes for asset in made.files.values())
+    size = sum(file.size_bytes for file in made.files.values())
     print(f"{rows} tiles of {len(made.sheets)} sheets, {size / 1e6:.3f} MB: {atlas.store}")
 
 

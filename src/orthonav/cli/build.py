@@ -1,11 +1,16 @@
-"""`orthonav build`: make a map, or the sheets of an atlas, from orthophotos."""
+"""`orthonav build`: make a map from orthophotos."""
 
 import argparse
+import logging
+import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-from orthonav.cli import build_atlas
 from orthonav.cli.common import add_area, add_orthos, print_json, progress
+
+log = logging.getLogger(__name__)
 
 EVERYDAY = ("--route", "--bounds", "--band-m", "--gsd-m", "--other-date", "--work", "--json")
 RECIPE = (
@@ -22,30 +27,12 @@ RECIPE = (
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     add_orthos(parser, "orthophoto (any georeferenced raster that GDAL reads)")
     add_area(parser, parser.add_mutually_exclusive_group())
+    add_recipe(parser)
     parser.add_argument(
-        "--gsd-m", type=float, help="ground resolution, metres per pixel (default: the imagery's)"
-    )
-    parser.add_argument("--tile-px", type=int, help="width of a tile (default 256)")
-    parser.add_argument("--overlap", type=float, help="share common to neighbours (default 0.875)")
-    parser.add_argument(
-        "--method",
-        help="embedding, name:field=value,...: gradient (default), autoencoder, triplet or bovw",
-    )
-    parser.add_argument(
-        "--edges",
-        help="what is compared: gradient, gray, canny (e.g. canny:low=100,high=200), segments or "
-        "sam:weights=PATH (default: gradient; canny for autoencoder, gray for triplet and bovw)",
-    )
-    parser.add_argument("--seed", type=int, help="seed of what is drawn (default 0)")
-    parser.add_argument(
-        "--no-registration",
-        dest="registration",
-        action="store_const",
-        const=False,
-        help="leave out the grey picture of the area: a smaller map, positions at tile level only",
+        "--out", type=Path, required=True, metavar="MAP.onav", help="map file to write"
     )
     parser.add_argument(
         "--other-date",
@@ -53,41 +40,79 @@ def add(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="TIF",
-        help="orthophoto of the same ground of another year: the confidence and the covariance "
-        "are learnt from it (may be given again; it does not become part of the map)",
-    )
-    parser.add_argument(
-        "--calibration-views",
-        type=int,
-        metavar="N",
-        help="views made of the orthophoto to learn the confidence from (default 48)",
+        help="orthophoto of the same area at another date, from which confidence and covariance "
+        "are calibrated; it does not become part of the map; may be repeated",
     )
     parser.add_argument(
         "--work",
         type=Path,
         metavar="DIR",
-        help="keep finished blocks, and checkpoints and pictures of a network's learning, there; "
-        "a build that was interrupted goes on from them (default: the blocks of a large area in "
-        "MAP.onav.work until the map is written)",
+        help="folder of finished blocks, and of checkpoints and images of a network's training, "
+        "from which an interrupted build resumes (default: MAP.onav.work for large areas, removed "
+        "when the map is written)",
     )
     parser.add_argument(
         "--workers",
         type=int,
         metavar="N",
-        help="threads that read imagery (default: one per core); of an atlas, sheets at a time",
+        help="threads that read imagery (default: one per core)",
     )
-    target = parser.add_mutually_exclusive_group(required=True)
-    target.add_argument("--out", type=Path, metavar="MAP.onav")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-    build_atlas.add(parser, target)
+
+
+def add_recipe(parser: argparse._ActionsContainer) -> None:
+    """The options of `RECIPE`."""
+    parser.add_argument(
+        "--gsd-m", type=float, help="ground resolution, metres per pixel (default: of the imagery)"
+    )
+    parser.add_argument("--tile-px", type=int, help="width of a tile (default 256)")
+    parser.add_argument(
+        "--overlap",
+        type=float,
+        metavar="SHARE",
+        help="overlap of neighbouring tiles, as a share of their width (default 0.875)",
+    )
+    parser.add_argument(
+        "--method",
+        metavar="NAME[:FIELD=VALUE,..]",
+        help="embedding: gradient (default), autoencoder, triplet or bovw",
+    )
+    parser.add_argument(
+        "--edges",
+        metavar="NAME[:FIELD=VALUE,..]",
+        help="image representation: gradient, gray, canny (canny:low=100,high=200), segments or "
+        "sam:weights=PATH (default: gradient; canny for autoencoder, gray for triplet and bovw)",
+    )
+    parser.add_argument("--seed", type=int, help="seed of all random draws (default 0)")
+    parser.add_argument(
+        "--no-registration",
+        dest="registration",
+        action="store_const",
+        const=False,
+        help="omit the registration layer: a smaller map, with positions at tile level only",
+    )
+    parser.add_argument(
+        "--calibration-views",
+        type=int,
+        metavar="N",
+        help="simulated views of the orthophoto for calibrating the confidence (default 48)",
+    )
+
+
+def recipe_of(options: argparse.Namespace) -> dict[str, Any]:
+    """The fields of the recipe that were given."""
+    return {name: value for name in RECIPE if (value := getattr(options, name)) is not None}
+
+
+def reporter(options: argparse.Namespace) -> Callable[[str], None]:
+    """A function that prints lines about the work on a terminal, and logs them elsewhere."""
+    if options.quiet or not sys.stderr.isatty():
+        return log.info
+    return lambda line: print(line, file=sys.stderr)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Build and print a summary."""
-    recipe = {name: value for name in RECIPE if (value := getattr(options, name)) is not None}
-    if options.atlas is not None:
-        return build_atlas.run(options, recipe)
-    build_atlas.refuse(options)
+    """Build the map and print a summary."""
     from orthonav.cli.info import summary, summary_text
     from orthonav.geo.route import read_route
     from orthonav.prepare import BuildRequest, build_map
@@ -102,10 +127,10 @@ def run(options: argparse.Namespace) -> int:
         other_dates=options.other_date,
         work=options.work,
         workers=options.workers,
-        **recipe,
+        **recipe_of(options),
     )
     with progress(options) as shown:
-        result = build_map(request, shown, build_atlas.teller(options))
+        result = build_map(request, shown, reporter(options))
     plain = summary(result.manifest, result.size_bytes, options.out)
     plain["build_s"] = round(time.perf_counter() - start, 3)
     if options.json:

@@ -1,4 +1,4 @@
-"""`orthonav calibrate`: find out what is wrong with what a flight tells, by flying it."""
+"""`orthonav calibrate`: estimate constant errors of mount, compass and height from a flight."""
 
 import argparse
 from dataclasses import asdict, replace
@@ -9,25 +9,33 @@ from orthonav.cli.common import print_json, progress
 from orthonav.cli.source import add_source, open_source
 
 if TYPE_CHECKING:
-    from orthonav.onboard.calibrate import Calibration
+    from orthonav.onboard.calibrate import MountCalibration
+
+EVERYDAY = ("--gnss", "--gnss-std-m", "--heading", "--camera", "--telemetry", "--json")
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("map", type=Path, metavar="MAP.onav")
+    parser.add_argument("map", type=Path, metavar="MAP.onav", help="map of the area")
     parser.add_argument(
-        "flight", type=Path, metavar="SOURCE", help="flight to learn from, as for `localize`"
+        "flight", type=Path, metavar="SOURCE", help="flight to calibrate with, as for `localize`"
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="mount.json")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="mount.json", help="file to write"
+    )
     parser.add_argument(
         "--gnss",
         type=Path,
         metavar="positions.csv",
-        help="measured positions of (some of) the views, frame,lat_deg,lon_deg: views then tell "
-        "the mount by where they are seen, not by their perspective alone",
+        help="measured positions of some or all views (frame,lat_deg,lon_deg); they make pitch and "
+        "roll observable from positions, not from the perspective alone",
     )
     parser.add_argument(
-        "--gnss-std-m", type=float, default=5.0, metavar="M", help="how good they are (default 5)"
+        "--gnss-std-m",
+        type=float,
+        default=5.0,
+        metavar="M",
+        help="standard deviation of --gnss per axis (m; default 5)",
     )
     parser.add_argument(
         "--heading",
@@ -40,15 +48,15 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Track the flight, place its views smoothed, and keep what they agree on."""
+    """Track and smooth the flight, then estimate the biases from its confident views."""
     from orthonav.errors import FlightError
     from orthonav.flight import read_truth
     from orthonav.flight.mount import write_mount
-    from orthonav.flight.recording import Retold
+    from orthonav.flight.recording import WithTelemetry
     from orthonav.localizer import Localizer
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
-    from orthonav.onboard.calibrate import calibrated
+    from orthonav.onboard.calibrate import calibrate_mount
     from orthonav.onboard.run import localize_flight, smoothed_track
     from orthonav.records import Prior
 
@@ -56,8 +64,10 @@ def run(options: argparse.Namespace) -> None:
         raise FlightError(f"--gnss-std-m must be above 0, got {options.gnss_std_m}")
     flight = open_source(options.flight, options)
     places = read_truth(options.gnss) if options.gnss else {}
-    told = {frame: Prior(*place, options.gnss_std_m) for frame, place in places.items()}
-    views = (Retold(v, replace(v.telemetry, prior=told.get(v.frame))) for v in flight.views)
+    priors = {frame: Prior(*place, options.gnss_std_m) for frame, place in places.items()}
+    views = (
+        WithTelemetry(v, replace(v.telemetry, prior=priors.get(v.frame))) for v in flight.views
+    )
     tracker = Tracker(
         Localizer(open_map(options.map)),
         heading_known=options.heading == "known",
@@ -71,7 +81,7 @@ def run(options: argparse.Namespace) -> None:
             results.append(result)
             if flight.expected:
                 shown("calibrate", min(1.0, len(results) / flight.expected))
-    found = calibrated(smoothed_track(tracker, results, None))
+    found = calibrate_mount(smoothed_track(tracker, results, None))
     write_mount(options.out, found.mount)
     if options.json:
         print_json(_plain(found))
@@ -79,11 +89,11 @@ def run(options: argparse.Namespace) -> None:
     print(_table(found))
     print(f"from {found.mount.views} views, {found.first} to {found.last}")
     if found.moved:
-        print("before these it was mounted otherwise; those views are left out")
+        print("the camera moved in its mount before these views; earlier views are not used")
     print(f"written to {options.out}")
 
 
-def _plain(found: "Calibration") -> dict[str, Any]:
+def _plain(found: "MountCalibration") -> dict[str, Any]:
     return asdict(found.mount) | {
         "first": found.first,
         "last": found.last,
@@ -91,8 +101,8 @@ def _plain(found: "Calibration") -> dict[str, Any]:
     }
 
 
-def _table(found: "Calibration") -> str:
-    lines = [f"{'':22} {'value':>8} {'known to':>9} {'scatter':>8}"]
+def _table(found: "MountCalibration") -> str:
+    lines = [f"{'':22} {'value':>8} {'std':>9} {'scatter':>8}"]
     rows = (
         ("heading, deg", found.mount.heading_deg, 1.0),
         ("height (or focal), %", found.mount.log_scale, 100.0),

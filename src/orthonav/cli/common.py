@@ -1,4 +1,4 @@
-"""What several commands share: argument types, progress, printing JSON."""
+"""Shared by several commands: argument types, progress bars, JSON output."""
 
 import argparse
 import json
@@ -11,13 +11,13 @@ from typing import Any
 from tqdm import tqdm
 
 ROUTE_HELP = (
-    "planned route: GeoJSON, CSV, KML or KMZ, GPX, a plan of QGroundControl or a waypoint file "
-    "(FILE#NAME where it holds several), or a trajectory of the paper: paper:B@46.6,1.9[,BEARING]"
+    "planned route: GeoJSON, CSV, KML or KMZ, GPX, a QGroundControl plan or a waypoint file "
+    "(FILE#NAME selects one of several), or a trajectory of the paper: paper:B@46.6,1.9[,BEARING]"
 )
 
 
 class Progress:
-    """Progress bars by stage on a terminal; silent elsewhere or when quiet."""
+    """Progress bars by stage on a terminal; silent without a terminal or when quiet."""
 
     def __init__(self, quiet: bool) -> None:
         self._off = quiet or not sys.stderr.isatty()
@@ -25,7 +25,7 @@ class Progress:
         self._stage = ""
 
     def __call__(self, stage: str, share: float) -> None:
-        """Show that `share` (0..1) of `stage` is done."""
+        """Show `share` (0..1) of `stage` as done."""
         if self._off:
             return
         if stage != self._stage:
@@ -40,7 +40,7 @@ class Progress:
         self._bar.update(round(share * 1000) - self._bar.n)
 
     def close(self) -> None:
-        """End the bar that is shown."""
+        """Close the current bar."""
         if self._bar is not None:
             self._bar.close()
             self._bar = None
@@ -48,7 +48,7 @@ class Progress:
 
 @contextmanager
 def progress(options: argparse.Namespace) -> Iterator[Progress]:
-    """Progress for a command, closed whatever happens."""
+    """Progress bars of a command, closed on success and on errors."""
     shown = Progress(options.quiet)
     try:
         yield shown
@@ -65,27 +65,29 @@ def bounds(text: str) -> tuple[float, float, float, float]:
     return west, south, east, north
 
 
-def add_area(parser: argparse.ArgumentParser, group: Any) -> None:
-    """`--route` and `--bounds` to a group (or the parser), `--band-m` beside them."""
-    group.add_argument("--route", type=Path, help=ROUTE_HELP)
+def add_area(parser: argparse._ActionsContainer, group: Any) -> None:
+    """Add `--route` and `--bounds` to a group (or the parser), and `--band-m` to the parser."""
+    group.add_argument("--route", type=Path, metavar="FILE", help=ROUTE_HELP)
     group.add_argument(
         "--bounds",
         type=bounds,
         metavar="W,S,E,N",
-        help="area in degrees; write --bounds=W,S,E,N where W is negative",
+        help="area in degrees; write --bounds=W,S,E,N if W is negative",
     )
     parser.add_argument(
-        "--band-m", type=float, help="width of the search band of legs that have none of their own"
+        "--band-m",
+        type=float,
+        help="width of the search band for legs without a width of their own",
     )
 
 
 def print_json(plain: Any) -> None:
-    """One JSON document on stdout."""
+    """Print one JSON document on stdout."""
     print(json.dumps(plain, indent=1, allow_nan=False))
 
 
 def add_orthos(parser: argparse.ArgumentParser, what: str) -> None:
-    """`--ortho FILE|FOLDER ..`, which may come several times."""
+    """Add `--ortho FILE|FOLDER ...`, which may be repeated."""
     parser.add_argument(
         "--ortho",
         action="extend",
@@ -93,6 +95,6 @@ def add_orthos(parser: argparse.ArgumentParser, what: str) -> None:
         required=True,
         type=Path,
         metavar="FILE",
-        help=f"{what}, or folder of such, of which the newest covers the others; may be given "
-        "several times, the first covers the next",
+        help=f"{what}, or a folder of them, where newer files take precedence; may be repeated, "
+        "earlier ones take precedence",
     )

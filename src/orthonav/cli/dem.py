@@ -1,4 +1,4 @@
-"""Terrain heights read from a raster, for planning on the ground."""
+"""Terrain heights from a raster file, for planning."""
 
 import math
 from pathlib import Path
@@ -7,41 +7,40 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import ImageryError, MissingExtraError, MissingFileError
+from orthonav.errors import ImageryError, MissingFileError
+from orthonav.extras import missing_extra
 from orthonav.geo.route import Route, leg_lengths_m
-from orthonav.geo.terrain import Ground
+from orthonav.geo.terrain import TerrainHeights
 
 Array = NDArray[np.float64]
 MAX_SIDE_PX = 4000
 _MARGIN_PX = 2
 
 
-def read_dem(path: Path, route: Route, margin_m: float) -> Ground:
-    """Terrain about a route, `margin_m` to all sides, as a function of places.
+def read_dem(path: Path, route: Route, margin_m: float) -> TerrainHeights:
+    """Terrain around a route, with `margin_m` on all sides, as a function of positions.
 
-    The first band is heights in metres above mean sea level; no data is NaN, as is what lies
-    beyond. Raises `MissingFileError`, `MissingExtraError` or `ImageryError`.
+    The first band holds heights in metres above mean sea level. Heights are NaN for no data and
+    outside the raster. Raises `MissingFileError`, `MissingExtraError` or `ImageryError`.
     """
     try:
         import rasterio
         from rasterio._err import CPLE_BaseError
         from rasterio.errors import RasterioError
     except ImportError as error:
-        raise MissingExtraError(
-            "reading terrain needs rasterio; install it with: pip install 'orthonav[geo]'"
-        ) from error
+        raise missing_extra("reading terrain", "geo", "rasterio", error) from error
     if not path.is_file():
         raise MissingFileError(f"terrain file does not exist: {path}")
     try:
         with rasterio.open(path) as data:
             if data.crs is None:
-                raise ImageryError(f"terrain has no coordinate system: {path}")
+                raise ImageryError(f"terrain file has no coordinate reference system: {path}")
             return _read(data, route, margin_m, path)
     except (RasterioError, CPLE_BaseError) as error:
-        raise ImageryError(f"terrain cannot be read ({error}): {path}") from error
+        raise ImageryError(f"terrain file cannot be read ({error}): {path}") from error
 
 
-def _read(data: Any, route: Route, margin_m: float, path: Path) -> Ground:
+def _read(data: Any, route: Route, margin_m: float, path: Path) -> TerrainHeights:
     from rasterio.enums import Resampling
     from rasterio.windows import Window
 
@@ -49,11 +48,11 @@ def _read(data: Any, route: Route, margin_m: float, path: Path) -> Ground:
     lat, lon = _surroundings(route, margin_m)
     col, row = _pixels(crs, transform, lat, lon)
     if not np.isfinite(col + row).any():
-        raise ImageryError(f"the route lies nowhere on the terrain: {path}")
+        raise ImageryError(f"the route lies outside the coordinate range of the terrain: {path}")
     left, right = _clipped(col, size[1])
     top, bottom = _clipped(row, size[0])
     if right <= left or bottom <= top:
-        raise ImageryError(f"the route lies beside the terrain: {path}")
+        raise ImageryError(f"the route lies outside the terrain: {path}")
     shape = tuple(min(side, MAX_SIDE_PX) for side in (bottom - top, right - left))
     window = Window(left, top, right - left, bottom - top)
     pixels = data.read(
@@ -62,15 +61,15 @@ def _read(data: Any, route: Route, margin_m: float, path: Path) -> Ground:
     heights = np.ma.filled(pixels.astype(np.float64), np.nan)
     scale = np.array([shape[1] / (right - left), shape[0] / (bottom - top)])
 
-    def ground(lat_deg: Array, lon_deg: Array) -> Array:
+    def heights_at(lat_deg: Array, lon_deg: Array) -> Array:
         col, row = _pixels(crs, transform, lat_deg, lon_deg)
         return _bilinear(heights, (col - left) * scale[0] - 0.5, (row - top) * scale[1] - 0.5)
 
-    return ground
+    return heights_at
 
 
 def _surroundings(route: Route, margin_m: float) -> tuple[Array, Array]:
-    """Places around each waypoint, farther where legs are long: they bulge on other maps."""
+    """Positions around each waypoint; farther for long legs, which other projections curve."""
     lat, lon = np.array(route.waypoints).T
     north = math.degrees((margin_m + 0.02 * float(leg_lengths_m(route).max())) / 6.37e6)
     east = north / np.maximum(np.cos(np.radians(lat)), 0.01)
@@ -81,7 +80,7 @@ def _surroundings(route: Route, margin_m: float) -> tuple[Array, Array]:
 
 
 def _pixels(crs: Any, transform: Any, lat: Array, lon: Array) -> tuple[Array, Array]:
-    """Columns and rows from the outer corner of the first pixel, of places in degrees."""
+    """Columns and rows of positions in degrees, from the outer corner of the first pixel."""
     from rasterio.warp import transform as transform_coordinates
 
     x, y = transform_coordinates("EPSG:4326", crs, lon.tolist(), lat.tolist())
@@ -99,7 +98,7 @@ def _clipped(at: Array, size: int) -> tuple[int, int]:
 
 
 def _bilinear(heights: Array, col: Array, row: Array) -> Array:
-    """Heights at fractional pixel centres; NaN beyond the outer pixels' edges."""
+    """Heights at fractional pixel coordinates; NaN outside the raster."""
     rows, cols = heights.shape
     beyond = ~((col >= -0.5) & (col <= cols - 0.5) & (row >= -0.5) & (row <= rows - 0.5))
     col = np.clip(np.where(beyond, 0, col), 0, cols - 1)

@@ -1,4 +1,4 @@
-"""`orthonav demo`: the whole story on a generated area."""
+"""`orthonav demo`: generate an area, build, check, fly, localize and report."""
 
 import argparse
 import json
@@ -13,13 +13,17 @@ if TYPE_CHECKING:
     from orthonav.evaluate.metrics import Metrics
 
 MARKER = "demo.json"
+"""File that marks a folder as an earlier demo, which may be replaced."""
 HEIGHT_M = 270.0
+"""Views then cover 346 x 259 m, a whole tile of 256 m."""
 SPACING_M = 24.0
+"""About 220 views along the route."""
 RADIUS_M = 15.0
+"""Error below which a fix is correct, as in the paper (accuracy at 15 m)."""
 CHECKED_BAND_M = 300.0
 CHECK_EFFORT = 0.5
-# The route in metres east and north of the area's centre, for a size of 2 km.
-TURNS_EN_M = (
+"""Half of the trials of a full check, to keep the demo short."""
+WAYPOINTS_EN_M = (
     (-720, -720),
     (-720, 650),
     (-300, 730),
@@ -28,48 +32,53 @@ TURNS_EN_M = (
     (420, 600),
     (740, 740),
 )
+"""The route in metres east and north of the centre of the area, which is 2 km wide."""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument(
-        "--out", type=Path, default=Path("orthonav-demo"), help="folder (default ./orthonav-demo)"
+        "--out",
+        type=Path,
+        default=Path("orthonav-demo"),
+        metavar="DIR",
+        help="folder to write (default ./orthonav-demo)",
     )
-    parser.add_argument("--seed", type=int, default=1, help="which landscape (default 1)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the landscape (default 1)")
     parser.add_argument("--json", action="store_true", help="print the metrics as JSON")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Generate, build, fly, localize, report."""
+    """Run the demo and print its results."""
     from orthonav.files import replacing_folder
 
     start = time.perf_counter()
     with progress(options) as shown, replacing_folder(options.out, _is_earlier_demo) as folder:
-        plain, text = _story(folder, options, shown)
+        plain, text = _demo(folder, options, shown)
         plain["made_by"] = "orthonav demo"
         (folder / MARKER).write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
     if options.json:
         print_json(plain)
         return
     print(f"{text}\n\ndone in {time.perf_counter() - start:.0f} s")
-    print(_how_to_look(options.out))
+    print(_how_to_view(options.out))
 
 
-def _how_to_look(out: Path) -> str:
-    """What was made, and how to open it."""
-    look = f"orthonav view {out}/fixes.jsonl --map {out}/area.onav --flight {out}/flight"
+def _how_to_view(out: Path) -> str:
+    """The reports, and the command that shows the flight."""
+    command = f"orthonav view {out}/fixes.jsonl --map {out}/area.onav --flight {out}/flight"
     return "\n".join(
         (
             "open in a browser:",
-            f"  {out}/check/index.html    before the flight: where it can be flown by the map",
-            f"  {out}/report/index.html   after it: errors, confidence, worst views",
-            f"step through the views:\n  {look}",
+            f"  {out}/check/index.html    before the flight: where fixes are expected on this map",
+            f"  {out}/report/index.html   after the flight: errors, confidence, worst views",
+            f"step through the views:\n  {command}",
         )
     )
 
 
 def _is_earlier_demo(out: Path) -> bool:
-    """Whether a folder holds what a demo left and nothing else."""
+    """Whether a folder holds the output of an earlier demo and nothing else."""
     try:
         plain = json.loads((out / MARKER).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -80,19 +89,19 @@ def _is_earlier_demo(out: Path) -> bool:
     return made and all(name in known or name.endswith(".tif") for name in names)
 
 
-def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[Any, str]:
+def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[Any, str]:
     from orthonav.cli.evaluate import map_background
     from orthonav.cli.info import recipe_text, summary, summary_text
     from orthonav.evaluate.flights import FlightReport, metrics_to_json, table
     from orthonav.evaluate.metrics import compare, measure
     from orthonav.evaluate.report import MadeFrom, write_report
     from orthonav.flight import open_flight, read_truth
+    from orthonav.flight.fixes import write_results
     from orthonav.geo.route import read_route
     from orthonav.localizer import Localizer
     from orthonav.mapfile import open_map
     from orthonav.onboard.run import SingleViews, localize_flight
     from orthonav.prepare import BuildRequest, build_map
-    from orthonav.publish.jsonl import write_results
     from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
     from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
 
@@ -109,10 +118,13 @@ def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[
     opened = open_map(map_path)
     frame = opened.manifest.sheets[0].frame
     route = folder / "route.geojson"
-    _write_route(route, frame.latlon_from_en(TURNS_EN_M))
-    _say(options, f"3/5 checking, from {past.name} alone, where the route can be flown by the map")
+    _write_route(route, frame.latlon_from_en(WAYPOINTS_EN_M))
+    _say(options, f"3/5 checking from {past.name} alone where along the route fixes are expected")
     checked = _checked(folder, map_path, route, shown)
-    _say(options, f"4/5 flying over {present.name}, heading off by 5 deg, height by 5 %")
+    _say(
+        options,
+        f"4/5 simulating a flight over {present.name}, heading error 5 deg, height error 5 %",
+    )
     request = SimulateRequest(
         [present],
         folder / "flight",
@@ -123,7 +135,7 @@ def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[
         seed=options.seed,
     )
     simulate_flight(request, lambda share: shown("simulate", share))
-    _say(options, "5/5 localizing every view anywhere on the map")
+    _say(options, "5/5 localizing every view, searching the whole map")
     results = []
     flight = open_flight(request.out)
     for result in localize_flight(SingleViews(Localizer(opened), use_prior=False), flight):
@@ -148,9 +160,9 @@ def _story(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[
 
 
 def _checked(folder: Path, map_path: Path, route: Path, shown: Progress) -> str:
-    """What the check predicts of the route, in a line; its report is in `check`."""
+    """The prediction for the route in one line; writes the report of the check to `check`."""
     from orthonav import __version__
-    from orthonav.check.outcome import About
+    from orthonav.check.outcome import Provenance
     from orthonav.check.request import CheckRequest
     from orthonav.check.run import check_map
     from orthonav.check.write import write_check
@@ -166,7 +178,7 @@ def _checked(folder: Path, map_path: Path, route: Path, shown: Progress) -> str:
         agl_m=HEIGHT_M,
         effort=CHECK_EFFORT,
         extras=False,
-        about=About(
+        about=Provenance(
             map_path.name,
             imagery_text(manifest.imagery),
             recipe_text(manifest.recipe),
@@ -179,13 +191,15 @@ def _checked(folder: Path, map_path: Path, route: Path, shown: Progress) -> str:
     write_check(result, opened, folder / "check")
     assert result.along is not None
     mean, word = float(result.along.probability.mean()), result.verdict.word.value
-    return f"{word}: {mean:.0%} of views along the route are expected to be placed"
+    return (
+        f"{word}: {mean:.0%} of views along the route are expected to give a correct, confident fix"
+    )
 
 
 def _criteria_lines(metrics: "Metrics") -> list[str]:
-    """What trusting only confident fixes would keep."""
+    """Accepted share and accuracy at each confidence threshold."""
     return [
-        f"confidence >= {row.threshold:g}: {row.share_accepted:.0%} of views kept, "
+        f"confidence >= {row.threshold:g}: {row.share_accepted:.0%} of views accepted, "
         f"{row.accuracy:.1%} of them within {metrics.radius_m:g} m"
         for row in metrics.criteria
         if row.name == "confidence" and row.share_accepted > 0

@@ -1,4 +1,4 @@
-"""`orthonav evaluate`: compare fixes with the truth."""
+"""`orthonav evaluate`: accuracy of fixes against the truth."""
 
 import argparse
 import json
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import print_json
+from orthonav.cli.needs import require_extras
 
 if TYPE_CHECKING:
     from orthonav.evaluate.contact_sheet import Row
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("fixes", type=Path, nargs="+", metavar="fixes.jsonl")
     parser.add_argument(
         "--truth",
@@ -28,37 +29,44 @@ def add(parser: argparse.ArgumentParser) -> None:
         required=True,
         action="append",
         metavar="truth.csv",
-        help="true positions; one for each file of fixes, in the same order",
+        help="true positions; one per file of fixes, in the same order",
     )
     parser.add_argument(
-        "--radius-m", type=float, default=15.0, help="an error below it is right (default 15)"
+        "--radius-m", type=float, default=15.0, help="largest error of a correct fix (default 15)"
     )
     parser.add_argument(
-        "--json",
-        nargs="?",
-        const="-",
-        metavar="metrics.json",
-        help="write metrics as JSON, to stdout where no file is named",
+        "--rpe-distance-m",
+        type=float,
+        default=100.0,
+        help="distance of the relative pose error (default 100)",
+    )
+    parser.add_argument(
+        "--metrics", type=Path, metavar="metrics.json", help="write the metrics to a file"
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="print the metrics as JSON instead of the table"
     )
     parser.add_argument(
         "--report",
         type=Path,
         metavar="REPORT/",
-        help="write an HTML report, and its figures beside it as SVG and PNG",
+        help="write an HTML report with its figures as SVG and PNG",
     )
-    parser.add_argument("--map", type=Path, metavar="MAP.onav", help="background of the report")
+    parser.add_argument(
+        "--map", type=Path, metavar="MAP.onav", help="map for the background of the report"
+    )
     parser.add_argument(
         "--flight",
         type=Path,
         action="append",
         metavar="FLIGHT_DIR",
-        help="show the worst views beside the map in the report (with --map and --report); one for "
-        "each file of fixes, in the same order",
+        help="show the worst views beside the map in the report (with --map and --report); one per "
+        "file of fixes, in the same order",
     )
 
 
 def run(options: argparse.Namespace) -> None:
-    """Measure, print the table, write what was asked for."""
+    """Measure, print the table, write JSON and report."""
     from orthonav.errors import FlightError
     from orthonav.evaluate.flights import flights_to_json, summary, table
     from orthonav.files import write_text
@@ -66,48 +74,54 @@ def run(options: argparse.Namespace) -> None:
 
     if len(options.fixes) != len(options.truth):
         raise FlightError(
-            f"{len(options.fixes)} files of fixes need as many --truth, got {len(options.truth)}"
+            f"give --truth once per file of fixes: {len(options.fixes)} expected, got "
+            f"{len(options.truth)}"
         )
     if not 0 < options.radius_m < 1e7:
-        raise FlightError(f"radius must be above 0 m, got {options.radius_m}")
+        raise FlightError(f"--radius-m must be above 0, got {options.radius_m}")
+    if not 0 < options.rpe_distance_m < 1e7:
+        raise FlightError(f"--rpe-distance-m must be above 0, got {options.rpe_distance_m}")
+    if options.report:
+        require_extras("evaluate --report")
     _check_flights(options)
     opened = open_map(options.map) if options.map else None
     flights = _measured(options, opened)
     if options.report:
         _write_report(options.report, flights, opened)
     plain = flights_to_json(flights)
-    if options.json == "-":
+    if options.metrics:
+        write_text(options.metrics, json.dumps(plain, indent=1, allow_nan=False) + "\n")
+    if options.json:
         print_json(plain)
         return
-    if options.json:
-        write_text(Path(options.json), json.dumps(plain, indent=1, allow_nan=False) + "\n")
     print(f"{table(flights)}\n\n{summary(flights)}")
     if options.report:
         print(f"report: {options.report / 'index.html'}")
 
 
 def _check_flights(options: argparse.Namespace) -> None:
-    """Raises `FlightError` where `--flight` lacks what it needs."""
+    """Raise `FlightError` where `--flight` lacks other options."""
     from orthonav.errors import FlightError
 
     flights = options.flight or []
     if flights and not (options.map and options.report):
         raise FlightError(
-            "--flight shows views beside the map in a report: give --map and --report"
+            "--flight shows views beside the map in a report; give --map and --report too"
         )
     if flights and len(flights) != len(options.fixes):
         raise FlightError(
-            f"{len(options.fixes)} files of fixes need as many --flight, got {len(flights)}"
+            f"give --flight once per file of fixes: {len(options.fixes)} expected, got "
+            f"{len(flights)}"
         )
 
 
 def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[FlightReport]":
-    """Every flight beside its truth, and its worst views where their pictures were given."""
+    """Metrics of every flight, with its worst views if their images are given."""
     from orthonav.evaluate.flights import FlightReport
     from orthonav.evaluate.metrics import compare, measure
     from orthonav.evaluate.track import measure_track
     from orthonav.flight import open_flight, read_truth
-    from orthonav.publish.jsonl import read_results
+    from orthonav.flight.fixes import read_results
 
     local = opened.manifest.sheets[0].frame if opened else None
     background = map_background(opened) if opened else None
@@ -121,14 +135,14 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
         worst: tuple[Row, ...] = ()
         if opened and layer:
             worst = _worst(comparison, results, folders[i], opened, layer)
-        metrics = measure(comparison, options.radius_m)
+        metrics = measure(comparison, options.radius_m, rpe_distance_m=options.rpe_distance_m)
         track = measure_track(comparison, results, options.radius_m)
         flights.append(FlightReport(names[i], comparison, metrics, background, track, worst))
     return flights
 
 
 def _grey_layer(opened: "MapFile") -> "GreyLayer":
-    """The grey pyramid of a map; raises `MapFileError` where it has none."""
+    """The grey pyramid of a map; raises `MapFileError` without one."""
     from orthonav.errors import MapFileError
     from orthonav.mapfile.layer import GreyLayer
 
@@ -153,7 +167,7 @@ def _worst(
 
 
 def _names(paths: list[Path]) -> list[str]:
-    """A name for each file: its stem, with its folder where stems are alike."""
+    """A name for each file: its stem, with its folder where stems are equal."""
     names = [path.stem for path in paths]
     if len(set(names)) < len(names):
         names = [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
@@ -179,7 +193,7 @@ def _write_report(out: Path, flights: list[Any], opened: "MapFile | None") -> No
 
 
 def map_background(opened: "MapFile") -> "Background":
-    """The small picture of the area that a map carries; raises `MapFileError` where it is none."""
+    """The preview of a map as background; raises `MapFileError` where it is damaged."""
     from orthonav.mapfile.layer import preview
     from orthonav.report import Background
 

@@ -1,4 +1,4 @@
-"""`orthonav fetch`: get orthophotos of an area from open services."""
+"""`orthonav fetch`: download orthophotos of an area from open services."""
 
 import argparse
 import sys
@@ -9,33 +9,30 @@ from orthonav.cli.common import add_area, bounds, print_json, progress
 from orthonav.errors import FetchError
 
 if TYPE_CHECKING:
-    from orthonav.fetch import FetchRequest, Wish
+    from orthonav.fetch import FetchRequest, FetchResult, ImageryOptions
     from orthonav.geo.area import Area
 
 PACKAGE = "ign-package:"
+EVERYDAY = (
+    "--route",
+    "--bounds",
+    "--band-m",
+    "--source",
+    "--list",
+    "--out",
+    "--dry-run",
+    "--gsd-m",
+    "--layer",
+    "--time",
+    "--date",
+    "--key-env",
+    "--cache",
+    "--json",
+)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    _add_area(parser)
-    parser.add_argument(
-        "--source",
-        metavar="NAME[:YEAR]|PROTOCOL:ADDRESS",
-        help="a service by name, such as ign:2021, or wmts|wms|xyz|tms|stac|cog:https://..., or "
-        "ign-package:D003:2013 for all of a department (--out is a folder then)",
-    )
-    parser.add_argument("--list", action="store_true", help="list the services known by name")
-    parser.add_argument("--out", type=Path, metavar="ORTHO.tif")
-    parser.add_argument(
-        "--dry-run", action="store_true", help="say what it would cost, fetch nothing"
-    )
-    _add_choices(parser)
-    _add_terms(parser)
-    _add_politeness(parser)
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-
-
-def _add_area(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "area", nargs="?", metavar="ROUTE|W,S,E,N", help="planned route, or an area in degrees"
     )
@@ -43,10 +40,25 @@ def _add_area(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--margin-m", type=float, default=200.0, help="fetched around the area (default 200)"
     )
+    parser.add_argument(
+        "--source",
+        metavar="NAME[:YEAR]|PROTOCOL:ADDRESS",
+        help="a service by name, such as ign:2021, or wmts|wms|xyz|tms|stac|cog:https://..., or "
+        "ign-package:D003:2013 for a whole department (--out is a folder then)",
+    )
+    parser.add_argument("--list", action="store_true", help="list the services known by name")
+    parser.add_argument("--out", type=Path, metavar="ORTHO.tif", help="GeoTIFF to write")
+    parser.add_argument(
+        "--dry-run", action="store_true", help="print the estimated cost and fetch nothing"
+    )
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    _add_imagery(parser)
+    _add_file(parser)
+    _add_requests(parser)
 
 
-def _add_choices(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("which imagery")
+def _add_imagery(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("imagery")
     group.add_argument(
         "--gsd-m",
         type=float,
@@ -56,61 +68,74 @@ def _add_choices(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--zoom", help="zoom level or tile matrix instead of --gsd-m")
     group.add_argument("--layer", help="layer of the service")
     group.add_argument("--style", help="style of the layer")
-    group.add_argument("--format", help="such as image/jpeg or image/png")
+    group.add_argument("--format", help="media type, such as image/jpeg or image/png")
     group.add_argument("--crs", help="coordinate system, such as EPSG:2154, if there is a choice")
     group.add_argument("--matrix-set", help="tile matrix set of a WMTS")
-    group.add_argument("--time", help="time, or interval A/B of a STAC, in ISO 8601")
+    group.add_argument("--time", help="ISO 8601 time, or interval A/B of a STAC")
     group.add_argument("--wms-version", choices=("1.1.1", "1.3.0"), help="(default 1.3.0)")
-    group.add_argument("--tile-px", type=int, help="width of tiles (xyz, tms), of pictures (wms)")
-    group.add_argument("--max-zoom", type=int, help="deepest zoom that there is (xyz, tms)")
-    group.add_argument("--subdomains", default="abc", help="what {s} may be (default abc)")
+    group.add_argument("--tile-px", type=int, help="width of tiles (xyz, tms) or images (wms)")
+    group.add_argument("--max-zoom", type=int, help="finest zoom level that exists (xyz, tms)")
+    group.add_argument("--subdomains", default="abc", help="values of {s} (default abc)")
     group.add_argument("--collection", help="collection of a STAC")
-    group.add_argument("--asset", help="file of each item of a STAC")
+    group.add_argument("--asset", help="asset of each STAC item")
     group.add_argument("--bands", help="bands of files, such as 1,2,3 (stac, cog)")
     group.add_argument(
         "--nodata-colour",
         choices=("black", "white"),
-        help="large patches of exactly this colour are no imagery",
+        help="large patches of exactly this colour are masked",
     )
 
 
-def _add_terms(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("what the file says of itself, where the name does not")
+def _add_file(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("the file that is written")
     group.add_argument("--date", help="date of the imagery: YYYY, YYYY-MM, YYYY-MM-DD, or A/B")
     group.add_argument("--licence", help="licence of the imagery")
     group.add_argument("--attribution", help="who must be named")
-    group.add_argument("--compress", choices=("jpeg", "deflate"), default="jpeg")
+    group.add_argument(
+        "--compress",
+        choices=("jpeg", "deflate"),
+        default="jpeg",
+        help="compression of the GeoTIFF (default jpeg)",
+    )
     group.add_argument("--quality", type=int, default=90, help="of JPEG, 1 to 100 (default 90)")
+    group.add_argument(
+        "--allow-holes", action="store_true", help="write the file although tiles failed"
+    )
 
 
-def _add_politeness(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("how the service is asked")
+def _add_requests(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("requests")
     group.add_argument(
         "--key-env", metavar="VARIABLE", help="environment variable with the key for {key}"
     )
-    group.add_argument("--parallel", type=int, default=4, help="requests at once (default 4)")
-    group.add_argument("--per-second", type=float, help="requests a second (default 10)")
-    group.add_argument("--retries", type=int, default=5, help="after a failure (default 5)")
-    group.add_argument("--max-tiles", type=int, default=50_000, help="(default 50000)")
-    group.add_argument("--max-mb", type=float, default=4000.0, help="(default 4000)")
+    group.add_argument("--parallel", type=int, default=4, help="at the same time (default 4)")
     group.add_argument(
-        "--allow-holes", action="store_true", help="write the file although tiles failed"
+        "--per-second", type=float, metavar="N", help="per second and host (default 10)"
+    )
+    group.add_argument(
+        "--retries", type=int, default=5, help="repetitions after a failure (default 5)"
+    )
+    group.add_argument(
+        "--max-tiles", type=int, default=50_000, help="refuse to fetch more (default 50000)"
+    )
+    group.add_argument(
+        "--max-mb", type=float, default=4000.0, help="refuse to fetch more (default 4000)"
     )
     group.add_argument(
         "--cache",
         type=Path,
         metavar="DIR",
-        help="keep what comes there (default: beside --out, removed in the end)",
+        help="store fetched tiles there (default: beside --out, removed at the end)",
     )
 
 
 def run(options: argparse.Namespace) -> None:
-    """Fetch and print a summary, or print the services that are known."""
+    """Fetch and print a summary, or list the known services."""
     if options.list:
         _print_presets(options.json)
         return
     if options.source is None or (options.out is None and not options.dry_run):
-        raise FetchError("name a --source (--list shows those known by name) and an --out")
+        raise FetchError("give a --source (--list shows the known ones) and an --out")
     if options.source.startswith(PACKAGE):
         _run_package(options)
         return
@@ -119,25 +144,23 @@ def run(options: argparse.Namespace) -> None:
     request = _request(options)
     if options.dry_run:
         estimate = estimate_fetch(request)
-        print_json(vars(estimate) | {"about": vars(estimate.about)}) if options.json else print(
-            f"would fetch {estimate.text()}"
-        )
+        if options.json:
+            print_json(vars(estimate) | {"provenance": vars(estimate.provenance)})
+        else:
+            print(f"would fetch {estimate.text()}")
         return
     with progress(options) as shown:
         result = fetch(
-            request,
-            shown,
-            lambda estimate: _say(options, f"fetching {estimate.text()}"),
+            request, shown, lambda estimate: _say(options, f"fetching {estimate.text()}")
         )
-    plain = {"out": str(options.out), **result.describe()}
     if options.json:
-        print_json(plain)
+        print_json({"out": str(options.out), **result.describe()})
     else:
-        print(_summary(plain))
+        print(_summary(options.out, result))
 
 
 def _request(options: argparse.Namespace) -> "FetchRequest":
-    from orthonav.fetch import FetchRequest, Limits, Packing, parse_source
+    from orthonav.fetch import FetchRequest, Packing, RequestLimits, parse_source
 
     if not (1 <= options.parallel <= 16 and 1 <= options.quality <= 100 and options.retries >= 0):
         raise FetchError("--parallel is 1 to 16, --quality 1 to 100, --retries 0 or more")
@@ -146,7 +169,7 @@ def _request(options: argparse.Namespace) -> "FetchRequest":
         raise FetchError(f"--per-second is above 0 and at most 50, got {rate:g}")
     spec = parse_source(
         options.source,
-        _wish(options),
+        _imagery(options),
         date=options.date,
         licence=options.licence,
         attribution=options.attribution,
@@ -162,16 +185,18 @@ def _request(options: argparse.Namespace) -> "FetchRequest":
         max_tiles=options.max_tiles,
         max_mb=options.max_mb,
         allow_holes=options.allow_holes,
-        limits=Limits(parallel=options.parallel, per_second=rate, attempts=options.retries + 1),
+        limits=RequestLimits(
+            parallel=options.parallel, per_second=rate, attempts=options.retries + 1
+        ),
     )
 
 
-def _wish(options: argparse.Namespace) -> "Wish":
-    from orthonav.fetch import Wish
+def _imagery(options: argparse.Namespace) -> "ImageryOptions":
+    from orthonav.fetch import ImageryOptions
 
     if options.gsd_m is not None and not 0 < options.gsd_m < 1000:
         raise FetchError(f"--gsd-m must be above 0, got {options.gsd_m:g}")
-    return Wish(
+    return ImageryOptions(
         layer=options.layer,
         style=options.style,
         format=options.format,
@@ -207,7 +232,7 @@ def _area(options: argparse.Namespace) -> "Area":
     route, box = options.route, options.bounds
     if options.area is not None:
         if route is not None or box is not None:
-            raise FetchError("name the area once: as ROUTE or W,S,E,N, --route or --bounds")
+            raise FetchError("give the area once: as ROUTE or W,S,E,N, --route or --bounds")
         if options.area.count(",") == 3 and not Path(options.area).exists():
             try:
                 box = bounds(options.area)
@@ -216,7 +241,7 @@ def _area(options: argparse.Namespace) -> "Area":
         else:
             route = Path(options.area)
     if (route is None) == (box is None):
-        raise FetchError("name one area: a route file, or W,S,E,N in degrees")
+        raise FetchError("give one area: a route file, or W,S,E,N in degrees")
     if box is not None:
         return Area.from_bounds(box)
     return Area.from_route(read_route(route), options.band_m)
@@ -243,15 +268,16 @@ def _run_package(options: argparse.Namespace) -> None:
         if not options.dry_run:
             with progress(options) as shown:
                 paths = download_package(client, files, options.out, shown)
-    plain = {
-        "package": package.name,
-        "date": package.date,
-        "attribution": ATTRIBUTION,
-        "files": [str(path) for path in paths],
-        "megabytes": round(megabytes, 3),
-    }
     if options.json:
-        print_json(plain)
+        print_json(
+            {
+                "package": package.name,
+                "date": package.date,
+                "attribution": ATTRIBUTION,
+                "files": [str(path) for path in paths],
+                "megabytes": round(megabytes, 3),
+            }
+        )
     elif paths:
         print(f"{package.name} ({ATTRIBUTION}); unpack it with: 7z x {paths[0]}")
 
@@ -261,26 +287,18 @@ def _say(options: argparse.Namespace, text: str) -> None:
         print(text, file=sys.stderr)
 
 
-def _summary(plain: dict[str, object]) -> str:
-    failed = plain["failed"]
-    assert isinstance(failed, dict)
-    holes = {
-        "not covered": plain["not_covered"],
-        "blank": plain["blank"],
-        "placeholders": plain["placeholders"],
-        "failed": sum(failed.values()),
-    }
-    missing = ", ".join(f"{count} {what}" for what, count in holes.items() if count) or "none"
+def _summary(out: Path, result: "FetchResult") -> str:
+    estimate, terms = result.estimate, result.estimate.provenance
     lines = {
-        "file": plain["out"],
-        "size": f"{plain['width_px']} x {plain['height_px']} px of {plain['gsd_m']} m",
-        "tiles": f"{plain['tiles']}, {plain['from_cache']} of them from the cache",
-        "missing": missing,
-        "layer": plain["layer"],
-        "date": plain["date"] or "unknown",
-        "licence": plain["licence"] or "unknown: ask the service before you pass imagery on",
-        "attribution": plain["attribution"] or "unknown",
-        "note": plain["note"],
+        "file": out,
+        "size": f"{estimate.width_px} x {estimate.height_px} px of {estimate.gsd_m:.4g} m",
+        "tiles": f"{estimate.tiles}, {result.fetched.from_cache} of them from the cache",
+        "missing": result.holes() or "none",
+        "layer": terms.layer,
+        "date": terms.date or "unknown",
+        "licence": terms.licence or "unknown: ask the service before you pass imagery on",
+        "attribution": terms.attribution or "unknown",
+        "note": terms.note,
     }
     return "\n".join(f"{name:<12}{value}" for name, value in lines.items() if value)
 
@@ -289,16 +307,11 @@ def _print_presets(as_json: bool) -> None:
     from orthonav.fetch.presets import presets
 
     if as_json:
-        print_json(
-            [
-                {**vars(preset), "layers": [vars(layer) for layer in preset.layers.values()]}
-                for preset in presets().values()
-            ]
-        )
+        print_json([preset.describe() for preset in presets().values()])
         return
     for preset in presets().values():
         print(f"{preset.name}: {preset.title} ({preset.country})")
         print(f"  {', '.join(preset.layers)}")
         print(f"  {preset.licence}; {preset.attribution}")
         if preset.key_env:
-            print(f"  wants a key in {preset.key_env}")
+            print(f"  needs a key in {preset.key_env}")

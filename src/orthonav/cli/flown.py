@@ -1,4 +1,4 @@
-"""A flight log told again: how it was flown against how it is flown now."""
+"""Replay of a flight log: compare options and results with those of the flight."""
 
 import argparse
 import logging
@@ -20,10 +20,10 @@ _CHOICES = {
 
 
 def take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | None":
-    """The mount to fly with; with `--as-flown` the logged options take the place of `options`.
+    """Mount to use; with `--as-flown`, the logged options replace those of `options`.
 
-    Without, or where the map is another, what differs is warned about. Raises `FlightError` where
-    options that were logged cannot be.
+    Logs a warning where options or the map differ from those of the flight. Raises `FlightError`
+    for invalid logged options.
     """
     from orthonav.errors import FlightError
     from orthonav.flight.mount import read_mount
@@ -32,48 +32,48 @@ def take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | Non
     mount: Mount | None = read_mount(options.mount) if options.mount else None
     if not isinstance(flight, LoggedFlight):
         if options.as_flown:
-            raise FlightError(f"--as-flown is for flight logs: {flight.path}")
+            raise FlightError(f"--as-flown needs a flight log: {flight.path}")
         return mount
     _check_map(options, flight.session.get("map"))
     flown = _flown(flight.session.get("options"))
-    told: dict[str, Any] = {name: getattr(options, name) for name in (*_CHOICES, "accept")}
-    told["track"] = options.track or options.smooth
-    told["mount"] = mount
-    differ = [name for name in told if name in flown and flown[name] != told[name]]
+    chosen: dict[str, Any] = {name: getattr(options, name) for name in (*_CHOICES, "accept")}
+    chosen["track"] = options.track or options.smooth
+    chosen["mount"] = mount
+    differ = [name for name in chosen if name in flown and flown[name] != chosen[name]]
     if options.as_flown:
         for name in (*_CHOICES, "accept", "track"):
             setattr(options, name, flown.get(name, getattr(options, name)))
-        options.skip_bad_images = True  # a flight goes on where the camera gave no picture
+        options.skip_bad_images = True  # a flight continues after an image that cannot be decoded
         return flown.get("mount", mount)
     if differ:
         log.warning(
-            "not flown like this in flight, where %s differed: --as-flown does it again",
+            "options differ from those of the flight (%s); --as-flown uses the logged ones",
             ", ".join(differ),
         )
     return mount
 
 
-def tell_whether_as_flown(flight: "Recording", results: Sequence["ViewResult"]) -> None:
-    """Log how many results are not those of the flight; for a replay of a log."""
+def compare_with_flight(flight: "Recording", results: Sequence["ViewResult"]) -> None:
+    """Log how many results of a replay differ from those of the flight."""
     from orthonav.sources import LoggedFlight
 
     if not isinstance(flight, LoggedFlight):
         return
-    logged = {result.frame: _answer(result) for result in flight.results()}
+    logged = {result.frame: _comparable(result) for result in flight.results()}
     both = [result for result in results if result.frame in logged]
-    other = [result.frame for result in both if logged[result.frame] != _answer(result)]
+    other = [result.frame for result in both if logged[result.frame] != _comparable(result)]
     if other:
-        told = len(other), len(both), other[0]
-        log.warning("%d of %d results are not those of the flight, the first: %s", *told)
+        counts = len(other), len(both), other[0]
+        log.warning("%d of %d results differ from those of the flight, first: %s", *counts)
     else:
-        log.info("all %d results are those of the flight", len(both))
+        log.info("all %d results equal those of the flight", len(both))
 
 
-def _answer(result: "ViewResult") -> str:
-    """A result without the time it took."""
+def _comparable(result: "ViewResult") -> str:
+    """A result as text, without its latency."""
     from dataclasses import replace
 
-    from orthonav.publish.jsonl import result_to_json
+    from orthonav.flight.fixes import result_to_json
 
     return result_to_json(replace(result, latency_ms=0.0))
 
@@ -83,11 +83,13 @@ def _check_map(options: argparse.Namespace, logged: Any) -> None:
 
     flown = logged.get("manifest_sha256") if isinstance(logged, dict) else None
     if flown is not None and flown != map_digest(options.map):
-        log.warning("flown with another map in flight (%.80s): %s", logged.get("name"), options.map)
+        log.warning(
+            "the log was flown with another map (%.80s): %s", logged.get("name"), options.map
+        )
 
 
 def _flown(logged: Any) -> dict[str, Any]:
-    """What a log says of how it was flown, checked: a log may come from a stranger."""
+    """Options of a log, validated: a log is untrusted input."""
     from orthonav.errors import FlightError
 
     if not isinstance(logged, dict):
@@ -96,12 +98,12 @@ def _flown(logged: Any) -> dict[str, Any]:
     for name, choices in _CHOICES.items():
         if name in logged:
             if logged[name] not in choices:
-                raise FlightError(f"flight log has no such option: {name} {logged[name]!r:.40}")
+                raise FlightError(f"flight log: invalid option {name}: {logged[name]!r:.40}")
             found[name] = logged[name]
     for name, kinds in (("accept", str | None), ("track", bool)):
         if name in logged:
             if not isinstance(logged[name], kinds):
-                raise FlightError(f"flight log has no such option: {name} {logged[name]!r:.40}")
+                raise FlightError(f"flight log: invalid option {name}: {logged[name]!r:.40}")
             found[name] = logged[name]
     if "mount" in logged:
         found["mount"] = None if logged["mount"] is None else _mount(logged["mount"])
@@ -115,4 +117,4 @@ def _mount(plain: Any) -> "Mount":
     try:
         return mount_from_plain(plain)
     except BROKEN as error:
-        raise FlightError(f"flight log has a mount that is none ({error!r:.80})") from error
+        raise FlightError(f"flight log: invalid mount ({error!r:.80})") from error

@@ -1,4 +1,4 @@
-"""`orthonav fly`: beside an autopilot, from camera to position messages."""
+"""`orthonav fly`: position messages to an autopilot, from a live camera or a recording."""
 
 import argparse
 from collections.abc import Callable
@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 EVERYDAY = (
-    "--camera-file",
+    "--camera",
     "--mount",
     "--autopilot",
+    "--recorded-telemetry",
+    "--ros2",
     "--send",
     "--nmea",
+    "--jsonl",
     "--accept",
     "--dry-run",
     "--heading",
@@ -23,8 +26,8 @@ SEND = ("global-position", "gps-input", "odometry", "vision", "external-position
 HEIGHTS = ("distance", "terrain", "home", "relative")
 
 
-def numbers(count: int, what: str) -> Callable[[str], tuple[float, ...]]:
-    """An argument of so many numbers with commas between."""
+def numbers(count: int, expected: str) -> Callable[[str], tuple[float, ...]]:
+    """An argument type: `count` numbers, separated by commas."""
 
     def parse(text: str) -> tuple[float, ...]:
         try:
@@ -32,7 +35,7 @@ def numbers(count: int, what: str) -> Callable[[str], tuple[float, ...]]:
         except ValueError:
             values = ()
         if len(values) != count:
-            raise argparse.ArgumentTypeError(f"expected {what}, got '{text}'")
+            raise argparse.ArgumentTypeError(f"expected {expected}, got '{text}'")
         return values
 
     return parse
@@ -40,44 +43,38 @@ def numbers(count: int, what: str) -> Callable[[str], tuple[float, ...]]:
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("map", type=Path, metavar="MAP.onav")
+    parser.add_argument("map", type=Path, metavar="MAP.onav", help="map of the area")
+    parser.add_argument(
+        "source",
+        nargs="?",
+        metavar="SOURCE",
+        help="images: /dev/video0 or 0, an rtsp:// or http:// stream, a video, a folder of images "
+        "or a flight folder; not with --ros2",
+    )
     _add_camera(parser.add_argument_group("camera"))
+    _add_recording(parser.add_argument_group("playback of recordings"))
     _add_autopilot(parser.add_argument_group("autopilot"))
-    _add_outputs(parser.add_argument_group("what is sent"))
+    _add_ros2(parser.add_argument_group("ROS 2"))
+    _add_outputs(parser.add_argument_group("outputs"))
+    _add_messages(parser.add_argument_group("fields of messages"))
     _add_flight(parser.add_argument_group("flight"))
+    _add_log(parser.add_argument_group("flight log"))
 
 
 def _add_camera(group: Any) -> None:
     group.add_argument(
         "--camera",
-        required=True,
-        metavar="SOURCE",
-        help="/dev/video0 or 0, rtsp:// or http:// stream, video, folder of images, flight folder",
-    )
-    group.add_argument(
-        "--camera-file",
         type=Path,
         metavar="FILE",
-        help="flight.json, OpenCV, ROS or Kalibr (default: that of the flight folder)",
+        help="camera calibration: flight.json, or a file of OpenCV, ROS or Kalibr (YAML, JSON); "
+        "default: flight.json of the flight folder",
     )
     group.add_argument(
         "--camera-latency-ms",
         type=float,
         default=0.0,
         metavar="MS",
-        help="of live cameras, from exposure to arrival",
-    )
-    group.add_argument(
-        "--pace", type=float, default=1.0, metavar="FACTOR", help="of recordings: how much faster"
-    )
-    group.add_argument(
-        "--rate-hz-images", type=float, default=2.0, metavar="HZ", help="of a folder of images"
-    )
-    group.add_argument(
-        "--file-clock",
-        choices=("own", "autopilot"),
-        default="own",
-        help="own: a recording begins at once (default); autopilot: its times are the autopilot's",
+        help="live cameras: time from exposure to arrival (default 0)",
     )
     group.add_argument(
         "--mount-deg",
@@ -85,10 +82,43 @@ def _add_camera(group: Any) -> None:
         nargs=3,
         default=(0.0, 0.0, 0.0),
         metavar=("YAW", "PITCH", "ROLL"),
-        help="camera in the aircraft: 0 0 0 (default) looks straight down, top forward",
+        help="orientation of the camera in the aircraft; 0 0 0 (default) looks straight down with "
+        "the top of the image forward",
     )
     group.add_argument(
-        "--mount", type=Path, metavar="mount.json", help="what `orthonav calibrate` found"
+        "--mount",
+        type=Path,
+        metavar="mount.json",
+        help="correct heading, height and tilt with a calibration by `orthonav calibrate`",
+    )
+
+
+def _add_recording(group: Any) -> None:
+    group.add_argument(
+        "--recorded-telemetry",
+        action="store_true",
+        help="use the telemetry of the flight folder; no autopilot is needed",
+    )
+    group.add_argument(
+        "--pace",
+        type=float,
+        default=1.0,
+        metavar="FACTOR",
+        help="playback speed (default 1: real time)",
+    )
+    group.add_argument(
+        "--rate-hz",
+        type=float,
+        metavar="HZ",
+        help="views per second taken from a recording (default: every frame of a video, 2 for a "
+        "folder of images)",
+    )
+    group.add_argument(
+        "--file-clock",
+        choices=("own", "autopilot"),
+        default="own",
+        help="own: playback starts at once (default); autopilot: recorded times are those of the "
+        "autopilot's clock since boot",
     )
 
 
@@ -96,37 +126,58 @@ def _add_autopilot(group: Any) -> None:
     group.add_argument(
         "--autopilot",
         metavar="URL",
-        help="udpin:[HOST:]PORT (loopback unless told), udpout:HOST:PORT, tcp:HOST:PORT, "
-        "/dev/DEVICE:BAUD",
+        help="MAVLink connection: udpin:[HOST:]PORT (default HOST: loopback), udpout:HOST:PORT, "
+        "tcp:HOST:PORT or /dev/DEVICE:BAUD",
     )
     group.add_argument(
-        "--telemetry",
-        choices=("autopilot", "recorded"),
-        default="autopilot",
-        help="recorded: that of the flight folder, to try without an autopilot",
+        "--system-id",
+        type=int,
+        metavar="N",
+        help="system id of the autopilot (default: the first one heard)",
     )
-    group.add_argument("--system-id", type=int, metavar="N", help="of the autopilot")
     group.add_argument(
-        "--component-id", type=int, default=197, metavar="N", help="ours (default 197)"
+        "--component-id",
+        type=int,
+        default=197,
+        metavar="N",
+        help="component id of orthonav (default 197)",
     )
     group.add_argument(
         "--signing-key",
         type=Path,
         metavar="FILE",
-        help="MAVLink signing: 32 bytes, or 64 hexadecimal digits, in a file",
+        help="sign messages and require signed ones: file with a key of 32 bytes or 64 "
+        "hexadecimal digits",
     )
     group.add_argument(
         "--height",
         action="append",
         choices=HEIGHTS,
-        help="heights that may be used, the best first (default: all in this order)",
+        help="height above ground to use; repeat in order of preference (default: all, in this "
+        "order)",
     )
     group.add_argument(
         "--telemetry-wait-ms",
         type=float,
         default=150.0,
         metavar="MS",
-        help="how long a view waits for the attitude after its exposure (default 150)",
+        help="longest wait of a view for the attitude at its exposure (default 150)",
+    )
+
+
+def _add_ros2(group: Any) -> None:
+    group.add_argument(
+        "--ros2",
+        action="store_true",
+        help="read images and telemetry from ROS 2 topics and publish positions there, instead "
+        "of SOURCE and --autopilot (docs/ros2.md)",
+    )
+    group.add_argument(
+        "--ros-args",
+        nargs=argparse.REMAINDER,
+        default=[],
+        metavar="ARGS",
+        help="must come last: -r FROM:=TO, -r __ns:=/NAMESPACE, -r __node:=NAME, -p NAME:=VALUE",
     )
 
 
@@ -135,88 +186,156 @@ def _add_outputs(group: Any) -> None:
         "--send",
         action="append",
         choices=SEND,
-        help="message on the autopilot's link (default global-position); may come several times",
+        help="message to send to the autopilot (default global-position); can be repeated",
     )
     group.add_argument(
         "--nmea",
         action="append",
         default=[],
         metavar="URL",
-        help="udp:HOST:PORT, tcp-listen:[HOST:]PORT or serial:DEVICE:BAUD",
+        help="send NMEA sentences to udp:HOST:PORT, tcp-listen:[HOST:]PORT or serial:DEVICE:BAUD; "
+        "can be repeated",
     )
     group.add_argument(
-        "--nmea-as-gps", action="store_true", help="NMEA quality 1 instead of 6 (estimated)"
+        "--jsonl",
+        action="append",
+        default=[],
+        metavar="FILE|-",
+        help="append one line of JSON per view to a file, or write them to stdout (-); can be "
+        "repeated",
     )
-    group.add_argument("--json", action="append", default=[], metavar="FILE|-", help="lines")
     group.add_argument(
-        "--rate-hz", type=float, metavar="HZ", help="most messages a second (default: every view)"
+        "--send-rate-hz",
+        type=float,
+        metavar="HZ",
+        help="maximum rate of each message (default: one per view)",
     )
     group.add_argument(
         "--accept",
         default="confidence:0.9",
         metavar="NAME:MIN",
-        help="what is sent: confidence:0.9 (default), or peak_ratio:1.3 beside it",
+        help="send fixes above a threshold only: confidence:0.9 (default), or peak_ratio:1.3 in "
+        "addition",
     )
     group.add_argument(
-        "--max-std-m", type=float, default=50.0, metavar="M", help="less sure is not sent"
+        "--max-std-m",
+        type=float,
+        default=50.0,
+        metavar="M",
+        help="positions with a larger standard deviation are not sent (m; default 50)",
     )
     group.add_argument(
-        "--min-std-m", type=float, default=0.0, metavar="M", help="what the orthophoto is worth"
-    )
-    group.add_argument(
-        "--stamp",
-        choices=("utc", "boot"),
-        default="utc",
-        help="clock of the messages: ours in UTC (default), or the autopilot's",
-    )
-    group.add_argument("--sensor-id", type=int, default=1, metavar="N", help="as EKF2_AGP0_ID")
-    group.add_argument("--gps-id", type=int, default=0, metavar="N", help="of GPS_INPUT")
-    group.add_argument("--satellites", type=int, default=0, metavar="N", help="of GPS_INPUT")
-    group.add_argument("--hdop-m", type=float, metavar="M", help="metres per HDOP, of GPS_INPUT")
-    group.add_argument(
-        "--origin",
-        type=numbers(3, "LAT,LON,ALT_M"),
-        metavar="LAT,LON,ALT_M",
-        help="sent where the autopilot has no origin, for odometry and vision",
+        "--min-std-m",
+        type=float,
+        default=0.0,
+        metavar="M",
+        help="lower bound of the reported standard deviation (m; default 0)",
     )
     group.add_argument("--dry-run", action="store_true", help="send nothing to the autopilot")
 
 
+def _add_messages(group: Any) -> None:
+    group.add_argument(
+        "--stamp",
+        choices=("utc", "boot"),
+        default="utc",
+        help="clock of the timestamps: UTC of this computer (default), or the autopilot's time "
+        "since boot",
+    )
+    group.add_argument(
+        "--origin",
+        type=numbers(3, "LAT,LON,ALT_M"),
+        metavar="LAT,LON,ALT_M",
+        help="origin of the local frame (degrees, m above mean sea level), for odometry and "
+        "vision: set where the autopilot has none; with --ros2: origin of the map frame",
+    )
+    group.add_argument(
+        "--sensor-id",
+        type=int,
+        default=1,
+        metavar="N",
+        help="id of GLOBAL_POSITION_SENSOR, as EKF2_AGP0_ID (default 1)",
+    )
+    group.add_argument(
+        "--gps-id", type=int, default=0, metavar="N", help="gps_id of GPS_INPUT (default 0)"
+    )
+    group.add_argument(
+        "--satellites",
+        type=int,
+        default=0,
+        metavar="N",
+        help="satellites_visible of GPS_INPUT (default 0)",
+    )
+    group.add_argument(
+        "--hdop-m",
+        type=float,
+        metavar="M",
+        help="hdop of GPS_INPUT: standard deviation divided by this many metres (default: ignored)",
+    )
+    group.add_argument(
+        "--nmea-as-gps",
+        action="store_true",
+        help="NMEA quality 1 (GPS fix) instead of 6 (estimated)",
+    )
+
+
 def _add_flight(group: Any) -> None:
     group.add_argument(
-        "--heading", choices=("known", "unknown"), default="known", help="is the compass believed?"
+        "--heading",
+        choices=("known", "unknown"),
+        default="known",
+        help="known: from telemetry (default); unknown: all headings are tried",
     )
     group.add_argument(
         "--start",
         type=numbers(3, "LAT,LON,STD_M"),
         metavar="LAT,LON,STD_M",
-        help="where the flight begins (default: anywhere on the map)",
+        help="start position and its standard deviation per axis (degrees, m; default: anywhere "
+        "on the map)",
     )
     group.add_argument(
-        "--state", type=Path, metavar="FILE", help="the last position, kept over a restart"
+        "--state",
+        type=Path,
+        metavar="FILE",
+        help="save the last position to this file and start from it after a restart",
     )
     group.add_argument(
-        "--state-max-age-s", type=float, default=300.0, metavar="S", help="older is not used"
+        "--state-max-age-s",
+        type=float,
+        default=300.0,
+        metavar="S",
+        help="ignore a saved position that is older (default 300)",
     )
     group.add_argument(
         "--deadline-ms",
         type=float,
         default=500.0,
         metavar="MS",
-        help="views older than this when their turn comes are dropped (default 500)",
+        help="drop views that are older when their processing would start (default 500)",
     )
     group.add_argument(
         "--require-signed",
         type=Path,
-        metavar="PUBLIC.pem",
-        help="do not fly by a map unless it was signed with this key (`orthonav sign`)",
+        metavar="public.pem",
+        help="refuse a map that was not signed with this key (see `orthonav sign`)",
     )
-    group.add_argument("--log", type=Path, metavar="FILE.mcap", help="what is needed for a replay")
+
+
+def _add_log(group: Any) -> None:
     group.add_argument(
-        "--log-max-mb", type=float, metavar="MB", help="of the log: its oldest files go"
+        "--log", type=Path, metavar="FILE.mcap", help="write a flight log that can be replayed"
     )
     group.add_argument(
-        "--log-views", choices=("none", "thumbnails", "full"), default="full", help="in the log"
+        "--log-max-mb",
+        type=float,
+        metavar="MB",
+        help="maximum size of the log; its oldest files are deleted (default: no limit)",
+    )
+    group.add_argument(
+        "--log-views",
+        choices=("none", "thumbnails", "full"),
+        default="full",
+        help="images in the log; a replay needs full ones (default)",
     )
 
 
@@ -227,10 +346,8 @@ def run(options: argparse.Namespace) -> None:
     import threading
 
     from orthonav.cli.flying import runner
-    from orthonav.errors import VariantError
 
-    if options.autopilot is None and options.telemetry == "autopilot":
-        raise VariantError("give --autopilot URL, or --telemetry recorded to try without one")
+    _check(options)
     stopping = threading.Event()
     before = {}
     if threading.current_thread() is threading.main_thread():
@@ -240,9 +357,25 @@ def run(options: argparse.Namespace) -> None:
         with ExitStack() as stack:
             made = runner(options, stopping, stack)
             gc.collect()
-            gc.freeze()  # what is loaded stays: looking through it takes as long as a view
+            gc.freeze()  # a full collection over the loaded modules takes as long as a view
             stack.callback(gc.unfreeze)
             made.run(stopping)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Raise `VariantError` where images or telemetry have no source, or two."""
+    from orthonav.errors import VariantError
+
+    if options.ros2 and (options.source or options.autopilot):
+        raise VariantError("--ros2 replaces SOURCE and --autopilot: give one or the other")
+    if options.ros_args and not options.ros2:
+        raise VariantError("--ros-args needs --ros2")
+    if options.ros2:
+        return
+    if options.source is None:
+        raise VariantError("give a SOURCE of images after the map, or --ros2 for a ROS 2 topic")
+    if options.autopilot is None and not options.recorded_telemetry:
+        raise VariantError("give --autopilot URL, or --recorded-telemetry to try without one")

@@ -1,4 +1,4 @@
-"""`orthonav fly`, put together from its options. Loaded when a flight begins, not for `--help`."""
+"""The parts of `orthonav fly`, made from its options. Loaded for a flight, not for `--help`."""
 
 import argparse
 import importlib
@@ -19,10 +19,10 @@ from orthonav.localizer import Localizer
 from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import open_map
 from orthonav.onboard import cameras
-from orthonav.onboard.calibrate import Mounted, model_of
+from orthonav.onboard.calibrate import MountCorrected, model_of
 from orthonav.onboard.cameras import CameraThread
 from orthonav.onboard.fly import FlyOptions, LogSink, Runner
-from orthonav.onboard.health import Notifier, SecondLook
+from orthonav.onboard.health import Notifier, TelemetryDiagnosis
 from orthonav.onboard.link import AutopilotLink, LinkThread
 from orthonav.onboard.outputs import (
     KINDS,
@@ -33,7 +33,7 @@ from orthonav.onboard.outputs import (
     open_sink,
 )
 from orthonav.onboard.ports import transport_opener
-from orthonav.onboard.publisher import Publisher
+from orthonav.onboard.publisher import PositionOutput, Publisher
 from orthonav.onboard.run import Locator
 from orthonav.onboard.state import boot_id, load, prior_of
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
@@ -47,7 +47,7 @@ from orthonav.sources.cameras import read_camera_file
 
 
 def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitStack) -> Runner:
-    """Everything that flies, put together; what runs beside is stopped with `stack`."""
+    """Runner of a flight with all its parts; `stack` stops their threads."""
     clocks = Clocks()
     if options.require_signed:  # cryptography is loaded only where it is asked for
         importlib.import_module("orthonav.mapfile.signature").require_signature(
@@ -55,19 +55,23 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         )
     accept = Acceptance.parse(options.accept)
     least = accept.threshold if accept.criterion == "confidence" else CONFIDENT
-    camera = _camera(options)
     mount = read_mount(options.mount) if options.mount else None
+    camera = _camera(options)
     localizer = Localizer(open_map(options.map))
     heading_known = options.heading == "known"
     tracker = Tracker(
         localizer, heading_known=heading_known, model=model_of(mount) if mount else None
     )
-    locator: Locator = Mounted(tracker, mount) if mount else tracker
+    locator: Locator = MountCorrected(tracker, mount) if mount else tracker
     link = _link(options, clocks)
-    publisher = _publisher(options, clocks, link, least)
+    source, graph = _inputs(options, clocks, link, camera, stopping, stack, localizer, least)
+    camera = camera or source.wait_for_camera()
+    publisher = _publisher(options, clocks, link, least, graph)
     if link is not None:
         stack.callback(LinkThread(link).stop)
-    source = _source(options, clocks, link, camera, stopping)
+    sink = _sink(options, camera)
+    if options.ros2 and sink is not None:
+        source.log_gnss = sink.gnss
     thread = CameraThread(source, stopping)
     stack.callback(thread.stop)
     fly = FlyOptions(
@@ -76,12 +80,12 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         heading_known=heading_known,
         deadline_s=options.deadline_ms / 1e3,
         telemetry_wait_s=options.telemetry_wait_ms / 1e3,
-        recorded=options.telemetry == "recorded",
+        recorded=options.ros2 or options.recorded_telemetry,
         accept=accept if accept.criterion != "confidence" else None,
         min_confidence=least,
         map_path=options.map,
         state_path=options.state,
-        told=_told(options, mount),
+        logged_options=_logged_options(options, mount),
     )
     return Runner(
         thread.newest,
@@ -91,20 +95,42 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         fly,
         clocks,
         link=link,
-        sink=_sink(options, camera),
-        second_look=SecondLook(localizer, least),
+        sink=sink,
+        diagnosis=TelemetryDiagnosis(localizer, least),
         start=_start(options, clocks),
         notifier=Notifier(),
     )
 
 
-def _camera(options: argparse.Namespace) -> Camera:
-    if options.camera_file is not None:
-        return read_camera_file(options.camera_file)
-    beside = Path(options.camera) / "flight.json"
-    if not beside.is_file():
-        raise CameraError(f"give --camera-file FILE: a camera does not tell its lens: {beside}")
-    return read_camera(beside)[0]
+def _inputs(
+    options: argparse.Namespace,
+    clocks: Clocks,
+    link: AutopilotLink | None,
+    camera: Camera | None,
+    stopping: threading.Event,
+    stack: ExitStack,
+    localizer: Localizer,
+    least: float,
+) -> tuple[Any, PositionOutput | None]:
+    """Source of images, and the output that belongs to it, if any."""
+    if camera is not None and not options.ros2:
+        return _source(options, clocks, link, camera, stopping), None
+    ros2 = importlib.import_module("orthonav.cli.flying_ros2")  # only where it is asked for
+    frame = localizer.sheet.frame
+    source, graph = ros2.joined(options, clocks, stopping, stack, frame, least)
+    return source, graph
+
+
+def _camera(options: argparse.Namespace) -> Camera | None:
+    """Camera of a file; None for that of a ROS 2 topic."""
+    if options.camera is not None:
+        return read_camera_file(options.camera)
+    if options.ros2:
+        return None
+    path = Path(options.source) / "flight.json"
+    if not path.is_file():
+        raise CameraError(f"no camera calibration: give --camera FILE, or a flight folder: {path}")
+    return read_camera(path)[0]
 
 
 def _source(
@@ -114,22 +140,22 @@ def _source(
     camera: Camera,
     stopping: threading.Event,
 ) -> Any:
-    if cameras.is_live(options.camera):
+    if cameras.is_live(options.source):
         return cameras.LiveCamera(
-            cameras.live_name(options.camera),
+            cameras.live_name(options.source),
             clocks,
             latency_s=options.camera_latency_ms / 1e3,
             size_px=(camera.width_px, camera.height_px),
         )
-    if not (options.pace > 0 and options.rate_hz_images > 0):
-        raise VariantError("--pace and --rate-hz-images must be above 0")
+    if not (options.pace > 0 and (options.rate_hz is None or options.rate_hz > 0)):
+        raise VariantError("--pace and --rate-hz must be above 0")
     due_ns: Any = cameras.own_pace(clocks, options.pace)
     if options.file_clock == "autopilot":
         if link is None:
             raise VariantError("--file-clock autopilot needs --autopilot")
         due_ns = cameras.autopilot_pace(link.boot_ns, clocks, options.pace)
-    entries = cameras.recorded_entries(Path(options.camera), options.rate_hz_images)
-    return cameras.Recorded(entries, due_ns, clocks, stopping.is_set)
+    images = cameras.recorded_images(Path(options.source), options.rate_hz)
+    return cameras.Playback(images, due_ns, clocks, stopping.is_set)
 
 
 def _link(options: argparse.Namespace, clocks: Clocks) -> AutopilotLink | None:
@@ -155,22 +181,28 @@ def _signing(options: argparse.Namespace, clocks: Clocks) -> Signing | None:
         try:
             key = bytes.fromhex(text.decode("ascii"))
         except ValueError:
-            raise VariantError(f"not hexadecimal: {options.signing_key}") from None
+            raise VariantError(
+                f"signing key: expected 32 bytes or 64 hexadecimal digits: {options.signing_key}"
+            ) from None
     saved = load(options.state) if options.state else None
     stamp = signing_timestamp(clocks.utc_ns())
     return Signing(key, max(stamp, saved.signing_timestamp_10us + 1 if saved else 0))
 
 
 def _publisher(
-    options: argparse.Namespace, clocks: Clocks, link: AutopilotLink | None, least: float
+    options: argparse.Namespace,
+    clocks: Clocks,
+    link: AutopilotLink | None,
+    least: float,
+    graph: PositionOutput | None,
 ) -> Publisher:
     interval = {}
-    if options.rate_hz is not None:
-        if not options.rate_hz > 0:
-            raise VariantError("--rate-hz must be above 0")
-        interval = dict.fromkeys([*KINDS.values(), "NMEA"], 1 / options.rate_hz)
+    if options.send_rate_hz is not None:
+        if not options.send_rate_hz > 0:
+            raise VariantError("--send-rate-hz must be above 0")
+        interval = dict.fromkeys([*KINDS.values(), "NMEA", "ROS2"], 1 / options.send_rate_hz)
     rules = GateRules(least, options.max_std_m, min_interval_s=interval)
-    gate = Gate(rules, clock=Clock.BOOT)  # ours: it judges by the monotonic clock
+    gate = Gate(rules, clock=Clock.BOOT)  # the monotonic clock of this computer
     chosen = MessageOptions(
         kinds=tuple(dict.fromkeys(options.send or ["global-position"])),
         clock=Clock(options.stamp),
@@ -185,9 +217,9 @@ def _publisher(
     quality = Quality.AUTONOMOUS if options.nmea_as_gps else Quality.ESTIMATED
     try:
         nmea = [NmeaOut(open_sink(url), quality=quality) for url in options.nmea]
-        lines = [JsonOut(None if each == "-" else Path(each)) for each in options.json]
+        lines = [JsonOut(None if each == "-" else Path(each)) for each in options.jsonl]
     except OSError as error:
-        raise OutputError(f"cannot be opened for output: {error}") from error
+        raise OutputError(f"output cannot be opened: {error}") from error
     messenger = None if link is None else Messenger(chosen, gate, link.send, clocks)
     return Publisher(
         gate,
@@ -196,23 +228,29 @@ def _publisher(
         link=link,
         nmea=nmea,
         lines=lines,
+        graph=graph,
         min_confidence=least,
     )
 
 
 def _start(options: argparse.Namespace, clocks: Clocks) -> Callable[[], Prior | None]:
-    """Where the flight begins: what was saved if it is fresh, else what was told, else anywhere."""
+    """Function that gives the prior of the first view.
 
-    told = Prior(*options.start) if options.start else None
-    if told and not (abs(told.lat_deg) <= 90 and abs(told.lon_deg) <= 180 and told.std_m > 0):
-        raise VariantError("--start needs a latitude, a longitude and metres above 0")
+    It is the saved position if that is recent, else `--start`, else None.
+    """
+    given = Prior(*options.start) if options.start else None
+    if given and not (abs(given.lat_deg) <= 90 and abs(given.lon_deg) <= 180 and given.std_m > 0):
+        raise VariantError(
+            "--start needs a latitude of -90 to 90, a longitude of -180 to 180 and a deviation "
+            "above 0 m"
+        )
     saved = load(options.state) if options.state else None
 
     def prior() -> Prior | None:
         if saved is None:
-            return told
+            return given
         age_s = saved.age_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
-        return prior_of(saved, age_s, options.state_max_age_s) or told
+        return prior_of(saved, age_s, options.state_max_age_s) or given
 
     return prior
 
@@ -230,10 +268,10 @@ def _sink(options: argparse.Namespace, camera: Camera) -> LogSink | None:
     return made
 
 
-def _told(options: argparse.Namespace, mount: Mount | None) -> dict[str, Any]:
-    """How the flight is flown, as a replay reads it, and the command line beside it.
+def _logged_options(options: argparse.Namespace, mount: Mount | None) -> dict[str, Any]:
+    """Options for a replay of the log, and the whole command line.
 
-    Of files it has the names: what is in a key file is written nowhere.
+    Files are logged by name: the contents of a key file are written nowhere.
     """
     line = {
         name: [str(each) for each in value] if isinstance(value, list | tuple) else str(value)

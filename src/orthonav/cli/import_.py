@@ -1,4 +1,4 @@
-"""`orthonav import`: write what somebody recorded as a flight folder."""
+"""`orthonav import`: write a recording as a flight folder."""
 
 import argparse
 import logging
@@ -10,6 +10,16 @@ from orthonav.cli.source import add_source, open_source
 
 log = logging.getLogger(__name__)
 
+EVERYDAY = (
+    "--kind",
+    "--camera",
+    "--telemetry",
+    "--time-offset-s",
+    "--mount-deg",
+    "--rate-hz",
+    "--json",
+)
+
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
@@ -19,20 +29,22 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="SOURCE",
         help="folder of photographs, video, ROS 1 or 2 bag, MCAP file, or flight folder",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="FLIGHT_DIR")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FLIGHT_DIR", help="folder to write"
+    )
     add_source(parser)
     parser.add_argument(
         "--jpeg-quality",
         type=int,
         choices=range(1, 101),
         metavar="1..100",
-        help="write pictures that were not encoded as JPEG (default: PNG, without loss)",
+        help="write images that are not encoded yet as JPEG (default: PNG, lossless)",
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Import and say what was written."""
+    """Import and print a summary."""
     from orthonav.sources import import_flight
 
     recording = open_source(options.source, options)

@@ -1,4 +1,4 @@
-"""`orthonav info`: print what is in a map."""
+"""`orthonav info`: print the contents of a map."""
 
 import argparse
 from collections.abc import Iterable, Mapping
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("map", type=Path, metavar="MAP.onav")
+    parser.add_argument("map", type=Path, metavar="MAP.onav", help="map to describe")
     parser.add_argument("--json", action="store_true", help="print as JSON")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Open the map, which verifies it, and print."""
+    """Open the map, which checks its contents, and print a summary."""
     from orthonav.mapfile import open_map
 
     opened = open_map(options.map)
@@ -30,7 +30,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]:
-    """What people ask of a map, as plain values."""
+    """Summary of a map as JSON values."""
     area_km2 = sum(sheet.area_km2 for sheet in manifest.sheets)
     size_mb = size_bytes / 1e6
     return {
@@ -65,10 +65,10 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
 
 
 def _registration(manifest: "Manifest") -> dict[str, Any] | None:
-    """The registration layers of all sheets; None where there is none.
+    """Size of the registration layers of all sheets; None without any.
 
-    They are set against the ground that shows imagery, which reaches beyond the tile centres, and
-    against the same pixels as RGB without compression.
+    `ground_km2` is the area with imagery, which extends beyond the tile centres; `raw_bytes` is the
+    size of the same pixels as uncompressed RGB.
     """
     from orthonav.mapfile.layer import part_names
 
@@ -94,7 +94,7 @@ def _registration(manifest: "Manifest") -> dict[str, Any] | None:
 
 
 def _bounds_deg(sheet: Any) -> list[float]:
-    """West, south, east, north of the outer tile centres."""
+    """West, south, east, north of the outer tile centres in degrees."""
     import numpy as np
 
     grid = sheet.grid
@@ -110,7 +110,7 @@ def _part_bytes(part: dict[str, Any]) -> int:
 
 
 def summary_text(plain: dict[str, Any]) -> str:
-    """The same for people."""
+    """The summary as text."""
     lines = [
         f"map        {plain['map']}  ({plain['created_by']})",
         f"area       {plain['area_km2']:.2f} km2 of tile centres, {plain['tiles']} tiles",
@@ -153,7 +153,7 @@ def _registration_text(layer: dict[str, Any] | None) -> str:
 
 
 def recipe_text(recipe: dict[str, Any]) -> str:
-    """Method, variants and their parameters on one line."""
+    """Method, variants and their parameters in one line."""
     parts = [str(recipe.get("method"))]
     for name in ("represent", "embed"):
         found = recipe.get(name)
@@ -168,7 +168,7 @@ def recipe_text(recipe: dict[str, Any]) -> str:
 
 
 def imagery_text(imagery: Iterable[Mapping[str, Any]]) -> str:
-    """Names, dates and attributions of what a map was made of, on one line."""
+    """Names, dates and attributions of the imagery of a map, in one line."""
     parts = []
     for source in imagery:
         dates = [str(source[key]) for key in ("date_from", "date") if source.get(key)]

@@ -1,4 +1,4 @@
-"""`orthonav landscape`: generate an area at several dates."""
+"""`orthonav landscape`: generate orthophotos of one area at three dates."""
 
 import argparse
 from pathlib import Path
@@ -7,18 +7,27 @@ from orthonav.cli.common import print_json, progress
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    """Add the arguments of the command."""
     parser.add_argument(
-        "--size-m", type=float, nargs=2, default=(2000.0, 2000.0), metavar=("EAST", "NORTH")
+        "--out", type=Path, required=True, metavar="DIR", help="folder for the GeoTIFF files"
     )
-    parser.add_argument("--gsd-m", type=float, default=1.0, help="metres per pixel (default 1)")
-    parser.add_argument("--seed", type=int, default=1, help="which landscape (default 1)")
-    parser.add_argument("--json", action="store_true", help="print the files as JSON")
+    parser.add_argument(
+        "--size-m",
+        type=float,
+        nargs=2,
+        default=(2000.0, 2000.0),
+        metavar=("EAST", "NORTH"),
+        help="extent of the area (default 2000 2000)",
+    )
+    parser.add_argument(
+        "--gsd-m", type=float, default=1.0, help="ground resolution, metres per pixel (default 1)"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="seed of the landscape (default 1)")
+    parser.add_argument("--json", action="store_true", help="print the file names as JSON")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Generate and name the files."""
+    """Generate the files and print their names."""
     from orthonav.simulate.landscape import generate_area
 
     with progress(options) as shown:

@@ -1,4 +1,4 @@
-"""`orthonav localize`: find where the views of a flight were taken."""
+"""`orthonav localize`: find the positions of the views of a flight."""
 
 import argparse
 import logging
@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from orthonav.cli.common import print_json, progress
-from orthonav.cli.flown import take_flown, tell_whether_as_flown
+from orthonav.cli.flown import compare_with_flight, take_flown
+from orthonav.cli.needs import require_extras
 from orthonav.cli.source import add_source, open_source
 
 if TYPE_CHECKING:
@@ -36,12 +37,14 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="SOURCE",
         help="flight folder, photographs, video or ROS recording, as for `orthonav import`",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="fixes.jsonl")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="fixes.jsonl", help="file to write"
+    )
     parser.add_argument(
         "--atlas",
         action="store_true",
-        help="the first argument is an atlas (folder or URL), of which nothing is known before: "
-        "no prior is used, and only what several views agree on is a fix",
+        help="the first argument is an atlas (folder or URL); no prior is used, and a fix needs "
+        "the agreement of several views",
     )
     parser.add_argument(
         "--heading",
@@ -53,58 +56,59 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--prior",
         choices=("telemetry", "none"),
         default="telemetry",
-        help="telemetry: search where its prior columns say, if it has them (default)",
+        help="telemetry: search around the prior position in the telemetry, if any (default)",
     )
     parser.add_argument(
         "--registration",
         choices=("on", "off"),
         default="on",
-        help="on: metres, where the map carries a registration layer (default); off: tiles only",
+        help="on: positions within a pixel, where the map has a registration layer (default); off: "
+        "positions at tile level, as in the paper",
     )
     parser.add_argument(
         "--position",
         choices=("peak", "best", "neighbours", "weighted"),
         default="peak",
-        help="with --registration off, from scores to a position: peak between tiles (default), "
-        "best tile (the paper), mean of the best and its neighbours, or of all tiles, weighted",
+        help="with --registration off, how scores become a position: interpolated peak (default), "
+        "best tile (the paper), mean of the best tile and its neighbours, or weighted mean of all",
     )
     parser.add_argument(
         "--accept",
         metavar="NAME:MIN",
-        help="withhold fixes below a threshold: confidence:0.9, peak_ratio:1.3, or the paper's "
-        "lowe_ratio:1.13 (with --registration off); default: all are written",
+        help="write fixes below a threshold as no_fix: confidence:0.9, peak_ratio:1.3, or the "
+        "paper's lowe_ratio:1.13 (with --registration off); default: all fixes are written",
     )
     parser.add_argument(
         "--skip-bad-images",
         action="store_true",
-        help="images that cannot be decoded become no_fix instead of an error",
+        help="write images that cannot be decoded as no_fix instead of stopping",
     )
     parser.add_argument(
         "--track",
         action="store_true",
-        help="follow the aircraft: every position rests on all views before it",
+        help="track the aircraft: every position also uses the views before it",
     )
     parser.add_argument(
         "--smooth",
         action="store_true",
-        help="track, then place every view by all views of the flight, also those after it",
+        help="track, then smooth: every position uses all views of the flight",
     )
     parser.add_argument(
         "--lag",
         type=int,
         metavar="VIEWS",
-        help="with --smooth: only so many views after each one (default: all)",
+        help="with --smooth: number of later views that a position uses (default: all)",
     )
     parser.add_argument(
         "--mount",
         type=Path,
         metavar="mount.json",
-        help="what `orthonav calibrate` found: told heading, height and tilt are corrected by it",
+        help="correct heading, height and tilt with a calibration by `orthonav calibrate`",
     )
     parser.add_argument(
         "--as-flown",
         action="store_true",
-        help="of a flight log: with the options that it was flown with",
+        help="flight log: use the options of the flight",
     )
     parser.add_argument(
         "--require-signed",
@@ -128,17 +132,17 @@ def run(options: argparse.Namespace) -> None:
 def _on_map(options: argparse.Namespace) -> None:
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
+    from orthonav.flight.fixes import write_results
     from orthonav.localizer import Localizer
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
     from orthonav.mapfile.signature import require_signature
-    from orthonav.onboard.calibrate import Mounted, model_of
+    from orthonav.onboard.calibrate import MountCorrected, model_of
     from orthonav.onboard.run import Locator, SingleViews, localize_flight, smoothed_track
-    from orthonav.publish.jsonl import write_results
     from orthonav.search.position import check_rule
 
     if options.lag is not None and not (options.smooth and options.lag >= 0):
-        raise VariantError("--lag is a number of views, for --smooth")
+        raise VariantError("--lag needs --smooth and a number of views, 0 or more")
     if options.require_signed:
         require_signature(options.map, options.require_signed)
     flight = open_source(options.flight, options)
@@ -150,9 +154,9 @@ def _on_map(options: argparse.Namespace) -> None:
         position=check_rule(options.position),
     )
     if localizer.registration is not None and accept and accept.criterion == "lowe_ratio":
-        raise VariantError("lowe_ratio compares tiles: give --registration off with it")
+        raise VariantError("--accept lowe_ratio compares tiles: it needs --registration off")
     if localizer.registration is None and options.registration == "on":
-        log.warning("the map has no registration layer: positions at tile level only")
+        log.warning("the map has no registration layer: positions are at tile level")
     how = {
         "use_prior": options.prior == "telemetry",
         "heading_known": options.heading == "known",
@@ -165,7 +169,7 @@ def _on_map(options: argparse.Namespace) -> None:
             localizer, smooth=options.smooth, lag=options.lag, model=model, **how
         )
     if mount:
-        locator = Mounted(locator, mount)
+        locator = MountCorrected(locator, mount)
     results = []
     with progress(options) as shown:
         for result in localize_flight(
@@ -177,21 +181,22 @@ def _on_map(options: argparse.Namespace) -> None:
     if tracker is not None and options.smooth:
         results = smoothed_track(tracker, results, accept)
     else:
-        tell_whether_as_flown(flight, results)
+        compare_with_flight(flight, results)
     write_results(options.out, results)
-    _tell(options, results)
+    _print_summary(options, results)
 
 
 def _on_atlas(options: argparse.Namespace) -> None:
-    """Without a prior: only what views agree on is a fix."""
+    """Localize on an atlas without a prior; a fix needs the agreement of several views."""
+    require_extras("localize --atlas")
     from orthonav.atlas.catalog import Atlas
-    from orthonav.atlas.ground import Ground
-    from orthonav.atlas.lookup import AtlasLookup
-    from orthonav.atlas.lost import LostLocator
+    from orthonav.atlas.locate import AtlasLocator
+    from orthonav.atlas.sheet_registration import SheetRegistrar
+    from orthonav.atlas.tile_search import TileSearch
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
+    from orthonav.flight.fixes import write_results
     from orthonav.onboard.run import localize_flight
-    from orthonav.publish.jsonl import write_results
 
     asked = [
         name
@@ -201,21 +206,21 @@ def _on_atlas(options: argparse.Namespace) -> None:
     asked += ["position"] if options.position != "peak" else []
     if asked or options.registration == "off":
         named = ", ".join(f"--{name.replace('_', '-')}" for name in asked) or "--registration off"
-        raise VariantError(f"{named} is for a map: cut one out of the atlas (orthonav atlas cut)")
+        raise VariantError(f"{named} needs a map: cut one out of the atlas (orthonav atlas cut)")
     accept = Acceptance.parse(options.accept) if options.accept else None
     if accept and accept.criterion == "lowe_ratio":
-        raise VariantError("lowe_ratio compares tiles: it is for a map, with --registration off")
+        raise VariantError("--accept lowe_ratio needs a map and --registration off")
     flight = open_source(options.flight, options)
     results = []
-    with AtlasLookup(Atlas.open(options.map)) as lookup, progress(options) as shown:
-        if lookup.unknown:
+    with TileSearch(Atlas.open(options.map)) as search, progress(options) as shown:
+        if search.unknown:
             log.warning(
-                "%d sheets are not in the index, so nothing is found there; bring it up to date "
-                "with 'orthonav atlas index'",
-                len(lookup.unknown),
+                "%d sheets are missing from the index and are not searched; update it with "
+                "'orthonav atlas index'",
+                len(search.unknown),
             )
-        locator = LostLocator(
-            Ground(lookup.atlas), lookup, heading_known=options.heading == "known"
+        locator = AtlasLocator(
+            SheetRegistrar(search.atlas), search, heading_known=options.heading == "known"
         )
         for result in localize_flight(
             locator, flight, skip_bad_images=options.skip_bad_images, accept=accept
@@ -224,10 +229,10 @@ def _on_atlas(options: argparse.Namespace) -> None:
             if flight.expected:
                 shown("localize", min(1.0, len(results) / flight.expected))
     write_results(options.out, results)
-    _tell(options, results)
+    _print_summary(options, results)
 
 
-def _tell(options: argparse.Namespace, results: "list[ViewResult]") -> None:
+def _print_summary(options: argparse.Namespace, results: "list[ViewResult]") -> None:
     """Print the summary."""
     import numpy as np
 

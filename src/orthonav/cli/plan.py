@@ -1,10 +1,15 @@
-"""`orthonav plan`: what a route, a camera and a height ask of a map, before anything is built."""
+"""`orthonav plan`: derive map requirements from a route, a camera and a height."""
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import add_area, print_json
+
+EVERYDAY = (
+    *("--route", "--bounds", "--band-m", "--camera", "--agl-m", "--speed-mps", "--dem"),
+    *("--out", "--json"),
+)
 
 if TYPE_CHECKING:
     from orthonav.geo.area import Area
@@ -14,36 +19,40 @@ if TYPE_CHECKING:
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     add_area(parser, parser.add_mutually_exclusive_group(required=True))
     parser.add_argument(
         "--camera",
         type=Path,
         metavar="FILE",
-        help="flight.json, or a camera file of OpenCV, ROS or Kalibr",
+        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",
     )
+    parser.add_argument("--agl-m", type=float, help="height above ground (default: from the route)")
+    parser.add_argument("--speed-mps", type=float, help="ground speed")
     parser.add_argument(
-        "--agl-m", type=float, help="height above ground (default: that of the route)"
+        "--gsd-m", type=float, help="ground resolution, metres per pixel (default: from the view)"
     )
-    parser.add_argument("--speed-mps", type=float, help="speed over ground")
+    parser.add_argument("--tile-px", type=int, help="width of a tile (default: from the view)")
     parser.add_argument(
-        "--gsd-m", type=float, help="ground resolution of the map (default: what suits the view)"
-    )
-    parser.add_argument("--tile-px", type=int, help="width of a tile (default: what suits)")
-    parser.add_argument(
-        "--overlap", type=float, default=0.875, help="share common to neighbours (default 0.875)"
+        "--overlap",
+        type=float,
+        default=0.875,
+        metavar="SHARE",
+        help="overlap of neighbouring tiles, as a share of their width (default 0.875)",
     )
     parser.add_argument(
         "--no-registration",
         dest="registration",
-        action="store_false",
-        help="a map without the grey picture of the area",
+        action="store_const",
+        const=False,
+        default=True,
+        help="plan a map without the registration layer",
     )
     parser.add_argument(
         "--dem",
         type=Path,
         metavar="TIF",
-        help="terrain, metres above sea level: height above ground and relief leg by leg",
+        help="terrain model, metres above sea level: report height above ground and relief by leg",
     )
     parser.add_argument(
         "--out",
@@ -55,7 +64,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print what the plan comes to."""
+    """Compute and print the plan."""
     from orthonav.cli.plan_text import plan_text
     from orthonav.errors import RouteError
     from orthonav.geo.planning import rate_cautions, view_cautions
@@ -66,7 +75,7 @@ def run(options: argparse.Namespace) -> None:
     if route is None and (options.band_m is not None or options.dem or options.out):
         raise RouteError("--band-m, --dem and --out need a route (--route)")
     if options.speed_mps is not None and not 0 < options.speed_mps < 10_000:
-        raise RouteError(f"speed must be above 0 m/s, got {options.speed_mps}")
+        raise RouteError(f"ground speed must be above 0 m/s, got {options.speed_mps}")
     sheets, areas = _sheets(options, route)
     view = _view(options, route)
     gsd_m, tile_px = _map_of(options, view)
@@ -94,7 +103,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _sheets(options: argparse.Namespace, route: "Route | None") -> tuple[list[Any], list["Area"]]:
-    """Sheets as what `build` takes (a route or bounds), and their areas."""
+    """Sheets as arguments of `build` (routes or bounds), and their areas."""
     from orthonav.geo.area import Area
     from orthonav.geo.sheets import sheets_of_bounds, sheets_of_route
 
@@ -106,7 +115,7 @@ def _sheets(options: argparse.Namespace, route: "Route | None") -> tuple[list[An
 
 
 def _view(options: argparse.Namespace, route: "Route | None") -> "ViewPlan | None":
-    """The view from the height told, else from the lowest that the route is flown at."""
+    """The view from `--agl-m`, else from the lowest height of the route."""
     from orthonav.errors import CameraError
     from orthonav.geo.planning import ViewPlan
     from orthonav.sources.cameras import read_camera_file
@@ -118,34 +127,33 @@ def _view(options: argparse.Namespace, route: "Route | None") -> "ViewPlan | Non
         agl_m = _lowest_agl_m(options, route)
     if agl_m is None:
         raise CameraError(
-            "a camera needs the height above ground it is flown at: --agl-m, or a route that says "
-            "it (above ground, or above the sea or home with --dem)"
+            "--camera needs a height above ground: give --agl-m, or a route with heights (above "
+            "ground; with --dem also above the sea or above home)"
         )
     return ViewPlan.of(read_camera_file(options.camera), agl_m)
 
 
 def _lowest_agl_m(options: argparse.Namespace, route: "Route") -> float | None:
-    """Lowest height above ground along the route, take-off and landing left out; None: unknown."""
+    """Lowest height above ground along the route, without take-off and landing; None: unknown."""
     from orthonav.geo.terrain import LANDING_M
 
     if options.dem is not None and route.heights:
-        told = [height for leg in _profile(options, route, None) for height in leg.agl_m]
+        heights_m = [height for leg in _profile(options, route, None) for height in leg.agl_m]
     else:
         found = [height for height in route.heights if height is not None]
-        told = [height.height_m for height in found if height.frame == "agl"]
-    return min((height for height in told if height >= LANDING_M), default=None)
+        heights_m = [height.height_m for height in found if height.frame == "agl"]
+    return min((height for height in heights_m if height >= LANDING_M), default=None)
 
 
 def _map_of(options: argparse.Namespace, view: "ViewPlan | None") -> tuple[float, int]:
-    """Ground resolution and tile width: as told, else as suits the view."""
+    """Ground resolution and tile width: from the options, else chosen for the view."""
     from orthonav.errors import AreaError
     from orthonav.geo.planning import suited_map, suited_tile_px
 
     if view is None:
         if options.gsd_m is None:
             raise AreaError(
-                "say at which ground resolution the map is built (--gsd-m), or with what it is "
-                "seen (--camera and --agl-m)"
+                "the ground resolution of the map is unknown; give --gsd-m, or --camera and --agl-m"
             )
         return options.gsd_m, 256 if options.tile_px is None else options.tile_px
     gsd_m, tile_px = suited_map(view)

@@ -1,4 +1,4 @@
-"""The plan as people read it."""
+"""The plan as text."""
 
 from typing import Any
 
@@ -35,18 +35,18 @@ def _route(route: dict[str, Any]) -> str:
     if route["heights_above"]:
         text += f", heights above {' and '.join(route['heights_above'])}"
     if route["legs_with_own_band"]:
-        text += f", {_count(route['legs_with_own_band'], 'leg')} with a band of their own"
+        text += f", {_count(route['legs_with_own_band'], 'leg')} with a band of its own"
     return text
 
 
 def _view(view: dict[str, Any]) -> list[str]:
     first = (
         f"{view['width_m']:.0f} x {view['height_m']:.0f} m from {view['agl_m']:.0f} m, "
-        f"{view['gsd_m']:.3g} m a pixel, {view['across_px']:.0f} px of the map across"
+        f"{view['gsd_m']:.3g} m per pixel, {view['across_px']:.0f} map pixels across"
     )
-    second = f"every {view['spacing_m']:.0f} m or nearer, so that views overlap"
+    second = f"overlapping views at most {view['spacing_m']:.0f} m apart"
     if view["rate_hz"] is not None:
-        second += f": {view['rate_hz']:.2g} a second"
+        second += f": {view['rate_hz']:.2g} views per second"
     return [_row("view", first), _row("", second)]
 
 
@@ -63,24 +63,24 @@ def _map(made: dict[str, Any], route: str | None) -> list[str]:
         _row(
             "map",
             f"{made['area_km2']:,.2f} km2, {made['tiles']:,} tiles, {size}, "
-            f"about {made['build_minutes']:,.0f} min to build on one core; "
+            f"built in about {made['build_minutes']:,.0f} min on one core; "
             f"imagery needed: {made['imagery_km2']:,.1f} km2",
         ),
     ]
     sheets = made["sheets"]
     if len(sheets) > 1:
         lines.append(
-            _row("sheets", f"{len(sheets)}: a map holds one sheet, so build one map for each")
+            _row("sheets", f"{len(sheets)}: a map holds one sheet; build one map per sheet")
         )
         if route == "FILE":
-            lines.append(_row("", "--out FILE writes them"))
+            lines.append(_row("", "write the sheets with --out FILE"))
         for sheet in sheets[:MAX_SHOWN]:
             where = f"--route {route}#{sheet['name']}"
             if route is None:
                 where = f"--bounds={','.join(map(_degrees, sheet['bounds_deg']))}"
             lines.append(_row("", f"{where}  {sheet['area_km2']:,.0f} km2"))
         if len(sheets) > MAX_SHOWN:
-            lines.append(_row("", f".. and {len(sheets) - MAX_SHOWN} more (--json)"))
+            lines.append(_row("", f"and {len(sheets) - MAX_SHOWN} more (--json)"))
     return lines
 
 
@@ -92,7 +92,7 @@ def _terrain(legs: list[dict[str, Any]]) -> list[str]:
         text = f"{leg['leg']:>3}  {leg['length_m']:>8.0f}   {ground:<12}  {over:<14}"
         lines.append(_row("", f"{text}  {leg['relief']:.1%}"))
     if len(legs) > MAX_SHOWN:
-        lines.append(_row("", f".. and {len(legs) - MAX_SHOWN} more (--json)"))
+        lines.append(_row("", f"and {len(legs) - MAX_SHOWN} more (--json)"))
     return lines
 
 

@@ -1,4 +1,4 @@
-"""`orthonav sign`: sign a map, or make a key for it."""
+"""`orthonav sign`: sign a map, or create a signing key."""
 
 import argparse
 from pathlib import Path
@@ -6,14 +6,14 @@ from pathlib import Path
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("map", type=Path, metavar="MAP.onav", nargs="?")
+    parser.add_argument("map", type=Path, metavar="MAP.onav", nargs="?", help="map to sign")
     how = parser.add_mutually_exclusive_group(required=True)
     how.add_argument("--key", type=Path, metavar="private.pem", help="Ed25519 private key (PEM)")
     how.add_argument(
         "--new-key",
         type=Path,
         metavar="DIR",
-        help="write a new private.pem and public.pem there (and sign the map with it, if given)",
+        help="create private.pem and public.pem in this folder, and sign the map if one is given",
     )
 
 
@@ -33,4 +33,4 @@ def run(options: argparse.Namespace) -> None:
     if options.map is not None:
         print(f"written to {sign_map(options.map, key)}")
     elif options.key is not None:
-        raise MapFileError("name the map that is to be signed")
+        raise MapFileError("--key needs a map to sign: orthonav sign MAP.onav --key private.pem")

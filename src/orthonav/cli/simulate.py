@@ -1,87 +1,143 @@
-"""`orthonav simulate`: fly over an orthophoto of another year."""
+"""`orthonav simulate`: simulate a flight over an orthophoto of another year."""
 
 import argparse
 from pathlib import Path
 
 from orthonav.cli.common import ROUTE_HELP, add_orthos, print_json, progress
 
+EVERYDAY = (
+    *("--route", "--random", "--agl-m", "--spacing-m", "--airspeed-mps", "--camera"),
+    *("--yaw-std-deg", "--agl-std", "--prior-std-m", "--seed", "--json"),
+)
+
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
-    add_orthos(parser, "orthophoto to fly over, of another year than the map's")
+    """Add the arguments of the command."""
+    add_orthos(parser, "orthophoto to fly over, of another year than the map")
     where = parser.add_mutually_exclusive_group(required=True)
-    where.add_argument("--route", type=Path, help=ROUTE_HELP)
-    where.add_argument("--random", type=int, metavar="N", help="N random places and headings")
+    where.add_argument("--route", type=Path, metavar="FILE", help=ROUTE_HELP)
+    where.add_argument(
+        "--random", type=int, metavar="N", help="fly N views at random positions and headings"
+    )
     parser.add_argument(
         "--agl-m",
         type=float,
-        help="height above ground (default: the image's shorter side covers 256 px of the imagery)",
+        help="height above ground (default: the shorter image side covers 256 px of imagery)",
     )
     parser.add_argument(
-        "--spacing-m", type=float, help="distance of views on a route (default: 1 s)"
+        "--spacing-m",
+        type=float,
+        help="distance between views on a route (default: flown in one second)",
     )
-    parser.add_argument("--speed-mps", type=float, default=25.0, help="airspeed (default 25)")
+    parser.add_argument("--airspeed-mps", type=float, default=25.0, help="airspeed (default 25)")
     parser.add_argument(
-        "--turn-radius-m", type=float, default=0.0, help="fly corners of the route as arcs"
-    )
-    parser.add_argument(
-        "--wind-mps", type=float, help="wind and gusts: heading crabs, ground speed varies"
-    )
-    parser.add_argument(
-        "--wind-from-deg", type=float, help="where it comes from (default 270, the west)"
+        "--turn-radius-m", type=float, default=0.0, help="fly the corners of the route as arcs"
     )
     parser.add_argument(
-        "--beyond", action="store_true", help="the route may leave the imagery: it is mirrored"
+        "--wind-mps", type=float, help="mean wind, with gusts; the aircraft crabs along its route"
     )
     parser.add_argument(
-        "--camera", type=Path, metavar="flight.json", help="camera (default 1280 x 960, 65 deg)"
+        "--wind-from-deg", type=float, help="direction the wind comes from (default 270, west)"
     )
-    errors = parser.add_argument_group("errors of the telemetry (standard deviations)")
-    errors.add_argument("--yaw-std-deg", type=float, default=0.0, help="heading")
-    errors.add_argument("--agl-std", type=float, default=0.0, help="height, as a share: 0.05")
-    errors.add_argument("--tilt-std-deg", type=float, default=0.0, help="told pitch and roll")
+    parser.add_argument(
+        "--beyond",
+        action="store_true",
+        help="let the route leave the imagery, which is mirrored at its border",
+    )
+    parser.add_argument(
+        "--camera",
+        type=Path,
+        metavar="FILE",
+        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (default 1280 x 960, 65 deg)",
+    )
+    errors = parser.add_argument_group("telemetry noise (standard deviations)")
+    errors.add_argument("--yaw-std-deg", type=float, default=0.0, help="reported heading")
+    errors.add_argument(
+        "--agl-std",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="reported height, as a share of it: 0.05 is 5 %%",
+    )
+    errors.add_argument("--tilt-std-deg", type=float, default=0.0, help="reported pitch and roll")
     errors.add_argument("--attitude-std-deg", type=float, default=0.0, help="true pitch and roll")
-    errors.add_argument("--prior-std-m", type=float, help="tell a position with this error")
+    errors.add_argument(
+        "--prior-std-m", type=float, help="report a prior position with this standard deviation"
+    )
     errors.add_argument(
         "--velocity-drift",
         type=float,
-        help="tell a velocity with this error of scale (a share) and direction (rad)",
+        metavar="SHARE",
+        help="report a velocity whose scale (a share) and direction (rad) drift this much",
     )
-    biases = parser.add_argument_group("errors that stay the same all along")
-    biases.add_argument("--yaw-bias-deg", type=float, default=0.0, help="heading told too large")
+    biases = parser.add_argument_group("constant telemetry biases")
     biases.add_argument(
-        "--agl-bias", type=float, default=0.0, help="height told too large, as a share: 0.05"
-    )
-    biases.add_argument(
-        "--pitch-bias-deg", type=float, default=0.0, help="the camera tilts more than told"
+        "--yaw-bias-deg", type=float, default=0.0, help="reported heading minus true heading"
     )
     biases.add_argument(
-        "--roll-bias-deg", type=float, default=0.0, help="the camera tilts more than told"
+        "--agl-bias",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="reported height minus true height, as a share of it: 0.05 is 5 %%",
     )
-    effects = parser.add_argument_group("faults of the picture")
+    biases.add_argument(
+        "--pitch-bias-deg", type=float, default=0.0, help="unreported pitch of the camera mount"
+    )
+    biases.add_argument(
+        "--roll-bias-deg", type=float, default=0.0, help="unreported roll of the camera mount"
+    )
+    effects = parser.add_argument_group("image degradation")
     effects.add_argument(
-        "--cloud-share", type=float, default=0.0, help="share of the views with clouds: 0.2"
+        "--cloud-share",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="share of the views with clouds: 0.2",
     )
-    effects.add_argument("--exposure-std", type=float, default=0.15, help="relative exposure")
-    effects.add_argument("--blur-px", type=float, default=0.6, help="blur in pixels")
-    effects.add_argument("--noise-std", type=float, default=2.0, help="noise in grey levels")
-    effects.add_argument("--jpeg-quality", type=int, default=90)
-    parser.add_argument("--seed", type=int, default=0, help="seed of all that is drawn (default 0)")
-    parser.add_argument("--out", type=Path, required=True, metavar="FLIGHT_DIR")
+    effects.add_argument(
+        "--exposure-std",
+        type=float,
+        default=0.15,
+        metavar="SHARE",
+        help="standard deviation of the relative exposure (default 0.15)",
+    )
+    effects.add_argument(
+        "--blur-px", type=float, default=0.6, help="standard deviation of the blur (default 0.6)"
+    )
+    effects.add_argument(
+        "--noise-std",
+        type=float,
+        default=2.0,
+        metavar="LEVELS",
+        help="standard deviation of the sensor noise in grey levels (default 2)",
+    )
+    effects.add_argument(
+        "--jpeg-quality",
+        type=int,
+        default=90,
+        choices=range(1, 101),
+        metavar="1..100",
+        help="JPEG quality of the images (default 90)",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of all random draws (default 0)")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FLIGHT_DIR", help="flight folder to write"
+    )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Simulate and say what was written."""
+    """Simulate a flight and report the number of views."""
     from orthonav.errors import FlightError
-    from orthonav.flight.folder import read_camera
     from orthonav.geo.route import read_route
     from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
     from orthonav.simulate.motion import Wind
     from orthonav.simulate.render import ViewEffects
+    from orthonav.sources.cameras import read_camera_file
 
     if options.wind_from_deg is not None and options.wind_mps is None:
-        raise FlightError("--wind-from-deg needs a speed: --wind-mps")
+        raise FlightError("--wind-from-deg needs the speed of the wind (--wind-mps)")
     from_deg = 270.0 if options.wind_from_deg is None else options.wind_from_deg
     request = SimulateRequest(
         orthos=options.ortho,
@@ -90,8 +146,8 @@ def run(options: argparse.Namespace) -> None:
         random=options.random,
         agl_m=options.agl_m,
         spacing_m=options.spacing_m,
-        speed_mps=options.speed_mps,
-        camera=read_camera(options.camera)[0] if options.camera else DEFAULT_CAMERA,
+        airspeed_mps=options.airspeed_mps,
+        camera=read_camera_file(options.camera) if options.camera else DEFAULT_CAMERA,
         errors=Errors(
             yaw_std_deg=options.yaw_std_deg,
             agl_std=options.agl_std,

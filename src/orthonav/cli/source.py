@@ -1,4 +1,4 @@
-"""The arguments of a source, which `import` and `localize` share."""
+"""Options for reading a recording, shared by `import` and `localize`."""
 
 import argparse
 import logging
@@ -20,18 +20,18 @@ def topic(text: str) -> tuple[str, str]:
 
 
 def add_source(parser: argparse.ArgumentParser) -> None:
-    """The arguments; see docs/flights.md."""
-    group = parser.add_argument_group("how the source is read")
+    """Add the options; see docs/flights.md."""
+    group = parser.add_argument_group("reading the recording")
     group.add_argument(
         "--kind",
         choices=("flight", "photos", "video", "ros"),
-        help="what the source is (default: found by content)",
+        help="kind of the recording (default: detected by content)",
     )
     group.add_argument(
         "--camera",
         type=Path,
         metavar="FILE",
-        help="camera of flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",
+        help="camera file: flight.json, or of OpenCV, ROS or Kalibr (YAML, JSON)",
     )
     group.add_argument(
         "--telemetry",
@@ -44,7 +44,7 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.0,
         metavar="S",
-        help="added to the times of the pictures to get those of the log",
+        help="added to the times of images to get times of the log",
     )
     group.add_argument(
         "--mount-deg",
@@ -52,7 +52,7 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         nargs=3,
         default=(0.0, 0.0, 0.0),
         metavar=("YAW", "PITCH", "ROLL"),
-        help="camera in the aircraft: 0 0 0 (default) looks straight down, top forward",
+        help="mounting of the camera: 0 0 0 (default) looks straight down, top forward",
     )
     group.add_argument(
         "--topic",
@@ -66,29 +66,35 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         "--rate-hz", type=float, default=1.0, metavar="HZ", help="views per second of a video"
     )
     group.add_argument(
-        "--sensor-width-mm", type=float, metavar="MM", help="of photographs, for the focal length"
+        "--sensor-width-mm",
+        type=float,
+        metavar="MM",
+        help="sensor width of photographs, for the focal length",
     )
     group.add_argument(
         "--ground-alt-m",
         type=float,
         metavar="M",
-        help="altitude of the ground, where only altitudes were recorded",
+        help="altitude of the ground, where altitudes but no heights were recorded",
     )
     group.add_argument(
         "--looks-down",
         action="store_true",
-        help="take pitch and roll as 0 where they were not recorded",
+        help="assume pitch and roll 0 where they were not recorded",
     )
     group.add_argument(
-        "--prior-std-m", type=float, metavar="M", help="tell the recorded position as a prior"
+        "--prior-std-m",
+        type=float,
+        metavar="M",
+        help="use the recorded position as the prior, with this standard deviation",
     )
 
 
 def open_source(path: Path, options: argparse.Namespace) -> "Recording":
-    """The source of the command line, opened; its warnings are logged."""
+    """The open recording of the command line; its warnings are logged."""
     from orthonav.sources import SourceOptions, open_source
 
-    told = SourceOptions(
+    source_options = SourceOptions(
         kind=options.kind,
         camera=options.camera,
         rate_hz=options.rate_hz,
@@ -101,7 +107,7 @@ def open_source(path: Path, options: argparse.Namespace) -> "Recording":
         ground_alt_m=options.ground_alt_m,
         looks_down=options.looks_down,
     )
-    recording = open_source(path, told)
+    recording = open_source(path, source_options)
     for warning in recording.warnings:
         log.warning("%s", warning)
     return recording

@@ -1,4 +1,4 @@
-"""`orthonav verify`: check a map and its signature."""
+"""`orthonav verify`: check the signature and the contents of a map."""
 
 import argparse
 from pathlib import Path
@@ -6,21 +6,21 @@ from pathlib import Path
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("map", type=Path, metavar="MAP.onav")
+    parser.add_argument("map", type=Path, metavar="MAP.onav", help="map to check")
     parser.add_argument(
         "--public-key",
         type=Path,
         required=True,
         metavar="public.pem",
-        help="Ed25519 public key (PEM) of whoever must have signed it",
+        help="Ed25519 public key (PEM) of the expected signer",
     )
 
 
 def run(options: argparse.Namespace) -> None:
-    """Check the signature, then every part; an error where either does not hold."""
+    """Check the signature, then every part; an error where one of them is wrong."""
     from orthonav.mapfile import open_map
     from orthonav.mapfile.signature import require_signature
 
     digest = require_signature(options.map, options.public_key)
     open_map(options.map)
-    print(f"signed and whole: {options.map}\nmanifest  {digest}")
+    print(f"signature and contents are valid: {options.map}\nmanifest  {digest}")

@@ -11,52 +11,57 @@ if TYPE_CHECKING:
     from orthonav.web.server import Server
 
 log = logging.getLogger(__name__)
+EVERYDAY = ("--flight", "--truth", "--live")
 LOOPBACK = "127.0.0.1"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument(
         "run",
         type=Path,
         metavar="RUN",
-        help="fixes.jsonl, what `orthonav fly --json` writes, or a flight log (a file, its folder, "
-        "or the name given to --log)",
+        help="fixes.jsonl, the output of `orthonav fly --jsonl`, or a flight log (file, folder, or "
+        "the name given to --log)",
     )
-    parser.add_argument("--map", type=Path, required=True, metavar="MAP.onav")
+    parser.add_argument(
+        "--map", type=Path, required=True, metavar="MAP.onav", help="map of the flight"
+    )
     parser.add_argument(
         "--flight",
         type=Path,
         metavar="FLIGHT_DIR",
-        help="pictures of the views: a flight folder or a flight log (a log as RUN brings its own)",
+        help="images of the views: a flight folder or a flight log (not needed if RUN is a log)",
     )
     parser.add_argument(
         "--truth",
         type=Path,
         metavar="truth.csv",
-        help="true positions (default: those of the flight folder, where it has any)",
+        help="true positions (default: those of the flight folder, if any)",
     )
     parser.add_argument(
-        "--radius-m", type=float, default=15.0, help="an error below it is right (default 15)"
+        "--radius-m", type=float, default=15.0, help="largest error of a correct fix (default 15)"
     )
     parser.add_argument(
         "--live",
         action="store_true",
-        help="the run is being flown: show what comes as it comes; its file may still be to come",
+        help="the run is in progress: show new views as they arrive; the file need not exist yet",
     )
-    parser.add_argument("--port", type=_port, default=0, help="default: any that is free")
+    parser.add_argument(
+        "--port", type=_port, default=0, help="port of the server (default: any free port)"
+    )
     parser.add_argument(
         "--host",
         default=LOOPBACK,
-        help=f"address to listen at (default {LOOPBACK}: nobody else can reach it)",
+        help=f"address to listen at (default {LOOPBACK}: this computer only)",
     )
     parser.add_argument(
-        "--no-browser", action="store_true", help="only print the address, open no browser"
+        "--no-browser", action="store_true", help="print the address without opening a browser"
     )
 
 
 def run(options: argparse.Namespace) -> None:
-    """Read the run, serve it until interrupted."""
+    """Read the run and serve it until interrupted."""
     from orthonav.web.assets import load_assets
     from orthonav.web.opening import ViewRequest, open_run
     from orthonav.web.server import Pages, Server
@@ -72,18 +77,18 @@ def run(options: argparse.Namespace) -> None:
     assets = load_assets()
     server = Server(Pages(open_run(request), assets), options.host, options.port)
     with server:
-        _tell(server, options)
+        _announce(server, options)
         try:
             server.serve_forever(poll_interval=0.2)
         except KeyboardInterrupt:
             print("ended", flush=True)
 
 
-def _tell(server: "Server", options: argparse.Namespace) -> None:
-    """Print the address, and open it where somebody sits at this computer."""
+def _announce(server: "Server", options: argparse.Namespace) -> None:
+    """Print the address, and open it if this terminal has a screen."""
     if not server.only_loopback:
         log.warning(
-            "listening at %s: whoever reaches this computer over the network can look at this run",
+            "listening at %s: anyone who can reach this computer over the network can see this run",
             options.host,
         )
     address = server.url()
@@ -92,12 +97,12 @@ def _tell(server: "Server", options: argparse.Namespace) -> None:
         import threading
         import webbrowser
 
-        # Some browsers return only when they are closed.
+        # Some browsers return only when closed.
         threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
 
 
 def _has_screen() -> bool:
-    """Whether a window can be opened; in a terminal a browser would cover what is printed."""
+    """Whether a window can be opened; a text browser would cover the output."""
     if not sys.platform.startswith("linux"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -106,5 +111,5 @@ def _has_screen() -> bool:
 def _port(text: str) -> int:
     port = int(text)
     if not 0 <= port <= 65535:
-        raise argparse.ArgumentTypeError(f"a port is 0 to 65535, got {text}")
+        raise argparse.ArgumentTypeError(f"a port must be 0 to 65535, got {text}")
     return port

@@ -1,1 +1,1 @@
-"""Confidence: numbers that separate right from wrong, and the probability made of them."""
+"""Confidence: numbers that separate right from wrong fixes, and a probability from them."""

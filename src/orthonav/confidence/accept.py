@@ -1,4 +1,4 @@
-"""What a fix must bring to be given out: a threshold on one number of its evidence."""
+"""Acceptance of fixes: a threshold on one number of their evidence."""
 
 import math
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ CRITERIA = ("confidence", "peak_ratio", "lowe_ratio")
 class Acceptance:
     """Fixes whose `criterion` is below `threshold` are withheld.
 
-    `confidence`: the calibrated probability; `peak_ratio`: best over best elsewhere; `lowe_ratio`:
-    best over second best tile, the criterion of Di Piazza et al. 2024 (threshold 1.13), which only
-    tile search knows.
+    `confidence`: the calibrated probability; `peak_ratio`: best over its strongest rival;
+    `lowe_ratio`: best over second best tile, the criterion of Di Piazza et al. 2024 (threshold
+    1.13), which only tile search has.
     """
 
     criterion: str
@@ -37,7 +37,7 @@ class Acceptance:
         return cls(name, threshold)
 
     def __call__(self, outcome: Fix | NoFix) -> Fix | NoFix:
-        """The outcome, or `NoFix` where it is not sure enough or the number is not known."""
+        """The outcome, or `NoFix` where the number is below the threshold or unknown."""
         if isinstance(outcome, NoFix):
             return outcome
         value = outcome.confidence
@@ -45,6 +45,6 @@ class Acceptance:
             value = outcome.evidence.get(self.criterion, math.nan)
         if value >= self.threshold:
             return outcome
-        known = "not known" if math.isnan(value) else f"{value:.3g}"
-        detail = f"{self.criterion} is {known}, {self.threshold:g} is asked for"
-        return NoFix("not_sure", detail, outcome.evidence)
+        value_text = "unknown" if math.isnan(value) else f"{value:.3g}"
+        detail = f"{self.criterion} is {value_text}, at least {self.threshold:g} is required"
+        return NoFix("low_confidence", detail, outcome.evidence)

@@ -12,7 +12,9 @@ from orthonav.errors import VariantError
 
 FEATURES = ("score", "margin")
 RIDGE = 1e-3
+"""Weight of the ridge: only against weights without bound where right and wrong separate fully."""
 LIMIT = 60.0
+"""Largest logit: beyond, the probability is 0 or 1 to all digits of a float."""
 
 
 @dataclass(frozen=True)

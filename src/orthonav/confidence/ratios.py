@@ -32,7 +32,7 @@ def rival_score(
     """Best score among tiles farther than `exclusion_m` from the best tile.
 
     The best score itself where there is no such tile: without a rival nothing is known of how
-    much the best stands out, and that must not look like certainty.
+    much the best stands out, and that must not appear as certainty.
     """
     offset = centres_en_m - centres_en_m[best]
     elsewhere = np.einsum("ij,ij->i", offset, offset) > exclusion_m**2

@@ -1,4 +1,4 @@
-"""Confidence of a registered view: a probability from how well it fits, here and elsewhere."""
+"""Confidence of a registered view: a probability from its score and its rivals."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,13 +17,14 @@ USUAL_BIAS, USUAL_WEIGHTS = -4.2, (3.0, 9.0, 1.5)
 """What separates right from wrong on generated landscapes, cautious enough to refuse views of other
 places; a map's own are drawn towards them."""
 RIDGE = 3e-2
+"""Weight of the usual values, see docs/decisions/confidence.md."""
 STAND_IN = 0.7
 """Share of the chance value that stands in for a rival where a narrow search found none."""
 
 
 @dataclass(frozen=True)
 class Chances:
-    """What the best place of a view that is not on the map scores, on all of the map.
+    """Scores of the best place of a view that is not on the map, over the whole map.
 
     `total`: the levels it is judged and finished at; `look`: the first of them; `fine`: with one
     more.
@@ -38,15 +39,19 @@ class Chances:
             raise VariantError(f"chance values must be above 0 and finite: {self}")
 
 
+USUAL_CHANCES = Chances(32.0, 15.0, 48.0)
+"""Chance values for a map on which none were measured: those of generated landscapes."""
+
+
 @dataclass(frozen=True)
 class RegisteredConfidence:
     """P(right) = 1 / (1 + exp(-(bias + weights . features))).
 
     Features are logarithms: of the strength over that of chance, of the strength over the best
     elsewhere, and of the same comparison among all candidates at a coarser level. Where the view
-    was doubtful enough to be looked at one level finer too, the second is the mean with and without
-    it: on blurred views the finer level alone says too much. A share of chance stands in for a
-    rival where none was found, so that a narrow search does not look like certainty. Weights are
+    was doubtful enough to be judged one level finer too, the second is the mean with and without
+    it: on blurred views the finer level alone is overconfident. A share of chance stands in for a
+    rival where none was found, so that a narrow search does not appear as certainty. Weights are
     never negative: more evidence never means less confidence.
     """
 

@@ -1,4 +1,4 @@
-"""Embeddings: a picture as a short vector whose scalar product says how alike two places look."""
+"""Embeddings: pictures as short vectors whose scalar product is the similarity of two places."""
 
 from orthonav.variants import Variant
 

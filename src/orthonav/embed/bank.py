@@ -3,7 +3,7 @@
 The view is represented once and averaged down to micro-cells. Each pose then samples `MICRO` x
 `MICRO` of their values where its own micro-cells lie, adds them up to cells and turns the phases
 of the harmonics: some 50 us a pose instead of the 1.5 ms of turning, representing and embedding
-the picture anew. What is approximate: gradients are taken at the ground resolution as told, and
+the picture again. Two things are approximate: gradients are taken at the reported resolution, and
 micro-cells are not turned. But the bank sees beyond the tile, where the turned picture has a
 border, and its embeddings find their tile no less often. Canny's edges, which depend on direction
 and ground resolution, come out less alike than gradients or grey levels do.
@@ -57,11 +57,11 @@ def embed_poses(
     """Unit embeddings (Q, D) of a view under `poses`; zero where a pose sees nothing.
 
     `grey` (H, W) and `valid` (H, W) are the view rectified with its own top at the top, at the
-    ground resolution of the map as told; H and W are free. A pose is the true heading of that top
-    (rad, clockwise from north) and the natural logarithm of true over told ground resolution.
-    Each embedding is close to that of the tile-sized square, north up, about the view's middle.
-    Scales farther than a third from the told one come out less alike. Raises `ValueError` if
-    `tile_px` is not a multiple of `MICRO` or the representation is of no known kind.
+    ground resolution of the map as reported; H and W are free. A pose is the true heading of that
+    top (rad, clockwise from north) and the natural logarithm of true over reported ground
+    resolution. Each embedding is close to that of the tile-sized square, north up, about the view's
+    middle. Scales farther than a third from the reported one are less similar. Raises `ValueError`
+    if `tile_px` is not a multiple of `MICRO` or the representation is of no known kind.
     """
     channels = representation.channels
     if tile_px % MICRO or (channels > 1 and channels % 2 == 0):
@@ -170,7 +170,7 @@ def _turned(cells: Array, poses: Poses) -> Array:
     """Cells (Q, cells, cells, C) as they would be on the map: turned, in grey levels per its pixel.
 
     A direction grows by the turn, so harmonic k of the doubled direction by 2 k turns; a step of
-    grey levels spreads over more pixels of the map where the view is coarser than told.
+    grey levels spreads over more pixels of the map where the view is coarser than reported.
     """
     channels = cells.shape[-1]
     if channels == 1:

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MapFileError, MissingExtraError, VariantError
+from orthonav.errors import MapFileError, VariantError
+from orthonav.extras import needed
 
 SIMILARITIES = ("product", "cosine")
 PRECISIONS = ("float32", "float16", "int8")
@@ -73,7 +74,7 @@ class TripletRecipe:
     `margin`: alpha of the loss, in squared distances of embeddings as they are compared. `mining`:
     "hardest" or "semihard" negatives. `apart`: how far, in tile widths, another tile of the batch
     must lie along rows or columns to count as another place: neighbours that overlap nearly wholly
-    cannot be told apart by a loss. The others are as in `AutoEncoderRecipe`, for Adam.
+    cannot be separated by a loss. The others are as in `AutoEncoderRecipe`, for Adam.
     """
 
     width: int = 64
@@ -190,7 +191,7 @@ class NetworkEmbedder:
         options.inter_op_num_threads = 1
         options.log_severity_level = 3
         options.add_session_config_entry("session.load_model_format", "ONNX")
-        # Threads that wait must not burn what the aircraft needs elsewhere.
+        # Threads that wait must not use time that the aircraft needs.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
             session = runtime.InferenceSession(
@@ -220,19 +221,13 @@ class NetworkEmbedder:
 
 
 def _onnxruntime() -> Any:
-    try:
-        import onnxruntime  # type: ignore[import-untyped, import-not-found, unused-ignore]
-    except ImportError as error:
-        raise MissingExtraError(
-            "neural encoders need onnxruntime, which is not installed: pip install orthonav[neural]"
-        ) from error
-    return onnxruntime
+    return needed("onnxruntime", "neural", "running a neural encoder")
 
 
 def check_graph(data: NDArray[np.uint8]) -> None:
     """Raise `MapFileError` unless bytes (n,) are one plain ONNX graph that holds all its weights.
 
-    Only the layout is read (onnx.proto, IR version 8), so that nothing of a file from elsewhere is
+    Only the layout is read (onnx.proto, IR version 8), so that nothing of an untrusted file is
     run or opened before it is known to be harmless: operators of `OPERATORS` in the standard
     domain, no functions, no graphs inside the graph, no weights in other files.
     """

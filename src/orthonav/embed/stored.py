@@ -47,15 +47,17 @@ def _network(
     recipe: AutoEncoderRecipe | TripletRecipe, part: Part, channels: int
 ) -> NetworkEmbedder:
     made = NetworkEmbedder(recipe, part("onnx", np.uint8, 1))
-    # Also says at once where onnxruntime is absent: not at the first view.
+    # Fails here, not at the first view, where onnxruntime is absent.
     if made.shape[0] != channels:
-        raise MapFileError(f"map's encoder looks at {made.shape[0]} channels, not {channels}")
+        raise MapFileError(
+            f"map's encoder takes {made.shape[0]} channels, its representation has {channels}"
+        )
     return made
 
 
 def _words(recipe: WordsRecipe, part: Part) -> WordsEmbedder:
     if recipe.features != "sift":
-        # Its recipe names a file of weights: not a map's to say where this machine should read.
+        # Its recipe names a file of weights; a map must not choose which files are read.
         raise MapFileError(f"words of {recipe.features} do not fly")
     try:
         return WordsEmbedder(recipe, part("vocabulary", np.uint8, 2), part("idf", np.float32, 1))

@@ -4,7 +4,7 @@ Cells of a tile overlap (each pixel belongs to up to four, with triangular weigh
 shift or turn of the view moves energy gradually from one cell to the next. Each cell is divided
 by its own norm: contrast differs between years, directions do not. Principal components of the
 reference tiles, each divided by its standard deviation (whitening, Jegou and Chum, ECCV 2012),
-give every way in which places differ an equal say. Similarity is the scalar product of unit
+give all directions of variation the same weight. Similarity is the scalar product of unit
 vectors.
 """
 
@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -25,13 +25,23 @@ from orthonav.embed.cells import MICRO, CellLayout, cell_means
 from orthonav.errors import VariantError
 
 CHUNK_TILES = 512
+"""Tiles worked on at once: 0.9 MB of features, which stays in the cache."""
 MAX_LEARNT_TILES = 20_000
+"""Tiles from which a whitening is learnt, at most: 44 for each of 448 features."""
 PART_NOISE = 2.0
+"""Noise of the conditional mean where cells are missing, over the smallest variance kept; chosen
+with docs/decisions/embedding.md."""
 SOLVER_STEPS = 6
+"""Steps of conjugate gradients for the same, over many poses."""
 SHARE_ROUNDING = 1e-3
+"""A cell seen to this much less than the whole counts as whole: resampling rounds."""
 TINY = np.float32(1e-30)
+"""Guards divisions by zero."""
 SPARSE_BYTES = 32 * 2**20
+"""Larger arrays of a sheet take memory only where they are written."""
 Made = TypeVar("Made")
+Features = NDArray[np.float32]
+Work = Callable[[Features, Features], Made]
 
 
 @dataclass(frozen=True)
@@ -362,28 +372,46 @@ def learn(
     """
     taken = tiles_px[:: max(1, -(-len(tiles_px) // MAX_LEARNT_TILES))]
 
-    def sums(part: slice) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        features, weights = pooled_features(recipe, sheet, taken[part])
+    def over_batches(work: Work[Made]) -> Iterator[Made]:
+        return _worked(
+            lambda part: work(*pooled_features(recipe, sheet, taken[part])), len(taken), workers
+        )
+
+    return learn_in_two_passes(recipe, over_batches)
+
+
+class OverBatches(Protocol):
+    """Runs a function on the features (N, F) and weights (N, F) of every batch, in order."""
+
+    def __call__(self, work: "Work[Made]") -> Iterator[Made]:
+        """What the function makes of each batch."""
+
+
+def learn_in_two_passes(recipe: WhitenedRecipe, over_batches: OverBatches) -> WhitenedEmbedder:
+    """The whitening of features that come in batches: one pass for their mean, one for scatter."""
+
+    def sums(features: Features, weights: Features) -> tuple[Any, Any]:
         total = np.einsum("nf,nf->f", features, weights, dtype=np.float64)
         return total, weights.sum(axis=0, dtype=np.float64)
 
-    def products(part: slice) -> NDArray[np.float64]:
-        features, weights = pooled_features(recipe, sheet, taken[part])
-        centred = (features - mean.astype(np.float32)) * weights
-        return np.asarray((centred.T @ centred).astype(np.float64))
-
     total: Any = 0.0
     weight: Any = 1e-9
-    for some, their_weight in _worked(sums, len(taken), workers):
+    for some, their_weight in over_batches(sums):
         total, weight = total + some, weight + their_weight
     mean = (total / weight).astype(np.float16)
+
+    def products(features: Features, weights: Features) -> tuple[Any, int]:
+        centred = (features - mean.astype(np.float32)) * weights
+        return (centred.T @ centred).astype(np.float64), len(features)
+
     scatter: Any = 0.0
-    for product in _worked(products, len(taken), workers):
-        scatter = scatter + product
-    return whitening(recipe, mean, scatter, len(taken))
+    count = 0
+    for product, size in over_batches(products):
+        scatter, count = scatter + product, count + size
+    return _whitening(recipe, mean, scatter, count)
 
 
-def whitening(
+def _whitening(
     recipe: WhitenedRecipe,
     mean: NDArray[np.float16],
     scatter: NDArray[np.float64],

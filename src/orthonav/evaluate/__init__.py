@@ -1,6 +1,6 @@
-"""How good the fixes of a flight are: figures, pictures and a report, given the truth.
+"""Accuracy of the fixes of a flight against the truth: metrics, figures and a report.
 
-`metrics` computes and knows nothing of files or plots, `calibration` is its part on what fixes say
-about themselves, `track` on tracks; the modules named `plots` draw what they computed; `flights`
-tells it as tables and JSON values, `report` as one page in the look of `orthonav.report`.
+`metrics` computes and knows neither files nor plots; its parts are `standard` (APE, RPE, CEP),
+`calibration` (confidence and covariance) and `track` (tracked flights). Modules named `plots` draw,
+`flights` makes tables and JSON values, `report` makes one page.
 """

@@ -1,11 +1,10 @@
-"""Does a fix say the truth about itself? Calibration of `confidence`, consistency of `cov_en_m2`.
+"""Calibration of `confidence` and consistency of `cov_en_m2`.
 
-A fix states the probability that its error is below its own `radius_m`. Here a fix is therefore
-*right* where its error is at most the radius it states itself, and only where it states none
-(null, or not a positive finite number) at most the radius of the evaluation. So these figures are
-about what was promised: another radius of the evaluation changes none of a fix that states its own.
+A fix states the probability that its error is below its own `radius_m`. In this module a fix is
+therefore *right* if its error is at most that radius, or, if it states none (null, or not a
+positive finite number), at most the radius of the evaluation.
 
-Arrays only: no records, no files, no plots. A figure that is not defined is NaN.
+Arrays only: no records, no files, no plots. Undefined figures are NaN.
 """
 
 import math
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from orthonav.evaluate.figures import FloatArray, frozen, mean, share, wilson
 
 N_BINS = 10
+"""Of the reliability diagram, as usual for a few hundred fixes."""
 NEES_LEVELS = (0.5, 0.9, 0.99)
 _LEAST_INDEPENDENCE = 1e-12  # of east and north, 1 - rho^2: below it a covariance is singular
 _ASYMMETRY = 1e-6  # share of the largest element that two mirrored ones may differ by
@@ -26,9 +26,10 @@ _ASYMMETRY = 1e-6  # share of the largest element that two mirrored ones may dif
 
 @dataclass(frozen=True)
 class Bin:
-    """Fixes whose confidence is at least `lower` and below `upper`; the last bin holds 1 too.
+    """Fixes whose confidence is at least `lower` and below `upper`; the last bin includes 1.
 
-    `right_low`, `right_high` is Wilson's 95 % interval of `share_right`.
+    `mean_confidence`, `share_right`: mean stated confidence, and share of right fixes, 0 to 1.
+    `right_low`, `right_high`: Wilson's 95 % interval of `share_right`.
     """
 
     lower: float
@@ -41,13 +42,14 @@ class Bin:
 
 
 @dataclass(frozen=True)
-class Calibration:
-    """How well stated confidences agree with what came out, over fixes that state one.
+class ConfidenceCalibration:
+    """Agreement of stated confidence with the outcome, over the fixes that state one.
 
-    `n_own_radius` of the `n_fixes` state a radius of their own. `ece` is the expected calibration
-    error, `brier` the Brier score; both are 0 at best. `mean_confidence` above `share_right` is
-    over-confidence. Few fixes leave an `ece` above 0 however good the confidence is: look at the
-    intervals of the bins.
+    `n_fixes`: number of these fixes; `n_own_radius`: how many state a radius of their own.
+    `ece`: expected calibration error, 0 at best; above 0 for few fixes even if calibrated.
+    `brier`: Brier score, 0 at best.
+    `mean_confidence`, `share_right`: the first above the second is over-confidence.
+    `bins`: the reliability diagram.
     """
 
     n_fixes: int
@@ -60,13 +62,14 @@ class Calibration:
 
 
 @dataclass(frozen=True, eq=False)
-class Consistency:
-    """How well stated covariances agree with the errors of the right fixes.
+class CovarianceConsistency:
+    """Agreement of stated covariances with the errors of the right fixes.
 
-    `nees` (K,) are the normalized errors squared e^T C^-1 e, ascending, of those of the `n_right`
-    right fixes whose covariance C can be used; `n_without` have none (a null in it), `n_unusable`
-    one that is singular, not positive definite or not symmetric. `within` maps each of
-    `NEES_LEVELS` to the share of `nees` inside the bound of that level.
+    `n_right`: number of right fixes.
+    `n_without`: how many of them state no covariance, or one with null values.
+    `n_unusable`: how many state one that is singular, not positive definite or not symmetric.
+    `nees` (K,): normalized estimation error squared e^T C^-1 e of the others, ascending.
+    `within`: for each of `NEES_LEVELS` the share of `nees` inside its bound.
     """
 
     n_right: int
@@ -79,22 +82,22 @@ class Consistency:
 
 
 def promised_radius_m(own_radius_m: FloatArray, radius_m: float) -> FloatArray:
-    """(N,) metres: each fix's own radius where it is known, else `radius_m`."""
+    """(N,) metres: the radius that each fix states, or `radius_m` where it states none."""
     return np.where(_is_radius(own_radius_m), own_radius_m, radius_m)
 
 
 def calibrate(
     confidence: FloatArray, errors_m: FloatArray, own_radius_m: FloatArray, radius_m: float
-) -> Calibration:
-    """Calibration of `confidence` (N,), NaN where not known, against `errors_m` (N,).
+) -> ConfidenceCalibration:
+    """Calibration of `confidence` (N,), NaN where unknown, against `errors_m` (N,).
 
     ECE = sum over bins b of n_b / N * |share right_b - mean confidence_b|, with `N_BINS` bins of
     equal width (Naeini et al., "Obtaining well calibrated probabilities using Bayesian binning",
-    AAAI 2015; Guo et al., "On calibration of modern neural networks", ICML 2017, arXiv
-    1706.04599). A bin holds its lower edge, not its upper, so that the last is what a criterion of
-    0.9 keeps; Guo et al. do the reverse. The Brier score is the mean of (confidence - right)^2.
-    Views without a confidence or an error are left out. Raises `ValueError` for a confidence that
-    is not 0 to 1.
+    AAAI 2015; Guo et al., "On calibration of modern neural networks", ICML 2017, arXiv 1706.04599).
+    A bin includes its lower edge, not its upper, so that the last bin is what a criterion of 0.9
+    accepts; Guo et al. do the reverse. The Brier score is the mean of (confidence - right)^2. Views
+    without a confidence or an error are left out. Raises `ValueError` for a confidence that is not
+    0 to 1.
     """
     known = ~np.isnan(confidence) & np.isfinite(errors_m)
     stated = confidence[known]
@@ -108,7 +111,7 @@ def calibrate(
         for i in range(N_BINS)
     )
     gaps = [b.n_fixes * abs(b.share_right - b.mean_confidence) for b in bins if b.n_fixes]
-    return Calibration(
+    return ConfidenceCalibration(
         n_fixes=stated.size,
         n_own_radius=int(np.count_nonzero(_is_radius(own_radius_m[known]))),
         ece=sum(gaps) / stated.size if stated.size else math.nan,
@@ -121,11 +124,11 @@ def calibrate(
 
 def check_covariance(
     errors_en_m: FloatArray, cov_en_m2: FloatArray, own_radius_m: FloatArray, radius_m: float
-) -> Consistency:
+) -> CovarianceConsistency:
     """Consistency of `cov_en_m2` (N, 2, 2) with `errors_en_m` (N, 2), NaN where there is no fix.
 
-    Only right fixes count: the covariance is that of a right fix, and whether a fix is right is
-    what its confidence says. If C is the covariance of the right ones, the mean of e^T C^-1 e is 2;
+    Only right fixes count: the covariance describes a right fix, and the confidence whether a fix
+    is right. If C is the covariance of the right ones, the mean of e^T C^-1 e is 2;
     if they are Gaussian too, it follows chi-square with 2 degrees of freedom (Bar-Shalom et al.,
     "Estimation with applications to tracking and navigation", 2001, section 5.4). Larger values
     mean a covariance that is too small. Where `radius_m` is less than about three standard
@@ -140,7 +143,7 @@ def check_covariance(
     inside = {
         p: share(int(np.count_nonzero(nees <= nees_bound(p))), nees.size) for p in NEES_LEVELS
     }
-    return Consistency(
+    return CovarianceConsistency(
         n_right=int(np.count_nonzero(right)),
         n_without=int(np.count_nonzero(without)),
         n_unusable=int(np.count_nonzero(~usable & ~without)),
@@ -152,7 +155,7 @@ def check_covariance(
 
 
 def is_covariance(cov_en_m2: FloatArray) -> NDArray[np.bool_]:
-    """(N,): which of (N, 2, 2) are finite, symmetric and positive definite, with room to invert."""
+    """(N,): which of (N, 2, 2) are finite, symmetric, positive definite and well conditioned."""
     east, north = cov_en_m2[:, 0, 0], cov_en_m2[:, 1, 1]
     with np.errstate(all="ignore"):
         largest = np.maximum(east, north)
@@ -178,7 +181,7 @@ def normalized_squared(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> FloatA
 
 
 def nees_bound(level: float) -> float:
-    """The value that chi-square with 2 degrees of freedom stays below with probability `level`."""
+    """The `level` quantile of chi-square with 2 degrees of freedom."""
     return -2.0 * math.log1p(-level)
 
 

@@ -1,4 +1,4 @@
-"""Pictures of what fixes say about themselves: reliability diagram, covariance against errors."""
+"""Figures of calibration: reliability diagram, and errors against covariance."""
 
 import math
 from typing import TYPE_CHECKING, Any
@@ -8,8 +8,8 @@ import numpy as np
 from orthonav.evaluate.calibration import (
     NEES_LEVELS,
     Bin,
-    Calibration,
-    Consistency,
+    ConfidenceCalibration,
+    CovarianceConsistency,
     nees_bound,
 )
 from orthonav.report.canvas import (
@@ -32,20 +32,20 @@ _SIDE: dict[str, Any] = {"fontsize": 9, "color": "#777777", "style": "italic"}
 _NEES_AXIS = (0.01, 1e4)  # its edges at the widest; 1 in 200 of consistent fixes lie below
 
 
-def reliability_picture(calibration: Calibration) -> Drawing:
-    """Share right over stated confidence per bin, with Wilson's 95 %; below it fixes per bin."""
+def reliability_picture(calibration: ConfidenceCalibration) -> Drawing:
+    """Share of right fixes over confidence per bin, with 95 % intervals; below, fixes per bin."""
 
     def draw(figure: "mpl.Figure") -> None:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
         above.plot([0, 1], [0, 1], color=GREY, linestyle=(0, (4, 3)), linewidth=1.2)
-        above.text(0.03, 0.96, "too cautious", va="top", **_SIDE)
-        above.text(0.97, 0.04, "too sure", ha="right", **_SIDE)
+        above.text(0.03, 0.96, "under-confident", va="top", **_SIDE)
+        above.text(0.97, 0.04, "over-confident", ha="right", **_SIDE)
         filled = [b for b in calibration.bins if b.n_fixes]
         if filled:
             _draw_bins(above, filled)
             _draw_verdict(above, calibration)
         else:
-            above.text(0.5, 0.5, "no fix has a confidence", ha="center", bbox=BACKING)
+            above.text(0.5, 0.5, "no fix states a confidence", ha="center", bbox=BACKING)
         above.set(xlim=(-0.015, 1.015), ylim=(-0.02, 1.04))
         above.set(ylabel="share with an error\nwithin the stated radius")
         _draw_counts(below, calibration)
@@ -55,8 +55,8 @@ def reliability_picture(calibration: Calibration) -> Drawing:
     return draw_figure((6.2, 5.0), draw)
 
 
-def nees_picture(consistency: Consistency) -> Drawing:
-    """Share of right fixes below each normalized error squared, beside chi-square of 2 dof."""
+def nees_picture(consistency: CovarianceConsistency) -> Drawing:
+    """Cumulative share of right fixes over NEES, compared with chi-square (2 dof)."""
 
     def draw(axes: "Axes") -> None:
         nees = np.clip(consistency.nees, _NEES_AXIS[0], None)  # a log axis has no zero
@@ -77,8 +77,8 @@ def nees_picture(consistency: Consistency) -> Drawing:
         else:
             said = "no right fix has a usable covariance"
             axes.text(0.5, 0.5, said, ha="center", transform=axes.transAxes, bbox=BACKING)
-        axes.text(0.02, 0.955, "too cautious", va="top", transform=axes.transAxes, **_SIDE)
-        axes.text(0.98, 0.04, "too sure", ha="right", transform=axes.transAxes, **_SIDE)
+        axes.text(0.02, 0.955, "under-confident", va="top", transform=axes.transAxes, **_SIDE)
+        axes.text(0.98, 0.04, "over-confident", ha="right", transform=axes.transAxes, **_SIDE)
         axes.set(xscale="log", xlim=(_NEES_AXIS[0], high), ylim=(0, 104))
         axes.set(xlabel="normalized error squared, eᵀC⁻¹e (no unit)")
         axes.set(ylabel="share of right fixes below it (%)")
@@ -103,15 +103,16 @@ def _draw_bins(axes: "Axes", filled: list[Bin]) -> None:
     axes.plot(x, y, "o", color=RIGHT, markersize=7, markeredgecolor="white", zorder=4)
 
 
-def _draw_verdict(axes: "Axes", calibration: Calibration) -> None:
+def _draw_verdict(axes: "Axes", calibration: ConfidenceCalibration) -> None:
     text = (
         f"ECE {calibration.ece:.3f} · Brier {calibration.brier:.3f}\n"
-        f"stated {calibration.mean_confidence:.2f}, right {calibration.share_right:.2f} on average"
+        f"mean confidence {calibration.mean_confidence:.2f}, "
+        f"share right {calibration.share_right:.2f}"
     )
     axes.set_title(text, fontsize=9, color=SOFT, linespacing=1.4)
 
 
-def _draw_counts(axes: "Axes", calibration: Calibration) -> None:
+def _draw_counts(axes: "Axes", calibration: ConfidenceCalibration) -> None:
     counts = [b.n_fixes for b in calibration.bins]
     middles = [(b.lower + b.upper) / 2 for b in calibration.bins]
     axes.bar(middles, counts, width=0.094, color="#9DB9CC")
@@ -131,14 +132,14 @@ def _whole_numbers() -> Any:
 def _draw_band(
     axes: "Axes", x: "np.ndarray[Any, Any]", expected: "np.ndarray[Any, Any]", n: int
 ) -> None:
-    """Where 95 % of samples of `n` stay throughout (Dvoretzky, Kiefer, Wolfowitz; Massart 1990)."""
+    """The 95 % band of samples of `n` (Dvoretzky, Kiefer, Wolfowitz; Massart 1990)."""
     reach = 100 * math.sqrt(math.log(2 / 0.05) / (2 * n))
     low, high = np.clip(expected - reach, 0, 100), np.clip(expected + reach, 0, 100)
     axes.fill_between(x, low, high, color=GREY, alpha=0.18, linewidth=0)
 
 
-def _draw_levels(axes: "Axes", consistency: Consistency) -> None:
-    """The bounds as lines, the shares found inside them as points."""
+def _draw_levels(axes: "Axes", consistency: CovarianceConsistency) -> None:
+    """Bounds as lines, and the shares found inside them as points."""
     for level in NEES_LEVELS:
         bound, found = nees_bound(level), 100 * consistency.within[level]
         axes.plot([bound] * 2, [0, 104], color=GREY, linewidth=0.9, zorder=1.5)
@@ -148,7 +149,7 @@ def _draw_levels(axes: "Axes", consistency: Consistency) -> None:
         axes.plot(bound, found, "o", color=WRONG, markersize=6, markeredgecolor="white", zorder=5)
 
 
-def _draw_summary(axes: "Axes", consistency: Consistency) -> None:
+def _draw_summary(axes: "Axes", consistency: CovarianceConsistency) -> None:
     levels = " / ".join(f"{100 * level:g}" for level in NEES_LEVELS)
     found = " / ".join(f"{100 * consistency.within[level]:.1f}" for level in NEES_LEVELS)
     text = (

@@ -1,14 +1,19 @@
-"""What fixes say about themselves, checked: as JSON values, as lines, as pieces of the page."""
+"""Standard figures, confidence criteria and calibration as JSON values, text, rows and figures."""
 
 from dataclasses import asdict
 
 from orthonav.evaluate import calibration_plots
-from orthonav.evaluate.calibration import NEES_LEVELS, Calibration, Consistency, nees_bound
+from orthonav.evaluate.calibration import (
+    NEES_LEVELS,
+    ConfidenceCalibration,
+    CovarianceConsistency,
+    nees_bound,
+)
 from orthonav.evaluate.figures import or_none
 from orthonav.evaluate.metrics import CriterionRow, Metrics, wrong_key
+from orthonav.evaluate.standard import RPE_FRAMES, ErrorStatistics
 from orthonav.report.figures import Figure
-from orthonav.report.numbers import percent_text, plain_text
-from orthonav.report.page import html_table
+from orthonav.report.numbers import measure_text, percent_text, plain_text
 
 
 def row_to_json(row: CriterionRow) -> dict[str, object]:
@@ -20,14 +25,14 @@ def row_to_json(row: CriterionRow) -> dict[str, object]:
         "accuracy": or_none(row.accuracy),
         "n_accepted": row.n_accepted,
         "n_right": row.n_right,
-        "share_of_right_kept": or_none(row.recall),
+        "share_of_right_accepted": or_none(row.recall),
         f"n_{wrong_key(row.far_m)}": row.n_far,
         wrong_key(row.far_m): or_none(row.share_far),
     }
 
 
-def calibration_to_json(calibration: Calibration) -> dict[str, object]:
-    """`calibration` as values for strict JSON; what is not defined becomes None."""
+def calibration_to_json(calibration: ConfidenceCalibration) -> dict[str, object]:
+    """`calibration` as values for strict JSON; undefined ones become None."""
     bins = [
         {key: or_none(value) if isinstance(value, float) else value for key, value in one.items()}
         for one in (asdict(b) for b in calibration.bins)
@@ -43,8 +48,8 @@ def calibration_to_json(calibration: Calibration) -> dict[str, object]:
     }
 
 
-def consistency_to_json(consistency: Consistency) -> dict[str, object]:
-    """`consistency` as values for strict JSON; what is not defined becomes None."""
+def consistency_to_json(consistency: CovarianceConsistency) -> dict[str, object]:
+    """`consistency` as values for strict JSON; undefined ones become None."""
     return {
         "n_right": consistency.n_right,
         "n_nees": consistency.nees.size,
@@ -59,17 +64,55 @@ def consistency_to_json(consistency: Consistency) -> dict[str, object]:
     }
 
 
-def calibration_lines(metrics: Metrics) -> list[str]:
-    """The same for a terminal: a line on confidence, one per threshold, one on covariance."""
+def trust_lines(metrics: Metrics) -> list[str]:
+    """Standard figures, confidence and covariance in lines for a terminal."""
+    standard = metrics.standard
+    cep50, cep95 = (measure_text(each, " m") for each in (standard.cep50_m, standard.cep95_m))
+    frames = f"{RPE_FRAMES} frame{'s' * (RPE_FRAMES != 1)}"
     rows = [row for row in metrics.criteria if row.name == "confidence"]
-    kept = [f"  >= {row.threshold:g}: {_kept(row, metrics.radius_m)}" for row in rows]
-    if not metrics.calibration.n_fixes:
-        kept = []
+    accepted = [f"  >= {row.threshold:g}: {_accepted(row, metrics.radius_m)}" for row in rows]
     return [
-        f"confidence: {_confidence_said(metrics)}",
-        *kept,
-        f"covariance: {_covariance_said(metrics.consistency)}",
+        f"CEP50 {cep50}, CEP95 {cep95}",
+        f"APE: {_statistics_text(standard.ape)}",
+        f"RPE over {frames}: {_statistics_text(standard.rpe_frames)}",
+        f"RPE over {standard.distance_m:g} m: {_statistics_text(standard.rpe_distance)}",
+        f"confidence: {confidence_text(metrics)}",
+        *(accepted if metrics.calibration.n_fixes else []),
+        f"covariance: {covariance_text(metrics.consistency)}",
     ]
+
+
+def _statistics_text(found: ErrorStatistics) -> str:
+    if not found.n:
+        return "not defined"
+    return (
+        f"RMSE {measure_text(found.rmse_m)}, mean {measure_text(found.mean_m)}, "
+        f"median {measure_text(found.median_m)}, std {measure_text(found.std_m)}, "
+        f"max {measure_text(found.max_m)} m ({found.n} values)"
+    )
+
+
+def standard_rows(
+    metrics: Metrics,
+) -> tuple[list[tuple[str, ...]], list[tuple[str, str]]]:
+    """Rows of the table of standard figures, and definitions of those that are not in it."""
+    standard = metrics.standard
+    named = (
+        ("APE", standard.ape),
+        (f"RPE over {RPE_FRAMES} frame", standard.rpe_frames),
+        (f"RPE over {standard.distance_m:g} m", standard.rpe_distance),
+    )
+    rows = []
+    for name, found in named:
+        values = (found.rmse_m, found.mean_m, found.median_m, found.std_m, found.max_m)
+        rows.append((name, *map(measure_text, values), str(found.n)))
+    more = [
+        ("CEP50, CEP95", f"{measure_text(standard.cep50_m)}, {measure_text(standard.cep95_m)} m"),
+        ("ECE", plain_text(metrics.calibration.ece)),
+        ("NEES (mean, 2 expected)", plain_text(metrics.consistency.nees_mean)),
+        ("definitions", "APE and RPE as evo defines them: horizontal, not aligned, fixes only"),
+    ]
+    return rows, more
 
 
 def calibration_figures(metrics: Metrics) -> tuple[Figure, Figure]:
@@ -77,47 +120,39 @@ def calibration_figures(metrics: Metrics) -> tuple[Figure, Figure]:
     return (
         Figure(
             "reliability",
-            f"Reliability diagram of confidence: {_confidence_said(metrics)}",
-            "Share of right fixes over the confidence they state, with 95 % intervals (Wilson); "
-            "dashed: as stated; orange: the gap. Below: fixes per bin.",
+            f"Reliability diagram of confidence: {confidence_text(metrics)}",
+            "Share of correct fixes over their confidence, with 95 % intervals (Wilson); dashed: "
+            "ideal; orange: the gap. Below: fixes per bin.",
             calibration_plots.reliability_picture(metrics.calibration),
         ),
         Figure(
             "covariance",
-            f"Errors of right fixes against covariance: {_covariance_said(metrics.consistency)}",
-            "Errors of right fixes in units of their covariance C; dashed: as they should be; "
-            "shaded: where 95 % of samples of this size stay.",
+            f"Errors of correct fixes against covariance: {covariance_text(metrics.consistency)}",
+            "Errors of correct fixes in units of their covariance C; dashed: ideal; shaded: where "
+            "95 % of samples of this size stay.",
             calibration_plots.nees_picture(metrics.consistency),
         ),
     )
 
 
-def calibration_html(metrics: Metrics) -> str:
-    """The figures of both pictures as tables, and words where there are none."""
-    calibration, consistency = metrics.calibration, metrics.consistency
-    parts = [f'<p class="small">Confidence: {_confidence_said(metrics)}.</p>']
-    if calibration.n_fixes:
-        parts.append(_bins_table(calibration))
-    parts.append(f'<p class="small">Covariance: {_covariance_said(consistency)}.</p>')
-    if consistency.nees.size:
-        parts.append(_levels_table(consistency))
-    return "".join(parts)
-
-
-def criteria_html(metrics: Metrics, labels: dict[str, str]) -> str:
-    """What each threshold of each criterion keeps, as a table; `labels` are names to show."""
+def criteria_header(metrics: Metrics) -> tuple[str, ...]:
+    """Column names of `criteria_rows`."""
     radius = f"{metrics.radius_m:g} m"
     far = f"{metrics.criteria[0].far_m:g} m" if metrics.criteria else ""
-    header = (
+    return (
         "criterion",
         "at least",
-        "kept",
+        "accepted",
         "of all views",
         f"of these within {radius}",
-        f"of all within {radius} kept",
+        f"of all within {radius} accepted",
         f"of these wrong by > {far}",
     )
-    rows = [
+
+
+def criteria_rows(metrics: Metrics, labels: dict[str, str]) -> list[tuple[str, ...]]:
+    """What each threshold of each criterion accepts; `labels` are names to show."""
+    return [
         (
             labels[row.name],
             f"{row.threshold:g}",
@@ -129,50 +164,53 @@ def criteria_html(metrics: Metrics, labels: dict[str, str]) -> str:
         )
         for row in metrics.criteria
     ]
-    return html_table(header, rows, label="confidence criteria")
 
 
-def _confidence_said(metrics: Metrics) -> str:
+def confidence_text(metrics: Metrics) -> str:
+    """ConfidenceCalibration of confidence in a sentence."""
     calibration = metrics.calibration
     if not calibration.n_fixes:
-        return "not known, no fix states one"
-    n_held = calibration.n_fixes - calibration.n_own_radius
-    held = f" ({n_held} state no radius and are held to {metrics.radius_m:g} m)" if n_held else ""
+        return "unknown, no fix states one"
+    n_default = calibration.n_fixes - calibration.n_own_radius
+    default = f" ({n_default} state no radius; {metrics.radius_m:g} m is used)" if n_default else ""
     return (
         f"{calibration.n_fixes} fixes state {calibration.mean_confidence:.3f} on average, and "
-        f"{calibration.share_right:.3f} of them err by no more than the radius they state{held}; "
+        f"{calibration.share_right:.3f} of them err by at most the radius they state{default}; "
         f"ECE {calibration.ece:.3f}, Brier score {calibration.brier:.3f}"
     )
 
 
-def _covariance_said(consistency: Consistency) -> str:
+def covariance_text(consistency: CovarianceConsistency) -> str:
+    """Consistency of the covariance in a sentence."""
     if not consistency.n_right:
-        return "not known, no fix is right"
-    counts = ((consistency.n_without, "state none"), (consistency.n_unusable, "one of no use"))
-    left_out = ", ".join(f"{count} {said}" for count, said in counts if count)
+        return "unknown, no fix is correct"
+    counts = ((consistency.n_without, "without one"), (consistency.n_unusable, "unusable"))
+    left_out = ", ".join(f"{count} {kind}" for count, kind in counts if count)
     if not consistency.nees.size:
-        return f"not known, of {consistency.n_right} right fixes {left_out}"
+        return f"unknown; of {consistency.n_right} correct fixes {left_out}"
     levels = " / ".join(f"{100 * level:g}" for level in NEES_LEVELS)
     found = " / ".join(f"{100 * consistency.within[level]:.1f}" for level in NEES_LEVELS)
     return (
-        f"NEES of {consistency.nees.size} right fixes has mean {consistency.nees_mean:.3g} "
+        f"NEES of {consistency.nees.size} correct fixes has mean {consistency.nees_mean:.3g} "
         f"(2 expected), median {consistency.nees_median:.3g} ({nees_bound(0.5):.2f} expected); "
         f"{found} % within the bounds of {levels} %" + (f"; {left_out}" if left_out else "")
     )
 
 
-def _kept(row: CriterionRow, radius_m: float) -> str:
+def _accepted(row: CriterionRow, radius_m: float) -> str:
     return (
-        f"{percent_text(row.share_accepted)} of views kept, {percent_text(row.accuracy)} of them "
-        f"within {radius_m:g} m ({percent_text(row.recall)} of all that are); "
+        f"{percent_text(row.share_accepted)} of views accepted, {percent_text(row.accuracy)} of "
+        f"them within {radius_m:g} m ({percent_text(row.recall)} of all that are); "
         f"{row.n_far} of {row.n_accepted} wrong by more than {row.far_m:g} m "
         f"({percent_text(row.share_far)})"
     )
 
 
-def _bins_table(calibration: Calibration) -> str:
-    header = ("confidence", "fixes", "mean", "share right", "95 % from", "to")
-    rows = [
+def bins_rows(calibration: ConfidenceCalibration) -> list[tuple[str, ...]]:
+    """Rows of the reliability diagram; empty where no fix states a confidence."""
+    if not calibration.n_fixes:
+        return []
+    return [
         (
             f"{b.lower:g} to {b.upper:g}",
             str(b.n_fixes),
@@ -183,13 +221,13 @@ def _bins_table(calibration: Calibration) -> str:
         )
         for b in calibration.bins
     ]
-    return html_table(header, rows, label="confidence against shares of right fixes")
 
 
-def _levels_table(consistency: Consistency) -> str:
-    header = ("bound of chi-square, 2 degrees of freedom", "eᵀC⁻¹e below", "expected", "found")
-    rows = [
+def levels_rows(consistency: CovarianceConsistency) -> list[tuple[str, ...]]:
+    """Rows of the bounds of chi-square; empty where no covariance is usable."""
+    if not consistency.nees.size:
+        return []
+    return [
         (f"{100 * level:g} %", f"{nees_bound(level):.2f}", percent_text(level), percent_text(share))
         for level, share in consistency.within.items()
     ]
-    return html_table(header, rows, label="covariance against errors")

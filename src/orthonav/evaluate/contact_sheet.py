@@ -1,7 +1,7 @@
-"""The worst views beside where they were put and where they were taken, all at one scale.
+"""Contact sheet: the worst views beside the map at the fix and at the true position, at one scale.
 
-A view is shown as if the camera had looked straight down, north up, by the heading and height its
-fix rests on. The map is the grey registration layer of the sheet that the comparison lies in.
+A view is rectified to nadir, north up, with the heading and height of its fix. The map is the grey
+registration layer of the sheet in whose plane the comparison is.
 """
 
 import math
@@ -31,22 +31,23 @@ if TYPE_CHECKING:
 
 N_ROWS = 6
 SIDE_PX = 260
-"""Pixels across each picture: those of the view are made so coarse, the map is read so."""
+"""Width of each image in pixels."""
 MARGIN = 1.15
-"""How much wider than the view a picture is."""
+"""Width of an image relative to the view."""
 MOST_READ_PX = 4 * SIDE_PX
-"""A window of the map of more pixels than that (no level is so coarse) is not read."""
+"""Larger windows of the map are not read: no level is coarse enough."""
 USUAL_SIDE_M = 200.0
-"""Width of the pictures of the map where that of the view is not known."""
+"""Width of the map images where the footprint of the view is unknown."""
 _NOTHING = "#F0E6D2"
 _GREY_LEVELS = 40
 
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Grey levels (H, W), masked where there is nothing, north up.
+    """A north-up image.
 
-    Its outer edges are in metres from the position it is about: west, east, south, north.
+    `grey`: grey levels (H, W), masked where there is no imagery.
+    `extent_m`: west, east, south, north edges, from the position in the middle.
     """
 
     grey: "np.ma.MaskedArray[tuple[int, ...], np.dtype[np.uint8]]"
@@ -55,11 +56,13 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One view: its figures, and three pictures of ground `side_m` metres wide around a position.
+    """One view of the contact sheet: its figures, and three images `side_m` wide.
 
-    `shift_en_m` (2,) leads from the true to the estimated position, `centre_en_m` (2,) from a
-    position to the middle of the pictures: a camera that tilts looks beside itself. Where a
-    picture is None, `why_not` or `why_no_map` says why.
+    `state`, `error_m`, `sigma_m`, `confidence`: of the fix.
+    `shift_en_m` (2,): from the true to the estimated position.
+    `centre_en_m` (2,): from a position to the middle of the images, which a tilt displaces.
+    `view`, `at_estimate`, `at_truth`: the rectified view, and the map at both positions.
+    `why_not`, `why_no_map`: why one of these is None.
     """
 
     frame: str
@@ -114,12 +117,12 @@ def worst_first(
 
 
 def sheet_picture(rows: Sequence[Row]) -> Drawing:
-    """The rows as one drawing: view, map at the estimate, map at the truth; a note where none."""
+    """The rows as one drawing: view, map at the fix, map at the true position."""
 
     def draw(figure: "Figure") -> None:
         if not rows:
             axes = figure.add_subplot()
-            axes.text(0.5, 0.5, "there is no fix", ha="center", color=SOFT)
+            axes.text(0.5, 0.5, "no view has a fix", ha="center", color=SOFT)
             axes.set_axis_off()
             return
         parts = np.atleast_1d(np.asarray(figure.subfigures(len(rows), 1, hspace=0.03)))
@@ -130,11 +133,11 @@ def sheet_picture(rows: Sequence[Row]) -> Drawing:
 
 
 def row_text(row: Row) -> str:
-    """What is said above a row."""
+    """The title of a row."""
     known = [row.frame, f"error {row.error_m:.1f} m"]
-    known.append(f"sigma {row.sigma_m:.1f} m" if math.isfinite(row.sigma_m) else "sigma not known")
-    sure = math.isfinite(row.confidence)
-    known.append(f"confidence {row.confidence:.3f}" if sure else "confidence not known")
+    known.append(f"sigma {row.sigma_m:.1f} m" if math.isfinite(row.sigma_m) else "sigma unknown")
+    stated = math.isfinite(row.confidence)
+    known.append(f"confidence {row.confidence:.3f}" if stated else "confidence unknown")
     return " · ".join(known + [row.state] * bool(row.state))
 
 
@@ -172,29 +175,29 @@ def _row(
         at_estimate=maps[0],
         at_truth=maps[1],
         why_not=why_not,
-        why_no_map="so wide a view is not shown on this map",
+        why_no_map="the view is too wide for this map",
     )
 
 
 def _view_patch(
     view: RecordedView, camera: Camera, result: ViewResult
 ) -> tuple[float, NDArray[np.float64], Patch]:
-    """Width of the picture in metres, its middle from the camera (2,), and the picture.
+    """Width of the image in metres, its middle from the camera (2,), and the image.
 
-    Raises `FlightError` where there is none, with why.
+    Raises `FlightError` with the reason where there is none.
     """
-    told = as_fixed(view.telemetry, result)
-    refused = check_telemetry(told, camera, math.inf, heading_known=True)
+    used = as_fixed(view.telemetry, result)
+    refused = check_telemetry(used, camera, math.inf, heading_known=True)
     if refused is not None:
         raise FlightError(refused.detail)
     grey = view.grey()
     if grey.shape != (camera.height_px, camera.width_px):
-        raise FlightError("the picture is not of the size of the camera")
-    longer_m = max(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px) * told.agl_m
+        raise FlightError("the image does not have the size of the calibration")
+    longer_m = max(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px) * used.agl_m
     side_m = MARGIN * longer_m
     gsd_m = side_m / SIDE_PX
     made = rectify(
-        downsampled(View(grey, camera, told), gsd_m),
+        downsampled(View(grey, camera, used), gsd_m),
         gsd_m=gsd_m,
         size_px=SIDE_PX,
     )
@@ -204,19 +207,19 @@ def _view_patch(
     return side_m, made.offset_en_m, Patch(np.ma.masked_where(~made.valid, made.grey), extent_m)
 
 
-def as_fixed(told: Telemetry, result: ViewResult) -> Telemetry:
-    """Heading, height and tilt as the fix has them, as told where it does not say."""
+def as_fixed(telemetry: Telemetry, result: ViewResult) -> Telemetry:
+    """`telemetry` with the heading, height and tilt that the fix states."""
     fix = result.outcome
     if not isinstance(fix, Fix):
-        return told
+        return telemetry
     tilt = [fix.evidence.get(name, 0.0) for name in ("pitch_bias_deg", "roll_bias_deg")]
     pitch, roll = (value if math.isfinite(value) else 0.0 for value in tilt)
     return replace(
-        told,
-        yaw_deg=fix.heading_deg if math.isfinite(fix.heading_deg) else told.yaw_deg,
-        agl_m=fix.agl_m if math.isfinite(fix.agl_m) else told.agl_m,
-        pitch_deg=told.pitch_deg + pitch,
-        roll_deg=told.roll_deg + roll,
+        telemetry,
+        yaw_deg=fix.heading_deg if math.isfinite(fix.heading_deg) else telemetry.yaw_deg,
+        agl_m=fix.agl_m if math.isfinite(fix.agl_m) else telemetry.agl_m,
+        pitch_deg=telemetry.pitch_deg + pitch,
+        roll_deg=telemetry.roll_deg + roll,
     )
 
 
@@ -248,7 +251,7 @@ def _map_patch(
 def _draw_row(part: "SubFigure", row: Row) -> None:
     colour = WRONG if row.state == "tracking" else INK
     part.suptitle(row_text(row), fontsize=10, color=colour, parse_math=False)
-    titles = ("view", "map where it was put", "map where it was taken")
+    titles = ("view", "map at the fix", "map at the true position")
     why = (row.why_not, row.why_no_map, row.why_no_map)
     patches = (row.view, row.at_estimate, row.at_truth)
     nothing = np.zeros(2)
@@ -257,14 +260,16 @@ def _draw_row(part: "SubFigure", row: Row) -> None:
         {"estimate": nothing, "truth": -row.shift_en_m},
         {"estimate": row.shift_en_m, "truth": nothing},
     )
-    for axes, title, patch, said, marked in zip(
+    for axes, title, patch, reason, marked in zip(
         part.subplots(1, 3), titles, patches, why, marks, strict=True
     ):
         axes.set_title(title, fontsize=9, color=SOFT)
         axes.set(facecolor=_NOTHING, xticks=[], yticks=[])
         axes.grid(visible=False)
         if patch is None:
-            axes.text(*(0.5, 0.5), _wrapped(said), ha="center", va="center", color=SOFT, fontsize=9)
+            axes.text(
+                *(0.5, 0.5), _wrapped(reason), ha="center", va="center", color=SOFT, fontsize=9
+            )
             axes.set(aspect="equal")
             continue
         _draw_patch(axes, row, patch)
@@ -294,7 +299,7 @@ def _draw_patch(axes: "Axes", row: Row, patch: Patch) -> None:
 
 
 def _few_greys() -> "Colormap":
-    """So few grey levels that the palette of the PNG has room for the colours of the marks."""
+    """Few grey levels, so that the palette of the PNG has room for the colours of the marks."""
     import matplotlib
 
     return matplotlib.colormaps["gray"].resampled(_GREY_LEVELS)
@@ -313,7 +318,7 @@ def _draw_marks(axes: "Axes", marked: dict[str, NDArray[np.float64]]) -> None:
                 markersize=size,
                 markeredgewidth=width,
                 markerfacecolor="none",
-                antialiased=False,  # no shades between: they would use up the palette
+                antialiased=False,  # shades would use up the palette
                 scalex=False,
                 scaley=False,
             )

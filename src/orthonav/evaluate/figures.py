@@ -1,4 +1,4 @@
-"""Small figures that the evaluation is made of: shares, percentiles, intervals, runs."""
+"""Basic statistics: shares, percentiles, intervals, runs."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ _Z95 = 1.959963984540054  # two-sided 95 % of a normal distribution
 
 
 def share(part: int, whole: int) -> float:
-    """`part` of `whole`, 0 to 1; NaN where there is nothing to share."""
+    """`part` of `whole`, 0 to 1; NaN for a `whole` of 0."""
     return part / whole if whole else math.nan
 
 
@@ -29,10 +29,10 @@ def percentile(values: FloatArray, percent: float) -> float:
 
 
 def wilson(part: int, whole: int) -> tuple[float, float]:
-    """The 95 % interval of a share of which `part` of `whole` were seen; NaN for none.
+    """The 95 % interval of a share, given `part` of `whole`; NaN for a `whole` of 0.
 
     Wilson, "Probable inference, the law of succession, and statistical inference", 1927: unlike
-    the normal interval it stays within 0 to 1 and has a width where all or none were seen.
+    the normal interval it stays within 0 to 1 and has a width at 0 and 1.
     """
     if not whole:
         return math.nan, math.nan

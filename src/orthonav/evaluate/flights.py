@@ -5,17 +5,18 @@ from dataclasses import dataclass
 from typing import Any
 
 from orthonav.evaluate.calibration_report import (
-    calibration_lines,
     calibration_to_json,
     consistency_to_json,
     row_to_json,
+    trust_lines,
 )
 from orthonav.evaluate.contact_sheet import Row
 from orthonav.evaluate.figures import or_none
 from orthonav.evaluate.metrics import Comparison, Metrics, measure, pool, radius_key
-from orthonav.evaluate.track import Track
+from orthonav.evaluate.standard import standard_to_json
+from orthonav.evaluate.track import TrackMetrics
 from orthonav.evaluate.track_report import track_lines, track_to_json, tracks_to_json
-from orthonav.report.ground import Background
+from orthonav.report.maps import Background
 from orthonav.report.numbers import measure_text, percent_text
 
 _COLUMNS = (
@@ -35,22 +36,24 @@ _COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class FlightReport:
-    """One evaluated flight: its name, its results beside the truth, and the figures of those.
+    """One evaluated flight.
 
-    `background` is in the plane of `comparison`; see `orthonav.report.ground.Background`. `track`
-    is None where views were placed one by one, `worst` empty where pictures were not asked for.
+    `comparison`: results with their truth; `metrics`: figures of these.
+    `background`: image in the plane of `comparison`; optional.
+    `track`: metrics of the track; None where views were placed one by one.
+    `worst`: rows of the contact sheet; empty where images were not requested.
     """
 
     name: str
     comparison: Comparison
     metrics: Metrics
     background: Background | None = None
-    track: Track | None = None
+    track: TrackMetrics | None = None
     worst: tuple[Row, ...] = ()
 
 
 def total(flights: Sequence[FlightReport]) -> Metrics:
-    """Figures of all views of all flights together.
+    """Metrics of all views of all flights together.
 
     Raises `ValueError` for no flight, and where flights were measured at different radii.
     """
@@ -59,7 +62,9 @@ def total(flights: Sequence[FlightReport]) -> Metrics:
     if len(flights) == 1:
         return flights[0].metrics
     first = flights[0].metrics
-    return measure(pool([f.comparison for f in flights]), first.radius_m, list(first.acc_at_m))
+    pooled = pool([flight.comparison for flight in flights])
+    distance_m = first.standard.distance_m
+    return measure(pooled, first.radius_m, list(first.acc_at_m), rpe_distance_m=distance_m)
 
 
 def table(flights: Sequence[FlightReport]) -> str:
@@ -77,7 +82,7 @@ def table(flights: Sequence[FlightReport]) -> str:
 
 
 def metrics_to_json(metrics: Metrics) -> dict[str, object]:
-    """`metrics` as values for strict JSON; what is not defined becomes None."""
+    """`metrics` as values for strict JSON; undefined ones become None."""
     return {
         "n_views": metrics.n_views,
         "n_fixes": metrics.n_fixes,
@@ -95,6 +100,7 @@ def metrics_to_json(metrics: Metrics) -> dict[str, object]:
         "latency_p95_ms": or_none(metrics.latency_p95_ms),
         "reasons": dict(metrics.reasons),
         "criteria": [row_to_json(row) for row in metrics.criteria],
+        "standard": standard_to_json(metrics.standard),
         "curves": {
             curve.name: {
                 "threshold": [or_none(value) for value in curve.thresholds],
@@ -111,8 +117,7 @@ def metrics_to_json(metrics: Metrics) -> dict[str, object]:
 def flights_to_json(flights: Sequence[FlightReport]) -> dict[str, Any]:
     """The figures of all flights together, and of several also of each, for strict JSON.
 
-    A track's figures are those of its flight: only what adds up is told of several. Raises
-    `ValueError` as `total` does.
+    Of several tracks only sums and maxima are given. Raises `ValueError` as `total` does.
     """
     plain = metrics_to_json(total(flights))
     if len(flights) == 1:
@@ -126,12 +131,11 @@ def flights_to_json(flights: Sequence[FlightReport]) -> dict[str, Any]:
 
 
 def summary(flights: Sequence[FlightReport]) -> str:
-    """How far confidence and covariance can be believed, in lines for a terminal, of all flights;
-    and how each track held.
+    """Standard figures, confidence and covariance of all flights, and metrics of each track.
 
     Raises `ValueError` as `total` does.
     """
-    lines = calibration_lines(total(flights))
+    lines = trust_lines(total(flights))
     for flight in flights:
         if flight.track is not None:
             lines += track_lines(flight.track, flight.name if len(flights) > 1 else "")

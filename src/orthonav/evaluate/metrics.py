@@ -1,8 +1,8 @@
-"""Figures of merit of the fixes of a flight. Arrays and records only: no files, no plots.
+"""Metrics of the fixes of a flight. Arrays and records only: no files, no plots.
 
-The names follow the paper (arXiv 2404.06207): accuracy at a radius (`acc_at_15m`), confidence
-criterion, Lowe's ratio. A share is between 0 and 1 and NaN where there is nothing to share.
-What a fix says about itself, confidence and covariance, is checked in `calibration`.
+Names follow the paper (arXiv 2404.06207): accuracy at a radius (`acc_at_15m`), confidence
+criterion, Lowe's ratio. A share is 0 to 1, and NaN where it is not defined. Confidence and
+covariance are checked in `calibration`, standard figures of the field are in `standard`.
 """
 
 import math
@@ -14,8 +14,14 @@ from types import MappingProxyType
 import numpy as np
 
 from orthonav.errors import FlightError
-from orthonav.evaluate.calibration import Calibration, Consistency, calibrate, check_covariance
+from orthonav.evaluate.calibration import (
+    ConfidenceCalibration,
+    CovarianceConsistency,
+    calibrate,
+    check_covariance,
+)
 from orthonav.evaluate.figures import FloatArray, frozen, mean, percentile, share
+from orthonav.evaluate.standard import RPE_DISTANCE_M, StandardFigures, standard_figures
 from orthonav.geo.frames import LocalFrame
 from orthonav.records import Fix, NoFix, ViewResult
 
@@ -23,27 +29,32 @@ Positions = Mapping[str, tuple[float, float]]
 """Frame name -> (latitude, longitude) in degrees."""
 
 FAR_M = 35.0
-"""A fix that is farther off than this is wrong by any measure: `wrong_by_35m`."""
+"""A larger error is wrong by any measure: half a tile of the paper, `wrong_by_35m`."""
 RADII_M = (5.0, 10.0, 15.0, 25.0, 35.0, 50.0, 100.0)
 CRITERIA: Mapping[str, tuple[float, ...]] = MappingProxyType(
     {
         "lowe_ratio": (1.13,),  # best tile against second best, threshold of the paper
-        "peak_ratio": (1.05, 1.13, 1.3),  # best peak against best peak elsewhere
+        "peak_ratio": (1.05, 1.13, 1.3),  # best peak against the best elsewhere on the map
         "confidence": (0.5, 0.9, 0.99),
     }
 )
-"""Confidence criterion -> thresholds; a view is kept where its value is at least the threshold."""
+"""Confidence criterion -> thresholds; a view is accepted if its value is at least that."""
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Results beside the truth, one entry per view that has both, in the order of the results.
+    """Results with their truth: N views that have both, in the order of the results.
 
-    `truth_en_m` and `fix_en_m` are (N, 2) metres east and north of (`lat_deg`, `lon_deg`), fixes
-    NaN where there is none, and then so is `errors_m` (N,), the distance between the two.
-    `cov_en_m2` (N, 2, 2) and `own_radius_m` (N,) are what each fix states, NaN where not known.
-    `criteria` maps each name of `CRITERIA` to (N,) values, NaN where not known or no fix.
-    `reasons` has the word of each view without a fix, and "" for a fix.
+    `lat_deg`, `lon_deg`: origin of the east-north plane of positions.
+    `frames`, `time_ns`: name and time of each view.
+    `truth_en_m`, `fix_en_m` (N, 2): positions in metres; fixes NaN where there is none.
+    `errors_m` (N,): distance between them, NaN without a fix.
+    `cov_en_m2` (N, 2, 2), `own_radius_m` (N,): as each fix states, NaN where unknown.
+    `criteria`: for each name of `CRITERIA` values (N,), NaN where unknown or without a fix.
+    `reasons`: code of each view without a fix, "" for a fix.
+    `latency_ms` (N,): processing time of each view.
+    `n_without_truth`, `n_without_result`: results without truth, and the reverse.
+    `starts`: index at which each pooled flight begins.
     """
 
     lat_deg: float
@@ -60,15 +71,18 @@ class Comparison:
     latency_ms: FloatArray
     n_without_truth: int
     n_without_result: int
+    starts: tuple[int, ...] = (0,)
 
 
 @dataclass(frozen=True)
 class CriterionRow:
-    """What is left at one threshold: share of all views kept, and share of those that are right.
+    """What one threshold of a criterion accepts. Shares are NaN where they are not defined.
 
-    Of the `n_accepted` views kept, `n_right` are right and `n_far` are wrong by more than `far_m`;
-    `share_far` is their share, `recall` the share of all right fixes that is kept. Shares are NaN
-    where no view has the criterion, those of the kept also where no view is kept.
+    `share_accepted`: share of all views accepted.
+    `accuracy`: share of the accepted views that are right.
+    `n_accepted`, `n_right`: number of accepted views, and of right ones among them.
+    `recall`: share of all right fixes that is accepted.
+    `far_m`, `n_far`, `share_far`: accepted views wrong by more than `far_m`.
     """
 
     name: str
@@ -85,7 +99,7 @@ class CriterionRow:
 
 @dataclass(frozen=True, eq=False)
 class CriterionCurve:
-    """The same over all thresholds (K,), from the strictest to the one that keeps every fix."""
+    """The same over all thresholds (K,), from the strictest to the one that accepts every fix."""
 
     name: str
     thresholds: FloatArray
@@ -95,12 +109,17 @@ class CriterionCurve:
 
 @dataclass(frozen=True, eq=False)
 class Metrics:
-    """Figures of one flight, or of several pooled. A figure that is not defined is NaN.
+    """Metrics of one flight, or of several pooled; undefined ones are NaN.
 
-    `acc_at_m` maps each radius to the share of all views with a fix within it, `acc_fixes_at_m` to
-    the share of fixes; both hold `radius_m`, the radius that "right" stands for. Errors are of
-    fixes, `latency_*` of all views, `coverage` is the share of views with a fix. `calibration` and
-    `consistency` take each fix at its own word: right is what is within the radius it states.
+    `radius_m`: a fix within it is right.
+    `n_views`, `n_fixes`, `n_without_truth`, `n_without_result`: counts, see `Comparison`.
+    `coverage`: share of views with a fix.
+    `acc_at_m`, `acc_fixes_at_m`: for each radius the share of all views, and of fixes, within it.
+    `error_*_m`: of fixes; `latency_*_ms`: of all views.
+    `reasons`: number of views without a fix by reason.
+    `criteria`, `curves`: what thresholds of the confidence criteria accept.
+    `calibration`, `consistency`: of confidence and covariance; right is within the own radius.
+    `standard`: APE, RPE, CEP50 and CEP95.
     """
 
     radius_m: float
@@ -120,8 +139,9 @@ class Metrics:
     reasons: Mapping[str, int]
     criteria: tuple[CriterionRow, ...]
     curves: tuple[CriterionCurve, ...]
-    calibration: Calibration
-    consistency: Consistency
+    calibration: ConfidenceCalibration
+    consistency: CovarianceConsistency
+    standard: StandardFigures
 
     @property
     def accuracy(self) -> float:
@@ -147,10 +167,10 @@ def wrong_key(far_m: float) -> str:
 def compare(
     truth: Positions, results: Sequence[ViewResult], local: LocalFrame | None = None
 ) -> Comparison:
-    """Results set beside the truth by frame name.
+    """Results matched with the truth by frame name.
 
-    `local` is the plane of the positions, by default one centred on the first true position.
-    A true position that is not finite counts as none. Raises `FlightError` where no result has a
+    `local` is the plane of the positions, by default centred on the first true position. A true
+    position that is not finite counts as missing. Raises `FlightError` where no result has a
     truth or a frame has two results.
     """
     known = {name: at for name, at in truth.items() if all(map(math.isfinite, at))}
@@ -181,13 +201,18 @@ def compare(
 
 
 def pool(comparisons: Sequence[Comparison]) -> Comparison:
-    """Several flights as one, for figures; positions stay in the planes they came in.
+    """Several flights as one, for metrics; positions stay in their own planes.
 
     Raises `ValueError` for no flight at all.
     """
     if not comparisons:
         raise ValueError("nothing to pool: expected at least one flight")
     parts = list(comparisons)
+    starts: list[int] = []
+    views = 0
+    for part in parts:
+        starts += [views + start for start in part.starts]
+        views += len(part.frames)
     joined = {n: frozen(np.concatenate([p.criteria[n] for p in parts])) for n in CRITERIA}
     return Comparison(
         lat_deg=parts[0].lat_deg,
@@ -204,6 +229,7 @@ def pool(comparisons: Sequence[Comparison]) -> Comparison:
         latency_ms=frozen(np.concatenate([p.latency_ms for p in parts])),
         n_without_truth=sum(p.n_without_truth for p in parts),
         n_without_result=sum(p.n_without_result for p in parts),
+        starts=tuple(starts),
     )
 
 
@@ -212,11 +238,12 @@ def measure(
     radius_m: float = 15.0,
     radii_m: Sequence[float] = RADII_M,
     far_m: float = FAR_M,
+    rpe_distance_m: float = RPE_DISTANCE_M,
 ) -> Metrics:
-    """All figures of `comparison`; `radius_m` says which fixes are right and joins `radii_m`.
+    """All metrics of `comparison`; `radius_m` defines right fixes and joins `radii_m`.
 
-    Raises `ValueError` for a radius that is not a positive finite number, and for a confidence
-    that is not 0 to 1.
+    `rpe_distance_m` is the distance of the relative pose error. Raises `ValueError` for a radius
+    that is not a positive finite number, and for a confidence that is not 0 to 1.
     """
     radii = sorted({float(r) for r in (*radii_m, radius_m)})
     if not all(0.0 < radius < math.inf for radius in (*radii, far_m)):
@@ -248,6 +275,9 @@ def measure(
         consistency=check_covariance(
             errors_en_m, comparison.cov_en_m2, own_radius_m, float(radius_m)
         ),
+        standard=standard_figures(
+            comparison.truth_en_m, comparison.fix_en_m, comparison.starts, rpe_distance_m
+        ),
     )
 
 
@@ -263,9 +293,9 @@ def criterion_rows(
 
 
 def criterion_curve(comparison: Comparison, name: str, radius_m: float) -> CriterionCurve:
-    """Share kept and accuracy among kept at every value that the criterion takes.
+    """Share accepted and accuracy at every value that the criterion takes.
 
-    Views of equal value are kept or dropped together. Empty where no view has the criterion.
+    Views of equal value are accepted together. Empty where no view has the criterion.
     """
     values = comparison.criteria[name]
     known = ~np.isnan(values)
@@ -295,10 +325,10 @@ def _criterion_row(
 ) -> CriterionRow:
     values, errors_m = comparison.criteria[name], comparison.errors_m
     known = bool(np.any(~np.isnan(values)))
-    kept = values >= threshold  # NaN is never kept
-    n_accepted = int(np.count_nonzero(kept))
-    n_right = int(np.count_nonzero(errors_m[kept] <= radius_m))
-    n_far = int(np.count_nonzero(errors_m[kept] > far_m))
+    accepted = values >= threshold  # NaN is never accepted
+    n_accepted = int(np.count_nonzero(accepted))
+    n_right = int(np.count_nonzero(errors_m[accepted] <= radius_m))
+    n_far = int(np.count_nonzero(errors_m[accepted] > far_m))
     n_all_right = int(np.count_nonzero(errors_m <= radius_m))
     return CriterionRow(
         name=name,
@@ -315,7 +345,7 @@ def _criterion_row(
 
 
 def _covariance(outcome: Fix | NoFix) -> FloatArray:
-    """(2, 2) m2, NaN where there is none; of a fix with a covariance of another shape too."""
+    """(2, 2) m2; NaN without one, and for one of another shape."""
     nothing = np.full((2, 2), np.nan)
     if not isinstance(outcome, Fix):
         return nothing

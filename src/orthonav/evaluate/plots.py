@@ -1,6 +1,6 @@
-"""Pictures of an evaluation: map, error curve, criteria, errors over time.
+"""Figures of an evaluation: map, error curve, criteria, errors over time.
 
-Right and wrong differ by colour and by mark.
+Right and wrong fixes differ in colour and in mark.
 """
 
 import math
@@ -22,12 +22,12 @@ from orthonav.report.canvas import (
     Drawing,
     draw_axes,
 )
-from orthonav.report.ground import Background, draw_map, map_size_in
+from orthonav.report.maps import Background, draw_map, map_size_in
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# colour, line, mark, order from below
+# colour, line, mark, drawing order
 CURVE_STYLES: dict[str, tuple[str, Any, str, float]] = {
     "confidence": ("#0072B2", "-", "o", 2.0),
     "peak_ratio": ("#009E73", (0, (5, 3)), "s", 2.1),
@@ -39,16 +39,16 @@ LABELS = {
     "lowe_ratio": "Lowe's ratio",
 }
 MAIN = ("confidence", 0.9)
-"""The criterion and threshold that people ask for first."""
+"""The criterion and threshold that is highlighted."""
 _NO_FIX_SHADE = "#EFE6C8"
 
 
 def map_picture(
     comparison: Comparison, radius_m: float, background: Background | None = None
 ) -> Drawing:
-    """True positions and fixes from above, a line from each truth to its fix; north is up.
+    """Map of true positions and fixes, joined by lines; north is up.
 
-    Fixes far outside the flight are not shown themselves, only their lines to the edge.
+    Of fixes far outside the flight only the lines to the edge are visible.
     """
     box = view_box(comparison, radius_m)
 
@@ -89,24 +89,24 @@ def error_curve_picture(comparison: Comparison, metrics: Metrics) -> Drawing:
 
 
 def criteria_picture(metrics: Metrics) -> Drawing:
-    """Share of views kept against accuracy among them, per criterion; its thresholds marked."""
+    """Accuracy over the share of views accepted, per criterion, with its thresholds."""
 
     def draw(axes: "Axes") -> None:
         drawn = [curve for curve in metrics.curves if curve.thresholds.size]
         for curve in drawn:
             _draw_criterion(axes, curve)
-        # the first few views make wild shares: they do not set the scale
+        # shares of the first few views are noisy and do not set the scale
         tails = [curve.accuracy[curve.share_accepted >= 0.05] for curve in drawn]
         lowest = min((float(tail.min()) for tail in tails if tail.size), default=0.0)
         bottom = max(0.0, math.floor(lowest * 10 - 0.5) * 10)
         axes.set(xlim=(0, 102), ylim=(min(bottom, 85.0), 101.5))
-        axes.set(xlabel="share of all views kept (%)")
+        axes.set(xlabel="share of all views accepted (%)")
         axes.set(ylabel=f"of these within {metrics.radius_m:g} m (%)")
         if drawn:
             _draw_thresholds(axes, metrics)
             axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)
         else:
-            axes.text(51, 50 + min(bottom, 85.0) / 2, "no fix has a criterion", ha="center")
+            axes.text(51, 50 + min(bottom, 85.0) / 2, "no fix states a criterion", ha="center")
 
     return draw_axes((6.2, 4.0), draw)
 
@@ -141,7 +141,7 @@ def over_time_picture(comparison: Comparison, radius_m: float) -> Drawing:
 
 
 def _time_axis(comparison: Comparison) -> tuple[FloatArray, str, FloatArray]:
-    """Where views lie (N,), the name of the axis, and the edges between views (N + 1,)."""
+    """Positions of views (N,), the name of the axis, and the edges between views (N + 1,)."""
     x, name = seconds_since_first(comparison.time_ns), "time since the first view (s)"
     if not np.isfinite(x).all():
         x, name = np.arange(1.0, x.size + 1), "view, in order of the flight"
@@ -152,12 +152,12 @@ def _time_axis(comparison: Comparison) -> tuple[FloatArray, str, FloatArray]:
 
 
 def _if(label: str, shown: BoolArray) -> str:
-    """A name for the legend where there is something to name."""
+    """A label for the legend if anything is shown."""
     return label if shown.any() else "_nolegend_"
 
 
 def view_box(comparison: Comparison, radius_m: float) -> tuple[float, float, float, float]:
-    """West, east, south, north: the flight, and what of its fixes is near to it."""
+    """West, east, south, north of the flight and of the fixes near it."""
     truth, fixes = comparison.truth_en_m, comparison.fix_en_m
     low, high = truth.min(axis=0), truth.max(axis=0)
     reach = max(float((high - low).max()) * 0.35, 5 * radius_m)
@@ -219,7 +219,7 @@ def _draw_criterion(axes: "Axes", curve: CriterionCurve) -> None:
 
 
 def _draw_thresholds(axes: "Axes", metrics: Metrics) -> None:
-    """A mark and a number for each threshold; numbers keep clear of each other and of marks."""
+    """A mark and a number for each threshold, placed without overlap."""
     rows = [row for row in metrics.criteria if math.isfinite(row.accuracy)]
     rows.sort(key=lambda row: list(CURVE_STYLES).index(row.name))
     spots = [(100 * row.share_accepted, 100 * row.accuracy) for row in rows]
@@ -250,7 +250,7 @@ def _overlap(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
 
 
 def _draw_main(axes: "Axes", at: tuple[float, float], colour: str) -> None:
-    """A ring around the point, led to both axes."""
+    """A ring around the point, with lines to both axes."""
     lead: dict[str, Any] = {"color": colour, "linewidth": 1.0, "alpha": 0.55, "zorder": 1.5}
     axes.plot([at[0], at[0], 0], [0, at[1], at[1]], linestyle=(0, (1, 2)), **lead)
     ring: dict[str, Any] = {"markerfacecolor": "none", "markeredgewidth": 1.5, "zorder": 4}

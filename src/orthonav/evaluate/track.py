@@ -1,8 +1,8 @@
-"""Does a track hold? Figures of views that were followed (`ViewResult.state`), given the truth.
+"""Metrics of a tracked flight (`ViewResult.state`), given the truth.
 
-States and confidence are those of all results, errors those of the views whose true position is
-known. A view stands for the time and the way until the next one. Where times are not known or do
-not rise, figures in seconds are not defined; what is not defined is NaN, and null in JSON.
+States and confidence are those of all results, errors those of the views with a true position. A
+view represents the time and the path until the next one. Where times are unknown or do not rise,
+figures in seconds are undefined: NaN, and null in JSON.
 """
 
 import math
@@ -26,23 +26,26 @@ from orthonav.evaluate.figures import (
     share,
 )
 from orthonav.evaluate.metrics import FAR_M, Comparison
-from orthonav.publish.jsonl import STATES
+from orthonav.flight.fixes import STATES
 from orthonav.records import CONFIDENT, Fix, ViewResult
 
 RADII_M = (25.0, 60.0)
+"""Radii of accuracy: a usual and a large error of a track."""
 COURSE_M = 5.0
-"""Courses are taken between places usually at least so far apart."""
+"""Minimum distance over which a course is measured, in the median."""
 STILL_M = 1.0
-"""Between places nearer than this there is no course: the aircraft stands still."""
+"""Below this distance the aircraft is stationary and has no course."""
 BIASES = ("heading_bias_deg", "log_scale_bias", "pitch_bias_deg", "roll_bias_deg")
-"""Evidence of a track: what is learnt to be wrong with what is told."""
+"""Evidence of a track: estimated biases of the telemetry."""
 
 
 @dataclass(frozen=True)
 class After:
-    """Errors from the first confirmed fix on, in whatever state.
+    """Errors from the first confirmed fix on, in any state.
 
-    Errors are of the `n_fixes` fixes; `acc_at_m` is the share of the `n_views` views within it.
+    `n_views`, `n_fixes`: number of views, and of fixes among them.
+    `error_*_m`: of the fixes.
+    `acc_at_m`: for each radius the share of views with a fix within it.
     """
 
     n_views: int
@@ -55,30 +58,32 @@ class After:
 
 @dataclass(frozen=True)
 class Spread:
-    """Mean (bias), standard deviation and root of the mean square of signed errors, in metres."""
+    """Mean (bias), standard deviation and RMSE of signed errors in metres, over `n_views` views."""
 
     n_views: int
     mean_m: float
     std_m: float
-    rms_m: float
+    rmse_m: float
 
 
 @dataclass(frozen=True)
 class Longest:
-    """The longest of several stretches in seconds and in metres of true way: two may hold these."""
+    """The longest of several stretches in time, and in metres of the true path."""
 
     seconds_s: float
     path_m: float
 
 
 @dataclass(frozen=True)
-class Consistency:
-    """Normalized errors squared (NEES, 2 degrees of freedom, 2 expected) of the tracking views.
+class TrackConsistency:
+    """Consistency of a track: NEES (2 degrees of freedom, 2 expected) of the tracking views.
 
-    Of `n_views` with a usable covariance; `n_left_out` have none. The mean of so many independent
-    ones lies within `independent_low`, `independent_high` with a probability of 95 %; errors of
-    consecutive views are alike, so `n_effective` of them count and the wider `effective_low`,
-    `effective_high` decide on the `verdict`: "consistent", "too sure", "too cautious"; "" for none.
+    `n_views`, `n_left_out`: views with and without a usable covariance.
+    `nees_mean`: mean NEES; `nees_within_95`: share below the 95 % bound.
+    `independent_low`, `independent_high`: 95 % interval of the mean of independent views.
+    `n_effective`: effective number of views, as errors of consecutive views are correlated.
+    `effective_low`, `effective_high`: the interval for that number, which decides the verdict.
+    `verdict`: "consistent", "over-confident" or "under-confident"; "" without views.
     """
 
     n_views: int
@@ -94,12 +99,14 @@ class Consistency:
 
 
 @dataclass(frozen=True, eq=False)
-class Series:
-    """What pictures need, one entry per compared view (N,): seconds since the first view, state,
-    error ahead of and to the right of the truth, and biases by the name of their evidence.
+class TrackSeries:
+    """Time series over the compared views (N,), for figures.
 
-    `sigma_m` is the standard deviation along the longer axis of the covariance, `bound_95_m` the
-    same axis of the ellipse that holds 95 %: an error beyond it has a NEES above 5.99.
+    `seconds_s`: time since the first view; `states`: state of the track.
+    `sigma_m`: standard deviation along the longer axis of the covariance.
+    `bound_95_m`: the same axis of the 95 % ellipse; a larger error has a NEES above 5.99.
+    `along_m`, `across_m`: error ahead and to the right of the true position.
+    `biases`: estimated biases by the name of their evidence.
     """
 
     seconds_s: FloatArray
@@ -112,17 +119,22 @@ class Series:
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
-    """Figures of one track.
+class TrackMetrics:
+    """Metrics of one track.
 
-    `first_view` (1 is the first view of the flight) and `first_s` (seconds since it) are of the
-    first confirmed fix: tracking, with a position. `share_of_views` and `share_of_time` are by
-    state. `low_confidence` is the time without a confident fix (not tracking, or confidence below
-    `CONFIDENT`), over the whole flight; `low_confidence_after` from the first confirmed fix on. A
-    view is confident and wrong where its confidence is at least `CONFIDENT` or it is tracking, and
-    it errs by more than `FAR_M`, the radius asked for and the radius that its own fix states;
-    `far_m` is the larger of the first two, the least of them all. A false lock is a stretch of such
-    views. `along` and `across` are of the tracking views.
+    `n_views`, `n_compared`: all views, and those with a true position.
+    `first_view`, `first_s`: number (from 1) and time of the first confirmed fix, that is, one in
+    state tracking.
+    `after`: errors from then on.
+    `share_of_views`, `share_of_time`: by state; `n_lost`: number of times the track was lost.
+    `low_confidence`: longest stretch without a confident fix (not tracking, or confidence below
+    `CONFIDENT`); `low_confidence_after`: the same from the first confirmed fix on.
+    `far_m`: the larger of `FAR_M` and the radius of the evaluation.
+    `n_confident_wrong`: views that are tracking, or have a confidence of `CONFIDENT` or more, with
+    an error above `far_m` and above the radius that the fix states.
+    `n_false_locks`, `false_lock_longest_s`: stretches of such views.
+    `along`, `across`: errors ahead and to the right, of the tracking views.
+    `consistency`, `series`: NEES, and time series for figures.
     """
 
     n_views: int
@@ -141,14 +153,14 @@ class Track:
     false_lock_longest_s: float
     along: Spread
     across: Spread
-    consistency: Consistency
-    series: Series
+    consistency: TrackConsistency
+    series: TrackSeries
 
 
 def measure_track(
     comparison: Comparison, results: Sequence[ViewResult], radius_m: float
-) -> Track | None:
-    """All figures of a track; None where no result has a state.
+) -> TrackMetrics | None:
+    """All metrics of a track; None where no result has a state.
 
     `comparison` is made of these `results`; raises `ValueError` where it is not.
     """
@@ -161,18 +173,18 @@ def measure_track(
     states = np.array([result.state or "" for result in results])
     seconds_s = seconds_since_first([result.time_ns for result in results])
     path_m = _path_m(comparison.truth_en_m, rows, len(results))
-    sure = np.array([_confidence(result) >= CONFIDENT for result in results])
+    confident = np.array([_confidence(result) >= CONFIDENT for result in results])
     tracking = states == "tracking"
     confirmed = tracking & np.array([isinstance(result.outcome, Fix) for result in results])
     first = int(np.argmax(confirmed)) if confirmed.any() else len(results)
     far_m = max(FAR_M, radius_m)
-    wrong = (sure | tracking)[rows] & (
+    wrong = (confident | tracking)[rows] & (
         comparison.errors_m > np.fmax(far_m, comparison.own_radius_m)
     )
-    low_confidence = ~(tracking & sure)
+    low_confidence = ~(tracking & confident)
     found = first < len(results)
     series = _series(comparison, [results[i] for i in rows], seconds_s[rows])
-    return Track(
+    return TrackMetrics(
         n_views=len(results),
         n_compared=len(rows),
         first_view=first + 1 if found else math.nan,
@@ -198,7 +210,7 @@ def measure_track(
 
 
 def seconds_since_first(times_ns: Sequence[float]) -> FloatArray:
-    """(N,) seconds since the first view; all NaN where times are not known, fall or stand still.
+    """(N,) seconds since the first view; all NaN where times are unknown, fall or stand still.
 
     Nanoseconds since 1970 do not fit a float64: they are subtracted before they become one.
     """
@@ -231,12 +243,12 @@ def course_en(truth_en_m: FloatArray) -> FloatArray:
     return course
 
 
-def check_consistency(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> Consistency:
-    """Whether errors (N, 2) of consecutive views are as large as their covariances (N, 2, 2) say.
+def check_consistency(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> TrackConsistency:
+    """Consistency of errors (N, 2) of consecutive views with their covariances (N, 2, 2).
 
     n times the mean NEES of n independent views follows chi-square with 2 n degrees of freedom
     (Bar-Shalom et al., "Estimation with applications to tracking and navigation", 2001, section
-    5.4); the effective number of views takes the place of n where errors are alike.
+    5.4); for correlated errors the effective number of views replaces n.
     """
     usable = is_covariance(cov_en_m2) & np.isfinite(errors_en_m).all(axis=1)
     errors_en_m, cov_en_m2 = errors_en_m[usable], cov_en_m2[usable]
@@ -244,9 +256,10 @@ def check_consistency(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> Consist
     n_effective = effective_number(_whitened(errors_en_m, cov_en_m2))
     low, high = nees_mean_bounds(n_effective)
     found = mean(nees)
-    verdict = "too sure" if found > high else "too cautious" if found < low else "consistent"
+    verdict = "over-confident" if found > high else "consistent"
+    verdict = "under-confident" if found < low else verdict
     independent = nees_mean_bounds(nees.size)
-    return Consistency(
+    return TrackConsistency(
         n_views=nees.size,
         n_left_out=int(np.count_nonzero(~usable)),
         nees_mean=found,
@@ -261,7 +274,7 @@ def check_consistency(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> Consist
 
 
 def nees_mean_bounds(n: float) -> tuple[float, float]:
-    """Within which the mean NEES of `n` independent views lies with 95 %; NaN for none.
+    """The 95 % interval of the mean NEES of `n` independent views; NaN for none.
 
     chi2.ppf(p, 2 n) / n, and chi2.ppf(p, k) is 2 gammaincinv(k / 2, p).
     """
@@ -272,7 +285,7 @@ def nees_mean_bounds(n: float) -> tuple[float, float]:
 
 
 def effective_number(whitened: FloatArray) -> float:
-    """How many independent views tell as much of the mean NEES as these, 1 to N.
+    """The effective number of independent views for the mean NEES, 1 to N.
 
     `whitened` (N, 2) are consecutive errors in units of their covariance, two independent parts.
     If these are Gaussian with autocorrelation r_k, their squares have autocorrelation r_k^2
@@ -299,11 +312,11 @@ def _autocorrelation_time(part: FloatArray) -> float:
         products = np.fft.irfft(power)[:n] / np.arange(n, 0, -1)
     if not (np.isfinite(products).all() and products[0] > 0.0):
         return float(n)  # always the same
-    alike = np.minimum(products[1:] / products[0], 1.0)
-    ends = np.flatnonzero(alike <= 0.0)
+    correlation = np.minimum(products[1:] / products[0], 1.0)
+    ends = np.flatnonzero(correlation <= 0.0)
     stop = int(ends[0]) if ends.size else n - 1
     weights = 1.0 - np.arange(1, stop + 1) / n
-    return 1.0 + 2.0 * float(weights @ alike[:stop] ** 2)
+    return 1.0 + 2.0 * float(weights @ correlation[:stop] ** 2)
 
 
 def _confidence(result: ViewResult) -> float:
@@ -318,7 +331,7 @@ def _path_m(truth_en_m: FloatArray, rows: NDArray[np.intp], n: int) -> FloatArra
 
 
 def _until_next(values: FloatArray) -> FloatArray:
-    """How far each value is from the next; nothing for the last."""
+    """Difference from each value to the next; 0 for the last."""
     return np.append(np.diff(values), 0.0)
 
 
@@ -330,7 +343,7 @@ def _shares(states: NDArray[np.str_], weights: FloatArray) -> Mapping[str, float
 
 
 def _longest_stretch(flags: BoolArray, until: FloatArray) -> float:
-    """The most that `until` rises from the start of a run to what follows it; 0 without any."""
+    """The largest rise of `until` from the start of a run to its end; 0 without runs."""
     last = len(flags) - 1
     steps = [until[min(stop, last)] - until[start] for start, stop in runs(flags)]
     return float(max(steps, default=0.0 if np.isfinite(until).all() else math.nan))
@@ -372,7 +385,9 @@ def _whitened(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(lower, errors_en_m[..., None])[..., 0])
 
 
-def _series(comparison: Comparison, results: Sequence[ViewResult], seconds_s: FloatArray) -> Series:
+def _series(
+    comparison: Comparison, results: Sequence[ViewResult], seconds_s: FloatArray
+) -> TrackSeries:
     errors_en_m = comparison.fix_en_m - comparison.truth_en_m
     course = course_en(comparison.truth_en_m)
     right = np.stack([course[:, 1], -course[:, 0]], axis=1)
@@ -383,7 +398,7 @@ def _series(comparison: Comparison, results: Sequence[ViewResult], seconds_s: Fl
         name: frozen([result.outcome.evidence.get(name, math.nan) for result in results])
         for name in BIASES
     }
-    return Series(
+    return TrackSeries(
         seconds_s=frozen(seconds_s),
         states=tuple(result.state or "" for result in results),
         sigma_m=frozen(sigma_m),

@@ -1,7 +1,4 @@
-"""Pictures of a track.
-
-States differ by colour and by mark.
-"""
+"""Figures of a track; states differ in colour and in mark."""
 
 import math
 from collections.abc import Sequence
@@ -13,8 +10,8 @@ from orthonav.evaluate.calibration import is_covariance, nees_bound
 from orthonav.evaluate.figures import FloatArray, runs
 from orthonav.evaluate.metrics import Comparison
 from orthonav.evaluate.plots import view_box
-from orthonav.evaluate.track import Series, Track
-from orthonav.evaluate.track_report import consistency_said, spread_said
+from orthonav.evaluate.track import TrackMetrics, TrackSeries
+from orthonav.evaluate.track_report import consistency_text, spread_text
 from orthonav.records import CONFIDENT
 from orthonav.report.canvas import (
     GREY,
@@ -27,7 +24,7 @@ from orthonav.report.canvas import (
     draw_figure,
 )
 from orthonav.report.figures import Figure
-from orthonav.report.ground import Background, draw_map, map_size_in
+from orthonav.report.maps import Background, draw_map, map_size_in
 
 if TYPE_CHECKING:
     from matplotlib import figure as mpl
@@ -45,40 +42,40 @@ _LEGEND: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), 
 
 
 def track_figures(
-    comparison: Comparison, track: Track, radius_m: float, background: Background | None
+    comparison: Comparison, track: TrackMetrics, radius_m: float, background: Background | None
 ) -> list[Figure]:
-    """Track on the map; error, state and confidence; errors along and across; what was learnt."""
+    """Track on the map; error, state and confidence; signed errors; estimated biases."""
     series, found = track.series, track.consistency
     figures = [
         Figure(
             "track-map",
             f"Track of {track.n_compared} views with a true position, coloured by state",
-            "From above, north up: the true way, and where the track had the aircraft. Ellipses "
-            f"hold 95 %; a line leads to the truth from what is more than {radius_m:g} m off.",
+            "Map, north up: true path and estimated positions. Ellipses hold 95 %; lines join "
+            f"estimates with an error above {radius_m:g} m to the true position.",
             track_map_picture(comparison, series, radius_m, background),
         ),
         Figure(
             "track-error",
-            f"Error and its own bounds over time, state and confidence; {consistency_said(found)}",
-            "Error against what the track says of it (longer axis of the covariance), state, and "
-            "confidence.",
+            "Error with its stated bounds over time, state and confidence; "
+            + consistency_text(found),
+            "Error and its stated bounds (longer axis of the covariance), state, and confidence.",
             error_picture(comparison, series, radius_m),
         ),
         Figure(
             "track-ahead-and-right",
-            f"Errors ahead of the truth: {spread_said(track.along)}; "
-            f"to the right of it: {spread_said(track.across)}",
-            "Errors ahead and to the right of the truth. What is wrong with heading or mount "
-            "stays the same here, wherever the aircraft flies.",
+            f"Errors ahead of the truth: {spread_text(track.along)}; "
+            f"to the right of it: {spread_text(track.across)}",
+            "Errors ahead and to the right of the true position. Errors of heading or mount appear "
+            "as constants, whatever the course.",
             signed_picture(series),
         ),
     ]
     if any(np.isfinite(values).any() for values in series.biases.values()):
         figures.append(
             Figure(
-                "track-learnt",
-                "What the track learnt to be wrong with told heading, height and tilt, over time",
-                "What was learnt to be wrong with what is told: to be added to it.",
+                "track-biases",
+                "Estimated biases of reported heading, height and tilt over time",
+                "Estimated biases, to be added to the reported values.",
                 biases_picture(series),
             )
         )
@@ -87,7 +84,7 @@ def track_figures(
 
 def track_map_picture(
     comparison: Comparison,
-    series: Series,
+    series: TrackSeries,
     radius_m: float,
     background: Background | None = None,
 ) -> Drawing:
@@ -118,8 +115,8 @@ def track_map_picture(
 _TRUTH: dict[str, Any] = {"color": TRUTH, "linewidth": 1.4, "markersize": 2.5, "zorder": 4}
 
 
-def error_picture(comparison: Comparison, series: Series, radius_m: float) -> Drawing:
-    """Error with 1 sigma and 95 % of its own, state as a band, confidence; one time axis."""
+def error_picture(comparison: Comparison, series: TrackSeries, radius_m: float) -> Drawing:
+    """Error with its stated 1 sigma and 95 % bounds, state and confidence over time."""
 
     def draw(figure: "mpl.Figure") -> None:
         above, band, below = figure.subplots(3, 1, sharex=True, height_ratios=(6, 0.5, 2))
@@ -136,8 +133,8 @@ def error_picture(comparison: Comparison, series: Series, radius_m: float) -> Dr
     return draw_figure((10.5, 5.2), draw)
 
 
-def signed_picture(series: Series) -> Drawing:
-    """Errors ahead of and to the right of the truth over time; the scale is that of tracking."""
+def signed_picture(series: TrackSeries) -> Drawing:
+    """Errors ahead and to the right of the truth over time, scaled to the tracking views."""
 
     def draw(figure: "mpl.Figure") -> None:
         parts = figure.subplots(2, 1, sharex=True)
@@ -147,7 +144,7 @@ def signed_picture(series: Series) -> Drawing:
         scale_from = signed[:, tracking] if np.isfinite(signed[:, tracking]).any() else signed
         sizes = np.abs(scale_from[np.isfinite(scale_from)])
         reach = 1.15 * float(max([1.0, *sizes]))
-        for axes, values, said in zip(parts, signed, ("ahead (m)", "right (m)"), strict=True):
+        for axes, values, label in zip(parts, signed, ("ahead (m)", "right (m)"), strict=True):
             axes.axhline(0.0, color=GREY, linewidth=1)
             within = np.where(np.abs(values) <= reach, values, math.nan)  # no lines to far away
             axes.plot(x, within, color="#BBBBBB", linewidth=0.9)
@@ -159,15 +156,15 @@ def signed_picture(series: Series) -> Drawing:
                 mean = float(known.mean())
                 axes.axhline(mean, color=RIGHT, linestyle=(0, (4, 3)), linewidth=1.2)
                 axes.set_title(f"tracking: mean {mean:+.1f} m", fontsize=9, color=SOFT)
-            axes.set(ylim=(-reach, reach), ylabel=said)
+            axes.set(ylim=(-reach, reach), ylabel=label)
         parts[1].set(xlabel=name)
         parts[1].set_xlim(*_limits(x))
 
     return draw_figure((6.2, 4.6), draw)
 
 
-def biases_picture(series: Series) -> Drawing:
-    """What was learnt to be wrong with heading, height and tilt, over time; only what is there."""
+def biases_picture(series: TrackSeries) -> Drawing:
+    """Estimated biases of heading, height and tilt over time, as far as they are known."""
     scale = 100.0 * np.expm1(np.clip(series.biases["log_scale_bias"], -5.0, 5.0))
     tilt = {
         "pitch": series.biases["pitch_bias_deg"],
@@ -183,11 +180,11 @@ def biases_picture(series: Series) -> Drawing:
     def draw(figure: "mpl.Figure") -> None:
         parts = np.atleast_1d(np.asarray(figure.subplots(len(panels), 1, sharex=True)))
         x, name = _axis(series)
-        for axes, (said, curves) in zip(parts, panels, strict=True):
+        for axes, (label, curves) in zip(parts, panels, strict=True):
             axes.axhline(0.0, color=GREY, linewidth=1)
-            for (label, values), colour in zip(curves.items(), (RIGHT, WRONG), strict=False):
-                axes.plot(x, values, ".-", color=colour, linewidth=1.2, markersize=3, label=label)
-            axes.set(ylabel=said)
+            for (name, values), colour in zip(curves.items(), (RIGHT, WRONG), strict=False):
+                axes.plot(x, values, ".-", color=colour, linewidth=1.2, markersize=3, label=name)
+            axes.set(ylabel=label)
             if len(curves) > 1:
                 axes.legend(ncols=2, loc="best", fontsize=8)
         parts[-1].set(xlabel=name)
@@ -198,7 +195,7 @@ def biases_picture(series: Series) -> Drawing:
 
 
 def _draw_ellipses(
-    axes: "Axes", comparison: Comparison, series: Series, box: tuple[float, ...]
+    axes: "Axes", comparison: Comparison, series: TrackSeries, box: tuple[float, ...]
 ) -> None:
     """The 95 % ellipses of up to `MOST_ELLIPSES` estimates, evenly along the flight."""
     from matplotlib.patches import Ellipse
@@ -218,7 +215,7 @@ def _draw_ellipses(
 
 
 def _draw_errors(
-    axes: "Axes", x: FloatArray, errors_m: FloatArray, series: Series, radius_m: float
+    axes: "Axes", x: FloatArray, errors_m: FloatArray, series: TrackSeries, radius_m: float
 ) -> None:
     from matplotlib.ticker import LogLocator
 
@@ -243,7 +240,7 @@ def _draw_errors(
 
 
 def _draw_states(axes: "Axes", x: FloatArray, states: Sequence[str]) -> None:
-    """A band of colour per state, from each view to the next; named where it is wide enough."""
+    """A coloured band per state, labelled where it is wide enough."""
     edges = np.append(x, _limits(x)[1])
     whole = float(edges[-1] - edges[0])
     for state, (colour, _) in STATE_STYLES.items():
@@ -257,14 +254,14 @@ def _draw_states(axes: "Axes", x: FloatArray, states: Sequence[str]) -> None:
     axes.grid(visible=False)
 
 
-def _axis(series: Series) -> tuple[FloatArray, str]:
-    """Where views lie on the time axis and its name; their number where times are not known."""
+def _axis(series: TrackSeries) -> tuple[FloatArray, str]:
+    """Times of the views and the name of the axis; their numbers where times are unknown."""
     if np.isfinite(series.seconds_s).all():
         return series.seconds_s, "time since the first view (s)"
-    return np.arange(1.0, len(series.states) + 1), "view (times are not known, or do not rise)"
+    return np.arange(1.0, len(series.states) + 1), "view (times are unknown, or do not rise)"
 
 
 def _limits(x: FloatArray) -> tuple[float, float]:
-    """Ends of the axis: room for what the last view stands for, and some for a single view."""
+    """Ends of the axis, with room after the last view."""
     step = float(np.median(np.diff(x))) if x.size > 1 else 1.0
     return float(x[0]), float(x[-1]) + max(step, 1e-3)

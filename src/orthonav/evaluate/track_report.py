@@ -1,4 +1,4 @@
-"""How a track is told: its figures in words and as JSON values."""
+"""Metrics of a track as text and as JSON values."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -7,19 +7,20 @@ from typing import Any
 from orthonav.evaluate.calibration import nees_bound
 from orthonav.evaluate.figures import FloatArray, or_none
 from orthonav.evaluate.metrics import radius_key
-from orthonav.evaluate.track import Consistency, Longest, Series, Spread, Track
-from orthonav.publish.jsonl import STATES
+from orthonav.evaluate.track import Longest, Spread, TrackConsistency, TrackMetrics, TrackSeries
+from orthonav.flight.fixes import STATES
 from orthonav.report.numbers import percent_text
 
 
-def track_rows(track: Track) -> tuple[tuple[str, str], ...]:
-    """The figures of a track as names and what is said of them."""
+def track_rows(track: TrackMetrics) -> tuple[tuple[str, str], ...]:
+    """The metrics of a track as names and texts."""
     after, far = track.after, f"{track.far_m:g} m"
     within = ", ".join(f"{percent_text(s)} within {r:g} m" for r, s in after.acc_at_m.items())
     found = "never"
     if math.isfinite(track.first_view):
-        found = f"at view {track.first_view:.0f} of {track.n_views}, {_s(track.first_s)} after the "
-        found += "first"
+        found = (
+            f"view {track.first_view:.0f} of {track.n_views}, {_s(track.first_s)} after the first"
+        )
     return (
         ("first confirmed fix", found),
         (
@@ -27,54 +28,55 @@ def track_rows(track: Track) -> tuple[tuple[str, str], ...]:
             f"median {_m(after.error_median_m)}, 95 % {_m(after.error_p95_m)}, "
             f"largest {_m(after.error_max_m)}; of {after.n_views} views {within}"
             if after.n_views
-            else "not known",
+            else "unknown",
         ),
-        ("states", _states_said(track)),
+        ("states", _states_text(track)),
         (
             "longest without a confident fix",
-            f"{_longest_said(track.low_confidence)}; from the first confirmed fix on "
-            f"{_longest_said(track.low_confidence_after)}",
+            f"{_longest_text(track.low_confidence)}; from the first confirmed fix on "
+            f"{_longest_text(track.low_confidence_after)}",
         ),
         (
             "false locks",
             f"{track.n_false_locks}, the longest {_s(track.false_lock_longest_s)}; "
-            f"{track.n_confident_wrong} views sure and more than {far} (and their own radius) off",
+            f"{track.n_confident_wrong} confident or tracking views wrong by more than {far} and "
+            "their own radius",
         ),
-        ("ahead of the truth", spread_said(track.along)),
-        ("right of the truth", spread_said(track.across)),
-        ("covariance", consistency_said(track.consistency)),
+        ("ahead of the truth", spread_text(track.along)),
+        ("right of the truth", spread_text(track.across)),
+        ("covariance", consistency_text(track.consistency)),
     )
 
 
-def track_lines(track: Track, name: str = "") -> list[str]:
+def track_lines(track: TrackMetrics, name: str = "") -> list[str]:
     """The same for a terminal."""
     head = f"track of {' '.join(name.split())}:" if name else "track:"
-    return [head, *(f"  {key}: {said}" for key, said in track_rows(track))]
+    return [head, *(f"  {name}: {text}" for name, text in track_rows(track))]
 
 
-def consistency_said(found: Consistency) -> str:
-    """Whether a track is as good as its covariance says."""
+def consistency_text(found: TrackConsistency) -> str:
+    """Consistency of a track in a sentence."""
     if not found.n_views:
-        return "not known, no tracking view has a usable one and a true position"
-    left_out = f"; {found.n_left_out} have no usable one" if found.n_left_out else ""
+        return "unknown, no tracking view has a usable one and a true position"
+    left_out = f"; {found.n_left_out} without a usable one" if found.n_left_out else ""
     return (
         f"{found.verdict}: NEES of {found.n_views} tracking views has mean {found.nees_mean:.3g} "
-        f"(2 expected; 95 % lie within {found.effective_low:.2f} to {found.effective_high:.2f}, as "
-        f"errors of neighbours are alike and count as {found.n_effective:.0f} independent ones; "
-        f"were all independent, {found.independent_low:.2f} to {found.independent_high:.2f}); "
+        f"(2 expected; 95 % interval {found.effective_low:.2f} to {found.effective_high:.2f} for "
+        f"{found.n_effective:.0f} effective views, as errors are correlated; for independent views "
+        f"{found.independent_low:.2f} to {found.independent_high:.2f}); "
         f"{percent_text(found.nees_within_95)} below {nees_bound(0.95):.2f} (95 % expected)"
         f"{left_out}"
     )
 
 
-def track_to_json(track: Track) -> dict[str, object]:
-    """`track` as values for strict JSON, units in the names; what is not defined becomes None.
+def track_to_json(track: TrackMetrics) -> dict[str, object]:
+    """`track` as values for strict JSON, units in the names; undefined ones become None.
 
     `over_time` has one value per compared view, rounded to milliseconds and millimetres.
     """
     values: dict[str, Any] = {}
     for name, value in vars(track).items():
-        if isinstance(value, Series):
+        if isinstance(value, TrackSeries):
             names = ("seconds_s", "sigma_m", "bound_95_m", "along_m", "across_m")
             values["over_time"] = {each: _rounded(getattr(value, each)) for each in names}
         elif isinstance(value, Mapping):
@@ -89,10 +91,10 @@ def track_to_json(track: Track) -> dict[str, object]:
     return values
 
 
-def tracks_to_json(tracks: Sequence[Track]) -> dict[str, object]:
-    """What of several tracks adds up: counts, shares of views, and the worst of each.
+def tracks_to_json(tracks: Sequence[TrackMetrics]) -> dict[str, object]:
+    """Sums, shares of views and maxima over several tracks.
 
-    Medians, biases and consistency are left to the flights.
+    Medians, biases and consistency are given per flight only.
     """
     n_after = sum(track.after.n_views for track in tracks)
     known = [track.after for track in tracks if track.after.n_views]
@@ -125,24 +127,24 @@ def tracks_to_json(tracks: Sequence[Track]) -> dict[str, object]:
     }
 
 
-def _states_said(track: Track) -> str:
+def _states_text(track: TrackMetrics) -> str:
     by_view = ", ".join(f"{name} {percent_text(track.share_of_views[name])}" for name in STATES)
     by_time = ", ".join(percent_text(track.share_of_time[name]) for name in STATES)
     lost = f"lost {track.n_lost} time{'s' * (track.n_lost != 1)}"
     return f"{by_view} of views; {by_time} of the time; {lost}"
 
 
-def _longest_said(longest: Longest) -> str:
+def _longest_text(longest: Longest) -> str:
     return f"{_s(longest.seconds_s)}, {_m(longest.path_m)}"
 
 
-def spread_said(spread: Spread) -> str:
-    """Bias and spread of signed errors."""
+def spread_text(spread: Spread) -> str:
+    """Bias and spread of signed errors in a sentence."""
     if not spread.n_views:
-        return "not known"
+        return "unknown"
     return (
         f"mean {spread.mean_m:+.1f} m, standard deviation {spread.std_m:.1f} m, "
-        f"RMS {spread.rms_m:.1f} m of {spread.n_views} tracking views"
+        f"RMSE {spread.rmse_m:.1f} m of {spread.n_views} tracking views"
     )
 
 
@@ -155,7 +157,7 @@ def _s(value: float) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers for strict JSON; no word for no verdict."""
+    """A value for strict JSON."""
     if isinstance(value, float):
         return or_none(value)
     return None if value == "" else value
@@ -166,5 +168,5 @@ def _rounded(values: FloatArray) -> list[float | None]:
 
 
 def _most(values: Iterable[float]) -> float | None:
-    """The largest of what is known."""
+    """The largest known value; None without any."""
     return max((value for value in values if math.isfinite(value)), default=None)

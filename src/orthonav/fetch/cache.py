@@ -1,8 +1,8 @@
-"""What was fetched, on disk, so that a run that was killed fetches only what is missing.
+"""Answers on disk, so that an interrupted run resumes with the cells that are missing.
 
 One file per cell, named by a hash of its address without keys. Each is written under a temporary
-name and renamed, and its content is checked when it is read: what a kill or a full disk left
-broken counts as missing.
+name and renamed, and its checksum is verified when it is read: a file that a kill or a full disk
+left incomplete counts as missing.
 """
 
 import hashlib
@@ -17,22 +17,22 @@ from orthonav.errors import OutputError
 _MAGIC = b"ORTHONAV-CELL-1\n"
 _MARKER = "orthonav-fetch-cache"
 _DIGEST = 32
-_ABSENT, _PICTURE = b"-", b"+"
+_ABSENT, _IMAGE = b"-", b"+"
 
 
 @dataclass(frozen=True, eq=False)
-class Entry:
-    """A stored answer: `body`, or None where the service has nothing there; `digest` of it."""
+class CachedCell:
+    """A stored cell: `body`, or None where the service has no imagery; `digest` of it."""
 
     body: bytes | None
     digest: bytes
 
 
 class FileCache:
-    """Answers by address, in a folder; several threads may use it."""
+    """Cells by address, in a folder; several threads may use it."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises `OutputError` where the folder cannot be made or holds something else."""
+        """Raises `OutputError` where the folder cannot be created or holds other files."""
         self.folder = Path(folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -40,7 +40,7 @@ class FileCache:
             if not marker.exists():
                 if any(self.folder.iterdir()):
                     raise OutputError(
-                        f"cache folder holds something else; name an empty one: {self.folder}"
+                        f"cache folder holds other files; choose an empty one: {self.folder}"
                     )
                 marker.write_text("Answers of services, kept by orthonav fetch.\n")
         except OutputError:
@@ -50,8 +50,8 @@ class FileCache:
                 f"cache folder cannot be used ({error.strerror or error}): {self.folder}"
             ) from error
 
-    def read(self, address: str) -> Entry | None:
-        """The stored answer, or None where there is none or it is broken."""
+    def read(self, address: str) -> CachedCell | None:
+        """The stored cell, or None where there is none or it is damaged."""
         path = self._path(address)
         try:
             data = path.read_bytes()
@@ -64,14 +64,14 @@ class FileCache:
             data[head:],
         )
         whole = data[: len(_MAGIC)] == _MAGIC and hashlib.sha256(kind + body).digest() == digest
-        if not whole or kind not in (_ABSENT, _PICTURE):
+        if not whole or kind not in (_ABSENT, _IMAGE):
             path.unlink(missing_ok=True)
             return None
-        return Entry(None if kind == _ABSENT else body, digest)
+        return CachedCell(None if kind == _ABSENT else body, digest)
 
     def write(self, address: str, body: bytes | None) -> None:
-        """Store an answer. Raises `OutputError` where the disk refuses."""
-        kind = _ABSENT if body is None else _PICTURE
+        """Store a cell. Raises `OutputError` where it cannot be written."""
+        kind = _ABSENT if body is None else _IMAGE
         digest = hashlib.sha256(kind + (body or b"")).digest()
         path = self._path(address)
         temporary = path.with_name(f"{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
@@ -82,11 +82,11 @@ class FileCache:
         except OSError as error:
             temporary.unlink(missing_ok=True)
             raise OutputError(
-                f"cannot keep what was fetched ({error.strerror or error}): {self.folder}"
+                f"cannot store a fetched cell ({error.strerror or error}): {self.folder}"
             ) from error
 
     def remove(self) -> None:
-        """Remove the folder and all that is in it."""
+        """Remove the folder and its content."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _path(self, address: str) -> Path:

@@ -1,43 +1,51 @@
-"""Asking over HTTP: politely, with limits, with keys put in only when sending.
+"""HTTP requests with rate limits, size limits and repetition; keys are inserted on sending only.
 
-An error never holds what a library says, for libraries quote whole addresses, keys included.
+Errors never quote messages of the HTTP library, because those contain whole addresses with keys.
 """
 
+import gzip
+import io
 import logging
+import re
 import threading
 import time
 import zlib
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 from urllib.parse import quote, urljoin
 
 from orthonav import __version__
-from orthonav.errors import FetchError, MissingExtraError
-from orthonav.fetch.politeness import Limits, Stopped, Turns, backoff_s, retry_after_s
+from orthonav.errors import FetchError
+from orthonav.extras import missing_extra
+from orthonav.fetch.politeness import (
+    RETRY_STATUS,
+    RequestLimits,
+    Stopped,
+    Turns,
+    retry_after_s,
+    retry_policy,
+)
 from orthonav.fetch.urls import KEY, Secret, checked_url, host_of, origin_of, shown
 
 try:
     import requests
     import urllib3
 except ImportError as error:  # pragma: no cover - depends on the installation
-    raise MissingExtraError(
-        "fetching imagery needs requests; install it with: pip install 'orthonav[geo,fetch]'"
-    ) from error
+    raise missing_extra("fetching imagery", "fetch", "requests", error) from error
 
 USER_AGENT = f"orthonav/{__version__} (fetches orthophotos for one area; +orthonav fetch)"
-AGAIN = frozenset({408, 425, 429, 500, 502, 503, 504})
 REDIRECTS = frozenset({301, 302, 303, 307, 308})
 _CHUNK = 64 * 1024
-_GZIP = 16 + zlib.MAX_WBITS
-_TOLD_CHARACTERS = 300
+_EXCERPT_CHARACTERS = 300
+_CONTENT_RANGE = re.compile(r"bytes (\d+)-(\d+)/(\d+)")
 log = logging.getLogger(__name__)
-Judged = TypeVar("Judged")
+Checked = TypeVar("Checked")
 
 
 @dataclass(frozen=True, eq=False)
-class Reply:
+class HttpReply:
     """An answer: `status`, `headers` by lower-case name, `body` unpacked, `url` without keys."""
 
     url: str
@@ -45,14 +53,17 @@ class Reply:
     headers: Mapping[str, str]
     body: bytes
 
-    @property
-    def kind(self) -> str:
-        """Media type that the answer claims, such as `image/jpeg`; empty where it claims none."""
-        return self.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+class ByteRange(NamedTuple):
+    """Part of a file on a server, the file's size in bytes, and the version the server names."""
+
+    data: bytes
+    size: int
+    version: str
 
 
 class BadReplyError(FetchError):
-    """An answer that is not what was asked for; asked again where `again`."""
+    """An answer that is not what was requested; the request is repeated where `again`."""
 
     def __init__(self, message: str, *, again: bool = True) -> None:
         super().__init__(message)
@@ -60,18 +71,19 @@ class BadReplyError(FetchError):
 
 
 class Client:
-    """Asks services for all threads of a run; close it when done.
+    """Sends the requests of all threads of a run; close it when done.
 
-    `secrets` are keys by placeholder, each for one origin. `received_bytes` and `requests` count.
+    `secrets` are keys by placeholder, each for one origin. `received_bytes` counts bodies as sent.
     """
 
-    def __init__(self, limits: Limits | None = None, secrets: tuple[Secret, ...] = ()) -> None:
-        # Its debug lines hold whole addresses.
+    def __init__(
+        self, limits: RequestLimits | None = None, secrets: tuple[Secret, ...] = ()
+    ) -> None:
+        # Debug messages of urllib3 contain whole addresses.
         logging.getLogger("urllib3").setLevel(logging.WARNING)
-        self.limits = limits or Limits()
+        self.limits = limits or RequestLimits()
         self.turns = Turns(self.limits)
         self.received_bytes = 0
-        self.requests = 0
         self._secrets = list(secrets)
         self._local = threading.local()
         self._sessions: list[Any] = []
@@ -92,7 +104,7 @@ class Client:
             self._sessions.clear()
 
     def add_secret(self, secret: Secret) -> None:
-        """A key that became known on the way, such as a signature that a service gave."""
+        """Add a key, such as a signature issued by a service; it replaces one for the same use."""
         with self._lock:
             self._secrets = [
                 known
@@ -111,74 +123,91 @@ class Client:
     def get(
         self,
         url: str,
-        judge: Callable[[Reply], Judged],
+        check: Callable[[HttpReply], Checked],
         *,
         headers: Mapping[str, str] | None = None,
         max_bytes: int | None = None,
         json: Any = None,
-    ) -> Judged:
-        """What `judge` makes of the answer. With `json` that is sent (POST).
+    ) -> Checked:
+        """The result of `check` on the answer. `json` is sent with POST.
 
-        Asks again, with growing pauses, after answers that may pass (429, 5xx), broken
-        connections, and where `judge` raises `BadReplyError` that may be asked again. Raises
-        `FetchError` in the end, and `Stopped` when the run is ended.
+        The request is repeated, with growing pauses, after a temporary status (429, 5xx), a broken
+        connection, and where `check` raises `BadReplyError` with `again`. Raises `FetchError` at
+        last, and `Stopped` when the run is ended.
         """
         checked_url(url)
-        last = FetchError("never asked")
-        for attempt in range(max(1, self.limits.attempts)):
-            if attempt:
-                log.info("asked again (%s): %s", last, self.redacted(shown(url)))
-                self.turns.sleep(backoff_s(self.limits, attempt))
+        retry = retry_policy(self.limits)
+        while True:
             try:
-                reply = self._ask(url, dict(headers or {}), max_bytes, json)
+                reply = self._follow(url, dict(headers or {}), max_bytes, json)
                 self._refuse_status(reply)
-                return judge(reply)
+                return check(reply)
             except BadReplyError as error:
-                last = error
-                if not error.again:
-                    break
-        raise FetchError(f"{self.redacted(str(last))}: {self.redacted(shown(url))}") from None
+                where = self.redacted(shown(url))
+                if not error.again or retry.total == 0:
+                    raise FetchError(f"{self.redacted(str(error))}: {where}") from None
+                log.info("repeated after a failure (%s): %s", error, where)
+                retry = retry.increment(error=error)
+                self.turns.sleep(retry.get_backoff_time())
 
-    def _refuse_status(self, reply: Reply) -> None:
-        """Raise `BadReplyError` where the answer asks to come again; note when."""
-        if reply.status not in AGAIN:
+    def get_range(self, url: str, start: int, end: int) -> ByteRange:
+        """Bytes `start` to `end` (excluded) of a file, fewer at its end. Raises as `get` does."""
+
+        def check(reply: HttpReply) -> ByteRange:
+            if reply.status != 206:
+                raise BadReplyError(
+                    f"HTTP {reply.status} ({excerpt(reply)})", again=reply.status >= 500
+                )
+            found = _CONTENT_RANGE.fullmatch(reply.headers.get("content-range", "").strip())
+            if not found:
+                raise BadReplyError("range without Content-Range")
+            first, last, size = (int(number) for number in found.groups())
+            if first != start or not last + 1 - first == min(end, size) - start == len(reply.body):
+                raise BadReplyError("another range than requested")
+            version = reply.headers.get("etag") or reply.headers.get("last-modified", "")
+            return ByteRange(reply.body, size, version)
+
+        headers = {"Range": f"bytes={start}-{end - 1}", "Accept-Encoding": "identity"}
+        return self.get(url, check, headers=headers, max_bytes=end - start + 4096)
+
+    def _refuse_status(self, reply: HttpReply) -> None:
+        """Raise `BadReplyError` for a temporary status; a Retry-After holds back the host."""
+        if reply.status not in RETRY_STATUS:
             return
         seconds = retry_after_s(reply.headers.get("retry-after"), self.limits)
         if seconds is not None:
             self.turns.pause(host_of(reply.url), seconds)
         raise BadReplyError(f"HTTP {reply.status}")
 
-    def _ask(self, url: str, headers: dict[str, str], max_bytes: int | None, json: Any) -> Reply:
+    def _follow(
+        self, url: str, headers: dict[str, str], max_bytes: int | None, json: Any
+    ) -> HttpReply:
         """One answer, redirects followed. Raises `BadReplyError`."""
         deadline_s = time.monotonic() + self.limits.total_s
         for _ in range(self.limits.max_redirects + 1):
             self.turns.wait(host_of(url))
-            with self._lock:
-                self.requests += 1
-            reply = self._once(url, headers, max_bytes or self.limits.max_bytes, json, deadline_s)
+            reply = self._send(url, headers, max_bytes or self.limits.max_bytes, json, deadline_s)
             if reply.status not in REDIRECTS:
                 return reply
-            where = self.redacted(reply.headers.get("location", ""))
-            if not where:
-                raise BadReplyError(f"HTTP {reply.status} without a place", again=False)
-            url = self._moved(url, where)
+            location = self.redacted(reply.headers.get("location", ""))
+            if not location:
+                raise BadReplyError(f"HTTP {reply.status} without a Location", again=False)
+            url = self._redirected(url, location)
         raise BadReplyError("too many redirects", again=False)
 
-    def _moved(self, url: str, where: str) -> str:
-        """Where a redirect leads. Raises `BadReplyError` where it would lose safety or a key."""
+    def _redirected(self, url: str, location: str) -> str:
+        """Target of a redirect. requests would follow with the key and to any scheme."""
         try:
-            moved = checked_url(urljoin(url, where))
+            target = checked_url(urljoin(url, location))
         except FetchError as error:
-            raise BadReplyError(
-                f"redirected to what is not fetched ({error})", again=False
-            ) from None
-        if url.startswith("https://") and not moved.startswith("https://"):
-            raise BadReplyError("redirected from https to http", again=False)
-        return moved
+            raise BadReplyError(f"invalid redirect ({error})", again=False) from None
+        if url.startswith("https://") and not target.startswith("https://"):
+            raise BadReplyError("redirect from https to http", again=False)
+        return target
 
-    def _once(
+    def _send(
         self, url: str, headers: dict[str, str], max_bytes: int, json: Any, deadline_s: float
-    ) -> Reply:
+    ) -> HttpReply:
         try:
             response = self._session().request(
                 "GET" if json is None else "POST",
@@ -192,35 +221,35 @@ class Client:
             with closing(response):
                 if "Range" in headers and response.status_code == 200:
                     raise BadReplyError("server sends whole files only, no ranges", again=False)
-                body = self._body(response, max_bytes, deadline_s)
+                packed = self._body(response, max_bytes, deadline_s)
+                body = _unpacked(packed, response.headers.get("Content-Encoding", ""), max_bytes)
                 plain = {name.lower(): value for name, value in response.headers.items()}
-                return Reply(url, response.status_code, plain, body)
+                return HttpReply(url, response.status_code, plain, body)
         except (requests.RequestException, urllib3.exceptions.HTTPError, OSError) as error:
             if isinstance(error, FetchError):
                 raise
-            raise BadReplyError(_broken(error)) from None
+            raise BadReplyError(_kind_of_failure(error)) from None
 
     def _body(self, response: Any, max_bytes: int, deadline_s: float) -> bytes:
-        """The body, unpacked, at most `max_bytes`. Raises `BadReplyError`."""
-        claimed = response.headers.get("Content-Length", "")
-        if claimed.isdecimal() and int(claimed) > max_bytes:
-            raise BadReplyError(f"body of {claimed} bytes is over the limit", again=False)
-        unpacker = _Unpacker(response.headers.get("Content-Encoding", ""), max_bytes)
-        while True:
+        """The body as sent, at most `max_bytes`. Raises `BadReplyError`."""
+        length = response.headers.get("Content-Length", "")
+        if length.isdecimal() and int(length) > max_bytes:
+            raise BadReplyError(f"body of {length} bytes is over the limit", again=False)
+        body = bytearray()
+        while part := response.raw.read1(_CHUNK, decode_content=False):
+            body += part
+            with self._lock:
+                self.received_bytes += len(part)
+            if len(body) > max_bytes:
+                raise _over(max_bytes)
             if self.turns.stop.is_set():
                 raise Stopped
             if time.monotonic() > deadline_s:
                 raise BadReplyError(f"took longer than {self.limits.total_s:g} s")
-            part = response.raw.read1(_CHUNK, decode_content=False)
-            if not part:
-                break
-            with self._lock:
-                self.received_bytes += len(part)
-            unpacker.add(part)
-        return unpacker.whole()
+        return bytes(body)
 
     def _with_keys(self, url: str) -> str:
-        """The address as it is sent. Raises `FetchError` where a key would leave its origin."""
+        """The address as sent. Raises `BadReplyError` where a key would leave its origin."""
         for secret in self._secrets:
             if secret.placeholder in url and secret.origin == origin_of(url):
                 value = quote(secret.value, safe="") if secret.placeholder == KEY else secret.value
@@ -237,79 +266,55 @@ class Client:
             session = requests.Session()
             session.headers["User-Agent"] = USER_AGENT
             session.headers["Accept-Encoding"] = "gzip"
-            session.auth = _no_auth  # else keys of ~/.netrc would be sent
-            session.mount("https://", requests.adapters.HTTPAdapter(max_retries=0))
-            session.mount("http://", requests.adapters.HTTPAdapter(max_retries=0))
+            session.auth = _no_auth  # otherwise passwords of ~/.netrc would be sent
             self._local.session = session
             with self._lock:
                 self._sessions.append(session)
         return session
 
 
-class _Unpacker:
-    """A body as it comes, unpacked where it is packed with gzip, up to a limit.
-
-    urllib3 takes half a packed body for a whole one, so it is done here.
-    """
-
-    def __init__(self, packing: str, max_bytes: int) -> None:
-        packing = packing.strip().lower()
-        if packing not in ("", "identity", "gzip", "x-gzip"):
-            raise BadReplyError(f"body is packed otherwise than asked for ({packing[:20]})")
-        self._gzip = zlib.decompressobj(_GZIP) if "gzip" in packing else None
-        self._max_bytes = max_bytes
-        self._size = 0
-        self._parts: list[bytes] = []
-
-    def add(self, part: bytes) -> None:
-        """Take the next part as it came. Raises `BadReplyError`."""
-        while part:
-            if self._gzip is None:
-                self._keep(part)
-                return
-            if self._gzip.eof:  # another member, which gzip allows
-                self._gzip = zlib.decompressobj(_GZIP)
-            try:
-                self._keep(self._gzip.decompress(part, self._max_bytes - self._size + 1))
-            except zlib.error:
-                raise BadReplyError("the answer's packing is broken") from None
-            part = self._gzip.unconsumed_tail or self._gzip.unused_data
-
-    def whole(self) -> bytes:
-        """The body. Raises `BadReplyError` where it ended too early."""
-        if self._gzip is not None and not self._gzip.eof:
-            raise BadReplyError("the answer was cut short")
-        return b"".join(self._parts)
-
-    def _keep(self, part: bytes) -> None:
-        self._size += len(part)
-        if self._size > self._max_bytes:
-            raise BadReplyError(f"body is over the limit of {self._max_bytes} bytes", again=False)
-        self._parts.append(part)
+def _unpacked(body: bytes, encoding: str, max_bytes: int) -> bytes:
+    """The body without its gzip packing. urllib3 accepts half a packed body as a whole one."""
+    encoding = encoding.strip().lower()
+    if encoding in ("", "identity"):
+        return body
+    if encoding not in ("gzip", "x-gzip"):
+        raise BadReplyError(f"body is packed with {encoding[:20]}, which was not requested")
+    try:
+        with gzip.GzipFile(fileobj=io.BytesIO(body)) as stream:
+            plain = stream.read(max_bytes + 1)
+    except (OSError, EOFError, zlib.error):
+        raise BadReplyError("gzip packing of the answer is broken or cut short") from None
+    if len(plain) > max_bytes:
+        raise _over(max_bytes)
+    return plain
 
 
-def told(reply: Reply) -> str:
-    """The beginning of what a service says in words, on one line, for an error."""
-    text = reply.body[: 4 * _TOLD_CHARACTERS].decode("utf-8", errors="replace")
+def _over(max_bytes: int) -> BadReplyError:
+    return BadReplyError(f"body is over the limit of {max_bytes} bytes", again=False)
+
+
+def excerpt(reply: HttpReply) -> str:
+    """The beginning of an answer as text on one line, for an error."""
+    text = reply.body[: 4 * _EXCERPT_CHARACTERS].decode("utf-8", errors="replace")
     words = " ".join("".join(c if c.isprintable() else " " for c in text).split())
-    return words[:_TOLD_CHARACTERS]
+    return words[:_EXCERPT_CHARACTERS]
 
 
 def _no_auth(request: Any) -> Any:
     return request
 
 
-def _broken(error: Exception) -> str:
-    """What broke, by kind only."""
+def _kind_of_failure(error: Exception) -> str:
+    """The failure by kind only, without the library's text."""
     kinds: list[tuple[tuple[type[BaseException], ...], str]] = [
-        ((requests.exceptions.SSLError, urllib3.exceptions.SSLError), "no safe connection (TLS)"),
+        ((requests.exceptions.SSLError, urllib3.exceptions.SSLError), "no secure connection (TLS)"),
         ((requests.exceptions.ConnectTimeout,), "no connection in time"),
         (
             (requests.exceptions.Timeout, urllib3.exceptions.TimeoutError, TimeoutError),
             "no answer in time",
         ),
         ((requests.exceptions.ProxyError,), "the proxy refused"),
-        ((urllib3.exceptions.IncompleteRead,), "the answer was cut short"),
         ((urllib3.exceptions.ProtocolError,), "the answer was cut short"),
     ]
     for classes, words in kinds:

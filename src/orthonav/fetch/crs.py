@@ -1,4 +1,4 @@
-"""Coordinate systems: their names in documents, their axes, and their scale on the ground."""
+"""Coordinate systems: names in documents, axis order, and scale on the ground."""
 
 import math
 import re
@@ -14,6 +14,7 @@ from orthonav.geo.frames import LocalFrame
 MERCATOR_HALF_M = math.pi * 6378137.0
 """Half the width of the square of EPSG:3857, metres of that projection."""
 METRES_PER_DEGREE = 6378137.0 * math.pi / 180
+"""At the equator of WGS84, as scale denominators are defined (OGC 07-057r7, 6.1)."""
 
 
 def ground_scale(crs: str, frame: LocalFrame) -> tuple[float, float]:
@@ -70,19 +71,19 @@ def epsg_name(crs: str) -> str:
 
 
 def swapped_corner(crs: str) -> Callable[[float], bool]:
-    """Whether the first number of a corner is the northing or latitude, by the first number."""
+    """Predicate on the first number of a corner: whether it is the northing or latitude."""
     if crs.endswith(("CRS84", "CRS:84")):
         return lambda first: False
     name = epsg_name(crs)
     if not north_first(name):
         return lambda first: False
     if pyproj.CRS.from_user_input(name).is_geographic:
-        return lambda first: abs(first) <= 90  # some services put the longitude first all the same
+        return lambda first: abs(first) <= 90  # some services put the longitude first nevertheless
     return lambda first: crs.startswith("urn:") or crs.startswith("http")
 
 
 def metres_per_unit(crs: str) -> float:
-    """What a unit of a coordinate system counts as, for scale denominators (07-057r7, 6.1)."""
+    """Metres per unit of a coordinate system, for scale denominators (OGC 07-057r7, 6.1)."""
     try:
         known = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.ProjError as error:

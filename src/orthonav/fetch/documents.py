@@ -1,89 +1,70 @@
-"""Documents of services: XML that can do no harm, and JSON."""
+"""XML and JSON documents of services, parsed with limits."""
 
 import json
 from typing import Any
-from xml.etree import ElementTree
-from xml.parsers import expat
+from xml.etree.ElementTree import Element, ParseError
 
 from orthonav.errors import FetchError
-from orthonav.fetch.client import BadReplyError, Client, Reply, told
-from orthonav.fetch.pictures import exception_text
+from orthonav.extras import missing_extra
+from orthonav.fetch.client import BadReplyError, Client, HttpReply, excerpt
+from orthonav.fetch.images import exception_text
+
+try:
+    from defusedxml import DefusedXmlException
+    from defusedxml.ElementTree import fromstring
+except ImportError as error:  # pragma: no cover - depends on the installation
+    raise missing_extra("reading capabilities", "fetch", "defusedxml", error) from error
 
 MAX_DOCUMENT_BYTES = 64 * 2**20
 """The capabilities of a national service list a thousand layers in some ten megabytes."""
-_MAX_DEPTH = 100
 
 
 def get_xml(client: Client, url: str) -> bytes:
     """An XML document without entities. Raises `FetchError`."""
 
-    def judged(reply: Reply) -> bytes:
+    def check(reply: HttpReply) -> bytes:
         _require_ok(reply)
         try:
-            check_xml(reply.body)
+            parse_xml(reply.body)
         except FetchError as error:
-            raise BadReplyError(f"{error} ({told(reply)})") from None
+            raise BadReplyError(f"{error} ({excerpt(reply)})") from None
         return reply.body
 
-    return client.get(url, judged, max_bytes=MAX_DOCUMENT_BYTES)
+    return client.get(url, check, max_bytes=MAX_DOCUMENT_BYTES)
 
 
-def get_json(client: Client, url: str, body: Any = None) -> Any:
-    """A JSON object; with `body` that is sent. Raises `FetchError`."""
+def get_json(client: Client, url: str, body: Any = None) -> dict[str, Any]:
+    """A JSON object; `body` is sent with POST. Raises `FetchError`."""
 
-    def judged(reply: Reply) -> Any:
+    def check(reply: HttpReply) -> dict[str, Any]:
         _require_ok(reply)
         try:
             plain = json.loads(reply.body)
         except (ValueError, RecursionError):
-            raise BadReplyError(f"not JSON ({told(reply)})") from None
+            raise BadReplyError(f"not JSON ({excerpt(reply)})") from None
         if not isinstance(plain, dict):
             raise BadReplyError("not a JSON object", again=False)
         return plain
 
     headers = {"Accept": "application/geo+json, application/json"}
-    return client.get(url, judged, headers=headers, max_bytes=MAX_DOCUMENT_BYTES, json=body)
+    return client.get(url, check, headers=headers, max_bytes=MAX_DOCUMENT_BYTES, json=body)
 
 
-def check_xml(body: bytes) -> None:
-    """Refuse XML that is broken, declares entities, or nests without end. Raises `FetchError`.
+def parse_xml(body: bytes) -> Element:
+    """The root of a document. Raises `FetchError` where it is malformed or declares entities.
 
-    A DOCTYPE alone is let through, for every WMS 1.1.1 has one; what it names is never loaded.
+    A DOCTYPE alone is accepted, because every WMS 1.1.1 has one; what it names is never loaded.
     """
-    depth = 0
-
-    def entity(*_: object) -> Any:
-        raise FetchError("document declares entities, which are not read")
-
-    def start(*_: object) -> None:
-        nonlocal depth
-        depth += 1
-        if depth > _MAX_DEPTH:
-            raise FetchError("document is nested too deep")
-
-    def end(*_: object) -> None:
-        nonlocal depth
-        depth -= 1
-
-    parser = expat.ParserCreate()
-    parser.EntityDeclHandler = entity
-    parser.UnparsedEntityDeclHandler = entity
-    parser.ExternalEntityRefHandler = entity
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
     try:
-        parser.Parse(body, True)
-    except (expat.ExpatError, ValueError):
+        root: Element = fromstring(body, forbid_dtd=False)
+    except DefusedXmlException:
+        raise FetchError("document declares entities, which are not read") from None
+    except (ParseError, ValueError):
         raise FetchError("not an XML document") from None
+    return root
 
 
-def parse_xml(body: bytes) -> ElementTree.Element:
-    """The tree of a document. Raises `FetchError` as `check_xml` does."""
-    check_xml(body)
-    return ElementTree.fromstring(body)
-
-
-def _require_ok(reply: Reply) -> None:
+def _require_ok(reply: HttpReply) -> None:
     if reply.status != 200:
-        words = exception_text(reply) or told(reply)
+        words = exception_text(reply) or excerpt(reply)
         raise BadReplyError(f"HTTP {reply.status} ({words})", again=reply.status >= 500)

@@ -1,9 +1,9 @@
-"""Fetching the cells of a selection, several at a time, each kept as it comes."""
+"""Parallel fetching of the cells of a selection; each is stored as soon as it arrives."""
 
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from queue import SimpleQueue
@@ -16,70 +16,76 @@ from orthonav.fetch.cache import FileCache
 from orthonav.fetch.client import Client
 from orthonav.fetch.grid import Selection
 from orthonav.fetch.service import CellSource
+from orthonav.files import Progress
 
 GIVE_UP_AFTER = 20
-"""So many cells in a row that fail, and the service is taken to be down."""
-SAME_PICTURE = 2
-"""Two cells that came with the very same bytes show a placeholder, not the ground."""
+"""Failed cells in a row after which the service counts as down."""
+PLACEHOLDER_CELLS = 2
+"""Cells with identical bytes from which they count as a placeholder: no two orthophotos agree."""
 _AHEAD = 4
-_PATIENCE_S = 1.0
-Progress = Callable[[str, float], None]
+"""Jobs queued per thread."""
+_JOIN_S = 1.0
+"""Longest wait for the threads after an error or an interrupt."""
 log = logging.getLogger(__name__)
 
 
 @dataclass(eq=False)
-class Fetched:
-    """What came: `digests` (N,) uint64 of the pictures by cell, 0 where there is none; reasons of
-    failed cells with how many, and one example of each."""
+class FetchedCells:
+    """Result of a download."""
 
     digests: np.ndarray
+    """(N,) uint64 digest of each cell's image, 0 where there is none."""
     from_cache: int = 0
+    """Cells that were in the cache already."""
     absent: int = 0
+    """Cells without imagery, as the service reports."""
     failed: Counter[str] = field(default_factory=Counter)
+    """Number of failed cells by reason."""
     examples: dict[str, str] = field(default_factory=dict)
+    """One whole message for each reason."""
 
     @property
     def placeholders(self) -> np.ndarray:
-        """Which cells (N,) hold a picture that another cell holds too."""
+        """Which cells (N,) hold an image that another cell holds too."""
         values, inverse, counts = np.unique(self.digests, return_inverse=True, return_counts=True)
-        return np.asarray((counts[inverse] >= SAME_PICTURE) & (values[inverse] != 0))
+        return np.asarray((counts[inverse] >= PLACEHOLDER_CELLS) & (values[inverse] != 0))
 
 
 def fetch_cells(
     source: CellSource, selection: Selection, client: Client, cache: FileCache, progress: Progress
-) -> Fetched:
-    """Fetch every cell that is not in the cache yet.
+) -> FetchedCells:
+    """Fetch every cell that is not in the cache.
 
-    A cell that fails is counted, and the others go on, until many in a row fail: then raises
-    `FetchError`; what came is kept in the cache. Raises `OutputError` where the disk refuses.
+    A failed cell is counted and the others continue, until `GIVE_UP_AFTER` fail in a row: then
+    raises `FetchError`. What arrived stays in the cache. Raises `OutputError` where it cannot be
+    stored.
     """
     cells = selection.cells
-    found = Fetched(np.zeros(len(cells), dtype=np.uint64))
+    fetched = FetchedCells(np.zeros(len(cells), dtype=np.uint64))
     in_a_row = 0
-    done = 0
     with _Pool(client) as pool:
         jobs = ((n, int(row), int(col)) for n, (row, col) in enumerate(cells))
-        for number, error, digest, cached in pool.run(source, cache, jobs):
-            done += 1
+        for done, outcome in enumerate(pool.run(source, cache, jobs), start=1):
+            number, error, digest, cached = outcome
             if error is None:
                 in_a_row = 0
-                found.digests[number] = digest
-                found.absent += digest == 0
-                found.from_cache += cached
+                fetched.digests[number] = digest
+                fetched.absent += digest == 0
+                fetched.from_cache += cached
             else:
                 in_a_row += 1
-                _count(found, error)
+                _count(fetched, error)
                 if in_a_row >= GIVE_UP_AFTER:
                     raise FetchError(f"{in_a_row} requests in a row failed, the last: {error}")
             progress("fetch", done / len(cells))
-    return found
+    return fetched
 
 
-def _count(found: Fetched, error: FetchError) -> None:
+def _count(fetched: FetchedCells, error: FetchError) -> None:
     text = str(error)
     reason = text.partition(" (")[0].partition(": http")[0]
-    found.failed[reason] += 1
-    found.examples.setdefault(reason, text)
+    fetched.failed[reason] += 1
+    fetched.examples.setdefault(reason, text)
     log.info("not fetched: %s", text)
 
 
@@ -88,10 +94,10 @@ Outcome = tuple[int, FetchError | None, int, bool]
 
 
 class _Pool:
-    """Threads that fetch. Left by an error or an interrupt, it does not wait for slow answers.
+    """Threads that fetch cells. After an error or an interrupt it does not wait for slow answers.
 
-    The threads are daemons for that: those of the standard pool would hold up the end of the
-    program until the last server has answered.
+    Its threads are daemons: those of `ThreadPoolExecutor` would delay the end of the program until
+    the last server has answered.
     """
 
     def __init__(self, client: Client) -> None:
@@ -108,13 +114,14 @@ class _Pool:
             self._client.turns.stop.set()
         for _ in self._threads:
             self._jobs.put(None)
-        until_s = time.monotonic() + _PATIENCE_S
+        until_s = time.monotonic() + _JOIN_S
         for thread in self._threads:
             thread.join(None if kind is None else max(0.0, until_s - time.monotonic()))
 
     def run(self, source: CellSource, cache: FileCache, jobs: Iterator[Job]) -> Iterator[Outcome]:
-        """Outcomes as they come; only a few jobs are handed out ahead, however many there are."""
-        for number in range(self._client.limits.parallel):
+        """Outcomes as they arrive; only a few jobs are queued ahead, however many there are."""
+        parallel = self._client.limits.parallel
+        for number in range(parallel):
             thread = Thread(
                 target=self._work, args=(source, cache), name=f"fetch-{number}", daemon=True
             )
@@ -122,7 +129,7 @@ class _Pool:
             self._threads.append(thread)
         waiting = 0
         while True:
-            for job in islice(jobs, _AHEAD * self._client.limits.parallel - waiting):
+            for job in islice(jobs, _AHEAD * parallel - waiting):
                 self._jobs.put(job)
                 waiting += 1
             if not waiting:
@@ -136,15 +143,15 @@ class _Pool:
     def _work(self, source: CellSource, cache: FileCache) -> None:
         while (job := self._jobs.get()) is not None:
             try:
-                self._outcomes.put(_one(source, cache, self._client, job))
+                self._outcomes.put(_fetch_one(source, cache, self._client, job))
             except Exception as error:
                 self._outcomes.put(error)
                 if self._client.turns.stop.is_set():
                     return
 
 
-def _one(source: CellSource, cache: FileCache, client: Client, job: Job) -> Outcome:
-    """Number, error, digest of the picture (0 where there is none), whether it was in the cache."""
+def _fetch_one(source: CellSource, cache: FileCache, client: Client, job: Job) -> Outcome:
+    """Number, error, digest of the image (0 where there is none), whether it was in the cache."""
     number, row, col = job
     address = source.address(row, col)
     entry = cache.read(address)
@@ -159,7 +166,7 @@ def _one(source: CellSource, cache: FileCache, client: Client, job: Job) -> Outc
         cache.write(address, body)
         entry = cache.read(address)
         if entry is None:
-            raise OutputError(f"what was kept cannot be read back: {cache.folder}")
+            raise OutputError(f"a stored cell cannot be read back: {cache.folder}")
     if entry.body is None:
         return number, None, 0, cached
     return number, None, int.from_bytes(entry.digest[:8], "little") or 1, cached

@@ -1,4 +1,4 @@
-"""The grid of a service: cells of pixels in its own coordinate system, and which an area needs."""
+"""The grid of a service, cells of pixels in its own coordinate system, and the cells of an area."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,9 @@ from orthonav.fetch.crs import ground_scale, transformers
 from orthonav.geo.area import Area
 
 MAX_CANDIDATES = 40_000_000
+"""Cells of the box around an area that are examined: some hundred megabytes at one row a time."""
 _EDGE = np.linspace(0, 1, 21)
+"""Points along an edge that are projected, as rasterio's `transform_bounds` does."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class CellGrid:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The cells of `grid` that an area needs: `cells` (N, 2) rows and columns, by row."""
+    """The cells of `grid` that cover an area: `cells` (N, 2) rows and columns, by row; `gsd_m`."""
 
     grid: CellGrid
     cells: NDArray[np.int64]
@@ -69,7 +71,7 @@ class Selection:
 
 
 def select(grid: CellGrid, area: Area, margin_m: float) -> Selection:
-    """The cells that touch the area or come within `margin_m` of it, and perhaps a few more.
+    """The cells that touch the area or lie within `margin_m` of it, and perhaps a few more.
 
     Raises `AreaError` where there is none, or where the box around the area has too many.
     """

@@ -1,41 +1,41 @@
 """BD ORTHO packages of a French department, from the download service of the Géoplateforme.
 
 The service answers in Atom: pages of packages, and for each package its files with length and MD5
-(in `content`). Files are downloaded by ranges into `NAME.part`, and renamed when their length and
-sum are right. They are split 7z archives, which 7-Zip unpacks (`7z x NAME.7z.001`).
+(in `content`). Files are downloaded by ranges into `NAME.part` and renamed once length and MD5 are
+verified. They are split 7z archives, which 7-Zip unpacks (`7z x NAME.7z.001`).
 """
 
 import hashlib
-import logging
 import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 from orthonav.errors import FetchError, OutputError
-from orthonav.fetch.client import BadReplyError, Client, Reply, told
-from orthonav.fetch.documents import get_xml
-from orthonav.fetch.politeness import Limits
-from orthonav.fetch.service import listed
+from orthonav.fetch.client import Client
+from orthonav.fetch.documents import get_xml, parse_xml
+from orthonav.fetch.options import listed
+from orthonav.fetch.politeness import RequestLimits
 from orthonav.fetch.urls import joined, with_query
+from orthonav.files import Progress
 
 SERVICE = "https://data.geopf.fr/telechargement"
 RESOURCE = "BDORTHO"
 PAGE = 50
+"""Packages per page, the most that the service returns."""
 MAX_PAGES = 200
 PART_BYTES = 16 * 2**20
-LIMITS = Limits(parallel=2, per_second=1.0, total_s=600.0)
-"""One request a second: the service allows ten in all, and has refused more than one."""
+"""Bytes per request: seconds on a usual line, so little is lost by an interrupt."""
+LIMITS = RequestLimits(parallel=2, per_second=1.0, total_s=600.0)
+"""One request a second: the service documents ten, and has refused more than one."""
 ATTRIBUTION = "IGN, BD ORTHO; Licence Ouverte / Open Licence 2.0 (Etalab)"
 _ATOM = "{http://www.w3.org/2005/Atom}"
 _GPF = "{https://data.geopf.fr/annexes/ressources/xsd/gpf_dl.xsd}"
 _NAME = re.compile(r"^[\w.-]{1,200}$")
 _ASKED = re.compile(r"^(D?\d{2,3}|D?\d[AB]|D?0\d[AB]):(\d{4})(?::(RVB|IRC))?$", re.IGNORECASE)
-Progress = Callable[[str, float], None]
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Package:
 
 @dataclass(frozen=True)
 class PackageFile:
-    """A file of a package; `size_bytes` and `md5` where the service tells them."""
+    """A file of a package; `size_bytes` and `md5` where the service states them."""
 
     name: str
     url: str
@@ -70,7 +70,7 @@ def parse_package(text: str) -> tuple[str, str, str]:
 def find_package(
     client: Client, zone: str, year: str, kind: str = "RVB", service: str = SERVICE
 ) -> Package:
-    """The finest package of a department and year. Raises `FetchError` listing what there is."""
+    """The finest package of a department and year. Raises `FetchError` with the available years."""
     here = [
         package
         for package in _packages(client, zone, service)
@@ -79,7 +79,7 @@ def find_package(
     dated = [package for package in here if package.date.startswith(year)]
     if not dated:
         years = sorted({package.date[:4] for package in here})
-        raise FetchError(f"no {kind} package of {zone} of {year}; there is {listed(years)}")
+        raise FetchError(f"no {kind} package of {zone} of {year}; available: {listed(years)}")
     return min(dated, key=_centimetres)
 
 
@@ -93,7 +93,7 @@ def package_files(client: Client, package: Package) -> list[PackageFile]:
         url = joined(package.url, link.get("href", ""))
         name = unquote(urlsplit(url).path.rpartition("/")[2])
         if not _NAME.match(name) or name.startswith("."):
-            raise FetchError(f"package names a file that is not taken: {name[:100]!r}")
+            raise FetchError(f"package names an unsafe file: {name[:100]!r}")
         length = link.get(f"{_GPF}length", "")
         md5 = (entry.findtext(f"{_ATOM}content") or "").strip().lower()
         files[name] = PackageFile(
@@ -113,8 +113,8 @@ def download_package(
 ) -> list[Path]:
     """Download what is missing of these files into `folder`; returns them in order.
 
-    A file that is whole already is not asked for again; half a file is gone on with. Raises
-    `FetchError`, and `OutputError` where the disk refuses or is too small.
+    A complete file is not requested again; an incomplete one is resumed. Raises `FetchError`, and
+    `OutputError` where the disk is too small or cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -125,7 +125,7 @@ def download_package(
         _size(_part(folder, file)) for file in missing
     )
     if needed > shutil.disk_usage(folder).free:
-        raise OutputError(f"disk is too small: {needed / 1e9:.1f} GB are to come: {folder}")
+        raise OutputError(f"disk is too small: {needed / 1e9:.1f} GB are needed: {folder}")
     for number, file in enumerate(files):
         start = number / len(files)
 
@@ -147,15 +147,9 @@ def _download(
         with part.open("ab") as stream:
             at = stream.tell()
             while size is None or at < size:
-                data, size = client.get(
-                    file.url,
-                    _range_judge(at, file),
-                    headers={
-                        "Range": f"bytes={at}-{at + PART_BYTES - 1}",
-                        "Accept-Encoding": "identity",
-                    },
-                    max_bytes=PART_BYTES,
-                )
+                data, size, _ = client.get_range(file.url, at, at + PART_BYTES)
+                if file.size_bytes not in (None, size):
+                    raise FetchError(f"file has {size} bytes, not {file.size_bytes}: {file.url}")
                 stream.write(data)
                 stream.flush()
                 at += len(data)
@@ -168,25 +162,8 @@ def _download(
         raise OutputError(f"cannot write ({error.strerror or error}): {part}") from error
 
 
-def _range_judge(at: int, file: PackageFile) -> Callable[[Reply], tuple[bytes, int]]:
-    def judged(reply: Reply) -> tuple[bytes, int]:
-        found = re.fullmatch(
-            r"bytes (\d+)-(\d+)/(\d+)", reply.headers.get("content-range", "").strip()
-        )
-        if reply.status != 206 or not found:
-            raise BadReplyError(f"HTTP {reply.status} ({told(reply)})", again=reply.status >= 500)
-        first, last, size = (int(number) for number in found.groups())
-        if first != at or last - first + 1 != len(reply.body) or not reply.body:
-            raise BadReplyError("another range than was asked for")
-        if file.size_bytes not in (None, size):
-            raise BadReplyError(f"file has {size} bytes, not {file.size_bytes}", again=False)
-        return reply.body, size
-
-    return judged
-
-
 def _check(file: PackageFile, part: Path, size: int | None) -> None:
-    """Remove and refuse a file that is not what the service says. Raises `FetchError`."""
+    """Remove a file whose size or MD5 is wrong, and raise `FetchError`."""
     problem = ""
     if size is not None and part.stat().st_size != size:
         problem = f"has {part.stat().st_size} bytes instead of {size}"
@@ -195,7 +172,7 @@ def _check(file: PackageFile, part: Path, size: int | None) -> None:
             found = hashlib.file_digest(
                 stream, lambda: hashlib.md5(usedforsecurity=False)
             ).hexdigest()
-        problem = "" if found == file.md5 else "has another MD5 sum than the service says"
+        problem = "" if found == file.md5 else "has another MD5 than the service states"
     if problem:
         part.unlink()
         raise FetchError(f"file {problem}; it was removed, run the command again: {file.url}")
@@ -215,16 +192,15 @@ def _packages(client: Client, zone: str, service: str) -> list[Package]:
     return found
 
 
-def _entries(client: Client, url: str, parameters: dict[str, str]) -> list[ElementTree.Element]:
+def _entries(client: Client, url: str, parameters: dict[str, str]) -> list[Element]:
     """Entries of all pages of a feed. Raises `FetchError`."""
-    found: list[ElementTree.Element] = []
-    pages = 1
-    number = 1
+    found: list[Element] = []
+    pages = number = 1
     while number <= pages:
         query = {**parameters, "page": str(number), "limit": str(PAGE)}
-        feed = ElementTree.fromstring(get_xml(client, with_query(url, query)))
-        told_pages = feed.get(f"{_GPF}pagecount", "1")
-        pages = int(told_pages) if told_pages.isdecimal() else 1
+        feed = parse_xml(get_xml(client, with_query(url, query)))
+        count = feed.get(f"{_GPF}pagecount", "1")
+        pages = int(count) if count.isdecimal() else 1
         if pages > MAX_PAGES:
             raise FetchError(f"feed has {pages} pages, more than are read: {url}")
         found += feed.findall(f"{_ATOM}entry")
@@ -233,7 +209,7 @@ def _entries(client: Client, url: str, parameters: dict[str, str]) -> list[Eleme
 
 
 def _centimetres(package: Package) -> tuple[int, str]:
-    """Pixel width that a name tells (0M20 is 20 cm), and what sorts newer editions first."""
+    """Pixel width in a name (0M20 is 20 cm), and a key that sorts newer editions first."""
     found = re.search(r"-(\d+)M(\d+)_", package.name)
     width = int(found.group(1)) * 100 + int(found.group(2)) if found else 10**6
     return width, "".join(chr(255 - min(ord(letter), 255)) for letter in package.name)

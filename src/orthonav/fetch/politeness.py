@@ -1,44 +1,57 @@
-"""How often a host is asked: a token bucket per host, and waiting that can be stopped."""
+"""Request rate per host, waits that can be interrupted, and the retry policy."""
 
-import random
 import threading
 import time
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
-from email.utils import parsedate_to_datetime
 
 from orthonav.errors import FetchError
+from orthonav.extras import missing_extra
+
+try:
+    from urllib3 import Retry
+    from urllib3.exceptions import InvalidHeader
+    from urllib3.util.retry import RequestHistory
+except ImportError as error:  # pragma: no cover - depends on the installation
+    raise missing_extra("fetching imagery", "fetch", "urllib3", error) from error
+
+RETRY_STATUS = frozenset({408, 425, 429, 500, 502, 503, 504})
+"""Temporary by definition (RFC 9110, 6585, 8470): the same request may succeed later."""
 
 
 @dataclass(frozen=True)
-class Limits:
-    """How a service is asked. Times in seconds; `per_second` requests per host, `parallel` at once.
-
-    `attempts` is how often one address is asked before it counts as failed; `total_s` the longest
-    one answer may take; `max_bytes` the largest body; `wait_max_s` the longest wait that a service
-    may ask for (Retry-After) before it counts as failed.
-    """
+class RequestLimits:
+    """How a service is asked. The defaults are conservative: no service asks for less in public."""
 
     parallel: int = 4
+    """Requests at the same time."""
     per_second: float = 10.0
+    """Requests per second and host."""
     attempts: int = 6
+    """Requests for one address before it counts as failed."""
     backoff_s: float = 0.5
+    """Pause before the first repetition; it doubles every time, plus random jitter up to this."""
     backoff_max_s: float = 30.0
+    """Longest such pause."""
     wait_max_s: float = 120.0
+    """Longest Retry-After that is waited for."""
     connect_s: float = 10.0
+    """Timeout of a connection."""
     read_s: float = 30.0
+    """Timeout between two reads of an answer."""
     total_s: float = 120.0
+    """Timeout of a whole answer, redirects included."""
     max_bytes: int = 32 * 2**20
+    """Largest body, unpacked."""
     max_redirects: int = 5
+    """Redirects that are followed."""
 
 
-class Stopped(Exception):  # noqa: N818 - no error: the caller asked for it
-    """The whole run is being ended, by an interrupt or an error elsewhere."""
+class Stopped(Exception):  # noqa: N818 - not an error: the caller requested it
+    """The whole run is being ended, by an interrupt or by an error in another thread."""
 
 
 @dataclass
 class _Bucket:
-    per_second: float
     tokens: float
     filled_s: float
     paused_until_s: float = 0.0
@@ -46,81 +59,83 @@ class _Bucket:
 
 @dataclass
 class Turns:
-    """Turns to ask, by host; `stop` ends every wait. One of them serves all threads."""
+    """Permissions to send a request, by host, for all threads; setting `stop` ends every wait."""
 
-    limits: Limits
+    limits: RequestLimits
     stop: threading.Event = field(default_factory=threading.Event)
     _buckets: dict[str, _Bucket] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def wait(self, host: str) -> None:
-        """Wait for a turn. Raises `Stopped`."""
-        while True:
-            delay_s = self._take(host)
-            if delay_s <= 0:
-                return
+        """Wait until a request may be sent to this host. Raises `Stopped`."""
+        while (delay_s := self._take(host)) > 0:
             self.sleep(delay_s)
 
     def pause(self, host: str, seconds: float) -> None:
-        """Let nobody ask this host for so long: it said so."""
+        """Send nothing to this host for so long, from any thread."""
         with self._lock:
             bucket = self._bucket(host)
             bucket.paused_until_s = max(bucket.paused_until_s, time.monotonic() + seconds)
 
     def sleep(self, seconds: float) -> None:
-        """Wait. Raises `Stopped`, at once, when the run is ended meanwhile."""
+        """Wait. Raises `Stopped` as soon as the run is ended."""
         if self.stop.wait(seconds):
             raise Stopped
 
     def _take(self, host: str) -> float:
-        """Seconds to wait before asking again for a turn; 0 where the turn was given."""
+        """Seconds until a token may be available; 0 where one was taken."""
         with self._lock:
             if self.stop.is_set():
                 raise Stopped
             bucket, now_s = self._bucket(host), time.monotonic()
             if now_s < bucket.paused_until_s:
                 return bucket.paused_until_s - now_s
-            # Half a second's worth may come at once, so that parallel requests start together.
-            most = max(1.0, bucket.per_second / 2)
-            bucket.tokens = min(most, bucket.tokens + (now_s - bucket.filled_s) * bucket.per_second)
-            bucket.filled_s = now_s
+            rate = self.limits.per_second
+            refilled = bucket.tokens + (now_s - bucket.filled_s) * rate
+            bucket.tokens, bucket.filled_s = min(self._capacity, refilled), now_s
             if bucket.tokens >= 1:
                 bucket.tokens -= 1
                 return 0.0
-            return (1 - bucket.tokens) / bucket.per_second
+            return (1 - bucket.tokens) / rate
+
+    @property
+    def _capacity(self) -> float:
+        """Half a second's worth of requests, so that parallel requests start together."""
+        return max(1.0, self.limits.per_second / 2)
 
     def _bucket(self, host: str) -> _Bucket:
-        if host not in self._buckets:
-            rate = self.limits.per_second
-            self._buckets[host] = _Bucket(rate, max(1.0, rate / 2), time.monotonic())
-        return self._buckets[host]
+        return self._buckets.setdefault(host, _Bucket(self._capacity, time.monotonic()))
 
 
-def backoff_s(limits: Limits, attempt: int) -> float:
-    """Seconds before attempt `attempt` (1 is the second): doubling, with jitter of a half."""
-    longest = min(limits.backoff_max_s, limits.backoff_s * 2.0 ** (attempt - 1))
-    return longest * random.uniform(0.5, 1.0)
+def retry_policy(limits: RequestLimits) -> Retry:
+    """urllib3's policy for one address: which status, how often, after which pause.
 
-
-def retry_after_s(value: str | None, limits: Limits) -> float | None:
-    """Seconds that a Retry-After header asks for (RFC 9110, 10.2.3); None where it says nothing.
-
-    Raises `FetchError` where it is more than `limits.wait_max_s`.
+    It counts and computes pauses; the client itself repeats and sleeps. An adapter that repeats on
+    its own would bypass the rate per host, could not be interrupted, and could not repeat what
+    only the body shows: an HTML page instead of an image, half a file.
     """
-    if not value:
+    # urllib3 repeats at once after the first failure. Half the factor and one entry of history
+    # make it wait `backoff_s` already then.
+    return Retry(
+        total=max(1, limits.attempts) - 1,
+        status_forcelist=RETRY_STATUS,
+        backoff_factor=limits.backoff_s / 2,
+        backoff_jitter=limits.backoff_s,
+        backoff_max=limits.backoff_max_s,
+        history=(RequestHistory("GET", None, None, None, None),),
+    )
+
+
+def retry_after_s(value: str | None, limits: RequestLimits) -> float | None:
+    """Seconds that a Retry-After header asks for; None where there is none or it is malformed.
+
+    Raises `FetchError` where it exceeds `limits.wait_max_s`.
+    """
+    try:
+        seconds = retry_policy(limits).parse_retry_after(value) if value else None
+    except (InvalidHeader, ValueError, OverflowError):
         return None
-    text = value.strip()
-    if text.isdecimal() and len(text) < 10:
-        seconds = float(text)
-    else:
-        try:
-            then = parsedate_to_datetime(text)
-        except (ValueError, TypeError, OverflowError):
-            return None
-        if then.tzinfo is None:
-            then = then.replace(tzinfo=UTC)
-        seconds = max(0.0, (then - datetime.now(UTC)).total_seconds())
-    if seconds > limits.wait_max_s:
+    if seconds is not None and seconds > limits.wait_max_s:
         raise FetchError(
             f"the service asks to come back in {seconds:.0f} s; run the command again then"
         )

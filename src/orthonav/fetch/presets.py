@@ -1,38 +1,38 @@
-"""Services known by name, read from `presets.toml` beside this file."""
+"""Services known by name, read from `presets.toml` in this package. Needs no extra."""
 
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from functools import cache
 from importlib import resources
 from typing import Any
 
 from orthonav.errors import FetchError
-from orthonav.fetch.service import Wish, listed
+from orthonav.fetch.options import ImageryOptions, listed
 
 PROTOCOLS = ("wmts", "wms", "xyz", "tms", "stac", "cog")
 CURRENT = "current"
+_OPTIONS = {field.name for field in fields(ImageryOptions)}
+_RENAMED = {"style": "preferred_style", "format": "preferred_format"}
+"""A preset prefers a style or format; a user who names one wants no other."""
 
 
 @dataclass(frozen=True)
 class PresetLayer:
-    """One layer of a service, chosen by `id` after the colon; `date` as in `About`."""
+    """One layer of a service, selected by `id` after the colon."""
 
     id: str
-    layer: str
     date: str | None
+    """As in `Provenance`."""
     gsd_m: float
-    style: str | None = None
-    format: str | None = None
-    min_zoom: int | None = None
-    max_zoom: int | None = None
-    time: str | None = None
-    empty: str | None = None
+    """Ground resolution of the imagery, metres per pixel."""
+    options: ImageryOptions
+    """Options of the service and the layer."""
     note: str | None = None
 
 
 @dataclass(frozen=True)
 class Preset:
-    """A service: how it is asked, what it has, and under which terms."""
+    """A service: how it is asked, its layers, and its terms."""
 
     name: str
     title: str
@@ -43,81 +43,88 @@ class Preset:
     licence_url: str
     attribution: str
     source_page: str
-    crs: str | None = None
-    format: str | None = None
-    style: str | None = None
-    collection: str | None = None
-    asset: str | None = None
-    bands: tuple[int, ...] | None = None
+    """Documentation that the preset was collected from."""
+    layers: dict[str, PresetLayer]
     token_url: str | None = None
+    """Address of a signing service for files."""
     key_env: str | None = None
-    empty: str | None = None
+    """Environment variable that holds the key."""
     note: str | None = None
-    layers: dict[str, PresetLayer] = field(default_factory=dict)
 
     def layer(self, id_: str | None) -> PresetLayer:
-        """The layer of that id, or the current one. Raises `FetchError` listing what there is."""
+        """The layer of that id, or the current one. Raises `FetchError` with the available ones."""
         found = self.layers.get(id_ or CURRENT)
         if found is None:
-            asked = f"{self.name} has no '{id_}'" if id_ else f"name a year: {self.name}:YEAR"
-            raise FetchError(f"{asked}; there is {listed(list(self.layers), id_ or '', most=40)}")
+            problem = f"{self.name} has no '{id_}'" if id_ else f"add a year: {self.name}:YEAR"
+            available = listed(list(self.layers), id_ or "", most=40)
+            raise FetchError(f"{problem}; available: {available}")
         return found
 
-    def wish(self, layer: PresetLayer) -> Wish:
-        """What this preset asks for, where the user asks for nothing else."""
-        return Wish(
-            layer=layer.layer or None,
-            usual_style=layer.style or self.style,
-            usual_format=layer.format or self.format,
-            crs=self.crs,
-            time=layer.time,
-            min_zoom=layer.min_zoom,
-            max_zoom=layer.max_zoom,
-            empty=layer.empty or self.empty,
-            collection=self.collection,
-            asset=self.asset,
-            bands=self.bands,
-        )
+    def describe(self) -> dict[str, Any]:
+        """Plain values for JSON; options that are not set are left out."""
+        layers = [
+            {
+                **{name: value for name, value in vars(layer).items() if name != "options"},
+                **{
+                    name: value
+                    for name, value in vars(layer.options).items()
+                    if value != getattr(ImageryOptions, name)
+                },
+            }
+            for layer in self.layers.values()
+        ]
+        return {**vars(self), "layers": layers}
 
 
 @cache
 def presets() -> dict[str, Preset]:
     """All services by name."""
     text = resources.files("orthonav.fetch").joinpath("presets.toml").read_text(encoding="utf-8")
-    return {name: _preset(name, plain) for name, plain in tomllib.loads(text).items()}
+    return {name: _preset(name, values) for name, values in tomllib.loads(text).items()}
 
 
 def find_preset(name: str) -> Preset:
-    """The service of that name. Raises `FetchError` listing what there is."""
+    """The service of that name. Raises `FetchError` with the available ones."""
     known = presets()
     if name not in known:
-        raise FetchError(
-            f"no service is known as '{name}'; there is {listed(list(known), name, 40)}"
-        )
+        raise FetchError(f"unknown service '{name}'; available: {listed(list(known), name, 40)}")
     return known[name]
 
 
-def _preset(name: str, plain: dict[str, Any]) -> Preset:
+def _preset(name: str, values: dict[str, Any]) -> Preset:
+    shared = _options(values)
     layers: dict[str, PresetLayer] = {}
-    values = dict(plain)
-    for told in values.pop("layer"):
-        for layer in _layers(dict(told)):
+    for entry in values["layer"]:
+        for layer in _layers(entry, shared):
             if layer.id in layers:
                 raise ValueError(f"preset {name} has {layer.id} twice")
             layers[layer.id] = layer
-    if "bands" in values:
-        values["bands"] = tuple(values["bands"])
-    return Preset(name=name, layers=layers, **values)
+    rest = {key: value for key, value in values.items() if key not in _OPTIONS}
+    return Preset(name=name, layers=layers, **rest)
 
 
-def _layers(told: dict[str, Any]) -> list[PresetLayer]:
+def _layers(entry: dict[str, Any], shared: ImageryOptions) -> list[PresetLayer]:
     """One layer, or one for each of its years."""
     made = []
-    for year in told.pop("years", [None]):
-        one: dict[str, Any] = {
+    for year in entry.get("years", [None]):
+        values: dict[str, Any] = {
             key: value.replace("{year}", str(year)) if isinstance(value, str) else value
-            for key, value in told.items()
+            for key, value in entry.items()
         }
-        one["date"] = one["date"] or None
-        made.append(PresetLayer(**one))
+        options = _options(values).over(shared)
+        made.append(
+            PresetLayer(
+                values["id"], values["date"] or None, values["gsd_m"], options, values.get("note")
+            )
+        )
     return made
+
+
+def _options(values: dict[str, Any]) -> ImageryOptions:
+    """The options among the values of a table; `gsd_m` describes the imagery and is not one."""
+    chosen: dict[str, Any] = {
+        _RENAMED.get(key, key): tuple(value) if isinstance(value, list) else value or None
+        for key, value in values.items()
+        if key in _OPTIONS and key != "gsd_m" and not (key == "layer" and isinstance(value, list))
+    }
+    return ImageryOptions(**chosen)

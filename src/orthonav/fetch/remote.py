@@ -1,118 +1,168 @@
-"""A file on a server, read by ranges: only the bytes that are asked for are fetched.
+"""Files on servers as GDAL reads them: by byte ranges, through the client.
 
-They are put at their place in a sparse file on this machine, which GDAL then reads like any other:
-so limits, pauses and keys are those of every other request, and GDAL opens no connection.
+rasterio hands every read of GDAL to this module (its `opener`), so the rate, size limits,
+repetition and keys of all other requests hold here too, and GDAL opens no connection. GDAL's own
+/vsicurl would send keys along redirects, and checks neither the range of an answer nor whether the
+file changes meanwhile.
 """
 
 import io
-import os
-import re
 import threading
-from pathlib import Path
+from collections import OrderedDict
+from typing import Any
 
-from orthonav.fetch.client import BadReplyError, Client, Reply, told
+from rasterio.abc import MultiByteRangeResourceContainer
+
+from orthonav.errors import FetchError
+from orthonav.fetch.client import Client
+from orthonav.fetch.urls import shown
 
 CHUNK = 128 * 1024
-GAP = 32 * 1024
-"""Bytes that are fetched in vain rather than asked around."""
-MAX_REQUEST = 8 * 2**20
-_RANGE = re.compile(r"bytes (\d+)-(\d+)/(\d+)")
-Range = tuple[int, int]
+"""Small reads (the head of a file) are rounded to this: one request holds most heads."""
+MAX_RANGE = 64 * 2**20
+"""Largest read. A block of a tiled file has at most a few megabytes."""
+_CACHE_BYTES = 64 * 2**20
+"""Ranges held in memory for all files: cells next to each other share blocks."""
+
+
+class RangeCache:
+    """The bytes that were read last, by address and range, up to `_CACHE_BYTES`."""
+
+    def __init__(self) -> None:
+        self._ranges: OrderedDict[tuple[str, int, int], bytes] = OrderedDict()
+        self._size = 0
+        self._lock = threading.Lock()
+
+    def get(self, key: tuple[str, int, int]) -> bytes | None:
+        """The bytes of a range, or None."""
+        with self._lock:
+            if key in self._ranges:
+                self._ranges.move_to_end(key)
+            return self._ranges.get(key)
+
+    def put(self, key: tuple[str, int, int], data: bytes) -> None:
+        """Store a range; those not used for longest are dropped."""
+        with self._lock:
+            self._size += len(data) - len(self._ranges.pop(key, b""))
+            self._ranges[key] = data
+            while self._size > _CACHE_BYTES:
+                self._size -= len(self._ranges.popitem(last=False)[1])
 
 
 class RemoteFile:
-    """The file at `url`, of `size` bytes; what was read of it lies in `copy`. For many threads.
+    """The file at `url`, of `size` bytes; several threads may read it.
 
     Raises `FetchError` where the server does not answer ranges or the file changes meanwhile.
     """
 
-    def __init__(self, client: Client, url: str, copy: Path) -> None:
+    def __init__(self, client: Client, url: str, cache: RangeCache | None = None) -> None:
         self.url = url
-        self.copy = copy
         self.size = 0
         self._version = ""
         self._client = client
+        self._cache = cache or RangeCache()
         self._lock = threading.Lock()
-        self._done: set[Range] = set()
-        self._chunks: dict[int, bytes] = {}
-        with copy.open("xb"):
-            pass
-        self._chunk(0)
-        os.truncate(copy, self.size)
+        self._fetch(0, CHUNK)
 
     @property
     def identity(self) -> str:
-        """What changes when the file does: its size and what the server calls its version."""
+        """Changes when the file does: its size and the version that the server names."""
         return f"{self.size} {self._version}"
 
     def read(self, start: int, length: int) -> bytes:
-        """Bytes from `start`, fewer at the end of the file: for its head, which is kept."""
+        """Bytes from `start`, fewer at the end of the file; small reads by whole chunks."""
         end = min(start + length, self.size)
         if start >= end:
             return b""
-        first, last = start // CHUNK, (end - 1) // CHUNK
-        joined = b"".join(self._chunk(number) for number in range(first, last + 1))
-        return joined[start - first * CHUNK : end - first * CHUNK]
+        if length > CHUNK:
+            return self._fetch(start, end)
+        first = start // CHUNK * CHUNK
+        chunks = (self._fetch(at, at + CHUNK) for at in range(first, end, CHUNK))
+        return b"".join(chunks)[start - first : end - first]
 
-    def require(self, ranges: list[Range]) -> None:
-        """Have these bytes (first, end) in the copy; neighbours come together."""
-        with self._lock:
-            missing = [one for one in ranges if one not in self._done]
-        for start, end in merged(missing, self.size):
-            self._store(start, self._fetch(start, end))
-        with self._lock:
-            self._done.update(missing)
-
-    def reader(self) -> "io.RawIOBase":
-        """A file object over the head of the file."""
-        return _Reader(self)
-
-    def _chunk(self, number: int) -> bytes:
-        with self._lock:
-            known = self._chunks.get(number)
-        if known is None:
-            known = self._fetch(number * CHUNK, (number + 1) * CHUNK)
-            self._store(number * CHUNK, known)
-            with self._lock:
-                self._chunks[number] = known
-        return known
-
-    def _store(self, start: int, data: bytes) -> None:
-        with self.copy.open("r+b") as stream:
-            stream.seek(start)
-            stream.write(data)
+    def read_exactly(self, start: int, length: int) -> bytes:
+        """These bytes and no others. Raises `FetchError` where they lie beyond the end."""
+        if start + length > self.size:
+            raise self._broken("blocks beyond its end")
+        return self._fetch(start, start + length)
 
     def _fetch(self, start: int, end: int) -> bytes:
-        """Bytes `start` to `end` (not included), fewer at the end of the file."""
-
-        def judged(reply: Reply) -> bytes:
-            if reply.status != 206:
-                raise BadReplyError(
-                    f"HTTP {reply.status} ({told(reply)})", again=reply.status >= 500
-                )
-            found = _RANGE.fullmatch(reply.headers.get("content-range", "").strip())
-            if not found:
-                raise BadReplyError("range without its place")
-            first, last, size = (int(number) for number in found.groups())
-            version = reply.headers.get("etag") or reply.headers.get("last-modified", "")
+        if end - start > MAX_RANGE:
+            raise self._broken("blocks too large to be read by windows")
+        key = (self.url, start, end)
+        data = self._cache.get(key)
+        if data is None:
+            data, size, version = self._client.get_range(self.url, start, end)
             with self._lock:
                 if self.size and (size, version) != (self.size, self._version):
-                    raise BadReplyError("file changed on the server while it was read", again=False)
+                    raise FetchError(
+                        f"file changed on the server while it was read: {shown(self.url)}"
+                    )
                 self.size, self._version = size, version
-            expected = min(end, size) - start
-            if first != start or last + 1 - first != expected or len(reply.body) != expected:
-                raise BadReplyError("another range than was asked for")
-            return reply.body
+            self._cache.put(key, data)
+        return data
 
-        headers = {"Range": f"bytes={start}-{end - 1}", "Accept-Encoding": "identity"}
-        return self._client.get(self.url, judged, headers=headers, max_bytes=end - start + 4096)
+    def _broken(self, reason: str) -> FetchError:
+        return FetchError(f"not a GeoTIFF that can be read ({reason}): {shown(self.url)}")
 
 
-class _Reader(io.RawIOBase):
-    """One place in the head of a remote file."""
+class RemoteFiles(MultiByteRangeResourceContainer):  # type: ignore[misc]
+    """Remote files by name, as an `opener` for rasterio; no other name can be opened.
 
-    def __init__(self, file: RemoteFile) -> None:
+    An exception must not pass through GDAL. It is stored for its thread, and `raise_failure`
+    raises it once GDAL has returned.
+    """
+
+    def __init__(self) -> None:
+        self.files: dict[str, RemoteFile] = {}
+        self._failure = threading.local()
+
+    def open(self, path: str, mode: str = "r", **kwds: Any) -> "_Stream":
+        """The file of that name, to be read."""
+        return _Stream(self, self.files[path])
+
+    def isfile(self, path: str) -> bool:
+        """Whether there is such a file."""
+        return path in self.files
+
+    def isdir(self, path: str) -> bool:
+        """There are no folders."""
+        return False
+
+    def ls(self, path: str) -> list[str]:
+        """No names: GDAL finds no files belonging to the one that is open."""
+        return []
+
+    def mtime(self, path: str) -> int:
+        """Not known."""
+        return 0
+
+    def rm(self, path: str) -> None:
+        """Nothing is removed."""
+
+    def size(self, path: str) -> int:
+        """Bytes of a file."""
+        return self.files[path].size
+
+    def set_failure(self, failure: Exception | None) -> None:
+        """Store an exception of this thread; the first one is kept until it is reset."""
+        if failure is None or getattr(self._failure, "value", None) is None:
+            self._failure.value = failure
+
+    def raise_failure(self) -> None:
+        """Raise the exception stored in this thread, if any."""
+        failure = getattr(self._failure, "value", None)
+        self._failure.value = None
+        if failure is not None:
+            raise failure
+
+
+class _Stream(io.RawIOBase):
+    """A position in a remote file."""
+
+    def __init__(self, files: RemoteFiles, file: RemoteFile) -> None:
         super().__init__()
+        self._files = files
         self._file = file
         self._at = 0
 
@@ -131,19 +181,21 @@ class _Reader(io.RawIOBase):
         return self._at
 
     def read(self, size: int = -1) -> bytes:
-        data = self._file.read(self._at, self._file.size if size < 0 else size)
+        try:
+            data = self._file.read(self._at, self._file.size if size < 0 else size)
+        except Exception as error:
+            self._files.set_failure(error)
+            return b""
         self._at += len(data)
         return data
 
-
-def merged(ranges: list[Range], size: int) -> list[Range]:
-    """Ranges joined where little lies between them, none longer than a request may be."""
-    joined: list[Range] = []
-    for start, end in sorted((max(0, start), min(end, size)) for start, end in ranges):
-        if start >= end:
-            continue
-        if joined and start - joined[-1][1] <= GAP and end - joined[-1][0] <= MAX_REQUEST:
-            joined[-1] = (joined[-1][0], max(end, joined[-1][1]))
-        else:
-            joined.append((start, end))
-    return joined
+    def get_byte_ranges(self, offsets: list[int], sizes: list[int]) -> list[bytes]:
+        """Several ranges at once, as GDAL asks for the blocks of a window."""
+        try:
+            return [
+                self._file.read_exactly(int(offset), int(size))
+                for offset, size in zip(offsets, sizes, strict=True)
+            ]
+        except Exception as error:
+            self._files.set_failure(error)
+            return [bytes(size) for size in sizes]  # rasterio copies these lengths, checked or not

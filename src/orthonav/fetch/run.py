@@ -1,4 +1,4 @@
-"""From a request to a file: ask the service, plan, say what it will cost, fetch, write."""
+"""From a request to a file: read the capabilities, plan, estimate the cost, fetch, write."""
 
 import logging
 import math
@@ -8,51 +8,61 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from orthonav.errors import FetchError, OutputError
+from orthonav.errors import AreaError, FetchError, OutputError
 from orthonav.fetch.cache import FileCache
 from orthonav.fetch.client import Client
-from orthonav.fetch.download import Fetched, fetch_cells
+from orthonav.fetch.download import FetchedCells, fetch_cells
 from orthonav.fetch.grid import Selection, select
-from orthonav.fetch.politeness import Limits, Stopped
-from orthonav.fetch.service import About, CellSource
+from orthonav.fetch.options import Provenance
+from orthonav.fetch.politeness import RequestLimits, Stopped
+from orthonav.fetch.service import CellSource
 from orthonav.fetch.sources import SourceSpec, open_cells
-from orthonav.fetch.write import Counts, Packing, write_mosaic
+from orthonav.fetch.write import CellCounts, Packing, write_mosaic
+from orthonav.files import Progress, no_progress
 from orthonav.geo.area import Area
+from orthonav.geo.swapped import swapped_hint
 
 DEFAULT_MAX_TILES = 50_000
+"""About 200 km2 at 0.5 m: more than a flight needs, less than a service minds."""
 DEFAULT_MAX_MB = 4000.0
 DEFAULT_MARGIN_M = 200.0
+"""Reference tiles at the border of a map reach beyond its area by less than this."""
 _SECONDS_PER_TILE = 0.3
-"""A usual answer of a tile service, seen from a usual line; a guess for the estimate."""
+"""Usual latency of a tile service; an assumption for the estimate."""
 _BYTES_PER_SECOND = 3e6
+"""Usual throughput of a connection; an assumption for the estimate."""
 log = logging.getLogger(__name__)
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
 class FetchRequest:
-    """What to fetch, and where to. Lengths in metres on the ground.
-
-    `margin_m` is fetched beyond the area, for tiles at its border. `cache` None keeps what comes
-    in a folder beside `out`, which is removed when `out` is written. `max_tiles` and `max_mb` end
-    a fetch before it starts. With `allow_holes` tiles that failed are left out of the file.
-    """
+    """Which imagery is fetched, and where it is written."""
 
     spec: SourceSpec
+    """The service and the imagery requested of it."""
     area: Area
+    """The area to cover."""
     out: Path
+    """The GeoTIFF, .tif or .tiff."""
     margin_m: float = DEFAULT_MARGIN_M
+    """Fetched beyond the area, metres."""
     packing: Packing = field(default_factory=Packing)
+    """Compression of the file."""
     cache: Path | None = None
+    """Folder of fetched cells; None: one beside `out` that is removed at the end."""
     max_tiles: int = DEFAULT_MAX_TILES
+    """A fetch of more tiles is refused before it starts."""
     max_mb: float = DEFAULT_MAX_MB
+    """A fetch of more megabytes (estimated) is refused before it starts."""
     allow_holes: bool = False
-    limits: Limits = field(default_factory=Limits)
+    """Whether the file is written although tiles failed; they are masked."""
+    limits: RequestLimits = field(default_factory=RequestLimits)
+    """How the service is asked."""
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """What a fetch will cost, before it starts: a guess from usual tiles."""
+class CostEstimate:
+    """Expected cost of a fetch, from usual tiles."""
 
     tiles: int
     gsd_m: float
@@ -60,7 +70,7 @@ class Estimate:
     height_px: int
     megabytes: float
     minutes: float
-    about: About
+    provenance: Provenance
 
     def text(self) -> str:
         """One line for people."""
@@ -73,132 +83,141 @@ class Estimate:
 
 @dataclass(frozen=True)
 class FetchResult:
-    """What was fetched: cells by what became of them, and the share of pixels that is valid."""
+    """What was fetched: cells by outcome, and the share of valid pixels, 0 to 1."""
 
-    estimate: Estimate
-    fetched: Fetched
-    counts: Counts
+    estimate: CostEstimate
+    fetched: FetchedCells
+    counts: CellCounts
     valid_share: float
     received_mb: float
     size_bytes: int
 
     def describe(self) -> dict[str, Any]:
-        """As plain values for JSON."""
-        about = self.estimate.about
+        """Plain values for JSON."""
         return {
             "tiles": self.estimate.tiles,
             "gsd_m": round(self.estimate.gsd_m, 4),
             "width_px": self.estimate.width_px,
             "height_px": self.estimate.height_px,
-            "pictures": self.counts.pictures,
+            "images": self.counts.images,
             "from_cache": self.fetched.from_cache,
             "not_covered": self.fetched.absent,
             "blank": self.counts.blank,
-            "placeholders": self.counts.placeholder,
+            "placeholders": self.counts.placeholders,
             "failed": dict(self.fetched.failed),
             "valid_share": round(self.valid_share, 4),
             "received_mb": round(self.received_mb, 3),
             "size_bytes": self.size_bytes,
-            "source": about.source,
-            "layer": about.layer,
-            "date": about.date,
-            "licence": about.licence,
-            "attribution": about.attribution,
-            "note": about.note,
+            **vars(self.estimate.provenance),
         }
 
+    def holes(self) -> str:
+        """Cells without imagery by reason, on one line; empty where there are none."""
+        numbers = {
+            "failed": self.fetched.failed.total(),
+            "not covered": self.fetched.absent,
+            "blank": self.counts.blank,
+            "placeholders": self.counts.placeholders,
+        }
+        return ", ".join(f"{count} {reason}" for reason, count in numbers.items() if count)
 
-def estimate_fetch(request: FetchRequest) -> Estimate:
-    """Ask the service what it has, and say what the fetch would cost. Raises as `fetch` does."""
+
+def estimate_fetch(request: FetchRequest) -> CostEstimate:
+    """Read the service's capabilities and estimate the cost of a fetch. Raises as `fetch` does."""
     with Client(request.limits, request.spec.secrets) as client:
-        source, _, estimate = _planned(client, request)
-        source.close()
-    return estimate
+        return _planned(client, request)[2]
 
 
 def fetch(
     request: FetchRequest,
-    progress: Progress = lambda stage, share: None,
-    started: Callable[[Estimate], None] = lambda estimate: None,
+    progress: Progress = no_progress,
+    started: Callable[[CostEstimate], None] = lambda estimate: None,
 ) -> FetchResult:
     """Fetch the imagery and write `request.out`, whole or not at all.
 
-    `started` is told the estimate before the first tile. Raises `FetchError` where the service has
-    no such imagery, answers wrongly, or tiles failed (what came is kept in the cache, and the same
-    request goes on from there), `AreaError` where the area lies outside, `OutputError` where the
-    disk refuses.
+    `started` receives the estimate before the first tile. Raises `FetchError` where the service
+    has no such imagery, answers wrongly, or tiles failed (what arrived stays in the cache, and the
+    same request resumes), `AreaError` where the area lies outside the service's coverage,
+    `OutputError` where the file cannot be written.
     """
     _check_out(request.out)
     with Client(request.limits, request.spec.secrets) as client:
         source, selection, estimate = _planned(client, request)
-        try:
-            _guard(request, estimate)
-            started(estimate)
-            cache = FileCache(request.cache or _cache_beside(request.out))
-            found = _fetched(source, selection, client, cache, progress)
-            _refuse_holes(request, found, cache)
-            counts = write_mosaic(
-                request.out,
-                source,
-                selection,
-                found.digests,
-                found.placeholders,
-                cache,
-                request.packing,
-                progress,
-            )
-        finally:
-            source.close()
+        _refuse_large(request, estimate)
+        started(estimate)
+        cache = FileCache(request.cache or request.out.with_name(f"{request.out.name}.tiles"))
+        fetched = _fetched(source, selection, client, cache, progress)
+        _refuse_holes(request, fetched, cache)
+        counts = write_mosaic(
+            request.out, source, selection, fetched, cache, request.packing, progress
+        )
         received_mb = client.received_bytes / 1e6
     if request.cache is None:
         cache.remove()
     grid = selection.grid
     share = counts.valid_px / (len(selection.cells) * grid.cell_w_px * grid.cell_h_px)
-    _tell_holes(found, counts)
     size = request.out.stat().st_size
-    return FetchResult(estimate, found, counts, share, received_mb, size)
+    result = FetchResult(estimate, fetched, counts, share, received_mb, size)
+    if result.holes():
+        log.warning("of %d tiles: %s; masked in the file", estimate.tiles, result.holes())
+    return result
 
 
-def _planned(client: Client, request: FetchRequest) -> tuple[CellSource, Selection, Estimate]:
+def _planned(client: Client, request: FetchRequest) -> tuple[CellSource, Selection, CostEstimate]:
     if not (math.isfinite(request.margin_m) and request.margin_m >= 0):
         raise FetchError(f"margin must be 0 m or more, got {request.margin_m}")
     source = open_cells(client, request.spec, request.area)
-    try:
-        selection = select(source.grid, request.area, request.margin_m)
-    except BaseException:
-        source.close()
-        raise
+    selection = _selected(source, request)
     height, width = selection.shape_px
     tiles = len(selection.cells)
-    megabytes = tiles * source.cell_bytes / 1e6
-    at_once = max(1, request.limits.parallel)
+    size = tiles * source.cell_bytes
     seconds = max(
         tiles / request.limits.per_second,
-        tiles * _SECONDS_PER_TILE / at_once,
-        megabytes * 1e6 / _BYTES_PER_SECOND,
+        tiles * _SECONDS_PER_TILE / max(1, request.limits.parallel),
+        size / _BYTES_PER_SECOND,
     )
-    estimate = Estimate(
-        tiles, selection.gsd_m, width, height, megabytes, seconds / 60, source.about
+    estimate = CostEstimate(
+        tiles, selection.gsd_m, width, height, size / 1e6, seconds / 60, source.provenance
     )
     return source, selection, estimate
 
 
-def _guard(request: FetchRequest, estimate: Estimate) -> None:
+def _selected(source: CellSource, request: FetchRequest) -> Selection:
+    """The cells of the area. Raises `AreaError`, which names swapped coordinates as the cause."""
+    frame = request.area.frame
+
+    def covered(lat_deg: float, lon_deg: float) -> bool:
+        half_deg = 1e-4
+        place = (lon_deg - half_deg, lat_deg - half_deg, lon_deg + half_deg, lat_deg + half_deg)
+        try:
+            select(source.grid, Area.from_bounds(place), 0.0)
+        except (AreaError, FetchError):
+            return False
+        return True
+
+    try:
+        return select(source.grid, request.area, request.margin_m)
+    except AreaError as error:
+        hint = swapped_hint(frame.lat_deg, frame.lon_deg, covered)
+        raise AreaError(f"{error}{hint}") from None
+
+
+def _refuse_large(request: FetchRequest, estimate: CostEstimate) -> None:
+    limit = ""
     if estimate.tiles > request.max_tiles:
+        limit = f"--max-tiles {request.max_tiles}"
+    elif estimate.megabytes > request.max_mb:
+        limit = f"--max-mb {request.max_mb:g}"
+    if limit:
         raise FetchError(
-            f"this would fetch {estimate.text()}: more than --max-tiles {request.max_tiles}; ask "
-            "for coarser pixels (--gsd-m), a part of the area, or raise the limit"
-        )
-    if estimate.megabytes > request.max_mb:
-        raise FetchError(
-            f"this would fetch {estimate.text()}: more than --max-mb {request.max_mb:g}; ask for "
-            "coarser pixels (--gsd-m), a part of the area, or raise the limit"
+            f"this would fetch {estimate.text()}: more than {limit}; choose coarser pixels "
+            "(--gsd-m), a part of the area, or raise the limit"
         )
 
 
 def _fetched(
     source: CellSource, selection: Selection, client: Client, cache: FileCache, progress: Progress
-) -> Fetched:
+) -> FetchedCells:
     try:
         return fetch_cells(source, selection, client, cache, progress)
     except Stopped:
@@ -206,36 +225,24 @@ def _fetched(
     except OutputError:
         raise
     except FetchError as error:
-        raise FetchError(f"{error}; {_kept(cache)}") from None
+        raise FetchError(f"{error}; {_resume_hint(cache)}") from None
 
 
-def _refuse_holes(request: FetchRequest, found: Fetched, cache: FileCache) -> None:
-    failed = found.failed.total()
+def _refuse_holes(request: FetchRequest, fetched: FetchedCells, cache: FileCache) -> None:
+    failed = fetched.failed.total()
     if not failed or request.allow_holes:
         return
-    reasons = ", ".join(f"{reason}: {count}" for reason, count in found.failed.most_common(4))
-    example = found.examples[found.failed.most_common(1)[0][0]]
+    common = fetched.failed.most_common(4)
+    reasons = ", ".join(f"{reason}: {count}" for reason, count in common)
     raise FetchError(
-        f"{failed} of {len(found.digests)} tiles failed ({reasons}; for example {example}); "
-        f"nothing was written; {_kept(cache)}; --allow-holes writes the file without them"
+        f"{failed} of {len(fetched.digests)} tiles failed ({reasons}; for example "
+        f"{fetched.examples[common[0][0]]}); nothing was written; {_resume_hint(cache)}; "
+        "--allow-holes writes the file without them"
     )
 
 
-def _kept(cache: FileCache) -> str:
-    return f"what came is kept, and the same command goes on from there: {cache.folder}"
-
-
-def _tell_holes(found: Fetched, counts: Counts) -> None:
-    """Holes are no error where the service has nothing, but they are told."""
-    holes = {
-        "failed": found.failed.total(),
-        "not covered": found.absent,
-        "blank": counts.blank,
-        "placeholders": counts.placeholder,
-    }
-    words = ", ".join(f"{count} {what}" for what, count in holes.items() if count)
-    if words:
-        log.warning("of %d tiles: %s; masked in the file", len(found.digests), words)
+def _resume_hint(cache: FileCache) -> str:
+    return f"fetched tiles are stored, rerun the command to resume: {cache.folder}"
 
 
 def _check_out(out: Path) -> None:
@@ -250,7 +257,3 @@ def _check_out(out: Path) -> None:
         raise OutputError(f"cannot write ({error.strerror or error}): {out}") from error
     if free < 2**20:
         raise OutputError(f"disk full; nothing was written: {out}")
-
-
-def _cache_beside(out: Path) -> Path:
-    return out.with_name(f"{out.name}.tiles")

@@ -1,4 +1,4 @@
-"""What `--source` names: a service known by name, or the address of one with its protocol."""
+"""Parsing of `--source`: a service known by name, or an address with its protocol."""
 
 import os
 import re
@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 from orthonav.errors import FetchError
 from orthonav.fetch.client import Client
+from orthonav.fetch.options import ImageryOptions, Provenance
 from orthonav.fetch.presets import PROTOCOLS, find_preset
-from orthonav.fetch.service import About, CellSource, Wish
-from orthonav.fetch.stac import Item, date_of, find_items, sign
+from orthonav.fetch.service import CellSource
+from orthonav.fetch.stac import CatalogItem, date_of, find_items, sign
 from orthonav.fetch.urls import KEY, Secret, checked_url, origin_of, shown, without_literal_keys
 from orthonav.fetch.wms import open_wms, wms_cells
 from orthonav.fetch.wmts import open_wmts
@@ -22,19 +23,25 @@ _DATE = re.compile(r"(1[89]\d\d|20\d\d)(-(0[1-9]|1[0-2])(-(0[1-9]|[12]\d|3[01]))
 
 @dataclass(frozen=True)
 class SourceSpec:
-    """A service to ask: its protocol, its address with `{key}` for a key, and what is wished."""
+    """A service and the imagery requested of it."""
 
     protocol: str
+    """One of `PROTOCOLS`."""
     url: str
-    wish: Wish
-    about: About
+    """Its address, with `{key}` in place of a key."""
+    options: ImageryOptions
+    """Which imagery."""
+    provenance: Provenance
+    """Origin and terms, as far as they are known before the service is asked."""
     secrets: tuple[Secret, ...] = ()
+    """The key, if the address holds one."""
     token_url: str | None = None
+    """Address of a signing service for files."""
 
 
 def parse_source(
     text: str,
-    wish: Wish,
+    options: ImageryOptions,
     *,
     date: str | None = None,
     licence: str | None = None,
@@ -52,31 +59,30 @@ def parse_source(
     head, _, rest = text.partition(":")
     if head in PROTOCOLS and rest:
         url, literal = without_literal_keys(checked(rest, head))
-        about = About(shown(url), wish.layer or "", date, licence, attribution)
+        provenance = Provenance(shown(url), options.layer or "", date, licence, attribution)
         secrets = _secrets(url, key_env, literal, environ)
-        return SourceSpec(head, url, wish, about, secrets)
+        return SourceSpec(head, url, options, provenance, secrets)
     if head.lower() in ("http", "https", "file"):
         raise FetchError(
-            f"say what kind of service it is: {'|'.join(PROTOCOLS)}:ADDRESS, got: {shown(text)}"
+            f"write the protocol before the address ({'|'.join(PROTOCOLS)}:ADDRESS): {shown(text)}"
         )
     preset = find_preset(head)
     layer = preset.layer(rest or None)
-    about = About(
+    options = options.over(layer.options)
+    provenance = Provenance(
         shown(preset.url),
-        wish.layer or layer.layer or preset.collection or "",
+        options.layer or options.collection or "",
         date or layer.date,
         licence or f"{preset.licence} ({preset.licence_url})",
         attribution or preset.attribution,
         "; ".join(note for note in (layer.note, preset.note) if note) or None,
     )
     secrets = _secrets(preset.url, key_env or preset.key_env, None, environ)
-    return SourceSpec(
-        preset.protocol, preset.url, wish.over(preset.wish(layer)), about, secrets, preset.token_url
-    )
+    return SourceSpec(preset.protocol, preset.url, options, provenance, secrets, preset.token_url)
 
 
 def checked(url: str, protocol: str) -> str:
-    """An address, perhaps with `{parts}`, that is http or https. Raises `FetchError`."""
+    """An http or https address, which may hold `{parts}`. Raises `FetchError`."""
     checked_url(re.sub(r"\{[^{}]*\}", "0", url))
     if protocol not in ("xyz", "tms") and set(re.findall(r"\{[^{}]*\}", url)) - {KEY}:
         raise FetchError(f"only {KEY} may stand in this address: {shown(url)}")
@@ -90,20 +96,18 @@ def check_date(text: str) -> None:
 
 
 def open_cells(client: Client, spec: SourceSpec, area: Area) -> CellSource:
-    """The cells of what is wished, after asking the service what it has.
+    """The cells of the imagery requested, after reading the service's capabilities.
 
-    Raises `FetchError` listing what there is where it has no such layer, style, zoom or time.
+    Raises `FetchError` with the available choices where it has no such layer, style, zoom or time.
     """
-    frame = area.frame
+    url, wanted = spec.url, (spec.options, area.frame, spec.provenance)
     openers: dict[str, Callable[[], CellSource]] = {
-        "wmts": lambda: wmts_tiles(open_wmts(client, spec.url), spec.wish, frame, spec.about),
-        "wms": lambda: wms_cells(
-            open_wms(client, spec.url, spec.wish.version), spec.wish, frame, spec.about
-        ),
-        "xyz": lambda: xyz_tiles(spec.url, spec.wish, frame, spec.about),
-        "tms": lambda: xyz_tiles(spec.url, spec.wish, frame, spec.about, rows_from_south=True),
+        "wmts": lambda: wmts_tiles(open_wmts(client, url), *wanted),
+        "wms": lambda: wms_cells(open_wms(client, url, spec.options.version), *wanted),
+        "xyz": lambda: xyz_tiles(url, *wanted),
+        "tms": lambda: xyz_tiles(url, *wanted, rows_from_south=True),
         "stac": lambda: _stac(client, spec, area),
-        "cog": lambda: _cogs(client, spec, [spec.url], spec.about, area),
+        "cog": lambda: _cogs(client, spec, [url], area),
     }
     return openers[spec.protocol]()
 
@@ -114,42 +118,45 @@ def _stac(client: Client, spec: SourceSpec, area: Area) -> CellSource:
         [(west, south), (west, north), (east, south), (east, north)]
     )
     box = (float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max()))
-    items = _one_per_place(find_items(client, spec.url, box, spec.wish))
+    items = _newest_by_place(find_items(client, spec.url, box, spec.options))
     if spec.token_url is not None:
         items = sign(client, spec.token_url, items)
-    about = replace(spec.about, date=date_of(items) or spec.about.date)
-    return _cogs(client, spec, [item.url for item in items], about, area)
+    provenance = replace(spec.provenance, date=date_of(items) or spec.provenance.date)
+    spec = replace(spec, provenance=provenance)
+    return _cogs(client, spec, [item.url for item in items], area)
 
 
-def _one_per_place(items: list[Item]) -> list[Item]:
-    """Items whose names differ by more than a year: of each place the newest."""
-    newest: dict[str, Item] = {}
+def _newest_by_place(items: list[CatalogItem]) -> list[CatalogItem]:
+    """The newest of the items whose names differ by a year only."""
+    newest: dict[str, CatalogItem] = {}
     for item in items:  # newest first
         newest.setdefault(re.sub(r"(?<!\d)(19|20)\d\d(?!\d)", "", item.name), item)
     return list(newest.values())
 
 
-def _cogs(
-    client: Client, spec: SourceSpec, urls: list[str], about: About, area: Area
-) -> CellSource:
-    from orthonav.fetch.cog import cog_source  # brings GDAL
+def _cogs(client: Client, spec: SourceSpec, urls: list[str], area: Area) -> CellSource:
+    from orthonav.fetch.cog import cog_source  # imports GDAL
 
-    return cog_source(client, urls, spec.wish, area.frame, about)
+    return cog_source(client, urls, spec.options, area.frame, spec.provenance)
 
 
 def _secrets(
     url: str, key_env: str | None, literal: str | None, environ: Mapping[str, str]
 ) -> tuple[Secret, ...]:
-    """The key for `{key}` in an address. Raises `FetchError` where it is not to be had."""
+    """The key for `{key}` in an address. Raises `FetchError` where it is missing."""
     if literal is not None:
         return (Secret(KEY, origin_of(url), literal),)
     if key_env is None:
         if KEY in url:
-            raise FetchError(f"address holds {KEY}; name the environment variable with --key-env")
+            raise FetchError(
+                f"address contains {KEY}; name the environment variable with --key-env"
+            )
         return ()
     if KEY not in url:
         raise FetchError(f"--key-env needs {KEY} in the address, where the key goes: {shown(url)}")
     value = environ.get(key_env, "").strip()
     if not value:
-        raise FetchError(f"this service wants a key; put yours into the variable {key_env}")
+        raise FetchError(
+            f"this service needs a key; put yours into the environment variable {key_env}"
+        )
     return (Secret(KEY, origin_of(url), value),)

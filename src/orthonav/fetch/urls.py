@@ -1,7 +1,7 @@
-"""Addresses of services: only http and https, and never a key in what is kept or shown.
+"""Addresses of services: only http and https, and never with a key where stored or shown.
 
-An address is text in which a key stands as `{key}`; the value is put in its place by the client,
-at the moment of sending, and for the one host it belongs to.
+An address holds `{key}` in place of a key. The client inserts the value when it sends a request,
+and only for the origin that the key belongs to.
 """
 
 import re
@@ -12,8 +12,9 @@ from orthonav.errors import FetchError
 
 KEY = "{key}"
 TOKEN = "{token}"
-"""Stands for a query string that a signing service gave for a host of pictures."""
+"""Placeholder of a query string that a signing service issued for a file server."""
 MAX_URL = 4096
+"""Longest address, characters: half of what servers accept by default (8 KB of header)."""
 _SECRET_NAME = re.compile(
     r"^(api[-_]?key|key|token|access[-_]?token|apikey|auth|authkey|password|pwd|sig|signature"
     r"|subscription-key|ocp-apim-subscription-key)$",
@@ -24,9 +25,9 @@ _PLACEHOLDERS = "{}"
 
 @dataclass(frozen=True)
 class Secret:
-    """What `placeholder` stands for in addresses of `origin` (scheme, host and port).
+    """The value of `placeholder` in addresses of `origin` (scheme, host and port).
 
-    Its `value` is left out of what is printed, so that no traceback shows it.
+    `repr` leaves `value` out, so that no traceback shows it.
     """
 
     placeholder: str
@@ -47,21 +48,21 @@ def checked_url(url: str) -> str:
         named = bool(parts.hostname)
         port_is_number = parts.port is None or parts.port > 0
     except ValueError as error:
-        raise FetchError(f"not an address: {shown(url)}") from error
+        raise FetchError(f"invalid address: {shown(url)}") from error
     if parts.scheme.lower() not in ("http", "https") or not named or not port_is_number:
         raise FetchError(f"only http:// and https:// addresses are fetched, got: {shown(url)}")
     if parts.username is not None or parts.password is not None:
         raise FetchError(
-            "an address must not hold a user name or password; write the key as {key} and give "
+            "an address must not contain a user name or password; write the key as {key} and give "
             f"it with --key-env: {parts.scheme}://{parts.hostname}"
         )
     if len(url) > MAX_URL or any(ord(letter) <= 32 or ord(letter) == 127 for letter in url):
-        raise FetchError(f"address is too long or holds blanks: {shown(url)}")
+        raise FetchError(f"address is too long or contains blanks: {shown(url)}")
     return url
 
 
 def origin_of(url: str) -> str:
-    """Scheme, host and port of an address, which a key must not leave."""
+    """Scheme, host and port of an address: where a key may be sent."""
     parts = urlsplit(url)
     scheme = parts.scheme.lower()
     port = parts.port or (443 if scheme == "https" else 80)
@@ -69,7 +70,7 @@ def origin_of(url: str) -> str:
 
 
 def host_of(url: str) -> str:
-    """Host and port, which share one rate limit whatever the scheme."""
+    """Host and port, which share one rate limit for both schemes."""
     return origin_of(url).partition("://")[2]
 
 
@@ -85,13 +86,13 @@ def without_literal_keys(url: str) -> tuple[str, str | None]:
     if not secret:
         return url, None
     if len(set(secret)) > 1 or KEY in url:
-        raise FetchError(f"address holds several keys; one is supported: {shown(url)}")
+        raise FetchError(f"address contains several keys; one is supported: {shown(url)}")
     plain = [(name, KEY if value == secret[0] else value) for name, value in query]
     return urlunsplit(parts._replace(query=_encoded(plain))), secret[0]
 
 
 def shown(url: str) -> str:
-    """The address for messages and tags: without values that look like keys, without user names."""
+    """The address for messages and tags, without user names and values that look like keys."""
     try:
         parts = urlsplit(url)
     except ValueError:
@@ -108,18 +109,18 @@ def with_query(url: str, parameters: dict[str, str]) -> str:
     """The address with these query parameters, which replace those of the same name in any case."""
     parts = urlsplit(url)
     names = {name.lower() for name in parameters}
-    kept = [
+    others = [
         (name, value)
         for name, value in parse_qsl(parts.query, keep_blank_values=True)
         if name.lower() not in names
     ]
-    return urlunsplit(parts._replace(query=_encoded([*kept, *parameters.items()]), fragment=""))
+    return urlunsplit(parts._replace(query=_encoded([*others, *parameters.items()]), fragment=""))
 
 
 def joined(base: str, reference: str) -> str:
-    """A reference found in a document, as an address, on the scheme of the document.
+    """A reference in a document as an absolute address, with https where the document has it.
 
-    Documents of services behind a proxy often name themselves with `http://`.
+    Documents of services behind a proxy often refer to themselves with `http://`.
     """
     url = urljoin(base, reference.strip())
     if base.startswith("https://") and url.startswith("http://"):
@@ -130,7 +131,7 @@ def joined(base: str, reference: str) -> str:
 
 
 def carrying_key(base: str, url: str) -> str:
-    """`url` with the key parameter of `base`, where both are of one origin; else as it is."""
+    """`url` with the key parameter of `base` where both have the same origin, else unchanged."""
     if KEY not in base or KEY in url or origin_of(base) != origin_of(url):
         return url
     for name, value in parse_qsl(urlsplit(base).query):
@@ -140,7 +141,7 @@ def carrying_key(base: str, url: str) -> str:
 
 
 def quoted(value: str) -> str:
-    """A value for a path or a query, with `{...}` left as it is."""
+    """A value for a path or a query; `{...}` stays unchanged."""
     return quote(value, safe=_PLACEHOLDERS + ":,-._~")
 
 

@@ -1,7 +1,6 @@
-"""WMTS 1.0.0: what a service says it has, and the tiles of one layer (OGC 07-057r7).
+"""WMTS 1.0.0 (OGC 07-057r7): the capabilities of a service, read with OWSLib.
 
-Capabilities are read with OWSLib. Both ways of asking are known: templates of addresses (REST)
-and parameters (KVP).
+Both encodings of requests are supported: address templates (REST) and parameters (KVP).
 """
 
 import math
@@ -10,7 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from orthonav.errors import FetchError, MissingExtraError
+from orthonav.errors import FetchError
+from orthonav.extras import needed
 from orthonav.fetch.client import Client
 from orthonav.fetch.crs import (
     MERCATOR_HALF_M,
@@ -23,13 +23,14 @@ from orthonav.fetch.grid import CellGrid
 from orthonav.fetch.urls import carrying_key, joined, with_query
 
 PIXEL_M = 0.28e-3
-"""Width of the pixel that scale denominators are defined by."""
+"""Width of the standardized pixel of scale denominators (OGC 07-057r7, 6.1)."""
 _MAX_TILE_PX = 4096
+"""Largest tile that is accepted; usual ones have 256 or 512 px."""
 
 
 @dataclass(frozen=True)
 class TileMatrix:
-    """One zoom of a tile matrix set: its `name` and the grid of its tiles."""
+    """One zoom level of a tile matrix set: its `name` and the grid of its tiles."""
 
     name: str
     grid: CellGrid
@@ -37,22 +38,24 @@ class TileMatrix:
 
 @dataclass(frozen=True)
 class WmtsLayer:
-    """A layer: `styles`, the usual one first; `links` of matrix sets to row and column limits by
-    matrix name (empty: no limits told); `templates` by format; `dimensions` with the usual value
-    first."""
+    """A layer as its capabilities describe it."""
 
     name: str
-    title: str
     styles: tuple[str, ...]
+    """Styles, the default one first."""
     formats: tuple[str, ...]
+    """Media types."""
     links: dict[str, dict[str, tuple[int, int, int, int]]]
+    """First row and column, last row and column, by matrix set and matrix; empty: no limits."""
     templates: dict[str, str]
+    """Address templates by media type."""
     dimensions: dict[str, tuple[str, ...]]
+    """Values by name of the dimension, the default one first."""
 
 
 @dataclass(frozen=True)
 class Wmts:
-    """A service: its layers, its matrix sets, and the address for parameters, if it takes any."""
+    """A service: its layers, matrix sets, and address of GetTile, if it takes parameters."""
 
     url: str
     layers: dict[str, WmtsLayer]
@@ -61,14 +64,14 @@ class Wmts:
 
 
 def capabilities_url(url: str) -> str:
-    """The address of a service's capabilities: a document's own, or with the parameters for it."""
+    """The address of a service's capabilities: a document, or the parameters that request it."""
     if url.partition("?")[0].lower().endswith(".xml"):
         return url
     return with_query(url, {"SERVICE": "WMTS", "REQUEST": "GetCapabilities", "VERSION": "1.0.0"})
 
 
 def open_wmts(client: Client, url: str) -> Wmts:
-    """What a service says it has. Raises `FetchError`."""
+    """The capabilities of a service. Raises `FetchError`."""
     where = capabilities_url(url)
     return read_capabilities(get_xml(client, where), where, client.redacted)
 
@@ -76,17 +79,12 @@ def open_wmts(client: Client, url: str) -> Wmts:
 def read_capabilities(
     document: bytes, url: str, redacted: Callable[[str], str] = lambda text: text
 ) -> Wmts:
-    """What a capabilities document, checked before, says. Raises `FetchError`."""
-    try:
-        from owslib.wmts import WebMapTileService
-    except ImportError as error:
-        raise MissingExtraError(
-            "reading capabilities needs OWSLib; install it with: pip install 'orthonav[geo,fetch]'"
-        ) from error
+    """The content of a capabilities document that was checked before. Raises `FetchError`."""
+    owslib = needed("owslib.wmts", "fetch", "reading capabilities")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = WebMapTileService(url, xml=document)
+            found = owslib.WebMapTileService(url, xml=document)
             sets = {
                 name: tuple(_matrices(name, matrix_set))
                 for name, matrix_set in found.tilematrixsets.items()
@@ -95,7 +93,7 @@ def read_capabilities(
             kvp_url = _kvp_url(found, url, redacted)
     except FetchError:
         raise
-    except Exception as error:  # OWSLib lets AttributeError and more through for odd documents
+    except Exception as error:  # OWSLib raises AttributeError and others for odd documents
         raise FetchError(
             f"WMTS capabilities cannot be read ({type(error).__name__}): {url}"
         ) from None
@@ -105,7 +103,7 @@ def read_capabilities(
 
 
 def _matrices(set_name: str, matrix_set: Any) -> list[TileMatrix]:
-    """The zooms of a set that can be used; none where its coordinate system is unknown."""
+    """The zoom levels of a set; none where its coordinate system is unknown."""
     try:
         crs = epsg_name(matrix_set.crs)
         swapped = swapped_corner(matrix_set.crs)
@@ -134,9 +132,9 @@ def _matrices(set_name: str, matrix_set: Any) -> list[TileMatrix]:
 
 
 def _exact_mercator(res: float, tile_px: int) -> float:
-    """The resolution that the usual grid has, where a document gives it with fewer digits.
+    """The resolution of the web grid, where a document states it with fewer digits.
 
-    One part in a million, harmless elsewhere, is 20 m at the far corner of this grid.
+    An error of one part in a million moves the far corner of this grid by 20 m.
     """
     zoom = round(math.log2(2 * MERCATOR_HALF_M / tile_px / res))
     exact = 2 * MERCATOR_HALF_M / tile_px / 2.0**zoom
@@ -144,8 +142,8 @@ def _exact_mercator(res: float, tile_px: int) -> float:
 
 
 def _layer(found: Any, url: str, redacted: Callable[[str], str]) -> WmtsLayer:
-    usual = [name for name, style in found.styles.items() if style.get("isDefault")]
-    styles = tuple(dict.fromkeys(name or "" for name in [*usual, *found.styles]))
+    default = [name for name, style in found.styles.items() if style.get("isDefault")]
+    styles = tuple(dict.fromkeys(name or "" for name in [*default, *found.styles]))
     links = {
         name: {
             limit.tilematrix: (
@@ -171,7 +169,6 @@ def _layer(found: Any, url: str, redacted: Callable[[str], str]) -> WmtsLayer:
     formats = tuple(name for name in dict.fromkeys([*found.formats, *templates]) if name)
     return WmtsLayer(
         found.id,
-        found.title or "",
         styles,
         formats,
         links,
@@ -181,13 +178,13 @@ def _layer(found: Any, url: str, redacted: Callable[[str], str]) -> WmtsLayer:
 
 
 def _template(url: str, template: str) -> str:
-    # An address with {parts} in it is none yet; the check comes when it is asked for.
+    # A template is checked as an address once it is filled in.
     absolute = joined(url, template.replace("{", "%7B").replace("}", "%7D"))
     return carrying_key(url, absolute.replace("%7B", "{").replace("%7D", "}"))
 
 
 def _kvp_url(found: Any, url: str, redacted: Callable[[str], str]) -> str | None:
-    """Where GetTile is asked with parameters; the service's own address where nothing is told."""
+    """Address of GetTile with parameters; the service's own where the document has none."""
     operations = {getattr(known, "name", ""): known for known in found.operations or []}
     if "GetTile" not in operations:
         return None if url.partition("?")[0].lower().endswith(".xml") else url

@@ -1,4 +1,4 @@
-"""Choosing a layer of a WMTS, its style, format, grid, zoom and time; addresses of its tiles."""
+"""Selection of a WMTS layer's style, format, grid, zoom and time, and addresses of its tiles."""
 
 import math
 import re
@@ -7,7 +7,8 @@ from dataclasses import replace
 
 from orthonav.errors import FetchError
 from orthonav.fetch.crs import ground_scale
-from orthonav.fetch.service import About, TileSource, Wish, finest_fitting, listed
+from orthonav.fetch.options import ImageryOptions, Provenance, choose, finest_fitting, listed
+from orthonav.fetch.service import TileSource
 from orthonav.fetch.urls import quoted, with_query
 from orthonav.fetch.wmts import TileMatrix, Wmts, WmtsLayer
 from orthonav.geo.frames import LocalFrame
@@ -15,17 +16,22 @@ from orthonav.geo.frames import LocalFrame
 _FORMATS = ("image/jpeg", "image/webp", "image/png")
 
 
-def wmts_tiles(service: Wmts, wish: Wish, frame: LocalFrame, about: About) -> TileSource:
-    """The tiles of the layer that is wished. Raises `FetchError` listing what there is."""
-    layer = _chosen_layer(service, wish.layer)
-    format_ = _chosen_format(layer, wish)
-    usual = wish.usual_style if wish.usual_style in layer.styles else None
-    problem = f"layer {layer.name} has no style"
-    style = _chosen(layer.styles, wish.style or usual, problem, "default")
-    set_name, matrix = _chosen_matrix(service, layer, wish, frame)
-    dimensions = {name: _dimension(layer, name, wish.time) for name in layer.dimensions}
-    if wish.time is not None and not any(name.lower() == "time" for name in dimensions):
-        raise FetchError(f"layer {layer.name} has no time to choose, --time was {wish.time}")
+def wmts_tiles(
+    service: Wmts, options: ImageryOptions, frame: LocalFrame, provenance: Provenance
+) -> TileSource:
+    """The tiles of the selected layer. Raises `FetchError` with the available choices."""
+    layer = _layer(service, options.layer)
+    format_ = _format(layer, options)
+    preferred = options.preferred_style if options.preferred_style in layer.styles else None
+    style = choose(
+        list(layer.styles) or ["default"],
+        options.style or preferred,
+        f"layer {layer.name} has no style",
+    )
+    set_name, matrix = _matrix(service, layer, options, frame)
+    dimensions = {name: _dimension(layer, name, options.time) for name in layer.dimensions}
+    if options.time is not None and not any(name.lower() == "time" for name in dimensions):
+        raise FetchError(f"layer {layer.name} has no time to choose, --time was {options.time}")
     names = {
         "layer": layer.name,
         "style": style,
@@ -34,7 +40,7 @@ def wmts_tiles(service: Wmts, wish: Wish, frame: LocalFrame, about: About) -> Ti
         **{name.lower(): value for name, value in dimensions.items()},
     }
     url_of = _url_of(service, layer, format_, names, dimensions)
-    return TileSource(about, matrix.grid, url_of, format_, wish.empty)
+    return TileSource(provenance, matrix.grid, url_of, format_, options.empty)
 
 
 def _url_of(
@@ -42,14 +48,10 @@ def _url_of(
 ) -> Callable[[int, int], str]:
     template = layer.templates.get(format_)
     if template is not None:
-        fixed = _filled(template, names)
-
-        def by_template(row: int, col: int) -> str:
-            return _filled(fixed, {"tilerow": str(row), "tilecol": str(col)})
-
-        return by_template
+        filled = _filled(template, names)
+        return lambda row, col: _filled(filled, {"tilerow": str(row), "tilecol": str(col)})
     if service.kvp_url is None:
-        raise FetchError(f"service tells no way to ask for tiles of {layer.name} as {format_}")
+        raise FetchError(f"service offers no tiles of {layer.name} as {format_}")
     fixed = with_query(
         service.kvp_url,
         {
@@ -64,131 +66,110 @@ def _url_of(
             **{name.upper(): value for name, value in dimensions.items()},
         },
     )
-
-    def by_parameters(row: int, col: int) -> str:
-        return f"{fixed}&TILEROW={row}&TILECOL={col}"
-
-    return by_parameters
+    return lambda row, col: f"{fixed}&TILEROW={row}&TILECOL={col}"
 
 
 def _filled(template: str, values: dict[str, str]) -> str:
-    """A template with the named parts, in any case, put in; others are left."""
+    """A template with these parts filled in, whatever their case; others stay."""
 
-    def put(found: re.Match[str]) -> str:
+    def fill(found: re.Match[str]) -> str:
         value = values.get(found.group(1).lower())
         return found.group(0) if value is None else quoted(value)
 
-    return re.sub(r"\{([^{}]+)\}", put, template)
+    return re.sub(r"\{([^{}]+)\}", fill, template)
 
 
-def _chosen_layer(service: Wmts, name: str | None) -> WmtsLayer:
-    if name in service.layers:
-        return service.layers[name]
-    if name is None and len(service.layers) == 1:
-        return next(iter(service.layers.values()))
-    asked = "name one with --layer" if name is None else f"no layer {name}"
-    raise FetchError(f"{asked}; there is {listed(list(service.layers), name or 'ortho')}")
+def _layer(service: Wmts, name: str | None) -> WmtsLayer:
+    if name is None and len(service.layers) > 1:
+        raise FetchError(
+            f"choose one with --layer; available: {listed(list(service.layers), 'ortho')}"
+        )
+    return service.layers[choose(list(service.layers), name, "no layer")]
 
 
-def _chosen_format(layer: WmtsLayer, wish: Wish) -> str:
+def _format(layer: WmtsLayer, options: ImageryOptions) -> str:
     known = [name for name in layer.formats if name.partition(";")[0] in _FORMATS]
-    if wish.format is not None:
-        return _chosen(tuple(known), wish.format, f"layer {layer.name} has no format", "")
-    for name in (wish.usual_format, *_FORMATS):
+    if options.format is not None:
+        return choose(known, options.format, f"layer {layer.name} has no format")
+    for name in (options.preferred_format, *_FORMATS):
         if name is not None and name in known:
             return name
     raise FetchError(
-        f"layer {layer.name} comes as {listed(list(layer.formats))}; JPEG, PNG or WebP are read"
+        f"layer {layer.name} comes as {listed(list(layer.formats))}; "
+        "supported are JPEG, PNG and WebP"
     )
-
-
-def _chosen(names: tuple[str, ...], wanted: str | None, problem: str, usual: str) -> str:
-    if wanted is None:
-        return names[0] if names else usual
-    if wanted not in names:
-        raise FetchError(f"{problem} {wanted}; there is {listed(list(names), wanted)}")
-    return wanted
 
 
 def _dimension(layer: WmtsLayer, name: str, time: str | None) -> str:
     values = layer.dimensions[name]
     if time is None or name.lower() != "time":
         return values[0]
-    if time not in values and not any("/" in value for value in values):
-        raise FetchError(
-            f"layer {layer.name} has no time {time}; there is {listed(list(dict.fromkeys(values)))}"
-        )
-    return time
+    if any("/" in value for value in values):  # an interval: any time within it
+        return time
+    return choose(list(values), time, f"layer {layer.name} has no time")
 
 
-def _chosen_matrix(
-    service: Wmts, layer: WmtsLayer, wish: Wish, frame: LocalFrame
+def _matrix(
+    service: Wmts, layer: WmtsLayer, options: ImageryOptions, frame: LocalFrame
 ) -> tuple[str, TileMatrix]:
     """Name of the matrix set, and the matrix with its limits."""
-    known = {name: limits for name, limits in layer.links.items() if service.sets.get(name)}
-    if not known:
+    links = {name: limits for name, limits in layer.links.items() if service.sets.get(name)}
+    if not links:
         raise FetchError(f"layer {layer.name} has no grid that can be read")
-    if wish.matrix_set is not None:
-        name = _chosen(tuple(known), wish.matrix_set, f"layer {layer.name} has no grid", "")
+    if options.matrix_set is not None:
+        name = choose(list(links), options.matrix_set, f"layer {layer.name} has no grid")
     else:
-        name = _set_of_crs(service, layer, tuple(known), wish.crs)
-    limits = known[name]
+        name = _set_of_crs(service, layer, list(links), options.crs)
+    limits = links[name]
     matrices = [m for m in service.sets[name] if not limits or m.name in limits]
-    if not limits:  # else the service itself says which zooms there are
-        matrices = [m for m in matrices if not _beyond(m.name, wish)]
+    if not limits:  # otherwise the service itself lists the zooms of the layer
+        matrices = [m for m in matrices if not _beyond(m.name, options)]
     if not matrices:
         raise FetchError(f"layer {layer.name} has no zoom in its grid {name}")
     scale = ground_scale(matrices[0].grid.crs, frame)
     gsds_m = [math.sqrt(scale[0] * scale[1]) * m.grid.res_x for m in matrices]
-    what = ", ".join(f"{m.name} ({g:.3g} m)" for m, g in zip(matrices, gsds_m, strict=True))
-    if wish.zoom is not None:
-        found = [m for m in matrices if _is_zoom(m.name, wish.zoom)]
+    levels = ", ".join(f"{m.name} ({g:.3g} m)" for m, g in zip(matrices, gsds_m, strict=True))
+    if options.zoom is not None:
+        found = [m for m in matrices if _is_zoom(m.name, options.zoom)]
         if not found:
-            raise FetchError(f"layer {layer.name} has no zoom {wish.zoom}; there is {what}")
+            raise FetchError(f"layer {layer.name} has no zoom {options.zoom}; available: {levels}")
         matrix = found[0]
     else:
-        matrix = matrices[finest_fitting(gsds_m, wish.ground_m, f"zoom {what}")]
+        matrix = matrices[finest_fitting(gsds_m, options.wanted_gsd_m, f"zoom {levels}")]
     return name, _limited(matrix, limits.get(matrix.name))
 
 
 def _is_zoom(name: str, zoom: str) -> bool:
-    """Whether a matrix goes by that name, or by that number: EPSG:3857:07 is zoom 7."""
+    """Whether a matrix has that name or number: EPSG:3857:07 is zoom 7."""
     number = name.rpartition(":")[2]
     same_number = number.isdecimal() and zoom.isdecimal() and int(number) == int(zoom)
     return zoom in (name, number) or same_number
 
 
-def _set_of_crs(service: Wmts, layer: WmtsLayer, names: tuple[str, ...], crs: str | None) -> str:
-    """The matrix set in the coordinate system that is wished, or in Web Mercator, or any."""
+def _set_of_crs(service: Wmts, layer: WmtsLayer, names: list[str], crs: str | None) -> str:
+    """The matrix set in the coordinate system requested, else in Web Mercator, else the first."""
     by_crs: dict[str, str] = {}
     for name in names:
         by_crs.setdefault(service.sets[name][0].grid.crs, name)
-    if crs is None:
-        return by_crs.get("EPSG:3857", next(iter(by_crs.values())))
-    if crs not in by_crs:
-        raise FetchError(
-            f"layer {layer.name} does not come in {crs}; there is {listed(list(by_crs))}"
-        )
-    return by_crs[crs]
+    if crs is None and "EPSG:3857" in by_crs:
+        return by_crs["EPSG:3857"]
+    return by_crs[choose(list(by_crs), crs, f"layer {layer.name} does not come in")]
 
 
-def _beyond(name: str, wish: Wish) -> bool:
-    """Whether a zoom is beyond what the preset knows to be there."""
+def _beyond(name: str, options: ImageryOptions) -> bool:
+    """Whether a zoom lies outside those that the preset names."""
     number = name.rpartition(":")[2]
     if not number.isdecimal():
         return False
-    low = wish.min_zoom is not None and int(number) < wish.min_zoom
-    return low or (wish.max_zoom is not None and int(number) > wish.max_zoom)
+    low, high = options.min_zoom, options.max_zoom
+    return (low is not None and int(number) < low) or (high is not None and int(number) > high)
 
 
 def _limited(matrix: TileMatrix, limits: tuple[int, int, int, int] | None) -> TileMatrix:
-    if limits is None or matrix.grid.limits is None:
+    """The matrix with the layer's limits of rows and columns, within its own."""
+    own = matrix.grid.limits
+    if limits is None or own is None:
         return matrix
-    whole = matrix.grid.limits
-    both = (
-        max(whole[0], limits[0]),
-        max(whole[1], limits[1]),
-        min(whole[2], limits[2]),
-        min(whole[3], limits[3]),
-    )
+    low = (max(own[0], limits[0]), max(own[1], limits[1]))
+    both = (*low, min(own[2], limits[2]), min(own[3], limits[3]))
     return replace(matrix, grid=replace(matrix.grid, limits=both))

@@ -3,7 +3,6 @@
 import json
 import shutil
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,7 +11,6 @@ from typing import Any
 import numpy as np
 import rasterio
 import rasterio.shutil
-from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
 from rasterio.errors import RasterioError
 from rasterio.transform import Affine
@@ -21,35 +19,36 @@ from rasterio.windows import Window
 from orthonav import __version__
 from orthonav.errors import FetchError, OutputError
 from orthonav.fetch.cache import FileCache
+from orthonav.fetch.download import FetchedCells
 from orthonav.fetch.grid import Selection
-from orthonav.fetch.service import About, CellSource
-from orthonav.files import replacing
+from orthonav.fetch.options import Provenance
+from orthonav.fetch.service import CellSource
+from orthonav.files import Progress, replacing
 
 BLOCK_PX = 512
+"""GDAL's default block of a COG."""
 GDAL_OPTIONS = {
     "GDAL_TIFF_INTERNAL_MASK": "YES",
     "GDAL_CACHEMAX": 128 * 2**20,
     "GDAL_NUM_THREADS": "2",
 }
-COMPRESSIONS = ("jpeg", "deflate")
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
 class Packing:
-    """How the file is packed: `compress` jpeg or deflate, `quality` of JPEG."""
+    """Compression of the file: `compress` jpeg or deflate, `quality` of JPEG, 1 to 100."""
 
     compress: str = "jpeg"
     quality: int = 90
 
 
 @dataclass
-class Counts:
-    """Cells by what they hold, and the share of pixels of all of them that is valid."""
+class CellCounts:
+    """Cells by content, and the number of valid pixels of all of them."""
 
-    pictures: int = 0
+    images: int = 0
     blank: int = 0
-    placeholder: int = 0
+    placeholders: int = 0
     valid_px: int = 0
 
 
@@ -57,17 +56,15 @@ def write_mosaic(
     out: Path,
     source: CellSource,
     selection: Selection,
-    digests: NDArray[np.uint64],
-    placeholders: NDArray[np.bool_],
+    fetched: FetchedCells,
     cache: FileCache,
     packing: Packing,
     progress: Progress,
-) -> Counts:
-    """Write the cells as one GeoTIFF and say what they held. What is missing is masked.
+) -> CellCounts:
+    """Write the cells as one GeoTIFF, with missing ones masked, and count them by content.
 
-    Raises `FetchError` where nothing is valid, `OutputError` where the disk refuses.
+    Raises `FetchError` where no pixel is valid, `OutputError` where the file cannot be written.
     """
-    counts = Counts()
     with (
         replacing(out) as temporary,
         tempfile.TemporaryDirectory(
@@ -77,12 +74,12 @@ def write_mosaic(
     ):
         raw = Path(folder) / "mosaic.tif"
         try:
-            _write_raw(raw, source, selection, digests, placeholders, cache, counts, progress)
+            counts = _write_raw(raw, source, selection, fetched, cache, progress)
             if counts.valid_px == 0:
                 raise FetchError("the service has no imagery of this area in this layer")
             progress("pack", 0.1)
             _pack(raw, temporary, source, packing)
-            _check(temporary, raw, source)
+            _verify(temporary, raw, source)
             progress("pack", 1.0)
         except (RasterioError, MemoryError) as error:
             raise _not_written(error, out) from error
@@ -93,20 +90,39 @@ def _write_raw(
     raw: Path,
     source: CellSource,
     selection: Selection,
-    digests: NDArray[np.uint64],
-    placeholders: NDArray[np.bool_],
+    fetched: FetchedCells,
     cache: FileCache,
-    counts: Counts,
     progress: Progress,
-) -> None:
-    """The mosaic as a sparse tiled file; a block is written once where cells and blocks agree."""
+) -> CellCounts:
+    """The mosaic as a sparse tiled file."""
+    counts = CellCounts()
+    placeholders = fetched.placeholders
+    with rasterio.open(raw, "w", **_profile(source, selection)) as dataset:
+        dataset.update_tags(**tags_of(source.provenance, selection))
+        if source.bands == 3:
+            dataset.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+        for number, (row, col) in enumerate(selection.cells.tolist()):
+            if fetched.digests[number] == 0:
+                continue
+            if placeholders[number]:
+                counts.placeholders += 1
+                continue
+            _write_cell(dataset, source, cache, (row, col), selection.first, counts)
+            progress("mosaic", (number + 1) / len(selection.cells))
+    return counts
+
+
+def _profile(source: CellSource, selection: Selection) -> dict[str, Any]:
+    """How the sparse file is laid out.
+
+    It is compressed only where cells consist of whole blocks: a compressed block that is written
+    twice leaves its first version in the file.
+    """
     grid = selection.grid
-    first_row, first_col = selection.first
     height, width = selection.shape_px
-    west, north = grid.corner(first_row, first_col)
+    west, north = grid.corner(*selection.first)
     cell = min(grid.cell_w_px, grid.cell_h_px, BLOCK_PX)
     block = cell if cell % 16 == 0 and grid.cell_w_px % cell == grid.cell_h_px % cell == 0 else 256
-    fits = grid.cell_w_px % block == 0 and grid.cell_h_px % block == 0
     profile = {
         "driver": "GTiff",
         "width": width,
@@ -123,47 +139,32 @@ def _write_raw(
         "transform": Affine(grid.res_x, 0, west, 0, -grid.res_y, north),
         "photometric": "RGB" if source.bands == 3 else "MINISBLACK",
     }
-    if fits:
+    if grid.cell_w_px % block == grid.cell_h_px % block == 0:
         profile |= {"compress": "DEFLATE", "zlevel": 1}
-    tags = tags_of(source.about, selection)
-    with rasterio.open(raw, "w", **profile) as dataset:
-        dataset.update_tags(**tags)
-        if source.bands == 3:
-            dataset.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
-        for number, (row, col) in enumerate(selection.cells.tolist()):
-            if digests[number] == 0:
-                continue
-            if placeholders[number]:
-                counts.placeholder += 1
-                continue
-            _write_cell(dataset, source, cache, (row, col), (first_row, first_col), counts)
-            progress("mosaic", (number + 1) / len(selection.cells))
+    return profile
 
 
 def _write_cell(
     dataset: Any,
     source: CellSource,
     cache: FileCache,
-    at: tuple[int, int],
+    cell: tuple[int, int],
     first: tuple[int, int],
-    counts: Counts,
+    counts: CellCounts,
 ) -> None:
-    entry = cache.read(source.address(*at))
+    entry = cache.read(source.address(*cell))
     if entry is None or entry.body is None:
-        raise OutputError(f"what was fetched is gone from the cache: {cache.folder}")
-    picture = source.decode(entry.body)
-    if picture.blank:
+        raise OutputError(f"a fetched cell is missing from the cache: {cache.folder}")
+    pixels = source.decode(entry.body)
+    if pixels.blank:
         counts.blank += 1
         return
-    grid = source.grid
-    height, width = picture.valid.shape
-    window = Window(
-        (at[1] - first[1]) * grid.cell_w_px, (at[0] - first[0]) * grid.cell_h_px, width, height
-    )
-    dataset.write(np.where(picture.valid, picture.bands, 0), window=window)
-    dataset.write_mask(np.where(picture.valid, 255, 0).astype(np.uint8), window=window)
-    counts.pictures += 1
-    counts.valid_px += int(picture.valid.sum())
+    height, width = pixels.valid.shape
+    window = Window((cell[1] - first[1]) * width, (cell[0] - first[0]) * height, width, height)
+    dataset.write(np.where(pixels.valid, pixels.bands, 0), window=window)
+    dataset.write_mask(np.where(pixels.valid, 255, 0).astype(np.uint8), window=window)
+    counts.images += 1
+    counts.valid_px += int(pixels.valid.sum())
 
 
 def _pack(raw: Path, out: Path, source: CellSource, packing: Packing) -> None:
@@ -183,8 +184,8 @@ def _pack(raw: Path, out: Path, source: CellSource, packing: Packing) -> None:
     rasterio.shutil.copy(raw, out, driver="COG", **options)
 
 
-def _check(out: Path, raw: Path, source: CellSource) -> None:
-    """What was packed has the size, place and kind of what was written."""
+def _verify(out: Path, raw: Path, source: CellSource) -> None:
+    """Raise `OutputError` unless the packed file has the size, place and bands of the raw one."""
     with rasterio.open(out) as packed, rasterio.open(raw) as written:
         same = (
             packed.shape == written.shape
@@ -193,32 +194,33 @@ def _check(out: Path, raw: Path, source: CellSource) -> None:
             and packed.count == source.bands
         )
         if not same:
-            raise OutputError(f"the file that was written is not what it should be: {out}")
+            raise OutputError(f"the packed file differs from the mosaic: {out}")
 
 
-def tags_of(about: About, selection: Selection) -> dict[str, str]:
-    """What the file says of itself, without keys: terms, source, layer, dates.
+def tags_of(provenance: Provenance, selection: Selection) -> dict[str, str]:
+    """Origin, terms and dates as tags of the file, without keys.
 
-    ACQUISITION_DATE is the date of the imagery as far as it is known; TIFFTAG_DATETIME is there
-    only where the day is, for that tag has no shorter form.
+    ACQUISITION_DATE is the date of the imagery as far as it is known; TIFFTAG_DATETIME exists only
+    where the day is known, because that tag has no shorter form.
     """
     tags = {
-        "ORTHONAV_SOURCE": about.source,
-        "ORTHONAV_LAYER": about.layer,
-        "ORTHONAV_LICENCE": about.licence or "unknown",
-        "ORTHONAV_ATTRIBUTION": about.attribution or "",
-        "ORTHONAV_NOTE": about.note or "",
+        "ORTHONAV_SOURCE": provenance.source,
+        "ORTHONAV_LAYER": provenance.layer,
+        "ORTHONAV_LICENCE": provenance.licence or "unknown",
+        "ORTHONAV_ATTRIBUTION": provenance.attribution or "",
+        "ORTHONAV_NOTE": provenance.note or "",
         "ORTHONAV_FETCHED": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
         "ORTHONAV_GSD_M": json.dumps(round(selection.gsd_m, 4)),
-        "TIFFTAG_COPYRIGHT": about.attribution or "",
+        "TIFFTAG_COPYRIGHT": provenance.attribution or "",
         "TIFFTAG_SOFTWARE": f"orthonav {__version__}",
     }
-    if about.date is not None:
-        tags["ACQUISITION_DATE"] = about.date.partition("/")[0]
-        if "/" in about.date:
-            tags["ORTHONAV_DATES"] = about.date
-        elif len(about.date) == 10:
-            tags["TIFFTAG_DATETIME"] = about.date.replace("-", ":") + " 00:00:00"
+    date = provenance.date
+    if date is not None:
+        tags["ACQUISITION_DATE"] = date.partition("/")[0]
+        if "/" in date:
+            tags["ORTHONAV_DATES"] = date
+        elif len(date) == 10:
+            tags["TIFFTAG_DATETIME"] = date.replace("-", ":") + " 00:00:00"
     return {name: value for name, value in tags.items() if value}
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from orthonav.errors import CameraError, FlightError, MissingFileError
 from orthonav.files import require_file
 from orthonav.geo.camera import Camera
+from orthonav.geo.swapped import swapped_hint
 from orthonav.records import Prior, Telemetry
 
 TELEMETRY_COLUMNS = ("frame", "time_s", "yaw_deg", "pitch_deg", "roll_deg", "agl_m")
@@ -31,7 +32,7 @@ OPTIONAL_COLUMNS = (
     "vel_std_mps",
 )
 MAX_TEXT_BYTES = 500_000_000
-# The camera describes the sensor: an orientation tag must not turn the picture.
+# The camera describes the sensor: an orientation tag must not rotate the image.
 _DECODE = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 _BROKEN_JSON = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
 _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
@@ -39,7 +40,7 @@ _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 
 @dataclass(frozen=True)
 class FlightView:
-    """One view of a flight: its name in `frames/`, where it lies, what was known at exposure."""
+    """One view of a flight: its name in `frames/`, its file, and its telemetry."""
 
     frame: str
     path: Path
@@ -47,11 +48,11 @@ class FlightView:
 
     @property
     def where(self) -> str:
-        """Where the picture lies, for messages."""
+        """Location of the image, for messages."""
         return str(self.path)
 
     def grey(self) -> NDArray[np.uint8]:
-        """Grey levels (H, W) uint8 of the picture; raises as `read_image`."""
+        """Grey levels (H, W) uint8 of the image; raises as `read_image`."""
         return read_image(self.path)
 
 
@@ -73,8 +74,8 @@ class FlightFolder:
 def open_flight(path: Path) -> FlightFolder:
     """Open a flight folder and check that every image named is there.
 
-    Raises `MissingFileError`, `FlightError` or `CameraError`, saying which file and line. Values
-    that are not numbers become NaN: what lacks heading or height is a matter of one view.
+    Raises `MissingFileError`, `FlightError` or `CameraError` with file and line. Values that are
+    not numbers become NaN: a missing heading or height concerns one view only.
     """
     path = Path(path)
     if not path.is_dir():
@@ -104,7 +105,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 
 
 def decode_image(data: bytes, where: str) -> NDArray[np.uint8]:
-    """Grey levels (H, W) uint8 of an encoded image (JPEG, PNG, TIFF); `where` it lies, for errors.
+    """Grey levels (H, W) uint8 of an encoded image (JPEG, PNG, TIFF); `where` is for errors.
 
     Raises `FlightError` where it cannot be decoded or was cut short.
     """
@@ -122,10 +123,10 @@ def decode_image(data: bytes, where: str) -> NDArray[np.uint8]:
 def _is_cut_jpeg(data: bytes) -> bool:
     """Whether this is a JPEG that lacks its end-of-image marker.
 
-    OpenCV before 5 fills what is missing of a JPEG with grey and says nothing; of PNG and TIFF it
-    decodes none. The marker is looked for behind the header of the first scan: thumbnails before
-    it end with a marker of their own, compressed data never holds one, and what some cameras put
-    behind it (previews, padding) does not matter.
+    OpenCV before 5 fills the missing part of a JPEG with grey without an error; incomplete PNG and
+    TIFF it does not decode. The marker is searched after the header of the first scan: thumbnails
+    before it end with a marker of their own, compressed data never holds one, and previews or
+    padding after it do not matter.
     """
     if not data.startswith(_JPEG_START):
         return False
@@ -146,9 +147,10 @@ def read_truth(path: Path) -> dict[str, tuple[float, float]]:
     for line, row in _rows(path, ("frame", "lat_deg", "lon_deg")):
         lat, lon = number_of(row["lat_deg"]), number_of(row["lon_deg"])
         if not (abs(lat) <= 90 and abs(lon) <= 360):
-            raise FlightError(f"line {line}: no latitude and longitude in degrees: {path}")
+            hint = swapped_hint(lat, lon)
+            raise FlightError(f"line {line}: not a latitude and longitude in degrees{hint}: {path}")
         if row["frame"] in truth:
-            raise FlightError(f"line {line}: frame {row['frame']} comes twice: {path}")
+            raise FlightError(f"line {line}: frame {row['frame']} appears twice: {path}")
         truth[row["frame"]] = (lat, lon)
     return truth
 
@@ -190,14 +192,17 @@ def _views(telemetry: Path, frames: Path) -> Iterator[FlightView]:
         if not frame or pure.is_absolute() or ".." in pure.parts or "\\" in frame:
             raise FlightError(f"line {line}: '{frame}' is not a name inside frames/: {telemetry}")
         if frame in seen:
-            raise FlightError(f"line {line}: frame {frame} comes twice: {telemetry}")
+            raise FlightError(f"line {line}: frame {frame} appears twice: {telemetry}")
         seen.add(frame)
         time_ns = time_ns_of(row["time_s"])
         if time_ns is None:
-            raise FlightError(f"line {line}: time_s is no time in seconds: {telemetry}")
+            raise FlightError(f"line {line}: time_s is not a time in seconds: {telemetry}")
         image = frames / frame
         if not _is_file(image):
             raise FlightError(f"telemetry line {line} names an image that does not exist: {image}")
+        prior = number_of(row.get("prior_lat_deg")), number_of(row.get("prior_lon_deg"))
+        if hint := swapped_hint(*prior):
+            raise FlightError(f"line {line}: prior position is out of range{hint}: {telemetry}")
         yield FlightView(frame, image, _telemetry(row, time_ns))
 
 
@@ -247,9 +252,9 @@ def _is_file(path: Path) -> bool:
 
 
 def time_ns_of(text: str | None) -> int | None:
-    """Nanoseconds of decimal seconds, None where it is no time.
+    """Nanoseconds of decimal seconds, None where the text is not a time.
 
-    Floats could not hold them for times since 1970.
+    Decimal, because a float64 of seconds since 1970 does not resolve nanoseconds.
     """
     if text is None or not abs(number_of(text)) < 9e9:  # NaN too
         return None
@@ -257,7 +262,7 @@ def time_ns_of(text: str | None) -> int | None:
 
 
 def number_of(text: Any) -> float:
-    """The number that a text of a table is, NaN where it is none."""
+    """The number in a field of a table, NaN where it is not a number."""
     try:
         return float(text)
     except (TypeError, ValueError):

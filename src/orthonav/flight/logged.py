@@ -1,10 +1,10 @@
-"""The messages of a flight log, written and read side by side.
+"""The messages of a flight log, written and read.
 
 A flight log is one or more MCAP files (`docs/flights.md`). Each message is JSON, so that it can be
-read without us, but pictures: base64 would hide their bytes from the compression of the chunks, so
-they are in the encoding of ROS 2 (CDR), of which Foxglove knows the schema by name. Numbers that
-JSON has no words for are the texts `NaN`, `Infinity` and `-Infinity`, as in JSON of Protocol
-Buffers; all others come back bit for bit.
+read without orthonav. Images are the exception: base64 would hide their bytes from the compression
+of the chunks, so they are encoded as in ROS 2 (CDR), and Foxglove knows the schema by name. Numbers
+that JSON cannot express are the texts `NaN`, `Infinity` and `-Infinity`, as in the JSON of Protocol
+Buffers; all others are read back bit for bit.
 """
 
 import json
@@ -19,16 +19,16 @@ from orthonav.geo.camera import Camera
 from orthonav.records import Fix, Prior, Telemetry
 
 PROFILE = "orthonav"
-"""The profile in the header of an MCAP file that says it is ours."""
+"""Profile in the header of an MCAP file that marks a flight log of orthonav."""
 FORMAT = 1
 MAX_CHUNK_BYTES = 128 * 2**20
-"""No chunk is larger, uncompressed; readers refuse those that claim to be."""
+"""Largest chunk, uncompressed; readers refuse those that claim more."""
 MAX_PICTURE_BYTES = MAX_CHUNK_BYTES // 2
 MAX_JSON_BYTES = 2**20
 FRAME_ID = "camera"
 PICTURES = ("full", "thumbnail", "none", "dropped", "bad")
-"""What became of a view's picture: logged, logged small, not asked for, no time or room for it,
-or the camera gave none that can be used."""
+"""State of a view's image: logged, logged small, not requested, dropped for lack of time or space,
+or unusable as the camera delivered it."""
 
 _WORDS = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 _TIME = {
@@ -91,8 +91,8 @@ MSG: sensor_msgs/NavSatStatus
 int8 status
 uint16 service
 """
-_TOLD = ("yaw_deg", "pitch_deg", "roll_deg", "agl_m")
-_TOLD_OR_NOT = tuple(each.name for each in fields(Telemetry) if each.type == float | None)
+_REPORTED = ("yaw_deg", "pitch_deg", "roll_deg", "agl_m")
+_REPORTED_IF_KNOWN = tuple(each.name for each in fields(Telemetry) if each.type == float | None)
 
 SESSION = Topic(
     "/orthonav/session",
@@ -117,9 +117,9 @@ TELEMETRY = Topic(
             "frame": _TEXT,
             "time_ns": _INTEGER,
             "picture": _TEXT,
-            **dict.fromkeys(_TOLD, _NUMBER),
+            **dict.fromkeys(_REPORTED, _NUMBER),
         },
-        {**dict.fromkeys(_TOLD_OR_NOT, _NUMBER), "prior": _OBJECT, "vel_en_mps": _numbers()},
+        {**dict.fromkeys(_REPORTED_IF_KNOWN, _NUMBER), "prior": _OBJECT, "vel_en_mps": _numbers()},
     ),
 )
 RESULT = Topic(
@@ -168,38 +168,39 @@ CAMERA = Topic(
         },
     ),
 )
+GNSS = Topic("/orthonav/gnss", "sensor_msgs/msg/NavSatFix", _NAVSAT, "ros2msg", "cdr")
 HEALTH = Topic("/orthonav/health", "orthonav.Health", _schema("orthonav.Health", {}, {}))
-TOPICS = (SESSION, VIEW, THUMBNAIL, TELEMETRY, RESULT, POSITION, NAVSAT, CAMERA, HEALTH)
+TOPICS = (SESSION, VIEW, THUMBNAIL, TELEMETRY, RESULT, POSITION, NAVSAT, GNSS, CAMERA, HEALTH)
 
 NO_ALTITUDE_M2 = 1e8
-"""Variance up of a position: a fix says nothing of the altitude, which is written as 0."""
+"""Vertical variance of a position: a fix has no altitude, which is written as 0."""
 _COVARIANCE_KNOWN = 3
 _STATUS_FIX, _STATUS_NO_FIX = 0, -1
 
 
 @dataclass(frozen=True)
 class LoggedView:
-    """What a log says of a view.
-
-    `index` counts the views of the log from 0 without gaps and is the sequence number of all its
-    messages; `number` is the runner's, which counts pictures that were passed over too. `frame`:
-    its name. `picture`: one of `PICTURES`.
-    """
+    """A view in a log."""
 
     index: int
+    """Number in the log, from 0 without gaps; the sequence number of all its messages."""
     number: int
+    """Number that the runner gave it, which counts skipped images too."""
     frame: str
+    """Its name."""
     telemetry: Telemetry
+    """Telemetry of its exposure."""
     picture: str
+    """State of its image, one of `PICTURES`."""
 
 
 def to_json(plain: Any) -> bytes:
-    """Strict JSON of plain values. Raises `ValueError` or `TypeError` where it cannot be."""
+    """Strict JSON of plain values. Raises `ValueError` or `TypeError` for others."""
     return json.dumps(_worded(plain), allow_nan=False, separators=(",", ":")).encode("ascii")
 
 
 def from_json(data: bytes) -> dict[str, Any]:
-    """The object that `to_json` wrote, words for numbers left as they are. Raises `FlightError`."""
+    """The object that `to_json` wrote; texts for numbers stay texts. Raises `FlightError`."""
     if len(data) > MAX_JSON_BYTES:
         raise FlightError(f"message of the log has {len(data)} bytes")
     try:
@@ -213,45 +214,47 @@ def from_json(data: bytes) -> dict[str, Any]:
 
 def telemetry_message(view: LoggedView) -> bytes:
     """The message of `TELEMETRY`."""
-    told = view.telemetry
+    telemetry = view.telemetry
     plain = {
-        "timestamp": stamp(told.time_ns),
+        "timestamp": stamp(telemetry.time_ns),
         "index": int(view.index),
         "number": int(view.number),
         "frame": view.frame,
-        "time_ns": int(told.time_ns),
+        "time_ns": int(telemetry.time_ns),
         "picture": view.picture,
-        **{name: float(getattr(told, name)) for name in _TOLD},
-        **{name: _float_or_none(getattr(told, name)) for name in _TOLD_OR_NOT},
-        "prior": told.prior and {name: float(v) for name, v in asdict(told.prior).items()},
-        "vel_en_mps": told.vel_en_mps and [float(value) for value in told.vel_en_mps],
+        **{name: float(getattr(telemetry, name)) for name in _REPORTED},
+        **{name: _float_or_none(getattr(telemetry, name)) for name in _REPORTED_IF_KNOWN},
+        "prior": telemetry.prior
+        and {name: float(v) for name, v in asdict(telemetry.prior).items()},
+        "vel_en_mps": telemetry.vel_en_mps and [float(value) for value in telemetry.vel_en_mps],
     }
     return to_json(plain)
 
 
 def view_of(data: bytes) -> LoggedView:
-    """What a message of `TELEMETRY` says. Raises `FlightError`."""
+    """The view in a message of `TELEMETRY`. Raises `FlightError`."""
     plain = from_json(data)
     try:
         prior, velocity = plain["prior"], plain["vel_en_mps"]
-        told = {name: _number(plain[name]) for name in _TOLD}
-        told_or_not: dict[str, Any] = {
-            name: None if plain.get(name) is None else _number(plain[name]) for name in _TOLD_OR_NOT
+        reported = {name: _number(plain[name]) for name in _REPORTED}
+        optional: dict[str, Any] = {
+            name: None if plain.get(name) is None else _number(plain[name])
+            for name in _REPORTED_IF_KNOWN
         }
         names = ("lat_deg", "lon_deg", "std_m")
         telemetry = Telemetry(
             time_ns=_integer(plain["time_ns"]),
-            **told,
-            **told_or_not,
+            **reported,
+            **optional,
             prior=None if prior is None else Prior(*(_number(prior[name]) for name in names)),
             vel_en_mps=None if velocity is None else _pair(velocity),
         )
         index, number = _integer(plain["index"]), _integer(plain["number"])
         frame, picture = plain["frame"], plain["picture"]
         if not isinstance(frame, str) or picture not in PICTURES:
-            raise ValueError("frame or picture is not what it should be")
+            raise ValueError("invalid frame or picture")
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise FlightError(f"telemetry of the log is broken ({error!r:.120})") from error
+        raise FlightError(f"telemetry of the log is damaged ({error!r:.120})") from error
     return LoggedView(index, number, frame, telemetry, picture)
 
 
@@ -273,7 +276,7 @@ def camera_of(plain: Any) -> Camera:
     except CameraError:
         raise
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise FlightError(f"camera of the log is broken ({error!r:.120})") from error
+        raise FlightError(f"camera of the log is damaged ({error!r:.120})") from error
 
 
 def calibration_message(camera: Camera, time_ns: int) -> bytes:
@@ -311,11 +314,11 @@ def position_message(fix: Fix, time_ns: int) -> bytes:
     return json.dumps(plain, allow_nan=False).encode("ascii")
 
 
-def navsat_message(fix: Fix, time_ns: int, *, sure: bool) -> bytes:
-    """The message of `NAVSAT` (CDR, little endian), status "no fix" unless `sure`.
+def navsat_message(fix: Fix, time_ns: int, *, confident: bool) -> bytes:
+    """The message of `NAVSAT` (CDR, little endian), status "no fix" unless `confident`.
 
-    Raises `ValueError` where a value is not finite. The altitude is NaN, as is usual where it is
-    not known.
+    Raises `ValueError` where a value is not finite. The altitude is NaN, the
+    convention for unknown.
     """
     (ee, en), (ne, nn) = fix.cov_en_m2.tolist()
     place = float(fix.lat_deg), float(fix.lon_deg)
@@ -324,7 +327,7 @@ def navsat_message(fix: Fix, time_ns: int, *, sure: bool) -> bytes:
     sec, nsec = divmod(max(0, int(time_ns)), 10**9)
     name = FRAME_ID.encode() + b"\0"
     out = bytearray(struct.pack("<III", sec & 0xFFFFFFFF, nsec, len(name)) + name)
-    out += struct.pack("<b", _STATUS_FIX if sure else _STATUS_NO_FIX)
+    out += struct.pack("<b", _STATUS_FIX if confident else _STATUS_NO_FIX)
     out += bytes(-len(out) % 2) + struct.pack("<H", 0)  # no satellite service
     out += bytes(-len(out) % 8)
     out += struct.pack("<3d", *place, math.nan)
@@ -333,7 +336,7 @@ def navsat_message(fix: Fix, time_ns: int, *, sure: bool) -> bytes:
 
 
 def stamp(time_ns: int) -> dict[str, int]:
-    """Seconds and nanoseconds, as Foxglove wants them: not before 1970."""
+    """Seconds and nanoseconds since 1970, as Foxglove expects; 0 for earlier times."""
     sec, nsec = divmod(max(0, int(time_ns)), 10**9)
     return {"sec": sec, "nsec": nsec}
 
@@ -350,21 +353,21 @@ def picture_message(data: bytes, kind: str, time_ns: int) -> bytes:
 
 
 def picture_of(message: bytes) -> tuple[bytes, str]:
-    """The encoded picture in a message of `VIEW` and its kind. Raises `FlightError`."""
+    """The encoded image in a message of `VIEW` and its format. Raises `FlightError`."""
     values, at = [], 12
     for _ in range(3):
         at += -at % 4
         length = int.from_bytes(message[at : at + 4], "little")
         value = message[at + 4 : at + 4 + length]
         if message[:4] != b"\0\1\0\0" or len(value) != length or at + 4 > len(message):
-            raise FlightError("picture of the log is broken")
+            raise FlightError("image of the log is damaged")
         values.append(value)
         at += 4 + length
     return values[1], values[2].rstrip(b"\0").decode("latin-1")
 
 
 def _worded(value: Any) -> Any:
-    """Plain values with words for what is not finite."""
+    """Plain values with texts for numbers that are not finite."""
     if isinstance(value, float) and not math.isfinite(value):
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     if isinstance(value, Mapping):
@@ -382,7 +385,7 @@ def _number(value: Any) -> float:
     if isinstance(value, str):
         return _WORDS[value]
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"{value!r:.40} is no number")
+        raise TypeError(f"{value!r:.40} is not a number")
     number = float(value)
     if not math.isfinite(number):
         raise ValueError(f"{value!r:.40} is beyond float64")
@@ -391,7 +394,7 @@ def _number(value: Any) -> float:
 
 def _integer(value: Any) -> int:
     if type(value) is not int or abs(value) >= 2**63:
-        raise TypeError(f"{value!r:.40} is no integer of 64 bits")
+        raise TypeError(f"{value!r:.40} is not an integer of 64 bits")
     return value
 
 

@@ -1,6 +1,6 @@
-"""What is wrong with what a flight tells, all along: how the camera is mounted, compass, height.
+"""Constant errors of a flight's telemetry: mounting of the camera, compass, height, focal length.
 
-Found by flying (`orthonav calibrate`), kept in a small JSON file, used for the flights after it.
+`orthonav calibrate` estimates them from a flight and writes a small JSON file for later flights.
 """
 
 import json
@@ -21,8 +21,8 @@ _LIMITS = {"heading_deg": 180.0, "log_scale": 1.0, "pitch_deg": 60.0, "roll_deg"
 
 @dataclass(frozen=True)
 class Bias:
-    """A constant error: `value` is added to what is told, `std` how well it is known, `scatter`
-    the standard deviation of what is left from view to view."""
+    """A constant error: `value` is added to the reported value, `std` is the standard deviation of
+    the estimate, `scatter` that of the residuals from view to view."""
 
     value: float
     std: float
@@ -31,21 +31,21 @@ class Bias:
 
 @dataclass(frozen=True)
 class Mount:
-    """Constant errors of what is told.
-
-    `heading_deg`, `pitch_deg` and `roll_deg` in degrees, clockwise, ahead and to the left as those
-    of `Telemetry`; `log_scale` is the natural logarithm of true over told height, errors of the
-    focal length included. `views`: how many it rests on.
-    """
+    """Constant errors of telemetry."""
 
     heading_deg: Bias
+    """Degrees, clockwise."""
     log_scale: Bias
+    """Natural logarithm of true over reported height; includes errors of the focal length."""
     pitch_deg: Bias
+    """Degrees, positive ahead."""
     roll_deg: Bias
+    """Degrees, positive to the left."""
     views: int
+    """Number of views that the estimate is based on."""
 
     def corrected(self, telemetry: Telemetry) -> Telemetry:
-        """Telemetry without these errors; what is not told stays so."""
+        """Telemetry without these errors; unknown values stay unknown."""
         return replace(
             telemetry,
             yaw_deg=telemetry.yaw_deg + self.heading_deg.value,
@@ -66,7 +66,7 @@ def read_mount(path: Path) -> Mount:
     path = require_file(path, "mount file")
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise ValueError("it is too large")
+            raise ValueError("too large")
         plain = json.loads(path.read_text(encoding="utf-8"))
         if plain["orthonav_mount"] != VERSION:
             raise ValueError(f"version {plain['orthonav_mount']}, expected {VERSION}")
@@ -76,7 +76,7 @@ def read_mount(path: Path) -> Mount:
 
 
 def mount_from_plain(plain: Any) -> Mount:
-    """Inverse of `asdict`, checked; raises one of `BROKEN` where it is no mount."""
+    """Inverse of `asdict`, checked; raises one of `BROKEN` for an invalid mount."""
     biases = {name: _bias(plain[name], name) for name in _LIMITS}
     return Mount(**biases, views=int(plain["views"]))
 

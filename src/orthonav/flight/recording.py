@@ -1,4 +1,4 @@
-"""What `localize` needs of a flight, whatever it was recorded with."""
+"""The interface of a recorded flight, whatever it was recorded with."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from orthonav.records import Telemetry
 
 
 class RecordedView(Protocol):
-    """One view: its name, what was known at exposure, and its picture when it is asked for."""
+    """One view: its name, its telemetry, and its image, which is decoded on request."""
 
     @property
     def frame(self) -> str:
@@ -20,11 +20,11 @@ class RecordedView(Protocol):
 
     @property
     def telemetry(self) -> Telemetry:
-        """What was known at exposure."""
+        """Telemetry of the exposure."""
 
     @property
     def where(self) -> str:
-        """Where the picture lies, for messages."""
+        """Location of the image, for messages."""
 
     def grey(self) -> NDArray[np.uint8]:
         """Grey levels (H, W) uint8. Raises `FlightError` where it cannot be decoded."""
@@ -39,20 +39,20 @@ class Flight(Protocol):
 
     @property
     def note(self) -> str:
-        """What people should know of the flight."""
+        """Remark on the flight, for people."""
 
     @property
     def views(self) -> Iterable[RecordedView]:
-        """The views, from the first; each is read when it comes."""
+        """The views in order; each is read when its turn comes."""
 
     @property
     def expected(self) -> int:
-        """About how many views will come, for progress; 0 where that is not known."""
+        """Approximate number of views, for progress; 0 where it is unknown."""
 
 
 @dataclass(frozen=True)
-class Retold:
-    """A view of which something else was known."""
+class WithTelemetry:
+    """A recorded view with other telemetry."""
 
     view: RecordedView
     telemetry: Telemetry

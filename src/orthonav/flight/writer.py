@@ -21,7 +21,7 @@ from orthonav.records import Telemetry
 class FlightWriter:
     """Writes views into an existing empty folder; `close` writes telemetry, camera and truth.
 
-    Use it inside `orthonav.files.replacing_folder`, so that a flight is there whole or not.
+    Use it inside `orthonav.files.replacing_folder`, so that it is written whole or not at all.
     """
 
     def __init__(self, folder: Path, camera: Camera, note: str) -> None:
@@ -51,7 +51,7 @@ class FlightWriter:
         telemetry: Telemetry,
         truth_latlon_deg: tuple[float, float] | None,
     ) -> None:
-        """Add one view whose picture is encoded already, as `data`; its truth where known."""
+        """Add one view whose image is encoded already, as `data`; its truth where known."""
         path = self._folder / "frames" / frame
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
@@ -78,7 +78,7 @@ class FlightWriter:
 def encoded(image: NDArray[np.uint8], frame: str, jpeg_quality: int = 90) -> bytes:
     """`image` (H, W) grey or (H, W, 3) BGR encoded by the ending of `frame`.
 
-    Raises `OutputError` where that cannot be done.
+    Raises `OutputError` where OpenCV cannot encode it.
     """
     options = [int(cv2.IMWRITE_JPEG_QUALITY), jpeg_quality]
     if not frame.lower().endswith((".jpg", ".jpeg")):

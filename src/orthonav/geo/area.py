@@ -1,4 +1,4 @@
-"""The reference area: where the aircraft may be, so where tile centres must lie."""
+"""The reference area: where the aircraft may be, and thus where tile centres are placed."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from orthonav.errors import AreaError
 from orthonav.geo.frames import MAX_SHEET_M, LocalFrame
 from orthonav.geo.route import Route, within_bands
+from orthonav.geo.swapped import swapped_hint
 
 Extent = tuple[float, float, float, float]
 
@@ -18,8 +19,8 @@ class Area:
     """A reference area in its own local plane.
 
     `extent_en_m` is (west, south, east, north) in metres of `frame`. With `route` the area is the
-    search band around it: each leg's own width, `band_m` metres where a leg has none; else it is
-    the whole extent.
+    search band around it: the width of each leg, or `band_m` metres for legs without one.
+    Without a route it is the whole extent.
     """
 
     frame: LocalFrame
@@ -29,7 +30,10 @@ class Area:
 
     @classmethod
     def from_bounds(cls, bounds_deg: Extent) -> "Area":
-        """Area of a latitude/longitude box (west, south, east, north in degrees)."""
+        """Area of a latitude/longitude box (west, south, east, north in degrees).
+
+        Raises `AreaError` for an invalid box; names swapped latitude and longitude.
+        """
         west, south, east, north = bounds_deg
         if west > east + 180:  # across the antimeridian, as in GeoJSON (RFC 7946, 5.2)
             east += 360
@@ -39,7 +43,11 @@ class Area:
                 f"south < north, got {','.join(map(str, bounds_deg))}"
             )
         if max(abs(south), abs(north)) > 89.9 or east - west > 10 or north - south > 10:
-            raise AreaError(f"bounds are no area a sheet can hold, in degrees: {bounds_deg}")
+            hint = swapped_hint(max(south, north, key=abs), max(west, east, key=abs))
+            raise AreaError(
+                "bounds must be west,south,east,north in degrees, at most 10 degrees across"
+                f"{hint}, got {','.join(map(str, bounds_deg))}"
+            )
         share = np.linspace(0, 1, 33)
         lon = west + (east - west) * share
         lat = south + (north - south) * share
@@ -51,7 +59,7 @@ class Area:
     def from_outline(cls, lat_deg: NDArray[np.float64], lon_deg: NDArray[np.float64]) -> "Area":
         """Smallest north-up box around outline points, in a plane centred on that box.
 
-        Longitudes are taken as near the first point, so the outline may cross the antimeridian.
+        Longitudes are unwrapped near the first point, so the outline may cross the antimeridian.
         """
         lon_deg = lon_deg - 360 * np.round((lon_deg - lon_deg[0]) / 360)
         frame = LocalFrame(
@@ -65,15 +73,15 @@ class Area:
 
     @classmethod
     def from_route(cls, route: Route, band_m: float | None = None) -> "Area":
-        """Search band around `route`, `band_m` metres across where its legs do not say otherwise.
+        """Search band around `route`, `band_m` metres wide for legs without a width of their own.
 
-        Raises `AreaError` where a leg has no band, and where one sheet cannot hold them all.
+        Raises `AreaError` if a leg has no band, or if the area does not fit into one sheet.
         """
         if band_m is not None and not (np.isfinite(band_m) and band_m > 0):
             raise AreaError(f"search band must be wider than 0 m, got {band_m}")
         bands_m = route.bands_m(band_m)
         if bands_m is None:
-            raise AreaError("a route needs the width of its search band in metres (--band-m)")
+            raise AreaError("the route has no search band; give its width in metres (--band-m)")
         lat_lon = np.array(route.waypoints)
         box = cls.from_outline(lat_lon[:, 0], lat_lon[:, 1])
         line = route.points_en_m(box.frame)
@@ -87,7 +95,7 @@ class Area:
     def contains(
         self, points_en_m: NDArray[np.float64], margin_m: float = 0.0
     ) -> NDArray[np.bool_]:
-        """Which of `(N, 2)` local points lie inside, or at most `margin_m` outside."""
+        """Mask `(N,)` of the local points `(N, 2)` inside, or at most `margin_m` outside."""
         if self.route is not None:
             return within_bands(points_en_m, *self._bands, margin_m)
         west, south, east, north = self.extent_en_m
@@ -97,7 +105,7 @@ class Area:
 
     @cached_property
     def _bands(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The route's vertices (M, 2) in the plane, and the width of each leg's band."""
+        """Vertices of the route (M, 2) in the plane, and the band width of each leg."""
         assert self.route is not None
         bands_m = self.route.bands_m(self.band_m or None)
         assert bands_m is not None

@@ -1,4 +1,4 @@
-"""What a map will need before it is built: tiles, size and time, from grid and area alone."""
+"""Estimated tiles, file size and build time of a map, from its grid and area alone."""
 
 import math
 from dataclasses import dataclass
@@ -9,26 +9,29 @@ from orthonav.geo.area import Area, Extent
 from orthonav.geo.grid import TileGrid
 
 TILE_BYTES = 273.0
-"""Embedding and centre of a tile: docs/benchmarks.md, 4.26 MB for 15,601 tiles."""
+"""Embedding and centre of a tile; docs/benchmarks.md: 4.26 MB for 15,601 tiles."""
 LAYER_BYTES_PER_PX = 0.15, 0.35
-"""Registration layer, all levels together: docs/map-format.md, least and most of real imagery."""
+"""Registration layer, all levels: minimum and maximum of real imagery, docs/map-format.md."""
 BUILD_FIXED_S = 40.0
 BUILD_S_PER_MPX = 0.5
 """Measured with one worker on a core of an AMD EPYC, generated landscape, 1 m, default build: 179 s
 for a corridor of 284 million pixels (`python -m benchmarks.corridor`), 47 s for 4 million on a
-shared Xeon at 2 GHz. What is fixed is the learning of confidences."""
+shared Xeon at 2 GHz. The fixed part is the calibration of the confidence."""
 _PAIRS = 1_000_000_000
+"""Limit on pairs of points and legs, which bounds the time of an estimate."""
 _MOST_POINTS = 200_000
 _LEAST_POINTS = 2_500
+"""Points sampled at most and at least: a standard error of the share of 0.1 % to 1 %."""
 
 
 @dataclass(frozen=True)
 class MapEstimate:
-    """What a map of one sheet will need.
+    """Estimate for a map of one sheet.
 
-    `area_km2` is the area of tile centres, `imagery_km2` that of the pixels under the tiles.
-    `map_mb` is the least and most size of the file, `build_s` the time that the default build
-    takes on one core of a desktop, with registration; networks take hours more.
+    `area_km2`: area covered by tile centres. `imagery_km2`: area of the pixels under the tiles.
+    `tiles`: number of reference tiles. `map_mb`: smallest and largest expected file size.
+    `build_s`: time of the default build on one desktop core, with registration; training a network
+    takes hours more.
     """
 
     area_km2: float
@@ -41,10 +44,10 @@ class MapEstimate:
 def estimate_map(
     area: Area, *, gsd_m: float, tile_px: int, overlap: float, registration: bool = True
 ) -> MapEstimate:
-    """Estimate of the map that `orthonav build` would make of an area.
+    """Estimate for the map that `orthonav build` makes of an area.
 
-    Tiles are counted where that is cheap, else measured on a sample (within 2 %). All ground is
-    taken to have imagery. Raises `AreaError` as `TileGrid.covering` does.
+    Tiles are counted if that is cheap, else estimated from a sample (within 2 %). Imagery is
+    assumed everywhere. Raises `AreaError` as `TileGrid.covering` does.
     """
     grid = TileGrid.covering(area.extent_en_m, gsd_m=gsd_m, tile_px=tile_px, overlap=overlap)
     half_m, centre_m = grid.tile_m / 2, (grid.tile_m - grid.stride_m) / 2
@@ -75,7 +78,7 @@ def _share(
 ) -> float:
     """Share of a box (west, south, east, north) that lies in the area or within a margin of it.
 
-    Told by the middles of its `cells` (rows, columns), or of fewer where that is dear.
+    Computed from the centres of its `cells` (rows, columns), or of fewer if those are too many.
     """
     if area.route is None:
         return 1.0

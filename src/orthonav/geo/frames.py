@@ -20,7 +20,7 @@ WGS84_A_M = 6378137.0
 WGS84_F = 1 / 298.257223563
 WGS84_E2 = WGS84_F * (2 - WGS84_F)
 MAX_SHEET_M = 50_000.0
-"""A sheet is at most this far across, so that the plane stays true to millimetres."""
+"""Largest extent of a sheet; the plane is then accurate to millimetres."""
 
 Array = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""The tile grid of a sheet: where reference tiles of `tile_px` pixels are cut, and how densely."""
+"""The tile grid of a sheet: positions and spacing of reference tiles of `tile_px` pixels."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -16,7 +16,7 @@ Numbers = tuple[float, ...]
 _STEPS = 50
 _CLOSE = 1e-9
 _EXACT = 1e-14
-"""Of all points: no step would change them any more."""
+"""Largest step at which the iteration of all points has converged."""
 
 
 def brown_distort(distortion: Numbers, xy: Array) -> Array:
@@ -28,7 +28,7 @@ def brown_distort(distortion: Numbers, xy: Array) -> Array:
 
 
 def brown_undistort(distortion: Numbers, xy: Array) -> Array:
-    """Ideal points (..., 2) of distorted ones, by Newton's method; NaN where there is none."""
+    """Ideal points (..., 2) of distorted ones, by Newton's method; NaN if there is none."""
     k1, k2, p1, p2, k3 = (*distortion, 0.0)[:5]
     ideal = np.array(xy, dtype=np.float64)
     with np.errstate(all="ignore"):
@@ -42,7 +42,7 @@ def brown_undistort(distortion: Numbers, xy: Array) -> Array:
             dyy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
             error = _brown(distortion, ideal) - xy
             if np.abs(error).max(initial=0.0) < _EXACT:
-                break  # NaN never is: points beyond the lens take all steps
+                break  # NaN never converges: points beyond the lens take all steps
             step = np.stack(
                 [
                     dyy * error[..., 0] - dxy * error[..., 1],
@@ -69,14 +69,14 @@ def fisheye_distort(distortion: Numbers, xy: Array) -> Array:
 
 
 def fisheye_undistort(distortion: Numbers, xy: Array) -> Array:
-    """Ideal points (..., 2) of distorted ones; NaN where there is none in front of the camera."""
+    """Ideal points (..., 2) of distorted ones; NaN if there is none in front of the camera."""
     radius = np.hypot(xy[..., 0], xy[..., 1])
     polynomial = _angles(distortion)
     slope, end = polynomial.deriv(), min(_fold_angle(polynomial), math.pi / 2)
     low, high = np.zeros_like(radius), np.full_like(radius, end)
     angle = np.clip(radius, 0.0, 0.9 * end)
     with np.errstate(all="ignore"):
-        for _ in range(_STEPS):  # Newton's, kept inside a bracket: far out the slope may vanish
+        for _ in range(_STEPS):  # Newton's method inside a bracket: far out the slope may vanish
             error = polynomial(angle) - radius
             if np.abs(error).max(initial=0.0) < _EXACT:
                 break
@@ -104,20 +104,20 @@ def _brown(distortion: Numbers, xy: Array) -> Array:
 
 @lru_cache(maxsize=16)
 def _fold_r2(k1: float, k2: float, k3: float) -> float:
-    """Squared radius at which the radial model stops growing; infinite where it never does."""
+    """Squared radius at which the radial model stops growing; infinite if it never does."""
     inverse = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])  # of 1 / r2: the leading 1 keeps it sound
     largest = inverse.real[np.abs(inverse.imag) < 1e-9].max(initial=0.0)
     return float(1 / largest) if largest > 1e-12 else math.inf
 
 
 def _angles(distortion: Numbers) -> np.polynomial.Polynomial:
-    """The distance from the centre of the image as a polynomial of the angle off the axis."""
+    """Distance from the image centre as a polynomial of the angle from the optical axis."""
     k1, k2, k3, k4 = distortion or (0.0,) * 4
     return np.polynomial.Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4])
 
 
 def _fold_angle(polynomial: np.polynomial.Polynomial) -> float:
-    """Angle in radians at which the fisheye model stops growing; infinite where it never does."""
+    """Angle in radians at which the fisheye model stops growing; infinite if it never does."""
     _, k1, k2, k3, k4 = polynomial.coef[1::2]
     inverse = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3, 9 * k4])  # of 1 / angle squared, as above
     largest = inverse.real[np.abs(inverse.imag) < 1e-9].max(initial=0.0)

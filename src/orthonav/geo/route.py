@@ -1,6 +1,6 @@
-"""A planned route: read from the files of planners, and its geometry.
+"""A planned route: read from the file formats of ground stations, and its geometry.
 
-Formats are told by the file's name; each has a module in `orthonav.geo.routes`.
+The file name suffix selects the format; each format has a module in `orthonav.geo.routes`.
 """
 
 import csv
@@ -68,8 +68,8 @@ _READERS: dict[str, Callable[[bytes], list[Route]]] = {
 def read_route(path: Path) -> Route:
     """Read a route from a file of one of the formats in `docs/routes.md`.
 
-    `FILE#NAME` picks a line by its name where a file holds several; `paper:B@46.6,1.9,30` is a
-    preset. Raises `MissingFileError` or `RouteError` (naming what came and what was expected).
+    `FILE#NAME` selects a line by its name if a file holds several; `paper:B@46.6,1.9,30` is a
+    preset. Raises `MissingFileError` or `RouteError` (naming found and expected content).
     """
     if str(path).startswith(PREFIX):
         return preset(str(path))
@@ -93,7 +93,7 @@ def read_route(path: Path) -> Route:
 
 
 def _name_apart(path: Path) -> tuple[Path, str | None]:
-    """The file and the name after its `#`; a file whose own name has one is taken whole."""
+    """The file and the line name after `#`; an existing file may have `#` in its name."""
     text = str(path)
     if path.exists():
         return path, None
@@ -106,7 +106,7 @@ def _name_apart(path: Path) -> tuple[Path, str | None]:
 def _chosen(found: list[Route], name: str | None, first: bool) -> Route:
     """The line of that name, else the only one.
 
-    With `first` that of several which have no names, with a warning. Raises `RouteError`, which
+    With `first`, the first of several unnamed lines, with a warning. Raises `RouteError`, which
     lists the names.
     """
     names = ", ".join(repr(route.name or "")[:60] for route in found[:20])
@@ -118,7 +118,7 @@ def _chosen(found: list[Route], name: str | None, first: bool) -> Route:
     if len(found) > 1:
         if not first or any(route.name for route in found):
             raise RouteError(f"file holds {len(found)} lines; name one as FILE#NAME: {names}")
-        log.warning("route file holds %d lines without names: the first is taken", len(found))
+        log.warning("route file holds %d unnamed lines: using the first", len(found))
     return found[0]
 
 
@@ -140,11 +140,10 @@ def beyond_bands_m(
     line_en_m: NDArray[np.float64],
     bands_m: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """How far `(N, 2)` points lie outside the bands of a polyline's legs; inside it is below 0.
+    """Distance in metres of `(N, 2)` points outside the bands of a polyline; negative inside.
 
-    `line_en_m` has `(M, 2)` vertices, M >= 1, `bands_m` the full width of the band of each of its
-    max(1, M - 1) legs. It is the least, over the legs, of the distance to the leg less half its
-    band.
+    `line_en_m`: vertices `(M, 2)`, M >= 1. `bands_m`: full band width of each of the max(1, M - 1)
+    legs. The result is the minimum over the legs of the distance to the leg minus half its band.
     """
     starts = line_en_m[:-1] if len(line_en_m) > 1 else line_en_m
     legs = (line_en_m[1:] if len(line_en_m) > 1 else line_en_m) - starts
@@ -169,9 +168,9 @@ def within_bands(
     bands_m: NDArray[np.float64],
     margin_m: float,
 ) -> NDArray[np.bool_]:
-    """Which of `(N, 2)` points lie in the band of a leg or at most `margin_m` beside it.
+    """Mask `(N,)` of the points `(N, 2)` inside the band of a leg or at most `margin_m` outside.
 
-    As `beyond_bands_m`, but for many points and legs it looks only at those that are near.
+    Equivalent to `beyond_bands_m`, but many points are tested only against nearby legs.
     """
     if len(points_en_m) <= _FEW_POINTS:
         return np.asarray(beyond_bands_m(points_en_m, line_en_m, bands_m) <= margin_m)
@@ -200,7 +199,7 @@ def within_bands(
 def along_polyline_en_m(
     line_en_m: NDArray[np.float64], spacing_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions `(N, 2)` every `spacing_m` along a polyline and the course `(N,)` in degrees there.
+    """Positions `(N, 2)` every `spacing_m` along a polyline, and the course `(N,)` in degrees.
 
     The first position is the first vertex; a route of one vertex gives one position, course 0.
     """

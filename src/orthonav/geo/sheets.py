@@ -1,7 +1,7 @@
-"""Areas too large for one sheet, cut into parts that each fit.
+"""Division of areas too large for one sheet into parts that each fit.
 
-A map holds one sheet, so each part becomes a map of its own. Neighbours touch: a map's tiles reach
-half a tile beyond its area, so a view near the border lies wholly on one of the two.
+A map holds one sheet, so each part becomes a separate map. Neighbouring parts share a border; tiles
+reach half a tile beyond the area, so a view near the border lies completely on one of the two maps.
 """
 
 import itertools
@@ -16,19 +16,24 @@ from orthonav.errors import AreaError
 from orthonav.geo.area import Area, Extent
 from orthonav.geo.frames import MAX_SHEET_M, WGS84_A_M
 from orthonav.geo.route import Height, Route, leg_lengths_m
+from orthonav.geo.swapped import swapped_hint
 
 MAX_SHEETS = 10_000
+"""Limit of the program; 2500 km2 each, so 25 million km2."""
 _DEGREE_M = 110_574.0
-"""A degree of latitude at its shortest, at the equator."""
+"""Shortest degree of latitude, at the equator (WGS84)."""
 _LON_DEGREE_M = 111_320.0
+"""Degree of longitude at the equator (WGS84)."""
 _TRIES = 4
+"""Numbers of columns tried for one row before rows are made lower."""
 
 
 def sheets_of_bounds(bounds_deg: Extent) -> list[Extent]:
-    """Boxes (west, south, east, north in degrees) that each fit a sheet and together are the box.
+    """Boxes (west, south, east, north in degrees) that each fit a sheet and together fill the box.
 
-    Rows of equal height, from south to north, each cut into as many equal boxes as its width asks
-    for, from west to east. Raises `AreaError` for what is no box, or more than `MAX_SHEETS` boxes.
+    Rows of equal height, from south to north; each row is divided into the number of equal boxes
+    its width requires, from west to east. Raises `AreaError` for an invalid box, or for more than
+    `MAX_SHEETS` boxes; names swapped latitude and longitude.
     """
     west, south, east, north = bounds_deg
     if west > east + 180:  # across the antimeridian, as in GeoJSON (RFC 7946, 5.2)
@@ -39,7 +44,11 @@ def sheets_of_bounds(bounds_deg: Extent) -> list[Extent]:
             f"got {','.join(map(str, bounds_deg))}"
         )
     if max(abs(south), abs(north)) > 89.5 or abs(west) > 360:
-        raise AreaError(f"bounds must lie within 89.5 deg of the equator, got {bounds_deg}")
+        hint = swapped_hint(max(south, north, key=abs), max(west, east, key=abs))
+        raise AreaError(
+            f"bounds must lie within 89.5 deg of the equator{hint}, "
+            f"got {','.join(map(str, bounds_deg))}"
+        )
     zone = math.sin(math.radians(north)) - math.sin(math.radians(south))
     least = math.radians(east - west) * zone * WGS84_A_M**2 / MAX_SHEET_M**2
     if least > MAX_SHEETS:
@@ -58,7 +67,7 @@ def sheets_of_bounds(bounds_deg: Extent) -> list[Extent]:
 
 
 def _row(west: float, south: float, east: float, north: float) -> list[Extent]:
-    """Boxes of a row, none where no width makes them fit, for the row is too high."""
+    """Boxes of a row; empty if the row is too high for boxes of any width."""
     widest = 0.0 if south <= 0 <= north else min(abs(south), abs(north))
     width_m = (east - west) * _LON_DEGREE_M * math.cos(math.radians(widest))
     least = max(1, int(width_m / MAX_SHEET_M))
@@ -82,20 +91,20 @@ def _box_fits(bounds_deg: Extent) -> bool:
 
 
 def _wrapped(lon_deg: float) -> float:
-    """A longitude within 180 degrees; those that are stay as they are."""
+    """A longitude in -180..180; values inside are returned unchanged."""
     return lon_deg if abs(lon_deg) <= 180 else (lon_deg + 180) % 360 - 180
 
 
 def sheets_of_route(route: Route, band_m: float | None) -> list[Route]:
     """Parts of a route, in order, whose search bands each fit a sheet.
 
-    Cut at waypoints, each part as long as fits; a leg that is too long for a sheet is cut into
-    equal pieces on the great circle. Each part begins where the one before ends. Parts of a route
-    that is cut are named sheet-1, sheet-2 and so on. Raises `AreaError`.
+    The route is divided at waypoints, each part as long as possible. A leg too long for a sheet is
+    divided into equal pieces on the great circle. Each part begins at the end of the previous one.
+    Parts are named sheet-1, sheet-2 and so on. Raises `AreaError`.
     """
     bands_m = route.bands_m(band_m)
     if bands_m is None or _route_fits(route, band_m):
-        Area.from_route(route, band_m)  # says what is missing
+        Area.from_route(route, band_m)  # raises if a band is missing
         return [route]
     if max(bands_m) >= MAX_SHEET_M:
         raise AreaError(
@@ -120,7 +129,7 @@ def _route_fits(route: Route, band_m: float | None) -> bool:
 
 
 def _last_that_fits(route: Route, first: int, band_m: float | None) -> int:
-    """The last waypoint such that the legs from `first` to it fit a sheet, at least one leg."""
+    """The last waypoint for which the legs from `first` fit a sheet; at least one leg."""
     step, last = 1, first + 1
     while last + step < len(route.waypoints) and _route_fits(
         route.part(first, last + step), band_m
@@ -137,14 +146,14 @@ def _last_that_fits(route: Route, first: int, band_m: float | None) -> int:
 
 
 def _with_short_legs(route: Route, bands_m: tuple[float, ...]) -> Route:
-    """The same way with more waypoints, so that each leg alone fits a sheet."""
+    """The same route with more waypoints, so that each leg fits a sheet."""
     waypoints, heights = [route.waypoints[0]], list(route.heights[:1])
     leg_bands: list[float | None] = []
     lengths_m = leg_lengths_m(route)
     for leg, (start, end) in enumerate(zip(route.waypoints, route.waypoints[1:], strict=False)):
         pieces = math.ceil(lengths_m[leg] / (0.99 * (MAX_SHEET_M - bands_m[leg])))
         if pieces <= 1 or _route_fits(Route((start, end)), bands_m[leg]):
-            pieces = 1  # most legs, without looking closer
+            pieces = 1  # most legs
         if len(waypoints) + pieces > MAX_SHEETS + len(route.waypoints):
             raise _too_many(pieces)
         shares = [number / pieces for number in range(1, pieces)]
@@ -171,7 +180,7 @@ def _on_great_circle(
     one, other = _direction(start), _direction(end)
     angle = math.atan2(float(np.linalg.norm(np.cross(one, other))), float(one @ other))
     if shares and math.sin(angle) < 1e-6:
-        raise AreaError(f"leg from {start} to {end} goes half around the Earth: add waypoints")
+        raise AreaError(f"leg from {start} to {end} spans half of the Earth: add waypoints")
     for share in shares:
         x, y, z = math.sin((1 - share) * angle) * one + math.sin(share * angle) * other
         yield math.degrees(math.atan2(z, math.hypot(x, y))), math.degrees(math.atan2(y, x))
@@ -183,4 +192,4 @@ def _direction(place: tuple[float, float]) -> NDArray[np.float64]:
 
 
 def _too_many(count: int) -> AreaError:
-    return AreaError(f"area needs {count:,} sheets, at most {MAX_SHEETS:,} are cut")
+    return AreaError(f"area needs {count:,} sheets, more than the limit of {MAX_SHEETS:,}")

@@ -1,4 +1,4 @@
-"""Height above ground along a route, and how much the ground differs within a view."""
+"""Height above ground along a route, and relief within a view."""
 
 import math
 from collections.abc import Callable
@@ -13,24 +13,26 @@ from orthonav.geo.planning import MOST_RELIEF, Caution
 from orthonav.geo.route import Route, leg_lengths_m
 
 Array = NDArray[np.float64]
-Ground = Callable[[Array, Array], Array]
-"""Heights above mean sea level in m of places given in degrees; NaN where they are not known."""
+TerrainHeights = Callable[[Array, Array], Array]
+"""Function of latitudes and longitudes (deg): heights above mean sea level (m), NaN if unknown."""
 MAX_POSITIONS = 2000
+"""Sampled positions along a route at most."""
 LANDING_M = 30.0
-"""Lower than this an aircraft takes off or lands: what it sees then is not judged."""
+"""Height above ground below which the aircraft takes off or lands; views there are not judged."""
 _BELOW_GROUND_M = 2.0
+"""Tolerance for errors of the terrain model."""
 _ACROSS = (0.0, -0.5, 0.5)
 _VIEW = [(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.0, 0.5)]
 
 
 @dataclass(frozen=True)
 class LegProfile:
-    """A leg over terrain. Metres; `leg` counts from 1.
+    """A leg over terrain.
 
-    `ground_m` and `agl_m` are least and most along the leg, ground above mean sea level, height
-    above ground. `relief` is the most by which ground differs within a view that is centred
-    on the leg or at a border of its search band, as a share of the height there; 0 where the
-    aircraft is lower than `LANDING_M`.
+    `leg`: number, from 1. `length_m`: its length. `ground_m`: minimum and maximum terrain height
+    above mean sea level along it. `agl_m`: minimum and maximum height above ground. `relief`:
+    largest difference of terrain height within a view centred on the leg or on an edge of its
+    search band, as a share of the height above ground; 0 below `LANDING_M`.
     """
 
     leg: int
@@ -41,27 +43,31 @@ class LegProfile:
 
 
 def profile(
-    route: Route, bands_m: tuple[float, ...], agl_m: float | None, view_m: float, ground: Ground
+    route: Route,
+    bands_m: tuple[float, ...],
+    agl_m: float | None,
+    view_m: float,
+    terrain: TerrainHeights,
 ) -> list[LegProfile]:
-    """Height above ground leg by leg.
+    """Height above ground and relief of each leg.
 
-    `bands_m` are the search bands of the legs; `agl_m` is the height above ground where the route
-    says none (or not above what), flown so all along; `view_m` is the width of a view. Raises
-    `RouteError` where a height is not known, or the terrain does not reach.
+    `bands_m`: search bands of the legs. `agl_m`: constant height above ground for legs without
+    known heights. `view_m`: width of a view. Raises `RouteError` if a height is unknown, or if the
+    terrain does not cover the route.
     """
     spacing_m = max(view_m / 2, float(leg_lengths_m(route).sum()) / MAX_POSITIONS, 1.0)
     home_m = route.home_amsl_m
     if home_m is None:
         first = np.array([route.waypoints[0]])
-        home_m = float(ground(first[:, 0], first[:, 1])[0])
+        home_m = float(terrain(first[:, 0], first[:, 1])[0])
     return [
-        _leg(route, leg, bands_m[leg], agl_m, view_m, spacing_m, home_m, ground)
+        _leg(route, leg, bands_m[leg], agl_m, view_m, spacing_m, home_m, terrain)
         for leg in range(route.legs)
     ]
 
 
 def _leg_m(route: Route, leg: int) -> tuple[LocalFrame, float, Array]:
-    """A plane about a leg, its length, and both ends in the plane (2, 2)."""
+    """A local plane at a leg, its length, and both ends in the plane (2, 2)."""
     ends = route.part(leg, min(leg + 1, len(route.waypoints) - 1))
     frame = LocalFrame(*ends.waypoints[0])
     points = ends.points_en_m(frame)
@@ -76,7 +82,7 @@ def _leg(
     view_m: float,
     spacing_m: float,
     home_m: float,
-    ground: Ground,
+    terrain: TerrainHeights,
 ) -> LegProfile:
     frame, length_m, (start, end) = _leg_m(route, leg)
     along = (end - start) / length_m if length_m > 0 else np.array([1.0, 0.0])
@@ -86,12 +92,12 @@ def _leg(
     centres = places[:, None, :] + np.array(_ACROSS)[:, None] * band_m * across
     seen = centres[:, :, None, :] + np.array(_VIEW) * view_m
     lat, lon = frame.latlon_from_en(seen)
-    heights = ground(lat.ravel(), lon.ravel()).reshape(lat.shape)
+    heights = terrain(lat.ravel(), lon.ravel()).reshape(lat.shape)
     middle = heights[..., len(_VIEW) // 2]
     if not np.isfinite(middle[:, 0]).all():
-        raise RouteError(f"the terrain does not reach leg {leg + 1} of the route")
+        raise RouteError(f"the terrain does not cover leg {leg + 1} of the route")
     if not np.isfinite(home_m):
-        raise RouteError("the terrain does not reach the take-off place (the first waypoint)")
+        raise RouteError("the terrain does not cover the take-off position (the first waypoint)")
     flown = _flown_amsl_m(route, leg, agl_m, shares, middle[:, 0], home_m)
     over = flown - middle[:, 0]
     known = np.isfinite(heights).all(axis=-1)
@@ -110,35 +116,35 @@ def _leg(
 def _flown_amsl_m(
     route: Route, leg: int, agl_m: float | None, shares: Array, below: Array, home_m: float
 ) -> Array:
-    """Heights above mean sea level that are flown at shares of a leg, over the ground `below`."""
+    """Flown heights above mean sea level at shares of a leg, over the terrain heights `below`."""
     ends = route.heights[leg : leg + 2]
     frames = {None if height is None else height.frame for height in ends}
     if not ends or None in frames or len(frames) > 1:
         if agl_m is None:
             raise RouteError(
-                f"route does not say how high leg {leg + 1} is flown, and above what; give the "
+                f"the height of leg {leg + 1} of the route, or its reference, is unknown; give the "
                 "height above ground (--agl-m)"
             )
         return below + agl_m
-    told = [height.height_m for height in ends if height is not None]
-    heights = told[0] + shares * (told[-1] - told[0])
+    known = [height.height_m for height in ends if height is not None]
+    heights = known[0] + shares * (known[-1] - known[0])
     base = {"agl": below, "home": np.array(home_m), "amsl": np.array(0.0)}
     return np.asarray(base[str(frames.pop())] + heights)
 
 
 def terrain_cautions(legs: list[LegProfile]) -> list[Caution]:
-    """What speaks against a route over this terrain."""
+    """Cautions about a route over this terrain."""
     found = []
     low = [leg.leg for leg in legs if leg.agl_m[0] < -_BELOW_GROUND_M]
     steep = [leg for leg in legs if leg.relief > MOST_RELIEF and leg.leg not in low]
     if low:
-        text = f"{_named(low)} would be flown into the ground"
+        text = f"{_named(low)} would pass below the terrain"
         found.append(Caution("ground", text))
     if steep:
         most = max(leg.relief for leg in steep)
         text = (
-            f"ground within a view differs by up to {most:.0%} of the height on "
-            f"{_named([leg.leg for leg in steep])} (above {MOST_RELIEF:.0%} hills bend the view)"
+            f"relief within a view is up to {most:.0%} of the height on "
+            f"{_named([leg.leg for leg in steep])}; above {MOST_RELIEF:.0%} it distorts the view"
         )
         found.append(Caution("relief", text))
     return found

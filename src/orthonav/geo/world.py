@@ -1,7 +1,7 @@
-"""The whole Earth cut into sheets: every place has one, and everybody names it alike.
+"""Division of the whole Earth into named sheets.
 
-Rows of equal height in latitude, each cut into as many equal boxes as its widest parallel asks for.
-Rows are counted from the South Pole, columns from 180 deg west.
+Rows have equal height in latitude; each row is divided into the number of equal boxes its longest
+parallel requires. Rows are counted from the South Pole, columns from 180 deg west.
 """
 
 import math
@@ -12,19 +12,21 @@ from dataclasses import dataclass
 from orthonav.errors import AreaError
 from orthonav.geo.area import Extent
 from orthonav.geo.frames import MAX_SHEET_M
+from orthonav.geo.swapped import swapped_hint
 
 LARGEST_SIDE_M = 0.9 * MAX_SHEET_M
-"""The box around a sheet is wider than the sheet itself where meridians tilt."""
+"""The box around a sheet is wider than the sheet, because meridians converge."""
 SMALLEST_SIDE_M = 200.0
 _MERIDIAN_DEGREE_M = 111_695.0
-"""A degree of latitude at its longest, at a pole."""
+"""Longest degree of latitude, at a pole (WGS84)."""
 _PARALLEL_DEGREE_M = 111_320.0
+"""Degree of longitude at the equator (WGS84)."""
 _NAME = re.compile(r"r([0-9]{6})c([0-9]{6})")
 
 
 @dataclass(frozen=True)
 class WorldSheets:
-    """Sheets at most `side_m` wide and high. Raises `AreaError` for what no sheet can be."""
+    """Sheets at most `side_m` wide and high. Raises `AreaError` for an impossible size."""
 
     side_m: float
 
@@ -48,16 +50,17 @@ class WorldSheets:
         return max(1, math.ceil(around_m / self.side_m))
 
     def name_at(self, lat_deg: float, lon_deg: float) -> str:
-        """Name of the sheet that a place lies on. Raises `AreaError` for what is no place."""
+        """Name of the sheet that contains a position. Raises `AreaError` if it is invalid."""
         if not (abs(lat_deg) <= 90 and math.isfinite(lon_deg)):
-            raise AreaError(f"no place on Earth: {lat_deg}, {lon_deg}")
+            hint = swapped_hint(lat_deg, lon_deg)
+            raise AreaError(f"no position on Earth: {lat_deg}, {lon_deg}{hint}")
         row = min(self.rows - 1, max(0, int((lat_deg + 90) / 180 * self.rows)))
         cols = self.cols(row)
         turned = (lon_deg + 180) % 360
         return _named(row, min(cols - 1, int(turned / 360 * cols)))
 
     def bounds_deg(self, name: str) -> Extent:
-        """West, south, east, north of a sheet. Raises `AreaError` where there is no such sheet."""
+        """West, south, east, north of a sheet. Raises `AreaError` if there is no such sheet."""
         match = _NAME.fullmatch(name)
         row, col = (int(part) for part in match.groups()) if match else (-1, -1)
         if not (0 <= row < self.rows and 0 <= col < self.cols(row)):
@@ -67,9 +70,9 @@ class WorldSheets:
         return -180 + col * step, south, -180 + (col + 1) * step, north
 
     def over(self, bounds_deg: Extent) -> Iterator[str]:
-        """Names of the sheets that a box touches, from south to north, from west to east.
+        """Names of the sheets that intersect a box, from south to north and west to east.
 
-        A box whose west lies east of its east goes across the antimeridian.
+        A box with west > east crosses the antimeridian.
         """
         west, south, east, north = bounds_deg
         if west > east:

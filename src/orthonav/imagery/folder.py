@@ -1,4 +1,4 @@
-"""Orthophotos in a folder, as producers hand them out: which files are, which are not, and why."""
+"""Selection of the orthophotos in a folder as producers deliver it."""
 
 import logging
 import re
@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 
 RASTERS = {".tif", ".tiff", ".jp2", ".j2k", ".vrt", ".mbtiles", ".gpkg", ".img"}
 PICTURES = {".png", ".jpg", ".jpeg", ".webp"}
-"""Orthophotos only with a world file or GDAL's own sidecar beside them."""
+"""Image formats that are orthophotos only with a world file or GDAL's sidecar."""
 CLOSED = {".ecw": "ECW", ".sid": "MrSID"}
 _ARCHIVE = re.compile(r"\.(?:7z|zip|tar|gz|tgz|rar)(?:\.\d{3})?$", re.IGNORECASE)
 _SMALL_PICTURE = re.compile(
@@ -23,46 +23,51 @@ _SMALL_PICTURE = re.compile(
     re.IGNORECASE,
 )
 _ARCHIVES = "archives"
-_UNFIT = "rasters that are no orthophotos (heights, too small, or placed nowhere)"
+_UNFIT = "rasters that are not orthophotos (heights, too small, or not georeferenced)"
 MAX_FILES = 1_000_000
 NAMED = 5
 
 
 @dataclass(frozen=True)
-class Found:
-    """Orthophotos of a folder, and what else was seen: how many files for each reason."""
+class FolderContents:
+    """Orthophotos of a folder, and the number of skipped files by reason."""
 
     files: tuple[Path, ...]
     skipped: dict[str, int]
 
     @property
-    def told(self) -> str:
-        """What was skipped and why, in one line."""
+    def summary(self) -> str:
+        """Skipped files by reason, on one line."""
         return "; ".join(f"{count} {reason}" for reason, count in sorted(self.skipped.items()))
 
 
 def sources_in(folder: Path) -> list[Source]:
     """The orthophotos of a folder and its folders, newest first, then the finest, then by name.
 
-    What cannot be orthophotos is skipped, and the log tells what. Raises `ImageryError` where none
-    is left, naming what was seen, and where one is broken or lacks its coordinate system.
+    Other files are skipped and logged. Raises `ImageryError` where no orthophoto is left, with the
+    kinds of files seen, and where one is damaged or has no coordinate system.
     """
     found = orthophotos_in(folder)
     sources, unfit = open_sources(found.files, folder)
     skipped = found.skipped | ({_UNFIT: len(unfit)} if unfit else {})
     if not sources:
-        raise _nothing(folder, Found((), skipped))
+        raise _nothing(folder, FolderContents((), skipped))
     for reason in unfit[:NAMED]:
         log.warning("skipped: %s", reason)
     if _ARCHIVES in skipped:
         log.warning("archives in the folder are not read; unpack them first: %s", folder)
     if skipped:
-        log.info("%d orthophotos; skipped %s: %s", len(sources), Found((), skipped).told, folder)
+        log.info(
+            "%d orthophotos; skipped %s: %s",
+            len(sources),
+            FolderContents((), skipped).summary,
+            folder,
+        )
     return sorted(sources, key=_preference)
 
 
-def orthophotos_in(folder: Path) -> Found:
-    """Files that may be orthophotos, by name; raises `ImageryError` where there are none."""
+def orthophotos_in(folder: Path) -> FolderContents:
+    """Files that may be orthophotos by their names; raises `ImageryError` where there are none."""
     files: list[Path] = []
     skipped: Counter[str] = Counter()
     for path in _files(folder):
@@ -74,8 +79,8 @@ def orthophotos_in(folder: Path) -> Found:
     virtual = {path for path in files if path.suffix.lower() == ".vrt"}
     if virtual and len(virtual) < len(files):
         files = [path for path in files if path not in virtual]
-        skipped["virtual rasters (.vrt), as the files themselves are there"] += len(virtual)
-    found = Found(tuple(sorted(files)), dict(skipped))
+        skipped["virtual rasters (.vrt), because their files are there"] += len(virtual)
+    found = FolderContents(tuple(sorted(files)), dict(skipped))
     if not files:
         raise _nothing(folder, found)
     return found
@@ -86,13 +91,13 @@ def _files(folder: Path) -> Iterator[Path]:
         raise MissingFileError(f"folder of orthophotos does not exist: {folder}")
     for count, path in enumerate(folder.rglob("*")):
         if count > MAX_FILES:
-            raise ImageryError(f"more than {MAX_FILES} files; name a smaller folder: {folder}")
+            raise ImageryError(f"more than {MAX_FILES} files; choose a smaller folder: {folder}")
         if path.is_file() and not path.name.startswith("."):
             yield path
 
 
 def _why_not(path: Path) -> str | None:
-    """Why a file is no orthophoto; None where it may be one, nothing where it is a sidecar."""
+    """Why a file is not an orthophoto; None where it may be one, "" for a sidecar."""
     suffix = path.suffix.lower()
     if suffix in CLOSED:
         return f"{CLOSED[suffix]} files, which GDAL as installed cannot read"
@@ -103,7 +108,7 @@ def _why_not(path: Path) -> str | None:
     if _SMALL_PICTURE.search(path.stem):
         return "thumbnails, overviews or masks, by their names"
     if suffix in PICTURES and not _has_sidecar(path):
-        return "pictures without a world file"
+        return "images without a world file"
     return None
 
 
@@ -115,28 +120,28 @@ def _has_sidecar(path: Path) -> bool:
     return any(name.is_file() for name in names)
 
 
-def _nothing(folder: Path, found: Found) -> ImageryError:
+def _nothing(folder: Path, found: FolderContents) -> ImageryError:
     archives = sorted(path for path in _files(folder) if _ARCHIVE.search(path.name))
     if archives:
         first = archives[0]
         zipped = first.suffix.lower() == ".zip"
         how = f"unzip '{first}' -d '{folder}'" if zipped else f"7z x '{first}' -o'{folder}'"
         return ImageryError(
-            f"folder holds no orthophotos but {len(archives)} files of archives; unpack them "
-            f"first: {how}"
+            f"folder holds archives ({len(archives)} files) but no orthophotos; unpack them first: "
+            f"{how}"
         )
-    seen = found.told or _suffixes(folder)
-    return ImageryError(f"folder holds no orthophotos that can be used; seen: {seen}: {folder}")
+    seen = found.summary or _suffixes(folder)
+    return ImageryError(f"folder holds no usable orthophotos; seen: {seen}: {folder}")
 
 
 def _suffixes(folder: Path) -> str:
-    """The kinds of files of a folder, the commonest first."""
+    """The kinds of files in a folder, the most common first."""
     counted = Counter(path.suffix.lower() or path.name for path in _files(folder))
     named = [f"{count} {suffix}" for suffix, count in counted.most_common(NAMED)]
     return ", ".join(named) or "nothing"
 
 
 def _preference(source: Source) -> tuple[object, ...]:
-    """Sorts the newest first, then the finest, then alike ones together, then by name."""
+    """Sort key: newest first, then finest, then by kind, then by name."""
     date = tuple(-int(part) for part in (source.date or "0").split("-"))
     return date, round(source.gsd_m, 3), source.crs, source.dtype, source.colours, str(source.path)

@@ -1,7 +1,7 @@
-"""Orthophotos whose pixels lie on one lattice, as the tiles of a producer do, read as one picture.
+"""Orthophotos on one pixel lattice, such as the tiles of a producer, read as one image.
 
-Resampled one by one, neighbouring tiles would leave a line of pixels between them that belong
-wholly to neither. Put together on their own pixels first, they are resampled across the seam.
+Resampled one by one, neighbouring tiles would leave a line of invalid pixels between them. They
+are joined on their own pixels first and then resampled across the seam.
 """
 
 import threading
@@ -20,11 +20,12 @@ from orthonav.imagery.source import Source
 from orthonav.imagery.thin import cells_of, read_thinned
 
 MAX_OFF_PX = 0.05
-"""Pixels count as lying on one lattice where they are off by no more, over the whole of a tile."""
+"""Largest deviation of a tile from the lattice, pixels: far below the error of orthophotos."""
 FULL = 1 - 1e-3
-MAX_KEPT_CELLS = 2 * 2**20
-KEPT_BYTES = 192 * 2**20
-"""Members of so many cells are kept once they were read, up to so many bytes of them."""
+"""Weight from which a cell counts as filled: rounding of masks of 8 bits."""
+MAX_CACHED_CELLS = 2 * 2**20
+CACHE_BYTES = 192 * 2**20
+"""Members of up to so many cells are cached, up to so many bytes in all."""
 Cells = tuple[NDArray[Any], NDArray[np.float32]]
 """Means (C, h, w) and the share (h, w) of each that is valid."""
 
@@ -34,22 +35,22 @@ Thinned = tuple[NDArray[Any], NDArray[np.uint8], Affine]
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Sources on one lattice of pixels; where several cover a place, the first wins.
+    """Sources on one pixel lattice; where several overlap, the first wins.
 
     `members` are indexes of the mosaic's sources. Pixel (0, 0) of the lattice is the corner that
     `transform` places; `boxes_px` (N, 4) are left, top, right, bottom of the members in it.
-    `decoded` keeps small members that were read, for all threads.
+    `decoded` caches small members, for all threads.
     """
 
     members: tuple[int, ...]
     sources: tuple[Source, ...]
     transform: Affine
     boxes_px: NDArray[np.int64]
-    decoded: "Decoded"
+    decoded: "CellCache"
 
     @property
     def first(self) -> Source:
-        """The source that stands for all in what they have in common."""
+        """The source whose CRS, type and resolution all share."""
         return self.sources[0]
 
     @cached_property
@@ -58,9 +59,9 @@ class Lattice:
         return int(self.boxes_px[:, 2].max()), int(self.boxes_px[:, 3].max())
 
     def factor(self, wanted: int) -> int:
-        """How many pixels a side are averaged where `wanted` would be best.
+        """Pixels per side that are averaged, at best `wanted`.
 
-        No more than half as fine again, so that cells end where tiles do, if any number does that.
+        Down to half of it, the largest factor with which cells end where tiles do, if any.
         """
         for factor in range(wanted, max(1, (wanted + 1) // 2) - 1, -1):
             if not (self.boxes_px % factor).any():
@@ -101,13 +102,13 @@ class Lattice:
         factor: int,
         opened: Callable[[int], Any],
     ) -> None:
-        """Read the members that will be kept and that no other thread is at: theirs come later.
+        """Read the members that will be cached, except those that another thread is reading.
 
-        Those that lie wholly below others are left to be asked for.
+        Members that others cover wholly are read only on request.
         """
         covered = np.zeros(shape, bool)
         for number, part, _ in near:
-            if self._is_kept(number, factor) and not covered[part].all():
+            if self._is_cached(number, factor) and not covered[part].all():
                 reader = self._reader(number, factor, opened)
                 self.decoded.begin((self.members[number], factor), reader)
             covered[part] = True
@@ -122,18 +123,18 @@ class Lattice:
     ) -> Cells:
         """Cells of a member, the first of which begins at its column and row `at`."""
         source, index = self.sources[number], self.members[number]
-        if not self._is_kept(number, factor):
+        if not self._is_cached(number, factor):
             return cells_of(opened(index), source, at, shape, factor)
         values, share = self.decoded.get((index, factor), self._reader(number, factor, opened))
         col, row = at[0] // factor, at[1] // factor
         part = np.s_[row : row + shape[0], col : col + shape[1]]
         return values[(slice(None), *part)], share[part]
 
-    def _is_kept(self, number: int, factor: int) -> bool:
-        """Whether a member is read whole and kept: its neighbours' blocks will ask again."""
+    def _is_cached(self, number: int, factor: int) -> bool:
+        """Whether a member is read whole and cached, for the blocks next to it."""
         source = self.sources[number]
         cells = source.width_px * source.height_px / factor**2
-        return cells <= MAX_KEPT_CELLS and not (self.boxes_px[number] % factor).any()
+        return cells <= MAX_CACHED_CELLS and not (self.boxes_px[number] % factor).any()
 
     def _reader(
         self, number: int, factor: int, opened: Callable[[int], Any]
@@ -149,26 +150,26 @@ class Lattice:
         return [int(number) for number in np.flatnonzero(near)]
 
 
-class Decoded:
-    """Cells of the members that were read last, for all threads; each is read by one of them."""
+class CellCache:
+    """Cache of the members that were read last; each is read by one thread only."""
 
-    def __init__(self, limit_bytes: int = KEPT_BYTES) -> None:
+    def __init__(self, limit_bytes: int = CACHE_BYTES) -> None:
         self._limit_bytes = limit_bytes
         self._lock = threading.Lock()
-        self._kept: OrderedDict[tuple[int, int], Cells] = OrderedDict()
+        self._cached: OrderedDict[tuple[int, int], Cells] = OrderedDict()
         self._turns: dict[tuple[int, int], threading.Lock] = {}
 
     def get(self, key: tuple[int, int], read: Callable[[], Cells]) -> Cells:
-        """What was read under a key, or is read now. Raises as `read` does."""
+        """The cells of a key, read if they are not cached. Raises as `read` does."""
         with self._turn(key):
-            return self._kept_or_read(key, read)
+            return self._cached_or_read(key, read)
 
     def begin(self, key: tuple[int, int], read: Callable[[], Cells]) -> None:
-        """Read what is not there, unless another thread is at it."""
+        """Read the cells of a key unless they are cached or another thread reads them."""
         turn = self._turn(key)
         if turn.acquire(blocking=False):
             try:
-                self._kept_or_read(key, read)
+                self._cached_or_read(key, read)
             finally:
                 turn.release()
 
@@ -176,16 +177,16 @@ class Decoded:
         with self._lock:
             return self._turns.setdefault(key, threading.Lock())
 
-    def _kept_or_read(self, key: tuple[int, int], read: Callable[[], Cells]) -> Cells:
+    def _cached_or_read(self, key: tuple[int, int], read: Callable[[], Cells]) -> Cells:
         with self._lock:
-            if key in self._kept:
-                self._kept.move_to_end(key)
-                return self._kept[key]
+            if key in self._cached:
+                self._cached.move_to_end(key)
+                return self._cached[key]
         cells = read()
         with self._lock:
-            self._kept[key] = cells
-            while sum(_bytes(each) for each in self._kept.values()) > self._limit_bytes:
-                self._kept.popitem(last=False)
+            self._cached[key] = cells
+            while sum(_bytes(each) for each in self._cached.values()) > self._limit_bytes:
+                self._cached.popitem(last=False)
         return cells
 
 
@@ -194,7 +195,7 @@ def _bytes(cells: Cells) -> int:
 
 
 class _Canvas:
-    """Cells that several sources fill, each as far as those before it have left them empty."""
+    """Cells that several sources fill, each where the ones before it left them empty."""
 
     def __init__(self, like: Source, rows: int, cols: int) -> None:
         self._dtype = np.dtype("uint8" if like.palette is not None else like.dtype)
@@ -207,7 +208,7 @@ class _Canvas:
     def add(
         self, part: tuple[slice, slice], values: NDArray[Any], share: NDArray[np.float32]
     ) -> None:
-        """Take in cells (C, h, w), of each of which a share (h, w) is known."""
+        """Add cells (C, h, w), of which a share (h, w) is valid."""
         weight = self._weight[part]
         new = np.minimum(share, 1 - weight)
         if values.dtype.kind == "f":
@@ -216,7 +217,7 @@ class _Canvas:
         weight += new
 
     def picture(self) -> tuple[NDArray[Any], NDArray[np.uint8]]:
-        """Bands (C, h, w) and mask (h, w), 0 for nothing known to 255."""
+        """Bands (C, h, w) and mask (h, w), 0 (invalid) to 255."""
         mean = self._total / np.maximum(self._weight, 1e-6)
         if self._dtype.kind in "iu":
             mean = np.rint(mean)
@@ -225,9 +226,9 @@ class _Canvas:
 
 
 def lattices_of(sources: Sequence[Source]) -> list[Lattice]:
-    """The sources in lattices; of those that follow each other, alike ones share one.
+    """The sources grouped into lattices.
 
-    Only neighbours in the order, so that what comes first still covers what comes later.
+    Only consecutive sources share one, so that earlier sources still cover later ones.
     """
     runs: list[list[int]] = []
     for index, source in enumerate(sources):
@@ -244,7 +245,7 @@ def _lattice(members: list[int], sources: list[Source]) -> Lattice:
     sizes = np.array([(each.width_px, each.height_px) for each in sources], np.int64)
     boxes = np.concatenate([offsets - corner, offsets - corner + sizes], axis=1)
     transform = sources[0].transform * Affine.translation(int(corner[0]), int(corner[1]))
-    return Lattice(tuple(members), tuple(sources), transform, boxes, Decoded())
+    return Lattice(tuple(members), tuple(sources), transform, boxes, CellCache())
 
 
 def _offset_px(first: Source, other: Source) -> tuple[int, int] | None:

@@ -1,4 +1,4 @@
-"""One or several orthophotos as one picture."""
+"""One or several orthophotos as one image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,20 +17,20 @@ from orthonav.imagery.folder import sources_in
 from orthonav.imagery.lattice import Lattice, lattices_of
 from orthonav.imagery.raster import GDAL_OPTIONS, GreyPixels, Pixels, SheetRaster
 from orthonav.imagery.source import Source, open_sources
-from orthonav.imagery.stretch import Stretch, sample_stretches
+from orthonav.imagery.stretch import ContrastStretch, sample_stretches
 
 __all__ = ["GreyPixels", "Mosaic", "Pixels", "SheetRaster"]
 
 
 @dataclass(frozen=True, eq=False)
 class Mosaic:
-    """Orthophotos read as one; where several cover a place, the first named wins.
+    """Orthophotos read as one; where several overlap, the first one given wins.
 
-    `stretches` says of each source how its values become 8 bits, None where they are.
+    `stretches` maps the values of each source to 8 bits, None where they have 8 bits.
     """
 
     sources: tuple[Source, ...]
-    stretches: tuple[Stretch | None, ...]
+    stretches: tuple[ContrastStretch | None, ...]
 
     @classmethod
     def open(cls, paths: Sequence[Path]) -> "Mosaic":
@@ -39,7 +39,7 @@ class Mosaic:
         Raises as `open_source` and `sources_in` do.
         """
         if not paths:
-            raise ImageryError("no orthophoto was named")
+            raise ImageryError("no orthophoto was given")
         sources: list[Source] = []
         files: list[Path] = []
         for path in map(Path, paths):
@@ -53,8 +53,8 @@ class Mosaic:
             return cls(tuple(sources), sample_stretches(sources))
 
     @property
-    def stretch(self) -> Stretch | None:
-        """How the first of the sources that are not of 8 bits are stretched, if any is."""
+    def stretch(self) -> ContrastStretch | None:
+        """The contrast stretch of the first source with more than 8 bits, if any."""
         return next((each for each in self.stretches if each is not None), None)
 
     @property
@@ -69,12 +69,12 @@ class Mosaic:
 
     @property
     def common_stamp(self) -> list[list[float] | None]:
-        """What all pixels depend on, beside the files they come from: the stretches."""
+        """The stretches, which all pixels depend on besides their files."""
         found = {(each.low, each.high) for each in self.stretches if each is not None}
         return [list(each) for each in sorted(found)]
 
     def describe(self) -> tuple[dict[str, Any], ...]:
-        """What the map's manifest keeps of the imagery: each file named, each folder by kinds."""
+        """Entries of the map's manifest: one per file, and one per kind of files of a folder."""
         kinds: dict[Any, list[Source]] = {}
         for index, source in enumerate(self.sources):
             alike: Any = index
@@ -94,9 +94,9 @@ class Mosaic:
         gsd_m: float,
         threads: int | None = None,
     ) -> SheetRaster:
-        """The mosaic resampled into `frame`, as a raster to be read by windows (use `with`).
+        """The mosaic resampled into `frame`, as a raster that is read by windows (use `with`).
 
-        It belongs to the thread that enters it, and uses `threads` (None: all cores) itself.
+        It belongs to the thread that enters it, and uses `threads` of its own (None: all cores).
         """
         return SheetRaster(
             self.sources,
@@ -131,17 +131,17 @@ class Mosaic:
 
 
 def _described(sources: Sequence[Source]) -> dict[str, Any]:
-    """A file, or the files of a folder that are alike as one: how many, from when to when."""
+    """A file, or the files of one kind of a folder: their number, first and last date."""
     first = sources[0]
     if first.folder is None:
         return first.describe()
     dates = sorted(source.date for source in sources if source.date is not None)
-    told = first.describe() | {
+    entry = first.describe() | {
         "name": first.folder.resolve().name,
         "date": dates[-1] if dates else None,
         "files": len(sources),
     }
-    del told["width_px"], told["height_px"]
+    del entry["width_px"], entry["height_px"]
     if dates and dates[0] != dates[-1]:
-        told["date_from"] = dates[0]
-    return told
+        entry["date_from"] = dates[0]
+    return entry

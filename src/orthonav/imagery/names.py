@@ -1,4 +1,4 @@
-"""What the names of files and folders, and sidecars, tell where a raster itself does not."""
+"""Date, coordinate system and georeference from names and sidecars of rasters without them."""
 
 import re
 from collections.abc import Iterable
@@ -22,7 +22,7 @@ _IGN_SYSTEMS = {
     "RGM04UTM38S": "EPSG:4471",
     "RGSPM06U21": "EPSG:4467",
 }
-"""How IGN (France) writes coordinate systems in the names of its packages, folders and tiles."""
+"""Coordinate systems in the names of packages, folders and tiles of IGN (France)."""
 _IGN_SYSTEM = re.compile(rf"(?<![A-Za-z0-9])({'|'.join(_IGN_SYSTEMS)})(?![A-Za-z0-9])")
 _IGN_TILE = re.compile(r"^[0-9][0-9AB]{1,2}-((?:19|20)\d\d)-\d{4}-\d{4}-")
 """A tile of BD ORTHO: department, year, kilometres east and north, and more."""
@@ -32,14 +32,14 @@ _TAB_POINT = re.compile(
 )
 _MAX_TAB_BYTES = 100_000
 MAX_OFF_PX = 0.2
-"""Control points of a sidecar that are farther off than this are no geotransform."""
+"""Largest residual of a sidecar's control points for them to be a geotransform."""
 
 
 def date_of(tags: dict[str, str], names: Iterable[str]) -> str | None:
-    """Date of acquisition as YYYY[-MM[-DD]]: of a file's tags or else the first name that has one.
+    """Date of acquisition as YYYY[-MM[-DD]]: from tags, else from the first name that has one.
 
-    `names` are the file's, without suffix, and those of folders above it. Of IGN's names the year
-    only: the day in them is that of the edition, and kilometres follow the year of a tile.
+    `names` are the file's, without suffix, and those of folders above it. From IGN's names only
+    the year: the day in them is that of the edition, and kilometres follow the year of a tile.
     """
     for tag in _TAGS:
         found = _DATE.search(str(tags[tag]).replace(":", "-")) if tag in tags else None
@@ -56,7 +56,7 @@ def date_of(tags: dict[str, str], names: Iterable[str]) -> str | None:
 
 
 def system_of(names: Iterable[str]) -> str | None:
-    """Coordinate system that IGN's names of files and folders tell, such as LAMB93: its code."""
+    """EPSG code of a coordinate system in IGN's names of files and folders, such as LAMB93."""
     for name in names:
         found = _IGN_SYSTEM.search(name)
         if found:
@@ -65,9 +65,9 @@ def system_of(names: Iterable[str]) -> str | None:
 
 
 def tab_transform(path: Path) -> tuple[float, ...] | None:
-    """Geotransform a..f of MapInfo's sidecar `NAME.tab`; None where there is none to be used.
+    """Geotransform a..f of MapInfo's sidecar `NAME.tab`; None where there is no usable one.
 
-    GDAL reads them beside TIFF, not beside JPEG 2000.
+    GDAL reads them for TIFF, but not for JPEG 2000.
     """
     for sidecar in (path.with_suffix(".tab"), path.with_suffix(".TAB")):
         if sidecar.is_file() and sidecar.stat().st_size <= _MAX_TAB_BYTES:
@@ -76,7 +76,7 @@ def tab_transform(path: Path) -> tuple[float, ...] | None:
 
 
 def _affine(points: list[tuple[str, str, str, str]]) -> tuple[float, ...] | None:
-    """Least squares of control points x, y, column, row; None where they are no affine map."""
+    """Least squares of control points x, y, column, row; None where they are not affine."""
     try:
         x, y, col, row = np.array(points, dtype=np.float64).reshape(-1, 4).T
     except ValueError:

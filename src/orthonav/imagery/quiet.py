@@ -1,4 +1,4 @@
-"""Warnings of rasterio that say nothing new: what they warn of is checked, or meant."""
+"""Suppression of rasterio warnings about cases that are checked elsewhere, or intended."""
 
 import threading
 import warnings
@@ -10,10 +10,10 @@ from rasterio.errors import NodataShadowWarning, NotGeoreferencedWarning
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep them away meanwhile, in all threads.
+    """Suppress them in all threads while this is open.
 
-    Filters of warnings belong to the process: threads that set and reset their own would mix them
-    up. So this does nothing outside the main thread; whoever starts threads is quiet for them.
+    Warning filters belong to the process, and threads that change them would interfere. So this
+    does nothing outside the main thread; callers that start threads enter it for them.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,7 +1,6 @@
 """Orthophotos resampled into a sheet's plane, read by windows."""
 
 import math
-import os
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -20,22 +19,24 @@ from rasterio.warp import reproject
 from rasterio.warp import transform as transform_coordinates
 from rasterio.windows import Window
 
+from orthonav.cores import usable_cores
 from orthonav.geo.frames import LocalFrame
 from orthonav.imagery.lattice import Lattice
 from orthonav.imagery.quiet import quiet
 from orthonav.imagery.source import Source, unreadable
-from orthonav.imagery.stretch import Stretch
+from orthonav.imagery.stretch import ContrastStretch
 
 GDAL_OPTIONS = {"GDAL_CACHEMAX": 192 * 2**20}
 MAX_OPEN = 24
 WHOLLY_VALID = 250
-"""A pixel counts as valid where the interpolated mask (0..255) is at least this."""
+"""Interpolated mask (0..255) from which a pixel is valid: no invalid neighbour."""
 _FALSE_ORIGIN_M = 1_000_000.0
-"""Added to the sheet's coordinates for GDAL, which takes a raster that starts at exactly (0, 0)
-with pixels of 1 m, as a window in the middle of a sheet does, for one without georeference."""
+"""Added to the sheet's coordinates for GDAL: it treats a raster that starts at exactly (0, 0) with
+pixels of 1 m, as a window in the middle of a sheet may, as one without georeference."""
 _MARGIN_PX = 4
-"""Pixels around what a window shows that interpolation may ask for, and some."""
+"""Pixels read around a window: cubic interpolation needs two; the others cover rounding."""
 _REACH_PX = 7
+"""Width of the box whose mean fills the edge of holes: beyond the reach of cubic weights."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,16 +63,15 @@ class GreyPixels:
 class SheetRaster:
     """A north-up raster in a sheet's plane over orthophotos; a context manager.
 
-    It belongs to the thread that enters it; one that is not the main thread should be started
-    while that is `quiet`. `stretches` are those of the sources that the lattices
-    number; `threads` (None: all cores) are what it uses itself.
+    It belongs to the thread that enters it; start other threads than the main one inside `quiet`.
+    `stretches` are those of `sources`; it uses `threads` of its own (None: all cores).
     """
 
     def __init__(
         self,
         sources: Sequence[Source],
         lattices: Sequence[Lattice],
-        stretches: Sequence[Stretch | None],
+        stretches: Sequence[ContrastStretch | None],
         frame: LocalFrame,
         *,
         west_m: float,
@@ -85,7 +85,7 @@ class SheetRaster:
         self._frame = frame
         self._transform = Affine(gsd_m, 0, west_m, 0, -gsd_m, north_m)
         self._gsd_m = gsd_m
-        self._threads = threads or os.cpu_count() or 1
+        self._threads = threads or usable_cores()
         self.width_px, self.height_px = width_px, height_px
         self._boxes_px = self._boxes()
         self._open: OrderedDict[int, Any] = OrderedDict()
@@ -104,33 +104,32 @@ class SheetRaster:
         self._env.close()
 
     def read(self, col: int, row: int, width_px: int, height_px: int) -> Pixels:
-        """Pixels of a window; what lies outside all imagery is not valid and 0.
+        """Pixels of a window; outside all imagery they are 0 and invalid.
 
-        Raises `ImageryError` where a file breaks while it is read.
+        Raises `ImageryError` where a file cannot be read.
         """
         values, valid = self._composed(Window(col, row, width_px, height_px), 3)
         return Pixels(values, valid)
 
     def read_grey(self, col: int, row: int, width_px: int, height_px: int) -> GreyPixels:
-        """The same in grey, made so before it is resampled: within a level of `read`, and faster.
+        """The same in grey, converted before resampling: within one level of `read`, and faster.
 
-        Raises `ImageryError` where a file breaks while it is read.
+        Raises `ImageryError` where a file cannot be read.
         """
         values, valid = self._composed(Window(col, row, width_px, height_px), 1)
         return GreyPixels(values[..., 0], valid)
 
     def stamps(self, col: int, row: int, width_px: int, height_px: int) -> list[Any]:
-        """Files that a window depends on, in the order they count, each with size and time."""
+        """Files that a window depends on, in order of precedence, each with size and time."""
         near = self._near(col, row, col + width_px, row + height_px)
         return [self._sources[index].stamp for index in np.flatnonzero(near).tolist()]
 
     def _composed(
         self, window: Window, colours: int
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Values (H, W, colours) and valid (H, W): what comes first covers what comes later.
+        """Values (H, W, colours) and valid (H, W); earlier lattices cover later ones.
 
-        A pixel that belongs wholly to no lattice, but to several of them together, as along the
-        seam of two, is their mean.
+        A pixel that several lattices cover only together, as along a seam, is their mean.
         """
         seams = _Seams(window, colours)
         out = np.zeros((window.height, window.width, colours), dtype=np.uint8)
@@ -150,7 +149,7 @@ class SheetRaster:
         return out, valid
 
     def _parts(self, window: Window) -> Iterator[tuple[Lattice, tuple[int, int, int, int]]]:
-        """Lattices that may show something of a window, and where: left, top, right, bottom."""
+        """Lattices that may overlap a window, and the overlap: left, top, right, bottom."""
         left, top = max(window.col_off, 0), max(window.row_off, 0)
         right = min(window.col_off + window.width, self.width_px)
         bottom = min(window.row_off + window.height, self.height_px)
@@ -171,7 +170,7 @@ class SheetRaster:
                 )
 
     def _near(self, left: int, top: int, right: int, bottom: int) -> NDArray[np.bool_]:
-        """Which of the sources may show something of a box."""
+        """Which of the sources may overlap a box."""
         boxes = self._boxes_px
         near = (boxes[:, 0] < right) & (boxes[:, 2] > left)
         return np.asarray(near & (boxes[:, 1] < bottom) & (boxes[:, 3] > top))
@@ -208,11 +207,11 @@ class SheetRaster:
         shape: tuple[int, int],
         is_picture: bool,
     ) -> NDArray[np.uint8]:
-        """Bands (C, h, w) resampled, (H, W, C): pictures by cubic, masks by linear weights."""
+        """Bands (C, h, w) resampled to (H, W, C): images by cubic, masks by bilinear weights."""
         out = np.zeros((len(bands), *shape), dtype=np.uint8)
         first = lattice.first
-        # Sheet pixels per source pixel. GDAL would guess it from the shapes of the two windows and
-        # blur narrow windows of a turned source.
+        # Sheet pixels per source pixel. GDAL would derive it from the shapes of the two windows and
+        # blur narrow windows of a rotated source.
         scale = first.gsd_m * math.sqrt(abs(transform.determinant / first.transform.determinant))
         scale = min(1.0, scale / self._gsd_m)
         reproject(
@@ -233,9 +232,9 @@ class SheetRaster:
     def _source_window(
         self, lattice: Lattice, target: Affine, shape: tuple[int, int]
     ) -> tuple[Window, bool] | None:
-        """Pixels of a lattice that a window of the sheet needs, and whether it has all of them.
+        """Pixels of a lattice that a window of the sheet needs, and whether all of them exist.
 
-        None where it has none.
+        None where none exists.
         """
         share = np.linspace(0, 1, 9)
         zero, one = np.zeros(9), np.ones(9)
@@ -262,7 +261,7 @@ class SheetRaster:
         return Window(left, top, right - left, bottom - top), had == wanted
 
     def _dataset(self, index: int) -> Any:
-        """The opened source; at most `MAX_OPEN` are open at a time."""
+        """The open source; at most `MAX_OPEN` are open at a time."""
         self._asked = index
         if index in self._open:
             self._open.move_to_end(index)
@@ -284,7 +283,7 @@ class SheetRaster:
 
 
 class _Seams:
-    """Sums of what lies in a window by a part of a pixel only."""
+    """Weighted sums of the pixels that lattices cover in part."""
 
     def __init__(self, window: Window, colours: int) -> None:
         self._shape = (window.height, window.width)
@@ -317,7 +316,7 @@ def _full(shape: tuple[int, int]) -> NDArray[np.uint8]:
 
 
 def _in_colours(bands: NDArray[np.uint8], colours: int) -> NDArray[np.uint8]:
-    """Bands (C, h, w) as that many: colours become grey, grey fills all three."""
+    """Bands (C, h, w) converted to one or three: colours to grey, or grey to all three."""
     if len(bands) == colours:
         return bands
     if colours == 3:
@@ -327,9 +326,9 @@ def _in_colours(bands: NDArray[np.uint8], colours: int) -> NDArray[np.uint8]:
 
 
 def _fill_holes(bands: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
-    """Write the mean of what is around it into what is not known near its edge.
+    """Fill invalid pixels near valid ones with the mean of their surroundings.
 
-    Interpolation mixes neighbours: what fills a hole in a file would show beside it.
+    Interpolation mixes neighbours, so the fill value of a hole would show next to it.
     """
     known = (mask > 0).astype(np.float32)
     if known.all() or not known.any():

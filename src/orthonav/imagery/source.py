@@ -1,4 +1,4 @@
-"""One orthophoto file: is it usable, where does it lie, which of its bands are used?"""
+"""Inspection of an orthophoto file: usability, georeference, and the bands that are used."""
 
 import logging
 from collections import Counter
@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import ImageryError, MissingExtraError, MissingFileError
+from orthonav.errors import ImageryError, MissingFileError
+from orthonav.extras import missing_extra
 from orthonav.geo.frames import LocalFrame
 from orthonav.imagery.names import date_of, system_of, tab_transform
 
@@ -28,15 +29,17 @@ try:
 
     from orthonav.imagery.quiet import quiet
 except ImportError as error:  # pragma: no cover - depends on the installation
-    raise MissingExtraError(
-        "reading orthophotos needs rasterio; install it with: pip install 'orthonav[geo]'"
-    ) from error
+    raise missing_extra("reading orthophotos", "geo", "rasterio", error) from error
 
 OUTLINE_POINTS = 21
+"""Points per side of the border, as rasterio's `transform_bounds` uses."""
 ALPHA_SAMPLE_PX = 512
+"""Alpha bands are sampled at about so many pixels a side, in `ALPHA_WINDOWS` windows a side."""
 ALPHA_WINDOWS = 8
 ALPHA_CHECKS = 16
+"""Files of one kind that are checked; their producer writes all alike."""
 MAX_PARTLY_CLEAR = 0.05
+"""Largest share of partly transparent pixels of a mask: its resampled edges."""
 HEIGHT_TYPES = ("float32", "float64", "int16", "int32")
 MIN_SIDE_PX = 16
 OPENED_AT_ONCE = 8
@@ -47,53 +50,61 @@ TERMS = {
     "layer": ("ORTHONAV_LAYER",),
     "dates": ("ORTHONAV_DATES",),
 }
-"""Tags of a file that travel into the map, by the key they have there."""
+"""Tags of a file that are copied into the map, by their key there."""
 MAX_TERM = 300
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What is known of one orthophoto without reading it whole.
-
-    `name` is what GDAL opens: the path, or a table in it. `transform` and `system` (its CRS) are
-    the raster's own or, where it has none, those that its names and sidecars tell (`is_named` for
-    the system). `bands` are the
-    1-based indexes used (one for grey, three for red, green, blue); `outline_latlon_deg` is the
-    (N, 2) border; `gsd_m` the ground resolution at the centre; `palette` the (N, 3) colours of a
-    colour-mapped image; `false_alpha` tells that the band the file calls alpha is a picture, such
-    as near infrared, so it says nothing of what is missing; `folder` is the one it was found in
-    where a folder was named; `stamp` size and time of its files; `terms` what the file says of
-    where it is from and under which terms, by the keys of `TERMS`.
-    """
+    """Metadata of one orthophoto."""
 
     path: Path
+    """The file."""
     name: str
+    """What GDAL opens: the path, or a table in the file."""
     bands: tuple[int, ...]
+    """Bands that are used, from 1: one for grey, three for red, green, blue."""
     dtype: str
+    """Pixel type."""
     width_px: int
+    """Columns."""
     height_px: int
+    """Rows."""
     crs: str
+    """Coordinate system as text."""
     system: Any
+    """The same as rasterio's CRS."""
     is_named: bool
+    """Whether the coordinate system was taken from names because the file has none."""
     transform: Affine
+    """From column, row to coordinates, of the raster or of a sidecar."""
     gsd_m: float
+    """Ground resolution at the centre, metres per pixel."""
     outline_latlon_deg: NDArray[np.float64]
+    """The border (N, 2), latitude and longitude in degrees."""
     date: str | None
+    """Date of acquisition, YYYY[-MM[-DD]]."""
     palette: NDArray[np.uint8] | None = None
+    """Colours (N, 3) of a colour-mapped image."""
     marked_alpha: bool = False
+    """Whether a band is marked as alpha."""
     false_alpha: bool = False
+    """Whether that band is an image, such as near infrared, and not a mask."""
     folder: Path | None = None
+    """The folder given by the user that it was found in."""
     stamp: tuple[tuple[str, int, int], ...] = ()
+    """Path, size and modification time in ns of its files."""
     terms: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    """Origin and terms, by the keys of `TERMS`."""
 
     @property
     def colours(self) -> int:
-        """Bands of the picture it gives: 1 for grey, 3 for colours."""
+        """Bands that are read: 1 for grey, 3 for colours."""
         return 3 if self.palette is not None else len(self.bands)
 
     def describe(self) -> dict[str, Any]:
-        """What the map's manifest keeps of this source."""
+        """Entry of the map's manifest."""
         return {
             "name": self.path.name,
             "date": self.date,
@@ -107,11 +118,11 @@ class Source:
 
 
 class UnfitError(ImageryError):
-    """A raster that is no orthophoto: a small picture, heights, nothing that tells where it is."""
+    """A raster that is not an orthophoto: a small image, heights, or not georeferenced."""
 
 
 def open_source(path: Path) -> Source:
-    """Inspect an orthophoto: of several tables of a GeoPackage the first.
+    """Inspect an orthophoto; of several tables of a GeoPackage, the first.
 
     Raises `MissingFileError`, or `ImageryError` for a file GDAL cannot read, without a
     georeference, or without usable bands.
@@ -124,8 +135,8 @@ def open_sources(
 ) -> tuple[list[Source], list[str]]:
     """Inspect orthophotos, several at a time; a file may hold several.
 
-    With `folder`, the one that was named rather than the files, rasters that are no orthophotos
-    are left out: the second list tells why, one line each. Raises as `open_source` does.
+    `folder` is the folder given by the user, if any; then rasters that are not orthophotos are
+    left out, and the second list has one reason for each. Raises as `open_source` does.
     """
     sources: list[Source] = []
     unfit: list[str] = []
@@ -168,7 +179,7 @@ def _opened(path: Path, folder: Path | None) -> list[Source]:
 def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
     names = _names_of(path, folder)
     if folder is not None and dataset.crs is None and _transform(path, dataset).is_identity:
-        raise UnfitError(f"raster has nothing that tells where it is: {path}")
+        raise UnfitError(f"raster has no georeference: {path}")
     system = _system(path, dataset, names)
     transform = _transform(path, dataset)
     if transform.is_identity or transform.determinant == 0:
@@ -181,7 +192,7 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
         )
     bands = _bands(dataset)
     if folder is not None and len(bands) == 1 and dataset.dtypes[0] in HEIGHT_TYPES:
-        raise UnfitError(f"raster of one band of {dataset.dtypes[0]} may be heights: {path}")
+        raise UnfitError(f"raster of one band of {dataset.dtypes[0]} may hold heights: {path}")
     palette = _palette(dataset) if dataset.colorinterp[0] == ColorInterp.palette else None
     outline, gsd_m = _outline(path, dataset, system, transform)
     return Source(
@@ -218,7 +229,7 @@ def _terms(tags: Mapping[str, str]) -> Mapping[str, str]:
 
 
 def _names_of(path: Path, folder: Path | None) -> list[str]:
-    """Names that may tell of a file: its own, then of the folders up to the one that was named."""
+    """Names to search for metadata: the file's, then of the folders up to the given one."""
     names = [path.stem]
     if folder is not None:
         above = path.parent.resolve().relative_to(folder.resolve()).parts
@@ -229,12 +240,12 @@ def _names_of(path: Path, folder: Path | None) -> list[str]:
 def _system(path: Path, dataset: Any, names: Sequence[str]) -> Any:
     if dataset.crs is not None and (dataset.crs.is_projected or dataset.crs.is_geographic):
         return dataset.crs
-    told = system_of(names)
-    if told is not None:
-        return CRS.from_user_input(told)
+    named = system_of(names)
+    if named is not None:
+        return CRS.from_user_input(named)
     if dataset.crs is None:
         raise ImageryError(
-            "orthophoto has no coordinate reference system; assign the one it was made in "
+            "orthophoto has no coordinate reference system; assign the correct one "
             f"(for example: gdal_edit.py -a_srs EPSG:2154 FILE): {path}"
         )
     return dataset.crs
@@ -249,7 +260,7 @@ def _transform(path: Path, dataset: Any) -> Affine:
 
 
 def _stamp(path: Path, dataset: Any) -> tuple[tuple[str, int, int], ...]:
-    """Path, size and time of change in ns of the file, and of those that a virtual one names."""
+    """Path, size and modification time in ns of the file, and of those that a VRT refers to."""
     files = [path, *(dataset.files if dataset.driver == "VRT" else ())]
     known = {str(Path(file).resolve()) for file in files}
     found = [(name, Path(name).stat()) for name in sorted(known) if Path(name).is_file()]
@@ -268,29 +279,29 @@ def _bands(dataset: Any) -> tuple[int, ...]:
 
 
 def _without_false_alpha(sources: list[Source]) -> list[Source]:
-    """The sources, told whether their band marked alpha is no mask.
+    """The sources, with `false_alpha` where their alpha band is not a mask.
 
-    Of many alike the first few tell for all: they come from one maker.
+    Of many files of one kind only the first `ALPHA_CHECKS` are checked.
     """
     verdicts: dict[Any, list[bool]] = {}
     checked = []
     for source in sources:
         if source.marked_alpha:
             alike = (source.folder, source.path.parent, source.bands, source.dtype, source.crs)
-            told = verdicts.setdefault(alike, [])
-            if len(told) < ALPHA_CHECKS:
-                told.append(_has_false_alpha(source))
+            found = verdicts.setdefault(alike, [])
+            if len(found) < ALPHA_CHECKS:
+                found.append(_has_false_alpha(source))
             source = replace(
-                source, false_alpha=told[-1] if len(told) < ALPHA_CHECKS else any(told)
+                source, false_alpha=found[-1] if len(found) < ALPHA_CHECKS else any(found)
             )
         checked.append(source)
     return checked
 
 
 def _has_false_alpha(source: Source) -> bool:
-    """Whether the band marked alpha, as GDAL marks the fourth of four by default, is no mask.
+    """Whether the alpha band (GDAL marks the fourth of four by default) is not a mask.
 
-    A mask is clear or opaque nearly everywhere; a picture holds every value between.
+    A mask is transparent or opaque nearly everywhere; an image holds all values between.
     """
     try:
         with rasterio.open(source.name) as dataset:
@@ -301,7 +312,7 @@ def _has_false_alpha(source: Source) -> bool:
     if partly <= MAX_PARTLY_CLEAR:
         return False
     log.info(
-        "band marked alpha is no mask (%.0f %% of it is neither clear nor opaque); ignored: %s",
+        "alpha band is not a mask (%.0f %% of it is neither transparent nor opaque); ignored: %s",
         100 * partly,
         source.path,
     )
@@ -311,7 +322,7 @@ def _has_false_alpha(source: Source) -> bool:
 def _sample(dataset: Any, band: int) -> NDArray[Any]:
     """Values (N,) of a band: all of a small one, else of windows spread evenly over it.
 
-    A thinned read of a large file without overviews would unpack all of it.
+    A decimated read of a large file without overviews would decode all of it.
     """
     if max(dataset.width, dataset.height) <= ALPHA_SAMPLE_PX:
         return np.asarray(dataset.read(band)).ravel()
@@ -340,7 +351,7 @@ def _outline(
 ) -> tuple[NDArray[np.float64], float]:
     """The border (N, 2), latitude and longitude in degrees, and the ground resolution in metres.
 
-    That is the square root of the ground area of the central pixel.
+    The resolution is the square root of the ground area of the central pixel.
     """
     share = np.linspace(0, 1, OUTLINE_POINTS)
     zero, one = np.zeros(OUTLINE_POINTS), np.ones(OUTLINE_POINTS)
@@ -353,14 +364,16 @@ def _outline(
     )
     try:
         lon, lat = transform_coordinates(system, "EPSG:4326", x, y)[:2]
-    except CPLE_BaseError as error:  # a local or engineering system: nowhere on Earth
+    except CPLE_BaseError as error:  # a local or engineering system
         raise ImageryError(
-            "orthophoto's coordinate system cannot be turned into latitude, longitude; assign the "
-            f"one it was made in (for example: gdal_edit.py -a_srs EPSG:2154 FILE): {path}"
+            "orthophoto's coordinate system cannot be converted to latitude, longitude; assign the "
+            f"correct one (for example: gdal_edit.py -a_srs EPSG:2154 FILE): {path}"
         ) from error
     latlon = np.stack([np.asarray(lat, dtype=float), np.asarray(lon, dtype=float)], axis=1)
     if not np.isfinite(latlon).all() or np.abs(latlon[:, 0]).max() > 90:
-        raise ImageryError(f"orthophoto's border cannot be turned into latitude, longitude: {path}")
+        raise ImageryError(
+            f"orthophoto's border cannot be converted to latitude, longitude: {path}"
+        )
     if system.is_geographic and max(-float(x.min()), float(x.max())) > 180 + 1e-6:
         raise ImageryError(
             "orthophoto in degrees lies beyond longitude 180, where GDAL reads one side only; "
@@ -373,7 +386,7 @@ def _outline(
 
 
 def unreadable(path: Path, error: Exception) -> ImageryError:
-    """What GDAL says of a file it cannot read, in one line."""
-    reason = error.__cause__ or error  # rasterio says no more than "see previous exception"
+    """GDAL's reason why a file cannot be read, on one line."""
+    reason = error.__cause__ or error  # rasterio itself only says "see previous exception"
     line = (str(reason).splitlines() or [type(reason).__name__])[0]
     return ImageryError(f"orthophoto cannot be read ({line}): {path}")

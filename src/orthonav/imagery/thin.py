@@ -1,4 +1,4 @@
-"""Reading windows of one orthophoto file, thinned to about a wanted resolution."""
+"""Windows of one orthophoto file, averaged to about a given resolution."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from orthonav.imagery.source import Source
 
 STRIP_BYTES = 64 * 2**20
 _STRIP_PIXEL_BYTES = 48
-"""Most that a full-resolution pixel takes while it is averaged: values, colours, sums, mask."""
+"""Largest memory per full-resolution pixel while it is averaged: values, colours, sums, mask."""
 
 
 def read_thinned(
@@ -21,12 +21,12 @@ def read_thinned(
 ) -> tuple[NDArray[Any], NDArray[np.uint8], Affine]:
     """Bands (C, h, w), mask (h, w) 0..255 and transform of a source window.
 
-    Averaged to about the ground resolution wanted where the source is finer than that, so that
-    nothing aliases and overviews are used where the file has them. A palette becomes its colours.
+    Averaged to about `gsd_m` where the source is finer, which avoids aliasing and uses overviews
+    where the file has them. A palette is expanded to its colours.
     """
     factor = max(1, round(gsd_m / source.gsd_m))
     window = _aligned(window, factor, dataset)
-    # GDAL averages the numbers of a palette, and leaves out what the alpha band says is missing.
+    # GDAL averages palette indexes, and drops pixels that a false alpha band marks as transparent.
     if factor > 1 and (source.palette is not None or source.false_alpha):
         values, share = _averaged_in_strips(dataset, source, window, factor)
         mask = np.rint(share * 255).astype(np.uint8)
@@ -48,7 +48,7 @@ def cells_of(
 ) -> tuple[NDArray[Any], NDArray[np.float32]]:
     """Means (C, h, w) of squares of `factor` pixels, and the share (h, w) of each that is valid.
 
-    The first begins at column and row `at`, which may lie outside; what does counts as not valid.
+    The first begins at column and row `at`, which may lie outside; pixels outside are invalid.
     """
     (col, row), (rows, cols) = at, shape
     left, top = max(col, 0), max(row, 0)
@@ -77,7 +77,7 @@ def _read(
     bands = list(source.bands)
     values = dataset.read(bands, window=window, out_shape=(len(bands), *shape), resampling=how)
     mask = read_mask(dataset, source, window=window, out_shape=shape, resampling=how)
-    if values.dtype.kind == "f":  # not a number is no data, whether the file says so or not
+    if values.dtype.kind == "f":  # NaN is nodata, whether the file declares it or not
         mask = mask * np.isfinite(values).all(axis=0)
     if source.palette is not None:
         values = np.ascontiguousarray(source.palette[values[0]].transpose(2, 0, 1))
@@ -98,7 +98,7 @@ def read_mask(dataset: Any, source: Source, **how: Any) -> NDArray[np.uint8]:
 def _averaged_in_strips(
     dataset: Any, source: Source, window: Window, factor: int, lead_px: tuple[int, int] = (0, 0)
 ) -> tuple[NDArray[Any], NDArray[np.float32]]:
-    """Means over squares of `factor` pixels of what is valid, and the valid share, 0 to 1.
+    """Means of the valid pixels of squares of `factor` pixels, and the valid share, 0 to 1.
 
     The first squares begin `lead_px` columns and rows before the window.
     """
@@ -128,7 +128,7 @@ def _averaged_in_strips(
 def _square_means(
     band: NDArray[np.float32], factor: int, lead_px: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """Means over squares of `factor` pixels; what is missing of the outer ones counts as 0."""
+    """Means over squares of `factor` pixels; missing pixels of the outer ones count as 0."""
     left, top = lead_px
     bottom, right = -(top + band.shape[0]) % factor, -(left + band.shape[1]) % factor
     if left or top or bottom or right:
@@ -138,7 +138,7 @@ def _square_means(
 
 
 def _aligned(window: Window, factor: int, dataset: Any) -> Window:
-    """The window grown to multiples of `factor` pixels, so that every window averages alike."""
+    """The window extended to multiples of `factor` pixels, so that all windows average alike."""
     left, top = window.col_off // factor * factor, window.row_off // factor * factor
     right = min(-(-(window.col_off + window.width) // factor) * factor, dataset.width)
     bottom = min(-(-(window.row_off + window.height) // factor) * factor, dataset.height)

@@ -1,8 +1,24 @@
-"""READ FIRST: a view, what the autopilot knew, and a map go in; a `Fix` or a `NoFix` comes out.
+"""READ FIRST: a camera view and an opened map go in, a `Fix` or a `NoFix` comes out.
 
-`localizer.Localizer.locate` is the whole path: check the view, rectify it to the map's ground
-resolution with north up (`rectify`), represent and embed it, search the tiles that the prior
-allows, and say how sure that is.
+`Localizer.locate(view)` is the whole path. The default path, in the order in which it runs:
+
+1. `checks.check_view` refuses what cannot be placed: missing telemetry, extreme tilt, a blank
+   picture. Everything wrong with a view becomes a `NoFix` with a reason; nothing is raised but
+   `CameraError`, for a camera of another size.
+2. `registration.RegistrationLocalizer` places the view. It rectifies the view with its own heading
+   up (`rectify`), and asks `plan.SearchPlan` which searches to try, the cheapest first.
+3. A search gives candidates: a correlation by FFT with the map (`orthonav.register.search`), or the
+   tiles whose embeddings are most similar (`propose`).
+4. Candidates are refined from coarse to fine, the best is compared with its strongest rival
+   (`orthonav.register.registrar`); the search ends as soon as the best stands out.
+5. The evidence becomes a confidence (`orthonav.confidence`) and the residuals a covariance.
+
+Where a map has no registration layer, or with `registration=False`, `tiles.TileLocalizer` takes the
+place of steps 2 to 5: the view is embedded under a few headings and put on the most similar tile.
+
+`tracker.Tracker` places the views of a flight one after another: `registration` gives it candidate
+places, `tilt` their pitch and roll from perspective, `odometry` the displacement between views, and
+`orthonav.track` joins all of it to one track.
 """
 
 from orthonav.localizer.localizer import Localizer

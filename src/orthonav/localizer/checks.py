@@ -1,4 +1,4 @@
-"""Views that cannot be placed, told before any search: each a `NoFix` with its reason."""
+"""Views that cannot be placed are refused before any search, each by a `NoFix` with its reason."""
 
 import math
 

@@ -1,7 +1,7 @@
-"""Finding the tile that queries look like, and the evidence for it.
+"""The tile most similar to a view, and the evidence for it.
 
-One piece for the localizer and for the calibration of a map, so that the confidence is learnt on
-the very numbers that it is asked about in flight.
+Shared by the localizer and the calibration of a map, so that the confidence is learnt on the same
+numbers that it judges in flight.
 """
 
 from dataclasses import dataclass
@@ -16,15 +16,17 @@ from orthonav.search.peak import TileNeighbours
 from orthonav.search.position import PositionRule, offset_en_m
 
 BACKGROUND_TILES = 20_000
+"""Rivals are taken from about so many tiles of the whole map, evenly spread: enough for the best
+rival, and the search of a narrow prior stays fast."""
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """What search found for one view.
+    """The best tile for one view.
 
-    `tile` is the row of the best tile, `shift_en_m` where between the tiles the peak lies,
-    measured from its centre, `query` the index of the best of the headings tried, `evidence` the
-    numbers behind it.
+    `tile`: its row. `shift_en_m`: offset of the position from the centre of that tile, east and
+    north (m). `query`: index of the best of the headings tried. `evidence`: that of
+    `TileMatcher.match`.
     """
 
     tile: int
@@ -34,7 +36,7 @@ class Match:
 
 
 class TileMatcher:
-    """The tiles of a sheet, to be matched: centres (N, 2) float32 and embeddings (N, D) float16."""
+    """The tiles of a sheet: centres (N, 2) float32 and embeddings (N, D) float16."""
 
     def __init__(
         self,
@@ -49,8 +51,8 @@ class TileMatcher:
         """
         self._position: PositionRule = position
         self.index = ExactIndex(embeddings)
-        self._grid = grid
-        self._centres_en_m = centres_en_m
+        self.grid = grid
+        self.centres_en_m = centres_en_m
         self.neighbours = TileNeighbours(grid, centres_en_m)
         step = -(-len(embeddings) // BACKGROUND_TILES)
         self._background = np.arange(0, len(embeddings), step, dtype=np.intp)
@@ -60,8 +62,8 @@ class TileMatcher:
 
         Evidence: `score` (best scalar product), `margin` (its lead over the best score farther
         than half a tile away), `lowe_ratio`, `peak_ratio` (the same with that exclusion). Rivals
-        are looked for beyond `rows` too, on up to `BACKGROUND_TILES` tiles of the whole map: a
-        narrow prior leaves no rival of its own, and that must not look like certainty.
+        are sought beyond `rows` too, on up to `BACKGROUND_TILES` tiles of the whole map: a
+        narrow prior leaves no rival of its own, and that must not appear as certainty.
         """
         searched = None
         if rows is not None:
@@ -70,14 +72,14 @@ class TileMatcher:
         best_heading = scores.argmax(axis=1)
         per_tile = np.take_along_axis(scores, best_heading[:, None], axis=1)[:, 0]
         if searched is None or rows is None:
-            centres, best = self._centres_en_m, int(per_tile.argmax())
+            centres, best = self.centres_en_m, int(per_tile.argmax())
             tile = best
         else:
-            centres, allowed = self._centres_en_m[searched], np.searchsorted(searched, rows)
+            centres, allowed = self.centres_en_m[searched], np.searchsorted(searched, rows)
             best = int(allowed[per_tile[allowed].argmax()])
             tile = int(searched[best])
         score = float(per_tile[best])
-        rival = rival_score(per_tile, centres, best, self._grid.tile_m / 2)
+        rival = rival_score(per_tile, centres, best, self.grid.tile_m / 2)
         evidence = {
             "score": score,
             "margin": score - rival,
@@ -94,8 +96,8 @@ class TileMatcher:
             used,
             tile,
             used_rows,
-            self._centres_en_m,
+            self.centres_en_m,
             self.neighbours,
-            self._grid.stride_m,
+            self.grid.stride_m,
         )
         return Match(tile, shift, int(best_heading[best]), evidence)

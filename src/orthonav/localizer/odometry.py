@@ -1,4 +1,4 @@
-"""How far the aircraft moved between two views, by registering one on the other."""
+"""Odometry by the camera: the displacement between two views, by registering one on the other."""
 
 import math
 from dataclasses import dataclass, replace
@@ -18,32 +18,43 @@ from orthonav.register.template import ViewTemplates, halved
 from orthonav.track import CameraDisplacement
 
 VIEW_PX = 160
-"""Views are compared at about so many pixels across."""
+"""Views are compared at about so many pixels across: odometry needs half the resolution of a fix.
+Like the other values here without a source of their own, chosen on the flights of
+docs/tracking.md."""
 LEVELS = 3
+"""Levels of a view that serves as the map of the next one."""
 TURN_STEP_RAD, SCALE_STEP = math.radians(8.0), 0.1
+"""Spacing of headings and log scales in the search, which is refined from a coarse level: about
+that of `plan.SearchPlan`."""
 MAX_SPEED_MPS = 80.0
+"""Largest speed over ground for which a displacement is sought."""
 MIN_SCORE_RATIO = 2.5
+"""Least score of a displacement over that of its strongest rival: right ones have at least 4 on
+Arroio and generated landscapes, wrong ones at most 1.7."""
 MIN_CORRELATION = 0.4
-"""Right ways have 4 and 0.56 at the least on Arroio and generated ground, wrong ones 1.7 and 0.11
-at the most."""
-SURE_CORRELATION = 0.6
-"""A way that is as expected and fits so well is not looked for elsewhere."""
+"""Least correlation: right ones have at least 0.56, wrong ones at most 0.11
+(docs/decisions/tracking.md, 5)."""
+EXPECTED_CORRELATION = 0.6
+"""An expected displacement that fits this well ends the search (docs/decisions/tracking.md, 5)."""
 NOISE_PX, NOISE_SHARE = 0.4, 0.01
+"""Standard deviation of a displacement per axis: in pixels, and as a share of its length."""
 CANDIDATES = 8
+"""Candidates of the search."""
 EXPECTED_STEPS, SMALL_STEP_PX = 5, 0.1
+"""Refinement of the expected displacement at each level: most steps, and the step that ends it."""
 TILT_SHARE = 0.6
-"""How much of what a wrong tilt moves a view stays in the sum of many ways: the next way takes most
-of it back."""
+"""Share of the error by a wrong tilt that remains in the sum of many displacements: the next
+displacement cancels most of it."""
 SAME_BIAS = np.array([math.inf, 0.01, math.radians(0.1), math.radians(0.1)])
-"""Differences of heading, log scale, pitch and roll for which a view is not rectified anew. A
-heading needs none: views are rectified with it up."""
+"""Changes of the biases of heading, log scale, pitch and roll up to which a view need not be
+rectified again. Heading has no limit: views are rectified with their heading up."""
 Array = NDArray[np.float64]
 NO_BIAS: Array = np.zeros(4)
 
 
 def corrected_by(telemetry: Telemetry, bias: Array) -> Telemetry:
-    """What is told, less what is known to be wrong with it (4,): heading (rad), log scale, pitch
-    and roll (rad)."""
+    """Telemetry corrected by estimated biases (4,) of heading (rad), log scale, pitch and roll
+    (rad)."""
     yaw_deg, pitch_deg, roll_deg = np.degrees(bias[[0, 2, 3]]).tolist()
     return replace(
         telemetry,
@@ -54,8 +65,8 @@ def corrected_by(telemetry: Telemetry, bias: Array) -> Telemetry:
     )
 
 
-class _Picture:
-    """One rectified view as a map: grey and valid (H, W) at several levels."""
+class _ViewPyramid:
+    """One rectified view in the role of the map: grey and valid (H, W) at several levels."""
 
     levels = LEVELS
 
@@ -83,12 +94,13 @@ class _Picture:
 
 
 @dataclass(frozen=True, eq=False)
-class Footprint:
-    """A view as odometry sees it: rectified, heading up, `pixel_m` per pixel.
+class OdometryView:
+    """A view rectified for odometry, heading up.
 
-    `camera_px` is where the camera is from the middle, x to the right and y down; `telemetry` what
-    it was rectified with: what was told, less what was known to be wrong with it, `bias` (4,) of
-    heading, log scale, pitch and roll. `view` is what it was made of.
+    `registrar`: registers the next view on this one. `grey`, `valid` (H, W): the rectified view, of
+    `pixel_m` metres a pixel. `camera_px` (2,): the camera seen from its middle, x to the right and
+    y down. `telemetry`: that of the view, corrected by `bias` (4,) of heading (rad), log scale,
+    pitch and roll (rad). `view`: what it was made of.
     """
 
     registrar: Registrar
@@ -108,7 +120,7 @@ class Footprint:
 
     @property
     def en_from_px(self) -> Array:
-        """What takes pixels (x, y) to metres east and north (2, 2), by what was told."""
+        """Matrix (2, 2) from pixels (x, y) to metres east and north, by the reported telemetry."""
         heading = math.radians(self.view.telemetry.yaw_deg)
         cos, sin = math.cos(heading), math.sin(heading)
         metres = self.pixel_m * math.exp(-self.bias[1])
@@ -120,7 +132,7 @@ class Footprint:
         view: View,
         pixel_m: float | None,
         bias: Array = NO_BIAS,
-    ) -> "Footprint | None":
+    ) -> "OdometryView | None":
         """A view for odometry, None where it shows too little."""
         camera, telemetry = view.camera, corrected_by(view.telemetry, bias)
         side_m = camera.gsd_m(telemetry.agl_m) * math.sqrt(camera.width_px * camera.height_px)
@@ -133,44 +145,44 @@ class Footprint:
         if check_footprint(made, 1.0, VIEW_PX / 4) is not None:
             return None
         camera_px = np.array([-made.offset_en_m[0], made.offset_en_m[1]]) / pixel_m
-        registrar = Registrar(Reference(_Picture(made.grey, made.valid)))
+        registrar = Registrar(Reference(_ViewPyramid(made.grey, made.valid)))
         return cls(registrar, made.grey, made.valid, pixel_m, camera_px, telemetry, bias, view)
 
-    def by(self, bias: Array) -> "Footprint | None":
-        """The same view by what is known now to be wrong with what is told.
+    def corrected(self, bias: Array) -> "OdometryView | None":
+        """The same view with the present estimate of the biases.
 
-        Two views must be seen by the same: else what was learnt between them, a tilt most of all,
-        would look like a way gone.
+        Both views of a displacement need the same estimate: otherwise what was learnt between
+        them, a tilt most of all, would appear as motion (docs/decisions/tracking.md, 11).
         """
         if (np.abs(bias - self.bias)[1:] > SAME_BIAS[1:]).any():
-            return Footprint.of(self.view, self.pixel_m, bias)
-        # Rectified with the heading up, so that only this need not be what it was.
-        kept = np.array([bias[0], *self.bias[1:]])
-        return replace(self, telemetry=corrected_by(self.view.telemetry, kept), bias=kept)
+            return OdometryView.of(self.view, self.pixel_m, bias)
+        # Rectified with its heading up, so only the heading may change without rectifying again.
+        same = np.array([bias[0], *self.bias[1:]])
+        return replace(self, telemetry=corrected_by(self.view.telemetry, same), bias=same)
 
 
 @dataclass(frozen=True, eq=False)
-class Moved:
-    """A displacement, and the share of the later view that the earlier one showed too."""
+class ViewDisplacement:
+    """A displacement, and the `overlap`: share of the later view that the earlier one shows too."""
 
-    way: CameraDisplacement
+    displacement: CameraDisplacement
     overlap: float
 
 
-def moved_between(
-    before: Footprint,
-    now: Footprint,
+def displacement(
+    before: OdometryView,
+    now: OdometryView,
     tilt_noise_rad: float,
     telemetry_noise: Array,
     expected_en_m: Array | None = None,
-) -> Moved | None:
-    """The way from one view to the next, both with the same `pixel_m`; None where they do not
-    show enough of the same ground to say.
+) -> ViewDisplacement | None:
+    """The displacement from one view to the next, both with the same `pixel_m`.
 
-    The displacement is turned and scaled as was told of the view before; `tilt_noise_rad` is how
-    the tilt differs from what was told between views, `telemetry_noise` (2,) the variances with
-    which reported heading (rad) and log scale do. A way that is `expected_en_m` (2,) is tried
-    first; it saves the search where it fits, and changes nothing where it does not.
+    None where they do not show enough common ground. The displacement is rotated and scaled by the
+    telemetry reported with the view before. `tilt_noise_rad`: standard deviation of the reported
+    tilt between views. `telemetry_noise` (2,): variances of reported heading (rad) and log scale
+    between views. `expected_en_m` (2,) is tried first: where it fits it saves the search, elsewhere
+    it changes nothing.
     """
     reported_turn = math.radians(now.telemetry.yaw_deg - before.telemetry.yaw_deg)
     if not math.isfinite(reported_turn):
@@ -184,32 +196,32 @@ def moved_between(
     if placed is None or placed.weighted < MIN_CORRELATION:
         return None
     pose = placed.pose
-    way = before.en_from_px @ (
+    moved_en_m = before.en_from_px @ (
         pose.map_px(now.camera_px) - np.array(before.middle_px) - before.camera_px
     )
-    std_m = math.hypot(NOISE_PX * before.pixel_m, NOISE_SHARE * float(np.hypot(*way)))
+    std_m = math.hypot(NOISE_PX * before.pixel_m, NOISE_SHARE * float(np.hypot(*moved_en_m)))
     variance = std_m**2 + (TILT_SHARE * now.telemetry.agl_m * tilt_noise_rad) ** 2
     reported_rad = math.radians(now.view.telemetry.yaw_deg - before.view.telemetry.yaw_deg)
     seen = CameraDisplacement(
-        way,
+        moved_en_m,
         np.eye(2) * variance,
         reach_m=_reach_px(before, now) * before.pixel_m,
         turned_rad=math.remainder(pose.turn_rad - reported_rad, 2 * math.pi),
         scaled=pose.log_scale + float(now.bias[1] - before.bias[1]),
     )
-    return Moved(seen, min(max(placed.overlap, 0.0), 1.0))
+    return ViewDisplacement(seen, min(max(placed.overlap, 0.0), 1.0))
 
 
 def _registered(
-    before: Footprint, now: Footprint, prior: PosePrior, expected_en_m: Array | None
+    before: OdometryView, now: OdometryView, prior: PosePrior, expected_en_m: Array | None
 ) -> Placed | None:
-    """The later view registered on the earlier one, where the best place stands out."""
+    """The later view registered on the earlier one; None where no place stands out."""
     templates = ViewTemplates(now.grey, now.valid, 0)
     side_px = math.sqrt(float(now.valid.sum()))
     levels = Levels.of(side_px, LEVELS)
     if expected_en_m is not None:
         placed = _as_expected(before, now, templates, levels, prior, expected_en_m)
-        if placed.weighted >= SURE_CORRELATION:
+        if placed.weighted >= EXPECTED_CORRELATION:
             return placed
     reach = _reach_px(before, now)
     tried = bank(
@@ -233,14 +245,14 @@ def _registered(
 
 
 def _as_expected(
-    before: Footprint,
-    now: Footprint,
+    before: OdometryView,
+    now: OdometryView,
     templates: ViewTemplates,
     levels: Levels,
     prior: PosePrior,
     expected_en_m: Array,
 ) -> Placed:
-    """The later view as near as possible to where it should be, refined from coarse to fine."""
+    """The later view refined from its expected place, from coarse to fine."""
     turned = Pose(0.0, 0.0, prior.turn_rad or 0.0, 0.0)
     moved_px = np.linalg.solve(before.en_from_px, expected_en_m)
     x, y = np.array(before.middle_px) + before.camera_px + moved_px - turned.map_px(now.camera_px)
@@ -252,9 +264,9 @@ def _as_expected(
     return placed
 
 
-def _reach_px(before: Footprint, now: Footprint) -> float:
-    """How far from the earlier view the later one is looked for, in pixels of both."""
+def _reach_px(before: OdometryView, now: OdometryView) -> float:
+    """How far from the earlier view the later one is sought, in pixels of both."""
     seconds = (now.telemetry.time_ns - before.telemetry.time_ns) / 1e9
     far = math.hypot(*before.grey.shape)
-    # A clock that stands still says nothing of how far it may be.
+    # A clock that stands still does not bound the distance.
     return min(MAX_SPEED_MPS * seconds / before.pixel_m, far) if seconds > 0 else far

@@ -1,4 +1,4 @@
-"""What a view may be: the best place it was registered at and those beside it, with their odds."""
+"""The places where a registered view may have been taken, with their odds."""
 
 import math
 
@@ -7,17 +7,18 @@ from orthonav.register.refine import Placed
 from orthonav.register.registrar import Registered, apart_px
 
 WORTH_LOG_ODDS = -12.0
+"""Less likely places are left out."""
 
 
 def places_of(
-    found: Registered, confidence: RegisteredConfidence, near_px: float, looked_at: float
+    found: Registered, confidence: RegisteredConfidence, near_px: float, searched_share: float
 ) -> list[tuple[float, float, Placed]]:
-    """Places with their log odds, and how likely each is by the view alone: the best, and those
-    that were finished beside it and are farther than `near_px` from it.
+    """Log odds, probability by the view alone, and place: of the best place and of the other
+    finished ones that are farther than `near_px` from it.
 
-    Where only a share of the map was `looked_at`, few rivals were found and chance is lower:
-    the odds are those of somebody who knows only that it is there, or, if that is less, of
-    somebody who looked everywhere and found elsewhere what chance makes.
+    A search of only a share of the map finds fewer rivals, and chance is lower: the log odds are
+    those within the area searched times `searched_share`, or, if less, those of a search of the
+    whole map whose rivals are what chance makes (docs/decisions/tracking.md, 9).
     """
     best, chances = found.evidence(), confidence.chances
     least = {"rival": chances.total, "look_rival": chances.look, "fine_rival": chances.fine}
@@ -34,7 +35,7 @@ def places_of(
                 "look": found.look_score * share,
                 "look_rival": found.look_score,
             }
-        there = _log_odds(confidence(evidence)) + math.log(looked_at)
+        there = _log_odds(confidence(evidence)) + math.log(searched_share)
         for name in least.keys() & evidence.keys():
             evidence[name] = max(evidence[name], least[name])
         alone = confidence(evidence)

@@ -1,4 +1,4 @@
-"""Candidates for registration from the tiles whose embeddings are most like the view's."""
+"""Candidates for registration: the tiles whose embeddings are most similar to the view's."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,25 +10,22 @@ from orthonav.embed.bank import embed_poses
 from orthonav.embed.contract import ViewEmbedder
 from orthonav.embed.whitened import WhitenedEmbedder
 from orthonav.geo.grid import TileGrid
+from orthonav.localizer.match import TileMatcher
+from orthonav.localizer.plan import SearchPlan
 from orthonav.localizer.rectify import RectifiedView
 from orthonav.register.pose import Pose
 from orthonav.register.search import Candidate
 from orthonav.search.exact import ExactIndex, top_tiles
 from orthonav.search.peak import TileNeighbours
 
-CANDIDATES = 20
-APART_STRIDES = 1.5
-VIEW_TILES = (0.6, 2.5)
-"""Sides of views, in tiles, of which a tile's embedding says enough."""
-POSE_MS = 0.06
-REPRESENT_MS = 4.0
-SCORE_MS = 5e-8
-"""Rough costs on one core: of a pose, of the view, of one number of one tile under one pose."""
-
 
 @dataclass(frozen=True, eq=False)
 class TileProposer:
-    """Embeds a view under a bank of poses and looks for the tiles most like it."""
+    """Embeds a view under many poses and finds the most similar tiles.
+
+    `grid`, `centres_en_m` (N, 2) and `index` are those of the sheet's tiles, `neighbours` the tiles
+    next to each; `representation` and `embedder` made the embeddings.
+    """
 
     grid: TileGrid
     centres_en_m: NDArray[np.float32]
@@ -39,30 +36,27 @@ class TileProposer:
 
     @classmethod
     def of(
-        cls,
-        grid: TileGrid,
-        centres_en_m: NDArray[np.float32],
-        index: ExactIndex,
-        embedder: ViewEmbedder,
-        representation: Any,
-        neighbours: TileNeighbours,
+        cls, tiles: TileMatcher, embedder: ViewEmbedder, representation: Any
     ) -> "TileProposer | None":
-        """A proposer for embeddings of which many poses can be made at once, None for others."""
+        """A proposer for whitened embeddings, None for others: those cannot embed a view under
+        many poses at once."""
         if not isinstance(embedder, WhitenedEmbedder):
             return None
-        return cls(grid, centres_en_m, index, embedder, representation, neighbours)
+        return cls(
+            tiles.grid, tiles.centres_en_m, tiles.index, embedder, representation, tiles.neighbours
+        )
 
-    def fits(self, side_px: float) -> bool:
-        """Whether views of this side (pixels of the map) can be proposed for."""
-        smallest, largest = VIEW_TILES
+    def fits(self, side_px: float, plan: SearchPlan) -> bool:
+        """Whether candidates are of use for views of this side (pixels of the map)."""
+        smallest, largest = plan.view_tiles
         return smallest * self.grid.tile_px <= side_px <= largest * self.grid.tile_px
 
-    def cost_ms(self, poses: int, tiles: int) -> float:
-        """About how long it takes."""
-        return REPRESENT_MS + poses * (POSE_MS + SCORE_MS * tiles * self.embedder.dims)
-
     def candidates(
-        self, view: RectifiedView, poses: list[tuple[float, float]], rows: NDArray[np.intp] | None
+        self,
+        view: RectifiedView,
+        poses: list[tuple[float, float]],
+        rows: NDArray[np.intp] | None,
+        plan: SearchPlan,
     ) -> list[Candidate]:
         """Candidates for a view rectified heading-up at the map's resolution, among tiles `rows`.
 
@@ -73,7 +67,8 @@ class TileProposer:
         )
         scores = self.index.best(queries, rows)
         centres = self.centres_en_m if rows is None else self.centres_en_m[rows]
-        chosen = top_tiles(scores, centres, CANDIDATES, APART_STRIDES * self.grid.stride_m)
+        apart_m = plan.tile_apart_strides * self.grid.stride_m
+        chosen = top_tiles(scores, centres, plan.tile_candidates, apart_m)
         tiles = chosen if rows is None else rows[chosen]
         which = self.index.which(queries, tiles)
         found = []

@@ -166,15 +166,15 @@ def _remapped(
 def _is_smooth(index: Array, shape: tuple[int, ...]) -> bool:
     """Whether straight lines between nodes (H, W, 2) miss by less than `NODE_ERROR_PX` in the view.
 
-    Between every other node they miss by four times as much, which the nodes between tell.
+    Between every other node they miss by four times as much, which the skipped nodes show.
     """
     odd = [side // 2 * 2 - 1 for side in index.shape[:2]]
     even = index[: odd[0] : 2, : odd[1] : 2]
     middle = (even[:-1, :-1] + even[1:, :-1] + even[:-1, 1:] + even[1:, 1:]) / 4
-    told = index[1 : odd[0] : 2, 1 : odd[1] : 2]
+    exact = index[1 : odd[0] : 2, 1 : odd[1] : 2]
     size = np.array(shape[::-1])
-    near = (np.abs(told - size / 2) < 0.6 * size + NODE_PX).all(axis=-1)
-    missed = np.abs(middle - told)[near].max(initial=0.0) / 4
+    near = (np.abs(exact - size / 2) < 0.6 * size + NODE_PX).all(axis=-1)
+    missed = np.abs(middle - exact)[near].max(initial=0.0) / 4
     return bool(np.isfinite(index).all() and missed < NODE_ERROR_PX)
 
 

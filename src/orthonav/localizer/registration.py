@@ -1,93 +1,42 @@
-"""Placing a view by registration: rectify it, find candidates, refine them, judge the best.
+"""Placing a view by registration on the map's imagery: collect candidates, refine, judge the best.
 
-Candidates come from where they cost least: a search by FFT of the whole sheet or of the part that
-the prior allows, at the level where the view is judged or one coarser; or, on large sheets, tiles
-whose embeddings are alike. Where the outcome leaves doubt, the next dearer way is tried too.
+`plan` decides which searches to run, this module runs them until one place stands out from chance
+and from its rivals. `register` is the one way from a view to its best place; `locate` makes a fix
+of it, `tracker`, `orthonav.atlas` and `orthonav.check` use the place itself.
 """
 
+import functools
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.confidence.registered import Chances, RegisteredConfidence
-from orthonav.localizer.checks import check_footprint
+from orthonav.confidence.registered import USUAL_CHANCES, Chances, RegisteredConfidence
+from orthonav.errors import MapFileError, VariantError
+from orthonav.localizer.plan import DEFAULT_PLAN, ClearMargin, Search, SearchPlan
+from orthonav.localizer.prepared import PreparedView, prepare
 from orthonav.localizer.propose import TileProposer
-from orthonav.localizer.rectify import RectifiedView, downsampled, rectify_footprint
+from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import SheetInfo
-from orthonav.records import Fix, NoFix, Prior, Telemetry, View
-from orthonav.register.pose import Pose
+from orthonav.mapfile.reader import MapFile
+from orthonav.records import PRIOR_SIGMAS, Fix, NoFix, Prior, Telemetry, View
+from orthonav.register.pose import Pose, rotation
 from orthonav.register.reference import GreyPyramid, Reference
 from orthonav.register.refine import Placed
-from orthonav.register.registrar import Levels, PosePrior, Registered, Registrar
-from orthonav.register.search import Candidate, bank, search
+from orthonav.register.registrar import Registered, Registrar
+from orthonav.register.search import Candidate, search
 from orthonav.register.template import ViewTemplates
 from orthonav.search.exact import rows_within
 
-DEFAULT_YAW_STD_DEG = 7.0
-DEFAULT_AGL_STD = 0.08
-MIN_YAW_STD_DEG = 2.0
-MIN_AGL_STD = 0.03
-MAX_AGL_STD = 0.15
-TURN_STEP_RAD, SCALE_STEP = math.radians(8.0), 0.13
-LOOK_TURN_STEP_RAD, LOOK_SCALE_STEP = math.radians(6.0), 0.09
-"""Steps of heading and scale: of candidates that are refined at a coarser level first, and of those
-that are not."""
-BANK_SIGMAS = 3.0
-MAX_NATS = 5.5
-STAGES_NATS = (-1.0, 0.4, 2.0, math.inf)
-"""Headings and scales are tried in stages, by how unlikely they are."""
-PRIOR_SIGMAS = 3.0
-CANDIDATES = 24
-STAGE_CANDIDATES = 8
-MIN_CANDIDATES = 6
-CANDIDATE_SHARE = 0.5
-MIN_VIEW_PX = 24.0
-MIN_TILT_COS = 0.5
-USUAL_CHANCES = Chances(32.0, 15.0, 48.0)
-DOUBT = 0.01
-"""Views of this confidence to one less it are looked at one level finer."""
-POSE_MS = 0.1
-PIXEL_MS = 5.5e-7
-LOOK_MS = 14.0
-LAST_MS = 900.0
-"""What searches cost on one core of a desktop, roughly: to choose between them, no more."""
-MAX_SEARCH_PX = 8_000_000
-"""Windows larger than this (some 300 MB) are not searched by FFT: on such a map views are found by
-tiles, or with a prior."""
-
-
-class _ClearMargin(NamedTuple):
-    """A view this far above chance and above its rivals is not searched again."""
-
-    strength: float
-    look_ratio: float
-    peak_ratio: float
-
-
-CLEAR = _ClearMargin(2.2, 1.9, 1.9)
-CLEAR_AT_JUDGED = _ClearMargin(1.8, 1.5, 1.5)
-"""Less is enough where the level that misses least was searched, if only in part."""
-
 
 @dataclass(frozen=True, eq=False)
-class PreparedView:
-    """A view made ready: its templates, levels, and where the camera is seen from its middle.
+class RegisteredView:
+    """A prepared view and its best place; `found` is a `NoFix` where it could not be compared."""
 
-    `rectified_at` makes the view at the ground resolution of a level.
-    """
-
-    rectified_at: Callable[[int], RectifiedView]
-    templates: ViewTemplates
-    levels: Levels
-    side_px: float
-    camera_px: NDArray[np.float64]
-    prior: PosePrior
+    prepared: PreparedView
+    found: Registered | NoFix
 
 
 class RegistrationLocalizer:
@@ -97,87 +46,128 @@ class RegistrationLocalizer:
         self,
         sheet: SheetInfo,
         layer: GreyPyramid,
+        *,
         confidence: RegisteredConfidence | None,
         radius_m: float,
         floor_px: float,
         propose: TileProposer | None = None,
-        last_ms: float = LAST_MS,
+        plan: SearchPlan = DEFAULT_PLAN,
     ) -> None:
-        """`floor_px` is the standard deviation with which maps of two dates agree, in pixels.
+        """Take a sheet and its imagery; `of_map` does so for a map.
 
-        Without `propose` candidates come from FFT search alone. Searches dearer than `last_ms`,
-        by a rough estimate, are left out.
+        `confidence`: None before it is learnt. `radius_m`: the error that it is about. `floor_px`:
+        standard deviation with which maps of two dates agree, in pixels of level 0. Without
+        `propose`, candidates come from searches by FFT only.
         """
         self.sheet, self.grid = sheet, sheet.grid
         self.registrar = Registrar(Reference(layer))
         self.confidence, self.radius_m = confidence, radius_m
-        self.propose = propose
-        self.floor_px, self._last_ms = floor_px, last_ms
+        self.propose, self.plan = propose, plan
+        self.floor_px = floor_px
+
+    @classmethod
+    def of_map(
+        cls, opened: MapFile, propose: TileProposer | None, plan: SearchPlan = DEFAULT_PLAN
+    ) -> "RegistrationLocalizer | None":
+        """A localizer for the only sheet of a map; None where the map has no registration layer.
+
+        Raises `MapFileError` where the manifest's registration is damaged.
+        """
+        layer = GreyLayer.of(opened)
+        if layer is None:
+            return None
+        plain = opened.manifest.registration or {}
+        try:
+            fitted = plain.get("confidence")
+            confidence = None if fitted is None else RegisteredConfidence.from_plain(fitted)
+            radius_m, floor_px = float(plain["radius_m"]), float(plain["position_floor_px"])
+        except (VariantError, KeyError, TypeError, ValueError) as error:
+            raise MapFileError(f"map cannot be flown ({error}): {opened.path}") from error
+        if not (0 < radius_m < math.inf and 0 <= floor_px < math.inf):
+            raise MapFileError(f"map has impossible registration parameters: {opened.path}")
+        return cls(
+            opened.manifest.sheets[0],
+            layer,
+            confidence=confidence,
+            radius_m=radius_m,
+            floor_px=floor_px,
+            propose=propose,
+            plan=plan,
+        )
+
+    @property
+    def pyramid(self) -> GreyPyramid:
+        """The grey levels of the sheet at all its resolutions."""
+        return self.registrar.reference.pyramid
 
     def locate(self, view: View, prior: Prior | None, heading_known: bool) -> Fix | NoFix:
-        """Where a view was taken; checks of view and telemetry have been made."""
+        """The position from which a view was taken; `check_view` has accepted the view."""
+        seen = self.register(view, prior, heading_known)
+        if isinstance(seen, NoFix):
+            return seen
+        if isinstance(seen.found, NoFix):
+            return seen.found
+        return self._fix(seen.prepared, seen.found, view.telemetry)
+
+    def register(
+        self,
+        view: View,
+        prior: Prior | None = None,
+        heading_known: bool = True,
+        *,
+        heading_std_rad: tuple[float, float] | None = None,
+    ) -> RegisteredView | NoFix:
+        """The view and its best place within `prior`; `NoFix` where it shows too little.
+
+        `heading_std_rad`: a heading (rad) and its standard deviation in place of the reported ones.
+        """
         prepared = self.prepared(view, heading_known)
         if isinstance(prepared, NoFix):
             return prepared
-        if prior is not None and not self.touches_map(prior, prepared):
-            return NoFix("outside_map", "the map does not reach to where the prior says")
-        best = self.best(prepared, prior)
-        if best is None:
+        if heading_std_rad is not None:
+            turn, std = heading_std_rad
+            pose_prior = replace(prepared.prior, turn_rad=turn, turn_std_rad=std)
+            prepared = replace(prepared, prior=pose_prior)
+        if prior is not None and not self._touches_map(prior, prepared):
+            outside = NoFix("outside_map", "the map does not reach to where the prior says")
+            return RegisteredView(prepared, outside)
+        found = self.best(prepared, prior)
+        if found is None:
             detail = "no place of the map could be compared with the view"
             if prior is None:
                 detail += "; a large map needs a prior, or views as large as its tiles"
-            return NoFix("no_match", detail)
-        return self._fix(prepared, best, view.telemetry)
+            return RegisteredView(prepared, NoFix("no_match", detail))
+        return RegisteredView(prepared, found)
 
     def prepared(self, view: View, heading_known: bool) -> PreparedView | NoFix:
-        """The view rectified to the level where it is finished, heading up, all that it sees."""
-        camera, telemetry = view.camera, view.telemetry
-        agl_m = telemetry.agl_m
-        tilt = math.cos(math.radians(telemetry.pitch_deg)) * math.cos(
-            math.radians(telemetry.roll_deg)
-        )
-        # The area seen grows with the inverse cube of the cosine, as far as it is looked at.
-        nominal_m = (agl_m / max(tilt, MIN_TILT_COS) ** 1.5) * math.sqrt(
-            camera.width_px * camera.height_px / (camera.fx_px * camera.fy_px)
-        )
-        levels = Levels.of(nominal_m / self.grid.gsd_m, self.registrar.reference.levels)
-        gsd_m = self.grid.gsd_m * 2**levels.final
-        reduce = levels.coarse - levels.final
-
-        def rectified_at(finest: int) -> RectifiedView:
-            finest_m = self.grid.gsd_m * 2**finest
-            return rectify_footprint(
-                downsampled(view, finest_m),
-                gsd_m=finest_m,
-                multiple_px=2 ** max(0, reduce + levels.final - finest),
-            )
-
-        rectified = rectified_at(levels.final)
-        refused = check_footprint(rectified, gsd_m / self.grid.gsd_m, MIN_VIEW_PX)
-        if refused is not None:
-            return refused
-        templates = ViewTemplates(rectified.grey, rectified.valid, levels.final)
-        pose_prior = _pose_prior(telemetry, heading_known)
-        offset = rectified.offset_en_m / self.grid.gsd_m
-        side_px = math.sqrt(float(rectified.valid.sum())) * gsd_m / self.grid.gsd_m
-        camera_px = np.array([-offset[0], offset[1]])
-        return PreparedView(rectified_at, templates, levels, side_px, camera_px, pose_prior)
+        """The view rectified and made ready for registration; `NoFix` where it shows too little."""
+        return prepare(view, self.grid.gsd_m, self.pyramid.levels, heading_known)
 
     def best(self, view: PreparedView, prior: Prior | None) -> Registered | None:
-        """The best place over all ways of search that had to be tried."""
+        """The best place after all searches that had to be run; None where nothing was found."""
         judged: list[Placed] = []
         best: Registered | None = None
         candidates = 0
-        for level, found in self._ways(view, prior):
+        rows = functools.cache(lambda: self._rows_near(view, prior))
+        for each in self.plan.searches(
+            view.levels,
+            view.prior,
+            lambda level, poses: self._fft_ms(view, prior, level, poses),
+            lambda poses: self._tiles_ms(view, rows(), poses),
+        ):
+            if each.from_tiles and self.propose is not None:
+                found = self.propose.candidates(view.rectified_at(0), each.poses, rows(), self.plan)
+            else:
+                found = self._searched(view, prior, each)
             judged += self.registrar.judged(
-                view.templates, view.levels, found, level, view.prior, judged
+                view.templates, view.levels, found, each.level, view.prior, judged
             )
             candidates += len(found)
             best = None
-            enough = CLEAR_AT_JUDGED if level == view.levels.look else CLEAR
-            if judged and self._looks_sure(view, judged, enough):
+            enough = self.plan.enough(each.level, view.levels)
+            if judged and self._seems_clear(view, judged, enough):
                 best = self._finished(view, judged, candidates)
-                if self._is_confident(best, enough):
+                if self._is_clear(best, enough):
                     return best
         if not judged:
             return None
@@ -191,60 +181,29 @@ class RegistrationLocalizer:
     def _finished(self, view: PreparedView, judged: list[Placed], candidates: int) -> Registered:
         return self.registrar.finished(view.templates, view.levels, judged, view.prior, candidates)
 
-    def _looks_sure(self, view: PreparedView, judged: list[Placed], enough: _ClearMargin) -> bool:
-        """Whether finishing the best of them may end the search."""
+    def _seems_clear(self, view: PreparedView, judged: list[Placed], enough: ClearMargin) -> bool:
+        """Whether the best candidate may end the search, before the cost of finishing it."""
         best, rival = self.registrar.standing(view.templates, judged, view.prior)
         return best > enough.strength * self._chances.look and best > enough.look_ratio * rival
 
-    def _is_confident(self, best: Registered, enough: _ClearMargin) -> bool:
+    def _is_clear(self, best: Registered, enough: ClearMargin) -> bool:
+        """Whether a finished place ends the search."""
         if best.score <= enough.strength * self._chances.total:
             return False
         return best.look_ratio > enough.look_ratio and best.peak_ratio > enough.peak_ratio
 
     def _is_doubtful(self, best: Registered) -> bool:
-        """Whether one finer level could change whether the place is believed."""
+        """Whether one finer level could change the verdict on a place."""
         if self.confidence is None:
             return True
-        return DOUBT <= self.confidence(best.evidence()) <= 1 - DOUBT
+        doubt = self.plan.doubt
+        return doubt <= self.confidence(best.evidence()) <= 1 - doubt
 
     @property
     def _chances(self) -> Chances:
         return self.confidence.chances if self.confidence else USUAL_CHANCES
 
-    def _ways(
-        self, view: PreparedView, prior: Prior | None
-    ) -> Iterator[tuple[int, list[Candidate]]]:
-        """Candidates and the level they were found at, by the cheapest way first.
-
-        The level where views are judged misses least: it alone is searched where that is cheap,
-        elsewhere after a cheaper way that left doubt, if it can be afforded at all. The likeliest
-        headings and scales come first.
-        """
-        look, coarse = view.levels.look, view.levels.coarse
-        rough = _by_likelihood(view.prior, TURN_STEP_RAD, SCALE_STEP)
-        fine = _by_likelihood(view.prior, LOOK_TURN_STEP_RAD, LOOK_SCALE_STEP)
-        look_ms = self._search_ms(view, prior, look, len(fine))
-        if look_ms > LOOK_MS:
-            poses = [pose for pose, _ in rough]
-            coarse_ms = self._search_ms(view, prior, coarse, len(poses))
-            rows = self._tiles(view, prior)
-            ways = sorted([(coarse_ms, False), (self._tiles_ms(view, rows, len(poses)), True)])
-            # The cheapest if it can be done at all; a second one only where it can be afforded.
-            dearest = 0.0 if look_ms <= self._last_ms else self._last_ms
-            for number, (cost_ms, from_tiles) in enumerate(ways):
-                if math.isinf(cost_ms) or (number and cost_ms > dearest):
-                    break
-                if from_tiles and self.propose is not None:
-                    yield coarse, self.propose.candidates(view.rectified_at(0), poses, rows)
-                else:
-                    yield coarse, self._searched(view, prior, coarse, poses, CANDIDATES)
-        if look_ms <= max(self._last_ms, LOOK_MS):
-            for least, most in pairwise(STAGES_NATS):
-                stage = [pose for pose, nats in fine if least < nats <= most]
-                if stage:
-                    yield look, self._searched(view, prior, look, stage, STAGE_CANDIDATES)
-
-    def _tiles(self, view: PreparedView, prior: Prior | None) -> NDArray[np.intp] | None:
+    def _rows_near(self, view: PreparedView, prior: Prior | None) -> NDArray[np.intp] | None:
         """Rows of the tiles that the prior allows, None for all."""
         if prior is None or self.propose is None:
             return None
@@ -255,13 +214,15 @@ class RegistrationLocalizer:
         return rows_within(self.propose.centres_en_m, centre, reach_m)
 
     def _tiles_ms(self, view: PreparedView, rows: NDArray[np.intp] | None, poses: int) -> float:
-        """What candidates from tiles cost; infinite where there can be none."""
-        if self.propose is None or not self.propose.fits(view.side_px):
+        """Estimated cost of candidates from tiles; infinite where there can be none."""
+        if self.propose is None or not self.propose.fits(view.side_px, self.plan):
             return math.inf
         tiles = len(self.propose.centres_en_m) if rows is None else len(rows)
-        return self.propose.cost_ms(poses, tiles) if tiles else math.inf
+        dims = self.propose.embedder.dims
+        return self.plan.tiles_ms(poses, tiles, dims) if tiles else math.inf
 
-    def _search_ms(self, view: PreparedView, prior: Prior | None, level: int, poses: int) -> float:
+    def _fft_ms(self, view: PreparedView, prior: Prior | None, level: int, poses: int) -> float:
+        """Estimated cost of an FFT search at a level, of the sheet or of what the prior allows."""
         rows, cols = self.registrar.reference.shape(level)
         if prior is not None:
             across = 2 * self._reach_px(view, prior) / 2**level
@@ -269,53 +230,45 @@ class RegistrationLocalizer:
         side = view.side_px / 2**level
         if prior is not None or min(rows, cols) < 3 * side:
             rows, cols = round(rows + side), round(cols + side)
-        pixels = float(rows * cols)
-        if pixels > MAX_SEARCH_PX:
-            return math.inf
-        return poses * (POSE_MS + PIXEL_MS * pixels * math.log2(pixels))
+        return self.plan.fft_ms(poses, rows, cols)
 
-    def _searched(
-        self,
-        view: PreparedView,
-        prior: Prior | None,
-        level: int,
-        poses: list[tuple[float, float]],
-        count: int,
-    ) -> list[Candidate]:
-        recipe = view.levels.recipe(level)
+    def _searched(self, view: PreparedView, prior: Prior | None, run: Search) -> list[Candidate]:
+        """Candidates of one FFT search, best first."""
+        recipe = view.levels.recipe(run.level)
         if prior is None:
-            window = self.registrar.whole_window(level, recipe, view.side_px)
+            window = self.registrar.whole_window(run.level, recipe, view.side_px)
         else:
             window = self.registrar.part_window(
-                level,
+                run.level,
                 recipe,
                 view.side_px,
                 self._prior_px(prior, view),
                 self._reach_px(view, prior),
             )
-        found = search(view.templates.at(level, recipe), window, poses, count)
-        worth = sum(each.score >= CANDIDATE_SHARE * found[0].score for each in found)
-        return found[: max(worth, MIN_CANDIDATES)]
+        template = view.templates.at(run.level, recipe)
+        found = search(template, window, run.poses, run.candidates)
+        least = self.plan.candidate_share
+        worth = sum(each.score >= least * found[0].score for each in found)
+        return found[: max(worth, self.plan.min_candidates)]
 
     def _prior_px(self, prior: Prior, view: PreparedView) -> tuple[float, float]:
-        """Where the middle of the view should lie by the prior, x and y at level 0."""
+        """The middle of the view as the prior expects it, x and y at level 0."""
         east, north = self.sheet.frame.en_from_latlon(prior.lat_deg, prior.lon_deg)
         x = (float(east) - self.grid.west_m) / self.grid.gsd_m
         y = (self.grid.north_m - float(north)) / self.grid.gsd_m
         if view.prior.turn_rad is None:
             return x, y
-        cos, sin = math.cos(view.prior.turn_rad), math.sin(view.prior.turn_rad)
-        moved = np.array([[cos, -sin], [sin, cos]]) @ view.camera_px
+        moved = rotation(view.prior.turn_rad) @ view.camera_px
         return x - float(moved[0]), y - float(moved[1])
 
     def _reach_px(self, view: PreparedView, prior: Prior) -> float:
-        """How far from there the middle of the view may lie."""
+        """How far from there the middle of the view may lie, in pixels of level 0."""
         tilt = float(np.hypot(*view.camera_px))
         turn = 2.0 if view.prior.turn_rad is None else 2 * view.prior.turn_std_rad
         reach = PRIOR_SIGMAS * max(prior.std_m, 0.0) / self.grid.gsd_m
         return float(reach + tilt * min(turn, 1.0) + 2.0 * 2**view.levels.coarse)
 
-    def touches_map(self, prior: Prior, view: PreparedView) -> bool:
+    def _touches_map(self, prior: Prior, view: PreparedView) -> bool:
         """Whether any of the map lies where the prior allows the view to be."""
         x, y = self._prior_px(prior, view)
         reach = self._reach_px(view, prior)
@@ -373,37 +326,3 @@ class RegistrationLocalizer:
         spread[:2, :2] += np.eye(2) * self.floor_px**2
         metres = np.diag([self.grid.gsd_m, -self.grid.gsd_m, 1.0, 1.0])
         return np.asarray(metres @ spread @ metres)
-
-
-def _pose_prior(telemetry: Telemetry, heading_known: bool) -> PosePrior:
-    """What the telemetry says of heading and scale."""
-    yaw_std = _or_default(telemetry.yaw_std_deg, DEFAULT_YAW_STD_DEG)
-    agl_std_m = telemetry.agl_std_m
-    agl_std = None if agl_std_m is None else agl_std_m / telemetry.agl_m
-    return PosePrior(
-        math.radians(telemetry.yaw_deg) if heading_known else None,
-        math.radians(min(max(yaw_std, MIN_YAW_STD_DEG), 90.0)),
-        min(max(_or_default(agl_std, DEFAULT_AGL_STD), MIN_AGL_STD), MAX_AGL_STD),
-    )
-
-
-def _or_default(value: float | None, default: float) -> float:
-    return default if value is None or not math.isfinite(value) else value
-
-
-def _by_likelihood(
-    prior: PosePrior, turn_step_rad: float, scale_step: float
-) -> list[tuple[tuple[float, float], float]]:
-    """Headings (rad) and log scales to try, each with its `nats`, the likeliest first."""
-    made = bank(
-        None if prior.turn_rad is None else prior.turn_std_rad,
-        prior.log_scale_std,
-        turn_step_rad=turn_step_rad,
-        scale_step=scale_step,
-        sigmas=BANK_SIGMAS,
-    )
-    told = prior.turn_rad or 0.0
-    cell = turn_step_rad / 2, scale_step / 2
-    poses = [(told + turn, log_scale) for turn, log_scale in made.poses]
-    known = [(pose, prior.nats(*pose, within=cell)) for pose in poses]
-    return sorted((each for each in known if each[1] <= MAX_NATS), key=lambda each: each[1])

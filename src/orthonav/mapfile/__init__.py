@@ -1,4 +1,4 @@
-"""The map file (`*.onav`): everything that flies, in one memory-mapped file safe to open."""
+"""The map file (`*.onav`): all data of a map in one memory-mapped file that is safe to open."""
 
 from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import SCHEMA, GreyInfo, Manifest, SheetInfo

@@ -1,7 +1,7 @@
 """The registration layer of a map: a grey pyramid of a sheet, read by windows.
 
-Each level is cut into square chunks, each a grey JPEG with its own mask, see
-`docs/map-format.md`. Only the chunks that a window touches are decoded. Maps come from strangers,
+Each level is divided into square chunks, each a grey JPEG with its own mask, see
+`docs/map-format.md`. Only the chunks that a window touches are decoded. Maps are untrusted files,
 so every length, size and offset is checked before it is used.
 """
 
@@ -20,15 +20,17 @@ from orthonav.mapfile.manifest import GreyInfo
 from orthonav.mapfile.reader import MapFile
 
 CACHE_BYTES = 64 * 2**20
+"""Decoded chunks cached: 64 km2 at 1 m where no chunk has a mask."""
 MAX_PREVIEW_PX = 384
-"""No map carries a larger preview (`docs/map-format.md`)."""
+"""Limit of the format (`docs/map-format.md`)."""
 MAX_CHUNK_BYTES_PER_PX = 4
+"""Sanity limit: an uncompressed chunk has 1."""
 _CHUNK_HEADER_BYTES = 4096
 _SOI, _EOI = b"\xff\xd8", b"\xff\xd9"
 _START_OF_FRAME = 0xC0
-"""Baseline: one pass over the pixels, whatever the file says."""
+"""Baseline JPEG: decoding takes one pass over the pixels."""
 _BEFORE_FRAME = (0xE0, 0xDB, 0xC4)
-"""What may come before it: application data 0, quantization and Huffman tables."""
+"""Segments allowed before the frame: APP0, quantization tables, Huffman tables."""
 _DECODE = int(cv2.IMREAD_GRAYSCALE) | int(cv2.IMREAD_IGNORE_ORIENTATION)
 
 Chunk = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
@@ -36,7 +38,7 @@ Chunk = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
 
 
 def part_names(sheet: int) -> dict[str, str]:
-    """Names of the parts of a sheet's layer, by what they hold."""
+    """Names of the parts of a sheet's layer, by kind of content."""
     kinds = ("bytes", "offsets", "mask_bytes", "mask_offsets")
     return {kind: f"sheet{sheet}/grey/{kind}" for kind in kinds}
 
@@ -47,7 +49,7 @@ def level_shape(height_px: int, width_px: int, level: int) -> tuple[int, int]:
 
 
 class ChunkTable:
-    """How the levels of a sheet are cut: chunks are numbered level by level, row by row."""
+    """Division of the levels of a sheet into chunks, numbered level by level and row by row."""
 
     def __init__(self, height_px: int, width_px: int, levels: int, chunk_px: int) -> None:
         self.chunk_px = chunk_px
@@ -67,7 +69,7 @@ class ChunkTable:
         return self._first[level] + chunk_row * self._cols[level] + chunk_col
 
     def shape(self, level: int, chunk_row: int, chunk_col: int) -> tuple[int, int]:
-        """Rows and columns of a chunk, less than `chunk_px` where the level ends."""
+        """Rows and columns of a chunk; less than `chunk_px` at the end of the level."""
         rows, cols = self.shapes[level]
         side = self.chunk_px
         return min(side, rows - chunk_row * side), min(side, cols - chunk_col * side)
@@ -84,7 +86,7 @@ class GreyLayer:
     def __init__(
         self, opened: MapFile, sheet: int, info: GreyInfo, cache_bytes: int = CACHE_BYTES
     ) -> None:
-        """Use `of`. Raises `MapFileError` where the parts do not fit the manifest."""
+        """Use `of`. Raises `MapFileError` if the parts do not fit the manifest."""
         grid = opened.manifest.sheets[sheet].grid
         self.levels = info.levels
         self._path = opened.path
@@ -98,20 +100,15 @@ class GreyLayer:
     def of(
         cls, opened: MapFile, sheet: int = 0, *, cache_bytes: int = CACHE_BYTES
     ) -> "GreyLayer | None":
-        """The layer of a sheet; None where the map has none.
+        """The layer of a sheet; None if the map has none.
 
-        Decoded chunks are kept up to `cache_bytes`. Raises `MapFileError` where it is damaged.
+        Decoded chunks are cached up to `cache_bytes`. Raises `MapFileError` if it is damaged.
         """
         sheets = opened.manifest.sheets
         if not 0 <= sheet < len(sheets):
             raise MapFileError(f"map has {len(sheets)} sheets, not sheet {sheet}: {opened.path}")
         info = sheets[sheet].grey
         return None if info is None else cls(opened, sheet, info, cache_bytes)
-
-    @property
-    def cached_bytes(self) -> int:
-        """Bytes of decoded chunks that are kept."""
-        return self._cache.held_bytes
 
     def shape(self, level: int) -> tuple[int, int]:
         """Rows and columns of a level."""
@@ -124,8 +121,8 @@ class GreyLayer:
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """Grey and valid (height, width) of the window that begins at (row, col) of a level.
 
-        It may reach beyond the sheet or lie outside: there, as where the sheet has no imagery,
-        pixels are not valid and 0. Raises `MapFileError` where a chunk is damaged.
+        It may reach beyond the sheet or lie outside it: pixels there, and pixels without imagery,
+        are 0 and not valid. Raises `MapFileError` if a chunk is damaged.
         """
         rows, cols = self.shape(level)
         if height < 0 or width < 0:
@@ -148,9 +145,9 @@ class GreyLayer:
         return grey, valid
 
     def jpeg(self, level: int, chunk_row: int, chunk_col: int) -> bytes | None:
-        """The JPEG of a chunk as it is stored, checked; None unless all of the chunk is valid.
+        """The stored JPEG of a chunk, checked; None unless all of the chunk is valid.
 
-        Raises `IndexError` where there is no such chunk, `MapFileError` where it is damaged.
+        Raises `IndexError` if there is no such chunk, `MapFileError` if it is damaged.
         """
         rows, cols = self.shape(level)
         side = self._table.chunk_px
@@ -162,7 +159,7 @@ class GreyLayer:
         return self._jpegs.blob(self._table.number(level, chunk_row, chunk_col)).tobytes()
 
     def _chunk(self, level: int, chunk_row: int, chunk_col: int) -> Chunk | None:
-        """A chunk, decoded now or before; None where no pixel of it is valid."""
+        """A chunk, from the cache or decoded; None if none of its pixels is valid."""
         number = self._table.number(level, chunk_row, chunk_col)
         jpeg, mask = self._jpegs.blob(number), self._masks.blob(number)
         if not jpeg.size and not mask.size:
@@ -181,16 +178,16 @@ class GreyLayer:
 
 
 def _cuts(first: int, last: int, size: int, side: int) -> list[tuple[int, int]]:
-    """[first, last) within [0, size), cut at multiples of `side`."""
+    """[first, last) within [0, size), divided at multiples of `side`."""
     first, last = max(first, 0), min(last, size)
     edges = [first, *range((first // side + 1) * side, last, side), last]
     return list(pairwise(edges)) if first < last else []
 
 
 def decode_chunk(jpeg: NDArray[np.uint8], mask: NDArray[np.uint8], shape: tuple[int, int]) -> Chunk:
-    """A chunk of `shape` from the bytes of its JPEG and of its mask, empty where all is valid.
+    """A chunk of `shape` from the bytes of its JPEG and of its mask (empty if all is valid).
 
-    Raises `MapFileError` where they are anything else.
+    Raises `MapFileError` if they are invalid.
     """
     grey = _decode_grey(jpeg, shape)
     valid = _decode_mask(mask, shape) if mask.size else None
@@ -222,7 +219,7 @@ def _decode_grey(jpeg: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.
 
 
 def jpeg_frame(data: bytes) -> tuple[int, int, int, int] | None:
-    """Bits, rows, columns and channels that a baseline JPEG declares; None if it is none."""
+    """Bits, rows, columns and channels declared by a baseline JPEG; None for other data."""
     if not (data.startswith(_SOI) and data.endswith(_EOI)):
         return None
     at = len(_SOI)
@@ -238,8 +235,7 @@ def jpeg_frame(data: bytes) -> tuple[int, int, int, int] | None:
 
 
 def preview(opened: MapFile) -> NDArray[np.uint8]:
-    """The small grey picture (rows, cols) of the first sheet; raises `MapFileError` where it is
-    none."""
+    """The grey preview (rows, cols) of the first sheet. Raises `MapFileError` if it is invalid."""
     data = opened.array("sheet0/preview_jpeg", np.uint8, 1)
     found = jpeg_frame(data.tobytes())
     small = found is not None and max(found[1:3]) <= MAX_PREVIEW_PX
@@ -258,13 +254,13 @@ def _decode_mask(mask: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.
     except zlib.error as error:
         raise MapFileError(f"mask cannot be decompressed ({error})") from error
     if len(packed) != expected or not stream.eof or stream.unused_data:
-        raise MapFileError(f"mask is not {expected} bytes")
+        raise MapFileError(f"mask must have {expected} bytes")
     bits = np.unpackbits(np.frombuffer(packed, dtype=np.uint8), count=size)
     return bits.reshape(shape).astype(np.bool_)
 
 
 class _Blobs:
-    """Runs of bytes in one part, where each begins and ends in another."""
+    """Byte strings concatenated in one part, with their offsets in another."""
 
     def __init__(self, opened: MapFile, data: str, offsets: str, count: int) -> None:
         self._data: NDArray[np.uint8] = opened.array(data, np.uint8, 1)
@@ -287,7 +283,7 @@ class _Blobs:
 
 
 class _Cache:
-    """Decoded chunks, the last used ones, up to a limit in bytes."""
+    """Least-recently-used cache of decoded chunks, limited in bytes."""
 
     def __init__(self, limit_bytes: int) -> None:
         self._limit = limit_bytes

@@ -1,7 +1,7 @@
-"""The manifest of a map: what it was made from and how, and what its parts must be.
+"""The manifest of a map: its sources, its recipe and a description of its parts.
 
-Version 1, see `docs/map-format.md`. Reading checks every value it will use, because a map may come
-from a stranger.
+Version 1, see `docs/map-format.md`. Every value is checked on reading, because a map is an
+untrusted file.
 """
 
 import hashlib
@@ -22,17 +22,17 @@ MAX_LEVELS = 10
 MIN_CHUNK_PX, MAX_CHUNK_PX = 16, 1024
 CODEC = "jpeg"
 MAX_DIGITS = 20
-"""More than any number in a map needs, and few enough for every one to be a float."""
+"""More digits than any number in a map needs, and few enough to fit a float."""
 MIN_HEADING_STEP_DEG = 0.5
-"""Finer than any method needs: every heading tried is a picture in memory."""
+"""Finer than any method needs; every heading tried takes an image in memory."""
 
 
 @dataclass(frozen=True)
 class GreyInfo:
     """The registration layer of a sheet: a grey pyramid in square chunks of `chunk_px`.
 
-    `quality` is that of its JPEGs (1 to 100, less for chunks of noise); `valid_px` the number of
-    pixels of the finest level that show imagery.
+    `chunk_px`: even, 16 to 1024. `levels`: 1 to 10. `quality`: JPEG quality, 1 to 100; chunks of
+    noise have less. `valid_px`: number of pixels of the finest level with imagery.
     """
 
     chunk_px: int
@@ -42,7 +42,7 @@ class GreyInfo:
 
     @property
     def raw_bytes(self) -> int:
-        """What the imagery would take as RGB without compression, at the working resolution."""
+        """Size of the imagery as uncompressed RGB at the working resolution."""
         return 3 * self.valid_px
 
     def to_plain(self) -> dict[str, Any]:
@@ -70,9 +70,10 @@ class GreyInfo:
 
 @dataclass(frozen=True)
 class SheetInfo:
-    """One sheet: its plane, its tile grid, how many tiles it has and the area they stand for.
+    """One sheet of a map.
 
-    `grey` describes its registration layer, None where it has none.
+    `frame`: its local plane. `grid`: its tile grid. `tiles`: number of tiles. `area_km2`: number of
+    tiles times stride squared. `grey`: its registration layer, None if it has none.
     """
 
     frame: LocalFrame
@@ -103,7 +104,7 @@ class SheetInfo:
 
     @classmethod
     def from_plain(cls, plain: Any) -> "SheetInfo":
-        """Inverse of `to_plain`; raises `MapFileError` on anything impossible."""
+        """Inverse of `to_plain`; raises `MapFileError` on impossible values."""
         raw = _get(plain, "grid", dict)
         grid = TileGrid(
             west_m=_number(raw, "west_m"),
@@ -134,13 +135,19 @@ class SheetInfo:
 
 @dataclass(frozen=True)
 class Manifest:
-    """All of a map that is not an array.
+    """Everything in a map except its arrays.
 
-    `recipe` names method, representation and their parameters; `imagery` the sources and dates;
-    `view` what a view must bring (`min_valid_share`, `heading_step_deg`); `confidence` the fitted
-    probability, None where there is none; `radius_m` the radius it speaks of; `registration` the
-    same for registered views (`confidence`, `radius_m`, `position_floor_px`), None where the map
-    has no registration layer; `parts` name to {dtype, shape, sha256}.
+    - `recipe`: method, representation and embedding with their parameters.
+    - `sheets`: one for maps that fly.
+    - `imagery`: source files with dates and resolutions.
+    - `view`: requirements on a view and errors of a fix (`heading_step_deg`, `min_valid_share`,
+      `position_std_m`).
+    - `confidence`: logistic regression of the probability of a correct fix, None if not fitted.
+    - `radius_m`: error below which a fix is correct.
+    - `created_by`: program and version.
+    - `registration`: the same for registered views (`confidence`, `radius_m`, `position_floor_px`),
+      None without a registration layer.
+    - `parts`: array name to {dtype, shape, sha256}; filled in by `write_map`.
     """
 
     recipe: dict[str, Any]
@@ -211,7 +218,7 @@ class Manifest:
 
 
 def _view(plain: Any) -> dict[str, Any]:
-    """What a view must bring, with headings that are not too many to be tried."""
+    """The validated `view` record; a fine heading step would exhaust memory."""
     view: dict[str, Any] = _get(plain, "view", dict)
     if not MIN_HEADING_STEP_DEG <= _number(view, "heading_step_deg") <= 360:
         raise MapFileError(

@@ -1,4 +1,4 @@
-"""Opening a map: checked whole before anything in it is used, then memory-mapped."""
+"""Opening a map: memory-mapped, and fully checked before any of it is used."""
 
 import hashlib
 import json
@@ -37,7 +37,7 @@ class MapFile:
     arrays: dict[str, NDArray[Any]]
 
     def array(self, name: str, dtype: type[np.generic], ndim: int) -> NDArray[Any]:
-        """The part `name`; raises `MapFileError` if it is missing or of another kind."""
+        """The part `name`; raises `MapFileError` if it is missing or has another type or shape."""
         found = self.arrays.get(name)
         if found is None or found.dtype != dtype or found.ndim != ndim:
             got = "nothing" if found is None else f"{found.dtype} of {found.ndim} dimensions"
@@ -52,7 +52,7 @@ def open_map(path: Path) -> MapFile:
     """Open a map and verify every checksum in it.
 
     The container is safetensors: eight bytes with the length of a JSON header, the header, raw
-    arrays. It is parsed here and not through the library because the arrays are to be mapped, not
+    arrays. It is parsed here, not with the library, because the arrays are mapped instead of
     copied, and because every length is checked against the file before it is used.
     Raises `MissingFileError`, `MapFileError`, or `MapVersionError`.
     """
@@ -68,7 +68,7 @@ def open_map(path: Path) -> MapFile:
         arrays = _arrays(mapped, size, start, header, manifest)
     except MapFileError as error:
         raise type(error)(f"{error}: {path}") from error
-    except (OverflowError, RecursionError) as error:  # crafted: numbers or nesting beyond reason
+    except (OverflowError, RecursionError) as error:  # crafted: excessive numbers or nesting
         raise MapFileError(f"map is damaged ({error}): {path}") from error
     return MapFile(path, size, manifest, arrays)
 
@@ -103,13 +103,13 @@ def _arrays(
     mapped: mmap.mmap, size: int, start: int, header: dict[str, Any], manifest: Manifest
 ) -> dict[str, NDArray[Any]]:
     if set(header) != set(manifest.parts):
-        raise MapFileError("map was altered (its parts are not those of the manifest)")
+        raise MapFileError("map was altered (its parts differ from the manifest)")
     arrays: dict[str, NDArray[Any]] = {}
     covered = start
     for name, entry in sorted(header.items(), key=lambda item: _offsets(item[1])):
         first, last = _offsets(entry)
         if start + first != covered:
-            raise MapFileError(f"map is damaged (part {name} is not where it should be)")
+            raise MapFileError(f"map is damaged (part {name} has a wrong offset)")
         if start + last > size:
             raise MapFileError(f"map is truncated ({size} of {start + last} bytes or more)")
         arrays[name] = _array(mapped, start + first, last - first, name, entry, manifest)
@@ -144,7 +144,7 @@ def _array(
     same = isinstance(described, dict) and described.get("dtype") == np.dtype(dtype).name
     same = same and described.get("shape") == shape
     if not same or min(shape, default=0) < 0 or count * np.dtype(dtype).itemsize != length:
-        raise MapFileError(f"map was altered (part {name} is not as the manifest says)")
+        raise MapFileError(f"map was altered (part {name} differs from the manifest)")
     view = memoryview(mapped)[first : first + length]
     if hashlib.sha256(view).hexdigest() != described.get("sha256"):
         raise MapFileError(f"map was altered (checksum of part {name} does not match)")

@@ -1,4 +1,4 @@
-"""Signatures of maps: who made this map, and is it still as they made it.
+"""Signatures of maps: authenticity and integrity.
 
 A detached Ed25519 signature, `MAP.onav.sig`, of the digest of the manifest, which holds the
 SHA-256 of every part. `open_map` checks all of them whenever it opens a map, so signing the
@@ -16,7 +16,8 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.errors import MapFileError, MissingExtraError, MissingFileError, OutputError
+from orthonav.errors import MapFileError, MissingFileError, OutputError
+from orthonav.extras import missing_extra
 from orthonav.files import replacing, require_file, write_text
 from orthonav.mapfile.manifest import MAX_MANIFEST_BYTES, Manifest
 from orthonav.mapfile.reader import MAX_HEADER_BYTES, MIN_FILE_BYTES
@@ -35,17 +36,17 @@ MAX_SIGNATURE_BYTES = 4096
 MAX_KEY_BYTES = 4096
 PRIVATE_NAME, PUBLIC_NAME = "private.pem", "public.pem"
 _SIGNED = b"orthonav map, schema 1, manifest sha256 "
-"""Goes before the digest in what is signed, so that no signature of anything else fits."""
+"""Prefix of the signed digest; domain separation from other signatures."""
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 def signature_path(path: Path) -> Path:
-    """Where the signature of a map lies: beside it, with `.sig` after its name."""
+    """Path of the signature of a map: the same folder, with `.sig` appended."""
     return Path(path).with_name(Path(path).name + ".sig")
 
 
 def map_digest(path: Path) -> str:
-    """SHA-256 (hex) of the manifest of a map: it tells maps apart, reading the header only.
+    """SHA-256 (hex) of the manifest of a map; identifies a map by reading its header only.
 
     Raises `MissingFileError`, `MapFileError` or `MapVersionError`.
     """
@@ -71,20 +72,20 @@ def map_digest(path: Path) -> str:
 
 
 def map_info(path: Path) -> dict[str, Any]:
-    """What a flight log says of the map it was flown with: `name` and `manifest_sha256`."""
+    """Identification of a map in a flight log: `name` and `manifest_sha256`."""
     return {"name": Path(path).name, "manifest_sha256": map_digest(path)}
 
 
 def new_key(folder: Path) -> str:
-    """Write a new pair, `private.pem` (readable by its owner only) and `public.pem`; its id.
+    """Write a new key pair, `private.pem` (mode 0600) and `public.pem`; returns its id.
 
-    Raises `OutputError` where either is there already, and `MissingExtraError`.
+    Raises `OutputError` if either file exists, and `MissingExtraError`.
     """
     _, serialization, ed25519 = _crypto()
     folder = Path(folder)
     private_path, public_path = folder / PRIVATE_NAME, folder / PUBLIC_NAME
     if private_path.exists() or public_path.exists():
-        raise OutputError(f"a key is there already and is not written over: {folder}")
+        raise OutputError(f"folder holds a key already; name another folder: {folder}")
     private = ed25519.Ed25519PrivateKey.generate()
     pem = private.private_bytes(
         serialization.Encoding.PEM,
@@ -111,14 +112,14 @@ def new_key(folder: Path) -> str:
 
 
 def key_id(public: "Ed25519PublicKey") -> str:
-    """Short name of a key: the first 16 hexadecimal digits of the SHA-256 of its 32 bytes."""
+    """Short id of a key: the first 16 hexadecimal digits of the SHA-256 of its 32 bytes."""
     return hashlib.sha256(public.public_bytes_raw()).hexdigest()[:16]
 
 
 def sign_map(path: Path, key: Path) -> Path:
-    """Sign a map with a private key (PEM); the path of the signature that was written.
+    """Sign a map with a private key (PEM); returns the path of the signature.
 
-    The whole map is checked before. Raises `MissingFileError`, `MapFileError`, `OutputError` or
+    The map is fully checked first. Raises `MissingFileError`, `MapFileError`, `OutputError` or
     `MissingExtraError`.
     """
     from orthonav.mapfile.reader import open_map
@@ -141,11 +142,11 @@ def sign_map(path: Path, key: Path) -> Path:
 
 
 def require_signature(path: Path, public_key: Path) -> str:
-    """Check that a map was signed with a key (PEM); the digest of its manifest.
+    """Check that a map was signed with a key (PEM); returns the digest of its manifest.
 
-    `open_map` then holds the parts against that manifest. Raises `MapFileError` of one line where
-    the signature is missing, broken, by another key or of another map, `MissingFileError` where
-    map or key are, and `MissingExtraError`.
+    `open_map` then compares the parts with that manifest. Raises `MapFileError` if the signature is
+    missing, broken, by another key or of another map, `MissingFileError` if the map or the key is
+    missing, and `MissingExtraError`.
     """
     invalid, _, _ = _crypto()
     public = _public_key(public_key)
@@ -153,7 +154,7 @@ def require_signature(path: Path, public_key: Path) -> str:
     plain = _signature(path)
     stated, known = plain["key_id"], key_id(public)
     if stated != known:
-        raise MapFileError(f"map is signed with key {stated}, required is {known}: {path}")
+        raise MapFileError(f"map is signed with key {stated}, expected key {known}: {path}")
     if plain["manifest_sha256"] != digest:
         raise MapFileError(f"signature is of another map, or the map was altered: {path}")
     try:
@@ -165,7 +166,7 @@ def require_signature(path: Path, public_key: Path) -> str:
 
 
 def _signature(path: Path) -> dict[str, str]:
-    """What a signature file says, all of it text of the right form."""
+    """The validated fields of a signature file."""
     file = signature_path(path)
     if not file.is_file():
         raise MapFileError(f"map is not signed, there is no {file.name}: {path}")
@@ -177,7 +178,7 @@ def _signature(path: Path) -> dict[str, str]:
         plain = json.loads(data)
         schema = plain["schema"]
         if plain["format"] != FORMAT or type(schema) is not int or schema < 1:
-            raise ValueError("it is none")
+            raise ValueError("not an orthonav signature")
         if schema > SCHEMA or plain["algorithm"] != ALGORITHM:
             raise ValueError(
                 f"schema {schema}, algorithm {plain['algorithm']!r:.20}; update orthonav"
@@ -185,12 +186,12 @@ def _signature(path: Path) -> dict[str, str]:
         found = {name: plain[name] for name in ("key_id", "manifest_sha256", "signature")}
         texts = all(isinstance(value, str) and value.isascii() for value in found.values())
         if not texts or not re.fullmatch(r"[0-9a-f]{16}", found["key_id"]):
-            raise ValueError("its fields are not what they should be")
+            raise ValueError("a field is invalid")
         if not _DIGEST.fullmatch(found["manifest_sha256"]):
-            raise ValueError("its digest is none")
+            raise ValueError("its digest is invalid")
     except (ValueError, KeyError, TypeError, RecursionError, OSError) as error:
-        told = " ".join(str(error).split())[:120]
-        raise MapFileError(f"signature of the map is broken ({told}): {file}") from error
+        reason = " ".join(str(error).split())[:120]
+        raise MapFileError(f"signature of the map is broken ({reason}): {file}") from error
     return found
 
 
@@ -199,7 +200,7 @@ def _private_key(path: Path) -> "Ed25519PrivateKey":
     data = _key_bytes(path, "private key")
     try:
         key = serialization.load_pem_private_key(data, password=None)
-    except TypeError as error:  # what the library says of a key with a passphrase
+    except TypeError as error:  # raised for a key with a passphrase
         raise MapFileError(f"private key has a passphrase; give one without: {path}") from error
     except Exception as error:
         raise MapFileError(f"not a private key in PEM: {path}") from error
@@ -238,7 +239,5 @@ def _crypto() -> tuple[Any, Any, Any]:
         from cryptography.hazmat.primitives import serialization
         from cryptography.hazmat.primitives.asymmetric import ed25519
     except ImportError as error:
-        raise MissingExtraError(
-            f"signatures need cryptography: pip install 'orthonav[signing]' ({error})"
-        ) from error
+        raise missing_extra("a signature", "signing", "cryptography", error) from error
     return InvalidSignature, serialization, ed25519

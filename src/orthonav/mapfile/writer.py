@@ -1,4 +1,4 @@
-"""Writing a map: one safetensors file, whole or not at all, the same bytes every time."""
+"""Writing a map: one safetensors file, complete or not at all, deterministic to the byte."""
 
 import dataclasses
 import errno
@@ -22,7 +22,7 @@ METADATA_KEY = "orthonav"
 def write_map(path: Path, manifest: Manifest, arrays: Mapping[str, NDArray[Any]]) -> Manifest:
     """Write `arrays` and `manifest` to `path`; returns the manifest with its `parts` filled in.
 
-    Raises `OutputError` where it cannot be written; then nothing is left behind.
+    Raises `OutputError` if it cannot be written; then nothing is left behind.
     """
     parts = {name: np.ascontiguousarray(array) for name, array in sorted(arrays.items())}
     described = {

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from torch import nn
 
 from orthonav.embed.network import AutoEncoderRecipe, NetworkEmbedder, TripletRecipe
-from orthonav.errors import MissingExtraError, OrthonavError
+from orthonav.errors import OrthonavError
+from orthonav.extras import needed
 from orthonav.neural.triplet import BasicBlock, ResNet34
 
 OPSET, IR_VERSION = 17, 8
@@ -197,14 +198,7 @@ class _Graph:
     """An ONNX graph that grows at its end; every method gives the name of the value it adds."""
 
     def __init__(self) -> None:
-        try:
-            import onnx
-        except ImportError as error:
-            raise MissingExtraError(
-                "exporting an encoder needs onnx, which is not installed: "
-                "pip install 'orthonav[train]'"
-            ) from error
-        self._onnx = onnx
+        self._onnx = needed("onnx", "train", "exporting an encoder")
         self._nodes: list[Any] = []
         self._weights: list[Any] = []
 

@@ -21,7 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MissingExtraError, VariantError
+from orthonav.errors import VariantError
+from orthonav.extras import missing_extra
 from orthonav.neural.sam_cache import cache_folder, cached, keep
 from orthonav.neural.sam_weights import WHERE, network, weights_digest
 from orthonav.neural.superpoint import chosen_device, require_device, weights_stamp
@@ -29,9 +30,7 @@ from orthonav.neural.superpoint import chosen_device, require_device, weights_st
 try:
     import torch
 except ImportError as error:  # pragma: no cover - depends on the installation
-    raise MissingExtraError(
-        "neural networks need PyTorch, which is not installed: pip install 'orthonav[train]'"
-    ) from error
+    raise missing_extra("a neural network", "train", "torch", error) from error
 
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 CACHE_FORMAT = b"orthonav sam boundaries 1"

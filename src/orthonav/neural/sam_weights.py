@@ -12,15 +12,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from orthonav.errors import MissingExtraError, VariantError
+from orthonav.errors import VariantError
+from orthonav.extras import missing_extra
 from orthonav.neural.superpoint import pretrained, quiet, transformers
 
 try:
     import torch
 except ImportError as error:  # pragma: no cover - depends on the installation
-    raise MissingExtraError(
-        "neural networks need PyTorch, which is not installed: pip install 'orthonav[train]'"
-    ) from error
+    raise missing_extra("a neural network", "train", "torch", error) from error
 
 WHERE = (
     "the folder of facebook/sam-vit-base, -large or -huge (config.json and model.safetensors) from "

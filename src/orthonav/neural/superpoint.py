@@ -18,14 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 
-from orthonav.errors import MissingExtraError, MissingFileError, VariantError
+from orthonav.errors import MissingFileError, VariantError
+from orthonav.extras import missing_extra, needed
 
 try:
     import torch
 except ImportError as error:  # pragma: no cover - depends on the installation
-    raise MissingExtraError(
-        "neural networks need PyTorch, which is not installed: pip install 'orthonav[train]'"
-    ) from error
+    raise missing_extra("a neural network", "train", "torch", error) from error
 
 CELL_PX = 8
 DIMS = 256
@@ -152,12 +151,7 @@ def pretrained(folder: str, model_type: str, class_name: str) -> Any:
 
 def transformers() -> Any:
     """The library `transformers`; raises `MissingExtraError` without it."""
-    try:
-        return importlib.import_module("transformers")
-    except ImportError as error:
-        raise MissingExtraError(
-            "this network needs transformers, which is not installed: pip install 'orthonav[train]'"
-        ) from error
+    return needed("transformers", "train", "a neural network")
 
 
 @contextmanager

@@ -14,7 +14,7 @@ are those of a process's own part.
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from torch import Tensor, distributed, nn
 
 from orthonav.embed.network import AutoEncoderRecipe, NetworkEmbedder
+from orthonav.files import Progress
 from orthonav.neural.autoencoder import Reconstruction
 from orthonav.neural.checkpoints import Recipe, State, Store, fingerprint
 from orthonav.neural.export import export_encoder
@@ -47,8 +48,6 @@ log = logging.getLogger(__name__)
 CALIBRATION_TILES, HELD_OUT_TILES = 64, 32
 SETTLING_BATCHES = 32
 PROGRESS_EVERY_S = 2.0
-
-Report = Callable[[str, float], None]
 
 
 class Task(Protocol):
@@ -81,7 +80,7 @@ def learn_network(
     seed: int,
     work: Path | None,
     positive: Positive | Sequence[SheetTiles] | None = None,
-    report: Report | None = None,
+    report: Progress | None = None,
     means: Means | None = None,
 ) -> NetworkEmbedder:
     """Learn an encoder from reference tiles and give what flies, checked against what was learnt.
@@ -115,7 +114,7 @@ def learn_network(
 
 
 def _exported(
-    encoder: nn.Module, recipe: Recipe, tiles: SheetTiles, told: Report
+    encoder: nn.Module, recipe: Recipe, tiles: SheetTiles, told: Progress
 ) -> NetworkEmbedder:
     """What flies, in the recipe's precision where tiles of the map say that it is good enough."""
     told("export", 1.0)
@@ -162,7 +161,7 @@ def train(
     *,
     seed: int,
     work: Path | None,
-    report: Report,
+    report: Progress,
     means: Means,
     world: World,
     dates: Sequence[SheetTiles] = (),
@@ -208,7 +207,7 @@ class _Pauses:
         tiles: SheetTiles,
         epochs: int,
         batches: int,
-        report: Report,
+        report: Progress,
         writer: Store | None,
     ) -> None:
         self._state, self._tiles = state, tiles

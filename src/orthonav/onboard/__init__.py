@@ -1,1 +1,1 @@
-"""On board: running the localizer over views as they come, live or from a recorded flight."""
+"""On board: locating the views of a flight, live or recorded."""

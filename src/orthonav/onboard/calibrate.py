@@ -1,4 +1,4 @@
-"""What is wrong with what a flight tells all along, from the track of that flight."""
+"""Constant errors of reported heading, height and tilt, estimated from the track of a flight."""
 
 import math
 from collections.abc import Sequence
@@ -15,10 +15,12 @@ from orthonav.track import Model
 
 MIN_VIEWS = 5
 MOVED_DEG, MOVED_SIGMAS = 2.0, 3.0
-"""A mount that differs by more than both from what it is in the end has moved meanwhile."""
+"""A tilt that differs by more than both from that at the end shows that the camera moved."""
 MAD_TO_STD = 1.4826
+"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
 LEAST_TILT_DEG = 0.1
 STD_FLOOR = {"heading_deg": 0.2, "log_scale": 0.003, "pitch_deg": 0.3, "roll_deg": 0.3}
+"""Lower bounds of the standard deviations of the estimated biases."""
 _LASTING = ("pitch_deg", "roll_deg")
 _EVIDENCE = {
     "heading_deg": "heading_bias_deg",
@@ -30,8 +32,13 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Calibration:
-    """A mount, the frames of its first and last view, and whether it had moved before those."""
+class MountCalibration:
+    """A mount calibration.
+
+    `mount`: estimated biases.
+    `first`, `last`: frames of the first and the last view used.
+    `moved`: whether the camera moved in its mount before `first`.
+    """
 
     mount: Mount
     first: str
@@ -39,32 +46,32 @@ class Calibration:
     moved: bool
 
 
-def calibrated(results: Sequence[ViewResult]) -> Calibration:
-    """The mount at the end of a flight that was tracked, from its confident views.
+def calibrate_mount(results: Sequence[ViewResult]) -> MountCalibration:
+    """Mount at the end of a tracked flight, estimated from its confident views.
 
-    Views before the camera moved in its mount are left out. Medians are taken, so that single
-    views do not matter; their standard deviation counts views that err alike as fewer.
-    Raises `FlightError` where fewer than `MIN_VIEWS` views are confident.
+    Views before a movement of the camera in its mount are excluded. Biases are medians; their
+    standard deviations account for the correlation of successive views. Raises `FlightError` where
+    fewer than `MIN_VIEWS` views are confident.
     """
-    sure = [each for each in results if _is_confident(each)]
-    if len(sure) < MIN_VIEWS:
+    confident = [each for each in results if _is_confident(each)]
+    if len(confident) < MIN_VIEWS:
         raise FlightError(
-            f"{len(sure)} of {len(results)} views have a confidence of {CONFIDENT}; a calibration "
-            f"needs {MIN_VIEWS}: is it the right map, camera and height?"
+            f"{len(confident)} of {len(results)} views have a confidence of {CONFIDENT} or more; a "
+            f"calibration needs {MIN_VIEWS}: check the map, the camera and the reported height"
         )
-    values = {name: _column(sure, key) for name, key in _EVIDENCE.items()}
+    values = {name: _column(confident, key) for name, key in _EVIDENCE.items()}
     spreads = {
-        name: _column(sure, key.replace("bias", "bias_std")) for name, key in _EVIDENCE.items()
+        name: _column(confident, key.replace("bias", "bias_std")) for name, key in _EVIDENCE.items()
     }
     begin = max(_still_from(values[name], spreads[name]) for name in ("pitch_deg", "roll_deg"))
-    begin = min(begin, len(sure) - MIN_VIEWS)
-    kept = slice(begin, None)
+    begin = min(begin, len(confident) - MIN_VIEWS)
+    used = slice(begin, None)
     biases = {
-        name: _bias(values[name][kept], spreads[name][kept], STD_FLOOR[name], name in _LASTING)
+        name: _bias(values[name][used], spreads[name][used], STD_FLOOR[name], name in _LASTING)
         for name in _EVIDENCE
     }
-    mount = Mount(**biases, views=len(sure) - begin)
-    return Calibration(mount, sure[begin].frame, sure[-1].frame, begin > 0)
+    mount = Mount(**biases, views=len(confident) - begin)
+    return MountCalibration(mount, confident[begin].frame, confident[-1].frame, begin > 0)
 
 
 def _is_confident(result: ViewResult) -> bool:
@@ -72,22 +79,22 @@ def _is_confident(result: ViewResult) -> bool:
     return isinstance(fix, Fix) and fix.confidence >= CONFIDENT and "pitch_bias_deg" in fix.evidence
 
 
-def _column(sure: Sequence[ViewResult], key: str) -> Array:
-    return np.array([each.outcome.evidence[key] for each in sure])
+def _column(confident: Sequence[ViewResult], key: str) -> Array:
+    return np.array([each.outcome.evidence[key] for each in confident])
 
 
 def _still_from(values: Array, spreads: Array) -> int:
-    """The first of the last views between which a value hardly changes."""
+    """Index of the first view from which on a value stays close to that at the end."""
     end = float(np.median(values[-MIN_VIEWS:]))
     far = np.abs(values - end) > np.maximum(MOVED_SIGMAS * spreads, MOVED_DEG)
     return int(np.flatnonzero(far)[-1]) + 1 if far.any() else 0
 
 
 def _bias(values: Array, spreads: Array, floor: float, lasting: bool) -> Bias:
-    """Median, how well it is known, and the scatter around it.
+    """Median, its standard deviation, and the scatter around it.
 
-    What is `lasting` in the track is known as well as the track knew it; what scatters from view to
-    view, as well as the mean of so many views, fewer where neighbours err alike.
+    The standard deviation of a `lasting` bias is that of the track. Otherwise it is that of the
+    mean of the views, their number reduced by the autocorrelation at lag one.
     """
     middle = float(np.median(values))
     off = values - middle
@@ -102,8 +109,8 @@ def _bias(values: Array, spreads: Array, floor: float, lasting: bool) -> Bias:
 
 
 def model_of(mount: Mount) -> Model:
-    """The model of a flight whose told values are corrected by a mount: no better known than that,
-    and not off by something else."""
+    """Model of a flight whose telemetry is corrected by a mount: the biases that remain have the
+    standard deviations of the calibration."""
     heading, tilt = mount.heading_deg, max(mount.pitch_deg.std, mount.roll_deg.std)
     tilt_rad = math.radians(max(tilt, LEAST_TILT_DEG))
     return replace(
@@ -115,11 +122,8 @@ def model_of(mount: Mount) -> Model:
 
 
 @dataclass(frozen=True)
-class Mounted:
-    """A locator that is told everything corrected by a mount.
-
-    What its fixes call wrong with what is told is what is left.
-    """
+class MountCorrected:
+    """A locator whose telemetry is corrected by a mount; its fixes report the remaining biases."""
 
     locator: Locator
     mount: Mount

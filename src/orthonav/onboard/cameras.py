@@ -1,10 +1,11 @@
-"""Pictures as a camera takes them: devices, streams, and recordings at their own pace.
+"""Images of live cameras (devices and streams) and of recordings played in real time.
 
-A thread reads; who asks gets the newest picture, and what came between is counted. A picture knows
-when it was exposed, by our monotonic clock, until the message that is made of it.
+A thread reads; the consumer gets the newest image, and replaced images are counted. Every image
+carries its time of exposure by our monotonic clock.
 """
 
 import logging
+import math
 import threading
 import zlib
 from collections.abc import Callable, Iterator
@@ -18,26 +19,35 @@ from numpy.typing import NDArray
 
 from orthonav.errors import CameraError, FlightError, MissingFileError
 from orthonav.flight import decode_image, open_flight
-from orthonav.onboard.telemetry import Clocks
+from orthonav.onboard.telemetry import Clocks, VehicleState
 from orthonav.records import NoFix, Telemetry
 
 log = logging.getLogger(__name__)
 RETRY_S = (0.5, 1.0, 2.0, 5.0)
 STREAMS = ("rtsp://", "rtsps://", "http://", "https://", "udp://", "tcp://")
-PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 FROZEN_LEVELS = 0.25
-"""Pictures that differ by less than this on average are one: noise alone is four times as much."""
+"""Mean difference in grey levels below which two images are the same: noise alone is four times
+as large."""
 FROZEN_SIDE_PX = 64
+FOLDER_RATE_HZ = 2.0
+"""Rate at which a folder of images without times is played."""
 _OPEN_MS, _READ_MS = 5000.0, 3000.0
 Grey = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """One picture: `grey` (H, W), or `problem` where it could not be decoded.
+class CameraImage:
+    """One image with its time of exposure.
 
-    `exposed_ns` is the exposure by our monotonic clock; `time_ns` what is written of it: UTC of a
-    live camera, the recording's own time else. `told` is what a recording knew of it.
+    `number`: counts up from 1.
+    `frame`: name of the image in logs and results.
+    `exposed_ns`: time of exposure by our monotonic clock.
+    `time_ns`: time written to results: UTC of a live camera, else the time of the recording.
+    `grey`: grey levels (H, W), None where the image could not be decoded.
+    `problem`: reason why it could not be decoded.
+    `telemetry`: telemetry that came with the image, from a recording or from ROS.
+    `vehicle`: state of the aircraft that `telemetry` was made of, from ROS.
     """
 
     number: int
@@ -46,28 +56,29 @@ class Picture:
     time_ns: int
     grey: Grey | None
     problem: NoFix | None = None
-    told: Telemetry | None = None
+    telemetry: Telemetry | None = None
+    vehicle: VehicleState | None = None
 
 
 class CameraGoneError(CameraError):
-    """A live camera cannot be opened, or gives no more pictures; it may come back."""
+    """A live camera cannot be opened or delivers no more images; it may come back."""
 
 
-class Source(Protocol):
-    """Where pictures come from."""
+class ImageSource(Protocol):
+    """A source of images."""
 
-    def read(self) -> Picture | None:
-        """The next one, as soon as it is there; None at the end, or where it was stopped.
+    def read(self) -> CameraImage | None:
+        """Wait for the next image; None at the end, or when stopped.
 
-        Raises `CameraGoneError`: ask again later.
+        Raises `CameraGoneError` where the camera is gone for now: call again later.
         """
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Release the device."""
 
 
 class LiveCamera:
-    """A device or stream through OpenCV. Exposure is arrival less a latency that was measured."""
+    """A device or stream, read by OpenCV. Exposure is the time of arrival minus `latency_s`."""
 
     def __init__(
         self,
@@ -83,22 +94,22 @@ class LiveCamera:
         self._opener = capture or _capture
         self._capture: Any = None
         self._number = 0
-        # UTC may be set while we fly; what is written of views must not jump with it.
+        # UTC may be set in flight; the times of views must not jump with it.
         self._utc_minus_mono_ns = clocks.utc_ns() - clocks.mono_ns()
 
-    def read(self) -> Picture | None:
-        """See `Source.read`."""
-        if self._capture is None:
+    def read(self) -> CameraImage | None:
+        """See `ImageSource.read`."""
+        if self._capture is None:  # first image, or after the camera was gone
             self._capture = self._open()
         if not self._capture.grab():
             self.close()
-            raise CameraGoneError(f"camera gives no pictures: {self._name}")
+            raise CameraGoneError(f"camera delivers no images: {self._name}")
         exposed_ns = self._clocks.mono_ns() - self._latency_ns
         found, frame = self._capture.retrieve()
         self._number += 1
         grey = _grey(frame) if found else None
-        problem = None if grey is not None else NoFix("bad_image", "picture could not be decoded")
-        return Picture(
+        problem = None if grey is not None else NoFix("bad_image", "image could not be decoded")
+        return CameraImage(
             self._number,
             f"{self._number:08d}",
             exposed_ns,
@@ -108,7 +119,7 @@ class LiveCamera:
         )
 
     def close(self) -> None:
-        """See `Source.close`."""
+        """See `ImageSource.close`."""
         if self._capture is not None:
             self._capture.release()
             self._capture = None
@@ -125,24 +136,24 @@ class LiveCamera:
         return capture
 
 
-class Recorded:
-    """Pictures of a recording, each at its time."""
+class Playback:
+    """Images of a recording, each at its time."""
 
     def __init__(
         self,
-        entries: Iterator["Entry"],
+        images: Iterator["RecordedImage"],
         due_ns: Callable[[int], int | None],
         clocks: Clocks,
         stopped: Callable[[], bool],
     ) -> None:
-        """`due_ns` says when, by our clock, a time of the recording comes; None: not yet known."""
-        self._entries, self._due_ns = entries, due_ns
+        """`due_ns` converts a time of the recording to our clock; None: not known yet."""
+        self._images, self._due_ns = images, due_ns
         self._clocks, self._stopped = clocks, stopped
         self._number = 0
 
-    def read(self) -> Picture | None:
-        """See `Source.read`."""
-        entry = next(self._entries, None)
+    def read(self) -> CameraImage | None:
+        """See `ImageSource.read`."""
+        entry = next(self._images, None)
         if entry is None:
             return None
         while not self._stopped():
@@ -154,9 +165,9 @@ class Recorded:
         return None
 
     def close(self) -> None:
-        """See `Source.close`."""
+        """See `ImageSource.close`."""
 
-    def _picture(self, entry: "Entry", due_ns: int) -> Picture:
+    def _picture(self, entry: "RecordedImage", due_ns: int) -> CameraImage:
         self._number += 1
         grey, problem = None, None
         try:
@@ -164,15 +175,15 @@ class Recorded:
         except FlightError as error:
             problem = NoFix("bad_image", str(error))
         except OSError as error:
-            problem = NoFix("bad_image", f"picture cannot be read ({error})")
-        return Picture(
+            problem = NoFix("bad_image", f"image cannot be read ({error})")
+        return CameraImage(
             self._number, entry.frame, due_ns, entry.time_ns, grey, problem, entry.telemetry
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Entry:
-    """One picture of a recording before it is decoded."""
+class RecordedImage:
+    """An image of a recording; `load` decodes it."""
 
     frame: str
     time_ns: int
@@ -181,10 +192,7 @@ class Entry:
 
 
 def own_pace(clocks: Clocks, pace: float) -> Callable[[int], int]:
-    """Times of a recording by our clock: its first picture comes now, the others as they did.
-
-    `pace` is how much faster.
-    """
+    """Playback at `pace` times real time that starts now with the first image."""
     begin: list[int] = []
 
     def due_ns(time_ns: int) -> int:
@@ -198,8 +206,10 @@ def own_pace(clocks: Clocks, pace: float) -> Callable[[int], int]:
 def autopilot_pace(
     boot_ns: Callable[[int], int | None], clocks: Clocks, pace: float
 ) -> Callable[[int], int | None]:
-    """The same where times of the recording are those of the autopilot's clock, as a simulation
-    has them. `boot_ns` takes our clock to the autopilot's, None while that is not known."""
+    """Playback of a recording whose times are those of the autopilot's clock, as in a simulation.
+
+    `boot_ns` converts our clock to the autopilot's; it returns None while the offset is unknown.
+    """
 
     def due_ns(time_ns: int) -> int | None:
         now_ns = clocks.mono_ns()
@@ -210,51 +220,62 @@ def autopilot_pace(
 
 
 def is_live(name: str) -> bool:
-    """Whether this names a device or a stream, and not a recording."""
+    """Whether `name` is a device or a stream, not a recording."""
     return name.isdigit() or name.startswith(("/dev/", *STREAMS))
 
 
 def live_name(name: str) -> int | str:
-    """The name as OpenCV wants it: a number for a V4L2 device."""
+    """Name as OpenCV expects it: a number for a V4L2 device."""
     tail = name.removeprefix("/dev/video")
     return int(tail) if tail.isdigit() else name
 
 
-def recorded_entries(path: Path, rate_hz: float) -> Iterator[Entry]:
-    """The pictures of a flight folder (its own times), a folder of images (`rate_hz`, by name), or
-    a video. Raises `FlightError` or `MissingFileError` at once where it is none of them."""
+def recorded_images(path: Path, rate_hz: float | None) -> Iterator[RecordedImage]:
+    """Images of a flight folder (at its own times), a folder of images (by name) or a video.
+
+    `rate_hz`: views per second; by default every frame of a video and `FOLDER_RATE_HZ` of a folder.
+    Raises `FlightError` or `MissingFileError` at once where `path` is none of these.
+    """
     if (path / "telemetry.csv").is_file():
         views = open_flight(path).views
-        return iter([Entry(v.frame, v.telemetry.time_ns, v.grey, v.telemetry) for v in views])
+        return iter(
+            [RecordedImage(v.frame, v.telemetry.time_ns, v.grey, v.telemetry) for v in views]
+        )
     if path.is_dir():
-        return _images(path, rate_hz)
+        return _images(path, rate_hz or FOLDER_RATE_HZ)
     if not path.is_file():
         raise MissingFileError(f"no such camera, stream, folder or file: {path}")
     capture = _capture(str(path.resolve()))
     if not capture.isOpened():
         raise FlightError(f"video cannot be opened: cut short, or not a video: {path}")
-    return _video(capture)
+    return _video(capture, rate_hz or math.inf)
 
 
-def _images(folder: Path, rate_hz: float) -> Iterator[Entry]:
-    paths = sorted(each for each in folder.iterdir() if each.suffix.lower() in PICTURES)
+def _images(folder: Path, rate_hz: float) -> Iterator[RecordedImage]:
+    paths = sorted(each for each in folder.iterdir() if each.suffix.lower() in SUFFIXES)
     if not paths:
-        raise FlightError(f"folder holds no pictures ({', '.join(PICTURES)}): {folder}")
+        raise FlightError(f"no images ({', '.join(SUFFIXES)}) in the folder: {folder}")
 
     def loader(path: Path) -> Callable[[], Grey]:
         return lambda: decode_image(path.read_bytes(), str(path))
 
-    return iter([Entry(p.name, round(i / rate_hz * 1e9), loader(p)) for i, p in enumerate(paths)])
+    return iter(
+        [RecordedImage(p.name, round(i / rate_hz * 1e9), loader(p)) for i, p in enumerate(paths)]
+    )
 
 
-def _video(capture: Any) -> Iterator[Entry]:
-    number = 0
+def _video(capture: Any, rate_hz: float) -> Iterator[RecordedImage]:
+    number = due = 0
     try:
         while capture.grab():
             time_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+            if math.isfinite(rate_hz):  # the same frames as `orthonav.sources.video` takes
+                if time_ns < due / rate_hz * 1e9 - 1:
+                    continue
+                due = math.floor(time_ns / 1e9 * rate_hz + 1e-6) + 1
             found, frame = capture.retrieve()
             grey = _grey(frame) if found else None
-            yield Entry(f"{number:06d}", time_ns, _loaded(grey, number))
+            yield RecordedImage(f"{number:06d}", time_ns, _loaded(grey, number))
             number += 1
     finally:
         capture.release()
@@ -283,54 +304,57 @@ def _capture(name: int | str) -> Any:
     return capture
 
 
-class Newest:
-    """The newest picture between the thread that reads and the one that asks."""
+class NewestImage:
+    """Hands the newest image from the reading thread to the consumer."""
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
-        self._picture: Picture | None = None
+        self._picture: CameraImage | None = None
         self.taken = self.replaced = self.outages = 0
         self.ended = False
 
-    def put(self, picture: Picture) -> None:
-        """A picture came; one that nobody asked for is dropped and counted."""
+    def put(self, image: CameraImage) -> None:
+        """Store a new image; one that was not taken is replaced and counted."""
         with self._condition:
             self.replaced += self._picture is not None
             self.taken += 1
-            self._picture = picture
+            self._picture = image
             self._condition.notify()
 
     def end(self) -> None:
-        """No more pictures will come."""
+        """Signal that no more images will come."""
         with self._condition:
             self.ended = True
             self._condition.notify()
 
-    def take(self, timeout_s: float) -> Picture | None:
-        """The newest picture, once; None where none came in time."""
+    def take(self, timeout_s: float) -> CameraImage | None:
+        """Newest image, each at most once; None where none came within `timeout_s`."""
         with self._condition:
             if self._picture is None and not self.ended:
                 self._condition.wait(timeout_s)
-            picture, self._picture = self._picture, None
-            return picture
+            image, self._picture = self._picture, None
+            return image
 
     @property
     def is_over(self) -> bool:
-        """Whether the last picture of a recording was taken."""
+        """Whether the last image of a recording was taken."""
         with self._condition:
             return self.ended and self._picture is None
 
 
 def read_into(
-    newest: Newest, source: Source, stopped: Callable[[], bool], pause: Callable[[float], object]
+    newest: NewestImage,
+    source: ImageSource,
+    stopped: Callable[[], bool],
+    pause: Callable[[float], object],
 ) -> None:
-    """Read until the end or until stopped; a camera that is gone is asked again after a pause."""
+    """Read until the end or until stopped; where the camera is gone, retry after a pause."""
     failures = 0
     try:
         while not stopped():
             try:
-                picture = source.read()
-            except Exception as error:  # gone, or a driver with a fault: it may come back
+                image = source.read()
+            except Exception as error:  # unplugged, or a fault of the driver: it may come back
                 if failures == 0:
                     newest.outages += 1
                     expected = isinstance(error, CameraGoneError)
@@ -339,20 +363,20 @@ def read_into(
                 pause(RETRY_S[min(failures, len(RETRY_S) - 1)])
                 failures += 1
                 continue
-            if picture is None:
+            if image is None:
                 break
             failures = 0
-            newest.put(picture)
+            newest.put(image)
     finally:
         source.close()
         newest.end()
 
 
 class CameraThread:
-    """Reads a source into a `Newest` until it is stopped."""
+    """Reads a source into a `NewestImage` until it is stopped."""
 
-    def __init__(self, source: Source, stopping: threading.Event) -> None:
-        self.newest, self._stopping = Newest(), stopping
+    def __init__(self, source: ImageSource, stopping: threading.Event) -> None:
+        self.newest, self._stopping = NewestImage(), stopping
         arguments = self.newest, source, stopping.is_set, stopping.wait
         self._thread = threading.Thread(
             target=read_into, args=arguments, name="camera", daemon=True
@@ -360,13 +384,13 @@ class CameraThread:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop; a device that does not answer is left behind."""
+        """Stop; does not wait for a device that does not answer."""
         self._stopping.set()
         self._thread.join(2.0)
 
 
 class FrozenCheck:
-    """Tells pictures that are the one before again: a camera that hangs would look like a hover."""
+    """Detects repeated images: a camera that hangs would look like an aircraft that hovers."""
 
     def __init__(self) -> None:
         self._before: Grey | None = None
@@ -374,7 +398,7 @@ class FrozenCheck:
         self.repeats = 0
 
     def is_repeat(self, grey: Grey) -> bool:
-        """Whether this picture is the one before it, to the bit or nearly."""
+        """Whether this image equals the previous one, exactly or nearly."""
         step = max(1, min(grey.shape) // FROZEN_SIDE_PX)
         sample = np.ascontiguousarray(grey[step // 2 :: step, step // 2 :: step])
         total = zlib.crc32(sample.tobytes())

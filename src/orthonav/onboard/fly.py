@@ -1,7 +1,7 @@
-"""The runner beside an autopilot: newest picture, telemetry at its exposure, position, message.
+"""The loop of `orthonav fly`: newest image, telemetry at its exposure, position, messages.
 
-One loop on one thread; a camera thread and a link thread feed it. Views go through
-`orthonav.onboard.run.locate_view` like those of a recorded flight, so a log replays what flew.
+It runs on one thread, fed by a camera thread and a link thread. Views are located by
+`orthonav.onboard.run.locate_view`, as those of a recorded flight are, so a log can be replayed.
 """
 
 import logging
@@ -22,21 +22,21 @@ from orthonav.flight.mount import Mount
 from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_picture
 from orthonav.onboard import state as states
-from orthonav.onboard.cameras import FrozenCheck, Newest, Picture
+from orthonav.onboard.cameras import CameraImage, FrozenCheck, NewestImage
 from orthonav.onboard.health import (
+    EventCounter,
     Health,
+    HealthReporter,
     Notifier,
-    SecondLook,
     Snapshot,
-    Tally,
-    Teller,
+    TelemetryDiagnosis,
     judge,
-    offsets,
+    mismatch,
 )
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.run import Locator, locate_view
-from orthonav.onboard.telemetry import Clocks, Told
+from orthonav.onboard.telemetry import Clocks, VehicleState
 from orthonav.publish.estimate import error_ellipse
 from orthonav.publish.mavlink import dialect
 from orthonav.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View, ViewResult
@@ -45,64 +45,75 @@ from orthonav.sources.recording import fitted
 
 log = logging.getLogger(__name__)
 TICK_NS = 10**9
+"""Interval of health and state."""
 UTC_JUMP_NS = 200_000_000
-_WAIT_S = 0.001
+"""UTC that moves by more than this against the monotonic clock within a tick has been set."""
+_POLL_S = 0.001
 Grey = NDArray[np.uint8]
 
 
 class LogSink(Protocol):
-    """What keeps a flight. Whatever it raises, the flight goes on and its health says so."""
+    """Writes a flight log. An exception degrades the health; the flight continues."""
 
     @property
     def lost(self) -> Mapping[str, int]:
-        """How much could not be kept, by kind."""
+        """Number of messages that could not be written, by kind."""
 
-    def options(self, told: dict[str, Any]) -> None:
-        """How it was started."""
+    def options(self, options: dict[str, Any]) -> None:
+        """Log the options of the flight."""
 
     def view(self, number: int, frame: str, grey: Grey, telemetry: Telemetry) -> None:
-        """A view and exactly what is told of it, before it is placed."""
+        """Log a view and its telemetry, before it is located."""
 
     def result(self, result: ViewResult) -> None:
-        """What came out of a picture."""
+        """Log the result of an image."""
 
-    def health(self, told: dict[str, Any]) -> None:
-        """How the flight is going."""
+    def health(self, health: dict[str, Any]) -> None:
+        """Log the health of the flight."""
+
+    def gnss(self, time_ns: int, cdr: bytes) -> None:
+        """Log a `sensor_msgs/NavSatFix` (CDR) of a GNSS receiver, as received."""
 
     def close(self) -> None:
-        """The flight is over."""
+        """Finish the log."""
 
 
 @dataclass(frozen=True)
 class FlyOptions:
-    """How views are taken.
+    """Options of the flight loop.
 
-    `mount_deg`: yaw, pitch, roll of the camera in the body; `mount`: what calibration found, for
-    second looks (the locator corrects by itself). `deadline_s`: older views are dropped.
-    `telemetry_wait_s`: how long a view waits for the telemetry after its exposure. `recorded`:
-    telemetry is that of the recording. `accept`: a criterion beside the gate's. `map_path`,
-    `state_path`: files to look after.
+    `mount_deg`: yaw, pitch, roll of the camera in the body, degrees.
+    `mount`: calibrated mount, for the health only (the locator applies it by itself).
+    `heading_known`: whether the reported heading is used.
+    `deadline_s`: images older than this are dropped.
+    `telemetry_wait_s`: longest wait for telemetry after the exposure.
+    `recorded`: telemetry comes with the image, from a recording or from ROS.
+    `accept`: criterion in addition to those of the gate.
+    `min_confidence`: confidence (0 to 1) from which a position is saved and counts as confident.
+    `map_path`: map file to watch for changes; None: none.
+    `state_path`: file for the last position; None: none.
+    `logged_options`: written to the flight log for a replay.
     """
 
     mount_deg: Angles = LOOKS_DOWN
     mount: Mount | None = None
     heading_known: bool = True
     deadline_s: float = 0.5
-    telemetry_wait_s: float = 0.15
+    telemetry_wait_s: float = 0.15  # three attitudes at 20 Hz, the least rate asked for
     recorded: bool = False
     accept: Acceptance | None = None
     min_confidence: float = CONFIDENT
     map_path: Path | None = None
     state_path: Path | None = None
-    told: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    logged_options: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
 
 class Runner:
-    """Flies: takes pictures until stopped or until a recording ends. Mutable, one thread."""
+    """Processes images until it is stopped or a recording ends. Mutable; for one thread."""
 
     def __init__(
         self,
-        newest: Newest,
+        newest: NewestImage,
         camera: Camera,
         locator: Locator,
         publisher: Publisher,
@@ -111,24 +122,24 @@ class Runner:
         *,
         link: AutopilotLink | None = None,
         sink: LogSink | None = None,
-        second_look: SecondLook | None = None,
+        diagnosis: TelemetryDiagnosis | None = None,
         start: Callable[[], Prior | None] = lambda: None,
         notifier: Notifier | None = None,
     ) -> None:
-        """`start` says where the flight begins, when the first view is placed."""
+        """`start` gives the prior of the first view; it is called when that view is located."""
         self._newest, self._camera, self._locator = newest, camera, locator
         self._publisher, self.options, self._clocks = publisher, options, clocks
-        self._link, self._sink, self._second = link, sink, second_look
+        self._link, self._sink, self._diagnosis = link, sink, diagnosis
         self._start: Callable[[], Prior | None] | None = start
         self._notifier = notifier or Notifier("")
-        self.tally, self._teller, self._frozen = Tally(), Teller(), FrozenCheck()
+        self.counter, self._reporter, self._frozen = EventCounter(), HealthReporter(), FrozenCheck()
         self.health: Health | None = None
         self._begun_ns = self._confident_ns = clocks.mono_ns()
         self._tick_ns = 0
-        self._picture_ns: int | None = None
-        self._last: states.Saved | None = None
-        self._saved: states.Saved | None = None
-        self._off = 0.0, 0.0
+        self._image_taken_ns: int | None = None
+        self._last: states.SavedState | None = None
+        self._saved: states.SavedState | None = None
+        self._mismatch = 0.0, 0.0
         self._utc_ahead_ns = clocks.utc_ns() - clocks.mono_ns()
         self._seen = {"jumps": 0, "outages": 0, "failed": 0, "lost": 0}
         self._map_id = _file_id(options.map_path)
@@ -136,138 +147,138 @@ class Runner:
 
     def run(self, stopping: threading.Event) -> None:
         """Fly until `stopping` is set, or until a recording ends."""
-        self._log(lambda sink: sink.options(dict(self.options.told)))
-        self._notifier.tell("READY=1", "STATUS=waiting for pictures")
+        self._log(lambda sink: sink.options(dict(self.options.logged_options)))
+        self._notifier.notify("READY=1", "STATUS=waiting for images")
         try:
             while not stopping.is_set() and not self._newest.is_over:
                 try:
                     self.step(0.1)
-                except Exception:  # whatever it was, the next view may be better
-                    log.exception("runner")
+                except Exception:  # the flight continues with the next view
+                    log.exception("unexpected error in the flight loop")
                     self._count("internal_error")
         finally:
-            self._notifier.tell("STOPPING=1")
+            self._notifier.notify("STOPPING=1")
             self._save_state()
             self._publisher.close()
             self._log(lambda sink: sink.close())
 
     def step(self, timeout_s: float) -> ViewResult | None:
-        """Take the newest picture, waiting so long for it; what came out, None without any."""
-        picture = self._newest.take(timeout_s)
-        result = None if picture is None else self._turn(picture)
+        """Process the newest image, waiting `timeout_s` for it; None without a result."""
+        image = self._newest.take(timeout_s)
+        result = None if image is None else self._process(image)
         now_ns = self._clocks.mono_ns()
         if now_ns >= self._tick_ns:
             self._tick_ns = now_ns + TICK_NS
             self._tick(now_ns)
         return result
 
-    def _turn(self, picture: Picture) -> ViewResult | None:
-        """One picture whose turn has come."""
-        self._picture_ns = self._clocks.mono_ns()
+    def _process(self, image: CameraImage) -> ViewResult | None:
+        """Result of one image; None where it is too old."""
+        self._image_taken_ns = self._clocks.mono_ns()
         self._count("taken")
-        if self._picture_ns - picture.exposed_ns > self.options.deadline_s * 1e9:
+        if self._image_taken_ns - image.exposed_ns > self.options.deadline_s * 1e9:
             self._count("late")
             return None
-        told, camera = Told(None), self._camera
-        refused = self._bad_picture(picture)
-        if refused is None and picture.grey is not None:
+        vehicle, camera = VehicleState(None), self._camera
+        refused = self._bad_image(image)
+        if refused is None and image.grey is not None:
             try:
-                height, width = picture.grey.shape
-                camera = fitted(camera, width, height, picture.frame)
+                height, width = image.grey.shape
+                camera = fitted(camera, width, height, image.frame)
             except CameraError as error:
                 refused = self._refusal("wrong_camera", "wrong_camera", str(error))
         telemetry = None
         if refused is None:
-            told, telemetry = self._telemetry(picture)
+            vehicle, telemetry = self._telemetry(image)
             refused = self._missing(telemetry)
-        if refused is not None or telemetry is None or picture.grey is None:
-            outcome = refused or NoFix("bad_image", "there is no picture")
-            result = self._result(picture, outcome, math.nan)
+        if refused is not None or telemetry is None or image.grey is None:
+            outcome = refused or NoFix("bad_image", "no image")
+            result = self._result(image, outcome, math.nan)
             self._log(lambda sink: sink.result(result))
-            self._publisher.publish(result, picture.exposed_ns, told, judged=False)
+            self._publisher.publish(result, image.exposed_ns, vehicle, judged=False)
             return result
-        return self._placed(picture, View(picture.grey, camera, telemetry), told)
+        return self._located(image, View(image.grey, camera, telemetry), vehicle)
 
-    def _placed(self, picture: Picture, view: View, told: Told) -> ViewResult:
-        """A view that can be placed: logged, located, published."""
+    def _located(self, image: CameraImage, view: View, vehicle: VehicleState) -> ViewResult:
+        """Log, locate and publish a view."""
         if self._start is not None:
             prior, self._start = self._start(), None
             telemetry = replace(view.telemetry, prior=prior or view.telemetry.prior)
             view = replace(view, telemetry=telemetry)
         telemetry = view.telemetry
-        self._log(lambda sink: sink.view(picture.number, picture.frame, view.grey, telemetry))
+        self._log(lambda sink: sink.view(image.number, image.frame, view.grey, telemetry))
         outcome: Fix | NoFix
         try:
             outcome, latency_ms = locate_view(self._locator, view)
-        except CameraError as error:  # on a recorded flight an error, here it must not end
+        except CameraError as error:  # ends `orthonav localize`, but must not end a flight
             outcome = self._refusal("wrong_camera", "wrong_camera", str(error))
             latency_ms = math.nan
         self._count("processed")
         if isinstance(outcome, NoFix) and outcome.reason == "internal_error":
             self._count("internal_error")
-        result = self._result(picture, outcome, latency_ms)
+        result = self._result(image, outcome, latency_ms)
         accepted = self.options.accept(outcome) if self.options.accept else outcome
         self._publisher.publish(
-            replace(result, outcome=accepted), picture.exposed_ns, told, judged=True
+            replace(result, outcome=accepted), image.exposed_ns, vehicle, judged=True
         )
         now_ns = self._clocks.mono_ns()
-        self.tally.add_latency(now_ns, (now_ns - picture.exposed_ns) / 1e9)
+        self.counter.add_latency(now_ns, (now_ns - image.exposed_ns) / 1e9)
         self._log(lambda sink: sink.result(result))
-        self._note(result, telemetry, picture.exposed_ns)
-        if self._second is not None:
+        self._note(result, telemetry, image.exposed_ns)
+        if self._diagnosis is not None:
             corrected = self.options.mount.corrected(telemetry) if self.options.mount else telemetry
             found = result.state not in ("searching", "lost") and isinstance(outcome, Fix)
-            self._second.look(replace(view, telemetry=corrected), found, now_ns)
+            self._diagnosis.observe(replace(view, telemetry=corrected), found, now_ns)
         return result
 
     def _note(self, result: ViewResult, telemetry: Telemetry, exposed_ns: int) -> None:
-        """Remember a sure position, and how far it lies from what was told."""
+        """Keep a confident position, and its difference from the reported heading and height."""
         fix = result.outcome
         if not isinstance(fix, Fix) or not fix.confidence >= self.options.min_confidence:
             return
         if result.state not in (None, "tracking"):
             return
         self._confident_ns = self._clocks.mono_ns()
-        self._count("sure")
+        self._count("confident")
         mount = self.options.mount
-        self._off = offsets(fix, mount.corrected(telemetry) if mount else telemetry)
+        self._mismatch = mismatch(fix, mount.corrected(telemetry) if mount else telemetry)
         if not self.options.heading_known:
-            self._off = 0.0, self._off[1]
+            self._mismatch = 0.0, self._mismatch[1]
         utc_ns = exposed_ns + self._clocks.utc_ns() - self._clocks.mono_ns()
         std_m = error_ellipse(fix.cov_en_m2)[0]
-        self._last = states.Saved(
+        self._last = states.SavedState(
             fix.lat_deg, fix.lon_deg, std_m, utc_ns, exposed_ns, self._boot_id
         )
 
-    def _result(self, picture: Picture, outcome: Fix | NoFix, latency_ms: float) -> ViewResult:
+    def _result(self, image: CameraImage, outcome: Fix | NoFix, latency_ms: float) -> ViewResult:
         state = self._locator.state_name
-        return ViewResult(picture.frame, picture.time_ns, outcome, latency_ms, state)
+        return ViewResult(image.frame, image.time_ns, outcome, latency_ms, state)
 
-    def _bad_picture(self, picture: Picture) -> NoFix | None:
-        """Why a picture cannot be used; the reasons of the localizer where it shows nothing."""
-        if picture.grey is None:
-            self._count("bad_picture")
-            return picture.problem or NoFix("bad_image", "picture could not be decoded")
-        shown = check_picture(picture.grey)
-        repeat = self._frozen.is_repeat(picture.grey)
+    def _bad_image(self, image: CameraImage) -> NoFix | None:
+        """Reason why an image cannot be used; None if it can."""
+        if image.grey is None:
+            self._count("bad_image")
+            return image.problem or NoFix("bad_image", "image could not be decoded")
+        shown = check_picture(image.grey)
+        repeat = self._frozen.is_repeat(image.grey)
         if shown is not None:
-            self._count("bad_picture")
+            self._count("bad_image")
             return shown
         if repeat:
-            detail = f"the same picture for the {self._frozen.repeats + 1}th time"
-            return self._refusal("frozen", "frozen_picture", detail)
+            detail = f"{self._frozen.repeats + 1} identical images in a row"
+            return self._refusal("frozen", "frozen_image", detail)
         return None
 
-    def _telemetry(self, picture: Picture) -> tuple[Told, Telemetry]:
-        """What is told of the exposure; waits a little for what comes after it."""
+    def _telemetry(self, image: CameraImage) -> tuple[VehicleState, Telemetry]:
+        """Telemetry at the exposure; waits a little for the samples that follow it."""
         if self.options.recorded or self._link is None:
-            nothing = Telemetry(picture.time_ns, math.nan, math.nan, math.nan, math.nan)
-            return Told(None), picture.told or nothing
+            nothing = Telemetry(image.time_ns, math.nan, math.nan, math.nan, math.nan)
+            return image.vehicle or VehicleState(None), image.telemetry or nothing
         until_ns = self._clocks.mono_ns() + round(self.options.telemetry_wait_s * 1e9)
-        while not self._link.covers(picture.exposed_ns) and self._clocks.mono_ns() < until_ns:
-            self._clocks.sleep(_WAIT_S)
-        told = self._link.told_at(picture.exposed_ns)
-        return told, told.telemetry(picture.time_ns, self.options.mount_deg)
+        while not self._link.covers(image.exposed_ns) and self._clocks.mono_ns() < until_ns:
+            self._clocks.sleep(_POLL_S)
+        vehicle = self._link.state_at(image.exposed_ns)
+        return vehicle, vehicle.telemetry(image.time_ns, self.options.mount_deg)
 
     def _missing(self, telemetry: Telemetry) -> NoFix | None:
         missing = [
@@ -275,7 +286,7 @@ class Runner:
         ]
         if not missing:
             return None
-        detail = f"not told at the exposure: {', '.join(missing)}"
+        detail = f"not reported at the exposure: {', '.join(missing)}"
         return self._refusal("no_telemetry", "no_telemetry", detail)
 
     def _refusal(self, count: str, reason: str, detail: str) -> NoFix:
@@ -283,40 +294,40 @@ class Runner:
         return NoFix(reason, detail)
 
     def _count(self, name: str) -> None:
-        self.tally.add(self._clocks.mono_ns(), name)
+        self.counter.add(self._clocks.mono_ns(), name)
 
     def _log(self, call: Callable[[LogSink], None]) -> None:
-        """Write to the log; a log that fails is a matter of health."""
+        """Write to the log; a failure is counted for the health."""
         if self._sink is None:
             return
         try:
             call(self._sink)
         except Exception as error:
-            if self.tally.total["log_failed"] == 0:
+            if self.counter.total["log_failed"] == 0:
                 log.warning("flight log: %s", error)
             self._count("log_failed")
 
     def _tick(self, now_ns: int) -> None:
-        """Once a second: health, who wants to know it, and what is kept over a restart."""
+        """Once a second: judge and publish the health, and save the state."""
         self._count_changes()
         self._save_state()
         health = self.health = judge(self._snapshot(now_ns))
         plain = self._plain(health)
         self._publisher.health(plain)
         self._log(lambda sink: sink.health(plain))
-        self._notifier.tell("WATCHDOG=1", f"STATUS={health.text()}")
+        self._notifier.notify("WATCHDOG=1", f"STATUS={health.text()}")
         if self._link is None:
             return
         self._link.system_status = health.level.value
-        heard = self._link.target is not None  # else nobody would hear it
-        if heard and self._teller.due(health, now_ns):
+        connected = self._link.target is not None
+        if connected and self._reporter.due(health, now_ns):
             text = health.text().encode("ascii", "replace")
             self._link.send(dialect().MAVLink_statustext_message(health.level.severity, text))
         if self._publisher.messenger is not None:
             self._publisher.messenger.send_origin(self._link.origin, self._link.target)
 
     def _count_changes(self) -> None:
-        """What others counted since the last time."""
+        """Count what the link, the camera, the outputs and the log counted since the last call."""
         now = {
             "jumps": 0 if self._link is None else self._link.sync.jumps,
             "outages": self._newest.outages,
@@ -339,34 +350,34 @@ class Runner:
         self._utc_ahead_ns = ahead_ns
 
     def _snapshot(self, now_ns: int) -> Snapshot:
-        counts = self.tally.counts(now_ns)
+        counts = self.counter.counts(now_ns)
         link = None
         if self._link is not None:
             link = self._link.status()
         uses_link = link is not None and not self.options.recorded
-        picture_ns = self._begun_ns if self._picture_ns is None else self._picture_ns
-        looked = (0.0, 0.0) if self._second is None else self._second.offsets(now_ns)
-        off = looked if any(looked) else self._off
+        image_ns = self._begun_ns if self._image_taken_ns is None else self._image_taken_ns
+        found = (0.0, 0.0) if self._diagnosis is None else self._diagnosis.mismatch(now_ns)
+        heading_deg, log_scale = found if any(found) else self._mismatch
         state = self._locator.state_name
-        if state is None and self._picture_ns is None:
+        if state is None and self._image_taken_ns is None:
             state = "searching"
         return Snapshot(
             running_s=(now_ns - self._begun_ns) / 1e9,
             counts=counts,
-            picture_age_s=(now_ns - picture_ns) / 1e9,
+            image_age_s=(now_ns - image_ns) / 1e9,
             telemetry_age_s=link.attitude_age_s if link and uses_link else 0.0,
             link_age_s=link.heard_age_s if link else 0.0,
             low_confidence_s=(now_ns - self._confident_ns) / 1e9,
-            latency_s=self.tally.latency_s(0.95),
+            latency_s=self.counter.latency_s(0.95),
             state=state,
             synced=link.synced if link else True,
-            map_there=_file_id(self.options.map_path) == self._map_id,
-            heading_off_deg=off[0],
-            log_scale_off=off[1],
+            map_unchanged=_file_id(self.options.map_path) == self._map_id,
+            heading_mismatch_deg=heading_deg,
+            log_scale_mismatch=log_scale,
         )
 
     def _plain(self, health: Health) -> dict[str, Any]:
-        total = self.tally.total
+        total = self.counter.total
         return {
             "health": health.level.name,
             "reasons": list(health.reasons),
@@ -375,8 +386,8 @@ class Runner:
             "counts": {**dict(sorted(total.items())), "replaced": self._newest.replaced},
             "withheld": dict(sorted(self._publisher.gate.withheld.items())),
             "sent": dict(sorted(self._publisher.gate.sent.items())),
-            "age_p50_ms": round(self.tally.latency_s(0.5) * 1e3, 1),
-            "age_p95_ms": round(self.tally.latency_s(0.95) * 1e3, 1),
+            "age_p50_ms": round(self.counter.latency_s(0.5) * 1e3, 1),
+            "age_p95_ms": round(self.counter.latency_s(0.95) * 1e3, 1),
         }
 
     def _save_state(self) -> None:
@@ -388,13 +399,13 @@ class Runner:
             states.save(path, replace(last, signing_timestamp_10us=stamp or 0))
             self._saved = last
         except OSError as error:
-            if self.tally.total["state_failed"] == 0:
+            if self.counter.total["state_failed"] == 0:
                 log.warning("state cannot be saved: %s", error)
             self._count("state_failed")
 
 
 def _file_id(path: Path | None) -> tuple[int, int] | None:
-    """Which file is there by that name; None where there is none."""
+    """Device and inode of the file of that name; None where there is none."""
     try:
         found = path.stat() if path is not None else None
     except OSError:

@@ -1,10 +1,9 @@
-"""The link to the autopilot: bytes in and out, telemetry kept, clocks compared, heartbeats sent.
+"""The MAVLink connection to an autopilot: telemetry, clock offset, heartbeats, messages.
 
-What comes in is decoded by pymavlink (extra `autopilot`);
-what goes out is packed by `orthonav.publish.mavlink`.
+pymavlink (extra `autopilot`) decodes incoming messages; `orthonav.publish.mavlink` packs outgoing
+ones.
 """
 
-import importlib
 import logging
 import math
 import select
@@ -14,9 +13,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from orthonav.errors import MissingExtraError
+from orthonav.extras import needed
 from orthonav.onboard.ports import Transport
-from orthonav.onboard.telemetry import Clocks, ClockSync, TelemetryBuffer, Told, wxyz_of_angles
+from orthonav.onboard.telemetry import (
+    Clocks,
+    ClockSync,
+    TelemetryBuffer,
+    VehicleState,
+    wxyz_of_angles,
+)
 from orthonav.publish.estimate import EstimateError
 from orthonav.publish.local import Autopilot, Origin
 from orthonav.publish.mavlink import (
@@ -31,8 +36,11 @@ from orthonav.publish.mavlink import (
 
 log = logging.getLogger(__name__)
 RETRY_S = (0.5, 1.0, 2.0, 5.0)
-"""Pauses before a port is opened again."""
-HEARTBEAT_NS, TIMESYNC_NS, RESIGN_NS = 10**9, 10**9, 10 * 10**9
+"""Pauses before a port is opened again; the last one repeats."""
+HEARTBEAT_NS, TIMESYNC_NS = 10**9, 10**9
+"""Intervals; 1 Hz is what the MAVLink heartbeat and TIMESYNC protocols expect."""
+RESIGN_NS = 10 * 10**9
+"""Interval at which signature timestamps are set to the current time."""
 _MOST_READS = 200
 _BOARD, _NO_AUTOPILOT, _AUTOPILOT_COMPONENT = 18, 8, 1
 _KINDS = {3: Autopilot.ARDUPILOT, 12: Autopilot.PX4}
@@ -42,7 +50,15 @@ _FAR_NS = 60 * 10**9
 
 @dataclass(frozen=True)
 class LinkStatus:
-    """What the link knows of itself: ages in seconds (infinite: never), counts since the start."""
+    """Status of a link. Ages are in seconds, infinite for "never".
+
+    `is_open`: whether the port is open.
+    `heard_age_s`, `attitude_age_s`: time since the last message and the last attitude.
+    `synced`: whether TIMESYNC is answered.
+    `jumps`: number of clock jumps since the start.
+    `errors`: number of failures of the port since the start.
+    `target`, `kind`: ids and type of the autopilot; None until its first heartbeat.
+    """
 
     is_open: bool
     heard_age_s: float
@@ -55,7 +71,7 @@ class LinkStatus:
 
 
 class AutopilotLink:
-    """Talks to one autopilot. Mutable; safe between the thread that polls it and the runner."""
+    """Connection to one autopilot. Mutable; thread-safe for the polling thread and the runner."""
 
     def __init__(
         self,
@@ -68,8 +84,9 @@ class AutopilotLink:
         signing: Signing | None = None,
         silent: bool = False,
     ) -> None:
-        """`system_id` is that of the autopilot, by default of the first that is heard. With
-        `signing` what comes in must be signed with the same key. `silent`: nothing is sent.
+        """`system_id`: that of the autopilot, by default of the first one heard. `signing`: sign
+        outgoing messages and require incoming ones to be signed with the same key. `silent`: send
+        nothing.
 
         Raises `MissingExtraError` where pymavlink is missing or too old.
         """
@@ -95,9 +112,9 @@ class AutopilotLink:
         self._sequence, self._packed, self._resign_ns = 0, 0, 0
 
     def poll(self, timeout_s: float = 0.0) -> int:
-        """Read what has come, waiting at most so long for it; send what is due.
+        """Read incoming messages, waiting at most `timeout_s`, and send what is due.
 
-        The number of messages that were understood.
+        Returns the number of messages from the autopilot.
         """
         transport = self._opened()
         if transport is None:
@@ -118,7 +135,7 @@ class AutopilotLink:
         return understood
 
     def send(self, message: Message) -> bool:
-        """Pack and send one message; whether a port was open for it."""
+        """Pack and send one message; whether the port was open."""
         with self._lock:
             if self._silent or self._transport is None:
                 return False
@@ -130,25 +147,25 @@ class AutopilotLink:
             return True
 
     def covers(self, exposed_ns: int) -> bool:
-        """Whether the attitude at a moment of our clock is known."""
+        """Whether the attitude at a time of our clock is known."""
         with self._lock:
             newest, offset = self.buffer.covered_ns, self.sync.offset_ns
             return newest is not None and offset is not None and newest >= exposed_ns + offset
 
-    def told_at(self, exposed_ns: int) -> Told:
-        """What the autopilot told of a moment of our clock."""
+    def state_at(self, exposed_ns: int) -> VehicleState:
+        """State that the autopilot reported for a time of our clock."""
         with self._lock:
             if self.sync.offset_ns is None:
-                return Told(None)
+                return VehicleState(None)
             return self.buffer.at(exposed_ns + self.sync.offset_ns)
 
     def boot_ns(self, mono_ns: int) -> int | None:
-        """A moment of our clock by the autopilot's, None while that is not known."""
+        """Convert a time of our clock to the autopilot's; None while the offset is unknown."""
         with self._lock:
             return None if self.sync.offset_ns is None else mono_ns + self.sync.offset_ns
 
     def status(self) -> LinkStatus:
-        """How the link is."""
+        """Status of the link."""
         with self._lock:
             now_ns = self._clocks.mono_ns()
             return LinkStatus(
@@ -163,7 +180,7 @@ class AutopilotLink:
             )
 
     def signing_now(self) -> int | None:
-        """The timestamp of the last signature, None where nothing is signed."""
+        """Timestamp of the last signature; None without signing."""
         with self._lock:
             return None if self._signing is None else self._signing.timestamp_10us + self._packed
 
@@ -190,7 +207,7 @@ class AutopilotLink:
         return opened
 
     def _lost(self, error: OSError) -> None:
-        """The port is gone; it is opened again after a pause."""
+        """Close the port after a failure; it is opened again after a pause."""
         with self._lock:
             if self.counts["error"] == 0 or self._transport is not None:
                 log.warning("link to the autopilot: %s", error)
@@ -203,7 +220,7 @@ class AutopilotLink:
     def _frame(self, message: Message) -> bytes:
         now_ns = self._clocks.mono_ns()
         if self._packer is None or (self._signing is not None and now_ns >= self._resign_ns):
-            if self._signing is not None:  # signatures keep up with the time
+            if self._signing is not None:  # timestamps of signatures follow the clock
                 before = self._signing.timestamp_10us + self._packed
                 stamp = max(signing_timestamp(self._clocks.utc_ns()), before)
                 self._signing = replace(self._signing, timestamp_10us=stamp)
@@ -220,8 +237,8 @@ class AutopilotLink:
         understood = 0
         try:
             messages = self._incoming.parse_buffer(bytearray(data)) or []
-        except Exception as error:  # what comes in may be anything
-            log.debug("not understood: %s", error)
+        except Exception as error:  # input is untrusted
+            log.debug("incoming data could not be decoded: %s", error)
             self.counts["damaged"] += 1
             seen = self._incoming.signing.stream_timestamps
             self._incoming = _decoder(self._signing)
@@ -239,7 +256,7 @@ class AutopilotLink:
         return understood
 
     def _is_autopilot(self, message: Message) -> bool:
-        """Whether it comes from the autopilot; the first heartbeat of one says who that is."""
+        """Whether a message comes from the autopilot; its first heartbeat sets the target."""
         system_id = message.get_srcSystem()
         if self.target is not None:
             return bool(
@@ -251,7 +268,7 @@ class AutopilotLink:
             return False
         self.target = Target(system_id, message.get_srcComponent() or _AUTOPILOT_COMPONENT)
         self._packer = None
-        self._due = dict.fromkeys(self._due, 0)  # it hears of us, and is asked its time, at once
+        self._due = dict.fromkeys(self._due, 0)  # send a heartbeat and TIMESYNC at once
         return True
 
     def _dispatch(self, message: Message, now_ns: int) -> None:
@@ -261,7 +278,7 @@ class AutopilotLink:
             handler(self, message, now_ns)
 
     def _timed(self, boot_ms: int, now_ns: int) -> int:
-        """The time of a message in ns, of which the clocks learn."""
+        """Time of a message in ns; updates the clock offset."""
         boot_ns = int(boot_ms) * 1_000_000
         if self.sync.heard(now_ns, boot_ns):
             self.buffer.clear()
@@ -294,12 +311,12 @@ class AutopilotLink:
         self.buffer.add_local(time_ns, (message.vx, message.vy, message.vz), message.z)
 
     def _altitude(self, message: Message, now_ns: int) -> None:
-        """Its time may be since 1970: then that of arrival counts."""
+        """Its timestamp may be UTC instead of time since boot; then the time of arrival is used."""
         arrived_ns, reported_ns = self._arrived(now_ns), int(message.time_usec) * 1000
         if arrived_ns is None:
             return
         time_ns = reported_ns if abs(reported_ns - arrived_ns) < _FAR_NS else arrived_ns
-        if message.altitude_terrain > -1000:  # below that it stands for "not known"
+        if message.altitude_terrain > -1000:  # lower values mean "not known" (common.xml)
             self.buffer.add_height("terrain", time_ns, message.altitude_terrain)
         self.buffer.add_height("relative", time_ns, message.altitude_relative)
 
@@ -326,7 +343,7 @@ class AutopilotLink:
             self.counts["damaged"] += 1
 
     def _timesync(self, message: Message, now_ns: int) -> None:
-        if message.tc1 == 0:  # asks us: our clock is the one that messages are stamped with
+        if message.tc1 == 0:  # a request: answer with the clock that stamps our messages
             self.send(dialect().MAVLink_timesync_message(self._clocks.utc_ns(), message.ts1))
         elif message.ts1 in self._asked:
             self._asked.remove(message.ts1)
@@ -365,7 +382,7 @@ _HANDLERS: dict[str, Callable[[AutopilotLink, Message, int], None]] = {
 
 
 class LinkThread:
-    """Polls a link until it is stopped."""
+    """Polls a link in a thread until it is stopped."""
 
     def __init__(self, link: AutopilotLink) -> None:
         self._link, self._stop = link, threading.Event()
@@ -377,8 +394,8 @@ class LinkThread:
             try:
                 if self._link.poll(0.02) == 0 and not self._link.status().is_open:
                     self._stop.wait(0.1)
-            except Exception:  # one odd message never ends a flight
-                log.exception("link to the autopilot")
+            except Exception:  # one malformed message must not end a flight
+                log.exception("unexpected error in the link to the autopilot")
                 self._stop.wait(0.1)
 
     def stop(self) -> None:
@@ -389,36 +406,31 @@ class LinkThread:
 
 
 def _decoder(signing: Signing | None) -> Any:
-    """A decoder of what comes in: the larger dialect, which has RANGEFINDER too."""
-    try:
-        module = importlib.import_module("pymavlink.dialects.v20.ardupilotmega")
-    except ImportError as error:
-        raise MissingExtraError(
-            f"a link to an autopilot needs pymavlink: pip install 'orthonav[autopilot]' ({error})"
-        ) from error
+    """Decoder of incoming messages, of the dialect `ardupilotmega`, which includes RANGEFINDER."""
+    module = needed("pymavlink.dialects.v20.ardupilotmega", "autopilot", "a link to an autopilot")
     decoder = module.MAVLink(None)
     decoder.robust_parsing = True
     if signing is not None:
         decoder.signing.secret_key = signing.secret_key
-        decoder.signing.timestamp = signing.timestamp_10us  # recordings of before are refused
-        decoder.check_signature = _forgetful(decoder)
+        decoder.signing.timestamp = signing.timestamp_10us  # refuse replayed older messages
+        decoder.check_signature = _without_side_effects(decoder)
     return decoder
 
 
-def _forgetful(decoder: Any) -> Callable[..., bool]:
-    """The decoder's check of signatures, that learns nothing from those that are wrong.
+def _without_side_effects(decoder: Any) -> Callable[..., bool]:
+    """The decoder's signature check, without effects of messages that fail it.
 
-    pymavlink notes a timestamp before it looks at the signature: one forged message from the
-    future would end the link.
+    pymavlink stores the timestamp of a message before it checks the signature: one forged message
+    from the future would block the link.
     """
-    whole = decoder.check_signature
+    original = decoder.check_signature
 
     def check(*arguments: Any) -> bool:
         before = dict(decoder.signing.stream_timestamps)
-        sound = bool(whole(*arguments))
-        if not sound:
+        valid = bool(original(*arguments))
+        if not valid:
             decoder.signing.stream_timestamps = before
-        return sound
+        return valid
 
     return check
 

@@ -1,9 +1,9 @@
-"""The flight log: what was seen, known and answered, in MCAP files that can be flown again.
+"""The flight log: images, telemetry and results in MCAP files that can be replayed.
 
-The flight never waits for it. What is logged goes into a bounded queue; a thread encodes it and
-writes a chunk about once a second, each whole on the disk before the next. Where the thread falls
-behind or the disk is full, pictures are left out first and everything else last, it is counted,
-and the flight goes on. `docs/flights.md` describes the files, `orthonav.sources` reads them.
+The flight never waits for the log. Messages go into a bounded queue; a thread encodes them and
+writes a chunk about once a second, each synced to disk before the next. Where the thread falls
+behind or the disk is full, images are dropped first and other messages last; dropped messages are
+counted. `docs/flights.md` describes the files, `orthonav.sources` reads them.
 """
 
 import contextlib
@@ -22,10 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__
-from orthonav.errors import CameraError, MissingExtraError, OutputError
+from orthonav.errors import CameraError, OutputError
+from orthonav.extras import needed
+from orthonav.flight.fixes import result_to_json
 from orthonav.flight.logged import (
     CAMERA,
     FORMAT,
+    GNSS,
     HEALTH,
     MAX_JSON_BYTES,
     MAX_PICTURE_BYTES,
@@ -47,7 +50,6 @@ from orthonav.flight.logged import (
 )
 from orthonav.flight.png import lossless_png
 from orthonav.geo.camera import Camera
-from orthonav.publish.jsonl import result_to_json
 from orthonav.records import CONFIDENT, Fix, Telemetry, ViewResult
 from orthonav.sources.recording import fitted
 
@@ -59,28 +61,28 @@ log = logging.getLogger(__name__)
 Views = Literal["none", "thumbnails", "full"]
 CHUNK_S = 1.0
 CHUNK_BYTES = 8 * 2**20
-"""A chunk ends with the view that makes it larger."""
+"""A chunk ends with the view that exceeds this size."""
 SEGMENT_BYTES = 256 * 2**20
 QUEUE_BYTES = 64 * 2**20
 SPARE_BYTES = 16 * 2**20
-"""Of the queue, for all that is no picture."""
+"""Part of the queue that is reserved for messages other than images."""
 QUEUE_MESSAGES = 10_000
 LARGEST_BYTES = MAX_PICTURE_BYTES - 2**20
-"""Of a picture; the rest is for what is around it."""
+"""Largest image; the rest of the limit is for its header."""
 FILES_KEPT = 8
-"""Into how many files `max_bytes` is cut at least."""
+"""Least number of files that `max_bytes` is divided into."""
 PAUSE_S = 30.0
-"""Without pictures after one could not be written."""
+"""Time without images after one could not be written."""
 THUMBNAIL_PX, THUMBNAIL_QUALITY = 320, 60
 RESULTS_LATE = 1000
-"""So many views may come before the result of one."""
+"""Number of views that may be logged before the result of an earlier one."""
 CLOSE_S = 30.0
 Grey = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class _Waiting:
-    """What is still to be encoded: `size_bytes` is what it holds while it waits."""
+    """A message to be encoded; `size_bytes` is the memory that it holds in the queue."""
 
     make: "Callable[[], list[Message]]"
     size_bytes: int
@@ -88,9 +90,9 @@ class _Waiting:
 
 
 class FlightLog:
-    """A log that is being written; every method returns at once and none raises.
+    """A flight log being written. Every method returns at once, and none raises.
 
-    `lost`: how many pictures (`views`) and other messages (`messages`) were left out so far.
+    `lost`: number of images (`views`) and other messages (`messages`) dropped so far.
     """
 
     def __init__(
@@ -104,21 +106,18 @@ class FlightLog:
         segment_bytes: int | None = None,
         chunk_s: float = CHUNK_S,
     ) -> None:
-        """Write `NAME_0001.mcap` and so on beside `path`, which is `NAME.mcap`.
+        """Write files `NAME_0001.mcap` and so on in the folder of `path`, which is `NAME.mcap`.
 
-        `map_info` is best that of `orthonav.mapfile.signature.map_info`. `views`: which pictures
-        are kept; a flight is flown again from full ones only. All files of this name take
-        `max_bytes` at most, the oldest go; each is at most `segment_bytes` large (256 MB, or an
-        eighth of `max_bytes`), unless a single chunk is larger. `chunk_s`: seconds between chunks,
-        which is what a power cut takes. Numbers go on after those of files that are there.
-        Raises `OutputError` where the folder cannot be written and `MissingExtraError`.
+        `map_info`: identity of the map, see `orthonav.mapfile.signature.map_info`.
+        `views`: images to log; a replay needs full ones.
+        `max_bytes`: largest total size of all files of this name; the oldest are deleted.
+        `segment_bytes`: largest size of a file (default 256 MB, or an eighth of `max_bytes`),
+        unless a single chunk is larger.
+        `chunk_s`: seconds between chunks, the most that a power cut loses.
+        Numbers continue after those of existing files. Raises `OutputError` where the folder
+        cannot be written, `MissingExtraError` where mcap is missing.
         """
-        try:
-            import orthonav.onboard.segment  # noqa: F401  loads mcap
-        except ImportError as error:
-            raise MissingExtraError(
-                f"a flight log needs mcap: pip install 'orthonav[autopilot]' ({error})"
-            ) from error
+        needed("mcap", "autopilot", "a flight log")
         path = Path(path)
         self._folder, self._name = path.parent, path.stem if path.suffix == ".mcap" else path.name
         try:
@@ -135,7 +134,7 @@ class FlightLog:
         self._chunk_s = chunk_s
         self._session: dict[str, Any] = {
             "format": FORMAT,
-            "run": os.urandom(8).hex(),  # tells files of two runs of one name apart
+            "run": os.urandom(8).hex(),  # distinguishes files of two runs of one name
             "version": __version__,
             "views": views,
             "camera": camera_plain(camera),
@@ -148,7 +147,7 @@ class FlightLog:
         self._sized = False
         self._segment: Segment | None = None
         self._no_views_until = -math.inf
-        self._told = False
+        self._warned = False
         self._queue: list[_Waiting] = []
         self._queued_bytes = 0
         self._closing = False
@@ -157,15 +156,15 @@ class FlightLog:
         self._thread.start()
 
     def options(self, options: Mapping[str, Any]) -> None:
-        """How the flight is flown, as the command line of `orthonav localize` says it.
+        """Log the options of the flight, named as those of `orthonav localize`.
 
-        Keys that a replay knows: `heading` ("known", "unknown"), `prior` ("telemetry", "none"),
+        A replay uses `heading` ("known", "unknown"), `prior` ("telemetry", "none"),
         `registration` ("on", "off"), `position`, `accept` (text or None), `track` (bool) and
-        `mount` (None, or `dataclasses.asdict` of a `Mount`). Others are kept.
+        `mount` (None, or `dataclasses.asdict` of a `Mount`). Other keys are logged as they are.
         """
         try:
             session = {**self._session, "options": dict(options)}
-            to_json(session)  # what cannot be written must not keep the rest from being written
+            to_json(session)  # options that cannot be encoded must not block later messages
         except Exception as error:
             self._lose("messages", error)
             return
@@ -173,11 +172,11 @@ class FlightLog:
         self._add(lambda: [self._session_message(session)], 1000)
 
     def view(self, number: int, frame: str, grey: Grey | None, telemetry: Telemetry) -> None:
-        """A view before it is placed: `grey` (H, W), None where the camera gave no usable one.
+        """Log a view before it is located: `grey` (H, W), None for an unusable image.
 
-        `number` is the runner's own; `telemetry` is what the locator is told, ahead of any mount.
-        The picture is copied. The first one settles the size of the camera, all others must have
-        its size to be flown again.
+        `number` is that of the runner; `telemetry` is uncorrected by the mount. The image is
+        copied. The first image sets the size of the camera; images of another size cannot be
+        replayed.
         """
         time_ns = self._time_ns = telemetry.time_ns
         if grey is not None and not self._sized:
@@ -195,7 +194,7 @@ class FlightLog:
             kept = np.array(grey, dtype=np.uint8, order="C")
             self._add(lambda: _full(seen, kept), kept.nbytes, has_view=True)
         elif self._views == "full":
-            self._lose("views", "the writer falls behind, or a picture is too large")
+            self._lose("views", "the writer falls behind, or an image is too large")
             seen = replace(seen, picture="dropped")
             self._add(lambda: [_telemetry(seen, time_ns)], 1000)
         else:
@@ -203,12 +202,12 @@ class FlightLog:
             self._add(lambda: _with_thumbnail(seen, small), small.nbytes)
 
     def result(self, result: ViewResult) -> None:
-        """What came out for a view."""
+        """Log the result of a view."""
         index = self._indices.get(result.frame, 0)
         self._add(lambda: _result(result, index), 1000)
 
     def health(self, health: Mapping[str, Any]) -> None:
-        """How the flight is doing: any plain values; what the log lost is added as `log_lost`."""
+        """Log the health (JSON values); the counts of dropped messages are added as `log_lost`."""
         try:
             data = to_json({**health, "log_lost": dict(self.lost)})
         except Exception as error:
@@ -217,17 +216,21 @@ class FlightLog:
         time_ns = self._time_ns
         self._add(lambda: [_message(HEALTH, time_ns, data)], len(data))
 
+    def gnss(self, time_ns: int, cdr: bytes) -> None:
+        """Log a `sensor_msgs/NavSatFix` (CDR) of a GNSS receiver, as received at `time_ns`."""
+        self._add(lambda: [_message(GNSS, time_ns, cdr)], len(cdr))
+
     def close(self) -> None:
-        """Write what is waiting and end the file; waits for it, half a minute at most."""
+        """Write all queued messages and finish the file; waits at most half a minute."""
         with self._change:
             self._closing = True
             self._change.notify()
         self._thread.join(CLOSE_S)
         if self._thread.is_alive():
-            log.warning("the flight log could not be ended in %.0f s", CLOSE_S)
+            log.warning("the flight log could not be finished within %.0f s", CLOSE_S)
 
     def _fit(self, shape: tuple[int, ...]) -> None:
-        """Make the camera that of the pictures, as the runner does."""
+        """Scale the camera to the size of the images, as the runner does."""
         self._sized = True
         try:
             camera = fitted(self._camera, shape[1], shape[0], "the flight log")
@@ -263,9 +266,9 @@ class FlightLog:
     def _lose(self, what: str, why: object, count: int = 1) -> None:
         with self._change:
             self.lost[what] += count
-            told, self._told = self._told, True
-        if not told:  # once: what is lost is counted
-            log.warning("the flight log loses %s (%s): %s", what, why, self._folder)
+            warned, self._warned = self._warned, True
+        if not warned:  # once; further losses are only counted
+            log.warning("the flight log drops %s (%s): %s", what, why, self._folder)
 
     # What follows runs in the thread.
 
@@ -281,7 +284,7 @@ class FlightLog:
                 self._write([message for each in taken for message in self._made(each)])
                 if closing:
                     self._end_segment()
-            except Exception as error:  # whatever it is, it must not end the log
+            except Exception as error:  # must not end the log
                 self._lose("messages", repr(error), len(taken))
                 self._segment = None
             if closing:
@@ -295,7 +298,7 @@ class FlightLog:
             return []
 
     def _write(self, messages: "list[Message]") -> None:
-        """Write a chunk; without its pictures where that fails."""
+        """Write a chunk; without its images where that fails."""
         views = sum(message.is_view for message in messages)
         if views and time.monotonic() < self._no_views_until:
             self._lose("views", "no room", views)
@@ -338,7 +341,7 @@ class FlightLog:
                 log.debug("flight log ends without an index: %s", error)
 
     def _head(self) -> "list[Message]":
-        """What every file begins with."""
+        """First messages of every file."""
         camera = _message(CAMERA, self._time_ns, calibration_message(self._camera, self._time_ns))
         return [self._session_message(self._session), camera]
 
@@ -376,19 +379,20 @@ def _with_thumbnail(seen: LoggedView, small: Grey) -> "list[Message]":
     time_ns = seen.telemetry.time_ns
     options = [int(cv2.IMWRITE_JPEG_QUALITY), THUMBNAIL_QUALITY]
     done, jpeg = cv2.imencode(".jpg", small, options)
-    told = _telemetry(replace(seen, picture="thumbnail" if done else "none"), time_ns)
+    telemetry = _telemetry(replace(seen, picture="thumbnail" if done else "none"), time_ns)
     data = picture_message(jpeg.tobytes() if done else b"", "jpeg", time_ns)
-    return [told, _message(THUMBNAIL, time_ns, data, seen.index)] if done else [told]
+    return [telemetry, _message(THUMBNAIL, time_ns, data, seen.index)] if done else [telemetry]
 
 
 def _result(result: ViewResult, index: int) -> "list[Message]":
     line = result_to_json(result).encode("ascii")
     messages = [_message(RESULT, result.time_ns, line, index)]
     if isinstance(result.outcome, Fix):
-        with contextlib.suppress(ValueError):  # a number that is none
+        with contextlib.suppress(ValueError):  # a value that is not finite
             data = position_message(result.outcome, result.time_ns)
             messages.append(_message(POSITION, result.time_ns, data, index))
-            sure = result.outcome.confidence >= CONFIDENT and result.state in (None, "tracking")
-            data = navsat_message(result.outcome, result.time_ns, sure=sure)
+            confident = result.outcome.confidence >= CONFIDENT
+            confident = confident and result.state in (None, "tracking")
+            data = navsat_message(result.outcome, result.time_ns, confident=confident)
             messages.append(_message(NAVSAT, result.time_ns, data, index))
     return messages

@@ -1,4 +1,4 @@
-"""Where positions go: messages on the autopilot's link, NMEA, lines of JSON."""
+"""Outputs of positions: MAVLink messages to the autopilot, NMEA sentences, lines of JSON."""
 
 import errno
 import json
@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Protocol, TextIO
 
 from orthonav.errors import VariantError
+from orthonav.flight.fixes import result_to_json
 from orthonav.onboard.ports import Descriptor, device_baud, host_port, open_serial
-from orthonav.onboard.telemetry import Clocks, Told
+from orthonav.onboard.telemetry import Clocks, VehicleState
 from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
 from orthonav.publish.gate import Gate
-from orthonav.publish.jsonl import result_to_json
 from orthonav.publish.local import Autopilot, Origin
 from orthonav.publish.mavlink import (
     AUTOPILOT,
@@ -44,14 +44,28 @@ KINDS = {
 }
 LOCAL = ("odometry", "vision")
 ATTITUDE_STD_RAD = (math.radians(1.0), math.radians(1.0), math.radians(3.0))
+"""Standard deviations sent with the autopilot's own roll, pitch and yaw: assumed."""
 DOWN_STD_M, VEL_DOWN_STD_MPS = 3.0, 0.5
+"""Standard deviations sent with the autopilot's own height and vertical velocity: assumed."""
 ORIGIN_NS = 2 * 10**9
+"""Interval at which the origin is sent until the autopilot reports one."""
 _MOST_CLIENTS, _CLIENT_BYTES = 8, 8192
 
 
 @dataclass(frozen=True)
 class MessageOptions:
-    """Which messages are sent (`KINDS`), and how; the rest is told in docs/autopilots.md."""
+    """Messages to send and their fields; docs/autopilots.md describes each message.
+
+    `kinds`: names of messages, keys of `KINDS`.
+    `clock`: clock of the timestamps.
+    `sensor_id`: id of GLOBAL_POSITION_SENSOR, 1 to 255; PX4's `EKF2_AGP0_ID`.
+    `gps_id`, `satellites`: fields of GPS_INPUT.
+    `hdop_m`: metres of standard deviation per unit of HDOP; None: HDOP is ignored.
+    `min_std_m`: lower bound of the reported standard deviation, metres.
+    `min_confidence`: confidence (0 to 1) from which a position is reported as valid.
+    `autopilot`: whose conventions local messages follow; None: those of the autopilot heard.
+    `origin`: origin of the local frame to set where the autopilot has none.
+    """
 
     kinds: tuple[str, ...] = ("global-position",)
     clock: Clock = Clock.UTC
@@ -71,12 +85,12 @@ class MessageOptions:
 
 
 class Messenger:
-    """Makes the messages of one view and sends those that are due. Mutable."""
+    """Builds the messages of a view and sends those that are due. Mutable."""
 
     def __init__(
         self, options: MessageOptions, gate: Gate, send: Callable[[Message], bool], clocks: Clocks
     ) -> None:
-        """`gate` is the one that admitted the estimates; `send` says whether a port was open."""
+        """`gate` limits the rates; `send` returns whether the port was open."""
         self.options, self._gate, self._send, self._clocks = options, gate, send, clocks
         self.not_made: Counter[str] = Counter()
         self._origin_due_ns = 0
@@ -84,7 +98,7 @@ class Messenger:
     def publish(
         self,
         estimate: NavigationEstimate,
-        told: Told,
+        vehicle: VehicleState,
         *,
         exposed_ns: int,
         boot_ns: int | None,
@@ -92,14 +106,17 @@ class Messenger:
         kind: Autopilot | None,
         origin: Origin | None,
     ) -> tuple[str, ...]:
-        """Names of what was sent. `exposed_ns` is the exposure by our clock, `boot_ns` by the
-        autopilot's; `target`, `kind` and `origin` are what it told of itself."""
+        """Names of the messages that were sent.
+
+        `exposed_ns` is the time of exposure by our clock, `boot_ns` by the autopilot's. `vehicle`,
+        `target`, `kind` and `origin` are what the autopilot reported.
+        """
         sent = []
         for name in self.options.kinds:
             now_ns = self._clocks.mono_ns()
             stamped = replace(estimate, boot_ns=boot_ns, processing_s=(now_ns - exposed_ns) / 1e9)
             try:
-                made = self._make(name, stamped, told, target or AUTOPILOT, kind, origin)
+                made = self._make(name, stamped, vehicle, target or AUTOPILOT, kind, origin)
             except EstimateError as error:
                 self.not_made[f"{KINDS[name]}: {error}"[:200]] += 1
                 continue
@@ -108,20 +125,20 @@ class Messenger:
         return tuple(sent)
 
     def send_origin(self, known: Origin | None, target: Target | None) -> None:
-        """Tell the autopilot the origin of its local frame until it says that it has one."""
-        now_ns, told = self._clocks.mono_ns(), self.options.origin
+        """Send the origin of the local frame until the autopilot reports one (`known`)."""
+        now_ns, origin = self._clocks.mono_ns(), self.options.origin
         wanted = any(kind in LOCAL for kind in self.options.kinds)
-        if not wanted or told is None or known is not None or now_ns < self._origin_due_ns:
+        if not wanted or origin is None or known is not None or now_ns < self._origin_due_ns:
             return
         self._origin_due_ns = now_ns + ORIGIN_NS
         system_id = (target or AUTOPILOT).system_id
-        self._send(set_gps_global_origin(told, target_system=system_id))
+        self._send(set_gps_global_origin(origin, target_system=system_id))
 
     def _make(
         self,
         name: str,
         estimate: NavigationEstimate,
-        told: Told,
+        vehicle: VehicleState,
         target: Target,
         kind: Autopilot | None,
         origin: Origin | None,
@@ -152,33 +169,33 @@ class Messenger:
                 estimate, clock=clock, target=target, min_std_m=floor, min_confidence=least
             )
         make = odometry if name == "odometry" else vision_position_estimate
-        pose = _pose(told, origin)
+        pose = _pose(vehicle, origin)
         kind = chosen.autopilot or kind or Autopilot.PX4
         return make(estimate, pose, kind, clock=clock, min_std_m=floor, min_confidence=least)
 
 
-def _pose(told: Told, origin: Origin | None) -> LocalPose:
+def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:
     if origin is None:
-        raise EstimateError("the autopilot has not told the origin of its local frame")
+        raise EstimateError("the autopilot has not reported the origin of its local frame")
     return LocalPose(
         origin,
-        down_m=told.down_m,
+        down_m=vehicle.down_m,
         down_std_m=DOWN_STD_M,
-        attitude_rad=told.attitude_rad(),
+        attitude_rad=vehicle.attitude_rad(),
         attitude_std_rad=ATTITUDE_STD_RAD,
-        vel_down_mps=told.velocity_ned_mps[2],
+        vel_down_mps=vehicle.velocity_ned_mps[2],
         vel_down_std_mps=VEL_DOWN_STD_MPS,
     )
 
 
 class Sink(Protocol):
-    """Takes bytes and never waits. Raises `OSError` where they could not be taken."""
+    """Output for bytes that never blocks. `write` raises `OSError` where it fails."""
 
     def write(self, data: bytes) -> None:
-        """Take them."""
+        """Send `data`."""
 
     def close(self) -> None:
-        """No more will come."""
+        """Close the output."""
 
 
 class UdpSink:
@@ -190,7 +207,7 @@ class UdpSink:
         self._socket.setblocking(False)
 
     def write(self, data: bytes) -> None:
-        """One datagram; that nobody listens is no error."""
+        """Send one datagram; a receiver that does not listen is no error."""
         try:
             self._socket.sendto(data, self._address)
         except (BlockingIOError, ConnectionRefusedError):
@@ -202,7 +219,7 @@ class UdpSink:
 
 
 class TcpSink:
-    """Listens, and sends the same to all who connected; who does not read is let go."""
+    """TCP server that sends the same data to all clients; one that does not read is dropped."""
 
     def __init__(self, address: tuple[str, int]) -> None:
         self._listening = socket.create_server(address)
@@ -211,11 +228,11 @@ class TcpSink:
 
     @property
     def port(self) -> int:
-        """The port it listens at."""
+        """Port of the server."""
         return int(self._listening.getsockname()[1])
 
     def write(self, data: bytes) -> None:
-        """To each client, whole or not at all."""
+        """Send to each client, all of `data` or nothing."""
         try:
             while len(self._clients) < _MOST_CLIENTS:
                 client, _ = self._listening.accept()
@@ -240,7 +257,7 @@ class TcpSink:
 
 
 class SerialSink:
-    """A serial port that is opened when something is to be sent, and anew where it was lost."""
+    """A serial port; after a failure the next write opens it again."""
 
     def __init__(self, device: str, baud: int) -> None:
         self._device, self._baud = device, baud
@@ -264,7 +281,7 @@ class SerialSink:
 
 
 def open_sink(url: str) -> Sink:
-    """`udp:HOST:PORT`, `tcp-listen:[HOST:]PORT` (the loopback unless a host is told) or
+    """Output at `udp:HOST:PORT`, `tcp-listen:[HOST:]PORT` (default: loopback) or
     `serial:DEVICE:BAUD`. Raises `VariantError`, or `OSError` where it cannot be opened."""
     kind, _, rest = url.partition(":")
     if kind == "udp":
@@ -274,12 +291,12 @@ def open_sink(url: str) -> Sink:
     if kind == "serial":
         return SerialSink(*device_baud(rest, url))
     raise VariantError(
-        f"NMEA goes to udp:HOST:PORT, tcp-listen:[HOST:]PORT or serial:DEVICE:BAUD, got '{url}'"
+        f"expected udp:HOST:PORT, tcp-listen:[HOST:]PORT or serial:DEVICE:BAUD, got '{url}'"
     )
 
 
 class NmeaOut:
-    """GGA, RMC and GST of every view to one sink, also those that say "no position"."""
+    """GGA, RMC and GST of every view to one sink, including those without a position."""
 
     def __init__(
         self, sink: Sink, *, talker: str = "GP", quality: Quality = Quality.ESTIMATED
@@ -289,7 +306,7 @@ class NmeaOut:
     def write(
         self, estimate: NavigationEstimate | None, utc_ns: int, min_confidence: float
     ) -> None:
-        """One view, which without an estimate was at `utc_ns`. Raises `OSError`."""
+        """Write one view; `utc_ns` is its time where there is no estimate. Raises `OSError`."""
         sentences = [
             make(
                 estimate,
@@ -311,8 +328,8 @@ class NmeaOut:
 
 
 class JsonOut:
-    """One line per view as in `fixes.jsonl`, with `age_ms`, `sent` and `withheld`; lines that
-    begin with `health` between them."""
+    """One line per view as in `fixes.jsonl`, with `age_ms`, `sent` and `withheld` in addition, and
+    lines of health, which begin with the key `health`."""
 
     def __init__(self, path: Path | None, stream: TextIO | None = None) -> None:
         """Append to a file, or write to `stream` (stdout) where `path` is None."""
@@ -324,12 +341,12 @@ class JsonOut:
     def view(
         self, result: ViewResult, age_ms: float, sent: Sequence[str], withheld: str | None
     ) -> None:
-        """One view. Raises `OSError`."""
+        """Write one view. Raises `OSError`."""
         more = {"age_ms": round(age_ms, 3), "sent": list(sent), "withheld": withheld}
         self._write(result_to_json(result)[:-1] + ", " + json.dumps(more)[1:])
 
     def health(self, plain: dict[str, object]) -> None:
-        """One line of health. Raises `OSError`."""
+        """Write one line of health. Raises `OSError`."""
         self._write(json.dumps(plain, allow_nan=False))
 
     def close(self) -> None:
@@ -338,23 +355,23 @@ class JsonOut:
             self._stream.close()
 
     def _write(self, line: str) -> None:
-        if self._stream is None and self._path is not None:  # once more, after a disk was full
+        if self._stream is None and self._path is not None:  # retry after a full disk
             self._stream = self._path.open("a", encoding="ascii")
             self._stream.write("\n")
         if self._stream is None:
-            raise OSError(errno.EPIPE, "nobody reads stdout any more")
+            raise OSError(errno.EPIPE, "the reader of stdout has closed it")
         try:
             self._stream.write(line + "\n")
             self._stream.flush()
         except OSError:
             stream, self._stream = self._stream, None
             if self._path is not None:
-                _let_go(stream)
+                _close_quietly(stream)
             raise
 
 
-def _let_go(stream: TextIO) -> None:
-    """Close a file whose disk is full, without what it still holds."""
+def _close_quietly(stream: TextIO) -> None:
+    """Close a file whose disk is full; its buffered data are lost."""
     try:
         stream.close()
     except OSError:

@@ -1,4 +1,8 @@
-"""Ports for bytes: UDP, TCP, serial. Opened here and nowhere else, never waiting."""
+"""Non-blocking ports for bytes: UDP, TCP, serial.
+
+`pymavlink.mavutil` is not used: it blocks for 2 s where a TCP port refuses, sends to whoever sent
+the last datagram, and needs pyserial.
+"""
 
 import errno
 import os
@@ -18,26 +22,26 @@ _MAX_BYTES = 4096
 
 
 class Transport(Protocol):
-    """Bytes in and out, never waiting. Both raise `OSError` where the port is gone."""
+    """Bytes in and out without blocking. `read` and `write` raise `OSError` on failure."""
 
     def fileno(self) -> int:
-        """For `select`."""
+        """File descriptor for `select`."""
 
     def read(self) -> bytes:
-        """What has come, empty where nothing has."""
+        """Available data; empty where there is none."""
 
     def write(self, data: bytes) -> None:
-        """Send one message; dropped where nobody is known to send it to."""
+        """Send one message; it is dropped while no receiver is known."""
 
     def heard(self) -> None:
-        """What was read last is from the autopilot."""
+        """Confirm that the data read last came from the autopilot."""
 
     def close(self) -> None:
         """Close the port."""
 
 
 class Udp:
-    """UDP: listens where `peer` is None and answers whom it heard the autopilot from."""
+    """UDP socket. Without `peer` it listens, and sends to the address of the autopilot heard."""
 
     def __init__(self, bind: tuple[str, int] | None, peer: tuple[str, int] | None) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -55,7 +59,7 @@ class Udp:
         return self._socket.fileno()
 
     def read(self) -> bytes:
-        """One datagram. That nobody listens at the other end is no error: it may come up."""
+        """Read one datagram; a peer that does not listen yet is no error."""
         try:
             data, self._candidate = self._socket.recvfrom(65_536)
         except (BlockingIOError, InterruptedError, ConnectionRefusedError):
@@ -63,12 +67,12 @@ class Udp:
         return data
 
     def heard(self) -> None:
-        """Answer there from now on."""
+        """Send to the source of the last datagram from now on."""
         if not self._fixed:
             self._peer = self._candidate
 
     def write(self, data: bytes) -> None:
-        """One datagram to the peer."""
+        """Send one datagram to the peer."""
         if self._peer is not None:
             try:
                 self._socket.sendto(data, self._peer)
@@ -92,7 +96,7 @@ class Descriptor:
         return self._fd
 
     def read(self) -> bytes:
-        """What has come; an end of the stream is an `OSError`."""
+        """Available data; raises `OSError` at the end of the stream."""
         try:
             data = os.read(self._fd, _MAX_BYTES)
         except BlockingIOError:
@@ -102,10 +106,10 @@ class Descriptor:
         return data
 
     def heard(self) -> None:
-        """There is one peer only."""
+        """Nothing to do: a stream has one peer."""
 
     def write(self, data: bytes) -> None:
-        """Send all or nothing: half a message would spoil the one after it."""
+        """Send all or nothing: half a message would damage the next one."""
         try:
             sent = os.write(self._fd, data)
             deadline = time.monotonic() + 0.1
@@ -113,7 +117,7 @@ class Descriptor:
                 select.select([], [self._fd], [], 0.02)
                 sent += os.write(self._fd, data[sent:])
         except BlockingIOError:
-            return  # the buffer is full: a position that waits is no use
+            return  # the buffer is full: a delayed position is of no use
 
     def close(self) -> None:
         """See `Transport.close`."""
@@ -121,10 +125,10 @@ class Descriptor:
 
 
 def open_serial(device: str, baud: int) -> Descriptor:
-    """A serial port, raw, 8N1. Raises `VariantError` for a speed that it cannot have."""
+    """Open a serial port, raw, 8N1. Raises `VariantError` for an unsupported speed."""
     speed = getattr(termios, f"B{baud}", None)
     if speed is None:
-        raise VariantError(f"a serial port cannot run at {baud} baud: {device}")
+        raise VariantError(f"unsupported speed of a serial port, {baud} baud: {device}")
     fd = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         tty.setraw(fd)
@@ -145,10 +149,10 @@ def _open_tcp(host: str, port: int) -> Descriptor:
 
 
 def transport_opener(url: str) -> Callable[[], Transport]:
-    """What opens a connection string of pymavlink: `udpin:[HOST:]PORT`, `udpout:HOST:PORT`,
-    `tcp:HOST:PORT`, `[serial:]DEVICE[:BAUD]`. Listening is on the loopback unless HOST is told.
+    """Function that opens a pymavlink connection string.
 
-    Raises `VariantError` for anything else.
+    `udpin:[HOST:]PORT` (default HOST: loopback), `udpout:HOST:PORT`, `tcp:HOST:PORT` or
+    `[serial:]DEVICE[:BAUD]`. Raises `VariantError` for anything else.
     """
     kind, _, rest = url.partition(":")
     if kind in ("udpin", "udp"):
@@ -165,7 +169,7 @@ def transport_opener(url: str) -> Callable[[], Transport]:
 
 
 def host_port(text: str, url: str) -> tuple[str, int]:
-    """HOST:PORT, the host being the loopback where it is left out."""
+    """Host and port of `[HOST:]PORT`; the default host is the loopback."""
     host, _, port = text.rpartition(":")
     if not (port.isascii() and port.isdigit() and 0 <= int(port) <= 65_535):
         raise VariantError(f"expected HOST:PORT, such as {LOOPBACK}:14550: '{url}'")
@@ -173,7 +177,7 @@ def host_port(text: str, url: str) -> tuple[str, int]:
 
 
 def device_baud(text: str, url: str) -> tuple[str, int]:
-    """DEVICE[:BAUD] of a serial port."""
+    """Device and speed of `DEVICE[:BAUD]`."""
     device, _, baud = text.replace(",", ":").partition(":")
     if not device.startswith("/") or not (baud == "" or baud.isdigit()):
         raise VariantError(

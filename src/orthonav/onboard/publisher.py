@@ -1,13 +1,13 @@
-"""From the result of one view to everyone who wants to know: messages, NMEA, lines."""
+"""Publishes the result of each view to all outputs: MAVLink, NMEA, JSON lines, ROS 2."""
 
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.outputs import JsonOut, Messenger, NmeaOut
-from orthonav.onboard.telemetry import Clocks, Told
+from orthonav.onboard.telemetry import Clocks, VehicleState
 from orthonav.publish.estimate import Clock, NavigationEstimate, estimate_from_result
 from orthonav.publish.gate import Gate
 from orthonav.records import CONFIDENT, ViewResult
@@ -15,8 +15,23 @@ from orthonav.records import CONFIDENT, ViewResult
 log = logging.getLogger(__name__)
 
 
+class PositionOutput(Protocol):
+    """Takes estimates that passed the gate, and the health. Raises `OSError` or `ValueError`."""
+
+    def position(
+        self, estimate: NavigationEstimate, vehicle: VehicleState, stamp_ns: int
+    ) -> tuple[str, ...]:
+        """Send one position; returns the names of messages. `stamp_ns`: time of the image."""
+
+    def health(self, plain: dict[str, Any]) -> None:
+        """Send the health."""
+
+    def close(self) -> None:
+        """Close the output."""
+
+
 class Publisher:
-    """Results to everyone who wants them. Mutable."""
+    """Publishes results to all outputs. Mutable."""
 
     def __init__(
         self,
@@ -27,20 +42,22 @@ class Publisher:
         link: AutopilotLink | None = None,
         nmea: Sequence[NmeaOut] = (),
         lines: Sequence[JsonOut] = (),
+        graph: PositionOutput | None = None,
         min_confidence: float = CONFIDENT,
     ) -> None:
         self.gate, self._clocks = gate, clocks
         self.messenger, self._link = messenger, link
         self._nmea, self._lines, self._least = nmea, lines, min_confidence
+        self._graph = [graph] if graph is not None else []
         self.failed = 0
 
     def publish(
-        self, result: ViewResult, exposed_ns: int, told: Told, *, judged: bool
+        self, result: ViewResult, exposed_ns: int, vehicle: VehicleState, *, judged: bool
     ) -> tuple[str, ...]:
-        """Send what may be sent of a view; the names of the messages.
+        """Send the position of a view where the gate admits it; the names of the messages.
 
-        Only views that were handed to the locator (`judged`) can bring a position: what a track
-        foretells where nothing was seen is no measurement.
+        Only views that the locator processed (`judged`) can give a position: the prediction of a
+        track is not a measurement.
         """
         estimate, withheld = None, None
         if judged:
@@ -53,26 +70,30 @@ class Publisher:
             withheld = next(iter(self.gate.withheld - before), None)
         sent: tuple[str, ...] = ()
         if estimate is not None and self.messenger is not None and self._link is not None:
-            sent = self._send(estimate, exposed_ns, told)
-        self._tell_nmea(estimate)
+            sent = self._send(estimate, exposed_ns, vehicle)
+        if estimate is not None:
+            sent += self._to_graph(estimate, vehicle, result.time_ns)
+        self._write_nmea(estimate)
         age_ms = (self._clocks.mono_ns() - exposed_ns) / 1e6
         self._each(self._lines, lambda out: out.view(result, age_ms, sent, withheld))
         return sent
 
     def health(self, plain: dict[str, Any]) -> None:
-        """A line of health for those who read lines."""
-        self._each(self._lines, lambda out: out.health(plain))
+        """Send the health to the outputs that carry it."""
+        self._each([*self._lines, *self._graph], lambda out: out.health(plain))
 
     def close(self) -> None:
-        """No more will come."""
-        self._each([*self._nmea, *self._lines], lambda out: out.close())
+        """Close all outputs."""
+        self._each([*self._nmea, *self._lines, *self._graph], lambda out: out.close())
 
-    def _send(self, estimate: NavigationEstimate, exposed_ns: int, told: Told) -> tuple[str, ...]:
+    def _send(
+        self, estimate: NavigationEstimate, exposed_ns: int, vehicle: VehicleState
+    ) -> tuple[str, ...]:
         if self.messenger is None or self._link is None:
             return ()
         return self.messenger.publish(
             estimate,
-            told,
+            vehicle,
             exposed_ns=exposed_ns,
             boot_ns=self._link.boot_ns(exposed_ns),
             target=self._link.target,
@@ -80,7 +101,17 @@ class Publisher:
             origin=self._link.origin,
         )
 
-    def _tell_nmea(self, estimate: NavigationEstimate | None) -> None:
+    def _to_graph(
+        self, estimate: NavigationEstimate, vehicle: VehicleState, stamp_ns: int
+    ) -> tuple[str, ...]:
+        sent: list[str] = []
+        if self._graph and self.gate.due("ROS2", self._clocks.mono_ns()):
+            self._each(
+                self._graph, lambda out: sent.extend(out.position(estimate, vehicle, stamp_ns))
+            )
+        return tuple(sent)
+
+    def _write_nmea(self, estimate: NavigationEstimate | None) -> None:
         if self._nmea and self.gate.due("NMEA", self._clocks.mono_ns()):
             utc_ns = self._clocks.utc_ns()
             self._each(self._nmea, lambda out: out.write(estimate, utc_ns, self._least))
@@ -91,5 +122,5 @@ class Publisher:
                 call(out)
             except (OSError, ValueError) as error:
                 if self.failed == 0:
-                    log.warning("output: %s", error)
+                    log.warning("output failed: %s", error)
                 self.failed += 1

@@ -1,4 +1,4 @@
-"""One code path from views to results, for recorded flights and live ones alike."""
+"""The path from views to results, shared by recorded and live flights."""
 
 import logging
 import math
@@ -20,22 +20,22 @@ log = logging.getLogger(__name__)
 
 
 class Locator(Protocol):
-    """What places the views of one flight: each for itself, or as a track."""
+    """Locates the views of one flight, one by one or as a track."""
 
     def locate(self, view: View) -> Fix | NoFix:
-        """Where a view was taken. Raises `CameraError` where its picture has another size."""
+        """Position of a view. Raises `CameraError` where the image has not the camera's size."""
 
     def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
-        """What is known at a view whose picture cannot be used, for `reason`."""
+        """Position at a view whose image cannot be used, for `reason`."""
 
     @property
     def state_name(self) -> str | None:
-        """State of the track, None where there is none."""
+        """State of the track; None for single views."""
 
 
 @dataclass(frozen=True)
 class SingleViews:
-    """Every view for itself."""
+    """Locates every view on its own."""
 
     localizer: Localizer
     use_prior: bool = True
@@ -51,21 +51,21 @@ class SingleViews:
         )
 
     def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
-        """Nothing."""
+        """Return `reason`: a single view has no other information."""
         return reason
 
 
 def locate_view(locator: Locator, view: View) -> tuple[Fix | NoFix, float]:
-    """Place one view; whatever goes wrong inside is a `NoFix`. Also the time taken, in ms.
+    """Result of one view and the time taken in ms; an internal error becomes a `NoFix`.
 
-    Raises `CameraError` only: a camera of another size is wrong for the whole flight.
+    Raises `CameraError` only: a wrong camera is an error of the whole flight.
     """
     start = time.perf_counter()
     try:
         outcome = locator.locate(view)
     except CameraError:
         raise
-    except Exception as error:  # One bad view never ends a flight.
+    except Exception as error:  # one view must not end a flight
         log.exception("view could not be processed")
         outcome = _passed(locator, view.telemetry, _internal(error))
     return _finite(outcome), (time.perf_counter() - start) * 1e3
@@ -79,11 +79,11 @@ def localize_flight(
     accept: Acceptance | None = None,
     views: Iterable[RecordedView] | None = None,
 ) -> Iterator[ViewResult]:
-    """Results for the views of a recorded flight, in order, as they are computed.
+    """Results of the views of a recorded flight, in order, as they are computed.
 
-    Fixes that do not pass `accept` become `NoFix` with their evidence.
-    Raises `FlightError` at an image that cannot be decoded, unless `skip_bad_images` makes it a
-    `NoFix`; raises `CameraError` where the camera is not that of an image.
+    Fixes that do not pass `accept` become `NoFix` with their evidence. Raises `FlightError` at an
+    image that cannot be decoded, unless `skip_bad_images` makes it a `NoFix`; raises `CameraError`
+    where an image has not the camera's size.
     """
     for view in flight.views if views is None else views:
         outcome: Fix | NoFix
@@ -111,7 +111,7 @@ def localize_flight(
 def smoothed_track(
     tracker: Tracker, results: Sequence[ViewResult], accept: Acceptance | None
 ) -> list[ViewResult]:
-    """Results of a whole flight again, every view placed by all of them."""
+    """Results of a whole flight after smoothing: every position uses all views."""
     placed = [_finite(outcome) for outcome in tracker.smoothed_track()]
     chosen = placed if accept is None else [accept(outcome) for outcome in placed]
     return [
@@ -123,7 +123,7 @@ def _passed(locator: Locator, telemetry: Telemetry, reason: NoFix) -> Fix | NoFi
     try:
         return locator.passed(telemetry, reason)
     except Exception as error:
-        log.exception("view could not be passed over")
+        log.exception("view could not be skipped")
         return _internal(error)
 
 
@@ -133,7 +133,7 @@ def _internal(error: Exception) -> NoFix:
 
 def _finite(outcome: Fix | NoFix) -> Fix | NoFix:
     if isinstance(outcome, Fix) and not _is_finite(outcome):
-        return NoFix("internal_error", "the position came out as not a number")
+        return NoFix("internal_error", "the computed position is not finite")
     return outcome
 
 

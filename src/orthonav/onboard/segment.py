@@ -1,8 +1,8 @@
-"""One MCAP file of a flight log, which grows by whole chunks.
+"""One MCAP file of a flight log, written in complete chunks.
 
-Whatever the disk does, the file ends with a whole chunk: one that cannot be written is cut off
-again. A file that lost power ends with a whole chunk but for the last, and lacks the index that
-`finish` writes; readers go through it from the start.
+A chunk that cannot be written completely is truncated, so the file always ends with a complete one.
+After a power cut all chunks but the last are complete, and the index that `finish` writes is
+missing: readers scan the file from the start.
 """
 
 import contextlib
@@ -20,12 +20,12 @@ from orthonav import __version__
 from orthonav.flight.logged import PROFILE, TOPICS, VIEW, Topic
 
 _INDEX_BYTES = 64_000, 300
-"""What the end of a file takes, at most: once, and for each chunk."""
+"""Upper bound of the size of the index: constant part, and per chunk."""
 
 
 @dataclass(frozen=True)
 class Message:
-    """A message of the log; `time_ns` is when what it speaks of was exposed, `index` the view's."""
+    """A message of the log. `time_ns`: time of exposure. `index`: index of the view."""
 
     topic: Topic
     time_ns: int
@@ -34,12 +34,12 @@ class Message:
 
     @property
     def is_view(self) -> bool:
-        """Whether it is a full picture, the first to go where room is short."""
+        """Whether it is a full image, which is dropped first where space is short."""
         return self.topic is VIEW
 
 
 class _Tail:
-    """What the writer writes, until it is on the disk; tells offsets in the whole file."""
+    """Buffers the writer's output until it is written to disk; offsets are those of the file."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
@@ -54,7 +54,7 @@ class _Tail:
         return self._count
 
     def flush(self) -> None:
-        """Nothing: `Segment` writes."""
+        """Do nothing: `Segment` writes to disk."""
 
     def taken(self) -> bytes:
         parts, self._parts = self._parts, []
@@ -62,7 +62,7 @@ class _Tail:
 
 
 class Segment:
-    """A new file. Every method that raises `OSError` leaves it closed, ending with a chunk."""
+    """A new file. A method that raises `OSError` leaves it closed, ending with a chunk."""
 
     def __init__(self, path: Path) -> None:
         """Raises `OSError`, also where `path` exists."""
@@ -73,7 +73,7 @@ class Segment:
         self._tail = _Tail()
         self._writer = Writer(
             self._tail,  # type: ignore[arg-type]
-            chunk_size=2**62,  # chunks end when they are told to
+            chunk_size=2**62,  # chunks end by `flush` only
             compression=CompressionType.ZSTD,
         )
         self._writer.start(profile=PROFILE, library=f"orthonav {__version__}")
@@ -90,11 +90,11 @@ class Segment:
 
     @property
     def finished_bytes(self) -> int:
-        """How large the file will be at most when it is finished now."""
+        """Upper bound of the size of the file if it is finished now."""
         return self.size_bytes + _INDEX_BYTES[0] + _INDEX_BYTES[1] * self.chunks
 
     def write(self, messages: Sequence[Message]) -> None:
-        """Write one chunk and wait until the disk has it. Raises `OSError`."""
+        """Write one chunk and sync it to disk. Raises `OSError`."""
         for message in messages:
             time_ns = max(0, message.time_ns)
             self._writer.add_message(
@@ -126,7 +126,7 @@ class Segment:
         self.size_bytes += len(data)
 
     def _abandon(self) -> None:
-        """Cut off what is not whole, and close; a file without a chunk is removed."""
+        """Truncate to complete chunks and close; a file without a chunk is removed."""
         with contextlib.suppress(OSError):
             os.ftruncate(self._file.fileno(), self.size_bytes)
             if self.chunks:
@@ -140,7 +140,7 @@ class Segment:
 
 
 def _write_ending(handle: int, size_bytes: int) -> None:
-    """End a file without an index, so that readers know that it ends there; or leave it be."""
+    """Write the end records without an index; where that fails, restore the size."""
     records = RecordBuilder()
     DataEnd(0).write(records)
     Footer(0, 0, 0).write(records)
@@ -155,9 +155,10 @@ def _write_ending(handle: int, size_bytes: int) -> None:
 
 
 def next_segment(folder: Path, name: str, needed_bytes: int, max_bytes: int | None) -> Segment:
-    """The next file `NAME_0001.mcap` of a log.
+    """Next file `NAME_0001.mcap` of a log.
 
-    The oldest ones go until all others and `needed_bytes` fit into `max_bytes`. Raises `OSError`.
+    The oldest files are deleted until the others and `needed_bytes` fit into `max_bytes`. Raises
+    `OSError`.
     """
     pattern = re.compile(re.escape(name) + r"_(\d{4,9})\.mcap")
     found = ((pattern.fullmatch(path.name), path) for path in folder.iterdir())
@@ -172,7 +173,7 @@ def next_segment(folder: Path, name: str, needed_bytes: int, max_bytes: int | No
     segment = Segment(folder / f"{name}_{max(files, default=0) + 1:04d}.mcap")
     handle = os.open(folder, os.O_RDONLY)
     try:
-        os.fsync(handle)  # so that the file is still there after a power cut
+        os.fsync(handle)  # the entry of the file must survive a power cut
     finally:
         os.close(handle)
     return segment

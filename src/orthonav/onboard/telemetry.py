@@ -1,7 +1,8 @@
-"""What the autopilot told over the last seconds, and what that was at the exposure of a view.
+"""Telemetry of the last seconds, interpolated to the exposure of a view.
 
-Two clocks: ours (monotonic) and the autopilot's (since it was switched on). Samples are kept by the
-autopilot's, `ClockSync` takes the exposure there. Nothing here reads a clock or a port.
+There are two clocks: ours (monotonic) and the autopilot's (since boot). Samples carry times of the
+autopilot's clock; `ClockSync` converts the time of exposure to it. Nothing here reads a clock or a
+port.
 """
 
 import math
@@ -21,8 +22,8 @@ from orthonav.records import Telemetry
 from orthonav.sources.attitude import LOOKS_DOWN, Angles, enu_from_body_camera
 
 HEIGHT_SOURCES = ("distance", "terrain", "home", "relative")
-"""Heights above ground, the better first: a rangefinder that looks down; the autopilot's terrain
-model; above home (right over flat ground only) of two messages."""
+"""Sources of the height above ground, best first: a rangefinder that looks down, the autopilot's
+terrain model, and the height above home (correct over flat ground only) of two messages."""
 _MS = 1_000_000
 _NAN3 = (math.nan, math.nan, math.nan)
 Triple = tuple[float, float, float]
@@ -31,7 +32,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Clocks:
-    """Where the time comes from; tests bring their own."""
+    """Functions that read the clocks and wait; tests replace them."""
 
     mono_ns: Callable[[], int] = time.monotonic_ns
     utc_ns: Callable[[], int] = time.time_ns
@@ -39,9 +40,16 @@ class Clocks:
 
 
 @dataclass(frozen=True)
-class Limits:
-    """How long samples are kept, how far apart two may lie that are interpolated between, and how
-    long the last one holds. Attitude changes fast, heights and velocities do not."""
+class BufferLimits:
+    """Times in seconds within which samples are used.
+
+    Attitude changes fast; heights and velocities change slowly.
+
+    `keep_s`: age at which samples are discarded.
+    `attitude_gap_s`, `slow_gap_s`: longest interval that is interpolated.
+    `attitude_hold_s`, `slow_hold_s`: time for which the last sample holds.
+    `attitude_ahead_s`: longest extrapolation of the attitude.
+    """
 
     keep_s: float = 10.0
     attitude_gap_s: float = 0.5
@@ -52,29 +60,29 @@ class Limits:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """What the autopilot said of one moment of its clock.
+class VehicleState:
+    """State of the aircraft that the autopilot reported for one time of its clock.
 
-    `ned_from_body` is its attitude (3, 3), None where not known; `height_m` above ground and which
-    of `HEIGHT_SOURCES` told it; `velocity_ned_mps` and `down_m` of its local frame; NaN where not
-    known.
+    `ned_from_body`: attitude as a rotation matrix (3, 3); None where not known.
+    `height_m`: height above ground; NaN where not known, as the next two.
+    `velocity_ned_mps`: velocity north, east, down.
+    `down_m`: distance below the origin of the autopilot's local frame.
     """
 
     ned_from_body: Array | None
     height_m: float = math.nan
-    height_source: str = ""
     velocity_ned_mps: Triple = _NAN3
     down_m: float = math.nan
 
     def attitude_rad(self) -> Triple:
-        """Roll, pitch and yaw; NaN where not known."""
+        """Roll, pitch and yaw of the body in radians; NaN where not known."""
         if self.ned_from_body is None:
             return _NAN3
         yaw, pitch, roll = Rotation.from_matrix(self.ned_from_body).as_euler("ZYX").tolist()
         return roll, pitch, yaw
 
     def telemetry(self, time_ns: int, mount_deg: Angles = LOOKS_DOWN) -> Telemetry:
-        """Heading, tilt and height of the camera in its mount, `time_ns` being what is written."""
+        """Heading, tilt and height of a camera mounted at `mount_deg`, with the time `time_ns`."""
         yaw = pitch = roll = math.nan
         if self.ned_from_body is not None:
             yaw, pitch, roll = attitude_of(enu_from_body_camera(self.ned_from_body, mount_deg))
@@ -85,8 +93,8 @@ class Told:
         )
 
 
-class _Line:
-    """Samples of one kind at increasing times."""
+class _Samples:
+    """Samples of one quantity at increasing times."""
 
     def __init__(self, gap_s: float, hold_s: float) -> None:
         self.gap_ns, self.hold_ns = round(gap_s * 1e9), round(hold_s * 1e9)
@@ -95,15 +103,15 @@ class _Line:
 
     def add(self, time_ns: int, value: Array, keep_ns: int) -> None:
         if self.times and time_ns <= self.times[-1]:
-            return  # came twice, or overtook the one before
+            return  # a duplicate, or out of order
         self.times.append(time_ns)
         self.values.append(value)
-        if self.times[0] < time_ns - 2 * keep_ns:  # now and then, not at every sample
+        if self.times[0] < time_ns - 2 * keep_ns:  # rarely: deleting moves the whole list
             first = bisect_left(self.times, time_ns - keep_ns)
             del self.times[:first], self.values[:first]
 
     def around(self, time_ns: int) -> tuple[Array, Array, float] | None:
-        """The values before and after a moment and the weight of the later one, None in gaps."""
+        """Values before and after a time, and the weight of the later one; None in gaps."""
         after = bisect_left(self.times, time_ns)
         if after < len(self.times) and self.times[after] == time_ns:
             return self.values[after], self.values[after], 0.0
@@ -113,20 +121,20 @@ class _Line:
         if after == len(self.times):
             held = time_ns - start <= self.hold_ns
             return (self.values[-1], self.values[-1], 0.0) if held else None
-        way = self.times[after] - start
-        if way > self.gap_ns:
+        interval = self.times[after] - start
+        if interval > self.gap_ns:
             return None
-        return self.values[after - 1], self.values[after], (time_ns - start) / way
+        return self.values[after - 1], self.values[after], (time_ns - start) / interval
 
     def ahead(self, time_ns: int, most_ns: int) -> tuple[Array, Array, float] | None:
-        """The last two values and a weight above 1 for a moment a little after them."""
+        """Last two values and a weight above 1, for a time shortly after them."""
         if not self.covered_ns(most_ns) >= time_ns > self.times[-1]:
             return None
-        way = self.times[-1] - self.times[-2]
-        return self.values[-2], self.values[-1], 1 + (time_ns - self.times[-1]) / way
+        interval = self.times[-1] - self.times[-2]
+        return self.values[-2], self.values[-1], 1 + (time_ns - self.times[-1]) / interval
 
     def covered_ns(self, most_ns: int) -> int:
-        """Up to when values are known: a little longer than told where they come closely."""
+        """Time up to which values are known, extrapolation included where samples are dense."""
         close = len(self.times) > 1 and self.times[-1] - self.times[-2] <= 2 * most_ns
         return self.times[-1] + (most_ns if close else 0)
 
@@ -143,23 +151,23 @@ class TelemetryBuffer:
     """Samples of the last seconds by the autopilot's clock. Mutable; not to be shared."""
 
     def __init__(
-        self, limits: Limits | None = None, heights: Sequence[str] = HEIGHT_SOURCES
+        self, limits: BufferLimits | None = None, heights: Sequence[str] = HEIGHT_SOURCES
     ) -> None:
         """`heights` are those of `HEIGHT_SOURCES` that may be used, the best first."""
-        self.limits = limits or Limits()
+        self.limits = limits or BufferLimits()
         self._order = tuple(heights)
         self.clear()
 
     def clear(self) -> None:
-        """Forget everything: the autopilot was switched on anew."""
-        told = self.limits
-        slow = told.slow_gap_s, told.slow_hold_s
-        self._attitude = _Line(told.attitude_gap_s, told.attitude_hold_s)
-        self._heights = {name: _Line(*slow) for name in self._order}
-        self._local = _Line(*slow)
+        """Discard all samples, as after a restart of the autopilot."""
+        limits = self.limits
+        slow = limits.slow_gap_s, limits.slow_hold_s
+        self._attitude = _Samples(limits.attitude_gap_s, limits.attitude_hold_s)
+        self._heights = {name: _Samples(*slow) for name in self._order}
+        self._local = _Samples(*slow)
 
     def add_attitude(self, time_ns: int, wxyz: Sequence[float]) -> None:
-        """A rotation from body (forward, right, down) to north, east, down; others are dropped."""
+        """Add a rotation from body (forward, right, down) to NED; invalid ones are dropped."""
         quaternion = np.array(wxyz, dtype=np.float64)
         norm = float(np.linalg.norm(quaternion))
         if not abs(norm - 1) < 0.1:  # NaN too
@@ -167,16 +175,16 @@ class TelemetryBuffer:
         quaternion /= norm
         before = self._attitude.values
         if before and float(before[-1] @ quaternion) < 0:
-            quaternion = -quaternion  # the same attitude, on the near side
+            quaternion = -quaternion  # the same attitude, for the shorter interpolation
         self._attitude.add(time_ns, quaternion, self._keep_ns)
 
     def add_height(self, source: str, time_ns: int, height_m: float) -> None:
-        """A height of one of `HEIGHT_SOURCES`; what is no number is dropped."""
+        """Add a height from one of `HEIGHT_SOURCES`; values that are not finite are dropped."""
         if source in self._heights and math.isfinite(height_m):
             self._heights[source].add(time_ns, np.array([height_m]), self._keep_ns)
 
     def add_distance(self, time_ns: int, distance_m: float) -> None:
-        """A distance along the axis of the body down to flat ground, as a height."""
+        """Add a distance along the body's down axis, converted to a height over flat ground."""
         found = self._attitude.values[-1] if self._attitude.values else None
         if found is not None:
             down = _matrix(found)[2, 2]
@@ -184,23 +192,18 @@ class TelemetryBuffer:
                 self.add_height("distance", time_ns, distance_m * float(down))
 
     def add_local(self, time_ns: int, velocity_ned_mps: Triple, down_m: float) -> None:
-        """Velocity and height in the autopilot's local frame."""
+        """Add velocity and down position of the autopilot's local frame."""
         values = np.array([*velocity_ned_mps, down_m])
         if np.isfinite(values).all():
             self._local.add(time_ns, values, self._keep_ns)
 
     @property
-    def newest_ns(self) -> int | None:
-        """Time of the last attitude, None where there is none."""
-        return self._attitude.times[-1] if self._attitude.times else None
-
-    @property
     def covered_ns(self) -> int | None:
-        """Up to when the attitude is known: a little longer than told, None where there is none."""
+        """Time up to which the attitude is known, extrapolation included; None without any."""
         return self._attitude.covered_ns(self._ahead_ns) if self._attitude.times else None
 
-    def at(self, time_ns: int) -> Told:
-        """What was told of a moment, between samples by the shortest turn and a straight line."""
+    def at(self, time_ns: int) -> VehicleState:
+        """State at a time; attitudes are interpolated by slerp, other values linearly."""
         found = self._attitude.around(time_ns)
         if found is not None and time_ns > self._attitude.times[-1]:
             found = self._attitude.ahead(time_ns, self._ahead_ns) or found
@@ -208,17 +211,13 @@ class TelemetryBuffer:
         if found is not None:
             before, after, weight = found
             turn = _matrix(_slerp(before, after, weight))
-        height, source = math.nan, ""
-        for name in self._order:
-            value = self._heights[name].at(time_ns)
-            if value is not None:
-                height, source = float(value[0]), name
-                break
+        found_heights = (self._heights[name].at(time_ns) for name in self._order)
+        height = next((float(value[0]) for value in found_heights if value is not None), math.nan)
         local = self._local.at(time_ns)
         if local is None:
-            return Told(turn, height, source)
+            return VehicleState(turn, height)
         north, east, down, below = local.tolist()
-        return Told(turn, height, source, (north, east, down), below)
+        return VehicleState(turn, height, (north, east, down), below)
 
     @property
     def _ahead_ns(self) -> int:
@@ -230,13 +229,13 @@ class TelemetryBuffer:
 
 
 def wxyz_of_angles(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
-    """The quaternion w, x, y, z of an autopilot's angles (turned in the order yaw, pitch, roll)."""
+    """Quaternion w, x, y, z of an autopilot's Euler angles (rotations in the order ZYX)."""
     xyzw = Rotation.from_euler("ZYX", [yaw_rad, pitch_rad, roll_rad]).as_quat()
     return np.asarray(xyzw[[3, 0, 1, 2]])
 
 
 def _slerp(before: Array, after: Array, weight: float) -> Array:
-    """Between two quaternions on the near side of each other, along the shortest turn."""
+    """Spherical linear interpolation of two quaternions whose dot product is not negative."""
     angle = math.acos(min(1.0, float(before @ after)))
     if weight == 0.0 or angle < 1e-6:
         return before
@@ -249,64 +248,61 @@ def _matrix(wxyz: Array) -> Array:
 
 
 class ClockSync:
-    """How far the autopilot's clock is ahead of ours, in ns: its time = ours + `offset_ns`.
+    """Offset of the autopilot's clock from ours in ns: its time = our time + `offset_ns`.
 
-    From TIMESYNC exchanges, the quick ones of the last `WINDOW`; without any, from the times that
-    messages carry, of which the one that came soonest counts. A sample that is far off is left
-    out, unless others agree with it: then a clock was set, or the autopilot started anew, and all
-    begins again (`jumps`). Mutable.
+    The offset is the median over those of the last `WINDOW` TIMESYNC exchanges that had a short
+    round trip. Without exchanges it comes from the timestamps of messages: the one with the least
+    delay counts. An outlier is ignored unless others agree with it; then a clock was set or the
+    autopilot restarted, and the estimate starts again (`jumps`). Mutable.
     """
 
     WINDOW = 32
+    """Number of exchanges: half a minute at one per second."""
     LONGEST_NS = 1000 * _MS
-    """A longer round trip tells nothing."""
+    """Exchanges with a longer round trip are ignored."""
     OUTLIER_NS = 20 * _MS
     JUMP_NS = 1000 * _MS
-    """What messages carry may be off by this much: they may have waited in a queue."""
+    """Tolerance of the timestamps of messages, which may have waited in a queue."""
     AGREE = 4
+    """Number of outliers that must agree before the clock is taken to have jumped."""
     AGREE_NS = 500 * _MS
+    """Time over which they must agree."""
 
     def __init__(self) -> None:
-        self.jumps = self.rejected = 0
-        self.exchanged_ns: int | None = None
-        """When (our clock) the last exchange was good."""
+        self.jumps = 0
         self.reset()
 
     def reset(self) -> None:
-        """Begin again."""
+        """Discard all samples."""
         self.offset_ns: int | None = None
         self._exact: deque[tuple[int, int]] = deque(maxlen=self.WINDOW)  # round trip, offset
         self._rough: deque[int] = deque(maxlen=100)
-        self._suspects: list[tuple[int, int]] = []  # when it came, offset
-        self.exchanged_ns = None
+        self._suspects: list[tuple[int, int]] = []  # arrival, offset
 
     @property
     def is_exact(self) -> bool:
-        """Whether the offset rests on exchanges and not on arrival alone."""
+        """Whether the offset comes from TIMESYNC exchanges, not from times of arrival."""
         return bool(self._exact)
 
     def exchange(self, sent_ns: int, received_ns: int, reported_ns: int) -> bool:
-        """One exchange: sent and answered by our clock, what the autopilot's said between.
+        """Add an exchange; whether a clock was found to have jumped.
 
-        Whether the clocks were found to have jumped.
+        `sent_ns` and `received_ns` are times of our clock, `reported_ns` one of the autopilot's.
         """
         trip_ns = received_ns - sent_ns
         if not 0 <= trip_ns <= self.LONGEST_NS:
-            self.rejected += 1
             return False
         offset_ns = reported_ns - (sent_ns + received_ns) // 2
         if self._exact and abs(offset_ns - self._now()) > max(self.OUTLIER_NS, trip_ns):
-            self.rejected += 1
             return self._suspect(received_ns, offset_ns, self.OUTLIER_NS)
         self._suspects.clear()
         self._exact.append((trip_ns, offset_ns))
         quick_ns = 1.5 * min(trip for trip, _ in self._exact) + _MS / 5
         self.offset_ns = round(median(offset for trip, offset in self._exact if trip <= quick_ns))
-        self.exchanged_ns = received_ns
         return False
 
     def heard(self, arrived_ns: int, reported_ns: int) -> bool:
-        """A message that carries its time. Whether the clocks were found to have jumped."""
+        """Add a message that carries its time; whether a clock was found to have jumped."""
         offset_ns = reported_ns - arrived_ns
         if self.offset_ns is not None and abs(offset_ns - self._now()) > self.JUMP_NS:
             return self._suspect(arrived_ns, offset_ns, self.OUTLIER_NS * 5)
@@ -320,11 +316,11 @@ class ClockSync:
         return self.offset_ns or 0
 
     def _suspect(self, arrived_ns: int, offset_ns: int, agree_ns: int) -> bool:
-        """Note an offset that is far off; begin again there where several agree for a while."""
+        """Note an outlier; start again from it where several agree over `AGREE_NS`."""
         near = [one for one in self._suspects if abs(one[1] - offset_ns) <= agree_ns]
         self._suspects = [*near[-50:], (arrived_ns, offset_ns)]
         if len(near) + 1 < self.AGREE or arrived_ns - near[0][0] < self.AGREE_NS:
-            return False  # a queue that empties brings many at once, and each with another delay
+            return False  # a queue that empties delivers many at once, with different delays
         self.reset()
         self.offset_ns = offset_ns
         self._rough.append(offset_ns)

@@ -1,4 +1,4 @@
-"""Preparing a flight on the workstation: from orthophotos to the map that flies."""
+"""Map building on the workstation: from orthophotos to the map that flies."""
 
 from orthonav.prepare.build import BuildRequest, BuildResult, build_map
 

@@ -1,4 +1,4 @@
-"""Reading a sheet block by block, so that memory does not depend on the orthophotos."""
+"""Block-wise reading of a sheet, so that memory does not depend on the orthophotos."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class Block:
     width: int
 
     def may_matter(self, area: Area, grid: TileGrid) -> bool:
-        """Whether a tile of the area could need it (False comes only far from a route)."""
+        """Whether a tile of the area may need the block; False only far from a route."""
         if area.route is None:
             return True
         east_m = grid.west_m + (self.col + self.width / 2) * grid.gsd_m
@@ -31,12 +31,12 @@ class Block:
         return bool(area.contains(np.array([[east_m, north_m]]), reach_px * grid.gsd_m)[0])
 
     def within(self, other: "Block") -> tuple[slice, slice]:
-        """Its rows and columns in the pixels of another block that holds it."""
+        """Rows and columns of the block in the pixels of another block that contains it."""
         row, col = self.row - other.row, self.col - other.col
         return slice(row, row + self.height), slice(col, col + self.width)
 
     def cut(self, side_px: int) -> Iterator["Block"]:
-        """Its parts between the multiples of `side_px` of the raster."""
+        """Parts of the block, divided at multiples of `side_px` of the raster."""
         bottom, right = self.row + self.height, self.col + self.width
         for row in range(self.row // side_px * side_px, bottom, side_px):
             for col in range(self.col // side_px * side_px, right, side_px):
@@ -47,7 +47,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class BlockPixels:
-    """Pixels of a block and of a margin around it; the block begins at (`top`, `left`) in them."""
+    """Pixels of a block with a margin; the block begins at row `top`, column `left`."""
 
     block: Block
     pixels: GreyPixels
@@ -55,7 +55,7 @@ class BlockPixels:
     left: int
 
     def part(self, beyond_px: int = 0) -> tuple[slice, slice]:
-        """Rows and columns of the block in the pixels, `beyond_px` more to south and east."""
+        """Rows and columns of the block in the pixels, with `beyond_px` more to south and east."""
         return (
             slice(self.top, self.top + self.block.height + beyond_px),
             slice(self.left, self.left + self.block.width + beyond_px),
@@ -71,7 +71,7 @@ def blocks_of(grid: TileGrid, side_px: int) -> Iterator[Block]:
 
 
 def margins(grid: TileGrid, block: Block, margin_px: int) -> tuple[int, int, int, int]:
-    """Top, left, bottom, right: up to `margin_px` around a block, less where the raster ends."""
+    """Top, left, bottom, right margin of a block: `margin_px`, less at the raster border."""
     return (
         min(margin_px, block.row),
         min(margin_px, block.col),
@@ -89,7 +89,7 @@ def read_block(raster: SheetRaster, grid: TileGrid, block: Block, margin_px: int
 
 
 class Preview:
-    """A small grey picture of a sheet, at most `across_px` wide or high, filled by blocks."""
+    """A grey overview of a sheet, at most `across_px` wide or high, filled block by block."""
 
     def __init__(self, grid: TileGrid, across_px: int) -> None:
         self._scale = min(1.0, across_px / max(grid.width_px, grid.height_px))
@@ -97,11 +97,11 @@ class Preview:
         self._grey = np.zeros((max(1, round(height)), max(1, round(width))), np.uint8)
 
     def small(self, read: BlockPixels) -> NDArray[np.uint8]:
-        """What it needs of a block: (h, w), nothing where that is less than a pixel."""
+        """The overview of a block: (h, w), empty if it is smaller than a pixel."""
         return self.small_of(read.block, read.pixels.grey[read.part()])
 
     def small_of(self, block: Block, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The same from a picture of the block at its resolution or a coarser one."""
+        """The same from an image of the block at its resolution or a coarser one."""
         y0, y1, x0, x1 = self._edges(block)
         if y1 <= y0 or x1 <= x0:
             return np.zeros((0, 0), np.uint8)
@@ -109,19 +109,19 @@ class Preview:
         return np.asarray(small, dtype=np.uint8)
 
     def put(self, block: Block, small: NDArray[np.uint8]) -> None:
-        """Take in what `small` made of a block."""
+        """Insert the result of `small` for a block."""
         if small.size:
             y0, y1, x0, x1 = self._edges(block)
             self._grey[y0:y1, x0:x1] = small
 
     def _edges(self, block: Block) -> tuple[int, int, int, int]:
-        """Top, bottom, left, right of a block in the picture."""
+        """Top, bottom, left, right of a block in the overview."""
         rows, cols = self._grey.shape
         y0, y1 = (round(edge * self._scale) for edge in (block.row, block.row + block.height))
         x0, x1 = (round(edge * self._scale) for edge in (block.col, block.col + block.width))
         return y0, min(y1, rows), x0, min(x1, cols)
 
     def jpeg(self) -> NDArray[np.uint8]:
-        """The picture as bytes of a JPEG."""
+        """The overview as bytes of a JPEG."""
         encoded = cv2.imencode(".jpg", self._grey, [int(cv2.IMWRITE_JPEG_QUALITY), 70])[1]
         return np.asarray(encoded, dtype=np.uint8).reshape(-1)

@@ -1,13 +1,12 @@
-"""Confidence of a new map, learnt from its own imagery: where would changed views be placed?
+"""Calibration of the confidence of tile matches from the imagery of the map itself.
 
-Views are cut from the reference at random places and changed as years change them: light,
-contrast, blur, noise, heading and height errors, and up to two thirds of the picture replaced by
-another place. Mirrored views stand for places that are not on the map: no place looks like the
-mirror image of another. Both are searched, and a logistic regression learns which were right.
-This is cautious rather than exact: it knows no second date.
+Views are cropped from the reference at random positions with simulated ageing: light, contrast,
+blur, noise, heading and height errors, and up to two thirds of the image replaced by another
+position. Mirrored views serve as negatives: no place is the mirror image of another. Both are
+searched, and a logistic regression is fitted to the outcome. The result is conservative rather than
+exact, because no second date is used.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,26 +16,33 @@ from numpy.typing import NDArray
 
 from orthonav.confidence.logistic import FEATURES, LogisticConfidence, fit_logistic
 from orthonav.embed.contract import ViewEmbedder
+from orthonav.files import Progress
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.match import TileMatcher
 
 CROPS = 192
+"""Views searched; seconds per map."""
 SLOW_CROPS = 32
+"""The same for representations that take minutes per view."""
 CROP_TILES = 1.5
+"""Width of a crop in tiles: a rotated tile fits into it."""
 HEADING_STD_DEG = 5.0
 SCALE_STD = 0.05
+"""Errors of heading and height: those of the benchmarks."""
 MAX_REPLACED = 0.65
 MIRRORED_WEIGHT = 0.25
-ELSEWHERE_SHARE = 0.25
-"""Share of changes that paste in another place of the map rather than none of it."""
+"""Weight of a mirrored view; a flight sees fewer places outside the map than inside."""
+PASTED_SHARE = 0.25
+"""Share of replacements by another position of the map; the others are mirrored."""
 RADIUS_STRIDES = 0.75
-"""A fix is right where it lies within this many strides of the truth."""
+"""A fix is correct if its error is below this many strides."""
 MIN_RIGHT = 10
+"""Fewest correct fixes for a fit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """Grey levels (S, S) cut from the reference, and where its centre lies on the sheet."""
+    """Grey levels (S, S) cropped from the reference, and the pixel position of its centre."""
 
     grey: NDArray[np.uint8]
     row_px: float
@@ -44,15 +50,19 @@ class Crop:
 
 
 @dataclass(frozen=True)
-class Calibration:
-    """What was learnt: the confidence (None if nothing could be) and the error when right."""
+class TileCalibration:
+    """Calibration of tile matches.
+
+    `confidence`: None if too little could be learned. `position_std_m`: standard deviation per axis
+    of a correct fix.
+    """
 
     confidence: LogisticConfidence | None
     position_std_m: float
 
 
 class CropSampler:
-    """Collects crops at random places from blocks of imagery as they pass by."""
+    """Collects crops at random positions from a stream of blocks of imagery."""
 
     def __init__(self, tile_px: int, seed: int) -> None:
         self._rng = np.random.default_rng([seed, 1])
@@ -61,10 +71,10 @@ class CropSampler:
         self.crops: list[Crop] = []
 
     def places(self, height: int, width: int, share: float) -> NDArray[np.intp]:
-        """First pixels (row, col), (N, 2), of crops to be cut from a block of imagery, at random.
+        """Random first pixels (row, col), (N, 2), of crops in a block.
 
-        `share` is the part of all imagery that this block is. They do not depend on what it shows,
-        so that blocks may be read in any order once places were drawn for all.
+        `share`: size of the block as a share of all imagery. Independent of the imagery, so that
+        blocks may be read in any order once positions are drawn for all.
         """
         size = self._crop_px(height, width)
         if size < self._tile_px:
@@ -78,21 +88,21 @@ class CropSampler:
     def cut(
         self, grey: NDArray[np.uint8], valid: NDArray[np.bool_], places: NDArray[np.intp]
     ) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-        """Crops (N, S, S) of a block at those of the places that show something, and which."""
+        """Crops (N, S, S) of a block at valid positions with contrast; these positions (N, 2)."""
         size = self._crop_px(*grey.shape)
         crops = np.zeros((len(places), size, size), np.uint8)
-        kept: list[tuple[int, int]] = []
+        found: list[tuple[int, int]] = []
         for row, col in places:
             part = np.s_[row : row + size, col : col + size]
             if valid[part].all() and grey[part].std() > 1:
-                crops[len(kept)] = grey[part]
-                kept.append((row, col))
-        return crops[: len(kept)], np.array(kept, np.intp).reshape(-1, 2)
+                crops[len(found)] = grey[part]
+                found.append((row, col))
+        return crops[: len(found)], np.array(found, np.intp).reshape(-1, 2)
 
     def take(
         self, crops: NDArray[np.uint8], places: NDArray[np.intp], row_px: int, col_px: int
     ) -> None:
-        """Keep the crops of a block whose first pixel is (row_px, col_px) of the sheet."""
+        """Add the crops of a block whose first pixel is (row_px, col_px) of the sheet."""
         for grey, (row, col) in zip(crops, places.tolist(), strict=True):
             if len(self.crops) < 2 * CROPS:
                 half = grey.shape[0] / 2
@@ -110,13 +120,13 @@ def calibrate(
     embeddings: NDArray[np.float16],
     centres_en_m: NDArray[np.float32],
     heading_step_deg: float,
-    report: Callable[[str, float], None],
+    progress: Progress,
     *,
     slow: bool = False,
-) -> Calibration:
+) -> TileCalibration:
     """Search changed and mirrored crops on the new map and fit the confidence to the outcome.
 
-    A `slow` representation, minutes a crop, is tried on `SLOW_CROPS` only.
+    A `slow` representation (minutes per crop) is tried on `SLOW_CROPS` only.
     """
     rng = np.random.default_rng([len(sampler.crops), 2])
     matcher = TileMatcher(grid, centres_en_m, embeddings)
@@ -125,7 +135,7 @@ def calibrate(
     features, errors, mirrored = [], [], []
     for done, crop in enumerate(crops):
         other = crops[int(rng.integers(len(crops)))].grey
-        if rng.random() > ELSEWHERE_SHARE:
+        if rng.random() > PASTED_SHARE:
             other = other[:, ::-1]
         for mirror in (False, True):
             picture = crop.grey[:, ::-1] if mirror else crop.grey
@@ -139,7 +149,7 @@ def calibrate(
             ]
             errors.append(centres_en_m[match.tile] + np.array(match.shift_en_m) - truth)
             mirrored.append(mirror)
-        report("calibrate", (done + 1) / len(crops))
+        progress("calibrate", (done + 1) / len(crops))
     return _fitted(np.array(features), np.array(errors), np.array(mirrored, dtype=bool), grid)
 
 
@@ -148,8 +158,8 @@ def _fitted(
     errors_en_m: NDArray[np.float64],
     mirrored: NDArray[np.bool_],
     grid: TileGrid,
-) -> Calibration:
-    fallback = Calibration(None, grid.stride_m)
+) -> TileCalibration:
+    fallback = TileCalibration(None, grid.stride_m)
     if len(features) == 0:
         return fallback
     near = np.hypot(*errors_en_m.T) <= RADIUS_STRIDES * grid.stride_m
@@ -159,13 +169,13 @@ def _fitted(
     weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)
     confidence = fit_logistic(features, right, weight)
     std_m = float(np.sqrt(np.mean(errors_en_m[right] ** 2)))
-    return Calibration(confidence, max(std_m, grid.gsd_m))
+    return TileCalibration(confidence, max(std_m, grid.gsd_m))
 
 
 def changed_picture(
     rng: np.random.Generator, grey: NDArray[np.uint8], other: NDArray[np.uint8]
 ) -> NDArray[np.uint8]:
-    """`grey` (S, S) as another year might show it: light, blur, noise, places that changed."""
+    """`grey` (S, S) with simulated ageing: light, blur, noise, replaced parts."""
     size = grey.shape[0]
     other = np.asarray(cv2.resize(other, (size, size)), dtype=np.uint8)
     mask = cv2.resize(
@@ -187,7 +197,7 @@ def _queries(
     embedder: ViewEmbedder,
     heading_step_deg: float,
 ) -> NDArray[np.float32]:
-    """Embeddings (3, D) of the middle of a picture under the headings the localizer would try."""
+    """Embeddings (3, D) of the centre of an image at the headings that the localizer tries."""
     heading = rng.normal(0, HEADING_STD_DEG)
     scale = float(np.exp(rng.normal(0, SCALE_STD)))
     size, middle = grid.tile_px, (picture.shape[0] - 1) / 2

@@ -1,13 +1,13 @@
-"""Confidence of registered views on a new map: where would views of another year be placed?
+"""Calibration of the confidence of registered views on a new map.
 
-Views are cut from the reference at random places, sizes, headings and heights and changed as years
-change them (`change`), or cut from another date of the same ground where one is given. Mirrored
-views stand for places that are not on the map: no place looks like the mirror image of another.
-All are placed by the very localizer that flies; a logistic regression learns which were right.
+Views are cropped from the reference at random positions, sizes, headings and heights with simulated
+ageing (`change`), or from another date of the same area if one is given. Mirrored views serve as
+negatives: no place is the mirror image of another. All are located by the localizer that flies, and
+a logistic regression is fitted to the outcome.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,37 +15,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.confidence.registered import Chances, RegisteredConfidence, fit_registered
+from orthonav.files import Progress
 from orthonav.geo.camera import Camera
 from orthonav.geo.grid import TileGrid
-from orthonav.localizer.registration import PRIOR_SIGMAS, RegistrationLocalizer
+from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.prepare.calibrate import Crop
 from orthonav.prepare.change import changed
-from orthonav.records import NoFix, Prior, Telemetry, View
+from orthonav.records import PRIOR_SIGMAS, NoFix, Prior, Telemetry, View
+from orthonav.register.pose import rotation
 
 YAW_STD_DEG = 5.0
 AGL_STD = 0.05
+"""Errors of heading and height (a share): those of the benchmarks."""
 FOCAL_PX = 1000.0
+"""Any value: views have the resolution of the map, and only the ratio to the height matters."""
 SIDES = (0.55, 1.0)
 """Long side of a view, from and to, in tiles; the short side is three quarters of it."""
 MIN_RIGHT, ENOUGH_RIGHT = 10, 12
+"""Fewest correct views for a fit; with fewer, views are added until the second number."""
 MORE_VIEWS = 3
-"""Where fewer than the least are right, up to so many times as many views are tried."""
+"""Additional views at most, as a multiple of the requested number."""
 FLOOR_PX = 0.6
-"""Standard deviation per axis, in pixels, with which orthophotos of two dates usually agree."""
+"""Usual standard deviation per axis, in pixels, between orthophotos of two dates."""
 FLOOR_LIMITS_PX = (0.25, 3.0)
 MIRRORED_WEIGHT = 1.0
 WHOLE_PX, SEARCHED_PX = 6144, 4096
 """Maps larger than a square of the first are searched in a square of the second for each view: on
-a map of 50 x 5 km the whole took 7 GB and minutes a view, and of views changed as much as these too
-few were found to learn from (4 of 24 on 10 x 5 km; 9 of 24 in the square)."""
+a map of 50 x 5 km a full search took 7 GB and minutes per view, and too few views were found for a
+fit (4 of 24 on 10 x 5 km; 9 of 24 in the square)."""
 FALLBACK_CHANCE = 40.0
+"""Score of a chance match if no negative has one."""
 USUAL_FINE, USUAL_FINE_VIEWS = 1.45, 8.0
-"""With one more level chance scores so many times as much; that counts like so many views."""
+"""Prior of the ratio by which one more level raises the score of a chance match, and its weight in
+views."""
 
 
 @dataclass(frozen=True)
 class RegistrationCalibration:
-    """The confidence (None if too little could be learnt) and the floor of the covariance."""
+    """Calibration of registration.
+
+    `confidence`: None if too little could be learned. `floor_px`: lower bound of the reported
+    standard deviation per axis, pixels.
+    """
 
     confidence: RegisteredConfidence | None
     floor_px: float
@@ -68,9 +79,9 @@ def calibrate_registration(
     other_dates: Sequence[Crop],
     views: int,
     seed: int,
-    report: Callable[[str, float], None],
+    progress: Progress,
 ) -> RegistrationCalibration:
-    """Place changed, mirrored and other-date views and fit the confidence to the outcome."""
+    """Locate changed, mirrored and other-date views and fit the confidence to the outcome."""
     rng = np.random.default_rng([seed, 3])
     order = rng.permutation(len(crops))
     chosen = [crops[i] for i in order[:views]]
@@ -81,16 +92,16 @@ def calibrate_registration(
     outcomes: list[_Outcome] = []
 
     def place(crop: Crop, mirror: bool, other_date: bool) -> None:
-        # What replaces parts of a view is mirrored: as it is, it would be found where it is from.
-        stranger = crops[int(rng.integers(len(crops)))].grey[:, ::-1]
-        outcome = _placed(rng, localizer, crop, stranger, mirror, other_date)
+        # The replacement is mirrored: unmirrored it would be found at its own position.
+        negative = crops[int(rng.integers(len(crops)))].grey[:, ::-1]
+        outcome = _placed(rng, localizer, crop, negative, mirror, other_date)
         if outcome is not None:
             outcomes.append(outcome)
 
     for done, each in enumerate(work):
         place(*each)
-        report("calibrate registration", (done + 1) / len(work))
-    # On a large map few are placed right: some more, rather than no confidence at all.
+        progress("calibrate registration", (done + 1) / len(work))
+    # Few views are correct on a large map: add some, rather than give up on a confidence.
     wanted = ENOUGH_RIGHT if _right(outcomes, radius_px) < MIN_RIGHT else 0
     spare = order[views : (1 + MORE_VIEWS) * views] if views >= MIN_RIGHT else order[:0]
     for index in spare:
@@ -108,27 +119,27 @@ def _placed(
     rng: np.random.Generator,
     localizer: RegistrationLocalizer,
     crop: Crop,
-    stranger: NDArray[np.uint8],
+    negative: NDArray[np.uint8],
     mirror: bool,
     other_date: bool,
 ) -> _Outcome | None:
-    """Where one view made of a crop is placed; None if nowhere."""
+    """Outcome of locating one view generated from a crop; None if there is no fix."""
     picture = np.ascontiguousarray(crop.grey[:, ::-1]) if mirror else crop.grey
     if not other_date:
-        picture = changed(rng, picture, stranger)
-    prepared = localizer.prepared(_view(rng, picture, localizer.grid), True)
-    prior = _prior(rng, localizer, crop)
-    best = None if isinstance(prepared, NoFix) else localizer.best(prepared, prior)
-    if best is None:
+        picture = changed(rng, picture, negative)
+    view = _view(rng, picture, localizer.grid)
+    seen = localizer.register(view, _prior(rng, localizer, crop))
+    if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
         return None
+    best = seen.found
     error = np.array([best.placed.pose.x_px - crop.col_px, best.placed.pose.y_px - crop.row_px])
     return _Outcome(best.evidence(), error, mirror, other_date)
 
 
 def _prior(rng: np.random.Generator, localizer: RegistrationLocalizer, crop: Crop) -> Prior | None:
-    """The square of a large map that is searched, with the crop somewhere in its middle half.
+    """Prior that limits the search on a large map to a square with the crop in its middle half.
 
-    None for all of the map.
+    None searches the whole map.
     """
     grid = localizer.grid
     if grid.height_px * grid.width_px <= WHOLE_PX**2:
@@ -146,8 +157,7 @@ def _view(rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid) 
     width = max(16, round(longest * rng.uniform(*SIDES)))
     height = max(12, round(width * 0.75))
     yaw_deg = rng.uniform(0, 360)
-    cos, sin = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
-    linear = np.array([[cos, -sin], [sin, cos]])
+    linear = rotation(math.radians(yaw_deg))
     move = np.full(2, (size - 1) / 2) - linear @ [(width - 1) / 2, (height - 1) / 2]
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     matrix = np.column_stack([linear, move])
@@ -168,7 +178,7 @@ def _view(rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid) 
 
 
 def _fitted(outcomes: Sequence[_Outcome], radius_px: float) -> RegistrationCalibration:
-    """The confidence of errors below a radius, and from other dates the floor of the covariance."""
+    """The confidence of errors below a radius, and the floor from views of other dates."""
     if not outcomes:
         return RegistrationCalibration(None, FLOOR_PX)
     mirrored = np.array([each.mirrored for each in outcomes])
@@ -183,16 +193,16 @@ def _fitted(outcomes: Sequence[_Outcome], radius_px: float) -> RegistrationCalib
     if right.sum() < MIN_RIGHT or not mirrored.any():
         return RegistrationCalibration(None, floor_px)
     evidence = [each.evidence for each in outcomes]
-    lost = [each for each, known in zip(evidence, mirrored, strict=True) if known]
-    total, look = _median(lost, "strength"), _median(lost, "look")
-    chances = Chances(total, look, _fine_chance(lost, total))
+    negatives = [each for each, known in zip(evidence, mirrored, strict=True) if known]
+    total, look = _median(negatives, "strength"), _median(negatives, "look")
+    chances = Chances(total, look, _fine_chance(negatives, total))
     weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)
     confidence = fit_registered(evidence, right, weight, chances)
     return RegistrationCalibration(confidence, floor_px)
 
 
 def _fine_chance(evidence: Sequence[Mapping[str, float]], total: float) -> float:
-    """What chance gives with one more level: from few views, if any, so drawn to what is usual."""
+    """Score of a chance match with one more level, shrunk towards the usual value."""
     known = sum(math.isfinite(each["fine"]) for each in evidence)
     usual = USUAL_FINE * total
     if not known:
@@ -202,6 +212,6 @@ def _fine_chance(evidence: Sequence[Mapping[str, float]], total: float) -> float
 
 
 def _median(evidence: Sequence[Mapping[str, float]], name: str) -> float:
-    """Median of one number of the evidence where it is known, at least 1."""
+    """Median of one number of the evidence over the views that have it, at least 1."""
     values = [each[name] for each in evidence if math.isfinite(each[name])]
     return max(float(np.median(values)), 1.0) if values else FALLBACK_CHANCE

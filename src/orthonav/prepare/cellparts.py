@@ -1,8 +1,8 @@
-"""Means of micro-cells as parts of a map: what new tiles are embedded from without the imagery.
+"""Means of micro-cells as parts of a map, from which new tiles are embedded without imagery.
 
-The numbers of a cell are kept as shares of its largest one, in a byte each, beside that one: nine
-bytes for the seven of oriented gradients. A rounding error is at most 0.4 % of the largest; a tile
-sums over dozens of cells for each of its numbers.
+The numbers of a cell are quantized to a byte each, relative to the largest, which is stored as a
+float16: nine bytes for the seven of oriented gradients. The rounding error is at most 0.4 % of the
+largest; each number of a tile sums over dozens of cells.
 """
 
 from typing import Any
@@ -22,7 +22,7 @@ _SMALLEST = float(np.finfo(np.float16).tiny)
 
 
 def cell_parts(cells: CellSheet, sheet: int = 0) -> dict[str, NDArray[Any]]:
-    """Parts of a map that keep the means of a sheet's cells, and their shares where not all 1."""
+    """Map parts with the cell means of a sheet, and the valid shares unless all are 1."""
     codes = np.full(cells.means.shape, MIDDLE, dtype=np.uint8)
     scale = np.zeros(cells.valid.shape, dtype=np.float16)
     valid = np.zeros(cells.valid.shape, dtype=np.uint8)
@@ -32,17 +32,17 @@ def cell_parts(cells: CellSheet, sheet: int = 0) -> dict[str, NDArray[Any]]:
         scale[rows] = np.abs(means).max(axis=2) / LEVELS
         unit = np.maximum(scale[rows].astype(np.float32), _SMALLEST)[..., None]
         codes[rows] = np.clip(np.rint(means / unit) + MIDDLE, MIDDLE - LEVELS, WHOLE)
-        valid[rows] = cells.valid[rows] * WHOLE + 1e-3  # cut off: only what is whole counts as such
+        valid[rows] = cells.valid[rows] * WHOLE + 1e-3  # truncated: only complete cells get 255
     names = _names(sheet)
     parts: dict[str, NDArray[Any]] = {names["codes"]: codes, names["scale"]: scale}
     return parts if (valid == WHOLE).all() else {**parts, names["valid"]: valid}
 
 
 class StoredCells:
-    """Means of a sheet's cells in an opened map. May be shared between threads."""
+    """Cell means of a sheet in an opened map. May be shared between threads."""
 
     def __init__(self, opened: MapFile, layout: CellLayout, channels: int, sheet: int = 0) -> None:
-        """Use `of`. Raises `MapFileError` where the parts do not fit the manifest."""
+        """Use `of`. Raises `MapFileError` if the parts do not fit the manifest."""
         grid = opened.manifest.sheets[sheet].grid
         names = _names(sheet)
         self.layout = layout
@@ -62,9 +62,9 @@ class StoredCells:
     def of(
         cls, opened: MapFile, layout: CellLayout, channels: int, sheet: int = 0
     ) -> "StoredCells | None":
-        """The cells of a sheet; None where the map has none.
+        """The cells of a sheet; None if the map has none.
 
-        Raises `MapFileError` where they are not those of its grid.
+        Raises `MapFileError` if they do not fit its grid.
         """
         there = _names(sheet)["codes"] in opened.arrays
         return cls(opened, layout, channels, sheet) if there else None
@@ -74,7 +74,7 @@ class StoredCells:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Means (height, width, C) and shares (height, width) of the window at (row, col).
 
-        It may reach beyond the sheet or lie outside: there both are 0.
+        It may reach beyond the sheet or lie outside it, where both are 0.
         """
         channels = self._codes.shape[2]
         means = np.zeros((max(height, 0), max(width, 0), channels), dtype=np.float32)

@@ -1,13 +1,13 @@
-"""A picture of the ground as another year might show it."""
+"""Simulated ageing of an image of the ground."""
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 MAX_REPLACED = 0.75
-"""Largest share of a view that is replaced."""
+"""Largest replaced share of a view."""
 MAX_MIXED = 0.85
-"""Largest share of a stranger's detail in what is left."""
+"""Largest share of detail mixed in from the other image."""
 
 
 def changed(
@@ -18,26 +18,26 @@ def changed(
     most_replaced: float = MAX_REPLACED,
     most_mixed: float = MAX_MIXED,
 ) -> NDArray[np.uint8]:
-    """`grey` (S, S) uint8 with what years change.
+    """`grey` (S, S) uint8 with the changes of years.
 
-    `other` is a picture of ground that must not be found on the map itself. Parts are erased and
-    replaced by it, and its detail is mixed into the rest; fields change their brightness and
-    contrast, some turn it around; light, blur and noise are others. At most the share
-    `most_replaced` is erased and `most_mixed` of the stranger's detail mixed into the rest.
+    `other` is an image that must not occur on the map. Parts are replaced by it, and its detail is
+    mixed into the rest; brightness and contrast of fields change, some invert their contrast;
+    light, blur and noise differ. `most_replaced`: largest replaced share (0..1). `most_mixed`:
+    largest weight of the detail of `other` in the rest (0..1).
     """
     size = grey.shape[0]
-    stranger = np.asarray(cv2.resize(other, (size, size)), dtype=np.float32)
+    resized = np.asarray(cv2.resize(other, (size, size)), dtype=np.float32)
     own, own_broad = _detail(grey.astype(np.float32), size)
-    strange, strange_broad = _detail(stranger, size)
+    foreign, foreign_broad = _detail(resized, size)
     mask = _smooth(rng, size, int(rng.integers(3, 12)))
     replaced = mask < np.quantile(mask, rng.uniform(0, most_replaced))
     gain = 0.35 + 0.9 * _smooth(rng, size, 6)
     turned = _smooth(rng, size, 5) > rng.uniform(0.55, 1.1)
     mixed = rng.uniform(0, most_mixed)
     detail = (1 - mixed) * own * np.where(turned, -gain, gain)
-    # The stranger's detail turned upside down is another one, so that both are not the same.
-    detail = np.where(replaced, strange, detail + mixed * strange[::-1])
-    light = np.where(replaced, strange_broad, own_broad) + 40 * (_smooth(rng, size, 4) - 0.5)
+    # Flipped, so that replaced and mixed parts show different detail.
+    detail = np.where(replaced, foreign, detail + mixed * foreign[::-1])
+    light = np.where(replaced, foreign_broad, own_broad) + 40 * (_smooth(rng, size, 4) - 0.5)
     tone = np.power(np.clip(light + detail, 0, 255) / 255, rng.uniform(0.6, 1.7))
     blurred = np.asarray(cv2.GaussianBlur(tone, (0, 0), float(rng.uniform(0.3, 1.4))))
     exposed = blurred * 255 * rng.uniform(0.6, 1.25)
@@ -48,7 +48,7 @@ def changed(
 def _detail(
     picture: NDArray[np.float32], size: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """A picture (S, S) less its broad light, and that light."""
+    """High-pass and low-pass part of an image (S, S)."""
     broad = np.asarray(cv2.GaussianBlur(picture, (0, 0), size / 16), dtype=np.float32)
     return picture - broad, broad
 

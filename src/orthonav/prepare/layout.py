@@ -1,4 +1,4 @@
-"""How an area is laid out in tiles: resolution, grid, and which of its tiles are worth having."""
+"""Layout of an area in tiles: resolution, grid, and tiles with enough imagery."""
 
 import logging
 
@@ -14,15 +14,16 @@ from orthonav.geo.grid import TileGrid
 log = logging.getLogger(__name__)
 
 MIN_TILE_VALID_SHARE = 0.5
+"""Tiles with less imagery are omitted: no view can match most of them."""
 _TILES_AT_ONCE = 2**17
 
 
 def grid_of(
     area: Area, imagery_gsd_m: float, gsd_m: float | None, tile_px: int, overlap: float
 ) -> TileGrid:
-    """The tile grid; `gsd_m` None takes the imagery's.
+    """The tile grid of an area; `gsd_m` None uses the resolution of the imagery.
 
-    Raises `AreaError` for tiles larger than an area that is not the band of a route.
+    Raises `AreaError` if tiles are larger than an area without a route.
     """
     gsd_m = _rounded(imagery_gsd_m) if gsd_m is None else gsd_m
     overlap = _whole_cells(tile_px, overlap)
@@ -43,7 +44,7 @@ def grid_of(
 
 
 def _rounded(gsd_m: float) -> float:
-    """Ground resolution as people state it: 5.002 is 5, 0.2431 stays 0.243."""
+    """Ground resolution rounded to few digits: 5.002 to 5, 0.2431 to 0.243."""
     for digits in (1, 2, 3):
         rounded = float(f"{gsd_m:.{digits}g}")
         if abs(rounded / gsd_m - 1) < 0.005:
@@ -52,9 +53,9 @@ def _rounded(gsd_m: float) -> float:
 
 
 def _whole_cells(tile_px: int, overlap: float) -> float:
-    """The overlap that makes tiles whole micro-cells apart, where they are at least one apart.
+    """The overlap adjusted so that the stride is a multiple of a micro-cell, if it is at least one.
 
-    Tiles then share all their cells; memory would grow with the square of what is left over.
+    Tiles then share all their cells; otherwise memory would grow with the square of the ratio.
     """
     micro_px = max(1, tile_px // MICRO)
     stride_px = tile_px * (1 - overlap)
@@ -64,9 +65,9 @@ def _whole_cells(tile_px: int, overlap: float) -> float:
 
 
 def tiles_of(area: Area, grid: TileGrid, cells: CellSheet) -> NDArray[np.intp]:
-    """Grid rows and columns (N, 2) of the tiles that lie in the area and have imagery.
+    """Grid rows and columns (N, 2) of the tiles in the area that have imagery.
 
-    Raises `AreaError` where there are none.
+    Raises `AreaError` if there are none.
     """
     tiles = np.concatenate(_inside(area, grid))
     share = cells.valid_share(tiles * grid.stride_px)
@@ -82,7 +83,7 @@ def tiles_of(area: Area, grid: TileGrid, cells: CellSheet) -> NDArray[np.intp]:
 
 
 def _inside(area: Area, grid: TileGrid) -> list[NDArray[np.intp]]:
-    """The tiles (N, 2) in the area, by rows, some rows at a time: the box may be mostly empty."""
+    """The tiles (N, 2) in the area, a few rows at a time: the box may be mostly empty."""
     reach_m = grid.stride_m * np.sqrt(0.5)
     step = max(1, _TILES_AT_ONCE // grid.cols)
     found = []

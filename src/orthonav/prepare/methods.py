@@ -1,4 +1,4 @@
-"""Methods and what they look at, as the command line names them."""
+"""Methods and their default representations, as named on the command line."""
 
 import logging
 from typing import Any
@@ -18,27 +18,29 @@ LOCAL_FIELDS = ("weights", "cache")
 
 
 def usual_edges(method: str) -> str:
-    """What a method looks at unless told: the paper's choices for its methods."""
+    """The default representation of a method; for methods of the paper, its choice."""
     name = method.partition(":")[0]
     return {"autoencoder": "canny", "triplet": "gray", "bovw": "gray"}.get(name, "gradient")
 
 
 def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderRecipe:
-    """The method's recipe; one-channel pictures are whitened on finer cells by default."""
+    """The recipe of a method; one-channel images are whitened on finer cells by default."""
     name, _, parameters = method.partition(":")
     if name == "gradient" and representation.channels == 1 and "cells=" not in parameters:
         method = f"{name}:{parameters},cells=16"
     recipe = make_variant(embed.TABLE, method)
     assert isinstance(recipe, WhitenedRecipe | AutoEncoderRecipe | TripletRecipe | WordsRecipe)
     if isinstance(recipe, WordsRecipe) and not isinstance(representation, Gray):
-        raise VariantError("visual words are of grey levels: give --edges gray, or none, with bovw")
+        raise VariantError("bovw needs grey levels; give --edges gray, or omit --edges")
     if not represent.TABLE[_name_of(representation)].flies:
-        log.warning("%s is too slow to fly: this map is for experiments", _name_of(representation))
+        log.warning(
+            "%s is too slow for flight: this map is for experiments", _name_of(representation)
+        )
     return recipe
 
 
 def stored_representation(representation: Any) -> dict[str, Any]:
-    """Its recipe for a manifest, without what is this machine's alone: paths and devices."""
+    """Recipe of a representation for a manifest, without local paths and devices."""
     recipe = variant_recipe(represent.TABLE, representation)
     return {name: "" if name in LOCAL_FIELDS else value for name, value in recipe.items()}
 

@@ -1,6 +1,7 @@
-"""Work shared among threads, its results in order: NumPy, OpenCV and GDAL let go of Python's lock.
+"""Ordered results of work in threads; NumPy, OpenCV and GDAL release the interpreter lock.
 
-Each thread opens what it works with for itself, because GDAL's datasets belong to one thread.
+`ThreadPoolExecutor.map` is not used: it submits all items at once, which would fill memory with
+results, and a GDAL dataset must be opened and closed by the thread that uses it.
 """
 
 import queue
@@ -14,7 +15,7 @@ Item = TypeVar("Item")
 Made = TypeVar("Made")
 Worker = AbstractContextManager[Callable[[Item], Made]]
 AHEAD = 2
-"""Results that may wait, beside those being made, for one that takes longer."""
+"""Finished results that may wait for a slower one."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +26,11 @@ class _Failed:
 def in_order(
     items: Sequence[Item], opened: Callable[[], Worker[Item, Made]], workers: int
 ) -> Iterator[Made]:
-    """What a worker makes of each item, in the order of the items.
+    """Results of a worker for each item, in the order of the items.
 
-    `opened` gives each thread its worker. At most `workers + AHEAD` items are begun and not yet
-    taken. The first error, in the order of the items, is raised here; then, as when the caller
-    ends early, the other threads are awaited, which finish what they are at and begin nothing new.
+    `opened` opens the worker of each thread. At most `workers + AHEAD` items are started and not
+    yet consumed. The first error, in the order of the items, is raised here. After an error, and if
+    the caller stops early, the threads finish their current items and start no new ones.
     """
     workers = min(workers, len(items))
     if workers > 1:
@@ -41,7 +42,7 @@ def in_order(
 
 
 class _Crew(Generic[Item, Made]):
-    """Threads that take items from one queue; each item has a place for what is made of it."""
+    """Threads that take items from one queue; each item has a queue for its result."""
 
     def __init__(self, items: Sequence[Item], opened: Callable[[], Worker[Item, Made]]) -> None:
         self._items, self._opened = items, opened
@@ -74,7 +75,7 @@ class _Crew(Generic[Item, Made]):
             self._todo.put(index)
 
     def _serve(self) -> None:
-        at = slice(None)  # whoever waits, until an item is begun
+        at = slice(None)  # all waiting items, until one is started
         try:
             with self._opened() as work:
                 while (index := self._todo.get()) is not None and not self._stop.is_set():

@@ -1,12 +1,12 @@
-"""The representation of a whole sheet, kept in bytes: what encoders of pictures learn from."""
+"""The representation of a whole sheet in bytes, from which encoders of images learn."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import VariantError
+from orthonav.files import Progress
 from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
 from orthonav.imagery.mosaic import Mosaic
@@ -20,14 +20,14 @@ BLOCK_PX = 1024
 class SheetPictures:
     """Grey levels or edges of a sheet, filled block by block; 1 to 2 bytes per pixel.
 
-    Raises `VariantError` for representations of several channels: encoders look at pictures.
+    Raises `VariantError` for representations of several channels, which encoders cannot use.
     """
 
     def __init__(self, grid: TileGrid, representation: Any) -> None:
         if representation.channels != 1:
             raise VariantError(
-                "this method looks at pictures of one channel: give --edges gray, canny, segments "
-                "or sam with it"
+                "this method needs a representation of one channel; give --edges gray, canny, "
+                "segments or sam"
             )
         shape = grid.height_px, grid.width_px
         self.is_grey = isinstance(representation, Gray)
@@ -38,7 +38,7 @@ class SheetPictures:
         self._grey = None if self.is_grey else np.zeros(shape, np.uint8)
 
     def parts(self, read: BlockPixels, maps: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
-        """What is kept of a block, whose representation with its margin is `maps` (1, H, W)."""
+        """The pixels of a block; `maps` (1, H, W) is its representation with the margin."""
         part = read.part()
         parts: dict[str, NDArray[Any]] = {
             "pixels": np.rint(maps[0][part] * self._scale).astype(np.uint8),
@@ -49,7 +49,7 @@ class SheetPictures:
         return parts
 
     def put(self, block: Block, parts: dict[str, NDArray[Any]]) -> None:
-        """Take in a block's `parts`."""
+        """Insert the `parts` of a block."""
         where = np.s_[block.row : block.row + block.height, block.col : block.col + block.width]
         self._pixels[0][where] = parts["pixels"]
         self._valid[where] = parts["pixels_valid"]
@@ -67,9 +67,9 @@ def read_pictures(
     area: Area,
     grid: TileGrid,
     representation: Any,
-    report: Callable[[str, float], None],
+    progress: Progress,
 ) -> SheetPictures:
-    """What another date shows of a sheet."""
+    """Images of the tiles of a sheet at another date."""
     pictures = SheetPictures(grid, representation)
     blocks = [block for block in blocks_of(grid, BLOCK_PX) if block.may_matter(area, grid)]
     with mosaic.grid_sheet(area.frame, grid) as raster:
@@ -78,5 +78,5 @@ def read_pictures(
             if read.pixels.valid.any():
                 maps = representation(read.pixels.grey, read.pixels.valid)
                 pictures.put(block, pictures.parts(read, maps))
-            report("other date", (done + 1) / len(blocks))
+            progress("other date", (done + 1) / len(blocks))
     return pictures

@@ -1,14 +1,13 @@
-"""Reading a sheet: blocks of imagery in, what the map is made of out.
+"""Reading a sheet: from blocks of imagery to cell means, crops and the registration layer.
 
-Blocks are read, represented and compressed by several threads, each with its own datasets; what
-comes of them is taken in their order, so the map is the same for any number of threads. What comes
-of a block is a dictionary of arrays, which can be kept in a folder: a build that was killed goes on
-from there.
+Blocks are read, represented and compressed by several threads, each with its own datasets; results
+are collected in the order of the blocks, so the map is the same for any number of threads. The
+result of a block is a dictionary of arrays, which can be cached in a folder: an interrupted build
+resumes from it.
 """
 
 import logging
 import math
-import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -21,16 +20,18 @@ import rasterio
 from numpy.typing import NDArray
 
 from orthonav import __version__, represent
+from orthonav.cores import usable_cores
 from orthonav.embed.cells import CellLayout, cell_means
 from orthonav.embed.whitened import CellSheet
 from orthonav.errors import AreaError
+from orthonav.files import Progress
 from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
 from orthonav.imagery.mosaic import Mosaic, SheetRaster
 from orthonav.imagery.quiet import quiet
+from orthonav.prepare.block_cache import BlockCache, digest
 from orthonav.prepare.blocks import Block, Preview, blocks_of, margins, read_block
 from orthonav.prepare.calibrate import CropSampler
-from orthonav.prepare.kept import BlockCache, digest
 from orthonav.prepare.layer import CHUNK_PX, GreyLayerWriter, Parts, compressed_block
 from orthonav.prepare.parallel import in_order
 from orthonav.prepare.pictures import SheetPictures
@@ -39,31 +40,29 @@ from orthonav.variants import variant_recipe
 log = logging.getLogger(__name__)
 
 BLOCK_PX = 1024
+"""Least width of a block: a few MB of memory per thread."""
 PREVIEW_PX = 384
-MIN_KEPT_BLOCKS = 16
-"""Finished blocks are kept beside the map where there are so many: fewer are soon made anew."""
-KEPT_BYTES_PER_PX = 1.6
-"""Disk for a pixel of a kept block; a corridor of the generated landscape at 1 m took 1.3."""
-MAX_WORKERS = 64
-
-
-def usable_cores() -> int:
-    """Processor cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+"""Limit of the map format (docs/map-format.md)."""
+MIN_CACHED_BLOCKS = 16
+"""Smaller builds do not cache blocks by default: they are quickly rebuilt."""
+CACHED_BYTES_PER_PX = 1.6
+"""Disk space per pixel of a cached block; a corridor of the generated landscape at 1 m took 1.3."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """A block to be read, and the places (row, col) in it where crops are to be cut."""
+    """A block to be read, and the positions (row, col) of crops in it."""
 
     block: Block
     places: tuple[tuple[int, int], ...]
 
 
 class SheetReader:
-    """Collects what a map needs of a sheet: `cells`, `preview`, crops, `layer`, `pictures`.
+    """Reads a sheet and collects the input of all later steps.
 
-    `layer` is None without `registration`; `pictures` is given for methods that learn from them.
+    `cells`: cell means. `preview`: grey overview. `sampler`: crops for calibration. `layer`: the
+    registration layer, None without `registration`. `pictures`: images of all tiles, for methods
+    that learn from them, else None.
     """
 
     def __init__(
@@ -92,27 +91,27 @@ class SheetReader:
 
     @property
     def blocks(self) -> int:
-        """How many blocks there are."""
+        """Number of blocks."""
         return len(self._jobs)
 
     def read(
         self,
-        report: Callable[[str, float], None],
+        progress: Progress,
         workers: int | None = None,
-        kept: BlockCache | None = None,
+        cache: BlockCache | None = None,
     ) -> None:
-        """Read all blocks with so many threads (None: all cores), less those that were kept.
+        """Read all blocks that are not in `cache`, with `workers` threads (None: one per core).
 
-        Raises `AreaError` where no pixel is valid, `ImageryError`, `OutputError`.
+        Raises `AreaError` if no pixel is valid, `ImageryError`, `OutputError`.
         """
         workers = usable_cores() if workers is None else workers
         if not represent.TABLE[self._recipe["name"]].flies:
-            workers = 1  # one network in memory, which has threads of its own
+            workers = 1  # one network in memory, which uses threads itself
 
         @contextmanager
         def opened() -> Iterator[Callable[[Job], Parts]]:
             with self.mosaic.grid_sheet(self.area.frame, self.grid, threads=1) as raster:
-                yield lambda job: self._kept_or_made(raster, job, kept)
+                yield lambda job: self._cached_or_read(raster, job, cache)
 
         threads = cv2.getNumThreads()
         cv2.setNumThreads(1)
@@ -120,7 +119,7 @@ class SheetReader:
             with quiet():
                 for done, parts in enumerate(in_order(self._jobs, opened, workers)):
                     self._take(self._jobs[done], parts)
-                    report("imagery", (done + 1) / len(self._jobs))
+                    progress("imagery", (done + 1) / len(self._jobs))
         finally:
             cv2.setNumThreads(threads)
         if not self.cells.valid.any():
@@ -128,22 +127,24 @@ class SheetReader:
                 "the area has no imagery: it lies outside the orthophotos or is all nodata"
             )
 
-    def kept(self, beside: Path, folder: Path | None) -> AbstractContextManager[BlockCache | None]:
-        """Where finished blocks are kept: in `folder` if there is one, else, if many, `beside`.
+    def block_cache(
+        self, default: Path, folder: Path | None
+    ) -> AbstractContextManager[BlockCache | None]:
+        """Cache of finished blocks in `folder`, or, if there are many, in `default`; else None.
 
-        Raises `OutputError` where there is no room for them.
+        Raises `OutputError` if the disk has too little free space.
         """
         pixels = sum(job.block.height * job.block.width for job in self._jobs)
-        worthwhile = folder is not None or len(self._jobs) >= MIN_KEPT_BLOCKS
-        needed_bytes = round(KEPT_BYTES_PER_PX * pixels) if worthwhile else 0
-        kept = BlockCache(folder or beside, self._request(), needed_bytes)
+        worthwhile = folder is not None or len(self._jobs) >= MIN_CACHED_BLOCKS
+        needed_bytes = round(CACHED_BYTES_PER_PX * pixels) if worthwhile else 0
+        cache = BlockCache(folder or default, self._request(), needed_bytes)
         if not worthwhile:
-            kept.discard()  # what an earlier request for the same map has left
+            cache.discard()  # left by an earlier request for the same map
             return nullcontext()
-        there = kept.begin(self._depends_on())
-        if there:
-            log.warning("%d of %d blocks were finished before and are used", there, len(self._jobs))
-        return kept
+        found = cache.begin(self._depends_on())
+        if found:
+            log.warning("resuming: %d of %d blocks are cached", found, len(self._jobs))
+        return cache
 
     @property
     def _recipe(self) -> dict[str, Any]:
@@ -165,16 +166,16 @@ class SheetReader:
             jobs.append(Job(block, tuple((int(row), int(col)) for row, col in places)))
         return jobs
 
-    def _kept_or_made(self, raster: SheetRaster, job: Job, kept: BlockCache | None) -> Parts:
-        parts = None if kept is None else kept.load(job.block)
+    def _cached_or_read(self, raster: SheetRaster, job: Job, cache: BlockCache | None) -> Parts:
+        parts = None if cache is None else cache.load(job.block)
         if parts is None:
-            parts = self._made(raster, job)
-            if kept is not None:
-                kept.keep(job.block, parts)
+            parts = self._read_block(raster, job)
+            if cache is not None:
+                cache.store(job.block, parts)
         return parts
 
-    def _made(self, raster: SheetRaster, job: Job) -> Parts:
-        """Everything that is kept of a block; nothing that was made before is touched."""
+    def _read_block(self, raster: SheetRaster, job: Job) -> Parts:
+        """The result of a block; does not change the state of the reader."""
         read = read_block(raster, self.grid, job.block, self._margin_px)
         grey, valid = read.pixels.grey, read.pixels.valid
         if not valid.any():
@@ -206,7 +207,7 @@ class SheetReader:
             put_layer_parts(self.layer, block, parts)
 
     def _request(self) -> str:
-        """Digest of what every block depends on, the programs that make it included."""
+        """Digest of the inputs common to all blocks, including program versions."""
         frame = self.area.frame
         return digest(
             {
@@ -224,7 +225,7 @@ class SheetReader:
         )
 
     def _depends_on(self) -> list[tuple[Block, Any]]:
-        """What each block alone depends on: imagery under it, crops, distance from the route."""
+        """Inputs of each block alone: its imagery, crops, and distance from the route."""
         found: list[tuple[Block, Any]] = []
         with self.mosaic.grid_sheet(self.area.frame, self.grid) as raster:
             for job in self._jobs:
@@ -240,9 +241,9 @@ class SheetReader:
 def layer_parts(
     area: Area, grid: TileGrid, block: Block, grey: NDArray[np.uint8], valid: NDArray[np.bool_]
 ) -> Parts:
-    """What the layer needs of a block: compressed where chunks do not go on in other blocks.
+    """The registration layer of a block; compressed if its chunks do not extend into other blocks.
 
-    Chunks that are too far from the route are left out.
+    Chunks too far from the route are omitted.
     """
     grey, valid = grey.copy(), valid.copy()
     for chunk in block.cut(CHUNK_PX):
@@ -265,7 +266,7 @@ def _whole_chunks(grid: TileGrid, block: Block) -> bool:
 
 
 def put_layer_parts(layer: GreyLayerWriter, block: Block, parts: Parts) -> None:
-    """Hand what `layer_parts` made of a block to a layer."""
+    """Insert the result of `layer_parts` for a block into a layer."""
     if "jpeg" in parts:
         layer.add_block(block.row, block.col, parts)
     else:
@@ -273,7 +274,7 @@ def put_layer_parts(layer: GreyLayerWriter, block: Block, parts: Parts) -> None:
 
 
 def block_side_px(tile_px: int, micro_px: int) -> int:
-    """Width of a block: whole micro-cells, and whole chunks of the layer where those fit."""
+    """Width of a block: a multiple of the micro-cell, and of the layer chunk if possible."""
     least = max(BLOCK_PX, 2 * tile_px)
     step = math.lcm(micro_px, CHUNK_PX)
     if step > 1.5 * least:

@@ -1,1 +1,1 @@
-"""Handing results on: `fixes.jsonl` for people and programs, messages for the autopilot."""
+"""Outputs of results: `fixes.jsonl` for people and programs, messages for autopilots."""

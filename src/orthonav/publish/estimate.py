@@ -1,7 +1,7 @@
-"""What an autopilot is told: one position at one exposure, how good it is, and when it was.
+"""Input of all messages: one position at one exposure, with its accuracy and time.
 
-The values of a `ViewResult` in the form that every message is made from. What is not known is NaN
-or None here and becomes "not known" in the message, never a number that looks like a measurement.
+Unknown values are NaN or None here and are marked as unknown in the message; they never become a
+number that looks like a measurement.
 """
 
 import math
@@ -15,37 +15,39 @@ from orthonav.errors import OrthonavError
 from orthonav.records import CONFIDENT, Fix, ViewResult
 
 _ROUNDING = 1e-9
-"""Share by which an eigenvalue may fall below zero before a covariance is no covariance."""
+"""Negative eigenvalues up to this share of the largest one are rounding errors."""
 
 
 class EstimateError(OrthonavError, ValueError):
-    """An estimate is impossible, or cannot be said in the message that was asked for."""
+    """An estimate is invalid, or the requested message cannot represent it."""
 
 
 class Clock(Enum):
-    """Whose time goes into a message. A link keeps to one: receivers learn its offset."""
+    """Clock of the timestamps. A link uses one clock: receivers estimate its offset."""
 
     UTC = "utc"
     """Since 1970-01-01 UTC."""
     BOOT = "boot"
-    """Since the autopilot was switched on, as it told (TIMESYNC, or the time of its messages)."""
+    """Time since boot of the autopilot (from TIMESYNC or the timestamps of its messages)."""
 
 
 @dataclass(frozen=True, eq=False)
 class NavigationEstimate:
-    """Where the aircraft was at one exposure.
+    """Position of the aircraft at one exposure.
 
-    `cov_en_m2` is the (2, 2) covariance of east and north of a right fix; that the fix may be wrong
-    altogether is not in it but in `confidence` (0 to 1, NaN: not known). `agl_m` is the height
-    above ground, `alt_amsl_m` the altitude above mean sea level with its standard deviation
-    `alt_std_m`; `heading_deg` that of the top of the image, clockwise from true north; each NaN
-    where not known. `vel_en_mps` is the velocity over ground, true east and north, with its
-    covariance where that is known. `state` is that of the track, None for views placed one by one.
-    `utc_ns` and `boot_ns` are the time of exposure, `processing_s` what has passed from then until
-    the message is handed over. `reset_counter` (0 to 255) changes whenever the position jumped.
+    `lat_deg`, `lon_deg`: position, WGS84.
+    `cov_en_m2`: covariance (2, 2) of east and north, given that the fix is correct.
+    `confidence`: probability (0 to 1) that the fix is correct; NaN: not known.
+    `utc_ns`, `boot_ns`: time of exposure by each clock; at least one is needed.
+    `processing_s`: time from exposure until the message is sent.
+    `agl_m`: height above ground; NaN where not known, as the next three.
+    `alt_amsl_m`, `alt_std_m`: altitude above mean sea level and its standard deviation.
+    `heading_deg`: heading of the top of the image, clockwise from true north.
+    `vel_en_mps`, `vel_cov_en`: velocity over ground (true east, north) and its covariance (2, 2).
+    `state`: state of the track; None for views that are located one by one.
+    `reset_counter`: 0 to 255; changes when the position jumped.
 
-    Raises `EstimateError` where a position, a covariance's shape, a confidence, a deviation, a
-    duration or the counter is impossible, or no time is told.
+    Raises `EstimateError` where a value is out of range or no time is given.
     """
 
     lat_deg: float
@@ -82,35 +84,35 @@ class NavigationEstimate:
         if not 0 <= self.reset_counter <= 255:
             raise EstimateError(f"reset_counter must be 0 to 255, got {self.reset_counter}")
         if self.utc_ns is None and self.boot_ns is None:
-            raise EstimateError("the time of exposure is told neither in UTC nor since boot")
+            raise EstimateError("the time of exposure is missing: give utc_ns or boot_ns")
 
     def exposed_ns(self, clock: Clock) -> int:
-        """Time of exposure by `clock`; raises `EstimateError` where that one is not known."""
+        """Time of exposure by `clock`; raises `EstimateError` where it is not known."""
         time_ns = self.utc_ns if clock is Clock.UTC else self.boot_ns
         if time_ns is None:
             raise EstimateError(f"the time of exposure is not known by the clock {clock.value!r}")
         return time_ns
 
     def sent_ns(self, clock: Clock) -> int:
-        """Time at which the message is handed over: exposure and what has passed since."""
+        """Time of sending: exposure plus `processing_s`."""
         return self.exposed_ns(clock) + round(self.processing_s * 1e9)
 
     def horizontal_std_m(self, min_std_m: float = 0.0) -> float:
-        """Standard deviation to tell as *the* horizontal one: that along the worst direction.
+        """Horizontal standard deviation as one number: that along the worst direction.
 
-        The square root of the larger eigenvalue of the covariance, and `min_std_m` at least.
-        Filters that take one number use it for both axes (PX4 squares it into the variance of
-        each), so anything smaller claims too much along the long axis. NaN where the covariance is
-        not known or is none.
+        The square root of the larger eigenvalue of the covariance, at least `min_std_m`. Filters
+        that take one number use it for both axes (PX4 squares it into the variance of each), so a
+        smaller value would be too optimistic along the long axis. NaN where the covariance is
+        unknown or invalid.
         """
         major = error_ellipse(self.cov_en_m2)[0]
         return major if math.isnan(major) else max(major, min_std_m)
 
     def is_confident(self, min_confidence: float = CONFIDENT) -> bool:
-        """Whether this may be told as a position.
+        """Whether this can be reported as a valid position.
 
-        Confident enough (an unknown confidence is not), with a covariance, and tracking where it
-        comes from a track.
+        It needs a confidence of at least `min_confidence`, a valid covariance, and the state
+        "tracking" if it comes from a track.
         """
         return (
             self.confidence >= min_confidence  # False for NaN
@@ -129,12 +131,13 @@ def estimate_from_result(
     alt_std_m: float = math.nan,
     reset_counter: int = 0,
 ) -> NavigationEstimate | None:
-    """The estimate that a view's fix stands for; None where there is no fix.
+    """Estimate of the fix of a view; None where there is no fix.
 
-    `result.time_ns` is the time of exposure by `clock`; with `utc_minus_boot_ns` the other clock's
-    follows. `processing_s` is the time from exposure to handing over, by default the latency of the
-    fix alone: add what reading the camera took. The altitude and its standard deviation are the
-    autopilot's own, if it should hear them back; a fix has none. The velocity is that of a track.
+    `clock`: clock of `result.time_ns`; with `utc_minus_boot_ns` both clocks are filled in.
+    `processing_s`: time from exposure to sending; by default the latency of the fix, without the
+    latency of the camera.
+    `alt_amsl_m`, `alt_std_m`: altitude of the autopilot, to be sent back; a fix has none.
+    The velocity is that of the track.
     """
     fix = result.outcome
     if not isinstance(fix, Fix):
@@ -162,11 +165,11 @@ def estimate_from_result(
 
 
 def error_ellipse(cov_en: NDArray[np.float64]) -> tuple[float, float, float]:
-    """One-sigma ellipse of a (2, 2) covariance of east and north.
+    """One-sigma error ellipse of a (2, 2) covariance of east and north.
 
-    The half axes, the longer first, in the root of the covariance's unit, and the direction of the
-    longer one in degrees clockwise from north, 0 to 180. All NaN where the covariance is not finite
-    or has a negative eigenvalue.
+    Returns the semi-major and the semi-minor axis (square root of the unit of the covariance) and
+    the direction of the major axis in degrees clockwise from north, 0 to 180. All are NaN where the
+    covariance is not finite or has a negative eigenvalue.
     """
     cov = np.asarray(cov_en, dtype=np.float64)
     if not np.isfinite(cov).all():
@@ -195,6 +198,6 @@ def _velocity(fix: Fix) -> tuple[float, float] | None:
 
 
 def _velocity_covariance(fix: Fix) -> NDArray[np.float64] | None:
-    """Of a track, which tells the standard deviation along the worst direction."""
+    """Covariance from a track, which reports the standard deviation along the worst direction."""
     std_mps = fix.evidence.get("vel_std_mps", math.nan)
     return np.eye(2) * std_mps**2 if math.isfinite(std_mps) else None

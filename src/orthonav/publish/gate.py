@@ -1,7 +1,7 @@
-"""What may go out: nothing unsure, nothing old, not too often; and what was withheld, and why.
+"""Decides which positions are sent, and counts the reasons why others are withheld.
 
-An autopilot that is told a wrong place flies to a wrong place; one that is told nothing for a while
-knows that. So the gate errs towards silence, and counts it.
+A wrong position leads an autopilot astray; a missing one does not, because the autopilot notices
+it. The gate therefore withholds positions in doubt.
 """
 
 import math
@@ -23,29 +23,29 @@ from orthonav.publish.estimate import (
 from orthonav.records import CONFIDENT
 
 FUTURE_S = 0.1
-"""An exposure may lie this far after now before the clocks are said to disagree."""
+"""Tolerance for exposures in the future, before the clocks are taken to disagree."""
 JITTER = 0.1
-"""Share of an interval by which a message may come early, so that views that come a little
-unevenly at the rate that was asked for all pass."""
+"""Share of an interval by which a message may be early, so that views with a small jitter all pass
+at their nominal rate."""
 _MOST_NORTH_DEG = 89.8
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class GateRules:
-    """What passes.
+    """Limits of the gate.
 
-    `min_confidence` is the least confidence that is sent, `max_std_m` the largest standard
-    deviation along the worst direction, `max_age_s` the longest time since exposure.
-    `min_interval_s` names, per message, the shortest time between two of them; messages not named
-    are not limited.
+    `min_confidence`: lowest confidence that is sent, 0 to 1.
+    `max_std_m`: largest standard deviation along the worst direction, metres.
+    `max_age_s`: longest time since exposure, seconds.
+    `min_interval_s`: shortest time between two messages, by name; others are not limited.
+    `jump_sigmas`: a position that differs from the prediction by more than this many standard
+    deviations plus the possible manoeuvre counts as a jump (reset counter).
+    `velocity_std_mps`: standard deviation of a velocity that has no covariance.
+    `max_accel_mps2`: acceleration of the possible manoeuvre where the velocity is known.
+    `max_speed_mps`: speed of the possible manoeuvre where it is not.
 
-    The position counts as reset where it moved, against what velocity says, by more than
-    `jump_sigmas` standard deviations of both positions together and what the aircraft can do:
-    `max_accel_mps2` where the velocity is known (to `velocity_std_mps`, unless its covariance is
-    told), `max_speed_mps` where it is not.
-
-    Raises `EstimateError` for limits that are not positive, or a confidence beyond 0 to 1.
+    Raises `EstimateError` for limits that are not positive, or a confidence outside 0 to 1.
     """
 
     min_confidence: float = CONFIDENT
@@ -72,15 +72,17 @@ class GateRules:
 
 
 class Gate:
-    """Judges the estimates of one flight as they come. Mutable; not to be shared between threads.
+    """Checks the estimates of one flight in order. Mutable; for one thread.
 
-    `withheld` counts reasons: `no_fix`, `not_tracking`, `low_confidence`, `no_covariance`,
+    `withheld`: counts by reason: `no_fix`, `not_tracking`, `low_confidence`, `no_covariance`,
     `too_uncertain`, `from_the_future`, `stale`, `out_of_order`, and `rate:NAME` for a message that
-    came too soon. `sent` counts messages by name, `resets` how often the position jumped.
+    would exceed its rate.
+    `sent`: counts of messages by name.
+    `resets`: number of jumps of the position.
     """
 
     def __init__(self, rules: GateRules | None = None, clock: Clock = Clock.UTC) -> None:
-        """`clock` is the one by which times of exposure and `now_ns` are compared."""
+        """`clock`: clock of `now_ns`, with which times of exposure are compared."""
         self.rules = rules or GateRules()
         self.clock = clock
         self.withheld: Counter[str] = Counter()
@@ -91,11 +93,11 @@ class Gate:
         self._due_ns: dict[str, int] = {}
 
     def admit(self, estimate: NavigationEstimate | None, now_ns: int) -> NavigationEstimate | None:
-        """The estimate with its reset counter set, or None where it must not be sent.
+        """Return the estimate with its reset counter set, or None where it must not be sent.
 
-        `estimate` is None for a view without a fix. Hand in every view, also those that cannot
-        pass: the gate learns from them that a track was lost. Raises `EstimateError` where the
-        exposure is not known by the gate's clock.
+        `estimate` is None for a view without a fix. Pass every view, also those that cannot be
+        sent: they show that a track was lost. Raises `EstimateError` where the exposure is not
+        known by the gate's clock.
         """
         reason = self._reason(estimate, now_ns)
         self._watch(estimate)
@@ -109,10 +111,10 @@ class Gate:
         return self._last
 
     def due(self, message: str, now_ns: int) -> bool:
-        """Whether `message` may be sent now, by its rate; counts it as sent or as withheld.
+        """Whether the rate of `message` allows sending now; counts it as sent or withheld.
 
-        Over a long time never more often than its interval says. `now_ns` may be of any clock that
-        runs evenly; after it jumped back the next message passes.
+        The long-term rate never exceeds the limit. `now_ns` may be of any steady clock; after a
+        jump back the next message passes.
         """
         interval_s = self.rules.min_interval_s.get(message)
         if interval_s is not None:
@@ -129,7 +131,7 @@ class Gate:
         return True
 
     def _reason(self, estimate: NavigationEstimate | None, now_ns: int) -> str | None:
-        """Why the estimate must not be sent; None where it may."""
+        """Reason why the estimate must not be sent; None if it can be sent."""
         if estimate is None:
             return "no_fix"
         exposed_ns, std_m = estimate.exposed_ns(self.clock), estimate.horizontal_std_m()
@@ -144,19 +146,19 @@ class Gate:
             "too_uncertain": std_m > self.rules.max_std_m,
             "from_the_future": age_s < -FUTURE_S,
             "stale": age_s > self.rules.max_age_s,
-            # Farther behind than that and yet not old: the clock was set back.
+            # Farther behind, and not stale: the clock was set back.
             "out_of_order": 0 <= behind_s <= self.rules.max_age_s + FUTURE_S,
         }
         return next((reason for reason, applies in refusals.items() if applies), None)
 
     def _watch(self, estimate: NavigationEstimate | None) -> None:
-        """Note that a track was lost: a view without a place, or not tracking, after it was."""
+        """Note the loss of a track: a view without a fix, or not tracking, after tracking."""
         tracked = self._last is not None and self._last.state == "tracking"
         if tracked and (estimate is None or estimate.state != "tracking"):
             self._interrupted = True
 
     def _jumped(self, before: NavigationEstimate, now: NavigationEstimate) -> bool:
-        """Whether the way between two positions is more than their errors and flight allow."""
+        """Whether two positions differ by more than their errors and the motion allow."""
         seconds = (now.exposed_ns(self.clock) - before.exposed_ns(self.clock)) / 1e9
         if seconds <= 0:
             return True
@@ -172,7 +174,7 @@ class Gate:
         else:
             free_m = self.rules.max_speed_mps * seconds
         allowed_m = self.rules.jump_sigmas * error_ellipse(cov)[0] + free_m
-        return not float(np.hypot(*moved)) <= allowed_m  # a covariance that is none too
+        return not float(np.hypot(*moved)) <= allowed_m  # true for an invalid covariance, too
 
 
 def _moved_en_m(before: NavigationEstimate, now: NavigationEstimate) -> Array:

@@ -1,8 +1,8 @@
 """GPS week and time of week of a UTC time.
 
-GPS time began with UTC on 1980-01-06 and does not know leap seconds, so it runs ahead by those that
-were inserted since. Source of the dates: IERS Bulletin C. The last leap second known here is that
-before 2017-01-01; should another one be announced, `_LEAPS` needs its day.
+GPS time equalled UTC on 1980-01-06 and has no leap seconds, so it is ahead by those inserted since.
+Source of the dates: IERS Bulletin C. The last leap second here is that before 2017-01-01; a new one
+must be added to `_LEAPS`.
 """
 
 from bisect import bisect_right
@@ -26,7 +26,7 @@ _WEEK_MS = 7 * 86_400_000
 
 
 def gps_time(utc_ns: int) -> tuple[int, int]:
-    """GPS week (not folded at 1024) and ms since its beginning of a time in ns since 1970, UTC.
+    """GPS week (without rollover at 1024) and time of week in ms, of a UTC time in ns since 1970.
 
     (0, 0), which receivers read as "not known", before 1980-01-06.
     """

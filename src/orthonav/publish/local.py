@@ -1,10 +1,9 @@
-"""North and east of an origin as the autopilot itself will turn them back into a position.
+"""Metres north and east of an origin, by the formula with which the autopilot converts them back.
 
-Messages in a local frame are metres from an origin, and each autopilot has a formula of its own for
-that: PX4 an azimuthal-equidistant plane on a sphere of 6371 km, ArduPilot degrees times a constant.
-Neither is the ellipsoid: 10 km from the origin true metres come back as a place up to 30 m away at
-48 degrees north, and up to 67 m at the equator. So the metres sent are those which the receiver's
-own formula takes for the fix.
+Messages in a local frame contain metres from an origin. PX4 converts them on an
+azimuthal-equidistant plane of a sphere of 6371 km, ArduPilot by a constant per degree; neither uses
+the ellipsoid. True metres, 10 km from the origin, would become positions up to 30 m away at 48
+degrees north, and up to 67 m at the equator. The inverse of the receiver's formula avoids this.
 
 Sources: PX4-Autopilot `src/lib/geo/geo.cpp` (`MapProjection::project`); ArduPilot
 `libraries/AP_Common/Location.cpp` (`Location::get_distance_NE`, `longitude_scale`) and its
@@ -23,7 +22,7 @@ _LEAST_SCALE = 0.01  # ArduPilot's, near the poles
 
 
 class Autopilot(Enum):
-    """Whose conventions a message in a local frame follows."""
+    """Autopilot whose conventions a message in a local frame follows."""
 
     PX4 = "px4"
     ARDUPILOT = "ardupilot"
@@ -31,10 +30,10 @@ class Autopilot(Enum):
 
 @dataclass(frozen=True)
 class Origin:
-    """Where an autopilot's local frame has its zero (WGS84, metres above mean sea level).
+    """Origin of an autopilot's local frame.
 
-    Raises `EstimateError` where it is no place; an altitude is needed, because the message that
-    sets the origin has no way to leave it out.
+    `lat_deg`, `lon_deg`: WGS84. `alt_amsl_m`: metres above mean sea level; needed, because the
+    message that sets the origin cannot omit it. Raises `EstimateError` for invalid values.
     """
 
     lat_deg: float
@@ -53,7 +52,7 @@ class Origin:
 def north_east_m(
     origin: Origin, lat_deg: float, lon_deg: float, autopilot: Autopilot
 ) -> tuple[float, float]:
-    """Metres north and east of `origin` that `autopilot` takes for this latitude and longitude."""
+    """Metres north and east of `origin` that `autopilot` converts to this position."""
     if autopilot is Autopilot.PX4:
         return _px4(origin, lat_deg, lon_deg)
     turned_deg = (lon_deg - origin.lon_deg + 180.0) % 360.0 - 180.0
@@ -63,7 +62,7 @@ def north_east_m(
 
 
 def _px4(origin: Origin, lat_deg: float, lon_deg: float) -> tuple[float, float]:
-    """Azimuthal-equidistant on a sphere; the angle by atan2, which is exact near zero too."""
+    """Azimuthal-equidistant projection of a sphere; atan2 is also accurate near zero."""
     lat, lat0 = math.radians(lat_deg), math.radians(origin.lat_deg)
     turned = math.radians(lon_deg - origin.lon_deg)
     north = math.cos(lat0) * math.sin(lat) - math.sin(lat0) * math.cos(lat) * math.cos(turned)

@@ -1,19 +1,19 @@
-"""MAVLink 2 messages that autopilots fuse: global positions, and how they become bytes.
+"""MAVLink 2 messages of global positions that autopilots fuse, and their encoding.
 
-Every field is filled as the definitions in pymavlink's `common.xml` say, and what is not known as
-they say it is marked; docs/autopilots.md lists each one and how PX4 and ArduPilot read it. Values
-beyond a field's range are cut off at its end, never wrapped round. Nothing here sends: a message
-is made by a function, bytes by `Packer`, and `orthonav.publish.gate` says what may go out.
+Fields and marks of unknown values are those of the definitions in `common.xml`; docs/autopilots.md
+lists each field and how PX4 and ArduPilot read it. Values out of range are clamped, never wrapped.
+Nothing is sent here: functions make messages, `Packer` encodes them, and `orthonav.publish.gate`
+decides which positions are sent.
 
-pymavlink (extra `autopilot`) is loaded when the first message is made.
+pymavlink (extra `autopilot`) is loaded with the first message.
 """
 
-import importlib
 import math
 from dataclasses import dataclass, field
 from typing import Any
 
 from orthonav.errors import MissingExtraError
+from orthonav.extras import needed
 from orthonav.publish.estimate import (
     Clock,
     EstimateError,
@@ -24,11 +24,11 @@ from orthonav.publish.gpstime import gps_time
 from orthonav.records import CONFIDENT
 
 Message = Any
-"""A `MAVLink_message` of pymavlink, which brings no types."""
+"""A `MAVLink_message` of pymavlink, which has no types."""
 COMPONENT_ID = 197
-"""MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY: a camera that tells where it is."""
+"""MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY (common.xml)."""
 WRAP_S = 250.0
-"""Where the float of `transmission_time` begins again: 10 us of resolution, says its definition."""
+"""Period of `transmission_time`, by its definition in common.xml."""
 UNKNOWN_DOP = 65535.0
 _INT32_MAX, _UINT16_MAX = 2**31 - 1, 2**16 - 1
 _UINT32_MAX, _UINT64_MAX = 2**32 - 1, 2**64 - 1
@@ -47,23 +47,25 @@ _CMD_EXTERNAL_POSITION_ESTIMATE = 43003
 
 @dataclass(frozen=True)
 class Target:
-    """Which autopilot is meant; 0 stands for all."""
+    """Addressed autopilot; 0 addresses all."""
 
     system_id: int = 1
     component_id: int = 1
 
 
 AUTOPILOT = Target()
-"""The first component of the first system, as autopilots are set up unless told otherwise."""
+"""First component of the first system: the default of autopilots."""
 
 
 @dataclass(frozen=True)
 class Signing:
-    """MAVLink 2 message signing: the shared key, and what makes every signature new.
+    """Key and state of MAVLink 2 message signing.
 
-    `secret_key` is 32 bytes. `timestamp_10us` counts in tens of microseconds since 2015-01-01 and
-    must never go back for a link and a key (see `signing_timestamp`); every message adds one.
-    Raises `EstimateError` for a key of another length or numbers out of range.
+    `secret_key`: 32 bytes.
+    `timestamp_10us`: tens of microseconds since 2015-01-01; must never decrease for a link and a
+    key (see `signing_timestamp`), and grows by one with every message.
+    `link_id`: 0 to 255.
+    Raises `EstimateError` for a key of another length or values out of range.
     """
 
     secret_key: bytes = field(repr=False)
@@ -86,10 +88,10 @@ def signing_timestamp(utc_ns: int) -> int:
 
 
 class Packer:
-    """Makes bytes of messages, one sequence number after the other. Mutable; one per link.
+    """Encodes messages with consecutive sequence numbers. Mutable; one per link.
 
-    The same messages in the same order give the same bytes. `sequence` is the number of the first
-    message, 0 to 255. Raises `MissingExtraError` where pymavlink is not installed.
+    Equal messages in equal order give equal bytes. `sequence` (0 to 255) is the number of the first
+    message. Raises `MissingExtraError` where pymavlink is not installed.
     """
 
     def __init__(
@@ -102,7 +104,7 @@ class Packer:
     ) -> None:
         for name, value in (("system", system_id), ("component", component_id)):
             if not 1 <= value <= 255:
-                raise EstimateError(f"a {name} that sends has an id of 1 to 255, got {value}")
+                raise EstimateError(f"the {name} id must be 1 to 255, got {value}")
         self._mav = dialect().MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._mav.seq = sequence % 256
         if signing is not None:
@@ -112,7 +114,7 @@ class Packer:
             self._mav.signing.sign_outgoing = True
 
     def pack(self, message: Message) -> bytes:
-        """The frame of one message, MAVLink 2, signed where that was asked for."""
+        """MAVLink 2 frame of one message, signed if the packer has a key."""
         frame = bytes(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
         return frame
@@ -127,14 +129,14 @@ def global_position_sensor(
     min_std_m: float = 0.0,
     min_confidence: float = CONFIDENT,
 ) -> Message:
-    """GLOBAL_POSITION_SENSOR (message 296): a position from map matching, at the time it was sent.
+    """GLOBAL_POSITION_SENSOR (message 296): a position from map matching, stamped at sending.
 
-    An estimate that is not sure is UNHEALTHY and says no position and no accuracy either, because
-    there are receivers that do not read the flag. `sensor_id` is 1 to 255 (PX4 takes 0 as "off").
+    An estimate of low confidence is UNHEALTHY and has neither position nor accuracy, because some
+    receivers do not read the flag. `sensor_id` is 1 to 255 (PX4 reads 0 as "off").
     """
     if not 1 <= sensor_id <= 255:
         raise EstimateError(f"sensor_id must be 1 to 255, got {sensor_id}")
-    sure = estimate.is_confident(min_confidence)
+    confident = estimate.is_confident(min_confidence)
     return dialect().MAVLink_global_position_sensor_message(
         target_system=target.system_id,
         target_component=target.component_id,
@@ -142,12 +144,12 @@ def global_position_sensor(
         time_usec=microseconds(estimate.sent_ns(clock)),
         processing_time=clamped(estimate.processing_s * 1e6, 0, _UINT32_MAX),
         source=_SOURCE_VISION,
-        flags=0 if sure else _UNHEALTHY,
-        lat=deg_e7(estimate.lat_deg) if sure else _INT32_MAX,
-        lon=deg_e7(estimate.lon_deg) if sure else _INT32_MAX,
+        flags=0 if confident else _UNHEALTHY,
+        lat=deg_e7(estimate.lat_deg) if confident else _INT32_MAX,
+        lon=deg_e7(estimate.lon_deg) if confident else _INT32_MAX,
         alt_ellipsoid=math.nan,
         alt=float32(estimate.alt_amsl_m),
-        eph=float32(estimate.horizontal_std_m(min_std_m)) if sure else math.nan,
+        eph=float32(estimate.horizontal_std_m(min_std_m)) if confident else math.nan,
         epv=float32(estimate.alt_std_m) if math.isfinite(estimate.alt_amsl_m) else math.nan,
     )
 
@@ -163,19 +165,19 @@ def gps_input(
     min_std_m: float = 0.0,
     min_confidence: float = CONFIDENT,
 ) -> Message:
-    """GPS_INPUT (message 232): the position in the clothes of a GPS receiver, stamped at exposure.
+    """GPS_INPUT (message 232): the position as that of a GPS receiver, stamped at exposure.
 
-    What is not known is marked in `ignore_flags` and sent as 0: always the vertical velocity,
-    altitude and speed accuracy unless the estimate has them. `fix_type` is 3 where the estimate is
-    sure, else 1 with all fields ignored. `satellites` is told as it is given: 0 is the truth, and
-    some checks refuse it. With `hdop_m`, metres per unit, a dilution of precision is made up of the
-    horizontal accuracy; else it is ignored. `send_yaw` tells the heading as that of the vehicle:
-    right only where the top of the image is its nose.
+    Unknown values are marked in `ignore_flags` and sent as 0: the vertical velocity always,
+    altitude and speed accuracy unless the estimate has them. `fix_type` is 3 for a confident
+    estimate, else 1 with all fields ignored. `satellites`: number to send; 0 is true, but some
+    checks refuse it. `hdop_m`: metres per unit of HDOP, which is then derived from the horizontal
+    standard deviation, else ignored. `send_yaw`: send the heading as that of the vehicle, which is
+    correct only where the top of the image points forward.
     """
-    sure = estimate.is_confident(min_confidence)
+    confident = estimate.is_confident(min_confidence)
     eph_m = estimate.horizontal_std_m(min_std_m)
     speed_std_mps = _speed_std_mps(estimate)
-    flags = _ignored(estimate, speed_std_mps, hdop_m) if sure else _IGNORE_ALL
+    flags = _ignored(estimate, speed_std_mps, hdop_m) if confident else _IGNORE_ALL
     week, week_ms = (0, 0) if estimate.utc_ns is None else gps_time(estimate.utc_ns)
     vel_east, vel_north = estimate.vel_en_mps or (0.0, 0.0)
 
@@ -188,9 +190,9 @@ def gps_input(
         ignore_flags=flags,
         time_week_ms=week_ms,
         time_week=clamped(week, 0, _UINT16_MAX),
-        fix_type=_FIX_3D if sure else _NO_FIX,
-        lat=deg_e7(estimate.lat_deg) if sure else 0,
-        lon=deg_e7(estimate.lon_deg) if sure else 0,
+        fix_type=_FIX_3D if confident else _NO_FIX,
+        lat=deg_e7(estimate.lat_deg) if confident else 0,
+        lon=deg_e7(estimate.lon_deg) if confident else 0,
         alt=unless(_IGNORE_ALT, estimate.alt_amsl_m),
         hdop=unless(_IGNORE_HDOP, _hdop(eph_m, hdop_m), UNKNOWN_DOP),
         vdop=UNKNOWN_DOP,
@@ -201,7 +203,7 @@ def gps_input(
         horiz_accuracy=unless(_IGNORE_HORIZ_ACC, eph_m),
         vert_accuracy=unless(_IGNORE_VERT_ACC, estimate.alt_std_m),
         satellites_visible=clamped(satellites, 0, 255),
-        yaw=_yaw_cdeg(estimate.heading_deg) if send_yaw and sure else 0,
+        yaw=_yaw_cdeg(estimate.heading_deg) if send_yaw and confident else 0,
     )
 
 
@@ -215,8 +217,8 @@ def external_position_estimate(
 ) -> Message:
     """MAV_CMD_EXTERNAL_POSITION_ESTIMATE (43003) as COMMAND_INT: a single fix while dead reckoning.
 
-    `transmission_time` is the time of sending, begun again every `WRAP_S`. Raises `EstimateError`
-    where the estimate is not sure: the command has no way to say so.
+    `transmission_time` is the time of sending modulo `WRAP_S`. Raises `EstimateError` for an
+    estimate of low confidence, which the command cannot mark.
     """
     require_confident(estimate, min_confidence, "MAV_CMD_EXTERNAL_POSITION_ESTIMATE")
     wrapped_ns = estimate.sent_ns(clock) % round(WRAP_S * 1e9)
@@ -238,10 +240,10 @@ def external_position_estimate(
 
 
 def require_confident(estimate: NavigationEstimate, min_confidence: float, message: str) -> None:
-    """Raise `EstimateError` unless the estimate is sure: `message` cannot say "no position"."""
+    """Raise `EstimateError` unless the estimate is confident, as `message` cannot mark it."""
     if not estimate.is_confident(min_confidence):
         raise EstimateError(
-            f"{message} has no way to say that a position is not sure (confidence "
+            f"{message} cannot mark a position of low confidence (confidence "
             f"{estimate.confidence:.3g}, state {estimate.state}, standard deviation "
             f"{estimate.horizontal_std_m():.3g} m): do not send it"
         )
@@ -249,37 +251,32 @@ def require_confident(estimate: NavigationEstimate, min_confidence: float, messa
 
 def dialect() -> Any:
     """pymavlink's `common` dialect. Raises `MissingExtraError` where it is missing or too old."""
-    try:
-        module = importlib.import_module("pymavlink.dialects.v20.common")
-    except ImportError as error:
-        raise MissingExtraError(
-            f"messages to autopilots need pymavlink: pip install 'orthonav[autopilot]' ({error})"
-        ) from error
+    module = needed("pymavlink.dialects.v20.common", "autopilot", "sending to an autopilot")
     if not hasattr(module, "MAVLink_global_position_sensor_message"):
         raise MissingExtraError(
-            "this pymavlink does not know GLOBAL_POSITION_SENSOR: "
+            "this version of pymavlink lacks GLOBAL_POSITION_SENSOR: "
             "pip install --upgrade 'orthonav[autopilot]'"
         )
     return module
 
 
 def deg_e7(degrees: float) -> int:
-    """An angle in 1e-7 degrees, to the nearest."""
+    """Angle in 1e-7 degrees, rounded to the nearest."""
     return round(degrees * 1e7)
 
 
 def microseconds(time_ns: int) -> int:
-    """Whole microseconds of a time, cut off at what 64 bits without sign hold."""
+    """Time in whole microseconds, clamped to 64 bits without sign."""
     return min(max(time_ns // 1000, 0), _UINT64_MAX)
 
 
 def clamped(value: float, low: int, high: int) -> int:
-    """The nearest whole number of `value`, not below `low` nor above `high`."""
+    """`value` clamped to `low` and `high`, rounded to the nearest integer."""
     return round(min(max(value, low), high))
 
 
 def float32(value: float) -> float:
-    """`value` as far as a float of 32 bits reaches; NaN where it is not finite: not known."""
+    """`value` clamped to the range of a 32-bit float; NaN ("not known") where it is not finite."""
     if not math.isfinite(value):
         return math.nan
     return min(max(value, -_FLOAT32_MAX), _FLOAT32_MAX)
@@ -300,7 +297,7 @@ def _speed_std_mps(estimate: NavigationEstimate) -> float:
 
 
 def _hdop(eph_m: float, hdop_m: float | None) -> float:
-    """Of the accuracy, at most 99.99: ArduPilot keeps hundredths in 16 bits."""
+    """HDOP of a standard deviation, at most 99.99: ArduPilot stores hundredths in 16 bits."""
     if hdop_m is None:
         return UNKNOWN_DOP
     if not hdop_m > 0:
@@ -309,7 +306,7 @@ def _hdop(eph_m: float, hdop_m: float | None) -> float:
 
 
 def _yaw_cdeg(heading_deg: float) -> int:
-    """Hundredths of degrees with north as 36000, for 0 stands for "not available"."""
+    """Hundredths of degrees, 36000 for north, because 0 means "not available"."""
     if not math.isfinite(heading_deg):
         return 0
     return round(heading_deg * 100) % 36000 or 36000

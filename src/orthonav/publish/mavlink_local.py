@@ -1,8 +1,8 @@
 """MAVLink messages in the autopilot's local frame: ODOMETRY, VISION_POSITION_ESTIMATE, its origin.
 
-They want more than a map tells: height, attitude and, in part, a full velocity. What the autopilot
-itself believes of these at exposure is handed in as `LocalPose` and said back, so that the message
-is whole; set its filter to take the horizontal position alone (docs/autopilots.md).
+They need more than a map provides: height, attitude and, in part, a 3D velocity. These are the
+autopilot's own values at the exposure (`LocalPose`), sent back to complete the message; its filter
+must fuse the horizontal position only (docs/autopilots.md).
 """
 
 import math
@@ -34,11 +34,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LocalPose:
-    """What the autopilot told of itself at exposure, in its local frame.
+    """State that the autopilot reported for the exposure, in its local frame. NaN: not known.
 
-    `down_m` below the origin, needed where the estimate has no altitude; `attitude_rad` roll, pitch
-    and yaw of the body (turned in the order yaw, pitch, roll from north, east, down) and
-    `vel_down_mps`, each with its standard deviation; NaN where not known.
+    `origin`: origin of the local frame.
+    `down_m`, `down_std_m`: distance below the origin; needed where the estimate has no altitude.
+    `attitude_rad`, `attitude_std_rad`: roll, pitch, yaw of the body from NED (rotations ZYX).
+    `vel_down_mps`, `vel_down_std_mps`: velocity downwards.
     """
 
     origin: Origin
@@ -59,13 +60,13 @@ def odometry(
     min_std_m: float = 0.0,
     min_confidence: float = CONFIDENT,
 ) -> Message:
-    """ODOMETRY (message 331) as `autopilot` reads it, at the time of exposure.
+    """ODOMETRY (message 331) as `autopilot` reads it, stamped at exposure.
 
-    PX4: pose and velocity in MAV_FRAME_LOCAL_NED; attitude and velocity NaN where not known.
+    PX4: pose and velocity in MAV_FRAME_LOCAL_NED; attitude and velocity are NaN where not known.
     ArduPilot: MAV_FRAME_LOCAL_FRD with its x axis north and the velocity in MAV_FRAME_BODY_FRD, the
-    only pair it takes; it reads attitude and velocity always, so they must be known. `quality` is
-    the confidence in per cent. Raises `EstimateError` where something needed is not known, or the
-    estimate is not sure.
+    only pair that it accepts; it always reads attitude and velocity, so they must be known.
+    `quality` is the confidence in per cent. Raises `EstimateError` where a needed value is not
+    known, or the estimate is of low confidence.
     """
     require_confident(estimate, min_confidence, "ODOMETRY")
     position, variance = _position(estimate, pose, autopilot, min_std_m, "ODOMETRY")
@@ -79,8 +80,8 @@ def odometry(
         velocity_cov = body_from_ned @ velocity_cov @ body_from_ned.T
         if not np.isfinite(velocity).all():
             raise EstimateError(
-                "ArduPilot reads attitude and velocity of every ODOMETRY and they are not all "
-                "known: send VISION_POSITION_ESTIMATE"
+                "ODOMETRY to ArduPilot needs attitude and velocity, and they are not all known: "
+                "send VISION_POSITION_ESTIMATE"
             )
     return dialect().MAVLink_odometry_message(
         time_usec=microseconds(estimate.exposed_ns(clock)),
@@ -115,13 +116,13 @@ def vision_position_estimate(
 ) -> Message:
     """VISION_POSITION_ESTIMATE (message 102): north, east, down and attitude, stamped at exposure.
 
-    Raises `EstimateError` where height or attitude is not known (the message has no mark for that)
-    or the estimate is not sure.
+    Raises `EstimateError` where height or attitude is not known (the message cannot mark that), or
+    the estimate is of low confidence.
     """
     require_confident(estimate, min_confidence, "VISION_POSITION_ESTIMATE")
     (x, y, z), variance = _position(estimate, pose, autopilot, min_std_m, "this message")
     if not all(map(math.isfinite, pose.attitude_rad)):
-        raise EstimateError("VISION_POSITION_ESTIMATE needs the attitude: hand in the autopilot's")
+        raise EstimateError("VISION_POSITION_ESTIMATE needs the attitude of the autopilot")
     roll, pitch, yaw = pose.attitude_rad
     return dialect().MAVLink_vision_position_estimate_message(
         usec=microseconds(estimate.exposed_ns(clock)),
@@ -139,10 +140,10 @@ def vision_position_estimate(
 def set_gps_global_origin(
     origin: Origin, *, target_system: int = 1, time_ns: int | None = None
 ) -> Message:
-    """SET_GPS_GLOBAL_ORIGIN (message 48): where the local frame has its zero.
+    """SET_GPS_GLOBAL_ORIGIN (message 48): origin of the local frame.
 
-    Autopilots take it once. `target_system` must be theirs: PX4 does not take 0. `time_ns` is that
-    of sending by the link's clock.
+    Autopilots accept it once. `target_system` must be theirs: PX4 refuses 0. `time_ns`: time of
+    sending by the clock of the link.
     """
     return dialect().MAVLink_set_gps_global_origin_message(
         target_system=target_system,
@@ -160,15 +161,15 @@ def _position(
     min_std_m: float,
     message: str,
 ) -> tuple[Triple, Array]:
-    """North, east, down in metres and their (3, 3) covariance; both must be whole."""
+    """North, east, down in metres and their (3, 3) covariance, all of them known."""
     north, east = north_east_m(pose.origin, estimate.lat_deg, estimate.lon_deg, autopilot)
     down, down_std = pose.origin.alt_amsl_m - estimate.alt_amsl_m, estimate.alt_std_m
     if not math.isfinite(down):
         down, down_std = pose.down_m, pose.down_std_m
     if not (math.isfinite(down) and math.isfinite(down_std)):
         raise EstimateError(
-            f"{message} needs a height and its standard deviation, else receivers drop the "
-            "position or its accuracy: hand in the autopilot's"
+            f"{message} needs the autopilot's height and its standard deviation; without them "
+            "receivers drop the position or its accuracy"
         )
     variance = np.zeros((3, 3))
     variance[:2, :2] = _floored(estimate.cov_en_m2[::-1, ::-1], min_std_m)
@@ -177,7 +178,7 @@ def _position(
 
 
 def _floored(cov: Array, min_std: float) -> Array:
-    """The covariance with no direction below `min_std`, symmetric."""
+    """Symmetric covariance with a standard deviation of at least `min_std` in every direction."""
     values, vectors = np.linalg.eigh(cov / 2 + cov.T / 2)
     return np.asarray((vectors * np.maximum(values, min_std**2)) @ vectors.T)
 
@@ -198,7 +199,7 @@ def _velocity_covariance(estimate: NavigationEstimate, pose: LocalPose) -> Array
 
 def _triangle(upper: Array, lower_std: Triple) -> list[float]:
     """Upper right triangle, by rows, of a (6, 6) covariance: `upper` (3, 3), then three
-    independent values; all NaN where the first is not known, as the definition has it."""
+    independent values; all NaN where the first is not known, as the definition requires."""
     cov = np.zeros((6, 6))
     cov[:3, :3] = upper
     cov[3:, 3:] = np.diag(np.square(lower_std))
@@ -208,7 +209,7 @@ def _triangle(upper: Array, lower_std: Triple) -> list[float]:
 
 
 def _quaternion(attitude_rad: Triple) -> tuple[float, float, float, float]:
-    """w, x, y, z of the rotation that takes body to north, east, down; NaN where not known."""
+    """Quaternion w, x, y, z of the rotation from body to NED; NaN where not known."""
     roll, pitch, yaw = (angle / 2 for angle in attitude_rad)
     cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
     cy, sy = math.cos(yaw), math.sin(yaw)
@@ -221,7 +222,7 @@ def _quaternion(attitude_rad: Triple) -> tuple[float, float, float, float]:
 
 
 def _body_from_ned(attitude_rad: Triple) -> Array:
-    """Rotation (3, 3) of north, east, down into forward, right, down."""
+    """Rotation matrix (3, 3) from NED to forward, right, down."""
     w, x, y, z = _quaternion(attitude_rad)
     ned_from_body = np.array(
         [

@@ -1,9 +1,11 @@
 """NMEA 0183 sentences of a position: GGA, RMC and GST, for displays, loggers and old receivers.
 
-Fields as in NMEA 0183 version 2.3 to 4.0. What is not known is an empty field. A sentence without a
-sure position says so in the way that its kind has: quality 0 (GGA), status V and mode N (RMC), no
-numbers (GST). Values beyond what a field is wide enough for are cut off at its end, and altitudes
-that do not fit are left out.
+Fields are as in NMEA 0183 version 2.3 to 4.0; unknown values are empty fields. A sentence without a
+confident position is marked as its type provides: quality 0 (GGA), status V and mode N (RMC), empty
+fields (GST). Values are limited to the width of their field; altitudes that do not fit are omitted.
+
+The writer of pynmeagps is not used: it writes hundredths of seconds, 60.00000 minutes instead of
+the next degree, zeros for unknown numbers, and the current time for an unknown one.
 """
 
 import math
@@ -14,24 +16,22 @@ from orthonav.publish.estimate import EstimateError, NavigationEstimate, error_e
 from orthonav.records import CONFIDENT
 
 MPS_PER_KNOT = 1852 / 3600
-MAX_LENGTH = 82
-"""Of a sentence, with `$` and the line end."""
 _MINUTE = 10**5
-"""Parts that a minute is told in: 2 cm."""
+"""Resolution of minutes: five decimals, 2 cm."""
 _LARGEST_M, _LARGEST_KNOTS = 9999.99, 999.99
 _ALTITUDES_M = (-9999.9, 99999.9)
 _UNIX = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class Quality(Enum):
-    """How a sure position is presented: GGA quality, RMC status and mode."""
+    """GGA quality, RMC status and RMC mode of a confident position."""
 
     ESTIMATED = ("6", "V", "E")
-    """What it is: estimated. RMC is then V, as NMEA has it for all modes but A and D, so that
-    receivers who want satellites (ArduPilot among them) do not take it for GPS."""
+    """Estimated, which is true. The RMC status is then V, as NMEA requires for all modes but A and
+    D, so that receivers that need satellites (such as ArduPilot) do not take it for GPS."""
     AUTONOMOUS = ("1", "A", "A")
-    """As a GPS fix would be, for receivers that take nothing else: who reads it is not told that
-    no satellite had a part in it."""
+    """As a GPS fix, for receivers that accept nothing else. It hides that no satellites were
+    used."""
 
 
 def gga(
@@ -45,11 +45,11 @@ def gga(
 ) -> bytes:
     """GGA: time, position, quality, altitude above mean sea level where known.
 
-    `utc_ns` is the time of a sentence without an estimate. With `hdop_m`, metres per unit, a
-    dilution of precision is made up of the horizontal accuracy. Satellites in use are 00.
+    `utc_ns`: time of a sentence without an estimate. `hdop_m`: metres per unit of HDOP; HDOP is
+    then derived from the horizontal standard deviation. The number of satellites is 00.
     """
-    time_ns, sure = _when_and_whether(estimate, utc_ns, min_confidence)
-    if estimate is None or not sure:
+    time_ns, confident = _when_and_whether(estimate, utc_ns, min_confidence)
+    if estimate is None or not confident:
         return _sentence(talker, ["GGA", _time(time_ns), *_NO_PLACE, "0", "00", *[""] * 7])
     altitude, hdop = _altitude(estimate.alt_amsl_m), ""
     if hdop_m is not None:
@@ -70,8 +70,8 @@ def rmc(
     min_confidence: float = CONFIDENT,
 ) -> bytes:
     """RMC: time and date, status, position, speed in knots and course where velocity is known."""
-    time_ns, sure = _when_and_whether(estimate, utc_ns, min_confidence)
-    if estimate is None or not sure:
+    time_ns, confident = _when_and_whether(estimate, utc_ns, min_confidence)
+    if estimate is None or not confident:
         fields = ["V", *_NO_PLACE, "", "", _date(time_ns), "", "", "N"]
     else:
         _, status, mode = quality.value
@@ -87,10 +87,10 @@ def gst(
     utc_ns: int | None = None,
     min_confidence: float = CONFIDENT,
 ) -> bytes:
-    """GST: one-sigma error ellipse (m, direction of the long axis from true north) and standard
-    deviations of latitude, longitude and altitude in m. There are no ranges, so no RMS of them."""
-    time_ns, sure = _when_and_whether(estimate, utc_ns, min_confidence)
-    if estimate is None or not sure:
+    """GST: one-sigma error ellipse (m, direction of the major axis from true north) and standard
+    deviations of latitude, longitude and altitude (m). The RMS of ranges is empty."""
+    time_ns, confident = _when_and_whether(estimate, utc_ns, min_confidence)
+    if estimate is None or not confident:
         return _sentence(talker, ["GST", _time(time_ns), *[""] * 7])
     major, minor, direction_deg = error_ellipse(estimate.cov_en_m2)
     direction = f"{round(direction_deg, 1) % 180.0:.1f}"
@@ -101,7 +101,7 @@ def gst(
 
 
 def checksum(body: str) -> str:
-    """Two hexadecimal digits: all characters between `$` and `*`, joined by exclusive or."""
+    """Two hexadecimal digits: exclusive or of all characters between `$` and `*`."""
     value = 0
     for byte in body.encode("ascii"):
         value ^= byte
@@ -113,7 +113,7 @@ _NO_PLACE = ("", "", "", "")
 
 def _sentence(talker: str, fields: list[str]) -> bytes:
     if not (len(talker) == 2 and talker.isascii() and talker.isalpha() and talker.isupper()):
-        raise EstimateError(f"a talker is two capital letters such as GP or GN, got {talker!r}")
+        raise EstimateError(f"talker: expected two capital letters such as GP, got {talker!r}")
     body = talker + ",".join(fields)
     return f"${body}*{checksum(body)}\r\n".encode("ascii")
 
@@ -133,14 +133,14 @@ def _place(estimate: NavigationEstimate) -> list[str]:
 
 
 def _minutes(degrees: float, width: int) -> str:
-    """Degrees and minutes as `ddmm.mmmmm`, rounded as a whole, so that minutes stay below 60."""
+    """Degrees and minutes as `ddmm.mmmmm`, rounded together so that minutes stay below 60."""
     whole, rest = divmod(round(abs(degrees) * 60 * _MINUTE), 60 * _MINUTE)
     minutes, parts = divmod(rest, _MINUTE)
     return f"{whole:0{width}d}{minutes:02d}.{parts:05d}"
 
 
 def _moment(utc_ns: int | None) -> datetime | None:
-    """The time, or None where it is not known or beyond what a calendar has."""
+    """Date and time; None where it is unknown or out of range."""
     if utc_ns is None:
         return None
     try:

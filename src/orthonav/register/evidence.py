@@ -49,7 +49,9 @@ COARSE = EvidenceRecipe(gradient_sigma_px=0.7, contrast_px=17, mean_px=7, deviat
 """For views of some 30 pixels across: the same evidence from smaller windows."""
 _GRADIENT_FLOOR = np.float32(0.5)
 _DEVIATION_FLOOR = np.float32(2.0)
+"""Grey levels (per pixel) below which gradient and contrast count as noise of an 8-bit picture."""
 _CLIP = 3.0
+"""Limit of the normalized grey, in local standard deviations."""
 
 
 def evidence(

@@ -9,13 +9,19 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
+def rotation(turn_rad: float, scale: float = 1.0) -> Array:
+    """Matrix (2, 2) of a clockwise turn and a scale, for x to the right and y down."""
+    cos, sin = scale * math.cos(turn_rad), scale * math.sin(turn_rad)
+    return np.array([[cos, -sin], [sin, cos]])
+
+
 @dataclass(frozen=True)
 class Pose:
     """Where the middle of a view's window lies on the map, and how it is turned and scaled.
 
     `x_px, y_px`: columns and rows of the map at level 0, pixel-is-area, y to the south;
     `turn_rad`: heading of the top of the window, clockwise from north; `log_scale`: natural
-    logarithm of the true over the assumed ground resolution (and so of true over told height).
+    logarithm of the true over the assumed ground resolution (and so of true over reported height).
     """
 
     x_px: float
@@ -26,9 +32,7 @@ class Pose:
     @property
     def linear(self) -> Array:
         """Rotation and scale (2, 2) from the view's window to the map."""
-        scale = math.exp(self.log_scale)
-        cos, sin = scale * math.cos(self.turn_rad), scale * math.sin(self.turn_rad)
-        return np.array([[cos, -sin], [sin, cos]])
+        return rotation(self.turn_rad, math.exp(self.log_scale))
 
     def map_px(self, from_middle_px: Array) -> Array:
         """Map coordinates (..., 2) of points given from the middle of the window, level 0 px."""
@@ -48,7 +52,7 @@ class Pose:
 def even_scale(log_scale: float) -> float:
     """Factor of correlation times root of pixels that makes scores of chance alike at any scale.
 
-    A view that is magnified touches more pixels of the map, but says no more; measured on mirrored
-    views, chance grows with about the root of the scale.
+    A view that is magnified touches more pixels of the map, without more information; on mirrored
+    views chance grows with about the root of the scale (docs/decisions/registration.md, 1).
     """
     return math.exp(log_scale / 2)

@@ -1,4 +1,4 @@
-"""The map as registration sees it: evidence of windows, made when they are looked at."""
+"""The map as registration sees it: evidence of windows, computed on demand."""
 
 import threading
 from collections import OrderedDict
@@ -48,7 +48,7 @@ class Reference:
         return self.pyramid.shape(level)
 
     def whole(self, level: int, recipe: EvidenceRecipe = FINE) -> Array:
-        """Evidence (H, W, 4) of a whole level, kept once made."""
+        """Evidence (H, W, 4) of a whole level, computed once."""
         with self._lock:
             key = (level, recipe)
             if key not in self._whole:

@@ -23,13 +23,22 @@ from orthonav.register.template import BLOCKS, Template, derivatives, turn_plane
 
 Array = NDArray[np.float32]
 STEPS = 6
+"""Gauss-Newton steps at most. Like the other values here without a source of their own, chosen on
+the scenes of `python -m benchmarks.real_imagery`."""
 SLACK_PX = 6
+"""Margin of the map window around the first pose: two steps of `MAX_STEP_PX`."""
 SMALL_STEP_PX = 0.03
+"""A step that moves no part of the view by more than this ends the refinement."""
 MAX_STEP_PX = 3.0
+"""Longest step: about the basin of convergence (docs/decisions/registration.md, 6)."""
 DAMPING = 1e-3
+"""Relative damping of the Gauss-Newton matrix (Levenberg and Marquardt)."""
 MIN_CORRELATION = 0.08
+"""Correlations below count as this in the gain, so that steps do not vanish."""
 WHOLE_OVERLAP = 0.97
+"""Above this overlap the Gauss-Newton matrix of the whole view is used."""
 MIN_CURVATURE = 0.05
+"""Least curvature of a direction in the covariance, as a share of the Gauss-Newton matrix."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +64,7 @@ class Placed:
 
     @classmethod
     def unjudged(cls, pose: Pose, level: int) -> "Placed":
-        """A pose that was proposed and not looked at."""
+        """A proposed pose that was not judged yet."""
         return cls(pose, level, math.nan, (), math.nan, math.nan, False)
 
 
@@ -119,7 +128,7 @@ class Refiner:
         """Inverse (4, 4) of the view's derivatives times the map's.
 
         Noise and change have derivatives too: counted as if they held the view in place, they
-        would make it look known where the ground runs in one direction.
+        would make the position appear known along ground that runs in one direction.
         """
         theirs = derivatives(seen.map, seen.counts).reshape(3, 4, -1)
         gains = np.repeat(seen.gains, [2, 1])
@@ -270,7 +279,7 @@ class _Seen:
         )
 
     def agreement(self) -> float:
-        """Share of the blocks of a view whose evidence speaks for the pose."""
+        """Share of the blocks of a view whose evidence correlates positively."""
         sums = self._template.block_sums((self._view * self.map).sum(axis=0))
         counts = self._template.block_sums(self.counts)
         used = counts > 0.25 * counts.max()

@@ -1,8 +1,8 @@
 """From a view to its best place on the map, and the evidence for it.
 
-Candidates come from a search of a window (here, by FFT) or from elsewhere (tiles whose embeddings
-are alike). Either way they are refined from coarse to fine, most are dropped on the way, and the
-best of the last few is the answer; how far it stands above the best one elsewhere is the evidence.
+Candidates come from a search of a window by FFT, or from tiles whose embeddings are similar. They
+are refined from coarse to fine and most are dropped early. The best of the last few is the result;
+its score over that of the strongest rival is the evidence.
 """
 
 import math
@@ -20,36 +20,44 @@ from orthonav.register.search import Candidate, SearchWindow
 from orthonav.register.template import ViewTemplates
 
 LOOK_PX = 72.0
-"""A view is judged at the level where it is about so many pixels across."""
+"""A view is judged at the level where it is about so many pixels across
+(docs/decisions/registration.md, 2)."""
 KEPT_TO_LOOK = 14
+"""Candidates that pass from the coarse level to the judged one, at most."""
 KEPT_TO_FINISH = 3
+"""Places that are finished: the best and its rivals."""
 HOPE_AT_FIRST = 0.4
 HOPE = 0.5
+"""Candidates below these shares of the best score are dropped, after one step and after all steps
+of a level (docs/decisions/registration.md, 7)."""
 MIN_HOPEFUL = 4
-"""Candidates below a share of the best score are dropped, after one step and after all steps of
-a level; so many stay whatever their score, for the evidence needs rivals."""
+"""So many stay whatever their score, for the evidence needs rivals."""
 FIRST_STEPS = 1
 FULL_STEPS = 4
+"""Steps of refinement before and after the first of these decisions."""
 ROUGH_STEP_PX = 0.1
 """Candidates that are only compared need no smaller steps."""
 EXCLUSION_SHARE = 0.25
 """A rival lies farther from the best than this share of the view's side."""
 NAT_SCORE = 1.0
-"""What a nat of prior probability of heading and scale is worth in units of the score."""
+"""Units of the score per nat of the prior of heading and scale
+(docs/decisions/registration.md, 5)."""
 MAX_KEPT_WINDOWS = 4
+"""Search windows of whole sheets in the cache."""
 MAX_RATIO = 10.0
+"""Limit of the ratios in the evidence."""
 
 
 @dataclass(frozen=True)
 class PosePrior:
-    """What is known of heading and scale: told heading (None: nothing) and standard deviations."""
+    """Expected heading and scale: `turn_rad` (None: unknown), and standard deviations of both."""
 
     turn_rad: float | None
     turn_std_rad: float
     log_scale_std: float
 
     def cost(self, pose: Pose) -> float:
-        """What a pose loses for being unlikely, in units of the score."""
+        """What is subtracted from the score of a pose, by the prior."""
         return NAT_SCORE * self.nats(pose.turn_rad, pose.log_scale)
 
     def nats(
@@ -81,17 +89,17 @@ class Levels:
         return cls(min(look + 1, levels - 1), look, max(look - 1, 0))
 
     def recipe(self, level: int) -> EvidenceRecipe:
-        """The evidence that a level is looked at with."""
+        """Parameters of the evidence at a level."""
         return COARSE if level > self.look else FINE
 
 
 @dataclass(frozen=True, eq=False)
 class Registered:
-    """The best place of a view, and what speaks for it.
+    """The best place of a view, with its rivals.
 
-    `placed` is where it was finished, with its covariance. `score` adds up the scores of the
-    levels it was judged and finished at, `rival` is the best such score elsewhere; `look_score`
-    and `look_rival` compare all candidates at the level they were judged at; `fine_score` and
+    `placed` is where it was finished, with its covariance. `score` adds up the scores of the levels
+    it was judged and finished at, `rival` is the best such score at another place; `look_score` and
+    `look_rival` compare all candidates at the level they were judged at; `fine_score` and
     `fine_rival` the finalists with one finer level added, NaN where that was not needed.
     `finalists` are the places that were finished, with their scores, best first.
     """
@@ -108,12 +116,12 @@ class Registered:
 
     @property
     def look_ratio(self) -> float:
-        """Score of the best over the best elsewhere, where all candidates were judged."""
+        """Score of the best over that of its strongest rival, at the judged level."""
         return self.look_score / max(self.look_rival, 1e-6)
 
     @property
     def peak_ratio(self) -> float:
-        """Score of the best over the best elsewhere that was finished."""
+        """Score of the best over that of its strongest rival, after finishing."""
         return self.score / max(self.rival, 1e-6)
 
     def evidence(self) -> dict[str, float]:
@@ -146,7 +154,7 @@ class Registrar:
         self._lock = threading.Lock()
 
     def whole_window(self, level: int, recipe: EvidenceRecipe, view_px: float) -> SearchWindow:
-        """The whole sheet at a level, kept: views of about the same size share it."""
+        """The whole sheet at a level, cached: views of about the same size share it."""
         side = _rounded_side(view_px / 2**level)
         key = (level, recipe, side)
         with self._lock:
@@ -190,9 +198,9 @@ class Registrar:
         prior: PosePrior,
         known: Sequence[Placed] = (),
     ) -> list[Placed]:
-        """Candidates found at `level`, refined from there down to the look level, best first.
+        """Candidates found at `level`, refined down to the judged level, best first.
 
-        Hope is measured at the best of them, at the look level also at those `known` already.
+        Those far below the best are dropped; at the judged level the best `known` one counts too.
         """
         placed = [Placed.unjudged(found.pose, level) for found in candidates]
         for at in range(level, levels.look - 1, -1):
@@ -206,16 +214,16 @@ class Registrar:
     def standing(
         self, templates: ViewTemplates, judged: Sequence[Placed], prior: PosePrior
     ) -> tuple[float, float]:
-        """Score of the best of judged candidates, and of the best elsewhere."""
+        """Score of the best judged candidate, and of its strongest rival."""
         values = [each.score - prior.cost(each.pose) for each in judged]
         best = int(np.argmax(values))
         exclusion = EXCLUSION_SHARE * view_side_px(templates)
-        elsewhere = [
+        rivals = [
             value
             for value, each in zip(values, judged, strict=True)
             if apart_px(each, judged[best]) > exclusion
         ]
-        return values[best], max(elsewhere, default=0.0)
+        return values[best], max(rivals, default=0.0)
 
     def _compared(
         self, refiner: Refiner, placed: list[Placed], prior: PosePrior, known: Sequence[Placed]
@@ -270,7 +278,7 @@ class Registrar:
     def deepened(
         self, templates: ViewTemplates, finer: ViewTemplates, levels: Levels, found: Registered
     ) -> Registered:
-        """`found` judged anew with one level finer than the final one, of which `finer` is made.
+        """`found` judged again with one level finer than the final one, of which `finer` is made.
 
         The best may become another of the finalists.
         """

@@ -18,11 +18,12 @@ from scipy.fft import fft, irfft2, next_fast_len, rfft, rfft2
 from orthonav.geo.camera import counted_from_centres
 from orthonav.register.evidence import GROUPS
 from orthonav.register.memory import thread_memory
-from orthonav.register.pose import Pose, even_scale
+from orthonav.register.pose import Pose, even_scale, rotation
 from orthonav.register.template import Template, energy_of, turn_planes
 
 Array = NDArray[np.float32]
 ENERGY_FLOOR = 0.3
+"""Share of the typical energy added to the local one, so that blank ground is not amplified."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,10 +185,8 @@ def posed_channels(template: Template, turn: float, log_scale: float) -> Array:
     Each kind of evidence has the norm of its weight.
     """
     height, width = template.mask.shape
-    scale = math.exp(log_scale)
     half = posed_half_px(template, log_scale)
-    cos, sin = scale * math.cos(turn), scale * math.sin(turn)
-    linear = np.array([[cos, -sin], [sin, cos]])
+    linear = rotation(turn, math.exp(log_scale))
     move = np.array([half, half]) - linear @ [width / 2, height / 2]
     matrix = np.vstack([np.column_stack([linear, move]), [0, 0, 1]])
     centred = counted_from_centres(matrix)

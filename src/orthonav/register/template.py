@@ -1,4 +1,4 @@
-"""A view made ready for registration, at each level it is looked at."""
+"""A view as templates: its evidence at every level of the map that registration uses."""
 
 import math
 from dataclasses import dataclass
@@ -123,16 +123,6 @@ def derivatives(channels: Array, mask: Array) -> Array:
         into[0], into[1] = dx, dy
         np.subtract(dy * x, dx * y, out=into[2])
         np.add(dx * x, dy * y, out=into[3])
-    return out
-
-
-def basis_fields(shape: tuple[int, ...]) -> Array:
-    """By how much x and y of each pixel change with those steps: (4, 2, H, W)."""
-    x, y = _from_middle(*shape)
-    out = np.zeros((4, 2, *shape), dtype=np.float32)
-    out[0, 0], out[1, 1] = 1, 1
-    out[2, 0], out[2, 1] = -y, x
-    out[3, 0], out[3, 1] = x, y
     return out
 
 

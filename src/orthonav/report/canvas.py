@@ -1,7 +1,7 @@
-"""What all drawings share: colours, style, and the way to PNG and SVG.
+"""Drawings by matplotlib as PNG and SVG, in one style.
 
-Drawn on matplotlib's own canvases without pyplot, so nothing global is kept and no display needed.
-Colours are those of Okabe and Ito, told apart by everyone.
+The canvases are used without pyplot: no global state changes and no display is needed. Colours are
+those of Okabe and Ito (https://jfly.uni-koeln.de/color/), safe for colour-blind readers.
 """
 
 import io
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MissingExtraError
+from orthonav.extras import missing_extra
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 RIGHT, WRONG, TRUTH, GREY, INK = "#0072B2", "#D55E00", "#1A1A1A", "#8C8C8C", "#222222"
 SOFT = "#555555"
 DPI = 220
-"""Of the PNG: twice what a screen shows in the page, and enough for a paper."""
+"""Resolution of the PNG: twice that of a screen, and enough for a paper."""
 MOST_POINTS = 20_000
-"""Lines of more points are pixels in the SVG too, which would be too large to open."""
+"""Lines of more points are rasterized in the SVG, which would be too large to open."""
 OFFSET: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9}
-"""Of a note beside a point: its place is in points from there."""
+"""Arguments of an annotation whose position is an offset in points."""
 BACKING: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5}
-"""Box (`bbox`) that keeps a text readable on what is below it, and a text in the SVG."""
+"""Box (`bbox`) that keeps text readable on any background."""
 _STYLE: dict[Any, Any] = {
     "font.size": 10,
     "axes.edgecolor": GREY,
@@ -57,9 +57,11 @@ _NO_METADATA = {"Date": None, "Creator": None}
 
 @dataclass(frozen=True)
 class Drawing:
-    """One drawing in both forms: a PNG of `DPI` with a palette, and SVG text.
+    """One drawing as PNG and SVG; the same drawing gives the same bytes.
 
-    `size_in` is width and height in inches. The same drawing gives the same bytes.
+    `png`: image of `DPI` with a palette.
+    `svg`: document with text as text.
+    `size_in`: width and height in inches.
     """
 
     png: bytes
@@ -68,12 +70,12 @@ class Drawing:
 
 
 def draw_axes(size_in: tuple[float, float], draw: "Callable[[Axes], None]") -> Drawing:
-    """What `draw` puts on one pair of axes; `size_in` in inches. Raises as `draw_figure` does."""
+    """A drawing of `size_in` inches by a function of one pair of axes; see `draw_figure`."""
     return draw_figure(size_in, lambda figure: draw(figure.add_subplot()))
 
 
 def draw_figure(size_in: tuple[float, float], draw: "Callable[[Figure], None]") -> Drawing:
-    """What `draw` puts on a figure of matplotlib of `size_in` inches.
+    """A drawing of `size_in` inches by a function of a matplotlib figure.
 
     Raises `MissingExtraError` without matplotlib.
     """
@@ -81,9 +83,7 @@ def draw_figure(size_in: tuple[float, float], draw: "Callable[[Figure], None]") 
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise MissingExtraError(
-            "pictures need matplotlib, which is not installed: pip install 'orthonav[report]'"
-        ) from error
+        raise missing_extra("drawing figures", "report", "matplotlib", error) from error
     svg = io.StringIO()
     with _own_style():
         figure = Figure(figsize=size_in, dpi=DPI, layout="constrained")
@@ -91,14 +91,14 @@ def draw_figure(size_in: tuple[float, float], draw: "Callable[[Figure], None]") 
         draw(figure)
         canvas.draw()
         png = _png(np.asarray(canvas.buffer_rgba()))
-        figure.set_layout_engine("none")  # both forms are laid out alike, and once
+        figure.set_layout_engine("none")  # PNG and SVG share one layout
         _limit_points(figure)
         figure.savefig(svg, format="svg", dpi=DPI, metadata=_NO_METADATA)
     return Drawing(png, _NOT_XML.sub("\ufffd", svg.getvalue()), size_in)
 
 
 def _png(rgba: NDArray[np.uint8]) -> bytes:
-    """An opaque picture (H, W, 4) as PNG with a palette."""
+    """An opaque image (H, W, 4) as PNG with a palette."""
     from PIL import Image
 
     out = io.BytesIO()
@@ -108,7 +108,7 @@ def _png(rgba: NDArray[np.uint8]) -> bytes:
 
 
 def _limit_points(figure: "Figure") -> None:
-    """Lines of many points become pixels."""
+    """Rasterize lines of many points."""
     for line in (line for axes in figure.axes for line in axes.lines):
         if np.size(line.get_xdata()) > MOST_POINTS:
             line.set_rasterized(True)
@@ -116,11 +116,11 @@ def _limit_points(figure: "Figure") -> None:
 
 @contextmanager
 def _own_style() -> Iterator[None]:
-    """matplotlib's defaults and our style, whatever the user's own settings are."""
+    """matplotlib's defaults and our style, whatever the settings of the user."""
     import matplotlib
 
     with matplotlib.rc_context(), warnings.catch_warnings():
-        # A name in a script that the font of the PNG lacks is shown as boxes there.
+        # Characters that the font of the PNG lacks are shown as boxes.
         warnings.filterwarnings("ignore", "Glyph .* missing from")
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_STYLE)

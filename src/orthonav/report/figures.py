@@ -1,7 +1,7 @@
 """Figures of a report as files: SVG and PNG side by side in a folder of their own.
 
-The folder keeps a list of what was written, with checksums as `sha256sum` writes them. A file is
-ours while it is in the list as it is; all others are left alone, and never written over.
+The folder holds a list of written files with checksums in the format of `sha256sum`. Files that
+match the list may be replaced; all others are neither changed nor removed.
 """
 
 import hashlib
@@ -15,26 +15,45 @@ from pathlib import Path
 from orthonav.errors import OutputError
 from orthonav.files import replacing, write_text
 from orthonav.report.canvas import Drawing
+from orthonav.report.page import data_url
 
 FOLDER = "figures"
 LIST = "orthonav.sha256"
-"""Name of the list of what was written."""
+"""Name of the list of written files."""
 _LONGEST_NAME = 80
+_PX_PER_IN = 110
+"""Pixels of a page per inch of a drawing: text of 10 points becomes 15 pixels high."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _LISTED = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9][A-Za-z0-9._-]*\.(?:png|svg))")
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A drawing and what is said of it.
+    """A drawing with its texts.
 
-    `name` is that of its files (letters, digits, dots and dashes), `alt` for who cannot see it.
+    `name`: of its files (letters, digits, dots, underscores, dashes).
+    `alt`: description for screen readers; `caption`: text below it.
     """
 
     name: str
     alt: str
     caption: str
     drawing: Drawing
+
+    @property
+    def width_px(self) -> int:
+        """Width in a page."""
+        return round(self.drawing.size_in[0] * _PX_PER_IN)
+
+    @property
+    def height_px(self) -> int:
+        """Height in a page."""
+        return round(self.drawing.size_in[1] * _PX_PER_IN)
+
+    @property
+    def data_url(self) -> str:
+        """The PNG as an address that needs no file."""
+        return data_url(self.drawing.png, "image/png")
 
 
 def write_page(folder: Path, page: str, figures: Iterable[Figure]) -> Path:
@@ -50,9 +69,9 @@ def write_page(folder: Path, page: str, figures: Iterable[Figure]) -> Path:
 def write_figures(folder: Path, figures: Iterable[Figure]) -> list[Path]:
     """Write `NAME.svg` and `NAME.png` of each figure into `folder`/figures; return their paths.
 
-    Figures that an earlier call left there and that are not among these are removed, no other
-    files. Raises `ValueError` for names that are no file names or are given twice, `OutputError`
-    where a name is taken by a file that is not ours, or where something cannot be written.
+    Figures of an earlier call that are not among these are removed; other files are not touched.
+    Raises `ValueError` for names that are not plain file names or not unique, `OutputError` where a
+    name is taken by a file of somebody else, or where a file cannot be written.
     """
     contents = _contents(figures)
     _write(Path(folder) / FOLDER, contents, {})
@@ -60,7 +79,7 @@ def write_figures(folder: Path, figures: Iterable[Figure]) -> list[Path]:
 
 
 def _write(folder: Path, contents: Mapping[str, bytes], others: Mapping[Path, bytes]) -> None:
-    """Figures into `folder`, `others` where they say; all are written before any is in place."""
+    """Write figures into `folder` and `others`; all are written before any is renamed."""
     sums = {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
     earlier = _listed(folder)
     _check_free(folder, sums, earlier)
@@ -68,7 +87,7 @@ def _write(folder: Path, contents: Mapping[str, bytes], others: Mapping[Path, by
     with ExitStack() as stack:
         for path, data in (*((folder / n, d) for n, d in contents.items()), *others.items()):
             stack.enter_context(replacing(path)).write_bytes(data)
-        # Old and new until all are in place: what is cut off leaves nothing that looks foreign.
+        # Old and new names until all are in place: an interrupted call leaves nothing unlisted.
         old = [(total, name) for name, totals in earlier.items() for total in totals]
         if old or new:
             _write_list(folder, [*old, *new])
@@ -82,7 +101,7 @@ def _write(folder: Path, contents: Mapping[str, bytes], others: Mapping[Path, by
 def file_names(texts: Sequence[str]) -> list[str]:
     """A name for files for each text: letters, digits, dots, underscores, single dashes.
 
-    No two are alike, also where large and small letters are not told apart.
+    No two are equal, also on file systems that ignore case.
     """
     names: list[str] = []
     taken: set[str] = set()
@@ -115,7 +134,7 @@ def _contents(figures: Iterable[Figure]) -> dict[str, bytes]:
 
 
 def _listed(folder: Path) -> dict[str, set[str]]:
-    """File name -> checksums, of what was written into `folder` before; empty where unknown."""
+    """File name -> checksums of earlier figures in `folder`; empty where unknown."""
     try:
         text = (folder / LIST).read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -134,13 +153,13 @@ def _check_free(folder: Path, sums: Mapping[str, str], earlier: Mapping[str, set
             path, {total, *earlier.get(name, ())}
         ):
             raise OutputError(
-                "this file was changed, or not written by orthonav, and stands where a figure is "
-                f"to go; move it away or name another folder: {path}"
+                "a figure would overwrite a file that orthonav did not write or that was changed; "
+                f"move it or name another folder: {path}"
             )
 
 
 def _is_ours(path: Path, totals: Iterable[str]) -> bool:
-    """Whether a file is as we wrote it."""
+    """Whether a file is unchanged since we wrote it."""
     try:
         plain = path.is_file() and not path.is_symlink()
         return plain and hashlib.sha256(path.read_bytes()).hexdigest() in totals

@@ -1,4 +1,4 @@
-"""Numbers as reports write them; what is not defined is a dash."""
+"""Numbers as text; an undefined one is a dash."""
 
 import math
 
@@ -14,9 +14,9 @@ def plain_text(value: float) -> str:
 
 
 def measure_text(value: float, unit: str = "") -> str:
-    """A length or time with as many decimals as say something, and `-` where it is not defined.
+    """A length or time with its significant decimals, and `-` where it is not defined.
 
-    `unit` follows as it is, a space before it included.
+    `unit` is appended, so it begins with a space.
     """
     if not math.isfinite(value):
         return "-"

@@ -1,90 +1,80 @@
-"""Pieces of a self-contained HTML page: no script, nothing from outside, light and dark.
+"""Self-contained HTML pages from Jinja2 templates: nothing is loaded from outside.
 
-All text is escaped here, except what is HTML already: the `body` of a document and what is put
-into `pictures`, both made of these pieces.
+A page extends `base.html` and uses `macros.html`, both in `orthonav.report/templates`. Everything
+that a template is given is escaped.
 """
 
 import base64
-from collections.abc import Iterable, Mapping, Sequence
-from html import escape
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from typing import Any
 
-from orthonav.report.figures import Figure
-from orthonav.report.style import STYLE
+from orthonav.extras import missing_extra
 
-_PX_PER_IN = 110
-"""Pixels of the page for an inch of a drawing, where there is room for it."""
-
-
-def document(title: str, body: str, style: str = STYLE, kind: str = "Report") -> str:
-    """A whole page: a line with the project and the `kind` of page, `title` as the one heading of
-    the first order, and `body`, which is HTML already and has headings from the second order on.
-    """
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)} - orthonav</title>\n<style>{style}</style>\n</head>\n"
-        f'<body>\n<header class="top"><p><b>orthonav</b> <span>{escape(kind)}</span></p></header>\n'
-        f"<main>\n<h1>{escape(title)}</h1>\n{body}\n</main>\n</body>\n</html>\n"
-    )
+_MODULE_SYNTAX = re.compile(r"^(?:export |import .*$)", re.MULTILINE)
 
 
-def cards(shown: Iterable[tuple[str, str]]) -> str:
-    """The few figures that matter most, large: (value, what it is). Six fill a line."""
-    inside = "".join(
-        f"<div><b>{escape(value)}</b><span>{escape(said)}</span></div>" for value, said in shown
-    )
-    return f'<div class="cards">{inside}</div>'
-
-
-def notes(said: Iterable[str]) -> str:
-    """Sentences set off from the rest, each on its own; empty for none."""
-    return "".join(f'<p class="note">{escape(sentence)}</p>' for sentence in said)
-
-
-def html_table(
-    header: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    last_is_total: bool = False,
-    label: str = "table",
+def render(
+    package: str,
+    template: str,
+    values: Mapping[str, Any],
+    *,
+    style: str = "",
+    scripts: Sequence[str] = (),
 ) -> str:
-    """A table that scrolls sideways where it is too wide; the last row may be set off.
+    """The page of `template`, in the folder `templates` of `package`.
 
-    `label` says what it is to who hears the page.
+    `values` must hold `title` and `kind` (of page). `style` is added to the style of reports and
+    `scripts` run at the end of the page; a Content-Security-Policy allows these and no others.
+    Raises `MissingExtraError` without Jinja2.
     """
-    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in header)
-    lines = []
-    for i, row in enumerate(rows):
-        cells = "".join(f"<td>{escape(cell)}</td>" for cell in row)
-        is_total = last_is_total and i == len(rows) - 1
-        lines.append(f'<tr class="total">{cells}</tr>' if is_total else f"<tr>{cells}</tr>")
+    try:
+        from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+    except ImportError as error:
+        raise missing_extra("writing a page", "report", "jinja2", error) from error
+    environment = Environment(
+        loader=ChoiceLoader([PackageLoader(package), PackageLoader("orthonav.report")]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    style = static_text("report.css") + style
+    own = {"style": style, "scripts": scripts, "policy": _policy(style, scripts)}
+    return environment.get_template(template).render({**values, **own})
+
+
+def static_text(name: str, package: str = "orthonav.report") -> str:
+    """A style or script in the folder `static` of a package."""
+    return files(package).joinpath("static", name).read_text(encoding="utf-8")
+
+
+def data_url(data: bytes, media_type: str) -> str:
+    """`data` as an address that needs no file."""
+    return f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+def _policy(style: str, scripts: Sequence[str]) -> str:
+    """Only these scripts and this style are used, and nothing is requested."""
+    allowed = " ".join(map(_source, scripts)) or "'none'"
     return (
-        f'<div class="wide" tabindex="0" role="region" aria-label="{escape(label)}"><table>'
-        f"<thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table></div>"
+        f"default-src 'none'; img-src data:; style-src {_source(style)}; script-src {allowed}; "
+        "base-uri 'none'; form-action 'none'"
     )
 
 
-def figure_html(figure: Figure, broad: bool = False) -> str:
-    """A figure inside the page, with a text for who cannot see it and its caption below.
+def _source(text: str) -> str:
+    digest = hashlib.sha256(text.encode("utf-8", "replace")).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
-    It is embedded as PNG, which looks the same with the fonts of any machine. `broad` ones fill a
-    line of `pictures`.
+
+def joined_scripts(shared: Sequence[str], package: str, own: Sequence[str]) -> str:
+    """ES modules of `orthonav.report` and scripts of `package` as one script for a page.
+
+    A page that is opened from a disk cannot import modules, so `export` and `import` are removed.
     """
-    width, height = (round(side * _PX_PER_IN) for side in figure.drawing.size_in)
-    data = base64.b64encode(figure.drawing.png).decode("ascii")
-    kind = ' class="broad"' if broad else ""
-    return (
-        f'<figure{kind}><img alt="{escape(figure.alt)}" width="{width}" height="{height}" '
-        f'src="data:image/png;base64,{data}"><figcaption>{escape(figure.caption)}</figcaption></figure>'
-    )
-
-
-def pictures(shown: Iterable[str]) -> str:
-    """What `figure_html` made, two in a line where there is room and they are not broad."""
-    return f'<div class="pictures">{"".join(shown)}</div>'
-
-
-def definitions(said: Mapping[str, str], sentences: bool = False) -> str:
-    """Names and what they are, one per line; empty for none. Sentences need `SAID_STYLE`."""
-    rows = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in said.items())
-    kind = ' class="said"' if sentences else ""
-    return f"<dl{kind}>{rows}</dl>" if rows else ""
+    texts = [static_text(name) for name in shared] + [static_text(name, package) for name in own]
+    plain = [_MODULE_SYNTAX.sub("", text) for text in texts]
+    return f'(() => {{\n"use strict";\n{"".join(plain)}}})();'

@@ -1,7 +1,7 @@
-"""Representations: what of a picture is compared, grey levels or edges or gradients.
+"""Image representations that are compared: grey levels, edges or gradients.
 
 Every variant is called as `variant(grey, valid)` with `grey` (H, W) uint8 and `valid` (H, W) bool
-and gives float32 `(C, H, W)`, zero where not valid, without touching its inputs.
+and returns float32 `(C, H, W)`, zero where not valid; its inputs stay unchanged.
 """
 
 from orthonav.variants import Variant

@@ -34,11 +34,11 @@ class Canny:
 
     @property
     def margin_px(self) -> int:
-        """How far a pixel's value can reach into the representation, but for hysteresis."""
+        """Radius of influence of a pixel on the representation, without hysteresis."""
         return self.kernel // 2 + 2
 
     def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Edges (1, H, W), 1 on an edge and 0 elsewhere; none along the border of `valid`."""
+        """Edges (1, H, W), 1 on an edge, else 0; none along the border of `valid`."""
         edges = cv2.Canny(np.ascontiguousarray(grey), self.low, self.high, apertureSize=self.kernel)
         if not valid.all():
             reach = self.kernel + 2

@@ -1,9 +1,9 @@
 """Oriented gradients as circular harmonics of the edge direction.
 
 A pixel with gradient magnitude m and direction t contributes m * exp(2ik t), k = 0..3:
-the Fourier series of an orientation histogram in which a direction and its opposite are one (an
-edge keeps its place when its contrast flips between seasons). Sums over a cell of these seven
-numbers say the same as a histogram of orientations with soft bins, without any binning.
+the Fourier series of a histogram of unsigned orientations (the contrast of an edge may flip between
+seasons, its orientation does not). Sums of these seven numbers over a cell are equivalent to an
+orientation histogram with soft bins, without binning.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from orthonav.errors import VariantError
 
 HARMONICS = 3
+"""Chosen on aerial imagery of two dates, see docs/decisions/embedding.md."""
 BINS = 8
+"""Bins of the equivalent histogram; its triangular bins set the weights of the harmonics."""
 # A triangular bin of an orientation histogram passes harmonic k with the weight sinc(k / bins)^2.
 _SHARES = [np.float32(np.sqrt(2) * np.sinc(k / BINS) ** 2) for k in range(1, HARMONICS + 1)]
 
@@ -44,7 +46,7 @@ class OrientedGradients:
 
     @property
     def margin_px(self) -> int:
-        """How far a pixel's value can reach into the representation."""
+        """Radius of influence of a pixel on the representation."""
         return int(np.ceil(4 * self.sigma_px)) + 1  # OpenCV's kernel of 4 sigma, then Scharr
 
     def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -17,7 +17,7 @@ class Gray:
 
     @property
     def margin_px(self) -> int:
-        """How far a pixel's value can reach into the representation."""
+        """Radius of influence of a pixel on the representation."""
         return 0
 
     def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:

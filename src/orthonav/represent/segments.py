@@ -1,9 +1,9 @@
 """Boundaries of a classical graph-based segmentation: a light substitute for Segment Anything.
 
 Di Piazza et al. 2024, section 4, compare Canny with the boundaries of Segment Anything, which is
-far too heavy for an aircraft. This one asks the same question (where do regions meet?) of the
-method of Felzenszwalb and Huttenlocher (IJCV 2004): pixels are joined to regions along the lightest
-differences first, for as long as a difference is small against those inside the two regions.
+too expensive for an aircraft. This one finds region boundaries with the method of Felzenszwalb and
+Huttenlocher (IJCV 2004): pixels are merged into regions in the order of increasing difference, as
+long as a difference is small compared with those inside the two regions.
 """
 
 import math
@@ -14,24 +14,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MissingExtraError, VariantError
+from orthonav.errors import VariantError
+from orthonav.extras import needed
 
 MARGIN_PX = 32
+"""Most changes by cropping end there, see `Segments`."""
 
 
 @dataclass(frozen=True)
 class Segments:
     """Binary boundaries between the regions of a graph-based segmentation of the grey levels.
 
-    `scale` is the paper's k for grey levels 0..255: larger means larger regions. `sigma` is the
-    Gaussian before it in pixels, `min_size` the area in pixels below which a region is joined to
-    its neighbour. The defaults draw about as many boundary pixels as Canny with the thresholds of
-    Di Piazza et al., on aerial imagery of 1.5 m. A blurred edge can be a thin region of its own.
+    `scale`: k of Felzenszwalb and Huttenlocher for grey levels 0..255; larger means larger regions.
+    `sigma`: Gaussian smoothing in pixels. `min_size`: area in pixels below which a region is merged
+    with its neighbour. The defaults give about as many boundary pixels as Canny with the thresholds
+    of Di Piazza et al., on aerial imagery of 1.5 m. A blurred edge can become a thin region.
 
     Segmentation is not local: a difference anywhere in a region can move its far boundary. The
-    picture's own border matters most. On the same imagery, of the boundary pixels of a cut-out
-    half differ from those of the whole picture within 16 px of the cut, a quarter 32 to 48 px
-    inside, and a fifth however deep.
+    image border matters most. On the same imagery, half of the boundary pixels of a crop differ
+    from those of the whole image within 16 px of its border, a quarter 32 to 48 px inside, and a
+    fifth at any depth.
     """
 
     scale: float = 100.0
@@ -55,13 +57,13 @@ class Segments:
 
     @property
     def margin_px(self) -> int:
-        """Width of the rim in which cutting the picture changes most; some changes go deeper."""
+        """Width of the rim in which cropping changes most; some changes go deeper."""
         return MARGIN_PX + math.ceil(4 * self.sigma)
 
     def __call__(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Boundaries (1, H, W): 1 on both sides of one, else 0; none along the border of `valid`.
 
-        What lies under pixels that are not valid has no influence. Raises `MissingExtraError`
+        Values of pixels that are not valid have no influence. Raises `MissingExtraError`
         without scikit-image.
         """
         if not valid.any():
@@ -85,25 +87,18 @@ def boundaries(labels: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
     below = labels[1:] != labels[:-1]
     edges[1:] |= below
     edges[:-1] |= below
-    beside = labels[:, 1:] != labels[:, :-1]
-    edges[:, 1:] |= beside
-    edges[:, :-1] |= beside
+    right = labels[:, 1:] != labels[:, :-1]
+    edges[:, 1:] |= right
+    edges[:, :-1] |= right
     return edges
 
 
 def _filled(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The picture with its mean where it is not valid."""
+    """The image, with its mean at pixels that are not valid."""
     if valid.all():
         return np.ascontiguousarray(grey)
     return np.where(valid, grey, np.uint8(round(float(grey[valid].mean()))))
 
 
 def _felzenszwalb() -> Any:
-    try:
-        from skimage.segmentation import felzenszwalb
-    except ImportError as error:
-        raise MissingExtraError(
-            "graph-based segmentation needs scikit-image, which is not installed: "
-            "pip install 'orthonav[segments]'"
-        ) from error
-    return felzenszwalb
+    return needed("skimage.segmentation", "segments", "graph-based segmentation").felzenszwalb

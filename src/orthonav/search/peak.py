@@ -1,4 +1,4 @@
-"""Between the tiles: where the scores of neighbouring tiles say the peak lies.
+"""The position of the peak between tiles, from the scores of neighbouring tiles.
 
 Couturier and Akhloufi interpolate between neighbouring embeddings too; Di Piazza et al. 2024 found
 no gain from it with a triplet network. With the whitened gradient embedding the score falls

@@ -1,1 +1,1 @@
-"""Simulated flights over any orthophoto, and a generated landscape of several dates to fly over."""
+"""Simulated flights over any orthophoto, and a generated landscape at several dates."""

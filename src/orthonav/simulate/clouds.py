@@ -1,4 +1,4 @@
-"""Clouds below the aircraft: soft, white to grey, closed in the middle of a stretch of the way."""
+"""Clouds below the aircraft: soft, white to grey, closed in the middle of each cloudy stretch."""
 
 import math
 from dataclasses import dataclass
@@ -10,39 +10,39 @@ from numpy.typing import NDArray
 from orthonav.geo.camera import Camera, footprint_en_m
 
 FEWEST_VIEWS, MOST_VIEWS = 10, 40
-"""How many views a stretch of clouds lasts."""
+"""Length of a cloudy stretch in views."""
 EDGE = 0.25
-"""Share of a stretch at each end over which clouds become closed."""
+"""Share of a stretch, at each end, over which the clouds close."""
 BROKEN = 0.3
-"""Share of the stretches that never close."""
+"""Share of the stretches whose clouds never close."""
 HEIGHT = 0.5
 """Height of the clouds as a share of the aircraft's."""
 SOFTNESS = 0.25
-"""From where a cloud begins to where it is opaque, as a share of all degrees of cover."""
+"""Width of a cloud edge, as a share of the range of cloud cover."""
 TEXTURE_PX, TEXTURE_VIEWS = 512, 4.0
-"""The clouds repeat after so many pixels, which so many views' lengths hold."""
+"""Period of the cloud texture, in its pixels and in lengths of a view."""
 BLOB_PX = 40.0
 """Size of the largest clouds in pixels of the texture."""
 GRID = 8
-"""Pixels of the view to one of what is drawn of the soft layer."""
+"""Clouds are rendered at this fraction of the resolution of the view."""
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Cover:
-    """Clouds before one view: `opacity` (H, W) 0..1 and `grey` (H, W), the level of the clouds."""
+class CloudLayer:
+    """Clouds in one view: `opacity` (H, W) 0..1 and `grey` (H, W), the grey level of the clouds."""
 
     opacity: NDArray[np.float32]
     grey: NDArray[np.float32]
 
     def over(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture (H, W, 3) behind the clouds."""
+        """The image (H, W, 3) with the clouds in front."""
         behind = picture * (1 - self.opacity[..., None])
         return np.asarray(behind + (self.opacity * self.grey)[..., None], dtype=np.uint8)
 
 
 class Clouds:
-    """The clouds of a flight of `count` views, a `share` of them with clouds before them."""
+    """Clouds of a flight of `count` views, a `share` (0..1) of which are cloudy."""
 
     def __init__(self, count: int, share: float, seed: int) -> None:
         rng = np.random.default_rng([seed, 3])
@@ -52,15 +52,15 @@ class Clouds:
         self._ranks = _texture(rng)
 
     def degree(self, number: int) -> float:
-        """How closed the clouds are at a view: 0 none, 1 all of it is hidden."""
+        """Cloud cover of a view: 0 clear, 1 fully covered."""
         return float(self._degree[number])
 
     def before(
         self, number: int, camera: Camera, attitude: tuple[float, float, float, float], en_m: Array
-    ) -> Cover | None:
-        """Clouds between a view and the ground, None where there are none.
+    ) -> CloudLayer | None:
+        """Clouds between a view and the ground, None if it is clear.
 
-        `attitude` is heading, pitch, roll (deg) and height (m), `en_m` (2,) the place.
+        `attitude`: heading, pitch, roll (deg) and height (m). `en_m`: position (2,).
         """
         degree, stretch = self.degree(number), int(self._stretch[number])
         if degree <= 0:
@@ -80,13 +80,13 @@ class Clouds:
         shade = _sampled(self._ranks, corners / across_m * TEXTURE_PX * 2 + 31.0, size) - 0.5
         grey = self._level[stretch] + self._contrast[stretch] * shade
         whole = (camera.width_px, camera.height_px)
-        return Cover(*(_enlarged(part, whole) for part in (opacity, grey)))
+        return CloudLayer(*(_enlarged(part, whole) for part in (opacity, grey)))
 
 
 def _stretches(
     count: int, share: float, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.int64]]:
-    """How closed the clouds are at each view (N,), and in which stretch it lies (N,)."""
+    """Cloud cover (N,) and number of the stretch (N,) of each view."""
     wanted = round(share * count)
     lengths: list[int] = []
     while sum(lengths) < wanted:
@@ -107,7 +107,7 @@ def _stretches(
 
 
 def _texture(rng: np.random.Generator) -> NDArray[np.float32]:
-    """Blobs of all sizes (S, S) that repeat without a seam, as ranks: even from 0 to 1."""
+    """A seamless periodic random texture (S, S), as ranks: uniform from 0 to 1."""
     frequency = np.fft.fftfreq(TEXTURE_PX)
     radius = np.hypot(frequency[:, None], frequency[None])
     power = (radius**2 + (1 / BLOB_PX) ** 2) ** -1.5
@@ -118,7 +118,7 @@ def _texture(rng: np.random.Generator) -> NDArray[np.float32]:
 
 
 def _sampled(texture: NDArray[np.float32], corners_px: Array, size: tuple[int, int]) -> Array:
-    """The texture between four corners (4, 2), top left first and clockwise, as (h, w)."""
+    """The texture (h, w) between four corners (4, 2), clockwise from the top left."""
     across, down = np.linspace(0, 1, size[0]), np.linspace(0, 1, size[1])[:, None, None]
     top = corners_px[0] + across[:, None] * (corners_px[1] - corners_px[0])
     bottom = corners_px[3] + across[:, None] * (corners_px[2] - corners_px[3])

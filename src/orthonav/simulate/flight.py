@@ -1,7 +1,7 @@
-"""Flights over an orthophoto: true pictures of the ground, telemetry that errs, truth beside it.
+"""Simulated flights over an orthophoto: images, telemetry with errors, and the true positions.
 
-Positions are arbitrary, never on a tile grid. The picture is rendered with the true attitude and
-height; what the telemetry tells differs from it by the stated errors.
+Positions are arbitrary, never on a tile grid. Images are rendered with the true attitude and
+height; the telemetry differs from these by the requested errors.
 """
 
 import math
@@ -18,32 +18,53 @@ from orthonav.flight.writer import FlightWriter
 from orthonav.geo.area import Area
 from orthonav.geo.camera import Camera, footprint_en_m
 from orthonav.geo.route import Route
+from orthonav.geo.swapped import swapped_hint
 from orthonav.imagery.mosaic import Mosaic, SheetRaster
 from orthonav.records import Prior, Telemetry
 from orthonav.simulate.clouds import Clouds
-from orthonav.simulate.ground import Coverage, Ground
-from orthonav.simulate.motion import Way, Wind, drifting, mounted, rounded, steady_way, windy_way
+from orthonav.simulate.imagery import Coverage, GroundImagery
+from orthonav.simulate.motion import (
+    FlownPath,
+    Wind,
+    drifting,
+    mounted,
+    rounded,
+    steady_path,
+    windy_path,
+)
 from orthonav.simulate.render import ViewEffects, render_view
 
 DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
+"""A field of view of 65 x 51 deg, typical of survey drones."""
 MAX_VIEWS = 1_000_000
+"""Sanity limit."""
 TRIES_PER_VIEW = 400
+"""Random positions tried per view; suffices if 2 % of them are covered by imagery."""
 MARGIN_PX = 4
+"""Margin of the ground window: radius of the bicubic kernel, and rounding."""
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Errors:
-    """What the telemetry gets wrong, and how the camera tilts.
+    """Errors of the telemetry, and motion of the camera. All default to none.
 
-    `_std` is the standard deviation of what is drawn anew at every view: `agl_std` a share of the
-    height; `attitude_std_deg` true pitch and roll, which are reported; `tilt_std_deg` the error of
-    the reported ones. `prior_std_m` None tells no prior. What is wrong all along: `yaw_bias_deg`
-    and `agl_bias` (a share) are added to what is told; the camera is mounted so that in the
-    aircraft it tilts by `pitch_bias_deg` and `roll_bias_deg` more than told. The standard
-    deviations that are told are those of the scatter alone. `velocity_drift` is the standard
-    deviation of the scale (a share) and the direction (rad) of the told velocity, see
-    `motion.drifting`; None tells no velocity.
+    Standard deviations, drawn independently for every view; the telemetry reports them:
+
+    - `yaw_std_deg`: reported heading, degrees, 0..180.
+    - `agl_std`: reported height, as a share of it, 0..0.5.
+    - `tilt_std_deg`: reported pitch and roll, degrees, 0..20.
+    - `attitude_std_deg`: true pitch and roll (which are reported), degrees, 0..20.
+    - `prior_std_m`: reported prior position, metres per axis, 0..1e6; None reports no prior.
+
+    Constant biases, which the reported standard deviations do not include:
+
+    - `yaw_bias_deg`: reported minus true heading, degrees, -180..180.
+    - `agl_bias`: reported minus true height, as a share of it, -0.5..0.5.
+    - `pitch_bias_deg`, `roll_bias_deg`: unreported tilt of the camera mount, degrees, -20..20.
+
+    `velocity_drift`: standard deviation of the scale (a share) and direction (rad) of the reported
+    velocity, 0..0.5, see `motion.drifting`; None reports no velocity.
     """
 
     yaw_std_deg: float = 0.0
@@ -81,7 +102,7 @@ class Errors:
 
     @property
     def mount_deg(self) -> tuple[float, float]:
-        """Pitch and roll of the camera in the aircraft that nobody tells."""
+        """Unreported pitch and roll of the camera in the aircraft."""
         return self.pitch_bias_deg, self.roll_bias_deg
 
 
@@ -91,13 +112,21 @@ USUAL_EFFECTS = ViewEffects()
 
 @dataclass(frozen=True)
 class SimulateRequest:
-    """What to fly: along `route` every `spacing_m`, or at `random` places; `agl_m` above ground.
+    """Parameters of a simulated flight.
 
-    Without `agl_m` the shorter side of the image covers 256 pixels of the orthophoto. `speed_mps`
-    is the airspeed; in `wind` views are as far apart in time as without, `spacing_m / speed_mps`.
-    Corners of the route are flown as arcs of `turn_radius_m`, with 0 on the spot. `cloud_share` of
-    the views have clouds before them. With `beyond` the route may leave the imagery, which is then
-    mirrored at its border.
+    - `orthos`: orthophotos to fly over; earlier ones take precedence.
+    - `out`: flight folder to write.
+    - `route`: route to fly; or `random`: number of random positions, 1 to 1e6. One of the two.
+    - `agl_m`: height above ground, 1..50,000 m; None: the shorter side of the image covers 256
+      pixels of the orthophoto.
+    - `spacing_m`: distance between views on a route in still air; None: flown in one second.
+    - `airspeed_mps`: airspeed. In wind, views are `spacing_m / airspeed_mps` seconds apart too.
+    - `camera`: intrinsics; `errors`: of the telemetry; `effects`: image degradation.
+    - `seed`: of all random draws, 0 or more; equal requests give equal bytes.
+    - `wind`: None for still air; only on a route.
+    - `turn_radius_m`: radius of the corners of a route, 0..100,000 m; 0 turns on the spot.
+    - `cloud_share`: share of the views with clouds, 0..1.
+    - `beyond`: whether the route may leave the imagery, which is then mirrored at its border.
     """
 
     orthos: Sequence[Path]
@@ -106,7 +135,7 @@ class SimulateRequest:
     random: int | None = None
     agl_m: float | None = None
     spacing_m: float | None = None
-    speed_mps: float = 25.0
+    airspeed_mps: float = 25.0
     camera: Camera = DEFAULT_CAMERA
     errors: Errors = NO_ERRORS
     effects: ViewEffects = USUAL_EFFECTS
@@ -119,8 +148,11 @@ class SimulateRequest:
 
 @dataclass(frozen=True)
 class _Pose:
-    """Where and how the camera is; what a faultless autopilot would tell of that is `reported_deg`:
-    heading, pitch and roll of the aircraft."""
+    """True pose of the camera at one view.
+
+    `reported_deg`: heading, pitch and roll of the aircraft as reported without errors.
+    `reported_en_mps`: reported velocity over ground, None if not reported.
+    """
 
     position_en_m: Array
     yaw_deg: float
@@ -140,10 +172,10 @@ class _Pose:
 def simulate_flight(
     request: SimulateRequest, progress: Callable[[float], None] | None = None
 ) -> int:
-    """Write a flight folder to `request.out`, whole or not at all; returns the number of views.
+    """Write a flight folder to `request.out`, complete or not at all; returns the number of views.
 
-    Raises `AreaError` where no view fits into the imagery or the route leaves it, and as
-    `Mosaic.open` does.
+    Raises `FlightError` on impossible parameters, `AreaError` if no view fits into the imagery or
+    the route leaves it, and as `Mosaic.open` does.
     """
     _check(request)
     mosaic = Mosaic.open(request.orthos)
@@ -174,7 +206,7 @@ def simulate_flight(
             rng = np.random.default_rng([request.seed, 1, number])
             image = _picture(request, ground, clouds, number, pose, rng)
             lat, lon = area.frame.latlon_from_en(pose.position_en_m)
-            telemetry = _told(request, area, pose, rng)
+            telemetry = _telemetry(request, area, pose, rng)
             quality = request.effects.jpeg_quality
             name = f"{number + 1:0{digits}d}.jpg"
             writer.add(name, image, telemetry, (float(lat), float(lon)), quality)
@@ -185,15 +217,17 @@ def simulate_flight(
 
 
 def _check(request: SimulateRequest) -> None:
-    """Raises `FlightError` on what cannot be flown, as far as that is known without imagery."""
+    """Raise `FlightError` on parameters that are impossible for any imagery."""
     if (request.route is None) == (request.random is None):
-        raise FlightError("fly along a route or at a number of random places, one of them")
+        raise FlightError("give either a route or a number of random positions")
     if request.random is not None and not 1 <= request.random <= MAX_VIEWS:
-        raise FlightError(f"number of random places must be 1 to {MAX_VIEWS}: {request.random}")
+        raise FlightError(
+            f"number of random positions must be 1 to {MAX_VIEWS}, got {request.random}"
+        )
     if request.seed < 0:
         raise FlightError(f"seed must be 0 or more, got {request.seed}")
     if not 0 <= request.turn_radius_m <= 100_000:
-        raise FlightError(f"radius of turns must be 0 to 100,000 m, got {request.turn_radius_m}")
+        raise FlightError(f"turn radius must be 0 to 100,000 m, got {request.turn_radius_m}")
     if not 0 <= request.cloud_share <= 1:
         raise FlightError(
             f"cloud_share must be 0 to 1 (a share of the views), got {request.cloud_share}"
@@ -204,9 +238,9 @@ def _check(request: SimulateRequest) -> None:
         "velocity_drift": request.errors.velocity_drift is not None,
         "beyond": request.beyond,
     }
-    asked = [name for name, value in on_a_route.items() if value]
-    if request.route is None and asked:
-        raise FlightError(f"{', '.join(asked)}: only along a route, not at random places")
+    given = [name for name, value in on_a_route.items() if value]
+    if request.route is None and given:
+        raise FlightError(f"{', '.join(given)}: only along a route, not at random positions")
 
 
 def _height_m(request: SimulateRequest, mosaic: Mosaic) -> float:
@@ -224,11 +258,11 @@ def _ground(
     raster: SheetRaster,
     corner: tuple[float, float, float],
     coverage: Coverage,
-) -> Ground:
-    """The raster whose west, north and pixel size in m are `corner`, mirrored if that is asked."""
+) -> GroundImagery:
+    """The raster with `corner` (west, north, pixel size, metres), mirrored if requested."""
     west_m, north_m, gsd_m = corner
     if not request.beyond:
-        return Ground(raster, west_m, north_m, gsd_m)
+        return GroundImagery(raster, west_m, north_m, gsd_m)
     west, south, east, north = coverage.box_en_m()
     box = (
         math.ceil((west - west_m) / gsd_m),
@@ -236,11 +270,11 @@ def _ground(
         math.floor((east - west_m) / gsd_m),
         math.floor((north_m - south) / gsd_m),
     )
-    return Ground(raster, west_m, north_m, gsd_m, box)
+    return GroundImagery(raster, west_m, north_m, gsd_m, box)
 
 
 def _sees_ground(coverage: Coverage, camera: Camera, pose: _Pose) -> bool:
-    """Whether the whole view lies on imagery, the horizon not in it."""
+    """Whether imagery covers the whole view, without the horizon."""
     try:
         return coverage.whole(_corners_en_m(camera, pose))
     except CameraError:
@@ -265,7 +299,7 @@ def _poses(
         else:
             wide, high = np.ptp(footprint_en_m(request.camera, 0, 0, 0, agl_m), axis=0)
             raise AreaError(
-                f"found no place where a view of {wide:.0f} x {high:.0f} m lies within the "
+                f"found no position where a view of {wide:.0f} x {high:.0f} m lies within the "
                 f"imagery of {east - west:.0f} x {north - south:.0f} m; fly lower (--agl-m)"
             )
 
@@ -273,44 +307,56 @@ def _poses(
 def _route_poses(
     request: SimulateRequest, route: Route, area: Area, agl_m: float, coverage: Coverage
 ) -> Iterator[_Pose]:
-    way = _way(request, route.points_en_m(area.frame))
-    velocities = _reported_velocities(request, way)
-    for number, (place, heading) in enumerate(zip(way.places_en_m, way.headings_deg, strict=True)):
+    path = _path(request, route.points_en_m(area.frame))
+    velocities = _reported_velocities(request, path)
+    views = zip(path.places_en_m, path.headings_deg, strict=True)
+    for number, (place, heading) in enumerate(views):
         rng = np.random.default_rng([request.seed, 0, number])
-        time_s, told = float(way.times_s[number]), velocities[number]
-        pose = _tilted(request, rng, place, float(heading), agl_m, time_s, told)
+        time_s, velocity = float(path.times_s[number]), velocities[number]
+        pose = _tilted(request, rng, place, float(heading), agl_m, time_s, velocity)
         if not request.beyond and not _sees_ground(coverage, request.camera, pose):
-            lat, lon = area.frame.latlon_from_en(place)
+            lat, lon = (float(value) for value in area.frame.latlon_from_en(place))
             raise AreaError(
                 f"view {number + 1} of the route, at {lat:.5f}, {lon:.5f}, "
-                "does not lie wholly within the imagery"
+                f"does not lie completely within the imagery{_swapped(area, lat, lon)}"
             )
         yield pose
 
 
-def _way(request: SimulateRequest, line_en_m: Array) -> Way:
-    speed_mps = request.speed_mps
-    spacing_m = speed_mps if request.spacing_m is None else request.spacing_m
-    if not (0 < spacing_m < math.inf and 0 < speed_mps < math.inf):
-        raise FlightError("distance between views and speed must be above 0")
+def _swapped(area: Area, lat_deg: float, lon_deg: float) -> str:
+    """A hint if the position with latitude and longitude swapped lies within the imagery."""
+
+    def within(lat: float, lon: float) -> bool:
+        return bool(area.contains(area.frame.en_from_latlon([lat], [lon]))[0])
+
+    return swapped_hint(lat_deg, lon_deg, within)
+
+
+def _path(request: SimulateRequest, line_en_m: Array) -> FlownPath:
+    airspeed_mps = request.airspeed_mps
+    spacing_m = airspeed_mps if request.spacing_m is None else request.spacing_m
+    if not (0 < spacing_m < math.inf and 0 < airspeed_mps < math.inf):
+        raise FlightError("distance between views and airspeed must be above 0")
     line = rounded(line_en_m, request.turn_radius_m) if request.turn_radius_m else line_en_m
     if request.wind is None:
-        way = steady_way(line, spacing_m, speed_mps)
+        path = steady_path(line, spacing_m, airspeed_mps)
     else:
         rng = np.random.default_rng([request.seed, 2])
-        way = windy_way(line, spacing_m, speed_mps, request.wind, rng, MAX_VIEWS)
-    if len(way.places_en_m) > MAX_VIEWS:
-        raise FlightError(f"route gives {len(way.places_en_m)} views, more than {MAX_VIEWS}")
-    return way
+        path = windy_path(line, spacing_m, airspeed_mps, request.wind, rng, MAX_VIEWS)
+    if len(path.places_en_m) > MAX_VIEWS:
+        raise FlightError(f"route has {len(path.places_en_m)} views, more than {MAX_VIEWS}")
+    return path
 
 
-def _reported_velocities(request: SimulateRequest, way: Way) -> list[tuple[float, float] | None]:
+def _reported_velocities(
+    request: SimulateRequest, path: FlownPath
+) -> list[tuple[float, float] | None]:
     drift = request.errors.velocity_drift
     if drift is None:
-        return [None] * len(way.places_en_m)
+        return [None] * len(path.places_en_m)
     rng = np.random.default_rng([request.seed, 4])
-    told = drifting(way.velocities_en_mps, way.times_s, drift, rng)
-    return [(round(float(east), 4), round(float(north), 4)) for east, north in told]
+    reported = drifting(path.velocities_en_mps, path.times_s, drift, rng)
+    return [(round(float(east), 4), round(float(north), 4)) for east, north in reported]
 
 
 def _tilted(
@@ -324,9 +370,9 @@ def _tilted(
 ) -> _Pose:
     errors = request.errors
     tilt = np.clip(rng.normal(0, 1, 2), -2.5, 2.5) * errors.attitude_std_deg
-    told = (float(yaw_deg), float(tilt[0]), float(tilt[1]))
-    true = mounted(told, *errors.mount_deg) if any(errors.mount_deg) else told
-    return _Pose(place, *true, agl_m, time_s, told, reported_en_mps)
+    reported = (float(yaw_deg), float(tilt[0]), float(tilt[1]))
+    true = mounted(reported, *errors.mount_deg) if any(errors.mount_deg) else reported
+    return _Pose(place, *true, agl_m, time_s, reported, reported_en_mps)
 
 
 def _corners_en_m(camera: Camera, pose: _Pose) -> Array:
@@ -336,13 +382,13 @@ def _corners_en_m(camera: Camera, pose: _Pose) -> Array:
 
 def _picture(
     request: SimulateRequest,
-    ground: Ground,
+    ground: GroundImagery,
     clouds: Clouds | None,
     number: int,
     pose: _Pose,
     rng: np.random.Generator,
 ) -> NDArray[np.uint8]:
-    """What the camera sees (H, W, 3), rendered from the window of imagery under it."""
+    """The image of the camera (H, W, 3), rendered from the window of imagery under it."""
     camera, attitude = request.camera, pose.attitude
     rgb, corner_en_m = ground.window(_corners_en_m(camera, pose), MARGIN_PX)
     cover = None
@@ -352,7 +398,9 @@ def _picture(
     return render_view(camera, attitude, rgb, corner, ground.gsd_m, request.effects, rng, cover)
 
 
-def _told(request: SimulateRequest, area: Area, pose: _Pose, rng: np.random.Generator) -> Telemetry:
+def _telemetry(
+    request: SimulateRequest, area: Area, pose: _Pose, rng: np.random.Generator
+) -> Telemetry:
     """Telemetry of a pose with its errors."""
     errors, height = request.errors, 1 + request.errors.agl_bias
     yaw_deg, pitch_deg, roll_deg = pose.reported_deg

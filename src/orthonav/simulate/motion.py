@@ -1,4 +1,4 @@
-"""How an aircraft gets along its route: corners, wind, what odometry tells of it, and its mount."""
+"""Motion along a route: corners, wind, reported velocity, and the camera mount."""
 
 import math
 from collections.abc import Iterator
@@ -12,18 +12,19 @@ from orthonav.geo.camera import attitude_of, enu_from_camera
 from orthonav.geo.route import along_polyline_en_m
 
 GUST_STD = 0.15
-"""Standard deviation per axis of what gusts add to the wind, as a share of its speed."""
+"""Standard deviation of the gusts per axis, as a share of the wind speed."""
 LARGEST_GUST = 0.4
-"""What gusts add at most, as a share of the wind's speed."""
+"""Largest gust, as a share of the wind speed."""
 GUST_TIME_S = 60.0
-"""Time after which a gust is e times weaker."""
+"""Time constant of the gusts."""
 DRIFT_TIME_S = 300.0
-"""Time after which the error of odometry is e times smaller: it hardly changes within a minute."""
+"""Time constant of the odometry error, which hardly changes within a minute."""
 ARC_STEP_DEG = 2.0
+"""Angle between the points of an arc."""
 SHARPEST_DEG = 179.0
-"""A corner that turns by more is no arc: the aircraft turns about on the spot."""
+"""Sharper corners are flown as turns on the spot."""
 LONGEST_STEP_S = 0.5
-"""Wind and course stay the same for so long."""
+"""Longest time step with constant wind and course."""
 Array = NDArray[np.float64]
 
 
@@ -31,8 +32,8 @@ Array = NDArray[np.float64]
 class Wind:
     """Wind of `speed_mps` that comes from `from_deg` (clockwise from true north), with gusts.
 
-    Gusts are an Ornstein-Uhlenbeck process per axis, `GUST_STD` of the speed strong and gone after
-    about `GUST_TIME_S`.
+    Gusts are an Ornstein-Uhlenbeck process per axis with the standard deviation `GUST_STD` (a share
+    of the wind speed) and the time constant `GUST_TIME_S`.
     """
 
     speed_mps: float
@@ -43,12 +44,12 @@ class Wind:
             raise FlightError(f"wind must be 0 to 200 m/s, got {self.speed_mps}")
         if not -360 <= self.from_deg <= 360:
             raise FlightError(
-                f"wind must come from -360 to 360 deg from true north, got {self.from_deg}"
+                f"wind direction must be -360 to 360 deg from true north, got {self.from_deg}"
             )
 
     @property
     def strongest_mps(self) -> float:
-        """Speed in the strongest gust."""
+        """Wind speed in the strongest gust."""
         return self.speed_mps * (1 + LARGEST_GUST)
 
     @property
@@ -59,9 +60,12 @@ class Wind:
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
-    """Views (N) along a route: places (N, 2), heading (N,), time since the first (N,), and the
-    velocity over ground at the first (2,)."""
+class FlownPath:
+    """N views along a route.
+
+    `places_en_m` (N, 2): positions. `headings_deg` (N,). `times_s` (N,): time since the first.
+    `first_velocity_en_mps` (2,): velocity over ground at the first.
+    """
 
     places_en_m: Array
     headings_deg: Array
@@ -70,42 +74,42 @@ class Way:
 
     @property
     def velocities_en_mps(self) -> Array:
-        """(N, 2) velocity over ground since the view before: what adds up to the way."""
+        """Mean velocity over ground (N, 2) since the previous view; integrates to the positions."""
         moved = np.diff(self.places_en_m, axis=0) / np.diff(self.times_s)[:, None]
         return np.concatenate([self.first_velocity_en_mps[None], moved])
 
 
-def steady_way(line_en_m: Array, spacing_m: float, speed_mps: float) -> Way:
-    """Along the polyline (M, 2) in still air: the heading is the course."""
+def steady_path(line_en_m: Array, spacing_m: float, speed_mps: float) -> FlownPath:
+    """Path along the polyline (M, 2) in still air; the heading equals the course."""
     places, courses = along_polyline_en_m(line_en_m, spacing_m)
     first = speed_mps * _direction(float(courses[0]))
     times = np.arange(len(places), dtype=np.float64) * spacing_m / speed_mps
-    return Way(places, courses, times, first)
+    return FlownPath(places, courses, times, first)
 
 
-def windy_way(
+def windy_path(
     line_en_m: Array,
     spacing_m: float,
     airspeed_mps: float,
     wind: Wind,
     rng: np.random.Generator,
     most: int,
-) -> Way:
-    """Along the polyline (M, 2) in wind: the heading crabs, the speed over ground varies.
+) -> FlownPath:
+    """Path along the polyline (M, 2) in wind, with a crab angle and a varying ground speed.
 
-    Views are `spacing_m / airspeed_mps` seconds apart, `most` of them and one at the most. Raises
-    `FlightError` where the strongest gust is not slower than the aircraft.
+    Views are `spacing_m / airspeed_mps` seconds apart, at most `most` + 1. Raises `FlightError` if
+    the strongest gust is as fast as the aircraft.
     """
     if wind.strongest_mps >= airspeed_mps:
         raise FlightError(
             f"wind of {wind.speed_mps:g} m/s, {wind.strongest_mps:.3g} m/s in gusts, is too strong "
-            f"for an airspeed of {airspeed_mps:g} m/s: the aircraft cannot keep to its route"
+            f"for an airspeed of {airspeed_mps:g} m/s: the aircraft cannot follow its route"
         )
     legs = np.diff(line_en_m, axis=0)
     lengths = np.linalg.norm(legs, axis=1)
     legs, starts, lengths = legs[lengths > 0], line_en_m[:-1][lengths > 0], lengths[lengths > 0]
     if not len(legs):
-        return steady_way(line_en_m, spacing_m, airspeed_mps)
+        return steady_path(line_en_m, spacing_m, airspeed_mps)
     courses, ends = legs / lengths[:, None], np.cumsum(lengths)
     interval_s = spacing_m / airspeed_mps
     steps = math.ceil(interval_s / LONGEST_STEP_S)
@@ -128,11 +132,11 @@ def windy_way(
     made = np.array(rows)
     headings = np.asarray(np.degrees(np.arctan2(made[:, 2], made[:, 3])) % 360, dtype=np.float64)
     times = np.arange(len(made), dtype=np.float64) * interval_s
-    return Way(made[:, :2], headings, times, made[0, 4:])
+    return FlownPath(made[:, :2], headings, times, made[0, 4:])
 
 
 def _moving_air(wind: Wind, step_s: float, rng: np.random.Generator) -> Iterator[Array]:
-    """Velocity of the air (2,) after every step, without end."""
+    """Velocity of the air (2,) at successive steps, infinitely many."""
     std, most = GUST_STD * wind.speed_mps, LARGEST_GUST * wind.speed_mps
     for gust in _wandering(step_s / GUST_TIME_S, rng):
         added = gust * std
@@ -140,18 +144,21 @@ def _moving_air(wind: Wind, step_s: float, rng: np.random.Generator) -> Iterator
 
 
 def _wandering(step: float, rng: np.random.Generator) -> Iterator[Array]:
-    """A stationary Ornstein-Uhlenbeck process (2,) of standard deviation 1, steps of `step` time
-    constants (Gillespie 1996, doi:10.1103/PhysRevE.54.2084)."""
-    kept = math.exp(-step)
+    """A stationary Ornstein-Uhlenbeck process (2,) of standard deviation 1, sampled every `step`
+    time constants (Gillespie 1996, doi:10.1103/PhysRevE.54.2084)."""
+    decay = math.exp(-step)
     value = rng.normal(0, 1, 2)
     while True:
         yield value
-        value = kept * value + math.sqrt(1 - kept**2) * rng.normal(0, 1, 2)
+        value = decay * value + math.sqrt(1 - decay**2) * rng.normal(0, 1, 2)
 
 
 def drifting(velocities: Array, times_s: Array, drift: float, rng: np.random.Generator) -> Array:
-    """What odometry tells of velocities (N, 2): too long or short by a share of `drift`, turned by
-    `drift` radians (standard deviations), both wandering with `DRIFT_TIME_S`."""
+    """Velocities (N, 2) as reported by odometry with a drifting scale and direction.
+
+    The scale error (a share) and the direction error (rad) have the standard deviation `drift` and
+    the time constant `DRIFT_TIME_S`.
+    """
     step_s = float(times_s[1] - times_s[0]) if len(times_s) > 1 else 1.0
     off = drift * np.array(
         [error for error, _ in zip(_wandering(step_s / DRIFT_TIME_S, rng), times_s, strict=False)]
@@ -163,9 +170,9 @@ def drifting(velocities: Array, times_s: Array, drift: float, rng: np.random.Gen
 
 
 def rounded(line_en_m: Array, radius_m: float) -> Array:
-    """The polyline (M, 2) with its corners cut to arcs of a radius, tighter where legs are short.
+    """The polyline (M, 2) with rounded corners; arcs are tighter at short legs.
 
-    About-turns stay as they are.
+    About-turns are left unchanged.
     """
     if len(line_en_m) < 3:
         return line_en_m
@@ -176,7 +183,7 @@ def rounded(line_en_m: Array, radius_m: float) -> Array:
 
 
 def _arc(before: Array, corner: Array, after: Array, radius_m: float) -> Array:
-    """Points (K, 2) of the arc that leaves one leg and joins the next, half of each at most."""
+    """Points (K, 2) of the arc between two legs, which replaces at most half of each."""
     legs = np.array([corner - before, after - corner])
     lengths = np.linalg.norm(legs, axis=1)
     if lengths.min() == 0:
@@ -196,7 +203,7 @@ def _arc(before: Array, corner: Array, after: Array, radius_m: float) -> Array:
 def mounted(
     attitude_deg: tuple[float, float, float], pitch_deg: float, roll_deg: float
 ) -> tuple[float, float, float]:
-    """Heading, pitch and roll of a camera that tilts in an aircraft of that attitude."""
+    """Heading, pitch and roll of a tilted camera in an aircraft with the given attitude."""
     level = enu_from_camera(0.0, 0.0, 0.0)
     tilted = enu_from_camera(0.0, pitch_deg, roll_deg)
     return attitude_of(enu_from_camera(*attitude_deg) @ level.T @ tilted)

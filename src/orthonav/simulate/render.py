@@ -1,4 +1,4 @@
-"""Rendering what a camera sees of flat ground, with the faults of real pictures."""
+"""Rendering of camera views of flat ground, with the degradation of real images."""
 
 from dataclasses import dataclass
 
@@ -14,17 +14,18 @@ from orthonav.geo.camera import (
     enu_from_camera,
     undistort,
 )
-from orthonav.simulate.clouds import Cover
+from orthonav.simulate.clouds import CloudLayer
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class ViewEffects:
-    """Faults of the picture.
+    """Image degradation.
 
-    `exposure_std`: relative error of exposure; `blur_px`: standard deviation of the blur in
-    pixels of the view; `noise_std`: sensor noise in grey levels; `jpeg_quality` 1..100.
+    `exposure_std`: standard deviation of the logarithm of the exposure, 0..1. `blur_px`: standard
+    deviation of the blur in pixels, 0..50. `noise_std`: standard deviation of the sensor noise in
+    grey levels, 0..128. `jpeg_quality`: 1..100. Raises `FlightError` outside these ranges.
     """
 
     exposure_std: float = 0.15
@@ -49,10 +50,13 @@ def render_view(
     gsd_m: float,
     effects: ViewEffects,
     rng: np.random.Generator,
-    clouds: Cover | None = None,
+    clouds: CloudLayer | None = None,
 ) -> NDArray[np.uint8]:
-    """Picture (H, W, 3) of ground (h, w, 3) whose north-west corner lies at `ground_corner_en_m`,
-    metres from the point below the camera; `attitude` is yaw, pitch, roll (deg) and height (m).
+    """Image (H, W, 3) of flat ground.
+
+    `ground_rgb` (h, w, 3) is an orthophoto with `gsd_m` metres per pixel; `ground_corner_en_m` is
+    its north-west corner, metres from the nadir of the camera. `attitude`: yaw, pitch, roll (deg)
+    and height (m).
     """
     picture = _projected(camera, attitude, ground_rgb, ground_corner_en_m, gsd_m)
     if clouds is not None:

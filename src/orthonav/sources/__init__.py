@@ -1,4 +1,4 @@
-"""What people record, read as flights: photographs, videos, ROS recordings, autopilots' logs."""
+"""Recordings of all kinds read as flights: photographs, videos, ROS recordings, autopilot logs."""
 
 from orthonav.sources.flightlog import LoggedFlight
 from orthonav.sources.importing import Imported, import_flight

@@ -21,9 +21,9 @@ from orthonav.sources.attitude import (
     rotations_of_wxyz,
 )
 from orthonav.sources.guard import needed, reading
-from orthonav.sources.track import Samples, Track, attitude_of_angles
+from orthonav.sources.track import RecordedTrack, Samples, attitude_of_angles
 
-DATAFLASH_MAGIC = b"\xa3\x95\x80"  # a record of formats comes first
+DATAFLASH_MAGIC = b"\xa3\x95\x80"  # starts with a record of formats
 MAVLINK_MAGICS = (0xFE, 0xFD)
 _DOWNWARD = 25  # MAV_SENSOR_ROTATION_PITCH_270
 _RANGE_IS_GOOD = 4
@@ -39,22 +39,22 @@ _WANTED = {
 
 
 class _Collected:
-    """Samples of a log as its messages come."""
+    """Samples collected from a log."""
 
     def __init__(self, mount_deg: Angles) -> None:
         self.mount = mount_deg
         self.attitude, self.velocity, self.position = Samples(3), Samples(2), Samples(3)
         self.distance, self.above_home = Samples(1), Samples(1)
 
-    def track(self, what: str, path: Path) -> Track:
-        """The track of it all; raises `FlightError` without attitude."""
+    def track(self, what: str, path: Path) -> RecordedTrack:
+        """The track of all samples; raises `FlightError` without attitude."""
         attitude = attitude_of_angles(
             self.attitude, lambda angles: enu_from_body_camera(ned_from_angles(angles), self.mount)
         )
         if attitude is None:
             raise FlightError(f"{what} has no attitude: {path}")
         heights = self.distance.series(), self.above_home.series()
-        return Track(
+        return RecordedTrack(
             attitude=attitude,
             heights=tuple(series for series in heights if series is not None),
             position=self.position.positions(),
@@ -63,17 +63,17 @@ class _Collected:
         )
 
 
-def read_dataflash(path: Path, mount_deg: Angles) -> Track:
+def read_dataflash(path: Path, mount_deg: Angles) -> RecordedTrack:
     """The track of a DataFlash log; times are UTC where it has a GPS fix, else since boot.
 
-    Raises `FlightError` where it is no such log, broken, or without attitude.
+    Raises `FlightError` where it is another file, damaged, or without attitude.
     """
     reader = needed("pymavlink.DFReader", "ArduPilot logs")
     collected = _Collected(mount_deg)
     with reading("ArduPilot log", path, silent=True):
         log = reader.DFReader_binary.__new__(reader.DFReader_binary)
         try:
-            log.__init__(str(path))  # apart, so that its file is closed where this fails
+            log.__init__(str(path))  # separately, so that its file is closed where this fails
             base_ns = round(getattr(log.clock, "timebase", 0.0) * 1e6) * 1000
             while (message := log.recv_match(type=["ATT", "GPS", "POS", "RFND"])) is not None:
                 if hasattr(message, "TimeUS"):
@@ -106,11 +106,11 @@ def _from_dataflash(collected: _Collected, message: Any, time_ns: int) -> None:
             collected.distance.add(time_ns, message.Dist)
 
 
-def read_tlog(path: Path, mount_deg: Angles) -> Track:
-    """The track of a telemetry log; times are UTC of the ground station, when messages came in.
+def read_tlog(path: Path, mount_deg: Angles) -> RecordedTrack:
+    """The track of a telemetry log; times are UTC of the ground station at reception.
 
-    Only the vehicle that tells its attitude first is read. Raises `FlightError` where there is no
-    attitude, or where nothing of it is MAVLink.
+    Only the first vehicle that sends its attitude is read. Raises `FlightError` where there is no
+    attitude, or no MAVLink message.
     """
     dialect = needed("pymavlink.dialects.v20.ardupilotmega", "telemetry logs")
     collected = _Collected(mount_deg)
@@ -125,7 +125,7 @@ def read_tlog(path: Path, mount_deg: Angles) -> Track:
 
 
 def _messages(stream: BinaryIO, dialect: Any) -> Iterator[tuple[int, Any]]:
-    """Time in ns and message, of those wanted, over whatever is damaged between them."""
+    """Time in ns and message of the wanted kinds; damaged bytes are skipped."""
     decoder = dialect.MAVLink(None)
     before_us = None
     wanted = {number for number, kind in dialect.mavlink_map.items() if kind.msgname in _WANTED}
@@ -147,13 +147,13 @@ def _messages(stream: BinaryIO, dialect: Any) -> Iterator[tuple[int, Any]]:
             continue
         stamp_us = int.from_bytes(head[:8], "big")
         near = before_us is None or abs(stamp_us - before_us) < _DAY_US
-        if stamp_us < _LATEST_US and near:  # else the time before a sound message was damaged
+        if stamp_us < _LATEST_US and near:  # otherwise the time stamp is damaged
             before_us = stamp_us
             yield stamp_us * 1000, message
 
 
 def _frame_size(head: bytes) -> int | None:
-    """Bytes of a MAVLink frame by its first three, None where it is none."""
+    """Length of a MAVLink frame by its first three bytes, None where it is not one."""
     if head[0] == 0xFE:
         return head[1] + 8
     if head[0] == 0xFD and head[2] in (0, 1):

@@ -1,7 +1,7 @@
-"""Angles of other makers, turned into rotations from our camera axes to east, north, up.
+"""Angles of various manufacturers as rotations from camera axes to east, north, up.
 
-Ours: `orthonav.geo.camera`. The makers' conventions, with sources: `docs/flights.md`. Angles are
-arrays (..., 3) of yaw, pitch, roll in degrees, rotations (..., 3, 3).
+The convention of orthonav is in `orthonav.geo.camera`, those of manufacturers, with sources, are in
+`docs/flights.md`. Angles are arrays (..., 3) of yaw, pitch, roll in degrees, rotations (..., 3, 3).
 """
 
 import numpy as np
@@ -21,15 +21,15 @@ LOOKS_DOWN = (0.0, 0.0, 0.0)
 
 
 def ned_from_angles(yaw_pitch_roll_deg: ArrayLike) -> Array:
-    """Rotations to north-east-down of Z-Y-X angles, as autopilots and gimbals write them."""
+    """Rotations to north-east-down of Z-Y-X angles, as autopilots and gimbals define them."""
     return np.asarray(Rotation.from_euler("ZYX", yaw_pitch_roll_deg, degrees=True).as_matrix())
 
 
 def enu_from_gimbal_camera(yaw_pitch_roll_deg: ArrayLike) -> Array:
-    """Rotations from camera axes to ENU of gimbal angles as DJI and Autel write them.
+    """Rotations from camera axes to ENU of gimbal angles as DJI and Autel define them.
 
-    They are those of a camera that looks ahead: pitch -90 looks straight down, and there the top
-    of the image is at the gimbal's yaw (plus its roll, about the same axis).
+    At 0, 0, 0 the camera looks ahead. Pitch -90 looks straight down; the top of the image then
+    points to the gimbal's yaw (plus its roll, about the same axis).
     """
     return np.asarray(_ENU_FROM_NED @ ned_from_angles(yaw_pitch_roll_deg) @ _GIMBAL_FROM_CAMERA)
 
@@ -44,14 +44,30 @@ def enu_from_body_camera(ned_from_frd: Array, mount_deg: Angles = LOOKS_DOWN) ->
 
 
 def enu_from_ros_camera(enu_from_flu: Array, mount_deg: Angles) -> Array:
-    """The same of attitudes as ROS writes them (REP 103): ENU from forward-left-up."""
+    """The same of attitudes in ROS (REP 103): ENU from forward-left-up."""
     return np.asarray(enu_from_flu @ _FRD_FROM_FLU @ _frd_from_camera(mount_deg))
 
 
-def rotations_of_wxyz(wxyz: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Rotations (N, 3, 3) of those quaternions (N, 4) that are one, and which are (N,) bool.
+def ned_wxyz_from_ros(wxyz: ArrayLike) -> Array | None:
+    """The attitude (4,) w, x, y, z from forward-right-down to north-east-down of one as ROS writes
+    it (REP 103): from forward-left-up to east-north-up. None where `wxyz` is not a rotation."""
+    rotations, _ = rotations_of_wxyz(np.asarray(wxyz, dtype=np.float64).reshape(1, 4))
+    if not len(rotations):
+        return None
+    xyzw = Rotation.from_matrix(_ENU_FROM_NED.T @ rotations[0] @ _FRD_FROM_FLU).as_quat()
+    return np.asarray(xyzw[[3, 0, 1, 2]])
 
-    All zeros and NaN, which stand for "not known", are none.
+
+def ros_xyzw_from_ned(ned_from_frd: Array) -> Array:
+    """The inverse, of a rotation (3, 3): x, y, z, w from forward-left-up to east-north-up."""
+    enu_from_flu = _ENU_FROM_NED @ ned_from_frd @ _FRD_FROM_FLU
+    return np.asarray(Rotation.from_matrix(enu_from_flu).as_quat())
+
+
+def rotations_of_wxyz(wxyz: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Rotations (N, 3, 3) of the valid quaternions (N, 4), and which are valid, (N,) bool.
+
+    All zeros and NaN, which stand for "unknown", are invalid.
     """
     with np.errstate(invalid="ignore"):
         sound = np.abs(np.linalg.norm(wxyz, axis=1) - 1) < 0.1

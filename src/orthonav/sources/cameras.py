@@ -1,7 +1,7 @@
 """Camera files of other programs.
 
-OpenCV, ROS and Kalibr count the principal point from the centre of the first pixel, we from its
-outer corner: theirs plus half a pixel is ours.
+OpenCV, ROS and Kalibr measure the principal point from the centre of the first pixel, orthonav
+from its outer corner, which adds half a pixel.
 """
 
 import json
@@ -35,7 +35,7 @@ _BROKEN = (
     IndexError,
     RecursionError,
 )
-# What opens another level, for OpenCV: -- and a:b: do, too; a minus before a number does not.
+# Whatever opens a level for OpenCV, -- and a:b: included; a minus before a number does not.
 _OPENING = re.compile(r"[\[{<:]|-(?![\d.])")
 
 
@@ -51,7 +51,7 @@ def read_camera_file(path: Path) -> Camera:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise CameraError(f"camera file is no text in UTF-8: {path}") from error
+        raise CameraError(f"camera file is not UTF-8 text: {path}") from error
     try:
         if text.startswith("%YAML:1.0") or "opencv-matrix" in text:
             return _opencv(text)
@@ -71,9 +71,9 @@ def read_camera_file(path: Path) -> Camera:
 def camera_from_numbers(
     size_px: Sequence[int], matrix: Sequence[float], distortion: Sequence[float], model: str
 ) -> Camera:
-    """A camera from width and height, fx, fy, cx, cy as others count them, and their model's name.
+    """A camera from width and height, fx, fy, cx, cy in OpenCV's convention, and a model's name.
 
-    Raises `CameraError` on models that we do not have.
+    Raises `CameraError` for models that orthonav does not have.
     """
     fx, fy, cx, cy = (float(number) for number in matrix)
     numbers = tuple(float(number) for number in distortion)
@@ -87,7 +87,7 @@ def camera_from_numbers(
             )
         numbers = (*numbers, *(0.0,) * (4 - len(numbers))) if 0 < len(numbers) < 4 else numbers[:5]
     else:
-        raise CameraError(f"distortion model '{model}' is not supported: brown or equidistant are")
+        raise CameraError(f"distortion model '{model}' is not supported; brown and equidistant are")
     return Camera(int(size_px[0]), int(size_px[1]), fx, fy, cx + 0.5, cy + 0.5, numbers, model=ours)
 
 
@@ -97,14 +97,14 @@ def _yaml(text: str) -> Any:
         _check_events(yaml, text)
         return yaml.safe_load(text)
     except yaml.YAMLError as error:
-        raise CameraError(f"camera file is no YAML ({error.__class__.__name__})") from error
+        raise CameraError(f"camera file is not YAML ({error.__class__.__name__})") from error
 
 
 def _check_events(yaml: Any, text: str) -> None:
-    """Raises `CameraError` where YAML holds what no camera needs, before anything is made of it.
+    """Raises `CameraError` for YAML that could exhaust memory or time, before it is built.
 
-    Aliases of aliases grow without end, nesting goes as deep as the stack, and some numbers (those
-    with colons) take time with the square of their length.
+    Aliases of aliases expand exponentially, nesting recurses as deep as the stack, and numbers
+    with colons take time with the square of their length.
     """
     depth = 0
     for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
@@ -128,7 +128,7 @@ def _plain(plain: Any) -> Camera:
         raise TypeError(f"a mapping was expected, got {type(plain).__name__}")
     cameras = [name for name in plain if str(name).startswith("cam") and str(name)[3:].isdecimal()]
     if len(cameras) > 1:
-        raise CameraError(f"file holds {', '.join(cameras)}: leave one in it")
+        raise CameraError(f"file holds {', '.join(cameras)}; leave one of them")
     if cameras:
         return _kalibr(plain[cameras[0]])
     if "intrinsics" in plain:
@@ -144,7 +144,7 @@ def _plain(plain: Any) -> Camera:
 
 def _kalibr(plain: Mapping[str, Any]) -> Camera:
     if plain["camera_model"] != "pinhole":
-        raise CameraError(f"camera model '{plain['camera_model']}' is not supported: pinhole is")
+        raise CameraError(f"camera model '{plain['camera_model']}' is not supported; pinhole is")
     return camera_from_numbers(
         plain["resolution"],
         plain["intrinsics"],
@@ -154,7 +154,7 @@ def _kalibr(plain: Mapping[str, Any]) -> Camera:
 
 
 def _opencv(text: str) -> Camera:
-    # OpenCV ends the program where nesting is deeper than the stack.
+    # OpenCV crashes where nesting is deeper than the stack.
     if sum(1 for _ in _OPENING.finditer(text)) > MAX_OPENINGS:
         raise CameraError(f"camera file has more than {MAX_OPENINGS} parts")
     try:

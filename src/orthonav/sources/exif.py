@@ -1,7 +1,7 @@
-"""What a photograph tells of itself: EXIF, and XMP of DJI, Autel, senseFly and Pix4D.
+"""Metadata of a photograph: EXIF, and XMP of DJI, Autel, senseFly and Pix4D.
 
-EXIF: CIPA DC-008 (Exif 2.32). XMP: the makers' names, found by prefix in the packet's text, so
-that a packet with undeclared prefixes (some firmwares write them) is read all the same.
+EXIF: CIPA DC-008 (Exif 2.32). XMP: values by the manufacturers' names, searched in the text of the
+packet: some firmware writes undeclared prefixes, which no XML parser accepts.
 """
 
 import math
@@ -38,35 +38,41 @@ _EXPOSED = re.compile(
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """What one photograph tells; NaN and None for what it does not.
-
-    `time_ns` is UTC, taken as such where `zone_known` is false; `rotation` is `enu_from_camera`;
-    `height_m` is above take-off; `focal_px` is for a picture of `width_px`.
-    """
+    """Metadata of one photograph; NaN and None where it has none."""
 
     width_px: int
+    """Columns of the image."""
     height_px: int
+    """Rows of the image."""
     time_ns: int | None
+    """Time of exposure, UTC."""
     zone_known: bool
+    """Whether the time zone was known; otherwise the camera's clock is assumed to be UTC."""
     latlon_deg: tuple[float, float] | None
+    """Recorded position."""
     alt_m: float
+    """Recorded altitude."""
     rotation: NDArray[np.float64] | None
+    """Attitude as `enu_from_camera`."""
     height_m: float
+    """Height above take-off."""
     vel_en_mps: tuple[float, float] | None
+    """Velocity over ground, east and north."""
     focal_px: float | None
+    """Focal length for an image of `width_px`."""
 
 
 def read_photo(path: Path, sensor_width_mm: float | None = None) -> Photo:
-    """What the photograph at `path` tells, without decoding its picture.
+    """Metadata of the photograph at `path`; the image is not decoded.
 
-    Raises `FlightError` where it is no picture.
+    Raises `FlightError` where it is not an image.
     """
     pillow = needed("PIL.Image", "photographs")
     with reading("photograph", path), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of large pictures and odd tags
+        warnings.simplefilter("ignore")  # about large images and odd tags
         with pillow.open(path) as image:
             exif = image.getexif()
-            tags = dict(exif)  # read here: they are decoded when they are asked for
+            tags = dict(exif)  # here, because tags are decoded on access
             more, gps = dict(exif.get_ifd(_EXIF_IFD)), dict(exif.get_ifd(_GPS_IFD))
             packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp")
             width, height = image.size
@@ -107,7 +113,7 @@ def _exposed_ns(text: str) -> int | None:
 
 
 def _exact_place(xmp: dict[str, float]) -> tuple[float, float] | None:
-    """The position of XMP, which may be of RTK; `GpsLongtitude` is how many models spell it."""
+    """The position of XMP, which may be of RTK; `GpsLongtitude` is a common misspelling."""
     for maker in ("drone-dji", "drone"):
         lat = _first(xmp, f"{maker}:GpsLatitude")
         lon = _first(xmp, f"{maker}:GpsLongitude", f"{maker}:GpsLongtitude")
@@ -128,7 +134,7 @@ def _rotation(xmp: dict[str, float], make: str) -> NDArray[np.float64] | None:
     yaw, pitch, roll = (_first(xmp, f"Camera:{name}") for name in ("Yaw", "Pitch", "Roll"))
     if not math.isfinite(yaw + pitch + roll):
         return None
-    # senseFly counts roll the other way round than Pix4D, whose names it uses.
+    # senseFly uses the names of Pix4D with the opposite sign of roll.
     return enu_from_camera(yaw, pitch, -roll if "sensefly" in make.lower() else roll)
 
 
@@ -144,8 +150,8 @@ def _time(
 ) -> tuple[int | None, bool]:
     """UTC in ns, and whether the time zone was known.
 
-    The zone is that of `OffsetTimeOriginal`, else the one that brings the camera's clock nearest
-    to the time of the GPS, by quarters of an hour.
+    The zone is that of `OffsetTimeOriginal`, else the difference between the camera's clock and
+    the time of the GPS, rounded to quarters of an hour.
     """
     parts = (_TIME_ORIGINAL, _SUBSEC_ORIGINAL, _OFFSET_ORIGINAL)
     if not str(more.get(_TIME_ORIGINAL, "")).strip("\0 :"):
@@ -201,7 +207,7 @@ def _focal_px(
     focal_mm, film_mm = _number(more.get(_FOCAL)), _number(more.get(_FOCAL_35))
     if sensor_width_mm is not None and focal_mm > 0:
         return focal_mm / sensor_width_mm * width_px
-    if film_mm > 0:  # of the diagonal: CIPA DCG-001
+    if film_mm > 0:  # equivalent of the diagonal: CIPA DCG-001
         return film_mm / _FILM_DIAGONAL_MM * math.hypot(width_px, height_px)
     unit_mm = _MM_PER_UNIT.get(int(more.get(_PLANE_UNIT) or 2), math.nan)
     px_per_mm = _number(more.get(_PLANE_X)) / unit_mm

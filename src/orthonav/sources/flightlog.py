@@ -1,7 +1,7 @@
-"""Flight logs of the on-board runner, read so that what flew is flown again bit for bit.
+"""Flight logs of the on-board runner, read so that a flight can be repeated bit for bit.
 
-Written by `orthonav.onboard.log`; messages as in `orthonav.flight.logged`. A log may be cut
-anywhere: whatever comes before the cut in whole chunks is read.
+Written by `orthonav.onboard.log`; messages as in `orthonav.flight.logged`. A log may end anywhere:
+all chunks that are complete are read.
 """
 
 import re
@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from orthonav.errors import CameraError, FlightError
+from orthonav.flight.fixes import result_from_json
 from orthonav.flight.logged import (
     FORMAT,
     MAX_JSON_BYTES,
@@ -28,14 +29,13 @@ from orthonav.flight.logged import (
 )
 from orthonav.flight.png import grey_of_png
 from orthonav.geo.camera import Camera
-from orthonav.publish.jsonl import result_from_json
 from orthonav.records import ViewResult
 from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.mcap_chunks import (
     Chunk,
-    Found,
     LastChunk,
-    Place,
+    MessageLocation,
+    MessageSpan,
     Walk,
     chunks,
     messages,
@@ -45,7 +45,7 @@ from orthonav.sources.options import SourceOptions
 from orthonav.sources.recording import Grey, Recording, SourceView, fitted, with_options
 
 MAX_VIEWS = 500_000
-"""Ten a second for 14 hours; a small file can claim far more."""
+"""Ten a second for 14 hours; a small damaged file can claim far more."""
 MAX_MESSAGES = 10 * MAX_VIEWS
 MAX_NAME = 200
 _NUMBERED = re.compile(r"(.+)_(\d{4,9})\.mcap")
@@ -53,9 +53,9 @@ _NUMBERED = re.compile(r"(.+)_(\d{4,9})\.mcap")
 
 @dataclass(frozen=True, eq=False)
 class LoggedFlight(Recording):
-    """A flight log opened. `session`: run, version, views, map and options as they were logged.
+    """An open flight log. `session`: run, version, views, map and options as they were logged.
 
-    `results` reads what came out in flight, in order.
+    `results` reads the results of the flight, in order.
     """
 
     session: Mapping[str, Any] = field(default_factory=dict)
@@ -64,50 +64,50 @@ class LoggedFlight(Recording):
 
 @dataclass
 class _Index:
-    """What is found in going through the files once."""
+    """Content of the files, collected in one pass."""
 
     session: dict[str, Any] = field(default_factory=dict)
     views: list[LoggedView] = field(default_factory=list)
-    pictures: dict[int, Place] = field(default_factory=dict)
+    pictures: dict[int, MessageLocation] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     messages: int = 0
 
 
 def is_flight_log(path: Path) -> bool:
-    """Whether a file is a flight log, cut or not, or a folder holds one."""
+    """Whether a file is a flight log, complete or not, or a folder holds one."""
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     return any(file.is_file() and profile_of(file) == PROFILE for file in files)
 
 
 def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
-    """The flight of a log: a file of it and those that follow, or the folder of one log.
+    """The flight of a log: one of its files and those that follow, or the folder of one log.
 
-    Views whose picture was not kept are left out, and it is told how many. Raises `FlightError`
-    where none was kept or nothing whole is left, `CameraError` or `MissingExtraError`.
+    Views whose image was not logged are left out, with a warning. Raises `FlightError` where no
+    image was logged or no chunk is complete, `CameraError` or `MissingExtraError`.
     """
     if options.telemetry is not None:
-        raise FlightError(f"a flight log has telemetry of its own: no --telemetry: {path}")
+        raise FlightError(f"a flight log has its own telemetry; leave out --telemetry: {path}")
     files = files_of_run(path)
     index = _Index()
     for file in files:
         _read_file(file, index)
     if not index.session:
-        raise FlightError(f"no chunk of the flight log is whole: {path}")
+        raise FlightError(f"no chunk of the flight log is complete: {path}")
     camera = _camera(index.session, path)
-    kept = _kept(index, path)
-    told = camera
+    replayable = _replayable(index, path)
+    used = camera
     if options.camera is not None:
-        read = read_camera_file(options.camera)
-        told = fitted(read, camera.width_px, camera.height_px, str(path))
-    _warn_of_gaps(index, kept)
+        given = read_camera_file(options.camera)
+        used = fitted(given, camera.width_px, camera.height_px, str(path))
+    _warn_of_gaps(index, replayable)
     run, version = index.session.get("run"), index.session.get("version")
     return LoggedFlight(
         kind="log",
         path=path,
-        camera=told,
+        camera=used,
         note=f"{path.name}: flight log {run!s:.40} of orthonav {version!s:.40}",
-        expected=len(kept),
-        stream=partial(_stream, kept, _Pictures(index.pictures, camera), options),
+        expected=len(replayable),
+        stream=partial(_stream, replayable, _LoggedImages(index.pictures, camera), options),
         warnings=tuple(index.warnings),
         session=index.session,
         results=partial(_results, files),
@@ -115,7 +115,7 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
 
 
 def files_of_run(path: Path) -> list[Path]:
-    """The files of one run in order: of a folder, or from the one that is named."""
+    """The files of one run in order: of a folder, or from the one that is given."""
     if path.is_dir():
         files = [file for file in path.glob("*.mcap") if profile_of(file) == PROFILE]
         found = {file: run for file in sorted(files, key=_order) if (run := run_of(file))}
@@ -123,7 +123,7 @@ def files_of_run(path: Path) -> list[Path]:
         if len(runs) > 1:
             names = ", ".join(sorted(file.name for file in runs.values())[:5])
             raise FlightError(
-                f"folder holds {len(runs)} flights; name the first file of one ({names}): {path}"
+                f"folder holds {len(runs)} flights; give the first file of one ({names}): {path}"
             )
         return list(found)
     match = _NUMBERED.fullmatch(path.name)
@@ -145,7 +145,7 @@ def _order(path: Path) -> tuple[str, int]:
 
 
 def run_of(path: Path) -> str | None:
-    """The run that a file is of; None where no chunk tells."""
+    """The run that a file belongs to; None where no chunk states it."""
     for chunk in chunks(path, Walk()):
         for found in messages(chunk, {}):
             if found.topic == SESSION.name:
@@ -169,18 +169,18 @@ def _read_file(path: Path, index: _Index) -> None:
                 raise FlightError(f"flight log holds more than {MAX_VIEWS} views: {path}")
     if walk.damaged or broken:
         index.warnings.append(
-            f"{walk.damaged} chunks and {broken} messages are damaged and left out: {path}"
+            f"{walk.damaged} chunks and {broken} messages are damaged and ignored: {path}"
         )
     if not walk.ended:
         index.warnings.append(
-            f"flight log was cut short, {walk.lost_bytes} bytes behind its last whole chunk are "
+            f"flight log was cut short, {walk.lost_bytes} bytes after its last complete chunk are "
             f"lost: {path}"
         )
 
 
-def _take(found: Found, chunk: Chunk, path: Path, index: _Index) -> None:
+def _take(found: MessageSpan, chunk: Chunk, path: Path, index: _Index) -> None:
     if found.topic == VIEW.name:
-        place = Place(path, chunk.offset, found.first, found.last)
+        place = MessageLocation(path, chunk.offset, found.first, found.last)
         index.pictures.setdefault(found.number, place)
     elif found.topic == TELEMETRY.name:
         index.views.append(view_of(chunk.data[found.first : found.last]))
@@ -189,11 +189,11 @@ def _take(found: Found, chunk: Chunk, path: Path, index: _Index) -> None:
 
 
 class NewerFormatError(FlightError):
-    """A log of a format that this program does not know."""
+    """A log of a newer format."""
 
 
 def session_of(data: bytes, path: Path) -> dict[str, Any]:
-    """What a log says of its flight. Raises `NewerFormatError`, or `FlightError` where broken."""
+    """The session of a log. Raises `NewerFormatError`, or `FlightError` where it is damaged."""
     plain = from_json(data)
     number = plain.get("format")
     if isinstance(number, int) and number > FORMAT:
@@ -207,7 +207,7 @@ def session_of(data: bytes, path: Path) -> dict[str, Any]:
 def _session(data: bytes, path: Path) -> dict[str, Any]:
     plain = session_of(data, path)
     if not isinstance(plain.get("camera"), dict):
-        raise FlightError("session of the log is broken")
+        raise FlightError("session of the log is damaged")
     return plain
 
 
@@ -218,26 +218,28 @@ def _camera(session: Mapping[str, Any], path: Path) -> Camera:
         raise type(error)(f"{error}: {path}") from error
 
 
-def _kept(index: _Index, path: Path) -> list[LoggedView]:
-    """The views that can be flown again: pictures that were kept, or were bad in flight too."""
+def _replayable(index: _Index, path: Path) -> list[LoggedView]:
+    """The views that can be localized again: image logged, or unusable in flight already."""
     seen: set[str] = set()
     for view in index.views:
         if not _is_name(view.frame):
-            raise FlightError(f"{view.frame!r:.80} is no name of a view: {path}")
+            raise FlightError(f"{view.frame!r:.80} is not a valid name of a view: {path}")
         if view.frame in seen:
-            raise FlightError(f"view {view.frame} comes twice: {path}")
+            raise FlightError(f"view {view.frame} appears twice: {path}")
         seen.add(view.frame)
-    kept = [each for each in index.views if each.index in index.pictures or each.picture == "bad"]
-    if not kept or not index.pictures:
+    replayable = [
+        each for each in index.views if each.index in index.pictures or each.picture == "bad"
+    ]
+    if not replayable or not index.pictures:
         raise FlightError(
-            f"flight log holds no full pictures (views: {index.session.get('views')!s:.20}), so "
+            f"flight log holds no full images (views: {index.session.get('views')!s:.20}), so "
             f"nothing can be localized again: {path}"
         )
-    return kept
+    return replayable
 
 
 def _is_name(frame: str) -> bool:
-    """Whether this names a file inside a folder, wherever it is written."""
+    """Whether this names a file inside a folder on every system."""
     pure = PurePosixPath(frame)
     return (
         0 < len(frame) <= MAX_NAME
@@ -250,26 +252,26 @@ def _is_name(frame: str) -> bool:
     )
 
 
-def _warn_of_gaps(index: _Index, kept: list[LoggedView]) -> None:
-    """A track that lacks views is another track: say what is missing."""
-    told = sorted(view.index for view in index.views)
-    begin, end = told[0], told[-1] + 1
+def _warn_of_gaps(index: _Index, replayable: list[LoggedView]) -> None:
+    """Warn of missing views: without them the track differs from the one in flight."""
+    logged = sorted(view.index for view in index.views)
+    begin, end = logged[0], logged[-1] + 1
     if begin > 0:
         index.warnings.append(
             f"the first {begin} views of the flight are not in the log: a track begins later than "
-            "it did in flight"
+            "in flight"
         )
-    missing = end - begin - len(kept)
+    missing = end - begin - len(replayable)
     if missing > 0:
         index.warnings.append(
-            f"{missing} views were not kept whole and are left out: a track differs after them"
+            f"{missing} views lack a full image and are left out: a track differs after them"
         )
 
 
 def _stream(
-    kept: list[LoggedView], pictures: "_Pictures", options: SourceOptions
+    replayable: list[LoggedView], pictures: "_LoggedImages", options: SourceOptions
 ) -> Iterator[SourceView]:
-    for view in kept:
+    for view in replayable:
         where = f"view {view.frame} of {pictures.where(view.index)}"
         yield SourceView(
             frame=view.frame,
@@ -280,10 +282,10 @@ def _stream(
         )
 
 
-class _Pictures:
-    """Reads pictures when they are asked for; holds the chunk of the last one."""
+class _LoggedImages:
+    """Reads images on request; caches the chunk of the last one."""
 
-    def __init__(self, places: Mapping[int, Place], camera: Camera) -> None:
+    def __init__(self, places: Mapping[int, MessageLocation], camera: Camera) -> None:
         self._places, self._camera = places, camera
         self._chunk = LastChunk()
 
@@ -295,7 +297,7 @@ class _Pictures:
         """Raises `FlightError` where it cannot be decoded."""
         place = self._places.get(index)
         if place is None:
-            raise FlightError(f"the camera gave no usable picture in flight: {where}")
+            raise FlightError(f"the camera delivered no usable image in flight: {where}")
         message = self._chunk.message(place, where)
         try:
             data, kind = picture_of(message)
@@ -307,7 +309,7 @@ class _Pictures:
 
 
 def _results(files: list[Path]) -> Iterator[ViewResult]:
-    """What came out in flight; what is damaged is left out."""
+    """The results of the flight; damaged ones are skipped."""
     for path in files:
         channels: dict[int, str] = {}
         for chunk in chunks(path, Walk()):

@@ -1,32 +1,26 @@
-"""Libraries that are loaded when they are needed, and what they raise turned into one line."""
+"""Optional libraries imported on demand, and their exceptions turned into one-line errors."""
 
 import contextlib
-import importlib
 import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from orthonav.errors import FlightError, MissingExtraError, OrthonavError
+from orthonav import extras
+from orthonav.errors import FlightError, OrthonavError
 
 
 def needed(module: str, what: str) -> Any:
     """The module of that name. Raises `MissingExtraError` naming the extra that brings it."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        package = module.partition(".")[0]
-        raise MissingExtraError(
-            f"reading {what} needs {package}: pip install 'orthonav[flights]' ({error})"
-        ) from error
+    return extras.needed(module, "flights", f"reading {what}")
 
 
 @contextlib.contextmanager
 def reading(what: str, path: Path, *, silent: bool = False) -> Iterator[None]:
-    """Whatever a library raises inside becomes a `FlightError` that names `what` and `path`.
+    """Turns any exception of a library into a `FlightError` with `what` and `path`.
 
-    With `silent`, what the library prints is dropped (some tell of damage line by line).
+    With `silent`, output of the library is dropped (some print a line for every damaged record).
     """
     try:
         with _silence() if silent else contextlib.nullcontext():
@@ -34,18 +28,18 @@ def reading(what: str, path: Path, *, silent: bool = False) -> Iterator[None]:
     except OrthonavError:
         raise
     except Exception as error:
-        told = " ".join(str(error).split())[:200] or "no more is known"
+        message = " ".join(str(error).split())[:200] or "no details"
         raise FlightError(
-            f"{what} cannot be read ({type(error).__name__}: {told}): {path}"
+            f"{what} cannot be read ({type(error).__name__}: {message}): {path}"
         ) from error
 
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """Drop what is written to stdout and stderr, by C code too, by the whole process meanwhile."""
+    """Drop output of the whole process to stdout and stderr, including that of C code."""
     sys.stdout.flush()
     sys.stderr.flush()
-    kept = [os.dup(1), os.dup(2)]
+    saved = [os.dup(1), os.dup(2)]
     sink = os.open(os.devnull, os.O_WRONLY)
     try:
         with (
@@ -57,7 +51,7 @@ def _silence() -> Iterator[None]:
             os.dup2(sink, 2)
             yield
     finally:
-        for number, copy in zip((1, 2), kept, strict=True):
+        for number, copy in zip((1, 2), saved, strict=True):
             os.dup2(copy, number)
             os.close(copy)
         os.close(sink)

@@ -1,4 +1,4 @@
-"""Writing a source as a flight folder."""
+"""Writing a recording as a flight folder."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,16 +15,18 @@ READABLE = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 
 @dataclass(frozen=True)
 class Imported:
-    """What was written: views, and of them with truth and with all that a fix needs.
-
-    `broken`: views left out because their picture cannot be decoded; `first_broken`: why.
-    """
+    """Number of views that were written."""
 
     views: int
+    """All of them."""
     with_truth: int
+    """Those with a true position."""
     complete: int
+    """Those with all telemetry that a fix needs."""
     broken: int
+    """Views left out because their image cannot be decoded."""
     first_broken: str
+    """The error of the first one of them."""
 
 
 def import_flight(
@@ -35,9 +37,9 @@ def import_flight(
 ) -> Imported:
     """Write the views of `recording` as a flight folder `out`, whole or not at all.
 
-    Encoded pictures are copied as they are; others are written grey, as PNG or, with
-    `jpeg_quality`, as JPEG. Raises `FlightError` where no picture can be decoded, `CameraError`
-    where one is of another size than the camera, `OutputError` where `out` cannot be written.
+    Encoded images are copied unchanged; others are written grey, as PNG or, with `jpeg_quality`,
+    as JPEG. Raises `FlightError` where no image can be decoded, `CameraError` where one has
+    another size than the camera, `OutputError` where `out` cannot be written.
     """
     views = truths = complete = broken = 0
     first_broken = ""
@@ -45,7 +47,7 @@ def import_flight(
         writer = FlightWriter(folder, recording.camera, recording.note)
         for view in recording.views:
             try:
-                frame, data = _picture(view, recording, jpeg_quality)
+                frame, data = _encoded_image(view, recording, jpeg_quality)
             except FlightError as error:
                 broken, first_broken = broken + 1, first_broken or str(error)
                 continue
@@ -56,13 +58,15 @@ def import_flight(
             if recording.expected:
                 progress(min(1.0, (views + broken) / recording.expected))
         if views == 0:
-            raise FlightError(first_broken or f"source holds no view: {recording.path}")
+            raise FlightError(first_broken or f"recording has no view: {recording.path}")
         writer.close()
     return Imported(views, truths, complete, broken, first_broken)
 
 
-def _picture(view: SourceView, recording: Recording, jpeg_quality: int | None) -> tuple[str, bytes]:
-    """Name and bytes of the picture as it is written, once it is known to be one."""
+def _encoded_image(
+    view: SourceView, recording: Recording, jpeg_quality: int | None
+) -> tuple[str, bytes]:
+    """Name and bytes of the image as it is written, once it is decoded."""
     grey, camera = view.grey(), recording.camera
     if grey.shape != (camera.height_px, camera.width_px):
         raise CameraError(

@@ -1,4 +1,4 @@
-"""Telemetry logs of all kinds, found by content."""
+"""Telemetry logs of all kinds, detected by content."""
 
 import re
 from pathlib import Path
@@ -9,7 +9,7 @@ from orthonav.sources import ardupilot, ulog
 from orthonav.sources.attitude import Angles
 from orthonav.sources.subtitles import read_srt
 from orthonav.sources.table import read_table
-from orthonav.sources.track import Track
+from orthonav.sources.track import RecordedTrack
 
 _SRT = re.compile(rb"\d+:\d\d:\d\d[,.]\d{1,3}\s*-->")
 
@@ -17,7 +17,7 @@ _SRT = re.compile(rb"\d+:\d\d:\d\d[,.]\d{1,3}\s*-->")
 def log_kind(path: Path) -> str:
     """`ulog`, `dataflash`, `tlog`, `srt` or `table`, by content.
 
-    Raises `MissingFileError`, or `FlightError` where it is none of them.
+    Raises `MissingFileError`, or `FlightError` for any other file.
     """
     path = require_file(path, "telemetry log")
     with path.open("rb") as stream:
@@ -41,8 +41,8 @@ def log_kind(path: Path) -> str:
     )
 
 
-def read_log(path: Path, mount_deg: Angles) -> Track:
-    """The track of a log. `mount_deg` counts where the log tells the attitude of the body."""
+def read_log(path: Path, mount_deg: Angles) -> RecordedTrack:
+    """The track of a log. `mount_deg` applies where the log holds the attitude of the body."""
     kind = log_kind(path)
     if kind == "ulog":
         return ulog.read_ulog(path, mount_deg)

@@ -1,8 +1,8 @@
-"""Chunks of an MCAP file that may be cut anywhere, damaged, or made by somebody who means harm.
+"""Chunks of an MCAP file that may be incomplete, damaged, or malicious.
 
-Libraries that read MCAP believe what records say of themselves. Here every length is held against
-a limit and the file before anything is allocated for it, and chunks that are damaged are passed
-over. The format: https://mcap.dev/spec.
+The mcap library trusts the lengths that records state, and ends at the first damaged one. So the
+chunks are read here: every length is checked against a limit and the file before anything is
+allocated, and damaged chunks are skipped. The format: https://mcap.dev/spec.
 """
 
 import io
@@ -24,8 +24,8 @@ WHAT = "flight logs"
 
 
 @dataclass(frozen=True)
-class Found:
-    """A message in a chunk: its topic and encodings, its number, and where its data lies there."""
+class MessageSpan:
+    """A message in a chunk: its topic, its sequence number, and first and last byte of its data."""
 
     topic: str
     number: int
@@ -35,7 +35,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Chunk:
-    """A whole chunk: where it begins in the file, and what is in it, uncompressed."""
+    """A complete chunk: its offset in the file and its content, uncompressed."""
 
     offset: int
     data: bytes
@@ -43,20 +43,20 @@ class Chunk:
 
 @dataclass
 class Walk:
-    """What became of a file: bytes behind the last whole record, damaged chunks, a proper end.
-
-    `next_offset` is where the first record begins that was not told of: a file that grows is gone
-    on with there.
-    """
+    """Progress through a file, and its damage."""
 
     next_offset: int = len(MAGIC)
+    """Offset of the first record that was not read yet; reading a growing file continues there."""
     lost_bytes: int = 0
+    """Bytes after the last complete record."""
     damaged: int = 0
+    """Damaged chunks."""
     ended: bool = False
+    """Whether the file has a proper end."""
 
 
 def profile_of(path: Path) -> str | None:
-    """The profile in the header of an MCAP file; None where it is none."""
+    """The profile in the header of an MCAP file; None for another file."""
     with path.open("rb") as stream:
         head = stream.read(64)
     at = len(MAGIC)
@@ -69,10 +69,7 @@ def profile_of(path: Path) -> str | None:
 
 
 def chunks(path: Path, walk: Walk) -> Iterator[Chunk]:
-    """The chunks of a file, up to its end or where it was cut; fills in `walk`.
-
-    They begin where `walk` ended before: with a new one at the start of the file.
-    """
+    """The complete chunks of a file, from `walk.next_offset`; updates `walk`."""
     with path.open("rb") as stream:
         size = stream.seek(0, io.SEEK_END)
         at = walk.next_offset
@@ -97,7 +94,7 @@ def chunks(path: Path, walk: Walk) -> Iterator[Chunk]:
 
 
 def chunk_at(path: Path, offset: int) -> bytes | None:
-    """What is in the chunk that begins at `offset`, None where it is damaged."""
+    """Content of the chunk at `offset`, None where it is damaged."""
     with path.open("rb") as stream:
         stream.seek(offset)
         head = stream.read(_RECORD_BYTES)
@@ -107,8 +104,8 @@ def chunk_at(path: Path, offset: int) -> bytes | None:
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where the data of a message lies: in a chunk of a file."""
+class MessageLocation:
+    """Location of a message: file, offset of its chunk, first and last byte in the chunk."""
 
     path: Path
     offset: int
@@ -117,16 +114,16 @@ class Place:
 
 
 class LastChunk:
-    """Data of messages by their place; holds the chunk of the last one. Mutable, one thread."""
+    """Data of messages by location; caches the chunk of the last one. For one thread."""
 
     def __init__(self) -> None:
         self._held: tuple[Path, int] | None = None
         self._data = b""
 
-    def message(self, place: Place, where: str) -> bytes:
-        """The data at a place, cut short where the chunk is damaged.
+    def message(self, place: MessageLocation, where: str) -> bytes:
+        """The data at a location, empty where the chunk is damaged.
 
-        Raises `FlightError`, which names `where`, for a file that cannot be read.
+        Raises `FlightError` with `where` for a file that cannot be read.
         """
         if self._held != (place.path, place.offset):
             try:
@@ -139,8 +136,8 @@ class LastChunk:
         return self._data[place.first : place.last]
 
 
-def messages(chunk: Chunk, channels: dict[int, str]) -> Iterator[Found]:
-    """The messages of a chunk; channels it tells of are added to `channels`, id to topic."""
+def messages(chunk: Chunk, channels: dict[int, str]) -> Iterator[MessageSpan]:
+    """The messages of a chunk; its channels are added to `channels`, id to topic."""
     data, at = chunk.data, 0
     while at + _RECORD_BYTES <= len(data):
         opcode = data[at]
@@ -156,12 +153,12 @@ def messages(chunk: Chunk, channels: dict[int, str]) -> Iterator[Found]:
         elif opcode == _MESSAGE and last - first >= _MESSAGE_BYTES:
             topic = channels.get(int.from_bytes(data[first : first + 2], "little"), "")
             number = int.from_bytes(data[first + 2 : first + 6], "little")
-            yield Found(topic, number, first + _MESSAGE_BYTES, last)
+            yield MessageSpan(topic, number, first + _MESSAGE_BYTES, last)
         at = last
 
 
 def _inflated(stream: BinaryIO, length: int) -> bytes | None:
-    """What is in the chunk record of `length` bytes that follows, None where it is damaged."""
+    """Content of the chunk record of `length` bytes that follows, None where it is damaged."""
     if not 40 <= length <= MAX_CHUNK_BYTES + 1000:
         return None
     body = stream.read(length)
@@ -180,11 +177,11 @@ def _inflated(stream: BinaryIO, length: int) -> bytes | None:
 
 
 def _zstd(data: bytes, size: int) -> bytes | None:
-    """`data` uncompressed, where its frame says that it takes `size` bytes and no more."""
+    """`data` uncompressed, if its frame states exactly `size` bytes."""
     zstandard = needed("zstandard", WHAT)
     try:
-        told = zstandard.get_frame_parameters(data)
-        if told.content_size != size or told.window_size > 2 * MAX_CHUNK_BYTES:
+        frame = zstandard.get_frame_parameters(data)
+        if frame.content_size != size or frame.window_size > 2 * MAX_CHUNK_BYTES:
             return None
         plain = zstandard.ZstdDecompressor().decompress(data, max_output_size=max(1, size))
     except zstandard.ZstdError:

@@ -1,4 +1,4 @@
-"""Finding out what a source is, and opening it."""
+"""Detection of the kind of a recording, and opening it."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -19,7 +19,7 @@ _TS_PACKET_BYTES = 188
 
 
 def open_source(path: Path, options: SourceOptions | None = None) -> Recording:
-    """Open what somebody recorded: a flight folder, photographs, a video, ROS messages, our log.
+    """Open a recording: a flight folder, photographs, a video, ROS messages, or a flight log.
 
     Raises `MissingFileError`, `FlightError`, `CameraError` or `MissingExtraError`.
     """
@@ -41,7 +41,7 @@ def open_source(path: Path, options: SourceOptions | None = None) -> Recording:
 
 
 def source_kind(path: Path) -> str:
-    """`flight`, `photos`, `video`, `ros` or `log`, by content; `FlightError` where it is none."""
+    """`flight`, `photos`, `video`, `ros` or `log`, by content. Raises `FlightError` for others."""
     if path.is_dir():
         if (path / "flight.json").exists() or (path / "telemetry.csv").exists():
             return "flight"
@@ -53,7 +53,7 @@ def source_kind(path: Path) -> str:
             return "photos"
         raise FlightError(
             "expected a flight folder (flight.json), photographs, a ROS 2 bag (metadata.yaml) or a "
-            f"flight log, found none: {path}"
+            f"flight log: {path}"
         )
     if path.stat().st_size == 0:
         raise FlightError(f"source is empty: {path}")
@@ -65,7 +65,7 @@ def source_kind(path: Path) -> str:
         return "video"
     raise FlightError(
         "expected a video (MP4, MOV, AVI, MKV, MPEG) or a ROS recording (.bag, .db3, .mcap); a "
-        f"log of an autopilot goes with --telemetry: {path}"
+        f"log of an autopilot belongs to --telemetry: {path}"
     )
 
 
@@ -81,20 +81,20 @@ def _is_video(path: Path) -> bool:
 
 
 def _flight(folder: FlightFolder, options: SourceOptions) -> Recording:
-    """A flight folder as a source; its truth may become a prior, and its camera be another."""
+    """A flight folder as a recording; truth may become the prior, the camera may be replaced."""
     if options.telemetry is not None:
         raise FlightError(
-            f"a flight folder has telemetry of its own: no --telemetry: {folder.path}"
+            f"a flight folder has its own telemetry; leave out --telemetry: {folder.path}"
         )
     camera = folder.camera
     if options.camera is not None:
-        told = read_camera_file(options.camera)
-        camera = fitted(told, camera.width_px, camera.height_px, str(folder.path))
+        given = read_camera_file(options.camera)
+        camera = fitted(given, camera.width_px, camera.height_px, str(folder.path))
     path, truth, warnings = folder.path / "truth.csv", {}, []
     try:
         truth = read_truth(path) if path.exists() else {}
-    except FlightError as error:  # a flight can be localized without
-        warnings.append(f"truth is left out: {error}")
+    except FlightError as error:  # a flight can be localized without truth
+        warnings.append(f"truth is ignored: {error}")
     return Recording(
         kind="flight",
         path=folder.path,

@@ -1,4 +1,4 @@
-"""What may be said about a source on the command line."""
+"""Options for reading a recording."""
 
 import math
 from collections.abc import Mapping
@@ -13,28 +13,30 @@ ROLES = ("image", "camera_info", "attitude", "velocity", "position", "height")
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """How a source is to be read.
-
-    `kind`: one of `KINDS`, else found by content. `camera`: a camera file. `rate_hz`: views per
-    second of a video. `telemetry`: a log to join by time; `time_offset_s` is added to the times
-    of the pictures before. `mount_deg`: yaw, pitch, roll of the camera in the body. `topics`: by
-    role, for ROS. `prior_std_m`: tell the recorded position as a prior with this deviation.
-    `sensor_width_mm`: for the focal length of photographs. `ground_alt_m`: altitude of the ground,
-    where altitudes were recorded and no heights. `looks_down`: the camera looked straight down
-    where no pitch and roll were recorded. Raises `FlightError` on impossible values.
-    """
+    """How a recording is read. Raises `FlightError` for invalid values."""
 
     kind: str | None = None
+    """One of `KINDS`; None: detected by content."""
     camera: Path | None = None
+    """Camera file; None: the recording's own camera."""
     rate_hz: float = 1.0
+    """Views per second of a video."""
     telemetry: Path | None = None
+    """Log to join by time; None: the recording's own telemetry."""
     time_offset_s: float = 0.0
+    """Added to the times of images to get times of the log, seconds."""
     mount_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Yaw, pitch, roll of the camera in the body; 0, 0, 0 looks straight down, top forward."""
     topics: Mapping[str, str] = field(default_factory=dict)
+    """ROS topics by role, one of `ROLES`."""
     prior_std_m: float | None = None
+    """Use the recorded position as the prior, with this standard deviation per axis."""
     sensor_width_mm: float | None = None
+    """Width of the sensor, for the focal length of photographs."""
     ground_alt_m: float | None = None
+    """Altitude of the ground, where altitudes but no heights were recorded."""
     looks_down: bool = False
+    """Whether the camera looked straight down where pitch and roll were not recorded."""
 
     def __post_init__(self) -> None:
         for name in ("rate_hz", "prior_std_m", "sensor_width_mm"):
@@ -52,5 +54,5 @@ class SourceOptions:
 
     @property
     def time_offset_ns(self) -> int:
-        """The offset in integer ns."""
+        """The offset in nanoseconds."""
         return round(self.time_offset_s * 1e9)

@@ -1,4 +1,4 @@
-"""A folder of photographs, with what they tell of themselves or a log joined by time."""
+"""A folder of photographs, with their own metadata or a log joined by time."""
 
 import logging
 import math
@@ -24,7 +24,7 @@ from orthonav.sources.recording import (
     rounded,
     with_options,
 )
-from orthonav.sources.track import Track
+from orthonav.sources.track import RecordedTrack
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 EXIF_NOTE = "focal length from EXIF: expect errors of some per cent"
@@ -32,8 +32,8 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class _Taken:
-    """A photograph and the time it was taken at, by the log's clock."""
+class _DatedPhoto:
+    """A photograph and its time by the log's clock."""
 
     path: Path
     time_ns: int
@@ -54,8 +54,8 @@ def photo_paths(folder: Path) -> list[Path]:
 def open_photos(folder: Path, options: SourceOptions) -> Recording:
     """The flight of a folder of photographs, by time.
 
-    Raises `FlightError`, `CameraError` or `MissingExtraError`. What cannot be read, or has no
-    time, is left out and said.
+    Raises `FlightError`, `CameraError` or `MissingExtraError`. Photographs that cannot be read or
+    have no time are left out, with a warning.
     """
     taken, warnings = _taken(folder, options)
     camera, note = _camera(taken[0], options)
@@ -74,11 +74,11 @@ def open_photos(folder: Path, options: SourceOptions) -> Recording:
     )
 
 
-def _taken(folder: Path, options: SourceOptions) -> tuple[list[_Taken], list[str]]:
-    """The photographs that can be read and have a time, in its order, and what to warn of."""
+def _taken(folder: Path, options: SourceOptions) -> tuple[list[_DatedPhoto], list[str]]:
+    """The photographs that can be read and have a time, by time, and warnings."""
     paths = photo_paths(folder)
     if not paths:
-        raise FlightError(f"folder holds no photographs ({', '.join(SUFFIXES)}): {folder}")
+        raise FlightError(f"folder has no photographs ({', '.join(SUFFIXES)}): {folder}")
     taken, unread, untimed, guessed = [], [], [], 0
     for path in paths:
         try:
@@ -91,36 +91,36 @@ def _taken(folder: Path, options: SourceOptions) -> tuple[list[_Taken], list[str
             untimed.append(path)
         else:
             guessed += not photo.zone_known
-            taken.append(_Taken(path, photo.time_ns + options.time_offset_ns, photo))
-    told = [
+            taken.append(_DatedPhoto(path, photo.time_ns + options.time_offset_ns, photo))
+    warnings = [
         f"{len(bad)} of {len(paths)} photographs left out, {why}, the first: {bad[0].name}"
-        for bad, why in ((unread, "no readable picture"), (untimed, "no time in EXIF"))
+        for bad, why in ((unread, "not readable"), (untimed, "no time in EXIF"))
         if bad
     ]
     if not taken:
-        raise FlightError(f"{'; '.join(told)}: {folder}")
+        raise FlightError(f"{'; '.join(warnings)}: {folder}")
     if guessed:
-        told.append(f"time zone of {guessed} photographs not in EXIF: taken as UTC")
-    return sorted(taken, key=lambda one: (one.time_ns, one.path)), told
+        warnings.append(f"no time zone in EXIF of {guessed} photographs: UTC assumed")
+    return sorted(taken, key=lambda one: (one.time_ns, one.path)), warnings
 
 
-def _camera(first: _Taken, options: SourceOptions) -> tuple[Camera, str]:
+def _camera(first: _DatedPhoto, options: SourceOptions) -> tuple[Camera, str]:
     width, height = first.photo.width_px, first.photo.height_px
     if options.camera is not None:
         return fitted(read_camera_file(options.camera), width, height, str(first.path)), ""
     focal = first.photo.focal_px
     if focal is None or not math.isfinite(focal):
-        raise CameraError(f"photograph tells no focal length; give --camera FILE: {first.path}")
+        raise CameraError(f"photograph has no focal length; give --camera FILE: {first.path}")
     return Camera(width, height, focal, focal, width / 2, height / 2), EXIF_NOTE
 
 
 def _views(
-    folder: Path, taken: list[_Taken], track: Track | None, options: SourceOptions
+    folder: Path, taken: list[_DatedPhoto], track: RecordedTrack | None, options: SourceOptions
 ) -> Iterator[SourceView]:
     for one in taken:
         if track is None:
             truth = one.photo.latlon_deg
-            telemetry = rounded(with_options(_told(one, options), truth, options))
+            telemetry = rounded(with_options(_own_telemetry(one, options), truth, options))
         else:
             telemetry, truth = known_at(track, one.time_ns, options)
         yield SourceView(
@@ -133,8 +133,8 @@ def _views(
         )
 
 
-def _told(one: _Taken, options: SourceOptions) -> Telemetry:
-    """What the photograph itself tells."""
+def _own_telemetry(one: _DatedPhoto, options: SourceOptions) -> Telemetry:
+    """Telemetry from the metadata of the photograph itself."""
     photo = one.photo
     yaw = pitch = roll = math.nan
     if photo.rotation is not None:

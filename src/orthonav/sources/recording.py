@@ -12,7 +12,7 @@ from orthonav.errors import CameraError, FlightError
 from orthonav.geo.camera import Camera
 from orthonav.records import Prior, Telemetry
 from orthonav.sources.options import SourceOptions
-from orthonav.sources.track import Track
+from orthonav.sources.track import RecordedTrack
 
 Grey = NDArray[np.uint8]
 DECIMALS = 8
@@ -20,18 +20,20 @@ DECIMALS = 8
 
 @dataclass(frozen=True, eq=False)
 class SourceView:
-    """One view of a source: a `RecordedView` that also knows what is written of it.
-
-    `frame` ends as its picture is to be written; `data` gives the picture as it was encoded, None
-    where it was not; `load` decodes it.
-    """
+    """One view of a recording: a `RecordedView` that can also be written to a flight folder."""
 
     frame: str
+    """Name, with the suffix of the format that its image is written in."""
     telemetry: Telemetry
+    """Telemetry of the exposure."""
     truth_latlon_deg: tuple[float, float] | None
+    """True position, where it is known."""
     where: str
+    """Location of the image, for messages."""
     load: Callable[[], Grey]
+    """Decodes the image."""
     data: Callable[[], bytes] | None = None
+    """Returns the image as it was encoded; None where it was recorded unencoded."""
 
     def grey(self) -> Grey:
         """Grey levels (H, W) uint8. Raises `FlightError` where it cannot be decoded."""
@@ -40,7 +42,7 @@ class SourceView:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A source opened: an `orthonav.flight.Flight`. `warnings`: what people must be told."""
+    """An open recording: an `orthonav.flight.Flight`, with `warnings` for people."""
 
     kind: str
     path: Path
@@ -52,14 +54,14 @@ class Recording:
 
     @property
     def views(self) -> Iterator[SourceView]:
-        """The views, from the first; each is read when it comes."""
+        """The views in order; each is read when its turn comes."""
         return self.stream()
 
 
 def with_options(
     telemetry: Telemetry, truth_latlon_deg: tuple[float, float] | None, options: SourceOptions
 ) -> Telemetry:
-    """The telemetry with what the options add: the recorded position as a prior, a level camera."""
+    """The telemetry with the prior and the level camera that the options ask for."""
     if options.prior_std_m is not None and truth_latlon_deg is not None:
         prior = Prior(*truth_latlon_deg, options.prior_std_m)
         telemetry = replace(telemetry, prior=prior)
@@ -69,7 +71,7 @@ def with_options(
 
 
 def rounded(telemetry: Telemetry) -> Telemetry:
-    """The telemetry as a flight folder holds it, so that a source and its import give the same."""
+    """The telemetry at the precision of a flight folder, so that import changes no result."""
     prior, velocity = telemetry.prior, telemetry.vel_en_mps
     yaw_std, agl_std = telemetry.yaw_std_deg, telemetry.agl_std_m
     return replace(
@@ -86,19 +88,19 @@ def rounded(telemetry: Telemetry) -> Telemetry:
 
 
 def known_at(
-    track: Track, time_ns: int, options: SourceOptions
+    track: RecordedTrack, time_ns: int, options: SourceOptions
 ) -> tuple[Telemetry, tuple[float, float] | None]:
-    """Telemetry and true position at a moment of the track's own clock."""
+    """Telemetry and true position at a time of the track's own clock."""
     truth = track.latlon_deg(time_ns)
     telemetry = track.telemetry(time_ns, options.ground_alt_m)
     return rounded(with_options(telemetry, truth, options)), truth
 
 
 def fitted(camera: Camera, width_px: int, height_px: int, where: str) -> Camera:
-    """The camera for pictures of this size.
+    """The camera for images of this size.
 
-    Raises `CameraError` where the sides are not in the same proportion: then the picture is not
-    a smaller one of the same view but a part of it, and which part is not known.
+    Raises `CameraError` where the aspect ratio differs: then the image is an unknown crop, not a
+    scaled version of the same view.
     """
     if (camera.width_px, camera.height_px) == (width_px, height_px):
         return camera
@@ -106,18 +108,18 @@ def fitted(camera: Camera, width_px: int, height_px: int, where: str) -> Camera:
         camera.width_px, width_px
     ):
         raise CameraError(
-            f"camera is {camera.width_px} x {camera.height_px} px, pictures are {width_px} x "
-            f"{height_px} px, of other proportions: calibrate in that mode: {where}"
+            f"camera is {camera.width_px} x {camera.height_px} px, images are {width_px} x "
+            f"{height_px} px, with another aspect ratio; calibrate in that mode: {where}"
         )
     return camera.resized(width_px, height_px)
 
 
-def check_overlap(track: Track, first_ns: int, last_ns: int, path: Path) -> None:
-    """Raise `FlightError` where no picture was taken while the track was recorded."""
+def check_overlap(track: RecordedTrack, first_ns: int, last_ns: int, path: Path) -> None:
+    """Raise `FlightError` where images and track do not overlap in time."""
     span = track.span_ns()
     if span is None or first_ns > span[1] or last_ns < span[0]:
-        told = "none" if span is None else f"{span[0] / 1e9:.3f} to {span[1] / 1e9:.3f} s"
+        recorded = "none" if span is None else f"{span[0] / 1e9:.3f} to {span[1] / 1e9:.3f} s"
         raise FlightError(
-            f"pictures and telemetry do not meet: pictures {first_ns / 1e9:.3f} to "
-            f"{last_ns / 1e9:.3f} s, telemetry {told}; give --time-offset-s: {path}"
+            f"images and telemetry do not overlap: images {first_ns / 1e9:.3f} to "
+            f"{last_ns / 1e9:.3f} s, telemetry {recorded}; give --time-offset-s: {path}"
         )

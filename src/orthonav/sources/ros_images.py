@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import CameraError, FlightError
+from orthonav.flight import decode_image
 from orthonav.geo.camera import Camera
 from orthonav.sources.cameras import camera_from_numbers
 
@@ -31,19 +32,29 @@ _TO_GREY: dict[str, tuple[int, int, int | None]] = {
 }
 
 
+def grey_of_message(message: Any, where: str) -> Grey:
+    """Grey levels (H, W) uint8 of a `sensor_msgs/Image` or `CompressedImage`.
+
+    Raises `FlightError` where it cannot be decoded.
+    """
+    if hasattr(message, "encoding"):
+        return grey_of_image(message, where)
+    return decode_image(np.asarray(message.data, dtype=np.uint8).tobytes(), where)
+
+
 def grey_of_image(message: Any, where: str) -> Grey:
     """Grey levels (H, W) uint8 of a `sensor_msgs/Image`; 16-bit ones are scaled down.
 
-    Raises `FlightError` on encodings that are not known and on data of another size.
+    Raises `FlightError` for unknown encodings and data of a wrong size.
     """
     encoding = str(message.encoding).lower()
     if encoding not in _TO_GREY:
-        raise FlightError(f"image encoding '{message.encoding}' is not known: {where}")
+        raise FlightError(f"image encoding '{message.encoding}' is not supported: {where}")
     width, channels, conversion = _TO_GREY[encoding]
     rows, columns, step = int(message.height), int(message.width), int(message.step)
     data, row_bytes = np.asarray(message.data, dtype=np.uint8), columns * width * channels
     if rows < 1 or columns < 1 or step < row_bytes or data.size < rows * step:
-        raise FlightError(f"image was cut short or has no size: {where}")
+        raise FlightError(f"image is cut short or has no size: {where}")
     packed = np.ascontiguousarray(data[: rows * step].reshape(rows, step)[:, :row_bytes])
     kind = np.uint8 if width == 1 else np.dtype(">u2" if message.is_bigendian else "<u2")
     pixels: NDArray[Any] = packed.view(kind).reshape(rows, columns, channels)
@@ -57,12 +68,12 @@ def grey_of_image(message: Any, where: str) -> Grey:
 def camera_of_info(message: Any) -> Camera:
     """The camera of a `sensor_msgs/CameraInfo` (matrix K, not the rectified P).
 
-    Raises `CameraError` where it is not calibrated, or of a kind that we do not have.
+    Raises `CameraError` where it is not calibrated, or has an unsupported model.
     """
     matrix = np.asarray(getattr(message, "K", getattr(message, "k", None)), dtype=np.float64)
     lens = np.asarray(getattr(message, "D", getattr(message, "d", None)), dtype=np.float64)
     if matrix.size != 9 or matrix[0] <= 0:
-        raise CameraError("camera_info is of a camera that was not calibrated; give --camera FILE")
+        raise CameraError("camera_info is not calibrated; give --camera FILE")
     roi = message.roi
     if message.binning_x > 1 or message.binning_y > 1 or roi.width or roi.height:
         raise CameraError("camera_info with binning or a region of interest; give --camera FILE")

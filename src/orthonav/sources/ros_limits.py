@@ -1,9 +1,10 @@
-"""What compressed ROS recordings may become in memory.
+"""Memory limits for compressed ROS recordings.
 
-`rosbags` inflates a chunk whole and then compares its size with what it claimed. Its tables of what
-inflates are replaced by ones that stop there. The chunks of MCAP whose times overlap are held at
-once: what they claim together is bounded before one of them is read. What is refused is told by
-`ValueError`, as `rosbags` tells of damage, for `guard.reading` to name the file.
+`rosbags` decompresses a whole chunk before it compares the size with the stated one, so a small
+malicious file can exhaust memory. Its decompressors are replaced by ones that stop at the stated
+size. Chunks of MCAP that overlap in time are held at once: their total is limited before one of
+them is read. Violations raise `ValueError`, as damage does in `rosbags`; `guard.reading` adds the
+name of the file.
 """
 
 import bz2
@@ -18,7 +19,7 @@ WHAT = "ROS recordings"
 
 
 def bound_inflation() -> None:
-    """From now on `rosbags` inflates no chunk beyond its claim, or beyond `MAX_CHUNK_BYTES`."""
+    """Limit decompression by `rosbags` to the stated size of a chunk and `MAX_CHUNK_BYTES`."""
     mcap = needed("rosbags.rosbag2.storage_mcap", WHAT)
     mcap.DECOMPRESSORS.update(lz4=_lz4, zstd=_zstd)
     bag = needed("rosbags.rosbag1.reader", WHAT)
@@ -26,12 +27,12 @@ def bound_inflation() -> None:
 
 
 def check_held(readers: Iterable[Any]) -> None:
-    """Raises `ValueError` where chunks claim too much, one by one or those of the same time.
+    """Raises `ValueError` where chunks state too many bytes, singly or those of the same time.
 
     `readers` are those of an opened recording (`AnyReader.readers`).
     """
     for reader in readers:
-        storage = getattr(reader, "storage", None)  # none of a bag of ROS 1: one chunk at a time
+        storage = getattr(reader, "storage", None)  # a ROS 1 bag has none: one chunk at a time
         for one in getattr(storage, "storages", [storage]):
             chunks = getattr(one, "chunks", [])
             _require(max((chunk.uncompressed_size for chunk in chunks), default=0))
@@ -42,7 +43,7 @@ def check_held(readers: Iterable[Any]) -> None:
 
 
 def _most_held(chunks: Iterable[Any]) -> int:
-    """The most bytes of chunks that cover one moment."""
+    """Largest total of chunks that overlap at one time."""
     edges = []
     for chunk in chunks:
         start, end = chunk.message_start_time, chunk.message_end_time
@@ -77,9 +78,9 @@ def _bz2(data: bytes) -> bytes:
 
 
 def _whole(decompressor: Any, data: bytes, size: int) -> bytes:
-    """`data` inflated; raises `ValueError` where that takes more than `size` bytes, or it is cut.
+    """`data` decompressed; raises `ValueError` beyond `size` bytes or where it is incomplete.
 
-    A byte more is asked for than there may be: an end behind exactly `size` bytes is seen then.
+    One byte more than allowed is requested, so that the end after exactly `size` bytes is seen.
     """
     plain: bytes = decompressor.decompress(data, max_length=size + 1)
     if len(plain) > size or not decompressor.eof:

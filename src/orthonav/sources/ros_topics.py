@@ -1,4 +1,4 @@
-"""Which topic of a ROS recording tells what: by type, or as told."""
+"""Selection of the topics of a ROS recording by type, or as requested."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ _HEIGHT_NAMES = ("rel_alt", "relative_altitude", "agl", "height_above_ground")
 
 @dataclass(frozen=True, eq=False)
 class Topics:
-    """The connection of each role that was found, and for attitude all that may tell it."""
+    """The connection of each role that was found, and all candidates for attitude."""
 
     image: Any
     roles: Mapping[str, Any]
@@ -41,8 +41,8 @@ class Topics:
         """All connections on the topic of one (bags split or appended have several)."""
         return [one for one in self.connections if one.topic == connection.topic]
 
-    def told(self) -> str:
-        """What is read from where, for people."""
+    def summary(self) -> str:
+        """Role and topic of each connection, for people."""
         named = {"image": self.image, **self.roles}
         return ", ".join(f"{role} {one.topic}" for role, one in named.items())
 
@@ -50,8 +50,8 @@ class Topics:
 def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
     """The topics of a recording by role.
 
-    Raises `FlightError` where a topic that was asked for is not there or of another type, and
-    where there is no topic of images, or more than one.
+    Raises `FlightError` where a requested topic is missing or has another type, and where there is
+    no image topic, or more than one.
     """
     connections = tuple(reader.connections)
     counted = {one.topic: one for one in connections if one.msgcount}
@@ -78,7 +78,7 @@ def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
 def _asked(role: str, name: str, counted: Mapping[str, Any], path: Path) -> Any:
     if name not in counted:
         raise FlightError(
-            f"no messages on {name}; there are {', '.join(sorted(counted)) or 'none'}: {path}"
+            f"no messages on {name}; available: {', '.join(sorted(counted)) or 'none'}: {path}"
         )
     if counted[name].msgtype not in TYPES[role]:
         raise FlightError(

@@ -8,17 +8,17 @@ import numpy as np
 
 from orthonav.sources.attitude import Angles, enu_from_ros_camera, rotations_of_wxyz
 from orthonav.sources.ros_topics import Topics
-from orthonav.sources.track import Samples, Series, Track, attitude_series
+from orthonav.sources.track import RecordedTrack, Samples, TimeSeries, attitude_series
 
 Reader = Any
 
 
-def read_track(reader: Reader, topics: Topics, mount_deg: Angles) -> Track:
-    """The track of the topics found; what no topic tells is not in it.
+def read_track(reader: Reader, topics: Topics, mount_deg: Angles) -> RecordedTrack:
+    """The track of the selected topics.
 
-    The attitude is that of the first topic that tells any (raw IMUs do not).
+    The attitude is that of the first topic that has one (raw IMUs do not).
     """
-    attitude: Series | None = None
+    attitude: TimeSeries | None = None
     for connection in topics.attitudes:
         attitude = _attitude(reader, topics, connection, mount_deg)
         if attitude is not None:
@@ -27,7 +27,7 @@ def read_track(reader: Reader, topics: Topics, mount_deg: Angles) -> Track:
     velocity = _collected(reader, topics, "velocity", 2, _velocity)
     position = _collected(reader, topics, "position", 3, _position)
     heights = None if height is None else height.series()
-    return Track(
+    return RecordedTrack(
         attitude=attitude,
         heights=() if heights is None else (heights,),
         position=None if position is None else position.positions(),
@@ -37,34 +37,61 @@ def read_track(reader: Reader, topics: Topics, mount_deg: Angles) -> Track:
 
 
 def stamp_ns(message: Any, recorded_ns: int) -> int:
-    """When a message was stamped, or, where it was not, recorded."""
+    """Time stamp of a message, or the time of its recording where it has none."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     stamped = 0 if stamp is None else int(stamp.sec) * 10**9 + int(stamp.nanosec)
     return stamped or recorded_ns
 
 
+def attitude_of_message(message: Any) -> tuple[float, float, float, float] | None:
+    """The orientation w, x, y, z in a `sensor_msgs/Imu`, `nav_msgs/Odometry` or
+    `geometry_msgs/PoseStamped`: from forward-left-up to east-north-up (REP 103).
+
+    None for an `Imu` that says it has none.
+    """
+    if hasattr(message, "orientation_covariance"):
+        if message.orientation_covariance[0] == -1:
+            return None
+        turn = message.orientation
+    elif hasattr(message.pose, "pose"):
+        turn = message.pose.pose.orientation
+    else:
+        turn = message.pose.orientation
+    return float(turn.w), float(turn.x), float(turn.y), float(turn.z)
+
+
+def height_of_message(message: Any) -> float | None:
+    """Metres above ground of a `sensor_msgs/Range`, `mavros_msgs/Altitude` or a plain number.
+
+    None for a range outside the limits of its sensor.
+    """
+    if hasattr(message, "range"):
+        sound = message.min_range <= message.range <= message.max_range
+        return float(message.range) if sound else None
+    if hasattr(message, "bottom_clearance"):
+        clearance = message.bottom_clearance
+        return float(clearance if math.isfinite(clearance) else message.relative)
+    return float(message.data)
+
+
 def _messages(reader: Reader, topics: Topics, connection: Any) -> Iterator[tuple[int, Any]]:
-    """Time of the stamp, else of recording, and message; what is broken is left out."""
+    """Time and message; damaged messages are skipped."""
     for one, recorded_ns, raw in reader.messages(connections=topics.of(connection)):
         try:
             message = reader.deserialize(raw, one.msgtype)
-        except Exception:  # one broken message is one sample less
+        except Exception:  # a damaged message is one sample less
             continue
         yield stamp_ns(message, recorded_ns), message
 
 
-def _attitude(reader: Reader, topics: Topics, connection: Any, mount_deg: Angles) -> Series | None:
+def _attitude(
+    reader: Reader, topics: Topics, connection: Any, mount_deg: Angles
+) -> TimeSeries | None:
     samples = Samples(4)
     for time_ns, message in _messages(reader, topics, connection):
-        if connection.msgtype == "sensor_msgs/msg/Imu":
-            if message.orientation_covariance[0] == -1:  # so a message says "none"
-                continue
-            turn = message.orientation
-        elif connection.msgtype == "nav_msgs/msg/Odometry":
-            turn = message.pose.pose.orientation
-        else:
-            turn = message.pose.orientation
-        samples.add(time_ns, turn.w, turn.x, turn.y, turn.z)
+        turn = attitude_of_message(message)
+        if turn is not None:
+            samples.add(time_ns, *turn)
     times, wxyz = samples.arrays()
     enu_from_flu, sound = rotations_of_wxyz(wxyz)
     return attitude_series(times[sound], enu_from_ros_camera(enu_from_flu, mount_deg))
@@ -88,17 +115,12 @@ def _collected(
 
 
 def _height(message: Any) -> tuple[float, ...] | None:
-    if hasattr(message, "range"):
-        sound = message.min_range <= message.range <= message.max_range
-        return (message.range,) if sound else None
-    if hasattr(message, "bottom_clearance"):
-        clearance = message.bottom_clearance
-        return (clearance if math.isfinite(clearance) else message.relative,)
-    return (message.data,)
+    height = height_of_message(message)
+    return None if height is None else (height,)
 
 
 def _velocity(message: Any) -> tuple[float, ...] | None:
-    """East and north of an odometry, whose twist is in the axes of the body."""
+    """East and north velocity of an odometry, whose twist is in body axes."""
     turn, twist = message.pose.pose.orientation, message.twist.twist.linear
     for enu_from_flu in rotations_of_wxyz(np.array([[turn.w, turn.x, turn.y, turn.z]]))[0]:
         east, north, _ = enu_from_flu @ [twist.x, twist.y, twist.z]

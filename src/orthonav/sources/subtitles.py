@@ -1,4 +1,4 @@
-"""DJI's telemetry in subtitle files (SRT), in its dialects; see `docs/flights.md`."""
+"""DJI's telemetry in subtitle files (SRT), in its variants; see `docs/flights.md`."""
 
 import math
 import re
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from orthonav.errors import FlightError
 from orthonav.sources.attitude import enu_from_gimbal_camera
-from orthonav.sources.track import Samples, Track, attitude_of_angles
+from orthonav.sources.track import RecordedTrack, Samples, attitude_of_angles
 
 MAX_BYTES = 500_000_000
 _NUMBER = r"([-+]?\d+(?:\.\d+)?)"
@@ -22,27 +22,29 @@ _GIMBAL = re.compile(rf"\bG\.PRY\s*\(\s*{_NUMBER}[^,]*,\s*{_NUMBER}[^,]*,\s*{_NU
 
 
 @dataclass(frozen=True)
-class Block:
-    """One block: its times in the video in ns, and what it tells; NaN for what it does not.
-
-    `height_m` is above take-off; `alt_m` an altitude of whatever reference the drone uses.
-    """
+class SubtitleBlock:
+    """One subtitle; values it does not hold are NaN."""
 
     start_ns: int
+    """Begin in the video."""
     end_ns: int
+    """End in the video."""
     lat_deg: float = math.nan
     lon_deg: float = math.nan
     alt_m: float = math.nan
+    """Altitude in the drone's own reference."""
     height_m: float = math.nan
+    """Height above take-off."""
     yaw_deg: float = math.nan
+    """Yaw of the gimbal, as are pitch and roll."""
     pitch_deg: float = math.nan
     roll_deg: float = math.nan
 
 
-def read_srt(path: Path) -> Track:
+def read_srt(path: Path) -> RecordedTrack:
     """The track of an SRT file; times are those of its video.
 
-    Raises `FlightError` where it holds no block with telemetry.
+    Raises `FlightError` where it has no telemetry.
     """
     if path.stat().st_size > MAX_BYTES:
         raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
@@ -51,32 +53,34 @@ def read_srt(path: Path) -> Track:
     for last in blocks(path.read_bytes()):
         _add(last, last.start_ns, attitude, position, height)
     if last is None:
-        raise FlightError(f"subtitles hold no block of telemetry: {path}")
+        raise FlightError(f"subtitles hold no telemetry: {path}")
     _add(last, last.end_ns, attitude, position, height)
     heights = height.series()
-    track = Track(
+    track = RecordedTrack(
         attitude=attitude_of_angles(attitude, enu_from_gimbal_camera),
         heights=() if heights is None else (heights,),
         position=position.positions(),
     )
     if track.attitude is None and track.position is None:
-        raise FlightError(f"subtitles tell neither position nor gimbal angles: {path}")
+        raise FlightError(f"subtitles have neither position nor gimbal angles: {path}")
     return track
 
 
-def end_ns(track: Track) -> int:
-    """The moment after which a track from subtitles or a table tells nothing more."""
+def end_ns(track: RecordedTrack) -> int:
+    """Last time of a track from subtitles or a table."""
     series = (track.attitude, track.position, *track.heights)
     return max(int(one.time_ns[-1]) for one in series if one is not None)
 
 
-def _add(block: Block, time_ns: int, attitude: Samples, position: Samples, height: Samples) -> None:
+def _add(
+    block: SubtitleBlock, time_ns: int, attitude: Samples, position: Samples, height: Samples
+) -> None:
     attitude.add(time_ns, block.yaw_deg, block.pitch_deg, block.roll_deg)
     position.add(time_ns, block.lat_deg, block.lon_deg, block.alt_m)
     height.add(time_ns, block.height_m)
 
 
-def blocks(data: bytes) -> Iterator[Block]:
+def blocks(data: bytes) -> Iterator[SubtitleBlock]:
     """The blocks of an SRT file in order; those without a line of times are left out."""
     text = _decoded(data)
     for part in re.split(r"\n\s*\n", text.replace("\r\n", "\n")):
@@ -97,13 +101,13 @@ def _ns(parts: tuple[str, ...]) -> int:
     return ((hours * 60 + minutes) * 60 + seconds) * 10**9 + int(parts[3].ljust(3, "0")) * 10**6
 
 
-def _block(start_ns: int, end: int, text: str) -> Block:
+def _block(start_ns: int, end: int, text: str) -> SubtitleBlock:
     fields = {name: float(value) for name, value in _FIELD.findall(text)}
     lat, lon = fields.get("latitude", math.nan), fields.get("longitude", math.nan)
-    lon = fields.get("longtitude", lon)  # so some models spell it
+    lon = fields.get("longtitude", lon)  # misspelt by some models
     if gps := _GPS.search(text):
         lon, lat = float(gps[1]), float(gps[2])
-        if abs(lat) > 90:  # written the other way round
+        if abs(lat) > 90:  # some models write the longitude second
             lat, lon = lon, lat
     height = fields.get("rel_alt", _first(_BAROMETER, text))
     if math.isnan(height):
@@ -114,7 +118,7 @@ def _block(start_ns: int, end: int, text: str) -> Block:
     altitude = fields.get("abs_alt", fields.get("altitude", math.nan))
     if not (abs(lat) <= 90 and abs(lon) <= 360):
         lat = lon = math.nan
-    return Block(start_ns, end, lat, lon, altitude, height, yaw, pitch, roll)
+    return SubtitleBlock(start_ns, end, lat, lon, altitude, height, yaw, pitch, roll)
 
 
 def _first(pattern: re.Pattern[str], text: str) -> float:

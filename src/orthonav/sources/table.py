@@ -1,4 +1,4 @@
-"""Telemetry as a table over time: the columns of a flight folder's `telemetry.csv`."""
+"""Telemetry as a table over time, with the columns of a flight folder's `telemetry.csv`."""
 
 import csv
 import math
@@ -6,8 +6,9 @@ from pathlib import Path
 
 from orthonav.errors import FlightError
 from orthonav.flight.folder import number_of, time_ns_of
+from orthonav.geo.swapped import swapped_hint
 from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
-from orthonav.sources.track import Samples, Series, Track, attitude_of_angles
+from orthonav.sources.track import RecordedTrack, Samples, TimeSeries, attitude_of_angles
 
 NEEDED = ("time_s", "pitch_deg", "roll_deg")
 MAX_BYTES = 500_000_000
@@ -20,11 +21,11 @@ _NAMES = {
 }
 
 
-def read_table(path: Path) -> Track:
+def read_table(path: Path) -> RecordedTrack:
     """The track of a CSV with `time_s` and the columns of a flight's telemetry, and, where it was
-    measured, `lat_deg,lon_deg`. Angles are in our convention, of the camera.
+    recorded, `lat_deg,lon_deg`. Angles are those of the camera, in the convention of orthonav.
 
-    Raises `FlightError`, naming the line, where it is no such table.
+    Raises `FlightError`, with the line, for an invalid table.
     """
     if path.stat().st_size > MAX_BYTES:
         raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
@@ -39,11 +40,16 @@ def read_table(path: Path) -> Track:
             for row in reader:
                 time_ns = time_ns_of(row["time_s"])
                 if time_ns is None:
-                    raise FlightError(f"line {reader.line_num}: time_s is no time: {path}")
+                    raise FlightError(f"line {reader.line_num}: time_s is not a time: {path}")
                 angles = (number_of(row.get(f"{name}_deg")) for name in ("yaw", "pitch", "roll"))
                 attitude.add(time_ns, *angles)
-                place = number_of(row.get("lat_deg")), number_of(row.get("lon_deg"))
-                position.add(time_ns, *place, math.nan)
+                latlon = number_of(row.get("lat_deg")), number_of(row.get("lon_deg"))
+                prior = number_of(row.get("prior_lat_deg")), number_of(row.get("prior_lon_deg"))
+                if hint := swapped_hint(*latlon) or swapped_hint(*prior):
+                    raise FlightError(
+                        f"line {reader.line_num}: position is out of range{hint}: {path}"
+                    )
+                position.add(time_ns, *latlon, math.nan)
                 for name, columns in _NAMES.items():
                     others[name].add(time_ns, *(number_of(row.get(column)) for column in columns))
     except (UnicodeDecodeError, csv.Error) as error:
@@ -51,10 +57,12 @@ def read_table(path: Path) -> Track:
     return _track(attitude, position, others, path)
 
 
-def _track(attitude: Samples, position: Samples, others: dict[str, Samples], path: Path) -> Track:
-    found: dict[str, Series | None] = {name: each.series() for name, each in others.items()}
+def _track(
+    attitude: Samples, position: Samples, others: dict[str, Samples], path: Path
+) -> RecordedTrack:
+    found: dict[str, TimeSeries | None] = {name: each.series() for name, each in others.items()}
     height = found["height"]
-    track = Track(
+    track = RecordedTrack(
         attitude=attitude_of_angles(
             attitude, lambda angles: enu_from_body_camera(ned_from_angles(angles))
         ),

@@ -1,4 +1,4 @@
-"""What was measured along a flight, as series over time, and telemetry at any moment of it."""
+"""Measurements along a flight as time series, and telemetry interpolated at any time."""
 
 import math
 from array import array
@@ -14,20 +14,22 @@ from orthonav.records import Prior, Telemetry
 
 Array = NDArray[np.float64]
 DAY_NS = 86_400 * 10**9
+"""Samples farther than this from the median time are damaged, or of a clock that was not set."""
 LATEST_NS = 2**62
+"""Latest valid time (the year 2116): leaves room for offsets in 64 bits."""
 GAP_NS = 2_000_000_000
-"""Across gaps longer than this nothing is interpolated: what was then is not known."""
+"""Longest gap that is interpolated: an aircraft may turn and climb meanwhile."""
 
 
 @dataclass(frozen=True, eq=False)
-class Series:
+class TimeSeries:
     """Values (N, D) at increasing times (N,) in integer ns."""
 
     time_ns: NDArray[np.int64]
     values: Array
 
     def around(self, time_ns: int) -> tuple[int, int, float] | None:
-        """The samples before and after a moment and the weight of the later one.
+        """The samples before and after a time and the weight of the later one.
 
         None outside the series and within gaps of more than `GAP_NS`.
         """
@@ -42,7 +44,7 @@ class Series:
         return after - 1, after, (time_ns - start) / (end - start)
 
     def at(self, time_ns: int) -> Array:
-        """Values (D,) at a moment, linear between samples; NaN where they are not known."""
+        """Values (D,) at a time, linear between samples; NaN where they are unknown."""
         found = self.around(time_ns)
         if found is None:
             return np.full(self.values.shape[1], np.nan)
@@ -51,7 +53,7 @@ class Series:
 
 
 class Samples:
-    """Collects samples in the order they come; `series` sorts them and drops what is no number."""
+    """Collects samples in any order; `series` sorts them and drops those that are not finite."""
 
     def __init__(self, width: int) -> None:
         self._width = width
@@ -59,35 +61,35 @@ class Samples:
         self._values = array("d")
 
     def add(self, time_ns: int, *values: float) -> None:
-        """One sample; a time that no clock tells (a damaged message) is dropped."""
+        """One sample; an impossible time (a damaged message) is dropped."""
         if abs(time_ns) > LATEST_NS:
             return
         self._times.append(time_ns)
         self._values.extend(values)
 
     def arrays(self) -> tuple[NDArray[np.int64], Array]:
-        """Times (N,) and values (N, D), as they came."""
+        """Times (N,) and values (N, D), in the order of `add`."""
         return np.array(self._times, dtype=np.int64), np.array(self._values).reshape(
             -1, self._width
         )
 
-    def series(self) -> Series | None:
+    def series(self) -> TimeSeries | None:
         """The series, or None where there is no sample. The first of equal times counts."""
         return series_of(*self.arrays())
 
-    def positions(self) -> Series | None:
+    def positions(self) -> TimeSeries | None:
         """The same of (lat_deg, lon_deg, alt_m): see `position_series`."""
         return position_series(*self.arrays())
 
 
-def series_of(time_ns: NDArray[np.int64], values: Array) -> Series | None:
-    """A series from times (N,) and values (N, D) in any order; None where none is a number."""
+def series_of(time_ns: NDArray[np.int64], values: Array) -> TimeSeries | None:
+    """A series from times (N,) and values (N, D) in any order; None where none is finite."""
     return _sorted(time_ns, values, np.asarray(np.isfinite(values).all(axis=1)))
 
 
 def attitude_series(
     time_ns: NDArray[np.int64], rotations: Array, known: NDArray[np.bool_] | None = None
-) -> Series | None:
+) -> TimeSeries | None:
     """An attitude series from `enu_from_camera` (N, 3, 3) and whether its heading is known (N,)."""
     if len(time_ns) == 0:
         return None
@@ -98,10 +100,10 @@ def attitude_series(
 
 def attitude_of_angles(
     samples: Samples, enu_from_angles: Callable[[Array], Array]
-) -> Series | None:
-    """An attitude series from samples of yaw, pitch, roll in degrees, and what they mean.
+) -> TimeSeries | None:
+    """An attitude series from samples of yaw, pitch, roll in degrees and their convention.
 
-    A heading that is NaN is noted as not known; without pitch and roll there is no sample.
+    A heading of NaN is marked as unknown; samples without pitch and roll are dropped.
     """
     times, angles = samples.arrays()
     sound = np.isfinite(angles[:, 1:]).all(axis=1)
@@ -110,10 +112,10 @@ def attitude_of_angles(
     return attitude_series(times[sound], enu_from_angles(turns), known) if sound.any() else None
 
 
-def position_series(time_ns: NDArray[np.int64], latlonalt: Array) -> Series | None:
+def position_series(time_ns: NDArray[np.int64], latlonalt: Array) -> TimeSeries | None:
     """A series of (lat_deg, lon_deg, alt_m) that crosses the 180th meridian the short way.
 
-    Altitudes may be NaN. Samples at 0, 0 are left out: so recorders write "no position".
+    Altitudes may be NaN. Samples at 0, 0 are dropped: recorders write that for "no position".
     """
     sound = np.isfinite(latlonalt[:, :2]).all(axis=1) & latlonalt[:, :2].any(axis=1)
     series = _sorted(time_ns, latlonalt, np.asarray(sound))
@@ -122,42 +124,46 @@ def position_series(time_ns: NDArray[np.int64], latlonalt: Array) -> Series | No
     return series
 
 
-def _sorted(time_ns: NDArray[np.int64], values: Array, sound: NDArray[np.bool_]) -> Series | None:
-    """A series of what is sound, less times a day off the others (damaged, or a clock unset)."""
+def _sorted(
+    time_ns: NDArray[np.int64], values: Array, sound: NDArray[np.bool_]
+) -> TimeSeries | None:
+    """A series of the valid samples within a day of their median time."""
     if not sound.any():
         return None
     near = np.abs(time_ns - np.median(time_ns[sound])) < DAY_NS
     times, first = np.unique(time_ns[sound & near], return_index=True)
-    return Series(times, values[sound & near][first])
+    return TimeSeries(times, values[sound & near][first])
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
-    """What was measured along a flight; a series that is None was not measured.
+class RecordedTrack:
+    """Measurements along a flight; a series that is None was not recorded."""
 
-    `attitude`: quaternion x, y, z, w of `enu_from_camera`, and 1 where its heading is known.
-    `heights`: metres above ground, the better ones first. `position`: latitude, longitude,
-    altitude. `velocity`: east and north. `yaw_std`, `agl_std`, `prior` (latitude, longitude,
-    deviation): as told. `origin_ns`: the moment that a recording without a clock begins at.
-    """
-
-    attitude: Series | None
-    heights: tuple[Series, ...] = ()
-    position: Series | None = None
-    velocity: Series | None = None
-    yaw_std: Series | None = None
-    agl_std: Series | None = None
-    prior: Series | None = None
+    attitude: TimeSeries | None
+    """Quaternion x, y, z, w of `enu_from_camera`, and 1 where its heading is known."""
+    heights: tuple[TimeSeries, ...] = ()
+    """Metres above ground; of several series the more accurate first."""
+    position: TimeSeries | None = None
+    """Latitude and longitude in degrees, altitude in metres."""
+    velocity: TimeSeries | None = None
+    """East and north, m/s."""
+    yaw_std: TimeSeries | None = None
+    """Reported standard deviation of the heading, degrees."""
+    agl_std: TimeSeries | None = None
+    """Reported standard deviation of the height, metres."""
+    prior: TimeSeries | None = None
+    """Reported prior: latitude, longitude in degrees, standard deviation in metres."""
     origin_ns: int = 0
+    """Time at which a recording without a clock begins."""
 
     def span_ns(self) -> tuple[int, int] | None:
-        """First and last moment of its attitude or, without any, of what else it tells."""
-        told = (self.attitude, *self.heights, self.position)
-        series = next((one for one in told if one is not None), None)
+        """First and last time of its attitude or, without any, of heights or positions."""
+        recorded = (self.attitude, *self.heights, self.position)
+        series = next((one for one in recorded if one is not None), None)
         return None if series is None else (int(series.time_ns[0]), int(series.time_ns[-1]))
 
     def telemetry(self, time_ns: int, ground_alt_m: float | None = None) -> Telemetry:
-        """What is known at a moment; with `ground_alt_m` height from altitude where need be."""
+        """Telemetry at a time; `ground_alt_m` gives a height where only the altitude is known."""
         yaw, pitch, roll = angles_at(self.attitude, time_ns)
         prior = _at(self.prior, time_ns, 3)
         velocity = _at(self.velocity, time_ns, 2)
@@ -176,7 +182,7 @@ class Track:
         )
 
     def latlon_deg(self, time_ns: int) -> tuple[float, float] | None:
-        """Where the aircraft was by its own GPS, or None."""
+        """Position by the aircraft's own GNSS receiver, or None."""
         lat, lon, _ = _at(self.position, time_ns, 3)
         if not math.isfinite(lat + lon):
             return None
@@ -193,10 +199,10 @@ class Track:
         return altitude - ground_alt_m
 
 
-def angles_at(attitude: Series | None, time_ns: int) -> tuple[float, float, float]:
-    """Heading, pitch and roll of the camera at a moment, along the shortest turn between samples.
+def angles_at(attitude: TimeSeries | None, time_ns: int) -> tuple[float, float, float]:
+    """Heading, pitch and roll of the camera at a time, by spherical interpolation.
 
-    Where the heading of a sample beside it is not known, the nearer sample counts, heading NaN.
+    Where a neighbouring sample has no heading, the nearer sample is used and the heading is NaN.
     """
     found = None if attitude is None else attitude.around(time_ns)
     if attitude is None or found is None:
@@ -212,7 +218,7 @@ def angles_at(attitude: Series | None, time_ns: int) -> tuple[float, float, floa
     return yaw if known else math.nan, pitch, roll
 
 
-def _at(series: Series | None, time_ns: int, width: int) -> Array:
+def _at(series: TimeSeries | None, time_ns: int, width: int) -> Array:
     return np.full(width, np.nan) if series is None else series.at(time_ns)
 
 

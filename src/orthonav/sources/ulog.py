@@ -9,7 +9,13 @@ from numpy.typing import NDArray
 from orthonav.errors import FlightError
 from orthonav.sources.attitude import Angles, enu_from_body_camera, rotations_of_wxyz
 from orthonav.sources.guard import needed, reading
-from orthonav.sources.track import Series, Track, attitude_series, position_series, series_of
+from orthonav.sources.track import (
+    RecordedTrack,
+    TimeSeries,
+    attitude_series,
+    position_series,
+    series_of,
+)
 
 MAGIC = b"ULog\x01\x12\x35"
 _TOPICS = [
@@ -25,10 +31,10 @@ _DOWNWARD = 25  # distance_sensor.orientation, as MAV_SENSOR_ROTATION_PITCH_270
 Columns = dict[str, NDArray[Any]]
 
 
-def read_ulog(path: Path, mount_deg: Angles) -> Track:
+def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
     """The track of a ULog; times are UTC where the log has a GPS fix, else since boot.
 
-    Raises `FlightError` where it is no ULog, broken, or without attitude.
+    Raises `FlightError` where it is not a ULog, damaged, or without attitude.
     """
     core = needed("pyulog.core", "PX4 logs")
     with reading("PX4 log", path, silent=True), path.open("rb") as stream:
@@ -39,7 +45,7 @@ def read_ulog(path: Path, mount_deg: Angles) -> Track:
         attitude = _attitude(topics.get("vehicle_attitude", {}), shift_us, mount_deg)
         if attitude is None:
             raise FlightError(f"PX4 log has no attitude (vehicle_attitude): {path}")
-        return Track(
+        return RecordedTrack(
             attitude=attitude,
             heights=_heights(topics, shift_us),
             position=_position(gps, topics, shift_us),
@@ -49,7 +55,7 @@ def read_ulog(path: Path, mount_deg: Angles) -> Track:
 
 
 def _utc_shift_us(gps: Columns) -> int:
-    """Microseconds from the log's clock to UTC; 0 where the GPS never knew the time."""
+    """Microseconds from the log's clock to UTC; 0 where the GPS never had the time."""
     if "time_utc_usec" not in gps:
         return 0
     utc, own = gps["time_utc_usec"].astype(np.int64), gps["timestamp"].astype(np.int64)
@@ -61,7 +67,7 @@ def _time_ns(columns: Columns, shift_us: int) -> NDArray[np.int64]:
     return np.asarray((columns["timestamp"].astype(np.int64) + shift_us) * 1000)
 
 
-def _attitude(columns: Columns, shift_us: int, mount_deg: Angles) -> Series | None:
+def _attitude(columns: Columns, shift_us: int, mount_deg: Angles) -> TimeSeries | None:
     if "q[3]" not in columns:
         return None
     wxyz = np.stack([columns[f"q[{i}]"] for i in range(4)], axis=1).astype(np.float64)
@@ -70,8 +76,8 @@ def _attitude(columns: Columns, shift_us: int, mount_deg: Angles) -> Series | No
     return attitude_series(_time_ns(columns, shift_us)[sound], rotations)
 
 
-def _heights(topics: dict[str, Columns], shift_us: int) -> tuple[Series, ...]:
-    """Above ground by distance sensor (the estimator's, then the raw one), then above home."""
+def _heights(topics: dict[str, Columns], shift_us: int) -> tuple[TimeSeries, ...]:
+    """Heights by distance sensor (the estimator's, then the raw one), then above home."""
     local = topics.get("vehicle_local_position", {})
     sensor = topics.get("distance_sensor", {})
     place, home = topics.get("vehicle_global_position", {}), topics.get("home_position", {})
@@ -95,13 +101,13 @@ def _heights(topics: dict[str, Columns], shift_us: int) -> tuple[Series, ...]:
 
 def _height(
     columns: Columns, height_m: NDArray[Any], valid: NDArray[np.bool_], shift_us: int
-) -> Series | None:
+) -> TimeSeries | None:
     times = _time_ns(columns, shift_us)
     return series_of(times[valid], height_m[valid].astype(np.float64)[:, None])
 
 
-def _position(gps: Columns, topics: dict[str, Columns], shift_us: int) -> Series | None:
-    """Of the GPS receiver; of the estimator where there is none in the log."""
+def _position(gps: Columns, topics: dict[str, Columns], shift_us: int) -> TimeSeries | None:
+    """Position of the GPS receiver, or of the estimator where the log has no receiver."""
     if "latitude_deg" in gps:  # since PX4 1.14
         parts = gps["latitude_deg"], gps["longitude_deg"], gps["altitude_msl_m"]
     elif "lat" in gps:
@@ -116,7 +122,7 @@ def _position(gps: Columns, topics: dict[str, Columns], shift_us: int) -> Series
     return position_series(_time_ns(gps, shift_us)[sound], place[sound])
 
 
-def _velocity(local: Columns, shift_us: int) -> Series | None:
+def _velocity(local: Columns, shift_us: int) -> TimeSeries | None:
     if "vx" not in local:
         return None
     east_north = np.stack([local["vy"], local["vx"]], axis=1).astype(np.float64)

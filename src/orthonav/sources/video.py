@@ -1,7 +1,7 @@
 """A video, with subtitles, a table or a log joined by time.
 
-Decoded by OpenCV's FFmpeg, which is there already with what flies; a second one (PyAV) would
-bring no format that is needed here.
+It is decoded by OpenCV's FFmpeg, which is installed anyway; PyAV would add no format that is
+needed here.
 """
 
 import math
@@ -27,7 +27,7 @@ from orthonav.sources.recording import (
     known_at,
 )
 from orthonav.sources.subtitles import end_ns
-from orthonav.sources.track import Track
+from orthonav.sources.track import RecordedTrack
 
 SIDECARS = (".srt", ".SRT", ".csv", ".CSV")
 _SHORT_NS = 1_000_000_000
@@ -37,16 +37,16 @@ _MISSING_FRAMES = 0.01
 def open_video(path: Path, options: SourceOptions) -> Recording:
     """The flight of a video, `options.rate_hz` views per second.
 
-    Telemetry is that of `options.telemetry`, else of a file beside it with the same name. Raises
+    Telemetry is that of `options.telemetry`, else of a file with the same name. Raises
     `FlightError` or `CameraError`.
     """
     with _opened(path) as capture:
         width, height = _sides(capture)
         fps, frames = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
         if width < 1 or height < 1 or not capture.grab():
-            raise FlightError(f"video holds no frame: {path}")
+            raise FlightError(f"video has no frame: {path}")
     if options.camera is None:
-        raise CameraError(f"a video does not tell its camera; give --camera FILE: {path}")
+        raise CameraError(f"the camera of a video is unknown; give --camera FILE: {path}")
     camera = fitted(read_camera_file(options.camera), width, height, str(path))
     last_ns = round((frames - 1) / fps * 1e9) if fps > 0 and frames > 0 else 0
     track, telemetry_path = _track(path, last_ns, options)
@@ -60,8 +60,8 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
     )
 
 
-def _track(path: Path, last_ns: int, options: SourceOptions) -> tuple[Track, Path]:
-    """The telemetry of a video and the file it is from."""
+def _track(path: Path, last_ns: int, options: SourceOptions) -> tuple[RecordedTrack, Path]:
+    """The telemetry of a video, and its file."""
     beside = [path.with_suffix(suffix) for suffix in SIDECARS]
     telemetry_path = options.telemetry or next((one for one in beside if one.is_file()), None)
     if telemetry_path is None:
@@ -80,7 +80,7 @@ def _track(path: Path, last_ns: int, options: SourceOptions) -> tuple[Track, Pat
     return track, telemetry_path
 
 
-def _views(path: Path, track: Track, options: SourceOptions) -> Iterator[SourceView]:
+def _views(path: Path, track: RecordedTrack, options: SourceOptions) -> Iterator[SourceView]:
     start_ns = track.origin_ns + options.time_offset_ns
     due, number, stuck, before_ns = 0, 0, 0, -1
     with _opened(path) as capture:
@@ -121,7 +121,7 @@ def _sides(capture: cv2.VideoCapture) -> tuple[int, int]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
-    """The video opened; what OpenCV would print of failures is ours to tell."""
+    """The open video; failures are reported as exceptions, so OpenCV's messages are dropped."""
     logging = cv2.utils.logging
     before = logging.getLogLevel()
     logging.setLogLevel(logging.LOG_LEVEL_SILENT)
@@ -132,7 +132,7 @@ def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
     try:
         if not capture.isOpened():
             raise FlightError(f"video cannot be opened: cut short, or not a video: {path}")
-        # The camera describes the sensor: an orientation tag must not turn the picture.
+        # The camera describes the sensor: an orientation tag must not rotate the image.
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         yield capture
     finally:

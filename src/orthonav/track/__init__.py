@@ -1,7 +1,7 @@
-"""Following the aircraft over time: from what single views say to one consistent track."""
+"""The track of an aircraft: a filter over the measurements of single views and of odometry."""
 
 from orthonav.track.mixture import Estimate, Mixture, State
-from orthonav.track.model import Model, Sighting, Told
+from orthonav.track.model import Model, ReportedAttitude, Sighting
 from orthonav.track.motion import CameraDisplacement, ReportedVelocity
 
 __all__ = [
@@ -9,8 +9,8 @@ __all__ = [
     "Estimate",
     "Mixture",
     "Model",
+    "ReportedAttitude",
     "ReportedVelocity",
     "Sighting",
     "State",
-    "Told",
 ]

@@ -1,4 +1,4 @@
-"""Hypotheses of a track: what one is, when two have become one, and what several are together."""
+"""Hypotheses of a track: one Kalman state each, and how several are merged."""
 
 import math
 from collections.abc import Sequence
@@ -10,19 +10,24 @@ from orthonav.track.model import POSITION, Array
 from orthonav.track.motion import Expected
 
 MAX_HYPOTHESES = 40
+"""More are dropped, the least likely first: the cost of a view grows with their number."""
 MIN_SHARE = 1e-7
+"""Less likely hypotheses are dropped."""
 MERGE_SIGMAS = 1.0
-WHAT_DIFFERS = np.ix_([0, 1, 2, 3, 6, 7], [0, 1, 2, 3, 6, 7])
-"""Of the covariances of two hypotheses: position, velocity and tilt."""
+"""Two hypotheses are merged where merging loses less (in nats, doubled) than this many standard
+deviations of distance, squared."""
+COMPARED = np.ix_([0, 1, 2, 3, 6, 7], [0, 1, 2, 3, 6, 7])
+"""Components that decide whether two hypotheses are alike: position, velocity and tilt."""
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One way things may be.
+    """One hypothesis of the track.
 
-    Its share of belief, mean (8,), covariance (8, 8), how much new ground was sighted (in views),
-    and its number; the number of what it came from, and what that was expected to become by now:
-    None where it came from nowhere.
+    `share`: its probability. `mean` (8,), `covariance` (8, 8): its state. `sighted`: new ground
+    that it recognized, in views. `number`: unique in the flight. `parent`: the number of the
+    hypothesis of the last view from which it was predicted, -1 where it was born now. `expected`:
+    that prediction, None where it was born now.
     """
 
     share: float
@@ -35,13 +40,13 @@ class Hypothesis:
 
 
 def merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
-    """Hypotheses, heaviest first, with those that have become one put together, few kept."""
+    """Hypotheses, most likely first, with similar ones merged and the unlikely ones dropped."""
     likely = [each for each in ordered[: 4 * MAX_HYPOTHESES] if each.share > MIN_SHARE]
     left = likely or ordered[:1]  # the last one stays, however unlikely
-    kept: list[Hypothesis] = []
-    while left and len(kept) < MAX_HYPOTHESES:
+    out: list[Hypothesis] = []
+    while left and len(out) < MAX_HYPOTHESES:
         first, rest = left[0], left[1:]
-        inverse = np.asarray(np.linalg.inv(first.covariance[WHAT_DIFFERS]), np.float64)
+        inverse = np.asarray(np.linalg.inv(first.covariance[COMPARED]), np.float64)
         group, left = [first], []
         for each in rest:
             alike = _divergence(each, first, inverse) < 2 * MERGE_SIGMAS**2
@@ -49,24 +54,24 @@ def merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
         mean, covariance = moments(group)
         share = sum(each.share for each in group)
         sighted = sum(each.share * each.sighted for each in group) / share
-        kept.append(replace(first, share=share, mean=mean, covariance=covariance, sighted=sighted))
-    return kept
+        out.append(replace(first, share=share, mean=mean, covariance=covariance, sighted=sighted))
+    return out
 
 
 def _divergence(one: Hypothesis, heavier: Hypothesis, inverse: Array) -> float:
-    """How much is lost (nats, Kullback and Leibler) where a hypothesis becomes part of a heavier
-    one, in position, velocity and tilt; `inverse` (6, 6) is that of the heavier one's covariance.
+    """Kullback-Leibler divergence (nats) of a hypothesis from a more likely one.
 
-    A place that is known well is not the same as a wide guess around it.
+    In position, velocity and tilt; `inverse` (6, 6) is that of the more likely one's covariance. A
+    well-known place must not vanish in a wide hypothesis around it (docs/decisions/tracking.md, 8).
     """
     off = (one.mean - heavier.mean)[[0, 1, 2, 3, 6, 7]]
-    turned = inverse @ one.covariance[WHAT_DIFFERS]
+    turned = inverse @ one.covariance[COMPARED]
     _, log_det = np.linalg.slogdet(turned)
     return float(off @ inverse @ off + np.trace(turned) - 6 - log_det) / 2
 
 
 def moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:
-    """Mean and covariance of several hypotheses taken as one."""
+    """Mean (8,) and covariance (8, 8) of several hypotheses as one Gaussian."""
     shares = np.array([each.share for each in group])
     shares = shares / shares.sum()
     means = np.stack([each.mean for each in group])
@@ -82,9 +87,9 @@ def distance(one: Hypothesis, other: Hypothesis) -> float:
 
 
 def within(mean: Array, covariance: Array, radius_m: float, middle: Array | None = None) -> float:
-    """About how much of a state lies within a radius of `middle` (2,), its own mean where None.
+    """Probability that a state lies within a radius of `middle` (2,), its own mean where None.
 
-    Exact for a round Gaussian around the middle; distance counts as so much more spread.
+    Exact for a round Gaussian around the middle; a distance from it is treated as added variance.
     """
     variance = float(np.trace(covariance[POSITION, POSITION])) / 2
     away = 0.0 if middle is None else float(np.hypot(*(mean[POSITION] - middle)))

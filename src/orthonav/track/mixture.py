@@ -1,11 +1,11 @@
-"""The track: a mixture of hypotheses, each a Kalman filter, and "somewhere else".
+"""The track: a mixture of hypotheses, each a Kalman filter, and the belief "elsewhere".
 
-A view seldom says one thing only: the true place may be its second best, or none of those that
-were found. So every hypothesis is split, one for each place where the view may have been taken and
-one for none of them, weighed by how well each fits (multiple hypothesis tracking, Reid 1979; a
-Gaussian sum filter, Sorenson and Alspach 1971); the unlikely ones are dropped, those that have
-become one are merged. Beside them stands what is left: that the aircraft is somewhere else. All of
-it was there at the start; some comes back with every view, so that no mistake is for ever.
+A view is ambiguous: its true place may be the second best, or none of those found. So every
+hypothesis is split, into one for each place where the view may have been taken and one for none of
+them, weighted by likelihood (multiple hypothesis tracking, Reid 1979; a Gaussian sum filter,
+Sorenson and Alspach 1971). Unlikely hypotheses are dropped, similar ones merged. The remaining
+probability stands for "elsewhere": it is 1 at the start, new hypotheses are born from it, and some
+returns to it with every view, so that no error is permanent (docs/decisions/tracking.md).
 """
 
 import math
@@ -24,10 +24,10 @@ from orthonav.track.model import (
     TILT,
     Array,
     Model,
+    ReportedAttitude,
     Sighting,
-    Told,
     log_density,
-    reading,
+    measurement,
     updated,
 )
 from orthonav.track.motion import (
@@ -41,39 +41,44 @@ from orthonav.track.motion import (
     velocity_forgotten,
 )
 
-MIN_WAY = 1e-5
-"""Less likely ways are not followed."""
+MIN_SPLIT = 1e-5
+"""Predictions less likely than this share of all predictions of a hypothesis are not followed. This
+and the other values without a source were chosen on the flights of docs/tracking.md."""
 MINOR_SHARE = 1e-4
-"""Hypotheses with less belief are not split for what is rare."""
+"""Less likely hypotheses are not split for rare events."""
 MAJOR_SHARE = 0.05
-"""The same where views show nothing, for there hypotheses are not merged."""
-TOLD_SHARE = 0.9
-"""Belief in a position that was told before anything was seen."""
+"""The same without odometry, where hypotheses are not merged between views."""
+START_SHARE = 0.9
+"""Probability of a reported start position."""
 LIKELY = 0.5
+"""A track with less confidence is lost."""
 CONFIRMED = 0.8
-"""Views' worth of new ground that must have been recognized before a track is one, each counted by
-how likely its view alone was placed rightly: no single view makes a track, and views that fit only
-because they were looked for there do not either."""
+"""New ground, in views, that must be recognized before a track is confirmed. Each view counts by
+its own probability: no single view confirms a track, nor do views that fit only because they were
+searched there (docs/decisions/tracking.md, 9)."""
 TRUSTED = (0.1, 0.5)
-"""Views whose own probability is below the first do not count, above the second fully."""
+"""Views with a probability of their own below the first do not count, above the second fully."""
 MOST_OF_ONE = 0.75
+"""A single view counts at most so much: less than `CONFIRMED`."""
 UNCONFIRMED = 0.8
-"""More confidence is not stated before."""
+"""Highest confidence that is stated before a track is confirmed (docs/decisions/tracking.md, 9)."""
 MOST_SIGHTED = 3.0
+"""Highest count of recognized ground, in views."""
 WIDE_M, FORGOTTEN = 50.0, 0.5
-"""More is not remembered, and half of it is forgotten with every view at which the position is
-known less well than this: after a while a track must be confirmed anew."""
+"""With every view at which the position is less certain than this (m, per axis), the count is
+multiplied by the second: after a while a track must be confirmed again."""
 GATE = 36.0
+"""Gate: largest squared innovation of the position over the trace of its covariance."""
 POSE = slice(2, 4)
-"""Heading and scale in what a sighting says."""
+"""Heading and scale in a measurement."""
 SEARCHED_SIGMAS = 6.0
-"""How wide headings and scales are looked for, in standard deviations, from end to end."""
+"""Width of the search over heading and scale, in standard deviations, from end to end."""
 MAX_LOG_ODDS = 7.0
-"""No single view is believed more than this."""
+"""Limit of the log odds of a single view."""
 
 
 class State(Enum):
-    """What the track is doing."""
+    """State of the track, as `fixes.jsonl` has it."""
 
     SEARCHING = "searching"
     TRACKING = "tracking"
@@ -82,9 +87,12 @@ class State(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Where the aircraft is: mean (8,) and covariance (8, 8) of the best cluster of hypotheses,
-    the probability that it is within the radius asked for, the state of the track, and the belief
-    in all of the cluster, however wide."""
+    """The estimate of the track: its best cluster of hypotheses.
+
+    `mean` (8,), `covariance` (8, 8): of the cluster. `confidence`: probability that the aircraft is
+    within the radius asked for. `state`: of the track. `belief`: probability of the cluster,
+    however wide it is.
+    """
 
     mean: Array
     covariance: Array
@@ -94,12 +102,14 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False)
-class _Reading:
-    """What a view says of the state (6,), its covariance (6, 6), and the log of what it is worth:
-    odds over the density of places, headings and scales that are only alike; `recognized`: how
-    much new ground that is, in views."""
+class _Measurement:
+    """A sighting as a measurement of the state.
 
-    seen: Array
+    `mean` (6,), `noise` (6, 6): in the components `SEEN`. `log_odds`: log odds over the density of
+    places, headings and scales that only look alike. `recognized`: new ground, in views.
+    """
+
+    mean: Array
     noise: Array
     log_odds: float
     recognized: float
@@ -119,39 +129,42 @@ class Mixture:
         self._numbers = 0
 
     def start(self, mean_en_m: Array, std_m: float) -> None:
-        """Begin with a position (2,) that was told, good to `std_m` per axis."""
-        self.hypotheses = list(self._told(mean_en_m, std_m, TOLD_SHARE))
-        self.elsewhere = 1 - TOLD_SHARE
+        """Begin at a reported position (2,) with standard deviation `std_m` per axis."""
+        self.hypotheses = list(self._born_at(mean_en_m, std_m, START_SHARE))
+        self.elsewhere = 1 - START_SHARE
 
-    def _told(self, mean_en_m: Array, std_m: float, share: float) -> Iterator[Hypothesis]:
-        """Hypotheses, together of belief `share`, of an aircraft that is where it was told."""
+    def _born_at(self, mean_en_m: Array, std_m: float, share: float) -> Iterator[Hypothesis]:
+        """Hypotheses at a position, together of probability `share`."""
         for mount, mean, covariance in self._mounts():
             mean[POSITION] = mean_en_m
             covariance[POSITION, POSITION] = np.eye(2) * std_m**2
             self._numbers += 1
             yield Hypothesis(share * mount, mean, covariance, 0.0, self._numbers)
 
-    def told_position(self, mean_en_m: Array, std_m: float) -> None:
-        """Take in a position (2,) that was measured otherwise, good to `std_m` per axis."""
+    def measure_position(self, mean_en_m: Array, std_m: float) -> None:
+        """Update with a position (2,) measured by other means, such as GNSS, `std_m` per axis."""
         if not self.hypotheses:
             self.start(mean_en_m, std_m)
             return
         made, noise = [], np.eye(2) * std_m**2
         for each in self.hypotheses:
             spread = each.covariance[POSITION, POSITION] + noise
-            off = mean_en_m - each.mean[POSITION]
+            innovation = mean_en_m - each.mean[POSITION]
             gain = np.linalg.solve(spread, each.covariance[POSITION]).T
             after = each.covariance - gain @ spread @ gain.T
-            share = each.share * math.exp(max(log_density(off, spread), -700.0))
+            share = each.share * math.exp(max(log_density(innovation, spread), -700.0))
             made.append(
                 replace(
-                    each, share=share, mean=each.mean + gain @ off, covariance=(after + after.T) / 2
+                    each,
+                    share=share,
+                    mean=each.mean + gain @ innovation,
+                    covariance=(after + after.T) / 2,
                 )
             )
-        # If it was anywhere else on the map, it is here too.
+        # Belief elsewhere is spread over the map: its density at this position remains.
         self.elsewhere /= self.area_m2
-        made += self._told(mean_en_m, std_m, TOLD_SHARE * self.elsewhere)
-        self.elsewhere *= 1 - TOLD_SHARE
+        made += self._born_at(mean_en_m, std_m, START_SHARE * self.elsewhere)
+        self.elsewhere *= 1 - START_SHARE
         self.hypotheses = made
         self._settle()
         self.hypotheses = merged(sorted(self.hypotheses, key=lambda each: -each.share))
@@ -160,97 +173,101 @@ class Mixture:
     def predict(
         self,
         seconds: float,
-        told: ReportedVelocity | None = None,
+        velocity: ReportedVelocity | None = None,
         camera: CameraDisplacement | None = None,
         telemetry_noise: Array | None = None,
     ) -> None:
-        """Let time pass; `told` is what instruments say of the way gone, `camera` what views say.
+        """Predict over so many seconds, by the reported velocity and the camera's odometry.
 
-        `telemetry_noise` (2,): variances with which reported heading (rad) and log scale scatter
-        from view to view, those of the model where None.
+        `telemetry_noise` (2,): variances of reported heading (rad) and log scale from view to view,
+        those of the model where None.
         """
         noise = self.model.telemetry_noise if telemetry_noise is None else telemetry_noise
-        kept = 1 - self.model.lost
+        stays = 1 - self.model.lost
         made = []
         for each in self.hypotheses:
-            for share, expected in self._ways(each, seconds, told, camera, noise):
+            for share, expected in self._predictions(each, seconds, velocity, camera, noise):
                 on_map = held_to_map(self.model, expected, self.area_m2)
-                made.append(self._from(each, on_map, each.share * share * kept))
+                made.append(self._from(each, on_map, each.share * share * stays))
         self.hypotheses = made
-        self.elsewhere += (1 - kept) * (1 - self.elsewhere)
+        self.elsewhere += (1 - stays) * (1 - self.elsewhere)
 
-    def _ways(
+    def _predictions(
         self,
         each: Hypothesis,
         seconds: float,
-        told: ReportedVelocity | None,
+        velocity: ReportedVelocity | None,
         camera: CameraDisplacement | None,
         telemetry_noise: Array,
     ) -> Iterator[tuple[float, Expected]]:
-        """Where a hypothesis may be next, and how likely: as the camera saw it, or not so.
+        """The predictions of a hypothesis with their probabilities: with odometry and without.
 
-        What the camera saw is weighed by what was expected: of a way that nothing else tells, it
-        may also be that the aircraft turned as nobody expected.
+        Odometry may be an outlier; it is weighted by its innovation. Where no velocity is reported,
+        the aircraft may also have made an unexpected turn.
         """
         model, likely = self.model, 1 - self.model.odometry_outlier
-        slipped = predicted(model, each.mean, each.covariance, seconds, told, telemetry_noise)
+        dead_reckoned = predicted(
+            model, each.mean, each.covariance, seconds, velocity, telemetry_noise
+        )
         if camera is None:
             chance = 0.0
-            if told is None and each.share >= MAJOR_SHARE:  # nobody saw it, nobody told it
+            if velocity is None and each.share >= MAJOR_SHARE:  # nothing measures the displacement
                 chance = 1 - (1 - model.turn) ** seconds
                 free = velocity_forgotten(model, each.covariance)
-                yield chance, predicted(model, each.mean, free, seconds, told, telemetry_noise)
-            yield 1.0 - chance, slipped
+                yield chance, predicted(model, each.mean, free, seconds, velocity, telemetry_noise)
+            yield 1.0 - chance, dead_reckoned
             return
-        # A wrong way lies anywhere that it was looked for.
-        wrong = math.log(model.odometry_outlier / (math.pi * camera.reach_m**2))
-        ways = [(wrong, slipped)]
+        # An outlier lies anywhere within the radius of the search.
+        outlier = math.log(model.odometry_outlier / (math.pi * camera.reach_m**2))
+        splits = [(outlier, dead_reckoned)]
         turns = [(likely, each.covariance)]
         if each.share < MINOR_SHARE:
-            ways = []
-        elif told is None:
+            splits = []
+        elif velocity is None:
             turns = [
                 (likely * (1 - model.turn), each.covariance),
                 (likely * model.turn, velocity_forgotten(model, each.covariance)),
             ]
         for share, covariance in turns:
-            turned = predicted(model, each.mean, covariance, seconds, told, telemetry_noise, camera)
+            turned = predicted(
+                model, each.mean, covariance, seconds, velocity, telemetry_noise, camera
+            )
             seen, log_fit = by_camera(turned, camera)
-            ways.append((math.log(share) + log_fit, seen))
-        best = max(log_share for log_share, _ in ways)
-        shares = [math.exp(max(log_share - best, -700.0)) for log_share, _ in ways]
-        for share, (_, expected) in zip(shares, ways, strict=True):
-            if share > MIN_WAY * sum(shares):
+            splits.append((math.log(share) + log_fit, seen))
+        best = max(log_share for log_share, _ in splits)
+        shares = [math.exp(max(log_share - best, -700.0)) for log_share, _ in splits]
+        for share, (_, expected) in zip(shares, splits, strict=True):
+            if share > MIN_SPLIT * sum(shares):
                 yield share / sum(shares), expected
 
     def update(
         self,
-        told: Told,
+        reported: ReportedAttitude,
         sightings: Sequence[Sighting],
         newness: float = 1.0,
         searched: tuple[Array, float] | None = None,
     ) -> None:
-        """Take in where a view may have been taken; none of it may be true.
+        """Update with the places where a view may have been taken; all of them may be wrong.
 
-        `searched` is the circle of the map that was looked at, middle (2,) and radius in metres;
-        None for all of it. `newness` is the share of the view that the last one did not show:
-        views of the same ground err alike, so that many of them are not more than one.
+        `searched`: the circle of the map that was searched, middle (2,) and radius in metres; None
+        for all of it. `newness`: share of the view that the last one did not show. Views of the
+        same ground have the same errors, so many of them count no more than one.
         """
         made = []
         missed = self.model.miss**newness
         found = (1 - self.model.miss) ** newness
-        readings = [self._reading(told, each, newness) for each in sightings]
+        measurements = [self._measurement(reported, each, newness) for each in sightings]
         for each in self.hypotheses:
-            looked_at = self._on_map(each.mean)
+            in_search = self._on_map(each.mean)
             if searched is not None:
-                looked_at &= bool(np.hypot(*(each.mean[:2] - searched[0])) < searched[1])
-            made.append(replace(each, share=each.share * (missed if looked_at else 1.0)))
+                in_search &= bool(np.hypot(*(each.mean[:2] - searched[0])) < searched[1])
+            made.append(replace(each, share=each.share * (missed if in_search else 1.0)))
             for start in self._with_bias_jump(each):
-                for seen in readings:
-                    split = self._seen(start, seen)
+                for seen in measurements:
+                    split = self._updated(start, seen)
                     if split is not None:
                         made.append(replace(split, share=split.share * found))
-        made += [born for each in readings for born in self._born(each)]
+        made += [born for each in measurements for born in self._born(each)]
         total = sum(each.share for each in made) + self.elsewhere
         self.elsewhere /= total
         made = [replace(each, share=each.share / total) for each in made]
@@ -258,10 +275,10 @@ class Mixture:
         self._settle()
 
     def estimate(self, radius_m: float, *, between_views: bool = False) -> Estimate | None:
-        """The best cluster, None where there is no hypothesis at all.
+        """The best cluster, None where there is no hypothesis.
 
-        The state changes with it, unless it is asked for `between_views`: before the view that
-        has just come was looked for.
+        It updates the state of the track, except with `between_views`: after the prediction to a
+        view, before the update with it.
         """
         if not self.hypotheses:
             return None
@@ -279,24 +296,24 @@ class Mixture:
 
     @property
     def likeliest(self) -> Hypothesis | None:
-        """The single hypothesis with most belief."""
+        """The most likely single hypothesis."""
         return self.hypotheses[0] if self.hypotheses else None
 
     def _best(self, radius_m: float) -> Hypothesis:
-        """The hypothesis with most belief around it."""
+        """The hypothesis with the highest probability around it, of the eight most likely."""
         heaviest = self.hypotheses[:8]
         return max(heaviest, key=lambda one: self._inside(radius_m, one.mean[POSITION]))
 
     def _inside(self, radius_m: float, middle: Array) -> float:
-        """How much of the belief lies within a radius of a place (2,)."""
+        """Probability that the aircraft is within a radius of a place (2,)."""
         return sum(
             each.share * within(each.mean, each.covariance, radius_m, middle)
             for each in self.hypotheses
         )
 
     def bias(self) -> tuple[Array, Array]:
-        """What is believed to be wrong with what is told, by all hypotheses: mean (4,) and
-        covariance (4, 4) of heading, log scale, pitch and roll."""
+        """The estimated biases of heading (rad), log scale, pitch and roll (rad): mean (4,) and
+        covariance (4, 4) over all hypotheses."""
         if not self.hypotheses:
             return np.zeros(4), np.diag(self.model.initial_bias())
         mean, covariance = moments(self.hypotheses)
@@ -314,7 +331,7 @@ class Mixture:
         return bool(inside.all())
 
     def _with_bias_jump(self, each: Hypothesis) -> list[Hypothesis]:
-        """A hypothesis as it is, and as it is if the camera was knocked since the last view."""
+        """A hypothesis without and with a bias jump since the last view."""
         rare = self.model.bias_jump
         if each.expected is None or each.share < MINOR_SHARE:
             return [each]
@@ -328,40 +345,42 @@ class Mixture:
         )
         return [replace(each, share=each.share * (1 - rare)), other]
 
-    def _reading(self, told: Told, sighting: Sighting, newness: float) -> "_Reading":
-        """A sighting, of which only a part is new, as it is weighed.
+    def _measurement(
+        self, reported: ReportedAttitude, sighting: Sighting, newness: float
+    ) -> "_Measurement":
+        """A sighting as a measurement, tempered by the share of it that is new.
 
-        A likelihood taken to the power `newness` is not only lower: its peak becomes broader, and
-        stands out less from all the places, headings and scales that there are. What is told anew
-        with every view is not part of that.
+        A likelihood raised to the power `newness` has a broader peak, which stands out less from
+        all places, headings and scales. The telemetry noise, independent at every view, is
+        excluded.
         """
-        seen, noise, anew = reading(self.model, told, sighting)
+        mean, noise, anew = measurement(self.model, reported, sighting)
         own = np.diag(noise)[POSE] + self.model.initial_bias()[:2]
         wide = math.log(self.area_m2) + float(np.log(SEARCHED_SIGMAS * np.sqrt(own)).sum())
-        # A view tilts as mounts do wherever it is put: that is no evidence for a place.
+        # Tilts are distributed as those of mounts at every place: no evidence for one.
         tilts = noise[4:, 4:] + anew[4:, 4:]
         wide -= math.log(
             sum(
-                share * math.exp(log_density(seen[4:], tilts + covariance[TILT, TILT]))
+                share * math.exp(log_density(mean[4:], tilts + covariance[TILT, TILT]))
                 for share, _, covariance in self._mounts()
             )
         )
         _, log_det = np.linalg.slogdet(2 * math.pi * noise)
         odds = newness * (min(sighting.log_odds, MAX_LOG_ODDS) + wide)
         odds += (1 - newness) * float(log_det) / 2 - len(SEEN) / 2 * math.log(newness)
-        return _Reading(
-            seen, noise / newness + anew, odds, min(newness * _trust(sighting.alone), MOST_OF_ONE)
+        return _Measurement(
+            mean, noise / newness + anew, odds, min(newness * _trust(sighting.alone), MOST_OF_ONE)
         )
 
-    def _seen(self, each: Hypothesis, seen: "_Reading") -> Hypothesis | None:
-        """The hypothesis after a sighting, weighed; None where they have nothing in common."""
-        off = seen.seen - each.mean[SEEN]
+    def _updated(self, each: Hypothesis, seen: "_Measurement") -> Hypothesis | None:
+        """The hypothesis after a measurement; None where that lies outside the gate."""
+        innovation = seen.mean - each.mean[SEEN]
         reach = np.trace(each.covariance[:2, :2]) + np.trace(seen.noise[:2, :2])
-        if off[:2] @ off[:2] > GATE * reach:
+        if innovation[:2] @ innovation[:2] > GATE * reach:
             return None
         spread = each.covariance[np.ix_(SEEN, SEEN)] + seen.noise
-        log_weight = seen.log_odds + log_density(off, spread)
-        mean, covariance = updated(each.mean, each.covariance, off, spread)
+        log_weight = seen.log_odds + log_density(innovation, spread)
+        mean, covariance = updated(each.mean, each.covariance, innovation, spread)
         self._numbers += 1
         return replace(
             each,
@@ -373,25 +392,25 @@ class Mixture:
         )
 
     def _nowhere(self, tilt_rad: float | None = None) -> tuple[Array, Array]:
-        """Mean (8,) and covariance (8, 8) of an aircraft that may be anywhere on the map."""
+        """Mean (8,) and covariance (8, 8) of a state that may be anywhere on the map."""
         place, speed = self.area_m2, self.model.speed_mps**2
         variances = [place, place, speed, speed, *self.model.initial_bias(tilt_rad)]
         return np.zeros(STATE), np.diag(np.array(variances))
 
     def _mounts(self) -> Iterator[tuple[float, Array, Array]]:
-        """How likely a mount is good, or off; mean and covariance of somebody anywhere with it."""
+        """Good and bad mount: probability, and a state anywhere on the map."""
         off = self.model.off_mount
         yield 1 - off, *self._nowhere()
         if off > 0:
             yield off, *self._nowhere(self.model.off_tilt_rad)
 
-    def _born(self, seen: "_Reading") -> Iterator[Hypothesis]:
-        """The hypotheses that the aircraft was elsewhere, and is here."""
+    def _born(self, seen: "_Measurement") -> Iterator[Hypothesis]:
+        """The hypotheses born from the belief elsewhere, at a measurement."""
         for share, mean, covariance in self._mounts():
             spread = covariance[np.ix_(SEEN, SEEN)] + seen.noise
             log_weight = seen.log_odds - math.log(self.area_m2)
-            log_weight += log_density(seen.seen[2:], spread[2:, 2:])
-            mean, covariance = updated(mean, covariance, seen.seen, spread)
+            log_weight += log_density(seen.mean[2:], spread[2:, 2:])
+            mean, covariance = updated(mean, covariance, seen.mean, spread)
             share *= self.elsewhere * math.exp(min(log_weight, 60.0))
             self._numbers += 1
             yield Hypothesis(share, mean, covariance, seen.recognized, self._numbers)
@@ -405,7 +424,7 @@ class Mixture:
         return Hypothesis(share, mean, covariance, sighted, self._numbers, each.number, expected)
 
     def _settle(self) -> None:
-        """Shares that add up to one with what is elsewhere."""
+        """Normalize: shares and the belief elsewhere add up to one."""
         total = sum(each.share for each in self.hypotheses) + self.elsewhere
         self.hypotheses = [replace(e, share=e.share / total) for e in self.hypotheses]
         self.elsewhere /= total

@@ -1,8 +1,8 @@
-"""What the track knows of an aircraft, how it moves, and what a view says of it.
+"""The state of a track, the model of aircraft and instruments, and the measurement update.
 
-The state of one hypothesis, 8 numbers: position and velocity (m, m/s, east and north), and what is
-wrong with what is told of the view at hand: heading (rad, added to the told one), log scale (of
-true over told height, focal length included), pitch and roll (rad; of these what stays the same).
+The state of one hypothesis has 8 components: position and velocity (m, m/s; east and north), and
+the biases of the telemetry of the present view: heading (rad, added to the reported one), log scale
+(of true over reported height, focal length included), pitch and roll (rad; their constant part).
 """
 
 import math
@@ -11,92 +11,114 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.records import DEFAULT_AGL_STD, DEFAULT_YAW_STD_DEG
+
 Array = NDArray[np.float64]
 STATE = 8
 POSITION, VELOCITY, HEADING, SCALE, TILT = slice(0, 2), slice(2, 4), 4, 5, slice(6, 8)
 HEADING_FLOOR_RAD, SCALE_FLOOR = math.radians(0.3), 0.004
+"""Standard deviations that the heading and log scale of a registered view have at least."""
 MOUNT_M, MOUNT_RAD = 10.0, (math.radians(0.5), math.radians(1.5))
+"""A good mount is misaligned by what makes so many metres on the ground, within these angles
+(docs/decisions/tracking.md, 4)."""
 TILT_WALK_SHARE = 1 / 30
-"""Of how far a mount may be off is how far it drifts, per root of a second."""
+"""Drift of a mount per root of a second, over its misalignment: in a quarter of an hour it drifts
+by as much."""
 SEEN = [0, 1, 4, 5, 6, 7]
-"""Which of the state a sighting speaks of."""
+"""Components of the state that a sighting measures."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """How aircraft and instruments behave.
+    """Standard deviations and probabilities of aircraft and instruments.
 
-    `speed_mps`: standard deviation of an unknown velocity per axis; `accel_mps2`: of what changes
-    it; `reported_velocity_s`: for how long a told one is off by about the same. `heading_rad`,
-    `log_scale`, `tilt_rad`: how wrong the told values may be all along; `heading_noise_rad`,
-    `log_scale_noise`, `tilt_noise_rad`: how they scatter from view to view; the `_walk` ones how
-    the former drift, per root of a second. `sighting_noise_m`: what maps of two dates disagree by
-    beyond what registration knows, which counts `sighting_growth` times; `map_m`: how far a map may
-    be displaced as a whole. `off_mount`: how likely the mount is not as good as `tilt_rad` but off
-    by `off_tilt_rad`. `odometry_outlier`: probability that a displacement between two views is
-    wrong though it looks right: moving clouds, a field that repeats. `turn`: how likely the
-    velocity changes by more than `accel_mps2` says. `bias_jump`: probability that the biases of
-    heading, scale and tilt jump: a gimbal that moved (by `off_tilt_rad`), a compass that was reset.
-    `miss`: how likely a view of ground that is on the map shows nothing that can be found. `lost`:
-    how likely the track went wrong since the last view.
+    Values without a source of their own were chosen on the flights of docs/tracking.md.
     """
 
     speed_mps: float = 30.0
+    """Of an unknown velocity, per axis."""
     accel_mps2: float = 4.0
+    """Of the acceleration while no velocity is reported, per axis."""
     reported_velocity_s: float = 120.0
-    heading_rad: float = math.radians(7.0)
+    """Correlation time of the error of a reported velocity, s (docs/decisions/tracking.md, 6)."""
+    heading_rad: float = math.radians(DEFAULT_YAW_STD_DEG)
+    """Of the constant error of the reported heading."""
     heading_noise_rad: float = math.radians(2.0)
+    """Of its error from view to view, where the telemetry has no `yaw_std_deg`."""
     heading_walk: float = math.radians(0.05)
-    log_scale: float = 0.08
+    """Of the drift of its constant error, rad per root of a second."""
+    log_scale: float = DEFAULT_AGL_STD
+    """Of the constant error of the log scale: height and focal length."""
     log_scale_noise: float = 0.02
+    """Of its error from view to view, where the telemetry has no `agl_std_m`."""
     log_scale_walk: float = 5e-4
+    """Of the drift of its constant error, per root of a second."""
     tilt_rad: float = math.radians(0.5)
+    """Of the misalignment of a good mount, in pitch and roll; see `at_height`."""
     off_tilt_rad: float = math.radians(6.0)
+    """Of the misalignment of a bad mount (docs/decisions/tracking.md, 4)."""
     off_mount: float = 0.03
+    """Probability that the mount is a bad one (docs/decisions/tracking.md, 4)."""
     tilt_noise_rad: float = math.radians(0.7)
+    """Of the reported pitch and roll from view to view, where there is no `tilt_std_deg`."""
     tilt_walk: float = math.radians(0.01)
+    """Of the drift of the misalignment, rad per root of a second."""
     sighting_noise_m: float = 2.0
+    """Of the disagreement of two dates beyond the covariance of a registration, per axis."""
     map_m: float = 3.0
+    """Of a displacement of the map as a whole, per axis: added to the covariance of a fix."""
     sighting_growth: float = 2.0
+    """Factor on the position covariance of a registration, its part due to tilt excepted
+    (docs/decisions/tracking.md, 10)."""
     bias_jump: float = 0.01
+    """Probability, per view, of a bias jump of heading, scale and tilt: a gimbal that moved (by
+    `off_tilt_rad`), a compass that was reset."""
     odometry_outlier: float = 0.01
+    """Probability that a displacement by the camera is an outlier that fits well: clouds, a field
+    that repeats (docs/decisions/tracking.md, 5)."""
     turn: float = 0.03
+    """Probability, per second, that the velocity changes by more than `accel_mps2` allows."""
     miss: float = 0.5
+    """Probability that a view of ground on the map cannot be found on it."""
     lost: float = 3e-3
+    """Belief that returns to "elsewhere" with every view, so that no error is permanent."""
 
     def at_height(self, agl_m: float) -> "Model":
-        """The same, with a mount as good as flying at that height asks for.
+        """The same model with a mount as good as this height requires.
 
-        Who flies high has mounted the camera so that fixes are of use: it is expected to be off by
-        what is `MOUNT_M` on the ground, within `MOUNT_RAD`.
+        For high flights the camera is mounted well enough for fixes to be of use: its expected
+        misalignment is what makes `MOUNT_M` on the ground, within `MOUNT_RAD`.
         """
         low, high = MOUNT_RAD
         return self.with_mount(min(max(MOUNT_M / max(agl_m, 1e-3), low), high))
 
     def with_mount(self, tilt_rad: float) -> "Model":
-        """The same, with a mount that is off by so much, and drifts accordingly."""
+        """The same model with a mount misaligned by this, and drifting accordingly."""
         return replace(self, tilt_rad=tilt_rad, tilt_walk=TILT_WALK_SHARE * tilt_rad)
 
     def initial_bias(self, tilt_rad: float | None = None) -> Array:
-        """Variances (4,) of heading, log scale, pitch and roll before anything is seen."""
+        """Prior variances (4,) of the biases of heading, log scale, pitch and roll."""
         tilt = self.tilt_rad if tilt_rad is None else tilt_rad
         return np.square([self.heading_rad, self.log_scale, tilt, tilt])
 
     @property
     def telemetry_noise(self) -> Array:
-        """Variances (2,) with which told heading and log scale scatter from view to view."""
+        """Variances (2,) of reported heading (rad) and log scale from view to view."""
         return np.square([self.heading_noise_rad, self.log_scale_noise])
 
     def drift(self, seconds: float) -> Array:
-        """Variances (4,) that are added to those of the biases in so many seconds."""
+        """Process noise (4,) of the biases over so many seconds."""
         walk = [self.heading_walk, self.log_scale_walk, self.tilt_walk, self.tilt_walk]
         return np.square(walk) * max(seconds, 0.0)
 
 
 @dataclass(frozen=True)
-class Told:
-    """What was told of a view: heading (rad; None where unknown), pitch and roll (rad), and how
-    far these two are off from view to view (None: as usual)."""
+class ReportedAttitude:
+    """The reported attitude of a view.
+
+    `heading_rad`: None where unknown. `pitch_rad`, `roll_rad`. `tilt_noise_rad`: standard deviation
+    of these two from view to view, that of the model where None.
+    """
 
     heading_rad: float | None
     pitch_rad: float
@@ -108,10 +130,10 @@ class Told:
 class Sighting:
     """One place where a view may have been taken.
 
-    `mean` (6,): metres east and north, heading (rad), log scale, pitch and roll (rad);
-    `covariance` (6, 6). `log_odds`: natural logarithm of the odds that this is the place, for
-    somebody who knows only that it lies somewhere on the map. `alone`: the probability that the
-    view is placed rightly, by itself.
+    `mean` (6,): metres east and north, heading (rad), log scale, pitch and roll (rad).
+    `covariance` (6, 6): of these. `log_odds`: natural logarithm of the odds of this place, given
+    only that the aircraft is somewhere on the map. `alone`: probability that this place is right,
+    by the view alone.
     """
 
     mean: Array
@@ -120,33 +142,40 @@ class Sighting:
     alone: float = 1.0
 
 
-def reading(model: Model, told: Told, sighting: Sighting) -> tuple[Array, Array, Array]:
-    """What a sighting says of the state (6,), in the order of `SEEN`, and two covariances (6, 6):
-    of how map and view err, and of what is told anew at every view."""
+def measurement(
+    model: Model, reported: ReportedAttitude, sighting: Sighting
+) -> tuple[Array, Array, Array]:
+    """A sighting as a measurement of the components `SEEN` of the state (6,), and two covariances
+    (6, 6): of the errors of map and view, and of the telemetry noise, which is independent at every
+    view."""
     noise = sighting.covariance.copy()
     tilt = slice(4, 6)
     by_tilt = noise[:2, tilt] @ np.linalg.solve(noise[tilt, tilt], noise[tilt, :2])
     noise[:2, :2] += (model.sighting_growth - 1) * (noise[:2, :2] - by_tilt)
     floor = [model.sighting_noise_m] * 2 + [HEADING_FLOOR_RAD, SCALE_FLOOR]
     noise[range(4), range(4)] += np.square(floor)
-    reported_tilt = model.tilt_noise_rad if told.tilt_noise_rad is None else told.tilt_noise_rad
+    reported_tilt = (
+        model.tilt_noise_rad if reported.tilt_noise_rad is None else reported.tilt_noise_rad
+    )
     anew = np.diag(np.square([0.0, 0.0, 0.0, 0.0, reported_tilt, reported_tilt]))
     seen = sighting.mean.copy()
-    if told.heading_rad is None:
+    if reported.heading_rad is None:
         seen[2] = 0.0
         noise[2, :] = noise[:, 2] = 0.0
         noise[2, 2] = math.pi**2
     else:
-        seen[2] = math.remainder(seen[2] - told.heading_rad, 2 * math.pi)
-    seen[4:] -= [told.pitch_rad, told.roll_rad]
+        seen[2] = math.remainder(seen[2] - reported.heading_rad, 2 * math.pi)
+    seen[4:] -= [reported.pitch_rad, reported.roll_rad]
     return seen, noise, anew
 
 
-def updated(mean: Array, covariance: Array, off: Array, spread: Array) -> tuple[Array, Array]:
-    """Mean and covariance after a sighting that lies `off` (6,), with covariance `spread`."""
+def updated(
+    mean: Array, covariance: Array, innovation: Array, spread: Array
+) -> tuple[Array, Array]:
+    """Kalman update: posterior mean and covariance, by an innovation (6,) and its covariance."""
     gain = np.linalg.solve(spread, covariance[SEEN]).T
     after = covariance - gain @ spread @ gain.T
-    return mean + gain @ off, (after + after.T) / 2
+    return mean + gain @ innovation, (after + after.T) / 2
 
 
 def log_density(off: Array, spread: Array) -> float:

@@ -1,4 +1,4 @@
-"""How a state becomes that of the next view: by time, by what is told, by what the camera saw."""
+"""Prediction of the state: by time, by the reported velocity, and by the camera's odometry."""
 
 import math
 from dataclasses import dataclass, replace
@@ -16,15 +16,19 @@ from orthonav.track.model import (
     log_density,
 )
 
-TOLD_JITTER = 0.3
-"""Of the error of a told velocity, how much is new at every view."""
+VELOCITY_JITTER = 0.3
+"""Share of the error of a reported velocity that is independent at every view; chosen on the
+flights of docs/tracking.md."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReportedVelocity:
-    """Velocity over ground as told, m/s east and north (2,): since the last view, and the one
-    `before` (None where none was told then). It is off by `std_mps` per axis, and by about the
-    same for a while."""
+    """The reported velocity over ground, m/s east and north.
+
+    `now_en_mps` (2,): since the last view. `before_en_mps` (2,): the one reported with the last
+    view, None where there was none. `std_mps`: standard deviation per axis of its error, which is
+    nearly constant for a while (`Model.reported_velocity_s`).
+    """
 
     now_en_mps: Array
     before_en_mps: Array | None
@@ -33,12 +37,13 @@ class ReportedVelocity:
 
 @dataclass(frozen=True, eq=False)
 class CameraDisplacement:
-    """Movement since the last view as the camera saw it.
+    """The displacement since the last view, measured by the camera.
 
-    `moved_en_m` (2,) is turned by the told heading and scaled by the told height of the view
-    before, so that wrong ones bend it; `covariance` (2, 2). `turned_rad` and `scaled` are by how
-    much the heading turned and the scale changed other than told (rad, natural logarithm), known
-    to `turned_std_rad` and `scaled_std`. `reach_m`: how far away it was looked for.
+    `moved_en_m` (2,): metres east and north, rotated by the reported heading and scaled by the
+    reported height of the view before, and so subject to their errors. `covariance` (2, 2).
+    `reach_m`: the radius within which it was sought. `turned_rad`, `scaled`: change of heading
+    (rad) and log scale beyond the reported change. `turned_std_rad`, `scaled_std`: their standard
+    deviations.
     """
 
     moved_en_m: Array
@@ -52,9 +57,12 @@ class CameraDisplacement:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """What a state became until the next view: mean (8,), covariance (8, 8); what is known of it
-    as it was, by the way in between too: `mean_before`, `covariance_before`; and how the two hang
-    together, `cross` (8, 8), rows of the state before."""
+    """A predicted state, with the state before it.
+
+    `mean` (8,), `covariance` (8, 8): the prediction. `mean_before`, `covariance_before`: the state
+    at the last view, by the odometry in between too. `cross` (8, 8): covariance of the state before
+    (rows) and the prediction (columns).
+    """
 
     mean: Array
     covariance: Array
@@ -63,7 +71,7 @@ class Expected:
     cross: Array
 
     def without(self, part: slice, variances: Array) -> "Expected":
-        """The same with a part of the state forgotten: nothing is left of it but variances."""
+        """The same with components of the state reset to zero mean and these variances."""
         mean, covariance, cross = self.mean.copy(), self.covariance.copy(), self.cross.copy()
         mean[part] = 0.0
         cross[:, part] = 0.0
@@ -77,16 +85,15 @@ def predicted(
     mean: Array,
     covariance: Array,
     seconds: float,
-    told: ReportedVelocity | None,
+    velocity: ReportedVelocity | None,
     telemetry_noise: Array,
     camera: CameraDisplacement | None = None,
 ) -> Expected:
-    """What a state is expected to be after so many seconds, by what is told of the way, else by its
-    velocity.
+    """The state predicted over so many seconds, by the reported velocity or else its own.
 
-    `telemetry_noise` (2,) are the variances with which reported heading and log scale scatter from
-    view to view: what was wrong with the last ones says that much less of these, unless the camera
-    saw how they changed. How far it went by the `camera` is not in this: see `by_camera`.
+    `telemetry_noise` (2,): variances of reported heading (rad) and log scale from view to view.
+    They are added to the biases of these, unless the `camera` measured the change. The displacement
+    by the camera is not included: see `by_camera`.
     """
     after, step = mean.copy(), np.eye(STATE)
     noise = np.zeros((STATE, STATE))
@@ -97,22 +104,22 @@ def predicted(
         after[[HEADING, SCALE]] += [camera.turned_rad, camera.scaled]
         noise[HEADING, HEADING] += camera.turned_std_rad**2
         noise[SCALE, SCALE] += camera.scaled_std**2
-    if told is None:
+    if velocity is None:
         after[POSITION] += seconds * mean[VELOCITY]
         step[0, 2] = step[1, 3] = seconds
         power = model.accel_mps2**2
         _add(noise, power * seconds**4 / 4, power * seconds**3 / 2, power * seconds**2)
     else:
         like_before = 0.0
-        after[VELOCITY] = told.now_en_mps
-        if told.before_en_mps is not None and covariance[2, 2] < (3 * told.std_mps) ** 2:
+        after[VELOCITY] = velocity.now_en_mps
+        if velocity.before_en_mps is not None and covariance[2, 2] < (3 * velocity.std_mps) ** 2:
             like_before = math.exp(-seconds / model.reported_velocity_s)
-            after[VELOCITY] += like_before * (mean[VELOCITY] - told.before_en_mps)
+            after[VELOCITY] += like_before * (mean[VELOCITY] - velocity.before_en_mps)
         after[POSITION] += seconds * after[VELOCITY]
         step[VELOCITY, VELOCITY] = like_before * np.eye(2)
         step[POSITION, VELOCITY] = seconds * like_before * np.eye(2)
-        anew = told.std_mps**2 * (1 - like_before**2)
-        jitter = (TOLD_JITTER * told.std_mps * seconds) ** 2
+        anew = velocity.std_mps**2 * (1 - like_before**2)
+        jitter = (VELOCITY_JITTER * velocity.std_mps * seconds) ** 2
         _add(noise, anew * seconds**2 + jitter, anew * seconds, anew)
     return Expected(
         after, step @ covariance @ step.T + noise, mean, covariance, covariance @ step.T
@@ -120,7 +127,7 @@ def predicted(
 
 
 def _add(noise: Array, position: float, both: float, velocity: float) -> None:
-    """Variances of position and velocity, and what they have in common, the same on both axes."""
+    """Add variances of position and velocity and their covariance `both`, alike on both axes."""
     for axis in (0, 1):
         noise[axis, axis] += position
         noise[axis, axis + 2] += both
@@ -128,11 +135,11 @@ def _add(noise: Array, position: float, both: float, velocity: float) -> None:
         noise[axis + 2, axis + 2] += velocity
 
 
-def by_camera(expected: Expected, way: CameraDisplacement) -> tuple[Expected, float]:
-    """The same with the way that the camera saw, and the log density of that way.
+def by_camera(expected: Expected, camera: CameraDisplacement) -> tuple[Expected, float]:
+    """The prediction updated with a displacement by the camera, and the log density of the latter.
 
-    The way is a measurement of the position now less that before (stochastic cloning, Roumeliotis
-    and Burdick 2002), bent by what was wrong with heading and scale before.
+    The displacement measures the position now less that before (stochastic cloning, Roumeliotis and
+    Burdick 2002), rotated and scaled by the errors of heading and scale before.
     """
     mean = np.concatenate([expected.mean, expected.mean_before])
     joint = np.block(
@@ -141,30 +148,30 @@ def by_camera(expected: Expected, way: CameraDisplacement) -> tuple[Expected, fl
             [expected.cross, expected.covariance_before],
         ]
     )
-    east, north = way.moved_en_m
+    east, north = camera.moved_en_m
     heading, scale = expected.mean_before[HEADING], expected.mean_before[SCALE]
     cos, sin = math.cos(heading), math.sin(heading)
     turn = math.exp(scale) * np.array([[cos, sin], [-sin, cos]])
-    looks = np.zeros((2, 2 * STATE))
-    looks[:, POSITION] = np.eye(2)
-    looks[:, STATE : STATE + 2] = -np.eye(2)
-    looks[:, STATE + HEADING] = -turn @ [north, -east]
-    looks[:, STATE + SCALE] = -turn @ [east, north]
-    off = turn @ [east, north] - (mean[POSITION] - mean[STATE : STATE + 2])
-    spread = looks @ joint @ looks.T + turn @ way.covariance @ turn.T
-    gain = np.linalg.solve(spread, looks @ joint).T
-    mean = mean + gain @ off
+    observes = np.zeros((2, 2 * STATE))
+    observes[:, POSITION] = np.eye(2)
+    observes[:, STATE : STATE + 2] = -np.eye(2)
+    observes[:, STATE + HEADING] = -turn @ [north, -east]
+    observes[:, STATE + SCALE] = -turn @ [east, north]
+    innovation = turn @ [east, north] - (mean[POSITION] - mean[STATE : STATE + 2])
+    spread = observes @ joint @ observes.T + turn @ camera.covariance @ turn.T
+    gain = np.linalg.solve(spread, observes @ joint).T
+    mean = mean + gain @ innovation
     joint = joint - gain @ spread @ gain.T
     joint = (joint + joint.T) / 2
     now, before = slice(0, STATE), slice(STATE, 2 * STATE)
     after = Expected(
         mean[now], joint[now, now], mean[before], joint[before, before], joint[before, now]
     )
-    return after, log_density(off, spread)
+    return after, log_density(innovation, spread)
 
 
 def velocity_forgotten(model: Model, covariance: Array) -> Array:
-    """A covariance (8, 8) of a state whose velocity is not known any more."""
+    """The covariance (8, 8) of a state with its velocity reset to unknown."""
     out = covariance.copy()
     out[VELOCITY] = out[:, VELOCITY] = 0.0
     out[VELOCITY, VELOCITY] = np.eye(2) * model.speed_mps**2
@@ -172,15 +179,12 @@ def velocity_forgotten(model: Model, covariance: Array) -> Array:
 
 
 def held_to_map(model: Model, expected: Expected, area_m2: float) -> Expected:
-    """The same, with a position that is known to be on the map at least.
-
-    Where no more than that is left of it, it is forgotten, with the velocity.
-    """
+    """The same; position and velocity are reset where that is less certain than the map."""
     if float(np.linalg.eigvalsh(expected.covariance[POSITION, POSITION])[-1]) <= area_m2:
         return expected
     return expected.without(slice(0, 4), np.repeat([area_m2, model.speed_mps**2], 2))
 
 
 def after_bias_jump(model: Model, expected: Expected) -> Expected:
-    """The same where heading, scale and tilt are no longer what they were."""
+    """The same after a bias jump: heading, scale and tilt are reset."""
     return expected.without(slice(4, 8), model.initial_bias(model.off_tilt_rad))

@@ -1,7 +1,7 @@
-"""Smoothing: what a whole flight says of each of its views.
+"""Smoothing: the state at each view of a flight, given all views before and after it.
 
-The hypotheses that were right in the end are followed back to where they came from, and every view
-learns from those after it (Rauch, Tung and Striebel 1965). Where a track began anew, so does this.
+The surviving hypotheses are followed back through their parents, with the fixed-interval smoother
+of Rauch, Tung and Striebel (1965). Where a track was born again, smoothing begins again.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from orthonav.track.model import Array
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """Mean (8,) and covariance (8, 8) at one view, and the belief in the track it belongs to."""
+    """A smoothed state: `mean` (8,), `covariance` (8, 8), and `belief` in its track."""
 
     mean: Array
     covariance: Array
@@ -23,30 +23,29 @@ class Smoothed:
 
 
 class History:
-    """What a mixture believed at each view, as far as it still matters. Mutable."""
+    """The hypotheses after each view, as far as the smoother still needs them. Mutable."""
 
     def __init__(self) -> None:
         self._views: list[dict[int, Hypothesis]] = []
 
     def record(self, mixture: Mixture) -> None:
-        """Take in the belief after a view."""
+        """Record the hypotheses after a view."""
         self._views.append({each.number: each for each in mixture.hypotheses})
         self._forget()
 
     def _forget(self) -> None:
-        """Drop what nothing came from, but for the likeliest of each view."""
+        """Drop hypotheses without successors, except the most likely one of each view."""
         for at in range(len(self._views) - 1, 0, -1):
             parents = {each.parent for each in self._views[at].values()}
             view = self._views[at - 1]
             best = max(view.values(), key=lambda each: each.share).number if view else -1
-            kept = {number: view[number] for number in view if number in parents | {best}}
-            if len(kept) == len(view):
+            needed = {number: view[number] for number in view if number in parents | {best}}
+            if len(needed) == len(view):
                 return
-            self._views[at - 1] = kept
+            self._views[at - 1] = needed
 
     def smoothed(self, last: int | None = None) -> list[Smoothed | None]:
-        """One for each view, or for each of the `last` ones; None where nothing was known of it
-        even afterwards."""
+        """Smoothed states of all views, or of the `last` ones; None where none exists even then."""
         out: list[Smoothed | None] = []
         after: Hypothesis | None = None
         later: Smoothed | None = None
@@ -65,7 +64,7 @@ class History:
 
 
 def _one_back(after: Hypothesis, later: Smoothed) -> Smoothed:
-    """The view before, with what is known of the one after it."""
+    """One step of the Rauch-Tung-Striebel smoother (AIAA Journal, 1965)."""
     expected = after.expected
     assert expected is not None
     gain = expected.cross @ np.linalg.pinv(expected.covariance)

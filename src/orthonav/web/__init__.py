@@ -1,1 +1,1 @@
-"""A run as a page in the browser: a small server of this computer's own, and what it serves."""
+"""A run as a page in the browser, and the local server of that page."""

@@ -1,19 +1,17 @@
-"""The files of the page: ours, and those of Leaflet, which a Python package brings."""
+"""The static files of the page: ours, those shared with reports, and Leaflet."""
 
-import importlib
 from dataclasses import dataclass
 from importlib.resources import files
-from importlib.resources.abc import Traversable
-from pathlib import Path
+from pathlib import PurePath
 
-from orthonav.errors import MissingExtraError
+from orthonav.report.leaflet import leaflet_files
 
 _TYPES = {
-    "html": "text/html; charset=utf-8",
-    "css": "text/css; charset=utf-8",
-    "js": "text/javascript; charset=utf-8",
-    "png": "image/png",
-    "svg": "image/svg+xml",
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".png": "image/png",
+    ".svg": "image/svg+xml",
 }
 LEAFLET = (
     "leaflet.css",
@@ -22,51 +20,37 @@ LEAFLET = (
     "images/layers-2x.png",
     "images/marker-icon.png",
 )
-"""What of Leaflet the page may ask for."""
+"""Files of Leaflet that the page may request."""
+SHARED = ("chart.js", "format.js", "plane.js")
+"""Scripts of `orthonav.report` that the page uses."""
 
 
 @dataclass(frozen=True)
-class Asset:
+class StaticFile:
     """A file of the page and its media type."""
 
     data: bytes
     media_type: str
 
 
-def load_assets() -> dict[str, Asset]:
-    """All files of the page by the path they are asked for with, `/` for the page itself.
+def load_assets() -> dict[str, StaticFile]:
+    """All files of the page by the path of their request, `/` for the page itself.
 
-    Only these can be asked for: no path is ever made of what a browser sends. Raises
+    Only these can be requested: no path is derived from what a browser sends. Raises
     `MissingExtraError` where Leaflet is not installed.
     """
-    ours = files("orthonav.web").joinpath("static")
-    found = {f"/static/{entry.name}": _asset(entry) for entry in ours.iterdir() if _is_ours(entry)}
+    own = list(files("orthonav.web").joinpath("static").iterdir())
+    own += [files("orthonav.report").joinpath("static", name) for name in SHARED]
+    found = {
+        f"/static/{entry.name}": _static_file(entry.read_bytes(), entry.name)
+        for entry in own
+        if entry.is_file() and PurePath(entry.name).suffix in _TYPES
+    }
     found["/"] = found.pop("/static/index.html")
-    leaflet = _leaflet()
-    for name in LEAFLET:
-        found[f"/leaflet/{name}"] = _asset(leaflet / name)
+    for name, path in zip(LEAFLET, leaflet_files(*LEAFLET), strict=True):
+        found[f"/leaflet/{name}"] = _static_file(path.read_bytes(), name)
     return found
 
 
-def _is_ours(entry: Traversable) -> bool:
-    return entry.is_file() and entry.name.rpartition(".")[2] in _TYPES
-
-
-def _asset(entry: Traversable) -> Asset:
-    return Asset(entry.read_bytes(), _TYPES[entry.name.rpartition(".")[2]])
-
-
-def _leaflet() -> Path:
-    try:
-        package = importlib.import_module("xstatic.pkg.leaflet")
-        folder = Path(package.BASE_DIR)
-    except (ImportError, AttributeError) as error:
-        raise MissingExtraError(
-            "the page needs Leaflet, which is not installed: pip install 'orthonav[web]'"
-        ) from error
-    missing = [name for name in LEAFLET if not (folder / name).is_file()]
-    if missing:
-        raise MissingExtraError(
-            f"the Leaflet that is installed lacks {missing[0]}: pip install -U 'orthonav[web]'"
-        )
-    return folder
+def _static_file(data: bytes, name: str) -> StaticFile:
+    return StaticFile(data, _TYPES[PurePath(name).suffix])

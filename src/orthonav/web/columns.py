@@ -1,6 +1,6 @@
-"""Results as columns of short numbers, so that many thousand views fit into one answer.
+"""Results as columns of short numbers, so that many thousand views fit into one response.
 
-Lengths and positions are rounded to what a screen can show. What is not known is None.
+Lengths and positions are rounded to what a screen can show; unknown values are None.
 """
 
 import math
@@ -12,43 +12,46 @@ from numpy.typing import NDArray
 
 from orthonav.evaluate.calibration import is_covariance
 from orthonav.evaluate.metrics import FAR_M
-from orthonav.publish.jsonl import STATES
+from orthonav.flight.fixes import STATES
 from orthonav.records import CONFIDENT, Fix, ViewResult
-from orthonav.web.ground import Ground
+from orthonav.web.sheet import SheetImagery
 
 Array = NDArray[np.float64]
 FAR_AWAY_PX = 1e9
-"""A place farther off than that is on no map: not drawn."""
+"""Positions farther away are not drawn."""
 
 
 def columns_of(
     results: Sequence[ViewResult],
     first_ns: int,
     truth: Mapping[str, tuple[float, float]],
-    ground: Ground,
+    sheet: SheetImagery,
     radius_m: float,
 ) -> dict[str, list[Any]]:
     """The columns of `results`, in order; times count from `first_ns`.
 
-    `frame`, `t` (seconds), `x`, `y` (of the fix) and `tx`, `ty` (of the truth) in pixels of the
-    sheet, `err` (m), `conf`, `radius` (m, its own), `a`, `b` (axes of one standard deviation, m)
-    and `turn` (of the longer one, degrees counter-clockwise from east), `head` (deg), `agl` (m),
-    `ms`, `state` (number in `STATES`, -1 for none), `reason` ("" for a fix), `wrong` (1: tracking
-    or sure, and off by more than 35 m, the radius asked for and its own).
+    `frame`: name; `t`: time in seconds; `ms`: processing time.
+    `x`, `y`, `tx`, `ty`: fix and true position in pixels of the sheet.
+    `err`: error in metres; `conf`, `radius`: confidence and radius (m) that the fix states.
+    `a`, `b`, `turn`: axes of one standard deviation (m), and the angle of the longer one in degrees
+    counter-clockwise from east.
+    `head`, `agl`: heading (deg) and height (m).
+    `state`: number in `STATES`, -1 without one; `reason`: "" for a fix.
+    `wrong`: 1 if tracking or confident, with an error above 35 m, `radius_m` and its own radius.
     """
     fixes = [r.outcome if isinstance(r.outcome, Fix) else None for r in results]
-    fix_en_m = _places([None if f is None else (f.lat_deg, f.lon_deg) for f in fixes], ground)
-    truth_en_m = _places([truth.get(r.frame) for r in results], ground)
+    fix_en_m = _places([None if f is None else (f.lat_deg, f.lon_deg) for f in fixes], sheet)
+    truth_en_m = _places([truth.get(r.frame) for r in results], sheet)
     error_m = np.hypot(*(fix_en_m - truth_en_m).T)
     own_m = np.array([math.nan if f is None else f.radius_m for f in fixes], dtype=np.float64)
-    sure = [
+    confident = [
         f is not None and (f.confidence >= CONFIDENT or r.state == "tracking")
         for f, r in zip(fixes, results, strict=True)
     ]
-    wrong = np.array(sure, dtype=bool) & (error_m > np.fmax(max(FAR_M, radius_m), own_m))
+    wrong = np.array(confident, dtype=bool) & (error_m > np.fmax(max(FAR_M, radius_m), own_m))
     axes_m, turn_deg = _ellipses(fixes)
-    x, y = _drawn(fix_en_m, ground)
-    tx, ty = _drawn(truth_en_m, ground)
+    x, y = _drawn(fix_en_m, sheet)
+    tx, ty = _drawn(truth_en_m, sheet)
     return {
         "frame": [r.frame for r in results],
         "t": [round((r.time_ns - first_ns) / 1e9, 3) for r in results],
@@ -71,24 +74,24 @@ def columns_of(
     }
 
 
-def _places(latlon_deg: Sequence[tuple[float, float] | None], ground: Ground) -> Array:
-    """Places (N, 2) in the plane of the sheet, NaN where there is none."""
+def _places(latlon_deg: Sequence[tuple[float, float] | None], sheet: SheetImagery) -> Array:
+    """Positions (N, 2) in the plane of the sheet, NaN where there is none."""
     en_m = np.full((len(latlon_deg), 2), math.nan)
     known = [i for i, at in enumerate(latlon_deg) if at and all(map(math.isfinite, at))]
     if known:
         lat, lon = np.array([latlon_deg[i] for i in known], dtype=np.float64).T
-        en_m[known] = ground.frame.en_from_latlon(lat, lon)
+        en_m[known] = sheet.frame.en_from_latlon(lat, lon)
     return en_m
 
 
-def _drawn(en_m: Array, ground: Ground) -> tuple[Array, Array]:
-    px = ground.px_from_en(en_m)
+def _drawn(en_m: Array, sheet: SheetImagery) -> tuple[Array, Array]:
+    px = sheet.px_from_en(en_m)
     px[~(np.abs(px) < FAR_AWAY_PX).all(axis=1)] = math.nan
     return px[:, 0], px[:, 1]
 
 
 def _ellipses(fixes: Sequence[Fix | None]) -> tuple[Array, Array]:
-    """Standard deviations (N, 2) along both axes, the shorter first, and how the longer lies."""
+    """Standard deviations (N, 2) along both axes, shorter first, and the angle of the longer."""
     cov = np.full((len(fixes), 2, 2), math.nan)
     for i, fix in enumerate(fixes):
         if fix is not None and np.shape(fix.cov_en_m2) == (2, 2):
@@ -96,9 +99,9 @@ def _ellipses(fixes: Sequence[Fix | None]) -> tuple[Array, Array]:
     axes, turn = np.full((len(fixes), 2), math.nan), np.full(len(fixes), math.nan)
     usable = is_covariance(cov)
     if usable.any():
-        sizes, ways = np.linalg.eigh(cov[usable])
+        sizes, vectors = np.linalg.eigh(cov[usable])
         axes[usable] = np.sqrt(np.maximum(sizes, 0.0))
-        turn[usable] = np.degrees(np.arctan2(ways[:, 1, 1], ways[:, 0, 1])) % 180.0
+        turn[usable] = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])) % 180.0
     return axes, turn
 
 

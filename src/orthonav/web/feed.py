@@ -1,4 +1,4 @@
-"""What comes out of a flight, read from a file that may still be growing."""
+"""Results and health of a flight, read from a file that may still grow."""
 
 import json
 from dataclasses import dataclass, field
@@ -7,21 +7,23 @@ from typing import Any, Protocol
 
 from orthonav.errors import FlightError
 from orthonav.files import require_file
-from orthonav.publish.jsonl import result_from_json
+from orthonav.flight.fixes import result_from_json
 from orthonav.records import ViewResult
 
 MAX_LINE_BYTES = 2**20
 MAX_VIEWS = 500_000
-"""Ten a second for 14 hours."""
+"""Ten per second for 14 hours."""
 MAX_HEALTH = 200_000
 
 
 @dataclass
 class Batch:
-    """What is new: results in order, and health with the number of results that came before it.
+    """What is new since the last poll.
 
-    `restarted`: what was told before is void, the file was begun anew. `problems`: what people
-    should know.
+    `results`: in order.
+    `health`: lines of health, each with the number of results before it.
+    `restarted`: the file was replaced, so everything read before is void.
+    `problems`: messages for people.
     """
 
     results: list[ViewResult] = field(default_factory=list)
@@ -31,25 +33,25 @@ class Batch:
 
 
 class Feed(Protocol):
-    """Where results come from."""
+    """A source of results."""
 
     def poll(self) -> Batch:
-        """What came since the last time. Raises `OrthonavError` or `OSError`."""
+        """What is new since the last call. Raises `OrthonavError` or `OSError`."""
         ...
 
 
 class LineFeed:
-    """`fixes.jsonl`, or what `orthonav fly --json` writes: results, and health between them.
+    """`fixes.jsonl`, or the output of `orthonav fly --jsonl`: results, and health between them.
 
-    Lines that are neither are passed over and told of: a flight log of a disk that was full is
-    better than none. With `live` the file may not be there yet, and its last line may not be whole.
+    Lines that are neither are skipped and reported: a file that a full disk cut short is better
+    than none. With `live` the file need not exist yet, and its last line may be incomplete.
     """
 
     def __init__(self, path: Path, *, live: bool = False) -> None:
         self._path, self._live = path, live
-        self._begin()
+        self._reset()
 
-    def _begin(self) -> None:
+    def _reset(self) -> None:
         self._offset, self._file, self._lines, self._views = 0, (0, 0), 0, 0
         self._health, self._broken = 0, 0
 
@@ -59,26 +61,26 @@ class LineFeed:
         if self._live and not self._path.exists():
             return batch
         with require_file(self._path, "file of fixes").open("rb") as stream:
-            batch.restarted = self._begun_anew()
+            batch.restarted = self._was_replaced()
             stream.seek(self._offset)
             while line := stream.readline(MAX_LINE_BYTES + 1):
                 whole = line.endswith(b"\n")
                 if not whole and self._live and len(line) <= MAX_LINE_BYTES:
-                    break  # the rest of it is still to come
+                    break  # incomplete
                 self._offset += len(line)
                 self._lines += whole
                 self._take(line, batch)
         return batch
 
-    def _begun_anew(self) -> bool:
-        """Whether the file is another one than before, or was cut."""
+    def _was_replaced(self) -> bool:
+        """Whether the file was replaced or truncated since the last poll."""
         found = self._path.stat()
         file = found.st_dev, found.st_ino
-        anew = self._file != (0, 0) and (file != self._file or found.st_size < self._offset)
-        if anew:
-            self._begin()
+        replaced = self._file != (0, 0) and (file != self._file or found.st_size < self._offset)
+        if replaced:
+            self._reset()
         self._file = file
-        return anew
+        return replaced
 
     def _take(self, line: bytes, batch: Batch) -> None:
         try:
@@ -97,7 +99,7 @@ class LineFeed:
         except (FlightError, UnicodeDecodeError) as error:
             self._broken += 1
             if self._broken == 1:
-                batch.problems.append(f"line {self._lines} is left out ({error}): {self._path}")
+                batch.problems.append(f"line {self._lines} was skipped ({error}): {self._path}")
             return
         self._views += 1
         if self._views > MAX_VIEWS:
@@ -106,7 +108,7 @@ class LineFeed:
 
 
 def _health_of(text: str) -> dict[str, Any] | None:
-    """The health that a line tells, None where it is a result or nothing."""
+    """The health in a line; None for any other line."""
     if not text.startswith('{"health"'):
         return None
     try:
@@ -117,7 +119,7 @@ def _health_of(text: str) -> dict[str, Any] | None:
 
 
 def checked_health(plain: Any) -> dict[str, Any]:
-    """Health as the page shows it: its level, reasons, time and counts; raises `FlightError`."""
+    """Level, reasons, time and counts of health, validated; raises `FlightError`."""
     level = plain.get("health") if isinstance(plain, dict) else None
     if not isinstance(level, str):
         raise FlightError("health has no level")

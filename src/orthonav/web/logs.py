@@ -1,4 +1,4 @@
-"""A flight log as a feed of results and as a source of pictures, also while it is written."""
+"""A flight log as a feed of results and a source of images, also while it is written."""
 
 import contextlib
 import threading
@@ -11,6 +11,7 @@ from typing import Any
 
 from orthonav.errors import FlightError, MissingFileError, OrthonavError
 from orthonav.flight import decode_image
+from orthonav.flight.fixes import result_from_json
 from orthonav.flight.logged import (
     HEALTH,
     MAX_JSON_BYTES,
@@ -27,7 +28,6 @@ from orthonav.flight.logged import (
 )
 from orthonav.flight.png import grey_of_png
 from orthonav.geo.camera import Camera
-from orthonav.publish.jsonl import result_from_json
 from orthonav.sources.flightlog import (
     NewerFormatError,
     files_of_run,
@@ -35,22 +35,30 @@ from orthonav.sources.flightlog import (
     run_of,
     session_of,
 )
-from orthonav.sources.mcap_chunks import Chunk, Found, LastChunk, Place, Walk, chunks, messages
+from orthonav.sources.mcap_chunks import (
+    Chunk,
+    LastChunk,
+    MessageLocation,
+    MessageSpan,
+    Walk,
+    chunks,
+    messages,
+)
 from orthonav.web.feed import MAX_HEALTH, MAX_VIEWS, Batch, checked_health
-from orthonav.web.pictures import Grey, Shot
+from orthonav.web.images import Grey, Shot
 
-LOOK_FOR_FILES_S = 1.0
+RESCAN_S = 1.0
 MAX_THUMBNAIL_BYTES = 2**20
 _WHY_NONE = {
-    "none": "the log keeps no pictures",
-    "dropped": "the log had no time or room for this picture",
-    "bad": "the camera gave no usable picture",
+    "none": "the log has no images",
+    "dropped": "this image was dropped for lack of time or space",
+    "bad": "the camera delivered no usable image",
 }
 
 
 @dataclass
-class _File:
-    """A file of the log, read so far."""
+class _LogFile:
+    """A file of the log and how far it was read."""
 
     path: Path
     walk: Walk = field(default_factory=Walk)
@@ -58,63 +66,63 @@ class _File:
 
 
 @dataclass(frozen=True)
-class _Picture(Place):
-    """Where the data of a picture lies, and whether it is the whole view or a thumbnail."""
+class _ImagePlace(MessageLocation):
+    """Where the data of an image is; `whole` for the full view, else a thumbnail."""
 
     whole: bool
 
 
 class LogReader:
-    """Results, health and pictures of one flight. Safe to share between threads."""
+    """Results, health and images of one flight. Safe to share between threads."""
 
     def __init__(self, path: Path, *, live: bool = False) -> None:
         """`path` is a folder, the first file, or the name given to `orthonav fly --log`.
 
-        With `live` it need not be there yet, and where it holds several flights it is the newest.
+        With `live` it need not exist yet; of several flights the newest is taken.
         """
         self._path, self._live = path, live
         self._lock = threading.Lock()
-        self._files: list[_File] = []
+        self._files: list[_LogFile] = []
         self._names: set[Path] = set()
         self._run: str | None = None
-        self._looked_s = -LOOK_FOR_FILES_S
+        self._scanned_s = -RESCAN_S
         self._chunk = LastChunk()
-        self._begin()
+        self._reset()
 
-    def _begin(self) -> None:
+    def _reset(self) -> None:
         self.camera: Camera | None = None
         self.session: dict[str, Any] = {}
         self._views: dict[str, LoggedView] = {}
-        self._places: dict[int, _Picture] = {}
+        self._places: dict[int, _ImagePlace] = {}
         self._results, self._health, self._broken = 0, 0, 0
 
     def poll(self) -> Batch:
         """See `orthonav.web.feed.Feed.poll`."""
         with self._lock:
             batch = Batch()
-            self._look_for_files(batch)
+            self._rescan(batch)
             for file in self._files:
                 if not file.walk.ended:
                     self._read(file, batch)
             return batch
 
     def shot(self, frame: str) -> Shot:
-        """See `orthonav.web.pictures.Pictures.shot`."""
+        """See `orthonav.web.images.ViewImages.shot`."""
         with self._lock:
             view, camera = self._views.get(frame), self.camera
             place = None if view is None else self._places.get(view.index)
         if view is None or camera is None:
             raise FlightError("this view is not in the log")
         if place is None:
-            raise FlightError(_WHY_NONE.get(view.picture, "the picture of this view is lost"))
+            raise FlightError(_WHY_NONE.get(view.picture, "the image of this view is missing"))
         return Shot(view.telemetry, camera, partial(self._grey, place, camera, frame))
 
-    def _look_for_files(self, batch: Batch) -> None:
-        """Add files that are new; where another flight began, begin with it anew."""
+    def _rescan(self, batch: Batch) -> None:
+        """Add new files; start over where another flight began."""
         now = time.monotonic()
-        if self._files and (not self._live or now - self._looked_s < LOOK_FOR_FILES_S):
+        if self._files and (not self._live or now - self._scanned_s < RESCAN_S):
             return
-        self._looked_s = now
+        self._scanned_s = now
         cut = any(_was_cut(file) for file in self._files)
         names = set(_candidates(self._path))
         if self._files and names == self._names and not cut:
@@ -123,21 +131,21 @@ class LogReader:
         run = run_of(found[-1]) if found else None
         if self._files and (cut or run not in (None, self._run)):
             self._files, batch.restarted = [], True
-            self._begin()
+            self._reset()
         self._names, self._run = names, run or self._run
         known = {file.path for file in self._files}
-        self._files += [_File(path) for path in found if path not in known]
+        self._files += [_LogFile(path) for path in found if path not in known]
 
-    def _read(self, file: _File, batch: Batch) -> None:
+    def _read(self, file: _LogFile, batch: Batch) -> None:
         damaged = file.walk.damaged
-        with contextlib.suppress(FileNotFoundError):  # deleted to make room; what was read stays
+        with contextlib.suppress(FileNotFoundError):  # deleted to make room; what was read remains
             for chunk in chunks(file.path, file.walk):
                 for found in messages(chunk, file.channels):
                     self._try(found, chunk, file.path, batch)
         if file.walk.damaged > damaged == 0:
-            batch.problems.append(f"damaged chunks are left out: {file.path}")
+            batch.problems.append(f"damaged chunks were skipped: {file.path}")
 
-    def _try(self, found: Found, chunk: Chunk, path: Path, batch: Batch) -> None:
+    def _try(self, found: MessageSpan, chunk: Chunk, path: Path, batch: Batch) -> None:
         try:
             self._take(found, chunk, path, batch)
         except (_EndError, NewerFormatError):
@@ -145,12 +153,12 @@ class LogReader:
         except (OrthonavError, UnicodeDecodeError) as error:
             self._broken += 1
             if self._broken == 1:
-                batch.problems.append(f"a message is left out ({error}): {path}")
+                batch.problems.append(f"a message was skipped ({error}): {path}")
 
-    def _take(self, found: Found, chunk: Chunk, path: Path, batch: Batch) -> None:
+    def _take(self, found: MessageSpan, chunk: Chunk, path: Path, batch: Batch) -> None:
         if found.topic in (VIEW.name, THUMBNAIL.name):
             whole = found.topic == VIEW.name
-            place = _Picture(path, chunk.offset, found.first, found.last, whole)
+            place = _ImagePlace(path, chunk.offset, found.first, found.last, whole)
             self._places.setdefault(found.number, place)
             return
         data = chunk.data[found.first : found.last]
@@ -170,22 +178,22 @@ class LogReader:
         if max(self._results, len(self._views), len(self._places)) > MAX_VIEWS:
             raise _EndError(f"more than {MAX_VIEWS} views: {path}")
 
-    def _grey(self, place: _Picture, camera: Camera, frame: str) -> Grey:
+    def _grey(self, place: _ImagePlace, camera: Camera, frame: str) -> Grey:
         data, kind = picture_of(self._message(place))
         where = f"view {frame} of {place.path}"
         if place.whole and kind == "png":
             return grey_of_png(data, camera.width_px, camera.height_px, where)
         if place.whole or kind != "jpeg" or len(data) > MAX_THUMBNAIL_BYTES:
-            raise FlightError(f"picture is of an unknown kind: {where}")
+            raise FlightError(f"image has an unknown format: {where}")
         return decode_image(data, where)
 
-    def _message(self, place: _Picture) -> bytes:
+    def _message(self, place: _ImagePlace) -> bytes:
         with self._lock:
             return self._chunk.message(place, str(place.path))
 
 
 class _EndError(FlightError):
-    """A log that cannot be gone on with."""
+    """A log that cannot be read any further."""
 
 
 def run_files(path: Path, *, live: bool) -> list[Path]:
@@ -198,7 +206,7 @@ def run_files(path: Path, *, live: bool) -> list[Path]:
     if path.is_dir() and not live:
         found = files_of_run(path)
         if not found:
-            raise FlightError(f"no chunk of a flight log is whole in this folder: {path}")
+            raise FlightError(f"no complete chunk of a flight log in this folder: {path}")
         return found
     runs = {file: run_of(file) for file in _candidates(path) if is_flight_log(file)}
     named = sorted((file for file in runs if runs[file]), key=lambda file: file.stat().st_mtime)
@@ -215,7 +223,7 @@ def run_files(path: Path, *, live: bool) -> list[Path]:
 
 
 def _candidates(path: Path) -> Iterator[Path]:
-    """Files that may be of a log: those in a folder, numbered ones, those beside a file of one."""
+    """Files that may belong to a log."""
     if path.is_dir():
         yield from path.glob("*.mcap")
     elif path.is_file():
@@ -224,9 +232,9 @@ def _candidates(path: Path) -> Iterator[Path]:
         yield from path.parent.glob(f"{path.stem}_*.mcap")
 
 
-def _was_cut(file: _File) -> bool:
-    """Whether a file is shorter than what was read of it."""
+def _was_cut(file: _LogFile) -> bool:
+    """Whether a file is shorter than what was already read."""
     try:
         return file.path.stat().st_size < file.walk.next_offset and not file.walk.ended
     except OSError:
-        return False  # it is gone: deleted to make room
+        return False  # deleted to make room

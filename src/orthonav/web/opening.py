@@ -1,4 +1,4 @@
-"""From the names on the command line to a run."""
+"""Opens a run from the arguments of the command."""
 
 import logging
 from collections.abc import Mapping
@@ -11,17 +11,17 @@ from orthonav.mapfile import open_map
 from orthonav.mapfile.signature import map_digest
 from orthonav.sources.flightlog import is_flight_log
 from orthonav.web.feed import Feed, LineFeed
-from orthonav.web.ground import Ground
+from orthonav.web.images import FolderImages, NoImages, ViewImages
 from orthonav.web.logs import LogReader
-from orthonav.web.pictures import FolderPictures, NoPictures, Pictures
-from orthonav.web.run import Run, Told
+from orthonav.web.run import Run, RunLabels
+from orthonav.web.sheet import SheetImagery
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """What is to be shown: see the arguments of `orthonav view`."""
+    """What to show: see the arguments of `orthonav view`."""
 
     run: Path
     map_path: Path
@@ -32,24 +32,24 @@ class ViewRequest:
 
 
 def open_run(request: ViewRequest) -> Run:
-    """The run, read as far as it is there. What people should know of it is logged.
+    """The run, read as far as it exists; problems are logged.
 
-    Raises an `OrthonavError` where something that was named is missing or broken.
+    Raises an `OrthonavError` where a given file is missing or damaged.
     """
     if not 0 < request.radius_m < 1e7:
         raise FlightError(f"radius must be above 0 m, got {request.radius_m}")
-    ground = Ground(open_map(request.map_path))
+    sheet = SheetImagery(open_map(request.map_path))
     feed = _feed(request)
-    pictures = _pictures(request, feed)
+    images = _images(request, feed)
     truth, truth_name = _truth(request)
-    told = Told(
+    labels = RunLabels(
         name=request.run.name or str(request.run),
         map_name=request.map_path.name,
-        pictures=_pictures_name(request, pictures),
+        images=_images_name(request, images),
         truth=truth_name,
         live=request.live,
     )
-    run = Run(told, feed, pictures, ground, truth, request.radius_m)
+    run = Run(labels, feed, images, sheet, truth, request.radius_m)
     for problem in run.problems:
         log.warning("%s", problem)
     _warn(request, run, feed, truth)
@@ -57,7 +57,7 @@ def open_run(request: ViewRequest) -> Run:
 
 
 def is_log(path: Path) -> bool:
-    """Whether this names a flight log, which may still be to come."""
+    """Whether this names a flight log, which need not exist yet."""
     if path.exists():
         return is_flight_log(path)
     return path.suffix == ".mcap"
@@ -70,14 +70,14 @@ def _feed(request: ViewRequest) -> Feed:
     if is_log(path) or (request.live and path.is_dir()):
         return LogReader(path, live=request.live)
     if path.is_dir():
-        raise FlightError(f"expected fixes.jsonl or a flight log, got a folder of neither: {path}")
+        raise FlightError(f"expected fixes.jsonl or a flight log, got a folder without one: {path}")
     return LineFeed(path, live=request.live)
 
 
-def _pictures(request: ViewRequest, feed: Feed) -> Pictures:
+def _images(request: ViewRequest, feed: Feed) -> ViewImages:
     path = request.flight
     if path is None:
-        return feed if isinstance(feed, LogReader) else NoPictures()
+        return feed if isinstance(feed, LogReader) else NoImages()
     if not path.exists() and not request.live:
         raise MissingFileError(f"flight does not exist: {path}")
     if is_log(path):
@@ -86,14 +86,14 @@ def _pictures(request: ViewRequest, feed: Feed) -> Pictures:
         return reader
     if path.is_file():
         raise FlightError(
-            f"expected a flight folder or a flight log; write others as a folder with `orthonav "
+            f"expected a flight folder or a flight log; convert other sources with `orthonav "
             f"import`: {path}"
         )
-    return FolderPictures(path)
+    return FolderImages(path)
 
 
 def _truth(request: ViewRequest) -> tuple[Mapping[str, tuple[float, float]], str]:
-    """True positions and where they come from: as told, else those of the flight folder."""
+    """True positions and their source: the given file, or the flight folder."""
     if request.truth is not None:
         return read_truth(request.truth), request.truth.name
     if request.flight is not None and (request.flight / "truth.csv").is_file():
@@ -102,8 +102,8 @@ def _truth(request: ViewRequest) -> tuple[Mapping[str, tuple[float, float]], str
     return {}, ""
 
 
-def _pictures_name(request: ViewRequest, pictures: Pictures) -> str:
-    if isinstance(pictures, NoPictures):
+def _images_name(request: ViewRequest, images: ViewImages) -> str:
+    if isinstance(images, NoImages):
         return ""
     return (request.flight or request.run).name
 
@@ -111,13 +111,13 @@ def _pictures_name(request: ViewRequest, pictures: Pictures) -> str:
 def _warn(
     request: ViewRequest, run: Run, feed: Feed, truth: Mapping[str, tuple[float, float]]
 ) -> None:
-    """What is probably a mistake."""
+    """Log probable mistakes."""
     flown = feed.session.get("map") if isinstance(feed, LogReader) else None
     if isinstance(flown, dict) and flown.get("manifest_sha256") != map_digest(request.map_path):
-        log.warning("flown with another map (%.80s): %s", flown.get("name"), request.map_path)
+        log.warning("the flight used another map (%.80s): %s", flown.get("name"), request.map_path)
     if not run.count:
         return
     if truth and not run.any_known("tx"):
-        log.warning("no view of the run has a true position in %s", run.told.truth)
+        log.warning("no view of the run has a true position in %s", run.labels.truth)
     if run.any_known("x") and not run.any_on_map():
         log.warning("no position of the run lies on this map: %s", request.map_path)

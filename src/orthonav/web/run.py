@@ -1,4 +1,4 @@
-"""A run that is looked at: its results, their truth, its health and its pictures."""
+"""A displayed run: its results, truth, health and images."""
 
 import math
 import threading
@@ -11,52 +11,52 @@ import numpy as np
 from orthonav import __version__
 from orthonav.errors import FlightError, OrthonavError
 from orthonav.evaluate.contact_sheet import as_fixed
-from orthonav.publish.jsonl import STATES
+from orthonav.flight.fixes import STATES
 from orthonav.records import Fix, Telemetry, ViewResult
 from orthonav.web.columns import columns_of
 from orthonav.web.feed import Batch, Feed
-from orthonav.web.ground import Ground, Window, small_jpeg, view_png, window_of
+from orthonav.web.images import Shot, ViewImages
 from orthonav.web.logs import LogReader
-from orthonav.web.pictures import Pictures, Shot
+from orthonav.web.sheet import GroundWindow, SheetImagery, small_jpeg, view_png, window_of
 
 AT = ("fix", "truth")
 
 
 @dataclass(frozen=True)
-class Told:
-    """What the page says of a run: names as text, and whether more of it is to come."""
+class RunLabels:
+    """Names of run, map, images and truth for the page; `live` while the run is in progress."""
 
     name: str
     map_name: str
-    pictures: str
+    images: str
     truth: str
     live: bool
 
 
 @dataclass(frozen=True, eq=False)
 class _Placed:
-    """A view with its picture, as its fix has it, and the ground that it shows."""
+    """A view, the telemetry corrected by its fix, and the ground that it shows."""
 
     shot: Shot
-    told: Telemetry
-    window: Window
+    telemetry: Telemetry
+    window: GroundWindow
 
 
 class Run:
-    """Everything that the page asks for. Safe to share between threads."""
+    """Everything that the page requests. Safe to share between threads."""
 
     def __init__(
         self,
-        told: Told,
+        labels: RunLabels,
         feed: Feed,
-        pictures: Pictures,
-        ground: Ground,
+        images: ViewImages,
+        sheet: SheetImagery,
         truth: Mapping[str, tuple[float, float]],
         radius_m: float,
     ) -> None:
-        """Reads what is there. Raises what the feed raises, and `FlightError` where it is empty."""
-        self.told, self.ground = told, ground
-        self._feed, self._pictures = feed, pictures
+        """Read what exists. Raises what the feed raises, and `FlightError` for an empty run."""
+        self.labels, self.sheet = labels, sheet
+        self._feed, self._images = feed, images
         self._truth, self._radius_m = truth, radius_m
         self._lock = threading.Lock()
         self._generation = 1
@@ -66,18 +66,18 @@ class Run:
         self._problems: list[str] = []
         self._trouble = ""
         self._take(feed.poll())
-        if not self._results and not told.live:
-            told_why = f": {self._problems[0]}" if self._problems else ""
-            raise FlightError(f"run has no views{told_why}: {told.name}")
+        if not self._results and not labels.live:
+            reason = f": {self._problems[0]}" if self._problems else ""
+            raise FlightError(f"run has no views{reason}: {labels.name}")
 
     @property
     def count(self) -> int:
-        """Views so far."""
+        """Number of views so far."""
         return len(self._results)
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What people should know of what was read."""
+        """Messages about what was read."""
         return tuple(self._problems)
 
     def any_known(self, column: str) -> bool:
@@ -86,7 +86,7 @@ class Run:
 
     def any_on_map(self) -> bool:
         """Whether any fix lies on the sheet."""
-        grid = self.ground.grid
+        grid = self.sheet.grid
         places = zip(self._columns.get("x", ()), self._columns.get("y", ()), strict=True)
         return any(
             x is not None and 0 <= x <= grid.width_px and 0 <= y <= grid.height_px
@@ -96,15 +96,15 @@ class Run:
     def summary(self) -> dict[str, Any]:
         """What does not change while the page is open."""
         return {
-            **asdict(self.told),
+            **asdict(self.labels),
             "version": __version__,
             "radius_m": self._radius_m,
             "states": list(STATES),
-            "sheet": self.ground.plain(),
+            "sheet": self.sheet.plain(),
         }
 
     def news(self, generation: int, views: int, health: int) -> dict[str, Any]:
-        """What came after so many views and lines of health; all where `generation` is another."""
+        """What is new after so many views and lines of health; all for another `generation`."""
         with self._lock:
             self._refresh()
             if generation != self._generation:
@@ -120,7 +120,7 @@ class Run:
             }
 
     def detail(self, index: int) -> dict[str, Any]:
-        """All that is known of one view. Raises `IndexError`."""
+        """Everything known about one view. Raises `IndexError`."""
         result = self._result(index)
         outcome = result.outcome
         plain: dict[str, Any] = {
@@ -138,8 +138,8 @@ class Run:
         if truth is not None:
             plain |= {"true_lat_deg": truth[0], "true_lon_deg": truth[1]}
         try:
-            shot = self._pictures.shot(result.frame)
-            plain["told"] = _told(shot.telemetry)
+            shot = self._images.shot(result.frame)
+            plain["telemetry"] = _plain(shot.telemetry)
             placed = self._placed(result, shot)
             plain["window"] = asdict(placed.window)
         except FlightError as error:
@@ -147,26 +147,26 @@ class Run:
         return plain
 
     def view_png(self, index: int) -> bytes:
-        """The view from straight above. Raises `IndexError` or `FlightError`."""
+        """The view rectified to nadir. Raises `IndexError` or `FlightError`."""
         result = self._result(index)
-        placed = self._placed(result, self._pictures.shot(result.frame))
-        return view_png(placed.shot.load(), placed.told, placed.shot.camera, placed.window)
+        placed = self._placed(result, self._images.shot(result.frame))
+        return view_png(placed.shot.load(), placed.telemetry, placed.shot.camera, placed.window)
 
     def raw_jpeg(self, index: int) -> bytes:
-        """The view as it was taken, made small. Raises `IndexError` or `FlightError`."""
-        return small_jpeg(self._pictures.shot(self._result(index).frame).load())
+        """The view as recorded, reduced. Raises `IndexError` or `FlightError`."""
+        return small_jpeg(self._images.shot(self._result(index).frame).load())
 
     def map_png(self, index: int, at: str) -> bytes:
-        """The map where a view was put, or was taken. Raises `IndexError` or `FlightError`."""
+        """The map at the fix or the true position. Raises `IndexError` or `FlightError`."""
         result = self._result(index)
         place = self._truth.get(result.frame) if at == "truth" else None
         if at == "fix" and isinstance(result.outcome, Fix):
             place = result.outcome.lat_deg, result.outcome.lon_deg
         if place is None:
-            raise FlightError(f"view {result.frame} has no such place: {at}")
-        window = self._placed(result, self._pictures.shot(result.frame)).window
-        east, north = np.asarray(self.ground.frame.en_from_latlon(*place)) + window.offset_en_m
-        return self.ground.crop_png((float(east), float(north)), window)
+            raise FlightError(f"view {result.frame} has no such position: {at}")
+        window = self._placed(result, self._images.shot(result.frame)).window
+        east, north = np.asarray(self.sheet.frame.en_from_latlon(*place)) + window.offset_en_m
+        return self.sheet.crop_png((float(east), float(north)), window)
 
     def _result(self, index: int) -> ViewResult:
         with self._lock:
@@ -175,16 +175,16 @@ class Run:
             return self._results[index]
 
     def _placed(self, result: ViewResult, shot: Shot) -> _Placed:
-        told = as_fixed(shot.telemetry, result)
-        return _Placed(shot, told, window_of(told, shot.camera, self.ground.grid.gsd_m))
+        telemetry = as_fixed(shot.telemetry, result)
+        return _Placed(shot, telemetry, window_of(telemetry, shot.camera, self.sheet.grid.gsd_m))
 
     def _refresh(self) -> None:
-        """Read what came; a file that cannot be read right now is told of and tried again."""
-        if not self.told.live:
+        """Read what is new; a file that cannot be read now is reported and tried again."""
+        if not self.labels.live:
             return
         try:
-            if isinstance(self._pictures, LogReader) and self._pictures is not self._feed:
-                self._pictures.poll()
+            if isinstance(self._images, LogReader) and self._images is not self._feed:
+                self._images.poll()
             self._take(self._feed.poll())
             self._trouble = ""
         except (OrthonavError, OSError) as error:
@@ -200,7 +200,7 @@ class Run:
             return
         self._results += batch.results
         began_ns = self._results[0].time_ns
-        made = columns_of(batch.results, began_ns, self._truth, self.ground, self._radius_m)
+        made = columns_of(batch.results, began_ns, self._truth, self.sheet, self._radius_m)
         for name, values in made.items():
             self._columns.setdefault(name, []).extend(values)
 
@@ -215,6 +215,6 @@ def _seconds(time_ns: int) -> str:
     return f"{'-' if time_ns < 0 else ''}{whole}.{rest:09d}"
 
 
-def _told(told: Telemetry) -> dict[str, float | None]:
+def _plain(telemetry: Telemetry) -> dict[str, float | None]:
     names = ("yaw_deg", "pitch_deg", "roll_deg", "agl_m")
-    return {name: _known(getattr(told, name)) for name in names}
+    return {name: _known(getattr(telemetry, name)) for name in names}

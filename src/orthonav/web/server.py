@@ -1,9 +1,8 @@
-"""The server of the page: reads only, answers only this computer unless told otherwise.
+"""The server of the page: read-only, and by default for this computer only.
 
-Without a password: it listens on the loopback, where other web sites cannot reach it. A site that
-a browser shows could try to: by a name of its own that leads here (DNS rebinding), which the check
-of the Host header refuses, or by asking for addresses here in its pages, which browsers tell in
-Sec-Fetch-Site, and answers carry no permission to be read elsewhere.
+There is no password: it listens on the loopback. A web site in the same browser could still try to
+reach it, by DNS rebinding, which the check of the Host header refuses, or by cross-site requests,
+which the check of Sec-Fetch-Site refuses; responses never allow other origins to read them.
 """
 
 import ipaddress
@@ -21,14 +20,14 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from orthonav.errors import FlightError, OrthonavError, OutputError
-from orthonav.web.assets import Asset
+from orthonav.web.assets import StaticFile
 from orthonav.web.run import AT, Run
 
 log = logging.getLogger(__name__)
 TIMEOUT_S = 60.0
-"""A connection on which nothing is said for so long is closed."""
-_KEPT = "private, max-age=86400"
-_NOT_KEPT = "no-store"
+"""An idle connection is closed after this time."""
+_CACHED = "private, max-age=86400"
+_NOT_CACHED = "no-store"
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
     "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
@@ -41,22 +40,22 @@ _HEADERS = {
 
 
 @dataclass(frozen=True)
-class Reply:
-    """An answer."""
+class Response:
+    """A response to a request."""
 
     status: HTTPStatus
     data: bytes = b""
     media_type: str = "text/plain; charset=utf-8"
-    cache: str = _NOT_KEPT
+    cache: str = _NOT_CACHED
 
 
 class Pages:
-    """From the path that is asked for to the answer. Safe to share between threads."""
+    """Routes of the server. Safe to share between threads."""
 
-    def __init__(self, run: Run, assets: dict[str, Asset]) -> None:
+    def __init__(self, run: Run, assets: dict[str, StaticFile]) -> None:
         self._run, self._assets = run, assets
         number = r"(\d{1,9})"
-        self._routes: list[tuple[re.Pattern[str], Callable[..., Reply]]] = [
+        self._routes: list[tuple[re.Pattern[str], Callable[..., Response]]] = [
             (re.compile(r"/api/run"), self._summary),
             (re.compile(r"/api/news"), self._news),
             (re.compile(rf"/api/views/{number}"), self._view),
@@ -67,89 +66,89 @@ class Pages:
             (re.compile(r"/preview\.jpg"), self._preview),
         ]
 
-    def answer(self, target: str) -> Reply:
-        """The answer to a request for `target`, a path with perhaps a query."""
+    def answer(self, target: str) -> Response:
+        """The response to a request for `target`, a path with an optional query."""
         try:
             asked = urlsplit(target)
         except ValueError:
             return _error(HTTPStatus.BAD_REQUEST, "not an address")
         asset = self._assets.get(asked.path)
         if asset is not None:
-            return Reply(HTTPStatus.OK, asset.data, asset.media_type)
+            return Response(HTTPStatus.OK, asset.data, asset.media_type)
         for pattern, made in self._routes:
             match = pattern.fullmatch(asked.path)
             if match is not None:
                 return self._made(made, match.groups(), asked.query)
-        return _error(HTTPStatus.NOT_FOUND, "there is nothing here")
+        return _error(HTTPStatus.NOT_FOUND, "not found")
 
-    def _made(self, made: Callable[..., Reply], parts: tuple[str, ...], query: str) -> Reply:
+    def _made(self, made: Callable[..., Response], parts: tuple[str, ...], query: str) -> Response:
         try:
             return made(*parts, query=query)
         except (IndexError, FlightError) as error:
             return _error(HTTPStatus.NOT_FOUND, str(error))
         except (OrthonavError, OSError) as error:
             return _error(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
-        except ValueError as error:  # a query that is none
+        except ValueError as error:  # an invalid query
             return _error(HTTPStatus.BAD_REQUEST, str(error))
 
-    def _summary(self, query: str) -> Reply:
+    def _summary(self, query: str) -> Response:
         return _json(self._run.summary())
 
-    def _news(self, query: str) -> Reply:
-        told = parse_qs(query, max_num_fields=10)
-        asked = [told.get(name, ["0"])[0] for name in ("generation", "views", "health")]
+    def _news(self, query: str) -> Response:
+        fields = parse_qs(query, max_num_fields=10)
+        asked = [fields.get(name, ["0"])[0] for name in ("generation", "views", "health")]
         if not all(re.fullmatch(r"\d{1,9}", each) for each in asked):
             return _error(HTTPStatus.BAD_REQUEST, "generation, views and health are numbers")
         return _json(self._run.news(*map(int, asked)))
 
-    def _view(self, index: str, query: str) -> Reply:
+    def _view(self, index: str, query: str) -> Response:
         return _json(self._run.detail(int(index)))
 
-    def _view_png(self, index: str, query: str) -> Reply:
-        return Reply(HTTPStatus.OK, self._run.view_png(int(index)), "image/png")
+    def _view_png(self, index: str, query: str) -> Response:
+        return Response(HTTPStatus.OK, self._run.view_png(int(index)), "image/png")
 
-    def _raw_jpeg(self, index: str, query: str) -> Reply:
-        return Reply(HTTPStatus.OK, self._run.raw_jpeg(int(index)), "image/jpeg")
+    def _raw_jpeg(self, index: str, query: str) -> Response:
+        return Response(HTTPStatus.OK, self._run.raw_jpeg(int(index)), "image/jpeg")
 
-    def _map_png(self, index: str, at: str, query: str) -> Reply:
-        return Reply(HTTPStatus.OK, self._run.map_png(int(index), at), "image/png")
+    def _map_png(self, index: str, at: str, query: str) -> Response:
+        return Response(HTTPStatus.OK, self._run.map_png(int(index), at), "image/png")
 
-    def _tile(self, level: str, col: str, row: str, query: str) -> Reply:
-        found = self._run.ground.tile(int(level), int(col), int(row))
+    def _tile(self, level: str, col: str, row: str, query: str) -> Response:
+        found = self._run.sheet.tile(int(level), int(col), int(row))
         if found is None:
-            return Reply(HTTPStatus.NO_CONTENT)
-        return Reply(HTTPStatus.OK, *found, cache=_KEPT)
+            return Response(HTTPStatus.NO_CONTENT)
+        return Response(HTTPStatus.OK, *found, cache=_CACHED)
 
-    def _preview(self, query: str) -> Reply:
-        if not self._run.ground.preview:
+    def _preview(self, query: str) -> Response:
+        if not self._run.sheet.preview:
             return _error(HTTPStatus.NOT_FOUND, "the map has tiles")
-        return Reply(HTTPStatus.OK, self._run.ground.preview, "image/jpeg", _KEPT)
+        return Response(HTTPStatus.OK, self._run.sheet.preview, "image/jpeg", _CACHED)
 
 
-def _json(plain: Any) -> Reply:
+def _json(plain: Any) -> Response:
     data = json.dumps(plain, allow_nan=False, separators=(",", ":")).encode("ascii")
-    return Reply(HTTPStatus.OK, data, "application/json")
+    return Response(HTTPStatus.OK, data, "application/json")
 
 
-def _error(status: HTTPStatus, said: str) -> Reply:
-    return Reply(status, (" ".join(said.split()) + "\n").encode("utf-8", "replace"))
+def _error(status: HTTPStatus, said: str) -> Response:
+    return Response(status, (" ".join(said.split()) + "\n").encode("utf-8", "replace"))
 
 
 class Server(ThreadingHTTPServer):
-    """Listens from the moment it is made; `serve_forever` answers."""
+    """Listens as soon as it is created; `serve_forever` responds."""
 
     daemon_threads = True
     block_on_close = False
     allow_reuse_address = True
 
     def __init__(self, pages: Pages, host: str = "127.0.0.1", port: int = 0) -> None:
-        """Port 0 is any that is free. Raises `OutputError` where it cannot be had."""
+        """Port 0 is any free port. Raises `OutputError` where it cannot listen."""
         try:
             address = ipaddress.ip_address(host)
             self.address_family = socket.AF_INET6 if address.version == 6 else socket.AF_INET
         except ValueError:
             pass  # a name
-        self.host_told = host.casefold()
+        self.host_name = host.casefold()
         try:
             super().__init__((host, port), partial(Handler, pages))
         except (OSError, OverflowError, UnicodeError) as error:
@@ -158,7 +157,7 @@ class Server(ThreadingHTTPServer):
         self.only_loopback = self._address.is_loopback
 
     def server_bind(self) -> None:
-        """Without the library's look-up of our own name, which may ask the network."""
+        """Bind without the library's look-up of the host name, which may use the network."""
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), self.port
 
@@ -168,22 +167,22 @@ class Server(ThreadingHTTPServer):
 
     @property
     def port(self) -> int:
-        """The port that is listened on."""
+        """The port of the server."""
         return int(self.server_address[1])
 
     def url(self) -> str:
-        """The address that a browser on this computer asks for, or others where all may."""
+        """The URL for a browser on this computer, or for others if the server is public."""
         address = self._address
         host = _own_address(address.version) if address.is_unspecified else str(address)
         return f"http://[{host}]:{self.port}/" if ":" in host else f"http://{host}:{self.port}/"
 
     def allows(self, host: str) -> bool:
-        """Whether a request may name this host: addresses and `localhost`, no names of strangers.
+        """Whether a request may name this host: addresses and `localhost`, no other names.
 
-        Listening on the loopback, only its addresses. Any port, for tunnels change it.
+        On the loopback only its addresses are allowed. Any port, because tunnels change it.
         """
         name = _host_name(host)
-        if name in ("localhost", self.host_told):
+        if name in ("localhost", self.host_name):
             return True
         try:
             address = ipaddress.ip_address(name)
@@ -192,12 +191,12 @@ class Server(ThreadingHTTPServer):
         return address.is_loopback or not self.only_loopback
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Connections that end early are usual; the rest is for people who debug."""
+        """Log errors for debugging; connections often end early."""
         log.debug("request of %s", client_address, exc_info=True)
 
 
 def _own_address(version: int) -> str:
-    """The address of this computer in its network, or the loopback where it is in none.
+    """The address of this computer in its network, or the loopback without one.
 
     Nothing is sent: connecting a datagram socket only looks up the route.
     """
@@ -232,29 +231,29 @@ class Handler(BaseHTTPRequestHandler):
         super().__init__(*arguments)
 
     def do_GET(self) -> None:
-        """Answer."""
+        """Respond to a request."""
         self._send(self._refused() or self._pages.answer(self.path))
 
     do_HEAD = do_GET  # noqa: N815
 
-    def _refused(self) -> Reply | None:
-        """Why this request is not answered; None if it is."""
+    def _refused(self) -> Response | None:
+        """The response that refuses a request; None if it is allowed."""
         hosts = self.headers.get_all("Host", [])
         if len(hosts) != 1 or not self.server.allows(hosts[0]):
-            return _error(HTTPStatus.MISDIRECTED_REQUEST, "this host name is not served here")
+            return _error(HTTPStatus.MISDIRECTED_REQUEST, "this host name is not served")
         site = self.headers.get("Sec-Fetch-Site", "none")
         if site not in ("none", "same-origin") and self.path != "/":
-            return _error(HTTPStatus.FORBIDDEN, "not for pages of other sites")
+            return _error(HTTPStatus.FORBIDDEN, "cross-site requests are refused")
         return None
 
     def _only_reads(self) -> None:
-        self.close_connection = True  # what else it sent is not read
-        reply = self._refused() or _error(HTTPStatus.METHOD_NOT_ALLOWED, "this server only reads")
+        self.close_connection = True  # the body is not read
+        reply = self._refused() or _error(HTTPStatus.METHOD_NOT_ALLOWED, "this server is read-only")
         self._send(reply)
 
     do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = _only_reads  # noqa: N815
 
-    def _send(self, reply: Reply) -> None:
+    def _send(self, reply: Response) -> None:
         self.send_response(reply.status)
         for name, value in _HEADERS.items():
             self.send_header(name, value)
@@ -269,5 +268,5 @@ class Handler(BaseHTTPRequestHandler):
             self.wfile.write(reply.data)
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Requests are told to those who debug."""
+        """Log requests for debugging."""
         log.debug(format, *arguments)

@@ -1,8 +1,4 @@
-"""What a check leaves behind: a page, JSON, a raster, shapes for a map viewer, figures, text.
-
-`write_check` writes the folder, `require_free` says before the work is done whether it can;
-`verdict_text` makes what a terminal shows.
-"""
+"""Writes a check: a page, JSON, a GeoTIFF, GeoJSON and figures; and as text for a terminal."""
 
 from orthonav.check.write.folder import require_free, write_check
 from orthonav.check.write.plain import to_json

@@ -1,16 +1,16 @@
-"""What is drawn of a check: map, course along the route, envelope of errors."""
+"""Figures of a check: map, profile along the route, envelope of errors."""
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.check.outcome import Along, CheckResult, Envelope, Stretch
-from orthonav.check.write.ground import Box, Ground, seen_box
-from orthonav.check.write.risk import ALL_RISKS, pieces
-from orthonav.check.write.said import fine_said, share_text
+from orthonav.check.outcome import Along, BlindStretch, CheckResult, Envelope
+from orthonav.check.write.imagery import Box, MapImage, visible_box
+from orthonav.check.write.risk import RISKS, segments
 from orthonav.check.write.shapes import stretch_en_m
-from orthonav.check.write.summary import interval_along, summarize
+from orthonav.check.write.summary import summarize
+from orthonav.check.write.wording import share_text, tolerance_sentence
 from orthonav.records import CONFIDENT
 from orthonav.report import Figure, draw_axes, draw_figure, draw_map, map_size_in
 from orthonav.report.canvas import BACKING, GREY, INK, OFFSET, RIGHT, SOFT, WRONG
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 FIGURE_NAMES = ("map", "profile", "envelope")
-MOST_LOOKALIKES = 20
-"""On map and page, the likeliest; the files hold all."""
+MAX_LOOKALIKES = 20
+"""Shown on map and page, the most similar ones; the files hold all."""
 _BACKGROUND_PX = 900
 _STEPS = 10
 _NUMBERED = 0.01
-"""Stretches of this share of the route get a number in the profile, and those that lose it."""
+"""Recoverable stretches shorter than this share of the route get no number in the profile."""
 _LEGEND: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "frameon": False}
 
 
-def figures(result: CheckResult, ground: Ground) -> list[Figure]:
+def figures(result: CheckResult, image: MapImage) -> list[Figure]:
     """The figures of a check, in the order in which the page shows them."""
-    found = [_map(result, ground)]
+    found = [_map(result, image)]
     if result.along is not None and len(result.along.distance_m) > 1:
         found.append(_profile(result, result.along))
     if result.envelope is not None and result.envelope.share.size:
@@ -40,24 +40,24 @@ def figures(result: CheckResult, ground: Ground) -> list[Figure]:
     return found
 
 
-def _map(result: CheckResult, ground: Ground) -> Figure:
-    west, south, east, north = box = seen_box(result)
-    seen = west, east, south, north
+def _map(result: CheckResult, image: MapImage) -> Figure:
+    west, south, east, north = box = visible_box(result)
+    visible = west, east, south, north
 
     def draw(axes: "Axes") -> None:
-        draw_map(axes, seen, ground.background(_BACKGROUND_PX))
+        draw_map(axes, visible, image.background(_BACKGROUND_PX))
         _draw_cells(axes, result)
         if result.along is not None:
             _draw_route(axes, result, result.along)
         _draw_lookalikes(axes, result)
-        axes.set(xlim=seen[:2], ylim=seen[2:])
+        axes.set(xlim=visible[:2], ylim=visible[2:])
 
     return Figure(
         "map",
-        f"Map of the probability of a fix, {share_text(result.mean)} on average over "
+        f"Map of the probability of a fix, mean {share_text(result.mean)} over "
         f"{result.area_km2:.2f} square kilometres; {len(result.stretches)} blind stretches",
-        "Probability that one view is placed, confidently and correctly; white where nothing is "
-        "known. " + _marks_said(result),
+        "Probability of a correct, confident fix of one view; white where unknown. "
+        + _marks_text(result),
         draw_axes(_map_size(box), draw),
     )
 
@@ -68,13 +68,13 @@ def _map_size(box: Box) -> tuple[float, float]:
     return width + 1.0, height
 
 
-def _marks_said(result: CheckResult) -> str:
-    said = []
+def _marks_text(result: CheckResult) -> str:
+    marks = []
     if result.stretches:
-        said.append("Black with a number: blind stretches.")
+        marks.append("Black with a number: blind stretches.")
     if result.lookalikes:
-        said.append("Dotted: places that look like one another.")
-    return " ".join(said)
+        marks.append("Dotted: lookalikes.")
+    return " ".join(marks)
 
 
 def _draw_cells(axes: "Axes", result: CheckResult) -> None:
@@ -101,16 +101,16 @@ def _draw_cells(axes: "Axes", result: CheckResult) -> None:
 
 
 def _draw_route(axes: "Axes", result: CheckResult, along: Along) -> None:
-    """The way in classes of risk, with its waypoints; blind stretches in black, with numbers."""
+    """The route in classes of risk; blind stretches in black, with numbers."""
     points = along.points_en_m
     axes.plot(*points.T, color="white", linewidth=4.5, zorder=3, solid_capstyle="round")
-    drawn = pieces(along.probability)
-    for number, risk in enumerate(ALL_RISKS):
+    drawn = segments(along.probability)
+    for number, risk in enumerate(RISKS):
         style: Any = (0, [each / risk.width for each in risk.dash]) if risk.dash else "-"
         looks = {"color": risk.colour, "linewidth": 0.5 * risk.width, "linestyle": style}
         found = [points[first : last + 1] for kind, first, last in drawn if kind == number]
         for i, line in enumerate(found):
-            axes.plot(*line.T, **looks, label="" if i else risk.said, zorder=4)
+            axes.plot(*line.T, **looks, label="" if i else risk.range_text, zorder=4)
     for number, each in enumerate(result.stretches, start=1):
         line = stretch_en_m(along, each.start_m, each.end_m)
         if len(line) > 1:
@@ -123,7 +123,7 @@ def _draw_route(axes: "Axes", result: CheckResult, along: Along) -> None:
 
 
 def _draw_lookalikes(axes: "Axes", result: CheckResult) -> None:
-    for each in result.lookalikes[:MOST_LOOKALIKES]:
+    for each in result.lookalikes[:MAX_LOOKALIKES]:
         ends = [
             result.frame.en_from_latlon(*each.place_latlon_deg),
             result.frame.en_from_latlon(*each.other_latlon_deg),
@@ -138,7 +138,7 @@ def _profile(result: CheckResult, along: Along) -> Figure:
         f"Probability and expected drift along the route; {share_text(summary.confident_share)} of "
         f"it at {CONFIDENT:g} or more, {len(result.stretches)} blind stretches",
         "Probability along the route with its 80 % interval and the lowest across the band; below, "
-        "how far the position may be off (one standard deviation). Shaded: blind stretches.",
+        "the expected position error (one standard deviation). Shaded: blind stretches.",
         draw_figure((10.0, 5.0), lambda figure: _draw_profile(figure, result, along)),
     )
 
@@ -146,8 +146,9 @@ def _profile(result: CheckResult, along: Along) -> Figure:
 def _draw_profile(figure: "mpl.Figure", result: CheckResult, along: Along) -> None:
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     x = along.distance_m / 1000
-    low, high = interval_along(result, along)
-    above.fill_between(x, low, high, color=RIGHT, alpha=0.18, linewidth=0, label="80 % interval")
+    above.fill_between(
+        x, along.low, along.high, color=RIGHT, alpha=0.18, linewidth=0, label="80 % interval"
+    )
     above.plot(x, along.across_low, color=SOFT, linewidth=0.9, label="lowest across the band")
     above.plot(x, along.probability, color=RIGHT, linewidth=1.6, label="probability")
     above.axhline(CONFIDENT, color=GREY, linestyle=(0, (4, 3)), linewidth=1)
@@ -155,23 +156,22 @@ def _draw_profile(figure: "mpl.Figure", result: CheckResult, along: Along) -> No
     above.legend(ncols=3, loc="lower right")
     below.plot(x, along.drift_m, color=WRONG, linewidth=1.6, label="position")
     below.plot(x, along.error_m, color=SOFT, linewidth=1.0, linestyle="--", label="one fix")
-    below.set(xlabel="distance (km)", ylabel="off by (m)", xlim=(x[0], max(x[-1], x[0] + 1e-6)))
+    below.set(xlabel="distance (km)", ylabel="error (m)", xlim=(x[0], max(x[-1], x[0] + 1e-6)))
     below.set_ylim(bottom=0)
     below.legend(ncols=2, loc="upper right")
     for number, each in enumerate(result.stretches, start=1):
         _shade(above, below, number, each)
-    # A kilometre takes so many minutes; the axis above says when.
     minutes = 1000 / result.conditions.speed_mps / 60
     times = above.secondary_xaxis("top", functions=(lambda km: km * minutes, lambda t: t / minutes))
     times.set_xlabel("minutes")
 
 
-def _shade(above: "Axes", below: "Axes", number: int, stretch: Stretch) -> None:
+def _shade(above: "Axes", below: "Axes", number: int, stretch: BlindStretch) -> None:
     for axes in (above, below):
-        colour = GREY if stretch.bearable else WRONG
+        colour = GREY if stretch.recoverable else WRONG
         axes.axvspan(stretch.start_m / 1000, stretch.end_m / 1000, color=colour, alpha=0.25, lw=0)
     at = (stretch.start_m + stretch.end_m) / 2000
-    if stretch.bearable and stretch.length_m < _NUMBERED * 1000 * above.get_xlim()[1]:
+    if stretch.recoverable and stretch.length_m < _NUMBERED * 1000 * above.get_xlim()[1]:
         return  # no room for its number
     above.annotate(str(number), (at, 0.03), (0, 0), **OFFSET, ha="center", bbox=BACKING)
 
@@ -193,11 +193,11 @@ def _envelope(envelope: Envelope) -> Figure:
             for j in range(cols):
                 share = envelope.share[i, j]
                 colour = "white" if share < 0.55 else "black"
-                said = f"{100 * share:.0f}" if np.isfinite(share) else "-"
-                axes.text(j, i, said, ha="center", va="center", color=colour, fontsize=9)
+                text = f"{100 * share:.0f}" if np.isfinite(share) else "-"
+                axes.text(j, i, text, ha="center", va="center", color=colour, fontsize=9)
         axes.set_xticks(range(cols), [f"{100 * value:+.3g}" for value in envelope.agl_off])
         axes.set_yticks(range(rows), [f"{value:+.3g}" for value in envelope.yaw_off_deg])
-        axes.set(xlabel="error of the told height (%)", ylabel="error of the told heading (deg)")
+        axes.set(xlabel="error of reported height (%)", ylabel="error of reported heading (deg)")
         axes.grid(visible=False)
         assert axes.figure is not None
         axes.figure.colorbar(shown, ax=axes, label="share of correct, confident fixes")
@@ -205,9 +205,8 @@ def _envelope(envelope: Envelope) -> Figure:
     size = (min(10.0, max(5.6, 2.2 + 0.62 * cols)), min(8.0, max(3.4, 1.2 + 0.42 * rows)))
     return Figure(
         "envelope",
-        "Share of correct, confident fixes over errors of told heading and height. "
-        + fine_said(envelope),
-        "Share of correct, confident fixes in percent, where told heading and height are wrong by "
-        "so much.",
+        "Share of correct, confident fixes over errors of reported heading and height. "
+        + tolerance_sentence(envelope),
+        "Share of correct, confident fixes (%) over errors of reported heading and height.",
         draw_axes(size, draw),
     )

@@ -1,90 +1,74 @@
-"""The folder of a check: all of it or nothing, in place of an earlier check, never of others."""
+"""The folder of a check: written whole or not at all; it replaces only an earlier check."""
 
 import json
 from pathlib import Path
 
 from orthonav.check.outcome import CheckResult
 from orthonav.check.write.figures import FIGURE_NAMES, figures
-from orthonav.check.write.geopackage import write_geopackage
-from orthonav.check.write.ground import ground_below, seen_box
-from orthonav.check.write.leaflet import load_leaflet
-from orthonav.check.write.page import render
+from orthonav.check.write.imagery import map_image, visible_box
+from orthonav.check.write.page import page_of
 from orthonav.check.write.plain import is_check, to_json
 from orthonav.check.write.raster import tif_bytes
-from orthonav.check.write.shapes import layers
-from orthonav.check.write.styles import raster_style
-from orthonav.errors import MissingExtraError, OutputError
+from orthonav.check.write.shapes import to_geojson
+from orthonav.errors import OutputError
+from orthonav.extras import needed
 from orthonav.files import replacing, replacing_folder, write_text
 from orthonav.mapfile.reader import MapFile
 from orthonav.report import write_figures
 from orthonav.report.figures import FOLDER, LIST
+from orthonav.report.leaflet import load_leaflet
 
-PAGE, JSON, TIF, GPKG, STYLE = "index.html", "check.json", "check.tif", "check.gpkg", "check.qml"
-_OPENED = ("check.tif.aux.xml", "check.gpkg-wal", "check.gpkg-shm", "check.gpkg-journal")
-"""What GIS programs leave beside files that they open."""
+PAGE, JSON, TIF, GEOJSON = "index.html", "check.json", "check.tif", "check.geojson"
+_SIDECAR = "check.tif.aux.xml"
+"""Written by GIS programs that open the raster."""
 _OURS = {
-    *(PAGE, JSON, TIF, GPKG, STYLE, FOLDER, *_OPENED),
+    *(PAGE, JSON, TIF, GEOJSON, _SIDECAR, FOLDER, f"{FOLDER}/{LIST}"),
     *(f"{FOLDER}/{name}.{kind}" for name in FIGURE_NAMES for kind in ("svg", "png")),
-    f"{FOLDER}/{LIST}",
 }
+_EXTRAS = {"rasterio": "geo", "shapely": "geo", "matplotlib": "report", "jinja2": "report"}
 
 
 def write_check(result: CheckResult, opened: MapFile, out: Path) -> Path:
-    """Write the page, `check.json`, `check.tif`, `check.gpkg` and figures; return the page's path.
+    """Write page, JSON, GeoTIFF, GeoJSON and figures into the folder `out`; return the page's path.
 
-    `opened` is the map that was checked, whose imagery the page shows. The folder `out` appears
-    whole or not at all; that of an earlier check is replaced. Raises `OutputError` where it holds
-    anything else or cannot be written, `MissingExtraError` without the extras geo, report and web.
+    `opened` is the checked map, whose imagery the page shows. The folder appears whole or not at
+    all; that of an earlier check is replaced. Raises `OutputError` where it holds other files or
+    cannot be written, `MissingExtraError` without the extras geo, report and web.
     """
     out = Path(out)
     require_free(out)
     leaflet = load_leaflet()
-    ground = ground_below(opened, seen_box(result))
-    drawn = figures(result, ground)
-    page = render(result, ground, drawn, leaflet)
+    image = map_image(opened, visible_box(result))
+    drawn = figures(result, image)
+    page = page_of(result, image, drawn, leaflet)
     with replacing_folder(out, is_ours=lambda folder: _foreign(folder) is None) as folder:
-        write_text(folder / JSON, _writable(to_json(result)))
+        for name, text in ((JSON, to_json(result)), (GEOJSON, to_geojson(result)), (PAGE, page)):
+            write_text(folder / name, _writable(text))
         with replacing(folder / TIF) as temporary:
             temporary.write_bytes(tif_bytes(result))
-        write_text(folder / STYLE, raster_style())
-        with replacing(folder / GPKG) as temporary:
-            temporary.unlink()  # GDAL wants to make it
-            write_geopackage(temporary, layers(result))
         write_figures(folder, drawn)
-        write_text(folder / PAGE, _writable(page))
     return out / PAGE
 
 
 def require_free(out: Path) -> None:
-    """Raise what `write_check` would raise of the folder and of what is installed, beforehand."""
+    """Raise what `write_check` would raise about the folder and missing extras, before any work."""
     out = Path(out)
     if out.is_dir():
         foreign = _foreign(out)
         if foreign is not None:
             raise OutputError(
-                f"output folder holds something that no check wrote ({foreign}); move it away or "
+                f"output folder holds a file that no check wrote ({foreign}); move it away or "
                 f"name another folder: {out}"
             )
     elif out.exists() or out.is_symlink():
         raise OutputError(f"output folder is a file: {out}")
     load_leaflet()
-    for module in ("rasterio", "shapely", "pyogrio"):
-        _require(module, "geo")
-    _require("matplotlib", "report")
-
-
-def _require(module: str, extra: str) -> None:
-    try:
-        __import__(module)
-    except ImportError as error:
-        raise MissingExtraError(
-            f"writing a check needs {module}, which is not installed: pip install "
-            f"'orthonav[{extra}]'"
-        ) from error
+    for module, extra in _EXTRAS.items():
+        needed(module, extra, "writing a check")
 
 
 def _foreign(folder: Path) -> str | None:
-    """A file of a folder that is not of a check; None where all are, or there is none."""
+    """A file of a folder that is not part of a check; None for a check or an empty folder."""
     try:
         found = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
         odd = next((name for name in found if name not in _OURS), None)
@@ -93,7 +77,7 @@ def _foreign(folder: Path) -> str | None:
         links = (name for name in found if (folder / name).is_symlink())
         return next(links, None) or (None if _is_check(folder / JSON) else found[0])
     except OSError as error:
-        raise OutputError(f"cannot look into ({error.strerror or error}): {folder}") from error
+        raise OutputError(f"cannot read folder ({error.strerror or error}): {folder}") from error
 
 
 def _is_check(path: Path) -> bool:
@@ -104,5 +88,5 @@ def _is_check(path: Path) -> bool:
 
 
 def _writable(text: str) -> str:
-    """Text without what no file can hold: halves of characters, from names that are not UTF-8."""
+    """Text without lone surrogates, which come from file names that are not UTF-8."""
     return text.encode("utf-8", "replace").decode("utf-8")

@@ -2,57 +2,55 @@
 
 import textwrap
 
-from orthonav.check.outcome import CheckResult, Stretch
-from orthonav.check.write.said import (
-    better_said,
+from orthonav.check.outcome import BlindStretch, CheckResult
+from orthonav.check.write.summary import summarize
+from orthonav.check.write.wording import (
+    better_sentence,
     metres_text,
     outcome_text,
     place_text,
     seconds_text,
     share_text,
-    verdict_said,
+    verdict_sentence,
 )
-from orthonav.check.write.summary import summarize
 from orthonav.records import CONFIDENT
 
-MOST_STRETCHES = 8
-_MOST_REASONS = 5
+MAX_STRETCHES = 8
+_MAX_REASONS = 5
 _WIDTH = 100
 
 
 def text(result: CheckResult) -> str:
-    """Verdict, reasons, a few figures and the blind stretches, in at most some 25 lines.
+    """Verdict, reasons, key figures and blind stretches, in about 25 lines at most.
 
-    Ends without a line break. Control characters of names are not passed on.
+    Control characters in names are replaced.
     """
-    lines = [f"{result.verdict.word.value.upper()}: {verdict_said(result)}"]
+    lines = [f"{result.verdict.word.value.upper()}: {verdict_sentence(result)}"]
     lines += _reasons(result)
     lines += ["", *_rows(_figures(result))]
     lines += _stretches(result)
-    said = [better_said(result.alternatives, what) for what in ("agl_m", "band_m")]
-    found = [sentence for sentence in said if sentence.startswith("A ")]
-    lines += ["", *found] if found else []
+    sentences = [better_sentence(result.alternatives, what) for what in ("agl_m", "band_m")]
+    better = [sentence for sentence in sentences if sentence.startswith("A ")]
+    lines += ["", *better] if better else []
     return "\n".join("".join(c if c.isprintable() else "\ufffd" for c in line) for line in lines)
 
 
 def _reasons(result: CheckResult) -> list[str]:
     reasons = result.verdict.reasons
     lines = []
-    for each in reasons[:_MOST_REASONS]:
-        said = " ".join(each.text.split())
-        wrapped = textwrap.wrap(said, _WIDTH - 4, max_lines=2) or [""]
+    for each in reasons[:_MAX_REASONS]:
+        wrapped = textwrap.wrap(" ".join(each.text.split()), _WIDTH - 4, max_lines=2) or [""]
         lines += [f"  - {wrapped[0]}", *(f"    {rest}" for rest in wrapped[1:])]
-    more = len(reasons) - _MOST_REASONS
+    more = len(reasons) - _MAX_REASONS
     return [*lines, f"  - and {more} more"] if more > 0 else lines
 
 
 def _figures(result: CheckResult) -> list[tuple[str, str]]:
     summary, conditions = summarize(result), result.conditions
-    own = "the map's own ground, changed as years change it"
-    dates = "another date too" if result.second_date else own
+    dates = "also of a second date" if result.second_date else "simulated ageing"
     rows = [
         ("map", result.about.map_name),
-        ("area", f"{result.area_km2:.2f} km2, probability {share_text(result.mean)} on average"),
+        ("area", f"{result.area_km2:.2f} km2, mean probability {share_text(result.mean)}"),
         ("views", f"{conditions.width_m:.0f} x {conditions.height_m:.0f} m on the ground, {dates}"),
     ]
     if result.along is not None:
@@ -63,7 +61,7 @@ def _figures(result: CheckResult) -> list[tuple[str, str]]:
                 f"{share_text(summary.confident_share)} of it at {CONFIDENT:g} or more",
             )
         ]
-    rows.append(("error", f"{metres_text(summary.error_m)} expected of a correct fix"))
+    rows.append(("error", f"{metres_text(summary.error_m)} expected for a correct fix"))
     if result.lookalikes:
         near = sum(each.within_prior for each in result.lookalikes)
         rows.append(("lookalikes", f"{len(result.lookalikes)} pairs, {near} within the prior"))
@@ -74,10 +72,10 @@ def _stretches(result: CheckResult) -> list[str]:
     if result.along is None:
         return []
     if not result.stretches:
-        return ["", "no blind stretch"]
-    worst = sorted(result.stretches, key=_badness)[:MOST_STRETCHES]
+        return ["", "no blind stretches"]
+    worst = sorted(result.stretches, key=_badness)[:MAX_STRETCHES]
     rows: list[tuple[str, ...]] = [
-        ("#", "from", "to", "long", "lasts", "prob.", "drift", "allowed", "")
+        ("#", "from", "to", "length", "duration", "prob.", "drift", "allowed", "")
     ]
     for number, each in enumerate(result.stretches, start=1):
         if each in worst:
@@ -97,18 +95,18 @@ def _stretches(result: CheckResult) -> list[str]:
     return ["", head, *_columns(rows)]
 
 
-def _badness(stretch: Stretch) -> tuple[bool, float]:
-    """Worst first."""
-    return stretch.bearable, -stretch.length_m
+def _badness(stretch: BlindStretch) -> tuple[bool, float]:
+    """Sort key: worst first."""
+    return stretch.recoverable, -stretch.length_m
 
 
 def _rows(rows: list[tuple[str, str]]) -> list[str]:
     width = max(len(name) for name, _ in rows)
-    return [f"{name:<{width}}  {said}" for name, said in rows]
+    return [f"{name:<{width}}  {value}" for name, value in rows]
 
 
 def _columns(rows: list[tuple[str, ...]]) -> list[str]:
-    """Numbers to the right, the last column to the left."""
+    """Aligned columns: right, the last one left."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(

@@ -75,7 +75,7 @@ def _bands_m(
 
 
 def _column(names: dict[str, Any], aliases: tuple[str, ...]) -> Any:
-    """The header's own spelling of the first alias it has, None where it has none."""
+    """The spelling in the header of the first alias found, None if there is none."""
     return next((names[alias] for alias in aliases if alias in names), None)
 
 

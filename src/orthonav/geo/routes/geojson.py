@@ -20,7 +20,7 @@ def read_geojson(data: bytes) -> list[Route]:
 
 
 def routes_of(plain: dict[str, Any]) -> list[Route]:
-    """All lines of a GeoJSON object, in order. Raises `RouteError` where there is none."""
+    """All lines of a GeoJSON object, in order. Raises `RouteError` if there is none."""
     found, others = [], set()
     for geometry, properties in _geometries(plain):
         kind = geometry.get("type")
@@ -102,7 +102,7 @@ def _bands_m(band: Any, legs: int) -> tuple[float | None, ...]:
 
 
 def _position(point: Any) -> tuple[float, float, float | None]:
-    """Latitude, longitude and height of a position, which must be numbers: `"12"` is not 1, 2."""
+    """Latitude, longitude and height of a position; only numbers are accepted, not `"12"`."""
     numbers = isinstance(point, list) and all(type(value) in (int, float) for value in point[:3])
     if not numbers or len(point) < 2:
         raise RouteError(
@@ -112,7 +112,7 @@ def _position(point: Any) -> tuple[float, float, float | None]:
 
 
 def _geometries(node: Any) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """Geometries of a GeoJSON object and the properties that are theirs, without recursion."""
+    """Geometries of a GeoJSON object with their properties, without recursion."""
     stack: list[tuple[Any, dict[str, Any]]] = [(node, {})]
     while stack:
         item, properties = stack.pop()

@@ -24,7 +24,7 @@ def read_gpx(data: bytes) -> list[Route]:
         waypoints = len(root.findall("wpt"))
         held = f"only {waypoints} waypoints (wpt) without an order" if waypoints else "nothing else"
         raise RouteError(f"GPX holds no route (rte) and no track (trk); it holds {held}")
-    # What is planned comes before what was once flown.
+    # Planned routes take precedence over recorded tracks.
     return [route for route in routes if route is not None] or found
 
 

@@ -16,7 +16,7 @@ from orthonav.geo.routes.values import parsed
 MAX_KML_BYTES = 50_000_000
 MAX_MEMBERS = 10_000
 _HEIGHT_FRAMES: dict[str, HeightFrame] = {"absolute": "amsl", "relativeToGround": "agl"}
-"""Other altitude modes, and none at all, say that the altitude is to be ignored."""
+"""With other altitude modes, or none, the altitude is ignored, as KML specifies."""
 _POINTLESS = ("Point", "Polygon", "LinearRing", "Model")
 _END = struct.Struct("<4s4H2LH")
 _Place = tuple[float, float, Height | None]
@@ -37,7 +37,7 @@ def read_kmz(data: bytes) -> list[Route]:
             with archive.open(chosen[0]) as member:
                 text = member.read(MAX_KML_BYTES + 1)
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError) as error:
-        raise RouteError(f"KMZ is no whole zip archive ({error})") from error
+        raise RouteError(f"KMZ is not a complete zip archive ({error})") from error
     except (NotImplementedError, RuntimeError, ValueError) as error:  # encrypted, odd compression
         if isinstance(error, RouteError):
             raise
@@ -75,7 +75,7 @@ def _routes(mark: Element) -> list[Route]:
 
 
 def _line(element: Element) -> Iterator[_Place]:
-    """Positions of `lon,lat[,alt]` tuples between spaces; spaces after commas are forgiven."""
+    """Positions of `lon,lat[,alt]` tuples separated by spaces; spaces after commas are accepted."""
     frame = _HEIGHT_FRAMES.get(text_of(element, "altitudeMode") or "")
     text = re.sub(r"\s*,\s*", ",", text_of(element, "coordinates") or "")
     for position in text.split():
@@ -99,10 +99,10 @@ def _place(values: list[str], frame: HeightFrame | None, text: str) -> _Place:
 
 
 def _check_archive(data: bytes) -> None:
-    """Refuse archives with so many members that their list alone would fill memory."""
+    """Refuse archives with so many members that their list alone would exhaust memory."""
     at = data.rfind(b"PK\x05\x06")
     if at < 0 or len(data) - at < _END.size:
-        raise RouteError("KMZ is no whole zip archive (its end is missing)")
+        raise RouteError("KMZ is not a complete zip archive (its end is missing)")
     members = _END.unpack_from(data, at)[4]
     if members > MAX_MEMBERS or data[max(0, at - 20) : at].startswith(b"PK\x06\x07"):
         raise RouteError(f"KMZ has more than {MAX_MEMBERS:,} members")

@@ -1,4 +1,4 @@
-"""What MAVLink missions have in common, whatever file holds them.
+"""MAVLink missions, independent of their file format.
 
 Commands and frames: MAV_CMD and MAV_FRAME of MAVLink's common.xml.
 """
@@ -14,8 +14,8 @@ WAYPOINT, RETURN_HOME, LAND, TAKEOFF, VTOL_TAKEOFF, VTOL_LAND = 16, 20, 21, 22, 
 _LOITERS = (17, 18, 19, 31)
 _ARC, _SPLINE, _PLACE = 36, 82, 94
 FLOWN = {WAYPOINT, LAND, TAKEOFF, VTOL_TAKEOFF, VTOL_LAND, *_LOITERS, _ARC, _SPLINE, _PLACE}
-"""Commands with a place that the aircraft flies to; all others (cameras, regions of interest,
-speeds, jumps, conditions, landing markers) say nothing of the way."""
+"""Commands with a position that the aircraft flies to. All others (cameras, regions of interest,
+speeds, jumps, conditions, landing markers) do not change the route."""
 _HEIGHT_FRAMES: dict[int, HeightFrame] = {
     0: "amsl",
     5: "amsl",
@@ -27,11 +27,12 @@ _HEIGHT_FRAMES: dict[int, HeightFrame] = {
 
 
 @dataclass(frozen=True)
-class Item:
-    """A mission item: `command` with its place in degrees, None where it has none.
+class MissionItem:
+    """A mission item.
 
-    `height_m` is above what `frame` (MAV_FRAME) says. Items of one `pattern` (a survey, a corridor)
-    are flown as a whole, and `band_m` is the search band between them.
+    `command`: MAV_CMD. `frame`: MAV_FRAME, the reference of `height_m`. `lat_deg`, `lon_deg`:
+    position, None if it has none. `pattern`: number shared by all items of one survey or corridor,
+    which is flown as a whole. `band_m`: search band between items of one pattern.
     """
 
     command: int
@@ -45,7 +46,7 @@ class Item:
 
 @dataclass(frozen=True)
 class Home:
-    """The planned take-off place, and its height above mean sea level."""
+    """The planned take-off position, and its height above mean sea level."""
 
     lat_deg: float
     lon_deg: float
@@ -53,7 +54,7 @@ class Home:
 
 
 def height_frame(frame: int) -> HeightFrame:
-    """Above what the heights of a MAV_FRAME are. Raises `RouteError` on frames without a globe."""
+    """Height reference of a MAV_FRAME. Raises `RouteError` for frames that are not global."""
     if frame not in _HEIGHT_FRAMES:
         raise RouteError(
             f"mission has a waypoint in MAV_FRAME {frame}; expected a global one "
@@ -62,14 +63,14 @@ def height_frame(frame: int) -> HeightFrame:
     return _HEIGHT_FRAMES[frame]
 
 
-def route_of(items: Iterable[Item], home: Home | None) -> Route:
-    """The route of a mission. Raises `RouteError` where no item has a place.
+def route_of(items: Iterable[MissionItem], home: Home | None) -> Route:
+    """The route of a mission. Raises `RouteError` if no item has a position.
 
-    As autopilots do: a place of 0, 0 or none is "where you are"; so a take-off without a place is
-    at home. A return to launch ends the route at home; what follows it is not flown. Jumps are not
-    followed, circles are their middle.
+    As in autopilots, a position of 0, 0 or none means the current position, so a take-off without
+    a position is at home. A return to launch ends the route at home; later items are ignored. Jumps
+    are not followed; a circle is replaced by its centre.
     """
-    stops: list[Item] = []
+    stops: list[MissionItem] = []
     for item in items:
         if item.command == RETURN_HOME:
             if home is not None:
@@ -83,7 +84,7 @@ def route_of(items: Iterable[Item], home: Home | None) -> Route:
         elif item.command in (TAKEOFF, VTOL_TAKEOFF) and home is not None:
             stops.append(_at_home(home))
     if not stops:
-        raise RouteError("mission holds no waypoint with a place")
+        raise RouteError("mission holds no waypoint with a position")
     heights = tuple(_height(stop) for stop in stops)
     bands = tuple(
         start.band_m if start.pattern is not None and start.pattern == end.pattern else None
@@ -97,17 +98,17 @@ def route_of(items: Iterable[Item], home: Home | None) -> Route:
     )
 
 
-def _at_home(home: Home) -> Item:
-    return Item(WAYPOINT, 0, home.lat_deg, home.lon_deg)
+def _at_home(home: Home) -> MissionItem:
+    return MissionItem(WAYPOINT, 0, home.lat_deg, home.lon_deg)
 
 
-def _has_place(item: Item) -> bool:
+def _has_place(item: MissionItem) -> bool:
     if item.lat_deg is None or item.lon_deg is None:
         return False
     return item.lat_deg != 0 or item.lon_deg != 0
 
 
-def _height(item: Item) -> Height | None:
+def _height(item: MissionItem) -> Height | None:
     if item.height_m is None:
         return None
     return Height(item.height_m, height_frame(item.frame))

@@ -1,9 +1,9 @@
-"""Routes of known shape, put anywhere: the paper's trajectories A to D.
+"""Preset routes at any position: the trajectories A to D of the paper.
 
 Di Piazza et al. (IGARSS 2024), Table 1. The paper states altitude, length, search band and overlap;
-it does not state the ground resolution: 0.2 m is taken for A, 1 m for B and D, 2 m for C, so that a
-tile of 256 px is about what a camera sees from 40, 2000 and 4000 m. Nor does it draw the
-trajectories: they are straight here.
+it does not state the ground resolution: 0.2 m is assumed for A, 1 m for B and D, 2 m for C, so that
+a tile of 256 px has about the size of a view from 40, 2000 and 4000 m. The paper does not draw the
+trajectories; they are straight here.
 """
 
 import math

@@ -8,7 +8,7 @@ writes and reads it (`MissionItem`, `SimpleMissionItem`, `TransectStyleComplexIt
 from typing import Any
 
 from orthonav.errors import RouteError
-from orthonav.geo.routes.mission import LAND, WAYPOINT, Home, Item, route_of
+from orthonav.geo.routes.mission import LAND, WAYPOINT, Home, MissionItem, route_of
 from orthonav.geo.routes.record import Route
 from orthonav.geo.routes.values import json_object, number, number_or_none
 
@@ -21,7 +21,7 @@ _LANDINGS = ("fwLandingPattern", "vtolLandingPattern")
 
 
 def read_plan(data: bytes) -> list[Route]:
-    """The route of a plan. Raises `RouteError`, naming what cannot be flown with a map."""
+    """The route of a plan. Raises `RouteError`, naming items that cannot be flown with a map."""
     return [plan_route(json_object(data))]
 
 
@@ -52,7 +52,7 @@ def _home(raw: Any) -> Home | None:
     return Home(lat, lon, number_or_none(raw[2] if len(raw) > 2 else None, "height of home"))
 
 
-def _items(raw: Any, index: int) -> list[Item]:
+def _items(raw: Any, index: int) -> list[MissionItem]:
     where = f"item {index + 1} of the plan"
     if not isinstance(raw, dict):
         raise RouteError(f"{where} must be an object, got {raw!r:.60}")
@@ -72,7 +72,7 @@ def _items(raw: Any, index: int) -> list[Item]:
     )
 
 
-def _simple(raw: dict[str, Any], where: str) -> Item:
+def _simple(raw: dict[str, Any], where: str) -> MissionItem:
     params = raw.get("params")
     place = params[4:7] if isinstance(params, list) and len(params) >= 7 else raw.get("coordinate")
     if not isinstance(place, list) or len(place) < 3:
@@ -81,11 +81,11 @@ def _simple(raw: dict[str, Any], where: str) -> Item:
     lat, lon, height = (number_or_none(value, f"{where}: params") for value in place[:3])
     if raw.get("AltitudeMode") == _ABOVE_TERRAIN_MODE:
         frame, height = _TERRAIN, number_or_none(raw.get("Altitude"), f"{where}: Altitude")
-    return Item(command, frame, lat, lon, height)
+    return MissionItem(command, frame, lat, lon, height)
 
 
-def _transects(raw: dict[str, Any], index: int, where: str) -> list[Item]:
-    """What is flown of a survey or a corridor; a corridor's width is the band of its legs."""
+def _transects(raw: dict[str, Any], index: int, where: str) -> list[MissionItem]:
+    """Flight lines of a survey or corridor scan; the corridor width is the band of its legs."""
     inner = raw.get("TransectStyleComplexItem")
     points = inner.get("VisualTransectPoints") if isinstance(inner, dict) else None
     if not isinstance(inner, dict) or not isinstance(points, list) or not points:
@@ -99,14 +99,16 @@ def _transects(raw: dict[str, Any], index: int, where: str) -> list[Item]:
     items = []
     for point in points:
         lat, lon = _place(point, f"{where}: VisualTransectPoints")
-        items.append(Item(WAYPOINT, frame, lat, lon, height_m, pattern=index, band_m=width_m))
+        items.append(
+            MissionItem(WAYPOINT, frame, lat, lon, height_m, pattern=index, band_m=width_m)
+        )
     return items
 
 
 def _survey_height(
     camera: dict[str, Any], inner: dict[str, Any], where: str
 ) -> tuple[int, float | None]:
-    """MAV_FRAME and height of a survey, as its camera calculation says."""
+    """MAV_FRAME and height of a survey, from its camera calculation."""
     height_m = number_or_none(camera.get("DistanceToSurface"), f"{where}: DistanceToSurface")
     mode = camera.get("DistanceMode")
     if mode in _FRAME_OF_MODE:
@@ -116,7 +118,7 @@ def _survey_height(
     return (_ABOVE_HOME if camera.get("DistanceToSurfaceRelative", True) else _AMSL), height_m
 
 
-def _landing(raw: dict[str, Any], where: str) -> list[Item]:
+def _landing(raw: dict[str, Any], where: str) -> list[MissionItem]:
     approach = raw.get("landingApproachCoordinate", raw.get("loiterCoordinate"))
     relative = raw.get("altitudesAreRelative", raw.get("landingAltitudeRelative", True))
     frame = _ABOVE_HOME if relative else _AMSL
@@ -125,7 +127,7 @@ def _landing(raw: dict[str, Any], where: str) -> list[Item]:
     for command, point in ends:
         lat, lon = _place(point, where)
         height = number_or_none(next(iter(point[2:]), None), where)
-        items.append(Item(command, frame, lat, lon, height))
+        items.append(MissionItem(command, frame, lat, lon, height))
     return items
 
 

@@ -1,4 +1,4 @@
-"""A planned route as all file formats give it."""
+"""A planned route, independent of its file format."""
 
 import math
 from dataclasses import dataclass
@@ -9,20 +9,25 @@ from numpy.typing import NDArray
 
 from orthonav.errors import RouteError
 from orthonav.geo.frames import LocalFrame
+from orthonav.geo.swapped import swapped_hint
 
 HeightFrame = Literal["agl", "home", "amsl"]
 HEIGHT_FRAMES: tuple[HeightFrame, ...] = ("agl", "home", "amsl")
 MAX_HEIGHT_M = 100_000.0
+"""Sanity limit: the edge of space."""
 MAX_BAND_M = 50_000.0
+"""Width of the largest sheet."""
 MAX_WAYPOINTS = 100_000
+"""Sanity limit against files that exhaust memory."""
 
 
 @dataclass(frozen=True)
 class Height:
-    """Height of a waypoint in metres, and above what.
+    """Height of a waypoint.
 
-    `frame` is "agl" (the ground below it), "home" (the ground at the take-off place), "amsl" (mean
-    sea level), or None where the file does not say.
+    `height_m`: metres above the reference. `frame`: the reference, "agl" (terrain below the
+    waypoint), "home" (terrain at the take-off position), "amsl" (mean sea level), or None if the
+    file does not state it.
     """
 
     height_m: float
@@ -35,18 +40,22 @@ class Height:
             )
         if self.frame is not None and self.frame not in HEIGHT_FRAMES:
             raise RouteError(
-                f"height must be above one of {', '.join(HEIGHT_FRAMES)}, got {self.frame!r:.40}"
+                f"height reference must be {', '.join(HEIGHT_FRAMES)}, got {self.frame!r:.40}"
             )
 
 
 @dataclass(frozen=True)
 class Route:
-    """Waypoints of the planned trajectory as `(lat_deg, lon_deg)`, at least one.
+    """Waypoints joined by straight legs; raises `RouteError` if invalid.
 
-    Leg i goes from waypoint i to waypoint i + 1; a route of one waypoint has one leg, of no length.
-    `heights` has one entry per waypoint (None: not said), `leg_bands_m` the width of the search
-    band of each leg (None: the default); both are empty where the file says nothing of the kind.
-    `home_amsl_m` is the take-off place's height above mean sea level. Raises `RouteError`.
+    Leg i goes from waypoint i to waypoint i + 1; a route of one waypoint has one leg of length 0.
+
+    - `waypoints`: `(lat_deg, lon_deg)`, WGS84, at least one; |lat| <= 90, |lon| <= 360.
+    - `heights`: one per waypoint, None if unknown; empty if the file has none.
+    - `leg_bands_m`: full width of the search band per leg in metres, None for the default; empty
+      if the file has none.
+    - `name`: name of the line in its file, None if it has none.
+    - `home_amsl_m`: height of the take-off position above mean sea level, metres, None if unknown.
     """
 
     waypoints: tuple[tuple[float, float], ...]
@@ -61,12 +70,13 @@ class Route:
         if len(self.waypoints) > MAX_WAYPOINTS:
             raise RouteError(
                 f"route has {len(self.waypoints):,} waypoints, at most {MAX_WAYPOINTS:,} are read; "
-                "thin it out"
+                "simplify it"
             )
         for lat, lon in self.waypoints:
             if not (abs(lat) <= 90 and abs(lon) <= 360):
                 raise RouteError(
-                    f"waypoint is not a latitude and longitude in degrees: {lat}, {lon}"
+                    "waypoint must have a latitude within 90 and a longitude within 360 degrees, "
+                    f"got {lat}, {lon}{swapped_hint(lat, lon)}"
                 )
         if self.heights and len(self.heights) != len(self.waypoints):
             raise RouteError(
@@ -81,7 +91,9 @@ class Route:
                     f"got {band_m}"
                 )
         if self.home_amsl_m is not None and not math.isfinite(self.home_amsl_m):
-            raise RouteError(f"height of the take-off place is not a number: {self.home_amsl_m}")
+            raise RouteError(
+                f"height of the take-off position must be finite, got {self.home_amsl_m}"
+            )
 
     @property
     def legs(self) -> int:
@@ -94,9 +106,9 @@ class Route:
         return frame.en_from_latlon(lat_lon[:, 0], lat_lon[:, 1])
 
     def bands_m(self, default_m: float | None) -> tuple[float, ...] | None:
-        """Width of the search band of each leg; None where a leg has none and there is no default.
+        """Width of the search band of each leg, `default_m` for legs without one.
 
-        `default_m` is for the legs that do not say.
+        None if a leg has none and there is no default.
         """
         if not self.leg_bands_m:
             return None if default_m is None else (default_m,) * self.legs

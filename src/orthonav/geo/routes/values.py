@@ -1,4 +1,4 @@
-"""Numbers and texts as route files hold them."""
+"""Validated numbers and texts of route files."""
 
 import json
 import math
@@ -8,21 +8,21 @@ from orthonav.errors import RouteError
 
 
 def number(value: Any, what: str) -> float:
-    """A finite JSON number; a text such as `"12"` or true is none. Raises `RouteError`."""
+    """A finite JSON number. Raises `RouteError` for anything else, as `"12"` or true."""
     if type(value) not in (int, float) or not math.isfinite(value):
         raise RouteError(f"{what} must be a number, got {value!r:.80}")
     return float(value)
 
 
 def number_or_none(value: Any, what: str) -> float | None:
-    """As `number`; None for null, NaN and what is not there."""
+    """As `number`; None for null, NaN and missing values."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return None
     return number(value, what)
 
 
 def parsed(text: str, what: str) -> float:
-    """The number that a text holds. Raises `RouteError`; NaN and infinity are none."""
+    """The finite number in a text. Raises `RouteError`, also for NaN and infinity."""
     try:
         value = float(text)
     except ValueError as error:
@@ -39,13 +39,13 @@ def decoded(data: bytes) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise RouteError("route file is no text in UTF-8; is it of the kind its name says?") from (
-            error
-        )
+        raise RouteError(
+            "route file is not UTF-8 text; check that its suffix matches its format"
+        ) from (error)
 
 
 def json_object(data: bytes) -> dict[str, Any]:
-    """The object that a JSON document is. Raises `RouteError`."""
+    """The object of a JSON document. Raises `RouteError`."""
     try:
         plain = json.loads(decoded(data))
     except (json.JSONDecodeError, RecursionError) as error:

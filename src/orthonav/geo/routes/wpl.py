@@ -7,7 +7,7 @@ first item is the planned home position, in the older 120 of QGroundControl ther
 """
 
 from orthonav.errors import RouteError
-from orthonav.geo.routes.mission import Home, Item, route_of
+from orthonav.geo.routes.mission import Home, MissionItem, route_of
 from orthonav.geo.routes.record import Route
 from orthonav.geo.routes.values import decoded, parsed
 
@@ -39,7 +39,7 @@ def read_wpl(data: bytes) -> list[Route]:
     return [route_of(items, home)]
 
 
-def _item(values: list[str], line: int) -> Item:
+def _item(values: list[str], line: int) -> MissionItem:
     if len(values) != _COLUMNS:
         raise RouteError(
             f"line {line} of the waypoint file has {len(values)} values, expected {_COLUMNS}"
@@ -48,7 +48,7 @@ def _item(values: list[str], line: int) -> Item:
     lat_deg, lon_deg, height_m = (
         parsed(values[index], f"line {line}, column {index + 1}") for index in (8, 9, 10)
     )
-    return Item(command, frame, lat_deg, lon_deg, height_m)
+    return MissionItem(command, frame, lat_deg, lon_deg, height_m)
 
 
 def _whole(text: str, line: int) -> int:

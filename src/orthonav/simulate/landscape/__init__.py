@@ -1,14 +1,14 @@
-"""A generated area: an invented countryside photographed at several dates.
+"""A generated landscape, imaged at several dates.
 
-Everything is a function of seed, place and date, so any window can be drawn on its own. From the
-plan to the picture: `network` (roads, settlements, rivers), `parcels` and `plan` (what each
-macro-cell holds, and in which years), `crops` (how it looks at a date), `ground` and `relief`
-(colour, height, shadow), `sensor`, and `scene` and `area`, which put them together.
+Everything is a function of seed, position and date, so any window can be rendered on its own. The
+steps: `network` (roads, settlements, rivers), `parcels` and `plan` (content of each macro-cell,
+with the years of changes), `crops` (appearance at a date), `surface` and `relief` (colour, height,
+shadow), `sensor`, and `scene` and `area`, which combine them.
 """
 
 from orthonav.simulate.landscape.area import generate_area
 from orthonav.simulate.landscape.epoch import DEFAULT_DATES, Epoch, Season
-from orthonav.simulate.landscape.scene import GSD_RANGE_M, ORIGIN_M, Landscape, render
+from orthonav.simulate.landscape.scene import GSD_RANGE_M, ORIGIN_M, Landscape
 
 __all__ = [
     "DEFAULT_DATES",
@@ -18,5 +18,4 @@ __all__ = [
     "Landscape",
     "Season",
     "generate_area",
-    "render",
 ]

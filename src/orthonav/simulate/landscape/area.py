@@ -8,7 +8,8 @@ from zlib import crc32
 
 import numpy as np
 
-from orthonav.errors import AreaError, MissingExtraError, OutputError
+from orthonav.errors import AreaError, OutputError
+from orthonav.extras import missing_extra
 from orthonav.files import replacing
 from orthonav.simulate.landscape.epoch import DEFAULT_DATES, Epoch
 from orthonav.simulate.landscape.scene import ORIGIN_M, Landscape, check_gsd
@@ -62,7 +63,7 @@ def generate_area(
 
 
 def _size_px(size_m: tuple[float, float], gsd_m: float) -> tuple[int, int]:
-    """Return (width, height) in pixels; raise `AreaError` where they make no picture."""
+    """Return (width, height) in pixels; raise `AreaError` for an impossible image."""
     check_gsd(gsd_m)
     if not all(isfinite(side) and side > 0.0 for side in size_m):
         raise AreaError(f"size_m must be two finite positive lengths, got {size_m}")
@@ -85,9 +86,7 @@ def _write(
         from rasterio import Affine
         from rasterio.windows import Window
     except ImportError as error:
-        raise MissingExtraError(
-            "writing a generated area needs rasterio: pip install 'orthonav[geo]'"
-        ) from error
+        raise missing_extra("writing a generated area", "geo", "rasterio", error) from error
     width_px, height_px = size_px
     west_m, north_m = ORIGIN_M[0], ORIGIN_M[1] + height_px * gsd_m
     profile: dict[str, Any] = {
@@ -123,11 +122,11 @@ def _write(
 
 
 def _check_written(path: Path, checksums: list[tuple[Any, int]]) -> None:
-    """Read windows back: GDAL writes its last blocks while closing, and fails there silently."""
+    """Read windows back: GDAL writes its last blocks on closing, and ignores errors there."""
     import rasterio
 
     with rasterio.open(path) as source:
         for window, checksum in checksums:
             picture = np.moveaxis(source.read(window=window), 0, 2)
             if crc32(picture.tobytes()) != checksum:
-                raise OSError("what was written cannot be read back; is the disk full?")
+                raise OSError("the written file cannot be read back; check for a full disk")

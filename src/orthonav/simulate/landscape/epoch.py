@@ -1,4 +1,4 @@
-"""When and how the landscape is photographed: season, light, air and camera of one date."""
+"""Date and imaging conditions of one generated orthophoto: season, light, air and camera."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -11,12 +11,9 @@ class Season(Enum):
     SPRING = 0
     SUMMER = 1
     AUTUMN = 2
-    WINTER = 3
 
 
-_MONTH_DAY = MappingProxyType(
-    {Season.SPRING: 15, Season.SUMMER: 12, Season.AUTUMN: 20, Season.WINTER: 10}
-)
+_MONTH_DAY = MappingProxyType({Season.SPRING: 15, Season.SUMMER: 12, Season.AUTUMN: 20})
 
 
 @dataclass(frozen=True)
@@ -24,15 +21,15 @@ class Epoch:
     """One photographic campaign over a generated landscape.
 
     name: file stem of the orthophoto, such as "2016-07".
-    year, month: calendar; what was built, felled or merged before then shows.
-    season: which crop and leaf colours are seen.
-    sun_azimuth_deg: where the light comes from, clockwise from north.
-    sun_elevation_deg: height of the sun above the horizon, 15..90.
-    haze: share of the light that is scattered air, 0..1.
-    exposure, contrast: factors on brightness and on its spread.
-    white_balance: factors on red, green and blue.
-    noise: standard deviation of the sensor noise, in grey levels.
-    water_level_m: by how much every shore lies farther out than on average.
+    year, month: calendar date; earlier changes (built, felled, merged) are visible.
+    season: column of the crop and leaf colours.
+    sun_azimuth_deg: direction to the sun, degrees clockwise from north.
+    sun_elevation_deg: elevation of the sun above the horizon, degrees, 15..90.
+    haze: share of scattered light, 0..1.
+    exposure, contrast: factors on brightness and on its spread; 1 is neutral.
+    white_balance: factors on red, green and blue; 1 is neutral.
+    noise: standard deviation of the sensor noise, grey levels.
+    water_level_m: outward displacement of every shore from its mean line, metres.
     """
 
     name: str
@@ -49,7 +46,7 @@ class Epoch:
     water_level_m: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse values that no photograph can have."""
+        """Refuse impossible values."""
         if not self.name or any(character in self.name for character in '/\\:*?"<>|'):
             raise ValueError(f"epoch name must be a plain file stem, got {self.name!r}")
         if not 1 <= self.month <= 12 or not 1 <= self.year <= 9999:
@@ -68,7 +65,7 @@ class Epoch:
 
     @property
     def tiff_datetime(self) -> str:
-        """The date as TIFFTAG_DATETIME wants it, at noon."""
+        """The date at noon in the format of TIFFTAG_DATETIME."""
         return f"{self.year:04d}:{self.month:02d}:{_MONTH_DAY[self.season]:02d} 12:00:00"
 
 
@@ -113,4 +110,4 @@ DEFAULT_DATES: tuple[Epoch, ...] = (
         water_level_m=2.0,
     ),
 )
-"""Dates of the demo area: the first two make map and flight, the third is an older map."""
+"""Dates of the demo area: the first for the map, the second for the flight, the third older."""

@@ -1,31 +1,31 @@
-"""Ways and borders as polygons: lines cut into short pieces and given a width."""
+"""Roads and borders as polygons: lines divided into short pieces, with a width."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from orthonav.simulate.landscape.network import Way
+from orthonav.simulate.landscape.network import LineKind
 from orthonav.simulate.landscape.noise import Float64
 from orthonav.simulate.landscape.window import Box, box_of
 
-_STEP_M = 12.0  # longest straight piece of a border; must stay below the margin of a drawing
+_STEP_M = 12.0  # longest straight piece of a border; must be below the margin of a drawing
 HALF_WIDTH_M = {
-    Way.MAIN: 5.5,
-    Way.MINOR: 2.9,
-    Way.STREET: 2.8,
-    Way.TRACK: 1.6,
-    Way.HEDGE: 1.8,
-    Way.STRIP: 0.9,
-    Way.NONE: 0.35,
+    LineKind.MAIN: 5.5,
+    LineKind.MINOR: 2.9,
+    LineKind.STREET: 2.8,
+    LineKind.TRACK: 1.6,
+    LineKind.HEDGE: 1.8,
+    LineKind.STRIP: 0.9,
+    LineKind.NONE: 0.35,
 }
 _VERGE_M = 2.2
 
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A way or border: its surface and its verge as polygons (N, 2), and when it is gone."""
+    """A road or border: its surface and verge as polygons (N, 2), and the year it disappears."""
 
-    way: Way
+    kind: LineKind
     surface_m: Float64
     verge_m: Float64
     gone_year: float
@@ -56,15 +56,15 @@ def ribbon(points_m: Float64, half_width_m: float | Float64) -> Float64:
     return np.concatenate([points_m + side, (points_m - side)[::-1]])
 
 
-def make_line(way: Way, points_m: Float64, gone_year: float) -> Line:
-    """Return the line through points (N, 2), its ends drawn out so that crossings close."""
-    half = HALF_WIDTH_M[way]
-    paved = way in (Way.MAIN, Way.MINOR, Way.STREET)
+def make_line(kind: LineKind, points_m: Float64, gone_year: float) -> Line:
+    """Return the line through points (N, 2), its ends extended so that crossings close."""
+    half = HALF_WIDTH_M[kind]
+    paved = kind in (LineKind.MAIN, LineKind.MINOR, LineKind.STREET)
     verge = half + (_VERGE_M if paved else 0.9)
     stretched = points_m.copy()
-    if paved or way is Way.TRACK:
+    if paved or kind is LineKind.TRACK:
         for end, inner in ((0, 1), (-1, -2)):
             step = points_m[end] - points_m[inner]
             stretched[end] += step * (half * 0.7 / max(float(np.hypot(*step)), 1e-9))
     outer = ribbon(stretched, verge)
-    return Line(way, ribbon(stretched, half), outer, gone_year, box_of(outer))
+    return Line(kind, ribbon(stretched, half), outer, gone_year, box_of(outer))

@@ -1,4 +1,4 @@
-"""What the land is hung on: a warped net of roads, the settlements at its crossings, the rivers.
+"""The skeleton of the landscape: a warped road network, settlements at crossings, and rivers.
 
 The plan lives in *sheet* coordinates, where roads follow a jittered square lattice of macro-cells.
 `Network.warp` bends the sheet into the landscape, smoothly and without folds, so everything drawn
@@ -23,8 +23,8 @@ _RIVER_SPACING_M = 5200.0
 _BENDS_M = ((1700.0, 190.0), (520.0, 42.0), (130.0, 4.0), (48.0, 0.8))
 
 
-class Way(IntEnum):
-    """Kinds of line in the land, from a motor road to an invisible border."""
+class LineKind(IntEnum):
+    """Kinds of lines in the landscape, from a main road to an invisible border."""
 
     MAIN = 0
     MINOR = 1
@@ -48,7 +48,7 @@ class Settlement:
     turn_rad: float
 
     def depth_m(self, east_m: float, north_m: float) -> float:
-        """Return how far inside the outline a point in sheet coordinates lies."""
+        """Return the distance inside the outline of a point in sheet coordinates."""
         x, y = east_m - self.centre_m[0], north_m - self.centre_m[1]
         bearing = atan2(y, x) - self.turn_rad
         bulge = 1.0 + 0.26 * cos(2.0 * bearing) + 0.18 * cos(3.0 * bearing + 2.0 * self.turn_rad)
@@ -56,7 +56,7 @@ class Settlement:
 
 
 class Network:
-    """The skeleton of one landscape; a pure function of its seed."""
+    """Roads, settlements and rivers of one landscape; a pure function of its seed."""
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
@@ -100,15 +100,15 @@ class Network:
         shift = bow * np.sin(np.pi * along) + wave * np.sin(2 * np.pi * along)
         return np.asarray(start + along * (end - start) + shift * sideways)
 
-    def edge_way(self, i: int, j: int, upward: bool) -> Way:
-        """Return what runs along an edge; main roads run on through the whole lattice."""
+    def edge_kind(self, i: int, j: int, upward: bool) -> LineKind:
+        """Return the kind of line along an edge; main roads continue through the whole lattice."""
         line = i if upward else j
         if uniform_at(key_of(self.seed, "main", upward), line) < 0.25:
-            return Way.MAIN
+            return LineKind.MAIN
         draw = uniform_at(key_of(self.seed, "way", upward), i, j)
         if draw < 0.5:
-            return Way.MINOR
-        return Way.TRACK if draw < 0.85 else Way.HEDGE
+            return LineKind.MINOR
+        return LineKind.TRACK if draw < 0.85 else LineKind.HEDGE
 
     def outline(self, i: int, j: int) -> Float64:
         """Return the border (32, 2) of macro-cell (i, j), counter-clockwise, sheet coordinates."""

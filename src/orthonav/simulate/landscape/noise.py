@@ -1,7 +1,7 @@
-"""Randomness that belongs to a place: the same at every visit, whatever window is rendered.
+"""Position-dependent pseudo-random numbers, independent of the rendered window.
 
 Integer lattice points are hashed to uniform numbers; smooth noise is a cubic B-spline through the
-hashed numbers, evaluated separably. Nothing here depends on the window but rounding.
+hashed numbers, evaluated separably. Only rounding depends on the window.
 """
 
 import zlib
@@ -102,7 +102,7 @@ def fractal_grid(
     """Return the sum (H, W) of noise at several wavelengths, each `gain` times the one before.
 
     The sum spreads like one noise, about -1..1.
-    Wavelengths below two pixels are left out, as no image of that resolution could show them.
+    Wavelengths below two pixels are omitted (Nyquist limit).
     """
     total = np.zeros((len(north_m), len(east_m)), np.float32)
     step_m = abs(float(east_m[1] - east_m[0])) if len(east_m) > 1 else 0.0

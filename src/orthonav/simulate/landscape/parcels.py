@@ -1,8 +1,8 @@
-"""Cutting a macro-cell into parcels, and what lies on the cuts.
+"""Division of a macro-cell into parcels, and the lines between them.
 
-A cell is halved again and again until its pieces are as large as fields are there, or as house
-plots near a settlement. What is decided here holds at all dates; years in which a border vanishes
-or a wood is felled are decided here too.
+A cell is halved recursively until its pieces have the size of fields, or of house plots near a
+settlement. The result holds for all dates, and includes the years in which a border disappears or
+a wood is felled.
 """
 
 from dataclasses import dataclass, field
@@ -12,16 +12,16 @@ from math import cos, hypot, pi, sin
 import cv2
 import numpy as np
 
-from orthonav.simulate.landscape.network import Network, Settlement, Way
+from orthonav.simulate.landscape.network import LineKind, Network, Settlement
 
 Point = tuple[float, float]
 
 FIRST_YEAR = 1995.0
-"""No change is drawn before this year: older dates show the land as it was then."""
+"""No changes happen before this year; older dates show its state."""
 
 
-class Cover(IntEnum):
-    """What a parcel is used for, at all dates unless felled."""
+class LandCover(IntEnum):
+    """Land cover of a parcel, at all dates unless felled."""
 
     ARABLE = 0
     MEADOW = 1
@@ -35,7 +35,7 @@ class Cover(IntEnum):
 
 @dataclass
 class Parcel:
-    """One parcel in sheet coordinates. `twin`: the number it shares once `merge_year` is past."""
+    """One parcel in sheet coordinates. `twin`: the number it shares from `merge_year` on."""
 
     polygon: list[Point]
     area_m2: float
@@ -46,11 +46,11 @@ class Parcel:
 
 
 @dataclass
-class Cut:
-    """A line between parcels in sheet coordinates, and the year when it is gone."""
+class Boundary:
+    """A line between parcels in sheet coordinates, and the year in which it disappears."""
 
     points: list[Point]
-    way: Way
+    kind: LineKind
     gone_year: float = np.inf
 
 
@@ -59,12 +59,12 @@ class Pieces:
     """All parcels and cuts of one macro-cell."""
 
     parcels: list[Parcel] = field(default_factory=list)
-    cuts: list[Cut] = field(default_factory=list)
+    boundaries: list[Boundary] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class Style:
-    """How land is held in one macro-cell: field size, hedges, narrow strips."""
+    """Style of one macro-cell: field size, hedges, narrow strips."""
 
     field_m2: float
     bocage: float
@@ -128,7 +128,7 @@ def long_axis(polygon: list[Point]) -> tuple[float, float, float]:
     return float(np.arctan2(by, bx)), b, a
 
 
-class Cutter:
+class ParcelCutter:
     """Halves one macro-cell down to parcels."""
 
     def __init__(self, network: Network, i: int, j: int, rng: np.random.Generator) -> None:
@@ -140,7 +140,7 @@ class Cutter:
     def cut(self, outline: list[Point]) -> Pieces:
         """Return the parcels of the cell with this outline and the cuts between them."""
         pieces = Pieces()
-        stack: list[tuple[list[Point], int, Cut | None]] = [(outline, 0, None)]
+        stack: list[tuple[list[Point], int, Boundary | None]] = [(outline, 0, None)]
         last_of_cut: dict[int, Parcel] = {}
         while stack:
             polygon, depth, parent = stack.pop()
@@ -150,7 +150,7 @@ class Cutter:
             settlement = self._settlement_at(centre, area)
             halves = self._halves(polygon, centre, area, depth, settlement)
             if halves is not None:
-                pieces.cuts.append(halves[2])
+                pieces.boundaries.append(halves[2])
                 stack += [(halves[0], depth + 1, halves[2]), (halves[1], depth + 1, halves[2])]
                 continue
             parcel = Parcel(polygon, area, self._next_number, settlement)
@@ -176,8 +176,8 @@ class Cutter:
         area: float,
         depth: int,
         settlement: Settlement | None,
-    ) -> tuple[list[Point], list[Point], Cut] | None:
-        """Return two halves and the cut, or None where the piece is small enough."""
+    ) -> tuple[list[Point], list[Point], Boundary] | None:
+        """Return two halves and their boundary, or None if the piece is small enough."""
         rng = self._rng
         wanted = settlement.plot_m2 if settlement else self.style.field_m2
         if depth >= 16 or area < wanted * rng.uniform(0.9, 2.1):
@@ -196,29 +196,31 @@ class Cutter:
         if len(left) < 3 or len(right) < 3 or len(crossings) < 2:
             return None
         crossings.sort(key=lambda p: p[1] * normal[0] - p[0] * normal[1])
-        cut = Cut([crossings[0], crossings[-1]], self._way(area, settlement))
-        if cut.way is Way.HEDGE:
+        cut = Boundary([crossings[0], crossings[-1]], self._line_kind(area, settlement))
+        if cut.kind is LineKind.HEDGE:
             cut.gone_year = FIRST_YEAR + float(rng.exponential(110.0))
         return left, right, cut
 
-    def _way(self, area: float, settlement: Settlement | None) -> Way:
-        """Draw what lies on a cut through a piece of this area."""
+    def _line_kind(self, area: float, settlement: Settlement | None) -> LineKind:
+        """Draw the kind of a boundary through a piece of this area."""
         draw = self._rng.uniform()
         if settlement is not None and area < 90000.0:
             if area > 11.0 * settlement.plot_m2:
-                return Way.STREET
-            return Way.HEDGE if draw < 0.12 else Way.STRIP if draw < 0.6 else Way.NONE
+                return LineKind.STREET
+            return (
+                LineKind.HEDGE if draw < 0.12 else LineKind.STRIP if draw < 0.6 else LineKind.NONE
+            )
         if area > 280000.0:
-            return Way.MINOR if draw < 0.35 else Way.TRACK
+            return LineKind.MINOR if draw < 0.35 else LineKind.TRACK
         if area > 90000.0 and draw < 0.4:
-            return Way.TRACK
+            return LineKind.TRACK
         if self._rng.uniform() < 0.05 + self.style.bocage:
-            return Way.HEDGE
-        return Way.TRACK if draw < 0.06 else Way.STRIP if draw < 0.85 else Way.NONE
+            return LineKind.HEDGE
+        return LineKind.TRACK if draw < 0.06 else LineKind.STRIP if draw < 0.85 else LineKind.NONE
 
-    def _maybe_merge(self, first: Parcel, second: Parcel, cut: Cut) -> None:
-        """Let two halves of one field become one some year, their border with them."""
-        if cut.way not in (Way.HEDGE, Way.STRIP, Way.NONE):
+    def _maybe_merge(self, first: Parcel, second: Parcel, cut: Boundary) -> None:
+        """Merge two halves of one field in some year, when their boundary disappears."""
+        if cut.kind not in (LineKind.HEDGE, LineKind.STRIP, LineKind.NONE):
             return
         year = FIRST_YEAR + float(self._rng.exponential(75.0))
         first.merge_year = second.merge_year = year

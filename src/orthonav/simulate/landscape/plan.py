@@ -1,4 +1,4 @@
-"""Everything that stands in one macro-cell, in landscape coordinates, with its years."""
+"""Content of one macro-cell in landscape coordinates, with the years of its changes."""
 
 from dataclasses import dataclass
 from math import pi
@@ -12,10 +12,10 @@ from orthonav.simulate.landscape.network import CELL_M, Network
 from orthonav.simulate.landscape.noise import Float64, UInt32, hash_u32, key_of, noise_at
 from orthonav.simulate.landscape.parcels import (
     FIRST_YEAR,
-    Cover,
-    Cut,
-    Cutter,
+    Boundary,
+    LandCover,
     Parcel,
+    ParcelCutter,
     Point,
     area_and_centre,
     long_axis,
@@ -36,15 +36,14 @@ class Pond:
 
 @dataclass(frozen=True, eq=False)
 class CellPlan:
-    """What one macro-cell holds.
+    """Content of one macro-cell.
 
     polygons_m: borders of its M parcels, each (N, 2).
     identity, twin (M,): numbers that crops are drawn from, before and after `merge_year` (M,).
     cover (M,): `Cover`; felled_year (M,): when a wood is cut.
-    angle_rad (M,): direction of the longer side; area_m2 (M,).
+    angle_rad (M,): direction of the longer side.
     """
 
-    box_m: Box
     polygons_m: list[Float64]
     boxes_m: list[Box]
     identity: UInt32
@@ -53,7 +52,6 @@ class CellPlan:
     cover: NDArray[np.int8]
     felled_year: Float64
     angle_rad: Float64
-    area_m2: Float64
     lines: list[Line]
     ponds: list[Pond]
     trees: Trees
@@ -61,7 +59,7 @@ class CellPlan:
 
 
 def outline_box(network: Network, i: int, j: int) -> Box:
-    """Return the box around macro-cell (i, j) and what stands on its border."""
+    """Return the box around macro-cell (i, j) and the objects on its border."""
     return box_of(network.warp(dense(network.outline(i, j), closed=True)), 40.0)
 
 
@@ -69,10 +67,12 @@ def make_plan(network: Network, i: int, j: int) -> CellPlan:
     """Return the plan of macro-cell (i, j); a pure function of the network and the cell."""
     rng = np.random.default_rng([network.seed, i & 0xFFFFFFFF, j & 0xFFFFFFFF, 1])
     outline = network.outline(i, j)
-    cutter = Cutter(network, i, j, rng)
+    cutter = ParcelCutter(network, i, j, rng)
     pieces = cutter.cut([(float(x), float(y)) for x, y in outline])
-    cuts = pieces.cuts + [
-        Cut([(float(x), float(y)) for x, y in network.edge(i, j, up)], network.edge_way(i, j, up))
+    boundaries = pieces.boundaries + [
+        Boundary(
+            [(float(x), float(y)) for x, y in network.edge(i, j, up)], network.edge_kind(i, j, up)
+        )
         for up in (False, True)
     ]
     polygons = _warped(network, [dense(np.array(p.polygon), True) for p in pieces.parcels])
@@ -80,17 +80,16 @@ def make_plan(network: Network, i: int, j: int) -> CellPlan:
     cover = _covers(network.seed, pieces.parcels, centres, rng)
     ponds = _ponds(network, i, j, pieces.parcels, cover, rng)
     wet = _Wet(network, i, j, ponds)
-    cut_points = _warped(network, [dense(np.array(cut.points)) for cut in cuts])
+    boundary_points = _warped(network, [dense(np.array(cut.points)) for cut in boundaries])
     angles = np.array([long_axis([*map(tuple, polygon)])[0] for polygon in polygons])
     areas = np.array([parcel.area_m2 for parcel in pieces.parcels])
     towns = [parcel.settlement for parcel in pieces.parcels]
     buildings = build(centres, angles, areas, cover, towns, rng)
-    trees = plant(cut_points, cuts, polygons, centres, areas, cover, rng)
+    trees = plant(boundary_points, boundaries, polygons, centres, areas, cover, rng)
     salt = key_of(network.seed, "parcel", i, j)
     numbers = np.array([parcel.number for parcel in pieces.parcels])
     twins = np.array([parcel.twin for parcel in pieces.parcels])
     return CellPlan(
-        box_m=outline_box(network, i, j),
         polygons_m=polygons,
         boxes_m=[box_of(polygon) for polygon in polygons],
         identity=hash_u32(salt, numbers, 0),
@@ -99,10 +98,9 @@ def make_plan(network: Network, i: int, j: int) -> CellPlan:
         cover=cover,
         felled_year=FIRST_YEAR + rng.exponential(80.0, len(areas)),
         angle_rad=angles,
-        area_m2=areas,
         lines=[
-            make_line(cut.way, points, cut.gone_year)
-            for cut, points in zip(cuts, cut_points, strict=True)
+            make_line(cut.kind, points, cut.gone_year)
+            for cut, points in zip(boundaries, boundary_points, strict=True)
         ],
         ponds=ponds,
         trees=trees.where(~wet(trees.centre_m, 1.0)),
@@ -119,22 +117,22 @@ def _warped(network: Network, lines: list[Float64]) -> list[Float64]:
 def _covers(
     seed: int, parcels: list[Parcel], centres_m: Float64, rng: np.random.Generator
 ) -> NDArray[np.int8]:
-    """Return the `Cover` (M,) of parcels: woods and vineyards keep together, the rest is drawn."""
+    """Return the `Cover` (M,) of parcels: woods and vineyards are clustered, the rest is drawn."""
     wooded = noise_at(key_of(seed, "wood"), centres_m, 1300.0)
     wooded += 0.6 * noise_at(key_of(seed, "grove"), centres_m, 330.0)
     vine = noise_at(key_of(seed, "vine"), centres_m, 2100.0)
     area = np.array([parcel.area_m2 for parcel in parcels])
     town = np.array([parcel.settlement is not None for parcel in parcels])
     draw = rng.uniform(size=len(parcels))
-    cover = np.full(len(parcels), Cover.ARABLE, np.int8)
-    cover[draw < 0.25] = Cover.MEADOW
-    cover[(draw > 0.25) & (draw < 0.275)] = Cover.ROUGH
-    cover[(draw > 0.275) & (draw < 0.295) & (area < 40000.0)] = Cover.FOREST
-    cover[(draw > 0.295) & (draw < 0.34) & (area < 30000.0)] = Cover.ORCHARD
-    cover[(vine > 0.45) & (draw > 0.5) & (area < 40000.0)] = Cover.VINEYARD
-    cover[(wooded > 1.05) & (draw > 0.08)] = Cover.FOREST
-    cover[town] = np.where(draw[town] < 0.06, Cover.YARD, Cover.GARDEN)
-    cover[town & (area > 2600.0)] = Cover.MEADOW
+    cover = np.full(len(parcels), LandCover.ARABLE, np.int8)
+    cover[draw < 0.25] = LandCover.MEADOW
+    cover[(draw > 0.25) & (draw < 0.275)] = LandCover.ROUGH
+    cover[(draw > 0.275) & (draw < 0.295) & (area < 40000.0)] = LandCover.FOREST
+    cover[(draw > 0.295) & (draw < 0.34) & (area < 30000.0)] = LandCover.ORCHARD
+    cover[(vine > 0.45) & (draw > 0.5) & (area < 40000.0)] = LandCover.VINEYARD
+    cover[(wooded > 1.05) & (draw > 0.08)] = LandCover.FOREST
+    cover[town] = np.where(draw[town] < 0.06, LandCover.YARD, LandCover.GARDEN)
+    cover[town & (area > 2600.0)] = LandCover.MEADOW
     return cover
 
 
@@ -152,7 +150,7 @@ def _ponds(
     if lake < 0.06:
         places.append((((i + 0.5) * CELL_M, (j + 0.5) * CELL_M), lake_radius))
     for parcel, kind in zip(parcels, cover.tolist(), strict=True):
-        if kind == Cover.MEADOW and rng.uniform() < 0.07:
+        if kind == LandCover.MEADOW and rng.uniform() < 0.07:
             radius = 0.25 * parcel.area_m2**0.5
             places.append((area_and_centre(parcel.polygon)[1], min(radius, 35.0)))
     ponds = []
@@ -169,7 +167,7 @@ def _ponds(
 
 
 class _Wet:
-    """Tells which points of a cell lie in water or within a margin of it."""
+    """Mask of points of a cell in water or within a margin of it."""
 
     def __init__(self, network: Network, i: int, j: int, ponds: list[Pond]) -> None:
         low, high = (

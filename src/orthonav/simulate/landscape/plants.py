@@ -1,4 +1,4 @@
-"""Single trees and the bushes that make up hedges: where they stand, how large, in which years."""
+"""Single trees and the bushes of hedges: positions, sizes and years."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -6,14 +6,14 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.simulate.landscape.network import Way
+from orthonav.simulate.landscape.network import LineKind
 from orthonav.simulate.landscape.noise import Float64
-from orthonav.simulate.landscape.parcels import FIRST_YEAR, Cover, Cut
+from orthonav.simulate.landscape.parcels import FIRST_YEAR, Boundary, LandCover
 
 
 @dataclass(frozen=True, eq=False)
 class Trees:
-    """N crowns: centre (N, 2), radius, height (N,), and the years between which each stands."""
+    """N crowns: centre (N, 2), radius, height (N,), first and last year (N,)."""
 
     centre_m: Float64
     radius_m: Float64
@@ -31,29 +31,32 @@ class Trees:
 
 
 def join(groups: Sequence[Trees]) -> Trees:
-    """Return all crowns of several groups, low ones first, so that high ones are drawn on top."""
+    """Return all crowns of several groups, low ones first; high ones are drawn on top."""
     columns = [np.concatenate([getattr(g, field.name) for g in groups]) for field in fields(Trees)]
     order = np.lexsort((columns[0][:, 0], columns[2]))
     return Trees(*(column[order] for column in columns))
 
 
 def plant(
-    cut_points: list[Float64],
-    cuts: list[Cut],
+    boundary_points: list[Float64],
+    boundaries: list[Boundary],
     polygons: list[Float64],
     centres_m: Float64,
     area_m2: Float64,
     cover: NDArray[np.int8],
     rng: np.random.Generator,
 ) -> Trees:
-    """Return the trees of a cell: hedges, trees along ways, in gardens, meadows and fields."""
+    """Return the trees of a cell: hedges, trees along roads, in gardens, meadows and fields."""
     groups = [_empty()]
-    for points, cut in zip(cut_points, cuts, strict=True):
-        if cut.way is Way.HEDGE:
+    for points, cut in zip(boundary_points, boundaries, strict=True):
+        if cut.kind is LineKind.HEDGE:
             groups.append(_hedge(points, cut.gone_year, rng))
-        elif rng.uniform() < {Way.MAIN: 0.5, Way.MINOR: 0.25, Way.TRACK: 0.2, Way.STRIP: 0.05}.get(
-            cut.way, 0.0
-        ):
+        elif rng.uniform() < {
+            LineKind.MAIN: 0.5,
+            LineKind.MINOR: 0.25,
+            LineKind.TRACK: 0.2,
+            LineKind.STRIP: 0.05,
+        }.get(cut.kind, 0.0):
             groups.append(_row(points, rng))
     for polygon, centre, area, kind in zip(
         polygons, centres_m, area_m2.tolist(), cover.tolist(), strict=True
@@ -68,13 +71,13 @@ def plant(
 
 
 def _mean_count(kind: int, area_m2: float) -> float:
-    if kind == Cover.GARDEN:
+    if kind == LandCover.GARDEN:
         return min(area_m2 / 350.0, 6.0)
-    if kind == Cover.MEADOW:
+    if kind == LandCover.MEADOW:
         return min(area_m2 / 9000.0, 6.0)
-    if kind == Cover.ROUGH:
+    if kind == LandCover.ROUGH:
         return min(area_m2 / 400.0, 60.0)
-    return 0.15 if kind == Cover.ARABLE else 0.0
+    return 0.15 if kind == LandCover.ARABLE else 0.0
 
 
 def _empty() -> Trees:
@@ -108,7 +111,7 @@ def _hedge(points: Float64, gone_year: float, rng: np.random.Generator) -> Trees
 
 
 def _row(points: Float64, rng: np.random.Generator) -> Trees:
-    """Return a row of trees beside a line."""
+    """Return a row of trees along one side of a line."""
     spacing = rng.uniform(9.0, 22.0)
     places = _along(points, spacing, rng)
     step = points[-1] - points[0]

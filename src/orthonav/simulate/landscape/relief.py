@@ -1,4 +1,4 @@
-"""What stands up from the ground: woods, trees, buildings, and the light they leave."""
+"""Objects with height (woods, trees, buildings), and the shadows they cast."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from orthonav.simulate.landscape.crops import Looks
 from orthonav.simulate.landscape.epoch import Epoch, Season
-from orthonav.simulate.landscape.ground import Labels, Mask
 from orthonav.simulate.landscape.noise import (
     Float32,
     Float64,
@@ -18,15 +17,16 @@ from orthonav.simulate.landscape.noise import (
     noise_grid,
     uniform,
 )
-from orthonav.simulate.landscape.parcels import Cover
+from orthonav.simulate.landscape.parcels import LandCover
 from orthonav.simulate.landscape.plan import CellPlan
 from orthonav.simulate.landscape.plants import Trees, join
 from orthonav.simulate.landscape.roofs import FLAT, Buildings
-from orthonav.simulate.landscape.window import Window
+from orthonav.simulate.landscape.surface import Labels, Mask
+from orthonav.simulate.landscape.window import PixelWindow
 
 _LEVELS_PER_M = 8.0  # heights are drawn into bytes
 TALLEST_M = 26.0
-"""Nothing stands higher than this."""
+"""Upper limit of all heights; sets the reach of shadows."""
 
 _CROWN_M = 6.5
 _FRUIT_M = (6.5, 5.0)  # between rows of fruit trees, and within a row
@@ -34,20 +34,25 @@ _LEAF_RGB: dict[Season, tuple[tuple[float, float, float], tuple[float, float, fl
     Season.SPRING: ((84.0, 112.0, 58.0), (112.0, 134.0, 70.0)),
     Season.SUMMER: ((64.0, 88.0, 48.0), (88.0, 108.0, 60.0)),
     Season.AUTUMN: ((86.0, 96.0, 54.0), (140.0, 114.0, 64.0)),
-    Season.WINTER: ((92.0, 84.0, 70.0), (116.0, 104.0, 88.0)),
 }
 _NEEDLE_RGB = (58.0, 78.0, 52.0)
 
 
 def paint_wood(
-    rgb: Float32, labels: Labels, look: Looks, closed: Mask, window: Window, seed: int, epoch: Epoch
+    rgb: Float32,
+    labels: Labels,
+    look: Looks,
+    closed: Mask,
+    window: PixelWindow,
+    seed: int,
+    epoch: Epoch,
 ) -> Float32:
     """Draw the canopy of woods into `rgb` (H, W, 3); return its height (H, W) in metres.
 
-    Crowns stand on a jittered lattice, so a wood keeps its trees from date to date.
+    Crowns stand on a jittered lattice, so a wood has the same trees at all dates.
     """
     height = np.zeros(window.shape, np.float32)
-    wood = ((look.cover == Cover.FOREST)[labels]) & (closed < 100)
+    wood = ((look.cover == LandCover.FOREST)[labels]) & (closed < 100)
     rows, cols = np.nonzero(wood)
     if len(rows) == 0:
         return height
@@ -73,11 +78,11 @@ def paint_orchards(
     labels: Labels,
     look: Looks,
     closed: Mask,
-    window: Window,
+    window: PixelWindow,
     epoch: Epoch,
 ) -> None:
     """Draw fruit trees in straight rows into colour (H, W, 3) and height (H, W)."""
-    rows, cols = np.nonzero((look.cover == Cover.ORCHARD)[labels] & (closed < 100))
+    rows, cols = np.nonzero((look.cover == LandCover.ORCHARD)[labels] & (closed < 100))
     if len(rows) == 0:
         return
     parcel = labels[rows, cols]
@@ -119,7 +124,7 @@ def _crowns(key: int, x: Float64, y: Float64) -> tuple[Float32, Float32]:
 
 
 def paint_trees(
-    rgb: Float32, height: Float32, plans: Sequence[CellPlan], window: Window, epoch: Epoch
+    rgb: Float32, height: Float32, plans: Sequence[CellPlan], window: PixelWindow, epoch: Epoch
 ) -> None:
     """Draw single trees and hedges into colour (H, W, 3) and height (H, W)."""
     near = [plan.trees.at(epoch.time_years) for plan in plans]
@@ -138,14 +143,14 @@ def paint_trees(
     )
     mix = leaf[rows, cols].astype(np.float32)[:, None] * np.float32(1.0 / 255.0)
     colour = (low + mix * (high - low)) * (0.95 + 0.15 * texture[rows, cols])[:, None]
-    alpha = cover[rows, cols][:, None] * np.float32(0.8 if epoch.season is Season.WINTER else 1.0)
+    alpha = cover[rows, cols][:, None]
     old = rgb[rows, cols]
     rgb[rows, cols] = old + alpha * (colour - old)
     dome *= 0.95 + 0.12 * texture
     np.maximum(height, dome, out=height)
 
 
-def _draw_crowns(trees: Trees, window: Window, epoch: Epoch) -> tuple[Mask, Mask]:
+def _draw_crowns(trees: Trees, window: PixelWindow, epoch: Epoch) -> tuple[Mask, Mask]:
     """Return heights (1/8 m) and leaf colour numbers (H, W) of crowns drawn as domes."""
     crown, leaf = np.zeros(window.shape, np.uint8), np.zeros(window.shape, np.uint8)
     level = np.clip(trees.height_m * _LEVELS_PER_M, 0, 255)
@@ -164,7 +169,7 @@ def paint_buildings(
     image: NDArray[np.uint8],
     height: Float32,
     plans: Sequence[CellPlan],
-    window: Window,
+    window: PixelWindow,
     epoch: Epoch,
 ) -> Mask:
     """Draw roofs into 8-bit colour (H, W, 3) and height (H, W); return their cover (H, W)."""
@@ -185,7 +190,7 @@ def _draw_buildings(
     image: NDArray[np.uint8],
     cover: Mask,
     tall: Mask,
-    window: Window,
+    window: PixelWindow,
     sun: Float64,
 ) -> None:
     corners, ridges = window.fixed(buildings.corners()), window.fixed(buildings.ridges())
@@ -219,11 +224,11 @@ def sun_vector(epoch: Epoch) -> Float64:
 
 
 def shadow_reach_m(epoch: Epoch) -> float:
-    """Return how far shadows fall at most."""
+    """Return the largest length of a shadow."""
     return float(TALLEST_M / np.tan(np.deg2rad(epoch.sun_elevation_deg)))
 
 
-def lighting(height: Float32, roofs: Mask, window: Window, epoch: Epoch) -> Float32:
+def lighting(height: Float32, roofs: Mask, window: PixelWindow, epoch: Epoch) -> Float32:
     """Return direct light (H, W) relative to open level ground: 0 in shadow, above 1 facing it."""
     sun = sun_vector(epoch)
     slope = float(sun[2] / max(np.hypot(sun[0], sun[1]), 1e-3))

@@ -1,4 +1,4 @@
-"""Buildings: one or more on a plot, turned with it, their roofs made of plane faces."""
+"""Buildings: one or more on a plot, aligned with it, with roofs of plane faces."""
 
 from dataclasses import dataclass, fields
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from orthonav.simulate.landscape.network import Settlement
 from orthonav.simulate.landscape.noise import Float64
-from orthonav.simulate.landscape.parcels import FIRST_YEAR, Cover
+from orthonav.simulate.landscape.parcels import FIRST_YEAR, LandCover
 
 _ROOF_RGB = np.array(
     [
@@ -61,7 +61,7 @@ class Buildings:
         return self._placed(unit[None] * np.stack([self.length_m, self.width_m], axis=1)[:, None])
 
     def ridges(self) -> Float64:
-        """Return both ends of the ridges (N, 2, 2); a hip roof's are drawn in."""
+        """Return both ends of the ridges (N, 2, 2); those of hip roofs are shorter."""
         inset = np.where(
             self.shape == HIP, 0.5 * np.minimum(self.width_m, 0.9 * self.length_m), 0.0
         )
@@ -96,9 +96,9 @@ def build(
     centres_m (M, 2), angle_rad, area_m2, cover (M,) and `settlements` describe the parcels.
     """
     in_town = np.array([s is not None and s.plot_m2 < 800.0 for s in settlements])
-    plot = (cover == Cover.GARDEN) & (rng.uniform(size=len(cover)) < 0.9)
-    yard = cover == Cover.YARD
-    farm = (cover == Cover.MEADOW) & (rng.uniform(size=len(cover)) < 0.025)
+    plot = (cover == LandCover.GARDEN) & (rng.uniform(size=len(cover)) < 0.9)
+    yard = cover == LandCover.YARD
+    farm = (cover == LandCover.MEADOW) & (rng.uniform(size=len(cover)) < 0.025)
     main = np.flatnonzero(plot | yard | farm)
     extra = main[rng.uniform(size=len(main)) < np.where(farm[main], 1.0, 0.35)]
     parcel = np.concatenate([main, extra])
@@ -144,7 +144,7 @@ def _roof_colours(
 
 
 def _years(shed: NDArray[np.bool_], rng: np.random.Generator) -> dict[str, Float64]:
-    """Return when buildings appear and vanish: most have always stood, sheds come and go."""
+    """Return first and last years of buildings; few houses change, many sheds do."""
     count = len(shed)
     born = FIRST_YEAR - 100.0 + rng.uniform(0.0, 140.0, count)
     gone = FIRST_YEAR + rng.exponential(np.where(shed, 60.0, 300.0), count)

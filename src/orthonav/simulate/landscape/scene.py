@@ -1,4 +1,4 @@
-"""The landscape itself: ask it for any window at any date and resolution."""
+"""The landscape: renders any window at any date and resolution."""
 
 from collections import OrderedDict
 from math import ceil
@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from orthonav.errors import AreaError
 from orthonav.simulate.landscape.crops import looks
 from orthonav.simulate.landscape.epoch import Epoch
-from orthonav.simulate.landscape.ground import label_parcels, paint_parcels, paint_ways
 from orthonav.simulate.landscape.network import Network
 from orthonav.simulate.landscape.noise import Float32
 from orthonav.simulate.landscape.plan import CellPlan, make_plan, outline_box
@@ -22,20 +21,21 @@ from orthonav.simulate.landscape.relief import (
     shadow_reach_m,
 )
 from orthonav.simulate.landscape.sensor import develop, expose
-from orthonav.simulate.landscape.window import Box, Window, chunks
+from orthonav.simulate.landscape.surface import label_parcels, paint_lines, paint_parcels
+from orthonav.simulate.landscape.window import Box, PixelWindow, chunks
 
 ORIGIN_M = (652000.0, 6862000.0)
 """Lambert-93 (EPSG:2154) east and north of the landscape's origin."""
 
 GSD_RANGE_M = (0.2, 10.0)
-"""Finest and coarsest ground resolution that can be drawn."""
+"""Finest and coarsest ground resolution that can be rendered."""
 
 _CHUNK_PX = 1024
-_CELLS_KEPT = 96
+_CACHED_CELLS = 96  # enough for one row of chunks
 
 
 class Landscape:
-    """An endless invented countryside; two with the same seed are the same everywhere."""
+    """An unbounded generated landscape; a pure function of its seed."""
 
     def __init__(self, seed: int = 1) -> None:
         if seed < 0:
@@ -54,18 +54,20 @@ class Landscape:
         height_px: int,
         gsd_m: float,
     ) -> NDArray[np.uint8]:
-        """Return the picture (H, W, 3) RGB of the ground whose upper left corner is given.
+        """Return the image (H, W, 3) RGB of the window whose upper left corner is given.
 
         west_m, north_m: outer corner of the first pixel in EPSG:2154, metres.
-        gsd_m: metres on the ground per pixel, 0.2..10. The same ground looks the same in every
-        window whose pixels lie on the same grid. Raises `AreaError` on impossible sizes.
+        gsd_m: metres on the ground per pixel, 0.2..10. Windows on the same pixel grid agree where
+        they overlap. Raises `AreaError` on impossible sizes.
         """
         if width_px < 1 or height_px < 1:
-            raise AreaError(f"a picture needs at least one pixel, got {width_px} x {height_px}")
+            raise AreaError(f"an image needs at least one pixel, got {width_px} x {height_px}")
         check_gsd(gsd_m)
         if not (np.isfinite(west_m) and np.isfinite(north_m)):
-            raise AreaError(f"the corner of a picture must be finite, got {west_m}, {north_m}")
-        whole = Window.at(west_m - ORIGIN_M[0], north_m - ORIGIN_M[1], width_px, height_px, gsd_m)
+            raise AreaError(f"the corner of an image must be finite, got {west_m}, {north_m}")
+        whole = PixelWindow.at(
+            west_m - ORIGIN_M[0], north_m - ORIGIN_M[1], width_px, height_px, gsd_m
+        )
         out = np.empty((height_px, width_px, 3), np.uint8)
         factor = ceil(gsd_m / 1.25)
         for col, row, width, height in chunks(width_px, height_px, _CHUNK_PX // factor):
@@ -76,7 +78,7 @@ class Landscape:
             out[row : row + height, col : col + width] = develop(picture, part, self.seed, date)
         return out
 
-    def _picture(self, window: Window, date: Epoch) -> Float32:
+    def _picture(self, window: PixelWindow, date: Epoch) -> Float32:
         """Return the picture (H, W, 3) float of a window, drawn with a margin and cropped."""
         margin = ceil(max(shadow_reach_m(date), 24.0) / window.gsd_m) + 4
         wide = window.part(
@@ -86,7 +88,7 @@ class Landscape:
         labels = label_parcels(plans, wide)
         look = looks(plans, date)
         rgb = paint_parcels(labels, look, wide, self.seed, date)
-        closed = paint_ways(rgb, plans, self._network, wide, date)
+        closed = paint_lines(rgb, plans, self._network, wide, date)
         height = paint_wood(rgb, labels, look, closed, wide, self.seed, date)
         paint_orchards(rgb, height, labels, look, closed, wide, date)
         paint_trees(rgb, height, plans, wide, date)
@@ -95,14 +97,14 @@ class Landscape:
         light = lighting(height, roofs, wide, date)
         return expose(image, light, wide, date)[margin:-margin, margin:-margin]
 
-    def _plans_in(self, window: Window) -> list[CellPlan]:
+    def _plans_in(self, window: PixelWindow) -> list[CellPlan]:
         """Return the plans of the macro-cells that reach into a window, in a fixed order."""
         cells = self._network.cells_near(window.bounds_m)
         near = [cell for cell in cells if window.touches(self._box(cell))]
         plans = [self._plan(cell) for cell in near]
-        while len(self._plans) > max(_CELLS_KEPT, len(near)):
+        while len(self._plans) > max(_CACHED_CELLS, len(near)):
             self._plans.popitem(last=False)
-        while len(self._boxes) > 64 * _CELLS_KEPT:
+        while len(self._boxes) > 64 * _CACHED_CELLS:
             self._boxes.popitem(last=False)
         return plans
 
@@ -126,20 +128,7 @@ def _averaged(picture: Float32, factor: int) -> Float32:
 
 
 def check_gsd(gsd_m: float) -> None:
-    """Raise `AreaError` where a ground resolution cannot be drawn."""
+    """Raise `AreaError` if a ground resolution cannot be rendered."""
     low, high = GSD_RANGE_M
     if not (low <= gsd_m <= high):
         raise AreaError(f"gsd_m must be between {low} and {high} m per pixel, got {gsd_m}")
-
-
-def render(
-    landscape: Landscape,
-    date: Epoch,
-    west_m: float,
-    north_m: float,
-    width_px: int,
-    height_px: int,
-    gsd_m: float,
-) -> NDArray[np.uint8]:
-    """Return what `Landscape.render` returns."""
-    return landscape.render(date, west_m, north_m, width_px, height_px, gsd_m)

@@ -1,4 +1,4 @@
-"""From lit ground to what the camera delivers: light, haze, contrast, blur and noise."""
+"""Sensor model: light, haze, contrast, blur and noise."""
 
 import cv2
 import numpy as np
@@ -6,15 +6,15 @@ from numpy.typing import NDArray
 
 from orthonav.simulate.landscape.epoch import Epoch
 from orthonav.simulate.landscape.noise import Float32, key_of, noise_grid, white_grid
-from orthonav.simulate.landscape.window import Window
+from orthonav.simulate.landscape.window import PixelWindow
 
-_SKY = np.array([0.40, 0.43, 0.48], np.float32)  # share of the light that shadows still get
+_SKY = np.array([0.40, 0.43, 0.48], np.float32)  # share of diffuse light, which shadows receive too
 _HAZE_RGB = np.array([196.0, 204.0, 214.0], np.float32)
 _MIDDLE = 120.0
-_FADE = 0.15  # colours from the air are paler than from near
+_FADE = 0.15  # colours are less saturated from the air
 
 
-def expose(rgb: NDArray[np.uint8], light: Float32, window: Window, epoch: Epoch) -> Float32:
+def expose(rgb: NDArray[np.uint8], light: Float32, window: PixelWindow, epoch: Epoch) -> Float32:
     """Return the picture (H, W, 3) float before noise: colours (H, W, 3) under `light` (H, W)."""
     out = rgb.astype(np.float32)
     drift = noise_grid(key_of("drift", epoch.name), window.east_m, window.north_m, 2600.0)
@@ -33,7 +33,7 @@ def expose(rgb: NDArray[np.uint8], light: Float32, window: Window, epoch: Epoch)
     return np.asarray(cv2.GaussianBlur(out, (0, 0), 0.55), np.float32)
 
 
-def develop(picture: Float32, window: Window, seed: int, epoch: Epoch) -> NDArray[np.uint8]:
+def develop(picture: Float32, window: PixelWindow, seed: int, epoch: Epoch) -> NDArray[np.uint8]:
     """Return the 8-bit picture (H, W, 3) with sensor noise, one number per pixel and channel."""
     out = picture.copy()
     shared = white_grid(key_of(seed, "noise", epoch.name), window.columns, window.rows)

@@ -1,4 +1,4 @@
-"""The piece of ground being drawn, and drawing on it with sub-pixel corners."""
+"""The rendered window of the landscape, and drawing on it with sub-pixel corners."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ _ONE = 1 << _SHIFT
 
 
 @dataclass(frozen=True, eq=False)
-class Window:
-    """A grid of pixels on the ground, counted from the landscape's origin.
+class PixelWindow:
+    """A grid of pixels, counted from the origin of the landscape.
 
     Columns count east and rows count south from a corner near the origin (`phase_en_m` away), so
     that two windows on the same grid compute bit-equal coordinates for the pixels they share.
@@ -36,16 +36,16 @@ class Window:
     @classmethod
     def at(
         cls, west_m: float, north_m: float, width_px: int, height_px: int, gsd_m: float
-    ) -> "Window":
+    ) -> "PixelWindow":
         """Return the window whose upper left corner is (west_m, north_m) from the origin."""
         col = int(np.floor(west_m / gsd_m + 1e-6))
         row = int(np.floor(-north_m / gsd_m + 1e-6))
         phase = (_snapped(west_m - col * gsd_m, gsd_m), _snapped(north_m + row * gsd_m, gsd_m))
         return cls(col, row, width_px, height_px, gsd_m, phase)
 
-    def part(self, col: int, row: int, width_px: int, height_px: int) -> "Window":
+    def part(self, col: int, row: int, width_px: int, height_px: int) -> "PixelWindow":
         """Return the window that starts at pixel (row, col) of this one; it may reach outside."""
-        return Window(
+        return PixelWindow(
             self.first_col + col,
             self.first_row + row,
             width_px,
@@ -54,9 +54,9 @@ class Window:
             self.phase_en_m,
         )
 
-    def finer(self, factor: int) -> "Window":
-        """Return the window of the same ground with `factor` times as many pixels each way."""
-        return Window(
+    def finer(self, factor: int) -> "PixelWindow":
+        """Return the same window with `factor` times as many pixels along each axis."""
+        return PixelWindow(
             self.first_col * factor,
             self.first_row * factor,
             self.width_px * factor,
@@ -109,11 +109,11 @@ class Window:
     def fixed(self, points_en_m: Float64) -> NDArray[np.int32]:
         """Return points (..., 2) as OpenCV fixed point (column, row) of this window.
 
-        Rounded before the window's own corner is taken off, so that it never matters.
+        Rounded before the window corner is subtracted, so that the window has no influence.
         """
         out = np.empty(points_en_m.shape, np.int64)
         scale = _ONE / self.gsd_m
-        half = _ONE // 2  # OpenCV puts the whole number in the middle of the pixel
+        half = _ONE // 2  # integer coordinates of OpenCV are pixel centres
         out[..., 0] = np.rint((points_en_m[..., 0] - self.phase_en_m[0]) * scale)
         out[..., 1] = np.rint((self.phase_en_m[1] - points_en_m[..., 1]) * scale)
         out[..., 0] -= self.first_col * _ONE + half
@@ -166,7 +166,7 @@ class Window:
 
 
 def _snapped(phase_m: float, gsd_m: float) -> float:
-    """Round away the float noise of the window's corner, far below what can be seen."""
+    """Round away float noise of the window corner, far below a pixel."""
     return round(phase_m / gsd_m * 1e4) * gsd_m / 1e4
 
 

@@ -1,13 +1,13 @@
-// What is asked of the server: everything is read, nothing is sent.
+// Requests to the server, which only reads.
 
-/** The JSON at a path; throws an Error with what the server said. */
+/** The JSON at a path; throws an Error with the message of the server. */
 export async function getJson(path) {
   const reply = await fetch(path, { cache: "no-store" });
   if (!reply.ok) throw new Error((await reply.text()).trim() || reply.statusText);
   return reply.json();
 }
 
-/** What came after so many views and lines of health. */
+/** What is new after so many views and lines of health. */
 export function getNews(generation, views, health) {
   return getJson(`api/news?generation=${generation}&views=${views}&health=${health}`);
 }
@@ -15,15 +15,15 @@ export function getNews(generation, views, health) {
 const POLL_MS = 500;
 const POLL_LATER_MS = 3000;
 
-/** Asks for news for ever, twice a second while the page is seen; `told` is called with each
-    answer, `lost` with true where the server does not answer and with false when it does again. */
-export function follow(state, told, lost) {
+/** Polls for news, twice a second while the page is visible; `take` is called with each response,
+    `lost` with true when the server does not respond and with false when it does again. */
+export function follow(state, take, lost) {
   let timer = 0;
   const once = async () => {
     clearTimeout(timer);
     let wait = document.hidden ? POLL_LATER_MS : POLL_MS;
     try {
-      told(await getNews(...state()));
+      take(await getNews(...state()));
       lost(false);
     } catch {
       lost(true);

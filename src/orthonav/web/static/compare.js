@@ -1,12 +1,13 @@
-// The selected view beside the map where it was put and where it was taken, and laid over both, to
-// judge by eye: fainter and stronger, or blinking.
+// The selected view beside the map at its fix and at its true position, and overlaid on both to
+// compare by eye: faded, or blinking.
 
 import { getJson, mapUrl, rawUrl, viewUrl } from "./api.js";
 import { L, at } from "./map.js";
-import { SAID, clock, metres, number } from "./look.js";
+import { clock, metres, number } from "./format.js";
+import { NAMES } from "./look.js";
 
 const BLINK_MS = 600; // slower than three flashes a second
-const WAIT_MS = 90; // while stepping fast, pictures are not asked for
+const WAIT_MS = 90; // while stepping fast, images are not requested
 
 export class Compare {
   constructor(map, store, root) {
@@ -35,7 +36,7 @@ export class Compare {
   /** Shows none. */
   clear() {
     clearTimeout(this.timer);
-    this.asked += 1; // what is still to come is of a view that is gone
+    this.asked += 1; // pending responses are for a view that is gone
     this.detail = undefined;
     this.over?.remove();
     this.over = null;
@@ -68,21 +69,21 @@ export class Compare {
     this.over?.remove();
     this.over = null;
     if (!window) {
-      this.find("no-compare").querySelector("p").textContent = `No picture from above: ${detail.why_no_window}.`;
+      this.find("no-compare").querySelector("p").textContent = `Cannot be rectified: ${detail.why_no_window}.`;
       this.#raw(i, detail);
       return;
     }
     const name = c.frame[i];
-    this.#image("img-view", viewUrl(i, generation), `View ${name} seen from above, north up`);
+    this.#image("img-view", viewUrl(i, generation), `View ${name}, rectified, north up`);
     this.find("figure-fix").hidden = !placed;
-    // Near to the fix it would be the same picture again.
+    // Near the fix it would show the same.
     const apart = taken && !(c.err[i] <= this.store.run.radius_m);
     this.find("figure-truth").hidden = !apart;
     if (placed) {
-      this.#image("img-fix", mapUrl(i, "fix", generation), "Map where the view was put");
+      this.#image("img-fix", mapUrl(i, "fix", generation), "Map at the fix");
       this.#image("img-over", viewUrl(i, generation), "");
     }
-    if (apart) this.#image("img-truth", mapUrl(i, "truth", generation), "Map where the view was taken");
+    if (apart) this.#image("img-truth", mapUrl(i, "truth", generation), "Map at the true position");
     this.#crosses(i, window);
     this.#layOver(placed ? [c.x[i], c.y[i]] : [c.tx[i], c.ty[i]], window, viewUrl(i, generation), placed || taken);
   }
@@ -93,17 +94,17 @@ export class Compare {
     image.src = url;
   }
 
-  /** The picture as it was taken, where it cannot be laid on the ground. */
+  /** The image as recorded, where it cannot be rectified. */
   #raw(i, detail) {
     const image = this.find("img-raw");
-    image.hidden = !("told" in detail);
+    image.hidden = !("telemetry" in detail);
     if (image.hidden) return;
     image.onerror = () => { image.hidden = true; };
-    image.alt = "The view as it was taken";
+    image.alt = "The view as recorded";
     image.src = rawUrl(i, this.store.generation);
   }
 
-  /** Marks the places below the camera, which a camera that tilts does not see in the middle. */
+  /** Marks the points below the camera, which a tilt moves off the middle. */
   #crosses(i, window) {
     const { columns: c, run } = this.store;
     const [east, north] = window.offset_en_m.map((value) => value / window.side_m);
@@ -114,12 +115,12 @@ export class Compare {
     this.#cross("taken", 0.5 - east, 0.5 + north);
   }
 
-  /** Puts a mark at a place of its picture, told in shares of its side. */
+  /** Puts a mark at a position of its image, given as shares of its side. */
   #cross(id, x, y) {
     const cross = this.find(id);
     cross.hidden = !(x > 0 && x < 1 && y > 0 && y < 1);
     cross.style.left = `${100 * x}%`;
-    // The picture is square and as wide as its figure; the caption below it is not counted.
+    // The image is square and as wide as its figure; the caption below it is not counted.
     cross.style.top = `${y * cross.parentElement.clientWidth}px`;
   }
 
@@ -142,18 +143,18 @@ export class Compare {
     else this.over.remove();
   }
 
-  /** Makes the view over the map stronger or fainter by some per cent. */
+  /** Changes the opacity of the overlay by some percent. */
   fadeBy(percent) {
     this.find("opacity").value = Number(this.find("opacity").value) + percent;
     this.#fade();
   }
 
-  /** Lays the view on the large map or takes it away. */
+  /** Overlays the view on the large map, or removes it. */
   toggleOnMap() {
     this.find("on-map").click();
   }
 
-  /** Begins or ends to blink. */
+  /** Starts or stops blinking. */
   blink() {
     const button = this.find("blink");
     const on = button.getAttribute("aria-pressed") !== "true";
@@ -182,13 +183,13 @@ export class Compare {
     if ("lat_deg" in detail) rows.push(["position", place(detail.lat_deg, detail.lon_deg)]);
     if ("true_lat_deg" in detail) rows.push(["true position", place(detail.true_lat_deg, detail.true_lon_deg)]);
     if (detail.reason) rows.push(["no fix", `${detail.reason}: ${detail.detail}`]);
-    for (const [name, value] of Object.entries(detail.told ?? {})) rows.push([`told ${name}`, number(value ?? NaN, 3)]);
+    for (const [name, value] of Object.entries(detail.telemetry ?? {})) rows.push([`reported ${name}`, number(value ?? NaN, 3)]);
     for (const [name, value] of Object.entries(detail.evidence ?? {})) {
       rows.push([name, value === null ? "–" : String(Number(value.toPrecision(5)))]);
     }
-    this.find("known").replaceChildren(...rows.filter(([, said]) => said).flatMap(([name, said]) => {
+    this.find("known").replaceChildren(...rows.filter(([, text]) => text).flatMap(([name, text]) => {
       const [term, value] = [document.createElement("dt"), document.createElement("dd")];
-      [term.textContent, value.textContent] = [name, said];
+      [term.textContent, value.textContent] = [name, text];
       return [term, value];
     }));
   }
@@ -196,13 +197,13 @@ export class Compare {
 
 const place = (lat, lon) => `${lat.toFixed(7)}, ${lon.toFixed(7)}`;
 
-/** The selected view in a sentence, for eyes and screen readers. */
+/** The selected view in a sentence, also for screen readers. */
 export function sentence(store, i) {
   const c = store.columns;
   const parts = [store.rising ? clock(c.t[i]) : `view ${i + 1}`];
   const health = healthAt(store, i);
   if (c.reason[i]) parts.push(`no fix: ${c.reason[i]}`);
-  else parts.push(SAID[store.state(i)]);
+  else parts.push(NAMES[store.state(i)]);
   if (Number.isFinite(c.err[i])) parts.push(`error ${metres(c.err[i])}`);
   if (c.wrong[i]) parts.push("CONFIDENT AND WRONG");
   if (Number.isFinite(c.conf[i])) parts.push(`confidence ${number(c.conf[i], 3)} within ${metres(c.radius[i])}`);
@@ -213,7 +214,7 @@ export function sentence(store, i) {
   return parts.join(", ");
 }
 
-/** The line of health that held when a view came out, undefined where there is none. */
+/** The health at the time of a view, undefined without one. */
 export function healthAt(store, i) {
   let found;
   for (const line of store.health) {

@@ -1,4 +1,4 @@
-// How the flight was going: the last word in the header, what changed in a list.
+// Health of the flight: the current level in the header, changes in a list.
 
 const LEVELS = { OK: "good", DEGRADED: "warn", FAILED: "bad" };
 const MOST = 200;
@@ -23,7 +23,7 @@ export class HealthPart {
     badge.className = `badge ${LEVELS[last.level] ?? ""}`;
     badge.textContent = [`health ${last.level}`, last.reasons.join(", ")].filter(Boolean).join(": ");
     this.#last(last);
-    const changes = lines.filter((line, k) => !k || said(line) !== said(lines[k - 1]));
+    const changes = lines.filter((line, k) => !k || key(line) !== key(lines[k - 1]));
     this.find("health-list").replaceChildren(...changes.slice(-MOST).reverse().map((line) => this.#row(line)));
   }
 
@@ -33,7 +33,7 @@ export class HealthPart {
       const parts = Object.entries(last[name] ?? {}).map(([key, value]) => `${key} ${value}`);
       if (parts.length) rows.push([name.replace("_", " "), parts.join(", ")]);
     }
-    if ("age_p95_ms" in last) rows.push(["age", `${last.age_p50_ms} ms median, ${last.age_p95_ms} ms 95 %`]);
+    if ("age_p95_ms" in last) rows.push(["age", `${last.age_p50_ms} ms median, ${last.age_p95_ms} ms p95`]);
     this.find("health-last").replaceChildren(...rows.flatMap(([name, text]) => {
       const [term, value] = [document.createElement("dt"), document.createElement("dd")];
       [term.textContent, value.textContent] = [name, text];
@@ -53,4 +53,4 @@ export class HealthPart {
   }
 }
 
-const said = (line) => [line.level, ...line.reasons].join();
+const key = (line) => [line.level, ...line.reasons].join();

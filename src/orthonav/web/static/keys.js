@@ -1,8 +1,8 @@
-// Single keys. Off where somebody types, and as a whole where the help says so, for they get in the
-// way of speech input.
+// Single keys. They are off in text fields, and can be turned off in the help, because they conflict
+// with speech input.
 
 const TYPES = "input:not([type=range]):not([type=checkbox]), textarea, select";
-const MOVED_BY_KEYS = "#map, #opacity"; // the slider of the course is the same as the course
+const MOVED_BY_KEYS = "#map, #opacity"; // the slider of the course acts like the course
 const STORED = "orthonav-keys";
 
 export function listen(store, actions, root) {

@@ -1,6 +1,8 @@
-// The list of views: which are shown, in which order; a few at a time.
+// The list of views, filtered and ordered, one page at a time.
 
-import { MARKS, SAID, clock, metres, number } from "./look.js";
+import { clock, metres, number } from "./format.js";
+import { MARKS, NAMES } from "./look.js";
+import { CONFIDENT } from "./store.js";
 
 const PAGE = 40;
 
@@ -8,7 +10,7 @@ export class List {
   constructor(store, root) {
     this.store = store;
     this.find = (id) => root.getElementById(id);
-    this.first = 0; // of the page of the list that is there
+    this.first = 0; // of the current page of the list
     const [which, order, named] = ["which", "order", "named"].map(this.find);
     which.addEventListener("change", () => this.#ask({ which: which.value }));
     order.addEventListener("change", () => this.#ask({ order: order.value }));
@@ -24,10 +26,10 @@ export class List {
 
   /** One row of the list is a stop of Tab; the arrow keys go from row to row. */
   #arrows(event) {
-    const way = { ArrowDown: 1, ArrowUp: -1 }[event.key];
-    if (!way || !event.target.closest("#list")) return;
+    const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
+    if (!step || !event.target.closest("#list")) return;
     event.preventDefault();
-    this.store.stepList(way);
+    this.store.stepList(step);
     this.find("list").querySelector("[aria-current]")?.focus();
   }
 
@@ -43,31 +45,29 @@ export class List {
     if (this.store.listed.length) this.store.select(this.store.listed[0], "list");
   }
 
-  /** What can be shown: what there is none of is not offered, unless it is chosen. */
+  /** Choices of the filter; empty ones are not offered unless chosen. */
   drawChoices() {
     const { store } = this;
     const many = (rule) => { let n = 0; for (let i = 0; i < store.count; i++) n += rule(i) ? 1 : 0; return n; };
     const c = store.columns;
     const choices = [["all", "all views", store.count], ["fix", "fixes", store.stats.fixes]];
     if (store.stats.withTruth) {
-      choices.push(["wrong", "sure and wrong", store.stats.wrong]);
+      choices.push(["wrong", "confident and wrong", store.stats.wrong]);
       choices.push(["far", `error above ${metres(store.run.radius_m)}`, many((i) => c.err[i] > store.run.radius_m)]);
     }
-    choices.push(["doubt", "confidence below 0.9", many((i) => !c.reason[i] && !(c.conf[i] >= 0.9))]);
+    choices.push(["doubt", `confidence below ${CONFIDENT}`, many((i) => !c.reason[i] && !(c.conf[i] >= CONFIDENT))]);
     for (const state of store.run.states) {
       choices.push([`state:${state}`, state, many((i) => store.state(i) === state)]);
     }
     choices.push(["none", "no fix", store.count - store.stats.fixes]);
     for (const [reason, count] of store.reasons) choices.push([`reason:${reason}`, `no fix: ${reason}`, count]);
-    const kept = choices.filter(([value, , count]) => count || ["all", "wrong", store.which].includes(value));
-    const said = JSON.stringify(kept);
-    if (said === this.said) return;
-    this.said = said;
-    this.find("which").replaceChildren(...kept.map(([value, text, count]) => new Option(`${text} (${count})`, value)));
+    const offered = choices.filter(([value, , count]) => count || ["all", "wrong", store.which].includes(value));
+    const key = JSON.stringify(offered);
+    if (key === this.key) return;
+    this.key = key;
+    this.find("which").replaceChildren(...offered.map(([value, text, count]) => new Option(`${text} (${count})`, value)));
     this.find("which").value = store.which;
-    for (const name of ["error"]) {
-      this.find("order").querySelector(`[value=${name}]`).disabled = !store.stats.withTruth;
-    }
+    this.find("order").querySelector("[value=error]").disabled = !store.stats.withTruth;
   }
 
   draw() {
@@ -93,7 +93,7 @@ export class List {
     const parts = [
       ["mark", MARKS[this.store.state(i)]],
       ["name", name],
-      [c.wrong[i] ? "bad" : "", c.wrong[i] ? `${error} sure!` : error],
+      [c.wrong[i] ? "bad" : "", c.wrong[i] ? `${error} confident!` : error],
       ["soft", Number.isFinite(c.conf[i]) ? number(c.conf[i], 2) : ""],
     ];
     for (const [kind, text] of parts) {
@@ -101,14 +101,14 @@ export class List {
       [part.className, part.textContent] = [kind, text];
       button.append(part);
     }
-    button.firstChild.setAttribute("role", "img"); // a shape for eyes, a word for screen readers
-    button.firstChild.setAttribute("aria-label", SAID[this.store.state(i)]);
+    button.firstChild.setAttribute("role", "img"); // a shape, and a word for screen readers
+    button.firstChild.setAttribute("aria-label", NAMES[this.store.state(i)]);
     const item = document.createElement("li");
     item.append(button);
     return item;
   }
 
-  /** Marks the selected view in the list; `reveal` turns to its page and brings it into sight. */
+  /** Marks the selected view in the list; `reveal` shows its page and scrolls to it. */
   mark(reveal = false) {
     const list = this.find("list");
     list.querySelector("[aria-current]")?.removeAttribute("aria-current");

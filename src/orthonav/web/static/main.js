@@ -1,12 +1,13 @@
-// The page: what is where, and who tells whom.
+// The page: creates its parts and connects them.
 
 import { follow, getJson, getNews } from "./api.js";
-import { Chart } from "./chart.js";
+import { metres, ratio } from "./format.js";
+import { Course } from "./course.js";
 import { Compare, sentence } from "./compare.js";
 import { HealthPart } from "./health.js";
 import { listen } from "./keys.js";
 import { List } from "./list.js";
-import { MARKS, SAID, metres, share, watchColours } from "./look.js";
+import { MARKS, NAMES, watchColours } from "./look.js";
 import { at, fitRun, makeMap, showCursor } from "./map.js";
 import { Chosen, Marks } from "./marks.js";
 import { Store } from "./store.js";
@@ -26,11 +27,11 @@ async function begin() {
     store, map, marks,
     chosen: new Chosen(map, store),
     compare: new Compare(map, store, document),
-    chart: new Chart(store, find("chart")),
+    course: new Course(store, find("chart")),
     list: new List(store, document),
     health: new HealthPart(store, document),
   };
-  watchColours(() => { marks.later(); parts.chosen.draw(); parts.chart.draw(); drawLegend(store); });
+  watchColours(() => { marks.later(); parts.chosen.draw(); parts.course.draw(); drawLegend(store); });
   showCursor(map, run.sheet, store, find("cursor"));
   map.on("click", ({ containerPoint }) => {
     const found = marks.nearest(containerPoint);
@@ -46,27 +47,27 @@ async function begin() {
   if (run.live) live(parts);
 }
 
-/** Draws what an event of the store changes. */
-function tie({ store, map, marks, chosen, compare, chart, list, health }) {
+/** Redraws the parts that an event of the store affects. */
+function tie({ store, map, marks, chosen, compare, course, list, health }) {
   store.addEventListener("data", ({ detail }) => {
     find("scrub").max = Math.max(store.count - 1, 0);
     if (detail.added || detail.anew) {
       marks.later();
-      chart.draw();
+      course.draw();
       list.drawChoices();
       list.draw();
       drawFigures(store);
       drawLegend(store);
     }
     health.draw();
-    if (detail.anew && !store.count) nothing({ chosen, compare });
+    if (detail.anew && !store.count) nothing({ chosen, compare, course });
   });
-  store.addEventListener("filter", () => { marks.later(); chart.draw(); list.draw(); });
+  store.addEventListener("filter", () => { marks.later(); course.draw(); list.draw(); });
   store.addEventListener("select", ({ detail }) => {
     const i = store.selected;
     chosen.draw();
     compare.show();
-    chart.drawNow();
+    course.drawCursor();
     list.mark(true);
     find("scrub").value = i;
     find("scrub").setAttribute("aria-valuetext", `view ${i + 1}: ${sentence(store, i)}`);
@@ -76,26 +77,26 @@ function tie({ store, map, marks, chosen, compare, chart, list, health }) {
   });
 }
 
-/** A run that is begun anew, and has no view yet. */
-function nothing({ chosen, compare }) {
+/** A run that was restarted and has no view yet. */
+function nothing({ chosen, compare, course }) {
   chosen.draw();
   compare.clear();
-  find("chart-now").getContext("2d").reset();
+  course.drawCursor();
   find("scrub").value = 0;
   find("scrub").removeAttribute("aria-valuetext");
   say("");
 }
 
-let saying = 0;
-/** The sentence for eyes at once; screen readers hear it when stepping pauses. */
+let pause = 0;
+/** Shows the sentence at once; screen readers get it when stepping pauses. */
 function say(text) {
-  find("said").setAttribute("aria-busy", "true");
-  find("said").textContent = text;
-  clearTimeout(saying);
-  saying = setTimeout(() => find("said").setAttribute("aria-busy", "false"), 400);
+  find("sentence").setAttribute("aria-busy", "true");
+  find("sentence").textContent = text;
+  clearTimeout(pause);
+  pause = setTimeout(() => find("sentence").setAttribute("aria-busy", "false"), 400);
 }
 
-/** Moves the map only where the selected view is not well inside. */
+/** Moves the map only if the selected view is near its edge. */
 function keepSeen(map, { columns: c, selected: i }) {
   const place = Number.isFinite(c.x[i]) ? [c.x[i], c.y[i]] : [c.tx[i], c.ty[i]];
   if (!place.every(Number.isFinite)) return;
@@ -119,15 +120,15 @@ function makePlay(store) {
   };
 }
 
-function steps({ store, map, compare, chart }, play) {
+function steps({ store, map, compare, course }, play) {
   const click = (id, action) => find(id).addEventListener("click", action);
   click("first", () => store.step(-store.count));
   click("before", () => store.step(-1));
   click("after", () => store.step(1));
   click("last", () => store.step(store.count));
   click("play", () => play());
-  click("zoom-in", () => chart.zoom(0.5));
-  click("zoom-out", () => chart.zoom(2));
+  click("zoom-in", () => course.zoom(0.5));
+  click("zoom-out", () => course.zoom(2));
   click("help-open", () => find("help").showModal());
   find("scrub").addEventListener("input", () => store.select(Number(find("scrub").value), "scrub"));
   listen(store, {
@@ -141,7 +142,7 @@ function steps({ store, map, compare, chart }, play) {
   }, document);
 }
 
-/** Follows a run that is being flown. */
+/** Follows a run in progress. */
 function live({ store, map }) {
   find("newest-label").hidden = false;
   find("follow-view").checked = true;
@@ -150,7 +151,7 @@ function live({ store, map }) {
   let fitted = store.count > 0;
   const lost = (yes) => {
     badge.className = `badge ${yes ? "bad" : "good"}`;
-    badge.textContent = yes ? "server does not answer" : store.count ? "live" : "live: waiting for the first view";
+    badge.textContent = yes ? "server does not respond" : store.count ? "live" : "live: waiting for the first view";
   };
   lost(false);
   follow(() => [store.generation, store.count, store.health.length], (news) => {
@@ -171,12 +172,12 @@ function drawProblems(problems) {
 function drawFigures(store) {
   const { stats, count, run } = store;
   const errors = (store.columns.err ?? []).filter((v) => v >= 0).sort((p, q) => p - q);
-  const quantile = (share) => errors[Math.min(errors.length - 1, Math.floor(share * errors.length))];
-  const rows = [["views", count], ["with a fix", share(stats.fixes, count)]];
+  const quantile = (part) => errors[Math.min(errors.length - 1, Math.floor(part * errors.length))];
+  const rows = [["views", count], ["with a fix", ratio(stats.fixes, count)]];
   if (stats.withTruth) {
-    rows.push([`within ${metres(run.radius_m)}`, share(stats.right, stats.withTruth)]);
-    rows.push(["median error", metres(quantile(0.5) ?? NaN)], ["95 %", metres(quantile(0.95) ?? NaN)]);
-    rows.push(["sure and wrong", stats.wrong]);
+    rows.push([`within ${metres(run.radius_m)}`, ratio(stats.right, stats.withTruth)]);
+    rows.push(["CEP50", metres(quantile(0.5) ?? NaN)], ["CEP95", metres(quantile(0.95) ?? NaN)]);
+    rows.push(["confident and wrong", stats.wrong]);
   }
   find("figures").replaceChildren(...rows.map(([name, value]) => {
     const [part, term, figure] = ["div", "dt", "dd"].map((tag) => document.createElement(tag));
@@ -189,20 +190,20 @@ function drawFigures(store) {
 function drawLegend(store) {
   const states = new Set();
   for (let i = 0; i < store.count; i++) states.add(store.state(i));
-  const rows = Object.keys(SAID).filter((state) => states.has(state) && state !== "none")
-    .map((state) => [MARKS[state], SAID[state], `var(--${state})`]);
-  if (store.stats.withTruth) rows.push(["—", "truth", "var(--truth)"], ["◯", "sure and wrong", "var(--wrong)"]);
-  find("legend").replaceChildren(...rows.map(([mark, said, paint]) => {
+  const rows = Object.keys(NAMES).filter((state) => states.has(state) && state !== "none")
+    .map((state) => [MARKS[state], NAMES[state], `var(--${state})`]);
+  if (store.stats.withTruth) rows.push(["—", "truth", "var(--truth)"], ["◯", "confident and wrong", "var(--wrong)"]);
+  find("legend").replaceChildren(...rows.map(([mark, name, paint]) => {
     const [part, sign] = [document.createElement("span"), document.createElement("i")];
     [sign.textContent, sign.style.color] = [mark, paint];
-    part.append(sign, said);
+    part.append(sign, name);
     return part;
   }));
 }
 
 function about(run) {
   const parts = [`orthonav ${run.version}`, `map ${run.map_name}`];
-  parts.push(run.pictures ? `pictures ${run.pictures}` : "no pictures (--flight)");
+  parts.push(run.images ? `images ${run.images}` : "no images (--flight)");
   parts.push(run.truth ? `truth ${run.truth}` : "no truth (--truth)");
   return parts.join(", ");
 }

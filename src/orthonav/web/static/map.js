@@ -3,13 +3,13 @@
 
 import * as L from "../leaflet/leaflet-src.esm.js";
 import { enFromPx, latLonFromEn } from "./plane.js";
-import { metres } from "./look.js";
+import { metres } from "./format.js";
 
 export { L };
 export const at = (col, row) => L.latLng(-row, col);
 export const pixel = (latLng) => [latLng.lng, -latLng.lat];
 const FINEST_ZOOM = 6;
-const LEAST_M = 300; // of ground are seen, however short the run
+const MIN_M = 300; // visible width, however short the run
 
 /** Leaflet's pixel plane, with distances in metres so that the scale bar is true. */
 function planeOf(sheet) {
@@ -18,7 +18,7 @@ function planeOf(sheet) {
   });
 }
 
-/** Chunks of the registration layer, as they are: a tile of zoom -L is a chunk of level L. Those at
+/** Chunks of the registration layer as stored: a tile of zoom -L is a chunk of level L. Those at
     the south and east borders may be smaller than a tile, so each lies in a box of the full size. */
 const Chunks = L.GridLayer.extend({
   createTile({ x, y, z }, done) {
@@ -33,7 +33,7 @@ const Chunks = L.GridLayer.extend({
     }
     const part = L.DomUtil.create("img", "tile-part", box);
     part.alt = "";
-    // A pixel more, or the ground below shows between tiles where the zoom is no whole number.
+    // One pixel more, or gaps between tiles are visible at fractional zooms.
     part.style.width = `calc(${(100 * width) / side}% + 1px)`;
     part.style.height = `calc(${(100 * height) / side}% + 1px)`;
     part.onload = () => done(null, box);
@@ -75,20 +75,20 @@ export function makeMap(id, sheet) {
   return map;
 }
 
-/** Shows where the pointer is, and how far from the selected view. */
+/** Shows the position of the pointer and its distance from the selected view. */
 export function showCursor(map, sheet, store, element) {
   map.on("mousemove click", ({ latlng }) => {
     const [col, row] = pixel(latlng);
     const [lat, lon] = latLonFromEn(sheet, ...enFromPx(sheet, col, row));
     const [x, y] = [store.columns.x?.[store.selected], store.columns.y?.[store.selected]];
     const far = Math.hypot(col - x, row - y) * sheet.gsd_m;
-    const said = Number.isFinite(far) ? ` · ${metres(far)} from the view` : "";
-    element.textContent = `${lat.toFixed(6)}, ${lon.toFixed(6)}${said}`;
+    const text = Number.isFinite(far) ? ` · ${metres(far)} from the view` : "";
+    element.textContent = `${lat.toFixed(6)}, ${lon.toFixed(6)}${text}`;
   });
   map.on("mouseout", () => { element.textContent = ""; });
 }
 
-/** Moves the map to the whole run: what is known of truth and fixes, less the farthest of fixes. */
+/** Moves the map to the whole run: true positions and fixes, far outliers excluded. */
 export function fitRun(map, store) {
   const c = store.columns;
   const known = [];
@@ -101,7 +101,7 @@ export function fitRun(map, store) {
   const low = at(min(xs), min(ys));
   const high = at(-min(xs.map((v) => -v)), -min(ys.map((v) => -v)));
   const bounds = L.latLngBounds(low, high).pad(0.08);
-  const least = LEAST_M / 2 / store.run.sheet.gsd_m;
+  const least = MIN_M / 2 / store.run.sheet.gsd_m;
   const { lat, lng } = bounds.getCenter();
   bounds.extend([lat - least, lng - least]).extend([lat + least, lng + least]);
   map.fitBounds(bounds);

@@ -1,5 +1,5 @@
-// Truth, fixes and ellipses of all views on one canvas, drawn anew when the map moves: a shape of
-// Leaflet for each of many thousand views would be too slow.
+// Truth, fixes and ellipses of all views on one canvas, redrawn when the map moves: a Leaflet shape
+// for each of many thousand views would be too slow.
 
 import { L, at } from "./map.js";
 import { Squares, colour, drawMark } from "./look.js";
@@ -30,12 +30,12 @@ export const Marks = L.Layer.extend({
     map.off("zoomanim", this._animate, this);
   },
 
-  /** Draws before the next picture of the screen. */
+  /** Draws before the next frame. */
   later() {
     this._asked ??= requestAnimationFrame(() => { this._asked = null; this._draw(); });
   },
 
-  /** While the map is dragged the canvas moves with it, and reaches a little beyond what is seen. */
+  /** While the map is dragged the canvas moves with it; it extends a little beyond the map. */
   _moved() {
     if (!this._bounds?.contains(this._map.getBounds())) this.later();
   },
@@ -78,7 +78,7 @@ export const Marks = L.Layer.extend({
     this._line(context, view, c.tx, c.ty);
     this._ellipses(context, view);
     const size = count > 4000 ? 2.2 : count > MANY ? 3 : 4;
-    const rings = new Path2D(); // drawn at once and above all: one by one takes longer
+    const rings = new Path2D(); // drawn together on top: one by one is slower
     for (const faded of [true, false]) {
       context.globalAlpha = faded ? 0.22 : 1;
       let last = "";
@@ -101,26 +101,26 @@ export const Marks = L.Layer.extend({
     context.stroke(rings);
   },
 
-  /** The way that was really flown; not joined where it is not known. */
+  /** The true path, with gaps where it is unknown. */
   _line(context, view, xs, ys) {
-    const way = new Path2D();
+    const path = new Path2D();
     let [before, lastX, lastY] = [false, 0, 0];
     for (let i = 0; i < xs.length; i++) {
       const known = !Number.isNaN(xs[i]);
       const [x, y] = [view.x + xs[i] * view.scale, view.y + ys[i] * view.scale];
-      if (known && before && Math.abs(x - lastX) + Math.abs(y - lastY) < 1.5) continue; // as good as one
-      if (known && before) way.lineTo(x, y);
-      else if (known) way.moveTo(x, y);
+      if (known && before && Math.abs(x - lastX) + Math.abs(y - lastY) < 1.5) continue; // indistinguishable
+      if (known && before) path.lineTo(x, y);
+      else if (known) path.moveTo(x, y);
       [before, lastX, lastY] = [known, x, y];
     }
     for (const [width, name, alpha] of [[4.5, "paper", 0.65], [1.6, "truth", 1]]) {
       [context.lineWidth, context.strokeStyle, context.globalAlpha] = [width, colour(name), alpha];
-      context.stroke(way);
+      context.stroke(path);
     }
     context.globalAlpha = 1;
   },
 
-  /** Sure and wrong: a ring, and a line to where it was really taken. */
+  /** Confident and wrong: a ring, and a line to the true position. */
   _ring(rings, view, i, x, y, size) {
     const c = this._store.columns;
     rings.moveTo(x + size + 3.5, y);
@@ -129,7 +129,7 @@ export const Marks = L.Layer.extend({
     rings.lineTo(view.x + c.tx[i] * view.scale, view.y + c.ty[i] * view.scale);
   },
 
-  /** 95 % ellipses of what is seen, of some where many are. */
+  /** 95 % ellipses of visible views, thinned out where there are many. */
   _ellipses(context, view) {
     const { columns: c, shown, run } = this._store;
     const inside = shown.filter((i) => {
@@ -153,7 +153,7 @@ export const Marks = L.Layer.extend({
     context.globalAlpha = 1;
   },
 
-  /** The shown view nearest to a point of the map's container, -1 where none is near. */
+  /** The shown view nearest to a point of the map's container, -1 if none is near. */
   nearest(point) {
     const { columns: c, shown } = this._store;
     const origin = this._map.latLngToContainerPoint(at(0, 0));
@@ -169,7 +169,7 @@ export const Marks = L.Layer.extend({
   },
 });
 
-/** The selected view on the map: where it was put, its 95 % ellipse, where it was taken. */
+/** The selected view on the map: fix, 95 % ellipse, true position. */
 export class Chosen {
   constructor(map, store) {
     this.store = store;

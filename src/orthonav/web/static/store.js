@@ -1,5 +1,5 @@
-// The views of the run, which is selected, and which are shown. Tells others by events:
-// "data" (more views, or all anew), "select", "filter".
+// The views of the run, the selected one, and the filter. Events: "data" (new views, or all replaced),
+// "select", "filter".
 
 const NUMBERS = ["x", "y", "tx", "ty", "err", "conf", "radius", "a", "b", "turn", "head", "agl", "ms"];
 export const CONFIDENT = 0.9;
@@ -28,7 +28,7 @@ export class Store extends EventTarget {
     this.stats = { fixes: 0, wrong: 0, right: 0, withTruth: 0 };
   }
 
-  /** Takes an answer of api/news. */
+  /** Takes a response of api/news. */
   take(news) {
     const anew = news.generation !== this.generation;
     if (anew) {
@@ -62,12 +62,12 @@ export class Store extends EventTarget {
     if (i && c.t[i] < c.t[i - 1]) this.rising = false;
   }
 
-  /** Where a view lies in time: seconds, or its number where times do not rise. */
+  /** The time of a view in seconds, or its number where times do not rise. */
   time(i) {
     return this.rising ? this.columns.t[i] : i;
   }
 
-  /** The state of a view: searching, tracking, lost, alone (placed for itself) or none. */
+  /** The state of a view: searching, tracking, lost, alone (placed without a track) or none. */
   state(i) {
     if (this.columns.reason[i]) return "none";
     const state = this.columns.state[i];
@@ -82,7 +82,7 @@ export class Store extends EventTarget {
     this.dispatchEvent(new CustomEvent("select", { detail: { by } }));
   }
 
-  /** Selects the shown view that is `count` further on in time, or the last there is. */
+  /** Selects the shown view `count` steps later in time, at most the last. */
   step(count) {
     if (!this.shown.length) return;
     let at = this.shown.findIndex((i) => i >= this.selected);

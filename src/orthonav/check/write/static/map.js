@@ -16,28 +16,28 @@ function makeMap() {
     crs: PLANE, maxZoom: FINEST, minZoom: -12, zoomSnap: 0.25, zoomDelta: 1, attributionControl: false,
     scrollWheelZoom: false, keyboardPanDelta: 60,
   });
-  const whole = boundsOf(data.box);
+  const whole = boundsOf(drawn.box);
   map.fitBounds(whole);
   map.setMinZoom(Math.floor(map.getZoom()) - 1);
   map.setMaxBounds(whole.pad(0.6));
-  for (const [name, order] of [["ground", 200], ["cells", 250]]) map.createPane(name).style.zIndex = order;
-  const ground = document.getElementById("check-ground");
-  L.imageOverlay(ground.src, boundsOf(data.ground), { pane: "ground", alt: "" }).addTo(map);
+  for (const [name, order] of [["image", 200], ["cells", 250]]) map.createPane(name).style.zIndex = order;
+  const image = document.getElementById("check-image");
+  L.imageOverlay(image.src, boundsOf(drawn.image), { pane: "image", alt: "" }).addTo(map);
   L.control.scale({ imperial: false, maxWidth: 150 }).addTo(map);
-  map.on("focus", () => map.scrollWheelZoom.enable()); // else the wheel moves the page
+  map.on("focus", () => map.scrollWheelZoom.enable()); // otherwise the wheel scrolls the page
   map.on("blur", () => map.scrollWheelZoom.disable());
   document.getElementById("whole").addEventListener("click", () => map.fitBounds(whole));
   return map;
 }
 
-/** A picture of a layer, a pixel per cell; cells that are not known are clear. */
+/** An image of a layer, one pixel per cell; unknown cells are transparent. */
 function pictureOf(name) {
   const canvas = document.createElement("canvas");
   [canvas.width, canvas.height] = [cells.cols, cells.rows];
   const context = canvas.getContext("2d");
   const picture = context.createImageData(cells.cols, cells.rows);
   for (let i = 0; i < cells.cols * cells.rows; i++) {
-    const value = grids[name](i);
+    const value = grids[name][i];
     if (Number.isNaN(value)) continue;
     picture.data.set([...colourAt(shadeOf(name, value)), 255], 4 * i);
   }
@@ -62,15 +62,15 @@ function addCells(map) {
   change();
 }
 
-function numbered(place, text, kind, said, chosen) {
+function numbered(place, text, kind, description, chosen) {
   const side = text.length > 2 ? 30 : 25;
   const icon = L.divIcon({ className: `mark ${kind}`, html: make("span", text), iconSize: [side, side] });
   const above = kind === "lost" ? 1000 : 0;
-  const marker = L.marker(at(place), { icon, title: said, alt: said, riseOnHover: true, zIndexOffset: above });
+  const marker = L.marker(at(place), { icon, title: description, alt: description, riseOnHover: true, zIndexOffset: above });
   marker.on("click", () => chosen());
   marker.on("add", () => {
     const element = marker.getElement();
-    element.setAttribute("aria-label", said);
+    element.setAttribute("aria-label", description);
     element.addEventListener("keydown", (event) => {
       if (!["Enter", " "].includes(event.key)) return;
       event.preventDefault();
@@ -84,51 +84,52 @@ function addRoute(map) {
   const group = L.layerGroup().addTo(map);
   const quiet = { interactive: false, lineCap: "round", lineJoin: "round" };
   for (const [colour, weight] of [["#fff", 4], ["#1a1a1a", 1.5]]) {
-    L.polygon(data.band.map((ring) => ring.map(at)), { ...quiet, color: colour, weight, fill: false }).addTo(group);
+    L.polygon(drawn.band.map((ring) => ring.map(at)), { ...quiet, color: colour, weight, fill: false }).addTo(group);
   }
-  const line = route.en.map(at);
+  const line = drawn.route.map(at);
   L.polyline(line, { ...quiet, color: "#fff", weight: 10 }).addTo(group);
-  for (const [risk, first, last] of route.pieces) {
-    const { colour, width, dash } = data.risks[risk];
+  for (const [risk, first, last] of drawn.segments) {
+    const { colour, width, dash } = drawn.risks[risk];
     const style = { ...quiet, color: colour, weight: width, dashArray: dash.length ? dash.join(" ") : null };
     L.polyline(line.slice(first, last + 1), { ...style, lineCap: "butt" }).addTo(group);
   }
-  for (const place of data.waypoints) {
+  for (const place of drawn.waypoints) {
     L.circleMarker(at(place), { ...quiet, radius: 4, color: "#1a1a1a", weight: 2, fillColor: "#fff", fillOpacity: 1 }).addTo(group);
   }
-  for (const blind of data.blind) {
-    if (blind.en.length < 2) continue;
-    L.polyline(blind.en.map(at), { ...quiet, color: "#1a1a1a", weight: 2.5 }).addTo(group);
+  data.stretches.forEach((blind, i) => {
+    if (drawn.blind[i].length < 2) return;
+    L.polyline(drawn.blind[i].map(at), { ...quiet, color: "#1a1a1a", weight: 2.5 }).addTo(group);
     const middle = nearestAlong((blind.start_m + blind.end_m) / 2);
-    const kind = blind.bearable ? "blind" : "lost";
-    numbered(route.en[middle], String(blind.number), kind, blind.said, () => {
-      lookAlong(middle, false);
-      tell(blind.said);
+    const description = describeBlind(blind);
+    numbered(drawn.route[middle], String(blind.number), blind.recoverable ? "blind" : "lost", description, () => {
+      selectAlong(middle, false);
+      announce(description);
     }).addTo(group);
-  }
+  });
   return group;
 }
 
-/** The point of the route nearest to a distance from its start. */
-function nearestAlong(distance) {
-  let [low, high] = [0, route.distance_m.length - 1];
-  while (high - low > 1) {
-    const middle = (low + high) >> 1;
-    if (route.distance_m[middle] < distance) low = middle;
-    else high = middle;
-  }
-  return distance - route.distance_m[low] < route.distance_m[high] - distance ? low : high;
+function describeBlind({ number: name, length_m, start_s, end_s, probability, drift_m, allowed_m, ends_lost, recoverable }) {
+  const outcome = ends_lost ? "the route ends in it" : recoverable ? "recovers" : "lost";
+  return `Blind stretch ${name}: ${metres(length_m)}, ${number(end_s - start_s, 0)} s, probability ${percent(probability)}, `
+    + `error ${metres(drift_m)} at its end, allowed ${metres(allowed_m)}: ${outcome}.`;
 }
 
 function addLookalikes(map) {
   const group = L.layerGroup().addTo(map);
-  for (const { number, ends, within_prior: near, said } of data.lookalikes) {
+  drawn.lookalikes.forEach((ends, k) => {
+    const { number: name, apart_m, similarity, trials, within_prior: near } = data.lookalikes[k];
+    const description = `Lookalikes ${name}: ${metres(apart_m)} apart, similarity ${similarity.toFixed(2)}, `
+      + `${trials} trials, ${near ? "within" : "outside"} the prior.`;
     L.polyline(ends.map(at), { color: "#8a2f63", weight: 2, dashArray: "3 6", interactive: false }).addTo(group);
     ends.forEach((place, i) => {
       const kind = near ? "twin near" : "twin";
-      numbered(place, `${number}${"ab"[i]}`, kind, said, () => { look(...place, -1, false); tell(said); }).addTo(group);
+      numbered(place, `${name}${"ab"[i]}`, kind, description, () => {
+        select(...place, -1, false);
+        announce(description);
+      }).addTo(group);
     });
-  }
+  });
   return group;
 }
 
@@ -139,28 +140,28 @@ function toggle(id, map, group) {
   });
 }
 
-/** The point of the route within reach of a place on the screen, -1 if none is. */
+/** The point of the route near a place on the screen, -1 if none is. */
 function routeNear(map, { lat, lng }) {
   if (!route) return -1;
   const metresPerPx = 1 / map.getZoomScale(map.getZoom(), 0);
   let [best, least] = [-1, (NEAR_PX * metresPerPx) ** 2];
-  route.en.forEach(([east, north], i) => {
+  drawn.route.forEach(([east, north], i) => {
     const far = (east - lng) ** 2 + (north - lat) ** 2;
     if (far < least) [best, least] = [i, far];
   });
   return best;
 }
 
-function lookFromMap(map) {
+function selectFromMap(map) {
   const choose = (latlng) => {
     const index = routeNear(map, latlng);
-    if (index >= 0) lookAlong(index);
-    else look(latlng.lng, latlng.lat);
+    if (index >= 0) selectAlong(index);
+    else select(latlng.lng, latlng.lat);
   };
   map.on("click", ({ latlng }) => choose(latlng));
   map.on("mousemove", ({ latlng }) => {
     const index = routeNear(map, latlng);
-    if (index >= 0) lookAlong(index, false);
+    if (index >= 0) selectAlong(index, false);
   });
   map.getContainer().addEventListener("keydown", (event) => {
     if (event.target !== map.getContainer() || !["Enter", " "].includes(event.key)) return;
@@ -169,7 +170,7 @@ function lookFromMap(map) {
   });
 }
 
-function showLooked(map) {
+function showSelected(map) {
   const side = cells.side_m;
   const square = L.rectangle(boundsOf([0, 0, side, side]), { color: "#fff", weight: 3, fill: false, interactive: false });
   const inner = L.rectangle(boundsOf([0, 0, side, side]), { color: "#000", weight: 1.2, fill: false, interactive: false });

@@ -1,0 +1,183 @@
+"""Shards of the vector index: files that are memory-mapped and searched together.
+
+A shard NAME is four files in a folder: `NAME.vectors.npy` (rows, D) float16, `NAME.codes` with the
+codes and rows of every list, `NAME.lists.npy` (lists, 3) uint64 with count, room and offset of each
+list, and `NAME.places.npy` (rows, 2) float64 with latitude and longitude of every row.
+
+FAISS maps neither lists of 4-bit codes nor checks the files that it reads, so this format is our
+own: every length is checked before FAISS is given the map.
+"""
+
+import os
+import weakref
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.atlas.index_manifest import ShardInfo
+from orthonav.atlas.quantizers import BLOCK, Array, Quantizers, faiss, one_thread
+from orthonav.errors import AtlasError
+
+SCAN_ONE = 10
+"""FAISS's implementation of the scan that is fastest for one query at a time."""
+ADD_ROWS = 32_768
+NONE = -1
+"""Id where fewer than k vectors were found."""
+
+Ids = NDArray[np.int64]
+
+
+def write_shard(
+    folder: Path,
+    name: str,
+    quantizers: Quantizers,
+    places_deg: NDArray[np.float64],
+    batches: Iterable[NDArray[np.floating[Any]]],
+) -> None:
+    """Write a shard of unit vectors, which come in batches (n, D); `places_deg` (rows, 2) are
+    their latitudes and longitudes.
+
+    Memory grows by the codes, some 24 bytes a vector. Raises `AtlasError` where the vectors are
+    not finite, or not as many as places.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    dims, index, rows = quantizers.recipe.dims, quantizers.empty_index(), 0
+    shape = (len(places_deg), dims)
+    with (folder / f"{name}.vectors.npy").open("wb") as out:
+        header = {"descr": "<f2", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(out, header)
+        for batch in batches:
+            if batch.ndim != 2 or batch.shape[1] != dims:
+                raise AtlasError(f"vectors must be (N, {dims}), got {batch.shape}")
+            rows += len(batch)
+            for start in range(0, len(batch), ADD_ROWS):
+                stored = np.ascontiguousarray(batch[start : start + ADD_ROWS], dtype=np.float16)
+                if not np.isfinite(stored).all():
+                    raise AtlasError("vectors of an index must be finite")
+                out.write(stored.data)
+                with one_thread():
+                    index.add(quantizers.rotated(stored.astype(np.float32)))
+    if rows != len(places_deg):
+        raise AtlasError(f"{rows} vectors for {len(places_deg)} places in shard {name}")
+    np.save(folder / f"{name}.places.npy", places_deg)
+    _write_lists(folder, name, index, quantizers)
+
+
+def _write_lists(folder: Path, name: str, index: Any, quantizers: Quantizers) -> None:
+    table = np.zeros((quantizers.recipe.lists, 3), dtype=np.uint64)
+    code_bytes = quantizers.recipe.code_bytes
+    with (folder / f"{name}.codes").open("wb") as out:
+        for number, codes, rows in _lists(index, quantizers):
+            table[number] = len(rows), len(codes) // code_bytes, out.tell()
+            out.write(codes.data)
+            out.write(np.pad(rows, (0, int(table[number, 1]) - len(rows))).data)
+        if out.tell() == 0:
+            out.write(bytes(BLOCK))  # an empty file cannot be mapped
+    np.save(folder / f"{name}.lists.npy", table)
+
+
+def _lists(index: Any, quantizers: Quantizers) -> Iterator[tuple[int, NDArray[np.uint8], Ids]]:
+    """Number, codes in blocks, and rows of each list that is not empty."""
+    module, lists = faiss(), index.invlists
+    for number in range(quantizers.recipe.lists):
+        size = lists.list_size(number)
+        if size == 0:
+            continue
+        room = -(-size // BLOCK) * BLOCK * quantizers.recipe.code_bytes
+        codes = module.rev_swig_ptr(lists.get_codes(number), room)
+        rows = module.rev_swig_ptr(lists.get_ids(number), size)
+        yield number, np.asarray(codes), np.asarray(rows, dtype=np.int64)
+
+
+class OpenShard:
+    """The files of a shard, opened. Lists are mapped. Vectors are read row by row: the system
+    would map a megabyte around each."""
+
+    def __init__(self, folder: Path, info: ShardInfo, quantizers: Quantizers) -> None:
+        """Raises `AtlasError` where a file cannot be read or does not fit `info`."""
+        self.info = info
+        path = folder / f"{info.name}.vectors.npy"
+        try:
+            vectors = np.load(path, mmap_mode="r")
+            table = np.load(folder / f"{info.name}.lists.npy")
+            self.places_deg = np.load(folder / f"{info.name}.places.npy", mmap_mode="r")
+            codes_bytes = (folder / f"{info.name}.codes").stat().st_size
+        except (OSError, ValueError) as error:
+            raise AtlasError(f"shard cannot be read ({error}): {folder / info.name}") from error
+        dims = quantizers.recipe.dims
+        if vectors.shape != (info.rows, dims) or vectors.dtype != np.float16:
+            raise AtlasError(
+                f"shard holds {vectors.shape} {vectors.dtype}, expected {info.rows} vectors of "
+                f"{dims} float16; rebuild the index: {path}"
+            )
+        if self.places_deg.shape != (info.rows, 2) or self.places_deg.dtype != np.float64:
+            raise AtlasError(
+                f"places of shard {info.name} are damaged; rebuild the index: {folder}"
+            )
+        self._dims, self._offset = dims, path.stat().st_size - vectors.nbytes
+        self._file = os.open(path, os.O_RDONLY)
+        weakref.finalize(self, os.close, self._file)
+        if hasattr(os, "posix_fadvise"):
+            os.posix_fadvise(self._file, 0, 0, os.POSIX_FADV_RANDOM)
+        self._retired = info.retired_rows
+        self._index = quantizers.empty_index()
+        self._map_lists(folder / f"{info.name}.codes", codes_bytes, table, quantizers)
+
+    def _map_lists(
+        self, path: Path, size: int, table: NDArray[np.uint64], quantizers: Quantizers
+    ) -> None:
+        """Let FAISS scan the lists in the mapped file."""
+        module, recipe = faiss(), quantizers.recipe
+        _check_table(table, recipe.lists, recipe.code_bytes, size, path)
+        if int(table[:, 0].sum()) != self.info.rows:
+            raise AtlasError(f"lists hold {table[:, 0].sum()} of {self.info.rows} rows: {path}")
+        mapped = module.OnDiskInvertedLists(recipe.lists, recipe.code_bytes, str(path))
+        mapped.lists.resize(recipe.lists)
+        contents = np.ascontiguousarray(table)
+        module.memcpy(mapped.lists.data(), module.swig_ptr(contents), contents.nbytes)
+        mapped.totsize, mapped.read_only, mapped.prefetch_nthread = size, True, 0
+        mapped.do_mmap()
+        self._index.replace_invlists(mapped, False)
+        self._index.ntotal = self.info.rows
+        self._index.referenced_objects.append(mapped)
+
+    def scan(self, rotated: Array, lists: Ids, scores: Array, count: int) -> tuple[Array, Ids]:
+        """Approximate products (Q, count) and rows (Q, count), best first, of lists (Q, probes)."""
+        module, index = faiss(), self._index
+        found = np.empty((len(rotated), count), dtype=np.float32)
+        rows = np.empty((len(rotated), count), dtype=np.int64)
+        index.nprobe = lists.shape[1]
+        index.implem = SCAN_ONE if len(rotated) == 1 else 0
+        point = module.swig_ptr
+        index.search_preassigned_c(
+            len(rotated), point(rotated), count, point(lists), point(scores),
+            point(found), point(rows), False,
+        )  # fmt: skip
+        if rows.max(initial=NONE) >= self.info.rows or rows.min(initial=NONE) < NONE:
+            raise AtlasError(f"codes of shard {self.info.name} are damaged; rebuild the index")
+        if len(self._retired):
+            gone = np.isin(rows, self._retired)
+            rows[gone], found[gone] = NONE, -np.inf
+        return found, rows
+
+    def vectors(self, rows: Ids) -> Array:
+        """Stored vectors (N, D) of rows (N,)."""
+        size, offset, file = 2 * self._dims, self._offset, self._file
+        read = b"".join([os.pread(file, size, offset + size * row) for row in rows.tolist()])
+        return np.frombuffer(read, dtype=np.float16).astype(np.float32).reshape(-1, self._dims)
+
+
+def _check_table(
+    table: NDArray[np.uint64], lists: int, code_bytes: int, size: int, path: Path
+) -> None:
+    """Raise `AtlasError` unless every list lies within the file."""
+    fits = table.shape == (lists, 3) and table.dtype == np.uint64
+    if fits:
+        count, room, offset = table.astype(np.float64).T
+        ends = offset + room * (code_bytes + 8)
+        fits = bool(((count <= room) & (ends <= size) & (room % BLOCK == 0)).all())
+    if not fits:
+        raise AtlasError(f"lists do not fit their file; rebuild the index: {path}")

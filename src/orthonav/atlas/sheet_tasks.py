@@ -1,0 +1,289 @@
+"""The sheets of an area that have imagery, each as a task for a worker."""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+
+from orthonav import __version__
+from orthonav.atlas.coverage import box_around, turned
+from orthonav.atlas.item import Sheet
+from orthonav.atlas.recipe import AtlasRecipe
+from orthonav.embed.cells import CellLayout
+from orthonav.errors import AreaError, AtlasError
+from orthonav.geo.area import Area, Extent
+from orthonav.geo.grid import TileGrid
+from orthonav.geo.route import Route
+from orthonav.geo.sheets import sheets_of_route
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.prepare.block_cache import digest
+from orthonav.prepare.layout import grid_of
+
+MARGIN_PX = 64
+"""Pixels beyond a tile that gradients and resampling use, and some more."""
+TOUCH_DEG = 1e-9
+"""Boxes that overlap by less than this only touch: a tenth of a millimetre."""
+_POINTS = 17
+"""Points along a side of a sheet at which it is compared with a search band."""
+
+
+@dataclass(frozen=True)
+class SheetTask:
+    """A sheet to be built, with all that a worker on another machine needs.
+
+    `sheet`: name.
+    `bounds_deg`: its box in the lattice: west, south, east, north.
+    `atlas`: folder or URL of the atlas.
+    `orthos`: the files and folders that may show it.
+    `recipe`: how it is made.
+    `request`: digest of what the sheet depends on (`request_digest`).
+    `imagery`, `dates`: description of the orthophotos for the catalogue.
+    `made_by`: the versions that must make it (`versions`).
+    """
+
+    sheet: str
+    bounds_deg: Extent
+    atlas: str
+    orthos: tuple[Path, ...]
+    recipe: AtlasRecipe
+    request: str
+    imagery: tuple[Mapping[str, Any], ...]
+    dates: tuple[str, ...]
+    made_by: Mapping[str, str]
+
+
+def versions() -> dict[str, str]:
+    """The versions that determine the bytes of a map."""
+    return {
+        "orthonav": __version__,
+        "numpy": np.__version__,
+        "opencv": cv2.__version__,
+        "gdal": str(rasterio.__gdal_version__),
+        "rasterio": rasterio.__version__,
+    }
+
+
+def version_differences(wanted: Mapping[str, str], found: Mapping[str, str]) -> list[str]:
+    """The differences, each as `name this, not that`."""
+    return [
+        f"{name} {found.get(name, 'absent')}, not {version}"
+        for name, version in wanted.items()
+        if found.get(name) != version
+    ]
+
+
+def plan_sheets(
+    url: str,
+    recipe: AtlasRecipe,
+    mosaic: Mosaic,
+    orthos: Sequence[Path],
+    *,
+    bounds_deg: Extent | None = None,
+    route: Route | None = None,
+    band_m: float | None = None,
+) -> list[SheetTask]:
+    """A task for each sheet of an area that imagery may touch, from south to north, west to east.
+
+    Without bounds and route the area is all imagery. Raises `AreaError` where there is no sheet,
+    and for recipes by which no sheet could be built.
+    """
+    imagery = Imagery(mosaic)
+    names = sorted(_names(recipe, imagery, bounds_deg, route, band_m))
+    if not names:
+        raise AreaError("the area lies outside the orthophotos")
+    made_by = versions()
+    tasks = []
+    for name in names:
+        box_deg = recipe.sheets.bounds_deg(name)
+        _require_possible(recipe, box_deg, mosaic.gsd_m)
+        part = imagery.under(box_deg, margin_m(recipe))
+        tasks.append(
+            SheetTask(
+                sheet=name,
+                bounds_deg=box_deg,
+                atlas=url,
+                orthos=_orthos_of(orthos, mosaic, part),
+                recipe=recipe,
+                request=request_digest(recipe, part, made_by),
+                imagery=part.describe(),
+                dates=tuple(sorted({s.date for s in part.sources if s.date is not None})),
+                made_by=made_by,
+            )
+        )
+    return tasks
+
+
+def request_digest(recipe: AtlasRecipe, part: Mosaic, made_by: Mapping[str, str]) -> str:
+    """Digest of what a sheet depends on: recipe, versions, and the imagery under it.
+
+    Each file counts with its name, size and second of change, in the order in which files cover
+    each other; its folder does not count, as it may differ between machines.
+    """
+    stamps = [
+        [Path(name).name, size, changed_ns // 10**9]
+        for source in part.sources
+        for name, size, changed_ns in source.stamp
+    ]
+    return digest([recipe.to_plain(), dict(made_by), part.common_stamp, stamps])
+
+
+def margin_m(recipe: AtlasRecipe) -> float:
+    """Width of the margin around its box on which a sheet may depend."""
+    reach_m = (recipe.tile_px + MARGIN_PX) * recipe.gsd_m
+    if recipe.coarse is None:
+        return reach_m
+    return max(reach_m, (recipe.coarse.tile_px + MARGIN_PX) * recipe.coarse.gsd_m)
+
+
+class Imagery:
+    """The sources of a mosaic by place."""
+
+    def __init__(self, mosaic: Mosaic) -> None:
+        self.mosaic = mosaic
+
+    def under(self, bounds_deg: Extent, reach_m: float) -> Mosaic:
+        """The sources that may show a box and a margin of `reach_m` around it."""
+        west, south, east, north = box_around(Area.from_bounds(bounds_deg), reach_m)
+        boxes = self._boxes
+        middle = (west + east) / 2
+        shift = 360 * np.round((middle - (boxes[:, 0] + boxes[:, 2]) / 2) / 360)
+        near = (boxes[:, 0] + shift < east) & (boxes[:, 2] + shift > west)
+        near &= (boxes[:, 1] < north) & (boxes[:, 3] > south)
+        chosen = np.flatnonzero(near).tolist()
+        sources = tuple(self.mosaic.sources[index] for index in chosen)
+        return Mosaic(sources, tuple(self.mosaic.stretches[index] for index in chosen))
+
+    def sheets(self, recipe: AtlasRecipe) -> set[str]:
+        """Names of the sheets that the boxes of the sources touch."""
+        found: set[str] = set()
+        for west, south, east, north in self._boxes.tolist():
+            around = turned(west) if east - west < 360 else -180.0
+            found.update(recipe.sheets.over((around, south, around + east - west, north)))
+        return found
+
+    @cached_property
+    def _boxes(self) -> NDArray[np.float64]:
+        """West, south, east, north (N, 4) in degrees; east may be above 180."""
+        outlines = [source.outline_latlon_deg for source in self.mosaic.sources]
+        boxes = []
+        for outline in outlines:
+            lat, lon = outline[:, 0], outline[:, 1]
+            lon = lon - 360 * np.round((lon - lon[0]) / 360)
+            boxes.append([lon.min(), lat.min(), lon.max(), lat.max()])
+        return np.array(boxes, np.float64)
+
+
+def _names(
+    recipe: AtlasRecipe,
+    imagery: Imagery,
+    bounds_deg: Extent | None,
+    route: Route | None,
+    band_m: float | None,
+) -> Iterable[str]:
+    """Names of the sheets of an area that imagery may touch."""
+    if route is not None and bounds_deg is not None:
+        raise AreaError("give a route with a band, or bounds, not both")
+    if route is None and band_m is not None:
+        raise AreaError("a search band needs a route (--route)")
+    there = imagery.sheets(recipe)
+    if bounds_deg is not None:
+        west, south, east, north = bounds_deg
+        if not (west != east and south < north):
+            raise AreaError(f"bounds are empty: {','.join(map(str, bounds_deg))}")
+        asked = (west, south, east + 360 if east < west else east, north)
+        return {name for name in there if _overlap(recipe.sheets.bounds_deg(name), asked)}
+    return there if route is None else set(_along(recipe, route, band_m, there))
+
+
+def _along(
+    recipe: AtlasRecipe, route: Route, band_m: float | None, there: set[str]
+) -> Iterator[str]:
+    """The sheets that the search band of a route crosses, and some that it nearly touches."""
+    world = recipe.sheets
+    for part in sheets_of_route(route, band_m):
+        area = Area.from_route(part, band_m)
+        west, south, east, north = box_around(area, 0.0)
+        first = turned(west)
+        for name in there.intersection(world.over((first, south, first + east - west, north))):
+            box_deg = world.bounds_deg(name)
+            lon, lat = np.meshgrid(
+                np.linspace(box_deg[0], box_deg[2], _POINTS),
+                np.linspace(box_deg[1], box_deg[3], _POINTS),
+            )
+            points = area.frame.en_from_latlon(lat.ravel(), lon.ravel())
+            if area.contains(points, world.side_m / (_POINTS - 1) * math.sqrt(0.5)).any():
+                yield name
+
+
+def _overlap(box_deg: Extent, other: Extent) -> bool:
+    """Whether two boxes share more than an edge."""
+    west, south, east, north = box_deg
+    shift = 360 * round(((other[0] + other[2]) / 2 - (west + east) / 2) / 360)
+    across = min(east + shift, other[2]) - max(west + shift, other[0])
+    return across > TOUCH_DEG and min(north, other[3]) - max(south, other[1]) > TOUCH_DEG
+
+
+def _require_possible(recipe: AtlasRecipe, bounds_deg: Extent, imagery_gsd_m: float) -> None:
+    """Raise `AreaError` for recipes by which this sheet cannot be built with any imagery.
+
+    An `AreaError` of a worker then means that there is no imagery.
+    """
+    area = Area.from_bounds(bounds_deg)
+    grid = grid_of(
+        area, min(imagery_gsd_m, recipe.gsd_m), recipe.gsd_m, recipe.tile_px, recipe.overlap
+    )
+    CellLayout.for_tiles(grid.tile_px, grid.stride_px)
+    if recipe.coarse is not None:
+        coarse = TileGrid.covering(
+            area.extent_en_m,
+            gsd_m=recipe.coarse.gsd_m,
+            tile_px=recipe.coarse.tile_px,
+            overlap=recipe.coarse.overlap,
+        )
+        CellLayout.for_tiles(coarse.tile_px, coarse.stride_px)
+
+
+def _orthos_of(orthos: Sequence[Path], mosaic: Mosaic, part: Mosaic) -> tuple[Path, ...]:
+    """The files and folders that a worker needs to read the same pixels as from all of them.
+
+    All of them where the stretch to 8 bits, or whether a fourth band is a mask, was derived from
+    many files together.
+    """
+    common = any(each is not None for each in mosaic.stretches)
+    if common or any(source.marked_alpha for source in mosaic.sources):
+        return tuple(orthos)
+    needed = {source.path for source in part.sources if source.folder is None}
+    folders = {source.folder for source in part.sources if source.folder is not None}
+    return tuple(path for path in orthos if path in needed or path in folders)
+
+
+def require_same(tasks: Sequence[SheetTask], known: Mapping[str, Sheet]) -> None:
+    """Raise `AtlasError` naming the sheets of the atlas (`known`) that were made otherwise."""
+    other = [task for task in tasks if not is_same(task, known)]
+    if not other:
+        return
+    why = sorted(
+        {
+            line
+            for task in other
+            for line in version_differences(task.made_by, known[task.sheet].made_by)
+            or ["their imagery has changed"]
+        }
+    )
+    named = ", ".join(task.sheet for task in other[:5]) + (", .." if len(other) > 5 else "")
+    raise AtlasError(
+        f"{len(other)} of {len(tasks)} sheets are in the atlas and were made otherwise "
+        f"({'; '.join(why[:4])}): {named}; rebuild them with --replace"
+    )
+
+
+def is_same(task: SheetTask, known: Mapping[str, Sheet]) -> bool:
+    """Whether the sheet of a task is not in the atlas, or is there as the task would make it."""
+    return task.sheet not in known or known[task.sheet].request == task.request

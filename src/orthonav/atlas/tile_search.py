@@ -1,0 +1,136 @@
+"""Searching a view among the coarse tiles of a whole atlas."""
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav import represent
+from orthonav.atlas.catalog import Atlas
+from orthonav.atlas.coarse import EDGES
+from orthonav.atlas.index import WHITENING_NAME, fetch_files, half_whitened, load_whitening
+from orthonav.atlas.index_manifest import read_manifest, stale_sheets
+from orthonav.atlas.recipe import CoarseRecipe
+from orthonav.atlas.vector_search import ShardedIndex
+from orthonav.embed.bank import embed_poses
+from orthonav.errors import AtlasError
+from orthonav.geo.frames import distances_m
+from orthonav.localizer.rectify import RectifiedView
+from orthonav.variants import make_variant
+
+PER_POSE = 60
+"""Tiles found for each pose; several neighbouring tiles are one place."""
+EFFORTS = ((10**6, 0.4, 300), (3 * 10**7, 0.25, 800))
+MOST_EFFORT = 0.085, 1500
+"""Greatest number of tiles, share of the lists scanned, tiles compared by their stored vectors:
+finds 98 % of the tiles that exact search finds among 10^7, 95 % among 10^8
+(`python -m benchmarks.atlas_search`)."""
+APART_STRIDES = 1.5
+"""Tiles nearer to each other than this are one place: the eight neighbours of a tile."""
+MAX_LAT_DEG = 89.8
+"""Nearer to a pole a view has no meaningful heading."""
+
+
+@dataclass(frozen=True)
+class TileMatch:
+    """A coarse tile similar to a view.
+
+    `lat_deg`, `lon_deg`: its centre, the middle of the ground that the view shows.
+    `turn_rad`, `log_scale`: the pose under which the view was similar.
+    `score`: cosine similarity.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    turn_rad: float
+    log_scale: float
+    score: float
+
+
+class TileSearch:
+    """The index of an atlas with its shards mapped. Not to be shared between threads.
+
+    A context manager. `unknown` names the sheets that are not in the index, which are not found.
+    """
+
+    def __init__(self, atlas: Atlas) -> None:
+        """Raises `AtlasError` where the atlas has no coarse tiles, or no valid index of them."""
+        if atlas.recipe.coarse is None:
+            raise AtlasError(
+                f"the atlas has no coarse tiles, so views need a prior there: {atlas.url}"
+            )
+        manifest = read_manifest(atlas)
+        if manifest is None:
+            raise AtlasError(
+                f"the atlas has no index: make it with 'orthonav atlas index': {atlas.url}"
+            )
+        self.atlas = atlas
+        self.recipe: CoarseRecipe = atlas.recipe.coarse
+        self.unknown = stale_sheets(atlas, manifest)[0]
+        self._folder = tempfile.TemporaryDirectory(prefix="orthonav-index-")
+        folder = Path(self._folder.name)
+        fetch_files(atlas, manifest, folder)
+        self._embedder = load_whitening(folder / WHITENING_NAME)
+        self._representation = make_variant(represent.TABLE, EDGES)
+        self._index = ShardedIndex(folder, manifest.shards)
+        if self._embedder.dims != self._index.quantizers.recipe.dims:
+            raise AtlasError(f"files of the index do not fit together: {atlas.url}")
+        efforts = (effort for most, *effort in EFFORTS if len(self._index) <= most)
+        share, rerank = next(efforts, MOST_EFFORT)
+        self._probes = max(1, round(share * manifest.recipe.lists))
+        self._rerank = int(rerank)
+
+    def __enter__(self) -> "TileSearch":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._folder.cleanup()
+
+    def matches(
+        self, view: RectifiedView, poses: Sequence[tuple[float, float]], count: int
+    ) -> list[TileMatch]:
+        """The tiles most similar to a view under any of the poses, best first, apart from each
+        other.
+
+        `view`: rectified to the resolution of the coarse tiles. `poses`: heading (rad) and log
+        scale of each.
+        """
+        embedded = embed_poses(
+            self._embedder,
+            self._representation,
+            view.grey,
+            view.valid,
+            poses,
+            self.recipe.tile_px,
+        )
+        queries = half_whitened(self._embedder, embedded)
+        per_pose = min(PER_POSE, len(self._index))
+        scores, ids = self._index.search(queries, per_pose, self._probes, self._rerank)
+        pose_of = np.repeat(np.arange(len(poses)), per_pose)
+        flat_scores, flat_ids = scores.reshape(-1), ids.reshape(-1)
+        order = np.argsort(-flat_scores, kind="stable")
+        apart_m = APART_STRIDES * self.recipe.tile_m * (1 - self.recipe.overlap)
+        found: list[TileMatch] = []
+        taken = np.zeros((count, 2))
+        for at in order[np.isfinite(flat_scores[order])].tolist():
+            place = self._index.place_deg(int(flat_ids[at]))
+            if place is None or abs(place[0]) > MAX_LAT_DEG or abs(place[1]) > 180:
+                continue
+            if found and _nearest_m(place, taken[: len(found)]) < apart_m:
+                continue
+            taken[len(found)] = place
+            turn, scale = poses[int(pose_of[at])]
+            found.append(TileMatch(*place, turn, scale, float(flat_scores[at])))
+            if len(found) == count:
+                break
+        return found
+
+
+def _nearest_m(place: tuple[float, float], others: NDArray[np.float64]) -> float:
+    """Distance to the nearest of places (N, 2); infinite where all are a degree away or more."""
+    if np.abs(others[:, 0] - place[0]).min() > 1.0:
+        return float("inf")
+    return float(distances_m([place] * len(others), others).min())

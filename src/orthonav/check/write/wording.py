@@ -1,0 +1,141 @@
+"""Words and sentences shared by page and terminal."""
+
+import math
+
+from orthonav.check.outcome import (
+    Alternative,
+    BlindStretch,
+    CheckResult,
+    Conditions,
+    Envelope,
+    Word,
+)
+
+SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}
+VERDICTS = {
+    Word.GO: "This route can be flown with this map.",
+    Word.MARGINAL: "This route can be flown with this map, but with care; see the reasons.",
+    Word.NO_GO: "Do not rely on this map for this route; see the reasons.",
+}
+AREA_VERDICTS = {
+    Word.GO: "Views can be placed on this map.",
+    Word.MARGINAL: "Views can be placed on parts of this map; see the reasons.",
+    Word.NO_GO: "Do not rely on this map; see the reasons.",
+}
+WHAT = {"agl_m": "height above ground", "band_m": "width of the band"}
+CLEARLY = 0.05
+"""Smaller differences may be chance, because an alternative rests on few trials."""
+SIMULATED = "Predicted from this map alone, with simulated ageing."
+
+
+def verdict_sentence(result: CheckResult) -> str:
+    """The verdict as a sentence, about the route or, without one, the map."""
+    sentences = AREA_VERDICTS if result.along is None else VERDICTS
+    return sentences[result.verdict.word]
+
+
+def share_text(value: float) -> str:
+    """A probability in whole percent, `-` if unknown; 100 % only if it really is."""
+    if not math.isfinite(value):
+        return "-"
+    percent = round(100 * value)
+    return f"{99 if percent == 100 and value < 0.9995 else percent} %"
+
+
+def metres_text(value: float | None) -> str:
+    """A length, in kilometres from 10 km on; `-` if unknown."""
+    if value is None or not math.isfinite(value):
+        return "-"
+    if abs(value) >= 10_000:
+        return f"{value / 1000:.1f} km"
+    return f"{value:.1f} m" if abs(value) < 10 and value != round(value) else f"{value:.0f} m"
+
+
+def place_text(value: float) -> str:
+    """A distance from the start of the route, in kilometres to ten metres."""
+    return f"{value / 1000:.2f} km" if math.isfinite(value) else "-"
+
+
+def seconds_text(value: float) -> str:
+    """A time in seconds, from two minutes on as `M:SS min`, from an hour on as `H:MM h`."""
+    if not math.isfinite(value):
+        return "-"
+    whole = round(value)
+    if abs(whole) < 120:
+        return f"{whole} s"
+    if abs(whole) < 3600:
+        return f"{whole // 60}:{whole % 60:02d} min"
+    return f"{whole // 3600}:{whole // 60 % 60:02d} h"
+
+
+def outcome_text(stretch: BlindStretch) -> str:
+    """What happens after a blind stretch."""
+    if stretch.ends_lost:
+        return "the route ends in it"
+    return "recovers" if stretch.recoverable else "lost"
+
+
+def tolerance_sentence(envelope: Envelope) -> str:
+    """The tolerated errors of reported heading and height."""
+    low, high = abs(envelope.tolerated_agl_low), abs(envelope.tolerated_agl_high)
+    if not all(map(math.isfinite, (envelope.tolerated_yaw_deg, low, high))):
+        return "The tolerated errors of heading and height are unknown."
+    return (
+        f"Tolerated: a heading error of up to {envelope.tolerated_yaw_deg:g}°, or a reported "
+        f"height from {100 * low:.0f} % too low to {100 * high:.0f} % too high. With either error "
+        "alone, the share of correct, confident fixes stays at 85 % or more of that without error."
+    )
+
+
+def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, str]:
+    """The conditions of the check by name."""
+    yaw, prior, height = conditions.yaw_std_deg, conditions.prior_std_m, conditions.agl_m
+    rows = {
+        "footprint of a view": f"{conditions.width_m:.0f} x {conditions.height_m:.0f} m",
+        "height above ground": "unknown" if height is None else f"{height:.0f} m",
+        "error of reported height": f"{100 * conditions.agl_std:.1f} % (standard deviation)",
+        "error of reported heading": (
+            "heading unknown: all headings are searched"
+            if yaw is None
+            else f"{yaw:g}° (standard deviation)"
+        ),
+        "error of prior position": (
+            "no prior: the whole map is searched"
+            if prior is None
+            else f"{metres_text(prior)} per axis (standard deviation)"
+        ),
+        "confident fix": f"confidence of {conditions.accept:g} or more",
+        "correct fix": f"error of at most {metres_text(conditions.radius_m)}",
+        "ground speed": f"{conditions.speed_mps:g} m/s",
+        "drift without fixes": f"{100 * conditions.drift:g} % of the distance flown",
+    }
+    if band_m is not None:
+        rows["band along the route"] = f"{metres_text(band_m)} wide"
+    return rows
+
+
+def value_text(alternative: Alternative) -> str:
+    """The value of an alternative with its unit."""
+    value = alternative.value
+    return metres_text(value) if alternative.what.endswith("_m") else f"{value:g}"
+
+
+def what_text(what: str) -> str:
+    """The parameter that an alternative changes, in words."""
+    return WHAT.get(what, what.replace("_", " "))
+
+
+def better_sentence(alternatives: tuple[Alternative, ...], what: str) -> str:
+    """Whether another value of `what` would be better; empty if unknown."""
+    tried = [each for each in alternatives if each.what == what]
+    known = [each for each in tried if math.isfinite(each.probability)]
+    chosen = next((each for each in known if each.chosen), None)
+    if not known or chosen is None:
+        return ""
+    best = max(known, key=lambda each: each.probability)
+    if best.probability < chosen.probability + CLEARLY:
+        return f"No other {what_text(what)} tried is better than {value_text(chosen)}."
+    return (
+        f"A {what_text(what)} of {value_text(best)} instead of {value_text(chosen)} would be "
+        f"better: {share_text(best.probability)} instead of {share_text(chosen.probability)}."
+    )

@@ -1,0 +1,37 @@
+"""Which extras each command needs: asked before it runs, and shown by `orthonav --version -v`."""
+
+from collections.abc import Mapping
+
+from orthonav.extras import require
+
+NEEDS: Mapping[str, tuple[str, ...]] = {
+    "demo": ("geo", "report", "web"),
+    "landscape": ("geo",),
+    "simulate": ("geo",),
+    "fetch": ("fetch",),
+    "build": ("geo",),
+    "check": ("geo", "report", "web"),
+    "atlas": ("geo",),
+    "sign": ("signing",),
+    "verify": ("signing",),
+    "view": ("web",),
+    # Only with these options or inputs; the part that needs it says so.
+    "plan --dem": ("geo",),
+    "build --edges segments": ("segments",),
+    "build --method autoencoder, triplet or bovw": ("train",),
+    "atlas build, atlas index": ("atlas",),
+    "atlas build --cluster": ("cluster",),
+    "localize, fly: a map with a neural encoder": ("neural",),
+    "localize --atlas": ("atlas",),
+    "localize, fly --require-signed": ("signing",),
+    "localize, import, calibrate: photographs, ROS, logs": ("flights",),
+    "fly --autopilot, --log": ("autopilot",),
+    "fly --ros2": ("ros2",),
+    "evaluate --report": ("report",),
+}
+"""Extras by command, or by command with an option or an input."""
+
+
+def require_extras(command: str) -> None:
+    """Raise `MissingExtraError`, one line with all that is missing, unless a command can run."""
+    require(f"orthonav {command}", *NEEDS.get(command, ()))

@@ -1,0 +1,110 @@
+"""`orthonav --version`: the version and, with `--verbose`, what is installed on which machine."""
+
+import argparse
+import contextlib
+import json
+import os
+import platform
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from orthonav import __version__
+from orthonav.cli.needs import NEEDS
+from orthonav.extras import missing, packages, pip_line
+
+_CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
+
+
+def show_version(arguments: Sequence[str]) -> int:
+    """Print what `--version`, with `--verbose` or `--json` beside it, asks for."""
+    parser = argparse.ArgumentParser(prog="orthonav", add_help=False)
+    parser.add_argument("--version", action="store_true")
+    parser.add_argument("-v", "--verbose", action="store_true")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args(arguments)
+    if options.json:
+        print(json.dumps(about(), indent=1))
+    elif options.verbose:
+        print(_text(about()))
+    else:
+        print(f"orthonav {__version__}")
+    return 0
+
+
+def about() -> dict[str, Any]:
+    """Plain values: versions, extras with what they lack, commands that lack one, the machine."""
+    names = sorted({extra for needed in NEEDS.values() for extra in needed})
+    return {
+        "orthonav": __version__,
+        "python": f"{platform.python_version()} ({platform.python_implementation()})",
+        "platform": platform.platform(),
+        "processor": _processor(),
+        "core": {package.name: package.version or None for package in packages()},
+        "extras": {
+            name: {package.name: package.version or None for package in packages(name)}
+            for name in names
+        },
+        "missing": {
+            command: pip_line(*lacking)
+            for command, needed in NEEDS.items()
+            if (lacking := [name for name in needed if missing(name)])
+        },
+    }
+
+
+def _processor() -> dict[str, Any]:
+    """Architecture, cores that may be used, memory, and what OpenCV uses of the instruction set."""
+    affinity = getattr(os, "sched_getaffinity", None)  # not on every system
+    return {
+        "machine": platform.machine(),
+        "cores": len(affinity(0)) if affinity else os.cpu_count(),
+        "memory_mb": _memory_mb(),
+        "features": _features(),
+    }
+
+
+def _features() -> list[str] | None:
+    """Instruction sets that OpenCV was built for and the processor has; None without OpenCV."""
+    try:
+        import cv2
+    except ImportError:
+        return None
+    line = cv2.getCPUFeaturesLine().split()
+    # OpenCV marks with * what is chosen at run time, with ? what this processor lacks.
+    return [name.lstrip("*") for name in line if not name.endswith("?")]
+
+
+def _memory_mb() -> int | None:
+    """Memory of the machine, or of the container where that is less; None where not known."""
+    try:
+        whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return None
+    with contextlib.suppress(OSError, ValueError):  # no container, or one without a limit ("max")
+        whole = min(whole, int(_CGROUP_LIMIT.read_text()))
+    return whole // 10**6
+
+
+def _text(plain: dict[str, Any]) -> str:
+    processor = plain["processor"]
+    features = ", ".join(processor["features"] or ["OpenCV cannot be loaded"])
+    lines = [
+        f"orthonav    {plain['orthonav']}",
+        f"Python      {plain['python']}",
+        f"platform    {plain['platform']}",
+        f"processor   {processor['machine']}, {processor['cores']} cores, "
+        f"{processor['memory_mb'] or '?'} MB of memory; {features}",
+        "",
+        f"{'core':<12}{_versions(plain['core'])}",
+        *(f"{name:<12}{_versions(found)}" for name, found in plain["extras"].items()),
+    ]
+    if plain["missing"]:
+        width = max(map(len, plain["missing"]))
+        rows = (f"  {command:<{width}}  {line}" for command, line in plain["missing"].items())
+        lines += ["", "cannot run, and what to type for it:", *rows]
+    return "\n".join(lines)
+
+
+def _versions(found: dict[str, str | None]) -> str:
+    return ", ".join(f"{name} {version or 'MISSING'}" for name, version in found.items())

@@ -1,0 +1,247 @@
+"""`fixes.jsonl`, written and read: one JSON object per view, in order of the flight.
+
+The keys of a line and their order are those of `KEYS`; those of a track end with `TRACK_KEYS`.
+Unknown numbers (NaN, infinite) are written as null and read as NaN. `time_s` is written with up to
+nine decimals, so that nanoseconds since 1970 are exact, which a float64 of seconds cannot hold.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from decimal import Decimal
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.errors import FlightError
+from orthonav.files import replacing, require_file
+from orthonav.records import Evidence, Fix, NoFix, ViewResult
+
+KEYS = (
+    "frame",  # name of the image in the flight folder
+    "time_s",  # time of exposure
+    "status",  # "fix" or "no_fix"
+    "lat_deg",  # WGS84; null for no_fix, like all down to agl_m
+    "lon_deg",
+    "cov_en_m2",  # [[east-east, east-north], [north-east, north-north]]
+    "confidence",  # probability that the error is below radius_m, 0 to 1
+    "radius_m",
+    "heading_deg",  # clockwise from true north, as estimated
+    "agl_m",  # metres above ground, as estimated
+    "reason",  # short word for programs; null for a fix
+    "detail",  # one sentence for people; null for a fix
+    "evidence",  # names and numbers
+    "latency_ms",
+)
+TRACK_KEYS = (
+    "tracked",  # true: the position is estimated from all views so far
+    "state",  # "searching", "tracking" or "lost"
+)
+STATES = ("searching", "tracking", "lost")
+_NULL_IN_FIX = {"reason": None, "detail": None}
+_NULL_IN_NO_FIX = dict.fromkeys(KEYS[3:10])
+_TIME_LIMIT_S = 2**63 / 1e9
+
+
+def result_to_json(result: ViewResult) -> str:
+    """One line of `fixes.jsonl`, without the line end: strict JSON in ASCII, keys as in `KEYS`."""
+    values: dict[str, Any] = {
+        "frame": result.frame,
+        **_outcome_values(result.outcome),
+        "evidence": {str(k): _or_none(v) for k, v in result.outcome.evidence.items()},
+        "latency_ms": _or_none(result.latency_ms),
+    }
+    texts = {key: json.dumps(value, allow_nan=False) for key, value in values.items()}
+    texts["time_s"] = _seconds(result.time_ns)
+    keys: tuple[str, ...] = KEYS
+    if result.state is not None:
+        keys += TRACK_KEYS
+        texts |= {"tracked": "true", "state": json.dumps(result.state)}
+    return "{" + ", ".join(f'"{key}": {texts[key]}' for key in keys) + "}"
+
+
+def result_from_json(line: str) -> ViewResult:
+    """The result in one line of `fixes.jsonl`.
+
+    Keys that are not in `KEYS` are ignored, and so are positions of a line without a fix.
+    Raises `FlightError` where the line is not strict JSON, a key is missing or has a wrong type.
+    """
+    try:
+        values = json.loads(line, parse_float=Decimal, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise FlightError(f"not a JSON object, cut off or damaged? ({error})") from error
+    if not isinstance(values, dict):
+        raise FlightError(f"expected a JSON object, got {_kind(values)}")
+    return ViewResult(
+        frame=_text(values, "frame"),
+        time_ns=_time_ns(values),
+        outcome=_outcome(values),
+        latency_ms=_number(values, "latency_ms"),
+        state=_state(values),
+    )
+
+
+def write_results(path: Path, results: Iterable[ViewResult]) -> None:
+    """Write `results` to `path`, one line each, whole or not at all."""
+    with replacing(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as out:
+        for result in results:
+            out.write(result_to_json(result) + "\n")
+
+
+def read_results(path: Path) -> list[ViewResult]:
+    """All results in `path`, in its order; empty lines are skipped.
+
+    Raises `MissingFileError` where there is no such file, and `FlightError` with the number of the
+    first invalid line.
+    """
+    path = require_file(path, "file of fixes")
+    results = []
+    with path.open("rb") as stream:
+        for number, raw in enumerate(stream, start=1):
+            try:
+                line = raw.decode("utf-8").strip()
+                if line:
+                    results.append(result_from_json(line))
+            except UnicodeDecodeError as error:
+                raise FlightError(f"line {number}: not UTF-8 text: {path}") from error
+            except FlightError as error:
+                raise FlightError(f"line {number}: {error}: {path}") from error
+    return results
+
+
+def _outcome_values(outcome: Fix | NoFix) -> dict[str, Any]:
+    if isinstance(outcome, NoFix):
+        no_fix = {"status": "no_fix", "reason": outcome.reason, "detail": outcome.detail}
+        return {**no_fix, **_NULL_IN_NO_FIX}
+    return {
+        "status": "fix",
+        "lat_deg": _or_none(outcome.lat_deg),
+        "lon_deg": _or_none(outcome.lon_deg),
+        "cov_en_m2": [[_or_none(value) for value in row] for row in outcome.cov_en_m2],
+        "confidence": _or_none(outcome.confidence),
+        "radius_m": _or_none(outcome.radius_m),
+        "heading_deg": _or_none(outcome.heading_deg),
+        "agl_m": _or_none(outcome.agl_m),
+        **_NULL_IN_FIX,
+    }
+
+
+def _state(values: Mapping[str, Any]) -> str | None:
+    state = values.get("state")
+    if state is not None and state not in STATES:
+        raise FlightError(f"state: expected one of {', '.join(STATES)}, got {state!r:.40}")
+    return state
+
+
+def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
+    status = _text(values, "status")
+    evidence = _evidence(values)
+    if status == "no_fix":
+        detail = "" if values.get("detail") is None else _text(values, "detail")
+        return NoFix(reason=_text(values, "reason"), detail=detail, evidence=evidence)
+    if status != "fix":
+        raise FlightError(f"status: expected 'fix' or 'no_fix', got {status!r:.40}")
+    confidence = _number(values, "confidence")
+    if not (math.isnan(confidence) or 0.0 <= confidence <= 1.0):
+        raise FlightError(f"confidence: expected 0 to 1, got {confidence:g}")
+    return Fix(
+        lat_deg=_angle(values, "lat_deg", 90.0),
+        lon_deg=_angle(values, "lon_deg", 180.0),
+        cov_en_m2=_covariance(values),
+        confidence=confidence,
+        radius_m=_number(values, "radius_m"),
+        heading_deg=_number(values, "heading_deg"),
+        agl_m=_number(values, "agl_m"),
+        evidence=evidence,
+    )
+
+
+def _seconds(time_ns: int) -> str:
+    whole, rest = divmod(abs(int(time_ns)), 1_000_000_000)
+    decimals = f"{rest:09d}".rstrip("0") or "0"
+    return f"{'-' if time_ns < 0 else ''}{whole}.{decimals}"
+
+
+def _time_ns(values: Mapping[str, Any]) -> int:
+    seconds = _number(values, "time_s")
+    if not abs(seconds) < _TIME_LIMIT_S:  # NaN too
+        raise FlightError(f"time_s: expected seconds that fit 64 bits of ns, got {seconds:g}")
+    return int(Decimal(values["time_s"]).scaleb(9).to_integral_value())
+
+
+def _or_none(value: float) -> float | None:
+    value = float(value)
+    return value if math.isfinite(value) else None
+
+
+def _value(values: Mapping[str, Any], key: str) -> Any:
+    if key not in values:
+        raise FlightError(f"key {key} is missing")
+    return values[key]
+
+
+def _text(values: Mapping[str, Any], key: str) -> str:
+    value = _value(values, key)
+    if not isinstance(value, str):
+        raise FlightError(f"{key}: expected text, got {_kind(value)}")
+    return value
+
+
+def _number(values: Mapping[str, Any], key: str) -> float:
+    return _as_float(_value(values, key), key)
+
+
+def _as_float(value: Any, name: str) -> float:
+    if value is None:
+        return math.nan
+    if isinstance(value, bool) or not isinstance(value, int | Decimal):
+        raise FlightError(f"{name}: expected a number or null, got {_kind(value)}")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise FlightError(f"{name}: expected a finite number or null, got one beyond float64")
+    return number
+
+
+def _angle(values: Mapping[str, Any], key: str, limit_deg: float) -> float:
+    angle = _number(values, key)
+    if not abs(angle) <= limit_deg:  # NaN too: a fix has a position
+        raise FlightError(f"{key}: a fix needs -{limit_deg:g} to {limit_deg:g}, got {angle:g}")
+    return angle
+
+
+def _covariance(values: Mapping[str, Any]) -> NDArray[np.float64]:
+    rows = _value(values, "cov_en_m2")
+    if rows is None:
+        rows = [[None, None], [None, None]]
+    if not isinstance(rows, list) or [_length(row) for row in rows] != [2, 2]:
+        raise FlightError("cov_en_m2: expected two rows of two numbers")
+    cov = np.array([[_as_float(value, "cov_en_m2") for value in row] for row in rows])
+    cov.setflags(write=False)
+    return cov
+
+
+def _length(row: Any) -> int:
+    return len(row) if isinstance(row, list) else -1
+
+
+def _evidence(values: Mapping[str, Any]) -> Evidence:
+    evidence = _value(values, "evidence")
+    if not isinstance(evidence, dict):
+        raise FlightError(f"evidence: expected an object, got {_kind(evidence)}")
+    named = {key: _as_float(value, f"evidence {key!r:.40}") for key, value in evidence.items()}
+    return MappingProxyType(named)
+
+
+def _kind(value: Any) -> str:
+    names = {dict: "an object", list: "a list", str: "text", bool: "true or false"}
+    return "null" if value is None else names.get(type(value), "a number")
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not JSON; write null")

@@ -1,0 +1,199 @@
+"""The plan of the search: which candidates to collect for a view, in which order, at what cost.
+
+A view is judged at one level of the map, where it is some 72 px across (`Levels.look`). There are
+three sources of candidates:
+
+- the *judged level* by FFT: the only one that misses nothing, and the dearest on a large area;
+- the *coarse level*, one above it, by FFT: a quarter of the pixels;
+- the *tiles* whose embeddings are most similar to the view.
+
+Where the judged level is cheap (a prior, a small sheet) only that one is searched. Elsewhere the
+cheaper of the other two comes first; the next one follows only while the best place does not stand
+out, and only if its estimated cost is acceptable. At the judged level headings and scales come in
+stages, the most likely first, so that an ordinary view ends after the first stage.
+
+This file decides; `registration` executes.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+from orthonav.register.registrar import Levels, PosePrior
+from orthonav.register.search import bank
+
+
+class ClearMargin(NamedTuple):
+    """How far a place must stand out for the search to end with it.
+
+    `strength`: score over that of chance. `look_ratio`, `peak_ratio`: score over that of the
+    strongest rival, at the judged level and after finishing.
+    """
+
+    strength: float
+    look_ratio: float
+    peak_ratio: float
+
+
+CLEAR = ClearMargin(2.2, 1.9, 1.9)
+CLEAR_AT_JUDGED = ClearMargin(1.8, 1.5, 1.5)
+
+Pose = tuple[float, float]
+"""Heading (rad, clockwise from north) and natural logarithm of the scale."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """One search to run.
+
+    `level`: level of the map at which candidates are found (those of tiles: refined first).
+    `poses`: headings and log scales to try. `from_tiles`: by embeddings of tiles, else by FFT.
+    `candidates`: at most so many are taken.
+    """
+
+    level: int
+    poses: list[Pose]
+    from_tiles: bool
+    candidates: int
+
+
+@dataclass(frozen=True)
+class SearchPlan:
+    """Parameters of the search.
+
+    Costs are rough estimates for one core of a desktop and only choose between searches. Where no
+    other source is named, a value was chosen on the scenes of `python -m benchmarks.real_imagery`
+    (docs/benchmarks.md).
+    """
+
+    turn_step_rad: float = math.radians(8.0)
+    """Spacing of headings at the coarse level and for tiles, whose candidates are refined there
+    first; docs/decisions/registration.md, 6."""
+    scale_step: float = 0.13
+    """Spacing of log scales there; docs/decisions/registration.md, 6."""
+    judged_turn_step_rad: float = math.radians(6.0)
+    """Spacing of headings at the judged level: 8 deg lose 2 to 6 points of views there;
+    docs/decisions/registration.md, 6."""
+    judged_scale_step: float = 0.09
+    """Spacing of log scales at the judged level; docs/decisions/registration.md, 6."""
+    bank_sigmas: float = 3.0
+    """Headings and scales reach so many standard deviations of the telemetry."""
+    max_nats: float = 5.5
+    """Poses less likely than this (negative log density, 0 at the peak) are not tried: it rounds
+    off the corners of the bank, where heading and scale are both far off."""
+    stages_nats: tuple[float, ...] = (-1.0, 0.4, 2.0, math.inf)
+    """Bounds of the stages at the judged level, in nats: poses within 0.4 nats first."""
+    candidates: int = 24
+    """Candidates of a search by FFT at the coarse level."""
+    stage_candidates: int = 8
+    """Candidates of one stage at the judged level."""
+    tile_candidates: int = 20
+    """Candidates from tiles."""
+    tile_apart_strides: float = 1.5
+    """Candidates from tiles lie at least so many strides of the tile grid apart: neighbours
+    show the same ground."""
+    view_tiles: tuple[float, float] = (0.6, 2.5)
+    """Least and largest side of a view, in tiles, for which tiles are asked: below, most of a tile
+    is missing; above, most of the view is unused."""
+    min_candidates: int = 6
+    """So many candidates are always kept, for the evidence needs rivals."""
+    candidate_share: float = 0.5
+    """Weaker candidates than this share of the best are dropped."""
+    clear: ClearMargin = CLEAR
+    """The search ends with a place that stands out so far. Views of other places reach a ratio of
+    1.4, rarely 1.6; docs/decisions/registration.md, 10."""
+    clear_at_judged: ClearMargin = CLEAR_AT_JUDGED
+    """The same once the judged level was searched, if only in part: it misses least."""
+    doubt: float = 0.01
+    """Views with a confidence from this to one minus this are judged one level finer too;
+    docs/decisions/registration.md, 2."""
+    cheap_ms: float = 14.0
+    """Up to this cost the judged level is searched at once, and nothing else."""
+    last_ms: float = 900.0
+    """A second search is left out where it would cost more: the limit of about a second for a view
+    on a large area (README)."""
+    max_search_px: int = 8_000_000
+    """Larger windows (some 300 MB) are not searched by FFT: on such a map views are found by
+    tiles, or with a prior."""
+    fft_pose_ms: float = 0.1
+    """Estimated cost of one pose of an FFT search, whatever its size."""
+    fft_pixel_ms: float = 5.5e-7
+    """Estimated cost of one pixel of the window under one pose, times the logarithm (base 2) of
+    the number of pixels."""
+    tile_view_ms: float = 4.0
+    """Estimated cost of representing a view for its embeddings."""
+    tile_pose_ms: float = 0.06
+    """Estimated cost of embedding the view under one pose."""
+    tile_score_ms: float = 5e-8
+    """Estimated cost of one number of one tile's embedding under one pose."""
+
+    def fft_ms(self, poses: int, rows: int, cols: int) -> float:
+        """Estimated cost of an FFT search of a window; infinite where it is too large."""
+        pixels = float(rows * cols)
+        if pixels > self.max_search_px:
+            return math.inf
+        return poses * (self.fft_pose_ms + self.fft_pixel_ms * pixels * math.log2(pixels))
+
+    def tiles_ms(self, poses: int, tiles: int, dims: int) -> float:
+        """Estimated cost of candidates from so many tiles with embeddings of `dims` numbers."""
+        return self.tile_view_ms + poses * (self.tile_pose_ms + self.tile_score_ms * tiles * dims)
+
+    def enough(self, level: int, levels: Levels) -> ClearMargin:
+        """The margin that ends the search after one at `level`."""
+        return self.clear_at_judged if level == levels.look else self.clear
+
+    def searches(
+        self,
+        levels: Levels,
+        prior: PosePrior,
+        fft_ms: Callable[[int, int], float],
+        tiles_ms: Callable[[int], float],
+    ) -> Iterator[Search]:
+        """The searches for a view, to be run in this order until its place stands out.
+
+        `fft_ms(level, poses)` and `tiles_ms(poses)` are estimated costs, infinite where a search
+        is impossible.
+        """
+        rough = [pose for pose, _ in self._poses(prior, self.turn_step_rad, self.scale_step)]
+        fine = self._poses(prior, self.judged_turn_step_rad, self.judged_scale_step)
+        judged_ms = fft_ms(levels.look, len(fine))
+        if judged_ms > self.cheap_ms:
+            coarse_ms = fft_ms(levels.coarse, len(rough))
+            both = sorted([(coarse_ms, False), (tiles_ms(len(rough)), True)])
+            # The cheaper one wherever it is possible; the other only where it can be afforded.
+            affordable = 0.0 if judged_ms <= self.last_ms else self.last_ms
+            for number, (cost_ms, from_tiles) in enumerate(both):
+                if math.isinf(cost_ms) or (number and cost_ms > affordable):
+                    break
+                count = self.tile_candidates if from_tiles else self.candidates
+                yield Search(levels.coarse, rough, from_tiles, count)
+        if judged_ms <= max(self.last_ms, self.cheap_ms):
+            for least, most in pairwise(self.stages_nats):
+                stage = [pose for pose, nats in fine if least < nats <= most]
+                if stage:
+                    yield Search(levels.look, stage, False, self.stage_candidates)
+
+    def _poses(
+        self, prior: PosePrior, turn_step_rad: float, scale_step: float
+    ) -> list[tuple[Pose, float]]:
+        """Poses to try, each with its negative log density in nats, the most likely first."""
+        made = bank(
+            None if prior.turn_rad is None else prior.turn_std_rad,
+            prior.log_scale_std,
+            turn_step_rad=turn_step_rad,
+            scale_step=scale_step,
+            sigmas=self.bank_sigmas,
+        )
+        reported = prior.turn_rad or 0.0
+        cell = turn_step_rad / 2, scale_step / 2
+        poses = [(reported + turn, log_scale) for turn, log_scale in made.poses]
+        rated = [(pose, prior.nats(*pose, within=cell)) for pose in poses]
+        return sorted(
+            (each for each in rated if each[1] <= self.max_nats), key=lambda each: each[1]
+        )
+
+
+DEFAULT_PLAN = SearchPlan()
+"""What flies."""

@@ -1,0 +1,102 @@
+"""A view made ready for registration: rectified with its own heading up, as templates."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.localizer.checks import check_footprint
+from orthonav.localizer.rectify import RectifiedView, downsampled, rectify_footprint
+from orthonav.records import (
+    DEFAULT_AGL_STD,
+    DEFAULT_YAW_STD_DEG,
+    MIN_YAW_STD_DEG,
+    NoFix,
+    Telemetry,
+    View,
+)
+from orthonav.register.registrar import Levels, PosePrior
+from orthonav.register.template import ViewTemplates
+
+MIN_AGL_STD = 0.03
+"""Least standard deviation of the log scale that is searched, whatever the telemetry reports."""
+MAX_AGL_STD = 0.15
+"""Largest one: three of them are scales of 0.64 to 1.57, about as far as scores of chance were
+measured to be alike (docs/decisions/registration.md, 1)."""
+MIN_VIEW_PX = 24.0
+"""Narrower views (pixels of the map across) are refused: a template of 24 px is a sixth of the size
+that views are finished at (docs/decisions/registration.md, 2)."""
+MIN_TILT_COS = 0.5
+"""Beyond a tilt of 60 deg the footprint is not expected to grow: it is cut off (`rectify`)."""
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedView:
+    """A view made ready for registration.
+
+    `rectified_at`: makes the view at the ground resolution of a level. `templates`: its evidence.
+    `levels`: levels of the map at which it is searched, judged and finished. `side_px`: root of the
+    area seen, in pixels of level 0. `camera_px` (2,): the camera as seen from the middle of the
+    view, heading up, x to the right and y down, in pixels of level 0. `prior`: expected heading and
+    scale.
+    """
+
+    rectified_at: Callable[[int], RectifiedView]
+    templates: ViewTemplates
+    levels: Levels
+    side_px: float
+    camera_px: NDArray[np.float64]
+    prior: PosePrior
+
+
+def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> PreparedView | NoFix:
+    """The view rectified at the level where it is finished; `NoFix` where it shows too little.
+
+    `gsd_m` is the ground resolution of level 0 of the map, `map_levels` the number of its levels.
+    """
+    camera, telemetry = view.camera, view.telemetry
+    tilt = math.cos(math.radians(telemetry.pitch_deg)) * math.cos(math.radians(telemetry.roll_deg))
+    # The area seen grows with the inverse cube of the cosine of the tilt.
+    nominal_m = (telemetry.agl_m / max(tilt, MIN_TILT_COS) ** 1.5) * math.sqrt(
+        camera.width_px * camera.height_px / (camera.fx_px * camera.fy_px)
+    )
+    levels = Levels.of(nominal_m / gsd_m, map_levels)
+
+    def rectified_at(level: int) -> RectifiedView:
+        level_m = gsd_m * 2**level
+        multiple = 2 ** max(0, levels.coarse - level)
+        return rectify_footprint(downsampled(view, level_m), gsd_m=level_m, multiple_px=multiple)
+
+    rectified = rectified_at(levels.final)
+    unit = gsd_m * 2**levels.final / gsd_m
+    refused = check_footprint(rectified, unit, MIN_VIEW_PX)
+    if refused is not None:
+        return refused
+    offset = rectified.offset_en_m / gsd_m
+    side_px = math.sqrt(float(rectified.valid.sum())) * (gsd_m * 2**levels.final) / gsd_m
+    return PreparedView(
+        rectified_at,
+        ViewTemplates(rectified.grey, rectified.valid, levels.final),
+        levels,
+        side_px,
+        np.array([-offset[0], offset[1]]),
+        pose_prior(telemetry, heading_known),
+    )
+
+
+def pose_prior(telemetry: Telemetry, heading_known: bool) -> PosePrior:
+    """Expected heading and scale of a view, by its telemetry."""
+    yaw_std = _or_default(telemetry.yaw_std_deg, DEFAULT_YAW_STD_DEG)
+    agl_std_m = telemetry.agl_std_m
+    agl_std = None if agl_std_m is None else agl_std_m / telemetry.agl_m
+    return PosePrior(
+        math.radians(telemetry.yaw_deg) if heading_known else None,
+        math.radians(min(max(yaw_std, MIN_YAW_STD_DEG), 90.0)),
+        min(max(_or_default(agl_std, DEFAULT_AGL_STD), MIN_AGL_STD), MAX_AGL_STD),
+    )
+
+
+def _or_default(value: float | None, default: float) -> float:
+    return default if value is None or not math.isfinite(value) else value

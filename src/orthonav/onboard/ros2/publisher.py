@@ -1,0 +1,182 @@
+"""Positions, the origin of their local frame, health and a transform as messages of ROS 2.
+
+Frames by REP 103 and REP 105: `map` is east, north, up at the origin, the aircraft forward, left,
+up. Positions reach this module only through the gate.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.flight.logged import NO_ALTITUDE_M2
+from orthonav.geo.frames import LocalFrame
+from orthonav.onboard.ros2.node import Node
+from orthonav.onboard.telemetry import VehicleState
+from orthonav.publish.estimate import NavigationEstimate
+from orthonav.publish.mavlink import require_confident
+from orthonav.records import CONFIDENT
+from orthonav.sources.attitude import ros_xyzw_from_ned
+
+NOT_MEASURED_RAD2 = math.pi**2
+"""Variance of an angle that is not measured: (180 deg)^2."""
+_STATUS_FIX, _COVARIANCE_KNOWN = 0, 3
+_LEVELS = {"OK": 0, "DEGRADED": 1, "FAILED": 2}
+Array = NDArray[np.float64]
+
+
+class Ros2Publisher:
+    """Publishes positions that passed the gate. The origin is latched for later subscribers."""
+
+    def __init__(
+        self,
+        node: Node,
+        origin: LocalFrame,
+        now_ns: Callable[[], int],
+        *,
+        min_std_m: float = 0.0,
+        min_confidence: float = CONFIDENT,
+        silent: bool = False,
+    ) -> None:
+        """`origin`: origin of the map frame. `now_ns`: reads ROS time. `min_std_m`: lower bound of
+        the standard deviation in any direction. `silent`: send no positions."""
+        self._node, self._frame, self._now_ns = node, origin, now_ns
+        self._floor_m, self._least, self._silent = min_std_m, min_confidence, silent
+        resolved = node.arguments.resolved
+        self._parameters = node.arguments.parameters
+        self._fix = node.advertise(resolved("~/fix"), "sensor_msgs/msg/NavSatFix")
+        pose = "geometry_msgs/msg/PoseWithCovarianceStamped"
+        self._pose = node.advertise(resolved("~/pose"), pose)
+        self._origin = node.advertise(
+            resolved("~/origin"), "geographic_msgs/msg/GeoPointStamped", depth=1, latched=True
+        )
+        diagnostics = "diagnostic_msgs/msg/DiagnosticArray"
+        self._health = node.advertise(resolved("/diagnostics"), diagnostics)
+        self._transform = None
+        if self._parameters.publish_tf:
+            self._transform = node.advertise(resolved("/tf"), "tf2_msgs/msg/TFMessage", depth=100)
+        self._send_origin()
+
+    def position(
+        self, estimate: NavigationEstimate, vehicle: VehicleState, stamp_ns: int
+    ) -> tuple[str, ...]:
+        """See `PositionOutput.position`; raises `EstimateError` for a low confidence too."""
+        require_confident(estimate, self._least, "NavSatFix")
+        if self._silent:
+            return ()
+        cov = floored(np.asarray(estimate.cov_en_m2), self._floor_m)
+        self._fix.write(self._navsatfix(estimate, cov, stamp_ns))
+        east, north = self._frame.en_from_latlon(estimate.lat_deg, estimate.lon_deg).tolist()
+        turn = orientation(vehicle)
+        self._pose.write(self._posed((east, north), cov, turn, stamp_ns))
+        sent = ["NavSatFix", "PoseWithCovarianceStamped"]
+        if self._transform is not None:
+            self._transform.write(self._transformed((east, north), turn, stamp_ns))
+            sent.append("TFMessage")
+        return tuple(sent)
+
+    def health(self, plain: dict[str, Any]) -> None:
+        """See `PositionOutput.health`; it also lists problems of the topics."""
+        new = self._node.definitions.new
+        problems = {f"topic {name}": text for name, text in self._node.problems.items()}
+        damaged = {f"damaged on {name}": n for name, n in self._node.undecodable.items()}
+        level = _LEVELS[plain["health"]]
+        values = [
+            new("diagnostic_msgs/msg/KeyValue", key=name, value=str(value))
+            for name, value in {**plain, **problems, **damaged}.items()
+        ]
+        status = new(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=max(level, 1) if problems else level,
+            name=f"{self._node.arguments.node}: position",
+            message=", ".join([*plain["reasons"], *problems]) or "OK",
+            hardware_id="orthonav",
+            values=values,
+        )
+        header = self._node.definitions.header(self._now_ns(), "")
+        self._health.write(
+            new("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[status])
+        )
+
+    def close(self) -> None:
+        """See `PositionOutput.close`; the node is closed by its owner."""
+
+    def _send_origin(self) -> None:
+        definitions = self._node.definitions
+        place = definitions.new(
+            "geographic_msgs/msg/GeoPoint",
+            latitude=self._frame.lat_deg,
+            longitude=self._frame.lon_deg,
+            altitude=math.nan,  # "unspecified": the map has no altitude
+        )
+        header = definitions.header(self._now_ns(), self._parameters.map_frame)
+        self._origin.write(
+            definitions.new("geographic_msgs/msg/GeoPointStamped", header=header, position=place)
+        )
+
+    def _navsatfix(self, estimate: NavigationEstimate, cov: Array, stamp_ns: int) -> Any:
+        """Latitude and longitude; the altitude is NaN, and the satellite service is 0."""
+        definitions = self._node.definitions
+        full = np.zeros((3, 3))
+        full[:2, :2], full[2, 2] = cov, NO_ALTITUDE_M2
+        return definitions.new(
+            "sensor_msgs/msg/NavSatFix",
+            header=definitions.header(stamp_ns, self._parameters.base_frame),
+            status=definitions.new("sensor_msgs/msg/NavSatStatus", status=_STATUS_FIX, service=0),
+            latitude=float(estimate.lat_deg),
+            longitude=float(estimate.lon_deg),
+            altitude=math.nan,
+            position_covariance=full.ravel(),
+            position_covariance_type=_COVARIANCE_KNOWN,
+        )
+
+    def _posed(
+        self, position_en_m: tuple[float, float], cov: Array, turn: Array, stamp_ns: int
+    ) -> Any:
+        """Pose whose x and y are measured. z is 0 and the orientation is the reported one, both
+        with large variances. Order: x, y, z, rotations about X, Y, Z."""
+        definitions = self._node.definitions
+        full = np.diag([0.0, 0, NO_ALTITUDE_M2, *[NOT_MEASURED_RAD2] * 3])
+        full[:2, :2] = cov
+        pose = definitions.new(
+            "geometry_msgs/msg/Pose",
+            position=definitions.vector("Point", "xyz", (*position_en_m, 0.0)),
+            orientation=definitions.vector("Quaternion", "xyzw", turn.tolist()),
+        )
+        return definitions.new(
+            "geometry_msgs/msg/PoseWithCovarianceStamped",
+            header=definitions.header(stamp_ns, self._parameters.map_frame),
+            pose=definitions.new(
+                "geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=full.ravel()
+            ),
+        )
+
+    def _transformed(self, position_en_m: tuple[float, float], turn: Array, stamp_ns: int) -> Any:
+        definitions = self._node.definitions
+        moved = definitions.new(
+            "geometry_msgs/msg/Transform",
+            translation=definitions.vector("Vector3", "xyz", (*position_en_m, 0.0)),
+            rotation=definitions.vector("Quaternion", "xyzw", turn.tolist()),
+        )
+        stamped = definitions.new(
+            "geometry_msgs/msg/TransformStamped",
+            header=definitions.header(stamp_ns, self._parameters.map_frame),
+            child_frame_id=self._parameters.base_frame,
+            transform=moved,
+        )
+        return definitions.new("tf2_msgs/msg/TFMessage", transforms=[stamped])
+
+
+def floored(cov_en_m2: Array, min_std_m: float) -> Array:
+    """Covariance (2, 2) with a standard deviation of at least `min_std_m` in every direction."""
+    values, vectors = np.linalg.eigh(cov_en_m2)
+    return np.asarray(vectors @ np.diag(np.maximum(values, min_std_m**2)) @ vectors.T)
+
+
+def orientation(vehicle: VehicleState) -> Array:
+    """Reported attitude as a ROS quaternion x, y, z, w; the identity where it is not known."""
+    if vehicle.ned_from_body is None:
+        return np.array([0.0, 0.0, 0.0, 1.0])
+    return ros_xyzw_from_ned(vehicle.ned_from_body)

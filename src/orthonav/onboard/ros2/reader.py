@@ -1,0 +1,282 @@
+"""Images of a ROS 2 graph with the telemetry of their exposure: an `ImageSource` for the runner.
+
+An image waits a little for the attitude that follows its exposure. Times are ROS time, that of the
+header stamps; for a message without a stamp the time of arrival is used.
+"""
+
+import logging
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from orthonav.errors import CameraError, FlightError
+from orthonav.geo.camera import Camera
+from orthonav.onboard.cameras import CameraImage
+from orthonav.onboard.ros2.messages import TIME_NS
+from orthonav.onboard.ros2.node import Node
+from orthonav.onboard.telemetry import Clocks, TelemetryBuffer
+from orthonav.records import NoFix
+from orthonav.sources.attitude import LOOKS_DOWN, Angles, ned_wxyz_from_ros
+from orthonav.sources.ros_images import camera_of_info, grey_of_message
+from orthonav.sources.ros_track import attitude_of_message, height_of_message, stamp_ns
+
+log = logging.getLogger(__name__)
+JUMP_NS = TIME_NS
+"""Stamps that go back by more show a restart: a simulation was reset, or a bag played again."""
+FAR_NS = 2 * TIME_NS
+"""Images whose stamps differ from now by more are stamped by another clock."""
+REMIND_S = 10.0
+"""Seconds between two log lines about a missing input."""
+MOST_LINES = 100
+"""Largest number of different log lines about messages, whose contents are untrusted."""
+_SPIN_S = 0.05
+_TELEMETRY_DEPTH = 200
+IMAGES = {"raw": "sensor_msgs/msg/Image", "compressed": "sensor_msgs/msg/CompressedImage"}
+
+
+@dataclass(frozen=True)
+class GnssSample:
+    """Position of a GNSS receiver, for comparison only: it is never a source of our positions.
+
+    `time_ns`: ROS time. `lat_deg`, `lon_deg`, `alt_m`: WGS84. `status`: that of
+    `sensor_msgs/NavSatStatus`; below 0 there is no fix.
+    """
+
+    time_ns: int
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+    status: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Waiting:
+    """An image that waits for its telemetry since `arrived_ns` of our clock."""
+
+    message: Any
+    stamp_ns: int
+    arrived_ns: int
+
+
+class Ros2Reader:
+    """Camera, attitude, heights and GNSS of a ROS 2 graph. `read` is for one thread. Mutable."""
+
+    def __init__(
+        self,
+        node: Node,
+        buffer: TelemetryBuffer,
+        clocks: Clocks,
+        stopped: Callable[[], bool],
+        *,
+        mount_deg: Angles = LOOKS_DOWN,
+        wait_s: float = 0.15,
+    ) -> None:
+        """`wait_s`: how long an image waits for the attitude that follows its exposure."""
+        self._node, self._buffer, self._clocks, self._stopped = node, buffer, clocks, stopped
+        self._mount_deg, self._wait_ns = mount_deg, round(wait_s * 1e9)
+        self.gnss: GnssSample | None = None
+        self.log_gnss: Callable[[int, bytes], None] = lambda time_ns, cdr: None
+        self._camera: Camera | None = None
+        self._camera_error: CameraError | None = None
+        self._images: deque[_Waiting] = deque()
+        self._clock: tuple[int, int] | None = None
+        self._number, self._image_ns, self._attitude_ns = 0, 0, 0
+        self._checked_ns = self._reminded_ns = clocks.mono_ns()
+        self._said: set[str] = set()
+        self._subscribe()
+
+    def wait_for_camera(self) -> Camera:
+        """Camera of the first `camera_info`; waits for it until stopped, and logs that.
+
+        Raises `CameraError` where it is not calibrated, or where the flight was stopped before.
+        """
+        while not self._stopped():
+            self._spin()
+            if self._camera_error is not None:
+                raise CameraError(f"{self._camera_error}: {self._info_topic}")
+            if self._camera is not None:
+                return self._camera
+            self._remind(f"no message on {self._info_topic}; or give --camera FILE")
+        raise CameraError(
+            f"stopped before a camera_info came; give --camera FILE: {self._info_topic}"
+        )
+
+    def read(self) -> CameraImage | None:
+        """See `ImageSource.read`."""
+        while not self._stopped():
+            self._spin()
+            if self._images and self._is_ready(self._images[0]):
+                return self._camera_image(self._images.popleft())
+            if self._node.arguments.parameters.use_sim_time and self._clock is None:
+                self._remind("use_sim_time is true and nothing came on /clock")
+            elif not self._images and self._number == 0:
+                self._remind(f"no images on {self._image_topic}")
+        return None
+
+    def close(self) -> None:
+        """See `ImageSource.close`; the node is closed by its owner."""
+
+    def now_ns(self) -> int:
+        """ROS time; 0 before the first `/clock`, as ROS defines it."""
+        ahead_ns = self._ahead_ns()
+        return 0 if ahead_ns is None else self._clocks.mono_ns() + ahead_ns
+
+    def _subscribe(self) -> None:
+        node, parameters = self._node, self._node.arguments.parameters
+        resolved = node.arguments.resolved
+        image, kind = resolved("image"), IMAGES[parameters.image_transport]
+        compressed = parameters.image_transport == "compressed"
+        self._image_topic = f"{image}/compressed" if compressed else image
+        beside = f"{image.rpartition('/')[0]}/camera_info"
+        remapped = resolved("camera_info")
+        is_default = remapped == node.arguments.expanded("camera_info")
+        self._info_topic = beside if is_default else remapped
+        reliable = parameters.image_reliability == "reliable"
+        node.subscribe(self._image_topic, kind, self._take_image, reliable=reliable)
+        for topic, kind, handler in (
+            (self._info_topic, "sensor_msgs/msg/CameraInfo", self._take_camera_info),
+            (resolved("imu"), "sensor_msgs/msg/Imu", self._take_attitude),
+            (resolved("range"), "sensor_msgs/msg/Range", self._take_range),
+            (resolved("rel_alt"), "std_msgs/msg/Float64", self._take_altitude),
+            (resolved("gnss"), "sensor_msgs/msg/NavSatFix", self._take_gnss),
+        ):
+            node.subscribe(topic, kind, handler, depth=_TELEMETRY_DEPTH)
+        if parameters.use_sim_time:
+            clock = "rosgraph_msgs/msg/Clock"
+            node.subscribe(resolved("/clock"), clock, self._take_clock, depth=1)
+
+    def _spin(self) -> None:
+        self._node.spin(_SPIN_S)
+        now_ns = self._clocks.mono_ns()
+        if now_ns - self._checked_ns >= TIME_NS:
+            self._checked_ns = now_ns
+            self._node.check_graph()
+
+    def _ahead_ns(self) -> int | None:
+        """ROS time minus our monotonic clock; None before the first `/clock`."""
+        if not self._node.arguments.parameters.use_sim_time:
+            return self._clocks.utc_ns() - self._clocks.mono_ns()
+        return None if self._clock is None else self._clock[0] - self._clock[1]
+
+    def _stamp(self, message: Any) -> int | None:
+        """Time of a message: its stamp, else its arrival; None while ROS time is unknown."""
+        ahead_ns = self._ahead_ns()
+        if ahead_ns is None:
+            return None
+        return stamp_ns(message, self._clocks.mono_ns() + ahead_ns)
+
+    def _take_clock(self, message: Any, cdr: bytes) -> None:
+        time_ns = int(message.clock.sec) * TIME_NS + int(message.clock.nanosec)
+        if self._clock is not None and time_ns < self._clock[0] - JUMP_NS:
+            self._restart("/clock", self._clock[0] - time_ns)
+        self._clock = time_ns, self._clocks.mono_ns()
+
+    def _take_image(self, message: Any, cdr: bytes) -> None:
+        """Keep the oldest waiting image and the newest one."""
+        time_ns = self._stamp(message)
+        if time_ns is None:
+            return
+        if time_ns <= self._image_ns:
+            if self._image_ns - time_ns < JUMP_NS:
+                self._say_once(f"stamps of images go back; dropped: {self._image_topic}")
+                return
+            self._restart(self._image_topic, self._image_ns - time_ns)
+        self._image_ns = time_ns
+        while len(self._images) > 1:
+            self._images.pop()
+        self._images.append(_Waiting(message, time_ns, self._clocks.mono_ns()))
+
+    def _take_camera_info(self, message: Any, cdr: bytes) -> None:
+        """Use the first one: the camera does not change in flight."""
+        if self._camera is None:
+            try:
+                self._camera = camera_of_info(message)
+            except CameraError as error:
+                self._camera_error = error
+
+    def _take_attitude(self, message: Any, cdr: bytes) -> None:
+        time_ns, wxyz = self._stamp(message), attitude_of_message(message)
+        if time_ns is None or wxyz is None:
+            return
+        if time_ns < self._attitude_ns - JUMP_NS:
+            self._restart("imu", self._attitude_ns - time_ns)
+        self._attitude_ns = max(self._attitude_ns, time_ns)
+        turned = ned_wxyz_from_ros(wxyz)
+        if turned is not None:
+            self._buffer.add_attitude(time_ns, turned.tolist())
+
+    def _take_range(self, message: Any, cdr: bytes) -> None:
+        self._take_height("distance", message)
+
+    def _take_altitude(self, message: Any, cdr: bytes) -> None:
+        self._take_height("home", message)
+
+    def _take_height(self, source: str, message: Any) -> None:
+        time_ns, height = self._stamp(message), height_of_message(message)
+        if time_ns is None or height is None:
+            return
+        if source == "distance":
+            self._buffer.add_distance(time_ns, height)
+        else:
+            self._buffer.add_height(source, time_ns, height)
+
+    def _take_gnss(self, message: Any, cdr: bytes) -> None:
+        time_ns = self._stamp(message)
+        if time_ns is not None:
+            place = float(message.latitude), float(message.longitude), float(message.altitude)
+            self.gnss = GnssSample(time_ns, *place, int(message.status.status))
+            self.log_gnss(time_ns, cdr)
+
+    def _is_ready(self, image: _Waiting) -> bool:
+        covered_ns = self._buffer.covered_ns
+        if covered_ns is not None and covered_ns >= image.stamp_ns:
+            return True
+        return self._clocks.mono_ns() - image.arrived_ns >= self._wait_ns
+
+    def _camera_image(self, image: _Waiting) -> CameraImage:
+        self._number += 1
+        exposed_ns = image.stamp_ns - (self._ahead_ns() or 0)
+        off_s = (self._clocks.mono_ns() - exposed_ns) / 1e9
+        if abs(off_s) > FAR_NS / 1e9:
+            self._say_once(
+                f"stamps of images are {off_s:.1f} s behind ROS time: set use_sim_time for "
+                f"recordings and simulations, or synchronize the clocks: {self._image_topic}"
+            )
+        grey, problem = None, None
+        try:
+            grey = grey_of_message(image.message, self._image_topic)
+        except FlightError as error:
+            problem = NoFix("bad_image", str(error))
+            self._say_once(str(error))
+        vehicle = self._buffer.at(image.stamp_ns)
+        return CameraImage(
+            self._number,
+            f"{image.stamp_ns}",
+            exposed_ns,
+            image.stamp_ns,
+            grey,
+            problem,
+            vehicle.telemetry(image.stamp_ns, self._mount_deg),
+            vehicle,
+        )
+
+    def _restart(self, what: str, back_ns: int) -> None:
+        """Discard telemetry and images: time went back, they belong to an earlier run."""
+        log.warning("ROS time went back by %.1f s (%s); telemetry is cleared", back_ns / 1e9, what)
+        self._buffer.clear()
+        self._images.clear()
+        self._image_ns = self._attitude_ns = 0
+
+    def _remind(self, text: str) -> None:
+        now_ns = self._clocks.mono_ns()
+        pause_s = REMIND_S if text in self._said else 1.0  # discovery takes a moment
+        if now_ns - self._reminded_ns >= pause_s * 1e9:
+            self._said.add(text)
+            self._reminded_ns = now_ns
+            log.warning("waiting: %s", text)
+
+    def _say_once(self, text: str) -> None:
+        if text not in self._said and len(self._said) < MOST_LINES:
+            self._said.add(text)
+            log.warning("%s", text)

@@ -1,0 +1,198 @@
+"""The request of a build, and its validated inputs: imagery, area, tile grid and recipe."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav import represent
+from orthonav.embed.whitened import WhitenedRecipe
+from orthonav.errors import AreaError, OutputError, VariantError
+from orthonav.geo.area import Area, Extent
+from orthonav.geo.estimate import estimate_map
+from orthonav.geo.grid import TileGrid
+from orthonav.geo.route import Route
+from orthonav.geo.swapped import swapped_hint
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.mapfile.manifest import Manifest
+from orthonav.prepare.calibrate import CROPS
+from orthonav.prepare.encoders import EncoderRecipe
+from orthonav.prepare.layout import grid_of
+from orthonav.prepare.methods import method_recipe, usual_edges
+from orthonav.variants import make_variant
+
+MAX_WORKERS = 64
+"""Sanity limit on threads."""
+MAX_CALIBRATION_VIEWS = 2 * CROPS
+"""Number of crops collected while the imagery is read."""
+
+
+@dataclass(frozen=True)
+class BuildRequest:
+    """Parameters of a build. With neither `bounds_deg` nor `route`, all of the imagery is mapped.
+
+    - `orthos`: orthophotos; earlier ones take precedence. At least one.
+    - `out`: map file to write.
+    - `bounds_deg`: area as west, south, east, north, degrees.
+    - `route`: route whose search band is the area.
+    - `band_m`: width of the search band for legs without a width of their own, metres, above 0.
+    - `gsd_m`: ground resolution, metres per pixel, above 0; None: that of the finest orthophoto.
+    - `tile_px`: width of a tile, pixels, 16 to 4096.
+    - `overlap`: overlap of neighbouring tiles as a share of their width, 0 to below 1; 0.875
+      gives a stride of 32 pixels at 256.
+    - `method`: embedding, `name:field=value,..`, a row of `embed.TABLE`.
+    - `edges`: image representation, a row of `represent.TABLE`; None: the default of the method.
+    - `seed`: of all random draws, 0 or more; equal requests give equal bytes.
+    - `registration`: whether the map carries the grey layer that locates views below tile size.
+    - `other_dates`: orthophotos of the same area at other dates, from which the confidence is
+      calibrated, and a triplet network learns. They do not become part of the map.
+    - `calibration_views`: views generated from the reference to calibrate the confidence of
+      registration, 1 to 384.
+    - `work`: folder for finished blocks and checkpoints of networks, from which an interrupted
+      build resumes; None: blocks of a large map in `OUT.work` until it is written.
+    - `workers`: threads that read the imagery, 1 to 64; None: one per core.
+    - `cells`: whether the map carries the cell means from which new tiles are embedded without
+      imagery, for sheets of an atlas; method gradient only.
+    """
+
+    orthos: Sequence[Path]
+    out: Path
+    bounds_deg: Extent | None = None
+    route: Route | None = None
+    band_m: float | None = None
+    gsd_m: float | None = None
+    tile_px: int = 256
+    overlap: float = 0.875
+    method: str = "gradient"
+    edges: str | None = None
+    seed: int = 0
+    registration: bool = True
+    other_dates: Sequence[Path] = ()
+    calibration_views: int = 48
+    work: Path | None = None
+    workers: int | None = None
+    cells: bool = False
+
+
+@dataclass(frozen=True)
+class BuildResult:
+    """A finished build: the manifest as written, and the size of the file in bytes."""
+
+    manifest: Manifest
+    size_bytes: int
+
+
+@dataclass(frozen=True, eq=False)
+class BuildInputs:
+    """Opened and validated inputs of a build.
+
+    `mosaic`: reference imagery. `other_dates`: one mosaic per other date. `area`, `grid`: extent
+    and tiles of the map. `representation`: variant of `represent`. `recipe`: embedding to learn.
+    """
+
+    request: BuildRequest
+    mosaic: Mosaic
+    other_dates: tuple[Mosaic, ...]
+    area: Area
+    grid: TileGrid
+    representation: Any
+    recipe: WhitenedRecipe | EncoderRecipe
+
+    @classmethod
+    def open(cls, request: BuildRequest) -> "BuildInputs":
+        """Open the imagery and check the request.
+
+        Raises `MissingFileError`, `ImageryError`, `AreaError`, `VariantError` or `OutputError`.
+        """
+        edges = request.edges or usual_edges(request.method)
+        representation = make_variant(represent.TABLE, edges)
+        recipe = method_recipe(request.method, representation)
+        mosaic = Mosaic.open(request.orthos)
+        other_dates = tuple(Mosaic.open([path]) for path in request.other_dates)
+        inputs = [source.path for each in (mosaic, *other_dates) for source in each.sources]
+        if request.out.exists() and any(request.out.samefile(path) for path in inputs):
+            raise OutputError(
+                f"the map would replace an orthophoto; name another file: {request.out}"
+            )
+        area = _area(request, mosaic)
+        grid = grid_of(area, mosaic.gsd_m, request.gsd_m, request.tile_px, request.overlap)
+        _check_numbers(request)
+        return cls(request, mosaic, other_dates, area, grid, representation, recipe)
+
+    @property
+    def learns_network(self) -> bool:
+        """Whether the embedding is learned from images of the tiles, not from cell means."""
+        return not isinstance(self.recipe, WhitenedRecipe)
+
+    def estimate_text(self) -> str:
+        """Estimated size of the map and duration of the build, as one line."""
+        grid = self.grid
+        need = estimate_map(
+            self.area,
+            gsd_m=grid.gsd_m,
+            tile_px=grid.tile_px,
+            overlap=1 - grid.stride_px / grid.tile_px,
+            registration=self.request.registration,
+        )
+        least, most = need.map_mb
+        size = f"{most:.1f} MB" if most - least < 0.1 else f"{least:.1f} to {most:.1f} MB"
+        more = ", and training the network" if self.learns_network else ""
+        return (
+            f"about {need.area_km2:.1f} km2, {need.tiles:,} tiles of {grid.tile_px} px at "
+            f"{grid.gsd_m:g} m, a map of {size}, {need.build_s / 60:.1f} min on one core{more}"
+        )
+
+
+def _check_numbers(request: BuildRequest) -> None:
+    if request.seed < 0:
+        raise VariantError(f"seed must be 0 or more, got {request.seed}")
+    if not 1 <= request.calibration_views <= MAX_CALIBRATION_VIEWS:
+        raise VariantError(
+            f"calibration views must be 1 to {MAX_CALIBRATION_VIEWS}, "
+            f"got {request.calibration_views}"
+        )
+    if request.workers is not None and not 1 <= request.workers <= MAX_WORKERS:
+        raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {request.workers}")
+
+
+def _area(request: BuildRequest, mosaic: Mosaic) -> Area:
+    if request.route is not None and request.bounds_deg is not None:
+        raise AreaError("give either a route with a search band or bounds, not both")
+    if request.route is None and request.band_m is not None:
+        raise AreaError("a search band needs a route (--route)")
+    outline = mosaic.outline_latlon_deg
+    if request.route is not None:
+        area = Area.from_route(request.route, request.band_m)
+    elif request.bounds_deg is not None:
+        area = Area.from_bounds(request.bounds_deg)
+    else:
+        return Area.from_outline(outline[:, 0], outline[:, 1])
+    _check_not_swapped(area, outline)
+    return area
+
+
+def _check_not_swapped(area: Area, outline_deg: NDArray[np.float64]) -> None:
+    """Raise `AreaError` if swapping latitude and longitude brings an area into the imagery.
+
+    `outline_deg` (N, 2): outline of the imagery. Areas that overlap its box are accepted.
+    """
+    south, west = outline_deg.min(axis=0)
+    north, east = outline_deg.max(axis=0)
+
+    def within(lat_deg: float, lon_deg: float) -> bool:
+        turned = lon_deg + 360 * np.round(((west + east) / 2 - lon_deg) / 360)
+        return bool(south <= lat_deg <= north and west <= turned <= east)
+
+    centre = area.frame.lat_deg, area.frame.lon_deg
+    lat, lon = area.frame.latlon_from_en(np.array(area.extent_en_m).reshape(2, 2))
+    lon += 360 * np.round(((west + east) / 2 - centre[1]) / 360)
+    apart = lat[1] < south or lat[0] > north or lon[1] < west or lon[0] > east
+    hint = swapped_hint(*centre, within)
+    if apart and hint:
+        raise AreaError(
+            f"the area, at {centre[0]:.4f}, {centre[1]:.4f}, has no imagery: the orthophotos cover "
+            f"{south:.4f} to {north:.4f} N, {west:.4f} to {east:.4f} E{hint}"
+        )

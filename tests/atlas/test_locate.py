@@ -1,0 +1,291 @@
+"""Views are located in an atlas of another year without a prior; negatives never are."""
+
+import dataclasses
+import itertools
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from orthonav.atlas.build import AtlasRequest, build_atlas
+from orthonav.atlas.catalog import Atlas
+from orthonav.atlas.cluster import SerialRunner
+from orthonav.atlas.index import make_index
+from orthonav.atlas.index_manifest import MANIFEST, IndexManifest, read_manifest, stale_sheets
+from orthonav.atlas.locate import AtlasLocator, _against, rectified
+from orthonav.atlas.recipe import CoarseRecipe
+from orthonav.atlas.sheet_registration import SheetRegistrar
+from orthonav.atlas.tile_search import TileSearch
+from orthonav.errors import AtlasError
+from orthonav.flight.folder import open_flight
+from orthonav.geo.frames import distances_m
+from orthonav.geo.route import Route
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.onboard.run import locate_view
+from orthonav.records import Fix, NoFix, View
+from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+
+RECIPE = {
+    "gsd_m": 2.5,
+    "sheet_km": 2.0,
+    "tile_px": 128,
+    "calibration_views": 12,
+    "coarse": dataclasses.asdict(CoarseRecipe(5.0, 64, 0.875)),
+}
+
+
+CANDIDATES = 6
+"""Registering candidates takes most of the time."""
+
+
+@pytest.fixture(autouse=True)
+def fewer_candidates(monkeypatch):
+    monkeypatch.setattr("orthonav.atlas.locate.CANDIDATES", CANDIDATES)
+
+
+@pytest.fixture(scope="module")
+def atlas(area, tmp_path_factory):
+    """An atlas of the first date with its index; read-only."""
+    place = tmp_path_factory.mktemp("located") / "atlas"
+    with pytest.MonkeyPatch.context() as patch, SerialRunner() as runner:
+        patch.setattr("orthonav.prepare.calibrate.CROPS", 24)  # most of the time of a sheet
+        built = build_atlas(AtlasRequest(str(place), [area.past], RECIPE), runner)
+    assert not built.failed
+    return Atlas.open(place)
+
+
+@pytest.fixture(scope="module")
+def flown(area, tmp_path_factory):
+    """A flight of five views across the second date, heading not reported; read-only."""
+    south, north = _inner(area.present)
+    request = SimulateRequest(
+        [area.present],
+        tmp_path_factory.mktemp("flown") / "flight",
+        route=Route((south, north)),
+        spacing_m=130.0,
+        agl_m=area.agl_m,
+        camera=area.camera,
+        errors=Errors(agl_std=0.03),
+        seed=3,
+    )
+    simulate_flight(request)
+    return request.out
+
+
+@pytest.fixture(scope="module")
+def search(atlas):
+    with TileSearch(atlas) as opened:
+        yield opened
+
+
+@pytest.fixture
+def locator(atlas, search):
+    return AtlasLocator(SheetRegistrar(atlas), search)
+
+
+@pytest.fixture(scope="module")
+def first_view(flown):
+    flight = open_flight(flown)
+    view = next(iter(flight.views))
+    return View(view.grey(), flight.camera, view.telemetry)
+
+
+@pytest.fixture
+def copied(atlas, tmp_path):
+    """A copy of the atlas, to be changed."""
+    return Atlas.open(shutil.copytree(atlas.url, tmp_path / "copy"))
+
+
+def _inner(ortho):
+    """Two places well inside an orthophoto, from its south-west to its north-east."""
+    outline = Mosaic.open([ortho]).outline_latlon_deg
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    return tuple(low + 0.33 * (high - low)), tuple(low + 0.67 * (high - low))
+
+
+def _truth(flown):
+    lines = (flown / "truth.csv").read_text().splitlines()[1:]
+    return {line.split(",")[0]: tuple(map(float, line.split(",")[1:3])) for line in lines}
+
+
+def test_a_flight_is_located_without_prior_and_heading(atlas, flown, tmp_path, run):
+    """The whole command, once."""
+    out = tmp_path / "fixes.jsonl"
+    done = run("localize", "--atlas", atlas.url, flown, "--out", out, "--heading", "unknown")
+    assert done.code == 0, done.err
+    lines = [json.loads(line) for line in out.read_text().splitlines()]
+    # One view alone never gives a fix.
+    assert (lines[0]["status"], lines[0]["reason"], lines[0]["state"]) == (
+        *("no_fix", "searching", "searching"),
+    )
+    truth = _truth(flown)
+    fixes = [line for line in lines if line["status"] == "fix"]
+    assert len(fixes) >= len(lines) - 3
+    for fix in fixes:
+        place = (fix["lat_deg"], fix["lon_deg"])
+        assert distances_m([place], [truth[fix["frame"]]])[0] < 25
+    assert fixes[-1]["confidence"] > 0.9 and fixes[-1]["state"] == "tracking"
+
+
+def test_options_of_maps_are_refused(atlas, flown, tmp_path, run):
+    refused = run(
+        "localize", "--atlas", atlas.url, flown, "--out", tmp_path / "fixes.jsonl", "--track"
+    )
+    assert refused.code == 1 and "--track" in refused.err
+
+
+def test_negatives_never_have_a_confident_fix(locator, flown):
+    flight = open_flight(flown)
+    for view in itertools.islice(flight.views, 3):
+        mirrored = np.ascontiguousarray(view.grey()[:, ::-1])
+        outcome = locator.locate(View(mirrored, flight.camera, view.telemetry))
+        assert not (isinstance(outcome, Fix) and outcome.confidence > 0.8)
+
+
+def test_the_index_finds_what_comparing_all_tiles_finds(atlas, search, first_view, monkeypatch):
+    coarse = rectified(first_view, search.recipe.gsd_m)
+    poses = [(turn, 0.0) for turn in np.arange(0, 2 * np.pi, 0.3)]
+    found = search.matches(coarse, poses, 10)
+    manifest = read_manifest(atlas)
+    monkeypatch.setattr(search, "_probes", manifest.recipe.lists)
+    monkeypatch.setattr(search, "_rerank", sum(shard.rows for shard in manifest.shards))
+    exact = search.matches(coarse, poses, 10)
+    assert found[0] == exact[0]
+    places = [{(each.lat_deg, each.lon_deg) for each in matches} for matches in (found, exact)]
+    assert len(places[0] & places[1]) >= 9
+
+
+def test_views_of_another_scale_are_refused_with_the_reason(locator, first_view):
+    low = dataclasses.replace(first_view.telemetry, agl_m=60.0)
+    outcome = locator.locate(dataclasses.replace(first_view, telemetry=low))
+    assert isinstance(outcome, NoFix)
+    assert outcome.reason in {"wrong_scale", "too_small"}
+
+
+def test_the_same_sheets_make_the_same_index(atlas, copied):
+    shutil.rmtree(Path(copied.url, "index"))
+    again = copied
+    make_index(again)
+    names = sorted(atlas.store.names("index"))
+    assert names == sorted(again.store.names("index"))
+    for name in names:
+        assert again.store.read(f"index/{name}") == atlas.store.read(f"index/{name}")
+
+
+def test_a_removed_sheet_is_retired_and_a_new_one_is_added(copied, tmp_path, monkeypatch):
+    monkeypatch.setattr("orthonav.atlas.index.FEW_ROWS", 0)
+    monkeypatch.setattr("orthonav.atlas.index.REBUILD_SHARE", 2.0)
+    changed = copied
+    smallest = min(changed.sheets().values(), key=lambda each: each.tiles)
+    kept = {key: changed.path(smallest, key) for key in smallest.files}
+    aside = {key: shutil.copy(path, tmp_path / path.name) for key, path in kept.items()}
+    changed.retire(smallest.id)
+    before = read_manifest(changed)
+    assert stale_sheets(changed, before) == ([], [smallest.id])
+    after = make_index(changed)
+    assert smallest.id not in after.sheets
+    assert [shard.name for shard in after.shards] == [shard.name for shard in before.shards]
+    changed.put(aside, smallest)
+    again = make_index(changed)
+    assert len(again.shards) == len(before.shards) + 1
+    assert stale_sheets(changed, again) == ([], [])
+    with TileSearch(changed) as opened:
+        assert not opened.unknown and all(shard.rows for shard in again.shards)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda plain: plain["shards"][0].update(name="../../../tmp/x"), "name"),
+        (lambda plain: plain["shards"][0].update(base=-5), "shard"),
+        (lambda plain: plain["shards"][0]["parts"][0].update(rows=2.5), "rows"),
+        (lambda plain: _asset(plain).update(size_bytes="x"), "size"),
+        (lambda plain: _asset(plain).update(sha256="../../../etc/passwd"), "sha256"),
+        (lambda plain: plain.update(shards=7), "cannot be read"),
+    ],
+    ids=["name", "base", "rows", "size", "sha256", "shards"],
+)
+def test_an_untrusted_index_is_checked(atlas, change, words):
+    plain = json.loads(atlas.store.read(MANIFEST))
+    change(plain)
+    with pytest.raises(AtlasError, match=words):
+        IndexManifest.from_json(json.dumps(plain).encode())
+
+
+def _asset(plain):
+    return plain["files"]["quantizers.safetensors"]
+
+
+def test_a_missing_and_a_damaged_index_are_reported(copied):
+    damaged = copied
+    damaged.store.write(MANIFEST, b'{"format": "orthonav-index", "schema": 99}')
+    with pytest.raises(AtlasError, match="schema 99"):
+        TileSearch(damaged)
+    damaged.store.remove(MANIFEST)
+    with pytest.raises(AtlasError, match="orthonav atlas index"):
+        TileSearch(damaged)
+    assert make_index(damaged) is not None
+
+
+@pytest.mark.parametrize("name", ["../../etc/passwd", "/etc/passwd", ".hidden"])
+def test_an_index_cannot_name_files_outside_it(copied, name):
+    crafted = copied
+    plain = json.loads(crafted.store.read(MANIFEST))
+    plain["files"][name] = plain["files"].pop("quantizers.safetensors")
+    crafted.store.write(MANIFEST, json.dumps(plain).encode())
+    with pytest.raises(AtlasError):
+        TileSearch(crafted)
+
+
+def evidence(**values):
+    return {
+        "strength": 50.0,
+        "rival": 10.0,
+        "look": 20.0,
+        "look_rival": 5.0,
+        "fine": np.nan,
+        "fine_rival": np.nan,
+        **values,
+    }
+
+
+def test_the_best_other_match_of_the_atlas_is_the_rival():
+    found = _against(evidence(), [evidence(strength=30.0, look=4.0, fine=40.0)])
+    assert found["rival"] == 30.0
+    assert found["look_rival"] == 5.0
+    assert np.isnan(found["fine_rival"])
+
+
+def test_the_finest_level_does_not_count_against_a_rival_not_compared_there():
+    doubtful = evidence(strength=60.0, fine=90.0, fine_rival=20.0)
+    found = _against(doubtful, [evidence(strength=60.0), evidence(strength=20.0, fine=30.0)])
+    assert np.isnan(found["fine"]) and np.isnan(found["fine_rival"])
+    both = _against(doubtful, [evidence(strength=60.0, fine=80.0)])
+    assert (both["fine"], both["fine_rival"]) == (90.0, 80.0)
+
+
+def test_impossible_telemetry_gives_a_reason_and_no_fix(atlas, search, first_view):
+    for change in (
+        {"agl_m": np.nan},
+        {"agl_m": -5.0},
+        {"pitch_deg": 80.0},
+        {"yaw_std_deg": -5.0, "yaw_deg": 10.0},
+        {"tilt_std_deg": np.nan},
+    ):
+        telemetry = dataclasses.replace(first_view.telemetry, **change)
+        registrar = SheetRegistrar(atlas)
+        locator = AtlasLocator(registrar, search, heading_known="yaw_std_deg" in change)
+        outcome, _ = locate_view(locator, dataclasses.replace(first_view, telemetry=telemetry))
+        assert isinstance(outcome, NoFix)
+        assert outcome.reason != "internal_error"
+        assert locator.state_name == "searching"
+
+
+def test_blank_views_give_a_reason_and_no_fix(locator, first_view):
+    black = dataclasses.replace(first_view, grey=np.zeros_like(first_view.grey))
+    assert locator.locate(black).reason == "too_dark"
+    noise = np.asarray(cv2.randu(np.zeros_like(first_view.grey), 0, 255))
+    assert isinstance(locator.locate(dataclasses.replace(first_view, grey=noise)), NoFix)

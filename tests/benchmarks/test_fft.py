@@ -1,0 +1,19 @@
+"""The three ways to transform that are compared give the same scores."""
+
+import numpy as np
+import pytest
+
+from benchmarks import fft
+
+
+@pytest.mark.parametrize(("side", "view"), [(40, 11), (45, 20)])
+def test_the_libraries_agree(side, view):
+    scores = {name: pose() for name, pose in fft.poses(side, view).items()}
+    assert set(scores) == {"scipy", "numpy", "OpenCV"}
+    for made in scores.values():
+        np.testing.assert_allclose(made, scores["scipy"], atol=1e-3 * np.abs(made).max())
+
+
+def test_every_size_has_a_row():
+    section = fft.measure([(24, 8), (30, 10)], repeats=1)
+    assert [row[0] for row in section.tables[0].rows] == ["24 x 24", "30 x 30"]

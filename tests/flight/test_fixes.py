@@ -1,0 +1,211 @@
+"""`fixes.jsonl`: what is written can be read, by anyone, and what is broken is named."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from orthonav.errors import FlightError, MissingFileError
+from orthonav.flight.fixes import (
+    KEYS,
+    read_results,
+    result_from_json,
+    result_to_json,
+    write_results,
+)
+from orthonav.records import Fix, NoFix, ViewResult
+
+FIX_LINE = {
+    "frame": "a.jpg",
+    "time_s": 12.5,
+    "status": "fix",
+    "lat_deg": 48.1,
+    "lon_deg": -4.3,
+    "cov_en_m2": [[4.0, 1.0], [1.0, 9.0]],
+    "confidence": 0.93,
+    "radius_m": 15.0,
+    "heading_deg": 90.0,
+    "agl_m": 120.0,
+    "reason": None,
+    "detail": None,
+    "evidence": {"peak_ratio": 1.8},
+    "latency_ms": 41.5,
+}
+NO_FIX_LINE = {
+    "frame": "b.jpg",
+    "time_s": 13.0,
+    "status": "no_fix",
+    "reason": "blank",
+    "evidence": {},
+    "latency_ms": 3,
+}
+
+numbers = st.floats(allow_nan=True, allow_infinity=False)
+evidences = st.dictionaries(st.text(max_size=8), numbers, max_size=4)
+covariances = st.lists(numbers, min_size=4, max_size=4).map(lambda v: np.reshape(v, (2, 2)))
+fixes = st.builds(
+    Fix,
+    lat_deg=st.floats(-90, 90),
+    lon_deg=st.floats(-180, 180),
+    cov_en_m2=covariances,
+    confidence=st.floats(0, 1) | st.just(math.nan),
+    radius_m=numbers,
+    heading_deg=numbers,
+    agl_m=numbers,
+    evidence=evidences,
+)
+no_fixes = st.builds(NoFix, reason=st.text(), detail=st.text(), evidence=evidences)
+view_results = st.builds(
+    ViewResult,
+    frame=st.text(alphabet=st.characters()),
+    time_ns=st.integers(-(2**62), 2**62),
+    outcome=fixes | no_fixes,
+    latency_ms=numbers,
+)
+
+
+def fields(result: ViewResult) -> dict:
+    """All values of a result in a form that compares, NaN included."""
+    outcome = {name: getattr(result.outcome, name) for name in vars(result.outcome)}
+    outcome["evidence"] = dict(outcome["evidence"])
+    values = [type(result.outcome).__name__, result.frame, result.time_ns, result.latency_ms]
+    if "cov_en_m2" in outcome:
+        outcome["cov_en_m2"] = outcome["cov_en_m2"].tolist()
+    return repr([*values, sorted(outcome.items())])
+
+
+def refuse(constant: str) -> None:
+    raise AssertionError(f"{constant} is not strict JSON")
+
+
+@given(view_results)
+def test_a_result_survives_the_round_trip(result: ViewResult) -> None:
+    assert fields(result_from_json(result_to_json(result))) == fields(result)
+
+
+@given(view_results)
+def test_a_line_is_strict_json_with_the_keys_in_order(result: ViewResult) -> None:
+    line = result_to_json(result)
+    values = json.loads(line, parse_constant=refuse)
+    assert tuple(values) == KEYS
+    assert "\n" not in line and line.isascii()
+    assert values["time_s"] == result.time_ns / 1e9
+
+
+def test_infinite_and_unknown_numbers_become_null() -> None:
+    fix = Fix(1.0, 2.0, np.full((2, 2), np.inf), math.nan, np.float32(15), math.inf, -math.inf)
+    values = json.loads(result_to_json(ViewResult("a", 0, fix, math.nan)))
+    assert values["cov_en_m2"] == [[None, None], [None, None]]
+    assert values["confidence"] is values["heading_deg"] is values["agl_m"] is None
+    assert values["radius_m"] == 15.0
+    assert values["latency_ms"] is None
+    assert values["reason"] is values["detail"] is None
+
+
+def test_no_fix_has_a_reason_and_no_position() -> None:
+    no_fix = NoFix("blank", "the view has no texture", {"spread": 0.5})
+    values = json.loads(result_to_json(ViewResult("a", 1_500_000_000, no_fix, 2.0)))
+    assert values["time_s"] == 1.5
+    assert [values[key] for key in KEYS[3:10]] == [None] * 7
+    assert values["reason"] == "blank"
+    assert values["detail"] == "the view has no texture"
+    assert values["evidence"] == {"spread": 0.5}
+
+
+def test_nanoseconds_since_1970_are_exact() -> None:
+    time_ns = 1_767_225_600_123_456_789
+    line = result_to_json(ViewResult("a", time_ns, NoFix("blank", ""), 1.0))
+    assert '"time_s": 1767225600.123456789,' in line
+    assert result_from_json(line).time_ns == time_ns
+
+
+def test_a_file_is_written_and_read_in_order(tmp_path: Path) -> None:
+    path = tmp_path / "out" / "fixes.jsonl"
+    results = [ViewResult(f"{i}.jpg", i, NoFix("blank", "ü"), 1.0) for i in (3, 1, 2)]
+    write_results(path, results)
+    assert [result.frame for result in read_results(path)] == ["3.jpg", "1.jpg", "2.jpg"]
+    assert path.read_bytes().endswith(b"}\n")
+    write_results(path, [])
+    assert read_results(path) == []
+
+
+def test_extra_keys_and_positions_without_a_fix_are_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "fixes.jsonl"
+    tracked = {**FIX_LINE, "tracked": True, "state": "tracking"}
+    lost = {**NO_FIX_LINE, "lat_deg": 48.0, "lon_deg": "?", "state": "lost"}
+    path.write_text(f"{json.dumps(tracked)}\r\n\n{json.dumps(lost)}")
+    fix, no_fix = (result.outcome for result in read_results(path))
+    assert isinstance(fix, Fix) and fix.lat_deg == 48.1
+    assert fix.cov_en_m2.tolist() == [[4, 1], [1, 9]] and not fix.cov_en_m2.flags.writeable
+    assert isinstance(no_fix, NoFix) and no_fix.reason == "blank" and no_fix.detail == ""
+
+
+def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(MissingFileError, match=r"fixes\.jsonl"):
+        read_results(tmp_path / "fixes.jsonl")
+
+
+@pytest.mark.parametrize("key", [key for key in KEYS if key not in ("reason", "detail")])
+def test_a_missing_key_of_a_fix_is_named(key: str) -> None:
+    line = {name: value for name, value in FIX_LINE.items() if name != key}
+    with pytest.raises(FlightError, match=f"key {key} is missing"):
+        result_from_json(json.dumps(line))
+
+
+def test_a_missing_reason_of_no_fix_is_named() -> None:
+    line = {name: value for name, value in NO_FIX_LINE.items() if name != "reason"}
+    with pytest.raises(FlightError, match="key reason is missing"):
+        result_from_json(json.dumps(line))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("frame", 7, "frame: expected text, got a number"),
+        ("time_s", None, "time_s"),
+        ("time_s", "12", "time_s: expected a number or null, got text"),
+        ("time_s", 1e12, "time_s"),
+        ("status", "maybe", "status: expected 'fix' or 'no_fix'"),
+        ("lat_deg", None, "lat_deg"),
+        ("lat_deg", 90.5, "lat_deg"),
+        ("lat_deg", True, "lat_deg: expected a number or null, got true or false"),
+        ("lon_deg", -181, "lon_deg"),
+        ("cov_en_m2", [1, 2, 3, 4], "cov_en_m2"),
+        ("cov_en_m2", [[1, 2], [3]], "cov_en_m2"),
+        ("cov_en_m2", [[1, 2], [3, "4"]], "cov_en_m2"),
+        ("confidence", 1.01, "confidence: expected 0 to 1"),
+        ("radius_m", [], "radius_m: expected a number or null, got a list"),
+        ("evidence", None, "evidence: expected an object, got null"),
+        ("evidence", {"a": "b"}, "evidence 'a'"),
+        ("latency_ms", 10**400, "latency_ms"),
+    ],
+)
+def test_a_wrong_value_is_named(key: str, value: object, said: str) -> None:
+    with pytest.raises(FlightError) as caught:
+        result_from_json(json.dumps({**FIX_LINE, key: value}))
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        b'{"frame": "a.jpg", "time_s": 1',
+        b"[]",
+        b"null",
+        b"\xff\xfe{}",
+        b"[" * 100_000,
+        json.dumps({**FIX_LINE, "agl_m": math.nan}).encode(),
+        json.dumps(FIX_LINE).replace("120.0", "1e999").encode(),
+        json.dumps(FIX_LINE).replace("120.0", "1" * 5000).encode(),
+        json.dumps(FIX_LINE).replace("12.5", "1e999999999").encode(),
+    ],
+)
+def test_a_broken_line_is_named_by_its_number(tmp_path: Path, bad: bytes) -> None:
+    path = tmp_path / "fixes.jsonl"
+    path.write_bytes(json.dumps(FIX_LINE).encode() + b"\n" + bad + b"\n")
+    with pytest.raises(FlightError, match=r"^line 2: .*fixes\.jsonl$"):
+        read_results(path)

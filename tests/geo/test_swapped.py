@@ -1,0 +1,41 @@
+"""Swapped latitude and longitude are named where a position cannot be right."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from orthonav.errors import AreaError
+from orthonav.geo.area import Area
+from orthonav.geo.swapped import HINT, swapped_hint
+
+
+def near(lat_deg, lon_deg):
+    """Whether a position lies near 46.5 N, 3 E."""
+    return abs(lat_deg - 46.5) < 1 and abs(lon_deg - 3.0) < 1
+
+
+@pytest.mark.parametrize(
+    "lat_deg, lon_deg, contains, swapped",
+    [
+        (121.0, 24.0, None, True),
+        (24.0, 121.0, None, False),
+        (121.0, 124.0, None, False),
+        (3.0, 46.5, near, True),
+        (46.5, 3.0, near, False),
+        (10.0, 20.0, near, False),
+        (float("nan"), 3.0, None, False),
+    ],
+)
+def test_swapped_positions(lat_deg, lon_deg, contains, swapped):
+    assert swapped_hint(lat_deg, lon_deg, contains) == (f"; {HINT}" if swapped else "")
+
+
+@given(st.floats(-90, 90), st.floats(-360, 360))
+def test_a_valid_position_is_never_called_swapped(lat_deg, lon_deg):
+    assert swapped_hint(lat_deg, lon_deg) == ""
+    assert swapped_hint(lat_deg, lon_deg, lambda lat, lon: True) == ""
+
+
+def test_swapped_bounds_out_of_range_are_named():
+    with pytest.raises(AreaError, match=HINT):
+        Area.from_bounds((24.0, 121.0, 24.1, 121.1))

@@ -1,0 +1,260 @@
+"""Messages of ROS 2 as a second reader of their definitions writes them: by hand, for the encoder
+of Cyclone DDS. Nothing here is shared with the program, which has both from `rosbags`.
+
+Copied member by member from the .msg files of Jazzy (https://docs.ros.org/en/jazzy/p/).
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import (
+    array,
+    byte,
+    float32,
+    float64,
+    int8,
+    int32,
+    sequence,
+    uint8,
+    uint16,
+    uint32,
+)
+
+
+def name(package, message):
+    return f"{package}.msg.dds_.{message}_"
+
+
+@dataclass
+class Time(IdlStruct, typename=name("builtin_interfaces", "Time")):
+    sec: int32
+    nanosec: uint32
+
+
+@dataclass
+class Header(IdlStruct, typename=name("std_msgs", "Header")):
+    stamp: Time
+    frame_id: str
+
+
+@dataclass
+class Image(IdlStruct, typename=name("sensor_msgs", "Image")):
+    header: Header
+    height: uint32
+    width: uint32
+    encoding: str
+    is_bigendian: uint8
+    step: uint32
+    data: sequence[uint8]
+
+
+@dataclass
+class CompressedImage(IdlStruct, typename=name("sensor_msgs", "CompressedImage")):
+    header: Header
+    format: str
+    data: sequence[uint8]
+
+
+@dataclass
+class RegionOfInterest(IdlStruct, typename=name("sensor_msgs", "RegionOfInterest")):
+    x_offset: uint32
+    y_offset: uint32
+    height: uint32
+    width: uint32
+    do_rectify: bool
+
+
+@dataclass
+class CameraInfo(IdlStruct, typename=name("sensor_msgs", "CameraInfo")):
+    header: Header
+    height: uint32
+    width: uint32
+    distortion_model: str
+    d: sequence[float64]
+    k: array[float64, 9]
+    r: array[float64, 9]
+    p: array[float64, 12]
+    binning_x: uint32
+    binning_y: uint32
+    roi: RegionOfInterest
+
+
+@dataclass
+class Quaternion(IdlStruct, typename=name("geometry_msgs", "Quaternion")):
+    x: float64
+    y: float64
+    z: float64
+    w: float64
+
+
+@dataclass
+class Vector3(IdlStruct, typename=name("geometry_msgs", "Vector3")):
+    x: float64
+    y: float64
+    z: float64
+
+
+@dataclass
+class Imu(IdlStruct, typename=name("sensor_msgs", "Imu")):
+    header: Header
+    orientation: Quaternion
+    orientation_covariance: array[float64, 9]
+    angular_velocity: Vector3
+    angular_velocity_covariance: array[float64, 9]
+    linear_acceleration: Vector3
+    linear_acceleration_covariance: array[float64, 9]
+
+
+@dataclass
+class Range(IdlStruct, typename=name("sensor_msgs", "Range")):
+    header: Header
+    radiation_type: uint8
+    field_of_view: float32
+    min_range: float32
+    max_range: float32
+    range: float32
+    variance: float32
+
+
+@dataclass
+class Float64(IdlStruct, typename=name("std_msgs", "Float64")):
+    data: float64
+
+
+@dataclass
+class NavSatStatus(IdlStruct, typename=name("sensor_msgs", "NavSatStatus")):
+    status: int8
+    service: uint16
+
+
+@dataclass
+class NavSatFix(IdlStruct, typename=name("sensor_msgs", "NavSatFix")):
+    header: Header
+    status: NavSatStatus
+    latitude: float64
+    longitude: float64
+    altitude: float64
+    position_covariance: array[float64, 9]
+    position_covariance_type: uint8
+
+
+@dataclass
+class Clock(IdlStruct, typename=name("rosgraph_msgs", "Clock")):
+    clock: Time
+
+
+@dataclass
+class Point(IdlStruct, typename=name("geometry_msgs", "Point")):
+    x: float64
+    y: float64
+    z: float64
+
+
+@dataclass
+class Pose(IdlStruct, typename=name("geometry_msgs", "Pose")):
+    position: Point
+    orientation: Quaternion
+
+
+@dataclass
+class PoseWithCovariance(IdlStruct, typename=name("geometry_msgs", "PoseWithCovariance")):
+    pose: Pose
+    covariance: array[float64, 36]
+
+
+@dataclass
+class PoseWithCovarianceStamped(
+    IdlStruct, typename=name("geometry_msgs", "PoseWithCovarianceStamped")
+):
+    header: Header
+    pose: PoseWithCovariance
+
+
+@dataclass
+class GeoPoint(IdlStruct, typename=name("geographic_msgs", "GeoPoint")):
+    latitude: float64
+    longitude: float64
+    altitude: float64
+
+
+@dataclass
+class GeoPointStamped(IdlStruct, typename=name("geographic_msgs", "GeoPointStamped")):
+    header: Header
+    position: GeoPoint
+
+
+@dataclass
+class KeyValue(IdlStruct, typename=name("diagnostic_msgs", "KeyValue")):
+    key: str
+    value: str
+
+
+@dataclass
+class DiagnosticStatus(IdlStruct, typename=name("diagnostic_msgs", "DiagnosticStatus")):
+    level: byte
+    name: str
+    message: str
+    hardware_id: str
+    values: sequence[KeyValue]
+
+
+@dataclass
+class DiagnosticArray(IdlStruct, typename=name("diagnostic_msgs", "DiagnosticArray")):
+    header: Header
+    status: sequence[DiagnosticStatus]
+
+
+@dataclass
+class Transform(IdlStruct, typename=name("geometry_msgs", "Transform")):
+    translation: Vector3
+    rotation: Quaternion
+
+
+@dataclass
+class TransformStamped(IdlStruct, typename=name("geometry_msgs", "TransformStamped")):
+    header: Header
+    child_frame_id: str
+    transform: Transform
+
+
+@dataclass
+class TFMessage(IdlStruct, typename=name("tf2_msgs", "TFMessage")):
+    transforms: sequence[TransformStamped]
+
+
+def zeros(kind):
+    """A message of a type with nothing in it."""
+    values = {}
+    for each in dataclasses.fields(kind):
+        hint = each.type if not isinstance(each.type, str) else None
+        values[each.name] = _zero(hint)
+    return kind(**values)
+
+
+def _zero(hint):
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+        return zeros(hint)
+    if hint is str:
+        return ""
+    if hint is bool:
+        return False
+    inner = getattr(hint, "__metadata__", None)
+    if inner and type(inner[0]).__name__ == "array":
+        return [_zero(inner[0].subtype)] * inner[0].length
+    if inner and type(inner[0]).__name__ == "sequence":
+        return []
+    return 0
+
+
+def native(message, kind):
+    """The same message in the type `kind` of this module, of a message of `rosbags`."""
+    values = {}
+    for each in dataclasses.fields(kind):
+        value = getattr(message, each.name)
+        if isinstance(each.type, type) and dataclasses.is_dataclass(each.type):
+            value = native(value, each.type)
+        elif hasattr(value, "tolist"):
+            value = value.tolist()
+        values[each.name] = value
+    return kind(**values)

@@ -1,0 +1,94 @@
+"""Names, remapping rules and parameters as a ROS 2 node resolves them."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from orthonav.errors import VariantError
+from orthonav.onboard.ros2.arguments import RosArguments, ros_arguments
+from orthonav.onboard.ros2.messages import dds_type_name, ros_type_name
+
+
+def parsed(*words, **environment):
+    return ros_arguments(words, environment)
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "expected"),
+    [  # as the design document of static remapping and rcl's tests have it
+        ((), "image", "/image"),
+        ((), "~/fix", "/orthonav/fix"),
+        ((), "/clock", "/clock"),
+        (("-r", "__ns:=/uav1"), "image", "/uav1/image"),
+        (("-r", "__ns:=/uav1"), "~/fix", "/uav1/orthonav/fix"),
+        (("-r", "__node:=down", "-r", "__ns:=/a/b"), "~/fix", "/a/b/down/fix"),
+        (("-r", "__name:=down"), "~/fix", "/down/fix"),
+        (("--remap", "image:=/cam/image_raw"), "image", "/cam/image_raw"),
+        (("-r", "image:=front/image", "-r", "__ns:=/u"), "image", "/u/front/image"),
+        (("-r", "/u/image:=/x", "-r", "__ns:=/u"), "image", "/x"),
+        (("-r", "~/fix:=/gps/fix"), "~/fix", "/gps/fix"),
+        (("-r", "/orthonav/fix:=/gps/fix"), "~/fix", "/gps/fix"),
+        (("-r", "image:=/a", "-r", "image:=/b"), "image", "/a"),  # the first that matches
+        (("-r", "orthonav:image:=/a"), "image", "/a"),
+        (("-r", "other:image:=/a"), "image", "/image"),
+        (("--ros-args", "-r", "image:=/a", "--"), "image", "/a"),
+    ],
+)
+def test_names_are_resolved(words, name, expected):
+    assert parsed(*words).resolved(name) == expected
+
+
+def test_parameters_and_environment():
+    made = parsed("-p", "use_sim_time:=true", "-p", "map_frame:=earth", ROS_DOMAIN_ID="42")
+    assert made.parameters.use_sim_time is True and made.parameters.map_frame == "earth"
+    assert made.domain_id == 42 and made.is_local is False
+    assert parsed(ROS_LOCALHOST_ONLY="1").is_local
+    assert parsed(ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST").is_local
+    assert parsed(ROS_NAMESPACE="/uav").resolved("image") == "/uav/image"
+    assert parsed("-r", "__ns:=/b", ROS_NAMESPACE="a").resolved("image") == "/b/image"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("-r", "image"), "-r image"),
+        (("-r",), "-r FROM:=TO"),
+        (("--params-file", "x.yaml"), "--params-file"),
+        (("-r", "image:=a//b"), "'a//b'"),
+        (("-r", "image:=2nd"), "'2nd'"),
+        (("-r", "ima ge:=a"), "'ima ge'"),
+        (("-r", "__ns:=/a/"), "'/a/'"),
+        (("-r", "__node:=a/b"), "'a/b'"),
+        (("-p", "use_sim_time:=maybe"), "'maybe'"),
+        (("-p", "colour:=red"), "use_sim_time"),
+        (("-p", "image_transport:=theora"), "raw or compressed"),
+    ],
+)
+def test_invalid_arguments_are_named(words, said):
+    with pytest.raises(VariantError) as error:
+        parsed(*words)
+    assert said in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["-1", "233", "x", "1.5"])
+def test_an_invalid_domain_is_refused(text):
+    with pytest.raises(VariantError, match="ROS_DOMAIN_ID"):
+        parsed(ROS_DOMAIN_ID=text)
+
+
+token = st.from_regex(r"[a-z_][a-z0-9_]{0,8}", fullmatch=True)
+
+
+@given(st.lists(token, max_size=3), st.lists(token, min_size=1, max_size=3), token)
+def test_expansion_is_absolute_and_idempotent(space, name, node):
+    made = RosArguments(node=node, namespace="/" + "/".join(space))
+    for start in ("", "~/", "/"):
+        full = made.expanded(start + "/".join(name))
+        assert full.startswith("/") and "//" not in full and full.endswith("/".join(name))
+        assert made.expanded(full) == full == made.resolved(full)
+
+
+def test_type_names_of_dds():
+    assert dds_type_name("sensor_msgs/msg/Image") == "sensor_msgs::msg::dds_::Image_"
+    assert ros_type_name("sensor_msgs::msg::dds_::Image_") == "sensor_msgs/msg/Image"
+    assert ros_type_name("Other::Thing") == "Other::Thing"

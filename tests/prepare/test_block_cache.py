@@ -1,0 +1,400 @@
+"""Maps built by several threads, and builds that were killed: the same bytes every time."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import Affine
+
+from helpers import textured
+from orthonav.errors import AreaError, ImageryError, OutputError, VariantError
+from orthonav.geo.area import Area
+from orthonav.geo.route import Route
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.prepare.block_cache import BlockCache
+from orthonav.prepare.blocks import Block
+from orthonav.prepare.calibrate import CropSampler
+from orthonav.prepare.layout import grid_of
+from orthonav.prepare.parallel import AHEAD, in_order
+from orthonav.prepare.pictures import SheetPictures
+from orthonav.prepare.sheet import SheetReader
+from orthonav.represent.gray import Gray
+
+BLOCKS = 16
+SMALL = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2}
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch):
+    """Many small blocks, few crops."""
+    monkeypatch.setattr("orthonav.prepare.sheet.BLOCK_PX", 128)
+    monkeypatch.setattr("orthonav.prepare.sheet.MIN_CACHED_BLOCKS", 4)
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 16)
+
+
+@pytest.fixture(scope="module")
+def ortho(make_ortho, tmp_path_factory):
+    grey = textured((400, 400))
+    grey[100:230, 130:190] = 0
+    return make_ortho(tmp_path_factory.mktemp("ortho") / "2019.tif", grey, nodata=0)
+
+
+@pytest.fixture
+def reads(monkeypatch):
+    """Blocks that were read from imagery rather than taken from the cache."""
+    made, counted = SheetReader._read_block, []
+
+    def counting(reader, raster, job):
+        counted.append((job.block.row, job.block.col))
+        return made(reader, raster, job)
+
+    monkeypatch.setattr(SheetReader, "_read_block", counting)
+    return counted
+
+
+def built(ortho, out, progress=None, **request):
+    build_map(BuildRequest([ortho], out, **SMALL | request), progress)
+    return out.read_bytes()
+
+
+@pytest.fixture
+def whole(ortho, made_once, reads):
+    """The map of a build that was not interrupted."""
+
+    def make(folder):
+        built(ortho, folder / "whole.onav", workers=1)
+
+    path = made_once("kept-whole", make) / "whole.onav"
+    reads.clear()
+    return path.read_bytes()
+
+
+def stopped(ortho, out, after=0.5, error=KeyboardInterrupt, **request):
+    """A build that ends when so much of the imagery was read."""
+
+    def progress(stage, share):
+        if stage == "imagery" and share >= after:
+            raise error
+
+    with pytest.raises(error):
+        built(ortho, out, progress, **request)
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [{}, {"tile_px": 96}],
+    ids=["chunks in one block", "chunks over blocks"],
+)
+def test_any_number_of_workers_gives_the_same_bytes(ortho, tmp_path, request_):
+    maps = [
+        built(ortho, tmp_path / f"{workers}.onav", workers=workers, **request_)
+        for workers in (1, 3)
+    ]
+    assert maps[0] == maps[1]
+
+
+@pytest.mark.parametrize("workers", [0, -1, 65])
+def test_how_many_workers_may_be(ortho, tmp_path, workers):
+    with pytest.raises(VariantError, match="workers"):
+        built(ortho, tmp_path / "a.onav", workers=workers)
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_an_interrupted_build_resumes(ortho, tmp_path, reads, names_in, workers, whole):
+    out = tmp_path / "out" / "map.onav"
+    stopped(ortho, out, workers=workers)
+    first = len(reads)
+    assert BLOCKS / 2 <= first <= BLOCKS / 2 + workers + AHEAD + 1
+    assert set(names_in(out.parent)) > {"map.onav.work"} and not out.exists()
+    assert built(ortho, out, workers=workers) == whole
+    assert len(reads) == len(set(reads)) == BLOCKS  # each once, before or after
+    assert names_in(out.parent) == ["map.onav"]
+
+
+def test_images_for_networks_are_cached_too(ortho, tmp_path, reads):
+    mosaic = Mosaic.open([ortho])
+    outline = mosaic.outline_latlon_deg
+    area = Area.from_outline(outline[:, 0], outline[:, 1])
+    grid = grid_of(area, mosaic.gsd_m, None, 64, 0.75)
+
+    def read(workers, kept_in=None, stop=2.0):
+        def report(stage, share):
+            if share > stop:
+                raise KeyboardInterrupt
+
+        pictures = SheetPictures(grid, Gray())
+        sampler = CropSampler(64, 0)
+        reader = SheetReader(
+            mosaic, area, grid, Gray(), sampler, registration=False, pictures=pictures
+        )
+        with reader.block_cache(tmp_path / "beside", kept_in) as kept:
+            reader.read(report, workers, kept)
+        tiles = pictures.tiles(np.array([[0, 0], [100, 130], [300, 301]]))
+        return tiles.batch(np.arange(3)), len(sampler.crops)
+
+    whole, crops = read(1)
+    with pytest.raises(KeyboardInterrupt):
+        read(2, tmp_path / "kept", 0.5)
+    reads.clear()
+    again = read(3, tmp_path / "kept")
+    np.testing.assert_array_equal(again[0], whole)
+    assert again[1] == crops > 0 and 0 < len(reads) < 30
+
+
+KILLED = """
+    import os, signal, sys
+    from pathlib import Path
+    from orthonav.prepare import BuildRequest, build_map, calibrate, sheet
+
+    sheet.BLOCK_PX, sheet.MIN_CACHED_BLOCKS, calibrate.CROPS = 128, 4, 16
+
+    def progress(stage, share):
+        if stage == "imagery" and share > 0.6:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    small = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2}
+    build_map(BuildRequest([Path(sys.argv[1])], Path(sys.argv[2]), workers=2, **small), progress)
+"""
+
+
+def test_a_killed_build_resumes(ortho, tmp_path, reads, names_in, whole):
+    out = tmp_path / "killed.onav"
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(KILLED), ortho, out], check=False)
+    assert done.returncode == -signal.SIGKILL and not out.exists()
+    assert built(ortho, out) == whole
+    assert 0 < len(reads) < 0.5 * BLOCKS
+    assert names_in(tmp_path) == ["killed.onav"]
+
+
+CHANGES = {
+    "seed": {"seed": 1},
+    "resolution": {"gsd_m": 1.1},
+    "edges": {"edges": "gray", "registration": False},
+    "tiles": {"tile_px": 96},
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
+def test_another_request_uses_nothing(ortho, tmp_path, reads, names_in, change):
+    whole = built(ortho, tmp_path / "whole.onav", **change)
+    blocks, out = len(reads), tmp_path / "out" / "map.onav"
+    stopped(ortho, out)
+    reads.clear()
+    assert built(ortho, out, **change) == whole
+    # Another seed cuts other crops: blocks without any stay what they are.
+    assert len(reads) == blocks or (change == {"seed": 1} and 0 < len(reads) < blocks)
+    assert names_in(out.parent) == ["map.onav"]
+
+
+def test_changed_imagery_is_read_again_where_it_is_needed(make_ortho, tmp_path, reads):
+    """Two files side by side; one of them is replaced after the build was interrupted."""
+    grey = textured((300, 800))
+    paths = [tmp_path / "a.tif", tmp_path / "b.tif"]
+
+    def write(index, picture):
+        make_ortho(paths[index], picture)
+        with rasterio.open(paths[index], "r+") as data:
+            data.transform = Affine(1, 0, 700_000 + 400 * index, 0, -1, 6_600_000)
+
+    write(0, grey[:, :400])
+    write(1, grey[:, 400:])
+    request = BuildRequest(paths, tmp_path / "map.onav", **SMALL)
+
+    def stop(stage, share):
+        if stage == "learn":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        build_map(request, stop)
+    all_blocks = set(reads)
+    reads.clear()
+    write(1, textured((300, 800), 5)[:, 400:])
+    build_map(request)
+    assert 0 < len(reads) < len(all_blocks)
+    assert min(col for _, col in reads) >= 400 - 128 - 64 and (0, 0) not in reads
+    again = request.out.read_bytes()
+    fresh = BuildRequest(paths, tmp_path / "fresh.onav", **SMALL)
+    build_map(fresh)
+    assert fresh.out.read_bytes() == again
+
+
+def test_damaged_blocks_are_recomputed(ortho, tmp_path, reads, caplog, whole):
+    out = tmp_path / "map.onav"
+    stopped(ortho, out, after=1.0)
+    kept = sorted(Path(f"{out}.work").iterdir())
+    kept[0].write_bytes(kept[0].read_bytes()[:1000])
+    content = bytearray(kept[1].read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    kept[1].write_bytes(content)
+    kept[2].write_bytes(b"")
+    reads.clear()
+    assert built(ortho, out) == whole
+    assert len(reads) == 3 and caplog.text.count("recomputed") == 3
+
+
+def test_few_blocks_are_not_cached(ortho, tmp_path, names_in, monkeypatch):
+    out = tmp_path / "map.onav"
+    stopped(ortho, out)
+    assert len(names_in(tmp_path)) > 2
+    monkeypatch.setattr("orthonav.prepare.sheet.MIN_CACHED_BLOCKS", 1000)
+    stopped(ortho, out)
+    assert names_in(tmp_path) == []  # not even those of the build before
+
+
+def test_a_work_folder_that_was_named(ortho, tmp_path, names_in, monkeypatch, reads):
+    monkeypatch.setattr("orthonav.prepare.sheet.MIN_CACHED_BLOCKS", 1000)
+    out, work = tmp_path / "map.onav", tmp_path / "work"
+    stopped(ortho, out, work=work)
+    assert all(name.startswith("work") for name in names_in(tmp_path))
+    (work / "mine.txt").write_text("kept")
+    reads.clear()
+    built(ortho, out, work=work)
+    assert 0 < len(reads) <= BLOCKS / 2
+    assert names_in(tmp_path) == ["map.onav", "work", "work/mine.txt"]
+
+
+def test_what_is_not_ours_in_the_folder_stays(ortho, tmp_path, names_in):
+    folder = tmp_path / "map.onav.work"
+    folder.mkdir()
+    (folder / "letter.npz").write_text("mine")
+    built(ortho, tmp_path / "map.onav")
+    assert names_in(tmp_path) == ["map.onav", "map.onav.work", "map.onav.work/letter.npz"]
+
+
+def test_an_area_without_tiles_leaves_nothing(ortho, tmp_path, names_in):
+    route = Route(((46.4, 3.0), (46.401, 3.001)))
+    with pytest.raises(AreaError):
+        built(ortho, tmp_path / "map.onav", route=route, band_m=900.0)
+    assert names_in(tmp_path) == []
+
+
+def test_a_full_disk_is_an_error_and_leaves_no_partial_block(
+    ortho, tmp_path, monkeypatch, reads, whole
+):
+    out, sync, count = tmp_path / "map.onav", os.fsync, []
+
+    def full(handle):
+        count.append(handle)
+        if len(count) > 5:
+            raise OSError(28, "No space left on device")
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OutputError, match=r"disk full.*--work"):
+        built(ortho, out, workers=1)
+    monkeypatch.setattr(os, "fsync", sync)
+    kept = [path.name for path in Path(f"{out}.work").iterdir()]
+    assert len(kept) == 5 and not any(name.startswith(".") for name in kept)
+    reads.clear()
+    assert built(ortho, out) == whole and (0, 0) not in reads
+
+
+def test_too_little_disk_space_is_an_error_before_reading(ortho, tmp_path, monkeypatch, reads):
+    monkeypatch.setattr("orthonav.prepare.sheet.CACHED_BYTES_PER_PX", 1e12)
+    with pytest.raises(OutputError, match=r"MB are free.*--work"):
+        built(ortho, tmp_path / "map.onav")
+    assert not reads and not any(tmp_path.iterdir())
+
+
+def test_a_block_without_imagery_is_cached_too(tmp_path):
+    kept = BlockCache(tmp_path / "work", "request", 0)
+    block = Block(0, 0, 8, 8)
+    assert kept.begin([(block, None)]) == 0 and kept.load(block) is None
+    kept.store(block, {})
+    assert kept.load(block) == {} and kept.begin([(block, None)]) == 1
+    assert kept.begin([(block, "other")]) == 0 and not any((tmp_path / "work").iterdir())
+
+
+@contextmanager
+def worker(log=None):
+    if log is not None:
+        log.append(threading.get_ident())
+    yield lambda item: item * item
+
+
+@pytest.mark.parametrize("workers", [1, 2, 7, 100])
+@pytest.mark.parametrize("count", [0, 1, 2, 50])
+def test_results_come_in_order(workers, count):
+    log = []
+    found = list(in_order(range(count), lambda: worker(log), workers))
+    assert found == [item * item for item in range(count)]
+    assert len(set(log)) == len(log) <= max(1, min(workers, count))
+
+
+def test_work_does_not_run_far_ahead():
+    begun = []
+
+    @contextmanager
+    def noting():
+        def work(item):
+            begun.append(item)
+            return item
+
+        yield work
+
+    for item in in_order(range(100), noting, 3):
+        time.sleep(0.002)
+        assert max(begun) <= item + 1 + 3 + AHEAD
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_the_first_error_is_raised_and_no_thread_stays(workers):
+    before = threading.active_count()
+
+    @contextmanager
+    def failing():
+        def work(item):
+            if item in (7, 8):
+                raise ImageryError(f"item {item}")
+            return item
+
+        yield work
+
+    found = []
+    with pytest.raises(ImageryError, match="item 7"):
+        for item in in_order(range(20), failing, workers):
+            found.append(item)
+    assert found == list(range(7)) and threading.active_count() == before
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_a_worker_that_cannot_begin(workers):
+    @contextmanager
+    def broken():
+        raise ImageryError("cannot open")
+        yield
+
+    with pytest.raises(ImageryError, match="cannot open"):
+        list(in_order(range(5), broken, workers))
+
+
+def test_memory_of_cells_is_that_of_what_is_written():
+    """A corridor across a large box: only its pages are there."""
+    code = """
+        import numpy as np
+        from orthonav.embed.cells import CellLayout
+        from orthonav.embed.whitened import CellSheet
+
+        sheet = CellSheet(CellLayout(8, 8), 40_000, 40_000, 7)
+        part = np.ones((128, 128, 7), np.float32), np.ones((128, 128), np.float32)
+        for at in range(0, 39_000, 1024):
+            sheet.put(at, at, *part)
+        tiles = np.array([[at, at] for at in range(0, 39_000, 1024)])
+        assert sheet.valid_share(tiles).min() > 0.9 and sheet.means.nbytes > 6e8
+        from pathlib import Path
+        print(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout) < 300_000

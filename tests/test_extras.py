@@ -1,0 +1,225 @@
+"""A core-only install: each command works, or names in one line what to install."""
+
+import ast
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from orthonav import extras
+from orthonav.cli import COMMANDS
+from orthonav.cli.needs import NEEDS
+from orthonav.errors import MissingExtraError
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+FOR_DEVELOPERS = {"dev", "docs", "test"}
+USED = sorted({extra for needed in NEEDS.values() for extra in needed})
+
+BLOCKED = """
+import sys
+blocked = set(sys.argv.pop(1).split(","))
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in blocked:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Blocked())
+from orthonav.cli import main
+sys.exit(main())
+"""
+
+AREA = "--bounds=3.0,46.0,3.01,46.01"
+CORE_COMMANDS = {
+    "info MAP": None,
+    f"plan --camera CAMERA --agl-m 270 {AREA}": None,
+    "evaluate FIXES --truth FLIGHT/truth.csv": None,
+    "demo --out new": "geo,report,web",
+    "landscape --out new": "geo",
+    "simulate --ortho MAP --random 3 --out new": "geo",
+    f"fetch {AREA} --source ign:2021 --out new.tif": "fetch",
+    "fetch --list": "fetch",
+    "build --ortho MAP --out new.onav": "geo",
+    "build --ortho MAP --atlas new": "geo",
+    "atlas check new": "geo",
+    "check MAP --agl-m 270 --out new": "geo,report,web",
+    "plan --camera CAMERA --agl-m 270 --route ROUTE --band-m 300 --dem MAP": "geo",
+    "sign MAP --new-key new": "signing",
+    "verify MAP --public-key MAP": "signing",
+    "import FLIGHT/frames --out new": "flights",
+    "localize MAP FLIGHT/frames --out new.jsonl": "flights",
+    "calibrate MAP FLIGHT/frames --out new.json": "flights",
+    "localize new FLIGHT --atlas --out new.jsonl": "atlas",
+    "localize MAP FLIGHT --require-signed MAP --out new.jsonl": "signing",
+    "fly MAP --camera FLIGHT --autopilot udpin:127.0.0.1:0 --dry-run": "autopilot",
+    "fly MAP --camera FLIGHT --telemetry recorded --log new.mcap": "autopilot",
+    "fly MAP --ros2 --dry-run": "ros2",
+    "evaluate FIXES --truth FLIGHT/truth.csv --report new": "report",
+    "view FIXES --map MAP --no-browser": "web",
+}
+"""Commands of a core-only install, and the extras that the answer names; None: it works."""
+
+
+def top_modules(extra):
+    return {extras.module_of(package.name).partition(".")[0] for package in extras.packages(extra)}
+
+
+def core_only(*arguments, cwd):
+    """A command where nothing but the core can be imported."""
+    optional = set().union(*(top_modules(extra) for extra in USED)) - top_modules("")
+    return subprocess.run(
+        [sys.executable, "-B", "-c", BLOCKED, ",".join(sorted(optional)), *arguments],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+
+
+@pytest.fixture(scope="module")
+def fixes(map_path, flight_path, tmp_path_factory):
+    """Fixes of the flight, made by the core alone."""
+    folder = tmp_path_factory.mktemp("fixes")
+    done = core_only("localize", map_path, flight_path, "--out", "fixes.jsonl", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return folder / "fixes.jsonl"
+
+
+@pytest.mark.parametrize("line", CORE_COMMANDS)
+def test_a_core_only_install_works_or_names_the_extras(
+    line, fixes, map_path, flight_path, tmp_path
+):
+    route = tmp_path / "route.csv"
+    route.write_text("lat_deg,lon_deg\n46.0,3.0\n46.01,3.01\n")
+    paths = {
+        "MAP": map_path,
+        "FLIGHT": flight_path,
+        "FIXES": fixes,
+        "CAMERA": flight_path / "flight.json",
+        "ROUTE": route,
+    }
+    words = [re.sub(r"^[A-Z]+", lambda m: str(paths.get(m[0], m[0])), w) for w in line.split()]
+    done = core_only(*words, cwd=tmp_path)
+    named = CORE_COMMANDS[line]
+    if named is None:
+        assert done.returncode == 0, done.stderr
+        return
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("orthonav: error: ") and done.stderr.count("\n") == 1
+    assert f"pip install 'orthonav[{named}]'" in done.stderr
+    assert not list(tmp_path.glob("new*"))
+
+
+def test_every_command_is_tried():
+    assert {line.split()[0] for line in CORE_COMMANDS} == set(COMMANDS)
+
+
+def test_the_version_report_names_what_is_missing(tmp_path):
+    done = core_only("--version", "--json", cwd=tmp_path)
+    plain = json.loads(done.stdout)
+    assert set(plain["missing"]) == set(NEEDS)
+    assert plain["missing"]["check"] == "pip install 'orthonav[geo,report,web]'"
+    assert plain["extras"]["geo"]["rasterio"] is None
+    assert plain["core"]["numpy"] == metadata.version("numpy")
+    assert plain["processor"]["cores"] >= 1 and plain["processor"]["features"]
+    text = core_only("--version", "--verbose", cwd=tmp_path).stdout
+    assert "rasterio MISSING" in text and "pip install 'orthonav[fetch]'" in text
+
+
+def test_every_extra_of_users_is_in_the_table():
+    assert set(USED) == set(PROJECT["optional-dependencies"]) - FOR_DEVELOPERS
+    assert {key.split(" ")[0].rstrip(",") for key in NEEDS} <= set(COMMANDS)
+
+
+def test_modules_are_those_of_the_packages():
+    """What an extra's package is called when imported, by the files that pip installed."""
+    installed = metadata.packages_distributions()
+
+    def plain(name):
+        return re.sub(r"[-_.]+", "-", name).lower()
+
+    names = {package.name for extra in ("", *USED) for package in extras.packages(extra)}
+    here = {plain(name) for found in installed.values() for name in found}
+    wrong = {
+        name
+        for name in names
+        if plain(name) in here
+        and plain(name)
+        not in map(plain, installed.get(extras.module_of(name).partition(".")[0], []))
+    }
+    assert names and not wrong
+
+
+def asked(extra):
+    """Names that pyproject.toml asks for, those of the extras that an extra includes too."""
+    for text in PROJECT["optional-dependencies"][extra]:
+        one = Requirement(text)
+        if one.name == "orthonav":
+            yield from (name for included in one.extras for name in asked(included))
+        else:
+            yield one.name
+
+
+def calls_of(function, tree):
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            name = getattr(node.func, "id", getattr(node.func, "attr", None))
+            if name == function:
+                yield [arg.value if isinstance(arg, ast.Constant) else None for arg in node.args]
+
+
+def test_the_extra_that_an_error_names_brings_the_module():
+    found = []
+    for path in (ROOT / "src").rglob("*.py"):
+        tree = ast.parse(path.read_text("utf-8"))
+        for module, *more in calls_of("needed", tree):  # of `sources.guard`, of `extras`
+            found.append((module, "flights" if len(more) == 1 else more[0]))
+        found += [(module, extra) for _, extra, module, _ in calls_of("missing_extra", tree)]
+    found = [(module, extra) for module, extra in found if module and extra]  # not by a variable
+    assert len(found) > 20
+    for module, extra in found:
+        tops = {extras.module_of(name).partition(".")[0] for name in asked(extra)}
+        assert module.partition(".")[0] in tops, (module, extra)
+
+
+def test_extras_that_include_others(monkeypatch):
+    lines = ['a>=1', 'b[x]>=2,<3; extra == "one"', 'orthonav[one]; extra == "two"',
+             'c; python_version >= "3" and extra == "two"']  # fmt: skip
+    monkeypatch.setattr(extras.metadata, "requires", lambda name: lines)
+    monkeypatch.setattr(
+        extras.metadata,
+        "metadata",
+        lambda name: type("M", (), {"get_all": lambda self, key: ["one", "two"]})(),
+    )
+    monkeypatch.setattr(extras, "_version", lambda name: "")
+    extras._requirements.cache_clear()
+    try:
+        asked = [(package.name, package.asked) for package in extras.packages("two")]
+        assert asked == [("b", ">=2,<3"), ("c", "")]
+        assert extras.missing("") == ("a",)
+        with pytest.raises(MissingExtraError) as caught:
+            extras.require("this", "one", "two")
+        assert str(caught.value) == "this needs b, c: pip install 'orthonav[one,two]'"
+    finally:
+        extras._requirements.cache_clear()
+
+
+def test_sources_without_metadata_ask_nothing(monkeypatch):
+    def gone(name):
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(extras.metadata, "requires", gone)
+    extras._requirements.cache_clear()
+    try:
+        assert extras.packages() == () and extras.missing("geo") == ()
+        extras.require("anything", "geo")
+    finally:
+        extras._requirements.cache_clear()

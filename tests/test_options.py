@@ -1,0 +1,73 @@
+"""An option has one meaning and one unit in all commands: one kind of value, one metavar."""
+
+import argparse
+
+import pytest
+
+from orthonav.cli import COMMANDS, UNITS, _parser
+
+DIFFERENT_METAVARS = {"--out"}
+"""The metavar of an output names what each command writes."""
+
+
+def commands(parser, name):
+    """Parsers of a command and of its actions, by name."""
+    yield name, parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for sub_name, sub in action.choices.items():
+                yield from commands(sub, f"{name} {sub_name}")
+
+
+def parser_of(command):
+    actions = _parser([command, "--help-all"])._actions
+    return next(a for a in actions if isinstance(a, argparse._SubParsersAction)).choices[command]
+
+
+ALL = [each for command in COMMANDS for each in commands(parser_of(command), command)]
+OPTIONS = {}
+for command, parser in ALL:
+    for action in parser._actions:
+        for option in action.option_strings:
+            OPTIONS.setdefault(option, []).append((command, action))
+
+
+def value_of(option, action):
+    """What an option takes: none or one or several values, of which type, named how."""
+    takes = {0: "no value", "?": "perhaps a value"}.get(action.nargs, "values")
+    metavar = None if option in DIFFERENT_METAVARS or takes == "no value" else action.metavar
+    choices = None if action.choices is None else tuple(action.choices)
+    return takes, getattr(action.type, "__name__", None), metavar, choices
+
+
+SHARED = [option for option, uses in sorted(OPTIONS.items()) if len(uses) > 1]
+
+
+@pytest.mark.parametrize("option", SHARED)
+def test_an_option_takes_the_same_value_in_all_commands(option):
+    values = {}
+    for command, action in OPTIONS[option]:
+        values.setdefault(value_of(option, action), []).append(command)
+    assert len(values) == 1, values
+
+
+@pytest.mark.parametrize("option", sorted(OPTIONS))
+def test_a_unit_in_the_name_is_the_metavar(option):
+    unit = option.rpartition("-")[2]
+    for command, action in OPTIONS[option]:
+        if unit in UNITS and action.nargs is None and action.type in (int, float):
+            assert action.metavar == unit.upper(), command
+
+
+@pytest.mark.parametrize("option", sorted(OPTIONS))
+def test_an_option_has_help_and_a_number_says_of_what(option):
+    for command, action in OPTIONS[option]:
+        assert action.type is not float or action.metavar, command
+        assert action.help or option in ("-v", "-q", "--verbose", "--quiet"), command
+
+
+@pytest.mark.parametrize("command, parser", ALL, ids=[name for name, _ in ALL])
+def test_commands_with_many_options_show_the_everyday_ones_first(command, parser):
+    own = [action for action in parser._actions if action.option_strings]
+    everyday = {string for action in own for string in action.option_strings}
+    assert len(own) <= 16 or "--help-all" in everyday or " " in command

@@ -1,0 +1,57 @@
+"""Files about the project agree with each other and can be read where they are shown."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import yaml
+
+from orthonav import __version__
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+CITATION = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+
+
+def test_the_version_is_one():
+    assert PROJECT["version"] == CITATION["version"] == __version__
+
+
+def test_the_paper_is_cited_with_its_authors():
+    (paper,) = CITATION["references"]
+    names = [author["family-names"] for author in paper["authors"]]
+    assert names[0] == "Di Piazza" and len(names) == 6
+    assert "2404.06207" in paper["url"]
+
+
+def test_the_page_of_the_package_index_has_no_relative_link():
+    text = (ROOT / PROJECT["readme"]).read_text("utf-8")
+    links = re.findall(r"\]\(([^)]+)\)", text)
+    assert links and all(link.startswith("https://") for link in links)
+
+
+def test_the_page_of_the_package_index_names_every_extra():
+    text = (ROOT / PROJECT["readme"]).read_text("utf-8")
+    for name in set(PROJECT["optional-dependencies"]) - {"dev", "docs", "test"}:
+        assert f"`orthonav[{name}]`" in text
+
+
+def test_the_installation_page_names_every_extra():
+    text = (ROOT / "docs" / "installation.md").read_text("utf-8")
+    named = set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE))
+    assert named == set(PROJECT["optional-dependencies"]) - {"dev", "docs", "test"}
+
+
+def test_workflows_and_issue_forms_are_whole():
+    forms = [path for path in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml")]
+    assert len(forms) == 4
+    for path in forms:
+        form = yaml.safe_load(path.read_text("utf-8"))
+        assert path.name == "config.yml" or {"name", "description", "body"} <= set(form)
+    for path in (ROOT / ".github" / "workflows").glob("*.yml"):
+        flow = yaml.safe_load(path.read_text("utf-8"))
+        assert flow["permissions"] == {"contents": "read"}
+        for job in flow["jobs"].values():
+            for step in job["steps"]:
+                for script in re.findall(r"(?:^|\s)(\.ci/\S+|tools/\S+\.py)", step.get("run", "")):
+                    assert (ROOT / script).is_file(), script
