@@ -344,7 +344,7 @@ def test_build_refuses(run, ortho, out, names_in, make_ortho, tmp_path):
     good, small = ["--ortho", ortho], SMALL_MAP
     refused(built("--ortho", tmp_path / "no.tif"), "does not exist", "no.tif")
     (tmp_path / "empty").mkdir()
-    refused(built("--ortho", tmp_path / "empty"), "no orthophotos", str(tmp_path / "empty"))
+    refused(built("--ortho", tmp_path / "empty"), "no usable orthophotos", str(tmp_path / "empty"))
     refused(built("--ortho", text, *small), "text.tif")
     refused(built("--ortho", cut, *small), "cut.tif")
     refused(built("--ortho", no_crs, *small), "coordinate reference system", "no_crs.tif")
