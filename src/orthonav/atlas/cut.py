@@ -33,13 +33,8 @@ from orthonav.prepare.build import BuildResult
 from orthonav.prepare.layer import GreyLayerWriter, Parts
 from orthonav.prepare.layout import grid_of, tiles_of
 from orthonav.prepare.parallel import in_order
-from orthonav.prepare.sheet import (
-    MAX_WORKERS,
-    PREVIEW_PX,
-    block_side_px,
-    layer_parts,
-    put_layer_parts,
-)
+from orthonav.prepare.request import MAX_WORKERS
+from orthonav.prepare.sheet import PREVIEW_PX, block_side_px, layer_parts, put_layer_parts
 from orthonav.represent.gradients import OrientedGradients
 
 COARSER = 4
