@@ -1,4 +1,4 @@
-"""A folder as delivered is an orthophoto; other files in it are skipped and logged."""
+"""A folder as its producer delivers it is an orthophoto; other files in it are skipped."""
 
 import numpy as np
 import pytest

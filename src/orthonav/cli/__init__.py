@@ -24,23 +24,23 @@ UNITS = frozenset(("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz"))
 """Last words of option names that are units."""
 
 COMMANDS = {
-    "demo": "generate an area, build, check, fly, localize and report",
-    "plan": "derive map requirements from a route, a camera and a height",
-    "fetch": "get orthophotos of an area from open services",
+    "demo": "generate an area, build a map, simulate a flight, localize it and report",
+    "plan": "recommend a map for a route, a camera and a height",
+    "fetch": "download orthophotos of an area from open services",
     "build": "build a map from orthophotos",
-    "atlas": "many sheets as one: what is in it, is it whole, cut a map, add and take out",
-    "check": "before the flight: where can it be localized, and will the route be flown well?",
+    "atlas": "build, inspect, check and cut an atlas of many sheets",
+    "check": "predict before the flight where views will be localized",
     "info": "print the contents of a map",
     "sign": "sign a map, or create a signing key",
     "verify": "check the signature and the contents of a map",
-    "import": "write photographs, a video or a ROS recording as a flight folder",
+    "import": "convert photographs, a video or a ROS recording to a flight folder",
     "calibrate": "estimate constant errors of mount, compass and height from a flight",
     "localize": "find the positions of the views of a flight",
     "fly": "send position fixes from a live camera to an autopilot",
     "evaluate": "compare fixes with the truth",
-    "view": "show a run in the browser: track, views beside the map, health; also while it flies",
+    "view": "show a run in the browser: track, views beside the map, health",
     "simulate": "simulate a flight over an orthophoto of another year",
-    "landscape": "generate orthophotos of one area at three dates",
+    "landscape": "generate orthophotos of a landscape at several dates",
 }
 
 
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     # Matrices here are small: more BLAS threads only wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # errors are told once, by us
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # this program reports errors, once
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     # Read once, when OpenCV is loaded: a few bytes must not become a picture of gigabytes.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**28))
