@@ -53,13 +53,12 @@ def _read(data: Any, route: Route, margin_m: float, path: Path) -> TerrainHeight
     left, right = _clipped(col, size[1])
     top, bottom = _clipped(row, size[0])
     if right <= left or bottom <= top:
-        lat, lon = route.waypoints[0]
 
         def within(lat_deg: float, lon_deg: float) -> bool:
             at = _pixels(crs, transform, np.array([lat_deg]), np.array([lon_deg]))
             return bool(0 <= at[0][0] <= size[1] and 0 <= at[1][0] <= size[0])
 
-        hint = swapped_hint(lat, lon, within)
+        hint = swapped_hint(*route.waypoints[0], within)
         raise ImageryError(f"the route lies outside the terrain{hint}: {path}")
     shape = tuple(min(side, MAX_SIDE_PX) for side in (bottom - top, right - left))
     window = Window(left, top, right - left, bottom - top)
