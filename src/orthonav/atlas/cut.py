@@ -34,7 +34,12 @@ from orthonav.prepare.layer import GreyLayerWriter, Parts
 from orthonav.prepare.layout import grid_of, tiles_of
 from orthonav.prepare.parallel import in_order
 from orthonav.prepare.request import MAX_WORKERS
-from orthonav.prepare.sheet import PREVIEW_PX, block_side_px, layer_parts, put_layer_parts
+from orthonav.prepare.sheet import (
+    PREVIEW_PX,
+    block_side_px,
+    layer_parts,
+    put_layer_parts,
+)
 from orthonav.represent.gradients import OrientedGradients
 
 COARSER = 4
