@@ -153,7 +153,7 @@ def test_unknown_heights_are_refused():
     with pytest.raises(RouteError, match=r"leg 1 .*--agl-m"):
         profile(Route(PLACES), (1.0, 1.0), None, 10.0, slope)
     nowhere = lambda lat, lon: np.full(lat.shape, np.nan)  # noqa: E731
-    with pytest.raises(RouteError, match="does not reach leg 1"):
+    with pytest.raises(RouteError, match="does not cover leg 1"):
         profile(Route(PLACES), (1.0, 1.0), 100, 10.0, nowhere)
 
 

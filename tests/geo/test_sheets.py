@@ -59,7 +59,7 @@ def test_a_box_that_fits_stays_as_it_is():
         ((1, 2, 2, 1), "south < north"),
         ((1, 1, np.nan, 2), "bounds must be"),
         ((1, 89, 2, 90), "within 89.5 deg"),
-        ((-180, -80, 180, 80), "at most 10,000"),
+        ((-180, -80, 180, 80), "limit of 10,000"),
     ],
 )
 def test_bounds_that_cannot_be_cut_are_refused(bounds, message):

@@ -4,9 +4,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.errors import AreaError
+from orthonav.errors import AreaError, RouteError
 from orthonav.geo.area import Area
+from orthonav.geo.route import Route
+from orthonav.geo.sheets import sheets_of_bounds
 from orthonav.geo.swapped import HINT, swapped_hint
+from orthonav.geo.world import WorldSheets
 
 
 def near(lat_deg, lon_deg):
@@ -39,3 +42,15 @@ def test_a_valid_position_is_never_called_swapped(lat_deg, lon_deg):
 def test_swapped_bounds_out_of_range_are_named():
     with pytest.raises(AreaError, match=HINT):
         Area.from_bounds((24.0, 121.0, 24.1, 121.1))
+
+
+def test_swapped_waypoints_out_of_range_are_named():
+    with pytest.raises(RouteError, match=HINT):
+        Route(((121.0, 24.0),))
+
+
+def test_swapped_boxes_of_sheets_are_named():
+    with pytest.raises(AreaError, match=HINT):
+        sheets_of_bounds((24.0, 121.0, 24.1, 121.1))
+    with pytest.raises(AreaError, match=HINT):
+        WorldSheets(5000.0).name_at(121.0, 24.0)

@@ -15,6 +15,7 @@ from orthonav.errors import AreaError, MissingFileError, OrthonavError, OutputEr
 from orthonav.geo.area import Area
 from orthonav.geo.camera import Camera
 from orthonav.geo.route import Route
+from orthonav.geo.swapped import HINT
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.mapfile import open_map
 from orthonav.prepare import BuildRequest, build_map
@@ -413,3 +414,16 @@ def test_slow_representations_are_calibrated_on_fewer_crops(ortho, tmp_path, mon
         build_map(request, tell)
         telemetry[name] = len(shares)
     assert telemetry["slow"] == 6 < telemetry["canny"]
+
+
+@pytest.mark.parametrize("kind", ["bounds", "route"])
+def test_swapped_latitude_and_longitude_are_named(ortho, tmp_path, frame, kind):
+    lat, lon = frame.lat_deg, frame.lon_deg
+    area = (
+        {"bounds_deg": (lat - 0.001, lon - 0.001, lat + 0.001, lon + 0.001)}
+        if kind == "bounds"
+        else {"route": Route(((lon, lat), (lon + 0.001, lat))), "band_m": 100.0}
+    )
+    with pytest.raises(AreaError, match=HINT):
+        built(ortho, tmp_path, **area)
+    assert not any(tmp_path.iterdir())

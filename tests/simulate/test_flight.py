@@ -13,6 +13,7 @@ from orthonav.flight import FlightWriter, open_flight, read_image, read_truth
 from orthonav.geo.area import Area
 from orthonav.geo.camera import Camera
 from orthonav.geo.route import Route
+from orthonav.geo.swapped import HINT
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.localizer import downsampled, rectify
 from orthonav.records import View
@@ -307,3 +308,12 @@ def test_progress_is_reported(area, tmp_path):
     request = SimulateRequest([area.past], tmp_path / "f", random=4, agl_m=100.0, camera=SMALL)
     assert simulate_flight(request, shares.append) == 4
     assert shares == [0.25, 0.5, 0.75, 1.0]
+
+
+def test_a_route_with_swapped_latitude_and_longitude_is_named(area, tmp_path):
+    latlon = Mosaic.open([area.present]).outline_latlon_deg
+    lat, lon = (float(value) for value in latlon.mean(axis=0))
+    swapped = Route(((lon, lat), (lon, lat + 0.001)))
+    with pytest.raises(AreaError, match=HINT):
+        flown(area, tmp_path / "f", random=None, route=swapped)
+    assert not any(tmp_path.iterdir())

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from orthonav.errors import ImageryError, MissingFileError
 from orthonav.extras import missing_extra
 from orthonav.geo.route import Route, leg_lengths_m
+from orthonav.geo.swapped import swapped_hint
 from orthonav.geo.terrain import TerrainHeights
 
 Array = NDArray[np.float64]
@@ -52,7 +53,13 @@ def _read(data: Any, route: Route, margin_m: float, path: Path) -> TerrainHeight
     left, right = _clipped(col, size[1])
     top, bottom = _clipped(row, size[0])
     if right <= left or bottom <= top:
-        raise ImageryError(f"the route lies outside the terrain: {path}")
+
+        def within(lat_deg: float, lon_deg: float) -> bool:
+            at = _pixels(crs, transform, np.array([lat_deg]), np.array([lon_deg]))
+            return bool(0 <= at[0][0] <= size[1] and 0 <= at[1][0] <= size[0])
+
+        hint = swapped_hint(*route.waypoints[0], within)
+        raise ImageryError(f"the route lies outside the terrain{hint}: {path}")
     shape = tuple(min(side, MAX_SIDE_PX) for side in (bottom - top, right - left))
     window = Window(left, top, right - left, bottom - top)
     pixels = data.read(

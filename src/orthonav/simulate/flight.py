@@ -318,18 +318,19 @@ def _route_poses(
             lat, lon = (float(value) for value in area.frame.latlon_from_en(place))
             raise AreaError(
                 f"view {number + 1} of the route, at {lat:.5f}, {lon:.5f}, "
-                f"does not lie completely within the imagery{_swapped(area, lat, lon)}"
+                f"does not lie completely within the imagery{_swapped(area, route)}"
             )
         yield pose
 
 
-def _swapped(area: Area, lat_deg: float, lon_deg: float) -> str:
-    """A hint if the position with latitude and longitude swapped lies within the imagery."""
+def _swapped(area: Area, route: Route) -> str:
+    """A hint if a waypoint with latitude and longitude swapped lies within the imagery."""
 
     def within(lat: float, lon: float) -> bool:
         return bool(area.contains(area.frame.en_from_latlon([lat], [lon]))[0])
 
-    return swapped_hint(lat_deg, lon_deg, within)
+    hints = (swapped_hint(lat, lon, within) for lat, lon in route.waypoints)
+    return next(filter(None, hints), "")
 
 
 def _path(request: SimulateRequest, line_en_m: Array) -> FlownPath:
