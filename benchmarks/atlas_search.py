@@ -76,24 +76,24 @@ def build(folder: Path, count: int, recipe: VectorRecipe, fields: Fields, shards
     made_s = time.perf_counter() - start
     quantizers = train(sample, recipe)
     quantizers.save(folder / QUANTIZERS_NAME)
-    spent = {"train_s": time.perf_counter() - start - made_s, "make_s": made_s, "write_s": 0.0}
+    seconds = {"train_s": time.perf_counter() - start - made_s, "make_s": made_s, "write_s": 0.0}
     source = _Pieces(fields, count)
     start = time.perf_counter()
     for info in shard_infos(count, shards):
         places_deg = np.zeros((info.rows, 2))
         write_shard(folder, info.name, quantizers, places_deg, source.take(info.rows))
-    spent["write_s"] = time.perf_counter() - start - source.made_s
-    spent["make_s"] += source.made_s
+    seconds["write_s"] = time.perf_counter() - start - source.made_s
+    seconds["make_s"] += source.made_s
     bytes_on_disk = sum(path.stat().st_size for path in folder.iterdir())
     drawn = drawn_ids(count, QUERIES, fields.seed)
     queries = np.concatenate([fields.queries(block, ids) for block, ids in drawn])
     start = time.perf_counter()
     scores, ids = exact_search(folder, shard_infos(count, shards), queries, K)
-    spent["exact_s"] = time.perf_counter() - start
+    seconds["exact_s"] = time.perf_counter() - start
     own = np.concatenate([ids for _, ids in drawn])
     np.savez(folder / TRUTH, queries=queries, ids=ids, scores=scores, own=own)
     about = {"count": count, "shards": shards, "fields": asdict(fields), "recipe": asdict(recipe)}
-    text = json.dumps({**about, "disk_bytes": bytes_on_disk, **spent})
+    text = json.dumps({**about, "disk_bytes": bytes_on_disk, **seconds})
     (folder / ABOUT).write_text(text + "\n", encoding="utf-8")
 
 
@@ -162,12 +162,12 @@ def find(folder: Path, probes: int, rerank: int) -> Found:
     open_ms = (time.perf_counter() - start) * 1e3
     for query in queries[:20]:
         index.search(query[None], K, probes, rerank)
-    times, spent, found = [], [], []
+    times, thread_ms, found = [], [], []
     for query in queries:
         start, busy = time.perf_counter(), time.thread_time()
         found.append(index.search(query[None], K, probes, rerank)[1][0])
         times.append((time.perf_counter() - start) * 1e3)
-        spent.append((time.thread_time() - busy) * 1e3)
+        thread_ms.append((time.thread_time() - busy) * 1e3)
     start = time.perf_counter()
     index.search(queries[:45], K, probes, rerank)
     batch_ms = (time.perf_counter() - start) * 1e3 / 45
@@ -181,7 +181,7 @@ def find(folder: Path, probes: int, rerank: int) -> Found:
         float((exact == own[:, None]).any(axis=1).mean()),
         float(np.median(times)),
         float(np.percentile(times, 90)),
-        float(np.median(spent)),
+        float(np.median(thread_ms)),
         batch_ms,
         open_ms,
         _status_mb("VmHWM"),
@@ -243,7 +243,7 @@ def table(folder: Path, found: Sequence[Found]) -> Table:
 
 
 def measure(place: Workplace) -> Section:
-    """Search among 10^5 and 10^6 vectors; 10^7 and 10^8 where prepared in the kept folder."""
+    """Search among 10^5 and 10^6 vectors; 10^7 and 10^8 if prepared in the cache folder."""
     section = Section("Search in an atlas")
     counts = COUNTS[:1] if place.quick else COUNTS
     folders = {}
@@ -253,8 +253,8 @@ def measure(place: Workplace) -> Section:
         recipe = VectorRecipe.for_count(count, fields.dims, fields.seed)
         build(folders[count], count, recipe, fields, 1)
     for count in PREPARED:
-        if not place.quick and (place.kept / f"vectors-{count}" / ABOUT).is_file():
-            folders[count] = place.kept / f"vectors-{count}"
+        if not place.quick and (place.cache / f"vectors-{count}" / ABOUT).is_file():
+            folders[count] = place.cache / f"vectors-{count}"
     for count, folder in folders.items():
         found = settings(folder, SHARES, (RERANK,))
         section.tables.append(table(folder, found))

@@ -215,6 +215,6 @@ def _losses(scene: Scene, results: Sequence[Result]) -> list[list[str]]:
         if time_ms < own_ms:
             rows.append([*head, "ms per view", number(time_ms), number(own_ms)])
         size, own_size = result.method.carried[1], default.method.carried[1]
-        if size < own_size and scene.errors is USUAL_ERRORS:  # the same whatever is told
+        if size < own_size and scene.errors is USUAL_ERRORS:  # does not depend on the telemetry
             rows.append([*head, "carried MB", number(size / 1e6), number(own_size / 1e6)])
     return rows

@@ -1,8 +1,8 @@
-"""A process that stands in for an autopilot: tells the telemetry of a flight, and what it hears.
+"""A fake autopilot process: sends the telemetry of a flight and records the messages it receives.
 
 `python -m benchmarks.fake_autopilot FLIGHT PORT [--pace N]` prints a line of JSON for every message
 that arrives, with its arrival time on the monotonic clock, which all processes of a machine share.
-What it hears is decoded from the definitions of MAVLink by the reader that the tests use, which
+The reader of the tests decodes received messages from the definitions of MAVLink; it
 shares nothing with what sends. Its clock since boot begins where the times of the flight do.
 """
 
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 READER = Path(__file__).resolve().parents[1] / "tests" / "wire.py"
 ATTITUDE_S = 1 / 49
-"""No divisor of what cameras run at, so that exposures fall anywhere between two attitudes."""
+"""Not a divisor of camera rates, so that exposures fall anywhere between two attitudes."""
 EVERY_OTHER = 2
 BEAT_S, TAIL_S = 1.0, 5.0
 _PX4, _DOWNWARD = 12, 25
@@ -50,7 +50,7 @@ class Autopilot:
         self._number = 0
 
     def run(self) -> None:
-        """Until the telemetry ends, and a little longer."""
+        """Send until the telemetry ends, and a little longer."""
         self._begin_ns = time.monotonic_ns()
         _say({"name": "BEGIN", "begin_ns": self._begin_ns, "utc_ahead_ns": utc_ahead_ns()})
         end_s = float(self._told["time_s"][-1]) / self._pace + TAIL_S
@@ -71,7 +71,7 @@ class Autopilot:
 
     def _send(self, name: str, *values: Any) -> None:
         message = getattr(self._mavlink, f"MAVLink_{name}_message")(*values)
-        with contextlib.suppress(ConnectionRefusedError):  # nobody is up yet
+        with contextlib.suppress(ConnectionRefusedError):  # the receiver is not up yet
             self._socket.sendto(message.pack(self._mav), self._address)
         self._mav.seq = (self._mav.seq + 1) % 256
 
@@ -79,7 +79,7 @@ class Autopilot:
         return float(np.interp(when_s, self._told["time_s"], self._told[name]))
 
     def _tell(self) -> None:
-        """Telemetry of now, as it is at the millisecond that the message carries."""
+        """Telemetry at the current time, rounded to the millisecond of the message."""
         boot_ms = self._boot_ns() // 10**6
         when_s = boot_ms / 1e3 * self._pace
         pitch, roll = (math.radians(self._at(name, when_s)) for name in ("pitch_deg", "roll_deg"))
@@ -96,7 +96,7 @@ class Autopilot:
             self._send("local_position_ned", boot_ms, 0, 0, 0, north, east, 0)
 
     def _listen(self) -> None:
-        """Whatever has come; a datagram holds one message."""
+        """All messages received so far; a datagram holds one message."""
         while True:
             try:
                 frame = self._socket.recv(65_536)
@@ -114,7 +114,7 @@ class Autopilot:
 
 
 def utc_ahead_ns() -> int:
-    """UTC less the monotonic clock: of several readings the one that was interrupted least."""
+    """UTC minus the monotonic clock, from the fastest of several readings."""
     readings = []
     for _ in range(20):
         before_ns, utc_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()

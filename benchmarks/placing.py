@@ -1,4 +1,4 @@
-"""A process that places the views of a flight by one method and tells errors, times and memory.
+"""A process that locates the views of a flight by one method and prints errors, times and memory.
 
 It imports nothing but what it measures. `python -m benchmarks.placing JSON` prints JSON.
 """
@@ -21,8 +21,10 @@ TEMPLATE, CANNY, PHASE, MUTUAL, SIFT = "template", "canny", "phase", "mutual", "
 
 @dataclass(frozen=True)
 class Task:
-    """What to place and how: `pixels` and `factor` (map pixels averaged to one) are for methods
-    that are not orthonav's, `telemetry_only` tries no other pose than the told one."""
+    """Views and method of one run.
+
+    `pixels` and `factor` (map pixels averaged to one) are for methods other than orthonav's;
+    `telemetry_only` tries the reported pose only."""
 
     method: str
     map_path: str
@@ -41,8 +43,8 @@ def placed(task: Task) -> dict[str, Any]:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
-    told: dict[str, Any] = json.loads(done.stdout)
-    return told
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
 
 
 def run(task: Task) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What a user might write to register a view with OpenCV: one measure of likeness, many poses.
+"""What a user might write to register a view with OpenCV: one similarity measure, many poses.
 
 Every method gets the view rectified by orthonav's own code, once per pose of orthonav's own bank of
 headings and heights, whole with a mask, and the whole map. The best value of any pose and place is
@@ -28,9 +28,9 @@ TURN_STEP_DEG, SCALE_STEP, SIGMAS = 8.0, 0.13, 3.0
 SCALE_STD = 0.1
 LEVELS_MI = 6
 MAP_ORB, VIEW_ORB = 40_000, 2_000
-"""Keypoints of ORB that are kept of 4 km2 of map, and of a view."""
+"""Number of ORB keypoints of 4 km2 of map, and of a view."""
 LOWE, MIN_INLIERS, RANSAC_PX, BORDER_PX = 0.75, 8, 4.0, 9
-TOLD = "told pose"
+REPORTED = "reported pose"
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,13 +84,13 @@ def poses(heading_known: bool, yaw_std_deg: float | None) -> list[tuple[float, f
 
 def posed(view: View, gsd_m: float, tried: list[tuple[float, float]]) -> Iterator[RectifiedView]:
     """All that the camera sees, north up, under each of the poses."""
-    camera, told = view.camera, view.telemetry
+    camera, reported = view.camera, view.telemetry
     smaller = downsampled(view, gsd_m)
-    yaw_deg = told.yaw_deg if math.isfinite(told.yaw_deg) else 0.0
+    yaw_deg = reported.yaw_deg if math.isfinite(reported.yaw_deg) else 0.0
     across = math.hypot(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px)
     for turn_deg, factor in tried:
-        agl_m = told.agl_m * factor
-        telemetry = replace(told, yaw_deg=yaw_deg + turn_deg, agl_m=agl_m)
+        agl_m = reported.agl_m * factor
+        telemetry = replace(reported, yaw_deg=yaw_deg + turn_deg, agl_m=agl_m)
         yield rectify(
             replace(smaller, telemetry=telemetry),
             gsd_m=gsd_m,
@@ -99,7 +99,7 @@ def posed(view: View, gsd_m: float, tried: list[tuple[float, float]]) -> Iterato
 
 
 Surface = Callable[[RectifiedView], Array]
-"""How well a rectified view (S, S) fits with its corner on each pixel: (h, w)."""
+"""Function from a rectified view (S, S) to its score (h, w) with its corner on each pixel."""
 
 
 class BestOfPoses:
@@ -180,7 +180,7 @@ class TemplateSurface:
         product = self._spectra.surface(self._map, self._spectra.of(template), seen)
         mean = self._spectra.surface(self._map, mask, seen)
         spread = self._spectra.surface(self._squared, mask, seen) - mean**2 / pixels
-        typical = float(np.median(spread))  # a uniform place says nothing
+        typical = float(np.median(spread))  # a uniform place has no evidence
         return np.asarray(product / np.sqrt(np.maximum(spread, 1e-3 * typical) * energy + 1e-9))
 
 
@@ -243,10 +243,10 @@ class MutualSurface:
 
 
 class Keypoints:
-    """SIFT or ORB of the told view against keypoints of the map, ratio test, RANSAC similarity.
+    """SIFT or ORB of the view against the map: ratio test, RANSAC similarity.
 
-    With `near_m` only keypoints so near to the place that `locate` is told are compared, one by
-    one; without, all those of the map, by an index that is made once.
+    With `near_m` the keypoints within that distance of the prior are compared exhaustively;
+    without, all keypoints of the map, through an index that is made once.
     """
 
     def __init__(self, picture: Picture, *, orb: bool = False, near_m: float | None = None) -> None:
@@ -289,7 +289,7 @@ class Keypoints:
     def _pairs(
         self, descriptors: NDArray[Any], near_en_m: Place
     ) -> tuple[NDArray[np.float64], Any]:
-        """Keypoints of the map (N, 2) that are compared, and the two likest of each of ours."""
+        """Compared keypoints of the map (N, 2), and two nearest neighbours of each of the view."""
         if self._near_m is None or near_en_m is None:
             return self._points, self._matcher.knnMatch(descriptors, k=2)
         grid, gsd_m = self._picture.grid, self._picture.gsd_m

@@ -131,8 +131,8 @@ def _stages(section: Section, columns: dict[bool, list[_Account]]) -> Table:
     notes = (
         f"generated 2 x 2 km at 1 m; heading known to 10 deg ({len(columns[True])} views) and "
         f"unknown ({len(columns[False])}); height known to 10 %; warm, one core; a view that is "
-        "not sure after one search is searched again, so means say more than medians; share: of "
-        "the time of all views",
+        "not confident after one search is searched again, so the mean is more useful than the "
+        "median; share: of the time of all views",
         "level n: pixels of 2^n m; rectify: checks, thinning, rectification; search, tiles: "
         "candidates from embeddings; refine: all candidates that reach the level; templates: "
         "evidence of the view and its derivatives; stages do not overlap",

@@ -1,4 +1,4 @@
-"""All sections in order, and what is made of them."""
+"""All sections in order, and the files written from them."""
 
 import argparse
 import logging

@@ -1,8 +1,8 @@
 """The paper's related work on one trajectory: methods that carry the reference images on board.
 
 Mutual information (Patel et al.), edges matched as such (Conte and Doherty: Sobel; and Canny), and
-local features with RANSAC. All are those of `benchmarks`, held to the told pose and given the
-whole map.
+local features with RANSAC. All are those of `benchmarks`, restricted to the reported pose and given
+the whole map.
 """
 
 import time
@@ -93,7 +93,7 @@ def _placed(
         picture = replace(picture, grey=sobel(picture.grey))
     method = baseline.make(picture)
     agl_m, gsd_m = scene.trajectory.agl_m, localizer.grid.gsd_m
-    camera, telemetry = views.camera_of(agl_m, gsd_m), views.told(agl_m)
+    camera, telemetry = views.camera_of(agl_m, gsd_m), views.telemetry_at(agl_m)
     errors: dict[str, list[float | None]] = {}
     times_ms = []
     for name, seen in grounds.items():

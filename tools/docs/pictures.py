@@ -43,7 +43,7 @@ MADE_FROM = "made_from.txt"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 PAST, PRESENT = "area/2016-07.tif", "area/2021-10.tif"
 SHOWN_EN_PX = (560, 300, 640)
-"""What of the area is shown of two dates: column, row and side."""
+"""Part of the area shown for two dates: column, row and side."""
 TILE_EN_PX = (690, 420, 256)
 """The tile whose representations are shown."""
 WINDOW_M, ZOOM_M = 460.0, 36.0
@@ -54,7 +54,7 @@ OPTIONS: dict[str, dict[str, Any]] = {"jpg": {"quality": 88, "optimize": True}, 
 
 
 def main() -> int:
-    """Make what is out of date."""
+    """Make the pictures that are out of date."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--force", action="store_true", help="make them in any case")
     options = parser.parse_args()
