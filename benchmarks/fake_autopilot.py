@@ -37,8 +37,8 @@ class Autopilot:
     """Plays the telemetry of a flight folder over UDP. Mutable."""
 
     def __init__(self, folder: Path, port: int, pace: float) -> None:
-        self._told = _columns(folder / "telemetry.csv")
-        self._told["yaw_rad"] = np.unwrap(np.radians(self._told["yaw_deg"]))
+        self._telemetry = _columns(folder / "telemetry.csv")
+        self._telemetry["yaw_rad"] = np.unwrap(np.radians(self._telemetry["yaw_deg"]))
         self._pace, self._address = pace, ("127.0.0.1", port)
         self._mavlink: Any = importlib.import_module("pymavlink.dialects.v20.common")
         self._mav = self._mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -53,7 +53,7 @@ class Autopilot:
         """Send until the telemetry ends, and a little longer."""
         self._begin_ns = time.monotonic_ns()
         _say({"name": "BEGIN", "begin_ns": self._begin_ns, "utc_ahead_ns": utc_ahead_ns()})
-        end_s = float(self._told["time_s"][-1]) / self._pace + TAIL_S
+        end_s = float(self._telemetry["time_s"][-1]) / self._pace + TAIL_S
         tell_s = beat_s = 0.0
         while (now_s := self._boot_ns() / 1e9) < end_s:
             if now_s >= beat_s:
@@ -76,7 +76,7 @@ class Autopilot:
         self._mav.seq = (self._mav.seq + 1) % 256
 
     def _at(self, name: str, when_s: float) -> float:
-        return float(np.interp(when_s, self._told["time_s"], self._told[name]))
+        return float(np.interp(when_s, self._telemetry["time_s"], self._telemetry[name]))
 
     def _tell(self) -> None:
         """Telemetry at the current time, rounded to the millisecond of the message."""
@@ -91,7 +91,7 @@ class Autopilot:
         slant_m = self._at("agl_m", when_s) / (math.cos(pitch) * math.cos(roll))
         slant_cm = round(slant_m * 100)
         self._send("distance_sensor", boot_ms, 1, 65_535, slant_cm, 0, 0, _DOWNWARD, 255)
-        if "vel_east_mps" in self._told:
+        if "vel_east_mps" in self._telemetry:
             north, east = self._at("vel_north_mps", when_s), self._at("vel_east_mps", when_s)
             self._send("local_position_ned", boot_ms, 0, 0, 0, north, east, 0)
 

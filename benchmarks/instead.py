@@ -1,4 +1,4 @@
-"""What one would run instead of the track, view by view on the same core.
+"""Alternatives to the track: other methods, view by view on the same core.
 
 `python -m benchmarks.instead JSON` places the views of a flight by one method, in a process that
 loads nothing else, and prints JSON.
@@ -91,7 +91,7 @@ def beside(
         print(f"        {task.name} done", file=sys.stderr, flush=True)
     header: tuple[str, ...] = ("method", "views", "ms", "p99 ms", "15 m", "35 m", "no answer")
     header += ("peak MB", "installed MB")
-    return Table("What one would run instead", header, rows, _notes(tiles))
+    return Table("Alternatives to the track", header, rows, _notes(tiles))
 
 
 def _notes(tiles: int) -> tuple[str, ...]:

@@ -267,7 +267,7 @@ def _followed(
     sources, truth = sources_digest(), read_truth(folder / "truth.csv")
     placed = localize_flight(Tracker(localizer, use_prior=False), open_flight(folder))
     rows = [
-        {**_told(each, localizer, truth[each.frame]), "clouds": about["clouds"][each.frame]}
+        {**_record(each, localizer, truth[each.frame]), "clouds": about["clouds"][each.frame]}
         for each in placed
     ]
     followed = {
@@ -282,7 +282,7 @@ def _followed(
     return followed
 
 
-def _told(result: ViewResult, localizer: Localizer, truth: tuple[float, float]) -> dict[str, Any]:
+def _record(result: ViewResult, localizer: Localizer, truth: tuple[float, float]) -> dict[str, Any]:
     """One view for JSON: error east and north in m and stated values; None without a fix."""
     out = result.outcome
     record: dict[str, Any] = {

@@ -106,12 +106,12 @@ class BestOfPoses:
     """The highest value of a surface over all poses."""
 
     def __init__(self, picture: Picture, surface: Surface, telemetry_only: bool) -> None:
-        self._picture, self._surface, self._told_only = picture, surface, telemetry_only
+        self._picture, self._surface, self._telemetry_only = picture, surface, telemetry_only
 
     def locate(self, view: View, heading_known: bool) -> Place:
         """East and north (2,) of the camera in the sheet."""
         tried = poses(heading_known, view.telemetry.yaw_std_deg)
-        if self._told_only:
+        if self._telemetry_only:
             tried = [(0.0, 1.0)]
         best, place = -math.inf, None
         for seen in posed(view, self._picture.gsd_m, tried):

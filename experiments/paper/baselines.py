@@ -44,19 +44,19 @@ class Baseline:
     sobel: bool = False
 
 
-def _told(surface: Callable[[Picture], Any]) -> Callable[[Picture], Any]:
+def _in_reported_pose(surface: Callable[[Picture], Any]) -> Callable[[Picture], Any]:
     return lambda picture: BestOfPoses(picture, surface(picture), telemetry_only=True)
 
 
 BASELINES = (
-    Baseline("mutual information (Patel et al.)", _told(MutualSurface), COARSER),
+    Baseline("mutual information (Patel et al.)", _in_reported_pose(MutualSurface), COARSER),
     Baseline(
         "Sobel edges matched (Conte and Doherty)",
-        _told(lambda picture: TemplateSurface(picture, False)),
+        _in_reported_pose(lambda picture: TemplateSurface(picture, False)),
         sobel=True,
     ),
-    Baseline("Canny edges matched", _told(lambda picture: TemplateSurface(picture, True))),
-    Baseline("grey levels matched", _told(lambda picture: TemplateSurface(picture, False))),
+    Baseline("Canny edges matched", _in_reported_pose(lambda picture: TemplateSurface(picture, True))),
+    Baseline("grey levels matched", _in_reported_pose(lambda picture: TemplateSurface(picture, False))),
     Baseline("SIFT, ratio test, RANSAC", Keypoints),
 )
 
