@@ -77,7 +77,7 @@ class Fields:
         return np.concatenate(parts)
 
     def block(self, number: int) -> Array:
-        """Components (1024^2, dims) of a block, each of variance 1: the same whenever asked."""
+        """Components (1024^2, dims) of a block, each of variance 1, reproducible."""
         rng = np.random.default_rng([self.seed, number])
         out = rng.standard_normal((BLOCK_ROWS, self.dims), dtype=np.float32)
         grid = out.reshape(BLOCK_SIDE, BLOCK_SIDE, self.dims)

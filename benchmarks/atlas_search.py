@@ -309,7 +309,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Build and measure one index, print its table and leave its figures as JSON beside it."""
+    """Build and measure one index, print its table, and write its figures as JSON."""
     options = _parser().parse_args()
     if options.child:
         print(json.dumps(asdict(find(options.child, options.probes, options.rerank[0]))))

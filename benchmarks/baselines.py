@@ -83,7 +83,7 @@ class Reference:
         return [self.localizer.tiles.rectified(smaller, yaw_deg + turn) for turn in turns_deg]
 
     def place_en_m(self, col_px: float, row_px: float) -> NDArray[np.float64]:
-        """Where a pixel coordinate (outer corner of the first pixel: 0, 0) lies in the sheet."""
+        """Position in the sheet of a pixel coordinate (outer corner of the first pixel: 0, 0)."""
         grid = self.localizer.grid
         return np.array([grid.west_m + col_px * grid.gsd_m, grid.north_m - row_px * grid.gsd_m])
 
@@ -127,7 +127,7 @@ class TemplateMatch:
             self.carried = ("orthophoto, grey JPEG", reference.jpeg_bytes)
 
     def locate(self, view: View) -> Place:
-        """The highest correlation anywhere."""
+        """Position of the highest correlation."""
         views = self.reference.rectified(view, self.turns_deg)
         middle = views[0].grey.shape[0] // 2
         half = min(_seen_half_px(one.valid) for one in views)
@@ -159,7 +159,7 @@ class SiftMatch:
         self.carried = ("keypoints, 136 bytes each", 136 * len(points))
 
     def locate(self, view: View) -> Place:
-        """Where the centre of the view falls; none with fewer than `MIN_INLIERS` inliers."""
+        """Position of the centre of the view; None with fewer than `MIN_INLIERS` inliers."""
         seen = self._reference.rectified(view, [0.0])[0]
         points, descriptors = self._features(seen.grey, seen.valid)
         if len(points) < 2:

@@ -1,4 +1,4 @@
-"""orthonav beside what a user would write first: same views, same run, same seeds."""
+"""orthonav compared with first-choice methods: same views, same run, same seeds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -78,7 +78,7 @@ class Result:
 
 def measure(place: Workplace) -> Section:
     """Every method on every scene; then the scenes and figures where orthonav loses."""
-    section = Section("Beside the methods a user would write first")
+    section = Section("Comparison with first-choice methods")
     losses = []
     scenes = _scenes(place)
     for past in dict.fromkeys(scene.past for scene in scenes):

@@ -83,7 +83,7 @@ def route_of(km: float) -> Route:
 
 
 def generated(work: Path, route: Route) -> Path:
-    """Folder of the tiles under the corridor, as a package of IGN; those that are missing made."""
+    """Folder of the tiles under the corridor, as a package of IGN; missing tiles are generated."""
     name = f"BDORTHO_2-0_RVB-1M00_JP2-E080_LAMB93_D000_{PAST.name[:4]}-01-01-{generator_digest()}"
     folder = work / name / "ORTHOHR" / "1_DONNEES_LIVRAISON"
     folder.mkdir(parents=True, exist_ok=True)
@@ -200,7 +200,7 @@ def _built(folder: Path, out: Path, km: float, workers: int) -> dict[str, Any]:
 
 
 def _killed_and_resumed(folder: Path, out: Path, km: float) -> tuple[float, dict[str, Any]]:
-    """Share of the blocks that a build had finished when it was killed, and the one after it."""
+    """Share of blocks finished when a build was killed, and the figures of the resumed build."""
     out.unlink(missing_ok=True)
     work = out.with_name(f"{out.name}.work")
     process = subprocess.Popen(_command(folder, out, km, 2), stdout=subprocess.PIPE, text=True)

@@ -198,7 +198,7 @@ def _notes(
 
 
 def _kind(wheel: str | None) -> str:
-    """In a word, what a wheel is for."""
+    """Python and platform tag of a wheel, in short."""
     if wheel is None:
         return "NONE"
     if not wheel.endswith(".whl"):

@@ -55,7 +55,7 @@ SCATTER = Errors(
     yaw_std_deg=1.0, agl_std=0.01, tilt_std_deg=0.2, attitude_std_deg=2.0, velocity_drift=DRIFT
 )
 GAP_M, JUMP_M = 3000.0, 2000.0
-"""What a kidnapped flight leaves out at least: so much of the way, and so far as the crow flies."""
+"""A kidnapped flight leaves out at least this path length and this straight distance."""
 CONFIDENT, RIGHT_M, DIVERGED_M, DIVERGED_VIEWS = 0.9, 35.0, 60.0, 10
 SEED = 100
 Array = NDArray[np.float64]
@@ -214,7 +214,7 @@ def _legs(rng: np.random.Generator, length_m: float, reach_m: float) -> Array:
         leg_m, new = float(np.hypot(*step)), math.atan2(step[1], step[0])
         turn_deg = abs(math.degrees(math.remainder(new - course, 2 * math.pi)))
         if not (shortest <= leg_m <= LEG_M[1] and turn_deg <= SHARPEST_DEG):
-            course += 0.05  # a corner of the square has no way out but back
+            course += 0.05  # leave the corner of the square
             continue
         line.append(line[-1] + step * min(1.0, left_m / leg_m))
         course, left_m = new, left_m - leg_m
@@ -228,9 +228,9 @@ def _kidnap(folder: Path, plan: Plan, localizer: Localizer, rng: np.random.Gener
     frame = localizer.sheet.frame
     places = np.array([frame.en_from_latlon(*truth[row["frame"]]) for row in rows])
     first = int(rng.uniform(0.4, 0.55) * len(rows))
-    way = np.cumsum(np.hypot(*np.diff(places[first:], axis=0).T))
+    path_m = np.cumsum(np.hypot(*np.diff(places[first:], axis=0).T))
     apart = np.hypot(*(places[first + 1 :] - places[first]).T)
-    after = first + 1 + int(np.argmax((way >= GAP_M) & (apart >= JUMP_M)))
+    after = first + 1 + int(np.argmax((path_m >= GAP_M) & (apart >= JUMP_M)))
     gap_s = float(rows[after]["time_s"]) - float(rows[first]["time_s"]) - SPACING_M / SPEED_MPS
     for row in rows[after:] if plan.kidnapped == "jump" else ():
         row["time_s"] = f"{float(row['time_s']) - gap_s:.6f}"
@@ -318,7 +318,7 @@ class Figures:
 
     @classmethod
     def of(cls, views: Sequence[dict[str, Any]]) -> "Figures":
-        """From the views that `_followed` gives."""
+        """From the views of `_followed`."""
         known = np.array([view["error_en_m"] is not None for view in views])
         fixed = [view for view in views if view["error_en_m"] is not None]
         errors, nees = np.full(len(views), np.inf), np.full(len(views), np.nan)
@@ -357,7 +357,7 @@ class Figures:
         return int((np.diff(edges)[::2] > DIVERGED_VIEWS).sum())
 
     def cells(self) -> list[str]:
-        """Median, 95 %, largest error while tracking; confident; confident and wrong; divergences."""
+        """Median, 95 %, largest error while tracking; confident; wrong; divergences."""
         errors = self.errors_m[self.tracking]
         spread = np.percentile(errors, [50, 95, 100]) if errors.size else np.full(3, np.nan)
         confident = percent(float(self.confident.mean()))

@@ -136,7 +136,7 @@ def played(
 
 
 def rest_of(folder: Path, out: Path, from_s: float) -> Path:
-    """The views of a played flight from a time on: what a camera started then sees."""
+    """The views of a played flight from a time on, as from a camera that starts then."""
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     rows = [row for row in _read(folder / "telemetry.csv") if float(row["time_s"]) >= from_s]

@@ -1,4 +1,4 @@
-"""The program as it flies: from exposure to message, load of its core, starts, beside others."""
+"""`orthonav fly` in real time: latency, load of its core, starts, alternatives."""
 
 import sys
 import time
@@ -37,7 +37,7 @@ class Scene:
     quick: bool
 
     def arguments(self, name: str, camera: Path, port: int) -> list[str]:
-        """A command line as on an aircraft, but for the pictures, which come from a folder."""
+        """Command line as on an aircraft, except that pictures come from a folder."""
         files = {"--jsonl": "lines.jsonl", "--log": "log.mcap", "--state": "state.json"}
         made = [str(self.map_path), str(camera), "--file-clock", "autopilot"]
         made += ["--autopilot", f"udpin:{port}", "--log-views", "thumbnails"]

@@ -53,7 +53,7 @@ def on_core(core: int) -> Iterator[None]:
 
 
 def free_port() -> int:
-    """A UDP port of the loopback that nobody uses."""
+    """A free UDP port of the loopback interface."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -30,7 +30,6 @@ LEVELS_MI = 6
 MAP_ORB, VIEW_ORB = 40_000, 2_000
 """Number of ORB keypoints of 4 km2 of map, and of a view."""
 LOWE, MIN_INLIERS, RANSAC_PX, BORDER_PX = 0.75, 8, 4.0, 9
-REPORTED = "reported pose"
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +46,7 @@ class Picture:
 
     @classmethod
     def read(cls, map_path: Path, pixels_path: Path, factor: int) -> "Picture":
-        """From what `benchmarks.side_by_side` stored beside a map."""
+        """From the files that `benchmarks.side_by_side` stored with a map."""
         with np.load(pixels_path) as stored:
             grey, valid = stored["grey"], stored["valid"]
         size = grey.shape[1] // factor, grey.shape[0] // factor
@@ -63,7 +62,7 @@ class Picture:
         return self.grid.gsd_m * self.factor
 
     def place_en_m(self, col_px: float, row_px: float) -> NDArray[np.float64]:
-        """Where a pixel coordinate (outer corner of the first pixel: 0, 0) lies in the sheet."""
+        """Position in the sheet of a pixel coordinate (outer corner of the first pixel: 0, 0)."""
         return np.array(
             [self.grid.west_m + col_px * self.gsd_m, self.grid.north_m - row_px * self.gsd_m]
         )
@@ -125,7 +124,7 @@ class BestOfPoses:
 
 
 class _Spectra:
-    """Real FFTs of planes as large as the map; values count where the view lies wholly on it."""
+    """Real FFTs of planes as large as the map; values are valid where the view lies fully on it."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self._shape = shape
@@ -156,7 +155,7 @@ _NOWHERE = np.full((1, 1), -np.inf, np.float32)
 
 
 class TemplateSurface:
-    """What `cv2.matchTemplate` gives for TM_CCOEFF_NORMED with a mask, of grey or Canny edges.
+    """Same as `cv2.matchTemplate` TM_CCOEFF_NORMED with a mask, of grey or Canny edges.
 
     The same numbers by FFT with the map's spectra made once, which is several times faster. The
     mask is what the camera saw: better than the largest square within it.
@@ -185,7 +184,7 @@ class TemplateSurface:
 
 
 class PhaseSurface:
-    """Phase correlation: the whitened cross spectrum; that of the map is made once."""
+    """Phase correlation: the whitened cross spectrum; the spectrum of the map is computed once."""
 
     def __init__(self, picture: Picture) -> None:
         grey = picture.grey.astype(np.float32)
@@ -266,7 +265,7 @@ class Keypoints:
             self._detector.setMaxFeatures(VIEW_ORB)
 
     def locate(self, view: View, heading_known: bool, near_en_m: Place = None) -> Place:
-        """Where the middle of the view falls; none with too few inliers. No heading is needed."""
+        """Position of the centre of the view; None with too few inliers. No heading is needed."""
         seen = next(posed(view, self._picture.gsd_m, [(0.0, 1.0)]))
         points, descriptors = self._features(seen.grey, seen.valid)
         if len(points) < MIN_INLIERS:

@@ -1,4 +1,4 @@
-"""Is `orthonav check` right? What it predicts, from one date alone, against what comes out.
+"""Predictions of `orthonav check`, from one date alone, compared with measured results.
 
 `python -m benchmarks.prediction [--views 240] [--only NAME ..] [--workers N] [--out FOLDER]` checks
 maps as the command does, without the second date, then flies over that date with the program's own
@@ -166,7 +166,7 @@ def _there(scene: Scene) -> bool:
 
 
 def _file(name: str, folder: Path) -> Path:
-    """A file of real imagery, or of a generated area, which is made once."""
+    """A file of real imagery, or of a generated area (cached)."""
     if not name.startswith("generated:"):
         return DATA / name
     _, seed, date = name.split(":")

@@ -1,4 +1,4 @@
-"""Where a registered view's time goes, and the floor that its FFTs set."""
+"""Stages of a registered view, and the floor of its FFTs."""
 
 import math
 import time
@@ -55,7 +55,7 @@ class _Account:
 
 def measure(place: Workplace) -> Section:
     """Stages of views with known and unknown heading; FFT floors of the searches they made."""
-    section = Section("Where a registered view's time goes")
+    section = Section("Time of a registered view")
     past, present = place.area(2000, 1.0, [PAST, PRESENT])
     localizer = Localizer(open_map(place.map(past)))
     flight = place.fly(present, 12 if place.quick else 100, WIDE_ERRORS)
@@ -148,7 +148,7 @@ def _lists(accounts: list[_Account], names: list[str]) -> dict[str, list[float]]
 
 
 def _floors(section: Section, searches: dict[Search, int]) -> Table:
-    """What the FFTs of each search cost alone."""
+    """Time of the FFTs of each search alone."""
     common: dict[Search, int] = {}
     for key in sorted(searches, key=lambda key: -searches[key]):
         if not any(key[0] == seen[0] and key[2] == seen[2] for seen in common):

@@ -73,7 +73,7 @@ def scenes() -> list[Scene]:
 
 @dataclass(frozen=True)
 class Bench:
-    """Where maps and flights of this run lie, and its options."""
+    """Folders of maps and flights of this run, and its options."""
 
     folder: Path
     options: argparse.Namespace
@@ -105,7 +105,7 @@ class Bench:
 
 
 def main() -> None:
-    """Run the scenes asked for and print their tables."""
+    """Run the chosen scenes and print their tables."""
     options = _parser().parse_args()
     cv2.setNumThreads(1)
     about = provenance("real imagery")

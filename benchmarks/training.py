@@ -135,7 +135,7 @@ def _precisions(section: Section) -> Table:
 
 
 def _in_a_process(**wanted: Any) -> dict[str, Any]:
-    """What `_learn` gives in a fresh process, whose memory nothing else has touched."""
+    """Result of `_learn` in a fresh process."""
     # Benchmarks that import NumPy first may be held to one thread; learning uses what there is.
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
     environment = {name: value for name, value in os.environ.items() if name not in names}

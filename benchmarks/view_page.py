@@ -75,7 +75,7 @@ WATCH = """
 
 @dataclass(frozen=True)
 class LongRun:
-    """Where a run without pictures lies."""
+    """Paths of a run without pictures."""
 
     fixes: Path
     truth: Path
@@ -125,7 +125,7 @@ def _name(i: int) -> str:
 
 
 def measure(place: Workplace) -> Section:
-    """A row for each number of views; nothing where there is no browser."""
+    """A row for each number of views; no rows without a browser."""
     section = Section("The page of a run")
     if chromium() is None:
         section.tables = [Table(section.title, ("views",), [], [HOW_TO_GET_ONE])]
@@ -175,7 +175,7 @@ def _cores() -> str:
 
 @contextmanager
 def _served(run: LongRun, map_path: Path) -> Iterator[tuple[str, float]]:
-    """Address of a server in a process of its own, and how long it took to come."""
+    """Address of a server in a process of its own, and its start time."""
     command = [sys.executable, "-m", "orthonav", "view", str(run.fixes), "--map", str(map_path)]
     command += ["--truth", str(run.truth), "--no-browser"]
     begun = time.perf_counter()
@@ -288,7 +288,7 @@ def _scrub(page: Page) -> None:
 
 
 def _swing(page: Page, part: str, height: float, reach_px: int) -> None:
-    """Presses the button over a part, goes to and fro, and lets it go."""
+    """Press the button over a part, move back and forth, and release it."""
     box = page.locator(part).bounding_box()
     assert box is not None
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] * height

@@ -36,7 +36,7 @@ KEY = "baselines"
 
 @dataclass(frozen=True)
 class Baseline:
-    """A method, made from the map's picture; `sobel` hands it edges instead of grey levels."""
+    """A method on the map's picture; `sobel` gives it edges instead of grey levels."""
 
     name: str
     make: Callable[[Picture], Any]
@@ -44,19 +44,21 @@ class Baseline:
     sobel: bool = False
 
 
-def _in_reported_pose(surface: Callable[[Picture], Any]) -> Callable[[Picture], Any]:
+def _reported_pose(surface: Callable[[Picture], Any]) -> Callable[[Picture], Any]:
     return lambda picture: BestOfPoses(picture, surface(picture), telemetry_only=True)
 
 
 BASELINES = (
-    Baseline("mutual information (Patel et al.)", _in_reported_pose(MutualSurface), COARSER),
+    Baseline("mutual information (Patel et al.)", _reported_pose(MutualSurface), COARSER),
     Baseline(
         "Sobel edges matched (Conte and Doherty)",
-        _in_reported_pose(lambda picture: TemplateSurface(picture, False)),
+        _reported_pose(lambda picture: TemplateSurface(picture, False)),
         sobel=True,
     ),
-    Baseline("Canny edges matched", _in_reported_pose(lambda picture: TemplateSurface(picture, True))),
-    Baseline("grey levels matched", _in_reported_pose(lambda picture: TemplateSurface(picture, False))),
+    Baseline("Canny edges matched", _reported_pose(lambda picture: TemplateSurface(picture, True))),
+    Baseline(
+        "grey levels matched", _reported_pose(lambda picture: TemplateSurface(picture, False))
+    ),
     Baseline("SIFT, ratio test, RANSAC", Keypoints),
 )
 

@@ -1,4 +1,4 @@
-"""One method on one trajectory: build the map, place the views, write down all that is asked of it.
+"""One method on one trajectory: build the map, locate the views, write the results.
 
 Everything the tables and plots need is in the file that a run leaves; a run that has its file is
 not run again.
@@ -39,7 +39,7 @@ MB = 1e6
 
 @dataclass(frozen=True)
 class Workplace:
-    """Where results, maps and generated areas lie, and what the run was called with."""
+    """Folders of results, maps and generated areas, and the options of the run."""
 
     out: Path
     setting: Setting

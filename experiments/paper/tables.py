@@ -1,4 +1,4 @@
-"""Tables 2 and 3 and those beside them, from result files alone."""
+"""Tables 2 and 3 and further tables, from result files alone."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -26,7 +26,7 @@ EDGES = {
 
 
 def report(out: Path, setting: str) -> Path | None:
-    """Write `tables.md` and the plots beside the result files; None where there are none."""
+    """Write `tables.md` and the plots next to the result files; None without results."""
     folder = out / setting
     results = read(folder)
     if not results:
@@ -98,7 +98,7 @@ def _best_words(found: Sequence[Result]) -> list[Result]:
 
 
 def table_3(results: Sequence[Result]) -> list[Table]:
-    """The confidence criterion, beside the ratio with an exclusion radius; views on the grid."""
+    """The confidence criterion and the ratio with an exclusion radius; views on the grid."""
     header = (
         *("scene", "method", "input", "paper acc. / accepted", "Lowe 1.13: acc. / accepted"),
         *(
@@ -119,7 +119,7 @@ def table_3(results: Sequence[Result]) -> list[Table]:
     notes = (
         "accuracy at 15 m of the accepted views, and their share, in %, views on the grid",
         "accepted at 95 %: largest share that a threshold accepts with at least 95 % correct, "
-        "chosen on these very views; excluding: best score over the best one farther than half a tile",
+        "chosen on these very views; excluding: best score over the best one beyond half a tile",
     )
     return [Table("Table 3: confidence criteria", header, rows, notes)]
 
@@ -136,7 +136,7 @@ def _table_3_row(scene: str, each: Result) -> list[str]:
 
 
 def choice(results: Sequence[Result]) -> list[Table]:
-    """The paper's best beside orthonav, over imagery that is not the paper's: what to choose."""
+    """The paper's best method and orthonav over other imagery."""
     rows = []
     for scene, found in _by_scene(results):
         shown = [e for e in found if e.family == "gradient" or _is_papers_best(e)]
@@ -150,7 +150,7 @@ def choice(results: Sequence[Result]) -> list[Table]:
     )
     notes = (
         "accuracy at 15 m in %; right tile: of views anywhere; correct / accepted: of views on "
-        "the grid, those accepted by the criterion; ms: one view, one core, from its picture to the fix",
+        "the grid, by the criterion; ms: one view, one core, from its picture to the fix",
     )
     return [Table("The paper's best and orthonav on other imagery", header, rows, notes)]
 
@@ -194,7 +194,7 @@ def rules(results: Sequence[Result]) -> list[Table]:
 
 
 def baselines(results: Sequence[Result], made: Sequence[Result]) -> list[Table]:
-    """Methods that carry the reference images, beside orthonav's rows on the same trajectory."""
+    """Methods that carry the reference images, and orthonav on the same trajectory."""
     rows = []
     for each in results:
         for name, result in each.plain.get("baselines", {}).items():

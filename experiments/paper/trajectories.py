@@ -11,7 +11,7 @@ from orthonav.geo.routes import presets
 
 TILE_PX = 256
 VIEW_ROOM = 1.5
-"""Ground around a view, in widths of it: turned by up to 45 deg it still lies within."""
+"""Ground around a view, in view widths: it contains the view turned by up to 45 deg."""
 LARGEST_M = 49_500.0
 """A map holds at most 50 km; C's 50 km are cut to this."""
 CONVERGENCE = 0.01
@@ -54,7 +54,7 @@ class Trajectory:
 
 TABLE_1 = {name: Trajectory(*astuple(column)) for name, column in presets.TABLE_1.items()}
 REDUCED_M = {"A": (150, 1), "B": (3000, 300), "C": (5000, 1000), "D": (1000, 1000)}
-"""Length and search band where hours are not to be had."""
+"""Length and search band of the reduced setting."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """Looped flights, the fake autopilot, and figures of the benchmarks of flying and installing."""
 
-import csv
 import json
 import math
 import os
@@ -145,30 +144,3 @@ def test_sizes_of_required_packages_add_up():
     assert not names & {"torch", "rasterio", "pyproj"}
     assert install.installed_mb(["numpy"]) > 5
     assert install.installed_mb(["orthonav[autopilot]"]) > install.installed_mb(["numpy", "scipy"])
-
-
-@pytest.mark.parametrize(
-    ("wheel", "telemetry"),
-    [
-        ("tqdm-4.70.1-py3-none-any.whl", "pure"),
-        ("lz4-4.4.5-cp311-cp311-manylinux2014_aarch64.manylinux_2_17_aarch64.whl",
-         "cp311, manylinux_2_17"),
-        (None, "NONE"),
-    ],
-)  # fmt: skip
-def test_a_wheel_in_a_word(wheel, telemetry):
-    assert install._kind(wheel) == telemetry
-
-
-@pytest.mark.slow
-def test_samples_become_a_csv_and_a_picture(tmp_path):
-    hours = np.linspace(0.01, 1, 40)
-    samples = [soak.Sample(n * 10**9, 200.0, 210.0, 0.5 * n, 0.0, n) for n in range(40)]
-    nothing = Arrivals(np.zeros(0, int), *np.zeros((3, 0)))
-    lines = Lines.read(tmp_path / "none")
-    soaked = soak.Soaked(100, 3.0, 0, hours, samples, nothing, lines, [5_000_000])
-    with soak._csv(tmp_path / "rss.csv", soaked).open() as stream:
-        rows = list(csv.DictReader(stream))
-    assert len(rows) == 40
-    assert float(rows[-1]["rss_mb"]) == 200
-    assert cv2.imread(str(soak._plot(tmp_path / "rss.png", soaked))) is not None

@@ -26,7 +26,7 @@ NOT_RUN = "<!-- not run -->"
 ELIDED = "..."
 MARK = "@@ step"
 VERDICTS = (0, 3, 4)
-"""What `orthonav check` ends with, beside errors: go, marginal, no-go."""
+"""Exit codes of `orthonav check` other than errors: go, marginal, no-go."""
 LIMIT_S = 1800
 
 

@@ -1,4 +1,4 @@
-"""Leaves out pictures that could not be made, such as those that need a browser.
+"""Leaves out pictures that do not exist, such as those that need a browser.
 
 `tools/docs/pictures.py` makes all pictures; these few it may do without. A page that shows any
 other picture that is not there does not build.

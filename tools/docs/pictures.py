@@ -80,7 +80,7 @@ def main() -> int:
 
 
 def _digest(steps: list[Step]) -> str:
-    """What the pictures are made from, in one word."""
+    """Digest of the sources of the pictures."""
     made = hashlib.sha256(json.dumps([[step.command, step.shown] for step in steps]).encode())
     sources = [*ROOT.glob("src/orthonav/**/*"), *Path(__file__).parent.glob("*.py")]
     for path in sorted(sources):
@@ -241,7 +241,7 @@ def _photograph(folder: Path) -> None:
 
 
 def _shoot(browser: str, address: str, out: Path, size_px: tuple[int, int]) -> None:
-    """A picture of a page; a browser that fails costs the picture, not the site."""
+    """A picture of a page; if the browser fails, the site is built without it."""
     with tempfile.TemporaryDirectory() as profile:
         command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
         command += [f"--user-data-dir={profile}", f"--window-size={size_px[0]},{size_px[1]}"]
