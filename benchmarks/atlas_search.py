@@ -48,9 +48,18 @@ ABOUT, TRUTH = "about.txt", "truth.npz"
 
 @dataclass(frozen=True)
 class Found:
-    """The result of one setting: `place` is the share of views whose own tile is among the best 10.
+    """The result of one setting.
 
-    `cpu_ms` is the median processor time, on which other processes have little influence.
+    - `probes`: lists searched.
+    - `rerank`: candidates ranked again by their full vectors.
+    - `recall_1`, `recall_10`: recall@1 and recall@10 against exact search, 0 to 1.
+    - `place`, `place_exact`: share of views whose own tile is among the best 10, by this search and
+      by exact search.
+    - `median_ms`, `p90_ms`: wall time of a query.
+    - `cpu_ms`: median processor time of a query, hardly affected by other processes.
+    - `batch_ms`: time per query in a batch of 45.
+    - `open_ms`: time to open the index.
+    - `peak_mb`, `bare_mb`: peak resident memory of the process, and before the index is opened.
     """
 
     probes: int

@@ -30,8 +30,15 @@ Placer = Callable[[Any], Any]
 class Task:
     """Views and method of one run.
 
-    It takes every `every`-th view of a lap, at most `views`. `pixels` is the orthophoto in the
-    map's raster, `near_m` the search radius around the true place (None: the whole map)."""
+    - `name`: name in the table.
+    - `method`: name of the method.
+    - `needs`: packages that the method needs, with their requirements.
+    - `near_m`: search radius around the true place, m; None: the whole map.
+    - `map_path`, `flight`: map file and flight folder.
+    - `pixels`: orthophoto in the map's raster.
+    - `views`: largest number of views.
+    - `every`: step between views of the lap.
+    """
 
     name: str
     method: str

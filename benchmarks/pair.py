@@ -127,8 +127,14 @@ class FakeAutopilot:
 
 @dataclass(frozen=True)
 class Sample:
-    """A process at a moment: memory, processor time, and how long its first thread was ready to
-    run and had to wait; `core_s` is what the core did for all processes."""
+    """State of a process at one time.
+
+    - `at_ns`: time on the monotonic clock, ns.
+    - `rss_mb`, `peak_mb`: resident memory, current and peak.
+    - `cpu_s`: processor time of the process.
+    - `waited_s`: time that its first thread was ready to run but had to wait.
+    - `core_s`: processor time of the core for all processes.
+    """
 
     at_ns: int
     rss_mb: float

@@ -23,8 +23,15 @@ TEMPLATE, CANNY, PHASE, MUTUAL, SIFT = "template", "canny", "phase", "mutual", "
 class Task:
     """Views and method of one run.
 
-    `pixels` and `factor` (map pixels averaged to one) are for methods other than orthonav's;
-    `telemetry_only` tries the reported pose only."""
+    - `method`: name of the method.
+    - `map_path`, `flight`: map file and flight folder.
+    - `heading_known`: whether the heading is reported.
+    - `use_prior`: whether the prior is used.
+    - `pixels`: orthophoto in the map's raster, for methods other than orthonav's.
+    - `factor`: map pixels averaged to one, for methods other than orthonav's.
+    - `telemetry_only`: try the reported pose only.
+    - `views`: largest number of views; None: all.
+    """
 
     method: str
     map_path: str

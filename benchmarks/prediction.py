@@ -96,7 +96,14 @@ def scenes() -> list[Scene]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Predicted and measured shares of the cells of a scene, with the views in each."""
+    """Predictions and measurements of one scene.
+
+    - `scene`, `group`: names of the scene and of its group.
+    - `predicted`, `measured`: share of correct, confident views for each cell, 0 to 1.
+    - `views`: number of views in each cell.
+    - `wrong`: number of views that are confident and wrong.
+    - `error_predicted_m`, `error_measured_m`: error of correct views, m.
+    """
 
     scene: str
     group: str

@@ -43,9 +43,14 @@ WILSON_Z = 1.2816
 
 @dataclass(frozen=True)
 class Measurement:
-    """One measured quantity: median and spread of `n` samples.
+    """One measured quantity.
 
-    Of a share, `median` is the share itself and p10 and p90 bound it (Wilson interval).
+    - `section`, `name`: section of the report, and name of the quantity.
+    - `unit`: its unit; "1" for a share.
+    - `median`, `p10`, `p90`, `p99`: quantiles of the samples. For a share, `median` is the
+      share, and p10 to p90 is its Wilson interval.
+    - `n`: number of samples.
+    - `data`, `seed`: input data, and the seed it was generated with.
     """
 
     section: str

@@ -38,7 +38,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Soaked:
-    """A flight of so many views at a pace."""
+    """Results of one soak flight.
+
+    - `views`: number of views flown.
+    - `pace`: factor on real time.
+    - `exit_code`: exit code of `orthonav fly`.
+    - `hours`: flight time of each sample, h.
+    - `samples`: samples of the process.
+    - `arrivals`: positions received by the fake autopilot.
+    - `lines`: log lines of the program.
+    - `log_bytes`: sizes of the log files.
+    """
 
     views: int
     pace: float
