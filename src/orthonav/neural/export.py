@@ -225,7 +225,7 @@ class _Graph:
         """A residual block."""
         if not isinstance(block, BasicBlock):
             raise TypeError(f"this block cannot be exported: {type(block).__name__}")
-        shortcut = value if block.shortcut is None else self.sequence(block.shortcut, value)
+        shortcut = value if block.short_cut is None else self.sequence(block.short_cut, value)
         value = self.convolution(block.first, block.first_norm, value)
         value = self.convolution(block.second, block.second_norm, self._node("Relu", [value]))
         return self._node("Relu", [self._node("Add", [value, shortcut])])

@@ -39,15 +39,16 @@ class BasicBlock(nn.Module):
         self.first_norm = nn.BatchNorm2d(after)
         self.second = nn.Conv2d(after, after, 3, 1, 1, bias=False)
         self.second_norm = nn.BatchNorm2d(after)
-        self.shortcut: nn.Sequential | None = None
+        # The name is part of stored checkpoints.
+        self.short_cut: nn.Sequential | None = None
         if stride != 1 or before != after:
-            self.shortcut = nn.Sequential(
+            self.short_cut = nn.Sequential(
                 nn.Conv2d(before, after, 1, stride, bias=False), nn.BatchNorm2d(after)
             )
 
     def forward(self, values: Tensor) -> Tensor:
         """Features (N, after, h, w) of features (N, before, H, W)."""
-        shortcut = values if self.shortcut is None else self.shortcut(values)
+        shortcut = values if self.short_cut is None else self.short_cut(values)
         residual = functional.relu(self.first_norm(self.first(values)), inplace=True)
         residual = self.second_norm(self.second(residual))
         return functional.relu(residual + shortcut, inplace=True)
