@@ -1,1 +1,1 @@
-"""Benchmarks: what a map costs to build and to carry, what a view costs, and what others cost."""
+"""Benchmarks: cost and accuracy of maps and views, compared with other methods."""

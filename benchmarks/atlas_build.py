@@ -22,7 +22,7 @@ from orthonav.imagery.mosaic import Mosaic
 
 SIDE_M, SHEET_KM = 6000, 1.9
 QUICK_SIDE_M, QUICK_SHEET_KM = 4000, 1.25
-"""At least two whole sheets lie in a row of the area, wherever the lattice begins."""
+"""At least two whole sheets fit in a row of the area, at any origin of the lattice."""
 INNER = 0.98
 """Share of the orthophoto's width that is covered in spite of its rotation against the lattice."""
 NOTES = (

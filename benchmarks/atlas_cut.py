@@ -196,7 +196,7 @@ def _floor(base: Path, mpx: float) -> str:
     layer = GreyLayer.of(open_map(base), cache_bytes=0)
     assert layer is not None
     side = 4 * CHUNK_PX
-    spent = np.zeros(3)
+    seconds = np.zeros(3)
     turn = np.array([[1, 0.003, 0.4], [-0.003, 1, 0.3]])
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     blocks = [(row, col) for row in range(0, 4 * side, side) for col in range(0, 4 * side, side)]
@@ -207,8 +207,8 @@ def _floor(base: Path, mpx: float) -> str:
         grey = np.asarray(cv2.warpAffine(grey, turn, (side, side), flags=flags), np.uint8)
         marks.append(time.perf_counter())
         compressed_block(grey, valid)
-        spent += np.diff([*marks, time.perf_counter()])
-    decode, warp, encode = spent / (len(blocks) * side**2 / 1e6) * mpx
+        seconds += np.diff([*marks, time.perf_counter()])
+    decode, warp, encode = seconds / (len(blocks) * side**2 / 1e6) * mpx
     return (
         f"floor for the grey picture of {mpx:.0f} million pixels on one core: {decode:.1f} s to "
         f"decode, {warp:.1f} s to resample, {encode:.1f} s to compress"

@@ -41,8 +41,13 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Fields:
-    """What vectors are made. `power` 1 are whitened ones; below, component i is made larger by its
-    standard deviation before whitening to the power of 1 - `power`."""
+    """Statistics of the generated vectors.
+
+    - `dims`: components.
+    - `power`: 1 for whitened vectors; below 1, component i is multiplied by its standard deviation
+      before whitening to the power of 1 - `power`.
+    - `seed`: seed of the field.
+    """
 
     dims: int = 64
     power: float = 0.5
@@ -72,7 +77,7 @@ class Fields:
         return np.concatenate(parts)
 
     def block(self, number: int) -> Array:
-        """Components (1024^2, dims) of a block, each of variance 1: the same whenever asked."""
+        """Components (1024^2, dims) of a block, each of variance 1, reproducible."""
         rng = np.random.default_rng([self.seed, number])
         out = rng.standard_normal((BLOCK_ROWS, self.dims), dtype=np.float32)
         grid = out.reshape(BLOCK_SIDE, BLOCK_SIDE, self.dims)

@@ -60,7 +60,7 @@ class Outcome:
 
 
 def prepared(work: Path) -> tuple[Path, Path]:
-    """The orthophoto of the views and the atlas of the other year, made where they are missing."""
+    """Orthophoto of the views and atlas of the other year, generated if missing."""
     for date in (PAST, PRESENT):
         if not (work / f"{date.name}.tif").is_file():
             _say(f"{date.name}: generating {SIDE_M / 1000:.0f} x {SIDE_M / 1000:.0f} km")
@@ -171,7 +171,7 @@ def row(name: str, outcomes: list[Outcome]) -> list[str]:
 
 
 def main() -> int:
-    """Run and write table and JSON beside those of the other benchmarks."""
+    """Run, and write table and JSON to the folder of the other benchmarks."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.atlas_lost", description=__doc__)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--trials", type=int, default=100)

@@ -48,9 +48,18 @@ ABOUT, TRUTH = "about.txt", "truth.npz"
 
 @dataclass(frozen=True)
 class Found:
-    """The result of one setting: `place` is the share of views whose own tile is among the best 10.
+    """The result of one setting.
 
-    `cpu_ms` is the median processor time, on which other processes have little influence.
+    - `probes`: lists searched.
+    - `rerank`: candidates ranked again by their full vectors.
+    - `recall_1`, `recall_10`: recall@1 and recall@10 against exact search, 0 to 1.
+    - `place`, `place_exact`: share of views whose own tile is among the best 10, by this search and
+      by exact search.
+    - `median_ms`, `p90_ms`: wall time of a query.
+    - `cpu_ms`: median processor time of a query, hardly affected by other processes.
+    - `batch_ms`: time per query in a batch of 45.
+    - `open_ms`: time to open the index.
+    - `peak_mb`, `bare_mb`: peak resident memory of the process, and before the index is opened.
     """
 
     probes: int
@@ -76,24 +85,24 @@ def build(folder: Path, count: int, recipe: VectorRecipe, fields: Fields, shards
     made_s = time.perf_counter() - start
     quantizers = train(sample, recipe)
     quantizers.save(folder / QUANTIZERS_NAME)
-    spent = {"train_s": time.perf_counter() - start - made_s, "make_s": made_s, "write_s": 0.0}
+    seconds = {"train_s": time.perf_counter() - start - made_s, "make_s": made_s, "write_s": 0.0}
     source = _Pieces(fields, count)
     start = time.perf_counter()
     for info in shard_infos(count, shards):
         places_deg = np.zeros((info.rows, 2))
         write_shard(folder, info.name, quantizers, places_deg, source.take(info.rows))
-    spent["write_s"] = time.perf_counter() - start - source.made_s
-    spent["make_s"] += source.made_s
+    seconds["write_s"] = time.perf_counter() - start - source.made_s
+    seconds["make_s"] += source.made_s
     bytes_on_disk = sum(path.stat().st_size for path in folder.iterdir())
     drawn = drawn_ids(count, QUERIES, fields.seed)
     queries = np.concatenate([fields.queries(block, ids) for block, ids in drawn])
     start = time.perf_counter()
     scores, ids = exact_search(folder, shard_infos(count, shards), queries, K)
-    spent["exact_s"] = time.perf_counter() - start
+    seconds["exact_s"] = time.perf_counter() - start
     own = np.concatenate([ids for _, ids in drawn])
     np.savez(folder / TRUTH, queries=queries, ids=ids, scores=scores, own=own)
     about = {"count": count, "shards": shards, "fields": asdict(fields), "recipe": asdict(recipe)}
-    text = json.dumps({**about, "disk_bytes": bytes_on_disk, **spent})
+    text = json.dumps({**about, "disk_bytes": bytes_on_disk, **seconds})
     (folder / ABOUT).write_text(text + "\n", encoding="utf-8")
 
 
@@ -162,12 +171,12 @@ def find(folder: Path, probes: int, rerank: int) -> Found:
     open_ms = (time.perf_counter() - start) * 1e3
     for query in queries[:20]:
         index.search(query[None], K, probes, rerank)
-    times, spent, found = [], [], []
+    times, thread_ms, found = [], [], []
     for query in queries:
         start, busy = time.perf_counter(), time.thread_time()
         found.append(index.search(query[None], K, probes, rerank)[1][0])
         times.append((time.perf_counter() - start) * 1e3)
-        spent.append((time.thread_time() - busy) * 1e3)
+        thread_ms.append((time.thread_time() - busy) * 1e3)
     start = time.perf_counter()
     index.search(queries[:45], K, probes, rerank)
     batch_ms = (time.perf_counter() - start) * 1e3 / 45
@@ -181,7 +190,7 @@ def find(folder: Path, probes: int, rerank: int) -> Found:
         float((exact == own[:, None]).any(axis=1).mean()),
         float(np.median(times)),
         float(np.percentile(times, 90)),
-        float(np.median(spent)),
+        float(np.median(thread_ms)),
         batch_ms,
         open_ms,
         _status_mb("VmHWM"),
@@ -243,7 +252,7 @@ def table(folder: Path, found: Sequence[Found]) -> Table:
 
 
 def measure(place: Workplace) -> Section:
-    """Search among 10^5 and 10^6 vectors; 10^7 and 10^8 where prepared in the kept folder."""
+    """Search among 10^5 and 10^6 vectors; 10^7 and 10^8 if prepared in the cache folder."""
     section = Section("Search in an atlas")
     counts = COUNTS[:1] if place.quick else COUNTS
     folders = {}
@@ -253,8 +262,8 @@ def measure(place: Workplace) -> Section:
         recipe = VectorRecipe.for_count(count, fields.dims, fields.seed)
         build(folders[count], count, recipe, fields, 1)
     for count in PREPARED:
-        if not place.quick and (place.kept / f"vectors-{count}" / ABOUT).is_file():
-            folders[count] = place.kept / f"vectors-{count}"
+        if not place.quick and (place.cache / f"vectors-{count}" / ABOUT).is_file():
+            folders[count] = place.cache / f"vectors-{count}"
     for count, folder in folders.items():
         found = settings(folder, SHARES, (RERANK,))
         section.tables.append(table(folder, found))
@@ -309,7 +318,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Build and measure one index, print its table and leave its figures as JSON beside it."""
+    """Build and measure one index, print its table, and write its figures as JSON."""
     options = _parser().parse_args()
     if options.child:
         print(json.dumps(asdict(find(options.child, options.probes, options.rerank[0]))))

@@ -1,6 +1,6 @@
-"""What a user would write first: OpenCV's template matching and SIFT, on the same rectified view.
+"""Baselines a user would write first: OpenCV's template matching and SIFT, on one rectified view.
 
-Each method takes a view and what was told with it, and gives a place in the sheet or none.
+Each method takes a view with its telemetry and returns a place in the sheet, or None.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ Place = NDArray[np.float64] | None
 
 
 class Method(Protocol):
-    """A way to place a view; `carried` is what the aircraft needs aboard, name -> bytes."""
+    """A method that locates a view; `carried` is the data needed aboard, name -> bytes."""
 
     name: str
     carried: tuple[str, int]
@@ -47,7 +47,7 @@ class Orthonav:
         self._localizer = localizer
 
     def locate(self, view: View) -> Place:
-        """The fix, whatever its confidence."""
+        """The fix, at any confidence."""
         found = self._localizer.locate(view)
         if not isinstance(found, Fix):
             return None
@@ -77,13 +77,13 @@ class Reference:
         )
 
     def rectified(self, view: View, turns_deg: Sequence[float]) -> list[RectifiedView]:
-        """The view as orthonav would rectify it, under the told heading and turns from it."""
+        """The view as orthonav would rectify it, under the reported heading and offsets from it."""
         yaw_deg = view.telemetry.yaw_deg
         smaller = downsampled(view, self.localizer.grid.gsd_m)
         return [self.localizer.tiles.rectified(smaller, yaw_deg + turn) for turn in turns_deg]
 
     def place_en_m(self, col_px: float, row_px: float) -> NDArray[np.float64]:
-        """Where a pixel coordinate (outer corner of the first pixel: 0, 0) lies in the sheet."""
+        """Position in the sheet of a pixel coordinate (outer corner of the first pixel: 0, 0)."""
         grid = self.localizer.grid
         return np.array([grid.west_m + col_px * grid.gsd_m, grid.north_m - row_px * grid.gsd_m])
 
@@ -113,7 +113,7 @@ class TemplateMatch:
 
     def __init__(self, reference: Reference, *, canny: bool, turns_deg: Sequence[float]) -> None:
         what = "Canny edges" if canny else "grey"
-        headings = "told heading" if len(turns_deg) == 1 else f"{len(turns_deg)} headings"
+        headings = "reported heading" if len(turns_deg) == 1 else f"{len(turns_deg)} headings"
         self.name = f"matchTemplate, {what}, {headings}"
         self.reference, self._canny, self.turns_deg = reference, canny, turns_deg
         self._picture = reference.edges if canny else reference.grey
@@ -127,7 +127,7 @@ class TemplateMatch:
             self.carried = ("orthophoto, grey JPEG", reference.jpeg_bytes)
 
     def locate(self, view: View) -> Place:
-        """The highest correlation anywhere."""
+        """Position of the highest correlation."""
         views = self.reference.rectified(view, self.turns_deg)
         middle = views[0].grey.shape[0] // 2
         half = min(_seen_half_px(one.valid) for one in views)
@@ -159,7 +159,7 @@ class SiftMatch:
         self.carried = ("keypoints, 136 bytes each", 136 * len(points))
 
     def locate(self, view: View) -> Place:
-        """Where the centre of the view falls; none with fewer than `MIN_INLIERS` inliers."""
+        """Position of the centre of the view; None with fewer than `MIN_INLIERS` inliers."""
         seen = self._reference.rectified(view, [0.0])[0]
         points, descriptors = self._features(seen.grey, seen.valid)
         if len(points) < 2:

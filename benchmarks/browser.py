@@ -36,7 +36,7 @@ def chromium() -> Path | None:
 
 
 def version_of(path: Path) -> str:
-    """What it says of itself; nothing where it does not start, as what only names a package."""
+    """Version string of the browser; empty if it does not start, as with package stubs."""
     try:
         done = subprocess.run(
             [path, "--version"], capture_output=True, text=True, timeout=60, check=True

@@ -50,11 +50,11 @@ def measure(place: Workplace) -> Section:
                 *(number(peak.median), number(map_mb), number(layer_mb), number(map_mb / km2)),
             ]
         )
-        spent = [
+        medians = [
             section.add(f"{name}: {stage}", "s", [r[stage] for r in runs], data=name, seed=seed)
             for stage in STAGES
         ]
-        stages.append([name, *(f"{one.median:.2f}" for one in spent)])
+        stages.append([name, *(f"{one.median:.2f}" for one in medians)])
         floors.append([name, *_floor(first, ortho, gflops)])
         _facts(section, name, wall.median, (map_mb - layer_mb) / km2)
     header = ["area", "km2", "tiles", "wall s", "p10..p90", "km2/s", "tiles/s"]
@@ -116,7 +116,7 @@ def _build(ortho: Path, out: Path) -> dict[str, Any]:
     command = [sys.executable, "-m", "benchmarks.child", "build", str(ortho), str(out)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     wall_s = time.perf_counter() - start
-    told: dict[str, Any] = json.loads(done.stdout)
-    told["wall_s"] = wall_s
-    told["start"] += wall_s - told["inside_s"]
-    return told
+    result: dict[str, Any] = json.loads(done.stdout)
+    result["wall_s"] = wall_s
+    result["start"] += wall_s - result["inside_s"]
+    return result

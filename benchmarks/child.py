@@ -1,4 +1,4 @@
-"""The processes that are measured. They import nothing but what they measure."""
+"""The measured processes. They import only the code that they measure."""
 
 import json
 import sys
@@ -16,7 +16,7 @@ def peak_memory_mb() -> float:
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmHWM:"):
             return int(line.split()[1]) * 1024 / 1e6
-    raise RuntimeError("this system does not tell the peak memory of a process")
+    raise RuntimeError("this system does not report the peak memory of a process")
 
 
 class _Clock:

@@ -1,4 +1,4 @@
-"""orthonav beside what a user would write first: same views, same run, same seeds."""
+"""orthonav compared with first-choice methods: same views, same run, same seeds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -78,7 +78,7 @@ class Result:
 
 def measure(place: Workplace) -> Section:
     """Every method on every scene; then the scenes and figures where orthonav loses."""
-    section = Section("Beside the methods a user would write first")
+    section = Section("Comparison with first-choice methods")
     losses = []
     scenes = _scenes(place)
     for past in dict.fromkeys(scene.past for scene in scenes):
@@ -215,6 +215,6 @@ def _losses(scene: Scene, results: Sequence[Result]) -> list[list[str]]:
         if time_ms < own_ms:
             rows.append([*head, "ms per view", number(time_ms), number(own_ms)])
         size, own_size = result.method.carried[1], default.method.carried[1]
-        if size < own_size and scene.errors is USUAL_ERRORS:  # the same whatever is told
+        if size < own_size and scene.errors is USUAL_ERRORS:  # does not depend on the telemetry
             rows.append([*head, "carried MB", number(size / 1e6), number(own_size / 1e6)])
     return rows

@@ -1,9 +1,9 @@
-"""A corridor built in one go from a package of JPEG 2000 tiles: speed, memory, killed and resumed.
+"""Builds a corridor from JPEG 2000 tiles: speed, memory, interruption and resumption.
 
 `python -m benchmarks.corridor [--quick] [--km 50] [--work DIR] [--out DIR]` generates the landscape
 under a corridor 5 km wide, as tiles of 1 km at 1 m in Lambert-93, named and compressed as IGN does
-(kept in the work folder: minutes the first time), builds it with 1 and 2 workers, each in a process
-of its own, kills a third build half way, and prints how long the rest takes.
+(stored in the work folder: minutes the first time), builds it with 1 and 2 workers, each in a
+process of its own, kills a third build half way, and prints how long the rest takes.
 """
 
 import argparse
@@ -83,7 +83,7 @@ def route_of(km: float) -> Route:
 
 
 def generated(work: Path, route: Route) -> Path:
-    """Folder of the tiles under the corridor, as a package of IGN; those that are missing made."""
+    """Folder of the tiles under the corridor, as a package of IGN; missing tiles are generated."""
     name = f"BDORTHO_2-0_RVB-1M00_JP2-E080_LAMB93_D000_{PAST.name[:4]}-01-01-{generator_digest()}"
     folder = work / name / "ORTHOHR" / "1_DONNEES_LIVRAISON"
     folder.mkdir(parents=True, exist_ok=True)
@@ -147,19 +147,19 @@ def _measured(folder: Path, out: Path, km: float) -> Section:
     rows, first = [], None
     for workers in (1, 2):
         path = out / f"{workers}.onav"
-        told = _built(folder, path, km, workers)
-        rows.append(_row(f"{workers} workers" if workers > 1 else "1 worker", told))
+        result = _built(folder, path, km, workers)
+        rows.append(_row(f"{workers} workers" if workers > 1 else "1 worker", result))
         first = first or path.read_bytes()
         same = path.read_bytes() == first
         for name in ("wall_s", "read_s", "peak_mb"):
             unit = "MB" if name.endswith("mb") else "s"
-            section.add(f"{workers} workers: {name}", unit, [told[name]], data=f"{km:g} x 5 km")
+            section.add(f"{workers} workers: {name}", unit, [result[name]], data=f"{km:g} x 5 km")
         if not same:
             raise RuntimeError("maps of 1 and 2 workers differ")
-    kept, told = _killed_and_resumed(folder, out / "killed.onav", km)
+    done_share, result = _killed_and_resumed(folder, out / "killed.onav", km)
     if (out / "killed.onav").read_bytes() != first:
-        raise RuntimeError("the map of the build that was killed differs")
-    rows.append(_row(f"killed at {kept:.0%}, resumed", told))
+        raise RuntimeError("the map of the interrupted build differs")
+    rows.append(_row(f"interrupted at {done_share:.0%}, resumed", result))
     header = ("build", "km2", "wall s", "reading s", "km2/s", "km2/s reading", "peak MB", "map MB")
     size_mb = sum(path.stat().st_size for path in folder.rglob("*.jp2")) / 1e6
     tiles = len(list(folder.rglob("*.jp2")))
@@ -172,13 +172,13 @@ def _measured(folder: Path, out: Path, km: float) -> Section:
     return section
 
 
-def _row(name: str, told: dict[str, Any]) -> list[str]:
-    km2 = told["km2"]
+def _row(name: str, result: dict[str, Any]) -> list[str]:
+    km2 = result["km2"]
     return [
         name,
-        *(number(km2), number(told["wall_s"]), number(told["read_s"])),
-        *(number(km2 / told["wall_s"]), number(km2 / max(told["read_s"], 1e-3))),
-        *(number(told["peak_mb"]), number(told["map_mb"])),
+        *(number(km2), number(result["wall_s"]), number(result["read_s"])),
+        *(number(km2 / result["wall_s"]), number(km2 / max(result["read_s"], 1e-3))),
+        *(number(result["peak_mb"]), number(result["map_mb"])),
     ]
 
 
@@ -188,19 +188,19 @@ def _command(folder: Path, out: Path, km: float, workers: int) -> list[str]:
 
 
 def _built(folder: Path, out: Path, km: float, workers: int) -> dict[str, Any]:
-    """One build in a fresh process, and what it tells of itself."""
+    """Figures of one build in a fresh process."""
     out.unlink(missing_ok=True)
     start = time.perf_counter()
     done = subprocess.run(
         _command(folder, out, km, workers), stdout=subprocess.PIPE, text=True, check=True
     )
-    told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    told["wall_s"] = time.perf_counter() - start
-    return told
+    result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    result["wall_s"] = time.perf_counter() - start
+    return result
 
 
 def _killed_and_resumed(folder: Path, out: Path, km: float) -> tuple[float, dict[str, Any]]:
-    """Share of the blocks that a build had finished when it was killed, and the one after it."""
+    """Share of blocks finished when a build was killed, and the figures of the resumed build."""
     out.unlink(missing_ok=True)
     work = out.with_name(f"{out.name}.work")
     process = subprocess.Popen(_command(folder, out, km, 2), stdout=subprocess.PIPE, text=True)
@@ -210,8 +210,8 @@ def _killed_and_resumed(folder: Path, out: Path, km: float) -> tuple[float, dict
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    kept = len(list(work.glob("r*.npz"))) / blocks
-    return kept, _built(folder, out, km, 2)
+    done_share = len(list(work.glob("r*.npz"))) / blocks
+    return done_share, _built(folder, out, km, 2)
 
 
 def _child(folder: Path, out: Path, workers: int) -> int:
@@ -225,13 +225,13 @@ def _child(folder: Path, out: Path, workers: int) -> int:
     def progress(stage: str, share: float) -> None:
         marks.setdefault(stage, time.perf_counter())
 
-    def told(reader: SheetReader, *arguments: Any, **named: Any) -> None:
+    def timed_read(reader: SheetReader, *arguments: Any, **named: Any) -> None:
         print(reader.blocks, flush=True)
         marks["begin"] = time.perf_counter()
         read(reader, *arguments, **named)
 
     read = SheetReader.read
-    setattr(SheetReader, "read", told)  # noqa: B010 - mypy knows methods as constants
+    setattr(SheetReader, "read", timed_read)  # noqa: B010 - mypy knows methods as constants
     km = float(sys.argv[sys.argv.index("--km") + 1])
     request = BuildRequest(
         [folder], out, route=route_of(km), band_m=BAND_M, gsd_m=GSD_M, workers=workers

@@ -1,8 +1,8 @@
-"""A process that stands in for an autopilot: tells the telemetry of a flight, and what it hears.
+"""A fake autopilot process: sends the telemetry of a flight and records the messages it receives.
 
 `python -m benchmarks.fake_autopilot FLIGHT PORT [--pace N]` prints a line of JSON for every message
 that arrives, with its arrival time on the monotonic clock, which all processes of a machine share.
-What it hears is decoded from the definitions of MAVLink by the reader that the tests use, which
+The reader of the tests decodes received messages from the definitions of MAVLink; it
 shares nothing with what sends. Its clock since boot begins where the times of the flight do.
 """
 
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 READER = Path(__file__).resolve().parents[1] / "tests" / "wire.py"
 ATTITUDE_S = 1 / 49
-"""No divisor of what cameras run at, so that exposures fall anywhere between two attitudes."""
+"""Not a divisor of camera rates, so that exposures fall anywhere between two attitudes."""
 EVERY_OTHER = 2
 BEAT_S, TAIL_S = 1.0, 5.0
 _PX4, _DOWNWARD = 12, 25
@@ -37,8 +37,8 @@ class Autopilot:
     """Plays the telemetry of a flight folder over UDP. Mutable."""
 
     def __init__(self, folder: Path, port: int, pace: float) -> None:
-        self._told = _columns(folder / "telemetry.csv")
-        self._told["yaw_rad"] = np.unwrap(np.radians(self._told["yaw_deg"]))
+        self._telemetry = _columns(folder / "telemetry.csv")
+        self._telemetry["yaw_rad"] = np.unwrap(np.radians(self._telemetry["yaw_deg"]))
         self._pace, self._address = pace, ("127.0.0.1", port)
         self._mavlink: Any = importlib.import_module("pymavlink.dialects.v20.common")
         self._mav = self._mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -50,10 +50,10 @@ class Autopilot:
         self._number = 0
 
     def run(self) -> None:
-        """Until the telemetry ends, and a little longer."""
+        """Send until the telemetry ends, and a little longer."""
         self._begin_ns = time.monotonic_ns()
         _say({"name": "BEGIN", "begin_ns": self._begin_ns, "utc_ahead_ns": utc_ahead_ns()})
-        end_s = float(self._told["time_s"][-1]) / self._pace + TAIL_S
+        end_s = float(self._telemetry["time_s"][-1]) / self._pace + TAIL_S
         tell_s = beat_s = 0.0
         while (now_s := self._boot_ns() / 1e9) < end_s:
             if now_s >= beat_s:
@@ -71,15 +71,15 @@ class Autopilot:
 
     def _send(self, name: str, *values: Any) -> None:
         message = getattr(self._mavlink, f"MAVLink_{name}_message")(*values)
-        with contextlib.suppress(ConnectionRefusedError):  # nobody is up yet
+        with contextlib.suppress(ConnectionRefusedError):  # the receiver is not up yet
             self._socket.sendto(message.pack(self._mav), self._address)
         self._mav.seq = (self._mav.seq + 1) % 256
 
     def _at(self, name: str, when_s: float) -> float:
-        return float(np.interp(when_s, self._told["time_s"], self._told[name]))
+        return float(np.interp(when_s, self._telemetry["time_s"], self._telemetry[name]))
 
     def _tell(self) -> None:
-        """Telemetry of now, as it is at the millisecond that the message carries."""
+        """Telemetry at the current time, rounded to the millisecond of the message."""
         boot_ms = self._boot_ns() // 10**6
         when_s = boot_ms / 1e3 * self._pace
         pitch, roll = (math.radians(self._at(name, when_s)) for name in ("pitch_deg", "roll_deg"))
@@ -91,12 +91,12 @@ class Autopilot:
         slant_m = self._at("agl_m", when_s) / (math.cos(pitch) * math.cos(roll))
         slant_cm = round(slant_m * 100)
         self._send("distance_sensor", boot_ms, 1, 65_535, slant_cm, 0, 0, _DOWNWARD, 255)
-        if "vel_east_mps" in self._told:
+        if "vel_east_mps" in self._telemetry:
             north, east = self._at("vel_north_mps", when_s), self._at("vel_east_mps", when_s)
             self._send("local_position_ned", boot_ms, 0, 0, 0, north, east, 0)
 
     def _listen(self) -> None:
-        """Whatever has come; a datagram holds one message."""
+        """All messages received so far; a datagram holds one message."""
         while True:
             try:
                 frame = self._socket.recv(65_536)
@@ -114,7 +114,7 @@ class Autopilot:
 
 
 def utc_ahead_ns() -> int:
-    """UTC less the monotonic clock: of several readings the one that was interrupted least."""
+    """UTC minus the monotonic clock, from the fastest of several readings."""
     readings = []
     for _ in range(20):
         before_ns, utc_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()

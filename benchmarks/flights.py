@@ -1,4 +1,4 @@
-"""Views of a flight with their truth. Imports nothing that does not fly: processes measure this."""
+"""Views of a flight with their truth. Measured processes import this: flight code only."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class Flight:
 
 
 def read_views(folder: Path) -> tuple[Camera, Iterator[FlownView]]:
-    """The camera of a flight folder and its views, each read when it is asked for."""
+    """The camera of a flight folder and its views, each read on demand."""
     recorded = open_flight(folder)
     truth = read_truth(folder / "truth.csv")
     views = (

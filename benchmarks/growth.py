@@ -23,7 +23,7 @@ HEADER = (
 
 @dataclass(frozen=True)
 class Case:
-    """One row: side of the area in m, what is known of heading (None: nothing), height, place."""
+    """One row: side of the area in m, deviations of heading (None: unknown), height and prior."""
 
     side_m: int
     yaw_std_deg: float | None = USUAL_YAW_DEG
@@ -55,7 +55,7 @@ def measure(place: Workplace) -> Section:
     for case in _cases(sides):
         map_path = place.map(place.area(case.side_m, 1.0, [PAST])[0])
         flight = place.flown(present, views, case.errors)
-        told = placed(
+        result = placed(
             Task(
                 BOTH,
                 str(map_path),
@@ -64,10 +64,10 @@ def measure(place: Workplace) -> Section:
                 use_prior=case.prior_std_m is not None,
             )
         )
-        rows.append([*case.cells, *_cells(section, case, told)])
+        rows.append([*case.cells, *_cells(section, case, result)])
         print(f"        {', '.join(case.cells)} done", file=sys.stderr, flush=True)
     notes = (
-        "sd of told heading and height, and of the prior; one core, one process per row, "
+        "sd of the reported heading and height, and of the prior; one core, one process per row, "
         f"{views} views of 2021 over the inner 1 x 1 km, the same places in every row",
         "first view: the cold one, right after the map was opened; open: the map and the "
         "localizer; ms and p99: warm; peak MB: resident memory of the process, Python, NumPy "
@@ -86,15 +86,15 @@ def _cases(sides_m: tuple[int, ...]) -> list[Case]:
     return cases
 
 
-def _cells(section: Section, case: Case, told: dict[str, object]) -> list[str]:
-    verdict = from_placed(told)
+def _cells(section: Section, case: Case, result: dict[str, object]) -> list[str]:
+    verdict = from_placed(result)
     name = ", ".join(case.cells)
     data = f"generated {case.side_m} m square, 1 m"
     time = section.add(f"{name}: time", "ms", verdict.times_ms, data=data, seed=FLIGHT_SEED)
     figures = {"first view": "cold_ms", "open": "opened_ms", "peak memory": "peak_mb"}
     cells = [number(time.median), number(float(np.percentile(verdict.times_ms, 99)))]
     for figure, key in figures.items():
-        value = float(str(told.get(key, math.nan)))
+        value = float(str(result.get(key, math.nan)))
         unit = "MB" if key == "peak_mb" else "ms"
         section.add(f"{name}: {figure}", unit, [value], data=data, seed=FLIGHT_SEED)
         cells.append(number(value))

@@ -1,4 +1,4 @@
-"""What is measured on: generated orthophotos, kept between runs, and views flown over them."""
+"""Inputs of the benchmarks: generated orthophotos, cached between runs, and simulated flights."""
 
 import hashlib
 from collections.abc import Sequence
@@ -17,16 +17,16 @@ REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 NAIP = REAL_DATA / "naip_nd"
 USUAL_ERRORS = Errors(yaw_std_deg=5.0, agl_std=0.05)
 WIDE_ERRORS = Errors(yaw_std_deg=10.0, agl_std=0.1)
-# A heading told to be this good is tried as told; the error itself is far below a pixel.
+# With this deviation only the reported heading is tried; the error is far below a pixel.
 NO_ERRORS = Errors(yaw_std_deg=0.001)
 
 
 @dataclass(frozen=True)
 class Workplace:
-    """Where a run may write: `scratch` is removed after it, `kept` holds generated areas."""
+    """Folders of a run: `scratch` is removed after it, `cache` holds generated areas."""
 
     scratch: Path
-    kept: Path
+    cache: Path
     quick: bool
 
     @property
@@ -40,13 +40,13 @@ class Workplace:
         return 2 if self.quick else 3
 
     def area(self, side_m: int, gsd_m: float, dates: Sequence[landscape.Epoch]) -> list[Path]:
-        """Orthophotos of a generated square; made anew when the generator has changed."""
+        """Orthophotos of a generated square; generated again when the generator has changed."""
         name = f"{generator_digest()}-{side_m}m-{gsd_m:g}m"
-        paths = [self.kept / name / f"{date.name}.tif" for date in dates]
+        paths = [self.cache / name / f"{date.name}.tif" for date in dates]
         missing = [date for date, path in zip(dates, paths, strict=True) if not path.is_file()]
         if missing:
             landscape.generate_area(
-                self.kept / name,
+                self.cache / name,
                 size_m=(side_m, side_m),
                 gsd_m=gsd_m,
                 dates=missing,
@@ -73,8 +73,8 @@ class Workplace:
 
     def flown(self, ortho: Path, count: int, errors: Errors) -> Path:
         """Folder of a flight with views at random places over an orthophoto, flown once per run."""
-        told = (errors.yaw_std_deg, errors.agl_std, errors.prior_std_m)
-        name = f"{ortho.parent.name}-{ortho.stem}-{count}-" + "-".join(map(str, told))
+        spreads = (errors.yaw_std_deg, errors.agl_std, errors.prior_std_m)
+        name = f"{ortho.parent.name}-{ortho.stem}-{count}-" + "-".join(map(str, spreads))
         folder = self.scratch / name
         if not folder.is_dir():
             request = SimulateRequest(

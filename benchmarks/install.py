@@ -33,7 +33,7 @@ GLIBC_MINORS = range(17, 29)
 """Up to 2.28, which Debian 10, Ubuntu 20.04 and what came after them have."""
 ABSENT = ("torch", "rasterio", "pyproj", "shapely", "matplotlib", "transformers", "onnxruntime")
 LOADED = ("orthonav.cli.flying", "orthonav.onboard.fly", "orthonav.onboard.log")
-TOLD = """
+REPORT_SCRIPT = """
 import importlib, importlib.util, json, sys
 from importlib import metadata
 def size(d, end=""):
@@ -75,15 +75,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     start, started = time.perf_counter(), provenance("install")
     section = Section("Installing what flies")
     with tempfile.TemporaryDirectory(prefix="orthonav-install-") as folder:
-        told = _installed(Path(folder))
-    packages = sorted((Package(**found) for found in told["found"]), key=lambda one: -one.bytes)
+        result = _installed(Path(folder))
+    packages = sorted((Package(**found) for found in result["found"]), key=lambda one: -one.bytes)
     wheels = {
         (package.name, python): _wheel(package.name, package.version, python)
         for package in packages
         for python in options.python
         if _plain(package.name) != "orthonav"
     }
-    present = [name for name, absent in told["absent"].items() if not absent]
+    present = [name for name, absent in result["absent"].items() if not absent]
     section.tables = [_table(section, packages, wheels, options.python, present)]
     print(section.markdown())
     wall_s = time.perf_counter() - start
@@ -93,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _installed(folder: Path) -> dict[str, Any]:
-    """Fields of `Package` and what is absent, of a fresh environment."""
+    """Fields of `Package`, and the absent modules, of a fresh environment."""
     source, environment = folder / "source", folder / "environment"
     source.mkdir()
     for name in ("pyproject.toml", "PYPI.md", "LICENSE"):
@@ -107,16 +107,16 @@ def _installed(folder: Path) -> dict[str, Any]:
     _run(*pip, "wheel", "--quiet", *constraints, "-w", wheels[1], f"{source}[{EXTRA}]")
     _run(*pip, "install", "--quiet", "--no-index", *wheels, f"orthonav[{EXTRA}]")
     _run(str(environment / "bin" / "orthonav"), "fly", "--help")
-    told: dict[str, Any] = json.loads(
-        _run(str(python), "-c", TOLD, ",".join(LOADED), ",".join(ABSENT))
+    result: dict[str, Any] = json.loads(
+        _run(str(python), "-c", REPORT_SCRIPT, ",".join(LOADED), ",".join(ABSENT))
     )
     downloads = {
         _plain(path.name.split("-")[0]): path.stat().st_size
         for path in (folder / "wheels").iterdir()
     }
-    for found in told["found"]:
+    for found in result["found"]:
         found["wheel"] = downloads[_plain(found["name"])]
-    return told
+    return result
 
 
 def _wheel(name: str, version: str, python: str) -> str | None:
@@ -198,7 +198,7 @@ def _notes(
 
 
 def _kind(wheel: str | None) -> str:
-    """In a word, what a wheel is for."""
+    """Python and platform tag of a wheel, in short."""
     if wheel is None:
         return "NONE"
     if not wheel.endswith(".whl"):
@@ -230,7 +230,7 @@ def closure(requirements: Sequence[str]) -> set[str]:
 
 
 def _required(name: str, extra: str) -> Sequence[str]:
-    """What a package asks for; this one by its project file, for what is installed may be old."""
+    """Requirements of a package; those of orthonav come from pyproject.toml."""
     if _plain(name) != "orthonav":
         return metadata.requires(name) or ()
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

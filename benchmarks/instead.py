@@ -1,4 +1,4 @@
-"""What one would run instead of the track, view by view on the same core.
+"""Alternatives to the track: other methods, view by view on the same core.
 
 `python -m benchmarks.instead JSON` places the views of a flight by one method, in a process that
 loads nothing else, and prints JSON.
@@ -28,8 +28,17 @@ Placer = Callable[[Any], Any]
 
 @dataclass(frozen=True)
 class Task:
-    """What to place: every so many views of a lap, at most `views`; `pixels` is the orthophoto in
-    the map's raster, `near_m` how far around the true place is looked (None: everywhere)."""
+    """Views and method of one run.
+
+    - `name`: name in the table.
+    - `method`: name of the method.
+    - `needs`: packages that the method needs, with their requirements.
+    - `near_m`: search radius around the true place, m; None: the whole map.
+    - `map_path`, `flight`: map file and flight folder.
+    - `pixels`: orthophoto in the map's raster.
+    - `views`: largest number of views.
+    - `every`: step between views of the lap.
+    """
 
     name: str
     method: str
@@ -72,31 +81,31 @@ def beside(
         task = replace(each, map_path=str(map_path), pixels=str(pixels), flight=str(lap))
         count = views if task.method == TRACK else max(views // 3, 20)
         with on_core(core):
-            told = _placed(replace(task, views=count, every=2 if task.method == TRACK else 6))
-        errors_m = np.array([math.nan if e is None else e for e in told["errors_m"]])
-        time = section.add(f"{task.name}: a view", "ms", told["ms"], data="lap", seed=FLIGHT_SEED)
-        section.add(f"{task.name}: peak memory", "MB", [told["peak_mb"]], data="lap")
+            result = _placed(replace(task, views=count, every=2 if task.method == TRACK else 6))
+        errors_m = np.array([math.nan if e is None else e for e in result["errors_m"]])
+        time = section.add(f"{task.name}: a view", "ms", result["ms"], data="lap", seed=FLIGHT_SEED)
+        section.add(f"{task.name}: peak memory", "MB", [result["peak_mb"]], data="lap")
         size_mb = installed_mb(task.needs)
         section.add(f"{task.name}: installed", "MB", [size_mb], data="site-packages")
         places = ["-", "-", "-"]
         if task.method != ENCODER:
             shares = [(errors_m <= radius_m).mean() for radius_m in (15.0, 35.0)]
             places = [percent(float(share)) for share in (*shares, np.isnan(errors_m).mean())]
-        tail = number(float(np.percentile(told["ms"], 99)))
-        memory = [number(told["peak_mb"]), number(size_mb)]
+        tail = number(float(np.percentile(result["ms"], 99)))
+        memory = [number(result["peak_mb"]), number(size_mb)]
         rows.append([task.name, str(len(errors_m)), number(time.median), tail, *places, *memory])
-        tiles = told["tiles"] or tiles
+        tiles = result["tiles"] or tiles
         print(f"        {task.name} done", file=sys.stderr, flush=True)
     header: tuple[str, ...] = ("method", "views", "ms", "p99 ms", "15 m", "35 m", "no answer")
     header += ("peak MB", "installed MB")
-    return Table("What one would run instead", header, rows, _notes(tiles))
+    return Table("Alternatives to the track", header, rows, _notes(tiles))
 
 
 def _notes(tiles: int) -> tuple[str, ...]:
     return (
         "ms: from the decoded picture to a place, one core, warm; tracked: `Tracker` on views "
         "that follow each other at 5 Hz, shares once it is tracking; the others: each view for "
-        "itself, rectified by orthonav's code under the told heading, height and tilt",
+        "itself, rectified by orthonav's code under the reported heading, height and tilt",
         "SIFT, ORB: keypoints of the map (1 m) made once; whole map: FLANN; around the true place "
         "(as if it were known): one by one; ratio 0.75, RANSAC similarity, fewer than 8 inliers "
         "are no answer",
@@ -114,8 +123,8 @@ def _placed(task: Task) -> dict[str, Any]:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
-    told: dict[str, Any] = json.loads(done.stdout)
-    return told
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
 
 
 def run(task: Task) -> dict[str, Any]:

@@ -4,7 +4,7 @@
 flies over a generated area, follows every flight with `Tracker` from no prior, and prints a table.
 Area, map, flights and what came out of each flight stay in the work folder: an interrupted run
 goes on where it ended, and `orthonav localize MAP FLIGHT --track --prior none --out fixes.jsonl`
-replays one of them. `--only` follows the named flights anew, whatever lies there.
+replays one of them. `--only` repeats the named flights even if results exist.
 """
 
 import argparse
@@ -55,13 +55,22 @@ SCATTER = Errors(
     yaw_std_deg=1.0, agl_std=0.01, tilt_std_deg=0.2, attitude_std_deg=2.0, velocity_drift=DRIFT
 )
 GAP_M, JUMP_M = 3000.0, 2000.0
-"""What a kidnapped flight leaves out at least: so much of the way, and so far as the crow flies."""
+"""A kidnapped flight leaves out at least this path length and this straight distance."""
 CONFIDENT, RIGHT_M, DIVERGED_M, DIVERGED_VIEWS = 0.9, 35.0, 60.0, 10
 SEED = 100
 Array = NDArray[np.float64]
 HEADER = (
     *("flight", "kidnapped", "views", "all: median m", "tracking from", "median m", "95 % m"),
-    *("max m", "sure", "sure and wrong", "diverged", "back after", "NEES", "below 5.99", "ms"),
+    *(
+        "max m",
+        "confident",
+        "confident and wrong",
+        "diverged",
+        "back after",
+        "NEES",
+        "below 5.99",
+        "ms",
+    ),
 )
 # What a map does not hang on.
 _NOT_IN_MAPS = ("cli", "simulate", "evaluate", "onboard", "sources", "track", "publish")
@@ -88,7 +97,7 @@ class Plan:
         return f"flight-{self.number:02d}-{digest}"
 
     def rng(self) -> np.random.Generator:
-        """For what is drawn once per flight."""
+        """Random generator for values drawn once per flight."""
         return np.random.default_rng([SEED, self.number])
 
 
@@ -127,7 +136,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--flights", type=int, default=20, help="how many (default 20)")
     parser.add_argument("--km", type=float, default=50.0, help="length of each (default 50)")
     parser.add_argument("--quick", action="store_true", help="3 flights of 8 km, a smaller area")
-    parser.add_argument("--only", type=int, nargs="+", metavar="N", help="these, anew")
+    parser.add_argument(
+        "--only", type=int, nargs="+", metavar="N", help="repeat these flights only"
+    )
     parser.add_argument("--work", type=Path, default=Path("bench_results/long_flights"))
     parser.add_argument("--out", type=Path, default=Path("bench_results"))
     return parser
@@ -145,14 +156,14 @@ def _digest(*parts: str, but: Sequence[str] = ()) -> str:
 
 
 def _map(work: Path, place: Workplace, ortho: Path) -> Path:
-    """The map with the defaults of `orthonav build`, built anew when what builds it changed."""
-    kept = work / f"maps-{_digest(but=_NOT_IN_MAPS)}"
-    kept.mkdir(exist_ok=True)
-    return replace(place, scratch=kept).map(ortho)
+    """The map with the defaults of `orthonav build`, built again when its sources changed."""
+    maps = work / f"maps-{_digest(but=_NOT_IN_MAPS)}"
+    maps.mkdir(exist_ok=True)
+    return replace(place, scratch=maps).map(ortho)
 
 
 def _flown(work: Path, plan: Plan, localizer: Localizer, ortho: Path) -> Path:
-    """Folder of the flight, flown where it is not there yet; what was drawn lies beside it."""
+    """Folder of the flight, simulated if absent, with the drawn values in a file."""
     folder, about = work / plan.name, work / f"{plan.name}.plan.json"
     if about.is_file():
         return folder
@@ -181,7 +192,7 @@ def _flown(work: Path, plan: Plan, localizer: Localizer, ortho: Path) -> Path:
         simulate_flight(request)
     names = list(read_truth(folder / "truth.csv"))
     clouds = Clouds(len(names), CLOUD_SHARE, seed)
-    told: dict[str, Any] = {
+    record: dict[str, Any] = {
         "yaw_bias_deg": errors.yaw_bias_deg,
         "agl_bias": errors.agl_bias,
         "wind_from_deg": wind.from_deg,
@@ -189,7 +200,7 @@ def _flown(work: Path, plan: Plan, localizer: Localizer, ortho: Path) -> Path:
         "first_after": _kidnap(folder, plan, localizer, rng) if plan.kidnapped else None,
     }
     with replacing(about) as temporary:
-        temporary.write_text(json.dumps(told, indent=1), encoding="utf-8")
+        temporary.write_text(json.dumps(record, indent=1), encoding="utf-8")
     return folder
 
 
@@ -203,7 +214,7 @@ def _legs(rng: np.random.Generator, length_m: float, reach_m: float) -> Array:
         leg_m, new = float(np.hypot(*step)), math.atan2(step[1], step[0])
         turn_deg = abs(math.degrees(math.remainder(new - course, 2 * math.pi)))
         if not (shortest <= leg_m <= LEG_M[1] and turn_deg <= SHARPEST_DEG):
-            course += 0.05  # a corner of the square has no way out but back
+            course += 0.05  # leave the corner of the square
             continue
         line.append(line[-1] + step * min(1.0, left_m / leg_m))
         course, left_m = new, left_m - leg_m
@@ -211,15 +222,15 @@ def _legs(rng: np.random.Generator, length_m: float, reach_m: float) -> Array:
 
 
 def _kidnap(folder: Path, plan: Plan, localizer: Localizer, rng: np.random.Generator) -> str:
-    """Leave out views in the middle; no velocity is told over the gap. The first one after it."""
+    """Leave out views in the middle and the velocity over the gap; returns the first after it."""
     rows = _read(folder / "telemetry.csv")
     truth = read_truth(folder / "truth.csv")
     frame = localizer.sheet.frame
     places = np.array([frame.en_from_latlon(*truth[row["frame"]]) for row in rows])
     first = int(rng.uniform(0.4, 0.55) * len(rows))
-    way = np.cumsum(np.hypot(*np.diff(places[first:], axis=0).T))
+    path_m = np.cumsum(np.hypot(*np.diff(places[first:], axis=0).T))
     apart = np.hypot(*(places[first + 1 :] - places[first]).T)
-    after = first + 1 + int(np.argmax((way >= GAP_M) & (apart >= JUMP_M)))
+    after = first + 1 + int(np.argmax((path_m >= GAP_M) & (apart >= JUMP_M)))
     gap_s = float(rows[after]["time_s"]) - float(rows[first]["time_s"]) - SPACING_M / SPEED_MPS
     for row in rows[after:] if plan.kidnapped == "jump" else ():
         row["time_s"] = f"{float(row['time_s']) - gap_s:.6f}"
@@ -244,19 +255,19 @@ def _write(path: Path, rows: Sequence[dict[str, str]]) -> None:
 
 
 def _followed(
-    work: Path, plan: Plan, folder: Path, localizer: Localizer, anew: bool
+    work: Path, plan: Plan, folder: Path, localizer: Localizer, repeat: bool
 ) -> dict[str, Any]:
     """What came out view by view, read where this very program has followed the flight before."""
     path = work / f"{plan.name}.followed.json"
-    if path.is_file() and not anew:
-        kept: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        if kept["sources"] == sources_digest():
-            return kept
+    if path.is_file() and not repeat:
+        stored: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        if stored["sources"] == sources_digest():
+            return stored
     about = json.loads((work / f"{plan.name}.plan.json").read_text(encoding="utf-8"))
     sources, truth = sources_digest(), read_truth(folder / "truth.csv")
     placed = localize_flight(Tracker(localizer, use_prior=False), open_flight(folder))
     rows = [
-        {**_told(each, localizer, truth[each.frame]), "clouds": about["clouds"][each.frame]}
+        {**_record(each, localizer, truth[each.frame]), "clouds": about["clouds"][each.frame]}
         for each in placed
     ]
     followed = {
@@ -271,21 +282,21 @@ def _followed(
     return followed
 
 
-def _told(result: ViewResult, localizer: Localizer, truth: tuple[float, float]) -> dict[str, Any]:
-    """One view as JSON has it: error east and north in m, what was stated, None without a fix."""
+def _record(result: ViewResult, localizer: Localizer, truth: tuple[float, float]) -> dict[str, Any]:
+    """One view for JSON: error east and north in m and stated values; None without a fix."""
     out = result.outcome
-    told: dict[str, Any] = {
+    record: dict[str, Any] = {
         "frame": result.frame,
         "time_s": result.time_ns / 1e9,
         "state": result.state,
         "ms": round(result.latency_ms, 2),
     }
     if not isinstance(out, Fix):
-        return {**told, "reason": out.reason, "error_en_m": None, "confidence": None}
+        return {**record, "reason": out.reason, "error_en_m": None, "confidence": None}
     frame = localizer.sheet.frame
     error = frame.en_from_latlon(out.lat_deg, out.lon_deg) - frame.en_from_latlon(*truth)
     return {
-        **told,
+        **record,
         "error_en_m": error.tolist(),
         "confidence": out.confidence,
         "radius_m": out.radius_m,
@@ -301,13 +312,13 @@ class Figures:
     errors_m: Array
     nees: Array
     tracking: NDArray[np.bool_]
-    sure: NDArray[np.bool_]
+    confident: NDArray[np.bool_]
     radius_m: Array
     ms: Array
 
     @classmethod
     def of(cls, views: Sequence[dict[str, Any]]) -> "Figures":
-        """From the views that `_followed` gives."""
+        """From the views of `_followed`."""
         known = np.array([view["error_en_m"] is not None for view in views])
         fixed = [view for view in views if view["error_en_m"] is not None]
         errors, nees = np.full(len(views), np.inf), np.full(len(views), np.nan)
@@ -334,9 +345,9 @@ class Figures:
 
     @property
     def wrong(self) -> int:
-        """Views that are sure and wrong."""
+        """Number of views that are confident and wrong."""
         far = self.errors_m > np.fmax(RIGHT_M, self.radius_m)
-        return int((self.sure & far).sum())
+        return int((self.confident & far).sum())
 
     @property
     def divergences(self) -> int:
@@ -346,11 +357,11 @@ class Figures:
         return int((np.diff(edges)[::2] > DIVERGED_VIEWS).sum())
 
     def cells(self) -> list[str]:
-        """Median, 95 %, largest error while tracking, sure, sure and wrong, divergences."""
+        """Median, 95 %, largest error while tracking; confident; wrong; divergences."""
         errors = self.errors_m[self.tracking]
         spread = np.percentile(errors, [50, 95, 100]) if errors.size else np.full(3, np.nan)
-        sure = percent(float(self.sure.mean()))
-        return [*map(number, spread), sure, str(self.wrong), str(self.divergences)]
+        confident = percent(float(self.confident.mean()))
+        return [*map(number, spread), confident, str(self.wrong), str(self.divergences)]
 
     def consistency(self) -> list[str]:
         """Mean of the normalized errors squared while tracking, and the share below 5.991."""
@@ -438,17 +449,17 @@ def _notes(km: float) -> tuple[str, ...]:
     return (
         f"{km:g} km of random legs, turns of {TURN_RADIUS_M:g} m radius, {AGL_M:g} m above ground, "
         f"a view every {SPACING_M / SPEED_MPS:g} s (about {SPACING_M:g} m), over another date than "
-        f"the map's; wind {WIND_MPS:g} m/s; told velocity off by {DRIFT:.0%} of scale and "
+        f"the map's; wind {WIND_MPS:g} m/s; reported velocity off by {DRIFT:.0%} of scale and "
         f"{DRIFT:g} rad; heading by {YAW_BIAS_DEG:g} deg, drawn once per flight, and "
         f"{SCATTER.yaw_std_deg:g} deg at every view; height by {AGL_BIAS:.0%} and "
-        f"{SCATTER.agl_std:.0%}; tilt {SCATTER.attitude_std_deg:g} deg, told with an error of "
+        f"{SCATTER.agl_std:.0%}; tilt {SCATTER.attitude_std_deg:g} deg, reported with an error of "
         f"{SCATTER.tilt_std_deg:g} deg (all standard deviations); clouds over {CLOUD_SHARE:.0%} of "
-        "the way; no prior, whole map, one core",
-        f"kidnapped: {GAP_M / 1000:g} km or more left out in the middle, no velocity told; gap: "
-        "the clock runs on, jump: it does not; back after: views until tracking and within "
+        "the route; no prior, whole map, one core",
+        f"kidnapped: {GAP_M / 1000:g} km or more left out in the middle, no velocity reported; "
+        "gap: the clock runs on, jump: it does not; back after: views until tracking and within "
         f"{RIGHT_M:g} m again",
         "all: median: of views that have a position; median, 95 %, max, NEES: of tracking views; "
-        "sure: confidence of 0.9 or more, of all views; "
+        "confident: confidence of 0.9 or more, of all views; "
         f"wrong: more than {RIGHT_M:g} m and the stated radius off; diverged: more than "
         f"{DIVERGED_VIEWS} tracking views in a row more than {DIVERGED_M:g} m off",
     )

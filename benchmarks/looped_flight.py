@@ -1,4 +1,4 @@
-"""Flights that are played in real time: one lap is rendered and kept, and flown round and round."""
+"""Looped flights played in real time: one lap is rendered, cached and repeated."""
 
 import csv
 import hashlib
@@ -60,11 +60,11 @@ class LoopedFlight:
 
 
 def rendered(place: Workplace, ortho: Path, frame: LocalFrame, lap: LoopedFlight) -> Path:
-    """The flight folder of a lap, kept until its settings or the simulator change."""
+    """Flight folder of a lap, cached until its settings or the simulator change."""
     settings = repr((lap, lap.corners_en_m.tolist(), AGL_M, SPEED_MPS, TURN_RADIUS_M, ERRORS))
     digest = hashlib.sha256(settings.encode() + ortho.parent.name.encode())
     digest.update(_sources())
-    folder = place.kept / f"lap-{lap.camera.width_px}-{digest.hexdigest()[:8]}"
+    folder = place.cache / f"lap-{lap.camera.width_px}-{digest.hexdigest()[:8]}"
     if not folder.is_dir():
         lat, lon = frame.latlon_from_en(lap.corners_en_m)
         request = SimulateRequest(
@@ -119,24 +119,24 @@ def played(
     period_s = float(times_s[-1]) + _closing_m(lap) / SPEED_MPS
     shutil.rmtree(out, ignore_errors=True)
     (out / "frames").mkdir(parents=True)
-    told, true = [], []
+    telemetry, true = [], []
     for number in range(views):
         turn, index = divmod(first + number * every, len(rows))
         frame = f"{turn:04d}/{rows[index]['frame']}"
         time_s = lead_s + turn * period_s + float(times_s[index] - times_s[first])
-        told.append({**rows[index], "frame": frame, "time_s": f"{time_s:.9f}"})
+        telemetry.append({**rows[index], "frame": frame, "time_s": f"{time_s:.9f}"})
         true.append({**truth[index], "frame": frame})
         link = out / "frames" / f"{turn:04d}"
         if not link.is_symlink():
             link.symlink_to((lap / "frames").resolve(), target_is_directory=True)
-    _write(out / "telemetry.csv", told)
+    _write(out / "telemetry.csv", telemetry)
     _write(out / "truth.csv", true)
     shutil.copyfile(lap / "flight.json", out / "flight.json")
     return out
 
 
 def rest_of(folder: Path, out: Path, from_s: float) -> Path:
-    """The views of a played flight from a time on: what a camera started then sees."""
+    """The views of a played flight from a time on, as from a camera that starts then."""
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     rows = [row for row in _read(folder / "telemetry.csv") if float(row["time_s"]) >= from_s]

@@ -15,7 +15,7 @@ def seconds(run: Callable[..., object], *arguments: Any) -> float:
 
 
 def timed(run: Callable[..., Made], *arguments: Any) -> tuple[Made, float]:
-    """What one call gives, and its wall time in seconds."""
+    """Result of one call, and its wall time in seconds."""
     start = time.perf_counter()
     made = run(*arguments)
     return made, time.perf_counter() - start

@@ -1,4 +1,4 @@
-"""Views that are not on a map and must be refused: other places, mirrored ones, water, nothing."""
+"""Negatives, views from outside a map: other places, mirrored views, water, blank views."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ FOREST_SHARE = 0.03
 
 @dataclass(frozen=True)
 class Sources:
-    """Real imagery that negatives are made of. `water` needs near infrared as its fourth band."""
+    """Real imagery for negatives. `water` needs near infrared as its fourth band."""
 
     other_places: Sequence[Path]
     mirrored_flights: Sequence[Path]

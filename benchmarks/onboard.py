@@ -1,4 +1,4 @@
-"""The program as it flies: from exposure to message, load of its core, starts, beside others."""
+"""`orthonav fly` in real time: latency, load of its core, starts, alternatives."""
 
 import sys
 import time
@@ -37,7 +37,7 @@ class Scene:
     quick: bool
 
     def arguments(self, name: str, camera: Path, port: int) -> list[str]:
-        """A command line as on an aircraft, but for the pictures, which come from a folder."""
+        """Command line as on an aircraft, except that pictures come from a folder."""
         files = {"--jsonl": "lines.jsonl", "--log": "log.mcap", "--state": "state.json"}
         made = [str(self.map_path), str(camera), "--file-clock", "autopilot"]
         made += ["--autopilot", f"udpin:{port}", "--log-views", "thumbnails"]
@@ -130,7 +130,7 @@ def _latency(section: Section, flown: dict[int, Flown]) -> Table:
         "49 Hz; log with thumbnails, state and lines written",
         "from exposure to the arrival of GLOBAL_POSITION_SENSOR at a process on the other core, on "
         "the clock that both share; age: the same by the program's own lines (`age_ms`), to after "
-        "the message; views that brought no message are those before the track is sure",
+        "the message; views without a message are those before the track is confident",
         "dropped: views that no line was written of, because a newer one was there or (late) it "
         "was too old",
     )
@@ -179,7 +179,7 @@ def _load(section: Section, scene: Scene, flown: dict[int, Flown]) -> Table:
         "RSS: resident memory after a tenth of the flight and at its end; peak: VmHWM; sampled "
         "each second",
         "error: of the decoded messages against the truth of the view; clock: by how much the "
-        "exposure that a message tells is off, at most",
+        "error of the exposure time in a message, at most",
     )
     return Table("Load and accuracy", header, rows, notes)
 

@@ -1,4 +1,4 @@
-"""`orthonav fly` in a process of its own on one core, beside a fake autopilot for the autopilot."""
+"""`orthonav fly` in a process of its own on one core, and a fake autopilot on another."""
 
 import contextlib
 import json
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Cores:
-    """Where what is measured runs, and where all the rest does; the same one if there is one."""
+    """Core of the measured process and core of all others; the same on a single-core machine."""
 
     flying: int
     other: int
@@ -53,14 +53,14 @@ def on_core(core: int) -> Iterator[None]:
 
 
 def free_port() -> int:
-    """A UDP port of the loopback that nobody uses."""
+    """A free UDP port of the loopback interface."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 class FakeAutopilot:
-    """The fake autopilot's process, and all it has heard so far."""
+    """The process of the fake autopilot, and its received messages."""
 
     def __init__(self, flight: Path, port: int, core: int, pace: float = 1.0) -> None:
         """Returns when its clock has begun."""
@@ -127,8 +127,14 @@ class FakeAutopilot:
 
 @dataclass(frozen=True)
 class Sample:
-    """A process at a moment: memory, processor time, and how long its first thread was ready to
-    run and had to wait; `core_s` is what the core did for all processes."""
+    """State of a process at one time.
+
+    - `at_ns`: time on the monotonic clock, ns.
+    - `rss_mb`, `peak_mb`: resident memory, current and peak.
+    - `cpu_s`: processor time of the process.
+    - `waited_s`: time that its first thread was ready to run but had to wait.
+    - `core_s`: processor time of the core for all processes.
+    """
 
     at_ns: int
     rss_mb: float
@@ -169,12 +175,12 @@ class Fly:
                 self.samples.append(made)
 
     def kill(self) -> None:
-        """At once, as when power fails."""
+        """Kill the process, as a power failure does."""
         self.process.kill()
         self.process.wait(10)
 
     def stop(self) -> int:
-        """As systemd stops it; the exit code."""
+        """Stop the process as systemd does; returns the exit code."""
         self.process.send_signal(signal.SIGTERM)
         try:
             return self.process.wait(40)
@@ -219,13 +225,18 @@ def _core_s(core: int) -> float:
         if name == f"cpu{core}":
             ticks = [int(value) for value in values[:8]]
             return (sum(ticks) - ticks[3] - ticks[4]) / TICKS_PER_S
-    raise RuntimeError(f"this system does not tell what core {core} does")
+    raise RuntimeError(f"this system does not report the load of core {core}")
 
 
 @dataclass(frozen=True, eq=False)
 class Arrivals:
-    """Positions that the fake autopilot heard (N,): which view, from its exposure to the message's
-    arrival, how far it is from the truth, how far off the exposure was that the message told."""
+    """Positions that the fake autopilot received (N,).
+
+    - `view`: index of the view.
+    - `latency_ms`: from exposure to arrival, ms.
+    - `error_m`: distance from the truth, m.
+    - `clock_ms`: error of the exposure time in the message, ms.
+    """
 
     view: NDArray[np.intp]
     latency_ms: Array

@@ -1,4 +1,4 @@
-"""A process that places the views of a flight by one method and tells errors, times and memory.
+"""A process that locates the views of a flight by one method and prints errors, times and memory.
 
 It imports nothing but what it measures. `python -m benchmarks.placing JSON` prints JSON.
 """
@@ -21,8 +21,17 @@ TEMPLATE, CANNY, PHASE, MUTUAL, SIFT = "template", "canny", "phase", "mutual", "
 
 @dataclass(frozen=True)
 class Task:
-    """What to place and how: `pixels` and `factor` (map pixels averaged to one) are for methods
-    that are not orthonav's, `telemetry_only` tries no other pose than the told one."""
+    """Views and method of one run.
+
+    - `method`: name of the method.
+    - `map_path`, `flight`: map file and flight folder.
+    - `heading_known`: whether the heading is reported.
+    - `use_prior`: whether the prior is used.
+    - `pixels`: orthophoto in the map's raster, for methods other than orthonav's.
+    - `factor`: map pixels averaged to one, for methods other than orthonav's.
+    - `telemetry_only`: try the reported pose only.
+    - `views`: largest number of views; None: all.
+    """
 
     method: str
     map_path: str
@@ -41,8 +50,8 @@ def placed(task: Task) -> dict[str, Any]:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
-    told: dict[str, Any] = json.loads(done.stdout)
-    return told
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
 
 
 def run(task: Task) -> dict[str, Any]:

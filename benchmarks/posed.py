@@ -1,4 +1,4 @@
-"""What a user might write to register a view with OpenCV: one measure of likeness, many poses.
+"""What a user might write to register a view with OpenCV: one similarity measure, many poses.
 
 Every method gets the view rectified by orthonav's own code, once per pose of orthonav's own bank of
 headings and heights, whole with a mask, and the whole map. The best value of any pose and place is
@@ -28,9 +28,8 @@ TURN_STEP_DEG, SCALE_STEP, SIGMAS = 8.0, 0.13, 3.0
 SCALE_STD = 0.1
 LEVELS_MI = 6
 MAP_ORB, VIEW_ORB = 40_000, 2_000
-"""Keypoints of ORB that are kept of 4 km2 of map, and of a view."""
+"""Number of ORB keypoints of 4 km2 of map, and of a view."""
 LOWE, MIN_INLIERS, RANSAC_PX, BORDER_PX = 0.75, 8, 4.0, 9
-TOLD = "told pose"
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +46,7 @@ class Picture:
 
     @classmethod
     def read(cls, map_path: Path, pixels_path: Path, factor: int) -> "Picture":
-        """From what `benchmarks.side_by_side` stored beside a map."""
+        """From the files that `benchmarks.side_by_side` stored with a map."""
         with np.load(pixels_path) as stored:
             grey, valid = stored["grey"], stored["valid"]
         size = grey.shape[1] // factor, grey.shape[0] // factor
@@ -63,7 +62,7 @@ class Picture:
         return self.grid.gsd_m * self.factor
 
     def place_en_m(self, col_px: float, row_px: float) -> NDArray[np.float64]:
-        """Where a pixel coordinate (outer corner of the first pixel: 0, 0) lies in the sheet."""
+        """Position in the sheet of a pixel coordinate (outer corner of the first pixel: 0, 0)."""
         return np.array(
             [self.grid.west_m + col_px * self.gsd_m, self.grid.north_m - row_px * self.gsd_m]
         )
@@ -84,13 +83,13 @@ def poses(heading_known: bool, yaw_std_deg: float | None) -> list[tuple[float, f
 
 def posed(view: View, gsd_m: float, tried: list[tuple[float, float]]) -> Iterator[RectifiedView]:
     """All that the camera sees, north up, under each of the poses."""
-    camera, told = view.camera, view.telemetry
+    camera, reported = view.camera, view.telemetry
     smaller = downsampled(view, gsd_m)
-    yaw_deg = told.yaw_deg if math.isfinite(told.yaw_deg) else 0.0
+    yaw_deg = reported.yaw_deg if math.isfinite(reported.yaw_deg) else 0.0
     across = math.hypot(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px)
     for turn_deg, factor in tried:
-        agl_m = told.agl_m * factor
-        telemetry = replace(told, yaw_deg=yaw_deg + turn_deg, agl_m=agl_m)
+        agl_m = reported.agl_m * factor
+        telemetry = replace(reported, yaw_deg=yaw_deg + turn_deg, agl_m=agl_m)
         yield rectify(
             replace(smaller, telemetry=telemetry),
             gsd_m=gsd_m,
@@ -99,19 +98,19 @@ def posed(view: View, gsd_m: float, tried: list[tuple[float, float]]) -> Iterato
 
 
 Surface = Callable[[RectifiedView], Array]
-"""How well a rectified view (S, S) fits with its corner on each pixel: (h, w)."""
+"""Function from a rectified view (S, S) to its score (h, w) with its corner on each pixel."""
 
 
 class BestOfPoses:
     """The highest value of a surface over all poses."""
 
     def __init__(self, picture: Picture, surface: Surface, telemetry_only: bool) -> None:
-        self._picture, self._surface, self._told_only = picture, surface, telemetry_only
+        self._picture, self._surface, self._telemetry_only = picture, surface, telemetry_only
 
     def locate(self, view: View, heading_known: bool) -> Place:
         """East and north (2,) of the camera in the sheet."""
         tried = poses(heading_known, view.telemetry.yaw_std_deg)
-        if self._told_only:
+        if self._telemetry_only:
             tried = [(0.0, 1.0)]
         best, place = -math.inf, None
         for seen in posed(view, self._picture.gsd_m, tried):
@@ -125,7 +124,7 @@ class BestOfPoses:
 
 
 class _Spectra:
-    """Real FFTs of planes as large as the map; values count where the view lies wholly on it."""
+    """Real FFTs of planes as large as the map; values are valid where the view lies fully on it."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self._shape = shape
@@ -156,7 +155,7 @@ _NOWHERE = np.full((1, 1), -np.inf, np.float32)
 
 
 class TemplateSurface:
-    """What `cv2.matchTemplate` gives for TM_CCOEFF_NORMED with a mask, of grey or Canny edges.
+    """Same as `cv2.matchTemplate` TM_CCOEFF_NORMED with a mask, of grey or Canny edges.
 
     The same numbers by FFT with the map's spectra made once, which is several times faster. The
     mask is what the camera saw: better than the largest square within it.
@@ -180,12 +179,12 @@ class TemplateSurface:
         product = self._spectra.surface(self._map, self._spectra.of(template), seen)
         mean = self._spectra.surface(self._map, mask, seen)
         spread = self._spectra.surface(self._squared, mask, seen) - mean**2 / pixels
-        typical = float(np.median(spread))  # a uniform place says nothing
+        typical = float(np.median(spread))  # a uniform place has no evidence
         return np.asarray(product / np.sqrt(np.maximum(spread, 1e-3 * typical) * energy + 1e-9))
 
 
 class PhaseSurface:
-    """Phase correlation: the whitened cross spectrum; that of the map is made once."""
+    """Phase correlation: the whitened cross spectrum; the spectrum of the map is computed once."""
 
     def __init__(self, picture: Picture) -> None:
         grey = picture.grey.astype(np.float32)
@@ -243,10 +242,10 @@ class MutualSurface:
 
 
 class Keypoints:
-    """SIFT or ORB of the told view against keypoints of the map, ratio test, RANSAC similarity.
+    """SIFT or ORB of the view against the map: ratio test, RANSAC similarity.
 
-    With `near_m` only keypoints so near to the place that `locate` is told are compared, one by
-    one; without, all those of the map, by an index that is made once.
+    With `near_m` the keypoints within that distance of the prior are compared exhaustively;
+    without, all keypoints of the map, through an index that is made once.
     """
 
     def __init__(self, picture: Picture, *, orb: bool = False, near_m: float | None = None) -> None:
@@ -266,7 +265,7 @@ class Keypoints:
             self._detector.setMaxFeatures(VIEW_ORB)
 
     def locate(self, view: View, heading_known: bool, near_en_m: Place = None) -> Place:
-        """Where the middle of the view falls; none with too few inliers. No heading is needed."""
+        """Position of the centre of the view; None with too few inliers. No heading is needed."""
         seen = next(posed(view, self._picture.gsd_m, [(0.0, 1.0)]))
         points, descriptors = self._features(seen.grey, seen.valid)
         if len(points) < MIN_INLIERS:
@@ -289,7 +288,7 @@ class Keypoints:
     def _pairs(
         self, descriptors: NDArray[Any], near_en_m: Place
     ) -> tuple[NDArray[np.float64], Any]:
-        """Keypoints of the map (N, 2) that are compared, and the two likest of each of ours."""
+        """Compared keypoints of the map (N, 2), and two nearest neighbours of each of the view."""
         if self._near_m is None or near_en_m is None:
             return self._points, self._matcher.knnMatch(descriptors, k=2)
         grid, gsd_m = self._picture.grid, self._picture.gsd_m

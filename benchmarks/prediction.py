@@ -1,11 +1,11 @@
-"""Is `orthonav check` right? What it predicts, from one date alone, against what comes out.
+"""Predictions of `orthonav check`, from one date alone, compared with measured results.
 
 `python -m benchmarks.prediction [--views 240] [--only NAME ..] [--workers N] [--out FOLDER]` checks
 maps as the command does, without the second date, then flies over that date with the program's own
 simulator, or replays a recorded flight, places every view once with the same prior, and compares
 cell by cell (stretch by stretch of flights) the predicted with the measured share of correct,
 confident fixes. Real imagery is looked for in `../shared/data` beside the checkout or in the folder
-that ORTHONAV_DATA names; what is absent is left out with a line that says so. The generated areas
+that ORTHONAV_DATA names; absent imagery is left out with a line that says so. The generated areas
 have seeds that `experiments.persistence` does not learn from.
 """
 
@@ -46,7 +46,7 @@ DATA = Path(os.environ.get("ORTHONAV_DATA", REAL_DATA))
 ACCEPT = 0.9
 YAW_STD_DEG, AGL_STD = 5.0, 0.05
 WIDTHS_PX = (112, 160, 256)
-"""Pixels of the map across a view, for orthophotos: what is seen from three heights."""
+"""Pixels of the map across a view, for orthophotos: views from three heights."""
 VIEWS_PER_CELL = 15
 LEAST_PER_CELL = 8
 PRIOR_PX = 60.0
@@ -96,7 +96,14 @@ def scenes() -> list[Scene]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Predicted and measured shares of the cells of a scene, with the views in each."""
+    """Predictions and measurements of one scene.
+
+    - `scene`, `group`: names of the scene and of its group.
+    - `predicted`, `measured`: share of correct, confident views for each cell, 0 to 1.
+    - `views`: number of views in each cell.
+    - `wrong`: number of views that are confident and wrong.
+    - `error_predicted_m`, `error_measured_m`: error of correct views, m.
+    """
 
     scene: str
     group: str
@@ -166,7 +173,7 @@ def _there(scene: Scene) -> bool:
 
 
 def _file(name: str, folder: Path) -> Path:
-    """A file of real imagery, or of a generated area, which is made once."""
+    """A file of real imagery, or of a generated area (cached)."""
     if not name.startswith("generated:"):
         return DATA / name
     _, seed, date = name.split(":")
@@ -248,20 +255,20 @@ def _flown(
             continue
         east, north = frame.en_from_latlon(*truth[view.frame]) + rng.normal(0, prior_m, 2)
         lat, lon = frame.latlon_from_en(np.array([east, north]))
-        told = replace(view.telemetry, prior=Prior(float(lat), float(lon), prior_m))
-        views.append(replace(view, telemetry=told))
+        telemetry = replace(view.telemetry, prior=Prior(float(lat), float(lon), prior_m))
+        views.append(replace(view, telemetry=telemetry))
     places, right, wrong, errors = [], [], [], []
     for result in localize_flight(SingleViews(localizer, use_prior=True), flight, views=views):
         true = frame.en_from_latlon(*truth[result.frame])
-        error, sure = math.inf, False
+        error, confident = math.inf, False
         if isinstance(result.outcome, Fix):
             found = frame.en_from_latlon(result.outcome.lat_deg, result.outcome.lon_deg)
             error = float(np.hypot(*(found - true)))
-            sure = result.outcome.confidence >= ACCEPT
+            confident = result.outcome.confidence >= ACCEPT
         near = error <= (result.outcome.radius_m if isinstance(result.outcome, Fix) else 0.0)
         places.append(true)
-        right.append(sure and near)
-        wrong.append(sure and not near)
+        right.append(confident and near)
+        wrong.append(confident and not near)
         errors.append(error)
     return np.array(places), np.array(right), np.array(wrong), np.array(errors)
 
@@ -283,44 +290,46 @@ def _cells_of(en_m: Array) -> NDArray[np.intp]:
 
 
 def totals(found: Sequence[Outcome]) -> dict[str, Any]:
-    """Correlation, calibration and the worst of the sure cells, over all cells."""
-    told, measured, views = _pooled(found)
+    """Correlation, calibration and the worst of the confident cells, over all cells."""
+    predicted, measured, views = _pooled(found)
     error = 0.0
     for low, high in pairwise(BINS):
-        inside = (told >= low) & (told < high)
+        inside = (predicted >= low) & (predicted < high)
         if inside.any():
-            off = np.average(told[inside] - measured[inside], weights=views[inside])
+            off = np.average(predicted[inside] - measured[inside], weights=views[inside])
             error += abs(float(off)) * float(views[inside].sum() / views.sum())
-    sure = told > CONFIDENT
+    confident = predicted > CONFIDENT
     return {
-        "cells": len(told),
-        "correlation": round(float(np.corrcoef(told, measured)[0, 1]), 3),
-        "bias": round(float(np.average(told - measured, weights=views)), 3),
+        "cells": len(predicted),
+        "correlation": round(float(np.corrcoef(predicted, measured)[0, 1]), 3),
+        "bias": round(float(np.average(predicted - measured, weights=views)), 3),
         "calibration_error": round(error, 3),
-        "sure_cells": int(sure.sum()),
-        "sure_cells_least_measured": float(measured[sure].min()) if sure.any() else None,
+        "confident_cells": int(confident.sum()),
+        "confident_cells_least_measured": float(measured[confident].min())
+        if confident.any()
+        else None,
         "wrong": sum(each.wrong for each in found),
         "views": int(views.sum()),
     }
 
 
 def _pooled(found: Sequence[Outcome]) -> tuple[Array, Array, Array]:
-    told = np.array([value for each in found for value in each.predicted])
+    predicted = np.array([value for each in found for value in each.predicted])
     measured = np.array([value for each in found for value in each.measured])
     views = np.array([value for each in found for value in each.views], np.float64)
-    return told, measured, views
+    return predicted, measured, views
 
 
 def _row(found: Outcome) -> list[str]:
-    told, measured, views = _pooled([found])
-    varied = len(told) > 2 and told.std() > 0 and measured.std() > 0
+    predicted, measured, views = _pooled([found])
+    varied = len(predicted) > 2 and predicted.std() > 0 and measured.std() > 0
     return [
         found.scene,
-        str(len(told)),
+        str(len(predicted)),
         str(int(views.sum())),
-        f"{np.average(told, weights=views):.2f}",
+        f"{np.average(predicted, weights=views):.2f}",
         f"{np.average(measured, weights=views):.2f}",
-        f"{np.corrcoef(told, measured)[0, 1]:.2f}" if varied else "-",
+        f"{np.corrcoef(predicted, measured)[0, 1]:.2f}" if varied else "-",
         f"{found.error_predicted_m:.1f}",
         f"{found.error_measured_m:.1f}",
         str(found.wrong),
@@ -330,10 +339,10 @@ def _row(found: Outcome) -> list[str]:
 def _scenes_table(found: Sequence[Outcome], options: argparse.Namespace) -> Table:
     header = (
         *("map / other date", "cells", "views", "predicted", "measured", "correlation of cells"),
-        *("error m predicted", "measured", "sure and wrong"),
+        *("error m predicted", "measured", "confident and wrong"),
     )
     whole = totals(found)
-    worst = whole["sure_cells_least_measured"]
+    worst = whole["confident_cells_least_measured"]
     notes = (
         f"share of views with a correct fix of confidence {ACCEPT:g} or more; predicted from the "
         "map's date alone",
@@ -343,23 +352,23 @@ def _scenes_table(found: Sequence[Outcome], options: argparse.Namespace) -> Tabl
         f"deviations; cells of {VIEWS_PER_CELL} views on average, stretches of as many",
         f"all cells: correlation {whole['correlation']}, predicted less measured "
         f"{whole['bias']:+}, calibration error {whole['calibration_error']} over fifths; "
-        f"{whole['sure_cells']} cells predicted above {CONFIDENT:g}, the least of them measured "
+        f"{whole['confident_cells']} cells predicted above {CONFIDENT:g}, lowest measured "
         f"{'-' if worst is None else worst}",
     )
     return Table("Predicted and measured fixes", header, [_row(each) for each in found], notes)
 
 
 def _bins_table(found: Sequence[Outcome]) -> Table:
-    told, measured, views = _pooled(found)
+    predicted, measured, views = _pooled(found)
     rows = []
     for low, high in pairwise(BINS):
-        inside = (told >= low) & (told < high)
+        inside = (predicted >= low) & (predicted < high)
         if inside.any():
             rows.append(
                 [
                     f"{low:.1f} to {min(high, 1.0):.1f}",
                     str(int(inside.sum())),
-                    f"{np.average(told[inside], weights=views[inside]):.2f}",
+                    f"{np.average(predicted[inside], weights=views[inside]):.2f}",
                     f"{np.average(measured[inside], weights=views[inside]):.2f}",
                     f"{measured[inside].min():.2f} to {measured[inside].max():.2f}",
                 ]
@@ -373,9 +382,9 @@ def _picture(found: Sequence[Outcome], path: Path) -> None:
 
     def draw(axes: Any) -> None:
         for group in GROUPS:
-            told, measured, views = _pooled([each for each in found if each.group == group])
-            if len(told):
-                axes.scatter(told, measured, s=2 * views, alpha=0.6, label=group)
+            predicted, measured, views = _pooled([each for each in found if each.group == group])
+            if len(predicted):
+                axes.scatter(predicted, measured, s=2 * views, alpha=0.6, label=group)
         axes.plot([0, 1], [0, 1], color="0.5", linewidth=1)
         axes.set(xlabel="predicted", ylabel="measured", xlim=(0, 1), ylim=(-0.02, 1.02))
         axes.legend()

@@ -1,4 +1,4 @@
-"""Where a registered view's time goes, and the floor that its FFTs set."""
+"""Stages of a registered view, and the floor of its FFTs."""
 
 import math
 import time
@@ -55,7 +55,7 @@ class _Account:
 
 def measure(place: Workplace) -> Section:
     """Stages of views with known and unknown heading; FFT floors of the searches they made."""
-    section = Section("Where a registered view's time goes")
+    section = Section("Time of a registered view")
     past, present = place.area(2000, 1.0, [PAST, PRESENT])
     localizer = Localizer(open_map(place.map(past)))
     flight = place.fly(present, 12 if place.quick else 100, WIDE_ERRORS)
@@ -131,8 +131,8 @@ def _stages(section: Section, columns: dict[bool, list[_Account]]) -> Table:
     notes = (
         f"generated 2 x 2 km at 1 m; heading known to 10 deg ({len(columns[True])} views) and "
         f"unknown ({len(columns[False])}); height known to 10 %; warm, one core; a view that is "
-        "not sure after one search is searched again, so means say more than medians; share: of "
-        "the time of all views",
+        "not confident after one search is searched again, so the mean is more useful than the "
+        "median; share: of the time of all views",
         "level n: pixels of 2^n m; rectify: checks, thinning, rectification; search, tiles: "
         "candidates from embeddings; refine: all candidates that reach the level; templates: "
         "evidence of the view and its derivatives; stages do not overlap",
@@ -148,7 +148,7 @@ def _lists(accounts: list[_Account], names: list[str]) -> dict[str, list[float]]
 
 
 def _floors(section: Section, searches: dict[Search, int]) -> Table:
-    """What the FFTs of each search cost alone."""
+    """Time of the FFTs of each search alone."""
     common: dict[Search, int] = {}
     for key in sorted(searches, key=lambda key: -searches[key]):
         if not any(key[0] == seen[0] and key[2] == seen[2] for seen in common):

@@ -3,7 +3,7 @@
 `python -m benchmarks.real_imagery [--views 200] [--negatives 2000] [--seed 1] [--only NAME ..]
 [--out FILE.md]` builds maps as `orthonav build` does, flies over other dates at random places, or
 replays recorded flights, and prints Markdown tables. Looked for in `../shared/data` beside the
-checkout or in the folder that ORTHONAV_DATA names; what is absent is left out, with a line that
+checkout or in the folder that ORTHONAV_DATA names; absent imagery is left out with a line that
 says so. Maps and flights go into a temporary folder.
 """
 
@@ -38,8 +38,8 @@ NAIP_VIEWS = ("naip_nd/20120731.tif", "naip_nd/20150926.tif", "naip_nd/20180716.
 SZADA = ("szada_1", "szada_5", "szada_7", "szada_mosaic")
 GROUPS = ("naip", "airchange", "taichung", "arroio", "negatives")
 HEADER = (
-    *("map", "views", "n", "near", "35 m", "median m", f"kept at {CONFIDENT:g} of right"),
-    *("wrong kept", "ECE", "NEES", "ms", "p99 ms"),
+    *("map", "views", "n", "near", "35 m", "median m", f"correct and accepted at {CONFIDENT:g}"),
+    *("wrong accepted", "ECE", "NEES", "ms", "p99 ms"),
 )
 
 
@@ -73,7 +73,7 @@ def scenes() -> list[Scene]:
 
 @dataclass(frozen=True)
 class Bench:
-    """Where maps and flights of this run lie, and its options."""
+    """Folders of maps and flights of this run, and its options."""
 
     folder: Path
     options: argparse.Namespace
@@ -105,7 +105,7 @@ class Bench:
 
 
 def main() -> None:
-    """Run the scenes asked for and print their tables."""
+    """Run the chosen scenes and print their tables."""
     options = _parser().parse_args()
     cv2.setNumThreads(1)
     about = provenance("real imagery")
@@ -182,7 +182,7 @@ def _row(scene: Scene, verdict: Verdict) -> list[str]:
         percent(float(verdict.within(FAR_M).mean()), 1),
         number(verdict.median_m),
         percent(verdict.accepted_of_right(FAR_M), 1),
-        f"{verdict.wrong_accepted} of {int(verdict.kept.sum())}",
+        f"{verdict.wrong_accepted} of {int(verdict.accepted.sum())}",
         f"{verdict.ece:.3f}",
         number(verdict.nees_mean),
         number(float(np.median(verdict.times_ms))),
@@ -197,8 +197,8 @@ def _notes(options: argparse.Namespace) -> tuple[str, ...]:
         f"whole map, no prior, seed {options.seed}; simulated flights: heading off by "
         f"{options.yaw_std_deg:g} deg and height by {options.agl_std:.0%} (standard deviations), "
         "random places; recorded flights as they are: Taichung's camera tilts up to 9 deg more "
-        "than told and its height is about 12 % off, Arroio's truth is good to 7 to 10 m and its "
-        "map's position is nominal",
+        "than reported and its height is about 12 % off, Arroio's truth is good to 7 to 10 m and "
+        "its map's position is nominal",
         "near: share of all views within the radius in brackets; accepted: confidence of "
         f"{CONFIDENT:g} or more, of the views within {FAR_M:g} m; wrong accepted: by more than "
         f"{FAR_M:g} m, of all accepted",
@@ -232,7 +232,7 @@ def _refusals(bench: Bench) -> Table:
     stated: dict[str, list[float]] = {kind: [] for kind in SHARES}
     times_ms = []
     for kind, picture in negatives(sources, options.negatives, size, options.seed):
-        told = Telemetry(
+        telemetry = Telemetry(
             time_ns=0,
             yaw_deg=float(rng.uniform(0, 360)),
             pitch_deg=0.0,
@@ -242,7 +242,7 @@ def _refusals(bench: Bench) -> Table:
             agl_std_m=options.agl_std * agl_m,
         )
         alone = SingleViews(localizer, use_prior=False)
-        outcome, took_ms = locate_view(alone, View(picture, DEFAULT_CAMERA, told))
+        outcome, took_ms = locate_view(alone, View(picture, DEFAULT_CAMERA, telemetry))
         stated[kind].append(outcome.confidence if isinstance(outcome, Fix) else np.nan)
         times_ms.append(took_ms)
     rows = [_refused(kind, np.array(values)) for kind, values in stated.items()]

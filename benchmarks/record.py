@@ -43,9 +43,14 @@ WILSON_Z = 1.2816
 
 @dataclass(frozen=True)
 class Measurement:
-    """One measured quantity: median and spread of `n` samples.
+    """One measured quantity.
 
-    Of a share, `median` is the share itself and p10 and p90 bound it (Wilson interval).
+    - `section`, `name`: section of the report, and name of the quantity.
+    - `unit`: its unit; "1" for a share.
+    - `median`, `p10`, `p90`, `p99`: quantiles of the samples. For a share, `median` is the
+      share, and p10 to p90 is its Wilson interval.
+    - `n`: number of samples.
+    - `data`, `seed`: input data, and the seed it was generated with.
     """
 
     section: str
@@ -158,7 +163,7 @@ TARGETS = (
 
 
 def targets_table(done: Sequence[Section]) -> Section:
-    """Each target beside what was measured."""
+    """Each target with its measured value."""
     facts = {key: value for section in done for key, value in section.facts.items()}
     rows = []
     for key, text, limit in TARGETS:
@@ -208,7 +213,7 @@ def _said(value: Any) -> str:
 
 
 def provenance(run: str) -> dict[str, Any]:
-    """Commit, date, machine and versions; `run` is a word for what is run."""
+    """Commit, date, machine and versions; `run` names the run."""
     with Path("/proc/meminfo").open() as stream:
         memory_gb = int(stream.readline().split()[1]) / 2**20
     return {
@@ -231,7 +236,7 @@ def provenance(run: str) -> dict[str, Any]:
 
 
 def sources_digest() -> str:
-    """Short digest of the package's sources: tells whether they changed during a run."""
+    """Short digest of the package's sources, to detect changes during a run."""
     digest = hashlib.sha256()
     for path in sorted(Path(orthonav.__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())

@@ -32,7 +32,7 @@ SIDE_M = 2000
 RADII_M = (15.0, 35.0)
 HEADER = (
     *("method", "pixels m", "poses", "15 m", "35 m", "median m"),
-    *("ms", "p99 ms", "peak MB", f"kept at {CONFIDENT:g}", "wrong kept", "ECE"),
+    *("ms", "p99 ms", "peak MB", f"accepted at {CONFIDENT:g}", "wrong accepted", "ECE"),
 )
 
 
@@ -55,11 +55,11 @@ KNOWN = (
     Entrant("orthonav (default)", BOTH),
     Entrant("orthonav, registration only", REGISTRATION),
     Entrant("orthonav, embedding only", TILES),
-    Entrant("matchTemplate, grey, told pose", TEMPLATE, 1, True),
+    Entrant("matchTemplate, grey, reported pose", TEMPLATE, 1, True),
     Entrant("matchTemplate, grey, pose bank", TEMPLATE, 4),
-    Entrant("matchTemplate, Canny, told pose", CANNY, 1, True),
+    Entrant("matchTemplate, Canny, reported pose", CANNY, 1, True),
     Entrant("matchTemplate, Canny, pose bank", CANNY, 4),
-    Entrant("phase correlation, told pose", PHASE, 1, True),
+    Entrant("phase correlation, reported pose", PHASE, 1, True),
     Entrant("phase correlation, pose bank", PHASE, 4),
     Entrant("mutual information, pose bank", MUTUAL, 8),
     Entrant("SIFT, ratio test, RANSAC", SIFT),
@@ -83,7 +83,7 @@ NOTES = (
     "map made once",
     "peak MB: resident memory of a process that does nothing else, Python, NumPy and OpenCV "
     "(about 45 MB) included; the others hold the orthophoto decoded, orthonav opens its map",
-    "wrong kept: of those kept, wrong by more than 35 m; the others state no confidence",
+    "wrong accepted: accepted views wrong by more than 35 m; the others state no confidence",
 )
 
 
@@ -103,12 +103,12 @@ def measure(place: Workplace) -> Section:
         task = Task("", str(map_path), str(flight), heading_known, pixels=str(pixels))
         verdicts = []
         for each in entrants:
-            told = placed(
+            result = placed(
                 replace(
                     task, method=each.method, factor=each.factor, telemetry_only=each.telemetry_only
                 )
             )
-            verdicts.append((each, from_placed(told), float(told["peak_mb"])))
+            verdicts.append((each, from_placed(result), float(result["peak_mb"])))
             print(f"        {title}: {each.name} done", file=sys.stderr, flush=True)
         section.tables.append(_table(section, title, heading_known, verdicts))
     return section
@@ -166,7 +166,11 @@ def _table(
 
 
 def _stated(verdict: Verdict) -> list[str]:
-    """Kept, wrong among them, ECE; dashes where no confidence is stated."""
+    """Accepted, wrong among them, ECE; dashes without a stated confidence."""
     if not verdict.states_confidence:
         return ["-", "-", "-"]
-    return [percent(float(verdict.kept.mean())), str(verdict.wrong_accepted), f"{verdict.ece:.3f}"]
+    return [
+        percent(float(verdict.accepted.mean())),
+        str(verdict.wrong_accepted),
+        f"{verdict.ece:.3f}",
+    ]

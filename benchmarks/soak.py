@@ -38,7 +38,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Soaked:
-    """A flight of so many views at a pace."""
+    """Results of one soak flight.
+
+    - `views`: number of views flown.
+    - `pace`: factor on real time.
+    - `exit_code`: exit code of `orthonav fly`.
+    - `hours`: flight time of each sample, h.
+    - `samples`: samples of the process.
+    - `arrivals`: positions received by the fake autopilot.
+    - `lines`: log lines of the program.
+    - `log_bytes`: sizes of the log files.
+    """
 
     views: int
     pace: float
@@ -127,11 +137,11 @@ def slope(hours: Array, rss_mb: Array) -> tuple[float, float]:
     Memory comes in steps, so single seconds are no independent readings: the line is laid through
     the means of `BLOCKS` parts.
     """
-    kept = hours >= WARM_UP * hours[-1]
+    warm = hours >= WARM_UP * hours[-1]
     parts = [
         (float(x.mean()), float(y.mean()))
         for x, y in zip(
-            np.array_split(hours[kept], BLOCKS), np.array_split(rss_mb[kept], BLOCKS), strict=True
+            np.array_split(hours[warm], BLOCKS), np.array_split(rss_mb[warm], BLOCKS), strict=True
         )
     ]
     line: Any = linregress(*np.array(parts).T)
@@ -156,7 +166,7 @@ def table(section: Section, soaked: Soaked) -> Table:
         "soak_dropped": soaked.views - handled,
         "soak_far": int((errors_m > FAR_M).sum()),
     }
-    told = (
+    degraded_s = (
         ", ".join(f"{name} {count}" for name, count in soaked.lines.reasons.most_common()) or "none"
     )
     rows = [
@@ -173,7 +183,7 @@ def table(section: Section, soaked: Soaked) -> Table:
         ["log files at the end, MB in all", f"{len(soaked.log_bytes)}, {_mb(soaked.log_bytes)}"],
         ["times that the log lost something", str(counts.get("log_failed", 0))],
         ["views that failed inside", str(counts.get("internal_error", 0))],
-        ["seconds with a reason of health", told],
+        ["seconds with a reason of health", degraded_s],
         ["exit code", str(soaked.exit_code)],
     ]
     camera = SMALL_CAMERA
@@ -209,8 +219,8 @@ def _csv(path: Path, soaked: Soaked) -> Path:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(("flight_s", "rss_mb", "peak_mb", "cpu_s"))
         for hours, one in zip(soaked.hours, soaked.samples, strict=True):
-            told = (3600 * hours, one.rss_mb, one.peak_mb, one.cpu_s)
-            writer.writerow([f"{value:.2f}" for value in told])
+            row = (3600 * hours, one.rss_mb, one.peak_mb, one.cpu_s)
+            writer.writerow([f"{value:.2f}" for value in row])
     return path
 
 

@@ -1,4 +1,4 @@
-"""All sections in order, and what is made of them."""
+"""All sections in order, and the files written from them."""
 
 import argparse
 import logging
@@ -46,7 +46,7 @@ SECTIONS: dict[str, Callable[[Workplace], Section]] = {
 
 
 def run_suite(arguments: Sequence[str]) -> int:
-    """Run the sections asked for; returns the exit code."""
+    """Run the chosen sections; returns the exit code."""
     options = _parser().parse_args(arguments)
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
     cv2.setNumThreads(1)

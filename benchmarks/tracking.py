@@ -24,8 +24,8 @@ TURNS_EN_M = ((-330, -330), (-330, 300), (-60, 330), (60, -330), (330, -300), (3
 SPACING_M, AGL_M = 40.0, 150.0
 ERRORS = Errors(yaw_std_deg=5.0, agl_std=0.05)
 HEADER = (
-    *("area km2", "views", "way", "ms", "p99 ms", "first view ms", "found at view"),
-    *("15 m", "median m", "sure and wrong"),
+    *("area km2", "views", "method", "ms", "p99 ms", "first view ms", "found at view"),
+    *("15 m", "median m", "confident and wrong"),
 )
 CONFIDENT, RIGHT_M = 0.9, 15.0
 
@@ -38,18 +38,19 @@ def measure(place: Workplace) -> Section:
     for side_m in SIDES_M[:1] if place.quick else SIDES_M:
         localizer = Localizer(open_map(place.map(place.area(side_m, 1.0, [PAST])[0])))
         folder = _flown(place, localizer, present)
-        for way in ("tracked", "one by one"):
+        for method in ("tracked", "one by one"):
             locator: Locator = SingleViews(localizer, use_prior=False)
-            if way == "tracked":
+            if method == "tracked":
                 locator = Tracker(localizer, use_prior=False)
-            rows.append(_row(section, side_m, way, localizer, folder, locator))
-            print(f"        {side_m} m, {way} done", file=sys.stderr, flush=True)
+            rows.append(_row(section, side_m, method, localizer, folder, locator))
+            print(f"        {side_m} m, {method} done", file=sys.stderr, flush=True)
     notes = (
         f"a flight of {AGL_M:g} m height, a view every {SPACING_M:g} m, 1 s apart, of another date "
-        "than the map's, heading off by 5 deg and height by 5 % (standard deviations, anew at each "
-        "view), no prior, whole map; one core",
+        "than the map's, heading off by 5 deg and height by 5 % (standard deviations, drawn for "
+        "each view), no prior, whole map; one core",
         "found at view: the first that is tracking; 15 m, median, ms and p99 from there on (one by "
-        "one: of all); sure and wrong: views more than 35 m off with a confidence of 0.9 or more",
+        "one: of all); confident and wrong: views more than 35 m off with a confidence of at "
+        "least 0.9",
     )
     section.tables = [Table("Following a flight", HEADER, rows, notes)]
     return section
@@ -76,7 +77,7 @@ def _flown(place: Workplace, localizer: Localizer, present: Path) -> Path:
 def _row(
     section: Section,
     side_m: int,
-    way: str,
+    method: str,
     localizer: Localizer,
     folder: Path,
     locator: Locator,
@@ -84,27 +85,27 @@ def _row(
     results = list(localize_flight(locator, open_flight(folder)))
     truth = read_truth(folder / "truth.csv")
     errors = np.array([_error_m(each, localizer, truth[each.frame]) for each in results])
-    sure = np.array(
+    confident = np.array(
         [isinstance(r.outcome, Fix) and r.outcome.confidence >= CONFIDENT for r in results]
     )
     times = np.array([each.latency_ms for each in results])
     tracking = [number for number, r in enumerate(results) if r.state in (None, "tracking")]
     first = tracking[0] if tracking else len(results)
     # The first view of all prepares the map.
-    told = times[max(first, 1) :]
-    name, data = f"{side_m} m, {way}", f"generated {side_m} m square, 1 m"
-    time = section.add(f"{name}: time", "ms", told, data=data, seed=FLIGHT_SEED)
+    warm = times[max(first, 1) :]
+    name, data = f"{side_m} m, {method}", f"generated {side_m} m square, 1 m"
+    time = section.add(f"{name}: time", "ms", warm, data=data, seed=FLIGHT_SEED)
     hits = errors[first:] <= RIGHT_M
     section.add_share(f"{name}: within 15 m", hits, data=data, seed=FLIGHT_SEED)
-    wrong = int((sure & (errors > 35.0)).sum())
+    wrong = int((confident & (errors > 35.0)).sum())
     return [
         number((side_m / 1000) ** 2),
         str(len(results)),
-        way,
+        method,
         number(time.median),
-        number(float(np.percentile(told, 99))),
+        number(float(np.percentile(warm, 99))),
         number(float(times[0])),
-        str(first + 1) if way == "tracked" else "-",
+        str(first + 1) if method == "tracked" else "-",
         percent(float(hits.mean())),
         number(float(np.median(errors[first:]))),
         str(wrong),

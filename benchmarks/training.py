@@ -1,9 +1,9 @@
-"""`python -m benchmarks.training`: what a step of learning the auto-encoder costs, and why.
+"""`python -m benchmarks.training`: time of a training step of the auto-encoder, option by option.
 
-Each row adds one means to the row above, in a process of its own, on the model that
-`orthonav build --method autoencoder` learns: 256 px edge maps, 32 a batch. The losses of a smaller
-model, learnt plainly and with all means, say whether what is learnt stays the same. The last table
-says what an encoder of width 32 costs and keeps in each precision that it can fly in.
+Each row adds one option to the row above, in a process of its own, on the model that
+`orthonav build --method autoencoder` trains: 256 px edge maps, 32 a batch. The losses of a smaller
+model, trained plainly and with all options, show that the result stays the same. The last table
+gives size, time and accuracy of an encoder of width 32 in each precision.
 """
 
 import argparse
@@ -26,7 +26,7 @@ PLAIN = {"bf16": False, "fused": False, "keep_memory": False}
 MEANS: dict[str, dict[str, bool]] = {
     "plain float32": PLAIN,
     "+ fused optimizer": {**PLAIN, "fused": True},
-    "+ memory kept": {**PLAIN, "fused": True, "keep_memory": True},
+    "+ freed memory reused": {**PLAIN, "fused": True, "keep_memory": True},
     "+ bfloat16": {"bf16": True, "fused": True, "keep_memory": True},
 }
 WHOLE = "+ bfloat16"
@@ -35,7 +35,7 @@ PRECISIONS = "precisions"
 PARTS = (*MEANS, LOSSES, PRECISIONS)
 SEEDS = (0, 1, 2)
 CURVE = {"tile_px": 64, "width": 32, "dims": 128, "epochs": 60}
-"""A smaller model, for which plain learning takes seconds."""
+"""A smaller model, for which plain training takes seconds."""
 TILE_PX, BATCH = 256, 32
 
 
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     start = time.perf_counter()
     started = provenance("training")
     wanted = options.only or PARTS
-    section = Section("Learning the auto-encoder")
+    section = Section("Training the auto-encoder")
     rows = [name for name in wanted if name in MEANS]
     if rows:
         section.tables.append(_speed(section, rows, options.steps))
@@ -81,17 +81,17 @@ def _speed(section: Section, names: Sequence[str], steps: int) -> Table:
     """Time of a step with each means added."""
     rows, first_s, threads = [], None, 0
     for name in names:
-        told = _in_a_process(means=MEANS[name], epochs=steps + 1, seed=0)
-        timing = section.add(name, "s", told["seconds"][1:], data="generated edges", seed=0)
-        first_s, threads = first_s or timing.median, told["threads"]
+        result = _in_a_process(means=MEANS[name], epochs=steps + 1, seed=0)
+        timing = section.add(name, "s", result["seconds"][1:], data="generated edges", seed=0)
+        first_s, threads = first_s or timing.median, result["threads"]
         cells = [number(value) for value in (timing.median, timing.p10, timing.p90)]
         gain = first_s / timing.median
         section.facts[f"gain {name}"] = gain
-        first_step = number(told["seconds"][0])
-        rows.append([name, *cells, number(gain), first_step, number(told["peak_mb"])])
+        first_step = number(result["seconds"][0])
+        rows.append([name, *cells, number(gain), first_step, number(result["peak_mb"])])
     header = ("means", "step s", "p10", "p90", "times faster", "first step s", "peak MB")
     notes = (
-        f"{threads} threads; {told['parameters']:,} parameters, {TILE_PX} px, batch {BATCH}; a "
+        f"{threads} threads; {result['parameters']:,} parameters, {TILE_PX} px, batch {BATCH}; a "
         f"step reads tiles, forward, backward, optimizer; {steps} steps after the first one",
     )
     return Table("One step of learning", header, rows, notes)
@@ -101,10 +101,10 @@ def _curves(section: Section) -> Table:
     """Losses of the smaller model, plain and with all means, from the same first weights."""
     rows = []
     for name in ("plain float32", WHOLE):
-        told = [
+        result = [
             _in_a_process(means=MEANS[name], seed=seed, count=8 * BATCH, **CURVE) for seed in SEEDS
         ]
-        curves = np.array([one["losses"] for one in told])
+        curves = np.array([one["losses"] for one in result])
         shown = [curves[:, at - 1] for at in (1, 10, 30, CURVE["epochs"])]
         section.add(f"last loss, {name}", "1", shown[-1], data="generated edges", seed=SEEDS[0])
         rows.append([name, *(" ".join(number(loss) for loss in losses) for losses in shown)])
@@ -118,11 +118,11 @@ def _curves(section: Section) -> Table:
 
 def _precisions(section: Section) -> Table:
     """What flies of a smaller encoder in each precision: size, time of a tile, likeness."""
-    told = _in_a_process(
+    result = _in_a_process(
         means=MEANS[WHOLE], epochs=10, seed=0, count=6 * BATCH, width=32, exported=True
     )
     rows = []
-    for name, one in told["exported"].items():
+    for name, one in result["exported"].items():
         time_ms = section.add(f"a tile, {name}", "ms", one["ms"], data="generated edges", seed=0)
         cells = [number(value) for value in (one["mb"], time_ms.median, time_ms.p10, time_ms.p90)]
         rows.append([name, *cells, f"{one['mean']:.5f}", f"{one['least']:.5f}"])
@@ -135,7 +135,7 @@ def _precisions(section: Section) -> Table:
 
 
 def _in_a_process(**wanted: Any) -> dict[str, Any]:
-    """What `_learn` gives in a fresh process, whose memory nothing else has touched."""
+    """Result of `_learn` in a fresh process."""
     # Benchmarks that import NumPy first may be held to one thread; learning uses what there is.
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
     environment = {name: value for name, value in os.environ.items() if name not in names}
@@ -146,8 +146,8 @@ def _in_a_process(**wanted: Any) -> dict[str, Any]:
         text=True,
         env=environment,
     )
-    told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return told
+    result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return result
 
 
 def _learn(
@@ -204,7 +204,7 @@ def _exported(encoder: Any, recipe: Any, tiles: Any) -> dict[str, dict[str, Any]
     held_out = _edge_tiles(32, TILE_PX, seed=1).batch(np.arange(32))
     calibration = tiles.batch(np.arange(64))
     wanted = export_encoder(encoder, recipe, calibration, held_out).embedder.views(held_out)
-    told = {}
+    result = {}
     for name in NAMES:
         flown = dataclasses.replace(recipe, precision=name)
         made = export_encoder(encoder, flown, calibration, held_out, least_cosine=-1.0).embedder
@@ -214,13 +214,13 @@ def _exported(encoder: Any, recipe: Any, tiles: Any) -> dict[str, dict[str, Any]
             start = time.thread_time()
             made.views(held_out[at : at + 1])
             times_ms.append(1e3 * (time.thread_time() - start))
-        told[name] = {
+        result[name] = {
             "mb": made.onnx.nbytes / 1e6,
             "ms": times_ms,
             "mean": float(alike.mean()),
             "least": float(alike.min()),
         }
-    return told
+    return result
 
 
 def _edge_tiles(count: int, tile_px: int, seed: int = 0) -> Any:

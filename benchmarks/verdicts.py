@@ -1,4 +1,4 @@
-"""Figures of placed views: how near, how sure, how often wrong when sure."""
+"""Metrics of located views: errors, confidence, and wrong views among the confident ones."""
 
 import math
 from dataclasses import dataclass
@@ -15,8 +15,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Views (N) of one flight by one method: `errors_en_m` (N, 2) and what was stated, NaN where
-    nothing was; `times_ms` (N,)."""
+    """Results of one method for the views (N) of one flight; NaN where it gave no value.
+
+    - `errors_en_m`: (N, 2), errors east and north, m.
+    - `confidence`: (N,), stated confidence, 0 to 1.
+    - `radius_m`: (N,), radius of the confidence, m.
+    - `cov_en_m2`: (N, 2, 2), stated covariance, m^2.
+    - `times_ms`: (N,), time per view, ms.
+    """
 
     errors_en_m: Array
     confidence: Array
@@ -33,7 +39,7 @@ class Verdict:
 
     @property
     def errors_m(self) -> Array:
-        """(N,) infinite where there is no position."""
+        """Errors (N,), m; infinite without a position."""
         far = np.hypot(self.errors_en_m[:, 0], self.errors_en_m[:, 1])
         return np.where(np.isnan(far), np.inf, far)
 
@@ -43,7 +49,7 @@ class Verdict:
         return bool(np.isfinite(self.confidence).any())
 
     def within(self, radius_m: float) -> NDArray[np.bool_]:
-        """(N,) whether the position is that near."""
+        """Mask (N,) of the views with an error of at most `radius_m`."""
         return self.errors_m <= radius_m
 
     @property
@@ -53,29 +59,29 @@ class Verdict:
         return float(np.median(known)) if known.size else math.nan
 
     @property
-    def kept(self) -> NDArray[np.bool_]:
-        """(N,) whether the stated confidence is at least `CONFIDENT`."""
+    def accepted(self) -> NDArray[np.bool_]:
+        """Mask (N,) of the views with a confidence of at least `CONFIDENT`."""
         return np.asarray(self.confidence >= CONFIDENT)
 
     @property
     def wrong_accepted(self) -> int:
-        """Views kept that are wrong by more than `FAR_M`."""
-        return int((self.kept & (self.errors_m > FAR_M)).sum())
+        """Number of accepted views that are wrong by more than `FAR_M`."""
+        return int((self.accepted & (self.errors_m > FAR_M)).sum())
 
     def accepted_of_right(self, radius_m: float) -> float:
-        """Share of the right ones that is kept; NaN where none is right."""
+        """Share of the correct views that is accepted; NaN if no view is correct."""
         right = self.within(radius_m)
-        return float(self.kept[right].mean()) if right.any() else math.nan
+        return float(self.accepted[right].mean()) if right.any() else math.nan
 
     @property
     def ece(self) -> float:
-        """Expected calibration error, each view at its own radius; no answer states nothing."""
+        """Expected calibration error of the views with a fix, each at its own radius."""
         errors_m = np.hypot(*self.errors_en_m.T)
         return float(calibrate(self.confidence, errors_m, self.radius_m, FAR_M).ece)
 
     @property
     def nees_mean(self) -> float:
-        """Mean normalized error squared of right fixes: 2 if the covariance is theirs."""
+        """Mean normalized error squared of right fixes: 2 if the covariance is consistent."""
         checked = check_covariance(self.errors_en_m, self.cov_en_m2, self.radius_m, FAR_M)
         return float(checked.nees_mean)
 
@@ -85,6 +91,6 @@ def percent(share: float, digits: int = 0) -> str:
     return "-" if math.isnan(share) else f"{share:.{digits}%}"
 
 
-def from_placed(told: dict[str, Any]) -> Verdict:
-    """The verdict of what `benchmarks.placing.placed` told."""
-    return Verdict.of(told["rows"])
+def from_placed(result: dict[str, Any]) -> Verdict:
+    """The verdict on the result of `benchmarks.placing.placed`."""
+    return Verdict.of(result["rows"])

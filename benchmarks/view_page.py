@@ -75,7 +75,7 @@ WATCH = """
 
 @dataclass(frozen=True)
 class LongRun:
-    """Where a run without pictures lies."""
+    """Paths of a run without pictures."""
 
     fixes: Path
     truth: Path
@@ -84,7 +84,7 @@ class LongRun:
 def write_long_run(
     folder: Path, count: int, frame: LocalFrame, middle_en_m: tuple[float, float], reach_m: float
 ) -> LongRun:
-    """Laps that wander, a view a second: most fixes right, some wrong and sure, some views without.
+    """Looped flight, one view per second: most fixes correct, a few confident but wrong.
 
     `reach_m`: how far from the middle, in metres, the looped_flight go.
     """
@@ -106,8 +106,8 @@ def write_long_run(
         if rng.random() >= NO_FIX_SHARE:
             size = rng.uniform(2.0, 8.0)
             cov = np.array([[size**2, 0.4 * size], [0.4 * size, 4.0]])
-            sure = float(rng.beta(9.0, 1.0))
-            outcome = Fix(float(lat[i]), float(lon[i]), cov, sure, 35.0, 40.0, 120.0, {})
+            confidence = float(rng.beta(9.0, 1.0))
+            outcome = Fix(float(lat[i]), float(lon[i]), cov, confidence, 35.0, 40.0, 120.0, {})
         results.append(ViewResult(_name(i), (100 + i) * 10**9, outcome, 25.0, state))
     run = LongRun(folder / f"{count}.jsonl", folder / f"{count}.csv")
     write_results(run.fixes, results)
@@ -125,7 +125,7 @@ def _name(i: int) -> str:
 
 
 def measure(place: Workplace) -> Section:
-    """A row for each number of views; nothing where there is no browser."""
+    """A row for each number of views; no rows without a browser."""
     section = Section("The page of a run")
     if chromium() is None:
         section.tables = [Table(section.title, ("views",), [], [HOW_TO_GET_ONE])]
@@ -175,7 +175,7 @@ def _cores() -> str:
 
 @contextmanager
 def _served(run: LongRun, map_path: Path) -> Iterator[tuple[str, float]]:
-    """Address of a server in a process of its own, and how long it took to come."""
+    """Address of a server in a process of its own, and its start time."""
     command = [sys.executable, "-m", "orthonav", "view", str(run.fixes), "--map", str(map_path)]
     command += ["--truth", str(run.truth), "--no-browser"]
     begun = time.perf_counter()
@@ -205,11 +205,11 @@ def _opened(browser: Browser, address: str) -> tuple[Page, float]:
 
 def _seen(page: Page) -> dict[str, Any]:
     """What was seen since the last time."""
-    told: dict[str, Any] = page.evaluate(
+    seen: dict[str, Any] = page.evaluate(
         "(() => { const seen = { ...window.orthonavSeen }; Object.assign(window.orthonavSeen,"
         " { frames: [], tasks: [], steps: [], shown: [] }); return seen; })()"
     )
-    return told
+    return seen
 
 
 def _opening(
@@ -288,7 +288,7 @@ def _scrub(page: Page) -> None:
 
 
 def _swing(page: Page, part: str, height: float, reach_px: int) -> None:
-    """Presses the button over a part, goes to and fro, and lets it go."""
+    """Press the button over a part, move back and forth, and release it."""
     box = page.locator(part).bounding_box()
     assert box is not None
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] * height

@@ -36,7 +36,7 @@ OUT = Path(__file__).parents[1] / "src" / "orthonav" / "check" / MODEL
 
 
 def main() -> None:
-    """Learn, tell how well it predicts a seed that was left out, and write."""
+    """Fit the model, print how well it predicts a held-out seed, and write it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args()
@@ -44,8 +44,8 @@ def main() -> None:
     held_out = []
     for seed in SEEDS:
         model = fitted([samples[each] for each in SEEDS if each != seed])
-        told, found = model(samples[seed][0]), samples[seed][1]
-        alike, bias = np.corrcoef(told, found)[0, 1], told.mean() - found.mean()
+        predicted, found = model(samples[seed][0]), samples[seed][1]
+        alike, bias = np.corrcoef(predicted, found)[0, 1], predicted.mean() - found.mean()
         held_out.append([float(alike), float(bias)])
         print(
             f"seed {seed} left out: correlation {held_out[-1][0]:.2f}, bias {held_out[-1][1]:+.3f}"
@@ -65,7 +65,7 @@ def main() -> None:
 def _samples(seed: int) -> tuple[Array, Array]:
     """Features (N, F) of patches and the correlation (N,) of their gradients with another date."""
     landscape = Landscape(seed)
-    told, found = [], []
+    patches, found = [], []
     for number, gsd_m in enumerate(GSD_M):
         west, north = ORIGIN_M[0] + 5000.0 * number, ORIGIN_M[1] + 9000.0
         pictures = [
@@ -81,9 +81,9 @@ def _samples(seed: int) -> tuple[Array, Array]:
                 evidence(each, np.ones(each.shape, np.bool_), FINE)[..., :2] for each in pictures
             ]
             for one, other in permutations(range(len(pictures)), 2):
-                told.append(kinds[one][1:-1, 1:-1].reshape(-1, kinds[one].shape[-1]))
+                patches.append(kinds[one][1:-1, 1:-1].reshape(-1, kinds[one].shape[-1]))
                 found.append(correlation(gradients[one], gradients[other])[1:-1, 1:-1].ravel())
-    return np.concatenate(told), np.concatenate(found)
+    return np.concatenate(patches), np.concatenate(found)
 
 
 def _grey(rgb: Array) -> NDArray[np.uint8]:
@@ -109,10 +109,10 @@ def correlation(one: Array, other: Array) -> Array:
 
 def fitted(samples: list[tuple[Array, Array]]) -> PersistenceModel:
     """Least squares with a slight ridge."""
-    told = np.concatenate([each[0] for each in samples]).astype(np.float64)
+    patches = np.concatenate([each[0] for each in samples]).astype(np.float64)
     found = np.concatenate([each[1] for each in samples]).astype(np.float64)
-    mean, spread = told.mean(axis=0), told.std(axis=0) + 1e-9
-    rows = terms((told - mean) / spread)
+    mean, spread = patches.mean(axis=0), patches.std(axis=0) + 1e-9
+    rows = terms((patches - mean) / spread)
     ridge = RIDGE * len(rows) * np.eye(rows.shape[1])
     ridge[0, 0] = 0.0
     weights = np.linalg.solve(rows.T @ rows + ridge, rows.T @ found)

@@ -1,5 +1,5 @@
 #!/bin/sh
-# make_venv.sh PYTHON FOLDER: make a virtual environment with pip, or say in words what is missing.
+# make_venv.sh PYTHON FOLDER: make a virtual environment with pip, or print a message that names the missing part.
 set -eu
 python=$1
 venv=$2

@@ -107,7 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def build(folder: Path, dist: Path) -> tuple[Path, Path]:
-    """Sdist and the wheel made of it, both checked by twine."""
+    """Sdist and the wheel built from it, both checked by twine."""
     if dist.is_dir() and any(dist.iterdir()):
         raise SystemExit(f"--dist must be new or empty: {dist}")
     python = environment(folder / "tools", "build", "twine")

@@ -19,7 +19,7 @@ DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
 def main(arguments: list[str]) -> int:
-    """Run what is asked for, then report; returns the exit code."""
+    """Run the chosen parts, then report; returns the exit code."""
     options = _parser().parse_args(arguments)
     for name in THREADS:  # NumPy's BLAS reads it once, in the processes started too
         os.environ.setdefault(name, "1")
@@ -63,9 +63,9 @@ def _run(options: argparse.Namespace, command: str) -> int:
     jobs = options.jobs or (cores() if options.setting == "reduced" else 1)
     failed = 0
     for (_, scene, method), minutes in side_by_side(tasks, jobs):
-        told = f"failed: {minutes!r}" if isinstance(minutes, Exception) else f"{minutes} min"
+        status = f"failed: {minutes!r}" if isinstance(minutes, Exception) else f"{minutes} min"
         failed += isinstance(minutes, Exception)
-        _say(f"{_minutes(start)}  {scene.name} {method.key}: {told}")
+        _say(f"{_minutes(start)}  {scene.name} {method.key}: {status}")
     if "baselines" in wanted and based and baselines.run(place, based[0][1]):
         _say(f"{_minutes(start)}  baselines")
     return failed

@@ -1,8 +1,8 @@
 """The paper's related work on one trajectory: methods that carry the reference images on board.
 
 Mutual information (Patel et al.), edges matched as such (Conte and Doherty: Sobel; and Canny), and
-local features with RANSAC. All are those of `benchmarks`, held to the told pose and given the
-whole map.
+local features with RANSAC. All are those of `benchmarks`, restricted to the reported pose and given
+the whole map.
 """
 
 import time
@@ -36,7 +36,7 @@ KEY = "baselines"
 
 @dataclass(frozen=True)
 class Baseline:
-    """A method, made from the map's picture; `sobel` hands it edges instead of grey levels."""
+    """A method on the map's picture; `sobel` gives it edges instead of grey levels."""
 
     name: str
     make: Callable[[Picture], Any]
@@ -44,19 +44,21 @@ class Baseline:
     sobel: bool = False
 
 
-def _told(surface: Callable[[Picture], Any]) -> Callable[[Picture], Any]:
+def _reported_pose(surface: Callable[[Picture], Any]) -> Callable[[Picture], Any]:
     return lambda picture: BestOfPoses(picture, surface(picture), telemetry_only=True)
 
 
 BASELINES = (
-    Baseline("mutual information (Patel et al.)", _told(MutualSurface), COARSER),
+    Baseline("mutual information (Patel et al.)", _reported_pose(MutualSurface), COARSER),
     Baseline(
         "Sobel edges matched (Conte and Doherty)",
-        _told(lambda picture: TemplateSurface(picture, False)),
+        _reported_pose(lambda picture: TemplateSurface(picture, False)),
         sobel=True,
     ),
-    Baseline("Canny edges matched", _told(lambda picture: TemplateSurface(picture, True))),
-    Baseline("grey levels matched", _told(lambda picture: TemplateSurface(picture, False))),
+    Baseline("Canny edges matched", _reported_pose(lambda picture: TemplateSurface(picture, True))),
+    Baseline(
+        "grey levels matched", _reported_pose(lambda picture: TemplateSurface(picture, False))
+    ),
     Baseline("SIFT, ratio test, RANSAC", Keypoints),
 )
 
@@ -93,7 +95,7 @@ def _placed(
         picture = replace(picture, grey=sobel(picture.grey))
     method = baseline.make(picture)
     agl_m, gsd_m = scene.trajectory.agl_m, localizer.grid.gsd_m
-    camera, telemetry = views.camera_of(agl_m, gsd_m), views.told(agl_m)
+    camera, telemetry = views.camera_of(agl_m, gsd_m), views.telemetry_at(agl_m)
     errors: dict[str, list[float | None]] = {}
     times_ms = []
     for name, seen in grounds.items():

@@ -22,7 +22,7 @@ class Method:
 
     @property
     def key(self) -> str:
-        """Short name, for files: what is in it tells rows of one setting apart."""
+        """Short name for files, unique within one setting."""
         words = self.recipe.partition("words=")[2].partition(",")[0]
         layer = "registration" if self.registration else ""
         parts = (self.family, self.edges.partition(":")[0], words, layer)
@@ -33,7 +33,7 @@ REDUCED_NETWORKS = {
     "autoencoder": {GREY: "ABCD", CANNY: "ABCD", SEGMENTS: "B", SAM: "B"},
     "triplet": {GREY: "B", CANNY: "B"},
 }
-"""Trajectories that the reduced setting learns a network on, by what it looks at."""
+"""Trajectories that the reduced setting trains a network on, by input."""
 
 
 def methods(

@@ -17,7 +17,7 @@ from experiments.paper.tables import EDGES, FAMILIES
 COLOURS = {"gray": "tab:gray", "canny": "tab:blue", "segments": "tab:orange", "sam": "tab:red"}
 OTHER = "tab:green"
 SWEPT = (("autoencoder", "Auto-Encoder"), ("triplet", "Triplet"), ("gradient", "orthonav"))
-STEPS = (("heading_deg", "heading wrong by, deg"), ("drop_m", "lower than told by, m"))
+STEPS = (("heading_deg", "heading error, deg"), ("drop_m", "height below the reported one, m"))
 RATIOS = (("lowe_ratio", "Lowe's ratio"), ("peak_ratio", "excluding half a tile"))
 
 
@@ -40,11 +40,11 @@ def _sensitivity(results: Sequence[Result], out: Path) -> Path:
         for row, (step, label) in enumerate(STEPS):
             axis = axes[row, column]
             for each in (e for e in results if e.family == family):
-                told = each.plain["sweep"][step]
-                values = [100 * share(errors) for errors in told.values()]
+                sweep = each.plain["sweep"][step]
+                values = [100 * share(errors) for errors in sweep.values()]
                 name = "default" if each.registration else EDGES[each.edges]
                 colour = "tab:purple" if each.registration else COLOURS.get(each.edges, OTHER)
-                axis.plot([float(v) for v in told], values, "o-", ms=3, color=colour, label=name)
+                axis.plot([float(v) for v in sweep], values, "o-", ms=3, color=colour, label=name)
             axis.set_xlabel(label)
             axis.set_ylim(0, 102)
             axis.grid(alpha=0.3)
@@ -57,7 +57,7 @@ def _sensitivity(results: Sequence[Result], out: Path) -> Path:
 
 
 def _curves(results: Sequence[Result], out: Path) -> Path:
-    """Accuracy and share kept over the threshold, for both ratios; views on the grid."""
+    """Accuracy and accepted share over the threshold, for both ratios; views on the grid."""
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True, layout="constrained")
     for axis, (ratio, label) in zip(axes, RATIOS, strict=True):
         for each in results:
@@ -65,8 +65,8 @@ def _curves(results: Sequence[Result], out: Path) -> Path:
             thresholds = np.linspace(1, 2, 101)
             pairs = np.array([confident(right, values, t) for t in thresholds]) * 100
             colour, name = COLOURS[each.edges], EDGES[each.edges]
-            axis.plot(thresholds, pairs[:, 0], color=colour, label=f"{name}: right of kept")
-            axis.plot(thresholds, pairs[:, 1], "--", color=colour, label=f"{name}: kept")
+            axis.plot(thresholds, pairs[:, 0], color=colour, label=f"{name}: correct of accepted")
+            axis.plot(thresholds, pairs[:, 1], "--", color=colour, label=f"{name}: accepted")
         if ratio == "lowe_ratio":
             axis.axvline(LOWE, color="black", lw=0.8)
         axis.set_xlabel(label)

@@ -18,7 +18,7 @@ CONFIDENT = {
     CANNY: ((96.0, 12.1), (99.7, 91.0), (98.6, 85.7), (100, 79.7)),
     SAM: ((95.0, 0.2), (96.4, 89.8), (99.3, 98.6), (100, 67.8)),
 }
-"""Table 3: accuracy and share kept in per cent at Lowe's ratio 1.13, auto-encoder."""
+"""Table 3: accuracy and accepted share in per cent at Lowe's ratio 1.13, auto-encoder."""
 LOWE = 1.13
 
 
@@ -40,5 +40,5 @@ def confident(edges: str, scene: str) -> str:
     row = CONFIDENT.get(stands_for(edges))
     if row is None or scene not in TRAJECTORIES:
         return "-"
-    right, kept = row[TRAJECTORIES.index(scene)]
-    return f"{right:.1f} / {kept:.1f}"
+    right, accepted = row[TRAJECTORIES.index(scene)]
+    return f"{right:.1f} / {accepted:.1f}"

@@ -1,4 +1,4 @@
-"""Result files read back, and the figures that tables and plots are made of."""
+"""Reads result files and computes the figures of tables and plots."""
 
 import json
 import math
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 ACCURACY_M = 15.0
 NEAREST_STRIDES = math.sqrt(0.5)
-"""A position is that of the right tile where it lies within half a tile spacing on each axis."""
-SURE = 0.95
+"""A position names the correct tile if it is within half a tile spacing on each axis."""
+ACCURACY = 0.95
 COLUMNS = {"error_m": 0, "score": 1, "lowe_ratio": 2, "peak_ratio": 3, "confidence": 4}
 Array = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ class Result:
 
     @property
     def edges(self) -> str:
-        """What the method looks at."""
+        """Input of the method, for tables."""
         return str(self.plain["method"]["edges"]).partition(":")[0]
 
     @property
@@ -57,7 +57,7 @@ class Result:
         return numbers(values, math.inf if name == "error_m" else math.nan)
 
     def right(self, placement: str) -> NDArray[np.bool_]:
-        """Which views (N,) lie within 15 m."""
+        """Mask (N,) of the views within 15 m."""
         return self.column(placement, "error_m") <= ACCURACY_M
 
     def accuracy(self, placement: str, radius_m: float = ACCURACY_M) -> float:
@@ -66,7 +66,7 @@ class Result:
         return float((errors <= radius_m).mean()) if errors.size else math.nan
 
     def right_tile(self, placement: str) -> float:
-        """Share of views that were given the tile they lie on, or one as near."""
+        """Share of views whose tile is the nearest one, or as near."""
         return self.accuracy(placement, NEAREST_STRIDES * self.stride_m + 1e-6)
 
 
@@ -88,16 +88,16 @@ def share(errors_m: Sequence[float | None]) -> float:
 
 
 def confident(right: NDArray[np.bool_], ratio: Array, threshold: float) -> tuple[float, float]:
-    """Accuracy among views kept, and the share kept; accuracy NaN where none is kept."""
-    kept = ratio >= threshold
-    return float(right[kept].mean()) if kept.any() else math.nan, float(kept.mean())
+    """Accuracy of the accepted views and the accepted share; accuracy NaN if none is accepted."""
+    accepted = ratio >= threshold
+    return float(right[accepted].mean()) if accepted.any() else math.nan, float(accepted.mean())
 
 
-def kept_at(right: NDArray[np.bool_], ratio: Array, accuracy: float = SURE) -> float:
+def accepted_at(right: NDArray[np.bool_], ratio: Array, accuracy: float = ACCURACY) -> float:
     """Largest share of views that a threshold on `ratio` keeps with at least that accuracy."""
     thresholds = np.unique(ratio[np.isfinite(ratio)])
     pairs = [confident(right, ratio, threshold) for threshold in thresholds]
-    return max((kept for found, kept in pairs if found >= accuracy), default=0.0)
+    return max((accepted for found, accepted in pairs if found >= accuracy), default=0.0)
 
 
 def ceiling(stride_m: float) -> float:

@@ -1,4 +1,4 @@
-"""From scores to a position: the paper's rule beside those of the works it compares with.
+"""Position rules: the paper's and those of the works it compares with.
 
 "We use the position of the reference embedding leading to the highest scalar product, as we
 observed that it yields better results than the weighted average" (section Methodology).

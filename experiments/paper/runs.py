@@ -1,4 +1,4 @@
-"""One method on one trajectory: build the map, place the views, write down all that is asked of it.
+"""One method on one trajectory: build the map, locate the views, write the results.
 
 Everything the tables and plots need is in the file that a run leaves; a run that has its file is
 not run again.
@@ -39,7 +39,7 @@ MB = 1e6
 
 @dataclass(frozen=True)
 class Workplace:
-    """Where results, maps and generated areas lie, and what the run was called with."""
+    """Folders of results, maps and generated areas, and the options of the run."""
 
     out: Path
     setting: Setting
@@ -60,7 +60,7 @@ class Workplace:
 
 
 def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
-    """Build, place, write; what was written. Returns at once what an earlier run has written."""
+    """Result of a run, after building, locating and writing; earlier results are reused."""
     out = place.result(scene, method.key)
     if out.is_file():
         found: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
@@ -82,7 +82,7 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
 
 
 def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, Any]:
-    """What every result file begins with: what was run, on what, with what."""
+    """Header of a result file: method, imagery and settings of the run."""
     return {
         "scene": scene.name,
         "trajectory": asdict(scene.trajectory),
@@ -153,7 +153,7 @@ def _placed(
     grid, frame = localizer.grid, localizer.sheet.frame
     agl_m, gsd_m = scene.trajectory.agl_m, grid.gsd_m
     camera = views.camera_of(agl_m, gsd_m)
-    telemetry = views.told(agl_m, exact=not registration)
+    telemetry = views.telemetry_at(agl_m, exact=not registration)
     times_ms: list[float] = []
 
     def locate(ground: views.Ground, **wrong: float) -> list[float]:
@@ -167,19 +167,19 @@ def _placed(
         evidence = [float(found.evidence.get(name, float("nan"))) for name in EVIDENCE]
         return [float(np.hypot(*error)), *evidence, found.confidence]
 
-    told: dict[str, Any] = {"views": {}, "chance": {}, "sweep": {}}
+    result: dict[str, Any] = {"views": {}, "chance": {}, "sweep": {}}
     seen = dict(placements(scene, localizer, setting.views))
     for name, grounds in seen.items():
-        told["views"][name] = [locate(ground) for ground in grounds]
-        told["chance"][name] = _chance(grounds, localizer.tiles.centres_en_m)
-    told["view_ms"] = statistics.median(times_ms)
+        result["views"][name] = [locate(ground) for ground in grounds]
+        result["chance"][name] = _chance(grounds, localizer.tiles.centres_en_m)
+    result["view_ms"] = statistics.median(times_ms)
     if scene.name == SWEPT_ON:
         count = min(setting.swept, len(seen["grid"]))
         few = [seen["grid"][at] for at in np.linspace(0, len(seen["grid"]) - 1, count, dtype=int)]
         turned = {v: [locate(each, turned_deg=v)[0] for each in few] for v in HEADINGS_DEG}
         lower = {v: [locate(each, drop_m=v)[0] for each in few] for v in DROPS_M}
-        told["sweep"] = {"heading_deg": turned, "drop_m": lower}
-    plain: dict[str, Any] = _without_nan(told)
+        result["sweep"] = {"heading_deg": turned, "drop_m": lower}
+    plain: dict[str, Any] = _without_nan(result)
     return plain
 
 
@@ -208,7 +208,7 @@ def _rules(scene: Scene, opened: MapFile, setting: Setting) -> dict[str, Any]:
     """Positions by each rule, with scalar product and cosine, on the same embeddings."""
     localizer = Localizer(opened, registration=False, flying=False)
     agl_m, gsd_m = scene.trajectory.agl_m, localizer.grid.gsd_m
-    camera, telemetry = views.camera_of(agl_m, gsd_m), views.told(agl_m)
+    camera, telemetry = views.camera_of(agl_m, gsd_m), views.telemetry_at(agl_m)
     made: dict[str, Any] = {}
     for name, grounds in placements(scene, localizer, setting.views):
         seen = [

@@ -56,7 +56,7 @@ class Scene:
 
 
 def generated(setting: Setting, name: str, folder: Path) -> Scene:
-    """A trajectory of Table 1 over a generated area of two dates, made once."""
+    """A trajectory of Table 1 over a generated area of two dates (cached)."""
     trajectory = setting.trajectory(name)
     east_m, north_m = trajectory.imagery_m
     place = folder / f"{name}-{east_m:.0f}x{north_m:.0f}m-{trajectory.gsd_m:g}m"

@@ -1,4 +1,4 @@
-"""Tables 2 and 3 and those beside them, from result files alone."""
+"""Tables 2 and 3 and further tables, from result files alone."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -7,7 +7,7 @@ from pathlib import Path
 from benchmarks.record import Table, number
 
 from experiments.paper import published
-from experiments.paper.results import Result, ceiling, confident, kept_at, read, share
+from experiments.paper.results import Result, accepted_at, ceiling, confident, read, share
 from orthonav.records import CONFIDENT
 
 FAMILIES = {
@@ -26,7 +26,7 @@ EDGES = {
 
 
 def report(out: Path, setting: str) -> Path | None:
-    """Write `tables.md` and the plots beside the result files; None where there are none."""
+    """Write `tables.md` and the plots next to the result files; None without results."""
     folder = out / setting
     results = read(folder)
     if not results:
@@ -55,7 +55,7 @@ def report(out: Path, setting: str) -> Path | None:
 
 def table_2(results: Sequence[Result]) -> list[Table]:
     """Accuracy at 15 m by method and scene, views on the grid and anywhere."""
-    header = ("method", "looks at", "paper", "on grid", "anywhere", "right tile", "of")
+    header = ("method", "input", "paper", "on grid", "anywhere", "right tile", "of")
     tables = []
     for scene, found in _by_scene(results):
         rows = [_table_2_row(each) for each in _best_words(found)]
@@ -89,17 +89,24 @@ def _best_words(found: Sequence[Result]) -> list[Result]:
     """All but the worse ones of several vocabularies: "the best performances will be displayed"."""
     words = [each for each in found if each.family == "bovw"]
     best = max(words, key=lambda each: each.accuracy("grid"), default=None)
-    kept = [each for each in found if each.family != "bovw" or each is best]
+    shown = [each for each in found if each.family != "bovw" or each is best]
     order = list(FAMILIES)
     edges = list(EDGES)
-    return sorted(kept, key=lambda r: (order.index(r.family), r.registration, edges.index(r.edges)))
+    return sorted(
+        shown, key=lambda r: (order.index(r.family), r.registration, edges.index(r.edges))
+    )
 
 
 def table_3(results: Sequence[Result]) -> list[Table]:
-    """The confidence criterion, beside the ratio with an exclusion radius; views on the grid."""
+    """The confidence criterion and the ratio with an exclusion radius; views on the grid."""
     header = (
-        *("scene", "method", "looks at", "paper acc. / kept", "Lowe 1.13: acc. / kept"),
-        *("Lowe: kept at 95 %", "excluding: kept at 95 %", "median Lowe", "median excluding"),
+        *("scene", "method", "input", "paper acc. / accepted", "Lowe 1.13: acc. / accepted"),
+        *(
+            "Lowe: accepted at 95 %",
+            "excluding: accepted at 95 %",
+            "median Lowe",
+            "median excluding",
+        ),
     )
     rows = []
     for scene, found in _by_scene(results):
@@ -110,9 +117,9 @@ def table_3(results: Sequence[Result]) -> list[Table]:
     if not rows:
         return []
     notes = (
-        "accuracy at 15 m of the views kept, and the share kept, in %, views on the grid",
-        "kept at 95 %: the largest share that a threshold keeps with at least 95 % right, chosen "
-        "on these very views; excluding: best score over the best one farther than half a tile",
+        "accuracy at 15 m of the accepted views, and their share, in %, views on the grid",
+        "accepted at 95 %: largest share that a threshold accepts with at least 95 % correct, "
+        "chosen on these very views; excluding: best score over the best one beyond half a tile",
     )
     return [Table("Table 3: confidence criteria", header, rows, notes)]
 
@@ -120,16 +127,16 @@ def table_3(results: Sequence[Result]) -> list[Table]:
 def _table_3_row(scene: str, each: Result) -> list[str]:
     right = each.right("grid")
     lowe, peak = (each.column("grid", name) for name in ("lowe_ratio", "peak_ratio"))
-    found, kept = confident(right, lowe, published.LOWE)
+    found, accepted = confident(right, lowe, published.LOWE)
     paper = published.confident(each.edges, scene) if each.family == "autoencoder" else "-"
-    cells = [percent(kept_at(right, ratio)) for ratio in (lowe, peak)]
+    cells = [percent(accepted_at(right, ratio)) for ratio in (lowe, peak)]
     medians = [f"{_median(ratio):.3f}" for ratio in (lowe, peak)]
-    both = f"{percent(found)} / {percent(kept)}"
+    both = f"{percent(found)} / {percent(accepted)}"
     return [scene, _name(each), EDGES[each.edges], paper, both, *cells, *medians]
 
 
 def choice(results: Sequence[Result]) -> list[Table]:
-    """The paper's best beside orthonav, over imagery that is not the paper's: what to choose."""
+    """The paper's best method and orthonav over other imagery."""
     rows = []
     for scene, found in _by_scene(results):
         shown = [e for e in found if e.family == "gradient" or _is_papers_best(e)]
@@ -138,12 +145,12 @@ def choice(results: Sequence[Result]) -> list[Table]:
     if not rows:
         return []
     header = (
-        *("scene", "method", "looks at", "on grid", "anywhere", "right tile", "criterion"),
-        *("right / kept", "learn s", "MB per km2", "encoder MB", "ms per view"),
+        *("scene", "method", "input", "on grid", "anywhere", "right tile", "criterion"),
+        *("correct / accepted", "learn s", "MB per km2", "encoder MB", "ms per view"),
     )
     notes = (
-        "accuracy at 15 m in %; right tile: of views anywhere; right / kept: of views on the grid, "
-        "those kept by the criterion; ms: one view, one core, from its picture to the fix",
+        "accuracy at 15 m in %; right tile: of views anywhere; correct / accepted: of views on "
+        "the grid, by the criterion; ms: one view, one core, from its picture to the fix",
     )
     return [Table("The paper's best and orthonav on other imagery", header, rows, notes)]
 
@@ -157,11 +164,11 @@ def _choice_row(scene: str, each: Result) -> list[str]:
     name, threshold = (
         ("confidence", CONFIDENT) if each.registration else ("lowe_ratio", published.LOWE)
     )
-    found, kept = confident(right, each.column("grid", name), threshold)
+    found, accepted = confident(right, each.column("grid", name), threshold)
     shares = [each.accuracy("grid"), each.accuracy("anywhere"), each.right_tile("anywhere")]
     criterion = f"confidence {CONFIDENT}" if each.registration else f"Lowe {published.LOWE}"
     figures = [plain["learn_s"], plain["mb_per_km2"], plain["encoder_mb"], plain["view_ms"]]
-    both = f"{percent(found)} / {percent(kept)}"
+    both = f"{percent(found)} / {percent(accepted)}"
     cells = [_name(each), EDGES[each.edges], *map(percent, shares), criterion, both]
     return [scene, *cells, *map(number, figures)]
 
@@ -178,7 +185,7 @@ def rules(results: Sequence[Result]) -> list[Table]:
             shares = [share(each.plain["rules"][placement][name]) for name in names]
             rows.append([f"{_name(each)}, {EDGES[each.edges]}", placement, *map(percent, shares)])
     notes = (
-        "product: embeddings as they come; cosine: the same ones, scaled to length 1. best: the "
+        "product: embeddings without scaling; cosine: the same, scaled to length 1. best: the "
         "paper; weighted: all tiles by score (Bianchi and Barfoot); neighbours: after Couturier "
         "and Akhloufi; peak: orthonav's",
     )
@@ -187,14 +194,14 @@ def rules(results: Sequence[Result]) -> list[Table]:
 
 
 def baselines(results: Sequence[Result], made: Sequence[Result]) -> list[Table]:
-    """Methods that carry the reference images, beside orthonav's rows on the same trajectory."""
+    """Methods that carry the reference images, and orthonav on the same trajectory."""
     rows = []
     for each in results:
-        for name, told in each.plain.get("baselines", {}).items():
-            shares = [share(told["views"][placement]) for placement in ("grid", "anywhere")]
-            count = len(told["views"]["anywhere"])
+        for name, result in each.plain.get("baselines", {}).items():
+            shares = [share(result["views"][placement]) for placement in ("grid", "anywhere")]
+            count = len(result["views"]["anywhere"])
             rows.append(
-                [each.scene, name, *map(percent, shares), str(count), number(told["view_ms"])]
+                [each.scene, name, *map(percent, shares), str(count), number(result["view_ms"])]
             )
     if not rows:
         return []
@@ -206,7 +213,7 @@ def baselines(results: Sequence[Result], made: Sequence[Result]) -> list[Table]:
             ms = number(each.plain["view_ms"])
             rows.append([each.scene, _name(each), *map(percent, shares), str(count), ms])
     header = ("scene", "method", "on grid", "anywhere", "of", "ms per view")
-    notes = ("the baselines carry the orthophoto itself; told pose, whole map, no prior",)
+    notes = ("the baselines carry the orthophoto itself; reported pose, whole map, no prior",)
     return [Table("Related work: accuracy at 15 m, %", header, rows, notes)]
 
 
@@ -220,7 +227,7 @@ def costs(results: Sequence[Result]) -> list[Table]:
             recipe = plain["method"]["recipe"]
             name = f"{recipe}, with registration" if each.registration else recipe
             rows.append([scene, name, EDGES[each.edges], *map(number, figures)])
-    header = ("scene", "method", "looks at", "learn s", "MB per km2", "encoder MB", "ms per view")
+    header = ("scene", "method", "input", "learn s", "MB per km2", "encoder MB", "ms per view")
     notes = (
         "learn s: the encoder, with embedding all tiles; MB per km2: the map file less the encoder "
         "or vocabulary, which it holds once; ms: one view from its picture to the fix",

@@ -11,7 +11,7 @@ from orthonav.geo.routes import presets
 
 TILE_PX = 256
 VIEW_ROOM = 1.5
-"""Ground around a view, in widths of it: turned by up to 45 deg it still lies within."""
+"""Ground around a view, in view widths: it contains the view turned by up to 45 deg."""
 LARGEST_M = 49_500.0
 """A map holds at most 50 km; C's 50 km are cut to this."""
 CONVERGENCE = 0.01
@@ -20,7 +20,7 @@ CONVERGENCE = 0.01
 
 @dataclass(frozen=True)
 class Trajectory:
-    """One column of Table 1, and what the paper leaves open: `gsd_m`, metres per pixel."""
+    """One column of Table 1; it leaves open the ground resolution `gsd_m`, metres per pixel."""
 
     name: str
     agl_m: float
@@ -54,19 +54,24 @@ class Trajectory:
 
 TABLE_1 = {name: Trajectory(*astuple(column)) for name, column in presets.TABLE_1.items()}
 REDUCED_M = {"A": (150, 1), "B": (3000, 300), "C": (5000, 1000), "D": (1000, 1000)}
-"""Length and search band where hours are not to be had."""
+"""Length and search band of the reduced setting."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """How much is run.
+    """Size of the experiments.
 
-    `encoder_width` and `triplet_width` are those of the networks, 320 and 64 in the paper;
-    `encoder_tiles` and `triplet_tiles` how many tiles are shown to them while they learn, None for
-    the paper's 200 epochs. `encoder_rate` is the auto-encoder's learning rate, 3e-4 in the paper;
-    1e-3, that of the authors' released code, where few steps must do. `triplet_more` are further
-    fields of the triplet recipe: with the hardest negatives and plain distances few steps end where
-    all embeddings are one. `views` are flown per placement, `swept` per step of the sensitivity.
+    - `name`: "reduced" or "full".
+    - `encoder_width`, `triplet_width`: widths of the networks, 320 and 64 in the paper.
+    - `encoder_rate`: learning rate of the auto-encoder: 3e-4 in the paper; 1e-3, as in the authors'
+      released code, if there are few steps.
+    - `encoder_tiles`, `triplet_tiles`: tiles shown in training; None: the paper's 200 epochs.
+    - `triplet_batch`: tiles per batch of the triplet network.
+    - `triplet_more`: further fields of the triplet recipe. With the hardest negatives and plain
+      distances, few steps collapse all embeddings to one.
+    - `words`: sizes of the vocabularies.
+    - `views`: views per placement.
+    - `swept`: views per step of the sensitivity.
     """
 
     name: str

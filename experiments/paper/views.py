@@ -24,7 +24,7 @@ SEED = 7
 PLACEMENTS = ("grid", "anywhere")
 NO_EFFECTS = ViewEffects(exposure_std=0.0, blur_px=0.0, noise_std=0.0, jpeg_quality=100)
 HEADING_TOLD_DEG = 0.001
-"""A heading told to be this good is tried as told."""
+"""With this deviation only the reported heading is tried."""
 Array = NDArray[np.float64]
 
 
@@ -87,7 +87,7 @@ def view_of(
     turned_deg: float = 0.0,
     drop_m: float = 0.0,
 ) -> NDArray[np.uint8]:
-    """Grey view (256, 256) from the place, turned and lower than told by so much."""
+    """Grey view (256, 256) from the place, with these errors of heading and height."""
     half_m = ground.rgb.shape[0] * gsd_m / 2
     attitude = (turned_deg, 0.0, 0.0, agl_m - drop_m)
     corner = np.array([-half_m, half_m])
@@ -96,7 +96,7 @@ def view_of(
     return np.asarray(cv2.cvtColor(seen, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
-def told(agl_m: float, *, exact: bool = True) -> Telemetry:
+def telemetry_at(agl_m: float, *, exact: bool = True) -> Telemetry:
     """Telemetry of every view: north up, nominal height; `exact` tries no other heading."""
     std = HEADING_TOLD_DEG if exact else None
     return Telemetry(0, 0.0, 0.0, 0.0, agl_m, yaw_std_deg=std)

@@ -1,4 +1,4 @@
-"""The three ways to transform that are compared give the same scores."""
+"""The three compared transforms give the same scores."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,3 @@ def test_the_libraries_agree(side, view):
     assert set(scores) == {"scipy", "numpy", "OpenCV"}
     for made in scores.values():
         np.testing.assert_allclose(made, scores["scipy"], atol=1e-3 * np.abs(made).max())
-
-
-def test_every_size_has_a_row():
-    section = fft.measure([(24, 8), (30, 10)], repeats=1)
-    assert [row[0] for row in section.tables[0].rows] == ["24 x 24", "30 x 30"]

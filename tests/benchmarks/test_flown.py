@@ -1,6 +1,5 @@
-"""What the benchmarks of flying and of installing rest on, without flying and without an index."""
+"""Looped flights, the fake autopilot, and figures of the benchmarks of flying and installing."""
 
-import csv
 import json
 import math
 import os
@@ -44,7 +43,7 @@ def lap(tmp_path_factory):
     return folder
 
 
-def test_a_lap_is_flown_round_and_round_and_time_goes_on(lap, tmp_path):
+def test_a_lap_repeats_with_continuous_time(lap, tmp_path):
     folder = played(lap, tmp_path / "played", 20, lead_s=3.0)
     flight = open_flight(folder)
     times_s = np.array([view.telemetry.time_ns / 1e9 for view in flight.views])
@@ -61,14 +60,14 @@ def test_every_other_view_from_anywhere(lap, tmp_path):
     assert np.diff(times_s) == pytest.approx(2 * STEP_S, abs=1e-5)
 
 
-def test_a_camera_that_is_started_late_sees_the_rest(lap, tmp_path):
+def test_a_late_start_plays_the_remaining_views(lap, tmp_path):
     folder = played(lap, tmp_path / "played", 10)
     rest = open_flight(rest_of(folder, tmp_path / "rest", 0.35))
     assert [int(view.grey()[0, 0]) for view in rest.views] == [4, 5, 6, 7, 0, 1]
     assert rest.views[0].telemetry.time_ns == pytest.approx(0.4e9)
 
 
-def test_the_stand_in_tells_telemetry_and_arrivals_are_timed(lap, tmp_path):
+def test_the_fake_autopilot_sends_telemetry_and_times_arrivals(lap, tmp_path):
     """A message of the third view, sent 80 ms after its exposure, 3 m south of the truth."""
     folder, port = played(lap, tmp_path / "played", 6, lead_s=0.3), free_port()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours:
@@ -98,7 +97,7 @@ def test_the_stand_in_tells_telemetry_and_arrivals_are_timed(lap, tmp_path):
     assert arrivals.clock_ms[0] == pytest.approx(0, abs=20)
 
 
-def test_a_process_is_watched_until_it_ends(tmp_path, monkeypatch):
+def test_a_process_is_sampled_until_it_ends(tmp_path, monkeypatch):
     core = max(os.sched_getaffinity(0))
     with on_core(core):
         assert os.sched_getaffinity(0) == {core}
@@ -128,7 +127,7 @@ def test_lines_of_a_killed_program_are_read(tmp_path):
     assert Lines.read(tmp_path / "none").health == {}
 
 
-def test_growth_of_memory_is_told_from_its_steps():
+def test_the_slope_separates_growth_of_memory_from_steps():
     hours, rng = np.linspace(0, 1, 1200), np.random.default_rng(0)
     steps = 2 * (np.cumsum(rng.normal(size=1200)) > 0)
     filling = 50 * (1 - np.exp(-hours / 0.03))
@@ -139,36 +138,9 @@ def test_growth_of_memory_is_told_from_its_steps():
     assert spread < 0.5
 
 
-def test_packages_that_are_needed_are_added_up():
+def test_sizes_of_required_packages_add_up():
     names = install.closure(["orthonav[autopilot]"])
     assert {"numpy", "scipy", "pymavlink", "mcap", "zstandard"} <= names
     assert not names & {"torch", "rasterio", "pyproj"}
     assert install.installed_mb(["numpy"]) > 5
     assert install.installed_mb(["orthonav[autopilot]"]) > install.installed_mb(["numpy", "scipy"])
-
-
-@pytest.mark.parametrize(
-    ("wheel", "telemetry"),
-    [
-        ("tqdm-4.70.1-py3-none-any.whl", "pure"),
-        ("lz4-4.4.5-cp311-cp311-manylinux2014_aarch64.manylinux_2_17_aarch64.whl",
-         "cp311, manylinux_2_17"),
-        (None, "NONE"),
-    ],
-)  # fmt: skip
-def test_a_wheel_in_a_word(wheel, telemetry):
-    assert install._kind(wheel) == telemetry
-
-
-@pytest.mark.slow
-def test_samples_become_a_csv_and_a_picture(tmp_path):
-    hours = np.linspace(0.01, 1, 40)
-    samples = [soak.Sample(n * 10**9, 200.0, 210.0, 0.5 * n, 0.0, n) for n in range(40)]
-    nothing = Arrivals(np.zeros(0, int), *np.zeros((3, 0)))
-    lines = Lines.read(tmp_path / "none")
-    soaked = soak.Soaked(100, 3.0, 0, hours, samples, nothing, lines, [5_000_000])
-    with soak._csv(tmp_path / "rss.csv", soaked).open() as stream:
-        rows = list(csv.DictReader(stream))
-    assert len(rows) == 40
-    assert float(rows[-1]["rss_mb"]) == 200
-    assert cv2.imread(str(soak._plot(tmp_path / "rss.png", soaked))) is not None

@@ -8,7 +8,7 @@ import pytest
 from experiments.paper import published, runs, scenes, views
 from experiments.paper.methods import Method, methods
 from experiments.paper.pool import side_by_side
-from experiments.paper.results import ceiling, confident, kept_at, read
+from experiments.paper.results import accepted_at, ceiling, confident, read
 from experiments.paper.tables import report
 from experiments.paper.trajectories import FULL, REDUCED, TABLE_1, epochs
 
@@ -121,7 +121,7 @@ def test_views_show_the_ground_of_the_map_pixel_by_pixel(place, scene, made):
     camera = views.camera_of(SMALL.agl_m, 1.0)
     for ground in seen["grid"]:
         grey = views.view_of(ground, camera, SMALL.agl_m, 1.0)
-        found = localizer.locate(View(grey, camera, views.told(SMALL.agl_m)))
+        found = localizer.locate(View(grey, camera, views.telemetry_at(SMALL.agl_m)))
         error = localizer.sheet.frame.en_from_latlon(found.lat_deg, found.lon_deg)
         assert np.hypot(*(error - ground.truth_en_m)) < 3
         lower = views.view_of(ground, camera, SMALL.agl_m, 1.0, drop_m=200)
@@ -186,8 +186,8 @@ def test_ratios_are_compared_at_equal_accuracy():
     right = np.array([True, True, True, False])
     ratio = np.array([2.0, 1.5, 1.2, 1.1])
     assert confident(right, ratio, 1.13) == (1.0, 0.75)
-    assert kept_at(right, ratio) == 0.75
-    assert kept_at(~right, ratio) == 0.0
+    assert accepted_at(right, ratio) == 0.75
+    assert accepted_at(~right, ratio) == 0.0
     nothing = confident(right, ratio, 9.0)
     assert np.isnan(nothing[0])
     assert nothing[1] == 0

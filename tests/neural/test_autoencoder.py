@@ -1,4 +1,4 @@
-"""The auto-encoder has the paper's layers and size, and learns to draw what it sees."""
+"""The auto-encoder has the paper's layers and size, and its loss is the mean squared error."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_the_encoder_has_four_strided_convolutions_each_normalized_and_rectified
 
 @pytest.mark.parametrize("tile_px", [32, 48, 128])
 @pytest.mark.parametrize("channels", [1, 2])
-def test_every_tile_size_comes_back_as_it_went_in(tile_px, channels):
+def test_a_reconstruction_has_the_size_of_its_tile(tile_px, channels):
     model = AutoEncoder(tile_px=tile_px, channels=channels, width=8, dims=12)
     tiles = torch.rand(3, channels, tile_px, tile_px)
     assert model.encoder(tiles).shape == (3, 12)
@@ -37,7 +37,7 @@ def test_every_tile_size_comes_back_as_it_went_in(tile_px, channels):
 
 
 @pytest.mark.parametrize("bad", [{"tile_px": 16}, {"tile_px": 72}, {"width": 12}, {"dims": 0}])
-def test_impossible_sizes_are_refused(bad):
+def test_invalid_sizes_are_refused(bad):
     with pytest.raises(ValueError, match="must be"):
         AutoEncoder(**{"tile_px": 64, "width": 8, "dims": 8, **bad})
 
@@ -56,7 +56,7 @@ def test_the_loss_is_the_mean_square():
     assert float(loss) == 9
 
 
-def test_the_picture_of_reconstructions_shows_tiles_above_what_is_made_of_them():
+def test_the_picture_shows_tiles_above_their_reconstructions():
     pixels = np.random.default_rng(0).integers(0, 256, (1, 64, 64), dtype=np.uint8)
     tiles = SheetTiles(pixels, np.ones((64, 64), bool), np.array([[0, 0], [32, 32]]), 32)
     model = AutoEncoder(tile_px=32, width=8, dims=8).train()

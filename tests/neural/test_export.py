@@ -1,18 +1,18 @@
-"""What flies computes what was learnt, in fewer bytes where that costs little."""
+"""An exported encoder equals PyTorch, in fewer bytes if that costs little accuracy."""
 
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch", reason="learning needs PyTorch")
-pytest.importorskip("onnx", reason="writing what flies needs ONNX")
-pytest.importorskip("onnxruntime", reason="checking what flies needs onnxruntime")
+torch = pytest.importorskip("torch", reason="training needs PyTorch")
+pytest.importorskip("onnx", reason="the export needs onnx")
+pytest.importorskip("onnxruntime", reason="the check of the export needs onnxruntime")
 
 from torch import nn  # noqa: E402
 
 from orthonav.embed.network import AutoEncoderRecipe, TripletRecipe  # noqa: E402
 from orthonav.neural import export  # noqa: E402
 from orthonav.neural.autoencoder import AutoEncoder  # noqa: E402
-from orthonav.neural.export import ExportError, export_encoder, least_likeness  # noqa: E402
+from orthonav.neural.export import ExportError, export_encoder, least_cosine_between  # noqa: E402
 from orthonav.neural.triplet import ResNet34  # noqa: E402
 
 
@@ -50,13 +50,13 @@ def embedded(encoder, tiles):
 
 @pytest.mark.parametrize("kind", ["autoencoder", "triplet"])
 @pytest.mark.parametrize("tile_px, channels", [(32, 1), (64, 2), (96, 1)])
-def test_it_flies_as_it_was_learnt(kind, tile_px, channels):
+def test_the_export_equals_pytorch(kind, tile_px, channels):
     encoder, recipe = encoder_and_recipe(kind, tile_px, channels)
     tiles = maps(5, tile_px, 7, channels)
     made = export_encoder(encoder, recipe, tiles, tiles)
-    wanted = embedded(encoder, tiles)
+    expected = embedded(encoder, tiles)
     np.testing.assert_allclose(
-        made.embedder.views(tiles), wanted, atol=1e-4 * float(np.abs(wanted).max())
+        made.embedder.views(tiles), expected, atol=1e-4 * float(np.abs(expected).max())
     )
     assert made.precision == "float32"
     assert made.embedder.shape == (channels, tile_px, tile_px)
@@ -64,7 +64,7 @@ def test_it_flies_as_it_was_learnt(kind, tile_px, channels):
 
 @pytest.mark.parametrize("kind", ["autoencoder", "triplet"])
 @pytest.mark.parametrize("precision, most", [("float16", 0.56), ("int8", 0.45)])
-def test_smaller_precisions_are_smaller_and_alike(kind, precision, most):
+def test_reduced_precisions_are_smaller_and_close_to_float32(kind, precision, most):
     encoder, recipe = encoder_and_recipe(kind, 64, precision=precision)
     tiles = maps(6, 64, 7)
     made = export_encoder(encoder, recipe, maps(16, 64, 5), tiles, least_cosine=0.9)
@@ -72,9 +72,9 @@ def test_smaller_precisions_are_smaller_and_alike(kind, precision, most):
     assert made.embedder.recipe == recipe
     assert made.sizes_mb[precision] < most * made.sizes_mb["float32"]
     assert made.embedder.onnx.nbytes / 1e6 == pytest.approx(made.sizes_mb[precision])
-    seen, wanted = made.embedder.views(tiles), embedded(encoder, tiles)
-    assert not np.array_equal(seen, wanted)
-    assert least_likeness(seen, wanted) == pytest.approx(made.cosine[precision], abs=1e-5)
+    seen, expected = made.embedder.views(tiles), embedded(encoder, tiles)
+    assert not np.array_equal(seen, expected)
+    assert least_cosine_between(seen, expected) == pytest.approx(made.cosine[precision], abs=1e-5)
 
 
 def test_the_same_weights_give_the_same_bytes():
@@ -85,7 +85,7 @@ def test_the_same_weights_give_the_same_bytes():
         np.testing.assert_array_equal(first.embedder.onnx, second.embedder.onnx)
 
 
-def test_a_precision_that_costs_too_much_is_not_used():
+def test_a_precision_that_is_too_inaccurate_is_not_used():
     encoder, recipe = encoder_and_recipe("autoencoder", 32, precision="int8")
     tiles = maps(8, 32)
     made = export_encoder(encoder, recipe, tiles, tiles, least_cosine=1.1)
@@ -94,28 +94,28 @@ def test_a_precision_that_costs_too_much_is_not_used():
     assert made.embedder.onnx.nbytes / 1e6 == pytest.approx(made.sizes_mb["float32"])
 
 
-def test_what_differs_from_what_was_learnt_is_an_error(monkeypatch):
-    """A batch norm that is forgotten must not go unseen."""
+def test_an_export_that_differs_from_pytorch_is_an_error(monkeypatch):
+    """A batch norm that is left out must be detected."""
     encoder, recipe = encoder_and_recipe("autoencoder", 32)
-    honest = export._Graph.convolution
+    original = export._Graph.convolution
     monkeypatch.setattr(
         export._Graph,
         "convolution",
-        lambda self, layer, norm, value: honest(self, layer, None, value),
+        lambda self, layer, norm, value: original(self, layer, None, value),
     )
     with pytest.raises(ExportError, match="disagree"):
         export_encoder(encoder, recipe, maps(4, 32), maps(4, 32))
 
 
-@pytest.mark.parametrize("strange", [nn.Sequential(nn.Tanh()), nn.Linear(2, 2)])
-def test_unknown_layers_are_refused(strange):
+@pytest.mark.parametrize("unknown", [nn.Sequential(nn.Tanh()), nn.Linear(2, 2)])
+def test_unknown_layers_are_refused(unknown):
     with pytest.raises(TypeError, match="exported"):
-        export.encoder_graph(strange, (1, 32, 32))
+        export.encoder_graph(unknown, (1, 32, 32))
 
 
-def test_likeness_is_the_least_cosine():
+def test_least_cosine_between_embeddings():
     first = np.array([[1, 0], [0, 0], [3, 3]], np.float32)
     second = np.array([[2, 0], [0, 0], [0, 1]], np.float32)
-    assert least_likeness(first, second) == pytest.approx(np.sqrt(0.5))
-    assert least_likeness(first[:2], second[:2]) == 1
-    assert least_likeness(first[:2], second[1:]) == 0
+    assert least_cosine_between(first, second) == pytest.approx(np.sqrt(0.5))
+    assert least_cosine_between(first[:2], second[:2]) == 1
+    assert least_cosine_between(first[:2], second[1:]) == 0

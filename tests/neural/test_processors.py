@@ -1,4 +1,4 @@
-"""Learning gives right gradients on each kind of processor, and none of them crashes it."""
+"""Training gives correct gradients on each kind of processor and does not crash."""
 
 import json
 import os
@@ -14,7 +14,7 @@ SWITCHES = {
     "this processor": {},
     "AVX2": {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2"},
 }
-"""Environment in which PyTorch and oneDNN use no more than these instructions."""
+"""Environment that limits PyTorch and oneDNN to these instructions."""
 
 LEARN = """
 import json, sys
@@ -66,10 +66,10 @@ print(json.dumps({"worst": worst, "contiguous": list(contiguous)}))
     "name, threads", [("this processor", 1), ("AVX2", 1), ("AVX2", 2)], ids=str
 )
 def test_gradients_do_not_depend_on_the_processor(name, threads):
-    """In a process of its own, which a fault in memory ends or holds up without ending the tests.
+    """Runs in a process of its own, so that a memory fault cannot end the tests.
 
-    Narrow networks, whose short cuts have fewer channels than a block of oneDNN. In the layout
-    `channels_last` a parameter's gradient is wrong by 28 % or more there, or the process crashes.
+    The networks are narrow: their shortcuts have fewer channels than a block of oneDNN. In the
+    layout `channels_last` their gradients are wrong by 28 % or more, or the process crashes.
     """
     done = subprocess.run(
         [sys.executable, "-c", LEARN, str(threads)],

@@ -148,7 +148,7 @@ def original_weights(model):
 
 
 def variant(weights, **parameters):
-    """All masks that the tiny network gives, whatever it thinks of them."""
+    """All masks that the tiny network gives, whatever their expected IoU."""
     chosen = {"grid": 4, "iou": 0.0, "stability": 0.0, "cache": "none", "device": "cpu"}
     return SamBoundaries(str(weights), **(chosen | parameters))
 
@@ -184,7 +184,7 @@ def test_boundaries_of_known_masks():
     assert not boundary_map([], (32, 32)).any()
 
 
-def test_the_border_of_the_picture_is_no_boundary():
+def test_the_border_of_the_picture_is_not_a_boundary():
     assert not boundary_map([np.ones((32, 32), bool)], (32, 32)).any()
     edges = boundary_map([box_mask(0, 0, 32, 12)], (32, 32))
     np.testing.assert_array_equal(edges, box_mask(0, 11, 32, 12))
@@ -223,7 +223,7 @@ def test_fake_network_gives_known_boundaries():
     assert (edges ^ wanted).sum() <= 24
 
 
-def test_points_are_an_even_grid_asked_in_batches():
+def test_points_form_an_even_grid_and_are_sent_in_batches():
     rules = SamBoundaries("somewhere", grid=4, prompts=7)
     predict = fake(THREE, [0.9, 0.9, 0.9])
     list(automatic_masks(predict, (32, 64), 128, rules))
@@ -233,7 +233,7 @@ def test_points_are_an_even_grid_asked_in_batches():
 
 
 @pytest.mark.parametrize("iou, left", [(0.8, 3), (0.92, 2), (0.97, 1), (1.0, 0)])
-def test_masks_that_the_network_doubts_are_dropped(iou, left):
+def test_masks_with_a_low_expected_iou_are_dropped(iou, left):
     rules = SamBoundaries("somewhere", grid=1, iou=iou)
     predict = fake(THREE, [0.95, 0.99, 0.9])
     assert len(list(automatic_masks(predict, (64, 64), 64, rules))) == left
@@ -261,7 +261,7 @@ def test_suppression_keeps_the_best_of_near_duplicates():
     assert suppressed(corners, scores, 1.0) == [2, 1, 0, 3]
 
 
-def test_suppression_is_that_of_opencv():
+def test_suppression_equals_that_of_opencv():
     rng = np.random.default_rng(1)
     first = rng.integers(0, 60, (200, 2))
     corners = np.hstack([first, first + rng.integers(5, 30, (200, 2))])
@@ -273,7 +273,7 @@ def test_suppression_is_that_of_opencv():
 
 
 @pytest.mark.slow
-def test_pixels_are_those_of_the_librarys_processor():
+def test_pixels_equal_those_of_the_librarys_processor():
     processing = pytest.importorskip("transformers.models.sam.image_processing_pil_sam")
     for shape in ((100, 256), (256, 200), (1500, 700)):
         grey = picture(shape)
@@ -296,8 +296,8 @@ def test_gives_a_binary_map(weights):
     assert not np.array_equal(out[0], drawn(variant(weights), picture(seed=1)))
 
 
-def test_predictions_are_the_librarys(weights):
-    """What the parts give for a point is what the whole model gives."""
+def test_predictions_equal_those_of_the_library(weights):
+    """The parts give the same for a point as the whole model."""
     model = transformers.SamModel.from_pretrained(weights)
     grey = picture()
     points = np.array([[10, 20], [40, 30]], np.float32)
@@ -329,13 +329,13 @@ def test_half_precision_is_close(weights, precision):
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (2, 3), (33, 47)])
-def test_any_size_is_taken(weights, shape):
+def test_any_size_is_accepted(weights, shape):
     grey = picture(shape)
     out = variant(weights)(grey, np.ones(shape, bool))
     assert out.shape == (1, *shape) and set(np.unique(out)) <= {0.0, 1.0}
 
 
-def test_masked_area_is_zero_and_says_nothing_of_what_lies_under_it(weights):
+def test_invalid_pixels_are_zero_and_have_no_influence(weights):
     grey = picture()
     valid = np.ones(grey.shape, bool)
     valid[20:, 30:] = False
@@ -346,12 +346,12 @@ def test_masked_area_is_zero_and_says_nothing_of_what_lies_under_it(weights):
     np.testing.assert_array_equal(out, other)
 
 
-def test_nothing_valid_is_zero_without_asking(tmp_path):
+def test_a_picture_without_valid_pixels_does_not_run_the_network(tmp_path):
     out = variant(tmp_path / "none")(picture(), np.zeros((48, 64), bool))
     assert out.shape == (1, 48, 64) and not out.any()
 
 
-def test_large_pictures_are_taken_window_by_window(weights):
+def test_large_pictures_are_cut_into_windows(weights):
     grey = picture((32, 80))
     whole = drawn(variant(weights, window=32), grey)
     parts = [drawn(variant(weights, window=32), grey[:, x : x + 32]) for x in (0, 24, 48)]
@@ -362,14 +362,14 @@ def test_large_pictures_are_taken_window_by_window(weights):
     assert not np.array_equal(whole, drawn(variant(weights, window=0), grey))
 
 
-def test_how_many_masks_are_scaled_at_once_changes_nothing(weights, monkeypatch):
+def test_the_result_does_not_depend_on_the_chunk_size(weights, monkeypatch):
     expected = drawn(variant(weights), picture())
     for pixels in (1, 3 * SIDE * SIDE, 1 << 24):
         monkeypatch.setattr(sam, "_CHUNK_PIXELS", {"cpu": pixels})
         np.testing.assert_array_equal(drawn(variant(weights), picture()), expected)
 
 
-def test_batch_is_one_by_one(weights):
+def test_a_batch_equals_single_calls(weights):
     greys = np.stack([picture(seed=seed) for seed in range(3)])
     valid = np.ones(greys.shape, bool)
     shares = []
@@ -384,7 +384,7 @@ def test_batch_is_one_by_one(weights):
 
 @pytest.fixture
 def asked(monkeypatch):
-    """How often a network was taken up."""
+    """Number of times a network was loaded."""
     calls = []
     real = sam._predictor
     monkeypatch.setattr(sam, "_predictor", lambda *given: calls.append(1) or real(*given))
@@ -400,7 +400,7 @@ def test_second_call_does_not_run_the_network(weights, tmp_path, asked, monkeypa
     assert len(asked) == 1
 
 
-def test_cache_tells_pictures_and_parameters_apart(weights, tmp_path, asked):
+def test_the_cache_distinguishes_pictures_and_parameters(weights, tmp_path, asked):
     cache = {"cache": str(tmp_path)}
     for chosen, grey in [
         (variant(weights, **cache), picture()),
@@ -416,7 +416,7 @@ def test_cache_tells_pictures_and_parameters_apart(weights, tmp_path, asked):
     assert len(asked) == 6
 
 
-def test_cache_tells_weights_apart_but_not_their_place(weights, tmp_path, asked):
+def test_the_cache_distinguishes_weights_but_not_their_path(weights, tmp_path, asked):
     moved = tmp_path / "moved"
     shutil.copytree(weights, moved)
     for place in (weights, moved):
@@ -433,7 +433,7 @@ def test_cache_tells_weights_apart_but_not_their_place(weights, tmp_path, asked)
 @pytest.mark.parametrize(
     "damage", [lambda b: b[:-5], lambda b: b"", lambda b: b[:40] + b"x" + b[41:]]
 )
-def test_damaged_entries_are_made_again(weights, tmp_path, asked, damage, names_in):
+def test_damaged_entries_are_computed_again(weights, tmp_path, asked, damage, names_in):
     chosen = variant(weights, cache=str(tmp_path))
     first = drawn(chosen, picture())
     (entry,) = tmp_path.iterdir()
@@ -444,15 +444,15 @@ def test_damaged_entries_are_made_again(weights, tmp_path, asked, damage, names_
     assert names_in(tmp_path) == [entry.name]
 
 
-def test_a_cache_that_cannot_be_written_costs_no_result(weights, tmp_path, caplog):
+def test_a_cache_that_cannot_be_written_does_not_fail_the_call(weights, tmp_path, caplog):
     blocked = tmp_path / "file"
     blocked.write_text("")
     out = drawn(variant(weights, cache=str(blocked / "below")), picture())
     np.testing.assert_array_equal(out, drawn(variant(weights), picture()))
-    assert "nothing cached" in caplog.text
+    assert "could not write the cache entry" in caplog.text
 
 
-def test_cache_lies_where_the_environment_says(weights, tmp_path, monkeypatch, names_in):
+def test_the_environment_sets_the_cache_folder(weights, tmp_path, monkeypatch, names_in):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
     monkeypatch.delenv("ORTHONAV_CACHE", raising=False)
     drawn(variant(weights, cache=""), picture())
@@ -488,15 +488,15 @@ def test_original_checkpoints_are_read(weights, checkpoint):
 
 
 @pytest.mark.parametrize("size", sorted(SIZES))
-def test_sizes_are_told_by_the_shapes_of_the_weights(size):
+def test_sizes_follow_from_the_shapes_of_the_weights(size):
     expected = transformers.SamConfig(vision_config=transformers.SamVisionConfig(**SIZES[size]))
     with torch.device("meta"):
         original = original_weights(transformers.SamModel(expected))
     made = sam_weights._config(original)
     for part in ("vision_config", "prompt_encoder_config", "mask_decoder_config"):
-        told, wanted = getattr(made, part).to_dict(), getattr(expected, part).to_dict()
-        assert told.pop("global_attn_indexes", []) == list(wanted.pop("global_attn_indexes", []))
-        assert told == wanted
+        found, wanted = getattr(made, part).to_dict(), getattr(expected, part).to_dict()
+        assert found.pop("global_attn_indexes", []) == list(wanted.pop("global_attn_indexes", []))
+        assert found == wanted
 
 
 def test_incomplete_checkpoints_are_refused(checkpoint, tmp_path):
@@ -521,7 +521,7 @@ class Evil:
 @pytest.mark.parametrize(
     "content", [b"", b"no checkpoint", pickle.dumps(Evil(), 2)], ids=["empty", "text", "code"]
 )
-def test_files_that_are_no_checkpoints_are_refused(tmp_path, content):
+def test_files_that_are_not_checkpoints_are_refused(tmp_path, content):
     path = tmp_path / "sam_vit_b.pth"
     path.write_bytes(content)
     with pytest.raises(VariantError, match="cannot read"):
@@ -534,7 +534,7 @@ def test_weights_of_another_model_are_refused(tmp_path):
         drawn(variant(tmp_path), picture())
 
 
-def test_missing_weights_say_where_they_are(tmp_path):
+def test_missing_weights_name_their_source(tmp_path):
     with pytest.raises(MissingFileError, match=r"facebook/sam-vit-base.*fbaipublicfiles"):
         drawn(variant(tmp_path / "none"), picture())
     with pytest.raises(VariantError, match=r"weights=PATH.*facebook/sam-vit-base"):
@@ -571,13 +571,13 @@ def test_defaults_are_those_of_the_original_generator():
         "precision=fp8",
     ],
 )
-def test_impossible_parameters_are_refused(text):
+def test_invalid_parameters_are_refused(text):
     with pytest.raises(VariantError, match=text.partition("=")[0]):
         make_variant(TABLE, f"sam:weights=somewhere,{text}")
 
 
-def test_weights_may_be_named_by_the_machine(weights, monkeypatch):
-    """A map does not say where they lie; whoever replays it does."""
+def test_the_environment_may_name_the_weights(weights, monkeypatch):
+    """A map does not store the path of the weights."""
     monkeypatch.setenv("ORTHONAV_SAM_WEIGHTS", str(weights))
     there = variant("")
     assert there.path == str(weights) and variant(weights).path == str(weights)

@@ -55,7 +55,7 @@ def test_points_and_unit_descriptors(weights):
     assert len(np.unique(points, axis=0)) == len(points)
 
 
-def test_is_what_the_library_says(weights):
+def test_it_equals_the_library(weights):
     """The same points and descriptors as the library's own processor and model give."""
     from transformers.models.superpoint.image_processing_pil_superpoint import (
         SuperPointImageProcessorPil,
@@ -82,7 +82,7 @@ def test_is_what_the_library_says(weights):
 
 
 def test_points_move_with_the_picture(weights):
-    """Moved by a cell of the network, what lies far from the border stays the same."""
+    """A shift by one cell of the network moves the points far from the border by the same."""
     large = picture((128, 136))
     first, at_first = describe(weights, large[:, :128])
     second, at_second = describe(weights, large[:, 8:])
@@ -112,7 +112,7 @@ def test_strongest_points_first(weights):
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (5, 40), (64, 64), (61, 83)])
-def test_any_size_is_taken(weights, shape):
+def test_any_size_is_accepted(weights, shape):
     points, descriptors = describe(weights, picture(shape))
     assert descriptors.shape == (len(points), 256)
     assert (points < np.array(shape)[::-1] - BORDER_PX).all()
@@ -127,7 +127,7 @@ def test_no_keypoints_is_empty(weights, tmp_path):
     assert points.shape == (0, 2) and descriptors.shape == (0, 256)
 
 
-def test_missing_weights_say_where_they_are(tmp_path):
+def test_missing_weights_name_their_source(tmp_path):
     with pytest.raises(MissingFileError, match="magic-leap-community/superpoint"):
         describe(tmp_path / "none", picture())
     with pytest.raises(VariantError, match="weights=PATH"):
@@ -143,7 +143,7 @@ def test_weights_of_another_model_are_refused(weights, tmp_path):
 
 
 def test_incomplete_weights_are_refused(weights, tmp_path):
-    """The library would fill what is missing with random numbers."""
+    """The library would fill missing weights with random numbers."""
     from safetensors.torch import load_file, save_file
 
     shutil.copy(weights / "config.json", tmp_path)
@@ -168,6 +168,6 @@ def test_is_a_frozen_value(weights):
 
 
 @pytest.mark.parametrize("parameters", [{"max_points": -1}, {"device": "tpu"}])
-def test_impossible_parameters_are_refused(parameters):
+def test_invalid_parameters_are_refused(parameters):
     with pytest.raises(VariantError, match=next(iter(parameters))):
         SuperPoint("somewhere", **parameters)

@@ -1,4 +1,4 @@
-"""Tiles are what the sheet shows, nothing more."""
+"""Tiles equal their part of the sheet."""
 
 import time
 
@@ -22,7 +22,7 @@ def sheet(channels=1, **changes):
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_a_tile_is_its_part_of_the_sheet_and_zero_where_not_valid(channels):
+def test_a_tile_equals_its_part_of_the_sheet_and_is_zero_where_invalid(channels):
     tiles = sheet(channels)
     maps = tiles.batch(np.array([2, 1]))
     assert maps.dtype == np.float32
@@ -33,14 +33,14 @@ def test_a_tile_is_its_part_of_the_sheet_and_zero_where_not_valid(channels):
         np.testing.assert_allclose(made, wanted, atol=1e-7)
 
 
-def test_scale_says_what_is_one():
+def test_scale_is_the_value_of_one():
     edges = np.ones((1, 80, 96), np.uint8)
     assert (
         sheet(pixels=edges, scale=1.0, valid=np.ones((80, 96), bool)).batch(np.arange(3)).min() == 1
     )
 
 
-def test_memory_maps_will_do(tmp_path):
+def test_memory_maps_are_accepted(tmp_path):
     tiles = sheet()
     np.save(tmp_path / "pixels.npy", tiles.pixels)
     mapped = np.load(tmp_path / "pixels.npy", mmap_mode="r")
@@ -71,7 +71,7 @@ def test_grey_levels_of_a_tile():
         {"scale": 0.0},
     ],
 )
-def test_what_does_not_fit_is_refused(changes):
+def test_fields_that_do_not_fit_together_are_refused(changes):
     with pytest.raises(ValueError):
         sheet(**changes)
 
@@ -92,7 +92,7 @@ def test_batches_are_shared_among_processes(count, batch, size):
         assert not np.array_equal(np.concatenate(plans[0]), seen)
 
 
-def test_batches_come_in_order_whoever_is_first():
+def test_batches_come_in_order_whichever_thread_is_first():
     plan = [np.array([number]) for number in range(12)]
 
     def make(indices):
@@ -103,7 +103,7 @@ def test_batches_come_in_order_whoever_is_first():
     assert made == [10 * number for number in range(12)]
 
 
-def test_an_error_in_a_thread_comes_out():
+def test_an_error_in_a_thread_is_raised():
     def make(indices):
         raise ValueError("broken tile")
 

@@ -68,11 +68,11 @@ def losses(work):
 
 
 class Killed(Exception):
-    """Stands for what ends a process."""
+    """Stands for a signal that ends the process."""
 
 
 def kill_at(beginning):
-    """A report that ends the learning where what is told begins so; what follows is not written."""
+    """Progress callback that raises `Killed` at the first message that starts with `beginning`."""
 
     def report(text, share):
         if text.startswith(beginning):
@@ -81,20 +81,20 @@ def kill_at(beginning):
     return report
 
 
-def test_the_auto_encoder_learns_to_draw_the_area(tmp_path):
-    told = []
+def test_the_auto_encoder_learns_to_reconstruct_the_area(tmp_path):
+    messages = []
     learn(
         dataclasses.replace(AUTO, epochs=25),
         tmp_path,
         means=RARELY_SAVED,
-        report=lambda text, share: told.append((text, share)),
+        report=lambda text, share: messages.append((text, share)),
     )
     history = losses(tmp_path)
     assert len(history) == 25
     assert history[-1] < 0.3 * history[0]
-    epochs = [share for text, share in told if text.startswith("epoch")]
+    epochs = [share for text, share in messages if text.startswith("epoch")]
     assert epochs == pytest.approx(np.arange(1, 26) / 25)
-    assert "float32" in told[-1][0]
+    assert "float32" in messages[-1][0]
 
 
 def test_the_triplet_network_learns_to_find_a_changed_place(tmp_path):
@@ -117,7 +117,7 @@ def test_the_triplet_network_learns_to_find_a_changed_place(tmp_path):
 
 
 @pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
-def test_a_killed_learning_goes_on_as_if_it_had_not_been(recipe, tmp_path):
+def test_an_interrupted_training_resumes_with_the_same_result(recipe, tmp_path):
     whole = learn(recipe, tmp_path / "whole")
     with pytest.raises(Killed):
         learn(recipe, tmp_path / "killed", report=kill_at("epoch 2 of 3, loss"))
@@ -130,16 +130,14 @@ def test_a_killed_learning_goes_on_as_if_it_had_not_been(recipe, tmp_path):
 
 @pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
 @pytest.mark.parametrize("at", ["epoch 1 of 3, batch 2", "epoch 2 of 3, batch 3"])
-def test_a_learning_killed_within_an_epoch_does_not_begin_it_again(
-    recipe, at, tmp_path, monkeypatch
-):
+def test_a_training_killed_within_an_epoch_resumes_within_it(recipe, at, tmp_path, monkeypatch):
     whole = learn(recipe, tmp_path / "whole")
     monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
     with pytest.raises(Killed):
         learn(recipe, tmp_path / "killed", report=kill_at(at))
-    told = []
-    resumed = learn(recipe, tmp_path / "killed", report=lambda text, share: told.append(text))
-    assert told[0].startswith(at)
+    messages = []
+    resumed = learn(recipe, tmp_path / "killed", report=lambda text, share: messages.append(text))
+    assert messages[0].startswith(at)
     np.testing.assert_array_equal(resumed.onnx, whole.onnx)
     assert losses(tmp_path / "killed") == losses(tmp_path / "whole")
 
@@ -168,32 +166,32 @@ here.learn(here.AUTO, Path(sys.argv[2]))
 """
 
 
-def test_a_kill_in_the_middle_of_writing_leaves_the_checkpoint_before(tmp_path, monkeypatch):
+def test_a_kill_during_a_write_leaves_the_previous_checkpoint(tmp_path, monkeypatch):
     command = [sys.executable, "-c", KILLED, str(Path(__file__).parent), str(tmp_path)]
     assert subprocess.run(command, timeout=60).returncode == -signal.SIGKILL
     assert len(list(tmp_path.glob(".checkpoint*"))) == 1
     monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
-    told = []
-    learn(AUTO, tmp_path, report=lambda text, share: told.append(text))
-    assert told[0].startswith("epoch 2 of 3, batch 2 of 4")  # five were written
+    messages = []
+    learn(AUTO, tmp_path, report=lambda text, share: messages.append(text))
+    assert messages[0].startswith("epoch 2 of 3, batch 2 of 4")  # five were written
     assert not list(tmp_path.glob(".*"))
     alone = tmp_path / "alone"
     learn(AUTO, alone)
     np.testing.assert_allclose(losses(tmp_path), losses(alone), rtol=1e-4)
 
 
-def test_long_epochs_tell_how_far_they_are(monkeypatch):
+def test_long_epochs_report_progress(monkeypatch):
     monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
-    told = []
-    learn(AUTO, report=lambda text, share: told.append((text, share)))
-    assert [text.partition(", loss")[0] for text, _ in told[:5]] == [
+    messages = []
+    learn(AUTO, report=lambda text, share: messages.append((text, share)))
+    assert [text.partition(", loss")[0] for text, _ in messages[:5]] == [
         "epoch 1 of 3, batch 1 of 4",
         "epoch 1 of 3, batch 2 of 4",
         "epoch 1 of 3, batch 3 of 4",
         "epoch 1 of 3",
         "epoch 2 of 3, batch 1 of 4",
     ]
-    assert [share for _, share in told[:12]] == pytest.approx(np.arange(1, 13) / 12)
+    assert [share for _, share in messages[:12]] == pytest.approx(np.arange(1, 13) / 12)
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not():
@@ -202,7 +200,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not():
     assert not np.array_equal(first, other)
 
 
-def test_callers_randomness_is_left_alone():
+def test_the_callers_random_state_is_unchanged():
     torch.manual_seed(5)
     wanted = torch.rand(3)
     torch.manual_seed(5)
@@ -242,7 +240,7 @@ def test_the_curve_falls_where_the_loss_does():
 
 
 @pytest.mark.parametrize("change", ["recipe", "seed", "tiles"])
-def test_a_folder_of_another_learning_is_refused(change, tmp_path):
+def test_a_folder_of_another_training_is_refused(change, tmp_path):
     learn(dataclasses.replace(AUTO, epochs=1), tmp_path)
     before = (tmp_path / "checkpoint.pt").read_bytes()
     changes = {
@@ -251,33 +249,35 @@ def test_a_folder_of_another_learning_is_refused(change, tmp_path):
         "tiles": {"tiles": sheet(ground(7))},
     }
     given = {"recipe": dataclasses.replace(AUTO, epochs=1), "work": tmp_path, **changes[change]}
-    with pytest.raises(OutputError, match="something else"):
+    with pytest.raises(OutputError, match="another training"):
         learn(**given)
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
 
 
-def test_what_was_learnt_can_be_had_in_another_precision(tmp_path):
+def test_a_finished_training_is_exported_in_another_precision(tmp_path):
     plain = learn(AUTO, tmp_path)
-    told = []
+    messages = []
     small = learn(
         dataclasses.replace(AUTO, precision="float16"),
         tmp_path,
-        report=lambda text, share: told.append(text),
+        report=lambda text, share: messages.append(text),
     )
-    assert len(told) == 2 and told[1].startswith("export: float16")  # nothing was learnt again
+    assert len(messages) == 2 and messages[1].startswith(
+        "export: float16"
+    )  # nothing was trained again
     assert small.recipe.precision == "float16" and small.onnx.nbytes < 0.6 * plain.onnx.nbytes
 
 
-def test_a_folder_learnt_with_other_dates_is_refused(tmp_path):
+def test_a_folder_trained_with_other_dates_is_refused(tmp_path):
     recipe = dataclasses.replace(TRIPLET, epochs=1)
     given = {"binary": False, "seed": 0, "work": tmp_path, "means": QUICK}
     learn_network(recipe, sheet(), positive=[sheet(ground(1))], **given)
     learn_network(recipe, sheet(), positive=[sheet(ground(1))], **given)
-    with pytest.raises(OutputError, match="something else"):
+    with pytest.raises(OutputError, match="another training"):
         learn_network(recipe, sheet(), positive=[sheet(ground(2))], **given)
 
 
-def test_a_broken_checkpoint_is_refused_and_nothing_in_it_is_run(tmp_path):
+def test_a_broken_checkpoint_is_refused_and_runs_no_code(tmp_path):
     (tmp_path / "checkpoint.pt").write_bytes(b"broken")
     with pytest.raises(OutputError, match="cannot be read"):
         learn(AUTO, tmp_path)
@@ -286,7 +286,7 @@ def test_a_broken_checkpoint_is_refused_and_nothing_in_it_is_run(tmp_path):
         learn(AUTO, tmp_path)
 
 
-def test_a_loss_that_is_no_number_ends_the_learning():
+def test_a_loss_that_is_not_finite_ends_the_training():
     with pytest.raises(TrainingError, match="learning_rate"):
         learn_network(
             TRIPLET,
@@ -304,7 +304,7 @@ def test_triplets_need_positives():
         learn_network(TRIPLET, sheet(), binary=False, seed=0, work=None, means=QUICK)
 
 
-def test_fast_means_learn_the_same_up_to_rounding(tmp_path):
+def test_fast_options_give_the_same_result_up_to_rounding(tmp_path):
     recipe = dataclasses.replace(AUTO, epochs=8)
     plain = Means(bf16=False, fused=False, keep_memory=False, device="cpu")
     fast = dataclasses.replace(QUICK, bf16=True)
@@ -350,7 +350,7 @@ torch.distributed.destroy_process_group()
 
 @pytest.mark.slow
 def test_two_processes_learn_one_network(tmp_path):
-    """Started as torchrun starts them; each writes the network it ends with."""
+    """Started as torchrun starts them; each writes its final network."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

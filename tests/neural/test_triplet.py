@@ -1,4 +1,4 @@
-"""The triplet network is the paper's ResNet34; loss and mining are what a slow loop gives."""
+"""The triplet network is the paper's ResNet34; loss and mining equal those of a slow loop."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_channels_are_averaged_over_the_left_and_the_right_half(tile_px):
 
 
 @pytest.mark.parametrize("bad", [{"tile_px": 31}, {"width": 0}, {"channels": 0}])
-def test_impossible_sizes_are_refused(bad):
+def test_invalid_sizes_are_refused(bad):
     with pytest.raises(ValueError, match="at least 32 px"):
         ResNet34(**{"tile_px": 64, "width": 1, **bad})
 
@@ -58,7 +58,7 @@ def slow_loss(anchors, positives, apart, margin, semi_hard):
 
 @pytest.mark.parametrize("semi_hard", [False, True])
 @pytest.mark.parametrize("seed", range(4))
-def test_the_loss_is_that_of_the_formula(seed, semi_hard):
+def test_the_loss_equals_the_formula(seed, semi_hard):
     anchors, positives, apart = batch(seed)
     tensors = [torch.from_numpy(values) for values in (anchors, positives, apart)]
     for margin in (0.2, 5.0):
@@ -75,7 +75,7 @@ def test_hardest_and_semi_hard_differ():
     assert hard_negatives(anchors, near, apart, semi_hard=True)[0] == 2
 
 
-def test_places_that_are_not_apart_are_no_negatives():
+def test_places_that_are_not_apart_are_not_negatives():
     vectors = torch.rand(4, 3, requires_grad=True)
     apart = torch.zeros(4, 4, dtype=torch.bool)
     loss = triplet_loss(vectors, vectors + 1, apart, margin=1.0, semi_hard=False)
@@ -96,7 +96,7 @@ def task(positive, chunk=64, **recipe):
     return Triplets(TripletRecipe(width=1, **recipe), sheet(), positive, seed=3, chunk=chunk)
 
 
-def test_positives_follow_from_seed_epoch_and_tile_alone():
+def test_positives_depend_on_seed_epoch_and_tile_only():
     noisy = task(lambda rng, grey: rng.integers(0, 256, grey.shape, dtype=np.uint8))
     both, _ = noisy.arrays(0, np.array([4, 1]))
     again, _ = noisy.arrays(0, np.array([0, 1, 4]))
@@ -119,7 +119,7 @@ def test_positives_may_be_another_date_or_a_representation():
         task(lambda rng, grey: grey[1:]).arrays(0, np.arange(3))
 
 
-def test_neighbours_that_overlap_nearly_wholly_are_not_apart():
+def test_neighbours_with_a_large_overlap_are_not_apart():
     _, apart = task([sheet()], apart=0.5).arrays(0, np.array([0, 1, 3]))
     assert apart.tolist() == [[False, False, True], [False, False, True], [True, True, False]]
     _, apart = task([sheet()], apart=0.0).arrays(0, np.array([2, 2, 3]))
@@ -128,7 +128,7 @@ def test_neighbours_that_overlap_nearly_wholly_are_not_apart():
 
 @pytest.mark.parametrize("similarity", ["product", "cosine"])
 def test_a_batch_in_chunks_has_the_gradients_of_the_whole(similarity):
-    """With batch norms at rest, for those are taken over chunks."""
+    """With batch norms in evaluation mode: in training they use chunks."""
     gradients = []
     for chunk in (64, 4):
         one = task([sheet()], chunk, similarity=similarity)

@@ -1,5 +1,5 @@
 #!/bin/sh
-# orthonav on 64-bit ARM, emulated by QEMU: what is needed and what it shows, see README.md here.
+# orthonav on 64-bit ARM, emulated by QEMU; see README.md here.
 #     tools/arm64/run.sh WORK [fixes|fly|tests|rebuild|python] [arguments]
 # WORK is a folder for the Debian files and the wheels (600 MB), made on the first run.
 set -eu

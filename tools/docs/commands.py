@@ -1,4 +1,4 @@
-"""The directive `{command} NAME`: what `orthonav NAME --help` tells, as a part of a page.
+"""The directive `{command} NAME`: the output of `orthonav NAME --help` as a part of a page.
 
 Written from the argparse parsers themselves, so that it cannot differ from the program. A command
 that no page describes is a warning.
@@ -22,7 +22,7 @@ USAGE_COLUMNS = 84
 
 
 def setup(app: Any) -> dict[str, bool]:
-    """Tell Sphinx of the directive."""
+    """Register the directive with Sphinx."""
     app.add_directive("command", Command)
     app.connect("env-check-consistency", _all_described)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -26,7 +26,7 @@ NOT_RUN = "<!-- not run -->"
 ELIDED = "..."
 MARK = "@@ step"
 VERDICTS = (0, 3, 4)
-"""What `orthonav check` ends with, beside errors: go, marginal, no-go."""
+"""Exit codes of `orthonav check` other than errors: go, marginal, no-go."""
 LIMIT_S = 1800
 
 
@@ -169,7 +169,7 @@ def masked(line: str) -> str:
 
 
 def check_page(page: Path, folder: Path, steps: list[Step] | None = None) -> list[str]:
-    """Run a tutorial in a folder; one message for each step that did not print what is shown.
+    """Run a tutorial in a folder; one message for each step whose output differs from the page.
 
     The folder stands for one inside the checkout: links to what a tutorial uses of the checkout
     are made beside it.
@@ -195,10 +195,10 @@ def update_page(page: Path, folder: Path) -> None:
 
 
 def main() -> int:
-    """Run or update pages; 1 where the output differs from what is shown."""
+    """Run or update pages; 1 if the output differs from the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("page", type=Path)
-    parser.add_argument("--update", action="store_true", help="write what is printed into the page")
+    parser.add_argument("--update", action="store_true", help="write the output into the page")
     parser.add_argument("--folder", type=Path, help="default: a temporary one")
     options = parser.parse_args()
     with contextlib.ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""Leaves out pictures that could not be made, such as those that need a browser.
+"""Leaves out pictures that do not exist, such as those that need a browser.
 
 `tools/docs/pictures.py` makes all pictures; these few it may do without. A page that shows any
 other picture that is not there does not build.
@@ -13,7 +13,7 @@ LINE = re.compile(r"^!\[[^\]]*\]\([^)]*pictures/([\w.-]+)\)\n", re.MULTILINE)
 
 
 def setup(app: Any) -> dict[str, bool]:
-    """Tell Sphinx what to do as it reads a page."""
+    """Connect the extension to Sphinx."""
     app.connect("source-read", _leave_out)
     return {"parallel_read_safe": True}
 
@@ -21,8 +21,8 @@ def setup(app: Any) -> dict[str, bool]:
 def _leave_out(app: Any, _docname: str, source: list[str]) -> None:
     folder = Path(app.srcdir) / "pictures"
 
-    def kept(found: re.Match[str]) -> str:
+    def replaced(found: re.Match[str]) -> str:
         is_missing = found[1] in OPTIONAL and not (folder / found[1]).is_file()
         return "" if is_missing else found[0]
 
-    source[0] = LINE.sub(kept, source[0])
+    source[0] = LINE.sub(replaced, source[0])

@@ -43,7 +43,7 @@ MADE_FROM = "made_from.txt"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 PAST, PRESENT = "area/2016-07.tif", "area/2021-10.tif"
 SHOWN_EN_PX = (560, 300, 640)
-"""What of the area is shown of two dates: column, row and side."""
+"""Part of the area shown for two dates: column, row and side."""
 TILE_EN_PX = (690, 420, 256)
 """The tile whose representations are shown."""
 WINDOW_M, ZOOM_M = 460.0, 36.0
@@ -54,7 +54,7 @@ OPTIONS: dict[str, dict[str, Any]] = {"jpg": {"quality": 88, "optimize": True}, 
 
 
 def main() -> int:
-    """Make what is out of date."""
+    """Make the pictures that are out of date."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--force", action="store_true", help="make them in any case")
     options = parser.parse_args()
@@ -80,7 +80,7 @@ def main() -> int:
 
 
 def _digest(steps: list[Step]) -> str:
-    """What the pictures are made from, in one word."""
+    """Digest of the sources of the pictures."""
     made = hashlib.sha256(json.dumps([[step.command, step.shown] for step in steps]).encode())
     sources = [*ROOT.glob("src/orthonav/**/*"), *Path(__file__).parent.glob("*.py")]
     for path in sorted(sources):
@@ -241,7 +241,7 @@ def _photograph(folder: Path) -> None:
 
 
 def _shoot(browser: str, address: str, out: Path, size_px: tuple[int, int]) -> None:
-    """A picture of a page; a browser that fails costs the picture, not the site."""
+    """A picture of a page; if the browser fails, the site is built without it."""
     with tempfile.TemporaryDirectory() as profile:
         command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
         command += [f"--user-data-dir={profile}", f"--window-size={size_px[0]},{size_px[1]}"]

@@ -1,7 +1,7 @@
 """Compares the fixes of this machine with stored ones, made on another.
 
     python tools/platforms/fixes.py                          # of the stored map and flight
-    python tools/platforms/fixes.py --rebuild                # the map built anew here (extra geo)
+    python tools/platforms/fixes.py --rebuild                # builds the map here (extra geo)
     python tools/platforms/fixes.py --map M.onav --flight F --out here.json
     python tools/platforms/fixes.py --map M.onav --flight F --against there.json
 
@@ -202,8 +202,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--run", nargs="+", choices=RUNS, default=RUNS, help="default: all")
     parser.add_argument("--out", type=Path, help="write this machine's fixes to this file")
     parser.add_argument("--against", type=Path, help="fixes that --out wrote on another machine")
-    parser.add_argument("--rebuild", action="store_true", help="build the stored map anew, here")
-    parser.add_argument("--make", action="store_true", help="replace what is stored")
+    parser.add_argument(
+        "--rebuild", action="store_true", help="build the stored map again on this machine"
+    )
+    parser.add_argument("--make", action="store_true", help="replace the stored files")
     return parser
 
 

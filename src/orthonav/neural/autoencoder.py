@@ -8,7 +8,7 @@ inputs are binary maps, a sigmoid is added to the last layer of the Decoder. The
 
 The text leaves kernels and widths open. Four strides of 2 turn 256 px into 16 x 16 cells of W
 channels; the dense layers from and to 1024 numbers hold 2 * 256 W * 1024 parameters, nearly all
-there are, so the count says that W is about 320. With W = 320, widths doubling from W / 8, and
+there are, so the count implies W of about 320. With W = 320, widths doubling from W / 8, and
 kernels of 4 px (a multiple of the stride, so that transposed convolutions leave no chequered
 pattern) there are 170,009,425 parameters, 1.4 % less than the paper's. No kernels of 2 to 9 px with
 widths that are multiples of 8, growing in the usual ways, give its count exactly.
@@ -29,11 +29,11 @@ KERNEL_PX, STRIDE_PX, PADDING_PX = 4, 2, 1
 LAYERS = 4
 SHOWN_TILES = 6
 SLOPE = 0.2
-"""Of LeakyReLU below zero; the paper names none, this one is usual with strided convolutions."""
+"""Slope of LeakyReLU below zero: usual with strided convolutions; the paper gives none."""
 
 
 class AutoEncoder(nn.Module):
-    """Auto-encoder for tiles (N, C, S, S) of `tile_px` S; `encoder` alone is what flies.
+    """Auto-encoder for tiles (N, C, S, S) of `tile_px` S; only `encoder` flies.
 
     `width` is the number of channels before the dense layer, a multiple of 8. `binary` adds the
     sigmoid. Raises `ValueError` for a tile that four strides of 2 do not divide, or below 32 px.
@@ -72,7 +72,7 @@ class AutoEncoder(nn.Module):
             nn.Linear(dims, width * side**2),
             nn.Unflatten(1, (width, side, side)),
             *(layer for pair in pairwise(back) for layer in _up(*pair)),
-            # The picture itself: normalized or rectified, it could not take all values.
+            # No norm and no rectifier at the output: it must reach all pixel values.
             nn.ConvTranspose2d(back[-1], channels, KERNEL_PX, STRIDE_PX, PADDING_PX),
         )
 
@@ -114,7 +114,7 @@ class Reconstruction:
 
 
 def reconstructions(model: AutoEncoder, tiles: SheetTiles) -> NDArray[np.uint8]:
-    """Some tiles above what the auto-encoder makes of them, (2S, K * S), of the first channel."""
+    """Some tiles above their reconstructions, (2S, K * S), first channel."""
     indices = np.unique(np.linspace(0, len(tiles) - 1, SHOWN_TILES).astype(np.intp))
     maps = torch.from_numpy(tiles.batch(indices))
     was_training = model.training

@@ -1,6 +1,6 @@
-"""What changes while a network learns, kept in a folder so that a learning that was killed goes on.
+"""Training state and its checkpoints: an interrupted training resumes from its folder.
 
-Checkpoints and pictures are written whole or not at all, between batches and after epochs.
+Checkpoints and pictures are written atomically, between batches and after epochs.
 """
 
 import dataclasses
@@ -28,19 +28,19 @@ from orthonav.neural.tiles import SheetTiles
 PLATEAU_FACTOR = 0.5
 SHOWN_EPOCHS = (1, 2, 5, 10, 20, 50)
 SHOWN_AFTER_S = (10.0, 60.0)
-"""When pictures are written though no checkpoint is due: early, to see whether it learns at all."""
+"""Early times at which pictures are written although no checkpoint is due, seconds."""
 
 Recipe = AutoEncoderRecipe | TripletRecipe
 
 
 class TrainingError(OrthonavError, RuntimeError):
-    """Learning went wrong: the loss is no longer a number."""
+    """The loss is not finite."""
 
 
-class State:
-    """What changes while learning: weights, optimizer, rate, and the losses so far.
+class TrainingState:
+    """State of a training: weights, optimizer, learning rate and losses.
 
-    `history` holds the mean loss of each epoch, `losses` those of the batches since.
+    `history` holds the mean loss of each epoch, `losses` those of the batches of the current epoch.
     """
 
     def __init__(self, model: nn.Module, recipe: Recipe, *, fused: bool) -> None:
@@ -58,10 +58,10 @@ class State:
         self.losses: list[Tensor] = []
 
     def end_epoch(self, loss: float) -> None:
-        """Keep the mean loss and lower the rate on a plateau; raises `TrainingError`."""
+        """Store the mean loss and lower the rate on a plateau; raises `TrainingError`."""
         if not math.isfinite(loss):
             raise TrainingError(
-                f"loss is {loss} in epoch {len(self.history) + 1}: take a smaller learning_rate"
+                f"loss is {loss} in epoch {len(self.history) + 1}: use a smaller learning_rate"
             )
         self.history.append(loss)
         self.losses = []
@@ -69,7 +69,7 @@ class State:
             self.plateau.step(loss)
 
     def parts(self) -> dict[str, Any]:
-        """All of it, as a checkpoint holds it."""
+        """The state as a dictionary, for a checkpoint."""
         return {
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -79,25 +79,25 @@ class State:
         }
 
     def take(self, parts: dict[str, Any]) -> None:
-        """Go on from what `parts` gave."""
+        """Restore the state from `parts`."""
         self.model.load_state_dict(parts["model"])
         self.optimizer.load_state_dict(parts["optimizer"])
         if self.plateau is not None:
             self.plateau.load_state_dict(parts["plateau"])
         self.history = list(parts["history"])
-        self.losses = list(parts.get("losses", []))  # older ones were written after epochs only
+        self.losses = list(parts.get("losses", []))  # absent in older checkpoints
 
 
-class Store:
-    """Checkpoints and pictures of one learning in a folder, or nowhere."""
+class CheckpointStore:
+    """Writes checkpoints and pictures of one training to a folder."""
 
     def __init__(self, work: Path | None, fingerprint: str, every_s: float) -> None:
         self._work, self._fingerprint, self._every_s = work, fingerprint, every_s
         self._saved_s = self._began_s = time.monotonic()
         self._early_s = list(SHOWN_AFTER_S)
 
-    def load(self, state: State, device: torch.device) -> None:
-        """Take the checkpoint, if there is one; raises `OutputError` if it is another's."""
+    def load(self, state: TrainingState, device: torch.device) -> None:
+        """Restore any checkpoint; raises `OutputError` if it belongs to another training."""
         path = None if self._work is None else self._work / "checkpoint.pt"
         if path is None or not path.exists():
             return
@@ -105,31 +105,31 @@ class Store:
             found = torch.load(path, map_location=device, weights_only=True)
             same = found.pop("fingerprint") == self._fingerprint
         except Exception as error:
-            # Unpickling fails in as many ways as there are broken files.
-            raise OutputError(f"checkpoint cannot be read; remove it: {path}") from error
+            # Unpickling a broken file may raise any exception.
+            raise OutputError(f"checkpoint cannot be read; delete it: {path}") from error
         if not same:
-            raise OutputError(f"folder holds a learning of something else; name another: {path}")
+            raise OutputError(f"folder holds another training; choose another folder: {path}")
         state.take(found)
 
     def clear(self) -> None:
-        """Remove what kills while writing have left, which may be gigabytes."""
+        """Remove temporary files of interrupted writes, which may hold gigabytes."""
         for left in self._work.glob(".checkpoint.pt.*.tmp.pt") if self._work else ():
             left.unlink(missing_ok=True)
 
-    def after_batch(self, state: State, tiles: SheetTiles) -> None:
-        """Write a checkpoint if it is time, and pictures then and early on."""
+    def after_batch(self, state: TrainingState, tiles: SheetTiles) -> None:
+        """Write a checkpoint if one is due; write pictures with it, and early in the training."""
         now_s = time.monotonic()
         early = bool(self._early_s) and now_s - self._began_s >= self._early_s[0]
         if early:
             self._early_s.pop(0)
         self._write(state, tiles, due=now_s - self._saved_s >= self._every_s, shown=early)
 
-    def after_epoch(self, state: State, tiles: SheetTiles, *, last: bool) -> None:
-        """The same after an epoch; always after the last one."""
+    def after_epoch(self, state: TrainingState, tiles: SheetTiles, *, last: bool) -> None:
+        """Write a checkpoint if one is due, and always after the last epoch."""
         due = last or time.monotonic() - self._saved_s >= self._every_s
         self._write(state, tiles, due=due, shown=len(state.history) in SHOWN_EPOCHS)
 
-    def _write(self, state: State, tiles: SheetTiles, *, due: bool, shown: bool) -> None:
+    def _write(self, state: TrainingState, tiles: SheetTiles, *, due: bool, shown: bool) -> None:
         if self._work is None or not (due or shown):
             return
         if due:
@@ -146,9 +146,9 @@ class Store:
 
 
 def loss_picture(history: Sequence[float], unit: str = "epoch") -> NDArray[np.uint8]:
-    """Losses of all epochs (360, 640, 3), logarithmic, with the first, least and last told.
+    """Plot (360, 640, 3) of the losses, logarithmic; its title gives the first, least and last one.
 
-    `unit`: what there is a loss of. Without any, or with one that is no number, there is no curve.
+    `unit`: "epoch" or "batch". The plot is blank without losses or if one of them is not finite.
     """
     picture = np.full((360, 640, 3), 255, np.uint8)
     if not history or not np.isfinite(history).all():
@@ -177,16 +177,16 @@ def fingerprint(
     means: Means,
     world: World,
 ) -> str:
-    """What must be the same for a checkpoint to be this learning's; `dates` are other sheets."""
+    """Key of a training: a checkpoint with another key is refused; `dates` are other sheets."""
     some = np.unique(np.linspace(0, len(tiles) - 1, 64).astype(np.intp))
     where = np.ascontiguousarray(tiles.tiles_px, dtype=np.int64).tobytes()
-    learnt = dataclasses.asdict(recipe) | {"precision": "float32"}  # chosen once it is learnt
-    told: dict[str, Any] = {
+    learnt = dataclasses.asdict(recipe) | {"precision": "float32"}  # chosen after training
+    key: dict[str, Any] = {
         "recipe": [type(recipe).__name__, learnt],
         "tiles": [zlib.crc32(where), zlib.crc32(tiles.batch(some).tobytes()), tiles.tile_px],
         "seed": seed,
         "means": [means.bf16, means.chunk, world.size],
     }
     if dates:
-        told["dates"] = [zlib.crc32(date.batch(some).tobytes()) for date in dates]
-    return json.dumps(told, sort_keys=True)
+        key["dates"] = [zlib.crc32(date.batch(some).tobytes()) for date in dates]
+    return json.dumps(key, sort_keys=True)

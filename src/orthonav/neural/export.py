@@ -1,7 +1,9 @@
-"""From a learnt encoder to the ONNX bytes that fly, checked against PyTorch and made smaller.
+"""Exports a trained encoder to ONNX, checks it against PyTorch and reduces its precision.
 
-The graph is written layer by layer rather than traced, with each batch norm folded into the
-convolution before it: it holds plain layers only, and the same weights give the same bytes.
+The graph is written layer by layer, with each batch norm folded into the convolution before it. It
+holds plain layers only, and the same weights give the same bytes. `torch.onnx.export` without
+dynamo does not replace this (PyTorch 2.13): it is deprecated, refuses the adaptive pooling of
+features with an odd side (tiles of 32 and 96 px), and names weights by internal counters.
 """
 
 import dataclasses
@@ -21,24 +23,24 @@ from orthonav.extras import needed
 from orthonav.neural.triplet import BasicBlock, ResNet34
 
 OPSET, IR_VERSION = 17, 8
-"""Old enough for any onnxruntime since 2022."""
+"""Supported by every onnxruntime since 2022."""
 FLOAT_TOLERANCE = 1e-3
-"""Largest difference between ONNX and PyTorch, in units of the largest number of an embedding."""
+"""Largest accepted difference between ONNX and PyTorch, relative to the largest embedding value."""
 LEAST_COSINE = {"float32": 0.99999, "float16": 0.9999, "int8": 0.97}
-"""Below it between the embeddings of what flies and of float32, a precision is not used.
+"""Smallest accepted cosine between embeddings in a precision and in PyTorch float32.
 
-Of the least over the tiles held out, so that the mean is above it too. 256 px, one tile at a time,
-onnxruntime 1.31 with one thread of an AMD EPYC with AVX-512 VNNI, processor time; the triplet
-network's cosines are of tiles of another date:
+It holds for every held-out tile. Measured on 256 px, one tile at a time, onnxruntime 1.31, one
+thread of an AMD EPYC with AVX-512 VNNI, processor time; the triplet network on tiles of another
+date:
 
     auto-encoder, width 32   float32 33.6 MB 1.8 ms   float16 16.8 MB 1.9 ms, cosine 1.0000
                                                       int8     8.4 MB 0.7 ms, least 0.9990
     triplet, width 16        float32  5.3 MB 5.8 ms   float16  2.7 MB 6.0 ms, cosine 1.0000
                                                       int8     1.4 MB 2.9 ms, least 0.986
 
-float16 halves the file and saves no time: weights are turned back when it is loaded. Where a
-processor lacks 8-bit products, int8 saves only the file. `python -m benchmarks.training --only
-precisions` measures the first of these again.
+float16 halves the file and saves no time: weights are converted back when it is loaded. On
+processors without 8-bit products, int8 only reduces the file. `python -m benchmarks.training --only
+precisions` measures the auto-encoder.
 """
 CALIBRATION_BATCH = 8
 
@@ -46,16 +48,18 @@ Array = NDArray[np.float32]
 
 
 class ExportError(OrthonavError, RuntimeError):
-    """What was written does not compute what was learnt."""
+    """The ONNX graph and the PyTorch encoder disagree."""
 
 
 @dataclass(frozen=True, eq=False)
 class Exported:
-    """An encoder ready to fly.
+    """An exported encoder.
 
-    `embedder`; `precision` it has, which is "float32" where less was not good enough; `cosine`,
-    the least between its embeddings of tiles and those of float32, by precision tried, of which
-    `least_cosine` was asked; `sizes_mb` by precision tried.
+    - `embedder`: the ONNX embedder.
+    - `precision`: its precision; "float32" if the recipe's precision was not accurate enough.
+    - `cosine`: for each precision tried, smallest cosine to the PyTorch embeddings of the tiles.
+    - `least_cosine`: smallest cosine that was required of the recipe's precision.
+    - `sizes_mb`: for each precision tried, size of the ONNX model, MB.
     """
 
     embedder: NetworkEmbedder
@@ -73,13 +77,16 @@ def export_encoder(
     *,
     least_cosine: float | None = None,
 ) -> Exported:
-    """The encoder in the recipe's precision, or in float32 where that costs too much likeness.
+    """The encoder in the recipe's precision, or in float32 if that precision is too inaccurate.
 
-    The embedder's own recipe, which the map's manifest repeats, has the precision that it flies in.
+    The recipe of the embedder, and so the map's manifest, states the precision that was chosen.
 
-    `encoder` is `AutoEncoder.encoder` or a `ResNet34`; `calibration` and `held_out` (N, C, S, S)
-    are tiles, to choose the ranges of int8 with and to judge with. `least_cosine` replaces the
-    value of `LEAST_COSINE`. Raises `ExportError` where ONNX in float32 and PyTorch disagree,
+    - `encoder`: `AutoEncoder.encoder` or a `ResNet34`.
+    - `calibration`: tiles (N, C, S, S) that set the ranges of int8.
+    - `held_out`: tiles (N, C, S, S) for the comparison with PyTorch.
+    - `least_cosine`: replaces the value of `LEAST_COSINE`.
+
+    Raises `ExportError` if ONNX in float32 and PyTorch disagree,
     `MissingExtraError` without onnx or onnxruntime.
     """
     model = encoder_graph(encoder, held_out.shape[1:])
@@ -88,14 +95,14 @@ def export_encoder(
     expected = _torch_embeddings(encoder, held_out)
     _require_same(_raw(plain, random), _torch_embeddings(encoder, random), "random numbers")
     _require_same(_raw(plain, held_out), expected, "tiles")
-    cosine = {"float32": least_likeness(_raw(plain, held_out), expected)}
+    cosine = {"float32": least_cosine_between(_raw(plain, held_out), expected)}
     sizes = {"float32": plain.onnx.nbytes / 1e6}
     enough = LEAST_COSINE[recipe.precision] if least_cosine is None else least_cosine
     if recipe.precision == "float32":
         return Exported(plain, "float32", cosine, enough, sizes)
     smaller = int8 if recipe.precision == "int8" else float16
     small = _embedder(recipe, smaller(model, calibration))
-    cosine[recipe.precision] = least_likeness(_raw(small, held_out), expected)
+    cosine[recipe.precision] = least_cosine_between(_raw(small, held_out), expected)
     sizes[recipe.precision] = small.onnx.nbytes / 1e6
     if cosine[recipe.precision] >= enough:
         return Exported(small, recipe.precision, cosine, enough, sizes)
@@ -103,15 +110,15 @@ def export_encoder(
 
 
 def cosines(first: Array, second: Array) -> Array:
-    """Cosines (N,) between embeddings (N, D) of the same tiles; two without length are alike."""
+    """Cosines (N,) between embeddings (N, D) of the same tiles; 1 for two zero vectors."""
     norms = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
     products = np.einsum("nd,nd->n", first, second)
     both_zero = np.maximum(np.abs(first).max(axis=1), np.abs(second).max(axis=1)) == 0
     return np.asarray(np.where(both_zero, 1, products / np.maximum(norms, 1e-30)), np.float32)
 
 
-def least_likeness(first: Array, second: Array) -> float:
-    """Least of the cosines between embeddings (N, D) of the same tiles."""
+def least_cosine_between(first: Array, second: Array) -> float:
+    """Smallest cosine between embeddings (N, D) of the same tiles."""
     return float(cosines(first, second).min())
 
 
@@ -129,7 +136,7 @@ def encoder_graph(encoder: nn.Module, shape: tuple[int, ...]) -> Any:
     elif isinstance(encoder, nn.Sequential):
         value = graph.sequence(encoder, "maps")
     else:
-        raise TypeError(f"no encoder that can be exported: {type(encoder).__name__}")
+        raise TypeError(f"this encoder cannot be exported: {type(encoder).__name__}")
     dims = _torch_embeddings(encoder, np.zeros((1, *shape), np.float32)).shape[1]
     return graph.model(value, shape, dims)
 
@@ -151,7 +158,7 @@ def int8(model: Any, calibration: Array) -> bytes:
             part = next(self._parts, None)
             return None if part is None else {"maps": part}
 
-    # Says that the graph is as simple as can be, so that no advice to make it so is logged.
+    # Marks the graph as preprocessed, so that onnxruntime does not log advice to do so.
     marked = type(model)()
     marked.CopyFrom(model)
     marked.metadata_props.add(key="onnx.quant.pre_process", value="onnxruntime.quant")
@@ -172,7 +179,7 @@ def int8(model: Any, calibration: Array) -> bytes:
 
 
 def float16(model: Any, _: Array | None = None) -> bytes:
-    """The model with its weights in 16 bits, turned back into 32 when it is loaded."""
+    """The model with weights in 16 bits, converted to 32 when it is loaded."""
     import onnx
 
     small = onnx.ModelProto()
@@ -195,7 +202,7 @@ def float16(model: Any, _: Array | None = None) -> bytes:
 
 
 class _Graph:
-    """An ONNX graph that grows at its end; every method gives the name of the value it adds."""
+    """ONNX graph under construction; each method returns the name of the value it adds."""
 
     def __init__(self) -> None:
         self._onnx = needed("onnx", "train", "exporting an encoder")
@@ -203,7 +210,7 @@ class _Graph:
         self._weights: list[Any] = []
 
     def sequence(self, layers: nn.Sequential, value: str) -> str:
-        """Layers one after the other, each batch norm folded into the convolution before it."""
+        """Layers in sequence, each batch norm folded into the convolution before it."""
         modules = list(layers)
         for at, module in enumerate(modules):
             following = modules[at + 1] if at + 1 < len(modules) else None
@@ -217,14 +224,14 @@ class _Graph:
     def block(self, block: nn.Module, value: str) -> str:
         """A residual block."""
         if not isinstance(block, BasicBlock):
-            raise TypeError(f"no block that can be exported: {type(block).__name__}")
-        short = value if block.short_cut is None else self.sequence(block.short_cut, value)
+            raise TypeError(f"this block cannot be exported: {type(block).__name__}")
+        shortcut = value if block.short_cut is None else self.sequence(block.short_cut, value)
         value = self.convolution(block.first, block.first_norm, value)
         value = self.convolution(block.second, block.second_norm, self._node("Relu", [value]))
-        return self._node("Relu", [self._node("Add", [value, short])])
+        return self._node("Relu", [self._node("Add", [value, shortcut])])
 
     def convolution(self, layer: nn.Conv2d, norm: nn.BatchNorm2d | None, value: str) -> str:
-        """A convolution and what its batch norm does once learnt."""
+        """A convolution with its trained batch norm folded in."""
         weights = layer.weight.detach().double().cpu()
         bias = torch.zeros(layer.out_channels, dtype=torch.float64)
         if layer.bias is not None:
@@ -264,7 +271,7 @@ class _Graph:
                     strides=[step, step],
                     pads=[pad] * 4,
                 )
-        raise TypeError(f"no layer that can be exported: {type(module).__name__}")
+        raise TypeError(f"this layer cannot be exported: {type(module).__name__}")
 
     def halves(self, value: str, side_px: int) -> str:
         """Means over the left and the right half of square features, channel by channel."""
@@ -272,7 +279,7 @@ class _Graph:
             mean = self._node("GlobalAveragePool", [value])
             pooled = self._node("Concat", [mean, mean], axis=3)
         else:
-            # Of an odd side, both halves take the column in the middle.
+            # If the side is odd, both halves include the middle column.
             pooled = self._node(
                 "AveragePool",
                 [value],
@@ -315,18 +322,13 @@ def _embedder(recipe: AutoEncoderRecipe | TripletRecipe, data: bytes) -> Network
 
 
 def _raw(embedder: NetworkEmbedder, maps: Array) -> Array:
-    """What the graph itself gives, not scaled to length 1."""
-    return NetworkEmbedder(_as_it_comes(embedder.recipe), embedder.onnx).views(maps)
-
-
-def _as_it_comes(
-    recipe: AutoEncoderRecipe | TripletRecipe,
-) -> AutoEncoderRecipe | TripletRecipe:
-    return dataclasses.replace(recipe, similarity="product")
+    """Output of the graph, not scaled to length 1."""
+    recipe = dataclasses.replace(embedder.recipe, similarity="product")
+    return NetworkEmbedder(recipe, embedder.onnx).views(maps)
 
 
 def _torch_embeddings(encoder: nn.Module, maps: Array) -> Array:
-    """Embeddings (N, D) as PyTorch computes them in float32, with what batch norms have learnt."""
+    """Embeddings (N, D) in float32 from PyTorch in evaluation mode."""
     device = next(encoder.parameters()).device
     was_training = encoder.training
     encoder.eval()
@@ -339,11 +341,11 @@ def _torch_embeddings(encoder: nn.Module, maps: Array) -> Array:
     return np.asarray(torch.cat(parts).numpy())
 
 
-def _require_same(flown: Array, learnt: Array, what: str) -> None:
-    difference = float(np.abs(flown - learnt).max())
-    largest = float(np.abs(learnt).max())
+def _require_same(exported: Array, expected: Array, what: str) -> None:
+    difference = float(np.abs(exported - expected).max())
+    largest = float(np.abs(expected).max())
     if not difference <= FLOAT_TOLERANCE * max(largest, 1e-6):
         raise ExportError(
-            f"ONNX and PyTorch disagree on {what}: by {difference:g} where embeddings reach "
+            f"ONNX and PyTorch disagree on {what}: difference {difference:g}, largest value "
             f"{largest:g}"
         )

@@ -1,7 +1,7 @@
-"""How learning is made fast: precision, memory, processes. What is learnt stays the same.
+"""Speed of training: precision, memory, processes. The learned weights are the same up to rounding.
 
 Tensors stay contiguous (NCHW) on every device. In `channels_last` oneDNN writes past a buffer in
-the backward pass of strided 1 x 1 convolutions with fewer channels than its block: the short cuts
+the backward pass of strided 1 x 1 convolutions with fewer channels than its block: the shortcuts
 of a narrow ResNet. On processors with AVX2 only, the gradients are then wrong, or the process
 crashes or hangs (oneDNN issue 6035, present in PyTorch 2.13.0). The gain was small:
 docs/benchmarks.md. `torch.compile` is not used, because on a CPU it chooses `channels_last` itself.
@@ -22,13 +22,15 @@ from torch.nn.parallel import DistributedDataParallel
 
 @dataclass(frozen=True)
 class Means:
-    """How learning is made fast; what is learnt stays the same up to rounding.
+    """Options for the speed of training; the learned weights are the same up to rounding.
 
-    `bf16`: mixed precision, None where the processor multiplies bfloat16 itself. `fused`: the
-    optimizer's step in one pass over memory. `keep_memory`: freed memory stays with the process
-    (Linux, CPU). `chunk`: most tiles of a triplet batch held for gradients at once; batch norms are
-    then taken over each chunk. `workers`: threads that make batches. `save_every_s`: least time
-    between checkpoints, s. `device`: None for a GPU where there is one.
+    - `bf16`: mixed precision; None: if the processor has bfloat16 instructions.
+    - `fused`: run the optimizer's step in one pass over memory.
+    - `keep_memory`: let the process keep freed memory (Linux, CPU).
+    - `chunk`: tiles of a triplet batch held for gradients at once; batch norms use each chunk.
+    - `workers`: threads that make batches.
+    - `save_every_s`: shortest time between checkpoints, s.
+    - `device`: name for PyTorch; None: a GPU if there is one.
     """
 
     bf16: bool | None = None
@@ -42,7 +44,7 @@ class Means:
 
 @dataclass(frozen=True)
 class World:
-    """This process among those that learn together."""
+    """Rank of this process, number of processes, rank on this machine (from torchrun)."""
 
     rank: int = 0
     size: int = 1
@@ -50,27 +52,27 @@ class World:
 
 
 def device_of(means: Means, world: World) -> torch.device:
-    """Where this process learns."""
+    """Device on which this process trains."""
     name = means.device or ("cuda" if torch.cuda.is_available() else "cpu")
     return torch.device("cuda", world.local_rank) if name == "cuda" else torch.device(name)
 
 
 def uses_bf16(means: Means, device: torch.device) -> bool:
-    """Whether to learn in mixed precision: as told, or where the device multiplies bfloat16 itself.
+    """Whether to train in mixed precision: `means.bf16`, else if the device supports bfloat16.
 
-    Elsewhere float32 is faster.
+    On other devices float32 is faster.
     """
     if means.bf16 is not None:
         return means.bf16
     if device.type == "cuda":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
-    # Older releases of PyTorch do not tell.
+    # Older releases of PyTorch lack this function.
     able: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
     return any(bool(able.get(name)) for name in ("avx512_bf16", "amx_bf16", "bf16"))
 
 
 def wrapped(model: nn.Module, device: torch.device, world: World) -> nn.Module:
-    """The model as it is run: of several processes, with gradients averaged over them."""
+    """The model; with several processes, wrapped so that gradients are averaged over them."""
     if world.size == 1:
         return model
     ids = [world.local_rank] if device.type == "cuda" else None
@@ -79,7 +81,7 @@ def wrapped(model: nn.Module, device: torch.device, world: World) -> nn.Module:
 
 @contextlib.contextmanager
 def processes(means: Means) -> Iterator[World]:
-    """This process's place among those that torchrun started; alone where it did not."""
+    """Process group set up by torchrun for as long as this lasts; one process without torchrun."""
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size == 1:
         yield World()
@@ -99,7 +101,7 @@ def processes(means: Means) -> Iterator[World]:
 
 
 def mean_over_processes(value: Tensor, world: World, device: torch.device) -> float:
-    """The mean of a number over all processes, the same for each."""
+    """Mean of a number over all processes."""
     if world.size > 1:
         value = value.to(device)
         distributed.all_reduce(value)
@@ -109,10 +111,10 @@ def mean_over_processes(value: Tensor, world: World, device: torch.device) -> fl
 
 @contextlib.contextmanager
 def kept_memory(wanted: bool) -> Iterator[None]:
-    """Let glibc keep freed memory while this lasts, instead of giving it back to the system.
+    """Let glibc keep freed memory while this lasts, instead of returning it to the system.
 
-    Activations and gradients are hundreds of MB that come and go in every step; a system that
-    fills each page with zeros anew costs as much as the arithmetic (mallopt(3)).
+    Every step allocates and frees hundreds of MB of activations and gradients. Zero-filled pages
+    from the system cost as much as the arithmetic (mallopt(3)).
     """
     try:
         library = ctypes.CDLL(None) if wanted and sys.platform == "linux" else None

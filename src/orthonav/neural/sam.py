@@ -2,10 +2,11 @@
 
 Di Piazza et al. 2024, section 4: Segment Anything is applied to each picture, and its masks are
 turned into one binary map of all their boundaries; Base does as well as Large and Huge. Masks come
-from the automatic mask generator of the paper's appendix B: a grid of points is asked about, three
-masks each; masks that the network itself or a stability check doubts are dropped, then near
-duplicates. The network is that of the `transformers` library (Apache-2.0), its weights are given
-by path and never fetched. This does not fly: it needs PyTorch and seconds to minutes a picture.
+from the automatic mask generator of the paper's appendix B: a grid of points prompts the network,
+which returns three masks each. Masks with a low expected IoU or a low stability are dropped, then
+near duplicates. The network is that of the `transformers` library (Apache-2.0); its weights are
+given by path and never downloaded. This module needs PyTorch and seconds to minutes per picture; it
+never flies.
 """
 
 import hashlib
@@ -34,10 +35,10 @@ except ImportError as error:  # pragma: no cover - depends on the installation
 
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 CACHE_FORMAT = b"orthonav sam boundaries 1"
-_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as it was trained
+_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as in training
 _CHUNK_PIXELS = {"cpu": 1 << 20, "cuda": 1 << 24}
-"""Pixels of masks scaled at once: on a CPU so few that no memory comes fresh from the system each
-time, which takes half of the time at 1 << 24 (0.57 against 1.18 s a window, small network)."""
+"""Pixels of masks scaled at once. On a CPU, small chunks reuse memory of the process: 0.57 s per
+window against 1.18 s at 1 << 24 (small network)."""
 
 WEIGHTS_VARIABLE = "ORTHONAV_SAM_WEIGHTS"
 Grey = NDArray[np.uint8]
@@ -50,16 +51,24 @@ Predict = Callable[[NDArray[np.float32]], tuple[torch.Tensor, torch.Tensor]]
 class SamBoundaries:
     """Binary map of the boundaries of all automatic Segment Anything masks of a picture.
 
-    `weights`: path of a Hugging Face folder or of an original `.pth` checkpoint (Base, Large or
-    Huge, as the weights say). `grid`: points along one side of a window. `iou`: least overlap the
-    network expects of a mask with the truth; `stability`: least overlap of the mask cut at logits
-    `offset` above and below zero; `overlap`: overlap of boxes above which only the mask with the
-    better expected `iou` is kept. All as in the original generator.
+    Defaults of `grid`, `iou`, `stability`, `offset` and `overlap` are those of the original
+    generator.
 
-    Larger pictures are cut into windows of `window` px, so that points and magnification are those
-    of a tile; 0 takes them whole. `prompts`: points at once. `device`: "auto", "cpu" or "cuda".
-    `precision`: "fp32", or "bf16" or "fp16" for the two transformers. `cache`: folder of finished
-    windows, "none" for no cache; by default ORTHONAV_CACHE or the user's cache folder.
+    - `weights`: path of a Hugging Face folder or of an original `.pth` checkpoint (Base, Large or
+      Huge); by default ORTHONAV_SAM_WEIGHTS.
+    - `grid`: points along one side of a window, 1 to 256.
+    - `iou`: smallest IoU with the truth that the network may expect of a mask, 0 to 1.
+    - `stability`: smallest IoU between the masks cut at logits `offset` above and below zero, 0 to
+      1.
+    - `offset`: offset of the logits for `stability`, above 0.
+    - `overlap`: IoU of boxes above which the mask with the lower expected IoU is dropped, 0 to 1.
+    - `window`: side of the windows into which larger pictures are cut, 16 to 4096 px, so that point
+      spacing and magnification are those of a tile; 0: no windows.
+    - `prompts`: points per call of the network, 1 to 4096.
+    - `device`: "auto", "cpu" or "cuda".
+    - `precision`: "fp32", or "bf16" or "fp16" for the two transformers.
+    - `cache`: folder of finished windows, "none" for no cache; by default ORTHONAV_CACHE or the
+      user's cache folder.
     """
 
     weights: str = ""
@@ -97,9 +106,9 @@ class SamBoundaries:
 
     @property
     def path(self) -> str:
-        """Where the weights lie: as told, else as ORTHONAV_SAM_WEIGHTS says.
+        """Path of the weights: `weights`, else ORTHONAV_SAM_WEIGHTS.
 
-        Maps do not say: a path of the machine that built one means nothing to another.
+        Maps do not store it: it is a path of the machine that built them.
         """
         return self.weights or os.environ.get(WEIGHTS_VARIABLE, "")
 
@@ -114,9 +123,9 @@ class SamBoundaries:
         return 0
 
     def __call__(self, grey: Grey, valid: Mask) -> NDArray[np.float32]:
-        """Boundaries (1, H, W), 1 on one and 0 elsewhere; none along the border of `valid`.
+        """Boundaries (1, H, W), 1 on a boundary, else 0; none along the border of `valid`.
 
-        What lies under pixels that are not valid has no influence. Raises `MissingFileError` or
+        Values of invalid pixels have no influence. Raises `MissingFileError` or
         `VariantError` where the weights are missing or not Segment Anything's.
         """
         out = np.zeros((1, *grey.shape), dtype=np.float32)
@@ -134,7 +143,7 @@ class SamBoundaries:
         valid: NDArray[np.bool_],
         report: Callable[[float], None] = lambda share: None,
     ) -> NDArray[np.float32]:
-        """Boundaries (N, 1, H, W) of pictures (N, H, W); `report` is told the share done."""
+        """Boundaries (N, 1, H, W) of pictures (N, H, W); `report` receives the share done."""
         out = np.zeros((len(greys), 1, *greys.shape[1:]), dtype=np.float32)
         for index, (grey, seen) in enumerate(zip(greys, valid, strict=True)):
             out[index] = self(grey, seen)
@@ -159,7 +168,7 @@ class SamBoundaries:
         return edges
 
     def _key(self, filled: Grey, stamp: tuple[int, ...]) -> str:
-        """Name of a window in the cache: its pixels, the weights and what else decides."""
+        """Cache key of a window: digest of its pixels, the weights and the settings."""
         rules = (self.grid, self.iou, self.stability, self.offset, self.overlap, self.precision)
         digest = hashlib.sha256(CACHE_FORMAT)
         digest.update(repr((filled.shape, rules, weights_digest(self.path, stamp))).encode())
@@ -168,7 +177,7 @@ class SamBoundaries:
 
 
 def _windows(shape: tuple[int, ...], window: int) -> Iterator[tuple[slice, slice]]:
-    """Windows of at most `window` px that cover a picture (H, W), evenly laid."""
+    """Evenly spaced windows of at most `window` px that cover a picture (H, W)."""
     sides = []
     for size in shape:
         length = min(size, window or size)
@@ -178,7 +187,7 @@ def _windows(shape: tuple[int, ...], window: int) -> Iterator[tuple[slice, slice
 
 
 class _Box(NamedTuple):
-    """A mask that passed: bits of (H, W), corners (x0, y0, x1, y1) of its pixels, expected IoU."""
+    """An accepted mask: bits of (H, W), corners (x0, y0, x1, y1) of its pixels, expected IoU."""
 
     bits: NDArray[np.uint8]
     corners: NDArray[np.int64]
@@ -188,9 +197,10 @@ class _Box(NamedTuple):
 def automatic_masks(
     predict: Predict, shape: tuple[int, ...], side: int, rules: SamBoundaries
 ) -> Iterator[Mask]:
-    """Masks (H, W) that a grid of points finds and the rules leave, the most trusted first.
+    """Accepted masks (H, W) of a grid of points, highest expected IoU first.
 
-    `side` is the width of the network's square picture, on which the picture's longer side lies.
+    `side` is the side of the network's square input in pixels; the longer side of the picture is
+    scaled to it.
     """
     height, width = shape
     centres = (np.arange(rules.grid) + 0.5) / rules.grid
@@ -212,7 +222,7 @@ def automatic_masks(
 def _trusted(
     logits: torch.Tensor, iou: torch.Tensor, shape: tuple[int, ...], side: int, rules: SamBoundaries
 ) -> Iterator[_Box]:
-    """Those of masks (M, h, w) whose expected IoU (M,) and stability are good enough."""
+    """Masks (M, h, w) whose expected IoU (M,) and stability reach the limits of `rules`."""
     good = iou > rules.iou
     logits, iou = logits[good], iou[good]
     resized = _resized_shape(shape, side)
@@ -243,28 +253,28 @@ def _corners(mask: Mask) -> NDArray[np.int64]:
 def suppressed(
     corners: NDArray[np.int64], scores: NDArray[np.floating[Any]], overlap: float
 ) -> list[int]:
-    """Indices of boxes that are left, best score first, when near duplicates are dropped.
+    """Indices of boxes after non-maximum suppression, best score first.
 
-    `corners` (N, 4) are x0, y0, x1, y1. A box goes if its intersection over union with a better
-    one that stays is above `overlap`. Boxes as the original takes them: from the first to the last
-    pixel's number, so that a box one pixel wide has no area and duplicates nothing.
+    `corners` (N, 4) are x0, y0, x1, y1. A box is dropped if its IoU with a better accepted box is
+    above `overlap`. As in the original generator, a box reaches from the index of its first pixel
+    to that of its last, so a box one pixel wide has no area and is never dropped.
     """
     order = np.argsort(-scores, kind="stable")
     areas = (corners[:, 2:] - corners[:, :2]).prod(axis=1)
-    kept = []
+    accepted = []
     while len(order):
         best, order = order[0], order[1:]
-        kept.append(int(best))
+        accepted.append(int(best))
         first = np.maximum(corners[best, :2], corners[order, :2])
         last = np.minimum(corners[best, 2:], corners[order, 2:])
         common = (last - first).clip(min=0).prod(axis=1)
         union = areas[best] + areas[order] - common
         order = order[common <= overlap * union]
-    return kept
+    return accepted
 
 
 def boundary_map(masks: Iterable[Mask], shape: tuple[int, ...]) -> Mask:
-    """Pixels (H, W) of any mask (H, W) next to a pixel outside it; the picture's border is none."""
+    """Pixels (H, W) of any mask that touch a pixel outside it within the picture."""
     edges = np.zeros(shape, dtype=bool)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     for mask in masks:
@@ -280,7 +290,7 @@ def _resized_shape(shape: tuple[int, ...], side: int) -> tuple[int, int]:
 
 
 def network_pixels(grey: Grey, side: int) -> torch.Tensor:
-    """A grey picture (H, W) as the network takes it: (1, 3, side, side), zeros below or beside."""
+    """Network input (1, 3, side, side) for a grey picture (H, W), padded with zeros."""
     height, width = _resized_shape(grey.shape, side)
     pixels = torch.from_numpy(np.array(grey, dtype=np.float32))[None, None]
     pixels = torch.nn.functional.interpolate(
@@ -292,9 +302,9 @@ def network_pixels(grey: Grey, side: int) -> torch.Tensor:
 
 
 def _predictor(model: Any, grey: Grey, dtype: torch.dtype) -> Predict:
-    """Function that asks the network about points of one picture, encoded once.
+    """Function that prompts the network with points of one picture, encoded once.
 
-    In half precision, positions are still encoded in float32: their phases would suffer.
+    Positions are always encoded in float32: half precision would lose their phases.
     """
     device = model.device
     half = (
@@ -309,10 +319,10 @@ def _predictor(model: Any, grey: Grey, dtype: torch.dtype) -> Predict:
         places = model.get_image_wide_positional_embeddings()
 
     def predict(points: NDArray[np.float32]) -> tuple[torch.Tensor, torch.Tensor]:
-        asked = torch.from_numpy(points).to(device)[None, :, None]
-        labels = torch.ones(asked.shape[:-1], dtype=torch.int, device=device)
+        prompt = torch.from_numpy(points).to(device)[None, :, None]
+        labels = torch.ones(prompt.shape[:-1], dtype=torch.int, device=device)
         with torch.inference_mode():
-            sparse, dense = model.prompt_encoder(asked, labels, None, None)
+            sparse, dense = model.prompt_encoder(prompt, labels, None, None)
             with half:
                 logits, iou = model.mask_decoder(encoded, places, sparse, dense, True)
         return logits[0], iou[0].float()

@@ -1,6 +1,6 @@
-"""Boundaries that were found once: a digest, then the compressed bits of a map, one file each.
+"""Cache of Segment Anything boundaries: one file per window, a digest and then compressed bits.
 
-Every entry is written whole or not at all; what is damaged is made again.
+Entries are written atomically; a damaged entry is computed again.
 """
 
 import hashlib
@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 
 
 def cache_folder(cache: str) -> Path | None:
-    """Where entries lie: as told, ORTHONAV_CACHE or the user's cache; None for "none"."""
+    """Folder of entries: `cache`, ORTHONAV_CACHE or the user's cache folder; None for "none"."""
     if cache == "none":
         return None
     if cache:
@@ -35,12 +35,12 @@ def cache_folder(cache: str) -> Path | None:
 
 
 def cached(path: Path, shape: tuple[int, ...]) -> Mask | None:
-    """The map (H, W) of a cache entry; none if there is none or it was damaged."""
+    """Edge map (H, W) of a cache entry; None if the entry is absent or damaged."""
     try:
         entry = path.read_bytes()
         digest, packed = entry[:_DIGEST_BYTES], entry[_DIGEST_BYTES:]
         if hashlib.sha256(packed).digest() != digest:
-            log.warning("damaged cache entry is made again: %s", path)
+            log.warning("damaged cache entry; computing it again: %s", path)
             return None
         bits = np.unpackbits(np.frombuffer(zlib.decompress(packed), np.uint8))
         return bits[: shape[0] * shape[1]].reshape(shape).astype(bool)
@@ -52,10 +52,10 @@ def cached(path: Path, shape: tuple[int, ...]) -> Mask | None:
 
 
 def keep(path: Path, edges: Mask) -> None:
-    """Write a cache entry; a cache that cannot be written costs time, not the result."""
+    """Write a cache entry; if that fails, log a warning and go on without it."""
     packed = zlib.compress(np.packbits(edges).tobytes())
     try:
         with replacing(path) as temporary:
             temporary.write_bytes(hashlib.sha256(packed).digest() + packed)
     except OutputError as error:
-        log.warning("nothing cached: %s", error)
+        log.warning("could not write the cache entry: %s", error)

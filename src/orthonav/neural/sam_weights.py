@@ -1,7 +1,7 @@
-"""Segment Anything's weights: which files hold them, and original checkpoints under new names.
+"""Loads Segment Anything weights from Hugging Face folders and from original checkpoints.
 
-The network is that of the `transformers` library; checkpoints of the segment-anything project hold
-the same one under other names, and its size in the shapes of its weights.
+The network is that of the `transformers` library. Checkpoints of the segment-anything project hold
+the same weights under other names; the shapes of the weights give the size of the network.
 """
 
 import hashlib
@@ -29,7 +29,7 @@ WHERE = (
 
 
 def network(weights: str) -> Any:
-    """The network in float32 on the CPU, of a Hugging Face folder or of an original checkpoint.
+    """Network in float32 on the CPU, from a Hugging Face folder or an original checkpoint.
 
     Raises `VariantError` if the path holds neither.
     """
@@ -39,7 +39,7 @@ def network(weights: str) -> Any:
 
 @lru_cache(maxsize=8)
 def weights_digest(weights: str, stamp: tuple[int, ...]) -> str:
-    """SHA-256 of what a path of weights holds."""
+    """SHA-256 of the weights file, or of the config and weights of a folder."""
     del stamp  # part of the key only: files may change
     path = Path(weights).expanduser()
     files = [path]
@@ -85,7 +85,7 @@ _POSITIONS = "prompt_encoder.shared_embedding.positional_embedding"
 
 
 def converted_weights(original: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Weights of an original checkpoint under the names that `transformers` gives them."""
+    """Weights of an original checkpoint, renamed as `transformers` expects them."""
     converted = {}
     for key, value in original.items():
         for pattern, name in _RENAMES:
@@ -96,16 +96,16 @@ def converted_weights(original: Mapping[str, torch.Tensor]) -> dict[str, torch.T
 
 
 def original_model(path: Path) -> Any:
-    """The network of an original checkpoint (`sam_vit_b_01ec64.pth` and its like), in float32.
+    """Network of an original checkpoint such as `sam_vit_b_01ec64.pth`, in float32.
 
-    Its size is read from the shapes of its weights. Raises `VariantError` if it is no such file.
+    The shapes of the weights give its size. Raises `VariantError` for any other file.
     """
     try:
         weights = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
         raise VariantError(f"cannot read the weights; expected {WHERE}: {path}") from error
     try:
-        # Constants of the preparation of pictures, in some files.
+        # Some files also hold the constants that normalize pictures.
         named = {k: v for k, v in weights.items() if k not in ("pixel_mean", "pixel_std")}
         with quiet():
             model = transformers().SamModel(_config(named))
@@ -116,7 +116,7 @@ def original_model(path: Path) -> Any:
 
 
 def _config(original: Mapping[str, torch.Tensor]) -> Any:
-    """The `SamConfig` that the shapes of an original checkpoint tell."""
+    """`SamConfig` derived from the shapes of an original checkpoint."""
     library = transformers()
     shapes = {key: tuple(value.shape) for key, value in original.items()}
     hidden, colours, patch, _ = shapes["image_encoder.patch_embed.proj.weight"]

@@ -1,8 +1,9 @@
 """SuperPoint keypoints and descriptors (DeTone, Malisiewicz and Rabinovich, CVPRW 2018).
 
 The network is that of the `transformers` library (Apache-2.0). Its weights are not part of
-orthonav and never fetched by it: their licence forbids commercial use. Who may use them finds them
-as `magic-leap-community/superpoint` on the Hugging Face hub. This does not fly: it needs PyTorch.
+orthonav and it never downloads them: their licence forbids commercial use. They are published as
+`magic-leap-community/superpoint` on the Hugging Face hub. This module needs PyTorch.
+It never flies.
 """
 
 import importlib
@@ -38,9 +39,11 @@ WHERE = (
 class SuperPoint:
     """Keypoints and descriptors of grey pictures.
 
-    `weights`: path of a Hugging Face folder. `max_points`: at most so many points of a picture,
-    the strongest; 0 for all. `device`: "auto" (a GPU where there is one), "cpu" or "cuda".
     Thresholds are those of the folder's config.json.
+
+    - `weights`: path of a Hugging Face folder.
+    - `max_points`: largest number of points per picture, the strongest first; 0 for all.
+    - `device`: "auto" (a GPU if there is one), "cpu" or "cuda".
     """
 
     weights: str = ""
@@ -72,9 +75,9 @@ class SuperPoint:
         points = (found.keypoints[0] * size).round().cpu().numpy()
         # The library clears its border on the left and at the top only.
         border = model.config.border_removal_distance
-        kept = (points[:, 0] < width - border) & (points[:, 1] < height - border)
-        kept &= found.mask[0].cpu().numpy() > 0
-        order = np.flatnonzero(kept)
+        inside = (points[:, 0] < width - border) & (points[:, 1] < height - border)
+        inside &= found.mask[0].cpu().numpy() > 0
+        order = np.flatnonzero(inside)
         scores = found.scores[0].cpu().numpy()[order]
         order = order[np.argsort(-scores, kind="stable")][: self.max_points or None]
         descriptors = found.descriptors[0].cpu().numpy()[order]
@@ -82,7 +85,7 @@ class SuperPoint:
 
 
 def _padding(size: int) -> int:
-    """Pixels to be added for a multiple of the network's cell and at least two cells."""
+    """Padding in pixels up to a multiple of the network's cell, and to two cells at least."""
     return max(-size % CELL_PX, 2 * CELL_PX - size)
 
 
@@ -93,36 +96,36 @@ def _model(weights: str, stamp: tuple[int, ...], device: str) -> Any:
 
 
 def require_device(device: str) -> None:
-    """Raise `VariantError` unless the name of a device is one that is known."""
+    """Raise `VariantError` unless `device` is "auto", "cpu" or "cuda"."""
     if device not in ("auto", "cpu", "cuda"):
         raise VariantError(f"device must be auto, cpu or cuda, got '{device}'")
 
 
 def chosen_device(device: str) -> torch.device:
-    """The device that "auto", "cpu" or "cuda" means; raises `VariantError` if there is none."""
+    """Device for "auto", "cpu" or "cuda"; raises `VariantError` for "cuda" without a GPU."""
     available = torch.cuda.is_available()
     if device == "cuda" and not available:
-        raise VariantError("device=cuda was asked for, but PyTorch sees no GPU here")
+        raise VariantError("device=cuda, but PyTorch sees no GPU; use device=auto or cpu")
     return torch.device("cuda" if device != "cpu" and available else "cpu")
 
 
 def weights_stamp(weights: str, where: str) -> tuple[int, ...]:
-    """Sizes and times (ns) of the file or folder's files `weights`: changed when they change.
+    """Sizes and modification times (ns) of `weights`, a file or a folder: a cache key.
 
-    Raises `MissingFileError`, saying `where` they are had, if there is no such path.
+    Raises `MissingFileError` with the source `where` if the path does not exist.
     """
     path = Path(weights).expanduser()
     if not path.exists():
-        raise MissingFileError(f"weights do not exist; take {where}: {path}")
+        raise MissingFileError(f"weights not found; use {where}: {path}")
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     stats = [file.stat() for file in files]
     return tuple(value for stat in stats for value in (stat.st_size, stat.st_mtime_ns))
 
 
 def pretrained(folder: str, model_type: str, class_name: str) -> Any:
-    """The model of `transformers` in a Hugging Face folder, in float32, ready to be run.
+    """Model of `transformers` from a Hugging Face folder, in float32 and in evaluation mode.
 
-    Nothing is fetched, and only safetensors are read. Raises `VariantError` if the folder holds
+    Nothing is downloaded, and only safetensors are read. Raises `VariantError` if the folder holds
     another kind of model or lacks some of its weights, which would otherwise be random.
     """
     path = Path(folder).expanduser()
@@ -156,7 +159,7 @@ def transformers() -> Any:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """No progress bars and warnings of `transformers`: what is wrong is raised instead."""
+    """Silence progress bars and warnings of `transformers`; errors are raised instead."""
     logging: Any = importlib.import_module("transformers.utils.logging")
     bars, level = logging.is_progress_bar_enabled(), logging.get_verbosity()
     logging.disable_progress_bar()

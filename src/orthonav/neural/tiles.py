@@ -1,4 +1,4 @@
-"""Reference tiles for learning, cut on the fly out of one sheet: nothing is stored per tile."""
+"""Reference tiles for training, cut on demand out of one sheet; no tile is stored."""
 
 import math
 from collections import deque
@@ -17,13 +17,15 @@ Arrays = tuple[NDArray[Any], ...]
 
 @dataclass(frozen=True, eq=False)
 class SheetTiles:
-    """Tiles of one sheet picture.
+    """Tiles of one sheet picture. Raises `ValueError` if the fields do not fit together.
 
-    `pixels` (C, H, W) uint8, any array or memory map; `scale` is the value that stands for 1.0:
-    255 for grey levels, 1 for edge maps. `valid` (H, W) bool. `tiles_px` (N, 2) is the row and
-    column of each tile's first pixel, `tile_px` the side S of a tile. `grey` (H, W) uint8 is the
-    picture that `pixels` were made from, where it is not their first channel itself: what
-    positives of triplets are made from. Raises `ValueError` where these do not fit together.
+    - `pixels`: (C, H, W) uint8, an array or a memory map.
+    - `valid`: (H, W) bool, pixels that are imagery.
+    - `tiles_px`: (N, 2), row and column of the first pixel of each tile.
+    - `tile_px`: side S of a tile, pixels.
+    - `scale`: value of `pixels` that stands for 1.0: 255 for grey levels, 1 for edge maps.
+    - `grey`: (H, W) uint8, the source of the positives of triplets; None: first channel of
+      `pixels`.
     """
 
     pixels: NDArray[np.uint8]
@@ -83,7 +85,7 @@ class SheetTiles:
         return np.array(picture[part])
 
     def valid_tile(self, index: int) -> NDArray[np.bool_]:
-        """Which pixels (S, S) of a tile are imagery."""
+        """Mask (S, S) of the pixels of a tile that are imagery."""
         return self.valid[self._part(index)]
 
     def _part(self, index: int) -> tuple[slice, slice]:
@@ -94,10 +96,10 @@ class SheetTiles:
 def epoch_batches(
     count: int, batch: int, seed: int, epoch: int, *, rank: int = 0, processes: int = 1
 ) -> list[NDArray[np.intp]]:
-    """This process's part of every batch of an epoch: indices below `count`, in random order.
+    """Share of this process of every batch of an epoch: indices below `count`, in random order.
 
-    Batches hold at most `batch` tiles and nearly the same number each; every process gets the same
-    number, at least 2, for which up to a process's worth of tiles is left out or taken twice.
+    Batches hold at most `batch` tiles, nearly the same number each. Every process gets the same
+    number, at least 2; to make that possible some tiles are left out or repeated.
     """
     order = np.random.default_rng([seed, epoch]).permutation(count)
     parts = []
@@ -110,7 +112,7 @@ def epoch_batches(
 def made_ahead(
     make: Callable[[NDArray[np.intp]], Arrays], plan: Sequence[NDArray[np.intp]], workers: int
 ) -> Iterator[Arrays]:
-    """What `make` gives for each batch of the plan, in order, made by threads a few ahead."""
+    """Results of `make` for each batch of the plan, in order, computed by threads a few ahead."""
     with ThreadPoolExecutor(max(1, workers)) as pool:
         waiting: deque[Future[Arrays]] = deque()
         for indices in plan:

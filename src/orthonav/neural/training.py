@@ -1,14 +1,14 @@
-"""Learning the neural encoders: one engine for the auto-encoder and the triplet network.
+"""Trains the neural encoders: one engine for the auto-encoder and the triplet network.
 
-Both are learnt as Di Piazza et al. 2024 say (section Methodology): the auto-encoder with AdamW, a
+Both are trained as in Di Piazza et al. 2024 (section Methodology): the auto-encoder with AdamW, a
 rate of 3e-4 that halves on plateaus, batches of 32; the triplet network with Adam, 1e-3, batches
-of 512; 200 epochs each. The order of tiles and every positive follow from the seed, the epoch and
-the tile alone, so that a learning that was killed, between batches or within one, goes on as if
-it had not been.
+of 512; 200 epochs each. The order of tiles and every positive depend on the seed, the epoch and
+the tile alone. An interrupted training therefore resumes with the same result, also within an
+epoch.
 
-Several processes or GPUs: start the program with `torchrun`. Each then takes its part of every
-batch, gradients are averaged, the first one writes. Negatives and the statistics of batch norms
-are those of a process's own part.
+Several processes or GPUs: start the program with `torchrun`. Each process takes its share of every
+batch, gradients are averaged, and the first process writes. Negatives and the statistics of batch
+norms come from the share of each process.
 """
 
 import logging
@@ -28,7 +28,7 @@ from torch import Tensor, distributed, nn
 from orthonav.embed.network import AutoEncoderRecipe, NetworkEmbedder
 from orthonav.files import Progress
 from orthonav.neural.autoencoder import Reconstruction
-from orthonav.neural.checkpoints import Recipe, State, Store, fingerprint
+from orthonav.neural.checkpoints import CheckpointStore, Recipe, TrainingState, fingerprint
 from orthonav.neural.export import export_encoder
 from orthonav.neural.means import (
     Means,
@@ -51,24 +51,24 @@ PROGRESS_EVERY_S = 2.0
 
 
 class Task(Protocol):
-    """What is learnt: a model, and how a batch becomes gradients."""
+    """A training task: a model, and how a batch becomes gradients."""
 
     @property
     def model(self) -> nn.Module:
-        """What is learnt."""
+        """The trained model."""
         ...
 
     @property
     def encoder(self) -> nn.Module:
-        """The part of it that flies."""
+        """The part of the model that flies."""
         ...
 
     def arrays(self, epoch: int, indices: NDArray[np.intp]) -> tuple[NDArray[Any], ...]:
-        """What a batch of tiles (B,) needs; called from several threads."""
+        """Arrays for a batch of tiles (B,); called from several threads."""
         ...
 
     def backward(self, run: nn.Module, *tensors: Tensor) -> Tensor:
-        """Add the gradients of the loss, which is returned; `run` is the model, perhaps wrapped."""
+        """Loss, after adding its gradients; `run` is the model, possibly wrapped."""
         ...
 
 
@@ -83,19 +83,23 @@ def learn_network(
     report: Progress | None = None,
     means: Means | None = None,
 ) -> NetworkEmbedder:
-    """Learn an encoder from reference tiles and give what flies, checked against what was learnt.
+    """ONNX embedder trained on reference tiles, checked against PyTorch.
 
-    `binary`: the tiles are edge maps. `work`: folder for checkpoints, from which a learning that
-    was interrupted goes on, and for pictures of its progress; None keeps nothing. `positive`: what
-    a triplet's second picture is: sheets of other dates with the same tiles, or a function that
-    changes grey levels. `report(text, share)` is told what is done and how much of it, 0 to 1.
+    - `binary`: the tiles are edge maps.
+    - `seed`: seed of the weights, of the order of tiles and of the positives.
+    - `work`: folder for checkpoints and pictures of the progress; an interrupted training resumes
+      from it; None: nothing is written.
+    - `positive`: source of the positives of triplets: sheets of other dates with the same tiles, or
+      a function that changes grey levels.
+    - `report(text, share)`: progress callback; `share` is the part done, 0 to 1.
+    - `means`: options for speed.
 
     Raises `ValueError` for a triplet network without `positive` or for impossible tiles,
-    `TrainingError` where the loss is no longer a number, `OutputError` where `work` holds another
-    learning, `ExportError` where what flies would not be what was learnt.
+    `TrainingError` if the loss is not finite, `OutputError` if `work` holds another training,
+    `ExportError` if ONNX and PyTorch disagree.
     """
     means = means or Means()
-    told = report or (lambda text, share: None)
+    progress = report or (lambda text, share: None)
     with kept_memory(means.keep_memory), processes(means) as world:
         task = _task(recipe, tiles, binary=binary, positive=positive, seed=seed, means=means)
         dates = () if positive is None or callable(positive) else positive
@@ -106,28 +110,28 @@ def learn_network(
             dates=dates,
             seed=seed,
             work=work,
-            report=told,
+            report=progress,
             means=means,
             world=world,
         )
-    return _exported(task.encoder, recipe, tiles, told)
+    return _exported(task.encoder, recipe, tiles, progress)
 
 
 def _exported(
-    encoder: nn.Module, recipe: Recipe, tiles: SheetTiles, told: Progress
+    encoder: nn.Module, recipe: Recipe, tiles: SheetTiles, progress: Progress
 ) -> NetworkEmbedder:
-    """What flies, in the recipe's precision where tiles of the map say that it is good enough."""
-    told("export", 1.0)
+    """ONNX embedder in the recipe's precision if that is accurate enough on tiles of the map."""
+    progress("export", 1.0)
     taken = np.unique(np.linspace(0, len(tiles) - 1, CALIBRATION_TILES).astype(np.intp))
     others = np.setdiff1d(np.arange(len(tiles)), taken)
     others = others if len(others) else taken
     held = others[np.unique(np.linspace(0, len(others) - 1, HELD_OUT_TILES).astype(np.intp))]
-    # A GPU's convolutions round more than what flies does.
+    # Convolutions on a GPU round more than ONNX on a CPU.
     made = export_encoder(encoder.to("cpu"), recipe, tiles.batch(taken), tiles.batch(held))
     tried, size = made.cosine[recipe.precision], made.sizes_mb[made.precision]
-    told(
-        f"export: {made.precision}, {size:.1f} MB; cosine of {recipe.precision} to what was learnt "
-        f"{tried:.4f}, {made.least_cosine:g} asked",
+    progress(
+        f"export: {made.precision}, {size:.1f} MB; cosine between {recipe.precision} and the "
+        f"trained encoder {tried:.4f}, at least {made.least_cosine:g} required",
         1.0,
     )
     return made.embedder
@@ -142,13 +146,15 @@ def _task(
     seed: int,
     means: Means,
 ) -> Task:
-    """The model with its first weights, which follow from the seed, and how it is learnt."""
+    """Training task of a recipe, with initial weights drawn from the seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         if isinstance(recipe, AutoEncoderRecipe):
             return Reconstruction(recipe, tiles, binary=binary)
         if positive is None:
-            raise ValueError("a triplet network needs positives: sheets of other dates, or changes")
+            raise ValueError(
+                "a triplet network needs positives: sheets of other dates or a function"
+            )
         if len(tiles) < 2:
             raise ValueError("a triplet network needs at least 2 tiles")
         return Triplets(recipe, tiles, positive, seed=seed, chunk=means.chunk)
@@ -166,19 +172,19 @@ def train(
     world: World,
     dates: Sequence[SheetTiles] = (),
 ) -> list[float]:
-    """Learn `task.model` in place, from its last checkpoint if any; the mean loss of each epoch.
+    """Mean loss of each epoch, after training `task.model` in place from any checkpoint.
 
-    `dates`: sheets that the task takes positives from, for a checkpoint to tell them apart. Of
-    several processes all read the checkpoint, so `work` must be a folder that all see.
+    `dates`: sheets of the positives, part of the key of a checkpoint. With several processes all
+    read the checkpoint, so `work` must be a shared folder.
     """
     device = device_of(means, world)
     bf16 = uses_bf16(means, device)
     precision = "bfloat16" if bf16 else "float32"
-    log.info("learning on %s in %s, contiguous tensors (NCHW)", device, precision)
+    log.info("training on %s in %s, contiguous tensors (NCHW)", device, precision)
     task.model.to(device)
-    state = State(task.model, recipe, fused=means.fused)
+    state = TrainingState(task.model, recipe, fused=means.fused)
     known_by = fingerprint(recipe, tiles, dates, seed, means, world)
-    store = Store(work, known_by, means.save_every_s)
+    store = CheckpointStore(work, known_by, means.save_every_s)
     store.load(state, device)
     run = wrapped(task.model, device, world)
     feed = _Feed(task, recipe.batch, seed, len(tiles), device, bf16, means, world)
@@ -186,7 +192,7 @@ def train(
     if writer:
         writer.clear()
     pauses = _Pauses(state, tiles, recipe.epochs, feed.per_epoch, report, writer)
-    # Else a GPU's convolutions add up in another order each time.
+    # By default convolutions on a GPU are not deterministic.
     with torch.backends.cudnn.flags(enabled=True, deterministic=True):
         while len(state.history) < recipe.epochs:
             task.model.train()
@@ -199,16 +205,16 @@ def train(
 
 
 class _Pauses:
-    """What is told and written while learning goes on: `writer` is None where another writes."""
+    """Reports progress and writes checkpoints; `writer` is None where another process writes."""
 
     def __init__(
         self,
-        state: State,
+        state: TrainingState,
         tiles: SheetTiles,
         epochs: int,
         batches: int,
         report: Progress,
-        writer: Store | None,
+        writer: CheckpointStore | None,
     ) -> None:
         self._state, self._tiles = state, tiles
         self._epochs, self._batches = epochs, batches
@@ -216,7 +222,7 @@ class _Pauses:
         self._progress_s = time.monotonic()
 
     def after_batch(self) -> None:
-        """Tell and write if it is time; what ends an epoch is left to `after_epoch`."""
+        """Report and write if due; the last batch of an epoch is left to `after_epoch`."""
         epoch, done = len(self._state.history), len(self._state.losses)
         if done == self._batches:
             return
@@ -229,7 +235,7 @@ class _Pauses:
             self._writer.after_batch(self._state, self._tiles)
 
     def after_epoch(self) -> None:
-        """Tell the mean loss, and write if it is time."""
+        """Report the mean loss, and write if due."""
         history = self._state.history
         done = len(history)
         text = f"epoch {done} of {self._epochs}, loss {history[-1]:.5g}"
@@ -241,7 +247,7 @@ class _Pauses:
 
 @dataclass(frozen=True, eq=False)
 class _Feed:
-    """Batches on their way to the device."""
+    """Makes batches and moves them to the device."""
 
     task: Task
     batch: int
@@ -258,7 +264,7 @@ class _Feed:
         return math.ceil(self.count / self.batch)
 
     def batches(self, epoch: int, first: int = 0, end: int | None = None) -> Iterator[list[Tensor]]:
-        """Tensors of each batch of this process, from number `first` up to, without, `end`."""
+        """Tensors of each batch of this process, from number `first` up to `end`, exclusive."""
         rank, size = self.world.rank, self.world.size
         plan = epoch_batches(self.count, self.batch, self.seed, epoch, rank=rank, processes=size)
         make = partial(self.task.arrays, epoch)
@@ -266,14 +272,14 @@ class _Feed:
             yield [torch.from_numpy(np.ascontiguousarray(a)).to(self.device) for a in arrays]
 
     def mixed(self) -> torch.autocast:
-        """Mixed precision where it is wanted."""
+        """Autocast context for mixed precision."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16)
 
 
-def _epoch(feed: _Feed, run: nn.Module, state: State, pauses: _Pauses) -> Tensor:
-    """Mean loss of one epoch of learning, whose first batches may have been learnt before a kill.
+def _epoch(feed: _Feed, run: nn.Module, state: TrainingState, pauses: _Pauses) -> Tensor:
+    """Mean loss of one epoch; a resumed epoch starts after its finished batches.
 
-    Of several processes, all then go on with the losses of the first one.
+    With several processes, all resume with the losses of the first one.
     """
     for tensors in feed.batches(len(state.history), len(state.losses)):
         state.optimizer.zero_grad(set_to_none=True)
@@ -285,17 +291,17 @@ def _epoch(feed: _Feed, run: nn.Module, state: State, pauses: _Pauses) -> Tensor
 
 
 def _settle(feed: _Feed) -> None:
-    """Give batch norms the means and variances that fit the final weights.
+    """Recompute the means and variances of batch norms for the final weights.
 
-    Running ones lag some ten steps behind; a small area has few steps in an epoch, and then what
-    flies would not be what was learnt. Of several processes those of the first one count.
+    Running averages lag some ten steps behind, and a small area has few steps in an epoch. With
+    several processes the statistics of the first one are used.
     """
     model = feed.task.model
     norms = [module for module in model.modules() if isinstance(module, nn.BatchNorm2d)]
     momenta = [norm.momentum for norm in norms]
     for norm in norms:
         norm.reset_running_stats()
-        norm.momentum = None  # the plain mean over all batches
+        norm.momentum = None  # plain mean over all batches
     model.train()
     with torch.no_grad(), feed.mixed():
         for maps, *_ in feed.batches(0, end=SETTLING_BATCHES):

@@ -26,12 +26,12 @@ BLOCKS = (3, 4, 6, 3)
 SMALLEST_TILE_PX = 32
 
 Positive = Callable[[np.random.Generator, NDArray[np.uint8]], NDArray[Any]]
-"""What makes of grey levels (S, S) uint8 another date's tile (S, S) or (C, S, S): uint8 in units
-of the sheet's pixels, or float32 in units of 1.0."""
+"""Function from grey levels (S, S) uint8 to a tile of another date, (S, S) or (C, S, S): uint8 in
+units of the sheet's pixels, or float32 in units of 1.0."""
 
 
 class BasicBlock(nn.Module):
-    """Two 3 x 3 convolutions beside a short cut, which is projected where sizes differ."""
+    """Residual block: two 3 x 3 convolutions and a shortcut, projected if the sizes differ."""
 
     def __init__(self, before: int, after: int, stride: int) -> None:
         super().__init__()
@@ -39,6 +39,7 @@ class BasicBlock(nn.Module):
         self.first_norm = nn.BatchNorm2d(after)
         self.second = nn.Conv2d(after, after, 3, 1, 1, bias=False)
         self.second_norm = nn.BatchNorm2d(after)
+        # The name is part of stored checkpoints.
         self.short_cut: nn.Sequential | None = None
         if stride != 1 or before != after:
             self.short_cut = nn.Sequential(
@@ -47,10 +48,10 @@ class BasicBlock(nn.Module):
 
     def forward(self, values: Tensor) -> Tensor:
         """Features (N, after, h, w) of features (N, before, H, W)."""
-        straight = values if self.short_cut is None else self.short_cut(values)
-        bent = functional.relu(self.first_norm(self.first(values)), inplace=True)
-        bent = self.second_norm(self.second(bent))
-        return functional.relu(bent + straight, inplace=True)
+        shortcut = values if self.short_cut is None else self.short_cut(values)
+        residual = functional.relu(self.first_norm(self.first(values)), inplace=True)
+        residual = self.second_norm(self.second(residual))
+        return functional.relu(residual + shortcut, inplace=True)
 
 
 class ResNet34(nn.Module):
@@ -102,11 +103,12 @@ def squared_distances(first: Tensor, second: Tensor) -> Tensor:
 def hard_negatives(
     anchors: Tensor, positive_distances: Tensor, apart: Tensor, *, semi_hard: bool
 ) -> Tensor:
-    """Rows (B,) of the negative for each anchor (B, D) among the other anchors; -1 where none is.
+    """Row (B,) of the negative for each anchor (B, D) among the other anchors; -1 if there is none.
 
-    Negatives show the same instant at another place: `apart` (B, B) bool says which places are
-    different ones. The hardest is the nearest. Semi-hard is the nearest that is farther than the
-    positive, whose squared distances are given (B,), and the hardest where there is none.
+    Negatives show another place on the same date; `apart` (B, B) bool marks pairs of different
+    places. The hardest negative is the nearest one. The semi-hard negative is the nearest one that
+    is farther than the positive, whose squared distances are given (B,); if there is none, the
+    hardest negative is taken.
     """
     distances = squared_distances(anchors, anchors).masked_fill(~apart, torch.inf)
     nearest, rows = distances.min(dim=1)
@@ -123,7 +125,7 @@ def triplet_loss(
     """Mean over anchors of max(0, ||xa - xp||^2 - ||xa - xn||^2 + margin), xn mined in the batch.
 
     `anchors` and `positives` (B, D); `apart` (B, B) as in `hard_negatives`. Anchors without a
-    negative count nothing; with none at all the loss is zero, with a gradient of zero.
+    negative are left out; if no anchor has one, loss and gradient are zero.
     """
     near = (anchors.float() - positives.float()).square().sum(1)
     with torch.no_grad():
@@ -135,7 +137,7 @@ def triplet_loss(
 
 
 class Triplets:
-    """The triplet network: each tile beside another date of it, negatives mined in the batch."""
+    """The triplet task: each tile with another date of it, negatives mined in the batch."""
 
     def __init__(
         self,
@@ -153,7 +155,7 @@ class Triplets:
         )
 
     def arrays(self, epoch: int, indices: NDArray[np.intp]) -> tuple[NDArray[Any], ...]:
-        """Tiles and their positives in turn (2B, C, S, S), and which are apart (B, B)."""
+        """Tiles and positives in alternation (2B, C, S, S), and the mask (B, B) of pairs apart."""
         anchors = self.tiles.batch(indices)
         both = np.empty((2 * len(indices), *anchors.shape[1:]), np.float32)
         both[0::2] = anchors
@@ -184,9 +186,9 @@ class Triplets:
     def backward(self, run: nn.Module, *tensors: Tensor) -> Tensor:
         """Add the gradients of the triplet loss.
 
-        A batch larger than `chunk` is embedded twice: first without gradients, which gives those
-        of the loss to the embeddings, then chunk by chunk with them (Gao et al. 2021,
-        arXiv 2101.06983), so that memory does not grow with the batch.
+        A batch larger than `chunk` is embedded twice (Gao et al. 2021, arXiv 2101.06983): first
+        without gradients, for the gradient of the loss with respect to the embeddings, then chunk
+        by chunk with gradients. Memory therefore does not grow with the batch.
         """
         both, apart = tensors
         if len(both) <= self.chunk:
@@ -218,7 +220,7 @@ class Triplets:
 
 
 def _unshared(run: nn.Module, wanted: bool) -> contextlib.AbstractContextManager[None]:
-    """Where several processes learn together: gradients stay with this one for a while."""
+    """With several processes: do not average gradients while this lasts."""
     if wanted and isinstance(run, DistributedDataParallel):
         held: contextlib.AbstractContextManager[None] = run.no_sync()
         return held

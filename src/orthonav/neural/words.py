@@ -1,6 +1,6 @@
-"""Learning a bag of visual words: k-means of the features of reference pictures.
+"""Learns a bag of visual words: k-means of the features of reference pictures.
 
-Needs faiss, and PyTorch for SuperPoint. What flies is `orthonav.embed.words`.
+Needs faiss, and PyTorch for SuperPoint. The embedder that flies is `orthonav.embed.words`.
 """
 
 import warnings
@@ -27,16 +27,16 @@ from orthonav.extras import needed
 SAMPLES_PER_WORD = 40
 """Descriptors per word: faiss warns below 39, as fewer make empty clusters."""
 MIN_SAMPLES = 100_000
-"""Least number of descriptors that are clustered, where the pictures have so many."""
+"""Descriptors that are clustered at least, if the pictures have that many."""
 ITERATIONS = 20
 """Iterations of k-means; faiss's own default is 25."""
 SUPERPOINT_RADIUS_PX = 8.0
-"""A SuperPoint feature sees its own cell and those beside it, of 8 px."""
+"""A SuperPoint feature covers its own cell of 8 px and the neighbouring cells."""
 
 
 @dataclass(frozen=True)
 class SuperPointDetector:
-    """SuperPoint features: `weights` is the path of its network, `most` the number of features."""
+    """SuperPoint features: `weights` is the path of the network, `most` the number of features."""
 
     weights: str
     most: int
@@ -51,14 +51,14 @@ class SuperPointDetector:
 
 
 def detector_of(recipe: WordsRecipe) -> Detector | None:
-    """What finds the features of a recipe; None for SIFT, which is built in."""
+    """Feature detector of a recipe; None for SIFT, which is built in."""
     if recipe.features == "sift":
         return None
     return SuperPointDetector(recipe.weights, recipe.max_features)
 
 
 class _Sample:
-    """A random sample of all rows that are put in, without knowing how many will come."""
+    """Uniform random sample of a stream of rows of unknown length (reservoir sampling)."""
 
     def __init__(self, size: int, seed: int) -> None:
         self.size = size
@@ -68,7 +68,7 @@ class _Sample:
         self._count = 0
 
     def put(self, rows: NDArray[Any]) -> None:
-        """Take in rows (N, ..)."""
+        """Add rows (N, ..)."""
         self._rows.append(rows)
         self._tickets.append(self._random.random(len(rows)))
         self._count += len(rows)
@@ -76,7 +76,7 @@ class _Sample:
             self._draw()
 
     def rows(self) -> NDArray[Any]:
-        """The sample, in the order in which its rows came."""
+        """The sample, in the order of arrival."""
         self._draw()
         return self._rows[0]
 
@@ -84,8 +84,8 @@ class _Sample:
         """Keep the rows with the lowest tickets."""
         rows, tickets = np.concatenate(self._rows), np.concatenate(self._tickets)
         if len(rows) > self.size:
-            kept = np.sort(np.argsort(tickets, kind="stable")[: self.size])
-            rows, tickets = rows[kept], tickets[kept]
+            drawn = np.sort(np.argsort(tickets, kind="stable")[: self.size])
+            rows, tickets = rows[drawn], tickets[drawn]
         self._rows, self._tickets, self._count = [rows], [tickets], len(rows)
 
 
@@ -95,7 +95,7 @@ def learn_words(
     seed: int = 0,
     progress: Callable[[float], None] = lambda share: None,
 ) -> WordsEmbedder:
-    """Learn the words from pictures (S, S) uint8, each with its valid pixels (S, S).
+    """Embedder learned from pictures (S, S) uint8, each with its valid pixels (S, S).
 
     k-means of at most 40 descriptors per word, and at least 100000, drawn evenly from all; the
     same seed gives the same words. With `tfidf`, a word found in n of N pictures weighs
@@ -116,8 +116,8 @@ def learn_words(
     drawn = sample.rows() if count else np.zeros((0, DIMS[recipe.features]), stored)
     if len(drawn) < recipe.words:
         raise VariantError(
-            f"{recipe.words} words cannot be learnt from {len(drawn)} features in {count} "
-            "pictures; take fewer words or more imagery"
+            f"{recipe.words} words cannot be learned from {len(drawn)} features in {count} "
+            "pictures; use fewer words or more imagery"
         )
     centres = _clustered(faiss, drawn.astype(np.float32), recipe.words, seed, progress)
     vocabulary = np.rint(centres).clip(0, 255) if recipe.features == "sift" else centres
