@@ -119,12 +119,17 @@ def _sides(capture: cv2.VideoCapture) -> tuple[int, int]:
     return int(width), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
 
 
+SILENT = 0
+"""OpenCV's level of logging at which it writes nothing."""
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
     """The open video; failures are reported as exceptions, so OpenCV's messages are dropped."""
-    logging = cv2.utils.logging
+    # OpenCV 5 has these in a module of their own, OpenCV 4 at the top.
+    logging: Any = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging
     before = logging.getLogLevel()
-    logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    logging.setLogLevel(SILENT)
     try:
         capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
     finally:
