@@ -12,23 +12,23 @@ import pytest
 
 pytest.importorskip("faiss", reason="searching an atlas needs FAISS")
 
-from orthonav.atlas.build import AtlasRequest, build_atlas  # noqa: E402
-from orthonav.atlas.catalog import Atlas  # noqa: E402
-from orthonav.atlas.cluster import SerialRunner  # noqa: E402
-from orthonav.atlas.index import make_index  # noqa: E402
-from orthonav.atlas.index_manifest import MANIFEST, IndexManifest, read_manifest, stale_sheets  # noqa: E402
-from orthonav.atlas.locate import AtlasLocator, _against, rectified  # noqa: E402
-from orthonav.atlas.recipe import CoarseRecipe  # noqa: E402
-from orthonav.atlas.sheet_registration import SheetRegistrar  # noqa: E402
-from orthonav.atlas.tile_search import TileSearch  # noqa: E402
-from orthonav.errors import AtlasError  # noqa: E402
-from orthonav.flight.folder import open_flight  # noqa: E402
-from orthonav.geo.frames import distances_m  # noqa: E402
-from orthonav.geo.route import Route  # noqa: E402
-from orthonav.imagery.mosaic import Mosaic  # noqa: E402
-from orthonav.onboard.run import locate_view  # noqa: E402
-from orthonav.records import Fix, NoFix, View  # noqa: E402
-from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight  # noqa: E402
+from orthonav.atlas.build import AtlasRequest, build_atlas
+from orthonav.atlas.catalog import Atlas
+from orthonav.atlas.cluster import SerialRunner
+from orthonav.atlas.index import make_index
+from orthonav.atlas.index_manifest import MANIFEST, IndexManifest, read_manifest, stale_sheets
+from orthonav.atlas.locate import AtlasLocator, _against, rectified
+from orthonav.atlas.recipe import CoarseRecipe
+from orthonav.atlas.sheet_registration import SheetRegistrar
+from orthonav.atlas.tile_search import TileSearch
+from orthonav.errors import AtlasError
+from orthonav.flight.folder import open_flight
+from orthonav.geo.frames import distances_m
+from orthonav.geo.route import Route
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.onboard.run import locate_view
+from orthonav.records import Fix, NoFix, View
+from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 
 RECIPE = {
     "gsd_m": 2.5,
