@@ -60,8 +60,8 @@ if asked fixes; then emulated tools/platforms/fixes.py "$@"; fi
 if asked fly; then
     rm -f "$work/fly.jsonl"  # lines are added to what there is
     # Slower than it was flown: an emulated view takes seconds. It ends where the flight ends.
-    orthonav fly "$golden/area.onav" --camera "$golden/flight" --telemetry recorded --pace 0.1 \
-        --dry-run --autopilot udpin:0 --json "$work/fly.jsonl"
+    orthonav fly "$golden/area.onav" "$golden/flight" --recorded-telemetry --pace 0.1 \
+        --dry-run --autopilot udpin:0 --jsonl "$work/fly.jsonl"
     emulated -c "import collections, json; lines = map(json.loads, open('$work/fly.jsonl'))
 print('flown:', collections.Counter(line.get('status', 'health') for line in lines))"
 fi
