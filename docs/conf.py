@@ -41,10 +41,8 @@ nitpicky = True
 nitpick_ignore_regex = [
     (r"py:.*", r"(?!orthonav\b).*"),
     # Values that are handed on between parts, not documented on pages of their own.
-    (
-        r"py:class",
-        r"orthonav\.(confidence|embed\.cells|register|search\.peak|track\.hypotheses)\..*",
-    ),
+    (r"py:class", r"orthonav\.(confidence|embed\.cells|register)\..*"),
+    (r"py:class", r"orthonav\.(search\.peak|track\.hypotheses)\..*"),
     (r"py:class", r"orthonav\.sources\.track\..*"),
 ]
 

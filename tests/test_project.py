@@ -1,12 +1,15 @@
 """Files about the project agree with each other and can be read where they are shown."""
 
+import importlib.util
 import re
+import shlex
 import tomllib
 from pathlib import Path
 
 import yaml
 
 from orthonav import __version__
+from orthonav.cli import _parser
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
@@ -55,3 +58,13 @@ def test_workflows_and_issue_forms_are_whole():
             for step in job["steps"]:
                 for script in re.findall(r"(?:^|\s)(\.ci/\S+|tools/\S+\.py)", step.get("run", "")):
                     assert (ROOT / script).is_file(), script
+
+
+def test_commands_of_the_wheel_script_are_understood():
+    spec = importlib.util.spec_from_file_location("try_wheel", ROOT / "tools" / "try_wheel.py")
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    lines = [line for lines in script.COMMANDS.values() for line in lines]
+    assert len(lines) > 10
+    for words in map(shlex.split, lines):
+        assert _parser(words).parse_args(words).command == words[0]

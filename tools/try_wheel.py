@@ -35,7 +35,7 @@ MADE_BY_BUILD = ("PKG-INFO", "setup.cfg", "src/orthonav.egg-info/")
 
 ORTHO, MAP, FLIGHT, FIXES = "land/2016-07.tif", "area.onav", "flight", "fixes.jsonl"
 BUILD = f"build --ortho {ORTHO} --tile-px 128 --overlap 0.75 --calibration-views 20"
-ATLAS = f"build --ortho {ORTHO} --tile-px 128 --coarse-gsd-m 2 --coarse-tile-px 64"
+ATLAS = f"--ortho {ORTHO} --tile-px 128 --coarse-gsd-m 2 --coarse-tile-px 64"
 COMMANDS: dict[str, Sequence[str]] = {
     "geo": (
         "landscape --out land --size-m 600 600 --gsd-m 1",
@@ -48,15 +48,13 @@ COMMANDS: dict[str, Sequence[str]] = {
         f"evaluate {FIXES} --truth {FLIGHT}/truth.csv --metrics metrics.json",
     ),
     "report": (f"evaluate {FIXES} --truth {FLIGHT}/truth.csv --report report",),
-    "autopilot": (
-        f"fly {MAP} --camera {FLIGHT} --telemetry recorded --pace 100 --json - --log run.mcap",
-    ),
+    "autopilot": (f"fly {MAP} {FLIGHT} --recorded-telemetry --pace 100 --jsonl - --log run.mcap",),
     "flights": ("import run_0001.mcap --out imported",),
     "signing": (f"sign {MAP} --new-key keys", f"verify {MAP} --public-key keys/public.pem"),
     "fetch": ("fetch --list",),
     "segments": (f"{BUILD} --edges segments --out segments.onav",),
-    "atlas": (f"{ATLAS} --atlas atlas", "atlas check atlas --deep"),
-    "cluster": (f"{ATLAS} --atlas cluster --cluster local",),
+    "atlas": (f"atlas build atlas {ATLAS}", "atlas check atlas --deep"),
+    "cluster": (f"atlas build cluster {ATLAS} --cluster local",),
     "train": (f"{BUILD} --method bovw --out words.onav",),
 }
 """Commands tried with an extra, in this order; later ones use what earlier ones made."""
