@@ -281,7 +281,7 @@ def test_rare_words_weigh_more():
 @needs_faiss
 @pytest.mark.parametrize("greys", [[], [np.zeros((64, 64), np.uint8)], [area(size=100)]])
 def test_too_few_features_are_refused(greys):
-    with pytest.raises(VariantError, match=r"1024 words cannot be learnt from \d+ features"):
+    with pytest.raises(VariantError, match=r"1024 words cannot be learned from \d+ features"):
         learn_words(WordsRecipe(), pictures_of(greys))
 
 
