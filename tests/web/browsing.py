@@ -27,8 +27,10 @@ SETTLED = """
 [...document.images].every((each) => !each.getAttribute("src") || each.complete)
   && [...document.querySelectorAll(".leaflet-tile")]
     .every((each) => getComputedStyle(each).opacity === "1")
-  && !document.querySelector(".leaflet-zoom-anim")
+  && !document.querySelector(".leaflet-zoom-anim, .leaflet-pan-anim")
 """
+TWO_FRAMES = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+"""Leaflet begins to zoom in the frame after the event that asks for it."""
 
 
 class Visit:
@@ -79,7 +81,8 @@ class Visit:
         self.settled()
 
     def settled(self):
-        """Waits until all images are there."""
+        """Waits until all images are there and the map stands still."""
+        self.page.evaluate(TWO_FRAMES)
         self.until(lambda: self.page.evaluate(SETTLED))
 
     def until(self, holds):
