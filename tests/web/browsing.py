@@ -87,7 +87,7 @@ class Visit:
 
     def until(self, holds):
         """Waits for what does not come at once; scripts of the page must not be made of text."""
-        last = time.monotonic() + 20
+        last = time.monotonic() + 60
         while not holds():
             assert time.monotonic() < last
             self.page.wait_for_timeout(30)
