@@ -56,7 +56,7 @@ def test_workflows_and_issue_forms_are_whole():
         assert flow["permissions"] == {"contents": "read"}
         for job in flow["jobs"].values():
             for step in job["steps"]:
-                for script in re.findall(r"(?:^|\s)(\.ci/\S+|tools/\S+\.py)", step.get("run", "")):
+                for script in re.findall(r"(?:^|\s)(\.ci/\S+|tools/\S+\.(?:py|sh))", step.get("run", "")):
                     assert (ROOT / script).is_file(), script
 
 

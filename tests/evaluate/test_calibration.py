@@ -358,11 +358,11 @@ def test_the_command_evaluates_several_flights(tmp_path, capsys) -> None:
 
     lat, lon = CENTRE.latlon_from_en(np.array([3.0, 4.0]))
     fix = Fix(float(lat), float(lon), 25 * np.eye(2), 0.95, RADIUS_M, 0.0, 100.0)
-    unsure = replace(fix, confidence=math.nan, cov_en_m2=np.full((2, 2), math.nan))
+    unknown = replace(fix, confidence=math.nan, cov_en_m2=np.full((2, 2), math.nan))
     truth, out = tmp_path / "truth.csv", tmp_path / "metrics.json"
     truth.write_text("frame,lat_deg,lon_deg\na.jpg,48.0,-4.5\n")
     paths = [tmp_path / "one.jsonl", tmp_path / "two.jsonl"]
-    for path, known in zip(paths, (fix, unsure), strict=True):
+    for path, known in zip(paths, (fix, unknown), strict=True):
         path.write_text(result_to_json(ViewResult("a.jpg", 0, known, 10.0)) + "\n")
     options = [
         *map(str, paths),

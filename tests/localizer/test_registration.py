@@ -217,11 +217,11 @@ def test_unknown_heading(localizer, yaw_deg):
 
 def test_headings_are_searched_as_far_as_their_deviation(localizer):
     grey = rendered(GROUND, (60.0, -30.0), (40.0, 0.0, 0.0))
-    unsure = localizer.locate(View(grey, CAMERA, telemetry(75.0, yaw_std_deg=25.0)))
-    assert error_m(localizer, unsure, (60.0, -30.0)) < 0.15
-    assert abs(turned_deg(unsure.heading_deg, 40.0)) < 0.1
-    sure = localizer.locate(View(grey, CAMERA, telemetry(75.0, yaw_std_deg=1.0)))
-    assert not isinstance(sure, Fix) or sure.confidence < 0.5
+    weak = localizer.locate(View(grey, CAMERA, telemetry(75.0, yaw_std_deg=25.0)))
+    assert error_m(localizer, weak, (60.0, -30.0)) < 0.15
+    assert abs(turned_deg(weak.heading_deg, 40.0)) < 0.1
+    precise = localizer.locate(View(grey, CAMERA, telemetry(75.0, yaw_std_deg=1.0)))
+    assert not isinstance(precise, Fix) or precise.confidence < 0.5
 
 
 def test_a_wrong_height_is_corrected(localizer):

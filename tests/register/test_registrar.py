@@ -173,8 +173,8 @@ def test_a_place_that_is_there_almost_twice_is_less_sure():
 
 
 @pytest.mark.parametrize("turn_deg", [25.0, -25.0])
-def test_of_two_like_places_the_one_told_is_taken(turn_deg):
-    """The twin is turned: the heading tells which of both it is, if it is told."""
+def test_the_reported_heading_chooses_between_two_alike_places(turn_deg):
+    """The twin is turned: the reported heading decides between them."""
     registrar = Registrar(reference_of(Twin(turn_rad=math.radians(turn_deg)), SHAPE))
     twin = Pose(336.0, 192.0, ONE.turn_rad + math.radians(turn_deg), 0.0)
     templates = templates_of(GROUND, ONE)
@@ -182,8 +182,9 @@ def test_of_two_like_places_the_one_told_is_taken(turn_deg):
     ratios = []
     for pose, std_deg in ((ONE, 10.0), (twin, 10.0), (ONE, 40.0)):
         found = verified(registrar, templates, LEVELS, candidates, LEVELS.look, told(pose, std_deg))
-        # A weak heading leaves a tie, which OpenCV 4 and 5 round apart.
-        assert std_deg > 10.0 or apart_px(found.placed.pose, pose) < 0.1
+        # A weak heading leaves a tie of both places, which OpenCV 4 and 5 round apart.
+        right = (ONE, twin) if std_deg > 10.0 else (pose,)
+        assert min(apart_px(found.placed.pose, each) for each in right) < 0.1
         ratios.append(found.peak_ratio)
     assert min(ratios[:2]) > ratios[2] >= 0.99
     unknown = verified(registrar, templates, LEVELS, candidates, LEVELS.look, NOTHING_TOLD)

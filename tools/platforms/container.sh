@@ -34,7 +34,7 @@ fi
 
 # Only what the Containerfile copies: a context of the whole checkout would take environments along.
 rm -rf "$work/context" && mkdir "$work/context"
-for name in pyproject.toml constraints.txt README.md LICENSE src examples; do
+for name in pyproject.toml constraints.txt PYPI.md LICENSE src examples; do
     cp -r "$checkout/$name" "$work/context/$name"
 done
 image build --quiet ${base:+--build-arg "BASE=$base"} -t localhost/orthonav \

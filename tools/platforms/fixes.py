@@ -127,7 +127,7 @@ def make(folder: Path) -> None:
             spacing_m=30.0,
             agl_m=150.0,
             camera=Camera(256, 192, 200.0, 200.0, 128.0, 96.0),
-            errors=Errors(yaw_std_deg=4.0, agl_std=0.03, lean_std_deg=2.0, velocity_drift=0.03),
+            errors=Errors(yaw_std_deg=4.0, agl_std=0.03, attitude_std_deg=2.0, velocity_drift=0.03),
             seed=1,
         )
         simulate_flight(request)
