@@ -40,7 +40,7 @@ from orthonav.localizer import Localizer
 from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import localize_flight
-from orthonav.records import Fix, ViewResult
+from orthonav.records import CONFIDENT, Fix, ViewResult
 from orthonav.simulate.clouds import Clouds
 from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.simulate.motion import Wind
@@ -56,7 +56,7 @@ SCATTER = Errors(
 )
 GAP_M, JUMP_M = 3000.0, 2000.0
 """A kidnapped flight leaves out at least this path length and this straight distance."""
-CONFIDENT, RIGHT_M, DIVERGED_M, DIVERGED_VIEWS = 0.9, 35.0, 60.0, 10
+RIGHT_M, DIVERGED_M, DIVERGED_VIEWS = 35.0, 60.0, 10
 SEED = 100
 Array = NDArray[np.float64]
 HEADER = (

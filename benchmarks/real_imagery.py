@@ -23,13 +23,13 @@ from benchmarks.inputs import REAL_DATA
 from benchmarks.negatives import SHARES, Sources, negatives
 from benchmarks.placing import row_of
 from benchmarks.record import Table, number, provenance
-from benchmarks.verdicts import CONFIDENT, FAR_M, Verdict, percent
+from benchmarks.verdicts import FAR_M, Verdict, percent
 from orthonav.flight import open_flight, read_truth
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import SingleViews, localize_flight, locate_view
 from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import Fix, Telemetry, View
+from orthonav.records import CONFIDENT, Fix, Telemetry, View
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
 DATA = Path(os.environ.get("ORTHONAV_DATA", REAL_DATA))

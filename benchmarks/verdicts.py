@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.evaluate.calibration import calibrate, check_covariance
+from orthonav.records import CONFIDENT
 
-CONFIDENT, FAR_M = 0.9, 35.0
+FAR_M = 35.0
 Array = NDArray[np.float64]
 
 

@@ -192,9 +192,9 @@ def test_the_extra_that_an_error_names_brings_the_module():
 def test_extras_that_include_others(monkeypatch):
     lines = ['a>=1', 'b[x]>=2,<3; extra == "one"', 'orthonav[one]; extra == "two"',
              'c; python_version >= "3" and extra == "two"']  # fmt: skip
-    monkeypatch.setattr(extras.metadata, "requires", lambda name: lines)
+    monkeypatch.setattr(metadata, "requires", lambda name: lines)
     monkeypatch.setattr(
-        extras.metadata,
+        metadata,
         "metadata",
         lambda name: type("M", (), {"get_all": lambda self, key: ["one", "two"]})(),
     )
@@ -215,7 +215,7 @@ def test_sources_without_metadata_ask_nothing(monkeypatch):
     def gone(name):
         raise metadata.PackageNotFoundError(name)
 
-    monkeypatch.setattr(extras.metadata, "requires", gone)
+    monkeypatch.setattr(metadata, "requires", gone)
     extras._requirements.cache_clear()
     try:
         assert extras.packages() == () and extras.missing("geo") == ()

@@ -56,7 +56,9 @@ def test_workflows_and_issue_forms_are_whole():
         assert flow["permissions"] == {"contents": "read"}
         for job in flow["jobs"].values():
             for step in job["steps"]:
-                for script in re.findall(r"(?:^|\s)(\.ci/\S+|tools/\S+\.(?:py|sh))", step.get("run", "")):
+                for script in re.findall(
+                    r"(?:^|\s)(\.ci/\S+|tools/\S+\.(?:py|sh))", step.get("run", "")
+                ):
                     assert (ROOT / script).is_file(), script
 
 
@@ -66,5 +68,7 @@ def test_commands_of_the_wheel_script_are_understood():
     spec.loader.exec_module(script)
     lines = [line for lines in script.COMMANDS.values() for line in lines]
     assert len(lines) > 10
+    extras = set(PROJECT["optional-dependencies"]) - {"dev", "docs", "test"}
+    assert extras <= set(script.COMMANDS | script.SCRIPTS)
     for words in map(shlex.split, lines):
         assert _parser(words).parse_args(words).command == words[0]

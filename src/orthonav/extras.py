@@ -8,7 +8,7 @@ import importlib
 import re
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import metadata, util
+from importlib import util
 from typing import Any
 
 from orthonav.errors import MissingExtraError
@@ -43,6 +43,8 @@ class Package:
 @lru_cache(maxsize=1)
 def _requirements() -> dict[str, list[tuple[str, str, str]]]:
     """(package, its extras, range) by extra, "" for what is always needed; {} if not installed."""
+    from importlib import metadata  # takes as long as the rest of the command line to import
+
     try:
         lines = metadata.requires(NAME) or []
     except metadata.PackageNotFoundError:  # run from its sources
@@ -117,6 +119,8 @@ def module_of(package: str) -> str:
 
 def _version(package: str) -> str:
     """Version of an installed package, "" where its module cannot be found."""
+    from importlib import metadata
+
     try:
         if util.find_spec(module_of(package)) is None:
             return ""

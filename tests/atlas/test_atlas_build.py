@@ -92,7 +92,7 @@ def test_an_atlas_holds_a_map_and_coarse_tiles_for_each_sheet(built, ortho):
     size_bytes = sum(sheet.size_bytes for sheet in sheets.values())
     assert plain["size_mb"] == pytest.approx(size_bytes / 1e6, abs=1e-4)
     assert plain["cpu_s"] > 0 and plain["peak_mb"] > 10
-    assert plain["cost"] == pytest.approx(plain["core_s"] / 100, abs=1e-3)
+    assert plain["cost"] == pytest.approx(plain["core_s"] / 100, abs=1e-4)
     assert plain["sheets_per_hour"] > 0 and plain["mb_per_km2"] > 0
 
 

@@ -299,7 +299,7 @@ def test_check(near, capfd):
     near.store.write(".atlas.json.a1b2c3d4.tmp.json", b"")
     code, done = run(capfd, "check", near.url, "--clean", "--min-age-h", "0")
     assert code == 3 and "missing file    sheets/" in done.out and "1 problems" in done.out
-    assert "(removed)" in done.out
+    assert "(fixed)" in done.out
     code, done = run(capfd, "check", near.url, "--json", "--deep")
     plain = json.loads(done.out)
     assert code == 3 and not plain["whole"] and plain["deep"]

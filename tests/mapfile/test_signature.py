@@ -251,7 +251,7 @@ def test_the_commands(tmp_path, run):
     assert run("sign", path, "--key", tmp_path / "key" / "private.pem").code == 0
     done = run("localize", path, tmp_path, "--out", tmp_path / "out", "--require-signed", public)
     assert "expected a flight folder" in done.err  # the next thing that is wrong
-    assert "--camera" in run(*fly).err  # likewise
+    assert "no camera calibration: give --camera FILE" in run(*fly).err  # likewise
     assert run("sign", "--key", tmp_path / "key" / "private.pem").code == 1
     assert run("sign", path).code == 2
 

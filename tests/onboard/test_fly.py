@@ -655,6 +655,7 @@ def test_a_flight_from_end_to_end(flown, autopilot, paced, tmp_path):
         assert np.hypot(*(place - truth[each.frame])) < 6
         assert line["sent"] or line["withheld"] == "stale"
     sent = [each for line, each in zip(written, results, strict=True) if line["sent"]]
+    assert sent, [line["withheld"] for line in written]
     for name in ("GLOBAL_POSITION_SENSOR", "GPS_INPUT"):
         wait_for(lambda name=name: len(autopilot.named(name)) >= len(sent), 10)
         assert [(m["lat"], m["lon"]) for m in autopilot.named(name)] == [

@@ -37,10 +37,10 @@ from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.ros2.arguments import ros_arguments
 from orthonav.onboard.ros2.messages import Definitions
 from orthonav.onboard.ros2.node import Node
-from orthonav.onboard.ros2.publisher import Ros2Publisher, floored
+from orthonav.onboard.ros2.publisher import Ros2Publisher
 from orthonav.onboard.ros2.reader import Ros2Reader
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer, VehicleState
-from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
+from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate, floored
 from orthonav.publish.gate import Gate, GateRules
 from orthonav.records import ViewResult
 from orthonav.sources.opening import open_source

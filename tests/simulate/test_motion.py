@@ -78,9 +78,17 @@ def test_wind_stronger_than_the_airspeed_is_refused(speed):
         flown(LINE, Wind(speed))
 
 
-@pytest.mark.parametrize("wind", [(-1.0, 0.0), (math.nan, 0.0), (5.0, math.nan), (5.0, 1e9)])
-def test_impossible_wind_is_refused(wind):
-    with pytest.raises(FlightError, match=r"wind (direction )?must"):
+@pytest.mark.parametrize(
+    "wind, message",
+    [
+        ((-1.0, 0.0), "wind must be 0 to 200 m/s"),
+        ((math.nan, 0.0), "wind must be 0 to 200 m/s"),
+        ((5.0, math.nan), "wind direction must be"),
+        ((5.0, 1e9), "wind direction must be"),
+    ],
+)
+def test_impossible_wind_is_refused(wind, message):
+    with pytest.raises(FlightError, match=message):
         Wind(*wind)
 
 

@@ -17,7 +17,6 @@ from contextlib import contextmanager
 from types import ModuleType
 
 from orthonav.cli.needs import require_extras
-from orthonav.cli.version import show_version
 from orthonav.errors import OrthonavError
 
 UNITS = frozenset(("m", "mps", "px", "deg", "s", "ms", "mb", "km", "hz"))
@@ -59,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     verbose = False
     try:
         if "--version" in arguments and COMMANDS.keys().isdisjoint(arguments):
-            return show_version(arguments)
+            return int(importlib.import_module("orthonav.cli.version").show_version(arguments))
         options = _parser(arguments).parse_args(arguments)
         verbose = options.verbose
         level = logging.DEBUG if verbose else logging.ERROR if options.quiet else logging.WARNING
@@ -69,8 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         logging.getLogger("matplotlib").setLevel(logging.ERROR)
         _print_any_letter()
         with _terminable():
-            if not getattr(options, "list", False):  # lists presets, which need no extra
-                require_extras(options.command)
+            require_extras(options.command)
             status: int | None = _module(options.command).run(options)
             sys.stdout.flush()
     except OrthonavError as error:

@@ -198,7 +198,7 @@ def _check(options: argparse.Namespace) -> int:
         )
     else:
         for problem in found:
-            done = " (removed)" if problem.removed else ""
+            done = " (fixed)" if problem.removed else ""
             print(f"{problem.kind:15} {problem.name}: {problem.detail}{done}")
         verdict = f"{len(left)} problems" if left else "whole"
         print(f"{verdict}{'' if options.deep else ', by names and sizes'}: {atlas.store}")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from orthonav.cli.common import add_area, bounds, print_json, progress
+from orthonav.cli.needs import require_extras
 from orthonav.errors import FetchError
 
 if TYPE_CHECKING:
@@ -136,6 +137,7 @@ def run(options: argparse.Namespace) -> None:
         return
     if options.source is None or (options.out is None and not options.dry_run):
         raise FetchError("give a --source (--list shows the known ones) and an --out")
+    require_extras("fetch --source")
     if options.source.startswith(PACKAGE):
         _run_package(options)
         return

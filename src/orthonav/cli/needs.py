@@ -8,7 +8,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "demo": ("geo", "report", "web"),
     "landscape": ("geo",),
     "simulate": ("geo",),
-    "fetch": ("fetch",),
+    "fetch --source": ("fetch",),
     "build": ("geo",),
     "check": ("geo", "report", "web"),
     "atlas": ("geo",),

@@ -11,6 +11,7 @@ from typing import Any
 
 from orthonav import __version__
 from orthonav.cli.needs import NEEDS
+from orthonav.cores import usable_cores
 from orthonav.extras import missing, packages, pip_line
 
 _CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
@@ -55,10 +56,9 @@ def about() -> dict[str, Any]:
 
 def _processor() -> dict[str, Any]:
     """Architecture, cores that may be used, memory, and what OpenCV uses of the instruction set."""
-    affinity = getattr(os, "sched_getaffinity", None)  # not on every system
     return {
         "machine": platform.machine(),
-        "cores": len(affinity(0)) if affinity else os.cpu_count(),
+        "cores": usable_cores(),
         "memory_mb": _memory_mb(),
         "features": _features(),
     }

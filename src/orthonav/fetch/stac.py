@@ -15,7 +15,7 @@ from typing import Any
 from orthonav.errors import FetchError
 from orthonav.fetch.client import Client
 from orthonav.fetch.documents import get_json
-from orthonav.fetch.options import ImageryOptions, listed
+from orthonav.fetch.options import GSD_TOLERANCE, ImageryOptions, listed
 from orthonav.fetch.urls import TOKEN, Secret, carrying_key, joined, origin_of, with_query
 
 MAX_ITEMS = 500
@@ -192,7 +192,9 @@ def _asset(assets: dict[str, Any], options: ImageryOptions, name: str) -> str:
     gsds_m = {
         key: float(asset.get("gsd", asset.get("eo:gsd", 0)) or 0) for key, asset in tiffs.items()
     }
-    fitting = [key for key, gsd_m in gsds_m.items() if 0 < gsd_m <= options.wanted_gsd_m * 1.05]
+    fitting = [
+        key for key, gsd_m in gsds_m.items() if 0 < gsd_m <= options.wanted_gsd_m * GSD_TOLERANCE
+    ]
     if fitting:
         return max(fitting, key=lambda key: gsds_m[key])
     raise FetchError(f"choose one with --asset; item {name} has {listed(list(tiffs))}")

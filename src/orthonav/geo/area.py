@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from orthonav.errors import AreaError
 from orthonav.geo.frames import MAX_SHEET_M, LocalFrame
 from orthonav.geo.route import Route, within_bands
-from orthonav.geo.swapped import swapped_hint
+from orthonav.geo.swapped import swapped_bounds_hint
 
 Extent = tuple[float, float, float, float]
 
@@ -43,7 +43,7 @@ class Area:
                 f"south < north, got {','.join(map(str, bounds_deg))}"
             )
         if max(abs(south), abs(north)) > 89.9 or east - west > 10 or north - south > 10:
-            hint = swapped_hint(max(south, north, key=abs), max(west, east, key=abs))
+            hint = swapped_bounds_hint((west, south, east, north))
             raise AreaError(
                 "bounds must be west,south,east,north in degrees, at most 10 degrees across"
                 f"{hint}, got {','.join(map(str, bounds_deg))}"

@@ -16,7 +16,7 @@ from orthonav.errors import AreaError
 from orthonav.geo.area import Area, Extent
 from orthonav.geo.frames import MAX_SHEET_M, WGS84_A_M
 from orthonav.geo.route import Height, Route, leg_lengths_m
-from orthonav.geo.swapped import swapped_hint
+from orthonav.geo.swapped import swapped_bounds_hint
 
 MAX_SHEETS = 10_000
 """Limit of the program; 2500 km2 each, so 25 million km2."""
@@ -44,7 +44,7 @@ def sheets_of_bounds(bounds_deg: Extent) -> list[Extent]:
             f"got {','.join(map(str, bounds_deg))}"
         )
     if max(abs(south), abs(north)) > 89.5 or abs(west) > 360:
-        hint = swapped_hint(max(south, north, key=abs), max(west, east, key=abs))
+        hint = swapped_bounds_hint((west, south, east, north))
         raise AreaError(
             f"bounds must lie within 89.5 deg of the equator{hint}, "
             f"got {','.join(map(str, bounds_deg))}"

@@ -5,6 +5,12 @@ from collections.abc import Callable
 HINT = "latitude and longitude seem to be swapped"
 
 
+def swapped_bounds_hint(bounds_deg: tuple[float, float, float, float]) -> str:
+    """`swapped_hint` of the corner of west, south, east, north that is farthest from 0, 0."""
+    west, south, east, north = bounds_deg
+    return swapped_hint(max(south, north, key=abs), max(west, east, key=abs))
+
+
 def swapped_hint(
     lat_deg: float, lon_deg: float, contains: Callable[[float, float], bool] | None = None
 ) -> str:

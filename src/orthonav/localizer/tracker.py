@@ -19,7 +19,7 @@ from orthonav.localizer.odometry import OdometryView, ViewDisplacement, correcte
 from orthonav.localizer.places import places_of
 from orthonav.localizer.prepared import PreparedView
 from orthonav.localizer.tilt import with_tilt
-from orthonav.records import Fix, NoFix, Prior, Telemetry, View
+from orthonav.records import PRIOR_SIGMAS, Fix, NoFix, Prior, Telemetry, View
 from orthonav.register.registrar import Registered
 from orthonav.track import (
     Estimate,
@@ -347,7 +347,7 @@ class Tracker:
         if 4 * reach**2 > self.mixture.area_m2 / 4:
             return None, None
         lat, lon = self._localizer.sheet.frame.latlon_from_en(expected.mean[:2])
-        return Prior(float(lat), float(lon), reach / 3), (expected.mean[:2], reach)
+        return Prior(float(lat), float(lon), reach / PRIOR_SIGMAS), (expected.mean[:2], reach)
 
     def _sightings(
         self,

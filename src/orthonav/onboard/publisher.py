@@ -69,9 +69,8 @@ class Publisher:
             estimate = self.gate.admit(made, now_ns)
             withheld = next(iter(self.gate.withheld - before), None)
         sent: tuple[str, ...] = ()
-        if estimate is not None and self.messenger is not None and self._link is not None:
-            sent = self._send(estimate, exposed_ns, vehicle)
         if estimate is not None:
+            sent = self._send(estimate, exposed_ns, vehicle)
             sent += self._to_graph(estimate, vehicle, result.time_ns)
         self._write_nmea(estimate)
         age_ms = (self._clocks.mono_ns() - exposed_ns) / 1e6

@@ -164,6 +164,15 @@ def estimate_from_result(
     )
 
 
+def floored(cov: NDArray[np.float64], min_std: float) -> NDArray[np.float64]:
+    """Symmetric covariance with a standard deviation of at least `min_std` in every direction.
+
+    `cov`: covariance (N, N). `min_std`: in the square root of its unit.
+    """
+    values, vectors = np.linalg.eigh(cov / 2 + cov.T / 2)
+    return np.asarray((vectors * np.maximum(values, min_std**2)) @ vectors.T)
+
+
 def error_ellipse(cov_en: NDArray[np.float64]) -> tuple[float, float, float]:
     """One-sigma error ellipse of a (2, 2) covariance of east and north.
 

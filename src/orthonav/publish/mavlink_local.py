@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
+from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate, floored
 from orthonav.publish.local import Autopilot, Origin, north_east_m
 from orthonav.publish.mavlink import (
     Message,
@@ -172,15 +172,9 @@ def _position(
             "receivers drop the position or its accuracy"
         )
     variance = np.zeros((3, 3))
-    variance[:2, :2] = _floored(estimate.cov_en_m2[::-1, ::-1], min_std_m)
+    variance[:2, :2] = floored(estimate.cov_en_m2[::-1, ::-1], min_std_m)
     variance[2, 2] = down_std**2
     return (north, east, down), variance
-
-
-def _floored(cov: Array, min_std: float) -> Array:
-    """Symmetric covariance with a standard deviation of at least `min_std` in every direction."""
-    values, vectors = np.linalg.eigh(cov / 2 + cov.T / 2)
-    return np.asarray((vectors * np.maximum(values, min_std**2)) @ vectors.T)
 
 
 def _velocity_ned(estimate: NavigationEstimate, pose: LocalPose) -> Array:

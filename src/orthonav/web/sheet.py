@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import CameraError, FlightError, MapFileError
+from orthonav.errors import CameraError, FlightError
 from orthonav.geo.camera import Camera, axis_on_ground_en_m, footprint_en_m
 from orthonav.localizer.checks import check_telemetry
 from orthonav.localizer.rectify import MAX_REACH, downsampled, rectify
-from orthonav.mapfile.layer import MAX_PREVIEW_PX, GreyLayer, jpeg_frame
+from orthonav.mapfile.layer import GreyLayer, preview
 from orthonav.mapfile.reader import MapFile
 from orthonav.records import Telemetry, View
 from orthonav.web.images import Grey
@@ -112,15 +112,13 @@ class SheetImagery:
         self.sheet = opened.manifest.sheets[0]
         self.frame, self.grid = self.sheet.frame, self.sheet.grid
         self._layer = GreyLayer.of(opened)
-        self.preview = _preview(opened) if self._layer is None else b""
+        self.preview = b""
         drawn = "preview_jpeg" if self._layer is None else "grey/bytes"
         self._drawn_id = str(opened.manifest.parts[f"sheet0/{drawn}"].get("sha256"))[:12]
         self._small = np.zeros((0, 0), np.uint8)
         if self._layer is None:
-            decoded = cv2.imdecode(np.frombuffer(self.preview, np.uint8), cv2.IMREAD_GRAYSCALE)
-            if decoded is None:
-                raise MapFileError(f"map's preview cannot be decoded: {opened.path}")
-            self._small = np.asarray(decoded, dtype=np.uint8)
+            self._small = preview(opened)
+            self.preview = opened.array("sheet0/preview_jpeg", np.uint8, 1).tobytes()
 
     def plain(self) -> dict[str, Any]:
         """Geometry of the sheet and its tiles, for the page."""
@@ -226,11 +224,3 @@ class SheetImagery:
             grey[inside] = self._small[top:bottom, left:right]
             valid[inside] = True
         return grey, valid
-
-
-def _preview(opened: MapFile) -> bytes:
-    data: bytes = opened.array("sheet0/preview_jpeg", np.uint8, 1).tobytes()
-    found = jpeg_frame(data)
-    if found is None or max(found[1:3]) > MAX_PREVIEW_PX:
-        raise MapFileError(f"map's preview cannot be shown: {opened.path}")
-    return data

@@ -16,7 +16,7 @@ from orthonav.files import replacing, replacing_folder, write_text
 from orthonav.mapfile.reader import MapFile
 from orthonav.report import write_figures
 from orthonav.report.figures import FOLDER, LIST
-from orthonav.report.leaflet import load_leaflet
+from orthonav.report.leaflet import leaflet_files, load_leaflet
 
 PAGE, JSON, TIF, GEOJSON = "index.html", "check.json", "check.tif", "check.geojson"
 _SIDECAR = "check.tif.aux.xml"
@@ -62,7 +62,7 @@ def require_free(out: Path) -> None:
             )
     elif out.exists() or out.is_symlink():
         raise OutputError(f"output folder is a file: {out}")
-    load_leaflet()
+    leaflet_files("leaflet.js", "leaflet.css")
     for module, extra in _EXTRAS.items():
         needed(module, extra, "writing a check")
 

@@ -57,22 +57,32 @@ def to_plain(result: CheckResult) -> Plain:
         },
         "cells": _cells(result.frame, result.cells),
         "route": _route(result),
-        "stretches": [
-            {
-                "number": number,
-                **plain(asdict(each)),
-                "length_m": plain(each.length_m, _DIGITS["m"]),
-                "recoverable": bool(each.recoverable),
-            }
-            for number, each in enumerate(result.stretches, start=1)
-        ],
-        "lookalikes": [
-            {"number": number, **plain(asdict(each))}
-            for number, each in enumerate(result.lookalikes, start=1)
-        ],
+        "stretches": stretches_to_plain(result),
+        "lookalikes": lookalikes_to_plain(result),
         "envelope": None if result.envelope is None else plain(asdict(result.envelope)),
         "alternatives": [plain(asdict(each)) for each in result.alternatives],
     }
+
+
+def stretches_to_plain(result: CheckResult) -> list[Plain]:
+    """The blind stretches, numbered from 1."""
+    return [
+        {
+            "number": number,
+            **plain(asdict(each)),
+            "length_m": plain(each.length_m, _DIGITS["m"]),
+            "recoverable": bool(each.recoverable),
+        }
+        for number, each in enumerate(result.stretches, start=1)
+    ]
+
+
+def lookalikes_to_plain(result: CheckResult) -> list[Plain]:
+    """The lookalikes, numbered from 1."""
+    return [
+        {"number": number, **plain(asdict(each))}
+        for number, each in enumerate(result.lookalikes, start=1)
+    ]
 
 
 def _summary(result: CheckResult) -> Plain:

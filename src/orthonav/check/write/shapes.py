@@ -8,7 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.check.outcome import Along, CheckResult
-from orthonav.check.write.plain import Plain, plain, to_plain
+from orthonav.check.write.plain import (
+    Plain,
+    lookalikes_to_plain,
+    plain,
+    stretches_to_plain,
+)
 from orthonav.check.write.risk import RISKS, risk_of
 from orthonav.geo.frames import LocalFrame
 
@@ -29,14 +34,13 @@ def to_geojson(result: CheckResult) -> str:
 
 def features(result: CheckResult) -> Iterator[Plain]:
     """Features of all layers: cells, lookalikes, and with a route route, blind, legs, waypoints."""
-    values = to_plain(result)
     yield from _cells(result)
     if result.along is not None:
         yield from _route(result, result.along)
-        for each, properties in zip(result.stretches, values["stretches"], strict=True):
+        for each, properties in zip(result.stretches, stretches_to_plain(result), strict=True):
             line = stretch_en_m(result.along, each.start_m, each.end_m)
             yield _feature(result.frame, "blind", "LineString", line, properties)
-    for properties in values["lookalikes"]:
+    for properties in lookalikes_to_plain(result):
         ends = [properties.pop(name) for name in ("place_latlon_deg", "other_latlon_deg")]
         geometry = {"type": "LineString", "coordinates": [[lon, lat] for lat, lon in ends]}
         yield _as_feature("lookalikes", geometry, properties)

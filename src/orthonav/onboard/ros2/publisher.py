@@ -15,7 +15,7 @@ from orthonav.flight.logged import NO_ALTITUDE_M2
 from orthonav.geo.frames import LocalFrame
 from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.telemetry import VehicleState
-from orthonav.publish.estimate import NavigationEstimate
+from orthonav.publish.estimate import NavigationEstimate, floored
 from orthonav.publish.mavlink import require_confident
 from orthonav.records import CONFIDENT
 from orthonav.sources.attitude import ros_xyzw_from_ned
@@ -167,12 +167,6 @@ class Ros2Publisher:
             transform=moved,
         )
         return definitions.new("tf2_msgs/msg/TFMessage", transforms=[stamped])
-
-
-def floored(cov_en_m2: Array, min_std_m: float) -> Array:
-    """Covariance (2, 2) with a standard deviation of at least `min_std_m` in every direction."""
-    values, vectors = np.linalg.eigh(cov_en_m2)
-    return np.asarray(vectors @ np.diag(np.maximum(values, min_std_m**2)) @ vectors.T)
 
 
 def orientation(vehicle: VehicleState) -> Array:
