@@ -15,7 +15,8 @@ from made_check import EVIL, small_route
 
 from orthonav.check.write import imagery, write_check
 from orthonav.check.write.imagery import MAX_SIDE_PX, map_image, visible_box
-from orthonav.check.write.plain import to_plain
+from orthonav.check.write.page import _known_cells
+from orthonav.check.write.plain import CELL_VALUES, to_plain
 from orthonav.check.write.risk import segments
 from orthonav.mapfile import open_map
 from orthonav.report import Drawing
@@ -112,11 +113,33 @@ def test_the_policy_names_each_script_and_style(page):
         assert f"'sha256-{digest}'" in policy
 
 
+def all_cells(cells):
+    """The cells of the page as in `check.json`: unknown ones are None, without trials."""
+    known = cells.pop("known")
+    for name in CELL_VALUES:
+        grid = [0 if name == "trials" else None] * (cells["rows"] * cells["cols"])
+        for number, value in zip(known, cells[name], strict=True):
+            grid[number] = value
+        starts = range(0, len(grid), cells["cols"])
+        cells[name] = [grid[start : start + cells["cols"]] for start in starts]
+
+
+def test_cells_around_a_band_cost_nothing(frame):
+    cells = to_plain(made_check.small_route(frame))["cells"]
+    known = _known_cells(cells)
+    empty = [[None] * cells["cols"]] * 300
+    wide = {**cells, "rows": cells["rows"] + 300}
+    for name in CELL_VALUES:
+        wide[name] = [*cells[name], *([[0] * cells["cols"]] * 300 if name == "trials" else empty)]
+    assert {**_known_cells(wide), "rows": cells["rows"]} == known
+
+
 def test_the_script_is_given_the_json_of_the_check(folder, frame):
     for name in ("tiny", "small_route", "long_route", "nearly_empty", "evil"):
         page = Page((folder / name / "index.html").read_text(encoding="utf-8"))
         plain = json.loads(page.inside["script"][0])
         drawn = plain.pop("drawn")
+        all_cells(plain["cells"])
         if name != "evil":
             assert plain == json.loads(json.dumps(to_plain(getattr(made_check, name)(frame))))
         assert (drawn["route"] is None) == (name in ("tiny", "nearly_empty"))

@@ -8,7 +8,7 @@ import numpy as np
 from orthonav.check.outcome import BlindStretch, CheckResult
 from orthonav.check.write.figures import MAX_LOOKALIKES
 from orthonav.check.write.imagery import MapImage, visible_box
-from orthonav.check.write.plain import Plain, plain, to_plain
+from orthonav.check.write.plain import CELL_VALUES, Plain, plain, to_plain
 from orthonav.check.write.risk import CIVIDIS, RISKS, segments
 from orthonav.check.write.shapes import stretch_en_m
 from orthonav.check.write.summary import summarize
@@ -171,7 +171,8 @@ def _made_from(result: CheckResult) -> list[tuple[str, str]]:
 def _page_data(result: CheckResult, image: MapImage) -> str:
     """JSON for the scripts: `check.json`, and under `drawn` positions in metres and colours.
 
-    It contains no `<`, so that no name can end the script element.
+    Cells of which nothing is known are left out: around a band they are most of the box. The text
+    contains no `<`, so that no name can end the script element.
     """
     along, cells = result.along, result.cells
     known_m = cells.error_m[np.isfinite(cells.error_m)]
@@ -200,8 +201,25 @@ def _page_data(result: CheckResult, image: MapImage) -> str:
         "lookalikes": np.array(pairs),
     }
     values = {**to_plain(result), "drawn": plain(drawn, 2)}
+    values["cells"] = _known_cells(values["cells"])
     text = json.dumps(values, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c")
+
+
+def _known_cells(cells: Plain) -> Plain:
+    """The cells of `check.json` with `known`, the numbers of those of which something is known, row
+    after row, and the values of these alone."""
+    grids = {name: [value for row in cells[name] for value in row] for name in CELL_VALUES}
+    known = [
+        number
+        for number, values in enumerate(zip(*grids.values(), strict=True))
+        if any(
+            value is not None and (value > 0 or name != "trials")
+            for name, value in zip(CELL_VALUES, values, strict=True)
+        )
+    ]
+    found = {name: [values[number] for number in known] for name, values in grids.items()}
+    return {**cells, "known": known, **found}
 
 
 def _two_digits(value: float) -> float:

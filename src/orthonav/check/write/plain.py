@@ -20,6 +20,8 @@ FORMAT, VERSION = "orthonav-check", 1
 _DIGITS = {"m": 2, "s": 2, "deg": 7, "value": 2, "off": 4}
 """Decimals by the last word of a name: a centimetre; shares and others have `_SHARE`."""
 _SHARE, _EXACT = 3, 6
+CELL_VALUES = ("probability", "low", "high", "error_m", "wrong", "trials", "persistence")
+"""Figures of a cell, each a grid of `Cells`."""
 
 Plain = dict[str, Any]
 
@@ -116,13 +118,12 @@ def _cells(frame: LocalFrame, cells: Cells) -> Plain:
         (cells.west_m, south_m),
     ]
     geometry = {name: plain(getattr(cells, name), 4) for name in ("side_m", "west_m", "north_m")}
-    names = ("probability", "low", "high", "error_m", "wrong", "trials", "persistence")
     return {
         "rows": rows,
         "cols": cols,
         **geometry,
         "corners_latlon_deg": latlon_deg(frame, np.array(corners)),
-        **plain({name: getattr(cells, name) for name in names}),
+        **plain({name: getattr(cells, name) for name in CELL_VALUES}),
     }
 
 

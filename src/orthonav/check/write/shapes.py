@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from orthonav.check.outcome import Along, CheckResult
 from orthonav.check.write.plain import (
+    CELL_VALUES,
     Plain,
     lookalikes_to_plain,
     plain,
@@ -51,12 +52,11 @@ def features(result: CheckResult) -> Iterator[Plain]:
 def _cells(result: CheckResult) -> Iterator[Plain]:
     """A square for every cell of which something is known."""
     cells = result.cells
-    names = ("probability", "low", "high", "error_m", "wrong", "trials", "persistence")
     known = np.isfinite(cells.probability) | (cells.trials > 0) | np.isfinite(cells.persistence)
     for row, col in np.argwhere(known).tolist():
         at = (_CORNERS + np.array([col, row])) * (cells.side_m, -cells.side_m)
         ring = at + np.array([cells.west_m, cells.north_m])
-        properties = plain({name: getattr(cells, name)[row, col].item() for name in names})
+        properties = plain({name: getattr(cells, name)[row, col].item() for name in CELL_VALUES})
         yield _feature(
             result.frame, "cells", "Polygon", ring, {"row": row, "col": col, **properties}
         )

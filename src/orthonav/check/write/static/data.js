@@ -6,7 +6,8 @@ const { cells, drawn } = data;
 const route = data.route?.points;
 const grids = {};
 for (const name of ["probability", "low", "high", "error_m", "wrong", "trials", "persistence"]) {
-  grids[name] = cells[name].flat().map((value) => value ?? NaN);
+  grids[name] = new Array(cells.rows * cells.cols).fill(name === "trials" ? 0 : NaN);
+  cells.known.forEach((cell, i) => { grids[name][cell] = cells[name][i] ?? NaN; });
 }
 
 /** Number of the cell at a place in metres, -1 outside. */
