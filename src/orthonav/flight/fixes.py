@@ -38,9 +38,9 @@ KEYS = (
 )
 TRACK_KEYS = (
     "tracked",  # true: the position is estimated from all views so far
-    "state",  # "searching", "tracking" or "lost"
+    "state",  # one of `STATES`
 )
-STATES = ("searching", "tracking", "lost")
+STATES = ("searching", "tracking", "coasting", "lost")
 _NULL_IN_FIX = {"reason": None, "detail": None}
 _NULL_IN_NO_FIX = dict.fromkeys(KEYS[3:10])
 _TIME_LIMIT_S = 2**63 / 1e9

@@ -41,6 +41,9 @@ class Model:
     """Of the acceleration while no velocity is reported, per axis."""
     reported_velocity_s: float = 120.0
     """Correlation time of the error of a reported velocity, s (docs/decisions/tracking.md, 6)."""
+    coasting_walk: float = 1.3
+    """Of the drift of that error while views do not show the map, m/s per root of a second: 3 m/s
+    and 9 m after 5 s, 24 m after 10 s (docs/decisions/tracking.md, 12)."""
     heading_rad: float = math.radians(DEFAULT_YAW_STD_DEG)
     """Of the constant error of the reported heading."""
     heading_noise_rad: float = math.radians(2.0)
