@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element
 
 from orthonav.errors import FetchError, OutputError
 from orthonav.fetch.client import Client
-from orthonav.fetch.documents import get_xml, parse_xml
+from orthonav.fetch.documents import get_xml
 from orthonav.fetch.options import listed
 from orthonav.fetch.politeness import RequestLimits
 from orthonav.fetch.urls import joined, with_query
@@ -198,7 +198,7 @@ def _entries(client: Client, url: str, parameters: dict[str, str]) -> list[Eleme
     pages = number = 1
     while number <= pages:
         query = {**parameters, "page": str(number), "limit": str(PAGE)}
-        feed = parse_xml(get_xml(client, with_query(url, query)))
+        feed = get_xml(client, with_query(url, query)).root
         count = feed.get(f"{_GPF}pagecount", "1")
         pages = int(count) if count.isdecimal() else 1
         if pages > MAX_PAGES:
