@@ -10,11 +10,11 @@ from orthonav.check.outcome import (
     Alternative,
     BlindStretch,
     Cells,
+    CheckedInputs,
     CheckResult,
     Conditions,
     Envelope,
     Lookalike,
-    Provenance,
     Reason,
     Verdict,
     Word,
@@ -140,7 +140,7 @@ def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", rout
         Lookalike(places[0], places[2], math.hypot(300, 100), 0.62, 9, False),
     )
     parts = {
-        "about": Provenance(
+        "about": CheckedInputs(
             map_name=name,
             imagery="2016-07.tif 2016-07-15, 1.0 m",
             recipe="gradient, 256 px",

@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import json
+import math
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -18,9 +19,11 @@ from orthonav.check.write.imagery import MAX_SIDE_PX, map_image, visible_box
 from orthonav.check.write.page import _known_cells
 from orthonav.check.write.plain import CELL_VALUES, to_plain
 from orthonav.check.write.risk import segments
+from orthonav.check.write.wording import share_text
 from orthonav.mapfile import open_map
-from orthonav.report import Drawing
+from orthonav.report import Drawing, metres_text
 from orthonav.report.leaflet import load_leaflet
+from orthonav.report.page import static_text
 
 VOID = {"meta", "img", "input", "br"}
 UNDRAWN = Drawing(
@@ -308,6 +311,20 @@ def test_without_scripts_figures_are_shown(visit):
     assert page.locator(".still-part img").count() == 2
     assert page.locator(".still-part img").first.is_visible()
     assert not page.locator("#map").is_visible()
+
+
+def test_scripts_write_numbers_as_python_does(browser):
+    numbers = [0, 0.04, 3.26, 9.96, 35, 50.04, 99.94, 99.97, 120.4, 9999.6, 12_345, -7.5, math.nan]
+    script = static_text("format.js").replace("export ", "")
+    page = browser.new_page()
+    texts = page.evaluate(f"() => {{ {script}; return {json.dumps(numbers)}.map(metres); }}")
+    shares = [0, 0.004, 0.126, 0.996, 0.9996, 1]
+    percents = page.evaluate(f"() => {{ {script}; return {shares}.map(percent); }}")
+    page.close()
+    assert [text.replace("\N{EN DASH}", "-") for text in texts] == [
+        metres_text(each) for each in numbers
+    ]
+    assert percents == [share_text(each) for each in shares]
 
 
 def test_rules_of_accessibility(visit):

@@ -121,7 +121,7 @@ def test_json_holds_what_was_found():
 
 
 def test_unknown_values_are_null():
-    unknown = Conditions(240, 180, None, None, 0.05, None, 0.9, 35, 20, 0.02)
+    unknown = Conditions(240, 180, 200.0, None, 0.05, None, 0.9, 35, 20, 0.02)
     plain = to_plain(made_check.nearly_empty(FRAME))
     assert plain["cells"]["probability"][0][0] is None and plain["route"] is None
     empty = lost_in(made_cells(4, 4, 50.0), np.ones((4, 4), bool))
@@ -134,7 +134,7 @@ def test_unknown_values_are_null():
 
 def test_a_check_of_nothing_is_written(opened, frame, tmp_path, undrawn):
     empty = lost_in(made_cells(4, 4, 50.0), np.ones((4, 4), bool))
-    unknown = Conditions(240, 180, None, None, 0.05, None, 0.9, 35, 20, 0.02)
+    unknown = Conditions(240, 180, 200.0, None, 0.05, None, 0.9, 35, 20, 0.02)
     result = made_check.made_check(frame, empty, conditions=unknown, lookalikes=())
     page = write_check(result, opened, tmp_path / "check")
     written = page.read_text(encoding="utf-8")

@@ -33,7 +33,7 @@ class Conditions:
     """The conditions that a check assumes; defaults are those of `CheckRequest`.
 
     `width_m`, `height_m`: footprint of a vertical view on the ground.
-    `agl_m`: height above ground; None: unknown.
+    `agl_m`: height above ground.
     `yaw_std_deg`: standard deviation of the reported heading; None: heading unknown.
     `agl_std`: standard deviation of the reported height, as a share of the height.
     `prior_std_m`: standard deviation of the prior position per axis; None: no prior.
@@ -45,7 +45,7 @@ class Conditions:
 
     width_m: float
     height_m: float
-    agl_m: float | None
+    agl_m: float
     yaw_std_deg: float | None
     agl_std: float
     prior_std_m: float | None
@@ -206,7 +206,7 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Provenance:
+class CheckedInputs:
     """What was checked, as text for reports; empty where it does not apply.
 
     `terms`: attribution and licence of each imagery source.
@@ -234,7 +234,7 @@ class CheckResult:
     `envelope`: None where it was not requested.
     """
 
-    about: Provenance
+    about: CheckedInputs
     conditions: Conditions
     frame: LocalFrame
     cells: Cells

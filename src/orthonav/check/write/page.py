@@ -17,18 +17,19 @@ from orthonav.check.write.wording import (
     SYMBOLS,
     better_sentence,
     conditions_text,
-    metres_text,
+    lookalike_sentence,
     outcome_text,
     place_text,
     seconds_text,
     share_text,
+    stretch_sentence,
     tolerance_sentence,
     value_text,
     verdict_sentence,
     what_text,
 )
 from orthonav.records import CONFIDENT
-from orthonav.report import Figure, render
+from orthonav.report import Figure, metres_text, render
 from orthonav.report.leaflet import Leaflet
 from orthonav.report.page import data_url, joined_scripts, static_text
 
@@ -185,7 +186,9 @@ def _page_data(result: CheckResult, image: MapImage) -> str:
     drawn = {
         "box": visible_box(result),
         "image": image.box,
+        "values": CELL_VALUES,
         "colours": CIVIDIS,
+        "confident": CONFIDENT,
         "risks": [vars(risk) for risk in RISKS],
         "most": {
             "error_m": _two_digits(max(most_m, 1.0)),
@@ -199,6 +202,11 @@ def _page_data(result: CheckResult, image: MapImage) -> str:
         "waypoints": [] if result.route_en_m is None else result.route_en_m,
         "band": _band(result),
         "lookalikes": np.array(pairs),
+        "blind_texts": [stretch_sentence(*each) for each in enumerate(result.stretches, start=1)],
+        "lookalike_texts": [
+            lookalike_sentence(*each)
+            for each in enumerate(result.lookalikes[:MAX_LOOKALIKES], start=1)
+        ],
     }
     values = {**to_plain(result), "drawn": plain(drawn, 2)}
     values["cells"] = _known_cells(values["cells"])

@@ -6,7 +6,6 @@ from orthonav.check.outcome import BlindStretch, CheckResult
 from orthonav.check.write.summary import summarize
 from orthonav.check.write.wording import (
     better_sentence,
-    metres_text,
     outcome_text,
     place_text,
     seconds_text,
@@ -14,6 +13,7 @@ from orthonav.check.write.wording import (
     verdict_sentence,
 )
 from orthonav.records import CONFIDENT
+from orthonav.report.numbers import metres_text
 
 MAX_STRETCHES = 8
 _MAX_REASONS = 5

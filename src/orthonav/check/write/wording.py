@@ -8,8 +8,10 @@ from orthonav.check.outcome import (
     CheckResult,
     Conditions,
     Envelope,
+    Lookalike,
     Word,
 )
+from orthonav.report.numbers import metres_text
 
 SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}
 VERDICTS = {
@@ -42,15 +44,6 @@ def share_text(value: float) -> str:
     return f"{99 if percent == 100 and value < 0.9995 else percent} %"
 
 
-def metres_text(value: float | None) -> str:
-    """A length, in kilometres from 10 km on; `-` if unknown."""
-    if value is None or not math.isfinite(value):
-        return "-"
-    if abs(value) >= 10_000:
-        return f"{value / 1000:.1f} km"
-    return f"{value:.1f} m" if abs(value) < 10 and value != round(value) else f"{value:.0f} m"
-
-
 def place_text(value: float) -> str:
     """A distance from the start of the route, in kilometres to ten metres."""
     return f"{value / 1000:.2f} km" if math.isfinite(value) else "-"
@@ -66,6 +59,25 @@ def seconds_text(value: float) -> str:
     if abs(whole) < 3600:
         return f"{whole // 60}:{whole % 60:02d} min"
     return f"{whole // 3600}:{whole // 60 % 60:02d} h"
+
+
+def stretch_sentence(number: int, stretch: BlindStretch) -> str:
+    """A blind stretch in one sentence."""
+    duration = seconds_text(stretch.end_s - stretch.start_s)
+    return (
+        f"Blind stretch {number}: {metres_text(stretch.length_m)}, {duration}, probability "
+        f"{share_text(stretch.probability)}, error {metres_text(stretch.drift_m)} at its end, "
+        f"allowed {metres_text(stretch.allowed_m)}: {outcome_text(stretch)}."
+    )
+
+
+def lookalike_sentence(number: int, pair: Lookalike) -> str:
+    """A pair of lookalikes in one sentence."""
+    where = "within" if pair.within_prior else "outside"
+    return (
+        f"Lookalikes {number}: {metres_text(pair.apart_m)} apart, similarity "
+        f"{pair.similarity:.2f}, {pair.trials} trials, {where} the prior."
+    )
 
 
 def outcome_text(stretch: BlindStretch) -> str:
@@ -89,10 +101,10 @@ def tolerance_sentence(envelope: Envelope) -> str:
 
 def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, str]:
     """The conditions of the check by name."""
-    yaw, prior, height = conditions.yaw_std_deg, conditions.prior_std_m, conditions.agl_m
+    yaw, prior = conditions.yaw_std_deg, conditions.prior_std_m
     rows = {
         "footprint of a view": f"{conditions.width_m:.0f} x {conditions.height_m:.0f} m",
-        "height above ground": "unknown" if height is None else f"{height:.0f} m",
+        "height above ground": f"{conditions.agl_m:.0f} m",
         "error of reported height": f"{100 * conditions.agl_std:.1f} % (standard deviation)",
         "error of reported heading": (
             "heading unknown: all headings are searched"
