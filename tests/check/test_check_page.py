@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 from made_check import EVIL, small_route
 
+from orthonav.check.outcome import CELL_VALUES
 from orthonav.check.write import imagery, write_check
-from orthonav.check.write.imagery import MAX_SIDE_PX, map_image, visible_box
+from orthonav.check.write.imagery import MAX_SIDE_PX, jpeg, map_image, visible_box
 from orthonav.check.write.page import _known_cells
-from orthonav.check.write.plain import CELL_VALUES, to_plain
+from orthonav.check.write.plain import to_plain
 from orthonav.check.write.risk import segments
 from orthonav.check.write.wording import share_text
 from orthonav.mapfile import open_map
@@ -164,24 +165,24 @@ def test_all_sections_are_there(page, folder):
 def test_the_picture_lies_where_the_map_does(opened, frame):
     result = made_check.tiny(frame)
     found = map_image(opened, visible_box(result))
-    west, south, east, north = found.box
+    west, south, east, north = found.west_m, found.south_m, found.east_m, found.north_m
     rows, cols = found.grey.shape
     assert max(rows, cols) <= MAX_SIDE_PX
     assert (east - west) / cols == pytest.approx((north - south) / rows, rel=0.01)
-    assert found.jpeg()[:2] == b"\xff\xd8"
+    assert jpeg(found.grey)[:2] == b"\xff\xd8"
 
 
 def test_a_map_without_a_layer_shows_its_preview(opened, frame, monkeypatch):
     monkeypatch.setattr(imagery, "GreyLayer", SimpleNamespace(of=lambda _: None))
     found = map_image(opened, visible_box(made_check.tiny(frame)))
     grid = opened.manifest.sheets[0].grid
-    assert found.box[0] == grid.west_m and found.box[3] == grid.north_m
+    assert found.west_m == grid.west_m and found.north_m == grid.north_m
     assert max(found.grey.shape) <= 384
 
 
 def test_pictures_of_noise_stay_small():
     noise = np.random.default_rng(1).integers(0, 255, (1300, 2000), dtype=np.uint8)
-    assert len(imagery.MapImage(noise, (0.0, 0.0, 1.0, 1.0)).jpeg()) <= imagery.MAX_BYTES
+    assert len(jpeg(noise)) <= imagery.MAX_BYTES
 
 
 def test_segments_take_the_worse_end():

@@ -81,6 +81,18 @@ class Cells:
     persistence: Array
 
 
+CELL_VALUES = {
+    "probability": "probability of a correct, confident fix of one view",
+    "low": "lower end of its 80 % interval",
+    "high": "upper end of its 80 % interval",
+    "error_m": "expected error of such a fix, root mean square, metres",
+    "wrong": "share of trials that were confident and wrong",
+    "trials": "number of views tried",
+    "persistence": "expected correlation of the ground with another year, 0 to 1",
+}
+"""Arrays of `Cells` and their meaning, in the order of the bands of the raster."""
+
+
 @dataclass(frozen=True, eq=False)
 class Along:
     """Predictions at points (N,) along the route.

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from orthonav.check.outcome import BlindStretch, CheckResult
+from orthonav.check.outcome import CELL_VALUES, BlindStretch, CheckResult
 from orthonav.check.write.figures import MAX_LOOKALIKES
-from orthonav.check.write.imagery import MapImage, visible_box
-from orthonav.check.write.plain import CELL_VALUES, Plain, plain, to_plain
-from orthonav.check.write.risk import CIVIDIS, RISKS, segments
+from orthonav.check.write.imagery import jpeg, visible_box
+from orthonav.check.write.plain import Plain, plain, to_plain
+from orthonav.check.write.risk import RISKS, segments
 from orthonav.check.write.shapes import stretch_en_m
 from orthonav.check.write.summary import summarize
 from orthonav.check.write.wording import (
@@ -18,10 +18,9 @@ from orthonav.check.write.wording import (
     better_sentence,
     conditions_text,
     lookalike_sentence,
-    outcome_text,
-    place_text,
     seconds_text,
     share_text,
+    stretch_row,
     stretch_sentence,
     tolerance_sentence,
     value_text,
@@ -29,7 +28,7 @@ from orthonav.check.write.wording import (
     what_text,
 )
 from orthonav.records import CONFIDENT
-from orthonav.report import Figure, metres_text, render
+from orthonav.report import Background, Figure, metres_text, render
 from orthonav.report.leaflet import Leaflet
 from orthonav.report.page import data_url, joined_scripts, static_text
 
@@ -47,7 +46,7 @@ LAYERS = {
 """Layers of cells that the map can show."""
 
 
-def page_of(result: CheckResult, image: MapImage, figures: list[Figure], leaflet: Leaflet) -> str:
+def page_of(result: CheckResult, image: Background, figures: list[Figure], leaflet: Leaflet) -> str:
     """The page as HTML. Raises `MissingExtraError` without Jinja2."""
     about = result.about
     scripts = (leaflet.script, joined_scripts(_SHARED, PACKAGE, _SCRIPTS))
@@ -71,7 +70,7 @@ def page_of(result: CheckResult, image: MapImage, figures: list[Figure], leaflet
         "conditions": conditions_text(result.conditions, result.band_m).items(),
         "made_from": _made_from(result),
         "data": _page_data(result, image),
-        "image": data_url(image.jpeg(), "image/jpeg"),
+        "image": data_url(jpeg(image.grey), "image/jpeg"),
     }
     style = leaflet.style + static_text("check.css", PACKAGE)
     return render(PACKAGE, "page.html", values, style=style, scripts=scripts)
@@ -110,16 +109,8 @@ def _longest(longest: BlindStretch | None) -> tuple[str, str]:
 
 
 def _stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
-    return (
-        str(number),
-        *(place_text(each) for each in (stretch.start_m, stretch.end_m)),
-        metres_text(stretch.length_m),
-        seconds_text(stretch.end_s - stretch.start_s),
-        share_text(stretch.probability),
-        metres_text(stretch.drift_m),
-        metres_text(stretch.allowed_m),
-        ("✓ " if stretch.recoverable else "✕ ") + outcome_text(stretch),
-    )
+    *values, outcome = stretch_row(number, stretch)
+    return (*values, ("✓ " if stretch.recoverable else "✕ ") + outcome)
 
 
 def _lookalike_rows(result: CheckResult) -> list[tuple[str, ...]]:
@@ -169,7 +160,7 @@ def _made_from(result: CheckResult) -> list[tuple[str, str]]:
     ]
 
 
-def _page_data(result: CheckResult, image: MapImage) -> str:
+def _page_data(result: CheckResult, image: Background) -> str:
     """JSON for the scripts: `check.json`, and under `drawn` positions in metres and colours.
 
     Cells of which nothing is known are left out: around a band they are most of the box. The text
@@ -185,9 +176,9 @@ def _page_data(result: CheckResult, image: MapImage) -> str:
     ]
     drawn = {
         "box": visible_box(result),
-        "image": image.box,
-        "values": CELL_VALUES,
-        "colours": CIVIDIS,
+        "image": (image.west_m, image.south_m, image.east_m, image.north_m),
+        "values": list(CELL_VALUES),
+        "colours": _colours(),
         "confident": CONFIDENT,
         "risks": [vars(risk) for risk in RISKS],
         "most": {
@@ -228,6 +219,18 @@ def _known_cells(cells: Plain) -> Plain:
     ]
     found = {name: [values[number] for number in known] for name, values in grids.items()}
     return {**cells, "known": known, **found}
+
+
+def _colours() -> list[str]:
+    """Colours of ten equal steps from 0 to 1, interpolated in between.
+
+    Cividis (Nunez et al. 2018, doi 10.1371/journal.pone.0199239) reads alike with and without
+    colour blindness.
+    """
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    return [to_hex(colour) for colour in colormaps["cividis"](np.linspace(0, 1, 10))]
 
 
 def _two_digits(value: float) -> float:

@@ -61,13 +61,28 @@ def seconds_text(value: float) -> str:
     return f"{whole // 3600}:{whole // 60 % 60:02d} h"
 
 
+def stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
+    """A blind stretch as a row of a table: number, ends, length, duration, probability, drift,
+    allowed drift and outcome."""
+    return (
+        str(number),
+        place_text(stretch.start_m),
+        place_text(stretch.end_m),
+        metres_text(stretch.length_m),
+        seconds_text(stretch.end_s - stretch.start_s),
+        share_text(stretch.probability),
+        metres_text(stretch.drift_m),
+        metres_text(stretch.allowed_m),
+        outcome_text(stretch),
+    )
+
+
 def stretch_sentence(number: int, stretch: BlindStretch) -> str:
     """A blind stretch in one sentence."""
-    duration = seconds_text(stretch.end_s - stretch.start_s)
+    _, _, _, length, duration, probability, drift, allowed, outcome = stretch_row(number, stretch)
     return (
-        f"Blind stretch {number}: {metres_text(stretch.length_m)}, {duration}, probability "
-        f"{share_text(stretch.probability)}, error {metres_text(stretch.drift_m)} at its end, "
-        f"allowed {metres_text(stretch.allowed_m)}: {outcome_text(stretch)}."
+        f"Blind stretch {number}: {length}, {duration}, probability {probability}, error {drift} "
+        f"at its end, allowed {allowed}: {outcome}."
     )
 
 
