@@ -20,6 +20,7 @@ from orthonav.check.outcome import (
     Word,
 )
 
+FILES = {"index.html", "check.json", "check.tif", "check.geojson", "figures"}
 EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)> & ünïcode \u202e'
 CONDITIONS = Conditions(
     width_m=240.0,

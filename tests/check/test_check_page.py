@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import made_check
 import numpy as np
 import pytest
-from made_check import EVIL, small_route
+from made_check import EVIL, FILES, small_route
 
 from orthonav.check.outcome import CELL_VALUES
 from orthonav.check.write import imagery, write_check
@@ -35,6 +35,7 @@ UNDRAWN = Drawing(
     (1.0, 1.0),
 )
 """A figure of one pixel."""
+KINDS = {"tiny", "small_route", "long_route", "nearly_empty", "evil"}
 TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
 
 
@@ -77,7 +78,8 @@ def folder(opened, frame, tmp_path_factory):
     root = tmp_path_factory.mktemp("checks")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.report.canvas.DPI", 20)
-        write_check(small_route(frame), opened, root / "small_route")
+        path = write_check(small_route(frame), opened, root / "small_route")
+        assert path == root / "small_route" / "index.html"
         for name in ("draw_axes", "draw_figure"):  # drawing takes longest
             patch.setattr(f"orthonav.check.write.figures.{name}", lambda *_: UNDRAWN)
         for kind in ("tiny", "long_route", "nearly_empty"):
@@ -90,6 +92,13 @@ def folder(opened, frame, tmp_path_factory):
 @pytest.fixture(scope="module")
 def page(folder):
     return Page((folder / "small_route" / "index.html").read_text(encoding="utf-8"))
+
+
+def test_every_kind_of_check_is_written(folder):
+    assert {path.name for path in folder.iterdir()} == KINDS
+    for each in folder.iterdir():
+        assert {path.name for path in each.iterdir()} == FILES
+        assert (each / "index.html").stat().st_size < 4_000_000
 
 
 def test_nothing_is_asked_for(page):
@@ -139,7 +148,7 @@ def test_cells_around_a_band_cost_nothing(frame):
 
 
 def test_the_script_is_given_the_json_of_the_check(folder, frame):
-    for name in ("tiny", "small_route", "long_route", "nearly_empty", "evil"):
+    for name in KINDS:
         page = Page((folder / name / "index.html").read_text(encoding="utf-8"))
         plain = json.loads(page.inside["script"][0])
         drawn = plain.pop("drawn")
@@ -236,7 +245,7 @@ def visit(browser, folder):
     assert wrong == []
 
 
-@pytest.mark.parametrize("name", ["tiny", "small_route", "long_route", "nearly_empty", "evil"])
+@pytest.mark.parametrize("name", sorted(KINDS))
 def test_the_page_comes_alive(visit, name):
     page = visit(name)
     assert page.locator("html.live").count() == 1

@@ -55,7 +55,8 @@ ENVELOPE_PLACES, HEIGHT_PLACES = 16, 30
 """Places of trials for the envelope (25 at each) and for other heights (4 at each)."""
 BANDS = (0.25, 0.5)
 """Narrower bands that are compared, as parts of the planned one."""
-MIN_TRIALS = 20
+MIN_VIEWS = 20
+"""A check of fewer trial views is refused."""
 MIN_BAND_VIEWS = 0.5
 """A band is checked at least so many sides of a view wide."""
 MAX_ASPECT = 8.0
@@ -249,7 +250,7 @@ class _Check:
         if other_date is not None:
             work.append((replace(plan, other_path=other_date, seed=plan.seed + 1), places))
         own, *others = run_many(work, self.workers, lambda share: self.progress("trials", share))
-        if len(own) < MIN_TRIALS:
+        if len(own) < MIN_VIEWS:
             raise AreaError(
                 f"only {len(own)} of {len(places)} trial views fit on the map: "
                 f"{plan.footprint_text}; fly lower, or build a larger map"

@@ -15,6 +15,7 @@ from orthonav.check.write.summary import summarize
 from orthonav.check.write.wording import (
     SIMULATED,
     SYMBOLS,
+    WHAT,
     better_sentence,
     conditions_text,
     lookalike_sentence,
@@ -23,9 +24,7 @@ from orthonav.check.write.wording import (
     stretch_row,
     stretch_sentence,
     tolerance_sentence,
-    value_text,
     verdict_sentence,
-    what_text,
 )
 from orthonav.records import CONFIDENT
 from orthonav.report import Background, Figure, metres_text, render
@@ -135,10 +134,14 @@ def _alternatives(result: CheckResult) -> list[Plain]:
     found = result.alternatives
     return [
         {
-            "name": what_text(what),
+            "name": WHAT[what],
             "sentence": better_sentence(found, what),
             "rows": [
-                (value_text(each), share_text(each.probability), "● chosen" if each.chosen else "-")
+                (
+                    metres_text(each.value),
+                    share_text(each.probability),
+                    "● chosen" if each.chosen else "-",
+                )
                 for each in found
                 if each.what == what
             ],

@@ -25,6 +25,7 @@ AREA_VERDICTS = {
     Word.NO_GO: "Do not rely on this map; see the reasons.",
 }
 WHAT = {"agl_m": "height above ground", "band_m": "width of the band"}
+"""Parameters that an alternative changes, in words."""
 CLEARLY = 0.05
 """Smaller differences may be chance, because an alternative rests on few trials."""
 SIMULATED = "Predicted from this map alone, with simulated ageing."
@@ -46,13 +47,11 @@ def share_text(value: float) -> str:
 
 def place_text(value: float) -> str:
     """A distance from the start of the route, in kilometres to ten metres."""
-    return f"{value / 1000:.2f} km" if math.isfinite(value) else "-"
+    return f"{value / 1000:.2f} km"
 
 
 def seconds_text(value: float) -> str:
     """A time in seconds, from two minutes on as `M:SS min`, from an hour on as `H:MM h`."""
-    if not math.isfinite(value):
-        return "-"
     whole = round(value)
     if abs(whole) < 120:
         return f"{whole} s"
@@ -105,8 +104,6 @@ def outcome_text(stretch: BlindStretch) -> str:
 def tolerance_sentence(envelope: Envelope) -> str:
     """The tolerated errors of reported heading and height."""
     low, high = abs(envelope.tolerated_agl_low), abs(envelope.tolerated_agl_high)
-    if not all(map(math.isfinite, (envelope.tolerated_yaw_deg, low, high))):
-        return "The tolerated errors of heading and height are unknown."
     return (
         f"Tolerated: a heading error of up to {envelope.tolerated_yaw_deg:g}°, or a reported "
         f"height from {100 * low:.0f} % too low to {100 * high:.0f} % too high. With either error "
@@ -141,17 +138,6 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
     return rows
 
 
-def value_text(alternative: Alternative) -> str:
-    """The value of an alternative with its unit."""
-    value = alternative.value
-    return metres_text(value) if alternative.what.endswith("_m") else f"{value:g}"
-
-
-def what_text(what: str) -> str:
-    """The parameter that an alternative changes, in words."""
-    return WHAT.get(what, what.replace("_", " "))
-
-
 def better_sentence(alternatives: tuple[Alternative, ...], what: str) -> str:
     """Whether another value of `what` would be better; empty if unknown."""
     tried = [each for each in alternatives if each.what == what]
@@ -161,8 +147,8 @@ def better_sentence(alternatives: tuple[Alternative, ...], what: str) -> str:
         return ""
     best = max(known, key=lambda each: each.probability)
     if best.probability < chosen.probability + CLEARLY:
-        return f"No other {what_text(what)} tried is better than {value_text(chosen)}."
+        return f"No other {WHAT[what]} tried is better than {metres_text(chosen.value)}."
     return (
-        f"A {what_text(what)} of {value_text(best)} instead of {value_text(chosen)} would be "
-        f"better: {share_text(best.probability)} instead of {share_text(chosen.probability)}."
+        f"A {WHAT[what]} of {metres_text(best.value)} instead of {metres_text(chosen.value)} would "
+        f"be better: {share_text(best.probability)} instead of {share_text(chosen.probability)}."
     )
