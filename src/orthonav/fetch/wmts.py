@@ -15,6 +15,7 @@ from orthonav.fetch.crs import (
     MERCATOR_HALF_M,
     epsg_name,
     ground_scale,
+    mercator_resolution,
     metres_per_unit,
     swapped_corner,
 )
@@ -155,8 +156,7 @@ def _exact_mercator(res: float, tile_px: int) -> float:
 
     An error of one part in a million moves the far corner of this grid by 20 m.
     """
-    zoom = round(math.log2(2 * MERCATOR_HALF_M / tile_px / res))
-    exact = 2 * MERCATOR_HALF_M / tile_px / 2.0**zoom
+    exact = mercator_resolution(round(math.log2(mercator_resolution(0, tile_px) / res)), tile_px)
     return exact if math.isclose(res, exact, rel_tol=1e-4) else res
 
 
