@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from orthonav.atlas.catalog import Atlas, Sheet
 
 NOT_WHOLE = 3
+EVERYDAY = {
+    "build": build_atlas.EVERYDAY,
+    "cut": ("--route", "--bounds", "--band-m"),
+}
 
 
 def add(parser: argparse.ArgumentParser) -> None:
