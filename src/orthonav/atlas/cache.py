@@ -3,6 +3,7 @@
 fsspec's own file cache neither verifies contents nor limits its size, so it is not used.
 """
 
+import contextlib
 import logging
 import os
 import time
@@ -38,41 +39,34 @@ def cache_limit_bytes() -> int:
         raise StorageError(f"ORTHONAV_CACHE_GB must be a number, got {gigabytes!r:.40}") from error
 
 
-class ContentCache:
-    """A folder of files named by their SHA-256, of about `limit_bytes` in all.
+def cached(folder: Path | None, name: str, size: int, fill: Callable[[Path], None]) -> Path:
+    """The file of the cache that is named by its SHA-256; if missing, `fill` writes it, verified.
 
-    Several processes may use it at the same time.
+    Several processes may use a cache at the same time. `folder` None: see `cache_folder`.
     """
+    folder, limit_bytes = folder or cache_folder(), cache_limit_bytes()
+    path = folder / name[:2] / name
+    with storage_errors(str(folder), "write to the cache of the atlas (ORTHONAV_CACHE)"):
+        if path.is_file() and path.stat().st_size == size:
+            os.utime(path)  # last used now
+            return path
+        fill(path)
+        _shrink(folder, limit_bytes, path)
+    return path
 
-    def __init__(self, folder: Path, limit_bytes: int = LIMIT_BYTES) -> None:
-        self.folder = folder
-        self.limit_bytes = limit_bytes
 
-    def get(self, sha256: str, suffix: str, size: int, fill: Callable[[Path], None]) -> Path:
-        """The file with that content; if missing, `fill` writes it, verified, to a path."""
-        path = self.folder / sha256[:2] / f"{sha256}{suffix}"
-        with storage_errors(str(self.folder), "write to the cache of the atlas (ORTHONAV_CACHE)"):
-            if path.is_file() and path.stat().st_size == size:
-                os.utime(path)  # last used now
-                return path
-            fill(path)
-            self._shrink(path)
-        return path
-
-    def _shrink(self, newest: Path) -> None:
-        """Remove the least recently used files until the limit holds."""
-        files = []
-        for path in self.folder.glob("??/*"):
-            try:
-                state = path.stat()
-            except FileNotFoundError:  # removed by another process
-                continue
+def _shrink(folder: Path, limit_bytes: int, newest: Path) -> None:
+    """Remove the least recently used files until the limit holds."""
+    files = []
+    for path in folder.glob("??/*"):
+        with contextlib.suppress(FileNotFoundError):  # removed by another process
+            state = path.stat()
             files.append((state.st_mtime, state.st_size, path))
-        excess = sum(size for _, size, _ in files) - self.limit_bytes
-        for used, size, path in sorted(files):
-            if excess <= 0:
-                return
-            if path != newest and time.time() - used > GRACE_S:
-                path.unlink(missing_ok=True)
-                excess -= size
-                log.debug("cache: removed %s", path.name)
+    excess = sum(size for _, size, _ in files) - limit_bytes
+    for used, size, path in sorted(files):
+        if excess <= 0:
+            return
+        if path != newest and time.time() - used > GRACE_S:
+            path.unlink(missing_ok=True)
+            excess -= size
+            log.debug("cache: removed %s", path.name)

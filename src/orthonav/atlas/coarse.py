@@ -130,6 +130,15 @@ def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path:
     return len(made.valid)
 
 
+def tile_count(path: Path) -> int:
+    """Number of coarse tiles in a file, from its header alone. Raises as `read_coarse`."""
+    try:
+        with safe_open(require_file(path, "coarse tiles"), framework="numpy") as stored:
+            return int(stored.get_slice("valid").get_shape()[0])
+    except (SafetensorError, OSError, IndexError) as error:
+        raise AtlasError(f"coarse tiles are damaged ({error}): {path}") from error
+
+
 def read_coarse(path: Path) -> CoarseTiles:
     """The coarse tiles in a file, completely checked.
 

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from orthonav.atlas.cache import ContentCache, cache_folder, cache_limit_bytes
+from orthonav.atlas.cache import cached
 from orthonav.atlas.filesystems import LocalFolder, RemoteFiles
 from orthonav.atlas.storage_errors import storage_errors
 from orthonav.errors import StorageError
@@ -103,8 +103,8 @@ class Store:
                 self.download(name, temporary)
                 _require(temporary, size, sha256, self.shown(name))
 
-        cache = ContentCache(self.cache or cache_folder(), cache_limit_bytes())
-        return cache.get(sha256, Path(checked_name(name)).suffix, size, fill)
+        file = f"{sha256}{Path(checked_name(name)).suffix}"
+        return cached(self.cache, file, size, fill)
 
     def download(self, name: str, path: Path) -> None:
         """Copy a file of the atlas to `path`, not verified."""
@@ -114,12 +114,12 @@ class Store:
     def put(self, path: Path, name: str) -> None:
         """Copy a local file into the atlas, whole or not at all."""
         with storage_errors(self.shown(name), "write to the atlas"):
-            self._files.put(path, checked_name(name))
+            self._files.save(path, checked_name(name))
 
     def write(self, name: str, data: bytes) -> None:
         """Write a small file, whole or not at all."""
         with storage_errors(self.shown(name), "write to the atlas"):
-            self._files.write(checked_name(name), data)
+            self._files.save(data, checked_name(name))
 
     def remove(self, name: str) -> None:
         """Remove a file if it exists."""
