@@ -57,14 +57,11 @@ def require_sheets(atlas: Atlas, found: Sequence[object]) -> None:
     """Raise `AreaError` with the extent of the atlas where no sheet was found."""
     if found:
         return
-    sheets = atlas.sheets().values()
-    if not sheets:
+    if atlas.bounds_deg is None:
         raise AreaError(f"the atlas has no sheets yet: {atlas.url}")
-    boxes = np.array([sheet.bounds_deg for sheet in sheets])
-    west, south = boxes[:, :2].min(axis=0)
-    east, north = boxes[:, 2:].max(axis=0)
+    west, south, east, north = atlas.bounds_deg
     raise AreaError(
-        f"the area lies outside the atlas, whose {len(boxes)} sheets lie within "
+        f"the area lies outside the atlas, whose {len(atlas.sheets())} sheets lie within "
         f"{west:.4f},{south:.4f},{east:.4f},{north:.4f} (west, south, east, north): {atlas.url}"
     )
 

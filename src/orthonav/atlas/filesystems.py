@@ -14,7 +14,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from orthonav.atlas.storage_errors import PACKAGES
 from orthonav.errors import MissingExtraError, StorageError
 from orthonav.extras import needed
 from orthonav.files import replacing
@@ -190,10 +189,7 @@ class RemoteFiles:
         except ValueError as error:
             raise StorageError(f"invalid address ({error}): {self._protocol}://") from error
         except ImportError as error:
-            package = PACKAGES.get(self._protocol)
-            wanted = package or f"a package that is not installed ({error})"
-            how = f", which is not installed: pip install {package}" if package else ""
             raise MissingExtraError(
-                f"an atlas at {self._protocol}:// needs {wanted}{how}"
+                f"an atlas at {self._protocol}:// needs a package that is not installed ({error})"
             ) from error
         return fs, f"{root.rstrip('/')}/{name}" if name else root.rstrip("/")

@@ -40,7 +40,7 @@ from orthonav.atlas.quantizers import (
 from orthonav.atlas.store import digest_of
 from orthonav.embed.whitened import Made, WhitenedEmbedder, Work, learn_in_two_passes
 from orthonav.errors import AtlasError
-from orthonav.files import Progress
+from orthonav.files import Progress, no_progress
 
 WHITENING_NAME = "whitening.safetensors"
 MAX_TRAINING_TILES = 40_000
@@ -67,7 +67,7 @@ Features = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 def make_index(
-    atlas: Atlas, progress: Progress | None = None, rebuild: bool = False
+    atlas: Atlas, progress: Progress = no_progress, rebuild: bool = False
 ) -> IndexManifest | None:
     """Bring the index of an atlas up to date; None where its sheets have no coarse tiles.
 
@@ -80,7 +80,7 @@ def make_index(
         return None
     before = None if rebuild else _usable(atlas)
     with tempfile.TemporaryDirectory(prefix="orthonav-index-") as name:
-        builder = _IndexBuilder(atlas, Path(name), progress or (lambda stage, share: None))
+        builder = _IndexBuilder(atlas, Path(name), progress)
         if before is None:
             return builder.build(list(sheets.values()))
         new, gone = stale_sheets(atlas, before)
