@@ -64,7 +64,7 @@ class SheetRegistrar:
     def __init__(self, atlas: Atlas) -> None:
         self.atlas = atlas
         self._lattice = atlas.recipe.sheets
-        self._damaged: set[str] = set()
+        self._usable = set(atlas.sheets())
         self._sheet = lru_cache(maxsize=MAX_OPEN)(self._opened)
 
     def register(self, view: View, region: SearchRegion, side_m: float) -> SheetMatch | None:
@@ -82,23 +82,20 @@ class SheetRegistrar:
         return best
 
     def _near(self, region: SearchRegion, side_m: float) -> list[str]:
-        """Names of the sheets within reach of the middle of a view."""
+        """Names of the usable sheets within reach of the middle of a view."""
         frame = LocalFrame(*region.middle_latlon_deg)
         reach_m = region.reach_m + BORDER_SHARE * side_m
         lats, lons = frame.latlon_from_en(np.array([[-reach_m, -reach_m], [reach_m, reach_m]]))
         box = float(lons[0]), float(lats[0]), float(lons[1]), float(lats[1])
-        return list(self._lattice.over(box))
+        return [name for name in self._lattice.over(box) if name in self._usable]
 
     def _opened(self, name: str) -> RegistrationLocalizer | None:
-        """A sheet, None where it is missing or damaged (logged once)."""
-        sheet = self.atlas.sheets().get(name)
-        if sheet is None or name in self._damaged:
-            return None
+        """A sheet, None where it is damaged (logged once)."""
         try:
-            return Localizer(open_map(self.atlas.path(sheet))).registration
+            return Localizer(open_map(self.atlas.path(self.atlas.sheets()[name]))).registration
         except (AtlasError, MapFileError) as error:
             log.warning("sheet %s cannot be used: %s", name, error)
-            self._damaged.add(name)
+            self._usable.discard(name)
             return None
 
 
