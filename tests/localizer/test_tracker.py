@@ -231,6 +231,34 @@ def test_views_that_show_nothing_are_bridged(localizer):
     assert variance[10] > variance[8] > variance[7]
 
 
+@pytest.mark.parametrize("picture", ["mirrored", "noise", "cloud", "turned"])
+def test_pictures_of_anything_else_give_dead_reckoning_only(localizer, picture):
+    """Five views a second overlap, and the reported velocity is reversed."""
+    rng, tracker = np.random.default_rng(5), Tracker(localizer)
+    cloud = cv2.GaussianBlur(rng.normal(0, 900, (240, 320)), (0, 0), 12) + 190
+    rows = []
+    for number, (seen, reported, place) in enumerate(views(26, every_s=1)):
+        fails = number >= 12
+        along = math.radians(60.0 if number < 15 else -35.0)
+        speed = SPEED_MPS * (-1 if fails else 1)
+        velocity = (speed * math.sin(along), speed * math.cos(along))
+        telemetry = replace(reported, vel_en_mps=velocity)
+        grey = seen
+        if fails and picture == "turned":
+            telemetry = replace(telemetry, yaw_deg=telemetry.yaw_deg + 86.0)
+        elif fails:
+            made = {
+                "mirrored": seen[:, ::-1],
+                "noise": rng.normal(128, 40, seen.shape),
+                "cloud": cloud + rng.normal(0, 2, seen.shape),
+            }[picture]
+            grey = np.ascontiguousarray(np.clip(made, 0, 255).astype(np.uint8))
+        rows += followed(tracker, localizer, [(grey, telemetry, place)])
+    assert [row[2] for row in rows[8:12]] == ["tracking"] * 4
+    assert {row[2] for row in rows[12:]} <= {"coasting", "lost"}
+    assert max(row[1] for row in rows[12:]) <= 0.8
+
+
 def test_a_reported_start_needs_no_search(localizer):
     lat, lon = localizer.sheet.frame.latlon_from_en((-160.0, -120.0))
     telemetry = Prior(float(lat), float(lon), 15.0)

@@ -225,6 +225,12 @@ def _add_outputs(group: Any) -> None:
         help="positions with a larger standard deviation are not sent (m; default 50)",
     )
     group.add_argument(
+        "--send-coasting",
+        action="store_true",
+        help="send dead-reckoned positions too, of views that do not show the map: as "
+        "GLOBAL_POSITION_SENSOR with the flag UNHEALTHY, by no other message",
+    )
+    group.add_argument(
         "--min-std-m",
         type=float,
         default=0.0,

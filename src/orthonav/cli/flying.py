@@ -201,7 +201,12 @@ def _publisher(
         if not options.send_rate_hz > 0:
             raise VariantError("--send-rate-hz must be above 0")
         interval = dict.fromkeys([*KINDS.values(), "NMEA", "ROS2"], 1 / options.send_rate_hz)
-    rules = GateRules(least, options.max_std_m, min_interval_s=interval)
+    rules = GateRules(
+        least,
+        options.max_std_m,
+        min_interval_s=interval,
+        send_coasting=options.send_coasting,
+    )
     gate = Gate(rules, clock=Clock.BOOT)  # the monotonic clock of this computer
     chosen = MessageOptions(
         kinds=tuple(dict.fromkeys(options.send or ["global-position"])),

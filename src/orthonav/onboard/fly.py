@@ -227,7 +227,7 @@ class Runner:
         self._note(result, telemetry, image.exposed_ns)
         if self._diagnosis is not None:
             corrected = self.options.mount.corrected(telemetry) if self.options.mount else telemetry
-            found = result.state not in ("searching", "lost") and isinstance(outcome, Fix)
+            found = result.state in (None, "tracking") and isinstance(outcome, Fix)
             self._diagnosis.observe(replace(view, telemetry=corrected), found, now_ns)
         return result
 

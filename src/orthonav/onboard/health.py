@@ -64,7 +64,8 @@ class HealthLimits:
     """Thresholds of `judge`; exceeding one is a reason.
 
     `image_age_s`, `telemetry_age_s`, `link_age_s`: time without an image, an attitude, a message.
-    `low_confidence_s`: time without a confident position.
+    `low_confidence_s`, `coasting_s`: time without a confident position, in general and by views
+    that do not show the map.
     `latency_s`: 95th percentile of the time from exposure to message.
     `share`: share (0 to 1) of the images in the window that are unusable, late or lack telemetry.
     `heading_deg`: difference of estimated and reported heading.
@@ -76,6 +77,7 @@ class HealthLimits:
     telemetry_age_s: float = 3.0
     link_age_s: float = 5.0
     low_confidence_s: float = 10.0
+    coasting_s: float = 2.0
     latency_s: float = 0.5
     share: float = 0.2
     heading_deg: float = 20.0
@@ -132,7 +134,8 @@ def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
         "height_mismatch": abs(seen.log_scale_mismatch) > limits.log_scale,
         "lost": seen.state == "lost",
         "searching": seen.state == "searching",
-        "low_confidence": seen.state not in ("lost", "searching")
+        "coasting": seen.state == "coasting" and seen.low_confidence_s > limits.coasting_s,
+        "low_confidence": seen.state not in ("lost", "searching", "coasting")
         and seen.low_confidence_s > limits.low_confidence_s,
         "frozen_image": count["frozen"] > many,
         "bad_images": count["bad_image"] > many,

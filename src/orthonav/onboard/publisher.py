@@ -71,7 +71,8 @@ class Publisher:
         sent: tuple[str, ...] = ()
         if estimate is not None:
             sent = self._send(estimate, exposed_ns, vehicle)
-            sent += self._to_graph(estimate, vehicle, result.time_ns)
+            if not estimate.dead_reckoned:  # messages of ROS cannot mark it
+                sent += self._to_graph(estimate, vehicle, result.time_ns)
         self._write_nmea(estimate)
         age_ms = (self._clocks.mono_ns() - exposed_ns) / 1e6
         self._each(self._lines, lambda out: out.view(result, age_ms, sent, withheld))

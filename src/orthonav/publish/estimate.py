@@ -46,6 +46,8 @@ class NavigationEstimate:
     `vel_en_mps`, `vel_cov_en`: velocity over ground (true east, north) and its covariance (2, 2).
     `state`: state of the track; None for views that are located one by one.
     `reset_counter`: 0 to 255; changes when the position jumped.
+    `dead_reckoned`: the view did not show the map, and the position is sent all the same because
+    that was asked for; messages that can mark it do, others are not made.
 
     Raises `EstimateError` where a value is out of range or no time is given.
     """
@@ -65,6 +67,7 @@ class NavigationEstimate:
     heading_deg: float = math.nan
     state: str | None = None
     reset_counter: int = 0
+    dead_reckoned: bool = False
 
     def __post_init__(self) -> None:
         if not (abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 180):  # NaN too

@@ -74,7 +74,7 @@ RECOGNIZED = 0.2
 """Probability from which on a view shows the map, by this view alone and by its agreement with the
 prediction: pictures of anything else stay below 0.12. Without, a track is coasting
 (docs/decisions/tracking.md, 12)."""
-MOST_AGREEMENT = 100.0
+MOST_AGREEMENT = 25.0
 """Largest factor on the odds by the agreement with the prediction: a view that has a probability
 below 1 % by itself does not show the map."""
 UNRECOGNIZED = 0.5

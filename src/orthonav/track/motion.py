@@ -115,7 +115,8 @@ def predicted(
     else:
         like_before = 0.0
         after[VELOCITY] = velocity.now_en_mps
-        if velocity.before_en_mps is not None and covariance[2, 2] < (3 * velocity.std_mps) ** 2:
+        known_mps = model.speed_mps / 2 if coasting else 3 * velocity.std_mps
+        if velocity.before_en_mps is not None and covariance[2, 2] < known_mps**2:
             like_before = math.exp(-seconds / model.reported_velocity_s)
             after[VELOCITY] += like_before * (mean[VELOCITY] - velocity.before_en_mps)
         after[POSITION] += seconds * after[VELOCITY]
