@@ -57,7 +57,8 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     least = accept.threshold if accept.criterion == "confidence" else CONFIDENT
     mount = read_mount(options.mount) if options.mount else None
     camera = _camera(options)
-    localizer = Localizer(open_map(options.map))
+    opened = open_map(options.map)
+    localizer = Localizer(opened)
     heading_known = options.heading == "known"
     tracker = Tracker(
         localizer, heading_known=heading_known, model=model_of(mount) if mount else None
@@ -84,6 +85,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         accept=accept if accept.criterion != "confidence" else None,
         min_confidence=least,
         map_path=options.map,
+        map_change=opened.change,
         state_path=options.state,
         logged_options=_logged_options(options, mount),
     )

@@ -1,6 +1,5 @@
 """Routes as KML (OGC 07-147r2, and Google's gx:Track) and KMZ, which is KML in a zip archive."""
 
-import re
 import struct
 import zipfile
 import zlib
@@ -77,7 +76,8 @@ def _routes(mark: Element) -> list[Route]:
 def _line(element: Element) -> Iterator[_Place]:
     """Positions of `lon,lat[,alt]` tuples separated by spaces; spaces after commas are accepted."""
     frame = _HEIGHT_FRAMES.get(text_of(element, "altitudeMode") or "")
-    text = re.sub(r"\s*,\s*", ",", text_of(element, "coordinates") or "")
+    text = " ".join((text_of(element, "coordinates") or "").split())
+    text = text.replace(" ,", ",").replace(", ", ",")
     for position in text.split():
         yield _place(position.split(","), frame, position)
 
