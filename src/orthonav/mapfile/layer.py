@@ -263,8 +263,8 @@ class _Blobs:
     """Byte strings concatenated in one part, with their offsets in another."""
 
     def __init__(self, opened: MapFile, data: str, offsets: str, count: int) -> None:
-        size = opened.length(data, np.uint8, 1)
-        self._parts, self._name = opened.arrays, data
+        size = opened.size_of(data, np.uint8, 1)
+        self._opened, self._name = opened, data
         self._offsets: NDArray[Any] = opened.array(offsets, np.int64, 1)
         places = self._offsets
         sane = (
@@ -284,7 +284,7 @@ class _Blobs:
 
     def blob(self, number: int) -> NDArray[np.uint8]:
         first, last = int(self._offsets[number]), int(self._offsets[number + 1])
-        return np.frombuffer(self._parts.range(self._name, first, last), dtype=np.uint8)
+        return np.frombuffer(self._opened.range(self._name, first, last), dtype=np.uint8)
 
 
 class _Cache:

@@ -46,14 +46,14 @@ _DTYPES = {
 class _Part:
     """Type and position of a part.
 
-    `first`, `length`: bytes in the file. `sha256`: of the whole part, hexadecimal. `blocks`:
+    `first`, `nbytes`: position and size in the file. `sha256`: of the whole part, hexadecimal. `blocks`:
     digests of its blocks, concatenated; empty for parts that are read whole.
     """
 
     dtype: type[np.generic]
     shape: tuple[int, ...]
     first: int
-    length: int
+    nbytes: int
     sha256: str
     blocks: bytes = b""
 
@@ -70,7 +70,7 @@ class MapParts(Mapping[str, NDArray[Any]]):
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         part = self._parts[name]
-        data = self._read(part.first, part.length)
+        data = self._read(part.first, part.nbytes)
         if hashlib.sha256(data).hexdigest() != part.sha256:
             raise self._changed(f"part {name} was rewritten")
         return np.frombuffer(data, dtype=part.dtype).reshape(part.shape)
@@ -93,7 +93,7 @@ class MapParts(Mapping[str, NDArray[Any]]):
         begin = first // BLOCK_BYTES
         end = -(-last // BLOCK_BYTES)
         start = begin * BLOCK_BYTES
-        data = self._read(part.first + start, min(end * BLOCK_BYTES, part.length) - start)
+        data = self._read(part.first + start, min(end * BLOCK_BYTES, part.nbytes) - start)
         size = _BLOCK_DIGEST_BYTES
         if _block_digests(data) != part.blocks[begin * size : end * size]:
             raise self._changed(f"part {name} was rewritten")
@@ -131,36 +131,48 @@ class MapParts(Mapping[str, NDArray[Any]]):
 
 @dataclass(frozen=True, eq=False)
 class MapFile:
-    """An opened map. `arrays`: its parts, read-only."""
+    """An opened map, or one that was built and not yet written.
+
+    `arrays`: its parts, read-only; those of an opened map are read when asked for.
+    """
 
     path: Path
     size_bytes: int
     manifest: Manifest
-    arrays: MapParts
+    arrays: Mapping[str, NDArray[Any]]
 
     def array(self, name: str, dtype: type[np.generic], ndim: int) -> NDArray[Any]:
         """The part `name`; raises `MapFileError` if it is missing or has another type or shape."""
-        self.length(name, dtype, ndim)
+        self.size_of(name, dtype, ndim)
         return self.arrays[name]
 
-    def length(self, name: str, dtype: type[np.generic], ndim: int) -> int:
-        """Length in bytes of the part `name`, which is not read; raises as `array`."""
-        found = self.arrays.described(name)
+    def size_of(self, name: str, dtype: type[np.generic], ndim: int) -> int:
+        """Bytes of the part `name`, without reading it; raises as `array`."""
+        arrays = self.arrays
+        found: _Part | NDArray[Any] | None
+        found = arrays.described(name) if isinstance(arrays, MapParts) else arrays.get(name)
         if found is None or found.dtype != dtype or len(found.shape) != ndim:
-            got = (
-                "nothing"
-                if found is None
-                else f"{np.dtype(found.dtype)} of {len(found.shape)} dimensions"
-            )
+            got = "nothing"
+            if found is not None:
+                got = f"{np.dtype(found.dtype)} of {len(found.shape)} dimensions"
             raise MapFileError(
                 f"map part {name} must be {np.dtype(dtype)} of {ndim} dimensions, got {got}: "
                 f"{self.path}"
             )
-        return found.length
+        return found.nbytes
+
+    def range(self, name: str, first: int, last: int) -> bytes:
+        """Bytes `first` to `last` (excluded) of a part of the registration layer.
+
+        Raises `MapChangedError` if they are not those of the opening.
+        """
+        if isinstance(self.arrays, MapParts):
+            return self.arrays.range(name, first, last)
+        return self.arrays[name][first:last].tobytes()
 
     def change(self) -> str | None:
         """How the open file was changed in place, as far as is known; see `MapParts.change`."""
-        return self.arrays.change()
+        return self.arrays.change() if isinstance(self.arrays, MapParts) else None
 
 
 class _OpenFile:

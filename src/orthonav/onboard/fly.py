@@ -35,7 +35,7 @@ from orthonav.onboard.health import (
 )
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.publisher import Publisher
-from orthonav.onboard.run import MAP_CHANGED, Locator, locate_view
+from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
 from orthonav.onboard.telemetry import Clocks, VehicleState
 from orthonav.publish.estimate import error_ellipse
 from orthonav.publish.mavlink import dialect
@@ -216,7 +216,7 @@ class Runner:
             outcome = self._refusal("wrong_camera", "wrong_camera", str(error))
             latency_ms = math.nan
         self._count("processed")
-        if isinstance(outcome, NoFix) and outcome.reason == "internal_error":
+        if isinstance(outcome, NoFix) and outcome.reason in ("internal_error", MAP_DAMAGED):
             self._count("internal_error")
         result = self._result(image, outcome, latency_ms)
         accepted = self.options.accept(outcome) if self.options.accept else outcome

@@ -19,6 +19,8 @@ from orthonav.records import Fix, NoFix, Telemetry, View, ViewResult
 log = logging.getLogger(__name__)
 MAP_CHANGED = "map_file_changed"
 """Reason of views after the open map file was truncated or rewritten."""
+MAP_DAMAGED = "map_damaged"
+"""Reason of a view for which a part of the map cannot be decoded."""
 
 
 class Locator(Protocol):
@@ -73,7 +75,7 @@ def locate_view(locator: Locator, view: View) -> tuple[Fix | NoFix, float]:
         outcome = NoFix(MAP_CHANGED, str(error))
     except MapFileError as error:  # a crafted part of the map, decoded for this view
         log.error("%s", error)
-        outcome = _passed(locator, view.telemetry, NoFix("map_damaged", str(error)))
+        outcome = _passed(locator, view.telemetry, NoFix(MAP_DAMAGED, str(error)))
     except Exception as error:  # one view must not end a flight
         log.exception("view could not be processed")
         outcome = _passed(locator, view.telemetry, _internal(error))
