@@ -1,8 +1,9 @@
-"""A map that is changed in place while it is open: nothing else than the opened map is ever read."""
+"""A map that is changed in place while it is open: only what was opened is ever returned."""
 
 import errno
 import os
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,6 +38,10 @@ def rewritten(path, at, data):
     with path.open("r+b") as stream:
         stream.seek(at)
         stream.write(data)
+
+
+def open_files():
+    return len(list(Path("/proc/self/fd").iterdir()))
 
 
 def whole_layer(layer, level=0):
@@ -162,9 +167,9 @@ def test_an_error_of_the_medium_is_an_error_of_ours(path, monkeypatch):
 
 
 def test_files_are_closed_with_their_maps(path):
-    before = len(os.listdir("/proc/self/fd"))
+    before = open_files()
     opened = [open_map(path) for _ in range(20)]
-    assert len(os.listdir("/proc/self/fd")) == before + 20
+    assert open_files() == before + 20
     np.testing.assert_equal(opened[0].arrays["tiles"], arrays()["tiles"])
     opened.clear()
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert open_files() == before

@@ -53,7 +53,8 @@ def estimate_map(
     """Estimate for the map that `orthonav build` makes of an area.
 
     Tiles are counted if that is cheap, else estimated from a sample (within 2 %), which is smaller
-    where this is one of many `maps`. Imagery is assumed everywhere. Raises `AreaError` as `TileGrid.covering` does.
+    where this is one of many `maps`. Imagery is assumed everywhere. Raises `AreaError` as
+    `TileGrid.covering` does.
     """
     grid = TileGrid.covering(area.extent_en_m, gsd_m=gsd_m, tile_px=tile_px, overlap=overlap)
     half_m, centre_m = grid.tile_m / 2, (grid.tile_m - grid.stride_m) / 2

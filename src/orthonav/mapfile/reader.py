@@ -46,8 +46,8 @@ _DTYPES = {
 class _Part:
     """Type and position of a part.
 
-    `first`, `nbytes`: position and size in the file. `sha256`: of the whole part, hexadecimal. `blocks`:
-    digests of its blocks, concatenated; empty for parts that are read whole.
+    `first`, `nbytes`: position and size in the file. `sha256`: of the whole part, hexadecimal.
+    `blocks`: digests of its blocks, concatenated; empty for parts that are read whole.
     """
 
     dtype: type[np.generic]
