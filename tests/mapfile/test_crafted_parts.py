@@ -121,7 +121,7 @@ MASK_CASES = {
 @pytest.mark.parametrize("how", MASK_CASES)
 def test_crafted_masks(tmp_path, how, caplog):
     opened = open_map(masked(MASK_CASES[how], tmp_path))
-    with pytest.raises(MapFileError, match="registration layer is damaged .*mask"):
+    with pytest.raises(MapFileError, match=r"registration layer is damaged .*mask"):
         everything_of_the_layer(opened)
     located(opened)
     assert not any(record.exc_info for record in caplog.records)
@@ -160,3 +160,17 @@ def test_an_encoded_preview_of_another_kind(tmp_path):
     encoded = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1]
     with pytest.raises(MapFileError, match="preview"):
         preview(open_map(written(tmp_path / "a.onav", {"sheet0/preview_jpeg": encoded})))
+
+
+def test_a_coarsest_level_of_gigapixels(tmp_path):
+    """Its chunks are empty, so the file is small; programs read this level as a whole."""
+    manifest, _ = golden()
+    sheet = manifest.sheets[0]
+    for rows, levels, sane in ((600, 1, False), (600, 4, True), (250, 1, True)):
+        grid = replace(sheet.grid, rows=rows, cols=2, stride_px=32, gsd_m=0.1)
+        sheets = (replace(sheet, grid=grid, tiles=2, grey=replace(sheet.grey, levels=levels)),)
+        if not sane:
+            with pytest.raises(MapFileError, match="impossible registration layer"):
+                open_map(written(tmp_path / "a.onav", {}, sheets=sheets))
+        else:
+            open_map(written(tmp_path / "a.onav", {}, sheets=sheets))
