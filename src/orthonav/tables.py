@@ -6,8 +6,8 @@ from typing import IO
 
 MAX_LINE_CHARS = 65_536
 """Limit of a line of a table: a thousand columns of the longest numbers."""
-MAX_ROWS = 10_000_000
-"""Limit of rows that callers do not set: half a day at 200 Hz."""
+MAX_ROWS = 5_000_000
+"""Limit of rows that callers do not set: seven hours at 200 Hz."""
 
 
 class TableError(ValueError):

@@ -33,7 +33,7 @@ _BLOCK_DIGEST_BYTES = 16
 _PIECE_BYTES = 64 * BLOCK_BYTES
 _IN_RANGES = re.compile(r"sheet\d+/grey/(mask_)?bytes")
 """Parts that are read in ranges: the largest of a map."""
-_DTYPES = {
+_DTYPES: dict[str, type[np.generic]] = {
     "F16": np.float16,
     "F32": np.float32,
     "U8": np.uint8,
