@@ -30,6 +30,10 @@ class MapFileError(OrthonavError, ValueError):
     """A map file is not a map, is truncated, or was altered."""
 
 
+class MapChangedError(MapFileError):
+    """An open map file was truncated or rewritten in place, or cannot be read any more."""
+
+
 class MapVersionError(MapFileError):
     """A map file was written for a newer schema than this program knows."""
 

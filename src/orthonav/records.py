@@ -45,7 +45,7 @@ class Prior:
     std_m: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Telemetry:
     """What the autopilot reported for the exposure of one view. NaN and None stand for unknown."""
 

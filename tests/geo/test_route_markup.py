@@ -184,3 +184,14 @@ def test_archives_of_many_members_or_with_a_password_are_refused(read):
     locked[flag] |= 1
     with pytest.raises(RouteError, match="cannot be unpacked"):
         read(bytes(locked), "a.kmz")
+
+
+def test_spaces_in_coordinates_take_linear_time(tmp_path):
+    """The time of a search for spaces around commas would grow with the square of their number."""
+    path = tmp_path / "a.kml"
+    spaces = " " * 3_000_000
+    text = f"1 ,\n2{spaces}3 , 4, 5"
+    path.write_text(
+        f"<kml><Placemark><LineString><coordinates>{text}</coordinates></LineString></Placemark></kml>"
+    )
+    assert read_route(path).waypoints == ((2.0, 1.0), (4.0, 3.0))

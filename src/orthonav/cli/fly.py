@@ -325,6 +325,12 @@ def _add_flight(group: Any) -> None:
         metavar="public.pem",
         help="refuse a map that was not signed with this key (see `orthonav sign`)",
     )
+    group.add_argument(
+        "--not-before",
+        metavar="DATE|SERIAL",
+        help="with --require-signed: refuse a map signed before this date (2026-05-31, UTC) or "
+        "with a lower serial number",
+    )
 
 
 def _add_log(group: Any) -> None:

@@ -17,7 +17,7 @@ from orthonav.flight.mount import Mount, read_mount
 from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
 from orthonav.localizer.tracker import Tracker
-from orthonav.mapfile import open_map
+from orthonav.mapfile import MapFile, open_map
 from orthonav.onboard import cameras
 from orthonav.onboard.calibrate import MountCorrected, model_of
 from orthonav.onboard.cameras import CameraThread
@@ -35,6 +35,7 @@ from orthonav.onboard.outputs import (
 from orthonav.onboard.ports import transport_opener
 from orthonav.onboard.publisher import PositionOutput, Publisher
 from orthonav.onboard.run import Locator
+from orthonav.onboard.serials import require_newest
 from orthonav.onboard.state import boot_id, load, prior_of
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
 from orthonav.publish.estimate import Clock
@@ -49,15 +50,12 @@ from orthonav.sources.cameras import read_camera_file
 def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitStack) -> Runner:
     """Runner of a flight with all its parts; `stack` stops their threads."""
     clocks = Clocks()
-    if options.require_signed:  # cryptography is loaded only where it is asked for
-        importlib.import_module("orthonav.mapfile.signature").require_signature(
-            options.map, options.require_signed
-        )
+    opened = _opened(options)
     accept = Acceptance.parse(options.accept)
     least = accept.threshold if accept.criterion == "confidence" else CONFIDENT
     mount = read_mount(options.mount) if options.mount else None
     camera = _camera(options)
-    localizer = Localizer(open_map(options.map))
+    localizer = Localizer(opened)
     heading_known = options.heading == "known"
     tracker = Tracker(
         localizer, heading_known=heading_known, model=model_of(mount) if mount else None
@@ -84,6 +82,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         accept=accept if accept.criterion != "confidence" else None,
         min_confidence=least,
         map_path=options.map,
+        map_change=opened.change,
         state_path=options.state,
         logged_options=_logged_options(options, mount),
     )
@@ -100,6 +99,22 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         start=_start(options, clocks),
         notifier=Notifier(),
     )
+
+
+def _opened(options: argparse.Namespace) -> MapFile:
+    """The map, its signature checked first where that is asked for."""
+    if options.not_before is not None and not options.require_signed:
+        raise VariantError("--not-before needs --require-signed")
+    if not options.require_signed:
+        return open_map(options.map)
+    # cryptography is loaded only where it is asked for
+    signature = importlib.import_module("orthonav.mapfile.signature").require_signature(
+        options.map, options.require_signed, options.not_before
+    )
+    opened = open_map(options.map)
+    if options.state is not None:
+        require_newest(options.state, signature, options.map)
+    return opened
 
 
 def _inputs(

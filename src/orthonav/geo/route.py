@@ -34,7 +34,8 @@ __all__ = [
     "within_bands",
 ]
 
-MAX_ROUTE_BYTES = 50_000_000
+MAX_ROUTE_BYTES = 20_000_000
+"""Twice as much as 100,000 waypoints take; JSON and XML take some 20 times their size in memory."""
 _PAIRS_AT_ONCE = 2**18
 _FEW_POINTS = 64
 _BROKEN = (ValueError, LookupError, TypeError, OverflowError, RecursionError, csv.Error)

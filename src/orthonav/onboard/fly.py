@@ -35,7 +35,7 @@ from orthonav.onboard.health import (
 )
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.publisher import Publisher
-from orthonav.onboard.run import Locator, locate_view
+from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
 from orthonav.onboard.telemetry import Clocks, VehicleState
 from orthonav.publish.estimate import error_ellipse
 from orthonav.publish.mavlink import dialect
@@ -91,6 +91,7 @@ class FlyOptions:
     `accept`: criterion in addition to those of the gate.
     `min_confidence`: confidence (0 to 1) from which a position is saved and counts as confident.
     `map_path`: map file to watch for changes; None: none.
+    `map_change`: how the open map file was changed in place, None if it was not.
     `state_path`: file for the last position; None: none.
     `logged_options`: written to the flight log for a replay.
     """
@@ -104,6 +105,7 @@ class FlyOptions:
     accept: Acceptance | None = None
     min_confidence: float = CONFIDENT
     map_path: Path | None = None
+    map_change: Callable[[], str | None] = lambda: None
     state_path: Path | None = None
     logged_options: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
@@ -180,7 +182,7 @@ class Runner:
             self._count("late")
             return None
         vehicle, camera = VehicleState(None), self._camera
-        refused = self._bad_image(image)
+        refused = self._map_changed() or self._bad_image(image)
         if refused is None and image.grey is not None:
             try:
                 height, width = image.grey.shape
@@ -214,7 +216,7 @@ class Runner:
             outcome = self._refusal("wrong_camera", "wrong_camera", str(error))
             latency_ms = math.nan
         self._count("processed")
-        if isinstance(outcome, NoFix) and outcome.reason == "internal_error":
+        if isinstance(outcome, NoFix) and outcome.reason in ("internal_error", MAP_DAMAGED):
             self._count("internal_error")
         result = self._result(image, outcome, latency_ms)
         accepted = self.options.accept(outcome) if self.options.accept else outcome
@@ -253,6 +255,15 @@ class Runner:
     def _result(self, image: CameraImage, outcome: Fix | NoFix, latency_ms: float) -> ViewResult:
         state = self._locator.state_name
         return ViewResult(image.frame, image.time_ns, outcome, latency_ms, state)
+
+    def _map_changed(self) -> NoFix | None:
+        """Reason to give no position where the map file was changed in place; None if it was not.
+
+        Parts of the map that are in memory would still give positions; they stop all the same, so
+        that the fault shows at once and not where the aircraft leaves these parts.
+        """
+        change = self.options.map_change()
+        return None if change is None else NoFix(MAP_CHANGED, f"map file was changed: {change}")
 
     def _bad_image(self, image: CameraImage) -> NoFix | None:
         """Reason why an image cannot be used; None if it can."""
@@ -372,6 +383,7 @@ class Runner:
             state=state,
             synced=link.synced if link else True,
             map_unchanged=_file_id(self.options.map_path) == self._map_id,
+            map_intact=self.options.map_change() is None,
             heading_mismatch_deg=heading_deg,
             log_scale_mismatch=log_scale,
         )

@@ -17,6 +17,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from orthonav.errors import MapFileError
 from orthonav.localizer.localizer import Localizer
 from orthonav.records import Fix, Telemetry, View
 
@@ -98,7 +99,8 @@ class Snapshot:
     `latency_s`: 95th percentile of the time from exposure to message.
     `state`: state of the track; None for views that are located one by one.
     `synced`: whether TIMESYNC is answered.
-    `map_unchanged`: whether the map file is still the one that was opened.
+    `map_unchanged`: whether the file of the map's name is still the one that was opened.
+    `map_intact`: whether the open map file was neither truncated nor rewritten.
     `heading_mismatch_deg`, `log_scale_mismatch`: see `mismatch`.
     """
 
@@ -112,6 +114,7 @@ class Snapshot:
     state: str | None = "tracking"
     synced: bool = True
     map_unchanged: bool = True
+    map_intact: bool = True
     heading_mismatch_deg: float = 0.0
     log_scale_mismatch: float = 0.0
 
@@ -127,6 +130,7 @@ def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
         "link_down": settled and seen.link_age_s > limits.link_age_s,
         "no_telemetry": settled and seen.telemetry_age_s > limits.telemetry_age_s,
         "wrong_camera": count["wrong_camera"] > 0,
+        "map_file_changed": not seen.map_intact,
         "internal_errors": count["internal_error"] > 0.5 * max(count["processed"], 1),
     }
     degraded = {
@@ -144,7 +148,7 @@ def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
         "camera_lost": count["camera_lost"] > 0 and not failed["no_camera"],
         "clock_jumped": count["clock_jump"] > 0,
         "not_synchronized": settled and not seen.synced and not failed["link_down"],
-        "map_file_changed": not seen.map_unchanged,
+        "map_file_changed": not seen.map_unchanged and seen.map_intact,
         "output_failed": count["output_failed"] > 0,
         "log_failed": count["log_failed"] > 0,
         "state_not_saved": count["state_failed"] > 0,
@@ -280,6 +284,8 @@ class TelemetryDiagnosis:
                 outcome = self._localizer.locate(assumed, heading_known=heading_known)
                 if isinstance(outcome, Fix) and outcome.confidence >= self._least:
                     self._found = (now_ns, *mismatch(outcome, telemetry))
+            except MapFileError as error:
+                log.warning("diagnosis of telemetry failed: %s", error)
             except Exception:  # the flight does not depend on it
                 log.exception("diagnosis of telemetry failed")
             finally:
