@@ -53,6 +53,7 @@ FAULTS = {
     "clock_jumped": (counted(clock_jump=1), Level.DEGRADED),
     "not_synchronized": (replace(GOOD, synced=False), Level.DEGRADED),
     "map_file_changed": (replace(GOOD, map_unchanged=False), Level.DEGRADED),
+    "slow_vision": (counted(slow_vision=3), Level.DEGRADED),
     "output_failed": (counted(output_failed=1), Level.DEGRADED),
     "log_failed": (counted(log_failed=1), Level.DEGRADED),
     "state_not_saved": (counted(state_failed=1), Level.DEGRADED),
