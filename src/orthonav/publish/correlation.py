@@ -13,10 +13,10 @@ from dataclasses import dataclass, field, replace
 from orthonav.publish.estimate import NavigationEstimate, error_ellipse, floored
 from orthonav.records import MAP_STD_M
 
-AVERAGING_S, AT_STD_M, EXPONENT = 6.0, 5.0, 0.4
-"""Time over which the filters of autopilots average positions, s, where their error should come out
-with the standard deviation `AT_STD_M`; it grows with this power of the standard deviation. Derived
-from the default process noise of PX4 and ArduPilot and chosen on generated flights
+AVERAGING_S, AT_STD_M, EXPONENT = 5.0, 5.0, 0.4
+"""Time over which the filters of autopilots average positions, s, where their claim should come to
+the standard deviation `AT_STD_M`; it grows with this power of it. Derived from the default process
+noise of PX4 and ArduPilot, 5.5 s, and chosen on generated flights
 (docs/decisions/correlated-errors.md)."""
 
 
