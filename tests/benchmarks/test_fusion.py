@@ -13,28 +13,28 @@ from orthonav.records import Fix, NoFix, ViewResult
 
 FRAME = LocalFrame(48.0, 2.0)
 INERTIAL = [each for each in RECEIVERS if each.inertial]
-STD_M, MEMORY_S, SECONDS = 4.0, 15.0, 180.0
+MEMORY_S, SECONDS = 15.0, 180.0
 
 
-def correlated(rng: np.random.Generator, rate_hz: float) -> Fixes:
+def correlated(rng: np.random.Generator, rate_hz: float, std_m: float) -> Fixes:
     """Errors of a flight, half constant, half forgotten within `MEMORY_S`, as positions."""
     count = round(SECONDS * rate_hz)
     kept = math.exp(-1 / rate_hz / MEMORY_S)
     errors = rng.normal(size=(count, 2))
     for k in range(1, count):
         errors[k] = kept * errors[k - 1] + math.sqrt(1 - kept**2) * errors[k]
-    errors = (errors + rng.normal(size=2)) * STD_M / math.sqrt(2)
-    own = np.full(count, STD_M**2)
-    estimate = NavigationEstimate(48.0, 2.0, np.eye(2) * STD_M**2, 0.99, utc_ns=0)
+    errors = (errors + rng.normal(size=2)) * std_m / math.sqrt(2)
+    own = np.full(count, std_m**2)
+    estimate = NavigationEstimate(48.0, 2.0, np.eye(2) * std_m**2, 0.99, utc_ns=0)
     sent = np.full(count, for_filter(estimate, 1 / rate_hz).horizontal_std_m() ** 2)
     sent[0] = own[0]
     return Fixes(np.arange(count) / rate_hz, errors, np.zeros((count, 2)), own, sent, 0.0)
 
 
-@pytest.fixture(scope="module", params=[5.0, 2.0, 1.0])
+@pytest.fixture(scope="module", params=[(5.0, 4.0), (2.0, 4.0), (1.0, 4.0), (1.0, 15.0)])
 def flights(request) -> list[Fixes]:
     rng = np.random.default_rng(3)
-    return [correlated(rng, request.param) for _ in range(20)]
+    return [correlated(rng, *request.param) for _ in range(20)]
 
 
 @pytest.mark.parametrize("receiver", INERTIAL, ids=lambda each: each.name)
@@ -55,8 +55,8 @@ def test_a_filter_of_independent_errors_is_consistent(receiver) -> None:
     rng, times = np.random.default_rng(4), np.arange(0.0, 120.0, 0.5)
     ratios = []
     for _ in range(30):
-        places = rng.normal(0.0, STD_M, (len(times), 2))
-        own = np.full(len(times), STD_M**2)
+        places = rng.normal(0.0, 4.0, (len(times), 2))
+        own = np.full(len(times), 16.0)
         fixes = Fixes(times, places, np.zeros_like(places), own, own, 0.0)
         ratios.append(fuse(receiver, fixes, own).ratio)
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.2)
