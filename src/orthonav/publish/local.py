@@ -64,10 +64,11 @@ def north_east_m(
 def ardupilot_variance(std_m: float) -> float:
     """Variance of each of three axes that ArduPilot reads as the standard deviation `std_m`.
 
-    It takes the cube root of the sum of the squared variances, where metres would need the square
-    root of a variance (`libraries/GCS_MAVLink/GCS_Common.cpp`, `handle_odometry`).
+    It takes the root of the sum of the variances of all three axes; older versions the cube root of
+    the sum of their squares, which gives `std_m` at 3 m and more than it above
+    (`libraries/GCS_MAVLink/GCS_Common.cpp`).
     """
-    return math.sqrt(std_m**3 / 3)
+    return std_m**2 / 3
 
 
 def _px4(origin: Origin, lat_deg: float, lon_deg: float) -> tuple[float, float]:
