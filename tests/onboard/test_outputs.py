@@ -149,6 +149,16 @@ def test_the_accuracy_for_filters_grows_with_the_rate():
     assert again[2]["pose_covariance"][0] == pytest.approx(9.0 * averaged)
 
 
+def test_the_gate_judges_the_accuracy_of_the_fix():
+    sending = Sending(rules=GateRules(max_std_m=4.0))
+    for _ in range(3):
+        now_ns = sending.time.now_ns
+        sending.publish(sending.gate.admit(replace(ESTIMATE, boot_ns=now_ns), now_ns))
+        sending.time.go(0.2)
+    assert len(sending.frames) == 3 and not sending.gate.withheld
+    assert sending.frames[-1]["eph"] > 4.0
+
+
 @pytest.mark.parametrize(
     "kind, interval_s, too_slow",
     [(Autopilot.PX4, 0.2, 4), (Autopilot.PX4, 0.125, 0), (Autopilot.ARDUPILOT, 0.5, 0)],
