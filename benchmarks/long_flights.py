@@ -168,7 +168,7 @@ def _flown(work: Path, plan: Plan, localizer: Localizer, ortho: Path) -> Path:
     if about.is_file():
         return folder
     rng = plan.rng()
-    line = _legs(rng, plan.km * 1000, plan.area_m / 2 - BORDER_M)
+    line = random_legs(rng, plan.km * 1000, plan.area_m / 2 - BORDER_M)
     lat, lon = localizer.sheet.frame.latlon_from_en(line)
     yaw_bias, agl_bias = rng.normal(0, 1, 2) * [YAW_BIAS_DEG, AGL_BIAS]
     wind = Wind(WIND_MPS, float(rng.uniform(0, 360)))
@@ -204,20 +204,22 @@ def _flown(work: Path, plan: Plan, localizer: Localizer, ortho: Path) -> Path:
     return folder
 
 
-def _legs(rng: np.random.Generator, length_m: float, reach_m: float) -> Array:
+def random_legs(
+    rng: np.random.Generator, length_m: float, reach_m: float, leg_m: tuple[float, float] = LEG_M
+) -> Array:
     """Corners (N, 2) of a route of random legs in a square, `length_m` long."""
     line = [rng.uniform(-reach_m, reach_m, 2)]
     course, left_m = rng.uniform(0, 2 * math.pi), length_m
-    shortest = min(LEG_M[0], reach_m)
+    shortest = min(leg_m[0], reach_m)
     while left_m > 0:
         step = rng.uniform(-reach_m, reach_m, 2) - line[-1]
-        leg_m, new = float(np.hypot(*step)), math.atan2(step[1], step[0])
+        drawn_m, new = float(np.hypot(*step)), math.atan2(step[1], step[0])
         turn_deg = abs(math.degrees(math.remainder(new - course, 2 * math.pi)))
-        if not (shortest <= leg_m <= LEG_M[1] and turn_deg <= SHARPEST_DEG):
+        if not (shortest <= drawn_m <= leg_m[1] and turn_deg <= SHARPEST_DEG):
             course += 0.05  # leave the corner of the square
             continue
-        line.append(line[-1] + step * min(1.0, left_m / leg_m))
-        course, left_m = new, left_m - leg_m
+        line.append(line[-1] + step * min(1.0, left_m / drawn_m))
+        course, left_m = new, left_m - drawn_m
     return np.array(line)
 
 

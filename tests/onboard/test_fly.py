@@ -752,6 +752,16 @@ def test_a_map_changed_in_place_in_flight_stops_positions_only(flown, autopilot,
     assert last["health"] == "FAILED" and "map_file_changed" in last["reasons"]
 
 
+@pytest.mark.parametrize(
+    "more, warned",
+    [(("--send", "odometry", "--send-rate-hz", "5"), True), (("--send", "odometry"), False)],
+)
+def test_a_rate_too_low_for_px4_is_a_warning(flown, run, more, warned):
+    path, folder, _, _ = flown
+    done = run("fly", path, folder, "--autopilot", "udpin:0", *more, "--nmea", "x:1")
+    assert done.code == 1 and ("PX4 fuses ODOMETRY only at more than 5 Hz" in done.err) == warned
+
+
 def test_invalid_options_end_with_one_line(flown, run, tmp_path):
     path, folder, _, _ = flown
     done = run("fly", path, folder)

@@ -57,6 +57,7 @@ FAULTS = {
         replace(GOOD, map_unchanged=False, map_intact=False),
         Level.FAILED,
     ),
+    "slow_vision": (counted(slow_vision=3), Level.DEGRADED),
     "output_failed": (counted(output_failed=1), Level.DEGRADED),
     "log_failed": (counted(log_failed=1), Level.DEGRADED),
     "state_not_saved": (counted(state_failed=1), Level.DEGRADED),

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import logging
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -26,6 +27,8 @@ from orthonav.onboard.health import Notifier, TelemetryDiagnosis
 from orthonav.onboard.link import AutopilotLink, LinkThread
 from orthonav.onboard.outputs import (
     KINDS,
+    LOCAL,
+    PX4_VISION_S,
     JsonOut,
     MessageOptions,
     Messenger,
@@ -45,6 +48,8 @@ from orthonav.publish.mavlink import Signing, signing_timestamp
 from orthonav.publish.nmea import Quality
 from orthonav.records import CONFIDENT, Prior
 from orthonav.sources.cameras import read_camera_file
+
+log = logging.getLogger(__name__)
 
 
 def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitStack) -> Runner:
@@ -184,6 +189,7 @@ def _link(options: argparse.Namespace, clocks: Clocks) -> AutopilotLink | None:
         component_id=options.component_id,
         signing=_signing(options, clocks),
         silent=options.dry_run,
+        stamp=Clock(options.stamp),
     )
 
 
@@ -216,6 +222,7 @@ def _publisher(
         if not options.send_rate_hz > 0:
             raise VariantError("--send-rate-hz must be above 0")
         interval = dict.fromkeys([*KINDS.values(), "NMEA", "ROS2"], 1 / options.send_rate_hz)
+    _warn_of_a_low_rate(options)
     rules = GateRules(
         least,
         options.max_std_m,
@@ -250,7 +257,22 @@ def _publisher(
         lines=lines,
         graph=graph,
         min_confidence=least,
+        min_std_m=options.min_std_m,
     )
+
+
+def _warn_of_a_low_rate(options: argparse.Namespace) -> None:
+    """Warn of local messages at a rate at which PX4 does not fuse them."""
+    local = [KINDS[kind] for kind in options.send or () if kind in LOCAL]
+    rates = [hz for hz in (options.send_rate_hz, options.rate_hz) if hz is not None]
+    if local and rates and min(rates) * PX4_VISION_S <= 1:
+        log.warning(
+            "PX4 fuses %s only at more than %g Hz, got %g Hz: send global-position to PX4, or "
+            "raise the rate",
+            " and ".join(local),
+            1 / PX4_VISION_S,
+            min(rates),
+        )
 
 
 def _start(options: argparse.Namespace, clocks: Clocks) -> Callable[[], Prior | None]:

@@ -143,7 +143,7 @@ class Runner:
         self._saved: states.SavedState | None = None
         self._mismatch = 0.0, 0.0
         self._utc_ahead_ns = clocks.utc_ns() - clocks.mono_ns()
-        self._seen = {"jumps": 0, "outages": 0, "failed": 0, "lost": 0}
+        self._seen = {"jumps": 0, "outages": 0, "failed": 0, "lost": 0, "slow": 0}
         self._map_id = _file_id(options.map_path)
         self._boot_id = states.boot_id()
 
@@ -339,17 +339,20 @@ class Runner:
 
     def _count_changes(self) -> None:
         """Count what the link, the camera, the outputs and the log counted since the last call."""
+        messenger = self._publisher.messenger
         now = {
             "jumps": 0 if self._link is None else self._link.sync.jumps,
             "outages": self._newest.outages,
             "failed": self._publisher.failed,
             "lost": 0 if self._sink is None else sum(self._sink.lost.values()),
+            "slow": 0 if messenger is None else messenger.too_slow,
         }
         names = {
             "jumps": "clock_jump",
             "outages": "camera_lost",
             "failed": "output_failed",
             "lost": "log_failed",
+            "slow": "slow_vision",
         }
         for key, name in names.items():
             if now[key] > self._seen[key]:

@@ -93,7 +93,8 @@ class Snapshot:
     `running_s`: time since the start.
     `counts`: events within the window by name: `taken` (by the runner), `processed`, `late`,
     `frozen`, `bad_image`, `no_telemetry`, `internal_error`, `wrong_camera`, `camera_lost`,
-    `clock_jump`, `output_failed`, `log_failed`, `state_failed`.
+    `clock_jump`, `output_failed`, `log_failed`, `state_failed`; `slow_vision`, seconds in which a
+    local message came too late for PX4.
     `image_age_s`, `telemetry_age_s`, `link_age_s`: time since the last image, attitude, message.
     `low_confidence_s`: time since the last confident position.
     `latency_s`: 95th percentile of the time from exposure to message.
@@ -145,6 +146,7 @@ def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
         "bad_images": count["bad_image"] > many,
         "telemetry_gaps": count["no_telemetry"] > many and not failed["no_telemetry"],
         "slow": seen.latency_s > limits.latency_s or count["late"] > many,
+        "slow_vision": count["slow_vision"] > limits.share * WINDOW_S,
         "camera_lost": count["camera_lost"] > 0 and not failed["no_camera"],
         "clock_jumped": count["clock_jump"] > 0,
         "not_synchronized": settled and not seen.synced and not failed["link_down"],

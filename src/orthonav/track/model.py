@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.records import DEFAULT_AGL_STD, DEFAULT_YAW_STD_DEG
+from orthonav.records import DEFAULT_AGL_STD, DEFAULT_YAW_STD_DEG, MAP_STD_M
 
 Array = NDArray[np.float64]
 STATE = 8
@@ -68,7 +68,7 @@ class Model:
     """Of the drift of the misalignment, rad per root of a second."""
     sighting_noise_m: float = 2.0
     """Of the disagreement of two dates beyond the covariance of a registration, per axis."""
-    map_m: float = 3.0
+    map_m: float = MAP_STD_M
     """Of a displacement of the map as a whole, per axis: added to the covariance of a fix."""
     sighting_growth: float = 2.0
     """Factor on the position covariance of a registration, its part due to tilt excepted
