@@ -132,7 +132,8 @@ def global_position_sensor(
     """GLOBAL_POSITION_SENSOR (message 296): a position from map matching, stamped at sending.
 
     An estimate of low confidence is UNHEALTHY and has neither position nor accuracy, because some
-    receivers do not read the flag; a dead-reckoned one is UNHEALTHY and has both. `sensor_id` is 1 to 255 (PX4 reads 0 as "off").
+    receivers do not read the flag; a dead-reckoned one is UNHEALTHY and has both. `sensor_id` is 1
+    to 255 (PX4 reads 0 as "off").
     """
     if not 1 <= sensor_id <= 255:
         raise EstimateError(f"sensor_id must be 1 to 255, got {sensor_id}")
