@@ -1,6 +1,6 @@
 """Whether a filter that takes our positions as independent claims the right accuracy.
 
-`python -m benchmarks.fusion [--flights 6] [--rates 5 2 1] [--averaging-s S ..] [--work DIR]` flies
+`python -m benchmarks.fusion [--flights 8] [--rates 5 2 1] [--averaging-s S ..] [--work DIR]` flies
 over a generated area with errors of attitude, heading and height, follows every flight with
 `Tracker` from no prior, and gives the positions that would be sent to Kalman filters of constant
 velocity, once with the covariance of the fix and once with the one that is sent
@@ -341,7 +341,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.fusion", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("--flights", type=int, default=6, help="per rate (default 6)")
+    parser.add_argument("--flights", type=int, default=8, help="per rate (default 8)")
     parser.add_argument(
         "--rates", type=float, nargs="+", choices=sorted(LENGTH_S), default=[5.0, 2.0, 1.0]
     )
