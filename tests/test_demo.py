@@ -35,9 +35,9 @@ def small_demo(area, monkeypatch):
 def test_the_demo(small_demo, tmp_path, capsys, names_in):
     out = tmp_path / "demo"
     assert main(["demo", "--out", str(out)]) == 0
-    told = capsys.readouterr()
-    assert f"{out}/report/index.html" in told.out and "5/5" in told.err
-    assert f"{out}/check/index.html" in told.out and "expected to give a correct" in told.out
+    printed = capsys.readouterr()
+    assert f"{out}/report/index.html" in printed.out and "5/5" in printed.err
+    assert f"{out}/check/index.html" in printed.out and "expected to give a correct" in printed.out
     assert json.loads((out / "check" / "check.json").read_text())["route"]["name"] == "demo"
     names = [name for name in names_in(out) if not name.startswith(("flight/", "."))]
     assert {"area.onav", "demo.json", "check", "fixes.jsonl", "flight", "report"} <= set(names)
@@ -67,8 +67,8 @@ def test_the_demo_may_be_repeated_but_replaces_nothing_else(
     (out / "mine").unlink()  # what is left is what an earlier demo might have made
     capsys.readouterr()
     assert main(["demo", "--quiet", "--json", "--out", str(out)]) == 0
-    told = capsys.readouterr()
-    assert json.loads(told.out)["n_views"] > 4 and told.err == ""
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["n_views"] > 4 and printed.err == ""
 
 
 def test_a_demo_that_fails_leaves_nothing(small_demo, tmp_path, capsys, names_in, monkeypatch):

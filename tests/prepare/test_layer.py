@@ -281,16 +281,16 @@ def test_info_describes_the_layer(ortho, tmp_path, capsys):
     opened = built(ortho, tmp_path)
     grey = opened.manifest.sheets[0].grey
     assert main(["info", str(opened.path), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)["registration"]
+    summary = json.loads(capsys.readouterr().out)["registration"]
     size = sum(opened.arrays[name].nbytes for name in NAMES.values())
-    assert told["bytes"] == size and told["levels"] == grey.levels
-    assert told["raw_bytes"] == 3 * grey.valid_px
-    assert told["raw_ratio"] == pytest.approx(3 * grey.valid_px / size, abs=0.01)
-    assert told["mb_per_km2"] == pytest.approx(size / grey.valid_px, rel=0.01)  # 1 m pixels
+    assert summary["bytes"] == size and summary["levels"] == grey.levels
+    assert summary["raw_bytes"] == 3 * grey.valid_px
+    assert summary["raw_ratio"] == pytest.approx(3 * grey.valid_px / size, abs=0.01)
+    assert summary["mb_per_km2"] == pytest.approx(size / grey.valid_px, rel=0.01)  # 1 m pixels
     assert main(["info", str(opened.path)]) == 0
     text = capsys.readouterr().out
     assert f"registration layer of {size / 1e6:.3f} MB" in text
-    assert f"{grey.levels} levels, 1/{told['raw_ratio']:.0f} of the raw orthophoto" in text
+    assert f"{grey.levels} levels, 1/{summary['raw_ratio']:.0f} of the raw orthophoto" in text
 
 
 def test_the_command_can_leave_it_out(ortho, tmp_path, capsys):
