@@ -2,6 +2,7 @@
 
 import ast
 import json
+import platform
 import re
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from orthonav import extras
-from orthonav.cli import COMMANDS
+from orthonav.cli import COMMANDS, version
 from orthonav.cli.needs import NEEDS
 from orthonav.errors import MissingExtraError
 
@@ -203,12 +204,43 @@ def test_extras_that_include_others(monkeypatch):
     try:
         asked = [(package.name, package.asked) for package in extras.packages("two")]
         assert asked == [("b", ">=2,<3"), ("c", "")]
+        assert all(package.available for package in extras.packages("two"))
         assert extras.missing("") == ("a",)
         with pytest.raises(MissingExtraError) as caught:
             extras.require("this", "one", "two")
         assert str(caught.value) == "this needs b, c: pip install 'orthonav[one,two]'"
     finally:
         extras._requirements.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("machine", "python", "available"),
+    [("x86_64", "3.13.2", True), ("aarch64", "3.13.2", False), ("x86_64", "3.14.0", False)],
+)
+def test_what_is_not_made_for_a_machine_is_not_called_missing(
+    monkeypatch, machine, python, available
+):
+    """By the marker of cyclonedds, as pip writes it."""
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    monkeypatch.setattr(platform, "python_version", lambda: python)
+    monkeypatch.setattr(extras, "_version", lambda name: "")
+    found = {package.name: package for package in extras.packages("ros2")}
+    assert found["cyclonedds"].available is available and found["rosbags"].available
+    plain = version.about()
+    assert plain["unavailable"] == ([] if available else ["cyclonedds"])
+    answer = plain["missing"]["fly --ros2"]
+    assert ("no wheel for this machine" in answer) is not available
+    assert ("pip install" in answer) is available
+    shown = version._text(plain)
+    assert ("cyclonedds MISSING" in shown) is available and "rosbags MISSING" in shown
+
+
+def test_markers_of_the_project_are_understood():
+    """`extras` reads comparisons with == and <, joined by `and`."""
+    for lines in PROJECT["optional-dependencies"].values():
+        for marker in (str(Requirement(line).marker or "") for line in lines):
+            left = extras._CONDITION.sub("", marker)
+            assert left.split() in ([], ["and"]), marker
 
 
 def test_sources_without_metadata_ask_nothing(monkeypatch):

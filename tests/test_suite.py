@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import absent
+from orthonav.extras import module_of
 
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = sorted(Path(__file__).parent.rglob("*.py"))
@@ -75,17 +76,6 @@ def test_only_what_is_absent_skips_a_test(monkeypatch):
     assert absent._reason("AssertionError: assert 1 == 2") is None
 
 
-MODULES = {
-    "owslib": "OWSLib",
-    "PIL": "pillow",
-    "yaml": "PyYAML",
-    "xstatic": "XStatic-Leaflet",
-    "faiss": "faiss-cpu",
-    "skimage": "scikit-image",
-    "jinja2": "Jinja2",
-}
-
-
 def test_every_package_of_an_extra_is_known_to_be_optional():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     extras = project["optional-dependencies"]
@@ -96,4 +86,5 @@ def test_every_package_of_an_extra_is_known_to_be_optional():
         if name not in ("test", "dev", "docs")
         for line in lines
     }
-    assert packages - {"orthonav"} <= {MODULES.get(name, name) for name in absent.EXTRA_OF}
+    modules = {module_of(name).partition(".")[0] for name in packages - {"orthonav"}}
+    assert modules <= set(absent.EXTRA_OF)
