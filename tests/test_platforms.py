@@ -3,7 +3,6 @@
 `tools/platforms/fixes.py` made the stored map, flight and fixes.
 """
 
-import importlib.util
 import json
 import os
 import re
@@ -14,6 +13,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import fixes
 import pytest
 
 from helpers import Done
@@ -24,16 +24,6 @@ GOLDEN = ROOT / "tests" / "data" / "golden_flight"
 COMMAND = "import sys; from orthonav.cli import main; sys.exit(main())"
 NO_LOCALE = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 NO_HOME = {"HOME": "/dev/null/none"}  # refused even to root
-
-
-@pytest.fixture(scope="module")
-def fixes():
-    """The script that compares fixes."""
-    path = ROOT / "tools" / "platforms" / "fixes.py"
-    spec = importlib.util.spec_from_file_location("fixes", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture
@@ -56,13 +46,13 @@ def run(*arguments, before=(), **environment):
 
 
 @pytest.mark.parametrize("kind", ["views", "track"])
-def test_this_machine_gives_the_stored_fixes(fixes, kind):
+def test_this_machine_gives_the_stored_fixes(kind):
     stored = json.loads((GOLDEN / "fixes.json").read_text(encoding="utf-8"))["runs"][kind]
     here = fixes.places(GOLDEN / "area.onav", open_flight(GOLDEN / "flight"), kind)
     assert fixes.farthest_m(here, stored) <= fixes.LIMITS_M[kind]
 
 
-def test_a_fix_elsewhere_and_a_missing_one_are_differences(fixes):
+def test_a_fix_elsewhere_and_a_missing_one_are_differences():
     there = {"a": [1.0, 2.0], "b": "no_evidence"}
     assert fixes.farthest_m(there, there) == 0
     assert fixes.farthest_m({**there, "a": [1.03, 2.04]}, there) == pytest.approx(0.05)
