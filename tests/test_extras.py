@@ -34,7 +34,19 @@ class Blocked:
 
 sys.meta_path.insert(0, Blocked())
 from orthonav.cli import main
-sys.exit(main())
+"""
+ONE = "sys.exit(main())"
+SEVERAL = """
+import contextlib, io, json, logging
+
+root, results = logging.getLogger(), []
+for words in json.loads(sys.argv[1]):
+    root.handlers = []
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        with contextlib.redirect_stderr(io.StringIO()) as err:
+            code = main(words)
+    results.append((code, out.getvalue(), err.getvalue()))
+print(json.dumps(results))
 """
 
 AREA = "--bounds=3.0,46.0,3.01,46.01"
@@ -71,11 +83,11 @@ def top_modules(extra):
     return {extras.module_of(package.name).partition(".")[0] for package in extras.packages(extra)}
 
 
-def core_only(*arguments, cwd):
-    """A command where nothing but the core can be imported."""
+def core_only(*arguments, cwd, script=ONE):
+    """A command, or a script with its arguments, where nothing but the core can be imported."""
     optional = set().union(*(top_modules(extra) for extra in USED)) - top_modules("")
     return subprocess.run(
-        [sys.executable, "-B", "-c", BLOCKED, ",".join(sorted(optional)), *arguments],
+        [sys.executable, "-B", "-c", BLOCKED + script, ",".join(sorted(optional)), *arguments],
         cwd=cwd,
         capture_output=True,
         text=True,
@@ -93,11 +105,11 @@ def fixes(map_path, flight_path, tmp_path_factory):
     return folder / "fixes.jsonl"
 
 
-@pytest.mark.parametrize("line", CORE_COMMANDS)
-def test_a_core_only_install_works_or_names_the_extras(
-    line, fixes, map_path, flight_path, tmp_path
-):
-    route = tmp_path / "route.csv"
+@pytest.fixture(scope="module")
+def answers(fixes, map_path, flight_path, tmp_path_factory):
+    """(exit code, stdout, stderr) of each command, all in one process, and its folder."""
+    folder = tmp_path_factory.mktemp("core")
+    route = folder / "route.csv"
     route.write_text("lat_deg,lon_deg\n46.0,3.0\n46.01,3.01\n")
     paths = {
         "MAP": map_path,
@@ -106,16 +118,27 @@ def test_a_core_only_install_works_or_names_the_extras(
         "CAMERA": flight_path / "flight.json",
         "ROUTE": route,
     }
-    words = [re.sub(r"^[A-Z]+", lambda m: str(paths.get(m[0], m[0])), w) for w in line.split()]
-    done = core_only(*words, cwd=tmp_path)
+    commands = [
+        [re.sub(r"^[A-Z]+", lambda m: str(paths.get(m[0], m[0])), word) for word in line.split()]
+        for line in CORE_COMMANDS
+    ]
+    done = core_only(json.dumps(commands), cwd=folder, script=SEVERAL)
+    assert done.returncode == 0, done.stderr
+    return dict(zip(CORE_COMMANDS, json.loads(done.stdout), strict=True)), folder
+
+
+@pytest.mark.parametrize("line", CORE_COMMANDS)
+def test_a_core_only_install_works_or_names_the_extras(line, answers):
+    done, folder = answers
+    code, out, err = done[line]
     named = CORE_COMMANDS[line]
     if named is None:
-        assert done.returncode == 0, done.stderr
+        assert code == 0, err
         return
-    assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith("orthonav: error: ") and done.stderr.count("\n") == 1
-    assert f"pip install 'orthonav[{named}]'" in done.stderr
-    assert not list(tmp_path.glob("new*"))
+    assert (code, out) == (1, "")
+    assert err.startswith("orthonav: error: ") and err.count("\n") == 1
+    assert f"pip install 'orthonav[{named}]'" in err
+    assert not list(folder.glob("new*"))
 
 
 def test_every_command_is_tried():
@@ -179,7 +202,10 @@ def calls_of(function, tree):
 def test_the_extra_that_an_error_names_brings_the_module():
     found = []
     for path in (ROOT / "src").rglob("*.py"):
-        tree = ast.parse(path.read_text("utf-8"))
+        text = path.read_text("utf-8")
+        if "needed(" not in text and "missing_extra(" not in text:
+            continue
+        tree = ast.parse(text)
         for module, *more in calls_of("needed", tree):  # of `sources.guard`, of `extras`
             found.append((module, "flights" if len(more) == 1 else more[0]))
         found += [(module, extra) for _, extra, module, _ in calls_of("missing_extra", tree)]

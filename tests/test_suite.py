@@ -9,8 +9,6 @@ import tomllib
 from collections import Counter
 from pathlib import Path
 
-import pytest
-
 import absent
 from orthonav.extras import module_of
 
@@ -37,32 +35,29 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_run_ends_with_the_name_of_the_test_that_crashed_or_hung(fault, tmp_path):
+def test_a_run_ends_with_the_names_of_the_tests_that_crashed_or_hung(tmp_path):
     """Under the command of `make test` and the project's own options, but for shorter limits."""
-    quick = "def test_one(): pass\ndef test_two(): pass\n"
-    for name in ("first", "second", "third"):
-        (tmp_path / f"test_{name}.py").write_text(quick)
-    broken = (
-        f"def test_before(): pass\ndef test_broken(): {FAULTS[fault]}\ndef test_after(): pass\n"
-    )
-    (tmp_path / "test_fourth.py").write_text(broken)
+    (tmp_path / "test_quick.py").write_text("def test_one(): pass\ndef test_two(): pass\n")
+    for name, fault in FAULTS.items():
+        broken = f"def test_before(): pass\ndef test_broken(): {fault}\ndef test_after(): pass\n"
+        (tmp_path / f"test_{name}.py").write_text(broken)
     makefile = (ROOT / "Makefile").read_text("utf-8")
     options = re.search(r"^PYTEST := \$\(BIN\)/python (.*)$", makefile, re.MULTILINE)
     assert options
     command = [sys.executable, *shlex.split(options[1]), "-p", "no:cacheprovider"]
-    limits = ["-o", "timeout=2", "-o", "faulthandler_timeout=4"]
+    limits = ["-o", "timeout=1", "-o", "faulthandler_timeout=3"]
     done = subprocess.run(
         [*command, "-c", str(ROOT / "pyproject.toml"), *limits, "--rootdir", ".", "."],
         cwd=tmp_path,
-        env={**os.environ, "PYTEST_XDIST_AUTO_NUM_WORKERS": "2"},
+        env={**os.environ, "PYTEST_XDIST_AUTO_NUM_WORKERS": "3"},
         capture_output=True,
         text=True,
         timeout=120,
     )
     assert done.returncode == 1, done.stdout
-    assert re.search(r"^FAILED test_fourth.py::test_broken", done.stdout, re.MULTILINE)
-    assert re.search(r"^1 failed, [1-9] passed", done.stdout, re.MULTILINE)
+    for name in FAULTS:
+        assert re.search(rf"^FAILED test_{name}.py::test_broken", done.stdout, re.MULTILINE)
+    assert re.search(r"^3 failed, [1-9] passed", done.stdout, re.MULTILINE)
 
 
 def test_only_what_is_absent_skips_a_test(monkeypatch):

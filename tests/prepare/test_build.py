@@ -99,7 +99,7 @@ REQUESTS = {
     "canny": {"edges": "canny:low=50,high=120"},
     "64 dims": {"method": "gradient:dims=64"},
     "both": {"method": "gradient:dims=32,cells=16", "edges": "canny"},
-    "seed": {**WITH_LAYER, "seed": 5, "calibration_views": 8},
+    "seed": {**WITH_LAYER, "seed": 5, "calibration_views": 3},
 }
 
 

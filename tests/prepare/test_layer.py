@@ -9,6 +9,7 @@ import pytest
 
 from helpers import textured
 from orthonav.cli import main
+from orthonav.geo.area import Area
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.mapfile import GreyLayer, open_map
@@ -253,7 +254,8 @@ def test_levels_are_aligned(ortho, tmp_path):
 def test_far_from_the_route_there_is_nothing(make_ortho, tmp_path):
     grey = textured((1500, 1500))
     wide = make_ortho(tmp_path / "wide.tif", grey)
-    frame = built(wide, tmp_path, "whole.onav", registration=False).manifest.sheets[0].frame
+    outline = Mosaic.open([wide]).outline_latlon_deg
+    frame = Area.from_outline(outline[:, 0], outline[:, 1]).frame
     ends = frame.latlon_from_en(np.array([[-700.0, -700.0], [700.0, 700.0]]))
     route = Route(tuple(zip(*(each.tolist() for each in ends), strict=True)))
     opened = built(wide, tmp_path, route=route, band_m=100.0)
