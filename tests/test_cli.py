@@ -686,10 +686,8 @@ sys.exit(main(sys.argv[2:]))
     "name, stage, number",
     [
         ("build", "imagery", signal.SIGINT),
-        ("build", "calibrate", signal.SIGINT),
         ("build", "calibrate", signal.SIGTERM),
         ("simulate", "simulate", signal.SIGINT),
-        ("simulate", "simulate", signal.SIGTERM),
         ("localize", "localize", signal.SIGINT),
         ("landscape", "landscape", signal.SIGTERM),
     ],

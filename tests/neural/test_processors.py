@@ -63,7 +63,12 @@ print(json.dumps({"worst": worst, "contiguous": list(contiguous)}))
 
 
 @pytest.mark.parametrize(
-    "name, threads", [("this processor", ["1"]), ("AVX2", ["1", "2"])], ids=["this", "AVX2"]
+    "name, threads",
+    [
+        pytest.param("this processor", ["1"], marks=pytest.mark.slow),  # starts PyTorch again
+        ("AVX2", ["1", "2"]),
+    ],
+    ids=["this", "AVX2"],
 )
 def test_gradients_do_not_depend_on_the_processor(name, threads):
     """Runs in a process of its own, so that a memory fault cannot end the tests.
