@@ -27,6 +27,7 @@ def small_demo(area, monkeypatch):
     monkeypatch.setattr(demo, "SPACING_M", 120.0)
     monkeypatch.setattr(demo, "CHECK_EFFORT", 0.05)
     monkeypatch.setattr("orthonav.check.run.usable_cores", lambda: 1)
+    monkeypatch.setattr("orthonav.report.canvas.DPI", 30)
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 48)
     monkeypatch.setattr("orthonav.prepare.calibrate_registration.MIN_RIGHT", 1)
     quicker = functools.partial(BuildRequest, calibration_views=6)
