@@ -8,7 +8,6 @@ replays one of them. `--only` repeats the named flights even if results exist.
 """
 
 import argparse
-import csv
 import hashlib
 import json
 import math
@@ -28,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 import orthonav
+from benchmarks.flights import read_rows, write_rows
 from benchmarks.inputs import PAST, PRESENT, Workplace
 from benchmarks.record import Section, Table, number, provenance, save, sources_digest
 from benchmarks.verdicts import percent
@@ -225,7 +225,7 @@ def random_legs(
 
 def _kidnap(folder: Path, plan: Plan, localizer: Localizer, rng: np.random.Generator) -> str:
     """Leave out views in the middle and the velocity over the gap; returns the first after it."""
-    rows = _read(folder / "telemetry.csv")
+    rows = read_rows(folder / "telemetry.csv")
     truth = read_truth(folder / "truth.csv")
     frame = localizer.sheet.frame
     places = np.array([frame.en_from_latlon(*truth[row["frame"]]) for row in rows])
@@ -239,21 +239,9 @@ def _kidnap(folder: Path, plan: Plan, localizer: Localizer, rng: np.random.Gener
     rows[after]["vel_east_mps"] = rows[after]["vel_north_mps"] = ""
     gone = {row["frame"] for row in rows[first + 1 : after]}
     for name in ("telemetry.csv", "truth.csv"):
-        table = rows if name == "telemetry.csv" else _read(folder / name)
-        _write(folder / name, [row for row in table if row["frame"] not in gone])
+        table = rows if name == "telemetry.csv" else read_rows(folder / name)
+        write_rows(folder / name, [row for row in table if row["frame"] not in gone])
     return rows[after]["frame"]
-
-
-def _read(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as stream:
-        return list(csv.DictReader(stream))
-
-
-def _write(path: Path, rows: Sequence[dict[str, str]]) -> None:
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def _followed(

@@ -261,10 +261,9 @@ def test_pictures_of_anything_else_give_dead_reckoning_only(localizer, picture):
 
 def test_a_reported_start_needs_no_search(localizer):
     lat, lon = localizer.sheet.frame.latlon_from_en((-160.0, -120.0))
-    telemetry = Prior(float(lat), float(lon), 15.0)
+    start = Prior(float(lat), float(lon), 15.0)
     seen = [
-        (g, replace(t, prior=telemetry if not n else None), p)
-        for n, (g, t, p) in enumerate(views(4))
+        (g, replace(t, prior=start if not n else None), p) for n, (g, t, p) in enumerate(views(4))
     ]
     rows = followed(Tracker(localizer), localizer, seen)
     assert rows[0][0] < 15 and rows[0][1] == pytest.approx(0.8)
@@ -423,9 +422,9 @@ def test_odometry_measures_the_displacement(moved, expected):
         telemetry = Telemetry(number * 10**9, heading, 0.0, 0.0, AGL_M)
         pixel_m = footprints[0].pixel_m if footprints else None
         footprints.append(OdometryView.of(View(noisy, WIDE, telemetry), pixel_m))
-    telemetry_noise = np.array([1e-3, 4e-4])
+    heading_scale_noise = np.array([1e-3, 4e-4])
     expected = None if expected is None else np.array(expected)
-    seen = displacement(*footprints, 0.0, telemetry_noise, expected)
+    seen = displacement(*footprints, 0.0, heading_scale_noise, expected)
     assert seen.displacement.moved_en_m == pytest.approx(moved, abs=0.7)
     assert 0 < seen.overlap < 1
 

@@ -285,7 +285,7 @@ def test_nesting_however_deep(path):
 
 
 def with_part(path, name, entry, part, more=b""):
-    """The map with one part as told put after the others."""
+    """The map with the given part and its bytes after the others."""
     header, plain, data = taken_apart(path)
     header[name], plain["parts"][name] = entry, part
     return put_together(path, header, plain, data + more)
@@ -332,7 +332,7 @@ def test_wrong_shapes(path, shape):
     header, plain, data = taken_apart(path)
     header["tiles"]["shape"] = shape
     refused(put_together(path, header, plain, data))
-    if shape not in ([7, 1], [1, 7]):  # the same bytes otherwise told are no damage
+    if shape not in ([7, 1], [1, 7]):  # the same bytes in another shape are no damage
         plain["parts"]["tiles"]["shape"] = shape
         refused(put_together(path, header, plain, data))
 
