@@ -98,6 +98,7 @@ class Snapshot:
     `synced`: whether TIMESYNC is answered.
     `map_unchanged`: whether the map file is still the one that was opened.
     `heading_mismatch_deg`, `log_scale_mismatch`: see `mismatch`.
+    `latency`: reason why the latency of the camera cannot be used, see `orthonav.onboard.latency`.
     """
 
     running_s: float
@@ -112,6 +113,7 @@ class Snapshot:
     map_unchanged: bool = True
     heading_mismatch_deg: float = 0.0
     log_scale_mismatch: float = 0.0
+    latency: str | None = None
 
 
 def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
@@ -147,6 +149,8 @@ def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
         "state_not_saved": count["state_failed"] > 0,
         "internal_error": count["internal_error"] > 0 and not failed["internal_errors"],
     }
+    if seen.latency is not None:
+        degraded = {seen.latency: True, **degraded}  # the cause of others, so it comes first
     worst = tuple(name for name, applies in failed.items() if applies)
     others = tuple(name for name, applies in degraded.items() if applies)
     level = Level.FAILED if worst else Level.DEGRADED if others else Level.OK

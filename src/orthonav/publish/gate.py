@@ -75,8 +75,8 @@ class Gate:
     """Checks the estimates of one flight in order. Mutable; for one thread.
 
     `withheld`: counts by reason: `no_fix`, `not_tracking`, `low_confidence`, `no_covariance`,
-    `too_uncertain`, `from_the_future`, `stale`, `out_of_order`, and `rate:NAME` for a message that
-    would exceed its rate.
+    `too_uncertain`, `from_the_future`, `stale`, `out_of_order`, `rate:NAME` for a message that
+    would exceed its rate, and those of views that the flight loop does not locate.
     `sent`: counts of messages by name.
     `resets`: number of jumps of the position.
     """
