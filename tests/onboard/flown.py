@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from orthonav.geo.camera import Camera
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
+SMALL = Camera(160, 120, 125.0, 125.0, 80.0, 60.0)
 STEP_S = 0.02
 G = 9.81
 

@@ -216,13 +216,24 @@ def _shift_slope(slope: Array, linear: Array) -> Array:
 
 
 def explained(pairs: Pairs, fit: Fit, stands_out: float = STANDS_OUT) -> float:
-    """Least share of the motion that a fit explains, of turn and of the varying part of shift,
-    where it is at least `stands_out` least standard deviations; NaN where neither is."""
-    rate = np.median(pairs.shift / pairs.seconds[:, None], axis=0)
-    varying = pairs.shift - rate * pairs.seconds[:, None]
+    """`explained_share` of a fit."""
+    return explained_share(
+        pairs.seconds, pairs.turn, pairs.shift, fit.turn_off, fit.shift_off, stands_out
+    )
+
+
+def explained_share(
+    seconds: Array, turn: Array, shift: Array, turn_off: Array, shift_off: Array, stands_out: float
+) -> float:
+    """Least share of the motion that is explained, of turn (N,) and of the varying part of shift
+    (N, 2), where it is at least `stands_out` least standard deviations; NaN where neither is.
+
+    `seconds` (N,): durations. `turn_off` (N,), `shift_off` (N, 2): seen less reported motion.
+    """
+    varying = shift - np.median(shift / seconds[:, None], axis=0) * seconds[:, None]
     parts = (
-        (pairs.turn[:, None], fit.turn_off[:, None], TURN_STD_RAD),
-        (varying, fit.shift_off, SHIFT_STD),
+        (turn[:, None], turn_off[:, None], TURN_STD_RAD),
+        (varying, shift_off, SHIFT_STD),
     )
     shares = []
     for seen, off, least in parts:

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 from orthonav.geo.camera import Camera
 from orthonav.onboard.arrival import GAP_S, Arrival
-from orthonav.onboard.delay import DelayEstimate, DelayEstimator
+from orthonav.onboard.delay import EXPLAINED, UNEXPLAINED, DelayEstimate, DelayEstimator
+from orthonav.onboard.delay_check import DelayCheck
 from orthonav.onboard.history import StateHistory
 from orthonav.onboard.motion import Grey, PictureOdometry
 from orthonav.onboard.telemetry import VehicleState
@@ -41,6 +42,7 @@ EXTRAPOLATED_S = 15.0
 GROWN_S, GROWN_RATE = 0.15, 0.002
 """Growth of the delay by timestamps that counts as a change, and what clocks may add to it each
 second."""
+UNLIKE = "images do not move as reported at the latency in use"
 BEFORE_S = 0.1
 """An exposure that is later than the arrival by more than this shows clocks that disagree."""
 
@@ -94,6 +96,7 @@ class LatencyMonitor:
         self._mount_deg = mount_deg
         self._odometry, self._history = PictureOdometry(), StateHistory()
         self._estimator = DelayEstimator(heading_known=heading_known)
+        self._check = DelayCheck()
         self._sampled_ns: int | None = None
         self._due_ns: int | None = None
         self._pending: DelayEstimate | None = None
@@ -154,9 +157,13 @@ class LatencyMonitor:
         self._sample(state_at, covered_ns)
         motion = self._odometry.motion(grey, camera, arrival.arrived_ns)
         self._estimator.add(motion, self._history)
+        if self._known is not None:
+            delay_s, _ = self._known.at(arrival.arrived_ns)
+            self._check.add(motion, self._history, delay_s)
         if self._due_ns is None or arrival.arrived_ns >= self._due_ns:
             self._due_ns = arrival.arrived_ns + EVERY_NS
             self._judge(self._estimator.estimate(), self._estimator.estimate(RECENT_S))
+            self._compare()
 
     def current(self) -> Latency:
         """The delay that was used last, or why it was not."""
@@ -228,6 +235,7 @@ class LatencyMonitor:
         """Forget pictures from before a change."""
         self._estimator.forget_before(arrived_ns)
         self._odometry.reset()
+        self._check.clear()
         self._pending, self._contradictions = None, 0
 
     def _judge(self, whole: DelayEstimate, recent: DelayEstimate) -> None:
@@ -258,6 +266,14 @@ class LatencyMonitor:
             measured = f"measured {found.delay_s * 1e3:.0f} ms, used {delay_ms:.0f} ms"
             self._dispute(measured, found)
 
+    def _compare(self) -> None:
+        """Dispute the delay in use where the last seconds do not fit it."""
+        share = self._check.share()
+        if share < UNEXPLAINED and not self._suspicion:
+            self._suspicion, self._disputed = UNLIKE, True
+        elif share > EXPLAINED and self._suspicion == UNLIKE:
+            self._suspicion, self._disputed = "", False
+
     def _dispute(self, why: str, found: DelayEstimate) -> None:
         """Withhold until the next estimate agrees with this one or with what was known."""
         self._suspicion, self._disputed, self._pending = why, True, found
@@ -274,6 +290,7 @@ class LatencyMonitor:
             self._known = _Known(found.delay_s, found.std_s, drift, found.last_ns)
         if changed:  # older pictures belong to another delay
             self._estimator.forget_before(found.last_ns - round(RECENT_S * 1e9))
+            self._check.clear()
         self._suspicion, self._disputed, self._pending, self._grown = "", False, None, False
         if self._arrival is not None and math.isfinite(self._arrival.grown_s):
             self._anchor = self._arrival.arrived_ns, self._arrival.grown_s
