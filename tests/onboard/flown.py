@@ -68,5 +68,7 @@ class Flown:
         angles, _, (north, east) = self.at(time_s)
         return rendered(GROUND, (east, north), angles, self.agl_m, camera)
 
-    def ned_from_body(self, time_s):
-        return Rotation.from_euler("ZYX", self.at(time_s)[0], degrees=True).as_matrix()
+    def ned_from_body(self, time_s, yaw_off_deg=0.0):
+        yaw, pitch, roll = self.at(time_s)[0]
+        angles = yaw + yaw_off_deg, pitch, roll
+        return Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()

@@ -197,8 +197,7 @@ def test_a_stream_that_is_late_from_the_start(late_s):
     assert flight.gate.withheld["stale"] > 50
 
 
-@pytest.mark.parametrize("late_s", [0.7, 2.0, 8.0])
-@pytest.mark.parametrize("stamps", [False, True])
+@pytest.mark.parametrize(("late_s", "stamps"), [(0.7, False), (2.0, False), (8.0, True)])
 def test_a_stall_after_which_the_stream_is_late(late_s, stamps):
     delay = {"s": 0.12}
     flight = LateFlight(Flown(100, seed=4), 0.12, lambda _: delay["s"])
