@@ -41,7 +41,7 @@ class Measured:
                 self.true_s.append(delay_s(arrived_s))
 
     def _report(self, flown, at_s, rng, known):
-        angles, (north, east), _ = flown.at(at_s)
+        _, (north, east), _ = flown.at(at_s)
         # An attitude off by 5 deg in heading, and a height by 10 %.
         turn = enu_from_body_camera(flown.ned_from_body(at_s, yaw_off_deg=5.0))
         velocity = (east, north, 0.0) if known else None
@@ -99,6 +99,10 @@ def frozen(grey, rng):
     return np.clip(still + rng.normal(0, 3, still.shape), 0, 255).astype(np.uint8)
 
 
+def rotated(grey, rng):
+    return grey[::-1, ::-1].copy()
+
+
 def clouded(grey, rng):
     rows = np.arange(grey.shape[0])[:, None] + np.zeros_like(grey, dtype=int)
     return np.where(rows < 0.3 * len(grey), np.uint8(240), grey)
@@ -108,7 +112,7 @@ def clouded(grey, rng):
     "change",
     [
         lambda grey, rng: grey[:, ::-1].copy(),
-        lambda grey, rng: grey[::-1, ::-1].copy(),
+        rotated,
         lambda grey, rng: rng.integers(0, 256, grey.shape, dtype=np.uint8),
         lambda grey, rng: np.full_like(grey, 128),
         frozen,
@@ -120,10 +124,8 @@ def test_wrong_images_give_no_delay(change):
     assert not any(each.found for each in seen.whole + seen.recent)
 
 
-@pytest.mark.parametrize("kind", ["rotated", "frozen"])
-def test_wrong_images_contradict_the_autopilot(kind):
-    change = frozen if kind == "frozen" else lambda grey, rng: grey[::-1, ::-1].copy()
-    seen = Measured(Flown(40, seed=6), lambda _: 0.12, seconds=32, change=change)
+def test_a_rotated_camera_contradicts_the_autopilot():
+    seen = Measured(Flown(40, seed=6), lambda _: 0.12, seconds=32, change=rotated)
     assert sum(each.contradicted for each in seen.whole) >= 5
 
 

@@ -265,6 +265,20 @@ def test_mirrored_and_rotated_images_give_no_latency(change):
     assert flight.reasons() & {"latency_unknown", "motion_mismatch"}
 
 
+def test_a_camera_that_freezes_with_noise_is_noticed():
+    flight = LateFlight(Flown(60, seed=1), 0.12, constant(0.12))
+    flight.fly(20)
+    rng, still = np.random.default_rng(0), flight.flown.picture(20.0, CAMERA)
+    flight.stream.change = lambda _: np.uint8(
+        np.clip(still + rng.normal(0, 3, still.shape), 0, 255)
+    )
+    flight.fly(8)
+    assert len(flight.fly(10)) == 0
+    flight.stream.change = lambda grey: grey
+    flight.fly(10)
+    assert len(flight.fly(5)) >= 38
+
+
 def test_the_covariance_includes_the_latency():
     flight = LateFlight(Flown(60, seed=1), 0.12, constant(0.12))
     flight.fly(2)

@@ -14,6 +14,9 @@ from orthonav.onboard.motion import ImageMotion
 
 SECONDS = 4.0
 LEAST_PAIRS = 12
+LEAST_PER_S, SCALES = 0.03, (0.4, 2.5)
+"""Shift per second by the velocity from which it is compared (3 m/s from 100 m), and the range of
+the seen over the reported one: height and heading may be off."""
 STANDS_OUT = 3.0
 """Motion counts from so many least standard deviations."""
 
@@ -21,7 +24,9 @@ STANDS_OUT = 3.0
 class DelayCheck:
     """Compares pictures at one delay. Mutable."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, heading_known: bool = True) -> None:
+        """`heading_known`: whether the reported heading gives the direction of the velocity."""
+        self._heading_known = heading_known
         self._waiting: deque[tuple[ImageMotion, int]] = deque(maxlen=100)
         self._rows: deque[tuple[int, Array]] = deque(maxlen=100)
 
@@ -41,8 +46,9 @@ class DelayCheck:
             self._waiting.popleft()
             times = (np.array([each - delay_ns]) for each in (one.start_ns, one.end_ns))
             moved = history.motion(*times)
-            shift = moved.tilt_shift[0] + np.nan_to_num(moved.velocity_shift[0])
-            row = np.array([one.seconds, one.turn_rad, *one.shift, moved.turn_rad[0], *shift])
+            velocity = np.nan_to_num(moved.velocity_shift[0])
+            turn, tilt = moved.turn_rad[0], moved.tilt_shift[0]
+            row = np.array([one.seconds, one.turn_rad, *one.shift, turn, *tilt, *velocity])
             if np.isfinite(row).all():
                 self._rows.append((one.end_ns, row))
 
@@ -56,9 +62,22 @@ class DelayCheck:
         rows = np.array([row for _, row in self._rows])
         seconds = rows[:, :1]
         # The constant part of the shift depends on height and heading, which may be off.
-        shift_off = rows[:, 2:4] - rows[:, 5:7]
+        velocity = rows[:, 7:9]
+        seen_by_velocity = rows[:, 2:4] - rows[:, 5:7]
+        if self._contradicts(seen_by_velocity / seconds, velocity / seconds):
+            return 0.0
+        shift_off = seen_by_velocity - velocity
         shift_off = shift_off - np.median(shift_off / seconds, axis=0) * seconds
         turn_off = rows[:, 1] - rows[:, 4]
         return explained_share(
             rows[:, 0], rows[:, 1], rows[:, 2:4], turn_off, shift_off, STANDS_OUT
         )
+
+    def _contradicts(self, seen: Array, reported: Array) -> bool:
+        """Whether shifts per second (N, 2) by the velocity differ beyond errors of height."""
+        seen, reported = np.median(seen, axis=0), np.median(reported, axis=0)
+        size = float(np.hypot(*reported))
+        if size < LEAST_PER_S:
+            return False
+        along = float(seen @ reported) / size if self._heading_known else float(np.hypot(*seen))
+        return not SCALES[0] < along / size < SCALES[1]

@@ -96,7 +96,7 @@ class LatencyMonitor:
         self._mount_deg = mount_deg
         self._odometry, self._history = PictureOdometry(), StateHistory()
         self._estimator = DelayEstimator(heading_known=heading_known)
-        self._check = DelayCheck()
+        self._check = DelayCheck(heading_known=heading_known)
         self._sampled_ns: int | None = None
         self._due_ns: int | None = None
         self._pending: DelayEstimate | None = None
