@@ -19,7 +19,7 @@ from orthonav.publish.estimate import Clock
 from orthonav.publish.gate import Gate, GateRules
 
 METRES = 111_195.0  # a degree of latitude; the flights are at the equator
-BEGIN_NS = 100 * S
+BEGIN_NS, BEGIN_S = 100 * S, 10.0
 AHEAD_NS = -90 * S
 LARGEST_ERROR_M = 8.0
 
@@ -39,7 +39,7 @@ class Stream:
         return True
 
     def retrieve(self):
-        return True, self.change(self.flight.flown.picture(max(0.0, self.exposed_s), CAMERA))
+        return True, self.change(self.flight.flown.picture(self.exposed_s, CAMERA))
 
     def get(self, _):
         return 0.0 if math.isnan(self.stamp_s) else self.stamp_s * 1e3
@@ -84,7 +84,8 @@ class LateFlight:
 
     @property
     def now_s(self):
-        return (self.time.now_ns - BEGIN_NS) / S
+        """Time of the generated flight, of which a late stream shows an earlier part."""
+        return BEGIN_S + (self.time.now_ns - BEGIN_NS) / S
 
     def where(self, view):
         north, east = self.flown.at(self.stream.exposed_s)[2]
@@ -151,7 +152,7 @@ def worst_m(sent):
 
 
 def test_an_undisturbed_flight_keeps_its_messages():
-    flight = LateFlight(Flown(60, seed=1), 0.12, constant(0.12))
+    flight = LateFlight(Flown(70, seed=1), 0.12, constant(0.12))
     sent = flight.fly(45)
     assert len(sent) >= 0.98 * len(flight.results) and worst_m(sent) < 4.0
     assert flight.runner.health.reasons == ()
@@ -160,13 +161,13 @@ def test_an_undisturbed_flight_keeps_its_messages():
 
 
 def test_a_straight_flight_with_a_stated_latency_is_undisturbed():
-    straight = Flown(60, turns=False, turbulence_deg=0.05, seed=2)
+    straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
     flight = LateFlight(straight, 0.12, constant(0.12), rate_hz=5.0)
     assert len(flight.fly(40)) >= 0.98 * len(flight.results)
 
 
 def test_without_a_stated_latency_nothing_is_sent_until_it_is_measured():
-    flight = LateFlight(Flown(60, seed=1), None, constant(0.25))
+    flight = LateFlight(Flown(70, seed=1), None, constant(0.25))
     assert flight.fly(10) == []
     assert "latency_unknown" in flight.reasons()
     assert flight.gate.withheld["latency_unknown"] >= len(flight.results) - 1
@@ -179,19 +180,19 @@ def test_without_a_stated_latency_nothing_is_sent_until_it_is_measured():
 
 
 def test_without_a_stated_latency_a_straight_flight_sends_nothing():
-    straight = Flown(60, turns=False, turbulence_deg=0.05, seed=2)
+    straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
     flight = LateFlight(straight, None, constant(0.12), rate_hz=5.0)
     assert flight.fly(40) == []
 
 
 @pytest.mark.parametrize("late_s", [2.0, 8.0])
 def test_a_stream_that_is_late_from_the_start(late_s):
-    """At most the first seconds believe the stated latency; then it is measured and positions are
-    withheld as stale; nothing wrong is sent."""
-    flight = LateFlight(Flown(80, seed=3), 0.12, constant(late_s))
+    """The stated latency is believed for the first seconds, until images have moved; then it is
+    measured, and positions are withheld as stale."""
+    flight = LateFlight(Flown(90, seed=3), 0.12, constant(late_s))
     flight.fly(40)
     wrong = [each for each in flight.sent if each[1] > LARGEST_ERROR_M]
-    assert all(at < 5.0 for at, _, _ in wrong)
+    assert all(at < BEGIN_S + 5.0 for at, _, _ in wrong)
     plain = flight.monitor.plain()
     assert plain["latency_ms"] == pytest.approx(late_s * 1e3, abs=80)
     assert flight.gate.withheld["stale"] > 50
@@ -200,7 +201,7 @@ def test_a_stream_that_is_late_from_the_start(late_s):
 @pytest.mark.parametrize(("late_s", "stamps"), [(0.7, False), (2.0, False), (8.0, True)])
 def test_a_stall_after_which_the_stream_is_late(late_s, stamps):
     delay = {"s": 0.12}
-    flight = LateFlight(Flown(100, seed=4), 0.12, lambda _: delay["s"])
+    flight = LateFlight(Flown(110, seed=4), 0.12, lambda _: delay["s"])
     flight.stamps = stamps
     assert len(flight.fly(20)) > 150
     flight.stalled = True
@@ -223,7 +224,7 @@ def test_a_stall_after_which_the_stream_is_late(late_s, stamps):
 
 
 def test_a_stall_with_timestamps_that_catches_up_needs_no_manoeuvre():
-    straight = Flown(60, turns=False, turbulence_deg=0.05, seed=2)
+    straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
     flight = LateFlight(straight, 0.12, constant(0.12), rate_hz=5.0)
     flight.stamps = True
     flight.fly(20)
@@ -234,7 +235,7 @@ def test_a_stall_with_timestamps_that_catches_up_needs_no_manoeuvre():
 
 
 def test_a_stall_without_timestamps_needs_a_manoeuvre():
-    straight = Flown(60, turns=False, turbulence_deg=0.05, seed=2)
+    straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
     flight = LateFlight(straight, 0.12, constant(0.12), rate_hz=5.0)
     flight.fly(20)
     flight.stalled = True
@@ -245,7 +246,7 @@ def test_a_stall_without_timestamps_needs_a_manoeuvre():
 
 
 def test_a_drifting_latency_is_followed():
-    flight = LateFlight(Flown(80, seed=5), 0.1, lambda now_s: 0.1 + 0.012 * now_s)
+    flight = LateFlight(Flown(90, seed=5), 0.1, lambda now_s: 0.1 + 0.012 * now_s)
     flight.fly(20)
     sent = flight.fly(40)
     assert worst_m(sent) < LARGEST_ERROR_M and len(sent) > 100
@@ -259,16 +260,16 @@ def test_a_drifting_latency_is_followed():
     ],
 )
 def test_mirrored_and_rotated_images_give_no_latency(change):
-    flight = LateFlight(Flown(60, seed=1), None, constant(0.12))
+    flight = LateFlight(Flown(70, seed=1), None, constant(0.12))
     flight.stream.change = change
     assert flight.fly(40) == []
     assert flight.reasons() & {"latency_unknown", "motion_mismatch"}
 
 
 def test_a_camera_that_freezes_with_noise_is_noticed():
-    flight = LateFlight(Flown(60, seed=1), 0.12, constant(0.12))
+    flight = LateFlight(Flown(70, seed=1), 0.12, constant(0.12))
     flight.fly(20)
-    rng, still = np.random.default_rng(0), flight.flown.picture(20.0, CAMERA)
+    rng, still = np.random.default_rng(0), flight.flown.picture(flight.now_s, CAMERA)
     flight.stream.change = lambda _: np.uint8(
         np.clip(still + rng.normal(0, 3, still.shape), 0, 255)
     )
@@ -280,7 +281,7 @@ def test_a_camera_that_freezes_with_noise_is_noticed():
 
 
 def test_the_covariance_includes_the_latency():
-    flight = LateFlight(Flown(60, seed=1), 0.12, constant(0.12))
+    flight = LateFlight(Flown(70, seed=1), 0.12, constant(0.12))
     flight.fly(2)
     cov = flight.results[-1][1].outcome.cov_en_m2
     (north, east) = flight.flown.at(flight.now_s - 0.12)[1]

@@ -17,7 +17,7 @@ LEAST_PAIRS = 12
 LEAST_PER_S, SCALES = 0.03, (0.4, 2.5)
 """Shift per second by the velocity from which it is compared (3 m/s from 100 m), and the range of
 the seen over the reported one: height and heading may be off."""
-STANDS_OUT = 3.0
+STANDS_OUT = 2.0
 """Motion counts from so many least standard deviations."""
 
 

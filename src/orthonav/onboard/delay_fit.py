@@ -120,7 +120,7 @@ def pair_sums(seconds: float, turn: float, shift: Array, reported: Array) -> Arr
     """What a pair adds to the normal equations of each candidate (C, 33): 25 and 5 products of
     columns with columns and shift, squares of shift and of the difference in turn, and whether its
     motion is known. `reported` (C, 5)."""
-    known: Array = np.isfinite(reported[:, :3]).all(axis=1).astype(np.float64)
+    known = np.asarray(np.isfinite(reported[:, :3]).all(axis=1), np.float64)
     reported = np.nan_to_num(reported)
     lines = columns(np.asarray(seconds), reported)
     wanted = shift - reported[:, 1:3]
@@ -151,7 +151,7 @@ def coarse(sums: Array, weights: Array, noise: Array, prior: Prior) -> Coarse:
 
 def fitted(pairs: Pairs, reported: Array, noise: Array, prior: Prior) -> Fit:
     """Fit for `reported` (N, 5), with standard deviations `noise` (2,) of turn and shift."""
-    known: Array = np.isfinite(reported[:, :3]).all(axis=1).astype(np.float64)
+    known = np.asarray(np.isfinite(reported[:, :3]).all(axis=1), np.float64)
     reported = np.nan_to_num(reported)
     lines = columns(pairs.seconds, reported)
     turn_off = pairs.turn - reported[:, 0]
@@ -203,7 +203,8 @@ def refined(
         flat = (design * precise[..., None]).reshape(-1, 7)
         right = flat.T @ off.reshape(-1)
         right -= wide * np.array([0.0, found[1], *(fit.linear - prior.mean)])
-        covariance: Array = np.linalg.inv(flat.T @ design.reshape(-1, 7) + np.diag(wide))
+        normal = flat.T @ design.reshape(-1, 7) + np.diag(wide)
+        covariance = np.asarray(np.linalg.inv(normal), np.float64)
         found = np.asarray(found + np.clip((covariance @ right)[:2], -step, step))
     return found, covariance[:2, :2], fit
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from orthonav.geo.camera import Camera
 from orthonav.onboard.arrival import GAP_S, Arrival
-from orthonav.onboard.delay import EXPLAINED, UNEXPLAINED, DelayEstimate, DelayEstimator
+from orthonav.onboard.delay import UNEXPLAINED, DelayEstimate, DelayEstimator
 from orthonav.onboard.delay_check import DelayCheck
 from orthonav.onboard.history import StateHistory
 from orthonav.onboard.motion import Grey, PictureOdometry
@@ -268,11 +268,9 @@ class LatencyMonitor:
 
     def _compare(self) -> None:
         """Dispute the delay in use where the last seconds do not fit it."""
-        share = self._check.share()
-        if share < UNEXPLAINED and not self._suspicion:
-            self._suspicion, self._disputed = UNLIKE, True
-        elif share > EXPLAINED and self._suspicion == UNLIKE:
-            self._suspicion, self._disputed = "", False
+        # It cannot be settled here: steady turns look alike at many delays.
+        if self._check.share() < UNEXPLAINED and not self._suspicion:
+            self._suspicion, self._disputed, self._pending = UNLIKE, True, None
 
     def _dispute(self, why: str, found: DelayEstimate) -> None:
         """Withhold until the next estimate agrees with this one or with what was known."""
