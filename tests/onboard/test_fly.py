@@ -217,7 +217,8 @@ def test_a_view_is_logged_with_its_telemetry_before_it_is_located(flight):
     flight.view()
     names = [name for name, _ in flight.log.calls[before:]]
     assert names[:2] == ["view", "result"]
-    number, frame, grey, telemetry = flight.log.named("view")[-1]
+    number, frame, grey, telemetry, latency_ms, withheld = flight.log.named("view")[-1]
+    assert latency_ms is None and withheld is False
     assert telemetry is flight.locator.seen[-1] and grey.shape == (240, 320)
     assert (number, frame) == (61, "000061")
     assert flight.log.named("result")[-1][0].frame == frame

@@ -8,6 +8,7 @@ from typing import Any
 
 EVERYDAY = (
     "--camera",
+    "--camera-latency-ms",
     "--mount",
     "--autopilot",
     "--recorded-telemetry",
@@ -71,10 +72,9 @@ def _add_camera(group: Any) -> None:
     )
     group.add_argument(
         "--camera-latency-ms",
-        type=float,
-        default=0.0,
-        metavar="MS",
-        help="live cameras: time from exposure to arrival (default 0)",
+        metavar="MS|FILE",
+        help="live cameras: time from exposure to arrival, or the file of `orthonav calibrate "
+        "--latency`; without it nothing is sent until it has been measured in flight",
     )
     group.add_argument(
         "--mount-deg",

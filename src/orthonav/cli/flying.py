@@ -14,6 +14,7 @@ from orthonav.confidence.accept import Acceptance
 from orthonav.errors import CameraError, OutputError, VariantError
 from orthonav.files import require_file
 from orthonav.flight import read_camera
+from orthonav.flight.latency import MOST_MS, CameraLatency, read_latency
 from orthonav.flight.mount import Mount, read_mount
 from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
@@ -24,6 +25,7 @@ from orthonav.onboard.calibrate import MountCorrected, model_of
 from orthonav.onboard.cameras import CameraThread
 from orthonav.onboard.fly import FlyOptions, LogSink, Runner
 from orthonav.onboard.health import Notifier, TelemetryDiagnosis
+from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
 from orthonav.onboard.outputs import (
     KINDS,
@@ -103,6 +105,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         diagnosis=TelemetryDiagnosis(localizer, least),
         start=_start(options, clocks),
         notifier=Notifier(),
+        latency=_latency(options, heading_known=heading_known),
     )
 
 
@@ -120,6 +123,32 @@ def _opened(options: argparse.Namespace) -> MapFile:
     if options.state is not None:
         require_newest(options.state, signature, options.map)
     return opened
+
+
+def _latency(options: argparse.Namespace, *, heading_known: bool) -> LatencyMonitor | None:
+    """Monitor of the latency of a live camera; None for recordings and ROS, which have times."""
+    if options.ros2 or not cameras.is_live(options.source):
+        return None
+    stated = _stated(options.camera_latency_ms)
+    return LatencyMonitor(
+        None if stated is None else stated.latency_ms / 1e3,
+        STATED_STD_S if stated is None else max(stated.std_ms / 1e3, STATED_STD_S),
+        mount_deg=tuple(options.mount_deg),
+        heading_known=heading_known,
+    )
+
+
+def _stated(text: str | None) -> CameraLatency | None:
+    """Latency of `--camera-latency-ms`: a number or a file."""
+    if text is None:
+        return None
+    try:
+        stated = CameraLatency(float(text), STATED_STD_S * 1e3)
+    except ValueError:
+        return read_latency(Path(text))
+    if not 0 <= stated.latency_ms <= MOST_MS:
+        raise VariantError(f"--camera-latency-ms must be 0 to {MOST_MS:g}, got {text}")
+    return stated
 
 
 def _inputs(
@@ -164,7 +193,6 @@ def _source(
         return cameras.LiveCamera(
             cameras.live_name(options.source),
             clocks,
-            latency_s=options.camera_latency_ms / 1e3,
             size_px=(camera.width_px, camera.height_px),
         )
     if not (options.pace > 0 and (options.rate_hz is None or options.rate_hz > 0)):

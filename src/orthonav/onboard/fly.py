@@ -33,6 +33,7 @@ from orthonav.onboard.health import (
     judge,
     mismatch,
 )
+from orthonav.onboard.latency import Latency, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.publisher import Publisher
 from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
@@ -62,8 +63,17 @@ class LogSink(Protocol):
     def options(self, options: dict[str, Any]) -> None:
         """Log the options of the flight."""
 
-    def view(self, number: int, frame: str, grey: Grey, telemetry: Telemetry) -> None:
-        """Log a view and its telemetry, before it is located."""
+    def view(
+        self,
+        number: int,
+        frame: str,
+        grey: Grey,
+        telemetry: Telemetry,
+        latency_ms: float | None,
+        withheld: bool,
+    ) -> None:
+        """Log a view, its telemetry, and the latency that was subtracted from its arrival, before
+        it is located, or `withheld`."""
 
     def result(self, result: ViewResult) -> None:
         """Log the result of an image."""
@@ -127,11 +137,14 @@ class Runner:
         diagnosis: TelemetryDiagnosis | None = None,
         start: Callable[[], Prior | None] = lambda: None,
         notifier: Notifier | None = None,
+        latency: LatencyMonitor | None = None,
     ) -> None:
-        """`start` gives the prior of the first view; it is called when that view is located."""
+        """`start` gives the prior of the first view; it is called when that view is located.
+        `latency`: that of a live camera; None where images carry the time of their exposure."""
         self._newest, self._camera, self._locator = newest, camera, locator
         self._publisher, self.options, self._clocks = publisher, options, clocks
         self._link, self._sink, self._diagnosis = link, sink, diagnosis
+        self._latency = latency
         self._start: Callable[[], Prior | None] | None = start
         self._notifier = notifier or Notifier("")
         self.counter, self._reporter, self._frozen = EventCounter(), HealthReporter(), FrozenCheck()
@@ -176,11 +189,20 @@ class Runner:
 
     def _process(self, image: CameraImage) -> ViewResult | None:
         """Result of one image; None where it is too old."""
-        self._image_taken_ns = self._clocks.mono_ns()
+        now_ns = self._image_taken_ns = self._clocks.mono_ns()
         self._count("taken")
-        if self._image_taken_ns - image.exposed_ns > self.options.deadline_s * 1e9:
+        latency = None
+        if self._latency is not None and image.arrival is not None:
+            latency = self._latency.latency(image.arrival)
+        arrived_ns = image.exposed_ns
+        if now_ns - arrived_ns > self.options.deadline_s * 1e9:
             self._count("late")
             return None
+        if latency is not None and math.isfinite(latency.delay_s):
+            delay_ns = round(latency.delay_s * 1e9)
+            image = replace(
+                image, exposed_ns=arrived_ns - delay_ns, time_ns=image.time_ns - delay_ns
+            )
         vehicle, camera = VehicleState(None), self._camera
         refused = self._map_changed() or self._bad_image(image)
         if refused is None and image.grey is not None:
@@ -189,26 +211,78 @@ class Runner:
                 camera = fitted(camera, width, height, image.frame)
             except CameraError as error:
                 refused = self._refusal("wrong_camera", "wrong_camera", str(error))
-        telemetry = None
-        if refused is None:
+        if refused is not None or image.grey is None:
+            frozen = refused is not None and refused.reason == "frozen_image"
+            if frozen and self._latency is not None and image.arrival is not None:
+                self._latency.frozen(image.arrival)
+            return self._refused(image, refused or NoFix("bad_image", "no image"), vehicle)
+        try:
             vehicle, telemetry = self._telemetry(image)
+            view = View(image.grey, camera, telemetry)
+            if latency is not None and latency.reason is not None:
+                return self._withheld(image, view, vehicle, latency)
             refused = self._missing(telemetry)
-        if refused is not None or telemetry is None or image.grey is None:
-            outcome = refused or NoFix("bad_image", "no image")
-            result = self._result(image, outcome, math.nan)
-            self._log(lambda sink: sink.result(result))
-            self._publisher.publish(result, image.exposed_ns, vehicle, judged=False)
-            return result
-        return self._located(image, View(image.grey, camera, telemetry), vehicle)
+            if refused is not None:
+                return self._refused(image, refused, vehicle)
+            return self._located(image, view, vehicle, latency)
+        finally:
+            self._observe(image, camera)
 
-    def _located(self, image: CameraImage, view: View, vehicle: VehicleState) -> ViewResult:
+    def _refused(self, image: CameraImage, reason: NoFix, vehicle: VehicleState) -> ViewResult:
+        """Log and publish an image that cannot be located."""
+        result = self._result(image, reason, math.nan)
+        self._log(lambda sink: sink.result(result))
+        self._publisher.publish(result, image.exposed_ns, vehicle, judged=False)
+        return result
+
+    def _withheld(
+        self, image: CameraImage, view: View, vehicle: VehicleState, latency: Latency
+    ) -> ViewResult:
+        """Log and publish a view whose time of exposure is in doubt: the track must not get it."""
+        reason = latency.reason or ""
+        self._count(reason)
+        result = self._result(image, NoFix(reason, latency.detail), math.nan)
+        if self._latency is not None and self._latency.wants(_arrived_ns(image)):
+            self._log_view(image, view, latency, withheld=True)
+            self._log(lambda sink: sink.result(result))
+        self._publisher.publish(
+            result, image.exposed_ns, vehicle, judged=False, withheld=latency.reason
+        )
+        return result
+
+    def _observe(self, image: CameraImage, camera: Camera) -> None:
+        """Measure the latency of a live camera with one more image."""
+        if self._latency is None or image.arrival is None or image.grey is None:
+            return
+        if self._link is None:
+            return
+        self._latency.observe(
+            image.arrival, image.grey, camera, self._link.state_at, self._link.covered_ns
+        )
+
+    def _log_view(
+        self, image: CameraImage, view: View, latency: Latency | None, *, withheld: bool
+    ) -> None:
+        known = latency is not None and math.isfinite(latency.delay_s)
+        # Without a known latency the telemetry is that of the arrival.
+        delay_ms = latency.delay_s * 1e3 if latency is not None and known else 0.0
+        used_ms = None if latency is None else delay_ms
+        self._log(
+            lambda sink: sink.view(
+                image.number, image.frame, view.grey, view.telemetry, used_ms, withheld
+            )
+        )
+
+    def _located(
+        self, image: CameraImage, view: View, vehicle: VehicleState, latency: Latency | None
+    ) -> ViewResult:
         """Log, locate and publish a view."""
         if self._start is not None:
             prior, self._start = self._start(), None
             telemetry = replace(view.telemetry, prior=prior or view.telemetry.prior)
             view = replace(view, telemetry=telemetry)
         telemetry = view.telemetry
-        self._log(lambda sink: sink.view(image.number, image.frame, view.grey, telemetry))
+        self._log_view(image, view, latency, withheld=False)
         outcome: Fix | NoFix
         try:
             outcome, latency_ms = locate_view(self._locator, view)
@@ -218,6 +292,8 @@ class Runner:
         self._count("processed")
         if isinstance(outcome, NoFix) and outcome.reason in ("internal_error", MAP_DAMAGED):
             self._count("internal_error")
+        if latency is not None and isinstance(outcome, Fix):
+            outcome = _with_latency(outcome, telemetry, latency.std_s)
         result = self._result(image, outcome, latency_ms)
         accepted = self.options.accept(outcome) if self.options.accept else outcome
         self._publisher.publish(
@@ -389,7 +465,14 @@ class Runner:
             map_intact=self.options.map_change() is None,
             heading_mismatch_deg=heading_deg,
             log_scale_mismatch=log_scale,
+            latency=self._latency_reason(),
         )
+
+    def _latency_reason(self) -> str | None:
+        """Reason why the latency of the camera cannot be used."""
+        if self._latency is None or self._image_taken_ns is None:
+            return None
+        return self._latency.current().reason
 
     def _plain(self, health: Health) -> dict[str, Any]:
         total = self.counter.total
@@ -403,6 +486,7 @@ class Runner:
             "sent": dict(sorted(self._publisher.gate.sent.items())),
             "age_p50_ms": round(self.counter.latency_s(0.5) * 1e3, 1),
             "age_p95_ms": round(self.counter.latency_s(0.95) * 1e3, 1),
+            **({} if self._latency is None else self._latency.plain()),
         }
 
     def _save_state(self) -> None:
@@ -417,6 +501,20 @@ class Runner:
             if self.counter.total["state_failed"] == 0:
                 log.warning("state cannot be saved: %s", error)
             self._count("state_failed")
+
+
+def _arrived_ns(image: CameraImage) -> int:
+    return image.exposed_ns if image.arrival is None else image.arrival.arrived_ns
+
+
+def _with_latency(fix: Fix, telemetry: Telemetry, std_s: float) -> Fix:
+    """Fix whose covariance includes the distance flown in the standard deviation of the latency."""
+    evidence = fix.evidence
+    own = evidence.get("vel_east_mps", math.nan), evidence.get("vel_north_mps", math.nan)
+    velocity = np.array(telemetry.vel_en_mps or own)
+    if not np.isfinite(velocity).all():
+        return fix
+    return replace(fix, cov_en_m2=fix.cov_en_m2 + std_s**2 * np.outer(velocity, velocity))
 
 
 def _file_id(path: Path | None) -> tuple[int, int] | None:

@@ -103,6 +103,7 @@ class Snapshot:
     `map_unchanged`: whether the file of the map's name is still the one that was opened.
     `map_intact`: whether the open map file was neither truncated nor rewritten.
     `heading_mismatch_deg`, `log_scale_mismatch`: see `mismatch`.
+    `latency`: reason why the latency of the camera cannot be used, see `orthonav.onboard.latency`.
     """
 
     running_s: float
@@ -118,6 +119,7 @@ class Snapshot:
     map_intact: bool = True
     heading_mismatch_deg: float = 0.0
     log_scale_mismatch: float = 0.0
+    latency: str | None = None
 
 
 def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
@@ -156,6 +158,8 @@ def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
         "state_not_saved": count["state_failed"] > 0,
         "internal_error": count["internal_error"] > 0 and not failed["internal_errors"],
     }
+    if seen.latency is not None:
+        degraded = {seen.latency: True, **degraded}  # the cause of others, so it comes first
     worst = tuple(name for name, applies in failed.items() if applies)
     others = tuple(name for name, applies in degraded.items() if applies)
     level = Level.FAILED if worst else Level.DEGRADED if others else Level.OK

@@ -149,9 +149,15 @@ class AutopilotLink:
 
     def covers(self, exposed_ns: int) -> bool:
         """Whether the attitude at a time of our clock is known."""
+        covered_ns = self.covered_ns
+        return covered_ns is not None and covered_ns >= exposed_ns
+
+    @property
+    def covered_ns(self) -> int | None:
+        """Time of our clock up to which the attitude is known; None without any."""
         with self._lock:
             newest, offset = self.buffer.covered_ns, self.sync.offset_ns
-            return newest is not None and offset is not None and newest >= exposed_ns + offset
+            return None if newest is None or offset is None else newest - offset
 
     def state_at(self, exposed_ns: int) -> VehicleState:
         """State that the autopilot reported for a time of our clock."""

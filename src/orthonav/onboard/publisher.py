@@ -56,15 +56,24 @@ class Publisher:
         self.failed = 0
 
     def publish(
-        self, result: ViewResult, exposed_ns: int, vehicle: VehicleState, *, judged: bool
+        self,
+        result: ViewResult,
+        exposed_ns: int,
+        vehicle: VehicleState,
+        *,
+        judged: bool,
+        withheld: str | None = None,
     ) -> tuple[str, ...]:
         """Send the position of a view where the gate admits it; the names of the messages.
 
         Only views that the locator processed (`judged`) can give a position: the prediction of a
-        track is not a measurement.
+        track is not a measurement. `withheld`: reason why a view was not located, which the gate
+        counts.
         """
-        estimate, withheld = None, None
-        if judged:
+        estimate = None
+        if withheld is not None:
+            self.gate.withheld[withheld] += 1
+        elif judged:
             now_ns = self._clocks.mono_ns()
             by_our_clock = replace(result, time_ns=exposed_ns)
             ahead_ns = self._clocks.utc_ns() - now_ns

@@ -80,8 +80,8 @@ class Gate:
 
     `withheld`: counts by reason: `no_fix`, `not_tracking`, `low_confidence`, `no_covariance`,
     `too_uncertain`, `from_the_future`, `stale`, `out_of_order`, `coasting` for dead reckoning,
-    `jump` for an impossible one that no other view has confirmed, and `rate:NAME` for a message
-    that would exceed its rate.
+    `jump` for an impossible one that no other view has confirmed, `rate:NAME` for a message that
+    would exceed its rate, and the reasons of views that the flight loop does not locate.
     `sent`: counts of messages by name.
     `resets`: number of admitted jumps of the position, and of tracks found again.
     """
