@@ -1,0 +1,523 @@
+"""Flights of the fault suite: a path, a live camera and an autopilot with simulated clocks.
+
+The flight loop is that of `orthonav fly` (`orthonav.onboard.fly.Runner`) with its tracker, latency
+monitor, gate and link; only clocks, camera and port are replaced. Nothing waits: a flight takes as
+long as its views take to locate. Messages are decoded by the reader of the tests.
+"""
+
+import importlib
+import math
+import runpy
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.geo.camera import Camera
+from orthonav.geo.frames import LocalFrame
+from orthonav.localizer import Localizer
+from orthonav.localizer.tracker import Tracker
+from orthonav.onboard.cameras import LiveCamera, NewestImage
+from orthonav.onboard.fly import FlyOptions, Runner
+from orthonav.onboard.latency import LatencyMonitor
+from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.outputs import MessageOptions, Messenger
+from orthonav.onboard.publisher import Publisher
+from orthonav.onboard.telemetry import Clocks, TelemetryBuffer
+from orthonav.publish.estimate import Clock
+from orthonav.publish.gate import Gate, GateRules
+from orthonav.records import Fix
+
+READER = Path(__file__).resolve().parents[1] / "tests" / "wire.py"
+CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
+STATED_S = 0.12
+"""Stated and true latency of the undisturbed camera."""
+VIEWS_HZ, STEP_S = 5.0, 0.04
+"""Rates of the camera, and of telemetry: 25 Hz."""
+S = 10**9
+BEGIN_NS, BEGIN_S = 100 * S, 15.0
+"""Our clock at the start, and the time on the path: a late camera shows what was before."""
+AHEAD_NS = -90 * S
+UTC_NS = 1_789_000_000 * S
+FAR_M, FAR_STD = 35.0, 3.0
+"""A message is wrong if its error exceeds both, the second in stated standard deviations."""
+RIGHT_COUNT = 5
+"""A flight ends so many right messages after its fault."""
+G_MPS2, SAMPLE_S, TURN_DEG_S = 9.81, 0.02, 14.0
+YAW_OFF_DEG, HEIGHT_SCALE, PITCH_OFF_DEG = 2.0, 1.03, 0.5
+"""Constant errors of telemetry, undisturbed."""
+Array = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class State:
+    """What an autopilot reports: angles (deg), velocity over ground (m/s), height (m)."""
+
+    yaw: float
+    pitch: float
+    roll: float
+    north: float
+    east: float
+    height: float
+
+
+class Path2D:
+    """An aircraft that steers to random places within `reach_m` of `middle`, in turbulence.
+
+    `excursion`: times (s) between which it flies to `outside` (east, north), metres.
+    """
+
+    def __init__(
+        self,
+        seconds: float,
+        seed: int,
+        *,
+        reach_m: float,
+        speed_mps: float,
+        agl_m: float,
+        turbulence_deg: float = 1.0,
+        excursion: tuple[float, float] | None = None,
+        outside: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        rng = np.random.default_rng([seed, 21])
+        count = int(seconds / SAMPLE_S) + 1
+        self._times = np.arange(count) * SAMPLE_S
+        self.agl_m = agl_m
+        place, course = rng.uniform(-0.3, 0.3, 2) * reach_m, rng.uniform(-np.pi, np.pi)
+        goal = rng.uniform(-1, 1, 2) * reach_m
+        places, courses = np.zeros((count, 2)), np.zeros(count)  # east, north; clockwise
+        for i, time_s in enumerate(self._times):
+            away = excursion is not None and excursion[0] <= time_s < excursion[1]
+            if away:
+                goal = np.array(outside)
+            elif np.hypot(*(goal - place)) < 4 * speed_mps or np.abs(goal).max() > reach_m:
+                goal = rng.uniform(-1, 1, 2) * reach_m
+            wanted = math.atan2(*(goal - place)) - course
+            most = math.radians(TURN_DEG_S) * SAMPLE_S
+            course += min(max(math.remainder(wanted, math.tau), -most), most)
+            place = place + speed_mps * SAMPLE_S * np.array([math.sin(course), math.cos(course)])
+            places[i], courses[i] = place, course
+        kernel = np.hanning(76) / np.hanning(76).sum()
+        courses = np.convolve(np.pad(courses, 38, mode="edge"), kernel, mode="same")[38:-38]
+        rate = np.gradient(courses, SAMPLE_S)
+        shaken = [_wandering(rng, count, turbulence_deg, each) for each in (0.25, 0.3, 0.5)]
+        self._roll = np.degrees(np.arctan(speed_mps * rate / G_MPS2)) + shaken[0]
+        self._pitch = 2.0 + shaken[1]
+        self._yaw = np.degrees(courses) + 0.5 * shaken[2]
+        self._places = places
+        self._velocity = np.gradient(places, SAMPLE_S, axis=0)
+
+    def attitude(self, time_s: float) -> tuple[float, float, float]:
+        """True yaw, pitch, roll (deg)."""
+        values = (self._yaw, self._pitch, self._roll)
+        yaw, pitch, roll = (float(np.interp(time_s, self._times, each)) for each in values)
+        return yaw, pitch, roll
+
+    def place(self, time_s: float) -> Array:
+        """True metres east and north (2,)."""
+        return np.array([np.interp(time_s, self._times, self._places[:, i]) for i in (0, 1)])
+
+    def reported(self, time_s: float) -> State:
+        """Telemetry of an undisturbed autopilot."""
+        yaw, pitch, roll = self.attitude(time_s)
+        east, north = (np.interp(time_s, self._times, self._velocity[:, i]) for i in (0, 1))
+        off = yaw + YAW_OFF_DEG, pitch + PITCH_OFF_DEG, roll
+        return State(*off, float(north), float(east), HEIGHT_SCALE * self.agl_m)
+
+
+def _wandering(rng: np.random.Generator, count: int, std: float, time_s: float) -> Array:
+    """Smooth noise (count,) of a standard deviation and a time constant."""
+    decay = math.exp(-SAMPLE_S / time_s)
+    out, value, slope = np.zeros(count), 0.0, 0.0
+    for i, each in enumerate(rng.standard_normal(count)):
+        slope = decay * slope + (1 - decay) * each
+        value = decay * value + (1 - decay) * slope
+        out[i] = value
+    return std * out / max(float(out.std()), 1e-12)
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A map, and pictures of the ground around its middle.
+
+    `picture(place, attitude, agl_m, rng)`: what the camera sees from a place (2,) metres east and
+    north of the origin of `frame`. `reach_m`: half the side of the square that is flown over.
+    """
+
+    localizer: Localizer
+    frame: LocalFrame
+    picture: Callable[[Array, tuple[float, float, float], float, np.random.Generator], Grey]
+    reach_m: float
+    agl_m: float
+    speed_mps: float
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong from its begin on; times `t` are seconds since then.
+
+    `delay_s(number)` by image number and `t`: exposure to arrival. `picture`: what arrives instead.
+    `arrives`: whether an image arrives. `state`: what the autopilot reports, None for nothing.
+    `others`: frames of other vehicles. `begins`, `ends`: called once. `ground_en_m`: displacement
+    of the ground under the aircraft against the map.
+    """
+
+    name: str
+    group: str
+    seconds: float = 10.0
+    from_start: bool = False
+    delay_s: Callable[[int, float], float] | None = None
+    arrives: Callable[[int, float], bool] | None = None
+    picture: Callable[["FaultFlight", Grey, float], Grey] | None = None
+    state: Callable[["FaultFlight", State, float], State | None] | None = None
+    others: Callable[["FaultFlight", State, int], list[bytes]] | None = None
+    begins: Callable[["FaultFlight"], None] | None = None
+    ends: Callable[["FaultFlight"], None] | None = None
+    ground_en_m: tuple[float, float] = (0.0, 0.0)
+    stated_s: float | None = STATED_S
+    leaves_map: bool = False
+    detectable: bool = True
+
+
+@dataclass(frozen=True)
+class Sent:
+    """A message: when (s since the start), error (m), and in standard deviations of its fix."""
+
+    at_s: float
+    error_m: float
+    sigmas: float
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether it is off by more than anybody would expect."""
+        return self.error_m > FAR_M and self.sigmas > FAR_STD
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a flight did. Times in seconds since its start.
+
+    `views`: times of all images that arrived. `fault_s`: begin and end of the fault.
+    """
+
+    fault: Fault
+    views: list[float] = field(repr=False)
+    sent: list[Sent] = field(repr=False)
+    fault_s: tuple[float, float] = (math.nan, math.nan)
+    withheld: dict[str, int] = field(default_factory=dict)
+
+    def during(self) -> list[Sent]:
+        """Messages during the fault."""
+        return [each for each in self.sent if self.fault_s[0] <= each.at_s < self.fault_s[1]]
+
+    def wrong(self) -> list[Sent]:
+        """Wrong messages of the whole flight."""
+        return [each for each in self.sent if each.is_wrong]
+
+    def worst_m(self) -> float:
+        """Worst error of a message since the fault began; NaN without one."""
+        errors = [each.error_m for each in self.sent if each.at_s >= self.fault_s[0]]
+        return max(errors, default=math.nan)
+
+    def recovery_s(self) -> float:
+        """From the end of the fault to the next right message; infinite where none came."""
+        right = (
+            each.at_s - self.fault_s[1]
+            for each in self.sent
+            if each.at_s >= self.fault_s[1] and each.error_m <= FAR_M
+        )
+        return next(right, math.inf)
+
+    def lead_in(self) -> tuple[int, int]:
+        """Messages and views of the undisturbed time before the fault, from the first message."""
+        begin = self.sent[0].at_s if self.sent else math.inf
+        sent = sum(each.at_s < self.fault_s[0] for each in self.sent)
+        return sent, sum(begin <= each < self.fault_s[0] for each in self.views)
+
+
+class Port:
+    """A port whose other end is the flight."""
+
+    def __init__(self) -> None:
+        self.coming: list[bytes] = []
+        self.gone: list[bytes] = []
+
+    def open(self) -> "Port":
+        """Open it."""
+        return self
+
+    def fileno(self) -> int:
+        """Never waited for."""
+        raise AssertionError("nothing waits in simulated time")
+
+    def read(self) -> bytes:
+        """The next frame."""
+        return self.coming.pop(0) if self.coming else b""
+
+    def write(self, data: bytes) -> None:
+        """Take a frame."""
+        self.gone.append(bytes(data))
+
+    def heard(self) -> None:
+        """Nothing to do."""
+
+    def close(self) -> None:
+        """Nothing to do."""
+
+
+class Autopilot:
+    """Encodes what an autopilot says."""
+
+    def __init__(self, system: int = 1, component: int = 1) -> None:
+        self._mavlink: Any = importlib.import_module("pymavlink.dialects.v20.ardupilotmega")
+        self._mav = self._mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+
+    def say(self, name: str, *values: Any) -> bytes:
+        """A frame."""
+        message = getattr(self._mavlink, f"MAVLink_{name}_message")(*values)
+        frame = bytes(message.pack(self._mav))
+        self._mav.seq = (self._mav.seq + 1) % 256
+        return frame
+
+    def telemetry(self, state: State, boot_ns: int) -> list[bytes]:
+        """Attitude, height above home, velocity."""
+        boot_ms = boot_ns // 10**6
+        yaw = math.remainder(math.radians(state.yaw), math.tau)
+        pitch, roll = math.radians(state.pitch), math.radians(state.roll)
+        height_mm = round(state.height * 1000)
+        made = [
+            self.say("attitude", boot_ms, roll, pitch, yaw, 0, 0, 0),
+            self.say("global_position_int", boot_ms, 0, 0, 0, height_mm, 0, 0, 0, 0),
+        ]
+        if math.isfinite(state.north):
+            velocity = state.north, state.east, 0.0
+            made.append(self.say("local_position_ned", boot_ms, 0, 0, 0, *velocity))
+        return made
+
+
+class Stream:
+    """A capture of a live camera whose image was exposed at `exposed_s`."""
+
+    def __init__(self, seen: Callable[[], Grey]) -> None:
+        self._seen = seen
+
+    def isOpened(self) -> bool:  # noqa: N802
+        """Always."""
+        return True
+
+    def grab(self) -> bool:
+        """Always."""
+        return True
+
+    def retrieve(self) -> tuple[bool, Grey]:
+        """The image."""
+        return True, self._seen()
+
+    def get(self, _: int) -> float:
+        """No timestamps."""
+        return 0.0
+
+    def set(self, *_: Any) -> None:
+        """Nothing to do."""
+
+    def release(self) -> None:
+        """Nothing to do."""
+
+
+class FaultFlight:
+    """One flight with one fault. Mutable."""
+
+    def __init__(
+        self,
+        world: World,
+        fault: Fault,
+        *,
+        seed: int,
+        lead_s: float,
+        recovery_s: float,
+        map_change: Callable[[], str | None] = lambda: None,
+    ) -> None:
+        self.world, self.fault = world, fault
+        self.rng = np.random.default_rng([seed, 22])
+        begin_s = 0.0 if fault.from_start else lead_s
+        self.fault_s = begin_s, begin_s + fault.seconds
+        self.end_s = begin_s + fault.seconds + recovery_s
+        away = tuple(BEGIN_S + each for each in self.fault_s)
+        self.path = Path2D(
+            BEGIN_S + self.end_s + 1,
+            seed,
+            reach_m=world.reach_m,
+            speed_mps=world.speed_mps,
+            agl_m=world.agl_m,
+            excursion=(away[0], away[0] + 0.55 * fault.seconds) if fault.leaves_map else None,
+            outside=(1.9 * world.reach_m, 0.0),
+        )
+        self.now_ns, self.utc_ahead_ns, self.boot_ahead_ns = BEGIN_NS, UTC_NS, AHEAD_NS
+        clocks = Clocks(self._mono_ns, lambda: self.now_ns + self.utc_ahead_ns, self._sleep)
+        self.port, self.autopilot, self.stranger = Port(), Autopilot(), Autopilot(2)
+        self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)
+        self.gate = Gate(GateRules(), Clock.BOOT)
+        messages = MessageOptions(("global-position",))
+        messenger = Messenger(messages, self.gate, self.link.send, clocks)
+        publisher = Publisher(self.gate, clocks, messenger=messenger, link=self.link)
+        self._camera = LiveCamera(0, clocks, capture=lambda _: Stream(self._seen))
+        self._newest = NewestImage()
+        self.runner = Runner(
+            self._newest,
+            CAMERA,
+            Tracker(world.localizer),
+            publisher,
+            FlyOptions(map_change=map_change),
+            clocks,
+            link=self.link,
+            latency=LatencyMonitor(fault.stated_s),
+        )
+        self._reader = runpy.run_path(str(READER))
+        self._inbox: dict[str, list[dict[str, Any]]] = {}
+        self._number, self._exposed_s = 0, 0.0
+        self._views: list[float] = []
+        self._sent: list[Sent] = []
+        self._hear(self.autopilot.say("heartbeat", 1, 12, 0, 0, 4, 3))
+
+    @property
+    def since_s(self) -> float:
+        """Seconds since the start."""
+        return (self.now_ns - BEGIN_NS) / S
+
+    def fly(self) -> Report:
+        """Fly to the end, or until the flight has recovered."""
+        began = ended = False
+        due_s = 0.0
+        while self.since_s < self.end_s and not self._has_recovered():
+            self.now_ns += round(STEP_S * S)
+            if not began and self.since_s >= self.fault_s[0]:
+                began = True
+                if self.fault.begins is not None:
+                    self.fault.begins(self)
+            if not ended and self.since_s >= self.fault_s[1]:
+                ended = True
+                if self.fault.ends is not None:
+                    self.fault.ends(self)
+            self._talk()
+            if self.since_s >= due_s:
+                due_s += 1 / VIEWS_HZ
+                self._image()
+        withheld = {str(key): value for key, value in self.gate.withheld.items()}
+        return Report(self.fault, self._views, self._sent, self.fault_s, withheld)
+
+    def _mono_ns(self) -> int:
+        return self.now_ns
+
+    def _sleep(self, seconds: float) -> None:
+        self.now_ns += round(seconds * S)
+
+    def _has_recovered(self) -> bool:
+        after = [each for each in self._sent[-RIGHT_COUNT:] if each.at_s >= self.fault_s[1]]
+        return len(after) == RIGHT_COUNT and all(each.error_m <= FAR_M for each in after)
+
+    def _fault_t(self) -> float | None:
+        """Time since the fault began; None outside it."""
+        inside = self.fault_s[0] <= self.since_s < self.fault_s[1]
+        return self.since_s - self.fault_s[0] if inside else None
+
+    def _hear(self, *frames: bytes) -> None:
+        self.port.coming.extend(frames)
+        self.link.poll()
+
+    def _received(self, name: str) -> list[dict[str, Any]]:
+        """Messages of that name since it was last asked for."""
+        for frame in self.port.gone:
+            if int.from_bytes(frame[7:10], "little") in self._reader["TABLES"]:
+                message = self._reader["decode"](frame)
+                self._inbox.setdefault(message["name"], []).append(message)
+        self.port.gone.clear()
+        return self._inbox.pop(name, [])
+
+    def _talk(self) -> None:
+        """Telemetry of this moment, and answers to TIMESYNC."""
+        t, boot_ns = self._fault_t(), self.now_ns + self.boot_ahead_ns
+        true = self.path.reported(BEGIN_S + self.since_s)
+        state: State | None = true
+        frames = []
+        if t is not None and self.fault.state is not None:
+            state = self.fault.state(self, true, t)
+        asked = self._received("TIMESYNC")
+        if state is not None:
+            frames = self.autopilot.telemetry(state, boot_ns)
+            for each in asked:  # with equal delays in both directions
+                answer_ns = (boot_ns + each["ts1"] + self.boot_ahead_ns) // 2
+                frames.append(self.autopilot.say("timesync", answer_ns, each["ts1"]))
+        if t is not None and self.fault.others is not None:
+            frames += self.fault.others(self, true, boot_ns)
+        self._hear(*frames)
+
+    def _seen(self) -> Grey:
+        """The image that arrives now."""
+        t = self._fault_t()
+        grey = self.seen_at(self._exposed_s)
+        if t is not None and self.fault.picture is not None:
+            grey = self.fault.picture(self, grey, t)
+        return grey
+
+    def seen_at(self, path_s: float, rng: np.random.Generator | None = None) -> Grey:
+        """What the camera sees at a time of the path; `rng`: of the noise."""
+        place = self.path.place(path_s)
+        if self._fault_t() is not None:
+            place = place + np.array(self.fault.ground_en_m)
+        attitude = self.path.attitude(path_s)
+        return self.world.picture(place, attitude, self.path.agl_m, rng or self.rng)
+
+    def _image(self) -> None:
+        """One image arrives."""
+        t, delay_s = self._fault_t(), STATED_S
+        self._number += 1
+        if t is not None and self.fault.arrives and not self.fault.arrives(self._number, t):
+            return
+        if t is not None and self.fault.delay_s is not None:
+            delay_s = self.fault.delay_s(self._number, t)
+        self._exposed_s = BEGIN_S + self.since_s - delay_s
+        self._views.append(self.since_s)
+        self._newest.put(self._camera.read())
+        result = self.runner.step(0)
+        for message in self._received("GLOBAL_POSITION_SENSOR"):
+            fix = None if result is None else result.outcome
+            if isinstance(fix, Fix):
+                self._sent.append(self._judged(message, fix))
+
+    def _judged(self, message: dict[str, Any], fix: Fix) -> Sent:
+        """A message against the truth of the exposure that it states."""
+        path_s = BEGIN_S + self.since_s - message["processing_time"] / 1e6
+        found = self.world.frame.en_from_latlon(message["lat"] * 1e-7, message["lon"] * 1e-7)
+        off = np.asarray(found) - self.path.place(path_s)
+        sigmas = math.sqrt(float(off @ np.linalg.solve(fix.cov_en_m2, off)))
+        return Sent(self.since_s, float(np.hypot(*off)), sigmas)
+
+
+def undisturbed(seconds: float) -> Fault:
+    """A flight without a fault."""
+    return Fault("undisturbed", "none", seconds=seconds)
+
+
+def combined(camera: Fault, telemetry: Fault) -> Fault:
+    """Two faults at once."""
+    return replace(
+        camera,
+        name=f"{camera.name}, {telemetry.name}",
+        group="combined",
+        state=_both(camera, telemetry),
+    )
+
+
+def _both(one: Fault, other: Fault) -> Callable[[FaultFlight, State, float], State | None]:
+    def state(flight: FaultFlight, state: State, t: float) -> State | None:
+        made: State | None = state
+        for each in (one.state, other.state):
+            if each is not None and made is not None:
+                made = each(flight, made, t)
+        return made
+
+    return state
