@@ -103,6 +103,7 @@ class Tracker:
         self._before: OdometryView | None = None
         self._velocity: Array | None = None
         self._new_ground = np.full(2, np.inf)
+        self._ground = 1.0  # share of the view that the one before cannot have shown
         self._start_was_reported = False
         self._use_prior, self._every_prior = use_prior, every_prior
         self._history = History() if smooth else None
@@ -219,7 +220,21 @@ class Tracker:
         self.mixture.predict(seconds, velocity, camera, noise)
         if self._every_prior and prior is not None:
             self.mixture.measure_position(*self._position_of(prior))
+        if moved is not None:
+            self._ground = 1 - moved.overlap
+        elif view is not None:  # clouds do not fit each other, but show no new ground either
+            self._ground = self._ground_by_speed(view, seconds, expected)
         return 0.0 if moved is None else moved.overlap
+
+    def _ground_by_speed(self, view: View, seconds: float, expected: Array | None) -> float:
+        """Share of a view that is new, by the expected displacement or the largest usual speed."""
+        moved_m = self.model.speed_mps * seconds
+        if expected is not None:
+            moved_m = float(np.hypot(*expected))
+        side_m = view.telemetry.agl_m * min(
+            view.camera.width_px / view.camera.fx_px, view.camera.height_px / view.camera.fy_px
+        )
+        return min(moved_m / side_m, 1.0) if side_m > 0 else 1.0
 
     def _position_of(self, prior: Prior) -> tuple[Array, float]:
         """Metres east and north (2,) of a prior, and its standard deviation."""
@@ -310,7 +325,7 @@ class Tracker:
             math.radians(telemetry.roll_deg),
             self._tilt_noise(telemetry),
         )
-        self.mixture.update(attitude, sightings, newness, searched)
+        self.mixture.update(attitude, sightings, newness, searched, self._ground)
         return None
 
     def _tilt_weights(self, newness: float, costly: bool) -> Array:

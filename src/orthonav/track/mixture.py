@@ -60,10 +60,10 @@ START_SHARE = 0.9
 """Probability of a reported start position."""
 LIKELY = 0.5
 """A track with less confidence is lost."""
-CONFIRMED = 0.8
+CONFIRMED = 1.25
 """New ground, in views, that must be recognized before a track is confirmed. Each view counts by
-its own probability: no single view confirms a track, nor do views that fit only because they were
-searched there (docs/decisions/tracking.md, 9)."""
+its own probability: no single view confirms a track, nor do further views of its ground, nor views
+that fit only because they were searched there (docs/decisions/tracking.md, 9)."""
 TRUSTED = (0.1, 0.5)
 """Views with a probability of their own below the first do not count, above the second fully."""
 MOST_OF_ONE = 0.75
@@ -130,7 +130,7 @@ class _Measurement:
     """A sighting as a measurement of the state.
 
     `mean` (6,), `noise` (6, 6): in the components `SEEN`. `log_odds`: log odds over the density of
-    places, headings and scales that only look alike. `new_ground`: what it confirms, in views.
+    places, headings and scales that only look alike. `new_ground`: what it confirms, in views; `first_ground`: at a place seen for the first time.
     `own_noise` (6, 6): covariance without regard to earlier views of the same ground. `alone`:
     probability by the view alone. `log_chance`: log density of places, headings and scales that
     chance finds in the area searched.
@@ -140,6 +140,7 @@ class _Measurement:
     noise: Array
     log_odds: float
     new_ground: float
+    first_ground: float
     own_noise: Array
     alone: float
     log_chance: float
@@ -274,24 +275,27 @@ class Mixture:
         sightings: Sequence[Sighting],
         newness: float = 1.0,
         searched: tuple[Array, float] | None = None,
+        new_ground: float | None = None,
     ) -> None:
         """Update with the places where a view may have been taken; all of them may be wrong.
 
         `searched`: the circle of the map that was searched, middle (2,) and radius in metres; None
-        for all of it. `newness`: share of the view that the last one did not show. Views of the
-        same ground have the same errors, so many of them count no more than one.
+        for all of it. `newness`: share of the view that counts as new evidence. Views of the same
+        ground have the same errors, so many of them count no more than one. `new_ground`: share of
+        the view that the last one did not show, which alone confirms a track; None: `newness`.
         """
+        ground = newness if new_ground is None else new_ground
         made = []
         missed = self.model.miss**newness
         found = (1 - self.model.miss) ** newness
         area_m2 = self.area_m2 if searched is None else math.pi * searched[1] ** 2
-        measurements = [self._measurement(reported, each, newness, area_m2) for each in sightings]
+        measurements = [self._measurement(reported, each, newness, ground, area_m2) for each in sightings]
         for each in self.hypotheses:
             in_search = self._on_map(each.mean)
             if searched is not None:
                 in_search &= bool(np.hypot(*(each.mean[:2] - searched[0])) < searched[1])
             share = each.share * (missed if in_search else 1.0)
-            sighted = each.sighted * UNRECOGNIZED**newness
+            sighted = each.sighted * UNRECOGNIZED**ground
             made.append(replace(each, share=share, sighted=sighted))
             for start in self._with_bias_jump(each):
                 for seen in measurements:
@@ -381,11 +385,16 @@ class Mixture:
         return [replace(each, share=each.share * (1 - rare)), other]
 
     def _measurement(
-        self, reported: ReportedAttitude, sighting: Sighting, newness: float, area_m2: float
+        self,
+        reported: ReportedAttitude,
+        sighting: Sighting,
+        newness: float,
+        ground: float,
+        area_m2: float,
     ) -> "_Measurement":
         """A sighting as a measurement, tempered by the share of it that is new.
 
-        `area_m2`: of the part of the map that was searched.
+        `ground`: share that the last view did not show. `area_m2`: of the part of the map that was searched.
 
         A likelihood raised to the power `newness` has a broader peak, which stands out less from
         all places, headings and scales. The telemetry noise, independent at every view, is
@@ -410,7 +419,8 @@ class Mixture:
             mean,
             noise / newness + anew,
             odds,
-            min(newness * _trust(sighting.alone), MOST_OF_ONE),
+            min(ground * _trust(sighting.alone), MOST_OF_ONE),
+            min(_trust(sighting.alone), MOST_OF_ONE),
             noise + anew,
             sighting.alone,
             -math.log(area_m2) - poses,
@@ -459,7 +469,7 @@ class Mixture:
             share *= self.elsewhere * math.exp(min(log_weight, 60.0))
             self._numbers += 1
             yield Hypothesis(
-                share, mean, covariance, seen.new_ground, self._numbers, recognized=seen.alone
+                share, mean, covariance, seen.first_ground, self._numbers, recognized=seen.alone
             )
 
     def _from(self, each: Hypothesis, expected: Expected, share: float) -> Hypothesis:
