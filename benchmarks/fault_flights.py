@@ -109,7 +109,7 @@ class Path2D:
         self._pitch = 2.0 + shaken[1]
         self._yaw = np.degrees(courses) + 0.5 * shaken[2]
         self._places = places
-        self._velocity = np.gradient(places, SAMPLE_S, axis=0)
+        self._velocity: Array = np.asarray(np.gradient(places, SAMPLE_S, axis=0), np.float64)
 
     def attitude(self, time_s: float) -> tuple[float, float, float]:
         """True yaw, pitch, roll (deg)."""
@@ -119,12 +119,12 @@ class Path2D:
 
     def place(self, time_s: float) -> Array:
         """True metres east and north (2,)."""
-        return np.array([np.interp(time_s, self._times, self._places[:, i]) for i in (0, 1)])
+        return np.array([np.interp(time_s, self._times, each) for each in self._places.T])
 
     def reported(self, time_s: float) -> State:
         """Telemetry of an undisturbed autopilot."""
         yaw, pitch, roll = self.attitude(time_s)
-        east, north = (np.interp(time_s, self._times, self._velocity[:, i]) for i in (0, 1))
+        east, north = (np.interp(time_s, self._times, each) for each in self._velocity.T)
         off = yaw + YAW_OFF_DEG, pitch + PITCH_OFF_DEG, roll
         return State(*off, float(north), float(east), HEIGHT_SCALE * self.agl_m)
 
@@ -481,7 +481,9 @@ class FaultFlight:
             delay_s = self.fault.delay_s(self._number, t)
         self._exposed_s = BEGIN_S + self.since_s - delay_s
         self._views.append(self.since_s)
-        self._newest.put(self._camera.read())
+        image = self._camera.read()
+        assert image is not None
+        self._newest.put(image)
         result = self.runner.step(0)
         for message in self._received("GLOBAL_POSITION_SENSOR"):
             fix = None if result is None else result.outcome

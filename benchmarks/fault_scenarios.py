@@ -100,12 +100,8 @@ CAMERA_FAULTS = (
         delay_s=lambda n, t: STATED_S + 3.0,
     ),
     Fault("2 s late without a gap", "camera", 15.0, delay_s=lambda n, t: 2.0),
-    Fault(
-        "latency grows by 0.1 s/s", "camera", 15.0, delay_s=lambda n, t: STATED_S + 0.1 * t
-    ),
-    Fault(
-        "latency grows by 0.02 s/s", "camera", 40.0, delay_s=lambda n, t: STATED_S + 0.02 * t
-    ),
+    Fault("latency grows by 0.1 s/s", "camera", 15.0, delay_s=lambda n, t: STATED_S + 0.1 * t),
+    Fault("latency grows by 0.02 s/s", "camera", 40.0, delay_s=lambda n, t: STATED_S + 0.02 * t),
     Fault(
         "reordered",
         "camera",

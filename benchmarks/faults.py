@@ -17,7 +17,6 @@ from dataclasses import replace
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -54,8 +53,8 @@ from orthonav.mapfile import open_map
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.simulate.render import ViewEffects, render_view
 
-SIDE_M, MAP_M, PATCH_M = 1600, 1200, 160
-"""Sides of the generated area, of the map in its middle, and of the repeated patch."""
+SIDE_M, MAP_M = 1600, 1200
+"""Sides of the generated area, and of the map in its middle."""
 REACH_M, AGL_M, SPEED_MPS = 380.0, 150.0, 18.0
 EFFECTS = ViewEffects(exposure_std=0.05)
 LEAD_S, RECOVERY_S, SEED = 15.0, 60.0, 5
@@ -65,11 +64,8 @@ Array = NDArray[np.float64]
 OWN_MAPS = (
     Fault("another place (mirrored ground)", "map", 30.0, from_start=True),
     Fault("map truncated in place", "map", 10.0),
-    Fault("repeated parcels", "ground", 30.0, from_start=True),
 )
-HEADER = (
-    *("fault", "s", "views", "sent", "worst m", "wrong", "recovered s", "lead-in sent"),
-)
+HEADER = (*("fault", "s", "views", "sent", "worst m", "wrong", "recovered s", "lead-in sent"),)
 
 
 class Ground:
@@ -103,8 +99,8 @@ class Ground:
         return np.asarray(cv2.cvtColor(seen, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def _cut(path: Path, out: Path, side_m: int, tiled: bool = False) -> Path:
-    """The middle of an orthophoto; `tiled`: its middle patch again and again."""
+def _cut(path: Path, out: Path, side_m: int) -> Path:
+    """The middle of an orthophoto."""
     if out.is_file():
         return out
     with rasterio.open(path) as source:
@@ -117,10 +113,6 @@ def _cut(path: Path, out: Path, side_m: int, tiled: bool = False) -> Path:
             transform=source.window_transform(Window(first, first, side_m, side_m)),
         )
         tags = source.tags()
-    if tiled:
-        patch = rgb[:, side_m // 2 : side_m // 2 + PATCH_M, side_m // 2 : side_m // 2 + PATCH_M]
-        times = -(-side_m // PATCH_M)
-        rgb = np.tile(patch, (1, times, times))[:, :side_m, :side_m]
     with rasterio.open(out, "w", **profile) as target:
         target.write(rgb)
         target.update_tags(**tags)
@@ -129,16 +121,13 @@ def _cut(path: Path, out: Path, side_m: int, tiled: bool = False) -> Path:
 
 @cache
 def _world(work: Path, kind: str) -> World:
-    """The map and the ground of a kind: usual, mirrored, repeated."""
+    """The map and the ground of a kind: usual, mirrored."""
     place = Workplace(work, work, quick=True)
     past, present = place.area(SIDE_M, 1.0, [PAST, PRESENT])
-    tiled = kind == "repeated"
-    name = f"{past.parent.name}-{'repeated' if tiled else 'map'}"
+    name = f"{past.parent.name}-map"
     path = work / f"{name}.onav"
     if not path.is_file():
-        build_map(BuildRequest([_cut(past, work / f"{name}.tif", MAP_M, tiled)], path))
-    if tiled:
-        present = _cut(present, work / f"{name}-present.tif", MAP_M, tiled)
+        build_map(BuildRequest([_cut(past, work / f"{name}.tif", MAP_M)], path))
     localizer = Localizer(open_map(path))
     frame = localizer.sheet.frame
     ground = Ground(present, frame)
@@ -151,8 +140,8 @@ def _fly(job: tuple[Path, Fault, int], quick: bool) -> Report:
     """One flight; `quick`: a shorter one."""
     work, fault, seed = job
     cv2.setNumThreads(1)
-    change: Callable[[], str | None] = lambda: None
-    kinds = {OWN_MAPS[0].name: "mirrored", OWN_MAPS[2].name: "repeated"}
+    change: Callable[[], str | None] | None = None
+    kinds = {OWN_MAPS[0].name: "mirrored"}
     world = _world(work, kinds.get(fault.name, "usual"))
     if fault.name == OWN_MAPS[1].name:
         usual = next(work.glob("*-map.onav"))
@@ -172,7 +161,7 @@ def _fly(job: tuple[Path, Fault, int], quick: bool) -> Report:
         seed=seed,
         lead_s=0.0 if calm else QUICK_LEAD_S if quick else LEAD_S,
         recovery_s=0.0 if calm or fault.name == OWN_MAPS[1].name else recovery_s,
-        map_change=change,
+        map_change=change or (lambda: None),
     )
     report = flight.fly()
     # Functions cannot be passed between processes.
@@ -223,8 +212,8 @@ def _tables(reports: list[tuple[int, Report]]) -> list[Table]:
         "of a message from its begin to the end of the flight; wrong: messages of the whole flight "
         f"more than {FAR_M:g} m and {FAR_STD:g} standard deviations of their own fix off",
         "recovered: from the end of the fault to the next message within "
-        f"{FAR_M:g} m, none: within {RECOVERY_S:g} s (--quick: {QUICK_RECOVERY_S:g} s) or as long as the "
-        "map stays truncated; lead-in sent: share of its views, from the first message on",
+        f"{FAR_M:g} m, none: within {RECOVERY_S:g} s (--quick: {QUICK_RECOVERY_S:g} s) or as long "
+        "as the map stays truncated; lead-in sent: share of its views, from the first message on",
     )
     made = [Table("Faults", HEADER, rows, notes)] if rows else []
     calm = [_calm_row(each, seed) for seed, each in reports if each.fault.group == "none"]
@@ -259,8 +248,7 @@ def main(arguments: Sequence[str]) -> int:
     started, begin = provenance(" ".join(["faults", *arguments])), time.perf_counter()
     options.work.mkdir(parents=True, exist_ok=True)
     jobs = _jobs(options)
-    for kind in ("usual", "repeated"):  # made once, before processes share them
-        _world(options.work, kind)
+    _world(options.work, "usual")  # made once, before processes share it
     reports: list[tuple[int, Report]] = []
     # Not forked: threads of this process would be lost in a child.
     with ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool:
@@ -288,7 +276,9 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m benchmarks.faults", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("--only", nargs="+", metavar="TEXT", help="faults whose name has this")
-    parser.add_argument("--quick", action="store_true", help="shorter flights, only one without a fault")
+    parser.add_argument(
+        "--quick", action="store_true", help="shorter flights, only one without a fault"
+    )
     parser.add_argument("--seeds", type=int, default=1, help="flights per fault (default 1)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
     parser.add_argument("--work", type=Path, default=Path("bench_results/faults"))

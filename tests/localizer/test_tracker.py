@@ -263,7 +263,7 @@ def test_a_reported_start_needs_no_search(localizer):
     lat, lon = localizer.sheet.frame.latlon_from_en((-160.0, -120.0))
     start = Prior(float(lat), float(lon), 15.0)
     seen = [
-        (g, replace(t, prior=start if not n else None), p) for n, (g, t, p) in enumerate(views(6))
+        (g, replace(t, prior=start if not n else None), p) for n, (g, t, p) in enumerate(views(10))
     ]
     rows = followed(Tracker(localizer), localizer, seen)
     assert rows[0][0] < 15 and rows[0][1] == pytest.approx(0.8)

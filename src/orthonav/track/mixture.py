@@ -130,8 +130,9 @@ class _Measurement:
     """A sighting as a measurement of the state.
 
     `mean` (6,), `noise` (6, 6): in the components `SEEN`. `log_odds`: log odds over the density of
-    places, headings and scales that only look alike. `new_ground`: what it confirms, in views; `first_ground`: at a place seen for the first time.
-    `own_noise` (6, 6): covariance without regard to earlier views of the same ground. `alone`:
+    places, headings and scales that only look alike. `new_ground`: what it confirms, in
+    places, headings and scales that only look alike. `new_ground`: what it confirms, in views;
+    `first_ground`: the same at a place seen for the first time.
     probability by the view alone. `log_chance`: log density of places, headings and scales that
     chance finds in the area searched.
     """
@@ -289,7 +290,9 @@ class Mixture:
         missed = self.model.miss**newness
         found = (1 - self.model.miss) ** newness
         area_m2 = self.area_m2 if searched is None else math.pi * searched[1] ** 2
-        measurements = [self._measurement(reported, each, newness, ground, area_m2) for each in sightings]
+        measurements = [
+            self._measurement(reported, each, newness, ground, area_m2) for each in sightings
+        ]
         for each in self.hypotheses:
             in_search = self._on_map(each.mean)
             if searched is not None:
@@ -394,7 +397,8 @@ class Mixture:
     ) -> "_Measurement":
         """A sighting as a measurement, tempered by the share of it that is new.
 
-        `ground`: share that the last view did not show. `area_m2`: of the part of the map that was searched.
+        `ground`: share that the last view did not show. `area_m2`: of the part of the map that was
+        searched.
 
         A likelihood raised to the power `newness` has a broader peak, which stands out less from
         all places, headings and scales. The telemetry noise, independent at every view, is
