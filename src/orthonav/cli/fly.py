@@ -228,7 +228,7 @@ def _add_outputs(group: Any) -> None:
         "--send-coasting",
         action="store_true",
         help="send dead-reckoned positions too, of views that do not show the map: as "
-        "GLOBAL_POSITION_SENSOR with the flag UNHEALTHY, by no other message",
+        "GLOBAL_POSITION_SENSOR with the flag UNHEALTHY, which PX4 ignores, by no other message",
     )
     group.add_argument(
         "--min-std-m",

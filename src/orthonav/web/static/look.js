@@ -1,7 +1,7 @@
 // Colours and marks, the same on map, course and list.
 
-const COLOURS = ["tracking", "searching", "lost", "alone", "none", "truth", "wrong", "ink", "soft", "line",
-  "paper", "shade", "strong", "good", "warn", "bad"];
+const COLOURS = ["tracking", "coasting", "searching", "lost", "alone", "none", "truth", "wrong", "ink", "soft",
+  "line", "paper", "shade", "strong", "good", "warn", "bad"];
 let colours = {};
 
 /** A colour of style.css, in the current scheme. */
@@ -19,8 +19,10 @@ export function watchColours(changed) {
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { read(); changed(); });
 }
 
-export const MARKS = { tracking: "●", alone: "●", searching: "▲", lost: "✕", none: "–" };
-export const NAMES = { tracking: "tracking", alone: "fix", searching: "searching", lost: "lost", none: "no fix" };
+export const MARKS = { tracking: "●", alone: "●", coasting: "◆", searching: "▲", lost: "✕", none: "–" };
+export const NAMES = {
+  tracking: "tracking", alone: "fix", coasting: "coasting", searching: "searching", lost: "lost", none: "no fix",
+};
 
 /** Draws the mark of a state at a point; each state has its own shape. */
 export function drawMark(context, state, x, y, size) {
@@ -29,6 +31,13 @@ export function drawMark(context, state, x, y, size) {
     context.moveTo(x, y - size * 1.2);
     context.lineTo(x + size * 1.1, y + size * 0.9);
     context.lineTo(x - size * 1.1, y + size * 0.9);
+    context.fill();
+  } else if (state === "coasting") {
+    context.beginPath();
+    context.moveTo(x, y - size * 1.3);
+    context.lineTo(x + size * 1.3, y);
+    context.lineTo(x, y + size * 1.3);
+    context.lineTo(x - size * 1.3, y);
     context.fill();
   } else if (state === "lost") {
     context.lineWidth = Math.max(1.6, size * 0.6);
