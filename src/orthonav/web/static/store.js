@@ -67,7 +67,7 @@ export class Store extends EventTarget {
     return this.rising ? this.columns.t[i] : i;
   }
 
-  /** The state of a view: searching, tracking, lost, alone (placed without a track) or none. */
+  /** The state of a view: searching, tracking, coasting, lost, alone (placed without a track) or none. */
   state(i) {
     if (this.columns.reason[i]) return "none";
     const state = this.columns.state[i];
