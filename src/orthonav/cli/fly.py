@@ -225,6 +225,12 @@ def _add_outputs(group: Any) -> None:
         help="positions with a larger standard deviation are not sent (m; default 50)",
     )
     group.add_argument(
+        "--send-coasting",
+        action="store_true",
+        help="send dead-reckoned positions too, of views that do not show the map: as "
+        "GLOBAL_POSITION_SENSOR with the flag UNHEALTHY, by no other message",
+    )
+    group.add_argument(
         "--min-std-m",
         type=float,
         default=0.0,
@@ -318,6 +324,12 @@ def _add_flight(group: Any) -> None:
         type=Path,
         metavar="public.pem",
         help="refuse a map that was not signed with this key (see `orthonav sign`)",
+    )
+    group.add_argument(
+        "--not-before",
+        metavar="DATE|SERIAL",
+        help="with --require-signed: refuse a map signed before this date (2026-05-31, UTC) or "
+        "with a lower serial number",
     )
 
 

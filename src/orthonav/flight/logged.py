@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from orthonav.errors import CameraError, FlightError
+from orthonav.errors import CameraError, FlightError, described
 from orthonav.geo.camera import Camera
 from orthonav.records import Fix, Prior, Telemetry
 
@@ -270,7 +270,7 @@ def view_of(data: bytes) -> LoggedView:
         if not isinstance(frame, str) or picture not in PICTURES:
             raise ValueError("invalid frame or picture")
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise FlightError(f"telemetry of the log is damaged ({error!r:.120})") from error
+        raise FlightError(f"telemetry of the log is damaged: {described(error)}") from error
     withheld = plain.get("withheld") is True
     return LoggedView(index, number, frame, telemetry, picture, latency_ms, withheld)
 
@@ -293,7 +293,7 @@ def camera_of(plain: Any) -> Camera:
     except CameraError:
         raise
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise FlightError(f"camera of the log is damaged ({error!r:.120})") from error
+        raise FlightError(f"camera of the log is damaged: {described(error)}") from error
 
 
 def calibration_message(camera: Camera, time_ns: int) -> bytes:
@@ -399,7 +399,7 @@ def _float_or_none(value: float | None) -> float | None:
 
 
 def _number(value: Any) -> float:
-    if isinstance(value, str):
+    if isinstance(value, str) and value in _WORDS:
         return _WORDS[value]
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"{value!r:.40} is not a number")

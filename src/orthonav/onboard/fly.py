@@ -36,7 +36,7 @@ from orthonav.onboard.health import (
 from orthonav.onboard.latency import Latency, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.publisher import Publisher
-from orthonav.onboard.run import Locator, locate_view
+from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
 from orthonav.onboard.telemetry import Clocks, VehicleState
 from orthonav.publish.estimate import error_ellipse
 from orthonav.publish.mavlink import dialect
@@ -101,6 +101,7 @@ class FlyOptions:
     `accept`: criterion in addition to those of the gate.
     `min_confidence`: confidence (0 to 1) from which a position is saved and counts as confident.
     `map_path`: map file to watch for changes; None: none.
+    `map_change`: how the open map file was changed in place, None if it was not.
     `state_path`: file for the last position; None: none.
     `logged_options`: written to the flight log for a replay.
     """
@@ -114,6 +115,7 @@ class FlyOptions:
     accept: Acceptance | None = None
     min_confidence: float = CONFIDENT
     map_path: Path | None = None
+    map_change: Callable[[], str | None] = lambda: None
     state_path: Path | None = None
     logged_options: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
@@ -154,7 +156,7 @@ class Runner:
         self._saved: states.SavedState | None = None
         self._mismatch = 0.0, 0.0
         self._utc_ahead_ns = clocks.utc_ns() - clocks.mono_ns()
-        self._seen = {"jumps": 0, "outages": 0, "failed": 0, "lost": 0}
+        self._seen = {"jumps": 0, "outages": 0, "failed": 0, "lost": 0, "slow": 0}
         self._map_id = _file_id(options.map_path)
         self._boot_id = states.boot_id()
 
@@ -202,7 +204,7 @@ class Runner:
                 image, exposed_ns=arrived_ns - delay_ns, time_ns=image.time_ns - delay_ns
             )
         vehicle, camera = VehicleState(None), self._camera
-        refused = self._bad_image(image)
+        refused = self._map_changed() or self._bad_image(image)
         if refused is None and image.grey is not None:
             try:
                 height, width = image.grey.shape
@@ -288,7 +290,7 @@ class Runner:
             outcome = self._refusal("wrong_camera", "wrong_camera", str(error))
             latency_ms = math.nan
         self._count("processed")
-        if isinstance(outcome, NoFix) and outcome.reason == "internal_error":
+        if isinstance(outcome, NoFix) and outcome.reason in ("internal_error", MAP_DAMAGED):
             self._count("internal_error")
         if latency is not None and isinstance(outcome, Fix):
             outcome = _with_latency(outcome, telemetry, latency.std_s)
@@ -303,7 +305,7 @@ class Runner:
         self._note(result, telemetry, image.exposed_ns)
         if self._diagnosis is not None:
             corrected = self.options.mount.corrected(telemetry) if self.options.mount else telemetry
-            found = result.state not in ("searching", "lost") and isinstance(outcome, Fix)
+            found = result.state in (None, "tracking") and isinstance(outcome, Fix)
             self._diagnosis.observe(replace(view, telemetry=corrected), found, now_ns)
         return result
 
@@ -329,6 +331,15 @@ class Runner:
     def _result(self, image: CameraImage, outcome: Fix | NoFix, latency_ms: float) -> ViewResult:
         state = self._locator.state_name
         return ViewResult(image.frame, image.time_ns, outcome, latency_ms, state)
+
+    def _map_changed(self) -> NoFix | None:
+        """Reason to give no position where the map file was changed in place; None if it was not.
+
+        Parts of the map that are in memory would still give positions; they stop all the same, so
+        that the fault shows at once and not where the aircraft leaves these parts.
+        """
+        change = self.options.map_change()
+        return None if change is None else NoFix(MAP_CHANGED, f"map file was changed: {change}")
 
     def _bad_image(self, image: CameraImage) -> NoFix | None:
         """Reason why an image cannot be used; None if it can."""
@@ -404,17 +415,20 @@ class Runner:
 
     def _count_changes(self) -> None:
         """Count what the link, the camera, the outputs and the log counted since the last call."""
+        messenger = self._publisher.messenger
         now = {
             "jumps": 0 if self._link is None else self._link.sync.jumps,
             "outages": self._newest.outages,
             "failed": self._publisher.failed,
             "lost": 0 if self._sink is None else sum(self._sink.lost.values()),
+            "slow": 0 if messenger is None else messenger.too_slow,
         }
         names = {
             "jumps": "clock_jump",
             "outages": "camera_lost",
             "failed": "output_failed",
             "lost": "log_failed",
+            "slow": "slow_vision",
         }
         for key, name in names.items():
             if now[key] > self._seen[key]:
@@ -448,6 +462,7 @@ class Runner:
             state=state,
             synced=link.synced if link else True,
             map_unchanged=_file_id(self.options.map_path) == self._map_id,
+            map_intact=self.options.map_change() is None,
             heading_mismatch_deg=heading_deg,
             log_scale_mismatch=log_scale,
             latency=self._latency_reason(),

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__
-from orthonav.errors import CameraError, OutputError
+from orthonav.errors import CameraError, OutputError, described
 from orthonav.extras import needed
 from orthonav.flight.fixes import result_to_json
 from orthonav.flight.logged import (
@@ -293,7 +293,7 @@ class FlightLog:
                 if closing:
                     self._end_segment()
             except Exception as error:  # must not end the log
-                self._lose("messages", repr(error), len(taken))
+                self._lose("messages", described(error), len(taken))
                 self._segment = None
             if closing:
                 return
@@ -302,7 +302,7 @@ class FlightLog:
         try:
             return waiting.make()
         except Exception as error:
-            self._lose("views" if waiting.has_view else "messages", repr(error))
+            self._lose("views" if waiting.has_view else "messages", described(error))
             return []
 
     def _write(self, messages: "list[Message]") -> None:
