@@ -72,6 +72,11 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     sink = _sink(options, camera)
     if options.ros2 and sink is not None:
         source.log_gnss = sink.gnss
+    gnss = None
+    if options.gnss != "off":  # only where it is asked for
+        made = importlib.import_module("orthonav.cli.flying_gnss").gnss_watch
+        queue = source.gnss if options.ros2 else None if link is None else link.gnss
+        gnss = made(options, localizer.sheet.frame, queue, least, sink, clocks)
     thread = CameraThread(source, stopping)
     stack.callback(thread.stop)
     fly = FlyOptions(
@@ -99,6 +104,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         diagnosis=TelemetryDiagnosis(localizer, least),
         start=_start(options, clocks),
         notifier=Notifier(),
+        gnss=gnss,
     )
 
 

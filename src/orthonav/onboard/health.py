@@ -98,6 +98,7 @@ class Snapshot:
     `synced`: whether TIMESYNC is answered.
     `map_unchanged`: whether the map file is still the one that was opened.
     `heading_mismatch_deg`, `log_scale_mismatch`: see `mismatch`.
+    `gnss`: reasons of the GNSS monitor.
     """
 
     running_s: float
@@ -112,6 +113,7 @@ class Snapshot:
     map_unchanged: bool = True
     heading_mismatch_deg: float = 0.0
     log_scale_mismatch: float = 0.0
+    gnss: tuple[str, ...] = ()
 
 
 def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
@@ -146,6 +148,7 @@ def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
         "log_failed": count["log_failed"] > 0,
         "state_not_saved": count["state_failed"] > 0,
         "internal_error": count["internal_error"] > 0 and not failed["internal_errors"],
+        **dict.fromkeys(seen.gnss, True),
     }
     worst = tuple(name for name, applies in failed.items() if applies)
     others = tuple(name for name, applies in degraded.items() if applies)
