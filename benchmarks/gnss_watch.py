@@ -27,7 +27,7 @@ from orthonav.onboard.gnss.records import (
     State,
 )
 from orthonav.simulate.motion import gauss_markov
-from orthonav.simulate.receiver import GnssTrack, receiver_of, samples_of, solutions
+from orthonav.simulate.receiver import RATE_HZ, GnssTrack, receiver_of, samples_of, solutions
 
 FRAME = LocalFrame(48.0, 2.0)
 SPEED_MPS, LEG_M, TURN_RADIUS_M = 20.0, 2000.0, 100.0
@@ -179,13 +179,13 @@ def watched(
 
 
 def false_alarms(
-    hours: float, seed: int, receiver: str, errors: MapErrors
+    hours: float, seed: int, receiver: str, errors: MapErrors, *, rate_hz: float = RATE_HZ
 ) -> tuple[list[tuple[float, GnssStatus]], GnssStatus]:
     """Alarms (time, status) of a receiver without a fault, and the last status."""
     rng = np.random.default_rng([seed, 0])
     path = lawnmower(hours * 3600)
     positions = map_positions(path, errors, rng)
-    solved = solutions(receiver_of(receiver), path.times_s, path.en_m, rng)
+    solved = solutions(receiver_of(receiver), path.times_s, path.en_m, rng, rate_hz)
     alarms: list[tuple[float, GnssStatus]] = []
 
     def changed(at_s: float, status: GnssStatus) -> bool:
@@ -198,14 +198,17 @@ def false_alarms(
     return alarms, monitor.status
 
 
-def delay(text: str, seed: int, errors: MapErrors) -> tuple[float, float, Fault | None]:
+def delay(
+    text: str, seed: int, errors: MapErrors, *, at_s: float = FAULT_AT_S, for_s: float = LONGEST_S
+) -> tuple[float, float, Fault | None]:
     """Seconds from a fault to its alarm, to its last name, and that name; NaN without an alarm.
 
     The last name is that of 10 s after the alarm: a sudden step is a jump at first.
+    The fault begins at `at_s` or up to 250 s later, and is watched `for_s`.
     """
     rng = np.random.default_rng([seed, 1])
-    at_s = FAULT_AT_S + rng.uniform(0, 250)
-    path = lawnmower(at_s + LONGEST_S)
+    at_s += rng.uniform(0, 250)
+    path = lawnmower(at_s + for_s)
     positions = map_positions(path, replace(errors, gaps_per_hour=0.0), rng)
     name, _, rest = text.partition(":")
     values = [rest, f"at_s={at_s}"]

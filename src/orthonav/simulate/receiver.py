@@ -208,16 +208,20 @@ def receiver_of(text: str) -> Good:
 
 
 def solutions(
-    receiver: Good, times_s: Array, places_en_m: Array, rng: np.random.Generator
+    receiver: Good,
+    times_s: Array,
+    places_en_m: Array,
+    rng: np.random.Generator,
+    rate_hz: float = RATE_HZ,
 ) -> GnssTrack:
-    """Solutions along true positions (M, 2) at times (M,), `RATE_HZ` of them a second."""
+    """Solutions along true positions (M, 2) at times (M,), `rate_hz` of them a second."""
     end_s = float(times_s[-1])
-    count = int((end_s - times_s[0]) * RATE_HZ) + 1
-    times = times_s[0] + np.arange(count) / RATE_HZ
+    count = int((end_s - times_s[0]) * rate_hz) + 1
+    times = times_s[0] + np.arange(count) / rate_hz
     place = _interpolated(times - LATENCY_S, times_s, places_en_m)
     before = _interpolated(times - LATENCY_S - 0.5, times_s, places_en_m)
     after = _interpolated(times - LATENCY_S + 0.5, times_s, places_en_m)
-    step_s = 1 / RATE_HZ
+    step_s = 1 / rate_hz
     slow = receiver.std_m * gauss_markov(step_s / ERROR_TAU_S, count, rng)
     place = place + slow + _multipath(times, rng) + rng.normal(0, NOISE_STD_M, (count, 2))
     velocity = after - before + rng.normal(0, VELOCITY_NOISE_MPS, (count, 2))

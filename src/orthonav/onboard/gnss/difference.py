@@ -52,7 +52,7 @@ class DifferenceModel:
     latency_std_s: float = 0.15
     multipath_m: float = 8.0
     sigmas: float = 5.0
-    step_ages: tuple[int, ...] = (2, 3, 4, 6, 8)
+    step_ages: tuple[int, ...] = (2, 3, 4, 5, 6, 8)
     ramp_ages_s: tuple[float, ...] = (12.0, 18.0, 24.0, 32.0, 40.0, 50.0)
 
 
@@ -123,7 +123,7 @@ class DifferenceWindow:
         return np.array([each.en_m for each in self._new if each.time_s > begin]).reshape(-1, 2)
 
     def finding(self, known: Displacement) -> Finding | None:
-        """The most significant fault, given what is known of the displacement; None without one."""
+        """The likeliest change that is a fault, given what is known of the displacement; None without one."""
         values = self.values
         count = len(values)
         if count < 3:
@@ -143,24 +143,14 @@ class DifferenceWindow:
         along = np.einsum("ka,kab,kb->k", sizes, covariance, sizes)
         std = np.sqrt(along) / np.maximum(length, 1e-9)
         excess = (length - self.model.multipath_m) / std
-        best = int(np.argmax(excess))
-        if excess[best] <= self.model.sigmas:
+        likelihood = np.einsum("ka,kab,kb->k", sizes, information, sizes)
+        likelihood[excess <= self.model.sigmas] = 0.0
+        best = int(np.argmax(likelihood))
+        if likelihood[best] == 0:
             return None
         fault, onset = named[best]
         east, north = sizes[best].tolist()
         return Finding(fault, onset, (east, north), float(std[best]), float(excess[best]))
-
-    def anchor(self, known: Displacement, before_s: float) -> Displacement:
-        """Displacement by the values before a time, and what is known of it."""
-        early = [each for each in self.values if each.time_s < before_s]
-        if len(early) < 3:
-            return known
-        off = (np.array([each.en_m for each in early]) - known.en_m).reshape(-1)
-        gain = known.std_m**2 * np.tile(np.eye(2), len(early))
-        weights = np.linalg.solve(_covariance(early, self.model, known), gain.T).T
-        east, north = (known.en_m + weights @ off).tolist()
-        left = known.std_m**2 * np.eye(2) - weights @ gain.T
-        return Displacement(east, north, math.sqrt(float(np.trace(left)) / 2), known.agreed_s)
 
     def _signatures(self, times: Array) -> tuple[Array, list[tuple[Fault, float]]]:
         """Unit changes (N, K): constant, steps, and ramps that end at 1; their names and onsets."""

@@ -4,6 +4,7 @@ Deterministic: it is fed with values and times, and reads no clock.
 """
 
 import math
+from bisect import bisect_left
 from collections import deque
 from dataclasses import replace
 
@@ -42,6 +43,8 @@ MAP_JUMP_M, MAP_JUMP_SIGMAS = 15.0, 3.0
 """The map jumped where its position leaves the track's velocity by more than both together."""
 MAP_JUMP_S = 60.0
 """A change so soon after a jump of the map is not attributed to GNSS."""
+HISTORY_S, HISTORY = 5.0, 100
+"""Interval and number of differences that are kept for the agreement after a fault."""
 _LEFT = {
     Fault.JUMP: Fault.STEP,
     Fault.LOST: Fault.OFFSET,
@@ -49,6 +52,8 @@ _LEFT = {
     Fault.VELOCITY: Fault.OFFSET,
 }
 """Name of a difference that is left where a fault of the receiver itself has ended."""
+SOLVED = 30
+"""Solutions that are kept for exposures before the newest: 3 s at 10 Hz."""
 PENDING = 100
 """Most map positions that wait for the GNSS solution after them."""
 
@@ -67,7 +72,7 @@ class GnssMonitor:
         self._receiver, self._window = Receiver(), DifferenceWindow(self._model)
         self._learner = DisplacementLearner(start, self._model)
         self._pending: deque[MapPosition] = deque(maxlen=PENDING)
-        self._before: tuple[GnssSample, Array] | None = None
+        self._solved: deque[tuple[GnssSample, Array]] = deque(maxlen=SOLVED)
         self._bin: list[Difference] = []
         self._map: MapPosition | None = None
         self._held: MapPosition | None = None
@@ -75,6 +80,7 @@ class GnssMonitor:
         self._anchor = start
         self._agreed_s, self._newest_s = 0.0, -math.inf
         self._fault_ns = self._velocity_ns = -(10**12)
+        self._history: deque[Difference] = deque(maxlen=HISTORY)
         self._recent: deque[MapPosition] = deque(maxlen=PENDING)
         self.status = GnssStatus(displacement=start)
 
@@ -82,8 +88,10 @@ class GnssMonitor:
         """Add a solution of the receiver."""
         en_m = np.asarray(self._frame.en_from_latlon(sample.lat_deg, sample.lon_deg))
         if self._receiver.add(sample, en_m):
-            self._pair(sample, en_m)
-            self._before = sample, en_m
+            if self._solved and sample.time_ns <= self._solved[-1][0].time_ns:
+                self._solved.clear()  # the clock went back
+            self._solved.append((sample, en_m))
+            self._pair(sample.arrived_ns)
         self.tick(sample.arrived_ns)
 
     def position(self, position: MapPosition) -> None:
@@ -94,15 +102,18 @@ class GnssMonitor:
                 self._held = position
                 return
             self._map_jump_ns = position.time_ns  # two positions agree on the new place
+            self._recent.clear()
             self._forget()
         self._held, self._map = None, position
         self._pending.append(position)
         self._recent.append(position)
+        self._pair(position.time_ns)
 
     def tick(self, now_ns: int) -> GnssStatus:
         """Judge the receiver at a time; the status."""
         fault = self._receiver.fault(now_ns, self._speed_mps(now_ns))
-        if fault is None and (now_ns - self._velocity_ns) * NANOSECONDS >= BIN_S:
+        named = self.status.fault in (None, Fault.VELOCITY)  # a jump contradicts the velocity too
+        if fault is None and named and (now_ns - self._velocity_ns) * NANOSECONDS >= BIN_S:
             self._velocity_ns = now_ns
             fault = self._velocity_fault()
         if fault is not None:
@@ -110,21 +121,28 @@ class GnssMonitor:
             self._alarm(fault, now_ns, None)
         return self.status
 
-    def _pair(self, sample: GnssSample, en_m: Array) -> None:
-        """Differences at the exposures up to this sample."""
-        before = self._before
-        while self._pending and self._pending[0].time_ns <= sample.time_ns:
-            position = self._pending.popleft()
-            if before is None or position.time_ns < before[0].time_ns:
+    def _pair(self, now_ns: int) -> None:
+        """Differences at the exposures up to the newest sample."""
+        while self._solved and self._pending:
+            position = self._pending[0]
+            if position.time_ns > self._solved[-1][0].time_ns:
+                return
+            self._pending.popleft()
+            times = [sample.time_ns for sample, _ in self._solved]
+            after = bisect_left(times, position.time_ns)
+            if after == 0 and times[0] > position.time_ns:
                 continue
-            interval_ns = sample.time_ns - before[0].time_ns
-            if not 0 < interval_ns * NANOSECONDS <= GAP_S:
+            sample, en_m = self._solved[after]
+            earlier, earlier_m = self._solved[max(after - 1, 0)]
+            interval_ns = sample.time_ns - earlier.time_ns
+            if interval_ns * NANOSECONDS > GAP_S:
                 continue
-            weight = (position.time_ns - before[0].time_ns) / interval_ns
-            at_exposure = (1 - weight) * before[1] + weight * en_m
-            self._add(position, at_exposure - position.en_m, sample)
+            ahead_ns = position.time_ns - earlier.time_ns
+            weight = ahead_ns / interval_ns if interval_ns else 1.0
+            at_exposure = (1 - weight) * earlier_m + weight * en_m
+            self._add(position, at_exposure - position.en_m, sample, now_ns)
 
-    def _add(self, position: MapPosition, off_en_m: Array, sample: GnssSample) -> None:
+    def _add(self, position: MapPosition, off_en_m: Array, sample: GnssSample, now_ns: int) -> None:
         velocity = position.vel_en_mps
         if velocity is None:
             velocity = np.array(sample.vel_en_mps or (0.0, 0.0))
@@ -134,15 +152,20 @@ class GnssMonitor:
         made = Difference(time_s, off_en_m, std_m, position.std_m, heading, velocity)
         if self._bin and math.floor(self._bin[0].time_s / BIN_S) != math.floor(time_s / BIN_S):
             value, self._bin = _median(self._bin), []
-            self._judge(value, sample.arrived_ns)
+            self._judge(value, now_ns)
         self._bin.append(made)
 
     def _judge(self, value: Difference, now_ns: int) -> None:
         """Test the window with a new value."""
         if value.time_s <= self._newest_s:
             self._window.clear()  # the clock went back
+            self._history.clear()
         self._newest_s = value.time_s
         self._window.add(value)
+        if self.status.state in (State.WAITING, State.GOOD) and (
+            not self._history or value.time_s - self._history[-1].time_s >= HISTORY_S
+        ):
+            self._history.append(value)
         recent = self._window.recent(RECENT_S)
         east, north = recent.mean(axis=0).tolist()
         self.status = replace(self.status, difference_en_m=(east, north))
@@ -185,7 +208,8 @@ class GnssMonitor:
         """Raise an alarm: learning stops, and what waits to be learnt is discarded."""
         if self.status.state in (State.WAITING, State.GOOD):
             begin_s = now_ns * NANOSECONDS if found is None else found.onset_s
-            self._anchor = self._window.anchor(self._learner.learnt, begin_s)
+            is_old = found is not None and found.fault is Fault.OFFSET
+            self._anchor = self._learner.learnt if is_old else self._anchor_before(begin_s)
         if self.status.state is State.ALARM and (
             self.status.fault is fault or (fault is Fault.JUMP and self.status.fault is Fault.STEP)
         ):
@@ -195,6 +219,22 @@ class GnssMonitor:
         size = (math.nan, math.nan) if found is None else found.en_m
         self.status = replace(self.status, fault=fault, fault_en_m=size)
         self._enter(State.ALARM, now_ns)
+
+    def _anchor_before(self, begin_s: float) -> Displacement:
+        """Difference with which GNSS has to agree after a fault that began at `begin_s`.
+
+        It joins what was learnt and the differences before the fault.
+        """
+        known, values = self._learner.learnt, [*self._history, *self._window.values]
+        before = [each for each in values if each.time_s < begin_s - HISTORY_S] or values[:1]
+        if not before:
+            return known
+        off = np.median([each.en_m for each in before], axis=0)
+        gnss_m = max(before[-1].gnss_std_m, self._model.gnss_std_m)
+        variance_m2 = gnss_m**2 + before[-1].map_std_m ** 2
+        gain = known.std_m**2 / (known.std_m**2 + variance_m2)
+        east, north = (known.en_m + gain * (off - known.en_m)).tolist()
+        return Displacement(east, north, known.std_m * math.sqrt(1 - gain), known.agreed_s)
 
     def _enter(self, state: State, now_ns: int) -> None:
         if state is State.ALARM:
