@@ -53,7 +53,7 @@ FAULTS = {
     "no fix": "jam",
     "no messages": "jam:silent=1",
 }
-"""Faults by name, as for `orthonav simulate --gnss`."""
+"""Faults by name, as for `orthonav simulate --receiver`."""
 Array = NDArray[np.float64]
 
 

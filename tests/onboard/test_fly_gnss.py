@@ -51,7 +51,7 @@ class Watched(Flight):
     def talk(self):
         super().talk()
         now = self.time.now_ns
-        lat, lon = FRAME.latlon_from_en(self.off_m + [0.0, self.north_at(now)])
+        lat, lon = FRAME.latlon_from_en(np.add(self.off_m, [0.0, self.north_at(now)]))
         values = {"lat": round(float(lat) * 1e7), "lon": round(float(lon) * 1e7), "alt": 0}
         more = {"dgps_numch": 0, "dgps_age": 0} if self.receiver == "gps2_raw" else {}
         self.hear(

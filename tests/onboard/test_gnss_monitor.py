@@ -40,7 +40,7 @@ class Air:
                 self.monitor.position(
                     MapPosition(
                         self.now_s * S + S // 2,
-                        true + [0.0, self.speed / 2] + map_m + self.rng.normal(0, 1, 2),
+                        true + np.add(map_m, (0.0, self.speed / 2)) + self.rng.normal(0, 1, 2),
                         3.0,
                         np.array([0.0, self.speed]),
                     )

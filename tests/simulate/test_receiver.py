@@ -77,10 +77,10 @@ def test_a_simulated_flight_has_solutions(area, tmp_path, run):
     rows = [f"{a:.8f},{b:.8f}" for a, b in zip(lat, lon, strict=True)]
     route.write_text("\n".join(["lat_deg,lon_deg", *rows]))
     flown = "simulate", "--ortho", area.past, "--agl-m", 100, "--out", tmp_path / "flight"
-    done = run(*flown, "--route", route, "--gnss", "jam:at_s=5")
+    done = run(*flown, "--route", route, "--receiver", "jam:at_s=5")
     assert done.code == 0, done.err
     samples = read_gnss(tmp_path / "flight" / "gnss.csv")
     assert {each.has_fix for each in samples if each.arrived_ns < 5e9} == {True}
     assert {each.has_fix for each in samples if each.arrived_ns >= 5e9} == {False}
-    done = run(*flown, "--random", 2, "--gnss", "good")
+    done = run(*flown, "--random", 2, "--receiver", "good")
     assert done.code == 1 and "gnss: only along a route" in done.err

@@ -88,7 +88,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--roll-bias-deg", type=float, default=0.0, help="unreported roll of the camera mount"
     )
     parser.add_argument(
-        "--gnss",
+        "--receiver",
         metavar="NAME[:KEY=VALUE,..]",
         help="write gnss.csv of a GNSS receiver along the route: good, step, drag, drift, frozen, "
         "jumping or jam (docs/reference/formats.md), such as drag:at_s=60,mps=1",
@@ -175,7 +175,7 @@ def run(options: argparse.Namespace) -> None:
         turn_radius_m=options.turn_radius_m,
         cloud_share=options.cloud_share,
         beyond=options.beyond,
-        gnss=receiver_of(options.gnss) if options.gnss else None,
+        gnss=receiver_of(options.receiver) if options.receiver else None,
     )
     with progress(options) as shown:
         views = simulate_flight(request, lambda share: shown("simulate", share))

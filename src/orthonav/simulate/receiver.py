@@ -198,7 +198,7 @@ RECEIVERS: Table = MappingProxyType(
         )
     }
 )
-"""Receivers that `orthonav simulate --gnss` knows."""
+"""Receivers that `orthonav simulate --receiver` knows."""
 
 
 def receiver_of(text: str) -> Good:

@@ -7,7 +7,6 @@ standard deviation: the generalized likelihood ratio test of Willsky and Jones (
 doi:10.1109/TAC.1976.1101146), over a window instead of a recursion.
 """
 
-import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -123,7 +122,10 @@ class DifferenceWindow:
         return np.array([each.en_m for each in self._new if each.time_s > begin]).reshape(-1, 2)
 
     def finding(self, known: Displacement) -> Finding | None:
-        """The likeliest change that is a fault, given what is known of the displacement; None without one."""
+        """The likeliest change that is a fault; None without one.
+
+        `known`: what is known of the displacement.
+        """
         values = self.values
         count = len(values)
         if count < 3:

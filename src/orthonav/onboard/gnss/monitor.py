@@ -81,7 +81,6 @@ class GnssMonitor:
         self._agreed_s, self._newest_s = 0.0, -math.inf
         self._fault_ns = self._velocity_ns = -(10**12)
         self._history: deque[Difference] = deque(maxlen=HISTORY)
-        self._recent: deque[MapPosition] = deque(maxlen=PENDING)
         self.status = GnssStatus(displacement=start)
 
     def sample(self, sample: GnssSample) -> None:
@@ -102,11 +101,9 @@ class GnssMonitor:
                 self._held = position
                 return
             self._map_jump_ns = position.time_ns  # two positions agree on the new place
-            self._recent.clear()
             self._forget()
         self._held, self._map = None, position
         self._pending.append(position)
-        self._recent.append(position)
         self._pair(position.time_ns)
 
     def tick(self, now_ns: int) -> GnssStatus:
@@ -264,29 +261,14 @@ class GnssMonitor:
         return Finding(Fault.OFFSET, begin_s, (east, north), std_m, (off_m - LARGEST_M) / std_m)
 
     def _velocity_fault(self) -> Fault | None:
-        """Whether the receiver's velocity contradicts its positions or those of the map."""
+        """Whether the receiver's velocity contradicts its positions."""
         model = self._model
         gnss_m2 = 2 * model.gnss_std_m**2 * (1 - math.exp(-VELOCITY_S / model.gnss_tau_s))
         drift_m2 = (VELOCITY_STD_MPS * VELOCITY_S) ** 2
         own_m = self._receiver.residual_over(VELOCITY_S)
         if own_m > model.multipath_m + model.sigmas * math.sqrt(gnss_m2 + drift_m2):
             return Fault.VELOCITY
-        positions = self._recent
-        if len(positions) < 2:
-            return None
-        last = positions[-1]
-        first = next(
-            (p for p in positions if (last.time_ns - p.time_ns) * NANOSECONDS <= VELOCITY_S),
-            last,
-        )
-        begin_s, end_s = first.time_ns * NANOSECONDS, last.time_ns * NANOSECONDS
-        moved = self._receiver.moved_by_velocity(begin_s, end_s)
-        if moved is None or end_s - begin_s < VELOCITY_S / 2:
-            return None
-        off_m = float(np.hypot(*(last.en_m - first.en_m - moved)))
-        map_m2 = first.std_m**2 + last.std_m**2
-        limit_m = model.multipath_m + model.sigmas * math.sqrt(map_m2 + drift_m2)
-        return Fault.VELOCITY if off_m > limit_m else None
+        return None
 
     def _speed_mps(self, now_ns: int) -> float:
         """Speed by the map's track; NaN where it is not known or too old."""

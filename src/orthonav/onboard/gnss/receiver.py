@@ -98,14 +98,6 @@ class Receiver:
             return Fault.FROZEN
         return Fault.JUMP if self._has_jumped() else None
 
-    def moved_by_velocity(self, begin_s: float, end_s: float) -> Array | None:
-        """Integrated velocity (2,) between two times; None where it is not known."""
-        begin, end = self._integral_at(begin_s), self._integral_at(end_s)
-        if begin is None or end is None:
-            return None
-        moved = end - begin
-        return moved if np.isfinite(moved).all() else None
-
     def residual_over(self, span_s: float) -> float:
         """Distance by which positions left the integrated velocity within `span_s`; NaN unknown."""
         points = self._points
@@ -114,16 +106,6 @@ class Receiver:
         last = points[-1]
         first = points[bisect_left(points, last.time_s - span_s, key=_time_s)]
         return float(np.hypot(*(last.en_m - first.en_m - last.integral_m + first.integral_m)))
-
-    def _integral_at(self, time_s: float) -> Array | None:
-        points = self._points
-        after = bisect_left(points, time_s, key=_time_s)
-        if after == len(points) or (after == 0 and points[0].time_s > time_s):
-            return None
-        later, earlier = points[after], points[max(after - 1, 0)]
-        interval_s = later.time_s - earlier.time_s
-        weight = 1.0 if interval_s == 0 else (time_s - earlier.time_s) / interval_s
-        return (1 - weight) * earlier.integral_m + weight * later.integral_m
 
     def _point(self, time_s: float, en_m: Array, velocity: tuple[float, float] | None) -> _Point:
         vel = None if velocity is None else np.array(velocity)

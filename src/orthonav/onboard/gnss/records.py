@@ -25,7 +25,7 @@ class Fault(Enum):
     DRIFT = "gnss_drift"
     """The difference from the map grows."""
     VELOCITY = "gnss_velocity"
-    """The velocity contradicts the positions of the receiver or of the map."""
+    """The velocity contradicts the positions of the receiver."""
     OFFSET = "gnss_offset"
     """The difference from the map is too large, and did not begin within the window."""
     DISAGREES = "gnss_disagrees"

@@ -170,7 +170,10 @@ class GnssWatch:
 
     def plain(self) -> list[dict[str, Any]]:
         """Status of each receiver for the line of health."""
-        return [_plain(number, each.status) for number, each in sorted(self._monitors.items())]
+        return [
+            _plain(number, each.status, self._now_ns)
+            for number, each in sorted(self._monitors.items())
+        ]
 
     def _take(self, now_ns: int) -> None:
         self._now_ns = max(self._now_ns, now_ns) if not self._recorded else now_ns
@@ -239,12 +242,13 @@ def _polar(en_m: tuple[float, float]) -> tuple[float, float]:
     return math.hypot(east, north), math.degrees(math.atan2(east, north)) % 360
 
 
-def _plain(number: int, status: GnssStatus) -> dict[str, Any]:
+def _plain(number: int, status: GnssStatus, now_ns: int) -> dict[str, Any]:
     length, bearing = _polar(status.difference_en_m)
     known = math.isfinite(length)
     return {
         "receiver": number,
         "state": status.state.value,
+        "for_s": round((now_ns - status.since_ns) * NANOSECONDS, 1) if status.since_ns else None,
         "fault": status.fault.value if status.fault else None,
         "difference_m": round(length, 2) if known else None,
         "bearing_deg": round(bearing, 1) if known else None,
