@@ -10,10 +10,16 @@ from orthonav.errors import FlightError
 from orthonav.files import replacing, require_file
 from orthonav.flight.folder import csv_rows, number_of, time_ns_of
 from orthonav.geo.swapped import swapped_hint
+from orthonav.records import Evidence
 
 FILE = "gnss.csv"
 FIX_3D = 3
 """GPS_FIX_TYPE of MAVLink from which a position is three-dimensional."""
+FAULTS = (
+    *("gnss_lost", "gnss_frozen", "gnss_jump", "gnss_step", "gnss_drift"),
+    *("gnss_velocity", "gnss_offset", "gnss_disagrees", "gnss_returning"),
+)
+"""Reasons by the code, from 1, that evidence has as `gnss_fault`; 0 is none (docs/onboard.md)."""
 COLUMNS = ("time_s", "lat_deg", "lon_deg", "fix_type")
 OPTIONAL_COLUMNS = (
     *("solved_s", "std_m", "vel_east_mps", "vel_north_mps"),
@@ -51,6 +57,18 @@ class GnssSample:
     def has_fix(self) -> bool:
         """Whether the receiver reports a 3D fix."""
         return self.fix_type >= FIX_3D
+
+
+def gnss_of(evidence: Evidence) -> tuple[float, float] | None:
+    """Latitude and longitude of GNSS at the exposure of a view; None where not known."""
+    lat, lon = (evidence.get(f"gnss_{name}_deg", math.nan) for name in ("lat", "lon"))
+    return (lat, lon) if abs(lat) <= 90 and abs(lon) <= 360 else None
+
+
+def fault_of(evidence: Evidence) -> str:
+    """Reason of the GNSS monitor at a view; "" without a fault."""
+    code = evidence.get("gnss_fault", 0.0)
+    return FAULTS[int(code) - 1] if 1 <= code <= len(FAULTS) else ""
 
 
 def write_gnss(path: Path, samples: Iterable[GnssSample]) -> None:

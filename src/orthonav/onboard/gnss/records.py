@@ -7,6 +7,8 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.flight.gnss import FAULTS
+
 Array = NDArray[np.float64]
 NANOSECONDS = 1e-9
 
@@ -34,12 +36,12 @@ class Fault(Enum):
     @property
     def code(self) -> int:
         """Number of the fault, from 1, in evidence and NAMED_VALUE_FLOAT."""
-        return list(Fault).index(self) + 1
+        return FAULTS.index(self.value) + 1
 
 
-RETURNING = "gnss_returning"
+RETURNING = FAULTS[-1]
 """Reason in health while GNSS agrees again, but not yet for long enough."""
-RETURNING_CODE = len(Fault) + 1
+RETURNING_CODE = len(FAULTS)
 
 
 class State(Enum):
