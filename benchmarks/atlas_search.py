@@ -24,7 +24,7 @@ from benchmarks.atlas_fields import Fields, drawn_ids
 from benchmarks.inputs import Workplace
 from benchmarks.record import Section, Table, number, provenance
 from orthonav.atlas.index_manifest import Part, ShardInfo
-from orthonav.atlas.index_shards import write_shard
+from orthonav.atlas.index_shards import ShardedIndex, write_shard
 from orthonav.atlas.quantizers import (
     MAX_TRAINING_VECTORS,
     QUANTIZERS_NAME,
@@ -32,7 +32,6 @@ from orthonav.atlas.quantizers import (
     faiss,
     train,
 )
-from orthonav.atlas.vector_search import ShardedIndex
 
 QUERIES = 500
 K = 10
@@ -89,8 +88,8 @@ def build(folder: Path, count: int, recipe: VectorRecipe, fields: Fields, shards
     source = _Pieces(fields, count)
     start = time.perf_counter()
     for info in shard_infos(count, shards):
-        places_deg = np.zeros((info.rows, 2))
-        write_shard(folder, info.name, quantizers, places_deg, source.take(info.rows))
+        pieces = ((np.zeros((len(piece), 2)), piece) for piece in source.take(info.rows))
+        write_shard(folder, info.name, quantizers, pieces)
     seconds["write_s"] = time.perf_counter() - start - source.made_s
     seconds["make_s"] += source.made_s
     bytes_on_disk = sum(path.stat().st_size for path in folder.iterdir())

@@ -382,9 +382,20 @@ def test_torchrun_is_refused(run, ortho, monkeypatch):
 
 
 def test_the_help_of_a_build_is_grouped(run):
-    done = run("atlas", "build", "--help")
+    done = run("atlas", "build", "--help-all")
     for group in ("area", "sheets", "coarse tiles", "workers"):
         assert f"\n{group}" in done.out
+
+
+@pytest.mark.parametrize(
+    ("action", "everyday", "other"),
+    [("build", "--sheet-km", "--coarse-gsd-m"), ("cut", "--band-m", "--allow-holes")],
+)
+def test_the_help_shows_everyday_options_first(run, action, everyday, other):
+    short, long = (run("atlas", action, how).out for how in ("--help", "--help-all"))
+    assert everyday in short and other not in short
+    assert f"more options: orthonav atlas {action} --help-all" in " ".join(short.split())
+    assert everyday in long and other in long
 
 
 def test_an_interrupted_build_says_how_to_resume(run, ortho, tmp_path, monkeypatch):

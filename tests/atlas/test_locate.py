@@ -20,6 +20,7 @@ from orthonav.atlas.index_manifest import MANIFEST, IndexManifest, read_manifest
 from orthonav.atlas.locate import AtlasLocator, _against, rectified
 from orthonav.atlas.recipe import CoarseRecipe
 from orthonav.atlas.sheet_registration import SheetRegistrar
+from orthonav.atlas.store import Store
 from orthonav.atlas.tile_search import TileSearch
 from orthonav.errors import AtlasError
 from orthonav.flight.folder import open_flight
@@ -170,7 +171,11 @@ def test_views_of_another_scale_are_refused_with_the_reason(locator, first_view)
 def test_the_same_sheets_make_the_same_index(atlas, copied):
     shutil.rmtree(Path(copied.url, "index"))
     again = copied
-    make_index(again)
+    stages = []
+    make_index(again, lambda stage, share: stages.append((stage, share)))
+    for stage in ("learn index", "index"):
+        shares = [share for each, share in stages if each == stage]
+        assert shares == sorted(shares) and len(shares) > 1 and shares[-1] == 1
     names = sorted(atlas.store.names("index"))
     assert names == sorted(again.store.names("index"))
     for name in names:
@@ -191,7 +196,14 @@ def test_a_removed_sheet_is_retired_and_a_new_one_is_added(copied, tmp_path, mon
     assert smallest.id not in after.sheets
     assert [shard.name for shard in after.shards] == [shard.name for shard in before.shards]
     changed.put(aside, smallest)
-    again = make_index(changed)
+    fetched, stages = [], []
+    fetch = Store.fetch
+    monkeypatch.setattr(
+        Store, "fetch", lambda self, name, *rest: fetched.append(name) or fetch(self, name, *rest)
+    )
+    again = make_index(changed, lambda stage, share: stages.append((stage, share)))
+    assert sorted(name.partition("/")[0] for name in fetched) == ["coarse", "index", "index"]
+    assert stages[-1] == ("index", 1.0)
     assert len(again.shards) == len(before.shards) + 1
     assert stale_sheets(changed, again) == ([], [])
     with TileSearch(changed) as opened:

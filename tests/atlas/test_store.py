@@ -11,9 +11,7 @@ import fsspec
 import pytest
 from fsspec.implementations.local import LocalFileSystem
 
-from orthonav.atlas import cache as cache_module
-from orthonav.atlas.cache import cache_folder
-from orthonav.atlas.store import Store
+from orthonav.atlas.store import Store, cache_folder
 from orthonav.errors import MissingExtraError, StorageError
 
 
@@ -238,7 +236,7 @@ def test_a_missing_bucket_is_named(trouble, tmp_path):
 
 def test_missing_packages_are_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "adlfs", None)
-    with pytest.raises(MissingExtraError, match=r"abfs:// needs adlfs.* pip install adlfs"):
+    with pytest.raises(MissingExtraError, match=r"abfs:// needs a package .*Install adlfs"):
         Store("abfs://container/atlas")
     with pytest.raises(StorageError, match=r"invalid address .*nosuch"):
         Store("nosuch://bucket/atlas")
@@ -309,7 +307,7 @@ def test_local_files_are_not_copied(tmp_path):
 
 def test_the_least_recently_used_files_leave_the_cache(far, monkeypatch):
     monkeypatch.setenv("ORTHONAV_CACHE_GB", "25e-9")  # three files of 8 bytes
-    monkeypatch.setattr(cache_module, "GRACE_S", 50)
+    monkeypatch.setattr("orthonav.atlas.store.GRACE_S", 50)
     paths = {}
     for number, name in enumerate("bcd"):
         data = f"map of {name}".encode()

@@ -9,9 +9,8 @@ import pytest
 pytest.importorskip("faiss")
 
 from orthonav.atlas.index_manifest import Part, ShardInfo
-from orthonav.atlas.index_shards import write_shard
+from orthonav.atlas.index_shards import ShardedIndex, write_shard
 from orthonav.atlas.quantizers import QUANTIZERS_NAME, Quantizers, VectorRecipe, train
-from orthonav.atlas.vector_search import ShardedIndex
 from orthonav.errors import AtlasError
 
 DIMS, COUNT = 16, 6000
@@ -57,8 +56,10 @@ def folder(tmp_path: Path, vectors: np.ndarray, quantizers: Quantizers) -> Path:
 
 
 def write(folder: Path, name: str, quantizers: Quantizers, vectors: np.ndarray) -> None:
-    batches = (vectors[start : start + 1500] for start in range(0, len(vectors), 1500))
-    write_shard(folder, name, quantizers, places(len(vectors)), batches)
+    where = places(len(vectors))
+    parts = [slice(start, start + 1500) for start in range(0, len(vectors), 1500)]
+    rows = write_shard(folder, name, quantizers, ((where[part], vectors[part]) for part in parts))
+    assert rows == len(vectors)
 
 
 def places(count: int) -> np.ndarray:
@@ -108,7 +109,7 @@ def test_a_shard_does_not_depend_on_batches(
 ) -> None:
     stored = np.load(folder / "a.vectors.npy")
     np.testing.assert_array_equal(stored, vectors[:4000].astype(np.float16))
-    write_shard(tmp_path / "again", "a", quantizers, places(4000), [stored])
+    write_shard(tmp_path / "again", "a", quantizers, [(places(4000), stored)])
     assert (tmp_path / "again" / "a.codes").read_bytes() == (folder / "a.codes").read_bytes()
 
 
@@ -161,10 +162,10 @@ def test_impossible_vectors_are_refused(
     for batch, words in (
         (np.full((1, DIMS), np.nan, dtype=np.float32), "finite"),
         (vectors[:1, :8], "must be"),
-        (vectors[:2], "2 vectors for 1 places"),
+        (vectors[:2], r"must be \(1, 16\), got \(2, 16\)"),
     ):
         with pytest.raises(AtlasError, match=words):
-            write_shard(tmp_path, "a", quantizers, places(1), [batch])
+            write_shard(tmp_path, "a", quantizers, [(places(1), batch)])
 
 
 @pytest.mark.parametrize("name", ["a.codes", "a.lists.npy", "a.vectors.npy", "a.places.npy"])

@@ -10,16 +10,17 @@ from orthonav.check.outcome import (
     Alternative,
     BlindStretch,
     Cells,
+    CheckedInputs,
     CheckResult,
     Conditions,
     Envelope,
     Lookalike,
-    Provenance,
     Reason,
     Verdict,
     Word,
 )
 
+FILES = {"index.html", "check.json", "check.tif", "check.geojson", "figures"}
 EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)> & ünïcode \u202e'
 CONDITIONS = Conditions(
     width_m=240.0,
@@ -140,7 +141,7 @@ def made_check(frame, cells, waypoints=None, band_m=None, name="area.onav", rout
         Lookalike(places[0], places[2], math.hypot(300, 100), 0.62, 9, False),
     )
     parts = {
-        "about": Provenance(
+        "about": CheckedInputs(
             map_name=name,
             imagery="2016-07.tif 2016-07-15, 1.0 m",
             recipe="gradient, 256 px",

@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import json
+import math
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -11,16 +12,19 @@ from types import SimpleNamespace
 import made_check
 import numpy as np
 import pytest
-from made_check import EVIL, small_route
+from made_check import EVIL, FILES, small_route
 
+from orthonav.check.outcome import CELL_VALUES
 from orthonav.check.write import imagery, write_check
-from orthonav.check.write.imagery import MAX_SIDE_PX, map_image, visible_box
+from orthonav.check.write.imagery import MAX_SIDE_PX, jpeg, map_image, visible_box
 from orthonav.check.write.page import _known_cells
-from orthonav.check.write.plain import CELL_VALUES, to_plain
+from orthonav.check.write.plain import to_plain
 from orthonav.check.write.risk import segments
+from orthonav.check.write.wording import share_text
 from orthonav.mapfile import open_map
-from orthonav.report import Drawing
+from orthonav.report import Drawing, metres_text
 from orthonav.report.leaflet import load_leaflet
+from orthonav.report.page import static_text
 
 VOID = {"meta", "img", "input", "br"}
 UNDRAWN = Drawing(
@@ -31,6 +35,7 @@ UNDRAWN = Drawing(
     (1.0, 1.0),
 )
 """A figure of one pixel."""
+KINDS = {"tiny", "small_route", "long_route", "nearly_empty", "evil"}
 TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
 
 
@@ -73,7 +78,8 @@ def folder(opened, frame, tmp_path_factory):
     root = tmp_path_factory.mktemp("checks")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.report.canvas.DPI", 20)
-        write_check(small_route(frame), opened, root / "small_route")
+        path = write_check(small_route(frame), opened, root / "small_route")
+        assert path == root / "small_route" / "index.html"
         for name in ("draw_axes", "draw_figure"):  # drawing takes longest
             patch.setattr(f"orthonav.check.write.figures.{name}", lambda *_: UNDRAWN)
         for kind in ("tiny", "long_route", "nearly_empty"):
@@ -86,6 +92,13 @@ def folder(opened, frame, tmp_path_factory):
 @pytest.fixture(scope="module")
 def page(folder):
     return Page((folder / "small_route" / "index.html").read_text(encoding="utf-8"))
+
+
+def test_every_kind_of_check_is_written(folder):
+    assert {path.name for path in folder.iterdir()} == KINDS
+    for each in folder.iterdir():
+        assert {path.name for path in each.iterdir()} == FILES
+        assert (each / "index.html").stat().st_size < 4_000_000
 
 
 def test_nothing_is_asked_for(page):
@@ -135,7 +148,7 @@ def test_cells_around_a_band_cost_nothing(frame):
 
 
 def test_the_script_is_given_the_json_of_the_check(folder, frame):
-    for name in ("tiny", "small_route", "long_route", "nearly_empty", "evil"):
+    for name in KINDS:
         page = Page((folder / name / "index.html").read_text(encoding="utf-8"))
         plain = json.loads(page.inside["script"][0])
         drawn = plain.pop("drawn")
@@ -161,24 +174,24 @@ def test_all_sections_are_there(page, folder):
 def test_the_picture_lies_where_the_map_does(opened, frame):
     result = made_check.tiny(frame)
     found = map_image(opened, visible_box(result))
-    west, south, east, north = found.box
+    west, south, east, north = found.west_m, found.south_m, found.east_m, found.north_m
     rows, cols = found.grey.shape
     assert max(rows, cols) <= MAX_SIDE_PX
     assert (east - west) / cols == pytest.approx((north - south) / rows, rel=0.01)
-    assert found.jpeg()[:2] == b"\xff\xd8"
+    assert jpeg(found.grey)[:2] == b"\xff\xd8"
 
 
 def test_a_map_without_a_layer_shows_its_preview(opened, frame, monkeypatch):
     monkeypatch.setattr(imagery, "GreyLayer", SimpleNamespace(of=lambda _: None))
     found = map_image(opened, visible_box(made_check.tiny(frame)))
     grid = opened.manifest.sheets[0].grid
-    assert found.box[0] == grid.west_m and found.box[3] == grid.north_m
+    assert found.west_m == grid.west_m and found.north_m == grid.north_m
     assert max(found.grey.shape) <= 384
 
 
 def test_pictures_of_noise_stay_small():
     noise = np.random.default_rng(1).integers(0, 255, (1300, 2000), dtype=np.uint8)
-    assert len(imagery.MapImage(noise, (0.0, 0.0, 1.0, 1.0)).jpeg()) <= imagery.MAX_BYTES
+    assert len(jpeg(noise)) <= imagery.MAX_BYTES
 
 
 def test_segments_take_the_worse_end():
@@ -232,7 +245,7 @@ def visit(browser, folder):
     assert wrong == []
 
 
-@pytest.mark.parametrize("name", ["tiny", "small_route", "long_route", "nearly_empty", "evil"])
+@pytest.mark.parametrize("name", sorted(KINDS))
 def test_the_page_comes_alive(visit, name):
     page = visit(name)
     assert page.locator("html.live").count() == 1
@@ -308,6 +321,20 @@ def test_without_scripts_figures_are_shown(visit):
     assert page.locator(".still-part img").count() == 2
     assert page.locator(".still-part img").first.is_visible()
     assert not page.locator("#map").is_visible()
+
+
+def test_scripts_write_numbers_as_python_does(browser):
+    numbers = [0, 0.04, 3.26, 9.96, 35, 50.04, 99.94, 99.97, 120.4, 9999.6, 12_345, -7.5, math.nan]
+    script = static_text("format.js").replace("export ", "")
+    page = browser.new_page()
+    texts = page.evaluate(f"() => {{ {script}; return {json.dumps(numbers)}.map(metres); }}")
+    shares = [0, 0.004, 0.126, 0.996, 0.9996, 1]
+    percents = page.evaluate(f"() => {{ {script}; return {shares}.map(percent); }}")
+    page.close()
+    assert [text.replace("\N{EN DASH}", "-") for text in texts] == [
+        metres_text(each) for each in numbers
+    ]
+    assert percents == [share_text(each) for each in shares]
 
 
 def test_rules_of_accessibility(visit):

@@ -142,7 +142,7 @@ def test_a_map_without_registration(half_blank, tmp_path, monkeypatch):
 
 def test_pictures_know_where_their_middle_is(plan, registration):
     layer = registration.pyramid
-    pictures = views.MapCrops(layer, registration)
+    pictures = views.MapCrops(layer, registration.grid)
     grid = registration.grid
     for level in (0, 1):
         grey, valid, middle = pictures.around(WEST[0], 60, level)
@@ -158,7 +158,7 @@ def test_pictures_know_where_their_middle_is(plan, registration):
 
 def test_donors_are_mirrored_ground(registration):
     layer = registration.pyramid
-    pictures = views.MapCrops(layer, registration)
+    pictures = views.MapCrops(layer, registration.grid)
     rng = np.random.default_rng(1)
     found = pictures.donor(rng, 200, 0)
     rng = np.random.default_rng(1)

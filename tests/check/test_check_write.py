@@ -11,7 +11,7 @@ from dataclasses import replace
 import made_check
 import numpy as np
 import pytest
-from made_check import EVIL, lost_in, made_cells, small_route
+from made_check import EVIL, FILES, lost_in, made_cells, small_route
 
 from orthonav.check.outcome import Conditions
 from orthonav.check.write import require_free, write_check
@@ -19,14 +19,12 @@ from orthonav.check.write.plain import to_json, to_plain
 from orthonav.check.write.raster import tif_bytes
 from orthonav.check.write.shapes import features, to_geojson
 from orthonav.check.write.text import text
-from orthonav.check.write.wording import tolerance_sentence
 from orthonav.errors import MissingExtraError, OutputError
 from orthonav.geo.frames import LocalFrame
 from orthonav.mapfile import open_map
 from orthonav.report import Drawing
 
 KINDS = ("tiny", "small_route", "long_route", "nearly_empty")
-FILES = {"index.html", "check.json", "check.tif", "check.geojson", "figures"}
 FRAME = LocalFrame(48.2, -3.1)
 
 
@@ -77,15 +75,6 @@ def tree(folder):
     return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_of_check_is_written(kind, opened, frame, tmp_path, undrawn):
-    page = write_check(getattr(made_check, kind)(frame), opened, tmp_path / "check")
-    assert page == tmp_path / "check" / "index.html"
-    assert {path.name for path in page.parent.iterdir()} == FILES
-    assert page.stat().st_size < 4_000_000
-    assert [p.name for p in tmp_path.iterdir()] == ["check"]
-
-
 def test_the_same_check_gives_the_same_bytes(written, opened, tmp_path, monkeypatch):
     monkeypatch.setattr("orthonav.report.canvas.DPI", 20)
     result, folder = written
@@ -121,7 +110,7 @@ def test_json_holds_what_was_found():
 
 
 def test_unknown_values_are_null():
-    unknown = Conditions(240, 180, None, None, 0.05, None, 0.9, 35, 20, 0.02)
+    unknown = Conditions(240, 180, 200.0, None, 0.05, None, 0.9, 35, 20, 0.02)
     plain = to_plain(made_check.nearly_empty(FRAME))
     assert plain["cells"]["probability"][0][0] is None and plain["route"] is None
     empty = lost_in(made_cells(4, 4, 50.0), np.ones((4, 4), bool))
@@ -134,7 +123,7 @@ def test_unknown_values_are_null():
 
 def test_a_check_of_nothing_is_written(opened, frame, tmp_path, undrawn):
     empty = lost_in(made_cells(4, 4, 50.0), np.ones((4, 4), bool))
-    unknown = Conditions(240, 180, None, None, 0.05, None, 0.9, 35, 20, 0.02)
+    unknown = Conditions(240, 180, 200.0, None, 0.05, None, 0.9, 35, 20, 0.02)
     result = made_check.made_check(frame, empty, conditions=unknown, lookalikes=())
     page = write_check(result, opened, tmp_path / "check")
     written = page.read_text(encoding="utf-8")
@@ -373,11 +362,6 @@ def test_text_holds_verdict_and_figures():
     assert any(line.startswith("area ") and "1.00 km2" in line for line in said)
     table = [line for line in said if "recovers" in line or "ends in it" in line]
     assert len({line.index(" m  ") for line in table}) == 1
-
-
-def test_an_unknown_tolerance_is_reported():
-    unknown = replace(made_check.envelope(), tolerated_yaw_deg=math.nan)
-    assert "unknown" in tolerance_sentence(unknown)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -11,7 +11,10 @@ import servers
 import terrain
 from servers import QUICK
 
-from orthonav.fetch import FetchRequest, ImageryOptions, Packing, fetch, parse_source
+from orthonav.fetch.options import ImageryOptions
+from orthonav.fetch.run import FetchRequest, fetch
+from orthonav.fetch.sources import parse_source
+from orthonav.fetch.write import Packing
 from orthonav.geo.area import Area
 
 MAPPROXY = """

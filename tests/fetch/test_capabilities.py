@@ -11,12 +11,13 @@ import pytest
 
 from orthonav.errors import FetchError
 from orthonav.fetch import wms, wmts
+from orthonav.fetch.client import Client
 from orthonav.fetch.crs import MERCATOR_HALF_M
 from orthonav.fetch.documents import parse_xml
 from orthonav.fetch.options import ImageryOptions, Provenance
 from orthonav.fetch.presets import presets
 from orthonav.fetch.wms import wms_cells
-from orthonav.fetch.wmts_tiles import wmts_tiles
+from orthonav.fetch.wmts import wmts_tiles
 from orthonav.geo.frames import LocalFrame
 
 FOLDER = Path(__file__).parent / "capabilities"
@@ -29,15 +30,21 @@ PLACES = {
 }
 
 
+CLIENT = Client()
+
+
 def document(name):
-    body = (FOLDER / f"{name}.xml").read_bytes()
-    parse_xml(body)
-    return body
+    return parse_xml((FOLDER / f"{name}.xml").read_bytes())
 
 
 def tiles(name, options, url="https://a.example/wmts"):
-    service = wmts.read_capabilities(document(f"{name}_wmts"), url)
-    return wmts_tiles(service, options, PLACES.get(name, PLACES["ign"]), PROVENANCE)
+    layer = wmts.read_layer(CLIENT, document(f"{name}_wmts"), url, options.layer)
+    return wmts_tiles(layer, options, PLACES.get(name, PLACES["ign"]), PROVENANCE)
+
+
+def cells(name, url, options, place):
+    layer = wms.read_layer(CLIENT, document(name), url, options.layer)
+    return wms_cells(layer, options, place, PROVENANCE)
 
 
 def of_preset(name, id_, **rest):
@@ -125,15 +132,15 @@ def test_a_grid_in_degrees_has_the_latitude_first():
 
 
 def test_ign_wms_in_lambert():
-    service = wms.read_capabilities(document("ign_wms"), "https://data.geopf.fr/wms-r/wms")
-    source = wms_cells(service, of_preset("ign-wms", "2021", gsd_m=0.5), PLACES["ign"], PROVENANCE)
+    url = "https://data.geopf.fr/wms-r/wms"
+    source = cells("ign_wms", url, of_preset("ign-wms", "2021", gsd_m=0.5), PLACES["ign"])
     assert source.url_of(-12891, 1367) == (
         "https://data.geopf.fr/wms-r/wms?SERVICE=WMS&VERSION=1.3.0&REQUEST=GetMap"
         "&LAYERS=ORTHOIMAGERY.ORTHOPHOTOS2021&STYLES=&CRS=EPSG:2154&WIDTH=1024&HEIGHT=1024"
         "&FORMAT=image/jpeg&TRANSPARENT=FALSE&BBOX=699904,6599680,700416,6600192"
     )
     degrees = of_preset("ign-wms", "2021", crs="EPSG:4326", format="image/png")
-    source = wms_cells(service, degrees, PLACES["ign"], PROVENANCE)
+    source = cells("ign_wms", url, degrees, PLACES["ign"])
     south, west, _, _ = map(
         float, source.url_of(*cell_at(source, 3.0, 46.5))[-80:].split("=")[-1].split(",")
     )
@@ -148,16 +155,15 @@ def cell_at(source, x, y):
 
 
 def test_an_old_wms_with_times():
-    service = wms.read_capabilities(document("old_wms"), "http://maps.example/wms")
+    url, place = "http://maps.example/wms", LocalFrame(51.5, 8.0)
     options = ImageryOptions(layer="ortho", time="2018", gsd_m=0.5)
-    source = wms_cells(service, options, LocalFrame(51.5, 8.0), PROVENANCE)
-    url = source.url_of(0, 0)
-    assert url.startswith("http://maps.example/cgi?map=/srv/ortho.map&SERVICE=WMS&VERSION=1.1.1")
-    assert "SRS=EPSG:25832" in url and "TIME=2018" in url
+    source = cells("old_wms", url, options, place)
+    address = source.url_of(0, 0)
+    start = "http://maps.example/cgi?map=/srv/ortho.map&SERVICE=WMS&VERSION=1.1.1"
+    assert address.startswith(start)
+    assert "SRS=EPSG:25832" in address and "TIME=2018" in address
     with pytest.raises(FetchError, match="no time 2019; available: 2015, 2018, 2021"):
-        wms_cells(
-            service, ImageryOptions(layer="ortho", time="2019"), LocalFrame(51.5, 8.0), PROVENANCE
-        )
+        cells("old_wms", url, ImageryOptions(layer="ortho", time="2019"), place)
 
 
 BOMB = b"""<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "bbbbbbbbbb"><!ENTITY c "&b;&b;&b;">]>
@@ -181,21 +187,19 @@ def test_harmful_documents_are_rejected(body, words):
         parse_xml(body)
 
 
+def refused(module, body, words):
+    with pytest.raises(FetchError, match=words):
+        module.read_layer(CLIENT, parse_xml(body), "http://a/b", None)
+
+
 def test_a_deeply_nested_document_is_rejected():
     layers = b"<Layer>" * 5000 + b"</Layer>" * 5000
-    with pytest.raises(FetchError, match="cannot be read"):
-        wms.read_capabilities(
-            b"<WMS_Capabilities version='1.3.0'>" + layers + b"</WMS_Capabilities>", "http://a/b"
-        )
-    with pytest.raises(FetchError, match="cannot be read"):
-        wmts.read_capabilities(
-            b"<Capabilities version='1.0.0'>" + layers + b"</Capabilities>", "http://a/b"
-        )
+    body = b"<WMS_Capabilities version='1.3.0'>" + layers + b"</WMS_Capabilities>"
+    refused(wms, body, "cannot be read")
+    refused(wmts, b"<Capabilities version='1.0.0'>" + layers + b"</Capabilities>", "cannot be read")
 
 
 @pytest.mark.parametrize("body", [b"<a/>", b"<WMS_Capabilities version='2.0'/>"])
 def test_other_documents_are_rejected(body):
-    with pytest.raises(FetchError, match=r"cannot be read|lists no layer"):
-        wmts.read_capabilities(body, "http://a/b")
-    with pytest.raises(FetchError, match=r"supported versions of WMS are 1\.1\.1 and 1\.3\.0"):
-        wms.read_capabilities(body, "http://a/b")
+    refused(wmts, body, "cannot be read|lists no layer")
+    refused(wms, body, r"supported versions of WMS are 1\.1\.1 and 1\.3\.0")

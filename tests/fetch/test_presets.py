@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from orthonav.errors import FetchError
-from orthonav.fetch import ImageryOptions, parse_source
+from orthonav.fetch.options import ImageryOptions
 from orthonav.fetch.presets import CURRENT, PROTOCOLS, find_preset, presets
-from orthonav.fetch.sources import check_date
+from orthonav.fetch.sources import check_date, parse_source
 from orthonav.fetch.urls import checked_url
 
 DOCUMENTATION = Path(__file__).parents[2] / "docs" / "imagery.md"

@@ -11,9 +11,9 @@ import terrain
 from pyproj import Transformer
 
 from orthonav.errors import FetchError
-from orthonav.fetch import Packing
 from orthonav.fetch.client import Client
 from orthonav.fetch.remote import CHUNK, RemoteFile
+from orthonav.fetch.write import Packing
 from orthonav.geo.area import Area
 
 UTM = "EPSG:32631"
@@ -255,7 +255,9 @@ def test_an_interface_with_a_search_in_pages(take, placed, catalogue):
 
 def test_signed_files(catalogue, tmp_path):
     """A query string that a signing service gives goes to the files' server, and nowhere else."""
-    from orthonav.fetch import FetchRequest, ImageryOptions, fetch, parse_source
+    from orthonav.fetch.options import ImageryOptions
+    from orthonav.fetch.run import FetchRequest, fetch
+    from orthonav.fetch.sources import parse_source
 
     url = []
     with servers.serving(searching(catalogue, url, [])) as server:

@@ -24,6 +24,7 @@ from orthonav.report import (
     file_names,
     map_size_in,
     measure_text,
+    metres_text,
     render,
     write_figures,
     write_page,
@@ -312,3 +313,20 @@ def test_scripts_of_a_page_are_joined_without_module_syntax() -> None:
 )
 def test_measures_have_their_significant_decimals(value: float, text: str) -> None:
     assert measure_text(value, " m") == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0 m"),
+        (3.26, "3.3 m"),
+        (35.0, "35 m"),
+        (99.97, "100 m"),
+        (120.4, "120 m"),
+        (12_345.0, "12.3 km"),
+        (np.nan, "-"),
+        (np.inf, "-"),
+    ],
+)
+def test_lengths_have_one_form(value: float, text: str) -> None:
+    assert metres_text(value) == text

@@ -12,6 +12,7 @@ from playwright.sync_api import expect
 from small_run import CHUNK_PX, FRAME, GSD_M, PLACES_EN_M, WRONG, name, result, serving
 
 from orthonav.flight.fixes import result_to_json
+from orthonav.report import metres_text
 from orthonav.web.opening import ViewRequest, open_run
 
 COUNT = len(PLACES_EN_M)
@@ -97,7 +98,7 @@ def test_the_run_is_drawn_where_it_is(page, columns):
         "◯confident and wrong",
     ]
     figures = page.locator("#figures").inner_text().replace("\n", " ")
-    assert figures.startswith("views 6 with a fix 83.3 % within 15.0 m 66.7 %")
+    assert figures.startswith("views 6 with a fix 83.3 % within 15 m 66.7 %")
     assert figures.endswith("confident and wrong 1")
 
 
@@ -105,9 +106,7 @@ def test_the_worst_view_with_its_images_and_values(page, small, ask):
     page.select_option("#order", "error")
     page.chosen(WRONG, COUNT)
     first = page.locator("#list button").first
-    expect(first).to_contain_text(name(WRONG)) and expect(first).to_contain_text(
-        "60.0 m confident!"
-    )
+    expect(first).to_contain_text(name(WRONG)) and expect(first).to_contain_text("60 m confident!")
     show_wrong(page)
     assert page.locator("#list button").count() == 1
     assert page.locator("#shown-count").inner_text() == f"1 of {COUNT} views"
@@ -117,10 +116,10 @@ def test_the_worst_view_with_its_images_and_values(page, small, ask):
     east_m, north_m = FRAME.en_from_latlon(fix["lat_deg"], fix["lon_deg"])
     error_m = np.hypot(east_m - PLACES_EN_M[WRONG][0], north_m - PLACES_EN_M[WRONG][1])
     for part in (
-        f"tracking, error {error_m:.1f} m, CONFIDENT AND WRONG",
-        f"confidence {fix['confidence']:.3f} within {fix['radius_m']:.1f} m",
-        f"\N{GREEK SMALL LETTER SIGMA} {spread_m:.1f} m, heading {fix['heading_deg']:.1f}°",
-        f"{fix['agl_m']:.1f} m high",
+        f"tracking, error {metres_text(error_m)}, CONFIDENT AND WRONG",
+        f"confidence {fix['confidence']:.3f} within {metres_text(fix['radius_m'])}",
+        f"\N{GREEK SMALL LETTER SIGMA} {metres_text(spread_m)}, heading {fix['heading_deg']:.1f}°",
+        f"{metres_text(fix['agl_m'])} high",
     ):
         assert part in said
     page.click("#more summary")

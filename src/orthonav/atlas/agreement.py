@@ -57,21 +57,34 @@ MAX_CHAIN_LOG_ODDS = 14.0
 """Chains remember no more nats, so that a chain that became wrong is given up after some views."""
 
 
-@dataclass(frozen=True, eq=False)
-class PlaceEvidence:
-    """One place where a view may have been taken.
+@dataclass(frozen=True)
+class Placement:
+    """How a view may have been taken.
 
-    `lat_deg`, `lon_deg`: place of the camera.
+    `lat_deg`, `lon_deg`: place of the camera, if nothing else is said.
     `turn_rad`: heading of the top of the view.
     `log_scale`: logarithm of true over reported height.
-    `log_odds`: of this place against all others of the atlas, from this view alone (nats).
-    `key`: number by which the caller recognizes the place.
     """
 
     lat_deg: float
     lon_deg: float
     turn_rad: float
     log_scale: float
+
+    @property
+    def latlon_deg(self) -> tuple[float, float]:
+        """Latitude and longitude."""
+        return self.lat_deg, self.lon_deg
+
+
+@dataclass(frozen=True)
+class PlaceEvidence(Placement):
+    """A possible placement with its evidence.
+
+    `log_odds`: of this place against all others of the atlas, from this view alone (nats).
+    `key`: number by which the caller recognizes the place.
+    """
+
     log_odds: float
     key: int
 
@@ -113,8 +126,8 @@ class Chain:
     def expected(self, time_ns: int) -> tuple[float, float]:
         """Latitude and longitude where the aircraft is expected."""
         if self.velocity_en_mps is None:
-            return self.last.lat_deg, self.last.lon_deg
-        frame = LocalFrame(self.last.lat_deg, self.last.lon_deg)
+            return self.last.latlon_deg
+        frame = LocalFrame(*self.last.latlon_deg)
         lat, lon = frame.latlon_from_en(self.velocity_en_mps * self._seconds(time_ns))
         return float(lat), float(lon)
 
@@ -126,7 +139,7 @@ class Chain:
     def reaches(self, place: PlaceEvidence, time_ns: int) -> bool:
         """Whether the aircraft can have flown to that place."""
         dt_s = self._seconds(time_ns)
-        away = distances_m([self.expected(time_ns)], [(place.lat_deg, place.lon_deg)])[0]
+        away = distances_m([self.expected(time_ns)], [place.latlon_deg])[0]
         turned = abs(math.remainder(place.turn_rad - self.last.turn_rad, 2 * math.pi))
         scaled = abs(place.log_scale - self.last.log_scale)
         return bool(
@@ -205,15 +218,14 @@ def _support(place: PlaceEvidence, gain: float) -> float:
 
 def _begun(place: PlaceEvidence, time_ns: int) -> Chain:
     odds = min(place.log_odds, MAX_LOG_ODDS)
-    return Chain(place, time_ns, odds, 1.0, odds, ((place.lat_deg, place.lon_deg),))
+    return Chain(place, time_ns, odds, 1.0, odds, (place.latlon_deg,))
 
 
 def _extended(
     chain: Chain, place: PlaceEvidence, time_ns: int, side_m: float, gain: float
 ) -> Chain:
-    here = place.lat_deg, place.lon_deg
-    nearest_m = float(distances_m([here] * len(chain.anchors), chain.anchors).min())
-    new = min(1.0, nearest_m / max(side_m, 1.0))
+    here = place.latlon_deg
+    new = min(1.0, nearest_m(here, chain.anchors) / max(side_m, 1.0))
     anchors = (*chain.anchors, here)[-ANCHORS:]
     if new < MIN_NEW:
         new, anchors = 0.0, chain.anchors
@@ -233,7 +245,7 @@ def _velocity(chain: Chain, place: PlaceEvidence, dt_s: float) -> NDArray[np.flo
     """Metres per second east and north from the latest place of a chain to this one."""
     if dt_s < MIN_VELOCITY_S:
         return chain.velocity_en_mps
-    frame = LocalFrame(chain.last.lat_deg, chain.last.lon_deg)
+    frame = LocalFrame(*chain.last.latlon_deg)
     velocity = frame.en_from_latlon(place.lat_deg, place.lon_deg) / dt_s
     speed = float(np.hypot(*velocity))
     return np.asarray(velocity * min(1.0, MAX_SPEED_MPS / max(speed, 1e-9)))
@@ -245,11 +257,13 @@ def _distinct(made: Sequence[Chain], side_m: float) -> list[Chain]:
     for each in sorted(made, key=lambda one: (-one.log_odds, -one.views)):
         if chains and each.log_odds < chains[0].log_odds - HOPELESS:
             break
-        place = (each.last.lat_deg, each.last.lon_deg)
-        others = [(one.last.lat_deg, one.last.lon_deg) for one in chains]
-        near = others and distances_m([place] * len(others), others).min() < side_m / 4
-        if not near:
+        if nearest_m(each.last.latlon_deg, [one.last.latlon_deg for one in chains]) >= side_m / 4:
             chains.append(each)
         if len(chains) == MAX_CHAINS:
             break
     return chains
+
+
+def nearest_m(place: tuple[float, float], others: Sequence[tuple[float, float]]) -> float:
+    """Distance to the nearest of other places, infinite where there are none."""
+    return float(distances_m([place] * len(others), others).min(initial=math.inf))

@@ -33,13 +33,12 @@ from orthonav.atlas.sheet_tasks import (
 )
 from orthonav.atlas.store import Store
 from orthonav.errors import AreaError, AtlasError, OrthonavError, WorkerError
-from orthonav.files import Progress
-from orthonav.geo.area import Area, Extent
-from orthonav.geo.frames import LocalFrame
+from orthonav.files import Progress, no_progress
+from orthonav.geo.area import Extent
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.prepare.build import BuildRequest, build_map
-from orthonav.prepare.layout import grid_of
+from orthonav.prepare.layout import rounded_gsd_m
 
 log = logging.getLogger(__name__)
 
@@ -79,7 +78,7 @@ class AtlasRequest:
 def build_atlas(
     request: AtlasRequest,
     runner: TaskRunner,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
     report: Callable[[str], None] = log.info,
 ) -> BuildReport:
     """Build the missing sheets with a runner that was entered, and report the results.
@@ -89,7 +88,6 @@ def build_atlas(
     `ImageryError`, `MissingFileError`; `AtlasError` where present sheets were made otherwise;
     `WorkerError` where workers have other versions; `StorageError`.
     """
-    progress = progress or (lambda stage, share: None)
     started_s = time.monotonic()
     orthos = [Path(path).absolute() for path in request.orthos]
     mosaic = Mosaic.open(orthos)
@@ -136,13 +134,10 @@ def recipe_for(request: AtlasRequest, mosaic: Mosaic) -> AtlasRecipe:
             wanted = replace(atlas.recipe, **_requested(request, atlas.recipe.coarse))
             atlas.require_recipe(wanted)
             return wanted
-        recipe = AtlasRecipe(**{"gsd_m": mosaic.gsd_m, **_requested(request, None)})
-        recipe = AtlasRecipe.from_plain(recipe.to_plain())  # checks it
-    except TypeError as error:
+        gsd_m = rounded_gsd_m(mosaic.gsd_m)
+        return AtlasRecipe(**{"gsd_m": gsd_m, **_requested(request, None)})
+    except (TypeError, AtlasError) as error:
         raise AtlasError(f"recipe of the atlas is impossible: {error}") from error
-    if "gsd_m" in request.recipe:
-        return recipe
-    return replace(recipe, gsd_m=_default_gsd_m(mosaic, recipe))
 
 
 def _requested(request: AtlasRequest, coarse: CoarseRecipe | None) -> dict[str, Any]:
@@ -275,13 +270,6 @@ def _finish(atlas: Atlas, index: bool, progress: Progress) -> str | None:
     except OrthonavError as error:
         return str(error)
     return None
-
-
-def _default_gsd_m(mosaic: Mosaic, recipe: AtlasRecipe) -> float:
-    """The ground resolution of the imagery, rounded as for a single map."""
-    side_m = recipe.sheet_km * 1000
-    area = Area(LocalFrame(0.0, 0.0), (0.0, 0.0, side_m, side_m))
-    return grid_of(area, mosaic.gsd_m, None, recipe.tile_px, recipe.overlap).gsd_m
 
 
 def _peak_bytes() -> int:

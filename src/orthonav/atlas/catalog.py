@@ -25,7 +25,7 @@ from orthonav.atlas.item_files import ITEMS, SNAPSHOT, read_items, read_some, sn
 from orthonav.atlas.recipe import FORMAT, SCHEMA, AtlasRecipe
 from orthonav.atlas.store import Store, digest_of
 from orthonav.errors import AreaError, AtlasError, MissingFileError
-from orthonav.files import Progress
+from orthonav.files import Progress, no_progress
 from orthonav.geo.area import Extent
 
 __all__ = ["Atlas", "Sheet", "SheetDescription", "StoredFile", "copy_sheets"]
@@ -106,20 +106,17 @@ class Atlas:
 
     def over(self, bounds_deg: Extent) -> list[Sheet]:
         """The sheets that a box touches; west is greater than east across the antimeridian."""
-        west, south, east, north = bounds_deg
-        next(self.recipe.sheets.over((west, south, east, north)), None)  # refuses an invalid box
-        if west > east:
-            east += 360
-        return [
-            sheet
-            for sheet in self.sheets().values()
-            if sheet.bounds_deg[1] <= north
-            and sheet.bounds_deg[3] > south
-            and any(
-                sheet.bounds_deg[0] + turn <= east and sheet.bounds_deg[2] + turn > west
-                for turn in (-360, 0, 360)
-            )
-        ]
+        touched = set(self.recipe.sheets.over(bounds_deg))
+        return [sheet for name, sheet in self.sheets().items() if name in touched]
+
+    @property
+    def bounds_deg(self) -> Extent | None:
+        """West, south, east, north of all sheets, never across the antimeridian; None if empty."""
+        boxes = [sheet.bounds_deg for sheet in self.sheets().values()]
+        if not boxes:
+            return None
+        west, south, east, north = zip(*boxes, strict=True)
+        return min(west), min(south), max(east), max(north)
 
     def put(self, files: Mapping[str, Path], described: SheetDescription) -> Sheet:
         """Put a sheet in, or its next revision; `files` by kind: `map`, `coarse`.
@@ -224,7 +221,7 @@ def copy_sheets(
     atlas: Atlas,
     sheet_ids: Sequence[str] | None = None,
     replace: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> tuple[list[str], list[str]]:
     """Copy sheets of one atlas into another of the same recipe: names of copied sheets, and of
     those that were there and left unchanged.
@@ -241,8 +238,7 @@ def copy_sheets(
     unchanged: list[str] = []
     wanted = list(dict.fromkeys(sheet_ids)) if sheet_ids is not None else list(found)
     for number, sheet_id in enumerate(wanted):
-        if progress:
-            progress("copy", number / len(wanted))
+        progress("copy", number / len(wanted))
         new, old = found[sheet_id], there.get(sheet_id)
         same = old is not None and (old.request, old.files) == (new.request, new.files)
         if old is not None and (same or not replace):

@@ -203,7 +203,8 @@ def attempted(work: Callable[[Item], Made], item: Item) -> Made | Failure:
     except MemoryError:
         return Failure(MemoryError.__name__, "out of memory")
     except Exception as error:
-        return Failure(type(error).__name__, repr(error), traceback.format_exc())
+        text = str(error) or "the error has no text (--verbose shows where it was raised)"
+        return Failure(type(error).__name__, text, traceback.format_exc())
 
 
 @contextmanager

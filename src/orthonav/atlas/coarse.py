@@ -5,7 +5,6 @@ learnt for the whole atlas. A tile belongs to the sheet whose box holds its cent
 half a tile beyond the box. So every place of the atlas is within half a stride of a tile centre.
 """
 
-import errno
 import json
 import math
 from dataclasses import asdict, dataclass
@@ -15,29 +14,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
 
 from orthonav import represent
+from orthonav.atlas.item import reason
 from orthonav.atlas.recipe import CoarseRecipe
 from orthonav.embed.cells import MICRO
 from orthonav.embed.whitened import WhitenedRecipe, pooled_features
-from orthonav.errors import AreaError, AtlasError, OutputError
-from orthonav.files import replacing, require_file
+from orthonav.errors import AreaError, AtlasError
+from orthonav.files import no_progress, require_file
 from orthonav.geo.area import Area, Extent
 from orthonav.geo.grid import TileGrid
 from orthonav.imagery.mosaic import Mosaic
+from orthonav.mapfile.writer import METADATA_KEY, save_tensors
 from orthonav.prepare.calibrate import CropSampler
+from orthonav.prepare.layout import MIN_TILE_VALID_SHARE
 from orthonav.prepare.sheet import SheetReader
 from orthonav.variants import make_variant
 
 FORMAT = "orthonav-coarse"
 SCHEMA = 1
-METADATA_KEY = "orthonav"
 EDGES = "gradient"
 """Representation of coarse tiles and of views searched among them, independent of the maps'."""
 POOLING = WhitenedRecipe()
-MIN_VALID_SHARE = 0.5
-"""Share of a tile that must show imagery, as for the tiles of a map."""
 MAX_TILES = 1_000_000
 """Greatest number of a sheet: 45 km with tiles 50 m apart are 800,000."""
 MAX_FEATURES = 16_384
@@ -92,11 +90,11 @@ def make_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe) -> Coa
     inside = _inside(latlon, bounds_deg)
     tiles, latlon = tiles[inside], latlon[inside]
     try:
-        reader.read(lambda stage, share: None, workers=1)
+        reader.read(no_progress, workers=1)
     except AreaError:  # no pixel of imagery
         tiles, latlon = tiles[:0], latlon[:0]
     first_px = tiles * grid.stride_px
-    enough = reader.cells.valid_share(first_px) >= MIN_VALID_SHARE
+    enough = reader.cells.valid_share(first_px) >= MIN_TILE_VALID_SHARE
     first_px, latlon = first_px[enough], latlon[enough]
     features = np.zeros((len(first_px), POOLING.cells**2 * representation.channels), np.float16)
     valid = np.zeros((len(first_px), POOLING.cells**2), np.uint8)
@@ -114,20 +112,22 @@ def write_coarse(mosaic: Mosaic, bounds_deg: Extent, recipe: CoarseRecipe, path:
     The bytes are the same every time. Raises as `make_coarse`, and `OutputError`.
     """
     made = make_coarse(mosaic, bounds_deg, recipe)
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "centres_latlon_deg": made.centres_latlon_deg,
         "features": made.features,
         "valid": made.valid,
     }
-    with replacing(path) as temporary:
-        try:
-            contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-            save_file(contiguous, temporary, metadata={METADATA_KEY: _metadata(made)})
-        except SafetensorError as error:
-            if f"os error {errno.ENOSPC}" in str(error):
-                raise OSError(errno.ENOSPC, "disk full") from error
-            raise OutputError(f"coarse tiles cannot be written ({error}): {path}") from error
+    save_tensors(path, arrays, _metadata(made), "coarse tiles")
     return len(made.valid)
+
+
+def tile_count(path: Path) -> int:
+    """Number of coarse tiles in a file, from its header alone. Raises as `read_coarse`."""
+    try:
+        with safe_open(require_file(path, "coarse tiles"), framework="numpy") as stored:
+            return int(stored.get_slice("valid").get_shape()[0])
+    except (SafetensorError, OSError, IndexError) as error:
+        raise AtlasError(f"coarse tiles are damaged ({error}): {path}") from error
 
 
 def read_coarse(path: Path) -> CoarseTiles:
@@ -148,7 +148,7 @@ def read_coarse(path: Path) -> CoarseTiles:
     except AtlasError as error:
         raise AtlasError(f"{error}: {path}") from error
     except (SafetensorError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-        raise AtlasError(f"coarse tiles are damaged ({error}): {path}") from error
+        raise AtlasError(f"coarse tiles are damaged ({reason(error)}): {path}") from error
 
 
 class _NoCrops(CropSampler):
@@ -190,12 +190,10 @@ def _parsed(metadata: str) -> tuple[CoarseRecipe, Extent]:
             f"this program compares {EDGES} in {POOLING.cells}"
         )
     recipe = CoarseRecipe(**plain["recipe"])
-    numbers = [recipe.gsd_m, recipe.tile_px, recipe.overlap, *plain["bounds_deg"]]
-    usable = asdict(recipe) == plain["recipe"] and 0 <= recipe.overlap < 1
-    usable = usable and all(isinstance(n, int | float) and math.isfinite(n) for n in numbers)
-    if not usable or recipe.gsd_m <= 0 or recipe.tile_px % MICRO or recipe.tile_px < MICRO:
-        raise AtlasError("coarse tiles have an impossible recipe")
     west, south, east, north = (float(value) for value in plain["bounds_deg"])
+    complete = asdict(recipe) == plain["recipe"] and math.isfinite(west + south + east + north)
+    if not complete or recipe.tile_px % MICRO:
+        raise AtlasError("coarse tiles have an impossible recipe")
     return recipe, (west, south, east, north)
 
 

@@ -57,14 +57,11 @@ def require_sheets(atlas: Atlas, found: Sequence[object]) -> None:
     """Raise `AreaError` with the extent of the atlas where no sheet was found."""
     if found:
         return
-    sheets = atlas.sheets().values()
-    if not sheets:
+    if atlas.bounds_deg is None:
         raise AreaError(f"the atlas has no sheets yet: {atlas.url}")
-    boxes = np.array([sheet.bounds_deg for sheet in sheets])
-    west, south = boxes[:, :2].min(axis=0)
-    east, north = boxes[:, 2:].max(axis=0)
+    west, south, east, north = atlas.bounds_deg
     raise AreaError(
-        f"the area lies outside the atlas, whose {len(boxes)} sheets lie within "
+        f"the area lies outside the atlas, whose {len(atlas.sheets())} sheets lie within "
         f"{west:.4f},{south:.4f},{east:.4f},{north:.4f} (west, south, east, north): {atlas.url}"
     )
 
@@ -88,12 +85,8 @@ def check_covered(
     names = _missing(lattice, lat[~covered], lon[~covered])
     route_lat, route_lon = area.frame.latlon_from_en(_route_en_m(area, grid))
     on_route = ~_covered(sources, route_lat, route_lon)
-    if on_route.any() and not allow_holes:
-        under = _missing(lattice, route_lat[on_route], route_lon[on_route])
-        raise AtlasError(
-            f"{on_route.mean():.0%} of the route lies on sheets that the atlas lacks "
-            f"({under}); add them, or allow holes (--allow-holes)"
-        )
+    under = _missing(lattice, route_lat[on_route], route_lon[on_route])
+    _require_route(on_route, f"lies on sheets that the atlas lacks ({under})", allow_holes)
     if names:
         log.warning(
             "%.3g %% of the area lies on sheets that the atlas lacks: %s",
@@ -113,10 +106,15 @@ def check_shown(area: Area, grid: TileGrid, cells: CellSheet, allow_holes: bool)
         log.warning("%.3g %% of the area has no imagery in the atlas", 100 * empty)
     route = grid.tiles_rc(_route_en_m(area, grid)).clip(0, [grid.rows - 1, grid.cols - 1])
     bare = cells.valid_share(route * grid.stride_px) < MIN_TILE_VALID_SHARE
-    if bare.any() and not allow_holes:
+    _require_route(bare, "has no imagery in the atlas", allow_holes)
+
+
+def _require_route(lacking: NDArray[np.bool_], what: str, allow_holes: bool) -> None:
+    """Raise `AtlasError` where points (N,) along a route lack something, unless holes may be."""
+    if lacking.any() and not allow_holes:
         raise AtlasError(
-            f"{bare.mean():.0%} of the route has no imagery in the atlas; "
-            "add some, or allow holes (--allow-holes)"
+            f"{lacking.mean():.0%} of the route {what}; extend the atlas, or allow holes "
+            "(--allow-holes)"
         )
 
 

@@ -22,8 +22,8 @@ from orthonav.cores import usable_cores
 from orthonav.embed.cells import CellLayout
 from orthonav.embed.whitened import CellSheet, WhitenedRecipe, learn
 from orthonav.errors import AreaError, OutputError, VariantError
-from orthonav.files import Progress
-from orthonav.geo.area import Area, Extent
+from orthonav.files import Progress, no_progress
+from orthonav.geo.area import Area, Extent, require_one_area
 from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
 from orthonav.mapfile.manifest import Manifest, SheetInfo
@@ -55,7 +55,7 @@ def cut_map(
     bounds_deg: Extent | None = None,
     workers: int | None = None,
     allow_holes: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> BuildResult:
     """Cut the map of a route with its band, or of bounds, and write it to `out` as a whole.
 
@@ -63,26 +63,25 @@ def cut_map(
     warning. Raises `AreaError` for areas outside the atlas, `AtlasError` where sheets are damaged
     or cannot be cut from, `StorageError`, `OutputError`.
     """
-    report = progress or (lambda stage, share: None)
     workers = usable_cores() if workers is None else workers
     if not 1 <= workers <= MAX_WORKERS:
         raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {workers}")
     area = _area(route, band_m, bounds_deg)
     common = atlas.recipe
     grid = grid_of(area, common.gsd_m, common.gsd_m, common.tile_px, common.overlap)
-    report("sheets", 0.0)
+    progress("sheets", 0.0)
     sheets = atlas.over(box_deg(area, grid.tile_m))
     require_sheets(atlas, sheets)
     members = opened_sheets(atlas, sheets, grid)
     _check_out(atlas, out, members)
     check_covered(area, grid, [each.source for each in members], common.sheets, allow_holes)
-    report("sheets", 1.0)
+    progress("sheets", 1.0)
     recipe, representation = recipes(members[0].manifest)
     cutter = _MapCutter(area, grid, members, representation)
-    cutter.read(report, workers)
+    cutter.read(progress, workers)
     check_shown(area, grid, cutter.cells, allow_holes)
-    written = write_map(out, *_learnt(cutter, recipe, members, workers, report))
-    report("learn", 1.0)
+    written = write_map(out, *_learnt(cutter, recipe, members, workers, progress))
+    progress("learn", 1.0)
     return BuildResult(written, out.stat().st_size)
 
 
@@ -101,7 +100,7 @@ class _MapCutter:
         self.layer = GreyLayerWriter(height, width)
         self.preview = Preview(grid, PREVIEW_PX)
 
-    def read(self, report: Progress, workers: int) -> None:
+    def read(self, progress: Progress, workers: int) -> None:
         """Resample all blocks with `workers` threads. Raises `AtlasError` for a damaged sheet."""
         side_px = block_side_px(self.grid.tile_px, self._layout.micro_px)
         blocks = [
@@ -119,7 +118,7 @@ class _MapCutter:
         try:
             for done, parts in enumerate(in_order(blocks, opened, workers)):
                 self._take(blocks[done], parts)
-                report("imagery", (done + 1) / len(blocks))
+                progress("imagery", (done + 1) / len(blocks))
         finally:
             cv2.setNumThreads(threads)
 
@@ -149,13 +148,11 @@ class _MapCutter:
 
 
 def _area(route: Route | None, band_m: float | None, bounds_deg: Extent | None) -> Area:
-    if (route is None) == (bounds_deg is None):
-        raise AreaError("a map is cut for a route with a band, or for bounds: give one of them")
+    require_one_area(route, band_m, bounds_deg)
     if route is not None:
         return Area.from_route(route, band_m)
-    if band_m is not None:
-        raise AreaError("a search band needs a route (--route)")
-    assert bounds_deg is not None
+    if bounds_deg is None:
+        raise AreaError("a map is cut for a route with a search band, or for bounds: give either")
     return Area.from_bounds(bounds_deg)
 
 
@@ -169,15 +166,15 @@ def _learnt(
     recipe: WhitenedRecipe,
     members: Sequence[CutSheet],
     workers: int,
-    report: Progress,
+    progress: Progress,
 ) -> tuple[Manifest, dict[str, NDArray[Any]]]:
     """Manifest and arrays of the map."""
     area, grid = cutter.area, cutter.grid
     tiles_rc = tiles_of(area, grid, cutter.cells)
     tiles_px = tiles_rc * grid.stride_px
-    report("learn", 0.0)
+    progress("learn", 0.0)
     embedder = learn(recipe, cutter.cells, tiles_px, workers)
-    report("learn", 0.3)
+    progress("learn", 0.3)
     embeddings = embedder.tiles(cutter.cells, tiles_px, workers)
     centres = grid.centres_en_m(tiles_rc)
     grey, grey_parts = cutter.layer.finish()

@@ -8,14 +8,12 @@ file system neither syncs files to disk before it renames them nor refuses links
 import contextlib
 import os
 import shutil
-import threading
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from orthonav.atlas.storage_errors import PACKAGES
 from orthonav.errors import MissingExtraError, StorageError
 from orthonav.extras import needed
 from orthonav.files import replacing
@@ -78,15 +76,13 @@ class LocalFolder:
         """Copy a file to a local path."""
         shutil.copyfile(self.path(name), path)
 
-    def put(self, path: Path, name: str) -> None:
-        """Copy a local file to a name, whole or not at all."""
+    def save(self, content: Path | bytes, name: str) -> None:
+        """Write a file with the content of a local file, or these bytes; whole or not at all."""
         with replacing(self.path(name)) as temporary:
-            shutil.copyfile(path, temporary)
-
-    def write(self, name: str, data: bytes) -> None:
-        """Write a file, whole or not at all."""
-        with replacing(self.path(name)) as temporary:
-            temporary.write_bytes(data)
+            if isinstance(content, Path):
+                shutil.copyfile(content, temporary)
+            else:
+                temporary.write_bytes(content)
 
     def remove(self, name: str) -> None:
         """Remove a file if it exists."""
@@ -94,16 +90,13 @@ class LocalFolder:
 
 
 class RemoteFiles:
-    """A file system of fsspec, with the methods of `LocalFolder`.
-
-    Each thread and process opens its own.
-    """
+    """A file system of fsspec, with the methods of `LocalFolder`."""
 
     def __init__(self, url: str, protocol: str) -> None:
-        self._url = url
         self._protocol = protocol
-        self._of_threads = threading.local()
-        self._opened()
+        self._fsspec = needed("fsspec", "atlas", "an atlas in object storage")
+        self._url = url
+        self._at("")
 
     def names(self, folder: str, prefix: str) -> dict[str, int]:
         """See `LocalFolder.names`."""
@@ -148,8 +141,8 @@ class RemoteFiles:
         """See `LocalFolder.read`; many files are read at the same time."""
         if not names:
             return {}
-        fs = self._opened()[0]
-        paths = [self._at(name)[1] for name in names]
+        fs, root = self._at("")
+        paths = [f"{root}/{name}" for name in names]
         found = fs.cat(paths) if len(paths) > 1 else {paths[0]: fs.cat_file(paths[0])}
         return {name: found[path] for name, path in zip(names, paths, strict=True)}
 
@@ -158,14 +151,29 @@ class RemoteFiles:
         fs, far_path = self._at(name)
         fs.get_file(far_path, str(path))
 
-    def put(self, path: Path, name: str) -> None:
-        """See `LocalFolder.put`."""
-        more = {"overwrite": True} if self._protocol in _NEEDS_OVERWRITE else {}
-        self._send(name, lambda fs, far_path: fs.put_file(str(path), far_path, **more))
+    def save(self, content: Path | bytes, name: str) -> None:
+        """See `LocalFolder.save`."""
+        fs, path = self._at(name)
+        if self._protocol in _OBJECT_STORES:
+            self._send(fs, content, path)
+            return
+        folder, _, file = path.rpartition("/")
+        fs.makedirs(folder, exist_ok=True)
+        temporary = f"{folder}/.{file}.{uuid.uuid4().hex[:12]}.tmp"
+        try:
+            self._send(fs, content, temporary)
+            fs.mv(temporary, path)
+        except BaseException:
+            with contextlib.suppress(Exception):
+                fs.rm_file(temporary)
+            raise
 
-    def write(self, name: str, data: bytes) -> None:
-        """See `LocalFolder.write`."""
-        self._send(name, lambda fs, far_path: fs.pipe_file(far_path, data))
+    def _send(self, fs: Any, content: Path | bytes, path: str) -> None:
+        if isinstance(content, bytes):
+            fs.pipe_file(path, content)
+        else:
+            more = {"overwrite": True} if self._protocol in _NEEDS_OVERWRITE else {}
+            fs.put_file(str(content), path, **more)
 
     def remove(self, name: str) -> None:
         """See `LocalFolder.remove`."""
@@ -173,44 +181,15 @@ class RemoteFiles:
         with contextlib.suppress(FileNotFoundError):
             fs.rm_file(path)
 
-    def _send(self, name: str, send: Callable[[Any, str], None]) -> None:
-        fs, path = self._at(name)
-        if self._protocol in _OBJECT_STORES:
-            send(fs, path)
-            return
-        folder, _, file = path.rpartition("/")
-        fs.makedirs(folder, exist_ok=True)
-        temporary = f"{folder}/.{file}.{uuid.uuid4().hex[:12]}.tmp"
-        try:
-            send(fs, temporary)
-            fs.mv(temporary, path)
-        except BaseException:
-            with contextlib.suppress(Exception):
-                fs.rm_file(temporary)
-            raise
-
     def _at(self, name: str) -> tuple[Any, str]:
-        fs, root = self._opened()
+        """The file system and a path on it. fsspec keeps one per process and thread."""
+        try:
+            self._fsspec.get_filesystem_class(self._protocol)
+            fs, root = self._fsspec.core.url_to_fs(self._url)
+        except ValueError as error:
+            raise StorageError(f"invalid address ({error}): {self._protocol}://") from error
+        except ImportError as error:
+            raise MissingExtraError(
+                f"an atlas at {self._protocol}:// needs a package that is not installed ({error})"
+            ) from error
         return fs, f"{root.rstrip('/')}/{name}" if name else root.rstrip("/")
-
-    def _opened(self) -> tuple[Any, str]:
-        mine = getattr(self._of_threads, "opened", None)
-        if mine is None or mine[0] != os.getpid():
-            mine = (os.getpid(), *_open(self._url, self._protocol))
-            self._of_threads.opened = mine
-        return mine[1], mine[2]
-
-
-def _open(url: str, protocol: str) -> tuple[Any, str]:
-    fsspec = needed("fsspec", "atlas", "an atlas in object storage")
-    try:
-        fsspec.get_filesystem_class(protocol)
-        fs, path = fsspec.core.url_to_fs(url)
-    except ValueError as error:
-        raise StorageError(f"invalid address ({error}): {protocol}://") from error
-    except ImportError as error:
-        package = PACKAGES.get(protocol)
-        wanted = package or f"a package that is not installed ({error})"
-        how = f", which is not installed: pip install {package}" if package else ""
-        raise MissingExtraError(f"an atlas at {protocol}:// needs {wanted}{how}") from error
-    return fs, path

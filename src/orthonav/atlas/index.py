@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import load_file, save
 
 from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.coarse import POOLING, CoarseTiles, read_coarse
+from orthonav.atlas.coarse import POOLING, read_coarse, tile_count
 from orthonav.atlas.index_manifest import (
     FOLDER,
     FORMAT,
@@ -40,7 +40,7 @@ from orthonav.atlas.quantizers import (
 from orthonav.atlas.store import digest_of
 from orthonav.embed.whitened import Made, WhitenedEmbedder, Work, learn_in_two_passes
 from orthonav.errors import AtlasError
-from orthonav.files import Progress
+from orthonav.files import Progress, no_progress
 
 WHITENING_NAME = "whitening.safetensors"
 MAX_TRAINING_TILES = 40_000
@@ -61,11 +61,13 @@ search."""
 MIN_TILES = 16
 """Fewer tiles than codes of a quantizer cannot train it."""
 BATCH_TILES = 4096
+LEARN_PASSES = 3
+"""Passes over the coarse tiles: mean and scatter of the features, sample of the vectors."""
 Features = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 def make_index(
-    atlas: Atlas, progress: Progress | None = None, rebuild: bool = False
+    atlas: Atlas, progress: Progress = no_progress, rebuild: bool = False
 ) -> IndexManifest | None:
     """Bring the index of an atlas up to date; None where its sheets have no coarse tiles.
 
@@ -78,7 +80,7 @@ def make_index(
         return None
     before = None if rebuild else _usable(atlas)
     with tempfile.TemporaryDirectory(prefix="orthonav-index-") as name:
-        builder = _IndexBuilder(atlas, Path(name), progress or (lambda stage, share: None))
+        builder = _IndexBuilder(atlas, Path(name), progress)
         if before is None:
             return builder.build(list(sheets.values()))
         new, gone = stale_sheets(atlas, before)
@@ -110,38 +112,50 @@ class _IndexBuilder:
 
     def build(self, sheets: Sequence[Sheet]) -> IndexManifest:
         """The index of these sheets."""
-        counts = [len(self._tiles(sheet).valid) for sheet in sheets]
+        counts = [tile_count(self._atlas.path(sheet, "coarse")) for sheet in sheets]
         total = sum(counts)
         if total < MIN_TILES:
             raise AtlasError(
                 f"the atlas has {total} coarse tiles with imagery, too few for an index; build it "
                 "with smaller ones (--coarse-gsd-m, --coarse-tile-px)"
             )
+        embedder, quantizers = self._learnt(sheets, total)
+        shards: list[ShardInfo] = []
+        for group in _groups(sheets, counts):
+            base = shards[-1].base + shards[-1].rows if shards else 0
+            done = sum(len(shard.parts) for shard in shards) / len(sheets)
+            share = done, done + len(group) / len(sheets)
+            shards.append(self._shard(group, base, embedder, quantizers, share))
+        return self._put(quantizers.recipe, shards, {})
+
+    def _learnt(self, sheets: Sequence[Sheet], total: int) -> tuple[WhitenedEmbedder, Quantizers]:
+        """Whitening and quantizers of an index of `total` tiles, written to the folder."""
         step = max(1, total // MAX_TRAINING_TILES)
         dims = POOLING.dims if total <= MANY_TILES else MANY_DIMS
+        done = iter(range(LEARN_PASSES * len(sheets)))
 
-        def over_sheets(work: Work[Made]) -> Iterator[Made]:
-            return (work(*self._features(sheet, step)) for sheet in sheets)
+        def over_sheets(work: Work[Made], step: int = step) -> Iterator[Made]:
+            for sheet in sheets:
+                self._progress("learn index", next(done) / (LEARN_PASSES * len(sheets)))
+                for _, features in self._batches(sheet, step):
+                    yield work(*features)
 
         embedder = _shortened(learn_in_two_passes(POOLING, over_sheets), dims)
         (self._folder / WHITENING_NAME).write_bytes(
             save(embedder.parts(), metadata={"orthonav": FORMAT})
         )
         step = max(1, total // MAX_TRAINING_VECTORS)
-        sample = [vectors_of(embedder, self._features(sheet, step)) for sheet in sheets]
-        quantizers = train(np.concatenate(sample), VectorRecipe.for_count(total, embedder.dims))
+        sample = over_sheets(lambda *features: vectors_of(embedder, features), step)
+        recipe = VectorRecipe.for_count(total, embedder.dims)
+        quantizers = train(np.concatenate(list(sample)), recipe)
         quantizers.save(self._folder / QUANTIZERS_NAME)
-        shards: list[ShardInfo] = []
-        for group in _groups(sheets, counts):
-            base = shards[-1].base + shards[-1].rows if shards else 0
-            shards.append(self._shard(group, base, embedder, quantizers))
-        return self._put(quantizers.recipe, shards, {})
+        self._progress("learn index", 1.0)
+        return embedder, quantizers
 
     def update(self, before: IndexManifest, new: Sequence[Sheet], stale: set[str]) -> IndexManifest:
         """`before` with a shard of the new sheets and the rows of stale sheets retired."""
-        fetch_files(self._atlas, before, self._folder)
-        embedder = load_whitening(self._folder / WHITENING_NAME)
-        quantizers = Quantizers.load(self._folder / QUANTIZERS_NAME)
+        embedder = load_whitening(index_file(self._atlas, before, WHITENING_NAME))
+        quantizers = Quantizers.load(index_file(self._atlas, before, QUANTIZERS_NAME))
         shards = [
             replace(
                 shard,
@@ -154,54 +168,55 @@ class _IndexBuilder:
         ]
         base = shards[-1].base + shards[-1].rows
         if new:
-            shards.append(self._shard(new, base, embedder, quantizers))
+            shards.append(self._shard(new, base, embedder, quantizers, (0.0, 1.0)))
         return self._put(quantizers.recipe, shards, before.files)
 
     def _shard(
-        self, sheets: Sequence[Sheet], base: int, embedder: WhitenedEmbedder, quantizers: Quantizers
+        self,
+        sheets: Sequence[Sheet],
+        base: int,
+        embedder: WhitenedEmbedder,
+        quantizers: Quantizers,
+        share: tuple[float, float],
     ) -> ShardInfo:
+        """A shard of these sheets; `share` of the progress is done before and after it."""
         digests = [sheet.files["coarse"].sha256 for sheet in sheets]
         content = hashlib.sha256("".join([quantizers.digest, *digests]).encode()).hexdigest()[:12]
         name = f"shard-{base:012d}-{content}"
-        tiles = [self._tiles(sheet).centres_latlon_deg for sheet in sheets]
-        parts = tuple(
-            Part(sheet.id, digest, len(places))
-            for sheet, digest, places in zip(sheets, digests, tiles, strict=True)
-        )
-        vectors = (
-            vectors_of(embedder, features)
-            for number, sheet in enumerate(sheets)
-            for features in self._batches(sheet, number / len(sheets))
-        )
-        write_shard(self._folder, name, quantizers, np.concatenate(tiles), vectors)
-        return ShardInfo(name, base, parts)
+        parts: list[Part] = []
 
-    def _tiles(self, sheet: Sheet) -> CoarseTiles:
-        return read_coarse(self._atlas.path(sheet, "coarse"))
+        def vectors() -> Iterator[tuple[NDArray[np.float64], NDArray[np.float32]]]:
+            for number, (sheet, digest) in enumerate(zip(sheets, digests, strict=True)):
+                rows = 0
+                for places, features in self._batches(sheet):
+                    rows += len(places)
+                    yield places, vectors_of(embedder, features)
+                parts.append(Part(sheet.id, digest, rows))
+                done = (number + 1) / len(sheets)
+                self._progress("index", share[0] + done * (share[1] - share[0]))
 
-    def _features(self, sheet: Sheet, step: int) -> Features:
-        """Features and weights (N, F) of every `step`-th tile of a sheet."""
-        return self._tiles(sheet).features_of(slice(None, None, step))
+        write_shard(self._folder, name, quantizers, vectors())
+        return ShardInfo(name, base, tuple(parts))
 
-    def _batches(self, sheet: Sheet, share: float) -> Iterator[Features]:
-        """Features of all tiles of a sheet, some at a time."""
-        self._progress("index", share)
-        tiles = self._tiles(sheet)
-        for start in range(0, len(tiles.valid), BATCH_TILES):
-            yield tiles.features_of(slice(start, start + BATCH_TILES))
+    def _batches(
+        self, sheet: Sheet, step: int = 1
+    ) -> Iterator[tuple[NDArray[np.float64], Features]]:
+        """Places (n, 2) and features of every `step`-th tile of a sheet, some at a time."""
+        tiles = read_coarse(self._atlas.path(sheet, "coarse"))
+        for start in range(0, len(tiles.valid), step * BATCH_TILES):
+            part = slice(start, start + step * BATCH_TILES, step)
+            yield tiles.centres_latlon_deg[part], tiles.features_of(part)
 
     def _put(
         self, recipe: VectorRecipe, shards: Sequence[ShardInfo], before: Mapping[str, StoredFile]
     ) -> IndexManifest:
         """Put the new files into the atlas, then the manifest; remove files not used any more."""
         store = self._atlas.store
-        files = {
-            path.name: StoredFile(f"{FOLDER}/{path.name}", path.stat().st_size, digest_of(path))
-            for path in sorted(self._folder.iterdir())
-        }
-        for name, file in files.items():
-            if store.size(file.name) != file.size_bytes or name not in before:
-                store.put(self._folder / name, file.name)
+        files = dict(before)
+        for path in sorted(self._folder.iterdir()):
+            name = f"{FOLDER}/{path.name}"
+            files[path.name] = StoredFile(name, path.stat().st_size, digest_of(path))
+            store.put(path, name)
         manifest = IndexManifest(recipe, tuple(shards), files)
         store.write(MANIFEST, manifest.to_json())
         used = {MANIFEST, *(file.name for file in files.values())}
@@ -257,10 +272,9 @@ def load_whitening(path: Path) -> WhitenedEmbedder:
     return WhitenedEmbedder(POOLING, mean, basis)
 
 
-def fetch_files(atlas: Atlas, manifest: IndexManifest, folder: Path) -> None:
-    """Link the files of an index into a folder under their names, verified."""
-    for name, file in manifest.files.items():
-        if file.name != f"{FOLDER}/{name}":
-            raise AtlasError(f"index of the atlas names a file outside it: {file.name!r:.80}")
-        found = atlas.store.fetch(file.name, file.size_bytes, file.sha256)
-        (folder / name).symlink_to(found.absolute())
+def index_file(atlas: Atlas, manifest: IndexManifest, name: str) -> Path:
+    """A local path of a file of an index, verified. Raises `AtlasError`, `StorageError`."""
+    file = manifest.files.get(name)
+    if file is None or file.name != f"{FOLDER}/{name}":
+        raise AtlasError(f"index of the atlas names no file {name} in its folder: {atlas.url}")
+    return atlas.store.fetch(file.name, file.size_bytes, file.sha256)

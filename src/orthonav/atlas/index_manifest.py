@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.item import Sheet, StoredFile
+from orthonav.atlas.item import Sheet, StoredFile, reason
 from orthonav.atlas.quantizers import VectorRecipe
 from orthonav.errors import AtlasError
 
@@ -122,7 +122,7 @@ class IndexManifest:
                 first += shard.rows
             return cls(VectorRecipe(**plain["recipe"]), shards, files)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise AtlasError(f"index of the atlas cannot be read ({error})") from error
+            raise AtlasError(f"index of the atlas cannot be read ({reason(error)})") from error
 
 
 def _shard(plain: Any) -> ShardInfo:

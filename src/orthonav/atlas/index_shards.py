@@ -1,4 +1,4 @@
-"""Shards of the vector index: files that are memory-mapped and searched together.
+"""The shards of the vector index: written to files, which are mapped and searched together.
 
 A shard NAME is four files in a folder: `NAME.vectors.npy` (rows, D) float16, `NAME.codes` with the
 codes and rows of every list, `NAME.lists.npy` (lists, 3) uint64 with count, room and offset of each
@@ -10,15 +10,22 @@ own: every length is checked before FAISS is given the map.
 
 import os
 import weakref
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.atlas.index_manifest import ShardInfo
-from orthonav.atlas.quantizers import BLOCK, Array, Quantizers, faiss, one_thread
+from orthonav.atlas.quantizers import (
+    BLOCK,
+    QUANTIZERS_NAME,
+    Array,
+    Quantizers,
+    faiss,
+    one_thread,
+)
 from orthonav.errors import AtlasError
 
 SCAN_ONE = 10
@@ -28,31 +35,27 @@ NONE = -1
 """Id where fewer than k vectors were found."""
 
 Ids = NDArray[np.int64]
+Places = NDArray[np.float64]
 
 
 def write_shard(
-    folder: Path,
-    name: str,
-    quantizers: Quantizers,
-    places_deg: NDArray[np.float64],
-    batches: Iterable[NDArray[np.floating[Any]]],
-) -> None:
-    """Write a shard of unit vectors, which come in batches (n, D); `places_deg` (rows, 2) are
-    their latitudes and longitudes.
+    folder: Path, name: str, quantizers: Quantizers, batches: Iterable[tuple[Places, Array]]
+) -> int:
+    """Write a shard of unit vectors and return its number of rows.
 
-    Memory grows by the codes, some 24 bytes a vector. Raises `AtlasError` where the vectors are
-    not finite, or not as many as places.
+    `batches`: latitudes and longitudes (n, 2) and vectors (n, D) of some rows at a time. Memory
+    grows by codes and places, some 40 bytes a vector. Raises `AtlasError` where the vectors are not
+    finite, or not as many as places.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    dims, index, rows = quantizers.recipe.dims, quantizers.empty_index(), 0
-    shape = (len(places_deg), dims)
+    dims, index = quantizers.recipe.dims, quantizers.empty_index()
+    places_deg = [np.empty((0, 2))]
     with (folder / f"{name}.vectors.npy").open("wb") as out:
-        header = {"descr": "<f2", "fortran_order": False, "shape": shape}
-        np.lib.format.write_array_header_1_0(out, header)
-        for batch in batches:
-            if batch.ndim != 2 or batch.shape[1] != dims:
-                raise AtlasError(f"vectors must be (N, {dims}), got {batch.shape}")
-            rows += len(batch)
+        _write_header(out, 0, dims)
+        for places, batch in batches:
+            if batch.shape != (len(places), dims):
+                raise AtlasError(f"vectors must be ({len(places)}, {dims}), got {batch.shape}")
+            places_deg.append(places)
             for start in range(0, len(batch), ADD_ROWS):
                 stored = np.ascontiguousarray(batch[start : start + ADD_ROWS], dtype=np.float16)
                 if not np.isfinite(stored).all():
@@ -60,10 +63,17 @@ def write_shard(
                 out.write(stored.data)
                 with one_thread():
                     index.add(quantizers.rotated(stored.astype(np.float32)))
-    if rows != len(places_deg):
-        raise AtlasError(f"{rows} vectors for {len(places_deg)} places in shard {name}")
-    np.save(folder / f"{name}.places.npy", places_deg)
+        out.seek(0)
+        _write_header(out, index.ntotal, dims)
+    np.save(folder / f"{name}.places.npy", np.concatenate(places_deg))
     _write_lists(folder, name, index, quantizers)
+    return int(index.ntotal)
+
+
+def _write_header(out: IO[bytes], rows: int, dims: int) -> None:
+    """Header of an array of NumPy, which reserves room for any number of rows."""
+    header = {"descr": "<f2", "fortran_order": False, "shape": (rows, dims)}
+    np.lib.format.write_array_header_1_0(out, header)
 
 
 def _write_lists(folder: Path, name: str, index: Any, quantizers: Quantizers) -> None:
@@ -181,3 +191,86 @@ def _check_table(
         fits = bool(((count <= room) & (ends <= size) & (room % BLOCK == 0)).all())
     if not fits:
         raise AtlasError(f"lists do not fit their file; rebuild the index: {path}")
+
+
+class ShardedIndex:
+    """The shards of an index, mapped and searched on one core.
+
+    The id of a vector is the base of its shard plus its row. Not for several threads at once.
+    """
+
+    def __init__(self, folder: Path, shards: Sequence[ShardInfo]) -> None:
+        """Open shards and quantizers; raises `AtlasError` where a file is damaged."""
+        self.quantizers = Quantizers.load(folder / QUANTIZERS_NAME)
+        self._shards = [OpenShard(folder, each, self.quantizers) for each in shards]
+
+    def __len__(self) -> int:
+        return sum(each.info.rows for each in self._shards)
+
+    def search(
+        self, queries: NDArray[np.float32], k: int, probes: int, rerank: int
+    ) -> tuple[Array, Ids]:
+        """Highest scalar products (Q, k) and ids (Q, k) of queries (Q, D), best first.
+
+        `probes` lists of every shard are scanned. The `rerank` best by code, over all shards, are
+        compared by their stored vectors. Where fewer are found: id -1 and product -inf.
+        """
+        dims = self.quantizers.recipe.dims
+        if queries.ndim != 2 or queries.shape[1] != dims:
+            raise ValueError(f"queries must be (Q, {dims}), got {queries.shape}")
+        queries = np.ascontiguousarray(queries, dtype=np.float32)
+        rotated = self.quantizers.rotated(queries)
+        lists, centre_scores = self.quantizers.nearest_lists(rotated, probes)
+        rerank = max(k, rerank)
+        scores = np.full((len(queries), 0), -np.inf, dtype=np.float32)
+        ids: Ids = np.empty((len(queries), 0), dtype=np.int64)
+        with one_thread():
+            for shard in self._shards:
+                found, rows = shard.scan(rotated, lists, centre_scores, rerank)
+                some = np.where(rows == NONE, NONE, rows + shard.info.base)
+                scores, ids = _highest(
+                    np.concatenate([scores, found], axis=1),
+                    np.concatenate([ids, some], axis=1),
+                    rerank,
+                )
+        return self._compared(queries, ids, k)
+
+    def vectors(self, ids: Ids) -> Array:
+        """Stored vectors (N, D) of ids (N,); zeros for ids that are in no shard."""
+        out = np.zeros((len(ids), self.quantizers.recipe.dims), dtype=np.float32)
+        for shard in self._shards:
+            rows = ids - shard.info.base
+            ours = np.flatnonzero((rows >= 0) & (rows < shard.info.rows))
+            if len(ours):
+                ours = ours[np.argsort(rows[ours], kind="stable")]
+                out[ours] = shard.vectors(rows[ours])
+        return out
+
+    def place_deg(self, number: int) -> tuple[float, float] | None:
+        """Latitude and longitude of an id; None where it is in no shard."""
+        for shard in self._shards:
+            if shard.info.base <= number < shard.info.base + shard.info.rows:
+                lat, lon = shard.places_deg[number - shard.info.base].tolist()
+                return lat, lon
+        return None
+
+    def _compared(self, queries: Array, ids: Ids, k: int) -> tuple[Array, Ids]:
+        """The k best of the candidates (Q, R) by their stored vectors; of equal ones the lower id
+        first."""
+        out_scores = np.full((len(queries), k), -np.inf, dtype=np.float32)
+        out_ids = np.full((len(queries), k), NONE, dtype=np.int64)
+        for query, candidates in enumerate(ids):
+            real = candidates[candidates != NONE]
+            scores = self.vectors(real) @ queries[query]
+            order = np.lexsort((real, -scores))[:k]
+            out_scores[query, : len(order)] = scores[order]
+            out_ids[query, : len(order)] = real[order]
+        return out_scores, out_ids
+
+
+def _highest(scores: Array, ids: Ids, count: int) -> tuple[Array, Ids]:
+    """The `count` highest of each row, in no order."""
+    if scores.shape[1] <= count:
+        return scores, ids
+    chosen = np.argpartition(scores, -count, axis=1)[:, -count:]
+    return np.take_along_axis(scores, chosen, axis=1), np.take_along_axis(ids, chosen, axis=1)

@@ -2,9 +2,10 @@
 
 import re
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from orthonav.atlas.catalog import Atlas
@@ -22,7 +23,7 @@ from orthonav.atlas.item_files import (
 from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.atlas.store import Store, digest_of
 from orthonav.errors import AtlasError, MapFileError
-from orthonav.files import Progress
+from orthonav.files import Progress, no_progress
 from orthonav.mapfile import Manifest, open_map
 from orthonav.prepare.methods import usual_edges
 
@@ -55,7 +56,7 @@ class Problem:
 def check_atlas(
     atlas: Atlas,
     deep: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
     *,
     clean: bool = False,
     min_age_s: float = MIN_AGE_S,
@@ -67,7 +68,6 @@ def check_atlas(
     replaced revisions) and rewrites a stale snapshot; nothing else is changed. Raises
     `StorageError` where the storage fails.
     """
-    progress = progress or (lambda stage, share: None)
     items, broken = read_items(atlas.store)
     files = _files(atlas.store)
     problems = [Problem("damaged item", f"{ITEMS}/{name}", why) for name, why in broken.items()]
@@ -179,17 +179,22 @@ def _sheet_problems(
         size = files.get(file.name, atlas.store.size(file.name))
         if size is None and atlas.store.size(f"{ITEMS}/{name}") is None:
             return  # replaced or retired during the check
-        wrong = list(_file_problems(atlas.store, file, size, deep, remedy))
-        yield from wrong
-        if deep and not wrong:
-            with _local_path(atlas.store, file.name) as path:
-                yield from _content_problems(atlas.recipe, sheet, key, file.name, path)
+        content = partial(_content_problems, atlas.recipe, sheet, key, file.name)
+        yield from _file_problems(atlas.store, file, size, deep, remedy, content)
 
 
 def _file_problems(
-    store: Store, file: StoredFile, size: int | None, deep: bool, remedy: str
+    store: Store,
+    file: StoredFile,
+    size: int | None,
+    deep: bool,
+    remedy: str,
+    content: Callable[[Path], Iterable[Problem]] = lambda path: (),
 ) -> Iterator[Problem]:
-    """Problems of a file that is `size` bytes long, None where it is missing."""
+    """Problems of a file that is `size` bytes long, None where it is missing.
+
+    `content` finds those of the content of a file whose checksum is right.
+    """
     if size is None:
         yield Problem("missing file", file.name, remedy)
     elif size != file.size_bytes:
@@ -198,6 +203,8 @@ def _file_problems(
         with _local_path(store, file.name) as path:
             if digest_of(path) != file.sha256:
                 yield Problem("wrong checksum", file.name, remedy)
+            else:
+                yield from content(path)
 
 
 def _index_problems(atlas: Atlas, deep: bool) -> Iterator[Problem]:

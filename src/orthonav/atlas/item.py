@@ -41,6 +41,7 @@ _SHEET = re.compile(r"r[0-9]{6}c[0-9]{6}")
 _ITEM_NAME = re.compile(r"(r[0-9]{6}c[0-9]{6})\.([0-9]{4})\.([0-9a-f]{12})\.json")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _ENCODER = json.JSONEncoder(sort_keys=True, separators=(",", ":"), allow_nan=False)
+_KINDS = {str: "text", int: "a whole number", dict: "an object"}
 _DATE = re.compile(r"([0-9]{4})(?:-([0-9]{2})(?:-([0-9]{2}))?)?")
 
 
@@ -191,13 +192,22 @@ class Sheet(SheetDescription):
                 and 1 <= sheet.tiles <= MAX_TILES
                 and sheet.area_km2 >= 0
             )
+        except AtlasError:
+            raise
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            if isinstance(error, AtlasError):
-                raise
-            raise AtlasError(f"damaged, or not an item of orthonav ({error!r:.120})") from error
+            raise AtlasError(f"damaged, or not an item of orthonav ({reason(error)})") from error
         if not possible or canonical(sheet.to_item()) != data:
             raise AtlasError(f"damaged, altered or not an item of orthonav: {sheet.id:.40}")
         return sheet
+
+
+def reason(error: Exception) -> str:
+    """What is wrong with plain values that could not be read, for people."""
+    if isinstance(error, KeyError):
+        return f"{error.args[0]!s:.80} is missing"
+    if isinstance(error, TypeError | AttributeError):
+        return "a value is of another kind than expected"
+    return f"{error!s:.200}"
 
 
 def canonical(plain: Any) -> bytes:
@@ -318,7 +328,7 @@ def _integer(text: str) -> int:
 
 
 def _of_type(kind: type, value: Any) -> Any:
-    """`value` if it is exactly of that type; raises `TypeError`."""
+    """`value` if it is exactly of that type; raises `ValueError`."""
     if type(value) is not kind:
-        raise TypeError(f"{value!r:.80} is not {kind.__name__}")
+        raise ValueError(f"{value!r:.80} where {_KINDS[kind]} is expected")
     return value

@@ -12,7 +12,14 @@ from types import MappingProxyType
 
 import numpy as np
 
-from orthonav.atlas.agreement import MAX_REACH_M, MIN_VIEWS, Agreement, Chain, PlaceEvidence
+from orthonav.atlas.agreement import (
+    MAX_REACH_M,
+    MIN_VIEWS,
+    Agreement,
+    Chain,
+    PlaceEvidence,
+    nearest_m,
+)
 from orthonav.atlas.sheet_registration import SearchRegion, SheetMatch, SheetRegistrar
 from orthonav.atlas.tile_search import TileSearch
 from orthonav.confidence.registered import (
@@ -21,10 +28,11 @@ from orthonav.confidence.registered import (
     USUAL_WEIGHTS,
     RegisteredConfidence,
 )
-from orthonav.geo.frames import LocalFrame, distances_m
+from orthonav.geo.frames import LocalFrame
 from orthonav.localizer.checks import check_footprint, check_view
+from orthonav.localizer.prepared import MIN_VIEW_PX, pose_prior
 from orthonav.localizer.rectify import RectifiedView, downsampled, rectify_footprint
-from orthonav.records import DEFAULT_YAW_STD_DEG, MIN_YAW_STD_DEG, Fix, NoFix, Telemetry, View
+from orthonav.records import Fix, NoFix, Telemetry, View
 
 # Values without another source: `python -m benchmarks.atlas_lost`.
 CANDIDATES = 24
@@ -58,8 +66,6 @@ LEAST = 1e-5
 """Least and greatest (1 - LEAST) probability of a match, for finite odds."""
 USUAL_CONFIDENCE = RegisteredConfidence(USUAL_BIAS, USUAL_WEIGHTS, USUAL_CHANCES)
 """Used for sheets with too little imagery to learn a confidence."""
-MIN_VIEW_PX = 24.0
-"""Least side of a view at the resolution of the coarse tiles, in pixels."""
 
 
 class AtlasLocator:
@@ -123,9 +129,7 @@ class AtlasLocator:
         made = (self._registrar.register(view, region, side_m) for region in regions)
         found = _distinct([each for each in made if each is not None], side_m)
         places = [
-            PlaceEvidence(
-                one.lat_deg, one.lon_deg, one.turn_rad, one.log_scale, _log_odds(key, found), key
-            )
+            PlaceEvidence(*one.latlon_deg, one.turn_rad, one.log_scale, _log_odds(key, found), key)
             for key, one in enumerate(found)
         ]
         # Where only expected places were searched, a wrong place lies there for certain.
@@ -159,17 +163,17 @@ class AtlasLocator:
             turn, std = each.last.turn_rad, each.turn_std_rad(time_ns)
             if self._heading_known:
                 turn = math.radians(view.telemetry.yaw_deg)
-                std = _yaw_std_rad(view.telemetry)
+                std = pose_prior(view.telemetry, True).turn_std_rad
             camera, scale = each.expected(time_ns), each.last.log_scale
             middle = _moved(camera, coarse, turn, scale, 1.0)
-            found.append(SearchRegion(*camera, middle, turn, scale, reach_m, std))
+            found.append(SearchRegion(*camera, turn, scale, middle, reach_m, std))
         return found
 
     def _candidates(self, view: View, coarse: RectifiedView) -> list[SearchRegion]:
         """The places of the whole atlas that are most similar to the view."""
         headings = np.arange(0.0, 360.0, TURN_STEP_DEG)
         if self._heading_known:
-            reach = KNOWN_SIGMAS * math.degrees(_yaw_std_rad(view.telemetry))
+            reach = KNOWN_SIGMAS * math.degrees(pose_prior(view.telemetry, True).turn_std_rad)
             steps = math.floor(min(180.0, reach) / TURN_STEP_DEG + 0.5)
             headings = view.telemetry.yaw_deg + TURN_STEP_DEG * np.arange(-steps, steps + 1)
         poses = [(math.radians(turn), scale) for turn in headings.tolist() for scale in LOG_SCALES]
@@ -177,11 +181,9 @@ class AtlasLocator:
         reach_m = REACH_STRIDES * recipe.tile_m * (1 - recipe.overlap)
         found = []
         for each in self._search.matches(coarse, poses, CANDIDATES):
-            middle = each.lat_deg, each.lon_deg
-            camera = _moved(middle, coarse, each.turn_rad, each.log_scale, -1.0)
-            found.append(
-                SearchRegion(*camera, middle, each.turn_rad, each.log_scale, reach_m, TURN_STD_RAD)
-            )
+            turn, scale, middle = each.turn_rad, each.log_scale, each.latlon_deg
+            camera = _moved(middle, coarse, turn, scale, -1.0)
+            found.append(SearchRegion(*camera, turn, scale, middle, reach_m, TURN_STD_RAD))
         return found
 
     def _outcome(self, found: Sequence[SheetMatch], view: View) -> Fix | NoFix:
@@ -209,13 +211,6 @@ def _searched_m2(regions: Sequence[SearchRegion]) -> float:
     return sum(math.pi * region.reach_m**2 for region in regions)
 
 
-def _yaw_std_rad(telemetry: Telemetry) -> float:
-    std_deg = telemetry.yaw_std_deg
-    if std_deg is None or not math.isfinite(std_deg):
-        std_deg = DEFAULT_YAW_STD_DEG
-    return math.radians(min(max(std_deg, MIN_YAW_STD_DEG), 180.0))
-
-
 def _log_odds(key: int, found: Sequence[SheetMatch]) -> float:
     """Log odds of one of the matches of a view (strongest first) against all the others."""
     one = found[key]
@@ -240,9 +235,8 @@ def _distinct(matches: Sequence[SheetMatch], side_m: float) -> list[SheetMatch]:
     """The strongest match of each place, strongest first."""
     distinct: list[SheetMatch] = []
     for each in sorted(matches, key=lambda one: -one.evidence["strength"]):
-        others = [(one.lat_deg, one.lon_deg) for one in distinct]
-        place = [(each.lat_deg, each.lon_deg)] * len(others)
-        if not others or distances_m(place, others).min() > RIVAL_SHARE * side_m:
+        others = [one.latlon_deg for one in distinct]
+        if nearest_m(each.latlon_deg, others) > RIVAL_SHARE * side_m:
             distinct.append(each)
     return distinct
 

@@ -1,13 +1,31 @@
 """The recipe that all sheets of an atlas share."""
 
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Any, cast
 
+from orthonav.atlas.item import reason
 from orthonav.errors import AtlasError
 from orthonav.geo.world import WorldSheets
 
 FORMAT = "orthonav-atlas"
 SCHEMA = 1
+
+
+def _require_possible(recipe: "CoarseRecipe | AtlasRecipe") -> None:
+    """Raise `AtlasError` where a value has another type than its field, or is impossible."""
+    for each in fields(recipe):
+        value, kind = getattr(recipe, each.name), cast(type, each.type)
+        if kind in (int, float):
+            kinds = int if kind is int else (int, float)
+            right = isinstance(value, kinds) and not isinstance(value, bool) and 0 <= value < 1e9
+        else:
+            right = isinstance(value, kind)
+        if not right:
+            raise AtlasError(f"{each.name} is {value!r:.40}")
+    if not (recipe.gsd_m > 0 and recipe.tile_px > 0 and recipe.overlap < 1):
+        raise AtlasError(
+            f"gsd_m {recipe.gsd_m}, tile_px {recipe.tile_px}, overlap {recipe.overlap}"
+        )
 
 
 @dataclass(frozen=True)
@@ -16,12 +34,15 @@ class CoarseRecipe:
 
     `gsd_m`: metres per pixel, above 0. `tile_px`: width of a tile. `overlap`: share that
     neighbouring tiles have in common, 0 to below 1; below 0.875 fewer views are found
-    (docs/decisions, the atlas).
+    (docs/decisions, the atlas). Raises `AtlasError` for impossible values.
     """
 
     gsd_m: float = 8.0
     tile_px: int = 128
     overlap: float = 0.875
+
+    def __post_init__(self) -> None:
+        _require_possible(self)
 
     @property
     def tile_m(self) -> float:
@@ -36,6 +57,7 @@ class AtlasRecipe:
     `gsd_m`: metres per pixel.
     `sheet_km`: greatest width of a sheet.
     `coarse`: recipe of the coarse tiles; None leaves them out, and views then need a prior.
+    Raises `AtlasError` and `AreaError` for impossible values.
     """
 
     gsd_m: float
@@ -48,6 +70,10 @@ class AtlasRecipe:
     calibration_views: int = 48
     sheet_km: float = 10.0
     coarse: CoarseRecipe | None = CoarseRecipe()
+
+    def __post_init__(self) -> None:
+        _require_possible(self)
+        WorldSheets(self.sheet_km * 1000)  # refuses impossible widths
 
     @property
     def sheets(self) -> WorldSheets:
@@ -64,12 +90,9 @@ class AtlasRecipe:
         try:
             values = {each.name: plain[each.name] for each in fields(cls)}
             coarse = values.pop("coarse")
-            recipe = cls(**values, coarse=None if coarse is None else CoarseRecipe(**coarse))
-            _require_plain(recipe)
-            WorldSheets(recipe.sheet_km * 1000)
+            return cls(**values, coarse=None if coarse is None else CoarseRecipe(**coarse))
         except (KeyError, TypeError, ValueError) as error:
-            raise AtlasError(f"recipe of the atlas cannot be read ({error})") from error
-        return recipe
+            raise AtlasError(f"recipe of the atlas cannot be read ({reason(error)})") from error
 
     def differences(self, other: "AtlasRecipe") -> list[str]:
         """The fields that differ, each as `name: this, not that`."""
@@ -79,26 +102,3 @@ class AtlasRecipe:
             for name in mine
             if mine[name] != theirs[name]
         ]
-
-
-_WHOLE = ("tile_px", "seed", "calibration_views")
-_FRACTIONS = ("gsd_m", "overlap", "sheet_km")
-
-
-def _require_plain(recipe: AtlasRecipe) -> None:
-    """Raise `ValueError` where a value has another type, or is impossible."""
-    parts: list[tuple[Any, tuple[str, ...], tuple[str, ...]]] = [(recipe, _WHOLE, _FRACTIONS)]
-    if recipe.coarse is not None:
-        parts.append((recipe.coarse, ("tile_px",), ("gsd_m", "overlap")))
-    for part, whole, fractions in parts:
-        for name in (*whole, *fractions):
-            value = getattr(part, name)
-            kinds = int if name in whole else (int, float)
-            if isinstance(value, bool) or not isinstance(value, kinds) or not 0 <= value < 1e9:
-                raise ValueError(f"{name} is {value!r:.40}")
-        if not (part.gsd_m > 0 and part.tile_px > 0 and part.overlap < 1):
-            raise ValueError(f"gsd_m {part.gsd_m}, tile_px {part.tile_px}, overlap {part.overlap}")
-    if not isinstance(recipe.method, str) or not isinstance(recipe.edges, str | None):
-        raise ValueError(f"method {recipe.method!r:.40}, edges {recipe.edges!r:.40}")
-    if not isinstance(recipe.registration, bool):
-        raise ValueError(f"registration is {recipe.registration!r:.40}")

@@ -2,13 +2,14 @@
 
 import logging
 import math
-from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.atlas.agreement import Placement
 from orthonav.atlas.catalog import Atlas
 from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.errors import AtlasError, MapFileError
@@ -28,43 +29,29 @@ searched where the middle of a view may lie up to this share of its side outside
 
 
 @dataclass(frozen=True)
-class SearchRegion:
-    """A place around which a view is registered.
+class SearchRegion(Placement):
+    """A placement around which a view is registered.
 
-    `lat_deg`, `lon_deg`: place of the camera.
     `middle_latlon_deg`: middle of the ground that the view shows.
-    `turn_rad`: heading of the top of the view.
-    `log_scale`: logarithm of true over reported height.
     `reach_m`: how far from the place is searched.
     `turn_std_rad`: standard deviation of the heading.
     """
 
-    lat_deg: float
-    lon_deg: float
     middle_latlon_deg: tuple[float, float]
-    turn_rad: float
-    log_scale: float
     reach_m: float
     turn_std_rad: float
 
 
 @dataclass(frozen=True, eq=False)
-class SheetMatch:
-    """A view registered on a sheet.
+class SheetMatch(Placement):
+    """The placement of a view registered on a sheet.
 
-    `lat_deg`, `lon_deg`: place of the camera.
-    `turn_rad`: heading of the top of the view.
-    `log_scale`: logarithm of true over reported height.
     `covariance` (4, 4): of metres east and north, heading (rad) and log scale.
     `evidence`: scores of the match and of its rivals.
     `confidence`: what the sheet makes of the evidence, None where it has learnt nothing.
     `radius_m`: error below which that confidence counts a fix as correct.
     """
 
-    lat_deg: float
-    lon_deg: float
-    turn_rad: float
-    log_scale: float
     covariance: NDArray[np.float64]
     evidence: Mapping[str, float]
     confidence: RegisteredConfidence | None
@@ -77,8 +64,8 @@ class SheetRegistrar:
     def __init__(self, atlas: Atlas) -> None:
         self.atlas = atlas
         self._lattice = atlas.recipe.sheets
-        self._open: OrderedDict[str, RegistrationLocalizer] = OrderedDict()
-        self._absent: set[str] = set()
+        self._usable = set(atlas.sheets())
+        self._sheet = lru_cache(maxsize=MAX_OPEN)(self._opened)
 
     def register(self, view: View, region: SearchRegion, side_m: float) -> SheetMatch | None:
         """The best match of a view `side_m` wide in a region, None where it cannot be compared.
@@ -95,36 +82,20 @@ class SheetRegistrar:
         return best
 
     def _near(self, region: SearchRegion, side_m: float) -> list[str]:
-        """Names of the sheets within reach of the middle of a view."""
+        """Names of the usable sheets within reach of the middle of a view."""
         frame = LocalFrame(*region.middle_latlon_deg)
         reach_m = region.reach_m + BORDER_SHARE * side_m
         lats, lons = frame.latlon_from_en(np.array([[-reach_m, -reach_m], [reach_m, reach_m]]))
         box = float(lons[0]), float(lats[0]), float(lons[1]), float(lats[1])
-        return list(self._lattice.over(box))
-
-    def _sheet(self, name: str) -> RegistrationLocalizer | None:
-        """The opened sheet, None where it is missing or damaged (logged once)."""
-        if name in self._absent:
-            return None
-        if name not in self._open:
-            found = self._opened(name)
-            if found is None:
-                self._absent.add(name)
-                return None
-            self._open[name] = found
-            while len(self._open) > MAX_OPEN:
-                self._open.popitem(last=False)
-        self._open.move_to_end(name)
-        return self._open[name]
+        return [name for name in self._lattice.over(box) if name in self._usable]
 
     def _opened(self, name: str) -> RegistrationLocalizer | None:
-        sheet = self.atlas.sheets().get(name)
-        if sheet is None:
-            return None
+        """A sheet, None where it is damaged (logged once)."""
         try:
-            return Localizer(open_map(self.atlas.path(sheet))).registration
+            return Localizer(open_map(self.atlas.path(self.atlas.sheets()[name]))).registration
         except (AtlasError, MapFileError) as error:
             log.warning("sheet %s cannot be used: %s", name, error)
+            self._usable.discard(name)
             return None
 
 
@@ -132,7 +103,7 @@ def _registered(
     sheet: RegistrationLocalizer, view: View, region: SearchRegion
 ) -> SheetMatch | None:
     telemetry = replace(view.telemetry, yaw_deg=math.degrees(region.turn_rad))
-    prior = Prior(region.lat_deg, region.lon_deg, region.reach_m / PRIOR_SIGMAS)
+    prior = Prior(*region.latlon_deg, region.reach_m / PRIOR_SIGMAS)
     heading = region.turn_rad, region.turn_std_rad
     seen = sheet.register(replace(view, telemetry=telemetry), prior, heading_std_rad=heading)
     if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):

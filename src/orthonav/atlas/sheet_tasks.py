@@ -18,7 +18,7 @@ from orthonav.atlas.item import Sheet
 from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.embed.cells import CellLayout
 from orthonav.errors import AreaError, AtlasError
-from orthonav.geo.area import Area, Extent
+from orthonav.geo.area import Area, Extent, require_one_area
 from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
 from orthonav.geo.sheets import sheets_of_route
@@ -188,10 +188,7 @@ def _names(
     band_m: float | None,
 ) -> Iterable[str]:
     """Names of the sheets of an area that imagery may touch."""
-    if route is not None and bounds_deg is not None:
-        raise AreaError("give a route with a band, or bounds, not both")
-    if route is None and band_m is not None:
-        raise AreaError("a search band needs a route (--route)")
+    require_one_area(route, band_m, bounds_deg)
     there = imagery.sheets(recipe)
     if bounds_deg is not None:
         west, south, east, north = bounds_deg

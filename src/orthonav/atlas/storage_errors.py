@@ -1,57 +1,21 @@
 """Errors of file systems as `StorageError` with the cause: unreachable, refused, full, missing."""
 
 import errno
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from orthonav.errors import MissingExtraError, OrthonavError, StorageError
 
-PACKAGES = {
-    "s3": "s3fs",
-    "s3a": "s3fs",
-    "gs": "gcsfs",
-    "gcs": "gcsfs",
-    "abfs": "adlfs",
-    "abfss": "adlfs",
-    "az": "adlfs",
-    "adl": "adlfs",
-    "oci": "ocifs",
-    "oss": "ossfs",
-    "sftp": "paramiko",
-    "ssh": "paramiko",
-    "smb": "smbprotocol",
-    "webdav": "webdav4",
-}
-"""The package to install for a protocol of fsspec."""
-_CREDENTIALS = {
-    "ClientAuthenticationError",
-    "CredentialRetrievalError",
-    "CredentialUnavailableError",
-    "DefaultCredentialsError",
-    "NoAuthTokenError",
-    "NoCredentialsError",
-    "PartialCredentialsError",
-    "ProfileNotFound",
-    "RefreshError",
-    "TokenRetrievalError",
-    "UnauthorizedSSOTokenError",
-}
-_UNREACHABLE = {
-    "ClientConnectorError",
-    "ClientConnectionError",
-    "ConnectTimeoutError",
-    "ConnectionClosedError",
-    "EndpointConnectionError",
-    "FSTimeoutError",
-    "HTTPClientError",
-    "ProxyConnectionError",
-    "ReadTimeoutError",
-    "SSLError",
-    "ServerTimeoutError",
-    "ServiceRequestError",
-    "ServiceResponseError",
-    "gaierror",
-}
+_CREDENTIALS = re.compile(
+    "Credential|ClientAuthentication|NoAuthToken|ProfileNotFound|RefreshError"
+    "|TokenRetrieval|UnauthorizedSSOToken"
+)
+"""In the names of exceptions of boto, Google and Azure: there are no valid credentials."""
+_UNREACHABLE = re.compile(
+    "Connect(or|ion)|Timeout|HTTPClientError|SSLError|ServiceRe(quest|sponse)Error|gaierror"
+)
+"""The same where the storage cannot be reached."""
 _REFUSED = {401, 403}
 _MAX_TEXT = 300
 
@@ -80,7 +44,7 @@ def _cause(error: Exception) -> str:
     numbers = {each.errno for each in chain if isinstance(each, OSError)}
     if numbers & {errno.ENOSPC, errno.EDQUOT}:
         return "disk full; free some space"
-    if names & _CREDENTIALS:
+    if any(map(_CREDENTIALS.search, names)):
         return f"no valid credentials ({text}); set those of the storage, see its documentation"
     if errno.EROFS in numbers:
         return "the file system is read-only"
@@ -88,9 +52,7 @@ def _cause(error: Exception) -> str:
         return f"not permitted, or credentials refused ({text})"
     if any(isinstance(each, FileNotFoundError) for each in chain):
         return f"no such file, folder or bucket ({text})"
-    if names & _UNREACHABLE or any(
-        isinstance(each, ConnectionError | TimeoutError) for each in chain
-    ):
+    if any(map(_UNREACHABLE.search, names)):
         return f"it cannot be reached ({text}); check the address and the network"
     return f"{type(error).__name__}: {text}"
 

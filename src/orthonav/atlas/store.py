@@ -2,24 +2,33 @@
 
 A file exists completely or not at all: locally it is written to a temporary name and renamed,
 object stores show a file when it is complete, elsewhere (SFTP) it is moved to its name. No file
-outside the atlas is ever named, because the catalogue may come from an untrusted source.
+outside the atlas is ever named, because the catalogue may come from an untrusted source. Remote
+files are copied to a cache and verified; that of fsspec neither verifies nor limits its size.
 """
 
+import contextlib
 import hashlib
+import logging
+import os
 import re
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from orthonav.atlas.cache import ContentCache, cache_folder, cache_limit_bytes
 from orthonav.atlas.filesystems import LocalFolder, RemoteFiles
 from orthonav.atlas.storage_errors import storage_errors
 from orthonav.errors import StorageError
 from orthonav.files import replacing
 
+log = logging.getLogger(__name__)
+
 MAX_READ_BYTES = 64 * 2**20
 """A guard for memory: catalogue and index manifest are smaller."""
+LIMIT_BYTES = 20 * 10**9
+"""Some 200 sheets of 100 km2 at 1 m, 70 to 100 MB each (docs/country.md)."""
+GRACE_S = 600.0
+"""Files used within this time are not removed: a process may be about to open them."""
 _PART = re.compile(r"[A-Za-z0-9._-]{1,200}")
 _PROTOCOL = re.compile(r"([a-z][a-z0-9+.-]*)://", re.IGNORECASE)
 _PASSWORD = re.compile(r"(://[^/@:]*):[^/]*@")
@@ -103,8 +112,8 @@ class Store:
                 self.download(name, temporary)
                 _require(temporary, size, sha256, self.shown(name))
 
-        cache = ContentCache(self.cache or cache_folder(), cache_limit_bytes())
-        return cache.get(sha256, Path(checked_name(name)).suffix, size, fill)
+        file = f"{sha256}{Path(checked_name(name)).suffix}"
+        return cached(self.cache, file, size, fill)
 
     def download(self, name: str, path: Path) -> None:
         """Copy a file of the atlas to `path`, not verified."""
@@ -114,12 +123,12 @@ class Store:
     def put(self, path: Path, name: str) -> None:
         """Copy a local file into the atlas, whole or not at all."""
         with storage_errors(self.shown(name), "write to the atlas"):
-            self._files.put(path, checked_name(name))
+            self._files.save(path, checked_name(name))
 
     def write(self, name: str, data: bytes) -> None:
         """Write a small file, whole or not at all."""
         with storage_errors(self.shown(name), "write to the atlas"):
-            self._files.write(checked_name(name), data)
+            self._files.save(data, checked_name(name))
 
     def remove(self, name: str) -> None:
         """Remove a file if it exists."""
@@ -167,3 +176,54 @@ def _require(path: Path, size: int, sha256: str, shown: str) -> None:
     else:
         return
     raise StorageError(f"{wrong}; 'orthonav atlas check --deep' finds all such files: {shown}")
+
+
+def cache_folder() -> Path:
+    """The folder of the cache: `ORTHONAV_CACHE`, otherwise the cache folder of the user."""
+    own = os.environ.get("ORTHONAV_CACHE")
+    if own:
+        return Path(own).expanduser()
+    users = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(users).expanduser() / "orthonav" / "atlas"
+
+
+def cache_limit_bytes() -> int:
+    """Size limit of the cache: `ORTHONAV_CACHE_GB`, otherwise 20 GB. Raises `StorageError`."""
+    gigabytes = os.environ.get("ORTHONAV_CACHE_GB")
+    try:
+        return int(float(gigabytes) * 1e9) if gigabytes else LIMIT_BYTES
+    except (ValueError, OverflowError) as error:
+        raise StorageError(f"ORTHONAV_CACHE_GB must be a number, got {gigabytes!r:.40}") from error
+
+
+def cached(folder: Path | None, name: str, size: int, fill: Callable[[Path], None]) -> Path:
+    """The file of the cache that is named by its SHA-256; if missing, `fill` writes it, verified.
+
+    Several processes may use a cache at the same time. `folder` None: see `cache_folder`.
+    """
+    folder, limit_bytes = folder or cache_folder(), cache_limit_bytes()
+    path = folder / name[:2] / name
+    with storage_errors(str(folder), "write to the cache of the atlas (ORTHONAV_CACHE)"):
+        if path.is_file() and path.stat().st_size == size:
+            os.utime(path)  # last used now
+            return path
+        fill(path)
+        _shrink(folder, limit_bytes, path)
+    return path
+
+
+def _shrink(folder: Path, limit_bytes: int, newest: Path) -> None:
+    """Remove the least recently used files until the limit holds."""
+    files = []
+    for path in folder.glob("??/*"):
+        with contextlib.suppress(FileNotFoundError):  # removed by another process
+            state = path.stat()
+            files.append((state.st_mtime, state.st_size, path))
+    excess = sum(size for _, size, _ in files) - limit_bytes
+    for used, size, path in sorted(files):
+        if excess <= 0:
+            return
+        if path != newest and time.time() - used > GRACE_S:
+            path.unlink(missing_ok=True)
+            excess -= size
+            log.debug("cache: removed %s", path.name)

@@ -2,19 +2,19 @@
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import represent
+from orthonav.atlas.agreement import Placement
 from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.coarse import EDGES
-from orthonav.atlas.index import WHITENING_NAME, fetch_files, half_whitened, load_whitening
+from orthonav.atlas.index import WHITENING_NAME, half_whitened, index_file, load_whitening
 from orthonav.atlas.index_manifest import read_manifest, stale_sheets
+from orthonav.atlas.index_shards import ShardedIndex
 from orthonav.atlas.recipe import CoarseRecipe
-from orthonav.atlas.vector_search import ShardedIndex
 from orthonav.embed.bank import embed_poses
 from orthonav.errors import AtlasError
 from orthonav.geo.frames import distances_m
@@ -32,22 +32,6 @@ APART_STRIDES = 1.5
 """Tiles nearer to each other than this are one place: the eight neighbours of a tile."""
 MAX_LAT_DEG = 89.8
 """Nearer to a pole a view has no meaningful heading."""
-
-
-@dataclass(frozen=True)
-class TileMatch:
-    """A coarse tile similar to a view.
-
-    `lat_deg`, `lon_deg`: its centre, the middle of the ground that the view shows.
-    `turn_rad`, `log_scale`: the pose under which the view was similar.
-    `score`: cosine similarity.
-    """
-
-    lat_deg: float
-    lon_deg: float
-    turn_rad: float
-    log_scale: float
-    score: float
 
 
 class TileSearch:
@@ -72,7 +56,8 @@ class TileSearch:
         self.unknown = stale_sheets(atlas, manifest)[0]
         self._folder = tempfile.TemporaryDirectory(prefix="orthonav-index-")
         folder = Path(self._folder.name)
-        fetch_files(atlas, manifest, folder)
+        for name in manifest.files:
+            (folder / name).symlink_to(index_file(atlas, manifest, name).absolute())
         self._embedder = load_whitening(folder / WHITENING_NAME)
         self._representation = make_variant(represent.TABLE, EDGES)
         self._index = ShardedIndex(folder, manifest.shards)
@@ -91,9 +76,9 @@ class TileSearch:
 
     def matches(
         self, view: RectifiedView, poses: Sequence[tuple[float, float]], count: int
-    ) -> list[TileMatch]:
+    ) -> list[Placement]:
         """The tiles most similar to a view under any of the poses, best first, apart from each
-        other.
+        other: their centres, which are the middle of the ground that the view shows.
 
         `view`: rectified to the resolution of the coarse tiles. `poses`: heading (rad) and log
         scale of each.
@@ -113,7 +98,7 @@ class TileSearch:
         flat_scores, flat_ids = scores.reshape(-1), ids.reshape(-1)
         order = np.argsort(-flat_scores, kind="stable")
         apart_m = APART_STRIDES * self.recipe.tile_m * (1 - self.recipe.overlap)
-        found: list[TileMatch] = []
+        found: list[Placement] = []
         taken = np.zeros((count, 2))
         for at in order[np.isfinite(flat_scores[order])].tolist():
             place = self._index.place_deg(int(flat_ids[at]))
@@ -122,8 +107,7 @@ class TileSearch:
             if found and _nearest_m(place, taken[: len(found)]) < apart_m:
                 continue
             taken[len(found)] = place
-            turn, scale = poses[int(pose_of[at])]
-            found.append(TileMatch(*place, turn, scale, float(flat_scores[at])))
+            found.append(Placement(*place, *poses[int(pose_of[at])]))
             if len(found) == count:
                 break
         return found

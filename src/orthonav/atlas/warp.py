@@ -55,8 +55,7 @@ class SheetSource:
 
     def covers(self, lat_deg: Array, lon_deg: Array) -> NDArray[np.bool_]:
         """Which places (N,) lie on the raster of the sheet."""
-        points = self.frame.en_from_latlon(lat_deg, lon_deg)
-        px = (points - [self.grid.west_m, self.grid.north_m]) * [1, -1] / self.grid.gsd_m
+        px = _px_from_latlon(self.frame, self.grid, lat_deg, lon_deg)
         return np.asarray(((px >= 0) & (px <= [self.grid.width_px, self.grid.height_px])).all(-1))
 
     def outline_deg(self) -> tuple[Array, Array]:
@@ -164,31 +163,35 @@ class Warp:
 
     def _source_px(self, target_px: Array) -> Array:
         """Pixels (N, 2), column and row, of the sheet at pixels of the grid."""
-        grid, source = self.grid, self.source
-        places = [grid.west_m, grid.north_m] + target_px * [grid.gsd_m, -grid.gsd_m]
-        points = source.frame.en_from_latlon(*self.frame.latlon_from_en(places))
-        corner = [source.grid.west_m, source.grid.north_m]
-        return np.asarray((points - corner) / [source.grid.gsd_m, -source.grid.gsd_m])
+        places = _latlon_from_px(self.frame, self.grid, target_px)
+        return _px_from_latlon(self.source.frame, self.source.grid, *places)
 
     @cached_property
     def _outline_px(self) -> Array:
         """The box of the sheet in pixels of the grid."""
-        return self._grid_px(*self.source.outline_deg())
+        return _px_from_latlon(self.frame, self.grid, *self.source.outline_deg())
 
     @cached_property
     def _box_px(self) -> tuple[float, float, float, float]:
         """Left, top, right, bottom of the raster of the sheet in pixels of the grid."""
         grid = self.source.grid
         corners = _corners(Block(0, 0, grid.height_px, grid.width_px))
-        places = [grid.west_m, grid.north_m] + corners * [grid.gsd_m, -grid.gsd_m]
-        points = self._grid_px(*self.source.frame.latlon_from_en(places))
+        places = _latlon_from_px(self.source.frame, grid, corners)
+        points = _px_from_latlon(self.frame, self.grid, *places)
         (left, top), (right, bottom) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
         return left - 1, top - 1, right + 1, bottom + 1
 
-    def _grid_px(self, lat_deg: Array, lon_deg: Array) -> Array:
-        corner = [self.grid.west_m, self.grid.north_m]
-        points = self.frame.en_from_latlon(lat_deg, lon_deg)
-        return np.asarray((points - corner) / [self.grid.gsd_m, -self.grid.gsd_m])
+
+def _px_from_latlon(frame: LocalFrame, grid: TileGrid, lat_deg: Array, lon_deg: Array) -> Array:
+    """Column and row (N, 2) of places on the raster of a grid."""
+    points = frame.en_from_latlon(lat_deg, lon_deg)
+    return np.asarray((points - [grid.west_m, grid.north_m]) / [grid.gsd_m, -grid.gsd_m])
+
+
+def _latlon_from_px(frame: LocalFrame, grid: TileGrid, px: Array) -> tuple[Array, Array]:
+    """Inverse of `_px_from_latlon`."""
+    places = [grid.west_m, grid.north_m] + px * [grid.gsd_m, -grid.gsd_m]
+    return frame.latlon_from_en(places)
 
 
 def joined_grey(warps: Sequence[Warp], block: Block) -> Pixels:

@@ -52,10 +52,6 @@ class Prediction:
     weight: Array
 
 
-def _full_coverage(points_en_m: Array) -> Array:
-    return np.ones(len(points_en_m))
-
-
 class Predictor:
     """Interpolates the outcomes of trials."""
 
@@ -69,7 +65,7 @@ class Predictor:
         spacing_m: float,
         other_date: Sequence[Trial] = (),
         least_error_m: float = 0.0,
-        coverage: Callable[[Array], Array] = _full_coverage,
+        coverage: Callable[[Array], Array],
     ) -> None:
         """`trials` of the map's own imagery, `other_date` of a second date.
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from orthonav.errors import AreaError
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.imagery.raster import SheetRaster
+from orthonav.mapfile.layer import level_shape
 from orthonav.mapfile.manifest import SheetInfo
 
 
@@ -32,8 +33,7 @@ class OrthoPyramid:
 
     def shape(self, level: int) -> tuple[int, int]:
         """Rows and columns of a level: those of the map."""
-        grid = self._sheet.grid
-        return -(-grid.height_px // 2**level), -(-grid.width_px // 2**level)
+        return level_shape(self._sheet.grid.height_px, self._sheet.grid.width_px, level)
 
     def read(
         self, level: int, row: int, col: int, height: int, width: int

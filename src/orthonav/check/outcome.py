@@ -33,7 +33,7 @@ class Conditions:
     """The conditions that a check assumes; defaults are those of `CheckRequest`.
 
     `width_m`, `height_m`: footprint of a vertical view on the ground.
-    `agl_m`: height above ground; None: unknown.
+    `agl_m`: height above ground.
     `yaw_std_deg`: standard deviation of the reported heading; None: heading unknown.
     `agl_std`: standard deviation of the reported height, as a share of the height.
     `prior_std_m`: standard deviation of the prior position per axis; None: no prior.
@@ -45,7 +45,7 @@ class Conditions:
 
     width_m: float
     height_m: float
-    agl_m: float | None
+    agl_m: float
     yaw_std_deg: float | None
     agl_std: float
     prior_std_m: float | None
@@ -79,6 +79,18 @@ class Cells:
     wrong: Array
     trials: NDArray[np.int32]
     persistence: Array
+
+
+CELL_VALUES = {
+    "probability": "probability of a correct, confident fix of one view",
+    "low": "lower end of its 80 % interval",
+    "high": "upper end of its 80 % interval",
+    "error_m": "expected error of such a fix, root mean square, metres",
+    "wrong": "share of trials that were confident and wrong",
+    "trials": "number of views tried",
+    "persistence": "expected correlation of the ground with another year, 0 to 1",
+}
+"""Arrays of `Cells` and their meaning, in the order of the bands of the raster."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +218,7 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Provenance:
+class CheckedInputs:
     """What was checked, as text for reports; empty where it does not apply.
 
     `terms`: attribution and licence of each imagery source.
@@ -234,7 +246,7 @@ class CheckResult:
     `envelope`: None where it was not requested.
     """
 
-    about: Provenance
+    about: CheckedInputs
     conditions: Conditions
     frame: LocalFrame
     cells: Cells

@@ -1,15 +1,14 @@
 """The request of a check, validated."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from orthonav.check.outcome import Provenance
+from orthonav.check.outcome import CheckedInputs
 from orthonav.errors import CheckError
 from orthonav.geo.camera import Camera
 from orthonav.geo.route import Route
 from orthonav.records import CONFIDENT
 
-NO_TEXTS = Provenance()
 DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
 """A field of view of 65 by 51 degrees, usual for small drones."""
 DEFAULT_SPEED_MPS = 20.0
@@ -63,7 +62,7 @@ class CheckRequest:
     extras: bool = True
     workers: int | None = None
     seed: int = 1
-    about: Provenance = NO_TEXTS
+    about: CheckedInputs = field(default_factory=CheckedInputs)
 
     def __post_init__(self) -> None:
         """Raise `CheckError` for values out of range."""

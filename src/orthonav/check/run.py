@@ -55,7 +55,8 @@ ENVELOPE_PLACES, HEIGHT_PLACES = 16, 30
 """Places of trials for the envelope (25 at each) and for other heights (4 at each)."""
 BANDS = (0.25, 0.5)
 """Narrower bands that are compared, as parts of the planned one."""
-MIN_TRIALS = 20
+MIN_VIEWS = 20
+"""A check of fewer trial views is refused."""
 MIN_BAND_VIEWS = 0.5
 """A band is checked at least so many sides of a view wide."""
 MAX_ASPECT = 8.0
@@ -99,6 +100,7 @@ class _Check:
         self.coverage = MapCoverage.of(registration.pyramid, self.sheet.grid)
         self.radius_m, self.floor_px = registration.radius_m, registration.floor_px
         self.calibrated = registration.confidence is not None
+        self.workers = self.request.workers or usable_cores()
         self.plan = self._plan()
         self.conditions = Conditions(
             self.plan.width_m,
@@ -200,6 +202,9 @@ class _Check:
         )
         cells = self._cells(predictor, own)
         along = self._along(predictor)
+        outside = 0.0
+        if along is not None:
+            outside = float(1 - self.coverage.covers(along.points_en_m).mean())
         known = np.isfinite(cells.probability)
         mean = float(cells.probability[known].mean()) if known.any() else 0.0
         findings = Findings(
@@ -208,7 +213,7 @@ class _Check:
             calibrated=self.calibrated,
             wrong=int(predictor.wrong.sum()),
             trials=len(own) + len(other),
-            outside=0.0 if along is None else self._outside(along),
+            outside=outside,
             along=along,
             stretches=() if along is None else blind_stretches(along, self.conditions, side_m),
             lookalikes=found_lookalikes(
@@ -238,17 +243,14 @@ class _Check:
             alternatives=self._alternatives(heights, own, cells),
         )
 
-    def _outside(self, along: Along) -> float:
-        return float(1 - self.coverage.covers(along.points_en_m).mean())
-
     def _trials(self, places: Array) -> tuple[list[Trial], list[Trial]]:
         """Trials with the map's imagery, and with that of the second date."""
         other_date, plan = self.request.other_date, self.plan
         work = [(plan, places)]
         if other_date is not None:
             work.append((replace(plan, other_path=other_date, seed=plan.seed + 1), places))
-        own, *others = run_many(work, self._workers, lambda share: self.progress("trials", share))
-        if len(own) < MIN_TRIALS:
+        own, *others = run_many(work, self.workers, lambda share: self.progress("trials", share))
+        if len(own) < MIN_VIEWS:
             raise AreaError(
                 f"only {len(own)} of {len(places)} trial views fit on the map: "
                 f"{plan.footprint_text}; fly lower, or build a larger map"
@@ -273,17 +275,11 @@ class _Check:
         errors = envelope_work(self.plan, exact) if len(exact) >= ENVELOPE_PLACES // 2 else []
         found = run_many(
             [*errors, *heights_work(self.plan, places)],
-            self._workers,
+            self.workers,
             lambda share: self.progress("envelope", share),
         )
         envelope = envelope_of(found[: len(errors)], accept, radius_m) if errors else None
         return envelope, found[len(errors) :]
-
-    @property
-    def _workers(self) -> int:
-        if self.request.workers is not None:
-            return self.request.workers
-        return usable_cores()
 
     def _predict(
         self, predictor: Predictor, points: Array, covered: NDArray[np.bool_]

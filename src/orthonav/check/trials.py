@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from orthonav.check.change import another_year, displaced
 from orthonav.check.ortho import OrthoPyramid
 from orthonav.check.persistence import MARGIN_PX
-from orthonav.check.views import MapCrops, TrialPlan, reported_persistence, view_levels, view_of
+from orthonav.check.views import MapCrops, TrialPlan, reported_persistence, view_of
 from orthonav.errors import MapFileError, WorkerError
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.records import NoFix, Prior, View
-from orthonav.register.registrar import apart_px
+from orthonav.register.registrar import Levels, apart_px
 
 AT_ONCE = 8
 """Trials that a worker takes at a time: about a second of work."""
@@ -169,7 +169,7 @@ class Trier:
                 f"only maps with a registration layer can be checked: {plans[0].map_path}"
             )
         self._registration = registration
-        self._own = MapCrops(registration.pyramid, registration)
+        self._own = MapCrops(registration.pyramid, registration.grid)
         self._plans = plans
         self._others: dict[Path, tuple[OrthoPyramid, MapCrops]] = {}
 
@@ -191,7 +191,7 @@ class Trier:
         if path not in self._others:
             pyramid = self._registration.pyramid
             other = OrthoPyramid(path, self._registration.sheet, pyramid.levels)
-            self._others[path] = other, MapCrops(other, self._registration)
+            self._others[path] = other, MapCrops(other, self._registration.grid)
         return self._others[path][1]
 
     def _trial(
@@ -204,7 +204,8 @@ class Trier:
     ) -> Trial | None:
         registration = self._registration
         # One level finer than the final one, where ambiguous views are registered too.
-        final = view_levels(plan, registration).final
+        side_px = plan.side_m / registration.grid.gsd_m
+        final = Levels.of(side_px, registration.pyramid.levels).final
         level = max(final - 1, 0)
         gsd_m = registration.grid.gsd_m * 2**level
         size = math.ceil(math.hypot(plan.width_m, plan.height_m) / gsd_m) + 4

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from orthonav.check.change import USUAL, Severity
 from orthonav.check.persistence import MARGIN_PX, default_model, features
 from orthonav.geo.camera import Camera
-from orthonav.localizer.registration import RegistrationLocalizer
+from orthonav.geo.grid import TileGrid
 from orthonav.records import Telemetry, View
 from orthonav.register.pose import rotation
 from orthonav.register.reference import GreyPyramid
-from orthonav.register.registrar import Levels
 
 EVERY_PX, PERSISTENCE_LEVELS = 8, 3
 """Persistence is computed every so many pixels, at so many levels: coarser detail lasts alike."""
@@ -95,17 +94,11 @@ def reported_persistence(grey: Grey, gsd_m: float, first: int = 0) -> list[NDArr
     return [found[0]] * first + found
 
 
-def view_levels(plan: TrialPlan, registration: RegistrationLocalizer) -> Levels:
-    """The levels of the map at which views are registered."""
-    levels = registration.pyramid.levels
-    return Levels.of(plan.side_m / registration.grid.gsd_m, levels)
-
-
 class MapCrops:
     """Square crops of a grey pyramid, in the plane of the checked map."""
 
-    def __init__(self, layer: GreyPyramid, registration: RegistrationLocalizer) -> None:
-        self._layer, self._grid = layer, registration.grid
+    def __init__(self, layer: GreyPyramid, grid: TileGrid) -> None:
+        self._layer, self._grid = layer, grid
 
     def around(
         self, en_m: NDArray[np.float64], size: int, level: int

@@ -1,7 +1,7 @@
 """The command line. Each command is one module with `add` (its arguments) and `run`.
 
-A module with many options names the everyday ones in `EVERYDAY`; `--help` shows those, and
-`--help-all` shows every option.
+A module with many options names the everyday ones in `EVERYDAY`, by action where the command has
+actions; `--help` shows those, and `--help-all` shows every option.
 """
 
 import argparse
@@ -135,9 +135,20 @@ def _parser(arguments: list[str]) -> argparse.ArgumentParser:
             module = _module(name)
             module.add(command)
             _name_units(command)
-            if everyday := getattr(module, "EVERYDAY", ()):
-                _shorten_help(command, everyday, show_all="--help-all" in arguments)
+            everyday = getattr(module, "EVERYDAY", ())
+            by_action = everyday.items() if isinstance(everyday, dict) else [("", everyday)]
+            for action, options in by_action:
+                if options:
+                    part = _action(command, action) if action else command
+                    _shorten_help(part, options, show_all="--help-all" in arguments)
     return parser
+
+
+def _action(command: argparse.ArgumentParser, name: str) -> argparse.ArgumentParser:
+    """The parser of an action of a command, such as `atlas build`."""
+    parts = (each for each in command._actions if isinstance(each, argparse._SubParsersAction))
+    found: argparse.ArgumentParser = next(parts).choices[name]
+    return found
 
 
 def _name_units(command: argparse.ArgumentParser) -> None:

@@ -2,7 +2,6 @@
 
 import argparse
 import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +9,13 @@ from orthonav.cli import build_atlas
 from orthonav.cli.common import add_area, print_json, progress
 
 if TYPE_CHECKING:
-    from orthonav.atlas.catalog import Atlas, Sheet
+    from orthonav.atlas.catalog import Atlas
 
 NOT_WHOLE = 3
+EVERYDAY = {
+    "build": build_atlas.EVERYDAY,
+    "cut": ("--route", "--bounds", "--band-m"),
+}
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -116,7 +119,7 @@ def summary(atlas: "Atlas") -> dict[str, Any]:
         terms = {key: source.get(key) for key in ("name", "attribution", "licence")}
         sources[tuple(map(str, terms.values()))] = terms
     size = sum(sheet.size_bytes for sheet in sheets)
-    area_km2 = sum(sheet.area_km2 for sheet in sheets)
+    area_km2, bounds = sum(sheet.area_km2 for sheet in sheets), atlas.bounds_deg
     return {
         "atlas": str(atlas.store),
         "sheets": len(sheets),
@@ -124,7 +127,7 @@ def summary(atlas: "Atlas") -> dict[str, Any]:
         "area_km2": round(area_km2, 4),
         "bytes": size,
         "mb_per_km2": round(size / 1e6 / area_km2, 4) if area_km2 > 0 else None,
-        "bounds_deg": _bounds(sheets),
+        "bounds_deg": bounds and [round(value, 7) for value in bounds],
         "date_from": dates[0] if dates else None,
         "date": dates[-1] if dates else None,
         "recipe": atlas.recipe.to_plain(),
@@ -132,15 +135,6 @@ def summary(atlas: "Atlas") -> dict[str, Any]:
         "made_by": sorted({" ".join(each) for sheet in sheets for each in sheet.made_by.items()}),
         "names": [sheet.id for sheet in sheets],
     }
-
-
-def _bounds(sheets: Iterable["Sheet"]) -> list[float] | None:
-    """West, south, east, north of all sheets, without crossing the antimeridian."""
-    boxes = [sheet.bounds_deg for sheet in sheets]
-    if not boxes:
-        return None
-    west, south, east, north = zip(*boxes, strict=True)
-    return [round(value, 7) for value in (min(west), min(south), max(east), max(north))]
 
 
 def summary_text(plain: dict[str, Any]) -> str:

@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from orthonav.atlas.build_report import BuildReport
     from orthonav.atlas.cluster import TaskRunner
 
+EVERYDAY = (
+    *("--route", "--bounds", "--band-m", "--gsd-m", "--sheet-km"),
+    *("--replace", "--cluster", "--workers", "--json"),
+)
 COARSE = ("gsd_m", "tile_px", "overlap")
 SHOWN_FAILURES = 20
 

@@ -14,7 +14,7 @@ EVERYDAY = (
 )
 
 if TYPE_CHECKING:
-    from orthonav.check.outcome import Provenance
+    from orthonav.check.outcome import CheckedInputs
     from orthonav.check.request import CheckRequest
     from orthonav.geo.camera import Camera
     from orthonav.geo.route import Route
@@ -186,7 +186,7 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         extras=not options.quick,
         workers=options.workers,
         seed=options.seed,
-        about=_provenance(options, route),
+        about=_checked_inputs(options, route),
     )
 
 
@@ -198,9 +198,9 @@ def _lowest_agl_m(route: "Route") -> float | None:
     return min((each.height_m for each in found if each.height_m >= LANDING_M), default=None)
 
 
-def _provenance(options: argparse.Namespace, route: "Route | None") -> "Provenance":
+def _checked_inputs(options: argparse.Namespace, route: "Route | None") -> "CheckedInputs":
     from orthonav import __version__
-    from orthonav.check.outcome import Provenance
+    from orthonav.check.outcome import CheckedInputs
     from orthonav.cli.info import imagery_text, recipe_text
     from orthonav.mapfile import open_map
 
@@ -210,7 +210,7 @@ def _provenance(options: argparse.Namespace, route: "Route | None") -> "Provenan
         parts = [str(source[key]) for key in ("attribution", "licence") if source.get(key)]
         if parts:
             terms.append(f"{source.get('name')}: {', '.join(parts)}")
-    return Provenance(
+    return CheckedInputs(
         map_name=options.map.name,
         imagery=imagery_text(manifest.imagery),
         recipe=recipe_text(manifest.recipe),

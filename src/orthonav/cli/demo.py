@@ -162,7 +162,7 @@ def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[A
 def _checked(folder: Path, map_path: Path, route: Path, shown: Progress) -> str:
     """The prediction for the route in one line; writes the report of the check to `check`."""
     from orthonav import __version__
-    from orthonav.check.outcome import Provenance
+    from orthonav.check.outcome import CheckedInputs
     from orthonav.check.request import CheckRequest
     from orthonav.check.run import check_map
     from orthonav.check.write import write_check
@@ -178,7 +178,7 @@ def _checked(folder: Path, map_path: Path, route: Path, shown: Progress) -> str:
         agl_m=HEIGHT_M,
         effort=CHECK_EFFORT,
         extras=False,
-        about=Provenance(
+        about=CheckedInputs(
             map_path.name,
             imagery_text(manifest.imagery),
             recipe_text(manifest.recipe),

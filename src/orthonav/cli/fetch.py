@@ -10,7 +10,8 @@ from orthonav.cli.needs import require_extras
 from orthonav.errors import FetchError
 
 if TYPE_CHECKING:
-    from orthonav.fetch import FetchRequest, FetchResult, ImageryOptions
+    from orthonav.fetch.options import ImageryOptions
+    from orthonav.fetch.run import FetchRequest, FetchResult
     from orthonav.geo.area import Area
 
 PACKAGE = "ign-package:"
@@ -141,7 +142,7 @@ def run(options: argparse.Namespace) -> None:
     if options.source.startswith(PACKAGE):
         _run_package(options)
         return
-    from orthonav.fetch import estimate_fetch, fetch
+    from orthonav.fetch.run import estimate_fetch, fetch
 
     request = _request(options)
     if options.dry_run:
@@ -162,7 +163,10 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _request(options: argparse.Namespace) -> "FetchRequest":
-    from orthonav.fetch import FetchRequest, Packing, RequestLimits, parse_source
+    from orthonav.fetch.politeness import RequestLimits
+    from orthonav.fetch.run import FetchRequest
+    from orthonav.fetch.sources import parse_source
+    from orthonav.fetch.write import Packing
 
     if not (1 <= options.parallel <= 16 and 1 <= options.quality <= 100 and options.retries >= 0):
         raise FetchError("--parallel is 1 to 16, --quality 1 to 100, --retries 0 or more")
@@ -194,7 +198,7 @@ def _request(options: argparse.Namespace) -> "FetchRequest":
 
 
 def _imagery(options: argparse.Namespace) -> "ImageryOptions":
-    from orthonav.fetch import ImageryOptions
+    from orthonav.fetch.options import ImageryOptions
 
     if options.gsd_m is not None and not 0 < options.gsd_m < 1000:
         raise FetchError(f"--gsd-m must be above 0, got {options.gsd_m:g}")

@@ -43,9 +43,9 @@ class FileCache:
                         f"cache folder holds other files; choose an empty one: {self.folder}"
                     )
                 marker.write_text("Answers of services, kept by orthonav fetch.\n")
-        except OutputError:
-            raise
         except OSError as error:
+            if isinstance(error, OutputError):
+                raise
             raise OutputError(
                 f"cache folder cannot be used ({error.strerror or error}): {self.folder}"
             ) from error
@@ -58,12 +58,9 @@ class FileCache:
         except OSError:
             return None
         head = len(_MAGIC) + 1 + _DIGEST
-        kind, digest, body = (
-            data[len(_MAGIC) : len(_MAGIC) + 1],
-            data[head - _DIGEST : head],
-            data[head:],
-        )
-        whole = data[: len(_MAGIC)] == _MAGIC and hashlib.sha256(kind + body).digest() == digest
+        magic, digest, body = data[: len(_MAGIC)], data[head - _DIGEST : head], data[head:]
+        kind = data[len(_MAGIC) : len(_MAGIC) + 1]
+        whole = magic == _MAGIC and hashlib.sha256(kind + body).digest() == digest
         if not whole or kind not in (_ABSENT, _IMAGE):
             path.unlink(missing_ok=True)
             return None

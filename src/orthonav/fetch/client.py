@@ -16,9 +16,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 from urllib.parse import quote, urljoin
 
+import requests
+import urllib3
+
 from orthonav import __version__
 from orthonav.errors import FetchError
-from orthonav.extras import missing_extra
 from orthonav.fetch.politeness import (
     RETRY_STATUS,
     RequestLimits,
@@ -27,19 +29,25 @@ from orthonav.fetch.politeness import (
     retry_after_s,
     retry_policy,
 )
-from orthonav.fetch.urls import KEY, Secret, checked_url, host_of, origin_of, shown
-
-try:
-    import requests
-    import urllib3
-except ImportError as error:  # pragma: no cover - depends on the installation
-    raise missing_extra("fetching imagery", "fetch", "requests", error) from error
+from orthonav.fetch.urls import (
+    KEY,
+    Secret,
+    carrying_key,
+    checked_url,
+    host_of,
+    joined,
+    origin_of,
+    shown,
+)
 
 USER_AGENT = f"orthonav/{__version__} (fetches orthophotos for one area; +orthonav fetch)"
 REDIRECTS = frozenset({301, 302, 303, 307, 308})
 _CHUNK = 64 * 1024
 _EXCERPT_CHARACTERS = 300
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-(\d+)/(\d+)")
+_EXCEPTION_TEXT = re.compile(
+    r"<(?:\w+:)?(?:ServiceException|ExceptionText)\b[^>]*>(.*?)</", re.DOTALL | re.IGNORECASE
+)
 log = logging.getLogger(__name__)
 Checked = TypeVar("Checked")
 
@@ -120,6 +128,10 @@ class Client:
                     text = text.replace(value, secret.placeholder)
         return text
 
+    def linked(self, base: str, reference: str) -> str:
+        """The absolute address of a reference in the document at `base`, with the key of `base`."""
+        return carrying_key(base, joined(base, self.redacted(reference)))
+
     def get(
         self,
         url: str,
@@ -155,9 +167,7 @@ class Client:
 
         def check(reply: HttpReply) -> ByteRange:
             if reply.status != 206:
-                raise BadReplyError(
-                    f"HTTP {reply.status} ({excerpt(reply)})", again=reply.status >= 500
-                )
+                raise bad_status(reply)
             found = _CONTENT_RANGE.fullmatch(reply.headers.get("content-range", "").strip())
             if not found:
                 raise BadReplyError("range without Content-Range")
@@ -299,6 +309,26 @@ def excerpt(reply: HttpReply) -> str:
     text = reply.body[: 4 * _EXCERPT_CHARACTERS].decode("utf-8", errors="replace")
     words = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     return words[:_EXCERPT_CHARACTERS]
+
+
+def bad_status(reply: HttpReply) -> BadReplyError:
+    """The error for an HTTP status other than the expected one, with what the service wrote."""
+    words = exception_text(reply) or excerpt(reply)
+    text = f"HTTP {reply.status}" + (f" ({words})" if words else "")
+    return BadReplyError(text, again=reply.status >= 500)
+
+
+def exception_text(reply: HttpReply) -> str:
+    """Code and text of an exception report of a WMS or WMTS; empty for anything else."""
+    text = reply.body[:20_000].decode("utf-8", errors="replace")
+    if "Exception" not in text:
+        return ""
+    found = _EXCEPTION_TEXT.search(text)
+    words = " ".join(found.group(1).split()) if found else ""
+    words = re.sub(r"<!\[CDATA\[|\]\]>|<[^>]*>", " ", words)
+    code = re.search(r'(?:exceptionCode|code)="([\w.]+)"', text)
+    joined = " ".join([*([code.group(1)] if code else []), *words.split()])
+    return "".join(c for c in joined if c.isprintable())[:300]
 
 
 def _no_auth(request: Any) -> Any:

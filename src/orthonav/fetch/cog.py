@@ -31,13 +31,12 @@ from orthonav.fetch.options import ImageryOptions, Provenance, finest_fitting
 from orthonav.fetch.remote import MAX_RANGE, RangeCache, RemoteFile, RemoteFiles
 from orthonav.fetch.urls import shown
 from orthonav.geo.frames import LocalFrame
+from orthonav.imagery.raster import WHOLLY_VALID
 
 CELL_PX = 512
 """GDAL's block size for COG, so a cell is usually one block."""
 _RESAMPLING_PX = 3
 """Pixels read beyond a window that is resampled: bilinear needs one, rounding another."""
-_WHOLLY_VALID = 250
-"""Interpolated mask (255: valid) from which a resampled pixel is valid: no invalid neighbour."""
 ALIGNED_PX = 0.02
 """Grids that differ by less count as one: a fiftieth of a pixel is below any error of imagery."""
 _PACKED_SHARE = 0.35
@@ -165,7 +164,7 @@ class CogSource:
         validity = np.zeros(shape, dtype=np.uint8)
         reproject(pixels, resampled, **placement)
         reproject(np.where(mask, 255, 0).astype(np.uint8), validity, **placement)
-        return (0, 0), resampled, validity >= _WHOLLY_VALID
+        return (0, 0), resampled, validity >= WHOLLY_VALID
 
     def _read(self, file: CogLevel, edges: tuple[int, ...]) -> Part | None:
         """Row, column, pixels and mask between edges (row, col, row, col), as far as they exist."""
@@ -176,10 +175,7 @@ class CogSource:
         window = Window(col0, row0, col1 - col0, row1 - row0)
         # Opened for every window: rasterio 1.4 crashes where a file of an opener is closed in
         # another thread than it was opened in. Its head is in memory, so this takes milliseconds.
-        with (
-            _gdal(self._remote, file.remote),
-            _open(self._remote, file.name, file.level) as dataset,
-        ):
+        with _opened(self._remote, file.name, file.level) as dataset:
             pixels = dataset.read(list(self.band_indexes), window=window)
             mask = _mask(dataset, self.band_indexes, window)
         return (row0, col0), pixels, mask
@@ -227,11 +223,11 @@ def _inspect(
 ) -> CogLevel:
     """A file at the level that fits `options`, read from its head."""
     file = remote.files[name]
-    with _gdal(remote, file), warnings.catch_warnings():
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with _open(remote, name, None) as whole:
+        with _opened(remote, name, None) as whole:
             level = _level(whole, options, frame, file)
-        with _open(remote, name, level) as dataset:
+        with _opened(remote, name, level) as dataset:
             _check(dataset, file)
             return CogLevel(
                 remote=file,
@@ -273,9 +269,7 @@ def _check(dataset: Any, file: RemoteFile) -> None:
     # Neither packed nor unpacked may a block exhaust memory: an untiled file is one huge block.
     block_px = max(height * width for height, width in dataset.block_shapes)
     if block_px * dataset.count * np.dtype(dataset.dtypes[0]).itemsize > MAX_RANGE:
-        raise FetchError(
-            f"not a GeoTIFF that can be read (blocks too large to be read by windows): {where}"
-        )
+        raise file.unreadable("blocks too large to be read by windows")
 
 
 def _mask(dataset: Any, bands: tuple[int, ...], window: Window) -> NDArray[np.bool_]:
@@ -303,22 +297,19 @@ def _offset_px(grid: CellGrid, file: CogLevel, box: Box) -> tuple[int, int] | No
     return round(row), round(col)
 
 
-def _open(remote: RemoteFiles, name: str, level: int | None) -> Any:
-    options = {} if level is None else {"overview_level": level}
-    return rasterio.open(name, driver="GTiff", opener=remote, **options)
-
-
 @contextmanager
-def _gdal(remote: RemoteFiles, file: RemoteFile) -> Iterator[None]:
-    """Run GDAL on a remote file. What went wrong on the network is raised before GDAL's error."""
-    remote.set_failure(None)
+def _opened(remote: RemoteFiles, name: str, level: int | None) -> Iterator[Any]:
+    """A remote file. What went wrong on the network is raised before GDAL's error."""
+    options = {} if level is None else {"overview_level": level}
+    remote.failure.value = None
     try:
-        with rasterio.Env(**GDAL_OPTIONS):
-            yield
+        with (
+            rasterio.Env(**GDAL_OPTIONS),
+            rasterio.open(name, driver="GTiff", opener=remote, **options) as dataset,
+        ):
+            yield dataset
     except RasterioError as error:
         remote.raise_failure()
         reason = " ".join(str(error.__cause__ or error).split())
-        raise FetchError(
-            f"not a GeoTIFF that can be read ({reason[:200]}): {shown(file.url)}"
-        ) from None
+        raise remote.files[name].unreadable(reason[:200]) from None
     remote.raise_failure()

@@ -1,34 +1,40 @@
 """XML and JSON documents of services, parsed with limits."""
 
 import json
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 from xml.etree.ElementTree import Element, ParseError
 
-from orthonav.errors import FetchError
-from orthonav.extras import missing_extra
-from orthonav.fetch.client import BadReplyError, Client, HttpReply, excerpt
-from orthonav.fetch.images import exception_text
+from defusedxml import DefusedXmlException
+from defusedxml.ElementTree import fromstring
 
-try:
-    from defusedxml import DefusedXmlException
-    from defusedxml.ElementTree import fromstring
-except ImportError as error:  # pragma: no cover - depends on the installation
-    raise missing_extra("reading capabilities", "fetch", "defusedxml", error) from error
+from orthonav.errors import FetchError
+from orthonav.fetch.client import BadReplyError, Client, HttpReply, bad_status, excerpt
 
 MAX_DOCUMENT_BYTES = 64 * 2**20
 """The capabilities of a national service list a thousand layers in some ten megabytes."""
 
 
-def get_xml(client: Client, url: str) -> bytes:
-    """An XML document without entities. Raises `FetchError`."""
+@dataclass(frozen=True, eq=False)
+class XmlDocument:
+    """An XML document without entities, as it came and as its root element."""
 
-    def check(reply: HttpReply) -> bytes:
+    body: bytes
+    root: Element
+
+
+def get_xml(client: Client, url: str) -> XmlDocument:
+    """An XML document. Raises `FetchError`."""
+
+    def check(reply: HttpReply) -> XmlDocument:
         _require_ok(reply)
         try:
-            parse_xml(reply.body)
+            return parse_xml(reply.body)
         except FetchError as error:
             raise BadReplyError(f"{error} ({excerpt(reply)})") from None
-        return reply.body
 
     return client.get(url, check, max_bytes=MAX_DOCUMENT_BYTES)
 
@@ -50,21 +56,37 @@ def get_json(client: Client, url: str, body: Any = None) -> dict[str, Any]:
     return client.get(url, check, headers=headers, max_bytes=MAX_DOCUMENT_BYTES, json=body)
 
 
-def parse_xml(body: bytes) -> Element:
-    """The root of a document. Raises `FetchError` where it is malformed or declares entities.
+def parse_xml(body: bytes) -> XmlDocument:
+    """A document. Raises `FetchError` where it is malformed or declares entities.
 
     A DOCTYPE alone is accepted, because every WMS 1.1.1 has one; what it names is never loaded.
     """
     try:
-        root: Element = fromstring(body, forbid_dtd=False)
+        return XmlDocument(body, fromstring(body, forbid_dtd=False))
     except DefusedXmlException:
         raise FetchError("document declares entities, which are not read") from None
     except (ParseError, ValueError):
         raise FetchError("not an XML document") from None
-    return root
+
+
+@contextmanager
+def capabilities(protocol: str, url: str) -> Iterator[None]:
+    """Read a document with OWSLib, whose warnings are ignored.
+
+    For odd documents it raises AttributeError and others; they become `FetchError`.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except FetchError:
+        raise
+    except Exception as error:
+        raise FetchError(
+            f"{protocol} capabilities cannot be read ({type(error).__name__}): {url}"
+        ) from None
 
 
 def _require_ok(reply: HttpReply) -> None:
     if reply.status != 200:
-        words = exception_text(reply) or excerpt(reply)
-        raise BadReplyError(f"HTTP {reply.status} ({words})", again=reply.status >= 500)
+        raise bad_status(reply)

@@ -126,14 +126,8 @@ def _candidates(grid: CellGrid, area: Area, margin_m: float) -> tuple[range, NDA
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         raise AreaError(f"area lies outside the coordinate system {grid.crs}")
     across, down = grid.cell_w_px * grid.res_x, grid.cell_h_px * grid.res_y
-    col0, col1 = (
-        math.floor((x.min() - grid.west) / across),
-        math.floor((x.max() - grid.west) / across),
-    )
-    row0, row1 = (
-        math.floor((grid.north - y.max()) / down),
-        math.floor((grid.north - y.min()) / down),
-    )
+    col0, col1 = (math.floor((edge - grid.west) / across) for edge in (x.min(), x.max()))
+    row0, row1 = (math.floor((grid.north - edge) / down) for edge in (y.max(), y.min()))
     if grid.limits is not None:
         row0, col0 = max(row0, grid.limits[0]), max(col0, grid.limits[1])
         row1, col1 = min(row1, grid.limits[2]), min(col1, grid.limits[3])

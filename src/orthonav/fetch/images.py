@@ -13,14 +13,9 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
 
-from orthonav.extras import missing_extra
-from orthonav.fetch.client import BadReplyError, HttpReply, excerpt
-
-try:
-    from PIL import Image, UnidentifiedImageError
-except ImportError as error:  # pragma: no cover - depends on the installation
-    raise missing_extra("fetching imagery", "fetch", "PIL", error) from error
+from orthonav.fetch.client import BadReplyError, HttpReply, bad_status, exception_text, excerpt
 
 FORMATS = ("JPEG", "PNG", "WEBP")
 _JPEG_END = b"\xff\xd9"
@@ -29,9 +24,6 @@ MIN_EMPTY_PX = 4096
 _EMPTY_COLOURS = {"black": 0, "white": 255}
 _NOT_COVERED = re.compile(
     r"TileOutOfRange|no data found|out of (the )?(range|bounds|extent)|not covered", re.IGNORECASE
-)
-_EXCEPTION_TEXT = re.compile(
-    r"<(?:\w+:)?(?:ServiceException|ExceptionText)\b[^>]*>(.*?)</", re.DOTALL | re.IGNORECASE
 )
 Array = NDArray[Any]
 
@@ -65,12 +57,10 @@ def image_or_absent(
     if reply.status == 204 or (tiled and reply.status in (404, 410)):
         return None
     if reply.status != 200:
-        words = exception_text(reply) or excerpt(reply)
-        if reply.status == 400 and _NOT_COVERED.search(words):
+        error = bad_status(reply)
+        if reply.status == 400 and _NOT_COVERED.search(str(error)):
             return None
-        raise BadReplyError(
-            f"HTTP {reply.status}" + (f" ({words})" if words else ""), again=reply.status >= 500
-        )
+        raise error
     if _looks_like_text(reply):
         words = exception_text(reply)
         if words and _NOT_COVERED.search(words):
@@ -129,19 +119,6 @@ def _empty_patches(rgb: NDArray[np.uint8], level: int) -> NDArray[np.bool_]:
     large = stats[:, cv2.CC_STAT_AREA] >= MIN_EMPTY_PX
     large[0] = False  # the other colours
     return np.asarray(large[labels])
-
-
-def exception_text(reply: HttpReply) -> str:
-    """Code and text of an exception report of a WMS or WMTS; empty for anything else."""
-    text = reply.body[:20_000].decode("utf-8", errors="replace")
-    if "Exception" not in text:
-        return ""
-    found = _EXCEPTION_TEXT.search(text)
-    words = " ".join(found.group(1).split()) if found else ""
-    words = re.sub(r"<!\[CDATA\[|\]\]>|<[^>]*>", " ", words)
-    code = re.search(r'(?:exceptionCode|code)="([\w.]+)"', text)
-    joined = " ".join([*([code.group(1)] if code else []), *words.split()])
-    return "".join(c for c in joined if c.isprintable())[:300]
 
 
 def _looks_like_text(reply: HttpReply) -> bool:

@@ -1,5 +1,6 @@
 """Which imagery is requested, and the provenance that travels with it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from orthonav.errors import FetchError
@@ -9,6 +10,8 @@ DEFAULT_GSD_M = 0.5
 GSD_TOLERANCE = 1.05
 """A level counts as fine enough when it is at most this much coarser than requested (zoom levels
 are powers of two and do not fall on round numbers)."""
+FORMATS = ("image/jpeg", "image/png", "image/webp")
+"""Media types that can be read, the usual one of orthophotos first."""
 MAX_COARSER = 1.5
 """Where no level is fine enough, the finest one is taken if it is at most this much coarser."""
 
@@ -111,6 +114,35 @@ def choose(names: list[str], wanted: str | None, what: str) -> str:
     if wanted is None and names:
         return names[0]
     raise FetchError(f"{what} {wanted}; available: {listed(names, wanted or '')}")
+
+
+def choose_layer(names: list[str], wanted: str | None, url: str, *, named: bool = False) -> str:
+    """The layer of that name; without a name, unless one is required (`named`), the only one.
+
+    Raises `FetchError` with the available ones.
+    """
+    if not names:
+        raise FetchError(f"document lists no layer: {url}")
+    if wanted is None and (named or len(names) > 1):
+        raise FetchError(f"choose one with --layer; available: {listed(names, 'ortho')}")
+    return choose(names, wanted, "no layer")
+
+
+def choose_format(offered: Sequence[str], options: ImageryOptions, what: str) -> str:
+    """The media type requested, else the preferred one, else the first of `FORMATS` on offer."""
+    if options.format is not None:
+        return choose(list(offered), options.format, f"{what} has no format")
+    found = next((name for name in (options.preferred_format, *FORMATS) if name in offered), None)
+    if found is None:
+        raise FetchError(f"{what} comes as {listed(list(offered))}; supported are JPEG, PNG, WebP")
+    return found
+
+
+def choose_time(values: Sequence[str], wanted: str, layer: str) -> str:
+    """The time requested, if the layer has it; one with an interval (A/B) may have any."""
+    if any("/" in value for value in values):
+        return wanted
+    return choose(list(values), wanted, f"layer {layer} has no time")
 
 
 def listed(names: list[str], wanted: str = "", most: int = 12) -> str:

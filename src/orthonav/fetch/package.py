@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element
 
 from orthonav.errors import FetchError, OutputError
 from orthonav.fetch.client import Client
-from orthonav.fetch.documents import get_xml, parse_xml
+from orthonav.fetch.documents import get_xml
 from orthonav.fetch.options import listed
 from orthonav.fetch.politeness import RequestLimits
 from orthonav.fetch.urls import joined, with_query
@@ -121,9 +121,8 @@ def download_package(
     except OSError as error:
         raise OutputError(f"cannot make the folder ({error.strerror}): {folder}") from error
     missing = [file for file in files if not (folder / file.name).is_file()]
-    needed = sum(file.size_bytes or 0 for file in missing) - sum(
-        _size(_part(folder, file)) for file in missing
-    )
+    parts = [path for file in missing if (path := _part(folder, file)).is_file()]
+    needed = sum(file.size_bytes or 0 for file in missing) - sum(p.stat().st_size for p in parts)
     if needed > shutil.disk_usage(folder).free:
         raise OutputError(f"disk is too small: {needed / 1e9:.1f} GB are needed: {folder}")
     for number, file in enumerate(files):
@@ -198,7 +197,7 @@ def _entries(client: Client, url: str, parameters: dict[str, str]) -> list[Eleme
     pages = number = 1
     while number <= pages:
         query = {**parameters, "page": str(number), "limit": str(PAGE)}
-        feed = parse_xml(get_xml(client, with_query(url, query)))
+        feed = get_xml(client, with_query(url, query)).root
         count = feed.get(f"{_GPF}pagecount", "1")
         pages = int(count) if count.isdecimal() else 1
         if pages > MAX_PAGES:
@@ -217,7 +216,3 @@ def _centimetres(package: Package) -> tuple[int, str]:
 
 def _part(folder: Path, file: PackageFile) -> Path:
     return folder / f"{file.name}.part"
-
-
-def _size(path: Path) -> int:
-    return path.stat().st_size if path.is_file() else 0

@@ -4,15 +4,11 @@ import threading
 import time
 from dataclasses import dataclass, field
 
-from orthonav.errors import FetchError
-from orthonav.extras import missing_extra
+from urllib3 import Retry
+from urllib3.exceptions import InvalidHeader
+from urllib3.util.retry import RequestHistory
 
-try:
-    from urllib3 import Retry
-    from urllib3.exceptions import InvalidHeader
-    from urllib3.util.retry import RequestHistory
-except ImportError as error:  # pragma: no cover - depends on the installation
-    raise missing_extra("fetching imagery", "fetch", "urllib3", error) from error
+from orthonav.errors import FetchError
 
 RETRY_STATUS = frozenset({408, 425, 429, 500, 502, 503, 504})
 """Temporary by definition (RFC 9110, 6585, 8470): the same request may succeed later."""

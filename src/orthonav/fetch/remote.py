@@ -83,12 +83,12 @@ class RemoteFile:
     def read_exactly(self, start: int, length: int) -> bytes:
         """These bytes and no others. Raises `FetchError` where they lie beyond the end."""
         if start + length > self.size:
-            raise self._broken("blocks beyond its end")
+            raise self.unreadable("blocks beyond its end")
         return self._fetch(start, start + length)
 
     def _fetch(self, start: int, end: int) -> bytes:
         if end - start > MAX_RANGE:
-            raise self._broken("blocks too large to be read by windows")
+            raise self.unreadable("blocks too large to be read by windows")
         key = (self.url, start, end)
         data = self._cache.get(key)
         if data is None:
@@ -102,20 +102,25 @@ class RemoteFile:
             self._cache.put(key, data)
         return data
 
-    def _broken(self, reason: str) -> FetchError:
+    def unreadable(self, reason: str) -> FetchError:
+        """The error for a file that GDAL cannot read."""
         return FetchError(f"not a GeoTIFF that can be read ({reason}): {shown(self.url)}")
+
+
+class _Failure(threading.local):
+    value: Exception | None = None
 
 
 class RemoteFiles(MultiByteRangeResourceContainer):  # type: ignore[misc]
     """Remote files by name, as an `opener` for rasterio; no other name can be opened.
 
-    An exception must not pass through GDAL. It is stored for its thread, and `raise_failure`
-    raises it once GDAL has returned.
+    An exception must not pass through GDAL. `failure.value` holds the first one of each thread
+    since it was reset to None, and `raise_failure` raises it once GDAL has returned.
     """
 
     def __init__(self) -> None:
         self.files: dict[str, RemoteFile] = {}
-        self._failure = threading.local()
+        self.failure = _Failure()
 
     def open(self, path: str, mode: str = "r", **kwds: Any) -> "_Stream":
         """The file of that name, to be read."""
@@ -144,17 +149,10 @@ class RemoteFiles(MultiByteRangeResourceContainer):  # type: ignore[misc]
         """Bytes of a file."""
         return self.files[path].size
 
-    def set_failure(self, failure: Exception | None) -> None:
-        """Store an exception of this thread; the first one is kept until it is reset."""
-        if failure is None or getattr(self._failure, "value", None) is None:
-            self._failure.value = failure
-
     def raise_failure(self) -> None:
         """Raise the exception stored in this thread, if any."""
-        failure = getattr(self._failure, "value", None)
-        self._failure.value = None
-        if failure is not None:
-            raise failure
+        if self.failure.value is not None:
+            raise self.failure.value
 
 
 class _Stream(io.RawIOBase):
@@ -184,7 +182,7 @@ class _Stream(io.RawIOBase):
         try:
             data = self._file.read(self._at, self._file.size if size < 0 else size)
         except Exception as error:
-            self._files.set_failure(error)
+            self._files.failure.value = self._files.failure.value or error
             return b""
         self._at += len(data)
         return data
@@ -197,5 +195,5 @@ class _Stream(io.RawIOBase):
                 for offset, size in zip(offsets, sizes, strict=True)
             ]
         except Exception as error:
-            self._files.set_failure(error)
+            self._files.failure.value = self._files.failure.value or error
             return [bytes(size) for size in sizes]  # rasterio copies these lengths, checked or not

@@ -222,8 +222,6 @@ def _fetched(
         return fetch_cells(source, selection, client, cache, progress)
     except Stopped:
         raise KeyboardInterrupt from None
-    except OutputError:
-        raise
     except FetchError as error:
         raise FetchError(f"{error}; {_resume_hint(cache)}") from None
 

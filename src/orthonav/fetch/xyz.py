@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 
 from orthonav.errors import FetchError
-from orthonav.fetch.crs import MERCATOR_HALF_M, ground_scale
+from orthonav.fetch.crs import MERCATOR_HALF_M, ground_scale, mercator_resolution
 from orthonav.fetch.grid import CellGrid
 from orthonav.fetch.options import ImageryOptions, Provenance, finest_fitting
 from orthonav.fetch.service import TileSource
@@ -44,7 +44,8 @@ def xyz_tiles(
     if not 64 <= tile_px <= 4096:
         raise FetchError(f"tiles must be 64 to 4096 px wide, got {tile_px}")
     zoom = _zoom(options, frame, tile_px)
-    half, res, last = MERCATOR_HALF_M, _resolution(zoom, tile_px), 2**zoom - 1
+    half, last = MERCATOR_HALF_M, 2**zoom - 1
+    res = mercator_resolution(zoom, tile_px)
     grid = CellGrid("EPSG:3857", -half, half, res, res, tile_px, tile_px, (0, 0, last, last))
     url_of = _url_of(template, zoom, options.subdomains, tile_px, rows_from_south)
     return TileSource(provenance, grid, url_of, _format(template), options.empty)
@@ -57,11 +58,6 @@ def quadkey(zoom: int, row: int, col: int) -> str:
     )
 
 
-def _resolution(zoom: int, tile_px: int) -> float:
-    """Metres of the projection per pixel."""
-    return 2 * MERCATOR_HALF_M / tile_px / 2.0**zoom
-
-
 def _zoom(options: ImageryOptions, frame: LocalFrame, tile_px: int) -> int:
     low, high = options.min_zoom or 0, min(MAX_ZOOM, options.max_zoom or MAX_ZOOM)
     if options.zoom is not None:
@@ -70,7 +66,7 @@ def _zoom(options: ImageryOptions, frame: LocalFrame, tile_px: int) -> int:
         return int(options.zoom)
     scale = math.sqrt(math.prod(ground_scale("EPSG:3857", frame)))
     zooms = list(range(low, high + 1))
-    gsds_m = [_resolution(zoom, tile_px) * scale for zoom in zooms]
+    gsds_m = [mercator_resolution(zoom, tile_px) * scale for zoom in zooms]
     return zooms[finest_fitting(gsds_m, options.wanted_gsd_m, f"zoom {low} to {high}")]
 
 

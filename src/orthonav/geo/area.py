@@ -112,6 +112,14 @@ class Area:
         return self.route.points_en_m(self.frame), np.array(bands_m)
 
 
+def require_one_area(route: Route | None, band_m: float | None, bounds_deg: Extent | None) -> None:
+    """Raise `AreaError` where both a route and bounds are given, or a band without a route."""
+    if route is not None and bounds_deg is not None:
+        raise AreaError("give either a route with a search band or bounds, not both")
+    if route is None and band_m is not None:
+        raise AreaError("a search band needs a route (--route)")
+
+
 def _checked(extent: Extent) -> Extent:
     west, south, east, north = extent
     across = max(east - west, north - south)

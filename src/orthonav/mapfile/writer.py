@@ -34,11 +34,20 @@ def write_map(path: Path, manifest: Manifest, arrays: Mapping[str, NDArray[Any]]
         for name, array in parts.items()
     }
     full = dataclasses.replace(manifest, parts=described)
+    save_tensors(path, parts, full.to_json(), "map")
+    return full
+
+
+def save_tensors(path: Path, arrays: Mapping[str, NDArray[Any]], metadata: str, what: str) -> None:
+    """Write arrays and metadata as safetensors, complete or not at all.
+
+    Raises `OutputError`, which names `what` could not be written.
+    """
     with replacing(path) as temporary:
         try:
-            save_file(parts, temporary, metadata={METADATA_KEY: full.to_json()})
+            contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+            save_file(contiguous, temporary, metadata={METADATA_KEY: metadata})
         except SafetensorError as error:
             if f"os error {errno.ENOSPC}" in str(error):
                 raise OSError(errno.ENOSPC, "disk full") from error
-            raise OutputError(f"map cannot be written ({error}): {path}") from error
-    return full
+            raise OutputError(f"{what} cannot be written ({error}): {path}") from error

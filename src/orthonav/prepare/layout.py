@@ -25,7 +25,7 @@ def grid_of(
 
     Raises `AreaError` if tiles are larger than an area without a route.
     """
-    gsd_m = _rounded(imagery_gsd_m) if gsd_m is None else gsd_m
+    gsd_m = rounded_gsd_m(imagery_gsd_m) if gsd_m is None else gsd_m
     overlap = _whole_cells(tile_px, overlap)
     grid = TileGrid.covering(area.extent_en_m, gsd_m=gsd_m, tile_px=tile_px, overlap=overlap)
     west, south, east, north = area.extent_en_m
@@ -43,7 +43,7 @@ def grid_of(
     return grid
 
 
-def _rounded(gsd_m: float) -> float:
+def rounded_gsd_m(gsd_m: float) -> float:
     """Ground resolution rounded to few digits: 5.002 to 5, 0.2431 to 0.243."""
     for digits in (1, 2, 3):
         rounded = float(f"{gsd_m:.{digits}g}")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from orthonav import represent
 from orthonav.embed.whitened import WhitenedRecipe
 from orthonav.errors import AreaError, OutputError, VariantError
-from orthonav.geo.area import Area, Extent
+from orthonav.geo.area import Area, Extent, require_one_area
 from orthonav.geo.estimate import estimate_map
 from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
@@ -159,10 +159,7 @@ def _check_numbers(request: BuildRequest) -> None:
 
 
 def _area(request: BuildRequest, mosaic: Mosaic) -> Area:
-    if request.route is not None and request.bounds_deg is not None:
-        raise AreaError("give either a route with a search band or bounds, not both")
-    if request.route is None and request.band_m is not None:
-        raise AreaError("a search band needs a route (--route)")
+    require_one_area(request.route, request.band_m, request.bounds_deg)
     outline = mosaic.outline_latlon_deg
     if request.route is not None:
         area = Area.from_route(request.route, request.band_m)

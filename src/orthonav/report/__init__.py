@@ -8,7 +8,7 @@ package imports neither matplotlib nor Jinja2.
 from orthonav.report.canvas import Drawing, draw_axes, draw_figure
 from orthonav.report.figures import Figure, file_names, write_figures, write_page
 from orthonav.report.maps import Background, draw_background, draw_map, map_size_in
-from orthonav.report.numbers import measure_text, percent_text, plain_text
+from orthonav.report.numbers import measure_text, metres_text, percent_text, plain_text
 from orthonav.report.page import render
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "file_names",
     "map_size_in",
     "measure_text",
+    "metres_text",
     "percent_text",
     "plain_text",
     "render",

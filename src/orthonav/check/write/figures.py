@@ -1,18 +1,19 @@
 """Figures of a check: map, profile along the route, envelope of errors."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.check.outcome import Along, BlindStretch, CheckResult, Envelope
-from orthonav.check.write.imagery import Box, MapImage, visible_box
+from orthonav.check.write.imagery import Box, shrunk, visible_box
 from orthonav.check.write.risk import RISKS, segments
 from orthonav.check.write.shapes import stretch_en_m
 from orthonav.check.write.summary import summarize
 from orthonav.check.write.wording import share_text, tolerance_sentence
 from orthonav.records import CONFIDENT
-from orthonav.report import Figure, draw_axes, draw_figure, draw_map, map_size_in
+from orthonav.report import Background, Figure, draw_axes, draw_figure, draw_map, map_size_in
 from orthonav.report.canvas import BACKING, GREY, INK, OFFSET, RIGHT, SOFT, WRONG
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ _NUMBERED = 0.01
 _LEGEND: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "frameon": False}
 
 
-def figures(result: CheckResult, image: MapImage) -> list[Figure]:
+def figures(result: CheckResult, image: Background) -> list[Figure]:
     """The figures of a check, in the order in which the page shows them."""
     found = [_map(result, image)]
     if result.along is not None and len(result.along.distance_m) > 1:
@@ -40,12 +41,13 @@ def figures(result: CheckResult, image: MapImage) -> list[Figure]:
     return found
 
 
-def _map(result: CheckResult, image: MapImage) -> Figure:
+def _map(result: CheckResult, image: Background) -> Figure:
     west, south, east, north = box = visible_box(result)
     visible = west, east, south, north
+    background = replace(image, grey=shrunk(image.grey, _BACKGROUND_PX))
 
     def draw(axes: "Axes") -> None:
-        draw_map(axes, visible, image.background(_BACKGROUND_PX))
+        draw_map(axes, visible, background)
         _draw_cells(axes, result)
         if result.along is not None:
             _draw_route(axes, result, result.along)

@@ -7,7 +7,7 @@ from orthonav.check.outcome import CheckResult
 from orthonav.check.write.figures import FIGURE_NAMES, figures
 from orthonav.check.write.imagery import map_image, visible_box
 from orthonav.check.write.page import page_of
-from orthonav.check.write.plain import is_check, to_json
+from orthonav.check.write.plain import FORMAT, to_json
 from orthonav.check.write.raster import tif_bytes
 from orthonav.check.write.shapes import to_geojson
 from orthonav.errors import OutputError
@@ -75,16 +75,14 @@ def _foreign(folder: Path) -> str | None:
         if odd is not None or not found:
             return odd
         links = (name for name in found if (folder / name).is_symlink())
-        return next(links, None) or (None if _is_check(folder / JSON) else found[0])
+        if (link := next(links, None)) is not None:
+            return link
+        plain = json.loads((folder / JSON).read_text(encoding="utf-8"))
+        return None if isinstance(plain, dict) and plain.get("format") == FORMAT else found[0]
+    except (FileNotFoundError, ValueError, RecursionError):
+        return found[0]
     except OSError as error:
         raise OutputError(f"cannot read folder ({error.strerror or error}): {folder}") from error
-
-
-def _is_check(path: Path) -> bool:
-    try:
-        return is_check(json.loads(path.read_text(encoding="utf-8")))
-    except (FileNotFoundError, ValueError, RecursionError):
-        return False
 
 
 def _writable(text: str) -> str:

@@ -1,7 +1,6 @@
 """The grey imagery of a map as background of a check, coarse enough for a page."""
 
 import math
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -25,26 +24,15 @@ Grey = NDArray[np.uint8]
 Box = tuple[float, float, float, float]
 
 
-@dataclass(frozen=True, eq=False)
-class MapImage:
-    """A grey image (rows, cols), north up; `box` is west, south, east, north in metres."""
-
-    grey: Grey
-    box: Box
-
-    def jpeg(self) -> bytes:
-        """The image as JPEG of the best quality within `MAX_BYTES`."""
-        for quality in _QUALITIES:
-            done, data = cv2.imencode(".jpg", self.grey, [int(cv2.IMWRITE_JPEG_QUALITY), quality])
-            if not done:
-                raise MapFileError("the imagery of the map cannot be encoded as JPEG")
-            if data.size <= MAX_BYTES:
-                break
-        return bytes(data.tobytes())
-
-    def background(self, max_px: int) -> Background:
-        """The image for a figure, no larger than `max_px` on its longer side."""
-        return Background(_shrunk(self.grey, max_px), *self.box)
+def jpeg(grey: Grey) -> bytes:
+    """An image (rows, cols) as JPEG of the best quality within `MAX_BYTES`."""
+    for quality in _QUALITIES:
+        done, data = cv2.imencode(".jpg", grey, [int(cv2.IMWRITE_JPEG_QUALITY), quality])
+        if not done:
+            raise MapFileError("the imagery of the map cannot be encoded as JPEG")
+        if data.size <= MAX_BYTES:
+            break
+    return bytes(data.tobytes())
 
 
 def visible_box(result: CheckResult) -> Box:
@@ -69,7 +57,7 @@ def visible_box(result: CheckResult) -> Box:
     return west, south, east, north
 
 
-def map_image(opened: MapFile, box: Box) -> MapImage:
+def map_image(opened: MapFile, box: Box) -> Background:
     """The imagery of the first sheet in `box`, from the registration layer or the preview.
 
     Raises `MapFileError` where these are damaged.
@@ -83,7 +71,7 @@ def map_image(opened: MapFile, box: Box) -> MapImage:
     if layer is None or longest_px > 2 ** (level + 2) * MAX_SIDE_PX:  # too few levels
         south_m = grid.north_m - grid.height_px * grid.gsd_m
         east_m = grid.west_m + grid.width_px * grid.gsd_m
-        return MapImage(preview(opened), (grid.west_m, south_m, east_m, grid.north_m))
+        return Background(preview(opened), grid.west_m, south_m, east_m, grid.north_m)
     gsd_m = grid.gsd_m * 2**level
     rows, cols = layer.shape(level)
     left = int(np.clip(math.floor((west - grid.west_m) / gsd_m), 0, cols - 1))
@@ -94,10 +82,11 @@ def map_image(opened: MapFile, box: Box) -> MapImage:
     grey[~valid] = _EMPTY
     west_m, north_m = grid.west_m + left * gsd_m, grid.north_m - top * gsd_m
     east_m, south_m = grid.west_m + right * gsd_m, grid.north_m - bottom * gsd_m
-    return MapImage(_shrunk(grey, MAX_SIDE_PX), (west_m, south_m, east_m, north_m))
+    return Background(shrunk(grey, MAX_SIDE_PX), west_m, south_m, east_m, north_m)
 
 
-def _shrunk(grey: Grey, max_px: int) -> Grey:
+def shrunk(grey: Grey, max_px: int) -> Grey:
+    """An image no larger than `max_px` on its longer side and `MAX_AREA_PX`."""
     rows, cols = grey.shape
     share = min(1.0, max_px / max(rows, cols), math.sqrt(MAX_AREA_PX / (rows * cols)))
     if share == 1:

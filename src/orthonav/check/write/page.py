@@ -5,30 +5,29 @@ from typing import Any
 
 import numpy as np
 
-from orthonav.check.outcome import BlindStretch, CheckResult
+from orthonav.check.outcome import CELL_VALUES, BlindStretch, CheckResult
 from orthonav.check.write.figures import MAX_LOOKALIKES
-from orthonav.check.write.imagery import MapImage, visible_box
-from orthonav.check.write.plain import CELL_VALUES, Plain, plain, to_plain
-from orthonav.check.write.risk import CIVIDIS, RISKS, segments
+from orthonav.check.write.imagery import jpeg, visible_box
+from orthonav.check.write.plain import Plain, plain, to_plain
+from orthonav.check.write.risk import RISKS, segments
 from orthonav.check.write.shapes import stretch_en_m
 from orthonav.check.write.summary import summarize
 from orthonav.check.write.wording import (
     SIMULATED,
     SYMBOLS,
+    WHAT,
     better_sentence,
     conditions_text,
-    metres_text,
-    outcome_text,
-    place_text,
+    lookalike_sentence,
     seconds_text,
     share_text,
+    stretch_row,
+    stretch_sentence,
     tolerance_sentence,
-    value_text,
     verdict_sentence,
-    what_text,
 )
 from orthonav.records import CONFIDENT
-from orthonav.report import Figure, render
+from orthonav.report import Background, Figure, metres_text, render
 from orthonav.report.leaflet import Leaflet
 from orthonav.report.page import data_url, joined_scripts, static_text
 
@@ -46,7 +45,7 @@ LAYERS = {
 """Layers of cells that the map can show."""
 
 
-def page_of(result: CheckResult, image: MapImage, figures: list[Figure], leaflet: Leaflet) -> str:
+def page_of(result: CheckResult, image: Background, figures: list[Figure], leaflet: Leaflet) -> str:
     """The page as HTML. Raises `MissingExtraError` without Jinja2."""
     about = result.about
     scripts = (leaflet.script, joined_scripts(_SHARED, PACKAGE, _SCRIPTS))
@@ -70,7 +69,7 @@ def page_of(result: CheckResult, image: MapImage, figures: list[Figure], leaflet
         "conditions": conditions_text(result.conditions, result.band_m).items(),
         "made_from": _made_from(result),
         "data": _page_data(result, image),
-        "image": data_url(image.jpeg(), "image/jpeg"),
+        "image": data_url(jpeg(image.grey), "image/jpeg"),
     }
     style = leaflet.style + static_text("check.css", PACKAGE)
     return render(PACKAGE, "page.html", values, style=style, scripts=scripts)
@@ -109,16 +108,8 @@ def _longest(longest: BlindStretch | None) -> tuple[str, str]:
 
 
 def _stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
-    return (
-        str(number),
-        *(place_text(each) for each in (stretch.start_m, stretch.end_m)),
-        metres_text(stretch.length_m),
-        seconds_text(stretch.end_s - stretch.start_s),
-        share_text(stretch.probability),
-        metres_text(stretch.drift_m),
-        metres_text(stretch.allowed_m),
-        ("✓ " if stretch.recoverable else "✕ ") + outcome_text(stretch),
-    )
+    *values, outcome = stretch_row(number, stretch)
+    return (*values, ("✓ " if stretch.recoverable else "✕ ") + outcome)
 
 
 def _lookalike_rows(result: CheckResult) -> list[tuple[str, ...]]:
@@ -143,10 +134,14 @@ def _alternatives(result: CheckResult) -> list[Plain]:
     found = result.alternatives
     return [
         {
-            "name": what_text(what),
+            "name": WHAT[what],
             "sentence": better_sentence(found, what),
             "rows": [
-                (value_text(each), share_text(each.probability), "● chosen" if each.chosen else "-")
+                (
+                    metres_text(each.value),
+                    share_text(each.probability),
+                    "● chosen" if each.chosen else "-",
+                )
                 for each in found
                 if each.what == what
             ],
@@ -168,7 +163,7 @@ def _made_from(result: CheckResult) -> list[tuple[str, str]]:
     ]
 
 
-def _page_data(result: CheckResult, image: MapImage) -> str:
+def _page_data(result: CheckResult, image: Background) -> str:
     """JSON for the scripts: `check.json`, and under `drawn` positions in metres and colours.
 
     Cells of which nothing is known are left out: around a band they are most of the box. The text
@@ -184,8 +179,10 @@ def _page_data(result: CheckResult, image: MapImage) -> str:
     ]
     drawn = {
         "box": visible_box(result),
-        "image": image.box,
-        "colours": CIVIDIS,
+        "image": (image.west_m, image.south_m, image.east_m, image.north_m),
+        "values": list(CELL_VALUES),
+        "colours": _colours(),
+        "confident": CONFIDENT,
         "risks": [vars(risk) for risk in RISKS],
         "most": {
             "error_m": _two_digits(max(most_m, 1.0)),
@@ -199,6 +196,11 @@ def _page_data(result: CheckResult, image: MapImage) -> str:
         "waypoints": [] if result.route_en_m is None else result.route_en_m,
         "band": _band(result),
         "lookalikes": np.array(pairs),
+        "blind_texts": [stretch_sentence(*each) for each in enumerate(result.stretches, start=1)],
+        "lookalike_texts": [
+            lookalike_sentence(*each)
+            for each in enumerate(result.lookalikes[:MAX_LOOKALIKES], start=1)
+        ],
     }
     values = {**to_plain(result), "drawn": plain(drawn, 2)}
     values["cells"] = _known_cells(values["cells"])
@@ -220,6 +222,18 @@ def _known_cells(cells: Plain) -> Plain:
     ]
     found = {name: [values[number] for number in known] for name, values in grids.items()}
     return {**cells, "known": known, **found}
+
+
+def _colours() -> list[str]:
+    """Colours of ten equal steps from 0 to 1, interpolated in between.
+
+    Cividis (Nunez et al. 2018, doi 10.1371/journal.pone.0199239) reads alike with and without
+    colour blindness.
+    """
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    return [to_hex(colour) for colour in colormaps["cividis"](np.linspace(0, 1, 10))]
 
 
 def _two_digits(value: float) -> float:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.check.outcome import Cells, CheckResult
+from orthonav.check.outcome import CELL_VALUES, Cells, CheckResult
 from orthonav.check.write.summary import summarize
 from orthonav.geo.frames import LocalFrame
 
@@ -20,8 +20,6 @@ FORMAT, VERSION = "orthonav-check", 1
 _DIGITS = {"m": 2, "s": 2, "deg": 7, "value": 2, "off": 4}
 """Decimals by the last word of a name: a centimetre; shares and others have `_SHARE`."""
 _SHARE, _EXACT = 3, 6
-CELL_VALUES = ("probability", "low", "high", "error_m", "wrong", "trials", "persistence")
-"""Figures of a cell, each a grid of `Cells`."""
 
 Plain = dict[str, Any]
 
@@ -175,8 +173,3 @@ def plain(value: Any, digits: int | None = None) -> Any:
     if isinstance(value, float):
         return round(float(value), digits or 0) if math.isfinite(value) else None
     return value
-
-
-def is_check(read: object) -> bool:
-    """Whether what was read from a JSON file is a check of any version."""
-    return isinstance(read, Mapping) and read.get("format") == FORMAT

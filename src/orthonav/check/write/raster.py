@@ -5,32 +5,17 @@ from typing import Any
 
 import numpy as np
 
-from orthonav.check.outcome import CheckResult
-from orthonav.extras import missing_extra
-
-BANDS = {
-    "probability": "probability of a correct, confident fix of one view",
-    "low": "lower end of its 80 % interval",
-    "high": "upper end of its 80 % interval",
-    "error_m": "expected error of such a fix, root mean square, metres",
-    "wrong": "share of trials that were confident and wrong",
-    "trials": "number of views tried",
-    "persistence": "expected correlation of the ground with another year, 0 to 1",
-}
-"""Bands in order: name (the band's description in the file) and meaning."""
+from orthonav.check.outcome import CELL_VALUES, CheckResult
 
 
 def tif_bytes(result: CheckResult) -> bytes:
     """The file: float32, NaN where unknown, north up, conditions as tags.
 
     Made in memory (28 bytes per cell before compression), because GDAL does not report a full disk.
-    Raises `MissingExtraError` without rasterio.
     """
-    try:
-        from rasterio import Affine
-        from rasterio.io import MemoryFile
-    except ImportError as error:
-        raise missing_extra("writing a check", "geo", "rasterio", error) from error
+    from rasterio import Affine
+    from rasterio.io import MemoryFile
+
     cells = result.cells
     rows, cols = cells.probability.shape
     side = cells.side_m
@@ -38,7 +23,7 @@ def tif_bytes(result: CheckResult) -> bytes:
         "driver": "GTiff",
         "width": cols,
         "height": rows,
-        "count": len(BANDS),
+        "count": len(CELL_VALUES),
         "dtype": "float32",
         "nodata": math.nan,
         "crs": result.frame.proj4,
@@ -49,7 +34,7 @@ def tif_bytes(result: CheckResult) -> bytes:
     }
     with MemoryFile() as memory:
         with memory.open(**profile) as target:
-            for number, (name, meaning) in enumerate(BANDS.items(), start=1):
+            for number, (name, meaning) in enumerate(CELL_VALUES.items(), start=1):
                 target.write(np.asarray(getattr(cells, name), dtype=np.float32), number)
                 target.set_band_description(number, name)
                 target.update_tags(number, meaning=meaning)

@@ -1,19 +1,11 @@
-"""Colours of probabilities on the map, and classes of risk along the route.
-
-Cells use cividis (Nunez et al. 2018, doi 10.1371/journal.pone.0199239), which reads alike with and
-without colour blindness; classes use colours of Okabe and Ito and also differ in width and dash.
-"""
+"""Classes of risk along the route; they differ in width and dash as well as in colour."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-CIVIDIS = (
-    *("#00224e", "#123570", "#3b496c", "#575d6d", "#707173", "#8a8678"),
-    *("#a59c74", "#c3b369", "#e1cc55", "#fee838"),
-)
-"""Colours at equal steps from 0 to 1, interpolated in between."""
+from orthonav.records import CONFIDENT
 
 
 @dataclass(frozen=True)
@@ -34,7 +26,7 @@ class Risk:
 
 
 RISKS = (
-    Risk("confident", 0.9, "#0072b2", 4.0, (), "0.9 or more"),
+    Risk("confident", CONFIDENT, "#0072b2", 4.0, (), "0.9 or more"),
     Risk("likely", 0.7, "#56b4e9", 4.0, (), "0.7 to 0.9"),
     Risk("doubtful", 0.5, "#e69f00", 5.0, (9, 4), "0.5 to 0.7"),
     Risk("unlikely", 0.0, "#d55e00", 6.5, (), "below 0.5"),

@@ -7,14 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.check.outcome import Along, CheckResult
-from orthonav.check.write.plain import (
-    CELL_VALUES,
-    Plain,
-    lookalikes_to_plain,
-    plain,
-    stretches_to_plain,
-)
+from orthonav.check.outcome import CELL_VALUES, Along, CheckResult
+from orthonav.check.write.plain import Plain, lookalikes_to_plain, plain, stretches_to_plain
 from orthonav.check.write.risk import RISKS, risk_of
 from orthonav.geo.frames import LocalFrame
 

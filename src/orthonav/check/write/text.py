@@ -6,14 +6,13 @@ from orthonav.check.outcome import BlindStretch, CheckResult
 from orthonav.check.write.summary import summarize
 from orthonav.check.write.wording import (
     better_sentence,
-    metres_text,
-    outcome_text,
-    place_text,
     seconds_text,
     share_text,
+    stretch_row,
     verdict_sentence,
 )
 from orthonav.records import CONFIDENT
+from orthonav.report.numbers import metres_text
 
 MAX_STRETCHES = 8
 _MAX_REASONS = 5
@@ -79,17 +78,7 @@ def _stretches(result: CheckResult) -> list[str]:
     ]
     for number, each in enumerate(result.stretches, start=1):
         if each in worst:
-            rows.append(
-                (
-                    str(number),
-                    *(place_text(each.start_m), place_text(each.end_m), metres_text(each.length_m)),
-                    seconds_text(each.end_s - each.start_s),
-                    share_text(each.probability),
-                    metres_text(each.drift_m),
-                    metres_text(each.allowed_m),
-                    outcome_text(each),
-                )
-            )
+            rows.append(stretch_row(number, each))
     more = len(result.stretches) - len(worst)
     head = f"blind stretches ({len(result.stretches)})" + (f", the {len(worst)} worst" * (more > 0))
     return ["", head, *_columns(rows)]

@@ -8,8 +8,10 @@ from orthonav.check.outcome import (
     CheckResult,
     Conditions,
     Envelope,
+    Lookalike,
     Word,
 )
+from orthonav.report.numbers import metres_text
 
 SYMBOLS = {Word.GO: "✓", Word.MARGINAL: "!", Word.NO_GO: "✕"}
 VERDICTS = {
@@ -23,6 +25,7 @@ AREA_VERDICTS = {
     Word.NO_GO: "Do not rely on this map; see the reasons.",
 }
 WHAT = {"agl_m": "height above ground", "band_m": "width of the band"}
+"""Parameters that an alternative changes, in words."""
 CLEARLY = 0.05
 """Smaller differences may be chance, because an alternative rests on few trials."""
 SIMULATED = "Predicted from this map alone, with simulated ageing."
@@ -42,30 +45,53 @@ def share_text(value: float) -> str:
     return f"{99 if percent == 100 and value < 0.9995 else percent} %"
 
 
-def metres_text(value: float | None) -> str:
-    """A length, in kilometres from 10 km on; `-` if unknown."""
-    if value is None or not math.isfinite(value):
-        return "-"
-    if abs(value) >= 10_000:
-        return f"{value / 1000:.1f} km"
-    return f"{value:.1f} m" if abs(value) < 10 and value != round(value) else f"{value:.0f} m"
-
-
 def place_text(value: float) -> str:
     """A distance from the start of the route, in kilometres to ten metres."""
-    return f"{value / 1000:.2f} km" if math.isfinite(value) else "-"
+    return f"{value / 1000:.2f} km"
 
 
 def seconds_text(value: float) -> str:
     """A time in seconds, from two minutes on as `M:SS min`, from an hour on as `H:MM h`."""
-    if not math.isfinite(value):
-        return "-"
     whole = round(value)
     if abs(whole) < 120:
         return f"{whole} s"
     if abs(whole) < 3600:
         return f"{whole // 60}:{whole % 60:02d} min"
     return f"{whole // 3600}:{whole // 60 % 60:02d} h"
+
+
+def stretch_row(number: int, stretch: BlindStretch) -> tuple[str, ...]:
+    """A blind stretch as a row of a table: number, ends, length, duration, probability, drift,
+    allowed drift and outcome."""
+    return (
+        str(number),
+        place_text(stretch.start_m),
+        place_text(stretch.end_m),
+        metres_text(stretch.length_m),
+        seconds_text(stretch.end_s - stretch.start_s),
+        share_text(stretch.probability),
+        metres_text(stretch.drift_m),
+        metres_text(stretch.allowed_m),
+        outcome_text(stretch),
+    )
+
+
+def stretch_sentence(number: int, stretch: BlindStretch) -> str:
+    """A blind stretch in one sentence."""
+    _, _, _, length, duration, probability, drift, allowed, outcome = stretch_row(number, stretch)
+    return (
+        f"Blind stretch {number}: {length}, {duration}, probability {probability}, error {drift} "
+        f"at its end, allowed {allowed}: {outcome}."
+    )
+
+
+def lookalike_sentence(number: int, pair: Lookalike) -> str:
+    """A pair of lookalikes in one sentence."""
+    where = "within" if pair.within_prior else "outside"
+    return (
+        f"Lookalikes {number}: {metres_text(pair.apart_m)} apart, similarity "
+        f"{pair.similarity:.2f}, {pair.trials} trials, {where} the prior."
+    )
 
 
 def outcome_text(stretch: BlindStretch) -> str:
@@ -78,8 +104,6 @@ def outcome_text(stretch: BlindStretch) -> str:
 def tolerance_sentence(envelope: Envelope) -> str:
     """The tolerated errors of reported heading and height."""
     low, high = abs(envelope.tolerated_agl_low), abs(envelope.tolerated_agl_high)
-    if not all(map(math.isfinite, (envelope.tolerated_yaw_deg, low, high))):
-        return "The tolerated errors of heading and height are unknown."
     return (
         f"Tolerated: a heading error of up to {envelope.tolerated_yaw_deg:g}°, or a reported "
         f"height from {100 * low:.0f} % too low to {100 * high:.0f} % too high. With either error "
@@ -89,10 +113,10 @@ def tolerance_sentence(envelope: Envelope) -> str:
 
 def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, str]:
     """The conditions of the check by name."""
-    yaw, prior, height = conditions.yaw_std_deg, conditions.prior_std_m, conditions.agl_m
+    yaw, prior = conditions.yaw_std_deg, conditions.prior_std_m
     rows = {
         "footprint of a view": f"{conditions.width_m:.0f} x {conditions.height_m:.0f} m",
-        "height above ground": "unknown" if height is None else f"{height:.0f} m",
+        "height above ground": f"{conditions.agl_m:.0f} m",
         "error of reported height": f"{100 * conditions.agl_std:.1f} % (standard deviation)",
         "error of reported heading": (
             "heading unknown: all headings are searched"
@@ -114,17 +138,6 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
     return rows
 
 
-def value_text(alternative: Alternative) -> str:
-    """The value of an alternative with its unit."""
-    value = alternative.value
-    return metres_text(value) if alternative.what.endswith("_m") else f"{value:g}"
-
-
-def what_text(what: str) -> str:
-    """The parameter that an alternative changes, in words."""
-    return WHAT.get(what, what.replace("_", " "))
-
-
 def better_sentence(alternatives: tuple[Alternative, ...], what: str) -> str:
     """Whether another value of `what` would be better; empty if unknown."""
     tried = [each for each in alternatives if each.what == what]
@@ -134,8 +147,8 @@ def better_sentence(alternatives: tuple[Alternative, ...], what: str) -> str:
         return ""
     best = max(known, key=lambda each: each.probability)
     if best.probability < chosen.probability + CLEARLY:
-        return f"No other {what_text(what)} tried is better than {value_text(chosen)}."
+        return f"No other {WHAT[what]} tried is better than {metres_text(chosen.value)}."
     return (
-        f"A {what_text(what)} of {value_text(best)} instead of {value_text(chosen)} would be "
-        f"better: {share_text(best.probability)} instead of {share_text(chosen.probability)}."
+        f"A {WHAT[what]} of {metres_text(best.value)} instead of {metres_text(chosen.value)} would "
+        f"be better: {share_text(best.probability)} instead of {share_text(chosen.probability)}."
     )

@@ -2,12 +2,12 @@
 
 export const known = (value) => value !== null && Number.isFinite(value);
 
-/** A length in metres with its significant digits. */
+/** A length in metres, as `metres_text` of `orthonav.report.numbers` writes it. */
 export function metres(value) {
   if (!known(value)) return "–";
   const size = Math.abs(value);
   if (size >= 10000) return `${(value / 1000).toFixed(1)} km`;
-  return `${value.toFixed(size < 100 ? 1 : 0)} m`;
+  return `${value.toFixed(size < 100 ? 1 : 0).replace(/\.0$/, "")} m`;
 }
 
 export const number = (value, digits) => (known(value) ? value.toFixed(digits) : "–");

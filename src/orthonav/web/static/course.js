@@ -112,7 +112,7 @@ export class Course extends Chart {
     const y = (v) => bottom - Math.max(share(v), 0) * (bottom - top);
     this.rules(context, [this.store.run.radius_m], y, colour("wrong"));
     const decades = [0.1, 1, 10, 100, 1000, 10000].filter((v) => share(v) >= 0 && share(v) <= 1);
-    this.rules(context, decades, y, colour("line"), { text: (v) => metres(v).replace(".0 m", " m") });
+    this.rules(context, decades, y, colour("line"), { text: (v) => metres(v) });
     const positive = c.a.map((v) => (v > 0 ? v : NaN));
     this.area(context, this.places, null, positive, y, colour("shade"), bottom);
     if (withGnss) this.#points(context, gnss, (v) => Math.max(y(v), top), () => "gnss");

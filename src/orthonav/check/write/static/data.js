@@ -5,7 +5,7 @@ const data = JSON.parse(document.getElementById("check-data").textContent);
 const { cells, drawn } = data;
 const route = data.route?.points;
 const grids = {};
-for (const name of ["probability", "low", "high", "error_m", "wrong", "trials", "persistence"]) {
+for (const name of drawn.values) {
   grids[name] = new Array(cells.rows * cells.cols).fill(name === "trials" ? 0 : NaN);
   cells.known.forEach((cell, i) => { grids[name][cell] = cells[name][i] ?? NaN; });
 }

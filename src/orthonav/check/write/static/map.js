@@ -55,7 +55,7 @@ function addCells(map) {
   const change = () => {
     overlay.setOpacity(choice.value ? opacity.value / 100 : 0);
     if (choice.value) overlay.setUrl(pictureOf(choice.value));
-    showLegend(choice.value);
+    showLegend(choice.value, choice.selectedOptions[0].text);
   };
   choice.addEventListener("change", change);
   opacity.addEventListener("input", () => overlay.setOpacity(choice.value ? opacity.value / 100 : 0));
@@ -100,7 +100,7 @@ function addRoute(map) {
     if (drawn.blind[i].length < 2) return;
     L.polyline(drawn.blind[i].map(at), { ...quiet, color: "#1a1a1a", weight: 2.5 }).addTo(group);
     const middle = nearestAlong((blind.start_m + blind.end_m) / 2);
-    const description = describeBlind(blind);
+    const description = drawn.blind_texts[i];
     numbered(drawn.route[middle], String(blind.number), blind.recoverable ? "blind" : "lost", description, () => {
       selectAlong(middle, false);
       announce(description);
@@ -109,18 +109,11 @@ function addRoute(map) {
   return group;
 }
 
-function describeBlind({ number: name, length_m, start_s, end_s, probability, drift_m, allowed_m, ends_lost, recoverable }) {
-  const outcome = ends_lost ? "the route ends in it" : recoverable ? "recovers" : "lost";
-  return `Blind stretch ${name}: ${metres(length_m)}, ${number(end_s - start_s, 0)} s, probability ${percent(probability)}, `
-    + `error ${metres(drift_m)} at its end, allowed ${metres(allowed_m)}: ${outcome}.`;
-}
-
 function addLookalikes(map) {
   const group = L.layerGroup().addTo(map);
   drawn.lookalikes.forEach((ends, k) => {
-    const { number: name, apart_m, similarity, trials, within_prior: near } = data.lookalikes[k];
-    const description = `Lookalikes ${name}: ${metres(apart_m)} apart, similarity ${similarity.toFixed(2)}, `
-      + `${trials} trials, ${near ? "within" : "outside"} the prior.`;
+    const { number: name, within_prior: near } = data.lookalikes[k];
+    const description = drawn.lookalike_texts[k];
     L.polyline(ends.map(at), { color: "#8a2f63", weight: 2, dashArray: "3 6", interactive: false }).addTo(group);
     ends.forEach((place, i) => {
       const kind = near ? "twin near" : "twin";

@@ -1,10 +1,5 @@
 // Panel, legend and start. If a script fails, the static figures stay visible.
 
-const NAMES = {
-  probability: "probability of a fix", low: "probability, lower end", error_m: "expected error of a fix",
-  wrong: "confident and wrong", persistence: "expected persistence",
-};
-
 /** A probability with its interval, if known. */
 function between(value, low, high) {
   const interval = known(low) && known(high) ? ` (${percent(low).replace(" %", "")}–${percent(high)})` : "";
@@ -50,11 +45,12 @@ function showFigures({ east, north, index, aloud }) {
   if (aloud) announce(rows.map(([name, value]) => `${name}: ${value}`).join("; "));
 }
 
-function showLegend(name) {
+/** The legend of a layer, whose `title` the page has in its choice of layers. */
+function showLegend(name, title) {
   const legend = document.getElementById("legend");
   legend.replaceChildren();
   if (name) {
-    make("b", NAMES[name], legend);
+    make("b", title, legend);
     const scale = make("canvas", "", legend);
     [scale.width, scale.height] = [100, 1];
     const context = scale.getContext("2d");
