@@ -189,6 +189,17 @@ def test_solutions_of_another_clock_use_their_arrival(begin):
     assert sample.vel_en_mps is None and sample.satellites == -1 and math.isnan(sample.std_m)
 
 
+def test_an_error_of_the_witness_does_not_end_the_flight(begin, caplog):
+    flight = begin()
+    flight.views(10)
+    flight.frames.clear()
+    flight.watch._monitors[0].position = None  # any bug
+    results = flight.views(10)
+    flight.health()
+    assert len(flight.sent("GLOBAL_POSITION_SENSOR")) == 10 and all(results)
+    assert caplog.text.count("could not be compared with GNSS") == 1
+
+
 def test_a_watch_without_solutions_reports_nothing():
     watch = GnssWatch(FRAME, LiveSolutions(deque()))
     assert watch.tick(10**12) == [] and watch.reasons == () and watch.plain() == []

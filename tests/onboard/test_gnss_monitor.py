@@ -226,8 +226,8 @@ def test_a_receiver_that_was_never_heard_has_no_fault():
 
 
 def test_invalid_samples_are_lost_not_an_error():
-    air = Air()
-    assert air.fly(1, lat_deg=math.nan).fault is Fault.LOST
+    for wrong in ({"lat_deg": math.nan}, {"lat_deg": 214.7}, {"lon_deg": 1e9}):
+        assert Air().fly(1, **wrong).fault is Fault.LOST
     assert Air().fly(1, std_m=math.nan).fault is None
 
 

@@ -1,16 +1,13 @@
 """`orthonav fly --gnss`: the witness, made from the options."""
 
 import argparse
-import contextlib
 from collections import deque
 from pathlib import Path
 
 from orthonav.errors import VariantError
 from orthonav.flight.gnss import FILE, GnssSample, read_gnss
-from orthonav.flight.logged import gnss_message
 from orthonav.geo.frames import LocalFrame
 from orthonav.mapfile.signature import map_digest
-from orthonav.onboard.fly import LogSink
 from orthonav.onboard.gnss.watch import (
     GnssSource,
     GnssWatch,
@@ -26,7 +23,6 @@ def gnss_watch(
     frame: LocalFrame,
     queue: deque[GnssSample] | None,
     min_confidence: float,
-    sink: LogSink | None,
     clocks: Clocks,
 ) -> GnssWatch:
     """Witness over the solutions in `queue`, or over `gnss.csv` of the flight folder.
@@ -44,14 +40,6 @@ def gnss_watch(
     else:
         source = LiveSolutions(queue)
 
-    def log(sample: GnssSample) -> None:
-        if sink is None or options.ros2:  # with ROS 2 the message is logged as received
-            return
-        ahead_ns = 0 if recorded else clocks.utc_ns() - clocks.mono_ns()
-        with contextlib.suppress(ValueError):
-            time_ns = sample.time_ns + ahead_ns
-            sink.gnss(time_ns, gnss_message(sample, time_ns))
-
     return GnssWatch(
         frame,
         source,
@@ -60,5 +48,5 @@ def gnss_watch(
         correct=options.gnss == "correct",
         recorded=recorded,
         min_confidence=min_confidence,
-        log=log,
+        utc_ahead_ns=lambda: 0 if recorded else clocks.utc_ns() - clocks.mono_ns(),
     )

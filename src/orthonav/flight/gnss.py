@@ -58,6 +58,11 @@ class GnssSample:
         """Whether the receiver reports a 3D fix."""
         return self.fix_type >= FIX_3D
 
+    @property
+    def is_valid(self) -> bool:
+        """Whether it has a fix with a latitude and longitude in range."""
+        return self.has_fix and abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 360  # NaN too
+
 
 def gnss_of(evidence: Evidence) -> tuple[float, float] | None:
     """Latitude and longitude of GNSS at the exposure of a view; None where not known."""

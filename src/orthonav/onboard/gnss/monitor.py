@@ -85,7 +85,9 @@ class GnssMonitor:
 
     def sample(self, sample: GnssSample) -> None:
         """Add a solution of the receiver."""
-        en_m = np.asarray(self._frame.en_from_latlon(sample.lat_deg, sample.lon_deg))
+        en_m = np.full(2, math.nan)
+        if sample.is_valid:
+            en_m = np.asarray(self._frame.en_from_latlon(sample.lat_deg, sample.lon_deg))
         if self._receiver.add(sample, en_m):
             if self._solved and sample.time_ns <= self._solved[-1][0].time_ns:
                 self._solved.clear()  # the clock went back

@@ -3,6 +3,8 @@
 It uses one time base: the monotonic clock of a live flight, or the times of a recording.
 """
 
+import contextlib
+import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -13,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from orthonav.flight.gnss import GnssSample
+from orthonav.flight.logged import gnss_message
 from orthonav.geo.frames import LocalFrame
 from orthonav.onboard.gnss.displacement import UNKNOWN
 from orthonav.onboard.gnss.monitor import GnssMonitor
@@ -27,6 +30,7 @@ from orthonav.onboard.gnss.records import (
 from orthonav.publish.estimate import error_ellipse
 from orthonav.records import CONFIDENT, Fix, NoFix, ViewResult
 
+log = logging.getLogger(__name__)
 CORRECT_AFTER_S, CORRECT_STD_M = 1800.0, 5.0
 """A stored displacement corrects positions only after this time of agreement, and with at most
 this standard deviation."""
@@ -88,28 +92,36 @@ class GnssWatch:
         correct: bool = False,
         recorded: bool = False,
         min_confidence: float = CONFIDENT,
-        log: Callable[[GnssSample], None] = lambda sample: None,
+        utc_ahead_ns: Callable[[], int] = lambda: 0,
     ) -> None:
         """`frame`: plane of the map. `digest`: of the map; `known`: displacements by digest.
 
         `correct`: correct positions by the displacement known before the flight; what is learnt in
-        this flight never moves a position. `recorded`: times are those of the recording. `log` gets
-        every solution.
+        this flight never moves a position. `recorded`: times are those of the recording.
+        `utc_ahead_ns`: what is added to times of solutions in the log. `log` gets every solution,
+        as the message of a flight log.
         """
-        self._frame, self._source, self._log = frame, source, log
+        self._frame, self._source, self._utc_ahead_ns = frame, source, utc_ahead_ns
+        self.log: Callable[[int, bytes], None] = lambda time_ns, cdr: None
         self._digest, self._known = digest, dict(known)
         self._start = self._known.get(digest, UNKNOWN)
         self._recorded, self._least = recorded, min_confidence
         self._monitors: dict[int, GnssMonitor] = {}
         self._shown: dict[int, GnssStatus] = {}
         self._last: GnssSample | None = None
-        self._now_ns = 0
+        self._now_ns, self._has_failed = 0, False
         usable = self._start.agreed_s >= CORRECT_AFTER_S and self._start.std_m <= CORRECT_STD_M
         self.correction_en_m = self._start.en_m if correct and usable else np.zeros(2)
 
     def view(self, result: ViewResult, exposed_ns: int) -> ViewResult:
         """Compare a view; the result with the GNSS position of its exposure as evidence."""
-        now_ns = result.time_ns if self._recorded else exposed_ns
+        try:
+            return self._compared(result, result.time_ns if self._recorded else exposed_ns)
+        except Exception:  # the flight does not depend on the witness
+            self._failed("a view could not be compared with GNSS")
+            return result
+
+    def _compared(self, result: ViewResult, now_ns: int) -> ViewResult:
         self._take(now_ns)
         fix = result.outcome
         if isinstance(fix, Fix) and self._is_confident(fix, result.state):
@@ -129,6 +141,18 @@ class GnssWatch:
 
     def tick(self, mono_ns: int) -> list[GnssText]:
         """Judge at a time of the monotonic clock; messages about changes since the last call."""
+        try:
+            return self._ticked(mono_ns)
+        except Exception:  # the flight does not depend on the witness
+            self._failed("GNSS could not be judged")
+            return []
+
+    def _failed(self, text: str) -> None:
+        if not self._has_failed:  # once: it may happen at every view
+            log.exception("%s", text)
+        self._has_failed = True
+
+    def _ticked(self, mono_ns: int) -> list[GnssText]:
         if not self._recorded:
             self._take(mono_ns)
         texts = []
@@ -183,10 +207,16 @@ class GnssWatch:
             self._monitors[sample.receiver].sample(sample)
             if sample.receiver == 0:
                 self._last = sample
-            self._log(sample)
+            self._write(sample)
+
+    def _write(self, sample: GnssSample) -> None:
+        time_ns = sample.time_ns + self._utc_ahead_ns()
+        with contextlib.suppress(ValueError):  # a position that is not finite
+            self.log(time_ns, gnss_message(sample, time_ns))
 
     def _is_confident(self, fix: Fix, state: str | None) -> bool:
-        return fix.confidence >= self._least and state in (None, "tracking")
+        known = math.isfinite(error_ellipse(fix.cov_en_m2)[0])
+        return known and fix.confidence >= self._least and state in (None, "tracking")
 
     def _position(self, fix: Fix, now_ns: int) -> MapPosition:
         east, north = (fix.evidence.get(f"vel_{n}_mps", math.nan) for n in ("east", "north"))
@@ -203,7 +233,7 @@ class GnssWatch:
         """Position of the first receiver at an exposure, by its velocity, and the fault's code."""
         made = {"gnss_fault": float(self.code)}
         last = self._last
-        if last is None or not last.has_fix:
+        if last is None or not last.is_valid:
             return made
         seconds = (now_ns - last.time_ns) * NANOSECONDS
         if abs(seconds) > SHOWN_S:

@@ -23,9 +23,7 @@ def result(number, gnss_m=None, fault=0.0, found=True):
         lat, lon = FRAME.latlon_from_en([10.0 * number + gnss_m, 0.0])
         evidence |= {"gnss_lat_deg": float(lat), "gnss_lon_deg": float(lon)}
     lat, lon = FRAME.latlon_from_en([10.0 * number, 3.0])
-    fix = Fix(
-        float(lat), float(lon), np.eye(2), 0.99, 35.0, 0.0, 100.0, MappingProxyType(evidence)
-    )
+    fix = Fix(float(lat), float(lon), np.eye(2), 0.99, 35.0, 0.0, 100.0, MappingProxyType(evidence))
     outcome = fix if found else NoFix("blank", "nothing", MappingProxyType(evidence))
     return ViewResult(f"{number}", number * 10**9, outcome, 5.0, "tracking")
 
