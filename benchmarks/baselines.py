@@ -101,7 +101,7 @@ class Reference:
     @cached_property
     def edges(self) -> NDArray[np.uint8]:
         """Canny edges (H, W), 255 on an edge, with the paper's parameters."""
-        return _edges(self.grey, self.valid)
+        return canny_edges(self.grey, self.valid)
 
 
 class TemplateMatch:
@@ -134,7 +134,7 @@ class TemplateMatch:
         part = np.s_[middle - half : middle + half, middle - half : middle + half]
         best, place = -np.inf, None
         for one in views:
-            picture = _edges(one.grey, one.valid) if self._canny else one.grey
+            picture = canny_edges(one.grey, one.valid) if self._canny else one.grey
             template = np.ascontiguousarray(picture[part])
             scores = cv2.matchTemplate(self._picture, template, cv2.TM_CCOEFF_NORMED)
             _, score, _, (col, row) = cv2.minMaxLoc(scores)
@@ -194,7 +194,8 @@ def _distinct(first: Any, second: Any) -> bool:
     return bool(first.distance < LOWE * second.distance)
 
 
-def _edges(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def canny_edges(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Edge map (H, W) of 0 and 255."""
     return np.asarray(Canny()(grey, valid)[0] * 255, dtype=np.uint8)
 
 

@@ -1,9 +1,11 @@
 """Views of a flight with their truth. Measured processes import this: flight code only."""
 
-from collections.abc import Iterator
+import csv
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from orthonav.files import replacing
 from orthonav.flight import open_flight, read_truth
 from orthonav.flight.folder import read_image
 from orthonav.geo.camera import Camera
@@ -41,3 +43,17 @@ def read_views(folder: Path) -> tuple[Camera, Iterator[FlownView]]:
         for each in recorded.views
     )
     return recorded.camera, views
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Rows of a table with a header, as text."""
+    with path.open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def write_rows(path: Path, rows: Sequence[dict[str, str]]) -> None:
+    """Write what `read_rows` reads."""
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)

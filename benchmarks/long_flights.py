@@ -8,7 +8,6 @@ replays one of them. `--only` repeats the named flights even if results exist.
 """
 
 import argparse
-import csv
 import hashlib
 import json
 import math
@@ -28,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 import orthonav
+from benchmarks.flights import read_rows, write_rows
 from benchmarks.inputs import PAST, PRESENT, Workplace
 from benchmarks.record import Section, Table, number, provenance, save, sources_digest
 from benchmarks.verdicts import percent
@@ -168,7 +168,7 @@ def _flown(work: Path, plan: Plan, localizer: Localizer, ortho: Path) -> Path:
     if about.is_file():
         return folder
     rng = plan.rng()
-    line = _legs(rng, plan.km * 1000, plan.area_m / 2 - BORDER_M)
+    line = random_legs(rng, plan.km * 1000, plan.area_m / 2 - BORDER_M)
     lat, lon = localizer.sheet.frame.latlon_from_en(line)
     yaw_bias, agl_bias = rng.normal(0, 1, 2) * [YAW_BIAS_DEG, AGL_BIAS]
     wind = Wind(WIND_MPS, float(rng.uniform(0, 360)))
@@ -204,26 +204,28 @@ def _flown(work: Path, plan: Plan, localizer: Localizer, ortho: Path) -> Path:
     return folder
 
 
-def _legs(rng: np.random.Generator, length_m: float, reach_m: float) -> Array:
+def random_legs(
+    rng: np.random.Generator, length_m: float, reach_m: float, leg_m: tuple[float, float] = LEG_M
+) -> Array:
     """Corners (N, 2) of a route of random legs in a square, `length_m` long."""
     line = [rng.uniform(-reach_m, reach_m, 2)]
     course, left_m = rng.uniform(0, 2 * math.pi), length_m
-    shortest = min(LEG_M[0], reach_m)
+    shortest = min(leg_m[0], reach_m)
     while left_m > 0:
         step = rng.uniform(-reach_m, reach_m, 2) - line[-1]
-        leg_m, new = float(np.hypot(*step)), math.atan2(step[1], step[0])
+        drawn_m, new = float(np.hypot(*step)), math.atan2(step[1], step[0])
         turn_deg = abs(math.degrees(math.remainder(new - course, 2 * math.pi)))
-        if not (shortest <= leg_m <= LEG_M[1] and turn_deg <= SHARPEST_DEG):
+        if not (shortest <= drawn_m <= leg_m[1] and turn_deg <= SHARPEST_DEG):
             course += 0.05  # leave the corner of the square
             continue
-        line.append(line[-1] + step * min(1.0, left_m / leg_m))
-        course, left_m = new, left_m - leg_m
+        line.append(line[-1] + step * min(1.0, left_m / drawn_m))
+        course, left_m = new, left_m - drawn_m
     return np.array(line)
 
 
 def _kidnap(folder: Path, plan: Plan, localizer: Localizer, rng: np.random.Generator) -> str:
     """Leave out views in the middle and the velocity over the gap; returns the first after it."""
-    rows = _read(folder / "telemetry.csv")
+    rows = read_rows(folder / "telemetry.csv")
     truth = read_truth(folder / "truth.csv")
     frame = localizer.sheet.frame
     places = np.array([frame.en_from_latlon(*truth[row["frame"]]) for row in rows])
@@ -237,21 +239,9 @@ def _kidnap(folder: Path, plan: Plan, localizer: Localizer, rng: np.random.Gener
     rows[after]["vel_east_mps"] = rows[after]["vel_north_mps"] = ""
     gone = {row["frame"] for row in rows[first + 1 : after]}
     for name in ("telemetry.csv", "truth.csv"):
-        table = rows if name == "telemetry.csv" else _read(folder / name)
-        _write(folder / name, [row for row in table if row["frame"] not in gone])
+        table = rows if name == "telemetry.csv" else read_rows(folder / name)
+        write_rows(folder / name, [row for row in table if row["frame"] not in gone])
     return rows[after]["frame"]
-
-
-def _read(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as stream:
-        return list(csv.DictReader(stream))
-
-
-def _write(path: Path, rows: Sequence[dict[str, str]]) -> None:
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def _followed(

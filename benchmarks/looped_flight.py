@@ -1,10 +1,9 @@
 """Looped flights played in real time: one lap is rendered, cached and repeated."""
 
-import csv
 import hashlib
 import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import patch
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import orthonav.simulate as simulate
+from benchmarks.flights import read_rows, write_rows
 from benchmarks.inputs import FLIGHT_SEED, Workplace
 from orthonav.flight import read_truth
 from orthonav.geo import camera, lens
@@ -114,7 +114,7 @@ def played(
     It begins with view `first`, at `lead_s`. Its pictures are those of the lap, under a name for
     each round, so an hour takes no more room than a lap.
     """
-    rows, truth = _read(lap / "telemetry.csv"), _read(lap / "truth.csv")
+    rows, truth = read_rows(lap / "telemetry.csv"), read_rows(lap / "truth.csv")
     times_s = np.array([float(row["time_s"]) for row in rows])
     period_s = float(times_s[-1]) + _closing_m(lap) / SPEED_MPS
     shutil.rmtree(out, ignore_errors=True)
@@ -129,8 +129,8 @@ def played(
         link = out / "frames" / f"{turn:04d}"
         if not link.is_symlink():
             link.symlink_to((lap / "frames").resolve(), target_is_directory=True)
-    _write(out / "telemetry.csv", telemetry)
-    _write(out / "truth.csv", true)
+    write_rows(out / "telemetry.csv", telemetry)
+    write_rows(out / "truth.csv", true)
     shutil.copyfile(lap / "flight.json", out / "flight.json")
     return out
 
@@ -139,8 +139,8 @@ def rest_of(folder: Path, out: Path, from_s: float) -> Path:
     """The views of a played flight from a time on, as from a camera that starts then."""
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    rows = [row for row in _read(folder / "telemetry.csv") if float(row["time_s"]) >= from_s]
-    _write(out / "telemetry.csv", rows)
+    rows = [row for row in read_rows(folder / "telemetry.csv") if float(row["time_s"]) >= from_s]
+    write_rows(out / "telemetry.csv", rows)
     shutil.copyfile(folder / "flight.json", out / "flight.json")
     (out / "frames").symlink_to((folder / "frames").resolve(), target_is_directory=True)
     return out
@@ -148,7 +148,7 @@ def rest_of(folder: Path, out: Path, from_s: float) -> Path:
 
 def views_of(folder: Path) -> int:
     """How many views a flight folder has."""
-    return len(_read(folder / "telemetry.csv"))
+    return len(read_rows(folder / "telemetry.csv"))
 
 
 def _closing_m(lap: Path) -> float:
@@ -156,15 +156,3 @@ def _closing_m(lap: Path) -> float:
     places = list(read_truth(lap / "truth.csv").values())
     last = LocalFrame(*places[0]).en_from_latlon(*places[-1])
     return math.hypot(*last.tolist())
-
-
-def _read(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as stream:
-        return list(csv.DictReader(stream))
-
-
-def _write(path: Path, rows: Sequence[dict[str, str]]) -> None:
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)

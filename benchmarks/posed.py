@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.baselines import canny_edges
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.rectify import RectifiedView, downsampled, rectify
 from orthonav.mapfile import open_map
 from orthonav.records import View
 from orthonav.register.search import bank
-from orthonav.represent.canny import Canny
 
 Array = NDArray[np.float32]
 Place = NDArray[np.float64] | None
@@ -163,7 +163,7 @@ class TemplateSurface:
 
     def __init__(self, picture: Picture, canny: bool) -> None:
         self._canny = canny
-        made = _edges(picture.grey, picture.valid) if canny else picture.grey
+        made = canny_edges(picture.grey, picture.valid) if canny else picture.grey
         plane = made.astype(np.float32) - np.float32(made.mean())
         self._spectra = _Spectra(picture.grey.shape[:2])
         self._map, self._squared = self._spectra.of(plane), self._spectra.of(plane**2)
@@ -172,7 +172,7 @@ class TemplateSurface:
         """Correlation coefficients (h, w)."""
         if not self._spectra.holds(seen):
             return _NOWHERE
-        made = _edges(seen.grey, seen.valid) if self._canny else seen.grey
+        made = canny_edges(seen.grey, seen.valid) if self._canny else seen.grey
         template = np.where(seen.valid, made - float(made[seen.valid].mean()), 0.0)
         pixels, energy = float(seen.valid.sum()), float((template**2).sum())
         mask = self._spectra.of(seen.valid)
@@ -304,10 +304,6 @@ class Keypoints:
         mask = cv2.erode(valid.astype(np.uint8), kernel, borderValue=1)
         keypoints, descriptors = self._detector.detectAndCompute(grey, mask)
         return np.array([k.pt for k in keypoints]).reshape(-1, 2) + 0.5, descriptors
-
-
-def _edges(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    return np.asarray(Canny()(grey, valid)[0] * 255, dtype=np.uint8)
 
 
 def _classes(grey: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -38,12 +38,11 @@ from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import SingleViews, localize_flight
 from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import Fix, Prior
+from orthonav.records import CONFIDENT, Fix, Prior
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
 
 DATA = Path(os.environ.get("ORTHONAV_DATA", REAL_DATA))
-ACCEPT = 0.9
 YAW_STD_DEG, AGL_STD = 5.0, 0.05
 WIDTHS_PX = (112, 160, 256)
 """Pixels of the map across a view, for orthophotos: views from three heights."""
@@ -51,7 +50,6 @@ VIEWS_PER_CELL = 15
 LEAST_PER_CELL = 8
 PRIOR_PX = 60.0
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0001)
-CONFIDENT = 0.9
 Array = NDArray[np.float64]
 
 
@@ -217,7 +215,7 @@ def _compared(job: tuple[Scene, Path, Path, Path, argparse.Namespace]) -> Outcom
         yaw_std_deg=YAW_STD_DEG,
         agl_std=AGL_STD,
         prior_std_m=prior_m,
-        accept=ACCEPT,
+        accept=CONFIDENT,
         relief_m=scene.relief_m,
         extras=False,
         effort=options.effort,
@@ -264,7 +262,7 @@ def _flown(
         if isinstance(result.outcome, Fix):
             found = frame.en_from_latlon(result.outcome.lat_deg, result.outcome.lon_deg)
             error = float(np.hypot(*(found - true)))
-            confident = result.outcome.confidence >= ACCEPT
+            confident = result.outcome.confidence >= CONFIDENT
         near = error <= (result.outcome.radius_m if isinstance(result.outcome, Fix) else 0.0)
         places.append(true)
         right.append(confident and near)
@@ -344,8 +342,8 @@ def _scenes_table(found: Sequence[Outcome], options: argparse.Namespace) -> Tabl
     whole = totals(found)
     worst = whole["confident_cells_least_measured"]
     notes = (
-        f"share of views with a correct fix of confidence {ACCEPT:g} or more; predicted from the "
-        "map's date alone",
+        f"share of views with a correct fix of confidence {CONFIDENT:g} or more; predicted from "
+        "the map's date alone",
         f"checks of effort {options.effort:g}; {options.views} views per orthophoto, heading off "
         f"by {YAW_STD_DEG:g} deg, height by "
         f"{AGL_STD:.0%}, prior off by {PRIOR_PX:g} px of the map (flights: 100 m), standard "

@@ -185,7 +185,7 @@ def run(capfd, monkeypatch):
         finally:
             root.handlers = handlers
             root.setLevel(level)
-        told = capfd.readouterr()
-        return Done(code, told.out, told.err)
+        captured = capfd.readouterr()
+        return Done(code, captured.out, captured.err)
 
     return command

@@ -1,5 +1,6 @@
 """Every command as it is typed: what it prints, how it exits, what it leaves behind."""
 
+import contextlib
 import errno
 import hashlib
 import json
@@ -26,15 +27,11 @@ WHOLE_MAP = ["--tile-px", "64", "--overlap", "0.75", "--calibration-views", "6"]
 SMALL_MAP = ["--tile-px", "64", "--overlap", "0.75", "--no-registration"]
 
 
-def process(*arguments, script=None, limit=None):
-    """A command in a process of its own; `limit` bytes is the largest file it may write."""
+def process(*arguments, script=None):
+    """A command in a process of its own."""
     script = script or "import sys, orthonav.cli as cli; sys.exit(cli.main())"
-    limits = None
-    if limit is not None:
-        limits = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))  # noqa: E731
     return subprocess.Popen(
         [sys.executable, "-B", "-c", script, *map(str, arguments)],
-        preexec_fn=limits,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -612,10 +609,21 @@ def nothing_in(folder):
     return files_in(folder) == [] and not [p for p in folder.iterdir() if p.name[0] == "."]
 
 
+@contextlib.contextmanager
+def largest_file(size_bytes):
+    """The kernel refuses to write more to a file."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
 @pytest.mark.parametrize("name", [name for name in WRITERS if name != "landscape"])
-def test_no_room_for_the_whole_file(writing, out, name):
-    """The kernel refuses to write more than 4 KiB to a file."""
-    done = finished(process(*writing[name], limit=4096))
+def test_no_room_for_the_whole_file(run, writing, out, name, undrawn):
+    with largest_file(4096):
+        done = run(*writing[name])
     refused(done, "File too large")
     assert nothing_in(out)
 
@@ -629,9 +637,10 @@ def orthophoto_bytes(tmp_path_factory):
 
 
 @pytest.mark.parametrize("share", [0.02, 0.5, 0.9, 0.999])
-def test_no_room_for_a_whole_orthophoto(writing, orthophoto_bytes, out, share):
+def test_no_room_for_a_whole_orthophoto(run, writing, orthophoto_bytes, out, share):
     """GDAL writes its last blocks while closing; its TIFF library has a line of its own to say."""
-    done = finished(process(*writing["landscape"], limit=int(share * orthophoto_bytes)))
+    with largest_file(int(share * orthophoto_bytes)):
+        done = run(*writing["landscape"])
     assert done.code == 1 and done.out == "" and "Traceback" not in done.err
     assert done.err.splitlines()[-1].startswith("orthonav: error: cannot write")
     assert nothing_in(out)
@@ -677,10 +686,8 @@ sys.exit(main(sys.argv[2:]))
     "name, stage, number",
     [
         ("build", "imagery", signal.SIGINT),
-        ("build", "calibrate", signal.SIGINT),
         ("build", "calibrate", signal.SIGTERM),
         ("simulate", "simulate", signal.SIGINT),
-        ("simulate", "simulate", signal.SIGTERM),
         ("localize", "localize", signal.SIGINT),
         ("landscape", "landscape", signal.SIGTERM),
     ],

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import platform
 import re
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from orthonav import extras
-from orthonav.cli import COMMANDS
+from orthonav.cli import COMMANDS, version
 from orthonav.cli.needs import NEEDS
 from orthonav.errors import MissingExtraError
 
@@ -33,7 +34,19 @@ class Blocked:
 
 sys.meta_path.insert(0, Blocked())
 from orthonav.cli import main
-sys.exit(main())
+"""
+ONE = "sys.exit(main())"
+SEVERAL = """
+import contextlib, io, json, logging
+
+root, results = logging.getLogger(), []
+for words in json.loads(sys.argv[1]):
+    root.handlers = []
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        with contextlib.redirect_stderr(io.StringIO()) as err:
+            code = main(words)
+    results.append((code, out.getvalue(), err.getvalue()))
+print(json.dumps(results))
 """
 
 AREA = "--bounds=3.0,46.0,3.01,46.01"
@@ -70,11 +83,11 @@ def top_modules(extra):
     return {extras.module_of(package.name).partition(".")[0] for package in extras.packages(extra)}
 
 
-def core_only(*arguments, cwd):
-    """A command where nothing but the core can be imported."""
+def core_only(*arguments, cwd, script=ONE):
+    """A command, or a script with its arguments, where nothing but the core can be imported."""
     optional = set().union(*(top_modules(extra) for extra in USED)) - top_modules("")
     return subprocess.run(
-        [sys.executable, "-B", "-c", BLOCKED, ",".join(sorted(optional)), *arguments],
+        [sys.executable, "-B", "-c", BLOCKED + script, ",".join(sorted(optional)), *arguments],
         cwd=cwd,
         capture_output=True,
         text=True,
@@ -92,11 +105,11 @@ def fixes(map_path, flight_path, tmp_path_factory):
     return folder / "fixes.jsonl"
 
 
-@pytest.mark.parametrize("line", CORE_COMMANDS)
-def test_a_core_only_install_works_or_names_the_extras(
-    line, fixes, map_path, flight_path, tmp_path
-):
-    route = tmp_path / "route.csv"
+@pytest.fixture(scope="module")
+def answers(fixes, map_path, flight_path, tmp_path_factory):
+    """(exit code, stdout, stderr) of each command, all in one process, and its folder."""
+    folder = tmp_path_factory.mktemp("core")
+    route = folder / "route.csv"
     route.write_text("lat_deg,lon_deg\n46.0,3.0\n46.01,3.01\n")
     paths = {
         "MAP": map_path,
@@ -105,16 +118,27 @@ def test_a_core_only_install_works_or_names_the_extras(
         "CAMERA": flight_path / "flight.json",
         "ROUTE": route,
     }
-    words = [re.sub(r"^[A-Z]+", lambda m: str(paths.get(m[0], m[0])), w) for w in line.split()]
-    done = core_only(*words, cwd=tmp_path)
+    commands = [
+        [re.sub(r"^[A-Z]+", lambda m: str(paths.get(m[0], m[0])), word) for word in line.split()]
+        for line in CORE_COMMANDS
+    ]
+    done = core_only(json.dumps(commands), cwd=folder, script=SEVERAL)
+    assert done.returncode == 0, done.stderr
+    return dict(zip(CORE_COMMANDS, json.loads(done.stdout), strict=True)), folder
+
+
+@pytest.mark.parametrize("line", CORE_COMMANDS)
+def test_a_core_only_install_works_or_names_the_extras(line, answers):
+    done, folder = answers
+    code, out, err = done[line]
     named = CORE_COMMANDS[line]
     if named is None:
-        assert done.returncode == 0, done.stderr
+        assert code == 0, err
         return
-    assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith("orthonav: error: ") and done.stderr.count("\n") == 1
-    assert f"pip install 'orthonav[{named}]'" in done.stderr
-    assert not list(tmp_path.glob("new*"))
+    assert (code, out) == (1, "")
+    assert err.startswith("orthonav: error: ") and err.count("\n") == 1
+    assert f"pip install 'orthonav[{named}]'" in err
+    assert not list(folder.glob("new*"))
 
 
 def test_every_command_is_tried():
@@ -178,7 +202,10 @@ def calls_of(function, tree):
 def test_the_extra_that_an_error_names_brings_the_module():
     found = []
     for path in (ROOT / "src").rglob("*.py"):
-        tree = ast.parse(path.read_text("utf-8"))
+        text = path.read_text("utf-8")
+        if "needed(" not in text and "missing_extra(" not in text:
+            continue
+        tree = ast.parse(text)
         for module, *more in calls_of("needed", tree):  # of `sources.guard`, of `extras`
             found.append((module, "flights" if len(more) == 1 else more[0]))
         found += [(module, extra) for _, extra, module, _ in calls_of("missing_extra", tree)]
@@ -203,12 +230,43 @@ def test_extras_that_include_others(monkeypatch):
     try:
         asked = [(package.name, package.asked) for package in extras.packages("two")]
         assert asked == [("b", ">=2,<3"), ("c", "")]
+        assert all(package.available for package in extras.packages("two"))
         assert extras.missing("") == ("a",)
         with pytest.raises(MissingExtraError) as caught:
             extras.require("this", "one", "two")
         assert str(caught.value) == "this needs b, c: pip install 'orthonav[one,two]'"
     finally:
         extras._requirements.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("machine", "python", "available"),
+    [("x86_64", "3.13.2", True), ("aarch64", "3.13.2", False), ("x86_64", "3.14.0", False)],
+)
+def test_what_is_not_made_for_a_machine_is_not_called_missing(
+    monkeypatch, machine, python, available
+):
+    """By the marker of cyclonedds, as pip writes it."""
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    monkeypatch.setattr(platform, "python_version", lambda: python)
+    monkeypatch.setattr(extras, "_version", lambda name: "")
+    found = {package.name: package for package in extras.packages("ros2")}
+    assert found["cyclonedds"].available is available and found["rosbags"].available
+    plain = version.about()
+    assert plain["unavailable"] == ([] if available else ["cyclonedds"])
+    answer = plain["missing"]["fly --ros2"]
+    assert ("no wheel for this machine" in answer) is not available
+    assert ("pip install" in answer) is available
+    shown = version._text(plain)
+    assert ("cyclonedds MISSING" in shown) is available and "rosbags MISSING" in shown
+
+
+def test_markers_of_the_project_are_understood():
+    """`extras` reads comparisons with == and <, joined by `and`."""
+    for lines in PROJECT["optional-dependencies"].values():
+        for marker in (str(Requirement(line).marker or "") for line in lines):
+            left = extras._CONDITION.sub("", marker)
+            assert left.split() in ([], ["and"]), marker
 
 
 def test_sources_without_metadata_ask_nothing(monkeypatch):

@@ -84,9 +84,9 @@ def fresh(script, *arguments, cwd):
 
 
 def test_a_fix_without_heavy_libraries(map_path, flight_path, tmp_path, names_in):
-    told = json.loads(fresh(BLOCK + FIX, map_path, flight_path, cwd=tmp_path))
-    assert [line["status"] for line in told["lines"]] == ["fix", "fix"]
-    assert not set(told["loaded"]) & set(FORBIDDEN)
+    result = json.loads(fresh(BLOCK + FIX, map_path, flight_path, cwd=tmp_path))
+    assert [line["status"] for line in result["lines"]] == ["fix", "fix"]
+    assert not set(result["loaded"]) & set(FORBIDDEN)
     assert names_in(tmp_path) == []
 
 

@@ -40,14 +40,14 @@ def test_links_lead_somewhere(page):
 
 def test_every_page_is_in_the_contents():
     docs = ROOT / "docs"
-    told = "\n".join(
+    contents = "\n".join(
         (docs / name).read_text("utf-8")
         for name in ("index.md", "reference/python.md", "decisions/index.md")
     )
     missing = [
         page.name
         for page in docs.rglob("*.md")
-        if page.name != "index.md" and not re.search(rf"\b{page.stem}(>|$)", told, re.MULTILINE)
+        if page.name != "index.md" and not re.search(rf"\b{page.stem}(>|$)", contents, re.MULTILINE)
     ]
     assert missing == []
 

@@ -1,11 +1,11 @@
 """Files about the project agree with each other and can be read where they are shown."""
 
-import importlib.util
 import re
 import shlex
 import tomllib
 from pathlib import Path
 
+import try_wheel
 import yaml
 
 from orthonav import __version__
@@ -63,12 +63,9 @@ def test_workflows_and_issue_forms_are_whole():
 
 
 def test_commands_of_the_wheel_script_are_understood():
-    spec = importlib.util.spec_from_file_location("try_wheel", ROOT / "tools" / "try_wheel.py")
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-    lines = [line for lines in script.COMMANDS.values() for line in lines]
+    lines = [line for lines in try_wheel.COMMANDS.values() for line in lines]
     assert len(lines) > 10
     extras = set(PROJECT["optional-dependencies"]) - {"dev", "docs", "test"}
-    assert extras <= set(script.COMMANDS | script.SCRIPTS)
+    assert extras <= set(try_wheel.COMMANDS | try_wheel.SCRIPTS)
     for words in map(shlex.split, lines):
         assert _parser(words).parse_args(words).command == words[0]

@@ -9,9 +9,8 @@ import tomllib
 from collections import Counter
 from pathlib import Path
 
-import pytest
-
 import absent
+from orthonav.extras import module_of
 
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = sorted(Path(__file__).parent.rglob("*.py"))
@@ -36,32 +35,29 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_run_ends_with_the_name_of_the_test_that_crashed_or_hung(fault, tmp_path):
+def test_a_run_ends_with_the_names_of_the_tests_that_crashed_or_hung(tmp_path):
     """Under the command of `make test` and the project's own options, but for shorter limits."""
-    quick = "def test_one(): pass\ndef test_two(): pass\n"
-    for name in ("first", "second", "third"):
-        (tmp_path / f"test_{name}.py").write_text(quick)
-    broken = (
-        f"def test_before(): pass\ndef test_broken(): {FAULTS[fault]}\ndef test_after(): pass\n"
-    )
-    (tmp_path / "test_fourth.py").write_text(broken)
+    (tmp_path / "test_quick.py").write_text("def test_one(): pass\ndef test_two(): pass\n")
+    for name, fault in FAULTS.items():
+        broken = f"def test_before(): pass\ndef test_broken(): {fault}\ndef test_after(): pass\n"
+        (tmp_path / f"test_{name}.py").write_text(broken)
     makefile = (ROOT / "Makefile").read_text("utf-8")
     options = re.search(r"^PYTEST := \$\(BIN\)/python (.*)$", makefile, re.MULTILINE)
     assert options
     command = [sys.executable, *shlex.split(options[1]), "-p", "no:cacheprovider"]
-    limits = ["-o", "timeout=2", "-o", "faulthandler_timeout=4"]
+    limits = ["-o", "timeout=1", "-o", "faulthandler_timeout=3"]
     done = subprocess.run(
         [*command, "-c", str(ROOT / "pyproject.toml"), *limits, "--rootdir", ".", "."],
         cwd=tmp_path,
-        env={**os.environ, "PYTEST_XDIST_AUTO_NUM_WORKERS": "2"},
+        env={**os.environ, "PYTEST_XDIST_AUTO_NUM_WORKERS": "3"},
         capture_output=True,
         text=True,
         timeout=120,
     )
     assert done.returncode == 1, done.stdout
-    assert re.search(r"^FAILED test_fourth.py::test_broken", done.stdout, re.MULTILINE)
-    assert re.search(r"^1 failed, [1-9] passed", done.stdout, re.MULTILINE)
+    for name in FAULTS:
+        assert re.search(rf"^FAILED test_{name}.py::test_broken", done.stdout, re.MULTILINE)
+    assert re.search(r"^3 failed, [1-9] passed", done.stdout, re.MULTILINE)
 
 
 def test_only_what_is_absent_skips_a_test(monkeypatch):
@@ -75,17 +71,6 @@ def test_only_what_is_absent_skips_a_test(monkeypatch):
     assert absent._reason("AssertionError: assert 1 == 2") is None
 
 
-MODULES = {
-    "owslib": "OWSLib",
-    "PIL": "pillow",
-    "yaml": "PyYAML",
-    "xstatic": "XStatic-Leaflet",
-    "faiss": "faiss-cpu",
-    "skimage": "scikit-image",
-    "jinja2": "Jinja2",
-}
-
-
 def test_every_package_of_an_extra_is_known_to_be_optional():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     extras = project["optional-dependencies"]
@@ -96,4 +81,5 @@ def test_every_package_of_an_extra_is_known_to_be_optional():
         if name not in ("test", "dev", "docs")
         for line in lines
     }
-    assert packages - {"orthonav"} <= {MODULES.get(name, name) for name in absent.EXTRA_OF}
+    modules = {module_of(name).partition(".")[0] for name in packages - {"orthonav"}}
+    assert modules <= set(absent.EXTRA_OF)

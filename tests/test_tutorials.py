@@ -1,8 +1,9 @@
 """Tutorials do not rot: their commands are understood, what they print is what they show."""
 
-import importlib.util
+import importlib
 import re
 import shlex
+import sys
 from pathlib import Path
 
 import pytest
@@ -92,12 +93,10 @@ def test_the_example_adds_a_representation(textured_grey):
     from orthonav import represent
     from orthonav.variants import make_variant
 
-    spec = importlib.util.spec_from_file_location("own", EXAMPLES / "own_representation.py")
-    own = importlib.util.module_from_spec(spec)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(represent, "TABLE", dict(represent.TABLE))
-        patch.setitem(__import__("sys").modules, "own", own)
-        spec.loader.exec_module(own)
+        patch.delitem(sys.modules, "own_representation", raising=False)
+        importlib.import_module("own_representation")
         variant = make_variant(represent.TABLE, "laplace:sigma_px=1.5")
     valid = np.ones(textured_grey.shape, bool)
     valid[:, :20] = False

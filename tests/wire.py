@@ -96,8 +96,8 @@ def decode(frame: bytes) -> dict:
     assert magic == 0xFD and incompatible in (0, 1)
     assert len(frame) == 12 + length + 13 * incompatible
     assert checksum_seed(name, fields[:base]) == seed
-    told = int.from_bytes(frame[10 + length : 12 + length], "little")
-    assert told == x25(frame[1 : 10 + length] + bytes([seed]))
+    checksum = int.from_bytes(frame[10 + length : 12 + length], "little")
+    assert checksum == x25(frame[1 : 10 + length] + bytes([seed]))
     shape = "<" + "".join(f"{count or ''}{kind}" for kind, _, count in fields)
     payload = frame[10 : 10 + length].ljust(struct.calcsize(shape), b"\0")
     values = list(struct.unpack(shape, payload))

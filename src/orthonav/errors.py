@@ -30,6 +30,10 @@ class MapFileError(OrthonavError, ValueError):
     """A map file is not a map, is truncated, or was altered."""
 
 
+class MapChangedError(MapFileError):
+    """An open map file was truncated or rewritten in place, or cannot be read any more."""
+
+
 class MapVersionError(MapFileError):
     """A map file was written for a newer schema than this program knows."""
 
@@ -59,7 +63,7 @@ class OutputError(OrthonavError, OSError):
 
 
 class FetchError(OrthonavError, OSError):
-    """Imagery could not be fetched: a service refused, has no such layer, or sent what is none."""
+    """Imagery could not be fetched: a service refused, lacks the layer or sent no image."""
 
 
 class MissingExtraError(OrthonavError, ImportError):
@@ -73,3 +77,13 @@ class AtlasError(OrthonavError, ValueError):
 
 class StorageError(OrthonavError, OSError):
     """The place where an atlas lies cannot be reached, read or written: address, credentials."""
+
+
+def described(error: BaseException) -> str:
+    """What went wrong, in words for a message, at most 120 characters.
+
+    A `KeyError` only holds the name that was sought, and some exceptions hold nothing.
+    """
+    if isinstance(error, KeyError) and len(error.args) == 1:
+        return f"{str(error.args[0])[:120]} is missing"
+    return " ".join(str(error).split())[:120] or type(error).__name__

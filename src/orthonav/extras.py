@@ -5,6 +5,7 @@ written down once, in pyproject.toml.
 """
 
 import importlib
+import platform
 import re
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,6 +17,8 @@ from orthonav.errors import MissingExtraError
 NAME = "orthonav"
 _REQUIREMENT = re.compile(r"\s*([\w.-]+)\s*(?:\[([^\]]*)\])?([^;]*)(?:;(.*))?")
 _OF_EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
+_CONDITION = re.compile(r"""(python_version|platform_machine)\s*(==|<)\s*["']([^"']+)["']""")
+"""Of environment markers, what pyproject.toml uses: such comparisons, joined by `and`."""
 _MODULES = {
     "faiss-cpu": "faiss",
     "opencv-python-headless": "cv2",
@@ -32,24 +35,26 @@ class Package:
     """A package that orthonav or one of its extras asks for.
 
     `name`: as pyproject.toml writes it. `asked`: version range, such as `>=1.4`. `version`: the one
-    that is installed; empty where its module cannot be found.
+    that is installed; empty where its module cannot be found. `available`: whether its
+    environment marker lets it be installed on this machine with this Python.
     """
 
     name: str
     asked: str
     version: str
+    available: bool
 
 
 @lru_cache(maxsize=1)
-def _requirements() -> dict[str, list[tuple[str, str, str]]]:
-    """(package, its extras, range) by extra, "" for what is always needed; {} if not installed."""
+def _requirements() -> dict[str, list[tuple[str, str, str, str]]]:
+    """(package, its extras, range, marker) by extra, "" for the core; {} if not installed."""
     from importlib import metadata  # takes as long as the rest of the command line to import
 
     try:
         lines = metadata.requires(NAME) or []
     except metadata.PackageNotFoundError:  # run from its sources
         return {}
-    found: dict[str, list[tuple[str, str, str]]] = {"": []}
+    found: dict[str, list[tuple[str, str, str, str]]] = {"": []}
     for extra in metadata.metadata(NAME).get_all("Provides-Extra") or []:
         found[extra] = []
     for line in lines:
@@ -57,19 +62,35 @@ def _requirements() -> dict[str, list[tuple[str, str, str]]]:
         assert match is not None, line
         name, extras, asked, marker = (part or "" for part in match.groups())
         of = _OF_EXTRA.search(marker)
-        found.setdefault(of[1] if of else "", []).append((name, extras, asked.strip(" ()")))
+        found.setdefault(of[1] if of else "", []).append((name, extras, asked.strip(" ()"), marker))
     return found
+
+
+def _holds(marker: str) -> bool:
+    """Whether an environment marker, without its extra, holds on this machine."""
+    here = {"python_version": platform.python_version(), "platform_machine": platform.machine()}
+    for name, comparison, value in _CONDITION.findall(marker):
+        if comparison == "==" and here[name] != value:
+            return False
+        if comparison == "<" and _numbers(here[name]) >= _numbers(value):
+            return False
+    return True
+
+
+def _numbers(version: str) -> list[int]:
+    """Major and minor number of a version."""
+    return [int(part) for part in version.split(".")[:2]]
 
 
 def packages(extra: str = "") -> tuple[Package, ...]:
     """Packages of an extra, those of the extras that it includes too, each once; "" is the core."""
     found: dict[str, Package] = {}
-    for name, included, asked in _requirements().get(extra, []):
+    for name, included, asked, marker in _requirements().get(extra, []):
         if name == NAME:
             for each in included.split(","):
                 found.update({package.name: package for package in packages(each.strip())})
         else:
-            found[name] = Package(name, asked, _version(name))
+            found[name] = Package(name, asked, _version(name), _holds(marker))
     return tuple(found.values())
 
 

@@ -28,6 +28,9 @@ five, and change every figure of the embedding alone."""
 DEFAULT_AGL_STD = 0.08
 """Standard deviation of a reported height that comes without one, over the height."""
 
+MAP_STD_M = 3.0
+"""Standard deviation, per axis, of a displacement of the map as a whole: it never averages out."""
+
 Evidence = Mapping[str, float]
 """Named numbers behind the confidence of a fix; see `docs/reference/formats.md`."""
 
@@ -45,7 +48,7 @@ class Prior:
     std_m: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Telemetry:
     """What the autopilot reported for the exposure of one view. NaN and None stand for unknown."""
 

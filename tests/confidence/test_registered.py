@@ -202,7 +202,7 @@ def test_what_is_learnt_tells_right_from_wrong():
 
 
 def test_few_views_do_not_make_it_certain():
-    """Ten views told apart perfectly: what is usual keeps the weights finite."""
+    """Ten views separated perfectly: the prior keeps the weights finite."""
     views = [evidence(60.0, 30.0)] * 5 + [evidence(26.0, 25.0, 15.0, 15.0)] * 5
     right = np.repeat([True, False], 5)
     fitted = fit_registered(views, right, np.ones(10), CHANCE)

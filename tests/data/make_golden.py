@@ -2,7 +2,7 @@
 
     python tests/data/make_golden.py
 
-A map file of version 1 must stay readable for good: make it anew only for another version.
+A map file of version 1 must stay readable for good: make it again only for another version.
 """
 
 import tempfile

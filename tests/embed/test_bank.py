@@ -1,4 +1,4 @@
-"""A bank of poses: close to turning, representing and embedding the view anew for each of them."""
+"""A bank of poses: close to turning, representing and embedding the view again for each of them."""
 
 import math
 
@@ -63,7 +63,7 @@ class Place:
         self.middle_tile = int(np.flatnonzero((self.tiles_px == 256).all(axis=1))[0])
 
     def view(self, turn, log_scale, shape=WHOLE):
-        """What a camera over the middle sees, its top at the top, as told without scale."""
+        """What a camera over the middle sees, its top at the top, without a scale error."""
         grey = warped(self.grey, shape, linear_of(turn, log_scale), (MIDDLE, MIDDLE))
         return grey, np.ones(shape, bool)
 

@@ -219,7 +219,7 @@ def test_embeddings_are_unit_vectors(any_place):
     assert seen.dtype == np.float32 and np.linalg.norm(seen) == pytest.approx(1, abs=1e-5)
 
 
-def test_places_are_told_apart(any_place):
+def test_places_are_distinguished(any_place):
     """Whitened, tiles that share nothing are as likely alike as unlike."""
     stored = any_place.embedder.tiles(any_place.sheet, any_place.tiles_px).astype(float)
     apart = np.abs(any_place.tiles_px[:, None] - any_place.tiles_px[None]).max(axis=2) >= TILE_PX

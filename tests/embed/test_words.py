@@ -1,4 +1,4 @@
-"""Bags of visual words: frequencies of known features, and places told apart by them."""
+"""Bags of visual words: frequencies of known features, and places distinguished by them."""
 
 import functools
 import json

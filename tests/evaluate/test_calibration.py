@@ -336,7 +336,7 @@ def test_unknown_values_are_reported(
     comparison = flown(offsets, confidence, cov)
     metrics = measure(comparison)
     flight = FlightReport("f", comparison, metrics)
-    said = summary([flight])
+    said = summary([flight], flight.metrics)
     html = write_report(tmp_path, [flight]).read_text("utf-8")
     for word in words:
         assert word in said and word in html
@@ -390,7 +390,7 @@ def test_a_file_with_an_impossible_confidence_is_refused() -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 40])
-def test_pictures_are_drawn_and_alike(n: int) -> None:
+def test_pictures_are_drawn_and_alike(n: int, coarse) -> None:
     random = np.random.default_rng(9)
     offsets = [(float(e), float(k)) for e, k in random.normal(0.0, 8.0, (n, 2))]
     errors_m = np.hypot(*np.reshape(offsets, (-1, 2)).T)

@@ -75,10 +75,10 @@ def test_shares_are_of_all_views_or_of_fixes() -> None:
 
 def test_error_and_latency_figures() -> None:
     metrics = measure(three_fixes())
-    assert metrics.error_median_m == pytest.approx(10.0, abs=1e-2)
-    assert metrics.error_p95_m == pytest.approx(10.0 + 0.9 * 490.0, abs=1e-1)
-    assert metrics.error_mean_m == pytest.approx(515.0 / 3, abs=1e-2)
-    assert metrics.error_max_m == pytest.approx(500.0, abs=1e-1)
+    assert metrics.standard.cep50_m == pytest.approx(10.0, abs=1e-2)
+    assert metrics.standard.cep95_m == pytest.approx(10.0 + 0.9 * 490.0, abs=1e-1)
+    assert metrics.standard.ape.mean_m == pytest.approx(515.0 / 3, abs=1e-2)
+    assert metrics.standard.ape.max_m == pytest.approx(500.0, abs=1e-1)
     assert metrics.latency_median_ms == pytest.approx(25.0)  # of 10, 20, 30, 50
     assert metrics.latency_p95_ms == pytest.approx(47.0)
 
@@ -121,8 +121,9 @@ def test_an_error_of_just_the_radius_is_right() -> None:
 def test_all_is_defined_without_any_fix() -> None:
     metrics = measure(compare(truth_of(TRUTH_EN_M), [no_fix("a"), no_fix("b", "too_dark")]))
     assert (metrics.coverage, metrics.accuracy, metrics.n_fixes) == (0.0, 0.0, 0)
-    undefined = (metrics.accuracy_of_fixes, metrics.error_median_m, metrics.error_p95_m)
-    assert all(map(math.isnan, (*undefined, metrics.error_mean_m, metrics.error_max_m)))
+    undefined = (metrics.accuracy_of_fixes, metrics.standard.cep50_m, metrics.standard.cep95_m)
+    assert all(map(math.isnan, undefined))
+    assert all(map(math.isnan, (metrics.standard.ape.mean_m, metrics.standard.ape.max_m)))
     assert metrics.reasons == {"blank": 1, "too_dark": 1}
     assert worst_views(compare(truth_of(TRUTH_EN_M), [no_fix("a")])) == []
 

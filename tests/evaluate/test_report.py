@@ -71,7 +71,7 @@ class Page(HTMLParser):
         self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
 
 
-def test_the_page_needs_nothing_from_outside(tmp_path: Path) -> None:
+def test_the_page_needs_nothing_from_outside(tmp_path: Path, coarse) -> None:
     path = write_report(tmp_path / "report", [made_flight(40)])
     html = path.read_text(encoding="utf-8")
     page = Page(html)
@@ -137,7 +137,7 @@ def test_flights_at_different_radii_have_no_total() -> None:
     with pytest.raises(ValueError, match="one radius"):
         total([one, other])
     with pytest.raises(ValueError, match="at least one flight"):
-        table([])
+        table([], one.metrics)
 
 
 def test_a_flight_without_any_fix_is_reported(tmp_path: Path, coarse) -> None:
@@ -145,7 +145,7 @@ def test_a_flight_without_any_fix_is_reported(tmp_path: Path, coarse) -> None:
     html = write_report(tmp_path, [flight]).read_text("utf-8")
     assert "No view has a fix" in html
     assert "nan" not in re.sub(r"base64,[^\"]+", "", html).lower()
-    assert "nan" not in table([flight]).lower()
+    assert "nan" not in table([flight], flight.metrics).lower()
     json.dumps(metrics_to_json(flight.metrics), allow_nan=False)
 
 
@@ -166,13 +166,13 @@ def test_unmatched_views_are_reported(tmp_path: Path, only_new) -> None:
 
 def test_the_table_is_aligned() -> None:
     flights = [made_flight(30, name="one"), made_flight(5, 0.0, name="a longer name")]
-    lines = table(flights).splitlines()
+    lines = table(flights, total(flights)).splitlines()
     header, *rows, rule, whole = lines
     assert header.split()[:4] == ["flight", "views", "fixes", "coverage"]
     assert "acc@15 m" in header
     assert len(rows) == 2 and set(rule) == {"-"} and whole.startswith("total")
     assert len({len(line) for line in lines}) == 1
-    assert len(table(flights[:1]).splitlines()) == 2
+    assert len(table(flights[:1], flights[0].metrics).splitlines()) == 2
 
 
 def test_json_values_are_strict_and_named() -> None:
@@ -196,7 +196,8 @@ def has_colour(image: np.ndarray, colour: str) -> bool:
     return bool((np.abs(image - wanted).max(axis=2) < 12).any())
 
 
-def test_the_map_shows_right_and_wrong_and_the_background() -> None:
+def test_the_map_shows_right_and_wrong_and_the_background(monkeypatch) -> None:
+    monkeypatch.setattr("orthonav.report.canvas.DPI", 80)
     flight = made_flight(80)
     plain = decoded(plots.map_picture(flight.comparison, 15.0))
     over = decoded(plots.map_picture(flight.comparison, 15.0, noisy_background()))

@@ -15,7 +15,7 @@ from helpers import textured
 from orthonav.cli import main
 from orthonav.errors import FlightError
 from orthonav.evaluate.contact_sheet import Row, row_text, sheet_picture, worst_first, worst_rows
-from orthonav.evaluate.flights import FlightReport, flights_to_json, metrics_to_json, summary
+from orthonav.evaluate.flights import FlightReport, flights_to_json, metrics_to_json, summary, total
 from orthonav.evaluate.metrics import Comparison, compare, measure
 from orthonav.evaluate.report import write_report
 from orthonav.evaluate.track import (
@@ -283,8 +283,8 @@ def test_odd_tracks_are_measured(errors, states, named) -> None:
     track = measure_track(comparison, results, 15.0)
     assert track is not None
     flight = FlightReport("odd", comparison, measure(comparison), track=track)
-    json.dumps(flights_to_json([flight]), allow_nan=False)
-    for text in (summary([flight]), "".join(said for _, said in track_rows(track))):
+    json.dumps(flights_to_json([flight], flight.metrics), allow_nan=False)
+    for text in (summary([flight], flight.metrics), "".join(said for _, said in track_rows(track))):
         assert "nan" not in text.lower() and "inf" not in text.lower()
 
 
@@ -310,7 +310,8 @@ def test_odd_tracks_are_drawn(errors, states, named, coarse) -> None:
 def test_undefined_values_are_none() -> None:
     comparison, results = flown([None] * 3, "searching", times_ns=[2, 1, 0])
     track = measure_track(comparison, results, 15.0)
-    plain = flights_to_json([FlightReport("f", comparison, measure(comparison), track=track)])
+    flight = FlightReport("f", comparison, measure(comparison), track=track)
+    plain = flights_to_json([flight], flight.metrics)
     found = plain["track"]
     assert found["first_view"] is None and found["first_s"] is None
     assert found["after"]["n_views"] == 0 and found["after"]["acc_at_15m"] is None
@@ -356,8 +357,8 @@ def test_views_placed_one_by_one_have_no_track(tmp_path: Path, only_new) -> None
     comparison, results = flown([(1.0, 0.0)] * 4, None)
     assert measure_track(comparison, results, 15.0) is None
     flight = FlightReport("f", comparison, measure(comparison))
-    assert flights_to_json([flight]) == metrics_to_json(flight.metrics)
-    assert "track" not in summary([flight])
+    assert flights_to_json([flight], flight.metrics) == metrics_to_json(flight.metrics)
+    assert "track" not in summary([flight], flight.metrics)
     html = write_report(tmp_path, [flight]).read_text("utf-8")
     assert "Track" not in html and html.count("<figure") == 6
 
@@ -373,7 +374,7 @@ def test_several_flights_are_summed_up() -> None:
         comparison, results = flown(errors, states)
         track = measure_track(comparison, results, 15.0)
         flights.append(FlightReport(name, comparison, measure(comparison), track=track))
-    plain = json.loads(json.dumps(flights_to_json(flights), allow_nan=False))
+    plain = json.loads(json.dumps(flights_to_json(flights, total(flights)), allow_nan=False))
     whole = plain["track"]
     assert (whole["n_tracks"], whole["n_found"], whole["n_views"]) == (3, 2, 10)
     assert whole["after"]["acc_at_15m"] == pytest.approx(5 / 7)
@@ -382,7 +383,7 @@ def test_several_flights_are_summed_up() -> None:
     assert (whole["n_false_locks"], whole["first_s_max"]) == (1, 1.0)
     assert "consistency" not in whole
     assert "track" in plain["flights"]["long"] and "track" not in plain["flights"]["single"]
-    said = summary(flights)
+    said = summary(flights, total(flights))
     assert "track of long:" in said and "track of single:" not in said
 
 
@@ -397,7 +398,8 @@ def has_colour(image: np.ndarray, colour: str) -> bool:
     return bool((np.abs(image - wanted).max(axis=2) < 25).sum() > 8)
 
 
-def test_pictures_tell_states_apart_by_colour() -> None:
+def test_pictures_tell_states_apart_by_colour(monkeypatch) -> None:
+    monkeypatch.setattr("orthonav.report.canvas.DPI", 80)
     states = ["searching"] * 10 + ["tracking"] * 15 + ["lost"] * 5
     comparison, results = flown(drawn(30), states)
     track = measure_track(comparison, results, 15.0)

@@ -165,7 +165,7 @@ def test_views_in_subfolders(folder):
         (f"{HEADER}\na.png,soon,90,0,0,100\n", "line 2: time_s is not a time"),
         (f"{HEADER}\na.png,inf,90,0,0,100\n", "line 2: time_s is not a time"),
         (f"{HEADER}\na.png,1e10,90,0,0,100\n", "line 2: time_s is not a time"),
-        (f"{HEADER}\na.png,1,{'9' * 200_000},0,0,100\n", "not a CSV file in UTF-8"),
+        (f"{HEADER}\na.png,1,{'9' * 200_000},0,0,100\n", "line 2 is longer than 65,536"),
     ],
 )
 def test_broken_telemetry(folder, text, message):

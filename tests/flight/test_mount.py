@@ -19,7 +19,7 @@ def test_a_mount_comes_back(tmp_path):
     assert read_mount(tmp_path / "mount.json") == MOUNT
 
 
-def test_told_values_are_corrected():
+def test_reported_values_are_corrected():
     telemetry = Telemetry(5, 350.0, 1.0, 2.0, 100.0, vel_en_mps=(1.0, 2.0), tilt_std_deg=0.5)
     found = MOUNT.corrected(telemetry)
     assert (found.yaw_deg, found.pitch_deg, found.roll_deg) == (354.0, 7.5, 0.75)
@@ -64,3 +64,10 @@ def test_the_file_can_be_read_by_people(tmp_path):
     plain = json.loads((tmp_path / "mount.json").read_text())
     assert plain["pitch_deg"] == {"value": 6.5, "std": 0.3, "scatter": 0.7}
     assert plain["views"] == 17
+
+
+def test_a_missing_field_is_named(tmp_path):
+    path = tmp_path / "mount.json"
+    path.write_text('{"camera": 1}')
+    with pytest.raises(FlightError, match="orthonav_mount is missing"):
+        read_mount(path)

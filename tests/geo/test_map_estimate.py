@@ -60,3 +60,19 @@ def test_impossible_numbers_are_refused():
     for numbers in ({"gsd_m": 0.0}, {"tile_px": 3}, {"overlap": 1.0}):
         with pytest.raises(AreaError):
             estimate_map(area, **{"gsd_m": 1.0, "tile_px": 256, "overlap": 0.5, **numbers})
+
+
+def test_estimates_of_many_maps_are_made_from_fewer_points(monkeypatch):
+    """Their sum takes as much work as one; each stays within some percent."""
+    area, asked, contains = Area.from_route(L_ROUTE), [], Area.contains
+
+    def counted(self, points, margin_m=0.0):
+        asked.append(len(points))
+        return contains(self, points, margin_m)
+
+    monkeypatch.setattr(Area, "contains", counted)
+    alone = estimate_map(area, gsd_m=1.0, tile_px=128, overlap=0.75)
+    one, asked[:] = sum(asked), []
+    of_many = estimate_map(area, gsd_m=1.0, tile_px=128, overlap=0.75, maps=100)
+    assert sum(asked) < one / 20
+    assert of_many.tiles == pytest.approx(alone.tiles, rel=0.05)

@@ -190,7 +190,7 @@ def test_any_bytes_give_a_route_or_a_route_error(suffix, content):
         ("a.geojson", b"{}", "no LineString; it holds None"),
         ("a.geojson", b'{"type": "FeatureCollection", "features": 5}', "cannot be read"),
         ("a.geojson", json.dumps(collection(POINT, None)).encode(), "it holds Point"),
-        ("a.geojson", b'{"type": "LineString"}', "cannot be read"),
+        ("a.geojson", b'{"type": "LineString"}', "coordinates is missing"),
         ("a.geojson", b'{"type": "LineString", "coordinates": []}', "no waypoints"),
         ("a.geojson", b'{"type": "LineString", "coordinates": [[1], [2]]}', "as numbers"),
         ("a.geojson", b'{"type": "LineString", "coordinates": [["x", 1]]}', "as numbers"),

@@ -31,8 +31,8 @@ def kml_of(*marks, namespaces=True):
 
 
 def line(mode=None, coordinates=LINE):
-    told = f"<altitudeMode>{mode}</altitudeMode>" if mode else ""
-    return f"<LineString><tessellate>1</tessellate>{told}{coordinates}</LineString>"
+    altitude = f"<altitudeMode>{mode}</altitudeMode>" if mode else ""
+    return f"<LineString><tessellate>1</tessellate>{altitude}{coordinates}</LineString>"
 
 
 def archive(*members):
@@ -71,8 +71,8 @@ def test_lines_and_tracks_of_kml(read, geometry, frame, namespaces):
     point = ("start", "<Point><coordinates>1,2,0</coordinates></Point>")
     route = read(kml_of(point, ("way", geometry), namespaces=namespaces), "a.kml")
     assert route.waypoints == PLACES and route.name == "way"
-    told = tuple(Height(metres, frame) for metres in (120, 130, 140))
-    assert route.heights == (told if frame else ())
+    expected = tuple(Height(metres, frame) for metres in (120, 130, 140))
+    assert route.heights == (expected if frame else ())
 
 
 def test_lines_of_one_placemark_are_joined_and_placemarks_picked_by_name(read):
@@ -184,3 +184,14 @@ def test_archives_of_many_members_or_with_a_password_are_refused(read):
     locked[flag] |= 1
     with pytest.raises(RouteError, match="cannot be unpacked"):
         read(bytes(locked), "a.kmz")
+
+
+def test_spaces_in_coordinates_take_linear_time(tmp_path):
+    """The time of a search for spaces around commas would grow with the square of their number."""
+    path = tmp_path / "a.kml"
+    spaces = " " * 3_000_000
+    text = f"1 ,\n2{spaces}3 , 4, 5"
+    path.write_text(
+        f"<kml><Placemark><LineString><coordinates>{text}</coordinates></LineString></Placemark></kml>"
+    )
+    assert read_route(path).waypoints == ((2.0, 1.0), (4.0, 3.0))

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from orthonav.errors import AreaError
+from orthonav.geo import sheets as sheets_module
 from orthonav.geo.area import Area
 from orthonav.geo.frames import MAX_SHEET_M
 from orthonav.geo.route import Height, Route, leg_lengths_m, read_route
@@ -126,3 +127,22 @@ def test_many_waypoints_are_divided_quickly():
 def test_routes_that_cannot_be_cut_are_refused(route, band_m, message):
     with pytest.raises(AreaError, match=message):
         sheets_of_route(route, band_m)
+
+
+@pytest.mark.parametrize(
+    "route",
+    [
+        Route(((0.0, 0.0), (1.0, 9.0)), leg_bands_m=(49_900.0,)),
+        Route(((0.0, 0.0), (0.0, 179.0)) * 3),
+        Route(tuple((0.0, longitude) for longitude in (0.0, 100.0) * 40_000)),
+    ],
+)
+def test_routes_of_too_many_sheets_are_refused_before_the_work(route, monkeypatch):
+    monkeypatch.setattr(Area, "contains", None)
+    fits, tried = sheets_module._route_fits, []
+    monkeypatch.setattr(
+        sheets_module, "_route_fits", lambda *each: tried.append(each) or fits(*each)
+    )
+    with pytest.raises(AreaError, match="at most 500 are planned"):
+        sheets_of_route(route, 500.0)
+    assert len(tried) <= 1000

@@ -299,7 +299,8 @@ def test_naip_swissimage_and_drones(tmp_path):
     assert len(mixed.sources) == 3 and len(mixed.describe()) == 3
 
 
-def test_build_from_a_folder(tmp_path, capsys):
+def test_build_from_a_folder(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 24)
     folder = tmp_path / "ortho_2019"
     tiles(folder, side=130, size=390, scene=smooth_scene(390))
     out = tmp_path / "map.onav"

@@ -1,4 +1,4 @@
-"""Views that cannot be placed are told why before any search; what is just usable passes."""
+"""Views that cannot be placed are refused before any search; the least usable ones pass."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Rectified views show the ground as it is, told by a renderer that shares no code with them."""
+"""Rectified views equal the ground as drawn by a renderer that shares no code with them."""
 
 import importlib
 import math

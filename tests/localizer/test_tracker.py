@@ -231,12 +231,39 @@ def test_views_that_show_nothing_are_bridged(localizer):
     assert variance[10] > variance[8] > variance[7]
 
 
+@pytest.mark.parametrize("picture", ["mirrored", "noise", "cloud", "turned"])
+def test_pictures_of_anything_else_give_dead_reckoning_only(localizer, picture):
+    """Five views a second overlap, and the reported velocity is reversed."""
+    rng, tracker = np.random.default_rng(5), Tracker(localizer)
+    cloud = cv2.GaussianBlur(rng.normal(0, 900, (240, 320)), (0, 0), 12) + 190
+    rows = []
+    for number, (seen, reported, place) in enumerate(views(26, every_s=1)):
+        fails = number >= 12
+        along = math.radians(60.0 if number < 15 else -35.0)
+        speed = SPEED_MPS * (-1 if fails else 1)
+        velocity = (speed * math.sin(along), speed * math.cos(along))
+        telemetry = replace(reported, vel_en_mps=velocity)
+        grey = seen
+        if fails and picture == "turned":
+            telemetry = replace(telemetry, yaw_deg=telemetry.yaw_deg + 86.0)
+        elif fails:
+            made = {
+                "mirrored": seen[:, ::-1],
+                "noise": rng.normal(128, 40, seen.shape),
+                "cloud": cloud + rng.normal(0, 2, seen.shape),
+            }[picture]
+            grey = np.ascontiguousarray(np.clip(made, 0, 255).astype(np.uint8))
+        rows += followed(tracker, localizer, [(grey, telemetry, place)])
+    assert [row[2] for row in rows[8:12]] == ["tracking"] * 4
+    assert {row[2] for row in rows[12:]} <= {"coasting", "lost"}
+    assert max(row[1] for row in rows[12:]) <= 0.8
+
+
 def test_a_reported_start_needs_no_search(localizer):
     lat, lon = localizer.sheet.frame.latlon_from_en((-160.0, -120.0))
-    telemetry = Prior(float(lat), float(lon), 15.0)
+    start = Prior(float(lat), float(lon), 15.0)
     seen = [
-        (g, replace(t, prior=telemetry if not n else None), p)
-        for n, (g, t, p) in enumerate(views(4))
+        (g, replace(t, prior=start if not n else None), p) for n, (g, t, p) in enumerate(views(4))
     ]
     rows = followed(Tracker(localizer), localizer, seen)
     assert rows[0][0] < 15 and rows[0][1] == pytest.approx(0.8)
@@ -395,9 +422,9 @@ def test_odometry_measures_the_displacement(moved, expected):
         telemetry = Telemetry(number * 10**9, heading, 0.0, 0.0, AGL_M)
         pixel_m = footprints[0].pixel_m if footprints else None
         footprints.append(OdometryView.of(View(noisy, WIDE, telemetry), pixel_m))
-    telemetry_noise = np.array([1e-3, 4e-4])
+    heading_scale_noise = np.array([1e-3, 4e-4])
     expected = None if expected is None else np.array(expected)
-    seen = displacement(*footprints, 0.0, telemetry_noise, expected)
+    seen = displacement(*footprints, 0.0, heading_scale_noise, expected)
     assert seen.displacement.moved_en_m == pytest.approx(moved, abs=0.7)
     assert 0 < seen.overlap < 1
 

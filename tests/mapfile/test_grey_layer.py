@@ -113,8 +113,8 @@ def test_what_was_written_comes_back(layer):
 )
 def test_any_window(opened, level, row, col, size):
     layer = GreyLayer.of(opened)
-    grey, valid = (np.pad(each, 500) for each in whole(layer, level))
-    part = np.s_[500 + row : 500 + row + size[0], 500 + col : 500 + col + size[1]]
+    grey, valid = (np.pad(each, 600) for each in whole(layer, level))
+    part = np.s_[600 + row : 600 + row + size[0], 600 + col : 600 + col + size[1]]
     found_grey, found_valid = layer.read(level, row, col, *size)
     np.testing.assert_array_equal(found_grey, grey[part])
     np.testing.assert_array_equal(found_valid, valid[part])

@@ -4,15 +4,24 @@ import base64
 import json
 import stat
 import sys
+import time
+from datetime import UTC, datetime, timedelta
 
 import pytest
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ed25519, rsa
 from maps import arrays, manifest, put_together, taken_apart
 
-from orthonav.errors import MapFileError, MissingExtraError, MissingFileError, OutputError
+from orthonav.errors import (
+    MapFileError,
+    MissingExtraError,
+    MissingFileError,
+    OutputError,
+    VariantError,
+)
 from orthonav.mapfile import open_map, write_map
 from orthonav.mapfile.signature import (
+    MAX_SERIAL,
     key_id,
     map_digest,
     map_info,
@@ -21,6 +30,7 @@ from orthonav.mapfile.signature import (
     sign_map,
     signature_path,
 )
+from orthonav.onboard.serials import require_newest, serials_path
 
 NAMES = ("private", "public")
 
@@ -55,12 +65,94 @@ def altered(path, **changes):
 
 
 def test_a_signed_map(path, keys):
-    digest = require_signature(path, keys / "ours" / "public.pem")
+    digest = require_signature(path, keys / "ours" / "public.pem").manifest_sha256
     assert digest == map_digest(path) == taken_apart(path)[1]["manifest_sha256"]
     assert map_info(path) == {"name": "area.onav", "manifest_sha256": digest}
-    before = signature_path(path).read_bytes()
-    sign_map(path, keys / "ours" / "private.pem")
-    assert signature_path(path).read_bytes() == before  # Ed25519 draws nothing
+
+
+def test_serial_numbers_increase_by_default(path, keys):
+    key, public = keys / "ours" / "private.pem", keys / "ours" / "public.pem"
+    before = int(time.time())
+    sign_map(path, key)
+    found = require_signature(path, public)
+    assert before <= found.serial <= time.time()
+    signed = datetime.fromisoformat(found.signed_utc).timestamp()
+    assert signed == pytest.approx(found.serial, abs=1)
+    sign_map(path, key, 0)
+    assert require_signature(path, public).serial == 0
+    for serial in (-1, MAX_SERIAL + 1):
+        with pytest.raises(VariantError, match="serial number must be 0 to"):
+            sign_map(path, key, serial)
+
+
+def test_older_maps_are_refused(path, keys):
+    public = keys / "ours" / "public.pem"
+    sign_map(path, keys / "ours" / "private.pem", 41)
+    now = datetime.now(UTC)
+    later, earlier = now + timedelta(days=2), now - timedelta(days=2)
+    for least in ("0", "41", f"{earlier:%Y-%m-%d}", f"{earlier:%Y-%m-%dT%H:%MZ}", "1969-12-31"):
+        assert require_signature(path, public, least).serial == 41
+    for least in ("42", str(MAX_SERIAL), f"{later:%Y-%m-%d}", f"{later:%Y-%m-%dT%H:%M:%SZ}"):
+        with pytest.raises(MapFileError, match="map is too old") as caught:
+            require_signature(path, public, least)
+        assert least in str(caught.value) and str(path) in str(caught.value)
+    for least in ("", "-1", "1e9", "2026-13-01", "yesterday", "2026-05-31T12:00+02:00", "9" * 17):
+        with pytest.raises(VariantError, match="--not-before must be"):
+            require_signature(path, public, least)
+
+
+def of_schema_1(path, keys):
+    """Sign a map as programs before the serial numbers did."""
+    data = (keys / "ours" / "private.pem").read_bytes()
+    private = serialization.load_pem_private_key(data, password=None)
+    digest = map_digest(path)
+    message = f"orthonav map, schema 1, manifest sha256 {digest}".encode()
+    plain = {
+        **{"format": "orthonav-signature", "schema": 1, "algorithm": "ed25519"},
+        **{"key_id": key_id(private.public_key()), "manifest_sha256": digest},
+        "signature": base64.b64encode(private.sign(message)).decode(),
+    }
+    signature_path(path).write_text(json.dumps(plain))
+    return plain
+
+
+def test_signatures_without_a_serial_number_stay_valid(path, keys):
+    public = keys / "ours" / "public.pem"
+    plain = of_schema_1(path, keys)
+    assert require_signature(path, public).serial is None
+    for least in ("0", "2020-01-01"):
+        with pytest.raises(MapFileError, match="sign the map again"):
+            require_signature(path, public, least)
+    new = {**plain, "schema": 2, "serial": 5, "signed_utc": "2026-01-01T00:00:00Z"}
+    signature_path(path).write_text(json.dumps(new))
+    refused(path, keys, "does not verify")  # they cannot be given one
+
+
+def test_the_newest_serial_number_is_remembered(path, keys, tmp_path, caplog):
+    key, public, state = (keys / "ours" / name for name in ("private.pem", "public.pem", "state"))
+
+    def fly(serial):
+        sign_map(path, key, serial)
+        require_newest(state, require_signature(path, public), path)
+
+    for serial in (7, 7, 9, 9):
+        fly(serial)
+    with pytest.raises(MapFileError, match=r"serial number 8, and one with serial number 9 .*was"):
+        fly(8)
+    of_schema_1(path, keys)
+    with pytest.raises(MapFileError, match="no serial number"):
+        require_newest(state, require_signature(path, public), path)
+    serials_path(state).unlink()
+    require_newest(state, require_signature(path, public), path)
+    assert not serials_path(state).exists()
+    for junk in ("", "[]", "{", "[" * 100_000, '{"x": 1e400}'):
+        serials_path(state).write_text(junk)
+        fly(3)
+        assert json.loads(serials_path(state).read_text())
+    serials_path(state).unlink()
+    serials_path(state).mkdir()
+    fly(4)
+    assert "not remembered" in caplog.text
 
 
 def test_it_is_plain_ed25519(path, keys):
@@ -68,7 +160,8 @@ def test_it_is_plain_ed25519(path, keys):
     plain = json.loads(signature_path(path).read_text())
     data = (keys / "ours" / "public.pem").read_bytes()
     public = serialization.load_pem_public_key(data)
-    signed = b"orthonav map, schema 1, manifest sha256 " + plain["manifest_sha256"].encode()
+    named = f"serial {plain['serial']}, signed {plain['signed_utc']}"
+    signed = f"orthonav map, schema 2, {named}, manifest sha256 {plain['manifest_sha256']}".encode()
     public.verify(base64.b64decode(plain["signature"]), signed)
     assert plain["key_id"] == key_id(public) and plain["algorithm"] == "ed25519"
 
@@ -166,7 +259,15 @@ def test_junk(path, keys, junk):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"schema": 2}, "update orthonav"),
+        ({"schema": 3}, "update orthonav"),
+        ({"schema": 1}, "does not verify"),
+        ({"serial": 1}, "does not verify"),
+        ({"serial": -1}, "serial number is invalid"),
+        ({"serial": 1.0}, "serial number is invalid"),
+        ({"serial": 2**53}, "serial number is invalid"),
+        ({"signed_utc": "2026-01-01T00:00:00Z"}, "does not verify"),
+        ({"signed_utc": "2026-1-1T00:00:00Z"}, "time is invalid"),
+        ({"signed_utc": 7}, "broken"),
         ({"algorithm": "none"}, "broken"),
         ({"algorithm": None}, "broken"),
         ({"format": "x"}, "broken"),
@@ -252,6 +353,16 @@ def test_the_commands(tmp_path, run):
     done = run("localize", path, tmp_path, "--out", tmp_path / "out", "--require-signed", public)
     assert "expected a flight folder" in done.err  # the next thing that is wrong
     assert "no camera calibration: give --camera FILE" in run(*fly).err  # likewise
+    signed = run("verify", path, "--public-key", public).out
+    assert "serial " in signed and "signed " in signed
+    for command in (("verify", path, "--public-key", public), (*fly, "--state", tmp_path / "s")):
+        done = run(*command, "--not-before", "2100-01-01")
+        assert done.code == 1 and "too old" in done.err and done.err.count("\n") == 1
+    localize = ("localize", path, tmp_path, "--out", tmp_path / "out", "--not-before", "9" * 15)
+    assert "too old" in run(*localize, "--require-signed", public).err
+    assert "--not-before needs --require-signed" in run(*localize).err
+    assert "--not-before needs" in run(*fly[:4], "--not-before", "5").err
+    assert run("sign", path, "--key", tmp_path / "key" / "private.pem", "--serial", "x").code == 2
     assert run("sign", "--key", tmp_path / "key" / "private.pem").code == 1
     assert run("sign", path).code == 2
 

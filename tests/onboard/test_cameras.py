@@ -5,7 +5,7 @@ import threading
 import cv2
 import numpy as np
 import pytest
-from fake_autopilot import MS, UTC_NS, S, Time, write_flight
+from fake_autopilot import UTC_NS, S, Time, write_flight
 
 from orthonav.errors import FlightError, MissingFileError
 from orthonav.geo.camera import Camera
@@ -52,6 +52,9 @@ class Device:
         frame = self.frames.pop(0)
         return frame is not None, frame
 
+    def get(self, name):
+        return self.settings.get(name, 0.0)
+
     def set(self, name, value):
         self.settings[name] = value
 
@@ -77,14 +80,12 @@ def test_take_waits_for_an_image():
     assert newest.take(5).number == 7
 
 
-def test_exposure_of_a_live_camera_is_arrival_minus_latency():
+def test_images_of_a_live_camera_carry_their_arrival():
     time = Time()
     device = Device([noisy(0), np.dstack([noisy(1)] * 3), None])
-    camera = LiveCamera(
-        0, time.clocks, latency_s=0.08, size_px=(320, 240), capture=lambda _: device
-    )
+    camera = LiveCamera(0, time.clocks, size_px=(320, 240), capture=lambda _: device)
     first = camera.read()
-    assert first.exposed_ns == time.now_ns - 80 * MS
+    assert first.exposed_ns == first.arrival.arrived_ns == time.now_ns
     assert first.time_ns == UTC_NS + first.exposed_ns
     time.go(1.0)
     time.utc_ahead_ns += 3600 * S  # the clock is set while we fly

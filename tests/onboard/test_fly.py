@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import shutil
 import signal
 import socket
@@ -218,7 +219,8 @@ def test_a_view_is_logged_with_its_telemetry_before_it_is_located(flight):
     flight.view()
     names = [name for name, _ in flight.log.calls[before:]]
     assert names[:2] == ["view", "result"]
-    number, frame, grey, telemetry = flight.log.named("view")[-1]
+    number, frame, grey, telemetry, latency_ms, withheld = flight.log.named("view")[-1]
+    assert latency_ms is None and withheld is False
     assert telemetry is flight.locator.seen[-1] and grey.shape == (240, 320)
     assert (number, frame) == (61, "000061")
     assert flight.log.named("result")[-1][0].frame == frame
@@ -427,6 +429,20 @@ def test_a_removed_map_file_degrades(begin, tmp_path):
     assert flight.reasons() == {"map_file_changed"}
     path.write_bytes(b"another")  # the flight still uses the old one
     assert flight.health().reasons in ((), ("map_file_changed",))
+
+
+def test_a_map_changed_in_place_fails_and_stops_positions(begin):
+    changes = [None]
+    flight = begin(map_change=lambda: changes[0])
+    flight.views(60)
+    assert flight.health().level is Level.OK and flight.port.sent("GPS_INPUT")
+    changes[0] = "5 bytes instead of 9"
+    flight.port.gone.clear()
+    flight.views(11)
+    assert flight.health().level is Level.FAILED and "map_file_changed" in flight.reasons()
+    assert flight.port.sent("GPS_INPUT") == []
+    views = [line for line in flight.written() if "frame" in line]
+    assert {line["reason"] for line in views[-11:]} == {"map_file_changed"}
 
 
 def test_a_log_that_fails_does_not_end_the_flight(flight):
@@ -733,6 +749,55 @@ def test_a_killed_flight_continues_from_the_saved_position(flown, autopilot, tmp
         second.send_signal(signal.SIGTERM)
         code = second.wait()
     assert code == 0  # a clean stop
+
+
+@pytest.mark.parametrize("how", ["truncated", "emptied", "rewritten"])
+def test_a_map_changed_in_place_in_flight_stops_positions_only(flown, autopilot, tmp_path, how):
+    """A process of its own: reading a mapped file beyond its end would kill it with SIGBUS."""
+    path, folder, _, _ = flown
+    area, lines, state = tmp_path / "area.onav", tmp_path / "lines.jsonl", tmp_path / "state.json"
+    area.write_bytes(path.read_bytes())
+    program = "import sys; from orthonav.cli import main; sys.exit(main(sys.argv[1:]))"
+    arguments = [
+        *("fly", area, folder, "--state", state, "--jsonl", lines, "--pace", "0.2"),
+        *("--autopilot", f"udpin:{autopilot.port}", "--deadline-ms", "60000"),
+    ]
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, *map(str, arguments)], stderr=subprocess.PIPE, text=True
+    )
+    try:
+        wait_for(state.exists)  # a confident position was found
+        size = area.stat().st_size
+        if how == "rewritten":
+            with area.open("r+b") as stream:
+                stream.write(bytes(size + 1))  # another size, as another map has
+        else:
+            os.truncate(area, size // 3 if how == "truncated" else 0)
+        wait_for(lambda: '"reason": "map_file_changed"' in lines.read_text())
+        wait_for(lambda: '"FAILED"' in lines.read_text())
+    finally:
+        process.send_signal(signal.SIGTERM)
+        err = process.communicate()[1]
+    assert process.returncode == 0 and "Traceback" not in err, err
+    written = [json.loads(line) for line in lines.read_text().splitlines()]
+    views = [line for line in written if "frame" in line]
+    first = next(i for i, line in enumerate(views) if line["reason"] == "map_file_changed")
+    assert any(line["status"] == "fix" for line in views[:first])
+    for line in views[first:]:
+        assert (line["status"], line["reason"]) == ("no_fix", "map_file_changed")
+        assert not line["sent"] and "bytes instead of" in line["detail"]
+    last = [line for line in written if "health" in line][-1]
+    assert last["health"] == "FAILED" and "map_file_changed" in last["reasons"]
+
+
+@pytest.mark.parametrize(
+    "more, warned",
+    [(("--send", "odometry", "--send-rate-hz", "5"), True), (("--send", "odometry"), False)],
+)
+def test_a_rate_too_low_for_px4_is_a_warning(flown, run, more, warned):
+    path, folder, _, _ = flown
+    done = run("fly", path, folder, "--autopilot", "udpin:0", *more, "--nmea", "x:1")
+    assert done.code == 1 and ("PX4 fuses ODOMETRY only at more than 5 Hz" in done.err) == warned
 
 
 def test_invalid_options_end_with_one_line(flown, run, tmp_path):

@@ -13,6 +13,7 @@ from orthonav.errors import MissingExtraError, VariantError
 from orthonav.onboard.link import RETRY_S, AutopilotLink, LinkThread
 from orthonav.onboard.ports import Descriptor, Udp, open_serial, transport_opener
 from orthonav.onboard.telemetry import TelemetryBuffer
+from orthonav.publish.estimate import Clock
 from orthonav.publish.local import Autopilot as Kind
 from orthonav.publish.local import Origin
 from orthonav.publish.mavlink import Signing, Target, dialect, signing_timestamp
@@ -167,6 +168,24 @@ def test_timesync_requests_are_answered(flying):
     answer = next(each for each in flying.port.sent("TIMESYNC") if each["tc1"])
     assert answer["ts1"] == 777
     assert answer["tc1"] == flying.time.clocks.utc_ns()  # the clock that messages are stamped with
+
+
+def test_timesync_is_answered_by_the_clock_of_the_stamps():
+    """PX4 converts the stamps of ODOMETRY by the offset that TIMESYNC gives it."""
+    flying = Flying(stamp=Clock.BOOT)
+    flying.hear(flying.autopilot.heartbeat())
+    flying.hear(flying.autopilot.say("timesync", 0, 776))
+    answers = [each for each in flying.port.sent("TIMESYNC") if each["tc1"]]
+    assert not answers  # its clock is not known yet
+    flying.hear(flying.autopilot.attitude(flying.boot_ns()))
+    flying.time.go(0.5)
+    asked = flying.boot_ns()
+    flying.hear(flying.autopilot.say("timesync", 0, asked))
+    answer = next(each for each in flying.port.sent("TIMESYNC") if each["tc1"])
+    assert answer["ts1"] == asked
+    px4_offset_us = ((answer["ts1"] // 1000) * 2 - (answer["tc1"] // 1000) * 2) // 2
+    stamp_us = flying.link.boot_ns(flying.time.now_ns) // 1000
+    assert stamp_us + px4_offset_us == pytest.approx(flying.boot_ns() // 1000, abs=1000)
 
 
 def test_a_restart_of_the_autopilot_is_detected(flying):

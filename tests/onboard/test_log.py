@@ -240,7 +240,7 @@ def full_disk(monkeypatch, room_bytes):
 
 
 def test_a_full_disk_drops_images_first(tmp_path, monkeypatch):
-    disk = full_disk(monkeypatch, 45_000)
+    disk = full_disk(monkeypatch, 46_000)
     log = begun(tmp_path)
     for index in range(30):
         log_views(log, [index])

@@ -25,6 +25,7 @@ from orthonav.onboard.outputs import (
     open_sink,
 )
 from orthonav.onboard.telemetry import VehicleState
+from orthonav.publish.correlation import messages_averaged
 from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
 from orthonav.publish.gate import Gate, GateRules
 from orthonav.publish.local import Autopilot, Origin, north_east_m
@@ -131,6 +132,43 @@ def test_a_message_without_an_open_port_is_not_sent():
     sending = Sending()
     sending.open = False
     assert sending.publish() == ()
+
+
+def test_the_accuracy_for_filters_grows_with_the_rate():
+    sending = Sending("global-position", "gps-input", "odometry")
+    for _ in range(2):
+        sending.publish()
+        sending.time.go(0.5)
+    first, again = sending.frames[:3], sending.frames[3:]
+    assert (first[0]["eph"], first[1]["horiz_accuracy"]) == (3.0, 3.0)
+    assert first[2]["pose_covariance"][0] == 9.0
+    averaged = messages_averaged(3.0, 0.5)
+    assert averaged > 5
+    assert again[0]["eph"] == pytest.approx(3.0 * math.sqrt(averaged))
+    assert again[1]["horiz_accuracy"] == pytest.approx(3.0 * math.sqrt(averaged))
+    assert again[2]["pose_covariance"][0] == pytest.approx(9.0 * averaged)
+
+
+def test_the_gate_judges_the_accuracy_of_the_fix():
+    sending = Sending(rules=GateRules(max_std_m=4.0))
+    for _ in range(3):
+        now_ns = sending.time.now_ns
+        sending.publish(sending.gate.admit(replace(ESTIMATE, boot_ns=now_ns), now_ns))
+        sending.time.go(0.2)
+    assert len(sending.frames) == 3 and not sending.gate.withheld
+    assert sending.frames[-1]["eph"] > 4.0
+
+
+@pytest.mark.parametrize(
+    "kind, interval_s, too_slow",
+    [(Autopilot.PX4, 0.2, 4), (Autopilot.PX4, 0.125, 0), (Autopilot.ARDUPILOT, 0.5, 0)],
+)
+def test_local_messages_too_slow_for_px4_are_counted(kind, interval_s, too_slow):
+    sending = Sending("odometry", "global-position")
+    for _ in range(5):
+        sending.publish(kind=kind)
+        sending.time.go(interval_s)
+    assert sending.messenger.too_slow == too_slow
 
 
 def test_unknown_messages_are_refused():

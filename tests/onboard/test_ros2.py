@@ -40,7 +40,14 @@ from orthonav.onboard.ros2.node import Node
 from orthonav.onboard.ros2.publisher import Ros2Publisher
 from orthonav.onboard.ros2.reader import Ros2Reader
 from orthonav.onboard.telemetry import Clocks, TelemetryBuffer, VehicleState
-from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate, floored
+from orthonav.publish.correlation import messages_averaged
+from orthonav.publish.estimate import (
+    Clock,
+    EstimateError,
+    NavigationEstimate,
+    error_ellipse,
+    floored,
+)
 from orthonav.publish.gate import Gate, GateRules
 from orthonav.records import ViewResult
 from orthonav.sources.opening import open_source
@@ -501,7 +508,7 @@ def publishing(env, peer):
         each.node.close()
 
 
-COV = np.array([[4.0, 1.5], [1.5, 9.0]])
+COV = np.array([[16.0, 1.5], [1.5, 25.0]])
 
 
 def fix(cov_en_m2=COV, **values):
@@ -535,6 +542,20 @@ def test_a_position_is_published_as_fix_and_pose(peer, publishing):
     forward_ned, left_ned = ned @ [1.0, 0, 0], ned @ [0.0, -1, 0]
     for axis, ned_axis in (([1, 0, 0], forward_ned), ([0, 1, 0], left_ned)):
         assert flu.apply(axis) == pytest.approx([ned_axis[1], ned_axis[0], -ned_axis[2]], abs=1e-12)
+
+
+def test_covariances_are_for_filters(peer, publishing):
+    flying = publishing()
+    flying.publish(fix())
+    flying.publish(fix(), 8 * S)  # 0.2 s later
+    wait_for(lambda: len(peer.heard("/orthonav/fix")) > 1, 5)
+    first, again = peer.heard("/orthonav/fix")
+    averaged = messages_averaged(error_ellipse(COV)[0], 0.2)
+    found = [np.reshape(each.position_covariance, (3, 3))[:2, :2] for each in (first, again)]
+    assert found[0] == pytest.approx(COV) and found[1] == pytest.approx(COV * averaged)
+    wait_for(lambda: len(peer.heard("/orthonav/pose")) > 1, 5)
+    full = np.reshape(peer.heard("/orthonav/pose")[1].pose.covariance, (6, 6))
+    assert full[:2, :2] == pytest.approx(COV * averaged)
 
 
 @pytest.mark.parametrize(
@@ -573,8 +594,8 @@ def test_a_dry_run_sends_health_and_no_position(peer, publishing):
 
 
 def test_min_std_m_is_a_bound_in_every_direction():
-    assert np.linalg.eigvalsh(floored(COV, 2.5)).tolist() == pytest.approx(
-        [2.5**2, np.linalg.eigvalsh(COV)[1]]
+    assert np.linalg.eigvalsh(floored(COV, 4.5)).tolist() == pytest.approx(
+        [4.5**2, np.linalg.eigvalsh(COV)[1]]
     )
     assert floored(COV, 0.0) == pytest.approx(COV)
 

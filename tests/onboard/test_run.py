@@ -158,8 +158,10 @@ def test_the_heading_may_be_unknown(localizer, short):
     views = [replace(v, telemetry=replace(v.telemetry, yaw_deg=math.nan)) for v in short.views[:3]]
     telemetry = localize_flight(SingleViews(localizer), short, views=views)
     assert set(outcomes(telemetry)) == {"missing_telemetry"}
-    untold = localize_flight(SingleViews(localizer, heading_known=False), short, views=views)
-    assert set(outcomes(untold)) == {"fix"}
+    without_heading = localize_flight(
+        SingleViews(localizer, heading_known=False), short, views=views
+    )
+    assert set(outcomes(without_heading)) == {"fix"}
 
 
 def test_one_view_is_the_same_as_in_a_flight(localizer, short):

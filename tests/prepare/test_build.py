@@ -99,7 +99,7 @@ REQUESTS = {
     "canny": {"edges": "canny:low=50,high=120"},
     "64 dims": {"method": "gradient:dims=64"},
     "both": {"method": "gradient:dims=32,cells=16", "edges": "canny"},
-    "seed": {**WITH_LAYER, "seed": 5, "calibration_views": 8},
+    "seed": {**WITH_LAYER, "seed": 5, "calibration_views": 3},
 }
 
 
@@ -123,8 +123,8 @@ def test_the_recipe_is_in_the_map(ortho, tmp_path):
 def test_one_channel_is_compared_on_finer_cells(ortho, tmp_path, edges):
     chosen = built(ortho, tmp_path, edges=edges).manifest.recipe["embed"]["cells"]
     assert chosen == (8 if edges == "gradient" else 16)
-    telemetry = built(ortho, tmp_path, "stated.onav", edges=edges, method="gradient:cells=4")
-    assert telemetry.manifest.recipe["embed"]["cells"] == 4
+    stated = built(ortho, tmp_path, "stated.onav", edges=edges, method="gradient:cells=4")
+    assert stated.manifest.recipe["embed"]["cells"] == 4
 
 
 def test_another_seed_changes_the_calibration_only(ortho, tmp_path, calibrated):
@@ -217,12 +217,12 @@ def test_blocks_do_not_matter(ortho, tmp_path, monkeypatch):
 
 
 def test_the_manifest(ortho, tmp_path):
-    calls, telemetry = [], []
+    calls, lines = [], []
     out = tmp_path / "deep" / "map.onav"
     request = BuildRequest([ortho], out, tile_px=64, calibration_views=4)
-    result = build_map(request, lambda stage, share: calls.append((stage, share)), telemetry.append)
+    result = build_map(request, lambda stage, share: calls.append((stage, share)), lines.append)
     manifest = open_map(request.out).manifest
-    (line,) = telemetry
+    (line,) = lines
     tiles = int(line.partition(" tiles of 64 px")[0].split(", ")[1].replace(",", ""))
     assert tiles == pytest.approx(manifest.sheets[0].tiles, rel=0.03)
     assert manifest == result.manifest and result.size_bytes == request.out.stat().st_size
@@ -396,7 +396,7 @@ def test_the_stated_error_is_of_the_order_of_the_grid(map_path, ortho, tmp_path,
 
 def test_slow_representations_are_calibrated_on_fewer_crops(ortho, tmp_path, monkeypatch):
     """For representations that take minutes; counted by the reported progress."""
-    telemetry = {}
+    crops = {}
     for name in ("canny", "slow"):
         if name == "slow":
             table = {**represent.TABLE, "canny": replace(represent.TABLE["canny"], flies=False)}
@@ -404,16 +404,16 @@ def test_slow_representations_are_calibrated_on_fewer_crops(ortho, tmp_path, mon
         monkeypatch.setattr("orthonav.prepare.calibrate.SLOW_CROPS", 6)
         shares = []
 
-        def tell(stage, share, shares=shares):
+        def progress(stage, share, shares=shares):
             if stage == "calibrate":
                 shares.append(share)
 
         request = BuildRequest(
             [ortho], tmp_path / f"{name}.onav", tile_px=64, edges="canny", registration=False
         )
-        build_map(request, tell)
-        telemetry[name] = len(shares)
-    assert telemetry["slow"] == 6 < telemetry["canny"]
+        build_map(request, progress)
+        crops[name] = len(shares)
+    assert crops["slow"] == 6 < crops["canny"]
 
 
 @pytest.mark.parametrize("kind", ["bounds", "route"])

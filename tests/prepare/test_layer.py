@@ -9,6 +9,7 @@ import pytest
 
 from helpers import textured
 from orthonav.cli import main
+from orthonav.geo.area import Area
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.mapfile import GreyLayer, open_map
@@ -253,7 +254,8 @@ def test_levels_are_aligned(ortho, tmp_path):
 def test_far_from_the_route_there_is_nothing(make_ortho, tmp_path):
     grey = textured((1500, 1500))
     wide = make_ortho(tmp_path / "wide.tif", grey)
-    frame = built(wide, tmp_path, "whole.onav", registration=False).manifest.sheets[0].frame
+    outline = Mosaic.open([wide]).outline_latlon_deg
+    frame = Area.from_outline(outline[:, 0], outline[:, 1]).frame
     ends = frame.latlon_from_en(np.array([[-700.0, -700.0], [700.0, 700.0]]))
     route = Route(tuple(zip(*(each.tolist() for each in ends), strict=True)))
     opened = built(wide, tmp_path, route=route, band_m=100.0)
@@ -281,16 +283,16 @@ def test_info_describes_the_layer(ortho, tmp_path, capsys):
     opened = built(ortho, tmp_path)
     grey = opened.manifest.sheets[0].grey
     assert main(["info", str(opened.path), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)["registration"]
+    summary = json.loads(capsys.readouterr().out)["registration"]
     size = sum(opened.arrays[name].nbytes for name in NAMES.values())
-    assert told["bytes"] == size and told["levels"] == grey.levels
-    assert told["raw_bytes"] == 3 * grey.valid_px
-    assert told["raw_ratio"] == pytest.approx(3 * grey.valid_px / size, abs=0.01)
-    assert told["mb_per_km2"] == pytest.approx(size / grey.valid_px, rel=0.01)  # 1 m pixels
+    assert summary["bytes"] == size and summary["levels"] == grey.levels
+    assert summary["raw_bytes"] == 3 * grey.valid_px
+    assert summary["raw_ratio"] == pytest.approx(3 * grey.valid_px / size, abs=0.01)
+    assert summary["mb_per_km2"] == pytest.approx(size / grey.valid_px, rel=0.01)  # 1 m pixels
     assert main(["info", str(opened.path)]) == 0
     text = capsys.readouterr().out
     assert f"registration layer of {size / 1e6:.3f} MB" in text
-    assert f"{grey.levels} levels, 1/{told['raw_ratio']:.0f} of the raw orthophoto" in text
+    assert f"{grey.levels} levels, 1/{summary['raw_ratio']:.0f} of the raw orthophoto" in text
 
 
 def test_the_command_can_leave_it_out(ortho, tmp_path, capsys):

@@ -36,6 +36,7 @@ def now(seconds: float) -> int:
         ("low_confidence", {"confidence": math.nan}, 0.1),
         ("not_tracking", {"state": "searching"}, 0.1),
         ("not_tracking", {"state": "lost"}, 0.1),
+        ("coasting", {"state": "coasting"}, 0.1),
         ("no_covariance", {"cov_en_m2": np.full((2, 2), math.nan)}, 0.1),
         ("too_uncertain", {"cov_en_m2": np.diag([1.0, 51.0**2])}, 0.1),
         ("stale", {}, 1.01),
@@ -79,8 +80,8 @@ def test_views_out_of_order_are_withheld() -> None:
 def test_positions_pass_again_after_a_clock_was_set_back() -> None:
     gate = Gate()
     gate.admit(estimate_at(3600.0), now(3600.0))
-    passed = gate.admit(estimate_at(0.0), now(0.1))
-    assert passed is not None and passed.reset_counter == 1
+    passed = [gate.admit(estimate_at(float(second)), now(second)) for second in range(3)]
+    assert [None if each is None else each.reset_counter for each in passed] == [None, None, 1]
 
 
 def test_the_gate_needs_its_clock() -> None:
@@ -109,23 +110,65 @@ def test_low_confidence_alone_is_no_reset() -> None:
     assert passed is not None and passed.reset_counter == 0
 
 
-@pytest.mark.parametrize(("jump_m", "resets"), [(20.0, 0), (90.0, 1)])
-def test_a_jump_beyond_the_possible_motion_is_a_reset(jump_m: float, resets: int) -> None:
-    """60 m/s for a second and five times 2.8 m are 74 m."""
+def test_a_view_that_does_not_show_the_map_is_no_reset() -> None:
     gate = Gate()
-    gate.admit(estimate_at(0.0), now(0))
-    passed = gate.admit(estimate_at(1.0, east_m=jump_m), now(1))
-    assert passed is not None and passed.reset_counter == resets
+    passed = [
+        gate.admit(estimate_at(second, state=state), now(second))
+        for second, state in enumerate(["tracking", "coasting", "tracking"])
+    ]
+    assert [None if each is None else each.reset_counter for each in passed] == [0, None, 0]
 
 
-@pytest.mark.parametrize(("jump_m", "resets"), [(0.0, 0), (15.0, 0), (30.0, 1)])
-def test_a_known_velocity_makes_the_limit_smaller(jump_m: float, resets: int) -> None:
+def test_dead_reckoning_is_admitted_and_marked_where_asked_for() -> None:
+    gate = Gate(GateRules(send_coasting=True))
+    gate.admit(estimate_at(0, state="tracking"), now(0))
+    passed = gate.admit(estimate_at(1, state="coasting", confidence=0.3), now(1))
+    assert passed is not None and passed.dead_reckoned
+    jumped = gate.admit(estimate_at(2, east_m=500.0, state="coasting"), now(2))
+    assert jumped is None and gate.withheld == {"jump": 1}
+    again = gate.admit(estimate_at(3, state="tracking"), now(3))
+    assert again is not None and not again.dead_reckoned and again.reset_counter == 0
+
+
+def jumped(gate: Gate, east_m: float, views: int, **more: object) -> list[int | None]:
+    """Reset counters of so many views a second apart, after one at 0 m; None for one withheld."""
+    gate.admit(estimate_at(0.0, **more), now(0))
+    counters = []
+    for second in range(1, views + 1):
+        passed = gate.admit(estimate_at(second, east_m=east_m, **more), now(second))
+        counters.append(None if passed is None else passed.reset_counter)
+    return counters
+
+
+@pytest.mark.parametrize(
+    ("jump_m", "counters"), [(20.0, [0, 0, 0, 0]), (300.0, [None, None, 1, 1])]
+)
+def test_an_impossible_jump_is_withheld_until_views_agree(jump_m, counters) -> None:
+    """60 m/s for a second and five times 2.8 m are 74 m, for three seconds 194 m."""
+    gate = Gate()
+    assert jumped(gate, jump_m, 4) == counters
+    assert gate.withheld["jump"] == counters.count(None)
+
+
+def test_a_single_view_elsewhere_is_withheld_for_good() -> None:
+    gate = Gate()
+    east_m = [0.0, 500.0, 0.0, 900.0, -700.0, 1500.0, 0.0]
+    passed = [
+        gate.admit(estimate_at(0.2 * step, east_m=east), now(0.2 * step))
+        for step, east in enumerate(east_m)
+    ]
+    assert [each is not None for each in passed] == [east == 0.0 for east in east_m]
+    assert gate.resets == 0
+
+
+@pytest.mark.parametrize(("jump_m", "withheld"), [(0.0, 0), (15.0, 0), (30.0, 1)])
+def test_a_known_velocity_makes_the_limit_smaller(jump_m: float, withheld: int) -> None:
     """30 m/s foretell 30 m; 5 m of acceleration and five times 3 m are 20 m more."""
     gate = Gate()
     moving = {"vel_en_mps": (30.0, 0.0), "state": "tracking"}
     gate.admit(estimate_at(0.0, **moving), now(0))
-    passed = gate.admit(estimate_at(1.0, east_m=30.0 + jump_m, **moving), now(1))
-    assert passed is not None and passed.reset_counter == resets
+    gate.admit(estimate_at(1.0, east_m=30.0 + jump_m, **moving), now(1))
+    assert gate.withheld["jump"] == withheld
 
 
 def test_noise_within_the_covariance_is_no_reset() -> None:
@@ -141,10 +184,11 @@ def test_noise_within_the_covariance_is_no_reset() -> None:
 
 def test_the_reset_counter_wraps_after_255() -> None:
     gate = Gate()
-    for second in range(300):
-        passed = gate.admit(estimate_at(second, east_m=500.0 * (second % 2)), now(second))
-    assert gate.resets == 299
-    assert passed is not None and passed.reset_counter == 299 - 256
+    for number in range(601):
+        state = "lost" if number % 2 else "tracking"
+        passed = gate.admit(estimate_at(number, state=state), now(number))
+    assert gate.resets == 300
+    assert passed is not None and passed.reset_counter == 300 - 256
 
 
 @pytest.mark.parametrize("place", [(90.0, 0.0), (-90.0, 180.0), (0.0, 180.0), (89.95, -180.0)])

@@ -93,11 +93,11 @@ GOLDEN = {
     """,
     "odometry_ardupilot": """
         fde900000001c54b010040b28205165b0600c43223456905c4c40000f0c2bb4a3b3ff79c2b3c451480bb7c7f
-        2e3f608d3b4122d58a40fa1c36be0000c07f0000c07f0000c07f000010410000404000000000000000000000
-        00000000000000008041000000000000000000000000000000000000804000000000000000000000000017b7
+        2e3f608d3b4122d58a40fa1c36be0000c07f0000c07f0000c07f1681b6400000000000000000000000000000
+        0000000000001681b640000000000000000000000000000000001681b64000000000000000000000000017b7
         d138000000000000000017b7d138000000000ad7233b0000c07f0000c07f0000c07f0000c07f0000c07f0000
         c07f0000c07f0000c07f0000c07f0000c07f0000c07f0000c07f0000c07f0000c07f0000c07f0000c07f0000
-        c07f0000c07f0000c07f0000c07f0000c07f140c03025f8d01
+        c07f0000c07f0000c07f0000c07f0000c07f140c03025f7c46
     """,
     "vision_position_estimate": """
         fd7500000001c566000040b28205165b0600b10723451bc2c3c40000f0c20ad7233c0ad7a3bc0000c03f0000
@@ -267,6 +267,10 @@ def test_odometry_for_ardupilot_has_its_velocity_in_the_body() -> None:
     assert (read["vx"], read["vy"], read["vz"]) == pytest.approx(tuple(body), rel=1e-5)
     turn = ned_from_body.as_matrix()
     expected = turn.T @ np.diag([1.0, 0.25, 0.04]) @ turn
+    pose = read["pose_covariance"]
+    variances = np.array([pose[0], pose[6], pose[11]])
+    assert math.sqrt(variances.sum()) == pytest.approx(EPH, rel=1e-6)  # as ArduPilot reads it
+    assert np.cbrt((variances**2).sum()) >= EPH  # as older versions do
     cov = read["velocity_covariance"]
     found = np.array(
         [[cov[0], cov[1], cov[2]], [cov[1], cov[6], cov[7]], [cov[2], cov[7], cov[11]]]
@@ -294,7 +298,7 @@ def test_local_messages_need_a_height_and_a_position_estimate_its_attitude() -> 
 
 
 def test_the_altitude_of_the_estimate_precedes_that_of_the_pose() -> None:
-    read = sent(vision_position_estimate(WITH_ALTITUDE, POSE, Autopilot.ARDUPILOT, min_std_m=50.0))
+    read = sent(vision_position_estimate(WITH_ALTITUDE, POSE, Autopilot.PX4, min_std_m=50.0))
     assert (read["z"], read["covariance"][11]) == (90.0 - 134.5, 6.25)
     assert read["covariance"][:2] == pytest.approx((2500.0, 0.0), abs=1e-3)
     assert (read["roll"], read["pitch"], read["yaw"]) == pytest.approx(POSE.attitude_rad)

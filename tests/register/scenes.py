@@ -45,7 +45,7 @@ def pixel_centres(shape):
 def seen(ground, pose, shape):
     """Values (H, W) of the ground under a window at a pose, one pixel of level 0 to a pixel.
 
-    Written out anew: the top of the window points to `turn_rad`, clockwise from north.
+    Written out independently: the top of the window points to `turn_rad`, clockwise from north.
     """
     x, y = pixel_centres(shape)
     scale = math.exp(pose.log_scale)

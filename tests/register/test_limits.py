@@ -17,7 +17,6 @@ from orthonav.register.registrar import Registrar
 from orthonav.register.search import search
 
 
-# -> test_refine.py
 @pytest.mark.parametrize("hole", [hole for hole, _ in HOLES.values()], ids=HOLES.keys())
 @pytest.mark.parametrize("level", [0, 1])
 def test_errors_on_a_part_of_the_map_are_as_large_as_the_covariance_says(hole, level):
@@ -56,7 +55,7 @@ def test_a_part_of_the_map_is_converged_upon_as_fast_and_known_less_exactly(hole
 
 @pytest.mark.parametrize("spread_rad", [0.12, 0.3, 0.6])
 @pytest.mark.parametrize("level", [0, 1])
-def test_where_the_ground_runs_in_one_direction_errors_are_told(spread_rad, level):
+def test_where_the_ground_runs_in_one_direction_the_covariance_covers_the_errors(spread_rad, level):
     """Furrows: a changed view says nothing along them, whatever its own noise says."""
     furrows = Ground(seed=1, spread_rad=spread_rad)
     reference = reference_of(furrows, SHAPE)
@@ -70,7 +69,6 @@ def test_where_the_ground_runs_in_one_direction_errors_are_told(spread_rad, leve
     assert normalized_squares(np.array(off), np.array(covariances)).mean() < 3.5
 
 
-# -> test_registrar.py
 @pytest.mark.parametrize("reach_px", [2e3, 1e6, math.inf])
 @pytest.mark.parametrize("centre", [(200.0, 170.0), (-1500.0, 100.0)])
 def test_a_part_is_no_larger_than_the_sheet_and_a_view_around_it(reach_px, centre):

@@ -49,7 +49,7 @@ def whole(holes):
 
 @pytest.fixture
 def piecewise(holes, monkeypatch):
-    """A reference that makes each window anew."""
+    """A reference that makes each window again."""
     monkeypatch.setattr(module, "WHOLE_LEVEL_PX", 0)
     return Reference(sheet(holes))
 

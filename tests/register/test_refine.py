@@ -178,7 +178,7 @@ def test_without_steps_a_pose_is_judged_where_it_is(reference):
     assert all(0 < each <= 1.0001 for each in there.correlations)
 
 
-def test_a_reversed_contrast_is_told_by_grey_only(reference):
+def test_a_reversed_contrast_is_recognized_by_grey_only(reference):
     pose = Pose(200.0, 180.0, 0.4, 0.0)
     grey = 255 - as_grey(seen(GROUND, pose, VIEW))
     view = ViewTemplates(grey, np.ones(VIEW, bool), 0)

@@ -42,7 +42,7 @@ VIEW = (96, 128)
 VIEW_PX = math.sqrt(96 * 128)
 LEVELS = Levels.of(VIEW_PX, 3)
 GROUND = Ground()
-NOTHING_TOLD = PosePrior(None, 3.0, 0.1)
+NO_PRIOR = PosePrior(None, 3.0, 0.1)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def registrar():
     return Registrar(reference_of(GROUND, SHAPE))
 
 
-def told(pose, std_deg=8.0):
+def prior_of(pose, std_deg=8.0):
     return PosePrior(pose.turn_rad, math.radians(std_deg), 0.08)
 
 
@@ -107,7 +107,7 @@ SAME_AGAIN = Pose(336.0, 192.0, 0.3, 0.0)
 @pytest.mark.parametrize("level", [LEVELS.look, LEVELS.coarse])
 def test_a_view_is_found_and_stands_out(registrar, level):
     for pose in random_poses(6, SHAPE, 90, seed=1, log_scale=0.08):
-        found = registered(registrar, templates_of(GROUND, pose), told(pose), level)
+        found = registered(registrar, templates_of(GROUND, pose), prior_of(pose), level)
         assert apart_px(found.placed.pose, pose) < 0.1
         assert abs(turned_rad(found.placed.pose, pose)) < math.radians(0.2)
         assert abs(found.placed.pose.log_scale - pose.log_scale) < 0.004
@@ -119,7 +119,7 @@ def test_a_view_is_found_and_stands_out(registrar, level):
 
 def test_nothing_is_known_of_the_heading(registrar):
     pose = Pose(180.0, 200.0, 2.5, 0.05)
-    found = registered(registrar, templates_of(GROUND, pose), NOTHING_TOLD)
+    found = registered(registrar, templates_of(GROUND, pose), NO_PRIOR)
     assert (
         apart_px(found.placed.pose, pose) < 0.1 and abs(turned_rad(found.placed.pose, pose)) < 0.01
     )
@@ -128,7 +128,7 @@ def test_nothing_is_known_of_the_heading(registrar):
 
 def test_evidence_is_of_numbers(registrar):
     pose = Pose(180.0, 200.0, 0.5, 0.0)
-    found = registered(registrar, templates_of(GROUND, pose), told(pose))
+    found = registered(registrar, templates_of(GROUND, pose), prior_of(pose))
     evidence = found.evidence()
     assert {"score", "strength", "rival", "look", "look_rival", "peak_ratio", "look_ratio"} <= set(
         evidence
@@ -142,9 +142,9 @@ def test_evidence_is_of_numbers(registrar):
 def test_the_same_again_is_the_same(registrar):
     pose = Pose(180.0, 200.0, 0.5, 0.0)
     templates = templates_of(GROUND, pose)
-    first, second = (registered(registrar, templates, told(pose)) for _ in range(2))
+    first, second = (registered(registrar, templates, prior_of(pose)) for _ in range(2))
     fresh = registered(
-        Registrar(reference_of(GROUND, SHAPE)), templates_of(GROUND, pose), told(pose)
+        Registrar(reference_of(GROUND, SHAPE)), templates_of(GROUND, pose), prior_of(pose)
     )
     for other in (second, fresh):
         assert other.placed.pose == first.placed.pose
@@ -154,7 +154,7 @@ def test_the_same_again_is_the_same(registrar):
 
 def test_a_place_that_is_there_twice_is_not_sure():
     registrar = Registrar(reference_of(Twin(), SHAPE))
-    found = registered(registrar, templates_of(GROUND, ONE), told(ONE))
+    found = registered(registrar, templates_of(GROUND, ONE), prior_of(ONE))
     assert min(apart_px(found.placed.pose, each) for each in (ONE, SAME_AGAIN)) < 0.1
     assert found.peak_ratio == pytest.approx(1, abs=0.05)
     assert found.look_ratio == pytest.approx(1, abs=0.05)
@@ -166,7 +166,7 @@ def test_a_place_that_is_there_almost_twice_is_less_sure():
     for share in (0.0, 0.5, 1.0):
         twin = Twin(other=Ground(seed=7), share=share)
         registrar = Registrar(reference_of(twin, SHAPE))
-        found = registered(registrar, templates_of(GROUND, ONE), told(ONE))
+        found = registered(registrar, templates_of(GROUND, ONE), prior_of(ONE))
         assert share == 0 or apart_px(found.placed.pose, ONE) < 0.1
         ratios.append(found.peak_ratio)
     assert ratios[0] + 0.1 < ratios[1] < ratios[2] - 0.3
@@ -181,13 +181,15 @@ def test_the_reported_heading_chooses_between_two_alike_places(turn_deg):
     candidates = [near(ONE, 3, -2), near(twin, -2, 3), near(twin, 0, 90), near(ONE, 0, -80)]
     ratios = []
     for pose, std_deg in ((ONE, 10.0), (twin, 10.0), (ONE, 40.0)):
-        found = verified(registrar, templates, LEVELS, candidates, LEVELS.look, told(pose, std_deg))
+        found = verified(
+            registrar, templates, LEVELS, candidates, LEVELS.look, prior_of(pose, std_deg)
+        )
         # A weak heading leaves a tie of both places, which OpenCV 4 and 5 round apart.
         right = (ONE, twin) if std_deg > 10.0 else (pose,)
         assert min(apart_px(found.placed.pose, each) for each in right) < 0.1
         ratios.append(found.peak_ratio)
     assert min(ratios[:2]) > ratios[2] >= 0.99
-    unknown = verified(registrar, templates, LEVELS, candidates, LEVELS.look, NOTHING_TOLD)
+    unknown = verified(registrar, templates, LEVELS, candidates, LEVELS.look, NO_PRIOR)
     assert unknown.peak_ratio == pytest.approx(1, abs=0.05)
 
 
@@ -196,12 +198,14 @@ def test_what_lies_beside_the_best_is_no_rival(registrar):
     pose = Pose(180.0, 200.0, 0.5, 0.0)
     close = [near(pose, *away) for away in ((0, 0), (1.5, 1), (15, 3), (-4, -16))]
     assert math.hypot(4, 16) < EXCLUSION_SHARE * VIEW_PX - 8
-    found = verified(registrar, templates_of(GROUND, pose), LEVELS, close, LEVELS.look, told(pose))
+    found = verified(
+        registrar, templates_of(GROUND, pose), LEVELS, close, LEVELS.look, prior_of(pose)
+    )
     assert found.rival == 0 and found.look_rival == 0 and found.candidates == 4
     assert found.evidence()["peak_ratio"] == found.evidence()["look_ratio"] == MAX_RATIO
     further = [*close, near(pose, 90.0, 60.0)]
     found = verified(
-        registrar, templates_of(GROUND, pose), LEVELS, further, LEVELS.look, told(pose)
+        registrar, templates_of(GROUND, pose), LEVELS, further, LEVELS.look, prior_of(pose)
     )
     assert found.rival > 0 and found.look_rival > 0 and found.peak_ratio > 1.8
 
@@ -209,15 +213,15 @@ def test_what_lies_beside_the_best_is_no_rival(registrar):
 def test_without_candidates_there_is_no_place(registrar):
     templates = templates_of(GROUND, Pose(180.0, 200.0, 0.5, 0.0))
     for level in (LEVELS.look, LEVELS.coarse):
-        assert registrar.judged(templates, LEVELS, [], level, NOTHING_TOLD) == []
+        assert registrar.judged(templates, LEVELS, [], level, NO_PRIOR) == []
 
 
 def test_the_order_of_candidates_does_not_matter(registrar):
     pose = Pose(180.0, 200.0, 0.5, 0.0)
     templates = templates_of(GROUND, pose)
-    candidates = searched(registrar, templates, told(pose), LEVELS.coarse)
+    candidates = searched(registrar, templates, prior_of(pose), LEVELS.coarse)
     one, other = (
-        verified(registrar, templates, LEVELS, each, LEVELS.coarse, told(pose))
+        verified(registrar, templates, LEVELS, each, LEVELS.coarse, prior_of(pose))
         for each in (candidates, candidates[::-1])
     )
     assert one.placed.pose == other.placed.pose and one.score == other.score
@@ -226,9 +230,9 @@ def test_the_order_of_candidates_does_not_matter(registrar):
 
 def test_a_view_of_elsewhere_stands_out_nowhere(registrar):
     pose = Pose(180.0, 200.0, 0.5, 0.0)
-    right = registered(registrar, templates_of(GROUND, pose), told(pose))
+    right = registered(registrar, templates_of(GROUND, pose), prior_of(pose))
     for seed in (5, 6, 7):
-        wrong = registered(registrar, templates_of(Ground(seed=seed), pose), told(pose))
+        wrong = registered(registrar, templates_of(Ground(seed=seed), pose), prior_of(pose))
         assert wrong.score < 0.5 * right.score
         assert wrong.peak_ratio < 1.5 and wrong.look_ratio < 1.5
         assert wrong.placed.weighted < 0.45
@@ -241,7 +245,7 @@ def test_blank_views_and_blank_maps_are_no_crash(registrar, grey):
     empty = Registrar(reference_of(lambda x, y: grey + 0 * x + 0 * y, SHAPE))
     for where, templates in ((registrar, blank), (empty, templates_of(GROUND, pose))):
         candidates = [near(pose), near(pose, 80.0, 40.0), near(pose, 1e4, 1e4)]
-        found = verified(where, templates, LEVELS, candidates, LEVELS.coarse, told(pose))
+        found = verified(where, templates, LEVELS, candidates, LEVELS.coarse, prior_of(pose))
         assert abs(found.score) < 30 and np.isfinite(found.placed.covariance).all()
         assert math.isfinite(found.peak_ratio) and math.isfinite(found.look_ratio)
 
@@ -249,7 +253,7 @@ def test_blank_views_and_blank_maps_are_no_crash(registrar, grey):
 def test_two_searches_know_of_each_others_rivals():
     """Each search found one of the twins: together they are not sure."""
     registrar = Registrar(reference_of(Twin(), SHAPE))
-    templates, prior = templates_of(GROUND, ONE), told(ONE)
+    templates, prior = templates_of(GROUND, ONE), prior_of(ONE)
     searches = [
         registrar.judged(templates, LEVELS, [near(each)], LEVELS.look, prior)
         for each in (ONE, SAME_AGAIN)
@@ -268,7 +272,7 @@ def test_two_searches_know_of_each_others_rivals():
 
 def test_two_searches_of_one_place_are_no_rivals(registrar):
     pose = Pose(180.0, 200.0, 0.5, 0.0)
-    templates, prior = templates_of(GROUND, pose), told(pose)
+    templates, prior = templates_of(GROUND, pose), prior_of(pose)
     one = registrar.judged(templates, LEVELS, [near(pose)], LEVELS.look, prior)
     again = [near(pose, 1.0), near(pose, -90.0, 30.0)]
     other = registrar.judged(templates, LEVELS, again, LEVELS.look, prior)
@@ -280,7 +284,7 @@ def test_two_searches_of_one_place_are_no_rivals(registrar):
 
 def test_candidates_without_hope_are_dropped_early_and_still_known_as_rivals(registrar):
     pose = Pose(180.0, 200.0, 0.5, 0.0)
-    templates, prior = templates_of(GROUND, pose), told(pose)
+    templates, prior = templates_of(GROUND, pose), prior_of(pose)
     rng = np.random.default_rng(0)
     away = [near(pose, *rng.uniform(60, 150, 2) * rng.choice([-1, 1], 2)) for _ in range(20)]
     judged = registrar.judged(templates, LEVELS, [*away, near(pose, 2.0)], LEVELS.look, prior)
@@ -356,7 +360,7 @@ def test_no_more_windows_are_kept_than_a_few():
 
 
 @pytest.mark.parametrize("level", [1, 2])
-def test_a_part_reaches_as_far_as_told(registrar, level):
+def test_a_part_reaches_as_far_as_given(registrar, level):
     """Middles of views within the reach are sought, those well beyond it are not."""
     centre, reach = (200.0, 170.0), 40.0
     window = registrar.part_window(level, FINE, VIEW_PX, centre, reach)
@@ -394,11 +398,11 @@ def test_a_part_over_the_border_of_the_sheet(registrar, centre):
 def test_threads_may_share_it():
     registrar = Registrar(reference_of(GROUND, SHAPE))
     poses = random_poses(8, SHAPE, 90, seed=3, log_scale=0.05)
-    alone = [registered(registrar, templates_of(GROUND, pose), told(pose)) for pose in poses]
+    alone = [registered(registrar, templates_of(GROUND, pose), prior_of(pose)) for pose in poses]
     cold = Registrar(reference_of(GROUND, SHAPE))
     with ThreadPoolExecutor(4) as pool:
         shared = pool.map(
-            lambda pose: registered(cold, templates_of(GROUND, pose), told(pose)), poses
+            lambda pose: registered(cold, templates_of(GROUND, pose), prior_of(pose)), poses
         )
         for one, other in zip(alone, shared, strict=True):
             assert str(one.evidence()) == str(other.evidence())
@@ -435,13 +439,13 @@ def test_one_finer_level_tells_what_coarser_ones_cannot():
     levels = Levels.of(math.sqrt(192 * 224), 4)
     assert levels.final == 1
     candidates = [near(pose, 3.0), near(twin, -2.0), near(twin, 0.0, 90.0)]
-    found = verified(registrar, templates, levels, candidates, levels.look, told(pose))
+    found = verified(registrar, templates, levels, candidates, levels.look, prior_of(pose))
     deep = registrar.deepened(templates, finer, levels, found)
     assert apart_px(deep.placed.pose, pose) < 0.3 and deep.placed.covariance is not None
     assert deep.fine_score > deep.score and deep.fine_rival > 0
     assert deep.fine_score / deep.fine_rival > found.peak_ratio + 0.1
     # Told the wrong one of both, the finer level sets it right.
-    both = verified(registrar, templates, levels, candidates[:2], levels.look, told(pose))
+    both = verified(registrar, templates, levels, candidates[:2], levels.look, prior_of(pose))
     turned = replace(both, finalists=both.finalists[::-1])
     again = registrar.deepened(templates, finer, levels, turned)
     assert apart_px(again.placed.pose, pose) < 0.3 and again.fine_score > again.fine_rival
@@ -455,7 +459,7 @@ def test_sheets_of_one_level():
     templates = templates_of(GROUND, pose)
     window = registrar.whole_window(0, levels.recipe(0), VIEW_PX)
     candidates = search(templates.at(0, levels.recipe(0)), window, [(0.4, 0.0)], 6)
-    found = verified(registrar, templates, levels, candidates, 0, told(pose))
+    found = verified(registrar, templates, levels, candidates, 0, prior_of(pose))
     assert apart_px(found.placed.pose, pose) < 0.1 and found.peak_ratio > 1.5
 
 

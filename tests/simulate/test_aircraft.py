@@ -61,7 +61,7 @@ def fly(ortho, frame, tmp_path):
     return flown
 
 
-def telemetry_path(flight, *fields):
+def reported(flight, *fields):
     return np.array([[getattr(v.telemetry, name) for name in fields] for v in flight.views])
 
 
@@ -92,24 +92,24 @@ def test_in_wind_the_aircraft_keeps_its_route_and_crabs(fly, frame):
     flight, truth = fly(wind=Wind(10.0, 270.0), spacing_m=25.0, errors=Errors(velocity_drift=0.0))
     places = np.array([frame.en_from_latlon(*truth[view.frame]) for view in flight.views])
     assert distance_to_polyline_m(places, CORNERS).max() < 0.05
-    seconds = telemetry_path(flight, "time_ns")[:, 0] / 1e9
+    seconds = reported(flight, "time_ns")[:, 0] / 1e9
     assert np.diff(seconds) == pytest.approx(1.0)
     north = places[:, 1] < 99
-    yaw = (telemetry_path(flight, "yaw_deg")[:, 0] + 180) % 360 - 180
+    yaw = (reported(flight, "yaw_deg")[:, 0] + 180) % 360 - 180
     assert yaw[north].mean() == pytest.approx(-math.degrees(math.asin(0.4)), abs=6)
     assert yaw[~north] == pytest.approx(90, abs=15)
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     assert steps[~north[1:]][1:].min() > 29 and steps[north[1:]].max() < 25
-    telemetry = telemetry_path(flight, "vel_en_mps")[:, 0]
-    assert telemetry[1:] == pytest.approx(np.diff(places, axis=0), abs=0.01)
+    velocity = reported(flight, "vel_en_mps")[:, 0]
+    assert velocity[1:] == pytest.approx(np.diff(places, axis=0), abs=0.01)
 
 
 def test_reported_velocity_drifts(fly, frame, tmp_path):
     exact, truth = fly("exact", errors=Errors(velocity_drift=0.0), spacing_m=80.0, seed=2)
     erring, same = fly("erring", errors=Errors(velocity_drift=0.1), spacing_m=80.0, seed=2)
     assert truth == same
-    true, telemetry = (telemetry_path(flight, "vel_en_mps")[:, 0] for flight in (exact, erring))
-    ratio = np.linalg.norm(telemetry, axis=1) / np.linalg.norm(true, axis=1) - 1
+    true, drifting = (reported(flight, "vel_en_mps")[:, 0] for flight in (exact, erring))
+    ratio = np.linalg.norm(drifting, axis=1) / np.linalg.norm(true, axis=1) - 1
     assert 0.001 < np.abs(ratio).mean() < 0.3 and np.abs(np.diff(ratio)).max() < 0.05
     header = (tmp_path / "erring/telemetry.csv").read_text().splitlines()[0]
     assert header.endswith("vel_east_mps,vel_north_mps")
@@ -117,7 +117,7 @@ def test_reported_velocity_drifts(fly, frame, tmp_path):
 
 def test_turns_are_arcs(fly, frame):
     flight, truth = fly(turn_radius_m=100.0, spacing_m=20.0)
-    yaw = telemetry_path(flight, "yaw_deg")[:, 0]
+    yaw = reported(flight, "yaw_deg")[:, 0]
     turned = (np.diff(yaw) + 180) % 360 - 180
     assert turned.sum() == pytest.approx(90, abs=0.1)
     assert np.abs(turned).max() < 1.1 * math.degrees(20 / 100)
@@ -131,11 +131,11 @@ def test_biases_are_constant(fly):
     bias = Errors(*[5.0, 0.05, 1.0, 2.0, 40.0], yaw_bias_deg=-4.0, agl_bias=0.08)
     erring, same = fly("erring", errors=bias, spacing_m=100.0, seed=3)
     assert truth == same
-    off = telemetry_path(erring, "yaw_deg", "agl_m") - telemetry_path(exact, "yaw_deg", "agl_m")
+    off = reported(erring, "yaw_deg", "agl_m") - reported(exact, "yaw_deg", "agl_m")
     assert (off[:, 0] + 180) % 360 - 180 == pytest.approx(-4)
     assert off[:, 1] == pytest.approx(8)
     rest = ("pitch_deg", "roll_deg", "yaw_std_deg", "agl_std_m", "time_ns")
-    assert (telemetry_path(erring, *rest) == telemetry_path(exact, *rest)).all()
+    assert (reported(erring, *rest) == reported(exact, *rest)).all()
     for a, b in zip(pictures(exact), pictures(erring), strict=True):
         assert (a == b).all()
 
@@ -146,9 +146,7 @@ def test_the_mount_tilt_is_not_reported(fly, ortho, frame):
     straight, truth = fly("straight", camera=SEEN, errors=Errors(attitude_std_deg=1.0))
     tilted, same = fly("tilted", camera=SEEN, errors=bias)
     rest = ("yaw_deg", "pitch_deg", "roll_deg", "agl_m")
-    assert (
-        truth == same and (telemetry_path(straight, *rest) == telemetry_path(tilted, *rest)).all()
-    )
+    assert truth == same and (reported(straight, *rest) == reported(tilted, *rest)).all()
 
     def alike(view, pitch_deg, roll_deg):
         """Correlation of the levelled view with the orthophoto where it should lie."""
@@ -181,7 +179,7 @@ def test_clouds_hide_some_views_and_leave_the_others(fly):
     hidden, same = fly("hidden", **kinds, cloud_share=0.4)
     assert truth == same
     fields = ("yaw_deg", "time_ns", "agl_m")
-    assert (telemetry_path(clear, *fields) == telemetry_path(hidden, *fields)).all()
+    assert (reported(clear, *fields) == reported(hidden, *fields)).all()
     pairs = list(zip(pictures(clear), pictures(hidden), strict=True))
     clouds = Clouds(len(pairs), 0.4, 3)
     degree = np.array([clouds.degree(number) for number in range(len(pairs))])

@@ -17,6 +17,7 @@ from orthonav.geo.swapped import HINT
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.localizer import downsampled, rectify
 from orthonav.records import View
+from orthonav.simulate import flight as flight_module
 from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 from orthonav.simulate.render import ViewEffects
 
@@ -247,6 +248,13 @@ def test_impossible_spacing_is_refused(area, plane, tmp_path, names_in, spacing)
     with pytest.raises(FlightError, match="above 0"):
         flown(area, tmp_path / "f", random=None, route=route, **spacing)
     assert names_in(tmp_path) == []
+
+
+def test_too_many_views_are_refused_before_they_are_placed(area, plane, tmp_path, monkeypatch):
+    monkeypatch.setattr(flight_module, "steady_path", None)
+    route = route_of(plane.frame, [0.0, 0.0], [100.0, 0.0])
+    with pytest.raises(FlightError, match="with a view every 1e-06 m has more than"):
+        flown(area, tmp_path / "f", random=None, route=route, spacing_m=1e-6)
 
 
 def test_views_keep_off_missing_imagery(make_ortho, tmp_path):

@@ -170,3 +170,10 @@ def test_the_mount_tilts_in_the_aircraft(attitude, tilt):
     axis_ned = (aircraft * camera).apply([0, 0, 1])
     axis_enu = enu_from_camera(*mounted(attitude, *tilt))[:, 2]
     assert axis_enu == pytest.approx([axis_ned[1], axis_ned[0], -axis_ned[2]], abs=1e-9)
+
+
+def test_flights_of_too_many_time_steps_are_refused():
+    line, rng = np.array([[0.0, 0.0], [50_000.0, 0.0]]), np.random.default_rng(0)
+    for spacing_m, airspeed_mps in ((1.0, 1e-3), (1e12, 1.0), (1e9, 1e-3)):
+        with pytest.raises(FlightError, match="time steps"):
+            windy_path(line, spacing_m, airspeed_mps, Wind(0.0), rng, 10)

@@ -96,7 +96,7 @@ def test_a_flight_is_found_and_followed(seed):
     _, rows, _ = known(seed)
     errors = np.hypot([row[0] for row in rows], [row[1] for row in rows])
     assert errors[10:].max() < 15 and np.median(errors[10:]) < 4
-    assert rows[-1][3].state is State.TRACKING
+    assert {row[3].state for row in rows[10:]} == {State.TRACKING, State.COASTING}
     assert np.median([row[2] for row in rows[10:]]) > 0.99
 
 
@@ -155,14 +155,14 @@ def test_without_sightings_it_becomes_lost_and_its_covariance_grows():
 
 def test_off_the_map_nothing_is_missed():
     flight, mixture, _ = flown(3)
-    inside = mixture.estimate(RADIUS_M).confidence
+    inside = mixture.estimate(RADIUS_M).belief
     mixture.hypotheses = [
         replace(each, mean=each.mean + np.array([3000.0, 0, 0, 0, 0, 0, 0, 0]))
         for each in mixture.hypotheses
     ]
     for _ in range(5):
         mixture.update(flight.reported(), [])
-    assert mixture.estimate(RADIUS_M).confidence == pytest.approx(inside, abs=0.01)
+    assert mixture.estimate(RADIUS_M).belief == pytest.approx(inside, abs=0.01)
 
 
 def test_a_kidnapped_aircraft_is_found_again():
@@ -182,7 +182,7 @@ def test_a_kidnapped_aircraft_is_found_again():
 def test_false_places_that_come_and_go_are_not_followed():
     """Views of nowhere on the map, each with a place that it is somewhat like."""
     confident = 0
-    for seed in range(4):
+    for seed in range(2):
         flight, mixture = Flight(seed), Mixture(MODEL, EXTENT)
         for _ in range(30):
             mixture.predict(1.0, camera=flight.moved())
@@ -411,3 +411,53 @@ def test_a_measured_position_starts_a_new_hypothesis():
         assert sum(each.share for each in mixture.hypotheses) + mixture.elsewhere == pytest.approx(
             1
         )
+
+
+def test_a_track_coasts_while_views_do_not_show_the_map():
+    flight, mixture, _ = flown(3, false_share=0.0)
+    assert mixture.estimate(RADIUS_M).state is State.TRACKING
+    velocity = ReportedVelocity(np.array(SPEED), np.array(SPEED), 1.0)
+    rows = []
+    for _ in range(15):
+        flight.moved()
+        mixture.predict(1.0, velocity)
+        mixture.update(flight.reported(), [])
+        rows.append(mixture.estimate(RADIUS_M))
+    assert rows[0].state is State.COASTING and rows[-1].state is State.LOST
+    assert rows[0].confidence <= 0.8
+    assert np.all(np.diff([each.confidence for each in rows]) <= 0)
+    std_m = [math.sqrt(each.covariance[0, 0]) for each in rows]
+    assert std_m[9] == pytest.approx(MODEL.coasting_walk * math.sqrt(9**3 / 3), rel=0.2)
+
+
+def test_one_view_that_shows_nothing_interrupts_a_track_for_that_view_only():
+    flight, mixture, _ = flown(3, false_share=0.0)
+    states = []
+    for view in range(6):
+        mixture.predict(1.0, camera=flight.moved())
+        mixture.update(flight.reported(), [] if view == 2 else [flight.sighting(2.0)])
+        states.append(mixture.estimate(RADIUS_M).state)
+    assert states == [State.TRACKING] * 2 + [State.COASTING] + [State.TRACKING] * 3
+
+
+def test_after_many_such_views_a_track_must_be_confirmed_again():
+    flight, mixture, _ = flown(3, false_share=0.0)
+    for _ in range(3):
+        mixture.predict(1.0, camera=flight.moved())
+        mixture.update(flight.reported(), [])
+    mixture.predict(1.0, camera=flight.moved())
+    mixture.update(flight.reported(), [flight.sighting(2.0)], newness=0.15)
+    assert mixture.estimate(RADIUS_M).state is State.COASTING
+    for _ in range(2):
+        mixture.predict(1.0, camera=flight.moved())
+        mixture.update(flight.reported(), [flight.sighting(2.0)])
+    assert mixture.estimate(RADIUS_M).state is State.TRACKING
+
+
+@pytest.mark.parametrize(("alone", "state"), [(0.005, State.COASTING), (0.9, State.TRACKING)])
+def test_a_view_counts_by_what_it_shows_itself(alone, state):
+    """However well a place agrees with the track: there is always one near the prediction."""
+    flight, mixture, _ = flown(3, false_share=0.0)
+    mixture.predict(1.0, camera=flight.moved())
+    mixture.update(flight.reported(), [replace(flight.sighting(2.0), alone=alone)])
+    assert mixture.estimate(RADIUS_M).state is state

@@ -54,7 +54,7 @@ def laptop(browser, server):
 
 @pytest.fixture
 def page(laptop):
-    """The small run on a laptop, opened anew, all there."""
+    """The small run on a laptop, freshly opened, with all views."""
     laptop.again()
     laptop.chosen(0, COUNT)
     laptop.settled()
@@ -390,7 +390,7 @@ def test_a_run_is_followed_from_before_its_beginning(visit, small, tmp_path):
         page.keyboard.press("End")
         expect(page.locator("#newest")).to_be_checked()
         page.pictured(3)
-        fixes.write_text(lines[4])  # begun anew
+        fixes.write_text(lines[4])  # started over
         page.chosen(0, 1)
         expect(page.locator("#sentence")).to_contain_text("no fix: blank")
         page.pictured(0)

@@ -102,11 +102,11 @@ def test_a_run_tells_news_and_begins_anew(fixes, small):
     later = run.news(news["generation"], 2, 1)
     assert later["first"] == 2 and later["columns"]["t"] == [2] and later["health"] == []
     fixes.write_text(line(3))
-    anew = run.news(news["generation"], 3, 1)
-    assert anew["generation"] != news["generation"] and anew["first"] == 0 and anew["count"] == 1
+    after = run.news(news["generation"], 3, 1)
+    assert after["generation"] != news["generation"] and after["first"] == 0 and after["count"] == 1
     fixes.write_text("")
     fixes.write_text("\n")
-    assert run.news(anew["generation"], 1, 0)["count"] == 0
+    assert run.news(after["generation"], 1, 0)["count"] == 0
 
 
 def test_a_file_that_disappears_is_reported(fixes, small):

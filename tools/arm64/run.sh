@@ -1,7 +1,7 @@
 #!/bin/sh
 # orthonav on 64-bit ARM, emulated by QEMU; see README.md here.
 #     tools/arm64/run.sh WORK [fixes|fly|tests|rebuild|python] [arguments]
-# WORK is a folder for the Debian files and the wheels (600 MB), made on the first run.
+# WORK is a folder for the Debian files and the wheels (0.9 GB), made on the first run.
 set -eu
 if [ $# -lt 1 ]; then
     sed -n 2,4p "$0" >&2

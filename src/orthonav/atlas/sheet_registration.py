@@ -104,8 +104,8 @@ def _registered(
 ) -> SheetMatch | None:
     telemetry = replace(view.telemetry, yaw_deg=math.degrees(region.turn_rad))
     prior = Prior(*region.latlon_deg, region.reach_m / PRIOR_SIGMAS)
-    heading = region.turn_rad, region.turn_std_rad
-    seen = sheet.register(replace(view, telemetry=telemetry), prior, heading_std_rad=heading)
+    turned = replace(view, telemetry=telemetry)
+    seen = sheet.register(turned, prior, heading_std_rad=region.turn_std_rad)
     if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
         return None
     prepared, best = seen.prepared, seen.found

@@ -11,7 +11,10 @@ from orthonav.cli.source import add_source, open_source
 if TYPE_CHECKING:
     from orthonav.onboard.calibrate import MountCalibration
 
-EVERYDAY = ("--gnss-positions", "--gnss-std-m", "--heading", "--camera", "--telemetry", "--json")
+EVERYDAY = (
+    *("--latency", "--gnss-positions", "--gnss-std-m", "--heading", "--camera", "--telemetry"),
+    "--json",
+)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -22,6 +25,12 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="mount.json", help="file to write"
+    )
+    parser.add_argument(
+        "--latency",
+        action="store_true",
+        help="estimate the time from exposure to arrival of the camera instead, from a flight log "
+        "of `fly --log` with turns; --out is then a file for `fly --camera-latency-ms`",
     )
     parser.add_argument(
         "--gnss-positions",
@@ -60,6 +69,9 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.onboard.run import localize_flight, smoothed_track
     from orthonav.records import Prior
 
+    if options.latency:
+        _run_latency(options)
+        return
     if not 0 < options.gnss_std_m < 1e5:
         raise FlightError(f"--gnss-std-m must be above 0, got {options.gnss_std_m}")
     flight = open_source(options.flight, options)
@@ -91,6 +103,34 @@ def run(options: argparse.Namespace) -> None:
     if found.moved:
         print("the camera moved in its mount before these views; earlier views are not used")
     print(f"written to {options.out}")
+
+
+def _run_latency(options: argparse.Namespace) -> None:
+    """Estimate the latency of the camera and write it."""
+    from orthonav.flight.latency import write_latency
+    from orthonav.onboard.calibrate_latency import arrivals_of, calibrate_latency
+
+    flight = open_source(options.flight, options)
+    with progress(options) as shown:
+        done = []
+
+        def count() -> None:
+            done.append(1)
+            if flight.expected:
+                shown("latency", min(1.0, len(done) / flight.expected))
+
+        found = calibrate_latency(
+            flight.camera,
+            arrivals_of(flight),
+            heading_known=options.heading == "known",
+            progress=count,
+        )
+    write_latency(options.out, found)
+    if options.json:
+        print_json(asdict(found))
+        return
+    print(f"latency of the camera {found.latency_ms:.0f} ms, std {found.std_ms:.0f} ms")
+    print(f"from {found.pairs} pairs of images; written to {options.out}")
 
 
 def _plain(found: "MountCalibration") -> dict[str, Any]:

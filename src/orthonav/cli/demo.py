@@ -155,7 +155,7 @@ def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[A
     )
     write_report(folder / "report", [shown_flight], made_from)
     lines = [summary_text(about), "", f"check      {checked}", ""]
-    lines += [table([shown_flight]), "", *_criteria_lines(metrics)]
+    lines += [table([shown_flight], metrics), "", *_criteria_lines(metrics)]
     return metrics_to_json(metrics), "\n".join(lines)
 
 

@@ -12,7 +12,7 @@ from orthonav.cli.needs import require_extras
 if TYPE_CHECKING:
     from orthonav.evaluate.contact_sheet import Row
     from orthonav.evaluate.flights import FlightReport
-    from orthonav.evaluate.metrics import Comparison
+    from orthonav.evaluate.metrics import Comparison, Metrics
     from orthonav.flight import FlightFolder
     from orthonav.mapfile.layer import GreyLayer
     from orthonav.mapfile.reader import MapFile
@@ -68,7 +68,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Measure, print the table, write JSON and report."""
     from orthonav.errors import FlightError
-    from orthonav.evaluate.flights import flights_to_json, summary, table
+    from orthonav.evaluate.flights import flights_to_json, summary, table, total
     from orthonav.files import write_text
     from orthonav.mapfile import open_map
 
@@ -86,15 +86,16 @@ def run(options: argparse.Namespace) -> None:
     _check_flights(options)
     opened = open_map(options.map) if options.map else None
     flights = _measured(options, opened)
+    whole = total(flights)
     if options.report:
-        _write_report(options.report, flights, opened)
-    plain = flights_to_json(flights)
+        _write_report(options.report, flights, whole, opened)
+    plain = flights_to_json(flights, whole)
     if options.metrics:
         write_text(options.metrics, json.dumps(plain, indent=1, allow_nan=False) + "\n")
     if options.json:
         print_json(plain)
         return
-    print(f"{table(flights)}\n\n{summary(flights)}")
+    print(f"{table(flights, whole)}\n\n{summary(flights, whole)}")
     if options.report:
         print(f"report: {options.report / 'index.html'}")
 
@@ -178,7 +179,9 @@ def _names(paths: list[Path]) -> list[str]:
     return names
 
 
-def _write_report(out: Path, flights: list[Any], opened: "MapFile | None") -> None:
+def _write_report(
+    out: Path, flights: list[Any], whole: "Metrics", opened: "MapFile | None"
+) -> None:
     from orthonav import __version__
     from orthonav.cli.info import imagery_text, recipe_text
     from orthonav.evaluate.report import MadeFrom, write_report
@@ -191,7 +194,7 @@ def _write_report(out: Path, flights: list[Any], opened: "MapFile | None") -> No
         command=" ".join(["orthonav", *sys.argv[1:]]),
         version=__version__,
     )
-    write_report(out, flights, made_from)
+    write_report(out, flights, made_from, whole=whole)
 
 
 def map_background(opened: "MapFile") -> "Background":

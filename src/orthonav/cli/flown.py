@@ -111,10 +111,10 @@ def _flown(logged: Any) -> dict[str, Any]:
 
 
 def _mount(plain: Any) -> "Mount":
-    from orthonav.errors import FlightError
+    from orthonav.errors import FlightError, described
     from orthonav.flight.mount import BROKEN, mount_from_plain
 
     try:
         return mount_from_plain(plain)
     except BROKEN as error:
-        raise FlightError(f"flight log: invalid mount ({error!r:.80})") from error
+        raise FlightError(f"flight log: invalid mount ({described(error)})") from error

@@ -8,6 +8,7 @@ from typing import Any
 
 EVERYDAY = (
     "--camera",
+    "--camera-latency-ms",
     "--mount",
     "--autopilot",
     "--recorded-telemetry",
@@ -72,10 +73,9 @@ def _add_camera(group: Any) -> None:
     )
     group.add_argument(
         "--camera-latency-ms",
-        type=float,
-        default=0.0,
-        metavar="MS",
-        help="live cameras: time from exposure to arrival (default 0)",
+        metavar="MS|FILE",
+        help="live cameras: time from exposure to arrival, or the file of `orthonav calibrate "
+        "--latency`; without it nothing is sent until it has been measured in flight",
     )
     group.add_argument(
         "--mount-deg",
@@ -226,6 +226,12 @@ def _add_outputs(group: Any) -> None:
         help="positions with a larger standard deviation are not sent (m; default 50)",
     )
     group.add_argument(
+        "--send-coasting",
+        action="store_true",
+        help="send dead-reckoned positions too, of views that do not show the map: as "
+        "GLOBAL_POSITION_SENSOR with the flag UNHEALTHY, by no other message",
+    )
+    group.add_argument(
         "--min-std-m",
         type=float,
         default=0.0,
@@ -327,6 +333,12 @@ def _add_flight(group: Any) -> None:
         type=Path,
         metavar="public.pem",
         help="refuse a map that was not signed with this key (see `orthonav sign`)",
+    )
+    group.add_argument(
+        "--not-before",
+        metavar="DATE|SERIAL",
+        help="with --require-signed: refuse a map signed before this date (2026-05-31, UTC) or "
+        "with a lower serial number",
     )
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import logging
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -13,19 +14,23 @@ from orthonav.confidence.accept import Acceptance
 from orthonav.errors import CameraError, OutputError, VariantError
 from orthonav.files import require_file
 from orthonav.flight import read_camera
+from orthonav.flight.latency import MOST_MS, CameraLatency, read_latency
 from orthonav.flight.mount import Mount, read_mount
 from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
 from orthonav.localizer.tracker import Tracker
-from orthonav.mapfile import open_map
+from orthonav.mapfile import MapFile, open_map
 from orthonav.onboard import cameras
 from orthonav.onboard.calibrate import MountCorrected, model_of
 from orthonav.onboard.cameras import CameraThread
 from orthonav.onboard.fly import FlyOptions, LogSink, Runner
 from orthonav.onboard.health import Notifier, TelemetryDiagnosis
+from orthonav.onboard.latency import STATED_STD_S, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink, LinkThread
 from orthonav.onboard.outputs import (
     KINDS,
+    LOCAL,
+    PX4_VISION_S,
     JsonOut,
     MessageOptions,
     Messenger,
@@ -35,6 +40,7 @@ from orthonav.onboard.outputs import (
 from orthonav.onboard.ports import transport_opener
 from orthonav.onboard.publisher import PositionOutput, Publisher
 from orthonav.onboard.run import Locator
+from orthonav.onboard.serials import require_newest
 from orthonav.onboard.state import boot_id, load, prior_of
 from orthonav.onboard.telemetry import HEIGHT_SOURCES, Clocks, TelemetryBuffer
 from orthonav.publish.estimate import Clock
@@ -45,19 +51,18 @@ from orthonav.publish.nmea import Quality
 from orthonav.records import CONFIDENT, Prior
 from orthonav.sources.cameras import read_camera_file
 
+log = logging.getLogger(__name__)
+
 
 def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitStack) -> Runner:
     """Runner of a flight with all its parts; `stack` stops their threads."""
     clocks = Clocks()
-    if options.require_signed:  # cryptography is loaded only where it is asked for
-        importlib.import_module("orthonav.mapfile.signature").require_signature(
-            options.map, options.require_signed
-        )
+    opened = _opened(options)
     accept = Acceptance.parse(options.accept)
     least = accept.threshold if accept.criterion == "confidence" else CONFIDENT
     mount = read_mount(options.mount) if options.mount else None
     camera = _camera(options)
-    localizer = Localizer(open_map(options.map))
+    localizer = Localizer(opened)
     heading_known = options.heading == "known"
     tracker = Tracker(
         localizer, heading_known=heading_known, model=model_of(mount) if mount else None
@@ -91,6 +96,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         accept=accept if accept.criterion != "confidence" else None,
         min_confidence=least,
         map_path=options.map,
+        map_change=opened.change,
         state_path=options.state,
         logged_options=_logged_options(options, mount),
     )
@@ -107,7 +113,50 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         start=_start(options, clocks),
         notifier=Notifier(),
         gnss=gnss,
+        latency=_latency(options, heading_known=heading_known),
     )
+
+
+def _opened(options: argparse.Namespace) -> MapFile:
+    """The map, its signature checked first where that is asked for."""
+    if options.not_before is not None and not options.require_signed:
+        raise VariantError("--not-before needs --require-signed")
+    if not options.require_signed:
+        return open_map(options.map)
+    # cryptography is loaded only where it is asked for
+    signature = importlib.import_module("orthonav.mapfile.signature").require_signature(
+        options.map, options.require_signed, options.not_before
+    )
+    opened = open_map(options.map)
+    if options.state is not None:
+        require_newest(options.state, signature, options.map)
+    return opened
+
+
+def _latency(options: argparse.Namespace, *, heading_known: bool) -> LatencyMonitor | None:
+    """Monitor of the latency of a live camera; None for recordings and ROS, which have times."""
+    if options.ros2 or not cameras.is_live(options.source):
+        return None
+    stated = _stated(options.camera_latency_ms)
+    return LatencyMonitor(
+        None if stated is None else stated.latency_ms / 1e3,
+        STATED_STD_S if stated is None else max(stated.std_ms / 1e3, STATED_STD_S),
+        mount_deg=tuple(options.mount_deg),
+        heading_known=heading_known,
+    )
+
+
+def _stated(text: str | None) -> CameraLatency | None:
+    """Latency of `--camera-latency-ms`: a number or a file."""
+    if text is None:
+        return None
+    try:
+        stated = CameraLatency(float(text), STATED_STD_S * 1e3)
+    except ValueError:
+        return read_latency(Path(text))
+    if not 0 <= stated.latency_ms <= MOST_MS:
+        raise VariantError(f"--camera-latency-ms must be 0 to {MOST_MS:g}, got {text}")
+    return stated
 
 
 def _inputs(
@@ -152,7 +201,6 @@ def _source(
         return cameras.LiveCamera(
             cameras.live_name(options.source),
             clocks,
-            latency_s=options.camera_latency_ms / 1e3,
             size_px=(camera.width_px, camera.height_px),
         )
     if not (options.pace > 0 and (options.rate_hz is None or options.rate_hz > 0)):
@@ -177,6 +225,7 @@ def _link(options: argparse.Namespace, clocks: Clocks) -> AutopilotLink | None:
         component_id=options.component_id,
         signing=_signing(options, clocks),
         silent=options.dry_run,
+        stamp=Clock(options.stamp),
     )
 
 
@@ -209,7 +258,13 @@ def _publisher(
         if not options.send_rate_hz > 0:
             raise VariantError("--send-rate-hz must be above 0")
         interval = dict.fromkeys([*KINDS.values(), "NMEA", "ROS2"], 1 / options.send_rate_hz)
-    rules = GateRules(least, options.max_std_m, min_interval_s=interval)
+    _warn_of_a_low_rate(options)
+    rules = GateRules(
+        least,
+        options.max_std_m,
+        min_interval_s=interval,
+        send_coasting=options.send_coasting,
+    )
     gate = Gate(rules, clock=Clock.BOOT)  # the monotonic clock of this computer
     chosen = MessageOptions(
         kinds=tuple(dict.fromkeys(options.send or ["global-position"])),
@@ -238,7 +293,22 @@ def _publisher(
         lines=lines,
         graph=graph,
         min_confidence=least,
+        min_std_m=options.min_std_m,
     )
+
+
+def _warn_of_a_low_rate(options: argparse.Namespace) -> None:
+    """Warn of local messages at a rate at which PX4 does not fuse them."""
+    local = [KINDS[kind] for kind in options.send or () if kind in LOCAL]
+    rates = [hz for hz in (options.send_rate_hz, options.rate_hz) if hz is not None]
+    if local and rates and min(rates) * PX4_VISION_S <= 1:
+        log.warning(
+            "PX4 fuses %s only at more than %g Hz, got %g Hz: send global-position to PX4, or "
+            "raise the rate",
+            " and ".join(local),
+            1 / PX4_VISION_S,
+            min(rates),
+        )
 
 
 def _start(options: argparse.Namespace, clocks: Clocks) -> Callable[[], Prior | None]:

@@ -116,6 +116,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="public.pem",
         help="refuse a map that was not signed with this key (see `orthonav sign`)",
     )
+    parser.add_argument(
+        "--not-before",
+        metavar="DATE|SERIAL",
+        help="with --require-signed: refuse a map signed before this date (2026-05-31, UTC) or "
+        "with a lower serial number",
+    )
     add_source(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
@@ -136,15 +142,13 @@ def _on_map(options: argparse.Namespace) -> None:
     from orthonav.localizer import Localizer
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
-    from orthonav.mapfile.signature import require_signature
     from orthonav.onboard.calibrate import MountCorrected, model_of
     from orthonav.onboard.run import Locator, SingleViews, localize_flight, smoothed_track
     from orthonav.search.position import check_rule
 
     if options.lag is not None and not (options.smooth and options.lag >= 0):
         raise VariantError("--lag needs --smooth and a number of views, 0 or more")
-    if options.require_signed:
-        require_signature(options.map, options.require_signed)
+    _check_signature(options)
     flight = open_source(options.flight, options)
     mount = take_flown(options, flight)
     accept = Acceptance.parse(options.accept) if options.accept else None
@@ -186,6 +190,16 @@ def _on_map(options: argparse.Namespace) -> None:
     _print_summary(options, results)
 
 
+def _check_signature(options: argparse.Namespace) -> None:
+    from orthonav.errors import VariantError
+    from orthonav.mapfile.signature import require_signature
+
+    if options.require_signed:
+        require_signature(options.map, options.require_signed, options.not_before)
+    elif options.not_before is not None:
+        raise VariantError("--not-before needs --require-signed")
+
+
 def _on_atlas(options: argparse.Namespace) -> None:
     """Localize on an atlas without a prior; a fix needs the agreement of several views."""
     require_extras("localize --atlas")
@@ -200,7 +214,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
 
     asked = [
         name
-        for name in ("track", "smooth", "mount", "as_flown", "require_signed", "lag")
+        for name in ("track", "smooth", "mount", "as_flown", "require_signed", "not_before", "lag")
         if getattr(options, name) not in (None, False)
     ]
     asked += ["position"] if options.position != "peak" else []

@@ -218,6 +218,7 @@ def _map_plain(
             tile_px=tile_px,
             overlap=options.overlap,
             registration=options.registration,
+            maps=len(areas),
         )
         for area in areas
     ]

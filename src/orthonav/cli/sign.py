@@ -15,6 +15,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="create private.pem and public.pem in this folder, and sign the map if one is given",
     )
+    parser.add_argument(
+        "--serial",
+        type=int,
+        metavar="N",
+        help="serial number in the signature (default: seconds since 1970, which increase)",
+    )
 
 
 def run(options: argparse.Namespace) -> None:
@@ -31,6 +37,6 @@ def run(options: argparse.Namespace) -> None:
         )
         key = options.new_key / PRIVATE_NAME
     if options.map is not None:
-        print(f"written to {sign_map(options.map, key)}")
+        print(f"written to {sign_map(options.map, key, options.serial)}")
     elif options.key is not None:
         raise MapFileError("--key needs a map to sign: orthonav sign MAP.onav --key private.pem")

@@ -14,6 +14,11 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="public.pem",
         help="Ed25519 public key (PEM) of the expected signer",
     )
+    parser.add_argument(
+        "--not-before",
+        metavar="DATE|SERIAL",
+        help="refuse a map signed before this date (2026-05-31, UTC) or with a lower serial number",
+    )
 
 
 def run(options: argparse.Namespace) -> None:
@@ -21,6 +26,8 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.mapfile import open_map
     from orthonav.mapfile.signature import require_signature
 
-    digest = require_signature(options.map, options.public_key)
+    found = require_signature(options.map, options.public_key, options.not_before)
     open_map(options.map)
-    print(f"signature and contents are valid: {options.map}\nmanifest  {digest}")
+    print(f"signature and contents are valid: {options.map}\nmanifest  {found.manifest_sha256}")
+    if found.serial is not None:
+        print(f"serial    {found.serial}\nsigned    {found.signed_utc}")

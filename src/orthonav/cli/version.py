@@ -46,12 +46,26 @@ def about() -> dict[str, Any]:
             name: {package.name: package.version or None for package in packages(name)}
             for name in names
         },
+        "unavailable": _unavailable(names),
         "missing": {
-            command: pip_line(*lacking)
+            command: _answer(lacking)
             for command, needed in NEEDS.items()
             if (lacking := [name for name in needed if missing(name)])
         },
     }
+
+
+def _unavailable(extras: Sequence[str]) -> list[str]:
+    """Packages of extras that are not installed and not made for this machine and Python."""
+    of_all = (package for name in extras for package in packages(name))
+    return sorted({each.name for each in of_all if not (each.available or each.version)})
+
+
+def _answer(extras: Sequence[str]) -> str:
+    """What to type for these extras, or which of their packages this machine cannot install."""
+    if never := _unavailable(extras):
+        return f"{', '.join(never)}: no wheel for this machine and Python; build it from source"
+    return pip_line(*extras)
 
 
 def _processor() -> dict[str, Any]:
@@ -96,8 +110,11 @@ def _text(plain: dict[str, Any]) -> str:
         f"processor   {processor['machine']}, {processor['cores']} cores, "
         f"{processor['memory_mb'] or '?'} MB of memory; {features}",
         "",
-        f"{'core':<12}{_versions(plain['core'])}",
-        *(f"{name:<12}{_versions(found)}" for name, found in plain["extras"].items()),
+        f"{'core':<12}{_versions(plain['core'], [])}",
+        *(
+            f"{name:<12}{_versions(found, plain['unavailable'])}"
+            for name, found in plain["extras"].items()
+        ),
     ]
     if plain["missing"]:
         width = max(map(len, plain["missing"]))
@@ -106,5 +123,8 @@ def _text(plain: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _versions(found: dict[str, str | None]) -> str:
-    return ", ".join(f"{name} {version or 'MISSING'}" for name, version in found.items())
+def _versions(found: dict[str, str | None], unavailable: Sequence[str]) -> str:
+    return ", ".join(
+        f"{name} {version or ('not made for this machine' if name in unavailable else 'MISSING')}"
+        for name, version in found.items()
+    )

@@ -167,7 +167,7 @@ def criteria_rows(metrics: Metrics, labels: dict[str, str]) -> list[tuple[str, .
 
 
 def confidence_text(metrics: Metrics) -> str:
-    """ConfidenceCalibration of confidence in a sentence."""
+    """A sentence that compares stated confidence with the share of right fixes."""
     calibration = metrics.calibration
     if not calibration.n_fixes:
         return "unknown, no fix states one"

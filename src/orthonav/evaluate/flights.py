@@ -60,19 +60,29 @@ def total(flights: Sequence[FlightReport]) -> Metrics:
 
     Raises `ValueError` for no flight, and where flights were measured at different radii.
     """
-    if len({flight.metrics.radius_m for flight in flights}) != 1:
-        raise ValueError("a total needs at least one flight, and one radius for all of them")
-    if len(flights) == 1:
-        return flights[0].metrics
+    radius_m = _radius_m(flights)
     first = flights[0].metrics
+    if len(flights) == 1:
+        return first
     pooled = pool([flight.comparison for flight in flights])
     distance_m = first.standard.distance_m
-    return measure(pooled, first.radius_m, list(first.acc_at_m), rpe_distance_m=distance_m)
+    return measure(pooled, radius_m, list(first.acc_at_m), rpe_distance_m=distance_m)
 
 
-def table(flights: Sequence[FlightReport]) -> str:
-    """The figures in aligned columns for a terminal: a row per flight, and a total of several."""
-    rows = [table_header(flights), *table_rows(flights)]
+def _radius_m(flights: Sequence[FlightReport]) -> float:
+    """The radius of all flights; raises `ValueError` as `total` does."""
+    radii_m = {flight.metrics.radius_m for flight in flights}
+    if len(radii_m) != 1:
+        raise ValueError("a total needs at least one flight, and one radius for all of them")
+    return radii_m.pop()
+
+
+def table(flights: Sequence[FlightReport], whole: Metrics) -> str:
+    """The figures in aligned columns for a terminal: a row per flight, and a total of several.
+
+    `whole`: what `total` gives. Raises `ValueError` as `total` does.
+    """
+    rows = [table_header(flights), *table_rows(flights, whole)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(_COLUMNS))]
     lines = []
     for row in rows:
@@ -95,10 +105,10 @@ def metrics_to_json(metrics: Metrics) -> dict[str, object]:
         "coverage": or_none(metrics.coverage),
         **{radius_key(r): or_none(share) for r, share in metrics.acc_at_m.items()},
         **{f"fixes_{radius_key(r)}": or_none(s) for r, s in metrics.acc_fixes_at_m.items()},
-        "error_median_m": or_none(metrics.error_median_m),
-        "error_p95_m": or_none(metrics.error_p95_m),
-        "error_mean_m": or_none(metrics.error_mean_m),
-        "error_max_m": or_none(metrics.error_max_m),
+        "error_median_m": or_none(metrics.standard.cep50_m),
+        "error_p95_m": or_none(metrics.standard.cep95_m),
+        "error_mean_m": or_none(metrics.standard.ape.mean_m),
+        "error_max_m": or_none(metrics.standard.ape.max_m),
         "latency_median_ms": or_none(metrics.latency_median_ms),
         "latency_p95_ms": or_none(metrics.latency_p95_ms),
         "reasons": dict(metrics.reasons),
@@ -117,12 +127,12 @@ def metrics_to_json(metrics: Metrics) -> dict[str, object]:
     }
 
 
-def flights_to_json(flights: Sequence[FlightReport]) -> dict[str, Any]:
+def flights_to_json(flights: Sequence[FlightReport], whole: Metrics) -> dict[str, Any]:
     """The figures of all flights together, and of several also of each, for strict JSON.
 
-    Of several tracks only sums and maxima are given. Raises `ValueError` as `total` does.
+    `whole`: what `total` gives. Of several tracks only sums and maxima are given.
     """
-    plain = metrics_to_json(total(flights))
+    plain = metrics_to_json(whole)
     if len(flights) == 1:
         track, gnss = flights[0].track, flights[0].gnss
         plain |= {} if track is None else {"track": track_to_json(track)}
@@ -130,16 +140,16 @@ def flights_to_json(flights: Sequence[FlightReport]) -> dict[str, Any]:
     tracks = [flight.track for flight in flights if flight.track is not None]
     if tracks:
         plain["track"] = tracks_to_json(tracks)
-    plain["flights"] = {flight.name: flights_to_json([flight]) for flight in flights}
+    plain["flights"] = {each.name: flights_to_json([each], each.metrics) for each in flights}
     return plain
 
 
-def summary(flights: Sequence[FlightReport]) -> str:
+def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
     """Standard figures, confidence and covariance of all flights, and metrics of each track.
 
-    Raises `ValueError` as `total` does.
+    `whole`: what `total` gives.
     """
-    lines = trust_lines(total(flights))
+    lines = trust_lines(whole)
     for flight in flights:
         if flight.track is not None:
             lines += track_lines(flight.track, flight.name if len(flights) > 1 else "")
@@ -149,15 +159,15 @@ def summary(flights: Sequence[FlightReport]) -> str:
 
 
 def table_header(flights: Sequence[FlightReport]) -> list[str]:
-    """Names of the columns."""
-    radius_m = total(flights).radius_m
+    """Names of the columns. Raises `ValueError` as `total` does."""
+    radius_m = _radius_m(flights)
     return [f"acc@{radius_m:g} m" if name == "right" else name for name in _COLUMNS]
 
 
-def table_rows(flights: Sequence[FlightReport]) -> list[list[str]]:
-    """A row per flight, and the total of several."""
+def table_rows(flights: Sequence[FlightReport], whole: Metrics) -> list[list[str]]:
+    """A row per flight, and the total `whole` of several."""
     rows = [_row(flight.name, flight.metrics) for flight in flights]
-    return rows if len(flights) == 1 else [*rows, _row("total", total(flights))]
+    return rows if len(flights) == 1 else [*rows, _row("total", whole)]
 
 
 def _row(name: str, metrics: Metrics) -> list[str]:
@@ -168,9 +178,9 @@ def _row(name: str, metrics: Metrics) -> list[str]:
         percent_text(metrics.coverage),
         percent_text(metrics.accuracy),
         percent_text(metrics.accuracy_of_fixes),
-        measure_text(metrics.error_median_m),
-        measure_text(metrics.error_p95_m),
-        measure_text(metrics.error_mean_m),
-        measure_text(metrics.error_max_m),
+        measure_text(metrics.standard.cep50_m),
+        measure_text(metrics.standard.cep95_m),
+        measure_text(metrics.standard.ape.mean_m),
+        measure_text(metrics.standard.ape.max_m),
         measure_text(metrics.latency_median_ms),
     ]

@@ -20,7 +20,7 @@ from orthonav.evaluate.calibration import (
     calibrate,
     check_covariance,
 )
-from orthonav.evaluate.figures import FloatArray, frozen, mean, percentile, share
+from orthonav.evaluate.figures import FloatArray, frozen, percentile, share
 from orthonav.evaluate.standard import RPE_DISTANCE_M, StandardFigures, standard_figures
 from orthonav.geo.frames import LocalFrame
 from orthonav.records import Fix, NoFix, ViewResult
@@ -115,11 +115,11 @@ class Metrics:
     `n_views`, `n_fixes`, `n_without_truth`, `n_without_result`: counts, see `Comparison`.
     `coverage`: share of views with a fix.
     `acc_at_m`, `acc_fixes_at_m`: for each radius the share of all views, and of fixes, within it.
-    `error_*_m`: of fixes; `latency_*_ms`: of all views.
+    `latency_*_ms`: of all views.
     `reasons`: number of views without a fix by reason.
     `criteria`, `curves`: what thresholds of the confidence criteria accept.
     `calibration`, `consistency`: of confidence and covariance; right is within the own radius.
-    `standard`: APE, RPE, CEP50 and CEP95.
+    `standard`: errors of fixes: APE, RPE, CEP50 and CEP95.
     """
 
     radius_m: float
@@ -130,10 +130,6 @@ class Metrics:
     coverage: float
     acc_at_m: Mapping[float, float]
     acc_fixes_at_m: Mapping[float, float]
-    error_median_m: float
-    error_p95_m: float
-    error_mean_m: float
-    error_max_m: float
     latency_median_ms: float
     latency_p95_ms: float
     reasons: Mapping[str, int]
@@ -260,10 +256,6 @@ def measure(
         coverage=share(of_fixes_m.size, errors_m.size),
         acc_at_m=_within(of_fixes_m, radii, errors_m.size),
         acc_fixes_at_m=_within(of_fixes_m, radii, of_fixes_m.size),
-        error_median_m=percentile(of_fixes_m, 50.0),
-        error_p95_m=percentile(of_fixes_m, 95.0),
-        error_mean_m=mean(of_fixes_m),
-        error_max_m=float(of_fixes_m.max()) if of_fixes_m.size else math.nan,
         latency_median_ms=percentile(comparison.latency_ms, 50.0),
         latency_p95_ms=percentile(comparison.latency_ms, 95.0),
         reasons=MappingProxyType(dict(Counter(r for r in comparison.reasons if r).most_common())),

@@ -62,21 +62,23 @@ def write_report(
     flights: Sequence[FlightReport],
     made_from: MadeFrom | None = None,
     title: str = "",
+    whole: Metrics | None = None,
 ) -> Path:
     """Write `index.html` into `out_dir` and return its path; it needs no other file and no network.
 
-    Figures are also written beside it, as `orthonav.report.write_page` does. Raises
+    `whole`: what `total` gives for these flights, computed where it is None. Figures are also
+    written beside the page, as `orthonav.report.write_page` does. Raises `ValueError` as `total`,
     `MissingExtraError` without matplotlib or Jinja2, `OutputError` where a file cannot be written.
     """
-    page, figures = page_of(flights, made_from or MadeFrom(), title)
+    page, figures = page_of(flights, whole or total(flights), made_from or MadeFrom(), title)
     return write_page(out_dir, page, figures)
 
 
 def page_of(
-    flights: Sequence[FlightReport], made_from: MadeFrom, title: str = ""
+    flights: Sequence[FlightReport], whole: Metrics, made_from: MadeFrom, title: str = ""
 ) -> tuple[str, list[Figure]]:
     """The page as HTML, and its figures; those of several flights carry the flights' names."""
-    whole, several = total(flights), len(flights) > 1
+    several = len(flights) > 1
     drawn = [_drawn(flight) for flight in flights]
     if several:
         drawn.append(_Drawn(_figures(pool([flight.comparison for flight in flights]), whole)))
@@ -91,7 +93,7 @@ def page_of(
         "notes": _notes(whole),
         "radius": f"{whole.radius_m:g} m",
         "table_header": table_header(flights),
-        "table_rows": table_rows(flights),
+        "table_rows": table_rows(flights, whole),
         "sections": [_section(*each) for each in zip(flights, drawn, strict=False)],
         "total_section": None,
         "made_from": _made_from(made_from),

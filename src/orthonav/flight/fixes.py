@@ -38,11 +38,15 @@ KEYS = (
 )
 TRACK_KEYS = (
     "tracked",  # true: the position is estimated from all views so far
-    "state",  # "searching", "tracking" or "lost"
+    "state",  # one of `STATES`
 )
-STATES = ("searching", "tracking", "lost")
+STATES = ("searching", "tracking", "coasting", "lost")
 _NULL_IN_FIX = {"reason": None, "detail": None}
 _NULL_IN_NO_FIX = dict.fromkeys(KEYS[3:10])
+MAX_LINE_BYTES = 2**20
+"""Limit of a line; the evidence of a view takes about 1000 bytes."""
+MAX_RESULTS = 1_000_000
+"""Limit of lines: as many as a flight folder may have views."""
 _TIME_LIMIT_S = 2**63 / 1e9
 
 
@@ -100,8 +104,13 @@ def read_results(path: Path) -> list[ViewResult]:
     path = require_file(path, "file of fixes")
     results = []
     with path.open("rb") as stream:
-        for number, raw in enumerate(stream, start=1):
+        lines = iter(lambda: stream.readline(MAX_LINE_BYTES + 1), b"")
+        for number, raw in enumerate(lines, start=1):
             try:
+                if len(raw) > MAX_LINE_BYTES or number > MAX_RESULTS:
+                    raise FlightError(
+                        f"more than {MAX_LINE_BYTES:,} bytes in a line, or {MAX_RESULTS:,} lines"
+                    )
                 line = raw.decode("utf-8").strip()
                 if line:
                     results.append(result_from_json(line))

@@ -1,6 +1,5 @@
 """Reading a flight folder."""
 
-import csv
 import json
 import math
 from collections.abc import Iterator, Mapping
@@ -18,6 +17,7 @@ from orthonav.files import require_file
 from orthonav.geo.camera import Camera
 from orthonav.geo.swapped import swapped_hint
 from orthonav.records import Prior, Telemetry
+from orthonav.tables import TableError, TableRows
 
 TELEMETRY_COLUMNS = ("frame", "time_s", "yaw_deg", "pitch_deg", "roll_deg", "agl_m")
 OPTIONAL_COLUMNS = (
@@ -32,19 +32,26 @@ OPTIONAL_COLUMNS = (
     "vel_std_mps",
 )
 MAX_TEXT_BYTES = 500_000_000
+MAX_VIEWS = 1_000_000
+"""Rows of a table of a flight: as many views as `simulate` makes, 55 hours at 5 Hz."""
 # The camera describes the sensor: an orientation tag must not rotate the image.
 _DECODE = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 _BROKEN_JSON = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
 _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class FlightView:
-    """One view of a flight: its name in `frames/`, its file, and its telemetry."""
+    """One view of a flight: its name in the folder `frames`, and its telemetry."""
 
+    frames: Path
     frame: str
-    path: Path
     telemetry: Telemetry
+
+    @property
+    def path(self) -> Path:
+        """File of the image."""
+        return self.frames / self.frame
 
     @property
     def where(self) -> str:
@@ -203,7 +210,7 @@ def _views(telemetry: Path, frames: Path) -> Iterator[FlightView]:
         prior = number_of(row.get("prior_lat_deg")), number_of(row.get("prior_lon_deg"))
         if hint := swapped_hint(*prior):
             raise FlightError(f"line {line}: prior position is out of range{hint}: {telemetry}")
-        yield FlightView(frame, image, _telemetry(row, time_ns))
+        yield FlightView(frames, frame, _telemetry(row, time_ns))
 
 
 def _telemetry(row: Mapping[str, str], time_ns: int) -> Telemetry:
@@ -232,16 +239,16 @@ def csv_rows(path: Path, needed: tuple[str, ...]) -> Iterator[tuple[int, dict[st
         raise FlightError(f"file is larger than {MAX_TEXT_BYTES // 10**6} MB: {path}")
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.DictReader(stream, skipinitialspace=True)
-            missing = [name for name in needed if name not in (reader.fieldnames or ())]
+            rows = TableRows(stream, most_rows=MAX_VIEWS)
+            missing = [name for name in needed if name not in rows.columns]
             if missing:
                 raise FlightError(f"columns are missing: {', '.join(missing)}: {path}")
-            for row in reader:
+            for row in rows:
                 if any(row[name] is None for name in needed):
-                    raise FlightError(f"line {reader.line_num} has too few fields: {path}")
-                yield reader.line_num, {k: v or "" for k, v in row.items() if isinstance(k, str)}
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise FlightError(f"not a CSV file in UTF-8 ({error}): {path}") from error
+                    raise FlightError(f"line {rows.line} has too few fields: {path}")
+                yield rows.line, {k: v or "" for k, v in row.items() if isinstance(k, str)}
+    except TableError as error:
+        raise FlightError(f"{error}: {path}") from error
 
 
 def _is_file(path: Path) -> bool:

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from orthonav.errors import CameraError, FlightError
+from orthonav.errors import CameraError, FlightError, described
 from orthonav.flight.gnss import GnssSample
 from orthonav.geo.camera import Camera
 from orthonav.records import Fix, Prior, Telemetry
@@ -120,7 +120,13 @@ TELEMETRY = Topic(
             "picture": _TEXT,
             **dict.fromkeys(_REPORTED, _NUMBER),
         },
-        {**dict.fromkeys(_REPORTED_IF_KNOWN, _NUMBER), "prior": _OBJECT, "vel_en_mps": _numbers()},
+        {
+            **dict.fromkeys(_REPORTED_IF_KNOWN, _NUMBER),
+            "prior": _OBJECT,
+            "vel_en_mps": _numbers(),
+            "camera_latency_ms": _NUMBER,
+            "withheld": {"type": "boolean"},
+        },
     ),
 )
 RESULT = Topic(
@@ -193,6 +199,10 @@ class LoggedView:
     """Telemetry of its exposure."""
     picture: str
     """State of its image, one of `PICTURES`."""
+    camera_latency_ms: float | None = None
+    """Latency that was subtracted from its arrival; None where the exposure was known."""
+    withheld: bool = False
+    """Whether it was not located because the latency of the camera was not known."""
 
 
 def to_json(plain: Any) -> bytes:
@@ -229,6 +239,10 @@ def telemetry_message(view: LoggedView) -> bytes:
         and {name: float(v) for name, v in asdict(telemetry.prior).items()},
         "vel_en_mps": telemetry.vel_en_mps and [float(value) for value in telemetry.vel_en_mps],
     }
+    if view.camera_latency_ms is not None:
+        plain["camera_latency_ms"] = float(view.camera_latency_ms)
+    if view.withheld:
+        plain["withheld"] = True
     return to_json(plain)
 
 
@@ -252,11 +266,14 @@ def view_of(data: bytes) -> LoggedView:
         )
         index, number = _integer(plain["index"]), _integer(plain["number"])
         frame, picture = plain["frame"], plain["picture"]
+        latency = plain.get("camera_latency_ms")
+        latency_ms = None if latency is None else _number(latency)
         if not isinstance(frame, str) or picture not in PICTURES:
             raise ValueError("invalid frame or picture")
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise FlightError(f"telemetry of the log is damaged ({error!r:.120})") from error
-    return LoggedView(index, number, frame, telemetry, picture)
+        raise FlightError(f"telemetry of the log is damaged: {described(error)}") from error
+    withheld = plain.get("withheld") is True
+    return LoggedView(index, number, frame, telemetry, picture, latency_ms, withheld)
 
 
 def camera_plain(camera: Camera) -> dict[str, Any]:
@@ -277,7 +294,7 @@ def camera_of(plain: Any) -> Camera:
     except CameraError:
         raise
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise FlightError(f"camera of the log is damaged ({error!r:.120})") from error
+        raise FlightError(f"camera of the log is damaged: {described(error)}") from error
 
 
 def calibration_message(camera: Camera, time_ns: int) -> bytes:
@@ -396,7 +413,7 @@ def _float_or_none(value: float | None) -> float | None:
 
 
 def _number(value: Any) -> float:
-    if isinstance(value, str):
+    if isinstance(value, str) and value in _WORDS:
         return _WORDS[value]
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"{value!r:.40} is not a number")

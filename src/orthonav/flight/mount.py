@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from orthonav.errors import FlightError
+from orthonav.errors import FlightError, described
 from orthonav.files import require_file, write_text
 from orthonav.records import Telemetry
 
@@ -72,7 +72,9 @@ def read_mount(path: Path) -> Mount:
             raise ValueError(f"version {plain['orthonav_mount']}, expected {VERSION}")
         return mount_from_plain(plain)
     except (*BROKEN, AttributeError, RecursionError, OSError) as error:
-        raise FlightError(f"not a mount file of `orthonav calibrate` ({error}): {path}") from error
+        raise FlightError(
+            f"not a mount file of `orthonav calibrate` ({described(error)}): {path}"
+        ) from error
 
 
 def mount_from_plain(plain: Any) -> Mount:

@@ -42,12 +42,19 @@ class MapEstimate:
 
 
 def estimate_map(
-    area: Area, *, gsd_m: float, tile_px: int, overlap: float, registration: bool = True
+    area: Area,
+    *,
+    gsd_m: float,
+    tile_px: int,
+    overlap: float,
+    registration: bool = True,
+    maps: int = 1,
 ) -> MapEstimate:
     """Estimate for the map that `orthonav build` makes of an area.
 
-    Tiles are counted if that is cheap, else estimated from a sample (within 2 %). Imagery is
-    assumed everywhere. Raises `AreaError` as `TileGrid.covering` does.
+    Tiles are counted if that is cheap, else estimated from a sample (within 2 %), which is smaller
+    where this is one of many `maps`. Imagery is assumed everywhere. Raises `AreaError` as
+    `TileGrid.covering` does.
     """
     grid = TileGrid.covering(area.extent_en_m, gsd_m=gsd_m, tile_px=tile_px, overlap=overlap)
     half_m, centre_m = grid.tile_m / 2, (grid.tile_m - grid.stride_m) / 2
@@ -59,8 +66,10 @@ def estimate_map(
     )
     centres = tuple(np.array(raster) + np.array([1, 1, -1, -1]) * centre_m)
     reach_m = grid.stride_m * math.sqrt(0.5)
-    tiles = round(grid.rows * grid.cols * _share(area, centres, reach_m, (grid.rows, grid.cols)))
-    imagery_m2 = grid.width_px * grid.height_px * gsd_m**2 * _share(area, raster, half_m)
+    room = max(_LEAST_POINTS, _MOST_POINTS // maps)
+    cells = grid.rows, grid.cols
+    tiles = round(grid.rows * grid.cols * _share(area, centres, reach_m, room, cells))
+    imagery_m2 = grid.width_px * grid.height_px * gsd_m**2 * _share(area, raster, half_m, room)
     pixels = imagery_m2 / gsd_m**2
     layer = [pixels * each / 1e6 if registration else 0.0 for each in LAYER_BYTES_PER_PX]
     embeddings = tiles * TILE_BYTES / 1e6
@@ -74,15 +83,20 @@ def estimate_map(
 
 
 def _share(
-    area: Area, box_en_m: Extent, margin_m: float, cells: tuple[int, int] | None = None
+    area: Area,
+    box_en_m: Extent,
+    margin_m: float,
+    room: int,
+    cells: tuple[int, int] | None = None,
 ) -> float:
     """Share of a box (west, south, east, north) that lies in the area or within a margin of it.
 
-    Computed from the centres of its `cells` (rows, columns), or of fewer if those are too many.
+    Computed from the centres of its `cells` (rows, columns), or of at most about `room` if those
+    are more.
     """
     if area.route is None:
         return 1.0
-    room = min(_MOST_POINTS, max(_LEAST_POINTS, _PAIRS // area.route.legs))
+    room = min(room, max(_LEAST_POINTS, _PAIRS // area.route.legs))
     west, south, east, north = box_en_m
     if cells is None or cells[0] * cells[1] > room:
         rows = max(1, min(room, round(math.sqrt(room * (north - south) / (east - west)))))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.errors import MissingFileError, RouteError
+from orthonav.errors import MissingFileError, RouteError, described
 from orthonav.geo.frames import distances_m
 from orthonav.geo.routes.delimited import read_delimited
 from orthonav.geo.routes.geojson import read_geojson, routes_of
@@ -34,7 +34,8 @@ __all__ = [
     "within_bands",
 ]
 
-MAX_ROUTE_BYTES = 50_000_000
+MAX_ROUTE_BYTES = 20_000_000
+"""Twice as much as 100,000 waypoints take; JSON and XML take some 20 times their size in memory."""
 _PAIRS_AT_ONCE = 2**18
 _FEW_POINTS = 64
 _BROKEN = (ValueError, LookupError, TypeError, OverflowError, RecursionError, csv.Error)
@@ -87,7 +88,7 @@ def read_route(path: Path) -> Route:
     except RouteError as error:
         raise RouteError(f"{error}: {path}") from error
     except _BROKEN as error:
-        raise RouteError(f"route cannot be read ({error!r}): {path}") from error
+        raise RouteError(f"route cannot be read ({described(error)}): {path}") from error
     except OSError as error:
         raise MissingFileError(f"route file cannot be read ({error.strerror}): {path}") from error
 

@@ -20,6 +20,8 @@ from orthonav.geo.swapped import swapped_bounds_hint
 
 MAX_SHEETS = 10_000
 """Limit of the program; 2500 km2 each, so 25 million km2."""
+MAX_ROUTE_SHEETS = 500
+"""Limit for a route: more than once around the Earth with bands of less than 10 km."""
 _DEGREE_M = 110_574.0
 """Shortest degree of latitude, at the equator (WGS84)."""
 _LON_DEGREE_M = 111_320.0
@@ -100,7 +102,8 @@ def sheets_of_route(route: Route, band_m: float | None) -> list[Route]:
 
     The route is divided at waypoints, each part as long as possible. A leg too long for a sheet is
     divided into equal pieces on the great circle. Each part begins at the end of the previous one.
-    Parts are named sheet-1, sheet-2 and so on. Raises `AreaError`.
+    Parts are named sheet-1, sheet-2 and so on. Raises `AreaError`, also for more than
+    `MAX_ROUTE_SHEETS` parts.
     """
     bands_m = route.bands_m(band_m)
     if bands_m is None or _route_fits(route, band_m):
@@ -114,6 +117,8 @@ def sheets_of_route(route: Route, band_m: float | None) -> list[Route]:
     parts: list[Route] = []
     first = 0
     while first < cut.legs:
+        if len(parts) == MAX_ROUTE_SHEETS:
+            raise _route_too_long(f"more than {MAX_ROUTE_SHEETS}")
         last = _last_that_fits(cut, first, band_m)
         parts.append(cut.part(first, last, f"sheet-{len(parts) + 1}"))
         first = last
@@ -150,12 +155,14 @@ def _with_short_legs(route: Route, bands_m: tuple[float, ...]) -> Route:
     waypoints, heights = [route.waypoints[0]], list(route.heights[:1])
     leg_bands: list[float | None] = []
     lengths_m = leg_lengths_m(route)
+    divided = 0
     for leg, (start, end) in enumerate(zip(route.waypoints, route.waypoints[1:], strict=False)):
         pieces = math.ceil(lengths_m[leg] / (0.99 * (MAX_SHEET_M - bands_m[leg])))
         if pieces <= 1 or _route_fits(Route((start, end)), bands_m[leg]):
             pieces = 1  # most legs
-        if len(waypoints) + pieces > MAX_SHEETS + len(route.waypoints):
-            raise _too_many(pieces)
+        divided += pieces if pieces > 1 else 0
+        if divided > MAX_ROUTE_SHEETS:
+            raise _route_too_long(f"{divided:,} or more")
         shares = [number / pieces for number in range(1, pieces)]
         waypoints += [*_on_great_circle(start, end, shares), end]
         if route.heights:
@@ -189,6 +196,13 @@ def _on_great_circle(
 def _direction(place: tuple[float, float]) -> NDArray[np.float64]:
     lat, lon = (math.radians(value) for value in place)
     return np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
+
+
+def _route_too_long(sheets: str) -> AreaError:
+    return AreaError(
+        f"route needs {sheets} sheets, at most {MAX_ROUTE_SHEETS} are planned at once; plan it in "
+        "parts, or with a narrower search band"
+    )
 
 
 def _too_many(count: int) -> AreaError:

@@ -70,12 +70,12 @@ def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> P
         return rectify_footprint(downsampled(view, level_m), gsd_m=level_m, multiple_px=multiple)
 
     rectified = rectified_at(levels.final)
-    unit = gsd_m * 2**levels.final / gsd_m
-    refused = check_footprint(rectified, unit, MIN_VIEW_PX)
+    unit_px = 2**levels.final
+    refused = check_footprint(rectified, unit_px, MIN_VIEW_PX)
     if refused is not None:
         return refused
     offset = rectified.offset_en_m / gsd_m
-    side_px = math.sqrt(float(rectified.valid.sum())) * (gsd_m * 2**levels.final) / gsd_m
+    side_px = math.sqrt(float(rectified.valid.sum())) * unit_px
     return PreparedView(
         rectified_at,
         ViewTemplates(rectified.grey, rectified.valid, levels.final),

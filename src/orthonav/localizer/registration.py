@@ -115,18 +115,18 @@ class RegistrationLocalizer:
         prior: Prior | None = None,
         heading_known: bool = True,
         *,
-        heading_std_rad: tuple[float, float] | None = None,
+        heading_std_rad: float | None = None,
     ) -> RegisteredView | NoFix:
         """The view and its best place within `prior`; `NoFix` where it shows too little.
 
-        `heading_std_rad`: a heading (rad) and its standard deviation in place of the reported ones.
+        `heading_std_rad`: standard deviation of the heading in place of the reported one, which
+        has limits.
         """
         prepared = self.prepared(view, heading_known)
         if isinstance(prepared, NoFix):
             return prepared
         if heading_std_rad is not None:
-            turn, std = heading_std_rad
-            pose_prior = replace(prepared.prior, turn_rad=turn, turn_std_rad=std)
+            pose_prior = replace(prepared.prior, turn_std_rad=heading_std_rad)
             prepared = replace(prepared, prior=pose_prior)
         if prior is not None and not self._touches_map(prior, prepared):
             outside = NoFix("outside_map", "the map does not reach to where the prior says")

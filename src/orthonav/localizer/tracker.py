@@ -177,6 +177,7 @@ class Tracker:
             more = {
                 "hypotheses": float(len(self.mixture.hypotheses)),
                 "elsewhere": self.mixture.elsewhere,
+                "recognized": estimate.recognized,
             }
             mean, covariance = estimate.mean, estimate.covariance
             outcome = self._fix(mean, covariance, estimate.confidence, telemetry, more)
@@ -335,11 +336,10 @@ class Tracker:
         """
         if expected is None:
             return None, None
-        likely = expected.confidence
-        if expected.state is State.SEARCHING:
-            if not self._start_was_reported:
-                return None, None  # an unconfirmed place must compete with the whole map
-            likely = expected.belief  # however wide the reported start was
+        if expected.state is State.SEARCHING and not self._start_was_reported:
+            return None, None  # an unconfirmed place must compete with the whole map
+        # However wide a reported start was, or dead reckoning has become.
+        likely = expected.confidence if expected.state is State.TRACKING else expected.belief
         if likely < LOCAL_SHARE:
             return None, None
         spread = float(np.linalg.eigvalsh(expected.covariance[:2, :2])[-1])

@@ -1,4 +1,4 @@
-"""The map file (`*.onav`): all data of a map in one memory-mapped file that is safe to open."""
+"""The map file (`*.onav`): all data of a map in one file that is safe to open and to keep open."""
 
 from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import SCHEMA, GreyInfo, Manifest, SheetInfo

@@ -161,11 +161,11 @@ class GreyLayer:
     def _chunk(self, level: int, chunk_row: int, chunk_col: int) -> Chunk | None:
         """A chunk, from the cache or decoded; None if none of its pixels is valid."""
         number = self._table.number(level, chunk_row, chunk_col)
-        jpeg, mask = self._jpegs.blob(number), self._masks.blob(number)
-        if not jpeg.size and not mask.size:
+        if self._jpegs.is_empty(number) and self._masks.is_empty(number):
             return None
         chunk = self._cache.get(number)
         if chunk is None:
+            jpeg, mask = self._jpegs.blob(number), self._masks.blob(number)
             try:
                 chunk = decode_chunk(jpeg, mask, self._table.shape(level, chunk_row, chunk_col))
             except MapFileError as error:
@@ -263,23 +263,28 @@ class _Blobs:
     """Byte strings concatenated in one part, with their offsets in another."""
 
     def __init__(self, opened: MapFile, data: str, offsets: str, count: int) -> None:
-        self._data: NDArray[np.uint8] = opened.array(data, np.uint8, 1)
+        size = opened.size_of(data, np.uint8, 1)
+        self._opened, self._name = opened, data
         self._offsets: NDArray[Any] = opened.array(offsets, np.int64, 1)
         places = self._offsets
         sane = (
             len(places) == count + 1
             and places[0] == 0
-            and places[-1] == len(self._data)
+            and places[-1] == size
             and bool((places[1:] >= places[:-1]).all())
         )
         if not sane:
             raise MapFileError(
-                f"map part {offsets} must rise from 0 to {len(self._data)} in {count + 1} numbers: "
+                f"map part {offsets} must rise from 0 to {size} in {count + 1} numbers: "
                 f"{opened.path}"
             )
 
+    def is_empty(self, number: int) -> bool:
+        return bool(self._offsets[number] == self._offsets[number + 1])
+
     def blob(self, number: int) -> NDArray[np.uint8]:
-        return self._data[self._offsets[number] : self._offsets[number + 1]]
+        first, last = int(self._offsets[number]), int(self._offsets[number + 1])
+        return np.frombuffer(self._opened.range(self._name, first, last), dtype=np.uint8)
 
 
 class _Cache:

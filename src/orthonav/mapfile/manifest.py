@@ -20,6 +20,9 @@ MAX_MANIFEST_BYTES = 8 * 2**20
 MAX_SHEETS = 10_000
 MAX_LEVELS = 10
 MIN_CHUNK_PX, MAX_CHUNK_PX = 16, 1024
+MAX_TOP_PX = 8192
+"""Longer side of the coarsest level, which is read as a whole: that of ten levels of the largest
+sheet at 5 cm. Programs write at most 64 px."""
 CODEC = "jpeg"
 MAX_DIGITS = 20
 """More digits than any number in a map needs, and few enough to fit a float."""
@@ -61,6 +64,7 @@ class GreyInfo:
             and info.chunk_px % 2 == 0
             and 1 <= info.levels <= MAX_LEVELS
             and 1 <= info.quality <= 100
+            and max(grid.height_px, grid.width_px) <= MAX_TOP_PX << (info.levels - 1)
             and 0 <= info.valid_px <= grid.height_px * grid.width_px
         )
         if not sane:

@@ -3,6 +3,7 @@
 A detached Ed25519 signature, `MAP.onav.sig`, of the digest of the manifest, which holds the
 SHA-256 of every part. `open_map` checks all of them whenever it opens a map, so signing the
 manifest's digest covers every byte that is used, and verifying reads the header of the file only.
+A serial number and the time of signing are signed too, so that older maps can be refused.
 See `docs/map-format.md`.
 """
 
@@ -13,10 +14,12 @@ import hashlib
 import json
 import os
 import re
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.errors import MapFileError, MissingFileError, OutputError
+from orthonav.errors import MapFileError, MissingFileError, OutputError, VariantError
 from orthonav.extras import missing_extra
 from orthonav.files import replacing, require_file, write_text
 from orthonav.mapfile.manifest import MAX_MANIFEST_BYTES, Manifest
@@ -29,15 +32,41 @@ if TYPE_CHECKING:
         Ed25519PublicKey,
     )
 
-SCHEMA = 1
+SCHEMA = 2
+"""Schema 1 has neither serial number nor time."""
 FORMAT = "orthonav-signature"
 ALGORITHM = "ed25519"
 MAX_SIGNATURE_BYTES = 4096
 MAX_KEY_BYTES = 4096
 PRIVATE_NAME, PUBLIC_NAME = "private.pem", "public.pem"
-_SIGNED = b"orthonav map, schema 1, manifest sha256 "
-"""Prefix of the signed digest; domain separation from other signatures."""
+MAX_SERIAL = 2**53 - 1
+"""Largest integer that every JSON reader keeps exact."""
+_TIME = "%Y-%m-%dT%H:%M:%SZ"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
+
+
+@dataclass(frozen=True)
+class Signature:
+    """A verified signature.
+
+    `key_id`: of the key. `manifest_sha256`: digest of the map's manifest, hexadecimal. `serial`:
+    serial number, at least 0. `signed_utc`: time of signing by the clock of the signer. The last
+    two are None in signatures of schema 1.
+    """
+
+    key_id: str
+    manifest_sha256: str
+    serial: int | None = None
+    signed_utc: str | None = None
+
+    @property
+    def message(self) -> bytes:
+        """The signed bytes; their beginning separates them from other uses of the key."""
+        digest = f"manifest sha256 {self.manifest_sha256}"
+        if self.serial is None:
+            return f"orthonav map, schema 1, {digest}".encode("ascii")
+        named = f"serial {self.serial}, signed {self.signed_utc}"
+        return f"orthonav map, schema 2, {named}, {digest}".encode("ascii")
 
 
 def signature_path(path: Path) -> Path:
@@ -116,24 +145,28 @@ def key_id(public: "Ed25519PublicKey") -> str:
     return hashlib.sha256(public.public_bytes_raw()).hexdigest()[:16]
 
 
-def sign_map(path: Path, key: Path) -> Path:
+def sign_map(path: Path, key: Path, serial: int | None = None) -> Path:
     """Sign a map with a private key (PEM); returns the path of the signature.
 
-    The map is fully checked first. Raises `MissingFileError`, `MapFileError`, `OutputError` or
-    `MissingExtraError`.
+    `serial` is 0 to `MAX_SERIAL`; by default the time in seconds since 1970, which increases. The
+    map is fully checked first. Raises `MissingFileError`, `MapFileError`, `OutputError`,
+    `VariantError` or `MissingExtraError`.
     """
     from orthonav.mapfile.reader import open_map
 
+    now = datetime.now(UTC)
+    serial = int(now.timestamp()) if serial is None else serial
+    if not 0 <= serial <= MAX_SERIAL:
+        raise VariantError(f"serial number must be 0 to {MAX_SERIAL}, got {serial}")
     private = _private_key(key)
     open_map(path)
-    digest = map_digest(path)
+    made = Signature(key_id(private.public_key()), map_digest(path), serial, now.strftime(_TIME))
     plain = {
         "format": FORMAT,
         "schema": SCHEMA,
         "algorithm": ALGORITHM,
-        "key_id": key_id(private.public_key()),
-        "manifest_sha256": digest,
-        "signature": base64.b64encode(private.sign(_SIGNED + digest.encode("ascii"))).decode(),
+        **asdict(made),
+        "signature": base64.b64encode(private.sign(made.message)).decode(),
     }
     out = signature_path(path)
     with replacing(out) as temporary:
@@ -141,32 +174,65 @@ def sign_map(path: Path, key: Path) -> Path:
     return out
 
 
-def require_signature(path: Path, public_key: Path) -> str:
-    """Check that a map was signed with a key (PEM); returns the digest of its manifest.
+def require_signature(path: Path, public_key: Path, not_before: str | None = None) -> Signature:
+    """The signature of a map, checked with a key (PEM).
 
-    `open_map` then compares the parts with that manifest. Raises `MapFileError` if the signature is
-    missing, broken, by another key or of another map, `MissingFileError` if the map or the key is
-    missing, and `MissingExtraError`.
+    `not_before` is a serial number, or a date or time in UTC; older maps are refused. `open_map`
+    then compares the parts with the manifest. Raises `MapFileError` if the signature is missing,
+    broken, by another key, of another map or too old, `MissingFileError` if the map or the key is
+    missing, `VariantError` if `not_before` is invalid, and `MissingExtraError`.
     """
     invalid, _, _ = _crypto()
+    least = None if not_before is None else _least(not_before)
     public = _public_key(public_key)
     digest = map_digest(path)
-    plain = _signature(path)
-    stated, known = plain["key_id"], key_id(public)
-    if stated != known:
-        raise MapFileError(f"map is signed with key {stated}, expected key {known}: {path}")
-    if plain["manifest_sha256"] != digest:
+    found, encoded = _signature(path)
+    known = key_id(public)
+    if found.key_id != known:
+        raise MapFileError(f"map is signed with key {found.key_id}, expected key {known}: {path}")
+    if found.manifest_sha256 != digest:
         raise MapFileError(f"signature is of another map, or the map was altered: {path}")
     try:
-        signature = base64.b64decode(plain["signature"], validate=True)
-        public.verify(signature, _SIGNED + digest.encode("ascii"))
+        public.verify(base64.b64decode(encoded, validate=True), found.message)
     except (invalid, binascii.Error, ValueError) as error:
         raise MapFileError(f"signature of the map does not verify: {path}") from error
-    return digest
+    if least is not None:
+        _require_not_older(found, least, str(not_before), path)
+    return found
 
 
-def _signature(path: Path) -> dict[str, str]:
-    """The validated fields of a signature file."""
+def _least(text: str) -> int | datetime:
+    """The serial number, or the time in UTC, in an option."""
+    if re.fullmatch(r"[0-9]{1,16}", text):
+        return int(text)
+    if re.fullmatch(r"[0-9]{4}-[0-9]{2}-[0-9]{2}(T[0-9]{2}:[0-9]{2}(:[0-9]{2})?Z?)?", text):
+        with contextlib.suppress(ValueError):
+            return datetime.fromisoformat(text.removesuffix("Z")).replace(tzinfo=UTC)
+    raise VariantError(
+        "--not-before must be a serial number, or a date or time in UTC as 2026-05-31 or "
+        f"2026-05-31T12:00:00Z, got {text!r:.60}"
+    )
+
+
+def _require_not_older(found: Signature, least: int | datetime, text: str, path: Path) -> None:
+    if found.serial is None or found.signed_utc is None:
+        raise MapFileError(
+            f"signature has no serial number and no date, which --not-before needs; sign the map "
+            f"again: {path}"
+        )
+    if isinstance(least, int):
+        if found.serial < least:
+            raise MapFileError(
+                f"map is too old: serial number {found.serial}, --not-before {text}: {path}"
+            )
+    elif datetime.strptime(found.signed_utc, _TIME).replace(tzinfo=UTC) < least:
+        raise MapFileError(
+            f"map is too old: signed {found.signed_utc}, --not-before {text}: {path}"
+        )
+
+
+def _signature(path: Path) -> tuple[Signature, str]:
+    """The validated fields of a signature file, not yet verified, and the encoded signature."""
     file = signature_path(path)
     if not file.is_file():
         raise MapFileError(f"map is not signed, there is no {file.name}: {path}")
@@ -189,10 +255,22 @@ def _signature(path: Path) -> dict[str, str]:
             raise ValueError("a field is invalid")
         if not _DIGEST.fullmatch(found["manifest_sha256"]):
             raise ValueError("its digest is invalid")
+        encoded = found.pop("signature")
+        signature = Signature(**found) if schema == 1 else Signature(**found, **_age(plain))
     except (ValueError, KeyError, TypeError, RecursionError, OSError) as error:
         reason = " ".join(str(error).split())[:120]
         raise MapFileError(f"signature of the map is broken ({reason}): {file}") from error
-    return found
+    return signature, encoded
+
+
+def _age(plain: dict[str, Any]) -> dict[str, Any]:
+    """Serial number and time of signing of a signature file; raises `ValueError`."""
+    serial, signed_utc = plain["serial"], plain["signed_utc"]
+    if type(serial) is not int or not 0 <= serial <= MAX_SERIAL:
+        raise ValueError("its serial number is invalid")
+    if datetime.strptime(signed_utc, _TIME).strftime(_TIME) != signed_utc:
+        raise ValueError("its time is invalid")
+    return {"serial": serial, "signed_utc": signed_utc}
 
 
 def _private_key(path: Path) -> "Ed25519PrivateKey":

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from orthonav.errors import CameraError, FlightError, MissingFileError
 from orthonav.flight import decode_image, open_flight
+from orthonav.onboard.arrival import Arrival, ArrivalWatch
 from orthonav.onboard.telemetry import Clocks, VehicleState
 from orthonav.records import NoFix, Telemetry
 
@@ -42,12 +43,14 @@ class CameraImage:
 
     `number`: counts up from 1.
     `frame`: name of the image in logs and results.
-    `exposed_ns`: time of exposure by our monotonic clock.
+    `exposed_ns`: time of exposure by our monotonic clock; of a live camera that of the arrival,
+    from which the flight loop subtracts the latency.
     `time_ns`: time written to results: UTC of a live camera, else the time of the recording.
     `grey`: grey levels (H, W), None where the image could not be decoded.
     `problem`: reason why it could not be decoded.
     `telemetry`: telemetry that came with the image, from a recording or from ROS.
     `vehicle`: state of the aircraft that `telemetry` was made of, from ROS.
+    `arrival`: of an image of a live camera, whose time of exposure is not known otherwise.
     """
 
     number: int
@@ -58,6 +61,7 @@ class CameraImage:
     problem: NoFix | None = None
     telemetry: Telemetry | None = None
     vehicle: VehicleState | None = None
+    arrival: Arrival | None = None
 
 
 class CameraGoneError(CameraError):
@@ -78,22 +82,21 @@ class ImageSource(Protocol):
 
 
 class LiveCamera:
-    """A device or stream, read by OpenCV. Exposure is the time of arrival minus `latency_s`."""
+    """A device or stream, read by OpenCV. Its images carry their time of arrival."""
 
     def __init__(
         self,
         name: int | str,
         clocks: Clocks,
         *,
-        latency_s: float = 0.0,
         size_px: tuple[int, int] | None = None,
         capture: Callable[[int | str], Any] | None = None,
     ) -> None:
         self._name, self._clocks, self._size = name, clocks, size_px
-        self._latency_ns = round(latency_s * 1e9)
         self._opener = capture or _capture
         self._capture: Any = None
         self._number = 0
+        self._arrivals = ArrivalWatch()
         # UTC may be set in flight; the times of views must not jump with it.
         self._utc_minus_mono_ns = clocks.utc_ns() - clocks.mono_ns()
 
@@ -101,10 +104,12 @@ class LiveCamera:
         """See `ImageSource.read`."""
         if self._capture is None:  # first image, or after the camera was gone
             self._capture = self._open()
+            self._arrivals.opened()
         if not self._capture.grab():
             self.close()
             raise CameraGoneError(f"camera delivers no images: {self._name}")
-        exposed_ns = self._clocks.mono_ns() - self._latency_ns
+        arrived_ns = self._clocks.mono_ns()
+        arrival = self._arrivals.arrived(arrived_ns, self._stamp_s())
         found, frame = self._capture.retrieve()
         self._number += 1
         grey = _grey(frame) if found else None
@@ -112,10 +117,11 @@ class LiveCamera:
         return CameraImage(
             self._number,
             f"{self._number:08d}",
-            exposed_ns,
-            exposed_ns + self._utc_minus_mono_ns,
+            arrived_ns,
+            arrived_ns + self._utc_minus_mono_ns,
             grey,
             problem,
+            arrival=arrival,
         )
 
     def close(self) -> None:
@@ -123,6 +129,11 @@ class LiveCamera:
         if self._capture is not None:
             self._capture.release()
             self._capture = None
+
+    def _stamp_s(self) -> float:
+        """Timestamp of the image in the stream; NaN where there is none."""
+        stamp_s = float(self._capture.get(cv2.CAP_PROP_POS_MSEC)) / 1e3
+        return stamp_s if stamp_s > 0 else math.nan
 
     def _open(self) -> Any:
         capture = self._opener(self._name)

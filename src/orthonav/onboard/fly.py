@@ -34,9 +34,10 @@ from orthonav.onboard.health import (
     judge,
     mismatch,
 )
+from orthonav.onboard.latency import Latency, LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.publisher import Publisher
-from orthonav.onboard.run import Locator, locate_view
+from orthonav.onboard.run import MAP_CHANGED, MAP_DAMAGED, Locator, locate_view
 from orthonav.onboard.telemetry import Clocks, VehicleState
 from orthonav.publish.estimate import error_ellipse
 from orthonav.publish.mavlink import dialect
@@ -63,8 +64,17 @@ class LogSink(Protocol):
     def options(self, options: dict[str, Any]) -> None:
         """Log the options of the flight."""
 
-    def view(self, number: int, frame: str, grey: Grey, telemetry: Telemetry) -> None:
-        """Log a view and its telemetry, before it is located."""
+    def view(
+        self,
+        number: int,
+        frame: str,
+        grey: Grey,
+        telemetry: Telemetry,
+        latency_ms: float | None,
+        withheld: bool,
+    ) -> None:
+        """Log a view, its telemetry, and the latency that was subtracted from its arrival, before
+        it is located, or `withheld`."""
 
     def result(self, result: ViewResult) -> None:
         """Log the result of an image."""
@@ -92,6 +102,7 @@ class FlyOptions:
     `accept`: criterion in addition to those of the gate.
     `min_confidence`: confidence (0 to 1) from which a position is saved and counts as confident.
     `map_path`: map file to watch for changes; None: none.
+    `map_change`: how the open map file was changed in place, None if it was not.
     `state_path`: file for the last position; None: none.
     `logged_options`: written to the flight log for a replay.
     """
@@ -105,6 +116,7 @@ class FlyOptions:
     accept: Acceptance | None = None
     min_confidence: float = CONFIDENT
     map_path: Path | None = None
+    map_change: Callable[[], str | None] = lambda: None
     state_path: Path | None = None
     logged_options: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
@@ -127,11 +139,14 @@ class Runner:
         start: Callable[[], Prior | None] = lambda: None,
         notifier: Notifier | None = None,
         gnss: GnssWatch | None = None,
+        latency: LatencyMonitor | None = None,
     ) -> None:
-        """`start` gives the prior of the first view; it is called when that view is located."""
+        """`start` gives the prior of the first view; it is called when that view is located.
+        `latency`: that of a live camera; None where images carry the time of their exposure."""
         self._newest, self._camera, self._locator = newest, camera, locator
         self._publisher, self.options, self._clocks = publisher, options, clocks
         self._link, self._sink, self._diagnosis = link, sink, diagnosis
+        self._latency = latency
         self._start: Callable[[], Prior | None] | None = start
         self._notifier = notifier or Notifier("")
         self._gnss = gnss
@@ -144,7 +159,7 @@ class Runner:
         self._saved: states.SavedState | None = None
         self._mismatch = 0.0, 0.0
         self._utc_ahead_ns = clocks.utc_ns() - clocks.mono_ns()
-        self._seen = {"jumps": 0, "outages": 0, "failed": 0, "lost": 0}
+        self._seen = {"jumps": 0, "outages": 0, "failed": 0, "lost": 0, "slow": 0}
         self._map_id = _file_id(options.map_path)
         self._boot_id = states.boot_id()
 
@@ -177,39 +192,100 @@ class Runner:
 
     def _process(self, image: CameraImage) -> ViewResult | None:
         """Result of one image; None where it is too old."""
-        self._image_taken_ns = self._clocks.mono_ns()
+        now_ns = self._image_taken_ns = self._clocks.mono_ns()
         self._count("taken")
-        if self._image_taken_ns - image.exposed_ns > self.options.deadline_s * 1e9:
+        latency = None
+        if self._latency is not None and image.arrival is not None:
+            latency = self._latency.latency(image.arrival)
+        arrived_ns = image.exposed_ns
+        if now_ns - arrived_ns > self.options.deadline_s * 1e9:
             self._count("late")
             return None
+        if latency is not None and math.isfinite(latency.delay_s):
+            delay_ns = round(latency.delay_s * 1e9)
+            image = replace(
+                image, exposed_ns=arrived_ns - delay_ns, time_ns=image.time_ns - delay_ns
+            )
         vehicle, camera = VehicleState(None), self._camera
-        refused = self._bad_image(image)
+        refused = self._map_changed() or self._bad_image(image)
         if refused is None and image.grey is not None:
             try:
                 height, width = image.grey.shape
                 camera = fitted(camera, width, height, image.frame)
             except CameraError as error:
                 refused = self._refusal("wrong_camera", "wrong_camera", str(error))
-        telemetry = None
-        if refused is None:
+        if refused is not None or image.grey is None:
+            frozen = refused is not None and refused.reason == "frozen_image"
+            if frozen and self._latency is not None and image.arrival is not None:
+                self._latency.frozen(image.arrival)
+            return self._refused(image, refused or NoFix("bad_image", "no image"), vehicle)
+        try:
             vehicle, telemetry = self._telemetry(image)
+            view = View(image.grey, camera, telemetry)
+            if latency is not None and latency.reason is not None:
+                return self._withheld(image, view, vehicle, latency)
             refused = self._missing(telemetry)
-        if refused is not None or telemetry is None or image.grey is None:
-            outcome = refused or NoFix("bad_image", "no image")
-            result = self._result(image, outcome, math.nan)
-            self._log(lambda sink: sink.result(result))
-            self._publisher.publish(result, image.exposed_ns, vehicle, judged=False)
-            return result
-        return self._located(image, View(image.grey, camera, telemetry), vehicle)
+            if refused is not None:
+                return self._refused(image, refused, vehicle)
+            return self._located(image, view, vehicle, latency)
+        finally:
+            self._observe(image, camera)
 
-    def _located(self, image: CameraImage, view: View, vehicle: VehicleState) -> ViewResult:
+    def _refused(self, image: CameraImage, reason: NoFix, vehicle: VehicleState) -> ViewResult:
+        """Log and publish an image that cannot be located."""
+        result = self._result(image, reason, math.nan)
+        self._log(lambda sink: sink.result(result))
+        self._publisher.publish(result, image.exposed_ns, vehicle, judged=False)
+        return result
+
+    def _withheld(
+        self, image: CameraImage, view: View, vehicle: VehicleState, latency: Latency
+    ) -> ViewResult:
+        """Log and publish a view whose time of exposure is in doubt: the track must not get it."""
+        reason = latency.reason or ""
+        self._count(reason)
+        result = self._result(image, NoFix(reason, latency.detail), math.nan)
+        if self._latency is not None and self._latency.wants(_arrived_ns(image)):
+            self._log_view(image, view, latency, withheld=True)
+            self._log(lambda sink: sink.result(result))
+        self._publisher.publish(
+            result, image.exposed_ns, vehicle, judged=False, withheld=latency.reason
+        )
+        return result
+
+    def _observe(self, image: CameraImage, camera: Camera) -> None:
+        """Measure the latency of a live camera with one more image."""
+        if self._latency is None or image.arrival is None or image.grey is None:
+            return
+        if self._link is None:
+            return
+        self._latency.observe(
+            image.arrival, image.grey, camera, self._link.state_at, self._link.covered_ns
+        )
+
+    def _log_view(
+        self, image: CameraImage, view: View, latency: Latency | None, *, withheld: bool
+    ) -> None:
+        known = latency is not None and math.isfinite(latency.delay_s)
+        # Without a known latency the telemetry is that of the arrival.
+        delay_ms = latency.delay_s * 1e3 if latency is not None and known else 0.0
+        used_ms = None if latency is None else delay_ms
+        self._log(
+            lambda sink: sink.view(
+                image.number, image.frame, view.grey, view.telemetry, used_ms, withheld
+            )
+        )
+
+    def _located(
+        self, image: CameraImage, view: View, vehicle: VehicleState, latency: Latency | None
+    ) -> ViewResult:
         """Log, locate and publish a view."""
         if self._start is not None:
             prior, self._start = self._start(), None
             telemetry = replace(view.telemetry, prior=prior or view.telemetry.prior)
             view = replace(view, telemetry=telemetry)
         telemetry = view.telemetry
-        self._log(lambda sink: sink.view(image.number, image.frame, view.grey, telemetry))
+        self._log_view(image, view, latency, withheld=False)
         outcome: Fix | NoFix
         try:
             outcome, latency_ms = locate_view(self._locator, view)
@@ -217,8 +293,10 @@ class Runner:
             outcome = self._refusal("wrong_camera", "wrong_camera", str(error))
             latency_ms = math.nan
         self._count("processed")
-        if isinstance(outcome, NoFix) and outcome.reason == "internal_error":
+        if isinstance(outcome, NoFix) and outcome.reason in ("internal_error", MAP_DAMAGED):
             self._count("internal_error")
+        if latency is not None and isinstance(outcome, Fix):
+            outcome = _with_latency(outcome, telemetry, latency.std_s)
         result = self._result(image, outcome, latency_ms)
         accepted = self.options.accept(result.outcome) if self.options.accept else result.outcome
         accepted = accepted if self._gnss is None else self._gnss.corrected(accepted)
@@ -231,7 +309,7 @@ class Runner:
         self._note(result, telemetry, image.exposed_ns)
         if self._diagnosis is not None:
             corrected = self.options.mount.corrected(telemetry) if self.options.mount else telemetry
-            found = result.state not in ("searching", "lost") and isinstance(outcome, Fix)
+            found = result.state in (None, "tracking") and isinstance(outcome, Fix)
             self._diagnosis.observe(replace(view, telemetry=corrected), found, now_ns)
         return result
 
@@ -258,6 +336,15 @@ class Runner:
         state = self._locator.state_name
         result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state)
         return result if self._gnss is None else self._gnss.view(result, image.exposed_ns)
+
+    def _map_changed(self) -> NoFix | None:
+        """Reason to give no position where the map file was changed in place; None if it was not.
+
+        Parts of the map that are in memory would still give positions; they stop all the same, so
+        that the fault shows at once and not where the aircraft leaves these parts.
+        """
+        change = self.options.map_change()
+        return None if change is None else NoFix(MAP_CHANGED, f"map file was changed: {change}")
 
     def _bad_image(self, image: CameraImage) -> NoFix | None:
         """Reason why an image cannot be used; None if it can."""
@@ -347,17 +434,20 @@ class Runner:
 
     def _count_changes(self) -> None:
         """Count what the link, the camera, the outputs and the log counted since the last call."""
+        messenger = self._publisher.messenger
         now = {
             "jumps": 0 if self._link is None else self._link.sync.jumps,
             "outages": self._newest.outages,
             "failed": self._publisher.failed,
             "lost": 0 if self._sink is None else sum(self._sink.lost.values()),
+            "slow": 0 if messenger is None else messenger.too_slow,
         }
         names = {
             "jumps": "clock_jump",
             "outages": "camera_lost",
             "failed": "output_failed",
             "lost": "log_failed",
+            "slow": "slow_vision",
         }
         for key, name in names.items():
             if now[key] > self._seen[key]:
@@ -391,10 +481,18 @@ class Runner:
             state=state,
             synced=link.synced if link else True,
             map_unchanged=_file_id(self.options.map_path) == self._map_id,
+            map_intact=self.options.map_change() is None,
             heading_mismatch_deg=heading_deg,
             log_scale_mismatch=log_scale,
             gnss=() if self._gnss is None else self._gnss.reasons,
+            latency=self._latency_reason(),
         )
+
+    def _latency_reason(self) -> str | None:
+        """Reason why the latency of the camera cannot be used."""
+        if self._latency is None or self._image_taken_ns is None:
+            return None
+        return self._latency.current().reason
 
     def _plain(self, health: Health) -> dict[str, Any]:
         total = self.counter.total
@@ -409,6 +507,7 @@ class Runner:
             "age_p50_ms": round(self.counter.latency_s(0.5) * 1e3, 1),
             "age_p95_ms": round(self.counter.latency_s(0.95) * 1e3, 1),
             **({} if self._gnss is None else {"gnss": self._gnss.plain()}),
+            **({} if self._latency is None else self._latency.plain()),
         }
 
     def _save_state(self) -> None:
@@ -424,6 +523,20 @@ class Runner:
             if self.counter.total["state_failed"] == 0:
                 log.warning("state cannot be saved: %s", error)
             self._count("state_failed")
+
+
+def _arrived_ns(image: CameraImage) -> int:
+    return image.exposed_ns if image.arrival is None else image.arrival.arrived_ns
+
+
+def _with_latency(fix: Fix, telemetry: Telemetry, std_s: float) -> Fix:
+    """Fix whose covariance includes the distance flown in the standard deviation of the latency."""
+    evidence = fix.evidence
+    own = evidence.get("vel_east_mps", math.nan), evidence.get("vel_north_mps", math.nan)
+    velocity = np.array(telemetry.vel_en_mps or own)
+    if not np.isfinite(velocity).all():
+        return fix
+    return replace(fix, cov_en_m2=fix.cov_en_m2 + std_s**2 * np.outer(velocity, velocity))
 
 
 def _file_id(path: Path | None) -> tuple[int, int] | None:

@@ -17,6 +17,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from orthonav.errors import MapFileError
 from orthonav.localizer.localizer import Localizer
 from orthonav.records import Fix, Telemetry, View
 
@@ -64,7 +65,8 @@ class HealthLimits:
     """Thresholds of `judge`; exceeding one is a reason.
 
     `image_age_s`, `telemetry_age_s`, `link_age_s`: time without an image, an attitude, a message.
-    `low_confidence_s`: time without a confident position.
+    `low_confidence_s`, `coasting_s`: time without a confident position, in general and by views
+    that do not show the map.
     `latency_s`: 95th percentile of the time from exposure to message.
     `share`: share (0 to 1) of the images in the window that are unusable, late or lack telemetry.
     `heading_deg`: difference of estimated and reported heading.
@@ -76,6 +78,7 @@ class HealthLimits:
     telemetry_age_s: float = 3.0
     link_age_s: float = 5.0
     low_confidence_s: float = 10.0
+    coasting_s: float = 2.0
     latency_s: float = 0.5
     share: float = 0.2
     heading_deg: float = 20.0
@@ -90,15 +93,18 @@ class Snapshot:
     `running_s`: time since the start.
     `counts`: events within the window by name: `taken` (by the runner), `processed`, `late`,
     `frozen`, `bad_image`, `no_telemetry`, `internal_error`, `wrong_camera`, `camera_lost`,
-    `clock_jump`, `output_failed`, `log_failed`, `state_failed`.
+    `clock_jump`, `output_failed`, `log_failed`, `state_failed`; `slow_vision`, seconds in which a
+    local message came too late for PX4.
     `image_age_s`, `telemetry_age_s`, `link_age_s`: time since the last image, attitude, message.
     `low_confidence_s`: time since the last confident position.
     `latency_s`: 95th percentile of the time from exposure to message.
     `state`: state of the track; None for views that are located one by one.
     `synced`: whether TIMESYNC is answered.
-    `map_unchanged`: whether the map file is still the one that was opened.
+    `map_unchanged`: whether the file of the map's name is still the one that was opened.
+    `map_intact`: whether the open map file was neither truncated nor rewritten.
     `heading_mismatch_deg`, `log_scale_mismatch`: see `mismatch`.
     `gnss`: reasons of the GNSS monitor.
+    `latency`: reason why the latency of the camera cannot be used, see `orthonav.onboard.latency`.
     """
 
     running_s: float
@@ -111,9 +117,11 @@ class Snapshot:
     state: str | None = "tracking"
     synced: bool = True
     map_unchanged: bool = True
+    map_intact: bool = True
     heading_mismatch_deg: float = 0.0
     log_scale_mismatch: float = 0.0
     gnss: tuple[str, ...] = ()
+    latency: str | None = None
 
 
 def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
@@ -127,6 +135,7 @@ def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
         "link_down": settled and seen.link_age_s > limits.link_age_s,
         "no_telemetry": settled and seen.telemetry_age_s > limits.telemetry_age_s,
         "wrong_camera": count["wrong_camera"] > 0,
+        "map_file_changed": not seen.map_intact,
         "internal_errors": count["internal_error"] > 0.5 * max(count["processed"], 1),
     }
     degraded = {
@@ -134,22 +143,26 @@ def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
         "height_mismatch": abs(seen.log_scale_mismatch) > limits.log_scale,
         "lost": seen.state == "lost",
         "searching": seen.state == "searching",
-        "low_confidence": seen.state not in ("lost", "searching")
+        "coasting": seen.state == "coasting" and seen.low_confidence_s > limits.coasting_s,
+        "low_confidence": seen.state not in ("lost", "searching", "coasting")
         and seen.low_confidence_s > limits.low_confidence_s,
         "frozen_image": count["frozen"] > many,
         "bad_images": count["bad_image"] > many,
         "telemetry_gaps": count["no_telemetry"] > many and not failed["no_telemetry"],
         "slow": seen.latency_s > limits.latency_s or count["late"] > many,
+        "slow_vision": count["slow_vision"] > limits.share * WINDOW_S,
         "camera_lost": count["camera_lost"] > 0 and not failed["no_camera"],
         "clock_jumped": count["clock_jump"] > 0,
         "not_synchronized": settled and not seen.synced and not failed["link_down"],
-        "map_file_changed": not seen.map_unchanged,
+        "map_file_changed": not seen.map_unchanged and seen.map_intact,
         "output_failed": count["output_failed"] > 0,
         "log_failed": count["log_failed"] > 0,
         "state_not_saved": count["state_failed"] > 0,
         "internal_error": count["internal_error"] > 0 and not failed["internal_errors"],
         **dict.fromkeys(seen.gnss, True),
     }
+    if seen.latency is not None:
+        degraded = {seen.latency: True, **degraded}  # the cause of others, so it comes first
     worst = tuple(name for name, applies in failed.items() if applies)
     others = tuple(name for name, applies in degraded.items() if applies)
     level = Level.FAILED if worst else Level.DEGRADED if others else Level.OK
@@ -280,6 +293,8 @@ class TelemetryDiagnosis:
                 outcome = self._localizer.locate(assumed, heading_known=heading_known)
                 if isinstance(outcome, Fix) and outcome.confidence >= self._least:
                     self._found = (now_ns, *mismatch(outcome, telemetry))
+            except MapFileError as error:
+                log.warning("diagnosis of telemetry failed: %s", error)
             except Exception:  # the flight does not depend on it
                 log.exception("diagnosis of telemetry failed")
             finally:

@@ -23,7 +23,7 @@ from orthonav.onboard.telemetry import (
     VehicleState,
     wxyz_of_angles,
 )
-from orthonav.publish.estimate import EstimateError
+from orthonav.publish.estimate import Clock, EstimateError
 from orthonav.publish.local import Autopilot, Origin
 from orthonav.publish.mavlink import (
     COMPONENT_ID,
@@ -89,10 +89,11 @@ class AutopilotLink:
         component_id: int = COMPONENT_ID,
         signing: Signing | None = None,
         silent: bool = False,
+        stamp: Clock = Clock.UTC,
     ) -> None:
         """`system_id`: that of the autopilot, by default of the first one heard. `signing`: sign
         outgoing messages and require incoming ones to be signed with the same key. `silent`: send
-        nothing.
+        nothing. `stamp`: clock of the timestamps of messages, with which TIMESYNC is answered.
 
         Raises `MissingExtraError` where pymavlink is missing or too old.
         """
@@ -102,7 +103,7 @@ class AutopilotLink:
         self.gnss: deque[GnssSample] = deque(maxlen=1000)  # for `orthonav.onboard.gnss`
         self._lock = threading.RLock()
         self._wanted, self._component_id, self._silent = system_id, component_id, silent
-        self._signing = signing
+        self._signing, self._stamp = signing, stamp
         self._incoming = _decoder(signing)
         self._transport: Transport | None = None
         self._retry_ns, self._failures = 0, 0
@@ -155,9 +156,15 @@ class AutopilotLink:
 
     def covers(self, exposed_ns: int) -> bool:
         """Whether the attitude at a time of our clock is known."""
+        covered_ns = self.covered_ns
+        return covered_ns is not None and covered_ns >= exposed_ns
+
+    @property
+    def covered_ns(self) -> int | None:
+        """Time of our clock up to which the attitude is known; None without any."""
         with self._lock:
             newest, offset = self.buffer.covered_ns, self.sync.offset_ns
-            return newest is not None and offset is not None and newest >= exposed_ns + offset
+            return None if newest is None or offset is None else newest - offset
 
     def state_at(self, exposed_ns: int) -> VehicleState:
         """State that the autopilot reported for a time of our clock."""
@@ -380,7 +387,10 @@ class AutopilotLink:
 
     def _timesync(self, message: Message, now_ns: int) -> None:
         if message.tc1 == 0:  # a request: answer with the clock that stamps our messages
-            self.send(dialect().MAVLink_timesync_message(self._clocks.utc_ns(), message.ts1))
+            by_utc = self._stamp is Clock.UTC
+            stamp_ns = self._clocks.utc_ns() if by_utc else self.boot_ns(now_ns)
+            if stamp_ns is not None:
+                self.send(dialect().MAVLink_timesync_message(stamp_ns, message.ts1))
         elif message.ts1 in self._asked:
             self._asked.remove(message.ts1)
             if self.sync.exchange(message.ts1, now_ns, message.tc1):

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__
-from orthonav.errors import CameraError, OutputError
+from orthonav.errors import CameraError, OutputError, described
 from orthonav.extras import needed
 from orthonav.flight.fixes import result_to_json
 from orthonav.flight.logged import (
@@ -171,12 +171,20 @@ class FlightLog:
         self._session = session
         self._add(lambda: [self._session_message(session)], 1000)
 
-    def view(self, number: int, frame: str, grey: Grey | None, telemetry: Telemetry) -> None:
+    def view(
+        self,
+        number: int,
+        frame: str,
+        grey: Grey | None,
+        telemetry: Telemetry,
+        latency_ms: float | None = None,
+        withheld: bool = False,
+    ) -> None:
         """Log a view before it is located: `grey` (H, W), None for an unusable image.
 
         `number` is that of the runner; `telemetry` is uncorrected by the mount. The image is
-        copied. The first image sets the size of the camera; images of another size cannot be
-        replayed.
+        copied. `latency_ms`, `withheld`: see `LoggedView`. The first image sets the size of the
+        camera; images of another size cannot be replayed.
         """
         time_ns = self._time_ns = telemetry.time_ns
         if grey is not None and not self._sized:
@@ -186,7 +194,7 @@ class FlightLog:
         while len(self._indices) > RESULTS_LATE:
             self._indices.pop(next(iter(self._indices)))
         picture = "none" if grey is not None else "bad"
-        seen = LoggedView(index, number, frame, telemetry, picture)
+        seen = LoggedView(index, number, frame, telemetry, picture, latency_ms, withheld)
         if grey is None or self._views == "none":
             self._add(lambda: [_telemetry(seen, time_ns)], 1000)
             return
@@ -285,7 +293,7 @@ class FlightLog:
                 if closing:
                     self._end_segment()
             except Exception as error:  # must not end the log
-                self._lose("messages", repr(error), len(taken))
+                self._lose("messages", described(error), len(taken))
                 self._segment = None
             if closing:
                 return
@@ -294,7 +302,7 @@ class FlightLog:
         try:
             return waiting.make()
         except Exception as error:
-            self._lose("views" if waiting.has_view else "messages", repr(error))
+            self._lose("views" if waiting.has_view else "messages", described(error))
             return []
 
     def _write(self, messages: "list[Message]") -> None:

@@ -15,6 +15,7 @@ from orthonav.errors import VariantError
 from orthonav.flight.fixes import result_to_json
 from orthonav.onboard.ports import Descriptor, device_baud, host_port, open_serial
 from orthonav.onboard.telemetry import Clocks, VehicleState
+from orthonav.publish.correlation import FilterCovariance
 from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate
 from orthonav.publish.gate import Gate
 from orthonav.publish.local import Autopilot, Origin
@@ -47,6 +48,9 @@ ATTITUDE_STD_RAD = (math.radians(1.0), math.radians(1.0), math.radians(3.0))
 """Standard deviations sent with the autopilot's own roll, pitch and yaw: assumed."""
 DOWN_STD_M, VEL_DOWN_STD_MPS = 3.0, 0.5
 """Standard deviations sent with the autopilot's own height and vertical velocity: assumed."""
+PX4_VISION_S = 0.2
+"""PX4 starts to fuse a local message only where it follows the one before sooner than this, and
+stops after twice this time without one (`EV_MAX_INTERVAL`; docs/autopilots.md)."""
 ORIGIN_NS = 2 * 10**9
 """Interval at which the origin is sent until the autopilot reports one."""
 _MOST_CLIENTS, _CLIENT_BYTES = 8, 8192
@@ -85,14 +89,20 @@ class MessageOptions:
 
 
 class Messenger:
-    """Builds the messages of a view and sends those that are due. Mutable."""
+    """Builds the messages of a view and sends those that are due. Mutable.
+
+    `not_made`: counts of messages that could not be built, by reason. `too_slow`: number of local
+    messages that followed the one before too late for PX4.
+    """
 
     def __init__(
         self, options: MessageOptions, gate: Gate, send: Callable[[Message], bool], clocks: Clocks
     ) -> None:
         """`gate` limits the rates; `send` returns whether the port was open."""
         self.options, self._gate, self._send, self._clocks = options, gate, send, clocks
+        self._covariance = FilterCovariance(options.min_std_m)
         self.not_made: Counter[str] = Counter()
+        self.too_slow = 0
         self._origin_due_ns = 0
 
     def publish(
@@ -115,14 +125,27 @@ class Messenger:
         for name in self.options.kinds:
             now_ns = self._clocks.mono_ns()
             stamped = replace(estimate, boot_ns=boot_ns, processing_s=(now_ns - exposed_ns) / 1e9)
+            stated = self._covariance.prepare(name, stamped, exposed_ns)
             try:
-                made = self._make(name, stamped, vehicle, target or AUTOPILOT, kind, origin)
+                made = self._make(name, stated, vehicle, target or AUTOPILOT, kind, origin)
             except EstimateError as error:
                 self.not_made[f"{KINDS[name]}: {error}"[:200]] += 1
                 continue
             if self._gate.due(KINDS[name], now_ns) and self._send(made):
                 sent.append(KINDS[name])
+                self._note(name, exposed_ns, kind)
         return tuple(sent)
+
+    def _note(self, name: str, exposed_ns: int, kind: Autopilot | None) -> None:
+        """Note that a message was sent, and whether it was too late for PX4."""
+        interval_s = self._covariance.interval_s(name, exposed_ns)
+        self._covariance.sent(name, exposed_ns)
+        if name in LOCAL and self._convention(kind) is Autopilot.PX4:
+            self.too_slow += PX4_VISION_S <= interval_s < math.inf
+
+    def _convention(self, kind: Autopilot | None) -> Autopilot:
+        """Whose conventions local messages follow; `kind` is the autopilot heard."""
+        return self.options.autopilot or kind or Autopilot.PX4
 
     def send_origin(self, known: Origin | None, target: Target | None) -> None:
         """Send the origin of the local frame until the autopilot reports one (`known`)."""
@@ -144,14 +167,13 @@ class Messenger:
         origin: Origin | None,
     ) -> Message:
         chosen = self.options
-        clock, least, floor = chosen.clock, chosen.min_confidence, chosen.min_std_m
+        clock, least = chosen.clock, chosen.min_confidence
         if name == "global-position":
             return global_position_sensor(
                 estimate,
                 clock=clock,
                 sensor_id=chosen.sensor_id,
                 target=target,
-                min_std_m=floor,
                 min_confidence=least,
             )
         if name == "gps-input":
@@ -161,17 +183,15 @@ class Messenger:
                 gps_id=chosen.gps_id,
                 satellites=chosen.satellites,
                 hdop_m=chosen.hdop_m,
-                min_std_m=floor,
                 min_confidence=least,
             )
         if name == "external-position":
             return external_position_estimate(
-                estimate, clock=clock, target=target, min_std_m=floor, min_confidence=least
+                estimate, clock=clock, target=target, min_confidence=least
             )
         make = odometry if name == "odometry" else vision_position_estimate
         pose = _pose(vehicle, origin)
-        kind = chosen.autopilot or kind or Autopilot.PX4
-        return make(estimate, pose, kind, clock=clock, min_std_m=floor, min_confidence=least)
+        return make(estimate, pose, self._convention(kind), clock=clock, min_confidence=least)
 
 
 def _pose(vehicle: VehicleState, origin: Origin | None) -> LocalPose:

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.outputs import JsonOut, Messenger, NmeaOut
 from orthonav.onboard.telemetry import Clocks, VehicleState
+from orthonav.publish.correlation import FilterCovariance
 from orthonav.publish.estimate import Clock, NavigationEstimate, estimate_from_result
 from orthonav.publish.gate import Gate
 from orthonav.records import CONFIDENT, ViewResult
@@ -44,23 +45,35 @@ class Publisher:
         lines: Sequence[JsonOut] = (),
         graph: PositionOutput | None = None,
         min_confidence: float = CONFIDENT,
+        min_std_m: float = 0.0,
     ) -> None:
+        """`min_std_m`: lower bound of the standard deviation of a fix that `graph` publishes."""
         self.gate, self._clocks = gate, clocks
         self.messenger, self._link = messenger, link
         self._nmea, self._lines, self._least = nmea, lines, min_confidence
         self._graph = [graph] if graph is not None else []
+        self._covariance = FilterCovariance(min_std_m)
         self.failed = 0
 
     def publish(
-        self, result: ViewResult, exposed_ns: int, vehicle: VehicleState, *, judged: bool
+        self,
+        result: ViewResult,
+        exposed_ns: int,
+        vehicle: VehicleState,
+        *,
+        judged: bool,
+        withheld: str | None = None,
     ) -> tuple[str, ...]:
         """Send the position of a view where the gate admits it; the names of the messages.
 
         Only views that the locator processed (`judged`) can give a position: the prediction of a
-        track is not a measurement.
+        track is not a measurement. `withheld`: reason why a view was not located, which the gate
+        counts.
         """
-        estimate, withheld = None, None
-        if judged:
+        estimate = None
+        if withheld is not None:
+            self.gate.withheld[withheld] += 1
+        elif judged:
             now_ns = self._clocks.mono_ns()
             by_our_clock = replace(result, time_ns=exposed_ns)
             ahead_ns = self._clocks.utc_ns() - now_ns
@@ -71,7 +84,8 @@ class Publisher:
         sent: tuple[str, ...] = ()
         if estimate is not None:
             sent = self._send(estimate, exposed_ns, vehicle)
-            sent += self._to_graph(estimate, vehicle, result.time_ns)
+            if not estimate.dead_reckoned:  # messages of ROS cannot mark it
+                sent += self._to_graph(estimate, exposed_ns, vehicle, result.time_ns)
         self._write_nmea(estimate)
         age_ms = (self._clocks.mono_ns() - exposed_ns) / 1e6
         self._each(self._lines, lambda out: out.view(result, age_ms, sent, withheld))
@@ -101,13 +115,15 @@ class Publisher:
         )
 
     def _to_graph(
-        self, estimate: NavigationEstimate, vehicle: VehicleState, stamp_ns: int
+        self, estimate: NavigationEstimate, exposed_ns: int, vehicle: VehicleState, stamp_ns: int
     ) -> tuple[str, ...]:
         sent: list[str] = []
         if self._graph and self.gate.due("ROS2", self._clocks.mono_ns()):
+            stated = self._covariance.prepare("ROS2", estimate, exposed_ns)
             self._each(
-                self._graph, lambda out: sent.extend(out.position(estimate, vehicle, stamp_ns))
+                self._graph, lambda out: sent.extend(out.position(stated, vehicle, stamp_ns))
             )
+            self._covariance.sent("ROS2", exposed_ns)
         return tuple(sent)
 
     def _write_nmea(self, estimate: NavigationEstimate | None) -> None:

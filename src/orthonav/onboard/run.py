@@ -10,13 +10,17 @@ from typing import Protocol
 import numpy as np
 
 from orthonav.confidence.accept import Acceptance
-from orthonav.errors import CameraError, FlightError
+from orthonav.errors import CameraError, FlightError, MapChangedError, MapFileError
 from orthonav.flight.recording import Flight, RecordedView
 from orthonav.localizer.localizer import Localizer
 from orthonav.localizer.tracker import Tracker
 from orthonav.records import Fix, NoFix, Telemetry, View, ViewResult
 
 log = logging.getLogger(__name__)
+MAP_CHANGED = "map_file_changed"
+"""Reason of views after the open map file was truncated or rewritten."""
+MAP_DAMAGED = "map_damaged"
+"""Reason of a view for which a part of the map cannot be decoded."""
 
 
 class Locator(Protocol):
@@ -58,13 +62,20 @@ class SingleViews:
 def locate_view(locator: Locator, view: View) -> tuple[Fix | NoFix, float]:
     """Result of one view and the time taken in ms; an internal error becomes a `NoFix`.
 
-    Raises `CameraError` only: a wrong camera is an error of the whole flight.
+    A map file that changed in place gives no position, not even that of a track. Raises
+    `CameraError` only: a wrong camera is an error of the whole flight.
     """
     start = time.perf_counter()
     try:
         outcome = locator.locate(view)
     except CameraError:
         raise
+    except MapChangedError as error:
+        log.error("%s", error)
+        outcome = NoFix(MAP_CHANGED, str(error))
+    except MapFileError as error:  # a crafted part of the map, decoded for this view
+        log.error("%s", error)
+        outcome = _passed(locator, view.telemetry, NoFix(MAP_DAMAGED, str(error)))
     except Exception as error:  # one view must not end a flight
         log.exception("view could not be processed")
         outcome = _passed(locator, view.telemetry, _internal(error))

@@ -51,7 +51,7 @@ class BufferLimits:
     `attitude_ahead_s`: longest extrapolation of the attitude.
     """
 
-    keep_s: float = 10.0
+    keep_s: float = 20.0  # the longest latency of a camera that is measured, and some more
     attitude_gap_s: float = 0.5
     attitude_hold_s: float = 0.1
     attitude_ahead_s: float = 0.03

@@ -40,12 +40,16 @@ class NavigationEstimate:
     `confidence`: probability (0 to 1) that the fix is correct; NaN: not known.
     `utc_ns`, `boot_ns`: time of exposure by each clock; at least one is needed.
     `processing_s`: time from exposure until the message is sent.
-    `agl_m`: height above ground; NaN where not known, as the next three.
+    `agl_m`: height above ground; NaN where not known, as the next four.
+    `tilt_std_deg`: standard deviation of the estimated tilt of the camera mount, the larger of
+    pitch and roll.
     `alt_amsl_m`, `alt_std_m`: altitude above mean sea level and its standard deviation.
     `heading_deg`: heading of the top of the image, clockwise from true north.
     `vel_en_mps`, `vel_cov_en`: velocity over ground (true east, north) and its covariance (2, 2).
     `state`: state of the track; None for views that are located one by one.
     `reset_counter`: 0 to 255; changes when the position jumped.
+    `dead_reckoned`: the view did not show the map, and the position is sent all the same because
+    that was asked for; messages that can mark it do, others are not made.
 
     Raises `EstimateError` where a value is out of range or no time is given.
     """
@@ -58,6 +62,7 @@ class NavigationEstimate:
     boot_ns: int | None = None
     processing_s: float = 0.0
     agl_m: float = math.nan
+    tilt_std_deg: float = math.nan
     alt_amsl_m: float = math.nan
     alt_std_m: float = math.nan
     vel_en_mps: tuple[float, float] | None = None
@@ -65,6 +70,7 @@ class NavigationEstimate:
     heading_deg: float = math.nan
     state: str | None = None
     reset_counter: int = 0
+    dead_reckoned: bool = False
 
     def __post_init__(self) -> None:
         if not (abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 180):  # NaN too
@@ -154,6 +160,7 @@ def estimate_from_result(
         boot_ns=boot_ns,
         processing_s=processing_s,
         agl_m=fix.agl_m,
+        tilt_std_deg=_tilt_std_deg(fix),
         alt_amsl_m=alt_amsl_m,
         alt_std_m=alt_std_m,
         vel_en_mps=_velocity(fix) if result.state is not None else None,
@@ -198,6 +205,11 @@ def _both_clocks(
     if clock is Clock.UTC:
         return time_ns, None if utc_minus_boot_ns is None else time_ns - utc_minus_boot_ns
     return None if utc_minus_boot_ns is None else time_ns + utc_minus_boot_ns, time_ns
+
+
+def _tilt_std_deg(fix: Fix) -> float:
+    names = ("pitch_bias_std_deg", "roll_bias_std_deg")
+    return float(np.max([fix.evidence.get(name, math.nan) for name in names]))
 
 
 def _velocity(fix: Fix) -> tuple[float, float] | None:

@@ -40,7 +40,9 @@ class GateRules:
     `max_age_s`: longest time since exposure, seconds.
     `min_interval_s`: shortest time between two messages, by name; others are not limited.
     `jump_sigmas`: a position that differs from the prediction by more than this many standard
-    deviations plus the possible manoeuvre counts as a jump (reset counter).
+    deviations plus the possible manoeuvre is a jump.
+    `jump_views`: a jump is withheld until so many views in a row agree on the new place.
+    `send_coasting`: admit dead reckoning of a track too; messages mark it.
     `velocity_std_mps`: standard deviation of a velocity that has no covariance.
     `max_accel_mps2`: acceleration of the possible manoeuvre where the velocity is known.
     `max_speed_mps`: speed of the possible manoeuvre where it is not.
@@ -53,6 +55,8 @@ class GateRules:
     max_age_s: float = 1.0
     min_interval_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     jump_sigmas: float = 5.0
+    jump_views: int = 3
+    send_coasting: bool = False
     velocity_std_mps: float = 1.0
     max_accel_mps2: float = 10.0
     max_speed_mps: float = 60.0
@@ -75,10 +79,11 @@ class Gate:
     """Checks the estimates of one flight in order. Mutable; for one thread.
 
     `withheld`: counts by reason: `no_fix`, `not_tracking`, `low_confidence`, `no_covariance`,
-    `too_uncertain`, `from_the_future`, `stale`, `out_of_order`, and `rate:NAME` for a message that
-    would exceed its rate.
+    `too_uncertain`, `from_the_future`, `stale`, `out_of_order`, `coasting` for dead reckoning,
+    `jump` for an impossible one that no other view has confirmed, `rate:NAME` for a message that
+    would exceed its rate, and the reasons of views that the flight loop does not locate.
     `sent`: counts of messages by name.
-    `resets`: number of jumps of the position.
+    `resets`: number of admitted jumps of the position, and of tracks found again.
     """
 
     def __init__(self, rules: GateRules | None = None, clock: Clock = Clock.UTC) -> None:
@@ -90,6 +95,7 @@ class Gate:
         self.resets = 0
         self._last: NavigationEstimate | None = None
         self._interrupted = False
+        self._jumped_to: list[NavigationEstimate] = []
         self._due_ns: dict[str, int] = {}
 
     def admit(self, estimate: NavigationEstimate | None, now_ns: int) -> NavigationEstimate | None:
@@ -104,11 +110,26 @@ class Gate:
         if estimate is None or reason is not None:
             self.withheld[reason or "no_fix"] += 1
             return None
-        if self._last is not None and (self._interrupted or self._jumped(self._last, estimate)):
+        coasting = estimate.state == "coasting"
+        jumped = self._last is not None and self._jumped(self._last, estimate)
+        if jumped and (coasting or not self._is_confirmed(estimate)):
+            self.withheld["jump"] += 1
+            return None
+        self._jumped_to = []
+        if jumped or (self._last is not None and self._interrupted):
             self.resets += 1
         self._interrupted = False
-        self._last = replace(estimate, reset_counter=self.resets % 256)
-        return self._last
+        made = replace(estimate, reset_counter=self.resets % 256, dead_reckoned=coasting)
+        if not coasting:
+            self._last = made
+        return made
+
+    def _is_confirmed(self, estimate: NavigationEstimate) -> bool:
+        """Whether enough views in a row, this one included, agree on a place after a jump."""
+        if self._jumped_to and self._jumped(self._jumped_to[-1], estimate):
+            self._jumped_to = []
+        self._jumped_to.append(estimate)
+        return len(self._jumped_to) >= self.rules.jump_views
 
     def due(self, message: str, now_ns: int) -> bool:
         """Whether the rate of `message` allows sending now; counts it as sent or withheld.
@@ -140,8 +161,10 @@ class Gate:
         if self._last is not None:
             behind_s = (self._last.exposed_ns(self.clock) - exposed_ns) / 1e9
         refusals = {
-            "not_tracking": estimate.state not in (None, "tracking"),
-            "low_confidence": not estimate.confidence >= self.rules.min_confidence,  # NaN too
+            "coasting": estimate.state == "coasting" and not self.rules.send_coasting,
+            "not_tracking": estimate.state not in (None, "tracking", "coasting"),
+            "low_confidence": estimate.state != "coasting"
+            and not estimate.confidence >= self.rules.min_confidence,  # NaN too
             "no_covariance": math.isnan(std_m),
             "too_uncertain": std_m > self.rules.max_std_m,
             "from_the_future": age_s < -FUTURE_S,
@@ -152,9 +175,9 @@ class Gate:
         return next((reason for reason, applies in refusals.items() if applies), None)
 
     def _watch(self, estimate: NavigationEstimate | None) -> None:
-        """Note the loss of a track: a view without a fix, or not tracking, after tracking."""
+        """Note the loss of a track: a view without a fix, searching or lost, after tracking."""
         tracked = self._last is not None and self._last.state == "tracking"
-        if tracked and (estimate is None or estimate.state != "tracking"):
+        if tracked and (estimate is None or estimate.state not in ("tracking", "coasting")):
             self._interrupted = True
 
     def _jumped(self, before: NavigationEstimate, now: NavigationEstimate) -> bool:

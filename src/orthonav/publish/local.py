@@ -61,6 +61,16 @@ def north_east_m(
     return north_m, turned_deg * ARDUPILOT_M_PER_DEG * scale
 
 
+def ardupilot_variance(std_m: float) -> float:
+    """Variance of each of three axes that ArduPilot reads as the standard deviation `std_m`.
+
+    It takes the root of the sum of the variances of all three axes; older versions the cube root of
+    the sum of their squares, which gives `std_m` at 3 m and more than it above
+    (`libraries/GCS_MAVLink/GCS_Common.cpp`).
+    """
+    return std_m**2 / 3
+
+
 def _px4(origin: Origin, lat_deg: float, lon_deg: float) -> tuple[float, float]:
     """Azimuthal-equidistant projection of a sphere; atan2 is also accurate near zero."""
     lat, lat0 = math.radians(lat_deg), math.radians(origin.lat_deg)

@@ -132,11 +132,13 @@ def global_position_sensor(
     """GLOBAL_POSITION_SENSOR (message 296): a position from map matching, stamped at sending.
 
     An estimate of low confidence is UNHEALTHY and has neither position nor accuracy, because some
-    receivers do not read the flag. `sensor_id` is 1 to 255 (PX4 reads 0 as "off").
+    receivers do not read the flag; a dead-reckoned one is UNHEALTHY and has both. `sensor_id` is 1
+    to 255 (PX4 reads 0 as "off").
     """
     if not 1 <= sensor_id <= 255:
         raise EstimateError(f"sensor_id must be 1 to 255, got {sensor_id}")
     confident = estimate.is_confident(min_confidence)
+    placed = confident or estimate.dead_reckoned
     return dialect().MAVLink_global_position_sensor_message(
         target_system=target.system_id,
         target_component=target.component_id,
@@ -145,11 +147,11 @@ def global_position_sensor(
         processing_time=clamped(estimate.processing_s * 1e6, 0, _UINT32_MAX),
         source=_SOURCE_VISION,
         flags=0 if confident else _UNHEALTHY,
-        lat=deg_e7(estimate.lat_deg) if confident else _INT32_MAX,
-        lon=deg_e7(estimate.lon_deg) if confident else _INT32_MAX,
+        lat=deg_e7(estimate.lat_deg) if placed else _INT32_MAX,
+        lon=deg_e7(estimate.lon_deg) if placed else _INT32_MAX,
         alt_ellipsoid=math.nan,
         alt=float32(estimate.alt_amsl_m),
-        eph=float32(estimate.horizontal_std_m(min_std_m)) if confident else math.nan,
+        eph=float32(estimate.horizontal_std_m(min_std_m)) if placed else math.nan,
         epv=float32(estimate.alt_std_m) if math.isfinite(estimate.alt_amsl_m) else math.nan,
     )
 

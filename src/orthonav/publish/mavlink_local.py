@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.publish.estimate import Clock, EstimateError, NavigationEstimate, floored
-from orthonav.publish.local import Autopilot, Origin, north_east_m
+from orthonav.publish.local import Autopilot, Origin, ardupilot_variance, north_east_m
 from orthonav.publish.mavlink import (
     Message,
     clamped,
@@ -161,7 +161,11 @@ def _position(
     min_std_m: float,
     message: str,
 ) -> tuple[Triple, Array]:
-    """North, east, down in metres and their (3, 3) covariance, all of them known."""
+    """North, east, down in metres and their (3, 3) covariance, all of them known.
+
+    ArduPilot makes one standard deviation of the covariance; it gets the one that comes out as the
+    horizontal standard deviation.
+    """
     north, east = north_east_m(pose.origin, estimate.lat_deg, estimate.lon_deg, autopilot)
     down, down_std = pose.origin.alt_amsl_m - estimate.alt_amsl_m, estimate.alt_std_m
     if not math.isfinite(down):
@@ -171,6 +175,9 @@ def _position(
             f"{message} needs the autopilot's height and its standard deviation; without them "
             "receivers drop the position or its accuracy"
         )
+    if autopilot is Autopilot.ARDUPILOT:
+        std_m = estimate.horizontal_std_m(min_std_m)
+        return (north, east, down), np.eye(3) * ardupilot_variance(std_m)
     variance = np.zeros((3, 3))
     variance[:2, :2] = floored(estimate.cov_en_m2[::-1, ::-1], min_std_m)
     variance[2, 2] = down_std**2

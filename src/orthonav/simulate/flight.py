@@ -358,13 +358,19 @@ def _path(request: SimulateRequest, line_en_m: Array) -> FlownPath:
     if not (0 < spacing_m < math.inf and 0 < airspeed_mps < math.inf):
         raise FlightError("distance between views and airspeed must be above 0")
     line = rounded(line_en_m, request.turn_radius_m) if request.turn_radius_m else line_en_m
+    length_m = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+    if length_m / spacing_m > MAX_VIEWS:
+        raise FlightError(
+            f"route of {length_m / 1000:,.1f} km with a view every {spacing_m:g} m has more than "
+            f"{MAX_VIEWS:,} views; increase the distance between views"
+        )
     if request.wind is None:
         path = steady_path(line, spacing_m, airspeed_mps)
     else:
         rng = np.random.default_rng([request.seed, 2])
         path = windy_path(line, spacing_m, airspeed_mps, request.wind, rng, MAX_VIEWS)
     if len(path.places_en_m) > MAX_VIEWS:
-        raise FlightError(f"route has {len(path.places_en_m)} views, more than {MAX_VIEWS}")
+        raise FlightError(f"route has more than {MAX_VIEWS:,} views; increase their distance")
     return path
 
 

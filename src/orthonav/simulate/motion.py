@@ -25,6 +25,8 @@ SHARPEST_DEG = 179.0
 """Sharper corners are flown as turns on the spot."""
 LONGEST_STEP_S = 0.5
 """Longest time step with constant wind and course."""
+MAX_STEPS = 1_000_000
+"""Limit of the time steps of a flight in wind: 139 hours."""
 Array = NDArray[np.float64]
 
 
@@ -98,7 +100,7 @@ def windy_path(
     """Path along the polyline (M, 2) in wind, with a crab angle and a varying ground speed.
 
     Views are `spacing_m / airspeed_mps` seconds apart, at most `most` + 1. Raises `FlightError` if
-    the strongest gust is as fast as the aircraft.
+    the strongest gust is as fast as the aircraft, or if the flight takes more than `MAX_STEPS`.
     """
     if wind.strongest_mps >= airspeed_mps:
         raise FlightError(
@@ -112,6 +114,9 @@ def windy_path(
         return steady_path(line_en_m, spacing_m, airspeed_mps)
     courses, ends = legs / lengths[:, None], np.cumsum(lengths)
     interval_s = spacing_m / airspeed_mps
+    least_s = ends[-1] / (airspeed_mps + wind.strongest_mps)
+    if max(least_s, interval_s) > MAX_STEPS * LONGEST_STEP_S:
+        raise _too_long()
     steps = math.ceil(interval_s / LONGEST_STEP_S)
     air = _moving_air(wind, interval_s / steps, rng)
     rows: list[tuple[float, ...]] = []
@@ -129,10 +134,19 @@ def windy_path(
             rows.append((*place, *heading, *(ground_mps * course)))
         along_m += ground_mps * interval_s / steps
         number += 1
+        if number > MAX_STEPS:
+            raise _too_long()
     made = np.array(rows)
     headings = np.asarray(np.degrees(np.arctan2(made[:, 2], made[:, 3])) % 360, dtype=np.float64)
     times = np.arange(len(made), dtype=np.float64) * interval_s
     return FlownPath(made[:, :2], headings, times, made[0, 4:])
+
+
+def _too_long() -> FlightError:
+    return FlightError(
+        f"flight in wind takes more than {MAX_STEPS:,} time steps; shorten the route or raise the "
+        "airspeed"
+    )
 
 
 def _moving_air(wind: Wind, step_s: float, rng: np.random.Generator) -> Iterator[Array]:

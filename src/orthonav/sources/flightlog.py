@@ -55,11 +55,13 @@ _NUMBERED = re.compile(r"(.+)_(\d{4,9})\.mcap")
 class LoggedFlight(Recording):
     """An open flight log. `session`: run, version, views, map and options as they were logged.
 
-    `results` reads the results of the flight, in order.
+    `results` reads the results of the flight, in order. `arrivals` reads all views in the order of
+    arrival, also those that were withheld, each with the latency that was subtracted from it.
     """
 
     session: Mapping[str, Any] = field(default_factory=dict)
     results: Callable[[], Iterator[ViewResult]] = lambda: iter(())
+    arrivals: Callable[[], Iterator[tuple[SourceView, float]]] = lambda: iter(())
 
 
 @dataclass
@@ -95,6 +97,7 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
         raise FlightError(f"no chunk of the flight log is complete: {path}")
     camera = _camera(index.session, path)
     replayable = _replayable(index, path)
+    images = _LoggedImages(index.pictures, camera)
     used = camera
     if options.camera is not None:
         given = read_camera_file(options.camera)
@@ -107,10 +110,11 @@ def open_flight_log(path: Path, options: SourceOptions) -> LoggedFlight:
         camera=used,
         note=f"{path.name}: flight log {run!s:.40} of orthonav {version!s:.40}",
         expected=len(replayable),
-        stream=partial(_stream, replayable, _LoggedImages(index.pictures, camera), options),
+        stream=partial(_stream, replayable, images, options),
         warnings=tuple(index.warnings),
         session=index.session,
         results=partial(_results, files),
+        arrivals=partial(_arrivals, index, images, options),
     )
 
 
@@ -228,9 +232,11 @@ def _replayable(index: _Index, path: Path) -> list[LoggedView]:
             raise FlightError(f"view {view.frame} appears twice: {path}")
         seen.add(view.frame)
     replayable = [
-        each for each in index.views if each.index in index.pictures or each.picture == "bad"
+        each
+        for each in index.views
+        if not each.withheld and (each.index in index.pictures or each.picture == "bad")
     ]
-    if not replayable or not index.pictures:
+    if not index.pictures:
         raise FlightError(
             f"flight log holds no full images (views: {index.session.get('views')!s:.20}), so "
             f"nothing can be localized again: {path}"
@@ -261,7 +267,13 @@ def _warn_of_gaps(index: _Index, replayable: list[LoggedView]) -> None:
             f"the first {begin} views of the flight are not in the log: a track begins later than "
             "in flight"
         )
-    missing = end - begin - len(replayable)
+    withheld = sum(view.withheld for view in index.views)
+    missing = end - begin - len(replayable) - withheld
+    if withheld:
+        index.warnings.append(
+            f"{withheld} views were not located in flight, because the latency of the camera was "
+            "not known, and are left out"
+        )
     if missing > 0:
         index.warnings.append(
             f"{missing} views lack a full image and are left out: a track differs after them"
@@ -280,6 +292,15 @@ def _stream(
             where=where,
             load=partial(pictures.grey, view.index, where),
         )
+
+
+def _arrivals(
+    index: _Index, pictures: "_LoggedImages", options: SourceOptions
+) -> Iterator[tuple[SourceView, float]]:
+    """Views with an image, and the latency (s) that was subtracted from their arrival."""
+    views = [each for each in index.views if each.index in index.pictures]
+    latencies = [(each.camera_latency_ms or 0.0) / 1e3 for each in views]
+    yield from zip(_stream(views, pictures, options), latencies, strict=True)
 
 
 class _LoggedImages:

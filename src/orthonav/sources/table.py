@@ -1,7 +1,7 @@
 """Telemetry as a table over time, with the columns of a flight folder's `telemetry.csv`."""
 
-import csv
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 from orthonav.errors import FlightError
@@ -9,6 +9,7 @@ from orthonav.flight.folder import number_of, time_ns_of
 from orthonav.geo.swapped import swapped_hint
 from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
 from orthonav.sources.track import RecordedTrack, Samples, TimeSeries, attitude_of_angles
+from orthonav.tables import TableError, TableRows
 
 NEEDED = ("time_s", "pitch_deg", "roll_deg")
 MAX_BYTES = 500_000_000
@@ -33,28 +34,38 @@ def read_table(path: Path) -> RecordedTrack:
     others = {name: Samples(len(columns)) for name, columns in _NAMES.items()}
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.DictReader(stream, skipinitialspace=True)
-            missing = [name for name in NEEDED if name not in (reader.fieldnames or ())]
+            rows = TableRows(stream)
+            missing = [name for name in NEEDED if name not in rows.columns]
             if missing:
                 raise FlightError(f"columns are missing: {', '.join(missing)}: {path}")
-            for row in reader:
+            held = {
+                name: columns
+                for name, columns in _NAMES.items()
+                if not set(columns).isdisjoint(rows.columns)
+            }
+            placed = not {"lat_deg", "prior_lat_deg"}.isdisjoint(rows.columns)
+            for row in rows:
                 time_ns = time_ns_of(row["time_s"])
                 if time_ns is None:
-                    raise FlightError(f"line {reader.line_num}: time_s is not a time: {path}")
+                    raise FlightError(f"line {rows.line}: time_s is not a time: {path}")
                 angles = (number_of(row.get(f"{name}_deg")) for name in ("yaw", "pitch", "roll"))
                 attitude.add(time_ns, *angles)
-                latlon = number_of(row.get("lat_deg")), number_of(row.get("lon_deg"))
-                prior = number_of(row.get("prior_lat_deg")), number_of(row.get("prior_lon_deg"))
-                if hint := swapped_hint(*latlon) or swapped_hint(*prior):
-                    raise FlightError(
-                        f"line {reader.line_num}: position is out of range{hint}: {path}"
-                    )
-                position.add(time_ns, *latlon, math.nan)
-                for name, columns in _NAMES.items():
+                if placed:
+                    position.add(time_ns, *_position(row, rows.line, path), math.nan)
+                for name, columns in held.items():
                     others[name].add(time_ns, *(number_of(row.get(column)) for column in columns))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise FlightError(f"not a CSV file in UTF-8 ({error}): {path}") from error
+    except TableError as error:
+        raise FlightError(f"{error}: {path}") from error
     return _track(attitude, position, others, path)
+
+
+def _position(row: Mapping[str, str | None], line: int, path: Path) -> tuple[float, float]:
+    """Latitude and longitude of a row; raises `FlightError` where they seem to be swapped."""
+    lat_deg, lon_deg = number_of(row.get("lat_deg")), number_of(row.get("lon_deg"))
+    prior = number_of(row.get("prior_lat_deg")), number_of(row.get("prior_lon_deg"))
+    if hint := swapped_hint(lat_deg, lon_deg) or swapped_hint(*prior):
+        raise FlightError(f"line {line}: position is out of range{hint}: {path}")
+    return lat_deg, lon_deg
 
 
 def _track(

@@ -16,6 +16,8 @@ MIN_SHARE = 1e-7
 MERGE_SIGMAS = 1.0
 """Two hypotheses are merged where merging loses less (in nats, doubled) than this many standard
 deviations of distance, squared."""
+MINOR_OF_GROUP = 0.01
+"""Share of a group of hypotheses below which one says nothing about the group."""
 COMPARED = np.ix_([0, 1, 2, 3, 6, 7], [0, 1, 2, 3, 6, 7])
 """Components that decide whether two hypotheses are alike: position, velocity and tilt."""
 
@@ -27,7 +29,8 @@ class Hypothesis:
     `share`: its probability. `mean` (8,), `covariance` (8, 8): its state. `sighted`: new ground
     that it recognized, in views. `number`: unique in the flight. `parent`: the number of the
     hypothesis of the last view from which it was predicted, -1 where it was born now. `expected`:
-    that prediction, None where it was born now.
+    that prediction, None where it was born now. `recognized`: probability, by the last view alone
+    and by how it agrees with the prediction, that this view showed the map here.
     """
 
     share: float
@@ -37,6 +40,7 @@ class Hypothesis:
     number: int
     parent: int = -1
     expected: Expected | None = None
+    recognized: float = 0.0
 
 
 def merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
@@ -54,8 +58,26 @@ def merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
         mean, covariance = moments(group)
         share = sum(each.share for each in group)
         sighted = sum(each.share * each.sighted for each in group) / share
-        out.append(replace(first, share=share, mean=mean, covariance=covariance, sighted=sighted))
+        out.append(
+            replace(
+                first,
+                share=share,
+                mean=mean,
+                covariance=covariance,
+                sighted=sighted,
+                recognized=recognized(group),
+            )
+        )
     return out
+
+
+def recognized(group: Sequence[Hypothesis]) -> float:
+    """Largest probability of having recognized the map in several hypotheses that are one place.
+
+    Those with less than `MINOR_OF_GROUP` of the group's probability do not count.
+    """
+    least = MINOR_OF_GROUP * sum(each.share for each in group)
+    return max(each.recognized for each in group if each.share >= least)
 
 
 def _divergence(one: Hypothesis, heavier: Hypothesis, inverse: Array) -> float:

@@ -12,11 +12,19 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
 
 import numpy as np
 
 from orthonav.records import CONFIDENT
-from orthonav.track.hypotheses import Hypothesis, distance, merged, moments, within
+from orthonav.track.hypotheses import (
+    Hypothesis,
+    distance,
+    merged,
+    moments,
+    recognized,
+    within,
+)
 from orthonav.track.model import (
     POSITION,
     SEEN,
@@ -62,6 +70,16 @@ MOST_OF_ONE = 0.75
 """A single view counts at most so much: less than `CONFIRMED`."""
 UNCONFIRMED = 0.8
 """Highest confidence that is stated before a track is confirmed (docs/decisions/tracking.md, 9)."""
+RECOGNIZED = 0.2
+"""Probability from which on a view shows the map, by this view alone and by its agreement with the
+prediction: pictures of anything else stay below 0.12. Without, a track is coasting
+(docs/decisions/tracking.md, 12)."""
+MOST_AGREEMENT = 25.0
+"""Largest factor on the odds by the agreement with the prediction: a view that has a probability
+below 1 % by itself does not show the map."""
+UNRECOGNIZED = 0.5
+"""Factor on the count of recognized ground for each view of new ground that does not show the map:
+after a few, a track must be confirmed again."""
 MOST_SIGHTED = 3.0
 """Highest count of recognized ground, in views."""
 WIDE_M, FORGOTTEN = 50.0, 0.5
@@ -81,8 +99,13 @@ class State(Enum):
     """State of the track, as `fixes.jsonl` has it."""
 
     SEARCHING = "searching"
+    """No place has been confirmed."""
     TRACKING = "tracking"
+    """Confirmed, and this view shows the map where the track is."""
+    COASTING = "coasting"
+    """Confirmed before; this view does not show the map, the position is dead reckoning."""
     LOST = "lost"
+    """Confirmed before; the position is no longer likely."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +122,7 @@ class Estimate:
     confidence: float
     state: State
     belief: float
+    recognized: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +130,19 @@ class _Measurement:
     """A sighting as a measurement of the state.
 
     `mean` (6,), `noise` (6, 6): in the components `SEEN`. `log_odds`: log odds over the density of
-    places, headings and scales that only look alike. `recognized`: new ground, in views.
+    places, headings and scales that only look alike. `new_ground`: what it confirms, in views.
+    `own_noise` (6, 6): covariance without regard to earlier views of the same ground. `alone`:
+    probability by the view alone. `log_chance`: log density of places, headings and scales that
+    chance finds in the area searched.
     """
 
     mean: Array
     noise: Array
     log_odds: float
-    recognized: float
+    new_ground: float
+    own_noise: Array
+    alone: float
+    log_chance: float
 
 
 class Mixture:
@@ -206,15 +236,15 @@ class Mixture:
         the aircraft may also have made an unexpected turn.
         """
         model, likely = self.model, 1 - self.model.odometry_outlier
-        dead_reckoned = predicted(
-            model, each.mean, each.covariance, seconds, velocity, telemetry_noise
-        )
+        coasting = self._state in (State.COASTING, State.LOST)
+        step = partial(predicted, model, each.mean, coasting=coasting)
+        dead_reckoned = step(each.covariance, seconds, velocity, telemetry_noise)
         if camera is None:
             chance = 0.0
             if velocity is None and each.share >= MAJOR_SHARE:  # nothing measures the displacement
                 chance = 1 - (1 - model.turn) ** seconds
                 free = velocity_forgotten(model, each.covariance)
-                yield chance, predicted(model, each.mean, free, seconds, velocity, telemetry_noise)
+                yield chance, step(free, seconds, velocity, telemetry_noise)
             yield 1.0 - chance, dead_reckoned
             return
         # An outlier lies anywhere within the radius of the search.
@@ -229,9 +259,7 @@ class Mixture:
                 (likely * model.turn, velocity_forgotten(model, each.covariance)),
             ]
         for share, covariance in turns:
-            turned = predicted(
-                model, each.mean, covariance, seconds, velocity, telemetry_noise, camera
-            )
+            turned = step(covariance, seconds, velocity, telemetry_noise, camera)
             seen, log_fit = by_camera(turned, camera)
             splits.append((math.log(share) + log_fit, seen))
         best = max(log_share for log_share, _ in splits)
@@ -256,12 +284,15 @@ class Mixture:
         made = []
         missed = self.model.miss**newness
         found = (1 - self.model.miss) ** newness
-        measurements = [self._measurement(reported, each, newness) for each in sightings]
+        area_m2 = self.area_m2 if searched is None else math.pi * searched[1] ** 2
+        measurements = [self._measurement(reported, each, newness, area_m2) for each in sightings]
         for each in self.hypotheses:
             in_search = self._on_map(each.mean)
             if searched is not None:
                 in_search &= bool(np.hypot(*(each.mean[:2] - searched[0])) < searched[1])
-            made.append(replace(each, share=each.share * (missed if in_search else 1.0)))
+            share = each.share * (missed if in_search else 1.0)
+            sighted = each.sighted * UNRECOGNIZED**newness
+            made.append(replace(each, share=share, sighted=sighted))
             for start in self._with_bias_jump(each):
                 for seen in measurements:
                     split = self._updated(start, seen)
@@ -287,12 +318,14 @@ class Mixture:
         mean, covariance = moments(near)
         confidence = min(self._inside(radius_m, mean[POSITION]), 1.0)
         sighted = max(each.sighted for each in near)
+        seen = recognized(near)
         if not between_views:
-            self._state = self._next_state(confidence, sighted)
+            confirmed = seen >= RECOGNIZED and sighted >= CONFIRMED
+            self._state = self._next_state(confidence, confirmed)
         if self._state is not State.TRACKING:
             confidence = min(confidence, UNCONFIRMED)
         belief = sum(each.share for each in near)
-        return Estimate(mean, covariance, confidence, self._state, belief)
+        return Estimate(mean, covariance, confidence, self._state, belief, seen)
 
     @property
     def likeliest(self) -> Hypothesis | None:
@@ -319,11 +352,13 @@ class Mixture:
         mean, covariance = moments(self.hypotheses)
         return mean[4:], covariance[4:, 4:]
 
-    def _next_state(self, confidence: float, sighted: float) -> State:
-        if confidence >= CONFIDENT and sighted >= CONFIRMED:
+    def _next_state(self, confidence: float, confirmed: bool) -> State:
+        """State after a view; `confirmed`: by it and by enough ground recognized before."""
+        followed = self._state in (State.TRACKING, State.COASTING)
+        if confirmed and confidence >= (LIKELY if followed else CONFIDENT):
             return State.TRACKING
-        if self._state is State.TRACKING and confidence < LIKELY:
-            return State.LOST
+        if followed:
+            return State.COASTING if confidence >= LIKELY else State.LOST
         return self._state
 
     def _on_map(self, mean: Array) -> bool:
@@ -346,9 +381,11 @@ class Mixture:
         return [replace(each, share=each.share * (1 - rare)), other]
 
     def _measurement(
-        self, reported: ReportedAttitude, sighting: Sighting, newness: float
+        self, reported: ReportedAttitude, sighting: Sighting, newness: float, area_m2: float
     ) -> "_Measurement":
         """A sighting as a measurement, tempered by the share of it that is new.
+
+        `area_m2`: of the part of the map that was searched.
 
         A likelihood raised to the power `newness` has a broader peak, which stands out less from
         all places, headings and scales. The telemetry noise, independent at every view, is
@@ -356,7 +393,8 @@ class Mixture:
         """
         mean, noise, anew = measurement(self.model, reported, sighting)
         own = np.diag(noise)[POSE] + self.model.initial_bias()[:2]
-        wide = math.log(self.area_m2) + float(np.log(SEARCHED_SIGMAS * np.sqrt(own)).sum())
+        poses = float(np.log(SEARCHED_SIGMAS * np.sqrt(own)).sum())
+        wide = math.log(self.area_m2) + poses
         # Tilts are distributed as those of mounts at every place: no evidence for one.
         tilts = noise[4:, 4:] + anew[4:, 4:]
         wide -= math.log(
@@ -369,7 +407,13 @@ class Mixture:
         odds = newness * (min(sighting.log_odds, MAX_LOG_ODDS) + wide)
         odds += (1 - newness) * float(log_det) / 2 - len(SEEN) / 2 * math.log(newness)
         return _Measurement(
-            mean, noise / newness + anew, odds, min(newness * _trust(sighting.alone), MOST_OF_ONE)
+            mean,
+            noise / newness + anew,
+            odds,
+            min(newness * _trust(sighting.alone), MOST_OF_ONE),
+            noise + anew,
+            sighting.alone,
+            -math.log(area_m2) - poses,
         )
 
     def _updated(self, each: Hypothesis, seen: "_Measurement") -> Hypothesis | None:
@@ -387,8 +431,9 @@ class Mixture:
             share=each.share * math.exp(min(log_weight, 60.0)),
             mean=mean,
             covariance=covariance,
-            sighted=min(each.sighted + seen.recognized, MOST_SIGHTED),
+            sighted=min(each.sighted + seen.new_ground, MOST_SIGHTED),
             number=self._numbers,
+            recognized=_recognized(seen, each, innovation),
         )
 
     def _nowhere(self, tilt_rad: float | None = None) -> tuple[Array, Array]:
@@ -413,7 +458,9 @@ class Mixture:
             mean, covariance = updated(mean, covariance, seen.mean, spread)
             share *= self.elsewhere * math.exp(min(log_weight, 60.0))
             self._numbers += 1
-            yield Hypothesis(share, mean, covariance, seen.recognized, self._numbers)
+            yield Hypothesis(
+                share, mean, covariance, seen.new_ground, self._numbers, recognized=seen.alone
+            )
 
     def _from(self, each: Hypothesis, expected: Expected, share: float) -> Hypothesis:
         self._numbers += 1
@@ -428,6 +475,20 @@ class Mixture:
         total = sum(each.share for each in self.hypotheses) + self.elsewhere
         self.hypotheses = [replace(e, share=e.share / total) for e in self.hypotheses]
         self.elsewhere /= total
+
+
+def _recognized(seen: _Measurement, each: Hypothesis, innovation: Array) -> float:
+    """Probability that a view showed the map, given its place and the prediction of that.
+
+    The odds by the view alone, times the likelihood ratio of the innovation (6,) in position,
+    heading and scale between a right place and one that chance finds in the area searched. A place
+    within the gate is never less likely for its distance.
+    """
+    spread = each.covariance[np.ix_(SEEN[:4], SEEN[:4])] + seen.own_noise[:4, :4]
+    ratio = log_density(innovation[:4], spread) - seen.log_chance
+    agreement = math.exp(min(max(ratio, 0.0), math.log(MOST_AGREEMENT)))
+    odds = seen.alone / max(1 - seen.alone, 1e-9) * agreement
+    return odds / (1 + odds)
 
 
 def _trust(alone: float) -> float:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.records import DEFAULT_AGL_STD, DEFAULT_YAW_STD_DEG
+from orthonav.records import DEFAULT_AGL_STD, DEFAULT_YAW_STD_DEG, MAP_STD_M
 
 Array = NDArray[np.float64]
 STATE = 8
@@ -41,6 +41,9 @@ class Model:
     """Of the acceleration while no velocity is reported, per axis."""
     reported_velocity_s: float = 120.0
     """Correlation time of the error of a reported velocity, s (docs/decisions/tracking.md, 6)."""
+    coasting_walk: float = 1.3
+    """Of the drift of that error while views do not show the map, m/s per root of a second: 3 m/s
+    and 9 m after 5 s, 24 m after 10 s (docs/decisions/tracking.md, 12)."""
     heading_rad: float = math.radians(DEFAULT_YAW_STD_DEG)
     """Of the constant error of the reported heading."""
     heading_noise_rad: float = math.radians(2.0)
@@ -65,7 +68,7 @@ class Model:
     """Of the drift of the misalignment, rad per root of a second."""
     sighting_noise_m: float = 2.0
     """Of the disagreement of two dates beyond the covariance of a registration, per axis."""
-    map_m: float = 3.0
+    map_m: float = MAP_STD_M
     """Of a displacement of the map as a whole, per axis: added to the covariance of a fix."""
     sighting_growth: float = 2.0
     """Factor on the position covariance of a registration, its part due to tilt excepted

@@ -88,12 +88,15 @@ def predicted(
     velocity: ReportedVelocity | None,
     telemetry_noise: Array,
     camera: CameraDisplacement | None = None,
+    *,
+    coasting: bool = False,
 ) -> Expected:
     """The state predicted over so many seconds, by the reported velocity or else its own.
 
     `telemetry_noise` (2,): variances of reported heading (rad) and log scale from view to view.
     They are added to the biases of these, unless the `camera` measured the change. The displacement
-    by the camera is not included: see `by_camera`.
+    by the camera is not included: see `by_camera`. While `coasting`, the error of a reported
+    velocity drifts (`Model.coasting_walk`).
     """
     after, step = mean.copy(), np.eye(STATE)
     noise = np.zeros((STATE, STATE))
@@ -112,7 +115,8 @@ def predicted(
     else:
         like_before = 0.0
         after[VELOCITY] = velocity.now_en_mps
-        if velocity.before_en_mps is not None and covariance[2, 2] < (3 * velocity.std_mps) ** 2:
+        known_mps = model.speed_mps / 2 if coasting else 3 * velocity.std_mps
+        if velocity.before_en_mps is not None and covariance[2, 2] < known_mps**2:
             like_before = math.exp(-seconds / model.reported_velocity_s)
             after[VELOCITY] += like_before * (mean[VELOCITY] - velocity.before_en_mps)
         after[POSITION] += seconds * after[VELOCITY]
@@ -121,6 +125,9 @@ def predicted(
         anew = velocity.std_mps**2 * (1 - like_before**2)
         jitter = (VELOCITY_JITTER * velocity.std_mps * seconds) ** 2
         _add(noise, anew * seconds**2 + jitter, anew * seconds, anew)
+        if coasting:
+            power = model.coasting_walk**2
+            _add(noise, power * seconds**3 / 3, power * seconds**2 / 2, power * seconds)
     return Expected(
         after, step @ covariance @ step.T + noise, mean, covariance, covariance @ step.T
     )

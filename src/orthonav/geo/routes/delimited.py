@@ -1,11 +1,12 @@
 """Routes as tables: CSV with comma, semicolon or tab, one waypoint a row."""
 
-import csv
+import io
 from typing import Any
 
 from orthonav.errors import RouteError
-from orthonav.geo.routes.record import Height, HeightFrame, Route
+from orthonav.geo.routes.record import Height, HeightFrame, Route, require_few_waypoints
 from orthonav.geo.routes.values import decoded, parsed
+from orthonav.tables import MAX_LINE_CHARS, TableError, TableRows
 
 _LAT = ("lat_deg", "lat", "latitude", "latitude_deg")
 _LON = ("lon_deg", "lon", "lng", "long", "longitude", "longitude_deg")
@@ -23,14 +24,18 @@ def read_delimited(data: bytes) -> list[Route]:
 
     Raises `RouteError`.
     """
-    text = decoded(data)
-    header = text.split("\n", 1)[0]
+    stream = io.StringIO(decoded(data), newline=None)
+    header = stream.readline(MAX_LINE_CHARS)
+    stream.seek(0)
     delimiter = max(",;\t", key=header.count)
     try:
-        reader = csv.DictReader(text.splitlines(), delimiter=delimiter, skipinitialspace=True)
-        names = {str(name).strip().lower(): name for name in reader.fieldnames or ()}
-        rows = list(reader)
-    except csv.Error as error:
+        table = TableRows(stream, delimiter=delimiter)
+        names = {name.strip().lower(): name for name in table.columns}
+        rows = []
+        for row in table:
+            rows.append(row)
+            require_few_waypoints(len(rows))
+    except TableError as error:
         raise RouteError(f"route table cannot be read ({error})") from error
     lat, lon = _column(names, _LAT), _column(names, _LON)
     if lat is None or lon is None:

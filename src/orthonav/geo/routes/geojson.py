@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from orthonav.errors import RouteError
-from orthonav.geo.routes.record import Height, Route
+from orthonav.geo.routes.record import Height, Route, require_few_waypoints
 from orthonav.geo.routes.values import json_object, number, number_or_none
 
 
@@ -73,6 +73,7 @@ def _feature(route: Route) -> dict[str, Any]:
 def _route(coordinates: Any, properties: dict[str, Any]) -> Route:
     if not isinstance(coordinates, list):
         raise RouteError(f"GeoJSON position must be in a list as numbers, got {coordinates!r:.80}")
+    require_few_waypoints(len(coordinates))
     points = [_position(point) for point in coordinates]
     frames = properties.get("height_frame")
     if not isinstance(frames, list):

@@ -10,10 +10,10 @@ from xml.etree.ElementTree import Element
 
 from orthonav.errors import RouteError
 from orthonav.geo.routes.markup import read_markup, text_of
-from orthonav.geo.routes.record import Height, HeightFrame, Route
+from orthonav.geo.routes.record import Height, HeightFrame, Route, require_few_waypoints
 from orthonav.geo.routes.values import parsed
 
-MAX_KML_BYTES = 50_000_000
+MAX_KML_BYTES = 20_000_000
 MAX_MEMBERS = 10_000
 _HEIGHT_FRAMES: dict[str, HeightFrame] = {"absolute": "amsl", "relativeToGround": "agl"}
 """With other altitude modes, or none, the altitude is ignored, as KML specifies."""
@@ -75,11 +75,13 @@ def _routes(mark: Element) -> list[Route]:
 
 
 def _line(element: Element) -> Iterator[_Place]:
-    """Positions of `lon,lat[,alt]` tuples separated by spaces; spaces after commas are accepted."""
+    """Positions of `lon,lat[,alt]` tuples separated by spaces; spaces at commas are accepted."""
     frame = _HEIGHT_FRAMES.get(text_of(element, "altitudeMode") or "")
-    text = re.sub(r"\s*,\s*", ",", text_of(element, "coordinates") or "")
-    for position in text.split():
-        yield _place(position.split(","), frame, position)
+    text = re.sub(r"\s+", " ", text_of(element, "coordinates") or "")  # linear, unlike \s*,\s*
+    text = text.replace(" ,", ",").replace(", ", ",")
+    for number, found in enumerate(re.finditer(r"\S+", text), 1):
+        require_few_waypoints(number)
+        yield _place(found.group().split(","), frame, found.group())
 
 
 def _track(element: Element) -> Iterator[_Place]:

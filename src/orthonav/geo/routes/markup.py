@@ -1,6 +1,6 @@
 """Safe reading of XML of unknown origin: no DTD, hence no entities and no external files.
 
-defusedxml and gpxpy are not used here: neither limits the number and depth of elements, and 50 MB
+defusedxml and gpxpy are not used here: neither limits the number and depth of elements, and 20 MB
 of empty elements would take gigabytes.
 """
 

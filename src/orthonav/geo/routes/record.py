@@ -21,6 +21,15 @@ MAX_WAYPOINTS = 100_000
 """Sanity limit against files that exhaust memory."""
 
 
+def require_few_waypoints(count: int) -> None:
+    """Raise `RouteError` for more than `MAX_WAYPOINTS`; readers ask before they make them."""
+    if count > MAX_WAYPOINTS:
+        raise RouteError(
+            f"route has at least {count:,} waypoints, at most {MAX_WAYPOINTS:,} are read; "
+            "simplify it"
+        )
+
+
 @dataclass(frozen=True)
 class Height:
     """Height of a waypoint.
@@ -67,11 +76,7 @@ class Route:
     def __post_init__(self) -> None:
         if not self.waypoints:
             raise RouteError("route has no waypoints")
-        if len(self.waypoints) > MAX_WAYPOINTS:
-            raise RouteError(
-                f"route has {len(self.waypoints):,} waypoints, at most {MAX_WAYPOINTS:,} are read; "
-                "simplify it"
-            )
+        require_few_waypoints(len(self.waypoints))
         for lat, lon in self.waypoints:
             if not (abs(lat) <= 90 and abs(lon) <= 360):
                 raise RouteError(

@@ -6,10 +6,14 @@ first item is the planned home position, in the older 120 of QGroundControl ther
 (QGroundControl, `MissionController::_loadTextMissionFile`).
 """
 
+import io
+from collections.abc import Iterator
+
 from orthonav.errors import RouteError
 from orthonav.geo.routes.mission import Home, MissionItem, route_of
-from orthonav.geo.routes.record import Route
+from orthonav.geo.routes.record import Route, require_few_waypoints
 from orthonav.geo.routes.values import decoded, parsed
+from orthonav.tables import TableError, bounded_lines
 
 _COLUMNS = 12
 _MAGIC = b"QGC WPL"
@@ -22,21 +26,30 @@ def is_wpl(data: bytes) -> bool:
 
 def read_wpl(data: bytes) -> list[Route]:
     """The route of a waypoint file. Raises `RouteError`."""
-    lines = decoded(data).strip().splitlines()
-    version = lines[0].split()
-    if version not in (["QGC", "WPL", "110"], ["QGC", "WPL", "120"]):
-        raise RouteError(f"waypoint file must begin with 'QGC WPL 110', got {lines[0]!r:.60}")
-    items = [
-        _item(line.split(), number)
-        for number, line in enumerate(lines[1:], 2)
-        if line.strip() and not line.startswith("#")
-    ]
+    lines = bounded_lines(io.StringIO(decoded(data).lstrip(), newline=None))
+    try:
+        first_line = next(lines)
+        version = first_line.split()
+        if version not in (["QGC", "WPL", "110"], ["QGC", "WPL", "120"]):
+            raise RouteError(
+                f"waypoint file must begin with 'QGC WPL 110', got {first_line.rstrip()!r:.60}"
+            )
+        items = list(_items(lines))
+    except TableError as error:
+        raise RouteError(f"waypoint file cannot be read ({error})") from error
     home = None
     if version[2] == "110" and items:
         first, *items = items
         if first.lat_deg or first.lon_deg:
             home = Home(first.lat_deg or 0.0, first.lon_deg or 0.0, first.height_m)
     return [route_of(items, home)]
+
+
+def _items(lines: Iterator[str]) -> Iterator[MissionItem]:
+    for number, line in enumerate(lines, 2):
+        require_few_waypoints(number - 2)  # the first line is the home position
+        if line.strip() and not line.startswith("#"):
+            yield _item(line.split(), number)
 
 
 def _item(values: list[str], line: int) -> MissionItem:

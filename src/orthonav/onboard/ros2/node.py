@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from orthonav.errors import OutputError
+from orthonav.errors import OutputError, described
 from orthonav.onboard.ros2.arguments import RosArguments
 from orthonav.onboard.ros2.messages import (
     Definitions,
@@ -171,7 +171,8 @@ class Node:
                 subscription.handler(message, cdr)
             except Exception as error:  # one odd message never ends a flight
                 if not self.undecodable[subscription.topic]:
-                    log.warning("message on %s: %r", subscription.topic, error)
+                    why = described(error)
+                    log.warning("message on %s cannot be used (%s)", subscription.topic, why)
                 self.undecodable[subscription.topic] += 1
             handled += 1
         return handled

@@ -51,7 +51,7 @@ async function begin() {
 function tie({ store, map, marks, chosen, compare, course, list, health }) {
   store.addEventListener("data", ({ detail }) => {
     find("scrub").max = Math.max(store.count - 1, 0);
-    if (detail.added || detail.anew) {
+    if (detail.added || detail.restarted) {
       marks.later();
       course.draw();
       list.drawChoices();
@@ -60,7 +60,7 @@ function tie({ store, map, marks, chosen, compare, course, list, health }) {
       drawLegend(store);
     }
     health.draw();
-    if (detail.anew && !store.count) nothing({ chosen, compare, course });
+    if (detail.restarted && !store.count) nothing({ chosen, compare, course });
   });
   store.addEventListener("filter", () => { marks.later(); course.draw(); list.draw(); });
   store.addEventListener("select", ({ detail }) => {

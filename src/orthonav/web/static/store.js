@@ -31,8 +31,8 @@ export class Store extends EventTarget {
 
   /** Takes a response of api/news. */
   take(news) {
-    const anew = news.generation !== this.generation;
-    if (anew) {
+    const restarted = news.generation !== this.generation;
+    if (restarted) {
       this.clear();
       this.generation = news.generation;
       this.selected = -1;
@@ -47,9 +47,9 @@ export class Store extends EventTarget {
     const first = this.count;
     this.count += added;
     for (let i = first; i < this.count; i++) this.#count(i);
-    if (!added && !anew && !news.health.length) return;
-    if (added || anew) this.#filter(first);
-    this.dispatchEvent(new CustomEvent("data", { detail: { first, added, anew } }));
+    if (!added && !restarted && !news.health.length) return;
+    if (added || restarted) this.#filter(first);
+    this.dispatchEvent(new CustomEvent("data", { detail: { first, added, restarted } }));
     if (this.selected < 0 && this.count) this.select(0);
   }
 

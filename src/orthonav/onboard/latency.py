@@ -1,0 +1,314 @@
+"""Decides which delay of a live camera is used, and when it is not known well enough.
+
+The delay is known where it was stated or measured in flight. It is not known after a change
+(`orthonav.onboard.arrival`) until it has been measured again, while measurements contradict it, and
+while the pictures do not move as the autopilot reports.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from orthonav.geo.camera import Camera
+from orthonav.onboard.arrival import GAP_S, Arrival
+from orthonav.onboard.delay import UNEXPLAINED, DelayEstimate, DelayEstimator
+from orthonav.onboard.delay_check import DelayCheck
+from orthonav.onboard.history import StateHistory
+from orthonav.onboard.motion import Grey, PictureOdometry
+from orthonav.onboard.telemetry import VehicleState
+from orthonav.sources.attitude import LOOKS_DOWN, Angles, enu_from_body_camera
+
+UNKNOWN, UNSTEADY, MISMATCH = "latency_unknown", "latency_unsteady", "motion_mismatch"
+EVERY_NS = 10**9
+"""Interval of estimates."""
+RECENT_S = 8.0
+"""Pictures of so many seconds show a change that the whole window hides."""
+SAMPLE_NS = 50_000_000
+"""Interval at which reported states are stored."""
+LARGEST_M, USUAL_MPS, LEAST_MPS = 4.0, 20.0, 5.0
+"""A measured delay is known where its standard deviation times the speed is at most so many metres;
+speed where none is reported, and least speed."""
+STATED_STD_S = 0.03
+"""Standard deviation of a stated delay: one image at 30 Hz."""
+AGREE_S, AGREE_SIGMAS = 0.08, 4.0
+"""Delays agree within the larger of both."""
+WALK_S, LARGEST_WALK_S = 0.01, 0.1
+"""Growth of the standard deviation since the measurement, per square root of a second, and its
+limit: a delay without a sign of change is believed, as a stated one is."""
+DRIFTS, TOO_FAST = 0.008, 0.05
+"""Drift (s/s) above which a delay is extrapolated, and above which it is not steady."""
+EXTRAPOLATED_S = 15.0
+"""Longest time for which a drifting delay is extrapolated."""
+GROWN_S, GROWN_RATE = 0.15, 0.002
+"""Growth of the delay by timestamps that counts as a change, and what clocks may add to it each
+second."""
+UNLIKE = "images do not move as reported at the latency in use"
+BEFORE_S = 0.1
+"""An exposure that is later than the arrival by more than this shows clocks that disagree."""
+
+
+@dataclass(frozen=True)
+class Latency:
+    """The delay to use for one image.
+
+    `delay_s`, `std_s`: exposure to arrival and its standard deviation; NaN where not known.
+    `reason`: why it must not be used; None if it can be used. `detail`: one sentence about it.
+    """
+
+    delay_s: float
+    std_s: float
+    reason: str | None = None
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class _Known:
+    """A delay that is used; `measured_ns`: arrival of the last picture of the measurement."""
+
+    delay_s: float
+    std_s: float
+    drift: float = 0.0
+    measured_ns: int | None = None
+
+    def at(self, arrived_ns: int) -> tuple[float, float]:
+        """Delay and standard deviation for an arrival."""
+        if self.measured_ns is None:
+            return self.delay_s, self.std_s
+        age_s = max(0.0, (arrived_ns - self.measured_ns) / 1e9)
+        walk_s = min(WALK_S * math.sqrt(age_s), LARGEST_WALK_S)
+        return self.delay_s + self.drift * age_s, math.hypot(self.std_s, walk_s)
+
+
+class LatencyMonitor:
+    """Measures and judges the delay of a live camera. Mutable; for one thread."""
+
+    def __init__(
+        self,
+        stated_s: float | None = None,
+        stated_std_s: float = STATED_STD_S,
+        *,
+        mount_deg: Angles = LOOKS_DOWN,
+        heading_known: bool = True,
+    ) -> None:
+        """`stated_s`: delay as stated by the user, None: not stated."""
+        self._stated = None if stated_s is None else _Known(stated_s, stated_std_s)
+        self._known = self._stated
+        self._mount_deg = mount_deg
+        self._odometry, self._history = PictureOdometry(), StateHistory()
+        self._estimator = DelayEstimator(heading_known=heading_known)
+        self._check = DelayCheck(heading_known=heading_known)
+        self._sampled_ns: int | None = None
+        self._due_ns: int | None = None
+        self._pending: DelayEstimate | None = None
+        self._suspicion = ""
+        self._disputed = False
+        self._contradictions = 0
+        self._changes: int | None = None
+        self._anchor: tuple[int, float] | None = None
+        self._grown = False
+        self._arrival: Arrival | None = None
+        self._frozen_ns: int | None = None
+
+    def wants(self, arrived_ns: int) -> bool:
+        """Whether an image that arrived then is compared with the one before."""
+        return self._odometry.wants(arrived_ns)
+
+    def latency(self, arrival: Arrival) -> Latency:
+        """The delay to use for an image. Pass every image, in the order of arrival."""
+        self._watch(arrival)
+        return self._judged(arrival.arrived_ns)
+
+    def frozen(self, arrival: Arrival) -> None:
+        """Note an image that repeats the one before: the stream may be stalled."""
+        if self._frozen_ns is None:
+            self._frozen_ns = arrival.arrived_ns
+
+    def _judged(self, arrived_ns: int) -> Latency:
+        if self._known is None:
+            advice = "fly turns until it is measured, or give --camera-latency-ms"
+            return Latency(math.nan, math.nan, UNKNOWN, f"camera latency not known: {advice}")
+        delay_s, std_s = self._known.at(arrived_ns)
+        reason, detail = None, ""
+        if self._contradictions >= 2:
+            detail = "images do not move as the autopilot reports: check the camera, --mount-deg"
+            reason, detail = MISMATCH, f"{detail}, the height and the heading"
+        elif self._suspicion:
+            reason = UNSTEADY
+            detail = f"{self._suspicion}: the camera latency must be measured again, in turns"
+        elif self._drifted_away(arrived_ns):
+            reason, detail = UNSTEADY, "the camera latency drifts and is not observable now"
+        elif std_s * self._speed_mps() > 2 * LARGEST_M:
+            reason, detail = UNKNOWN, f"camera latency known to {std_s * 1e3:.0f} ms only"
+        return Latency(delay_s, std_s, reason, detail)
+
+    def observe(
+        self,
+        arrival: Arrival,
+        grey: Grey,
+        camera: Camera,
+        state_at: Callable[[int], VehicleState],
+        covered_ns: int | None,
+    ) -> None:
+        """Compare an image with the one before, and with the states that the autopilot reported.
+
+        `state_at` gives the state at a time of our clock, known up to `covered_ns`.
+        """
+        self._frozen_ns = None  # this image is not frozen
+        self._sample(state_at, covered_ns)
+        motion = self._odometry.motion(grey, camera, arrival.arrived_ns)
+        self._estimator.add(motion, self._history)
+        if self._known is not None:
+            delay_s, _ = self._known.at(arrival.arrived_ns)
+            self._check.add(motion, self._history, delay_s)
+        if self._due_ns is None or arrival.arrived_ns >= self._due_ns:
+            self._due_ns = arrival.arrived_ns + EVERY_NS
+            self._judge(self._estimator.estimate(), self._estimator.estimate(RECENT_S))
+            self._compare()
+
+    def current(self) -> Latency:
+        """The delay that was used last, or why it was not."""
+        return self._judged(0 if self._arrival is None else self._arrival.arrived_ns)
+
+    def plain(self) -> dict[str, float | str | None]:
+        """What is known, for logs: `latency_ms`, `latency_std_ms`, and `latency`, where it comes
+        from or why it is not used."""
+        found = self.current()
+        source = "stated" if self._known is self._stated else "measured"
+        rounded = (
+            None if math.isnan(each) else round(each * 1e3, 1)
+            for each in (found.delay_s, found.std_s)
+        )
+        delay_ms, std_ms = rounded
+        return {
+            "latency_ms": delay_ms,
+            "latency_std_ms": std_ms,
+            "latency": f"{found.reason}: {found.detail}" if found.reason else source,
+        }
+
+    def _sample(self, state_at: Callable[[int], VehicleState], covered_ns: int | None) -> None:
+        if covered_ns is None:
+            return
+        if self._sampled_ns is None or covered_ns - self._sampled_ns > 10**9:
+            self._sampled_ns = covered_ns - SAMPLE_NS  # at the start, or after a gap
+        while self._sampled_ns + SAMPLE_NS <= covered_ns:
+            self._sampled_ns += SAMPLE_NS
+            state = state_at(self._sampled_ns)
+            turn = state.ned_from_body
+            attitude = None if turn is None else enu_from_body_camera(turn, self._mount_deg)
+            north, east, down = state.velocity_ned_mps
+            velocity = north + east + down
+            known = (east, north, -down) if math.isfinite(velocity) else None
+            self._history.add(self._sampled_ns, attitude, known, state.height_m)
+
+    def _watch(self, arrival: Arrival) -> None:
+        """Notice changes in the arrivals."""
+        self._arrival = arrival
+        if self._changes is None:
+            self._changes = arrival.changes
+        if arrival.changes != self._changes:
+            self._changes, self._anchor, self._grown = arrival.changes, None, False
+            self._suspect(arrival.why, arrival.arrived_ns)
+        if self._frozen_ns is not None:
+            stalled_s = (arrival.arrived_ns - self._frozen_ns) / 1e9
+            if stalled_s > GAP_S:
+                self._suspect(f"the image was frozen for {stalled_s:.1f} s", arrival.arrived_ns)
+        if math.isnan(arrival.grown_s):
+            return
+        if self._anchor is None:
+            self._anchor = arrival.arrived_ns, arrival.grown_s
+        since_ns, grown_s = self._anchor
+        allowed_s = GROWN_S + GROWN_RATE * (arrival.arrived_ns - since_ns) / 1e9
+        grown = abs(arrival.grown_s - grown_s) > allowed_s
+        if grown and not self._grown:
+            change_ms = (arrival.grown_s - grown_s) * 1e3
+            self._suspect(f"images arrive {change_ms:+.0f} ms later", arrival.arrived_ns)
+        elif self._grown and not grown:  # as late as before
+            self._suspicion = ""
+            self._start_again(arrival.arrived_ns)
+        self._grown = grown
+
+    def _suspect(self, why: str, arrived_ns: int) -> None:
+        self._suspicion, self._disputed = why, False
+        self._start_again(arrived_ns)
+
+    def _start_again(self, arrived_ns: int) -> None:
+        """Forget pictures from before a change."""
+        self._estimator.forget_before(arrived_ns)
+        self._odometry.reset()
+        self._check.clear()
+        self._pending, self._contradictions = None, 0
+
+    def _judge(self, whole: DelayEstimate, recent: DelayEstimate) -> None:
+        found = recent if recent.found else whole
+        if found.contradicted or recent.contradicted:
+            self._contradictions += 1
+            return
+        self._contradictions = 0
+        if not found.found or found.std_s * self._speed_mps() > LARGEST_M:
+            return
+        if found.delay_s < -BEFORE_S or abs(found.drift) > TOO_FAST:
+            before = found.delay_s < -BEFORE_S
+            why = "images seem to arrive before exposure" if before else "the latency drifts fast"
+            self._dispute(why, found)
+            return
+        known = self._known
+        if known is not None and not (self._suspicion and not self._disputed):
+            delay_s, std_s = known.at(found.last_ns)
+            if _near(found.delay_s - delay_s, found.std_s, std_s):
+                self._adopt(found)
+                return
+        if self._pending is not None and _agree(found, self._pending):
+            self._adopt(found)
+        elif known is None or (self._suspicion and not self._disputed):
+            self._pending = found
+        else:
+            delay_ms = known.at(found.last_ns)[0] * 1e3
+            measured = f"measured {found.delay_s * 1e3:.0f} ms, used {delay_ms:.0f} ms"
+            self._dispute(measured, found)
+
+    def _compare(self) -> None:
+        """Dispute the delay in use where the last seconds do not fit it."""
+        # It cannot be settled here: steady turns look alike at many delays.
+        if self._check.share() < UNEXPLAINED and not self._suspicion:
+            self._suspicion, self._disputed, self._pending = UNLIKE, True, None
+
+    def _dispute(self, why: str, found: DelayEstimate) -> None:
+        """Withhold until the next estimate agrees with this one or with what was known."""
+        self._suspicion, self._disputed, self._pending = why, True, found
+
+    def _adopt(self, found: DelayEstimate) -> None:
+        stated = self._stated
+        changed = self._known is None or not _near(
+            found.delay_s - self._known.at(found.last_ns)[0], found.std_s, 0.0
+        )
+        if stated is not None and _near(found.delay_s - stated.delay_s, found.std_s, stated.std_s):
+            self._known = stated
+        else:
+            drift = found.drift if abs(found.drift) > DRIFTS else 0.0
+            self._known = _Known(found.delay_s, found.std_s, drift, found.last_ns)
+        if changed:  # older pictures belong to another delay
+            self._estimator.forget_before(found.last_ns - round(RECENT_S * 1e9))
+            self._check.clear()
+        self._suspicion, self._disputed, self._pending, self._grown = "", False, None, False
+        if self._arrival is not None and math.isfinite(self._arrival.grown_s):
+            self._anchor = self._arrival.arrived_ns, self._arrival.grown_s
+
+    def _drifted_away(self, arrived_ns: int) -> bool:
+        known = self._known
+        if known is None or known.measured_ns is None or known.drift == 0.0:
+            return False
+        return arrived_ns - known.measured_ns > EXTRAPOLATED_S * 1e9
+
+    def _speed_mps(self) -> float:
+        speed = self._history.speed_mps()
+        return max(LEAST_MPS, speed) if math.isfinite(speed) else USUAL_MPS
+
+
+def _near(off_s: float, std_s: float, other_std_s: float) -> bool:
+    return abs(off_s) <= max(AGREE_S, AGREE_SIGMAS * math.hypot(std_s, other_std_s))
+
+
+def _agree(one: DelayEstimate, other: DelayEstimate) -> bool:
+    """Whether two estimates agree; False where one of them was not found."""
+    moved_s = other.drift * (one.last_ns - other.last_ns) / 1e9
+    return _near(one.delay_s - other.delay_s - moved_s, one.std_s, other.std_s)

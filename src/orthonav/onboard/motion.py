@@ -1,0 +1,185 @@
+"""Motion of the picture between consecutive images, as seen and as the autopilot reports it.
+
+Both are given as the rotation about the optical axis and the displacement of the centre of the
+picture, so that they can be compared. Corners are tracked (Shi and Tomasi 1994; Lucas and Kanade in
+a pyramid, Bouguet 2001) in a small picture, independently of the odometry of the localizer.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.geo.camera import Camera, undistort
+
+SIDE_PX = 240
+"""Images are compared at this width or height, whichever is larger: corners are then found to about
+0.1 px, 0.03 deg for a usual lens."""
+CORNERS, LEAST_CORNERS, LEAST_SHARE = 90, 20, 0.5
+"""Corners that are sought; those that must be found again, by number and share."""
+RETURN_PX = 0.5
+"""A corner tracked forth and back must return within this distance (Kalal et al. 2010)."""
+RANSAC_PX = 1.0
+SHORTEST_S, LONGEST_S = 0.08, 1.2
+"""Images closer than this are skipped, and not compared if they are further apart."""
+FARTHEST_TILT_COS = 0.3
+"""Cosine of the largest angle between optical axis and vertical for which motion is predicted."""
+Array = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+Corners = NDArray[np.float32]
+_WINDOW = (17, 17)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageMotion:
+    """Motion from one image to a later one.
+
+    `start_ns`, `end_ns`: times of arrival of both. `turn_rad`: rotation of the picture about the
+    optical axis, clockwise in the image. `shift` (2,): displacement of the centre, right and down,
+    in units of the focal length.
+    """
+
+    start_ns: int
+    end_ns: int
+    turn_rad: float
+    shift: Array
+
+    @property
+    def seconds(self) -> float:
+        """Time between the images."""
+        return (self.end_ns - self.start_ns) / 1e9
+
+
+class PictureOdometry:
+    """Compares every image with the one before. Mutable."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the image before."""
+        self._before: Grey | None = None
+        self._arrived_ns = 0
+        self._corners: Corners | None = None
+
+    def wants(self, arrived_ns: int) -> bool:
+        """Whether an image that arrived then would be used."""
+        return self._before is None or not 0 <= arrived_ns - self._arrived_ns < SHORTEST_S * 1e9
+
+    def motion(self, grey: Grey, camera: Camera, arrived_ns: int) -> ImageMotion | None:
+        """Motion since the image before; None where they are too close, too far apart, or differ.
+
+        `grey` (H, W); `camera` of its size; `arrived_ns`: time of arrival.
+        """
+        if not self.wants(arrived_ns):
+            return None
+        share = min(1.0, SIDE_PX / max(grey.shape))
+        size = (max(8, round(grey.shape[1] * share)), max(8, round(grey.shape[0] * share)))
+        small = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
+        before, corners, start_ns = self._before, self._corners, self._arrived_ns
+        self._before, self._arrived_ns = small, arrived_ns
+        self._corners = _corners(small)
+        if before is None or corners is None or before.shape != small.shape:
+            return None
+        if not 0 < arrived_ns - start_ns <= LONGEST_S * 1e9:
+            return None
+        pairs = _tracked(before, small, corners)
+        if pairs is None:
+            return None
+        return _motion(*pairs, camera.resized(size[0], size[1]), start_ns, arrived_ns)
+
+
+def _corners(grey: Grey) -> Corners | None:
+    """Corners (N, 1, 2) of an image; None where there are none."""
+    found: Any = cv2.goodFeaturesToTrack(grey, CORNERS, 0.02, SIDE_PX / 30, blockSize=5)
+    return None if found is None else np.asarray(found, np.float32)
+
+
+def _tracked(before: Grey, now: Grey, corners: Corners) -> tuple[Corners, Corners] | None:
+    """Corners (N, 2) of an image and where they are in the next one; None where too few are
+    found again."""
+    options = {"winSize": _WINDOW, "maxLevel": 3}
+    ahead, found, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None, **options)  # type: ignore[call-overload]
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(now, before, ahead, None, **options)  # type: ignore[call-overload]
+    off = np.abs(back - corners).reshape(-1, 2).max(axis=1)
+    good = (found.ravel() == 1) & (returned.ravel() == 1) & (off < RETURN_PX)
+    if good.sum() < max(LEAST_CORNERS, LEAST_SHARE * len(corners)):
+        return None
+    return corners.reshape(-1, 2)[good], ahead.reshape(-1, 2)[good]
+
+
+def _motion(
+    start_px: Corners,
+    end_px: Corners,
+    camera: Camera,
+    start_ns: int,
+    end_ns: int,
+) -> ImageMotion | None:
+    focal_px = math.sqrt(camera.fx_px * camera.fy_px)
+    start, end = _plane(start_px, camera), _plane(end_px, camera)
+    sound = np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1)
+    if sound.sum() < LEAST_CORNERS:
+        return None
+    cv2.setRNGSeed(0)  # the same images give the same motion
+    found, inliers = cv2.findHomography(start[sound], end[sound], cv2.RANSAC, RANSAC_PX / focal_px)
+    if found is None or inliers.sum() < max(LEAST_CORNERS, LEAST_SHARE * len(start_px)):
+        return None
+    turn, shift = centre_motion(np.asarray(found, np.float64)[None])
+    if not np.isfinite(turn[0] + shift[0].sum()):
+        return None
+    return ImageMotion(start_ns, end_ns, float(turn[0]), shift[0])
+
+
+def _plane(px: Corners, camera: Camera) -> Array:
+    """Ideal camera-plane coordinates (N, 2) of OpenCV's pixels, which count from pixel centres."""
+    middle = np.array([camera.cx_px, camera.cy_px]) - 0.5
+    return undistort(camera, (px - middle) / [camera.fx_px, camera.fy_px])
+
+
+def centre_motion(homographies: Array) -> tuple[Array, Array]:
+    """Rotation (N,) and displacement (N, 2) of the centre by homographies (N, 3, 3) between
+    camera planes."""
+    below = homographies[:, 2, 2]
+    shift = homographies[:, :2, 2] / below[:, None]
+    jacobian = homographies[:, :2, :2] - shift[:, :, None] * homographies[:, 2:, :2]
+    jacobian = jacobian / below[:, None, None]
+    turn = np.arctan2(jacobian[:, 1, 0] - jacobian[:, 0, 1], jacobian[:, 0, 0] + jacobian[:, 1, 1])
+    return np.asarray(turn), np.asarray(shift)
+
+
+@dataclass(frozen=True, eq=False)
+class ReportedMotion:
+    """Motion of the picture that follows from the reported state, for N pairs of times.
+
+    `turn_rad` (N,): by the attitudes, and by the velocity where that is known. `tilt_shift`
+    (N, 2): by the attitudes alone. `velocity_shift` (N, 2): by the velocity over flat ground. NaN
+    where the state is not known.
+    """
+
+    turn_rad: Array
+    tilt_shift: Array
+    velocity_shift: Array
+
+
+def reported_motion(
+    start_enu: Array, end_enu: Array, velocity: Array, height_m: Array, seconds: float
+) -> ReportedMotion:
+    """Motion over flat ground from attitudes `start_enu` to `end_enu` (N, 3, 3), which rotate from
+    camera axes to east, north, up, with the mean `velocity` (N, 3) in m/s east, north, up, from
+    `height_m` (N,) above ground. NaN where a value is not known or the camera looks too far ahead.
+    """
+    turned = np.einsum("nji,njk->nik", end_enu, start_enu)
+    down = -start_enu[:, 2, 2]
+    turned = np.where((down > FARTHEST_TILT_COS)[:, None, None], turned, np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        turn, tilt_shift = centre_motion(turned)
+        # A ground point at the ray r of the first camera lies at height / -r_up along it.
+        moved = np.einsum("nji,nj->ni", end_enu, velocity) * (seconds / height_m)[:, None]
+        ground_up = -start_enu[:, 2, :]
+        both = turned - moved[:, :, None] * ground_up[:, None, :]
+        turn_of_both, shift = centre_motion(both)
+    turn = np.where(np.isfinite(turn_of_both), turn_of_both, turn)
+    return ReportedMotion(turn, tilt_shift, shift - tilt_shift)

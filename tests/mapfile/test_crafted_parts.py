@@ -1,0 +1,176 @@
+"""Maps whose checksums are right and whose parts are not: the decoders themselves are reached."""
+
+import os
+import resource
+import subprocess
+import sys
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from orthonav.errors import MapFileError
+from orthonav.geo.camera import Camera
+from orthonav.localizer import Localizer
+from orthonav.mapfile import GreyLayer, open_map, write_map
+from orthonav.mapfile.layer import preview
+from orthonav.onboard.run import SingleViews, locate_view
+from orthonav.records import NoFix, Telemetry, View
+
+GOLDEN = Path(__file__).parent.parent / "data" / "golden_v1.onav"
+MASKS, MASK_OFFSETS = "sheet0/grey/mask_bytes", "sheet0/grey/mask_offsets"
+CAMERA = Camera(160, 120, 100.0, 100.0, 80.0, 60.0)
+
+
+def golden():
+    opened = open_map(GOLDEN)
+    return opened.manifest, {name: np.array(part) for name, part in opened.arrays.items()}
+
+
+def written(path, parts, **changes):
+    """The golden map with other parts, its checksums right."""
+    manifest, arrays = golden()
+    write_map(path, replace(manifest, **changes), {**arrays, **parts})
+    return path
+
+
+def used(path):
+    """Everything that reads a part of a map; only errors of ours are allowed."""
+    opened = open_map(path)
+    for read in (preview, everything_of_the_layer, located):
+        try:
+            read(opened)
+        except MapFileError as error:
+            assert "\n" not in str(error)
+
+
+def everything_of_the_layer(opened):
+    layer = GreyLayer.of(opened)
+    for level in range(layer.levels):
+        layer.read(level, 0, 0, *layer.shape(level))
+
+
+def located(opened):
+    grey = np.random.default_rng(0).integers(0, 255, (120, 160), np.uint8)
+    view = View(grey, CAMERA, Telemetry(0, 0.0, 0.0, 0.0, 250.0))
+    outcome, _ = locate_view(SingleViews(Localizer(opened)), view)
+    assert not isinstance(outcome, NoFix) or outcome.reason != "internal_error", outcome
+
+
+def mutations(part, rng):
+    """Variants of the values of a part, of the same type and number of dimensions."""
+    flat = part.reshape(-1)
+    for _ in range(6):
+        changed = flat.copy()
+        at = rng.integers(0, len(changed), 3)
+        changed[at] = rng.integers(0, 256, 3).astype(part.dtype)
+        yield changed.reshape(part.shape)
+    if part.dtype == np.uint8:
+        yield np.zeros_like(part)
+        yield np.full_like(part, 255)
+    elif part.dtype.kind == "f":
+        for value in (np.nan, np.inf, 0.0, 6e4):
+            yield np.full_like(part, value)
+    else:
+        for value in (-1, 0, 2**62, -(2**63)):
+            yield np.full_like(part, value)
+            changed = part.copy()
+            changed[1] = value
+            yield changed
+    yield part[: len(part) // 2]
+    yield part[:0]
+    yield np.concatenate([part, part])
+
+
+@pytest.mark.parametrize("name", sorted(golden()[1]))
+def test_any_values_of_a_part_give_our_errors(tmp_path, name, caplog):
+    rng = np.random.default_rng(len(name))
+    for changed in mutations(golden()[1][name], rng):
+        used(written(tmp_path / "a.onav", {name: changed}))
+    assert not any(record.exc_info for record in caplog.records)
+
+
+def masked(mask, tmp_path):
+    """The golden map with `mask` as the mask of every chunk that has one."""
+    _, arrays = golden()
+    has = np.diff(arrays[MASK_OFFSETS]) > 0
+    data = np.frombuffer(mask * int(has.sum()), np.uint8)
+    offsets = np.concatenate([[0], np.cumsum(has * len(mask))]).astype(np.int64)
+    return written(tmp_path / "a.onav", {MASKS: data, MASK_OFFSETS: offsets})
+
+
+BITS = 256 * 256 // 8
+MASK_CASES = {
+    "not compressed": bytes(100),
+    "one byte": b"\x78",
+    "wrong checksum": zlib.compress(bytes(BITS))[:-1] + b"\0",
+    "too short": zlib.compress(bytes(BITS - 1)),
+    "too long": zlib.compress(bytes(BITS + 1)),
+    "a bomb of 100 MB": zlib.compress(bytes(100_000_000), 9),
+    "bytes after the end": zlib.compress(bytes(BITS)) + b"more",
+    "a preset dictionary": (lambda c: c.compress(bytes(BITS)) + c.flush())(
+        zlib.compressobj(zdict=b"words")
+    ),
+    "raw deflate": zlib.compress(bytes(BITS))[2:-4],
+}
+
+
+@pytest.mark.parametrize("how", MASK_CASES)
+def test_crafted_masks(tmp_path, how, caplog):
+    opened = open_map(masked(MASK_CASES[how], tmp_path))
+    with pytest.raises(MapFileError, match=r"registration layer is damaged .*mask"):
+        everything_of_the_layer(opened)
+    located(opened)
+    assert not any(record.exc_info for record in caplog.records)
+
+
+COMMANDS = """
+import sys
+from orthonav.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_crafted_maps_print_no_traceback(tmp_path, flight_path):
+    """Commands in processes of their own, whose memory is limited."""
+    limit = lambda: resource.setrlimit(resource.RLIMIT_AS, (3 * 2**29,) * 2)  # noqa: E731
+    path = masked(MASK_CASES["a bomb of 100 MB"], tmp_path)
+    commands = (
+        ("localize", path, flight_path, "--out", tmp_path / "fixes.jsonl", "-q"),
+        ("localize", path, flight_path, "--out", tmp_path / "fixes.jsonl", "-q", "--track"),
+        ("check", path, "--agl-m", "270", "--out", tmp_path / "check", "-q"),
+        ("info", path),
+    )
+    for command in commands:
+        done = subprocess.run(
+            [sys.executable, "-c", COMMANDS, *map(str, command)],
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+            preexec_fn=limit,
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        assert done.returncode in (0, 1, 3, 4) and "Traceback" not in done.stderr, done.stderr
+
+
+def test_an_encoded_preview_of_another_kind(tmp_path):
+    encoded = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1]
+    with pytest.raises(MapFileError, match="preview"):
+        preview(open_map(written(tmp_path / "a.onav", {"sheet0/preview_jpeg": encoded})))
+
+
+def test_a_coarsest_level_of_gigapixels(tmp_path):
+    """Its chunks are empty, so the file is small; programs read this level as a whole."""
+    manifest, _ = golden()
+    sheet = manifest.sheets[0]
+    for rows, levels, sane in ((600, 1, False), (600, 4, True), (250, 1, True)):
+        grid = replace(sheet.grid, rows=rows, cols=2, stride_px=32, gsd_m=0.1)
+        sheets = (replace(sheet, grid=grid, tiles=2, grey=replace(sheet.grey, levels=levels)),)
+        if not sane:
+            with pytest.raises(MapFileError, match="impossible registration layer"):
+                open_map(written(tmp_path / "a.onav", {}, sheets=sheets))
+        else:
+            open_map(written(tmp_path / "a.onav", {}, sheets=sheets))

@@ -1,0 +1,87 @@
+"""`orthonav calibrate --latency` from flight logs."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from fake_autopilot import UTC_NS, S
+from flown import SMALL, Flown
+
+from orthonav.cli import main
+from orthonav.cli.flying import _stated
+from orthonav.errors import FlightError, OrthonavError
+from orthonav.flight.latency import CameraLatency, read_latency, write_latency
+from orthonav.onboard.log import FlightLog
+from orthonav.onboard.telemetry import VehicleState
+
+RATE_HZ = 5.0
+
+
+def logged(folder, flown, delay_s, *, used_s=0.0, seconds=62, rate_hz=RATE_HZ, heading_off=0.0):
+    """A log of a flight whose images are late, flown with another latency."""
+    log = FlightLog(folder / "flight.mcap", SMALL, {})
+    begin_ns = UTC_NS + 1000 * S
+    for number in range(int(seconds * rate_hz)):
+        arrived_s = 10.0 + number / rate_hz
+        at_s = arrived_s - used_s
+        _, (north, east), _ = flown.at(at_s)
+        state = VehicleState(flown.ned_from_body(at_s), flown.agl_m, (north, east, 0.0))
+        telemetry = state.telemetry(begin_ns + round(at_s * S))
+        telemetry = replace(telemetry, yaw_deg=telemetry.yaw_deg + heading_off)
+        grey = flown.picture(arrived_s - delay_s, SMALL)
+        log.view(number, f"{number:06d}", grey, telemetry, used_s * 1e3, number % 3 == 0)
+    log.close()
+    return folder / "flight_0001.mcap"
+
+
+def calibrated(log, out, *more):
+    return main(["calibrate", "area.onav", str(log), "--latency", "--out", str(out), *more])
+
+
+@pytest.mark.parametrize(("delay_s", "used_s"), [(0.4, 0.0), (0.15, 0.15), (2.2, 0.3)])
+def test_the_latency_is_found(tmp_path, capsys, delay_s, used_s):
+    log = logged(tmp_path, Flown(80, seed=1), delay_s, used_s=used_s)
+    out = tmp_path / "latency.json"
+    assert calibrated(log, out, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["latency_ms"] == pytest.approx(delay_s * 1e3, abs=50)
+    assert found["std_ms"] < 100 and found["pairs"] > 100
+    assert _stated(str(out)) == read_latency(out) == CameraLatency(**found)
+
+
+def test_a_straight_flight_is_refused(tmp_path, capsys):
+    log = logged(tmp_path, Flown(80, turns=False, turbulence_deg=0.05, seed=2), 0.4)
+    assert calibrated(log, tmp_path / "latency.json") == 1
+    assert "turns" in capsys.readouterr().err and not (tmp_path / "latency.json").exists()
+
+
+def test_views_that_are_rare_are_refused(tmp_path, capsys):
+    log = logged(tmp_path, Flown(80, seed=1), 0.4, rate_hz=1.0)
+    assert calibrated(log, tmp_path / "latency.json") == 1
+    assert "1.0 s apart" in capsys.readouterr().err
+
+
+def test_a_wrong_mount_is_refused(tmp_path, capsys):
+    log = logged(tmp_path, Flown(80, seed=1), 0.4, heading_off=180.0)
+    assert calibrated(log, tmp_path / "latency.json") == 1
+    assert "--mount-deg" in capsys.readouterr().err
+
+
+def test_a_stated_latency_is_a_number_or_a_file(tmp_path):
+    path = tmp_path / "latency.json"
+    write_latency(path, CameraLatency(85.0, 20.0, 120))
+    assert _stated(None) is None and _stated("85").latency_ms == 85.0
+    assert _stated(str(path)) == CameraLatency(85.0, 20.0, 120)
+    for wrong in ("-1", "20000", "nan", str(tmp_path / "absent.json")):
+        with pytest.raises(OrthonavError):
+            _stated(wrong)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{}", "[1]", '{"orthonav_latency": 2}', '{"orthonav_latency": 1}']
+)
+def test_damaged_files_are_refused(tmp_path, text):
+    path = tmp_path / "latency.json"
+    path.write_text(text)
+    with pytest.raises(FlightError, match="calibrate --latency"):
+        read_latency(path)

@@ -1,0 +1,291 @@
+"""Whole flights with a live camera whose images are late: nothing wrong is sent."""
+
+import math
+
+import numpy as np
+import pytest
+from fake_autopilot import MS, Autopilot, FakeLocator, Port, S, Time, fix
+from flown import SMALL as CAMERA
+from flown import Flown
+
+from orthonav.onboard.cameras import LiveCamera, NewestImage
+from orthonav.onboard.fly import FlyOptions, Runner
+from orthonav.onboard.latency import LatencyMonitor
+from orthonav.onboard.link import AutopilotLink
+from orthonav.onboard.outputs import MessageOptions, Messenger
+from orthonav.onboard.publisher import Publisher
+from orthonav.onboard.telemetry import TelemetryBuffer
+from orthonav.publish.estimate import Clock
+from orthonav.publish.gate import Gate, GateRules
+
+METRES = 111_195.0  # a degree of latitude; the flights are at the equator
+BEGIN_NS, BEGIN_S = 100 * S, 10.0
+AHEAD_NS = -90 * S
+LARGEST_ERROR_M = 8.0
+
+
+class Stream:
+    """A capture whose images arrive when the test says so, exposed `delay_s` before."""
+
+    def __init__(self, flight):
+        self.flight, self.exposed_s = flight, 0.0
+        self.change = lambda grey: grey
+        self.stamp_s = math.nan
+
+    def isOpened(self):
+        return True
+
+    def grab(self):
+        return True
+
+    def retrieve(self):
+        return True, self.change(self.flight.flown.picture(self.exposed_s, CAMERA))
+
+    def get(self, _):
+        return 0.0 if math.isnan(self.stamp_s) else self.stamp_s * 1e3
+
+    def set(self, *_):
+        pass
+
+    def release(self):
+        pass
+
+
+class LateFlight:
+    """A flight of `orthonav fly` with a fake clock, whose locator is always right about where an
+    image was exposed, but not when."""
+
+    def __init__(self, flown, stated_s, delay_s, *, rate_hz=8.0, max_age_s=1.0):
+        self.flown, self.delay_s, self.rate_hz = flown, delay_s, rate_hz
+        self.time, self.port, self.autopilot = Time(), Port(), Autopilot()
+        clocks = self.time.clocks
+        self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)
+        self.gate = Gate(GateRules(max_age_s=max_age_s), Clock.BOOT)
+        messages = MessageOptions(("global-position",))
+        messenger = Messenger(messages, self.gate, self.link.send, clocks)
+        publisher = Publisher(self.gate, clocks, messenger=messenger, link=self.link)
+        self.stream = Stream(self)
+        self.source = LiveCamera(0, clocks, capture=lambda _: self.stream)
+        self.newest, self.monitor = NewestImage(), LatencyMonitor(stated_s)
+        self.runner = Runner(
+            self.newest,
+            CAMERA,
+            FakeLocator(self.where),
+            publisher,
+            FlyOptions(),
+            clocks,
+            link=self.link,
+            latency=self.monitor,
+        )
+        self.hear(self.autopilot.heartbeat())
+        self.sent = []  # time since the start, error in metres, age
+        self.results = []
+        self.stamps, self.stalled = False, False
+
+    @property
+    def now_s(self):
+        """Time of the generated flight, of which a late stream shows an earlier part."""
+        return BEGIN_S + (self.time.now_ns - BEGIN_NS) / S
+
+    def where(self, view):
+        north, east = self.flown.at(self.stream.exposed_s)[2]
+        heading, height = view.telemetry.yaw_deg, view.telemetry.agl_m
+        return fix(north / METRES, east / METRES, std_m=2.0, heading_deg=heading, agl_m=height)
+
+    def hear(self, *frames):
+        self.port.coming.extend(frames)
+        self.link.poll()
+
+    def talk(self):
+        """Telemetry of this moment, and answers to TIMESYNC."""
+        boot_ns = self.time.now_ns + AHEAD_NS
+        (yaw, pitch, roll), (north, east), _ = self.flown.at(self.now_s)
+        answers = [
+            self.autopilot.say("timesync", (boot_ns + each["ts1"] + AHEAD_NS) // 2, each["ts1"])
+            for each in self.port.sent("TIMESYNC")
+        ]
+        self.hear(
+            self.autopilot.attitude(boot_ns, yaw, pitch, roll),
+            self.autopilot.home(boot_ns, self.flown.agl_m),
+            self.autopilot.local(boot_ns, (north, east, 0.0)),
+            *answers,
+        )
+
+    def fly(self, seconds):
+        """Fly on; the errors of the messages of this time."""
+        end_ns, before = self.time.now_ns + round(seconds * S), len(self.sent)
+        due_ns, step_ns = self.time.now_ns, round(S / self.rate_hz)
+        while self.time.now_ns < end_ns:
+            self.time.now_ns += 40 * MS
+            self.talk()
+            if self.time.now_ns >= due_ns and not self.stalled:
+                due_ns += step_ns
+                self.image()
+            due_ns = max(due_ns, self.time.now_ns - step_ns)
+        return self.sent[before:]
+
+    def image(self):
+        """One image arrives."""
+        self.stream.exposed_s = self.now_s - self.delay_s(self.now_s)
+        if self.stamps:
+            self.stream.stamp_s = 1000 + self.stream.exposed_s
+        self.port.gone.clear()
+        self.newest.put(self.source.read())
+        result = self.runner.step(0)
+        self.results.append((self.now_s, result))
+        for message in self.port.sent("GLOBAL_POSITION_SENSOR"):
+            age_s = message["processing_time"] / 1e6
+            north, east = self.flown.at(self.now_s - age_s)[2]
+            off = message["lat"] * 1e-7 * METRES - north, message["lon"] * 1e-7 * METRES - east
+            self.sent.append((self.now_s, float(np.hypot(*off)), age_s))
+
+    def reasons(self):
+        return set(self.runner.health.reasons)
+
+
+def constant(delay_s):
+    return lambda now_s: delay_s
+
+
+def worst_m(sent):
+    return max((error for _, error, _ in sent), default=0.0)
+
+
+def test_an_undisturbed_flight_keeps_its_messages():
+    flight = LateFlight(Flown(70, seed=1), 0.12, constant(0.12))
+    sent = flight.fly(45)
+    assert len(sent) >= 0.98 * len(flight.results) and worst_m(sent) < 4.0
+    assert flight.runner.health.reasons == ()
+    plain = flight.monitor.plain()
+    assert (plain["latency_ms"], plain["latency"]) == (120.0, "stated")
+
+
+def test_a_straight_flight_with_a_stated_latency_is_undisturbed():
+    straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
+    flight = LateFlight(straight, 0.12, constant(0.12), rate_hz=5.0)
+    assert len(flight.fly(40)) >= 0.98 * len(flight.results)
+
+
+def test_without_a_stated_latency_nothing_is_sent_until_it_is_measured():
+    flight = LateFlight(Flown(70, seed=1), None, constant(0.25))
+    assert flight.fly(10) == []
+    assert "latency_unknown" in flight.reasons()
+    assert flight.gate.withheld["latency_unknown"] >= len(flight.results) - 1
+    assert "--camera-latency-ms" in flight.monitor.plain()["latency"]
+    sent = flight.fly(35)
+    assert len(sent) > 100 and worst_m(sent) < 4.0
+    plain = flight.monitor.plain()
+    assert plain["latency_ms"] == pytest.approx(250, abs=80) and plain["latency"] == "measured"
+    assert flight.reasons() == set()
+
+
+def test_without_a_stated_latency_a_straight_flight_sends_nothing():
+    straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
+    flight = LateFlight(straight, None, constant(0.12), rate_hz=5.0)
+    assert flight.fly(40) == []
+
+
+@pytest.mark.parametrize("late_s", [2.0, 8.0])
+def test_a_stream_that_is_late_from_the_start(late_s):
+    """The stated latency is believed for the first seconds, until images have moved; then it is
+    measured, and positions are withheld as stale."""
+    flight = LateFlight(Flown(90, seed=3), 0.12, constant(late_s))
+    flight.fly(40)
+    wrong = [each for each in flight.sent if each[1] > LARGEST_ERROR_M]
+    assert all(at < BEGIN_S + 5.0 for at, _, _ in wrong)
+    plain = flight.monitor.plain()
+    assert plain["latency_ms"] == pytest.approx(late_s * 1e3, abs=80)
+    assert flight.gate.withheld["stale"] > 50
+
+
+@pytest.mark.parametrize(("late_s", "stamps"), [(0.7, False), (2.0, False), (8.0, True)])
+def test_a_stall_after_which_the_stream_is_late(late_s, stamps):
+    delay = {"s": 0.12}
+    flight = LateFlight(Flown(110, seed=4), 0.12, lambda _: delay["s"])
+    flight.stamps = stamps
+    assert len(flight.fly(20)) > 150
+    flight.stalled = True
+    flight.fly(late_s - 0.12)
+    flight.stalled, delay["s"] = False, late_s
+    sent = flight.fly(1.5)
+    assert sent == [] and "latency_unsteady" in flight.reasons()
+    sent = flight.fly(25)
+    assert worst_m(sent) < LARGEST_ERROR_M
+    assert flight.monitor.plain()["latency_ms"] == pytest.approx(late_s * 1e3, abs=80)
+    if late_s < 0.9:
+        assert len(sent) > 80
+    # The stream catches up: a burst, then live images.
+    delay["s"] = 0.12
+    sent = flight.fly(30)
+    late = [each for each in sent if each[1] > LARGEST_ERROR_M]
+    assert all(at - flight.now_s < -25 for at, _, _ in late)
+    assert worst_m(sent[-80:]) < 4.0 and len(sent) > 80
+    assert flight.monitor.plain()["latency"] == "stated"
+
+
+def test_a_stall_with_timestamps_that_catches_up_needs_no_manoeuvre():
+    straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
+    flight = LateFlight(straight, 0.12, constant(0.12), rate_hz=5.0)
+    flight.stamps = True
+    flight.fly(20)
+    flight.stalled = True
+    flight.fly(2.0)
+    flight.stalled = False
+    assert len(flight.fly(10)) >= 48
+
+
+def test_a_stall_without_timestamps_needs_a_manoeuvre():
+    straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
+    flight = LateFlight(straight, 0.12, constant(0.12), rate_hz=5.0)
+    flight.fly(20)
+    flight.stalled = True
+    flight.fly(2.0)
+    flight.stalled = False
+    assert flight.fly(10) == [] and "latency_unsteady" in flight.reasons()
+    assert "no image for 2" in flight.monitor.plain()["latency"]
+
+
+def test_a_drifting_latency_is_followed():
+    flight = LateFlight(Flown(90, seed=5), 0.1, lambda now_s: 0.1 + 0.012 * now_s)
+    flight.fly(20)
+    sent = flight.fly(40)
+    assert worst_m(sent) < LARGEST_ERROR_M and len(sent) > 100
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda grey: grey[:, ::-1].copy(),
+        lambda grey: grey[::-1, ::-1].copy(),
+    ],
+)
+def test_mirrored_and_rotated_images_give_no_latency(change):
+    flight = LateFlight(Flown(70, seed=1), None, constant(0.12))
+    flight.stream.change = change
+    assert flight.fly(40) == []
+    assert flight.reasons() & {"latency_unknown", "motion_mismatch"}
+
+
+def test_a_camera_that_freezes_with_noise_is_noticed():
+    flight = LateFlight(Flown(70, seed=1), 0.12, constant(0.12))
+    flight.fly(20)
+    rng, still = np.random.default_rng(0), flight.flown.picture(flight.now_s, CAMERA)
+    flight.stream.change = lambda _: np.uint8(
+        np.clip(still + rng.normal(0, 3, still.shape), 0, 255)
+    )
+    flight.fly(8)
+    assert len(flight.fly(10)) == 0
+    flight.stream.change = lambda grey: grey
+    flight.fly(10)
+    assert len(flight.fly(5)) >= 38
+
+
+def test_the_covariance_includes_the_latency():
+    flight = LateFlight(Flown(70, seed=1), 0.12, constant(0.12))
+    flight.fly(2)
+    cov = flight.results[-1][1].outcome.cov_en_m2
+    (north, east) = flight.flown.at(flight.now_s - 0.12)[1]
+    along = np.array([east, north]) / np.hypot(east, north)
+    across = np.array([-along[1], along[0]])
+    assert along @ cov @ along == pytest.approx(4 + (0.03 * np.hypot(east, north)) ** 2, rel=0.02)
+    assert across @ cov @ across == pytest.approx(4.0, rel=0.02)

@@ -1,0 +1,103 @@
+"""Tables of untrusted origin: bounded lines, rows and memory; errors name lines."""
+
+import io
+import tracemalloc
+
+import pytest
+
+from orthonav.errors import FlightError, RouteError
+from orthonav.flight import folder as folders
+from orthonav.flight.fixes import MAX_LINE_BYTES, read_results
+from orthonav.flight.folder import read_truth
+from orthonav.geo.route import read_route
+from orthonav.sources.table import read_table
+from orthonav.tables import MAX_LINE_CHARS, TableError, TableRows, bounded_lines
+
+TRUTH = "frame,lat_deg,lon_deg\n"
+TABLE = "time_s,pitch_deg,roll_deg\n"
+
+
+def test_rows_are_those_of_a_csv():
+    rows = TableRows(io.StringIO('a, b\n1, 2\n\n"x\ny",3,4\n5\n'))
+    assert rows.columns == ["a", "b"]
+    assert [(row["a"], row["b"], rows.line) for row in rows] == [
+        ("1", "2", 2),
+        ("x\ny", "3", 5),
+        ("5", None, 6),
+    ]
+
+
+def test_lines_are_bounded_exactly():
+    longest = "x" * (MAX_LINE_CHARS - 1) + "\n"
+    assert list(bounded_lines(io.StringIO(longest * 2))) == [longest] * 2
+    with pytest.raises(TableError, match="line 2 is longer than 65,536 characters"):
+        list(bounded_lines(io.StringIO(longest + "x" + longest)))
+
+
+def test_rows_are_bounded():
+    text = "a\n" + "1\n" * 5
+    assert len(list(TableRows(io.StringIO(text), most_rows=5))) == 5
+    with pytest.raises(TableError, match="line 6: table has more than 4 rows"):
+        list(TableRows(io.StringIO(text), most_rows=4))
+
+
+@pytest.mark.parametrize("at", [1, 3])
+@pytest.mark.parametrize(
+    ("name", "head", "row", "read", "error"),
+    [
+        ("truth.csv", TRUTH, "{},1,2\n", read_truth, FlightError),
+        ("table.csv", TABLE, "{},1,2\n", read_table, FlightError),
+        ("route.csv", "lat,lon\n", "1,{}\n", read_route, RouteError),
+    ],
+)
+def test_a_line_of_many_fields_is_refused(tmp_path, at, name, head, row, read, error):
+    lines = [head, row.format(1), row.format(2)]
+    lines[at - 1] = lines[at - 1].rstrip() + "," * 3_000_000 + "\n"
+    path = tmp_path / name
+    path.write_text("".join(lines))
+    tracemalloc.start()
+    try:
+        with pytest.raises(error, match=f"line {at} is longer than") as caught:
+            read(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert str(path) in str(caught.value)
+    assert peak < 10 * path.stat().st_size
+
+
+def test_tables_of_a_flight_have_at_most_so_many_rows(tmp_path, monkeypatch):
+    monkeypatch.setattr(folders, "MAX_VIEWS", 3)
+    path = tmp_path / "truth.csv"
+    path.write_text(TRUTH + "".join(f"{n},1,2\n" for n in range(3)))
+    assert len(read_truth(path)) == 3
+    path.write_text(TRUTH + "".join(f"{n},1,2\n" for n in range(4)))
+    with pytest.raises(FlightError, match="line 5: table has more than 3 rows"):
+        read_truth(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.csv", "lat,lon\n" + "0,0\n" * 400_000),
+        ("a.waypoints", "QGC WPL 110\n" + "0 0 3 16 0 0 0 0 1 1 1 1\n" * 150_000),
+    ],
+)
+def test_routes_of_too_many_waypoints_take_little_memory(tmp_path, name, text):
+    path = tmp_path / name
+    path.write_text(text)
+    tracemalloc.start()
+    try:
+        with pytest.raises(RouteError, match="at most 100,000 are read"):
+            read_route(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 100_000_000  # mostly the 100,000 waypoints
+
+
+def test_a_line_of_fixes_is_bounded(tmp_path):
+    path = tmp_path / "fixes.jsonl"
+    path.write_bytes(b"\n[" + b" " * MAX_LINE_BYTES + b"]\n")
+    with pytest.raises(FlightError, match="line 2: more than 1,048,576 bytes"):
+        read_results(path)
