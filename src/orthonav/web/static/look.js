@@ -1,7 +1,7 @@
 // Colours and marks, the same on map, course and list.
 
 const COLOURS = ["tracking", "coasting", "searching", "lost", "alone", "none", "truth", "wrong", "ink", "soft", "line",
-  "paper", "shade", "strong", "good", "warn", "bad"];
+  "paper", "shade", "strong", "good", "warn", "bad", "gnss"];
 let colours = {};
 
 /** A colour of style.css, in the current scheme. */
@@ -54,7 +54,7 @@ export function drawMark(context, state, x, y, size) {
   }
 }
 
-const KINDS = [...Object.keys(MARKS), "wrong", "ink"];
+const KINDS = [...Object.keys(MARKS), "wrong", "ink", "gnss"];
 
 /** Of many thousand marks most cover equal ones: one in a small square is enough. */
 export class Squares {
