@@ -392,7 +392,8 @@ def test_gnss_is_logged_only(peer, reading):
     message.header.stamp, message.latitude, message.status.status = stamp(7 * S), 46.5, -1
     peer.write("/gps/fix", message)
     wait_for(lambda: flying.node.spin(0.02) >= 0 and flying.reader.gnss, 5)
-    assert (flying.reader.gnss.lat_deg, flying.reader.gnss.status) == (46.5, -1)
+    (sample,) = flying.reader.gnss
+    assert (sample.lat_deg, sample.has_fix, sample.stamp_ns) == (46.5, False, 7 * S)
     ((time_ns, cdr),) = logged
     assert time_ns == 7 * S and ros.NavSatFix.deserialize(cdr) == message
 
