@@ -200,7 +200,7 @@ def test_localize_as_a_track(run, map_path, flight_path, out):
         assert done.code == 0, done.err
         lines = [json.loads(line) for line in (out / "fixes.jsonl").read_text().splitlines()]
         assert len(lines) == 6 and {line["tracked"] for line in lines} == {True}
-        assert {line["state"] for line in lines} <= {"searching", "tracking", "lost"}
+        assert {line["state"] for line in lines} <= {"searching", "tracking", "coasting", "lost"}
         assert lines[0]["status"] == "fix" and "heading_bias_deg" in lines[0]["evidence"]
     off = run("localize", map_path, few, *to, "--track", "--registration", "off")
     refused(off, "registration layer")
