@@ -90,7 +90,14 @@ def test_a_fault_is_named_in_time(text, seconds, names):
     assert name in names
 
 
-@pytest.mark.parametrize(("name", "seed"), [("usual", 11), ("poor", 12), ("high", 13)])
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        ("usual", 11),
+        pytest.param("poor", 12, marks=pytest.mark.slow),
+        pytest.param("high", 13, marks=pytest.mark.slow),
+    ],
+)
 def test_ten_hours_without_a_fault_raise_no_alarm(name, seed):
     """Ten hours in all, with multipath, latency, turns, gaps and single wrong map positions."""
     errors = MAPS[name]
