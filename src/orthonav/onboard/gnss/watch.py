@@ -132,12 +132,15 @@ class GnssWatch:
         return replace(result, outcome=replace(fix, evidence=evidence))
 
     def corrected(self, outcome: Fix | NoFix) -> Fix | NoFix:
-        """A fix moved by the displacement of the map, where that is to be corrected."""
+        """A fix moved by the displacement of the map, where that is to be corrected; its covariance
+        includes that of the displacement."""
         if not isinstance(outcome, Fix) or not self.correction_en_m.any():
             return outcome
         en_m = np.asarray(self._frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg))
         lat, lon = self._frame.latlon_from_en(en_m + self.correction_en_m)
-        return replace(outcome, lat_deg=float(lat), lon_deg=float(lon))
+        cov = outcome.cov_en_m2 + np.eye(2) * self._start.std_m**2
+        cov.setflags(write=False)
+        return replace(outcome, lat_deg=float(lat), lon_deg=float(lon), cov_en_m2=cov)
 
     def tick(self, mono_ns: int) -> list[GnssText]:
         """Judge at a time of the monotonic clock; messages about changes since the last call."""
