@@ -6,9 +6,9 @@ beside
 
     orthonav fly area.onav flight --file-clock autopilot --autopilot udpin:14550
 
-It answers TIMESYNC, sends HEARTBEAT, ATTITUDE, DISTANCE_SENSOR and LOCAL_POSITION_NED over UDP, and
-compares the positions that it receives with the truth of the folder, if there is one. Its clock is
-0 at the start of the folder. Needs pymavlink.
+It answers TIMESYNC, sends HEARTBEAT, ATTITUDE, DISTANCE_SENSOR and LOCAL_POSITION_NED over UDP (and
+GPS_RAW_INT where the folder has a `gnss.csv`), and compares the positions that it receives with the
+truth of the folder, if there is one. Its clock is 0 at the start of the folder. Needs pymavlink.
 """
 
 import argparse
@@ -51,6 +51,10 @@ class Autopilot:
         self.socket.setblocking(False)
         self.address, self.begin_s = address, None
         self.received = []
+        self.gnss = []
+        if (folder / "gnss.csv").is_file():
+            with (folder / "gnss.csv").open(encoding="utf-8", newline="") as stream:
+                self.gnss = list(csv.DictReader(stream))
 
     def boot_s(self):
         """Seconds since boot."""
@@ -82,6 +86,27 @@ class Autopilot:
         if "vel_east_mps" in self.telemetry:
             north, east = self.at("vel_north_mps", when_s), self.at("vel_east_mps", when_s)
             self.send(mavlink.MAVLink_local_position_ned_message(boot_ms, 0, 0, 0, north, east, 0))
+
+    def send_gnss(self):
+        """Send the solutions of gnss.csv that are due."""
+        while self.gnss and float(self.gnss[0]["time_s"]) <= self.boot_s() * self.pace:
+            row = {name: float(value or "nan") for name, value in self.gnss.pop(0).items()}
+            east, north = row["vel_east_mps"], row["vel_north_mps"]
+            self.send(
+                mavlink.MAVLink_gps_raw_int_message(
+                    time_usec=round(row["solved_s"] / self.pace * 1e6),
+                    fix_type=int(row["fix_type"]),
+                    lat=round(row["lat_deg"] * 1e7),
+                    lon=round(row["lon_deg"] * 1e7),
+                    alt=0,
+                    eph=65_535,
+                    epv=65_535,
+                    vel=round(math.hypot(east, north) * 100),
+                    cog=round(math.degrees(math.atan2(east, north)) % 360 * 100) % 36_000,
+                    satellites_visible=int(row["satellites"]),
+                    h_acc=round(row["std_m"] * 1000),
+                )
+            )
 
     def listen(self):
         """Read all available messages."""
@@ -129,6 +154,7 @@ class Autopilot:
             if self.boot_s() >= due_s:
                 due_s += self.interval_s
                 self.send_telemetry()
+            self.send_gnss()
             self.listen()
             time.sleep(0.002)
 

@@ -200,7 +200,7 @@ def test_localize_as_a_track(run, map_path, flight_path, out):
         assert done.code == 0, done.err
         lines = [json.loads(line) for line in (out / "fixes.jsonl").read_text().splitlines()]
         assert len(lines) == 6 and {line["tracked"] for line in lines} == {True}
-        assert {line["state"] for line in lines} <= {"searching", "tracking", "lost"}
+        assert {line["state"] for line in lines} <= {"searching", "tracking", "coasting", "lost"}
         assert lines[0]["status"] == "fix" and "heading_bias_deg" in lines[0]["evidence"]
     off = run("localize", map_path, few, *to, "--track", "--registration", "off")
     refused(off, "registration layer")
@@ -209,7 +209,7 @@ def test_localize_as_a_track(run, map_path, flight_path, out):
 def test_calibrate_and_fly_with_it(run, map_path, flight_path, out):
     mount, fixes, few = out / "mount.json", out / "fixes.jsonl", out / "flight"
     shorten(shutil.copytree(flight_path, few), 16)
-    gnss = ["--gnss", few / "truth.csv", "--gnss-std-m", "2"]
+    gnss = ["--gnss-positions", few / "truth.csv", "--gnss-std-m", "2"]
     done = run("calibrate", map_path, few, "--out", mount, *gnss)
     assert (done.code, done.err) == (0, "")
     assert "pitch, deg" in done.out and str(mount) in done.out

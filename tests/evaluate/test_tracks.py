@@ -184,10 +184,10 @@ def test_first_confirmed_fix_and_errors_from_then_on() -> None:
 def test_states_by_view_and_by_the_time_until_the_next() -> None:
     track = by_hand()
     assert dict(track.share_of_views) == pytest.approx(
-        {"searching": 0.2, "tracking": 0.5, "lost": 0.3}
+        {"searching": 0.2, "tracking": 0.5, "coasting": 0.0, "lost": 0.3}
     )
     assert dict(track.share_of_time) == pytest.approx(
-        {"searching": 3 / 20, "tracking": 6 / 20, "lost": 11 / 20}
+        {"searching": 3 / 20, "tracking": 6 / 20, "coasting": 0.0, "lost": 11 / 20}
     )
     assert track.n_lost == 2
 
@@ -400,7 +400,7 @@ def has_colour(image: np.ndarray, colour: str) -> bool:
 
 def test_pictures_tell_states_apart_by_colour(monkeypatch) -> None:
     monkeypatch.setattr("orthonav.report.canvas.DPI", 80)
-    states = ["searching"] * 10 + ["tracking"] * 15 + ["lost"] * 5
+    states = ["searching"] * 10 + ["tracking"] * 10 + ["coasting"] * 5 + ["lost"] * 5
     comparison, results = flown(drawn(30), states)
     track = measure_track(comparison, results, 15.0)
     image = decoded(track_map_picture(comparison, track.series, 15.0))

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -31,6 +32,7 @@ from fake_autopilot import (
 from orthonav.cli import main
 from orthonav.errors import CameraError
 from orthonav.flight.fixes import result_from_json
+from orthonav.flight.gnss import GnssSample, fault_of, gnss_of, write_gnss
 from orthonav.geo.camera import Camera
 from orthonav.onboard import cameras
 from orthonav.onboard import state as states
@@ -191,7 +193,8 @@ def test_without_faults_health_is_ok(flight):
 
 def test_a_view_becomes_a_message(flight):
     flight.locator.outcome = lambda view: fix(48.1234567, -4.3210987)
-    result = flight.view(age_s=0.05)
+    for _ in range(3):  # far from the views before: three must agree
+        result = flight.view(age_s=0.05)
     read = {each["name"]: each for each in flight.port.sent()}
     for name in ("GLOBAL_POSITION_SENSOR", "GPS_INPUT"):
         assert (read[name]["lat"], read[name]["lon"]) == (481234567, -43210987)
@@ -680,6 +683,41 @@ def test_a_flight_from_end_to_end(flown, autopilot, paced, tmp_path):
     assert all(m["processing_time"] > 0 for m in autopilot.named("GLOBAL_POSITION_SENSOR"))
     assert autopilot.named("HEARTBEAT") and autopilot.named("TIMESYNC")
     assert states.load(state).lat_deg == pytest.approx(confident[-1][1].outcome.lat_deg)
+
+
+def test_gnss_of_a_recording_is_compared(flown, paced, run, tmp_path):
+    """A receiver that jumps away at the middle of the flight; views carry its position."""
+    path, recorded, frame, truth = flown
+    folder = shutil.copytree(recorded, tmp_path / "flight")
+    step_m, lines = 60.0, tmp_path / "lines.jsonl"
+    samples = []
+    for number, place in enumerate(truth.values()):
+        off = [step_m, 0.0] if number >= COUNT // 2 else [0.0, 0.0]
+        lat, lon = frame.latlon_from_en(place + off)
+        time_ns = round(number * EVERY_S * S)
+        samples.append(
+            GnssSample(time_ns, time_ns, float(lat), float(lon), 3, 1.5, stamp_ns=time_ns)
+        )
+    command = [
+        *("fly", path, folder, "--recorded-telemetry", "--gnss", "watch", "--jsonl", lines),
+        *("--deadline-ms", "60000", "--log", tmp_path / "log.mcap"),
+    ]
+    done = run(*command)
+    assert done.code == 1 and "gnss.csv" in done.err
+    lines.unlink(missing_ok=True)
+    write_gnss(folder / "gnss.csv", samples)
+    paced(lines)
+    assert run(*command).code == 0
+    _, results = views_in(lines)
+    off_m = []
+    for each in results:
+        place = frame.en_from_latlon(*gnss_of(each.outcome.evidence))
+        off_m.append(np.hypot(*(place - truth[each.frame])))
+    assert max(off_m[: COUNT // 2]) < 1 and min(off_m[COUNT // 2 :]) > step_m - 1
+    assert fault_of(results[0].outcome.evidence) == ""
+    assert "gnss_jump" in {fault_of(each.outcome.evidence) for each in results}
+    log = b"".join(each.read_bytes() for each in tmp_path.glob("log_*.mcap"))
+    assert b"/orthonav/gnss" in log
 
 
 def test_a_killed_flight_continues_from_the_saved_position(flown, autopilot, tmp_path):

@@ -153,8 +153,11 @@ def worst_m(sent):
 
 def test_an_undisturbed_flight_keeps_its_messages():
     flight = LateFlight(Flown(70, seed=1), 0.12, constant(0.12))
-    sent = flight.fly(45)
-    assert len(sent) >= 0.98 * len(flight.results) and worst_m(sent) < 4.0
+    flight.fly(5)
+    assert flight.gate.withheld["latency_unknown"] < 4.5 * flight.rate_hz  # compared first
+    before = len(flight.results)
+    sent = flight.fly(40)
+    assert len(sent) >= 0.98 * (len(flight.results) - before) and worst_m(sent) < 4.0
     assert flight.runner.health.reasons == ()
     plain = flight.monitor.plain()
     assert (plain["latency_ms"], plain["latency"]) == (120.0, "stated")
@@ -163,7 +166,9 @@ def test_an_undisturbed_flight_keeps_its_messages():
 def test_a_straight_flight_with_a_stated_latency_is_undisturbed():
     straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
     flight = LateFlight(straight, 0.12, constant(0.12), rate_hz=5.0)
-    assert len(flight.fly(40)) >= 0.98 * len(flight.results)
+    flight.fly(5.5)
+    before = len(flight.results)
+    assert len(flight.fly(35)) >= 0.98 * (len(flight.results) - before)
 
 
 def test_without_a_stated_latency_nothing_is_sent_until_it_is_measured():
@@ -187,12 +192,11 @@ def test_without_a_stated_latency_a_straight_flight_sends_nothing():
 
 @pytest.mark.parametrize("late_s", [2.0, 8.0])
 def test_a_stream_that_is_late_from_the_start(late_s):
-    """The stated latency is believed for the first seconds, until images have moved; then it is
+    """The stated latency is compared with the first images before it is used; then it is
     measured, and positions are withheld as stale."""
     flight = LateFlight(Flown(90, seed=3), 0.12, constant(late_s))
     flight.fly(40)
-    wrong = [each for each in flight.sent if each[1] > LARGEST_ERROR_M]
-    assert all(at < BEGIN_S + 5.0 for at, _, _ in wrong)
+    assert worst_m(flight.sent) < LARGEST_ERROR_M
     plain = flight.monitor.plain()
     assert plain["latency_ms"] == pytest.approx(late_s * 1e3, abs=80)
     assert flight.gate.withheld["stale"] > 50
@@ -203,7 +207,7 @@ def test_a_stall_after_which_the_stream_is_late(late_s, stamps):
     delay = {"s": 0.12}
     flight = LateFlight(Flown(110, seed=4), 0.12, lambda _: delay["s"])
     flight.stamps = stamps
-    assert len(flight.fly(20)) > 150
+    assert len(flight.fly(20)) > 130
     flight.stalled = True
     flight.fly(late_s - 0.12)
     flight.stalled, delay["s"] = False, late_s
@@ -282,7 +286,7 @@ def test_a_camera_that_freezes_with_noise_is_noticed():
 
 def test_the_covariance_includes_the_latency():
     flight = LateFlight(Flown(70, seed=1), 0.12, constant(0.12))
-    flight.fly(2)
+    flight.fly(6)
     cov = flight.results[-1][1].outcome.cov_en_m2
     (north, east) = flight.flown.at(flight.now_s - 0.12)[1]
     along = np.array([east, north]) / np.hypot(east, north)

@@ -77,6 +77,16 @@ def test_every_message_has_the_position():
         assert place == pytest.approx((north, east, -90.0), rel=1e-5)
 
 
+def test_dead_reckoning_is_sent_by_the_message_that_can_mark_it_only():
+    sending = Sending(*KINDS)
+    coasting = replace(ESTIMATE, state="coasting", confidence=0.4, dead_reckoned=True)
+    assert sending.publish(coasting) == ("GLOBAL_POSITION_SENSOR",)
+    (sensor,) = sending.frames
+    assert sensor["flags"] == 1 and (sensor["lat"], sensor["lon"]) == (480100000, 20100000)
+    assert sensor["eph"] == pytest.approx(3.0)
+    assert not sending.messenger.not_made
+
+
 def test_times_are_those_of_exposure_and_sending():
     sending = Sending("global-position", "gps-input")
     sending.publish(age_s=0.25)

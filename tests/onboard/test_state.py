@@ -2,12 +2,13 @@
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 
 from orthonav.onboard import state
-from orthonav.onboard.state import SavedState, boot_id, load, prior_of, save
+from orthonav.onboard.gnss.records import Displacement
+from orthonav.onboard.state import SavedState, boot_id, displacements, load, prior_of, save
 
 S = 10**9
 SAVED = SavedState(48.1, 2.3, 4.0, 1_700_000_000 * S, 500 * S, "run-1", 77)
@@ -80,3 +81,21 @@ def test_a_write_that_fails_leaves_the_old_one(tmp_path, monkeypatch, names_in):
 def test_a_missing_folder_is_an_error(tmp_path):
     with pytest.raises(OSError):
         save(tmp_path / "nowhere" / "state.json", SAVED)
+
+
+def test_displacements_of_maps_are_saved_and_survive_without_the_witness(tmp_path):
+    path = tmp_path / "state.json"
+    learnt = Displacement(12.5, -3.25, 1.5, 3600.0)
+    save(path, SAVED, {"digest": asdict(learnt), "other": asdict(replace(learnt, east_m=1.0))})
+    save(path, replace(SAVED, lat_deg=1.0))  # a flight without --gnss keeps them
+    assert load(path).lat_deg == 1.0
+    found = displacements(path)
+    assert found["digest"] == learnt and found["other"].east_m == 1.0
+
+
+@pytest.mark.parametrize("maps", [3, [], {"a": 1}, {"a": {"east_m": "x"}}, {"a": {"std_m": 0}}])
+def test_damaged_displacements_are_ignored(tmp_path, maps):
+    path = tmp_path / "state.json"
+    save(path, SAVED)
+    path.write_text(json.dumps({**json.loads(path.read_text()), "maps": maps}))
+    assert displacements(path) == {} and load(path) == SAVED

@@ -454,6 +454,17 @@ def test_after_many_such_views_a_track_must_be_confirmed_again():
     assert mixture.estimate(RADIUS_M).state is State.TRACKING
 
 
+def test_places_near_the_prediction_do_not_keep_a_track_confirmed():
+    """Such places are found in any picture; views that do not show the map count all the same."""
+    flight, mixture, _ = flown(3, false_share=0.0)
+    for _ in range(3):
+        mixture.predict(1.0, camera=flight.moved())
+        mixture.update(flight.reported(), [replace(flight.sighting(-5.0), alone=0.005)])
+    mixture.predict(1.0, camera=flight.moved())
+    mixture.update(flight.reported(), [flight.sighting(2.0)], newness=0.15)
+    assert mixture.estimate(RADIUS_M).state is State.COASTING
+
+
 @pytest.mark.parametrize(("alone", "state"), [(0.005, State.COASTING), (0.9, State.TRACKING)])
 def test_a_view_counts_by_what_it_shows_itself(alone, state):
     """However well a place agrees with the track: there is always one near the prediction."""

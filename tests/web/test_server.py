@@ -45,7 +45,8 @@ def test_the_summary_says_what_is_shown(ask):
     found = as_json(ask("/api/run"))
     assert found["name"] == "fixes.jsonl" and found["map_name"] == "area.onav"
     assert found["images"] == "flight" and found["truth"] == "flight/truth.csv"
-    assert found["states"] == ["searching", "tracking", "lost"] and not found["live"]
+    assert found["states"] == ["searching", "tracking", "coasting", "lost"]
+    assert not found["live"]
     sheet = found["sheet"]
     assert (sheet["west_m"], sheet["north_m"], sheet["gsd_m"]) == (WEST_M, NORTH_M, GSD_M)
     assert sheet["tiles"]["side_px"] == CHUNK_PX and sheet["tiles"]["levels"][0] == [620, 700]

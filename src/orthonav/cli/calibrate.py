@@ -11,7 +11,10 @@ from orthonav.cli.source import add_source, open_source
 if TYPE_CHECKING:
     from orthonav.onboard.calibrate import MountCalibration
 
-EVERYDAY = ("--latency", "--gnss", "--gnss-std-m", "--heading", "--camera", "--telemetry", "--json")
+EVERYDAY = (
+    *("--latency", "--gnss-positions", "--gnss-std-m", "--heading", "--camera", "--telemetry"),
+    "--json",
+)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +33,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "of `fly --log` with turns; --out is then a file for `fly --camera-latency-ms`",
     )
     parser.add_argument(
-        "--gnss",
+        "--gnss-positions",
         type=Path,
         metavar="positions.csv",
         help="measured positions of some or all views (frame,lat_deg,lon_deg); they make pitch and "
@@ -41,7 +44,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=5.0,
         metavar="M",
-        help="standard deviation of --gnss per axis (m; default 5)",
+        help="standard deviation of --gnss-positions per axis (m; default 5)",
     )
     parser.add_argument(
         "--heading",
@@ -72,7 +75,7 @@ def run(options: argparse.Namespace) -> None:
     if not 0 < options.gnss_std_m < 1e5:
         raise FlightError(f"--gnss-std-m must be above 0, got {options.gnss_std_m}")
     flight = open_source(options.flight, options)
-    places = read_truth(options.gnss) if options.gnss else {}
+    places = read_truth(options.gnss_positions) if options.gnss_positions else {}
     priors = {frame: Prior(*place, options.gnss_std_m) for frame, place in places.items()}
     views = (
         WithTelemetry(v, replace(v.telemetry, prior=priors.get(v.frame))) for v in flight.views
@@ -80,8 +83,8 @@ def run(options: argparse.Namespace) -> None:
     tracker = Tracker(
         Localizer(open_map(options.map)),
         heading_known=options.heading == "known",
-        use_prior=bool(options.gnss),
-        every_prior=bool(options.gnss),
+        use_prior=bool(options.gnss_positions),
+        every_prior=bool(options.gnss_positions),
         smooth=True,
     )
     results = []

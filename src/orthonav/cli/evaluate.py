@@ -119,6 +119,7 @@ def _check_flights(options: argparse.Namespace) -> None:
 def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[FlightReport]":
     """Metrics of every flight, with its worst views if their images are given."""
     from orthonav.evaluate.flights import FlightReport
+    from orthonav.evaluate.gnss import measure_gnss
     from orthonav.evaluate.metrics import compare, measure
     from orthonav.evaluate.track import measure_track
     from orthonav.flight import open_flight, read_truth
@@ -138,7 +139,8 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
             worst = _worst(comparison, results, folders[i], opened, layer)
         metrics = measure(comparison, options.radius_m, rpe_distance_m=options.rpe_distance_m)
         track = measure_track(comparison, results, options.radius_m)
-        flights.append(FlightReport(names[i], comparison, metrics, background, track, worst))
+        gnss = measure_gnss(comparison, results)
+        flights.append(FlightReport(names[i], comparison, metrics, background, track, worst, gnss))
     return flights
 
 

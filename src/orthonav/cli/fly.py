@@ -21,6 +21,7 @@ EVERYDAY = (
     "--heading",
     "--start",
     "--state",
+    "--gnss",
     "--log",
 )
 SEND = ("global-position", "gps-input", "odometry", "vision", "external-position")
@@ -228,7 +229,7 @@ def _add_outputs(group: Any) -> None:
         "--send-coasting",
         action="store_true",
         help="send dead-reckoned positions too, of views that do not show the map: as "
-        "GLOBAL_POSITION_SENSOR with the flag UNHEALTHY, by no other message",
+        "GLOBAL_POSITION_SENSOR with the flag UNHEALTHY, which PX4 ignores, by no other message",
     )
     group.add_argument(
         "--min-std-m",
@@ -311,6 +312,14 @@ def _add_flight(group: Any) -> None:
         default=300.0,
         metavar="S",
         help="ignore a saved position that is older (default 300)",
+    )
+    group.add_argument(
+        "--gnss",
+        choices=("off", "watch", "correct"),
+        default="off",
+        help="watch: compare GNSS with the map, report faults and the displacement of the map; "
+        "correct: also move positions by the displacement that --state has from earlier flights "
+        "(default off)",
     )
     group.add_argument(
         "--deadline-ms",

@@ -71,12 +71,19 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     link = _link(options, clocks)
     source, graph = _inputs(options, clocks, link, camera, stopping, stack, localizer, least)
     camera = camera or source.wait_for_camera()
+    gnss = None
+    if options.gnss != "off":  # only where it is asked for
+        made = importlib.import_module("orthonav.cli.flying_gnss").gnss_watch
+        queue = source.gnss if options.ros2 else None if link is None else link.gnss
+        gnss = made(options, localizer.sheet.frame, queue, least, clocks)
     publisher = _publisher(options, clocks, link, least, graph)
     if link is not None:
         stack.callback(LinkThread(link).stop)
     sink = _sink(options, camera)
     if options.ros2 and sink is not None:
         source.log_gnss = sink.gnss
+    if gnss is not None and sink is not None and not options.ros2:
+        gnss.log = sink.gnss  # with ROS 2 messages are logged as received
     thread = CameraThread(source, stopping)
     stack.callback(thread.stop)
     fly = FlyOptions(
@@ -105,6 +112,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         diagnosis=TelemetryDiagnosis(localizer, least),
         start=_start(options, clocks),
         notifier=Notifier(),
+        gnss=gnss,
         latency=_latency(options, heading_known=heading_known),
     )
 

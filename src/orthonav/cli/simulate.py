@@ -87,6 +87,12 @@ def add(parser: argparse.ArgumentParser) -> None:
     biases.add_argument(
         "--roll-bias-deg", type=float, default=0.0, help="unreported roll of the camera mount"
     )
+    parser.add_argument(
+        "--receiver",
+        metavar="NAME[:KEY=VALUE,..]",
+        help="write gnss.csv of a GNSS receiver along the route: good, step, drag, drift, frozen, "
+        "jumping or jam (docs/reference/formats.md), such as drag:at_s=60,mps=1",
+    )
     effects = parser.add_argument_group("image degradation")
     effects.add_argument(
         "--cloud-share",
@@ -133,6 +139,7 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.geo.route import read_route
     from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
     from orthonav.simulate.motion import Wind
+    from orthonav.simulate.receiver import receiver_of
     from orthonav.simulate.render import ViewEffects
     from orthonav.sources.cameras import read_camera_file
 
@@ -168,6 +175,7 @@ def run(options: argparse.Namespace) -> None:
         turn_radius_m=options.turn_radius_m,
         cloud_share=options.cloud_share,
         beyond=options.beyond,
+        gnss=receiver_of(options.receiver) if options.receiver else None,
     )
     with progress(options) as shown:
         views = simulate_flight(request, lambda share: shown("simulate", share))

@@ -12,6 +12,7 @@ from orthonav.evaluate.calibration_report import (
 )
 from orthonav.evaluate.contact_sheet import Row
 from orthonav.evaluate.figures import or_none
+from orthonav.evaluate.gnss import GnssMetrics, gnss_rows, gnss_to_json
 from orthonav.evaluate.metrics import Comparison, Metrics, measure, pool, radius_key
 from orthonav.evaluate.standard import standard_to_json
 from orthonav.evaluate.track import TrackMetrics
@@ -42,6 +43,7 @@ class FlightReport:
     `background`: image in the plane of `comparison`; optional.
     `track`: metrics of the track; None where views were placed one by one.
     `worst`: rows of the contact sheet; empty where images were not requested.
+    `gnss`: GNSS beside the map; None where it was not recorded.
     """
 
     name: str
@@ -50,6 +52,7 @@ class FlightReport:
     background: Background | None = None
     track: TrackMetrics | None = None
     worst: tuple[Row, ...] = ()
+    gnss: GnssMetrics | None = None
 
 
 def total(flights: Sequence[FlightReport]) -> Metrics:
@@ -131,8 +134,9 @@ def flights_to_json(flights: Sequence[FlightReport], whole: Metrics) -> dict[str
     """
     plain = metrics_to_json(whole)
     if len(flights) == 1:
-        track = flights[0].track
-        return plain if track is None else {**plain, "track": track_to_json(track)}
+        track, gnss = flights[0].track, flights[0].gnss
+        plain |= {} if track is None else {"track": track_to_json(track)}
+        return plain | ({} if gnss is None else {"gnss": gnss_to_json(gnss)})
     tracks = [flight.track for flight in flights if flight.track is not None]
     if tracks:
         plain["track"] = tracks_to_json(tracks)
@@ -149,6 +153,8 @@ def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
     for flight in flights:
         if flight.track is not None:
             lines += track_lines(flight.track, flight.name if len(flights) > 1 else "")
+        if flight.gnss is not None:
+            lines += [f"  {name}: {text}" for name, text in gnss_rows(flight.gnss)]
     return "\n".join(lines)
 
 

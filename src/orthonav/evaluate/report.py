@@ -18,6 +18,7 @@ from orthonav.evaluate.calibration_report import (
 )
 from orthonav.evaluate.contact_sheet import row_text, sheet_picture
 from orthonav.evaluate.flights import FlightReport, table_header, table_rows, total
+from orthonav.evaluate.gnss import gnss_figure, gnss_rows
 from orthonav.evaluate.metrics import Comparison, Metrics, pool, worst_views
 from orthonav.evaluate.track_plots import track_figures
 from orthonav.evaluate.track_report import track_rows
@@ -132,7 +133,10 @@ def _section(flight: FlightReport, drawn: _Drawn) -> dict[str, Any]:
     return {
         "name": flight.name,
         "figures": drawn.general,
-        "track": track_rows(flight.track) if flight.track else (),
+        "track": (
+            *(track_rows(flight.track) if flight.track else ()),
+            *(gnss_rows(flight.gnss) if flight.gnss else ()),
+        ),
         "track_figures": drawn.track,
         "worst": _worst(flight.comparison, flight.metrics),
         "worst_figures": drawn.worst,
@@ -174,8 +178,9 @@ def _drawn(flight: FlightReport) -> _Drawn:
         ),
         *_figures(comparison, metrics),
     )
-    of_track = track_figures(comparison, track, radius_m, background) if track else ()
-    return _Drawn(general, tuple(of_track), _contact_sheet(flight))
+    of_track = track_figures(comparison, track, radius_m, background) if track else []
+    of_gnss = [gnss_figure(flight.gnss)] if flight.gnss else []
+    return _Drawn(general, (*of_track, *of_gnss), _contact_sheet(flight))
 
 
 def _contact_sheet(flight: FlightReport) -> tuple[Figure, ...]:

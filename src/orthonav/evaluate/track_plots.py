@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 STATE_STYLES = {
     "searching": ("#E69F00", "^"),
     "tracking": (RIGHT, "o"),
+    "coasting": ("#56B4E9", "s"),
     "lost": ("#B8558F", "X"),
 }
 """State -> colour and mark."""

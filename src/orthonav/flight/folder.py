@@ -151,7 +151,7 @@ def read_truth(path: Path) -> dict[str, tuple[float, float]]:
     """
     path = require_file(path, "truth")
     truth: dict[str, tuple[float, float]] = {}
-    for line, row in _rows(path, ("frame", "lat_deg", "lon_deg")):
+    for line, row in csv_rows(path, ("frame", "lat_deg", "lon_deg")):
         lat, lon = number_of(row["lat_deg"]), number_of(row["lon_deg"])
         if not (abs(lat) <= 90 and abs(lon) <= 360):
             hint = swapped_hint(lat, lon)
@@ -193,7 +193,7 @@ def read_camera(path: Path) -> tuple[Camera, str]:
 
 def _views(telemetry: Path, frames: Path) -> Iterator[FlightView]:
     seen: set[str] = set()
-    for line, row in _rows(telemetry, TELEMETRY_COLUMNS):
+    for line, row in csv_rows(telemetry, TELEMETRY_COLUMNS):
         frame = row["frame"]
         pure = PurePosixPath(frame)
         if not frame or pure.is_absolute() or ".." in pure.parts or "\\" in frame:
@@ -233,7 +233,7 @@ def _telemetry(row: Mapping[str, str], time_ns: int) -> Telemetry:
     )
 
 
-def _rows(path: Path, needed: tuple[str, ...]) -> Iterator[tuple[int, dict[str, str]]]:
+def csv_rows(path: Path, needed: tuple[str, ...]) -> Iterator[tuple[int, dict[str, str]]]:
     """Line number and fields of each row of a CSV that must have the columns `needed`."""
     if path.stat().st_size > MAX_TEXT_BYTES:
         raise FlightError(f"file is larger than {MAX_TEXT_BYTES // 10**6} MB: {path}")

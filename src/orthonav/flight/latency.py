@@ -46,7 +46,7 @@ def read_latency(path: Path) -> CameraLatency:
         )
         if not (0 <= found.latency_ms <= MOST_MS and 0 <= found.std_ms < math.inf):
             raise ValueError("latency out of range")
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError, OSError) as error:
+    except (ArithmeticError, LookupError, TypeError, ValueError, RecursionError, OSError) as error:
         raise FlightError(
             f"not a latency file of `orthonav calibrate --latency` ({error}): {path}"
         ) from error

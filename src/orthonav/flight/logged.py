@@ -10,11 +10,12 @@ Buffers; all others are read back bit for bit.
 import json
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from orthonav.errors import CameraError, FlightError, described
+from orthonav.flight.gnss import GnssSample
 from orthonav.geo.camera import Camera
 from orthonav.records import Fix, Prior, Telemetry
 
@@ -337,14 +338,27 @@ def navsat_message(fix: Fix, time_ns: int, *, confident: bool) -> bytes:
     Raises `ValueError` where a value is not finite. The altitude is NaN, the
     convention for unknown.
     """
-    (ee, en), (ne, nn) = fix.cov_en_m2.tolist()
     place = float(fix.lat_deg), float(fix.lon_deg)
+    return _navsat(place, fix.cov_en_m2.reshape(-1).tolist(), time_ns, valid=confident)
+
+
+def gnss_message(sample: GnssSample, time_ns: int) -> bytes:
+    """The message of `GNSS` (CDR, little endian) of a solution. Raises `ValueError` as above."""
+    std_m = sample.std_m if math.isfinite(sample.std_m) else 0.0
+    place = sample.lat_deg, sample.lon_deg
+    return _navsat(place, [std_m**2, 0.0, 0.0, std_m**2], time_ns, valid=sample.has_fix)
+
+
+def _navsat(
+    place: tuple[float, float], cov_en_m2: Sequence[float], time_ns: int, *, valid: bool
+) -> bytes:
+    ee, en, ne, nn = cov_en_m2
     if not all(map(math.isfinite, (*place, ee, en, ne, nn))):
         raise ValueError("position is not finite")
     sec, nsec = divmod(max(0, int(time_ns)), 10**9)
     name = FRAME_ID.encode() + b"\0"
     out = bytearray(struct.pack("<III", sec & 0xFFFFFFFF, nsec, len(name)) + name)
-    out += struct.pack("<b", _STATUS_FIX if confident else _STATUS_NO_FIX)
+    out += struct.pack("<b", _STATUS_FIX if valid else _STATUS_NO_FIX)
     out += bytes(-len(out) % 2) + struct.pack("<H", 0)  # no satellite service
     out += bytes(-len(out) % 8)
     out += struct.pack("<3d", *place, math.nan)

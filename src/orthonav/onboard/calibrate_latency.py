@@ -46,7 +46,7 @@ def calibrate_latency(
     """Latency of a camera from views and the latency (s) that their times already contain.
 
     Telemetry is interpolated between the exposures of the views. Raises `FlightError` where the
-    flight says too little, or estimates disagree.
+    flight shows too little motion, or estimates disagree.
     """
     history = StateHistory(GAP_S)
     odometry, estimator = PictureOdometry(), DelayEstimator(heading_known=heading_known)
@@ -98,8 +98,9 @@ def _agreed(estimates: list[DelayEstimate], intervals: list[float]) -> CameraLat
         )
     if len(found) < LEAST:
         raise FlightError(
-            f"the flight says too little about the latency of the camera: {len(found)} of "
-            f"{len(estimates)} windows show it, {LEAST} are needed. {NEEDED[0].upper()}{NEEDED[1:]}"
+            f"the flight does not show the latency of the camera: {len(found)} of "
+            f"{len(estimates)} windows give an estimate, {LEAST} are needed. "
+            f"{NEEDED[0].upper()}{NEEDED[1:]}"
         )
     delays = np.array([each.delay_s for each in found])
     stds = np.array([each.std_s for each in found])

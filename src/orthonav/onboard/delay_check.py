@@ -17,8 +17,8 @@ LEAST_PAIRS = 12
 LEAST_PER_S, SCALES = 0.03, (0.4, 2.5)
 """Shift per second by the velocity from which it is compared (3 m/s from 100 m), and the range of
 the seen over the reported one: height and heading may be off."""
-STANDS_OUT = 2.0
-"""Motion counts from so many least standard deviations."""
+SUMMED, STANDS_OUT = 4, 3.0
+"""Successive pairs that are summed; their motion counts from so many least standard deviations."""
 
 
 class DelayCheck:
@@ -59,7 +59,9 @@ class DelayCheck:
             self._rows.popleft()
         if len(self._rows) < LEAST_PAIRS:
             return math.nan
-        rows = np.array([row for _, row in self._rows])
+        pairs = np.array([row for _, row in self._rows])
+        # Sums over successive pairs: jitter of the attitudes cancels, motion adds up.
+        rows = np.lib.stride_tricks.sliding_window_view(pairs, SUMMED, axis=0).sum(axis=-1)
         seconds = rows[:, :1]
         # The constant part of the shift depends on height and heading, which may be off.
         velocity = rows[:, 7:9]

@@ -23,6 +23,7 @@ from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_picture
 from orthonav.onboard import state as states
 from orthonav.onboard.cameras import CameraImage, FrozenCheck, NewestImage
+from orthonav.onboard.gnss.watch import GnssWatch
 from orthonav.onboard.health import (
     EventCounter,
     Health,
@@ -137,6 +138,7 @@ class Runner:
         diagnosis: TelemetryDiagnosis | None = None,
         start: Callable[[], Prior | None] = lambda: None,
         notifier: Notifier | None = None,
+        gnss: GnssWatch | None = None,
         latency: LatencyMonitor | None = None,
     ) -> None:
         """`start` gives the prior of the first view; it is called when that view is located.
@@ -147,6 +149,7 @@ class Runner:
         self._latency = latency
         self._start: Callable[[], Prior | None] | None = start
         self._notifier = notifier or Notifier("")
+        self._gnss = gnss
         self.counter, self._reporter, self._frozen = EventCounter(), HealthReporter(), FrozenCheck()
         self.health: Health | None = None
         self._begun_ns = self._confident_ns = clocks.mono_ns()
@@ -295,7 +298,8 @@ class Runner:
         if latency is not None and isinstance(outcome, Fix):
             outcome = _with_latency(outcome, telemetry, latency.std_s)
         result = self._result(image, outcome, latency_ms)
-        accepted = self.options.accept(outcome) if self.options.accept else outcome
+        accepted = self.options.accept(result.outcome) if self.options.accept else result.outcome
+        accepted = accepted if self._gnss is None else self._gnss.corrected(accepted)
         self._publisher.publish(
             replace(result, outcome=accepted), image.exposed_ns, vehicle, judged=True
         )
@@ -330,7 +334,8 @@ class Runner:
 
     def _result(self, image: CameraImage, outcome: Fix | NoFix, latency_ms: float) -> ViewResult:
         state = self._locator.state_name
-        return ViewResult(image.frame, image.time_ns, outcome, latency_ms, state)
+        result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state)
+        return result if self._gnss is None else self._gnss.view(result, image.exposed_ns)
 
     def _map_changed(self) -> NoFix | None:
         """Reason to give no position where the map file was changed in place; None if it was not.
@@ -398,6 +403,7 @@ class Runner:
         """Once a second: judge and publish the health, and save the state."""
         self._count_changes()
         self._save_state()
+        texts = [] if self._gnss is None else self._gnss.tick(now_ns)
         health = self.health = judge(self._snapshot(now_ns))
         plain = self._plain(health)
         self._publisher.health(plain)
@@ -410,8 +416,21 @@ class Runner:
         if connected and self._reporter.due(health, now_ns):
             text = health.text().encode("ascii", "replace")
             self._link.send(dialect().MAVLink_statustext_message(health.level.severity, text))
+        for each in texts:
+            if connected:
+                text = each.text.encode("ascii", "replace")
+                self._link.send(dialect().MAVLink_statustext_message(each.severity, text))
+        if self._gnss is not None and connected:
+            self._send_gnss(self._link, self._gnss, now_ns)
         if self._publisher.messenger is not None:
             self._publisher.messenger.send_origin(self._link.origin, self._link.target)
+
+    @staticmethod
+    def _send_gnss(link: AutopilotLink, gnss: GnssWatch, now_ns: int) -> None:
+        """Send fault code and difference as NAMED_VALUE_FLOAT, for scripts and ground stations."""
+        boot_ms = ((link.boot_ns(now_ns) or 0) // 1_000_000) % 2**32
+        for name, value in ((b"gnss_fault", float(gnss.code)), (b"gnss_diff", gnss.difference_m)):
+            link.send(dialect().MAVLink_named_value_float_message(boot_ms, name, value))
 
     def _count_changes(self) -> None:
         """Count what the link, the camera, the outputs and the log counted since the last call."""
@@ -465,6 +484,7 @@ class Runner:
             map_intact=self.options.map_change() is None,
             heading_mismatch_deg=heading_deg,
             log_scale_mismatch=log_scale,
+            gnss=() if self._gnss is None else self._gnss.reasons,
             latency=self._latency_reason(),
         )
 
@@ -486,6 +506,7 @@ class Runner:
             "sent": dict(sorted(self._publisher.gate.sent.items())),
             "age_p50_ms": round(self.counter.latency_s(0.5) * 1e3, 1),
             "age_p95_ms": round(self.counter.latency_s(0.95) * 1e3, 1),
+            **({} if self._gnss is None else {"gnss": self._gnss.plain()}),
             **({} if self._latency is None else self._latency.plain()),
         }
 
@@ -495,7 +516,8 @@ class Runner:
             return
         stamp = self._link.signing_now() if self._link is not None else None
         try:
-            states.save(path, replace(last, signing_timestamp_10us=stamp or 0))
+            maps = None if self._gnss is None else self._gnss.maps()
+            states.save(path, replace(last, signing_timestamp_10us=stamp or 0), maps)
             self._saved = last
         except OSError as error:
             if self.counter.total["state_failed"] == 0:

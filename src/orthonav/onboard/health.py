@@ -103,6 +103,7 @@ class Snapshot:
     `map_unchanged`: whether the file of the map's name is still the one that was opened.
     `map_intact`: whether the open map file was neither truncated nor rewritten.
     `heading_mismatch_deg`, `log_scale_mismatch`: see `mismatch`.
+    `gnss`: reasons of the GNSS monitor.
     `latency`: reason why the latency of the camera cannot be used, see `orthonav.onboard.latency`.
     """
 
@@ -119,6 +120,7 @@ class Snapshot:
     map_intact: bool = True
     heading_mismatch_deg: float = 0.0
     log_scale_mismatch: float = 0.0
+    gnss: tuple[str, ...] = ()
     latency: str | None = None
 
 
@@ -157,6 +159,7 @@ def judge(seen: Snapshot, limits: HealthLimits | None = None) -> Health:
         "log_failed": count["log_failed"] > 0,
         "state_not_saved": count["state_failed"] > 0,
         "internal_error": count["internal_error"] > 0 and not failed["internal_errors"],
+        **dict.fromkeys(seen.gnss, True),
     }
     if seen.latency is not None:
         degraded = {seen.latency: True, **degraded}  # the cause of others, so it comes first

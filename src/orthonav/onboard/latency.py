@@ -21,6 +21,9 @@ from orthonav.sources.attitude import LOOKS_DOWN, Angles, enu_from_body_camera
 UNKNOWN, UNSTEADY, MISMATCH = "latency_unknown", "latency_unsteady", "motion_mismatch"
 EVERY_NS = 10**9
 """Interval of estimates."""
+FIRST_NS = 5 * 10**9
+"""A stated delay is used after images agreed with it, or after this time without enough motion to
+tell."""
 RECENT_S = 8.0
 """Pictures of so many seconds show a change that the whole window hides."""
 SAMPLE_NS = 50_000_000
@@ -108,6 +111,8 @@ class LatencyMonitor:
         self._grown = False
         self._arrival: Arrival | None = None
         self._frozen_ns: int | None = None
+        self._first_ns: int | None = None
+        self._compared = False
 
     def wants(self, arrived_ns: int) -> bool:
         """Whether an image that arrived then is compared with the one before."""
@@ -135,6 +140,8 @@ class LatencyMonitor:
         elif self._suspicion:
             reason = UNSTEADY
             detail = f"{self._suspicion}: the camera latency must be measured again, in turns"
+        elif not self._compared:
+            reason, detail = UNKNOWN, "the stated camera latency is compared with the first images"
         elif self._drifted_away(arrived_ns):
             reason, detail = UNSTEADY, "the camera latency drifts and is not observable now"
         elif std_s * self._speed_mps() > 2 * LARGEST_M:
@@ -154,6 +161,9 @@ class LatencyMonitor:
         `state_at` gives the state at a time of our clock, known up to `covered_ns`.
         """
         self._frozen_ns = None  # this image is not frozen
+        if self._first_ns is None:
+            self._first_ns = arrival.arrived_ns
+        self._compared |= arrival.arrived_ns - self._first_ns > FIRST_NS
         self._sample(state_at, covered_ns)
         motion = self._odometry.motion(grey, camera, arrival.arrived_ns)
         self._estimator.add(motion, self._history)
@@ -243,7 +253,8 @@ class LatencyMonitor:
         if found.contradicted or recent.contradicted:
             self._contradictions += 1
             return
-        self._contradictions = 0
+        if found.found:
+            self._contradictions = 0
         if not found.found or found.std_s * self._speed_mps() > LARGEST_M:
             return
         if found.delay_s < -BEFORE_S or abs(found.drift) > TOO_FAST:
@@ -268,8 +279,11 @@ class LatencyMonitor:
 
     def _compare(self) -> None:
         """Dispute the delay in use where the last seconds do not fit it."""
+        share = self._check.share()
+        if share >= UNEXPLAINED:
+            self._compared, self._contradictions = True, 0
         # It cannot be settled here: steady turns look alike at many delays.
-        if self._check.share() < UNEXPLAINED and not self._suspicion:
+        if share < UNEXPLAINED and not self._suspicion:
             self._suspicion, self._disputed, self._pending = UNLIKE, True, None
 
     def _dispute(self, why: str, found: DelayEstimate) -> None:
@@ -290,6 +304,7 @@ class LatencyMonitor:
             self._estimator.forget_before(found.last_ns - round(RECENT_S * 1e9))
             self._check.clear()
         self._suspicion, self._disputed, self._pending, self._grown = "", False, None, False
+        self._compared = True
         if self._arrival is not None and math.isfinite(self._arrival.grown_s):
             self._anchor = self._arrival.arrived_ns, self._arrival.grown_s
 

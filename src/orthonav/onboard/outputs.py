@@ -123,6 +123,8 @@ class Messenger:
         """
         sent = []
         for name in self.options.kinds:
+            if estimate.dead_reckoned and name != "global-position":
+                continue  # only this message can mark it
             now_ns = self._clocks.mono_ns()
             stamped = replace(estimate, boot_ns=boot_ns, processing_s=(now_ns - exposed_ns) / 1e9)
             stated = self._covariance.prepare(name, stamped, exposed_ns)

@@ -8,15 +8,21 @@ import json
 import math
 import os
 import tempfile
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
+from orthonav.onboard.gnss.records import Displacement
 from orthonav.records import Prior
 
 VERSION = 1
 MAX_BYTES = 100_000
+MAX_MAPS = 100
+"""Maps whose displacement is stored, the latest."""
 SPEED_MPS = 30.0
 """Standard deviation of the speed of the aircraft since the position was saved: assumed."""
+_DISPLACEMENT = tuple(each.name for each in fields(Displacement))
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
@@ -62,16 +68,50 @@ def prior_of(saved: SavedState, age_s: float, max_age_s: float) -> Prior | None:
     return Prior(saved.lat_deg, saved.lon_deg, math.hypot(saved.std_m, SPEED_MPS * age_s))
 
 
-def save(path: Path, saved: SavedState) -> None:
-    """Write the file, replacing an existing one atomically. Raises `OSError`."""
+def save(path: Path, saved: SavedState, maps: Mapping[str, Any] | None = None) -> None:
+    """Write the file, replacing an existing one atomically. Raises `OSError`.
+
+    `maps`: what was learnt of maps, by their digest; None keeps what the file has.
+    """
+    maps = _maps_of(path) if maps is None else maps
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
         with os.fdopen(handle, "w", encoding="ascii") as stream:
-            json.dump({"version": VERSION, **asdict(saved)}, stream, allow_nan=True)
+            plain = {
+                "version": VERSION,
+                **asdict(saved),
+                "maps": dict(list(maps.items())[-MAX_MAPS:]),
+            }
+            json.dump(plain, stream, allow_nan=True)
         Path(name).replace(path)
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
+
+
+def displacements(path: Path) -> dict[str, Displacement]:
+    """Learnt displacements by the digest of their map; none where the file has no valid one."""
+    found = {}
+    for digest, plain in _maps_of(path).items():
+        try:
+            made = Displacement(**{name: float(plain[name]) for name in _DISPLACEMENT})
+        except (KeyError, TypeError, ValueError):
+            continue
+        values = [getattr(made, name) for name in _DISPLACEMENT]
+        if all(map(math.isfinite, values)) and made.std_m > 0 and made.agreed_s >= 0:
+            found[digest] = made
+    return found
+
+
+def _maps_of(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            return {}
+        plain = json.loads(path.read_text(encoding="ascii"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    maps = plain.get("maps") if isinstance(plain, dict) else None
+    return maps if isinstance(maps, dict) else {}
 
 
 def load(path: Path) -> SavedState | None:

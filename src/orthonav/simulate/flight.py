@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from orthonav.errors import AreaError, CameraError, FlightError
 from orthonav.files import replacing_folder
+from orthonav.flight.gnss import FILE as GNSS_FILE
+from orthonav.flight.gnss import GnssSample, write_gnss
 from orthonav.flight.writer import FlightWriter
 from orthonav.geo.area import Area
 from orthonav.geo.camera import Camera, footprint_en_m
@@ -32,6 +34,7 @@ from orthonav.simulate.motion import (
     steady_path,
     windy_path,
 )
+from orthonav.simulate.receiver import Good, samples_of, solutions
 from orthonav.simulate.render import ViewEffects, render_view
 
 DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
@@ -127,6 +130,7 @@ class SimulateRequest:
     - `turn_radius_m`: radius of the corners of a route, 0..100,000 m; 0 turns on the spot.
     - `cloud_share`: share of the views with clouds, 0..1.
     - `beyond`: whether the route may leave the imagery, which is then mirrored at its border.
+    - `gnss`: receiver whose solutions are written to `gnss.csv`; only on a route.
     """
 
     orthos: Sequence[Path]
@@ -144,6 +148,7 @@ class SimulateRequest:
     turn_radius_m: float = 0.0
     cloud_share: float = 0.0
     beyond: bool = False
+    gnss: Good | None = None
 
 
 @dataclass(frozen=True)
@@ -213,7 +218,20 @@ def simulate_flight(
             if progress is not None:
                 progress((number + 1) / len(poses))
         writer.close()
+        if request.gnss is not None:
+            write_gnss(folder / GNSS_FILE, _solutions(request, request.gnss, area, poses))
     return len(poses)
+
+
+def _solutions(
+    request: SimulateRequest, receiver: Good, area: Area, poses: Sequence[_Pose]
+) -> Iterator[GnssSample]:
+    """Solutions of the receiver along the poses."""
+    times = np.array([pose.time_s for pose in poses])
+    places = np.array([pose.position_en_m for pose in poses])
+    rng = np.random.default_rng([request.seed, 5])
+    made = solutions(receiver, times, places, rng)
+    return samples_of(made, area.frame)
 
 
 def _check(request: SimulateRequest) -> None:
@@ -237,6 +255,7 @@ def _check(request: SimulateRequest) -> None:
         "turn_radius_m": request.turn_radius_m > 0,
         "velocity_drift": request.errors.velocity_drift is not None,
         "beyond": request.beyond,
+        "gnss": request.gnss is not None,
     }
     given = [name for name, value in on_a_route.items() if value]
     if request.route is None and given:

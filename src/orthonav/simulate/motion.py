@@ -167,6 +167,11 @@ def _wandering(step: float, rng: np.random.Generator) -> Iterator[Array]:
         value = decay * value + math.sqrt(1 - decay**2) * rng.normal(0, 1, 2)
 
 
+def gauss_markov(step: float, count: int, rng: np.random.Generator) -> Array:
+    """`count` values (N, 2) of the process of `_wandering`."""
+    return np.array([value for value, _ in zip(_wandering(step, rng), range(count), strict=False)])
+
+
 def drifting(velocities: Array, times_s: Array, drift: float, rng: np.random.Generator) -> Array:
     """Velocities (N, 2) as reported by odometry with a drifting scale and direction.
 
@@ -174,9 +179,7 @@ def drifting(velocities: Array, times_s: Array, drift: float, rng: np.random.Gen
     the time constant `DRIFT_TIME_S`.
     """
     step_s = float(times_s[1] - times_s[0]) if len(times_s) > 1 else 1.0
-    off = drift * np.array(
-        [error for error, _ in zip(_wandering(step_s / DRIFT_TIME_S, rng), times_s, strict=False)]
-    )
+    off = drift * gauss_markov(step_s / DRIFT_TIME_S, len(times_s), rng)
     cos, sin = np.cos(off[:, 1]), np.sin(off[:, 1])
     east, north = velocities.T
     turned = np.stack([cos * east + sin * north, cos * north - sin * east], axis=1)

@@ -74,10 +74,15 @@ def merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
 def recognized(group: Sequence[Hypothesis]) -> float:
     """Largest probability of having recognized the map in several hypotheses that are one place.
 
-    Those with less than `MINOR_OF_GROUP` of the group's probability do not count.
+    Only the `major` ones count.
     """
+    return max(each.recognized for each in major(group))
+
+
+def major(group: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Those with at least `MINOR_OF_GROUP` of the probability of the group."""
     least = MINOR_OF_GROUP * sum(each.share for each in group)
-    return max(each.recognized for each in group if each.share >= least)
+    return [each for each in group if each.share >= least]
 
 
 def _divergence(one: Hypothesis, heavier: Hypothesis, inverse: Array) -> float:

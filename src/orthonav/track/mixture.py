@@ -20,6 +20,7 @@ from orthonav.records import CONFIDENT
 from orthonav.track.hypotheses import (
     Hypothesis,
     distance,
+    major,
     merged,
     moments,
     recognized,
@@ -303,8 +304,10 @@ class Mixture:
             for start in self._with_bias_jump(each):
                 for seen in measurements:
                     split = self._updated(start, seen)
-                    if split is not None:
-                        made.append(replace(split, share=split.share * found))
+                    if split is None:
+                        continue
+                    count = split.sighted if split.recognized >= RECOGNIZED else sighted
+                    made.append(replace(split, share=split.share * found, sighted=count))
         made += [born for each in measurements for born in self._born(each)]
         total = sum(each.share for each in made) + self.elsewhere
         self.elsewhere /= total
@@ -324,7 +327,7 @@ class Mixture:
         near = [each for each in self.hypotheses if distance(each, best) <= radius_m]
         mean, covariance = moments(near)
         confidence = min(self._inside(radius_m, mean[POSITION]), 1.0)
-        sighted = max(each.sighted for each in near)
+        sighted = max(each.sighted for each in major(near))
         seen = recognized(near)
         if not between_views:
             confirmed = seen >= RECOGNIZED and sighted >= CONFIRMED

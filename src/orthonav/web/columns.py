@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from orthonav.evaluate.calibration import is_covariance
 from orthonav.evaluate.metrics import FAR_M
 from orthonav.flight.fixes import STATES
+from orthonav.flight.gnss import fault_of, gnss_of
 from orthonav.records import CONFIDENT, Fix, ViewResult
 from orthonav.web.sheet import SheetImagery
 
@@ -32,6 +33,8 @@ def columns_of(
 
     `frame`: name; `t`: time in seconds; `ms`: processing time.
     `x`, `y`, `tx`, `ty`: fix and true position in pixels of the sheet.
+    `gx`, `gy`, `gerr`, `gdiff`: GNSS in pixels of the sheet, its error, and its distance from the
+    fix in metres; `gfault`: reason of the GNSS monitor, "" without one.
     `err`: error in metres; `conf`, `radius`: confidence and radius (m) that the fix states.
     `a`, `b`, `turn`: axes of one standard deviation (m), and the angle of the longer one in degrees
     counter-clockwise from east.
@@ -49,6 +52,8 @@ def columns_of(
         for f, r in zip(fixes, results, strict=True)
     ]
     wrong = np.array(confident, dtype=bool) & (error_m > np.fmax(max(FAR_M, radius_m), own_m))
+    gnss_en_m = _places([gnss_of(r.outcome.evidence) for r in results], sheet)
+    gx, gy = _drawn(gnss_en_m, sheet)
     axes_m, turn_deg = _ellipses(fixes)
     x, y = _drawn(fix_en_m, sheet)
     tx, ty = _drawn(truth_en_m, sheet)
@@ -59,6 +64,11 @@ def columns_of(
         "y": _rounded(y, 2),
         "tx": _rounded(tx, 2),
         "ty": _rounded(ty, 2),
+        "gx": _rounded(gx, 2),
+        "gy": _rounded(gy, 2),
+        "gerr": _rounded(np.hypot(*(gnss_en_m - truth_en_m).T), 2),
+        "gdiff": _rounded(np.hypot(*(gnss_en_m - fix_en_m).T), 2),
+        "gfault": [fault_of(r.outcome.evidence) for r in results],
         "err": _rounded(error_m, 2),
         "conf": _each(fixes, "confidence", 4),
         "radius": _rounded(own_m, 1),

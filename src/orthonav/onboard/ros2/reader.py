@@ -5,12 +5,14 @@ header stamps; for a message without a stamp the time of arrival is used.
 """
 
 import logging
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from orthonav.errors import CameraError, FlightError
+from orthonav.flight.gnss import FIX_3D, GnssSample
 from orthonav.geo.camera import Camera
 from orthonav.onboard.cameras import CameraImage
 from orthonav.onboard.ros2.messages import TIME_NS
@@ -33,21 +35,6 @@ MOST_LINES = 100
 _SPIN_S = 0.05
 _TELEMETRY_DEPTH = 200
 IMAGES = {"raw": "sensor_msgs/msg/Image", "compressed": "sensor_msgs/msg/CompressedImage"}
-
-
-@dataclass(frozen=True)
-class GnssSample:
-    """Position of a GNSS receiver, for comparison only: it is never a source of our positions.
-
-    `time_ns`: ROS time. `lat_deg`, `lon_deg`, `alt_m`: WGS84. `status`: that of
-    `sensor_msgs/NavSatStatus`; below 0 there is no fix.
-    """
-
-    time_ns: int
-    lat_deg: float
-    lon_deg: float
-    alt_m: float
-    status: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +62,7 @@ class Ros2Reader:
         """`wait_s`: how long an image waits for the attitude that follows its exposure."""
         self._node, self._buffer, self._clocks, self._stopped = node, buffer, clocks, stopped
         self._mount_deg, self._wait_ns = mount_deg, round(wait_s * 1e9)
-        self.gnss: GnssSample | None = None
+        self.gnss: deque[GnssSample] = deque(maxlen=1000)  # for `orthonav.onboard.gnss`
         self.log_gnss: Callable[[int, bytes], None] = lambda time_ns, cdr: None
         self._camera: Camera | None = None
         self._camera_error: CameraError | None = None
@@ -224,8 +211,19 @@ class Ros2Reader:
     def _take_gnss(self, message: Any, cdr: bytes) -> None:
         time_ns = self._stamp(message)
         if time_ns is not None:
-            place = float(message.latitude), float(message.longitude), float(message.altitude)
-            self.gnss = GnssSample(time_ns, *place, int(message.status.status))
+            known = int(message.position_covariance_type) > 0
+            variance_m2 = max(float(message.position_covariance[i]) for i in (0, 4))
+            self.gnss.append(
+                GnssSample(
+                    time_ns=time_ns - (self._ahead_ns() or 0),
+                    arrived_ns=self._clocks.mono_ns(),
+                    lat_deg=float(message.latitude),
+                    lon_deg=float(message.longitude),
+                    fix_type=FIX_3D if int(message.status.status) >= 0 else 1,
+                    std_m=math.sqrt(variance_m2) if known and variance_m2 > 0 else math.nan,
+                    stamp_ns=time_ns,
+                )
+            )
             self.log_gnss(time_ns, cdr)
 
     def _is_ready(self, image: _Waiting) -> bool:

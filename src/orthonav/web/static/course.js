@@ -53,6 +53,7 @@ export class Course extends Chart {
     const times = store.rising ? store.columns.t : Array.from({ length: store.count }, (_, i) => i);
     this.places = this.xs(times);
     const bands = store.health.length ? 2 : 1;
+    this.#alarms(context);
     const ground = this.box.clientHeight - 16 - bands * (BAND + 2) - GAP;
     const split = Math.round(ground * 0.62);
     this.#errors(context, 4, split);
@@ -83,11 +84,25 @@ export class Course extends Chart {
     context.globalAlpha = 1;
   }
 
+  /** Shades the views with a fault of GNSS. */
+  #alarms(context) {
+    const { count, columns } = this.store;
+    context.globalAlpha = 0.18;
+    for (let from = 0, i = 1; i <= count; i++) {
+      if (i < count && columns.gfault[i] === columns.gfault[from]) continue;
+      const until = i < count ? this.places[i] : this.places[i - 1] + 2;
+      if (columns.gfault[from]) this.span(context, this.places[from], until, 0, this.box.clientHeight, colour("gnss"));
+      from = i;
+    }
+    context.globalAlpha = 1;
+  }
+
   #errors(context, top, bottom) {
     const c = this.store.columns;
-    const withTruth = this.store.stats.withTruth > 0;
+    const { withTruth, withGnss } = this.store.stats;
+    const gnss = withTruth ? c.gerr : c.gdiff;
     let [low, high] = [this.store.run.radius_m / 10, this.store.run.radius_m * 2];
-    for (const values of withTruth ? [c.err, c.a] : [c.a]) {
+    for (const values of withTruth ? [c.err, c.a, gnss] : [c.a, gnss]) {
       for (const v of values) {
         if (v > 0) [low, high] = [Math.min(low, Math.max(v, FLOOR_M)), Math.max(high, v)];
       }
@@ -100,8 +115,11 @@ export class Course extends Chart {
     this.rules(context, decades, y, colour("line"), { text: (v) => metres(v) });
     const positive = c.a.map((v) => (v > 0 ? v : NaN));
     this.area(context, this.places, null, positive, y, colour("shade"), bottom);
+    if (withGnss) this.#points(context, gnss, (v) => Math.max(y(v), top), () => "gnss");
     this.#points(context, c.err, (v) => Math.max(y(v), top), (i) => (c.wrong[i] ? "wrong" : "ink"));
-    this.label(context, withTruth ? "error; shaded: stated 1 σ" : "stated 1 σ", LEFT + 5, top + 10);
+    const text = withTruth ? "error; shaded: stated 1 σ" : "stated 1 σ";
+    const more = withTruth ? "; green: error of GNSS" : "; green: GNSS from the map";
+    this.label(context, withGnss ? text + more : text, LEFT + 5, top + 10);
   }
 
   #confidence(context, top, bottom) {

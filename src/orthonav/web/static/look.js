@@ -1,7 +1,7 @@
 // Colours and marks, the same on map, course and list.
 
-const COLOURS = ["tracking", "searching", "lost", "alone", "none", "truth", "wrong", "ink", "soft", "line",
-  "paper", "shade", "strong", "good", "warn", "bad"];
+const COLOURS = ["tracking", "coasting", "searching", "lost", "alone", "none", "truth", "wrong", "ink", "soft", "line",
+  "paper", "shade", "strong", "good", "warn", "bad", "gnss"];
 let colours = {};
 
 /** A colour of style.css, in the current scheme. */
@@ -19,8 +19,10 @@ export function watchColours(changed) {
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { read(); changed(); });
 }
 
-export const MARKS = { tracking: "●", alone: "●", searching: "▲", lost: "✕", none: "–" };
-export const NAMES = { tracking: "tracking", alone: "fix", searching: "searching", lost: "lost", none: "no fix" };
+export const MARKS = { tracking: "●", coasting: "○", alone: "●", searching: "▲", lost: "✕", none: "–" };
+export const NAMES = {
+  tracking: "tracking", coasting: "coasting", alone: "fix", searching: "searching", lost: "lost", none: "no fix",
+};
 
 /** Draws the mark of a state at a point; each state has its own shape. */
 export function drawMark(context, state, x, y, size) {
@@ -38,6 +40,11 @@ export function drawMark(context, state, x, y, size) {
     context.moveTo(x + size, y - size);
     context.lineTo(x - size, y + size);
     context.stroke();
+  } else if (state === "coasting") {
+    context.lineWidth = Math.max(1.2, size * 0.5);
+    context.beginPath();
+    context.arc(x, y, size, 0, 2 * Math.PI);
+    context.stroke();
   } else if (size < 2.5) {
     context.fillRect(x - size, y - size, 2 * size, 2 * size); // too small to look round
   } else {
@@ -47,7 +54,7 @@ export function drawMark(context, state, x, y, size) {
   }
 }
 
-const KINDS = [...Object.keys(MARKS), "wrong", "ink"];
+const KINDS = [...Object.keys(MARKS), "wrong", "ink", "gnss"];
 
 /** Of many thousand marks most cover equal ones: one in a small square is enough. */
 export class Squares {

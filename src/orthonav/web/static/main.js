@@ -179,6 +179,7 @@ function drawFigures(store) {
     rows.push(["CEP50", metres(quantile(0.5) ?? NaN)], ["CEP95", metres(quantile(0.95) ?? NaN)]);
     rows.push(["confident and wrong", stats.wrong]);
   }
+  if (stats.withGnss || stats.gnssAlarms) rows.push(["GNSS alarms", stats.gnssAlarms]);
   find("figures").replaceChildren(...rows.map(([name, value]) => {
     const [part, term, figure] = ["div", "dt", "dd"].map((tag) => document.createElement(tag));
     [term.textContent, figure.textContent] = [name, value];
@@ -193,6 +194,7 @@ function drawLegend(store) {
   const rows = Object.keys(NAMES).filter((state) => states.has(state) && state !== "none")
     .map((state) => [MARKS[state], NAMES[state], `var(--${state})`]);
   if (store.stats.withTruth) rows.push(["—", "truth", "var(--truth)"], ["◯", "confident and wrong", "var(--wrong)"]);
+  if (store.stats.withGnss) rows.push(["—", "GNSS", "var(--gnss)"]);
   find("legend").replaceChildren(...rows.map(([mark, name, paint]) => {
     const [part, sign] = [document.createElement("span"), document.createElement("i")];
     [sign.textContent, sign.style.color] = [mark, paint];

@@ -75,7 +75,8 @@ export const Marks = L.Layer.extend({
   _paint(context, view) {
     const { columns: c, count } = this._store;
     if (!count) return;
-    this._line(context, view, c.tx, c.ty);
+    this._line(context, view, c.tx, c.ty, "truth");
+    if (this._store.stats.withGnss) this._line(context, view, c.gx, c.gy, "gnss");
     this._ellipses(context, view);
     const size = count > 4000 ? 2.2 : count > MANY ? 3 : 4;
     const rings = new Path2D(); // drawn together on top: one by one is slower
@@ -101,8 +102,8 @@ export const Marks = L.Layer.extend({
     context.stroke(rings);
   },
 
-  /** The true path, with gaps where it is unknown. */
-  _line(context, view, xs, ys) {
+  /** The path by truth or GNSS, with gaps where it is unknown. */
+  _line(context, view, xs, ys, paint) {
     const path = new Path2D();
     let [before, lastX, lastY] = [false, 0, 0];
     for (let i = 0; i < xs.length; i++) {
@@ -113,7 +114,7 @@ export const Marks = L.Layer.extend({
       else if (known) path.moveTo(x, y);
       [before, lastX, lastY] = [known, x, y];
     }
-    for (const [width, name, alpha] of [[4.5, "paper", 0.65], [1.6, "truth", 1]]) {
+    for (const [width, name, alpha] of [[4.5, "paper", 0.65], [1.6, paint, 1]]) {
       [context.lineWidth, context.strokeStyle, context.globalAlpha] = [width, colour(name), alpha];
       context.stroke(path);
     }

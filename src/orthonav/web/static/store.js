@@ -1,7 +1,8 @@
 // The views of the run, the selected one, and the filter. Events: "data" (new views, or all replaced),
 // "select", "filter".
 
-const NUMBERS = ["x", "y", "tx", "ty", "err", "conf", "radius", "a", "b", "turn", "head", "agl", "ms"];
+const NUMBERS = ["x", "y", "tx", "ty", "err", "conf", "radius", "a", "b", "turn", "head", "agl", "ms",
+  "gx", "gy", "gerr", "gdiff"];
 export const CONFIDENT = 0.9;
 
 export class Store extends EventTarget {
@@ -25,7 +26,7 @@ export class Store extends EventTarget {
     this.listed = []; // the same in the order of the list
     this.isShown = [];
     this.rising = true;
-    this.stats = { fixes: 0, wrong: 0, right: 0, withTruth: 0 };
+    this.stats = { fixes: 0, wrong: 0, right: 0, withTruth: 0, withGnss: 0, gnssAlarms: 0 };
   }
 
   /** Takes a response of api/news. */
@@ -59,6 +60,8 @@ export class Store extends EventTarget {
     this.stats.wrong += c.wrong[i];
     this.stats.right += c.err[i] <= this.run.radius_m ? 1 : 0;
     this.stats.withTruth += Number.isNaN(c.tx[i]) ? 0 : 1;
+    this.stats.withGnss += Number.isNaN(c.gx[i]) ? 0 : 1;
+    if (c.gfault[i] && !(i && c.gfault[i - 1])) this.stats.gnssAlarms += 1;
     if (i && c.t[i] < c.t[i - 1]) this.rising = false;
   }
 
@@ -67,7 +70,7 @@ export class Store extends EventTarget {
     return this.rising ? this.columns.t[i] : i;
   }
 
-  /** The state of a view: searching, tracking, lost, alone (placed without a track) or none. */
+  /** The state of a view: searching, tracking, coasting, lost, alone (placed without a track) or none. */
   state(i) {
     if (this.columns.reason[i]) return "none";
     const state = this.columns.state[i];

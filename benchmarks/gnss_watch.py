@@ -1,0 +1,290 @@
+"""`python -m benchmarks.gnss_watch [--hours 10] [--trials 20]`: the GNSS monitor by itself.
+
+Simulated receivers against simulated positions of a map, both with correlated errors: false alarms
+over hours, and the delay until each fault is named. No images are involved.
+"""
+
+import argparse
+import math
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.record import Section, Table, number, provenance, save
+from orthonav.flight.gnss import GnssSample
+from orthonav.geo.frames import LocalFrame
+from orthonav.onboard.gnss.monitor import GnssMonitor
+from orthonav.onboard.gnss.records import (
+    Fault,
+    GnssStatus,
+    MapPosition,
+    State,
+)
+from orthonav.simulate.motion import gauss_markov
+from orthonav.simulate.receiver import RATE_HZ, GnssTrack, receiver_of, samples_of, solutions
+
+FRAME = LocalFrame(48.0, 2.0)
+SPEED_MPS, LEG_M, TURN_RADIUS_M = 20.0, 2000.0, 100.0
+FAULT_AT_S = 900.0
+LONGEST_S, SETTLED_S = 1800.0, 10.0
+"""How long a fault is watched, and from its alarm to its last name."""
+PROCESSING_NS = 10**8
+"""Time from exposure to the map's position."""
+FAULTS = {
+    "step of 30 m": "step:metres=30",
+    "step of 30 m within 3 s, velocity too": "step:metres=30,over_s=3",
+    "step of 20 m": "step:metres=20",
+    "drag-off of 2 m/s": "drag:mps=2",
+    "drag-off of 1 m/s": "drag:mps=1",
+    "drag-off of 0.5 m/s": "drag:mps=0.5",
+    "drag-off of 0.2 m/s": "drag:mps=0.2",
+    "drag-off of 0.1 m/s": "drag:mps=0.1",
+    "drift of 0.5 m/s": "drift:mps=0.5",
+    "frozen position": "frozen",
+    "frozen, stale timestamps": "frozen:stale=1",
+    "jumping by 40 m": "jumping:metres=40",
+    "jumping by 20 m": "jumping:metres=20",
+    "no fix": "jam",
+    "no messages": "jam:silent=1",
+}
+"""Faults by name, as for `orthonav simulate --receiver`."""
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MapErrors:
+    """Errors of the simulated map positions; each position states the root of their squares.
+
+    `mount_m`: constant in the aircraft, as from a tilted mount. `local_m`, `local_tau_s`: slowly
+    varying. `white_m`: from view to view. `displaced_m`: length of the constant displacement.
+    `gaps_per_hour`: stretches of 10 to 90 s without confident positions. `outlier_share`: share of
+    confident positions that are 20 to 150 m off.
+    """
+
+    mount_m: float = 2.0
+    local_m: float = 2.5
+    local_tau_s: float = 40.0
+    white_m: float = 1.0
+    displaced_m: float = 40.0
+    gaps_per_hour: float = 20.0
+    outlier_share: float = 3e-4
+
+    @property
+    def displaced_en_m(self) -> Array:
+        """True minus map position (2,)."""
+        return self.displaced_m * np.array([0.6, -0.8])
+
+    @property
+    def std_m(self) -> float:
+        """Standard deviation per axis that a position states, with the track's floor of 3 m."""
+        return math.sqrt(self.mount_m**2 / 2 + self.local_m**2 + self.white_m**2 + 9.0)
+
+
+MAPS = {
+    "usual": MapErrors(),
+    "poor": MapErrors(mount_m=4.0, local_m=4.0, white_m=2.0, displaced_m=60.0),
+    "high": MapErrors(mount_m=15.0, local_m=6.0, white_m=3.0, displaced_m=20.0),
+}
+"""Errors by name: at 300 m, with a worse mount and map, and at 2,000 m."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlownPath:
+    """True path: `times_s` (N,), `en_m` (N, 2), `heading_rad` (N,)."""
+
+    times_s: Array
+    en_m: Array
+    heading_rad: Array
+
+
+def lawnmower(seconds: float) -> FlownPath:
+    """Parallel legs with half turns, one position a second."""
+    half_m, turn_m = LEG_M, math.pi * TURN_RADIUS_M
+    along = np.arange(0.0, seconds) * SPEED_MPS
+    number, rest = np.divmod(along, half_m + turn_m)
+    turning = np.clip(rest - half_m, 0, None) / TURN_RADIUS_M
+    side = np.where(number % 2 == 0, 1.0, -1.0)
+    heading = np.where(number % 2 == 0, 0.0, math.pi) + side * turning
+    moved = SPEED_MPS * np.stack([np.sin(heading), np.cos(heading)], axis=1)
+    places = np.cumsum(moved, axis=0)
+    return FlownPath(np.arange(0.0, seconds), places - places[0], heading)
+
+
+def map_positions(
+    path: FlownPath, errors: MapErrors, rng: np.random.Generator
+) -> list[MapPosition]:
+    """Confident positions along a path, with errors."""
+    count = len(path.times_s)
+    step_s = float(path.times_s[1] - path.times_s[0])
+    body = rng.normal(0, errors.mount_m / math.sqrt(2), 2)
+    cos, sin = np.cos(path.heading_rad), np.sin(path.heading_rad)
+    mount = np.stack([cos * body[0] + sin * body[1], cos * body[1] - sin * body[0]], axis=1)
+    off = mount + errors.local_m * gauss_markov(step_s / errors.local_tau_s, count, rng)
+    off += rng.normal(0, errors.white_m, (count, 2)) - errors.displaced_en_m
+    wrong = rng.random(count) < errors.outlier_share
+    off[wrong] += rng.uniform(20, 150, (int(wrong.sum()), 1)) * np.array([[0.6, 0.8]])
+    confident = np.ones(count, dtype=bool)
+    hours = (path.times_s[-1] - path.times_s[0]) / 3600
+    for _ in range(rng.poisson(errors.gaps_per_hour * hours)):
+        begin = rng.uniform(path.times_s[0], path.times_s[-1])
+        confident &= (path.times_s < begin) | (path.times_s > begin + rng.uniform(10, 90))
+    velocity = SPEED_MPS * np.stack([sin, cos], axis=1)
+    velocity = velocity + 0.3 * gauss_markov(step_s / 30.0, count, rng)
+    return [
+        MapPosition(
+            round(path.times_s[i] * 1e9),
+            path.en_m[i] + off[i],
+            errors.std_m,
+            velocity[i],
+            math.degrees(path.heading_rad[i]) % 360,
+        )
+        for i in np.flatnonzero(confident)
+    ]
+
+
+def watched(
+    monitor: GnssMonitor,
+    solved: GnssTrack,
+    positions: Sequence[MapPosition],
+    changed: Callable[[float, GnssStatus], bool],
+) -> None:
+    """Feed a monitor in the order of arrival, positions 0.1 s after their exposure.
+
+    `changed` gets the time and the status at each change of state or fault; True stops. Silence is
+    noticed by a tick with each position.
+    """
+    events: list[tuple[int, GnssSample | MapPosition]] = [
+        (sample.arrived_ns, sample) for sample in samples_of(solved, FRAME)
+    ]
+    events += [(each.time_ns + PROCESSING_NS, each) for each in positions]
+    events.sort(key=lambda event: event[0])
+    before = monitor.status
+    for now_ns, event in events:
+        if isinstance(event, GnssSample):
+            monitor.sample(event)
+        else:
+            monitor.position(event)
+            monitor.tick(now_ns)
+        now = monitor.status
+        if (now.state, now.fault) != (before.state, before.fault):
+            before = now
+            if changed(now_ns / 1e9, now):
+                return
+
+
+def false_alarms(
+    hours: float, seed: int, receiver: str, errors: MapErrors, *, rate_hz: float = RATE_HZ
+) -> tuple[list[tuple[float, GnssStatus]], GnssStatus]:
+    """Alarms (time, status) of a receiver without a fault, and the last status."""
+    rng = np.random.default_rng([seed, 0])
+    path = lawnmower(hours * 3600)
+    positions = map_positions(path, errors, rng)
+    solved = solutions(receiver_of(receiver), path.times_s, path.en_m, rng, rate_hz)
+    alarms: list[tuple[float, GnssStatus]] = []
+
+    def changed(at_s: float, status: GnssStatus) -> bool:
+        if status.state is State.ALARM:
+            alarms.append((at_s, status))
+        return False
+
+    monitor = GnssMonitor(FRAME)
+    watched(monitor, solved, positions, changed)
+    return alarms, monitor.status
+
+
+def delay(
+    text: str, seed: int, errors: MapErrors, *, at_s: float = FAULT_AT_S, for_s: float = LONGEST_S
+) -> tuple[float, float, Fault | None]:
+    """Seconds from a fault to its alarm, to its last name, and that name; NaN without an alarm.
+
+    The last name is that of 10 s after the alarm: a sudden step is a jump at first.
+    The fault begins at `at_s` or up to 250 s later, and is watched `for_s`.
+    """
+    rng = np.random.default_rng([seed, 1])
+    at_s += rng.uniform(0, 250)
+    path = lawnmower(at_s + for_s)
+    positions = map_positions(path, replace(errors, gaps_per_hour=0.0), rng)
+    name, _, rest = text.partition(":")
+    values = [rest, f"at_s={at_s}"]
+    if name in ("step", "drag", "drift"):
+        values.append(f"bearing_deg={rng.uniform(0, 360)}")
+    receiver = receiver_of(f"{name}:{','.join(filter(None, values))}")
+    solved = solutions(receiver, path.times_s, path.en_m, rng)
+    found: list[tuple[float, Fault | None]] = []
+
+    def changed(now_s: float, status: GnssStatus) -> bool:
+        if status.state is State.ALARM and now_s >= at_s:
+            found.append((now_s - at_s, status.fault))
+        return bool(found) and now_s > at_s + found[0][0] + SETTLED_S
+
+    watched(GnssMonitor(FRAME), solved, positions, changed)
+    within = [each for each in found if each[0] <= found[0][0] + SETTLED_S]
+    return (found[0][0], *within[-1]) if found else (math.nan, math.nan, None)
+
+
+def false_alarm_table(hours: float, section: Section) -> Table:
+    """False alarms and learnt displacements."""
+    rows: list[list[str]] = []
+    for receiver in ("good", "good:std_m=5"):
+        for name, errors in MAPS.items():
+            alarms, last = false_alarms(hours, len(rows), receiver, errors)
+            learnt = last.displacement
+            off_m = math.hypot(*(learnt.en_m - errors.displaced_en_m))
+            section.facts[f"false alarms: {receiver}, {name}"] = len(alarms)
+            std = receiver_of(receiver).std_m
+            rows.append(
+                [
+                    f"{std:g} m",
+                    name,
+                    number(hours),
+                    str(len(alarms)),
+                    f"{off_m:.1f}",
+                    f"{learnt.std_m:.1f}",
+                ]
+            )
+            print(rows[-1], file=sys.stderr, flush=True)
+    header = ["GNSS error", "map", "hours", "false alarms", "displacement off, m", "stated, m"]
+    return Table("No fault", header, rows)
+
+
+def delay_table(trials: int, section: Section) -> Table:
+    """Delays until faults are named."""
+    rows = []
+    for name, text in FAULTS.items():
+        found = [delay(text, seed, MAPS["usual"]) for seed in range(trials)]
+        delays = np.array([each[0] for each in found])
+        missed = int(np.isnan(delays).sum())
+        names = Counter(each[2].value if each[2] else "none" for each in found)
+        shown = ", ".join(f"{key} {count}" for key, count in names.most_common())
+        if missed < trials:
+            section.add(f"delay: {name}", "s", delays[~np.isnan(delays)], data="simulated", seed=0)
+        median, most = (f"{f(delays):.1f}" for f in (np.nanmedian, np.nanmax))
+        rows.append([name, str(trials), str(missed), median, most, shown])
+        print(rows[-1], file=sys.stderr, flush=True)
+    header = ["fault", "trials", "missed", "median s", "worst s", "name after 10 s"]
+    return Table("Delay until a fault is named", header, rows)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.gnss_watch", description=__doc__)
+    parser.add_argument("--hours", type=float, default=10.0, help="of each flight without a fault")
+    parser.add_argument("--trials", type=int, default=20, help="of each fault")
+    parser.add_argument("--out", type=Path, default=Path("bench_results"), help="folder")
+    options = parser.parse_args(arguments)
+    started, begin = provenance("gnss-watch"), time.perf_counter()
+    section = Section("GNSS watch")
+    section.tables.append(delay_table(options.trials, section))
+    section.tables.append(false_alarm_table(options.hours, section))
+    print(section.markdown())
+    save(options.out, [section], started, wall_s=time.perf_counter() - begin, latest=False)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,128 @@
+"""Records of the GNSS monitor: its inputs, its faults and its status."""
+
+import math
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthonav.flight.gnss import FAULTS
+
+Array = NDArray[np.float64]
+NANOSECONDS = 1e-9
+
+
+class Fault(Enum):
+    """A fault of GNSS; the value is the reason in health, logs and pages. In order of priority."""
+
+    LOST = "gnss_lost"
+    """No messages, no 3D fix, or a useless stated accuracy."""
+    FROZEN = "gnss_frozen"
+    """The position or the timestamp stands still while the aircraft moves."""
+    JUMP = "gnss_jump"
+    """The position jumps against the receiver's own velocity."""
+    STEP = "gnss_step"
+    """The difference from the map changed within seconds."""
+    DRIFT = "gnss_drift"
+    """The difference from the map grows."""
+    VELOCITY = "gnss_velocity"
+    """The velocity contradicts the positions of the receiver."""
+    OFFSET = "gnss_offset"
+    """The difference from the map is too large, and did not begin within the window."""
+    DISAGREES = "gnss_disagrees"
+    """The difference changed, but the map jumped too: which of the two is wrong is not known."""
+
+    @property
+    def code(self) -> int:
+        """Number of the fault, from 1, in evidence and NAMED_VALUE_FLOAT."""
+        return FAULTS.index(self.value) + 1
+
+
+RETURNING = FAULTS[-1]
+"""Reason in health while GNSS agrees again, but not yet for long enough."""
+RETURNING_CODE = len(FAULTS)
+
+
+class State(Enum):
+    """State of the comparison."""
+
+    WAITING = "waiting"
+    """Since the start: no fault, but no agreement with the map yet."""
+    GOOD = "good"
+    """GNSS and map agree; the displacement of the map is learnt."""
+    ALARM = "alarm"
+    """A fault."""
+    RETURNING = "returning"
+    """No fault is seen any more; not yet in agreement for long enough."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapPosition:
+    """A confident position by the map.
+
+    `time_ns`: exposure, by the clock of the samples.
+    `en_m` (2,): position in the plane of the map, uncorrected.
+    `std_m`: standard deviation along the worst axis.
+    `vel_en_mps` (2,): velocity of the track; None where not known.
+    `heading_deg`: heading of the top of the image; errors of a tilted mount turn with it.
+    """
+
+    time_ns: int
+    en_m: Array
+    std_m: float
+    vel_en_mps: Array | None = None
+    heading_deg: float = 0.0
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """Constant difference GNSS minus map: where the map should be, east and north of where it is.
+
+    `east_m`, `north_m`: the displacement. `std_m`: standard deviation per axis. `agreed_s`: time of
+    agreement that it was learnt from.
+    """
+
+    east_m: float = 0.0
+    north_m: float = 0.0
+    std_m: float = 30.0
+    agreed_s: float = 0.0
+
+    @property
+    def en_m(self) -> Array:
+        """East and north (2,)."""
+        return np.array([self.east_m, self.north_m])
+
+
+@dataclass(frozen=True)
+class GnssStatus:
+    """Status of one receiver.
+
+    `state`, `fault`: the fault is that of the alarm, also while returning; None without one.
+    `since_ns`: time at which the state began.
+    `difference_en_m`: recent GNSS minus map, east and north; NaN where not known. A switch from the
+    map to GNSS would make this jump.
+    `fault_en_m`: estimated change of the difference by the fault; NaN where it has none.
+    `displacement`: learnt displacement of the map.
+    """
+
+    state: State = State.WAITING
+    fault: Fault | None = None
+    since_ns: int = 0
+    difference_en_m: tuple[float, float] = (math.nan, math.nan)
+    fault_en_m: tuple[float, float] = (math.nan, math.nan)
+    displacement: Displacement = field(default_factory=Displacement)
+
+    @property
+    def reason(self) -> str | None:
+        """Reason in the health; None while there is no alarm."""
+        if self.state is State.RETURNING:
+            return RETURNING
+        return self.fault.value if self.state is State.ALARM and self.fault else None
+
+    @property
+    def code(self) -> int:
+        """0 without a fault, else that of the fault, or `RETURNING_CODE`."""
+        if self.state is State.RETURNING:
+            return RETURNING_CODE
+        return self.fault.code if self.state is State.ALARM and self.fault else 0

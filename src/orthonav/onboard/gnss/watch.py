@@ -1,0 +1,289 @@
+"""The witness of a flight: its monitors are fed with views and GNSS, and their status is reported.
+
+It uses one time base: the monotonic clock of a live flight, or the times of a recording.
+"""
+
+import contextlib
+import logging
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from types import MappingProxyType
+from typing import Any, Protocol
+
+import numpy as np
+
+from orthonav.flight.gnss import GnssSample
+from orthonav.flight.logged import gnss_message
+from orthonav.geo.frames import LocalFrame
+from orthonav.onboard.gnss.displacement import UNKNOWN
+from orthonav.onboard.gnss.monitor import GnssMonitor
+from orthonav.onboard.gnss.records import (
+    NANOSECONDS,
+    Array,
+    Displacement,
+    GnssStatus,
+    MapPosition,
+    State,
+)
+from orthonav.publish.estimate import error_ellipse
+from orthonav.records import CONFIDENT, Fix, NoFix, ViewResult
+
+log = logging.getLogger(__name__)
+CORRECT_AFTER_S, CORRECT_STD_M = 1800.0, 5.0
+"""A stored displacement corrects positions only after this time of agreement, and with at most
+this standard deviation."""
+SHOWN_S = 1.0
+"""Age up to which a solution is extrapolated to an exposure, for display only."""
+ALARM_SEVERITY, RETURN_SEVERITY = 2, 5  # MAV_SEVERITY_CRITICAL, MAV_SEVERITY_NOTICE
+
+
+class GnssSource(Protocol):
+    """Delivers solutions."""
+
+    def take(self, until_ns: int) -> list[GnssSample]:
+        """Solutions that arrived until a time, each once, in order."""
+
+
+class LiveSolutions:
+    """Solutions that another thread puts into a queue."""
+
+    def __init__(self, queue: deque[GnssSample]) -> None:
+        self._queue = queue
+
+    def take(self, until_ns: int) -> list[GnssSample]:
+        """See `GnssSource.take`."""
+        return [self._queue.popleft() for _ in range(len(self._queue))]
+
+
+class RecordedSolutions:
+    """Solutions of a recording."""
+
+    def __init__(self, samples: list[GnssSample]) -> None:
+        self._samples = deque(sorted(samples, key=lambda each: each.arrived_ns))
+
+    def take(self, until_ns: int) -> list[GnssSample]:
+        """See `GnssSource.take`."""
+        taken = []
+        while self._samples and self._samples[0].arrived_ns <= until_ns:
+            taken.append(self._samples.popleft())
+        return taken
+
+
+@dataclass(frozen=True)
+class GnssText:
+    """A message for the operator: at most 50 characters, and its MAV_SEVERITY."""
+
+    severity: int
+    text: str
+
+
+class GnssWatch:
+    """Compares the GNSS receivers of a flight with the map. Mutable; for the flight's thread."""
+
+    def __init__(
+        self,
+        frame: LocalFrame,
+        source: GnssSource,
+        *,
+        digest: str = "",
+        known: Mapping[str, Displacement] = MappingProxyType({}),
+        correct: bool = False,
+        recorded: bool = False,
+        min_confidence: float = CONFIDENT,
+        utc_ahead_ns: Callable[[], int] = lambda: 0,
+    ) -> None:
+        """`frame`: plane of the map. `digest`: of the map; `known`: displacements by digest.
+
+        `correct`: correct positions by the displacement known before the flight; what is learnt in
+        this flight never moves a position. `recorded`: times are those of the recording.
+        `utc_ahead_ns`: what is added to times of solutions in the log. `log` gets every solution,
+        as the message of a flight log.
+        """
+        self._frame, self._source, self._utc_ahead_ns = frame, source, utc_ahead_ns
+        self.log: Callable[[int, bytes], None] = lambda time_ns, cdr: None
+        self._digest, self._known = digest, dict(known)
+        self._start = self._known.get(digest, UNKNOWN)
+        self._recorded, self._least = recorded, min_confidence
+        self._monitors: dict[int, GnssMonitor] = {}
+        self._shown: dict[int, GnssStatus] = {}
+        self._last: GnssSample | None = None
+        self._now_ns, self._has_failed = 0, False
+        usable = self._start.agreed_s >= CORRECT_AFTER_S and self._start.std_m <= CORRECT_STD_M
+        self.correction_en_m = self._start.en_m if correct and usable else np.zeros(2)
+
+    def view(self, result: ViewResult, exposed_ns: int) -> ViewResult:
+        """Compare a view; the result with the GNSS position of its exposure as evidence."""
+        try:
+            return self._compared(result, result.time_ns if self._recorded else exposed_ns)
+        except Exception:  # the flight does not depend on the witness
+            self._failed("a view could not be compared with GNSS")
+            return result
+
+    def _compared(self, result: ViewResult, now_ns: int) -> ViewResult:
+        self._take(now_ns)
+        fix = result.outcome
+        if isinstance(fix, Fix) and self._is_confident(fix, result.state):
+            position = self._position(fix, now_ns)
+            for monitor in self._monitors.values():
+                monitor.position(position)
+        evidence = MappingProxyType({**fix.evidence, **self._evidence(now_ns)})
+        return replace(result, outcome=replace(fix, evidence=evidence))
+
+    def corrected(self, outcome: Fix | NoFix) -> Fix | NoFix:
+        """A fix moved by the displacement of the map, where that is to be corrected; its covariance
+        includes that of the displacement."""
+        if not isinstance(outcome, Fix) or not self.correction_en_m.any():
+            return outcome
+        en_m = np.asarray(self._frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg))
+        lat, lon = self._frame.latlon_from_en(en_m + self.correction_en_m)
+        cov = outcome.cov_en_m2 + np.eye(2) * self._start.std_m**2
+        cov.setflags(write=False)
+        return replace(outcome, lat_deg=float(lat), lon_deg=float(lon), cov_en_m2=cov)
+
+    def tick(self, mono_ns: int) -> list[GnssText]:
+        """Judge at a time of the monotonic clock; messages about changes since the last call."""
+        try:
+            return self._ticked(mono_ns)
+        except Exception:  # the flight does not depend on the witness
+            self._failed("GNSS could not be judged")
+            return []
+
+    def _failed(self, text: str) -> None:
+        if not self._has_failed:  # once: it may happen at every view
+            log.exception("%s", text)
+        self._has_failed = True
+
+    def _ticked(self, mono_ns: int) -> list[GnssText]:
+        if not self._recorded:
+            self._take(mono_ns)
+        texts = []
+        for number, monitor in self._monitors.items():
+            status = monitor.tick(self._now_ns)
+            before = self._shown.get(number, GnssStatus())
+            self._shown[number] = status
+            name = "GNSS" if number == 0 else f"GNSS {number + 1}"
+            text = _change(name, before, status, self.correction_en_m)
+            if text is not None:
+                texts.append(text)
+        return texts
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Reasons in the health."""
+        found = (monitor.status.reason for monitor in self._monitors.values())
+        return tuple(dict.fromkeys(each for each in found if each))
+
+    @property
+    def code(self) -> int:
+        """Code of the first receiver with a fault; 0 without one."""
+        return next((m.status.code for m in self._monitors.values() if m.status.code), 0)
+
+    @property
+    def difference_m(self) -> float:
+        """Recent distance from the map to the first receiver; NaN where not known."""
+        first = self._monitors.get(0)
+        return math.nan if first is None else math.hypot(*first.status.difference_en_m)
+
+    def maps(self) -> dict[str, Any]:
+        """Displacements for the state file: that of this map, learnt further, and the others."""
+        known = {digest: each for digest, each in self._known.items() if digest != self._digest}
+        first = self._monitors.get(0)
+        learnt = self._start if first is None else first.status.displacement
+        if self._digest and learnt.agreed_s > 0:
+            known[self._digest] = learnt
+        return {digest: asdict(each) for digest, each in known.items()}
+
+    def plain(self) -> list[dict[str, Any]]:
+        """Status of each receiver for the line of health."""
+        return [
+            _plain(number, each.status, self._now_ns)
+            for number, each in sorted(self._monitors.items())
+        ]
+
+    def _take(self, now_ns: int) -> None:
+        self._now_ns = max(self._now_ns, now_ns) if not self._recorded else now_ns
+        for sample in self._source.take(now_ns):
+            if sample.receiver not in self._monitors:
+                self._monitors[sample.receiver] = GnssMonitor(self._frame, self._start)
+            self._monitors[sample.receiver].sample(sample)
+            if sample.receiver == 0:
+                self._last = sample
+            self._write(sample)
+
+    def _write(self, sample: GnssSample) -> None:
+        time_ns = sample.time_ns + self._utc_ahead_ns()
+        with contextlib.suppress(ValueError):  # a position that is not finite
+            self.log(time_ns, gnss_message(sample, time_ns))
+
+    def _is_confident(self, fix: Fix, state: str | None) -> bool:
+        known = math.isfinite(error_ellipse(fix.cov_en_m2)[0])
+        return known and fix.confidence >= self._least and state in (None, "tracking")
+
+    def _position(self, fix: Fix, now_ns: int) -> MapPosition:
+        east, north = (fix.evidence.get(f"vel_{n}_mps", math.nan) for n in ("east", "north"))
+        known = math.isfinite(east) and math.isfinite(north)
+        return MapPosition(
+            now_ns,
+            np.asarray(self._frame.en_from_latlon(fix.lat_deg, fix.lon_deg)),
+            error_ellipse(fix.cov_en_m2)[0],
+            np.array([east, north]) if known else None,
+            fix.heading_deg if math.isfinite(fix.heading_deg) else 0.0,
+        )
+
+    def _evidence(self, now_ns: int) -> dict[str, float]:
+        """Position of the first receiver at an exposure, by its velocity, and the fault's code."""
+        made = {"gnss_fault": float(self.code)}
+        last = self._last
+        if last is None or not last.is_valid:
+            return made
+        seconds = (now_ns - last.time_ns) * NANOSECONDS
+        if abs(seconds) > SHOWN_S:
+            return made
+        en_m = np.asarray(self._frame.en_from_latlon(last.lat_deg, last.lon_deg))
+        en_m = en_m + seconds * np.array(last.vel_en_mps or (0.0, 0.0))
+        lat, lon = self._frame.latlon_from_en(en_m)
+        return made | {
+            "gnss_lat_deg": float(lat),
+            "gnss_lon_deg": float(lon),
+            "gnss_std_m": last.std_m,
+        }
+
+
+def _change(
+    name: str, before: GnssStatus, now: GnssStatus, correction_en_m: Array
+) -> GnssText | None:
+    """Message about a change; None without one that matters to an operator."""
+    if now.state is State.ALARM and (before.state is not State.ALARM or before.fault != now.fault):
+        kind = now.fault.value.removeprefix("gnss_") if now.fault else "fault"
+        return GnssText(ALARM_SEVERITY, f"orthonav {name} {kind}{_size(now.fault_en_m)}")
+    if now.state is State.GOOD and before.state in (State.ALARM, State.RETURNING):
+        east, north = (np.array(now.difference_en_m) - correction_en_m).tolist()
+        return GnssText(RETURN_SEVERITY, f"orthonav {name} agrees, jump{_size((east, north))}")
+    return None
+
+
+def _size(en_m: tuple[float, float]) -> str:
+    length, bearing = _polar(en_m)
+    return f" {length:.0f} m to {bearing:03.0f} deg" if math.isfinite(length) else ""
+
+
+def _polar(en_m: tuple[float, float]) -> tuple[float, float]:
+    """Length and bearing (degrees clockwise from north); NaN where not known."""
+    east, north = en_m
+    return math.hypot(east, north), math.degrees(math.atan2(east, north)) % 360
+
+
+def _plain(number: int, status: GnssStatus, now_ns: int) -> dict[str, Any]:
+    length, bearing = _polar(status.difference_en_m)
+    known = math.isfinite(length)
+    return {
+        "receiver": number,
+        "state": status.state.value,
+        "for_s": round((now_ns - status.since_ns) * NANOSECONDS, 1) if status.since_ns else None,
+        "fault": status.fault.value if status.fault else None,
+        "difference_m": round(length, 2) if known else None,
+        "bearing_deg": round(bearing, 1) if known else None,
+        "displacement": {k: round(v, 2) for k, v in asdict(status.displacement).items()},
+    }

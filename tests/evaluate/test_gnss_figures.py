@@ -1,0 +1,76 @@
+"""GNSS beside the map: errors, differences and alarms, in figures, JSON and report."""
+
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+
+from orthonav.evaluate.gnss import gnss_rows, gnss_to_json, measure_gnss
+from orthonav.evaluate.metrics import compare
+from orthonav.flight.fixes import write_results
+from orthonav.flight.gnss import FAULTS, fault_of
+from orthonav.geo.frames import LocalFrame
+from orthonav.records import Fix, NoFix, ViewResult
+
+FRAME = LocalFrame(48.0, 2.0)
+STEP = float(FAULTS.index("gnss_step") + 1)
+
+
+def result(number, gnss_m=None, fault=0.0, found=True):
+    """A view on a flight to the east at 10 m a view; the fix is 3 m off to the north."""
+    evidence = {"gnss_fault": fault}
+    if gnss_m is not None:
+        lat, lon = FRAME.latlon_from_en([10.0 * number + gnss_m, 0.0])
+        evidence |= {"gnss_lat_deg": float(lat), "gnss_lon_deg": float(lon)}
+    lat, lon = FRAME.latlon_from_en([10.0 * number, 3.0])
+    fix = Fix(float(lat), float(lon), np.eye(2), 0.99, 35.0, 0.0, 100.0, MappingProxyType(evidence))
+    outcome = fix if found else NoFix("blank", "nothing", MappingProxyType(evidence))
+    return ViewResult(f"{number}", number * 10**9, outcome, 5.0, "tracking")
+
+
+def truth(count):
+    lat, lon = FRAME.latlon_from_en(np.stack([10.0 * np.arange(count), np.zeros(count)], axis=1))
+    return {f"{i}": (float(lat[i]), float(lon[i])) for i in range(count)}
+
+
+RESULTS = [
+    *(result(i, 4.0) for i in range(5)),
+    *(result(i, 40.0, STEP) for i in range(5, 8)),
+    result(8, None),
+    result(9, 4.0, found=False),
+]
+
+
+def test_errors_differences_and_alarms_are_measured():
+    found = measure_gnss(compare(truth(10), RESULTS, FRAME), RESULTS)
+    assert found.errors_m[:6] == pytest.approx([4, 4, 4, 4, 4, 40], abs=1e-3)
+    assert found.differences_m[:6] == pytest.approx([5] * 5 + [np.hypot(40, 3)], abs=1e-3)
+    assert np.isnan(found.errors_m[8]) and np.isnan(found.differences_m[9])
+    assert found.alarms == ((5, 8),)
+    plain = gnss_to_json(found)
+    assert plain["error_max_m"] == pytest.approx(40, abs=1e-3)
+    assert plain["alarms"] == [{"fault": "gnss_step", "first_s": 5.0, "views": 3}]
+    assert dict(gnss_rows(found))["GNSS alarms"] == "1: gnss_step"
+
+
+def test_without_gnss_there_are_no_figures():
+    results = [result(i) for i in range(3)]
+    assert measure_gnss(compare(truth(3), results, FRAME), results) is None
+
+
+def test_codes_of_faults_are_read_safely():
+    assert fault_of({}) == fault_of({"gnss_fault": 0.0}) == fault_of({"gnss_fault": 99.0}) == ""
+    assert fault_of({"gnss_fault": float("nan")}) == ""
+    assert fault_of({"gnss_fault": STEP}) == "gnss_step"
+
+
+def test_the_report_has_the_figure(tmp_path, run):
+    fixes, true = tmp_path / "fixes.jsonl", tmp_path / "truth.csv"
+    write_results(fixes, RESULTS)
+    rows = [f"{name},{lat:.9f},{lon:.9f}" for name, (lat, lon) in truth(10).items()]
+    true.write_text("\n".join(["frame,lat_deg,lon_deg", *rows]))
+    done = run("evaluate", fixes, "--truth", true, "--report", tmp_path / "report")
+    assert done.code == 0, done.err
+    assert "error of GNSS: median" in done.out and "GNSS alarms: 1: gnss_step" in done.out
+    assert (tmp_path / "report" / "figures" / "gnss.svg").is_file()
+    assert "GNSS alarms" in (tmp_path / "report" / "index.html").read_text()

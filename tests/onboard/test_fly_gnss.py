@@ -1,0 +1,206 @@
+"""`orthonav fly --gnss`: solutions of an autopilot are compared, faults are reported."""
+
+import math
+from collections import deque
+
+import numpy as np
+import pytest
+from fake_autopilot import MS, FakeLocator, S, fix
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from test_fly import AHEAD_NS, Flight
+
+from orthonav.geo.frames import LocalFrame
+from orthonav.onboard.gnss.records import Displacement, Fault
+from orthonav.onboard.gnss.watch import GnssWatch, LiveSolutions
+from orthonav.onboard.state import SavedState, displacements, save
+
+FRAME = LocalFrame(48.0, 2.0)
+SPEED_MPS = 10.0
+
+
+class Watched(Flight):
+    """A flight to the north at 10 m/s, whose autopilot sends GPS_RAW_INT; `off_m` is its error."""
+
+    def __init__(self, tmp_path, receiver="gps_raw_int", **options):
+        known = options.pop("known", {})
+        correct = options.pop("correct", False)
+        super().__init__(tmp_path, FakeLocator(lambda view: self.seen()), **options)
+        self.off_m, self.fix_type, self.receiver, self.north_m = np.zeros(2), 3, receiver, 0.0
+        self.watch = GnssWatch(
+            FRAME, LiveSolutions(self.link.gnss), digest="d", known=known, correct=correct
+        )
+        self.runner._gnss = self.watch
+        self.frames, write = [], self.port.write
+        self.port.write = lambda data: (self.frames.append(bytes(data)), write(data))
+
+    def seen(self):
+        lat, lon = FRAME.latlon_from_en([0.0, self.north_at(self.time.now_ns - 50 * MS)])
+        return fix(float(lat), float(lon), std_m=3.0)
+
+    def sent(self, kind):
+        """Messages of a kind since the last call, decoded by pymavlink."""
+        decoder = mavlink.MAVLink(None)
+        messages = [each for frame in self.frames for each in decoder.parse_buffer(frame)]
+        self.frames.clear()
+        return [each for each in messages if each.get_type() == kind]
+
+    @staticmethod
+    def north_at(time_ns):
+        return SPEED_MPS * (time_ns / S - 100)
+
+    def talk(self):
+        super().talk()
+        now = self.time.now_ns
+        lat, lon = FRAME.latlon_from_en(np.add(self.off_m, [0.0, self.north_at(now)]))
+        values = {"lat": round(float(lat) * 1e7), "lon": round(float(lon) * 1e7), "alt": 0}
+        more = {"dgps_numch": 0, "dgps_age": 0} if self.receiver == "gps2_raw" else {}
+        self.hear(
+            self.autopilot.say(
+                self.receiver,
+                time_usec=(now + AHEAD_NS) // 1000,
+                fix_type=self.fix_type,
+                eph=100,
+                epv=65535,
+                vel=round(SPEED_MPS * 100),
+                cog=0,
+                satellites_visible=14,
+                h_acc=1500,
+                **values,
+                **more,
+            )
+        )
+
+
+@pytest.fixture
+def begin(tmp_path):
+    """Function that starts a watched flight, which ends after the test."""
+    made = []
+
+    def flight(**options):
+        made.append(Watched(tmp_path, **options))
+        return made[-1]
+
+    yield flight
+    for each in made:
+        each.runner._publisher.close()
+
+
+def test_agreement_is_no_reason(begin):
+    flight = begin()
+    flight.views(400, wait_s=0.25)
+    north_m = flight.north_at(flight.time.now_ns - 50 * MS)
+    health = flight.health()
+    assert not [reason for reason in health.reasons if reason.startswith("gnss")]
+    line = [each for each in flight.written() if "health" in each][-1]
+    (status,) = line["gnss"]
+    assert status["state"] == "good" and status["difference_m"] < 2
+    last = [each for each in flight.written() if "frame" in each][-1]["evidence"]
+    place = FRAME.en_from_latlon(last["gnss_lat_deg"], last["gnss_lon_deg"])
+    assert place == pytest.approx([0, north_m], abs=0.5)
+    assert last["gnss_fault"] == 0 and last["gnss_std_m"] == 1.5
+
+
+@pytest.mark.parametrize("receiver", ["gps_raw_int", "gps2_raw"])
+def test_a_step_is_reported_everywhere(begin, receiver):
+    flight = begin(receiver=receiver)
+    flight.views(300, wait_s=0.25)
+    flight.frames.clear()
+    flight.off_m = np.array([40.0, 0.0])
+    flight.views(30)
+    assert flight.reasons() & {"gnss_jump", "gnss_step"}
+    name = "GNSS" if receiver == "gps_raw_int" else "GNSS 2"
+    alarms = [each.text for each in flight.sent("STATUSTEXT") if each.severity == 2]
+    assert alarms and alarms[0].startswith(f"orthonav {name} jump")
+    flight.views(100)
+    assert flight.reasons() >= {"gnss_step"}
+    evidence = [each for each in flight.written() if "frame" in each][-1]["evidence"]
+    assert evidence["gnss_fault"] == Fault.STEP.code
+    assert flight.log.named("health")[-1][0]["gnss"][0]["fault"] == "gnss_step"
+
+
+def test_named_values_are_sent_once_a_second(begin):
+    flight = begin()
+    flight.views(100)
+    flight.frames.clear()
+    flight.fix_type = 1
+    flight.views(20)
+    sent = flight.sent("NAMED_VALUE_FLOAT")
+    assert {each.name for each in sent} == {"gnss_fault", "gnss_diff"} and len(sent) == 4
+    assert [each.value for each in sent if each.name == "gnss_fault"][-1] == Fault.LOST.code
+    assert "gnss_lost" in flight.reasons()
+
+
+def test_the_displacement_is_saved_by_the_digest_of_the_map(begin, tmp_path):
+    state = tmp_path / "state.json"
+    save(state, SavedState(), {"other": {"east_m": 1, "north_m": 2, "std_m": 3, "agreed_s": 4}})
+    flight = begin(known=displacements(state), state_path=state)
+    flight.off_m = np.array([20.0, 0.0])
+    flight.views(800, wait_s=0.5)
+    flight.health()
+    found = displacements(state)
+    assert found["other"] == Displacement(1, 2, 3, 4)
+    assert found["d"].en_m == pytest.approx([20, 0], abs=2) and found["d"].agreed_s > 60
+
+
+def test_positions_are_moved_only_where_asked_and_known_before(begin):
+    good = Displacement(30.0, -10.0, 2.0, 3600.0)
+    short = Displacement(30.0, -10.0, 2.0, 600.0)
+    for known, correct, moved_m in (
+        (good, True, [30.0, -10.0]),
+        (good, False, [0.0, 0.0]),
+        (short, True, [0.0, 0.0]),
+    ):
+        flight = begin(known={"d": known}, correct=correct)
+        flight.off_m = known.en_m
+        flight.views(20)
+        flight.frames.clear()
+        result = flight.view()
+        (sent,) = flight.sent("GLOBAL_POSITION_SENSOR")
+        at_map = FRAME.en_from_latlon(result.outcome.lat_deg, result.outcome.lon_deg)
+        place = FRAME.en_from_latlon(sent.lat * 1e-7, sent.lon * 1e-7)
+        assert place - at_map == pytest.approx(moved_m, abs=0.05)
+
+
+def test_spoofing_never_moves_what_is_sent(begin):
+    """Not even one from the first second on, over a long time, where positions are corrected."""
+    known = {"d": Displacement(0.0, 0.0, 2.0, 3600.0)}
+    flight = begin(known=known, correct=True)
+    for number in range(500):
+        flight.off_m = np.array([0.1 * number, 0.0])
+        flight.view(wait_s=0.5)
+    sent = flight.sent("GLOBAL_POSITION_SENSOR")
+    east = [FRAME.en_from_latlon(each.lat * 1e-7, each.lon * 1e-7)[0] for each in sent]
+    assert len(east) > 400 and np.abs(east).max() < 0.1
+    assert any(each.startswith("gnss") for each in flight.reasons())
+
+
+def test_solutions_of_another_clock_use_their_arrival(begin):
+    flight = begin()
+    flight.views(3)
+    flight.link.gnss.clear()
+    flight.hear(
+        flight.autopilot.say(
+            "gps_raw_int", 1_700_000_000 * 10**6, 3, 480000000, 20000000, 0, 65535, 65535, 65535,
+            65535, 255,
+        )
+    )  # fmt: skip
+    (sample,) = flight.link.gnss
+    assert sample.time_ns == sample.arrived_ns == flight.time.now_ns
+    assert sample.vel_en_mps is None and sample.satellites == -1 and math.isnan(sample.std_m)
+
+
+def test_an_error_of_the_witness_does_not_end_the_flight(begin, caplog):
+    flight = begin()
+    flight.views(10)
+    flight.frames.clear()
+    flight.watch._monitors[0].position = None  # any bug
+    results = flight.views(10)
+    flight.health()
+    assert len(flight.sent("GLOBAL_POSITION_SENSOR")) == 10 and all(results)
+    assert caplog.text.count("could not be compared with GNSS") == 1
+
+
+def test_a_watch_without_solutions_reports_nothing():
+    watch = GnssWatch(FRAME, LiveSolutions(deque()))
+    assert watch.tick(10**12) == [] and watch.reasons == () and watch.plain() == []
+    assert watch.maps() == {} and math.isnan(watch.difference_m)

@@ -1,0 +1,284 @@
+"""The GNSS monitor: each fault is named in time, and a good receiver is never named.
+
+Receivers and positions of the map are simulated with correlated errors; no images are involved.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from benchmarks.gnss_watch import FRAME, MAPS, delay, false_alarms, lawnmower
+
+from orthonav.flight.gnss import GnssSample
+from orthonav.onboard.gnss.difference import Difference, DifferenceModel, DifferenceWindow
+from orthonav.onboard.gnss.displacement import LARGEST_M, UNKNOWN, DisplacementLearner
+from orthonav.onboard.gnss.monitor import RETURN_S, GnssMonitor
+from orthonav.onboard.gnss.receiver import SILENCE_S, Receiver
+from orthonav.onboard.gnss.records import Displacement, Fault, MapPosition, State
+
+S = 10**9
+KNOWN = Displacement(0.0, 0.0, 1.5, 3600.0)
+
+
+class Air:
+    """A straight flight to the north at 20 m/s over a perfect map, one step a second."""
+
+    def __init__(self, start=UNKNOWN, speed_mps=20.0):
+        self.monitor, self.now_s, self.speed = GnssMonitor(FRAME, start), 1000, speed_mps
+        self.north_m, self.rng, self.states = 0.0, np.random.default_rng(0), []
+
+    def fly(self, seconds, gnss_m=(0.0, 0.0), map_m=(0.0, 0.0), silent=False, **sample):
+        """Fly with constant errors of GNSS and map; the states that were seen."""
+        for _ in range(seconds):
+            self.now_s += 1
+            self.north_m += self.speed
+            true = np.array([0.0, self.north_m])
+            if not silent:
+                self.monitor.sample(self._sample(true + gnss_m, sample))
+            if map_m is not None:
+                self.monitor.position(
+                    MapPosition(
+                        self.now_s * S + S // 2,
+                        true + np.add(map_m, (0.0, self.speed / 2)) + self.rng.normal(0, 1, 2),
+                        3.0,
+                        np.array([0.0, self.speed]),
+                    )
+                )
+            status = self.monitor.tick(self.now_s * S + S // 2)
+            if not self.states or self.states[-1] != (status.state, status.fault):
+                self.states.append((status.state, status.fault))
+        return self.monitor.status
+
+    def _sample(self, en_m, changed):
+        lat, lon = FRAME.latlon_from_en(en_m + self.rng.normal(0, 0.3, 2))
+        made = GnssSample(
+            self.now_s * S, self.now_s * S, float(lat), float(lon), 3, 1.5, (0.0, self.speed)
+        )
+        return replace(made, **changed)
+
+
+def test_agreement_is_reached_and_the_displacement_learnt():
+    air = Air()
+    errors = {"gnss_m": (12.0, -5.0), "map_m": (12.0 - 25.0, -5.0 + 10.0)}
+    assert air.fly(30, **errors).state is State.WAITING
+    status = air.fly(900, **errors)
+    assert (status.state, status.reason, status.code) == (State.GOOD, None, 0)
+    assert status.displacement.en_m == pytest.approx([25, -10], abs=2.5)
+    assert status.displacement.std_m < 6 and status.displacement.agreed_s > 400
+    assert status.difference_en_m == pytest.approx([25, -10], abs=2)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds", "names"),
+    [
+        ("step:metres=30", 5.0, {Fault.JUMP, Fault.STEP}),
+        ("step:metres=30,over_s=3", 5.0, {Fault.STEP}),
+        ("drag:mps=1", 60.0, {Fault.DRIFT}),
+        ("drift:mps=1", 60.0, {Fault.DRIFT}),
+        ("frozen", 5.0, {Fault.FROZEN}),
+        ("frozen:stale=1", 5.0, {Fault.FROZEN}),
+        ("jumping:metres=40", 5.0, {Fault.JUMP, Fault.STEP}),
+        ("jam", 0.5, {Fault.LOST}),
+        ("jam:silent=1", SILENCE_S + 1.5, {Fault.LOST}),
+    ],
+)
+def test_a_fault_is_named_in_time(text, seconds, names):
+    """Delays of the requirement; positions of the map come once a second."""
+    first_s, last_s, name = delay(text, 5, MAPS["usual"], at_s=200.0, for_s=seconds + 15)
+    assert 0 <= first_s <= last_s and first_s <= seconds
+    assert name in names
+
+
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        ("usual", 11),
+        pytest.param("poor", 12, marks=pytest.mark.slow),
+        pytest.param("high", 13, marks=pytest.mark.slow),
+    ],
+)
+def test_ten_hours_without_a_fault_raise_no_alarm(name, seed):
+    """Ten hours in all, with multipath, latency, turns, gaps and single wrong map positions."""
+    errors = MAPS[name]
+    alarms, last = false_alarms(10 / 3, seed, "good:std_m=4", errors, rate_hz=1.0)
+    assert alarms == []
+    assert last.state is State.GOOD
+    off_m = np.hypot(*(last.displacement.en_m - errors.displaced_en_m))
+    assert off_m < 4 * last.displacement.std_m < 15
+
+
+def test_a_slow_drag_off_never_becomes_a_displacement():
+    """A drag-off of 0.2 m/s is named before it was learnt by as much as it moved."""
+    air = Air(KNOWN)
+    air.fly(120)
+    for second in range(400):
+        status = air.fly(1, gnss_m=(0.2 * second, 0.0))
+    assert status.state is State.ALARM and status.fault in (Fault.OFFSET, Fault.DRIFT)
+    assert np.hypot(*status.displacement.en_m) < 8
+
+
+def test_learning_stops_at_an_alarm_and_forgets_what_waits():
+    learner = DisplacementLearner(UNKNOWN, DifferenceModel())
+    for second in range(250):
+        learner.add(value(second, (40.0, 0.0)))
+    assert learner.learnt == UNKNOWN  # in quarantine
+    learner.discard()
+    for second in range(250, 650):
+        learner.add(value(second, (0.0, 0.0)))
+    assert 0 < learner.learnt.agreed_s < 400
+    assert np.hypot(*learner.learnt.en_m) < 1e-6
+
+
+def test_the_displacement_is_bounded():
+    learner = DisplacementLearner(UNKNOWN, DifferenceModel())
+    for second in range(3000):
+        learner.add(value(second, (300.0, 400.0)))
+    assert np.hypot(*learner.learnt.en_m) <= LARGEST_M + 1e-9
+
+
+def test_a_spoofed_place_at_the_start_is_an_offset():
+    air = Air()
+    status = air.fly(30, gnss_m=(400.0, 0.0))
+    assert (status.state, status.fault) == (State.ALARM, Fault.OFFSET)
+    air = Air(KNOWN)  # with a known displacement much less is enough
+    status = air.fly(90, gnss_m=(60.0, 0.0))
+    assert (status.state, status.fault) == (State.ALARM, Fault.OFFSET)
+
+
+def test_a_constant_offset_from_the_start_counts_as_displacement_of_an_unknown_map():
+    """What cannot be known is documented: nothing tells this spoofing from a displaced map."""
+    assert Air().fly(900, gnss_m=(60.0, 0.0)).displacement.en_m == pytest.approx([60, 0], abs=4)
+
+
+def test_a_return_is_announced_after_agreement_only():
+    air = Air()
+    air.fly(400)
+    assert air.fly(20, gnss_m=(35.0, 0.0)).state is State.ALARM
+    assert air.fly(600, gnss_m=(35.0, 0.0)).state is State.ALARM  # it does not heal by itself
+    status = air.fly(30)
+    assert (status.state, status.reason) == (State.RETURNING, "gnss_returning")
+    status = air.fly(int(RETURN_S) + 10)
+    assert (status.state, status.fault) == (State.GOOD, None)
+    assert np.hypot(*status.difference_en_m) < 3
+
+
+def test_an_outage_needs_agreement_too():
+    air = Air()
+    air.fly(400)
+    assert air.fly(5, fix_type=1).fault is Fault.LOST
+    assert air.fly(8).state is State.ALARM
+    assert air.fly(8).state is State.RETURNING
+    assert air.fly(int(RETURN_S) + 10).state is State.GOOD
+    air.fly(5, fix_type=1)
+    assert air.fly(30, gnss_m=(50.0, 0.0)).reason == "gnss_offset"  # it came back elsewhere
+
+
+def test_a_jump_of_the_map_is_not_blamed_on_gnss():
+    air = Air()
+    air.fly(400)
+    status = air.fly(20, map_m=(60.0, 0.0))
+    assert status.state is State.ALARM and status.fault is Fault.DISAGREES
+
+
+def test_single_wrong_positions_of_the_map_are_ignored():
+    air = Air()
+    for _ in range(20):
+        air.fly(20)
+        air.fly(1, map_m=(120.0, 0.0))
+    assert all(state is not State.ALARM for state, _ in air.states)
+
+
+def test_without_the_map_the_receiver_is_still_checked():
+    air = Air()
+    assert air.fly(60, map_m=None).state is State.WAITING
+    assert air.fly(1, map_m=None, gnss_m=(40.0, 0.0)).fault is Fault.JUMP
+
+
+def test_a_stated_inaccuracy_is_no_position():
+    air = Air()
+    air.fly(100)
+    assert air.fly(1, std_m=80.0).fault is Fault.LOST
+
+
+def test_a_hovering_receiver_may_repeat_its_position():
+    air = Air(speed_mps=0.0)
+    air.fly(100)
+    lat, lon = (float(each) for each in FRAME.latlon_from_en([0.0, 0.0]))
+    air.fly(20, lat_deg=lat, lon_deg=lon)
+    assert all(state is not State.ALARM for state, _ in air.states)
+    air = Air()
+    air.fly(100)
+    status = air.fly(6, lat_deg=lat, lon_deg=lon, vel_en_mps=None)
+    assert status.state is State.ALARM
+
+
+def test_a_wrong_velocity_is_named():
+    air = Air()
+    air.fly(100)
+    for _ in range(30):
+        status = air.fly(1, vel_en_mps=(3.0, 20.0))
+    assert status.fault is Fault.VELOCITY
+
+
+def test_a_receiver_without_velocity_is_watched():
+    air = Air()
+    assert air.fly(200, vel_en_mps=None).state is State.GOOD
+    assert air.fly(6, vel_en_mps=None, gnss_m=(50.0, 0.0)).state is State.ALARM
+
+
+def test_a_receiver_that_was_never_heard_has_no_fault():
+    assert Receiver().fault(10**12, 20.0) is None
+    assert Air().fly(100, silent=True).state is State.WAITING
+
+
+def test_invalid_samples_are_lost_not_an_error():
+    for wrong in ({"lat_deg": math.nan}, {"lat_deg": 214.7}, {"lon_deg": 1e9}):
+        assert Air().fly(1, **wrong).fault is Fault.LOST
+    assert Air().fly(1, std_m=math.nan).fault is None
+
+
+def test_a_clock_that_goes_back_begins_a_new_window():
+    air = Air()
+    air.fly(200)
+    air.now_s -= 150
+    air.fly(100)
+    assert all(state is not State.ALARM for state, _ in air.states)
+
+
+def value(second, en_m, std_m=3.0):
+    return Difference(float(second), np.array(en_m), 2.0, std_m, 0.0, np.array([0.0, 20.0]))
+
+
+def test_the_covariance_is_that_of_the_simulated_errors():
+    """Whitened differences of the model's own errors have unit variance: the test is consistent."""
+    model, rng = DifferenceModel(), np.random.default_rng(3)
+    path = lawnmower(60)
+    values = [
+        replace(value(t, (0.0, 0.0)), heading_rad=float(path.heading_rad[t])) for t in range(60)
+    ]
+    window = DifferenceWindow(model)
+    for each in values:
+        window.add(each)
+    used = window.values
+    assert len(used) < 35 and [v.time_s for v in used] == sorted(v.time_s for v in used)
+    found = 0
+    for _ in range(200):
+        offset = rng.normal(0, 3.0, 2)
+        window = DifferenceWindow(model)
+        for each in values:
+            window.add(replace(each, en_m=offset + rng.normal(0, 1.0, 2)))
+        found += window.finding(Displacement(0, 0, 3.0)) is not None
+    assert found == 0
+
+
+@pytest.mark.parametrize("bearing", [0.0, 77.0, 200.0])
+def test_size_and_direction_of_a_step_are_estimated(bearing):
+    angle = math.radians(bearing)
+    step = 40 * np.array([math.sin(angle), math.cos(angle)])
+    window = DifferenceWindow(DifferenceModel())
+    for second in range(40):
+        window.add(value(second, step if second >= 35 else (0.0, 0.0)))
+    found = window.finding(UNKNOWN)
+    assert found.fault is Fault.STEP and found.en_m == pytest.approx(step, abs=2)
+    assert found.onset_s == pytest.approx(35, abs=2)
