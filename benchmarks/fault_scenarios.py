@@ -77,10 +77,6 @@ def _levels(values: NDArray[Any]) -> Grey:
     return np.asarray(np.clip(values, 0, 255), np.uint8)
 
 
-def _reported_before(flight: FaultFlight, seconds: float) -> State:
-    return flight.path.reported(BEGIN_S + flight.since_s - seconds)
-
-
 CAMERA_FAULTS = (
     Fault("2 s late from the start", "camera", 30.0, from_start=True, delay_s=lambda n, t: 2.0),
     Fault("8 s late from the start", "camera", 30.0, from_start=True, delay_s=lambda n, t: 8.0),
