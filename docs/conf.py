@@ -44,6 +44,7 @@ nitpick_ignore_regex = [
     (r"py:class", r"orthonav\.(confidence|embed\.cells|register)\..*"),
     (r"py:class", r"orthonav\.(search\.peak|track\.hypotheses)\..*"),
     (r"py:class", r"orthonav\.sources\.track\..*"),
+    (r"py:class", r"orthonav\.(mapfile\.reader\._.*|simulate\.receiver\..*)"),
 ]
 
 
