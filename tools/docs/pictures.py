@@ -12,7 +12,6 @@ import hashlib
 import json
 import math
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -236,7 +235,7 @@ def _photograph(folder: Path) -> None:
         if address:
             _shoot(browser, address[0], PICTURES / "view.png", (1366, 900))
     finally:
-        server.send_signal(signal.SIGINT)
+        server.terminate()
         server.wait(timeout=BROWSER_S)
 
 
