@@ -103,7 +103,6 @@ class Tracker:
         self._before: OdometryView | None = None
         self._velocity: Array | None = None
         self._new_ground = np.full(2, np.inf)
-        self._ground = 1.0  # share of the view that the one before cannot have shown
         self._start_was_reported = False
         self._use_prior, self._every_prior = use_prior, every_prior
         self._history = History() if smooth else None
@@ -119,10 +118,10 @@ class Tracker:
         has another size than the picture.
         """
         refused = check_view(view, self._localizer.grid.gsd_m, self._heading_known)
-        overlap = self._predict(None if refused else view, view.telemetry)
+        overlap, ground = self._predict(None if refused else view, view.telemetry)
         self._new_ground += 1 - overlap
         if refused is None:
-            refused = self._update(view, overlap)
+            refused = self._update(view, overlap, ground)
         return self._outcome(view.telemetry, refused)
 
     @property
@@ -190,8 +189,12 @@ class Tracker:
                 self._lagged.append(self._smoothed_fix(smoothed, self._outcomes[-self._lag - 1]))
         return outcome
 
-    def _predict(self, view: View | None, telemetry: Telemetry) -> float:
-        """Propagate the track to the time of this view; its overlap with the view before, 0..1."""
+    def _predict(self, view: View | None, telemetry: Telemetry) -> tuple[float, float]:
+        """Propagate the track to the time of this view.
+
+        Its measured overlap with the view before, 0..1, and the share of it that the view before
+        cannot have shown, 0..1.
+        """
         before, now = self._before, None
         if view is not None and self._heading_known:
             bias, _ = self.mixture.bias()
@@ -206,7 +209,7 @@ class Tracker:
             if prior is not None:
                 self._start_was_reported = True
                 self.mixture.start(*self._position_of(prior))
-            return 0.0
+            return 0.0, 1.0
         seconds = (telemetry.time_ns - self._time_ns) / 1e9
         if not 0 < seconds < LONGEST_GAP_S:
             seconds = UNKNOWN_STEP_S if seconds <= 0 else LONGEST_GAP_S
@@ -221,10 +224,9 @@ class Tracker:
         if self._every_prior and prior is not None:
             self.mixture.measure_position(*self._position_of(prior))
         if moved is not None:
-            self._ground = 1 - moved.overlap
-        elif view is not None:  # clouds do not fit each other, but show no new ground either
-            self._ground = self._ground_by_speed(view, seconds, expected)
-        return 0.0 if moved is None else moved.overlap
+            return moved.overlap, 1 - moved.overlap
+        # Clouds do not fit each other, but show no new ground either.
+        return 0.0, 1.0 if view is None else self._ground_by_speed(view, seconds, expected)
 
     def _ground_by_speed(self, view: View, seconds: float, expected: Array | None) -> float:
         """Share of a view that is new, by the expected displacement or the largest usual speed."""
@@ -301,7 +303,7 @@ class Tracker:
         tilt_noise = self._tilt_noise(now.telemetry)
         return displacement(before, now, tilt_noise, telemetry_noise, expected_en_m)
 
-    def _update(self, view: View, overlap: float) -> NoFix | None:
+    def _update(self, view: View, overlap: float, ground: float) -> NoFix | None:
         """Register the view and update the mixture; a `NoFix` where it shows too little."""
         telemetry = view.telemetry
         expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
@@ -325,7 +327,7 @@ class Tracker:
             math.radians(telemetry.roll_deg),
             self._tilt_noise(telemetry),
         )
-        self.mixture.update(attitude, sightings, newness, searched, self._ground)
+        self.mixture.update(attitude, sightings, newness, searched, ground)
         return None
 
     def _tilt_weights(self, newness: float, costly: bool) -> Array:

@@ -17,6 +17,7 @@ from functools import partial
 import numpy as np
 
 from orthonav.records import CONFIDENT
+from orthonav.track.evidence import Measurement, confirmed_ground, recognition, tempered
 from orthonav.track.hypotheses import (
     Hypothesis,
     distance,
@@ -30,13 +31,11 @@ from orthonav.track.model import (
     POSITION,
     SEEN,
     STATE,
-    TILT,
     Array,
     Model,
     ReportedAttitude,
     Sighting,
     log_density,
-    measurement,
     updated,
 )
 from orthonav.track.motion import (
@@ -65,19 +64,11 @@ CONFIRMED = 1.25
 """New ground, in views, that must be recognized before a track is confirmed. Each view counts by
 its own probability: no single view confirms a track, nor do further views of its ground, nor views
 that fit only because they were searched there (docs/decisions/tracking.md, 9)."""
-TRUSTED = (0.1, 0.5)
-"""Views with a probability of their own below the first do not count, above the second fully."""
-MOST_OF_ONE = 0.75
-"""A single view counts at most so much: less than `CONFIRMED`."""
 UNCONFIRMED = 0.8
 """Highest confidence that is stated before a track is confirmed (docs/decisions/tracking.md, 9)."""
 RECOGNIZED = 0.2
 """Probability from which on a view shows the map, by this view alone and by its agreement with the
-prediction: pictures of anything else stay below 0.12. Without, a track is coasting
-(docs/decisions/tracking.md, 12)."""
-MOST_AGREEMENT = 25.0
-"""Largest factor on the odds by the agreement with the prediction: a view that has a probability
-below 1 % by itself does not show the map."""
+prediction. Without, a track is coasting (docs/decisions/tracking.md, 12)."""
 UNRECOGNIZED = 0.5
 """Factor on the count of recognized ground for each view of new ground that does not show the map:
 after a few, a track must be confirmed again."""
@@ -88,12 +79,6 @@ WIDE_M, FORGOTTEN = 50.0, 0.5
 multiplied by the second: after a while a track must be confirmed again."""
 GATE = 36.0
 """Gate: largest squared innovation of the position over the trace of its covariance."""
-POSE = slice(2, 4)
-"""Heading and scale in a measurement."""
-SEARCHED_SIGMAS = 6.0
-"""Width of the search over heading and scale, in standard deviations, from end to end."""
-MAX_LOG_ODDS = 7.0
-"""Limit of the log odds of a single view."""
 
 
 class State(Enum):
@@ -124,28 +109,6 @@ class Estimate:
     state: State
     belief: float
     recognized: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Measurement:
-    """A sighting as a measurement of the state.
-
-    `mean` (6,), `noise` (6, 6): in the components `SEEN`. `log_odds`: log odds over the density of
-    places, headings and scales that only look alike. `new_ground`: what it confirms, in
-    places, headings and scales that only look alike. `new_ground`: what it confirms, in views;
-    `first_ground`: the same at a place seen for the first time.
-    probability by the view alone. `log_chance`: log density of places, headings and scales that
-    chance finds in the area searched.
-    """
-
-    mean: Array
-    noise: Array
-    log_odds: float
-    new_ground: float
-    first_ground: float
-    own_noise: Array
-    alone: float
-    log_chance: float
 
 
 class Mixture:
@@ -290,24 +253,23 @@ class Mixture:
         made = []
         missed = self.model.miss**newness
         found = (1 - self.model.miss) ** newness
-        area_m2 = self.area_m2 if searched is None else math.pi * searched[1] ** 2
+        searched_m2 = self.area_m2 if searched is None else math.pi * searched[1] ** 2
+        mounts = [(share, covariance) for share, _, covariance in self._mounts()]
         measurements = [
-            self._measurement(reported, each, newness, ground, area_m2) for each in sightings
+            tempered(self.model, mounts, (self.area_m2, searched_m2), reported, each, newness)
+            for each in sightings
         ]
         for each in self.hypotheses:
             in_search = self._on_map(each.mean)
             if searched is not None:
                 in_search &= bool(np.hypot(*(each.mean[:2] - searched[0])) < searched[1])
             share = each.share * (missed if in_search else 1.0)
-            sighted = each.sighted * UNRECOGNIZED**ground
-            made.append(replace(each, share=share, sighted=sighted))
+            made.append(replace(each, share=share, sighted=_forgotten(each.sighted, ground)))
             for start in self._with_bias_jump(each):
                 for seen in measurements:
-                    split = self._updated(start, seen)
-                    if split is None:
-                        continue
-                    count = split.sighted if split.recognized >= RECOGNIZED else sighted
-                    made.append(replace(split, share=split.share * found, sighted=count))
+                    split = self._updated(start, seen, ground)
+                    if split is not None:
+                        made.append(replace(split, share=split.share * found))
         made += [born for each in measurements for born in self._born(each)]
         total = sum(each.share for each in made) + self.elsewhere
         self.elsewhere /= total
@@ -390,51 +352,11 @@ class Mixture:
         )
         return [replace(each, share=each.share * (1 - rare)), other]
 
-    def _measurement(
-        self,
-        reported: ReportedAttitude,
-        sighting: Sighting,
-        newness: float,
-        ground: float,
-        area_m2: float,
-    ) -> "_Measurement":
-        """A sighting as a measurement, tempered by the share of it that is new.
+    def _updated(self, each: Hypothesis, seen: Measurement, ground: float) -> Hypothesis | None:
+        """The hypothesis after a measurement; None where that lies outside the gate.
 
-        `ground`: share that the last view did not show. `area_m2`: of the part of the map that was
-        searched.
-
-        A likelihood raised to the power `newness` has a broader peak, which stands out less from
-        all places, headings and scales. The telemetry noise, independent at every view, is
-        excluded.
+        `ground`: share of the view that the last one did not show.
         """
-        mean, noise, anew = measurement(self.model, reported, sighting)
-        own = np.diag(noise)[POSE] + self.model.initial_bias()[:2]
-        poses = float(np.log(SEARCHED_SIGMAS * np.sqrt(own)).sum())
-        wide = math.log(self.area_m2) + poses
-        # Tilts are distributed as those of mounts at every place: no evidence for one.
-        tilts = noise[4:, 4:] + anew[4:, 4:]
-        wide -= math.log(
-            sum(
-                share * math.exp(log_density(mean[4:], tilts + covariance[TILT, TILT]))
-                for share, _, covariance in self._mounts()
-            )
-        )
-        _, log_det = np.linalg.slogdet(2 * math.pi * noise)
-        odds = newness * (min(sighting.log_odds, MAX_LOG_ODDS) + wide)
-        odds += (1 - newness) * float(log_det) / 2 - len(SEEN) / 2 * math.log(newness)
-        return _Measurement(
-            mean,
-            noise / newness + anew,
-            odds,
-            min(ground * _trust(sighting.alone), MOST_OF_ONE),
-            min(_trust(sighting.alone), MOST_OF_ONE),
-            noise + anew,
-            sighting.alone,
-            -math.log(area_m2) - poses,
-        )
-
-    def _updated(self, each: Hypothesis, seen: "_Measurement") -> Hypothesis | None:
-        """The hypothesis after a measurement; None where that lies outside the gate."""
         innovation = seen.mean - each.mean[SEEN]
         reach = np.trace(each.covariance[:2, :2]) + np.trace(seen.noise[:2, :2])
         if innovation[:2] @ innovation[:2] > GATE * reach:
@@ -442,15 +364,19 @@ class Mixture:
         spread = each.covariance[np.ix_(SEEN, SEEN)] + seen.noise
         log_weight = seen.log_odds + log_density(innovation, spread)
         mean, covariance = updated(each.mean, each.covariance, innovation, spread)
+        shown = recognition(seen, each.covariance, innovation)
+        sighted = _forgotten(each.sighted, ground)
+        if shown >= RECOGNIZED:
+            sighted = min(each.sighted + confirmed_ground(seen.alone, ground), MOST_SIGHTED)
         self._numbers += 1
         return replace(
             each,
             share=each.share * math.exp(min(log_weight, 60.0)),
             mean=mean,
             covariance=covariance,
-            sighted=min(each.sighted + seen.new_ground, MOST_SIGHTED),
+            sighted=sighted,
             number=self._numbers,
-            recognized=_recognized(seen, each, innovation),
+            recognized=shown,
         )
 
     def _nowhere(self, tilt_rad: float | None = None) -> tuple[Array, Array]:
@@ -466,7 +392,7 @@ class Mixture:
         if off > 0:
             yield off, *self._nowhere(self.model.off_tilt_rad)
 
-    def _born(self, seen: "_Measurement") -> Iterator[Hypothesis]:
+    def _born(self, seen: Measurement) -> Iterator[Hypothesis]:
         """The hypotheses born from the belief elsewhere, at a measurement."""
         for share, mean, covariance in self._mounts():
             spread = covariance[np.ix_(SEEN, SEEN)] + seen.noise
@@ -475,9 +401,8 @@ class Mixture:
             mean, covariance = updated(mean, covariance, seen.mean, spread)
             share *= self.elsewhere * math.exp(min(log_weight, 60.0))
             self._numbers += 1
-            yield Hypothesis(
-                share, mean, covariance, seen.first_ground, self._numbers, recognized=seen.alone
-            )
+            sighted = confirmed_ground(seen.alone, 1.0)
+            yield Hypothesis(share, mean, covariance, sighted, self._numbers, recognized=seen.alone)
 
     def _from(self, each: Hypothesis, expected: Expected, share: float) -> Hypothesis:
         self._numbers += 1
@@ -494,20 +419,7 @@ class Mixture:
         self.elsewhere /= total
 
 
-def _recognized(seen: _Measurement, each: Hypothesis, innovation: Array) -> float:
-    """Probability that a view showed the map, given its place and the prediction of that.
-
-    The odds by the view alone, times the likelihood ratio of the innovation (6,) in position,
-    heading and scale between a right place and one that chance finds in the area searched. A place
-    within the gate is never less likely for its distance.
-    """
-    spread = each.covariance[np.ix_(SEEN[:4], SEEN[:4])] + seen.own_noise[:4, :4]
-    ratio = log_density(innovation[:4], spread) - seen.log_chance
-    agreement = math.exp(min(max(ratio, 0.0), math.log(MOST_AGREEMENT)))
-    odds = seen.alone / max(1 - seen.alone, 1e-9) * agreement
-    return odds / (1 + odds)
-
-
-def _trust(alone: float) -> float:
-    low, high = TRUSTED
-    return min(max((alone - low) / (high - low), 0.0), 1.0)
+def _forgotten(sighted: float, ground: float) -> float:
+    """The count of recognized ground after a view that does not show the map; `ground`: the share
+    of it that the last one did not show."""
+    return sighted * float(UNRECOGNIZED**ground)

@@ -160,7 +160,7 @@ def measurement(
     reported_tilt = (
         model.tilt_noise_rad if reported.tilt_noise_rad is None else reported.tilt_noise_rad
     )
-    anew = np.diag(np.square([0.0, 0.0, 0.0, 0.0, reported_tilt, reported_tilt]))
+    independent = np.diag(np.square([0.0, 0.0, 0.0, 0.0, reported_tilt, reported_tilt]))
     seen = sighting.mean.copy()
     if reported.heading_rad is None:
         seen[2] = 0.0
@@ -169,7 +169,7 @@ def measurement(
     else:
         seen[2] = math.remainder(seen[2] - reported.heading_rad, 2 * math.pi)
     seen[4:] -= [reported.pitch_rad, reported.roll_rad]
-    return seen, noise, anew
+    return seen, noise, independent
 
 
 def updated(

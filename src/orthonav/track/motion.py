@@ -122,9 +122,9 @@ def predicted(
         after[POSITION] += seconds * after[VELOCITY]
         step[VELOCITY, VELOCITY] = like_before * np.eye(2)
         step[POSITION, VELOCITY] = seconds * like_before * np.eye(2)
-        anew = velocity.std_mps**2 * (1 - like_before**2)
+        added = velocity.std_mps**2 * (1 - like_before**2)
         jitter = (VELOCITY_JITTER * velocity.std_mps * seconds) ** 2
-        _add(noise, anew * seconds**2 + jitter, anew * seconds, anew)
+        _add(noise, added * seconds**2 + jitter, added * seconds, added)
         if coasting:
             power = model.coasting_walk**2
             _add(noise, power * seconds**3 / 3, power * seconds**2 / 2, power * seconds)
