@@ -255,21 +255,17 @@ class Runner:
 
     def _observe(self, image: CameraImage, camera: Camera) -> None:
         """Measure the latency of a live camera with one more image."""
-        if self._latency is None or image.arrival is None or image.grey is None:
+        link, arrival, grey = self._link, image.arrival, image.grey
+        if self._latency is None or link is None or arrival is None or grey is None:
             return
-        if self._link is None:
-            return
-        self._latency.observe(
-            image.arrival, image.grey, camera, self._link.state_at, self._link.covered_ns
-        )
+        self._latency.observe(arrival, grey, camera, link.state_at, link.covered_ns)
 
     def _log_view(
         self, image: CameraImage, view: View, latency: Latency | None, *, withheld: bool
     ) -> None:
-        known = latency is not None and math.isfinite(latency.delay_s)
-        # Without a known latency the telemetry is that of the arrival.
-        delay_ms = latency.delay_s * 1e3 if latency is not None and known else 0.0
-        used_ms = None if latency is None else delay_ms
+        used_ms = None
+        if latency is not None:  # where it is not known, the telemetry is that of the arrival
+            used_ms = latency.delay_s * 1e3 if math.isfinite(latency.delay_s) else 0.0
         self._log(
             lambda sink: sink.view(
                 image.number, image.frame, view.grey, view.telemetry, used_ms, withheld
@@ -412,25 +408,15 @@ class Runner:
         if self._link is None:
             return
         self._link.system_status = health.level.value
-        connected = self._link.target is not None
-        if connected and self._reporter.due(health, now_ns):
-            text = health.text().encode("ascii", "replace")
-            self._link.send(dialect().MAVLink_statustext_message(health.level.severity, text))
-        for each in texts:
-            if connected:
-                text = each.text.encode("ascii", "replace")
-                self._link.send(dialect().MAVLink_statustext_message(each.severity, text))
-        if self._gnss is not None and connected:
-            self._send_gnss(self._link, self._gnss, now_ns)
+        if self._link.target is not None:
+            if self._reporter.due(health, now_ns):
+                _send_text(self._link, health.level.severity, health.text())
+            for each in texts:
+                _send_text(self._link, each.severity, each.text)
+            if self._gnss is not None:
+                _send_gnss(self._link, self._gnss, now_ns)
         if self._publisher.messenger is not None:
             self._publisher.messenger.send_origin(self._link.origin, self._link.target)
-
-    @staticmethod
-    def _send_gnss(link: AutopilotLink, gnss: GnssWatch, now_ns: int) -> None:
-        """Send fault code and difference as NAMED_VALUE_FLOAT, for scripts and ground stations."""
-        boot_ms = ((link.boot_ns(now_ns) or 0) // 1_000_000) % 2**32
-        for name, value in ((b"gnss_fault", float(gnss.code)), (b"gnss_diff", gnss.difference_m)):
-            link.send(dialect().MAVLink_named_value_float_message(boot_ms, name, value))
 
     def _count_changes(self) -> None:
         """Count what the link, the camera, the outputs and the log counted since the last call."""
@@ -537,6 +523,17 @@ def _with_latency(fix: Fix, telemetry: Telemetry, std_s: float) -> Fix:
     if not np.isfinite(velocity).all():
         return fix
     return replace(fix, cov_en_m2=fix.cov_en_m2 + std_s**2 * np.outer(velocity, velocity))
+
+
+def _send_text(link: AutopilotLink, severity: int, text: str) -> None:
+    link.send(dialect().MAVLink_statustext_message(severity, text.encode("ascii", "replace")))
+
+
+def _send_gnss(link: AutopilotLink, gnss: GnssWatch, now_ns: int) -> None:
+    """Send fault code and difference as NAMED_VALUE_FLOAT, for scripts and ground stations."""
+    boot_ms = ((link.boot_ns(now_ns) or 0) // 1_000_000) % 2**32
+    for name, value in ((b"gnss_fault", float(gnss.code)), (b"gnss_diff", gnss.difference_m)):
+        link.send(dialect().MAVLink_named_value_float_message(boot_ms, name, value))
 
 
 def _file_id(path: Path | None) -> tuple[int, int] | None:

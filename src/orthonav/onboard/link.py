@@ -15,6 +15,7 @@ from typing import Any
 
 from orthonav.extras import needed
 from orthonav.flight.gnss import GnssSample
+from orthonav.onboard.gnss.mavlink import gnss_sample
 from orthonav.onboard.ports import Transport
 from orthonav.onboard.telemetry import (
     Clocks,
@@ -47,11 +48,6 @@ _BOARD, _NO_AUTOPILOT, _AUTOPILOT_COMPONENT = 18, 8, 1
 _KINDS = {3: Autopilot.ARDUPILOT, 12: Autopilot.PX4}
 _DOWNWARD = 25
 _FAR_NS = 60 * 10**9
-_LATE_NS = 2 * 10**9
-"""Timestamps of GNSS solutions that differ more from their arrival are of another clock."""
-_UNKNOWN_16 = 65535
-HDOP_STD_M = 3.0
-"""Standard deviation of a GNSS position per unit of HDOP, where no accuracy is stated."""
 
 
 @dataclass(frozen=True)
@@ -357,33 +353,7 @@ class AutopilotLink:
             self.counts["damaged"] += 1
 
     def _gnss(self, message: Message, now_ns: int) -> None:
-        """A solution by our clock: its timestamp where that is time since boot, else its arrival.
-
-        `eph` is an HDOP; `h_acc`, an extension, is 0 where it is not known.
-        """
-        arrived_ns, stamp_ns = self._arrived(now_ns), int(message.time_usec) * 1000
-        late_ns = math.inf if arrived_ns is None else arrived_ns - stamp_ns
-        solved_ns = now_ns - int(late_ns) if abs(late_ns) <= _LATE_NS else now_ns
-        std_m = math.nan if message.eph == _UNKNOWN_16 else message.eph * 1e-2 * HDOP_STD_M
-        std_m = message.h_acc * 1e-3 if message.h_acc > 0 else std_m
-        velocity = None
-        if _UNKNOWN_16 not in (message.vel, message.cog):
-            speed, course = message.vel * 1e-2, math.radians(message.cog * 1e-2)
-            velocity = speed * math.sin(course), speed * math.cos(course)
-        self.gnss.append(
-            GnssSample(
-                time_ns=solved_ns,
-                arrived_ns=now_ns,
-                lat_deg=message.lat * 1e-7,
-                lon_deg=message.lon * 1e-7,
-                fix_type=message.fix_type,
-                std_m=std_m,
-                vel_en_mps=velocity,
-                satellites=-1 if message.satellites_visible == 255 else message.satellites_visible,
-                stamp_ns=stamp_ns or None,
-                receiver=int(message.get_type() == "GPS2_RAW"),
-            )
-        )
+        self.gnss.append(gnss_sample(message, now_ns, self._arrived(now_ns)))
 
     def _timesync(self, message: Message, now_ns: int) -> None:
         if message.tc1 == 0:  # a request: answer with the clock that stamps our messages
