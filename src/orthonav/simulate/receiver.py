@@ -2,7 +2,7 @@
 their fix."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -30,6 +30,14 @@ LATENCY_S = 0.12
 STATED_STD_M = 1.5
 """Standard deviation that the receiver states: less than its error, as receivers do."""
 SATELLITES = 16
+_LIMITS = {
+    "std_m": 100.0,
+    "at_s": 1e9,
+    "metres": 1e6,
+    "mps": 1e3,
+    **dict.fromkeys(("over_s", "every_s", "for_s"), 1e9),
+}
+"""Largest values of a receiver's fields; the least is 0."""
 Array = NDArray[np.float64]
 
 
@@ -58,7 +66,10 @@ class Good:
     std_m: float = ERROR_STD_M
 
     def __post_init__(self) -> None:
-        _check(std_m=self.std_m)
+        for name, most in _LIMITS.items():
+            value = getattr(self, name, 0.0)
+            if not 0 <= value <= most:
+                raise FlightError(f"GNSS receiver: {name} must be 0 to {most:g}, got {value:g}")
 
     def spoilt(self, track: GnssTrack) -> GnssTrack:
         """The track with the fault."""
@@ -76,9 +87,6 @@ class Step(Good):
     metres: float = 30.0
     bearing_deg: float = 90.0
     over_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        _check(std_m=self.std_m, at_s=self.at_s, metres=self.metres, over_s=self.over_s)
 
     def spoilt(self, track: GnssTrack) -> GnssTrack:
         """The track with the fault."""
@@ -101,9 +109,6 @@ class Drag(Good):
     at_s: float = 60.0
     mps: float = 1.0
     bearing_deg: float = 90.0
-
-    def __post_init__(self) -> None:
-        _check(std_m=self.std_m, at_s=self.at_s, mps=self.mps)
 
     def spoilt(self, track: GnssTrack) -> GnssTrack:
         """The track with the fault."""
@@ -131,9 +136,6 @@ class Frozen(Good):
     at_s: float = 60.0
     stale: int = 0
 
-    def __post_init__(self) -> None:
-        _check(std_m=self.std_m, at_s=self.at_s)
-
     def spoilt(self, track: GnssTrack) -> GnssTrack:
         """The track with the fault."""
         last = max(int(np.searchsorted(track.times_s, self.at_s)) - 1, 0)
@@ -151,9 +153,6 @@ class Jumping(Good):
     metres: float = 40.0
     every_s: float = 5.0
 
-    def __post_init__(self) -> None:
-        _check(std_m=self.std_m, at_s=self.at_s, metres=self.metres, every_s=self.every_s)
-
     def spoilt(self, track: GnssTrack) -> GnssTrack:
         """The track with the fault."""
         phase = np.floor((track.times_s - self.at_s) / max(self.every_s, 0.1))
@@ -168,9 +167,6 @@ class Jam(Good):
     at_s: float = 60.0
     for_s: float = 1e9
     silent: int = 0
-
-    def __post_init__(self) -> None:
-        _check(std_m=self.std_m, at_s=self.at_s, for_s=self.for_s)
 
     def spoilt(self, track: GnssTrack) -> GnssTrack:
         """The track with the fault."""
@@ -281,12 +277,3 @@ def _interpolated(at_s: Array, times_s: Array, places: Array) -> Array:
 def _towards(bearing_deg: float) -> Array:
     angle = math.radians(bearing_deg)
     return np.array([math.sin(angle), math.cos(angle)])
-
-
-def _check(**values: float) -> None:
-    limits: Mapping[str, float] = {"std_m": 100.0, "metres": 1e6, "mps": 1e3}
-    for name, value in values.items():
-        if not 0 <= value <= limits.get(name, 1e9):
-            raise FlightError(
-                f"GNSS receiver: {name} must be 0 to {limits.get(name, 1e9):g}, got {value:g}"
-            )
