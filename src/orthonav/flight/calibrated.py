@@ -1,16 +1,12 @@
 """The small JSON files that `orthonav calibrate` writes: a version and the fields of one record."""
 
 import json
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from orthonav.errors import FlightError, described
 from orthonav.files import require_file, write_text
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 VERSION = 1
 MAX_BYTES = 100_000
@@ -18,9 +14,9 @@ BROKEN = (KeyError, TypeError, ValueError, OverflowError)
 Record = TypeVar("Record")
 
 
-def write_record(path: Path, kind: str, record: "DataclassInstance") -> None:
-    """Write a record as JSON with the version in `orthonav_{kind}`, whole or not at all."""
-    plain = {f"orthonav_{kind}": VERSION, **asdict(record)}
+def write_record(path: Path, kind: str, fields: Mapping[str, Any]) -> None:
+    """Write the fields of a record as JSON with the version in `orthonav_{kind}`, whole or not at all."""
+    plain = {f"orthonav_{kind}": VERSION, **fields}
     write_text(path, json.dumps(plain, indent=1, allow_nan=False) + "\n")
 
 

@@ -1,7 +1,7 @@
 """Latency of a camera, from exposure to arrival, as `orthonav calibrate --latency` writes it."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ class CameraLatency:
 
 def write_latency(path: Path, latency: CameraLatency) -> None:
     """Write a latency as JSON, whole or not at all."""
-    write_record(path, "latency", latency)
+    write_record(path, "latency", asdict(latency))
 
 
 def read_latency(path: Path) -> CameraLatency:

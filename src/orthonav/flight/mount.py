@@ -4,7 +4,7 @@
 """
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,7 @@ class Mount:
 
 def write_mount(path: Path, mount: Mount) -> None:
     """Write a mount as JSON, whole or not at all."""
-    write_record(path, "mount", mount)
+    write_record(path, "mount", asdict(mount))
 
 
 def read_mount(path: Path) -> Mount:
