@@ -15,7 +15,7 @@ Record = TypeVar("Record")
 
 
 def write_record(path: Path, kind: str, fields: Mapping[str, Any]) -> None:
-    """Write the fields of a record as JSON with the version in `orthonav_{kind}`, whole or not at all."""
+    """Write fields as JSON with the version in `orthonav_{kind}`, whole or not at all."""
     plain = {f"orthonav_{kind}": VERSION, **fields}
     write_text(path, json.dumps(plain, indent=1, allow_nan=False) + "\n")
 
