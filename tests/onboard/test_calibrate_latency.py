@@ -39,13 +39,15 @@ def calibrated(log, out, *more):
 
 
 @pytest.mark.parametrize(("delay_s", "used_s"), [(0.4, 0.0), (0.15, 0.15), (2.2, 0.3)])
-def test_the_latency_is_found(tmp_path, capsys, delay_s, used_s):
+def test_the_latency_is_found(tmp_path, capsys, caplog, delay_s, used_s):
     log = logged(tmp_path, Flown(80, seed=1), delay_s, used_s=used_s)
     out = tmp_path / "latency.json"
     assert calibrated(log, out, "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert found["latency_ms"] == pytest.approx(delay_s * 1e3, abs=50)
     assert found["std_ms"] < 100 and found["pairs"] > 100
+    assert "only `orthonav calibrate --latency` uses them" in caplog.text
+    assert "left out" not in caplog.text
     assert _stated(str(out)) == read_latency(out) == CameraLatency(**found)
 
 

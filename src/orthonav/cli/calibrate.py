@@ -9,6 +9,9 @@ from orthonav.cli.common import print_json, progress
 from orthonav.cli.source import add_source, open_source
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from orthonav.flight.recording import RecordedView
     from orthonav.onboard.calibrate import MountCalibration
 
 EVERYDAY = (
@@ -112,19 +115,14 @@ def _run_latency(options: argparse.Namespace) -> None:
 
     flight = open_source(options.flight, options)
     with progress(options) as shown:
-        done = []
 
-        def count() -> None:
-            done.append(1)
-            if flight.expected:
-                shown("latency", min(1.0, len(done) / flight.expected))
+        def views() -> "Iterator[tuple[RecordedView, float]]":
+            for number, view in enumerate(arrivals_of(flight), 1):
+                yield view
+                if flight.expected:
+                    shown("latency", min(1.0, number / flight.expected))
 
-        found = calibrate_latency(
-            flight.camera,
-            arrivals_of(flight),
-            heading_known=options.heading == "known",
-            progress=count,
-        )
+        found = calibrate_latency(flight.camera, views(), heading_known=options.heading == "known")
     write_latency(options.out, found)
     if options.json:
         print_json(asdict(found))

@@ -112,7 +112,8 @@ def _flown(logged: Any) -> dict[str, Any]:
 
 def _mount(plain: Any) -> "Mount":
     from orthonav.errors import FlightError, described
-    from orthonav.flight.mount import BROKEN, mount_from_plain
+    from orthonav.flight.calibrated import BROKEN
+    from orthonav.flight.mount import mount_from_plain
 
     try:
         return mount_from_plain(plain)

@@ -76,11 +76,10 @@ def gnss_to_json(found: GnssMetrics) -> dict[str, object]:
     """The figures as values for strict JSON."""
     plain: dict[str, object] = {}
     for name, values in (("error", found.errors_m), ("difference", found.differences_m)):
-        known = values[np.isfinite(values)]
         plain |= {
-            f"{name}_median_m": or_none(percentile(known, 50)),
-            f"{name}_p95_m": or_none(percentile(known, 95)),
-            f"{name}_max_m": or_none(percentile(known, 100)),
+            f"{name}_median_m": or_none(percentile(values, 50)),
+            f"{name}_p95_m": or_none(percentile(values, 95)),
+            f"{name}_max_m": or_none(percentile(values, 100)),
         }
     plain["alarms"] = [
         {
@@ -128,6 +127,5 @@ def _picture(found: GnssMetrics) -> Drawing:
 
 
 def _spread_text(values: FloatArray) -> str:
-    known = values[np.isfinite(values)]
-    median, p95, most = (measure_text(percentile(known, q), " m") for q in (50, 95, 100))
+    median, p95, most = (measure_text(percentile(values, q), " m") for q in (50, 95, 100))
     return f"median {median}, 95 % {p95}, largest {most}"

@@ -3,19 +3,14 @@
 `orthonav calibrate` estimates them from a flight and writes a small JSON file for later flights.
 """
 
-import json
 import math
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from orthonav.errors import FlightError, described
-from orthonav.files import require_file, write_text
+from orthonav.flight.calibrated import read_record, write_record
 from orthonav.records import Telemetry
 
-VERSION = 1
-MAX_BYTES = 100_000
-BROKEN = (KeyError, TypeError, ValueError, OverflowError)
 _LIMITS = {"heading_deg": 180.0, "log_scale": 1.0, "pitch_deg": 60.0, "roll_deg": 60.0}
 
 
@@ -57,28 +52,16 @@ class Mount:
 
 def write_mount(path: Path, mount: Mount) -> None:
     """Write a mount as JSON, whole or not at all."""
-    plain = {"orthonav_mount": VERSION, **asdict(mount)}
-    write_text(path, json.dumps(plain, indent=1, allow_nan=False) + "\n")
+    write_record(path, "mount", asdict(mount))
 
 
 def read_mount(path: Path) -> Mount:
     """Read what `write_mount` wrote. Raises `MissingFileError` or `FlightError`."""
-    path = require_file(path, "mount file")
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ValueError("too large")
-        plain = json.loads(path.read_text(encoding="utf-8"))
-        if plain["orthonav_mount"] != VERSION:
-            raise ValueError(f"version {plain['orthonav_mount']}, expected {VERSION}")
-        return mount_from_plain(plain)
-    except (*BROKEN, AttributeError, RecursionError, OSError) as error:
-        raise FlightError(
-            f"not a mount file of `orthonav calibrate` ({described(error)}): {path}"
-        ) from error
+    return read_record(path, "mount", "orthonav calibrate", mount_from_plain)
 
 
 def mount_from_plain(plain: Any) -> Mount:
-    """Inverse of `asdict`, checked; raises one of `BROKEN` for an invalid mount."""
+    """Inverse of `asdict`, checked; raises one of `calibrated.BROKEN` for an invalid mount."""
     biases = {name: _bias(plain[name], name) for name in _LIMITS}
     return Mount(**biases, views=int(plain["views"]))
 

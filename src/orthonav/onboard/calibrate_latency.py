@@ -1,7 +1,7 @@
 """Latency of a camera, estimated from a recorded flight."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -41,7 +41,6 @@ def calibrate_latency(
     views: Iterable[tuple[RecordedView, float]],
     *,
     heading_known: bool = True,
-    progress: Callable[[], None] = lambda: None,
 ) -> CameraLatency:
     """Latency of a camera from views and the latency (s) that their times already contain.
 
@@ -69,7 +68,6 @@ def calibrate_latency(
         if before_ns is not None:
             intervals.append((arrived_ns - before_ns) / 1e9)
         before_ns = arrived_ns
-        progress()
         try:
             grey = view.grey()
         except FlightError:

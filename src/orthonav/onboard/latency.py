@@ -172,7 +172,9 @@ class LatencyMonitor:
             self._check.add(motion, self._history, delay_s)
         if self._due_ns is None or arrival.arrived_ns >= self._due_ns:
             self._due_ns = arrival.arrived_ns + EVERY_NS
-            self._judge(self._estimator.estimate(), self._estimator.estimate(RECENT_S))
+            recent = self._estimator.estimate(RECENT_S)
+            decided = recent.found or recent.contradicted
+            self._judge(recent if decided else self._estimator.estimate())
             self._compare()
 
     def current(self) -> Latency:
@@ -248,9 +250,8 @@ class LatencyMonitor:
         self._check.clear()
         self._pending, self._contradictions = None, 0
 
-    def _judge(self, whole: DelayEstimate, recent: DelayEstimate) -> None:
-        found = recent if recent.found else whole
-        if found.contradicted or recent.contradicted:
+    def _judge(self, found: DelayEstimate) -> None:
+        if found.contradicted:
             self._contradictions += 1
             return
         if found.found:
@@ -262,15 +263,16 @@ class LatencyMonitor:
             why = "images seem to arrive before exposure" if before else "the latency drifts fast"
             self._dispute(why, found)
             return
-        known = self._known
-        if known is not None and not (self._suspicion and not self._disputed):
+        # After a change, an estimate is not compared with the delay from before.
+        known = None if self._suspicion and not self._disputed else self._known
+        if known is not None:
             delay_s, std_s = known.at(found.last_ns)
             if _near(found.delay_s - delay_s, found.std_s, std_s):
                 self._adopt(found)
                 return
         if self._pending is not None and _agree(found, self._pending):
             self._adopt(found)
-        elif known is None or (self._suspicion and not self._disputed):
+        elif known is None:
             self._pending = found
         else:
             delay_ms = known.at(found.last_ns)[0] * 1e3

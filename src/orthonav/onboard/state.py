@@ -9,7 +9,7 @@ import math
 import os
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -97,31 +97,33 @@ def displacements(path: Path) -> dict[str, Displacement]:
             made = Displacement(**{name: float(plain[name]) for name in _DISPLACEMENT})
         except (KeyError, TypeError, ValueError):
             continue
-        values = [getattr(made, name) for name in _DISPLACEMENT]
-        if all(map(math.isfinite, values)) and made.std_m > 0 and made.agreed_s >= 0:
+        if all(map(math.isfinite, astuple(made))) and made.std_m > 0 and made.agreed_s >= 0:
             found[digest] = made
     return found
 
 
 def _maps_of(path: Path) -> dict[str, Any]:
+    maps = _plain_of(path).get("maps")
+    return maps if isinstance(maps, dict) else {}
+
+
+def _plain_of(path: Path) -> dict[str, Any]:
+    """Content of the file; empty where it is missing or damaged."""
     try:
         if path.stat().st_size > MAX_BYTES:
             return {}
         plain = json.loads(path.read_text(encoding="ascii"))
     except (OSError, ValueError, RecursionError):
         return {}
-    maps = plain.get("maps") if isinstance(plain, dict) else None
-    return maps if isinstance(maps, dict) else {}
+    return plain if isinstance(plain, dict) else {}
 
 
 def load(path: Path) -> SavedState | None:
     """Saved state; None where the file is missing or damaged."""
+    plain = _plain_of(path)
+    if plain.get("version") != VERSION:
+        return None
     try:
-        if path.stat().st_size > MAX_BYTES:
-            return None
-        plain = json.loads(path.read_text(encoding="ascii"))
-        if plain.pop("version") != VERSION:
-            return None
         return SavedState(
             lat_deg=float(plain["lat_deg"]),
             lon_deg=float(plain["lon_deg"]),
@@ -131,5 +133,5 @@ def load(path: Path) -> SavedState | None:
             boot_id=str(plain["boot_id"]),
             signing_timestamp_10us=int(plain["signing_timestamp_10us"]),
         )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (ValueError, KeyError, TypeError):
         return None

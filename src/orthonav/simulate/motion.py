@@ -57,8 +57,7 @@ class Wind:
     @property
     def velocity_en_mps(self) -> Array:
         """Mean velocity of the air over ground (2,)."""
-        angle = math.radians(self.from_deg)
-        return -self.speed_mps * np.array([math.sin(angle), math.cos(angle)])
+        return -self.speed_mps * direction(self.from_deg)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +83,7 @@ class FlownPath:
 def steady_path(line_en_m: Array, spacing_m: float, speed_mps: float) -> FlownPath:
     """Path along the polyline (M, 2) in still air; the heading equals the course."""
     places, courses = along_polyline_en_m(line_en_m, spacing_m)
-    first = speed_mps * _direction(float(courses[0]))
+    first = speed_mps * direction(float(courses[0]))
     times = np.arange(len(places), dtype=np.float64) * spacing_m / speed_mps
     return FlownPath(places, courses, times, first)
 
@@ -226,6 +225,7 @@ def mounted(
     return attitude_of(enu_from_camera(*attitude_deg) @ level.T @ tilted)
 
 
-def _direction(course_deg: float) -> Array:
+def direction(course_deg: float) -> Array:
+    """Unit vector (2,), east and north, of a course clockwise from north."""
     angle = math.radians(course_deg)
     return np.array([math.sin(angle), math.cos(angle)])

@@ -1,8 +1,7 @@
 """Simulated GNSS receivers: errors of a good one, and those that are spoofed, drift, freeze or lose
 their fix."""
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from orthonav.errors import FlightError
 from orthonav.flight.gnss import GnssSample
 from orthonav.geo.frames import LocalFrame
-from orthonav.simulate.motion import gauss_markov
+from orthonav.simulate.motion import direction, gauss_markov
 from orthonav.variants import Table, Variant, make_variant
 
 RATE_HZ = 5.0
@@ -30,6 +29,14 @@ LATENCY_S = 0.12
 STATED_STD_M = 1.5
 """Standard deviation that the receiver states: less than its error, as receivers do."""
 SATELLITES = 16
+_LIMITS = {
+    "std_m": 100.0,
+    "at_s": 1e9,
+    "metres": 1e6,
+    "mps": 1e3,
+    **dict.fromkeys(("over_s", "every_s", "for_s"), 1e9),
+}
+"""Largest values of a receiver's fields; the least is 0."""
 Array = NDArray[np.float64]
 
 
@@ -58,9 +65,12 @@ class Good:
     std_m: float = ERROR_STD_M
 
     def __post_init__(self) -> None:
-        _check(std_m=self.std_m)
+        for name, most in _LIMITS.items():
+            value = getattr(self, name, 0.0)
+            if not 0 <= value <= most:
+                raise FlightError(f"GNSS receiver: {name} must be 0 to {most:g}, got {value:g}")
 
-    def spoilt(self, track: GnssTrack) -> GnssTrack:
+    def with_fault(self, track: GnssTrack) -> GnssTrack:
         """The track with the fault."""
         return track
 
@@ -77,12 +87,9 @@ class Step(Good):
     bearing_deg: float = 90.0
     over_s: float = 0.0
 
-    def __post_init__(self) -> None:
-        _check(std_m=self.std_m, at_s=self.at_s, metres=self.metres, over_s=self.over_s)
-
-    def spoilt(self, track: GnssTrack) -> GnssTrack:
+    def with_fault(self, track: GnssTrack) -> GnssTrack:
         """The track with the fault."""
-        towards, seconds = _towards(self.bearing_deg), track.times_s - self.at_s
+        towards, seconds = direction(self.bearing_deg), track.times_s - self.at_s
         if self.over_s == 0:
             return replace(track, en_m=track.en_m + (seconds >= 0)[:, None] * self.metres * towards)
         share = np.clip(seconds / self.over_s, 0, 1)[:, None]
@@ -102,13 +109,10 @@ class Drag(Good):
     mps: float = 1.0
     bearing_deg: float = 90.0
 
-    def __post_init__(self) -> None:
-        _check(std_m=self.std_m, at_s=self.at_s, mps=self.mps)
-
-    def spoilt(self, track: GnssTrack) -> GnssTrack:
+    def with_fault(self, track: GnssTrack) -> GnssTrack:
         """The track with the fault."""
         seconds = np.maximum(track.times_s - self.at_s, 0.0)[:, None]
-        towards = self.mps * _towards(self.bearing_deg)
+        towards = self.mps * direction(self.bearing_deg)
         velocity = track.vel_en_mps + (seconds > 0) * towards
         return replace(track, en_m=track.en_m + seconds * towards, vel_en_mps=velocity)
 
@@ -119,9 +123,9 @@ class Drift(Drag):
 
     mps: float = 0.5
 
-    def spoilt(self, track: GnssTrack) -> GnssTrack:
+    def with_fault(self, track: GnssTrack) -> GnssTrack:
         """The track with the fault."""
-        return replace(super().spoilt(track), vel_en_mps=track.vel_en_mps)
+        return replace(super().with_fault(track), vel_en_mps=track.vel_en_mps)
 
 
 @dataclass(frozen=True)
@@ -131,10 +135,7 @@ class Frozen(Good):
     at_s: float = 60.0
     stale: int = 0
 
-    def __post_init__(self) -> None:
-        _check(std_m=self.std_m, at_s=self.at_s)
-
-    def spoilt(self, track: GnssTrack) -> GnssTrack:
+    def with_fault(self, track: GnssTrack) -> GnssTrack:
         """The track with the fault."""
         last = max(int(np.searchsorted(track.times_s, self.at_s)) - 1, 0)
         source = np.minimum(np.arange(len(track.times_s)), last)
@@ -151,14 +152,11 @@ class Jumping(Good):
     metres: float = 40.0
     every_s: float = 5.0
 
-    def __post_init__(self) -> None:
-        _check(std_m=self.std_m, at_s=self.at_s, metres=self.metres, every_s=self.every_s)
-
-    def spoilt(self, track: GnssTrack) -> GnssTrack:
+    def with_fault(self, track: GnssTrack) -> GnssTrack:
         """The track with the fault."""
         phase = np.floor((track.times_s - self.at_s) / max(self.every_s, 0.1))
         away = (phase >= 0) & (phase % 2 == 0)
-        return replace(track, en_m=track.en_m + away[:, None] * self.metres * _towards(45.0))
+        return replace(track, en_m=track.en_m + away[:, None] * self.metres * direction(45.0))
 
 
 @dataclass(frozen=True)
@@ -169,10 +167,7 @@ class Jam(Good):
     for_s: float = 1e9
     silent: int = 0
 
-    def __post_init__(self) -> None:
-        _check(std_m=self.std_m, at_s=self.at_s, for_s=self.for_s)
-
-    def spoilt(self, track: GnssTrack) -> GnssTrack:
+    def with_fault(self, track: GnssTrack) -> GnssTrack:
         """The track with the fault."""
         gone = (track.times_s >= self.at_s) & (track.times_s < self.at_s + self.for_s)
         if self.silent:
@@ -235,7 +230,7 @@ def solutions(
         np.full(count, STATED_STD_M),
         np.full(count, SATELLITES),
     )
-    return receiver.spoilt(good)
+    return receiver.with_fault(good)
 
 
 def samples_of(track: GnssTrack, frame: LocalFrame) -> Iterator[GnssSample]:
@@ -263,7 +258,7 @@ def _multipath(times: Array, rng: np.random.Generator) -> Array:
     for _ in range(rng.poisson(MULTIPATH_PER_HOUR * hours)):
         begin = rng.uniform(times[0], times[-1])
         during = (times >= begin) & (times < begin + rng.uniform(*MULTIPATH_S))
-        off[during] += rng.uniform(0, MULTIPATH_M) * _towards(rng.uniform(0, 360))
+        off[during] += rng.uniform(0, MULTIPATH_M) * direction(rng.uniform(0, 360))
     return off
 
 
@@ -276,17 +271,3 @@ def _interpolated(at_s: Array, times_s: Array, places: Array) -> Array:
         made += np.minimum(at_s - times_s[0], 0.0)[:, None] * first
         made += np.maximum(at_s - times_s[-1], 0.0)[:, None] * last
     return made
-
-
-def _towards(bearing_deg: float) -> Array:
-    angle = math.radians(bearing_deg)
-    return np.array([math.sin(angle), math.cos(angle)])
-
-
-def _check(**values: float) -> None:
-    limits: Mapping[str, float] = {"std_m": 100.0, "metres": 1e6, "mps": 1e3}
-    for name, value in values.items():
-        if not 0 <= value <= limits.get(name, 1e9):
-            raise FlightError(
-                f"GNSS receiver: {name} must be 0 to {limits.get(name, 1e9):g}, got {value:g}"
-            )

@@ -272,7 +272,7 @@ def _warn_of_gaps(index: _Index, replayable: list[LoggedView]) -> None:
     if withheld:
         index.warnings.append(
             f"{withheld} views were not located in flight, because the latency of the camera was "
-            "not known, and are left out"
+            "not known; only `orthonav calibrate --latency` uses them"
         )
     if missing > 0:
         index.warnings.append(

@@ -44,7 +44,7 @@ MAP_JUMP_M, MAP_JUMP_SIGMAS = 15.0, 3.0
 MAP_JUMP_S = 60.0
 """A change so soon after a jump of the map is not attributed to GNSS."""
 HISTORY_S, HISTORY = 5.0, 100
-"""Interval and number of differences that are kept for the agreement after a fault."""
+"""Interval and number of differences that are stored for the agreement after a fault."""
 _LEFT = {
     Fault.JUMP: Fault.STEP,
     Fault.LOST: Fault.OFFSET,
@@ -53,7 +53,7 @@ _LEFT = {
 }
 """Name of a difference that is left where a fault of the receiver itself has ended."""
 SOLVED = 30
-"""Solutions that are kept for exposures before the newest: 3 s at 10 Hz."""
+"""Solutions that are stored for exposures before the newest: 3 s at 10 Hz."""
 PENDING = 100
 """Most map positions that wait for the GNSS solution after them."""
 
@@ -127,11 +127,10 @@ class GnssMonitor:
             if position.time_ns > self._solved[-1][0].time_ns:
                 return
             self._pending.popleft()
-            times = [sample.time_ns for sample, _ in self._solved]
-            after = bisect_left(times, position.time_ns)
-            if after == 0 and times[0] > position.time_ns:
-                continue
+            after = bisect_left(self._solved, position.time_ns, key=lambda each: each[0].time_ns)
             sample, en_m = self._solved[after]
+            if after == 0 and sample.time_ns > position.time_ns:
+                continue
             earlier, earlier_m = self._solved[max(after - 1, 0)]
             interval_ns = sample.time_ns - earlier.time_ns
             if interval_ns * NANOSECONDS > GAP_S:
