@@ -245,7 +245,8 @@ def _flown(job_number: tuple[list[str], int]) -> tuple[int, Report]:
 def main(arguments: Sequence[str]) -> int:
     """Fly all faults and print the tables; returns the exit code, 1 where a message was wrong."""
     options = _parser().parse_args(arguments)
-    started, begin = provenance(" ".join(["faults", *arguments])), time.perf_counter()
+    started = provenance("faults-quick" if options.quick else "faults")
+    begin = time.perf_counter()
     options.work.mkdir(parents=True, exist_ok=True)
     jobs = _jobs(options)
     _world(options.work, "usual")  # made once, before processes share it
