@@ -9,7 +9,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.fault_flights import BEGIN_S, STATED_S, Fault, FaultFlight, Grey, State, combined
+from benchmarks.fakes import Grey
+from benchmarks.fault_flights import (
+    BEGIN_S,
+    STATED_S,
+    Fault,
+    FaultFlight,
+    State,
+    combined,
+    telemetry_frames,
+)
 
 FROZEN_NOISE = 3.0
 """Grey levels, standard deviation."""
@@ -139,11 +148,11 @@ def _autopilot_jumps(flight: FaultFlight) -> None:
 
 
 def _autopilot_restarts(flight: FaultFlight) -> None:
-    flight.boot_ahead_ns = -flight.now_ns
+    flight.boot_ahead_ns = -flight.time.now_ns
 
 
 def _computer_jumps(flight: FaultFlight) -> None:
-    flight.utc_ahead_ns += round(3600 * 1e9)
+    flight.time.utc_ahead_ns += round(3600 * 1e9)
 
 
 def _elsewhere(state: State) -> State:
@@ -152,12 +161,12 @@ def _elsewhere(state: State) -> State:
 
 
 def _other_system(flight: FaultFlight, state: State, boot_ns: int) -> list[bytes]:
-    heartbeat = flight.stranger.say("heartbeat", 1, 12, 0, 0, 4, 3)
-    return [heartbeat, *flight.stranger.telemetry(_elsewhere(state), boot_ns + BOOTED_BEFORE_NS)]
+    made = telemetry_frames(flight.other, _elsewhere(state), boot_ns + BOOTED_BEFORE_NS)
+    return [flight.other.heartbeat(), *made]
 
 
 def _same_system(flight: FaultFlight, state: State, boot_ns: int) -> list[bytes]:
-    return flight.autopilot.telemetry(_elsewhere(state), boot_ns + BOOTED_BEFORE_NS)
+    return telemetry_frames(flight.autopilot, _elsewhere(state), boot_ns + BOOTED_BEFORE_NS)
 
 
 TELEMETRY_FAULTS = (

@@ -23,9 +23,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import cv2
 import numpy as np
 import rasterio
-from numpy.typing import NDArray
 from rasterio.windows import Window
 
+from benchmarks.fakes import Array, Grey
 from benchmarks.fault_flights import (
     CAMERA,
     FAR_M,
@@ -33,7 +33,6 @@ from benchmarks.fault_flights import (
     VIEWS_HZ,
     Fault,
     FaultFlight,
-    Grey,
     Report,
     World,
     undisturbed,
@@ -60,7 +59,6 @@ EFFECTS = ViewEffects(exposure_std=0.05)
 LEAD_S, RECOVERY_S, SEED = 15.0, 60.0, 5
 QUICK_LEAD_S, QUICK_RECOVERY_S, QUICK_FAULT_S = 10.0, 20.0, 10.0
 CALM_S, CALM_SEEDS = 60.0, (11, 12, 13)
-Array = NDArray[np.float64]
 OWN_MAPS = (
     Fault("another place (mirrored ground)", "map", 30.0, from_start=True),
     Fault("map truncated in place", "map", 10.0),
