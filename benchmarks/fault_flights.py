@@ -5,17 +5,25 @@ monitor, gate and link; only clocks, camera and port are replaced. Nothing waits
 long as its views take to locate. Messages are decoded by the reader of the tests.
 """
 
-import importlib
 import math
-import runpy
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from benchmarks.fakes import (
+    BEGIN_NS,
+    SAMPLE_S,
+    Array,
+    Autopilot,
+    Grey,
+    Port,
+    S,
+    Stream,
+    Time,
+    wandering,
+)
 from orthonav.geo.camera import Camera
 from orthonav.geo.frames import LocalFrame
 from orthonav.localizer import Localizer
@@ -26,31 +34,26 @@ from orthonav.onboard.latency import LatencyMonitor
 from orthonav.onboard.link import AutopilotLink
 from orthonav.onboard.outputs import MessageOptions, Messenger
 from orthonav.onboard.publisher import Publisher
-from orthonav.onboard.telemetry import Clocks, TelemetryBuffer
+from orthonav.onboard.telemetry import TelemetryBuffer
 from orthonav.publish.estimate import Clock
 from orthonav.publish.gate import Gate, GateRules
 from orthonav.records import Fix
 
-READER = Path(__file__).resolve().parents[1] / "tests" / "wire.py"
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 STATED_S = 0.12
 """Stated and true latency of the undisturbed camera."""
 VIEWS_HZ, STEP_S = 5.0, 0.04
 """Rates of the camera, and of telemetry: 25 Hz."""
-S = 10**9
-BEGIN_NS, BEGIN_S = 100 * S, 15.0
-"""Our clock at the start, and the time on the path: a late camera shows what was before."""
+BEGIN_S = 15.0
+"""Time on the path at the start: a late camera shows what was before."""
 AHEAD_NS = -90 * S
-UTC_NS = 1_789_000_000 * S
 FAR_M, FAR_STD = 35.0, 3.0
 """A message is wrong if its error exceeds both, the second in stated standard deviations."""
 RIGHT_COUNT = 5
 """A flight ends so many right messages after its fault."""
-G_MPS2, SAMPLE_S, TURN_DEG_S = 9.81, 0.02, 14.0
+G_MPS2, TURN_DEG_S = 9.81, 14.0
 YAW_OFF_DEG, HEIGHT_SCALE, PITCH_OFF_DEG = 2.0, 1.03, 0.5
 """Constant errors of telemetry, undisturbed."""
-Array = NDArray[np.float64]
-Grey = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,7 @@ class Path2D:
         kernel = np.hanning(76) / np.hanning(76).sum()
         courses = np.convolve(np.pad(courses, 38, mode="edge"), kernel, mode="same")[38:-38]
         rate = np.gradient(courses, SAMPLE_S)
-        shaken = [_wandering(rng, count, turbulence_deg, each) for each in (0.25, 0.3, 0.5)]
+        shaken = [wandering(rng, count, turbulence_deg, each) for each in (0.25, 0.3, 0.5)]
         self._roll = np.degrees(np.arctan(speed_mps * rate / G_MPS2)) + shaken[0]
         self._pitch = 2.0 + shaken[1]
         self._yaw = np.degrees(courses) + 0.5 * shaken[2]
@@ -127,17 +130,6 @@ class Path2D:
         east, north = (np.interp(time_s, self._times, each) for each in self._velocity.T)
         off = yaw + YAW_OFF_DEG, pitch + PITCH_OFF_DEG, roll
         return State(*off, float(north), float(east), HEIGHT_SCALE * self.agl_m)
-
-
-def _wandering(rng: np.random.Generator, count: int, std: float, time_s: float) -> Array:
-    """Smooth noise (count,) of a standard deviation and a time constant."""
-    decay = math.exp(-SAMPLE_S / time_s)
-    out, value, slope = np.zeros(count), 0.0, 0.0
-    for i, each in enumerate(rng.standard_normal(count)):
-        slope = decay * slope + (1 - decay) * each
-        value = decay * value + (1 - decay) * slope
-        out[i] = value
-    return std * out / max(float(out.std()), 1e-12)
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,93 +231,15 @@ class Report:
         return sent, sum(begin <= each < self.fault_s[0] for each in self.views)
 
 
-class Port:
-    """A port whose other end is the flight."""
-
-    def __init__(self) -> None:
-        self.coming: list[bytes] = []
-        self.gone: list[bytes] = []
-
-    def open(self) -> "Port":
-        """Open it."""
-        return self
-
-    def fileno(self) -> int:
-        """Never waited for."""
-        raise AssertionError("nothing waits in simulated time")
-
-    def read(self) -> bytes:
-        """The next frame."""
-        return self.coming.pop(0) if self.coming else b""
-
-    def write(self, data: bytes) -> None:
-        """Take a frame."""
-        self.gone.append(bytes(data))
-
-    def heard(self) -> None:
-        """Nothing to do."""
-
-    def close(self) -> None:
-        """Nothing to do."""
-
-
-class Autopilot:
-    """Encodes what an autopilot says."""
-
-    def __init__(self, system: int = 1, component: int = 1) -> None:
-        self._mavlink: Any = importlib.import_module("pymavlink.dialects.v20.ardupilotmega")
-        self._mav = self._mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
-
-    def say(self, name: str, *values: Any) -> bytes:
-        """A frame."""
-        message = getattr(self._mavlink, f"MAVLink_{name}_message")(*values)
-        frame = bytes(message.pack(self._mav))
-        self._mav.seq = (self._mav.seq + 1) % 256
-        return frame
-
-    def telemetry(self, state: State, boot_ns: int) -> list[bytes]:
-        """Attitude, height above home, velocity."""
-        boot_ms = boot_ns // 10**6
-        yaw = math.remainder(math.radians(state.yaw), math.tau)
-        pitch, roll = math.radians(state.pitch), math.radians(state.roll)
-        height_mm = round(state.height * 1000)
-        made = [
-            self.say("attitude", boot_ms, roll, pitch, yaw, 0, 0, 0),
-            self.say("global_position_int", boot_ms, 0, 0, 0, height_mm, 0, 0, 0, 0),
-        ]
-        if math.isfinite(state.north):
-            velocity = state.north, state.east, 0.0
-            made.append(self.say("local_position_ned", boot_ms, 0, 0, 0, *velocity))
-        return made
-
-
-class Stream:
-    """A capture of a live camera whose image was exposed at `exposed_s`."""
-
-    def __init__(self, seen: Callable[[], Grey]) -> None:
-        self._seen = seen
-
-    def isOpened(self) -> bool:  # noqa: N802
-        """Always."""
-        return True
-
-    def grab(self) -> bool:
-        """Always."""
-        return True
-
-    def retrieve(self) -> tuple[bool, Grey]:
-        """The image."""
-        return True, self._seen()
-
-    def get(self, _: int) -> float:
-        """No timestamps."""
-        return 0.0
-
-    def set(self, *_: Any) -> None:
-        """Nothing to do."""
-
-    def release(self) -> None:
-        """Nothing to do."""
+def telemetry_frames(autopilot: Autopilot, state: State, boot_ns: int) -> list[bytes]:
+    """Attitude, height above home and velocity, as an autopilot sends them."""
+    made = [
+        autopilot.attitude(boot_ns, state.yaw, state.pitch, state.roll),
+        autopilot.home(boot_ns, state.height),
+    ]
+    if math.isfinite(state.north):
+        made.append(autopilot.local(boot_ns, (state.north, state.east, 0.0)))
+    return made
 
 
 class FaultFlight:
@@ -356,9 +270,9 @@ class FaultFlight:
             excursion=(away[0], away[0] + 0.55 * fault.seconds) if fault.leaves_map else None,
             outside=(1.9 * world.reach_m, 0.0),
         )
-        self.now_ns, self.utc_ahead_ns, self.boot_ahead_ns = BEGIN_NS, UTC_NS, AHEAD_NS
-        clocks = Clocks(self._mono_ns, lambda: self.now_ns + self.utc_ahead_ns, self._sleep)
-        self.port, self.autopilot, self.stranger = Port(), Autopilot(), Autopilot(2)
+        self.time, self.boot_ahead_ns = Time(), AHEAD_NS
+        clocks = self.time.clocks
+        self.port, self.autopilot, self.other = Port(), Autopilot(), Autopilot(2)
         self.link = AutopilotLink(self.port.open, TelemetryBuffer(), clocks)
         self.gate = Gate(GateRules(), Clock.BOOT)
         messages = MessageOptions(("global-position",))
@@ -376,24 +290,23 @@ class FaultFlight:
             link=self.link,
             latency=LatencyMonitor(fault.stated_s),
         )
-        self._reader = runpy.run_path(str(READER))
         self._inbox: dict[str, list[dict[str, Any]]] = {}
         self._number, self._exposed_s = 0, 0.0
         self._views: list[float] = []
         self._sent: list[Sent] = []
-        self._hear(self.autopilot.say("heartbeat", 1, 12, 0, 0, 4, 3))
+        self._hear(self.autopilot.heartbeat())
 
     @property
     def since_s(self) -> float:
         """Seconds since the start."""
-        return (self.now_ns - BEGIN_NS) / S
+        return (self.time.now_ns - BEGIN_NS) / S
 
     def fly(self) -> Report:
         """Fly to the end, or until the flight has recovered."""
         began = ended = False
         due_s = 0.0
         while self.since_s < self.end_s and not self._has_recovered():
-            self.now_ns += round(STEP_S * S)
+            self.time.go(STEP_S)
             if not began and self.since_s >= self.fault_s[0]:
                 began = True
                 if self.fault.begins is not None:
@@ -408,12 +321,6 @@ class FaultFlight:
                 self._image()
         withheld = {str(key): value for key, value in self.gate.withheld.items()}
         return Report(self.fault, self._views, self._sent, self.fault_s, withheld)
-
-    def _mono_ns(self) -> int:
-        return self.now_ns
-
-    def _sleep(self, seconds: float) -> None:
-        self.now_ns += round(seconds * S)
 
     def _has_recovered(self) -> bool:
         after = [each for each in self._sent[-RIGHT_COUNT:] if each.at_s >= self.fault_s[1]]
@@ -430,16 +337,13 @@ class FaultFlight:
 
     def _received(self, name: str) -> list[dict[str, Any]]:
         """Messages of that name since it was last asked for."""
-        for frame in self.port.gone:
-            if int.from_bytes(frame[7:10], "little") in self._reader["TABLES"]:
-                message = self._reader["decode"](frame)
-                self._inbox.setdefault(message["name"], []).append(message)
-        self.port.gone.clear()
+        for message in self.port.sent():
+            self._inbox.setdefault(message["name"], []).append(message)
         return self._inbox.pop(name, [])
 
     def _talk(self) -> None:
         """Telemetry of this moment, and answers to TIMESYNC."""
-        t, boot_ns = self._fault_t(), self.now_ns + self.boot_ahead_ns
+        t, boot_ns = self._fault_t(), self.time.now_ns + self.boot_ahead_ns
         true = self.path.reported(BEGIN_S + self.since_s)
         state: State | None = true
         frames = []
@@ -447,10 +351,8 @@ class FaultFlight:
             state = self.fault.state(self, true, t)
         asked = self._received("TIMESYNC")
         if state is not None:
-            frames = self.autopilot.telemetry(state, boot_ns)
-            for each in asked:  # with equal delays in both directions
-                answer_ns = (boot_ns + each["ts1"] + self.boot_ahead_ns) // 2
-                frames.append(self.autopilot.say("timesync", answer_ns, each["ts1"]))
+            frames = telemetry_frames(self.autopilot, state, boot_ns)
+            frames += self.autopilot.answers(asked, self.time.now_ns, self.boot_ahead_ns)
         if t is not None and self.fault.others is not None:
             frames += self.fault.others(self, true, boot_ns)
         self._hear(*frames)

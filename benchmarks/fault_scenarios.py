@@ -9,11 +9,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.fault_flights import BEGIN_S, STATED_S, Fault, FaultFlight, Grey, State, combined
+from benchmarks.fakes import Grey
+from benchmarks.fault_flights import (
+    BEGIN_S,
+    STATED_S,
+    Fault,
+    FaultFlight,
+    State,
+    combined,
+    telemetry_frames,
+)
 
 FROZEN_NOISE = 3.0
 """Grey levels, standard deviation."""
 JUMP_S = 30.0
+BOOTED_BEFORE_NS = 20 * 10**9
+"""The other vehicle was switched on so long before: its times of the same moment are greater."""
 
 
 def _noise(flight: FaultFlight, grey: Grey, t: float) -> Grey:
@@ -137,11 +148,11 @@ def _autopilot_jumps(flight: FaultFlight) -> None:
 
 
 def _autopilot_restarts(flight: FaultFlight) -> None:
-    flight.boot_ahead_ns = -flight.now_ns
+    flight.boot_ahead_ns = -flight.time.now_ns
 
 
 def _computer_jumps(flight: FaultFlight) -> None:
-    flight.utc_ahead_ns += round(3600 * 1e9)
+    flight.time.utc_ahead_ns += round(3600 * 1e9)
 
 
 def _elsewhere(state: State) -> State:
@@ -150,12 +161,12 @@ def _elsewhere(state: State) -> State:
 
 
 def _other_system(flight: FaultFlight, state: State, boot_ns: int) -> list[bytes]:
-    heartbeat = flight.stranger.say("heartbeat", 1, 12, 0, 0, 4, 3)
-    return [heartbeat, *flight.stranger.telemetry(_elsewhere(state), boot_ns)]
+    made = telemetry_frames(flight.other, _elsewhere(state), boot_ns + BOOTED_BEFORE_NS)
+    return [flight.other.heartbeat(), *made]
 
 
 def _same_system(flight: FaultFlight, state: State, boot_ns: int) -> list[bytes]:
-    return flight.autopilot.telemetry(_elsewhere(state), boot_ns)
+    return telemetry_frames(flight.autopilot, _elsewhere(state), boot_ns + BOOTED_BEFORE_NS)
 
 
 TELEMETRY_FAULTS = (
@@ -194,9 +205,7 @@ TELEMETRY_FAULTS = (
         20.0,
         state=lambda f, state, t: replace(state, north=math.nan, east=math.nan),
     ),
-    Fault(
-        "attitude frozen", "telemetry", 15.0, state=lambda f, state, t: _attitude_of(f, state, t)
-    ),
+    Fault("attitude frozen", "telemetry", 15.0, state=_attitude_of),
     Fault("attitude 1 s late", "telemetry", 15.0, state=lambda f, s, t: _attitude_of(f, s, 1.0)),
     Fault(
         "no telemetry for 1 s of 2",

@@ -23,9 +23,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import cv2
 import numpy as np
 import rasterio
-from numpy.typing import NDArray
 from rasterio.windows import Window
 
+from benchmarks.fakes import Array, Grey
 from benchmarks.fault_flights import (
     CAMERA,
     FAR_M,
@@ -33,7 +33,6 @@ from benchmarks.fault_flights import (
     VIEWS_HZ,
     Fault,
     FaultFlight,
-    Grey,
     Report,
     World,
     undisturbed,
@@ -60,7 +59,6 @@ EFFECTS = ViewEffects(exposure_std=0.05)
 LEAD_S, RECOVERY_S, SEED = 15.0, 60.0, 5
 QUICK_LEAD_S, QUICK_RECOVERY_S, QUICK_FAULT_S = 10.0, 20.0, 10.0
 CALM_S, CALM_SEEDS = 60.0, (11, 12, 13)
-Array = NDArray[np.float64]
 OWN_MAPS = (
     Fault("another place (mirrored ground)", "map", 30.0, from_start=True),
     Fault("map truncated in place", "map", 10.0),
@@ -245,7 +243,8 @@ def _flown(job_number: tuple[list[str], int]) -> tuple[int, Report]:
 def main(arguments: Sequence[str]) -> int:
     """Fly all faults and print the tables; returns the exit code, 1 where a message was wrong."""
     options = _parser().parse_args(arguments)
-    started, begin = provenance(" ".join(["faults", *arguments])), time.perf_counter()
+    started = provenance("faults-quick" if options.quick else "faults")
+    begin = time.perf_counter()
     options.work.mkdir(parents=True, exist_ok=True)
     jobs = _jobs(options)
     _world(options.work, "usual")  # made once, before processes share it

@@ -136,7 +136,10 @@ sys.exit(main(sys.argv[1:]))
 
 def test_crafted_maps_print_no_traceback(tmp_path, flight_path):
     """Commands in processes of their own, whose memory is limited."""
-    limit = lambda: resource.setrlimit(resource.RLIMIT_AS, (3 * 2**29,) * 2)  # noqa: E731
+
+    def limit():
+        resource.setrlimit(resource.RLIMIT_AS, (3 * 2**29,) * 2)
+
     path = masked(MASK_CASES["a bomb of 100 MB"], tmp_path)
     commands = (
         ("localize", path, flight_path, "--out", tmp_path / "fixes.jsonl", "-q"),

@@ -1,10 +1,7 @@
-"""Fake surroundings of a flight: clocks, a port, an autopilot, a tracker.
-
-What the autopilot hears is decoded by `wire`; what it says is encoded by pymavlink.
-"""
+"""Fake surroundings of a flight, beyond those of `benchmarks.fakes`: faults of the port, an
+autopilot over UDP, a flight folder, a locator."""
 
 import json
-import math
 import socket
 import threading
 import time
@@ -13,100 +10,53 @@ from types import MappingProxyType
 
 import cv2
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from benchmarks.fakes import MS, UTC_NS, S, Time
 
-from orthonav.onboard.telemetry import Clocks
+from benchmarks import fakes
 from orthonav.records import Fix
 from wire import TABLES, decode
 
-MS, S = 10**6, 10**9
-UTC_NS = 1_789_000_000 * S
+__all__ = ["MS", "UTC_NS", "Time"]  # tests import them from here
 
 
-class Time:
-    """Clocks that advance by `go` or by sleeping only."""
-
-    def __init__(self):
-        self.now_ns, self.utc_ahead_ns = 100 * S, UTC_NS
-        self.clocks = Clocks(lambda: self.now_ns, lambda: self.now_ns + self.utc_ahead_ns, self.go)
-
-    def go(self, seconds):
-        self.now_ns += round(seconds * S)
-
-
-class Port:
-    """A port whose other end is the test."""
+class Port(fakes.Port):
+    """A port that can refuse to open, and break."""
 
     def __init__(self):
-        self.coming, self.gone, self.broken, self.opened, self.refuse = [], [], None, 0, False
+        super().__init__()
+        self.broken, self.opened, self.refuse = None, 0, False
 
     def open(self):
         if self.refuse:
             raise ConnectionRefusedError("nobody there")
         self.opened += 1
-        return self
-
-    def fileno(self):
-        raise AssertionError("nobody should wait for this")
+        return super().open()
 
     def read(self):
         if self.broken:
             raise self.broken
-        return self.coming.pop(0) if self.coming else b""
+        return super().read()
 
     def write(self, data):
         if self.broken:
             raise self.broken
-        self.gone.append(bytes(data))
-
-    def heard(self):
-        pass
-
-    def close(self):
-        pass
-
-    def sent(self, name=None):
-        """What was sent so far, decoded; it is asked for once."""
-        frames, self.gone = self.gone, []
-        messages = [decode(f) for f in frames if int.from_bytes(f[7:10], "little") in TABLES]
-        return [each for each in messages if name in (None, each["name"])]
+        super().write(data)
 
 
-class Autopilot:
-    """Encodes what an autopilot says."""
+class Autopilot(fakes.Autopilot):
+    """An autopilot that can sign, and has a rangefinder."""
 
     def __init__(self, system=1, component=1, key=None):
-        self.mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+        super().__init__(system, component)
         if key is not None:
             self.mav.signing.secret_key, self.mav.signing.sign_outgoing = key, True
             self.mav.signing.timestamp = 2**47
-
-    def say(self, name, *values, **named):
-        message = getattr(mavlink, f"MAVLink_{name.lower()}_message")(*values, **named)
-        frame = bytes(message.pack(self.mav))
-        self.mav.seq = (self.mav.seq + 1) % 256
-        return frame
-
-    def heartbeat(self, kind=12):
-        return self.say("heartbeat", 1, kind, 0, 0, 4, 3)
-
-    def attitude(self, boot_ns, yaw_deg=0.0, pitch_deg=0.0, roll_deg=0.0):
-        angles = (math.radians(angle) for angle in (roll_deg, pitch_deg, yaw_deg))
-        return self.say("attitude", boot_ns // MS, *angles, 0, 0, 0)
 
     def distance(self, boot_ns, metres, orientation=25):
         centimetres = round(metres * 100)
         return self.say(
             "distance_sensor", boot_ns // MS, 1, 65535, centimetres, 0, 0, orientation, 255
         )
-
-    def home(self, boot_ns, metres):
-        return self.say(
-            "global_position_int", boot_ns // MS, 0, 0, 0, round(metres * 1000), *[0] * 4
-        )
-
-    def local(self, boot_ns, velocity_ned, down=0.0):
-        return self.say("local_position_ned", boot_ns // MS, 0, 0, down, *velocity_ned)
 
 
 class LiveAutopilot(threading.Thread):

@@ -4,6 +4,7 @@ Nothing here is shared with the program.
 """
 
 import numpy as np
+from benchmarks.fakes import SAMPLE_S, wandering
 from blots import GROUND, rendered
 from scipy.spatial.transform import Rotation
 
@@ -11,19 +12,7 @@ from orthonav.geo.camera import Camera
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 SMALL = Camera(160, 120, 125.0, 125.0, 80.0, 60.0)
-STEP_S = 0.02
 G = 9.81
-
-
-def wandering(rng, count, std, seconds):
-    """Smooth noise of a standard deviation and a time constant."""
-    out, decay = np.zeros(count), np.exp(-STEP_S / seconds)
-    value = slope = 0.0
-    for i, each in enumerate(rng.standard_normal(count)):
-        slope = decay * slope + (1 - decay) * each
-        value = decay * value + (1 - decay) * slope
-        out[i] = value
-    return std * out / max(out.std(), 1e-12)
 
 
 class Flown:
@@ -31,8 +20,8 @@ class Flown:
 
     def __init__(self, seconds, *, turns=True, turbulence_deg=1.0, speed=15.0, agl_m=120.0, seed=0):
         rng = np.random.default_rng(seed)
-        count = int(seconds / STEP_S) + 1
-        self.times = np.arange(count) * STEP_S
+        count = int(seconds / SAMPLE_S) + 1
+        self.times = np.arange(count) * SAMPLE_S
         self.speed, self.agl_m = speed, agl_m
         rate = np.zeros(count)  # rad/s
         if turns:
@@ -48,11 +37,11 @@ class Flown:
         t = turbulence_deg
         self.roll = bank + wandering(rng, count, t, 0.25)
         self.pitch = 2.0 + wandering(rng, count, t, 0.3)
-        course = rng.uniform(0, 2 * np.pi) + np.cumsum(rate) * STEP_S
+        course = rng.uniform(0, 2 * np.pi) + np.cumsum(rate) * SAMPLE_S
         self.yaw = np.unwrap(course) * 180 / np.pi + wandering(rng, count, 0.5 * t, 0.5)
         fast = speed * (1 + 0.03 * wandering(rng, count, 0.3 * t, 2.0))
         self.velocity = np.stack([fast * np.cos(course), fast * np.sin(course)], axis=1)  # N, E
-        self.place = np.cumsum(self.velocity, axis=0) * STEP_S
+        self.place = np.cumsum(self.velocity, axis=0) * SAMPLE_S
 
     def at(self, time_s):
         """Yaw, pitch, roll (deg), velocity north and east, place north and east."""

@@ -112,10 +112,7 @@ class Flight:
         """The autopilot sends telemetry and answers TIMESYNC."""
         now = self.time.now_ns + AHEAD_NS
         asked = self.port.sent("TIMESYNC") if not self.port.broken else []
-        answers = [  # with equal delays in both directions
-            self.autopilot.say("timesync", (now + each["ts1"] + AHEAD_NS) // 2, each["ts1"])
-            for each in asked
-        ]
+        answers = self.autopilot.answers(asked, self.time.now_ns, AHEAD_NS)
         attitude = self.autopilot.attitude(now, yaw_deg=self.yaw_deg)
         self.hear(self.autopilot.home(now, self.agl_m), attitude, *answers)
 

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from benchmarks.fakes import BEGIN_NS, Stream
 from fake_autopilot import MS, Autopilot, FakeLocator, Port, S, Time, fix
 from flown import SMALL as CAMERA
 from flown import Flown
@@ -19,36 +20,21 @@ from orthonav.publish.estimate import Clock
 from orthonav.publish.gate import Gate, GateRules
 
 METRES = 111_195.0  # a degree of latitude; the flights are at the equator
-BEGIN_NS, BEGIN_S = 100 * S, 10.0
+BEGIN_S = 10.0
 AHEAD_NS = -90 * S
 LARGEST_ERROR_M = 8.0
 
 
-class Stream:
-    """A capture whose images arrive when the test says so, exposed `delay_s` before."""
+class LateStream(Stream):
+    """A capture whose images arrive when the test says so, exposed at `exposed_s`."""
 
     def __init__(self, flight):
-        self.flight, self.exposed_s = flight, 0.0
+        super().__init__(lambda: self.change(flight.flown.picture(self.exposed_s, CAMERA)))
+        self.exposed_s, self.stamp_s = 0.0, math.nan
         self.change = lambda grey: grey
-        self.stamp_s = math.nan
-
-    def isOpened(self):
-        return True
-
-    def grab(self):
-        return True
-
-    def retrieve(self):
-        return True, self.change(self.flight.flown.picture(self.exposed_s, CAMERA))
 
     def get(self, _):
         return 0.0 if math.isnan(self.stamp_s) else self.stamp_s * 1e3
-
-    def set(self, *_):
-        pass
-
-    def release(self):
-        pass
 
 
 class LateFlight:
@@ -64,7 +50,7 @@ class LateFlight:
         messages = MessageOptions(("global-position",))
         messenger = Messenger(messages, self.gate, self.link.send, clocks)
         publisher = Publisher(self.gate, clocks, messenger=messenger, link=self.link)
-        self.stream = Stream(self)
+        self.stream = LateStream(self)
         self.source = LiveCamera(0, clocks, capture=lambda _: self.stream)
         self.newest, self.monitor = NewestImage(), LatencyMonitor(stated_s)
         self.runner = Runner(
@@ -100,10 +86,7 @@ class LateFlight:
         """Telemetry of this moment, and answers to TIMESYNC."""
         boot_ns = self.time.now_ns + AHEAD_NS
         (yaw, pitch, roll), (north, east), _ = self.flown.at(self.now_s)
-        answers = [
-            self.autopilot.say("timesync", (boot_ns + each["ts1"] + AHEAD_NS) // 2, each["ts1"])
-            for each in self.port.sent("TIMESYNC")
-        ]
+        answers = self.autopilot.answers(self.port.sent("TIMESYNC"), self.time.now_ns, AHEAD_NS)
         self.hear(
             self.autopilot.attitude(boot_ns, yaw, pitch, roll),
             self.autopilot.home(boot_ns, self.flown.agl_m),
