@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.errors import MapFileError, MissingFileError, OutputError, VariantError
+from orthonav.errors import MapFileError, MissingFileError, OutputError, VariantError, described
 from orthonav.extras import missing_extra
 from orthonav.files import replacing, require_file, write_text
 from orthonav.mapfile.manifest import MAX_MANIFEST_BYTES, Manifest
@@ -255,8 +255,9 @@ def _signature(path: Path) -> tuple[Signature, str]:
         encoded = found.pop("signature")
         signature = Signature(**found) if schema == 1 else Signature(**found, **_age(plain))
     except (ValueError, KeyError, TypeError, RecursionError, OSError) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise MapFileError(f"signature of the map is broken ({reason}): {file}") from error
+        raise MapFileError(
+            f"signature of the map is broken ({described(error)}): {file}"
+        ) from error
     return signature, encoded
 
 
