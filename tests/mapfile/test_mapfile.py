@@ -37,7 +37,7 @@ def path(tmp_path, content):
 def same_as_written(opened):
     """Whether all that can be read is what was written."""
     found = opened.manifest
-    wanted = {**vars(manifest()), "parts": found.parts}
+    wanted = {**vars(manifest()), "parts": found.parts, "sha256": found.sha256}
     same = vars(found) == wanted and sorted(opened.arrays) == sorted(arrays())
     return same and all(
         opened.arrays[name].dtype == array.dtype and np.array_equal(opened.arrays[name], array)

@@ -5,6 +5,7 @@ import json
 import stat
 import sys
 import time
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
 import pytest
@@ -12,6 +13,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ed25519, rsa
 from maps import arrays, manifest, put_together, taken_apart
 
+from orthonav.cli import localize
 from orthonav.errors import (
     MapFileError,
     MissingExtraError,
@@ -19,7 +21,7 @@ from orthonav.errors import (
     OutputError,
     VariantError,
 )
-from orthonav.mapfile import open_map, write_map
+from orthonav.mapfile import open_map, signature, write_map
 from orthonav.mapfile.signature import (
     MAX_SERIAL,
     key_id,
@@ -365,6 +367,37 @@ def test_the_commands(tmp_path, run):
     assert run("sign", path, "--key", tmp_path / "key" / "private.pem", "--serial", "x").code == 2
     assert run("sign", "--key", tmp_path / "key" / "private.pem").code == 1
     assert run("sign", path).code == 2
+
+
+@pytest.mark.parametrize("command", ["verify", "localize", "fly"])
+def test_a_map_that_replaces_the_checked_one_is_not_used(command, path, keys, run, monkeypatch):
+    public = keys / "ours" / "public.pem"
+    other = path.with_name("other.onav")
+    write_map(other, replace(manifest(), radius_m=99.0), arrays())
+
+    def check(*asked):
+        found = require_signature(*asked)
+        other.replace(path)
+        return found
+
+    monkeypatch.setattr(signature, "require_signature", check)
+    monkeypatch.setattr(localize, "open_source", lambda *asked: None)  # read before the map
+    monkeypatch.setattr(localize, "take_flown", lambda *asked: None)
+    done = run(
+        *{
+            "verify": ("verify", path, "--public-key", public),
+            "localize": ("localize", path, path, "--out", path, "--require-signed", public),
+            "fly": ("fly", path, path, "--recorded-telemetry", "--require-signed", public),
+        }[command]
+    )
+    assert done.code == 1 and "map was replaced after its signature was checked" in done.err
+    assert open_map(path).manifest.sha256 == map_digest(path)
+
+
+def test_the_digest_is_of_the_manifest_that_was_read(path):
+    read = open_map(path).manifest
+    assert read.sha256 == taken_apart(path)[1]["manifest_sha256"]
+    assert replace(read, radius_m=99.0).sha256 == manifest().sha256 == ""
 
 
 def test_without_the_library(path, keys, monkeypatch):

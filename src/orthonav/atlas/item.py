@@ -16,7 +16,7 @@ from dataclasses import dataclass, fields
 from datetime import date
 from typing import Any
 
-from orthonav.errors import AtlasError
+from orthonav.errors import AtlasError, described
 from orthonav.geo.area import Extent
 
 SCHEMA = 1
@@ -203,11 +203,9 @@ class Sheet(SheetDescription):
 
 def reason(error: Exception) -> str:
     """What is wrong with plain values that could not be read, for people."""
-    if isinstance(error, KeyError):
-        return f"{error.args[0]!s:.80} is missing"
     if isinstance(error, TypeError | AttributeError):
         return "a value is of another kind than expected"
-    return f"{error!s:.200}"
+    return described(error)
 
 
 def canonical(plain: Any) -> bytes:

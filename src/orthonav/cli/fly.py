@@ -6,6 +6,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from orthonav.cli.signed import add_signature
+
 EVERYDAY = (
     "--camera",
     "--camera-latency-ms",
@@ -328,18 +330,7 @@ def _add_flight(group: Any) -> None:
         metavar="MS",
         help="drop views that are older when their processing would start (default 500)",
     )
-    group.add_argument(
-        "--require-signed",
-        type=Path,
-        metavar="public.pem",
-        help="refuse a map that was not signed with this key (see `orthonav sign`)",
-    )
-    group.add_argument(
-        "--not-before",
-        metavar="DATE|SERIAL",
-        help="with --require-signed: refuse a map signed before this date (2026-05-31, UTC) or "
-        "with a lower serial number",
-    )
+    add_signature(group)
 
 
 def _add_log(group: Any) -> None:

@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from orthonav.cli.signed import checked_signature
 from orthonav.confidence.accept import Acceptance
 from orthonav.errors import CameraError, OutputError, VariantError
 from orthonav.files import require_file
@@ -119,16 +120,9 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
 
 def _opened(options: argparse.Namespace) -> MapFile:
     """The map, its signature checked first where that is asked for."""
-    if options.not_before is not None and not options.require_signed:
-        raise VariantError("--not-before needs --require-signed")
-    if not options.require_signed:
-        return open_map(options.map)
-    # cryptography is loaded only where it is asked for
-    signature = importlib.import_module("orthonav.mapfile.signature").require_signature(
-        options.map, options.require_signed, options.not_before
-    )
-    opened = open_map(options.map)
-    if options.state is not None:
+    signature = checked_signature(options)
+    opened = open_map(options.map, signature.manifest_sha256 if signature else None)
+    if signature is not None and options.state is not None:
         require_newest(options.state, signature, options.map)
     return opened
 

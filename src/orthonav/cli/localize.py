@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from orthonav.cli.common import print_json, progress
 from orthonav.cli.flown import compare_with_flight, take_flown
 from orthonav.cli.needs import require_extras
+from orthonav.cli.signed import add_signature, checked_signature
 from orthonav.cli.source import add_source, open_source
 
 if TYPE_CHECKING:
@@ -110,18 +111,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="flight log: use the options of the flight",
     )
-    parser.add_argument(
-        "--require-signed",
-        type=Path,
-        metavar="public.pem",
-        help="refuse a map that was not signed with this key (see `orthonav sign`)",
-    )
-    parser.add_argument(
-        "--not-before",
-        metavar="DATE|SERIAL",
-        help="with --require-signed: refuse a map signed before this date (2026-05-31, UTC) or "
-        "with a lower serial number",
-    )
+    add_signature(parser)
     add_source(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
@@ -148,12 +138,12 @@ def _on_map(options: argparse.Namespace) -> None:
 
     if options.lag is not None and not (options.smooth and options.lag >= 0):
         raise VariantError("--lag needs --smooth and a number of views, 0 or more")
-    _check_signature(options)
+    signature = checked_signature(options)
     flight = open_source(options.flight, options)
     mount = take_flown(options, flight)
     accept = Acceptance.parse(options.accept) if options.accept else None
     localizer = Localizer(
-        open_map(options.map),
+        open_map(options.map, signature.manifest_sha256 if signature else None),
         registration=options.registration == "on",
         position=check_rule(options.position),
     )
@@ -188,16 +178,6 @@ def _on_map(options: argparse.Namespace) -> None:
         compare_with_flight(flight, results)
     write_results(options.out, results)
     _print_summary(options, results)
-
-
-def _check_signature(options: argparse.Namespace) -> None:
-    from orthonav.errors import VariantError
-    from orthonav.mapfile.signature import require_signature
-
-    if options.require_signed:
-        require_signature(options.map, options.require_signed, options.not_before)
-    elif options.not_before is not None:
-        raise VariantError("--not-before needs --require-signed")
 
 
 def _on_atlas(options: argparse.Namespace) -> None:

@@ -28,7 +28,7 @@ from orthonav.fetch.crs import ground_scale
 from orthonav.fetch.grid import CellGrid
 from orthonav.fetch.images import CellPixels
 from orthonav.fetch.options import ImageryOptions, Provenance, finest_fitting
-from orthonav.fetch.remote import MAX_RANGE, RangeCache, RemoteFile, RemoteFiles
+from orthonav.fetch.remote import CACHE_BYTES, MAX_RANGE, RangeCache, RemoteFile, RemoteFiles
 from orthonav.fetch.urls import shown
 from orthonav.geo.frames import LocalFrame
 from orthonav.imagery.raster import WHOLLY_VALID
@@ -192,7 +192,7 @@ def cog_source(
 
     Raises `FetchError` where one cannot be read or they differ in pixel type or bands.
     """
-    remote, cache = RemoteFiles(), RangeCache()
+    remote, cache = RemoteFiles(), RangeCache(CACHE_BYTES, len)
     files: list[CogLevel] = []
     for number, url in enumerate(urls):
         name = f"{number}.tif"

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
+from orthonav.errors import described
 from orthonav.fetch.client import BadReplyError, HttpReply, bad_status, exception_text, excerpt
 
 FORMATS = ("JPEG", "PNG", "WEBP")
@@ -93,7 +94,7 @@ def decode(body: bytes, shape_px: tuple[int, int], empty: str | None) -> CellPix
     except UnidentifiedImageError:
         raise BadReplyError("not an image (JPEG, PNG or WebP)") from None
     except (OSError, ValueError, SyntaxError, Warning, Image.DecompressionBombError) as error:
-        raise BadReplyError(f"image is broken ({_words(error)})") from None
+        raise BadReplyError(f"image is broken ({described(error)})") from None
     valid = np.ones((height, width), dtype=bool) if alpha is None else alpha > 0
     if empty is not None:
         valid &= ~_empty_patches(rgb, _EMPTY_COLOURS[empty])
@@ -124,7 +125,3 @@ def _empty_patches(rgb: NDArray[np.uint8], level: int) -> NDArray[np.bool_]:
 def _looks_like_text(reply: HttpReply) -> bool:
     """By its first character, because media types are often wrong."""
     return reply.body[:256].lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"<", b"{")
-
-
-def _words(error: BaseException) -> str:
-    return " ".join(str(error).split())[:120] or type(error).__name__

@@ -8,11 +8,11 @@ file changes meanwhile.
 
 import io
 import threading
-from collections import OrderedDict
 from typing import Any
 
 from rasterio.abc import MultiByteRangeResourceContainer
 
+from orthonav.caches import ByteCache
 from orthonav.errors import FetchError
 from orthonav.fetch.client import Client
 from orthonav.fetch.urls import shown
@@ -21,32 +21,10 @@ CHUNK = 128 * 1024
 """Small reads (the head of a file) are rounded to this: one request holds most heads."""
 MAX_RANGE = 64 * 2**20
 """Largest read. A block of a tiled file has at most a few megabytes."""
-_CACHE_BYTES = 64 * 2**20
+CACHE_BYTES = 64 * 2**20
 """Ranges held in memory for all files: cells next to each other share blocks."""
-
-
-class RangeCache:
-    """The bytes that were read last, by address and range, up to `_CACHE_BYTES`."""
-
-    def __init__(self) -> None:
-        self._ranges: OrderedDict[tuple[str, int, int], bytes] = OrderedDict()
-        self._size = 0
-        self._lock = threading.Lock()
-
-    def get(self, key: tuple[str, int, int]) -> bytes | None:
-        """The bytes of a range, or None."""
-        with self._lock:
-            if key in self._ranges:
-                self._ranges.move_to_end(key)
-            return self._ranges.get(key)
-
-    def put(self, key: tuple[str, int, int], data: bytes) -> None:
-        """Store a range; those not used for longest are dropped."""
-        with self._lock:
-            self._size += len(data) - len(self._ranges.pop(key, b""))
-            self._ranges[key] = data
-            while self._size > _CACHE_BYTES:
-                self._size -= len(self._ranges.popitem(last=False)[1])
+RangeCache = ByteCache[tuple[str, int, int], bytes]
+"""Bytes by address and range."""
 
 
 class RemoteFile:
@@ -60,7 +38,7 @@ class RemoteFile:
         self.size = 0
         self._version = ""
         self._client = client
-        self._cache = cache or RangeCache()
+        self._cache = cache or RangeCache(CACHE_BYTES, len)
         self._lock = threading.Lock()
         self._fetch(0, CHUNK)
 

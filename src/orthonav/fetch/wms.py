@@ -75,7 +75,7 @@ def read_layer(client: Client, document: XmlDocument, url: str, name: str | None
         layers = {name: layer for name, layer in service.contents.items() if name}
         layer = layers[choose_layer(list(layers), name, url, named=True)]
         times = (value.strip() for value in layer.timepositions or [] if value)
-        address = next(way["url"] for way in get_map.methods if way["type"].lower() == "get")
+        address = next(each["url"] for each in get_map.methods if each["type"].lower() == "get")
         return WmsLayer(
             name=layer.name,
             styles=tuple(layer.styles),

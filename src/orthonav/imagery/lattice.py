@@ -5,7 +5,6 @@ are joined on their own pixels first and then resampled across the seam.
 """
 
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
+from orthonav.caches import ByteCache
 from orthonav.imagery.source import Source
 from orthonav.imagery.thin import cells_of, read_thinned
 
@@ -154,9 +154,8 @@ class CellCache:
     """Cache of the members that were read last; each is read by one thread only."""
 
     def __init__(self, limit_bytes: int = CACHE_BYTES) -> None:
-        self._limit_bytes = limit_bytes
         self._lock = threading.Lock()
-        self._cached: OrderedDict[tuple[int, int], Cells] = OrderedDict()
+        self._cells = ByteCache[tuple[int, int], Cells](limit_bytes, _bytes)
         self._turns: dict[tuple[int, int], threading.Lock] = {}
 
     def get(self, key: tuple[int, int], read: Callable[[], Cells]) -> Cells:
@@ -178,15 +177,10 @@ class CellCache:
             return self._turns.setdefault(key, threading.Lock())
 
     def _cached_or_read(self, key: tuple[int, int], read: Callable[[], Cells]) -> Cells:
-        with self._lock:
-            if key in self._cached:
-                self._cached.move_to_end(key)
-                return self._cached[key]
-        cells = read()
-        with self._lock:
-            self._cached[key] = cells
-            while sum(_bytes(each) for each in self._cached.values()) > self._limit_bytes:
-                self._cached.popitem(last=False)
+        cells = self._cells.get(key)
+        if cells is None:
+            cells = read()
+            self._cells.put(key, cells)
         return cells
 
 

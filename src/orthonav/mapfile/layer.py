@@ -5,9 +5,7 @@ Each level is divided into square chunks, each a grey JPEG with its own mask, se
 so every length, size and offset is checked before it is used.
 """
 
-import threading
 import zlib
-from collections import OrderedDict
 from itertools import pairwise
 from typing import Any
 
@@ -15,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.caches import ByteCache
 from orthonav.errors import MapFileError
 from orthonav.mapfile.manifest import GreyInfo
 from orthonav.mapfile.reader import MapFile
@@ -94,7 +93,7 @@ class GreyLayer:
         names = part_names(sheet)
         self._jpegs = _Blobs(opened, names["bytes"], names["offsets"], self._table.count)
         self._masks = _Blobs(opened, names["mask_bytes"], names["mask_offsets"], self._table.count)
-        self._cache = _Cache(cache_bytes)
+        self._cache = ByteCache[int, Chunk](cache_bytes, _bytes_of)
 
     @classmethod
     def of(
@@ -285,32 +284,6 @@ class _Blobs:
     def blob(self, number: int) -> NDArray[np.uint8]:
         first, last = int(self._offsets[number]), int(self._offsets[number + 1])
         return np.frombuffer(self._opened.range(self._name, first, last), dtype=np.uint8)
-
-
-class _Cache:
-    """Least-recently-used cache of decoded chunks, limited in bytes."""
-
-    def __init__(self, limit_bytes: int) -> None:
-        self._limit = limit_bytes
-        self._chunks: OrderedDict[int, Chunk] = OrderedDict()
-        self._lock = threading.Lock()
-        self.held_bytes = 0
-
-    def get(self, number: int) -> Chunk | None:
-        with self._lock:
-            chunk = self._chunks.get(number)
-            if chunk is not None:
-                self._chunks.move_to_end(number)
-            return chunk
-
-    def put(self, number: int, chunk: Chunk) -> None:
-        with self._lock:
-            if number in self._chunks:  # another thread was faster
-                return
-            self._chunks[number] = chunk
-            self.held_bytes += _bytes_of(chunk)
-            while self.held_bytes > self._limit:
-                self.held_bytes -= _bytes_of(self._chunks.popitem(last=False)[1])
 
 
 def _bytes_of(chunk: Chunk) -> int:

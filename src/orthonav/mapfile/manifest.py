@@ -152,6 +152,7 @@ class Manifest:
     - `registration`: the same for registered views (`confidence`, `radius_m`, `position_floor_px`),
       None without a registration layer.
     - `parts`: array name to {dtype, shape, sha256}; filled in by `write_map`.
+    - `sha256`: digest of the manifest that was read, hexadecimal; empty for one that was not read.
     """
 
     recipe: dict[str, Any]
@@ -163,6 +164,7 @@ class Manifest:
     created_by: str
     registration: dict[str, Any] | None = None
     parts: dict[str, dict[str, Any]] = field(default_factory=dict)
+    sha256: str = field(default="", init=False, compare=False)
 
     def to_json(self) -> str:
         """Canonical JSON, with the SHA-256 of everything else in `manifest_sha256`."""
@@ -208,7 +210,7 @@ class Manifest:
         if not 1 <= len(sheets) <= MAX_SHEETS:
             raise MapFileError(f"map must have 1 to {MAX_SHEETS} sheets, has {len(sheets)}")
         confidence, registration = plain.get("confidence"), plain.get("registration")
-        return cls(
+        manifest = cls(
             recipe=_get(plain, "recipe", dict),
             sheets=tuple(SheetInfo.from_plain(sheet) for sheet in sheets),
             imagery=tuple(item for item in _get(plain, "imagery", list) if isinstance(item, dict)),
@@ -219,6 +221,8 @@ class Manifest:
             registration=registration if isinstance(registration, dict) else None,
             parts=_get(plain, "parts", dict),
         )
+        object.__setattr__(manifest, "sha256", stated)  # no argument: `replace` must not copy it
+        return manifest
 
 
 def _view(plain: Any) -> dict[str, Any]:

@@ -200,8 +200,11 @@ class _OpenFile:
         return b"".join(pieces)
 
 
-def open_map(path: Path) -> MapFile:
+def open_map(path: Path, manifest_sha256: str | None = None) -> MapFile:
     """Open a map and verify every checksum in it.
+
+    `manifest_sha256` is that of a signature: another map is refused, also one that took the place
+    of the signed one after the signature was checked.
 
     The container is safetensors: eight bytes with the length of a JSON header, the header, raw
     arrays. It is parsed here, not with the library, because the arrays are read on demand, and
@@ -218,6 +221,8 @@ def open_map(path: Path) -> MapFile:
         if not isinstance(metadata, dict) or not isinstance(metadata.get(METADATA_KEY), str):
             raise MapFileError("not an orthonav map")
         manifest = Manifest.from_json(metadata[METADATA_KEY])
+        if manifest_sha256 not in (None, manifest.sha256):
+            raise MapFileError("map was replaced after its signature was checked; try again")
         parts = _parts(opened, start, header, manifest)
     except MapFileError as error:
         raise type(error)(f"{error}: {path}") from error

@@ -19,11 +19,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.errors import MapFileError, MissingFileError, OutputError, VariantError
+from orthonav.errors import MapFileError, MissingFileError, OutputError, VariantError, described
 from orthonav.extras import missing_extra
 from orthonav.files import replacing, require_file, write_text
 from orthonav.mapfile.manifest import MAX_MANIFEST_BYTES, Manifest
-from orthonav.mapfile.reader import MAX_HEADER_BYTES, MIN_FILE_BYTES
+from orthonav.mapfile.reader import MAX_HEADER_BYTES, MIN_FILE_BYTES, open_map
 from orthonav.mapfile.writer import METADATA_KEY
 
 if TYPE_CHECKING:
@@ -89,15 +89,13 @@ def map_digest(path: Path) -> str:
             text = json.loads(stream.read(length))["__metadata__"][METADATA_KEY]
             if not isinstance(text, str) or len(text) > MAX_MANIFEST_BYTES:
                 raise ValueError("manifest")
-            Manifest.from_json(text)  # its digest is right
-            digest = json.loads(text)["manifest_sha256"]
+            return Manifest.from_json(text).sha256
     except MapFileError as error:
         raise type(error)(str(error) if str(path) in str(error) else f"{error}: {path}") from error
     except OSError as error:
         raise MissingFileError(f"map cannot be read ({error.strerror}): {path}") from error
     except (ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
         raise MapFileError(f"not an orthonav map, or damaged: {path}") from error
-    return str(digest)
 
 
 def map_info(path: Path) -> dict[str, Any]:
@@ -152,15 +150,13 @@ def sign_map(path: Path, key: Path, serial: int | None = None) -> Path:
     map is fully checked first. Raises `MissingFileError`, `MapFileError`, `OutputError`,
     `VariantError` or `MissingExtraError`.
     """
-    from orthonav.mapfile.reader import open_map
-
     now = datetime.now(UTC)
     serial = int(now.timestamp()) if serial is None else serial
     if not 0 <= serial <= MAX_SERIAL:
         raise VariantError(f"serial number must be 0 to {MAX_SERIAL}, got {serial}")
     private = _private_key(key)
-    open_map(path)
-    made = Signature(key_id(private.public_key()), map_digest(path), serial, now.strftime(_TIME))
+    digest = open_map(path).manifest.sha256
+    made = Signature(key_id(private.public_key()), digest, serial, now.strftime(_TIME))
     plain = {
         "format": FORMAT,
         "schema": SCHEMA,
@@ -177,10 +173,11 @@ def sign_map(path: Path, key: Path, serial: int | None = None) -> Path:
 def require_signature(path: Path, public_key: Path, not_before: str | None = None) -> Signature:
     """The signature of a map, checked with a key (PEM).
 
-    `not_before` is a serial number, or a date or time in UTC; older maps are refused. `open_map`
-    then compares the parts with the manifest. Raises `MapFileError` if the signature is missing,
-    broken, by another key, of another map or too old, `MissingFileError` if the map or the key is
-    missing, `VariantError` if `not_before` is invalid, and `MissingExtraError`.
+    `not_before` is a serial number, or a date or time in UTC; older maps are refused. `open_map`,
+    given the digest of the signature, then compares the parts with the manifest. Raises
+    `MapFileError` if the signature is missing, broken, by another key, of another map or too old,
+    `MissingFileError` if the map or the key is missing, `VariantError` if `not_before` is invalid,
+    and `MissingExtraError`.
     """
     invalid, _, _ = _crypto()
     least = None if not_before is None else _least(not_before)
@@ -258,8 +255,9 @@ def _signature(path: Path) -> tuple[Signature, str]:
         encoded = found.pop("signature")
         signature = Signature(**found) if schema == 1 else Signature(**found, **_age(plain))
     except (ValueError, KeyError, TypeError, RecursionError, OSError) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise MapFileError(f"signature of the map is broken ({reason}): {file}") from error
+        raise MapFileError(
+            f"signature of the map is broken ({described(error)}): {file}"
+        ) from error
     return signature, encoded
 
 
