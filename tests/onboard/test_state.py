@@ -57,6 +57,15 @@ def test_a_damaged_file_is_ignored(tmp_path, text):
     assert load(path) is None
 
 
+def test_numbers_beyond_their_type_are_damage(tmp_path):
+    path = tmp_path / "state.json"
+    maps = {"a": {"east_m": 10**400, "north_m": 0, "std_m": 1, "agreed_s": 1}}
+    save(path, SAVED)
+    plain = json.loads(path.read_text())
+    path.write_text(json.dumps({**plain, "utc_ns": math.inf, "maps": maps}))
+    assert load(path) is None and displacements(path) == {}
+
+
 def test_a_huge_file_is_ignored(tmp_path):
     path = tmp_path / "state.json"
     save(path, SAVED)

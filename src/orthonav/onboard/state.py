@@ -95,7 +95,7 @@ def displacements(path: Path) -> dict[str, Displacement]:
     for digest, plain in _maps_of(path).items():
         try:
             made = Displacement(**{name: float(plain[name]) for name in _DISPLACEMENT})
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             continue
         if all(map(math.isfinite, astuple(made))) and made.std_m > 0 and made.agreed_s >= 0:
             found[digest] = made
@@ -133,5 +133,5 @@ def load(path: Path) -> SavedState | None:
             boot_id=str(plain["boot_id"]),
             signing_timestamp_10us=int(plain["signing_timestamp_10us"]),
         )
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, OverflowError):
         return None
