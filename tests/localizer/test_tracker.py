@@ -17,6 +17,7 @@ from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import localize_flight, smoothed_track
 from orthonav.records import Fix, NoFix, Prior, Telemetry, View
+from orthonav.track import ReportedAttitude, Sighting, State
 
 WIDE = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
 SPEED_MPS = 14.0
@@ -513,3 +514,26 @@ def test_a_reversed_heading_confirms_no_track(localizer):
     rows = followed(tracker, localizer, views(14, heading_off=180.0))
     assert not any(row[1] > 0.8 and row[0] > 35 for row in rows)
     assert all(row[2] == "searching" for row in rows)
+
+
+def test_a_wrong_place_found_after_a_loss_does_not_bias_the_search(localizer):
+    """Heading and height of a wrong place must not keep the true one from being found."""
+    tracker, seen = Tracker(localizer), list(views(26, year=lit))
+    followed(tracker, localizer, seen[:8])
+    assert tracker.state is State.TRACKING
+    wrong = np.array([170.0, 150.0, math.radians(14.0), 0.15, 0.0, 0.0])
+    spread = np.diag([4.0, 4.0, 1e-3, 1e-4, 1e-3, 1e-3])
+    states = []
+    for _, telemetry, _ in seen[8:16]:
+        tracker.passed(telemetry, NoFix("too_dark", "no picture"))
+        tracker.mixture.update(
+            ReportedAttitude(None, 0.0, 0.0), [Sighting(wrong, spread, 7.0, 0.3)]
+        )
+        states.append(tracker.mixture.estimate(15.0))
+    assert states[-1].belief > 0.9
+    assert np.hypot(*(states[-1].mean[:2] - wrong[:2])) < 20
+    rows = followed(tracker, localizer, seen[16:])
+    print([(round(float(r[0])), round(r[1],2), r[2], round(r[3].evidence['recognized'],2), round(r[3].evidence['elsewhere'],3), round(r[3].evidence['heading_bias_deg'],1)) for r in rows])
+    print([(s.belief, s.state, s.confirmed) for s in states])
+    assert all(row[0] < 10 for row in rows if row[2] == "tracking")
+    assert rows[-1][2] == "tracking"

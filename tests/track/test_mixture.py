@@ -472,3 +472,26 @@ def test_a_view_counts_by_what_it_shows_itself(alone, state):
     mixture.predict(1.0, camera=flight.moved())
     mixture.update(flight.reported(), [replace(flight.sighting(2.0), alone=alone)])
     assert mixture.estimate(RADIUS_M).state is state
+
+
+@pytest.mark.parametrize(("confirms", "state"), [(False, State.SEARCHING), (True, State.TRACKING)])
+def test_only_places_that_competed_with_all_others_confirm_a_track(confirms, state):
+    flight, mixture = Flight(5), Mixture(MODEL, EXTENT)
+    for view in range(6):
+        if view:
+            mixture.predict(1.0, camera=flight.moved())
+        # A place is born once from a view of the whole map.
+        mixture.update(flight.reported(), [flight.sighting(4.0)], confirms=confirms or not view)
+    estimate = mixture.estimate(RADIUS_M)
+    assert estimate.belief > 0.9 and np.hypot(*(estimate.mean[:2] - flight.place)) < 10
+    assert (estimate.state, estimate.followed) == (state, state is State.TRACKING)
+
+
+def test_a_place_that_contradicts_the_track_does_not_descend_from_the_track():
+    flight, mixture, _ = flown(3, false_share=0.0)
+    assert mixture.estimate(RADIUS_M).followed
+    flight.place = -flight.place
+    mixture.update(flight.reported(), [flight.sighting(7.0)], confirms=False)
+    mixture.update(flight.reported(), [flight.sighting(7.0)], confirms=False)
+    found = mixture.estimate(RADIUS_M)
+    assert np.hypot(*(found.mean[:2] - flight.place)) < 15 and not found.followed

@@ -62,6 +62,8 @@ VELOCITY_STD_MPS = 1.0
 VELOCITY_SHARE = 0.02
 """Standard deviation of a reported velocity that comes without one: this, and this share of the
 speed (docs/tracking.md)."""
+FOLLOWED = (State.TRACKING, State.COASTING)
+"""States in which a track is followed."""
 Array = NDArray[np.float64]
 
 
@@ -103,7 +105,7 @@ class Tracker:
         self._before: OdometryView | None = None
         self._velocity: Array | None = None
         self._new_ground = np.full(2, np.inf)
-        self._start_was_reported = False
+        self._whole_map = False
         self._use_prior, self._every_prior = use_prior, every_prior
         self._history = History() if smooth else None
         self._lag = lag
@@ -207,7 +209,6 @@ class Tracker:
         if self._time_ns is None:
             self._time_ns, self._before = telemetry.time_ns, now
             if prior is not None:
-                self._start_was_reported = True
                 self.mixture.start(*self._position_of(prior))
             return 0.0, 1.0
         seconds = (telemetry.time_ns - self._time_ns) / 1e9
@@ -307,9 +308,10 @@ class Tracker:
         """Register the view and update the mixture; a `NoFix` where it shows too little."""
         telemetry = view.telemetry
         expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
-        bias, spread = self.mixture.bias()
-        corrected = replace(view, telemetry=_known(corrected_by(telemetry, bias), spread))
         prior, searched = self._search_area(expected)
+        bias, spread = self._correction(prior)
+        corrected = replace(view, telemetry=_known(corrected_by(telemetry, bias), spread))
+        confirms = prior is None or (expected is not None and not self._must_compete(expected))
         seen = self._registration.register(corrected, prior, self._heading_known)
         if isinstance(seen, NoFix):
             return seen
@@ -327,8 +329,23 @@ class Tracker:
             math.radians(telemetry.roll_deg),
             self._tilt_noise(telemetry),
         )
-        self.mixture.update(attitude, sightings, newness, searched, ground)
+        self.mixture.update(attitude, sightings, newness, searched, ground, confirms=confirms)
         return None
+
+    def _correction(self, prior: Prior | None) -> tuple[Array, Array]:
+        """Mean (4,) and covariance (4, 4) of the biases by which telemetry is corrected.
+
+        Those of the track in its surroundings. A search of the whole map has to find any place at
+        its own heading and height.
+        """
+        if prior is None:
+            return np.zeros(4), np.diag(self.model.initial_bias())
+        return self.mixture.bias()
+
+    def _must_compete(self, expected: Estimate) -> bool:
+        """Whether places near the track have to compete with the whole map to confirm it."""
+        reported = expected.state is State.SEARCHING and expected.followed
+        return not (reported or (expected.state in FOLLOWED and expected.confirmed))
 
     def _tilt_weights(self, newness: float, costly: bool) -> Array:
         """How many times the weight of the view perspective counts, for pitch and roll (2,).
@@ -349,16 +366,19 @@ class Tracker:
     ) -> tuple[Prior | None, tuple[Array, float] | None]:
         """The part of the map to search, as a prior and as a circle (middle, radius); None for all.
 
-        It is the surroundings of the predicted position where that is nearly certain.
+        It is the surroundings of the predicted position where that is nearly certain. Where these
+        have to compete with the whole map, views are searched there and here by turns.
         """
-        if expected is None:
-            return None, None
-        if expected.state is State.SEARCHING and not self._start_was_reported:
+        if expected is None or not expected.followed:
             return None, None  # an unconfirmed place must compete with the whole map
         # However wide a reported start was, or dead reckoning has become.
         likely = expected.confidence if expected.state is State.TRACKING else expected.belief
         if likely < LOCAL_SHARE:
             return None, None
+        if self._must_compete(expected):
+            self._whole_map = not self._whole_map
+            if self._whole_map:
+                return None, None
         spread = float(np.linalg.eigvalsh(expected.covariance[:2, :2])[-1])
         reach = max(LOCAL_SIGMAS * math.sqrt(spread), MIN_LOCAL_M)
         if 4 * reach**2 > self.mixture.area_m2 / 4:

@@ -30,7 +30,8 @@ class Hypothesis:
     that it recognized, in views. `number`: unique in the flight. `parent`: the number of the
     hypothesis of the last view from which it was predicted, -1 where it was born now. `expected`:
     that prediction, None where it was born now. `recognized`: probability, by the last view alone
-    and by how it agrees with the prediction, that this view showed the map here.
+    and by how it agrees with the prediction, that this view showed the map here. `followed`:
+    whether it descends from a confirmed track or a reported position.
     """
 
     share: float
@@ -41,6 +42,7 @@ class Hypothesis:
     parent: int = -1
     expected: Expected | None = None
     recognized: float = 0.0
+    followed: bool = False
 
 
 def merged(ordered: list[Hypothesis]) -> list[Hypothesis]:

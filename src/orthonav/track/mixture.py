@@ -100,7 +100,9 @@ class Estimate:
 
     `mean` (8,), `covariance` (8, 8): of the cluster. `confidence`: probability that the aircraft is
     within the radius asked for. `state`: of the track. `belief`: probability of the cluster,
-    however wide it is.
+    however wide it is. `recognized`: probability that the last view showed the map there.
+    `confirmed`: whether enough of its ground was recognized lately. `followed`: whether it descends
+    from a confirmed track or a reported position.
     """
 
     mean: Array
@@ -109,6 +111,8 @@ class Estimate:
     state: State
     belief: float
     recognized: float
+    confirmed: bool
+    followed: bool
 
 
 class Mixture:
@@ -135,7 +139,7 @@ class Mixture:
             mean[POSITION] = mean_en_m
             covariance[POSITION, POSITION] = np.eye(2) * std_m**2
             self._numbers += 1
-            yield Hypothesis(share * mount, mean, covariance, 0.0, self._numbers)
+            yield Hypothesis(share * mount, mean, covariance, 0.0, self._numbers, followed=True)
 
     def measure_position(self, mean_en_m: Array, std_m: float) -> None:
         """Update with a position (2,) measured by other means, such as GNSS, `std_m` per axis."""
@@ -241,6 +245,8 @@ class Mixture:
         newness: float = 1.0,
         searched: tuple[Array, float] | None = None,
         new_ground: float | None = None,
+        *,
+        confirms: bool = True,
     ) -> None:
         """Update with the places where a view may have been taken; all of them may be wrong.
 
@@ -248,6 +254,8 @@ class Mixture:
         for all of it. `newness`: share of the view that counts as new evidence. Views of the same
         ground have the same errors, so many of them count no more than one. `new_ground`: share of
         the view that the last one did not show, which alone confirms a track; None: `newness`.
+        `confirms`: whether these places competed with all others where the aircraft may be. Without
+        that, a view does not count towards a confirmed track.
         """
         ground = newness if new_ground is None else new_ground
         made = []
@@ -267,7 +275,7 @@ class Mixture:
             made.append(replace(each, share=share, sighted=_forgotten(each.sighted, ground)))
             for start in self._with_bias_jump(each):
                 for seen in measurements:
-                    split = self._updated(start, seen, ground)
+                    split = self._updated(start, seen, ground, confirms)
                     if split is not None:
                         made.append(replace(split, share=split.share * found))
         made += [born for each in measurements for born in self._born(each)]
@@ -289,15 +297,25 @@ class Mixture:
         near = [each for each in self.hypotheses if distance(each, best) <= radius_m]
         mean, covariance = moments(near)
         confidence = min(self._inside(radius_m, mean[POSITION]), 1.0)
-        sighted = max(each.sighted for each in major(near))
-        seen = recognized(near)
+        confirmed = max(each.sighted for each in major(near)) >= CONFIRMED
+        seen, follows = recognized(near), best.followed
         if not between_views:
-            confirmed = seen >= RECOGNIZED and sighted >= CONFIRMED
-            self._state = self._next_state(confidence, confirmed)
+            self._state = self._next_state(confidence, confirmed and seen >= RECOGNIZED)
+            if self._state is State.TRACKING:
+                self._follow(near)
+                follows = True
         if self._state is not State.TRACKING:
             confidence = min(confidence, UNCONFIRMED)
         belief = sum(each.share for each in near)
-        return Estimate(mean, covariance, confidence, self._state, belief, seen)
+        return Estimate(mean, covariance, confidence, self._state, belief, seen, confirmed, follows)
+
+    def _follow(self, near: list[Hypothesis]) -> None:
+        """Mark the hypotheses of a confirmed track."""
+        numbers = {each.number for each in near}
+        self.hypotheses = [
+            replace(each, followed=True) if each.number in numbers else each
+            for each in self.hypotheses
+        ]
 
     @property
     def likeliest(self) -> Hypothesis | None:
@@ -352,10 +370,12 @@ class Mixture:
         )
         return [replace(each, share=each.share * (1 - rare)), other]
 
-    def _updated(self, each: Hypothesis, seen: Measurement, ground: float) -> Hypothesis | None:
+    def _updated(
+        self, each: Hypothesis, seen: Measurement, ground: float, confirms: bool
+    ) -> Hypothesis | None:
         """The hypothesis after a measurement; None where that lies outside the gate.
 
-        `ground`: share of the view that the last one did not show.
+        `ground`: share of the view that the last one did not show. `confirms`: see `update`.
         """
         innovation = seen.mean - each.mean[SEEN]
         reach = np.trace(each.covariance[:2, :2]) + np.trace(seen.noise[:2, :2])
@@ -367,7 +387,8 @@ class Mixture:
         shown = recognition(seen, each.covariance, innovation)
         sighted = _forgotten(each.sighted, ground)
         if shown >= RECOGNIZED:
-            sighted = min(each.sighted + confirmed_ground(seen.alone, ground), MOST_SIGHTED)
+            new = confirmed_ground(seen.alone, ground) if confirms else 0.0
+            sighted = min(each.sighted + new, MOST_SIGHTED)
         self._numbers += 1
         return replace(
             each,
@@ -410,7 +431,17 @@ class Mixture:
         sighted = each.sighted
         if float(np.trace(covariance[POSITION, POSITION])) > 2 * WIDE_M**2:
             sighted *= FORGOTTEN
-        return Hypothesis(share, mean, covariance, sighted, self._numbers, each.number, expected)
+        return replace(
+            each,
+            share=share,
+            mean=mean,
+            covariance=covariance,
+            sighted=sighted,
+            number=self._numbers,
+            parent=each.number,
+            expected=expected,
+            recognized=0.0,
+        )
 
     def _settle(self) -> None:
         """Normalize: shares and the belief elsewhere add up to one."""
