@@ -31,7 +31,7 @@ from orthonav.track import (
     State,
 )
 from orthonav.track.hypotheses import within
-from orthonav.track.model import HEADING, SCALE, TILT, VELOCITY
+from orthonav.track.model import BIASES, HEADING, SCALE, TILT, VELOCITY
 from orthonav.track.smooth import History, Smoothed
 
 LOCAL_SHARE = 0.75
@@ -309,7 +309,7 @@ class Tracker:
         telemetry = view.telemetry
         expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
         prior, searched = self._search_area(expected)
-        bias, spread = self._correction(prior)
+        bias, spread = self._correction(expected, prior)
         corrected = replace(view, telemetry=_known(corrected_by(telemetry, bias), spread))
         confirms = prior is None or (expected is not None and not self._must_compete(expected))
         seen = self._registration.register(corrected, prior, self._heading_known)
@@ -332,15 +332,15 @@ class Tracker:
         self.mixture.update(attitude, sightings, newness, searched, ground, confirms=confirms)
         return None
 
-    def _correction(self, prior: Prior | None) -> tuple[Array, Array]:
+    def _correction(self, expected: Estimate | None, prior: Prior | None) -> tuple[Array, Array]:
         """Mean (4,) and covariance (4, 4) of the biases by which telemetry is corrected.
 
         Those of the track in its surroundings. A search of the whole map has to find any place at
         its own heading and height.
         """
-        if prior is None:
+        if expected is None or prior is None:
             return np.zeros(4), np.diag(self.model.initial_bias())
-        return self.mixture.bias()
+        return expected.mean[BIASES], expected.covariance[BIASES, BIASES]
 
     def _must_compete(self, expected: Estimate) -> bool:
         """Whether places near the track have to compete with the whole map to confirm it."""
@@ -371,14 +371,12 @@ class Tracker:
         """
         if expected is None or not expected.followed:
             return None, None  # an unconfirmed place must compete with the whole map
-        # However wide a reported start was, or dead reckoning has become.
-        likely = expected.confidence if expected.state is State.TRACKING else expected.belief
-        if likely < LOCAL_SHARE:
-            return None, None
         if self._must_compete(expected):
             self._whole_map = not self._whole_map
             if self._whole_map:
                 return None, None
+        elif expected.state is State.TRACKING and expected.confidence < LOCAL_SHARE:
+            return None, None
         spread = float(np.linalg.eigvalsh(expected.covariance[:2, :2])[-1])
         reach = max(LOCAL_SIGMAS * math.sqrt(spread), MIN_LOCAL_M)
         if 4 * reach**2 > self.mixture.area_m2 / 4:

@@ -31,7 +31,8 @@ class Hypothesis:
     hypothesis of the last view from which it was predicted, -1 where it was born now. `expected`:
     that prediction, None where it was born now. `recognized`: probability, by the last view alone
     and by how it agrees with the prediction, that this view showed the map here. `followed`:
-    whether it descends from a confirmed track or a reported position.
+    whether it descends from a confirmed track or a reported position. `uncounted`: new ground, in
+    views, since the last view that counted towards `sighted`.
     """
 
     share: float
@@ -43,6 +44,7 @@ class Hypothesis:
     expected: Expected | None = None
     recognized: float = 0.0
     followed: bool = False
+    uncounted: float = 0.0
 
 
 def merged(ordered: list[Hypothesis]) -> list[Hypothesis]:

@@ -72,6 +72,9 @@ prediction. Without, a track is coasting (docs/decisions/tracking.md, 12)."""
 UNRECOGNIZED = 0.5
 """Factor on the count of recognized ground for each view of new ground that does not show the map:
 after a few, a track must be confirmed again."""
+BLIND = 0.5
+"""Factor on the evidence of a view that does not show the map, for each such view before: clouds,
+water and a covered lens last (docs/decisions/tracking.md, 13)."""
 MOST_SIGHTED = 3.0
 """Highest count of recognized ground, in views."""
 WIDE_M, FORGOTTEN = 50.0, 0.5
@@ -126,6 +129,7 @@ class Mixture:
         self.hypotheses: list[Hypothesis] = []
         self.elsewhere = 1.0
         self._state = State.SEARCHING
+        self._blind = 0.0
         self._numbers = 0
 
     def start(self, mean_en_m: Array, std_m: float) -> None:
@@ -259,7 +263,7 @@ class Mixture:
         """
         ground = newness if new_ground is None else new_ground
         made = []
-        missed = self.model.miss**newness
+        missed = self.model.miss ** (newness * BLIND**self._blind)
         found = (1 - self.model.miss) ** newness
         searched_m2 = self.area_m2 if searched is None else math.pi * searched[1] ** 2
         mounts = [(share, covariance) for share, _, covariance in self._mounts()]
@@ -272,6 +276,7 @@ class Mixture:
             if searched is not None:
                 in_search &= bool(np.hypot(*(each.mean[:2] - searched[0])) < searched[1])
             share = each.share * (missed if in_search else 1.0)
+            each = replace(each, uncounted=min(each.uncounted + ground, 1.0))
             made.append(replace(each, share=share, sighted=_forgotten(each.sighted, ground)))
             for start in self._with_bias_jump(each):
                 for seen in measurements:
@@ -284,6 +289,8 @@ class Mixture:
         made = [replace(each, share=each.share / total) for each in made]
         self.hypotheses = merged(sorted(made, key=lambda each: -each.share))
         self._settle()
+        shown = bool(self.hypotheses) and self.hypotheses[0].recognized >= RECOGNIZED
+        self._blind = 0.0 if shown else self._blind + newness
 
     def estimate(self, radius_m: float, *, between_views: bool = False) -> Estimate | None:
         """The best cluster, None where there is no hypothesis.
@@ -385,10 +392,11 @@ class Mixture:
         log_weight = seen.log_odds + log_density(innovation, spread)
         mean, covariance = updated(each.mean, each.covariance, innovation, spread)
         shown = recognition(seen, each.covariance, innovation)
-        sighted = _forgotten(each.sighted, ground)
+        sighted, uncounted = _forgotten(each.sighted, ground), each.uncounted
         if shown >= RECOGNIZED:
-            new = confirmed_ground(seen.alone, ground) if confirms else 0.0
-            sighted = min(each.sighted + new, MOST_SIGHTED)
+            counted = confirmed_ground(seen.alone, uncounted) if confirms else 0.0
+            sighted = min(each.sighted + counted, MOST_SIGHTED)
+            uncounted = 0.0 if counted else uncounted
         self._numbers += 1
         return replace(
             each,
@@ -396,6 +404,7 @@ class Mixture:
             mean=mean,
             covariance=covariance,
             sighted=sighted,
+            uncounted=uncounted,
             number=self._numbers,
             recognized=shown,
         )

@@ -15,7 +15,8 @@ from orthonav.records import DEFAULT_AGL_STD, DEFAULT_YAW_STD_DEG, MAP_STD_M
 
 Array = NDArray[np.float64]
 STATE = 8
-POSITION, VELOCITY, HEADING, SCALE, TILT = slice(0, 2), slice(2, 4), 4, 5, slice(6, 8)
+POSITION, VELOCITY, BIASES = slice(0, 2), slice(2, 4), slice(4, 8)
+HEADING, SCALE, TILT = 4, 5, slice(6, 8)
 HEADING_FLOOR_RAD, SCALE_FLOOR = math.radians(0.3), 0.004
 """Standard deviations that the heading and log scale of a registered view have at least."""
 MOUNT_M, MOUNT_RAD = 10.0, (math.radians(0.5), math.radians(1.5))
