@@ -43,7 +43,7 @@ def frame(ortho):
 def fewer_crops(map_path, monkeypatch):
     """Calibration from few crops and views, but for the map that all tests share."""
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 24)
-    monkeypatch.setattr("orthonav.prepare.calibrate_registration.MIN_RIGHT", 1)
+    monkeypatch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
 
 
 @pytest.fixture

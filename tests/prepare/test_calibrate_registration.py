@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from helpers import textured
+from orthonav.confidence.registered import USUAL_CONFIDENCE, USUAL_WEIGHTS
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.registration import RegistrationLocalizer
@@ -68,7 +69,7 @@ def localizer():
 
 @pytest.fixture(autouse=True)
 def few_will_do(monkeypatch):
-    monkeypatch.setattr(module, "MIN_RIGHT", 6)
+    monkeypatch.setattr(module, "ENOUGH_RIGHT", 6)
 
 
 def crops_of(grey, count=FEW, seed=0, moved_px=(0, 0)):
@@ -89,7 +90,7 @@ def calibrated(localizer, crops, later=(), seed=0, report=lambda stage, share: N
 @pytest.fixture(scope="module")
 def learnt(localizer):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "MIN_RIGHT", 6)
+        patch.setattr(module, "ENOUGH_RIGHT", 6)
         return calibrated(localizer, crops_of(GREY))
 
 
@@ -185,15 +186,21 @@ def test_another_place_does_not_count_as_another_date(localizer):
     assert calibrated(localizer, crops_of(GREY, 2), later).floor_px == FLOOR_PX
 
 
-def test_too_little_gives_no_confidence(localizer):
-    assert calibrated(localizer, []) == RegistrationCalibration(None, FLOOR_PX)
-    few = calibrated(localizer, crops_of(GREY, 5))
-    assert few == RegistrationCalibration(None, FLOOR_PX)
+def test_without_crops_the_confidence_is_the_usual_one(localizer):
+    assert calibrated(localizer, []) == RegistrationCalibration(USUAL_CONFIDENCE, FLOOR_PX, 0)
 
 
-def test_blank_crops_give_no_confidence(localizer):
+def test_a_few_right_views_measure_chance_only(localizer):
+    few = calibrated(localizer, crops_of(GREY, 10))
+    assert 0 < few.right < 6
+    assert few.confidence == replace(USUAL_CONFIDENCE, chances=few.confidence.chances)
+    assert few.confidence.chances != USUAL_CONFIDENCE.chances
+
+
+def test_blank_crops_leave_the_usual_weights(localizer):
     blank = [Crop(np.full((CROP_PX, CROP_PX), 99, np.uint8), 120.0, 120.0)] * 6
-    assert calibrated(localizer, blank).confidence is None
+    made = calibrated(localizer, blank)
+    assert made.confidence.weights == USUAL_WEIGHTS and made.right == 0
 
 
 @pytest.fixture
@@ -202,8 +209,8 @@ def small(make_ortho, tmp_path, monkeypatch):
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 10)
     grey = textured((240, 240), 11)
 
-    def build(made_of=grey[20:220, 20:220], *other_dates):
-        ortho = make_ortho(tmp_path / "2020.tif", made_of)
+    def build(made_of=grey[20:220, 20:220], *other_dates, nodata=None):
+        ortho = make_ortho(tmp_path / "2020.tif", made_of, nodata=nodata)
         later = [make_ortho(tmp_path / "later.tif", picture) for picture in other_dates]
         request = BuildRequest([ortho], tmp_path / "map.onav", tile_px=64, other_dates=later)
         build_map(replace(request, calibration_views=12))
@@ -221,11 +228,19 @@ def test_a_second_date_sets_the_floor_of_a_map(small):
     assert plain["confidence"] is not None and plain["radius_m"] > 0
 
 
-def test_a_uniform_map_has_no_confidence_and_a_warning(small, caplog):
+def test_a_uniform_map_has_the_usual_confidence_and_a_warning(small, caplog):
     with caplog.at_level(logging.WARNING):
         plain = small(np.full((200, 200), 99, np.uint8))
-    assert plain["confidence"] is None and plain["position_floor_px"] == FLOOR_PX
-    assert "too little imagery to calibrate registration" in caplog.text
+    assert plain["confidence"] == USUAL_CONFIDENCE.to_plain()
+    assert plain["position_floor_px"] == FLOOR_PX
+    assert "only 0 trial views were right" in caplog.text
+
+
+def test_imagery_with_marks_all_over_calibrates_its_map(small):
+    """No part as large as a crop is without them."""
+    grey = small.grey[20:220, 20:220].copy()
+    grey[::40, ::40] = 0
+    assert small(grey, nodata=0)["confidence"] != USUAL_CONFIDENCE.to_plain()
 
 
 def test_a_second_date_without_texture_gives_a_warning(small, caplog):

@@ -112,3 +112,7 @@ def fit_registered(
     features = np.stack([features_of(each, chances) for each in evidence])
     bias, weights = fit_weights(features, right, sample_weight, RIDGE, (USUAL_BIAS, USUAL_WEIGHTS))
     return RegisteredConfidence(bias, weights, chances)
+
+
+USUAL_CONFIDENCE = RegisteredConfidence(USUAL_BIAS, USUAL_WEIGHTS, USUAL_CHANCES)
+"""For a map without views to learn from."""

@@ -34,7 +34,11 @@ from orthonav.prepare.calibrate import (
     TileCalibration,
     calibrate,
 )
-from orthonav.prepare.calibrate_registration import FLOOR_PX, calibrate_registration
+from orthonav.prepare.calibrate_registration import (
+    ENOUGH_RIGHT,
+    FLOOR_PX,
+    calibrate_registration,
+)
 from orthonav.prepare.cellparts import cell_parts
 from orthonav.prepare.encoders import learn_encoder
 from orthonav.prepare.layout import tiles_of
@@ -245,10 +249,15 @@ def registration_record(
     learned = calibrate_registration(
         localizer, crops, later, request.calibration_views, request.seed, progress
     )
-    if learned.confidence is None:
-        log.warning("too little imagery to calibrate registration: fixes will have no confidence")
+    if learned.right < ENOUGH_RIGHT:
+        log.warning(
+            "only %d trial views were right, %d are needed to calibrate registration: the usual "
+            "confidence, that of generated landscapes, is used",
+            learned.right,
+            ENOUGH_RIGHT,
+        )
     return {
-        "confidence": None if learned.confidence is None else learned.confidence.to_plain(),
+        "confidence": learned.confidence.to_plain(),
         "radius_m": radius_m,
         "position_floor_px": learned.floor_px,
     }

@@ -36,6 +36,10 @@ PASTED_SHARE = 0.25
 """Share of replacements by another position of the map; the others are mirrored."""
 RADIUS_STRIDES = 0.75
 """A fix is correct if its error is below this many strides."""
+MIN_VALID = 0.9
+"""Least share of valid pixels in a crop, where there are too few whole ones."""
+ENOUGH_CROPS = 48
+"""Whole crops from which on no others are taken."""
 MIN_RIGHT = 10
 """Fewest correct fixes for a fit."""
 
@@ -68,7 +72,8 @@ class CropSampler:
         self._rng = np.random.default_rng([seed, 1])
         self._tile_px = tile_px
         self.size_px = round(tile_px * CROP_TILES)
-        self.crops: list[Crop] = []
+        self._whole: list[Crop] = []
+        self._partial: list[Crop] = []
 
     def places(self, height: int, width: int, share: float) -> NDArray[np.intp]:
         """Random first pixels (row, col), (N, 2), of crops in a block.
@@ -88,25 +93,41 @@ class CropSampler:
     def cut(
         self, grey: NDArray[np.uint8], valid: NDArray[np.bool_], places: NDArray[np.intp]
     ) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-        """Crops (N, S, S) of a block at valid positions with contrast; these positions (N, 2)."""
+        """Crops (N, S, S) of a block at places with contrast; these places and whether all pixels
+        are valid (N, 3).
+
+        Few pixels may be invalid, such as marks on the imagery; they get the mean grey level.
+        """
         size = self._crop_px(*grey.shape)
         crops = np.zeros((len(places), size, size), np.uint8)
-        found: list[tuple[int, int]] = []
+        found: list[tuple[int, int, bool]] = []
         for row, col in places:
             part = np.s_[row : row + size, col : col + size]
-            if valid[part].all() and grey[part].std() > 1:
-                crops[len(found)] = grey[part]
-                found.append((row, col))
-        return crops[: len(found)], np.array(found, np.intp).reshape(-1, 2)
+            crop, inside = grey[part], valid[part]
+            share = inside.mean()
+            if share >= MIN_VALID and crop[inside].std() > 1:
+                crops[len(found)] = np.where(inside, crop, crop[inside].mean().round())
+                found.append((row, col, share == 1))
+        return crops[: len(found)], np.array(found, np.intp).reshape(-1, 3)
 
     def take(
         self, crops: NDArray[np.uint8], places: NDArray[np.intp], row_px: int, col_px: int
     ) -> None:
-        """Add the crops of a block whose first pixel is (row_px, col_px) of the sheet."""
-        for grey, (row, col) in zip(crops, places.tolist(), strict=True):
-            if len(self.crops) < 2 * CROPS:
+        """Add the crops of a block whose first pixel is (row_px, col_px) of the sheet.
+
+        `crops`, `places`: of `cut`.
+        """
+        for grey, (row, col, whole) in zip(crops, places.tolist(), strict=True):
+            known = self._whole if whole else self._partial
+            if len(known) < 2 * CROPS:
                 half = grey.shape[0] / 2
-                self.crops.append(Crop(grey.copy(), row_px + row + half, col_px + col + half))
+                known.append(Crop(grey.copy(), row_px + row + half, col_px + col + half))
+
+    @property
+    def crops(self) -> list[Crop]:
+        """The whole crops, with others where these are fewer than `ENOUGH_CROPS`."""
+        missing = max(ENOUGH_CROPS - len(self._whole), 0)
+        return self._whole + self._partial[:missing]
 
     def _crop_px(self, height: int, width: int) -> int:
         return min(height, width, self.size_px)

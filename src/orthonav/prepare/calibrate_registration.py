@@ -8,13 +8,19 @@ a logistic regression is fitted to the outcome.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.confidence.registered import Chances, RegisteredConfidence, fit_registered
+from orthonav.confidence.registered import (
+    USUAL_CHANCES,
+    USUAL_CONFIDENCE,
+    Chances,
+    RegisteredConfidence,
+    fit_registered,
+)
 from orthonav.files import Progress
 from orthonav.geo.camera import Camera
 from orthonav.geo.grid import TileGrid
@@ -31,14 +37,19 @@ FOCAL_PX = 1000.0
 """Any value: views have the resolution of the map, and only the ratio to the height matters."""
 SIDES = (0.55, 1.0)
 """Long side of a view, from and to, in tiles; the short side is three quarters of it."""
-MIN_RIGHT, ENOUGH_RIGHT = 10, 12
-"""Fewest correct views for a fit; with fewer, views are added until the second number."""
+ENOUGH_RIGHT = 10
+"""Fewest correct views that a confidence is fitted to: of fewer, the evidence hardly varies. With
+fewer the usual confidence is used, with the scores of chance measured on this map."""
+ENOUGH_VIEWS = 12
+"""Where fewer than `ENOUGH_RIGHT` views are right, views are added until so many are."""
 MORE_VIEWS = 3
 """Additional views at most, as a multiple of the requested number."""
 FLOOR_PX = 0.6
 """Usual standard deviation per axis, in pixels, between orthophotos of two dates."""
 FLOOR_LIMITS_PX = (0.25, 3.0)
 MIRRORED_WEIGHT = 1.0
+MIN_NEGATIVES = 5
+"""Mirrored views from which on the scores of chance are their medians."""
 WHOLE_PX, SEARCHED_PX = 6144, 4096
 """Maps larger than a square of the first are searched in a square of the second for each view: on
 a map of 50 x 5 km a full search took 7 GB and minutes per view, and too few views were found for a
@@ -54,12 +65,13 @@ views."""
 class RegistrationCalibration:
     """Calibration of registration.
 
-    `confidence`: None if too little could be learned. `floor_px`: lower bound of the reported
-    standard deviation per axis, pixels.
+    `floor_px`: lower bound of the reported standard deviation per axis, pixels. `right`: correct
+    views that the confidence was learnt from.
     """
 
-    confidence: RegisteredConfidence | None
+    confidence: RegisteredConfidence
     floor_px: float
+    right: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +114,8 @@ def calibrate_registration(
         place(*each)
         progress("calibrate registration", (done + 1) / len(work))
     # Few views are correct on a large map: add some, rather than give up on a confidence.
-    wanted = ENOUGH_RIGHT if _right(outcomes, radius_px) < MIN_RIGHT else 0
-    spare = order[views : (1 + MORE_VIEWS) * views] if views >= MIN_RIGHT else order[:0]
+    wanted = ENOUGH_VIEWS if _right(outcomes, radius_px) < ENOUGH_RIGHT else 0
+    spare = order[views : (1 + MORE_VIEWS) * views] if views >= ENOUGH_RIGHT else order[:0]
     for index in spare:
         if _right(outcomes, radius_px) >= wanted:
             break
@@ -180,25 +192,30 @@ def _view(rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid) 
 def _fitted(outcomes: Sequence[_Outcome], radius_px: float) -> RegistrationCalibration:
     """The confidence of errors below a radius, and the floor from views of other dates."""
     if not outcomes:
-        return RegistrationCalibration(None, FLOOR_PX)
+        return RegistrationCalibration(USUAL_CONFIDENCE, FLOOR_PX, 0)
     mirrored = np.array([each.mirrored for each in outcomes])
     errors = np.stack([each.error_px for each in outcomes])
     right = (np.hypot(*errors.T) <= radius_px) & ~mirrored
     later = right & np.array([each.other_date for each in outcomes])
     floor_px = FLOOR_PX
-    if later.sum() >= MIN_RIGHT:
+    if later.sum() >= ENOUGH_RIGHT:
         # From the median: Rayleigh's is 1.1774 standard deviations.
         spread = float(np.median(np.hypot(*errors[later].T))) / 1.1774
         floor_px = min(max(spread, FLOOR_LIMITS_PX[0]), FLOOR_LIMITS_PX[1])
-    if right.sum() < MIN_RIGHT or not mirrored.any():
-        return RegistrationCalibration(None, floor_px)
     evidence = [each.evidence for each in outcomes]
     negatives = [each for each, known in zip(evidence, mirrored, strict=True) if known]
+    chances = _chances(negatives) if len(negatives) >= MIN_NEGATIVES else USUAL_CHANCES
+    confidence = replace(USUAL_CONFIDENCE, chances=chances)
+    if right.sum() >= ENOUGH_RIGHT:
+        weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)
+        confidence = fit_registered(evidence, right, weight, chances)
+    return RegistrationCalibration(confidence, floor_px, int(right.sum()))
+
+
+def _chances(negatives: Sequence[Mapping[str, float]]) -> Chances:
+    """The scores of chance by the evidence of mirrored views."""
     total, look = _median(negatives, "strength"), _median(negatives, "look")
-    chances = Chances(total, look, _fine_chance(negatives, total))
-    weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)
-    confidence = fit_registered(evidence, right, weight, chances)
-    return RegistrationCalibration(confidence, floor_px)
+    return Chances(total, look, _fine_chance(negatives, total))
 
 
 def _fine_chance(evidence: Sequence[Mapping[str, float]], total: float) -> float:
