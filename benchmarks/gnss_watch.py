@@ -31,6 +31,8 @@ from orthonav.simulate.receiver import RATE_HZ, GnssTrack, receiver_of, samples_
 
 FRAME = LocalFrame(48.0, 2.0)
 SPEED_MPS, LEG_M, TURN_RADIUS_M = 20.0, 2000.0, 100.0
+ROLL_S = 3
+"""Time to roll into a turn."""
 FAULT_AT_S = 900.0
 LONGEST_S, SETTLED_S = 1800.0, 10.0
 """How long a fault is watched, and from its alarm to its last name."""
@@ -61,10 +63,11 @@ Array = NDArray[np.float64]
 class MapErrors:
     """Errors of the simulated map positions; each position states the root of their squares.
 
-    `mount_m`: constant in the aircraft, as from a tilted mount. `local_m`, `local_tau_s`: slowly
+    `mount_m`: constant in the aircraft at `agl_m`, as from a tilted mount. `local_m`, `local_tau_s`: slowly
     varying. `white_m`: from view to view. `displaced_m`: length of the constant displacement.
     `gaps_per_hour`: stretches of 10 to 90 s without confident positions. `outlier_share`: share of
-    confident positions that are 20 to 150 m off.
+    confident positions that are 20 to 150 m off. `pitch_deg`: error of the reported pitch, which
+    the position does not state. `late_s`: the images are older than assumed.
     """
 
     mount_m: float = 2.0
@@ -74,6 +77,9 @@ class MapErrors:
     displaced_m: float = 40.0
     gaps_per_hour: float = 20.0
     outlier_share: float = 3e-4
+    agl_m: float = 300.0
+    pitch_deg: float = 0.0
+    late_s: float = 0.0
 
     @property
     def displaced_en_m(self) -> Array:
@@ -89,31 +95,48 @@ class MapErrors:
 MAPS = {
     "usual": MapErrors(),
     "poor": MapErrors(mount_m=4.0, local_m=4.0, white_m=2.0, displaced_m=60.0),
-    "high": MapErrors(mount_m=15.0, local_m=6.0, white_m=3.0, displaced_m=20.0),
+    "high": MapErrors(mount_m=15.0, local_m=6.0, white_m=3.0, displaced_m=20.0, agl_m=2000.0),
 }
 """Errors by name: at 300 m, with a worse mount and map, and at 2,000 m."""
 
 
 @dataclass(frozen=True, eq=False)
 class FlownPath:
-    """True path: `times_s` (N,), `en_m` (N, 2), `heading_rad` (N,)."""
+    """True path: `times_s` (N,), `en_m` (N, 2), `heading_rad` (N,), `speed_mps` (N,)."""
 
     times_s: Array
     en_m: Array
     heading_rad: Array
+    speed_mps: Array
+
+    @property
+    def vel_en_mps(self) -> Array:
+        """Velocity (N, 2)."""
+        ahead = np.stack([np.sin(self.heading_rad), np.cos(self.heading_rad)], axis=1)
+        return self.speed_mps[:, None] * ahead
+
+    def lean(self, late_s: float) -> Array:
+        """Tangent (N,) of the bank angle, to the right, `late_s` before each time."""
+        rate = np.gradient(np.unwrap(self.heading_rad), self.times_s)
+        return np.interp(self.times_s - late_s, self.times_s, rate * self.speed_mps / 9.81)
 
 
-def lawnmower(seconds: float) -> FlownPath:
-    """Parallel legs with half turns, one position a second."""
-    half_m, turn_m = LEG_M, math.pi * TURN_RADIUS_M
-    along = np.arange(0.0, seconds) * SPEED_MPS
-    number, rest = np.divmod(along, half_m + turn_m)
-    turning = np.clip(rest - half_m, 0, None) / TURN_RADIUS_M
+def lawnmower(seconds: float, speeds_mps: Sequence[float] = (SPEED_MPS,)) -> FlownPath:
+    """Parallel legs with half turns, one position a second; each speed for two legs in turn."""
+    lap_m = LEG_M + math.pi * TURN_RADIUS_M
+    times, along, speeds = np.arange(0.0, seconds), [0.0], []
+    for _ in times:
+        speeds.append(speeds_mps[int(along[-1] // (2 * lap_m)) % len(speeds_mps)])
+        along.append(along[-1] + speeds[-1])
+    number, rest = np.divmod(np.array(along[:-1]), lap_m)
+    turning = np.clip(rest - LEG_M, 0, None) / TURN_RADIUS_M
     side = np.where(number % 2 == 0, 1.0, -1.0)
     heading = np.where(number % 2 == 0, 0.0, math.pi) + side * turning
-    moved = SPEED_MPS * np.stack([np.sin(heading), np.cos(heading)], axis=1)
-    places = np.cumsum(moved, axis=0)
-    return FlownPath(np.arange(0.0, seconds), places - places[0], heading)
+    heading = np.unwrap(heading)
+    heading = np.convolve(np.pad(heading, ROLL_S // 2, "edge"), np.ones(ROLL_S) / ROLL_S, "valid")
+    path = FlownPath(times, np.zeros((len(times), 2)), heading, np.array(speeds))
+    places = np.cumsum(path.vel_en_mps, axis=0)
+    return replace(path, en_m=places - places[0])
 
 
 def map_positions(
@@ -127,6 +150,10 @@ def map_positions(
     mount = np.stack([cos * body[0] + sin * body[1], cos * body[1] - sin * body[0]], axis=1)
     off = mount + errors.local_m * gauss_markov(step_s / errors.local_tau_s, count, rng)
     off += rng.normal(0, errors.white_m, (count, 2)) - errors.displaced_en_m
+    ahead, right = np.stack([sin, cos], axis=1), np.stack([cos, -sin], axis=1)
+    off += errors.agl_m * math.tan(math.radians(errors.pitch_deg)) * ahead
+    rolled = path.lean(0.0) - path.lean(errors.late_s)
+    off += errors.agl_m * rolled[:, None] * right - errors.late_s * path.vel_en_mps
     wrong = rng.random(count) < errors.outlier_share
     off[wrong] += rng.uniform(20, 150, (int(wrong.sum()), 1)) * np.array([[0.6, 0.8]])
     confident = np.ones(count, dtype=bool)
@@ -134,8 +161,7 @@ def map_positions(
     for _ in range(rng.poisson(errors.gaps_per_hour * hours)):
         begin = rng.uniform(path.times_s[0], path.times_s[-1])
         confident &= (path.times_s < begin) | (path.times_s > begin + rng.uniform(10, 90))
-    velocity = SPEED_MPS * np.stack([sin, cos], axis=1)
-    velocity = velocity + 0.3 * gauss_markov(step_s / 30.0, count, rng)
+    velocity = path.vel_en_mps + 0.3 * gauss_markov(step_s / 30.0, count, rng)
     return [
         MapPosition(
             round(path.times_s[i] * 1e9),
@@ -143,6 +169,7 @@ def map_positions(
             errors.std_m,
             velocity[i],
             math.degrees(path.heading_rad[i]) % 360,
+            errors.agl_m,
         )
         for i in np.flatnonzero(confident)
     ]
@@ -180,8 +207,8 @@ def watched(
 
 def false_alarms(
     hours: float, seed: int, receiver: str, errors: MapErrors, *, rate_hz: float = RATE_HZ
-) -> tuple[list[tuple[float, GnssStatus]], GnssStatus]:
-    """Alarms (time, status) of a receiver without a fault, and the last status."""
+) -> tuple[list[tuple[float, GnssStatus]], GnssMonitor]:
+    """Alarms (time, status) of a receiver without a fault, and the monitor at the end."""
     rng = np.random.default_rng([seed, 0])
     path = lawnmower(hours * 3600)
     positions = map_positions(path, errors, rng)
@@ -195,7 +222,7 @@ def false_alarms(
 
     monitor = GnssMonitor(FRAME)
     watched(monitor, solved, positions, changed)
-    return alarms, monitor.status
+    return alarms, monitor
 
 
 def delay(
@@ -234,7 +261,7 @@ def false_alarm_table(hours: float, section: Section) -> Table:
     for receiver in ("good", "good:std_m=5"):
         for name, errors in MAPS.items():
             alarms, last = false_alarms(hours, len(rows), receiver, errors)
-            learnt = last.displacement
+            learnt = last.learnt
             off_m = math.hypot(*(learnt.en_m - errors.displaced_en_m))
             section.facts[f"false alarms: {receiver}, {name}"] = len(alarms)
             std = receiver_of(receiver).std_m
