@@ -1,7 +1,8 @@
 """`python -m benchmarks.gnss_watch [--hours 10] [--trials 20]`: the GNSS monitor by itself.
 
 Simulated receivers against simulated positions of a map, both with correlated errors: false alarms
-over hours, and the delay until each fault is named. No images are involved.
+over hours, the delay until each fault is named, and the biases learnt of map, mount and latency. No
+images are involved.
 """
 
 import argparse
@@ -9,7 +10,7 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from benchmarks.record import Section, Table, number, provenance, save
 from orthonav.flight.gnss import GnssSample
 from orthonav.geo.frames import LocalFrame
+from orthonav.onboard.gnss.biases import Biases, design
 from orthonav.onboard.gnss.monitor import GnssMonitor
 from orthonav.onboard.gnss.records import (
     Fault,
@@ -27,15 +29,25 @@ from orthonav.onboard.gnss.records import (
     State,
 )
 from orthonav.simulate.motion import gauss_markov
-from orthonav.simulate.receiver import RATE_HZ, GnssTrack, receiver_of, samples_of, solutions
+from orthonav.simulate.receiver import (
+    LATENCY_S,
+    RATE_HZ,
+    GnssTrack,
+    receiver_of,
+    samples_of,
+    solutions,
+)
 
 FRAME = LocalFrame(48.0, 2.0)
 SPEED_MPS, LEG_M, TURN_RADIUS_M = 20.0, 2000.0, 100.0
 ROLL_S = 3
 """Time to roll into a turn."""
 FAULT_AT_S = 900.0
-LONGEST_S, SETTLED_S = 1800.0, 10.0
+LONGEST_S, SETTLED_S = 900.0, 10.0
 """How long a fault is watched, and from its alarm to its last name."""
+PITCH_DEG, LATE_S, MINUTES = 2.0, 0.3, (15, 30, 60, 90)
+"""Error of the mount and latency that are learnt besides the displacement; when they are read."""
+SLOW_DRAG_S = 4 * 3600.0
 PROCESSING_NS = 10**8
 """Time from exposure to the map's position."""
 FAULTS = {
@@ -63,11 +75,12 @@ Array = NDArray[np.float64]
 class MapErrors:
     """Errors of the simulated map positions; each position states the root of their squares.
 
-    `mount_m`: constant in the aircraft at `agl_m`, as from a tilted mount. `local_m`, `local_tau_s`: slowly
-    varying. `white_m`: from view to view. `displaced_m`: length of the constant displacement.
-    `gaps_per_hour`: stretches of 10 to 90 s without confident positions. `outlier_share`: share of
-    confident positions that are 20 to 150 m off. `pitch_deg`: error of the reported pitch, which
-    the position does not state. `late_s`: the images are older than assumed.
+    `mount_m`: constant in the aircraft at `agl_m`, as from a tilted mount. `local_m`,
+    `local_tau_s`: slowly varying. `white_m`: from view to view. `displaced_m`: length of the
+    constant displacement. `gaps_per_hour`: stretches of 10 to 90 s without confident positions.
+    `outlier_share`: share of confident positions that are 20 to 150 m off. `pitch_deg`: error of
+    the reported pitch, which the position does not state. `late_s`: the images are older than
+    assumed.
     """
 
     mount_m: float = 2.0
@@ -118,7 +131,8 @@ class FlownPath:
     def lean(self, late_s: float) -> Array:
         """Tangent (N,) of the bank angle, to the right, `late_s` before each time."""
         rate = np.gradient(np.unwrap(self.heading_rad), self.times_s)
-        return np.interp(self.times_s - late_s, self.times_s, rate * self.speed_mps / 9.81)
+        lean = rate * self.speed_mps / 9.81
+        return np.asarray(np.interp(self.times_s - late_s, self.times_s, lean))
 
 
 def lawnmower(seconds: float, speeds_mps: Sequence[float] = (SPEED_MPS,)) -> FlownPath:
@@ -175,34 +189,34 @@ def map_positions(
     ]
 
 
-def watched(
-    monitor: GnssMonitor,
-    solved: GnssTrack,
-    positions: Sequence[MapPosition],
-    changed: Callable[[float, GnssStatus], bool],
-) -> None:
+def fed(
+    monitor: GnssMonitor, solved: GnssTrack, positions: Sequence[MapPosition]
+) -> Iterator[tuple[float, GnssStatus]]:
     """Feed a monitor in the order of arrival, positions 0.1 s after their exposure.
 
-    `changed` gets the time and the status at each change of state or fault; True stops. Silence is
-    noticed by a tick with each position.
+    Time and status after each event. Silence is noticed by a tick with each position.
     """
     events: list[tuple[int, GnssSample | MapPosition]] = [
         (sample.arrived_ns, sample) for sample in samples_of(solved, FRAME)
     ]
     events += [(each.time_ns + PROCESSING_NS, each) for each in positions]
     events.sort(key=lambda event: event[0])
-    before = monitor.status
     for now_ns, event in events:
         if isinstance(event, GnssSample):
             monitor.sample(event)
         else:
             monitor.position(event)
             monitor.tick(now_ns)
-        now = monitor.status
+        yield now_ns / 1e9, monitor.status
+
+
+def changes(statuses: Iterable[tuple[float, GnssStatus]]) -> Iterator[tuple[float, GnssStatus]]:
+    """The first of each stretch of equal state and fault."""
+    before = GnssStatus()
+    for at_s, now in statuses:
         if (now.state, now.fault) != (before.state, before.fault):
             before = now
-            if changed(now_ns / 1e9, now):
-                return
+            yield at_s, now
 
 
 def false_alarms(
@@ -213,16 +227,9 @@ def false_alarms(
     path = lawnmower(hours * 3600)
     positions = map_positions(path, errors, rng)
     solved = solutions(receiver_of(receiver), path.times_s, path.en_m, rng, rate_hz)
-    alarms: list[tuple[float, GnssStatus]] = []
-
-    def changed(at_s: float, status: GnssStatus) -> bool:
-        if status.state is State.ALARM:
-            alarms.append((at_s, status))
-        return False
-
     monitor = GnssMonitor(FRAME)
-    watched(monitor, solved, positions, changed)
-    return alarms, monitor
+    seen = changes(fed(monitor, solved, positions))
+    return [(at_s, status) for at_s, status in seen if status.state is State.ALARM], monitor
 
 
 def delay(
@@ -244,13 +251,11 @@ def delay(
     receiver = receiver_of(f"{name}:{','.join(filter(None, values))}")
     solved = solutions(receiver, path.times_s, path.en_m, rng)
     found: list[tuple[float, Fault | None]] = []
-
-    def changed(now_s: float, status: GnssStatus) -> bool:
+    for now_s, status in changes(fed(GnssMonitor(FRAME), solved, positions)):
         if status.state is State.ALARM and now_s >= at_s:
             found.append((now_s - at_s, status.fault))
-        return bool(found) and now_s > at_s + found[0][0] + SETTLED_S
-
-    watched(GnssMonitor(FRAME), solved, positions, changed)
+        if found and now_s > at_s + found[0][0] + SETTLED_S:
+            break
     within = [each for each in found if each[0] <= found[0][0] + SETTLED_S]
     return (found[0][0], *within[-1]) if found else (math.nan, math.nan, None)
 
@@ -298,6 +303,82 @@ def delay_table(trials: int, section: Section) -> Table:
     return Table("Delay until a fault is named", header, rows)
 
 
+def recovered(
+    seed: int, speeds_mps: Sequence[float], minutes: Sequence[int]
+) -> list[tuple[Array, Biases]]:
+    """Errors (5,) of the learnt biases and the biases, after each of the ascending `minutes`."""
+    rng = np.random.default_rng([seed, 2])
+    path = lawnmower(60.0 * minutes[-1] + 2, speeds_mps)
+    errors = replace(MAPS["usual"], mount_m=0.0, pitch_deg=PITCH_DEG, late_s=LATE_S + LATENCY_S)
+    positions = map_positions(path, errors, rng)
+    solved = solutions(receiver_of("good"), path.times_s, path.en_m, rng, 1.0)
+    true = np.array([*errors.displaced_en_m, math.radians(PITCH_DEG), 0.0, LATE_S])
+    monitor, left, found = GnssMonitor(FRAME), list(minutes), []
+    for now_s, _ in fed(monitor, solved, positions):
+        if left and now_s >= 60.0 * left[0]:
+            left.pop(0)
+            found.append((monitor.learnt.mean - true, monitor.learnt))
+    return found
+
+
+def recovery_table(trials: int, section: Section) -> Table:
+    """Errors of the learnt biases over time: root mean square, and as stated."""
+    scale = np.array([1.0, 1.0, math.degrees(1.0), math.degrees(1.0), 1e3])
+    rows = []
+    for speeds in ((15.0, 25.0), (SPEED_MPS,)):
+        leg = design(0.0, MAPS["usual"].agl_m, np.array([0.0, SPEED_MPS]))
+        runs = [recovered(seed, speeds, MINUTES) for seed in range(trials)]
+        for i, minutes in enumerate(MINUTES):
+            off = np.array([run[i][0] for run in runs])
+            learnt = [run[i][1] for run in runs]
+            rms = np.sqrt((off**2).mean(axis=0)) * scale
+            stated = np.mean([each.stds for each in learnt], axis=0) * scale
+            moved = math.sqrt(((off @ leg.T) ** 2).sum(axis=1).mean())
+            spread = np.mean([math.sqrt(np.trace(each.correction(leg)[1])) for each in learnt])
+            displaced = math.hypot(rms[0], rms[1]), math.hypot(stated[0], stated[1])
+            pairs = [displaced, (rms[2], stated[2]), (rms[4], stated[4]), (moved, spread)]
+            shown = [f"{error:.3g} / {std:.3g}" for error, std in pairs]
+            rows.append([" and ".join(f"{v:g}" for v in speeds), str(minutes), *shown])
+            print(rows[-1], file=sys.stderr, flush=True)
+    header = ["speeds, m/s", "minutes", "displacement, m", "pitch, deg", "latency, ms"]
+    title = f"Learning {MAPS['usual'].displaced_m:g} m, {PITCH_DEG:g} deg and {LATE_S:g} s"
+    section.facts["trials of learning"] = trials
+    return Table(f"{title}: error / stated", [*header, "their sum, m"], rows)
+
+
+def slow_drag(mps: float, seed: int) -> tuple[float, float, float]:
+    """Seconds until a drag-off after an hour of agreement is named, the most by which the learnt
+    displacement followed it, and its error after the alarm; NaN without an alarm."""
+    rng = np.random.default_rng([seed, 3])
+    errors = MAPS["usual"]
+    path = lawnmower(3600.0 + SLOW_DRAG_S)
+    positions = map_positions(path, errors, rng)
+    text = f"drag:mps={mps},at_s=3600,bearing_deg={rng.uniform(0, 360)}"
+    solved = solutions(receiver_of(text), path.times_s, path.en_m, rng, 1.0)
+    monitor, most = GnssMonitor(FRAME), 0.0
+    for now_s, status in fed(monitor, solved, positions):
+        off_m = math.hypot(*(monitor.learnt.en_m - errors.displaced_en_m))
+        if now_s > 3600 and status.state is State.ALARM:
+            return now_s - 3600, most, off_m
+        most = max(most, off_m) if now_s > 3600 else 0.0
+    return math.nan, most, off_m
+
+
+def slow_drag_table(trials: int, section: Section) -> Table:
+    """Drag-offs that are slow enough to be learnt."""
+    rows = []
+    for mps in (0.1, 0.05, 0.02, 0.01, 0.005):
+        found = np.array([slow_drag(mps, seed) for seed in range(trials)])
+        missed = int(np.isnan(found[:, 0]).sum())
+        section.facts[f"slow drag-off of {mps:g} m/s: missed"] = missed
+        late, most, left = (f"{value:.1f}" for value in np.nanmax(found, axis=0))
+        moved = f"{np.nanmax(found[:, 0]) * mps:.0f}"
+        rows.append([f"{mps:g} m/s", str(trials), str(missed), late, moved, most, left])
+        print(rows[-1], file=sys.stderr, flush=True)
+    header = ["drag-off", "trials", "missed", "worst s", "GNSS moved, m", "learnt, m", "kept, m"]
+    return Table("Slow drag-offs after an hour of agreement", header, rows)
+
+
 def main(arguments: Sequence[str]) -> None:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.gnss_watch", description=__doc__)
@@ -308,6 +389,8 @@ def main(arguments: Sequence[str]) -> None:
     started, begin = provenance("gnss-watch"), time.perf_counter()
     section = Section("GNSS watch")
     section.tables.append(delay_table(options.trials, section))
+    section.tables.append(recovery_table(options.trials, section))
+    section.tables.append(slow_drag_table(min(options.trials, 4), section))
     section.tables.append(false_alarm_table(options.hours, section))
     print(section.markdown())
     save(options.out, [section], started, wall_s=time.perf_counter() - begin, latest=False)

@@ -56,4 +56,3 @@ def gnss_watch(
         min_confidence=min_confidence,
         utc_ahead_ns=lambda: 0 if recorded else clocks.utc_ns() - clocks.mono_ns(),
     )
-

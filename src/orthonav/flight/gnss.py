@@ -84,6 +84,13 @@ def fault_of(evidence: Evidence) -> str:
     return FAULTS[int(code) - 1] if 1 <= code <= len(FAULTS) else ""
 
 
+def biases_of(evidence: Evidence) -> dict[str, float]:
+    """Learnt biases of GNSS minus map and their standard deviations, by the keys of `BIASES`; empty
+    unless all are known."""
+    found = {key: evidence.get(key, math.nan) for pair in BIASES for key in pair}
+    return found if all(map(math.isfinite, found.values())) else {}
+
+
 def write_gnss(path: Path, samples: Iterable[GnssSample]) -> None:
     """Write `gnss.csv`, whole or not at all."""
     with replacing(path) as temporary, temporary.open("w", encoding="ascii", newline="") as out:

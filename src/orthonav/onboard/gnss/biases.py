@@ -31,6 +31,8 @@ PLAUSIBLE_SIGMAS = 5.0
 """A displacement beyond so many of the standard deviations that every fix includes for it
 (`MAP_STD_M`) is that of a wrong map, or of a spoofed receiver."""
 _LEAST_EIGENVALUE = 1e-12
+_MOST_VARIANCE = 4.0
+"""Of what is assumed where nothing was learnt: a larger variance is damage."""
 _MOST_AGREED_S = 1e9
 
 
@@ -112,7 +114,7 @@ def biases_from_plain(plain: Mapping[str, Any]) -> Biases:
     cov[np.tril_indices(count)] = lower
     cov += np.tril(cov, -1).T
     scaled = cov / np.multiply.outer(_PRIOR_STD, _PRIOR_STD)
-    if not _LEAST_EIGENVALUE <= np.linalg.eigvalsh(scaled)[0] or not np.diag(scaled).max() <= 4:
+    if np.linalg.eigvalsh(scaled)[0] < _LEAST_EIGENVALUE or np.diag(scaled).max() > _MOST_VARIANCE:
         raise ValueError("not a covariance")
     return Biases(mean, cov, agreed_s, setup)
 

@@ -1,9 +1,10 @@
 """Tests of the difference between GNSS and map over a window, with correlated errors.
 
 The differences of the window are a Gaussian vector: the biases as far as they are known, and slowly
-varying errors of GNSS and map. A fault adds a step or a ramp. For each onset the change is estimated by generalized least squares and compared with its
-standard deviation: the generalized likelihood ratio test of Willsky and Jones (1976,
-doi:10.1109/TAC.1976.1101146), over a window instead of a recursion.
+varying errors of GNSS and map. A fault adds a step or a ramp. For each onset the change is
+estimated by generalized least squares and compared with its standard deviation: the generalized
+likelihood ratio test of Willsky and Jones (1976, doi:10.1109/TAC.1976.1101146), over a window
+instead of a recursion.
 """
 
 from collections import deque

@@ -5,7 +5,8 @@ these in the state the differences are correlated, and the covariance of the bia
 combination of biases that a flight does not show stays as uncertain as before.
 
 A spoofed receiver must not move the map: only values in agreement count, each waits in quarantine,
-an alarm discards those that wait, outliers are left out, and the biases are bounded.
+an alarm discards those that wait, an offset discards all that was learnt since the reference,
+outliers are left out, and the biases are bounded.
 """
 
 import copy
@@ -21,6 +22,8 @@ from orthonav.onboard.gnss.records import Array
 
 QUARANTINE_S = 180.0
 """Time that a value waits before it counts: longer than a drift of 0.25 m/s needs to be named."""
+SETTLED_S = 1800.0
+"""Time of agreement after which biases count as known."""
 OUTLIER = 13.8
 """Squared Mahalanobis distance of an outlier: chi-square of two axes, 99.9 %."""
 LARGEST_STEP_S = 2.0
@@ -37,7 +40,8 @@ class BiasLearner:
 
     def __init__(self, start: Biases, model: DifferenceModel) -> None:
         """`start` is what is known before the flight."""
-        self._filter = _Filter(start, model)
+        self._model, self._filter = model, _Filter(start, model)
+        self._reference = start
         self._waiting: deque[Difference] = deque()
 
     @property
@@ -45,11 +49,19 @@ class BiasLearner:
         """Estimate from all values whose quarantine has ended."""
         return self._filter.biases
 
+    @property
+    def reference(self) -> Biases:
+        """What a slow drag-off of this flight has not moved: the biases before the flight, or,
+        where they were not known, after the first `SETTLED_S` of agreement."""
+        return self._reference
+
     def add(self, value: Difference) -> None:
         """Add a value during agreement."""
         self._waiting.append(value)
         while self._waiting and self._waiting[0].time_s <= value.time_s - QUARANTINE_S:
             self._filter.update(self._waiting.popleft())
+        if self._reference.agreed_s < SETTLED_S <= self.learnt.agreed_s:
+            self._reference = self.learnt
 
     def widen(self, rolling_std_m: float) -> None:
         """Give the newest value at least this error by rolling."""
@@ -59,6 +71,12 @@ class BiasLearner:
     def discard(self) -> None:
         """Drop everything in quarantine, as at an alarm."""
         self._waiting.clear()
+
+    def restore(self) -> None:
+        """Go back to the reference, if there is one: a drag-off may have been learnt since."""
+        self.discard()
+        if self._reference.agreed_s >= SETTLED_S:
+            self._filter = _Filter(self._reference, self._model)
 
     def until(self, time_s: float) -> Biases:
         """Estimate with the values before a time as well, though they are in quarantine."""
@@ -121,4 +139,3 @@ class _Filter:
         turned = np.array([[cos, sin], [-sin, cos]])
         made[:, _BODY] = math.sqrt(model.mount_share) * value.map_std_m * turned
         return made
-

@@ -21,7 +21,6 @@ from orthonav.onboard.gnss.difference import (
     Finding,
 )
 from orthonav.onboard.gnss.learner import BiasLearner
-from orthonav.onboard.gnss.rolling import Rolling
 from orthonav.onboard.gnss.receiver import GAP_S, VELOCITY_S, VELOCITY_STD_MPS, Receiver
 from orthonav.onboard.gnss.records import (
     NANOSECONDS,
@@ -31,6 +30,7 @@ from orthonav.onboard.gnss.records import (
     MapPosition,
     State,
 )
+from orthonav.onboard.gnss.rolling import Rolling
 
 RETURN_S = 60.0
 """Time of agreement after which a return is announced."""
@@ -178,7 +178,11 @@ class GnssMonitor:
         if (now_ns - self._fault_ns) * NANOSECONDS < CLEAR_S:
             return  # the receiver has a fault by itself
         if self.status.state in (State.WAITING, State.GOOD):
-            found = self._window.finding(self._learner.learnt) or self._too_far(recent, value)
+            found = (
+                self._window.finding(self._learner.learnt)
+                or self._too_far(recent, value)
+                or self._crept(value)
+            )
             if found is not None:
                 self._alarm(self._attributed(found, now_ns), now_ns, found)
                 return
@@ -213,6 +217,8 @@ class GnssMonitor:
         """Raise an alarm: learning stops, and what waits to be learnt is discarded."""
         if self.status.state in (State.WAITING, State.GOOD):
             begin_s = now_ns * NANOSECONDS if found is None else found.onset_s
+            if fault is Fault.OFFSET:
+                self._learner.restore()
             is_old = found is not None and found.fault is Fault.OFFSET
             self._anchor = self._learner.until(-math.inf if is_old else begin_s - BEFORE_S)
         if self.status.state is State.ALARM and (
@@ -251,6 +257,18 @@ class GnssMonitor:
             return None
         begin_s = self._window.values[0].time_s
         return Finding(Fault.OFFSET, begin_s, (east, north), std_m, (off_m - LARGEST_M) / std_m)
+
+    def _crept(self, value: Difference) -> Finding | None:
+        """A drag-off that was slow enough to be learnt: the biases left their reference."""
+        reference = self._learner.reference
+        moved = value.design @ (self._learner.learnt.mean - reference.mean)
+        east, north = moved.tolist()
+        _, cov = reference.correction(value.design)
+        std_m = math.sqrt(float(np.linalg.eigvalsh(cov)[-1]))
+        excess = (math.hypot(east, north) - self._model.multipath_m) / std_m
+        if excess <= self._model.sigmas:
+            return None
+        return Finding(Fault.OFFSET, self._window.values[0].time_s, (east, north), std_m, excess)
 
     def _std_m(self, value: Difference, known: Biases) -> float:
         """Standard deviation of a difference from the known biases, along the worst axis."""

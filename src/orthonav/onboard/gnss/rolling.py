@@ -7,17 +7,18 @@ displaces the view by 16 m for seconds, which looks like a step of GNSS.
 import math
 from collections import deque
 
+import numpy as np
+
 from orthonav.onboard.gnss.biases import Biases
 from orthonav.onboard.gnss.difference import Difference
-
-import numpy as np
 
 LARGEST_GAP_S = 2.0
 """Values farther apart do not show how the aircraft turned between them."""
 LEAST_DEG_S2 = 3.0
 """Change of the turn rate per second from which the aircraft rolls; less is noise of headings."""
-GNSS_LATENCY_S = 0.15
-"""Standard deviation of the latency of GNSS, which hides as much of that of the images."""
+LATENCY_STD_S = 0.08
+"""Standard deviation of the latency of the images beyond the learnt one. With more, a step of GNSS
+in a turn is named after more than 5 s; with less, images that are 0.3 s late look like steps."""
 GRAVITY_MPS2 = 9.81
 
 
@@ -25,7 +26,7 @@ class Rolling:
     """Recognizes rolling by the change of the turn rate. Mutable; deterministic."""
 
     def __init__(self) -> None:
-        self._before: deque[Difference] = deque(maxlen=3)
+        self._before: deque[Difference] = deque(maxlen=2)
 
     def std_m(self, value: Difference, known: Biases) -> float:
         """Standard deviation of the error of a value, the next after those before; 0 without.
@@ -34,12 +35,12 @@ class Rolling:
         """
         values = [*self._before, value]
         self._before.append(value)
-        change = max(map(_change_of_rate, values, values[1:], values[2:]), default=0.0)
+        change = _change_of_rate(*values) if len(values) == 3 else 0.0
         if change <= math.radians(LEAST_DEG_S2):
             return 0.0
         # in a coordinated turn the tangent of the bank is speed times turn rate over gravity
         lean_rate = float(np.hypot(*value.vel_en_mps)) * change / GRAVITY_MPS2
-        latency_s = math.hypot(known.mean[4], known.stds[4], GNSS_LATENCY_S)
+        latency_s = math.hypot(known.mean[4], LATENCY_STD_S)
         return latency_s * lean_rate * value.agl_m
 
 

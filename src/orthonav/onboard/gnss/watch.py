@@ -18,6 +18,7 @@ from orthonav.flight.gnss import BIASES, GnssSample
 from orthonav.flight.logged import gnss_message
 from orthonav.geo.frames import LocalFrame
 from orthonav.onboard.gnss.biases import Biases, at_start, design
+from orthonav.onboard.gnss.learner import SETTLED_S
 from orthonav.onboard.gnss.monitor import GnssMonitor
 from orthonav.onboard.gnss.records import (
     NANOSECONDS,
@@ -30,8 +31,6 @@ from orthonav.publish.estimate import error_ellipse
 from orthonav.records import CONFIDENT, Fix, NoFix, ViewResult
 
 log = logging.getLogger(__name__)
-CORRECT_AFTER_S = 1800.0
-"""Stored biases correct positions only after this time of agreement."""
 DISPLACED = "map_displaced"
 """Reason in health: the learnt displacement is larger than that of a map as accurate as fixes
 state, or GNSS was spoofed since the first flight over it."""
@@ -113,7 +112,7 @@ class GnssWatch:
         self._shown: dict[int, GnssStatus] = {}
         self._last: GnssSample | None = None
         self._now_ns, self._has_failed = 0, False
-        self._corrects = correct and self._start.agreed_s >= CORRECT_AFTER_S
+        self._corrects = correct and self._start.agreed_s >= SETTLED_S
         self._correction_en_m = np.zeros(2)
 
     def view(self, result: ViewResult, exposed_ns: int) -> ViewResult:
@@ -312,7 +311,7 @@ def _shown(learnt: Biases) -> list[tuple[float, float]]:
 
 
 def _bias_evidence(learnt: Biases) -> dict[str, float]:
-    made = {}
+    made: dict[str, float] = {}
     for (key, std_key), (value, std) in zip(BIASES, _shown(learnt), strict=True):
         made |= {key: round(value, 3), std_key: round(std, 3)}
     return made
