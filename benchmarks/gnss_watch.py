@@ -126,7 +126,7 @@ class FlownPath:
     def vel_en_mps(self) -> Array:
         """Velocity (N, 2)."""
         ahead = np.stack([np.sin(self.heading_rad), np.cos(self.heading_rad)], axis=1)
-        return self.speed_mps[:, None] * ahead
+        return np.asarray(self.speed_mps[:, None] * ahead)
 
     def lean(self, late_s: float) -> Array:
         """Tangent (N,) of the bank angle, to the right, `late_s` before each time."""

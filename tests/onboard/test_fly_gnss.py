@@ -139,12 +139,15 @@ def test_named_values_are_sent_once_a_second(begin):
     assert "gnss_lost" in flight.reasons()
 
 
-def test_what_was_learnt_is_reported_and_saved_by_the_digest_of_the_map(begin, tmp_path):
+def test_what_was_learnt_is_reported_and_saved_by_the_digest_of_the_map(
+    begin, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("orthonav.onboard.gnss.learner.QUARANTINE_S", 20.0)
     state = tmp_path / "state.json"
     save(state, SavedState(), {"other": unknown("x").to_plain()})
     flight = begin(known=learnt_biases(state), state_path=state)
     flight.off_m = np.array([30.0, 0.0])
-    flight.views(560, wait_s=0.5)
+    flight.views(230, wait_s=0.5)
     flight.health()
     found = learnt_biases(state)
     assert found["other"].setup == "x" and list(found)[-1] == "d"

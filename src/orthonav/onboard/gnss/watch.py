@@ -139,10 +139,13 @@ class GnssWatch:
         if not isinstance(outcome, Fix) or not self._corrects:
             return outcome
         en_m = np.asarray(self._frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg))
-        position = self._position(outcome, 0)
-        velocity = np.zeros(2) if position.vel_en_mps is None else position.vel_en_mps
-        heading_rad = math.radians(position.heading_deg)
-        moved, more = self._start.correction(design(heading_rad, position.agl_m, velocity))
+        velocity = _velocity(outcome)
+        shown = design(
+            math.radians(_or_zero(outcome.heading_deg)),
+            _or_zero(outcome.agl_m),
+            np.zeros(2) if velocity is None else velocity,
+        )
+        moved, more = self._start.correction(shown)
         self._correction_en_m = moved
         lat, lon = self._frame.latlon_from_en(en_m + moved)
         cov = outcome.cov_en_m2 + more
@@ -235,15 +238,13 @@ class GnssWatch:
         return known and fix.confidence >= self._least and state in (None, "tracking")
 
     def _position(self, fix: Fix, now_ns: int) -> MapPosition:
-        east, north = (fix.evidence.get(f"vel_{n}_mps", math.nan) for n in ("east", "north"))
-        known = math.isfinite(east) and math.isfinite(north)
         return MapPosition(
             now_ns,
             np.asarray(self._frame.en_from_latlon(fix.lat_deg, fix.lon_deg)),
             error_ellipse(fix.cov_en_m2)[0],
-            np.array([east, north]) if known else None,
-            fix.heading_deg if math.isfinite(fix.heading_deg) else 0.0,
-            fix.agl_m if math.isfinite(fix.agl_m) else 0.0,
+            _velocity(fix),
+            _or_zero(fix.heading_deg),
+            _or_zero(fix.agl_m),
         )
 
     def _evidence(self, now_ns: int) -> dict[str, float]:
@@ -265,6 +266,16 @@ class GnssWatch:
             "gnss_lon_deg": float(lon),
             "gnss_std_m": last.std_m,
         }
+
+
+def _velocity(fix: Fix) -> Array | None:
+    """Velocity (2,) of the track, east and north; None where it is not known."""
+    made = np.array([fix.evidence.get(f"vel_{n}_mps", math.nan) for n in ("east", "north")])
+    return made if np.isfinite(made).all() else None
+
+
+def _or_zero(value: float) -> float:
+    return value if math.isfinite(value) else 0.0
 
 
 def _change(
