@@ -1,7 +1,8 @@
 """`python -m benchmarks.gnss_watch [--hours 10] [--trials 20]`: the GNSS monitor by itself.
 
 Simulated receivers against simulated positions of a map, both with correlated errors: false alarms
-over hours, and the delay until each fault is named. No images are involved.
+over hours, the delay until each fault is named, and the biases learnt of map, mount and latency. No
+images are involved.
 """
 
 import argparse
@@ -9,7 +10,7 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from benchmarks.record import Section, Table, number, provenance, save
 from orthonav.flight.gnss import GnssSample
 from orthonav.geo.frames import LocalFrame
+from orthonav.onboard.gnss.biases import Biases, design
 from orthonav.onboard.gnss.monitor import GnssMonitor
 from orthonav.onboard.gnss.records import (
     Fault,
@@ -27,13 +29,25 @@ from orthonav.onboard.gnss.records import (
     State,
 )
 from orthonav.simulate.motion import gauss_markov
-from orthonav.simulate.receiver import RATE_HZ, GnssTrack, receiver_of, samples_of, solutions
+from orthonav.simulate.receiver import (
+    LATENCY_S,
+    RATE_HZ,
+    GnssTrack,
+    receiver_of,
+    samples_of,
+    solutions,
+)
 
 FRAME = LocalFrame(48.0, 2.0)
 SPEED_MPS, LEG_M, TURN_RADIUS_M = 20.0, 2000.0, 100.0
+ROLL_S = 3
+"""Time to roll into a turn."""
 FAULT_AT_S = 900.0
-LONGEST_S, SETTLED_S = 1800.0, 10.0
+LONGEST_S, SETTLED_S = 900.0, 10.0
 """How long a fault is watched, and from its alarm to its last name."""
+PITCH_DEG, LATE_S, MINUTES = 2.0, 0.3, (15, 30, 60, 90)
+"""Error of the mount and latency that are learnt besides the displacement; when they are read."""
+SLOW_DRAG_S = 4 * 3600.0
 PROCESSING_NS = 10**8
 """Time from exposure to the map's position."""
 FAULTS = {
@@ -61,10 +75,12 @@ Array = NDArray[np.float64]
 class MapErrors:
     """Errors of the simulated map positions; each position states the root of their squares.
 
-    `mount_m`: constant in the aircraft, as from a tilted mount. `local_m`, `local_tau_s`: slowly
-    varying. `white_m`: from view to view. `displaced_m`: length of the constant displacement.
-    `gaps_per_hour`: stretches of 10 to 90 s without confident positions. `outlier_share`: share of
-    confident positions that are 20 to 150 m off.
+    `mount_m`: constant in the aircraft at `agl_m`, as from a tilted mount. `local_m`,
+    `local_tau_s`: slowly varying. `white_m`: from view to view. `displaced_m`: length of the
+    constant displacement. `gaps_per_hour`: stretches of 10 to 90 s without confident positions.
+    `outlier_share`: share of confident positions that are 20 to 150 m off. `pitch_deg`: error of
+    the reported pitch, which the position does not state. `late_s`: the images are older than
+    assumed.
     """
 
     mount_m: float = 2.0
@@ -74,6 +90,9 @@ class MapErrors:
     displaced_m: float = 40.0
     gaps_per_hour: float = 20.0
     outlier_share: float = 3e-4
+    agl_m: float = 300.0
+    pitch_deg: float = 0.0
+    late_s: float = 0.0
 
     @property
     def displaced_en_m(self) -> Array:
@@ -89,31 +108,49 @@ class MapErrors:
 MAPS = {
     "usual": MapErrors(),
     "poor": MapErrors(mount_m=4.0, local_m=4.0, white_m=2.0, displaced_m=60.0),
-    "high": MapErrors(mount_m=15.0, local_m=6.0, white_m=3.0, displaced_m=20.0),
+    "high": MapErrors(mount_m=15.0, local_m=6.0, white_m=3.0, displaced_m=20.0, agl_m=2000.0),
 }
 """Errors by name: at 300 m, with a worse mount and map, and at 2,000 m."""
 
 
 @dataclass(frozen=True, eq=False)
 class FlownPath:
-    """True path: `times_s` (N,), `en_m` (N, 2), `heading_rad` (N,)."""
+    """True path: `times_s` (N,), `en_m` (N, 2), `heading_rad` (N,), `speed_mps` (N,)."""
 
     times_s: Array
     en_m: Array
     heading_rad: Array
+    speed_mps: Array
+
+    @property
+    def vel_en_mps(self) -> Array:
+        """Velocity (N, 2)."""
+        ahead = np.stack([np.sin(self.heading_rad), np.cos(self.heading_rad)], axis=1)
+        return np.asarray(self.speed_mps[:, None] * ahead)
+
+    def lean(self, late_s: float) -> Array:
+        """Tangent (N,) of the bank angle, to the right, `late_s` before each time."""
+        rate = np.gradient(np.unwrap(self.heading_rad), self.times_s)
+        lean = rate * self.speed_mps / 9.81
+        return np.asarray(np.interp(self.times_s - late_s, self.times_s, lean))
 
 
-def lawnmower(seconds: float) -> FlownPath:
-    """Parallel legs with half turns, one position a second."""
-    half_m, turn_m = LEG_M, math.pi * TURN_RADIUS_M
-    along = np.arange(0.0, seconds) * SPEED_MPS
-    number, rest = np.divmod(along, half_m + turn_m)
-    turning = np.clip(rest - half_m, 0, None) / TURN_RADIUS_M
+def lawnmower(seconds: float, speeds_mps: Sequence[float] = (SPEED_MPS,)) -> FlownPath:
+    """Parallel legs with half turns, one position a second; each speed for two legs in turn."""
+    lap_m = LEG_M + math.pi * TURN_RADIUS_M
+    times, along, speeds = np.arange(0.0, seconds), [0.0], []
+    for _ in times:
+        speeds.append(speeds_mps[int(along[-1] // (2 * lap_m)) % len(speeds_mps)])
+        along.append(along[-1] + speeds[-1])
+    number, rest = np.divmod(np.array(along[:-1]), lap_m)
+    turning = np.clip(rest - LEG_M, 0, None) / TURN_RADIUS_M
     side = np.where(number % 2 == 0, 1.0, -1.0)
     heading = np.where(number % 2 == 0, 0.0, math.pi) + side * turning
-    moved = SPEED_MPS * np.stack([np.sin(heading), np.cos(heading)], axis=1)
-    places = np.cumsum(moved, axis=0)
-    return FlownPath(np.arange(0.0, seconds), places - places[0], heading)
+    heading = np.unwrap(heading)
+    heading = np.convolve(np.pad(heading, ROLL_S // 2, "edge"), np.ones(ROLL_S) / ROLL_S, "valid")
+    path = FlownPath(times, np.zeros((len(times), 2)), heading, np.array(speeds))
+    places = np.cumsum(path.vel_en_mps, axis=0)
+    return replace(path, en_m=places - places[0])
 
 
 def map_positions(
@@ -127,6 +164,10 @@ def map_positions(
     mount = np.stack([cos * body[0] + sin * body[1], cos * body[1] - sin * body[0]], axis=1)
     off = mount + errors.local_m * gauss_markov(step_s / errors.local_tau_s, count, rng)
     off += rng.normal(0, errors.white_m, (count, 2)) - errors.displaced_en_m
+    ahead, right = np.stack([sin, cos], axis=1), np.stack([cos, -sin], axis=1)
+    off += errors.agl_m * math.tan(math.radians(errors.pitch_deg)) * ahead
+    rolled = path.lean(0.0) - path.lean(errors.late_s)
+    off += errors.agl_m * rolled[:, None] * right - errors.late_s * path.vel_en_mps
     wrong = rng.random(count) < errors.outlier_share
     off[wrong] += rng.uniform(20, 150, (int(wrong.sum()), 1)) * np.array([[0.6, 0.8]])
     confident = np.ones(count, dtype=bool)
@@ -134,8 +175,7 @@ def map_positions(
     for _ in range(rng.poisson(errors.gaps_per_hour * hours)):
         begin = rng.uniform(path.times_s[0], path.times_s[-1])
         confident &= (path.times_s < begin) | (path.times_s > begin + rng.uniform(10, 90))
-    velocity = SPEED_MPS * np.stack([sin, cos], axis=1)
-    velocity = velocity + 0.3 * gauss_markov(step_s / 30.0, count, rng)
+    velocity = path.vel_en_mps + 0.3 * gauss_markov(step_s / 30.0, count, rng)
     return [
         MapPosition(
             round(path.times_s[i] * 1e9),
@@ -143,59 +183,53 @@ def map_positions(
             errors.std_m,
             velocity[i],
             math.degrees(path.heading_rad[i]) % 360,
+            errors.agl_m,
         )
         for i in np.flatnonzero(confident)
     ]
 
 
-def watched(
-    monitor: GnssMonitor,
-    solved: GnssTrack,
-    positions: Sequence[MapPosition],
-    changed: Callable[[float, GnssStatus], bool],
-) -> None:
+def fed(
+    monitor: GnssMonitor, solved: GnssTrack, positions: Sequence[MapPosition]
+) -> Iterator[tuple[float, GnssStatus]]:
     """Feed a monitor in the order of arrival, positions 0.1 s after their exposure.
 
-    `changed` gets the time and the status at each change of state or fault; True stops. Silence is
-    noticed by a tick with each position.
+    Time and status after each event. Silence is noticed by a tick with each position.
     """
     events: list[tuple[int, GnssSample | MapPosition]] = [
         (sample.arrived_ns, sample) for sample in samples_of(solved, FRAME)
     ]
     events += [(each.time_ns + PROCESSING_NS, each) for each in positions]
     events.sort(key=lambda event: event[0])
-    before = monitor.status
     for now_ns, event in events:
         if isinstance(event, GnssSample):
             monitor.sample(event)
         else:
             monitor.position(event)
             monitor.tick(now_ns)
-        now = monitor.status
+        yield now_ns / 1e9, monitor.status
+
+
+def changes(statuses: Iterable[tuple[float, GnssStatus]]) -> Iterator[tuple[float, GnssStatus]]:
+    """The first of each stretch of equal state and fault."""
+    before = GnssStatus()
+    for at_s, now in statuses:
         if (now.state, now.fault) != (before.state, before.fault):
             before = now
-            if changed(now_ns / 1e9, now):
-                return
+            yield at_s, now
 
 
 def false_alarms(
     hours: float, seed: int, receiver: str, errors: MapErrors, *, rate_hz: float = RATE_HZ
-) -> tuple[list[tuple[float, GnssStatus]], GnssStatus]:
-    """Alarms (time, status) of a receiver without a fault, and the last status."""
+) -> tuple[list[tuple[float, GnssStatus]], GnssMonitor]:
+    """Alarms (time, status) of a receiver without a fault, and the monitor at the end."""
     rng = np.random.default_rng([seed, 0])
     path = lawnmower(hours * 3600)
     positions = map_positions(path, errors, rng)
     solved = solutions(receiver_of(receiver), path.times_s, path.en_m, rng, rate_hz)
-    alarms: list[tuple[float, GnssStatus]] = []
-
-    def changed(at_s: float, status: GnssStatus) -> bool:
-        if status.state is State.ALARM:
-            alarms.append((at_s, status))
-        return False
-
     monitor = GnssMonitor(FRAME)
-    watched(monitor, solved, positions, changed)
-    return alarms, monitor.status
+    seen = changes(fed(monitor, solved, positions))
+    return [(at_s, status) for at_s, status in seen if status.state is State.ALARM], monitor
 
 
 def delay(
@@ -217,13 +251,11 @@ def delay(
     receiver = receiver_of(f"{name}:{','.join(filter(None, values))}")
     solved = solutions(receiver, path.times_s, path.en_m, rng)
     found: list[tuple[float, Fault | None]] = []
-
-    def changed(now_s: float, status: GnssStatus) -> bool:
+    for now_s, status in changes(fed(GnssMonitor(FRAME), solved, positions)):
         if status.state is State.ALARM and now_s >= at_s:
             found.append((now_s - at_s, status.fault))
-        return bool(found) and now_s > at_s + found[0][0] + SETTLED_S
-
-    watched(GnssMonitor(FRAME), solved, positions, changed)
+        if found and now_s > at_s + found[0][0] + SETTLED_S:
+            break
     within = [each for each in found if each[0] <= found[0][0] + SETTLED_S]
     return (found[0][0], *within[-1]) if found else (math.nan, math.nan, None)
 
@@ -234,7 +266,7 @@ def false_alarm_table(hours: float, section: Section) -> Table:
     for receiver in ("good", "good:std_m=5"):
         for name, errors in MAPS.items():
             alarms, last = false_alarms(hours, len(rows), receiver, errors)
-            learnt = last.displacement
+            learnt = last.learnt
             off_m = math.hypot(*(learnt.en_m - errors.displaced_en_m))
             section.facts[f"false alarms: {receiver}, {name}"] = len(alarms)
             std = receiver_of(receiver).std_m
@@ -271,6 +303,82 @@ def delay_table(trials: int, section: Section) -> Table:
     return Table("Delay until a fault is named", header, rows)
 
 
+def recovered(
+    seed: int, speeds_mps: Sequence[float], minutes: Sequence[int]
+) -> list[tuple[Array, Biases]]:
+    """Errors (5,) of the learnt biases and the biases, after each of the ascending `minutes`."""
+    rng = np.random.default_rng([seed, 2])
+    path = lawnmower(60.0 * minutes[-1] + 2, speeds_mps)
+    errors = replace(MAPS["usual"], mount_m=0.0, pitch_deg=PITCH_DEG, late_s=LATE_S + LATENCY_S)
+    positions = map_positions(path, errors, rng)
+    solved = solutions(receiver_of("good"), path.times_s, path.en_m, rng, 1.0)
+    true = np.array([*errors.displaced_en_m, math.radians(PITCH_DEG), 0.0, LATE_S])
+    monitor, left, found = GnssMonitor(FRAME), list(minutes), []
+    for now_s, _ in fed(monitor, solved, positions):
+        if left and now_s >= 60.0 * left[0]:
+            left.pop(0)
+            found.append((monitor.learnt.mean - true, monitor.learnt))
+    return found
+
+
+def recovery_table(trials: int, section: Section) -> Table:
+    """Errors of the learnt biases over time: root mean square, and as stated."""
+    scale = np.array([1.0, 1.0, math.degrees(1.0), math.degrees(1.0), 1e3])
+    rows = []
+    for speeds in ((15.0, 25.0), (SPEED_MPS,)):
+        leg = design(0.0, MAPS["usual"].agl_m, np.array([0.0, SPEED_MPS]))
+        runs = [recovered(seed, speeds, MINUTES) for seed in range(trials)]
+        for i, minutes in enumerate(MINUTES):
+            off = np.array([run[i][0] for run in runs])
+            learnt = [run[i][1] for run in runs]
+            rms = np.sqrt((off**2).mean(axis=0)) * scale
+            stated = np.mean([each.stds for each in learnt], axis=0) * scale
+            moved = math.sqrt(((off @ leg.T) ** 2).sum(axis=1).mean())
+            spread = np.mean([math.sqrt(np.trace(each.correction(leg)[1])) for each in learnt])
+            displaced = math.hypot(rms[0], rms[1]), math.hypot(stated[0], stated[1])
+            pairs = [displaced, (rms[2], stated[2]), (rms[4], stated[4]), (moved, spread)]
+            shown = [f"{error:.3g} / {std:.3g}" for error, std in pairs]
+            rows.append([" and ".join(f"{v:g}" for v in speeds), str(minutes), *shown])
+            print(rows[-1], file=sys.stderr, flush=True)
+    header = ["speeds, m/s", "minutes", "displacement, m", "pitch, deg", "latency, ms"]
+    title = f"Learning {MAPS['usual'].displaced_m:g} m, {PITCH_DEG:g} deg and {LATE_S:g} s"
+    section.facts["trials of learning"] = trials
+    return Table(f"{title}: error / stated", [*header, "their sum, m"], rows)
+
+
+def slow_drag(mps: float, seed: int) -> tuple[float, float, float]:
+    """Seconds until a drag-off after an hour of agreement is named, the most by which the learnt
+    displacement followed it, and its error after the alarm; NaN without an alarm."""
+    rng = np.random.default_rng([seed, 3])
+    errors = MAPS["usual"]
+    path = lawnmower(3600.0 + SLOW_DRAG_S)
+    positions = map_positions(path, errors, rng)
+    text = f"drag:mps={mps},at_s=3600,bearing_deg={rng.uniform(0, 360)}"
+    solved = solutions(receiver_of(text), path.times_s, path.en_m, rng, 1.0)
+    monitor, most = GnssMonitor(FRAME), 0.0
+    for now_s, status in fed(monitor, solved, positions):
+        off_m = math.hypot(*(monitor.learnt.en_m - errors.displaced_en_m))
+        if now_s > 3600 and status.state is State.ALARM:
+            return now_s - 3600, most, off_m
+        most = max(most, off_m) if now_s > 3600 else 0.0
+    return math.nan, most, off_m
+
+
+def slow_drag_table(trials: int, section: Section) -> Table:
+    """Drag-offs that are slow enough to be learnt."""
+    rows = []
+    for mps in (0.1, 0.05, 0.02, 0.01, 0.005):
+        found = np.array([slow_drag(mps, seed) for seed in range(trials)])
+        missed = int(np.isnan(found[:, 0]).sum())
+        section.facts[f"slow drag-off of {mps:g} m/s: missed"] = missed
+        late, most, left = (f"{value:.1f}" for value in np.nanmax(found, axis=0))
+        moved = f"{np.nanmax(found[:, 0]) * mps:.0f}"
+        rows.append([f"{mps:g} m/s", str(trials), str(missed), late, moved, most, left])
+        print(rows[-1], file=sys.stderr, flush=True)
+    header = ["drag-off", "trials", "missed", "worst s", "GNSS moved, m", "learnt, m", "kept, m"]
+    return Table("Slow drag-offs after an hour of agreement", header, rows)
+
+
 def main(arguments: Sequence[str]) -> None:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.gnss_watch", description=__doc__)
@@ -281,6 +389,8 @@ def main(arguments: Sequence[str]) -> None:
     started, begin = provenance("gnss-watch"), time.perf_counter()
     section = Section("GNSS watch")
     section.tables.append(delay_table(options.trials, section))
+    section.tables.append(recovery_table(options.trials, section))
+    section.tables.append(slow_drag_table(min(options.trials, 4), section))
     section.tables.append(false_alarm_table(options.hours, section))
     print(section.markdown())
     save(options.out, [section], started, wall_s=time.perf_counter() - begin, latest=False)

@@ -1,5 +1,6 @@
 """GNSS beside the map: errors, differences and alarms, in figures, JSON and report."""
 
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from orthonav.evaluate.gnss import gnss_rows, gnss_to_json, measure_gnss
 from orthonav.evaluate.metrics import compare
 from orthonav.flight.fixes import write_results
-from orthonav.flight.gnss import FAULTS, fault_of
+from orthonav.flight.gnss import BIASES, FAULTS, fault_of
 from orthonav.geo.frames import LocalFrame
 from orthonav.records import Fix, NoFix, ViewResult
 
@@ -51,6 +52,25 @@ def test_errors_differences_and_alarms_are_measured():
     assert plain["error_max_m"] == pytest.approx(40, abs=1e-3)
     assert plain["alarms"] == [{"fault": "gnss_step", "first_s": 5.0, "views": 3}]
     assert dict(gnss_rows(found))["GNSS alarms"] == "1: gnss_step"
+    assert plain["learnt"] == {} and len(gnss_rows(found)) == 3
+
+
+def test_what_was_learnt_is_that_of_the_last_view_that_knows_it():
+    def learnt(number, east_m):
+        keys = [key for pair in BIASES for key in pair]
+        numbers = [east_m, 1.0, -4.0, 1.0, 0.5, 0.25, -0.5, 0.25, 120.0, 30.0]
+        values = dict(zip(keys, numbers, strict=True))
+        before = result(number, 4.0)
+        evidence = MappingProxyType({**before.outcome.evidence, **values})
+        return replace(before, outcome=replace(before.outcome, evidence=evidence))
+
+    results = [learnt(0, 3.0), learnt(1, 12.0), result(2, 4.0), learnt(3, float("nan"))]
+    found = measure_gnss(compare(truth(4), results, FRAME), results)
+    assert gnss_to_json(found)["learnt"]["gnss_map_east_m"] == 12.0
+    rows = dict(gnss_rows(found))
+    assert rows["learnt displacement of the map"] == "12.0 +- 1.0 m east, -4.0 +- 1.0 m north"
+    assert rows["learnt error of the mount"] == "0.50 +- 0.25 deg pitch, -0.50 +- 0.25 deg roll"
+    assert rows["learnt latency"] == "120 +- 30 ms"
 
 
 def test_without_gnss_there_are_no_figures():

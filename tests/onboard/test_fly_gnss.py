@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +11,20 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from test_fly import AHEAD_NS, Flight
 
 from orthonav.geo.frames import LocalFrame
-from orthonav.onboard.gnss.records import Displacement, Fault
+from orthonav.onboard.gnss.biases import Biases, unknown
+from orthonav.onboard.gnss.records import Fault
 from orthonav.onboard.gnss.watch import GnssWatch, LiveSolutions
-from orthonav.onboard.state import SavedState, displacements, save
+from orthonav.onboard.state import SavedState, learnt_biases, save
+from orthonav.records import NoFix
 
 FRAME = LocalFrame(48.0, 2.0)
 SPEED_MPS = 10.0
+
+
+def known_biases(east_m, north_m, std_m, agreed_s, pitch_rad=0.0, latency_s=0.0):
+    """Biases with a displacement known to `std_m`, as learnt before."""
+    mean = np.array([east_m, north_m, pitch_rad, 0.0, latency_s])
+    return Biases(mean, np.diag([std_m, std_m, 1e-3, 1e-3, 0.01]) ** 2, agreed_s)
 
 
 class Watched(Flight):
@@ -130,21 +139,32 @@ def test_named_values_are_sent_once_a_second(begin):
     assert "gnss_lost" in flight.reasons()
 
 
-def test_the_displacement_is_saved_by_the_digest_of_the_map(begin, tmp_path):
+def test_what_was_learnt_is_reported_and_saved_by_the_digest_of_the_map(
+    begin, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("orthonav.onboard.gnss.learner.QUARANTINE_S", 20.0)
     state = tmp_path / "state.json"
-    save(state, SavedState(), {"other": {"east_m": 1, "north_m": 2, "std_m": 3, "agreed_s": 4}})
-    flight = begin(known=displacements(state), state_path=state)
-    flight.off_m = np.array([20.0, 0.0])
-    flight.views(800, wait_s=0.5)
+    save(state, SavedState(), {"other": unknown("x").to_plain()})
+    flight = begin(known=learnt_biases(state), state_path=state)
+    flight.off_m = np.array([30.0, 0.0])
+    flight.views(230, wait_s=0.5)
     flight.health()
-    found = displacements(state)
-    assert found["other"] == Displacement(1, 2, 3, 4)
-    assert found["d"].en_m == pytest.approx([20, 0], abs=2) and found["d"].agreed_s > 60
+    found = learnt_biases(state)
+    assert found["other"].setup == "x" and list(found)[-1] == "d"
+    assert found["d"].en_m == pytest.approx([30, 0], abs=2) and found["d"].agreed_s > 60
+    (status,) = [each for each in flight.written() if "health" in each][-1]["gnss"]
+    place = status["displacement"]
+    assert place["east_m"] == pytest.approx(30, abs=2) and 1 < place["std_m"] < 7
+    assert status["latency"]["std_ms"] > 100 and status["mount"]["pitch_std_deg"] > 1
+    evidence = [each for each in flight.written() if "frame" in each][-1]["evidence"]
+    assert evidence["gnss_map_east_m"] == pytest.approx(place["east_m"], abs=0.1)
+    assert evidence["gnss_mount_pitch_std_deg"] > 1
+    assert "map_displaced" in flight.reasons()  # by more than maps usually are
 
 
 def test_positions_are_moved_only_where_asked_and_known_before(begin):
-    good = Displacement(30.0, -10.0, 2.0, 3600.0)
-    short = Displacement(30.0, -10.0, 2.0, 600.0)
+    good = known_biases(30.0, -10.0, 2.0, 3600.0)
+    short = known_biases(30.0, -10.0, 2.0, 600.0)
     for known, correct, moved_m in (
         (good, True, [30.0, -10.0]),
         (good, False, [0.0, 0.0]),
@@ -161,9 +181,26 @@ def test_positions_are_moved_only_where_asked_and_known_before(begin):
         assert place - at_map == pytest.approx(moved_m, abs=0.05)
 
 
+def test_mount_and_latency_move_a_position_by_heading_height_and_velocity():
+    known = known_biases(0.0, 0.0, 1.0, 3600.0, pitch_rad=0.02, latency_s=0.25)
+    watch = GnssWatch(FRAME, LiveSolutions(deque()), digest="d", known={"d": known}, correct=True)
+    velocity = {"vel_east_mps": 20.0, "vel_north_mps": 0.0}
+    seen = replace(fix(48.0, 2.0), heading_deg=90.0, agl_m=200.0, evidence=velocity)
+    moved = watch.corrected(seen)
+    assert FRAME.en_from_latlon(moved.lat_deg, moved.lon_deg) == pytest.approx(
+        [-4 + 5, 0], abs=0.01
+    )
+    more = moved.cov_en_m2 - seen.cov_en_m2
+    start = watch._start.stds
+    along = 1.0 + (200 * start[2]) ** 2 + (20 * start[4]) ** 2
+    assert np.diag(more) == pytest.approx([along, 1.0 + (200 * start[3]) ** 2])
+    lost = NoFix("blank", "nothing")
+    assert watch.corrected(lost) is lost
+
+
 def test_spoofing_never_moves_what_is_sent(begin):
     """Not even one from the first second on, over a long time, where positions are corrected."""
-    known = {"d": Displacement(0.0, 0.0, 2.0, 3600.0)}
+    known = {"d": known_biases(0.0, 0.0, 2.0, 3600.0)}
     flight = begin(known=known, correct=True)
     for number in range(500):
         flight.off_m = np.array([0.1 * number, 0.0])
@@ -189,7 +226,7 @@ def test_solutions_of_another_clock_use_their_arrival(begin):
     assert sample.vel_en_mps is None and sample.satellites == -1 and math.isnan(sample.std_m)
 
 
-def test_an_error_of_the_witness_does_not_end_the_flight(begin, caplog):
+def test_an_error_of_the_monitor_does_not_end_the_flight(begin, caplog):
     flight = begin()
     flight.views(10)
     flight.frames.clear()

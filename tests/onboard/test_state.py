@@ -2,13 +2,14 @@
 
 import json
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from orthonav.onboard import state
-from orthonav.onboard.gnss.records import Displacement
-from orthonav.onboard.state import SavedState, boot_id, displacements, load, prior_of, save
+from orthonav.onboard.gnss.biases import unknown
+from orthonav.onboard.state import SavedState, boot_id, learnt_biases, load, prior_of, save
 
 S = 10**9
 SAVED = SavedState(48.1, 2.3, 4.0, 1_700_000_000 * S, 500 * S, "run-1", 77)
@@ -59,11 +60,11 @@ def test_a_damaged_file_is_ignored(tmp_path, text):
 
 def test_numbers_beyond_their_type_are_damage(tmp_path):
     path = tmp_path / "state.json"
-    maps = {"a": {"east_m": 10**400, "north_m": 0, "std_m": 1, "agreed_s": 1}}
+    maps = {"a": {**unknown().to_plain(), "agreed_s": 10**400}}
     save(path, SAVED)
     plain = json.loads(path.read_text())
     path.write_text(json.dumps({**plain, "utc_ns": math.inf, "maps": maps}))
-    assert load(path) is None and displacements(path) == {}
+    assert load(path) is None and learnt_biases(path) == {}
 
 
 def test_a_huge_file_is_ignored(tmp_path):
@@ -92,19 +93,61 @@ def test_a_missing_folder_is_an_error(tmp_path):
         save(tmp_path / "nowhere" / "state.json", SAVED)
 
 
-def test_displacements_of_maps_are_saved_and_survive_without_the_witness(tmp_path):
+def test_what_was_learnt_of_maps_is_saved_and_survives_without_the_monitor(tmp_path):
     path = tmp_path / "state.json"
-    learnt = Displacement(12.5, -3.25, 1.5, 3600.0)
-    save(path, SAVED, {"digest": asdict(learnt), "other": asdict(replace(learnt, east_m=1.0))})
+    learnt = replace(unknown("camera"), mean=np.array([12.5, -3.25, 0.01, -0.02, 0.125]))
+    cov = (learnt.cov + np.outer(learnt.stds, learnt.stds)) / 3
+    learnt = replace(learnt, cov=cov, agreed_s=3600.0)
+    save(path, SAVED, {"digest": learnt.to_plain(), "other": unknown().to_plain()})
     save(path, replace(SAVED, lat_deg=1.0))  # a flight without --gnss keeps them
     assert load(path).lat_deg == 1.0
-    found = displacements(path)
-    assert found["digest"] == learnt and found["other"].east_m == 1.0
+    found = learnt_biases(path)
+    assert list(found) == ["digest", "other"]
+    assert (found["digest"].agreed_s, found["digest"].setup) == (3600.0, "camera")
+    assert np.array_equal(found["digest"].mean, learnt.mean)
+    assert np.array_equal(found["digest"].cov, learnt.cov)
 
 
-@pytest.mark.parametrize("maps", [3, [], {"a": 1}, {"a": {"east_m": "x"}}, {"a": {"std_m": 0}}])
-def test_damaged_displacements_are_ignored(tmp_path, maps):
+def test_what_was_learnt_of_many_maps_fits_into_the_file(tmp_path):
+    path = tmp_path / "state.json"
+    third = replace(unknown("0" * 16), mean=np.full(5, 1 / 30), cov=unknown().cov / 3)
+    save(path, SAVED, {f"{number:064d}": third.to_plain() for number in range(state.MAX_MAPS + 5)})
+    assert len(learnt_biases(path)) == state.MAX_MAPS and load(path) == SAVED
+
+
+GOOD = unknown().to_plain()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        3,
+        {},
+        {**GOOD, "mean": [0.0] * 4},
+        {**GOOD, "mean": [101.0, 0, 0, 0, 0]},
+        {**GOOD, "mean": [0, 0, 0, 0, math.nan]},
+        {**GOOD, "mean": [0, 0, 1.0, 0, 0]},
+        {**GOOD, "mean": "none"},
+        {**GOOD, "cov": GOOD["cov"][:-1]},
+        {**GOOD, "cov": [0.0] * 15},
+        {**GOOD, "cov": [-each for each in GOOD["cov"]]},
+        {**GOOD, "cov": [1e9 * each for each in GOOD["cov"]]},
+        {**GOOD, "cov": [math.inf] * 15},
+        {**GOOD, "cov": [each or 1e6 for each in GOOD["cov"]]},
+        {**GOOD, "agreed_s": -1},
+        {**GOOD, "setup": 7},
+        {"east_m": 1.0, "north_m": 2.0, "std_m": 3.0, "agreed_s": 4.0},
+    ],
+)
+def test_damaged_or_impossible_biases_are_ignored(tmp_path, wrong):
+    path = tmp_path / "state.json"
+    save(path, SAVED, {"wrong": wrong, "good": GOOD})
+    assert list(learnt_biases(path)) == ["good"] and load(path) == SAVED
+
+
+@pytest.mark.parametrize("maps", [3, []])
+def test_damaged_maps_are_ignored(tmp_path, maps):
     path = tmp_path / "state.json"
     save(path, SAVED)
     path.write_text(json.dumps({**json.loads(path.read_text()), "maps": maps}))
-    assert displacements(path) == {} and load(path) == SAVED
+    assert learnt_biases(path) == {} and load(path) == SAVED

@@ -319,9 +319,9 @@ def _add_flight(group: Any) -> None:
         "--gnss",
         choices=("off", "watch", "correct"),
         default="off",
-        help="watch: compare GNSS with the map, report faults and the displacement of the map; "
-        "correct: also move positions by the displacement that --state has from earlier flights "
-        "(default off)",
+        help="watch: compare GNSS with the map, report faults, learn the displacement of the map, "
+        "errors of the mount and the latency; correct: also correct positions by what --state has "
+        "from earlier flights (default off)",
     )
     group.add_argument(
         "--deadline-ms",

@@ -72,15 +72,17 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     link = _link(options, clocks)
     source, graph = _inputs(options, clocks, link, camera, stopping, stack, localizer, least)
     camera = camera or source.wait_for_camera()
+    digest = opened.manifest.sha256
     gnss = None
     if options.gnss != "off":  # only where it is asked for
         made = importlib.import_module("orthonav.cli.flying_gnss").gnss_watch
         queue = source.gnss if options.ros2 else None if link is None else link.gnss
-        gnss = made(options, localizer.sheet.frame, queue, least, clocks)
+        used = camera, options.mount_deg, mount, _stated(options.camera_latency_ms)
+        gnss = made(options, localizer.sheet.frame, digest, used, queue, least, clocks)
     publisher = _publisher(options, clocks, link, least, graph)
     if link is not None:
         stack.callback(LinkThread(link).stop)
-    sink = _sink(options, camera)
+    sink = _sink(options, camera, digest)
     if options.ros2 and sink is not None:
         source.log_gnss = sink.gnss
     if gnss is not None and sink is not None and not options.ros2:
@@ -327,12 +329,12 @@ def _start(options: argparse.Namespace, clocks: Clocks) -> Callable[[], Prior | 
     return prior
 
 
-def _sink(options: argparse.Namespace, camera: Camera) -> LogSink | None:
+def _sink(options: argparse.Namespace, camera: Camera, digest: str) -> LogSink | None:
     if options.log is None:
         return None
 
     module = importlib.import_module("orthonav.onboard.log")  # only where it is asked for
-    info = importlib.import_module("orthonav.mapfile.signature").map_info(options.map)
+    info = {"name": options.map.name, "manifest_sha256": digest}
     most = None if options.log_max_mb is None else round(options.log_max_mb * 1e6)
     made: LogSink = module.FlightLog(
         options.log, camera, info, views=options.log_views, max_bytes=most

@@ -1,36 +1,41 @@
-"""`orthonav fly --gnss`: the witness, made from the options."""
+"""`orthonav fly --gnss`: the GNSS monitor, made from the options."""
 
 import argparse
+import hashlib
 from collections import deque
 from pathlib import Path
+from typing import Any
 
 from orthonav.errors import VariantError
 from orthonav.flight.gnss import FILE, GnssSample, read_gnss
 from orthonav.geo.frames import LocalFrame
-from orthonav.mapfile.signature import map_digest
 from orthonav.onboard.gnss.watch import (
     GnssSource,
     GnssWatch,
     LiveSolutions,
     RecordedSolutions,
 )
-from orthonav.onboard.state import displacements
+from orthonav.onboard.state import learnt_biases
 from orthonav.onboard.telemetry import Clocks
 
 
 def gnss_watch(
     options: argparse.Namespace,
     frame: LocalFrame,
+    digest: str,
+    used: tuple[Any, ...],
     queue: deque[GnssSample] | None,
     min_confidence: float,
     clocks: Clocks,
 ) -> GnssWatch:
-    """Witness over the solutions in `queue`, or over `gnss.csv` of the flight folder.
+    """GNSS monitor over the solutions in `queue`, or over `gnss.csv` of the flight folder.
 
-    Raises `VariantError` where GNSS has no source, or `correct` no state.
+    `digest`: of the map. `used`: camera, its mount and stated latency; after a change of them,
+    what they add to the difference is learnt anew. Raises `VariantError` where GNSS has no source,
+    or `correct` no state.
     """
     if options.gnss == "correct" and options.state is None:
-        raise VariantError("--gnss correct needs --state FILE with the displacement of the map")
+        raise VariantError("--gnss correct needs --state FILE with what was learnt of the map")
     recorded = options.recorded_telemetry and not options.ros2
     source: GnssSource
     if recorded:
@@ -43,8 +48,9 @@ def gnss_watch(
     return GnssWatch(
         frame,
         source,
-        digest=map_digest(options.map),
-        known=displacements(options.state) if options.state else {},
+        digest=digest,
+        known=learnt_biases(options.state) if options.state else {},
+        setup=hashlib.sha256(repr(used).encode()).hexdigest()[:16],
         correct=options.gnss == "correct",
         recorded=recorded,
         min_confidence=min_confidence,

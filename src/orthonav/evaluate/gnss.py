@@ -1,6 +1,6 @@
 """GNSS beside the map, where `orthonav fly --gnss` recorded it in the evidence of views."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -9,7 +9,7 @@ import numpy as np
 from orthonav.evaluate.figures import FloatArray, frozen, or_none, percentile, runs
 from orthonav.evaluate.metrics import Comparison
 from orthonav.evaluate.track import seconds_since_first
-from orthonav.flight.gnss import fault_of, gnss_of
+from orthonav.flight.gnss import BIASES, biases_of, fault_of, gnss_of
 from orthonav.geo.frames import LocalFrame
 from orthonav.records import ViewResult
 from orthonav.report.canvas import GREY, RIGHT, TRUTH, WRONG, Drawing, draw_figure
@@ -19,6 +19,14 @@ from orthonav.report.numbers import measure_text
 if TYPE_CHECKING:
     from matplotlib import figure as mpl
 
+_EAST, _NORTH, _PITCH, _ROLL, _LATENCY = BIASES
+_LEARNT = {
+    "learnt displacement of the map": ((_EAST, 1, "m east"), (_NORTH, 1, "m north")),
+    "learnt error of the mount": ((_PITCH, 2, "deg pitch"), (_ROLL, 2, "deg roll")),
+    "learnt latency": ((_LATENCY, 0, "ms"),),
+}
+"""Learnt biases as they are shown: keys, digits and units."""
+
 
 @dataclass(frozen=True, eq=False)
 class GnssMetrics:
@@ -27,6 +35,8 @@ class GnssMetrics:
     `seconds_s`: time since the first view. `errors_m`: of GNSS. `map_errors_m`: of the fixes.
     `differences_m`: distance between both; NaN where one of them is missing, as above.
     `faults`: reason of the monitor, "" without one.
+    `learnt`: biases of GNSS minus map at the last view that has them, each with its standard
+    deviation, by their keys in evidence; empty where nothing was learnt.
     """
 
     seconds_s: FloatArray
@@ -34,6 +44,7 @@ class GnssMetrics:
     map_errors_m: FloatArray
     differences_m: FloatArray
     faults: tuple[str, ...]
+    learnt: Mapping[str, float]
 
     @property
     def alarms(self) -> tuple[tuple[int, int], ...]:
@@ -59,6 +70,7 @@ def measure_gnss(comparison: Comparison, results: Sequence[ViewResult]) -> GnssM
         comparison.errors_m,
         frozen(np.hypot(*(en_m - comparison.fix_en_m).T)),
         tuple(fault_of(each) for each in evidence),
+        next((found for each in reversed(evidence) if (found := biases_of(each))), {}),
     )
 
 
@@ -69,6 +81,7 @@ def gnss_rows(found: GnssMetrics) -> tuple[tuple[str, str], ...]:
         ("error of GNSS", _spread_text(found.errors_m)),
         ("difference of GNSS and map", _spread_text(found.differences_m)),
         ("GNSS alarms", f"{len(named)}{': ' if named else ''}{', '.join(named)}"),
+        *_learnt_rows(found.learnt),
     )
 
 
@@ -89,7 +102,20 @@ def gnss_to_json(found: GnssMetrics) -> dict[str, object]:
         }
         for first, end in found.alarms
     ]
+    plain["learnt"] = dict(found.learnt)
     return plain
+
+
+def _learnt_rows(learnt: Mapping[str, float]) -> Iterator[tuple[str, str]]:
+    """Names and texts of the learnt biases."""
+    if not learnt:
+        return
+    for name, pairs in _LEARNT.items():
+        texts = [
+            f"{learnt[key]:.{digits}f} +- {learnt[std_key]:.{digits}f} {unit}"
+            for (key, std_key), digits, unit in pairs
+        ]
+        yield name, ", ".join(texts)
 
 
 def gnss_figure(found: GnssMetrics) -> Figure:

@@ -20,6 +20,14 @@ FAULTS = (
     *("gnss_velocity", "gnss_offset", "gnss_disagrees", "gnss_returning"),
 )
 """Reasons by the code, from 1, that evidence has as `gnss_fault`; 0 is none (docs/onboard.md)."""
+BIASES = (
+    ("gnss_map_east_m", "gnss_map_east_std_m"),
+    ("gnss_map_north_m", "gnss_map_north_std_m"),
+    ("gnss_mount_pitch_deg", "gnss_mount_pitch_std_deg"),
+    ("gnss_mount_roll_deg", "gnss_mount_roll_std_deg"),
+    ("gnss_latency_ms", "gnss_latency_std_ms"),
+)
+"""Keys in evidence of the learnt biases of GNSS minus map, and of their standard deviations."""
 COLUMNS = ("time_s", "lat_deg", "lon_deg", "fix_type")
 OPTIONAL_COLUMNS = (
     *("solved_s", "std_m", "vel_east_mps", "vel_north_mps"),
@@ -74,6 +82,13 @@ def fault_of(evidence: Evidence) -> str:
     """Reason of the GNSS monitor at a view; "" without a fault."""
     code = evidence.get("gnss_fault", 0.0)
     return FAULTS[int(code) - 1] if 1 <= code <= len(FAULTS) else ""
+
+
+def biases_of(evidence: Evidence) -> dict[str, float]:
+    """Learnt biases of GNSS minus map and their standard deviations, by the keys of `BIASES`; empty
+    unless all are known."""
+    found = {key: evidence.get(key, math.nan) for pair in BIASES for key in pair}
+    return found if all(map(math.isfinite, found.values())) else {}
 
 
 def write_gnss(path: Path, samples: Iterable[GnssSample]) -> None:

@@ -98,11 +98,6 @@ def map_digest(path: Path) -> str:
         raise MapFileError(f"not an orthonav map, or damaged: {path}") from error
 
 
-def map_info(path: Path) -> dict[str, Any]:
-    """Identification of a map in a flight log: `name` and `manifest_sha256`."""
-    return {"name": Path(path).name, "manifest_sha256": map_digest(path)}
-
-
 def new_key(folder: Path) -> str:
     """Write a new key pair, `private.pem` (mode 0600) and `public.pem`; returns its id.
 

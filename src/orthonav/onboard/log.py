@@ -108,7 +108,7 @@ class FlightLog:
     ) -> None:
         """Write files `NAME_0001.mcap` and so on in the folder of `path`, which is `NAME.mcap`.
 
-        `map_info`: identity of the map, see `orthonav.mapfile.signature.map_info`.
+        `map_info`: its `name` and `manifest_sha256`.
         `views`: images to log; a replay needs full ones.
         `max_bytes`: largest total size of all files of this name; the oldest are deleted.
         `segment_bytes`: largest size of a file (default 256 MB, or an eighth of `max_bytes`),

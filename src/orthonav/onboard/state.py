@@ -4,25 +4,25 @@ A small JSON file, replaced atomically about once a second. It is not synced to 
 slow on memory cards: it survives a killed process, but not always a power cut.
 """
 
+import contextlib
 import json
 import math
 import os
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict, astuple, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from orthonav.onboard.gnss.records import Displacement
+from orthonav.onboard.gnss.biases import Biases, biases_from_plain
 from orthonav.records import Prior
 
 VERSION = 1
 MAX_BYTES = 100_000
 MAX_MAPS = 100
-"""Maps whose displacement is stored, the latest."""
+"""Maps of which something is stored, the latest."""
 SPEED_MPS = 30.0
 """Standard deviation of the speed of the aircraft since the position was saved: assumed."""
-_DISPLACEMENT = tuple(each.name for each in fields(Displacement))
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
@@ -89,16 +89,12 @@ def save(path: Path, saved: SavedState, maps: Mapping[str, Any] | None = None) -
         raise
 
 
-def displacements(path: Path) -> dict[str, Displacement]:
-    """Learnt displacements by the digest of their map; none where the file has no valid one."""
+def learnt_biases(path: Path) -> dict[str, Biases]:
+    """What was learnt of maps, by their digest, the latest last; invalid entries are left out."""
     found = {}
     for digest, plain in _maps_of(path).items():
-        try:
-            made = Displacement(**{name: float(plain[name]) for name in _DISPLACEMENT})
-        except (KeyError, TypeError, ValueError, OverflowError):
-            continue
-        if all(map(math.isfinite, astuple(made))) and made.std_m > 0 and made.agreed_s >= 0:
-            found[digest] = made
+        with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
+            found[digest] = biases_from_plain(plain)
     return found
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from orthonav.flight.gnss import GnssSample
 from orthonav.geo.frames import LocalFrame
+from orthonav.onboard.gnss.biases import LARGEST_M, Biases, unknown
 from orthonav.onboard.gnss.difference import (
     BIN_S,
     Difference,
@@ -19,17 +20,17 @@ from orthonav.onboard.gnss.difference import (
     DifferenceWindow,
     Finding,
 )
-from orthonav.onboard.gnss.displacement import LARGEST_M, UNKNOWN, DisplacementLearner
+from orthonav.onboard.gnss.learner import BiasLearner
 from orthonav.onboard.gnss.receiver import GAP_S, VELOCITY_S, VELOCITY_STD_MPS, Receiver
 from orthonav.onboard.gnss.records import (
     NANOSECONDS,
     Array,
-    Displacement,
     Fault,
     GnssStatus,
     MapPosition,
     State,
 )
+from orthonav.onboard.gnss.rolling import Rolling
 
 RETURN_S = 60.0
 """Time of agreement after which a return is announced."""
@@ -43,8 +44,8 @@ MAP_JUMP_M, MAP_JUMP_SIGMAS = 15.0, 3.0
 """The map jumped where its position leaves the track's velocity by more than both together."""
 MAP_JUMP_S = 60.0
 """A change so soon after a jump of the map is not attributed to GNSS."""
-HISTORY_S, HISTORY = 5.0, 100
-"""Interval and number of differences that are stored for the agreement after a fault."""
+BEFORE_S = 5.0
+"""Values so long before the onset of a fault show what GNSS has to agree with after it."""
 _LEFT = {
     Fault.JUMP: Fault.STEP,
     Fault.LOST: Fault.OFFSET,
@@ -64,13 +65,14 @@ class GnssMonitor:
     def __init__(
         self,
         frame: LocalFrame,
-        start: Displacement = UNKNOWN,
+        start: Biases | None = None,
         model: DifferenceModel | None = None,
     ) -> None:
-        """`frame`: plane of the map. `start`: displacement known before the flight."""
+        """`frame`: plane of the map. `start`: biases known before the flight."""
+        start = start or unknown()
         self._frame, self._model = frame, model or DifferenceModel()
         self._receiver, self._window = Receiver(), DifferenceWindow(self._model)
-        self._learner = DisplacementLearner(start, self._model)
+        self._learner, self._rolling = BiasLearner(start, self._model), Rolling()
         self._pending: deque[MapPosition] = deque(maxlen=PENDING)
         self._solved: deque[tuple[GnssSample, Array]] = deque(maxlen=SOLVED)
         self._bin: list[Difference] = []
@@ -80,8 +82,12 @@ class GnssMonitor:
         self._anchor = start
         self._agreed_s, self._newest_s = 0.0, -math.inf
         self._fault_ns = self._velocity_ns = -(10**12)
-        self._history: deque[Difference] = deque(maxlen=HISTORY)
-        self.status = GnssStatus(displacement=start)
+        self.status = GnssStatus()
+
+    @property
+    def learnt(self) -> Biases:
+        """Biases as learnt so far."""
+        return self._learner.learnt
 
     def sample(self, sample: GnssSample) -> None:
         """Add a solution of the receiver."""
@@ -147,7 +153,8 @@ class GnssMonitor:
         std_m = sample.std_m if math.isfinite(sample.std_m) else self._model.gnss_std_m
         heading = math.radians(position.heading_deg)
         time_s = position.time_ns * NANOSECONDS
-        made = Difference(time_s, off_en_m, std_m, position.std_m, heading, velocity)
+        agl_m = position.agl_m
+        made = Difference(time_s, off_en_m, std_m, position.std_m, heading, velocity, agl_m)
         if self._bin and math.floor(self._bin[0].time_s / BIN_S) != math.floor(time_s / BIN_S):
             value, self._bin = _median(self._bin), []
             self._judge(value, now_ns)
@@ -157,38 +164,42 @@ class GnssMonitor:
         """Test the window with a new value."""
         if value.time_s <= self._newest_s:
             self._window.clear()  # the clock went back
-            self._history.clear()
+            self._learner.discard()
         self._newest_s = value.time_s
+        rolling_m = self._rolling.std_m(value, self._learner.learnt)
+        if rolling_m:  # headings show it a second later than the bank
+            value = value.rolling(rolling_m)
+            self._window.widen(rolling_m)
+            self._learner.widen(rolling_m)
         self._window.add(value)
-        if self.status.state in (State.WAITING, State.GOOD) and (
-            not self._history or value.time_s - self._history[-1].time_s >= HISTORY_S
-        ):
-            self._history.append(value)
         recent = self._window.recent(RECENT_S)
-        east, north = recent.mean(axis=0).tolist()
+        east, north = np.mean([each.en_m for each in recent], axis=0).tolist()
         self.status = replace(self.status, difference_en_m=(east, north))
         if (now_ns - self._fault_ns) * NANOSECONDS < CLEAR_S:
             return  # the receiver has a fault by itself
         if self.status.state in (State.WAITING, State.GOOD):
-            found = self._window.finding(self._learner.learnt) or self._too_far(recent, value)
+            found = (
+                self._window.finding(self._learner.learnt)
+                or self._too_far(recent, value)
+                or self._crept(value)
+            )
             if found is not None:
                 self._alarm(self._attributed(found, now_ns), now_ns, found)
                 return
-        self._count_agreement(recent, value, now_ns)
-        if self.status.state is State.GOOD:
+        if self.status.state in (State.WAITING, State.GOOD):
             self._learner.add(value)
-            self.status = replace(self.status, displacement=self._learner.learnt)
+        self._count_agreement(recent, value, now_ns)
 
-    def _count_agreement(self, recent: Array, value: Difference, now_ns: int) -> None:
+    def _count_agreement(self, recent: list[Difference], value: Difference, now_ns: int) -> None:
         """Count the time of agreement with the anchor, and change the state."""
         anchor = self._learner.learnt if self.status.state is State.GOOD else self._anchor
-        gnss_m = max(value.gnss_std_m, self._model.gnss_std_m)
-        std_m = math.sqrt(anchor.std_m**2 + gnss_m**2 + value.map_std_m**2)
-        limit_m = max(AGREE_M, AGREE_SIGMAS * std_m)
+        limit_m = max(AGREE_M, AGREE_SIGMAS * self._std_m(value, anchor))
         if self.status.state is State.WAITING and anchor.agreed_s == 0:
-            limit_m = LARGEST_M  # nothing is known of the map
-        if float(np.hypot(*(recent.mean(axis=0) - anchor.en_m))) > limit_m:
+            limit_m = max(limit_m, LARGEST_M)  # nothing is known of the map
+        if float(np.hypot(*_residual(recent, anchor))) > limit_m:
             self._agreed_s = 0.0
+            if self.status.state is State.WAITING:
+                self._learner.discard()
             if self.status.state in (State.ALARM, State.RETURNING):
                 fault = self.status.fault
                 named = fault if fault is None else _LEFT.get(fault, fault)
@@ -206,8 +217,10 @@ class GnssMonitor:
         """Raise an alarm: learning stops, and what waits to be learnt is discarded."""
         if self.status.state in (State.WAITING, State.GOOD):
             begin_s = now_ns * NANOSECONDS if found is None else found.onset_s
+            if fault is Fault.OFFSET:
+                self._learner.restore()
             is_old = found is not None and found.fault is Fault.OFFSET
-            self._anchor = self._learner.learnt if is_old else self._anchor_before(begin_s)
+            self._anchor = self._learner.until(-math.inf if is_old else begin_s - BEFORE_S)
         if self.status.state is State.ALARM and (
             self.status.fault is fault or (fault is Fault.JUMP and self.status.fault is Fault.STEP)
         ):
@@ -217,22 +230,6 @@ class GnssMonitor:
         size = (math.nan, math.nan) if found is None else found.en_m
         self.status = replace(self.status, fault=fault, fault_en_m=size)
         self._enter(State.ALARM, now_ns)
-
-    def _anchor_before(self, begin_s: float) -> Displacement:
-        """Difference with which GNSS has to agree after a fault that began at `begin_s`.
-
-        It joins what was learnt and the differences before the fault.
-        """
-        known, values = self._learner.learnt, [*self._history, *self._window.values]
-        before = [each for each in values if each.time_s < begin_s - HISTORY_S] or values[:1]
-        if not before:
-            return known
-        off = np.median([each.en_m for each in before], axis=0)
-        gnss_m = max(before[-1].gnss_std_m, self._model.gnss_std_m)
-        variance_m2 = gnss_m**2 + before[-1].map_std_m ** 2
-        gain = known.std_m**2 / (known.std_m**2 + variance_m2)
-        east, north = (known.en_m + gain * (off - known.en_m)).tolist()
-        return Displacement(east, north, known.std_m * math.sqrt(1 - gain), known.agreed_s)
 
     def _enter(self, state: State, now_ns: int) -> None:
         if state is State.ALARM:
@@ -251,15 +248,34 @@ class GnssMonitor:
             return Fault.DISAGREES
         return found.fault
 
-    def _too_far(self, recent: Array, value: Difference) -> Finding | None:
+    def _too_far(self, recent: list[Difference], value: Difference) -> Finding | None:
         """A difference that no displacement of a map explains."""
-        east, north = recent.mean(axis=0).tolist()
-        off_m = math.hypot(east, north)
-        std_m = math.hypot(max(value.gnss_std_m, self._model.gnss_std_m), value.map_std_m)
+        others = self._learner.learnt.without_displacement()
+        east, north = _residual(recent, others).tolist()
+        off_m, std_m = math.hypot(east, north), self._std_m(value, others)
         if len(recent) < RECENT_S / 2 or off_m < LARGEST_M + AGREE_SIGMAS * std_m:
             return None
         begin_s = self._window.values[0].time_s
         return Finding(Fault.OFFSET, begin_s, (east, north), std_m, (off_m - LARGEST_M) / std_m)
+
+    def _crept(self, value: Difference) -> Finding | None:
+        """A drag-off that was slow enough to be learnt: the biases left their reference."""
+        reference = self._learner.reference
+        moved = value.design @ (self._learner.learnt.mean - reference.mean)
+        east, north = moved.tolist()
+        _, cov = reference.correction(value.design)
+        std_m = math.sqrt(float(np.linalg.eigvalsh(cov)[-1]))
+        excess = (math.hypot(east, north) - self._model.multipath_m) / std_m
+        if excess <= self._model.sigmas:
+            return None
+        return Finding(Fault.OFFSET, self._window.values[0].time_s, (east, north), std_m, excess)
+
+    def _std_m(self, value: Difference, known: Biases) -> float:
+        """Standard deviation of a difference from the known biases, along the worst axis."""
+        gnss_m = max(value.gnss_std_m, self._model.gnss_std_m)
+        _, cov = known.correction(value.design)
+        worst_m2 = float(np.linalg.eigvalsh(cov)[-1])
+        return math.sqrt(worst_m2 + gnss_m**2 + value.map_std_m**2)
 
     def _velocity_fault(self) -> Fault | None:
         """Whether the receiver's velocity contradicts its positions."""
@@ -290,6 +306,11 @@ def _jumped(before: MapPosition, now: MapPosition) -> bool:
     moved = np.mean(velocities, axis=0) * seconds
     off_m = float(np.hypot(*(now.en_m - before.en_m - moved)))
     return off_m > MAP_JUMP_M + MAP_JUMP_SIGMAS * max(before.std_m, now.std_m)
+
+
+def _residual(values: list[Difference], known: Biases) -> Array:
+    """Mean (2,) of what the biases do not explain."""
+    return np.asarray(np.mean([each.residual(known) for each in values], axis=0))
 
 
 def _median(values: list[Difference]) -> Difference:

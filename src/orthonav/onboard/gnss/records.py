@@ -1,7 +1,7 @@
 """Records of the GNSS monitor: its inputs, its faults and its status."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -50,7 +50,7 @@ class State(Enum):
     WAITING = "waiting"
     """Since the start: no fault, but no agreement with the map yet."""
     GOOD = "good"
-    """GNSS and map agree; the displacement of the map is learnt."""
+    """GNSS and map agree; the biases of their difference are learnt."""
     ALARM = "alarm"
     """A fault."""
     RETURNING = "returning"
@@ -66,6 +66,7 @@ class MapPosition:
     `std_m`: standard deviation along the worst axis.
     `vel_en_mps` (2,): velocity of the track; None where not known.
     `heading_deg`: heading of the top of the image; errors of a tilted mount turn with it.
+    `agl_m`: height above ground; errors of a tilted mount grow with it. 0 where not known.
     """
 
     time_ns: int
@@ -73,25 +74,7 @@ class MapPosition:
     std_m: float
     vel_en_mps: Array | None = None
     heading_deg: float = 0.0
-
-
-@dataclass(frozen=True)
-class Displacement:
-    """Constant difference GNSS minus map: where the map should be, east and north of where it is.
-
-    `east_m`, `north_m`: the displacement. `std_m`: standard deviation per axis. `agreed_s`: time of
-    agreement that it was learnt from.
-    """
-
-    east_m: float = 0.0
-    north_m: float = 0.0
-    std_m: float = 30.0
-    agreed_s: float = 0.0
-
-    @property
-    def en_m(self) -> Array:
-        """East and north (2,)."""
-        return np.array([self.east_m, self.north_m])
+    agl_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +86,6 @@ class GnssStatus:
     `difference_en_m`: recent GNSS minus map, east and north; NaN where not known. A switch from the
     map to GNSS would make this jump.
     `fault_en_m`: estimated change of the difference by the fault; NaN where it has none.
-    `displacement`: learnt displacement of the map.
     """
 
     state: State = State.WAITING
@@ -111,7 +93,6 @@ class GnssStatus:
     since_ns: int = 0
     difference_en_m: tuple[float, float] = (math.nan, math.nan)
     fault_en_m: tuple[float, float] = (math.nan, math.nan)
-    displacement: Displacement = field(default_factory=Displacement)
 
     @property
     def reason(self) -> str | None:

@@ -1,4 +1,4 @@
-"""The witness of a flight: its monitors are fed with views and GNSS, and their status is reported.
+"""The GNSS monitors of a flight: they are fed with views and GNSS, and their status is reported.
 
 It uses one time base: the monotonic clock of a live flight, or the times of a recording.
 """
@@ -8,21 +8,21 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
 
-from orthonav.flight.gnss import GnssSample
+from orthonav.flight.gnss import BIASES, GnssSample
 from orthonav.flight.logged import gnss_message
 from orthonav.geo.frames import LocalFrame
-from orthonav.onboard.gnss.displacement import UNKNOWN
+from orthonav.onboard.gnss.biases import Biases, at_start, design
+from orthonav.onboard.gnss.learner import SETTLED_S
 from orthonav.onboard.gnss.monitor import GnssMonitor
 from orthonav.onboard.gnss.records import (
     NANOSECONDS,
     Array,
-    Displacement,
     GnssStatus,
     MapPosition,
     State,
@@ -31,9 +31,9 @@ from orthonav.publish.estimate import error_ellipse
 from orthonav.records import CONFIDENT, Fix, NoFix, ViewResult
 
 log = logging.getLogger(__name__)
-CORRECT_AFTER_S, CORRECT_STD_M = 1800.0, 5.0
-"""A stored displacement corrects positions only after this time of agreement, and with at most
-this standard deviation."""
+DISPLACED = "map_displaced"
+"""Reason in health: the learnt displacement is larger than that of a map as accurate as fixes
+state, or GNSS was spoofed since the first flight over it."""
 SHOWN_S = 1.0
 """Age up to which a solution is extrapolated to an exposure, for display only."""
 ALARM_SEVERITY, RETURN_SEVERITY = 2, 5  # MAV_SEVERITY_CRITICAL, MAV_SEVERITY_NOTICE
@@ -88,36 +88,38 @@ class GnssWatch:
         source: GnssSource,
         *,
         digest: str = "",
-        known: Mapping[str, Displacement] = MappingProxyType({}),
+        known: Mapping[str, Biases] = MappingProxyType({}),
+        setup: str = "",
         correct: bool = False,
         recorded: bool = False,
         min_confidence: float = CONFIDENT,
         utc_ahead_ns: Callable[[], int] = lambda: 0,
     ) -> None:
-        """`frame`: plane of the map. `digest`: of the map; `known`: displacements by digest.
+        """`frame`: plane of the map. `digest`: of the map; `known`: biases by digest, the latest
+        last. `setup`: identifies camera, mount and stated latency.
 
-        `correct`: correct positions by the displacement known before the flight; what is learnt in
-        this flight never moves a position. `recorded`: times are those of the recording.
+        `correct`: correct positions by the biases known before the flight; what is learnt in this
+        flight never moves a position. `recorded`: times are those of the recording.
         `utc_ahead_ns`: what is added to times of solutions in the log. `log` gets every solution,
         as the message of a flight log.
         """
         self._frame, self._source, self._utc_ahead_ns = frame, source, utc_ahead_ns
         self.log: Callable[[int, bytes], None] = lambda time_ns, cdr: None
         self._digest, self._known = digest, dict(known)
-        self._start = self._known.get(digest, UNKNOWN)
+        self._start = at_start(known, digest, setup)
         self._recorded, self._least = recorded, min_confidence
         self._monitors: dict[int, GnssMonitor] = {}
         self._shown: dict[int, GnssStatus] = {}
         self._last: GnssSample | None = None
         self._now_ns, self._has_failed = 0, False
-        usable = self._start.agreed_s >= CORRECT_AFTER_S and self._start.std_m <= CORRECT_STD_M
-        self.correction_en_m = self._start.en_m if correct and usable else np.zeros(2)
+        self._corrects = correct and self._start.agreed_s >= SETTLED_S
+        self._correction_en_m = np.zeros(2)
 
     def view(self, result: ViewResult, exposed_ns: int) -> ViewResult:
         """Compare a view; the result with the GNSS position of its exposure as evidence."""
         try:
             return self._compared(result, result.time_ns if self._recorded else exposed_ns)
-        except Exception:  # the flight does not depend on the witness
+        except Exception:  # the flight does not depend on the monitor
             self._failed("a view could not be compared with GNSS")
             return result
 
@@ -132,13 +134,21 @@ class GnssWatch:
         return replace(result, outcome=replace(fix, evidence=evidence))
 
     def corrected(self, outcome: Fix | NoFix) -> Fix | NoFix:
-        """A fix moved by the displacement of the map, where that is to be corrected; its covariance
-        includes that of the displacement."""
-        if not isinstance(outcome, Fix) or not self.correction_en_m.any():
+        """A fix moved by the biases known before the flight, where they are to be corrected; its
+        covariance includes theirs at its heading, height and velocity."""
+        if not isinstance(outcome, Fix) or not self._corrects:
             return outcome
         en_m = np.asarray(self._frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg))
-        lat, lon = self._frame.latlon_from_en(en_m + self.correction_en_m)
-        cov = outcome.cov_en_m2 + np.eye(2) * self._start.std_m**2
+        velocity = _velocity(outcome)
+        shown = design(
+            math.radians(_or_zero(outcome.heading_deg)),
+            _or_zero(outcome.agl_m),
+            np.zeros(2) if velocity is None else velocity,
+        )
+        moved, more = self._start.correction(shown)
+        self._correction_en_m = moved
+        lat, lon = self._frame.latlon_from_en(en_m + moved)
+        cov = outcome.cov_en_m2 + more
         cov.setflags(write=False)
         return replace(outcome, lat_deg=float(lat), lon_deg=float(lon), cov_en_m2=cov)
 
@@ -146,7 +156,7 @@ class GnssWatch:
         """Judge at a time of the monotonic clock; messages about changes since the last call."""
         try:
             return self._ticked(mono_ns)
-        except Exception:  # the flight does not depend on the witness
+        except Exception:  # the flight does not depend on the monitor
             self._failed("GNSS could not be judged")
             return []
 
@@ -164,7 +174,7 @@ class GnssWatch:
             before = self._shown.get(number, GnssStatus())
             self._shown[number] = status
             name = "GNSS" if number == 0 else f"GNSS {number + 1}"
-            text = _change(name, before, status, self.correction_en_m)
+            text = _change(name, before, status, self._correction_en_m)
             if text is not None:
                 texts.append(text)
         return texts
@@ -172,8 +182,16 @@ class GnssWatch:
     @property
     def reasons(self) -> tuple[str, ...]:
         """Reasons in the health."""
-        found = (monitor.status.reason for monitor in self._monitors.values())
+        found = [monitor.status.reason for monitor in self._monitors.values()]
+        if not self._learnt.is_plausible:
+            found.append(DISPLACED)
         return tuple(dict.fromkeys(each for each in found if each))
+
+    @property
+    def _learnt(self) -> Biases:
+        """Biases of the first receiver."""
+        first = self._monitors.get(0)
+        return self._start if first is None else first.learnt
 
     @property
     def code(self) -> int:
@@ -187,18 +205,16 @@ class GnssWatch:
         return math.nan if first is None else math.hypot(*first.status.difference_en_m)
 
     def maps(self) -> dict[str, Any]:
-        """Displacements for the state file: that of this map, learnt further, and the others."""
+        """Biases for the state file: those of this map, learnt further, after the others."""
         known = {digest: each for digest, each in self._known.items() if digest != self._digest}
-        first = self._monitors.get(0)
-        learnt = self._start if first is None else first.status.displacement
-        if self._digest and learnt.agreed_s > 0:
-            known[self._digest] = learnt
-        return {digest: asdict(each) for digest, each in known.items()}
+        if self._digest and self._learnt.agreed_s > 0:
+            known[self._digest] = self._learnt
+        return {digest: each.to_plain() for digest, each in known.items()}
 
     def plain(self) -> list[dict[str, Any]]:
         """Status of each receiver for the line of health."""
         return [
-            _plain(number, each.status, self._now_ns)
+            _plain(number, each.status, self._now_ns) | _plain_biases(each.learnt)
             for number, each in sorted(self._monitors.items())
         ]
 
@@ -222,19 +238,20 @@ class GnssWatch:
         return known and fix.confidence >= self._least and state in (None, "tracking")
 
     def _position(self, fix: Fix, now_ns: int) -> MapPosition:
-        east, north = (fix.evidence.get(f"vel_{n}_mps", math.nan) for n in ("east", "north"))
-        known = math.isfinite(east) and math.isfinite(north)
         return MapPosition(
             now_ns,
             np.asarray(self._frame.en_from_latlon(fix.lat_deg, fix.lon_deg)),
             error_ellipse(fix.cov_en_m2)[0],
-            np.array([east, north]) if known else None,
-            fix.heading_deg if math.isfinite(fix.heading_deg) else 0.0,
+            _velocity(fix),
+            _or_zero(fix.heading_deg),
+            _or_zero(fix.agl_m),
         )
 
     def _evidence(self, now_ns: int) -> dict[str, float]:
         """Position of the first receiver at an exposure, by its velocity, and the fault's code."""
         made = {"gnss_fault": float(self.code)}
+        if self._learnt.agreed_s > 0:
+            made |= _bias_evidence(self._learnt)
         last = self._last
         if last is None or not last.is_valid:
             return made
@@ -249,6 +266,16 @@ class GnssWatch:
             "gnss_lon_deg": float(lon),
             "gnss_std_m": last.std_m,
         }
+
+
+def _velocity(fix: Fix) -> Array | None:
+    """Velocity (2,) of the track, east and north; None where it is not known."""
+    made = np.array([fix.evidence.get(f"vel_{n}_mps", math.nan) for n in ("east", "north")])
+    return made if np.isfinite(made).all() else None
+
+
+def _or_zero(value: float) -> float:
+    return value if math.isfinite(value) else 0.0
 
 
 def _change(
@@ -285,5 +312,30 @@ def _plain(number: int, status: GnssStatus, now_ns: int) -> dict[str, Any]:
         "fault": status.fault.value if status.fault else None,
         "difference_m": round(length, 2) if known else None,
         "bearing_deg": round(bearing, 1) if known else None,
-        "displacement": {k: round(v, 2) for k, v in asdict(status.displacement).items()},
+    }
+
+
+def _shown(learnt: Biases) -> list[tuple[float, float]]:
+    """Each bias and its standard deviation, in the units of `BIASES`."""
+    scale = np.array([1.0, 1.0, math.degrees(1.0), math.degrees(1.0), 1e3])
+    return list(zip((scale * learnt.mean).tolist(), (scale * learnt.stds).tolist(), strict=True))
+
+
+def _bias_evidence(learnt: Biases) -> dict[str, float]:
+    made: dict[str, float] = {}
+    for (key, std_key), (value, std) in zip(BIASES, _shown(learnt), strict=True):
+        made |= {key: round(value, 3), std_key: round(std, 3)}
+    return made
+
+
+def _plain_biases(learnt: Biases) -> dict[str, Any]:
+    """What was learnt, for the line of health."""
+    (east, _), (north, _), pitch, roll, latency = _shown(learnt)
+    place = {"east_m": east, "north_m": north, "std_m": learnt.std_m, "agreed_s": learnt.agreed_s}
+    mount = dict(zip(("pitch_deg", "pitch_std_deg"), pitch, strict=True))
+    mount |= dict(zip(("roll_deg", "roll_std_deg"), roll, strict=True))
+    times = dict(zip(("ms", "std_ms"), latency, strict=True))
+    parts = {"displacement": place, "mount": mount, "latency": times}
+    return {
+        name: {key: round(value, 2) for key, value in part.items()} for name, part in parts.items()
     }
