@@ -89,16 +89,9 @@ class Tracker:
 
         Raises `MapFileError` where the map has no registration layer or no confidence.
         """
-        registration = localizer.registration
-        if registration is None or registration.confidence is None:
-            raise MapFileError("a track needs a map with a registration layer and its confidence")
-        self._registration, self._confidence = registration, registration.confidence
-        self._localizer, self._heading_known = localizer, heading_known
+        self._heading_known = heading_known
         self.model, self._usual_model = model or Model(), model is None
-        grid = localizer.grid
-        east_m, south_m = grid.width_px * grid.gsd_m, -grid.height_px * grid.gsd_m
-        extent = grid.west_m, grid.north_m + south_m, grid.west_m + east_m, grid.north_m
-        self.mixture = Mixture(self.model, extent)
+        self.mixture = Mixture(self.model, self._use(localizer))
         self._time_ns: int | None = None
         self._before: OdometryView | None = None
         self._velocity: Array | None = None
@@ -110,6 +103,24 @@ class Tracker:
         self._outcomes: list[tuple[Fix | NoFix, Telemetry]] = []
         self._lagged: list[Fix | NoFix] = []
         self.state = State.SEARCHING
+
+    def _use(self, localizer: Localizer) -> tuple[float, float, float, float]:
+        """Use the map of a localizer: its extent (west, south, east, north) in metres."""
+        registration = localizer.registration
+        if registration is None or registration.confidence is None:
+            raise MapFileError("a track needs a map with a registration layer and its confidence")
+        self._registration, self._confidence = registration, registration.confidence
+        self._localizer, grid = localizer, localizer.grid
+        east_m, south_m = grid.width_px * grid.gsd_m, -grid.height_px * grid.gsd_m
+        return grid.west_m, grid.north_m + south_m, grid.west_m + east_m, grid.north_m
+
+    def continue_on(self, localizer: Localizer) -> None:
+        """Continue the track between two views on another map, which shows the aircraft too.
+
+        Not with `smooth`, whose history is in the plane of one map. Raises as the constructor.
+        """
+        frame = self._localizer.sheet.frame
+        self.mixture.move(frame, localizer.sheet.frame, self._use(localizer))
 
     def locate(self, view: View) -> Fix | NoFix:
         """The position of the aircraft, by this view and all before it.
