@@ -98,9 +98,7 @@ class _MapCutter:
     def __init__(self, atlas: Atlas, area: Area) -> None:
         common = atlas.recipe
         self.area = area
-        self.grid = grid = grid_of(
-            area, common.gsd_m, common.gsd_m, common.tile_px, common.overlap
-        )
+        self.grid = grid = grid_of(area, common.gsd_m, common.gsd_m, common.tile_px, common.overlap)
         sheets = atlas.over(box_deg(area, grid.tile_m))
         require_sheets(atlas, sheets)
         self.members = members = opened_sheets(atlas, sheets, grid)

@@ -95,9 +95,10 @@ def recognition(
 ) -> float:
     """Probability that a view showed the map, given its place and the prediction of that.
 
-    `covariance` (8, 8): of the prediction. `most_agreement`: see `Model`. The odds by the view alone, times the likelihood ratio
-    of the innovation (6,) in position, heading and scale between a right place and one that chance
-    finds in the area searched. A place within the gate is never less likely for its distance.
+    `covariance` (8, 8): of the prediction. `most_agreement`: see `Model`. The odds by the view
+    alone, times the likelihood ratio of the innovation (6,) in position, heading and scale between
+    a right place and one that chance finds in the area searched. A place within the gate is never
+    less likely for its distance.
     """
     spread = covariance[np.ix_(SEEN[:4], SEEN[:4])] + seen.own_noise[:4, :4]
     ratio = log_density(innovation[:4], spread) - seen.log_chance

@@ -113,9 +113,9 @@ def moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:
 
 def moved(each: Hypothesis, plane: LocalFrame, other: LocalFrame) -> Hypothesis:
     """A hypothesis of one plane in another one, which is turned by the convergence of north."""
-    step_m = np.array([0.0, NORTH_STEP_M])
-    places = other.en_from_latlon(*plane.latlon_from_en(each.mean[POSITION] + [0 * step_m, step_m]))
-    east, north = (places[1] - places[0]).tolist()
+    two = each.mean[POSITION] + np.array([[0.0, 0.0], [0.0, NORTH_STEP_M]])
+    place, to_north = other.en_from_latlon(*plane.latlon_from_en(two))
+    east, north = (to_north - place).tolist()
     turn = math.atan2(east, north)
     turned = np.eye(len(each.mean))
     turned[POSITION, POSITION] = turned[VELOCITY, VELOCITY] = [
@@ -123,7 +123,7 @@ def moved(each: Hypothesis, plane: LocalFrame, other: LocalFrame) -> Hypothesis:
         [-math.sin(turn), math.cos(turn)],
     ]
     mean = turned @ each.mean
-    mean[POSITION] = places[0]
+    mean[POSITION] = place
     mean[HEADING] += turn
     return replace(each, mean=mean, covariance=turned @ each.covariance @ turned.T)
 
