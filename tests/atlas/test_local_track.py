@@ -51,12 +51,15 @@ def test_the_track_follows_from_one_map_to_the_next(atlas, views, places, monkey
     track = LocalTrack(atlas, found(views, places), heading_known=False)
     assert track.agrees
     assert track.fix.confidence <= 0.95  # no more than that of the place found
+    along = LocalFrame(*places[0]).en_from_latlon(*places[-1])
+    heading_deg = math.degrees(math.atan2(*along))  # views look along the route
     for view, place in zip(views[BEGUN:], places[BEGUN:], strict=True):
         assert track.locate(view)
         here = (track.fix.lat_deg, track.fix.lon_deg)
         assert distances_m([here], [place])[0] < 25
         assert track.state is State.TRACKING
         assert track.fix.confidence > 0.9
+        assert abs((track.fix.heading_deg - heading_deg + 180) % 360 - 180) < 5
     assert len(cuts) > 1
 
 

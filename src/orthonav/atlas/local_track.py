@@ -42,17 +42,18 @@ class LocalTrack:
     def __init__(self, atlas: Atlas, found: FoundPlace, *, heading_known: bool) -> None:
         """Begin with the views on which the place was found. Raises as `cut_in_memory`."""
         self._atlas = atlas
-        views, places = zip(*found.seen, strict=True)
+        views = [view for view, _ in found.seen]
+        places = [place.latlon_deg for _, place in found.seen]
         first, last = views[0].telemetry, views[-1].telemetry
-        middle = LocalFrame(*places[0].latlon_deg)
-        away = distances_m([places[0].latlon_deg] * len(places), [p.latlon_deg for p in places])
+        middle = LocalFrame(*places[0])
+        away = distances_m([places[0]] * len(places), places)
         self._area, localizer = self._cut(
             middle, float(away.max()) + SIGMAS * found.std_m + _half_diagonal_m(views[-1])
         )
         self._tracker = Tracker(
             localizer, model=MODEL.at_height(first.agl_m), heading_known=heading_known
         )
-        prior: Prior | None = Prior(*places[0].latlon_deg, found.std_m)
+        prior: Prior | None = Prior(*places[0], found.std_m)
         for view in views:
             telemetry = replace(view.telemetry, prior=prior)
             seen = self._tracker.locate(replace(view, telemetry=telemetry))
@@ -63,7 +64,7 @@ class LocalTrack:
                 ]
         self._take(seen, last, found.confidence)
         here = [(self._last.lat_deg, self._last.lon_deg)]
-        off_m = distances_m(here, [places[-1].latlon_deg])[0]
+        off_m = distances_m(here, [places[-1]])[0]
         self.agrees = bool(off_m <= self._last.radius_m)
 
     @property
@@ -72,11 +73,13 @@ class LocalTrack:
         return self._tracker.state
 
     def locate(self, view: View) -> bool:
-        """Follow a view; False where the aircraft may be anywhere, and the track has ended."""
+        """Follow a view; False where the track has ended: the aircraft may be anywhere, or a lost
+        track is not found again at once."""
         if not self._can_follow(view.telemetry, _half_diagonal_m(view)):
             return False
+        was_lost = self.state is State.LOST
         self._take(self._tracker.locate(view), view.telemetry)
-        return True
+        return not (was_lost and self.state is State.LOST)
 
     def passed(self, telemetry: Telemetry, reason: NoFix) -> bool:
         """The same for a view whose picture cannot be used for `reason`."""

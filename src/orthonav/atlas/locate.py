@@ -40,7 +40,7 @@ class AtlasLocator:
 
     def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """The outcome of a view that cannot be used: `reason`."""
-        self._followed(lambda track: track.passed(telemetry, reason))
+        self._follow(lambda track: track.passed(telemetry, reason))
         return self._outcome(reason)
 
     def locate(self, view: View) -> Fix | NoFix:
@@ -49,7 +49,8 @@ class AtlasLocator:
         Raises `CameraError` where the image is not of the camera's size, `StorageError` where
         sheets cannot be fetched.
         """
-        if self._followed(lambda track: track.locate(view)) is State.TRACKING:
+        self._follow(lambda track: track.locate(view))
+        if self._track is not None and self._track.fix is not None:
             self._finder.restart()
             return self._outcome()
         found = self._finder.find(view)
@@ -58,19 +59,16 @@ class AtlasLocator:
         self._begin(found)
         return self._outcome()
 
-    def _followed(self, follow: Callable[[LocalTrack], bool]) -> State | None:
-        """State of the track after it took in a view by `follow`; None where there is none."""
+    def _follow(self, take_in: Callable[[LocalTrack], bool]) -> None:
+        """Let the track, if there is one, take in a view; forget a track that has ended."""
         if self._track is None:
-            return None
+            return
         try:
-            followed = follow(self._track)
+            if not take_in(self._track):
+                self._track = None
         except (AreaError, AtlasError) as error:
             log.warning("no map can be cut where the aircraft is expected: %s", error)
-            followed = False
-        if not followed:
             self._track = None
-            return None
-        return self._track.state
 
     def _begin(self, found: FoundPlace) -> None:
         """Begin another track at a place, where its views agree on it on a map cut there too."""

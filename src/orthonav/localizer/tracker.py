@@ -95,6 +95,7 @@ class Tracker:
         self._time_ns: int | None = None
         self._before: OdometryView | None = None
         self._velocity: Array | None = None
+        self._seen: list[Sighting] = []
         self._new_ground = np.full(2, np.inf)
         self._start_was_reported = False
         self._use_prior, self._every_prior = use_prior, every_prior
@@ -131,6 +132,7 @@ class Tracker:
         refused = check_view(view, self._localizer.grid.gsd_m, self._heading_known)
         overlap, ground = self._predict(None if refused else view, view.telemetry)
         self._new_ground += 1 - overlap
+        self._seen = []
         if refused is None:
             refused = self._update(view, overlap, ground)
         return self._outcome(view.telemetry, refused)
@@ -142,6 +144,7 @@ class Tracker:
 
     def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """The position by dead reckoning, at a view whose picture cannot be used for `reason`."""
+        self._seen = []
         self._predict(None, telemetry)
         return self._outcome(telemetry, reason)
 
@@ -192,6 +195,8 @@ class Tracker:
             }
             mean, covariance = estimate.mean, estimate.covariance
             outcome = self._fix(mean, covariance, estimate.confidence, telemetry, more)
+            if not self._heading_known:
+                outcome = replace(outcome, heading_deg=self._registered_heading_deg(outcome, mean))
         if self._history is not None:
             self._history.record(self.mixture)
             self._outcomes.append((outcome, telemetry))
@@ -199,6 +204,14 @@ class Tracker:
                 smoothed = self._history.smoothed(self._lag + 1)[0]
                 self._lagged.append(self._smoothed_fix(smoothed, self._outcomes[-self._lag - 1]))
         return outcome
+
+    def _registered_heading_deg(self, fix: Fix, mean: Array) -> float:
+        """The heading under which this view was registered at a fix; NaN where it was not."""
+        off_m, turn_rad = min(
+            ((float(np.hypot(*(each.mean[:2] - mean[:2]))), each.mean[2]) for each in self._seen),
+            default=(math.inf, math.nan),
+        )
+        return math.degrees(turn_rad) % 360 if off_m <= fix.radius_m else math.nan
 
     def _predict(self, view: View | None, telemetry: Telemetry) -> tuple[float, float]:
         """Propagate the track to the time of this view.
@@ -338,6 +351,7 @@ class Tracker:
             math.radians(telemetry.roll_deg),
             self._tilt_noise(telemetry),
         )
+        self._seen = sightings
         self.mixture.update(attitude, sightings, newness, searched, ground)
         return None
 
