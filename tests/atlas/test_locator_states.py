@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from orthonav.atlas import locate
 from orthonav.atlas.find import FoundPlace
 from orthonav.atlas.locate import AtlasLocator
+from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.errors import AtlasError
 from orthonav.records import NoFix
 from orthonav.track import State
@@ -51,11 +52,16 @@ class Track:
         return True
 
 
+def made(**recipe):
+    atlas = SimpleNamespace(recipe=AtlasRecipe(gsd_m=1.0, **recipe), url="atlas")
+    return AtlasLocator(SimpleNamespace(atlas=atlas), None)
+
+
 @pytest.fixture
 def locator(monkeypatch):
     monkeypatch.setattr(locate, "PlaceFinder", Finder)
     monkeypatch.setattr(locate, "LocalTrack", Track)
-    return AtlasLocator(SimpleNamespace(atlas=None), None)
+    return made()
 
 
 @pytest.fixture
@@ -103,3 +109,9 @@ def test_a_view_that_cannot_be_used_has_its_reason(tracking):
     reason = NoFix("bad_image", "damaged")
     assert tracking.passed(None, reason) is reason
     assert tracking.state_name == "coasting"
+
+
+@pytest.mark.parametrize("recipe", [{"method": "triplet:width=32"}, {"registration": False}])
+def test_an_atlas_without_maps_to_cut_is_refused(recipe):
+    with pytest.raises(AtlasError, match="gradient and registration"):
+        made(**recipe)
