@@ -11,7 +11,7 @@ from safetensors import SafetensorError
 from helpers import textured
 from orthonav.atlas.catalog import Atlas, SheetDescription
 from orthonav.atlas.coverage import box_deg, check_shown
-from orthonav.atlas.cut import cut_map
+from orthonav.atlas.cut import cut_in_memory, cut_map
 from orthonav.atlas.recipe import AtlasRecipe
 from orthonav.embed.cells import CellLayout
 from orthonav.embed.stored import embedder_of
@@ -114,6 +114,15 @@ def cut(folder, middle, tmp_path_factory):
     out = tmp_path_factory.mktemp("cut") / "cut.onav"
     cut_map(Atlas.open(str(folder)), out, bounds_deg=bounds_around(middle, 150), workers=1)
     return open_map(out)
+
+
+def test_a_map_cut_in_memory_is_the_one_that_is_written(folder, middle, cut):
+    area = Area.from_bounds(bounds_around(middle, 150))
+    made = cut_in_memory(Atlas.open(str(folder)), area)
+    assert set(made.arrays) == set(cut.arrays)
+    for name in cut.arrays:
+        np.testing.assert_array_equal(made.arrays[name], cut.arrays[name])
+    assert Localizer(made).registration is not None
 
 
 def sheet_file(atlas, name):

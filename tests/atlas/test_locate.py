@@ -12,33 +12,19 @@ import pytest
 
 pytest.importorskip("faiss", reason="searching an atlas needs FAISS")
 
-from orthonav.atlas.build import AtlasRequest, build_atlas
 from orthonav.atlas.catalog import Atlas
-from orthonav.atlas.cluster import SerialRunner
+from orthonav.atlas.find import _against, rectified
 from orthonav.atlas.index import make_index
 from orthonav.atlas.index_manifest import MANIFEST, IndexManifest, read_manifest, stale_sheets
-from orthonav.atlas.locate import AtlasLocator, _against, rectified
-from orthonav.atlas.recipe import CoarseRecipe
+from orthonav.atlas.locate import AtlasLocator
 from orthonav.atlas.sheet_registration import SheetRegistrar
 from orthonav.atlas.store import Store
 from orthonav.atlas.tile_search import TileSearch
 from orthonav.errors import AtlasError
 from orthonav.flight.folder import open_flight
 from orthonav.geo.frames import distances_m
-from orthonav.geo.route import Route
-from orthonav.imagery.mosaic import Mosaic
 from orthonav.onboard.run import locate_view
 from orthonav.records import Fix, NoFix, View
-from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
-
-RECIPE = {
-    "gsd_m": 2.5,
-    "sheet_km": 2.0,
-    "tile_px": 128,
-    "calibration_views": 12,
-    "coarse": dataclasses.asdict(CoarseRecipe(5.0, 64, 0.875)),
-}
-
 
 CANDIDATES = 6
 """Registering candidates takes most of the time."""
@@ -46,36 +32,7 @@ CANDIDATES = 6
 
 @pytest.fixture(autouse=True)
 def fewer_candidates(monkeypatch):
-    monkeypatch.setattr("orthonav.atlas.locate.CANDIDATES", CANDIDATES)
-
-
-@pytest.fixture(scope="module")
-def atlas(area, tmp_path_factory):
-    """An atlas of the first date with its index; read-only."""
-    place = tmp_path_factory.mktemp("located") / "atlas"
-    with pytest.MonkeyPatch.context() as patch, SerialRunner() as runner:
-        patch.setattr("orthonav.prepare.calibrate.CROPS", 24)  # most of the time of a sheet
-        built = build_atlas(AtlasRequest(str(place), [area.past], RECIPE), runner)
-    assert not built.failed
-    return Atlas.open(place)
-
-
-@pytest.fixture(scope="module")
-def flown(area, tmp_path_factory):
-    """A flight of five views across the second date, heading not reported; read-only."""
-    south, north = _inner(area.present)
-    request = SimulateRequest(
-        [area.present],
-        tmp_path_factory.mktemp("flown") / "flight",
-        route=Route((south, north)),
-        spacing_m=130.0,
-        agl_m=area.agl_m,
-        camera=area.camera,
-        errors=Errors(agl_std=0.03),
-        seed=3,
-    )
-    simulate_flight(request)
-    return request.out
+    monkeypatch.setattr("orthonav.atlas.find.CANDIDATES", CANDIDATES)
 
 
 @pytest.fixture(scope="module")
@@ -100,13 +57,6 @@ def first_view(flown):
 def copied(atlas, tmp_path):
     """A copy of the atlas, to be changed."""
     return Atlas.open(shutil.copytree(atlas.url, tmp_path / "copy"))
-
-
-def _inner(ortho):
-    """Two places well inside an orthophoto, from its south-west to its north-east."""
-    outline = Mosaic.open([ortho]).outline_latlon_deg
-    low, high = outline.min(axis=0), outline.max(axis=0)
-    return tuple(low + 0.33 * (high - low)), tuple(low + 0.67 * (high - low))
 
 
 def _truth(flown):

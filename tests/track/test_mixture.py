@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from orthonav.geo.frames import LocalFrame
 from orthonav.track import (
     CameraDisplacement,
     Mixture,
@@ -495,3 +496,31 @@ def test_a_place_that_contradicts_the_track_does_not_descend_from_the_track():
     mixture.update(flight.reported(), [flight.sighting(7.0)], confirms=False)
     found = mixture.estimate(RADIUS_M)
     assert np.hypot(*(found.mean[:2] - flight.place)) < 15 and not found.followed
+
+
+@pytest.mark.parametrize("away_m", [(4000.0, -7000.0), (0.0, 20_000.0)], ids=["near", "far"])
+def test_a_track_goes_on_in_the_plane_of_another_map(away_m):
+    """Position, course over true north and uncertainty stay as they are."""
+    plane = LocalFrame(62.0, 12.0)
+    other = LocalFrame(*(float(each) for each in plane.latlon_from_en(away_m)))
+    _, mixture, _ = flown(3, views=15)
+    before = mixture.estimate(RADIUS_M)
+    mixture.move(plane, other, EXTENT)
+    after = mixture.estimate(RADIUS_M)
+    there = other.en_from_latlon(*plane.latlon_from_en(before.mean[:2]))
+    assert after.mean[:2] == pytest.approx(there, abs=0.01)
+    seconds = 5.0
+    ahead = [
+        np.array(frame.latlon_from_en(each.mean[:2] + seconds * each.mean[2:4]))
+        for frame, each in ((plane, before), (other, after))
+    ]
+    assert ahead[1] == pytest.approx(ahead[0], abs=1e-7)
+    to_north = before.mean[:2] + np.array([0.0, 10.0])
+    north = other.en_from_latlon(*plane.latlon_from_en(to_north)) - there
+    turned = after.mean[4] - before.mean[4]
+    assert turned == pytest.approx(math.atan2(*north), abs=1e-6)
+    assert abs(turned) > 1e-4 or away_m[0] == 0
+    for covariance in (before.covariance, after.covariance):
+        assert np.linalg.eigvalsh(covariance[:2, :2])[0] > 0
+    assert np.trace(after.covariance[:2, :2]) == pytest.approx(np.trace(before.covariance[:2, :2]))
+    assert after.confidence == pytest.approx(before.confidence, abs=1e-6)

@@ -82,7 +82,7 @@ class PlaceEvidence(Placement):
     """A possible placement with its evidence.
 
     `log_odds`: of this place against all others of the atlas, from this view alone (nats).
-    `key`: number by which the caller recognizes the place.
+    `key`: number by which the caller recognizes the view.
     """
 
     log_odds: float
@@ -98,7 +98,7 @@ class Chain:
     `log_odds`: of the chain (nats).
     `views`: how many agree, in views of new ground.
     `latest_log_odds`: what the latest view alone says of its place (nats).
-    `anchors`: latitudes and longitudes of the views that counted.
+    `anchors`: the places of the views that counted.
     `velocity_en_mps`: east and north, None where unknown.
     `missed`: views since the latest place that did not support the chain.
     """
@@ -108,9 +108,14 @@ class Chain:
     log_odds: float
     views: float
     latest_log_odds: float
-    anchors: tuple[tuple[float, float], ...]
+    anchors: tuple[PlaceEvidence, ...]
     velocity_en_mps: NDArray[np.float64] | None = None
     missed: int = 0
+
+    def latest(self, count: int) -> tuple[PlaceEvidence, ...]:
+        """The latest places that counted, and the last one; at most `count`."""
+        places = self.anchors if self.anchors[-1] is self.last else (*self.anchors, self.last)
+        return places[-count:]
 
     def _seconds(self, time_ns: int) -> float:
         return max(0.0, (time_ns - self.time_ns) / 1e9)
@@ -218,15 +223,15 @@ def _support(place: PlaceEvidence, gain: float) -> float:
 
 def _begun(place: PlaceEvidence, time_ns: int) -> Chain:
     odds = min(place.log_odds, MAX_LOG_ODDS)
-    return Chain(place, time_ns, odds, 1.0, odds, (place.latlon_deg,))
+    return Chain(place, time_ns, odds, 1.0, odds, (place,))
 
 
 def _extended(
     chain: Chain, place: PlaceEvidence, time_ns: int, side_m: float, gain: float
 ) -> Chain:
-    here = place.latlon_deg
-    new = min(1.0, nearest_m(here, chain.anchors) / max(side_m, 1.0))
-    anchors = (*chain.anchors, here)[-ANCHORS:]
+    there = [each.latlon_deg for each in chain.anchors]
+    new = min(1.0, nearest_m(place.latlon_deg, there) / max(side_m, 1.0))
+    anchors = (*chain.anchors, place)[-ANCHORS:]
     if new < MIN_NEW:
         new, anchors = 0.0, chain.anchors
     support = _support(place, gain)

@@ -20,13 +20,13 @@ from orthonav.atlas.cut_sheets import CutSheet, opened_sheets, pooled_manifest, 
 from orthonav.atlas.warp import Warp, joined_cells, joined_grey
 from orthonav.cores import usable_cores
 from orthonav.embed.cells import CellLayout
-from orthonav.embed.whitened import CellSheet, WhitenedRecipe, learn
+from orthonav.embed.whitened import CellSheet, learn
 from orthonav.errors import AreaError, OutputError, VariantError
 from orthonav.files import Progress, no_progress
 from orthonav.geo.area import Area, Extent, require_one_area
-from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
 from orthonav.mapfile.manifest import Manifest, SheetInfo
+from orthonav.mapfile.reader import MapFile
 from orthonav.mapfile.writer import write_map
 from orthonav.prepare.blocks import Block, Preview, blocks_of
 from orthonav.prepare.build import BuildResult
@@ -67,31 +67,42 @@ def cut_map(
     if not 1 <= workers <= MAX_WORKERS:
         raise VariantError(f"workers must be 1 to {MAX_WORKERS}, got {workers}")
     area = _area(route, band_m, bounds_deg)
-    common = atlas.recipe
-    grid = grid_of(area, common.gsd_m, common.gsd_m, common.tile_px, common.overlap)
     progress("sheets", 0.0)
-    sheets = atlas.over(box_deg(area, grid.tile_m))
-    require_sheets(atlas, sheets)
-    members = opened_sheets(atlas, sheets, grid)
-    _check_out(atlas, out, members)
-    check_covered(area, grid, [each.source for each in members], common.sheets, allow_holes)
+    cutter = _MapCutter(atlas, area)
+    _check_out(atlas, out, cutter.members)
+    sources = [each.source for each in cutter.members]
+    check_covered(area, cutter.grid, sources, atlas.recipe.sheets, allow_holes)
     progress("sheets", 1.0)
-    recipe, representation = recipes(members[0].manifest)
-    cutter = _MapCutter(area, grid, members, representation)
     cutter.read(progress, workers)
-    check_shown(area, grid, cutter.cells, allow_holes)
-    written = write_map(out, *_learnt(cutter, recipe, members, workers, progress))
+    check_shown(area, cutter.grid, cutter.cells, allow_holes)
+    written = write_map(out, *_learnt(cutter, workers, progress))
     progress("learn", 1.0)
     return BuildResult(written, out.stat().st_size)
+
+
+def cut_in_memory(atlas: Atlas, area: Area) -> MapFile:
+    """The map of an area, flown at once and never written; missing sheets are holes in it.
+
+    Raises `AreaError` for areas outside the atlas, `AtlasError` where sheets are damaged or cannot
+    be cut from, `StorageError`.
+    """
+    cutter = _MapCutter(atlas, area)
+    cutter.read(no_progress, 1)
+    manifest, arrays = _learnt(cutter, 1, no_progress)
+    return MapFile(Path(atlas.url, "cut"), 0, manifest, arrays)
 
 
 class _MapCutter:
     """Collects cells, grey layer and preview of the map from the sheets under it."""
 
-    def __init__(
-        self, area: Area, grid: TileGrid, members: Sequence[CutSheet], representation: Any
-    ) -> None:
-        self.area, self.grid = area, grid
+    def __init__(self, atlas: Atlas, area: Area) -> None:
+        common = atlas.recipe
+        self.area = area
+        self.grid = grid = grid_of(area, common.gsd_m, common.gsd_m, common.tile_px, common.overlap)
+        sheets = atlas.over(box_deg(area, grid.tile_m))
+        require_sheets(atlas, sheets)
+        self.members = members = opened_sheets(atlas, sheets, grid)
+        self.recipe, representation = recipes(members[0].manifest)
         turns = isinstance(representation, OrientedGradients)
         self._warps = [Warp(each.source, area.frame, grid, turns) for each in members]
         self._layout = layout = CellLayout.for_tiles(grid.tile_px, grid.stride_px)
@@ -162,18 +173,14 @@ def _check_out(atlas: Atlas, out: Path, members: Sequence[CutSheet]) -> None:
 
 
 def _learnt(
-    cutter: _MapCutter,
-    recipe: WhitenedRecipe,
-    members: Sequence[CutSheet],
-    workers: int,
-    progress: Progress,
+    cutter: _MapCutter, workers: int, progress: Progress
 ) -> tuple[Manifest, dict[str, NDArray[Any]]]:
     """Manifest and arrays of the map."""
-    area, grid = cutter.area, cutter.grid
+    area, grid, members = cutter.area, cutter.grid, cutter.members
     tiles_rc = tiles_of(area, grid, cutter.cells)
     tiles_px = tiles_rc * grid.stride_px
     progress("learn", 0.0)
-    embedder = learn(recipe, cutter.cells, tiles_px, workers)
+    embedder = learn(cutter.recipe, cutter.cells, tiles_px, workers)
     progress("learn", 0.3)
     embeddings = embedder.tiles(cutter.cells, tiles_px, workers)
     centres = grid.centres_en_m(tiles_rc)

@@ -1,71 +1,24 @@
 """Placing the views of a flight in an atlas without any prior position.
 
-Each view is searched among the coarse tiles of the whole atlas, under all possible headings. The
-best places, and the places where earlier views let expect it, are registered on their sheets. Each
-match has odds against the best other match of the whole atlas. Only places on which several views
-agree become fixes (`orthonav.atlas.agreement`).
+Views are searched in the whole atlas until several agree on a place (`orthonav.atlas.find`). From
+there on the aircraft is tracked on a map cut around it (`orthonav.atlas.local_track`). A view that
+the track does not recognize is searched in the whole atlas too: where several of them agree on a
+place, another track begins there.
 """
 
-import math
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+import logging
+from collections.abc import Callable
 
-import numpy as np
-
-from orthonav.atlas.agreement import (
-    MAX_REACH_M,
-    MIN_VIEWS,
-    Agreement,
-    Chain,
-    PlaceEvidence,
-    nearest_m,
-)
-from orthonav.atlas.sheet_registration import SearchRegion, SheetMatch, SheetRegistrar
+from orthonav.atlas.catalog import Atlas
+from orthonav.atlas.find import FoundPlace, PlaceFinder
+from orthonav.atlas.local_track import LocalTrack
+from orthonav.atlas.sheet_registration import SheetRegistrar
 from orthonav.atlas.tile_search import TileSearch
-from orthonav.confidence.registered import (
-    USUAL_BIAS,
-    USUAL_CHANCES,
-    USUAL_WEIGHTS,
-    RegisteredConfidence,
-)
-from orthonav.geo.frames import LocalFrame
-from orthonav.localizer.checks import check_footprint, check_view
-from orthonav.localizer.prepared import MIN_VIEW_PX, pose_prior
-from orthonav.localizer.rectify import RectifiedView, downsampled, rectify_footprint
+from orthonav.errors import AreaError, AtlasError
 from orthonav.records import Fix, NoFix, Telemetry, View
+from orthonav.track import State
 
-# Values without another source: `python -m benchmarks.atlas_lost`.
-CANDIDATES = 24
-"""Places of the whole atlas that are registered: they cost a second, most of the time of a view."""
-TURN_STEP_DEG = 8.0
-LOG_SCALES = (-0.06, 0.06)
-"""Headings and log scales under which coarse tiles are searched: each
-view has a pose that is off by 4 deg and 6 % at most, for scales within 12 %."""
-KNOWN_SIGMAS = 2.0
-"""Standard deviations of a reported heading that are searched to either side."""
-REACH_STRIDES = 0.8
-"""Strides of the coarse tiles around a candidate that are searched: more than half a diagonal."""
-TURN_STD_RAD = math.radians(4.0)
-"""Of the heading of a candidate: half of `TURN_STEP_DEG`."""
-VIEW_TILES = (0.6, 2.5)
-"""Least and greatest side of a view, in coarse tiles."""
-FOLLOWED, FOLLOWED_NATS = 4, 4.0
-"""Chains whose expected places are searched: at most so many, and not less likely than the best by
-more nats."""
-RIVAL_SHARE = 0.25
-"""Matches farther apart than this share of the view's side are different places."""
-FOLLOW_VIEWS, FOLLOW_CONFIDENCE, FOLLOW_REACH_M = 2.5, 0.97, 600.0
-"""While the best chain has so many views and this confidence, and the view is expected within this
-distance (or the view's side), only the expected places are searched."""
-WHOLE_EVERY = 5
-"""The whole atlas is searched again after so many views."""
-LIKELY = 0.5
-"""Least confidence of a fix."""
-MAX_CONFIDENCE = 0.999
-LEAST = 1e-5
-"""Least and greatest (1 - LEAST) probability of a match, for finite odds."""
-USUAL_CONFIDENCE = RegisteredConfidence(USUAL_BIAS, USUAL_WEIGHTS, USUAL_CHANCES)
-"""Used for sheets with too little imagery to learn a confidence."""
+log = logging.getLogger(__name__)
 
 
 class AtlasLocator:
@@ -74,24 +27,28 @@ class AtlasLocator:
     def __init__(
         self, registrar: SheetRegistrar, search: TileSearch, *, heading_known: bool = False
     ) -> None:
-        self._registrar, self._search = registrar, search
+        """Raises `AtlasError` where no maps can be cut out of the atlas."""
+        self._atlas: Atlas = registrar.atlas
+        recipe = self._atlas.recipe
+        if recipe.method.partition(":")[0] != "gradient" or not recipe.registration:
+            raise AtlasError(
+                "an aircraft is tracked on maps that are cut out of the atlas; that needs the "
+                f"method gradient and registration layers: {self._atlas.url}"
+            )
         self._heading_known = heading_known
-        self._agreement = Agreement()
-        self._has_fix = False
-        self._since_whole = 0
+        self._finder = PlaceFinder(registrar, search, heading_known=heading_known)
+        self._track: LocalTrack | None = None
+        self._state = State.SEARCHING
 
     @property
     def state_name(self) -> str | None:
-        """`searching` until views agree, then `tracking`, or `lost` after a view without a fix."""
-        best = self._agreement.best
-        if best is None or best.views < MIN_VIEWS:
-            return "searching"
-        return "tracking" if self._agreement.agreed and self._has_fix else "lost"
+        """That of the track: `searching` before there is one, `lost` after it has ended."""
+        return self._state.value
 
     def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """The outcome of a view that cannot be used: `reason`."""
-        self._has_fix = False
-        return reason
+        self._follow(lambda track: track.passed(telemetry, reason))
+        return self._outcome(reason)
 
     def locate(self, view: View) -> Fix | NoFix:
         """Where a view was taken, once views agree; until then the reason why not.
@@ -99,182 +56,43 @@ class AtlasLocator:
         Raises `CameraError` where the image is not of the camera's size, `StorageError` where
         sheets cannot be fetched.
         """
-        self._has_fix = False
-        recipe = self._search.recipe
-        refused = check_view(view, recipe.gsd_m, self._heading_known)
-        if refused is not None:
-            return refused
-        coarse = rectified(view, recipe.gsd_m)
-        refused = check_footprint(coarse, 1.0, MIN_VIEW_PX)
-        if refused is not None:
-            return refused
-        side_m = math.sqrt(float(coarse.valid.sum())) * recipe.gsd_m
-        least, most = (share * recipe.tile_m for share in VIEW_TILES)
-        if not least <= side_m <= most:
-            return NoFix(
-                "wrong_scale",
-                f"view is {side_m:.0f} m wide; the coarse tiles of this atlas are for views of "
-                f"{least:.0f} to {most:.0f} m",
-            )
-        return self._placed(view, coarse, side_m)
+        self._follow(lambda track: track.locate(view))
+        if self._track is not None and self._track.fix is not None:
+            self._finder.restart()
+            return self._outcome()
+        found = self._finder.find(view)
+        if isinstance(found, NoFix):
+            return self._outcome(found)
+        self._begin(found)
+        return self._outcome()
 
-    def _placed(self, view: View, coarse: RectifiedView, side_m: float) -> Fix | NoFix:
-        time_ns = view.telemetry.time_ns
-        regions = expected = self._expected(view, coarse, time_ns)
-        if self._can_follow(time_ns, side_m):
-            self._since_whole += 1
-        else:
-            self._since_whole = 0
-            regions = [*expected, *self._candidates(view, coarse)]
-        made = (self._registrar.register(view, region, side_m) for region in regions)
-        found = _distinct([each for each in made if each is not None], side_m)
-        places = [
-            PlaceEvidence(*one.latlon_deg, one.turn_rad, one.log_scale, _log_odds(key, found), key)
-            for key, one in enumerate(found)
-        ]
-        # Where only expected places were searched, a wrong place lies there for certain.
-        all_m2 = _searched_m2(regions)
-        chance = _searched_m2(expected) / all_m2 if all_m2 else 1.0
-        self._agreement.add_view(places, time_ns, side_m, chance)
-        return self._outcome(found, view)
+    def _follow(self, take_in: Callable[[LocalTrack], bool]) -> None:
+        """Let the track, if there is one, take in a view; forget a track that has ended."""
+        if self._track is None:
+            return
+        try:
+            if not take_in(self._track):
+                self._track = None
+        except (AreaError, AtlasError) as error:
+            log.warning("no map can be cut where the aircraft is expected: %s", error)
+            self._track = None
 
-    def _can_follow(self, time_ns: int, side_m: float) -> bool:
-        """Whether only the expected places need to be searched this time."""
-        best = self._agreement.best
-        return (
-            best is not None
-            and self._agreement.agreed
-            and best.views >= FOLLOW_VIEWS
-            and self._agreement.confidence >= FOLLOW_CONFIDENCE
-            and best.reach_m(time_ns) <= max(side_m, FOLLOW_REACH_M)
-            and self._since_whole < WHOLE_EVERY
-        )
+    def _begin(self, found: FoundPlace) -> None:
+        """Begin another track at a place, where its views agree on it on a map cut there too."""
+        try:
+            begun = LocalTrack(self._atlas, found, heading_known=self._heading_known)
+        except (AreaError, AtlasError) as error:
+            log.warning("no map can be cut around the place found: %s", error)
+            return
+        if begun.agrees:
+            self._track = begun
 
-    def _expected(self, view: View, coarse: RectifiedView, time_ns: int) -> list[SearchRegion]:
-        """Where the likeliest chains expect the view."""
-        found = []
-        chains = self._agreement.chains[:FOLLOWED]
-        for each in chains:
-            if each.log_odds < chains[0].log_odds - FOLLOWED_NATS:
-                break
-            reach_m = each.reach_m(time_ns)
-            if time_ns < each.time_ns or reach_m > MAX_REACH_M:
-                continue
-            turn, std = each.last.turn_rad, each.turn_std_rad(time_ns)
-            if self._heading_known:
-                turn = math.radians(view.telemetry.yaw_deg)
-                std = pose_prior(view.telemetry, True).turn_std_rad
-            camera, scale = each.expected(time_ns), each.last.log_scale
-            middle = _moved(camera, coarse, turn, scale, 1.0)
-            found.append(SearchRegion(*camera, turn, scale, middle, reach_m, std))
-        return found
-
-    def _candidates(self, view: View, coarse: RectifiedView) -> list[SearchRegion]:
-        """The places of the whole atlas that are most similar to the view."""
-        headings = np.arange(0.0, 360.0, TURN_STEP_DEG)
-        if self._heading_known:
-            reach = KNOWN_SIGMAS * math.degrees(pose_prior(view.telemetry, True).turn_std_rad)
-            steps = math.floor(min(180.0, reach) / TURN_STEP_DEG + 0.5)
-            headings = view.telemetry.yaw_deg + TURN_STEP_DEG * np.arange(-steps, steps + 1)
-        poses = [(math.radians(turn), scale) for turn in headings.tolist() for scale in LOG_SCALES]
-        recipe = self._search.recipe
-        reach_m = REACH_STRIDES * recipe.tile_m * (1 - recipe.overlap)
-        found = []
-        for each in self._search.matches(coarse, poses, CANDIDATES):
-            turn, scale, middle = each.turn_rad, each.log_scale, each.latlon_deg
-            camera = _moved(middle, coarse, turn, scale, -1.0)
-            found.append(SearchRegion(*camera, turn, scale, middle, reach_m, TURN_STD_RAD))
-        return found
-
-    def _outcome(self, found: Sequence[SheetMatch], view: View) -> Fix | NoFix:
-        agreement = self._agreement
-        best = agreement.best
-        if best is None:
-            return NoFix("no_match", "no place of the atlas could be compared with the view")
-        confidence = min(agreement.confidence, MAX_CONFIDENCE)
-        if not agreement.agreed or confidence < LIKELY:
-            return NoFix(
-                "searching",
-                f"{len(agreement.chains)} places are possible; {best.views:.1f} views support the "
-                "likeliest",
-            )
-        self._has_fix = True
-        return _fix(found[best.last.key], best, confidence, view.telemetry)
-
-
-def rectified(view: View, gsd_m: float) -> RectifiedView:
-    """The view rectified to `gsd_m` metres per pixel, its own heading up."""
-    return rectify_footprint(downsampled(view, gsd_m), gsd_m=gsd_m, multiple_px=1)
-
-
-def _searched_m2(regions: Sequence[SearchRegion]) -> float:
-    return sum(math.pi * region.reach_m**2 for region in regions)
-
-
-def _log_odds(key: int, found: Sequence[SheetMatch]) -> float:
-    """Log odds of one of the matches of a view (strongest first) against all the others."""
-    one = found[key]
-    rivals = [each.evidence for place, each in enumerate(found) if place != key]
-    confidence = one.confidence or USUAL_CONFIDENCE
-    likely = min(max(confidence(_against(one.evidence, rivals)), LEAST), 1 - LEAST)
-    return math.log(likely / (1 - likely))
-
-
-def _moved(
-    place: tuple[float, float], view: RectifiedView, turn_rad: float, log_scale: float, sign: float
-) -> tuple[float, float]:
-    """From the camera to the middle of the ground in view (`sign` 1), or back (-1); degrees."""
-    cos, sin = math.cos(turn_rad), math.sin(turn_rad)
-    ahead = view.offset_en_m * math.exp(log_scale) * sign
-    moved = np.array([cos * ahead[0] + sin * ahead[1], cos * ahead[1] - sin * ahead[0]])
-    lat, lon = LocalFrame(*place).latlon_from_en(moved)
-    return float(lat), float(lon)
-
-
-def _distinct(matches: Sequence[SheetMatch], side_m: float) -> list[SheetMatch]:
-    """The strongest match of each place, strongest first."""
-    distinct: list[SheetMatch] = []
-    for each in sorted(matches, key=lambda one: -one.evidence["strength"]):
-        others = [one.latlon_deg for one in distinct]
-        if nearest_m(each.latlon_deg, others) > RIVAL_SHARE * side_m:
-            distinct.append(each)
-    return distinct
-
-
-def _against(
-    evidence: Mapping[str, float], rivals: Sequence[Mapping[str, float]]
-) -> dict[str, float]:
-    """The evidence of a match with the best other match of the whole atlas as its rival.
-
-    The finest level counts only where the strongest rival was compared there too.
-    """
-    made = dict(evidence)
-    for rival, value in (("rival", "strength"), ("look_rival", "look")):
-        made[rival] = max([made[rival], *(each[value] for each in rivals)])
-    strongest = max(rivals, key=lambda each: each["strength"], default=None)
-    if strongest is None or not math.isfinite(made["fine"]):
-        return made
-    if math.isfinite(strongest["fine"]):
-        made["fine_rival"] = max(made["fine_rival"], strongest["fine"])
-    else:
-        made["fine"] = made["fine_rival"] = math.nan
-    return made
-
-
-def _fix(one: SheetMatch, best: Chain, confidence: float, telemetry: Telemetry) -> Fix:
-    covariance = np.array(one.covariance[:2, :2])
-    tilt_std_deg = telemetry.tilt_std_deg
-    if tilt_std_deg is not None and math.isfinite(tilt_std_deg):
-        covariance += np.eye(2) * (telemetry.agl_m * math.radians(tilt_std_deg)) ** 2
-    covariance.flags.writeable = False
-    evidence = {**one.evidence, "views": best.views, "log_odds": best.log_odds}
-    return Fix(
-        lat_deg=one.lat_deg,
-        lon_deg=one.lon_deg,
-        cov_en_m2=covariance,
-        confidence=confidence,
-        radius_m=one.radius_m,
-        heading_deg=math.degrees(one.turn_rad) % 360,
-        agl_m=telemetry.agl_m * math.exp(one.log_scale),
-        evidence=MappingProxyType(evidence),
-    )
+    def _outcome(self, reason: NoFix | None = None) -> Fix | NoFix:
+        """The fix of the track, or why there is none."""
+        if self._track is not None:
+            self._state = self._track.state
+        elif self._state is not State.SEARCHING:
+            self._state = State.LOST
+        fix = None if self._track is None else self._track.fix
+        unconfirmed = NoFix("searching", "the last view does not confirm the place found")
+        return fix or reason or unconfirmed

@@ -91,19 +91,13 @@ class Tracker:
 
         Raises `MapFileError` where the map has no registration layer or no confidence.
         """
-        registration = localizer.registration
-        if registration is None or registration.confidence is None:
-            raise MapFileError("a track needs a map with a registration layer and its confidence")
-        self._registration, self._confidence = registration, registration.confidence
-        self._localizer, self._heading_known = localizer, heading_known
+        self._heading_known = heading_known
         self.model, self._usual_model = model or Model(), model is None
-        grid = localizer.grid
-        east_m, south_m = grid.width_px * grid.gsd_m, -grid.height_px * grid.gsd_m
-        extent = grid.west_m, grid.north_m + south_m, grid.west_m + east_m, grid.north_m
-        self.mixture = Mixture(self.model, extent)
+        self.mixture = Mixture(self.model, self._use(localizer))
         self._time_ns: int | None = None
         self._before: OdometryView | None = None
         self._velocity: Array | None = None
+        self._seen: list[Sighting] = []
         self._new_ground = np.full(2, np.inf)
         self._whole_map = False
         self._use_prior, self._every_prior = use_prior, every_prior
@@ -112,6 +106,24 @@ class Tracker:
         self._outcomes: list[tuple[Fix | NoFix, Telemetry]] = []
         self._lagged: list[Fix | NoFix] = []
         self.state = State.SEARCHING
+
+    def _use(self, localizer: Localizer) -> tuple[float, float, float, float]:
+        """Use the map of a localizer: its extent (west, south, east, north) in metres."""
+        registration = localizer.registration
+        if registration is None or registration.confidence is None:
+            raise MapFileError("a track needs a map with a registration layer and its confidence")
+        self._registration, self._confidence = registration, registration.confidence
+        self._localizer, grid = localizer, localizer.grid
+        east_m, south_m = grid.width_px * grid.gsd_m, -grid.height_px * grid.gsd_m
+        return grid.west_m, grid.north_m + south_m, grid.west_m + east_m, grid.north_m
+
+    def continue_on(self, localizer: Localizer) -> None:
+        """Continue the track between two views on another map, which shows the aircraft too.
+
+        Not with `smooth`, whose history is in the plane of one map. Raises as the constructor.
+        """
+        frame = self._localizer.sheet.frame
+        self.mixture.move(frame, localizer.sheet.frame, self._use(localizer))
 
     def locate(self, view: View) -> Fix | NoFix:
         """The position of the aircraft, by this view and all before it.
@@ -122,6 +134,7 @@ class Tracker:
         refused = check_view(view, self._localizer.grid.gsd_m, self._heading_known)
         overlap, ground = self._predict(None if refused else view, view.telemetry)
         self._new_ground += 1 - overlap
+        self._seen = []
         if refused is None:
             refused = self._update(view, overlap, ground)
         return self._outcome(view.telemetry, refused)
@@ -133,6 +146,7 @@ class Tracker:
 
     def passed(self, telemetry: Telemetry, reason: NoFix) -> Fix | NoFix:
         """The position by dead reckoning, at a view whose picture cannot be used for `reason`."""
+        self._seen = []
         self._predict(None, telemetry)
         return self._outcome(telemetry, reason)
 
@@ -183,6 +197,8 @@ class Tracker:
             }
             mean, covariance = estimate.mean, estimate.covariance
             outcome = self._fix(mean, covariance, estimate.confidence, telemetry, more)
+            if not self._heading_known:
+                outcome = replace(outcome, heading_deg=self._registered_heading_deg(outcome, mean))
         if self._history is not None:
             self._history.record(self.mixture)
             self._outcomes.append((outcome, telemetry))
@@ -190,6 +206,14 @@ class Tracker:
                 smoothed = self._history.smoothed(self._lag + 1)[0]
                 self._lagged.append(self._smoothed_fix(smoothed, self._outcomes[-self._lag - 1]))
         return outcome
+
+    def _registered_heading_deg(self, fix: Fix, mean: Array) -> float:
+        """The heading under which this view was registered at a fix; NaN where it was not."""
+        off_m, turn_rad = min(
+            ((float(np.hypot(*(each.mean[:2] - mean[:2]))), each.mean[2]) for each in self._seen),
+            default=(math.inf, math.nan),
+        )
+        return math.degrees(turn_rad) % 360 if off_m <= fix.radius_m else math.nan
 
     def _predict(self, view: View | None, telemetry: Telemetry) -> tuple[float, float]:
         """Propagate the track to the time of this view.
@@ -329,6 +353,7 @@ class Tracker:
             math.radians(telemetry.roll_deg),
             self._tilt_noise(telemetry),
         )
+        self._seen = sightings
         self.mixture.update(attitude, sightings, newness, searched, ground, confirms=confirms)
         return None
 

@@ -21,9 +21,6 @@ TRUSTED = (0.1, 0.5)
 """Views with a probability of their own below the first do not count, above the second fully."""
 MOST_OF_ONE = 0.75
 """A single view counts at most so much: less than `CONFIRMED`."""
-MOST_AGREEMENT = 25.0
-"""Largest factor on the odds by the agreement with the prediction: a view that has a probability
-below 1 % by itself does not show the map."""
 POSE = slice(2, 4)
 """Heading and scale in a measurement."""
 SEARCHED_SIGMAS = 6.0
@@ -93,16 +90,19 @@ def tempered(
     )
 
 
-def recognition(seen: Measurement, covariance: Array, innovation: Array) -> float:
+def recognition(
+    seen: Measurement, covariance: Array, innovation: Array, most_agreement: float
+) -> float:
     """Probability that a view showed the map, given its place and the prediction of that.
 
-    `covariance` (8, 8): of the prediction. The odds by the view alone, times the likelihood ratio
-    of the innovation (6,) in position, heading and scale between a right place and one that chance
-    finds in the area searched. A place within the gate is never less likely for its distance.
+    `covariance` (8, 8): of the prediction. `most_agreement`: see `Model`. The odds by the view
+    alone, times the likelihood ratio of the innovation (6,) in position, heading and scale between
+    a right place and one that chance finds in the area searched. A place within the gate is never
+    less likely for its distance.
     """
     spread = covariance[np.ix_(SEEN[:4], SEEN[:4])] + seen.own_noise[:4, :4]
     ratio = log_density(innovation[:4], spread) - seen.log_chance
-    agreement = math.exp(min(max(ratio, 0.0), math.log(MOST_AGREEMENT)))
+    agreement = math.exp(min(max(ratio, 0.0), math.log(most_agreement)))
     odds = seen.alone / max(1 - seen.alone, 1e-9) * agreement
     return odds / (1 + odds)
 

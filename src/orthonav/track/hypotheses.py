@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from orthonav.track.model import POSITION, Array
+from orthonav.geo.frames import LocalFrame
+from orthonav.track.model import HEADING, POSITION, VELOCITY, Array
 from orthonav.track.motion import Expected
 
 MAX_HYPOTHESES = 40
@@ -18,6 +19,8 @@ MERGE_SIGMAS = 1.0
 deviations of distance, squared."""
 MINOR_OF_GROUP = 0.01
 """Share of a group of hypotheses below which one says nothing about the group."""
+NORTH_STEP_M = 100.0
+"""Length over which the convergence of two planes is measured."""
 COMPARED = np.ix_([0, 1, 2, 3, 6, 7], [0, 1, 2, 3, 6, 7])
 """Components that decide whether two hypotheses are alike: position, velocity and tilt."""
 
@@ -110,6 +113,23 @@ def moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:
     off = means - mean
     covariance = sum(s * each.covariance for s, each in zip(shares, group, strict=True))
     return mean, np.asarray(covariance + (off * shares[:, None]).T @ off)
+
+
+def moved(each: Hypothesis, plane: LocalFrame, other: LocalFrame) -> Hypothesis:
+    """A hypothesis of one plane in another one, which is turned by the convergence of north."""
+    two = each.mean[POSITION] + np.array([[0.0, 0.0], [0.0, NORTH_STEP_M]])
+    place, to_north = other.en_from_latlon(*plane.latlon_from_en(two))
+    east, north = (to_north - place).tolist()
+    turn = math.atan2(east, north)
+    turned = np.eye(len(each.mean))
+    turned[POSITION, POSITION] = turned[VELOCITY, VELOCITY] = [
+        [math.cos(turn), math.sin(turn)],
+        [-math.sin(turn), math.cos(turn)],
+    ]
+    mean = turned @ each.mean
+    mean[POSITION] = place
+    mean[HEADING] += turn
+    return replace(each, mean=mean, covariance=turned @ each.covariance @ turned.T)
 
 
 def distance(one: Hypothesis, other: Hypothesis) -> float:

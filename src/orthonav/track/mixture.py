@@ -16,6 +16,7 @@ from functools import partial
 
 import numpy as np
 
+from orthonav.geo.frames import LocalFrame
 from orthonav.records import CONFIDENT
 from orthonav.track.evidence import Measurement, confirmed_ground, recognition, tempered
 from orthonav.track.hypotheses import (
@@ -24,6 +25,7 @@ from orthonav.track.hypotheses import (
     major,
     merged,
     moments,
+    moved,
     recognized,
     within,
 )
@@ -77,9 +79,9 @@ BLIND = 0.5
 water and a covered lens last (docs/decisions/tracking.md, 13)."""
 MOST_SIGHTED = 3.0
 """Highest count of recognized ground, in views."""
-WIDE_M, FORGOTTEN = 50.0, 0.5
-"""With every view at which the position is less certain than this (m, per axis), the count is
-multiplied by the second: after a while a track must be confirmed again."""
+FORGOTTEN = 0.5
+"""The count is multiplied by this with every view at which the position is less certain than
+`Model.wide_m`: after a while a track must be confirmed again."""
 GATE = 36.0
 """Gate: largest squared innovation of the position over the trace of its covariance."""
 
@@ -124,13 +126,27 @@ class Mixture:
     def __init__(self, model: Model, extent_en_m: tuple[float, float, float, float]) -> None:
         """`extent_en_m` (west, south, east, north) is that of the map: the aircraft may be
         anywhere on it."""
-        self.model, self._extent = model, np.array(extent_en_m)
-        self.area_m2 = float(np.prod(self._extent[2:] - self._extent[:2]))
+        self.model = model
+        self._set_extent(extent_en_m)
         self.hypotheses: list[Hypothesis] = []
         self.elsewhere = 1.0
         self._state = State.SEARCHING
         self._blind = 0.0
         self._numbers = 0
+
+    def _set_extent(self, extent_en_m: tuple[float, float, float, float]) -> None:
+        self._extent = np.array(extent_en_m)
+        self.area_m2 = float(np.prod(self._extent[2:] - self._extent[:2]))
+
+    def move(
+        self,
+        plane: LocalFrame,
+        other: LocalFrame,
+        extent_en_m: tuple[float, float, float, float],
+    ) -> None:
+        """Continue between two views in another plane, on a map of this extent there."""
+        self.hypotheses = [moved(each, plane, other) for each in self.hypotheses]
+        self._set_extent(extent_en_m)
 
     def start(self, mean_en_m: Array, std_m: float) -> None:
         """Begin at a reported position (2,) with standard deviation `std_m` per axis."""
@@ -391,7 +407,7 @@ class Mixture:
         spread = each.covariance[np.ix_(SEEN, SEEN)] + seen.noise
         log_weight = seen.log_odds + log_density(innovation, spread)
         mean, covariance = updated(each.mean, each.covariance, innovation, spread)
-        shown = recognition(seen, each.covariance, innovation)
+        shown = recognition(seen, each.covariance, innovation, self.model.most_agreement)
         sighted, uncounted = _forgotten(each.sighted, ground), each.uncounted
         if shown >= RECOGNIZED:
             counted = confirmed_ground(seen.alone, uncounted) if confirms else 0.0
@@ -438,7 +454,7 @@ class Mixture:
         self._numbers += 1
         mean, covariance = expected.mean, expected.covariance
         sighted = each.sighted
-        if float(np.trace(covariance[POSITION, POSITION])) > 2 * WIDE_M**2:
+        if float(np.trace(covariance[POSITION, POSITION])) > 2 * self.model.wide_m**2:
             sighted *= FORGOTTEN
         return replace(
             each,

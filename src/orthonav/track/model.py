@@ -84,6 +84,11 @@ class Model:
     """Probability, per second, that the velocity changes by more than `accel_mps2` allows."""
     miss: float = 0.5
     """Probability that a view of ground on the map cannot be found on it."""
+    wide_m: float = 50.0
+    """Per axis: less certain positions are confirmed again after a while."""
+    most_agreement: float = 25.0
+    """Largest factor on the odds that a view shows the map by its agreement with the prediction: a
+    view that has a probability below 1 % by itself does not show it."""
     lost: float = 3e-3
     """Belief that returns to "elsewhere" with every view, so that no error is permanent."""
 

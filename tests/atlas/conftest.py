@@ -1,0 +1,57 @@
+"""An atlas with its index, and a flight over it in another year."""
+
+import dataclasses
+
+import pytest
+
+RECIPE = {
+    "gsd_m": 2.5,
+    "sheet_km": 2.0,
+    "tile_px": 128,
+    "calibration_views": 12,
+}
+COARSE = (5.0, 64, 0.875)
+
+
+@pytest.fixture(scope="module")
+def atlas(area, made_once):
+    """An atlas of the first date with its index; read-only."""
+    from orthonav.atlas.build import AtlasRequest, build_atlas
+    from orthonav.atlas.catalog import Atlas
+    from orthonav.atlas.cluster import SerialRunner
+    from orthonav.atlas.recipe import CoarseRecipe
+
+    def make(folder):
+        recipe = {**RECIPE, "coarse": dataclasses.asdict(CoarseRecipe(*COARSE))}
+        with pytest.MonkeyPatch.context() as patch, SerialRunner() as runner:
+            patch.setattr("orthonav.prepare.calibrate.CROPS", 24)  # most of the time of a sheet
+            request = AtlasRequest(str(folder / "atlas"), [area.past], recipe)
+            assert not build_atlas(request, runner).failed
+
+    return Atlas.open(made_once("searched-atlas", make) / "atlas")
+
+
+@pytest.fixture(scope="module")
+def flown(area, made_once):
+    """A flight of five views across the second date, heading not reported; read-only."""
+    from orthonav.geo.route import Route
+    from orthonav.imagery.mosaic import Mosaic
+    from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+
+    def make(folder):
+        outline = Mosaic.open([area.present]).outline_latlon_deg
+        low, high = outline.min(axis=0), outline.max(axis=0)
+        route = Route(tuple(tuple(low + share * (high - low)) for share in (0.33, 0.67)))
+        request = SimulateRequest(
+            [area.present],
+            folder / "flight",
+            route=route,
+            spacing_m=130.0,
+            agl_m=area.agl_m,
+            camera=area.camera,
+            errors=Errors(agl_std=0.03),
+            seed=3,
+        )
+        simulate_flight(request)
+
+    return made_once("searched-flight", make) / "flight"

@@ -1,0 +1,117 @@
+"""When a track begins, ends and is replaced, shown with a finder and tracks made for it."""
+
+import pytest
+
+pytest.importorskip("faiss", reason="searching an atlas needs FAISS")
+
+from types import SimpleNamespace
+
+from orthonav.atlas import locate
+from orthonav.atlas.find import FoundPlace
+from orthonav.atlas.locate import AtlasLocator
+from orthonav.atlas.recipe import AtlasRecipe
+from orthonav.errors import AtlasError
+from orthonav.records import NoFix
+from orthonav.track import State
+
+SEARCHING = NoFix("searching", "nothing agrees")
+FOUND = FoundPlace((), 1.0, 0.95)
+
+
+class Finder:
+    """Gives the outcomes it is told, and counts restarts."""
+
+    def __init__(self, *_, **__):
+        self.outcomes, self.asked, self.restarts = [], 0, 0
+
+    def find(self, view):
+        self.asked += 1
+        return self.outcomes.pop(0) if self.outcomes else SEARCHING
+
+    def restart(self):
+        self.restarts += 1
+
+
+class Track:
+    """Follows views that are its fixes; `None` is a view that it does not recognize."""
+
+    agrees = True
+
+    def __init__(self, *_, **__):
+        self.fix, self.state = "begun", State.TRACKING
+
+    def locate(self, view):
+        if view == "no map":
+            raise AtlasError("a sheet is damaged")
+        self.fix = view
+        self.state = State.TRACKING if view else State.COASTING
+        return view != "end"
+
+    def passed(self, telemetry, reason):
+        self.fix, self.state = None, State.COASTING
+        return True
+
+
+def made(**recipe):
+    atlas = SimpleNamespace(recipe=AtlasRecipe(gsd_m=1.0, **recipe), url="atlas")
+    return AtlasLocator(SimpleNamespace(atlas=atlas), None)
+
+
+@pytest.fixture
+def locator(monkeypatch):
+    monkeypatch.setattr(locate, "PlaceFinder", Finder)
+    monkeypatch.setattr(locate, "LocalTrack", Track)
+    return made()
+
+
+@pytest.fixture
+def tracking(locator):
+    """A locator that has just found a place."""
+    locator._finder.outcomes = [FOUND]
+    assert (locator.locate("view"), locator.state_name) == ("begun", "tracking")
+    return locator
+
+
+def test_views_are_searched_until_a_place_is_found(locator):
+    assert locator.locate("view") is SEARCHING
+    assert locator.state_name == "searching"
+
+
+def test_followed_views_are_not_searched(tracking):
+    before = tracking._finder.asked
+    assert tracking.locate("fix") == "fix"
+    assert (tracking._finder.asked, tracking._finder.restarts) == (before, 1)
+
+
+def test_a_view_without_a_fix_is_searched_and_the_track_goes_on(tracking):
+    assert tracking.locate(None) is SEARCHING
+    assert tracking.state_name == "coasting"
+    assert tracking.locate("fix") == "fix"
+    assert tracking.state_name == "tracking"
+
+
+@pytest.mark.parametrize("view", ["end", "no map"])
+def test_after_the_end_of_a_track_the_aircraft_is_lost_until_a_place_is_found(tracking, view):
+    assert tracking.locate(view) is SEARCHING
+    assert tracking.state_name == "lost"
+    tracking._finder.outcomes = [FOUND]
+    assert (tracking.locate("view"), tracking.state_name) == ("begun", "tracking")
+
+
+def test_a_place_that_its_views_do_not_confirm_begins_no_track(locator, monkeypatch):
+    monkeypatch.setattr(Track, "agrees", False)
+    locator._finder.outcomes = [FOUND]
+    assert locator.locate("view").reason == "searching"
+    assert locator.state_name == "searching"
+
+
+def test_a_view_that_cannot_be_used_has_its_reason(tracking):
+    reason = NoFix("bad_image", "damaged")
+    assert tracking.passed(None, reason) is reason
+    assert tracking.state_name == "coasting"
+
+
+@pytest.mark.parametrize("recipe", [{"method": "triplet:width=32"}, {"registration": False}])
+def test_an_atlas_without_maps_to_cut_is_refused(recipe):
+    with pytest.raises(AtlasError, match="gradient and registration"):
+        made(**recipe)
