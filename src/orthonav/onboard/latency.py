@@ -46,6 +46,9 @@ GROWN_S, GROWN_RATE = 0.15, 0.002
 """Growth of the delay by timestamps that counts as a change, and what clocks may add to it each
 second."""
 UNLIKE = "images do not move as reported at the latency in use"
+SETTLED_S = 8.0
+"""Images that moved unlike the report for a moment, without another sign of a change: the delay in
+use is in doubt until they have not contradicted it for so long."""
 BEFORE_S = 0.1
 """An exposure that is later than the arrival by more than this shows clocks that disagree."""
 
@@ -105,6 +108,7 @@ class LatencyMonitor:
         self._pending: DelayEstimate | None = None
         self._suspicion = ""
         self._disputed = False
+        self._unlike_ns = 0
         self._contradictions = 0
         self._changes: int | None = None
         self._anchor: tuple[int, float] | None = None
@@ -175,7 +179,7 @@ class LatencyMonitor:
             recent = self._estimator.estimate(RECENT_S)
             decided = recent.found or recent.contradicted
             self._judge(recent if decided else self._estimator.estimate())
-            self._compare()
+            self._compare(arrival.arrived_ns)
 
     def current(self) -> Latency:
         """The delay that was used last, or why it was not."""
@@ -279,14 +283,19 @@ class LatencyMonitor:
             measured = f"measured {found.delay_s * 1e3:.0f} ms, used {delay_ms:.0f} ms"
             self._dispute(measured, found)
 
-    def _compare(self) -> None:
+    def _compare(self, arrived_ns: int) -> None:
         """Dispute the delay in use where the last seconds do not fit it."""
         share = self._check.share()
         if share >= UNEXPLAINED:
             self._compared, self._contradictions = True, 0
-        # It cannot be settled here: steady turns look alike at many delays.
-        if share < UNEXPLAINED and not self._suspicion:
-            self._suspicion, self._disputed, self._pending = UNLIKE, True, None
+        if share < UNEXPLAINED:
+            self._unlike_ns = arrived_ns
+            if not self._suspicion:
+                self._suspicion, self._disputed, self._pending = UNLIKE, True, None
+        elif self._suspicion == UNLIKE and self._check.seconds > 0:
+            # Not at once: steady turns look alike at many delays.
+            if arrived_ns - self._unlike_ns > SETTLED_S * 1e9:
+                self._suspicion = ""
 
     def _dispute(self, why: str, found: DelayEstimate) -> None:
         """Withhold until the next estimate agrees with this one or with what was known."""
