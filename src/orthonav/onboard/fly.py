@@ -294,6 +294,12 @@ class Runner:
         if latency is not None and isinstance(outcome, Fix):
             outcome = _with_latency(outcome, telemetry, latency.std_s)
         result = self._result(image, outcome, latency_ms)
+        doubt = self._doubt(image, result)
+        if doubt is not None:
+            self._count(doubt)
+            self._log(lambda sink: sink.result(result))
+            self._publisher.publish(result, image.exposed_ns, vehicle, judged=False, withheld=doubt)
+            return result
         accepted = self.options.accept(result.outcome) if self.options.accept else result.outcome
         accepted = accepted if self._gnss is None else self._gnss.corrected(accepted)
         self._publisher.publish(
@@ -309,12 +315,25 @@ class Runner:
             self._diagnosis.observe(replace(view, telemetry=corrected), found, now_ns)
         return result
 
-    def _note(self, result: ViewResult, telemetry: Telemetry, exposed_ns: int) -> None:
-        """Keep a confident position, and its difference from the reported heading and height."""
+    def _doubt(self, image: CameraImage, result: ViewResult) -> str | None:
+        """Reason to doubt the time of exposure by the position of a view; None without one."""
+        fix, arrival = self._confident_fix(result), image.arrival
+        if self._latency is None or arrival is None or fix is None:
+            return None
+        std_m = error_ellipse(fix.cov_en_m2)[0]
+        place = fix.lat_deg, fix.lon_deg
+        return self._latency.located(arrival, image.exposed_ns, place, std_m).reason
+
+    def _confident_fix(self, result: ViewResult) -> Fix | None:
         fix = result.outcome
         if not isinstance(fix, Fix) or not fix.confidence >= self.options.min_confidence:
-            return
-        if result.state not in (None, "tracking"):
+            return None
+        return fix if result.state in (None, "tracking") else None
+
+    def _note(self, result: ViewResult, telemetry: Telemetry, exposed_ns: int) -> None:
+        """Keep a confident position, and its difference from the reported heading and height."""
+        fix = self._confident_fix(result)
+        if fix is None:
             return
         self._confident_ns = self._clocks.mono_ns()
         self._count("confident")

@@ -28,7 +28,7 @@ EVERY_NS, DOUBT_EVERY_NS = 10**9, 5 * 10**8
 FIRST_NS = 5 * 10**9
 """A stated delay is used after images agreed with it, or after this time without enough motion to
 tell."""
-RECENT_S = 8.0
+RECENT_S = 5.0
 """Pictures of so many seconds show a change that the whole window hides."""
 SAMPLE_NS, REACH_NS = 50_000_000, 18 * 10**9
 """Interval at which reported states are stored, and how far back, at the start and after a time
@@ -38,7 +38,7 @@ LARGEST_M, USUAL_MPS, LEAST_MPS = 4.0, 20.0, 5.0
 speed where none is reported, and least speed."""
 STATED_STD_S = 0.03
 """Standard deviation of a stated delay: one image at 30 Hz."""
-AGREE_S, AGREE_SIGMAS = 0.08, 4.0
+AGREE_S, AGREE_SIGMAS = 0.08, 3.0
 """Delays agree within the larger of both."""
 WALK_S, LARGEST_WALK_S = 0.01, 0.1
 """Growth of the standard deviation since the measurement, per square root of a second, and its
