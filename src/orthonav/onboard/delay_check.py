@@ -85,11 +85,9 @@ class DelayCheck:
         )
 
     @property
-    def seconds(self) -> float:
-        """Time that is covered by enough pairs to compare; 0 where there are too few."""
-        if len(self._rows) < LEAST_PAIRS:
-            return 0.0
-        return (self._rows[-1][0] - self._rows[0][0]) / 1e9
+    def is_filled(self) -> bool:
+        """Whether there are enough pairs to compare."""
+        return len(self._rows) >= LEAST_PAIRS
 
     def _contradicts(self, seen: Array, reported: Array) -> bool:
         """Whether shifts per second (N, 2) by the velocity differ beyond errors of height."""

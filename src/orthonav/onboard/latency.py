@@ -318,10 +318,10 @@ class LatencyMonitor:
             self._unlike_ns = arrived_ns
             if not self._suspicion:
                 self._suspicion, self._disputed, self._pending = UNLIKE, True, None
-        elif self._suspicion == UNLIKE and self._check.seconds > 0:
+        elif self._suspicion == UNLIKE and self._check.is_filled:
             # Not at once: steady turns look alike at many delays.
-            if arrived_ns - self._unlike_ns > SETTLED_S * 1e9:
-                self._suspicion = ""
+            settled = arrived_ns - self._unlike_ns > SETTLED_S * 1e9
+            self._suspicion = "" if settled else UNLIKE
 
     def _dispute(self, why: str, found: DelayEstimate) -> None:
         """Withhold until the next estimate agrees with this one or with what was known."""

@@ -73,7 +73,7 @@ def _path(exposed_ns: int, history: StateHistory) -> tuple[Array, Array]:
     steps = (velocity[1:] + velocity[:-1]) / 2 * STEP_S
     before = np.cumsum(steps[count:], axis=0)
     after = np.cumsum(steps[:count][::-1], axis=0)[::-1]
-    return delays_s, np.concatenate([after, np.zeros((1, 2)), -before])
+    return np.asarray(delays_s, np.float64), np.concatenate([after, np.zeros((1, 2)), -before])
 
 
 def _change_s(before: _Place, now: _Place, delays_s: Array, path: Array) -> float | None:
