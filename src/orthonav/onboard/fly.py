@@ -155,6 +155,7 @@ class Runner:
         self._begun_ns = self._confident_ns = clocks.mono_ns()
         self._tick_ns = 0
         self._image_taken_ns: int | None = None
+        self._tracked_ns: int | None = None
         self._last: states.SavedState | None = None
         self._saved: states.SavedState | None = None
         self._mismatch = 0.0, 0.0
@@ -224,7 +225,7 @@ class Runner:
             view = View(image.grey, camera, telemetry)
             if latency is not None and latency.reason is not None:
                 return self._withheld(image, view, vehicle, latency)
-            refused = self._missing(telemetry)
+            refused = self._missing(telemetry) or self._before_the_last(image)
             if refused is not None:
                 return self._refused(image, refused, vehicle)
             return self._located(image, view, vehicle, latency)
@@ -252,6 +253,15 @@ class Runner:
             result, image.exposed_ns, vehicle, judged=False, withheld=latency.reason
         )
         return result
+
+    def _before_the_last(self, image: CameraImage) -> NoFix | None:
+        """Reason not to locate a view whose exposure is not later than that of the one before, as
+        after growth of the latency: a track cannot go back."""
+        if self._latency is None or self._tracked_ns is None:
+            return None
+        if image.exposed_ns > self._tracked_ns:
+            return None
+        return self._refusal("out_of_order", "out_of_order", "exposed before the last view")
 
     def _observe(self, image: CameraImage, camera: Camera) -> None:
         """Measure the latency of a live camera with one more image."""
@@ -288,6 +298,7 @@ class Runner:
         except CameraError as error:  # ends `orthonav localize`, but must not end a flight
             outcome = self._refusal("wrong_camera", "wrong_camera", str(error))
             latency_ms = math.nan
+        self._tracked_ns = image.exposed_ns
         self._count("processed")
         if isinstance(outcome, NoFix) and outcome.reason in ("internal_error", MAP_DAMAGED):
             self._count("internal_error")
