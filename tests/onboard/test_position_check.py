@@ -60,6 +60,12 @@ def test_a_filter_that_follows_slowly_shows_the_step_too():
     assert any(each is not None for each in changes(followed, TIMES))
 
 
+def test_the_last_position_before_a_gap_of_the_track_counts():
+    times = [21.0, 22.0, 42.0]
+    assert changes(late(10.0), times)[-1] == pytest.approx(10.0, abs=4.0)
+    assert set(changes(late(0.0), times)) == {None}
+
+
 def test_noise_and_an_error_of_the_velocity_are_no_jump():
     rng = np.random.default_rng(0)
     drift = np.array([0.8, -0.5])

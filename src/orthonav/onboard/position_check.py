@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from orthonav.onboard.history import StateHistory
 
-KEEP_S = 5.0
-"""Earlier positions with which one is compared: a track moves to a new place within seconds."""
+KEEP_S, LONGEST_GAP_S = 5.0, 30.0
+"""Earlier positions with which one is compared: a track moves to a new place within seconds. The
+last one counts for longer: a track may have been coasting or lost since."""
 SIGMAS = 3.0
 VELOCITY_STD_MPS, VELOCITY_SHARE = 1.0, 0.02
 """Standard deviation of the reported velocity, as that of the track: this, and this share of it."""
@@ -51,44 +52,46 @@ class PositionCheck:
         standard deviation.
         """
         now = _Place(exposed_ns, en_m, std_m)
-        while self._places and self._places[0].exposed_ns < exposed_ns - KEEP_S * 1e9:
+        while len(self._places) > 1 and self._places[0].exposed_ns < exposed_ns - KEEP_S * 1e9:
             self._places.popleft()
         found = None
         if self._places:
-            delays_s, path = _path(exposed_ns, history)
-            changes = (_change_s(each, now, delays_s, path) for each in self._places)
+            ago_s, path = _path(exposed_ns, history)
+            changes = (_change_s(each, now, ago_s, path) for each in self._places)
             found = next((each for each in changes if each is not None), None)
         self._places.append(now)
         return found
 
 
 def _path(exposed_ns: int, history: StateHistory) -> tuple[Array, Array]:
-    """Delays (N,) (s) and where the aircraft was by so much before an exposure (N, 2), metres from
-    where it was then; NaN where the velocity is not known."""
-    count = round(LONGEST_S / STEP_S)
-    delays_s = np.arange(-count, count + 1) * STEP_S
-    times_ns = exposed_ns - np.round(delays_s * 1e9).astype(np.int64)
+    """Times before an exposure (N,) (s, negative: after it), and where the aircraft was then
+    (N, 2), metres from where it was at the exposure; NaN where the velocity is not known."""
+    after, before = round(LONGEST_S / STEP_S), round(LONGEST_GAP_S / STEP_S)
+    ago_s = np.arange(-after, before + 1) * STEP_S
+    times_ns = exposed_ns - np.round(ago_s * 1e9).astype(np.int64)
     velocity = history.velocity(np.minimum(times_ns, history.newest_ns))
     velocity[times_ns > history.newest_ns + round(LEAST_S * 1e9)] = np.nan
     steps = (velocity[1:] + velocity[:-1]) / 2 * STEP_S
-    before = np.cumsum(steps[count:], axis=0)
-    after = np.cumsum(steps[:count][::-1], axis=0)[::-1]
-    return np.asarray(delays_s, np.float64), np.concatenate([after, np.zeros((1, 2)), -before])
+    later = np.cumsum(steps[:after][::-1], axis=0)[::-1]
+    earlier = -np.cumsum(steps[after:], axis=0)
+    return np.asarray(ago_s, np.float64), np.concatenate([later, np.zeros((1, 2)), earlier])
 
 
-def _change_s(before: _Place, now: _Place, delays_s: Array, path: Array) -> float | None:
+def _change_s(before: _Place, now: _Place, ago_s: Array, path: Array) -> float | None:
     """Growth of the delay that explains a jump; None without a jump or an explanation."""
     seconds = (now.exposed_ns - before.exposed_ns) / 1e9
-    flown = np.array([np.interp(seconds, delays_s, each) for each in path.T])
-    if not 0 < seconds <= KEEP_S or not np.isfinite(flown).all():
+    if not 0 < seconds <= LONGEST_GAP_S:
         return None
-    jump = now.en_m - before.en_m + flown
+    flown = -np.array([np.interp(seconds, ago_s, each) for each in path.T])
+    if not np.isfinite(flown).all():
+        return None
+    jump = now.en_m - before.en_m - flown
     speed_std = VELOCITY_STD_MPS + VELOCITY_SHARE * float(np.hypot(*flown)) / seconds
-    allowed_m = SIGMAS * math.hypot(before.std_m, now.std_m) + speed_std * seconds
-    size_m = float(np.hypot(*jump))
-    if not size_m > allowed_m:
+    std_m = math.hypot(before.std_m, now.std_m)
+    if not np.hypot(*jump) > SIGMAS * math.hypot(std_m, speed_std * seconds):
         return None
-    off_m = np.hypot(*(jump - path).T) - speed_std * np.abs(delays_s)
-    off_m[np.isnan(off_m) | (np.abs(delays_s) < LEAST_S)] = np.inf
-    best = int(np.argmin(off_m))
-    return float(delays_s[best]) if off_m[best] <= allowed_m < size_m else None
+    usual = (np.abs(ago_s) >= LEAST_S) & (np.abs(ago_s) <= LONGEST_S)
+    off = np.hypot(*(jump - path).T) / np.hypot(std_m, speed_std * (seconds + np.abs(ago_s)))
+    off[~usual | np.isnan(off)] = np.inf
+    best = int(np.argmin(off))
+    return float(ago_s[best]) if off[best] <= SIGMAS else None
