@@ -8,7 +8,13 @@ from collections import deque
 
 import numpy as np
 
-from orthonav.onboard.delay_fit import Array, explained_share
+from orthonav.onboard.delay_fit import (
+    MAD_TO_STD,
+    SHIFT_STD,
+    TURN_STD_RAD,
+    Array,
+    explained_share,
+)
 from orthonav.onboard.history import StateHistory
 from orthonav.onboard.motion import ImageMotion
 
@@ -19,6 +25,9 @@ LEAST_PER_S, SCALES = 0.03, (0.4, 2.5)
 the seen over the reported one: height and heading may be off."""
 SUMMED, STANDS_OUT = 4, 3.0
 """Successive pairs that are summed; their motion counts from so many least standard deviations."""
+OUTLIER, OUTLIER_SHARE = 6.0, 0.1
+"""Pairs that differ by more than so many standard deviations are left out, the worst ones, up to
+this share: one false motion of the picture is in four sums."""
 
 
 class DelayCheck:
@@ -59,7 +68,7 @@ class DelayCheck:
             self._rows.popleft()
         if len(self._rows) < LEAST_PAIRS:
             return math.nan
-        pairs = np.array([row for _, row in self._rows])
+        pairs = _sound(np.array([row for _, row in self._rows]))
         # Sums over successive pairs: jitter of the attitudes cancels, motion adds up.
         rows = np.lib.stride_tricks.sliding_window_view(pairs, SUMMED, axis=0).sum(axis=-1)
         seconds = rows[:, :1]
@@ -75,6 +84,11 @@ class DelayCheck:
             rows[:, 0], rows[:, 1], rows[:, 2:4], turn_off, shift_off, STANDS_OUT
         )
 
+    @property
+    def is_filled(self) -> bool:
+        """Whether there are enough pairs to compare."""
+        return len(self._rows) >= LEAST_PAIRS
+
     def _contradicts(self, seen: Array, reported: Array) -> bool:
         """Whether shifts per second (N, 2) by the velocity differ beyond errors of height."""
         seen, reported = np.median(seen, axis=0), np.median(reported, axis=0)
@@ -83,3 +97,15 @@ class DelayCheck:
             return False
         along = float(seen @ reported) / size if self._heading_known else float(np.hypot(*seen))
         return not SCALES[0] < along / size < SCALES[1]
+
+
+def _sound(pairs: Array) -> Array:
+    """The rows (N, 9) without outliers."""
+    off = np.concatenate([pairs[:, 1:2] - pairs[:, 4:5], pairs[:, 2:4] - pairs[:, 5:7]], axis=1)
+    off[:, 1:] -= pairs[:, 7:9]
+    off = np.abs(off - np.median(off, axis=0))
+    least = np.array([TURN_STD_RAD, SHIFT_STD, SHIFT_STD])
+    worst = (off / np.maximum(least, MAD_TO_STD * np.median(off, axis=0))).max(axis=1)
+    count = math.ceil(OUTLIER_SHARE * len(pairs))
+    limit = max(OUTLIER, float(np.sort(worst)[-count - 1]))
+    return np.asarray(pairs[worst <= limit])

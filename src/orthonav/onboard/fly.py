@@ -155,6 +155,7 @@ class Runner:
         self._begun_ns = self._confident_ns = clocks.mono_ns()
         self._tick_ns = 0
         self._image_taken_ns: int | None = None
+        self._tracked_ns: int | None = None
         self._last: states.SavedState | None = None
         self._saved: states.SavedState | None = None
         self._mismatch = 0.0, 0.0
@@ -224,7 +225,7 @@ class Runner:
             view = View(image.grey, camera, telemetry)
             if latency is not None and latency.reason is not None:
                 return self._withheld(image, view, vehicle, latency)
-            refused = self._missing(telemetry)
+            refused = self._missing(telemetry) or self._before_the_last(image)
             if refused is not None:
                 return self._refused(image, refused, vehicle)
             return self._located(image, view, vehicle, latency)
@@ -252,6 +253,15 @@ class Runner:
             result, image.exposed_ns, vehicle, judged=False, withheld=latency.reason
         )
         return result
+
+    def _before_the_last(self, image: CameraImage) -> NoFix | None:
+        """Reason not to locate a view whose exposure is not later than that of the one before, as
+        after growth of the latency: a track cannot go back."""
+        if self._latency is None or self._tracked_ns is None:
+            return None
+        if image.exposed_ns > self._tracked_ns:
+            return None
+        return self._refusal("out_of_order", "out_of_order", "exposed before the last view")
 
     def _observe(self, image: CameraImage, camera: Camera) -> None:
         """Measure the latency of a live camera with one more image."""
@@ -288,12 +298,19 @@ class Runner:
         except CameraError as error:  # ends `orthonav localize`, but must not end a flight
             outcome = self._refusal("wrong_camera", "wrong_camera", str(error))
             latency_ms = math.nan
+        self._tracked_ns = image.exposed_ns
         self._count("processed")
         if isinstance(outcome, NoFix) and outcome.reason in ("internal_error", MAP_DAMAGED):
             self._count("internal_error")
         if latency is not None and isinstance(outcome, Fix):
             outcome = _with_latency(outcome, telemetry, latency.std_s)
         result = self._result(image, outcome, latency_ms)
+        doubt = self._doubt(image, result)
+        if doubt is not None:
+            self._count(doubt)
+            self._log(lambda sink: sink.result(result))
+            self._publisher.publish(result, image.exposed_ns, vehicle, judged=False, withheld=doubt)
+            return result
         accepted = self.options.accept(result.outcome) if self.options.accept else result.outcome
         accepted = accepted if self._gnss is None else self._gnss.corrected(accepted)
         self._publisher.publish(
@@ -309,12 +326,25 @@ class Runner:
             self._diagnosis.observe(replace(view, telemetry=corrected), found, now_ns)
         return result
 
-    def _note(self, result: ViewResult, telemetry: Telemetry, exposed_ns: int) -> None:
-        """Keep a confident position, and its difference from the reported heading and height."""
+    def _doubt(self, image: CameraImage, result: ViewResult) -> str | None:
+        """Reason to doubt the time of exposure by the position of a view; None without one."""
+        fix, arrival = self._confident_fix(result), image.arrival
+        if self._latency is None or arrival is None or fix is None:
+            return None
+        std_m = error_ellipse(fix.cov_en_m2)[0]
+        place = fix.lat_deg, fix.lon_deg
+        return self._latency.located(arrival, image.exposed_ns, place, std_m).reason
+
+    def _confident_fix(self, result: ViewResult) -> Fix | None:
         fix = result.outcome
         if not isinstance(fix, Fix) or not fix.confidence >= self.options.min_confidence:
-            return
-        if result.state not in (None, "tracking"):
+            return None
+        return fix if result.state in (None, "tracking") else None
+
+    def _note(self, result: ViewResult, telemetry: Telemetry, exposed_ns: int) -> None:
+        """Keep a confident position, and its difference from the reported heading and height."""
+        fix = self._confident_fix(result)
+        if fix is None:
             return
         self._confident_ns = self._clocks.mono_ns()
         self._count("confident")

@@ -61,6 +61,10 @@ class StateHistory:
         before, after = (each[:, :9].reshape(-1, 3, 3) for each in (start, end))
         return reported_motion(before, after, velocity, height, seconds)
 
+    def velocity(self, times_ns: Times) -> Array:
+        """Velocities (N, 2) east and north at N times; NaN where not known."""
+        return self._at(times_ns)[:, 9:11]
+
     def speed_mps(self) -> float:
         """Newest speed over ground; NaN where not known."""
         if not self._count:

@@ -1,39 +1,46 @@
 """Decides which delay of a live camera is used, and when it is not known well enough.
 
-The delay is known where it was stated or measured in flight. It is not known after a change
-(`orthonav.onboard.arrival`) until it has been measured again, while measurements contradict it, and
-while the pictures do not move as the autopilot reports.
+The delay is known where it was stated or measured in flight. It is not known after a sign of a
+change (in the arrivals, `orthonav.onboard.arrival`, or in the positions,
+`orthonav.onboard.position_check`) until it has been measured again, while measurements contradict
+it, and while the pictures do not move as the autopilot reports.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from orthonav.geo.camera import Camera
+from orthonav.geo.frames import LocalFrame
 from orthonav.onboard.arrival import GAP_S, Arrival
 from orthonav.onboard.delay import UNEXPLAINED, DelayEstimate, DelayEstimator
 from orthonav.onboard.delay_check import DelayCheck
 from orthonav.onboard.history import StateHistory
 from orthonav.onboard.motion import Grey, PictureOdometry
+from orthonav.onboard.position_check import PositionCheck
 from orthonav.onboard.telemetry import VehicleState
 from orthonav.sources.attitude import LOOKS_DOWN, Angles, enu_from_body_camera
 
 UNKNOWN, UNSTEADY, MISMATCH = "latency_unknown", "latency_unsteady", "motion_mismatch"
-EVERY_NS = 10**9
-"""Interval of estimates."""
+EVERY_NS, DOUBT_EVERY_NS = 10**9, 5 * 10**8
+"""Interval of estimates; the same while nothing can be sent."""
 FIRST_NS = 5 * 10**9
 """A stated delay is used after images agreed with it, or after this time without enough motion to
 tell."""
-RECENT_S = 8.0
-"""Pictures of so many seconds show a change that the whole window hides."""
-SAMPLE_NS = 50_000_000
-"""Interval at which reported states are stored."""
+RECENT_S = 5.0
+"""Pictures of so many seconds show a change that the whole window hides. With 8 s instead, growth
+by 0.1 s/s made errors of 18 m before it showed, 9 m with 5 s (flights with computed pictures)."""
+SAMPLE_NS, REACH_NS = 50_000_000, 18 * 10**9
+"""Interval at which reported states are stored, and how far back, at the start and after a time
+without images; telemetry is kept for 20 s (`orthonav.onboard.telemetry.BufferLimits`)."""
 LARGEST_M, USUAL_MPS, LEAST_MPS = 4.0, 20.0, 5.0
 """A measured delay is known where its standard deviation times the speed is at most so many metres;
 speed where none is reported, and least speed."""
 STATED_STD_S = 0.03
 """Standard deviation of a stated delay: one image at 30 Hz."""
-AGREE_S, AGREE_SIGMAS = 0.08, 4.0
+AGREE_S, AGREE_SIGMAS = 0.08, 3.0
 """Delays agree within the larger of both."""
 WALK_S, LARGEST_WALK_S = 0.01, 0.1
 """Growth of the standard deviation since the measurement, per square root of a second, and its
@@ -46,6 +53,9 @@ GROWN_S, GROWN_RATE = 0.15, 0.002
 """Growth of the delay by timestamps that counts as a change, and what clocks may add to it each
 second."""
 UNLIKE = "images do not move as reported at the latency in use"
+SETTLED_S = 8.0
+"""Images that moved unlike the report for a moment, without another sign of a change: the delay in
+use is in doubt until they have not contradicted it for so long."""
 BEFORE_S = 0.1
 """An exposure that is later than the arrival by more than this shows clocks that disagree."""
 
@@ -100,11 +110,14 @@ class LatencyMonitor:
         self._odometry, self._history = PictureOdometry(), StateHistory()
         self._estimator = DelayEstimator(heading_known=heading_known)
         self._check = DelayCheck(heading_known=heading_known)
+        self._positions = PositionCheck()
+        self._frame: LocalFrame | None = None
         self._sampled_ns: int | None = None
         self._due_ns: int | None = None
         self._pending: DelayEstimate | None = None
         self._suspicion = ""
         self._disputed = False
+        self._unlike_ns = 0
         self._contradictions = 0
         self._changes: int | None = None
         self._anchor: tuple[int, float] | None = None
@@ -121,6 +134,23 @@ class LatencyMonitor:
     def latency(self, arrival: Arrival) -> Latency:
         """The delay to use for an image. Pass every image, in the order of arrival."""
         self._watch(arrival)
+        return self._judged(arrival.arrived_ns)
+
+    def located(
+        self, arrival: Arrival, exposed_ns: int, latlon_deg: tuple[float, float], std_m: float
+    ) -> Latency:
+        """The delay after the position by an image: in doubt where that jumped to a place where the
+        aircraft was earlier or later.
+
+        `exposed_ns`: its believed time of exposure. `std_m`: standard deviation of the position.
+        """
+        if self._frame is None:
+            self._frame = LocalFrame(*latlon_deg)
+        en_m = np.asarray(self._frame.en_from_latlon(*latlon_deg), np.float64)
+        change_s = self._positions.change_s(exposed_ns, en_m, std_m, self._history)
+        if change_s is not None:
+            why = f"the position jumped as by a change of the latency of {change_s:+.1f} s"
+            self._suspect(why, arrival.arrived_ns)
         return self._judged(arrival.arrived_ns)
 
     def frozen(self, arrival: Arrival) -> None:
@@ -171,11 +201,12 @@ class LatencyMonitor:
             delay_s, _ = self._known.at(arrival.arrived_ns)
             self._check.add(motion, self._history, delay_s)
         if self._due_ns is None or arrival.arrived_ns >= self._due_ns:
-            self._due_ns = arrival.arrived_ns + EVERY_NS
+            doubt = self._judged(arrival.arrived_ns).reason is not None
+            self._due_ns = arrival.arrived_ns + (DOUBT_EVERY_NS if doubt else EVERY_NS)
             recent = self._estimator.estimate(RECENT_S)
             decided = recent.found or recent.contradicted
             self._judge(recent if decided else self._estimator.estimate())
-            self._compare()
+            self._compare(arrival.arrived_ns)
 
     def current(self) -> Latency:
         """The delay that was used last, or why it was not."""
@@ -200,8 +231,8 @@ class LatencyMonitor:
     def _sample(self, state_at: Callable[[int], VehicleState], covered_ns: int | None) -> None:
         if covered_ns is None:
             return
-        if self._sampled_ns is None or covered_ns - self._sampled_ns > 10**9:
-            self._sampled_ns = covered_ns - SAMPLE_NS  # at the start, or after a gap
+        if self._sampled_ns is None or covered_ns - self._sampled_ns > REACH_NS:
+            self._sampled_ns = covered_ns - REACH_NS
         while self._sampled_ns + SAMPLE_NS <= covered_ns:
             self._sampled_ns += SAMPLE_NS
             state = state_at(self._sampled_ns)
@@ -248,6 +279,7 @@ class LatencyMonitor:
         self._estimator.forget_before(arrived_ns)
         self._odometry.reset()
         self._check.clear()
+        self._positions.clear()
         self._pending, self._contradictions = None, 0
 
     def _judge(self, found: DelayEstimate) -> None:
@@ -279,14 +311,19 @@ class LatencyMonitor:
             measured = f"measured {found.delay_s * 1e3:.0f} ms, used {delay_ms:.0f} ms"
             self._dispute(measured, found)
 
-    def _compare(self) -> None:
+    def _compare(self, arrived_ns: int) -> None:
         """Dispute the delay in use where the last seconds do not fit it."""
         share = self._check.share()
         if share >= UNEXPLAINED:
             self._compared, self._contradictions = True, 0
-        # It cannot be settled here: steady turns look alike at many delays.
-        if share < UNEXPLAINED and not self._suspicion:
-            self._suspicion, self._disputed, self._pending = UNLIKE, True, None
+        if share < UNEXPLAINED:
+            self._unlike_ns = arrived_ns
+            if not self._suspicion:
+                self._suspicion, self._disputed, self._pending = UNLIKE, True, None
+        elif self._suspicion == UNLIKE and self._check.is_filled:
+            # Not at once: steady turns look alike at many delays.
+            settled = arrived_ns - self._unlike_ns > SETTLED_S * 1e9
+            self._suspicion = "" if settled else UNLIKE
 
     def _dispute(self, why: str, found: DelayEstimate) -> None:
         """Withhold until the next estimate agrees with this one or with what was known."""
@@ -305,6 +342,7 @@ class LatencyMonitor:
         if changed:  # older pictures belong to another delay
             self._estimator.forget_before(found.last_ns - round(RECENT_S * 1e9))
             self._check.clear()
+            self._positions.clear()
         self._suspicion, self._disputed, self._pending, self._grown = "", False, None, False
         self._compared = True
         if self._arrival is not None and math.isfinite(self._arrival.grown_s):
