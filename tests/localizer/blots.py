@@ -88,7 +88,7 @@ def ortho_of_blots(make_ortho, folder):
 def map_of_blots(ortho, path):
     """A map of that orthophoto with 1 m pixels; its confidence is as maps of its kind learn it."""
     confidence = RegisteredConfidence(-3.5, (0.5, 12.0, 3.0), Chances(18.0, 16.0, 30.0))
-    learnt = RegistrationCalibration(confidence, 0.6)
+    learnt = RegistrationCalibration(confidence, 0.6, 20)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.prepare.calibrate.CROPS", 16)
         patch.setattr("orthonav.prepare.build.calibrate_registration", lambda *_: learnt)
