@@ -164,11 +164,11 @@ def test_doubtful_input_causes_a_warning(run, tmp_path):
     (tmp_path / "photos/1.jpg").write_bytes(data[:-200])
     code, out, err = run("import", tmp_path / "photos", "--out", tmp_path / "flight")
     assert code == 0 and "2 views, 0 with heading" in out
-    assert "focal length from EXIF: expect errors of some per cent" in err
+    assert "good to 3 %: 35 mm equivalent of EXIF" in err
     assert "1 views left out, the first" in err and "1.jpg" in err
     assert "2 of 2 views lack heading, pitch, roll or height" in err
     note = json.loads((tmp_path / "flight/flight.json").read_text())["note"]
-    assert "focal length from EXIF" in note
+    assert "35 mm equivalent of EXIF" in note
     assert not (tmp_path / "flight/truth.csv").exists()
     quiet = run("import", tmp_path / "photos", "--out", tmp_path / "quiet", "-q")
     assert quiet[0] == 0 and quiet[2] == ""

@@ -180,6 +180,7 @@ def read_camera(path: Path) -> tuple[Camera, str]:
             **{name: float(raw[name]) for name in ("fx_px", "fy_px", "cx_px", "cy_px")},
             distortion=tuple(float(value) for value in distortion),
             model=str(raw.get("model", "brown")),
+            focal_std=float(raw.get("focal_std", 0.0)),
         )
         return camera, str(plain.get("note", ""))
     except CameraError as error:

@@ -118,6 +118,9 @@ class Tracker:
         has another size than the picture.
         """
         refused = check_view(view, self._localizer.grid.gsd_m, self._heading_known)
+        if self._usual_model:
+            scale = math.hypot(Model.log_scale, view.camera.focal_std)
+            self.model = self.mixture.model = replace(self.model, log_scale=scale)
         overlap, ground = self._predict(None if refused else view, view.telemetry)
         self._new_ground += 1 - overlap
         if refused is None:
@@ -308,7 +311,11 @@ class Tracker:
         telemetry = view.telemetry
         expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
         bias, spread = self.mixture.bias()
-        corrected = replace(view, telemetry=_known(corrected_by(telemetry, bias), spread))
+        corrected = replace(
+            view,
+            camera=replace(view.camera, focal_std=0.0),  # part of the spread of the scale
+            telemetry=_known(corrected_by(telemetry, bias), spread),
+        )
         prior, searched = self._search_area(expected)
         seen = self._registration.register(corrected, prior, self._heading_known)
         if isinstance(seen, NoFix):

@@ -1,7 +1,7 @@
 """A recorded flight that is read view by view."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
@@ -10,12 +10,17 @@ from numpy.typing import NDArray
 
 from orthonav.errors import CameraError, FlightError
 from orthonav.geo.camera import Camera
+from orthonav.geo.frames import distances_m
 from orthonav.records import Prior, Telemetry
+from orthonav.sources.attitude import ASSUMED_TILT_STD_DEG
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.track import RecordedTrack
 
 Grey = NDArray[np.uint8]
 DECIMALS = 8
+JUMP_M, JUMP_MPS = 500.0, 150.0
+"""Positions that are farther apart, and farther than this speed allows, are a jump: an aircraft
+that this program is for flies slower, and logs round positions to some metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +71,9 @@ def with_options(
         prior = Prior(*truth_latlon_deg, options.prior_std_m)
         telemetry = replace(telemetry, prior=prior)
     if options.looks_down and math.isnan(telemetry.pitch_deg + telemetry.roll_deg):
-        telemetry = replace(telemetry, pitch_deg=0.0, roll_deg=0.0)
+        telemetry = replace(
+            telemetry, pitch_deg=0.0, roll_deg=0.0, tilt_std_deg=ASSUMED_TILT_STD_DEG
+        )
     return telemetry
 
 
@@ -94,6 +101,38 @@ def known_at(
     truth = track.latlon_deg(time_ns)
     telemetry = track.telemetry(time_ns, options.ground_alt_m)
     return rounded(with_options(telemetry, truth, options)), truth
+
+
+def jump_warnings(
+    positions: Sequence[tuple[int, tuple[float, float] | None]],
+) -> list[str]:
+    """Warning about jumps of a recorded position, at times in ns; empty without one."""
+    known = [(time_ns, place) for time_ns, place in positions if place is not None]
+    if len(known) < 2:
+        return []
+    seconds = np.diff([time_ns / 1e9 for time_ns, _ in known])
+    places = np.array([place for _, place in known])
+    apart_m = distances_m(places[:-1], places[1:])
+    jumps = np.flatnonzero((apart_m > JUMP_M) & (apart_m > JUMP_MPS * seconds))
+    if not len(jumps):
+        return []
+    first = int(jumps[0])
+    return [
+        f"recorded position jumps {len(jumps)} times, the first by {apart_m[first] / 1000:.1f} km "
+        f"{seconds[: first + 1].sum():.1f} s after the beginning: check it before it is used"
+    ]
+
+
+def doubts_of(track: RecordedTrack) -> list[str]:
+    """Warnings about a track for people: its own, and jumps of its position."""
+    series = track.position
+    if series is None:
+        return list(track.warnings)
+    places = [
+        (int(time_ns), (float(lat), float(lon)))
+        for time_ns, (lat, lon) in zip(series.time_ns, series.values[:, :2], strict=True)
+    ]
+    return [*track.warnings, *jump_warnings(places)]
 
 
 def fitted(camera: Camera, width_px: int, height_px: int, where: str) -> Camera:

@@ -19,7 +19,14 @@ from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.guard import needed, reading
 from orthonav.sources.logs import read_log
 from orthonav.sources.options import SourceOptions
-from orthonav.sources.recording import Recording, SourceView, check_overlap, fitted, known_at
+from orthonav.sources.recording import (
+    Recording,
+    SourceView,
+    check_overlap,
+    doubts_of,
+    fitted,
+    known_at,
+)
 from orthonav.sources.ros_images import camera_of_info, grey_of_message
 from orthonav.sources.ros_limits import bound_inflation, check_held
 from orthonav.sources.ros_topics import Topics, find_topics
@@ -64,7 +71,7 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
         note=f"{path.name}: {topics.summary()}",
         expected=expected,
         stream=partial(_views, path, topics.image.topic, track, options),
-        warnings=tuple(warnings),
+        warnings=(*warnings, *doubts_of(track)),
     )
 
 

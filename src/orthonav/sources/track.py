@@ -155,6 +155,8 @@ class RecordedTrack:
     """Reported prior: latitude, longitude in degrees, standard deviation in metres."""
     origin_ns: int = 0
     """Time at which a recording without a clock begins."""
+    warnings: tuple[str, ...] = ()
+    """Doubts about the log, for people."""
 
     def span_ns(self) -> tuple[int, int] | None:
         """First and last time of its attitude or, without any, of heights or positions."""
