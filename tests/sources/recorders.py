@@ -217,7 +217,7 @@ def px4_topics(seconds=10, boot_us=5_000_000, sensor=True):
     for t, yaw, pitch, roll in flown(seconds):
         stamp = boot_us + round(t * 1e6)
         attitude.append((stamp, *quaternion_wxyz(yaw, pitch, roll)))
-        local.append((stamp, 3.0, -1.0, -100.0 - t, 90.0 + t, t < 8))
+        local.append((stamp, 3.0, -1.0, -100.0 - t, 90.0 + t, t < 8, 1))
         place.append((stamp, 46.5, 2.5, 400.0 + t))
         gps.append((stamp, START_S * 10**6 + round(t * 1e6), 465_000_000, 25_000_000, 400_000, 3))
     stamp, double, single = "uint64_t", "double", "float"
@@ -231,8 +231,10 @@ def px4_topics(seconds=10, boot_us=5_000_000, sensor=True):
                 "z": single,
                 "dist_bottom": single,
                 "dist_bottom_valid": "bool",
+                "dist_bottom_sensor_bitfield": "uint8_t",
             },
-            local if sensor else [(*row[:4], 0.0, False) for row in local],
+            # Without a sensor the estimator guesses a height and calls it valid.
+            local if sensor else [(*row[:4], 0.1, True, 0) for row in local],
         ),
         "vehicle_global_position": (
             {"timestamp": stamp, "lat": double, "lon": double, "alt": single},

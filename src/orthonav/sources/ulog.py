@@ -84,6 +84,9 @@ def _heights(topics: dict[str, Columns], shift_us: int) -> tuple[TimeSeries, ...
     found = []
     if "dist_bottom" in local:
         valid = local.get("dist_bottom_valid", np.ones(len(local["dist_bottom"]))) != 0
+        # Without a sensor the estimator guesses, and calls its guess valid.
+        sensors = local.get("dist_bottom_sensor_bitfield", np.full(len(valid), len(sensor)))
+        valid &= sensors != 0
         found.append(_height(local, local["dist_bottom"], valid, shift_us))
     if "current_distance" in sensor:
         distance = sensor["current_distance"]
