@@ -143,6 +143,8 @@ def test_sensefly(tmp_path):
         RollAngle="-3.5",
         Height="66.111175540000005",
         UTCTime="2023:11:14 22:13:20",
+        AltitudeAMSL="313.99",
+        AltitudeWGS84="281.69",
         Latitude="41.0346708",
         Longitude="-83.3057253",
     )
@@ -155,8 +157,22 @@ def test_sensefly(tmp_path):
     assert (reported.yaw_deg, reported.pitch_deg, reported.roll_deg) == pytest.approx(
         (70.0620575, 2.5, -3.5)
     )
-    assert reported.agl_m == pytest.approx(66.11117554)
+    assert reported.agl_m == reported.home_m == pytest.approx(66.11117554)
+    assert (reported.amsl_m, reported.hae_m) == (313.99, 281.69)
     assert view.truth_latlon_deg == (41.0346708, -83.3057253)
+
+
+@pytest.mark.parametrize("flag, hae", [("50", 431.5), ("0", None)])
+def test_altitudes_of_rtk_are_above_the_ellipsoid(tmp_path, flag, hae):
+    xmp = dji().replace('drone-dji:AbsoluteAltitude="+400.00"', "")
+    more = f'drone-dji:RtkFlag="{flag}" drone-dji:AbsoluteAltitude="+431.50" '
+    photo(
+        tmp_path / "p/a.jpg", xmp=xmp.replace("drone-dji:FlightYaw", f"{more}drone-dji:FlightYaw")
+    )
+    import_flight(open_source(tmp_path / "p"), tmp_path / "flight")
+    (view,) = open_flight(tmp_path / "flight").views
+    assert (view.telemetry.hae_m, view.telemetry.amsl_m) == (hae, None)
+    assert view.telemetry.home_m == view.telemetry.agl_m == 120.5
 
 
 @pytest.mark.parametrize("order", "<>")
@@ -237,7 +253,7 @@ def test_a_jump_of_the_position_is_named(tmp_path):
     for number, lat in enumerate((46.5, 46.5001, 46.6)):
         time = f"2023:11:14 22:13:2{number}"
         photo(tmp_path / f"p/{number}.jpg", time, gps=place(lat, 2.5), xmp=dji())
-    assert "jumps 1 times, the first by 11.1 km" in open_source(tmp_path / "p").warnings[0]
+    assert "jumps 1 times, the first by 11.1 km" in open_source(tmp_path / "p").warnings[1]
 
 
 # Photographs of another size, and without a time.

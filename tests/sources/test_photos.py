@@ -26,6 +26,7 @@ from orthonav.sources import SourceOptions, import_flight, open_source
 from orthonav.sources.exif import read_photo
 from orthonav.sources.focal import focal_length
 from orthonav.sources.photo_poses import poses_of
+from orthonav.sources.recording import LEVEL_GROUND
 
 SUBSEC, OFFSET = 0x9291, 0x9011
 FILM_NOTE = "focal length 44 px, good to 3 %: 35 mm equivalent of EXIF"
@@ -61,7 +62,7 @@ def folder(tmp_path):
 def test_a_folder_of_dji(folder, tmp_path):
     recording = open_source(folder)
     assert recording.kind == "photos" and recording.expected == 3
-    assert FILM_NOTE in recording.note and recording.warnings == (FILM_NOTE,)
+    assert FILM_NOTE in recording.note and recording.warnings == (LEVEL_GROUND, FILM_NOTE)
     done = import_flight(recording, tmp_path / "flight")
     assert (done.views, done.complete, done.with_truth, done.broken) == (3, 3, 3, 0)
     flight = open_flight(tmp_path / "flight")
@@ -107,7 +108,7 @@ def test_a_camera_file_replaces_exif(folder, tmp_path):
     file = camera_file(tmp_path / "c.json", width_px=128, height_px=96, cx_px=66.0)
     recording = open_source(folder, SourceOptions(camera=file))
     assert (recording.camera.width_px, recording.camera.cx_px) == (WIDTH, 33.0)
-    assert recording.camera.focal_std == 0 and recording.warnings == ()
+    assert recording.camera.focal_std == 0 and recording.warnings == (LEVEL_GROUND,)
     wrong = camera_file(tmp_path / "d.json", width_px=128, height_px=72)
     with pytest.raises(CameraError, match="another aspect ratio"):
         open_source(folder, SourceOptions(camera=wrong))

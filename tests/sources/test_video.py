@@ -177,7 +177,7 @@ def test_doubtful_positions_are_named(recorded, tmp_path):
     assert "begins with the latitude or the longitude: positions are left out" in warning
     texts = [dji_subtitle(n).replace("46.5", "46.6" if n >= 20 else "46.5") for n in range(30)]
     subtitles(srt, texts)
-    (warning,) = open_source(recorded, options(recorded)).warnings
+    _, warning = open_source(recorded, options(recorded)).warnings
     assert "jumps 1 times, the first by 11.1 km 2.0 s after the beginning" in warning
 
 

@@ -75,7 +75,8 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         "--ground-alt-m",
         type=float,
         metavar="M",
-        help="altitude of the ground, where altitudes but no heights were recorded",
+        help="altitude of the ground, in the reference of the recorded altitudes, where no heights "
+        "were recorded",
     )
     group.add_argument(
         "--looks-down",

@@ -50,6 +50,10 @@ class Photo:
     """Heading of the aircraft."""
     home_m: float
     """Height above take-off."""
+    amsl_m: float
+    """Height above mean sea level, where its reference is stated."""
+    hae_m: float
+    """Height above the ellipsoid, where its reference is stated."""
     vel_en_mps: tuple[float, float] | None
     """Velocity over ground, east and north."""
     optics: Optics
@@ -92,6 +96,8 @@ def read_photo(path: Path) -> Photo:
         rotation=xmp.rotation(make),
         body_yaw_deg=body_yaw if math.isfinite(body_yaw) else notes.body_yaw_deg,
         home_m=xmp.home_m(),
+        amsl_m=xmp.first("sensefly:AltitudeAMSL"),
+        hae_m=xmp.hae_m(),
         vel_en_mps=xmp.velocity_en_mps(),
         optics=_optics(tags, more),
         software=", ".join(filter(None, dict.fromkeys((_word(tags.get(_SOFTWARE)), xmp.writer)))),

@@ -25,6 +25,7 @@ from orthonav.sources.recording import (
     check_overlap,
     doubts_of,
     fitted,
+    height_warnings,
     jump_warnings,
     known_at,
     rounded,
@@ -72,11 +73,17 @@ def open_photos(folder: Path, options: SourceOptions) -> Recording:
     if options.telemetry is not None:
         track = read_log(options.telemetry, options.mount_deg)
         check_overlap(track, taken[0].time_ns, taken[-1].time_ns, options.telemetry)
-        warnings += doubts_of(track)
+        warnings += doubts_of(track, options)
     else:
         poses, doubts = poses_of([one.photo for one in taken])
         taken = [replace(one, pose=pose) for one, pose in zip(taken, poses, strict=True)]
         warnings += doubts
+        warnings += height_warnings(
+            any(math.isfinite(one.photo.home_m) for one in taken),
+            all(math.isnan(one.photo.home_m) for one in taken)
+            and any(math.isfinite(one.photo.alt_m) for one in taken),
+            options,
+        )
         warnings += jump_warnings([(one.time_ns, one.photo.latlon_deg) for one in taken])
     return Recording(
         kind="photos",
@@ -215,4 +222,11 @@ def _own_telemetry(one: _DatedPhoto, options: SourceOptions) -> Telemetry:
         yaw_std_deg=pose.yaw_std_deg,
         tilt_std_deg=pose.tilt_std_deg,
         vel_en_mps=photo.vel_en_mps,
+        home_m=_known(photo.home_m),
+        amsl_m=_known(photo.amsl_m),
+        hae_m=_known(photo.hae_m),
     )
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -14,7 +14,7 @@ from orthonav.geo.frames import distances_m
 from orthonav.records import Prior, Telemetry
 from orthonav.sources.attitude import ASSUMED_TILT_STD_DEG
 from orthonav.sources.options import SourceOptions
-from orthonav.sources.track import RecordedTrack
+from orthonav.sources.track import RecordedTrack, altitude_series
 
 Grey = NDArray[np.uint8]
 DECIMALS = 8
@@ -80,18 +80,24 @@ def with_options(
 def rounded(telemetry: Telemetry) -> Telemetry:
     """The telemetry at the precision of a flight folder, so that import changes no result."""
     prior, velocity = telemetry.prior, telemetry.vel_en_mps
-    yaw_std, agl_std = telemetry.yaw_std_deg, telemetry.agl_std_m
     return replace(
         telemetry,
         yaw_deg=round(telemetry.yaw_deg, DECIMALS),
         pitch_deg=round(telemetry.pitch_deg, DECIMALS),
         roll_deg=round(telemetry.roll_deg, DECIMALS),
         agl_m=round(telemetry.agl_m, DECIMALS),
-        yaw_std_deg=None if yaw_std is None else round(yaw_std, DECIMALS),
-        agl_std_m=None if agl_std is None else round(agl_std, DECIMALS),
+        yaw_std_deg=_rounded(telemetry.yaw_std_deg),
+        agl_std_m=_rounded(telemetry.agl_std_m),
         prior=prior and Prior(*(round(number, DECIMALS) for number in astuple(prior))),
         vel_en_mps=velocity and (round(velocity[0], DECIMALS), round(velocity[1], DECIMALS)),
+        home_m=_rounded(telemetry.home_m),
+        amsl_m=_rounded(telemetry.amsl_m),
+        hae_m=_rounded(telemetry.hae_m),
     )
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, DECIMALS)
 
 
 def known_at(
@@ -123,16 +129,38 @@ def jump_warnings(
     ]
 
 
-def doubts_of(track: RecordedTrack) -> list[str]:
-    """Warnings about a track for people: its own, and jumps of its position."""
-    series = track.position
+LEVEL_GROUND = (
+    "height above ground is taken from the height above take-off: level ground is assumed"
+)
+
+
+def doubts_of(track: RecordedTrack, options: SourceOptions) -> list[str]:
+    """Warnings about a track for people: its own, what its heights are, and jumps."""
+    warnings, series = list(track.warnings), track.position
+    known = bool(track.heights) or track.home is not None
+    altitudes = altitude_series(series) is not None or track.amsl is not None
+    warnings += height_warnings(track.home is not None, not known and altitudes, options)
     if series is None:
-        return list(track.warnings)
+        return warnings
     places = [
         (int(time_ns), (float(lat), float(lon)))
         for time_ns, (lat, lon) in zip(series.time_ns, series.values[:, :2], strict=True)
     ]
-    return [*track.warnings, *jump_warnings(places)]
+    return [*warnings, *jump_warnings(places)]
+
+
+def height_warnings(above_home: bool, only_altitudes: bool, options: SourceOptions) -> list[str]:
+    """What is assumed about heights: of those above take-off, or where only altitudes are known."""
+    if above_home:
+        return [LEVEL_GROUND]
+    if not only_altitudes:
+        return []
+    if options.ground_alt_m is None:
+        return [
+            "no height above ground was recorded, only altitudes, which are not taken for one; "
+            "give --ground-alt-m, in the same reference"
+        ]
+    return [f"height above ground is the recorded altitude minus {options.ground_alt_m:g} m"]
 
 
 def fitted(camera: Camera, width_px: int, height_px: int, where: str) -> Camera:

@@ -71,7 +71,7 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
         note=f"{path.name}: {topics.summary()}",
         expected=expected,
         stream=partial(_views, path, topics.image.topic, track, options),
-        warnings=(*warnings, *doubts_of(track)),
+        warnings=(*warnings, *doubts_of(track, options)),
     )
 
 

@@ -29,7 +29,8 @@ TYPES: dict[str, tuple[str, ...]] = {
 }
 _PLAIN_NUMBERS = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
 log = logging.getLogger(__name__)
-_HEIGHT_NAMES = ("rel_alt", "relative_altitude", "agl", "height_above_ground")
+_HOME_NAMES = ("rel_alt", "relative_altitude")
+_HEIGHT_NAMES = (*_HOME_NAMES, "agl", "height_above_ground")
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +145,11 @@ def _fits(connection: Any, role: str) -> bool:
         return False
     named = connection.topic.rpartition("/")[2] in _HEIGHT_NAMES
     return named or connection.msgtype not in _PLAIN_NUMBERS
+
+
+def is_above_home(topic: str) -> bool:
+    """Whether a topic of plain numbers has the height above take-off, by its name."""
+    return topic.rpartition("/")[2] in _HOME_NAMES
 
 
 def _beside(info: str, image: str) -> bool:

@@ -59,10 +59,9 @@ def read_srt(path: Path) -> RecordedTrack:
     if last is None:
         raise FlightError(f"subtitles hold no telemetry: {path}")
     _add(last, last.end_ns, attitude, position, height)
-    heights = height.series()
     track = RecordedTrack(
         attitude=attitude_of_angles(attitude, enu_from_gimbal_camera),
-        heights=() if heights is None else (heights,),
+        home=height.series(),
         position=position.positions(),
         warnings=_warnings(data),
     )
@@ -73,7 +72,7 @@ def read_srt(path: Path) -> RecordedTrack:
 
 def end_ns(track: RecordedTrack) -> int:
     """Last time of a track from subtitles or a table."""
-    series = (track.attitude, track.position, *track.heights)
+    series = (track.attitude, track.position, track.home, *track.heights)
     return max(int(one.time_ns[-1]) for one in series if one is not None)
 
 

@@ -58,7 +58,7 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
         note=f"video {path.name}, telemetry of {telemetry_path.name}",
         expected=math.floor(last_ns / 1e9 * options.rate_hz) + 1 if last_ns else 0,
         stream=partial(_views, path, track, options),
-        warnings=tuple(doubts_of(track)),
+        warnings=tuple(doubts_of(track, options)),
     )
 
 

@@ -92,6 +92,12 @@ class Xmp:
         """Height above the place of take-off."""
         return self.first("drone-dji:RelativeAltitude", "drone:RelativeAltitude", "sensefly:Height")
 
+    def hae_m(self) -> float:
+        """Height above the ellipsoid: of RTK, or as senseFly writes it."""
+        if self.first("drone-dji:RtkFlag") > 0:
+            return self.first("drone-dji:AbsoluteAltitude")
+        return self.first("sensefly:AltitudeWGS84")
+
     def _angles(self, pattern: str) -> tuple[float, float, float] | None:
         yaw, pitch, roll = (self.first(pattern.format(name)) for name in ("Yaw", "Pitch", "Roll"))
         return (yaw, pitch, roll) if math.isfinite(yaw + pitch + roll) else None
