@@ -74,6 +74,12 @@ class Telemetry:
     """Standard deviation of pitch and of roll from view to view; see `orthonav.track.Model`."""
     vel_std_mps: float | None = None
     """Standard deviation of the velocity per axis; see `orthonav.localizer.tracker`."""
+    home_m: float | None = None
+    """Height above the place of take-off, as recorded; it is not used in place of `agl_m`."""
+    amsl_m: float | None = None
+    """Height above mean sea level, as recorded."""
+    hae_m: float | None = None
+    """Height above the ellipsoid of WGS 84, as recorded."""
 
     def missing(self) -> list[str]:
         """Names of the fields without which a view cannot be rectified, empty if all are there."""

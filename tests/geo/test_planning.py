@@ -150,8 +150,11 @@ def test_a_hill_beside_the_leg_counts_within_the_band():
 
 
 def test_unknown_heights_are_refused():
-    with pytest.raises(RouteError, match=r"height of leg 1 .*is unknown; .*--agl-m"):
+    with pytest.raises(RouteError, match=r"height of leg 1 .*is unknown, or .*--agl-m"):
         profile(Route(PLACES), (1.0, 1.0), None, 10.0, slope)
+    ellipsoid = Route(PLACES, tuple(Height(400.0, "hae") for _ in PLACES))
+    with pytest.raises(RouteError, match=r"or it is above the ellipsoid; .*--agl-m"):
+        profile(ellipsoid, (1.0, 1.0), None, 10.0, slope)
     nowhere = lambda lat, lon: np.full(lat.shape, np.nan)  # noqa: E731
     with pytest.raises(RouteError, match="does not cover leg 1"):
         profile(Route(PLACES), (1.0, 1.0), 100, 10.0, nowhere)

@@ -131,10 +131,20 @@ def test_lines_are_picked_by_name(tmp_path, caplog):
     both["features"][1]["properties"] = {"name": "x#/y"}
     path.write_text(json.dumps(both))
     assert read_route(Path(f"{path}#x#/y")).waypoints[0] == (9, 9)
-    with pytest.raises(RouteError, match="2 lines; name one as FILE#NAME: '', 'x#/y'"):
+    with pytest.raises(
+        RouteError, match=r"2 lines; give FILE#NAME or FILE#NUMBER: 1 \(no name\), 2 'x"
+    ):
         read_route(path)
-    with pytest.raises(RouteError, match=r"0 lines are named 'z'; the file holds '', 'x#/y'"):
+    with pytest.raises(RouteError, match=r"0 lines are named 'z'; give .*: 1 \(no name\), 2 'x"):
         read_route(Path(f"{path}#z"))
+    assert read_route(Path(f"{path}#1")).waypoints == WAYPOINTS
+    assert read_route(Path(f"{path}#2")).waypoints[0] == (9, 9)
+    for number in ("0", "3", "-1", "1.0"):
+        with pytest.raises(RouteError, match=f"0 lines are named '{number}'"):
+            read_route(Path(f"{path}#{number}"))
+    both["features"][0]["properties"] = {"name": "2"}
+    path.write_text(json.dumps(both))
+    assert read_route(Path(f"{path}#2")).waypoints == WAYPOINTS  # a name comes before a number
 
 
 def test_a_multilinestring_is_one_line(tmp_path):

@@ -86,7 +86,7 @@ def test_lines_of_one_placemark_are_joined_and_placemarks_picked_by_name(read):
     )
     assert read(text, "a.kml#way").waypoints == PLACES
     assert read(text, "a.kml#é & b").waypoints == PLACES
-    with pytest.raises(RouteError, match="2 lines; name one as FILE#NAME: 'way', 'é & b'"):
+    with pytest.raises(RouteError, match=r"2 lines; give .*: 1 'way', 2 'é & b'"):
         read(text, "a.kml")
 
 
@@ -94,6 +94,72 @@ def test_kmz_is_kml_in_an_archive(read):
     text = kml_of(("way", line()))
     assert read(archive(("doc.kml", text), ("files/b.kml", "<x/>")), "a.kmz").waypoints == PLACES
     assert read(archive(("way.KML", text), ("a.png", "x")), "a.kmz").waypoints == PLACES
+
+
+WAYPOINT = """<Placemark><Point><coordinates>{lon},{lat},0</coordinates></Point>
+<wpml:index>{index}</wpml:index><wpml:executeHeight>{height}</wpml:executeHeight></Placemark>"""
+
+
+def wayline(mode="relativeToStartPoint", ident=0, order=(0, 1, 2)):
+    """A wayline through `PLACES`, written in this order."""
+    marks = "".join(
+        WAYPOINT.format(lat=PLACES[i][0], lon=PLACES[i][1], index=i, height=50 + i) for i in order
+    )
+    return (
+        f"<Folder><wpml:executeHeightMode>{mode}</wpml:executeHeightMode>"
+        f"<wpml:waylineId>{ident}</wpml:waylineId>{marks}</Folder>"
+    )
+
+
+def wpml_of(*folders):
+    spaces = 'xmlns="http://www.opengis.net/kml/2.2" xmlns:wpml="http://www.dji.com/wpmz/1.0.2"'
+    config = (
+        "<wpml:missionConfig><wpml:finishAction>goHome</wpml:finishAction></wpml:missionConfig>"
+    )
+    return f"<kml {spaces}><Document>{config}{''.join(folders)}</Document></kml>"
+
+
+@pytest.mark.parametrize(
+    "mode, frame",
+    [("relativeToStartPoint", "home"), ("WGS84", "hae"), ("realTimeFollowSurface", "agl")],
+)
+@pytest.mark.parametrize("packed", [False, True])
+def test_waylines_of_dji(read, mode, frame, packed):
+    content, name = wpml_of(wayline(mode, order=(2, 0, 1))), "a.wpml"
+    if packed:
+        template = wpml_of(wayline())
+        members = ("wpmz/template.kml", template), ("wpmz/waylines.wpml", content)
+        content, name = archive(*members), "a.kmz"
+    route = read(content, name)
+    assert route.waypoints == PLACES
+    assert route.heights == tuple(Height(50.0 + i, frame) for i in range(3))
+
+
+def test_several_waylines_are_picked_by_identifier_or_number(read):
+    both = wpml_of(wayline(ident=7), wayline(ident=8, order=(0, 1)))
+    with pytest.raises(RouteError, match=r"2 lines; .*: 1 '7', 2 '8'"):
+        read(both, "a.wpml")
+    assert len(read(both, "a.wpml#8").waypoints) == len(read(both, "a.wpml#2").waypoints) == 2
+
+
+@pytest.mark.parametrize(
+    "content, name, message",
+    [
+        (wpml_of(), "a.wpml", "no wayline with waypoints"),
+        (wpml_of(wayline("aboveTheMoon")), "a.wpml", "executeHeightMode must be relative"),
+        (wpml_of(wayline()).replace("<wpml:index>1", "<wpml:index>x"), "a.wpml", "WPML index"),
+        (wpml_of(wayline()).replace(",0</coord", "</coord"), "a.wpml", None),
+        (wpml_of(wayline()).replace("2.5,46.5,0", "2.5"), "a.wpml", "longitude,latitude"),
+        (wpml_of(), "a.kml", "template of a DJI mission; give its waylines.wpml"),
+        ("<gpx/>", "a.wpml", "must begin with <kml>"),
+    ],
+)
+def test_waylines_that_are_none(read, content, name, message):
+    if message is None:
+        assert read(content, name).waypoints == PLACES
+        return
+    with pytest.raises(RouteError, match=message):
+        read(content, name)
 
 
 GPX = """<?xml version="1.0"?>
@@ -119,7 +185,7 @@ def test_a_route_comes_before_a_track_and_names_choose(read):
     assert read(GPX.format(SEGMENTS + ROUTE), "a.gpx").name == "planned"
     two = GPX.format(ROUTE + ROUTE.replace("planned", "other"))
     assert read(two, "a.gpx#other").name == "other"
-    with pytest.raises(RouteError, match="'planned', 'other'"):
+    with pytest.raises(RouteError, match="1 'planned', 2 'other'"):
         read(two, "a.gpx")
 
 

@@ -9,6 +9,7 @@ from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
 from scipy.ndimage import binary_dilation
 
+from orthonav.errors import ImageryError
 from orthonav.imagery.mosaic import Mosaic
 
 INNER = np.s_[4:-4, 4:-4]
@@ -128,7 +129,7 @@ def test_grey_fills_all_three(tmp_path, make):
     "dtype, scale, offset",
     [("uint16", 16, 100), ("int16", 20, -3000), ("float32", 1 / 255, 0), ("float64", 1e4, -7e5)],
 )
-@pytest.mark.parametrize("bands", [1, 3, 4])
+@pytest.mark.parametrize("bands", [3, 4])
 def test_deeper_pixels_are_stretched_alike(tmp_path, dtype, scale, offset, bands):
     scene = with_band(SCENE, SCENE[0])[:bands]
     deep = (scene * float(scale) + offset).astype(dtype)
@@ -139,6 +140,13 @@ def test_deeper_pixels_are_stretched_alike(tmp_path, dtype, scale, offset, bands
     pixels = read(path)
     assert pixels.valid[INNER].all()
     assert np.abs(pixels.rgb[INNER].astype(int) - expected[INNER]).max() <= 5
+
+
+@pytest.mark.parametrize("dtype", ["int16", "int32", "float32", "float64"])
+def test_one_band_that_may_hold_heights_is_refused(tmp_path, dtype):
+    path = write(tmp_path / "surface.tif", SCENE[:1].astype(dtype))
+    with pytest.raises(ImageryError, match=rf"one band of {dtype} may hold heights.*surface\.tif"):
+        Mosaic.open([path])
 
 
 def palette(path):

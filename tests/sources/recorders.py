@@ -24,6 +24,7 @@ XMP = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
 <rdf:Description rdf:about="" xmlns:{prefix}="{uri}" {attributes}>{elements}</rdf:Description>
 </rdf:RDF></x:xmpmeta><?xpacket end="w"?>"""
+SENSEFLY = "sensefly", "http://ns.sensefly.com/1.0/"
 DJI = "drone-dji", "http://www.dji.com/drone-dji/1.0/"
 AUTEL = "drone", "http://www.autelrobotics.com/drone/1.0/"
 PIX4D = "Camera", "http://pix4d.com/camera/1.0/"
@@ -68,10 +69,22 @@ def dji(yaw=30.0, pitch=-90.0, roll=0.0, height=120.5):
     )
 
 
-def photo(path, time="2023:11:14 22:13:20", more=(), gps=(), xmp=None, seed=0, make="DJI", **size):
-    """A JPEG, PNG or TIFF with EXIF (`more` by number of the tag, `gps` likewise) and XMP."""
+def photo(
+    path,
+    time="2023:11:14 22:13:20",
+    more=(),
+    gps=(),
+    xmp=None,
+    seed=0,
+    make="DJI",
+    first=(),
+    **size,
+):
+    """A JPEG, PNG or TIFF with EXIF (`more` by number of the tag, `gps` and `first`, which is the
+    first directory, likewise) and XMP."""
     exif = Image.Exif()
     exif[0x010F] = make
+    exif.update(dict(first))
     inner = {0x9003: time, 0x9011: "+00:00", 0xA405: 24, 0x920A: 8.8, **dict(more)}
     exif.get_ifd(0x8769).update({tag: value for tag, value in inner.items() if value is not None})
     if gps:
@@ -87,6 +100,14 @@ def photo(path, time="2023:11:14 22:13:20", more=(), gps=(), xmp=None, seed=0, m
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(picture(seed, **size)).save(path, **options)
     return path
+
+
+def maker_notes(order="<", **values):
+    """Maker notes as older models of DJI write them: an IFD of floats."""
+    tags = {"yaw": 7, "camera_pitch": 9, "camera_yaw": 10, "camera_roll": 11}
+    entries = [struct.pack(f"{order}HHI4s", 1, 2, 4, b"DJI\0")]
+    entries += [struct.pack(f"{order}HHIf", tags[name], 11, 1, values[name]) for name in values]
+    return struct.pack(f"{order}H", len(entries)) + b"".join(entries) + bytes(4)
 
 
 def place(lat, lon, alt=400.0):
@@ -196,7 +217,7 @@ def px4_topics(seconds=10, boot_us=5_000_000, sensor=True):
     for t, yaw, pitch, roll in flown(seconds):
         stamp = boot_us + round(t * 1e6)
         attitude.append((stamp, *quaternion_wxyz(yaw, pitch, roll)))
-        local.append((stamp, 3.0, -1.0, -100.0 - t, 90.0 + t, t < 8))
+        local.append((stamp, 3.0, -1.0, -100.0 - t, 90.0 + t, t < 8, 1))
         place.append((stamp, 46.5, 2.5, 400.0 + t))
         gps.append((stamp, START_S * 10**6 + round(t * 1e6), 465_000_000, 25_000_000, 400_000, 3))
     stamp, double, single = "uint64_t", "double", "float"
@@ -210,8 +231,10 @@ def px4_topics(seconds=10, boot_us=5_000_000, sensor=True):
                 "z": single,
                 "dist_bottom": single,
                 "dist_bottom_valid": "bool",
+                "dist_bottom_sensor_bitfield": "uint8_t",
             },
-            local if sensor else [(*row[:4], 0.0, False) for row in local],
+            # Without a sensor the estimator guesses a height and calls it valid.
+            local if sensor else [(*row[:4], 0.1, True, 0) for row in local],
         ),
         "vehicle_global_position": (
             {"timestamp": stamp, "lat": double, "lon": double, "alt": single},

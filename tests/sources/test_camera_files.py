@@ -105,6 +105,20 @@ def test_kalibr(tmp_path):
     assert read_camera_file(kalibr(tmp_path / "c.yaml", "none", [])) == expected(())
 
 
+def test_a_chain_of_kalibr_with_the_header_of_opencv(tmp_path):
+    path = kalibr(tmp_path / "a.yaml", names=("cam0", "cam1"))
+    chain = path.read_text()
+    second = chain.index("cam1:")
+    chain = chain[:second] + chain[second:].replace("500.25", "600.25")
+    path.write_text("%YAML:1.0\n\n" + chain)
+    assert read_camera_file(tmp_path / "a.yaml#cam0") == expected(BROWN[:4])
+    assert read_camera_file(tmp_path / "a.yaml#cam1").fx_px == 600.25
+    with pytest.raises(CameraError, match="holds cam0, cam1; select one as FILE#cam0"):
+        read_camera_file(path)
+    with pytest.raises(CameraError, match="no camera 'cam7', it holds cam0, cam1"):
+        read_camera_file(tmp_path / "a.yaml#cam7")
+
+
 def test_our_own(tmp_path):
     path = camera_file(tmp_path / "flight.json", distortion=FISHEYE, model="fisheye")
     camera = read_camera_file(path)

@@ -1,6 +1,7 @@
 """`orthonav import` as it is typed, and `localize` of a source as of its import."""
 
 import json
+import re
 import time
 from pathlib import Path
 
@@ -10,13 +11,14 @@ import pytest
 from bags import Messages, record
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
-from recorders import START_S, camera_file, packet, photo, subtitles, tlog, video
+from recorders import START_S, camera_file, dji, packet, photo, place, subtitles, tlog, video
 
 from orthonav.cli import main
 from orthonav.flight import FlightWriter, open_flight, read_image
 from orthonav.flight.fixes import read_results
 from orthonav.geo.camera import Camera
 from orthonav.records import Fix, Telemetry
+from orthonav.sources.recording import LEVEL_GROUND
 
 DATA = Path(__file__).parents[1] / "data"
 MAP = DATA / "golden_v1.onav"
@@ -112,7 +114,7 @@ def test_a_source_is_localized_as_its_import_is(run, kind, tmp_path, camera):
     source = MAKERS[kind](tmp_path)
     telemetry = ["--camera", camera]
     code, out, err = run("import", source, "--out", tmp_path / "flight", *telemetry, "--json")
-    assert (code, err) == (0, "")
+    assert code == 0 and err in ("", f"WARNING: {LEVEL_GROUND}\n")
     plain = json.loads(out)
     assert plain["kind"] == {"bag": "ros", "db3": "ros", "mcap": "ros"}.get(kind, kind)
     assert plain["views"] == plain["complete"] == 2 and plain["broken"] == 0
@@ -164,11 +166,11 @@ def test_doubtful_input_causes_a_warning(run, tmp_path):
     (tmp_path / "photos/1.jpg").write_bytes(data[:-200])
     code, out, err = run("import", tmp_path / "photos", "--out", tmp_path / "flight")
     assert code == 0 and "2 views, 0 with heading" in out
-    assert "focal length from EXIF: expect errors of some per cent" in err
+    assert "good to 3 %: 35 mm equivalent of EXIF" in err
     assert "1 views left out, the first" in err and "1.jpg" in err
     assert "2 of 2 views lack heading, pitch, roll or height" in err
     note = json.loads((tmp_path / "flight/flight.json").read_text())["note"]
-    assert "focal length from EXIF" in note
+    assert "35 mm equivalent of EXIF" in note
     assert not (tmp_path / "flight/truth.csv").exists()
     quiet = run("import", tmp_path / "photos", "--out", tmp_path / "quiet", "-q")
     assert quiet[0] == 0 and quiet[2] == ""
@@ -258,3 +260,43 @@ def test_help_is_quick():
     with pytest.raises(SystemExit):
         main(["import", "--help"])
     assert time.perf_counter() - start < 0.3
+
+
+def test_a_recording_far_from_the_map_is_named(run, tmp_path, camera):
+    source, camera = photographs(tmp_path / "photos"), ["--camera", camera]
+    for index in range(2):
+        add_gps(source / f"{index}.png", place(46.0, 3.0))
+    code, _, err = run("localize", MAP, source, "--out", tmp_path / "a.jsonl", *camera)
+    assert code == 0 and re.search(r"first view is 5\d km from the map: check the map", err)
+    for index in range(2):
+        add_gps(source / f"{index}.png", place(*PLACE))
+    _, _, err = run("localize", MAP, source, "--out", tmp_path / "a.jsonl", *camera)
+    assert "from the map" not in err
+
+
+def test_a_photograph_that_was_turned_in_an_editor_is_placed(run, tmp_path, camera):
+    """It keeps its old angles, and is named by its software."""
+    xmp = dji(yaw=20.0, height=160.0)
+    path = photo(tmp_path / "photos/a.png", xmp=xmp, first={0x0131: "Windows Photo Viewer 10"})
+    with Image.open(path) as written:
+        tags, text = written.getexif(), written.info["XML:com.adobe.xmp"]
+    info = PngInfo()
+    info.add_itxt("XML:com.adobe.xmp", text)
+    Image.fromarray(seen(0)[::-1, ::-1].copy()).save(path, exif=tags, pnginfo=info)
+    out = tmp_path / "a.jsonl"
+    code, _, err = run("localize", MAP, tmp_path / "photos", "--camera", camera, "--out", out)
+    assert code == 0 and "1 of 1 photographs were written by an editor" in err
+    (result,) = read_results(out)
+    off = np.subtract((result.outcome.lat_deg, result.outcome.lon_deg), PLACE)
+    assert np.abs(off * [111e3, 76e3]).max() < 2
+    assert result.outcome.heading_deg == pytest.approx(200, abs=1)
+
+
+def add_gps(path, gps):
+    """Write GPS tags into a PNG, which keeps the rest."""
+    with Image.open(path) as written:
+        tags, text, pixels = written.getexif(), written.info["XML:com.adobe.xmp"], written.copy()
+    tags.get_ifd(0x8825).update(gps)
+    info = PngInfo()
+    info.add_itxt("XML:com.adobe.xmp", text)
+    pixels.save(path, exif=tags, pnginfo=info)

@@ -82,6 +82,15 @@ def test_heights_are_of_the_distance_sensor_where_it_is_sound(kind, early, late,
     assert heights == pytest.approx([early, late], abs=0.01)
 
 
+@pytest.mark.parametrize(
+    "kind, home, amsl", [("ulog", 400 + 3 - 280, 400), ("dataflash", 113, 400), ("tlog", 108, 400)]
+)
+def test_heights_above_home_and_sea_level(kind, home, amsl, tmp_path):
+    reported = read_log(WRITERS[kind](tmp_path / "log"), DOWN).telemetry((START_S + 3) * 10**9)
+    assert (reported.home_m, reported.amsl_m) == pytest.approx((home, amsl), abs=0.01)
+    assert reported.hae_m is None
+
+
 def test_the_mount_turns_the_camera(log):
     right = read_log(log, (90.0, 0.0, 0.0))
     telemetry = angles_at(right.attitude, START_S * 10**9)

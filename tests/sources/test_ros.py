@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from bags import FORMATS, Messages, flight, record
 from recorders import START_S, camera_file, picture, px4_topics, ulog
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
 
 from orthonav.errors import CameraError, FlightError
 from orthonav.flight import open_flight, read_truth
@@ -300,3 +302,43 @@ def test_a_bag_without_images_is_rejected(tmp_path, messages, topics):
     del topics["/cam/image_raw"]
     with pytest.raises(FlightError, match="expected one topic of images, found none"):
         open_source(record(tmp_path / "flight", topics, messages))
+
+
+EVENT = """service_msgs/ServiceEventInfo info
+example/srv/Add_Request[<=1] request
+{line}
+MSG: service_msgs/ServiceEventInfo
+uint8 event_type
+{line}
+MSG: example/srv/Add_Request
+int64 a
+"""
+
+
+@pytest.mark.parametrize(
+    "kind, definition",
+    [
+        ("example/srv/Add_Event", EVENT.format(line="=" * 80)),
+        ("example/msg/Unreadable", "no definition {"),
+    ],
+)
+def test_topics_that_cannot_be_parsed_are_passed_over(tmp_path, messages, kind, definition):
+    """Events of services, for example: their types are no messages."""
+    path, image = tmp_path / "flight", messages.image(START_S * 10**9, picture())
+    with Writer2(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        event = writer.add_connection(
+            "/add/_service_event",
+            kind,
+            msgdef=definition,
+            rihs01=f"RIHS01_{0:064}",
+        )
+        writer.write(event, START_S * 10**9, b"\0\1\0\0")
+        for topic, message in (
+            ("/cam/image_raw", image),
+            ("/cam/camera_info", messages.camera_info()),
+        ):
+            made = writer.add_connection(topic, message.__msgtype__, typestore=messages.store)
+            raw = messages.store.serialize_cdr(message, message.__msgtype__)
+            writer.write(made, START_S * 10**9, raw)
+    (view,) = open_source(path).views
+    assert view.grey().shape == picture().shape

@@ -12,7 +12,7 @@ from orthonav.geo.camera import enu_from_camera
 from orthonav.records import Prior
 from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
 from orthonav.sources.options import SourceOptions
-from orthonav.sources.recording import check_overlap, fitted, with_options
+from orthonav.sources.recording import check_overlap, doubts_of, fitted, with_options
 from orthonav.sources.track import GAP_NS, RecordedTrack, Samples, angles_at, attitude_of_angles
 
 S = 10**9
@@ -104,10 +104,40 @@ def test_the_better_height_counts_where_it_is_there():
     other.add(0, 80.0), other.add(2 * S, 80.0)
     place.add(0, 46.0, 2.0, 400.0), place.add(4 * S, 46.0, 2.0, 400.0)
     place.add(2 * S, 46.0, 2.0, 400.0)
-    track = RecordedTrack(None, (good.series(), other.series()), place.positions())
+    track = RecordedTrack(None, (good.series(), other.series()), position=place.positions())
     heights = [track.telemetry(t).agl_m for t in (S // 2, 3 * S // 2, 3 * S)]
     assert heights[:2] == [51.0, 80.0] and math.isnan(heights[2])
     assert track.telemetry(3 * S, ground_alt_m=310.0).agl_m == 90.0
+
+
+def test_heights_of_different_references_are_not_taken_for_each_other():
+    home, amsl, hae, place = Samples(1), Samples(1), Samples(1), Samples(3)
+    home.add(0, 50.0), amsl.add(0, 400.0), hae.add(0, 450.0), place.add(0, 46.0, 2.0, 400.0)
+    altitudes = {"amsl": amsl.series(), "hae": hae.series(), "position": place.positions()}
+    reported = RecordedTrack(None, home=home.series(), **altitudes).telemetry(0)
+    assert (reported.home_m, reported.amsl_m, reported.hae_m) == (50.0, 400.0, 450.0)
+    assert reported.agl_m == 50.0  # level ground assumed, and said
+    only = RecordedTrack(None, **altitudes)
+    assert math.isnan(only.telemetry(0).agl_m)
+
+
+@pytest.mark.parametrize(
+    "names, options, expected",
+    [
+        ((), {}, None),
+        (("home",), {}, "level ground is assumed"),
+        (("amsl",), {}, "only altitudes, which are not taken for one; give --ground-alt-m"),
+        (("amsl",), {"ground_alt_m": 290.0}, "is the recorded altitude minus 290 m"),
+        (("home", "amsl"), {"ground_alt_m": 290.0}, "level ground is assumed"),
+    ],
+)
+def test_what_is_assumed_about_heights_is_said_once(names, options, expected):
+    series = Samples(1)
+    series.add(0, 50.0)
+    track = RecordedTrack(None, **dict.fromkeys(names, series.series()))
+    doubts = doubts_of(track, SourceOptions(**options))
+    assert len(doubts) == (expected is not None)
+    assert expected is None or expected in doubts[0]
 
 
 def test_what_the_options_add():

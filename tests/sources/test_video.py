@@ -9,6 +9,7 @@ from recorders import camera_file, dji_subtitle, picture, subtitles, video
 from orthonav.errors import CameraError, FlightError
 from orthonav.flight import open_flight, read_image
 from orthonav.sources import SourceOptions, import_flight, open_source
+from orthonav.sources.attitude import ASSUMED_TILT_STD_DEG
 from orthonav.sources.subtitles import blocks, read_srt
 
 
@@ -109,10 +110,24 @@ DIALECTS = {
         "ISO:100 Shutter:60 EV: Fnum:2.2",
         (-20.2533, 149.0261, 91.9, math.nan, *[math.nan] * 3),
     ),
-    "barometer with units": (
-        "GPS(-1.5,42.5,0.0M) BAROMETER:36.5M",
+    "latitude first, with units": (
+        "2022.06.21 16:06:17\nGPS(42.5,-1.5,0.0M) BAROMETER:36.5M",
         (42.5, -1.5, 36.5, math.nan, *[math.nan] * 3),
     ),
+    "old barometer": (
+        "HOME(149.0251,-20.2532) 2017.8.5 14:11:51\nGPS(49.0251,-20.2533,16) Hb:1.9 Hs:2.9",
+        (-20.2533, 49.0251, 1.9, math.nan, *[math.nan] * 3),
+    ),
+    "RTK": (
+        "F/6.3, SS 60, RTK (20.083799, 30.213635, 28), HOME (20.084146, 30.214243, 103.55m), "
+        "D 75.04m, H 76.19m, G.PRY (-40.0°, 0.0°, 28.2°)",
+        (30.213635, 20.083799, 76.19, math.nan, 28.2, -40.0, 0.0),
+    ),
+    "marks of both orders": (
+        "HOME(2.5,42.5)\nGPS(2.5,42.5,0.0M) BAROMETER:36.5M",
+        (math.nan, math.nan, 36.5, *[math.nan] * 4),
+    ),
+    "no mark": ("GPS(2.5,42.5)", (math.nan,) * 7),
     "latitude first": ("GPS(-20.25,149.5,16)", (-20.25, 149.5, *[math.nan] * 5)),
     "one line": (
         "F/2.8, SS 206.14, ISO 150, EV 0, GPS (-82.6669, 27.7716, 10), D 2.80m, H 41.50m, "
@@ -144,6 +159,28 @@ def test_dialects(tmp_path, dialect, encoding):
     assert telemetry == pytest.approx(expected, nan_ok=True)
 
 
+def test_the_order_is_that_of_the_whole_file(tmp_path):
+    """The first block by itself could begin with either."""
+    texts = ["GPS(50.5,2.5)", "GPS(50.5,2.5)", "GPS(50.5,102.5)"]
+    path = subtitles(tmp_path / "a.srt", texts)
+    assert [(block.lat_deg, block.lon_deg) for block in blocks(path.read_bytes())] == [
+        (50.5, 2.5),
+        (50.5, 2.5),
+        (50.5, 102.5),
+    ]
+
+
+def test_doubtful_positions_are_named(recorded, tmp_path):
+    srt = recorded.with_suffix(".SRT")
+    subtitles(srt, ["GPS(2.5,42.5) G.PRY (-90.0, 0.0, 10.0)"] * 30)
+    (warning,) = open_source(recorded, options(recorded)).warnings
+    assert "begins with the latitude or the longitude: positions are left out" in warning
+    texts = [dji_subtitle(n).replace("46.5", "46.6" if n >= 20 else "46.5") for n in range(30)]
+    subtitles(srt, texts)
+    _, warning = open_source(recorded, options(recorded)).warnings
+    assert "jumps 1 times, the first by 11.1 km 2.0 s after the beginning" in warning
+
+
 def test_windows_lines_and_long_times(tmp_path):
     text = "7\r\n01:02:03,5 --> 01:02:04,000\r\n[latitude: 1.5] [longitude: 2.5]\r\n\r\n"
     (block,) = blocks(text.encode())
@@ -168,7 +205,7 @@ def test_without_gimbal_angles_nothing_is_made_up(tmp_path):
     telemetry = next(open_source(path, options(path)).views).telemetry
     assert telemetry.missing() == ["yaw_deg", "pitch_deg", "roll_deg"] and telemetry.agl_m == 91.9
     level = next(open_source(path, options(path, looks_down=True)).views).telemetry
-    assert level.missing() == ["yaw_deg"]
+    assert level.missing() == ["yaw_deg"] and level.tilt_std_deg == ASSUMED_TILT_STD_DEG
 
 
 def broken(recorded, how):

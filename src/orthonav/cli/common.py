@@ -11,8 +11,9 @@ from typing import Any
 from tqdm import tqdm
 
 ROUTE_HELP = (
-    "planned route: GeoJSON, CSV, KML or KMZ, GPX, a QGroundControl plan or a waypoint file "
-    "(FILE#NAME selects one of several), or a trajectory of the paper: paper:B@46.6,1.9[,BEARING]"
+    "planned route: GeoJSON, CSV, KML or KMZ, GPX, WPML, a QGroundControl plan or a waypoint "
+    "file (FILE#NAME or FILE#NUMBER selects one of several), or a trajectory of the paper: "
+    "paper:B@46.6,1.9[,BEARING]"
 )
 
 

@@ -6,8 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from orthonav.localizer import Localizer
     from orthonav.sources import Recording
 
+FAR_M = 1000.0
+"""A recorded position farther outside the map is named: GNSS and logs err by less."""
 log = logging.getLogger(__name__)
 
 
@@ -75,7 +78,8 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         "--ground-alt-m",
         type=float,
         metavar="M",
-        help="altitude of the ground, where altitudes but no heights were recorded",
+        help="altitude of the ground, in the reference of the recorded altitudes, where no heights "
+        "were recorded",
     )
     group.add_argument(
         "--looks-down",
@@ -88,6 +92,30 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         help="use the recorded position as the prior, with this standard deviation",
     )
+
+
+def warn_if_elsewhere(flight: "Recording", localizer: "Localizer") -> None:
+    """Log a warning where the first view was recorded far from the map."""
+    import numpy as np
+
+    view = next(iter(flight.views), None)
+    if view is None:
+        return
+    prior, place = view.telemetry.prior, getattr(view, "truth_latlon_deg", None)
+    if place is None and prior is not None:
+        place = prior.lat_deg, prior.lon_deg
+    if place is None:
+        return
+    grid, position = localizer.grid, localizer.sheet.frame.en_from_latlon(*place)
+    low = np.array([grid.west_m, grid.north_m - grid.height_px * grid.gsd_m])
+    high = np.array([grid.west_m + grid.width_px * grid.gsd_m, grid.north_m])
+    beyond_m = float(np.hypot(*np.maximum(np.maximum(low - position, position - high), 0.0)))
+    if beyond_m > FAR_M:
+        log.warning(
+            "the recorded position of the first view is %s km from the map: check the map, and "
+            "the order of latitude and longitude",
+            f"{beyond_m / 1000:,.0f}",
+        )
 
 
 def open_source(path: Path, options: argparse.Namespace) -> "Recording":

@@ -30,6 +30,9 @@ OPTIONAL_COLUMNS = (
     "vel_north_mps",
     "tilt_std_deg",
     "vel_std_mps",
+    "home_m",
+    "amsl_m",
+    "hae_m",
 )
 MAX_TEXT_BYTES = 500_000_000
 MAX_VIEWS = 1_000_000
@@ -180,6 +183,7 @@ def read_camera(path: Path) -> tuple[Camera, str]:
             **{name: float(raw[name]) for name in ("fx_px", "fy_px", "cx_px", "cy_px")},
             distortion=tuple(float(value) for value in distortion),
             model=str(raw.get("model", "brown")),
+            focal_std=float(raw.get("focal_std", 0.0)),
         )
         return camera, str(plain.get("note", ""))
     except CameraError as error:
@@ -228,6 +232,9 @@ def _telemetry(row: Mapping[str, str], time_ns: int) -> Telemetry:
         agl_std_m=_optional(row, "agl_std_m"),
         tilt_std_deg=_optional(row, "tilt_std_deg"),
         vel_std_mps=_optional(row, "vel_std_mps"),
+        home_m=_optional(row, "home_m"),
+        amsl_m=_optional(row, "amsl_m"),
+        hae_m=_optional(row, "hae_m"),
         prior=Prior(prior[0] or 0.0, prior[1] or 0.0, prior[2] or 0.0) if usable else None,
         vel_en_mps=None if None in velocity else (velocity[0] or 0.0, velocity[1] or 0.0),
     )

@@ -290,6 +290,7 @@ def camera_of(plain: Any) -> Camera:
             **{name: _number(plain[name]) for name in ("fx_px", "fy_px", "cx_px", "cy_px")},
             distortion=tuple(_number(value) for value in plain["distortion"]),
             model=str(plain["model"]),
+            focal_std=_number(plain.get("focal_std", 0.0)),
         )
     except CameraError:
         raise

@@ -106,6 +106,9 @@ def _columns(telemetry: Telemetry) -> dict[str, Any]:
         "vel_north_mps": velocity and velocity[1],
         "tilt_std_deg": telemetry.tilt_std_deg,
         "vel_std_mps": telemetry.vel_std_mps,
+        "home_m": telemetry.home_m,
+        "amsl_m": telemetry.amsl_m,
+        "hae_m": telemetry.hae_m,
     }
 
 

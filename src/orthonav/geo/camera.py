@@ -18,6 +18,7 @@ from orthonav.geo import lens
 
 Array = NDArray[np.float64]
 MAX_DIMENSION_PX = 65_535
+MAX_FOCAL_STD = 0.5
 _BROWN = (0, 4, 5), "k1,k2,p1,p2[,k3]"
 _HALF_PIXEL = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
 _BODY_FROM_CAMERA = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -31,7 +32,8 @@ class Camera:
     Focal lengths and principal point in pixels, measured from the outer corner of the first pixel
     (pixel-is-area: its centre is 0.5, 0.5). With `model` "brown", `distortion` is empty or
     k1, k2, p1, p2[, k3]; with "fisheye" (equidistant) it is empty or k1, k2, k3, k4; both as in
-    OpenCV. Raises `CameraError` on values no camera has.
+    OpenCV. `focal_std` is the standard deviation of the focal length as a share of it, 0 to 0.5; 0
+    for a calibrated camera. Raises `CameraError` on values no camera has.
     """
 
     width_px: int
@@ -42,6 +44,7 @@ class Camera:
     cy_px: float
     distortion: tuple[float, ...] = ()
     model: str = "brown"
+    focal_std: float = 0.0
 
     def __post_init__(self) -> None:
         if self.distortion and not any(self.distortion):
@@ -54,6 +57,10 @@ class Camera:
             raise CameraError(f"camera has a value that is not finite: {self}")
         if self.fx_px <= 0 or self.fy_px <= 0:
             raise CameraError(f"camera focal length must be above 0 px: {self}")
+        if not 0 <= self.focal_std <= MAX_FOCAL_STD:
+            raise CameraError(
+                f"camera focal_std must be a share of 0 to {MAX_FOCAL_STD}, got {self.focal_std}"
+            )
         if self.model not in ("brown", "fisheye"):
             raise CameraError(f"camera model must be brown or fisheye, got '{self.model}'")
         allowed, names = ((0, 4), "k1,k2,k3,k4") if self.model == "fisheye" else _BROWN

@@ -5,6 +5,7 @@ The file name suffix selects the format; each format has a module in `orthonav.g
 
 import csv
 import logging
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from orthonav.geo.routes.qgc_plan import is_plan, plan_route, read_plan
 from orthonav.geo.routes.record import Height, Route
 from orthonav.geo.routes.values import json_object
 from orthonav.geo.routes.wpl import is_wpl, read_wpl
+from orthonav.geo.routes.wpml import read_wpml
 
 __all__ = [
     "Height",
@@ -36,6 +38,7 @@ __all__ = [
 
 MAX_ROUTE_BYTES = 20_000_000
 """Twice as much as 100,000 waypoints take; JSON and XML take some 20 times their size in memory."""
+MAX_LISTED = 20
 _PAIRS_AT_ONCE = 2**18
 _FEW_POINTS = 64
 _BROKEN = (ValueError, LookupError, TypeError, OverflowError, RecursionError, csv.Error)
@@ -62,6 +65,7 @@ _READERS: dict[str, Callable[[bytes], list[Route]]] = {
     ".plan": read_plan,
     ".kml": read_kml,
     ".kmz": read_kmz,
+    ".wpml": read_wpml,
     ".gpx": read_gpx,
 }
 
@@ -69,8 +73,9 @@ _READERS: dict[str, Callable[[bytes], list[Route]]] = {
 def read_route(path: Path) -> Route:
     """Read a route from a file of one of the formats in `docs/routes.md`.
 
-    `FILE#NAME` selects a line by its name if a file holds several; `paper:B@46.6,1.9,30` is a
-    preset. Raises `MissingFileError` or `RouteError` (naming found and expected content).
+    `FILE#NAME` selects a line by its name, or else its number from 1, if a file holds several;
+    `paper:B@46.6,1.9,30` is a preset. Raises `MissingFileError` or `RouteError` (naming found and
+    expected content).
     """
     if str(path).startswith(PREFIX):
         return preset(str(path))
@@ -105,22 +110,38 @@ def _name_apart(path: Path) -> tuple[Path, str | None]:
 
 
 def _chosen(found: list[Route], name: str | None, first: bool) -> Route:
-    """The line of that name, else the only one.
+    """The line of that name, else of that number, from 1; without a name the only one.
 
     With `first`, the first of several unnamed lines, with a warning. Raises `RouteError`, which
-    lists the names.
+    lists numbers and names.
     """
-    names = ", ".join(repr(route.name or "")[:60] for route in found[:20])
     if name is not None:
         named = [route for route in found if route.name == name]
+        number = int(name) if re.fullmatch(r"[0-9]{1,9}", name) else 0
+        if not named and 1 <= number <= len(found):
+            return found[number - 1]
         if len(named) != 1:
-            raise RouteError(f"{len(named)} lines are named {name!r:.60}; the file holds {names}")
+            raise RouteError(
+                f"{len(named)} lines are named {name!r:.60}; give FILE#NAME or FILE#NUMBER: "
+                f"{_listed(found)}"
+            )
         return named[0]
     if len(found) > 1:
         if not first or any(route.name for route in found):
-            raise RouteError(f"file holds {len(found)} lines; name one as FILE#NAME: {names}")
+            raise RouteError(
+                f"file holds {len(found)} lines; give FILE#NAME or FILE#NUMBER: {_listed(found)}"
+            )
         log.warning("route file holds %d unnamed lines: using the first", len(found))
     return found[0]
+
+
+def _listed(found: list[Route]) -> str:
+    """Number and name of each line."""
+    shown = [
+        f"{number} {route.name!r:.60}" if route.name else f"{number} (no name)"
+        for number, route in enumerate(found[:MAX_LISTED], 1)
+    ]
+    return ", ".join(shown) + (", .." if len(found) > MAX_LISTED else "")
 
 
 def leg_lengths_m(route: Route) -> NDArray[np.float64]:

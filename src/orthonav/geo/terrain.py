@@ -119,11 +119,11 @@ def _flown_amsl_m(
     """Flown heights above mean sea level at shares of a leg, over the terrain heights `below`."""
     ends = route.heights[leg : leg + 2]
     frames = {None if height is None else height.frame for height in ends}
-    if not ends or None in frames or len(frames) > 1:
+    if not ends or not frames.isdisjoint({None, "hae"}) or len(frames) > 1:
         if agl_m is None:
             raise RouteError(
-                f"the height of leg {leg + 1} of the route, or its reference, is unknown; give the "
-                "height above ground (--agl-m)"
+                f"the height of leg {leg + 1} of the route, or its reference, is unknown, or it is "
+                "above the ellipsoid; give the height above ground (--agl-m)"
             )
         return below + agl_m
     known = [height.height_m for height in ends if height is not None]

@@ -191,8 +191,11 @@ def _inspect(path: Path, dataset: Any, folder: Path | None) -> Source:
             f"orthophoto is only {dataset.width} x {dataset.height} px, too small to use: {path}"
         )
     bands = _bands(dataset)
-    if folder is not None and len(bands) == 1 and dataset.dtypes[0] in HEIGHT_TYPES:
-        raise UnfitError(f"raster of one band of {dataset.dtypes[0]} may hold heights: {path}")
+    if len(bands) == 1 and dataset.dtypes[0] in HEIGHT_TYPES:
+        raise UnfitError(
+            f"raster of one band of {dataset.dtypes[0]} may hold heights; an orthophoto has bands "
+            f"of 8 or 16 bits without a sign: {path}"
+        )
     palette = _palette(dataset) if dataset.colorinterp[0] == ColorInterp.palette else None
     outline, gsd_m = _outline(path, dataset, system, transform)
     return Source(

@@ -82,19 +82,20 @@ def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> P
         levels,
         side_px,
         np.array([-offset[0], offset[1]]),
-        pose_prior(telemetry, heading_known),
+        pose_prior(telemetry, heading_known, camera.focal_std),
     )
 
 
-def pose_prior(telemetry: Telemetry, heading_known: bool) -> PosePrior:
-    """Expected heading and scale of a view, by its telemetry."""
+def pose_prior(telemetry: Telemetry, heading_known: bool, focal_std: float = 0.0) -> PosePrior:
+    """Expected heading and scale of a view, by its telemetry and its camera's `focal_std`."""
     yaw_std = _or_default(telemetry.yaw_std_deg, DEFAULT_YAW_STD_DEG)
     agl_std_m = telemetry.agl_std_m
     agl_std = None if agl_std_m is None else agl_std_m / telemetry.agl_m
+    scale_std = math.hypot(_or_default(agl_std, DEFAULT_AGL_STD), focal_std)
     return PosePrior(
         math.radians(telemetry.yaw_deg) if heading_known else None,
         math.radians(min(max(yaw_std, MIN_YAW_STD_DEG), 90.0)),
-        min(max(_or_default(agl_std, DEFAULT_AGL_STD), MIN_AGL_STD), MAX_AGL_STD),
+        min(max(scale_std, MIN_AGL_STD), MAX_AGL_STD),
     )
 
 

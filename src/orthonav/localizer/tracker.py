@@ -132,6 +132,9 @@ class Tracker:
         has another size than the picture.
         """
         refused = check_view(view, self._localizer.grid.gsd_m, self._heading_known)
+        if self._usual_model:
+            scale = math.hypot(Model.log_scale, view.camera.focal_std)
+            self.model = self.mixture.model = replace(self.model, log_scale=scale)
         overlap, ground = self._predict(None if refused else view, view.telemetry)
         self._new_ground += 1 - overlap
         self._seen = []
@@ -333,8 +336,12 @@ class Tracker:
         telemetry = view.telemetry
         expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
         prior, searched = self._search_area(expected)
-        bias, spread = self._correction(expected, prior)
-        corrected = replace(view, telemetry=_known(corrected_by(telemetry, bias), spread))
+        bias, spread = self._correction(telemetry, expected, prior)
+        corrected = replace(
+            view,
+            camera=replace(view.camera, focal_std=0.0),  # part of the spread of the scale
+            telemetry=_known(corrected_by(telemetry, bias), spread),
+        )
         confirms = prior is None or (expected is not None and not self._must_compete(expected))
         seen = self._registration.register(corrected, prior, self._heading_known)
         if isinstance(seen, NoFix):
@@ -357,14 +364,18 @@ class Tracker:
         self.mixture.update(attitude, sightings, newness, searched, ground, confirms=confirms)
         return None
 
-    def _correction(self, expected: Estimate | None, prior: Prior | None) -> tuple[Array, Array]:
+    def _correction(
+        self, telemetry: Telemetry, expected: Estimate | None, prior: Prior | None
+    ) -> tuple[Array, Array]:
         """Mean (4,) and covariance (4, 4) of the biases by which telemetry is corrected.
 
         Those of the track in its surroundings. A search of the whole map has to find any place at
         its own heading and height.
         """
         if expected is None or prior is None:
-            return np.zeros(4), np.diag(self.model.initial_bias())
+            variances = self.model.initial_bias()
+            variances[:2] += self._telemetry_noise(telemetry)
+            return np.zeros(4), np.diag(variances)
         return expected.mean[BIASES], expected.covariance[BIASES, BIASES]
 
     def _must_compete(self, expected: Estimate) -> bool:

@@ -21,7 +21,12 @@ from orthonav.sources.attitude import (
     rotations_of_wxyz,
 )
 from orthonav.sources.guard import needed, reading
-from orthonav.sources.track import RecordedTrack, Samples, attitude_of_angles
+from orthonav.sources.track import (
+    RecordedTrack,
+    Samples,
+    altitude_series,
+    attitude_of_angles,
+)
 
 DATAFLASH_MAGIC = b"\xa3\x95\x80"  # starts with a record of formats
 MAVLINK_MAGICS = (0xFE, 0xFD)
@@ -44,7 +49,7 @@ class _Collected:
     def __init__(self, mount_deg: Angles) -> None:
         self.mount = mount_deg
         self.attitude, self.velocity, self.position = Samples(3), Samples(2), Samples(3)
-        self.distance, self.above_home = Samples(1), Samples(1)
+        self.distance, self.above_home, self.hae = Samples(1), Samples(1), Samples(1)
 
     def track(self, what: str, path: Path) -> RecordedTrack:
         """The track of all samples; raises `FlightError` without attitude."""
@@ -53,11 +58,14 @@ class _Collected:
         )
         if attitude is None:
             raise FlightError(f"{what} has no attitude: {path}")
-        heights = self.distance.series(), self.above_home.series()
+        distance, position = self.distance.series(), self.position.positions()
         return RecordedTrack(
             attitude=attitude,
-            heights=tuple(series for series in heights if series is not None),
-            position=self.position.positions(),
+            heights=() if distance is None else (distance,),
+            home=self.above_home.series(),
+            amsl=altitude_series(position),
+            hae=self.hae.series(),
+            position=position,
             velocity=self.velocity.series(),
             origin_ns=int(attitude.time_ns[0]),
         )
@@ -177,6 +185,8 @@ def _from_tlog(collected: _Collected, message: Any, time_ns: int) -> None:
     elif kind == "GPS_RAW_INT" and message.fix_type >= 3:
         place = message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3
         collected.position.add(time_ns, *place)
+        if message.alt_ellipsoid:  # 0 without this extension
+            collected.hae.add(time_ns, message.alt_ellipsoid * 1e-3)
     elif kind == "DISTANCE_SENSOR" and message.orientation == _DOWNWARD:
         if message.min_distance < message.current_distance < message.max_distance:
             collected.distance.add(time_ns, message.current_distance * 1e-2)

@@ -24,6 +24,8 @@ MAX_EVENTS = 20_000
 MAX_DEPTH = 20
 MAX_VALUE_CHARS = 10_000
 MAX_OPENINGS = 5000
+_OPENCV_HEADER = "%YAML:1.0"
+_CHAIN = re.compile(r"^cam\d+\s*:", re.MULTILINE)
 _BROWN = ("", "brown", "plumb_bob", "rational_polynomial", "radtan", "none")
 _FISHEYE = ("equidistant", "fisheye")
 _BROKEN = (
@@ -42,8 +44,10 @@ _OPENING = re.compile(r"[\[{<:]|-(?![\d.])")
 def read_camera_file(path: Path) -> Camera:
     """The camera of a `flight.json`, or of a file of OpenCV (YAML, JSON), ROS or Kalibr (YAML).
 
-    Raises `MissingFileError`, `CameraError` or `MissingExtraError`.
+    `FILE#cam1` selects one camera of a Kalibr chain. Raises `MissingFileError`, `CameraError` or
+    `MissingExtraError`.
     """
+    path, name = _name_apart(Path(path))
     path = require_file(path, "camera file")
     if path.stat().st_size > MAX_BYTES:
         raise CameraError(f"camera file is larger than {MAX_BYTES // 10**6} MB: {path}")
@@ -53,12 +57,14 @@ def read_camera_file(path: Path) -> Camera:
     except UnicodeDecodeError as error:
         raise CameraError(f"camera file is not UTF-8 text: {path}") from error
     try:
-        if text.startswith("%YAML:1.0") or "opencv-matrix" in text:
+        # Kalibr chains may begin with OpenCV's header, which is not YAML.
+        chain = _CHAIN.search(text) is not None
+        if not chain and (text.startswith(_OPENCV_HEADER) or "opencv-matrix" in text):
             return _opencv(text)
         if text.lstrip().startswith("{"):
             plain = json.loads(text)
             return read_camera(path)[0] if "camera" in plain else _plain(plain)
-        return _plain(_yaml(text))
+        return _plain(_yaml(text.removeprefix(_OPENCV_HEADER)), name)
     except CameraError as error:
         raise CameraError(f"{error}: {path}") from error
     except _BROKEN as error:
@@ -122,15 +128,23 @@ def _check_events(yaml: Any, text: str) -> None:
             )
 
 
-def _plain(plain: Any) -> Camera:
-    """A camera of ROS or Kalibr."""
+def _name_apart(path: Path) -> tuple[Path, str | None]:
+    """The file and the camera after `#`; an existing file may have `#` in its name."""
+    file, mark, name = str(path).rpartition("#")
+    return (path, None) if not mark or path.exists() else (Path(file), name)
+
+
+def _plain(plain: Any, name: str | None = None) -> Camera:
+    """A camera of ROS or Kalibr; of several the one of that name."""
     if not isinstance(plain, Mapping):
         raise TypeError(f"a mapping was expected, got {type(plain).__name__}")
     cameras = [name for name in plain if str(name).startswith("cam") and str(name)[3:].isdecimal()]
-    if len(cameras) > 1:
-        raise CameraError(f"file holds {', '.join(cameras)}; leave one of them")
+    if name is not None and name not in cameras:
+        raise CameraError(f"file holds no camera {name!r:.60}, it holds {', '.join(cameras)}")
+    if name is None and len(cameras) > 1:
+        raise CameraError(f"file holds {', '.join(cameras)}; select one as FILE#{cameras[0]}")
     if cameras:
-        return _kalibr(plain[cameras[0]])
+        return _kalibr(plain[name or cameras[0]])
     if "intrinsics" in plain:
         return _kalibr(plain)
     matrix = _numbers(plain["camera_matrix"]["data"], 9)

@@ -1,8 +1,4 @@
-"""Metadata of a photograph: EXIF, and XMP of DJI, Autel, senseFly and Pix4D.
-
-EXIF: CIPA DC-008 (Exif 2.32). XMP: values by the manufacturers' names, searched in the text of the
-packet: some firmware writes undeclared prefixes, which no XML parser accepts.
-"""
+"""Metadata of a photograph: EXIF (CIPA DC-008, Exif 2.32), XMP and maker notes."""
 
 import math
 import re
@@ -15,25 +11,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.geo.camera import enu_from_camera
-from orthonav.sources.attitude import enu_from_gimbal_camera
+from orthonav.sources.focal import Optics
 from orthonav.sources.guard import needed, reading
+from orthonav.sources.makernotes import read_maker_notes
+from orthonav.sources.xmp import Xmp
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
-_XMP_TAG, _MAKE, _TIME, _TIME_ORIGINAL = 700, 0x010F, 0x0132, 0x9003
+_XMP_TAG, _MAKE, _MODEL, _SOFTWARE = 700, 0x010F, 0x0110, 0x0131
+_TIME, _TIME_ORIGINAL, _MAKER_NOTE = 0x0132, 0x9003, 0x927C
 _OFFSET, _OFFSET_ORIGINAL = 0x9010, 0x9011
 _SUBSEC, _SUBSEC_ORIGINAL = 0x9290, 0x9291
 _FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002
-_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-_FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
+_ZOOM = 0xA404
 _QUARTER_HOUR = timedelta(minutes=15)
-_XMP = re.compile(
-    r"\b(drone-dji|drone|Camera):([A-Za-z]+)\s*(?:=\s*[\"']|>)\s*([-+]?\d+(?:\.\d+)?)"
-)
-_EXPOSED = re.compile(
-    r"\bdrone-dji:UTCAtExposure\s*(?:=\s*[\"']|>)\s*"
-    r"(\d{4})[-:](\d\d)[-:](\d\d)[T ](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,18 +41,28 @@ class Photo:
     latlon_deg: tuple[float, float] | None
     """Recorded position."""
     alt_m: float
-    """Recorded altitude."""
+    """Recorded altitude; its reference differs between makers."""
+    gimbal_deg: tuple[float, float, float] | None
+    """Yaw, pitch, roll of the gimbal as recorded, of a camera that looks ahead at 0, 0, 0."""
     rotation: NDArray[np.float64] | None
-    """Attitude as `enu_from_camera`."""
-    height_m: float
+    """Attitude as `enu_from_camera` of a camera without a gimbal."""
+    body_yaw_deg: float
+    """Heading of the aircraft."""
+    home_m: float
     """Height above take-off."""
+    amsl_m: float
+    """Height above mean sea level, where its reference is stated."""
+    hae_m: float
+    """Height above the ellipsoid, where its reference is stated."""
     vel_en_mps: tuple[float, float] | None
     """Velocity over ground, east and north."""
-    focal_px: float | None
-    """Focal length for an image of `width_px`."""
+    optics: Optics
+    """Camera and lens."""
+    software: str
+    """Programs that wrote the file; of a camera its firmware."""
 
 
-def read_photo(path: Path, sensor_width_mm: float | None = None) -> Photo:
+def read_photo(path: Path) -> Photo:
     """Metadata of the photograph at `path`; the image is not decoded.
 
     Raises `FlightError` where it is not an image.
@@ -76,73 +76,53 @@ def read_photo(path: Path, sensor_width_mm: float | None = None) -> Photo:
             more, gps = dict(exif.get_ifd(_EXIF_IFD)), dict(exif.get_ifd(_GPS_IFD))
             packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp")
             width, height = image.size
-    text = _text(packet or tags.get(_XMP_TAG) or b"")
-    xmp = {f"{maker}:{name}": float(value) for maker, name, value in _XMP.findall(text)}
-    time_ns, zone_known = _exposed_ns(text), True
+    # Some thermal cameras have XMP in the Exif directory.
+    xmp = Xmp.of(packet or tags.get(_XMP_TAG) or more.get(_XMP_TAG) or b"")
+    make = _word(tags.get(_MAKE))
+    notes = read_maker_notes(_bytes(more.get(_MAKER_NOTE)), make)
+    time_ns, zone_known = xmp.time_ns, True
     if time_ns is None:
         time_ns, zone_known = _time(tags, more, gps)
     latlon, alt = _place(gps)
+    body_yaw = xmp.body_yaw_deg()
     return Photo(
         width_px=width,
         height_px=height,
         time_ns=time_ns,
         zone_known=zone_known,
-        latlon_deg=_exact_place(xmp) or latlon,
+        latlon_deg=xmp.latlon_deg() or latlon,
         alt_m=alt,
-        rotation=_rotation(xmp, str(tags.get(_MAKE, ""))),
-        height_m=_first(xmp, "drone-dji:RelativeAltitude", "drone:RelativeAltitude"),
-        vel_en_mps=_velocity(xmp),
-        focal_px=_focal_px(more, width, height, sensor_width_mm),
+        gimbal_deg=xmp.gimbal_deg() or notes.gimbal_deg,
+        rotation=xmp.rotation(make),
+        body_yaw_deg=body_yaw if math.isfinite(body_yaw) else notes.body_yaw_deg,
+        home_m=xmp.home_m(),
+        amsl_m=xmp.first("sensefly:AltitudeAMSL"),
+        hae_m=xmp.hae_m(),
+        vel_en_mps=xmp.velocity_en_mps(),
+        optics=_optics(tags, more),
+        software=", ".join(filter(None, dict.fromkeys((_word(tags.get(_SOFTWARE)), xmp.writer)))),
     )
 
 
-def _text(packet: str | bytes) -> str:
-    return packet.decode("utf-8", errors="replace") if isinstance(packet, bytes) else packet
-
-
-def _exposed_ns(text: str) -> int | None:
-    """UTC in ns at exposure, as DJI's survey cameras write it."""
-    found = _EXPOSED.search(text)
-    if found is None:
-        return None
-    try:
-        whole = datetime(*map(int, found.groups()[:6]), tzinfo=UTC)  # type: ignore[misc,arg-type]
-    except ValueError:
-        return None
-    return round(whole.timestamp()) * 10**9 + int((found[7] or "0").ljust(9, "0"))
-
-
-def _exact_place(xmp: dict[str, float]) -> tuple[float, float] | None:
-    """The position of XMP, which may be of RTK; `GpsLongtitude` is a common misspelling."""
-    for maker in ("drone-dji", "drone"):
-        lat = _first(xmp, f"{maker}:GpsLatitude")
-        lon = _first(xmp, f"{maker}:GpsLongitude", f"{maker}:GpsLongtitude")
-        if abs(lat) <= 90 and abs(lon) <= 360 and (lat, lon) != (0.0, 0.0):
-            return lat, lon
-    return None
-
-
-def _first(xmp: dict[str, float], *names: str) -> float:
-    return next((xmp[name] for name in names if name in xmp), math.nan)
-
-
-def _rotation(xmp: dict[str, float], make: str) -> NDArray[np.float64] | None:
-    for maker in ("drone-dji", "drone"):
-        angles = [_first(xmp, f"{maker}:Gimbal{name}Degree") for name in ("Yaw", "Pitch", "Roll")]
-        if np.isfinite(angles).all():
-            return enu_from_gimbal_camera(angles)
-    yaw, pitch, roll = (_first(xmp, f"Camera:{name}") for name in ("Yaw", "Pitch", "Roll"))
-    if not math.isfinite(yaw + pitch + roll):
-        return None
-    # senseFly uses the names of Pix4D with the opposite sign of roll.
-    return enu_from_camera(yaw, pitch, -roll if "sensefly" in make.lower() else roll)
-
-
-def _velocity(xmp: dict[str, float]) -> tuple[float, float] | None:
-    north, east = (
-        _first(xmp, f"drone-dji:Flight{axis}Speed", f"drone:Flight{axis}Speed") for axis in "XY"
+def _optics(tags: dict[int, Any], more: dict[int, Any]) -> Optics:
+    return Optics(
+        make=_word(tags.get(_MAKE)),
+        model=_word(tags.get(_MODEL)),
+        focal_mm=_number(more.get(_FOCAL)),
+        film_mm=_number(more.get(_FOCAL_35)),
+        plane=_number(more.get(_PLANE_X)),
+        plane_unit=int(more.get(_PLANE_UNIT) or 2),
+        taken_px=_number(more.get(_PIXELS_X)),
+        zoom=_number(more.get(_ZOOM)),
     )
-    return (east, north) if math.isfinite(east + north) else None
+
+
+def _word(value: Any) -> str:
+    return "" if value is None else str(value).strip("\0 ")
+
+
+def _bytes(value: Any) -> bytes:
+    return value if isinstance(value, bytes) else b""
 
 
 def _time(
@@ -198,23 +178,6 @@ def _place(gps: dict[int, Any]) -> tuple[tuple[float, float] | None, float]:
     lat, lon = -lat if south else lat, -lon if west else lon
     sound = abs(lat) <= 90 and abs(lon) <= 360 and (lat, lon) != (0.0, 0.0)
     return ((lat, lon) if sound else None), alt
-
-
-def _focal_px(
-    more: dict[int, Any], width_px: int, height_px: int, sensor_width_mm: float | None
-) -> float | None:
-    """Focal length in pixels, good to some per cent, or None."""
-    focal_mm, film_mm = _number(more.get(_FOCAL)), _number(more.get(_FOCAL_35))
-    if sensor_width_mm is not None and focal_mm > 0:
-        return focal_mm / sensor_width_mm * width_px
-    if film_mm > 0:  # equivalent of the diagonal: CIPA DCG-001
-        return film_mm / _FILM_DIAGONAL_MM * math.hypot(width_px, height_px)
-    unit_mm = _MM_PER_UNIT.get(int(more.get(_PLANE_UNIT) or 2), math.nan)
-    px_per_mm = _number(more.get(_PLANE_X)) / unit_mm
-    taken_px = _number(more.get(_PIXELS_X))
-    if not (focal_mm > 0 and px_per_mm > 0):
-        return None
-    return focal_mm * px_per_mm * (width_px / taken_px if taken_px > 0 else 1.0)
 
 
 def _number(value: Any) -> float:

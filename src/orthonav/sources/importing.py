@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from orthonav.errors import CameraError, FlightError
+from orthonav.errors import FlightError
 from orthonav.files import replacing_folder
 from orthonav.flight import FlightWriter
 from orthonav.flight.writer import encoded
@@ -24,7 +24,7 @@ class Imported:
     complete: int
     """Those with all telemetry that a fix needs."""
     broken: int
-    """Views left out because their image cannot be decoded."""
+    """Views left out because their image cannot be decoded, or has another size."""
     first_broken: str
     """The error of the first one of them."""
 
@@ -38,8 +38,9 @@ def import_flight(
     """Write the views of `recording` as a flight folder `out`, whole or not at all.
 
     Encoded images are copied unchanged; others are written grey, as PNG or, with `jpeg_quality`,
-    as JPEG. Raises `FlightError` where no image can be decoded, `CameraError` where one has
-    another size than the camera, `OutputError` where `out` cannot be written.
+    as JPEG. Views whose image cannot be decoded, or has another size than the camera, are left out
+    and counted. Raises `FlightError` where none is left, `OutputError` where `out` cannot be
+    written.
     """
     views = truths = complete = broken = 0
     first_broken = ""
@@ -69,7 +70,7 @@ def _encoded_image(
     """Name and bytes of the image as it is written, once it is decoded."""
     grey, camera = view.grey(), recording.camera
     if grey.shape != (camera.height_px, camera.width_px):
-        raise CameraError(
+        raise FlightError(
             f"camera is {camera.width_px} x {camera.height_px} px, the image is "
             f"{grey.shape[1]} x {grey.shape[0]} px: {view.where}"
         )

@@ -34,7 +34,7 @@ class SourceOptions:
     sensor_width_mm: float | None = None
     """Width of the sensor, for the focal length of photographs."""
     ground_alt_m: float | None = None
-    """Altitude of the ground, where altitudes but no heights were recorded."""
+    """Altitude of the ground, where altitudes but no heights were recorded; in their reference."""
     looks_down: bool = False
     """Whether the camera looked straight down where pitch and roll were not recorded."""
 

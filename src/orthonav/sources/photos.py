@@ -2,24 +2,31 @@
 
 import logging
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from orthonav.errors import CameraError, FlightError
 from orthonav.flight import read_image
-from orthonav.geo.camera import Camera, attitude_of
+from orthonav.geo.camera import Camera
 from orthonav.records import Telemetry
 from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.exif import Photo, read_photo
+from orthonav.sources.focal import focal_length
 from orthonav.sources.logs import read_log
 from orthonav.sources.options import SourceOptions
+from orthonav.sources.photo_poses import PhotoPose, poses_of
 from orthonav.sources.recording import (
     Recording,
     SourceView,
     check_overlap,
+    doubts_of,
     fitted,
+    height_warnings,
+    jump_warnings,
     known_at,
     rounded,
     with_options,
@@ -27,17 +34,20 @@ from orthonav.sources.recording import (
 from orthonav.sources.track import RecordedTrack
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
-EXIF_NOTE = "focal length from EXIF: expect errors of some per cent"
+_BY_NAME_NS = 10**9
+"""Spacing of photographs without a time, which are ordered by name."""
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class _DatedPhoto:
-    """A photograph and its time by the log's clock."""
+    """A photograph, its time by the log's clock, and its attitude."""
 
     path: Path
     time_ns: int
     photo: Photo
+    pose: PhotoPose | None = None
+    """None where a log has it."""
 
 
 def photo_paths(folder: Path) -> list[Path]:
@@ -54,8 +64,8 @@ def photo_paths(folder: Path) -> list[Path]:
 def open_photos(folder: Path, options: SourceOptions) -> Recording:
     """The flight of a folder of photographs, by time.
 
-    Raises `FlightError`, `CameraError` or `MissingExtraError`. Photographs that cannot be read or
-    have no time are left out, with a warning.
+    Raises `FlightError`, `CameraError` or `MissingExtraError`. Photographs that cannot be read,
+    have no time, or another size than most, are left out, with a warning.
     """
     taken, warnings = _taken(folder, options)
     camera, note = _camera(taken[0], options)
@@ -63,6 +73,18 @@ def open_photos(folder: Path, options: SourceOptions) -> Recording:
     if options.telemetry is not None:
         track = read_log(options.telemetry, options.mount_deg)
         check_overlap(track, taken[0].time_ns, taken[-1].time_ns, options.telemetry)
+        warnings += doubts_of(track, options)
+    else:
+        poses, doubts = poses_of([one.photo for one in taken])
+        taken = [replace(one, pose=pose) for one, pose in zip(taken, poses, strict=True)]
+        warnings += doubts
+        warnings += height_warnings(
+            any(math.isfinite(one.photo.home_m) for one in taken),
+            all(math.isnan(one.photo.home_m) for one in taken)
+            and any(math.isfinite(one.photo.alt_m) for one in taken),
+            options,
+        )
+        warnings += jump_warnings([(one.time_ns, one.photo.latlon_deg) for one in taken])
     return Recording(
         kind="photos",
         path=folder,
@@ -75,43 +97,95 @@ def open_photos(folder: Path, options: SourceOptions) -> Recording:
 
 
 def _taken(folder: Path, options: SourceOptions) -> tuple[list[_DatedPhoto], list[str]]:
-    """The photographs that can be read and have a time, by time, and warnings."""
+    """The photographs that can be used, by time, and warnings."""
     paths = photo_paths(folder)
     if not paths:
         raise FlightError(f"folder has no photographs ({', '.join(SUFFIXES)}): {folder}")
-    taken, unread, untimed, guessed = [], [], [], 0
+    found: list[tuple[Path, Photo]] = []
+    unread = []
     for path in paths:
         try:
-            photo = read_photo(path, options.sensor_width_mm)
+            found.append((path, read_photo(path)))
         except FlightError as error:
             log.info("%s", error)
             unread.append(path)
-            continue
-        if photo.time_ns is None:
-            untimed.append(path)
-        else:
-            guessed += not photo.zone_known
-            taken.append(_DatedPhoto(path, photo.time_ns + options.time_offset_ns, photo))
+    found, odd = _of_one_size(found)
+    timed = [one for one in found if one[1].time_ns is not None]
+    untimed = [path for path, photo in found if photo.time_ns is None]
+    by_name = _by_name(found) if options.telemetry is None else []
+    if len(by_name) > len(timed):
+        timed, untimed = by_name, [one for one in untimed if one not in dict(by_name)]
     warnings = [
         f"{len(bad)} of {len(paths)} photographs left out, {why}, the first: {bad[0].name}"
-        for bad, why in ((unread, "not readable"), (untimed, "no time in EXIF"))
+        for bad, why in (
+            (unread, "not readable"),
+            (odd, "of another size than most"),
+            (untimed, "no time in EXIF"),
+        )
         if bad
     ]
-    if not taken:
+    if not timed:
         raise FlightError(f"{'; '.join(warnings)}: {folder}")
-    if guessed:
+    if timed is by_name:
+        warnings.append(
+            f"no time in EXIF of {len(timed)} photographs: ordered by name, one second apart"
+        )
+    elif guessed := sum(not photo.zone_known for _, photo in timed):
         warnings.append(f"no time zone in EXIF of {guessed} photographs: UTC assumed")
+    taken = [
+        _DatedPhoto(path, (photo.time_ns or 0) + options.time_offset_ns, photo)
+        for path, photo in timed
+    ]
     return sorted(taken, key=lambda one: (one.time_ns, one.path)), warnings
+
+
+def _of_one_size(
+    found: Sequence[tuple[Path, Photo]],
+) -> tuple[list[tuple[Path, Photo]], list[Path]]:
+    """The photographs of the most frequent size, of two the larger one, and the other files."""
+    sizes = Counter((photo.width_px, photo.height_px) for _, photo in found)
+    usual = max(sizes, key=lambda size: (sizes[size], size[0] * size[1]), default=None)
+    alike = [one for one in found if (one[1].width_px, one[1].height_px) == usual]
+    odd = [path for path, photo in found if (photo.width_px, photo.height_px) != usual]
+    return alike, odd
+
+
+def _by_name(found: Sequence[tuple[Path, Photo]]) -> list[tuple[Path, Photo]]:
+    """Photographs with a pose but without a time, in the order of their names."""
+    posed = [
+        (path, photo)
+        for path, photo in found
+        if photo.time_ns is None
+        and not (photo.gimbal_deg is None and photo.rotation is None and photo.latlon_deg is None)
+    ]
+    posed.sort(key=lambda one: _natural(one[0]))
+    return [
+        (path, replace(photo, time_ns=number * _BY_NAME_NS))
+        for number, (path, photo) in enumerate(posed)
+    ]
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Key that puts IMG_9 before IMG_10."""
+    parts = re.split(r"(\d+)", str(path))
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def _camera(first: _DatedPhoto, options: SourceOptions) -> tuple[Camera, str]:
     width, height = first.photo.width_px, first.photo.height_px
     if options.camera is not None:
         return fitted(read_camera_file(options.camera), width, height, str(first.path)), ""
-    focal = first.photo.focal_px
-    if focal is None or not math.isfinite(focal):
+    try:
+        focal = focal_length(first.photo.optics, width, height, options.sensor_width_mm)
+    except CameraError as error:
+        raise CameraError(f"{error}: {first.path}") from error
+    if focal is None:
         raise CameraError(f"photograph has no focal length; give --camera FILE: {first.path}")
-    return Camera(width, height, focal, focal, width / 2, height / 2), EXIF_NOTE
+    camera = Camera(width, height, focal.px, focal.px, width / 2, height / 2, focal_std=focal.std)
+    return (
+        camera,
+        f"focal length {focal.px:.0f} px, good to {100 * focal.std:.0f} %: {focal.source}",
+    )
 
 
 def _views(
@@ -135,11 +209,24 @@ def _views(
 
 def _own_telemetry(one: _DatedPhoto, options: SourceOptions) -> Telemetry:
     """Telemetry from the metadata of the photograph itself."""
-    photo = one.photo
-    yaw = pitch = roll = math.nan
-    if photo.rotation is not None:
-        yaw, pitch, roll = attitude_of(photo.rotation)
-    height = photo.height_m
+    photo, pose = one.photo, one.pose or PhotoPose()
+    height = photo.home_m
     if math.isnan(height) and options.ground_alt_m is not None:
         height = photo.alt_m - options.ground_alt_m
-    return Telemetry(one.time_ns, yaw, pitch, roll, height, vel_en_mps=photo.vel_en_mps)
+    return Telemetry(
+        one.time_ns,
+        pose.yaw_deg,
+        pose.pitch_deg,
+        pose.roll_deg,
+        height,
+        yaw_std_deg=pose.yaw_std_deg,
+        tilt_std_deg=pose.tilt_std_deg,
+        vel_en_mps=photo.vel_en_mps,
+        home_m=_known(photo.home_m),
+        amsl_m=_known(photo.amsl_m),
+        hae_m=_known(photo.hae_m),
+    )
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,7 +1,7 @@
 """A recorded flight that is read view by view."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
@@ -10,12 +10,17 @@ from numpy.typing import NDArray
 
 from orthonav.errors import CameraError, FlightError
 from orthonav.geo.camera import Camera
+from orthonav.geo.frames import distances_m
 from orthonav.records import Prior, Telemetry
+from orthonav.sources.attitude import ASSUMED_TILT_STD_DEG
 from orthonav.sources.options import SourceOptions
-from orthonav.sources.track import RecordedTrack
+from orthonav.sources.track import RecordedTrack, altitude_series
 
 Grey = NDArray[np.uint8]
 DECIMALS = 8
+JUMP_M, JUMP_MPS = 500.0, 150.0
+"""Positions that are farther apart, and farther than this speed allows, are a jump: an aircraft
+that this program is for flies slower, and logs round positions to some metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,25 +71,33 @@ def with_options(
         prior = Prior(*truth_latlon_deg, options.prior_std_m)
         telemetry = replace(telemetry, prior=prior)
     if options.looks_down and math.isnan(telemetry.pitch_deg + telemetry.roll_deg):
-        telemetry = replace(telemetry, pitch_deg=0.0, roll_deg=0.0)
+        telemetry = replace(
+            telemetry, pitch_deg=0.0, roll_deg=0.0, tilt_std_deg=ASSUMED_TILT_STD_DEG
+        )
     return telemetry
 
 
 def rounded(telemetry: Telemetry) -> Telemetry:
     """The telemetry at the precision of a flight folder, so that import changes no result."""
     prior, velocity = telemetry.prior, telemetry.vel_en_mps
-    yaw_std, agl_std = telemetry.yaw_std_deg, telemetry.agl_std_m
     return replace(
         telemetry,
         yaw_deg=round(telemetry.yaw_deg, DECIMALS),
         pitch_deg=round(telemetry.pitch_deg, DECIMALS),
         roll_deg=round(telemetry.roll_deg, DECIMALS),
         agl_m=round(telemetry.agl_m, DECIMALS),
-        yaw_std_deg=None if yaw_std is None else round(yaw_std, DECIMALS),
-        agl_std_m=None if agl_std is None else round(agl_std, DECIMALS),
+        yaw_std_deg=_rounded(telemetry.yaw_std_deg),
+        agl_std_m=_rounded(telemetry.agl_std_m),
         prior=prior and Prior(*(round(number, DECIMALS) for number in astuple(prior))),
         vel_en_mps=velocity and (round(velocity[0], DECIMALS), round(velocity[1], DECIMALS)),
+        home_m=_rounded(telemetry.home_m),
+        amsl_m=_rounded(telemetry.amsl_m),
+        hae_m=_rounded(telemetry.hae_m),
     )
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, DECIMALS)
 
 
 def known_at(
@@ -94,6 +107,60 @@ def known_at(
     truth = track.latlon_deg(time_ns)
     telemetry = track.telemetry(time_ns, options.ground_alt_m)
     return rounded(with_options(telemetry, truth, options)), truth
+
+
+def jump_warnings(
+    positions: Sequence[tuple[int, tuple[float, float] | None]],
+) -> list[str]:
+    """Warning about jumps of a recorded position, at times in ns; empty without one."""
+    known = [(time_ns, place) for time_ns, place in positions if place is not None]
+    if len(known) < 2:
+        return []
+    seconds = np.diff([time_ns / 1e9 for time_ns, _ in known])
+    places = np.array([place for _, place in known])
+    apart_m = distances_m(places[:-1], places[1:])
+    jumps = np.flatnonzero((apart_m > JUMP_M) & (apart_m > JUMP_MPS * seconds))
+    if not len(jumps):
+        return []
+    first = int(jumps[0])
+    return [
+        f"recorded position jumps {len(jumps)} times, the first by {apart_m[first] / 1000:.1f} km "
+        f"{seconds[: first + 1].sum():.1f} s after the beginning: check it before it is used"
+    ]
+
+
+LEVEL_GROUND = (
+    "height above ground is taken from the height above take-off: level ground is assumed"
+)
+
+
+def doubts_of(track: RecordedTrack, options: SourceOptions) -> list[str]:
+    """Warnings about a track for people: its own, what its heights are, and jumps."""
+    warnings, series = list(track.warnings), track.position
+    known = bool(track.heights) or track.home is not None
+    altitudes = altitude_series(series) is not None or track.amsl is not None
+    warnings += height_warnings(track.home is not None, not known and altitudes, options)
+    if series is None:
+        return warnings
+    places = [
+        (int(time_ns), (float(lat), float(lon)))
+        for time_ns, (lat, lon) in zip(series.time_ns, series.values[:, :2], strict=True)
+    ]
+    return [*warnings, *jump_warnings(places)]
+
+
+def height_warnings(above_home: bool, only_altitudes: bool, options: SourceOptions) -> list[str]:
+    """What is assumed about heights: of those above take-off, or where only altitudes are known."""
+    if above_home:
+        return [LEVEL_GROUND]
+    if not only_altitudes:
+        return []
+    if options.ground_alt_m is None:
+        return [
+            "no height above ground was recorded, only altitudes, which are not taken for one; "
+            "give --ground-alt-m, in the same reference"
+        ]
+    return [f"height above ground is the recorded altitude minus {options.ground_alt_m:g} m"]
 
 
 def fitted(camera: Camera, width_px: int, height_px: int, where: str) -> Camera:

@@ -19,10 +19,17 @@ from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.guard import needed, reading
 from orthonav.sources.logs import read_log
 from orthonav.sources.options import SourceOptions
-from orthonav.sources.recording import Recording, SourceView, check_overlap, fitted, known_at
+from orthonav.sources.recording import (
+    Recording,
+    SourceView,
+    check_overlap,
+    doubts_of,
+    fitted,
+    known_at,
+)
 from orthonav.sources.ros_images import camera_of_info, grey_of_message
 from orthonav.sources.ros_limits import bound_inflation, check_held
-from orthonav.sources.ros_topics import Topics, find_topics
+from orthonav.sources.ros_topics import ParsableReader, Topics, find_topics
 from orthonav.sources.ros_track import read_track, stamp_ns
 from orthonav.sources.track import RecordedTrack
 
@@ -64,7 +71,7 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
         note=f"{path.name}: {topics.summary()}",
         expected=expected,
         stream=partial(_views, path, topics.image.topic, track, options),
-        warnings=tuple(warnings),
+        warnings=(*warnings, *doubts_of(track, options)),
     )
 
 
@@ -82,7 +89,9 @@ def _opened(path: Path) -> Iterator[Any]:
             named = Path(folder) / f"recording{suffix}"  # the library goes by the suffix
             named.symlink_to(path.resolve())
         known = typesys.get_typestore(typesys.Stores.LATEST)  # for old bags without definitions
-        reader = stack.enter_context(highlevel.AnyReader([named], default_typestore=known))
+        reader = highlevel.AnyReader([named], default_typestore=known)
+        reader.readers = [ParsableReader(each) for each in reader.readers]
+        stack.enter_context(reader)
         check_held(reader.readers)
         yield reader
 

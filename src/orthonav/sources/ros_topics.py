@@ -1,11 +1,14 @@
 """Selection of the topics of a ROS recording by type, or as requested."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from orthonav.errors import FlightError
+from orthonav.sources.guard import needed
 
 TYPES: dict[str, tuple[str, ...]] = {
     "image": ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"),
@@ -25,7 +28,9 @@ TYPES: dict[str, tuple[str, ...]] = {
     ),
 }
 _PLAIN_NUMBERS = ("std_msgs/msg/Float64", "std_msgs/msg/Float32")
-_HEIGHT_NAMES = ("rel_alt", "relative_altitude", "agl", "height_above_ground")
+log = logging.getLogger(__name__)
+_HOME_NAMES = ("rel_alt", "relative_altitude")
+_HEIGHT_NAMES = (*_HOME_NAMES, "agl", "height_above_ground")
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +52,49 @@ class Topics:
         return ", ".join(f"{role} {one.topic}" for role, one in named.items())
 
 
+class ParsableReader:
+    """A reader of `rosbags` without the connections whose messages it cannot describe.
+
+    `rosbags` refuses a whole recording for one of them. Such are events of services and actions:
+    their definitions refer to types that messages do not have.
+    """
+
+    def __init__(self, reader: Any) -> None:
+        self._reader = reader
+
+    def __enter__(self) -> "ParsableReader":
+        self._reader.__enter__()
+        return self
+
+    def __exit__(self, *raised: Any) -> None:
+        self._reader.__exit__(*raised)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._reader, name)
+
+    @cached_property
+    def connections(self) -> list[Any]:
+        """The connections whose messages can be parsed, once the reader is open."""
+        return [one for one in self._reader.connections if _is_parsable(one)]
+
+
+def _is_parsable(connection: Any) -> bool:
+    """Whether a topic carries messages whose definition is complete."""
+    typesys = needed("rosbags.typesys", "ROS recordings")
+    parsable = "/msg/" in connection.msgtype
+    if parsable and connection.msgdef.format.name == "MSG":
+        store = typesys.get_typestore(typesys.Stores.EMPTY)
+        try:
+            store.register(typesys.get_types_from_msg(connection.msgdef.data, connection.msgtype))
+            store.hash_rihs01(connection.msgtype)
+        except Exception as error:  # of the parser, or of a type that is not defined
+            log.info("%s cannot be parsed: %s", connection.msgtype, error)
+            parsable = False
+    if not parsable:
+        log.info("topic is ignored: %s carries %s", connection.topic, connection.msgtype)
+    return parsable
+
+
 def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
     """The topics of a recording by role.
 
@@ -66,8 +114,12 @@ def find_topics(reader: Any, asked: Mapping[str, str], path: Path) -> Topics:
             )
     images = found.pop("image")
     if len(images) != 1:
-        names = ", ".join(sorted(one.topic for one in images)) or "none"
-        raise FlightError(f"expected one topic of images, found {names}; give --topic: {path}")
+        found_names = ", ".join(sorted(one.topic for one in images))
+        if not images:
+            found_names = f"none among {', '.join(sorted(counted)) or 'no topic'}"
+        raise FlightError(
+            f"expected one topic of images, found {found_names}; give --topic: {path}"
+        )
     infos = found["camera_info"]
     near = [one for one in infos if _beside(one.topic, images[0].topic)]
     found["camera_info"] = near or (infos if len(infos) == 1 else [])
@@ -93,6 +145,11 @@ def _fits(connection: Any, role: str) -> bool:
         return False
     named = connection.topic.rpartition("/")[2] in _HEIGHT_NAMES
     return named or connection.msgtype not in _PLAIN_NUMBERS
+
+
+def is_above_home(topic: str) -> bool:
+    """Whether a topic of plain numbers has the height above take-off, by its name."""
+    return topic.rpartition("/")[2] in _HOME_NAMES
 
 
 def _beside(info: str, image: str) -> bool:

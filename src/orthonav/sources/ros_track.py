@@ -7,8 +7,14 @@ from typing import Any
 import numpy as np
 
 from orthonav.sources.attitude import Angles, enu_from_ros_camera, rotations_of_wxyz
-from orthonav.sources.ros_topics import Topics
-from orthonav.sources.track import RecordedTrack, Samples, TimeSeries, attitude_series
+from orthonav.sources.ros_topics import Topics, is_above_home
+from orthonav.sources.track import (
+    RecordedTrack,
+    Samples,
+    TimeSeries,
+    altitude_series,
+    attitude_series,
+)
 
 Reader = Any
 
@@ -23,14 +29,17 @@ def read_track(reader: Reader, topics: Topics, mount_deg: Angles) -> RecordedTra
         attitude = _attitude(reader, topics, connection, mount_deg)
         if attitude is not None:
             break
-    height = _collected(reader, topics, "height", 1, _height)
+    heights = _heights(reader, topics)
     velocity = _collected(reader, topics, "velocity", 2, _velocity)
     position = _collected(reader, topics, "position", 3, _position)
-    heights = None if height is None else height.series()
+    places = None if position is None else position.positions()
     return RecordedTrack(
         attitude=attitude,
-        heights=() if heights is None else (heights,),
-        position=None if position is None else position.positions(),
+        heights=() if heights["agl"] is None else (heights["agl"],),
+        home=heights["home"],
+        amsl=heights["amsl"],
+        hae=altitude_series(places),  # sensor_msgs/NavSatFix
+        position=places,
         velocity=None if velocity is None else velocity.series(),
         origin_ns=0 if attitude is None else int(attitude.time_ns[0]),
     )
@@ -114,9 +123,19 @@ def _collected(
     return samples
 
 
-def _height(message: Any) -> tuple[float, ...] | None:
-    height = height_of_message(message)
-    return None if height is None else (height,)
+def _heights(reader: Reader, topics: Topics) -> dict[str, TimeSeries | None]:
+    """Heights above ground (agl), take-off (home) and sea level (amsl)."""
+    found = {name: Samples(1) for name in ("agl", "home", "amsl")}
+    if "height" in topics.roles:
+        connection = topics.roles["height"]
+        for time_ns, message in _messages(reader, topics, connection):
+            if hasattr(message, "bottom_clearance"):
+                found["agl"].add(time_ns, message.bottom_clearance)
+                found["home"].add(time_ns, message.relative)
+                found["amsl"].add(time_ns, message.amsl)
+            elif (height := height_of_message(message)) is not None:
+                found["home" if is_above_home(connection.topic) else "agl"].add(time_ns, height)
+    return {name: samples.series() for name, samples in found.items()}
 
 
 def _velocity(message: Any) -> tuple[float, ...] | None:

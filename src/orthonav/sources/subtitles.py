@@ -15,8 +15,11 @@ _NUMBER = r"([-+]?\d+(?:\.\d+)?)"
 _TIMES = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->\s*(\d+):(\d\d):(\d\d)[,.](\d{1,3})")
 _TAG = re.compile(r"<[^<>]*>")
 _FIELD = re.compile(rf"\b([a-z]+(?:_[a-z]+)*)\s*:\s*{_NUMBER}")
-_GPS = re.compile(rf"\bGPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}")
-_BAROMETER = re.compile(rf"\bBAROMETER\s*:\s*{_NUMBER}")
+_GPS = re.compile(
+    rf"\b(?:GPS|RTK)\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(?:,\s*{_NUMBER}\s*([Mm]?)\s*)?\)"
+)
+_BAROMETER = re.compile(rf"\b(?:BAROMETER|Hb)\s*:\s*{_NUMBER}(M?)")
+_HOME = re.compile(r"\bHOME\s*\(")
 _HEIGHT = re.compile(rf"\bH\s+{_NUMBER}m\b")
 _GIMBAL = re.compile(rf"\bG\.PRY\s*\(\s*{_NUMBER}[^,]*,\s*{_NUMBER}[^,]*,\s*{_NUMBER}")
 
@@ -50,16 +53,17 @@ def read_srt(path: Path) -> RecordedTrack:
         raise FlightError(f"file is larger than {MAX_BYTES // 10**6} MB: {path}")
     attitude, position, height = Samples(3), Samples(3), Samples(1)
     last = None
-    for last in blocks(path.read_bytes()):
+    data = path.read_bytes()
+    for last in blocks(data):
         _add(last, last.start_ns, attitude, position, height)
     if last is None:
         raise FlightError(f"subtitles hold no telemetry: {path}")
     _add(last, last.end_ns, attitude, position, height)
-    heights = height.series()
     track = RecordedTrack(
         attitude=attitude_of_angles(attitude, enu_from_gimbal_camera),
-        heights=() if heights is None else (heights,),
+        home=height.series(),
         position=position.positions(),
+        warnings=_warnings(data),
     )
     if track.attitude is None and track.position is None:
         raise FlightError(f"subtitles have neither position nor gimbal angles: {path}")
@@ -68,7 +72,7 @@ def read_srt(path: Path) -> RecordedTrack:
 
 def end_ns(track: RecordedTrack) -> int:
     """Last time of a track from subtitles or a table."""
-    series = (track.attitude, track.position, *track.heights)
+    series = (track.attitude, track.position, track.home, *track.heights)
     return max(int(one.time_ns[-1]) for one in series if one is not None)
 
 
@@ -83,11 +87,12 @@ def _add(
 def blocks(data: bytes) -> Iterator[SubtitleBlock]:
     """The blocks of an SRT file in order; those without a line of times are left out."""
     text = _decoded(data)
+    latitude_first = _latitude_first(text)
     for part in re.split(r"\n\s*\n", text.replace("\r\n", "\n")):
         times = _TIMES.search(part)
         if times:
             start, end = _ns(times.groups()[:4]), _ns(times.groups()[4:])
-            yield _block(start, end, _TAG.sub(" ", part[times.end() :]))
+            yield _block(start, end, _TAG.sub(" ", part[times.end() :]), latitude_first)
 
 
 def _decoded(data: bytes) -> str:
@@ -101,13 +106,42 @@ def _ns(parts: tuple[str, ...]) -> int:
     return ((hours * 60 + minutes) * 60 + seconds) * 10**9 + int(parts[3].ljust(3, "0")) * 10**6
 
 
-def _block(start_ns: int, end: int, text: str) -> SubtitleBlock:
+def _latitude_first(text: str) -> bool | None:
+    """Whether the file writes GPS(latitude, longitude, ..), as the Matrice 300 does; None where its
+    marks contradict each other, or there are none.
+
+    Most models write the longitude first, then the number of satellites, and HOME(..); the Matrice
+    300 writes an altitude with its unit in their place, and BAROMETER with a unit.
+    """
+    found = _GPS.findall(text)
+    beyond = [any(abs(float(each[i])) > 90 for each in found) for i in (0, 1)]
+    if any(beyond):
+        return None if all(beyond) else beyond[1]
+    barometer = _BAROMETER.search(text)
+    unit = barometer is not None and bool(barometer[2])
+    latitude = any(each[3] for each in found) or unit
+    longitude = any(each[2].isdecimal() and not each[3] for each in found)
+    longitude = longitude or _HOME.search(text) is not None
+    return None if latitude == longitude else latitude
+
+
+def _warnings(data: bytes) -> tuple[str, ...]:
+    text = _decoded(data)
+    if _GPS.search(text) is None or _latitude_first(text) is not None:
+        return ()
+    return (
+        "subtitles do not show whether GPS(..) begins with the latitude or the longitude: "
+        "positions are left out",
+    )
+
+
+def _block(start_ns: int, end: int, text: str, latitude_first: bool | None) -> SubtitleBlock:
     fields = {name: float(value) for name, value in _FIELD.findall(text)}
     lat, lon = fields.get("latitude", math.nan), fields.get("longitude", math.nan)
     lon = fields.get("longtitude", lon)  # misspelt by some models
-    if gps := _GPS.search(text):
-        lon, lat = float(gps[1]), float(gps[2])
-        if abs(lat) > 90:  # some models write the longitude second
+    if latitude_first is not None and (gps := _GPS.search(text)):
+        lat, lon = float(gps[1]), float(gps[2])
+        if not latitude_first:
             lat, lon = lon, lat
     height = fields.get("rel_alt", _first(_BAROMETER, text))
     if math.isnan(height):

@@ -15,6 +15,9 @@ NEEDED = ("time_s", "pitch_deg", "roll_deg")
 MAX_BYTES = 500_000_000
 _NAMES = {
     "height": ("agl_m",),
+    "home": ("home_m",),
+    "amsl": ("amsl_m",),
+    "hae": ("hae_m",),
     "velocity": ("vel_east_mps", "vel_north_mps"),
     "yaw_std": ("yaw_std_deg",),
     "agl_std": ("agl_std_m",),
@@ -78,6 +81,9 @@ def _track(
             attitude, lambda angles: enu_from_body_camera(ned_from_angles(angles))
         ),
         heights=() if height is None else (height,),
+        home=found["home"],
+        amsl=found["amsl"],
+        hae=found["hae"],
         position=position.positions(),
         velocity=found["velocity"],
         yaw_std=found["yaw_std"],

@@ -124,6 +124,11 @@ def position_series(time_ns: NDArray[np.int64], latlonalt: Array) -> TimeSeries 
     return series
 
 
+def altitude_series(position: TimeSeries | None) -> TimeSeries | None:
+    """The altitudes (N, 1) of a series of positions where they are known."""
+    return None if position is None else series_of(position.time_ns, position.values[:, 2:3])
+
+
 def _sorted(
     time_ns: NDArray[np.int64], values: Array, sound: NDArray[np.bool_]
 ) -> TimeSeries | None:
@@ -142,9 +147,15 @@ class RecordedTrack:
     attitude: TimeSeries | None
     """Quaternion x, y, z, w of `enu_from_camera`, and 1 where its heading is known."""
     heights: tuple[TimeSeries, ...] = ()
-    """Metres above ground; of several series the more accurate first."""
+    """Metres above ground, as measured; of several series the more accurate first."""
+    home: TimeSeries | None = None
+    """Metres above the place of take-off."""
+    amsl: TimeSeries | None = None
+    """Metres above mean sea level."""
+    hae: TimeSeries | None = None
+    """Metres above the ellipsoid of WGS 84."""
     position: TimeSeries | None = None
-    """Latitude and longitude in degrees, altitude in metres."""
+    """Latitude and longitude in degrees, and the altitude in metres, whose reference differs."""
     velocity: TimeSeries | None = None
     """East and north, m/s."""
     yaw_std: TimeSeries | None = None
@@ -155,15 +166,20 @@ class RecordedTrack:
     """Reported prior: latitude, longitude in degrees, standard deviation in metres."""
     origin_ns: int = 0
     """Time at which a recording without a clock begins."""
+    warnings: tuple[str, ...] = ()
+    """Doubts about the log, for people."""
 
     def span_ns(self) -> tuple[int, int] | None:
         """First and last time of its attitude or, without any, of heights or positions."""
-        recorded = (self.attitude, *self.heights, self.position)
+        recorded = (self.attitude, *self.heights, self.home, self.position)
         series = next((one for one in recorded if one is not None), None)
         return None if series is None else (int(series.time_ns[0]), int(series.time_ns[-1]))
 
     def telemetry(self, time_ns: int, ground_alt_m: float | None = None) -> Telemetry:
-        """Telemetry at a time; `ground_alt_m` gives a height where only the altitude is known."""
+        """Telemetry at a time; `ground_alt_m` gives a height where only the altitude is known.
+
+        Where no height above ground was measured, it is the one above take-off.
+        """
         yaw, pitch, roll = angles_at(self.attitude, time_ns)
         prior = _at(self.prior, time_ns, 3)
         velocity = _at(self.velocity, time_ns, 2)
@@ -179,6 +195,9 @@ class RecordedTrack:
             vel_en_mps=(float(velocity[0]), float(velocity[1]))
             if np.isfinite(velocity).all()
             else None,
+            home_m=_number(_at(self.home, time_ns, 1)[0]),
+            amsl_m=_number(_at(self.amsl, time_ns, 1)[0]),
+            hae_m=_number(_at(self.hae, time_ns, 1)[0]),
         )
 
     def latlon_deg(self, time_ns: int) -> tuple[float, float] | None:
@@ -189,8 +208,8 @@ class RecordedTrack:
         return float(lat), float((lon + 180) % 360 - 180)
 
     def _agl_m(self, time_ns: int, ground_alt_m: float | None) -> float:
-        for series in self.heights:
-            height = float(series.at(time_ns)[0])
+        for series in (*self.heights, self.home):
+            height = float(_at(series, time_ns, 1)[0])
             if math.isfinite(height):
                 return height
         altitude = float(_at(self.position, time_ns, 3)[2])

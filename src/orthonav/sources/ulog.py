@@ -12,6 +12,7 @@ from orthonav.sources.guard import needed, reading
 from orthonav.sources.track import (
     RecordedTrack,
     TimeSeries,
+    altitude_series,
     attitude_series,
     position_series,
     series_of,
@@ -45,10 +46,14 @@ def read_ulog(path: Path, mount_deg: Angles) -> RecordedTrack:
         attitude = _attitude(topics.get("vehicle_attitude", {}), shift_us, mount_deg)
         if attitude is None:
             raise FlightError(f"PX4 log has no attitude (vehicle_attitude): {path}")
+        position = _position(gps, topics, shift_us)
         return RecordedTrack(
             attitude=attitude,
             heights=_heights(topics, shift_us),
-            position=_position(gps, topics, shift_us),
+            home=_home(topics, shift_us),
+            amsl=altitude_series(position),
+            hae=_hae(gps, shift_us),
+            position=position,
             velocity=_velocity(topics.get("vehicle_local_position", {}), shift_us),
             origin_ns=int(attitude.time_ns[0]),
         )
@@ -77,13 +82,15 @@ def _attitude(columns: Columns, shift_us: int, mount_deg: Angles) -> TimeSeries 
 
 
 def _heights(topics: dict[str, Columns], shift_us: int) -> tuple[TimeSeries, ...]:
-    """Heights by distance sensor (the estimator's, then the raw one), then above home."""
+    """Heights above ground by distance sensor: the estimator's, then the raw one."""
     local = topics.get("vehicle_local_position", {})
     sensor = topics.get("distance_sensor", {})
-    place, home = topics.get("vehicle_global_position", {}), topics.get("home_position", {})
     found = []
     if "dist_bottom" in local:
         valid = local.get("dist_bottom_valid", np.ones(len(local["dist_bottom"]))) != 0
+        # Without a sensor the estimator guesses, and calls its guess valid.
+        sensors = local.get("dist_bottom_sensor_bitfield", np.full(len(valid), len(sensor)))
+        valid &= sensors != 0
         found.append(_height(local, local["dist_bottom"], valid, shift_us))
     if "current_distance" in sensor:
         distance = sensor["current_distance"]
@@ -91,12 +98,31 @@ def _heights(topics: dict[str, Columns], shift_us: int) -> tuple[TimeSeries, ...
         valid &= distance > sensor.get("min_distance", np.zeros(len(distance)))
         valid &= distance < sensor.get("max_distance", np.full(len(distance), np.inf))
         found.append(_height(sensor, distance, valid, shift_us))
+    return tuple(series for series in found if series is not None)
+
+
+def _home(topics: dict[str, Columns], shift_us: int) -> TimeSeries | None:
+    """Height above home, or above the origin of the local frame, which is where PX4 started."""
+    local = topics.get("vehicle_local_position", {})
+    place, home = topics.get("vehicle_global_position", {}), topics.get("home_position", {})
     if "alt" in place and "alt" in home:
         above = place["alt"].astype(np.float64) - float(home["alt"][-1])
-        found.append(_height(place, above, np.ones(len(above), dtype=bool), shift_us))
-    elif "z" in local:
-        found.append(_height(local, -local["z"], np.ones(len(local["z"]), dtype=bool), shift_us))
-    return tuple(series for series in found if series is not None)
+        return _height(place, above, np.ones(len(above), dtype=bool), shift_us)
+    if "z" not in local:
+        return None
+    valid = local.get("z_valid", np.ones(len(local["z"]))) != 0
+    return _height(local, -local["z"], valid, shift_us)
+
+
+def _hae(gps: Columns, shift_us: int) -> TimeSeries | None:
+    """Height of the GPS receiver above the ellipsoid."""
+    if "altitude_ellipsoid_m" in gps:  # since PX4 1.14
+        height = gps["altitude_ellipsoid_m"].astype(np.float64)
+    elif "alt_ellipsoid" in gps:
+        height = gps["alt_ellipsoid"] * 1e-3
+    else:
+        return None
+    return _height(gps, height, gps.get("fix_type", np.full(len(height), 3)) >= 3, shift_us)
 
 
 def _height(

@@ -23,6 +23,7 @@ from orthonav.sources.recording import (
     Recording,
     SourceView,
     check_overlap,
+    doubts_of,
     fitted,
     known_at,
 )
@@ -57,6 +58,7 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
         note=f"video {path.name}, telemetry of {telemetry_path.name}",
         expected=math.floor(last_ns / 1e9 * options.rate_hz) + 1 if last_ns else 0,
         stream=partial(_views, path, track, options),
+        warnings=tuple(doubts_of(track, options)),
     )
 
 

@@ -14,6 +14,7 @@ _HEIGHTS: tuple[tuple[HeightFrame | None, tuple[str, ...]], ...] = (
     ("agl", ("agl_m", "agl")),
     ("home", ("home_m", "height_above_home_m")),
     ("amsl", ("amsl_m", "amsl", "altitude_amsl_m")),
+    ("hae", ("hae_m",)),
     (None, ("alt_m", "alt", "altitude_m", "altitude", "height_m", "height", "ele")),
 )
 _BAND = ("band_m",)

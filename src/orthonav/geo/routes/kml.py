@@ -12,6 +12,7 @@ from orthonav.errors import RouteError
 from orthonav.geo.routes.markup import read_markup, text_of
 from orthonav.geo.routes.record import Height, HeightFrame, Route, require_few_waypoints
 from orthonav.geo.routes.values import parsed
+from orthonav.geo.routes.wpml import read_wpml
 
 MAX_KML_BYTES = 20_000_000
 MAX_MEMBERS = 10_000
@@ -23,15 +24,15 @@ _Place = tuple[float, float, Height | None]
 
 
 def read_kmz(data: bytes) -> list[Route]:
-    """Lines and tracks of the archive's `doc.kml`, else of its only KML file.
+    """Lines and tracks of the archive's `doc.kml`, else of its only KML file; of a mission of DJI
+    its waylines.
 
     Raises `RouteError`, also on archives that would unpack to more than `MAX_KML_BYTES`.
     """
     _check_archive(data)
     try:
         with zipfile.ZipFile(BytesIO(data)) as archive:
-            names = [name for name in archive.namelist() if name.lower().endswith(".kml")]
-            chosen = [name for name in names if name.lower() == "doc.kml"] or names
+            chosen = _chosen_members(archive.namelist())
             if len(chosen) != 1:
                 raise RouteError(f"KMZ must hold one KML file, got {len(chosen)}")
             with archive.open(chosen[0]) as member:
@@ -44,7 +45,14 @@ def read_kmz(data: bytes) -> list[Route]:
         raise RouteError(f"KMZ cannot be unpacked ({error})") from error
     if len(text) > MAX_KML_BYTES:
         raise RouteError(f"KML in the KMZ is larger than {MAX_KML_BYTES // 10**6} MB")
-    return read_kml(text)
+    return read_wpml(text) if chosen[0].lower().endswith(".wpml") else read_kml(text)
+
+
+def _chosen_members(members: list[str]) -> list[str]:
+    """What is flown: waylines of DJI, which come with a template in KML, else `doc.kml`."""
+    waylines = [name for name in members if name.lower().endswith(".wpml")]
+    names = [name for name in members if name.lower().endswith(".kml")]
+    return waylines or [name for name in names if name.lower() == "doc.kml"] or names
 
 
 def read_kml(data: bytes) -> list[Route]:
@@ -55,6 +63,10 @@ def read_kml(data: bytes) -> list[Route]:
     found = [route for mark in root.iter("Placemark") for route in _routes(mark)]
     if found:
         return found
+    if any(element.tag == "missionConfig" for element in root.iter()):
+        raise RouteError(
+            "KML is the template of a DJI mission; give its waylines.wpml, or the whole KMZ"
+        )
     kinds = sorted({each.tag for mark in root.iter("Placemark") for each in mark.iter()})
     held = [kind for kind in kinds if kind in _POINTLESS] or ["no placemark with a geometry"]
     raise RouteError(f"KML holds no LineString and no gx:Track; it holds {', '.join(held)}")

@@ -11,8 +11,8 @@ from orthonav.errors import RouteError
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.swapped import swapped_hint
 
-HeightFrame = Literal["agl", "home", "amsl"]
-HEIGHT_FRAMES: tuple[HeightFrame, ...] = ("agl", "home", "amsl")
+HeightFrame = Literal["agl", "home", "amsl", "hae"]
+HEIGHT_FRAMES: tuple[HeightFrame, ...] = ("agl", "home", "amsl", "hae")
 MAX_HEIGHT_M = 100_000.0
 """Sanity limit: the edge of space."""
 MAX_BAND_M = 50_000.0
@@ -35,8 +35,8 @@ class Height:
     """Height of a waypoint.
 
     `height_m`: metres above the reference. `frame`: the reference, "agl" (terrain below the
-    waypoint), "home" (terrain at the take-off position), "amsl" (mean sea level), or None if the
-    file does not state it.
+    waypoint), "home" (terrain at the take-off position), "amsl" (mean sea level), "hae" (the WGS 84
+    ellipsoid), or None if the file does not state it.
     """
 
     height_m: float

@@ -1,0 +1,71 @@
+"""Waylines of DJI's waypoint missions (WPML: waylines.wpml, by itself or in a KMZ).
+
+https://developer.dji.com/doc/cloud-api-tutorial/en/api-reference/dji-wpml/waylines-wpml.html
+"""
+
+from collections.abc import Iterator
+from xml.etree.ElementTree import Element
+
+from orthonav.errors import RouteError
+from orthonav.geo.routes.markup import read_markup, text_of
+from orthonav.geo.routes.record import Height, HeightFrame, Route, require_few_waypoints
+from orthonav.geo.routes.values import parsed
+
+_HEIGHT_FRAMES: dict[str, HeightFrame] = {
+    "relativeToStartPoint": "home",
+    "WGS84": "hae",
+    "realTimeFollowSurface": "agl",
+}
+"""By `executeHeightMode`."""
+
+
+def read_wpml(data: bytes) -> list[Route]:
+    """The waylines of a mission, one route per folder, their waypoints by index.
+
+    Raises `RouteError`, also for a height mode that is not known.
+    """
+    root = read_markup(data, "WPML")
+    if root.tag != "kml":
+        raise RouteError(f"WPML must begin with <kml>, got <{root.tag:.40}>")
+    found = [route for folder in root.iter("Folder") for route in _routes(folder)]
+    if not found:
+        raise RouteError("WPML holds no wayline with waypoints")
+    return found
+
+
+def _routes(folder: Element) -> Iterator[Route]:
+    mode = text_of(folder, "executeHeightMode")
+    if mode is not None and mode not in _HEIGHT_FRAMES:
+        raise RouteError(
+            f"WPML executeHeightMode must be {', '.join(_HEIGHT_FRAMES)}, got {mode!r:.60}"
+        )
+    frame = None if mode is None else _HEIGHT_FRAMES[mode]
+    marks = [mark for mark in folder.iterfind("Placemark") if mark.find("Point") is not None]
+    require_few_waypoints(len(marks))
+    marks.sort(key=_index)
+    if marks:
+        heights = tuple(_height(mark, frame) for mark in marks)
+        yield Route(
+            tuple(map(_latlon, marks)),
+            heights if any(heights) else (),
+            name=text_of(folder, "waylineId"),
+        )
+
+
+def _index(mark: Element) -> float:
+    return parsed(text_of(mark, "index") or "nan", "WPML index")
+
+
+def _latlon(mark: Element) -> tuple[float, float]:
+    point = mark.find("Point")
+    values = (text_of(point, "coordinates") or "" if point is not None else "").split(",")
+    if not 2 <= len(values) <= 3:
+        raise RouteError(f"WPML position must be longitude,latitude, got {values!r:.60}")
+    lon, lat = (parsed(value, "WPML position") for value in values[:2])
+    return lat, lon
+
+
+def _height(mark: Element, frame: HeightFrame | None) -> Height | None:
+    """The height that is flown; the third coordinate of the point is not."""
+    text = text_of(mark, "executeHeight")
+    return None if text is None else Height(parsed(text, "WPML executeHeight"), frame)
