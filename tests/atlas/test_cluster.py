@@ -84,11 +84,11 @@ def test_a_cluster_of_this_machine_builds_the_same_atlas(ray, ortho, tmp_path, m
         made = dict(runner.run(np.reciprocal, [1.0, "no number", 2.0]))
         assert (made[1.0], made[2.0]) == (1.0, 0.5)
         assert isinstance(made["no number"], Failure)
-        run = runner.run(time.sleep, [0.0, 30.0, 30.0, 30.0])
+        run = runner.run(time.sleep, [0.0, 200.0, 200.0, 200.0])
         assert next(run) == (0.0, None)
         started_s = time.monotonic()
         run.close()
-        assert time.monotonic() - started_s < 10
+        assert time.monotonic() - started_s < 60
         [(name, limits)] = runner.everywhere(os.getcwd)
         assert name and limits
     assert not ray.is_initialized()

@@ -1,7 +1,6 @@
 """`orthonav import` as it is typed, and `localize` of a source as of its import."""
 
 import json
-import time
 from pathlib import Path
 
 import cv2
@@ -12,7 +11,6 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from recorders import START_S, camera_file, packet, photo, subtitles, tlog, video
 
-from orthonav.cli import main
 from orthonav.flight import FlightWriter, open_flight, read_image
 from orthonav.flight.fixes import read_results
 from orthonav.geo.camera import Camera
@@ -248,13 +246,3 @@ def test_an_existing_output_is_not_replaced(run, tmp_path, names_in):
     before = names_in(tmp_path)
     code, _, err = run("import", source, "--out", source)
     assert code == 1 and "not empty" in err and names_in(tmp_path) == before
-
-
-def test_help_is_quick():
-    from orthonav.cli import import_, source  # loaded when the command is asked for
-
-    assert import_.add and source.add_source
-    start = time.perf_counter()
-    with pytest.raises(SystemExit):
-        main(["import", "--help"])
-    assert time.perf_counter() - start < 0.3
