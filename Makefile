@@ -11,7 +11,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := sh tools/install.sh $(BIN)/python
-PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile -rfEs
+PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -rfEs
 EXTRAS ?= dev
 DEPENDS := pyproject.toml constraints.txt
 

@@ -14,6 +14,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**28))
 
+# A run starts many processes. Without bytecode each one compiles the tests and the program again.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 import cv2
 import hypothesis
 import pytest

@@ -64,9 +64,9 @@ def test_a_fix_elsewhere_and_a_missing_one_are_differences():
     assert fixes.digest({**there, "a": [1.01, 2.0]}) != fixes.digest(there)
 
 
-@pytest.mark.parametrize("environment", [NO_LOCALE, NO_HOME], ids=["locale", "home"])
-def test_odd_folders_and_poor_environments(odd_folder, environment):
+def test_odd_folders_and_a_poor_environment(odd_folder):
     """Placed and reported, with nothing on stderr."""
+    environment = NO_LOCALE | NO_HOME
     out = odd_folder / "füxes 1.jsonl"
     done = run("localize", odd_folder / "area.onav", odd_folder / "flight", "--out", out, "-q",
                **environment)  # fmt: skip

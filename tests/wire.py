@@ -4,6 +4,7 @@ Written from the serialization guide (mavlink.io/en/guide/serialization.html) an
 tables below, which were typed from the definitions; it shares nothing with the encoder.
 """
 
+import functools
 import struct
 
 SIZES = {"B": 1, "b": 1, "s": 1, "H": 2, "I": 4, "i": 4, "f": 4, "Q": 8, "q": 8}
@@ -59,16 +60,25 @@ TABLES = {
 }
 
 
-def x25(data: bytes) -> int:
-    """CRC-16/MCRF4XX, bit by bit."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc >> 1) ^ 0x8408 if crc & 1 else crc >> 1
+def of_byte(crc: int) -> int:
+    """CRC-16/MCRF4XX of one byte, bit by bit."""
+    for _ in range(8):
+        crc = (crc >> 1) ^ 0x8408 if crc & 1 else crc >> 1
     return crc
 
 
+CRC = [of_byte(byte) for byte in range(256)]
+
+
+def x25(data: bytes) -> int:
+    """CRC-16/MCRF4XX."""
+    crc = 0xFFFF
+    for byte in data:
+        crc = (crc >> 8) ^ CRC[(crc ^ byte) & 0xFF]
+    return crc
+
+
+@functools.cache
 def layout(table: str) -> tuple[list[tuple[str, str, int]], int]:
     """Fields in the order of the wire (the widest first, extensions last), how many are base."""
     base, extensions = (
@@ -79,9 +89,13 @@ def layout(table: str) -> tuple[list[tuple[str, str, int]], int]:
     return base + extensions, len(base)
 
 
-def checksum_seed(name: str, fields: list[tuple[str, str, int]]) -> int:
+@functools.cache
+def checksum_seed(number: int) -> int:
+    """Of a message, by its definition."""
+    name, _, table = TABLES[number]
+    fields, base = layout(table)
     text = f"{name} ".encode()
-    for kind, field, length in fields:
+    for kind, field, length in fields[:base]:
         text += f"{TYPES[kind]} {field} ".encode() + (bytes([length]) if length else b"")
     crc = x25(text)
     return (crc & 0xFF) ^ (crc >> 8)
@@ -92,10 +106,10 @@ def decode(frame: bytes) -> dict:
     magic, length, incompatible, _, sequence, system, component = frame[:7]
     number = int.from_bytes(frame[7:10], "little")
     name, seed, table = TABLES[number]
-    fields, base = layout(table)
+    fields, _ = layout(table)
     assert magic == 0xFD and incompatible in (0, 1)
     assert len(frame) == 12 + length + 13 * incompatible
-    assert checksum_seed(name, fields[:base]) == seed
+    assert checksum_seed(number) == seed
     checksum = int.from_bytes(frame[10 + length : 12 + length], "little")
     assert checksum == x25(frame[1 : 10 + length] + bytes([seed]))
     shape = "<" + "".join(f"{count or ''}{kind}" for kind, _, count in fields)

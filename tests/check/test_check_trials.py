@@ -125,7 +125,7 @@ def test_workers_always_end(plan, how):
     with pytest.raises(expected) as raised:
         run_many([(plan, np.tile(EAST, (16, 1)))], 2, stop)
     assert how != "killed" or "--workers" in str(raised.value)
-    for _ in range(50):  # those that were killed are collected
+    for _ in range(600):  # those that were killed are collected
         if not multiprocessing.active_children():
             break
         time.sleep(0.1)

@@ -1,5 +1,6 @@
 """Small georeferenced rasters for the tests of imagery, around one place."""
 
+import functools
 import math
 import warnings
 
@@ -19,8 +20,9 @@ LAMBERT = "EPSG:2154"
 SIZE = 120
 
 
+@functools.cache
 def from_local(crs, frame=FRAME):
-    """PROJ's way from the sheet's plane to a coordinate system."""
+    """PROJ's way from the sheet's plane to a coordinate system, which takes 10 ms to make."""
     return Transformer.from_crs(frame.proj4, crs, always_xy=True)
 
 

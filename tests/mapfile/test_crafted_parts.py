@@ -63,7 +63,7 @@ def located(opened):
 def mutations(part, rng):
     """Variants of the values of a part, of the same type and number of dimensions."""
     flat = part.reshape(-1)
-    for _ in range(6):
+    for _ in range(3):
         changed = flat.copy()
         at = rng.integers(0, len(changed), 3)
         changed[at] = rng.integers(0, 256, 3).astype(part.dtype)
@@ -109,7 +109,7 @@ MASK_CASES = {
     "wrong checksum": zlib.compress(bytes(BITS))[:-1] + b"\0",
     "too short": zlib.compress(bytes(BITS - 1)),
     "too long": zlib.compress(bytes(BITS + 1)),
-    "a bomb of 100 MB": zlib.compress(bytes(100_000_000), 9),
+    "a bomb of 100 MB": zlib.compress(bytes(100_000_000), 1),
     "bytes after the end": zlib.compress(bytes(BITS)) + b"more",
     "a preset dictionary": (lambda c: c.compress(bytes(BITS)) + c.flush())(
         zlib.compressobj(zdict=b"words")

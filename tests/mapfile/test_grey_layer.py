@@ -393,7 +393,7 @@ MASKS = {
     "cut": zlib.compress(bytes(PACKED))[:-3],
     "short": zlib.compress(bytes(PACKED - 1)),
     "long": zlib.compress(bytes(PACKED + 1)),
-    "bomb": zlib.compress(bytes(50_000_000)),
+    "bomb": zlib.compress(bytes(20_000_000), 1),
     "more behind": zlib.compress(bytes(PACKED)) + b"more",
 }
 

@@ -1,13 +1,16 @@
 """Learning: the loss falls, a kill changes nothing, several processes learn one network."""
 
 import dataclasses
+import functools
 import json
 import os
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -67,6 +70,13 @@ def losses(work):
     return json.loads((work / "history.json").read_text())["loss"]
 
 
+@functools.cache
+def undisturbed(recipe):
+    """What a training without interruption gives, and its losses."""
+    with tempfile.TemporaryDirectory() as folder:
+        return SimpleNamespace(onnx=learn(recipe, Path(folder)).onnx, losses=losses(Path(folder)))
+
+
 class Killed(Exception):
     """Stands for a signal that ends the process."""
 
@@ -118,20 +128,20 @@ def test_the_triplet_network_learns_to_find_a_changed_place(tmp_path):
 
 @pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
 def test_an_interrupted_training_resumes_with_the_same_result(recipe, tmp_path):
-    whole = learn(recipe, tmp_path / "whole")
+    whole = undisturbed(recipe)
     with pytest.raises(Killed):
         learn(recipe, tmp_path / "killed", report=kill_at("epoch 2 of 3, loss"))
     assert len(losses(tmp_path / "killed")) == 1
     resumed = learn(recipe, tmp_path / "killed")
     np.testing.assert_array_equal(resumed.onnx, whole.onnx)
-    assert losses(tmp_path / "killed") == losses(tmp_path / "whole")
+    assert losses(tmp_path / "killed") == whole.losses
     np.testing.assert_array_equal(learn(recipe, tmp_path / "killed").onnx, whole.onnx)
 
 
 @pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
 @pytest.mark.parametrize("at", ["epoch 1 of 3, batch 2", "epoch 2 of 3, batch 3"])
 def test_a_training_killed_within_an_epoch_resumes_within_it(recipe, at, tmp_path, monkeypatch):
-    whole = learn(recipe, tmp_path / "whole")
+    whole = undisturbed(recipe)
     monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
     with pytest.raises(Killed):
         learn(recipe, tmp_path / "killed", report=kill_at(at))
@@ -139,7 +149,7 @@ def test_a_training_killed_within_an_epoch_resumes_within_it(recipe, at, tmp_pat
     resumed = learn(recipe, tmp_path / "killed", report=lambda text, share: messages.append(text))
     assert messages[0].startswith(at)
     np.testing.assert_array_equal(resumed.onnx, whole.onnx)
-    assert losses(tmp_path / "killed") == losses(tmp_path / "whole")
+    assert losses(tmp_path / "killed") == whole.losses
 
 
 KILLED = """

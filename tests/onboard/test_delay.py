@@ -12,7 +12,9 @@ from orthonav.onboard.history import StateHistory
 from orthonav.onboard.motion import PictureOdometry
 from orthonav.sources.attitude import enu_from_body_camera
 
-RATE_HZ = 7.0
+RATE_HZ = 5.0
+STATE_S = 0.1
+"""Between two reports of the autopilot."""
 
 
 class Measured:
@@ -25,8 +27,8 @@ class Measured:
         states = 0
         for number in range(int(seconds * RATE_HZ)):
             arrived_s = number / RATE_HZ
-            while states * 0.05 <= arrived_s:
-                self._report(flown, states * 0.05, rng, known)
+            while states * STATE_S <= arrived_s:
+                self._report(flown, states * STATE_S, rng, known)
                 states += 1
             exposed_s = arrived_s - delay_s(arrived_s)
             if exposed_s < 0:
@@ -112,12 +114,11 @@ def clouded(grey, rng):
     "change",
     [
         lambda grey, rng: grey[:, ::-1].copy(),
-        rotated,
         lambda grey, rng: rng.integers(0, 256, grey.shape, dtype=np.uint8),
         lambda grey, rng: np.full_like(grey, 128),
         frozen,
     ],
-    ids=["mirrored", "rotated", "noise", "blank", "frozen"],
+    ids=["mirrored", "noise", "blank", "frozen"],
 )
 def test_wrong_images_give_no_delay(change):
     seen = Measured(Flown(40, seed=6), lambda _: 0.12, seconds=32, change=change)
@@ -127,6 +128,7 @@ def test_wrong_images_give_no_delay(change):
 def test_a_rotated_camera_contradicts_the_autopilot():
     seen = Measured(Flown(40, seed=6), lambda _: 0.12, seconds=32, change=rotated)
     assert sum(each.contradicted for each in seen.whole) >= 5
+    assert not any(each.found for each in seen.whole + seen.recent)
 
 
 def test_clouds_over_a_part_do_no_harm():

@@ -13,7 +13,7 @@ from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 
 FAULTS = {each.name: each for each in (*CAMERA_FAULTS, *TELEMETRY_FAULTS, *COMBINED_FAULTS)}
-LEAD_S = 10.0
+LEAD_S = 9.0
 
 
 def picture(place, attitude, agl_m, rng):
@@ -38,7 +38,7 @@ def fly(world, fault, recovery_s, seconds=None):
 
 
 def test_an_undisturbed_flight_sends_its_messages(world):
-    report = fly(world, undisturbed(10.0), 0.0)
+    report = fly(world, undisturbed(3.0), 0.0)
     sent, views = len(report.sent), sum(at >= report.sent[0].at_s for at in report.views)
     assert sent >= 0.95 * views >= 20
     assert report.worst_m() < 12.0 and report.wrong() == []
@@ -52,7 +52,7 @@ def test_an_undisturbed_flight_sends_its_messages(world):
     ],
 )
 def test_pictures_that_show_nothing_of_the_map_give_no_wrong_message(world, name):
-    report = fly(world, FAULTS[name], 0.0, seconds=4.0)
+    report = fly(world, FAULTS[name], 0.0, seconds=3.0)
     sent, views = report.lead_in()
     assert sent >= 0.9 * views >= 10  # it was tracking before
     assert report.wrong() == [] and len(report.during()) <= 3

@@ -96,7 +96,7 @@ def begin(tmp_path):
 
 def test_agreement_is_no_reason(begin):
     flight = begin()
-    flight.views(400, wait_s=0.25)
+    flight.views(200, wait_s=0.5)
     north_m = flight.north_at(flight.time.now_ns - 50 * MS)
     health = flight.health()
     assert not [reason for reason in health.reasons if reason.startswith("gnss")]
@@ -112,7 +112,7 @@ def test_agreement_is_no_reason(begin):
 @pytest.mark.parametrize("receiver", ["gps_raw_int", "gps2_raw"])
 def test_a_step_is_reported_everywhere(begin, receiver):
     flight = begin(receiver=receiver)
-    flight.views(300, wait_s=0.25)
+    flight.views(150, wait_s=0.5)
     flight.frames.clear()
     flight.off_m = np.array([40.0, 0.0])
     flight.views(30)
@@ -120,7 +120,7 @@ def test_a_step_is_reported_everywhere(begin, receiver):
     name = "GNSS" if receiver == "gps_raw_int" else "GNSS 2"
     alarms = [each.text for each in flight.sent("STATUSTEXT") if each.severity == 2]
     assert alarms and alarms[0].startswith(f"orthonav {name} jump")
-    flight.views(100)
+    flight.views(20, wait_s=0.5)
     assert flight.reasons() >= {"gnss_step"}
     evidence = [each for each in flight.written() if "frame" in each][-1]["evidence"]
     assert evidence["gnss_fault"] == Fault.STEP.code

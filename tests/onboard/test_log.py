@@ -70,7 +70,7 @@ def plain(messages):
 
 
 def wait_for(condition):
-    until = time.monotonic() + 10
+    until = time.monotonic() + 60
     while not condition():
         assert time.monotonic() < until
         time.sleep(0.002)
@@ -196,21 +196,20 @@ def test_chunks_are_on_disk_before_the_end(tmp_path):
 
 def test_a_slow_disk_does_not_block_the_flight(tmp_path, monkeypatch):
     monkeypatch.setattr(log_module, "QUEUE_BYTES", 10 * 64 * 48)
-    goes_on, sync = threading.Event(), os.fsync
+    goes_on, in_time, sync = threading.Event(), [], os.fsync
 
     def stuck(handle):
-        goes_on.wait(10)
+        in_time.append(goes_on.wait(60))
         sync(handle)
 
     monkeypatch.setattr(segment_module.os, "fsync", stuck)
     log = begun(tmp_path)
     log_views(log, range(1))
     wait_for(lambda: not log._queue)
-    start = time.perf_counter()
     log_views(log, range(1, 40))
-    assert time.perf_counter() - start < 1.0
     goes_on.set()
     log.close()
+    assert in_time and all(in_time)  # the flight went on while the disk was stuck
     found = read(tmp_path / "flight_0001.mcap")
     assert len(found["/orthonav/result"]) == len(found["/orthonav/telemetry"]) == 40
     dropped = [each["picture"] for each in plain(found["/orthonav/telemetry"])].count("dropped")

@@ -24,6 +24,7 @@ from orthonav.prepare import BuildRequest, build_map
 from orthonav.prepare.block_cache import BlockCache
 from orthonav.prepare.blocks import Block
 from orthonav.prepare.calibrate import CropSampler
+from orthonav.prepare.calibrate_registration import RegistrationCalibration
 from orthonav.prepare.layout import grid_of
 from orthonav.prepare.parallel import AHEAD, in_order
 from orthonav.prepare.pictures import SheetPictures
@@ -36,7 +37,9 @@ SMALL = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2}
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch):
-    """Many small blocks, few crops."""
+    """Many small blocks, few crops, registration as if it was calibrated."""
+    learnt = RegistrationCalibration(None, 0.5)
+    monkeypatch.setattr("orthonav.prepare.build.calibrate_registration", lambda *_: learnt)
     monkeypatch.setattr("orthonav.prepare.sheet.BLOCK_PX", 128)
     monkeypatch.setattr("orthonav.prepare.sheet.MIN_CACHED_BLOCKS", 4)
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 16)

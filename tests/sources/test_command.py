@@ -2,7 +2,6 @@
 
 import json
 import re
-import time
 from pathlib import Path
 
 import cv2
@@ -13,7 +12,6 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from recorders import START_S, camera_file, dji, packet, photo, place, subtitles, tlog, video
 
-from orthonav.cli import main
 from orthonav.flight import FlightWriter, open_flight, read_image
 from orthonav.flight.fixes import read_results
 from orthonav.geo.camera import Camera
@@ -250,16 +248,6 @@ def test_an_existing_output_is_not_replaced(run, tmp_path, names_in):
     before = names_in(tmp_path)
     code, _, err = run("import", source, "--out", source)
     assert code == 1 and "not empty" in err and names_in(tmp_path) == before
-
-
-def test_help_is_quick():
-    from orthonav.cli import import_, source  # loaded when the command is asked for
-
-    assert import_.add and source.add_source
-    start = time.perf_counter()
-    with pytest.raises(SystemExit):
-        main(["import", "--help"])
-    assert time.perf_counter() - start < 0.3
 
 
 def test_a_recording_far_from_the_map_is_named(run, tmp_path, camera):

@@ -33,7 +33,7 @@ class Coverage:
             height_px=height,
             gsd_m=self._gsd_m,
         ) as raster:
-            self._missing = ~raster.read(0, 0, width, height).valid
+            self._missing = ~raster.read_grey(0, 0, width, height).valid
 
     def whole(self, corners_en_m: Array) -> bool:
         """Whether imagery covers all of the quadrilateral (4, 2)."""

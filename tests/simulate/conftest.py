@@ -1,0 +1,9 @@
+"""What tests of simulated flights share: finding out where imagery is takes most of their time."""
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def coarse_coverage(monkeypatch):
+    """Coverage of few pixels."""
+    monkeypatch.setattr("orthonav.simulate.imagery.COVERAGE_PX", 256)
