@@ -26,7 +26,6 @@ from orthonav.track.hypotheses import (
     merged,
     moments,
     moved,
-    recognized,
     within,
 )
 from orthonav.track.model import (
@@ -71,6 +70,9 @@ UNCONFIRMED = 0.8
 RECOGNIZED = 0.2
 """Probability from which on a view shows the map, by this view alone and by its agreement with the
 prediction. Without, a track is coasting (docs/decisions/tracking.md, 12)."""
+RECOGNIZED_SIGMAS = 1.5
+"""Farther from the estimated position than this many standard deviations per axis, a view does not
+show the map there."""
 UNRECOGNIZED = 0.5
 """Factor on the count of recognized ground for each view of new ground that does not show the map:
 after a few, a track must be confirmed again."""
@@ -321,7 +323,7 @@ class Mixture:
         mean, covariance = moments(near)
         confidence = min(self._inside(radius_m, mean[POSITION]), 1.0)
         confirmed = max(each.sighted for each in major(near)) >= CONFIRMED
-        seen, follows = recognized(near), best.followed
+        seen, follows = self._recognized_at(mean, covariance, near), best.followed
         if not between_views:
             self._state = self._next_state(confidence, confirmed and seen >= RECOGNIZED)
             if self._state is State.TRACKING:
@@ -331,6 +333,21 @@ class Mixture:
             confidence = min(confidence, UNCONFIRMED)
         belief = sum(each.share for each in near)
         return Estimate(mean, covariance, confidence, self._state, belief, seen, confirmed, follows)
+
+    def _recognized_at(self, mean: Array, covariance: Array, near: list[Hypothesis]) -> float:
+        """Largest probability of having recognized the map at the estimated position.
+
+        Hypotheses of the cluster that are farther from it than it is certain do not speak for it.
+        """
+        reach_m = RECOGNIZED_SIGMAS * math.sqrt(float(np.trace(covariance[POSITION, POSITION])) / 2)
+        return max(
+            (
+                each.recognized
+                for each in major(near)
+                if float(np.hypot(*(each.mean - mean)[POSITION])) <= reach_m
+            ),
+            default=0.0,
+        )
 
     def _follow(self, near: list[Hypothesis]) -> None:
         """Mark the hypotheses of a confirmed track."""
