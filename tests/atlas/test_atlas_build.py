@@ -41,7 +41,7 @@ RECIPE = AtlasRecipe(**{"gsd_m": 1.0, **SMALL, "coarse": COARSE})
 def fewer_crops(monkeypatch):
     """Calibration from few crops: it takes longest."""
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 4)
-    monkeypatch.setattr("orthonav.prepare.calibrate_registration.MIN_RIGHT", 1)
+    monkeypatch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
 
 
 @pytest.fixture(scope="module")
