@@ -56,6 +56,7 @@ def built(ortho, tmp_path_factory):
     place = tmp_path_factory.mktemp("built") / "atlas"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.prepare.calibrate.CROPS", 4)
+        patch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
         return place, made(place, ortho)
 
 
