@@ -77,8 +77,8 @@ UNRECOGNIZED = 0.5
 """Factor on the count of recognized ground for each view of new ground that does not show the map:
 after a few, a track must be confirmed again."""
 BLIND = 0.5
-"""Factor on the evidence of a view that does not show the map, for each such view before: clouds,
-water and a covered lens last (docs/decisions/tracking.md, 13)."""
+"""Factor on the evidence of a view that does not show the map against a track that was confirmed,
+for each such view before: clouds, water and a covered lens last (docs/decisions/tracking.md, 13)."""
 MOST_SIGHTED = 3.0
 """Highest count of recognized ground, in views."""
 FORGOTTEN = 0.5
@@ -281,7 +281,8 @@ class Mixture:
         """
         ground = newness if new_ground is None else new_ground
         made = []
-        missed = self.model.miss ** (newness * BLIND**self._blind)
+        missed = self.model.miss**newness
+        missed_again = self.model.miss ** (newness * BLIND**self._blind)
         found = (1 - self.model.miss) ** newness
         searched_m2 = self.area_m2 if searched is None else math.pi * searched[1] ** 2
         mounts = [(share, covariance) for share, _, covariance in self._mounts()]
@@ -293,7 +294,8 @@ class Mixture:
             in_search = self._on_map(each.mean)
             if searched is not None:
                 in_search &= bool(np.hypot(*(each.mean[:2] - searched[0])) < searched[1])
-            share = each.share * (missed if in_search else 1.0)
+            miss = missed_again if each.followed else missed
+            share = each.share * (miss if in_search else 1.0)
             each = replace(each, uncounted=min(each.uncounted + ground, 1.0))
             made.append(replace(each, share=share, sighted=_forgotten(each.sighted, ground)))
             for start in self._with_bias_jump(each):
@@ -427,7 +429,9 @@ class Mixture:
         shown = recognition(seen, each.covariance, innovation, self.model.most_agreement)
         sighted, uncounted = _forgotten(each.sighted, ground), each.uncounted
         if shown >= RECOGNIZED:
-            counted = confirmed_ground(seen.alone, uncounted) if confirms else 0.0
+            # Only of a track that was confirmed: chance has many views to agree with a new one.
+            shown_anew = uncounted if each.followed else ground
+            counted = confirmed_ground(seen.alone, shown_anew) if confirms else 0.0
             sighted = min(each.sighted + counted, MOST_SIGHTED)
             uncounted = 0.0 if counted else uncounted
         self._numbers += 1
