@@ -173,7 +173,8 @@ def _of_one_focal_length(
     if not known:
         return taken, []
     usual = known.most_common(1)[0][0]
-    alike, odd = [], []
+    alike: list[_DatedPhoto] = []
+    odd: list[_DatedPhoto] = []
     for one, each in zip(taken, found, strict=True):
         other = isinstance(each, CameraError) or (
             each is not None and abs(each.px / usual.px - 1) > usual.std
