@@ -114,6 +114,11 @@ def test_focal_lengths(camera):
     assert found.px == pytest.approx(px, abs=1)
 
 
+@pytest.mark.parametrize("size", [(4000, 3000), (3000, 4000)])
+def test_the_width_of_a_sensor_is_its_longer_side(size):
+    assert focal_length(optics(focal_mm=4.5), *size, 6.0).px == pytest.approx(3000)
+
+
 def test_what_is_not_believed_is_an_error(tmp_path):
     wide = optics(focal_mm=13, plane=10.88, plane_unit=3)
     with pytest.raises(CameraError, match=r"field of view of 1\d\d deg; give --camera"):
