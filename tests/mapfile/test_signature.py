@@ -68,6 +68,7 @@ def altered(path, **changes):
 def test_a_signed_map(path, keys):
     digest = require_signature(path, keys / "ours" / "public.pem").manifest_sha256
     assert digest == map_digest(path) == taken_apart(path)[1]["manifest_sha256"]
+    assert digest == open_map(path).manifest.sha256
 
 
 def test_serial_numbers_increase_by_default(path, keys):

@@ -16,6 +16,7 @@ import rasterio
 from rasterio.transform import Affine
 
 from helpers import textured
+from orthonav.confidence.registered import USUAL_CONFIDENCE
 from orthonav.errors import AreaError, ImageryError, OutputError, VariantError
 from orthonav.geo.area import Area
 from orthonav.geo.route import Route
@@ -38,7 +39,7 @@ SMALL = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2}
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch):
     """Many small blocks, few crops, registration as if it was calibrated."""
-    learnt = RegistrationCalibration(None, 0.5)
+    learnt = RegistrationCalibration(USUAL_CONFIDENCE, 0.5, 20)
     monkeypatch.setattr("orthonav.prepare.build.calibrate_registration", lambda *_: learnt)
     monkeypatch.setattr("orthonav.prepare.sheet.BLOCK_PX", 128)
     monkeypatch.setattr("orthonav.prepare.sheet.MIN_CACHED_BLOCKS", 4)

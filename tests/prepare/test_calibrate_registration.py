@@ -203,6 +203,14 @@ def test_blank_crops_leave_the_usual_weights(localizer):
     assert made.confidence.weights == USUAL_WEIGHTS and made.right == 0
 
 
+def test_without_mirrored_views_the_weights_are_the_usual_ones(localizer, monkeypatch):
+    """Right views alone would make any confidence high."""
+    placed = module._placed
+    monkeypatch.setattr(module, "_placed", lambda *args: None if args[4] else placed(*args))
+    made = calibrated(localizer, crops_of(GREY))
+    assert made.right >= 6 and made.confidence == USUAL_CONFIDENCE
+
+
 @pytest.fixture
 def small(make_ortho, tmp_path, monkeypatch):
     """Function that builds a map of 200 x 200 m and gives what it says of registration."""

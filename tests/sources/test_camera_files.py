@@ -119,6 +119,13 @@ def test_a_chain_of_kalibr_with_the_header_of_opencv(tmp_path):
         read_camera_file(tmp_path / "a.yaml#cam7")
 
 
+@pytest.mark.parametrize("made", [ros, opencv, camera_file])
+def test_one_camera_of_a_file_that_is_no_chain(tmp_path, made):
+    made(tmp_path / "a.yaml")
+    with pytest.raises(CameraError, match="no Kalibr chain; give it without #cam1"):
+        read_camera_file(tmp_path / "a.yaml#cam1")
+
+
 def test_our_own(tmp_path):
     path = camera_file(tmp_path / "flight.json", distortion=FISHEYE, model="fisheye")
     camera = read_camera_file(path)

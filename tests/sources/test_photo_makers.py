@@ -13,6 +13,7 @@ from orthonav.sources.exif import read_photo
 from orthonav.sources.focal import FocalLength, Optics, focal_length
 from orthonav.sources.makernotes import read_maker_notes
 from orthonav.sources.photo_poses import UNKNOWN_YAW_STD_DEG
+from orthonav.sources.xmp import Xmp
 
 MODEL, SOFTWARE, XMP_TAG, MAKER_NOTE = 0x0110, 0x0131, 700, 0x927C
 FIRMWARE, VIEWER = "v01.43.0039", "Microsoft Windows Photo Viewer 10.0"
@@ -113,6 +114,11 @@ def test_focal_lengths(camera):
     assert found.px == pytest.approx(px, abs=1)
 
 
+@pytest.mark.parametrize("size", [(4000, 3000), (3000, 4000)])
+def test_the_width_of_a_sensor_is_its_longer_side(size):
+    assert focal_length(optics(focal_mm=4.5), *size, 6.0).px == pytest.approx(3000)
+
+
 def test_what_is_not_believed_is_an_error(tmp_path):
     wide = optics(focal_mm=13, plane=10.88, plane_unit=3)
     with pytest.raises(CameraError, match=r"field of view of 1\d\d deg; give --camera"):
@@ -206,6 +212,30 @@ def test_xmp_in_the_exif_directory(tmp_path):
     assert (reported.yaw_deg, reported.agl_m) == pytest.approx((321.4, 100.0))
 
 
+@pytest.mark.parametrize(
+    "more",
+    [
+        {0xA210: "x"},
+        {0x9003: "0001:01:01 00:00:00", 0x9011: "+10:00"},
+        {0x9003: "9999:12:31 23:00:00", 0x9011: "-10:00"},
+    ],
+)
+def test_impossible_exif_is_missing(tmp_path, more):
+    found = read_photo(photo(tmp_path / "a.jpg", more=more))
+    assert (found.time_ns is None) == (0x9003 in more)
+    assert (found.optics.plane_unit == 0) == (0xA210 in more)
+
+
+@pytest.mark.parametrize(
+    "text, value",
+    [("+45.50", 45.5), ("1.2e-05", 1.2e-5), ("123/100", None), ("1,5", None), ("n/a", None)],
+)
+def test_only_whole_values_of_xmp_are_read(text, value):
+    expected = {} if value is None else {"Camera:Yaw": value}
+    assert Xmp.of(f'<a Camera:Yaw="{text}"/>').values == expected
+    assert Xmp.of(f"<Camera:Yaw>{text}</Camera:Yaw>").values == expected
+
+
 # Photographs that an editor has written.
 
 
@@ -269,6 +299,24 @@ def test_photographs_of_another_size_are_left_out(tmp_path):
     )
     done = import_flight(recording, tmp_path / "flight")
     assert (done.views, done.broken) == (3, 0)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [{0xA405: 48, 0x920A: 17.6}, {0xA404: 2.0}, {0xA405: 8}],
+    ids=["lens zoom", "digital zoom", "too wide"],
+)
+def test_photographs_of_another_focal_length_are_left_out(tmp_path, other):
+    photo(tmp_path / "p/a.jpg", "2023:11:14 22:13:19", more=other, xmp=dji())
+    for number in range(2):
+        photo(tmp_path / f"p/{number}.jpg", f"2023:11:14 22:13:2{number}", xmp=dji())
+    photo(tmp_path / "p/none.jpg", "2023:11:14 22:13:25", {0xA405: None, 0x920A: None}, xmp=dji())
+    recording = open_source(tmp_path / "p")
+    assert recording.warnings[0] == (
+        "1 of 4 photographs left out, of another focal length than most, the first: a.jpg"
+    )
+    assert [view.frame for view in recording.views] == ["0.jpg", "1.jpg", "none.jpg"]
+    assert recording.camera.fx_px == pytest.approx(math.hypot(64, 48) * 24 / math.hypot(36, 24))
 
 
 def test_of_two_sizes_the_larger_one(tmp_path):

@@ -12,7 +12,13 @@ from orthonav.geo.camera import enu_from_camera
 from orthonav.records import Prior
 from orthonav.sources.attitude import enu_from_body_camera, ned_from_angles
 from orthonav.sources.options import SourceOptions
-from orthonav.sources.recording import check_overlap, doubts_of, fitted, with_options
+from orthonav.sources.recording import (
+    LEVEL_GROUND_IN_GAPS,
+    check_overlap,
+    doubts_of,
+    fitted,
+    with_options,
+)
 from orthonav.sources.track import GAP_NS, RecordedTrack, Samples, angles_at, attitude_of_angles
 
 S = 10**9
@@ -138,6 +144,23 @@ def test_what_is_assumed_about_heights_is_said_once(names, options, expected):
     doubts = doubts_of(track, SourceOptions(**options))
     assert len(doubts) == (expected is not None)
     assert expected is None or expected in doubts[0]
+
+
+def test_the_height_above_a_given_ground_is_of_one_reference():
+    amsl, place = Samples(1), Samples(3)
+    amsl.add(0, 400.0), amsl.add(S, 400.0), place.add(0, 46.0, 2.0, 450.0)
+    only = RecordedTrack(None, amsl=amsl.series())
+    assert only.telemetry(0, ground_alt_m=290.0).agl_m == 110.0
+    both = RecordedTrack(None, amsl=amsl.series(), position=place.positions())
+    assert both.telemetry(0, ground_alt_m=290.0).agl_m == 160.0
+    assert math.isnan(both.telemetry(S, ground_alt_m=290.0).agl_m)
+
+
+def test_take_off_heights_in_gaps_of_a_distance_sensor_are_said():
+    series = Samples(1)
+    series.add(0, 50.0)
+    track = RecordedTrack(None, (series.series(),), home=series.series())
+    assert doubts_of(track, SourceOptions()) == [LEVEL_GROUND_IN_GAPS]
 
 
 def test_what_the_options_add():

@@ -21,12 +21,7 @@ from orthonav.atlas.agreement import (
 )
 from orthonav.atlas.sheet_registration import SearchRegion, SheetMatch, SheetRegistrar
 from orthonav.atlas.tile_search import TileSearch
-from orthonav.confidence.registered import (
-    USUAL_BIAS,
-    USUAL_CHANCES,
-    USUAL_WEIGHTS,
-    RegisteredConfidence,
-)
+from orthonav.confidence.registered import USUAL_CONFIDENCE
 from orthonav.geo.frames import LocalFrame
 from orthonav.localizer.checks import check_footprint, check_view
 from orthonav.localizer.prepared import MIN_VIEW_PX, pose_prior
@@ -60,8 +55,6 @@ REPLAYED = 4
 """Latest views of a place that a track begins with."""
 LEAST = 1e-5
 """Least and greatest (1 - LEAST) probability of a match, for finite odds."""
-USUAL_CONFIDENCE = RegisteredConfidence(USUAL_BIAS, USUAL_WEIGHTS, USUAL_CHANCES)
-"""Used for sheets with too little imagery to learn a confidence."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,8 @@ import numpy as np
 from orthonav.atlas.agreement import AGILE_MPS, MAX_REACH_M, MAX_SPEED_MPS
 from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.cut import cut_in_memory
-from orthonav.atlas.find import USUAL_CONFIDENCE, FoundPlace
+from orthonav.atlas.find import FoundPlace
+from orthonav.confidence.registered import USUAL_CONFIDENCE
 from orthonav.geo.area import Area
 from orthonav.geo.frames import LocalFrame, distances_m
 from orthonav.localizer import Localizer
@@ -50,9 +51,9 @@ class LocalTrack:
         self._area, localizer = self._cut(
             middle, float(away.max()) + SIGMAS * found.std_m + _half_diagonal_m(views[-1])
         )
-        self._tracker = Tracker(
-            localizer, model=MODEL.at_height(first.agl_m), heading_known=heading_known
-        )
+        scale = math.hypot(MODEL.log_scale, views[0].camera.focal_std)
+        model = replace(MODEL.at_height(first.agl_m), log_scale=scale)
+        self._tracker = Tracker(localizer, model=model, heading_known=heading_known)
         prior: Prior | None = Prior(*places[0], found.std_m)
         for view in views:
             telemetry = replace(view.telemetry, prior=prior)

@@ -72,7 +72,7 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         "--sensor-width-mm",
         type=float,
         metavar="MM",
-        help="sensor width of photographs, for the focal length",
+        help="longer side of the sensor of photographs, for the focal length",
     )
     group.add_argument(
         "--ground-alt-m",

@@ -25,7 +25,8 @@ from orthonav.prepare.blocks import Block
 
 log = logging.getLogger(__name__)
 
-FORMAT = 1
+FORMAT = 2
+"""Of the arrays of a block: increase it when they change."""
 _OURS = re.compile(r"\.?r\d+-c\d+-[0-9a-f]{24}\.npz(\..*\.tmp\.npz)?")
 
 

@@ -211,7 +211,8 @@ def _fitted(outcomes: Sequence[_Outcome], radius_px: float) -> RegistrationCalib
     negatives = [each for each, known in zip(evidence, mirrored, strict=True) if known]
     chances = _chances(negatives) if len(negatives) >= MIN_NEGATIVES else USUAL_CHANCES
     confidence = replace(USUAL_CONFIDENCE, chances=chances)
-    if right.sum() >= ENOUGH_RIGHT:
+    # Without a mirrored view nothing would show what a wrong place looks like.
+    if right.sum() >= ENOUGH_RIGHT and negatives:
         weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)
         confidence = fit_registered(evidence, right, weight, chances)
     return RegistrationCalibration(confidence, floor_px, int(right.sum()))

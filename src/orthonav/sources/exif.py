@@ -105,13 +105,14 @@ def read_photo(path: Path) -> Photo:
 
 
 def _optics(tags: dict[int, Any], more: dict[int, Any]) -> Optics:
+    unit = _number(more.get(_PLANE_UNIT) or 2)
     return Optics(
         make=_word(tags.get(_MAKE)),
         model=_word(tags.get(_MODEL)),
         focal_mm=_number(more.get(_FOCAL)),
         film_mm=_number(more.get(_FOCAL_35)),
         plane=_number(more.get(_PLANE_X)),
-        plane_unit=int(more.get(_PLANE_UNIT) or 2),
+        plane_unit=int(unit) if math.isfinite(unit) else 0,
         taken_px=_number(more.get(_PIXELS_X)),
         zoom=_number(more.get(_ZOOM)),
     )
@@ -139,12 +140,12 @@ def _time(
     text, fraction, offset = (str(more.get(part, "")).strip("\0 ") for part in parts)
     try:
         local = datetime.strptime(text, "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
-    except ValueError:
+        zone = _offset(offset)
+        if zone is None and (utc := _gps_time(gps)) is not None:
+            zone = round((local - utc) / _QUARTER_HOUR) * _QUARTER_HOUR
+        whole = local - (zone or timedelta())
+    except (ValueError, OverflowError):  # the latter for the years 1 and 9999
         return None, False
-    zone = _offset(offset)
-    if zone is None and (utc := _gps_time(gps)) is not None:
-        zone = round((local - utc) / _QUARTER_HOUR) * _QUARTER_HOUR
-    whole = local - (zone or timedelta())
     nanoseconds = int(fraction[:9].ljust(9, "0")) if fraction.isdecimal() else 0
     return round(whole.timestamp()) * 10**9 + nanoseconds, zone is not None
 

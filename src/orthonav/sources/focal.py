@@ -105,8 +105,8 @@ def focal_length(
 ) -> FocalLength | None:
     """The focal length of a picture of this size, None where nothing is known of it.
 
-    `sensor_width_mm` is what the user knows. Raises `CameraError` for a digital zoom, and where the
-    picture would be wider than `MAX_FIELD_DEG`.
+    `sensor_width_mm`: longer side of the sensor, as the user knows it. Raises `CameraError` for a
+    digital zoom, and where the picture would be wider than `MAX_FIELD_DEG`.
     """
     if optics.zoom > 1.0:
         raise CameraError(f"digital zoom of {optics.zoom:g}; give --camera FILE")
@@ -126,7 +126,7 @@ def _found(
     optics: Optics, width_px: int, height_px: int, sensor_width_mm: float | None
 ) -> FocalLength | None:
     if sensor_width_mm is not None and optics.focal_mm > 0:
-        px = optics.focal_mm / sensor_width_mm * width_px
+        px = optics.focal_mm / sensor_width_mm * max(width_px, height_px)
         return FocalLength(px, _GIVEN_STD, "EXIF and --sensor-width-mm")
     sensor = _SENSORS.get((optics.make.upper(), optics.model.upper()))
     if sensor is not None and (known := _of_sensor(sensor, optics, width_px, height_px)):

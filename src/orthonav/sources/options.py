@@ -32,7 +32,7 @@ class SourceOptions:
     prior_std_m: float | None = None
     """Use the recorded position as the prior, with this standard deviation per axis."""
     sensor_width_mm: float | None = None
-    """Width of the sensor, for the focal length of photographs."""
+    """Longer side of the sensor, for the focal length of photographs."""
     ground_alt_m: float | None = None
     """Altitude of the ground, where altitudes but no heights were recorded; in their reference."""
     looks_down: bool = False

@@ -15,7 +15,7 @@ from orthonav.geo.camera import Camera
 from orthonav.records import Telemetry
 from orthonav.sources.cameras import read_camera_file
 from orthonav.sources.exif import Photo, read_photo
-from orthonav.sources.focal import focal_length
+from orthonav.sources.focal import FocalLength, focal_length
 from orthonav.sources.logs import read_log
 from orthonav.sources.options import SourceOptions
 from orthonav.sources.photo_poses import PhotoPose, poses_of
@@ -65,9 +65,12 @@ def open_photos(folder: Path, options: SourceOptions) -> Recording:
     """The flight of a folder of photographs, by time.
 
     Raises `FlightError`, `CameraError` or `MissingExtraError`. Photographs that cannot be read,
-    have no time, or another size than most, are left out, with a warning.
+    have no time, or another size or focal length than most, are left out, with a warning.
     """
     taken, warnings = _taken(folder, options)
+    if options.camera is None:
+        taken, zoomed = _of_one_focal_length(taken, options)
+        warnings += zoomed
     camera, note = _camera(taken[0], options)
     track = None
     if options.telemetry is not None:
@@ -148,6 +151,41 @@ def _of_one_size(
     alike = [one for one in found if (one[1].width_px, one[1].height_px) == usual]
     odd = [path for path, photo in found if (photo.width_px, photo.height_px) != usual]
     return alike, odd
+
+
+def _of_one_focal_length(
+    taken: list[_DatedPhoto], options: SourceOptions
+) -> tuple[list[_DatedPhoto], list[str]]:
+    """The photographs of the most frequent focal length, and a warning about others.
+
+    Those that state none are kept. All are, where there is none that can be used.
+    """
+    found: list[FocalLength | CameraError | None] = []
+    for one in taken:
+        photo = one.photo
+        try:
+            found.append(
+                focal_length(photo.optics, photo.width_px, photo.height_px, options.sensor_width_mm)
+            )
+        except CameraError as error:
+            found.append(error)
+    known = Counter(each for each in found if isinstance(each, FocalLength))
+    if not known:
+        return taken, []
+    usual = known.most_common(1)[0][0]
+    alike: list[_DatedPhoto] = []
+    odd: list[_DatedPhoto] = []
+    for one, each in zip(taken, found, strict=True):
+        other = isinstance(each, CameraError) or (
+            each is not None and abs(each.px / usual.px - 1) > usual.std
+        )
+        (odd if other else alike).append(one)
+    if not odd:
+        return taken, []
+    return alike, [
+        f"{len(odd)} of {len(taken)} photographs left out, of another focal length than most, "
+        f"the first: {odd[0].path.name}"
+    ]
 
 
 def _by_name(found: Sequence[tuple[Path, Photo]]) -> list[tuple[Path, Photo]]:

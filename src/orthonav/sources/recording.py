@@ -14,7 +14,7 @@ from orthonav.geo.frames import distances_m
 from orthonav.records import Prior, Telemetry
 from orthonav.sources.attitude import ASSUMED_TILT_STD_DEG
 from orthonav.sources.options import SourceOptions
-from orthonav.sources.track import RecordedTrack, altitude_series
+from orthonav.sources.track import RecordedTrack
 
 Grey = NDArray[np.uint8]
 DECIMALS = 8
@@ -132,14 +132,21 @@ def jump_warnings(
 LEVEL_GROUND = (
     "height above ground is taken from the height above take-off: level ground is assumed"
 )
+LEVEL_GROUND_IN_GAPS = (
+    "where no height above ground was measured, it is taken from the height above take-off: level "
+    "ground is assumed there"
+)
 
 
 def doubts_of(track: RecordedTrack, options: SourceOptions) -> list[str]:
     """Warnings about a track for people: its own, what its heights are, and jumps."""
     warnings, series = list(track.warnings), track.position
     known = bool(track.heights) or track.home is not None
-    altitudes = altitude_series(series) is not None or track.amsl is not None
-    warnings += height_warnings(track.home is not None, not known and altitudes, options)
+    altitudes = track.altitude is not None
+    if track.heights and track.home is not None:
+        warnings.append(LEVEL_GROUND_IN_GAPS)
+    else:
+        warnings += height_warnings(track.home is not None, not known and altitudes, options)
     if series is None:
         return warnings
     places = [

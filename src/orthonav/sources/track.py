@@ -4,6 +4,7 @@ import math
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,6 +170,12 @@ class RecordedTrack:
     warnings: tuple[str, ...] = ()
     """Doubts about the log, for people."""
 
+    @cached_property
+    def altitude(self) -> TimeSeries | None:
+        """Altitudes of one reference: as recorded with positions, else above mean sea level."""
+        recorded = altitude_series(self.position)
+        return self.amsl if recorded is None else recorded
+
     def span_ns(self) -> tuple[int, int] | None:
         """First and last time of its attitude or, without any, of heights or positions."""
         recorded = (self.attitude, *self.heights, self.home, self.position)
@@ -212,7 +219,7 @@ class RecordedTrack:
             height = float(_at(series, time_ns, 1)[0])
             if math.isfinite(height):
                 return height
-        altitude = float(_at(self.position, time_ns, 3)[2])
+        altitude = float(_at(self.altitude, time_ns, 1)[0])
         if ground_alt_m is None or not math.isfinite(altitude):
             return math.nan
         return altitude - ground_alt_m

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from orthonav.geo.camera import enu_from_camera
 
 _VALUE = re.compile(
-    r"\b(drone-dji|drone|Camera|sensefly):([A-Za-z0-9]+)\s*(?:=\s*[\"']|>)\s*([-+]?\d+(?:\.\d+)?)"
+    r"\b(drone-dji|drone|Camera|sensefly):([A-Za-z0-9]+)\s*(?:=\s*[\"']|>)\s*"
+    r"([-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d{1,2})?)\s*[\"'<]"
 )
+"""Whole values only: the beginning of a fraction or of a decimal comma is another number."""
 _EXPOSED = re.compile(
     r"\b(?:drone-dji:UTCAtExposure|sensefly:UTCTime)\s*(?:=\s*[\"']|>)\s*"
     r"(\d{4})[-:](\d\d)[-:](\d\d)[T ](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?"

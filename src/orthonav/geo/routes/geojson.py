@@ -1,8 +1,8 @@
 """Routes as GeoJSON (RFC 7946): LineStrings, and the properties that orthonav reads and writes.
 
 Properties of a feature: `name`; `band_m`, a number or a list with one per leg (null: the default);
-`height_frame`, above what the third coordinate is ("agl", "home", "amsl"; the RFC's ellipsoid is
-hardly ever meant, so without it that is taken as not said); `home_amsl_m`.
+`height_frame`, above what the third coordinate is ("agl", "home", "amsl", "hae"; the RFC's
+ellipsoid is hardly ever meant, so without it that is taken as not said); `home_amsl_m`.
 """
 
 import json

@@ -53,7 +53,7 @@ def _routes(folder: Element) -> Iterator[Route]:
 
 
 def _index(mark: Element) -> float:
-    return parsed(text_of(mark, "index") or "nan", "WPML index")
+    return parsed(text_of(mark, "index") or "", "WPML index")
 
 
 def _latlon(mark: Element) -> tuple[float, float]:
