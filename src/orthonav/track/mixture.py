@@ -78,7 +78,8 @@ UNRECOGNIZED = 0.5
 after a few, a track must be confirmed again."""
 BLIND = 0.5
 """Factor on the evidence of a view that does not show the map, for each such view before: clouds,
-water and a covered lens last (docs/decisions/tracking.md, 13)."""
+water and a covered lens last (docs/decisions/tracking.md, 13). Only after a track was confirmed:
+before that the reported start may be wrong."""
 MOST_SIGHTED = 3.0
 """Highest count of recognized ground, in views."""
 FORGOTTEN = 0.5
@@ -301,14 +302,15 @@ class Mixture:
                     split = self._updated(start, seen, ground, confirms)
                     if split is not None:
                         made.append(replace(split, share=split.share * found))
-        made += [born for each in measurements for born in self._born(each)]
+        made += [born for each in measurements for born in self._born(each, confirms)]
         total = sum(each.share for each in made) + self.elsewhere
         self.elsewhere /= total
         made = [replace(each, share=each.share / total) for each in made]
         self.hypotheses = merged(sorted(made, key=lambda each: -each.share))
         self._settle()
         shown = bool(self.hypotheses) and self.hypotheses[0].recognized >= RECOGNIZED
-        self._blind = 0.0 if shown else self._blind + newness
+        confirmed = self._state is not State.SEARCHING
+        self._blind = self._blind + newness if confirmed and not shown else 0.0
 
     def estimate(self, radius_m: float, *, between_views: bool = False) -> Estimate | None:
         """The best cluster, None where there is no hypothesis.
@@ -455,8 +457,9 @@ class Mixture:
         if off > 0:
             yield off, *self._nowhere(self.model.off_tilt_rad)
 
-    def _born(self, seen: Measurement) -> Iterator[Hypothesis]:
-        """The hypotheses born from the belief elsewhere, at a measurement."""
+    def _born(self, seen: Measurement, confirms: bool) -> Iterator[Hypothesis]:
+        """The hypotheses born from the belief elsewhere, at a measurement. `confirms`: see
+        `update`."""
         for share, mean, covariance in self._mounts():
             spread = covariance[np.ix_(SEEN, SEEN)] + seen.noise
             log_weight = seen.log_odds - math.log(self.area_m2)
@@ -464,8 +467,15 @@ class Mixture:
             mean, covariance = updated(mean, covariance, seen.mean, spread)
             share *= self.elsewhere * math.exp(min(log_weight, 60.0))
             self._numbers += 1
-            sighted = confirmed_ground(seen.alone, 1.0)
-            yield Hypothesis(share, mean, covariance, sighted, self._numbers, recognized=seen.alone)
+            yield Hypothesis(
+                share,
+                mean,
+                covariance,
+                sighted=confirmed_ground(seen.alone, 1.0) if confirms else 0.0,
+                number=self._numbers,
+                recognized=seen.alone,
+                uncounted=0.0 if confirms else 1.0,
+            )
 
     def _from(self, each: Hypothesis, expected: Expected, share: float) -> Hypothesis:
         self._numbers += 1
