@@ -565,3 +565,22 @@ def test_the_map_must_be_recognized_at_the_estimated_position(off_m, state):
     other = replace(likely, share=0.1, recognized=1.0, mean=beside, number=likely.number + 1)
     mixture.hypotheses, mixture.elsewhere = [likely, other], 0.0
     assert mixture.estimate(RADIUS_M).state is state
+
+
+@pytest.mark.parametrize(("followed", "state"), [(True, State.COASTING), (False, State.LOST)])
+def test_a_place_that_was_never_confirmed_is_no_dead_reckoning(followed, state):
+    _, mixture, _ = flown(3, false_share=0.0)
+    assert mixture.estimate(RADIUS_M).state is State.TRACKING
+    track = mixture.hypotheses[0]
+    found = replace(
+        track,
+        share=0.8,
+        sighted=0.75,
+        recognized=0.9,
+        mean=track.mean + np.eye(8)[0] * 300.0,
+        number=track.number + 1,
+        followed=followed,
+    )
+    mixture.hypotheses = [found, replace(track, share=0.2)]
+    mixture.elsewhere = 0.0
+    assert mixture.estimate(RADIUS_M).state is state

@@ -99,7 +99,7 @@ class State(Enum):
     COASTING = "coasting"
     """Confirmed before; this view does not show the map, the position is dead reckoning."""
     LOST = "lost"
-    """Confirmed before; the position is no longer likely."""
+    """Confirmed before; the position is no longer likely, or that of another, unconfirmed place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,7 +327,8 @@ class Mixture:
         confirmed = max(each.sighted for each in major(near)) >= CONFIRMED
         seen, follows = self._recognized_at(mean, covariance, near), best.followed
         if not between_views:
-            self._state = self._next_state(confidence, confirmed and seen >= RECOGNIZED)
+            shown = confirmed and seen >= RECOGNIZED
+            self._state = self._next_state(confidence, shown, best.followed)
             if self._state is State.TRACKING:
                 self._follow(near)
                 follows = True
@@ -384,13 +385,18 @@ class Mixture:
         mean, covariance = moments(self.hypotheses)
         return mean[4:], covariance[4:, 4:]
 
-    def _next_state(self, confidence: float, confirmed: bool) -> State:
-        """State after a view; `confirmed`: by it and by enough ground recognized before."""
+    def _next_state(self, confidence: float, confirmed: bool, follows: bool) -> State:
+        """State after a view.
+
+        `confirmed`: by it and by enough ground recognized before. `follows`: whether the likeliest
+        place descends from a confirmed track or a reported position; another one is no dead
+        reckoning.
+        """
         followed = self._state in (State.TRACKING, State.COASTING)
-        if confirmed and confidence >= (LIKELY if followed else CONFIDENT):
+        if confirmed and confidence >= (LIKELY if followed and follows else CONFIDENT):
             return State.TRACKING
         if followed:
-            return State.COASTING if confidence >= LIKELY else State.LOST
+            return State.COASTING if follows and confidence >= LIKELY else State.LOST
         return self._state
 
     def _on_map(self, mean: Array) -> bool:
