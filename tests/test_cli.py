@@ -62,7 +62,7 @@ def ortho(make_ortho, tmp_path_factory):
 def fewer_crops(map_path, monkeypatch):
     """Calibration from few crops and views, but for the map that all tests share."""
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 48)
-    monkeypatch.setattr("orthonav.prepare.calibrate_registration.MIN_RIGHT", 1)
+    monkeypatch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ def small_demo(area, monkeypatch):
     monkeypatch.setattr("orthonav.check.run.usable_cores", lambda: 1)
     monkeypatch.setattr("orthonav.report.canvas.DPI", 30)
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 48)
-    monkeypatch.setattr("orthonav.prepare.calibrate_registration.MIN_RIGHT", 1)
+    monkeypatch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
     quicker = functools.partial(BuildRequest, calibration_views=6)
     monkeypatch.setattr("orthonav.prepare.BuildRequest", quicker)
 

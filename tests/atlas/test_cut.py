@@ -65,7 +65,7 @@ def folder(ortho, names, tmp_path_factory):
     atlas = Atlas.create(str(folder), RECIPE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.prepare.calibrate.CROPS", 12)
-        patch.setattr("orthonav.prepare.calibrate_registration.MIN_RIGHT", 1)
+        patch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
         for name in names:
             put(atlas, name, built(ortho, name, folder.parent / "sheet.onav"))
     return folder

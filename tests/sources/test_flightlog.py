@@ -38,7 +38,7 @@ from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
 from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import open_map
-from orthonav.mapfile.signature import map_info
+from orthonav.mapfile.signature import map_digest
 from orthonav.onboard import log as log_module
 from orthonav.onboard.calibrate import MountCorrected, model_of
 from orthonav.onboard.log import FlightLog
@@ -129,7 +129,8 @@ def flown(localizer, flight, folder, mount=None, **how):
     locator = Tracker(localizer, model=model_of(mount) if mount else None)
     if mount:
         locator = MountCorrected(locator, mount)
-    info = map_info(localizer_path(localizer))
+    path = localizer_path(localizer)
+    info = {"name": path.name, "manifest_sha256": map_digest(path)}
     log = FlightLog(folder / "flight.mcap", flight.camera, info, chunk_s=0.05, **how)
     plain = None if mount is None else {
         **{name: vars(getattr(mount, name)) for name in

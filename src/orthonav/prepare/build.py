@@ -34,11 +34,7 @@ from orthonav.prepare.calibrate import (
     TileCalibration,
     calibrate,
 )
-from orthonav.prepare.calibrate_registration import (
-    ENOUGH_RIGHT,
-    FLOOR_PX,
-    calibrate_registration,
-)
+from orthonav.prepare.calibrate_registration import FLOOR_PX, calibrate_registration
 from orthonav.prepare.cellparts import cell_parts
 from orthonav.prepare.encoders import learn_encoder
 from orthonav.prepare.layout import tiles_of
@@ -249,12 +245,11 @@ def registration_record(
     learned = calibrate_registration(
         localizer, crops, later, request.calibration_views, request.seed, progress
     )
-    if learned.right < ENOUGH_RIGHT:
+    if learned.is_usual:
         log.warning(
-            "only %d trial views were right, %d are needed to calibrate registration: the usual "
+            "only %d trial views were right, too few to calibrate registration: the usual "
             "confidence, that of generated landscapes, is used",
             learned.right,
-            ENOUGH_RIGHT,
         )
     return {
         "confidence": learned.confidence.to_plain(),

@@ -73,6 +73,11 @@ class RegistrationCalibration:
     floor_px: float
     right: int
 
+    @property
+    def is_usual(self) -> bool:
+        """Whether too few views were right for a confidence of the map's own."""
+        return self.right < ENOUGH_RIGHT
+
 
 @dataclass(frozen=True, eq=False)
 class _Outcome:
