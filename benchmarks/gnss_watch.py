@@ -128,11 +128,11 @@ class FlownPath:
         ahead = np.stack([np.sin(self.heading_rad), np.cos(self.heading_rad)], axis=1)
         return np.asarray(self.speed_mps[:, None] * ahead)
 
-    def lean(self, late_s: float) -> Array:
+    def bank_tangent(self, late_s: float) -> Array:
         """Tangent (N,) of the bank angle, to the right, `late_s` before each time."""
         rate = np.gradient(np.unwrap(self.heading_rad), self.times_s)
-        lean = rate * self.speed_mps / 9.81
-        return np.asarray(np.interp(self.times_s - late_s, self.times_s, lean))
+        tangent = rate * self.speed_mps / 9.81
+        return np.asarray(np.interp(self.times_s - late_s, self.times_s, tangent))
 
 
 def lawnmower(seconds: float, speeds_mps: Sequence[float] = (SPEED_MPS,)) -> FlownPath:
@@ -166,7 +166,7 @@ def map_positions(
     off += rng.normal(0, errors.white_m, (count, 2)) - errors.displaced_en_m
     ahead, right = np.stack([sin, cos], axis=1), np.stack([cos, -sin], axis=1)
     off += errors.agl_m * math.tan(math.radians(errors.pitch_deg)) * ahead
-    rolled = path.lean(0.0) - path.lean(errors.late_s)
+    rolled = path.bank_tangent(0.0) - path.bank_tangent(errors.late_s)
     off += errors.agl_m * rolled[:, None] * right - errors.late_s * path.vel_en_mps
     wrong = rng.random(count) < errors.outlier_share
     off[wrong] += rng.uniform(20, 150, (int(wrong.sum()), 1)) * np.array([[0.6, 0.8]])

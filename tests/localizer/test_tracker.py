@@ -274,6 +274,29 @@ def test_a_reported_start_needs_no_search(localizer):
     assert all(each.parent == -1 for each in unused.mixture.hypotheses)
 
 
+def test_a_start_that_was_reported_wrongly_is_left(localizer):
+    tracker, seen = Tracker(localizer), list(views(19))
+    lat, lon = localizer.sheet.frame.latlon_from_en((-160.0, 30.0))  # 150 m from the true place
+    grey, telemetry, place = seen[0]
+    seen[0] = grey, replace(telemetry, prior=Prior(float(lat), float(lon), 15.0)), place
+    rows = followed(tracker, localizer, seen)
+    assert rows[0][0] > 100
+    assert all(row[0] < 10 for row in rows if row[2] == "tracking" or row[1] > 0.8)
+    assert rows[-1][2] == "tracking"
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["first view", "after a dark view"])
+def test_an_uncertain_focal_length_widens_the_scale(localizer, dark):
+    tracker, (grey, telemetry, _) = Tracker(localizer), next(iter(views(1)))
+    usual = tracker.model.log_scale
+    if dark:
+        tracker.passed(telemetry, NoFix("too_dark", "no picture"))
+        telemetry = replace(telemetry, time_ns=telemetry.time_ns + 10**9)
+    tracker.locate(View(grey, replace(WIDE, focal_std=0.2), telemetry))
+    assert tracker.model.log_scale == tracker.mixture.model.log_scale
+    assert tracker.model.log_scale == pytest.approx(math.hypot(usual, 0.2))
+
+
 def test_unknown_heading_is_tracked(localizer):
     seen = [(g, replace(t, yaw_deg=math.nan), p) for g, t, p in views(8)]
     rows = followed(Tracker(localizer, heading_known=False), localizer, seen)

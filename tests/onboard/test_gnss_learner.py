@@ -8,7 +8,14 @@ import pytest
 from benchmarks.gnss_watch import PITCH_DEG, recovered
 
 from orthonav.geo.camera import axis_on_ground_en_m
-from orthonav.onboard.gnss.biases import LIMITS, Biases, at_start, design, unknown
+from orthonav.onboard.gnss.biases import (
+    LIMITS,
+    Biases,
+    at_start,
+    biases_from_plain,
+    design,
+    unknown,
+)
 from orthonav.onboard.gnss.difference import Difference, DifferenceModel
 from orthonav.onboard.gnss.learner import QUARANTINE_S, SETTLED_S, BiasLearner
 from orthonav.onboard.gnss.rolling import Rolling
@@ -160,6 +167,14 @@ def test_the_mount_belongs_to_the_camera_and_the_displacement_to_the_map():
     assert not elsewhere.mean[:2].any() and elsewhere.agreed_s == 0
     assert elsewhere.mean[2:] == pytest.approx(TRUE[2:])
     assert np.array_equal(at_start({}, "map", "").mean, np.zeros(5))
+
+
+def test_many_flights_that_show_nothing_are_no_damage():
+    """The uncertainty of a bias that no flight shows stays within what the state file may hold."""
+    known = unknown("camera")
+    for _ in range(200):
+        known = at_start({"map": biases_from_plain(known.to_plain())}, "map", "camera")
+    assert known.stds == pytest.approx(unknown().stds)
 
 
 def test_rolling_is_seen_by_a_change_of_the_turn_rate():

@@ -146,7 +146,7 @@ def test_a_latency_does_not_make_a_step_where_the_aircraft_rolls():
     monitor = GnssMonitor(FRAME)
     states = {status.state for _, status in fed(monitor, solved, positions)}
     assert states == {State.WAITING, State.GOOD}
-    rolled = path.lean(0.0) - path.lean(0.3)
+    rolled = path.bank_tangent(0.0) - path.bank_tangent(0.3)
     assert 300 * np.abs(rolled).max() > 15  # the flight has such rolls
 
 

@@ -488,6 +488,36 @@ def test_only_places_that_competed_with_all_others_confirm_a_track(confirms, sta
     assert (estimate.state, estimate.followed) == (state, state is State.TRACKING)
 
 
+@pytest.mark.parametrize("confirms", [False, True])
+def test_a_place_counts_from_the_first_view_that_competed(confirms):
+    flight, mixture = Flight(5), Mixture(MODEL, EXTENT)
+    states = []
+    for view in range(3):
+        if view:
+            mixture.predict(1.0, camera=flight.moved())
+        mixture.update(flight.reported(), [flight.sighting(4.0)], confirms=confirms or view > 0)
+        states.append(mixture.estimate(RADIUS_M).state)
+    first = State.TRACKING if confirms else State.SEARCHING
+    assert states == [State.SEARCHING, first, State.TRACKING]
+
+
+@pytest.mark.parametrize(
+    ("sightings", "least", "most"), [(0, 0.0, 0.2), (6, 0.7, 1.0)], ids=["start", "track"]
+)
+def test_only_a_confirmed_track_survives_a_long_loss_of_sight(sightings, least, most):
+    """A reported start may be wrong; a confirmed track is under clouds."""
+    flight, mixture = Flight(5), Mixture(MODEL, EXTENT)
+    mixture.start(flight.place, 10.0)
+    for _ in range(sightings):
+        mixture.update(flight.reported(), [flight.sighting(4.0)])
+        mixture.estimate(RADIUS_M)
+        mixture.predict(1.0, camera=flight.moved())
+    for _ in range(8):
+        mixture.update(flight.reported(), [])
+        estimate = mixture.estimate(RADIUS_M)
+    assert least < estimate.belief < most
+
+
 def test_a_place_that_contradicts_the_track_does_not_descend_from_the_track():
     flight, mixture, _ = flown(3, false_share=0.0)
     assert mixture.estimate(RADIUS_M).followed
@@ -534,4 +564,23 @@ def test_the_map_must_be_recognized_at_the_estimated_position(off_m, state):
     beside = likely.mean + np.eye(8)[0] * off_m
     other = replace(likely, share=0.1, recognized=1.0, mean=beside, number=likely.number + 1)
     mixture.hypotheses, mixture.elsewhere = [likely, other], 0.0
+    assert mixture.estimate(RADIUS_M).state is state
+
+
+@pytest.mark.parametrize(("followed", "state"), [(True, State.COASTING), (False, State.LOST)])
+def test_a_place_that_was_never_confirmed_is_no_dead_reckoning(followed, state):
+    _, mixture, _ = flown(3, false_share=0.0)
+    assert mixture.estimate(RADIUS_M).state is State.TRACKING
+    track = mixture.hypotheses[0]
+    found = replace(
+        track,
+        share=0.8,
+        sighted=0.75,
+        recognized=0.9,
+        mean=track.mean + np.eye(8)[0] * 300.0,
+        number=track.number + 1,
+        followed=followed,
+    )
+    mixture.hypotheses = [found, replace(track, share=0.2)]
+    mixture.elsewhere = 0.0
     assert mixture.estimate(RADIUS_M).state is state

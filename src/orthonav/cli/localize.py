@@ -9,7 +9,7 @@ from orthonav.cli.common import print_json, progress
 from orthonav.cli.flown import compare_with_flight, take_flown
 from orthonav.cli.needs import require_extras
 from orthonav.cli.signed import add_signature, checked_signature
-from orthonav.cli.source import add_source, open_source, warn_if_elsewhere
+from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
 
 if TYPE_CHECKING:
     from orthonav.records import ViewResult
@@ -151,7 +151,7 @@ def _on_map(options: argparse.Namespace) -> None:
         raise VariantError("--accept lowe_ratio compares tiles: it needs --registration off")
     if localizer.registration is None and options.registration == "on":
         log.warning("the map has no registration layer: positions are at tile level")
-    warn_if_elsewhere(flight, localizer)
+    warn_if_far_from_map(flight, localizer)
     how = {
         "use_prior": options.prior == "telemetry",
         "heading_known": options.heading == "known",

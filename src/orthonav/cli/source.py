@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from orthonav.sources import Recording
 
 FAR_M = 1000.0
-"""A recorded position farther outside the map is named: GNSS and logs err by less."""
+"""A recorded position farther from the map causes a warning: GNSS and logs err by less."""
 log = logging.getLogger(__name__)
 
 
@@ -94,7 +94,7 @@ def add_source(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def warn_if_elsewhere(flight: "Recording", localizer: "Localizer") -> None:
+def warn_if_far_from_map(flight: "Recording", localizer: "Localizer") -> None:
     """Log a warning where the first view was recorded far from the map."""
     import numpy as np
 

@@ -93,6 +93,7 @@ class Tracker:
         """
         self._heading_known = heading_known
         self.model, self._usual_model = model or Model(), model is None
+        self._usual_scale = self._usual_model
         self.mixture = Mixture(self.model, self._use(localizer))
         self._time_ns: int | None = None
         self._before: OdometryView | None = None
@@ -132,7 +133,8 @@ class Tracker:
         has another size than the picture.
         """
         refused = check_view(view, self._localizer.grid.gsd_m, self._heading_known)
-        if self._usual_model:
+        if self._usual_scale:
+            self._usual_scale = False
             scale = math.hypot(Model.log_scale, view.camera.focal_std)
             self.model = self.mixture.model = replace(self.model, log_scale=scale)
         overlap, ground = self._predict(None if refused else view, view.telemetry)
@@ -379,9 +381,13 @@ class Tracker:
         return expected.mean[BIASES], expected.covariance[BIASES, BIASES]
 
     def _must_compete(self, expected: Estimate) -> bool:
-        """Whether places near the track have to compete with the whole map to confirm it."""
-        reported = expected.state is State.SEARCHING and expected.followed
-        return not (reported or (expected.state in FOLLOWED and expected.confirmed))
+        """Whether places near the track have to compete with the whole map to confirm it.
+
+        Not while a reported start is likely.
+        """
+        if expected.state is State.SEARCHING:
+            return expected.belief < LOCAL_SHARE
+        return not (expected.state in FOLLOWED and expected.confirmed)
 
     def _tilt_weights(self, newness: float, costly: bool) -> Array:
         """How many times the weight of the view perspective counts, for pitch and roll (2,).

@@ -61,10 +61,11 @@ START_SHARE = 0.9
 """Probability of a reported start position."""
 LIKELY = 0.5
 """A track with less confidence is lost."""
-CONFIRMED = 1.25
-"""New ground, in views, that must be recognized before a track is confirmed. Each view counts by
-its own probability: no single view confirms a track, nor do further views of its ground, nor views
-that fit only because they were searched there (docs/decisions/tracking.md, 9)."""
+CONFIRMED, CONFIRMED_AGAIN = 2.0, 1.25
+"""New ground, in views, that must be recognized before a new track is confirmed, and before one that
+was confirmed before is so again. Each view counts by its own probability: no single view confirms a
+track, nor do further views of its ground, nor views that fit only because they were searched there
+(docs/decisions/tracking.md, 9 and 13)."""
 UNCONFIRMED = 0.8
 """Highest confidence that is stated before a track is confirmed (docs/decisions/tracking.md, 9)."""
 RECOGNIZED = 0.2
@@ -98,7 +99,7 @@ class State(Enum):
     COASTING = "coasting"
     """Confirmed before; this view does not show the map, the position is dead reckoning."""
     LOST = "lost"
-    """Confirmed before; the position is no longer likely."""
+    """Confirmed before; the position is no longer likely, or that of another, unconfirmed place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,14 +304,15 @@ class Mixture:
                     split = self._updated(start, seen, ground, confirms)
                     if split is not None:
                         made.append(replace(split, share=split.share * found))
-        made += [born for each in measurements for born in self._born(each)]
+        made += [born for each in measurements for born in self._born(each, confirms)]
         total = sum(each.share for each in made) + self.elsewhere
         self.elsewhere /= total
         made = [replace(each, share=each.share / total) for each in made]
         self.hypotheses = merged(sorted(made, key=lambda each: -each.share))
         self._settle()
         shown = bool(self.hypotheses) and self.hypotheses[0].recognized >= RECOGNIZED
-        self._blind = 0.0 if shown else self._blind + newness
+        confirmed = self._state is not State.SEARCHING
+        self._blind = self._blind + newness if confirmed and not shown else 0.0
 
     def estimate(self, radius_m: float, *, between_views: bool = False) -> Estimate | None:
         """The best cluster, None where there is no hypothesis.
@@ -324,10 +326,11 @@ class Mixture:
         near = [each for each in self.hypotheses if distance(each, best) <= radius_m]
         mean, covariance = moments(near)
         confidence = min(self._inside(radius_m, mean[POSITION]), 1.0)
-        confirmed = max(each.sighted for each in major(near)) >= CONFIRMED
+        confirmed = any(_is_confirmed(each) for each in major(near))
         seen, follows = self._recognized_at(mean, covariance, near), best.followed
         if not between_views:
-            self._state = self._next_state(confidence, confirmed and seen >= RECOGNIZED)
+            shown = confirmed and seen >= RECOGNIZED
+            self._state = self._next_state(confidence, shown, best.followed)
             if self._state is State.TRACKING:
                 self._follow(near)
                 follows = True
@@ -384,13 +387,18 @@ class Mixture:
         mean, covariance = moments(self.hypotheses)
         return mean[4:], covariance[4:, 4:]
 
-    def _next_state(self, confidence: float, confirmed: bool) -> State:
-        """State after a view; `confirmed`: by it and by enough ground recognized before."""
+    def _next_state(self, confidence: float, confirmed: bool, follows: bool) -> State:
+        """State after a view.
+
+        `confirmed`: by it and by enough ground recognized before. `follows`: whether the likeliest
+        place descends from a confirmed track or a reported position; another one is no dead
+        reckoning.
+        """
         followed = self._state in (State.TRACKING, State.COASTING)
-        if confirmed and confidence >= (LIKELY if followed else CONFIDENT):
+        if confirmed and confidence >= (LIKELY if followed and follows else CONFIDENT):
             return State.TRACKING
         if followed:
-            return State.COASTING if confidence >= LIKELY else State.LOST
+            return State.COASTING if follows and confidence >= LIKELY else State.LOST
         return self._state
 
     def _on_map(self, mean: Array) -> bool:
@@ -459,8 +467,9 @@ class Mixture:
         if off > 0:
             yield off, *self._nowhere(self.model.off_tilt_rad)
 
-    def _born(self, seen: Measurement) -> Iterator[Hypothesis]:
-        """The hypotheses born from the belief elsewhere, at a measurement."""
+    def _born(self, seen: Measurement, confirms: bool) -> Iterator[Hypothesis]:
+        """The hypotheses born from the belief elsewhere, at a measurement. `confirms`: see
+        `update`."""
         for share, mean, covariance in self._mounts():
             spread = covariance[np.ix_(SEEN, SEEN)] + seen.noise
             log_weight = seen.log_odds - math.log(self.area_m2)
@@ -468,8 +477,15 @@ class Mixture:
             mean, covariance = updated(mean, covariance, seen.mean, spread)
             share *= self.elsewhere * math.exp(min(log_weight, 60.0))
             self._numbers += 1
-            sighted = confirmed_ground(seen.alone, 1.0)
-            yield Hypothesis(share, mean, covariance, sighted, self._numbers, recognized=seen.alone)
+            yield Hypothesis(
+                share,
+                mean,
+                covariance,
+                sighted=confirmed_ground(seen.alone, 1.0) if confirms else 0.0,
+                number=self._numbers,
+                recognized=seen.alone,
+                uncounted=0.0 if confirms else 1.0,
+            )
 
     def _from(self, each: Hypothesis, expected: Expected, share: float) -> Hypothesis:
         self._numbers += 1
@@ -494,6 +510,11 @@ class Mixture:
         total = sum(each.share for each in self.hypotheses) + self.elsewhere
         self.hypotheses = [replace(e, share=e.share / total) for e in self.hypotheses]
         self.elsewhere /= total
+
+
+def _is_confirmed(each: Hypothesis) -> bool:
+    """Whether enough ground was recognized lately."""
+    return each.sighted >= (CONFIRMED_AGAIN if each.followed else CONFIRMED)
 
 
 def _forgotten(sighted: float, ground: float) -> float:

@@ -142,7 +142,10 @@ def at_start(known: Mapping[str, Biases], digest: str, setup: str) -> Biases:
         if same:
             mean[2:], cov[2:, 2:] = same[-1].mean[2:], same[-1].cov[2:, 2:]
         start = Biases(mean, cov, agreed_s, setup)
-    return replace(start, cov=start.cov + np.diag(_BETWEEN_STD**2))
+    cov = start.cov + np.diag(_BETWEEN_STD**2)
+    # no less certain than where nothing was learnt, however many flights did not show a bias
+    scale = np.minimum(_PRIOR_STD / np.sqrt(np.diag(cov)), 1.0)
+    return replace(start, cov=np.multiply.outer(scale, scale) * cov)
 
 
 def design(heading_rad: ArrayLike, agl_m: ArrayLike, vel_en_mps: Array) -> Array:

@@ -39,9 +39,9 @@ class Rolling:
         if change <= math.radians(LEAST_DEG_S2):
             return 0.0
         # in a coordinated turn the tangent of the bank is speed times turn rate over gravity
-        lean_rate = float(np.hypot(*value.vel_en_mps)) * change / GRAVITY_MPS2
+        bank_rate = float(np.hypot(*value.vel_en_mps)) * change / GRAVITY_MPS2
         latency_s = math.hypot(known.mean[4], LATENCY_STD_S)
-        return latency_s * lean_rate * value.agl_m
+        return latency_s * bank_rate * value.agl_m
 
 
 def _change_of_rate(first: Difference, middle: Difference, last: Difference) -> float:
