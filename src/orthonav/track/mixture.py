@@ -61,11 +61,10 @@ START_SHARE = 0.9
 """Probability of a reported start position."""
 LIKELY = 0.5
 """A track with less confidence is lost."""
-CONFIRMED, CONFIRMED_AGAIN = 2.0, 1.25
-"""New ground, in views, that must be recognized before a new track is confirmed, and before one that
-was confirmed before is so again. Each view counts by its own probability: no single view confirms a
-track, nor do further views of its ground, nor views that fit only because they were searched there
-(docs/decisions/tracking.md, 9 and 13)."""
+CONFIRMED = 1.25
+"""New ground, in views, that must be recognized before a track is confirmed. Each view counts by
+its own probability: no single view confirms a track, nor do further views of its ground, nor views
+that fit only because they were searched there (docs/decisions/tracking.md, 9 and 13)."""
 UNCONFIRMED = 0.8
 """Highest confidence that is stated before a track is confirmed (docs/decisions/tracking.md, 9)."""
 RECOGNIZED = 0.2
@@ -78,8 +77,8 @@ UNRECOGNIZED = 0.5
 """Factor on the count of recognized ground for each view of new ground that does not show the map:
 after a few, a track must be confirmed again."""
 BLIND = 0.5
-"""Factor on the evidence of a view that does not show the map against a track that was confirmed,
-for each such view before: clouds, water and a covered lens last (docs/decisions/tracking.md, 13)."""
+"""Factor on the evidence, against a track that was confirmed, of a view that does not show the map,
+for each such view before: clouds, water and a covered lens last (decisions/tracking.md, 13)."""
 MOST_SIGHTED = 3.0
 """Highest count of recognized ground, in views."""
 FORGOTTEN = 0.5
@@ -326,7 +325,7 @@ class Mixture:
         near = [each for each in self.hypotheses if distance(each, best) <= radius_m]
         mean, covariance = moments(near)
         confidence = min(self._inside(radius_m, mean[POSITION]), 1.0)
-        confirmed = any(_is_confirmed(each) for each in major(near))
+        confirmed = max(each.sighted for each in major(near)) >= CONFIRMED
         seen, follows = self._recognized_at(mean, covariance, near), best.followed
         if not between_views:
             shown = confirmed and seen >= RECOGNIZED
@@ -510,11 +509,6 @@ class Mixture:
         total = sum(each.share for each in self.hypotheses) + self.elsewhere
         self.hypotheses = [replace(e, share=e.share / total) for e in self.hypotheses]
         self.elsewhere /= total
-
-
-def _is_confirmed(each: Hypothesis) -> bool:
-    """Whether enough ground was recognized lately."""
-    return each.sighted >= (CONFIRMED_AGAIN if each.followed else CONFIRMED)
 
 
 def _forgotten(sighted: float, ground: float) -> float:
