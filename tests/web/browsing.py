@@ -63,7 +63,8 @@ class Visit:
         self.page.goto(self.url)
 
     def was_well(self):
-        assert [*self.wrong, *self.elsewhere] == []
+        found = [*self.wrong, *self.elsewhere]
+        assert found == [], found
 
     def __getattr__(self, name):
         return getattr(self.page, name)
