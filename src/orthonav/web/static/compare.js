@@ -47,13 +47,15 @@ export class Compare {
 
   async #load(i) {
     const asked = ++this.asked;
+    const { generation } = this.store;
     let detail;
     try {
       detail = await getJson(`api/views/${i}`);
     } catch (error) {
       detail = { why_no_window: error.message };
     }
-    if (asked !== this.asked) return; // another was selected meanwhile
+    // Another was selected meanwhile, or the run started over.
+    if (asked !== this.asked || generation !== this.store.generation) return;
     this.detail = detail;
     this.#pictures(i, detail);
     this.#known(detail);
