@@ -21,6 +21,7 @@ from orthonav.atlas.agreement import (
 )
 from orthonav.atlas.sheet_registration import SearchRegion, SheetMatch, SheetRegistrar
 from orthonav.atlas.tile_search import TileSearch
+from orthonav.confidence.logistic import logit
 from orthonav.confidence.registered import USUAL_CONFIDENCE
 from orthonav.geo.frames import LocalFrame
 from orthonav.localizer.checks import check_footprint, check_view
@@ -199,8 +200,7 @@ def _log_odds(key: int, found: Sequence[SheetMatch]) -> float:
     one = found[key]
     rivals = [each.evidence for place, each in enumerate(found) if place != key]
     confidence = one.confidence or USUAL_CONFIDENCE
-    likely = min(max(confidence(_against(one.evidence, rivals)), LEAST), 1 - LEAST)
-    return math.log(likely / (1 - likely))
+    return logit(confidence(_against(one.evidence, rivals)), LEAST)
 
 
 def _moved(

@@ -133,6 +133,4 @@ class LocalTrack:
 
 def _half_diagonal_m(view: View) -> float:
     """Half of the diagonal of the ground that a view shows from straight above."""
-    camera = view.camera
-    across = math.hypot(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px)
-    return view.telemetry.agl_m * across / 2
+    return view.telemetry.agl_m * math.hypot(*view.camera.extent) / 2

@@ -124,7 +124,7 @@ class _Check:
         agl_m = request.agl_m
         if agl_m is None:
             tile_m = self.sheet.grid.tile_m
-            agl_m = tile_m / min(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px)
+            agl_m = tile_m / min(camera.extent)
         plan = TrialPlan(
             request.map_path,
             camera,

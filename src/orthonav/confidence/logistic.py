@@ -56,6 +56,12 @@ def probability(logit: float) -> float:
     return 1 / (1 + math.exp(-min(max(logit, -LIMIT), LIMIT)))
 
 
+def logit(likely: float, least: float) -> float:
+    """Logarithm of the odds of a probability that is taken as `least` to 1 - `least`."""
+    inside = min(max(likely, least), 1 - least)
+    return math.log(inside / (1 - inside))
+
+
 def fit_logistic(
     features: NDArray[np.float64], right: NDArray[np.bool_], sample_weight: NDArray[np.float64]
 ) -> LogisticConfidence:

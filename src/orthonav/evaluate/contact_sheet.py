@@ -193,7 +193,7 @@ def _view_patch(
     grey = view.grey()
     if grey.shape != (camera.height_px, camera.width_px):
         raise FlightError("the image does not have the size of the calibration")
-    longer_m = max(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px) * used.agl_m
+    longer_m = max(camera.extent) * used.agl_m
     side_m = MARGIN * longer_m
     gsd_m = side_m / SIDE_PX
     made = rectify(

@@ -80,6 +80,11 @@ class Camera:
         """`px_from_camera`, (3, 3): pixel-is-area coordinates from camera axes, no distortion."""
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
 
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height of what it sees straight ahead, in metres for each metre away."""
+        return self.width_px / self.fx_px, self.height_px / self.fy_px
+
     def gsd_m(self, agl_m: float) -> float:
         """Ground resolution in metres per pixel of a vertical view from `agl_m`."""
         return agl_m / math.sqrt(self.fx_px * self.fy_px)

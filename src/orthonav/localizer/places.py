@@ -2,12 +2,15 @@
 
 import math
 
+from orthonav.confidence.logistic import logit
 from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.register.refine import Placed
 from orthonav.register.registrar import Registered, apart_px
 
 WORTH_LOG_ODDS = -12.0
 """Less likely places are left out."""
+LEAST = 1e-12
+"""Least and greatest (1 - LEAST) probability of a place, for finite odds."""
 
 
 def places_of(
@@ -35,16 +38,11 @@ def places_of(
                 "look": found.look_score * share,
                 "look_rival": found.look_score,
             }
-        there = _log_odds(confidence(evidence)) + math.log(searched_share)
+        there = logit(confidence(evidence), LEAST) + math.log(searched_share)
         for name in least.keys() & evidence.keys():
             evidence[name] = max(evidence[name], least[name])
         alone = confidence(evidence)
-        log_odds = min(there, _log_odds(alone))
+        log_odds = min(there, logit(alone, LEAST))
         if not out or log_odds > WORTH_LOG_ODDS:
             out.append((log_odds, alone, placed))
     return out
-
-
-def _log_odds(confidence: float) -> float:
-    inside = min(max(confidence, 1e-12), 1 - 1e-12)
-    return math.log(inside / (1 - inside))

@@ -78,7 +78,7 @@ def rectify_footprint(view: View, *, gsd_m: float, multiple_px: int) -> Rectifie
     camera, telemetry = view.camera, view.telemetry
     pitch_deg, roll_deg, agl_m = telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
     axis = np.array(axis_on_ground_en_m(0.0, pitch_deg, roll_deg, agl_m))
-    half_m = np.array([camera.width_px / camera.fx_px, camera.height_px / camera.fy_px]) * agl_m / 2
+    half_m = np.array(camera.extent) * agl_m / 2
     low, high = axis - MAX_REACH * half_m, axis + MAX_REACH * half_m
     try:
         corners = footprint_en_m(camera, 0.0, pitch_deg, roll_deg, agl_m)

@@ -143,7 +143,7 @@ class _TiltProfile:
     def __init__(self, registration: RegistrationLocalizer, view: View, level: int) -> None:
         self._registration, self._view = registration, view
         camera, telemetry = view.camera, view.telemetry
-        corner = math.hypot(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px) / 2
+        corner = math.hypot(*camera.extent) / 2
         rim_m = RIM_PX * registration.grid.gsd_m * 2**level
         self.step_rad = min(rim_m / max(telemetry.agl_m * corner**2, 1e-9), MAX_STEP_RAD)
 

@@ -32,6 +32,7 @@ from orthonav.track import (
 )
 from orthonav.track.hypotheses import within
 from orthonav.track.model import BIASES, HEADING, SCALE, TILT, VELOCITY
+from orthonav.track.motion import usual_velocity_std_mps
 from orthonav.track.smooth import History, Smoothed
 
 LOCAL_SHARE = 0.75
@@ -58,12 +59,6 @@ RADIUS_SHARE = 0.025
 """Least radius of the confidence over the height: what an error of 1.4 deg in tilt makes."""
 KNOWN_MPS = 5.0
 """An estimated velocity with less uncertainty than this predicts the next displacement."""
-VELOCITY_STD_MPS = 1.0
-VELOCITY_SHARE = 0.02
-"""Standard deviation of a reported velocity that comes without one: this, and this share of the
-speed (docs/tracking.md)."""
-FOLLOWED = (State.TRACKING, State.COASTING)
-"""States in which a track is followed."""
 Array = NDArray[np.float64]
 
 
@@ -263,9 +258,7 @@ class Tracker:
         moved_m = self.model.speed_mps * seconds
         if expected is not None:
             moved_m = float(np.hypot(*expected))
-        side_m = view.telemetry.agl_m * min(
-            view.camera.width_px / view.camera.fx_px, view.camera.height_px / view.camera.fy_px
-        )
+        side_m = view.telemetry.agl_m * min(view.camera.extent)
         return min(moved_m / side_m, 1.0) if side_m > 0 else 1.0
 
     def _position_of(self, prior: Prior) -> tuple[Array, float]:
@@ -301,7 +294,7 @@ class Tracker:
         self._velocity = now = np.array(reported)
         std = telemetry.vel_std_mps
         if std is None or not std > 0:
-            std = VELOCITY_STD_MPS + VELOCITY_SHARE * float(np.hypot(*now))
+            std = usual_velocity_std_mps(float(np.hypot(*now)))
         return ReportedVelocity(now, before, std)
 
     def _tilt_noise(self, telemetry: Telemetry) -> float:
@@ -337,14 +330,13 @@ class Tracker:
         """Register the view and update the mixture; a `NoFix` where it shows too little."""
         telemetry = view.telemetry
         expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
-        prior, searched = self._search_area(expected)
+        prior, searched, confirms = self._search_area(expected)
         bias, spread = self._correction(telemetry, expected, prior)
         corrected = replace(
             view,
             camera=replace(view.camera, focal_std=0.0),  # part of the spread of the scale
             telemetry=_known(corrected_by(telemetry, bias), spread),
         )
-        confirms = prior is None or (expected is not None and not self._must_compete(expected))
         seen = self._registration.register(corrected, prior, self._heading_known)
         if isinstance(seen, NoFix):
             return seen
@@ -387,7 +379,7 @@ class Tracker:
         """
         if expected.state is State.SEARCHING:
             return expected.belief < LOCAL_SHARE
-        return not (expected.state in FOLLOWED and expected.confirmed)
+        return not (expected.state.is_followed and expected.confirmed)
 
     def _tilt_weights(self, newness: float, costly: bool) -> Array:
         """How many times the weight of the view perspective counts, for pitch and roll (2,).
@@ -405,26 +397,30 @@ class Tracker:
 
     def _search_area(
         self, expected: Estimate | None
-    ) -> tuple[Prior | None, tuple[Array, float] | None]:
-        """The part of the map to search, as a prior and as a circle (middle, radius); None for all.
+    ) -> tuple[Prior | None, tuple[Array, float] | None, bool]:
+        """The part of the map to search, as a prior and as a circle (middle, radius), None for all,
+        and whether a place found there may confirm the track.
 
         It is the surroundings of the predicted position where that is nearly certain. Where these
         have to compete with the whole map, views are searched there and here by turns.
         """
+        whole_map = None, None, True
         if expected is None or not expected.followed:
-            return None, None  # an unconfirmed place must compete with the whole map
-        if self._must_compete(expected):
+            return whole_map  # an unconfirmed place must compete with the whole map
+        competes = self._must_compete(expected)
+        if competes:
             self._whole_map = not self._whole_map
             if self._whole_map:
-                return None, None
+                return whole_map
         elif expected.state is State.TRACKING and expected.confidence < LOCAL_SHARE:
-            return None, None
+            return whole_map
         spread = float(np.linalg.eigvalsh(expected.covariance[:2, :2])[-1])
         reach = max(LOCAL_SIGMAS * math.sqrt(spread), MIN_LOCAL_M)
         if 4 * reach**2 > self.mixture.area_m2 / 4:
-            return None, None
+            return whole_map
         lat, lon = self._localizer.sheet.frame.latlon_from_en(expected.mean[:2])
-        return Prior(float(lat), float(lon), reach / PRIOR_SIGMAS), (expected.mean[:2], reach)
+        prior = Prior(float(lat), float(lon), reach / PRIOR_SIGMAS)
+        return prior, (expected.mean[:2], reach), not competes
 
     def _sightings(
         self,

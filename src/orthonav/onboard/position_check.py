@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.onboard.history import StateHistory
+from orthonav.track.motion import usual_velocity_std_mps
 
 KEEP_S, LONGEST_GAP_S = 5.0, 30.0
 """Earlier positions with which one is compared: a track moves to a new place within seconds. The
 last one counts for longer: a track may have been coasting or lost since."""
 SIGMAS = 3.0
-VELOCITY_STD_MPS, VELOCITY_SHARE = 1.0, 0.02
-"""Standard deviation of the reported velocity, as that of the track: this, and this share of it."""
 LONGEST_S, LEAST_S, STEP_S = 12.0, 0.5, 0.1
 """Changes of the delay that are looked for."""
 Array = NDArray[np.float64]
@@ -86,7 +85,7 @@ def _change_s(before: _Place, now: _Place, ago_s: Array, path: Array) -> float |
     if not np.isfinite(flown).all():
         return None
     jump = now.en_m - before.en_m - flown
-    speed_std = VELOCITY_STD_MPS + VELOCITY_SHARE * float(np.hypot(*flown)) / seconds
+    speed_std = usual_velocity_std_mps(float(np.hypot(*flown)) / seconds)
     std_m = math.hypot(before.std_m, now.std_m)
     if not np.hypot(*jump) > SIGMAS * math.hypot(std_m, speed_std * seconds):
         return None

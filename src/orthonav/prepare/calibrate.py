@@ -149,10 +149,11 @@ def calibrate(
 
     A `slow` representation (minutes per crop) is tried on `SLOW_CROPS` only.
     """
-    rng = np.random.default_rng([len(sampler.crops), 2])
+    sampled = sampler.crops
+    rng = np.random.default_rng([len(sampled), 2])
     matcher = TileMatcher(grid, centres_en_m, embeddings)
     most = min(CROPS, SLOW_CROPS) if slow else CROPS
-    crops = [sampler.crops[i] for i in rng.permutation(len(sampler.crops))[:most]]
+    crops = [sampled[i] for i in rng.permutation(len(sampled))[:most]]
     features, errors, mirrored = [], [], []
     for done, crop in enumerate(crops):
         other = crops[int(rng.integers(len(crops)))].grey

@@ -68,11 +68,7 @@ class Clouds:
         *angles, agl_m = attitude
         below_m = agl_m * (1 - HEIGHT)
         corners = en_m + footprint_en_m(camera, angles[0], angles[1], angles[2], below_m)
-        across_m = (
-            TEXTURE_VIEWS
-            * below_m
-            * max(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px)
-        )
+        across_m = TEXTURE_VIEWS * below_m * max(camera.extent)
         size = math.ceil(camera.width_px / GRID) + 1, math.ceil(camera.height_px / GRID) + 1
         ranks = _sampled(self._ranks, corners / across_m * TEXTURE_PX + 97.0 * stretch, size)
         inside = np.clip((degree * (1 + SOFTNESS) - ranks) / SOFTNESS, 0, 1)

@@ -266,7 +266,7 @@ def _height_m(request: SimulateRequest, mosaic: Mosaic) -> float:
     camera = request.camera
     if request.agl_m is None:
         side_m = 256 * mosaic.gsd_m
-        return side_m / min(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px)
+        return side_m / min(camera.extent)
     if not 1 <= request.agl_m <= 50_000:
         raise FlightError(f"height above ground must be 1 to 50,000 m, got {request.agl_m}")
     return request.agl_m

@@ -29,6 +29,7 @@ from orthonav.track.hypotheses import (
     within,
 )
 from orthonav.track.model import (
+    BIASES,
     POSITION,
     SEEN,
     STATE,
@@ -99,6 +100,11 @@ class State(Enum):
     """Confirmed before; this view does not show the map, the position is dead reckoning."""
     LOST = "lost"
     """Confirmed before; the position is no longer likely, or that of another, unconfirmed place."""
+
+    @property
+    def is_followed(self) -> bool:
+        """Whether the position is that of a confirmed track."""
+        return self in (State.TRACKING, State.COASTING)
 
 
 @dataclass(frozen=True, eq=False)
@@ -384,7 +390,7 @@ class Mixture:
         if not self.hypotheses:
             return np.zeros(4), np.diag(self.model.initial_bias())
         mean, covariance = moments(self.hypotheses)
-        return mean[4:], covariance[4:, 4:]
+        return mean[BIASES], covariance[BIASES, BIASES]
 
     def _next_state(self, confidence: float, confirmed: bool, follows: bool) -> State:
         """State after a view.
@@ -393,7 +399,7 @@ class Mixture:
         place descends from a confirmed track or a reported position; another one is no dead
         reckoning.
         """
-        followed = self._state in (State.TRACKING, State.COASTING)
+        followed = self._state.is_followed
         if confirmed and confidence >= (LIKELY if followed and follows else CONFIDENT):
             return State.TRACKING
         if followed:

@@ -19,6 +19,14 @@ from orthonav.track.model import (
 VELOCITY_JITTER = 0.3
 """Share of the error of a reported velocity that is independent at every view; chosen on the
 flights of docs/tracking.md."""
+VELOCITY_STD_MPS, VELOCITY_SHARE = 1.0, 0.02
+"""Standard deviation of a reported velocity that comes without one: this, and this share of the
+speed (docs/tracking.md)."""
+
+
+def usual_velocity_std_mps(speed_mps: float) -> float:
+    """Standard deviation per axis of a reported velocity that comes without one."""
+    return VELOCITY_STD_MPS + VELOCITY_SHARE * speed_mps
 
 
 @dataclass(frozen=True, eq=False)

@@ -55,7 +55,7 @@ def window_of(telemetry: Telemetry, camera: Camera, gsd_m: float) -> GroundWindo
         raise FlightError(refused.detail)
     attitude = telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
     axis = axis_on_ground_en_m(*attitude)
-    half_m = math.hypot(camera.width_px / camera.fx_px, camera.height_px / camera.fy_px) / 2
+    half_m = math.hypot(*camera.extent) / 2
     reach_m = MAX_REACH * half_m * telemetry.agl_m
     try:
         corners = footprint_en_m(camera, *attitude)
