@@ -375,7 +375,7 @@ def slow_drag_table(trials: int, section: Section) -> Table:
         moved = f"{np.nanmax(found[:, 0]) * mps:.0f}"
         rows.append([f"{mps:g} m/s", str(trials), str(missed), late, moved, most, left])
         print(rows[-1], file=sys.stderr, flush=True)
-    header = ["drag-off", "trials", "missed", "worst s", "GNSS moved, m", "learnt, m", "kept, m"]
+    header = ["drag-off", "trials", "missed", "worst s", "GNSS moved, m", "learnt, m", "left, m"]
     return Table("Slow drag-offs after an hour of agreement", header, rows)
 
 

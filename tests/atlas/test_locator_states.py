@@ -19,7 +19,7 @@ FOUND = FoundPlace((), 1.0, 0.95)
 
 
 class Finder:
-    """Gives the outcomes it is told, and counts restarts."""
+    """Returns the outcomes given to it, and counts restarts."""
 
     def __init__(self, *_, **__):
         self.outcomes, self.asked, self.restarts = [], 0, 0

@@ -33,7 +33,7 @@ def difference(second, heading=0.0, speed=20.0, agl_m=300.0, true=TRUE, off_m=(0
 
 
 def learnt(values, start=None):
-    """What is learnt of values, all of them past quarantine."""
+    """The biases learnt from values, all of them past quarantine."""
     learner = BiasLearner(start or unknown(), MODEL)
     values = list(values)
     for each in values:

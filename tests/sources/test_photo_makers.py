@@ -1,4 +1,4 @@
-"""What makers, models and editors write into photographs, and what is made of it."""
+"""Metadata of photographs by maker, model and editor."""
 
 import math
 

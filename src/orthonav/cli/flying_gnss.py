@@ -31,7 +31,7 @@ def gnss_watch(
     """GNSS monitor over the solutions in `queue`, or over `gnss.csv` of the flight folder.
 
     `digest`: of the map. `used`: camera, its mount and stated latency; after a change of them,
-    what they add to the difference is learnt anew. Raises `VariantError` where GNSS has no source,
+    what they add to the difference is learnt again. Raises `VariantError` where GNSS has no source,
     or `correct` no state.
     """
     if options.gnss == "correct" and options.state is None:

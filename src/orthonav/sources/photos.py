@@ -158,7 +158,7 @@ def _of_one_focal_length(
 ) -> tuple[list[_DatedPhoto], list[str]]:
     """The photographs of the most frequent focal length, and a warning about others.
 
-    Those that state none are kept. All are, where there is none that can be used.
+    Those that state none are used too, and all of them where no focal length can be used.
     """
     found: list[FocalLength | CameraError | None] = []
     for one in taken:

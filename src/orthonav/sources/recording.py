@@ -157,7 +157,7 @@ def doubts_of(track: RecordedTrack, options: SourceOptions) -> list[str]:
 
 
 def height_warnings(above_home: bool, only_altitudes: bool, options: SourceOptions) -> list[str]:
-    """What is assumed about heights: of those above take-off, or where only altitudes are known."""
+    """Assumptions about heights: of those above take-off, or where only altitudes are known."""
     if above_home:
         return [LEVEL_GROUND]
     if not only_altitudes:

@@ -49,7 +49,7 @@ def read_kmz(data: bytes) -> list[Route]:
 
 
 def _chosen_members(members: list[str]) -> list[str]:
-    """What is flown: waylines of DJI, which come with a template in KML, else `doc.kml`."""
+    """The members with the route: waylines of DJI (beside a template in KML), else `doc.kml`."""
     waylines = [name for name in members if name.lower().endswith(".wpml")]
     names = [name for name in members if name.lower().endswith(".kml")]
     return waylines or [name for name in names if name.lower() == "doc.kml"] or names

@@ -120,12 +120,12 @@ def biases_from_plain(plain: Mapping[str, Any]) -> Biases:
 
 
 def unknown(setup: str = "") -> Biases:
-    """What is assumed where nothing was learnt."""
+    """The biases assumed where nothing was learnt."""
     return Biases(np.zeros(len(NAMES)), np.diag(_PRIOR_STD**2), 0.0, setup)
 
 
 def at_start(known: Mapping[str, Biases], digest: str, setup: str) -> Biases:
-    """What is known before a flight over the map `digest` with the camera of `setup`.
+    """The biases known before a flight over the map `digest` with the camera of `setup`.
 
     `known`: what was learnt of maps, by their digest, the latest last. The displacement belongs to
     the map, the other biases to the setup: they are those of this map, or of the latest with the
