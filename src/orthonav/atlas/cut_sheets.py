@@ -99,12 +99,13 @@ def pooled_manifest(
 
 def _registration(manifests: Sequence[Manifest], shares: NDArray[np.float64]) -> dict[str, Any]:
     layers = [each.registration or {} for each in manifests]
-    known = [
-        (RegisteredConfidence.from_plain(each["confidence"]), share)
-        for each, share in zip(layers, shares, strict=True)
-        if each.get("confidence") is not None and share > 0
-    ]
-    confidence = pooled_registered(*_apart(known))
+    confidence = pooled_registered(
+        [
+            RegisteredConfidence.from_plain(each["confidence"])
+            for each, share in zip(layers, shares, strict=True)
+            if each.get("confidence") is not None and share > 0
+        ]
+    )
     return {
         "confidence": None if confidence is None else confidence.to_plain(),
         "radius_m": max(float(each["radius_m"]) for each in layers),

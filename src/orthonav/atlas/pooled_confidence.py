@@ -9,26 +9,25 @@ the mean in the range of evidence that decides.
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import TypeVar
+from dataclasses import replace
 
 import numpy as np
 
 from orthonav.confidence.logistic import LogisticConfidence
-from orthonav.confidence.registered import CHANCES, Chances, RegisteredConfidence
+from orthonav.confidence.registered import (
+    CHANCES,
+    USUAL_CONFIDENCE,
+    Chances,
+    RegisteredConfidence,
+)
 
 DECIDING = 0.5, 0.99
 """Thresholds of acceptance lie in this range of probabilities."""
 SCORES = np.linspace(0.05, 1.0, 20)
 MARGINS = np.linspace(0.0, 0.6, 13)
-STRENGTHS = np.exp(np.linspace(0.0, 2.0, 9))
-RATIOS = np.exp(np.linspace(0.0, 1.4, 8))
-LOOKS = np.exp(np.linspace(0.0, 1.4, 5))
 """Evidence at which the pooled confidence is compared with the sheets': scores and margins of
-tiles; for registered views strength over chance, over the best rival, and the finer look."""
+tiles."""
 Evidence = Mapping[str, float]
-
-
-Confidence = TypeVar("Confidence", LogisticConfidence, RegisteredConfidence)
 
 
 def pooled_tiles(
@@ -47,34 +46,21 @@ def pooled_tiles(
     return LogisticConfidence(bias - math.log(max(more_tiles, 1.0)), mean.weights)
 
 
-def pooled_registered(
-    confidences: Sequence[RegisteredConfidence], shares: Sequence[float]
-) -> RegisteredConfidence | None:
-    """Confidence of registered views on a map made of sheets in these shares; None without sheets.
+def pooled_registered(confidences: Sequence[RegisteredConfidence]) -> RegisteredConfidence | None:
+    """Confidence of registered views on a map made of sheets; None without sheets.
 
-    The scores of chance are those of the sheet where they are highest.
+    It is the usual one, with the scores of chance of the sheet where they are highest.
     """
     if not confidences:
         return None
     chances = Chances(
         **{name: max(getattr(each.chances, name) for each in confidences) for name in CHANCES}
     )
-    evidence = [
-        {
-            "strength": strength * chances.total,
-            "rival": strength * chances.total / ratio,
-            "look": look * chances.look,
-            "look_rival": chances.look,
-        }
-        for strength, ratio, look in itertools.product(STRENGTHS, RATIOS, LOOKS)
-    ]
-    mean = RegisteredConfidence(*_mean(confidences, shares), chances)
-    bias = mean.bias - _excess(mean, confidences, shares, evidence)
-    return RegisteredConfidence(bias, mean.weights, chances)
+    return replace(USUAL_CONFIDENCE, chances=chances)
 
 
 def _mean(
-    confidences: Sequence[Confidence], shares: Sequence[float]
+    confidences: Sequence[LogisticConfidence], shares: Sequence[float]
 ) -> tuple[float, tuple[float, ...]]:
     bias = np.average([each.bias for each in confidences], weights=shares)
     weights = np.average([each.weights for each in confidences], axis=0, weights=shares)
@@ -82,8 +68,8 @@ def _mean(
 
 
 def _excess(
-    pooled: Confidence,
-    confidences: Sequence[Confidence],
+    pooled: LogisticConfidence,
+    confidences: Sequence[LogisticConfidence],
     shares: Sequence[float],
     evidence: Sequence[Evidence],
 ) -> float:

@@ -1,4 +1,8 @@
-"""Confidence of a registered view: a probability from its score and its rivals."""
+"""Confidence of a registered view: a probability from its scores, its rivals and its ground.
+
+Weights are those of real imagery of two dates (`python -m benchmarks.trust`), scores of chance
+those of the map.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,15 +15,29 @@ from numpy.typing import NDArray
 from orthonav.confidence.logistic import fit_weights, probability
 from orthonav.errors import VariantError
 
-FEATURES = ("log_strength", "log_peak_ratio", "log_look_ratio")
+FEATURES = (
+    "log_strength",
+    "log_peak_ratio",
+    "log_look_ratio",
+    "log_local_ratio",
+    "blocks_t",
+    "log_detail_ratio",
+)
+OLD_FEATURES = {"log_strength", "log_peak_ratio", "log_look_ratio"}
+"""Features of maps up to version 0.1."""
 CHANCES = ("total", "look", "fine")
-USUAL_BIAS, USUAL_WEIGHTS = -4.2, (3.0, 9.0, 1.5)
-"""What separates right from wrong on generated landscapes, cautious enough to refuse views of other
-places; a map's own are drawn towards them."""
+USUAL_BIAS, USUAL_WEIGHTS = -10.75, (2.83, 2.99, 3.73, 5.24, 1.11, 3.89)
+"""What separates right from wrong: `python -m benchmarks.trust --fit` prints these numbers, and how
+they judge scenes that they were not fitted to."""
 RIDGE = 3e-2
-"""Weight of the usual values, see docs/decisions/confidence.md."""
+"""Weight of the usual values where views of another date of the map's area are fitted too, see
+docs/decisions/confidence.md."""
 STAND_IN = 0.7
 """Share of the chance value that stands in for a rival where a narrow search found none."""
+LEAST_LOCAL = 0.5
+"""Least ratio to the ground nearby that makes a difference."""
+USUAL_DETAIL = 1.4
+"""Stands in for the detail ratio of views too small to be finished at a finer level."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +56,10 @@ class Chances:
         if not all(0 < value < math.inf for value in (self.total, self.look, self.fine)):
             raise VariantError(f"chance values must be above 0 and finite: {self}")
 
+    def of_strength(self, evidence: Mapping[str, float]) -> float:
+        """The strength that chance gives a view with this evidence: of one level or of two."""
+        return self.look if math.isnan(evidence["detail_ratio"]) else self.total
+
 
 USUAL_CHANCES = Chances(32.0, 15.0, 48.0)
 """Chance values for a map on which none were measured: those of generated landscapes."""
@@ -47,12 +69,20 @@ USUAL_CHANCES = Chances(32.0, 15.0, 48.0)
 class RegisteredConfidence:
     """P(right) = 1 / (1 + exp(-(bias + weights . features))).
 
-    Features are logarithms: of the strength over that of chance, of the strength over the best
-    elsewhere, and of the same comparison among all candidates at a coarser level. Where the view
-    was doubtful enough to be judged one level finer too, the second is the mean with and without
-    it: on blurred views the finer level alone is overconfident. A share of chance stands in for a
-    rival where none was found, so that a narrow search does not appear as certainty. Weights are
-    never negative: more evidence never means less confidence.
+    Features, with what each shows wrong:
+
+    - `log_strength`: score over that of chance. Views that show nothing of the map.
+    - `log_peak_ratio`: score over that of the strongest rival. Ground that exists more than once.
+      Where the view was doubtful enough to be judged one level finer too, it is the mean with and
+      without it: on blurred views the finer level alone is overconfident.
+    - `log_look_ratio`: the same among all candidates, at a coarser level.
+    - `log_local_ratio`: correlation over the best one a little aside. Rows, lattices, single roads.
+    - `blocks_t`: agreement of the blocks of the view. Views that one strong line places.
+    - `log_detail_ratio`: score at the finest level over that at the coarser one. Chance matches
+      lose more in detail.
+
+    A share of chance stands in for a rival where none was found, so that a narrow search does not
+    appear as certainty. Weights are never negative: more evidence never means less confidence.
     """
 
     bias: float
@@ -74,11 +104,17 @@ class RegisteredConfidence:
 
     @classmethod
     def from_plain(cls, plain: Any) -> "RegisteredConfidence":
-        """Inverse of `to_plain`; raises `VariantError` if it does not fit."""
+        """Inverse of `to_plain`; raises `VariantError` if it does not fit.
+
+        Maps built before all of `FEATURES` existed have the usual weights, with their own scores
+        of chance.
+        """
         try:
-            weights = tuple(float(plain["weights"][name]) for name in FEATURES)
+            stored, bias = plain["weights"], float(plain["bias"])
+            if set(stored) == OLD_FEATURES:
+                stored, bias = dict(zip(FEATURES, USUAL_WEIGHTS, strict=True)), USUAL_BIAS
+            weights = tuple(float(stored[name]) for name in FEATURES)
             chances = Chances(**{name: float(plain["chances"][name]) for name in CHANCES})
-            bias = float(plain["bias"])
         except (KeyError, TypeError, ValueError) as error:
             raise VariantError(
                 f"confidence of registration must have a bias, weights of {FEATURES} and chances "
@@ -92,25 +128,28 @@ class RegisteredConfidence:
 
 
 def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.float64]:
-    """Features (3,) of the evidence of a registered view, see `RegisteredConfidence`."""
+    """Features (6,) of the evidence of a registered view, see `RegisteredConfidence`."""
     strength, look = max(evidence["strength"], 1e-3), max(evidence["look"], 1e-3)
-    ratio = strength / max(evidence["rival"], STAND_IN * chances.total)
-    fine, fine_rival = evidence.get("fine", math.nan), evidence.get("fine_rival", math.nan)
+    detail, chance = evidence["detail_ratio"], chances.of_strength(evidence)
+    if math.isnan(detail):
+        detail = USUAL_DETAIL
+    ratio = strength / max(evidence["rival"], STAND_IN * chance)
+    fine, fine_rival = evidence["fine"], evidence["fine_rival"]
     if math.isfinite(fine + fine_rival):
         ratio = math.sqrt(ratio * max(fine, 1e-3) / max(fine_rival, STAND_IN * chances.fine))
     look_ratio = look / max(evidence["look_rival"], STAND_IN * chances.look)
-    return np.log(np.array([strength / chances.total, ratio, look_ratio], dtype=np.float64))
+    local = max(evidence["local_ratio"], LEAST_LOCAL)
+    logs = np.log(np.array([strength / chance, ratio, look_ratio, local], dtype=np.float64))
+    return np.array([*logs, evidence["blocks_t"], math.log(max(detail, 1e-3))])
 
 
 def fit_registered(
-    evidence: Sequence[Mapping[str, float]],
-    right: NDArray[np.bool_],
-    sample_weight: NDArray[np.float64],
-    chances: Chances,
+    evidence: Sequence[Mapping[str, float]], right: NDArray[np.bool_], chances: Chances
 ) -> RegisteredConfidence:
     """The confidence that fits views (N) of which it is known whether they came out right."""
     features = np.stack([features_of(each, chances) for each in evidence])
-    bias, weights = fit_weights(features, right, sample_weight, RIDGE, (USUAL_BIAS, USUAL_WEIGHTS))
+    equal = np.ones(len(right))
+    bias, weights = fit_weights(features, right, equal, RIDGE, (USUAL_BIAS, USUAL_WEIGHTS))
     return RegisteredConfidence(bias, weights, chances)
 
 

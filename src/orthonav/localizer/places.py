@@ -24,7 +24,11 @@ def places_of(
     whole map whose rivals are what chance makes (docs/decisions/tracking.md, 9).
     """
     best, chances = found.evidence(), confidence.chances
-    least = {"rival": chances.total, "look_rival": chances.look, "fine_rival": chances.fine}
+    least = {
+        "rival": chances.of_strength(best),
+        "look_rival": chances.look,
+        "fine_rival": chances.fine,
+    }
     out: list[tuple[float, float, Placed]] = []
     for score, placed in ((found.score, found.placed), *found.finalists):
         if any(apart_px(placed, other) < near_px for *_, other in out):
@@ -32,15 +36,18 @@ def places_of(
         evidence = dict(best)
         if out:
             share = score / max(found.score, 1e-6)
-            evidence = {
+            evidence |= {
                 "strength": score,
                 "rival": found.score,
                 "look": found.look_score * share,
                 "look_rival": found.look_score,
+                "fine": math.nan,
+                "fine_rival": math.nan,
             }
         there = logit(confidence(evidence), LEAST) + math.log(searched_share)
-        for name in least.keys() & evidence.keys():
-            evidence[name] = max(evidence[name], least[name])
+        for name, value in least.items():
+            if not math.isnan(evidence[name]):
+                evidence[name] = max(evidence[name], value)
         alone = confidence(evidence)
         log_odds = min(there, logit(alone, LEAST))
         if not out or log_odds > WORTH_LOG_ODDS:

@@ -176,7 +176,7 @@ class RegistrationLocalizer:
             return best
         made = view.rectified_at(view.levels.final - 1)
         finer = ViewTemplates(made.grey, made.valid, view.levels.final - 1)
-        return self.registrar.deepened(view.templates, finer, view.levels, best)
+        return self.registrar.deepened(view.templates, finer, view.levels, best, view.prior)
 
     def _finished(self, view: PreparedView, judged: list[Placed], candidates: int) -> Registered:
         return self.registrar.finished(view.templates, view.levels, judged, view.prior, candidates)

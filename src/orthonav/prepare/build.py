@@ -245,12 +245,6 @@ def registration_record(
     learned = calibrate_registration(
         localizer, crops, later, request.calibration_views, request.seed, progress
     )
-    if learned.is_usual:
-        log.warning(
-            "only %d trial views were right, too few to calibrate registration: the usual "
-            "confidence, that of generated landscapes, is used",
-            learned.right,
-        )
     return {
         "confidence": learned.confidence.to_plain(),
         "radius_m": radius_m,

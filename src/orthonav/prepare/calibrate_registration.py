@@ -1,9 +1,9 @@
-"""Calibration of the confidence of registered views on a new map.
+"""Calibration of registration on a new map: the scores of chance, and how well dates agree.
 
-Views are cropped from the reference at random positions, sizes, headings and heights with simulated
-ageing (`change`), or from another date of the same area if one is given. Mirrored views serve as
-negatives: no place is the mirror image of another. All are located by the localizer that flies, and
-a logistic regression is fitted to the outcome.
+Mirrored views of the map, aged by simulation (`change`), show no place of it: the scores that they
+reach are those of chance. With another date of the same area, views of it show how far two dates
+are displaced, and the usual confidence is drawn to them. All views are located by the localizer
+that flies, at random sizes, headings and heights.
 """
 
 import math
@@ -38,16 +38,10 @@ FOCAL_PX = 1000.0
 SIDES = (0.55, 1.0)
 """Long side of a view, from and to, in tiles; the short side is three quarters of it."""
 ENOUGH_RIGHT = 10
-"""Fewest correct views that a confidence is fitted to: of fewer, the evidence hardly varies. With
-fewer the usual confidence is used, with the scores of chance measured on this map."""
-ENOUGH_VIEWS = 12
-"""Where fewer than `ENOUGH_RIGHT` views are right, views are added until so many are."""
-MORE_VIEWS = 3
-"""Additional views at most, as a multiple of the requested number."""
+"""Fewest correct views of another date that anything is learnt from."""
 FLOOR_PX = 0.6
 """Usual standard deviation per axis, in pixels, between orthophotos of two dates."""
 FLOOR_LIMITS_PX = (0.25, 3.0)
-MIRRORED_WEIGHT = 1.0
 MIN_NEGATIVES = 5
 """Mirrored views from which on the scores of chance are their medians."""
 WHOLE_PX, SEARCHED_PX = 6144, 4096
@@ -65,18 +59,11 @@ views."""
 class RegistrationCalibration:
     """Calibration of registration.
 
-    `floor_px`: lower bound of the reported standard deviation per axis, pixels. `right`: correct
-    views that the confidence was learnt from.
+    `floor_px`: lower bound of the reported standard deviation per axis, pixels.
     """
 
     confidence: RegisteredConfidence
     floor_px: float
-    right: int
-
-    @property
-    def is_usual(self) -> bool:
-        """Whether too few views were right for a confidence of the map's own."""
-        return self.right < ENOUGH_RIGHT
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +71,6 @@ class _Outcome:
     evidence: Mapping[str, float]
     error_px: NDArray[np.float64]
     mirrored: bool
-    other_date: bool
-
-    def is_right(self, radius_px: float) -> bool:
-        return not self.mirrored and float(np.hypot(*self.error_px)) <= radius_px
 
 
 def calibrate_registration(
@@ -98,59 +81,47 @@ def calibrate_registration(
     seed: int,
     progress: Progress,
 ) -> RegistrationCalibration:
-    """Locate changed, mirrored and other-date views and fit the confidence to the outcome."""
+    """Locate mirrored views and views of other dates, and learn from the outcome.
+
+    `crops` and `other_dates` are crops of the map and of other dates of its area; `views` is the
+    number of other-date views, and twice that of mirrored ones.
+    """
     rng = np.random.default_rng([seed, 3])
     order = rng.permutation(len(crops))
-    chosen = [crops[i] for i in order[:views]]
     later = [other_dates[i] for i in rng.permutation(len(other_dates))[:views]]
-    work = [(crop, False, False) for crop in chosen] + [(crop, False, True) for crop in later]
-    work += [(crop, True, False) for crop in (later or chosen)[: views // 2]]
-    radius_px = localizer.radius_m / localizer.grid.gsd_m
+    mirrored = (later or [crops[i] for i in order])[: views // 2]
+    work = [(crop, False) for crop in later] + [(crop, True) for crop in mirrored]
     outcomes: list[_Outcome] = []
-
-    def place(crop: Crop, mirror: bool, other_date: bool) -> None:
-        # The replacement is mirrored: unmirrored it would be found at its own position.
-        negative = crops[int(rng.integers(len(crops)))].grey[:, ::-1]
-        outcome = _placed(rng, localizer, crop, negative, mirror, other_date)
+    for done, (crop, mirror) in enumerate(work):
+        picture = crop.grey
+        if mirror:
+            picture = np.ascontiguousarray(picture[:, ::-1])
+        if not later:
+            # The replacement is mirrored: unmirrored it would be found at its own position.
+            replaced_by = crops[int(rng.integers(len(crops)))].grey[:, ::-1]
+            picture = changed(rng, picture, replaced_by)
+        outcome = _placed(rng, localizer, crop, picture, mirror)
         if outcome is not None:
             outcomes.append(outcome)
-
-    for done, each in enumerate(work):
-        place(*each)
         progress("calibrate registration", (done + 1) / len(work))
-    # Few views are correct on a large map: add some, rather than give up on a confidence.
-    wanted = ENOUGH_VIEWS if _right(outcomes, radius_px) < ENOUGH_RIGHT else 0
-    spare = order[views : (1 + MORE_VIEWS) * views] if views >= ENOUGH_RIGHT else order[:0]
-    for index in spare:
-        if _right(outcomes, radius_px) >= wanted:
-            break
-        place(crops[index], False, False)
-    return _fitted(outcomes, radius_px)
-
-
-def _right(outcomes: Sequence[_Outcome], radius_px: float) -> int:
-    return sum(each.is_right(radius_px) for each in outcomes)
+    return _fitted(outcomes, localizer.radius_m / localizer.grid.gsd_m)
 
 
 def _placed(
     rng: np.random.Generator,
     localizer: RegistrationLocalizer,
     crop: Crop,
-    negative: NDArray[np.uint8],
+    picture: NDArray[np.uint8],
     mirror: bool,
-    other_date: bool,
 ) -> _Outcome | None:
-    """Outcome of locating one view generated from a crop; None if there is no fix."""
-    picture = np.ascontiguousarray(crop.grey[:, ::-1]) if mirror else crop.grey
-    if not other_date:
-        picture = changed(rng, picture, negative)
+    """Outcome of locating one view of the picture of a crop; None if there is no fix."""
     view = _view(rng, picture, localizer.grid)
     seen = localizer.register(view, _prior(rng, localizer, crop))
     if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
         return None
     best = seen.found
     error = np.array([best.placed.pose.x_px - crop.col_px, best.placed.pose.y_px - crop.row_px])
-    return _Outcome(best.evidence(), error, mirror, other_date)
+    return _Outcome(best.evidence(), error, mirror)
 
 
 def _prior(rng: np.random.Generator, localizer: RegistrationLocalizer, crop: Crop) -> Prior | None:
@@ -196,26 +167,19 @@ def _view(rng: np.random.Generator, picture: NDArray[np.uint8], grid: TileGrid) 
 
 def _fitted(outcomes: Sequence[_Outcome], radius_px: float) -> RegistrationCalibration:
     """The confidence of errors below a radius, and the floor from views of other dates."""
-    if not outcomes:
-        return RegistrationCalibration(USUAL_CONFIDENCE, FLOOR_PX, 0)
-    mirrored = np.array([each.mirrored for each in outcomes])
-    errors = np.stack([each.error_px for each in outcomes])
-    right = (np.hypot(*errors.T) <= radius_px) & ~mirrored
-    later = right & np.array([each.other_date for each in outcomes])
-    floor_px = FLOOR_PX
-    if later.sum() >= ENOUGH_RIGHT:
-        # From the median: Rayleigh's is 1.1774 standard deviations.
-        spread = float(np.median(np.hypot(*errors[later].T))) / 1.1774
-        floor_px = min(max(spread, FLOOR_LIMITS_PX[0]), FLOOR_LIMITS_PX[1])
-    evidence = [each.evidence for each in outcomes]
-    negatives = [each for each, known in zip(evidence, mirrored, strict=True) if known]
+    negatives = [each.evidence for each in outcomes if each.mirrored]
     chances = _chances(negatives) if len(negatives) >= MIN_NEGATIVES else USUAL_CHANCES
-    confidence = replace(USUAL_CONFIDENCE, chances=chances)
-    # Without a mirrored view nothing would show what a wrong place looks like.
-    if right.sum() >= ENOUGH_RIGHT and negatives:
-        weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)
-        confidence = fit_registered(evidence, right, weight, chances)
-    return RegistrationCalibration(confidence, floor_px, int(right.sum()))
+    confidence, floor_px = replace(USUAL_CONFIDENCE, chances=chances), FLOOR_PX
+    errors_px = np.array([np.hypot(*each.error_px) for each in outcomes])
+    right = np.array([not each.mirrored for each in outcomes]) & (errors_px <= radius_px)
+    if right.sum() >= ENOUGH_RIGHT:
+        # From the median: Rayleigh's is 1.1774 standard deviations.
+        spread = float(np.median(errors_px[right])) / 1.1774
+        floor_px = min(max(spread, FLOOR_LIMITS_PX[0]), FLOOR_LIMITS_PX[1])
+        # Without a mirrored view nothing would show what a wrong place looks like.
+        if negatives:
+            confidence = fit_registered([each.evidence for each in outcomes], right, chances)
+    return RegistrationCalibration(confidence, floor_px)
 
 
 def _chances(negatives: Sequence[Mapping[str, float]]) -> Chances:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.register.evidence import GROUPS
+from orthonav.register.map_window import MapWindow
 from orthonav.register.memory import thread_memory
 from orthonav.register.pose import Pose, even_scale
 from orthonav.register.reference import Reference
@@ -48,8 +49,9 @@ class Placed:
     `score`: weighted sum of correlations times the square root of the pixels of the level that
     it rests on; `correlations` of the kinds of evidence, `weighted` their weighted mean;
     `overlap`: share of the view that lies on valid map; `converged` whether it stopped moving;
-    `agreement`: share of the blocks of the view that speak for it, and `covariance` (4, 4) of
-    position (level-0 pixels), turn (rad) and log scale, where they were asked for.
+    `agreement`: share of the blocks of the view that speak for it, `blocks_t`: their mean over its
+    standard deviation if they were independent, and `covariance` (4, 4) of position (level-0
+    pixels), turn (rad) and log scale, where they were asked for.
     """
 
     pose: Pose
@@ -60,6 +62,7 @@ class Placed:
     overlap: float
     converged: bool
     agreement: float = math.nan
+    blocks_t: float = math.nan
     covariance: NDArray[np.float64] | None = None
 
     @classmethod
@@ -89,7 +92,7 @@ class Refiner:
 
         It ends where a step moves no part of the view by more than `small_step_px`.
         """
-        window = _Window(self.template, self.reference, pose)
+        window = MapWindow.of(self.template, self.reference, pose, SLACK_PX)
         unit = np.array([2.0**self.template.level, 2.0**self.template.level, 1.0, 1.0])
         converged, step = False, np.zeros(4)
         seen = self._scratch.seen(window, pose)
@@ -113,7 +116,9 @@ class Refiner:
         if not converged:
             # Still moving: its last step is an error of its own.
             covariance += np.outer(move := self._to_map(seen) @ step, move)
-        return replace(best, covariance=covariance, agreement=seen.agreement())
+        return replace(
+            best, covariance=covariance, agreement=seen.agreement(), blocks_t=seen.blocks_t()
+        )
 
     def _hessian(self, seen: "_Seen") -> NDArray[np.float64]:
         """Gauss-Newton matrix (4, 4) over the part of the view that lies on the map."""
@@ -177,35 +182,6 @@ def _bounded_inverse(
     return np.asarray(inverse / np.outer(own, own))
 
 
-class _Window:
-    """The part of the map that a view may touch while its pose is refined."""
-
-    def __init__(self, template: Template, reference: Reference, pose: Pose) -> None:
-        self._template = template
-        self._unit = 2.0**template.level
-        height, width = template.mask.shape
-        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, height / 2]
-        at = pose.map_px(corners * self._unit) / self._unit
-        low, high = np.floor(at.min(axis=0)) - SLACK_PX, np.ceil(at.max(axis=0)) + SLACK_PX
-        self._col, self._row = int(low[0]), int(low[1])
-        size = (high - low).astype(int)
-        self._made = reference.window(
-            template.level, self._row, self._col, int(size[1]), int(size[0]), template.recipe
-        )
-
-    def sample(self, pose: Pose, into: Array) -> None:
-        """Evidence (H, W, 4) of the map as the view's window shows it under a pose."""
-        height, width = self._template.mask.shape
-        linear = pose.linear
-        middle = np.array([pose.x_px, pose.y_px]) / self._unit - [self._col, self._row]
-        move = middle - linear @ [width / 2, height / 2]
-        # Pixel-is-area to pixel centres: source and target are both half a pixel off.
-        move = move + linear @ [0.5, 0.5] - 0.5
-        matrix = np.column_stack([linear, move])
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        cv2.warpAffine(self._made, matrix, (width, height), dst=into, flags=flags)
-
-
 class _Scratch:
     """Memory for one pose of a view, used again for every other: fresh pages would cost more than
     the arithmetic. What `seen` returned before, from any refiner of the thread, is overwritten."""
@@ -217,7 +193,7 @@ class _Scratch:
         self.planes, self.turned = planes[4:8], planes[8:10]
         self.residual, self.product, self.counts = planes[10:13], planes[13:16], planes[8]
 
-    def seen(self, window: "_Window", pose: Pose) -> "_Seen":
+    def seen(self, window: MapWindow, pose: Pose) -> "_Seen":
         """The view beside the map under a pose."""
         window.sample(pose, self.interleaved)
         turn_planes(self.interleaved, -pose.turn_rad, self.planes, self.turned)
@@ -284,3 +260,11 @@ class _Seen:
         counts = self._template.block_sums(self.counts)
         used = counts > 0.25 * counts.max()
         return float((sums[used] > 0).mean()) if used.any() else 0.0
+
+    def blocks_t(self) -> float:
+        """Sum of the gradients' products over the blocks of a view, divided by the root of the sum
+        of their squares: large where many blocks agree, not a few strong ones."""
+        gradients = GROUPS[0]
+        products = (self._view[gradients] * self.map[gradients]).sum(axis=0)
+        sums = self._template.block_sums(products).astype(np.float64)
+        return float(sums.sum() / max(math.sqrt(float(sums @ sums)), 1e-12))

@@ -9,6 +9,7 @@ import math
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
 from orthonav.register.refine import Placed, Refiner
 from orthonav.register.search import Candidate, SearchWindow
+from orthonav.register.sharpness import local_ratio
 from orthonav.register.template import ViewTemplates
 
 LOOK_PX = 72.0
@@ -93,6 +95,17 @@ class Levels:
         return COARSE if level > self.look else FINE
 
 
+class OwnRatios(NamedTuple):
+    """What a place says of itself.
+
+    `detail`: score at the final level over that at the judged level, NaN where these are the same
+    level. `local`: correlation at the judged level over the best one nearby (`sharpness`).
+    """
+
+    detail: float
+    local: float
+
+
 @dataclass(frozen=True, eq=False)
 class Registered:
     """The best place of a view, with its rivals.
@@ -101,7 +114,8 @@ class Registered:
     it was judged and finished at, `rival` is the best such score at another place; `look_score` and
     `look_rival` compare all candidates at the level they were judged at; `fine_score` and
     `fine_rival` the finalists with one finer level added, NaN where that was not needed.
-    `finalists` are the places that were finished, with their scores, best first.
+    `finalists` are the places that were finished, with their scores, best first. `own`: what the
+    place says of itself, without rivals.
     """
 
     placed: Placed
@@ -111,6 +125,7 @@ class Registered:
     look_rival: float
     candidates: int
     finalists: tuple[tuple[float, Placed], ...]
+    own: OwnRatios
     fine_score: float = math.nan
     fine_rival: float = math.nan
 
@@ -139,6 +154,9 @@ class Registered:
             "look_ratio": min(MAX_RATIO, self.look_ratio),
             "gradient_correlation": gradient,
             "grey_correlation": grey,
+            "detail_ratio": self.own.detail,
+            "local_ratio": self.own.local,
+            "blocks_t": self.placed.blocks_t,
             "agreement": self.placed.agreement,
             "overlap": self.placed.overlap,
             "candidates": float(self.candidates),
@@ -273,10 +291,16 @@ class Registrar:
             look_rival=max((each.score - prior.cost(each.pose) for each in others), default=0.0),
             candidates=candidates,
             finalists=tuple(totals),
+            own=self._own_ratios(templates, levels, score + prior.cost(best.pose), best),
         )
 
     def deepened(
-        self, templates: ViewTemplates, finer: ViewTemplates, levels: Levels, found: Registered
+        self,
+        templates: ViewTemplates,
+        finer: ViewTemplates,
+        levels: Levels,
+        found: Registered,
+        prior: PosePrior,
     ) -> Registered:
         """`found` judged again with one level finer than the final one, of which `finer` is made.
 
@@ -305,12 +329,23 @@ class Registrar:
             rival=max((entry[1] for entry in rivals), default=0.0),
             look_score=found.look_rival,
             look_rival=found.look_score,
+            own=self._own_ratios(templates, levels, score + prior.cost(best.pose), best),
         )
 
     def with_covariance(self, templates: ViewTemplates, levels: Levels, best: Placed) -> Placed:
         """A placed view once more, at the final level, with its covariance."""
         final = self.refiner(templates, levels, levels.final)
         return final.place(best.pose, 3, with_covariance=True)
+
+    def _own_ratios(
+        self, templates: ViewTemplates, levels: Levels, total: float, best: Placed
+    ) -> OwnRatios:
+        """Of a finished place, `total` its scores at the final and the judged level added up."""
+        judged = templates.at(levels.look, levels.recipe(levels.look))
+        detail = math.nan
+        if levels.final != levels.look:
+            detail = max(best.score, 1e-3) / max(total - best.score, 1e-3)
+        return OwnRatios(detail, local_ratio(judged, self.reference, best.pose))
 
     def _at_final(
         self, templates: ViewTemplates, levels: Levels, judged: Placed

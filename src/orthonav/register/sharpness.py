@@ -1,0 +1,81 @@
+"""How much a place stands out from the ground around it: evidence against texture that repeats.
+
+A view of rows, lattices or a single road fits nearly as well a little aside. Places found by chance
+do so too: in every one of the confident and wrong views of the sets of `python -m benchmarks.trust`
+the best score nearby reached more than 0.9 of theirs.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
+
+from orthonav.register.evidence import CHANNELS, GROUPS
+from orthonav.register.map_window import MapWindow
+from orthonav.register.pose import Pose
+from orthonav.register.reference import Reference
+from orthonav.register.template import Template, turn_planes
+
+Array = NDArray[np.float32]
+REACH_SHARE = 0.25
+"""The window is moved by up to this share of its sides: rivals farther away are compared anyway."""
+PEAK_SHARE = 0.11
+"""Moves below this share of the view's side belong to the place itself."""
+MIN_PEAK_PX = 3.0
+"""The same, at least, pixels of the level."""
+NEAR_PX = 3.0
+"""The place itself is the best within so many pixels."""
+ENERGY_FLOOR = 0.05
+"""Least energy of the map under the view, as a share of the most: blank ground is not amplified."""
+MAX_RATIO = 10.0
+
+
+def local_ratio(template: Template, reference: Reference, pose: Pose) -> float:
+    """Correlation of a view at `pose` over the best one of the window moved a little, up to 10.
+
+    Heading and scale stay those of `pose`. 0 where the view does not correlate at all.
+    """
+    scores = _moved_scores(template, reference, pose)
+    rows, cols = (np.arange(side, dtype=np.float64) - side // 2 for side in scores.shape)
+    moved_px = np.hypot(rows[:, None], cols)
+    peak_px = max(MIN_PEAK_PX, PEAK_SHARE * math.sqrt(template.pixels))
+    here = float(scores[moved_px <= NEAR_PX].max())
+    aside = float(scores[moved_px > peak_px].max(initial=0.0))
+    if here <= 0:
+        return 0.0
+    return min(here / max(aside, 1e-6), MAX_RATIO)
+
+
+def _moved_scores(template: Template, reference: Reference, pose: Pose) -> Array:
+    """Correlations (2 R + 1, 2 C + 1) of a view's window moved by up to R rows and C columns."""
+    height, width = template.mask.shape
+    rows, cols = int(height * REACH_SHARE), int(width * REACH_SHARE)
+    window = MapWindow.of(template, reference, pose, 0, (rows, cols))
+    sampled = np.empty((*window.shape, CHANNELS), np.float32)
+    window.sample(pose, sampled)
+    planes, scratch = np.empty((2, CHANNELS, *window.shape), np.float32)
+    turn_planes(sampled, -pose.turn_rad, planes, scratch[:2])
+    planes[:3] *= planes[3] > 0.99
+    # Moves of less than the margin never reach over the border: no padding.
+    size = tuple(next_fast_len(side, real=True) for side in window.shape)
+
+    def spectra(made: Array) -> NDArray[np.complex64]:
+        return np.asarray(rfft2(made, s=size), np.complex64)
+
+    def moved(view: NDArray[np.complex64], ground: NDArray[np.complex64]) -> Array:
+        products = (np.conj(view) * ground).reshape(-1, *ground.shape[-2:]).sum(axis=0)
+        return np.asarray(irfft2(products, s=size)[: 2 * rows + 1, : 2 * cols + 1], np.float32)
+
+    views, grounds, mask = spectra(template.channels), spectra(planes[:3]), spectra(template.mask)
+    total = np.zeros((2 * rows + 1, 2 * cols + 1), np.float32)
+    for group, weight in zip(GROUPS, template.weights, strict=True):
+        power = np.square(planes[group]).sum(axis=0)
+        energy = moved(mask, spectra(power))
+        most = float(energy.max())
+        if most <= 0:
+            continue
+        # The energy of the view in this kind of evidence is its weight (`Template.of`).
+        norm = np.sqrt(np.maximum(energy, ENERGY_FLOOR * most) * np.float32(weight))
+        total += np.float32(weight) * moved(views[group], grounds[group]) / norm
+    return total
