@@ -9,14 +9,12 @@ the mean in the range of evidence that decides.
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from orthonav.confidence.logistic import LogisticConfidence
 from orthonav.confidence.registered import (
     CHANCES,
-    USUAL_CONFIDENCE,
     Chances,
     RegisteredConfidence,
 )
@@ -56,7 +54,7 @@ def pooled_registered(confidences: Sequence[RegisteredConfidence]) -> Registered
     chances = Chances(
         **{name: max(getattr(each.chances, name) for each in confidences) for name in CHANCES}
     )
-    return replace(USUAL_CONFIDENCE, chances=chances)
+    return RegisteredConfidence.usual(chances)
 
 
 def _mean(

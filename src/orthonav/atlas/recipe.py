@@ -67,7 +67,7 @@ class AtlasRecipe:
     edges: str | None = None
     seed: int = 0
     registration: bool = True
-    calibration_views: int = 48
+    calibration_views: int = 24
     sheet_km: float = 10.0
     coarse: CoarseRecipe | None = CoarseRecipe()
 

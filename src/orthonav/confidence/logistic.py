@@ -74,20 +74,17 @@ def fit_weights(
     right: NDArray[np.bool_],
     sample_weight: NDArray[np.float64],
     ridge: float = RIDGE,
-    usual: tuple[float, tuple[float, ...]] | None = None,
 ) -> tuple[float, tuple[float, ...]]:
     """Bias and weights of a logistic regression: weighted maximum likelihood with a slight ridge.
 
     Weights are bounded at zero. `features` (N, F), `right` (N,) whether the fix was right,
-    `sample_weight` (N,). Features are standardized inside, the result applies to raw ones. Weights
-    and bias are drawn towards `usual` ones (of raw features); where None weights towards zero.
+    `sample_weight` (N,). Features are standardized inside, the result applies to raw ones.
     """
     from scipy.optimize import minimize  # not needed to fly
 
     mean, std = features.mean(axis=0), features.std(axis=0) + 1e-9
     scaled = (features - mean) / std
     sign = np.where(right, 1.0, -1.0)
-    towards = np.zeros(len(std)) if usual is None else np.array(usual[1]) * std
     total = sample_weight.sum()
 
     def loss(parameters: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
@@ -95,14 +92,8 @@ def fit_weights(
         value = sample_weight @ np.logaddexp(0, -sign * logit) / total
         slope = -sign * sample_weight / (1 + np.exp(np.clip(sign * logit, -60, 60))) / total
         gradient = np.concatenate([[slope.sum()], scaled.T @ slope])
-        off = parameters[1:] - towards
-        gradient[1:] += 2 * ridge * off
-        value += ridge * (off**2).sum()
-        if usual is not None:
-            # The bias of raw features: found between right and wrong ones it may lie anywhere.
-            beyond = parameters[0] - parameters[1:] @ (mean / std) - usual[0]
-            gradient += 2 * ridge * beyond * np.concatenate([[1.0], -mean / std])
-            value += ridge * beyond**2
+        gradient[1:] += 2 * ridge * parameters[1:]
+        value += ridge * (parameters[1:] ** 2).sum()
         return float(value), gradient
 
     bounds = [(None, None)] + [(0.0, None)] * features.shape[1]

@@ -6,13 +6,13 @@ those of the map.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.confidence.logistic import fit_weights, probability
+from orthonav.confidence.logistic import probability
 from orthonav.errors import VariantError
 
 FEATURES = (
@@ -30,8 +30,9 @@ USUAL_BIAS, USUAL_WEIGHTS = -10.75, (2.83, 2.99, 3.73, 5.24, 1.11, 3.89)
 """What separates right from wrong: `python -m benchmarks.trust --fit` prints these numbers, and how
 they judge scenes that they were not fitted to."""
 RIDGE = 3e-2
-"""Weight of the usual values where views of another date of the map's area are fitted too, see
-docs/decisions/confidence.md."""
+"""Weight of the usual bias where views of another date of the map's area are fitted."""
+MAX_SHIFT = 5.0
+"""Largest change of the bias by them."""
 STAND_IN = 0.7
 """Share of the chance value that stands in for a rival where a narrow search found none."""
 LEAST_LOCAL = 0.5
@@ -94,6 +95,11 @@ class RegisteredConfidence:
         total = self.bias + float(np.dot(self.weights, features_of(evidence, self.chances)))
         return probability(total)
 
+    @classmethod
+    def usual(cls, chances: Chances) -> "RegisteredConfidence":
+        """With the usual weights, and a map's own scores of chance."""
+        return cls(USUAL_BIAS, USUAL_WEIGHTS, chances)
+
     def to_plain(self) -> dict[str, Any]:
         """Plain values for a manifest."""
         return {
@@ -146,12 +152,19 @@ def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.f
 def fit_registered(
     evidence: Sequence[Mapping[str, float]], right: NDArray[np.bool_], chances: Chances
 ) -> RegisteredConfidence:
-    """The confidence that fits views (N) of which it is known whether they came out right."""
+    """The usual confidence with the bias that fits views (N) that came out right or not (N,)."""
+    from scipy.optimize import minimize_scalar  # not needed to fly
+
+    usual = RegisteredConfidence.usual(chances)
     features = np.stack([features_of(each, chances) for each in evidence])
-    equal = np.ones(len(right))
-    bias, weights = fit_weights(features, right, equal, RIDGE, (USUAL_BIAS, USUAL_WEIGHTS))
-    return RegisteredConfidence(bias, weights, chances)
+    logits, sign = usual.bias + features @ np.array(usual.weights), np.where(right, 1.0, -1.0)
+
+    def loss(shift: float) -> float:
+        return float(np.logaddexp(0, -sign * (logits + shift)).mean() + RIDGE * shift**2)
+
+    shift = float(minimize_scalar(loss, bounds=(-MAX_SHIFT, MAX_SHIFT)).x)
+    return replace(usual, bias=usual.bias + shift)
 
 
-USUAL_CONFIDENCE = RegisteredConfidence(USUAL_BIAS, USUAL_WEIGHTS, USUAL_CHANCES)
+USUAL_CONFIDENCE = RegisteredConfidence.usual(USUAL_CHANCES)
 """For a map without views to learn from."""

@@ -8,7 +8,7 @@ that flies, at random sizes, headings and heights.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from orthonav.confidence.registered import (
     USUAL_CHANCES,
-    USUAL_CONFIDENCE,
     Chances,
     RegisteredConfidence,
     fit_registered,
@@ -83,13 +82,13 @@ def calibrate_registration(
 ) -> RegistrationCalibration:
     """Locate mirrored views and views of other dates, and learn from the outcome.
 
-    `crops` and `other_dates` are crops of the map and of other dates of its area; `views` is the
-    number of other-date views, and twice that of mirrored ones.
+    `crops` and `other_dates` are crops of the map and of other dates of its area. At most `views`
+    mirrored views are located, and as many of other dates.
     """
     rng = np.random.default_rng([seed, 3])
     order = rng.permutation(len(crops))
     later = [other_dates[i] for i in rng.permutation(len(other_dates))[:views]]
-    mirrored = (later or [crops[i] for i in order])[: views // 2]
+    mirrored = (later or [crops[i] for i in order])[:views]
     work = [(crop, False) for crop in later] + [(crop, True) for crop in mirrored]
     outcomes: list[_Outcome] = []
     for done, (crop, mirror) in enumerate(work):
@@ -169,9 +168,10 @@ def _fitted(outcomes: Sequence[_Outcome], radius_px: float) -> RegistrationCalib
     """The confidence of errors below a radius, and the floor from views of other dates."""
     negatives = [each.evidence for each in outcomes if each.mirrored]
     chances = _chances(negatives) if len(negatives) >= MIN_NEGATIVES else USUAL_CHANCES
-    confidence, floor_px = replace(USUAL_CONFIDENCE, chances=chances), FLOOR_PX
+    confidence, floor_px = RegisteredConfidence.usual(chances), FLOOR_PX
     errors_px = np.array([np.hypot(*each.error_px) for each in outcomes])
-    right = np.array([not each.mirrored for each in outcomes]) & (errors_px <= radius_px)
+    mirrored = np.array([each.mirrored for each in outcomes], np.bool_)
+    right = ~mirrored & (errors_px <= radius_px)
     if right.sum() >= ENOUGH_RIGHT:
         # From the median: Rayleigh's is 1.1774 standard deviations.
         spread = float(np.median(errors_px[right])) / 1.1774

@@ -49,8 +49,8 @@ class BuildRequest:
     - `registration`: whether the map carries the grey layer that locates views below tile size.
     - `other_dates`: orthophotos of the same area at other dates, from which the confidence is
       calibrated, and a triplet network learns. They do not become part of the map.
-    - `calibration_views`: views generated from the reference to calibrate the confidence of
-      registration, 1 to 384.
+    - `calibration_views`: mirrored views of the reference that measure the scores of chance of
+      registration, 1 to 384; as many views of other dates are located.
     - `work`: folder for finished blocks and checkpoints of networks, from which an interrupted
       build resumes; None: blocks of a large map in `OUT.work` until it is written.
     - `workers`: threads that read the imagery, 1 to 64; None: one per core.
@@ -71,7 +71,7 @@ class BuildRequest:
     seed: int = 0
     registration: bool = True
     other_dates: Sequence[Path] = ()
-    calibration_views: int = 48
+    calibration_views: int = 24
     work: Path | None = None
     workers: int | None = None
     cells: bool = False

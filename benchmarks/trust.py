@@ -1,0 +1,220 @@
+"""How far confidence can be trusted on ground that it was not learnt on: whole scenes left out.
+
+`python -m benchmarks.trust --work DIR [--views 40] [--seed 1] [--workers 2] [--fit]` places views
+of all scenes of two dates beside the checkout (`../shared/data`, or the folder that ORTHONAV_DATA
+names) and of generated ones, and views that are on no map. It prints what the shipped confidence
+says of them, and what one says that was fitted to the other scenes only. `--fit` prints the weights
+fitted to all scenes, those of `orthonav.confidence.registered`. DIR keeps maps, flights and the
+evidence of every view: a second run takes seconds. About an hour on two cores.
+"""
+
+import argparse
+import os
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.record import Table, provenance
+from benchmarks.trust_views import pairs, views_of
+from benchmarks.verdicts import percent
+from orthonav.confidence.logistic import fit_weights
+from orthonav.confidence.registered import FEATURES, Chances, RegisteredConfidence, features_of
+from orthonav.evaluate.calibration import calibrate
+from orthonav.files import write_text
+from orthonav.records import CONFIDENT
+
+RIDGE = 3e-4
+"""Weight of the ridge of the fit: of 1e-4, 3e-4 and 1e-3 the one with the best likelihood on scenes
+left out."""
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Rows of views (N), their features (N, F) and whether they are right (N,)."""
+
+    rows: list[dict[str, Any]]
+    features: Array
+    right: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, rows: list[dict[str, Any]]) -> "Judged":
+        """From the rows of `views_of`."""
+        made = [features_of(each["evidence"], Chances(**each["chances"])) for each in rows]
+        return cls(rows, np.stack(made), np.array([each["right"] for each in rows]))
+
+    def where(self, **wanted: Any) -> NDArray[np.bool_]:
+        """Mask (N,) of the rows that have these values."""
+        return np.array(
+            [all(each[name] == value for name, value in wanted.items()) for each in self.rows]
+        )
+
+    def shipped(self) -> Array:
+        """Confidence (N,) as the program states it."""
+        return np.array(
+            [
+                RegisteredConfidence.usual(Chances(**each["chances"]))(each["evidence"])
+                for each in self.rows
+            ]
+        )
+
+    def fitted(self, train: NDArray[np.bool_], features: tuple[int, ...]) -> Array:
+        """Confidence (N,) of all rows by the chosen features, fitted to the rows `train`."""
+        chosen = self.features[:, features]
+        equal = np.ones(int(train.sum()))
+        bias, weights = fit_weights(chosen[train], self.right[train], equal, RIDGE)
+        return np.asarray(1 / (1 + np.exp(-(bias + chosen @ np.array(weights)))))
+
+    def left_out(self, features: tuple[int, ...]) -> Array:
+        """Confidence (N,) of each row by a fit to all other scenes."""
+        scenes = np.array([each["scene"] for each in self.rows])
+        found = np.zeros(len(self.rows))
+        for scene in np.unique(scenes):
+            inside = scenes == scene
+            found[inside] = self.fitted(~inside, features)[inside]
+        return found
+
+
+def main() -> None:
+    """Place, fit, print; write Markdown where a file is named."""
+    options = _parser().parse_args()
+    options.work.mkdir(parents=True, exist_ok=True)
+    about = provenance("trust")
+    every = pairs()
+    chosen = [each for each in every if each.is_there]
+    for each in set(every) - set(chosen):
+        print(f"not there, left out: {each.map}")
+    rows: list[dict[str, Any]] = []
+    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
+        jobs = [
+            pool.submit(views_of, each, chosen, options.views, options.seed, options.work)
+            for each in chosen
+        ]
+        for pair, job in zip(chosen, jobs, strict=True):
+            rows += job.result()
+            print(f"{pair.scene}: {pair.map} seen by {pair.views}", flush=True)
+    judged = Judged.of(rows)
+    tables = [_scenes_table(judged), _features_table(judged), _cases_table(judged)]
+    head = (
+        f"commit {about['commit'][:10]}, sources {about['sources']}, {about['cpu']}; "
+        f"{len(rows)} views, seed {options.seed}"
+    )
+    text = "\n".join([head, "", *(table.markdown() for table in tables)])
+    print("\n" + text)
+    if options.fit:
+        everything = np.ones(len(rows), np.bool_)
+        bias, weights = fit_weights(
+            judged.features, judged.right, everything.astype(np.float64), RIDGE
+        )
+        print(f"USUAL_BIAS, USUAL_WEIGHTS = {bias:.2f}, {tuple(round(w, 2) for w in weights)}")
+    if options.out:
+        write_text(options.out, text + "\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.trust", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument("--work", type=Path, required=True, help="folder for maps and flights")
+    parser.add_argument("--views", type=int, default=40, help="views per kind (default 40)")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=os.cpu_count(), help="pairs at a time")
+    parser.add_argument("--fit", action="store_true", help="print weights fitted to all scenes")
+    parser.add_argument("--out", type=Path, help="Markdown file to write too")
+    return parser
+
+
+ALL = tuple(range(len(FEATURES)))
+
+
+def _verdict(judged: Judged, confidence: Array, inside: NDArray[np.bool_]) -> list[str]:
+    """Accepted of right, wrong of accepted, and calibration error of some rows."""
+    right, accepted = judged.right & inside, (confidence >= CONFIDENT) & inside
+    errors = np.where(judged.right, 0.0, 2.0)[inside]
+    ece = calibrate(confidence[inside], errors, np.ones(len(errors)), 1.0).ece
+    share = float(accepted[right].mean()) if right.any() else float("nan")
+    return [
+        percent(share, 1),
+        f"{int((accepted & ~judged.right).sum())} of {int(accepted.sum())}",
+        f"{ece:.3f}",
+    ]
+
+
+def _scenes_table(judged: Judged) -> Table:
+    left_out, shipped = judged.left_out(ALL), judged.shipped()
+    rows = []
+    names = sorted({each["scene"] for each in judged.rows})
+    masks = [(name, judged.where(scene=name)) for name in names]
+    for name, inside in [*masks, ("**all**", np.ones(len(judged.rows), np.bool_))]:
+        found = inside & judged.where(kind="found")
+        rows.append(
+            [
+                name,
+                f"{int(found.sum())} + {int((inside & ~found).sum())}",
+                percent(float(judged.right[found].mean()), 1),
+                *_verdict(judged, left_out, inside),
+                *_verdict(judged, shipped, inside),
+            ]
+        )
+    header = (
+        *("scene", "views on + off the map", "right", "accepted of right", "wrong of accepted"),
+        *("calibration error", "shipped: accepted", "wrong", "calibration error"),
+    )
+    notes = (
+        f"accepted: confidence of {CONFIDENT:g} or more; right: within 35 m or 10 px; heading sd "
+        "10 deg, height sd 10 %",
+        "by a fit to the other scenes; shipped: by the weights of the program, which are fitted to "
+        "all of these scenes",
+    )
+    return Table("Confidence on scenes left out", header, rows, notes)
+
+
+def _features_table(judged: Judged) -> Table:
+    """What each kind of evidence brings: all but one, on scenes left out."""
+    rows = []
+    for name, used in (
+        ("all", ALL),
+        *((f"without {FEATURES[i]}", tuple(k for k in ALL if k != i)) for i in ALL),
+        ("the first three", ALL[:3]),
+    ):
+        confidence = judged.left_out(used)
+        clipped = np.clip(confidence, 1e-9, 1 - 1e-9)
+        loss = -np.mean(np.log(np.where(judged.right, clipped, 1 - clipped)))
+        everything = np.ones(len(judged.rows), np.bool_)
+        rows.append([name, *_verdict(judged, confidence, everything), f"{loss:.4f}"])
+    header = ("evidence", "accepted of right", "wrong of accepted", "calibration error", "log loss")
+    return Table("What each kind of evidence brings", header, rows)
+
+
+def _cases_table(judged: Judged) -> Table:
+    confidence = judged.left_out(ALL)
+    keys = ("kind", "width_px", "heading_known", "prior_px")
+    cases = dict.fromkeys(tuple(each[key] for key in keys) for each in judged.rows)
+    rows = []
+    for case in cases:
+        inside = judged.where(**dict(zip(keys, case, strict=True)))
+        kind, width_px, known, prior_px = case
+        words = [kind, f"{width_px} px"]
+        words += [] if known else ["heading unknown"]
+        words += [] if prior_px is None else [f"prior {prior_px:g} px"]
+        rows.append(
+            [
+                ", ".join(words),
+                str(int(inside.sum())),
+                percent(float(judged.right[inside].mean()), 1),
+                *_verdict(judged, confidence, inside),
+            ]
+        )
+    header = ("views", "n", "right", "accepted of right", "wrong of accepted", "calibration error")
+    return Table("By kind of view, scenes left out", header, rows)
+
+
+if __name__ == "__main__":
+    main()

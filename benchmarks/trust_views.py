@@ -1,0 +1,277 @@
+"""Views of known places for `benchmarks.trust`, and the evidence that the localizer finds for them.
+
+Each pair of dates is a map and an orthophoto that views are simulated over. Views of the pair are
+to be found; mirrored views, views of other scenes and views of ground beside the map are not.
+"""
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rasterio
+from rasterio.warp import transform_bounds
+
+from benchmarks.real_imagery import DATA
+from orthonav.files import write_text
+from orthonav.flight import open_flight, read_truth
+from orthonav.flight.folder import read_image
+from orthonav.localizer import Localizer
+from orthonav.localizer.registration import RegistrationLocalizer
+from orthonav.mapfile import open_map
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.records import NoFix, Telemetry, View
+from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
+from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
+
+YAW_STD_DEG, AGL_STD = 10.0, 0.1
+FAR_PX, FAR_M = 10.0, 35.0
+"""A view is right within the larger of these."""
+BESIDE_SHARE = 0.9
+"""Views beside the map are farther from its border than this share of their width."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A map and an orthophoto of another date; `scene` is left out as a whole."""
+
+    scene: str
+    map: str
+    views: str
+
+    @property
+    def is_there(self) -> bool:
+        """Whether both exist, or can be generated."""
+        names = (self.map, self.views)
+        return all(name.startswith("generated:") or (DATA / name).exists() for name in names)
+
+
+@dataclass(frozen=True)
+class Case:
+    """Views of one kind.
+
+    - `kind`: `found`, or those that are not on the map: `mirrored`, `elsewhere`, `beside`.
+    - `width_px`: shorter side of the view on the ground, pixels of the map.
+    - `share`: number of views, as a share of the requested one.
+    - `heading_known`: whether the reported heading is used; `prior_px`: standard deviation of a
+      prior position, pixels of the map, None without.
+    """
+
+    kind: str
+    width_px: int
+    share: float
+    heading_known: bool = True
+    prior_px: float | None = None
+
+
+CASES = (
+    Case("found", 256, 1.0),
+    Case("found", 128, 1.0),
+    Case("found", 180, 0.5),
+    Case("found", 360, 0.2),
+    Case("found", 256, 0.4, heading_known=False),
+    Case("found", 128, 0.3, heading_known=False),
+    Case("found", 128, 0.4, prior_px=40.0),
+    Case("found", 90, 0.3, prior_px=40.0),
+    Case("found", 64, 0.3, prior_px=40.0),
+    Case("mirrored", 256, 0.4),
+    Case("mirrored", 128, 0.4),
+    Case("elsewhere", 256, 0.4),
+    Case("elsewhere", 128, 0.4),
+    Case("beside", 256, 1.0),
+    Case("beside", 128, 1.0),
+)
+
+
+def pairs() -> list[Pair]:
+    """All pairs of dates."""
+    szada = [("szada", f"airchange/szada_{n}_a.tif", f"airchange/szada_{n}_b.tif") for n in "157"]
+    szada.append(("szada", "airchange/szada_mosaic_a.tif", "airchange/szada_mosaic_b.tif"))
+    dates = {
+        "garching": (("2001_09", "2015_04"), ("2020_03", "2009_04")),
+        "schiphol": (("2004_05", "2018_04"), ("2021_06", "2008_05")),
+        "solar_farm": (("2009_12", "2017_12"), ("2012_12", "2015_12")),
+        "atlanta": (("2012_11", "2021_08"), ("2024_02", "2016_12")),
+        "aral": (("1985_12", "2012_12"), ("2000_12", "2015_12")),
+        "tours": (("1964", "1976"),),
+    }
+    past, present, other = (date.name for date in DEFAULT_DATES)
+    found = [
+        ("naip", "naip_nd/20090818.tif", "naip_nd/20120731.tif"),
+        ("naip", "naip_nd/20090818.tif", "naip_nd/20180716.tif"),
+        *szada,
+        *(
+            (scene, f"scenes/{scene}/{a}.tif", f"scenes/{scene}/{b}.tif")
+            for scene, both in dates.items()
+            for a, b in both
+        ),
+        ("generated", f"generated:31:{past}", f"generated:31:{present}"),
+        ("generated", f"generated:32:{other}", f"generated:32:{past}"),
+    ]
+    return [Pair(*each) for each in found]
+
+
+def views_of(
+    pair: Pair, others: Sequence[Pair], views: int, seed: int, work: Path
+) -> list[dict[str, Any]]:
+    """Rows of all views of a pair; stored in `work`, where maps and flights are kept as well."""
+    stored = work / f"{_plain(pair.map)}-{_plain(pair.views)}-{views}-{seed}.json"
+    if not stored.is_file():
+        cv2.setNumThreads(1)
+        rows = list(_rows(pair, others, views, seed, work))
+        write_text(stored, json.dumps(rows))
+    found: list[dict[str, Any]] = json.loads(stored.read_text(encoding="utf-8"))
+    return found
+
+
+def _rows(
+    pair: Pair, others: Sequence[Pair], views: int, seed: int, work: Path
+) -> Iterator[dict[str, Any]]:
+    ortho, flown = _file(pair.map, work), _file(pair.views, work)
+    whole = _localizer(ortho, work)
+    west, south, east, north = _bounds_deg(ortho)
+    middle = (west + east) / 2
+    half = _localizer(ortho, work, (west, south, middle, north))
+    elsewhere = [each for each in others if each.scene != pair.scene]
+    for number, case in enumerate(CASES):
+        count = max(1, round(case.share * views))
+        over, gsd_m = flown, None
+        if case.kind == "elsewhere":
+            over = _file(elsewhere[(seed + number) % len(elsewhere)].views, work)
+            gsd_m = _gsd_m(over)
+        folder = _flight(over, case, count, seed + number, work)
+        localizer = half if case.kind == "beside" else whole
+        for name, view, truth in _flown(folder):
+            if case.kind == "beside":
+                span_deg = case.width_px * _gsd_m(over) / 111_320
+                if truth[1] < middle + BESIDE_SHARE * span_deg / math.cos(math.radians(truth[0])):
+                    continue
+            if case.kind == "mirrored":
+                view = replace(view, grey=np.ascontiguousarray(view.grey[:, ::-1]))
+            if gsd_m is not None:
+                scale = localizer.grid.gsd_m / gsd_m
+                view = replace(view, telemetry=_scaled(view.telemetry, scale))
+            row = _placed(localizer, case, view, truth)
+            if row is not None:
+                about = {**asdict(pair), **asdict(case), "frame": f"{folder.name}/{name}"}
+                if case.kind == "found" and not _is_covered(localizer, truth, case.width_px):
+                    about["kind"] = "beside"
+                yield {**about, **row}
+
+
+def _placed(
+    localizer: RegistrationLocalizer, case: Case, view: View, truth: tuple[float, float]
+) -> dict[str, Any] | None:
+    """Evidence, error and verdict of a view; None where it was refused."""
+    prior = None if case.prior_px is None else view.telemetry.prior
+    seen = localizer.register(view, prior, case.heading_known)
+    if isinstance(seen, NoFix) or isinstance(seen.found, NoFix):
+        return None
+    found, gsd_m = seen.found, localizer.grid.gsd_m
+    assert localizer.confidence is not None
+    place = localizer.camera_en_m(seen.prepared, found.placed.pose)
+    error_m = float(np.hypot(*(place - localizer.sheet.frame.en_from_latlon(*truth))))
+    right = case.kind == "found" and error_m <= max(FAR_M, FAR_PX * gsd_m)
+    return {
+        "evidence": found.evidence(),
+        "chances": asdict(localizer.confidence.chances),
+        "error_px": error_m / gsd_m,
+        "right": right,
+        "confidence": localizer.confidence(found.evidence()),
+    }
+
+
+def _is_covered(
+    localizer: RegistrationLocalizer, truth: tuple[float, float], width_px: float
+) -> bool:
+    """Whether the map has imagery at the middle of a view and half way to its corners."""
+    grid = localizer.grid
+    east, north = localizer.sheet.frame.en_from_latlon(*truth)
+    col, row = (float(east) - grid.west_m) / grid.gsd_m, (grid.north_m - float(north)) / grid.gsd_m
+    steps = np.array([-0.25, 0.0, 0.25]) * width_px
+    inside = [
+        localizer.pyramid.read(0, int(row + dy), int(col + dx), 1, 1)[1].all()
+        for dy in steps
+        for dx in steps
+    ]
+    return all(inside)
+
+
+def _flown(folder: Path) -> Iterator[tuple[str, View, tuple[float, float]]]:
+    """Name, view and true latitude and longitude of the views of a flight."""
+    flight, truth = open_flight(folder), read_truth(folder / "truth.csv")
+    for each in flight.views:
+        yield (
+            each.frame,
+            View(read_image(each.path), flight.camera, each.telemetry),
+            truth[each.frame],
+        )
+
+
+def _scaled(telemetry: Telemetry, scale: float) -> Telemetry:
+    """Telemetry at a height so much greater, for imagery of another ground resolution."""
+    std_m = telemetry.agl_std_m
+    return replace(
+        telemetry,
+        agl_m=telemetry.agl_m * scale,
+        agl_std_m=None if std_m is None else std_m * scale,
+        prior=None,
+    )
+
+
+def _plain(name: str) -> str:
+    return name.replace("/", "-").replace(":", "-")
+
+
+def _file(name: str, work: Path) -> Path:
+    """A file of real imagery, or of a generated area (cached)."""
+    if not name.startswith("generated:"):
+        return DATA / name
+    _, seed, date = name.split(":")
+    area = work / f"area{seed}"
+    if not area.is_dir():
+        generate_area(area, dates=DEFAULT_DATES, seed=int(seed))
+    return area / f"{date}.tif"
+
+
+def _localizer(
+    ortho: Path, work: Path, bounds_deg: tuple[float, float, float, float] | None = None
+) -> RegistrationLocalizer:
+    part = "" if bounds_deg is None else "-part"
+    path = work / f"{ortho.parent.name}-{ortho.stem}{part}.onav"
+    if not path.is_file():
+        build_map(BuildRequest([ortho], path, bounds_deg=bounds_deg))
+    found = Localizer(open_map(path)).registration
+    assert found is not None
+    return found
+
+
+def _flight(ortho: Path, case: Case, count: int, seed: int, work: Path) -> Path:
+    """A simulated flight at random places, kept in `work`."""
+    name = f"{ortho.parent.name}-{ortho.stem}-{case.width_px}-{count}-{case.prior_px}-{seed}"
+    folder = work / name
+    if not folder.is_dir():
+        gsd_m = _gsd_m(ortho)
+        prior_m = None if case.prior_px is None else case.prior_px * gsd_m
+        errors = Errors(yaw_std_deg=YAW_STD_DEG, agl_std=AGL_STD, prior_std_m=prior_m)
+        agl_m = case.width_px * gsd_m / min(DEFAULT_CAMERA.extent)
+        request = SimulateRequest(
+            [ortho], folder, random=count, agl_m=agl_m, errors=errors, seed=seed
+        )
+        simulate_flight(request)
+    return folder
+
+
+def _gsd_m(ortho: Path) -> float:
+    with rasterio.open(ortho) as source:
+        return float(abs(source.transform.a))
+
+
+def _bounds_deg(ortho: Path) -> tuple[float, float, float, float]:
+    with rasterio.open(ortho) as source:
+        west, south, east, north = transform_bounds(source.crs, "EPSG:4326", *source.bounds)
+    return west, south, east, north
