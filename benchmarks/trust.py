@@ -20,19 +20,24 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
 from benchmarks.record import Table, provenance
-from benchmarks.trust_views import pairs, views_of
+from benchmarks.trust_views import file_of, pairs, views_of
 from benchmarks.verdicts import percent
-from orthonav.confidence.logistic import fit_weights
-from orthonav.confidence.registered import FEATURES, Chances, RegisteredConfidence, features_of
+from orthonav.confidence.registered import (
+    FEATURES,
+    USUAL_CHANCES,
+    Chances,
+    RegisteredConfidence,
+    features_of,
+)
 from orthonav.evaluate.calibration import calibrate
 from orthonav.files import write_text
 from orthonav.records import CONFIDENT
 
-RIDGE = 3e-4
-"""Weight of the ridge of the fit: of 1e-4, 3e-4 and 1e-3 the one with the best likelihood on scenes
-left out."""
+RIDGE = 1e-5
+"""Weight of the ridge of the fit: only against weights without bound."""
 Array = NDArray[np.float64]
 
 
@@ -65,21 +70,51 @@ class Judged:
             ]
         )
 
-    def fitted(self, train: NDArray[np.bool_], features: tuple[int, ...]) -> Array:
-        """Confidence (N,) of all rows by the chosen features, fitted to the rows `train`."""
-        chosen = self.features[:, features]
-        equal = np.ones(int(train.sum()))
-        bias, weights = fit_weights(chosen[train], self.right[train], equal, RIDGE)
-        return np.asarray(1 / (1 + np.exp(-(bias + chosen @ np.array(weights)))))
+    def fitted(self, train: NDArray[np.bool_], without: int | None = None) -> RegisteredConfidence:
+        """Fitted to the rows `train`, with one of the features left out or none."""
+        chosen = self.features[train].copy()
+        if without is not None:
+            chosen[:, without] = 0.0
+        return fit_judge(chosen, self.right[train])
 
-    def left_out(self, features: tuple[int, ...]) -> Array:
+    def left_out(self, without: int | None = None) -> Array:
         """Confidence (N,) of each row by a fit to all other scenes."""
         scenes = np.array([each["scene"] for each in self.rows])
         found = np.zeros(len(self.rows))
         for scene in np.unique(scenes):
             inside = scenes == scene
-            found[inside] = self.fitted(~inside, features)[inside]
+            judge = self.fitted(~inside, without)
+            found[inside] = [judge.of(each) for each in self.features[inside]]
         return found
+
+
+def fit_judge(features: Array, right: NDArray[np.bool_]) -> RegisteredConfidence:
+    """Biases and weights, none negative, under which the outcome of views (N, F) is likeliest."""
+    mean, std = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-6)
+    scaled, count = (features - mean) / std, len(FEATURES)
+
+    def loss(parameters: Array) -> tuple[float, Array]:
+        weights = parameters[2:]
+        fits = 1 / (1 + np.exp(-(parameters[0] + scaled[:, :-1] @ weights[:-1])))
+        alone = 1 / (1 + np.exp(-(parameters[1] + scaled[:, -1] * weights[-1])))
+        both = np.clip(fits * alone, 1e-9, 1 - 1e-9)
+        value = -np.log(np.where(right, both, 1 - both)).mean()
+        slope = np.where(right, -1.0, both / (1 - both)) / len(right)
+        first, second = slope * (1 - fits), slope * (1 - alone)
+        gradient = np.array([first.sum(), second.sum(), *(scaled[:, :-1].T @ first), 0.0])
+        gradient[-1] = scaled[:, -1] @ second
+        gradient[2:] += 2 * RIDGE * weights
+        return float(value + RIDGE * (weights**2).sum()), gradient
+
+    start = np.full(2 + count, 0.3)
+    bounds = [(None, None)] * 2 + [(0.0, None)] * count
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
+    weights = found[2:] / std
+    biases = (
+        float(found[0] - weights[:-1] @ mean[:-1]),
+        float(found[1] - weights[-1] * mean[-1]),
+    )
+    return RegisteredConfidence(biases, tuple(float(each) for each in weights), USUAL_CHANCES)
 
 
 def main() -> None:
@@ -91,6 +126,8 @@ def main() -> None:
     chosen = [each for each in every if each.is_there]
     for each in set(every) - set(chosen):
         print(f"not there, left out: {each.map}")
+    for each in chosen:  # before processes share them
+        file_of(each.map, options.work)
     rows: list[dict[str, Any]] = []
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
         jobs = [
@@ -110,10 +147,9 @@ def main() -> None:
     print("\n" + text)
     if options.fit:
         everything = np.ones(len(rows), np.bool_)
-        bias, weights = fit_weights(
-            judged.features, judged.right, everything.astype(np.float64), RIDGE
-        )
-        print(f"USUAL_BIAS, USUAL_WEIGHTS = {bias:.2f}, {tuple(round(w, 2) for w in weights)}")
+        judge = judged.fitted(everything)
+        print("USUAL_BIASES =", tuple(round(each, 2) for each in judge.biases))
+        print("USUAL_WEIGHTS =", tuple(round(each, 2) for each in judge.weights))
     if options.out:
         write_text(options.out, text + "\n")
 
@@ -131,9 +167,6 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-ALL = tuple(range(len(FEATURES)))
-
-
 def _verdict(judged: Judged, confidence: Array, inside: NDArray[np.bool_]) -> list[str]:
     """Accepted of right, wrong of accepted, and calibration error of some rows."""
     right, accepted = judged.right & inside, (confidence >= CONFIDENT) & inside
@@ -148,7 +181,7 @@ def _verdict(judged: Judged, confidence: Array, inside: NDArray[np.bool_]) -> li
 
 
 def _scenes_table(judged: Judged) -> Table:
-    left_out, shipped = judged.left_out(ALL), judged.shipped()
+    left_out, shipped = judged.left_out(), judged.shipped()
     rows = []
     names = sorted({each["scene"] for each in judged.rows})
     masks = [(name, judged.where(scene=name)) for name in names]
@@ -179,12 +212,9 @@ def _scenes_table(judged: Judged) -> Table:
 def _features_table(judged: Judged) -> Table:
     """What each kind of evidence brings: all but one, on scenes left out."""
     rows = []
-    for name, used in (
-        ("all", ALL),
-        *((f"without {FEATURES[i]}", tuple(k for k in ALL if k != i)) for i in ALL),
-        ("the first three", ALL[:3]),
-    ):
-        confidence = judged.left_out(used)
+    for without in (None, *range(len(FEATURES))):
+        name = "all" if without is None else f"without {FEATURES[without]}"
+        confidence = judged.left_out(without)
         clipped = np.clip(confidence, 1e-9, 1 - 1e-9)
         loss = -np.mean(np.log(np.where(judged.right, clipped, 1 - clipped)))
         everything = np.ones(len(judged.rows), np.bool_)
@@ -194,7 +224,7 @@ def _features_table(judged: Judged) -> Table:
 
 
 def _cases_table(judged: Judged) -> Table:
-    confidence = judged.left_out(ALL)
+    confidence = judged.left_out()
     keys = ("kind", "width_px", "heading_known", "prior_px")
     cases = dict.fromkeys(tuple(each[key] for key in keys) for each in judged.rows)
     rows = []

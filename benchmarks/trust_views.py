@@ -131,7 +131,7 @@ def views_of(
 def _rows(
     pair: Pair, others: Sequence[Pair], views: int, seed: int, work: Path
 ) -> Iterator[dict[str, Any]]:
-    ortho, flown = _file(pair.map, work), _file(pair.views, work)
+    ortho, flown = file_of(pair.map, work), file_of(pair.views, work)
     whole = _localizer(ortho, work)
     west, south, east, north = _bounds_deg(ortho)
     middle = (west + east) / 2
@@ -141,7 +141,7 @@ def _rows(
         count = max(1, round(case.share * views))
         over, gsd_m = flown, None
         if case.kind == "elsewhere":
-            over = _file(elsewhere[(seed + number) % len(elsewhere)].views, work)
+            over = file_of(elsewhere[(seed + number) % len(elsewhere)].views, work)
             gsd_m = _gsd_m(over)
         folder = _flight(over, case, count, seed + number, work)
         localizer = half if case.kind == "beside" else whole
@@ -227,8 +227,8 @@ def _plain(name: str) -> str:
     return name.replace("/", "-").replace(":", "-")
 
 
-def _file(name: str, work: Path) -> Path:
-    """A file of real imagery, or of a generated area (cached)."""
+def file_of(name: str, work: Path) -> Path:
+    """A file of real imagery, or of a generated area, which is kept in `work`."""
     if not name.startswith("generated:"):
         return DATA / name
     _, seed, date = name.split(":")

@@ -13,9 +13,7 @@ from orthonav.confidence.registered import (
     FEATURES,
     OLD_FEATURES,
     STAND_IN,
-    USUAL_BIAS,
     USUAL_DETAIL,
-    USUAL_WEIGHTS,
     Chances,
     RegisteredConfidence,
     features_of,
@@ -24,7 +22,7 @@ from orthonav.confidence.registered import (
 from orthonav.errors import VariantError
 
 CHANCE = Chances(total=25.0, look=15.0, fine=40.0)
-MODEL = RegisteredConfidence(-8.0, (0.5, 11.0, 1.5, 4.0, 0.5, 2.0), CHANCE)
+MODEL = RegisteredConfidence((-6.0, -1.0), (0.5, 11.0, 1.5, 0.5, 2.0, 10.0), CHANCE)
 
 strengths = st.floats(1.0, 300.0)
 sometimes = st.one_of(st.just(math.nan), strengths)
@@ -56,23 +54,23 @@ def evidence(strength=60.0, rival=30.0, look=35.0, look_rival=18.0, **more):
 
 def test_features_by_hand():
     features = features_of(evidence(50.0, 40.0, 30.0, 20.0), CHANCE)
-    ratios = [50 / 25, 50 / 40, 30 / 20, 2.0]
-    np.testing.assert_allclose(features, [*np.log(ratios), 4.0, math.log(1.5)])
+    ratios = [50 / 25, 50 / 40, 30 / 20]
+    np.testing.assert_allclose(features, [*np.log(ratios), 4.0, math.log(1.5), math.log(2.0)])
     assert len(features) == len(FEATURES)
 
 
 def test_a_view_of_one_level_is_compared_with_the_chance_of_one_level():
     features = features_of(evidence(30.0, 0.0, 30.0, 20.0, detail_ratio=math.nan), CHANCE)
     np.testing.assert_allclose(np.exp(features[:2]), [30 / 15, 1 / STAND_IN * 30 / 15])
-    assert features[5] == math.log(USUAL_DETAIL)
+    assert features[4] == math.log(USUAL_DETAIL)
 
 
 def test_a_place_that_fits_as_well_a_little_aside_is_not_believed():
     """A lattice: strong, without a rival far away."""
     usual = RegisteredConfidence.usual(CHANCE)
-    strong = {"strength": 60.0, "rival": 30.0, "look": 28.0, "look_rival": 18.0}
-    assert usual(evidence(**strong, local_ratio=2.5)) > 0.9
-    assert usual(evidence(**strong, local_ratio=1.02)) < 0.9
+    strong = {"strength": 400.0, "rival": 30.0, "look": 200.0, "look_rival": 18.0}
+    assert usual(evidence(**strong, local_ratio=2.5)) > 0.99
+    assert usual(evidence(**strong, local_ratio=1.02)) < 0.5
 
 
 def test_chance_stands_in_for_a_rival_that_is_missing():
@@ -133,21 +131,21 @@ def test_strength_and_ratios_each_raise_it():
 
 
 @given(
-    st.floats(-50, 50),
+    st.tuples(*[st.floats(-50, 50)] * 2),
     st.tuples(*[st.floats(0, 50)] * 6),
     st.tuples(*[st.floats(1e-3, 1e4)] * 3),
 )
-def test_plain_round_trip(bias, weights, chances):
-    model = RegisteredConfidence(bias, weights, Chances(*chances))
+def test_plain_round_trip(biases, weights, chances):
+    model = RegisteredConfidence(biases, weights, Chances(*chances))
     again = RegisteredConfidence.from_plain(json.loads(json.dumps(model.to_plain())))
     assert again == model and again(evidence()) == model(evidence())
 
 
 def test_an_older_map_has_the_usual_weights_and_its_own_chance():
-    plain = {**PLAIN, "weights": dict.fromkeys(sorted(OLD_FEATURES), 2.0), "bias": -4.0}
+    plain = {**PLAIN, "weights": dict.fromkeys(sorted(OLD_FEATURES), 2.0)}
     assert RegisteredConfidence.from_plain(plain) == RegisteredConfidence.usual(CHANCE)
-    with pytest.raises(VariantError, match="bias"):
-        RegisteredConfidence.from_plain(without(plain, "bias"))
+    with pytest.raises(VariantError, match="chances"):
+        RegisteredConfidence.from_plain(without(plain, "chances"))
 
 
 def without(plain, *path):
@@ -169,7 +167,7 @@ def changed(plain, value, *path):
 
 
 PLAIN = MODEL.to_plain()
-NUMBERS = [("bias",), *(("weights", name) for name in FEATURES)]
+NUMBERS = [("biases",), *(("weights", name) for name in FEATURES)]
 NUMBERS += [("chances", name) for name in CHANCES]
 
 
@@ -239,8 +237,8 @@ def test_what_is_learnt_fits_fresh_views_better_than_the_usual(harder):
 def test_one_sided_views_give_a_finite_answer(all_right):
     views, _ = synthetic(40, seed=3)
     fitted = fit_registered(views, np.full(40, all_right), CHANCE)
-    assert all(math.isfinite(number) for number in (fitted.bias, *fitted.weights))
-    usual = RegisteredConfidence(USUAL_BIAS, USUAL_WEIGHTS, CHANCE)
+    assert all(math.isfinite(number) for number in (*fitted.biases, *fitted.weights))
+    usual = RegisteredConfidence.usual(CHANCE)
     moved = [fitted(each) - usual(each) for each in views]
     assert min(moved) > 0 if all_right else max(moved) < 0
 

@@ -19,20 +19,23 @@ FEATURES = (
     "log_strength",
     "log_peak_ratio",
     "log_look_ratio",
-    "log_local_ratio",
     "blocks_t",
     "log_detail_ratio",
+    "log_local_ratio",
 )
 OLD_FEATURES = {"log_strength", "log_peak_ratio", "log_look_ratio"}
 """Features of maps up to version 0.1."""
 CHANCES = ("total", "look", "fine")
-USUAL_BIAS, USUAL_WEIGHTS = -10.75, (2.83, 2.99, 3.73, 5.24, 1.11, 3.89)
+USUAL_BIASES = -8.43, -1.55
+USUAL_WEIGHTS = 3.69, 5.69, 5.10, 0.94, 2.69, 11.54
 """What separates right from wrong: `python -m benchmarks.trust --fit` prints these numbers, and how
 they judge scenes that they were not fitted to."""
 RIDGE = 3e-2
 """Weight of the usual bias where views of another date of the map's area are fitted."""
 MAX_SHIFT = 5.0
 """Largest change of the bias by them."""
+LEAST = 1e-9
+"""Least and greatest (1 - LEAST) probability of the fit, for a finite loss."""
 STAND_IN = 0.7
 """Share of the chance value that stands in for a rival where a narrow search found none."""
 LEAST_LOCAL = 0.5
@@ -68,42 +71,48 @@ USUAL_CHANCES = Chances(32.0, 15.0, 48.0)
 
 @dataclass(frozen=True)
 class RegisteredConfidence:
-    """P(right) = 1 / (1 + exp(-(bias + weights . features))).
+    """P(right) = P(the view fits) P(it fits nowhere near as well).
 
-    Features, with what each shows wrong:
+    Each is a logistic regression. The first has all `FEATURES` but the last, the second has the
+    last: a strong fit cannot outweigh ground that repeats. What each feature shows wrong:
 
     - `log_strength`: score over that of chance. Views that show nothing of the map.
     - `log_peak_ratio`: score over that of the strongest rival. Ground that exists more than once.
       Where the view was doubtful enough to be judged one level finer too, it is the mean with and
       without it: on blurred views the finer level alone is overconfident.
     - `log_look_ratio`: the same among all candidates, at a coarser level.
-    - `log_local_ratio`: correlation over the best one a little aside. Rows, lattices, single roads.
     - `blocks_t`: agreement of the blocks of the view. Views that one strong line places.
     - `log_detail_ratio`: score at the finest level over that at the coarser one. Chance matches
       lose more in detail.
+    - `log_local_ratio`: score over the best one a little aside. Rows, lattices, single roads.
 
     A share of chance stands in for a rival where none was found, so that a narrow search does not
     appear as certainty. Weights are never negative: more evidence never means less confidence.
     """
 
-    bias: float
+    biases: tuple[float, float]
     weights: tuple[float, ...]
     chances: Chances
 
     def __call__(self, evidence: Mapping[str, float]) -> float:
         """Probability in 0..1 that the fix is right."""
-        total = self.bias + float(np.dot(self.weights, features_of(evidence, self.chances)))
-        return probability(total)
+        return self.of(features_of(evidence, self.chances))
+
+    def of(self, features: NDArray[np.float64]) -> float:
+        """The same, by features (6,)."""
+        fits = self.biases[0] + float(np.dot(self.weights[:-1], features[:-1]))
+        alone = self.biases[1] + self.weights[-1] * float(features[-1])
+        return probability(fits) * probability(alone)
 
     @classmethod
     def usual(cls, chances: Chances) -> "RegisteredConfidence":
         """With the usual weights, and a map's own scores of chance."""
-        return cls(USUAL_BIAS, USUAL_WEIGHTS, chances)
+        return cls(USUAL_BIASES, USUAL_WEIGHTS, chances)
 
     def to_plain(self) -> dict[str, Any]:
         """Plain values for a manifest."""
         return {
-            "bias": self.bias,
+            "biases": list(self.biases),
             "weights": dict(zip(FEATURES, self.weights, strict=True)),
             "chances": {name: getattr(self.chances, name) for name in CHANCES},
         }
@@ -116,21 +125,23 @@ class RegisteredConfidence:
         of chance.
         """
         try:
-            stored, bias = plain["weights"], float(plain["bias"])
-            if set(stored) == OLD_FEATURES:
-                stored, bias = dict(zip(FEATURES, USUAL_WEIGHTS, strict=True)), USUAL_BIAS
-            weights = tuple(float(stored[name]) for name in FEATURES)
             chances = Chances(**{name: float(plain["chances"][name]) for name in CHANCES})
+            stored = plain["weights"]
+            if set(stored) == OLD_FEATURES:
+                return cls.usual(chances)
+            first, second = plain["biases"]
+            biases = float(first), float(second)
+            weights = tuple(float(stored[name]) for name in FEATURES)
         except (KeyError, TypeError, ValueError) as error:
             raise VariantError(
-                f"confidence of registration must have a bias, weights of {FEATURES} and chances "
-                f"of {CHANCES}, got {plain!r:.200}"
+                f"confidence of registration must have two biases, weights of {FEATURES} and "
+                f"chances of {CHANCES}, got {plain!r:.200}"
             ) from error
-        if not all(math.isfinite(number) for number in (bias, *weights)) or min(weights) < 0:
+        if not all(math.isfinite(number) for number in (*biases, *weights)) or min(weights) < 0:
             raise VariantError(
                 f"confidence of registration has a weight that is negative or not finite: {plain}"
             )
-        return cls(bias, weights, chances)
+        return cls(biases, weights, chances)
 
 
 def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.float64]:
@@ -145,25 +156,29 @@ def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.f
         ratio = math.sqrt(ratio * max(fine, 1e-3) / max(fine_rival, STAND_IN * chances.fine))
     look_ratio = look / max(evidence["look_rival"], STAND_IN * chances.look)
     local = max(evidence["local_ratio"], LEAST_LOCAL)
-    logs = np.log(np.array([strength / chance, ratio, look_ratio, local], dtype=np.float64))
-    return np.array([*logs, evidence["blocks_t"], math.log(max(detail, 1e-3))])
+    logs = np.log([strength / chance, ratio, look_ratio, max(detail, 1e-3), local])
+    return np.array([*logs[:3], evidence["blocks_t"], *logs[3:]], np.float64)
 
 
 def fit_registered(
     evidence: Sequence[Mapping[str, float]], right: NDArray[np.bool_], chances: Chances
 ) -> RegisteredConfidence:
-    """The usual confidence with the bias that fits views (N) that came out right or not (N,)."""
+    """The usual confidence with its first bias fitted to views (N) that came out right or not (N,)
+    and drawn to the usual one."""
     from scipy.optimize import minimize_scalar  # not needed to fly
 
     usual = RegisteredConfidence.usual(chances)
-    features = np.stack([features_of(each, chances) for each in evidence])
-    logits, sign = usual.bias + features @ np.array(usual.weights), np.where(right, 1.0, -1.0)
+    features = [features_of(each, chances) for each in evidence]
+
+    def shifted(shift: float) -> RegisteredConfidence:
+        return replace(usual, biases=(usual.biases[0] + shift, usual.biases[1]))
 
     def loss(shift: float) -> float:
-        return float(np.logaddexp(0, -sign * (logits + shift)).mean() + RIDGE * shift**2)
+        model = shifted(shift)
+        said = np.clip([model.of(each) for each in features], LEAST, 1 - LEAST)
+        return float(RIDGE * shift**2 - np.log(np.where(right, said, 1 - said)).mean())
 
-    shift = float(minimize_scalar(loss, bounds=(-MAX_SHIFT, MAX_SHIFT)).x)
-    return replace(usual, bias=usual.bias + shift)
+    return shifted(float(minimize_scalar(loss, bounds=(-MAX_SHIFT, MAX_SHIFT)).x))
 
 
 USUAL_CONFIDENCE = RegisteredConfidence.usual(USUAL_CHANCES)

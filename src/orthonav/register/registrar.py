@@ -99,7 +99,7 @@ class OwnRatios(NamedTuple):
     """What a place says of itself.
 
     `detail`: score at the final level over that at the judged level, NaN where these are the same
-    level. `local`: correlation at the judged level over the best one nearby (`sharpness`).
+    level. `local`: score at the final level over the best one nearby (`sharpness`).
     """
 
     detail: float
@@ -341,11 +341,11 @@ class Registrar:
         self, templates: ViewTemplates, levels: Levels, total: float, best: Placed
     ) -> OwnRatios:
         """Of a finished place, `total` its scores at the final and the judged level added up."""
-        judged = templates.at(levels.look, levels.recipe(levels.look))
+        final = templates.at(levels.final, levels.recipe(levels.final))
         detail = math.nan
         if levels.final != levels.look:
             detail = max(best.score, 1e-3) / max(total - best.score, 1e-3)
-        return OwnRatios(detail, local_ratio(judged, self.reference, best.pose))
+        return OwnRatios(detail, local_ratio(final, self.reference, best.pose))
 
     def _at_final(
         self, templates: ViewTemplates, levels: Levels, judged: Placed

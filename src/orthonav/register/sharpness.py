@@ -1,8 +1,8 @@
 """How much a place stands out from the ground around it: evidence against texture that repeats.
 
 A view of rows, lattices or a single road fits nearly as well a little aside. Places found by chance
-do so too: in every one of the confident and wrong views of the sets of `python -m benchmarks.trust`
-the best score nearby reached more than 0.9 of theirs.
+do so too. At the finest level, where rows show, the ratio is 1.2 at wrong places (median) and 3.3
+at right ones; at wrong places in an orchard it is 0.9 to 1.15.
 """
 
 import math
@@ -18,16 +18,14 @@ from orthonav.register.reference import Reference
 from orthonav.register.template import Template, turn_planes
 
 Array = NDArray[np.float32]
-REACH_SHARE = 0.25
-"""The window is moved by up to this share of its sides: rivals farther away are compared anyway."""
-PEAK_SHARE = 0.11
+REACH_SHARE = 0.125
+"""The window is moved by up to this share of its sides to either side."""
+PEAK_SHARE = 0.06
 """Moves below this share of the view's side belong to the place itself."""
 MIN_PEAK_PX = 3.0
 """The same, at least, pixels of the level."""
 NEAR_PX = 3.0
 """The place itself is the best within so many pixels."""
-ENERGY_FLOOR = 0.05
-"""Least energy of the map under the view, as a share of the most: blank ground is not amplified."""
 MAX_RATIO = 10.0
 
 
@@ -48,7 +46,10 @@ def local_ratio(template: Template, reference: Reference, pose: Pose) -> float:
 
 
 def _moved_scores(template: Template, reference: Reference, pose: Pose) -> Array:
-    """Correlations (2 R + 1, 2 C + 1) of a view's window moved by up to R rows and C columns."""
+    """Scores (2 R + 1, 2 C + 1) of a view's window moved by up to R rows and C columns.
+
+    Not divided by the energy of the map under each move: that hardly changes.
+    """
     height, width = template.mask.shape
     rows, cols = int(height * REACH_SHARE), int(width * REACH_SHARE)
     window = MapWindow.of(template, reference, pose, 0, (rows, cols))
@@ -56,26 +57,11 @@ def _moved_scores(template: Template, reference: Reference, pose: Pose) -> Array
     window.sample(pose, sampled)
     planes, scratch = np.empty((2, CHANNELS, *window.shape), np.float32)
     turn_planes(sampled, -pose.turn_rad, planes, scratch[:2])
-    planes[:3] *= planes[3] > 0.99
+    for group, weight in zip(GROUPS, template.weights, strict=True):
+        energy = float(np.square(planes[group]).sum())
+        planes[group] *= math.sqrt(weight / energy) if energy > 0 else 0.0
     # Moves of less than the margin never reach over the border: no padding.
     size = tuple(next_fast_len(side, real=True) for side in window.shape)
-
-    def spectra(made: Array) -> NDArray[np.complex64]:
-        return np.asarray(rfft2(made, s=size), np.complex64)
-
-    def moved(view: NDArray[np.complex64], ground: NDArray[np.complex64]) -> Array:
-        products = (np.conj(view) * ground).reshape(-1, *ground.shape[-2:]).sum(axis=0)
-        return np.asarray(irfft2(products, s=size)[: 2 * rows + 1, : 2 * cols + 1], np.float32)
-
-    views, grounds, mask = spectra(template.channels), spectra(planes[:3]), spectra(template.mask)
-    total = np.zeros((2 * rows + 1, 2 * cols + 1), np.float32)
-    for group, weight in zip(GROUPS, template.weights, strict=True):
-        power = np.square(planes[group]).sum(axis=0)
-        energy = moved(mask, spectra(power))
-        most = float(energy.max())
-        if most <= 0:
-            continue
-        # The energy of the view in this kind of evidence is its weight (`Template.of`).
-        norm = np.sqrt(np.maximum(energy, ENERGY_FLOOR * most) * np.float32(weight))
-        total += np.float32(weight) * moved(views[group], grounds[group]) / norm
-    return total
+    products = np.conj(rfft2(template.channels, s=size)) * rfft2(planes[:3], s=size)
+    moved = irfft2(products.sum(axis=0), s=size)[: 2 * rows + 1, : 2 * cols + 1]
+    return np.asarray(moved, np.float32)
