@@ -6,9 +6,9 @@ import sys
 
 import numpy as np
 import pytest
+from orthonav.cli.dem import read_dem
 from pyproj import Transformer
 
-from orthonav.cli.dem import read_dem
 from orthonav.errors import ImageryError, MissingFileError
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.route import Height, Route, read_route

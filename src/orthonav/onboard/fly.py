@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from orthonav.confidence.accept import Acceptance
 from orthonav.errors import CameraError
+from orthonav.flight.heights import FlownHeights
 from orthonav.flight.mount import Mount
 from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_picture
@@ -95,6 +96,7 @@ class FlyOptions:
 
     `mount_deg`: yaw, pitch, roll of the camera in the body, degrees.
     `mount`: calibrated mount, for the health only (the locator applies it by itself).
+    `heights`: turns reported heights into heights above ground; None: the map has no terrain.
     `heading_known`: whether the reported heading is used.
     `deadline_s`: images older than this are dropped.
     `telemetry_wait_s`: longest wait for telemetry after the exposure.
@@ -109,6 +111,7 @@ class FlyOptions:
 
     mount_deg: Angles = LOOKS_DOWN
     mount: Mount | None = None
+    heights: FlownHeights | None = None
     heading_known: bool = True
     deadline_s: float = 0.5
     telemetry_wait_s: float = 0.15  # three attitudes at 20 Hz, the least rate asked for
@@ -225,7 +228,7 @@ class Runner:
             view = View(image.grey, camera, telemetry)
             if latency is not None and latency.reason is not None:
                 return self._withheld(image, view, vehicle, latency)
-            refused = self._missing(telemetry) or self._before_the_last(image)
+            refused = self._missing(self._above_ground(telemetry)) or self._before_the_last(image)
             if refused is not None:
                 return self._refused(image, refused, vehicle)
             return self._located(image, view, vehicle, latency)
@@ -290,7 +293,8 @@ class Runner:
             prior, self._start = self._start(), None
             telemetry = replace(view.telemetry, prior=prior or view.telemetry.prior)
             view = replace(view, telemetry=telemetry)
-        telemetry = view.telemetry
+        telemetry = self._above_ground(view.telemetry)
+        view = replace(view, telemetry=telemetry)
         self._log_view(image, view, latency, withheld=False)
         outcome: Fix | NoFix
         try:
@@ -311,6 +315,8 @@ class Runner:
             self._log(lambda sink: sink.result(result))
             self._publisher.publish(result, image.exposed_ns, vehicle, judged=False, withheld=doubt)
             return result
+        if self.options.heights is not None:
+            self.options.heights.observe(telemetry.time_ns, outcome, result.state)
         accepted = self.options.accept(result.outcome) if self.options.accept else result.outcome
         accepted = accepted if self._gnss is None else self._gnss.corrected(accepted)
         self._publisher.publish(
@@ -397,6 +403,11 @@ class Runner:
             self._clocks.sleep(_POLL_S)
         vehicle = self._link.state_at(image.exposed_ns)
         return vehicle, vehicle.telemetry(image.time_ns, self.options.mount_deg)
+
+    def _above_ground(self, telemetry: Telemetry) -> Telemetry:
+        """The telemetry with its height above ground by the terrain of the map, if it has one."""
+        heights = self.options.heights
+        return telemetry if heights is None else heights.corrected(telemetry)
 
     def _missing(self, telemetry: Telemetry) -> NoFix | None:
         missing = [
