@@ -122,6 +122,14 @@ def test_a_flight_uses_its_prior_and_its_last_confident_fix():
     assert far.agl_std_m > 5 * found.agl_std_m  # a place ages
 
 
+def test_a_velocity_moves_the_last_place():
+    heights = flown()
+    heights.observe(0, fix(0, -1000), None)
+    found = heights.corrected(reported(20.0, amsl_m=700.0, vel_en_mps=(0.0, 50.0)))
+    assert found.agl_m == pytest.approx(400, abs=0.5)  # 1 km farther north
+    assert found.agl_std_m == pytest.approx(math.hypot(32, SLOPE * (5 + 300)), rel=0.02)
+
+
 @pytest.mark.parametrize(
     "outcome, state",
     [

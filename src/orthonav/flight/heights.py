@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.geo.frames import LocalFrame
 from orthonav.geo.ground import Ground, TerrainHeights, ground_around, ground_over
 from orthonav.records import CONFIDENT, DEFAULT_AGL_STD, Fix, NoFix, Telemetry
 
@@ -22,6 +23,8 @@ Undulation = Callable[[Array, Array], Array]
 """Height of the geoid above the ellipsoid (m) at latitudes and longitudes (deg)."""
 USUAL_MPS = 30.0
 """Speed at which a position ages where none is reported: that of a fast small aircraft."""
+VELOCITY_ERROR = 0.3
+"""Error of a reported velocity as a share of it, turns between two fixes included."""
 MISMATCH_M = 20.0
 """Heights above sea and above take-off that differ by more over the terrain are named: barometers
 and positions of take-off explain less, a wrong datum more."""
@@ -161,10 +164,7 @@ class FlownHeights:
         if prior is not None:
             found.append((prior.std_m, (prior.lat_deg, prior.lon_deg)))
         if self._last is not None:
-            time_ns, place, std_m = self._last
-            velocity = telemetry.vel_en_mps
-            speed_mps = USUAL_MPS if velocity is None else math.hypot(*velocity)
-            found.append((std_m + speed_mps * abs(telemetry.time_ns - time_ns) / 1e9, place))
+            found.append(_aged(*self._last, telemetry))
         if not found:
             return None, math.inf
         std_m, place = min(found)
@@ -185,6 +185,16 @@ class FlownHeights:
     def _middle(self) -> Place:
         lat, lon = self._area_deg
         return float(lat.mean()), float(lon.mean())
+
+
+def _aged(time_ns: int, place: Place, std_m: float, telemetry: Telemetry) -> tuple[float, Place]:
+    """Standard deviation and place at a view, of a place known at an earlier time."""
+    seconds = (telemetry.time_ns - time_ns) / 1e9
+    if telemetry.vel_en_mps is None:
+        return std_m + USUAL_MPS * abs(seconds), place
+    moved_m = np.array(telemetry.vel_en_mps) * seconds
+    lat, lon = LocalFrame(*place).latlon_from_en(moved_m)
+    return std_m + VELOCITY_ERROR * float(np.hypot(*moved_m)), (float(lat), float(lon))
 
 
 def warn_of_mismatch(off_m: float) -> None:
