@@ -59,6 +59,8 @@ class BuildRequest:
     - `dem`: terrain model from which the map gets a terrain layer; None: it has none.
     - `dem_datum`: what its heights count from, where the file does not state it
       (`orthonav.imagery.datum.OPTION`).
+    - `dem_needed`: whether an area in which the model has no height is refused; else the map has
+      no terrain layer.
     - `cells`: whether the map carries the cell means from which new tiles are embedded without
       imagery, for sheets of an atlas; method gradient only.
     """
@@ -81,6 +83,7 @@ class BuildRequest:
     workers: int | None = None
     dem: Path | None = None
     dem_datum: str | None = None
+    dem_needed: bool = True
     cells: bool = False
 
 
@@ -132,7 +135,8 @@ class BuildInputs:
         _check_numbers(request)
         terrain = None
         if request.dem is not None:
-            terrain = terrain_of_dem(open_dem(request.dem, request.dem_datum), area, grid)
+            dem = open_dem(request.dem, request.dem_datum)
+            terrain = terrain_of_dem(dem, area, grid, needed=request.dem_needed)
         return cls(request, mosaic, other_dates, area, grid, representation, recipe, terrain)
 
     @property

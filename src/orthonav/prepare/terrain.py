@@ -43,11 +43,13 @@ class TerrainParts:
         return self.info, self.arrays
 
 
-def terrain_of_dem(dem: Dem, area: Area, grid: TileGrid) -> TerrainParts:
+def terrain_of_dem(
+    dem: Dem, area: Area, grid: TileGrid, *, needed: bool = True
+) -> TerrainParts | None:
     """The terrain layer of a sheet from a terrain model.
 
-    Raises `AreaError` where the model has no height in the area, `ImageryError` where it cannot be
-    read.
+    Where the model has no height in the area: `AreaError`, or None unless `needed`. Raises
+    `ImageryError` where it cannot be read.
     """
     posting_m = min(max(POSTING_M, rounded_gsd_m(dem.gsd_m)), MAX_POSTING_M)
 
@@ -55,7 +57,7 @@ def terrain_of_dem(dem: Dem, area: Area, grid: TileGrid) -> TerrainParts:
         return dem.in_plane(area.frame, west_m, north_m, posting_m, rows, cols)
 
     made = terrain_parts(area, grid, posting_m, dem.path.name, dem.datum.name, sampled)
-    if made is None:
+    if made is None and needed:
         centre = area.frame.lat_deg, area.frame.lon_deg
         hint = swapped_hint(*centre, dem.covers)
         raise AreaError(

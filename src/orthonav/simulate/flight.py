@@ -352,9 +352,8 @@ def _route_poses(
     for number, (place, heading) in enumerate(views):
         rng = np.random.default_rng([request.seed, 0, number])
         time_s, velocity = float(path.times_s[number]), velocities[number]
-        above_m, heights = agl_m, {}
+        above_m = agl_m
         if ground_m is not None:
-            heights = {"home_m": agl_m, "amsl_m": agl_m + float(ground_m[0])}
             above_m += float(ground_m[0] - ground_m[number])
         if not above_m >= 1:
             raise FlightError(
@@ -362,7 +361,8 @@ def _route_poses(
                 "(--agl-m)"
             )
         pose = _tilted(request, rng, place, float(heading), above_m, time_s, velocity)
-        pose = replace(pose, **heights)
+        if ground_m is not None:
+            pose = replace(pose, home_m=agl_m, amsl_m=agl_m + float(ground_m[0]))
         if not request.beyond and not _sees_ground(coverage, request.camera, pose):
             lat, lon = (float(value) for value in area.frame.latlon_from_en(place))
             raise AreaError(
