@@ -38,9 +38,12 @@ class CellPixels:
 
     @property
     def blank(self) -> bool:
-        """Whether there is no imagery: no valid pixel, or pure black or white throughout."""
-        if not self.valid.any():
-            return True
+        """Whether there is no imagery: no valid pixel, or pure black or white throughout.
+
+        Heights, which are signed numbers, are never blank where they are valid.
+        """
+        if not self.valid.any() or self.bands.dtype.kind != "u":
+            return not self.valid.any()
         first = self.bands[:, 0, 0]
         if not (first == first[0]).all() or first[0] not in (0, np.iinfo(np.uint8).max):
             return False

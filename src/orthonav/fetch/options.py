@@ -88,6 +88,8 @@ class Provenance:
     """Who must be named."""
     note: str | None = None
     """What a user should know, such as resampling."""
+    datum: str | None = None
+    """What the heights of a terrain model count from; None for imagery."""
 
 
 def finest_fitting(gsds_m: list[float], wanted_m: float, levels: str) -> int:

@@ -38,6 +38,8 @@ BLOCK_PX = 256
 CACHE_BYTES = 64 * 2**20
 SAMPLE_PX = 512
 """Side of the overview from which units and voids are judged."""
+DATUM_TAG = "ORTHONAV_VERTICAL_DATUM"
+"""Tag of files that `orthonav fetch` wrote: what their heights count from."""
 _UNITS = {
     "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0,
     "ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "international foot": 0.3048,
@@ -198,7 +200,8 @@ def _inspected(path: Path, data: Any, given: str | None) -> Dem:
             f"terrain file has {data.count} bands of {data.dtypes[0]}, which is a picture: one "
             f"band of heights is expected: {path}"
         )
-    horizontal, vertical = horizontal_and_vertical(data.crs, given, path)
+    known = given or data.tags().get(DATUM_TAG)
+    horizontal, vertical = horizontal_and_vertical(data.crs, known, path)
     unit = (data.units[0] or "").strip().lower()
     if unit and unit not in _UNITS:
         raise ImageryError(
