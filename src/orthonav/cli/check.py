@@ -14,6 +14,14 @@ EVERYDAY = (
     *("--yaw-std-deg", "--heading", "--prior-std-m", "--prior", "--quick", "--json"),
 )
 
+_REFERENCES = {
+    None: "an unknown reference",
+    "agl": "ground",
+    "home": "home",
+    "amsl": "sea level",
+    "hae": "the ellipsoid",
+}
+
 if TYPE_CHECKING:
     from orthonav.check.outcome import CheckedInputs
     from orthonav.check.request import CheckRequest
@@ -202,6 +210,8 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
     from orthonav.errors import CheckError
     from orthonav.geo.terrain import LANDING_M
 
+    if options.dem_datum is not None and options.dem is None:
+        raise CheckError("--dem-datum is that of a terrain model: give --dem too")
     if options.agl_m is not None:
         return options.agl_m, "as given"
     heights = [] if route is None else [each for each in route.heights if each is not None]
@@ -213,7 +223,7 @@ def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | 
     else:
         legs, name = _profile(options, route)
         if not legs:
-            named = sorted({None: "unknown", "hae": "ellipsoid"}.get(f, str(f)) for f in frames)
+            named = sorted(_REFERENCES[frame] for frame in frames)
             raise CheckError(
                 f"heights of the route are above {', '.join(named)}, not above ground: give the "
                 "terrain (--dem FILE, or a map built with --dem) or the height (--agl-m)"

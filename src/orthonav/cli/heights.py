@@ -89,8 +89,6 @@ def flight_heights(
 
     What is assumed about heights is logged once.
     """
-    from orthonav.flight.heights import assumed_heights
-
     first = next(iter(flight.views), None)
     if first is None:
         return None
@@ -106,10 +104,21 @@ def flight_heights(
     name = None
     if heights is not None:
         name = "the terrain of the map" if dem is None else f"the terrain of {options.dem.name}"
-    said = assumed_heights(first.telemetry, name)
-    if said is not None and (name is not None or flight.kind in ("flight", "log")):
-        log.log(logging.WARNING if name is None else logging.INFO, "%s", said)
+    say_assumed_heights(flight, name)
     return heights
+
+
+def say_assumed_heights(flight: "Recording", terrain: str | None = None) -> None:
+    """Log what is assumed about the heights of a flight, over a terrain or without one.
+
+    Other recordings than flights have said it when they were opened.
+    """
+    from orthonav.flight.heights import assumed_heights
+
+    first = next(iter(flight.views), None)
+    said = None if first is None else assumed_heights(first.telemetry, terrain)
+    if said is not None and (terrain is not None or flight.kind in ("flight", "log")):
+        log.log(logging.WARNING if terrain is None else logging.INFO, "%s", said)
 
 
 def geoid_for(flight: "Recording") -> "Undulation | None":

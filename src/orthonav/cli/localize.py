@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from orthonav.cli.common import print_json, progress
 from orthonav.cli.flown import compare_with_flight, take_flown
-from orthonav.cli.heights import dem_of, flight_heights
+from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
 from orthonav.cli.needs import require_extras
 from orthonav.cli.signed import add_signature, checked_signature
 from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
@@ -219,6 +219,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
     if accept and accept.criterion == "lowe_ratio":
         raise VariantError("--accept lowe_ratio needs a map and --registration off")
     flight = open_source(options.flight, options)
+    say_assumed_heights(flight)
     results = []
     with TileSearch(Atlas.open(options.map)) as search, progress(options) as shown:
         if search.unknown:

@@ -40,10 +40,12 @@ def is_measured(telemetry: Telemetry) -> bool:
     return math.isfinite(telemetry.agl_m) and telemetry.agl_m != telemetry.home_m
 
 
-def assumed_heights(telemetry: Telemetry, terrain: str | None) -> str | None:
+def assumed_heights(
+    telemetry: Telemetry, terrain: str | None, advice: str = "give --dem, or build the map with it"
+) -> str | None:
     """What is assumed about the height of a view, in words; None where it was measured.
 
-    `terrain`: name of the terrain that is used, None without one.
+    `terrain`: name of the terrain that is used, None without one. `advice`: what would help then.
     """
     if is_measured(telemetry):
         return None
@@ -55,7 +57,6 @@ def assumed_heights(telemetry: Telemetry, terrain: str | None) -> str | None:
     if terrain is not None:
         plus = " plus the terrain there" if known[0] == "take-off" else ""
         return f"height above ground is the height above {known[0]}{plus} minus {terrain}"
-    advice = "give the terrain (--dem FILE, or a map built with --dem)"
     if math.isfinite(telemetry.agl_m):
         return f"level ground is assumed: height above ground is that above take-off; {advice}"
     return f"only heights above {' and '.join(known)} are known, none above ground: {advice}"

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from orthonav.confidence.accept import Acceptance
 from orthonav.errors import CameraError
-from orthonav.flight.heights import FlownHeights
+from orthonav.flight.heights import FlownHeights, assumed_heights
 from orthonav.flight.mount import Mount
 from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_picture
@@ -159,6 +159,7 @@ class Runner:
         self._tick_ns = 0
         self._image_taken_ns: int | None = None
         self._tracked_ns: int | None = None
+        self._heights_said = False
         self._last: states.SavedState | None = None
         self._saved: states.SavedState | None = None
         self._mismatch = 0.0, 0.0
@@ -293,6 +294,7 @@ class Runner:
             prior, self._start = self._start(), None
             telemetry = replace(view.telemetry, prior=prior or view.telemetry.prior)
             view = replace(view, telemetry=telemetry)
+        self._say_heights(view.telemetry)
         telemetry = self._above_ground(view.telemetry)
         view = replace(view, telemetry=telemetry)
         self._log_view(image, view, latency, withheld=False)
@@ -408,6 +410,16 @@ class Runner:
         """The telemetry with its height above ground by the terrain of the map, if it has one."""
         heights = self.options.heights
         return telemetry if heights is None else heights.corrected(telemetry)
+
+    def _say_heights(self, telemetry: Telemetry) -> None:
+        """Log once what is assumed about heights."""
+        if self._heights_said:
+            return
+        self._heights_said = True
+        name = None if self.options.heights is None else "the terrain of the map"
+        said = assumed_heights(telemetry, name, "build the map with --dem")
+        if said is not None:
+            log.log(logging.WARNING if name is None else logging.INFO, "%s", said)
 
     def _missing(self, telemetry: Telemetry) -> NoFix | None:
         missing = [
