@@ -145,6 +145,24 @@ def test_unsure_positions_say_nothing_about_the_ground(outcome, state):
     assert heights.corrected(reported(amsl_m=700.0)).agl_m == pytest.approx(400, abs=0.1)
 
 
+def test_a_place_of_long_ago_or_of_a_wide_prior_is_unknown():
+    heights = flown()
+    heights.observe(0, fix(0, 1000), None)
+    wide = Prior(*place(0, 1500), 1e6)
+    for time_s in (1e3, 1e9):
+        found = heights.corrected(reported(time_s, amsl_m=700.0, prior=wide))
+        assert found.agl_m == pytest.approx(400, abs=1)
+
+
+def test_a_track_that_is_lost_forgets_its_place():
+    heights = flown()
+    heights.observe(0, fix(0, 1000), "tracking")
+    heights.observe(10**9, NoFix("blank", "nothing to see"), "coasting")
+    assert heights.corrected(reported(1.0, amsl_m=700.0)).agl_m == pytest.approx(300, abs=1)
+    heights.observe(2 * 10**9, NoFix("lost", "no position"), "lost")
+    assert heights.corrected(reported(2.0, amsl_m=700.0)).agl_m == pytest.approx(400, abs=1)
+
+
 def test_a_hole_below_is_filled_by_the_area():
     heights = flown()
     found = heights.corrected(reported(amsl_m=700.0, prior=Prior(*place(5000, 0), 10.0)))

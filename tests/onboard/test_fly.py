@@ -30,7 +30,7 @@ from fake_autopilot import (
 )
 
 from orthonav.cli import main
-from orthonav.errors import CameraError
+from orthonav.errors import CameraError, MapChangedError, MapFileError
 from orthonav.flight.fixes import result_from_json
 from orthonav.flight.gnss import GnssSample, fault_of, gnss_of, write_gnss
 from orthonav.flight.heights import FlownHeights
@@ -539,6 +539,25 @@ def test_a_map_with_terrain_gives_heights_above_ground(begin):
         assert seen.agl_m == pytest.approx(agl_m, abs=0.1) and seen.amsl_m == 400.0
         (view,) = flight.log.named("view")
         assert view[3] == seen  # a replay of the log has the height that was flown with
+
+
+@pytest.mark.parametrize(
+    "error, reason",
+    [(MapFileError("damaged"), "map_damaged"), (MapChangedError("cut"), "map_file_changed")],
+)
+def test_terrain_that_cannot_be_read_gives_no_fix(begin, error, reason):
+    broken = []
+
+    def terrain(lat_deg, lon_deg):
+        if broken:
+            raise error
+        return np.zeros(np.shape(lat_deg))
+
+    flight = begin(heights=FlownHeights(terrain, (np.zeros(2), np.zeros(2))))
+    flight.runner.options.heights.observe(UTC_NS + flight.time.now_ns, fix(), "tracking")
+    broken.append(True)
+    assert [reason_of(result) for result in flight.views(2)] == [reason] * 2
+    assert flight.locator.seen == []
 
 
 def test_the_flight_ends_with_the_recording(flight):

@@ -28,6 +28,10 @@ VELOCITY_ERROR = 0.3
 MISMATCH_M = 20.0
 """Heights above sea and above take-off that differ by more over the terrain are named: barometers
 and positions of take-off explain less, a wrong datum more."""
+LARGEST_STD_M = 10_000.0
+"""A position with a larger standard deviation is unknown: a map is at most 50 km across."""
+_LOST = ("searching", "lost")
+"""States of a track that has no position."""
 log = logging.getLogger(__name__)
 
 
@@ -151,7 +155,12 @@ class FlownHeights:
         return self._heights.above(telemetry, below, place or self._middle)
 
     def observe(self, time_ns: int, outcome: Fix | NoFix, state: str | None) -> None:
-        """Take note of the outcome of a view: a confident fix says where the aircraft is."""
+        """Take note of the outcome of a view: a confident fix says where the aircraft is.
+
+        A track that is lost does not know it any more, wherever its last fix was.
+        """
+        if state in _LOST:
+            self._last = None
         if not isinstance(outcome, Fix) or not outcome.confidence >= CONFIDENT:
             return
         if state in (None, "tracking"):
@@ -160,16 +169,14 @@ class FlownHeights:
 
     def _place(self, telemetry: Telemetry) -> tuple[Place | None, float]:
         """Expected position and its standard deviation per axis."""
-        found: list[tuple[float, Place]] = []
+        found: list[tuple[float, Place | None]] = []
         prior = telemetry.prior if self._use_prior else None
         if prior is not None:
             found.append((prior.std_m, (prior.lat_deg, prior.lon_deg)))
         if self._last is not None:
             found.append(_aged(*self._last, telemetry))
-        if not found:
-            return None, math.inf
-        std_m, place = min(found)
-        return place, std_m
+        std_m, place = min(found, default=(math.inf, None))
+        return (place, std_m) if std_m <= LARGEST_STD_M else (None, math.inf)
 
     def _check(self, telemetry: Telemetry) -> None:
         """Warn once where heights above sea and above take-off disagree over the terrain."""

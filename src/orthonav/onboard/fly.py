@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.confidence.accept import Acceptance
-from orthonav.errors import CameraError
+from orthonav.errors import CameraError, MapChangedError, MapFileError
 from orthonav.flight.heights import FlownHeights, assumed_heights
 from orthonav.flight.mount import Mount
 from orthonav.geo.camera import Camera
@@ -229,7 +229,7 @@ class Runner:
             view = View(image.grey, camera, telemetry)
             if latency is not None and latency.reason is not None:
                 return self._withheld(image, view, vehicle, latency)
-            refused = self._missing(self._above_ground(telemetry)) or self._before_the_last(image)
+            refused = self._missing(telemetry) or self._before_the_last(image)
             if refused is not None:
                 return self._refused(image, refused, vehicle)
             return self._located(image, view, vehicle, latency)
@@ -422,6 +422,12 @@ class Runner:
             log.log(logging.WARNING if name is None else logging.INFO, "%s", said)
 
     def _missing(self, telemetry: Telemetry) -> NoFix | None:
+        try:
+            telemetry = self._above_ground(telemetry)
+        except MapChangedError as error:
+            return self._refusal("internal_error", MAP_CHANGED, str(error))
+        except MapFileError as error:  # a crafted part of the map
+            return self._refusal("internal_error", MAP_DAMAGED, str(error))
         missing = [
             name for name in telemetry.missing() if name != "yaw_deg" or self.options.heading_known
         ]
