@@ -60,7 +60,9 @@ def test_a_layer_is_complete(name, id_):
 
 def test_terrain_names_the_datum_of_its_heights():
     terrain = {name: preset.datum for name, preset in presets().items() if preset.datum}
-    assert set(terrain) == {"copernicus-dem", "nasadem", "usgs-3dep", "swissalti3d"}
+    assert set(terrain) == {
+        "copernicus-dem", "nasadem", "usgs-3dep", "swissalti3d", "ign-terrain",
+    }  # fmt: skip
     for name, datum in terrain.items():
         assert not datum_of(datum).above_ellipsoid
         assert parse_source(name, ImageryOptions()).provenance.datum == datum
