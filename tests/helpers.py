@@ -28,3 +28,22 @@ class Done(NamedTuple):
     code: int
     out: str
     err: str
+
+
+def write_dem(path, frame, height_of, half_m=1500.0, px_m=25.0, change=lambda heights: heights):
+    """A terrain model in the plane of `frame`: `height_of` east and north (m), above the sea.
+
+    It does not state its datum. `change` alters the heights (H, W) before they are written.
+    """
+    import rasterio
+    from rasterio.transform import Affine
+
+    side = round(2 * half_m / px_m)
+    centres = (np.arange(side) + 0.5) * px_m - half_m
+    heights = change(height_of(centres[None, :], -centres[:, None]).astype(np.float32))
+    with rasterio.open(
+        path, "w", driver="GTiff", count=1, height=side, width=side, dtype="float32",
+        crs=frame.proj4, transform=Affine(px_m, 0, -half_m, 0, -px_m, half_m), nodata=-9999,
+    ) as data:  # fmt: skip
+        data.write(heights[None])
+    return path

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from orthonav.cli.dem import read_dem
-from orthonav.errors import ImageryError, MissingFileError
 from orthonav.geo.frames import LocalFrame
-from orthonav.geo.route import Height, Route, read_route
+from orthonav.geo.route import Height, read_route
 from orthonav.mapfile import open_map
 
 FRAME = LocalFrame(46.5, 2.5)
@@ -70,7 +68,7 @@ def test_a_plan_for_people(run, camera, table, dem, tmp_path):
     out = tmp_path / "route.geojson"
     done = run(
         "plan", "--route", table, "--band-m", 500, "--camera", camera, "--agl-m", 400,
-        "--speed-mps", 25, "--dem", dem, "--out", out,
+        "--speed-mps", 25, "--dem", dem, "--dem-datum", "msl", "--out", out,
     )  # fmt: skip
     assert (done.code, done.err) == (0, "")
     assert "3 waypoints, 6.00 km, 240 s, heights above amsl, 1 leg with a band" in done.out
@@ -83,7 +81,7 @@ def test_a_plan_for_people(run, camera, table, dem, tmp_path):
 def test_a_plan_for_programs(run, camera, table, dem):
     done = run(
         "plan", "--route", table, "--band-m", 500, "--camera", camera, "--agl-m", 400,
-        "--dem", dem, "--json",
+        "--dem", dem, "--dem-datum", "msl", "--json",
     )  # fmt: skip
     plain = json.loads(done.out)
     assert plain["route"]["length_m"] == pytest.approx(6000, abs=1)
@@ -102,7 +100,9 @@ def test_a_plan_for_programs(run, camera, table, dem):
 
 def test_the_height_is_that_of_the_route_over_terrain(run, camera, table, dem):
     sizes = ["--band-m", 500, "--camera", camera, "--json"]
-    plain = json.loads(run("plan", "--route", table, "--dem", dem, *sizes).out)
+    plain = json.loads(
+        run("plan", "--route", table, "--dem", dem, "--dem-datum", "msl", *sizes).out
+    )
     assert plain["view"]["agl_m"] == pytest.approx(325, abs=1)
     assert run("plan", "--route", table, *sizes).code == 1  # above the sea says nothing alone
     plain = json.loads(run("plan", "--route", "paper:A@46.5,2.5", *sizes).out)
@@ -134,7 +134,12 @@ def test_a_large_area_is_cut_into_sheets(run, camera, tmp_path):
         (["--route", "TABLE", "--band-m", 99, "--camera", "CAMERA"], "needs a height above"),
         (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--speed-mps", 0], "speed must be above"),
         (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--dem", "none.tif"], "none.tif"),
-        (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--dem", "DEM"], "outside the terrain"),
+        (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--dem", "DEM"], "give --dem-datum"),
+        (["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--dem-datum", "msl"], "give --dem too"),
+        (
+            ["--route", "paper:B@46.6,1.9", "--gsd-m", 1, "--dem", "DEM", "--dem-datum", "msl"],
+            "outside the terrain",
+        ),
     ],
 )
 def test_impossible_plans_are_refused(run, table, camera, dem, arguments, message):
@@ -155,20 +160,6 @@ def test_help_loads_no_heavy_library():
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
     assert done.stdout.startswith("usage: orthonav plan") and done.stdout.endswith("set()\n")
-
-
-def test_terrain_is_read_where_it_is(dem, tmp_path):
-    ground = read_dem(dem, Route(places_of(CORNERS_EN_M)), 100)
-    east, north = np.meshgrid(np.linspace(-1500, 1500, 7), np.linspace(-1500, 1500, 7))
-    lat, lon = FRAME.latlon_from_en(np.stack([east.ravel(), north.ravel()], axis=1))
-    np.testing.assert_allclose(ground(lat, lon), 300 + 0.05 * north.ravel(), atol=0.05)
-    far = FRAME.latlon_from_en(np.array([[-2990.0, 2990.0], [9000.0, 0.0]]))
-    assert np.isnan(ground(*far)).all()  # no data, and beyond
-    with pytest.raises(MissingFileError, match="terrain file does not exist"):
-        read_dem(tmp_path / "none.tif", Route(((46.5, 2.5),)), 10)
-    (tmp_path / "broken.tif").write_bytes(b"II*\0")
-    with pytest.raises(ImageryError, match="terrain file cannot be read"):
-        read_dem(tmp_path / "broken.tif", Route(((46.5, 2.5),)), 10)
 
 
 def test_the_bands_of_a_route_are_built_and_it_is_flown(run, make_ortho, tmp_path):

@@ -11,10 +11,14 @@ import pytest
 
 from orthonav.evaluate.metrics import compare
 from orthonav.flight import open_flight, read_truth
+from orthonav.geo.area import Area
+from orthonav.geo.grid import TileGrid
+from orthonav.imagery.terrain import open_dem
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import SingleViews, localize_flight
 from orthonav.prepare import BuildRequest, build_map
+from orthonav.prepare.terrain import terrain_of_dem
 from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 
 BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -44,3 +48,18 @@ def test_views_of_another_year_are_placed(tmp_path, monkeypatch, past, present, 
     comparison = compare(read_truth(flight / "truth.csv"), results, sheet.frame)
     right = comparison.errors_m <= WITHIN_STRIDES * sheet.grid.stride_m
     assert len(right) == VIEWS and np.mean(right) >= least
+
+
+def test_a_terrain_model_of_mountains_is_small_in_a_map():
+    path = DATA / "relief_ngi/dem.tif"
+    if not path.is_file():
+        pytest.skip(f"optional real imagery is not there (see ORTHONAV_DATA): {path}")
+    dem = open_dem(path)
+    assert dem.datum.name == "EGM2008 height"
+    area = Area.from_bounds((24.37, -33.70, 24.41, -33.66))
+    grid = TileGrid.covering(area.extent_en_m, gsd_m=2.0, tile_px=256, overlap=0.875)
+    made = terrain_of_dem(dem, area, grid)
+    info = made.info
+    km2 = info.known * info.posting_m**2 / 1e6
+    assert made.arrays["sheet0/terrain/bytes"].size < 0.004e6 * km2
+    assert 149 <= info.low_m < info.high_m <= 782 and info.known == info.rows * info.cols

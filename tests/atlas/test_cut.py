@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from safetensors import SafetensorError
 
-from helpers import textured
+from helpers import textured, write_dem
 from orthonav.atlas.catalog import Atlas, SheetDescription
 from orthonav.atlas.coverage import box_deg, check_shown
 from orthonav.atlas.cut import cut_in_memory, cut_map
@@ -24,6 +24,7 @@ from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.localizer import Localizer
 from orthonav.mapfile import GreyLayer, open_map, write_map
+from orthonav.mapfile.terrain import TerrainLayer
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.prepare.layout import grid_of
 from orthonav.records import Fix, Telemetry, View
@@ -59,16 +60,22 @@ def names(middle):
 
 
 @pytest.fixture(scope="module")
-def folder(ortho, names, tmp_path_factory):
+def folder(ortho, names, middle, tmp_path_factory):
     """An atlas of them, not to be changed."""
     folder = tmp_path_factory.mktemp("atlas") / "atlas"
     atlas = Atlas.create(str(folder), RECIPE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.prepare.calibrate.CROPS", 12)
         patch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
+        dem = write_dem(folder.parent / "dem.tif", middle, ground, half_m=900.0)
         for name in names:
-            put(atlas, name, built(ortho, name, folder.parent / "sheet.onav"))
+            terrain = {"dem": dem, "dem_datum": "msl"}
+            put(atlas, name, built(ortho, name, folder.parent / "sheet.onav", **terrain))
     return folder
+
+
+def ground(east_m, north_m):
+    return 200 + 0.1 * np.asarray(east_m) - 0.2 * np.asarray(north_m)
 
 
 def built(ortho, name, out, **request):
@@ -123,6 +130,18 @@ def test_a_map_cut_in_memory_is_the_one_that_is_written(folder, middle, cut):
     for name in cut.arrays:
         np.testing.assert_array_equal(made.arrays[name], cut.arrays[name])
     assert Localizer(made).registration is not None
+
+
+def test_terrain_is_that_of_the_sheets(cut, middle):
+    layer = TerrainLayer.of(cut)
+    assert (layer.info.name, layer.info.datum, layer.info.posting_m) == (
+        "dem.tif",
+        "MSL height",
+        25,
+    )
+    points = np.random.default_rng(0).uniform(-150, 150, (300, 2))
+    found = layer(*middle.latlon_from_en(points))
+    np.testing.assert_allclose(found, ground(*points.T), atol=0.2)  # two times rounded
 
 
 def sheet_file(atlas, name):

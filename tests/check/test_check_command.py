@@ -9,6 +9,7 @@ import pytest
 import rasterio
 from made_trials import lost, right
 
+from helpers import write_dem
 from orthonav.check import run as check_run
 from orthonav.check.outcome import Word
 from orthonav.check.request import CheckRequest
@@ -18,6 +19,7 @@ from orthonav.check.write import to_json
 from orthonav.cli import main
 from orthonav.errors import AreaError, CameraError, CheckError, MapFileError, MissingFileError
 from orthonav.geo.camera import Camera
+from orthonav.geo.frames import LocalFrame
 from orthonav.geo.route import Route
 from orthonav.mapfile import open_map
 
@@ -388,6 +390,29 @@ def test_the_height_of_a_route(run, unwritten, half_blank, route_path, tmp_path)
         )
         found.append(json.loads(done.out)["conditions"]["agl_m"])
     assert found == [150, 160]
+
+
+def test_heights_above_sea_need_a_terrain(run, unwritten, half_blank, frame, route_path, tmp_path):
+    """The heights of the route as written are never taken for heights above ground."""
+    route, out = tmp_path / "high.csv", tmp_path / "report"
+    lines = route_path.read_text().splitlines()
+    rows = zip(lines, [",home_m", ",120", ",120"], strict=True)
+    route.write_text("\n".join(line + add for line, add in rows) + "\n")
+    check = ("check", half_blank.map, "--route", route, "--out", out)
+    done = run(*check)
+    assert done.code == 1 and "above home, not above ground: give the terrain (--dem" in done.err
+    assert "Checked at 160 m above ground, as given." in run(*check, "--agl-m", 160).out
+    # The ground falls by 100 m from the first waypoint to the second.
+    dem = write_dem(tmp_path / "dem.tif", frame, lambda east, north: 300 - 0.4 * east + 0 * north)
+    over = run(*check, "--dem", dem, "--dem-datum", "msl")
+    assert (
+        "Checked at 120 m above ground, the lowest over the terrain of dem.tif (220 m" in over.out
+    )
+    far = write_dem(
+        tmp_path / "far.tif", LocalFrame(1, 1), lambda east, north: 0.1 * east + north * 0
+    )
+    done = run(*check, "--dem", far, "--dem-datum", "msl")
+    assert done.code == 1 and "the route lies outside the terrain" in done.err
 
 
 @pytest.mark.parametrize(

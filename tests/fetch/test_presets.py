@@ -10,6 +10,7 @@ from orthonav.fetch.options import ImageryOptions
 from orthonav.fetch.presets import CURRENT, PROTOCOLS, find_preset, presets
 from orthonav.fetch.sources import check_date, parse_source
 from orthonav.fetch.urls import checked_url
+from orthonav.imagery.datum import datum_of
 
 DOCUMENTATION = Path(__file__).parents[2] / "docs" / "imagery.md"
 LAYERS = [(p.name, layer.id) for p in presets().values() for layer in p.layers.values()]
@@ -37,7 +38,7 @@ def test_a_service_is_complete(name):
 def test_a_layer_is_complete(name, id_):
     preset = presets()[name]
     layer = preset.layers[id_]
-    assert "{" not in f"{layer}" and 0.05 <= layer.gsd_m <= 1
+    assert "{" not in f"{layer}" and 0.05 <= layer.gsd_m <= (1 if preset.datum is None else 30)
     assert layer.options.layer or preset.protocol == "stac"
     assert layer.options.empty in (None, "black", "white")
     assert 0 <= (layer.options.min_zoom or 0) <= (layer.options.max_zoom or 22) <= 22
@@ -55,6 +56,16 @@ def test_a_layer_is_complete(name, id_):
         and spec.provenance.date == layer.date
     )
     assert spec.options.layer == layer.options.layer
+
+
+def test_terrain_names_the_datum_of_its_heights():
+    terrain = {name: preset.datum for name, preset in presets().items() if preset.datum}
+    assert set(terrain) == {
+        "copernicus-dem", "nasadem", "usgs-3dep", "swissalti3d", "ign-terrain",
+    }  # fmt: skip
+    for name, datum in terrain.items():
+        assert not datum_of(datum).above_ellipsoid
+        assert parse_source(name, ImageryOptions()).provenance.datum == datum
 
 
 def test_express_layers_warn_that_they_are_no_other_date():

@@ -9,12 +9,19 @@ import rasterio
 import servers
 import terrain
 from pyproj import Transformer
+from rasterio.transform import Affine
 
 from orthonav.errors import FetchError
 from orthonav.fetch.client import Client
+from orthonav.fetch.options import ImageryOptions
+from orthonav.fetch.presets import find_preset
 from orthonav.fetch.remote import CHUNK, RemoteFile
+from orthonav.fetch.run import FetchRequest, fetch
+from orthonav.fetch.sources import parse_source
 from orthonav.fetch.write import Packing
 from orthonav.geo.area import Area
+from orthonav.geo.frames import LocalFrame
+from orthonav.imagery.terrain import open_dem
 
 UTM = "EPSG:32631"
 
@@ -255,10 +262,6 @@ def test_an_interface_with_a_search_in_pages(take, placed, catalogue):
 
 def test_signed_files(catalogue, tmp_path):
     """A query string that a signing service gives goes to the files' server, and nowhere else."""
-    from orthonav.fetch.options import ImageryOptions
-    from orthonav.fetch.run import FetchRequest, fetch
-    from orthonav.fetch.sources import parse_source
-
     url = []
     with servers.serving(searching(catalogue, url, [])) as server:
         url.append(server.url)
@@ -293,3 +296,54 @@ def test_invalid_catalogues_are_rejected(take, body, words):
     answer = servers.files({"/c.json": body})
     with servers.serving(answer) as server, pytest.raises(FetchError, match=words):
         take(f"stac:{server.url}/c.json", gsd_m=None)
+
+
+def heights(lat_deg, lon_deg):
+    """Metres: they rise to the north and to the east, and pass through 0."""
+    north, east = np.asarray(lat_deg) - terrain.LAT_DEG, np.asarray(lon_deg) - terrain.LON_DEG
+    return 40 + 0.1 * north * terrain.NORTH_M - 0.2 * east * terrain.EAST_M
+
+
+def test_a_terrain_preset_is_fetched_with_its_datum(catalogue, tmp_path, monkeypatch):
+    """Two files of heights in degrees, as those of Copernicus, with a hole."""
+    step = 1 / 3600
+    west = round(terrain.LON_DEG / step) * step
+    north = round(terrain.LAT_DEG / step) * step + 20 * step
+    found = {}
+    for name, first in (("west", west - 40 * step), ("east", west)):
+        col, row = np.meshgrid(np.arange(40) + 0.5, np.arange(40) + 0.5)
+        values = heights(north - row * step, first + col * step).astype(np.float32)
+        if name == "east":
+            values[18:20, 5:8] = -9999
+        raw, path = tmp_path / f"{name}.raw.tif", tmp_path / f"{name}.tif"
+        with rasterio.open(
+            raw, "w", driver="GTiff", width=40, height=40, count=1, dtype="float32",
+            crs="EPSG:4326", nodata=-9999, transform=Affine(step, 0, first, 0, -step, north),
+        ) as data:  # fmt: skip
+            data.write(values[None])
+            box = tuple(data.bounds)
+        rasterio.shutil.copy(raw, path, driver="COG", COMPRESS="DEFLATE")
+        found[f"/{name}.tif"] = path.read_bytes()
+        found[name] = terrain.item(name, f"./{name}.tif", box)
+    url, asked_for = [], []
+    with servers.serving(searching(found, url, asked_for)) as server:
+        url.append(server.url)
+        known = replace(
+            find_preset("copernicus-dem"),
+            url=f"{server.url}/api/", token_url=f"{server.url}/api/token",
+        )  # fmt: skip
+        monkeypatch.setattr("orthonav.fetch.sources.find_preset", lambda name: known)
+        spec = parse_source("copernicus-dem", ImageryOptions())
+        area = Area.from_bounds(terrain.bounds(300))
+        fetch(FetchRequest(spec, area, tmp_path / "dem.tif", margin_m=0, limits=servers.QUICK))
+    assert asked_for[0]["collections"] == ["cop-dem-glo-30"]
+    assert terrain.tags(tmp_path / "dem.tif")["ORTHONAV_VERTICAL_DATUM"] == "egm2008"
+    dem = open_dem(tmp_path / "dem.tif")  # its datum is not asked for
+    assert dem.datum.name == "EGM2008 height" and not dem.datum.above_ellipsoid
+    lat = terrain.LAT_DEG + np.linspace(-5, 5, 11) * step
+    lon = west - np.linspace(0.5, 8, 11) * step
+    np.testing.assert_allclose(dem(lat, lon), heights(lat, lon), atol=0.05)
+    hole = np.array([north - 19 * step]), np.array([west + 6.5 * step])
+    assert np.isnan(dem(*hole))
+    plane = dem.in_plane(LocalFrame(float(hole[0][0]), float(hole[1][0])), -5, 5, 10, 1, 1)
+    assert np.isnan(plane).all()

@@ -1,14 +1,22 @@
 """What comes from a real WMTS and WMS is the ground, in its place to a twentieth of a pixel."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import rasterio
 import servers
 import terrain
+from pyproj import Transformer
 
 from orthonav.errors import AreaError, FetchError
+from orthonav.fetch.options import ImageryOptions
+from orthonav.fetch.presets import find_preset
+from orthonav.fetch.run import FetchRequest, fetch
+from orthonav.fetch.sources import parse_source
 from orthonav.geo.area import Area
 from orthonav.imagery.source import open_source
+from orthonav.imagery.terrain import open_dem
 
 MAX_OFF_PX = 0.05
 
@@ -167,3 +175,56 @@ def test_an_area_outside_the_grid(mapproxy, take):
     area = Area.from_bounds((50.0, 46.0, 50.01, 46.01))
     with pytest.raises((AreaError, FetchError), match="outside"):
         take(f"wmts:{mapproxy}/service", layer="tiles", crs="EPSG:32631", area=area)
+
+
+CAPABILITIES = """<WMS_Capabilities version="1.3.0" xmlns="http://www.opengis.net/wms"
+ xmlns:xlink="http://www.w3.org/1999/xlink"><Service><Name>WMS</Name><Title>t</Title></Service>
+<Capability><Request><GetMap><Format>image/jpeg</Format><Format>image/x-bil;bits=32</Format>
+<DCPType><HTTP><Get><OnlineResource xlink:href="URL/map"/></Get></HTTP></DCPType></GetMap></Request>
+<Layer><Title>t</Title><CRS>EPSG:2154</CRS>
+<Layer><Name>ELEVATION.ELEVATIONGRIDCOVERAGE.HIGHRES</Name><Title>t</Title></Layer></Layer>
+</Capability></WMS_Capabilities>"""
+
+
+@pytest.mark.parametrize("broken", ["", "cut", "page"])
+def test_heights_of_a_wms(tmp_path, monkeypatch, broken):
+    """Raw numbers, as the preset of IGN asks for them; -99999 is no data."""
+    url = []
+
+    def answer(asked):
+        if asked.query["REQUEST"] == "GetCapabilities":
+            return servers.Answer(CAPABILITIES.replace("URL", url[0]).encode(), kind="text/xml")
+        assert asked.query["FORMAT"] == "image/x-bil;bits=32" and asked.query["CRS"] == "EPSG:2154"
+        west, south, east, north = (float(v) for v in asked.query["BBOX"].split(","))
+        width, height = int(asked.query["WIDTH"]), int(asked.query["HEIGHT"])
+        x = west + (np.arange(width) + 0.5) * (east - west) / width
+        y = north - (np.arange(height) + 0.5) * (north - south) / height
+        values = (0.01 * (x - 700_000)[None, :] + 0.02 * (y - 6_600_000)[:, None]).astype("<f4")
+        values[abs(y - middle_y) < 8] = -99999
+        body = values.tobytes()
+        if broken == "page":
+            return servers.Answer(b"<html>busy</html>", kind="text/html")
+        return servers.Answer(body[:-4] if broken else body, kind="image/x-bil;bits=32")
+
+    middle_x, middle_y = Transformer.from_crs(4326, 2154, always_xy=True).transform(
+        terrain.LON_DEG, terrain.LAT_DEG
+    )
+    with servers.serving(answer) as server:
+        url.append(server.url)
+        known = replace(find_preset("ign-terrain"), url=server.url)
+        monkeypatch.setattr("orthonav.fetch.sources.find_preset", lambda name: known)
+        area = Area.from_bounds(terrain.bounds(60))
+        spec = parse_source("ign-terrain", ImageryOptions(tile_px=128))
+        request = FetchRequest(spec, area, tmp_path / "dem.tif", margin_m=0, limits=servers.QUICK)
+        if broken:
+            with pytest.raises(FetchError, match="tiles failed"):
+                fetch(request)
+            return
+        fetch(request)
+    dem = open_dem(tmp_path / "dem.tif")
+    assert dem.datum.name == "NGF-IGN69 height" and dem.gsd_m == pytest.approx(5, rel=0.01)
+    x, y = middle_x + np.array([-40.0, 31.5]), middle_y + np.array([-30.0, 44.0])
+    lon, lat = Transformer.from_crs(2154, 4326, always_xy=True).transform(x, y)
+    expected = 0.01 * (x - 700_000) + 0.02 * (y - 6_600_000)
+    np.testing.assert_allclose(dem(lat, lon), expected, atol=0.02)
+    assert np.isnan(dem(np.array([terrain.LAT_DEG]), np.array([terrain.LON_DEG])))

@@ -30,9 +30,10 @@ from fake_autopilot import (
 )
 
 from orthonav.cli import main
-from orthonav.errors import CameraError
+from orthonav.errors import CameraError, MapChangedError, MapFileError
 from orthonav.flight.fixes import result_from_json
 from orthonav.flight.gnss import GnssSample, fault_of, gnss_of, write_gnss
+from orthonav.flight.heights import FlownHeights
 from orthonav.geo.camera import Camera
 from orthonav.onboard import cameras
 from orthonav.onboard import state as states
@@ -517,6 +518,46 @@ def test_recorded_telemetry_needs_no_autopilot(begin):
     grey = flight.rng.integers(0, 256, (240, 320), np.uint8)
     flight.newest.put(CameraImage(1, "a", flight.time.now_ns, 5, grey, telemetry=telemetry))
     assert reason_of(flight.runner.step(0)) == "fix" and flight.locator.seen == [telemetry]
+
+
+def test_a_map_with_terrain_gives_heights_above_ground(begin):
+    """Also the first view, by its start position, and where only a height above sea is known."""
+    north_deg = 10.0  # metres of terrain per degree
+
+    def terrain(lat_deg, lon_deg):
+        return 300.0 + north_deg * (np.asarray(lat_deg) - 48.0)
+
+    lat, lon = np.linspace(47.0, 49.0, 9), np.full(9, 2.0)
+    for prior, agl_m in ((None, 100.0), (Prior(49.0, 2.0, 5.0), 90.0)):
+        heights = FlownHeights(terrain, (lat, lon))
+        flight = begin(recorded=True, heights=heights, start=[prior].pop)
+        telemetry = Telemetry(5, 1.0, 2.0, 3.0, math.nan, amsl_m=400.0)
+        grey = flight.rng.integers(0, 256, (240, 320), np.uint8)
+        flight.newest.put(CameraImage(1, "a", flight.time.now_ns, 5, grey, telemetry=telemetry))
+        assert reason_of(flight.runner.step(0)) == "fix"
+        (seen,) = flight.locator.seen
+        assert seen.agl_m == pytest.approx(agl_m, abs=0.1) and seen.amsl_m == 400.0
+        (view,) = flight.log.named("view")
+        assert view[3] == seen  # a replay of the log has the height that was flown with
+
+
+@pytest.mark.parametrize(
+    "error, reason",
+    [(MapFileError("damaged"), "map_damaged"), (MapChangedError("cut"), "map_file_changed")],
+)
+def test_terrain_that_cannot_be_read_gives_no_fix(begin, error, reason):
+    broken = []
+
+    def terrain(lat_deg, lon_deg):
+        if broken:
+            raise error
+        return np.zeros(np.shape(lat_deg))
+
+    flight = begin(heights=FlownHeights(terrain, (np.zeros(2), np.zeros(2))))
+    flight.runner.options.heights.observe(UTC_NS + flight.time.now_ns, fix(), "tracking")
+    broken.append(True)
+    assert [reason_of(result) for result in flight.views(2)] == [reason] * 2
+    assert flight.locator.seen == []
 
 
 def test_the_flight_ends_with_the_recording(flight):

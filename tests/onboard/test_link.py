@@ -88,6 +88,21 @@ def test_telemetry_at_an_exposure(flying):
     assert flying.link.covers(exposed) and not flying.link.covers(flying.time.now_ns + S)
 
 
+def test_heights_above_sea_level(flying):
+    now = flying.boot_ns()
+    say = flying.autopilot.say
+    flying.hear(flying.autopilot.attitude(now))
+    flying.hear(say("global_position_int", now // MS, 0, 0, 0, 60_000, 0, 0, 0, 0))
+    state = flying.link.state_at(flying.time.now_ns)
+    assert state.home_m == state.height_m == 60.0 and math.isnan(state.amsl_m)  # 0 is "unknown"
+    flying.hear(say("altitude", now // 1000, 0, 640.0, 0, 55.0, -1001.0, 0))
+    assert flying.link.state_at(flying.time.now_ns).amsl_m == 640.0
+    flying.time.go(0.02)
+    now = flying.boot_ns()
+    flying.hear(say("global_position_int", now // MS, 0, 0, 655_000, 60_000, 0, 0, 0, 0))
+    assert flying.link.state_at(flying.time.now_ns).amsl_m == 655.0
+
+
 def test_heights_of_every_message(flying):
     now = flying.boot_ns()
     flying.hear(flying.autopilot.attitude(now, roll_deg=10.0))

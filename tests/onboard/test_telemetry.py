@@ -221,3 +221,30 @@ def test_a_queue_that_empties_is_no_jump():
     for number in range(150):
         sync.heard(10 * S + number * MS, 7 * S + number * 20 * MS + OFFSET_NS)
     assert (sync.jumps, sync.offset_ns) == (0, before)
+
+
+def test_heights_above_sea_and_home_are_apart_from_the_one_above_ground():
+    buffer = TelemetryBuffer()
+    buffer.add_height("amsl", 0, 700.0)
+    state = buffer.at(0)
+    assert math.isnan(state.height_m) and state.amsl_m == 700.0
+    telemetry = state.telemetry(0)
+    assert (telemetry.amsl_m, telemetry.home_m) == (700.0, None) and math.isnan(telemetry.agl_m)
+    buffer.add_height("relative", 0, 90.0)
+    telemetry = buffer.at(0).telemetry(0)
+    assert telemetry.agl_m == telemetry.home_m == 90.0  # level ground
+    buffer.add_height("distance", 0, 60.0)
+    telemetry = buffer.at(0).telemetry(0)
+    assert (telemetry.agl_m, telemetry.home_m, telemetry.amsl_m) == (60.0, 90.0, 700.0)
+
+
+def test_a_second_height_above_sea_stands_in_for_the_first():
+    buffer = TelemetryBuffer()
+    buffer.add_height("altitude", 0, 650.0)
+    assert buffer.at(0).amsl_m == 650.0
+    buffer.add_height("amsl", 0, 700.0)
+    assert buffer.at(0).amsl_m == 700.0
+    only = TelemetryBuffer(heights=("home",))
+    only.add_height("amsl", 0, 700.0)
+    only.add_height("altitude", 0, 700.0)
+    assert math.isnan(only.at(0).amsl_m)

@@ -37,6 +37,7 @@ from orthonav.files import Progress, no_progress
 from orthonav.geo.area import Extent
 from orthonav.geo.route import Route
 from orthonav.imagery.mosaic import Mosaic
+from orthonav.imagery.terrain import open_dem
 from orthonav.prepare.build import BuildRequest, build_map
 from orthonav.prepare.layout import rounded_gsd_m
 
@@ -63,6 +64,8 @@ class AtlasRequest:
     imagery is the area.
     `replace`: rebuild sheets that were made otherwise, instead of refusing them.
     `index`: also make the index of the coarse tiles.
+    `dem`, `dem_datum`: terrain model of which sheets get a terrain layer where it has heights, and
+    what its heights count from.
     """
 
     url: str
@@ -73,6 +76,8 @@ class AtlasRequest:
     band_m: float | None = None
     replace: bool = False
     index: bool = True
+    dem: Path | None = None
+    dem_datum: str | None = None
 
 
 def build_atlas(
@@ -100,6 +105,8 @@ def build_atlas(
         bounds_deg=request.bounds_deg,
         route=request.route,
         band_m=request.band_m,
+        dem=_checked_dem(request),
+        dem_datum=request.dem_datum,
     )
     _require_same_versions(runner)
     atlas = Atlas.open_or_create(request.url, recipe)
@@ -124,6 +131,13 @@ def build_atlas(
     result.finish_error = _finish(atlas, index, progress)
     result.wall_s = time.monotonic() - started_s
     return result
+
+
+def _checked_dem(request: AtlasRequest) -> Path | None:
+    """The terrain model, opened once before the work; raises as `open_dem`."""
+    if request.dem is None:
+        return None
+    return open_dem(Path(request.dem).absolute(), request.dem_datum).path
 
 
 def recipe_for(request: AtlasRequest, mosaic: Mosaic) -> AtlasRecipe:
@@ -158,7 +172,8 @@ def build_sheet(task: SheetTask) -> SheetResult:
     if differences := version_differences(task.made_by, versions()):
         raise WorkerError(_other_versions("this worker", differences))
     mosaic = Imagery(Mosaic.open(task.orthos)).under(task.bounds_deg, margin_m(task.recipe))
-    if request_digest(task.recipe, mosaic, task.made_by) != task.request:
+    wanted = request_digest(task.recipe, mosaic, task.made_by, task.dem, task.dem_datum)
+    if wanted != task.request:
         raise AtlasError("the imagery has changed, or is not the same on all machines")
     with scratch_folder() as folder:
         tiles, area_km2, size_bytes = _built(task, mosaic, folder)
@@ -184,6 +199,9 @@ def _built(task: SheetTask, mosaic: Mosaic, folder: Path) -> tuple[int, float, i
         out=files["map"],
         bounds_deg=task.bounds_deg,
         workers=1,
+        dem=task.dem,
+        dem_datum=task.dem_datum,
+        dem_needed=False,
         cells=True,
         **recipe,
     )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from orthonav.atlas.catalog import Atlas
 from orthonav.atlas.coverage import box_deg, check_covered, check_shown, require_sheets
 from orthonav.atlas.cut_sheets import CutSheet, opened_sheets, pooled_manifest, recipes
+from orthonav.atlas.cut_terrain import cut_terrain
 from orthonav.atlas.warp import Warp, joined_cells, joined_grey
 from orthonav.cores import usable_cores
 from orthonav.embed.cells import CellLayout
@@ -186,7 +187,9 @@ def _learnt(
     centres = grid.centres_en_m(tiles_rc)
     grey, grey_parts = cutter.layer.finish()
     area_km2 = round(len(tiles_rc) * grid.stride_m**2 / 1e6, 6)
-    sheet = SheetInfo(area.frame, grid, len(tiles_rc), area_km2, grey)
+    made = cut_terrain(members, area, grid)
+    terrain, terrain_parts = (None, {}) if made is None else made.content
+    sheet = SheetInfo(area.frame, grid, len(tiles_rc), area_km2, grey, terrain)
     manifest = pooled_manifest(members, _shares(area, centres, members), sheet)
     return manifest, {
         "sheet0/centres_en_m": centres.astype(np.float32),
@@ -194,6 +197,7 @@ def _learnt(
         "sheet0/preview_jpeg": cutter.preview.jpeg(),
         **{f"embed/{name}": array for name, array in embedder.parts().items()},
         **grey_parts,
+        **terrain_parts,
     }
 
 

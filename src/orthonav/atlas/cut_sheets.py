@@ -21,6 +21,7 @@ from orthonav.geo.grid import TileGrid
 from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import Manifest, SheetInfo
 from orthonav.mapfile.reader import MapFile, open_map
+from orthonav.mapfile.terrain import TerrainLayer
 from orthonav.prepare.cellparts import StoredCells
 from orthonav.variants import variant_from_recipe
 
@@ -31,11 +32,12 @@ REBUILD = "rebuild it with this program (orthonav atlas build ATLAS .. --replace
 
 @dataclass(frozen=True, eq=False)
 class CutSheet:
-    """A sheet that a map is cut from: its item, its manifest and its pixels."""
+    """A sheet that a map is cut from: its item, manifest, pixels and, if it has one, terrain."""
 
     sheet: Sheet
     manifest: Manifest
     source: SheetSource
+    terrain: TerrainLayer | None = None
 
 
 def opened_sheets(atlas: Atlas, sheets: Sequence[Sheet], grid: TileGrid) -> list[CutSheet]:
@@ -45,7 +47,8 @@ def opened_sheets(atlas: Atlas, sheets: Sequence[Sheet], grid: TileGrid) -> list
         try:
             opened = open_map(atlas.path(sheet, "map"))
             _check_alike(opened, sheet, grid, found[0].manifest if found else None)
-            found.append(CutSheet(sheet, opened.manifest, _source(opened, sheet)))
+            terrain = TerrainLayer.of(opened)
+            found.append(CutSheet(sheet, opened.manifest, _source(opened, sheet), terrain))
         except (MapFileError, MissingFileError) as error:
             raise AtlasError(f"sheet {sheet.id} is damaged, {REBUILD}: {error}") from error
     return found

@@ -46,6 +46,7 @@ class SheetTask:
     `request`: digest of what the sheet depends on (`request_digest`).
     `imagery`, `dates`: description of the orthophotos for the catalogue.
     `made_by`: the versions that must make it (`versions`).
+    `dem`, `dem_datum`: terrain model and what its heights count from, as for a map.
     """
 
     sheet: str
@@ -57,6 +58,8 @@ class SheetTask:
     imagery: tuple[Mapping[str, Any], ...]
     dates: tuple[str, ...]
     made_by: Mapping[str, str]
+    dem: Path | None = None
+    dem_datum: str | None = None
 
 
 def versions() -> dict[str, str]:
@@ -88,6 +91,8 @@ def plan_sheets(
     bounds_deg: Extent | None = None,
     route: Route | None = None,
     band_m: float | None = None,
+    dem: Path | None = None,
+    dem_datum: str | None = None,
 ) -> list[SheetTask]:
     """A task for each sheet of an area that imagery may touch, from south to north, west to east.
 
@@ -111,17 +116,25 @@ def plan_sheets(
                 atlas=url,
                 orthos=_orthos_of(orthos, mosaic, part),
                 recipe=recipe,
-                request=request_digest(recipe, part, made_by),
+                request=request_digest(recipe, part, made_by, dem, dem_datum),
                 imagery=part.describe(),
                 dates=tuple(sorted({s.date for s in part.sources if s.date is not None})),
                 made_by=made_by,
+                dem=dem,
+                dem_datum=dem_datum,
             )
         )
     return tasks
 
 
-def request_digest(recipe: AtlasRecipe, part: Mosaic, made_by: Mapping[str, str]) -> str:
-    """Digest of what a sheet depends on: recipe, versions, and the imagery under it.
+def request_digest(
+    recipe: AtlasRecipe,
+    part: Mosaic,
+    made_by: Mapping[str, str],
+    dem: Path | None = None,
+    dem_datum: str | None = None,
+) -> str:
+    """Digest of what a sheet depends on: recipe, versions, the imagery under it, and the terrain.
 
     Each file counts with its name, size and second of change, in the order in which files cover
     each other; its folder does not count, as it may differ between machines.
@@ -131,7 +144,11 @@ def request_digest(recipe: AtlasRecipe, part: Mosaic, made_by: Mapping[str, str]
         for source in part.sources
         for name, size, changed_ns in source.stamp
     ]
-    return digest([recipe.to_plain(), dict(made_by), part.common_stamp, stamps])
+    depends: list[Any] = [recipe.to_plain(), dict(made_by), part.common_stamp, stamps]
+    if dem is not None:
+        found = dem.stat()
+        depends.append([dem.name, found.st_size, found.st_mtime_ns // 10**9, dem_datum])
+    return digest(depends)
 
 
 def margin_m(recipe: AtlasRecipe) -> float:

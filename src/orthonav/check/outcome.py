@@ -221,6 +221,7 @@ class Verdict:
 class CheckedInputs:
     """What was checked, as text for reports; empty where it does not apply.
 
+    `height`: where the height above ground comes from.
     `terms`: attribution and licence of each imagery source.
     """
 
@@ -229,6 +230,7 @@ class CheckedInputs:
     recipe: str = ""
     other_date: str = ""
     route_name: str = ""
+    height: str = ""
     command: str = ""
     version: str = ""
     terms: tuple[str, ...] = ()

@@ -8,11 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from orthonav.cli.common import add_area, add_orthos, print_json, progress
+from orthonav.cli.common import add_area, add_dem, add_orthos, print_json, progress
 
 log = logging.getLogger(__name__)
 
-EVERYDAY = ("--route", "--bounds", "--band-m", "--gsd-m", "--other-date", "--work", "--json")
+EVERYDAY = (
+    *("--route", "--bounds", "--band-m", "--gsd-m", "--other-date", "--dem", "--work", "--json"),
+)
 RECIPE = (
     "gsd_m",
     "tile_px",
@@ -43,6 +45,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="orthophoto of the same area at another date, from which confidence and covariance "
         "are calibrated; it does not become part of the map; may be repeated",
     )
+    add_dem(parser, "which gives the map a terrain layer")
     parser.add_argument(
         "--work",
         type=Path,
@@ -127,6 +130,8 @@ def run(options: argparse.Namespace) -> int:
         other_dates=options.other_date,
         work=options.work,
         workers=options.workers,
+        dem=options.dem,
+        dem_datum=options.dem_datum,
         **recipe_of(options),
     )
     with progress(options) as shown:

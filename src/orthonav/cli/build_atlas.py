@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.build import add_recipe, recipe_of, reporter
-from orthonav.cli.common import add_area, add_orthos, print_json, progress
+from orthonav.cli.common import add_area, add_dem, add_orthos, print_json, progress
 
 if TYPE_CHECKING:
     from orthonav.atlas.build_report import BuildReport
@@ -32,6 +32,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--sheet-km", type=float, metavar="KM", help="greatest width of a sheet (default 10)"
     )
     add_recipe(sheets)
+    add_dem(sheets, "which gives sheets a terrain layer, and maps that are cut out of them")
     sheets.add_argument(
         "--replace", action="store_true", help="rebuild sheets that were made otherwise"
     )
@@ -78,6 +79,8 @@ def run(options: argparse.Namespace) -> int:
         band_m=options.band_m,
         replace=options.replace,
         index=options.index,
+        dem=options.dem,
+        dem_datum=options.dem_datum,
     )
     try:
         with _runner(options) as runner, progress(options) as shown:

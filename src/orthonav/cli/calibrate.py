@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import print_json, progress
+from orthonav.cli.heights import dem_of, flight_heights
 from orthonav.cli.source import add_source, open_source
 
 if TYPE_CHECKING:
@@ -73,26 +74,33 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.records import Prior
 
     if options.latency:
+        if options.dem is not None:
+            raise FlightError("--latency uses the heights of the log: leave out --dem")
         _run_latency(options)
         return
     if not 0 < options.gnss_std_m < 1e5:
         raise FlightError(f"--gnss-std-m must be above 0, got {options.gnss_std_m}")
-    flight = open_source(options.flight, options)
+    dem, opened = dem_of(options), open_map(options.map)
+    over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
+    flight = open_source(options.flight, options, over_terrain=over_terrain)
     places = read_truth(options.gnss_positions) if options.gnss_positions else {}
     priors = {frame: Prior(*place, options.gnss_std_m) for frame, place in places.items()}
     views = (
         WithTelemetry(v, replace(v.telemetry, prior=priors.get(v.frame))) for v in flight.views
     )
     tracker = Tracker(
-        Localizer(open_map(options.map)),
+        Localizer(opened),
         heading_known=options.heading == "known",
         use_prior=bool(options.gnss_positions),
         every_prior=bool(options.gnss_positions),
         smooth=True,
     )
     results = []
+    heights = flight_heights(options, opened, flight, dem)
     with progress(options) as shown:
-        for result in localize_flight(tracker, flight, skip_bad_images=True, views=views):
+        for result in localize_flight(
+            tracker, flight, skip_bad_images=True, views=views, heights=heights
+        ):
             results.append(result)
             if flight.expected:
                 shown("calibrate", min(1.0, len(results) / flight.expected))

@@ -3,21 +3,31 @@
 import argparse
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthonav.cli.common import ROUTE_HELP, print_json, progress
+from orthonav.cli.common import ROUTE_HELP, add_dem, print_json, progress
 
 EVERYDAY = (
-    *("--route", "--band-m", "--other-date", "--camera", "--agl-m"),
+    *("--route", "--band-m", "--other-date", "--camera", "--agl-m", "--dem"),
     *("--yaw-std-deg", "--heading", "--prior-std-m", "--prior", "--quick", "--json"),
 )
+
+_REFERENCES = {
+    None: "an unknown reference",
+    "agl": "ground",
+    "home": "home",
+    "amsl": "sea level",
+    "hae": "the ellipsoid",
+}
 
 if TYPE_CHECKING:
     from orthonav.check.outcome import CheckedInputs
     from orthonav.check.request import CheckRequest
     from orthonav.geo.camera import Camera
     from orthonav.geo.route import Route
+    from orthonav.geo.terrain import LegProfile
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -51,6 +61,10 @@ def add(parser: argparse.ArgumentParser) -> None:
         type=float,
         help="height above ground (default: the lowest of the route; without one, the height from "
         "which the shorter side of a view covers a tile of the map)",
+    )
+    add_dem(
+        parser,
+        "for routes whose heights are above sea level or home (default: the terrain of the map)",
     )
     _add_errors(parser)
     _add_effort(parser)
@@ -165,9 +179,7 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
     camera: Camera = DEFAULT_CAMERA
     if options.camera is not None:
         camera = read_camera_file(options.camera)
-    agl_m = options.agl_m
-    if agl_m is None and route is not None:
-        agl_m = _lowest_agl_m(route)
+    agl_m, origin = _agl_m(options, route)
     return CheckRequest(
         map_path=options.map,
         route=route,
@@ -186,16 +198,64 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         extras=not options.quick,
         workers=options.workers,
         seed=options.seed,
-        about=_checked_inputs(options, route),
+        about=replace(_checked_inputs(options, route), height=origin),
     )
 
 
-def _lowest_agl_m(route: "Route") -> float | None:
-    """Lowest height above ground of a route, take-off and landing excluded."""
+def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | None, str]:
+    """Height above ground to check at, None for that of a tile, and where it comes from.
+
+    Raises `CheckError` where the heights of the route are not above ground and no terrain is known.
+    """
+    from orthonav.errors import CheckError
     from orthonav.geo.terrain import LANDING_M
 
-    found = [each for each in route.heights if each is not None and each.frame == "agl"]
-    return min((each.height_m for each in found if each.height_m >= LANDING_M), default=None)
+    if options.dem_datum is not None and options.dem is None:
+        raise CheckError("--dem-datum is that of a terrain model: give --dem too")
+    if options.agl_m is not None:
+        return options.agl_m, "as given"
+    heights = [] if route is None else [each for each in route.heights if each is not None]
+    if route is None or not heights:
+        return None, "from which a view covers a tile of the map"
+    frames = {each.frame for each in heights}
+    if frames == {"agl"}:
+        found, where = [each.height_m for each in heights], "of the route"
+    else:
+        legs, name = _profile(options, route)
+        if not legs:
+            named = sorted(_REFERENCES[frame] for frame in frames)
+            raise CheckError(
+                f"heights of the route are above {', '.join(named)}, not above ground: give the "
+                "terrain (--dem FILE, or a map built with --dem) or the height (--agl-m)"
+            )
+        found, where = [height for leg in legs for height in leg.agl_m], f"over {name}"
+    flown = [height for height in found if height >= LANDING_M]
+    if not flown:
+        raise CheckError(
+            f"the route stays below {LANDING_M:.0f} m above ground ({max(found):.0f} m at most): "
+            "check its heights, or give --agl-m"
+        )
+    low_m, high_m = min(flown), max(flown)
+    return low_m, f"the lowest {where}" + (f" ({high_m:.0f} m at most)" * (high_m > low_m + 1))
+
+
+def _profile(options: argparse.Namespace, route: "Route") -> tuple[list["LegProfile"], str]:
+    """Heights above ground along a route, and the terrain in words; none without a terrain."""
+    from orthonav.cli.heights import dem_for_route
+    from orthonav.errors import CheckError, RouteError
+    from orthonav.geo.terrain import profile
+    from orthonav.mapfile import open_map
+    from orthonav.mapfile.terrain import TerrainLayer
+
+    dem = dem_for_route(options, route)
+    terrain = TerrainLayer.of(open_map(options.map)) if dem is None else dem
+    if terrain is None:
+        return [], ""
+    name = "the terrain of the map" if dem is None else f"the terrain of {options.dem.name}"
+    try:
+        return profile(route, (0.0,) * route.legs, None, 0.0, terrain), name
+    except RouteError as error:
+        raise CheckError(f"{error} ({name}); or give --agl-m") from error
 
 
 def _checked_inputs(options: argparse.Namespace, route: "Route | None") -> "CheckedInputs":

@@ -82,6 +82,22 @@ def add_area(parser: argparse._ActionsContainer, group: Any) -> None:
     )
 
 
+def add_dem(parser: argparse._ActionsContainer, effect: str) -> None:
+    """Add `--dem` and `--dem-datum`."""
+    parser.add_argument(
+        "--dem",
+        type=Path,
+        metavar="FILE",
+        help=f"terrain model (any raster that GDAL reads), {effect}",
+    )
+    parser.add_argument(
+        "--dem-datum",
+        metavar="NAME",
+        help="what its heights count from, where it does not state it: egm96, egm2008, msl, "
+        "ellipsoid or EPSG:NUMBER of a vertical system",
+    )
+
+
 def print_json(plain: Any) -> None:
     """Print one JSON document on stdout."""
     print(json.dumps(plain, indent=1, allow_nan=False))

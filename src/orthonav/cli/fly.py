@@ -27,7 +27,7 @@ EVERYDAY = (
     "--log",
 )
 SEND = ("global-position", "gps-input", "odometry", "vision", "external-position")
-HEIGHTS = ("distance", "terrain", "home", "relative")
+HEIGHTS = ("distance", "terrain", "amsl", "home", "relative")
 
 
 def numbers(count: int, expected: str) -> Callable[[str], tuple[float, ...]]:

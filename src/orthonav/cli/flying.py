@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from orthonav.cli.heights import map_heights
 from orthonav.cli.signed import checked_signature
 from orthonav.confidence.accept import Acceptance
 from orthonav.errors import CameraError, OutputError, VariantError
@@ -69,6 +70,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
         localizer, heading_known=heading_known, model=model_of(mount) if mount else None
     )
     locator: Locator = MountCorrected(tracker, mount) if mount else tracker
+    heights = map_heights(opened, take_off=tuple(options.start) if options.start else None)
     link = _link(options, clocks)
     source, graph = _inputs(options, clocks, link, camera, stopping, stack, localizer, least)
     camera = camera or source.wait_for_camera()
@@ -92,6 +94,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     fly = FlyOptions(
         mount_deg=tuple(options.mount_deg),
         mount=mount,
+        heights=heights,
         heading_known=heading_known,
         deadline_s=options.deadline_ms / 1e3,
         telemetry_wait_s=options.telemetry_wait_ms / 1e3,

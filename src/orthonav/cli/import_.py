@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from orthonav.cli.common import print_json, progress
+from orthonav.cli.heights import dem_of, geoid_for
 from orthonav.cli.source import add_source, open_source
 
 log = logging.getLogger(__name__)
@@ -17,6 +18,7 @@ EVERYDAY = (
     "--time-offset-s",
     "--mount-deg",
     "--rate-hz",
+    "--dem",
     "--json",
 )
 
@@ -45,15 +47,26 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Import and print a summary."""
-    from orthonav.sources import import_flight
+    from orthonav.sources import OverTerrain, import_flight
 
-    recording = open_source(options.source, options)
+    dem = dem_of(options)
+    recording = open_source(options.source, options, over_terrain=dem is not None)
+    over = None
+    if dem is not None:
+        over = OverTerrain(dem, f"the terrain of {options.dem.name}", geoid_for(recording))
+        recording = over.recording(recording)
     with progress(options) as shown:
         done = import_flight(
             recording, options.out, options.jpeg_quality, lambda share: shown("import", share)
         )
     if done.broken:
         log.warning("%d views left out, the first: %s", done.broken, done.first_broken)
+    if over is not None and over.without:
+        log.warning(
+            "%d views have no height above ground: no height or no position was recorded, or it "
+            "lies over a hole of the terrain, or outside it",
+            over.without,
+        )
     if done.complete < done.views:
         log.warning(
             "%d of %d views lack heading, pitch, roll or height",

@@ -44,6 +44,7 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
         "radius_m": manifest.radius_m,
         "calibrated": manifest.confidence is not None,
         "registration": _registration(manifest),
+        "terrain": _terrain(manifest),
         "sheets": [
             {
                 "centre_lat_deg": sheet.frame.lat_deg,
@@ -93,6 +94,28 @@ def _registration(manifest: "Manifest") -> dict[str, Any] | None:
     }
 
 
+def _terrain(manifest: "Manifest") -> dict[str, Any] | None:
+    """Heights and size of the terrain layer of the first sheet; None without one."""
+    from orthonav.mapfile.terrain import terrain_part_names
+
+    info = manifest.sheets[0].terrain
+    if info is None:
+        return None
+    parts = [manifest.parts[name] for name in terrain_part_names(0) if name in manifest.parts]
+    size = sum(_part_bytes(part) for part in parts)
+    ground_km2 = info.known * info.posting_m**2 / 1e6
+    return {
+        "low_m": info.low_m,
+        "high_m": info.high_m,
+        "posting_m": info.posting_m,
+        "name": info.name,
+        "datum": info.datum,
+        "bytes": size,
+        "ground_km2": round(ground_km2, 4),
+        "mb_per_km2": round(size / 1e6 / ground_km2, 5) if ground_km2 > 0 else None,
+    }
+
+
 def _bounds_deg(sheet: Any) -> list[float]:
     """West, south, east, north of the outer tile centres in degrees."""
     import numpy as np
@@ -124,6 +147,7 @@ def summary_text(plain: dict[str, Any]) -> str:
             f"{sheet['centre_lon_deg']:.6f}"
         )
     lines.append(f"grey       {_registration_text(plain['registration'])}")
+    lines += _terrain_lines(plain["terrain"])
     for source in plain["imagery"]:
         dates = [source[key] for key in ("date_from", "date") if source.get(key)]
         files = f"{source['files']} files  " if source.get("files") else ""
@@ -150,6 +174,18 @@ def _registration_text(layer: dict[str, Any] | None) -> str:
         f"per km2 of ground, {layer['levels']} levels, 1/{layer['raw_ratio'] or 0:.0f} of the raw "
         "orthophoto"
     )
+
+
+def _terrain_lines(layer: dict[str, Any] | None) -> list[str]:
+    """The terrain layer in a line; none without one."""
+    if layer is None:
+        return []
+    printable = "".join(c for c in f"{layer['name']}, {layer['datum']}" if c.isprintable())
+    return [
+        f"terrain    {layer['low_m']:.0f} to {layer['high_m']:.0f} m above the sea every "
+        f"{layer['posting_m']:g} m, {layer['bytes'] / 1e6:.3f} MB, {layer['mb_per_km2'] or 0:.4f} "
+        f"MB per km2 ({printable})"
+    ]
 
 
 def recipe_text(recipe: dict[str, Any]) -> str:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from orthonav.cli.common import print_json, progress
 from orthonav.cli.flown import compare_with_flight, take_flown
+from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
 from orthonav.cli.needs import require_extras
 from orthonav.cli.signed import add_signature, checked_signature
 from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
@@ -23,6 +24,7 @@ EVERYDAY = (
     "--mount",
     "--atlas",
     "--camera",
+    "--dem",
     "--json",
 )
 
@@ -139,11 +141,14 @@ def _on_map(options: argparse.Namespace) -> None:
     if options.lag is not None and not (options.smooth and options.lag >= 0):
         raise VariantError("--lag needs --smooth and a number of views, 0 or more")
     signature = checked_signature(options)
-    flight = open_source(options.flight, options)
+    dem = dem_of(options)
+    opened = open_map(options.map, signature.manifest_sha256 if signature else None)
+    over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
+    flight = open_source(options.flight, options, over_terrain=over_terrain)
     mount = take_flown(options, flight)
     accept = Acceptance.parse(options.accept) if options.accept else None
     localizer = Localizer(
-        open_map(options.map, signature.manifest_sha256 if signature else None),
+        opened,
         registration=options.registration == "on",
         position=check_rule(options.position),
     )
@@ -166,9 +171,14 @@ def _on_map(options: argparse.Namespace) -> None:
     if mount:
         locator = MountCorrected(locator, mount)
     results = []
+    heights = flight_heights(options, opened, flight, dem)
     with progress(options) as shown:
         for result in localize_flight(
-            locator, flight, skip_bad_images=options.skip_bad_images, accept=accept
+            locator,
+            flight,
+            skip_bad_images=options.skip_bad_images,
+            accept=accept,
+            heights=heights,
         ):
             results.append(result)
             if flight.expected:
@@ -195,7 +205,10 @@ def _on_atlas(options: argparse.Namespace) -> None:
 
     asked = [
         name
-        for name in ("track", "smooth", "mount", "as_flown", "require_signed", "not_before", "lag")
+        for name in (
+            *("track", "smooth", "mount", "as_flown", "require_signed", "not_before", "lag"),
+            *("dem", "dem_datum"),
+        )
         if getattr(options, name) not in (None, False)
     ]
     asked += ["position"] if options.position != "peak" else []
@@ -206,6 +219,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
     if accept and accept.criterion == "lowe_ratio":
         raise VariantError("--accept lowe_ratio needs a map and --registration off")
     flight = open_source(options.flight, options)
+    say_assumed_heights(flight)
     results = []
     with TileSearch(Atlas.open(options.map)) as search, progress(options) as shown:
         if search.unknown:

@@ -16,7 +16,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "verify": ("signing",),
     "view": ("web",),
     # Only with these options or inputs; the part that needs it says so.
-    "plan --dem": ("geo",),
+    "plan, import, localize, calibrate --dem": ("geo",),
     "build --edges segments": ("segments",),
     "build --method autoencoder, triplet or bovw": ("train",),
     "atlas build, atlas index": ("atlas",),

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import add_area, print_json
+from orthonav.cli.common import add_area, add_dem, print_json
 
 EVERYDAY = (
     *("--route", "--bounds", "--band-m", "--camera", "--agl-m", "--speed-mps", "--dem"),
@@ -48,12 +48,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         default=True,
         help="plan a map without the registration layer",
     )
-    parser.add_argument(
-        "--dem",
-        type=Path,
-        metavar="TIF",
-        help="terrain model, metres above sea level: report height above ground and relief by leg",
-    )
+    add_dem(parser, "to report height above ground and relief by leg")
     parser.add_argument(
         "--out",
         type=Path,
@@ -72,6 +67,8 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.geo.terrain import terrain_cautions
 
     route = read_route(options.route) if options.route else None
+    if options.dem_datum is not None and options.dem is None:
+        raise RouteError("--dem-datum is that of a terrain model: give --dem too")
     if route is None and (options.band_m is not None or options.dem or options.out):
         raise RouteError("--band-m, --dem and --out need a route (--route)")
     if options.speed_mps is not None and not 0 < options.speed_mps < 10_000:
@@ -165,13 +162,14 @@ def _map_of(options: argparse.Namespace, view: "ViewPlan | None") -> tuple[float
 def _profile(
     options: argparse.Namespace, route: "Route", view: "ViewPlan | None"
 ) -> list["LegProfile"]:
-    from orthonav.cli.dem import read_dem
+    from orthonav.cli.heights import dem_for_route
     from orthonav.geo.terrain import profile
 
     bands_m = route.bands_m(options.band_m) or ()
     view_m = 0.0 if view is None else view.short_m
     agl_m = options.agl_m if view is None else view.agl_m
-    ground = read_dem(options.dem, route, max(bands_m) / 2 + view_m)
+    ground = dem_for_route(options, route)
+    assert ground is not None
     return profile(route, bands_m, agl_m, view_m, ground)
 
 

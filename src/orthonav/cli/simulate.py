@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from orthonav.cli.common import ROUTE_HELP, add_orthos, print_json, progress
+from orthonav.cli.common import ROUTE_HELP, add_dem, add_orthos, print_json, progress
+from orthonav.cli.heights import dem_of
 
 EVERYDAY = (
     *("--route", "--random", "--agl-m", "--spacing-m", "--airspeed-mps", "--camera"),
@@ -22,7 +23,11 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--agl-m",
         type=float,
-        help="height above ground (default: the shorter image side covers 256 px of imagery)",
+        help="height above ground (default: the shorter image side covers 256 px of imagery); with "
+        "--dem that at the first view of a route, which is flown at a constant altitude",
+    )
+    add_dem(
+        parser, "over which is flown; heights above sea level and take-off are reported, not ground"
     )
     parser.add_argument(
         "--spacing-m",
@@ -174,6 +179,7 @@ def run(options: argparse.Namespace) -> None:
         wind=None if options.wind_mps is None else Wind(options.wind_mps, from_deg),
         turn_radius_m=options.turn_radius_m,
         cloud_share=options.cloud_share,
+        terrain=dem_of(options),
         beyond=options.beyond,
         gnss=receiver_of(options.receiver) if options.receiver else None,
     )

@@ -5,6 +5,8 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from orthonav.cli.common import add_dem
+
 if TYPE_CHECKING:
     from orthonav.localizer import Localizer
     from orthonav.sources import Recording
@@ -81,6 +83,7 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         help="altitude of the ground, in the reference of the recorded altitudes, where no heights "
         "were recorded",
     )
+    add_dem(group, "for heights above ground where others were recorded")
     group.add_argument(
         "--looks-down",
         action="store_true",
@@ -118,8 +121,13 @@ def warn_if_far_from_map(flight: "Recording", localizer: "Localizer") -> None:
         )
 
 
-def open_source(path: Path, options: argparse.Namespace) -> "Recording":
-    """The open recording of the command line; its warnings are logged."""
+def open_source(
+    path: Path, options: argparse.Namespace, *, over_terrain: bool = False
+) -> "Recording":
+    """The open recording of the command line; its warnings are logged.
+
+    `over_terrain`: whether a terrain turns its heights into heights above ground.
+    """
     from orthonav.sources import SourceOptions, open_source
 
     source_options = SourceOptions(
@@ -134,6 +142,7 @@ def open_source(path: Path, options: argparse.Namespace) -> "Recording":
         sensor_width_mm=options.sensor_width_mm,
         ground_alt_m=options.ground_alt_m,
         looks_down=options.looks_down,
+        over_terrain=over_terrain,
     )
     recording = open_source(path, source_options)
     for warning in recording.warnings:

@@ -17,6 +17,7 @@ from PIL import Image, UnidentifiedImageError
 
 from orthonav.errors import described
 from orthonav.fetch.client import BadReplyError, HttpReply, bad_status, exception_text, excerpt
+from orthonav.geo.ground import HIGHEST_M, LOWEST_M
 
 FORMATS = ("JPEG", "PNG", "WEBP")
 _JPEG_END = b"\xff\xd9"
@@ -38,9 +39,12 @@ class CellPixels:
 
     @property
     def blank(self) -> bool:
-        """Whether there is no imagery: no valid pixel, or pure black or white throughout."""
-        if not self.valid.any():
-            return True
+        """Whether there is no imagery: no valid pixel, or pure black or white throughout.
+
+        Heights, which are signed numbers, are never blank where they are valid.
+        """
+        if not self.valid.any() or self.bands.dtype.kind != "u":
+            return not self.valid.any()
         first = self.bands[:, 0, 0]
         if not (first == first[0]).all() or first[0] not in (0, np.iinfo(np.uint8).max):
             return False
@@ -48,9 +52,14 @@ class CellPixels:
 
 
 def image_or_absent(
-    reply: HttpReply, shape_px: tuple[int, int], empty: str | None, *, tiled: bool = True
+    reply: HttpReply,
+    shape_px: tuple[int, int],
+    empty: str | None,
+    *,
+    tiled: bool = True,
+    heights: bool = False,
 ) -> bytes | None:
-    """The body of an answer that is an image of this shape (height, width).
+    """The body of an answer that is an image, or `heights`, of this shape (height, width).
 
     None where the service reports that it has no imagery there; 404 means that only for a `tiled`
     service. Raises `BadReplyError` for everything else, with the content that came.
@@ -62,14 +71,32 @@ def image_or_absent(
         if reply.status == 400 and _NOT_COVERED.search(str(error)):
             return None
         raise error
-    if _looks_like_text(reply):
+    whole = heights and len(reply.body) == 4 * shape_px[0] * shape_px[1]
+    if not whole and _looks_like_text(reply):  # a height may begin with the byte of "<"
         words = exception_text(reply)
         if words and _NOT_COVERED.search(words):
             return None
         what = "an error of the service" if words else "a page or text"
         raise BadReplyError(f"{what} instead of an image ({words or excerpt(reply)})")
-    decode(reply.body, shape_px, empty)
+    if heights:
+        decode_heights(reply.body, shape_px)
+    else:
+        decode(reply.body, shape_px, empty)
     return reply.body
+
+
+def decode_heights(body: bytes, shape_px: tuple[int, int]) -> CellPixels:
+    """Heights in metres of raw little-endian float32 of exactly this shape (height, width).
+
+    Values that no ground can have stand for no data. Raises `BadReplyError` for another size.
+    """
+    height, width = shape_px
+    if len(body) != 4 * height * width:
+        raise BadReplyError(f"{len(body)} bytes instead of {height} x {width} heights of 4 bytes")
+    heights = np.frombuffer(body, "<f4").reshape(1, height, width).astype(np.float32)
+    with np.errstate(invalid="ignore"):
+        valid = (heights[0] >= LOWEST_M) & (heights[0] <= HIGHEST_M)
+    return CellPixels(np.where(valid, heights, np.float32(0)), valid)
 
 
 def decode(body: bytes, shape_px: tuple[int, int], empty: str | None) -> CellPixels:

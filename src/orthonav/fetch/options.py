@@ -12,6 +12,10 @@ GSD_TOLERANCE = 1.05
 are powers of two and do not fall on round numbers)."""
 FORMATS = ("image/jpeg", "image/png", "image/webp")
 """Media types that can be read, the usual one of orthophotos first."""
+HEIGHTS_FORMAT = "image/x-bil;bits=32"
+"""Media type of heights: raw numbers of 32 bits, by rows. Taken where a preset or user names it."""
+TERRAIN_GSD_M = 5.0
+"""Ground resolution of heights where none is given: half the posting of a map's terrain."""
 MAX_COARSER = 1.5
 """Where no level is fine enough, the finest one is taken if it is at most this much coarser."""
 
@@ -88,6 +92,8 @@ class Provenance:
     """Who must be named."""
     note: str | None = None
     """What a user should know, such as resampling."""
+    datum: str | None = None
+    """What the heights of a terrain model count from; None for imagery."""
 
 
 def finest_fitting(gsds_m: list[float], wanted_m: float, levels: str) -> int:

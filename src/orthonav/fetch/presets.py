@@ -50,6 +50,8 @@ class Preset:
     key_env: str | None = None
     """Environment variable that holds the key."""
     note: str | None = None
+    datum: str | None = None
+    """What the heights of a terrain model count from (`--dem-datum`); None for imagery."""
 
     def layer(self, id_: str | None) -> PresetLayer:
         """The layer of that id, or the current one. Raises `FetchError` with the available ones."""

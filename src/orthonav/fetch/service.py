@@ -7,10 +7,10 @@ from typing import Protocol
 
 from orthonav.fetch.client import Client
 from orthonav.fetch.grid import CellGrid
-from orthonav.fetch.images import CellPixels, decode, image_or_absent
-from orthonav.fetch.options import Provenance
+from orthonav.fetch.images import CellPixels, decode, decode_heights, image_or_absent
+from orthonav.fetch.options import HEIGHTS_FORMAT, Provenance
 
-_BYTES_PER_PX = {"image/jpeg": 0.35, "image/webp": 0.25, "image/png": 1.9}
+_BYTES_PER_PX = {"image/jpeg": 0.35, "image/webp": 0.25, "image/png": 1.9, HEIGHTS_FORMAT: 4.0}
 """Size of usual tiles of orthophotos relative to their pixels, for the estimate."""
 
 
@@ -52,7 +52,10 @@ class CellSource(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class TileSource:
-    """Cells that are one image per address; `tiled` where 404 means that there is no imagery."""
+    """Cells that are one image, or one block of heights, per address.
+
+    `tiled`: whether 404 means that there is no imagery.
+    """
 
     provenance: Provenance
     grid: CellGrid
@@ -60,8 +63,21 @@ class TileSource:
     format: str
     empty: str | None = None
     tiled: bool = True
-    bands: int = 3
-    dtype: str = "uint8"
+
+    @property
+    def is_heights(self) -> bool:
+        """Whether cells hold heights."""
+        return self.format == HEIGHTS_FORMAT
+
+    @property
+    def bands(self) -> int:
+        """Number of bands."""
+        return 1 if self.is_heights else 3
+
+    @property
+    def dtype(self) -> str:
+        """Pixel type."""
+        return "float32" if self.is_heights else "uint8"
 
     @property
     def cell_bytes(self) -> float:
@@ -77,12 +93,15 @@ class TileSource:
         shape = (self.grid.cell_h_px, self.grid.cell_w_px)
         return client.get(
             self.url_of(row, col),
-            lambda reply: image_or_absent(reply, shape, self.empty, tiled=self.tiled),
+            lambda reply: image_or_absent(
+                reply, shape, self.empty, tiled=self.tiled, heights=self.is_heights
+            ),
         )
 
     def decode(self, body: bytes) -> CellPixels:
         """Its pixels. Raises `FetchError`."""
-        return decode(body, (self.grid.cell_h_px, self.grid.cell_w_px), self.empty)
+        shape = (self.grid.cell_h_px, self.grid.cell_w_px)
+        return decode_heights(body, shape) if self.is_heights else decode(body, shape, self.empty)
 
 
 def resolution(wanted_m: float, metres_per_unit: float) -> float:

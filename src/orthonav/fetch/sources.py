@@ -75,6 +75,7 @@ def parse_source(
         licence or f"{preset.licence} ({preset.licence_url})",
         attribution or preset.attribution,
         "; ".join(note for note in (layer.note, preset.note) if note) or None,
+        preset.datum,
     )
     secrets = _secrets(preset.url, key_env or preset.key_env, None, environ)
     return SourceSpec(preset.protocol, preset.url, options, provenance, secrets, preset.token_url)

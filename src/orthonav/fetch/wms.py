@@ -14,6 +14,8 @@ from orthonav.fetch.crs import epsg_name, ground_scale, north_first
 from orthonav.fetch.documents import XmlDocument, capabilities, get_xml
 from orthonav.fetch.grid import CellGrid
 from orthonav.fetch.options import (
+    HEIGHTS_FORMAT,
+    TERRAIN_GSD_M,
     ImageryOptions,
     Provenance,
     choose,
@@ -122,8 +124,10 @@ def wms_cells(
     format_ = choose_format(layer.formats, options, "service")
     scale_x, scale_y = ground_scale(crs, frame)
     cell_px = min(CELL_PX, layer.max_px, options.tile_px or CELL_PX)
-    res_x = resolution(options.wanted_gsd_m, scale_x)
-    res_y = resolution(options.wanted_gsd_m, scale_y)
+    gsd_m = options.wanted_gsd_m
+    if format_ == HEIGHTS_FORMAT and options.gsd_m is None:
+        gsd_m = TERRAIN_GSD_M
+    res_x, res_y = resolution(gsd_m, scale_x), resolution(gsd_m, scale_y)
     grid = CellGrid(crs, 0.0, 0.0, res_x, res_y, cell_px, cell_px)
     fixed = _get_map(layer, options, format_, layer.crs[crs], cell_px)
     swap = layer.version == "1.3.0" and not layer.crs[crs].startswith("CRS:") and north_first(crs)
@@ -149,7 +153,7 @@ def _get_map(layer: WmsLayer, options: ImageryOptions, format_: str, crs: str, c
         "WIDTH": str(cell_px),
         "HEIGHT": str(cell_px),
         "FORMAT": format_,
-        "TRANSPARENT": "TRUE" if format_ != "image/jpeg" else "FALSE",
+        "TRANSPARENT": "FALSE" if format_ in ("image/jpeg", HEIGHTS_FORMAT) else "TRUE",
     }
     if options.time is not None:
         parameters["TIME"] = choose_time(layer.times, options.time, layer.name)

@@ -209,6 +209,7 @@ def tags_of(provenance: Provenance, selection: Selection) -> dict[str, str]:
         "ORTHONAV_LICENCE": provenance.licence or "unknown",
         "ORTHONAV_ATTRIBUTION": provenance.attribution or "",
         "ORTHONAV_NOTE": provenance.note or "",
+        "ORTHONAV_VERTICAL_DATUM": provenance.datum or "",
         "ORTHONAV_FETCHED": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
         "ORTHONAV_GSD_M": json.dumps(round(selection.gsd_m, 4)),
         "TIFFTAG_COPYRIGHT": provenance.attribution or "",

@@ -1,7 +1,6 @@
 """Height above ground along a route, and relief within a view."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,12 +8,11 @@ from numpy.typing import NDArray
 
 from orthonav.errors import RouteError
 from orthonav.geo.frames import LocalFrame
+from orthonav.geo.ground import TerrainHeights
 from orthonav.geo.planning import MOST_RELIEF, Caution
 from orthonav.geo.route import Route, leg_lengths_m
 
 Array = NDArray[np.float64]
-TerrainHeights = Callable[[Array, Array], Array]
-"""Function of latitudes and longitudes (deg): heights above mean sea level (m), NaN if unknown."""
 MAX_POSITIONS = 2000
 """Sampled positions along a route at most."""
 LANDING_M = 30.0

@@ -7,7 +7,6 @@ so every length, size and offset is checked before it is used.
 
 import zlib
 from itertools import pairwise
-from typing import Any
 
 import cv2
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from orthonav.caches import ByteCache
 from orthonav.errors import MapFileError
+from orthonav.mapfile.blobs import Blobs
 from orthonav.mapfile.manifest import GreyInfo
 from orthonav.mapfile.reader import MapFile
 
@@ -91,8 +91,8 @@ class GreyLayer:
         self._path = opened.path
         self._table = ChunkTable(grid.height_px, grid.width_px, info.levels, info.chunk_px)
         names = part_names(sheet)
-        self._jpegs = _Blobs(opened, names["bytes"], names["offsets"], self._table.count)
-        self._masks = _Blobs(opened, names["mask_bytes"], names["mask_offsets"], self._table.count)
+        self._jpegs = Blobs(opened, names["bytes"], names["offsets"], self._table.count)
+        self._masks = Blobs(opened, names["mask_bytes"], names["mask_offsets"], self._table.count)
         self._cache = ByteCache[int, Chunk](cache_bytes, _bytes_of)
 
     @classmethod
@@ -256,34 +256,6 @@ def _decode_mask(mask: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.
         raise MapFileError(f"mask must have {expected} bytes")
     bits = np.unpackbits(np.frombuffer(packed, dtype=np.uint8), count=size)
     return bits.reshape(shape).astype(np.bool_)
-
-
-class _Blobs:
-    """Byte strings concatenated in one part, with their offsets in another."""
-
-    def __init__(self, opened: MapFile, data: str, offsets: str, count: int) -> None:
-        size = opened.size_of(data, np.uint8, 1)
-        self._opened, self._name = opened, data
-        self._offsets: NDArray[Any] = opened.array(offsets, np.int64, 1)
-        places = self._offsets
-        sane = (
-            len(places) == count + 1
-            and places[0] == 0
-            and places[-1] == size
-            and bool((places[1:] >= places[:-1]).all())
-        )
-        if not sane:
-            raise MapFileError(
-                f"map part {offsets} must rise from 0 to {size} in {count + 1} numbers: "
-                f"{opened.path}"
-            )
-
-    def is_empty(self, number: int) -> bool:
-        return bool(self._offsets[number] == self._offsets[number + 1])
-
-    def blob(self, number: int) -> NDArray[np.uint8]:
-        first, last = int(self._offsets[number]), int(self._offsets[number + 1])
-        return np.frombuffer(self._opened.range(self._name, first, last), dtype=np.uint8)
 
 
 def _bytes_of(chunk: Chunk) -> int:

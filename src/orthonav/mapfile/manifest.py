@@ -13,6 +13,7 @@ from typing import Any
 from orthonav.errors import AreaError, MapFileError, MapVersionError
 from orthonav.geo.frames import MAX_SHEET_M, LocalFrame
 from orthonav.geo.grid import MAX_TILE_PX, TileGrid
+from orthonav.geo.ground import HIGHEST_M, LOWEST_M
 
 FORMAT = "orthonav-map"
 SCHEMA = 1
@@ -24,6 +25,11 @@ MAX_TOP_PX = 8192
 """Longer side of the coarsest level, which is read as a whole: that of ten levels of the largest
 sheet at 5 cm. Programs write at most 64 px."""
 CODEC = "jpeg"
+TERRAIN_CODEC = "delta-zlib"
+MAX_CODE = 65_535
+"""Greatest step of a height above the lowest one of its layer."""
+MAX_POSTING_M = 1000.0
+MAX_NAME = 200
 MAX_DIGITS = 20
 """More digits than any number in a map needs, and few enough to fit a float."""
 MIN_HEADING_STEP_DEG = 0.5
@@ -73,11 +79,70 @@ class GreyInfo:
 
 
 @dataclass(frozen=True)
+class TerrainInfo:
+    """The terrain layer of a sheet: heights of the ground at samples in the sheet's plane.
+
+    `west_m`, `north_m`: outer north-west corner; sample (0, 0) lies half a posting to its
+    south-east. `posting_m`: distance of samples, 1 to 1000 m. `rows`, `cols`: their number.
+    `chunk_px`: samples along a side of a chunk, 16 to 1024. `low_m`, `high_m`: least and greatest
+    height above mean sea level, -500 to 9000. `unit_m`: metres per step, 0.01 to 10. `known`:
+    number of samples with a height. `name`: file it was made of. `datum`: what heights counted from
+    there.
+    """
+
+    west_m: float
+    north_m: float
+    posting_m: float
+    rows: int
+    cols: int
+    chunk_px: int
+    low_m: float
+    high_m: float
+    unit_m: float
+    known: int
+    name: str
+    datum: str
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain values for the manifest."""
+        return {"codec": TERRAIN_CODEC, **vars(self)}
+
+    @classmethod
+    def from_plain(cls, plain: Any) -> "TerrainInfo":
+        """Inverse of `to_plain`; raises `MapFileError`."""
+        codec = _get(plain, "codec", str)
+        numbers = ("west_m", "north_m", "posting_m", "low_m", "high_m", "unit_m")
+        values: dict[str, Any] = {name: _number(plain, name) for name in numbers}
+        for name in ("rows", "cols", "chunk_px", "known"):
+            values[name] = _get(plain, name, int)
+        for name in ("name", "datum"):
+            values[name] = _get(plain, name, str)[:MAX_NAME]
+        info = cls(**values)
+        most = 4 * MAX_SHEET_M
+        sane = (
+            codec == TERRAIN_CODEC
+            and 1 <= info.posting_m <= MAX_POSTING_M
+            and MIN_CHUNK_PX <= info.chunk_px <= MAX_CHUNK_PX
+            and min(info.rows, info.cols) >= 1
+            and max(info.rows, info.cols) * info.posting_m <= most
+            and max(abs(info.west_m), abs(info.north_m)) <= most
+            and LOWEST_M <= info.low_m <= info.high_m <= HIGHEST_M
+            and 0.01 <= info.unit_m <= 10
+            and (info.high_m - info.low_m) / info.unit_m <= MAX_CODE + 0.5
+            and 0 <= info.known <= info.rows * info.cols
+        )
+        if not sane:
+            raise MapFileError(f"map has an impossible terrain layer: {plain!r:.300}")
+        return info
+
+
+@dataclass(frozen=True)
 class SheetInfo:
     """One sheet of a map.
 
     `frame`: its local plane. `grid`: its tile grid. `tiles`: number of tiles. `area_km2`: number of
-    tiles times stride squared. `grey`: its registration layer, None if it has none.
+    tiles times stride squared. `grey`: its registration layer, None if it has none. `terrain`: its
+    terrain layer, None if it has none.
     """
 
     frame: LocalFrame
@@ -85,11 +150,14 @@ class SheetInfo:
     tiles: int
     area_km2: float
     grey: GreyInfo | None = None
+    terrain: TerrainInfo | None = None
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain values for the manifest."""
+        """Plain values for the manifest; maps without terrain do not name it."""
         grid = self.grid
+        terrain = {} if self.terrain is None else {"terrain": self.terrain.to_plain()}
         return {
+            **terrain,
             "origin_lat_deg": self.frame.lat_deg,
             "origin_lon_deg": self.frame.lon_deg,
             "grid": {
@@ -134,7 +202,9 @@ class SheetInfo:
             raise MapFileError(f"map has an impossible sheet origin: {error}") from error
         layer = plain.get("grey")
         grey = None if layer is None else GreyInfo.from_plain(layer, grid)
-        return cls(frame, grid, tiles, _number(plain, "area_km2"), grey)
+        layer = plain.get("terrain")
+        terrain = None if layer is None else TerrainInfo.from_plain(layer)
+        return cls(frame, grid, tiles, _number(plain, "area_km2"), grey, terrain)
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ BLOCK_BYTES = 16 * 2**10
 layer (docs/map-format.md)."""
 _BLOCK_DIGEST_BYTES = 16
 _PIECE_BYTES = 64 * BLOCK_BYTES
-_IN_RANGES = re.compile(r"sheet\d+/grey/(mask_)?bytes")
+_IN_RANGES = re.compile(r"sheet\d+/(grey/(mask_)?|terrain/)bytes")
 """Parts that are read in ranges: the largest of a map."""
 _DTYPES: dict[str, type[np.generic]] = {
     "F16": np.float16,
@@ -162,7 +162,7 @@ class MapFile:
         return found.nbytes
 
     def range(self, name: str, first: int, last: int) -> bytes:
-        """Bytes `first` to `last` (excluded) of a part of the registration layer.
+        """Bytes `first` to `last` (excluded) of a part that is read in ranges.
 
         Raises `MapChangedError` if they are not those of the opening.
         """

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.confidence.accept import Acceptance
-from orthonav.errors import CameraError
+from orthonav.errors import CameraError, MapChangedError, MapFileError
+from orthonav.flight.heights import FlownHeights, assumed_heights
 from orthonav.flight.mount import Mount
 from orthonav.geo.camera import Camera
 from orthonav.localizer.checks import check_picture
@@ -95,6 +96,7 @@ class FlyOptions:
 
     `mount_deg`: yaw, pitch, roll of the camera in the body, degrees.
     `mount`: calibrated mount, for the health only (the locator applies it by itself).
+    `heights`: turns reported heights into heights above ground; None: the map has no terrain.
     `heading_known`: whether the reported heading is used.
     `deadline_s`: images older than this are dropped.
     `telemetry_wait_s`: longest wait for telemetry after the exposure.
@@ -109,6 +111,7 @@ class FlyOptions:
 
     mount_deg: Angles = LOOKS_DOWN
     mount: Mount | None = None
+    heights: FlownHeights | None = None
     heading_known: bool = True
     deadline_s: float = 0.5
     telemetry_wait_s: float = 0.15  # three attitudes at 20 Hz, the least rate asked for
@@ -156,6 +159,7 @@ class Runner:
         self._tick_ns = 0
         self._image_taken_ns: int | None = None
         self._tracked_ns: int | None = None
+        self._heights_said = False
         self._last: states.SavedState | None = None
         self._saved: states.SavedState | None = None
         self._mismatch = 0.0, 0.0
@@ -290,7 +294,9 @@ class Runner:
             prior, self._start = self._start(), None
             telemetry = replace(view.telemetry, prior=prior or view.telemetry.prior)
             view = replace(view, telemetry=telemetry)
-        telemetry = view.telemetry
+        self._say_heights(view.telemetry)
+        telemetry = self._above_ground(view.telemetry)
+        view = replace(view, telemetry=telemetry)
         self._log_view(image, view, latency, withheld=False)
         outcome: Fix | NoFix
         try:
@@ -311,6 +317,8 @@ class Runner:
             self._log(lambda sink: sink.result(result))
             self._publisher.publish(result, image.exposed_ns, vehicle, judged=False, withheld=doubt)
             return result
+        if self.options.heights is not None:
+            self.options.heights.observe(telemetry.time_ns, outcome, result.state)
         accepted = self.options.accept(result.outcome) if self.options.accept else result.outcome
         accepted = accepted if self._gnss is None else self._gnss.corrected(accepted)
         self._publisher.publish(
@@ -398,7 +406,28 @@ class Runner:
         vehicle = self._link.state_at(image.exposed_ns)
         return vehicle, vehicle.telemetry(image.time_ns, self.options.mount_deg)
 
+    def _above_ground(self, telemetry: Telemetry) -> Telemetry:
+        """The telemetry with its height above ground by the terrain of the map, if it has one."""
+        heights = self.options.heights
+        return telemetry if heights is None else heights.corrected(telemetry)
+
+    def _say_heights(self, telemetry: Telemetry) -> None:
+        """Log once what is assumed about heights."""
+        if self._heights_said:
+            return
+        self._heights_said = True
+        name = None if self.options.heights is None else "the terrain of the map"
+        said = assumed_heights(telemetry, name, "build the map with --dem")
+        if said is not None:
+            log.log(logging.WARNING if name is None else logging.INFO, "%s", said)
+
     def _missing(self, telemetry: Telemetry) -> NoFix | None:
+        try:
+            telemetry = self._above_ground(telemetry)
+        except MapChangedError as error:
+            return self._refusal("internal_error", MAP_CHANGED, str(error))
+        except MapFileError as error:  # a crafted part of the map
+            return self._refusal("internal_error", MAP_DAMAGED, str(error))
         missing = [
             name for name in telemetry.missing() if name != "yaw_deg" or self.options.heading_known
         ]

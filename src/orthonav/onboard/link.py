@@ -315,6 +315,8 @@ class AutopilotLink:
     def _global_position(self, message: Message, now_ns: int) -> None:
         time_ns = self._timed(message.time_boot_ms, now_ns)
         self.buffer.add_height("home", time_ns, message.relative_alt * 1e-3)
+        if message.alt != 0:  # 0 where the autopilot has no position
+            self.buffer.add_height("amsl", time_ns, message.alt * 1e-3)
 
     def _local_position(self, message: Message, now_ns: int) -> None:
         time_ns = self._timed(message.time_boot_ms, now_ns)
@@ -329,6 +331,7 @@ class AutopilotLink:
         if message.altitude_terrain > -1000:  # lower values mean "not known" (common.xml)
             self.buffer.add_height("terrain", time_ns, message.altitude_terrain)
         self.buffer.add_height("relative", time_ns, message.altitude_relative)
+        self.buffer.add_height("altitude", time_ns, message.altitude_amsl)
 
     def _distance(self, message: Message, now_ns: int) -> None:
         within = message.min_distance < message.current_distance < message.max_distance

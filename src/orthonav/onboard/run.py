@@ -11,6 +11,7 @@ import numpy as np
 
 from orthonav.confidence.accept import Acceptance
 from orthonav.errors import CameraError, FlightError, MapChangedError, MapFileError
+from orthonav.flight.heights import FlownHeights
 from orthonav.flight.recording import Flight, RecordedView
 from orthonav.localizer.localizer import Localizer
 from orthonav.localizer.tracker import Tracker
@@ -89,34 +90,37 @@ def localize_flight(
     skip_bad_images: bool = False,
     accept: Acceptance | None = None,
     views: Iterable[RecordedView] | None = None,
+    heights: FlownHeights | None = None,
 ) -> Iterator[ViewResult]:
     """Results of the views of a recorded flight, in order, as they are computed.
 
+    `heights`: turns reported heights into heights above ground; None: they are used as reported.
     Fixes that do not pass `accept` become `NoFix` with their evidence. Raises `FlightError` at an
     image that cannot be decoded, unless `skip_bad_images` makes it a `NoFix`; raises `CameraError`
     where an image has not the camera's size.
     """
     for view in flight.views if views is None else views:
         outcome: Fix | NoFix
+        telemetry = view.telemetry if heights is None else heights.corrected(view.telemetry)
         try:
             grey = view.grey()
         except FlightError as error:
             if not skip_bad_images:
                 raise
             reason = NoFix("bad_image", str(error))
-            outcome = _finite(_passed(locator, view.telemetry, reason))
+            outcome = _finite(_passed(locator, telemetry, reason))
             latency_ms = math.nan
         else:
             try:
-                seen = View(grey, flight.camera, view.telemetry)
+                seen = View(grey, flight.camera, telemetry)
                 outcome, latency_ms = locate_view(locator, seen)
             except CameraError as error:
                 raise CameraError(f"{error}: {view.where}") from error
+        if heights is not None:
+            heights.observe(telemetry.time_ns, outcome, locator.state_name)
         if accept is not None:
             outcome = accept(outcome)
-        yield ViewResult(
-            view.frame, view.telemetry.time_ns, outcome, latency_ms, locator.state_name
-        )
+        yield ViewResult(view.frame, telemetry.time_ns, outcome, latency_ms, locator.state_name)
 
 
 def smoothed_track(

@@ -10,7 +10,7 @@ import time
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 
 import numpy as np
@@ -21,9 +21,13 @@ from orthonav.geo.camera import attitude_of
 from orthonav.records import Telemetry
 from orthonav.sources.attitude import LOOKS_DOWN, Angles, enu_from_body_camera
 
-HEIGHT_SOURCES = ("distance", "terrain", "home", "relative")
+HEIGHT_SOURCES = ("distance", "terrain", "amsl", "home", "relative")
 """Sources of the height above ground, best first: a rangefinder that looks down, the autopilot's
-terrain model, and the height above home (correct over flat ground only) of two messages."""
+terrain model, the height above sea level (with the terrain of the map only), and the height above
+home (without that terrain correct over flat ground only) of two messages."""
+_ABOVE_HOME = ("home", "relative")
+_SECOND_AMSL = "altitude"
+"""Height above sea level of a second message, where the first gives none."""
 _MS = 1_000_000
 _NAN3 = (math.nan, math.nan, math.nan)
 Triple = tuple[float, float, float]
@@ -64,15 +68,19 @@ class VehicleState:
     """State of the aircraft that the autopilot reported for one time of its clock.
 
     `ned_from_body`: attitude as a rotation matrix (3, 3); None where not known.
-    `height_m`: height above ground; NaN where not known, as the next two.
+    `height_m`: height above ground; NaN where not known, as the rest. It equals `home_m` where only
+    that is known: then level ground is assumed.
     `velocity_ned_mps`: velocity north, east, down.
     `down_m`: distance below the origin of the autopilot's local frame.
+    `home_m`, `amsl_m`: height above the place of take-off, and above mean sea level.
     """
 
     ned_from_body: Array | None
     height_m: float = math.nan
     velocity_ned_mps: Triple = _NAN3
     down_m: float = math.nan
+    home_m: float = math.nan
+    amsl_m: float = math.nan
 
     def attitude_rad(self) -> Triple:
         """Roll, pitch and yaw of the body in radians; NaN where not known."""
@@ -89,7 +97,14 @@ class VehicleState:
         north, east, _ = self.velocity_ned_mps
         known = math.isfinite(north + east)
         return Telemetry(
-            time_ns, yaw, pitch, roll, self.height_m, vel_en_mps=(east, north) if known else None
+            time_ns,
+            yaw,
+            pitch,
+            roll,
+            self.height_m,
+            vel_en_mps=(east, north) if known else None,
+            home_m=self.home_m if math.isfinite(self.home_m) else None,
+            amsl_m=self.amsl_m if math.isfinite(self.amsl_m) else None,
         )
 
 
@@ -164,6 +179,8 @@ class TelemetryBuffer:
         slow = limits.slow_gap_s, limits.slow_hold_s
         self._attitude = _Samples(limits.attitude_gap_s, limits.attitude_hold_s)
         self._heights = {name: _Samples(*slow) for name in self._order}
+        if "amsl" in self._order:
+            self._heights[_SECOND_AMSL] = _Samples(*slow)
         self._local = _Samples(*slow)
 
     def add_attitude(self, time_ns: int, wxyz: Sequence[float]) -> None:
@@ -179,7 +196,10 @@ class TelemetryBuffer:
         self._attitude.add(time_ns, quaternion, self._keep_ns)
 
     def add_height(self, source: str, time_ns: int, height_m: float) -> None:
-        """Add a height from one of `HEIGHT_SOURCES`; values that are not finite are dropped."""
+        """Add a height from one of `HEIGHT_SOURCES`; values that are not finite are dropped.
+
+        `altitude` is a second height above sea level, for messages that come beside the first.
+        """
         if source in self._heights and math.isfinite(height_m):
             self._heights[source].add(time_ns, np.array([height_m]), self._keep_ns)
 
@@ -211,13 +231,23 @@ class TelemetryBuffer:
         if found is not None:
             before, after, weight = found
             turn = _matrix(_slerp(before, after, weight))
-        found_heights = (self._heights[name].at(time_ns) for name in self._order)
-        height = next((float(value[0]) for value in found_heights if value is not None), math.nan)
+        above_ground = [name for name in self._order if name != "amsl"]
+        state = VehicleState(
+            turn,
+            self._height(above_ground, time_ns),
+            home_m=self._height([name for name in above_ground if name in _ABOVE_HOME], time_ns),
+            amsl_m=self._height(("amsl", _SECOND_AMSL), time_ns),
+        )
         local = self._local.at(time_ns)
         if local is None:
-            return VehicleState(turn, height)
+            return state
         north, east, down, below = local.tolist()
-        return VehicleState(turn, height, (north, east, down), below)
+        return replace(state, velocity_ned_mps=(north, east, down), down_m=below)
+
+    def _height(self, names: Sequence[str], time_ns: int) -> float:
+        """The first of these heights that is known at a time, else NaN."""
+        found = (self._heights[name].at(time_ns) for name in names if name in self._heights)
+        return next((float(value[0]) for value in found if value is not None), math.nan)
 
     @property
     def _ahead_ns(self) -> int:

@@ -187,6 +187,8 @@ def map_content(
     grey, grey_parts = (None, {}) if sheet.layer is None else sheet.layer.finish()
     tiles = len(embedding.centres_en_m)
     area_km2 = round(tiles * grid.stride_m**2 / 1e6, 6)
+    terrain, terrain_parts = (None, {}) if inputs.terrain is None else inputs.terrain.content
+    sheet_info = SheetInfo(inputs.area.frame, grid, tiles, area_km2, grey, terrain)
     manifest = Manifest(
         recipe={
             "method": request.method.partition(":")[0],
@@ -195,7 +197,7 @@ def map_content(
             "overlap": request.overlap,
             "seed": request.seed,
         },
-        sheets=(SheetInfo(inputs.area.frame, grid, tiles, area_km2, grey),),
+        sheets=(sheet_info,),
         imagery=inputs.mosaic.describe(),
         view={
             "heading_step_deg": HEADING_STEP_DEG,
@@ -212,6 +214,7 @@ def map_content(
         "sheet0/preview_jpeg": sheet.preview.jpeg(),
         **{f"embed/{name}": array for name, array in embedder.parts().items()},
         **grey_parts,
+        **terrain_parts,
     }
     if request.cells and isinstance(inputs.recipe, WhitenedRecipe):
         arrays |= cell_parts(sheet.cells)

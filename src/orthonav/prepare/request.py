@@ -17,11 +17,13 @@ from orthonav.geo.grid import TileGrid
 from orthonav.geo.route import Route
 from orthonav.geo.swapped import swapped_hint
 from orthonav.imagery.mosaic import Mosaic
+from orthonav.imagery.terrain import open_dem
 from orthonav.mapfile.manifest import Manifest
 from orthonav.prepare.calibrate import CROPS
 from orthonav.prepare.encoders import EncoderRecipe
 from orthonav.prepare.layout import grid_of
 from orthonav.prepare.methods import method_recipe, usual_edges
+from orthonav.prepare.terrain import TerrainParts, terrain_of_dem
 from orthonav.variants import make_variant
 
 MAX_WORKERS = 64
@@ -54,6 +56,11 @@ class BuildRequest:
     - `work`: folder for finished blocks and checkpoints of networks, from which an interrupted
       build resumes; None: blocks of a large map in `OUT.work` until it is written.
     - `workers`: threads that read the imagery, 1 to 64; None: one per core.
+    - `dem`: terrain model from which the map gets a terrain layer; None: it has none.
+    - `dem_datum`: what its heights count from, where the file does not state it
+      (`orthonav.imagery.datum.OPTION`).
+    - `dem_needed`: whether an area in which the model has no height is refused; else the map has
+      no terrain layer.
     - `cells`: whether the map carries the cell means from which new tiles are embedded without
       imagery, for sheets of an atlas; method gradient only.
     """
@@ -74,6 +81,9 @@ class BuildRequest:
     calibration_views: int = 24
     work: Path | None = None
     workers: int | None = None
+    dem: Path | None = None
+    dem_datum: str | None = None
+    dem_needed: bool = True
     cells: bool = False
 
 
@@ -91,6 +101,7 @@ class BuildInputs:
 
     `mosaic`: reference imagery. `other_dates`: one mosaic per other date. `area`, `grid`: extent
     and tiles of the map. `representation`: variant of `represent`. `recipe`: embedding to learn.
+    `terrain`: the map's terrain layer, None without one.
     """
 
     request: BuildRequest
@@ -100,6 +111,7 @@ class BuildInputs:
     grid: TileGrid
     representation: Any
     recipe: WhitenedRecipe | EncoderRecipe
+    terrain: TerrainParts | None = None
 
     @classmethod
     def open(cls, request: BuildRequest) -> "BuildInputs":
@@ -113,14 +125,19 @@ class BuildInputs:
         mosaic = Mosaic.open(request.orthos)
         other_dates = tuple(Mosaic.open([path]) for path in request.other_dates)
         inputs = [source.path for each in (mosaic, *other_dates) for source in each.sources]
+        inputs += [] if request.dem is None else [request.dem]
         if request.out.exists() and any(request.out.samefile(path) for path in inputs):
             raise OutputError(
-                f"the map would replace an orthophoto; name another file: {request.out}"
+                f"the map would replace an orthophoto or terrain; name another file: {request.out}"
             )
         area = _area(request, mosaic)
         grid = grid_of(area, mosaic.gsd_m, request.gsd_m, request.tile_px, request.overlap)
         _check_numbers(request)
-        return cls(request, mosaic, other_dates, area, grid, representation, recipe)
+        terrain = None
+        if request.dem is not None:
+            dem = open_dem(request.dem, request.dem_datum)
+            terrain = terrain_of_dem(dem, area, grid, needed=request.dem_needed)
+        return cls(request, mosaic, other_dates, area, grid, representation, recipe, terrain)
 
     @property
     def learns_network(self) -> bool:

@@ -6,7 +6,7 @@ height; the telemetry differs from these by the requested errors.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from orthonav.flight.gnss import GnssSample, write_gnss
 from orthonav.flight.writer import FlightWriter
 from orthonav.geo.area import Area
 from orthonav.geo.camera import Camera, footprint_en_m
+from orthonav.geo.ground import TerrainHeights
 from orthonav.geo.route import Route
 from orthonav.geo.swapped import swapped_hint
 from orthonav.imagery.mosaic import Mosaic, SheetRaster
@@ -36,6 +37,7 @@ from orthonav.simulate.motion import (
 )
 from orthonav.simulate.receiver import Good, samples_of, solutions
 from orthonav.simulate.render import ViewEffects, render_view
+from orthonav.simulate.terrain import ground_below_m, reported_heights
 
 DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
 """A field of view of 65 x 51 deg, typical of survey drones."""
@@ -121,7 +123,8 @@ class SimulateRequest:
     - `out`: flight folder to write.
     - `route`: route to fly; or `random`: number of random positions, 1 to 1e6. One of the two.
     - `agl_m`: height above ground, 1..50,000 m; None: the shorter side of the image covers 256
-      pixels of the orthophoto.
+      pixels of the orthophoto. On a route over a terrain it is the height above the ground at the
+      first view, and the altitude is constant.
     - `spacing_m`: distance between views on a route in still air; None: flown in one second.
     - `airspeed_mps`: airspeed. In wind, views are `spacing_m / airspeed_mps` seconds apart too.
     - `camera`: intrinsics; `errors`: of the telemetry; `effects`: image degradation.
@@ -130,6 +133,8 @@ class SimulateRequest:
     - `turn_radius_m`: radius of the corners of a route, 0..100,000 m; 0 turns on the spot.
     - `cloud_share`: share of the views with clouds, 0..1.
     - `beyond`: whether the route may leave the imagery, which is then mirrored at its border.
+    - `terrain`: heights of the ground above mean sea level. The telemetry then reports heights
+      above sea level and, on a route, above the first view, and no measured one above ground.
     - `gnss`: receiver whose solutions are written to `gnss.csv`; only on a route.
     """
 
@@ -148,6 +153,7 @@ class SimulateRequest:
     turn_radius_m: float = 0.0
     cloud_share: float = 0.0
     beyond: bool = False
+    terrain: TerrainHeights | None = None
     gnss: Good | None = None
 
 
@@ -157,6 +163,7 @@ class _Pose:
 
     `reported_deg`: heading, pitch and roll of the aircraft as reported without errors.
     `reported_en_mps`: reported velocity over ground, None if not reported.
+    `home_m`, `amsl_m`: height above take-off and above sea level, None if not reported.
     """
 
     position_en_m: Array
@@ -167,6 +174,8 @@ class _Pose:
     time_s: float
     reported_deg: tuple[float, float, float]
     reported_en_mps: tuple[float, float] | None = None
+    home_m: float | None = None
+    amsl_m: float | None = None
 
     @property
     def attitude(self) -> tuple[float, float, float, float]:
@@ -313,7 +322,7 @@ def _poses(
             place = rng.uniform([west, south], [east, north])
             pose = _tilted(request, rng, place, rng.uniform(0, 360), agl_m, number * 1.0)
             if _sees_ground(coverage, request.camera, pose):
-                yield pose
+                yield _above_sea(request, area, pose)
                 break
         else:
             wide, high = np.ptp(footprint_en_m(request.camera, 0, 0, 0, agl_m), axis=0)
@@ -323,16 +332,37 @@ def _poses(
             )
 
 
+def _above_sea(request: SimulateRequest, area: Area, pose: _Pose) -> _Pose:
+    """The pose with its height above sea level, where there is a terrain."""
+    if request.terrain is None:
+        return pose
+    below_m = ground_below_m(request.terrain, area.frame, pose.position_en_m[None])
+    return replace(pose, amsl_m=pose.agl_m + float(below_m[0]))
+
+
 def _route_poses(
     request: SimulateRequest, route: Route, area: Area, agl_m: float, coverage: Coverage
 ) -> Iterator[_Pose]:
     path = _path(request, route.points_en_m(area.frame))
     velocities = _reported_velocities(request, path)
     views = zip(path.places_en_m, path.headings_deg, strict=True)
+    ground_m = None
+    if request.terrain is not None:
+        ground_m = ground_below_m(request.terrain, area.frame, path.places_en_m)
     for number, (place, heading) in enumerate(views):
         rng = np.random.default_rng([request.seed, 0, number])
         time_s, velocity = float(path.times_s[number]), velocities[number]
-        pose = _tilted(request, rng, place, float(heading), agl_m, time_s, velocity)
+        above_m = agl_m
+        if ground_m is not None:
+            above_m += float(ground_m[0] - ground_m[number])
+        if not above_m >= 1:
+            raise FlightError(
+                f"view {number + 1} of the route is {above_m:.0f} m above the terrain; fly higher "
+                "(--agl-m)"
+            )
+        pose = _tilted(request, rng, place, float(heading), above_m, time_s, velocity)
+        if ground_m is not None:
+            pose = replace(pose, home_m=agl_m, amsl_m=agl_m + float(ground_m[0]))
         if not request.beyond and not _sees_ground(coverage, request.camera, pose):
             lat, lon = (float(value) for value in area.frame.latlon_from_en(place))
             raise AreaError(
@@ -436,7 +466,7 @@ def _telemetry(
         place = pose.position_en_m + rng.normal(0, errors.prior_std_m, 2)
         lat, lon = area.frame.latlon_from_en(place)
         prior = Prior(float(lat), float(lon), errors.prior_std_m)
-    return Telemetry(
+    telemetry = Telemetry(
         time_ns=round(pose.time_s * 1e9),
         yaw_deg=round((yaw_deg + rng.normal(0, 1) * errors.yaw_std_deg) % 360, 3),
         pitch_deg=round(pitch_deg + rng.normal(0, 1) * errors.tilt_std_deg, 3),
@@ -448,3 +478,6 @@ def _telemetry(
         prior=prior,
         vel_en_mps=pose.reported_en_mps,
     )
+    if pose.amsl_m is None:
+        return telemetry
+    return reported_heights(telemetry, pose.agl_m, pose.home_m, pose.amsl_m)

@@ -4,6 +4,7 @@ from orthonav.sources.flightlog import LoggedFlight
 from orthonav.sources.importing import Imported, import_flight
 from orthonav.sources.opening import open_source, source_kind
 from orthonav.sources.options import KINDS, ROLES, SourceOptions
+from orthonav.sources.over_terrain import OverTerrain
 from orthonav.sources.recording import Recording, SourceView
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "ROLES",
     "Imported",
     "LoggedFlight",
+    "OverTerrain",
     "Recording",
     "SourceOptions",
     "SourceView",

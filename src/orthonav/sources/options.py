@@ -37,6 +37,8 @@ class SourceOptions:
     """Altitude of the ground, where altitudes but no heights were recorded; in their reference."""
     looks_down: bool = False
     """Whether the camera looked straight down where pitch and roll were not recorded."""
+    over_terrain: bool = False
+    """Whether a terrain turns the heights of the recording into heights above ground later on."""
 
     def __post_init__(self) -> None:
         for name in ("rate_hz", "prior_std_m", "sensor_width_mm"):

@@ -81,12 +81,7 @@ def open_photos(folder: Path, options: SourceOptions) -> Recording:
         poses, doubts = poses_of([one.photo for one in taken])
         taken = [replace(one, pose=pose) for one, pose in zip(taken, poses, strict=True)]
         warnings += doubts
-        warnings += height_warnings(
-            any(math.isfinite(one.photo.home_m) for one in taken),
-            all(math.isnan(one.photo.home_m) for one in taken)
-            and any(math.isfinite(one.photo.alt_m) for one in taken),
-            options,
-        )
+        warnings += _height_warnings([one.photo for one in taken], options)
         warnings += jump_warnings([(one.time_ns, one.photo.latlon_deg) for one in taken])
     return Recording(
         kind="photos",
@@ -96,7 +91,20 @@ def open_photos(folder: Path, options: SourceOptions) -> Recording:
         expected=len(taken),
         stream=partial(_views, folder, taken, track, options),
         warnings=tuple(filter(None, [*warnings, note])),
+        take_off_latlon_deg=None if track is None else track.take_off_latlon_deg,
     )
+
+
+def _height_warnings(photos: Sequence[Photo], options: SourceOptions) -> list[str]:
+    """Assumptions about the heights of photographs without a log."""
+    above_home = any(math.isfinite(photo.home_m) for photo in photos)
+    usable = above_home or any(
+        math.isfinite(value) for photo in photos for value in (photo.amsl_m, photo.hae_m)
+    )
+    if options.over_terrain and usable:
+        return []
+    only_altitudes = not above_home and any(math.isfinite(photo.alt_m) for photo in photos)
+    return height_warnings(above_home, only_altitudes, options)
 
 
 def _taken(folder: Path, options: SourceOptions) -> tuple[list[_DatedPhoto], list[str]]:

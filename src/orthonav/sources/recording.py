@@ -56,6 +56,8 @@ class Recording:
     expected: int
     stream: Callable[[], Iterator[SourceView]]
     warnings: tuple[str, ...] = ()
+    take_off_latlon_deg: tuple[float, float] | None = None
+    """First position of its track, where heights above take-off count from; None: unknown."""
 
     @property
     def views(self) -> Iterator[SourceView]:
@@ -143,7 +145,9 @@ def doubts_of(track: RecordedTrack, options: SourceOptions) -> list[str]:
     warnings, series = list(track.warnings), track.position
     known = bool(track.heights) or track.home is not None
     altitudes = track.altitude is not None
-    if track.heights and track.home is not None:
+    if options.over_terrain and (known or track.amsl is not None or track.hae is not None):
+        pass  # the terrain gives heights above ground
+    elif track.heights and track.home is not None:
         warnings.append(LEVEL_GROUND_IN_GAPS)
     else:
         warnings += height_warnings(track.home is not None, not known and altitudes, options)

@@ -72,6 +72,7 @@ def open_ros(path: Path, options: SourceOptions) -> Recording:
         expected=expected,
         stream=partial(_views, path, topics.image.topic, track, options),
         warnings=(*warnings, *doubts_of(track, options)),
+        take_off_latlon_deg=track.take_off_latlon_deg,
     )
 
 

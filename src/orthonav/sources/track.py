@@ -176,6 +176,11 @@ class RecordedTrack:
         recorded = altitude_series(self.position)
         return self.amsl if recorded is None else recorded
 
+    @property
+    def take_off_latlon_deg(self) -> tuple[float, float] | None:
+        """The first position, taken as that of take-off; None without positions."""
+        return None if self.position is None else self.latlon_deg(int(self.position.time_ns[0]))
+
     def span_ns(self) -> tuple[int, int] | None:
         """First and last time of its attitude or, without any, of heights or positions."""
         recorded = (self.attitude, *self.heights, self.home, self.position)

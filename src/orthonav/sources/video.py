@@ -59,6 +59,7 @@ def open_video(path: Path, options: SourceOptions) -> Recording:
         expected=math.floor(last_ns / 1e9 * options.rate_hz) + 1 if last_ns else 0,
         stream=partial(_views, path, track, options),
         warnings=tuple(doubts_of(track, options)),
+        take_off_latlon_deg=track.take_off_latlon_deg,
     )
 
 

@@ -32,9 +32,11 @@ SIMULATED = "Predicted from this map alone, with simulated ageing."
 
 
 def verdict_sentence(result: CheckResult) -> str:
-    """The verdict as a sentence, about the route or, without one, the map."""
+    """The verdict about the route or, without one, the map, and the height it holds for."""
     sentences = AREA_VERDICTS if result.along is None else VERDICTS
-    return sentences[result.verdict.word]
+    origin = f", {result.about.height}" if result.about.height else ""
+    height = f"Checked at {result.conditions.agl_m:.0f} m above ground{origin}."
+    return f"{sentences[result.verdict.word]} {height}"
 
 
 def share_text(value: float) -> str:

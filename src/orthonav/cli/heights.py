@@ -1,0 +1,141 @@
+"""Heights above ground for the commands: the terrain of `--dem` or of the map."""
+
+import argparse
+import logging
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from orthonav.flight.heights import FlownHeights, Undulation
+    from orthonav.geo.ground import TerrainHeights
+    from orthonav.geo.route import Route
+    from orthonav.imagery.terrain import Dem
+    from orthonav.mapfile import MapFile
+    from orthonav.sources import Recording
+
+AREA_POINTS = 48
+"""Positions along a side of a map at which its terrain is averaged."""
+log = logging.getLogger(__name__)
+
+
+def dem_of(options: argparse.Namespace) -> "Dem | None":
+    """The terrain model of `--dem`, None without one.
+
+    Raises `ImageryError`, `MissingFileError`, `MissingExtraError`, and `FlightError` for options
+    that exclude each other.
+    """
+    from orthonav.errors import FlightError
+
+    if options.dem is None:
+        if options.dem_datum is not None:
+            raise FlightError("--dem-datum is that of a terrain model: give --dem too")
+        return None
+    if getattr(options, "ground_alt_m", None) is not None:
+        raise FlightError("--ground-alt-m assumes level ground: give it or --dem")
+    from orthonav.imagery.terrain import open_dem
+
+    return open_dem(options.dem, options.dem_datum)
+
+
+def dem_for_route(options: argparse.Namespace, route: "Route") -> "Dem | None":
+    """The same for a route, at least one waypoint of which lies in it.
+
+    Raises also `ImageryError` where none does; it names swapped coordinates as the cause.
+    """
+    from orthonav.errors import ImageryError
+    from orthonav.geo.swapped import swapped_hint
+
+    dem = dem_of(options)
+    if dem is not None and not any(dem.covers(*waypoint) for waypoint in route.waypoints):
+        hint = swapped_hint(*route.waypoints[0], dem.covers)
+        raise ImageryError(f"the route lies outside the terrain{hint}: {options.dem}")
+    return dem
+
+
+def map_heights(
+    opened: "MapFile",
+    terrain: "TerrainHeights | None" = None,
+    *,
+    take_off: tuple[float, float, float] | None = None,
+    geoid: "Undulation | None" = None,
+    use_prior: bool = True,
+) -> "FlownHeights | None":
+    """Heights above ground on a map by `terrain`, else by its own; None where it has none."""
+    import numpy as np
+
+    from orthonav.flight.heights import FlownHeights
+    from orthonav.mapfile.terrain import TerrainLayer
+
+    terrain = terrain or TerrainLayer.of(opened)
+    if terrain is None:
+        return None
+    sheet = opened.manifest.sheets[0]
+    grid = sheet.grid
+    half_m = grid.tile_m / 2
+    east, north = np.meshgrid(
+        grid.west_m + np.linspace(half_m, grid.width_px * grid.gsd_m - half_m, AREA_POINTS),
+        grid.north_m - np.linspace(half_m, grid.height_px * grid.gsd_m - half_m, AREA_POINTS),
+    )
+    area_deg = sheet.frame.latlon_from_en(np.stack([east.ravel(), north.ravel()], axis=1))
+    return FlownHeights(terrain, area_deg, take_off=take_off, geoid=geoid, use_prior=use_prior)
+
+
+def flight_heights(
+    options: argparse.Namespace,
+    opened: "MapFile",
+    flight: "Recording",
+    dem: "Dem | None",
+) -> "FlownHeights | None":
+    """Heights above ground of the views of a recorded flight; None without a terrain.
+
+    What is assumed about heights is logged once.
+    """
+    first = next(iter(flight.views), None)
+    if first is None:
+        return None
+    has_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
+    place = flight.take_off_latlon_deg or getattr(first, "truth_latlon_deg", None)
+    heights = map_heights(
+        opened,
+        dem,
+        take_off=None if place is None else (*place, 0.0),
+        geoid=geoid_for(flight) if has_terrain else None,
+        use_prior=getattr(options, "prior", None) != "none",
+    )
+    name = None
+    if heights is not None:
+        name = "the terrain of the map" if dem is None else f"the terrain of {options.dem.name}"
+    say_assumed_heights(flight, name)
+    return heights
+
+
+def say_assumed_heights(flight: "Recording", terrain: str | None = None) -> None:
+    """Log what is assumed about the heights of a flight, over a terrain or without one.
+
+    Other recordings than flights have said it when they were opened.
+    """
+    from orthonav.flight.heights import assumed_heights
+
+    first = next(iter(flight.views), None)
+    said = None if first is None else assumed_heights(first.telemetry, terrain)
+    if said is not None and (terrain is not None or flight.kind in ("flight", "log")):
+        log.log(logging.WARNING if terrain is None else logging.INFO, "%s", said)
+
+
+def geoid_for(flight: "Recording") -> "Undulation | None":
+    """The geoid, where the height above the ellipsoid is known and that above the sea is not.
+
+    Where it is needed and missing, a warning says what to install.
+    """
+    from orthonav.errors import ImageryError, MissingExtraError
+
+    first = next(iter(flight.views), None)
+    if first is None or first.telemetry.hae_m is None or first.telemetry.amsl_m is not None:
+        return None
+    try:
+        from orthonav.imagery.datum import geoid
+
+        return geoid()
+    except (ImageryError, MissingExtraError) as error:
+        if first.telemetry.home_m is None:
+            log.warning("%s", error)
+        return None

@@ -1,0 +1,201 @@
+"""Heights above ground from heights above sea, take-off and the ellipsoid."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+
+from orthonav.flight.heights import (
+    MISMATCH_M,
+    FlownHeights,
+    GroundHeights,
+    assumed_heights,
+    is_measured,
+)
+from orthonav.geo.frames import LocalFrame
+from orthonav.geo.ground import Ground, ground_around, ground_over
+from orthonav.records import Fix, NoFix, Prior, Telemetry
+
+FRAME = LocalFrame(46.5, 2.5)
+SLOPE = 0.1
+HOLE_M = 3000.0
+
+
+def terrain(lat_deg, lon_deg):
+    """300 m in the middle, a metre more every 10 m to the north; a hole east of `HOLE_M`."""
+    east, north = np.moveaxis(FRAME.en_from_latlon(lat_deg, lon_deg), -1, 0)
+    return np.where(east > HOLE_M, np.nan, 300 + SLOPE * north)
+
+
+def place(east_m, north_m):
+    return tuple(float(value) for value in FRAME.latlon_from_en([east_m, north_m]))
+
+
+def reported(time_s=0.0, agl_m=math.nan, prior=None, **heights):
+    return Telemetry(round(time_s * 1e9), 0.0, 0.0, 0.0, agl_m, prior=prior, **heights)
+
+
+def area(half_m=2000.0):
+    east, north = np.meshgrid(*[np.linspace(-half_m, half_m, 21)] * 2)
+    return FRAME.latlon_from_en(np.stack([east.ravel(), north.ravel()], axis=1))
+
+
+def flown(**options):
+    return FlownHeights(terrain, area(), **options)
+
+
+def fix(east_m, north_m, confidence=0.95, std_m=5.0):
+    cov = np.eye(2) * std_m**2
+    return Fix(*place(east_m, north_m), cov, confidence, 35.0, 0.0, 100.0)
+
+
+GEOID_M = 47.0
+
+
+@pytest.mark.parametrize(
+    "heights, expected_m",
+    [
+        ({"amsl_m": 700.0}, 300.0),
+        ({"home_m": 250.0}, 170.0),  # took off at 320 m
+        ({"home_m": 250.0, "agl_m": 250.0}, 170.0),  # level ground was assumed
+        ({"hae_m": 747.0}, 300.0),
+        ({"amsl_m": 700.0, "home_m": 250.0, "hae_m": 1.0}, 300.0),
+        ({"agl_m": 123.0, "amsl_m": 700.0, "home_m": 250.0}, 123.0),  # measured
+    ],
+)
+def test_each_height_becomes_one_above_ground(heights, expected_m):
+    over = GroundHeights(terrain, Ground(320.0, 0.0, 1.0), lambda lat, lon: 0 * lat + GEOID_M)
+    found = over.above(reported(**heights), Ground(400.0, 0.0, 1.0), place(0, 1000))
+    assert found.agl_m == pytest.approx(expected_m) and found.agl_std_m is None
+
+
+@pytest.mark.parametrize("heights", [{}, {"home_m": 250.0}, {"hae_m": 747.0}])
+def test_no_height_is_taken_for_another(heights):
+    telemetry = reported(**heights)
+    assert (
+        GroundHeights(terrain).above(telemetry, Ground(400.0, 0.0, 1.0), place(0, 0)) == telemetry
+    )
+
+
+def test_spread_of_the_ground_widens_the_height():
+    over = GroundHeights(terrain, Ground(320.0, 4.0, 1.0))
+    below = Ground(400.0, 3.0, 1.0)
+    found = over.above(reported(home_m=250.0, agl_std_m=12.0), below, place(0, 0))
+    assert found.agl_std_m == pytest.approx(13.0)
+    found = over.above(reported(amsl_m=700.0), below, place(0, 0))
+    assert found.agl_std_m == pytest.approx(math.hypot(0.08 * 300, 3))
+
+
+def test_the_ground_around_a_place():
+    exact = ground_around(terrain, place(0, 500), 0.0)
+    assert (exact.height_m, exact.std_m, exact.known) == pytest.approx((350, 0, 1))
+    spread = ground_around(terrain, place(0, 500), 100.0)
+    assert spread.height_m == pytest.approx(350, abs=0.2)
+    assert spread.std_m == pytest.approx(100 * SLOPE, rel=0.03)
+    edge = ground_around(terrain, place(HOLE_M, 0), 100.0)
+    assert 0.4 < edge.known < 0.6
+    assert ground_around(terrain, place(HOLE_M + 500, 0), 10.0) is None
+    assert ground_over(terrain, *np.array([place(4000, 0)]).T) is None
+
+
+def test_a_flight_without_a_position_uses_the_area_searched():
+    found = flown().corrected(reported(amsl_m=700.0))
+    std_m = SLOPE * np.std(np.linspace(-2000, 2000, 21))
+    assert found.agl_m == pytest.approx(400, abs=0.1)
+    assert found.agl_std_m == pytest.approx(math.hypot(0.08 * 400, std_m), rel=1e-3)
+
+
+def test_a_flight_uses_its_prior_and_its_last_confident_fix():
+    heights = flown()
+    near = Prior(*place(0, 1000), 50.0)
+    assert heights.corrected(reported(amsl_m=700.0, prior=near)).agl_m == pytest.approx(
+        300, abs=0.1
+    )
+    ignoring = flown(use_prior=False)
+    assert ignoring.corrected(reported(amsl_m=700.0, prior=near)).agl_m == pytest.approx(400, abs=1)
+    heights.observe(10**9, fix(0, -1000), "tracking")
+    found = heights.corrected(reported(2.0, amsl_m=700.0))
+    assert found.agl_m == pytest.approx(500, abs=0.2)
+    assert found.agl_std_m == pytest.approx(math.hypot(40, SLOPE * 35), rel=0.02)
+    far = heights.corrected(reported(100.0, amsl_m=700.0))
+    assert far.agl_std_m > 5 * found.agl_std_m  # a place ages
+
+
+def test_a_velocity_moves_the_last_place():
+    heights = flown()
+    heights.observe(0, fix(0, -1000), None)
+    found = heights.corrected(reported(20.0, amsl_m=700.0, vel_en_mps=(0.0, 50.0)))
+    assert found.agl_m == pytest.approx(400, abs=0.5)  # 1 km farther north
+    assert found.agl_std_m == pytest.approx(math.hypot(32, SLOPE * (5 + 300)), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "outcome, state",
+    [
+        (fix(0, 1000, confidence=0.5), None),
+        (fix(0, 1000, confidence=math.nan), None),
+        (fix(0, 1000), "searching"),
+        (NoFix("blank", "nothing to see"), None),
+    ],
+)
+def test_unsure_positions_say_nothing_about_the_ground(outcome, state):
+    heights = flown()
+    heights.observe(0, outcome, state)
+    assert heights.corrected(reported(amsl_m=700.0)).agl_m == pytest.approx(400, abs=0.1)
+
+
+def test_a_place_of_long_ago_or_of_a_wide_prior_is_unknown():
+    heights = flown()
+    heights.observe(0, fix(0, 1000), None)
+    wide = Prior(*place(0, 1500), 1e6)
+    for time_s in (1e3, 1e9):
+        found = heights.corrected(reported(time_s, amsl_m=700.0, prior=wide))
+        assert found.agl_m == pytest.approx(400, abs=1)
+
+
+def test_a_track_that_is_lost_forgets_its_place():
+    heights = flown()
+    heights.observe(0, fix(0, 1000), "tracking")
+    heights.observe(10**9, NoFix("blank", "nothing to see"), "coasting")
+    assert heights.corrected(reported(1.0, amsl_m=700.0)).agl_m == pytest.approx(300, abs=1)
+    heights.observe(2 * 10**9, NoFix("lost", "no position"), "lost")
+    assert heights.corrected(reported(2.0, amsl_m=700.0)).agl_m == pytest.approx(400, abs=1)
+
+
+def test_a_hole_below_is_filled_by_the_area():
+    heights = flown()
+    found = heights.corrected(reported(amsl_m=700.0, prior=Prior(*place(5000, 0), 10.0)))
+    assert found.agl_m == pytest.approx(400, abs=0.1) and found.agl_std_m > 100
+    nothing = FlownHeights(lambda lat, lon: np.full(np.shape(lat), np.nan), area())
+    assert math.isnan(nothing.corrected(reported(amsl_m=700.0)).agl_m)
+
+
+def test_heights_that_disagree_are_named_once(caplog):
+    start = (*place(0, 0), 5.0)
+    heights = flown(take_off=start)
+    for _ in range(3):
+        heights.corrected(reported(home_m=100.0, amsl_m=400.0 - MISMATCH_M - 5))
+    assert caplog.text.count("differ by 25 m over this terrain") == 1
+    caplog.clear()
+    flown(take_off=start).corrected(reported(home_m=100.0, amsl_m=405.0))
+    assert not caplog.text
+
+
+@pytest.mark.parametrize(
+    "telemetry, terrain_name, words",
+    [
+        (reported(agl_m=100.0), None, None),
+        (reported(agl_m=100.0, home_m=101.0), "dem", None),
+        (reported(), None, None),
+        (reported(agl_m=100.0, home_m=100.0), None, "level ground is assumed.*--dem"),
+        (reported(amsl_m=100.0), None, "only heights above sea level are known.*--dem"),
+        (reported(hae_m=100.0), None, "only heights above the ellipsoid are known"),
+        (reported(agl_m=9.0, home_m=9.0), "dem", "above take-off plus the terrain there minus dem"),
+        (reported(amsl_m=9.0), "dem", "is the height above sea level minus dem"),
+    ],
+)
+def test_what_is_assumed_is_said(telemetry, terrain_name, words):
+    said = assumed_heights(telemetry, terrain_name)
+    assert (said is None) if words is None else re.search(words, said)
+    assert is_measured(telemetry) == (telemetry.agl_m == 100.0 and telemetry.home_m != 100.0)

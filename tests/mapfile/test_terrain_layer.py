@@ -1,0 +1,168 @@
+"""The terrain layer of a map: what was encoded is read, and nothing damaged is believed."""
+
+import zlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from maps import arrays, manifest
+
+from orthonav.errors import MapFileError
+from orthonav.mapfile import open_map, write_map
+from orthonav.mapfile.manifest import TerrainInfo
+from orthonav.mapfile.terrain import (
+    TerrainLayer,
+    decode_terrain,
+    encode_terrain,
+    terrain_part_names,
+)
+
+POSTING_M, ROWS, COLS, CHUNK = 10.0, 40, 50, 16
+INFO = TerrainInfo(
+    -250.0, 200.0, POSTING_M, ROWS, COLS, CHUNK, 100.0, 900.0, 0.1, ROWS * COLS, "dem.tif", "msl"
+)
+DATA, OFFSETS = terrain_part_names(0)
+
+
+def height(east_m, north_m):
+    return 400 + 0.8 * np.asarray(east_m) - 0.3 * np.asarray(north_m)
+
+
+def samples():
+    """Heights (rows, cols) of the layer; a corner of it is a hole."""
+    col, row = np.meshgrid(np.arange(COLS) + 0.5, np.arange(ROWS) + 0.5)
+    heights = height(INFO.west_m + col * POSTING_M, INFO.north_m - row * POSTING_M)
+    heights[:20, :20] = np.nan
+    return heights.astype(np.float32)
+
+
+def chunks(heights):
+    return [
+        encode_terrain(heights[row : row + CHUNK, col : col + CHUNK], INFO)
+        for row in range(0, ROWS, CHUNK)
+        for col in range(0, COLS, CHUNK)
+    ]
+
+
+def parts_of(blobs):
+    ends = np.cumsum([0, *map(len, blobs)]).astype(np.int64)
+    return {DATA: np.frombuffer(b"".join(blobs), np.uint8), OFFSETS: ends}
+
+
+def with_terrain(info=INFO):
+    plain = manifest()
+    return replace(plain, sheets=(replace(plain.sheets[0], terrain=info),))
+
+
+def write(path, blobs=None, info=INFO, **parts):
+    found = parts_of(chunks(samples()) if blobs is None else blobs)
+    write_map(path, with_terrain(info), {**arrays(), **found, **parts})
+    return path
+
+
+@pytest.fixture
+def layer(tmp_path):
+    return TerrainLayer.of(open_map(write(tmp_path / "a.onav")))
+
+
+def test_heights_are_those_that_were_encoded(layer):
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-30, -190], [240, -10], (200, 2))
+    np.testing.assert_allclose(layer.at_en_m(points), height(*points.T), atol=0.051)
+    lat, lon = layer.frame.latlon_from_en(points.reshape(20, 10, 2))
+    np.testing.assert_allclose(layer(lat, lon).ravel(), height(*points.T), atol=0.06)
+    assert layer.info == INFO
+
+
+def test_holes_and_what_lies_outside_are_unknown(layer):
+    outside = [[-251.0, 0], [251, 0], [0, 201], [0, -201], [np.nan, 0], [-200, 150], [1e9, 1e9]]
+    assert np.isnan(layer.at_en_m(np.array(outside))).all()
+    assert np.isnan(layer.at_en_m([-46.0, 100.0]))  # beside a hole
+    assert np.isfinite(layer.at_en_m([-44.0, 100.0]))
+
+
+def test_a_map_without_terrain_is_as_before(tmp_path):
+    write_map(tmp_path / "a.onav", manifest(), arrays())
+    opened = open_map(tmp_path / "a.onav")
+    assert TerrainLayer.of(opened) is None
+    assert b"terrain" not in (tmp_path / "a.onav").read_bytes()
+
+
+@given(
+    st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32 - 1), st.sampled_from([0, 0.3, 1])
+)
+def test_any_heights_come_back(rows, cols, seed, holes):
+    rng = np.random.default_rng(seed)
+    heights = rng.uniform(INFO.low_m, INFO.high_m, (rows, cols)).astype(np.float32)
+    heights[rng.random((rows, cols)) < holes] = np.nan
+    data = encode_terrain(heights, INFO)
+    if not np.isfinite(heights).any():
+        assert data == b""
+        return
+    found = decode_terrain(np.frombuffer(data, np.uint8), (rows, cols), INFO)
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(heights))
+    np.testing.assert_allclose(found, heights, atol=0.051)
+
+
+SIZE = CHUNK * CHUNK
+DAMAGED = {
+    "not compressed": b"\0" * 40,
+    "too short": zlib.compress(bytes(2 * SIZE - 1)),
+    "between": zlib.compress(bytes(2 * SIZE + 1)),
+    "too long": zlib.compress(bytes(2 * SIZE + SIZE // 8 + 1)),
+    "a bomb": zlib.compress(bytes(10**8)),
+    "more after it": zlib.compress(bytes(2 * SIZE)) + b"x",
+    "cut": zlib.compress(np.random.default_rng(0).bytes(2 * SIZE))[:-9],
+    "many bytes": bytes(4 * SIZE + 2000),
+    "too high": zlib.compress(b"\xfe" * SIZE + b"\xff" * SIZE),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_a_damaged_chunk_is_an_error(tmp_path, name):
+    blobs = chunks(samples())
+    blobs[-5] = DAMAGED[name]
+    layer = TerrainLayer.of(open_map(write(tmp_path / "a.onav", blobs)))
+    assert np.isfinite(layer.at_en_m([-40.0, 30.0]))
+    with pytest.raises(MapFileError, match=r"terrain layer is damaged \(chunk 1, 3: .*a\.onav"):
+        layer.at_en_m([240.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"posting_m": 0.5},
+        {"posting_m": 1001.0},
+        {"rows": 0},
+        {"cols": 10**6},
+        {"chunk_px": 8},
+        {"low_m": -1000.0},
+        {"high_m": 10_000.0},
+        {"low_m": 901.0},
+        {"unit_m": 0.001},
+        {"unit_m": 0.01, "high_m": 800.0, "low_m": 100.0},
+        {"known": ROWS * COLS + 1},
+        {"west_m": 1e9},
+    ],
+)
+def test_impossible_layers_are_refused(tmp_path, change):
+    path = write(tmp_path / "a.onav", info=replace(INFO, **change))
+    with pytest.raises(MapFileError, match="impossible terrain layer"):
+        open_map(path)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {OFFSETS: np.zeros(3, np.int64)},
+        {OFFSETS: np.zeros(13, np.int64)},
+        {OFFSETS: np.zeros(13, np.int32)},
+        {DATA: np.zeros((0, 2), np.uint8)},
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(tmp_path, parts):
+    opened = open_map(write(tmp_path / "a.onav", **parts))
+    with pytest.raises(MapFileError, match="terrain"):
+        TerrainLayer.of(opened)

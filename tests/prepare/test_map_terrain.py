@@ -1,0 +1,277 @@
+"""A map with terrain: built from a model, read without GDAL, used to place views."""
+
+import csv
+import json
+import math
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from helpers import write_dem
+from orthonav.cli.heights import map_heights
+from orthonav.errors import AreaError
+from orthonav.flight import open_flight, read_truth
+from orthonav.geo.area import Area
+from orthonav.geo.frames import LocalFrame
+from orthonav.geo.grid import TileGrid
+from orthonav.geo.route import Route
+from orthonav.imagery.terrain import open_dem
+from orthonav.mapfile import open_map, write_map
+from orthonav.mapfile.reader import MapFile
+from orthonav.mapfile.terrain import TerrainLayer
+from orthonav.onboard.run import localize_flight
+from orthonav.prepare.terrain import terrain_of_dem
+from orthonav.records import Fix
+
+FRAME = LocalFrame(46.5, 2.5)
+LOCAL_DEG = 46.4982, 3.0026
+"""The middle of the picture that `make_ortho` writes."""
+
+
+def hill(east_m, north_m):
+    """100 to 240 m high, with a wavelength of 2.5 km."""
+    return 170 + 70 * np.sin(np.asarray(east_m) / 400 + 0.3) * np.cos(np.asarray(north_m) / 400)
+
+
+@pytest.fixture(scope="module")
+def frame(localizer):
+    return localizer.sheet.frame
+
+
+@pytest.fixture(scope="module")
+def dem(frame, tmp_path_factory):
+    return write_dem(tmp_path_factory.mktemp("dem") / "hill.tif", frame, hill)
+
+
+@pytest.fixture(scope="module")
+def hill_map(map_path, dem, tmp_path_factory):
+    """The map of the session with terrain."""
+    opened = open_map(map_path)
+    sheet = opened.manifest.sheets[0]
+    low, high = [sheet.grid.west_m, -500.0], [-sheet.grid.west_m, 500.0]
+    made = terrain_of_dem(open_dem(dem, "msl"), Area(sheet.frame, (*low, *high)), sheet.grid)
+    out = tmp_path_factory.mktemp("map") / "hill.onav"
+    manifest = replace(opened.manifest, sheets=(replace(sheet, terrain=made.info),))
+    write_map(out, manifest, {**opened.arrays, **made.arrays})
+    return out
+
+
+def test_terrain_is_all_that_a_map_gains(run, make_ortho, tmp_path):
+    ortho = make_ortho(tmp_path / "past.tif")
+    frame = LocalFrame(*LOCAL_DEG)
+    dem = write_dem(tmp_path / "dem.tif", frame, hill)
+    maps = []
+    for name, more in (("flat", ()), ("hill", ("--dem", dem, "--dem-datum", "msl"))):
+        out = tmp_path / f"{name}.onav"
+        sizes = ("--tile-px", 64, "--no-registration", "--out", out)
+        assert run("build", "--ortho", ortho, *sizes, *more).code == 0
+        maps.append(open_map(out))
+    flat, hilly = maps
+    more = {"sheet0/terrain/bytes", "sheet0/terrain/offsets"}
+    assert set(hilly.arrays) - set(flat.arrays) == more
+    for name in flat.arrays:
+        np.testing.assert_array_equal(hilly.arrays[name], flat.arrays[name])
+    sheet = hilly.manifest.sheets[0]
+    assert replace(sheet, terrain=None) == flat.manifest.sheets[0]
+    assert b"terrain" not in flat.path.read_bytes()
+    assert (sheet.terrain.name, sheet.terrain.posting_m) == ("dem.tif", 25.0)
+    lat, lon = sheet.frame.latlon_from_en(np.random.default_rng(0).uniform(-180, 180, (99, 2)))
+    # Bilinear between samples of 25 m of a wave of 2.5 km.
+    found = TerrainLayer.of(hilly)(lat, lon)
+    np.testing.assert_allclose(found, hill(*frame.en_from_latlon(lat, lon).T), atol=1)
+
+
+def test_info_shows_the_terrain(run, hill_map, map_path):
+    plain = json.loads(run("info", hill_map, "--json").out)["terrain"]
+    assert plain["posting_m"] == 25 and plain["mb_per_km2"] < 0.02
+    assert plain["low_m"] == pytest.approx(100, abs=1) and plain["datum"] == "MSL height"
+    assert "terrain    100 to 240 m above the sea every 25 m" in run("info", hill_map).out
+    assert json.loads(run("info", map_path, "--json").out)["terrain"] is None
+
+
+def test_terrain_of_a_corridor_is_small_and_holes_are_named(tmp_path, caplog):
+    def holed(heights):
+        heights[100:104, 100:104] = -9999
+        return heights
+
+    path = write_dem(tmp_path / "dem.tif", FRAME, hill, half_m=4000, px_m=10, change=holed)
+    ends = FRAME.latlon_from_en(np.array([[-3500.0, -3500.0], [3500.0, 3500.0]]))
+    route = Route(tuple(zip(*(each.tolist() for each in ends), strict=True)))
+    sizes = {}
+    for name, area in (("all", Area.from_bounds((2.46, 46.47, 2.54, 46.53))),
+                       ("band", Area.from_route(route, 300))):  # fmt: skip
+        grid = TileGrid.covering(area.extent_en_m, gsd_m=1.0, tile_px=256, overlap=0.875)
+        made = terrain_of_dem(open_dem(path, "msl"), area, grid)
+        sizes[name] = made.info.known, made.arrays["sheet0/terrain/bytes"].size
+        assert sizes[name][1] < 0.02e6 * made.info.known * made.info.posting_m**2 / 1e6
+    assert sizes["band"][0] < 0.6 * sizes["all"][0]
+    assert "these holes stay holes in the map (dem.tif)" in caplog.text
+
+
+def test_terrain_elsewhere_is_refused(tmp_path):
+    path = write_dem(tmp_path / "dem.tif", FRAME, hill)
+    area = Area.from_bounds((3.46, 46.47, 3.47, 46.48))
+    grid = TileGrid.covering(area.extent_en_m, gsd_m=1.0, tile_px=256, overlap=0.875)
+    with pytest.raises(AreaError, match=r"no height in the area, at 46\.4750, 3\.4650: .*dem\.tif"):
+        terrain_of_dem(open_dem(path, "msl"), area, grid)
+
+
+def test_build_names_what_is_wrong_before_the_work(run, area, dem, tmp_path):
+    build = ("build", "--ortho", area.past, "--out", tmp_path / "a.onav", "--dem")
+    assert "give --dem-datum" in run(*build, dem).err
+    assert "is a picture" in run(*build, area.past, "--dem-datum", "msl").err
+    assert "does not exist: no.tif" in run(*build, "no.tif").err
+    done = run("build", "--ortho", area.past, "--dem", dem, "--dem-datum", "msl", "--out", dem)
+    assert "would replace an orthophoto or terrain" in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def flown(area, frame, dem, tmp_path_factory):
+    """A flight at a constant altitude over the hill."""
+    from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+
+    corners = np.array([[-350.0, -250.0], [350.0, -250.0], [350.0, 250.0]])
+    lat, lon = frame.latlon_from_en(corners)
+    out = tmp_path_factory.mktemp("flown") / "flight"
+    simulate_flight(
+        SimulateRequest(
+            [area.present], out, route=Route(tuple(zip(lat.tolist(), lon.tolist(), strict=True))),
+            agl_m=250.0, spacing_m=70.0, camera=area.camera, errors=Errors(yaw_std_deg=3.0),
+            terrain=open_dem(dem, "msl"), seed=1,
+        )
+    )  # fmt: skip
+    return out
+
+
+def rows(flight):
+    with (flight / "telemetry.csv").open() as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_a_flight_reports_heights_above_sea_and_take_off(flown):
+    reported = rows(flown)
+    assert {row["agl_m"] for row in reported} == {row["home_m"] for row in reported} == {"250"}
+    amsl = {float(row["amsl_m"]) for row in reported}
+    assert max(amsl) - min(amsl) < 0.01
+    assert max(amsl) == pytest.approx(250 + hill(-350, -250), abs=1)
+
+
+def test_a_terrain_places_views_that_level_ground_does_not(
+    run, flown, map_path, hill_map, dem, tmp_path
+):
+    found = {}
+    for name, arguments in {
+        "level": [map_path],
+        "map": [hill_map],
+        "file": [map_path, "--dem", dem, "--dem-datum", "msl"],
+    }.items():
+        out = tmp_path / f"{name}.jsonl"
+        done = run("localize", *arguments[:1], flown, *arguments[1:], "--out", out)
+        assert done.code == 0
+        assert ("level ground is assumed" in done.err) == (name == "level"), done.err
+        scored = run("evaluate", out, "--truth", flown / "truth.csv", "--radius-m", 15, "--json")
+        found[name] = json.loads(scored.out)["acc_at_15m"]
+    assert found["level"] + 0.1 < found["map"] == found["file"], found
+
+
+class KnowsThePlace:
+    """A locator that finds every view where it was taken, and keeps the heights it was given."""
+
+    state_name = None
+
+    def __init__(self, truth):
+        self.places, self.agl_m = iter(truth.values()), []
+
+    def locate(self, view):
+        self.agl_m.append(view.telemetry.agl_m)
+        return Fix(*next(self.places), np.eye(2), 0.99, 35.0, 0.0, view.telemetry.agl_m)
+
+
+def test_a_flight_is_located_with_heights_above_the_ground_where_it_is(flown, hill_map, dem):
+    truth = read_truth(flown / "truth.csv")
+    locator, heights = KnowsThePlace(truth), map_heights(open_map(hill_map))
+    assert len(list(localize_flight(locator, open_flight(flown), heights=heights))) == len(truth)
+    below = open_dem(dem, "msl")(*np.array(list(truth.values())).T)
+    expected = float(rows(flown)[0]["amsl_m"]) - below
+    off = np.array(locator.agl_m) / expected - 1
+    assert np.ptp(expected) > 60
+    assert abs(off[1:]).max() < 0.1  # by the ground of the view before, 70 m away
+    assert abs(off[1:]).mean() < 0.3 * abs(250 / expected - 1).mean()
+
+
+def test_import_writes_heights_above_ground(run, flown, dem, tmp_path):
+    done = run("import", flown, "--dem", dem, "--dem-datum", "msl", "--out", tmp_path / "imported")
+    assert (done.code, done.err) == (0, "")
+    before, after = rows(flown), rows(tmp_path / "imported")
+    with (flown / "truth.csv").open() as stream:
+        places = [(float(row["lat_deg"]), float(row["lon_deg"])) for row in csv.DictReader(stream)]
+    below = open_dem(dem, "msl")(*np.array(places).T)
+    expected = np.array([float(row["amsl_m"]) for row in before]) - below
+    np.testing.assert_allclose([float(row["agl_m"]) for row in after], expected, atol=0.01)
+    assert [row["home_m"] for row in before] == [row["home_m"] for row in after]
+    note = json.loads((tmp_path / "imported/flight.json").read_text())["note"]
+    assert "above sea level minus the terrain of hill.tif" in note
+
+
+def test_views_over_holes_have_no_height(run, flown, frame, tmp_path):
+    path = write_dem(
+        tmp_path / "holes.tif", frame, hill,
+        change=lambda heights: np.where(np.arange(heights.shape[1]) > 62, -9999, heights),
+    )  # fmt: skip
+    done = run("import", flown, "--dem", path, "--dem-datum", "msl", "--out", tmp_path / "imported")
+    found = [row["agl_m"] for row in rows(tmp_path / "imported")]
+    unknown = sum(math.isnan(float(each)) for each in found)
+    assert 0 < unknown < len(found)
+    assert f"{unknown} views have no height above ground" in done.err
+
+
+def test_random_views_report_heights_above_sea_only(run, area, dem, tmp_path):
+    done = run(
+        "simulate", "--ortho", area.present, "--random", 3, "--agl-m", 250, "--dem", dem,
+        "--dem-datum", "msl", "--out", tmp_path / "flight",
+    )  # fmt: skip
+    assert done.code == 0
+    reported = rows(tmp_path / "flight")
+    assert {row["agl_m"] for row in reported} == {"nan"} and "home_m" not in reported[0]
+    assert all(340 < float(row["amsl_m"]) < 500 for row in reported)
+
+
+def test_options_that_exclude_each_other(run, flown, map_path, dem, tmp_path):
+    for more, said in (
+        (("--dem-datum", "msl"), "give --dem too"),
+        (("--dem", dem, "--ground-alt-m", 5), "give it or --dem"),
+    ):
+        done = run("localize", map_path, flown, *more, "--out", tmp_path / "f.jsonl")
+        assert done.code == 1 and said in done.err and done.err.count("\n") == 1
+
+
+def test_terrain_is_flown_without_gdal_and_proj(hill_map, flown):
+    script = f"""
+import sys
+for name in ("rasterio", "pyproj", "torch"): sys.modules[name] = None
+from orthonav.cli.heights import map_heights
+from orthonav.flight import open_flight
+from orthonav.mapfile import open_map, write_map
+heights = map_heights(open_map({str(hill_map)!r}))
+view = open_flight({str(flown)!r}).views[0]
+print(heights.corrected(view.telemetry).agl_m)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, env=dict(os.environ)
+    )
+    assert 200 < float(done.stdout) < 400, done.stderr
+
+
+def test_a_map_in_memory_has_its_terrain_too(hill_map):
+    opened = open_map(hill_map)
+    held = MapFile(
+        hill_map, 0, opened.manifest, {name: opened.arrays[name] for name in opened.arrays}
+    )
+    points = np.array([[0.0, 0.0], [100.0, 200.0]])
+    found = TerrainLayer.of(held).at_en_m(points)
+    np.testing.assert_array_equal(found, TerrainLayer.of(opened).at_en_m(points))
