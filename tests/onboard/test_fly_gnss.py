@@ -11,7 +11,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from test_fly import AHEAD_NS, Flight
 
 from orthonav.geo.frames import LocalFrame
-from orthonav.onboard.gnss.biases import Biases, unknown
+from orthonav.onboard.gnss.biases import Biases, design, unknown
+from orthonav.onboard.gnss.learner import Resumed
 from orthonav.onboard.gnss.records import Fault
 from orthonav.onboard.gnss.watch import GnssWatch, LiveSolutions
 from orthonav.onboard.state import SavedState, learnt_biases, save
@@ -31,13 +32,10 @@ class Watched(Flight):
     """A flight to the north at 10 m/s, whose autopilot sends GPS_RAW_INT; `off_m` is its error."""
 
     def __init__(self, tmp_path, receiver="gps_raw_int", **options):
-        known = options.pop("known", {})
-        correct = options.pop("correct", False)
+        more = {key: options.pop(key) for key in ("known", "correct", "resumed") if key in options}
         super().__init__(tmp_path, FakeLocator(lambda view: self.seen()), **options)
         self.off_m, self.fix_type, self.receiver, self.north_m = np.zeros(2), 3, receiver, 0.0
-        self.watch = GnssWatch(
-            FRAME, LiveSolutions(self.link.gnss), digest="d", known=known, correct=correct
-        )
+        self.watch = GnssWatch(FRAME, LiveSolutions(self.link.gnss), digest="d", **more)
         self.runner._gnss = self.watch
         self.frames, write = [], self.port.write
         self.port.write = lambda data: (self.frames.append(bytes(data)), write(data))
@@ -162,15 +160,22 @@ def test_what_was_learnt_is_reported_and_saved_by_the_digest_of_the_map(
     assert "map_displaced" in flight.reasons()  # by more than maps usually are
 
 
-def test_positions_are_moved_only_where_asked_and_known_before(begin):
-    good = known_biases(30.0, -10.0, 2.0, 3600.0)
-    short = known_biases(30.0, -10.0, 2.0, 600.0)
-    for known, correct, moved_m in (
-        (good, True, [30.0, -10.0]),
-        (good, False, [0.0, 0.0]),
-        (short, True, [0.0, 0.0]),
+def test_positions_are_moved_only_where_asked_known_before_and_plausible(begin, caplog):
+    good = known_biases(12.0, -5.0, 2.0, 3600.0)
+    short = known_biases(12.0, -5.0, 2.0, 600.0)
+    spoofed = known_biases(60.0, 0.0, 2.0, 36000.0)
+    vague = known_biases(12.0, -5.0, 8.0, 36000.0)
+    for known, correct, moved_m, refused in (
+        (good, True, [12.0, -5.0], False),
+        (good, False, [0.0, 0.0], False),
+        (short, True, [0.0, 0.0], False),
+        (spoofed, True, [0.0, 0.0], True),
+        (spoofed, False, [0.0, 0.0], False),
+        (vague, True, [0.0, 0.0], True),
     ):
+        caplog.clear()
         flight = begin(known={"d": known}, correct=correct)
+        assert ("not corrected" in caplog.text) is (correct and known is not good)
         flight.off_m = known.en_m
         flight.views(20)
         flight.frames.clear()
@@ -179,6 +184,26 @@ def test_positions_are_moved_only_where_asked_and_known_before(begin):
         at_map = FRAME.en_from_latlon(result.outcome.lat_deg, result.outcome.lon_deg)
         place = FRAME.en_from_latlon(sent.lat * 1e-7, sent.lon * 1e-7)
         assert place - at_map == pytest.approx(moved_m, abs=0.05)
+        reasons = flight.health().reasons
+        assert ("not_corrected" in reasons) is refused
+        assert ("map_displaced" in reasons) is (known is spoofed)
+
+
+def test_an_interrupted_flight_is_not_corrected_by_what_it_learnt(begin):
+    """A spoofer could move the positions by a restart of the computer."""
+    before, dragged = known_biases(0.0, 0.0, 2.0, 3600.0), known_biases(12.0, 0.0, 1.0, 9000.0)
+    flight = begin(known={"d": before}, correct=True, resumed=Resumed(dragged, before))
+    flight.off_m = dragged.en_m
+    flight.views(20)
+    flight.frames.clear()
+    result = flight.view()
+    (sent,) = flight.sent("GLOBAL_POSITION_SENSOR")
+    at_map = FRAME.en_from_latlon(result.outcome.lat_deg, result.outcome.lon_deg)
+    assert FRAME.en_from_latlon(sent.lat * 1e-7, sent.lon * 1e-7) == pytest.approx(at_map, abs=0.05)
+    saved = flight.watch.maps()["d"]
+    assert saved["mean"][0] == pytest.approx(12.0, abs=0.5)  # it continues to learn
+    flown = saved["flight"]
+    assert flown["before"] == before.to_plain() == flown["reference"]
 
 
 def test_mount_and_latency_move_a_position_by_heading_height_and_velocity():
@@ -194,8 +219,36 @@ def test_mount_and_latency_move_a_position_by_heading_height_and_velocity():
     start = watch._start.stds
     along = 1.0 + (200 * start[2]) ** 2 + (20 * start[4]) ** 2
     assert np.diag(more) == pytest.approx([along, 1.0 + (200 * start[3]) ** 2])
-    lost = NoFix("blank", "nothing")
-    assert watch.corrected(lost) is lost
+    late = watch.corrected(seen, as_stated=False)  # the learnt latency belongs to the stated one
+    assert FRAME.en_from_latlon(late.lat_deg, late.lon_deg) == pytest.approx([-4, 0], abs=0.01)
+    lost, low = NoFix("blank", "nothing"), replace(seen, agl_m=math.nan)
+    assert watch.corrected(lost) is lost and watch.corrected(low) is low
+
+
+def test_a_position_without_heading_is_not_moved_by_the_mount():
+    """The correction and its covariance hold for any heading."""
+    known = known_biases(3.0, 0.0, 1.0, 3600.0, pitch_rad=0.02, latency_s=0.25)
+    watch = GnssWatch(FRAME, LiveSolutions(deque()), digest="d", known={"d": known}, correct=True)
+    velocity = {"vel_east_mps": 0.0, "vel_north_mps": 20.0}
+    seen = replace(fix(48.0, 2.0), heading_deg=math.nan, agl_m=200.0, evidence=velocity)
+    moved = watch.corrected(seen)
+    place = FRAME.en_from_latlon(moved.lat_deg, moved.lon_deg)
+    assert place == pytest.approx([3, 5], abs=0.01)
+    squares = np.zeros((2, 2))
+    for heading in np.linspace(0, 2 * math.pi, 36, endpoint=False):
+        mean, cov = watch._start.correction(design(heading, 200.0, np.array([0.0, 20.0])))
+        squares += cov + np.outer(mean - [3, 5], mean - [3, 5])
+    assert moved.cov_en_m2 - seen.cov_en_m2 == pytest.approx(squares / 36, rel=1e-6, abs=1e-6)
+
+
+def test_neither_heading_nor_mount_is_learnt_from_a_position_without_heading(begin):
+    flight = begin()
+    flight.seen = lambda: replace(Watched.seen(flight), heading_deg=math.nan)
+    flight.views(30)
+    assert all(
+        math.isnan(each.status.difference_en_m[0]) for each in flight.watch._monitors.values()
+    )
+    assert flight.watch._monitors
 
 
 def test_spoofing_never_moves_what_is_sent(begin):

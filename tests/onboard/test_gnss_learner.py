@@ -17,7 +17,13 @@ from orthonav.onboard.gnss.biases import (
     unknown,
 )
 from orthonav.onboard.gnss.difference import Difference, DifferenceModel
-from orthonav.onboard.gnss.learner import QUARANTINE_S, SETTLED_S, BiasLearner
+from orthonav.onboard.gnss.learner import (
+    QUARANTINE_S,
+    SETTLED_S,
+    BiasLearner,
+    Resumed,
+    before_flight,
+)
 from orthonav.onboard.gnss.rolling import Rolling
 
 MODEL = DifferenceModel()
@@ -175,6 +181,28 @@ def test_many_flights_that_show_nothing_are_no_damage():
     for _ in range(200):
         known = at_start({"map": biases_from_plain(known.to_plain())}, "map", "camera")
     assert known.stds == pytest.approx(unknown().stds)
+
+
+def test_a_measured_latency_is_not_learnt():
+    """What was learnt belongs to the stated one."""
+    values = [replace(each, as_stated=False) for each in legs((NORTH, SOUTH), (12.0, 30.0))]
+    found = learnt(values)
+    assert found.mean[4] == 0 and found.stds[4] >= unknown().stds[4]
+
+
+def test_an_interrupted_flight_keeps_its_reference():
+    """A drag-off that was learnt before the restart is undone after it."""
+    start = replace(unknown(), agreed_s=SETTLED_S)
+    learner = BiasLearner(start, MODEL)
+    for second in range(400):
+        learner.add(difference(second))
+    saved = Resumed(learner.learnt, learner.reference).to_plain(None)
+    before, resumed = before_flight(saved)
+    assert before is None
+    again = BiasLearner(unknown(), MODEL, resumed)
+    assert again.learnt.mean == pytest.approx(learner.learnt.mean)
+    again.restore()
+    assert not again.learnt.mean.any() and again.learnt.agreed_s == SETTLED_S
 
 
 def test_rolling_is_seen_by_a_change_of_the_turn_rate():

@@ -313,7 +313,7 @@ def _add_flight(group: Any) -> None:
         type=float,
         default=300.0,
         metavar="S",
-        help="ignore a saved position that is older (default 300)",
+        help="a saved state that is older is not of this flight (default 300)",
     )
     group.add_argument(
         "--gnss",

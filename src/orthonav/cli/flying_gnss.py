@@ -3,19 +3,22 @@
 import argparse
 import hashlib
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from orthonav.errors import VariantError
 from orthonav.flight.gnss import FILE, GnssSample, read_gnss
 from orthonav.geo.frames import LocalFrame
+from orthonav.onboard.gnss.biases import Biases
+from orthonav.onboard.gnss.learner import Resumed
 from orthonav.onboard.gnss.watch import (
     GnssSource,
     GnssWatch,
     LiveSolutions,
     RecordedSolutions,
 )
-from orthonav.onboard.state import learnt_biases
+from orthonav.onboard.state import before_the_flight, boot_id, learnt_biases, load
 from orthonav.onboard.telemetry import Clocks
 
 
@@ -45,14 +48,34 @@ def gnss_watch(
     else:
         source = LiveSolutions(queue)
 
+    known, resumed = _learnt_before(options, digest, clocks)
     return GnssWatch(
         frame,
         source,
         digest=digest,
-        known=learnt_biases(options.state) if options.state else {},
+        known=known,
+        resumed=resumed,
         setup=hashlib.sha256(repr(used).encode()).hexdigest()[:16],
         correct=options.gnss == "correct",
         recorded=recorded,
         min_confidence=min_confidence,
         utc_ahead_ns=lambda: 0 if recorded else clocks.utc_ns() - clocks.mono_ns(),
     )
+
+
+def _learnt_before(
+    options: argparse.Namespace, digest: str, clocks: Clocks
+) -> tuple[Mapping[str, Biases], Resumed | None]:
+    """What was learnt before this flight, and by it, where it was interrupted.
+
+    A state that is no older than `--state-max-age-s` is that of this flight, also one whose age is
+    not known because a clock was set back.
+    """
+    if options.state is None:
+        return {}, None
+    saved = load(options.state)
+    if saved is not None:
+        age_s = saved.age_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
+        if age_s > options.state_max_age_s:
+            return learnt_biases(options.state), None
+    return before_the_flight(options.state, digest)

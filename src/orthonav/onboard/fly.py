@@ -310,7 +310,8 @@ class Runner:
             self._count("internal_error")
         if latency is not None and isinstance(outcome, Fix):
             outcome = _with_latency(outcome, telemetry, latency.std_s)
-        result = self._result(image, outcome, latency_ms)
+        as_stated = latency is None or latency.stated
+        result = self._result(image, outcome, latency_ms, as_stated=as_stated)
         doubt = self._doubt(image, result)
         if doubt is not None:
             self._count(doubt)
@@ -320,7 +321,8 @@ class Runner:
         if self.options.heights is not None:
             self.options.heights.observe(telemetry.time_ns, outcome, result.state)
         accepted = self.options.accept(result.outcome) if self.options.accept else result.outcome
-        accepted = accepted if self._gnss is None else self._gnss.corrected(accepted)
+        if self._gnss is not None:
+            accepted = self._gnss.corrected(accepted, as_stated=as_stated)
         self._publisher.publish(
             replace(result, outcome=accepted), image.exposed_ns, vehicle, judged=True
         )
@@ -366,10 +368,14 @@ class Runner:
             fix.lat_deg, fix.lon_deg, std_m, utc_ns, exposed_ns, self._boot_id
         )
 
-    def _result(self, image: CameraImage, outcome: Fix | NoFix, latency_ms: float) -> ViewResult:
+    def _result(
+        self, image: CameraImage, outcome: Fix | NoFix, latency_ms: float, *, as_stated: bool = True
+    ) -> ViewResult:
         state = self._locator.state_name
         result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state)
-        return result if self._gnss is None else self._gnss.view(result, image.exposed_ns)
+        if self._gnss is None:
+            return result
+        return self._gnss.view(result, image.exposed_ns, as_stated=as_stated)
 
     def _map_changed(self) -> NoFix | None:
         """Reason to give no position where the map file was changed in place; None if it was not.

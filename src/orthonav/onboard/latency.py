@@ -66,12 +66,14 @@ class Latency:
 
     `delay_s`, `std_s`: exposure to arrival and its standard deviation; NaN where not known.
     `reason`: why it must not be used; None if it can be used. `detail`: one sentence about it.
+    `stated`: whether it is the stated delay, not one that was measured in flight.
     """
 
     delay_s: float
     std_s: float
     reason: str | None = None
     detail: str = ""
+    stated: bool = False
 
 
 @dataclass(frozen=True)
@@ -176,7 +178,7 @@ class LatencyMonitor:
             reason, detail = UNSTEADY, "the camera latency drifts and is not observable now"
         elif std_s * self._speed_mps() > 2 * LARGEST_M:
             reason, detail = UNKNOWN, f"camera latency known to {std_s * 1e3:.0f} ms only"
-        return Latency(delay_s, std_s, reason, detail)
+        return Latency(delay_s, std_s, reason, detail, self._known is self._stated)
 
     def observe(
         self,
@@ -216,7 +218,7 @@ class LatencyMonitor:
         """What is known, for logs: `latency_ms`, `latency_std_ms`, and `latency`, where it comes
         from or why it is not used."""
         found = self.current()
-        source = "stated" if self._known is self._stated else "measured"
+        source = "stated" if found.stated else "measured"
         rounded = (
             None if math.isnan(each) else round(each * 1e3, 1)
             for each in (found.delay_s, found.std_s)

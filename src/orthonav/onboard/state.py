@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from orthonav.onboard.gnss.biases import Biases, biases_from_plain
+from orthonav.onboard.gnss.learner import Resumed, before_flight
 from orthonav.records import Prior
 
 VERSION = 1
@@ -96,6 +97,20 @@ def learnt_biases(path: Path) -> dict[str, Biases]:
         with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
             found[digest] = biases_from_plain(plain)
     return found
+
+
+def before_the_flight(path: Path, digest: str) -> tuple[dict[str, Biases], Resumed | None]:
+    """As `learnt_biases`, but of the time before the flight that saved the file, and what that
+    flight had learnt of the map `digest`, None where it had learnt nothing."""
+    known, resumed = {}, None
+    for each, plain in _maps_of(path).items():
+        with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
+            before, flown = before_flight(plain)
+            if before is not None:
+                known[each] = before
+            if each == digest:
+                resumed = flown
+    return known, resumed
 
 
 def _maps_of(path: Path) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from orthonav.records import MAP_STD_M
 
 NAMES = ("east_m", "north_m", "pitch_rad", "roll_rad", "latency_s")
 """Biases in the order of `Biases.mean`."""
+_MOUNT = slice(2, 4)
 LARGEST_M = 100.0
 """Largest displacement; a larger difference is a fault."""
 LIMITS = np.array([LARGEST_M, LARGEST_M, math.radians(10), math.radians(10), 1.0])
@@ -74,9 +75,24 @@ class Biases:
         largest_m = PLAUSIBLE_SIGMAS * MAP_STD_M + 2 * self.std_m
         return float(np.hypot(*self.en_m)) <= largest_m
 
+    @property
+    def is_usable(self) -> bool:
+        """Whether positions may be corrected by them: the displacement is plausible, and known at
+        least as well as every fix assumes it. Otherwise a constant error of a receiver could pass
+        for one of the mount."""
+        return self.is_plausible and self.std_m <= MAP_STD_M
+
     def correction(self, design: Array) -> tuple[Array, Array]:
         """Mean (2,) and covariance (2, 2) of GNSS minus map for the `design` (2, 5) of a view."""
         return design @ self.mean, design @ self.cov @ design.T
+
+    def correction_at_any_heading(self, agl_m: float, vel_en_mps: Array) -> tuple[Array, Array]:
+        """The same where all headings are equally likely: the error of the mount, which turns with
+        the heading, is only part of the covariance."""
+        mean, cov = self.correction(design(0.0, 0.0, vel_en_mps))
+        tilt, spread = self.mean[_MOUNT], self.cov[_MOUNT, _MOUNT]
+        turning_m2 = agl_m**2 * (float(tilt @ tilt) + float(np.trace(spread)))
+        return mean, cov + turning_m2 / 2 * np.eye(2)
 
     def without_displacement(self) -> "Biases":
         """The same with no displacement, known exactly."""

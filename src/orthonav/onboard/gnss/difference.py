@@ -62,7 +62,8 @@ class Difference:
     `time_s`: time. `en_m` (2,): GNSS minus map. `gnss_std_m`, `map_std_m`: stated deviations.
     `heading_rad`: heading. `vel_en_mps` (2,): velocity. `agl_m`: height above ground; 0 where not
     known, which gives it no error of the mount. `rolling_std_m`: standard deviation of an error of
-    this value alone, while the aircraft rolls.
+    this value alone, while the aircraft rolls. `as_stated`: whether the latency of the images is
+    the stated one; one that was measured in flight has no bias to be learnt.
     """
 
     time_s: float
@@ -73,6 +74,7 @@ class Difference:
     vel_en_mps: Array
     agl_m: float = 0.0
     rolling_std_m: float = 0.0
+    as_stated: bool = True
 
     def rolling(self, std_m: float) -> "Difference":
         """The same with at least this error by rolling."""
@@ -81,7 +83,7 @@ class Difference:
     @cached_property
     def design(self) -> Array:
         """Derivatives (2, 5) by the biases."""
-        return design(self.heading_rad, self.agl_m, self.vel_en_mps)
+        return design(self.heading_rad, self.agl_m, self.as_stated * self.vel_en_mps)
 
     def residual(self, known: Biases) -> Array:
         """Difference (2,) that the biases do not explain."""

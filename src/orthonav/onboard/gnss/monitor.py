@@ -20,7 +20,7 @@ from orthonav.onboard.gnss.difference import (
     DifferenceWindow,
     Finding,
 )
-from orthonav.onboard.gnss.learner import BiasLearner
+from orthonav.onboard.gnss.learner import BiasLearner, Resumed
 from orthonav.onboard.gnss.receiver import GAP_S, VELOCITY_S, VELOCITY_STD_MPS, Receiver
 from orthonav.onboard.gnss.records import (
     NANOSECONDS,
@@ -67,19 +67,21 @@ class GnssMonitor:
         frame: LocalFrame,
         start: Biases | None = None,
         model: DifferenceModel | None = None,
+        resumed: Resumed | None = None,
     ) -> None:
-        """`frame`: plane of the map. `start`: biases known before the flight."""
-        start = start or unknown()
+        """`frame`: plane of the map. `start`: biases known before the flight. `resumed`: what it
+        had learnt when it was interrupted."""
         self._frame, self._model = frame, model or DifferenceModel()
         self._receiver, self._window = Receiver(), DifferenceWindow(self._model)
-        self._learner, self._rolling = BiasLearner(start, self._model), Rolling()
+        self._learner = BiasLearner(start or unknown(), self._model, resumed)
+        self._rolling = Rolling()
         self._pending: deque[MapPosition] = deque(maxlen=PENDING)
         self._solved: deque[tuple[GnssSample, Array]] = deque(maxlen=SOLVED)
         self._bin: list[Difference] = []
         self._map: MapPosition | None = None
         self._held: MapPosition | None = None
         self._map_jump_ns: int | None = None
-        self._anchor = start
+        self._anchor = self._learner.learnt
         self._agreed_s, self._newest_s = 0.0, -math.inf
         self._fault_ns = self._velocity_ns = -(10**12)
         self.status = GnssStatus()
@@ -88,6 +90,11 @@ class GnssMonitor:
     def learnt(self) -> Biases:
         """Biases as learnt so far."""
         return self._learner.learnt
+
+    @property
+    def reference(self) -> Biases:
+        """See `BiasLearner.reference`."""
+        return self._learner.reference
 
     def sample(self, sample: GnssSample) -> None:
         """Add a solution of the receiver."""
@@ -153,8 +160,16 @@ class GnssMonitor:
         std_m = sample.std_m if math.isfinite(sample.std_m) else self._model.gnss_std_m
         heading = math.radians(position.heading_deg)
         time_s = position.time_ns * NANOSECONDS
-        agl_m = position.agl_m
-        made = Difference(time_s, off_en_m, std_m, position.std_m, heading, velocity, agl_m)
+        made = Difference(
+            time_s,
+            off_en_m,
+            std_m,
+            position.std_m,
+            heading,
+            velocity,
+            position.agl_m,
+            as_stated=position.as_stated,
+        )
         if self._bin and math.floor(self._bin[0].time_s / BIN_S) != math.floor(time_s / BIN_S):
             value, self._bin = _median(self._bin), []
             self._judge(value, now_ns)

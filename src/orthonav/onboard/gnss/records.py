@@ -67,6 +67,7 @@ class MapPosition:
     `vel_en_mps` (2,): velocity of the track; None where not known.
     `heading_deg`: heading of the top of the image; errors of a tilted mount turn with it.
     `agl_m`: height above ground; errors of a tilted mount grow with it. 0 where not known.
+    `as_stated`: whether the latency in use is the stated one, to which the learnt one belongs.
     """
 
     time_ns: int
@@ -75,6 +76,7 @@ class MapPosition:
     vel_en_mps: Array | None = None
     heading_deg: float = 0.0
     agl_m: float = 0.0
+    as_stated: bool = True
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from orthonav.flight.gnss import BIASES, GnssSample
 from orthonav.flight.logged import gnss_message
 from orthonav.geo.frames import LocalFrame
 from orthonav.onboard.gnss.biases import Biases, at_start, design
-from orthonav.onboard.gnss.learner import SETTLED_S
+from orthonav.onboard.gnss.learner import SETTLED_S, Resumed
 from orthonav.onboard.gnss.monitor import GnssMonitor
 from orthonav.onboard.gnss.records import (
     NANOSECONDS,
@@ -34,6 +34,8 @@ log = logging.getLogger(__name__)
 DISPLACED = "map_displaced"
 """Reason in health: the learnt displacement is larger than that of a map as accurate as fixes
 state, or GNSS was spoofed since the first flight over it."""
+NOT_CORRECTED = "not_corrected"
+"""Reason in health: positions should be corrected, but what was learnt before must not be used."""
 SHOWN_S = 1.0
 """Age up to which a solution is extrapolated to an exposure, for display only."""
 ALARM_SEVERITY, RETURN_SEVERITY = 2, 5  # MAV_SEVERITY_CRITICAL, MAV_SEVERITY_NOTICE
@@ -89,6 +91,7 @@ class GnssWatch:
         *,
         digest: str = "",
         known: Mapping[str, Biases] = MappingProxyType({}),
+        resumed: Resumed | None = None,
         setup: str = "",
         correct: bool = False,
         recorded: bool = False,
@@ -96,12 +99,13 @@ class GnssWatch:
         utc_ahead_ns: Callable[[], int] = lambda: 0,
     ) -> None:
         """`frame`: plane of the map. `digest`: of the map; `known`: biases by digest, the latest
-        last. `setup`: identifies camera, mount and stated latency.
+        last. `resumed`: what this flight had learnt when it was interrupted. `setup`: identifies
+        camera, mount and stated latency.
 
-        `correct`: correct positions by the biases known before the flight; what is learnt in this
-        flight never moves a position. `recorded`: times are those of the recording.
-        `utc_ahead_ns`: what is added to times of solutions in the log. `log` gets every solution,
-        as the message of a flight log.
+        `correct`: correct positions by the biases known before the flight, if they are usable; what
+        is learnt in this flight never moves a position, nor after a restart. `recorded`: times are
+        those of the recording. `utc_ahead_ns`: what is added to times of solutions in the log.
+        `log` gets every solution, as the message of a flight log.
         """
         self._frame, self._source, self._utc_ahead_ns = frame, source, utc_ahead_ns
         self.log: Callable[[int, bytes], None] = lambda time_ns, cdr: None
@@ -112,40 +116,54 @@ class GnssWatch:
         self._shown: dict[int, GnssStatus] = {}
         self._last: GnssSample | None = None
         self._now_ns, self._has_failed = 0, False
-        self._corrects = correct and self._start.agreed_s >= SETTLED_S
+        self._resumed = resumed if resumed and resumed.learnt.setup == setup else None
+        settled = self._start.agreed_s >= SETTLED_S
+        self._corrects = correct and settled and self._start.is_usable
+        self._refuses = correct and settled and not self._start.is_usable
+        if correct and not self._corrects:
+            log.warning("positions are not corrected: %s", _why_not(self._start))
         self._correction_en_m = np.zeros(2)
 
-    def view(self, result: ViewResult, exposed_ns: int) -> ViewResult:
-        """Compare a view; the result with the GNSS position of its exposure as evidence."""
+    def view(self, result: ViewResult, exposed_ns: int, *, as_stated: bool = True) -> ViewResult:
+        """Compare a view; the result with the GNSS position of its exposure as evidence.
+
+        `as_stated`: whether the latency of the image is the stated one.
+        """
+        now_ns = result.time_ns if self._recorded else exposed_ns
         try:
-            return self._compared(result, result.time_ns if self._recorded else exposed_ns)
+            return self._compared(result, now_ns, as_stated=as_stated)
         except Exception:  # the flight does not depend on the monitor
             self._failed("a view could not be compared with GNSS")
             return result
 
-    def _compared(self, result: ViewResult, now_ns: int) -> ViewResult:
+    def _compared(self, result: ViewResult, now_ns: int, *, as_stated: bool) -> ViewResult:
         self._take(now_ns)
         fix = result.outcome
         if isinstance(fix, Fix) and self._is_confident(fix, result.state):
-            position = self._position(fix, now_ns)
+            position = self._position(fix, now_ns, as_stated=as_stated)
             for monitor in self._monitors.values():
                 monitor.position(position)
         evidence = MappingProxyType({**fix.evidence, **self._evidence(now_ns)})
         return replace(result, outcome=replace(fix, evidence=evidence))
 
-    def corrected(self, outcome: Fix | NoFix) -> Fix | NoFix:
+    def corrected(self, outcome: Fix | NoFix, *, as_stated: bool = True) -> Fix | NoFix:
         """A fix moved by the biases known before the flight, where they are to be corrected; its
-        covariance includes theirs at its heading, height and velocity."""
-        if not isinstance(outcome, Fix) or not self._corrects:
+        covariance includes theirs at its heading, height and velocity.
+
+        Without a heading the error of the mount is only part of the covariance; without a height
+        nothing is corrected. The learnt latency is that of images with the stated one
+        (`as_stated`).
+        """
+        if not isinstance(outcome, Fix) or not self._corrects or not math.isfinite(outcome.agl_m):
             return outcome
         en_m = np.asarray(self._frame.en_from_latlon(outcome.lat_deg, outcome.lon_deg))
-        velocity = _velocity(outcome)
-        shown = design(
-            math.radians(_or_zero(outcome.heading_deg)),
-            _or_zero(outcome.agl_m),
-            np.zeros(2) if velocity is None else velocity,
-        )
-        moved, more = self._start.correction(shown)
+        velocity = _velocity(outcome) if as_stated else None
+        velocity = np.zeros(2) if velocity is None else velocity
+        if math.isfinite(outcome.heading_deg):
+            shown = design(math.radians(outcome.heading_deg), outcome.agl_m, velocity)
+            moved, more = self._start.correction(shown)
+        else:
+            moved, more = self._start.correction_at_any_heading(outcome.agl_m, velocity)
         self._correction_en_m = moved
         lat, lon = self._frame.latlon_from_en(en_m + moved)
         cov = outcome.cov_en_m2 + more
@@ -185,13 +203,22 @@ class GnssWatch:
         found = [monitor.status.reason for monitor in self._monitors.values()]
         if not self._learnt.is_plausible:
             found.append(DISPLACED)
+        if self._refuses:
+            found.append(NOT_CORRECTED)
         return tuple(dict.fromkeys(each for each in found if each))
 
     @property
     def _learnt(self) -> Biases:
         """Biases of the first receiver."""
+        return self._resumable.learnt
+
+    @property
+    def _resumable(self) -> Resumed:
+        """What a restart continues from: of the first receiver."""
         first = self._monitors.get(0)
-        return self._start if first is None else first.learnt
+        if first is None:
+            return self._resumed or Resumed(self._start, self._start)
+        return Resumed(first.learnt, first.reference)
 
     @property
     def code(self) -> int:
@@ -206,10 +233,10 @@ class GnssWatch:
 
     def maps(self) -> dict[str, Any]:
         """Biases for the state file: those of this map, learnt further, after the others."""
-        known = {digest: each for digest, each in self._known.items() if digest != self._digest}
+        made = {name: each.to_plain() for name, each in self._known.items() if name != self._digest}
         if self._digest and self._learnt.agreed_s > 0:
-            known[self._digest] = self._learnt
-        return {digest: each.to_plain() for digest, each in known.items()}
+            made[self._digest] = self._resumable.to_plain(self._known.get(self._digest))
+        return made
 
     def plain(self) -> list[dict[str, Any]]:
         """Status of each receiver for the line of health."""
@@ -222,7 +249,9 @@ class GnssWatch:
         self._now_ns = max(self._now_ns, now_ns) if not self._recorded else now_ns
         for sample in self._source.take(now_ns):
             if sample.receiver not in self._monitors:
-                self._monitors[sample.receiver] = GnssMonitor(self._frame, self._start)
+                resumed = self._resumed if sample.receiver == 0 else None
+                made = GnssMonitor(self._frame, self._start, resumed=resumed)
+                self._monitors[sample.receiver] = made
             self._monitors[sample.receiver].sample(sample)
             if sample.receiver == 0:
                 self._last = sample
@@ -234,17 +263,18 @@ class GnssWatch:
             self.log(time_ns, gnss_message(sample, time_ns))
 
     def _is_confident(self, fix: Fix, state: str | None) -> bool:
-        known = math.isfinite(error_ellipse(fix.cov_en_m2)[0])
+        known = math.isfinite(error_ellipse(fix.cov_en_m2)[0] + fix.heading_deg)
         return known and fix.confidence >= self._least and state in (None, "tracking")
 
-    def _position(self, fix: Fix, now_ns: int) -> MapPosition:
+    def _position(self, fix: Fix, now_ns: int, *, as_stated: bool) -> MapPosition:
         return MapPosition(
             now_ns,
             np.asarray(self._frame.en_from_latlon(fix.lat_deg, fix.lon_deg)),
             error_ellipse(fix.cov_en_m2)[0],
             _velocity(fix),
-            _or_zero(fix.heading_deg),
-            _or_zero(fix.agl_m),
+            fix.heading_deg,
+            fix.agl_m if math.isfinite(fix.agl_m) else 0.0,
+            as_stated,
         )
 
     def _evidence(self, now_ns: int) -> dict[str, float]:
@@ -274,8 +304,14 @@ def _velocity(fix: Fix) -> Array | None:
     return made if np.isfinite(made).all() else None
 
 
-def _or_zero(value: float) -> float:
-    return value if math.isfinite(value) else 0.0
+def _why_not(known: Biases) -> str:
+    """Why biases known before a flight are not used."""
+    if known.agreed_s < SETTLED_S:
+        return f"GNSS agreed for {known.agreed_s / 60:.0f} min, {SETTLED_S / 60:.0f} are needed"
+    learnt = f"the learnt displacement of the map is {math.hypot(*known.en_m):.0f} m"
+    if known.is_plausible:
+        return f"{learnt}, known to {known.std_m:.0f} m only: fly more headings with GNSS"
+    return f"{learnt}: check the map against a surveyed point, GNSS may have been spoofed"
 
 
 def _change(
