@@ -62,8 +62,8 @@ class Setting:
     """Size of the experiments.
 
     - `name`: "reduced" or "full".
-    - `encoder_width`, `triplet_width`: widths of the networks, 512 and 64 in the paper; an eighth in
-      the reduced setting.
+    - `encoder_width`, `triplet_width`: widths of the networks, 512 and 64 in the paper; an
+      eighth in the reduced setting.
     - `encoder_rate`: learning rate of the auto-encoder: 3e-4 in the paper; 1e-3, as in the authors'
       released code, if there are few steps.
     - `encoder_tiles`, `triplet_tiles`: tiles shown in training; None: the paper's 200 epochs.

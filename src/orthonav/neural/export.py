@@ -39,8 +39,8 @@ date:
                                                       int8     1.4 MB 2.9 ms, least 0.986
 
 float16 halves the file and saves no time: weights are converted back when it is loaded. On
-processors without 8-bit products, and in small networks, int8 only reduces the file. `python -m benchmarks.training --only
-precisions` measures the auto-encoder.
+processors without 8-bit products, and in small networks, int8 only reduces the file.
+`python -m benchmarks.training --only precisions` measures the auto-encoder.
 """
 CALIBRATION_BATCH = 8
 
