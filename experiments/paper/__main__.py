@@ -1,6 +1,8 @@
 """`python -m experiments.paper`: run the paper's experiments; `report`: tables and plots of them.
 
 Every run leaves one file under `paper_results/<setting>/` and is not run again while it is there.
+`keep` copies these files into the repository and makes `docs/paper-results.md` of what is there;
+`check` names rows that are older than the code they speak of, and rows without a stored result.
 """
 
 import argparse
@@ -14,6 +16,7 @@ from typing import Any
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 PARTS = ("A", "B", "C", "D", "real", "own", "baselines")
+WHAT = ("run", "report", "keep", "check")
 ORDER = ("triplet", "autoencoder", "gradient", "bovw")
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -24,11 +27,14 @@ def main(arguments: list[str]) -> int:
     for name in THREADS:  # NumPy's BLAS reads it once, in the processes started too
         os.environ.setdefault(name, "1")
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
+    if options.what in ("keep", "check"):
+        return _stored(options)
     from experiments.paper.tables import report
 
     failed = 0
     if options.what == "run":
-        failed = _run(options, " ".join(["python -m experiments.paper", *arguments]))
+        shown = [Path(each).name if "/" in each else each for each in arguments]
+        failed = _run(options, " ".join(["python -m experiments.paper", *shown]))
     made = report(options.out, options.setting)
     if made is None:
         _say(f"nothing to report: no results in {options.out / options.setting}")
@@ -36,6 +42,24 @@ def main(arguments: list[str]) -> int:
     print(made.read_text(encoding="utf-8"))
     _say(f"written to {made.parent}")
     return 1 if failed else 0
+
+
+def _stored(options: argparse.Namespace) -> int:
+    """Keep results, or check them; returns the exit code: 1 if the page is not of the rows."""
+    from experiments.paper import page as pages
+    from experiments.paper.stored import keep, stored
+
+    if options.what == "keep":
+        for name in keep(options.out, options.setting):
+            _say(f"stored: {name}")
+        pages.PAGE.write_text(pages.page(stored()), encoding="utf-8")
+    rows = stored()
+    for line in pages.state(rows):
+        print(line)
+    if pages.PAGE.read_text(encoding="utf-8") != pages.page(rows):
+        _say(f"not made of the stored rows: {pages.PAGE}; run python -m experiments.paper keep")
+        return 1
+    return 0
 
 
 def _run(options: argparse.Namespace, command: str) -> int:
@@ -95,7 +119,9 @@ def _scenes(options: argparse.Namespace, wanted: set[str]) -> Iterator[Any]:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m experiments.paper", description=__doc__)
-    parser.add_argument("what", nargs="?", choices=("run", "report"), default="run")
+    parser.add_argument(
+        "what", nargs="?", choices=("run", "report", "keep", "check"), default="run"
+    )
     parser.add_argument("--setting", choices=("reduced", "full"), default="reduced")
     parser.add_argument("--only", nargs="+", choices=PARTS, help="only these parts")
     parser.add_argument(

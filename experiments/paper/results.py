@@ -81,10 +81,10 @@ def numbers(values: Sequence[float | None], missing: float) -> Array:
     return np.array([missing if value is None else value for value in values], np.float64)
 
 
-def share(errors_m: Sequence[float | None]) -> float:
-    """Share of errors within 15 m."""
-    errors = numbers(errors_m, math.inf)
-    return float((errors <= ACCURACY_M).mean()) if errors.size else math.nan
+def share(counted: Sequence[int]) -> float:
+    """Share of views within 15 m: number of them, and of all."""
+    hits, count = counted
+    return hits / count if count else math.nan
 
 
 def confident(right: NDArray[np.bool_], ratio: Array, threshold: float) -> tuple[float, float]:

@@ -8,7 +8,7 @@ import hashlib
 import json
 import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 
 from experiments.paper import views
 from experiments.paper.methods import Method
+from experiments.paper.results import ACCURACY_M
 from experiments.paper.rules import compared
 from experiments.paper.scenes import Scene
+from experiments.paper.stored import code_of, compact
 from experiments.paper.trajectories import TILE_PX, Setting
 from orthonav.files import write_text
 from orthonav.localizer import Localizer
@@ -28,7 +30,6 @@ from orthonav.mapfile import MapFile, open_map
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import Fix, View
 
-ACCURACY_M = 15.0
 SWEPT_ON = "B"
 HEADINGS_DEG = (0, 1, 2, 3, 5, 7, 10, 15)
 DROPS_M = (0, 25, 50, 75, 100, 150, 200)
@@ -74,11 +75,11 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
         flying=False,
     )
     made = head(place, scene, before)
-    made |= {"method": asdict(method), **built, **_sizes(opened)}
+    edges = method.edges.partition(":weights=")[0]  # where weights lie is no part of a result
+    made |= {"method": asdict(method) | {"edges": edges}, **built, **_sizes(opened)}
     made |= _placed(scene, localizer, place.setting, method.registration)
     made["rules"] = {} if method.registration else _rules(scene, opened, place.setting)
-    save(out, made, start)
-    return made
+    return save(out, made | {"code": code_of(method, scene.name)}, start)
 
 
 def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, Any]:
@@ -94,11 +95,14 @@ def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, A
     }
 
 
-def save(out: Path, made: dict[str, Any], start: float) -> None:
-    """Write a result, whole or not at all, with the minutes since `start`."""
+def save(out: Path, made: dict[str, Any], start: float) -> dict[str, Any]:
+    """The result as written, whole or not at all, with the minutes since `start`."""
     made["minutes"] = round((time.perf_counter() - start) / 60, 2)
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_text(out, json.dumps(made, indent=1) + "\n")
+    text = compact(made)
+    write_text(out, text)
+    written: dict[str, Any] = json.loads(text)
+    return written
 
 
 def _map(scene: Scene, method: Method, work: Path) -> tuple[MapFile, dict[str, float]]:
@@ -176,11 +180,10 @@ def _placed(
     if scene.name == SWEPT_ON:
         count = min(setting.swept, len(seen["grid"]))
         few = [seen["grid"][at] for at in np.linspace(0, len(seen["grid"]) - 1, count, dtype=int)]
-        turned = {v: [locate(each, turned_deg=v)[0] for each in few] for v in HEADINGS_DEG}
-        lower = {v: [locate(each, drop_m=v)[0] for each in few] for v in DROPS_M}
+        turned = {v: _hits(locate(each, turned_deg=v)[0] for each in few) for v in HEADINGS_DEG}
+        lower = {v: _hits(locate(each, drop_m=v)[0] for each in few) for v in DROPS_M}
         result["sweep"] = {"heading_deg": turned, "drop_m": lower}
-    plain: dict[str, Any] = _without_nan(result)
-    return plain
+    return result
 
 
 def placements(
@@ -216,17 +219,15 @@ def _rules(scene: Scene, opened: MapFile, setting: Setting) -> dict[str, Any]:
             for ground in grounds
         ]
         truths = [ground.truth_en_m for ground in grounds]
-        made[name] = compared(localizer, opened, seen, truths)
+        errors = compared(localizer, opened, seen, truths)
+        made[name] = {rule: _hits(errors_m) for rule, errors_m in errors.items()}
     return made
 
 
-def _without_nan(value: Any) -> Any:
-    """The same with None for numbers that are none: JSON has no NaN."""
-    if isinstance(value, dict):
-        return {str(key): _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+def _hits(errors_m: Iterable[float]) -> list[int]:
+    """Number of errors within 15 m, and of all."""
+    within = [error <= ACCURACY_M for error in errors_m]
+    return [sum(within), len(within)]
 
 
 def _digest(path: Path) -> str:

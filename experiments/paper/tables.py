@@ -8,6 +8,7 @@ from benchmarks.record import Table, number
 
 from experiments.paper import published
 from experiments.paper.results import Result, accepted_at, ceiling, confident, read, share
+from experiments.paper.stored import name_of
 from orthonav.records import CONFIDENT
 
 FAMILIES = {
@@ -32,38 +33,44 @@ def report(out: Path, setting: str) -> Path | None:
     if not results:
         return None
     made = [r for r in results if r.family]
-    tables = [
-        *table_2(made),
-        *table_3(made),
-        *choice(made),
-        *rules(made),
-        *baselines(results, made),
-        *costs(made),
-        run_table(results),
-    ]
     try:
         from experiments.paper.plots import draw
     except ImportError:
         notes = ["Plots need matplotlib: pip install 'orthonav[report]'"]
     else:
         notes = [f"![{path.stem}]({path.name})" for path in draw(made, folder)]
-    text = "\n".join([*(table.markdown() for table in tables), *notes, ""])
+    text = "\n".join([*(table.markdown() for table in tables(results)), *notes, ""])
     path = folder / "tables.md"
     path.write_text(text, encoding="utf-8")
     return path
 
 
+def tables(results: Sequence[Result]) -> list[Table]:
+    """All tables of results of one setting."""
+    made = [each for each in results if each.family]
+    return [
+        *table_2(made),
+        *table_3(made),
+        *choice(made),
+        *rules(made),
+        *sensitivity(made),
+        *baselines(results, made),
+        *costs(made),
+        row_table(results),
+    ]
+
+
 def table_2(results: Sequence[Result]) -> list[Table]:
     """Accuracy at 15 m by method and scene, views on the grid and anywhere."""
     header = ("method", "input", "paper", "on grid", "anywhere", "right tile", "of")
-    tables = []
+    made = []
     for scene, found in _by_scene(results):
         rows = [_table_2_row(each) for each in _best_words(found)]
         chance = found[0].plain["chance"]
         guessed = (percent(chance.get(name)) for name in ("grid", "anywhere"))
         rows.append(["a guess", "", "-", *guessed, "", ""])
-        tables.append(Table(f"Table 2, {scene}: accuracy at 15 m, %", header, rows, _area(found)))
-    return tables
+        made.append(Table(f"Table 2, {scene}: accuracy at 15 m, %", header, rows, _area(found)))
+    return made
 
 
 def _table_2_row(each: Result) -> list[str]:
@@ -199,7 +206,7 @@ def baselines(results: Sequence[Result], made: Sequence[Result]) -> list[Table]:
     for each in results:
         for name, result in each.plain.get("baselines", {}).items():
             shares = [share(result["views"][placement]) for placement in ("grid", "anywhere")]
-            count = len(result["views"]["anywhere"])
+            count = result["views"]["anywhere"][1]
             rows.append(
                 [each.scene, name, *map(percent, shares), str(count), number(result["view_ms"])]
             )
@@ -235,29 +242,37 @@ def costs(results: Sequence[Result]) -> list[Table]:
     return [Table("What it costs", header, rows, notes)]
 
 
-def run_table(results: Sequence[Result]) -> Table:
-    """Commit, versions and minutes of the runs that these tables are made of."""
-    found = {
-        (
-            str(each.plain["provenance"]["commit"])[:10],
-            "yes" if each.plain["provenance"]["dirty"] else "no",
-            str(each.plain["provenance"]["sources"]),
-            str(each.plain["setting"]["name"]),
-        )
-        for each in results
-    }
+def sensitivity(results: Sequence[Result]) -> list[Table]:
+    """Accuracy at each error of heading and height, on the trajectory that the paper sweeps."""
+    made = []
+    for step, title in (("heading_deg", "heading error, deg"), ("drop_m", "height lower by, m")):
+        swept = [each for each in _best_words(results) if each.plain.get("sweep")]
+        if swept:
+            values = list(swept[0].plain["sweep"][step])
+            count = swept[0].plain["sweep"][step][values[0]][1]
+            rows = [
+                [
+                    f"{_name(each)}, {EDGES[each.edges]}",
+                    *(percent(share(each.plain["sweep"][step][value])) for value in values),
+                ]
+                for each in swept
+            ]
+            notes = (f"{count} views on the grid of {swept[0].scene}",)
+            header = ("method", *values)
+            made.append(Table(f"Accuracy at 15 m, %, by {title}", header, rows, notes))
+    return made
+
+
+def row_table(results: Sequence[Result]) -> Table:
+    """Commit, day, minutes and machine of every row."""
     rows = []
-    for key in sorted(found):
-        mine = [
-            each
-            for each in results
-            if str(each.plain["provenance"]["commit"])[:10] == key[0]
-            and str(each.plain["provenance"]["sources"]) == key[2]
-        ]
-        minutes = sum(each.plain["minutes"] for each in mine)
-        rows.append([*key, str(len(mine)), number(minutes), mine[0].plain["provenance"]["cpu"]])
-    header = ("commit", "changed", "sources", "setting", "runs", "minutes", "processor")
-    return Table("Runs", header, rows)
+    for each in sorted(results, key=name_of):
+        made = each.plain["provenance"]
+        changed = "yes" if made["dirty"] else "no"
+        about = [str(made["commit"])[:10], changed, str(made["date"])[:10]]
+        rows.append([name_of(each), *about, number(each.plain["minutes"]), str(made["cpu"])])
+    header = ("row", "commit", "files not committed", "date", "minutes", "processor")
+    return Table("Rows", header, rows)
 
 
 def percent(value: float | None) -> str:
