@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-PARTS = ("A", "B", "C", "D", "real", "own", "baselines")
+PARTS = ("A", "B", "C", "D", "real", "untuned", "own", "baselines")
 WHAT = ("run", "report", "keep", "check")
 ORDER = ("triplet", "autoencoder", "gradient", "bovw")
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -77,6 +77,8 @@ def _run(options: argparse.Namespace, command: str) -> int:
     for scene in _scenes(options, wanted):
         rows = methods(place.setting, scene.name, scene.trajectory.tiles, options.sam)
         chosen = [each for each in rows if not options.methods or each.family in options.methods]
+        if not scene.others:
+            chosen = [each for each in chosen if not each.needs_dates]
         if scene.name not in wanted and scene.name == baselines.TRIED_ON:
             chosen = [each for each in rows if each.key == baselines.MAP_OF]
         tasks += [(place, scene, method) for method in chosen]
@@ -110,10 +112,11 @@ def _scenes(options: argparse.Namespace, wanted: set[str]) -> Iterator[Any]:
     if "own" in wanted and options.past and options.present:
         name = f"own-{options.past.stem}-{options.present.stem}"
         yield scenes.over(name, options.past, options.present, options.gsd_m)
-    if "real" in wanted:
-        found = list(scenes.real(options.data, setting))
+    sets = {"real": scenes.real(options.data, setting), "untuned": scenes.untuned(options.data)}
+    for name in (each for each in sets if each in wanted):
+        found = list(sets[name])
         if not found:
-            _say("real imagery skipped: the optional real imagery beside the checkout is absent")
+            _say(f"{name} skipped: the optional real imagery beside the checkout is absent")
         yield from found
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from experiments.paper.trajectories import TABLE_1, Setting, epochs
+from experiments.paper.trajectories import LEARNABLE, TABLE_1, Setting, epochs
 
 GREY, CANNY, SEGMENTS, SAM = "gray", "canny", "segments", "sam"
 DEFAULT = "gradient"
@@ -21,12 +21,29 @@ class Method:
     registration: bool = False
 
     @property
+    def needs_dates(self) -> bool:
+        """Whether it is only learnt from several dates: no positive is segmented by SAM."""
+        return self.family == "triplet" and self.edges.startswith(SAM)
+
+    @property
     def key(self) -> str:
         """Short name for files, unique within one setting."""
         words = self.recipe.partition("words=")[2].partition(",")[0]
         layer = "registration" if self.registration else ""
         parts = (self.family, self.edges.partition(":")[0], words, layer)
         return "-".join(part for part in parts if part)
+
+
+def tuned(family: str, recipe: str, scene: str) -> bool:
+    """Whether a row was tuned with imagery or views of its scene, or of the same generator.
+
+    docs/paper.md lists what was tuned on what. The default was chosen on generated landscapes, the
+    Szada pairs and NAIP; training of the reduced triplet network by its accuracy on B; the number
+    of words is chosen by its accuracy everywhere, as in the paper.
+    """
+    if family == "gradient":
+        return scene in TABLE_1 or scene.startswith(("naip-", "szada-"))
+    return family == "bovw" or (family == "triplet" and scene == "B" and LEARNABLE in recipe)
 
 
 REDUCED_NETWORKS = {
@@ -43,7 +60,7 @@ def methods(
 
     The reduced setting learns fewer networks: `REDUCED_NETWORKS`, and over imagery that no
     trajectory of the paper is flown over the auto-encoder on Canny edges, the paper's best, and on
-    grey levels.
+    grey levels over NAIP and Szada.
     """
     shown, width = setting.encoder_tiles, setting.encoder_width
     encoder = (
@@ -69,5 +86,6 @@ def _reduced(method: Method, scene: str) -> bool:
     """Whether the reduced setting learns this network here."""
     edges = method.edges.partition(":")[0]
     if scene not in TABLE_1:
-        return method.family == "autoencoder" and edges in (CANNY, GREY)
+        wanted = (CANNY, GREY) if scene.startswith(("naip-", "szada-")) else (CANNY,)
+        return method.family == "autoencoder" and edges in wanted
     return scene in REDUCED_NETWORKS[method.family].get(edges, "")

@@ -90,9 +90,13 @@ def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, A
         "setting": asdict(place.setting),
         "command": place.command,
         "seeds": {"views": views.SEED, "build": 0},
-        "inputs": {path.name: _digest(path) for path in (scene.past, scene.present)},
+        "inputs": {path.name: _digest(path) for path in _imagery(scene)},
         "provenance": started,
     }
+
+
+def _imagery(scene: Scene) -> tuple[Path, ...]:
+    return scene.past, scene.present, *scene.others
 
 
 def save(out: Path, made: dict[str, Any], start: float) -> dict[str, Any]:
@@ -125,6 +129,7 @@ def _map(scene: Scene, method: Method, work: Path) -> tuple[MapFile, dict[str, f
             method=method.recipe,
             edges=method.edges,
             registration=method.registration,
+            other_dates=scene.others if method.family == "triplet" else (),
             work=work,
         )
 

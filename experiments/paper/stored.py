@@ -13,7 +13,7 @@ from typing import Any
 
 from experiments.paper.methods import CANNY, DEFAULT, GREY, SAM, SEGMENTS, Method, methods
 from experiments.paper.results import Result, read
-from experiments.paper.scenes import REDUCED_REAL
+from experiments.paper.scenes import REDUCED_REAL, UNTUNED
 from experiments.paper.trajectories import REDUCED, SETTINGS, TABLE_1
 from orthonav.files import write_text
 
@@ -119,7 +119,7 @@ def older(row: Result) -> list[str]:
 
 def expected() -> list[str]:
     """Names of all rows of the reduced setting, as files are named."""
-    scenes = (*TABLE_1, *REDUCED_REAL)
+    scenes = (*TABLE_1, *REDUCED_REAL, *UNTUNED)
     names = [f"{scene}-{each.key}" for scene in scenes for each in methods(REDUCED, scene, 1000)]
     return [*names, f"B-{BASELINES}"]
 

@@ -7,10 +7,12 @@ from pathlib import Path
 from benchmarks.record import Table, number
 
 from experiments.paper import published
+from experiments.paper.methods import tuned
 from experiments.paper.results import Result, accepted_at, ceiling, confident, read, share
 from experiments.paper.stored import name_of
 from orthonav.records import CONFIDENT
 
+TUNED = "*: tuned on this scene or on imagery of the same generator (docs/paper.md)"
 FAMILIES = {
     "bovw": "Bag of Words",
     "triplet": "Triplet",
@@ -89,6 +91,7 @@ def _area(found: Sequence[Result]) -> list[str]:
         f"{flown['gsd_m']:g} m per pixel, {tiles:,} tiles {first.stride_m:g} m apart; one who "
         f"always named the right tile would have {percent(bound)} % at 15 m anywhere",
         "right tile: of views anywhere, within half a tile spacing (along the diagonal)",
+        TUNED,
     ]
 
 
@@ -158,6 +161,7 @@ def choice(results: Sequence[Result]) -> list[Table]:
     notes = (
         "accuracy at 15 m in %; right tile: of views anywhere; correct / accepted: of views on "
         "the grid, by the criterion; ms: one view, one core, from its picture to the fix",
+        TUNED,
     )
     return [Table("The paper's best and orthonav on other imagery", header, rows, notes)]
 
@@ -270,8 +274,10 @@ def row_table(results: Sequence[Result]) -> Table:
         made = each.plain["provenance"]
         changed = "yes" if made["dirty"] else "no"
         about = [str(made["commit"])[:10], changed, str(made["date"])[:10]]
-        rows.append([name_of(each), *about, number(each.plain["minutes"]), str(made["cpu"])])
-    header = ("row", "commit", "files not committed", "date", "minutes", "processor")
+        mark = "yes" if each.family and is_tuned(each) else "no"
+        cost = [number(each.plain["minutes"]), str(made["cpu"])]
+        rows.append([name_of(each), mark, *about, *cost])
+    header = ("row", "tuned on it", "commit", "files not committed", "date", "minutes", "processor")
     return Table("Rows", header, rows)
 
 
@@ -281,6 +287,16 @@ def percent(value: float | None) -> str:
 
 
 def _name(each: Result) -> str:
+    """Name of the method, with a star if it was tuned on its scene."""
+    return _plain_name(each) + ("*" if is_tuned(each) else "")
+
+
+def is_tuned(each: Result) -> bool:
+    """Whether a row was tuned on its scene."""
+    return tuned(each.family, each.plain["method"]["recipe"], each.scene)
+
+
+def _plain_name(each: Result) -> str:
     name = FAMILIES[each.family]
     if each.family == "bovw":
         return f"{name}, k = {each.plain['dims']}"

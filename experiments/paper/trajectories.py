@@ -62,8 +62,7 @@ class Setting:
     """Size of the experiments.
 
     - `name`: "reduced" or "full".
-    - `encoder_width`, `triplet_width`: widths of the networks, 512 and 64 in the paper; an
-      eighth in the reduced setting.
+    - `encoder_width`, `triplet_width`: widths of the networks, 512 and 64 in the paper.
     - `encoder_rate`: learning rate of the auto-encoder: 3e-4 in the paper; 1e-3, as in the authors'
       released code, if there are few steps.
     - `encoder_tiles`, `triplet_tiles`: tiles shown in training; None: the paper's 200 epochs.
@@ -97,7 +96,7 @@ class Setting:
 
 
 LEARNABLE = ",mining=semihard,similarity=cosine,margin=0.2"
-REDUCED = Setting("reduced", 64, 1e-3, 19_200, 8, 28_800, 64, LEARNABLE, (256, 1024), 100, 40)
+REDUCED = Setting("reduced", 32, 1e-3, 19_200, 8, 28_800, 64, LEARNABLE, (256, 1024), 100, 40)
 FULL = Setting("full", 512, 3e-4, None, 64, None, 512, "", (256, 1000, 3000, 10_000), 300, 300)
 SETTINGS = {each.name: each for each in (REDUCED, FULL)}
 PAPER_EPOCHS = 200

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from experiments.paper import published, runs, scenes, views
-from experiments.paper.methods import Method, methods
+from experiments.paper.methods import Method, methods, tuned
 from experiments.paper.pool import side_by_side
 from experiments.paper.results import accepted_at, ceiling, confident, read
 from experiments.paper.tables import report
@@ -223,3 +223,38 @@ def test_local_frame_box_is_centred():
 def test_no_results_are_no_tables(tmp_path):
     assert read(tmp_path) == []
     assert report(tmp_path, "reduced") is None
+
+
+def test_the_date_of_the_views_is_never_learnt_from():
+    for name, (past, present, *others) in scenes.UNTUNED.items():
+        assert len({past, present, *others}) == 2 + len(others), name
+    pairs = {name: (past, present) for name, past, present in scenes.REAL}
+    for name, others in scenes.OTHERS.items():
+        assert not set(pairs[name]) & set(others), name
+
+
+def test_rows_tuned_on_their_scene_are_marked():
+    def marked(scene):
+        rows = methods(REDUCED, scene, 900)
+        return {each.key for each in rows if tuned(each.family, each.recipe, scene)}
+
+    words = {"bovw-gray-256", "bovw-gray-1024"}
+    ours = {"gradient-gradient", "gradient-gradient-registration"}
+    assert marked("B") == words | ours | {"triplet-canny", "triplet-gray"}
+    assert marked("naip-2018") == words | ours
+    for scene in scenes.UNTUNED:
+        assert marked(scene) == words
+    assert not any(
+        tuned(each.family, each.recipe, "B")
+        for each in methods(FULL, "B", 900)
+        if each.family == "triplet"
+    )
+
+
+def test_a_triplet_learns_from_the_third_date_of_a_generated_area(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(scenes, "generate_area", lambda *_, dates, **__: asked.append(dates))
+    made = scenes.generated(REDUCED, "B", tmp_path)
+    assert [path.stem for path in made.others] == [asked[0][2].name]
+    assert scenes.generated(REDUCED, "D", tmp_path).others == ()
+    assert len(scenes.generated(FULL, "D", tmp_path).others) == 1

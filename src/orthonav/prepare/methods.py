@@ -39,6 +39,18 @@ def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderR
     return recipe
 
 
+def check_positives(recipe: WhitenedRecipe | EncoderRecipe, representation: Any) -> None:
+    """Raise `VariantError` if a triplet network without other dates would need days.
+
+    Its positives would be segmented anew at every step: seconds to minutes each.
+    """
+    if isinstance(recipe, TripletRecipe) and not represent.TABLE[_name_of(representation)].flies:
+        raise VariantError(
+            f"a triplet network on {_name_of(representation)} edges needs orthophotos of other "
+            "dates; give --other-date"
+        )
+
+
 def stored_representation(representation: Any) -> dict[str, Any]:
     """Recipe of a representation for a manifest, without local paths and devices."""
     recipe = variant_recipe(represent.TABLE, representation)

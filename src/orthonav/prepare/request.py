@@ -21,7 +21,7 @@ from orthonav.mapfile.manifest import Manifest
 from orthonav.prepare.calibrate import CROPS
 from orthonav.prepare.encoders import EncoderRecipe
 from orthonav.prepare.layout import grid_of
-from orthonav.prepare.methods import method_recipe, usual_edges
+from orthonav.prepare.methods import check_positives, method_recipe, usual_edges
 from orthonav.variants import make_variant
 
 MAX_WORKERS = 64
@@ -110,6 +110,8 @@ class BuildInputs:
         edges = request.edges or usual_edges(request.method)
         representation = make_variant(represent.TABLE, edges)
         recipe = method_recipe(request.method, representation)
+        if not request.other_dates:
+            check_positives(recipe, representation)
         mosaic = Mosaic.open(request.orthos)
         other_dates = tuple(Mosaic.open([path]) for path in request.other_dates)
         inputs = [source.path for each in (mosaic, *other_dates) for source in each.sources]
