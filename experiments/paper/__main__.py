@@ -108,7 +108,7 @@ def _scenes(options: argparse.Namespace, wanted: set[str]) -> Iterator[Any]:
     setting = SETTINGS[options.setting]
     for name in ("B", "D", "A", "C"):
         if name in wanted or (name == "B" and "baselines" in wanted):
-            yield scenes.generated(setting, name, options.out / "areas")
+            yield scenes.generated(setting, name, options.out / "areas", options.gsd_m)
     if "own" in wanted and options.past and options.present:
         name = f"own-{options.past.stem}-{options.present.stem}"
         yield scenes.over(name, options.past, options.present, options.gsd_m)
@@ -140,7 +140,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--past", type=Path, help="an orthophoto of your own, for the map")
     parser.add_argument("--present", type=Path, help="the same ground at another date")
     parser.add_argument(
-        "--gsd-m", type=float, help="ground resolution for --past (default its own)"
+        "--gsd-m",
+        type=float,
+        help="ground resolution for --past (default its own), and of A to D, as further scenes",
     )
     parser.add_argument("--sam", metavar="PATH", help="weights of Segment Anything: adds its rows")
     return parser

@@ -76,6 +76,7 @@ def run(place: Workplace, scene: Scene) -> bool:
     _store(scene, localizer, pixels_path)
     count = min(VIEWS, place.setting.views)
     grounds = dict(placements(scene, localizer, count))
+    del grounds["route"]
     made["baselines"] = {
         each.name: _placed(each, scene, localizer, map_path, pixels_path, grounds)
         for each in BASELINES

@@ -42,8 +42,15 @@ def tuned(family: str, recipe: str, scene: str) -> bool:
     of words is chosen by its accuracy everywhere, as in the paper.
     """
     if family == "gradient":
-        return scene in TABLE_1 or scene.startswith(("naip-", "szada-"))
-    return family == "bovw" or (family == "triplet" and scene == "B" and LEARNABLE in recipe)
+        return column(scene) in TABLE_1 or scene.startswith(("naip-", "szada-"))
+    return family == "bovw" or (
+        family == "triplet" and column(scene) == "B" and LEARNABLE in recipe
+    )
+
+
+def column(scene: str) -> str:
+    """Scene without its ground resolution: "B" for "B-0.75m", B at another one."""
+    return scene.partition("-")[0]
 
 
 REDUCED_NETWORKS = {
@@ -85,7 +92,8 @@ def methods(
 def _reduced(method: Method, scene: str) -> bool:
     """Whether the reduced setting learns this network here."""
     edges = method.edges.partition(":")[0]
-    if scene not in TABLE_1:
+    name = column(scene)
+    if name not in TABLE_1:
         wanted = (CANNY, GREY) if scene.startswith(("naip-", "szada-")) else (CANNY,)
         return method.family == "autoencoder" and edges in wanted
-    return scene in REDUCED_NETWORKS[method.family].get(edges, "")
+    return name in REDUCED_NETWORKS[method.family].get(edges, "")

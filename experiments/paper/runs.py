@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.record import provenance
 from numpy.typing import NDArray
 
-from experiments.paper import views
+from experiments.paper import published, views
 from experiments.paper.methods import Method
 from experiments.paper.results import ACCURACY_M
 from experiments.paper.rules import compared
@@ -182,7 +182,7 @@ def _placed(
         result["views"][name] = [locate(ground) for ground in grounds]
         result["chance"][name] = _chance(grounds, localizer.tiles.centres_en_m)
     result["view_ms"] = statistics.median(times_ms)
-    if scene.name == SWEPT_ON:
+    if scene.name == SWEPT_ON and seen["grid"]:
         count = min(setting.swept, len(seen["grid"]))
         few = [seen["grid"][at] for at in np.linspace(0, len(seen["grid"]) - 1, count, dtype=int)]
         turned = {v: _hits(locate(each, turned_deg=v)[0] for each in few) for v in HEADINGS_DEG}
@@ -194,10 +194,17 @@ def _placed(
 def placements(
     scene: Scene, localizer: Localizer, count: int
 ) -> Iterator[tuple[str, list[views.Ground]]]:
-    """Views on the grid and anywhere, at the same places but for where they are snapped to."""
+    """Views along the route, on the grid and anywhere.
+
+    The last two are at the same places but for where they are snapped to.
+    """
     centres = localizer.tiles.centres_en_m
     anywhere = views.places_en_m(centres, count)
-    places = {"grid": views.on_grid(anywhere, centres), "anywhere": anywhere}
+    places = {
+        "route": views.along_route(centres, published.views(scene.name)),
+        "grid": views.on_grid(anywhere, centres),
+        "anywhere": anywhere,
+    }
     for name in views.PLACEMENTS:
         yield name, views.grounds(scene, localizer.sheet.frame, localizer.grid, places[name])
 
@@ -219,6 +226,8 @@ def _rules(scene: Scene, opened: MapFile, setting: Setting) -> dict[str, Any]:
     camera, telemetry = views.camera_of(agl_m, gsd_m), views.telemetry_at(agl_m)
     made: dict[str, Any] = {}
     for name, grounds in placements(scene, localizer, setting.views):
+        if name == "route":
+            continue
         seen = [
             View(views.view_of(ground, camera, agl_m, gsd_m), camera, telemetry)
             for ground in grounds

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -74,12 +74,17 @@ class Scene:
         return {"bounds_deg": _box_deg(area.frame, middle - half, middle + half)}
 
 
-def generated(setting: Setting, name: str, folder: Path) -> Scene:
+def generated(setting: Setting, name: str, folder: Path, gsd_m: float | None = None) -> Scene:
     """A trajectory of Table 1 over a generated area (cached).
 
-    Of two dates, and a third where a triplet network is trained.
+    Of two dates, and a third where a triplet network is trained. `gsd_m`: another ground
+    resolution; the scene is then named by it.
     """
     trajectory = setting.trajectory(name)
+    title = name
+    if gsd_m is not None and gsd_m != trajectory.gsd_m:
+        trajectory = replace(trajectory, gsd_m=gsd_m)
+        title = f"{name}-{gsd_m:g}m"
     east_m, north_m = trajectory.imagery_m
     place = folder / f"{name}-{east_m:.0f}x{north_m:.0f}m-{trajectory.gsd_m:g}m"
     learns = setting.name != "reduced" or name in "".join(REDUCED_NETWORKS["triplet"].values())
@@ -89,7 +94,7 @@ def generated(setting: Setting, name: str, folder: Path) -> Scene:
         generate_area(
             place, size_m=(east_m, north_m), gsd_m=trajectory.gsd_m, dates=dates, seed=SEED
         )
-    return Scene(name, paths[0], paths[1], trajectory, tuple(paths[2:]))
+    return Scene(title, paths[0], paths[1], trajectory, tuple(paths[2:]))
 
 
 def over(

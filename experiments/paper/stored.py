@@ -11,7 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from experiments.paper.methods import CANNY, DEFAULT, GREY, SAM, SEGMENTS, Method, methods
+from experiments.paper.methods import CANNY, DEFAULT, GREY, SAM, SEGMENTS, Method, column, methods
 from experiments.paper.results import Result, read
 from experiments.paper.scenes import REDUCED_REAL, UNTUNED
 from experiments.paper.trajectories import REDUCED, SETTINGS, TABLE_1
@@ -92,7 +92,7 @@ def _is_text(node: ast.AST) -> bool:
 
 def code_of(method: Method | None, scene: str) -> dict[str, str]:
     """The same of a method on a scene; None: of the baselines."""
-    generated = scene in TABLE_1
+    generated = column(scene) in TABLE_1
     if method is None:
         return code(BASELINES, "", registration=False, generated=generated)
     return code(method.family, method.edges, registration=method.registration, generated=generated)

@@ -53,6 +53,9 @@ class Trajectory:
 
 
 TABLE_1 = {name: Trajectory(*astuple(column)) for name, column in presets.TABLE_1.items()}
+IMPLIED_GSD_M = {"B": 0.75, "C": 1.5, "D": 0.75}
+"""Ground resolution that the paper's numbers of views imply: 12 km in 500 tile steps of 32 px, and
+2 km in 84; C, from twice the height, in proportion. A's 0.19 m is finer than landscapes are made."""
 REDUCED_M = {"A": (150, 1), "B": (3000, 300), "C": (5000, 1000), "D": (1000, 1000)}
 """Length and search band of the reduced setting."""
 
@@ -92,7 +95,8 @@ class Setting:
         if self.name == "reduced":
             length_m, band_m = REDUCED_M[name]
             return replace(whole, length_m=length_m, band_m=band_m)
-        return replace(whole, length_m=min(whole.length_m, LARGEST_M))
+        gsd_m = IMPLIED_GSD_M.get(name, whole.gsd_m)
+        return replace(whole, length_m=min(whole.length_m, LARGEST_M), gsd_m=gsd_m)
 
 
 LEARNABLE = ",mining=semihard,similarity=cosine,margin=0.2"

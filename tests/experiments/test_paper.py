@@ -139,6 +139,8 @@ def test_a_run_says_what_it_was_and_is_not_run_twice(place, scene, made, monkeyp
     assert {"provenance", "inputs", "minutes", "command", "seeds"} <= set(made)
     assert all(len(digest) == 64 for digest in made["inputs"].values())
     assert len(made["views"]["grid"]) == len(made["views"]["anywhere"]) == 6
+    assert len(made["views"]["route"]) == SMALL.length_m / SMALL.stride_m
+    assert set(made["rules"]) == {"grid", "anywhere"}
     assert set(made["sweep"]) == {"heading_deg", "drop_m"}
 
     def refuse(*_):
@@ -165,12 +167,13 @@ def test_tables_and_plots_are_made_of_the_files_alone(tmp_path, made):
     plain["views"] = {
         "grid": [[0.0, 1, 1.5, 2.0], [14.0, 1, 1.2, 1.9], [99.0, 1, 1.2, 1.1], [None] * 4],
         "anywhere": [[20.0, 1, 1.1, 1.3]] * 4,
+        "route": [[1.0, 1, 1.1, 1.3]] * 3,
     }
     (folder / "B-autoencoder-canny.json").write_text(json.dumps(plain))
     text = report(tmp_path, "reduced").read_text()
     row = next(line for line in text.splitlines() if line.startswith("| Auto-Encoder"))
     assert [cell.strip() for cell in row.split("|")[2:-1]] == [
-        *("Canny", "90.2", "50", "0", "100", "4"),
+        *("Canny", "90.2", "100", "50", "0", "100", "3 / 4 / 4"),
     ]
     confidence = next(
         line for line in text.splitlines() if line.startswith("| B") and " / " in line
@@ -258,3 +261,25 @@ def test_a_triplet_learns_from_the_third_date_of_a_generated_area(tmp_path, monk
     assert [path.stem for path in made.others] == [asked[0][2].name]
     assert scenes.generated(REDUCED, "D", tmp_path).others == ()
     assert len(scenes.generated(FULL, "D", tmp_path).others) == 1
+
+
+def test_one_view_per_tile_step_as_many_as_the_paper():
+    """B and D are flown in the tile steps of their pixels; C in every third or fourth one."""
+    for name in ("B", "D"):
+        flown = FULL.trajectory(name)
+        assert round(flown.length_m / flown.stride_m + 0.5) == published.views(name)
+    centres = np.stack(np.meshgrid(np.arange(0, 320, 32), np.arange(0, 160, 32)), -1)
+    centres = centres.reshape(-1, 2).astype(np.float32)
+    places = views.along_route(centres, 500)
+    assert np.array_equal(places[:, 0], np.arange(0, 320, 32))
+    assert (places[:, 1] == 64).all()
+    assert np.array_equal(views.along_route(centres, 4)[:, 0], [0, 96, 192, 288])
+
+
+def test_another_ground_resolution_is_a_scene_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setattr(scenes, "generate_area", lambda *_, **__: None)
+    made = scenes.generated(REDUCED, "B", tmp_path, gsd_m=0.75)
+    assert (made.name, made.trajectory.gsd_m, made.trajectory.stride_m) == ("B-0.75m", 0.75, 24)
+    rows = {each.key for each in methods(REDUCED, made.name, 900)}
+    assert rows == {each.key for each in methods(REDUCED, "B", 900)}
+    assert scenes.generated(REDUCED, "B", tmp_path, gsd_m=1.0).name == "B"

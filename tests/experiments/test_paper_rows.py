@@ -9,6 +9,7 @@ from experiments.paper.__main__ import main
 from experiments.paper.methods import methods
 from experiments.paper.page import PAGE, missing, page, state
 from experiments.paper.results import Result
+from experiments.paper.tables import orders, resolutions
 from experiments.paper.trajectories import REDUCED, TABLE_1
 
 TILES = 940
@@ -31,8 +32,8 @@ def row(key="autoencoder-canny", scene="B"):
         "method": asdict(method),
         "tiles": TILES,
         "dims": 1024,
-        "views": {"grid": seen, "anywhere": seen},
-        "chance": {"grid": 0.0, "anywhere": 0.0},
+        "views": dict.fromkeys(("route", "grid", "anywhere"), seen),
+        "chance": {},
         "sweep": {},
         "rules": {},
         "code": stored.code_of(method, scene),
@@ -121,3 +122,24 @@ def test_a_row_is_small():
     made = row().plain
     made["views"] = {"grid": [[123.456789, 0.123456, 1.234567, 2.345678, 0.98765]] * 625}
     assert len(stored.compact(made)) < 32_000
+
+
+def test_the_order_of_the_papers_methods_is_compared():
+    grey, canny = row("autoencoder-gray"), row()
+    grey.plain["views"]["route"] = [[99.0, 1.0, 1.0, 1.0, 0.0]] * 400
+    canny.plain["views"]["route"] = [[1.0, 1.0, 1.0, 1.0, 0.0]] * 400
+    (table,) = orders([grey, canny])
+    assert table.rows == [
+        ["B", "Auto-Encoder, Canny", "Auto-Encoder, grey", "90.2 : 71.2", "100 : 0", "yes"]
+    ]
+    grey.plain["views"]["route"] = canny.plain["views"]["route"]
+    (table,) = orders([grey, canny])
+    assert table.rows[0][-1] == "equal"
+
+
+def test_ground_resolutions_of_a_trajectory_are_compared():
+    finer = row().plain | {"scene": "B-0.75m"}
+    finer["trajectory"] = finer["trajectory"] | {"gsd_m": 0.75}
+    (table,) = resolutions([row(), Result(finer)])
+    assert [each[3:6] for each in table.rows] == [["1", "32", "69"], ["0.75", "24", "97"]]
+    assert resolutions([row()]) == []
