@@ -70,12 +70,14 @@ def _run(options: argparse.Namespace, command: str) -> int:
     from experiments.paper.runs import Workplace
     from experiments.paper.trajectories import SETTINGS
 
+    _require(options)
     start = time.perf_counter()
     place = Workplace(options.out, SETTINGS[options.setting], command)
     wanted = set(options.only or PARTS)
     tasks: list[Any] = []
     for scene in _scenes(options, wanted):
-        rows = methods(place.setting, scene.name, scene.trajectory.tiles, options.sam)
+        tiles = scene.trajectory.tiles
+        rows = methods(place.setting, scene.name, tiles, options.sam, options.epochs)
         chosen = [each for each in rows if not options.methods or each.family in options.methods]
         if not scene.others:
             chosen = [each for each in chosen if not each.needs_dates]
@@ -95,6 +97,14 @@ def _run(options: argparse.Namespace, command: str) -> int:
     if "baselines" in wanted and based and baselines.run(place, based[0][1]):
         _say(f"{_minutes(start)}  baselines")
     return failed
+
+
+def _require(options: argparse.Namespace) -> None:
+    """Raise `MissingExtraError` naming all that the chosen rows need and that is not installed."""
+    from orthonav.extras import require
+
+    learnt = not options.methods or set(options.methods) != {"gradient"}
+    require("python -m experiments.paper", "geo", *(["train"] if learnt else []))
 
 
 def _minutes(start: float) -> str:
@@ -137,6 +147,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--jobs", type=int, help="runs at a time (default one per core; 1 in the full setting)"
     )
+    parser.add_argument(
+        "--epochs",
+        type=int,
+        metavar="N",
+        help="epochs of networks; more than a finished training has are added to it",
+    )
     parser.add_argument("--past", type=Path, help="an orthophoto of your own, for the map")
     parser.add_argument("--present", type=Path, help="the same ground at another date")
     parser.add_argument(
@@ -153,4 +169,9 @@ def _say(text: str) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    from orthonav.errors import OrthonavError
+
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except OrthonavError as error:
+        sys.exit(f"error: {error}")

@@ -61,9 +61,15 @@ REDUCED_NETWORKS = {
 
 
 def methods(
-    setting: Setting, scene: str, tiles: int, sam_weights: str | None = None
+    setting: Setting,
+    scene: str,
+    tiles: int,
+    sam_weights: str | None = None,
+    more_epochs: int | None = None,
 ) -> list[Method]:
     """All rows for a scene whose map has so many tiles, quick ones first.
+
+    `more_epochs`: epochs of all networks, instead of the setting's.
 
     The reduced setting learns fewer networks: `REDUCED_NETWORKS`, and over imagery that no
     trajectory of the paper is flown over the auto-encoder on Canny edges, the paper's best, and on
@@ -72,11 +78,11 @@ def methods(
     shown, width = setting.encoder_tiles, setting.encoder_width
     encoder = (
         f"autoencoder:width={width},learning_rate={setting.encoder_rate:g},"
-        f"epochs={epochs(tiles, shown)}"
+        f"epochs={more_epochs or epochs(tiles, shown)}"
     )
     triplet = (
         f"triplet:width={setting.triplet_width},batch={setting.triplet_batch},"
-        f"epochs={epochs(tiles, setting.triplet_tiles)}{setting.triplet_more}"
+        f"epochs={more_epochs or epochs(tiles, setting.triplet_tiles)}{setting.triplet_more}"
     )
     looked_at = [CANNY, GREY, SEGMENTS]
     if sam_weights:

@@ -2,6 +2,8 @@
 
 import logging
 import os
+import sys
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -11,6 +13,7 @@ from experiments.paper.methods import Method
 from experiments.paper.runs import Workplace, run
 from experiments.paper.scenes import Scene
 
+SAID_EVERY_S = 30.0
 Task = tuple[Workplace, Scene, Method]
 
 
@@ -40,7 +43,25 @@ def cores() -> int:
 
 
 def _minutes(place: Workplace, scene: Scene, method: Method) -> float:
+    LEARNING.title = f"{scene.name} {method.key}"
     return float(run(place, scene, method)["minutes"])
+
+
+class _Learning(logging.Handler):
+    """Prints epoch, loss and time left of a training now and then, on a terminal or not."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self.title, self._said_s = "", time.monotonic()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a message, unless one was printed lately."""
+        if time.monotonic() - self._said_s >= SAID_EVERY_S:
+            self._said_s = time.monotonic()
+            print(f"           {self.title}: {record.getMessage()}", file=sys.stderr, flush=True)
+
+
+LEARNING = _Learning()
 
 
 def _prepare(jobs: int) -> None:
@@ -48,6 +69,10 @@ def _prepare(jobs: int) -> None:
     import cv2
 
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
+    learning = logging.getLogger("orthonav.prepare.encoders")
+    learning.setLevel(logging.INFO)
+    learning.propagate = False
+    learning.addHandler(LEARNING)
     cv2.setNumThreads(1)
     cv2.setRNGSeed(0)
     try:

@@ -61,11 +61,12 @@ class Workplace:
 
 
 def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
-    """Result of a run, after building, locating and writing; earlier results are reused."""
+    """Result of a run, after building, locating and writing; one of the same recipe is reused."""
     out = place.result(scene, method.key)
     if out.is_file():
         found: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
-        return found
+        if found["method"]["recipe"] == method.recipe:
+            return found
     start, before = time.perf_counter(), provenance("paper")
     opened, built = _map(scene, method, place.work(scene, method.key))
     localizer = Localizer(

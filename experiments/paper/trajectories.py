@@ -55,7 +55,7 @@ class Trajectory:
 TABLE_1 = {name: Trajectory(*astuple(column)) for name, column in presets.TABLE_1.items()}
 IMPLIED_GSD_M = {"B": 0.75, "C": 1.5, "D": 0.75}
 """Ground resolution that the paper's numbers of views imply: 12 km in 500 tile steps of 32 px, and
-2 km in 84; C, from twice the height, in proportion. A's would be 0.19 m, landscapes end at 0.2 m."""
+2 km in 84; C, from twice the height, in proportion. A: 0.19 m, but landscapes end at 0.2 m."""
 REDUCED_M = {"A": (150, 1), "B": (3000, 300), "C": (5000, 1000), "D": (1000, 1000)}
 """Length and search band of the reduced setting."""
 

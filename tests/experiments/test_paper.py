@@ -1,11 +1,12 @@
 """The paper's experiments: geometry of trajectories, views, tables, resuming. No figure of it."""
 
 import json
+import logging
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from experiments.paper import published, runs, scenes, views
+from experiments.paper import pool, published, runs, scenes, views
 from experiments.paper.methods import Method, methods, tuned
 from experiments.paper.pool import side_by_side
 from experiments.paper.results import accepted_at, ceiling, confident, read
@@ -283,3 +284,22 @@ def test_another_ground_resolution_is_a_scene_of_its_own(tmp_path, monkeypatch):
     rows = {each.key for each in methods(REDUCED, made.name, 900)}
     assert rows == {each.key for each in methods(REDUCED, "B", 900)}
     assert scenes.generated(REDUCED, "B", tmp_path, gsd_m=1.0).name == "B"
+
+
+def test_learning_is_reported_without_a_terminal(monkeypatch, capsys):
+    monkeypatch.setattr(pool, "SAID_EVERY_S", 0.0)
+    said = pool._Learning()
+    said.title = "B autoencoder-canny"
+    said.handle(logging.makeLogRecord({"levelno": logging.INFO, "msg": "epoch 2 of 20, loss 0.1"}))
+    assert "B autoencoder-canny: epoch 2 of 20, loss 0.1" in capsys.readouterr().err
+    monkeypatch.setattr(pool, "SAID_EVERY_S", 1e6)
+    said.handle(logging.makeLogRecord({"levelno": logging.INFO, "msg": "epoch 3 of 20"}))
+    assert capsys.readouterr().err == ""
+
+
+def test_more_epochs_are_another_run_of_the_same_row(place, scene, made, monkeypatch):
+    rows = {each.key: each.recipe for each in methods(REDUCED, "B", 900, more_epochs=77)}
+    assert "epochs=77" in rows["autoencoder-canny"] and "epochs=77" in rows["triplet-gray"]
+    monkeypatch.setattr(runs, "build_map", lambda *_: pytest.fail("built"))
+    with pytest.raises(pytest.fail.Exception, match="built"):
+        runs.run(place, scene, Method("gradient", "gradient:dims=8", "gradient"))

@@ -4,7 +4,7 @@ Both are trained as in Di Piazza et al. 2024 (section Methodology): the auto-enc
 rate of 3e-4 that halves on plateaus, batches of 32; the triplet network with Adam, 1e-3, batches
 of 512; 200 epochs each. The order of tiles and every positive depend on the seed, the epoch and
 the tile alone. An interrupted training therefore resumes with the same result, also within an
-epoch.
+epoch, and a finished one goes on where it is given more epochs.
 
 Several processes or GPUs: start the program with `torchrun`. Each process takes its share of every
 batch, gradients are averaged, and the first process writes. Negatives and the statistics of batch
@@ -88,7 +88,7 @@ def learn_network(
     - `binary`: the tiles are edge maps.
     - `seed`: seed of the weights, of the order of tiles and of the positives.
     - `work`: folder for checkpoints and pictures of the progress; an interrupted training resumes
-      from it; None: nothing is written.
+      from it, and a finished one if the recipe has more epochs; None: nothing is written.
     - `positive`: source of the positives of triplets: sheets of other dates with the same tiles, or
       a function that changes grey levels.
     - `report(text, share)`: progress callback; `share` is the part done, 0 to 1.
@@ -185,7 +185,7 @@ def train(
     state = TrainingState(task.model, recipe, fused=means.fused)
     known_by = fingerprint(recipe, tiles, dates, seed, means, world)
     store = CheckpointStore(work, known_by, means.save_every_s)
-    store.load(state, device)
+    store.load(state, device, recipe.epochs)
     run = wrapped(task.model, device, world)
     feed = _Feed(task, recipe.batch, seed, len(tiles), device, bf16, means, world)
     writer = store if world.rank == 0 else None
@@ -219,7 +219,8 @@ class _Pauses:
         self._state, self._tiles = state, tiles
         self._epochs, self._batches = epochs, batches
         self._report, self._writer = report, writer
-        self._progress_s = time.monotonic()
+        self._progress_s = self._start_s = time.monotonic()
+        self._start = self._share()
 
     def after_batch(self) -> None:
         """Report and write if due; the last batch of an epoch is left to `after_epoch`."""
@@ -228,9 +229,7 @@ class _Pauses:
             return
         if time.monotonic() - self._progress_s >= PROGRESS_EVERY_S:
             at = f"epoch {epoch + 1} of {self._epochs}, batch {done} of {self._batches}"
-            share = (epoch + done / self._batches) / self._epochs
-            self._report(f"{at}, loss {float(self._state.losses[-1]):.5g}", share)
-            self._progress_s = time.monotonic()
+            self._say(f"{at}, loss {float(self._state.losses[-1]):.5g}")
         if self._writer:
             self._writer.after_batch(self._state, self._tiles)
 
@@ -238,11 +237,29 @@ class _Pauses:
         """Report the mean loss, and write if due."""
         history = self._state.history
         done = len(history)
-        text = f"epoch {done} of {self._epochs}, loss {history[-1]:.5g}"
-        self._report(text, done / self._epochs)
-        self._progress_s = time.monotonic()
+        self._say(f"epoch {done} of {self._epochs}, loss {history[-1]:.5g}")
         if self._writer:
             self._writer.after_epoch(self._state, self._tiles, last=done == self._epochs)
+
+    def _share(self) -> float:
+        """Share of the training that is done."""
+        batches = len(self._state.history) * self._batches + len(self._state.losses)
+        return batches / (self._epochs * self._batches)
+
+    def _say(self, text: str) -> None:
+        """Report with the time left, at the speed since this process began."""
+        self._progress_s, share = time.monotonic(), self._share()
+        speed = (share - self._start) / max(self._progress_s - self._start_s, 1e-9)
+        left = f", {_duration((1 - share) / speed)} left" if speed > 0 and share < 1 else ""
+        self._report(f"{text}{left}", share)
+
+
+def _duration(seconds: float) -> str:
+    """Seconds in the unit that people would name."""
+    for size, name in ((3600, "h"), (60, "min")):
+        if seconds >= 1.5 * size:
+            return f"{seconds / size:.{int(seconds < 10 * size)}f} {name}"
+    return f"{seconds:.0f} s"
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,19 +1,27 @@
 """Methods and their default representations, as named on the command line."""
 
 import logging
+from importlib.util import find_spec
 from typing import Any
 
 from orthonav import embed, represent
 from orthonav.embed.network import AutoEncoderRecipe, TripletRecipe
 from orthonav.embed.whitened import WhitenedRecipe
 from orthonav.embed.words import WordsRecipe
-from orthonav.errors import VariantError
+from orthonav.errors import MissingExtraError, VariantError
+from orthonav.extras import pip_line
 from orthonav.prepare.encoders import EncoderRecipe
 from orthonav.represent.gray import Gray
 from orthonav.variants import make_variant, variant_recipe
 
 log = logging.getLogger(__name__)
 
+LEARNT_WITH = {
+    "autoencoder": ("torch", "onnx", "onnxruntime"),
+    "triplet": ("torch", "onnx", "onnxruntime"),
+    "bovw": ("faiss",),
+}
+"""Modules of the extra "train" that learning a method needs."""
 LOCAL_FIELDS = ("weights", "cache")
 
 
@@ -24,8 +32,15 @@ def usual_edges(method: str) -> str:
 
 
 def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderRecipe:
-    """The recipe of a method; one-channel images are whitened on finer cells by default."""
+    """The recipe of a method; one-channel images are whitened on finer cells by default.
+
+    Raises `VariantError`, and `MissingExtraError` naming all that learning it needs and lacks.
+    """
     name, _, parameters = method.partition(":")
+    absent = [each for each in LEARNT_WITH.get(name, ()) if find_spec(each) is None]
+    if absent:
+        gone = ", ".join(absent)
+        raise MissingExtraError(f"--method {name} needs {gone}: {pip_line('train')}")
     if name == "gradient" and representation.channels == 1 and "cells=" not in parameters:
         method = f"{name}:{parameters},cells=16"
     recipe = make_variant(embed.TABLE, method)
