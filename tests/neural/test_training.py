@@ -357,10 +357,29 @@ def test_fast_options_give_the_same_result_up_to_rounding(tmp_path):
 def test_bfloat16_is_used_where_the_processor_has_it(able, wanted, monkeypatch):
     cpu = torch.device("cpu")
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: able, raising=False)
-    assert means.uses_bf16(Means(), cpu) is wanted
-    assert means.uses_bf16(Means(bf16=not wanted), cpu) is not wanted
+    bf16 = torch.bfloat16
+    assert means.mixed_precision(Means(), cpu) is (bf16 if wanted else None)
+    assert means.mixed_precision(Means(bf16=not wanted), cpu) is (None if wanted else bf16)
     monkeypatch.delattr(torch.cpu, "get_capabilities")
-    assert means.uses_bf16(Means(), cpu) is False
+    assert means.mixed_precision(Means(), cpu) is None
+
+
+@pytest.mark.parametrize("able, wanted", [(True, torch.bfloat16), (False, torch.float16)])
+def test_a_gpu_without_bfloat16_learns_in_float16(able, wanted, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: able)
+    assert means.mixed_precision(Means(), torch.device("cuda")) is wanted
+
+
+@pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
+def test_scaled_gradients_give_the_same_result(recipe, tmp_path, monkeypatch):
+    """What float16 needs: gradients times 65536, and divided by it before the step."""
+    original = torch.amp.GradScaler
+    monkeypatch.setattr(
+        training.torch.amp, "GradScaler", lambda device, enabled: original(device, enabled=True)
+    )
+    learn(recipe, tmp_path)
+    monkeypatch.undo()
+    np.testing.assert_allclose(losses(tmp_path), undisturbed(recipe).losses, rtol=1e-3)
 
 
 SHARED = """

@@ -105,11 +105,11 @@ class Reconstruction:
         """Tiles (B, C, S, S)."""
         return (self.tiles.batch(indices),)
 
-    def backward(self, run: nn.Module, *tensors: Tensor) -> Tensor:
-        """Add the gradients of the L2 loss."""
+    def backward(self, run: nn.Module, *tensors: Tensor, scale: Tensor) -> Tensor:
+        """The L2 loss, after adding its gradients times `scale`."""
         (maps,) = tensors
         loss = reconstruction_loss(maps, run(maps))
-        torch.autograd.backward(loss)
+        torch.autograd.backward(loss * scale)
         return loss.detach()
 
 

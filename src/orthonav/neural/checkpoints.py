@@ -41,11 +41,14 @@ class TrainingState:
     """State of a training: weights, optimizer, learning rate and losses.
 
     `history` holds the mean loss of each epoch, `losses` those of the batches of the current epoch.
+    `scaler` scales gradients of float16 and does nothing for other types.
     """
 
-    def __init__(self, model: nn.Module, recipe: Recipe, *, fused: bool) -> None:
+    def __init__(
+        self, model: nn.Module, recipe: Recipe, *, fused: bool, scaler: torch.amp.GradScaler
+    ) -> None:
         kind = torch.optim.AdamW if isinstance(recipe, AutoEncoderRecipe) else torch.optim.Adam
-        self.model = model
+        self.model, self.scaler = model, scaler
         self.optimizer: torch.optim.Optimizer = kind(
             model.parameters(), lr=recipe.learning_rate, fused=fused
         )
@@ -74,6 +77,7 @@ class TrainingState:
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "plateau": self.plateau.state_dict() if self.plateau else None,
+            "scaler": self.scaler.state_dict(),
             "history": self.history,
             "losses": self.losses,
         }
@@ -84,6 +88,8 @@ class TrainingState:
         self.optimizer.load_state_dict(parts["optimizer"])
         if self.plateau is not None:
             self.plateau.load_state_dict(parts["plateau"])
+        if parts.get("scaler"):
+            self.scaler.load_state_dict(parts["scaler"])
         self.history = list(parts["history"])
         self.losses = list(parts.get("losses", []))  # absent in older checkpoints
 

@@ -5,14 +5,15 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 BATCHES_AHEAD = 2
+"""Batches made ahead at least; with more threads, one each."""
 
-Arrays = tuple[NDArray[Any], ...]
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,14 +111,14 @@ def epoch_batches(
 
 
 def made_ahead(
-    make: Callable[[NDArray[np.intp]], Arrays], plan: Sequence[NDArray[np.intp]], workers: int
-) -> Iterator[Arrays]:
+    make: Callable[[NDArray[np.intp]], Made], plan: Sequence[NDArray[np.intp]], workers: int
+) -> Iterator[Made]:
     """Results of `make` for each batch of the plan, in order, computed by threads a few ahead."""
     with ThreadPoolExecutor(max(1, workers)) as pool:
-        waiting: deque[Future[Arrays]] = deque()
+        waiting: deque[Future[Made]] = deque()
         for indices in plan:
             waiting.append(pool.submit(make, indices))
-            if len(waiting) > BATCHES_AHEAD:
+            if len(waiting) > max(BATCHES_AHEAD, workers):
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()

@@ -36,8 +36,9 @@ from orthonav.neural.means import (
     device_of,
     kept_memory,
     mean_over_processes,
+    mixed_precision,
     processes,
-    uses_bf16,
+    workers_of,
     wrapped,
 )
 from orthonav.neural.tiles import SheetTiles, epoch_batches, made_ahead
@@ -67,9 +68,33 @@ class Task(Protocol):
         """Arrays for a batch of tiles (B,); called from several threads."""
         ...
 
-    def backward(self, run: nn.Module, *tensors: Tensor) -> Tensor:
-        """Loss, after adding its gradients; `run` is the model, possibly wrapped."""
+    def backward(self, run: nn.Module, *tensors: Tensor, scale: Tensor) -> Tensor:
+        """Loss, after adding its gradients times `scale`; `run` is the model, possibly wrapped."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedNetwork:
+    """A trained encoder: `embedder` as it flies, `encoder` on the device where it was trained."""
+
+    embedder: NetworkEmbedder
+    encoder: nn.Module
+    device: torch.device
+
+    def views(self, maps: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Embeddings (N, D) of tiles (N, C, S, S): on a GPU if it learnt, else as in flight.
+
+        A precision below float32 is always computed as in flight.
+        """
+        recipe = self.embedder.recipe
+        if self.device.type == "cpu" or recipe.precision != "float32":
+            return self.embedder.views(maps)
+        # TF32 would round like no other device.
+        with torch.no_grad(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+            found = self.encoder(torch.from_numpy(maps).to(self.device)).float()
+        if recipe.similarity == "cosine":
+            found = nn.functional.normalize(found, dim=1)
+        return np.asarray(found.cpu().numpy())
 
 
 def learn_network(
@@ -94,6 +119,25 @@ def learn_network(
     - `report(text, share)`: progress callback; `share` is the part done, 0 to 1.
     - `means`: options for speed.
 
+    Raises what `trained_network` raises.
+    """
+    given = {"binary": binary, "seed": seed, "work": work, "positive": positive}
+    return trained_network(recipe, tiles, report=report, means=means, **given).embedder
+
+
+def trained_network(
+    recipe: Recipe,
+    tiles: SheetTiles,
+    *,
+    binary: bool,
+    seed: int,
+    work: Path | None,
+    positive: Positive | Sequence[SheetTiles] | None = None,
+    report: Progress | None = None,
+    means: Means | None = None,
+) -> TrainedNetwork:
+    """The same with the encoder that was trained, on its device.
+
     Raises `ValueError` for a triplet network without `positive` or for impossible tiles,
     `TrainingError` if the loss is not finite, `OutputError` if `work` holds another training,
     `ExportError` if ONNX and PyTorch disagree.
@@ -114,7 +158,9 @@ def learn_network(
             means=means,
             world=world,
         )
-    return _exported(task.encoder, recipe, tiles, progress)
+        device = device_of(means, world)
+    embedder = _exported(task.encoder, recipe, tiles, progress)
+    return TrainedNetwork(embedder, task.encoder.to(device).eval(), device)
 
 
 def _exported(
@@ -178,16 +224,16 @@ def train(
     read the checkpoint, so `work` must be a shared folder.
     """
     device = device_of(means, world)
-    bf16 = uses_bf16(means, device)
-    precision = "bfloat16" if bf16 else "float32"
-    log.info("training on %s in %s, contiguous tensors (NCHW)", device, precision)
+    mixed = mixed_precision(means, device)
+    log.info("training on %s in %s, contiguous tensors (NCHW)", device, mixed or torch.float32)
     task.model.to(device)
-    state = TrainingState(task.model, recipe, fused=means.fused)
+    scaler = torch.amp.GradScaler(device.type, enabled=mixed == torch.float16)
+    state = TrainingState(task.model, recipe, fused=means.fused, scaler=scaler)
     known_by = fingerprint(recipe, tiles, dates, seed, means, world)
     store = CheckpointStore(work, known_by, means.save_every_s)
     store.load(state, device, recipe.epochs)
     run = wrapped(task.model, device, world)
-    feed = _Feed(task, recipe.batch, seed, len(tiles), device, bf16, means, world)
+    feed = _Feed(task, recipe.batch, seed, len(tiles), device, mixed, means, world)
     writer = store if world.rank == 0 else None
     if writer:
         writer.clear()
@@ -271,7 +317,7 @@ class _Feed:
     seed: int
     count: int
     device: torch.device
-    bf16: bool
+    precision: torch.dtype | None
     means: Means
     world: World
 
@@ -284,13 +330,20 @@ class _Feed:
         """Tensors of each batch of this process, from number `first` up to `end`, exclusive."""
         rank, size = self.world.rank, self.world.size
         plan = epoch_batches(self.count, self.batch, self.seed, epoch, rank=rank, processes=size)
-        make = partial(self.task.arrays, epoch)
-        for arrays in made_ahead(make, plan[first:end], self.means.workers):
-            yield [torch.from_numpy(np.ascontiguousarray(a)).to(self.device) for a in arrays]
+        workers = workers_of(self.means, self.device)
+        for tensors in made_ahead(partial(self._made, epoch), plan[first:end], workers):
+            yield [each.to(self.device, non_blocking=True) for each in tensors]
+
+    def _made(self, epoch: int, indices: NDArray[np.intp]) -> list[Tensor]:
+        """Tensors of a batch, for a GPU in pinned memory, from which copies are asynchronous."""
+        arrays = self.task.arrays(epoch, indices)
+        made = [torch.from_numpy(np.ascontiguousarray(each)) for each in arrays]
+        return [each.pin_memory() for each in made] if self.device.type == "cuda" else made
 
     def mixed(self) -> torch.autocast:
         """Autocast context for mixed precision."""
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16)
+        wanted, kind = self.precision is not None, self.precision or torch.bfloat16
+        return torch.autocast(self.device.type, kind, enabled=wanted)
 
 
 def _epoch(feed: _Feed, run: nn.Module, state: TrainingState, pauses: _Pauses) -> Tensor:
@@ -298,11 +351,14 @@ def _epoch(feed: _Feed, run: nn.Module, state: TrainingState, pauses: _Pauses) -
 
     With several processes, all resume with the losses of the first one.
     """
+    one = torch.ones((), device=feed.device)
     for tensors in feed.batches(len(state.history), len(state.losses)):
         state.optimizer.zero_grad(set_to_none=True)
         with feed.mixed():
-            state.losses.append(feed.task.backward(run, *tensors))
-        state.optimizer.step()
+            loss = feed.task.backward(run, *tensors, scale=state.scaler.scale(one))
+        state.losses.append(loss)
+        state.scaler.step(state.optimizer)
+        state.scaler.update()
         pauses.after_batch()
     return torch.stack(state.losses).double().mean()
 

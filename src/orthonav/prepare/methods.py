@@ -9,7 +9,7 @@ from orthonav.embed.network import AutoEncoderRecipe, TripletRecipe
 from orthonav.embed.whitened import WhitenedRecipe
 from orthonav.embed.words import WordsRecipe
 from orthonav.errors import MissingExtraError, VariantError
-from orthonav.extras import pip_line
+from orthonav.extras import needed, pip_line
 from orthonav.prepare.encoders import EncoderRecipe
 from orthonav.represent.gray import Gray
 from orthonav.variants import make_variant, variant_recipe
@@ -22,6 +22,7 @@ LEARNT_WITH = {
     "bovw": ("faiss",),
 }
 """Modules of the extra "train" that learning a method needs."""
+DEVICES = ("auto", "cpu", "cuda")
 LOCAL_FIELDS = ("weights", "cache")
 
 
@@ -52,6 +53,14 @@ def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderR
             "%s is too slow for flight: this map is for experiments", _name_of(representation)
         )
     return recipe
+
+
+def check_device(name: str) -> None:
+    """Raise `VariantError` for an unknown device, and for a GPU that PyTorch does not see."""
+    if name not in DEVICES:
+        raise VariantError(f"device must be {', '.join(DEVICES)}, got '{name}'")
+    if name == "cuda" and not needed("torch", "train", "a GPU").cuda.is_available():
+        raise VariantError("PyTorch sees no GPU; use --device auto or cpu")
 
 
 def check_positives(recipe: WhitenedRecipe | EncoderRecipe, representation: Any) -> None:

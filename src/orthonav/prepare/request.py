@@ -21,7 +21,7 @@ from orthonav.mapfile.manifest import Manifest
 from orthonav.prepare.calibrate import CROPS
 from orthonav.prepare.encoders import EncoderRecipe
 from orthonav.prepare.layout import grid_of
-from orthonav.prepare.methods import check_positives, method_recipe, usual_edges
+from orthonav.prepare.methods import check_device, check_positives, method_recipe, usual_edges
 from orthonav.variants import make_variant
 
 MAX_WORKERS = 64
@@ -53,7 +53,9 @@ class BuildRequest:
       registration, 1 to 384.
     - `work`: folder for finished blocks and checkpoints of networks, from which an interrupted
       build resumes; None: blocks of a large map in `OUT.work` until it is written.
-    - `workers`: threads that read the imagery, 1 to 64; None: one per core.
+    - `workers`: threads that read the imagery and make batches for a network, 1 to 64; None: one
+      per core that read, and 2 or, for a GPU, up to 16 that make batches.
+    - `device`: where a network is learnt, "auto" (a GPU if there is one), "cpu" or "cuda".
     - `cells`: whether the map carries the cell means from which new tiles are embedded without
       imagery, for sheets of an atlas; method gradient only.
     """
@@ -74,6 +76,7 @@ class BuildRequest:
     calibration_views: int = 48
     work: Path | None = None
     workers: int | None = None
+    device: str = "auto"
     cells: bool = False
 
 
@@ -110,6 +113,7 @@ class BuildInputs:
         edges = request.edges or usual_edges(request.method)
         representation = make_variant(represent.TABLE, edges)
         recipe = method_recipe(request.method, representation)
+        check_device(request.device)
         if not request.other_dates:
             check_positives(recipe, representation)
         mosaic = Mosaic.open(request.orthos)
