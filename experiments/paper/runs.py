@@ -40,16 +40,23 @@ MB = 1e6
 
 @dataclass(frozen=True)
 class Workplace:
-    """Folders of results, maps and generated areas, and the options of the run."""
+    """Folders of results, maps and generated areas, and the options of the run.
+
+    `device`, `workers`: as of `BuildRequest`. `keep_checkpoints`: also when a row is done, so that
+    epochs can be added.
+    """
 
     out: Path
     setting: Setting
     command: str
+    device: str = "auto"
+    workers: int | None = None
+    keep_checkpoints: bool = False
 
     @property
     def results(self) -> Path:
         """Folder of the result files."""
-        return self.out / self.setting.name
+        return self.out / self.setting.folder
 
     def result(self, scene: Scene, key: str) -> Path:
         """The file that a run leaves."""
@@ -57,7 +64,7 @@ class Workplace:
 
     def work(self, scene: Scene, key: str) -> Path:
         """Folder of checkpoints, and of the map."""
-        return self.out / "work" / self.setting.name / f"{scene.name}-{key}"
+        return self.out / "work" / self.setting.folder / f"{scene.name}-{key}"
 
 
 def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
@@ -68,7 +75,8 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
         if found["method"]["recipe"] == method.recipe:
             return found
     start, before = time.perf_counter(), provenance("paper")
-    opened, built = _map(scene, method, place.work(scene, method.key))
+    work = place.work(scene, method.key)
+    opened, built = _map(place, scene, method, work)
     localizer = Localizer(
         opened,
         registration=method.registration,
@@ -80,7 +88,10 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
     made |= {"method": asdict(method) | {"edges": edges}, **built, **_sizes(opened)}
     made |= _placed(scene, localizer, place.setting, method.registration)
     made["rules"] = {} if method.registration else _rules(scene, opened, place.setting)
-    return save(out, made | {"code": code_of(method, scene.name)}, start)
+    written = save(out, made | {"code": code_of(method, scene.name)}, start)
+    if not place.keep_checkpoints:
+        (work / "checkpoint.pt").unlink(missing_ok=True)
+    return written
 
 
 def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, Any]:
@@ -110,7 +121,9 @@ def save(out: Path, made: dict[str, Any], start: float) -> dict[str, Any]:
     return written
 
 
-def _map(scene: Scene, method: Method, work: Path) -> tuple[MapFile, dict[str, float]]:
+def _map(
+    place: Workplace, scene: Scene, method: Method, work: Path
+) -> tuple[MapFile, dict[str, float]]:
     """The map by `build_map`, and the seconds it took; `learn_s` includes embedding the tiles."""
     work.mkdir(parents=True, exist_ok=True)
     marks: dict[float, float] = {}
@@ -132,6 +145,8 @@ def _map(scene: Scene, method: Method, work: Path) -> tuple[MapFile, dict[str, f
             registration=method.registration,
             other_dates=scene.others if method.family == "triplet" else (),
             work=work,
+            workers=place.workers,
+            device=place.device,
         )
 
     start = time.perf_counter()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.paper.methods import REDUCED_NETWORKS
-from experiments.paper.trajectories import TABLE_1, TILE_PX, Setting, Trajectory
+from experiments.paper.trajectories import TABLE_1, TILE_PX, Setting, Trajectory, two_tiles
 from orthonav.geo.area import Area
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.route import Route
@@ -56,6 +56,10 @@ class Scene:
     present: Path
     trajectory: Trajectory
     others: tuple[Path, ...] = ()
+
+    def of(self, setting: Setting) -> "Scene":
+        """The scene as a setting runs it: a dry run has two tiles."""
+        return replace(self, trajectory=two_tiles(self.trajectory)) if setting.dry else self
 
     def area(self) -> dict[str, Any]:
         """The search band in the middle of the imagery, as `BuildRequest` takes an area.

@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from experiments.paper import pool, published, runs, scenes, views
+from experiments.paper.__main__ import main
+from experiments.paper.estimate import lines, parameters, steps
 from experiments.paper.methods import Method, methods, tuned
 from experiments.paper.pool import side_by_side
 from experiments.paper.results import accepted_at, ceiling, confident, read
 from experiments.paper.tables import report
-from experiments.paper.trajectories import FULL, REDUCED, TABLE_1, epochs
+from experiments.paper.trajectories import FULL, GPU, REDUCED, TABLE_1, dry, epochs
 
 from orthonav.errors import AreaError, MissingFileError
 from orthonav.geo.area import Area
@@ -286,10 +288,11 @@ def test_another_ground_resolution_is_a_scene_of_its_own(tmp_path, monkeypatch):
     assert scenes.generated(REDUCED, "B", tmp_path, gsd_m=1.0).name == "B"
 
 
-def test_learning_is_reported_without_a_terminal(monkeypatch, capsys):
+def test_learning_is_reported_without_a_terminal(scene, monkeypatch, capsys):
     monkeypatch.setattr(pool, "SAID_EVERY_S", 0.0)
     said = pool._Learning()
-    said.title = "B autoencoder-canny"
+    (method,) = [each for each in methods(REDUCED, "B", 940) if each.key == "autoencoder-canny"]
+    said.begin(scene, method)
     said.handle(logging.makeLogRecord({"levelno": logging.INFO, "msg": "epoch 2 of 20, loss 0.1"}))
     assert "B autoencoder-canny: epoch 2 of 20, loss 0.1" in capsys.readouterr().err
     monkeypatch.setattr(pool, "SAID_EVERY_S", 1e6)
@@ -303,3 +306,56 @@ def test_more_epochs_are_another_run_of_the_same_row(place, scene, made, monkeyp
     monkeypatch.setattr(runs, "build_map", lambda *_: pytest.fail("built"))
     with pytest.raises(pytest.fail.Exception, match="built"):
         runs.run(place, scene, Method("gradient", "gradient:dims=8", "gradient"))
+
+
+def test_hours_of_all_rows_are_estimated_from_the_first_minute(scene, monkeypatch, capsys):
+    times_s = [0.0]
+    monkeypatch.setattr(pool.time, "monotonic", lambda: times_s[-1])
+    said = pool._Learning()
+    (method,) = [each for each in methods(REDUCED, "B", 90) if each.key == "autoencoder-canny"]
+    said.work = {"autoencoder": 10.0 * steps(method, scene.trajectory.tiles)}
+    said.begin(scene, method)
+    for time_s, share in ((0.0, 0.0), (30.0, 0.1), (72.0, 0.2), (90.0, 0.25)):
+        times_s.append(time_s)
+        record = {"levelno": logging.INFO, "msg": "epoch", "share": share}
+        said.handle(logging.makeLogRecord(record))
+    (line,) = [each for each in capsys.readouterr().err.splitlines() if "all auto" in each]
+    assert "about 1.0 h" in line  # 72 s for a fifth of a tenth
+
+
+def test_what_a_series_takes_is_said(scene, tmp_path):
+    rows = {each.key: each for each in methods(GPU, "B", 21_000)}
+    assert set(rows) == {
+        *("gradient-gradient", "autoencoder-canny", "autoencoder-gray"),
+        "gradient-gradient-registration",
+    }
+    flown = replace(scene, trajectory=GPU.trajectory("B"))
+    assert steps(rows["autoencoder-canny"], 21_000) == 200 * 657
+    assert parameters(rows["autoencoder-canny"])[0] == 172_506_561
+    text = "\n".join(lines([(flown, each) for each in rows.values()], 1, tmp_path, True))
+    assert "262,800 steps, 1.1 h at 15 ms each" in text
+    assert "memory for learning: about 4.4 GB" in text
+    assert "disk: at most" in text and "are free" in text
+    assert [scene for scene in "ABCD" if len(methods(GPU, scene, 900)) > 2] == ["B", "D"]
+
+
+def test_a_dry_run_goes_through_every_step(scene, tmp_path, monkeypatch):
+    """A small network, from imagery to the tables; no checkpoint is left."""
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 8)
+    setting = dry(replace(REDUCED, encoder_width=8))
+    there = runs.Workplace(tmp_path, setting, "test", device="cpu", workers=1)
+    flown = scene.of(setting)
+    (method,) = [each for each in methods(setting, "B", 2) if each.key == "autoencoder-canny"]
+    made = runs.run(there, flown, method)
+    assert made["tiles"] <= 4 and "epochs=1" in made["method"]["recipe"]
+    assert set(made["views"]) == set(views.PLACEMENTS)
+    assert "Auto-Encoder" in report(tmp_path, setting.folder).read_text()
+    assert not list(tmp_path.rglob("checkpoint.pt"))
+
+
+@pytest.mark.slow
+def test_a_dry_run_of_all_rows_ends_without_a_failure(tmp_path):
+    arguments = ["--dry-run", "--only", *"ABCD", "baselines", "--jobs", "2", "--device", "cpu"]
+    assert main([*arguments, "--out", str(tmp_path)]) == 0
+    rows = {path.stem for path in (tmp_path / "dry-reduced").glob("*.json")}
+    assert rows >= {f"{name}-autoencoder-canny" for name in "ABCD"} | {"B-triplet-gray"}

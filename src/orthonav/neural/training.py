@@ -121,8 +121,16 @@ def learn_network(
 
     Raises what `trained_network` raises.
     """
-    given = {"binary": binary, "seed": seed, "work": work, "positive": positive}
-    return trained_network(recipe, tiles, report=report, means=means, **given).embedder
+    return trained_network(
+        recipe,
+        tiles,
+        binary=binary,
+        seed=seed,
+        work=work,
+        positive=positive,
+        report=report,
+        means=means,
+    ).embedder
 
 
 def trained_network(
