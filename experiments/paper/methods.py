@@ -6,6 +6,7 @@ from experiments.paper.trajectories import LEARNABLE, TABLE_1, Setting, epochs
 
 GREY, CANNY, SEGMENTS, SAM = "gray", "canny", "segments", "sam"
 DEFAULT = "gradient"
+PER_TILE = "per=tile"
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,8 @@ class Method:
         """Short name for files, unique within one setting."""
         words = self.recipe.partition("words=")[2].partition(",")[0]
         layer = "registration" if self.registration else ""
-        parts = (self.family, self.edges.partition(":")[0], words, layer)
+        singly = "tile" if PER_TILE in self.edges else ""
+        parts = (self.family, self.edges.partition(":")[0], singly, words, layer)
         return "-".join(part for part in parts if part)
 
 
@@ -91,6 +93,8 @@ def methods(
     looked_at = [CANNY, GREY, SEGMENTS]
     if sam_weights:
         looked_at.append(f"{SAM}:weights={sam_weights}")
+        if setting.name != "reduced":  # a row of the reduced setting would take days on a CPU
+            looked_at.append(f"{SAM}:{PER_TILE},weights={sam_weights}")
     rows = [Method(DEFAULT, DEFAULT, DEFAULT)]
     rows += [Method("bovw", f"bovw:words={words}", GREY) for words in setting.words]
     networks = [Method("autoencoder", encoder, edges) for edges in looked_at]

@@ -44,7 +44,7 @@ def views(scene: str) -> int:
 
 def stands_for(edges: str) -> str:
     """What the paper looked at where we look at `edges`: segments stand for Segment Anything."""
-    return SAM if edges == SEGMENTS else edges
+    return SAM if edges in (SEGMENTS, f"{SAM}-tile") else edges
 
 
 def accuracy(family: str, edges: str, scene: str) -> str:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments.paper.methods import PER_TILE
+
 ACCURACY_M = 15.0
 NEAREST_STRIDES = math.sqrt(0.5)
 """A position names the correct tile if it is within half a tile spacing on each axis."""
@@ -37,7 +39,8 @@ class Result:
     @property
     def edges(self) -> str:
         """Input of the method, for tables."""
-        return str(self.plain["method"]["edges"]).partition(":")[0]
+        edges = str(self.plain["method"]["edges"])
+        return edges.partition(":")[0] + ("-tile" if PER_TILE in edges else "")
 
     @property
     def registration(self) -> bool:

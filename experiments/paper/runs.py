@@ -6,6 +6,7 @@ not run again.
 
 import hashlib
 import json
+import re
 import statistics
 import time
 from collections.abc import Iterable, Iterator
@@ -84,7 +85,8 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
         flying=False,
     )
     made = head(place, scene, before)
-    edges = method.edges.partition(":weights=")[0]  # where weights lie is no part of a result
+    # Where weights lie is no part of a result.
+    edges = re.sub("[:,]weights=[^,]*", "", method.edges)
     made |= {"method": asdict(method) | {"edges": edges}, **built, **_sizes(opened)}
     made |= _placed(scene, localizer, place.setting, method.registration)
     made["rules"] = {} if method.registration else _rules(scene, opened, place.setting)

@@ -24,7 +24,8 @@ EDGES = {
     "gray": "grey",
     "canny": "Canny",
     "segments": "segments",
-    "sam": "Segment Anything",
+    "sam": "Segment Anything, sheet",
+    "sam-tile": "Segment Anything, tile",
     "gradient": "gradients",
 }
 

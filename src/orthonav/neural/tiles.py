@@ -27,6 +27,8 @@ class SheetTiles:
     - `scale`: value of `pixels` that stands for 1.0: 255 for grey levels, 1 for edge maps.
     - `grey`: (H, W) uint8, the source of the positives of triplets; None: first channel of
       `pixels`.
+    - `singles`: (N, C, S, S) uint8, tiles that were represented each by itself; None: tiles are cut
+      out of `pixels`.
     """
 
     pixels: NDArray[np.uint8]
@@ -35,6 +37,7 @@ class SheetTiles:
     tile_px: int
     scale: float = 255.0
     grey: NDArray[np.uint8] | None = None
+    singles: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
         if self.pixels.ndim != 3 or self.pixels.dtype != np.uint8:
@@ -69,7 +72,8 @@ class SheetTiles:
         out = np.empty((len(indices), self.channels, self.tile_px, self.tile_px), np.float32)
         for row, index in enumerate(indices):
             part = self._part(int(index))
-            self.scaled(self.pixels[:, *part], self.valid[part], out[row])
+            raw = self.pixels[:, *part] if self.singles is None else self.singles[int(index)]
+            self.scaled(raw, self.valid[part], out[row])
         return out
 
     def scaled(

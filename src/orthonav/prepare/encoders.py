@@ -60,14 +60,14 @@ def learn_encoder(
     themselves with simulated ageing.
     Raises `MissingExtraError` if PyTorch or faiss is needed and missing.
     """
-    tiles = pictures.tiles(tiles_px)
+    tiles = pictures.tiles(tiles_px, progress)
     if isinstance(recipe, WordsRecipe):
         chosen = _word_tiles(tiles)
         encoder = learn_words(
             recipe, chosen, learning.seed, lambda share: progress("learn words", share)
         )
         return encoder, _embedded(lambda of: _words(encoder, tiles, of), tiles, progress)
-    positive: Any = [each.tiles(tiles_px) for each in other_dates]
+    positive: Any = [each.tiles(tiles_px, progress) for each in other_dates]
     training = _training()
     device = None if learning.device == "auto" else learning.device
     trained = training.trained_network(

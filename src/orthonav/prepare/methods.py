@@ -48,6 +48,8 @@ def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderR
     assert isinstance(recipe, WhitenedRecipe | AutoEncoderRecipe | TripletRecipe | WordsRecipe)
     if isinstance(recipe, WordsRecipe) and not isinstance(representation, Gray):
         raise VariantError("bovw needs grey levels; give --edges gray, or omit --edges")
+    if isinstance(recipe, WhitenedRecipe) and getattr(representation, "per", "sheet") == "tile":
+        raise VariantError("edges per tile need a network; give --method autoencoder or triplet")
     if not represent.TABLE[_name_of(representation)].flies:
         log.warning(
             "%s is too slow for flight: this map is for experiments", _name_of(representation)
