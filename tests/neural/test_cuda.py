@@ -16,7 +16,7 @@ from test_training import AUTO, TRIPLET, Killed, kill_at, losses, noisy, sheet  
 from orthonav.embed.network import TripletRecipe  # noqa: E402
 from orthonav.neural import means, training  # noqa: E402
 from orthonav.neural.means import Means  # noqa: E402
-from orthonav.neural.training import trained_network  # noqa: E402
+from orthonav.neural.training import learn_network  # noqa: E402
 
 GPU = Means(save_every_s=0, device="cuda")
 BOTH = pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
@@ -25,7 +25,7 @@ BOTH = pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "t
 def trained(recipe, work, how=GPU, report=None):
     positive = noisy if isinstance(recipe, TripletRecipe) else None
     given = {"binary": False, "seed": 1, "work": work, "positive": positive}
-    return trained_network(recipe, sheet(), means=how, report=report, **given)
+    return learn_network(recipe, sheet(), means=how, report=report, **given)
 
 
 @BOTH

@@ -63,7 +63,7 @@ def learn(recipe, work=None, tiles=None, means=QUICK, seed=1, report=None):
         positive=positive,
         means=means,
         report=report,
-    )
+    ).embedder
 
 
 def losses(work):

@@ -107,8 +107,8 @@ def learn_network(
     positive: Positive | Sequence[SheetTiles] | None = None,
     report: Progress | None = None,
     means: Means | None = None,
-) -> NetworkEmbedder:
-    """ONNX embedder trained on reference tiles, checked against PyTorch.
+) -> TrainedNetwork:
+    """Encoder trained on reference tiles, with its ONNX embedder checked against PyTorch.
 
     - `binary`: the tiles are edge maps.
     - `seed`: seed of the weights, of the order of tiles and of the positives.
@@ -118,33 +118,6 @@ def learn_network(
       a function that changes grey levels.
     - `report(text, share)`: progress callback; `share` is the part done, 0 to 1.
     - `means`: options for speed.
-
-    Raises what `trained_network` raises.
-    """
-    return trained_network(
-        recipe,
-        tiles,
-        binary=binary,
-        seed=seed,
-        work=work,
-        positive=positive,
-        report=report,
-        means=means,
-    ).embedder
-
-
-def trained_network(
-    recipe: Recipe,
-    tiles: SheetTiles,
-    *,
-    binary: bool,
-    seed: int,
-    work: Path | None,
-    positive: Positive | Sequence[SheetTiles] | None = None,
-    report: Progress | None = None,
-    means: Means | None = None,
-) -> TrainedNetwork:
-    """The same with the encoder that was trained, on its device.
 
     Raises `ValueError` for a triplet network without `positive` or for impossible tiles,
     `TrainingError` if the loss is not finite, `OutputError` if `work` holds another training,

@@ -70,7 +70,7 @@ def learn_encoder(
     positive: Any = [each.tiles(tiles_px, progress) for each in other_dates]
     training = _training()
     device = None if learning.device == "auto" else learning.device
-    trained = training.trained_network(
+    trained = training.learn_network(
         recipe,
         tiles,
         binary=not pictures.is_grey,
