@@ -68,9 +68,10 @@ def _run(options: argparse.Namespace, command: str) -> int:
     """Run all rows that are wanted, several at a time; how many failed."""
     from experiments.paper import baselines
     from experiments.paper.estimate import lines
-    from experiments.paper.methods import GPU_SCENES, methods
+    from experiments.paper.methods import GPU_SCENES
     from experiments.paper.pool import cores, side_by_side
     from experiments.paper.runs import Workplace
+    from experiments.paper.scenes import render
     from experiments.paper.trajectories import SETTINGS, dry
 
     _require(options)
@@ -85,17 +86,7 @@ def _run(options: argparse.Namespace, command: str) -> int:
         options.keep_checkpoints,
     )
     wanted = set(options.only or (GPU_SCENES if options.setting == "gpu" else PARTS))
-    tasks: list[Any] = []
-    for scene in _scenes(options, setting, wanted):
-        tiles = scene.trajectory.tiles
-        rows = methods(place.setting, scene.name, tiles, options.sam, options.epochs)
-        chosen = [each for each in rows if not options.methods or each.family in options.methods]
-        if not scene.others:
-            chosen = [each for each in chosen if not each.needs_dates]
-        if scene.name not in wanted and scene.name == baselines.TRIED_ON:
-            chosen = [each for each in rows if each.key == baselines.MAP_OF]
-        tasks += [(place, scene, method) for method in chosen]
-        _say(f"{_minutes(start)}  {scene.name}: imagery is there, {len(chosen)} runs")
+    tasks = _tasks(options, place, wanted)
     # Those that learn longest first, so that no core is idle at the end.
     tasks.sort(key=lambda task: ORDER.index(task[2].family))
     based = [task for task in tasks if task[1].name == baselines.TRIED_ON]
@@ -104,6 +95,9 @@ def _run(options: argparse.Namespace, command: str) -> int:
     ahead = [task[1:] for task in tasks if not place.result(task[1], task[2].key).is_file()]
     for line in lines(ahead, jobs, options.out, on_gpu):
         _say(f"           {line}")
+    for scene in {task[1].name: task[1] for task in tasks}.values():
+        render(scene)
+        _say(f"{_minutes(start)}  {scene.name}: imagery is there")
     failed = 0
     for (_, scene, method), minutes in side_by_side(tasks, jobs):
         status = f"failed: {minutes!r}" if isinstance(minutes, Exception) else f"{minutes} min"
@@ -112,6 +106,25 @@ def _run(options: argparse.Namespace, command: str) -> int:
     if "baselines" in wanted and based and baselines.run(place, based[0][1]):
         _say(f"{_minutes(start)}  baselines")
     return failed
+
+
+def _tasks(options: argparse.Namespace, place: Any, wanted: set[str]) -> list[Any]:
+    """All rows of the chosen parts: workplace, scene and method."""
+    from experiments.paper import baselines
+    from experiments.paper.methods import methods
+
+    tasks: list[Any] = []
+    for scene in _scenes(options, place.setting, wanted):
+        tiles = scene.trajectory.tiles
+        rows = methods(place.setting, scene.name, tiles, options.sam, options.epochs)
+        chosen = [each for each in rows if not options.methods or each.family in options.methods]
+        if not scene.others:
+            chosen = [each for each in chosen if not each.needs_dates]
+        if scene.name not in wanted and scene.name == baselines.TRIED_ON:
+            chosen = [each for each in rows if each.key == baselines.MAP_OF]
+        tasks += [(place, scene, method) for method in chosen]
+        _say(f"           {scene.name}: {tiles:,} tiles, {len(chosen)} runs")
+    return tasks
 
 
 def _require(options: argparse.Namespace) -> None:

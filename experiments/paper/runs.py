@@ -162,14 +162,15 @@ def _sizes(opened: MapFile) -> dict[str, float]:
     """Megabytes of the map per km2, and of what it holds once: the encoder or vocabulary."""
     sheet = opened.manifest.sheets[0]
     embeddings = opened.array("sheet0/embeddings", np.float16, 2)
+    area_km2 = len(embeddings) * sheet.grid.stride_m**2 / 1e6
     once = sum(part.nbytes for name, part in opened.arrays.items() if name.startswith("embed/"))
     whole = opened.path.stat().st_size
     return {
         "tiles": len(embeddings),
         "dims": embeddings.shape[1],
-        "area_km2": sheet.area_km2,
+        "area_km2": area_km2,
         "encoder_mb": once / MB,
-        "mb_per_km2": (whole - once) / MB / sheet.area_km2,
+        "mb_per_km2": (whole - once) / MB / area_km2,
     }
 
 

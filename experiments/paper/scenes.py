@@ -79,7 +79,7 @@ class Scene:
 
 
 def generated(setting: Setting, name: str, folder: Path, gsd_m: float | None = None) -> Scene:
-    """A trajectory of Table 1 over a generated area (cached).
+    """A trajectory of Table 1 over an area that `render` generates.
 
     Of two dates, and a third where a triplet network is trained. `gsd_m`: another ground
     resolution; the scene is then named by it.
@@ -91,14 +91,22 @@ def generated(setting: Setting, name: str, folder: Path, gsd_m: float | None = N
         title = f"{name}-{gsd_m:g}m"
     east_m, north_m = trajectory.imagery_m
     place = folder / f"{name}-{east_m:.0f}x{north_m:.0f}m-{trajectory.gsd_m:g}m"
-    learns = setting.name != "reduced" or name in "".join(REDUCED_NETWORKS["triplet"].values())
+    reduced = "".join(REDUCED_NETWORKS["triplet"].values())
+    learns = setting.name == "full" or (setting.name == "reduced" and name in reduced)
     dates = DEFAULT_DATES if learns else DEFAULT_DATES[:2]
     paths = [place / f"{date.name}.tif" for date in dates]
-    if not all(path.is_file() for path in paths):
-        generate_area(
-            place, size_m=(east_m, north_m), gsd_m=trajectory.gsd_m, dates=dates, seed=SEED
-        )
     return Scene(title, paths[0], paths[1], trajectory, tuple(paths[2:]))
+
+
+def render(scene: Scene) -> None:
+    """Generate the imagery of a scene, unless it is there."""
+    paths = (scene.past, scene.present, *scene.others)
+    if all(path.is_file() for path in paths):
+        return
+    flown, names = scene.trajectory, [path.stem for path in paths]
+    dates = [date for date in DEFAULT_DATES if date.name in names]
+    folder = scene.past.parent
+    generate_area(folder, size_m=flown.imagery_m, gsd_m=flown.gsd_m, dates=dates, seed=SEED)
 
 
 def over(
