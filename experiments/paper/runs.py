@@ -200,6 +200,8 @@ def _placed(
     for name, grounds in seen.items():
         result["views"][name] = [locate(ground) for ground in grounds]
         result["chance"][name] = _chance(grounds, localizer.tiles.centres_en_m)
+    if not times_ms:
+        raise ValueError(f"no view of {scene.name} lies wholly on the imagery of the later date")
     result["view_ms"] = statistics.median(times_ms)
     if scene.name == SWEPT_ON and seen["grid"]:
         count = min(setting.swept, len(seen["grid"]))
