@@ -1,7 +1,7 @@
 # make demo    install into .venv and run the whole story on a generated area
 # make test    install and run the tests; `make test EXTRAS=test` without PyTorch and Ray, whose tests
 #              are then skipped by name
-# make lint    style, types, import layers
+# make lint    style, types, import layers; rows of the paper's tables that are older than their code
 # make bench   measure speed, memory and accuracy beside what a user would pick instead
 # make paper   the tables of the paper in the reduced setting, less than an hour
 # make docs    the documentation as a site in site/, to be opened without a server
@@ -33,6 +33,7 @@ lint: $(VENV)/.dev-installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/vulture
+	$(BIN)/python -m experiments.paper check
 
 format: $(VENV)/.dev-installed
 	$(BIN)/ruff check --fix .

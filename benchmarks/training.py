@@ -156,7 +156,7 @@ def _learn(
     seed: int,
     count: int = BATCH,
     tile_px: int = TILE_PX,
-    width: int = 320,
+    width: int = 512,
     dims: int = 1024,
     exported: bool = False,
 ) -> dict[str, Any]:

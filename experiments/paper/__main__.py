@@ -1,6 +1,8 @@
 """`python -m experiments.paper`: run the paper's experiments; `report`: tables and plots of them.
 
 Every run leaves one file under `paper_results/<setting>/` and is not run again while it is there.
+`keep` copies these files into the repository and makes `docs/paper-results.md` of what is there;
+`check` names rows that are older than the code they speak of, and rows without a stored result.
 """
 
 import argparse
@@ -8,12 +10,14 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-PARTS = ("A", "B", "C", "D", "real", "own", "baselines")
+PARTS = ("A", "B", "C", "D", "real", "untuned", "own", "baselines")
+WHAT = ("run", "report", "keep", "check")
+NETWORKS = ("triplet", "autoencoder")
 ORDER = ("triplet", "autoencoder", "gradient", "bovw")
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -24,43 +28,76 @@ def main(arguments: list[str]) -> int:
     for name in THREADS:  # NumPy's BLAS reads it once, in the processes started too
         os.environ.setdefault(name, "1")
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s: %(message)s")
+    if options.what in ("keep", "check"):
+        return _stored(options)
     from experiments.paper.tables import report
 
     failed = 0
     if options.what == "run":
-        failed = _run(options, " ".join(["python -m experiments.paper", *arguments]))
-    made = report(options.out, options.setting)
+        shown = [Path(each).name if "/" in each else each for each in arguments]
+        failed = _run(options, " ".join(["python -m experiments.paper", *shown]))
+    folder = f"dry-{options.setting}" if options.dry_run else options.setting
+    made = report(options.out, folder)
     if made is None:
-        _say(f"nothing to report: no results in {options.out / options.setting}")
+        _say(f"nothing to report: no results in {options.out / folder}")
         return 1
     print(made.read_text(encoding="utf-8"))
     _say(f"written to {made.parent}")
     return 1 if failed else 0
 
 
+def _stored(options: argparse.Namespace) -> int:
+    """Keep results, or check them; returns the exit code: 1 if the page is not of the rows."""
+    from experiments.paper import page as pages
+    from experiments.paper.stored import keep, stored
+
+    if options.what == "keep":
+        for name in keep(options.out, options.setting):
+            _say(f"stored: {name}")
+        pages.PAGE.write_text(pages.page(stored()), encoding="utf-8")
+    rows = stored()
+    for line in pages.state(rows):
+        print(line)
+    if pages.PAGE.read_text(encoding="utf-8") != pages.page(rows):
+        _say(f"not made of the stored rows: {pages.PAGE}; run python -m experiments.paper keep")
+        return 1
+    return 0
+
+
 def _run(options: argparse.Namespace, command: str) -> int:
     """Run all rows that are wanted, several at a time; how many failed."""
     from experiments.paper import baselines
-    from experiments.paper.methods import methods
+    from experiments.paper.estimate import lines
+    from experiments.paper.methods import GPU_SCENES
     from experiments.paper.pool import cores, side_by_side
     from experiments.paper.runs import Workplace
-    from experiments.paper.trajectories import SETTINGS
+    from experiments.paper.scenes import render
+    from experiments.paper.trajectories import SETTINGS, dry
 
+    _require(options)
     start = time.perf_counter()
-    place = Workplace(options.out, SETTINGS[options.setting], command)
-    wanted = set(options.only or PARTS)
-    tasks: list[Any] = []
-    for scene in _scenes(options, wanted):
-        rows = methods(place.setting, scene.name, scene.trajectory.tiles, options.sam)
-        chosen = [each for each in rows if not options.methods or each.family in options.methods]
-        if scene.name not in wanted and scene.name == baselines.TRIED_ON:
-            chosen = [each for each in rows if each.key == baselines.MAP_OF]
-        tasks += [(place, scene, method) for method in chosen]
-        _say(f"{_minutes(start)}  {scene.name}: imagery is there, {len(chosen)} runs")
+    setting = dry(SETTINGS[options.setting]) if options.dry_run else SETTINGS[options.setting]
+    place = Workplace(
+        options.out,
+        setting,
+        command,
+        options.device,
+        options.workers,
+        options.keep_checkpoints,
+    )
+    wanted = set(options.only or (GPU_SCENES if options.setting == "gpu" else PARTS))
+    tasks = _tasks(options, place, wanted)
     # Those that learn longest first, so that no core is idle at the end.
     tasks.sort(key=lambda task: ORDER.index(task[2].family))
     based = [task for task in tasks if task[1].name == baselines.TRIED_ON]
     jobs = options.jobs or (cores() if options.setting == "reduced" else 1)
+    on_gpu = _has_gpu(options, tasks)
+    ahead = [task[1:] for task in tasks if not place.result(task[1], task[2].key).is_file()]
+    for line in lines(ahead, jobs, options.out, on_gpu):
+        _say(f"           {line}")
+    for scene in {task[1].name: task[1] for task in tasks}.values():
+        render(scene)
+        _say(f"{_minutes(start)}  {scene.name}: imagery is there")
     failed = 0
     for (_, scene, method), minutes in side_by_side(tasks, jobs):
         status = f"failed: {minutes!r}" if isinstance(minutes, Exception) else f"{minutes} min"
@@ -71,32 +108,69 @@ def _run(options: argparse.Namespace, command: str) -> int:
     return failed
 
 
+def _tasks(options: argparse.Namespace, place: Any, wanted: set[str]) -> list[Any]:
+    """All rows of the chosen parts: workplace, scene and method."""
+    from experiments.paper import baselines
+    from experiments.paper.methods import methods
+
+    tasks: list[Any] = []
+    for scene in _scenes(options, place.setting, wanted):
+        tiles = scene.trajectory.tiles
+        rows = methods(place.setting, scene.name, tiles, options.sam, options.epochs)
+        chosen = [each for each in rows if not options.methods or each.family in options.methods]
+        if not scene.others:
+            chosen = [each for each in chosen if not each.needs_dates]
+        if scene.name not in wanted and scene.name == baselines.TRIED_ON:
+            chosen = [each for each in rows if each.key == baselines.MAP_OF]
+        tasks += [(place, scene, method) for method in chosen]
+        _say(f"           {scene.name}: {tiles:,} tiles, {len(chosen)} runs")
+    return tasks
+
+
+def _require(options: argparse.Namespace) -> None:
+    """Raise `MissingExtraError` naming all that the chosen rows need and that is not installed."""
+    from orthonav.extras import require
+
+    learnt = not options.methods or set(options.methods) != {"gradient"}
+    require("python -m experiments.paper", "geo", *(["train"] if learnt else []))
+
+
 def _minutes(start: float) -> str:
     return f"{(time.perf_counter() - start) / 60:5.1f} min"
 
 
-def _scenes(options: argparse.Namespace, wanted: set[str]) -> Iterator[Any]:
-    from experiments.paper import scenes
-    from experiments.paper.trajectories import SETTINGS
+def _has_gpu(options: argparse.Namespace, tasks: Sequence[Any]) -> bool:
+    """Whether networks are learnt on a GPU."""
+    if options.device == "cpu" or not any(task[2].family in NETWORKS for task in tasks):
+        return False
+    import torch
 
-    setting = SETTINGS[options.setting]
+    return torch.cuda.is_available()
+
+
+def _scenes(options: argparse.Namespace, setting: Any, wanted: set[str]) -> Iterator[Any]:
+    from experiments.paper import scenes
+
     for name in ("B", "D", "A", "C"):
         if name in wanted or (name == "B" and "baselines" in wanted):
-            yield scenes.generated(setting, name, options.out / "areas")
+            yield scenes.generated(setting, name, options.out / "areas", options.gsd_m)
     if "own" in wanted and options.past and options.present:
         name = f"own-{options.past.stem}-{options.present.stem}"
-        yield scenes.over(name, options.past, options.present, options.gsd_m)
-    if "real" in wanted:
-        found = list(scenes.real(options.data, setting))
+        yield scenes.over(name, options.past, options.present, options.gsd_m).of(setting)
+    sets = {"real": scenes.real(options.data, setting), "untuned": scenes.untuned(options.data)}
+    for name in (each for each in sets if each in wanted):
+        found = list(sets[name])
         if not found:
-            _say("real imagery skipped: the optional real imagery beside the checkout is absent")
-        yield from found
+            _say(f"{name} skipped: the optional real imagery beside the checkout is absent")
+        yield from (each.of(setting) for each in found)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m experiments.paper", description=__doc__)
-    parser.add_argument("what", nargs="?", choices=("run", "report"), default="run")
-    parser.add_argument("--setting", choices=("reduced", "full"), default="reduced")
+    parser.add_argument(
+        "what", nargs="?", choices=("run", "report", "keep", "check"), default="run"
+    )
+    parser.add_argument("--setting", choices=("reduced", "gpu", "full"), default="reduced")
     parser.add_argument("--only", nargs="+", choices=PARTS, help="only these parts")
     parser.add_argument(
         "--methods", nargs="+", metavar="NAME", help="gradient, bovw, autoencoder, triplet"
@@ -108,10 +182,38 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--jobs", type=int, help="runs at a time (default one per core; 1 in the full setting)"
     )
+    parser.add_argument(
+        "--dry-run", action="store_true", help="every step once, on two tiles of every scene"
+    )
+    parser.add_argument(
+        "--device",
+        default="auto",
+        choices=("auto", "cpu", "cuda"),
+        help="where networks are learnt (default auto: a GPU if there is one)",
+    )
+    parser.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="threads that make batches and read imagery (default up to 16 with a GPU, else 2)",
+    )
+    parser.add_argument(
+        "--keep-checkpoints",
+        action="store_true",
+        help="keep checkpoints of finished rows, so that epochs can be added",
+    )
+    parser.add_argument(
+        "--epochs",
+        type=int,
+        metavar="N",
+        help="epochs of networks; added to a training whose checkpoint was kept",
+    )
     parser.add_argument("--past", type=Path, help="an orthophoto of your own, for the map")
     parser.add_argument("--present", type=Path, help="the same ground at another date")
     parser.add_argument(
-        "--gsd-m", type=float, help="ground resolution for --past (default its own)"
+        "--gsd-m",
+        type=float,
+        help="ground resolution for --past (default its own), and of A to D, as further scenes",
     )
     parser.add_argument("--sam", metavar="PATH", help="weights of Segment Anything: adds its rows")
     return parser
@@ -122,4 +224,9 @@ def _say(text: str) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    from orthonav.errors import OrthonavError
+
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except OrthonavError as error:
+        sys.exit(f"error: {error}")

@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 
-from experiments.paper.trajectories import TABLE_1, Setting, epochs
+from experiments.paper.trajectories import LEARNABLE, TABLE_1, Setting, epochs
 
 GREY, CANNY, SEGMENTS, SAM = "gray", "canny", "segments", "sam"
 DEFAULT = "gradient"
+PER_TILE = "per=tile"
 
 
 @dataclass(frozen=True)
@@ -21,12 +22,37 @@ class Method:
     registration: bool = False
 
     @property
+    def needs_dates(self) -> bool:
+        """Whether it is only learnt from several dates: no positive is segmented by SAM."""
+        return self.family == "triplet" and self.edges.startswith(SAM)
+
+    @property
     def key(self) -> str:
         """Short name for files, unique within one setting."""
         words = self.recipe.partition("words=")[2].partition(",")[0]
         layer = "registration" if self.registration else ""
-        parts = (self.family, self.edges.partition(":")[0], words, layer)
+        singly = "tile" if PER_TILE in self.edges else ""
+        parts = (self.family, self.edges.partition(":")[0], singly, words, layer)
         return "-".join(part for part in parts if part)
+
+
+def tuned(family: str, recipe: str, scene: str) -> bool:
+    """Whether a row was tuned with imagery or views of its scene, or of the same generator.
+
+    docs/paper.md lists what was tuned on what. The default was chosen on generated landscapes, the
+    Szada pairs and NAIP; training of the reduced triplet network by its accuracy on B; the number
+    of words is chosen by its accuracy everywhere, as in the paper.
+    """
+    if family == "gradient":
+        return column(scene) in TABLE_1 or scene.startswith(("naip-", "szada-"))
+    return family == "bovw" or (
+        family == "triplet" and column(scene) == "B" and LEARNABLE in recipe
+    )
+
+
+def column(scene: str) -> str:
+    """Scene without its ground resolution: "B" for "B-0.75m", B at another one."""
+    return scene.partition("-")[0]
 
 
 REDUCED_NETWORKS = {
@@ -36,38 +62,55 @@ REDUCED_NETWORKS = {
 """Trajectories that the reduced setting trains a network on, by input."""
 
 
+GPU_SCENES = ("B", "D")
+"""Scenes of the setting "gpu": auto-encoder on Canny edges and grey levels."""
+
+
 def methods(
-    setting: Setting, scene: str, tiles: int, sam_weights: str | None = None
+    setting: Setting,
+    scene: str,
+    tiles: int,
+    sam_weights: str | None = None,
+    more_epochs: int | None = None,
 ) -> list[Method]:
     """All rows for a scene whose map has so many tiles, quick ones first.
 
+    `more_epochs`: epochs of all networks, instead of the setting's.
+
     The reduced setting learns fewer networks: `REDUCED_NETWORKS`, and over imagery that no
     trajectory of the paper is flown over the auto-encoder on Canny edges, the paper's best, and on
-    grey levels.
+    grey levels over NAIP and Szada.
     """
     shown, width = setting.encoder_tiles, setting.encoder_width
     encoder = (
         f"autoencoder:width={width},learning_rate={setting.encoder_rate:g},"
-        f"epochs={epochs(tiles, shown)}"
+        f"epochs={more_epochs or epochs(tiles, shown)}"
     )
     triplet = (
         f"triplet:width={setting.triplet_width},batch={setting.triplet_batch},"
-        f"epochs={epochs(tiles, setting.triplet_tiles)}{setting.triplet_more}"
+        f"epochs={more_epochs or epochs(tiles, setting.triplet_tiles)}{setting.triplet_more}"
     )
     looked_at = [CANNY, GREY, SEGMENTS]
     if sam_weights:
         looked_at.append(f"{SAM}:weights={sam_weights}")
+        if setting.name != "reduced":  # a row of the reduced setting would take days on a CPU
+            looked_at.append(f"{SAM}:{PER_TILE},weights={sam_weights}")
     rows = [Method(DEFAULT, DEFAULT, DEFAULT)]
     rows += [Method("bovw", f"bovw:words={words}", GREY) for words in setting.words]
     networks = [Method("autoencoder", encoder, edges) for edges in looked_at]
     networks += [Method("triplet", triplet, edges) for edges in looked_at]
+    ours = Method(DEFAULT, DEFAULT, DEFAULT, True)
+    if setting.name == "gpu":
+        return [rows[0], *(each for each in networks[:2] if column(scene) in GPU_SCENES), ours]
     rows += [each for each in networks if setting.name != "reduced" or _reduced(each, scene)]
-    return [*rows, Method(DEFAULT, DEFAULT, DEFAULT, True)]
+    return [*rows, ours]
 
 
 def _reduced(method: Method, scene: str) -> bool:
     """Whether the reduced setting learns this network here."""
     edges = method.edges.partition(":")[0]
-    if scene not in TABLE_1:
-        return method.family == "autoencoder" and edges in (CANNY, GREY)
-    return scene in REDUCED_NETWORKS[method.family].get(edges, "")
+    name = column(scene)
+    if name not in TABLE_1:
+        wanted = (CANNY, GREY) if scene.startswith(("naip-", "szada-")) else (CANNY,)
+        return method.family == "autoencoder" and edges in wanted
+    return name in REDUCED_NETWORKS[method.family].get(edges, "")

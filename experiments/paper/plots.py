@@ -14,7 +14,13 @@ from experiments.paper.published import LOWE
 from experiments.paper.results import Result, confident, share
 from experiments.paper.tables import EDGES, FAMILIES
 
-COLOURS = {"gray": "tab:gray", "canny": "tab:blue", "segments": "tab:orange", "sam": "tab:red"}
+COLOURS = {
+    "gray": "tab:gray",
+    "canny": "tab:blue",
+    "segments": "tab:orange",
+    "sam": "tab:red",
+    "sam-tile": "tab:pink",
+}
 OTHER = "tab:green"
 SWEPT = (("autoencoder", "Auto-Encoder"), ("triplet", "Triplet"), ("gradient", "orthonav"))
 STEPS = (("heading_deg", "heading error, deg"), ("drop_m", "height below the reported one, m"))

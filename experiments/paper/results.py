@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments.paper.methods import PER_TILE
+
 ACCURACY_M = 15.0
 NEAREST_STRIDES = math.sqrt(0.5)
 """A position names the correct tile if it is within half a tile spacing on each axis."""
@@ -37,7 +39,8 @@ class Result:
     @property
     def edges(self) -> str:
         """Input of the method, for tables."""
-        return str(self.plain["method"]["edges"]).partition(":")[0]
+        edges = str(self.plain["method"]["edges"])
+        return edges.partition(":")[0] + ("-tile" if PER_TILE in edges else "")
 
     @property
     def registration(self) -> bool:
@@ -81,10 +84,10 @@ def numbers(values: Sequence[float | None], missing: float) -> Array:
     return np.array([missing if value is None else value for value in values], np.float64)
 
 
-def share(errors_m: Sequence[float | None]) -> float:
-    """Share of errors within 15 m."""
-    errors = numbers(errors_m, math.inf)
-    return float((errors <= ACCURACY_M).mean()) if errors.size else math.nan
+def share(counted: Sequence[int]) -> float:
+    """Share of views within 15 m: number of them, and of all."""
+    hits, count = counted
+    return hits / count if count else math.nan
 
 
 def confident(right: NDArray[np.bool_], ratio: Array, threshold: float) -> tuple[float, float]:

@@ -6,9 +6,10 @@ not run again.
 
 import hashlib
 import json
+import re
 import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,12 @@ import numpy as np
 from benchmarks.record import provenance
 from numpy.typing import NDArray
 
-from experiments.paper import views
+from experiments.paper import published, views
 from experiments.paper.methods import Method
+from experiments.paper.results import ACCURACY_M
 from experiments.paper.rules import compared
 from experiments.paper.scenes import Scene
+from experiments.paper.stored import code_of, compact
 from experiments.paper.trajectories import TILE_PX, Setting
 from orthonav.files import write_text
 from orthonav.localizer import Localizer
@@ -28,7 +31,6 @@ from orthonav.mapfile import MapFile, open_map
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import Fix, View
 
-ACCURACY_M = 15.0
 SWEPT_ON = "B"
 HEADINGS_DEG = (0, 1, 2, 3, 5, 7, 10, 15)
 DROPS_M = (0, 25, 50, 75, 100, 150, 200)
@@ -39,16 +41,23 @@ MB = 1e6
 
 @dataclass(frozen=True)
 class Workplace:
-    """Folders of results, maps and generated areas, and the options of the run."""
+    """Folders of results, maps and generated areas, and the options of the run.
+
+    `device`, `workers`: as of `BuildRequest`. `keep_checkpoints`: also when a row is done, so that
+    epochs can be added.
+    """
 
     out: Path
     setting: Setting
     command: str
+    device: str = "auto"
+    workers: int | None = None
+    keep_checkpoints: bool = False
 
     @property
     def results(self) -> Path:
         """Folder of the result files."""
-        return self.out / self.setting.name
+        return self.out / self.setting.folder
 
     def result(self, scene: Scene, key: str) -> Path:
         """The file that a run leaves."""
@@ -56,17 +65,19 @@ class Workplace:
 
     def work(self, scene: Scene, key: str) -> Path:
         """Folder of checkpoints, and of the map."""
-        return self.out / "work" / self.setting.name / f"{scene.name}-{key}"
+        return self.out / "work" / self.setting.folder / f"{scene.name}-{key}"
 
 
 def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
-    """Result of a run, after building, locating and writing; earlier results are reused."""
+    """Result of a run, after building, locating and writing; one of the same recipe is reused."""
     out = place.result(scene, method.key)
     if out.is_file():
         found: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
-        return found
+        if found["method"]["recipe"] == method.recipe:
+            return found
     start, before = time.perf_counter(), provenance("paper")
-    opened, built = _map(scene, method, place.work(scene, method.key))
+    work = place.work(scene, method.key)
+    opened, built = _map(place, scene, method, work)
     localizer = Localizer(
         opened,
         registration=method.registration,
@@ -74,11 +85,15 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
         flying=False,
     )
     made = head(place, scene, before)
-    made |= {"method": asdict(method), **built, **_sizes(opened)}
+    # Where weights lie is no part of a result.
+    edges = re.sub("[:,]weights=[^,]*", "", method.edges)
+    made |= {"method": asdict(method) | {"edges": edges}, **built, **_sizes(opened)}
     made |= _placed(scene, localizer, place.setting, method.registration)
     made["rules"] = {} if method.registration else _rules(scene, opened, place.setting)
-    save(out, made, start)
-    return made
+    written = save(out, made | {"code": code_of(method, scene.name)}, start)
+    if not place.keep_checkpoints:
+        (work / "checkpoint.pt").unlink(missing_ok=True)
+    return written
 
 
 def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, Any]:
@@ -89,19 +104,28 @@ def head(place: Workplace, scene: Scene, started: dict[str, Any]) -> dict[str, A
         "setting": asdict(place.setting),
         "command": place.command,
         "seeds": {"views": views.SEED, "build": 0},
-        "inputs": {path.name: _digest(path) for path in (scene.past, scene.present)},
+        "inputs": {path.name: _digest(path) for path in _imagery(scene)},
         "provenance": started,
     }
 
 
-def save(out: Path, made: dict[str, Any], start: float) -> None:
-    """Write a result, whole or not at all, with the minutes since `start`."""
+def _imagery(scene: Scene) -> tuple[Path, ...]:
+    return scene.past, scene.present, *scene.others
+
+
+def save(out: Path, made: dict[str, Any], start: float) -> dict[str, Any]:
+    """The result as written, whole or not at all, with the minutes since `start`."""
     made["minutes"] = round((time.perf_counter() - start) / 60, 2)
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_text(out, json.dumps(made, indent=1) + "\n")
+    text = compact(made)
+    write_text(out, text)
+    written: dict[str, Any] = json.loads(text)
+    return written
 
 
-def _map(scene: Scene, method: Method, work: Path) -> tuple[MapFile, dict[str, float]]:
+def _map(
+    place: Workplace, scene: Scene, method: Method, work: Path
+) -> tuple[MapFile, dict[str, float]]:
     """The map by `build_map`, and the seconds it took; `learn_s` includes embedding the tiles."""
     work.mkdir(parents=True, exist_ok=True)
     marks: dict[float, float] = {}
@@ -121,7 +145,10 @@ def _map(scene: Scene, method: Method, work: Path) -> tuple[MapFile, dict[str, f
             method=method.recipe,
             edges=method.edges,
             registration=method.registration,
+            other_dates=scene.others if method.family == "triplet" else (),
             work=work,
+            workers=place.workers,
+            device=place.device,
         )
 
     start = time.perf_counter()
@@ -135,14 +162,15 @@ def _sizes(opened: MapFile) -> dict[str, float]:
     """Megabytes of the map per km2, and of what it holds once: the encoder or vocabulary."""
     sheet = opened.manifest.sheets[0]
     embeddings = opened.array("sheet0/embeddings", np.float16, 2)
+    area_km2 = len(embeddings) * sheet.grid.stride_m**2 / 1e6
     once = sum(part.nbytes for name, part in opened.arrays.items() if name.startswith("embed/"))
     whole = opened.path.stat().st_size
     return {
         "tiles": len(embeddings),
         "dims": embeddings.shape[1],
-        "area_km2": sheet.area_km2,
+        "area_km2": area_km2,
         "encoder_mb": once / MB,
-        "mb_per_km2": (whole - once) / MB / sheet.area_km2,
+        "mb_per_km2": (whole - once) / MB / area_km2,
     }
 
 
@@ -172,24 +200,32 @@ def _placed(
     for name, grounds in seen.items():
         result["views"][name] = [locate(ground) for ground in grounds]
         result["chance"][name] = _chance(grounds, localizer.tiles.centres_en_m)
+    if not times_ms:
+        raise ValueError(f"no view of {scene.name} lies wholly on the imagery of the later date")
     result["view_ms"] = statistics.median(times_ms)
-    if scene.name == SWEPT_ON:
+    if scene.name == SWEPT_ON and seen["grid"]:
         count = min(setting.swept, len(seen["grid"]))
         few = [seen["grid"][at] for at in np.linspace(0, len(seen["grid"]) - 1, count, dtype=int)]
-        turned = {v: [locate(each, turned_deg=v)[0] for each in few] for v in HEADINGS_DEG}
-        lower = {v: [locate(each, drop_m=v)[0] for each in few] for v in DROPS_M}
+        turned = {v: _hits(locate(each, turned_deg=v)[0] for each in few) for v in HEADINGS_DEG}
+        lower = {v: _hits(locate(each, drop_m=v)[0] for each in few) for v in DROPS_M}
         result["sweep"] = {"heading_deg": turned, "drop_m": lower}
-    plain: dict[str, Any] = _without_nan(result)
-    return plain
+    return result
 
 
 def placements(
     scene: Scene, localizer: Localizer, count: int
 ) -> Iterator[tuple[str, list[views.Ground]]]:
-    """Views on the grid and anywhere, at the same places but for where they are snapped to."""
+    """Views along the route, on the grid and anywhere.
+
+    The last two are at the same places but for where they are snapped to.
+    """
     centres = localizer.tiles.centres_en_m
     anywhere = views.places_en_m(centres, count)
-    places = {"grid": views.on_grid(anywhere, centres), "anywhere": anywhere}
+    places = {
+        "route": views.along_route(centres, published.views(scene.name)),
+        "grid": views.on_grid(anywhere, centres),
+        "anywhere": anywhere,
+    }
     for name in views.PLACEMENTS:
         yield name, views.grounds(scene, localizer.sheet.frame, localizer.grid, places[name])
 
@@ -211,22 +247,22 @@ def _rules(scene: Scene, opened: MapFile, setting: Setting) -> dict[str, Any]:
     camera, telemetry = views.camera_of(agl_m, gsd_m), views.telemetry_at(agl_m)
     made: dict[str, Any] = {}
     for name, grounds in placements(scene, localizer, setting.views):
+        if name == "route":
+            continue
         seen = [
             View(views.view_of(ground, camera, agl_m, gsd_m), camera, telemetry)
             for ground in grounds
         ]
         truths = [ground.truth_en_m for ground in grounds]
-        made[name] = compared(localizer, opened, seen, truths)
+        errors = compared(localizer, opened, seen, truths)
+        made[name] = {rule: _hits(errors_m) for rule, errors_m in errors.items()}
     return made
 
 
-def _without_nan(value: Any) -> Any:
-    """The same with None for numbers that are none: JSON has no NaN."""
-    if isinstance(value, dict):
-        return {str(key): _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+def _hits(errors_m: Iterable[float]) -> list[int]:
+    """Number of errors within 15 m, and of all."""
+    within = [error <= ACCURACY_M for error in errors_m]
+    return [sum(within), len(within)]
 
 
 def _digest(path: Path) -> str:

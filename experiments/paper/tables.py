@@ -7,9 +7,13 @@ from pathlib import Path
 from benchmarks.record import Table, number
 
 from experiments.paper import published
+from experiments.paper.methods import column, tuned
 from experiments.paper.results import Result, accepted_at, ceiling, confident, read, share
+from experiments.paper.stored import name_of
+from experiments.paper.views import PLACEMENTS
 from orthonav.records import CONFIDENT
 
+TUNED = "*: tuned on this scene or on imagery of the same generator (docs/paper.md)"
 FAMILIES = {
     "bovw": "Bag of Words",
     "triplet": "Triplet",
@@ -20,7 +24,8 @@ EDGES = {
     "gray": "grey",
     "canny": "Canny",
     "segments": "segments",
-    "sam": "Segment Anything",
+    "sam": "Segment Anything, sheet",
+    "sam-tile": "Segment Anything, tile",
     "gradient": "gradients",
 }
 
@@ -32,45 +37,57 @@ def report(out: Path, setting: str) -> Path | None:
     if not results:
         return None
     made = [r for r in results if r.family]
-    tables = [
-        *table_2(made),
-        *table_3(made),
-        *choice(made),
-        *rules(made),
-        *baselines(results, made),
-        *costs(made),
-        run_table(results),
-    ]
     try:
         from experiments.paper.plots import draw
     except ImportError:
         notes = ["Plots need matplotlib: pip install 'orthonav[report]'"]
     else:
         notes = [f"![{path.stem}]({path.name})" for path in draw(made, folder)]
-    text = "\n".join([*(table.markdown() for table in tables), *notes, ""])
+    text = "\n".join([*(table.markdown() for table in tables(results)), *notes, ""])
     path = folder / "tables.md"
     path.write_text(text, encoding="utf-8")
     return path
 
 
+def tables(results: Sequence[Result]) -> list[Table]:
+    """All tables of results of one setting."""
+    made = [each for each in results if each.family]
+    return [
+        *table_2(made),
+        *orders(made),
+        *table_3(made),
+        *choice(made),
+        *rules(made),
+        *sensitivity(made),
+        *resolutions(made),
+        *baselines(results, made),
+        *costs(made),
+        row_table(results),
+    ]
+
+
 def table_2(results: Sequence[Result]) -> list[Table]:
     """Accuracy at 15 m by method and scene, views on the grid and anywhere."""
-    header = ("method", "input", "paper", "on grid", "anywhere", "right tile", "of")
-    tables = []
+    header = ("method", "input", "paper", "route", "on grid", "anywhere", "right tile", "of")
+    made = []
     for scene, found in _by_scene(results):
         rows = [_table_2_row(each) for each in _best_words(found)]
         chance = found[0].plain["chance"]
-        guessed = (percent(chance.get(name)) for name in ("grid", "anywhere"))
+        guessed = (percent(chance.get(name)) for name in PLACEMENTS)
         rows.append(["a guess", "", "-", *guessed, "", ""])
-        tables.append(Table(f"Table 2, {scene}: accuracy at 15 m, %", header, rows, _area(found)))
-    return tables
+        made.append(Table(f"Table 2, {scene}: accuracy at 15 m, %", header, rows, _area(found)))
+    return made
 
 
 def _table_2_row(each: Result) -> list[str]:
-    placed = [each.accuracy("grid"), each.accuracy("anywhere"), each.right_tile("anywhere")]
-    views = len(each.plain["views"]["anywhere"])
-    paper = "-" if each.registration else published.accuracy(each.family, each.edges, each.scene)
-    return [_name(each), EDGES[each.edges], paper, *map(percent, placed), str(views)]
+    placed = [*(each.accuracy(name) for name in PLACEMENTS), each.right_tile("anywhere")]
+    views = " / ".join(str(len(each.plain["views"][name])) for name in PLACEMENTS)
+    paper = (
+        "-"
+        if each.registration
+        else published.accuracy(each.family, each.edges, column(each.scene))
+    )
+    return [_name(each), EDGES[each.edges], paper, *map(percent, placed), views]
 
 
 def _area(found: Sequence[Result]) -> list[str]:
@@ -81,7 +98,9 @@ def _area(found: Sequence[Result]) -> list[str]:
         f"{flown['length_m']:g} x {flown['band_m']:g} m from {flown['agl_m']:g} m, "
         f"{flown['gsd_m']:g} m per pixel, {tiles:,} tiles {first.stride_m:g} m apart; one who "
         f"always named the right tile would have {percent(bound)} % at 15 m anywhere",
-        "right tile: of views anywhere, within half a tile spacing (along the diagonal)",
+        "route: one view per tile step along it; right tile: of views anywhere, within half a tile "
+        "spacing (along the diagonal); of: number of views of each kind",
+        TUNED,
     ]
 
 
@@ -95,6 +114,35 @@ def _best_words(found: Sequence[Result]) -> list[Result]:
     return sorted(
         shown, key=lambda r: (order.index(r.family), r.registration, edges.index(r.edges))
     )
+
+
+def orders(results: Sequence[Result]) -> list[Table]:
+    """Each comparison of the paper's Table 2 beside the same one here."""
+    rows = []
+    for scene, found in _by_scene(results):
+        best = {(each.family, each.edges): each for each in _best_words(found)}
+        for one, other in published.COMPARED:
+            if scene in published.TRAJECTORIES and one in best and other in best:
+                rows.append(_order_row(scene, best[one], best[other]))
+    header = ("trajectory", "first", "second", "paper", "here", "same order")
+    notes = (
+        "accuracy at 15 m in %, first : second; here: views along the route; equal: the shares "
+        "differ by less than two standard errors of their difference",
+    )
+    return [Table("Order of the paper's methods", header, rows, notes)] if rows else []
+
+
+def _order_row(scene: str, one: Result, other: Result) -> list[str]:
+    said = [float(published.accuracy(each.family, each.edges, scene)) for each in (one, other)]
+    found = [each.accuracy("route") for each in (one, other)]
+    counts = [len(each.plain["views"]["route"]) for each in (one, other)]
+    spread = math.sqrt(sum(p * (1 - p) / n for p, n in zip(found, counts, strict=True)))
+    same = "yes" if (said[0] > said[1]) == (found[0] > found[1]) else "no"
+    if abs(found[0] - found[1]) <= 2 * spread:
+        same = "equal"
+    names = [f"{_name(each)}, {EDGES[each.edges]}" for each in (one, other)]
+    pairs = (f"{said[0]:.1f} : {said[1]:.1f}", f"{percent(found[0])} : {percent(found[1])}")
+    return [scene, *names, *pairs, same]
 
 
 def table_3(results: Sequence[Result]) -> list[Table]:
@@ -140,7 +188,7 @@ def choice(results: Sequence[Result]) -> list[Table]:
     rows = []
     for scene, found in _by_scene(results):
         shown = [e for e in found if e.family == "gradient" or _is_papers_best(e)]
-        if scene not in published.TRAJECTORIES and len(shown) > 1:
+        if column(scene) not in published.TRAJECTORIES and len(shown) > 1:
             rows += [_choice_row(scene, each) for each in shown]
     if not rows:
         return []
@@ -151,6 +199,7 @@ def choice(results: Sequence[Result]) -> list[Table]:
     notes = (
         "accuracy at 15 m in %; right tile: of views anywhere; correct / accepted: of views on "
         "the grid, by the criterion; ms: one view, one core, from its picture to the fix",
+        TUNED,
     )
     return [Table("The paper's best and orthonav on other imagery", header, rows, notes)]
 
@@ -199,7 +248,7 @@ def baselines(results: Sequence[Result], made: Sequence[Result]) -> list[Table]:
     for each in results:
         for name, result in each.plain.get("baselines", {}).items():
             shares = [share(result["views"][placement]) for placement in ("grid", "anywhere")]
-            count = len(result["views"]["anywhere"])
+            count = result["views"]["anywhere"][1]
             rows.append(
                 [each.scene, name, *map(percent, shares), str(count), number(result["view_ms"])]
             )
@@ -235,29 +284,54 @@ def costs(results: Sequence[Result]) -> list[Table]:
     return [Table("What it costs", header, rows, notes)]
 
 
-def run_table(results: Sequence[Result]) -> Table:
-    """Commit, versions and minutes of the runs that these tables are made of."""
-    found = {
-        (
-            str(each.plain["provenance"]["commit"])[:10],
-            "yes" if each.plain["provenance"]["dirty"] else "no",
-            str(each.plain["provenance"]["sources"]),
-            str(each.plain["setting"]["name"]),
-        )
-        for each in results
-    }
+def sensitivity(results: Sequence[Result]) -> list[Table]:
+    """Accuracy at each error of heading and height, on the trajectory that the paper sweeps."""
+    made = []
+    for step, title in (("heading_deg", "heading error, deg"), ("drop_m", "height lower by, m")):
+        swept = [each for each in _best_words(results) if each.plain.get("sweep")]
+        if swept:
+            values = list(swept[0].plain["sweep"][step])
+            count = swept[0].plain["sweep"][step][values[0]][1]
+            rows = [
+                [
+                    f"{_name(each)}, {EDGES[each.edges]}",
+                    *(percent(share(each.plain["sweep"][step][value])) for value in values),
+                ]
+                for each in swept
+            ]
+            notes = (f"{count} views on the grid of {swept[0].scene}",)
+            header = ("method", *values)
+            made.append(Table(f"Accuracy at 15 m, %, by {title}", header, rows, notes))
+    return made
+
+
+def resolutions(results: Sequence[Result]) -> list[Table]:
+    """Accuracy anywhere by ground resolution, where a trajectory was run at several."""
     rows = []
-    for key in sorted(found):
-        mine = [
-            each
-            for each in results
-            if str(each.plain["provenance"]["commit"])[:10] == key[0]
-            and str(each.plain["provenance"]["sources"]) == key[2]
-        ]
-        minutes = sum(each.plain["minutes"] for each in mine)
-        rows.append([*key, str(len(mine)), number(minutes), mine[0].plain["provenance"]["cpu"]])
-    header = ("commit", "changed", "sources", "setting", "runs", "minutes", "processor")
-    return Table("Runs", header, rows)
+    for scene in sorted({each.scene for each in results if column(each.scene) != each.scene}):
+        if column(scene) not in published.TRAJECTORIES:
+            continue
+        for each in _best_words([e for e in results if e.scene in (scene, column(scene))]):
+            shares = [ceiling(each.stride_m), each.accuracy("anywhere")]
+            gsd_m = f"{each.plain['trajectory']['gsd_m']:g}"
+            cells = [_name(each), EDGES[each.edges], gsd_m, f"{each.stride_m:g}"]
+            rows.append([column(scene), *cells, *map(percent, shares)])
+    header = ("trajectory", "method", "input", "m per pixel", "tile step m", "possible", "anywhere")
+    return [Table("Accuracy anywhere by ground resolution, %", header, rows)] if rows else []
+
+
+def row_table(results: Sequence[Result]) -> Table:
+    """Commit, day, minutes and machine of every row."""
+    rows = []
+    for each in sorted(results, key=name_of):
+        made = each.plain["provenance"]
+        changed = "yes" if made["dirty"] else "no"
+        about = [str(made["commit"])[:10], changed, str(made["date"])[:10]]
+        mark = "yes" if each.family and is_tuned(each) else "no"
+        cost = [number(each.plain["minutes"]), str(made["cpu"])]
+        rows.append([name_of(each), mark, *about, *cost])
+    header = ("row", "tuned on it", "commit", "files not committed", "date", "minutes", "processor")
+    return Table("Rows", header, rows)
 
 
 def percent(value: float | None) -> str:
@@ -266,6 +340,16 @@ def percent(value: float | None) -> str:
 
 
 def _name(each: Result) -> str:
+    """Name of the method, with a star if it was tuned on its scene."""
+    return _plain_name(each) + ("*" if is_tuned(each) else "")
+
+
+def is_tuned(each: Result) -> bool:
+    """Whether a row was tuned on its scene."""
+    return tuned(each.family, each.plain["method"]["recipe"], each.scene)
+
+
+def _plain_name(each: Result) -> str:
     name = FAMILIES[each.family]
     if each.family == "bovw":
         return f"{name}, k = {each.plain['dims']}"

@@ -53,6 +53,9 @@ class Trajectory:
 
 
 TABLE_1 = {name: Trajectory(*astuple(column)) for name, column in presets.TABLE_1.items()}
+IMPLIED_GSD_M = {"B": 0.75, "C": 1.5, "D": 0.75}
+"""Ground resolution that the paper's numbers of views imply: 12 km in 500 tile steps of 32 px, and
+2 km in 84; C, from twice the height, in proportion. A: 0.19 m, but landscapes end at 0.2 m."""
 REDUCED_M = {"A": (150, 1), "B": (3000, 300), "C": (5000, 1000), "D": (1000, 1000)}
 """Length and search band of the reduced setting."""
 
@@ -61,8 +64,8 @@ REDUCED_M = {"A": (150, 1), "B": (3000, 300), "C": (5000, 1000), "D": (1000, 100
 class Setting:
     """Size of the experiments.
 
-    - `name`: "reduced" or "full".
-    - `encoder_width`, `triplet_width`: widths of the networks, 320 and 64 in the paper.
+    - `name`: "reduced", "full", or "gpu": the full auto-encoder on B and D.
+    - `encoder_width`, `triplet_width`: widths of the networks, 512 and 64 in the paper.
     - `encoder_rate`: learning rate of the auto-encoder: 3e-4 in the paper; 1e-3, as in the authors'
       released code, if there are few steps.
     - `encoder_tiles`, `triplet_tiles`: tiles shown in training; None: the paper's 200 epochs.
@@ -72,6 +75,7 @@ class Setting:
     - `words`: sizes of the vocabularies.
     - `views`: views per placement.
     - `swept`: views per step of the sensitivity.
+    - `dry`: two tiles of every scene and one epoch, to try every step.
     """
 
     name: str
@@ -85,21 +89,43 @@ class Setting:
     words: tuple[int, ...]
     views: int
     swept: int
+    dry: bool = False
+
+    @property
+    def folder(self) -> str:
+        """Name of the folder of its results."""
+        return f"dry-{self.name}" if self.dry else self.name
 
     def trajectory(self, name: str) -> Trajectory:
         """A trajectory of Table 1, cut to what this setting runs."""
         whole = TABLE_1[name]
+        if self.dry:
+            return two_tiles(whole)
         if self.name == "reduced":
             length_m, band_m = REDUCED_M[name]
             return replace(whole, length_m=length_m, band_m=band_m)
-        return replace(whole, length_m=min(whole.length_m, LARGEST_M))
+        gsd_m = IMPLIED_GSD_M.get(name, whole.gsd_m)
+        return replace(whole, length_m=min(whole.length_m, LARGEST_M), gsd_m=gsd_m)
 
 
 LEARNABLE = ",mining=semihard,similarity=cosine,margin=0.2"
 REDUCED = Setting("reduced", 32, 1e-3, 19_200, 8, 28_800, 64, LEARNABLE, (256, 1024), 100, 40)
-FULL = Setting("full", 320, 3e-4, None, 64, None, 512, "", (256, 1000, 3000, 10_000), 300, 300)
-SETTINGS = {each.name: each for each in (REDUCED, FULL)}
+FULL = Setting("full", 512, 3e-4, None, 64, None, 512, "", (256, 1000, 3000, 10_000), 300, 300)
+GPU = replace(FULL, name="gpu")
+SETTINGS = {each.name: each for each in (REDUCED, GPU, FULL)}
 PAPER_EPOCHS = 200
+
+
+def dry(setting: Setting) -> Setting:
+    """The same networks on two tiles of every scene, for one epoch, with two views."""
+    once = replace(setting, dry=True, encoder_tiles=1, triplet_tiles=1)
+    return replace(once, words=(256,), views=2, swept=1)
+
+
+def two_tiles(flown: Trajectory) -> Trajectory:
+    """The first two tiles of a trajectory, about."""
+    stride_m = flown.stride_m
+    return replace(flown, length_m=1.5 * stride_m, band_m=min(flown.band_m, stride_m / 2))
 
 
 def epochs(tiles: int, shown: int | None) -> int:

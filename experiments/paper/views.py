@@ -1,7 +1,8 @@
 """The paper's section Dataset: UAV views along the trajectory, cut from imagery of another date.
 
-Its figures at 15 m on tiles 32 px apart can only be had where views lie on the tile grid. So every
-figure here comes twice: for views *on the grid*, and *anywhere* between the tiles.
+The paper's numbers of views are those of tile steps along its trajectories, and its figures at 15 m
+can only be had where views lie on the tile grid. So every figure here comes for views *along the
+route*, one per tile step, for views *on the grid* all over the search band, and *anywhere*.
 """
 
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from orthonav.records import Telemetry
 from orthonav.simulate.render import ViewEffects, render_view
 
 SEED = 7
-PLACEMENTS = ("grid", "anywhere")
+PLACEMENTS = ("route", "grid", "anywhere")
 NO_EFFECTS = ViewEffects(exposure_std=0.0, blur_px=0.0, noise_std=0.0, jpeg_quality=100)
 HEADING_TOLD_DEG = 0.001
 """With this deviation only the reported heading is tried."""
@@ -49,6 +50,16 @@ def on_grid(places: Array, centres_en_m: NDArray[np.floating[Any]]) -> Array:
     away = places[:, None] - centres_en_m[None].astype(np.float64)
     nearest = (away**2).sum(axis=2).argmin(axis=1)
     return np.asarray(centres_en_m[nearest], dtype=np.float64)
+
+
+def along_route(centres_en_m: NDArray[np.floating[Any]], most: int) -> Array:
+    """Tile centres (N, 2) of the line along the middle of the search band, evenly thinned."""
+    lines = np.unique(centres_en_m[:, 1])
+    line = lines[np.abs(lines - (lines[0] + lines[-1]) / 2).argmin()]
+    places = centres_en_m[centres_en_m[:, 1] == line].astype(np.float64)
+    places = places[np.argsort(places[:, 0])]
+    chosen = np.linspace(0, len(places) - 1, min(most, len(places))).round().astype(int)
+    return np.asarray(places[chosen])
 
 
 def grounds(scene: Scene, frame: LocalFrame, grid: TileGrid, places: Array) -> list[Ground]:

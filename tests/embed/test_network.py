@@ -7,8 +7,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from orthonav.embed import TABLE
 from orthonav.embed.network import AutoEncoderRecipe, NetworkEmbedder, TripletRecipe
+from orthonav.embed.stored import embedder_of
 from orthonav.errors import MapFileError, MissingExtraError, VariantError
+from orthonav.variants import variant_recipe
 
 onnx = pytest.importorskip("onnx", reason="making graphs needs ONNX")
 pytest.importorskip("onnxruntime", reason="neural encoders need onnxruntime")
@@ -267,3 +270,11 @@ def test_defaults_are_the_papers():
     assert (triplet.dims, triplet.epochs, triplet.batch) == (1024, 200, 512)
     assert (triplet.learning_rate, triplet.mining) == (1e-3, "hardest")
     assert auto.similarity == triplet.similarity == "product"
+
+
+def test_an_encoder_of_other_layers_than_todays_stays_readable():
+    """Older maps name width 320; what flies is the graph that the map carries."""
+    plain = variant_recipe(TABLE, AutoEncoderRecipe(dims=DIMS)) | {"width": 320}
+    made = embedder_of(plain, lambda *_: embedder().onnx, 2)
+    assert made.recipe == AutoEncoderRecipe(dims=DIMS, width=320)
+    np.testing.assert_array_equal(made.views(maps(2)), embedder().views(maps(2)))

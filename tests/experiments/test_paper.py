@@ -1,16 +1,19 @@
 """The paper's experiments: geometry of trajectories, views, tables, resuming. No figure of it."""
 
 import json
+import logging
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from experiments.paper import published, runs, scenes, views
-from experiments.paper.methods import Method, methods
+from experiments.paper import pool, published, runs, scenes, views
+from experiments.paper.__main__ import main
+from experiments.paper.estimate import lines, parameters, steps
+from experiments.paper.methods import Method, methods, tuned
 from experiments.paper.pool import side_by_side
 from experiments.paper.results import accepted_at, ceiling, confident, read
 from experiments.paper.tables import report
-from experiments.paper.trajectories import FULL, REDUCED, TABLE_1, epochs
+from experiments.paper.trajectories import FULL, GPU, REDUCED, TABLE_1, dry, epochs
 
 from orthonav.errors import AreaError, MissingFileError
 from orthonav.geo.area import Area
@@ -139,6 +142,8 @@ def test_a_run_says_what_it_was_and_is_not_run_twice(place, scene, made, monkeyp
     assert {"provenance", "inputs", "minutes", "command", "seeds"} <= set(made)
     assert all(len(digest) == 64 for digest in made["inputs"].values())
     assert len(made["views"]["grid"]) == len(made["views"]["anywhere"]) == 6
+    assert len(made["views"]["route"]) == pytest.approx(SMALL.length_m / SMALL.stride_m, abs=1)
+    assert set(made["rules"]) == {"grid", "anywhere"}
     assert set(made["sweep"]) == {"heading_deg", "drop_m"}
 
     def refuse(*_):
@@ -165,12 +170,13 @@ def test_tables_and_plots_are_made_of_the_files_alone(tmp_path, made):
     plain["views"] = {
         "grid": [[0.0, 1, 1.5, 2.0], [14.0, 1, 1.2, 1.9], [99.0, 1, 1.2, 1.1], [None] * 4],
         "anywhere": [[20.0, 1, 1.1, 1.3]] * 4,
+        "route": [[1.0, 1, 1.1, 1.3]] * 3,
     }
     (folder / "B-autoencoder-canny.json").write_text(json.dumps(plain))
     text = report(tmp_path, "reduced").read_text()
     row = next(line for line in text.splitlines() if line.startswith("| Auto-Encoder"))
     assert [cell.strip() for cell in row.split("|")[2:-1]] == [
-        *("Canny", "90.2", "50", "0", "100", "4"),
+        *("Canny", "90.2", "100", "50", "0", "100", "3 / 4 / 4"),
     ]
     confidence = next(
         line for line in text.splitlines() if line.startswith("| B") and " / " in line
@@ -223,3 +229,134 @@ def test_local_frame_box_is_centred():
 def test_no_results_are_no_tables(tmp_path):
     assert read(tmp_path) == []
     assert report(tmp_path, "reduced") is None
+
+
+def test_the_date_of_the_views_is_never_learnt_from():
+    for name, (past, present, *others) in scenes.UNTUNED.items():
+        assert len({past, present, *others}) == 2 + len(others), name
+    pairs = {name: (past, present) for name, past, present in scenes.REAL}
+    for name, others in scenes.OTHERS.items():
+        assert not set(pairs[name]) & set(others), name
+
+
+def test_rows_tuned_on_their_scene_are_marked():
+    def marked(scene):
+        rows = methods(REDUCED, scene, 900)
+        return {each.key for each in rows if tuned(each.family, each.recipe, scene)}
+
+    words = {"bovw-gray-256", "bovw-gray-1024"}
+    ours = {"gradient-gradient", "gradient-gradient-registration"}
+    assert marked("B") == words | ours | {"triplet-canny", "triplet-gray"}
+    assert marked("naip-2018") == words | ours
+    for scene in scenes.UNTUNED:
+        assert marked(scene) == words
+    assert not any(
+        tuned(each.family, each.recipe, "B")
+        for each in methods(FULL, "B", 900)
+        if each.family == "triplet"
+    )
+
+
+def test_a_triplet_learns_from_the_third_date_of_a_generated_area(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(scenes, "generate_area", lambda *_, dates, **__: asked.append(dates))
+    made = scenes.generated(REDUCED, "B", tmp_path)
+    assert asked == []
+    scenes.render(made)
+    assert [path.stem for path in made.others] == [asked[0][2].name]
+    assert scenes.generated(REDUCED, "D", tmp_path).others == ()
+    assert len(scenes.generated(FULL, "D", tmp_path).others) == 1
+
+
+def test_one_view_per_tile_step_as_many_as_the_paper():
+    """B and D are flown in the tile steps of their pixels; C in every third or fourth one."""
+    for name in ("B", "D"):
+        flown = FULL.trajectory(name)
+        assert round(flown.length_m / flown.stride_m + 0.5) == published.views(name)
+    centres = np.stack(np.meshgrid(np.arange(0, 320, 32), np.arange(0, 160, 32)), -1)
+    centres = centres.reshape(-1, 2).astype(np.float32)
+    places = views.along_route(centres, 500)
+    assert np.array_equal(places[:, 0], np.arange(0, 320, 32))
+    assert (places[:, 1] == 64).all()
+    assert np.array_equal(views.along_route(centres, 4)[:, 0], [0, 96, 192, 288])
+
+
+def test_another_ground_resolution_is_a_scene_of_its_own(tmp_path):
+    made = scenes.generated(REDUCED, "B", tmp_path, gsd_m=0.75)
+    assert (made.name, made.trajectory.gsd_m, made.trajectory.stride_m) == ("B-0.75m", 0.75, 24)
+    rows = {each.key for each in methods(REDUCED, made.name, 900)}
+    assert rows == {each.key for each in methods(REDUCED, "B", 900)}
+    assert scenes.generated(REDUCED, "B", tmp_path, gsd_m=1.0).name == "B"
+
+
+def test_learning_is_reported_without_a_terminal(scene, monkeypatch, capsys):
+    monkeypatch.setattr(pool, "SAID_EVERY_S", 0.0)
+    said = pool._Learning()
+    (method,) = [each for each in methods(REDUCED, "B", 940) if each.key == "autoencoder-canny"]
+    said.begin(scene, method)
+    said.handle(logging.makeLogRecord({"levelno": logging.INFO, "msg": "epoch 2 of 20, loss 0.1"}))
+    assert "B autoencoder-canny: epoch 2 of 20, loss 0.1" in capsys.readouterr().err
+    monkeypatch.setattr(pool, "SAID_EVERY_S", 1e6)
+    said.handle(logging.makeLogRecord({"levelno": logging.INFO, "msg": "epoch 3 of 20"}))
+    assert capsys.readouterr().err == ""
+
+
+def test_more_epochs_are_another_run_of_the_same_row(place, scene, made, monkeypatch):
+    rows = {each.key: each.recipe for each in methods(REDUCED, "B", 900, more_epochs=77)}
+    assert "epochs=77" in rows["autoencoder-canny"] and "epochs=77" in rows["triplet-gray"]
+    monkeypatch.setattr(runs, "build_map", lambda *_: pytest.fail("built"))
+    with pytest.raises(pytest.fail.Exception, match="built"):
+        runs.run(place, scene, Method("gradient", "gradient:dims=8", "gradient"))
+
+
+def test_hours_of_all_rows_are_estimated_from_the_first_minute(scene, monkeypatch, capsys):
+    times_s = [0.0]
+    monkeypatch.setattr(pool.time, "monotonic", lambda: times_s[-1])
+    said = pool._Learning()
+    (method,) = [each for each in methods(REDUCED, "B", 90) if each.key == "autoencoder-canny"]
+    said.work = {"autoencoder": 10.0 * steps(method, scene.trajectory.tiles)}
+    said.begin(scene, method)
+    for time_s, share in ((0.0, 0.0), (30.0, 0.1), (72.0, 0.2), (90.0, 0.25)):
+        times_s.append(time_s)
+        record = {"levelno": logging.INFO, "msg": "epoch", "share": share}
+        said.handle(logging.makeLogRecord(record))
+    (line,) = [each for each in capsys.readouterr().err.splitlines() if "all auto" in each]
+    assert "about 1.0 h" in line  # 72 s for a fifth of a tenth
+
+
+def test_what_a_series_takes_is_said(scene, tmp_path):
+    rows = {each.key: each for each in methods(GPU, "B", 21_000)}
+    assert set(rows) == {
+        *("gradient-gradient", "autoencoder-canny", "autoencoder-gray"),
+        "gradient-gradient-registration",
+    }
+    flown = replace(scene, trajectory=GPU.trajectory("B"))
+    assert steps(rows["autoencoder-canny"], 21_000) == 200 * 657
+    assert parameters(rows["autoencoder-canny"])[0] == 172_506_561
+    text = "\n".join(lines([(flown, each) for each in rows.values()], 1, tmp_path, True))
+    assert "262,800 steps, 1.1 h at 15 ms each" in text
+    assert "memory for learning: about 4.4 GB" in text
+    assert "disk: at most" in text and "are free" in text
+    assert [scene for scene in "ABCD" if len(methods(GPU, scene, 900)) > 2] == ["B", "D"]
+
+
+def test_a_dry_run_goes_through_every_step(scene, tmp_path, monkeypatch):
+    """A small network, from imagery to the tables; no checkpoint is left."""
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 8)
+    setting = dry(replace(REDUCED, encoder_width=8))
+    there = runs.Workplace(tmp_path, setting, "test", device="cpu", workers=1)
+    flown = scene.of(setting)
+    (method,) = [each for each in methods(setting, "B", 2) if each.key == "autoencoder-canny"]
+    made = runs.run(there, flown, method)
+    assert made["tiles"] <= 4 and "epochs=1" in made["method"]["recipe"]
+    assert set(made["views"]) == set(views.PLACEMENTS)
+    assert "Auto-Encoder" in report(tmp_path, setting.folder).read_text()
+    assert not list(tmp_path.rglob("checkpoint.pt"))
+
+
+@pytest.mark.slow
+def test_a_dry_run_of_all_rows_ends_without_a_failure(tmp_path):
+    arguments = ["--dry-run", "--only", *"ABCD", "baselines", "--jobs", "2", "--device", "cpu"]
+    assert main([*arguments, "--out", str(tmp_path)]) == 0
+    rows = {path.stem for path in (tmp_path / "dry-reduced").glob("*.json")}
+    assert rows >= {f"{name}-autoencoder-canny" for name in "ABCD"} | {"B-triplet-gray"}

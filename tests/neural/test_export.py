@@ -30,8 +30,8 @@ def encoder_and_recipe(kind, tile_px, channels=1, **fields):
         encoder = ResNet34(tile_px=tile_px, channels=channels, width=8)
         recipe = TripletRecipe(width=8, **fields)
     else:
-        encoder = AutoEncoder(tile_px=tile_px, channels=channels, width=16, dims=24).encoder
-        recipe = AutoEncoderRecipe(width=16, dims=24, **fields)
+        encoder = AutoEncoder(tile_px=tile_px, channels=channels, width=64, dims=24).encoder
+        recipe = AutoEncoderRecipe(width=64, dims=24, **fields)
     for norm in encoder.modules():
         if isinstance(norm, nn.BatchNorm2d):
             norm.momentum = None  # the plain mean over all batches

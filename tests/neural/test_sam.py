@@ -17,8 +17,14 @@ import torch
 import transformers
 
 from orthonav.errors import MissingFileError, VariantError
+from orthonav.geo.camera import Camera
+from orthonav.imagery.mosaic import Mosaic
+from orthonav.localizer import Localizer
+from orthonav.mapfile import open_map
 from orthonav.neural import sam, sam_weights
 from orthonav.neural.sam import SamBoundaries, automatic_masks, boundary_map, suppressed
+from orthonav.prepare import BuildRequest, build_map
+from orthonav.records import Telemetry, View
 from orthonav.variants import Variant, make_variant, variant_from_recipe, variant_recipe
 
 SIDE = 64
@@ -566,6 +572,7 @@ def test_defaults_are_those_of_the_original_generator():
         "offset=0",
         "overlap=2",
         "window=8",
+        "per=view",
         "prompts=0",
         "device=tpu",
         "precision=fp8",
@@ -585,3 +592,41 @@ def test_the_environment_may_name_the_weights(weights, monkeypatch):
     monkeypatch.delenv("ORTHONAV_SAM_WEIGHTS")
     with pytest.raises(VariantError, match="ORTHONAV_SAM_WEIGHTS"):
         variant("")
+
+
+@pytest.mark.parametrize("per", ["sheet", "tile"])
+def test_a_network_learns_from_the_boundaries_of_sheets_or_tiles(
+    per, weights, area, tmp_path, monkeypatch
+):
+    """The whole path with a stand-in for the weights: imagery, network, map, views."""
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 4)
+    monkeypatch.setenv(sam.WEIGHTS_VARIABLE, str(weights))
+    given = "grid=4,iou=0,stability=0,cache=none,device=cpu,window=64"
+    request = BuildRequest(
+        [area.past],
+        tmp_path / "a.onav",
+        method="autoencoder:width=8,dims=32,epochs=2,similarity=cosine",
+        edges=f"sam:per={per},{given}",
+        registration=False,
+        tile_px=64,
+        gsd_m=5.0,
+        overlap=0.5,
+        work=tmp_path / "work",
+    )
+    build_map(request)
+    opened = open_map(tmp_path / "a.onav")
+    assert opened.manifest.recipe["represent"]["per"] == per
+    localizer = Localizer(opened, registration=False, flying=False, position="best")
+    grid, centres = localizer.grid, localizer.tiles.centres_en_m
+    camera = Camera(64, 64, 64.0, 64.0, 32.0, 32.0)
+    right = 0
+    with Mosaic.open([area.past]).grid_sheet(localizer.sheet.frame, grid) as raster:
+        for centre in centres[:: max(1, len(centres) // 6)]:
+            col = round((centre[0] - grid.west_m) / 5.0 - 32)
+            row = round((grid.north_m - centre[1]) / 5.0 - 32)
+            grey = raster.read_grey(col, row, 64, 64).grey
+            found = localizer.locate(View(grey, camera, Telemetry(0, 0.0, 0.0, 0.0, 320.0)))
+            place = localizer.sheet.frame.en_from_latlon(found.lat_deg, found.lon_deg)
+            right += np.hypot(*(place - centre)) < 1
+    if per == "tile":  # tiles are segmented as views are
+        assert right >= 5

@@ -63,7 +63,7 @@ def learn(recipe, work=None, tiles=None, means=QUICK, seed=1, report=None):
         positive=positive,
         means=means,
         report=report,
-    )
+    ).embedder
 
 
 def losses(work):
@@ -190,6 +190,31 @@ def test_a_kill_during_a_write_leaves_the_previous_checkpoint(tmp_path, monkeypa
     np.testing.assert_allclose(losses(tmp_path), losses(alone), rtol=1e-4)
 
 
+@pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
+def test_epochs_can_be_added_to_a_finished_training_and_not_taken_away(recipe, tmp_path):
+    learn(dataclasses.replace(recipe, epochs=2), tmp_path)
+    np.testing.assert_array_equal(learn(recipe, tmp_path).onnx, undisturbed(recipe).onnx)
+    assert losses(tmp_path) == undisturbed(recipe).losses
+    with pytest.raises(OutputError, match="of 3 epochs, 2 are asked"):
+        learn(dataclasses.replace(recipe, epochs=2), tmp_path)
+
+
+def test_the_time_left_is_that_of_the_present_speed(monkeypatch):
+    clock = iter(range(0, 10_000, 60))
+    monkeypatch.setattr(training.time, "monotonic", lambda: float(next(clock)))
+    messages = []
+    state = SimpleNamespace(history=[0.5], losses=[])
+    pauses = training._Pauses(state, None, 4, 10, lambda *said: messages.append(said), None)
+    state.history = [0.5, 0.4]
+    pauses.after_epoch()
+    state.history = [0.5, 0.4, 0.3, 0.2]
+    pauses.after_epoch()
+    assert messages == [
+        ("epoch 2 of 4, loss 0.4, 2.0 min left", 0.5),
+        ("epoch 4 of 4, loss 0.2", 1),
+    ]
+
+
 def test_long_epochs_report_progress(monkeypatch):
     monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
     messages = []
@@ -254,7 +279,7 @@ def test_a_folder_of_another_training_is_refused(change, tmp_path):
     learn(dataclasses.replace(AUTO, epochs=1), tmp_path)
     before = (tmp_path / "checkpoint.pt").read_bytes()
     changes = {
-        "recipe": {"recipe": AUTO},
+        "recipe": {"recipe": dataclasses.replace(AUTO, epochs=1, learning_rate=1e-3)},
         "seed": {"seed": 2},
         "tiles": {"tiles": sheet(ground(7))},
     }
@@ -332,10 +357,29 @@ def test_fast_options_give_the_same_result_up_to_rounding(tmp_path):
 def test_bfloat16_is_used_where_the_processor_has_it(able, wanted, monkeypatch):
     cpu = torch.device("cpu")
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: able, raising=False)
-    assert means.uses_bf16(Means(), cpu) is wanted
-    assert means.uses_bf16(Means(bf16=not wanted), cpu) is not wanted
+    bf16 = torch.bfloat16
+    assert means.mixed_precision(Means(), cpu) is (bf16 if wanted else None)
+    assert means.mixed_precision(Means(bf16=not wanted), cpu) is (None if wanted else bf16)
     monkeypatch.delattr(torch.cpu, "get_capabilities")
-    assert means.uses_bf16(Means(), cpu) is False
+    assert means.mixed_precision(Means(), cpu) is None
+
+
+@pytest.mark.parametrize("able, wanted", [(True, torch.bfloat16), (False, torch.float16)])
+def test_a_gpu_without_bfloat16_learns_in_float16(able, wanted, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: able)
+    assert means.mixed_precision(Means(), torch.device("cuda")) is wanted
+
+
+@pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
+def test_scaled_gradients_give_the_same_result(recipe, tmp_path, monkeypatch):
+    """What float16 needs: gradients times 65536, and divided by it before the step."""
+    original = torch.amp.GradScaler
+    monkeypatch.setattr(
+        training.torch.amp, "GradScaler", lambda device, enabled: original(device, enabled=True)
+    )
+    learn(recipe, tmp_path)
+    monkeypatch.undo()
+    np.testing.assert_allclose(losses(tmp_path), undisturbed(recipe).losses, rtol=1e-3)
 
 
 SHARED = """

@@ -7,12 +7,12 @@ import pytest
 
 from orthonav.embed.network import NetworkEmbedder
 from orthonav.embed.words import WordsEmbedder
-from orthonav.errors import MapFileError, VariantError
+from orthonav.errors import MapFileError, MissingExtraError, VariantError
 from orthonav.flight import open_flight, read_truth
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import SingleViews, localize_flight
-from orthonav.prepare import BuildRequest, build_map
+from orthonav.prepare import BuildRequest, build_map, methods
 from orthonav.prepare.methods import stored_representation, usual_edges
 from orthonav.records import Fix
 from orthonav.represent import TABLE
@@ -124,6 +124,7 @@ def test_interrupted_training_resumes(area, tmp_path):
         ("triplet:width=0", None, "width must be"),
         ("vlad", None, "unknown variant 'vlad'"),
         ("autoencoder", "sam", "weights"),
+        ("triplet", "sam:weights=there", "--other-date"),
     ],
 )
 def test_what_does_not_go_together_is_refused(area, tmp_path, method, edges, says):
@@ -160,3 +161,14 @@ def test_words_of_files_elsewhere_do_not_fly():
     plain = {"name": "bovw", "features": "superpoint", "weights": "/etc", "words": 256}
     with pytest.raises(MapFileError, match="do not fly"):
         embedder_of(plain, lambda *_: np.zeros(0), 1)
+
+
+@pytest.mark.parametrize("method, hidden", [("autoencoder", "onnx"), ("bovw", "faiss")])
+def test_what_is_missing_is_named_before_imagery_is_read(
+    area, tmp_path, monkeypatch, method, hidden
+):
+    found = methods.find_spec
+    monkeypatch.setattr(methods, "find_spec", lambda name: None if name == hidden else found(name))
+    monkeypatch.setattr("orthonav.prepare.request.Mosaic.open", lambda *_: pytest.fail("read"))
+    with pytest.raises(MissingExtraError, match=rf"{hidden}: pip install 'orthonav\[train\]'"):
+        build_map(BuildRequest([area.past], tmp_path / "a.onav", method=method, **SMALL))

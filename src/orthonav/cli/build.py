@@ -58,7 +58,14 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--workers",
         type=int,
         metavar="N",
-        help="threads that read imagery (default: one per core)",
+        help="threads that read imagery and make batches for a network (default: one per core; "
+        "2 make batches, up to 16 for a GPU)",
+    )
+    parser.add_argument(
+        "--device",
+        default="auto",
+        choices=("auto", "cpu", "cuda"),
+        help="where a network is learnt (default auto: a GPU if there is one)",
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
@@ -132,6 +139,7 @@ def run(options: argparse.Namespace) -> int:
         workers=options.workers,
         dem=options.dem,
         dem_datum=options.dem_datum,
+        device=options.device,
         **recipe_of(options),
     )
     with progress(options) as shown:

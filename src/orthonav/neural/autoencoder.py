@@ -6,12 +6,10 @@ deconvolution layers, followed by batch normalization and a LeakyReLU activation
 inputs are binary maps, a sigmoid is added to the last layer of the Decoder. The neural network has
 172 506 561 parameters." (section Methodology, after Bianchi and Barfoot 2021)
 
-The text leaves kernels and widths open. Four strides of 2 turn 256 px into 16 x 16 cells of W
-channels; the dense layers from and to 1024 numbers hold 2 * 256 W * 1024 parameters, nearly all
-there are, so the count implies W of about 320. With W = 320, widths doubling from W / 8, and
-kernels of 4 px (a multiple of the stride, so that transposed convolutions leave no chequered
-pattern) there are 170,009,425 parameters, 1.4 % less than the paper's. No kernels of 2 to 9 px with
-widths that are multiples of 8, growing in the usual ways, give its count exactly.
+The text leaves kernels and widths open, and the authors' released code has five strided
+convolutions. Its count comes out exactly with convolutions of 3 x 3 and widths 64, 128, 256, 512,
+512, a dense layer from 8 x 8 x 512 to 1024 numbers and one back to 16 x 16 x 512, and transposed
+convolutions of 2 x 2 to 256, 128, 64 and 1 channels, each but the last normalized and rectified.
 """
 
 from itertools import pairwise
@@ -25,8 +23,9 @@ from torch import Tensor, nn
 from orthonav.embed.network import AutoEncoderRecipe
 from orthonav.neural.tiles import SheetTiles
 
-KERNEL_PX, STRIDE_PX, PADDING_PX = 4, 2, 1
-LAYERS = 4
+STRIDE_PX = 2
+DOWN, UP = 5, 4
+"""Strided convolutions of the encoder and of the decoder."""
 SHOWN_TILES = 6
 SLOPE = 0.2
 """Slope of LeakyReLU below zero: usual with strided convolutions; the paper gives none."""
@@ -36,7 +35,8 @@ class AutoEncoder(nn.Module):
     """Auto-encoder for tiles (N, C, S, S) of `tile_px` S; only `encoder` flies.
 
     `width` is the number of channels before the dense layer, a multiple of 8. `binary` adds the
-    sigmoid. Raises `ValueError` for a tile that four strides of 2 do not divide, or below 32 px.
+    sigmoid. Raises `ValueError` for a tile that the decoder's four strides of 2 do not divide, or
+    below 32 px.
     """
 
     def __init__(
@@ -44,15 +44,14 @@ class AutoEncoder(nn.Module):
         *,
         tile_px: int = 256,
         channels: int = 1,
-        width: int = 320,
+        width: int = 512,
         dims: int = 1024,
         binary: bool = True,
     ) -> None:
         super().__init__()
-        if tile_px < 32 or tile_px % STRIDE_PX**LAYERS:
+        if tile_px < 32 or tile_px % STRIDE_PX**UP:
             raise ValueError(
-                f"tile must be at least 32 px and a multiple of {STRIDE_PX**LAYERS} px, "
-                f"got {tile_px}"
+                f"tile must be at least 32 px and a multiple of {STRIDE_PX**UP} px, got {tile_px}"
             )
         if width < 8 or width % 8 or channels < 1 or dims < 1:
             raise ValueError(
@@ -60,20 +59,21 @@ class AutoEncoder(nn.Module):
                 f"got {width}, {channels}, {dims}"
             )
         self.tile_px, self.channels, self.dims, self.binary = tile_px, channels, dims, binary
-        side = tile_px // STRIDE_PX**LAYERS
-        widths = [channels, width // 8, width // 4, width // 2, width]
+        widths = [channels, width // 8, width // 4, width // 2, width, width]
+        side = -(-tile_px // STRIDE_PX**DOWN)
         self.encoder = nn.Sequential(
             *(layer for pair in pairwise(widths) for layer in _down(*pair)),
             nn.Flatten(),
             nn.Linear(width * side**2, dims),
         )
         back = [width, width // 2, width // 4, width // 8]
+        side = tile_px // STRIDE_PX**UP
         self.decoder = nn.Sequential(
             nn.Linear(dims, width * side**2),
             nn.Unflatten(1, (width, side, side)),
             *(layer for pair in pairwise(back) for layer in _up(*pair)),
             # No norm and no rectifier at the output: it must reach all pixel values.
-            nn.ConvTranspose2d(back[-1], channels, KERNEL_PX, STRIDE_PX, PADDING_PX),
+            nn.ConvTranspose2d(back[-1], channels, STRIDE_PX, STRIDE_PX),
         )
 
     def forward(self, tiles: Tensor) -> Tensor:
@@ -105,11 +105,11 @@ class Reconstruction:
         """Tiles (B, C, S, S)."""
         return (self.tiles.batch(indices),)
 
-    def backward(self, run: nn.Module, *tensors: Tensor) -> Tensor:
-        """Add the gradients of the L2 loss."""
+    def backward(self, run: nn.Module, *tensors: Tensor, scale: Tensor) -> Tensor:
+        """The L2 loss, after adding its gradients times `scale`."""
         (maps,) = tensors
         loss = reconstruction_loss(maps, run(maps))
-        torch.autograd.backward(loss)
+        torch.autograd.backward(loss * scale)
         return loss.detach()
 
 
@@ -128,7 +128,7 @@ def reconstructions(model: AutoEncoder, tiles: SheetTiles) -> NDArray[np.uint8]:
 
 def _down(before: int, after: int) -> list[nn.Module]:
     return [
-        nn.Conv2d(before, after, KERNEL_PX, STRIDE_PX, PADDING_PX),
+        nn.Conv2d(before, after, 3, STRIDE_PX, 1),
         nn.BatchNorm2d(after),
         nn.LeakyReLU(SLOPE, inplace=True),
     ]
@@ -136,7 +136,7 @@ def _down(before: int, after: int) -> list[nn.Module]:
 
 def _up(before: int, after: int) -> list[nn.Module]:
     return [
-        nn.ConvTranspose2d(before, after, KERNEL_PX, STRIDE_PX, PADDING_PX),
+        nn.ConvTranspose2d(before, after, STRIDE_PX, STRIDE_PX),
         nn.BatchNorm2d(after),
         nn.LeakyReLU(SLOPE, inplace=True),
     ]

@@ -41,11 +41,14 @@ class TrainingState:
     """State of a training: weights, optimizer, learning rate and losses.
 
     `history` holds the mean loss of each epoch, `losses` those of the batches of the current epoch.
+    `scaler` scales gradients of float16 and does nothing for other types.
     """
 
-    def __init__(self, model: nn.Module, recipe: Recipe, *, fused: bool) -> None:
+    def __init__(
+        self, model: nn.Module, recipe: Recipe, *, fused: bool, scaler: torch.amp.GradScaler
+    ) -> None:
         kind = torch.optim.AdamW if isinstance(recipe, AutoEncoderRecipe) else torch.optim.Adam
-        self.model = model
+        self.model, self.scaler = model, scaler
         self.optimizer: torch.optim.Optimizer = kind(
             model.parameters(), lr=recipe.learning_rate, fused=fused
         )
@@ -74,6 +77,7 @@ class TrainingState:
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "plateau": self.plateau.state_dict() if self.plateau else None,
+            "scaler": self.scaler.state_dict(),
             "history": self.history,
             "losses": self.losses,
         }
@@ -84,6 +88,8 @@ class TrainingState:
         self.optimizer.load_state_dict(parts["optimizer"])
         if self.plateau is not None:
             self.plateau.load_state_dict(parts["plateau"])
+        if parts.get("scaler"):
+            self.scaler.load_state_dict(parts["scaler"])
         self.history = list(parts["history"])
         self.losses = list(parts.get("losses", []))  # absent in older checkpoints
 
@@ -96,8 +102,11 @@ class CheckpointStore:
         self._saved_s = self._began_s = time.monotonic()
         self._early_s = list(SHOWN_AFTER_S)
 
-    def load(self, state: TrainingState, device: torch.device) -> None:
-        """Restore any checkpoint; raises `OutputError` if it belongs to another training."""
+    def load(self, state: TrainingState, device: torch.device, epochs: int) -> None:
+        """Restore any checkpoint.
+
+        Raises `OutputError` if it belongs to another training, or has more than `epochs` epochs.
+        """
         path = None if self._work is None else self._work / "checkpoint.pt"
         if path is None or not path.exists():
             return
@@ -109,6 +118,11 @@ class CheckpointStore:
             raise OutputError(f"checkpoint cannot be read; delete it: {path}") from error
         if not same:
             raise OutputError(f"folder holds another training; choose another folder: {path}")
+        if len(found["history"]) > epochs:
+            raise OutputError(
+                f"folder holds a training of {len(found['history'])} epochs, {epochs} are asked "
+                f"for; give as many, or choose another folder: {path}"
+            )
         state.take(found)
 
     def clear(self) -> None:
@@ -180,7 +194,8 @@ def fingerprint(
     """Key of a training: a checkpoint with another key is refused; `dates` are other sheets."""
     some = np.unique(np.linspace(0, len(tiles) - 1, 64).astype(np.intp))
     where = np.ascontiguousarray(tiles.tiles_px, dtype=np.int64).tobytes()
-    learnt = dataclasses.asdict(recipe) | {"precision": "float32"}  # chosen after training
+    # Precision is chosen after training, and epochs can be added.
+    learnt = dataclasses.asdict(recipe) | {"precision": "float32", "epochs": 0}
     key: dict[str, Any] = {
         "recipe": [type(recipe).__name__, learnt],
         "tiles": [zlib.crc32(where), zlib.crc32(tiles.batch(some).tobytes()), tiles.tile_px],

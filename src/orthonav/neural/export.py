@@ -33,14 +33,14 @@ It holds for every held-out tile. Measured on 256 px, one tile at a time, onnxru
 thread of an AMD EPYC with AVX-512 VNNI, processor time; the triplet network on tiles of another
 date:
 
-    auto-encoder, width 32   float32 33.6 MB 1.8 ms   float16 16.8 MB 1.9 ms, cosine 1.0000
-                                                      int8     8.4 MB 0.7 ms, least 0.9990
+    auto-encoder, width 32   float32  8.5 MB 0.6 ms   float16  4.2 MB 0.4 ms, cosine 1.0000
+                                                      int8     2.1 MB 0.6 ms, least 0.9998
     triplet, width 16        float32  5.3 MB 5.8 ms   float16  2.7 MB 6.0 ms, cosine 1.0000
                                                       int8     1.4 MB 2.9 ms, least 0.986
 
 float16 halves the file and saves no time: weights are converted back when it is loaded. On
-processors without 8-bit products, int8 only reduces the file. `python -m benchmarks.training --only
-precisions` measures the auto-encoder.
+processors without 8-bit products, and in small networks, int8 only reduces the file.
+`python -m benchmarks.training --only precisions` measures the auto-encoder.
 """
 CALIBRATION_BATCH = 8
 

@@ -19,16 +19,23 @@ import torch
 from torch import Tensor, distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 
+from orthonav.cores import usable_cores
+
+GPU_WORKERS = 16
+"""Threads that make batches for a GPU: more tiles than one thread cuts, and positives take far
+longer than tiles."""
+
 
 @dataclass(frozen=True)
 class Means:
     """Options for the speed of training; the learned weights are the same up to rounding.
 
-    - `bf16`: mixed precision; None: if the processor has bfloat16 instructions.
+    - `bf16`: mixed precision with bfloat16; None: if the processor has its instructions, else with
+      float16 on a GPU.
     - `fused`: run the optimizer's step in one pass over memory.
     - `keep_memory`: let the process keep freed memory (Linux, CPU).
     - `chunk`: tiles of a triplet batch held for gradients at once; batch norms use each chunk.
-    - `workers`: threads that make batches.
+    - `workers`: threads that make batches; None: 2 for a CPU, one per core up to 16 for a GPU.
     - `save_every_s`: shortest time between checkpoints, s.
     - `device`: name for PyTorch; None: a GPU if there is one.
     """
@@ -37,7 +44,7 @@ class Means:
     fused: bool = True
     keep_memory: bool = True
     chunk: int = 128
-    workers: int = 2
+    workers: int | None = None
     save_every_s: float = 300.0
     device: str | None = None
 
@@ -57,18 +64,27 @@ def device_of(means: Means, world: World) -> torch.device:
     return torch.device("cuda", world.local_rank) if name == "cuda" else torch.device(name)
 
 
-def uses_bf16(means: Means, device: torch.device) -> bool:
-    """Whether to train in mixed precision: `means.bf16`, else if the device supports bfloat16.
+def mixed_precision(means: Means, device: torch.device) -> torch.dtype | None:
+    """Type for mixed precision: as `means.bf16` says, else bfloat16 if the device supports it.
 
-    On other devices float32 is faster.
+    A GPU without it, before NVIDIA's Ampere, gets float16; on other processors float32 is faster.
     """
     if means.bf16 is not None:
-        return means.bf16
+        return torch.bfloat16 if means.bf16 else None
     if device.type == "cuda":
-        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
+        able = torch.cuda.is_bf16_supported(including_emulation=False)
+        return torch.bfloat16 if able else torch.float16
     # Older releases of PyTorch lack this function.
-    able: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
-    return any(bool(able.get(name)) for name in ("avx512_bf16", "amx_bf16", "bf16"))
+    found: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
+    able = any(bool(found.get(name)) for name in ("avx512_bf16", "amx_bf16", "bf16"))
+    return torch.bfloat16 if able else None
+
+
+def workers_of(means: Means, device: torch.device) -> int:
+    """Threads that make batches."""
+    if means.workers is not None:
+        return means.workers
+    return min(GPU_WORKERS, usable_cores()) if device.type == "cuda" else 2
 
 
 def wrapped(model: nn.Module, device: torch.device, world: World) -> nn.Module:

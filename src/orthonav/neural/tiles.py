@@ -5,14 +5,15 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 BATCHES_AHEAD = 2
+"""Batches made ahead at least; with more threads, one each."""
 
-Arrays = tuple[NDArray[Any], ...]
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +27,8 @@ class SheetTiles:
     - `scale`: value of `pixels` that stands for 1.0: 255 for grey levels, 1 for edge maps.
     - `grey`: (H, W) uint8, the source of the positives of triplets; None: first channel of
       `pixels`.
+    - `singles`: (N, C, S, S) uint8, tiles that were represented each by itself; None: tiles are cut
+      out of `pixels`.
     """
 
     pixels: NDArray[np.uint8]
@@ -34,6 +37,7 @@ class SheetTiles:
     tile_px: int
     scale: float = 255.0
     grey: NDArray[np.uint8] | None = None
+    singles: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
         if self.pixels.ndim != 3 or self.pixels.dtype != np.uint8:
@@ -68,7 +72,8 @@ class SheetTiles:
         out = np.empty((len(indices), self.channels, self.tile_px, self.tile_px), np.float32)
         for row, index in enumerate(indices):
             part = self._part(int(index))
-            self.scaled(self.pixels[:, *part], self.valid[part], out[row])
+            raw = self.pixels[:, *part] if self.singles is None else self.singles[int(index)]
+            self.scaled(raw, self.valid[part], out[row])
         return out
 
     def scaled(
@@ -110,14 +115,14 @@ def epoch_batches(
 
 
 def made_ahead(
-    make: Callable[[NDArray[np.intp]], Arrays], plan: Sequence[NDArray[np.intp]], workers: int
-) -> Iterator[Arrays]:
+    make: Callable[[NDArray[np.intp]], Made], plan: Sequence[NDArray[np.intp]], workers: int
+) -> Iterator[Made]:
     """Results of `make` for each batch of the plan, in order, computed by threads a few ahead."""
     with ThreadPoolExecutor(max(1, workers)) as pool:
-        waiting: deque[Future[Arrays]] = deque()
+        waiting: deque[Future[Made]] = deque()
         for indices in plan:
             waiting.append(pool.submit(make, indices))
-            if len(waiting) > BATCHES_AHEAD:
+            if len(waiting) > max(BATCHES_AHEAD, workers):
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()

@@ -4,7 +4,7 @@ Both are trained as in Di Piazza et al. 2024 (section Methodology): the auto-enc
 rate of 3e-4 that halves on plateaus, batches of 32; the triplet network with Adam, 1e-3, batches
 of 512; 200 epochs each. The order of tiles and every positive depend on the seed, the epoch and
 the tile alone. An interrupted training therefore resumes with the same result, also within an
-epoch.
+epoch, and a finished one goes on where it is given more epochs.
 
 Several processes or GPUs: start the program with `torchrun`. Each process takes its share of every
 batch, gradients are averaged, and the first process writes. Negatives and the statistics of batch
@@ -36,8 +36,9 @@ from orthonav.neural.means import (
     device_of,
     kept_memory,
     mean_over_processes,
+    mixed_precision,
     processes,
-    uses_bf16,
+    workers_of,
     wrapped,
 )
 from orthonav.neural.tiles import SheetTiles, epoch_batches, made_ahead
@@ -67,9 +68,33 @@ class Task(Protocol):
         """Arrays for a batch of tiles (B,); called from several threads."""
         ...
 
-    def backward(self, run: nn.Module, *tensors: Tensor) -> Tensor:
-        """Loss, after adding its gradients; `run` is the model, possibly wrapped."""
+    def backward(self, run: nn.Module, *tensors: Tensor, scale: Tensor) -> Tensor:
+        """Loss, after adding its gradients times `scale`; `run` is the model, possibly wrapped."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedNetwork:
+    """A trained encoder: `embedder` as it flies, `encoder` on the device where it was trained."""
+
+    embedder: NetworkEmbedder
+    encoder: nn.Module
+    device: torch.device
+
+    def views(self, maps: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Embeddings (N, D) of tiles (N, C, S, S): on a GPU if it learnt, else as in flight.
+
+        A precision below float32 is always computed as in flight.
+        """
+        recipe = self.embedder.recipe
+        if self.device.type == "cpu" or recipe.precision != "float32":
+            return self.embedder.views(maps)
+        # TF32 would round like no other device.
+        with torch.no_grad(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+            found = self.encoder(torch.from_numpy(maps).to(self.device)).float()
+        if recipe.similarity == "cosine":
+            found = nn.functional.normalize(found, dim=1)
+        return np.asarray(found.cpu().numpy())
 
 
 def learn_network(
@@ -82,13 +107,13 @@ def learn_network(
     positive: Positive | Sequence[SheetTiles] | None = None,
     report: Progress | None = None,
     means: Means | None = None,
-) -> NetworkEmbedder:
-    """ONNX embedder trained on reference tiles, checked against PyTorch.
+) -> TrainedNetwork:
+    """Encoder trained on reference tiles, with its ONNX embedder checked against PyTorch.
 
     - `binary`: the tiles are edge maps.
     - `seed`: seed of the weights, of the order of tiles and of the positives.
     - `work`: folder for checkpoints and pictures of the progress; an interrupted training resumes
-      from it; None: nothing is written.
+      from it, and a finished one if the recipe has more epochs; None: nothing is written.
     - `positive`: source of the positives of triplets: sheets of other dates with the same tiles, or
       a function that changes grey levels.
     - `report(text, share)`: progress callback; `share` is the part done, 0 to 1.
@@ -114,7 +139,9 @@ def learn_network(
             means=means,
             world=world,
         )
-    return _exported(task.encoder, recipe, tiles, progress)
+        device = device_of(means, world)
+    embedder = _exported(task.encoder, recipe, tiles, progress)
+    return TrainedNetwork(embedder, task.encoder.to(device).eval(), device)
 
 
 def _exported(
@@ -178,16 +205,16 @@ def train(
     read the checkpoint, so `work` must be a shared folder.
     """
     device = device_of(means, world)
-    bf16 = uses_bf16(means, device)
-    precision = "bfloat16" if bf16 else "float32"
-    log.info("training on %s in %s, contiguous tensors (NCHW)", device, precision)
+    mixed = mixed_precision(means, device)
+    log.info("training on %s in %s, contiguous tensors (NCHW)", device, mixed or torch.float32)
     task.model.to(device)
-    state = TrainingState(task.model, recipe, fused=means.fused)
+    scaler = torch.amp.GradScaler(device.type, enabled=mixed == torch.float16)
+    state = TrainingState(task.model, recipe, fused=means.fused, scaler=scaler)
     known_by = fingerprint(recipe, tiles, dates, seed, means, world)
     store = CheckpointStore(work, known_by, means.save_every_s)
-    store.load(state, device)
+    store.load(state, device, recipe.epochs)
     run = wrapped(task.model, device, world)
-    feed = _Feed(task, recipe.batch, seed, len(tiles), device, bf16, means, world)
+    feed = _Feed(task, recipe.batch, seed, len(tiles), device, mixed, means, world)
     writer = store if world.rank == 0 else None
     if writer:
         writer.clear()
@@ -219,7 +246,8 @@ class _Pauses:
         self._state, self._tiles = state, tiles
         self._epochs, self._batches = epochs, batches
         self._report, self._writer = report, writer
-        self._progress_s = time.monotonic()
+        self._progress_s = self._start_s = time.monotonic()
+        self._start = self._share()
 
     def after_batch(self) -> None:
         """Report and write if due; the last batch of an epoch is left to `after_epoch`."""
@@ -228,9 +256,7 @@ class _Pauses:
             return
         if time.monotonic() - self._progress_s >= PROGRESS_EVERY_S:
             at = f"epoch {epoch + 1} of {self._epochs}, batch {done} of {self._batches}"
-            share = (epoch + done / self._batches) / self._epochs
-            self._report(f"{at}, loss {float(self._state.losses[-1]):.5g}", share)
-            self._progress_s = time.monotonic()
+            self._say(f"{at}, loss {float(self._state.losses[-1]):.5g}")
         if self._writer:
             self._writer.after_batch(self._state, self._tiles)
 
@@ -238,11 +264,29 @@ class _Pauses:
         """Report the mean loss, and write if due."""
         history = self._state.history
         done = len(history)
-        text = f"epoch {done} of {self._epochs}, loss {history[-1]:.5g}"
-        self._report(text, done / self._epochs)
-        self._progress_s = time.monotonic()
+        self._say(f"epoch {done} of {self._epochs}, loss {history[-1]:.5g}")
         if self._writer:
             self._writer.after_epoch(self._state, self._tiles, last=done == self._epochs)
+
+    def _share(self) -> float:
+        """Share of the training that is done."""
+        batches = len(self._state.history) * self._batches + len(self._state.losses)
+        return batches / (self._epochs * self._batches)
+
+    def _say(self, text: str) -> None:
+        """Report with the time left, at the speed since this process began."""
+        self._progress_s, share = time.monotonic(), self._share()
+        speed = (share - self._start) / max(self._progress_s - self._start_s, 1e-9)
+        left = f", {_duration((1 - share) / speed)} left" if speed > 0 and share < 1 else ""
+        self._report(f"{text}{left}", share)
+
+
+def _duration(seconds: float) -> str:
+    """Seconds in the unit that people would name."""
+    for size, name in ((3600, "h"), (60, "min")):
+        if seconds >= 1.5 * size:
+            return f"{seconds / size:.{int(seconds < 10 * size)}f} {name}"
+    return f"{seconds:.0f} s"
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +298,7 @@ class _Feed:
     seed: int
     count: int
     device: torch.device
-    bf16: bool
+    precision: torch.dtype | None
     means: Means
     world: World
 
@@ -267,13 +311,20 @@ class _Feed:
         """Tensors of each batch of this process, from number `first` up to `end`, exclusive."""
         rank, size = self.world.rank, self.world.size
         plan = epoch_batches(self.count, self.batch, self.seed, epoch, rank=rank, processes=size)
-        make = partial(self.task.arrays, epoch)
-        for arrays in made_ahead(make, plan[first:end], self.means.workers):
-            yield [torch.from_numpy(np.ascontiguousarray(a)).to(self.device) for a in arrays]
+        workers = workers_of(self.means, self.device)
+        for tensors in made_ahead(partial(self._made, epoch), plan[first:end], workers):
+            yield [each.to(self.device, non_blocking=True) for each in tensors]
+
+    def _made(self, epoch: int, indices: NDArray[np.intp]) -> list[Tensor]:
+        """Tensors of a batch, for a GPU in pinned memory, from which copies are asynchronous."""
+        arrays = self.task.arrays(epoch, indices)
+        made = [torch.from_numpy(np.ascontiguousarray(each)) for each in arrays]
+        return [each.pin_memory() for each in made] if self.device.type == "cuda" else made
 
     def mixed(self) -> torch.autocast:
         """Autocast context for mixed precision."""
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16)
+        wanted, kind = self.precision is not None, self.precision or torch.bfloat16
+        return torch.autocast(self.device.type, kind, enabled=wanted)
 
 
 def _epoch(feed: _Feed, run: nn.Module, state: TrainingState, pauses: _Pauses) -> Tensor:
@@ -281,11 +332,14 @@ def _epoch(feed: _Feed, run: nn.Module, state: TrainingState, pauses: _Pauses) -
 
     With several processes, all resume with the losses of the first one.
     """
+    one = torch.ones((), device=feed.device)
     for tensors in feed.batches(len(state.history), len(state.losses)):
         state.optimizer.zero_grad(set_to_none=True)
         with feed.mixed():
-            state.losses.append(feed.task.backward(run, *tensors))
-        state.optimizer.step()
+            loss = feed.task.backward(run, *tensors, scale=state.scaler.scale(one))
+        state.losses.append(loss)
+        state.scaler.step(state.optimizer)
+        state.scaler.update()
         pauses.after_batch()
     return torch.stack(state.losses).double().mean()
 

@@ -183,8 +183,8 @@ class Triplets:
         else:
             np.multiply(made, valid, out=out)
 
-    def backward(self, run: nn.Module, *tensors: Tensor) -> Tensor:
-        """Add the gradients of the triplet loss.
+    def backward(self, run: nn.Module, *tensors: Tensor, scale: Tensor) -> Tensor:
+        """The triplet loss, after adding its gradients times `scale`.
 
         A batch larger than `chunk` is embedded twice (Gao et al. 2021, arXiv 2101.06983): first
         without gradients, for the gradient of the loss with respect to the embeddings, then chunk
@@ -193,13 +193,13 @@ class Triplets:
         both, apart = tensors
         if len(both) <= self.chunk:
             loss = self._loss(run(both), apart)
-            torch.autograd.backward(loss)
+            torch.autograd.backward(loss * scale)
             return loss.detach()
         parts = torch.split(both, self.chunk)
         with torch.no_grad():
             embedded = torch.cat([self.model(part) for part in parts])
         loss = self._loss(embedded.requires_grad_(), apart)
-        (wanted,) = torch.autograd.grad(loss, embedded)
+        (wanted,) = torch.autograd.grad(loss * scale, embedded)
         for number, (part, gradient) in enumerate(
             zip(parts, torch.split(wanted, self.chunk), strict=True), start=1
         ):

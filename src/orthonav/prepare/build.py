@@ -36,7 +36,7 @@ from orthonav.prepare.calibrate import (
 )
 from orthonav.prepare.calibrate_registration import FLOOR_PX, calibrate_registration
 from orthonav.prepare.cellparts import cell_parts
-from orthonav.prepare.encoders import learn_encoder
+from orthonav.prepare.encoders import Learning, learn_encoder
 from orthonav.prepare.layout import tiles_of
 from orthonav.prepare.methods import stored_representation
 from orthonav.prepare.pictures import SheetPictures, read_pictures
@@ -126,7 +126,7 @@ def learn_embedding(
 
     Raises `AreaError` if no tile has imagery.
     """
-    grid, recipe = inputs.grid, inputs.recipe
+    grid, recipe, request = inputs.grid, inputs.recipe, inputs.request
     tiles_rc = tiles_of(inputs.area, grid, sheet.cells)
     tiles_px = tiles_rc * grid.stride_px
     centres = grid.centres_en_m(tiles_rc).astype(np.float32)
@@ -147,8 +147,7 @@ def learn_embedding(
             dates,
             tiles_px,
             inputs.representation,
-            inputs.request.seed,
-            inputs.request.work,
+            Learning(request.seed, request.work, request.device, request.workers),
             progress,
         )
     progress("learn", 1.0)

@@ -3,6 +3,7 @@
 import importlib
 import logging
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,9 @@ log = logging.getLogger(__name__)
 
 BATCH_TILES = 64
 MAX_WORD_TILES = 2000
+CHECKED_TILES, SAME = 32, 4e-3
+"""Tiles on which a device is compared with flight, and the largest difference, relative to the
+largest value: four times that of float16."""
 MOST_REPLACED, MOST_MIXED = 0.35, 0.4
 """Change of the positives of a triplet, weaker than in calibration: with the stronger change a
 network learned a third as much in its first 300 batches."""
@@ -31,44 +35,72 @@ EncoderRecipe = AutoEncoderRecipe | TripletRecipe | WordsRecipe
 Encoder = NetworkEmbedder | WordsEmbedder
 
 
+@dataclass(frozen=True)
+class Learning:
+    """How to learn: seed of all draws, and of networks what `BuildRequest` says of each."""
+
+    seed: int = 0
+    work: Path | None = None
+    device: str = "auto"
+    workers: int | None = None
+
+
 def learn_encoder(
     recipe: EncoderRecipe,
     pictures: SheetPictures,
     other_dates: Sequence[SheetPictures],
     tiles_px: NDArray[np.intp],
     representation: Any,
-    seed: int,
-    work: Path | None,
+    learning: Learning,
     progress: Progress,
 ) -> tuple[Encoder, NDArray[np.float16]]:
     """Learn from the reference tiles and embed them: the embedder and embeddings (N, D).
 
     A triplet network's positives are the same tiles of `other_dates`; without any, the tiles
-    themselves with simulated ageing. `work`: folder for checkpoints and images of networks.
+    themselves with simulated ageing.
     Raises `MissingExtraError` if PyTorch or faiss is needed and missing.
     """
-    tiles = pictures.tiles(tiles_px)
-    encoder: Encoder
+    tiles = pictures.tiles(tiles_px, progress)
     if isinstance(recipe, WordsRecipe):
         chosen = _word_tiles(tiles)
-        encoder = learn_words(recipe, chosen, seed, lambda share: progress("learn words", share))
-    else:
-        positive: Any = [each.tiles(tiles_px) for each in other_dates]
-        learn_network = _training().learn_network
-        encoder = learn_network(
-            recipe,
-            tiles,
-            binary=not pictures.is_grey,
-            seed=seed,
-            work=work,
-            positive=positive or _changed_tiles(tiles, representation),
-            report=lambda text, share: _log_progress(progress, text, share),
+        encoder = learn_words(
+            recipe, chosen, learning.seed, lambda share: progress("learn words", share)
         )
-    return encoder, _embedded(encoder, tiles, progress)
+        return encoder, _embedded(lambda of: _words(encoder, tiles, of), tiles, progress)
+    positive: Any = [each.tiles(tiles_px, progress) for each in other_dates]
+    training = _training()
+    device = None if learning.device == "auto" else learning.device
+    trained = training.learn_network(
+        recipe,
+        tiles,
+        binary=not pictures.is_grey,
+        seed=learning.seed,
+        work=learning.work,
+        positive=positive or _changed_tiles(tiles, representation),
+        report=lambda text, share: _log_progress(progress, text, share),
+        means=training.Means(device=device, workers=learning.workers),
+    )
+    embedded = _embedded(lambda of: trained.views(tiles.batch(of)), tiles, progress)
+    _require_as_in_flight(trained.embedder, tiles, embedded)
+    return trained.embedder, embedded
+
+
+def _require_as_in_flight(
+    embedder: NetworkEmbedder, tiles: SheetTiles, embedded: NDArray[np.float16]
+) -> None:
+    """Raise `VariantError` if a device embeds tiles otherwise than the encoder that flies."""
+    some = np.unique(np.linspace(0, len(tiles) - 1, CHECKED_TILES).astype(np.intp))
+    flown, found = embedder.views(tiles.batch(some)), embedded[some].astype(np.float32)
+    away = float(np.abs(flown - found).max())
+    if away > SAME * max(float(np.abs(flown).max()), 1e-6):
+        raise VariantError(
+            f"the device embeds tiles otherwise than the encoder in flight, by {away:.2g}; "
+            "learn with --device cpu"
+        )
 
 
 def _log_progress(progress: Progress, text: str, share: float) -> None:
-    log.info("%s", text)
+    log.info("%s", text, extra={"share": share})
     progress("learn", share)
 
 
@@ -92,17 +124,23 @@ def _changed_tiles(
     return positive
 
 
-def _embedded(encoder: Encoder, tiles: SheetTiles, progress: Progress) -> NDArray[np.float16]:
-    out = np.empty((len(tiles), encoder.dims), np.float16)
+def _words(
+    encoder: WordsEmbedder, tiles: SheetTiles, indices: NDArray[np.intp]
+) -> NDArray[np.float32]:
+    valid = np.stack([tiles.valid_tile(int(index)) for index in indices])
+    return encoder.views(tiles.batch(indices), valid)
+
+
+def _embedded(
+    embed: Callable[[NDArray[np.intp]], NDArray[np.float32]], tiles: SheetTiles, progress: Progress
+) -> NDArray[np.float16]:
+    """Embeddings (N, D) of all tiles; `embed` takes indices of some."""
+    parts = []
     for start in range(0, len(tiles), BATCH_TILES):
         indices = np.arange(start, min(start + BATCH_TILES, len(tiles)))
-        maps = tiles.batch(indices)
-        if isinstance(encoder, WordsEmbedder):
-            valid = np.stack([tiles.valid_tile(int(index)) for index in indices])
-            out[indices] = encoder.views(maps, valid)
-        else:
-            out[indices] = encoder.views(maps)
+        parts.append(embed(indices).astype(np.float16))
         progress("embed", (int(indices[-1]) + 1) / len(tiles))
+    out = np.concatenate(parts)
     if not np.isfinite(out).all():
         raise VariantError(
             "embeddings are too large to be stored; learn with similarity=cosine, a smaller "

@@ -1,19 +1,28 @@
 """Methods and their default representations, as named on the command line."""
 
 import logging
+from importlib.util import find_spec
 from typing import Any
 
 from orthonav import embed, represent
 from orthonav.embed.network import AutoEncoderRecipe, TripletRecipe
 from orthonav.embed.whitened import WhitenedRecipe
 from orthonav.embed.words import WordsRecipe
-from orthonav.errors import VariantError
+from orthonav.errors import MissingExtraError, VariantError
+from orthonav.extras import needed, pip_line
 from orthonav.prepare.encoders import EncoderRecipe
 from orthonav.represent.gray import Gray
 from orthonav.variants import make_variant, variant_recipe
 
 log = logging.getLogger(__name__)
 
+LEARNT_WITH = {
+    "autoencoder": ("torch", "onnx", "onnxruntime"),
+    "triplet": ("torch", "onnx", "onnxruntime"),
+    "bovw": ("faiss",),
+}
+"""Modules of the extra "train" that learning a method needs."""
+DEVICES = ("auto", "cpu", "cuda")
 LOCAL_FIELDS = ("weights", "cache")
 
 
@@ -24,19 +33,48 @@ def usual_edges(method: str) -> str:
 
 
 def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderRecipe:
-    """The recipe of a method; one-channel images are whitened on finer cells by default."""
+    """The recipe of a method; one-channel images are whitened on finer cells by default.
+
+    Raises `VariantError`, and `MissingExtraError` naming all that learning it needs and lacks.
+    """
     name, _, parameters = method.partition(":")
+    absent = [each for each in LEARNT_WITH.get(name, ()) if find_spec(each) is None]
+    if absent:
+        gone = ", ".join(absent)
+        raise MissingExtraError(f"--method {name} needs {gone}: {pip_line('train')}")
     if name == "gradient" and representation.channels == 1 and "cells=" not in parameters:
         method = f"{name}:{parameters},cells=16"
     recipe = make_variant(embed.TABLE, method)
     assert isinstance(recipe, WhitenedRecipe | AutoEncoderRecipe | TripletRecipe | WordsRecipe)
     if isinstance(recipe, WordsRecipe) and not isinstance(representation, Gray):
         raise VariantError("bovw needs grey levels; give --edges gray, or omit --edges")
+    if isinstance(recipe, WhitenedRecipe) and getattr(representation, "per", "sheet") == "tile":
+        raise VariantError("edges per tile need a network; give --method autoencoder or triplet")
     if not represent.TABLE[_name_of(representation)].flies:
         log.warning(
             "%s is too slow for flight: this map is for experiments", _name_of(representation)
         )
     return recipe
+
+
+def check_device(name: str) -> None:
+    """Raise `VariantError` for an unknown device, and for a GPU that PyTorch does not see."""
+    if name not in DEVICES:
+        raise VariantError(f"device must be {', '.join(DEVICES)}, got '{name}'")
+    if name == "cuda" and not needed("torch", "train", "a GPU").cuda.is_available():
+        raise VariantError("PyTorch sees no GPU; use --device auto or cpu")
+
+
+def check_positives(recipe: WhitenedRecipe | EncoderRecipe, representation: Any) -> None:
+    """Raise `VariantError` if a triplet network without other dates would need days.
+
+    Its positives would be segmented anew at every step: seconds to minutes each.
+    """
+    if isinstance(recipe, TripletRecipe) and not represent.TABLE[_name_of(representation)].flies:
+        raise VariantError(
+            f"a triplet network on {_name_of(representation)} edges needs orthophotos of other "
+            "dates; give --other-date"
+        )
 
 
 def stored_representation(representation: Any) -> dict[str, Any]:

@@ -1,12 +1,13 @@
 """The representation of a whole sheet in bytes, from which encoders of images learn."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import VariantError
-from orthonav.files import Progress
+from orthonav.files import Progress, no_progress
 from orthonav.geo.area import Area
 from orthonav.geo.grid import TileGrid
 from orthonav.imagery.mosaic import Mosaic
@@ -15,6 +16,11 @@ from orthonav.prepare.blocks import Block, BlockPixels, blocks_of, read_block
 from orthonav.represent.gray import Gray
 
 BLOCK_PX = 1024
+
+
+def is_per_tile(representation: Any) -> bool:
+    """Whether every tile is represented by itself, not cut out of the sheet's representation."""
+    return getattr(representation, "per", "sheet") == "tile"
 
 
 class SheetPictures:
@@ -31,7 +37,7 @@ class SheetPictures:
             )
         shape = grid.height_px, grid.width_px
         self.is_grey = isinstance(representation, Gray)
-        self._grid = grid
+        self._grid, self._representation = grid, representation
         self._scale = 255.0 if self.is_grey else 1.0
         self._pixels = np.zeros((1, *shape), np.uint8)
         self._valid = np.zeros(shape, np.bool_)
@@ -56,10 +62,27 @@ class SheetPictures:
         if self._grey is not None:
             self._grey[where] = parts["pixels_grey"]
 
-    def tiles(self, tiles_px: NDArray[np.intp]) -> SheetTiles:
+    def tiles(self, tiles_px: NDArray[np.intp], progress: Progress = no_progress) -> SheetTiles:
         """Tiles whose first pixels (row, col) are given (N, 2)."""
         grey, tile_px = self._grey, self._grid.tile_px
-        return SheetTiles(self._pixels, self._valid, tiles_px, tile_px, self._scale, grey)
+        tiles = SheetTiles(self._pixels, self._valid, tiles_px, tile_px, self._scale, grey)
+        if not is_per_tile(self._representation):
+            return tiles
+        singles = np.zeros((len(tiles), 1, tile_px, tile_px), np.uint8)
+        for index in range(len(tiles)):
+            made = self._representation(tiles.grey_tile(index), tiles.valid_tile(index))
+            singles[index] = np.rint(made * self._scale)
+            progress("edges of tiles", (index + 1) / len(tiles))
+        return replace(tiles, singles=singles)
+
+
+def sheet_maps(
+    representation: Any, grey: NDArray[np.uint8], valid: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Representation (C, H, W) of a part of a sheet; zeros if tiles are represented singly."""
+    if is_per_tile(representation):
+        return np.zeros((representation.channels, *grey.shape), np.float32)
+    return np.asarray(representation(grey, valid), np.float32)
 
 
 def read_pictures(
@@ -76,7 +99,7 @@ def read_pictures(
         for done, block in enumerate(blocks):
             read = read_block(raster, grid, block, representation.margin_px)
             if read.pixels.valid.any():
-                maps = representation(read.pixels.grey, read.pixels.valid)
+                maps = sheet_maps(representation, read.pixels.grey, read.pixels.valid)
                 pictures.put(block, pictures.parts(read, maps))
             progress("other date", (done + 1) / len(blocks))
     return pictures

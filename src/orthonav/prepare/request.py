@@ -22,7 +22,7 @@ from orthonav.mapfile.manifest import Manifest
 from orthonav.prepare.calibrate import CROPS
 from orthonav.prepare.encoders import EncoderRecipe
 from orthonav.prepare.layout import grid_of
-from orthonav.prepare.methods import method_recipe, usual_edges
+from orthonav.prepare.methods import check_device, check_positives, method_recipe, usual_edges
 from orthonav.prepare.terrain import TerrainParts, terrain_of_dem
 from orthonav.variants import make_variant
 
@@ -55,7 +55,9 @@ class BuildRequest:
       registration, 1 to 384; as many views of other dates are located.
     - `work`: folder for finished blocks and checkpoints of networks, from which an interrupted
       build resumes; None: blocks of a large map in `OUT.work` until it is written.
-    - `workers`: threads that read the imagery, 1 to 64; None: one per core.
+    - `workers`: threads that read the imagery and make batches for a network, 1 to 64; None: one
+      per core that read, and 2 or, for a GPU, up to 16 that make batches.
+    - `device`: where a network is learnt, "auto" (a GPU if there is one), "cpu" or "cuda".
     - `dem`: terrain model from which the map gets a terrain layer; None: it has none.
     - `dem_datum`: what its heights count from, where the file does not state it
       (`orthonav.imagery.datum.OPTION`).
@@ -84,6 +86,7 @@ class BuildRequest:
     dem: Path | None = None
     dem_datum: str | None = None
     dem_needed: bool = True
+    device: str = "auto"
     cells: bool = False
 
 
@@ -122,6 +125,9 @@ class BuildInputs:
         edges = request.edges or usual_edges(request.method)
         representation = make_variant(represent.TABLE, edges)
         recipe = method_recipe(request.method, representation)
+        check_device(request.device)
+        if not request.other_dates:
+            check_positives(recipe, representation)
         mosaic = Mosaic.open(request.orthos)
         other_dates = tuple(Mosaic.open([path]) for path in request.other_dates)
         inputs = [source.path for each in (mosaic, *other_dates) for source in each.sources]

@@ -34,7 +34,7 @@ from orthonav.prepare.blocks import Block, Preview, blocks_of, margins, read_blo
 from orthonav.prepare.calibrate import CropSampler
 from orthonav.prepare.layer import CHUNK_PX, GreyLayerWriter, Parts, compressed_block
 from orthonav.prepare.parallel import in_order
-from orthonav.prepare.pictures import SheetPictures
+from orthonav.prepare.pictures import SheetPictures, sheet_maps
 from orthonav.variants import variant_recipe
 
 log = logging.getLogger(__name__)
@@ -180,7 +180,7 @@ class SheetReader:
         grey, valid = read.pixels.grey, read.pixels.valid
         if not valid.any():
             return {}
-        maps = self.representation(grey, valid)
+        maps = sheet_maps(self.representation, grey, valid)
         part = read.part(self._beyond_px)
         means, share = cell_means(maps[:, part[0], part[1]], valid[part], self._layout)
         parts: Parts = {"means": means, "share": share, "preview": self.preview.small(read)}

@@ -1,0 +1,46 @@
+"""The page `docs/paper-results.md`: all tables, from the rows in the repository alone."""
+
+from collections.abc import Iterator, Sequence
+
+from experiments.paper.results import Result
+from experiments.paper.scenes import SEED
+from experiments.paper.stored import ROOT, expected, made_at, name_of, older
+from experiments.paper.tables import tables
+from experiments.paper.trajectories import REDUCED, SETTINGS
+
+PAGE = ROOT / "docs" / "paper-results.md"
+HEAD = f"""# Results of the paper's experiments
+
+Made by `python -m experiments.paper keep` from `experiments/paper/rows`; do not edit.
+[The paper's experiments](paper.md) has the protocol and the discussion. Generated landscapes:
+seed {SEED}.
+"""
+
+
+def page(rows: Sequence[Result]) -> str:
+    """Text of the page: the tables of each setting, and the rows that are missing."""
+    text = [HEAD]
+    for name in SETTINGS:
+        found = [row for row in rows if row.plain["setting"]["name"] == name]
+        if found:
+            text.append(f"## The {name} setting\n")
+            text += [table.markdown() for table in tables(found)]
+    if names := missing(rows):
+        lines = "\n".join(f"- `{name}`" for name in names)
+        text.append(f"## Rows of the reduced setting without a stored result\n\n{lines}\n")
+    return "\n".join(text)
+
+
+def missing(rows: Sequence[Result]) -> list[str]:
+    """Names of the rows of the reduced setting that have no stored result."""
+    names = {name_of(row) for row in rows if row.plain["setting"]["name"] == REDUCED.name}
+    return [name for name in expected() if name not in names]
+
+
+def state(rows: Sequence[Result]) -> Iterator[str]:
+    """One line for each row that is older than its code, and one naming those without result."""
+    for row in rows:
+        if changed := older(row):
+            yield f"{name_of(row)} ({made_at(row)}) is older than {', '.join(changed)}"
+    if names := missing(rows):
+        yield f"without a stored result: {', '.join(names)}"

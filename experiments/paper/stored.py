@@ -1,0 +1,184 @@
+"""Results in the repository: one small file per row, and what has changed since it was made.
+
+A row names the code it was made with: a digest of every source file that decides its figures.
+"""
+
+import ast
+import hashlib
+import json
+import re
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from experiments.paper.methods import CANNY, DEFAULT, GREY, SAM, SEGMENTS, Method, column, methods
+from experiments.paper.results import Result, read
+from experiments.paper.scenes import REDUCED_REAL, UNTUNED
+from experiments.paper.trajectories import REDUCED, SETTINGS, TABLE_1
+from orthonav.files import write_text
+
+ROOT = Path(__file__).resolve().parents[2]
+ROWS = Path(__file__).resolve().parent / "rows"
+BASELINES = "baselines"
+DIGITS = 5
+"""Significant digits of figures in a row: a confidence to 1e-5, an error of 9 km to 0.1 m."""
+
+PROTOCOL = ("experiments/paper/views.py", "experiments/paper/runs.py")
+GENERATED = ("src/orthonav/simulate/landscape/*.py",)
+TILES = (
+    "src/orthonav/localizer/match.py",
+    "src/orthonav/localizer/rectify.py",
+    "src/orthonav/localizer/tiles.py",
+    "src/orthonav/search/*.py",
+)
+NETWORK = (
+    "src/orthonav/embed/network.py",
+    "src/orthonav/neural/tiles.py",
+    "src/orthonav/neural/training.py",
+)
+FAMILY = {
+    "gradient": ("src/orthonav/embed/cells.py", "src/orthonav/embed/whitened.py"),
+    "bovw": ("src/orthonav/embed/words.py", "src/orthonav/neural/words.py"),
+    "autoencoder": (*NETWORK, "src/orthonav/neural/autoencoder.py"),
+    "triplet": (
+        *NETWORK,
+        "src/orthonav/neural/triplet.py",
+        "src/orthonav/prepare/change.py",
+        "src/orthonav/prepare/encoders.py",
+    ),
+    BASELINES: ("benchmarks/posed.py", "experiments/paper/baselines.py"),
+}
+EDGES = {
+    DEFAULT: "src/orthonav/represent/gradients.py",
+    GREY: "src/orthonav/represent/gray.py",
+    CANNY: "src/orthonav/represent/canny.py",
+    SEGMENTS: "src/orthonav/represent/segments.py",
+    SAM: "src/orthonav/neural/sam.py",
+}
+REGISTRATION = (
+    "src/orthonav/confidence/*.py",
+    "src/orthonav/localizer/*.py",
+    "src/orthonav/register/*.py",
+)
+
+
+def code(family: str, edges: str, *, registration: bool, generated: bool) -> dict[str, str]:
+    """Digests of the files that decide the figures of a row, by path in the repository."""
+    patterns = [*PROTOCOL, *FAMILY[family], *(REGISTRATION if registration else TILES)]
+    patterns += GENERATED if generated else ()
+    patterns += [EDGES[edges.partition(":")[0]]] if edges else []
+    paths = {path for pattern in patterns for path in ROOT.glob(pattern)}
+    return {path.relative_to(ROOT).as_posix(): _digest(path) for path in sorted(paths)}
+
+
+@lru_cache
+def _digest(path: Path) -> str:
+    """Short digest of a source file without its comments and docstrings."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            node.body = [each for each in body if not _is_text(each)] or [ast.Pass()]  # type: ignore[attr-defined]
+    return hashlib.sha256(ast.unparse(tree).encode()).hexdigest()[:12]
+
+
+def _is_text(node: ast.AST) -> bool:
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
+
+
+def code_of(method: Method | None, scene: str) -> dict[str, str]:
+    """The same of a method on a scene; None: of the baselines."""
+    generated = column(scene) in TABLE_1
+    if method is None:
+        return code(BASELINES, "", registration=False, generated=generated)
+    return code(method.family, method.edges, registration=method.registration, generated=generated)
+
+
+def older(row: Result) -> list[str]:
+    """What has changed since a row was made: files, "recipe" or "setting"; empty if it is current.
+
+    A file that has gone, or that the row does not know, has changed.
+    """
+    plain = row.plain
+    made = Method(**plain["method"]) if row.family else None
+    known, now = plain.get("code", {}), code_of(made, row.scene)
+    changed = sorted(path for path in known.keys() | now if known.get(path) != now.get(path))
+    setting = SETTINGS[plain["setting"]["name"]]
+    if plain["setting"] != json.loads(json.dumps(asdict(setting))):
+        changed.append("setting")
+    if made is not None:
+        rows = methods(setting, row.scene, plain["tiles"], sam_weights="PATH")
+        if _plain(made.recipe) not in {
+            _plain(each.recipe) for each in rows if each.key == made.key
+        }:
+            changed.append("recipe")
+    return changed
+
+
+def _plain(recipe: str) -> str:
+    """A recipe without its epochs, of which more may be learnt."""
+    return re.sub(r",epochs=\d+", "", recipe)
+
+
+def expected() -> list[str]:
+    """Names of all rows of the reduced setting, as files are named."""
+    scenes = (*TABLE_1, *REDUCED_REAL, *UNTUNED)
+    names = [f"{scene}-{each.key}" for scene in scenes for each in methods(REDUCED, scene, 1000)]
+    return [*names, f"B-{BASELINES}"]
+
+
+def stored() -> list[Result]:
+    """All rows in the repository."""
+    return [row for name in SETTINGS for row in read(ROWS / name)]
+
+
+def keep(results: Path, setting: str) -> list[str]:
+    """Copy the results of a setting into the repository; the names of the rows that changed."""
+    changed = []
+    for path in sorted((results / setting).glob("*.json")):
+        target = ROWS / setting / path.name
+        text = path.read_text(encoding="utf-8")
+        if not target.is_file() or target.read_text(encoding="utf-8") != text:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            write_text(target, text)
+            changed.append(path.stem)
+    return changed
+
+
+def compact(made: dict[str, Any]) -> str:
+    """A result as text: one line per field, numbers rounded to five digits."""
+    lines = [
+        f"{json.dumps(name)}: {json.dumps(rounded(value), separators=(',', ':'))}"
+        for name, value in made.items()
+    ]
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def rounded(value: Any) -> Any:
+    """The same with numbers of five digits, and None for those that are not finite."""
+    if isinstance(value, dict):
+        return {str(key): rounded(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [rounded(item) for item in value]
+    if not isinstance(value, float):
+        return value
+    return float(f"{value:.{DIGITS}g}") if abs(value) < float("inf") else None
+
+
+def name_of(row: Result) -> str:
+    """Scene and method of a row, as its file is named."""
+    if not row.family:
+        return f"{row.scene}-{BASELINES}"
+    return f"{row.scene}-{Method(**row.plain['method']).key}"
+
+
+def made_at(row: Result) -> str:
+    """Commit and day of a row, "changed" where files were not committed."""
+    made = row.plain["provenance"]
+    changed = ", changed" if made["dirty"] else ""
+    return f"commit {str(made['commit'])[:10]}{changed}, {str(made['date'])[:10]}"
