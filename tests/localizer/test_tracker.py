@@ -39,7 +39,7 @@ def localizer(map_path):
 def changed(grey, rng):
     """Another year: other light, noise, and different content in a part of the view."""
     other = OTHER(*np.meshgrid(np.arange(320) + rng.uniform(-200, 200), np.arange(240)))
-    small = cv2.GaussianBlur(rng.standard_normal((30, 40)), (0, 0), 25 / 8)
+    small = cv2.GaussianBlur(rng.standard_normal((60, 80)), (0, 0), 25 / 4)
     mask = cv2.resize(small, grey.shape[::-1], interpolation=cv2.INTER_CUBIC) > 0
     mixed = np.where(mask, 0.7 * grey.astype(float) + 20, 0.5 * grey + 0.5 * other)
     return np.clip(mixed + rng.normal(0, 4, grey.shape), 0, 255).astype(np.uint8)
@@ -252,7 +252,7 @@ def tracking(localizer):
 def test_pictures_of_anything_else_give_dead_reckoning_only(localizer, tracking, picture):
     """The views overlap, and the reported velocity is reversed."""
     before, ahead = tracking
-    shared = (localizer, localizer.registration)
+    shared = (localizer, localizer.registration, before._before)
     tracker = copy.deepcopy(before, {id(each): each for each in shared})
     rng = np.random.default_rng(5)
     cloud = cv2.GaussianBlur(rng.normal(0, 900, (240, 320)), (0, 0), 12) + 190
