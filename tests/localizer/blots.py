@@ -28,15 +28,19 @@ class Ground:
     """Grey levels of a ground of blots of many sizes, by metres east and north of its middle."""
 
     def __init__(self, seed=0, reach_m=560.0):
-        rng = np.random.default_rng(seed)
-        side = int(reach_m / FINEST_M) * 2
-        self._grey = np.full((side, side), 128, np.float32)
+        self._seed, self._reach_m = seed, reach_m
+
+    @functools.cached_property
+    def _grey(self):
+        rng = np.random.default_rng(self._seed)
+        side = int(self._reach_m / FINEST_M) * 2
+        grey = np.full((side, side), 128, np.float32)
         for sigma_m in (1.5, 4.0, 12.0):
             small = cv2.GaussianBlur(
                 rng.standard_normal((side, side), np.float32), (0, 0), sigma_m / FINEST_M
             )
-            self._grey += 17 * small / small.std()
-        self._reach_m = reach_m
+            grey += 17 * small / small.std()
+        return grey
 
     def __call__(self, east_m, north_m):
         """The table is far finer than what it holds: a cubic spline between its pixels is it."""
