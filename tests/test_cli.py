@@ -711,6 +711,9 @@ def test_an_interrupt_leaves_nothing(writing, out, name, stage, number):
 KILLED = """
 import os, sys, time
 from orthonav.cli import main
+from orthonav.prepare import calibrate
+
+calibrate.CROPS = 16
 
 def held(_):
     print("here", flush=True)
