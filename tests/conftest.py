@@ -8,8 +8,6 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-# Nothing that tests write has to outlive the machine. A file that is closed is still an error.
-os.fsync = os.fstat
 # Before NumPy and PyTorch are loaded: tests run side by side.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -33,6 +31,8 @@ from orthonav.mapfile import open_map
 
 pytest_plugins = ["absent"]
 SEED = 2
+# Nothing that tests write has to outlive the machine. A file that is closed is still an error.
+os.fsync = os.fstat
 cv2.setNumThreads(1)  # tests run side by side
 # A slow or busy machine fails no test: the time limit of a whole test is in pyproject.toml.
 hypothesis.settings.register_profile("orthonav", deadline=None)

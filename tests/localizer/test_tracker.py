@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from blots import AGL_M, GROUND, Ground, map_of_blots, ortho_of_blots, rendered
+from blots import AGL_M, GROUND, Ground, known_map, rendered
 
 from orthonav.errors import CameraError, MapFileError
 from orthonav.geo.camera import Camera
@@ -26,9 +26,8 @@ OTHER = Ground(seed=1)
 
 
 @pytest.fixture(scope="module")
-def map_path(make_ortho, tmp_path_factory):
-    ortho, _ = ortho_of_blots(make_ortho, tmp_path_factory.mktemp("ortho"))
-    return map_of_blots(ortho, tmp_path_factory.mktemp("map") / "a.onav")
+def map_path(made_once, make_ortho):
+    return known_map(made_once, make_ortho).path
 
 
 @pytest.fixture(scope="module")

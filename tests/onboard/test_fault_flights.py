@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from benchmarks.fault_flights import CAMERA, Fault, FaultFlight, World
 from benchmarks.fault_scenarios import CAMERA_FAULTS, COMBINED_FAULTS, TELEMETRY_FAULTS
-from blots import AGL_M, GROUND, as_grey, map_of_blots, ortho_of_blots, rendered
+from blots import AGL_M, GROUND, as_grey, known_map, rendered
 
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
@@ -22,10 +22,9 @@ def picture(place, attitude, agl_m, rng):
 
 
 @pytest.fixture(scope="module")
-def world(make_ortho, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("faults")
-    ortho, frame = ortho_of_blots(make_ortho, folder)
-    localizer = Localizer(open_map(map_of_blots(ortho, folder / "area.onav")))
+def world(made_once, make_ortho):
+    _, path, frame = known_map(made_once, make_ortho)
+    localizer = Localizer(open_map(path))
     return World(localizer, frame, picture, 140.0, AGL_M, 20.0)
 
 

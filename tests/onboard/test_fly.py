@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from blots import AGL_M, GROUND, map_of_blots, ortho_of_blots, rendered
+from blots import AGL_M, GROUND, known_map, rendered
 from fake_autopilot import (
     MS,
     UTC_NS,
@@ -571,11 +571,10 @@ PACED = Path(__file__).parent / "paced.py"
 
 
 @pytest.fixture(scope="module")
-def flown(make_ortho, tmp_path_factory):
+def flown(made_once, make_ortho, tmp_path_factory):
     """A map, a flight folder over it, and the frame of the map."""
     folder = tmp_path_factory.mktemp("fly")
-    ortho, frame = ortho_of_blots(make_ortho, folder)
-    path = map_of_blots(ortho, folder / "area.onav")
+    _, path, frame = known_map(made_once, make_ortho)
     rng = np.random.default_rng(0)
     along = np.array([math.sin(math.radians(HEADING)), math.cos(math.radians(HEADING))])
     seen, truth = [], {}

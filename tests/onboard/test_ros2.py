@@ -19,7 +19,7 @@ pytest.importorskip("cyclonedds", reason="the extra ros2 (cyclonedds) is not ins
 
 import ros2_types as ros
 from bags import Messages, record
-from blots import AGL_M, CAMERA, GROUND, map_of_blots, ortho_of_blots, rendered
+from blots import AGL_M, CAMERA, GROUND, known_map, rendered
 from cyclonedds.idl import make_idl_struct
 from fake_autopilot import Time
 from fake_autopilot import fix as fix_of
@@ -651,11 +651,10 @@ ENOUGH = 5
 
 
 @pytest.fixture(scope="module")
-def flown(make_ortho, tmp_path_factory):
+def flown(made_once, make_ortho, tmp_path_factory):
     """A map, a bag over it with a GNSS receiver that lies, its frame and the true places."""
     folder = tmp_path_factory.mktemp("ros2")
-    ortho, frame = ortho_of_blots(make_ortho, folder)
-    path = map_of_blots(ortho, folder / "area.onav")
+    _, path, frame = known_map(made_once, make_ortho)
     messages, rng, begin_ns = Messages(), np.random.default_rng(0), 1_700_000_000 * S
     along = np.array([math.sin(math.radians(HEADING)), math.cos(math.radians(HEADING))])
     topics = {name: [] for name in ("/cam/image_raw", "/imu/data", "/range", "/gps/fix")}
