@@ -102,10 +102,7 @@ def map_path(area, made_once):
 
     def make(folder):
         out = folder / "area.onav"
-        request = BuildRequest([area.past], out, tile_px=128, gsd_m=2.5, calibration_views=16)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("orthonav.prepare.calibrate.CROPS", 96)
-            build_map(request)
+        build_map(BuildRequest([area.past], out, tile_px=128, gsd_m=2.5, calibration_views=24))
 
     return made_once("map", make) / "area.onav"
 
