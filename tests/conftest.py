@@ -1,6 +1,7 @@
 """What many tests share: a generated area at two dates, a map of it, a flight over it."""
 
 import fcntl
+import gc
 import logging
 import os
 import shutil
@@ -30,10 +31,23 @@ from orthonav.mapfile import open_map
 
 pytest_plugins = ["absent"]
 SEED = 2
+# Nothing that tests write has to outlive the machine. A file that is closed is still an error.
+os.fsync = os.fstat
 cv2.setNumThreads(1)  # tests run side by side
 # A slow or busy machine fails no test: the time limit of a whole test is in pyproject.toml.
 hypothesis.settings.register_profile("orthonav", deadline=None)
 hypothesis.settings.load_profile("orthonav")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Modules and tests live until the end: the garbage collector need not look at them."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from orthonav.mapfile import open_map
 from orthonav.records import Fix
 from orthonav.report import Drawing
 
-WHOLE_MAP = ["--tile-px", "64", "--overlap", "0.75", "--calibration-views", "6"]
+WHOLE_MAP = ["--tile-px", "64", "--overlap", "0.75", "--calibration-views", "2"]
 SMALL_MAP = ["--tile-px", "64", "--overlap", "0.75", "--no-registration"]
 
 
@@ -208,13 +208,13 @@ def test_localize_as_a_track(run, map_path, flight_path, out):
 
 def test_calibrate_and_fly_with_it(run, map_path, flight_path, out):
     mount, fixes, few = out / "mount.json", out / "fixes.jsonl", out / "flight"
-    shorten(shutil.copytree(flight_path, few), 16)
+    shorten(shutil.copytree(flight_path, few), 10)
     gnss = ["--gnss-positions", few / "truth.csv", "--gnss-std-m", "2"]
     done = run("calibrate", map_path, few, "--out", mount, *gnss)
     assert (done.code, done.err) == (0, "")
     assert "pitch, deg" in done.out and str(mount) in done.out
     plain = json.loads(mount.read_text())
-    assert abs(plain["heading_deg"]["value"]) < 8 and 5 <= plain["views"] <= 16
+    assert abs(plain["heading_deg"]["value"]) < 8 and 5 <= plain["views"] <= 10
     to = ["--out", fixes, "--mount", mount]
     assert run("localize", map_path, few, *to, "--smooth", "--lag", "2").code == 0
     turned = json.loads(mount.read_text())
@@ -228,7 +228,8 @@ def test_calibrate_and_fly_with_it(run, map_path, flight_path, out):
     refused(run("calibrate", map_path, few, "--out", mount, "--gnss-std-m", "0"), "above 0")
 
 
-def test_evaluate(run, fixes_path, truth_path, map_path, out, names_in):
+def test_evaluate(run, fixes_path, truth_path, map_path, out, names_in, monkeypatch):
+    monkeypatch.setattr("orthonav.report.canvas.DPI", 30)
     done = run(
         *("evaluate", fixes_path, "--truth", truth_path, "--radius-m", "40", "--map", map_path),
         *("--metrics", out / "metrics.json", "--report", out / "report"),
@@ -591,9 +592,15 @@ def commands(ortho, map_path, flight_path, fixes_path, truth_path, out):
     }
 
 
+@pytest.fixture(scope="module")
+def short_flight(flight_path, tmp_path_factory):
+    """Its first views, whose fixes fill more than a page of a disk."""
+    return shorten(shutil.copytree(flight_path, tmp_path_factory.mktemp("short") / "flight"), 8)
+
+
 @pytest.fixture
-def writing(ortho, map_path, flight_path, fixes_path, truth_path, out):
-    return commands(ortho, map_path, flight_path, fixes_path, truth_path, out)
+def writing(ortho, map_path, short_flight, fixes_path, truth_path, out):
+    return commands(ortho, map_path, short_flight, fixes_path, truth_path, out)
 
 
 LANDSCAPE = ["--size-m", "300", "300"]
@@ -704,6 +711,9 @@ def test_an_interrupt_leaves_nothing(writing, out, name, stage, number):
 KILLED = """
 import os, sys, time
 from orthonav.cli import main
+from orthonav.prepare import calibrate
+
+calibrate.CROPS = 16
 
 def held(_):
     print("here", flush=True)

@@ -24,13 +24,13 @@ def small_demo(area, monkeypatch):
     monkeypatch.setattr(landscape, "generate_area", generate)
     turns = tuple((east * 0.45, north * 0.35) for east, north in demo.WAYPOINTS_EN_M)
     monkeypatch.setattr(demo, "WAYPOINTS_EN_M", turns)
-    monkeypatch.setattr(demo, "SPACING_M", 120.0)
+    monkeypatch.setattr(demo, "SPACING_M", 150.0)
     monkeypatch.setattr(demo, "CHECK_EFFORT", 0.05)
     monkeypatch.setattr("orthonav.check.run.usable_cores", lambda: 1)
     monkeypatch.setattr("orthonav.report.canvas.DPI", 30)
-    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 48)
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 24)
     monkeypatch.setattr("orthonav.prepare.calibrate_registration.ENOUGH_RIGHT", 1)
-    quicker = functools.partial(BuildRequest, calibration_views=6)
+    quicker = functools.partial(BuildRequest, calibration_views=2)
     monkeypatch.setattr("orthonav.prepare.BuildRequest", quicker)
 
 

@@ -43,27 +43,28 @@ def value_of(option, action):
 SHARED = [option for option, uses in sorted(OPTIONS.items()) if len(uses) > 1]
 
 
-@pytest.mark.parametrize("option", SHARED)
-def test_an_option_takes_the_same_value_in_all_commands(option):
-    values = {}
-    for command, action in OPTIONS[option]:
-        values.setdefault(value_of(option, action), []).append(command)
-    assert len(values) == 1, values
+def test_an_option_takes_the_same_value_in_all_commands():
+    for option in SHARED:
+        values = {}
+        for command, action in OPTIONS[option]:
+            values.setdefault(value_of(option, action), []).append(command)
+        assert len(values) == 1, (option, values)
 
 
-@pytest.mark.parametrize("option", sorted(OPTIONS))
-def test_a_unit_in_the_name_is_the_metavar(option):
-    unit = option.rpartition("-")[2]
-    for command, action in OPTIONS[option]:
-        if unit in UNITS and action.nargs is None and action.type in (int, float):
-            assert action.metavar == unit.upper(), command
+def test_a_unit_in_the_name_is_the_metavar():
+    for option, uses in OPTIONS.items():
+        unit = option.rpartition("-")[2]
+        for command, action in uses:
+            if unit in UNITS and action.nargs is None and action.type in (int, float):
+                assert action.metavar == unit.upper(), (option, command)
 
 
-@pytest.mark.parametrize("option", sorted(OPTIONS))
-def test_an_option_has_help_and_a_number_says_of_what(option):
-    for command, action in OPTIONS[option]:
-        assert action.type is not float or action.metavar, command
-        assert action.help or option in ("-v", "-q", "--verbose", "--quiet"), command
+def test_an_option_has_help_and_a_number_says_of_what():
+    for option, uses in OPTIONS.items():
+        for command, action in uses:
+            assert action.type is not float or action.metavar, (option, command)
+            known = option in ("-v", "-q", "--verbose", "--quiet")
+            assert action.help or known, (option, command)
 
 
 @pytest.mark.parametrize("command, parser", ALL, ids=[name for name, _ in ALL])

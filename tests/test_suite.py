@@ -45,7 +45,7 @@ def test_a_run_ends_with_the_names_of_the_tests_that_crashed_or_hung(tmp_path):
     options = re.search(r"^PYTEST := \$\(BIN\)/python (.*)$", makefile, re.MULTILINE)
     assert options
     command = [sys.executable, *shlex.split(options[1]), "-p", "no:cacheprovider"]
-    limits = ["-o", "timeout=1", "-o", "faulthandler_timeout=3"]
+    limits = ["-o", "timeout=1", "-o", "faulthandler_timeout=2"]
     done = subprocess.run(
         [*command, "-c", str(ROOT / "pyproject.toml"), *limits, "--rootdir", ".", "."],
         cwd=tmp_path,

@@ -173,7 +173,7 @@ def test_a_route_that_leaves_the_map(checked, frame):
         ([[-200, 0], [200, 0]], {"yaw_std_deg": None, "agl_std": 0.0}),
         ([[-9000, 0], [9000, 0]], {"band_m": 20.0}),
         ([[-200, 0], [200, 0]], {"agl_m": 1.0, "effort": 0.05}),
-        ([[-200, 0], [200, 0]], {"agl_m": 20.0, "effort": 5.0}),
+        ([[-200, 0], [200, 0]], {"agl_m": 20.0, "effort": 2.0}),
     ],
     ids=lambda each: str(each) if isinstance(each, dict) else f"{len(each)} from {each[0][0]}",
 )

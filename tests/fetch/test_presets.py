@@ -13,7 +13,6 @@ from orthonav.fetch.urls import checked_url
 from orthonav.imagery.datum import datum_of
 
 DOCUMENTATION = Path(__file__).parents[2] / "docs" / "imagery.md"
-LAYERS = [(p.name, layer.id) for p in presets().values() for layer in p.layers.values()]
 
 
 @pytest.mark.parametrize("name", presets())
@@ -34,28 +33,26 @@ def test_a_service_is_complete(name):
     assert preset.layers
 
 
-@pytest.mark.parametrize("name, id_", LAYERS)
-def test_a_layer_is_complete(name, id_):
+@pytest.mark.parametrize("name", presets())
+def test_its_layers_are_complete(name):
     preset = presets()[name]
-    layer = preset.layers[id_]
-    assert "{" not in f"{layer}" and 0.05 <= layer.gsd_m <= (1 if preset.datum is None else 30)
-    assert layer.options.layer or preset.protocol == "stac"
-    assert layer.options.empty in (None, "black", "white")
-    assert 0 <= (layer.options.min_zoom or 0) <= (layer.options.max_zoom or 22) <= 22
-    if layer.date is None:
-        assert id_ == CURRENT
-    else:
-        check_date(layer.date)
-        assert layer.date.partition("/")[0] in id_
-    environ = {preset.key_env: "x" * 8} if preset.key_env else {}
-    source = name if id_ == CURRENT else f"{name}:{id_}"
-    spec = parse_source(source, ImageryOptions(), environ=environ)
-    assert (
-        spec.provenance.licence
-        and spec.provenance.attribution
-        and spec.provenance.date == layer.date
-    )
-    assert spec.options.layer == layer.options.layer
+    coarsest_m = 1 if preset.datum is None else 30
+    for id_, layer in preset.layers.items():
+        assert "{" not in f"{layer}" and 0.05 <= layer.gsd_m <= coarsest_m, id_
+        assert layer.options.layer or preset.protocol == "stac", id_
+        assert layer.options.empty in (None, "black", "white"), id_
+        assert 0 <= (layer.options.min_zoom or 0) <= (layer.options.max_zoom or 22) <= 22, id_
+        if layer.date is None:
+            assert id_ == CURRENT
+        else:
+            check_date(layer.date)
+            assert layer.date.partition("/")[0] in id_
+        environ = {preset.key_env: "x" * 8} if preset.key_env else {}
+        source = name if id_ == CURRENT else f"{name}:{id_}"
+        spec = parse_source(source, ImageryOptions(), environ=environ)
+        assert spec.provenance.licence and spec.provenance.attribution, id_
+        assert spec.provenance.date == layer.date, id_
+        assert spec.options.layer == layer.options.layer, id_
 
 
 def test_terrain_names_the_datum_of_its_heights():

@@ -4,6 +4,8 @@ The views are rendered by code that shares nothing with the program.
 """
 
 import functools
+from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from orthonav.confidence.registered import Chances, RegisteredConfidence
 from orthonav.geo.area import Area
 from orthonav.geo.camera import Camera
+from orthonav.geo.frames import LocalFrame
 from orthonav.imagery.mosaic import Mosaic
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.prepare.calibrate_registration import RegistrationCalibration
@@ -28,15 +31,19 @@ class Ground:
     """Grey levels of a ground of blots of many sizes, by metres east and north of its middle."""
 
     def __init__(self, seed=0, reach_m=560.0):
-        rng = np.random.default_rng(seed)
-        side = int(reach_m / FINEST_M) * 2
-        self._grey = np.full((side, side), 128, np.float32)
+        self._seed, self._reach_m = seed, reach_m
+
+    @functools.cached_property
+    def _grey(self):
+        rng = np.random.default_rng(self._seed)
+        side = int(self._reach_m / FINEST_M) * 2
+        grey = np.full((side, side), 128, np.float32)
         for sigma_m in (1.5, 4.0, 12.0):
             small = cv2.GaussianBlur(
                 rng.standard_normal((side, side), np.float32), (0, 0), sigma_m / FINEST_M
             )
-            self._grey += 17 * small / small.std()
-        self._reach_m = reach_m
+            grey += 17 * small / small.std()
+        return grey
 
     def __call__(self, east_m, north_m):
         """The table is far finer than what it holds: a cubic spline between its pixels is it."""
@@ -71,26 +78,46 @@ def rendered(ground, place_en_m, attitude, agl_m=AGL_M, camera=CAMERA):
 GROUND = Ground()
 
 
-def ortho_of_blots(make_ortho, folder):
-    """An orthophoto of the ground, and the plane of a map of it."""
+class KnownMap(NamedTuple):
+    """An orthophoto of the ground, a map of it with 1 m pixels, and the plane of the map."""
+
+    ortho: Path
+    path: Path
+    frame: LocalFrame
+
+
+def known_map(made_once, make_ortho):
+    """The same for all processes that run tests; not to be changed."""
+
+    def make(folder):
+        _map_of(_ortho_of(make_ortho, folder), folder / "area.onav")
+
+    folder = made_once("blots", make)
+    ortho = folder / "2020-05.tif"
+    return KnownMap(ortho, folder / "area.onav", _frame_of(ortho))
+
+
+def _frame_of(ortho):
+    outline = Mosaic.open([ortho]).outline_latlon_deg
+    return Area.from_outline(outline[:, 0], outline[:, 1]).frame
+
+
+def _ortho_of(make_ortho, folder):
     empty = np.ones((SIDE_M, SIDE_M), np.uint8)
     path = make_ortho(folder / "2020-05.tif", empty)
-    outline = Mosaic.open([path]).outline_latlon_deg
-    frame = Area.from_outline(outline[:, 0], outline[:, 1]).frame
+    frame = _frame_of(path)
     x, y = np.meshgrid(np.arange(SIDE_M) + 700_000.5, 6_599_999.5 - np.arange(SIDE_M))
     to_degrees = pyproj.Transformer.from_crs("EPSG:2154", "EPSG:4326", always_xy=True)
     lon, lat = to_degrees.transform(x.ravel(), y.ravel())
     east, north = np.reshape(frame.en_from_latlon(lat, lon).T, (2, SIDE_M, SIDE_M))
-    make_ortho(path, as_grey(GROUND(east, north)))
-    return path, frame
+    return make_ortho(path, as_grey(GROUND(east, north)))
 
 
-def map_of_blots(ortho, path):
-    """A map of that orthophoto with 1 m pixels; its confidence is as maps of its kind learn it."""
-    confidence = RegisteredConfidence(-3.5, (0.5, 12.0, 3.0), Chances(18.0, 16.0, 30.0))
-    learnt = RegistrationCalibration(confidence, 0.6, 20)
+def _map_of(ortho, path):
+    """The confidence is as maps of its kind learn it."""
+    confidence = RegisteredConfidence.usual(Chances(18.0, 16.0, 30.0))
+    learnt = RegistrationCalibration(confidence, 0.6)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.prepare.calibrate.CROPS", 16)
         patch.setattr("orthonav.prepare.build.calibrate_registration", lambda *_: learnt)
         build_map(BuildRequest([ortho], path, tile_px=128, overlap=0.75, gsd_m=1.0))
-    return path

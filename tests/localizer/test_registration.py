@@ -14,8 +14,7 @@ from blots import (
     GROUND,
     Ground,
     as_grey,
-    map_of_blots,
-    ortho_of_blots,
+    known_map,
     rendered,
 )
 
@@ -33,19 +32,19 @@ EVIDENCE |= {"gradient_correlation", "grey_correlation", "agreement", "overlap",
 
 
 @pytest.fixture(scope="module")
-def ortho(make_ortho, tmp_path_factory):
-    return ortho_of_blots(make_ortho, tmp_path_factory.mktemp("ortho"))
+def known(made_once, make_ortho):
+    return known_map(made_once, make_ortho)
 
 
 @pytest.fixture(scope="module")
-def map_path(ortho, tmp_path_factory):
-    return map_of_blots(ortho[0], tmp_path_factory.mktemp("map") / "area.onav")
+def map_path(known):
+    return known.path
 
 
 @pytest.fixture(scope="module")
-def localizer(map_path, ortho):
+def localizer(map_path, known):
     made = Localizer(open_map(map_path))
-    offset = made.sheet.frame.en_from_latlon(ortho[1].lat_deg, ortho[1].lon_deg)
+    offset = made.sheet.frame.en_from_latlon(known.frame.lat_deg, known.frame.lon_deg)
     assert made.registration is not None and np.hypot(*offset) < 1e-3
     return made
 
@@ -459,11 +458,11 @@ def test_without_registration_it_is_placed_by_its_tiles(localizer, map_path, pla
     assert error_m(localizer, fix, place) < error_m(coarse, tiled, place)
 
 
-def test_a_map_without_the_layer_is_flown_by_its_tiles(ortho, tmp_path, plain):
+def test_a_map_without_the_layer_is_flown_by_its_tiles(known, tmp_path, plain):
     path = tmp_path / "tiles.onav"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthonav.prepare.calibrate.CROPS", 16)
-        request = BuildRequest([ortho[0]], path, tile_px=128, overlap=0.75, gsd_m=1.0)
+        request = BuildRequest([known.ortho], path, tile_px=128, overlap=0.75, gsd_m=1.0)
         build_map(replace(request, registration=False))
     opened = open_map(path)
     assert GreyLayer.of(opened) is None and opened.manifest.registration is None

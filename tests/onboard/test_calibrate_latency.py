@@ -17,7 +17,7 @@ from orthonav.onboard.telemetry import VehicleState
 RATE_HZ = 5.0
 
 
-def logged(folder, flown, delay_s, *, used_s=0.0, seconds=45, rate_hz=RATE_HZ, heading_off=0.0):
+def logged(folder, flown, delay_s, *, used_s=0.0, seconds=32, rate_hz=RATE_HZ, heading_off=0.0):
     """A log of a flight whose images are late, flown with another latency."""
     log = FlightLog(folder / "flight.mcap", SMALL, {})
     begin_ns = UTC_NS + 1000 * S

@@ -121,7 +121,7 @@ def clouded(grey, rng):
     ids=["mirrored", "noise", "blank", "frozen"],
 )
 def test_wrong_images_give_no_delay(change):
-    seen = Measured(Flown(40, seed=6), lambda _: 0.12, seconds=32, change=change)
+    seen = Measured(Flown(40, seed=6), lambda _: 0.12, seconds=24, change=change)
     assert not any(each.found for each in seen.whole + seen.recent)
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from blots import AGL_M, GROUND, map_of_blots, ortho_of_blots, rendered
+from blots import AGL_M, GROUND, known_map, rendered
 from fake_autopilot import (
     MS,
     UTC_NS,
@@ -28,6 +28,7 @@ from fake_autopilot import (
     fix,
     write_flight,
 )
+from paced import pace_by
 
 from orthonav.cli import main
 from orthonav.errors import CameraError, MapChangedError, MapFileError
@@ -607,14 +608,14 @@ def test_a_camera_error_of_the_locator_is_a_wrong_camera(flight):
 
 SPEED_MPS, HEADING, EVERY_S = 14.0, 60.0, 0.5
 COUNT = 20
+PACED = Path(__file__).parent / "paced.py"
 
 
 @pytest.fixture(scope="module")
-def flown(make_ortho, tmp_path_factory):
+def flown(made_once, make_ortho, tmp_path_factory):
     """A map, a flight folder over it, and the frame of the map."""
     folder = tmp_path_factory.mktemp("fly")
-    ortho, frame = ortho_of_blots(make_ortho, folder)
-    path = map_of_blots(ortho, folder / "area.onav")
+    _, path, frame = known_map(made_once, make_ortho)
     rng = np.random.default_rng(0)
     along = np.array([math.sin(math.radians(HEADING)), math.cos(math.radians(HEADING))])
     seen, truth = [], {}
@@ -666,22 +667,7 @@ def wait_for(condition, seconds=60):
 def paced(monkeypatch):
     """Function that makes a playback wait until a line was written for every earlier image."""
 
-    def pace_by(lines):
-        def pace(clocks, factor):
-            given = []
-
-            def due_ns(time_ns):
-                written = lines.read_text().count('"frame"') if lines.exists() else 0
-                if written < len(given):
-                    return None
-                given.append(time_ns)
-                return clocks.mono_ns()
-
-            return due_ns
-
-        monkeypatch.setattr(cameras, "own_pace", pace)
-
-    return pace_by
+    return lambda lines: monkeypatch.setattr(cameras, "own_pace", pace_by(lines))
 
 
 def test_a_flight_from_end_to_end(flown, autopilot, paced, tmp_path):
@@ -762,16 +748,14 @@ def test_a_killed_flight_continues_from_the_saved_position(flown, autopilot, tmp
     """A process is killed in flight; the next one starts from the position that it saved."""
     path, folder, _, _ = flown
     state = tmp_path / "state.json"
-    fast = tmp_path / "flight"
-    fast.symlink_to(folder)
 
     def start(lines):
-        program = "import sys; from orthonav.cli import main; sys.exit(main(sys.argv[1:]))"
         arguments = [
-            *("fly", path, fast, "--state", state, "--jsonl", lines),
+            *(lines, tmp_path / "release", "fly", path, folder),
+            *("--state", state, "--jsonl", lines, "--telemetry-wait-ms", "10000"),
             *("--autopilot", f"udpin:{autopilot.port}", "--deadline-ms", "60000"),
         ]
-        return subprocess.Popen([sys.executable, "-c", program, *map(str, arguments)])
+        return subprocess.Popen([sys.executable, PACED, *map(str, arguments)])
 
     first = start(tmp_path / "1.jsonl")
     try:
@@ -803,13 +787,14 @@ def test_a_map_changed_in_place_in_flight_stops_positions_only(flown, autopilot,
     path, folder, _, _ = flown
     area, lines, state = tmp_path / "area.onav", tmp_path / "lines.jsonl", tmp_path / "state.json"
     area.write_bytes(path.read_bytes())
-    program = "import sys; from orthonav.cli import main; sys.exit(main(sys.argv[1:]))"
+    release = tmp_path / "release"
     arguments = [
-        *("fly", area, folder, "--state", state, "--jsonl", lines, "--pace", "0.5"),
+        *(lines, release, "fly", area, folder, "--state", state, "--jsonl", lines),
+        *("--telemetry-wait-ms", "10000"),
         *("--autopilot", f"udpin:{autopilot.port}", "--deadline-ms", "60000"),
     ]
     process = subprocess.Popen(
-        [sys.executable, "-c", program, *map(str, arguments)], stderr=subprocess.PIPE, text=True
+        [sys.executable, PACED, *map(str, arguments)], stderr=subprocess.PIPE, text=True
     )
     try:
         wait_for(state.exists)  # a confident position was found
@@ -819,6 +804,7 @@ def test_a_map_changed_in_place_in_flight_stops_positions_only(flown, autopilot,
                 stream.write(bytes(size + 1))  # another size, as another map has
         else:
             os.truncate(area, size // 3 if how == "truncated" else 0)
+        release.touch()
         wait_for(lambda: '"reason": "map_file_changed"' in lines.read_text())
     finally:
         process.send_signal(signal.SIGTERM)

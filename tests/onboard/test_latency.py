@@ -139,7 +139,7 @@ def test_an_undisturbed_flight_keeps_its_messages():
     flight.fly(5)
     assert flight.gate.withheld["latency_unknown"] < 4.5 * flight.rate_hz  # compared first
     before = len(flight.results)
-    sent = flight.fly(40)
+    sent = flight.fly(25)
     assert len(sent) >= 0.98 * (len(flight.results) - before) and worst_m(sent) < 4.0
     assert flight.runner.health.reasons == ()
     plain = flight.monitor.plain()
@@ -151,7 +151,7 @@ def test_a_straight_flight_with_a_stated_latency_is_undisturbed():
     flight = LateFlight(straight, 0.12, constant(0.12))
     flight.fly(5.5)
     before = len(flight.results)
-    assert len(flight.fly(35)) >= 0.98 * (len(flight.results) - before)
+    assert len(flight.fly(20)) >= 0.98 * (len(flight.results) - before)
 
 
 def test_without_a_stated_latency_nothing_is_sent_until_it_is_measured():
@@ -170,13 +170,13 @@ def test_without_a_stated_latency_nothing_is_sent_until_it_is_measured():
 def test_without_a_stated_latency_a_straight_flight_sends_nothing():
     straight = Flown(70, turns=False, turbulence_deg=0.05, seed=2)
     flight = LateFlight(straight, None, constant(0.12))
-    assert flight.fly(40) == []
+    assert flight.fly(25) == []
 
 
-@pytest.mark.parametrize("late_s", [2.0, 8.0])
-def test_a_stream_that_is_late_from_the_start(late_s):
+def test_a_stream_that_is_late_from_the_start():
     """The stated latency is compared with the first images before it is used; then it is
     measured, and positions are withheld as stale."""
+    late_s = 8.0
     flight = LateFlight(Flown(90, seed=3), 0.12, constant(late_s))
     flight.fly(40)
     assert worst_m(flight.sent) < LARGEST_ERROR_M
@@ -190,7 +190,7 @@ def test_a_stall_after_which_the_stream_is_late(late_s, stamps):
     delay = {"s": 0.12}
     flight = LateFlight(Flown(110, seed=4), 0.12, lambda _: delay["s"])
     flight.stamps = stamps
-    assert len(flight.fly(20)) > 80
+    assert len(flight.fly(14)) > 50
     flight.stalled = True
     flight.fly(late_s - 0.12)
     flight.stalled, delay["s"] = False, late_s
@@ -249,7 +249,7 @@ def test_a_drifting_latency_is_followed():
 def test_mirrored_and_rotated_images_give_no_latency(change):
     flight = LateFlight(Flown(70, seed=1), None, constant(0.12))
     flight.stream.change = change
-    assert flight.fly(40) == []
+    assert flight.fly(25) == []
     assert flight.reasons() & {"latency_unknown", "motion_mismatch"}
 
 

@@ -39,7 +39,7 @@ SMALL = {"tile_px": 64, "overlap": 0.75, "calibration_views": 2}
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch):
     """Many small blocks, few crops, registration as if it was calibrated."""
-    learnt = RegistrationCalibration(USUAL_CONFIDENCE, 0.5, 20)
+    learnt = RegistrationCalibration(USUAL_CONFIDENCE, 0.5)
     monkeypatch.setattr("orthonav.prepare.build.calibrate_registration", lambda *_: learnt)
     monkeypatch.setattr("orthonav.prepare.sheet.BLOCK_PX", 128)
     monkeypatch.setattr("orthonav.prepare.sheet.MIN_CACHED_BLOCKS", 4)

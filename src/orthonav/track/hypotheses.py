@@ -21,7 +21,7 @@ MINOR_OF_GROUP = 0.01
 """Share of a group of hypotheses below which one says nothing about the group."""
 NORTH_STEP_M = 100.0
 """Length over which the convergence of two planes is measured."""
-COMPARED = np.ix_([0, 1, 2, 3, 6, 7], [0, 1, 2, 3, 6, 7])
+COMPARED = [0, 1, 2, 3, 6, 7]
 """Components that decide whether two hypotheses are alike: position, velocity and tilt."""
 
 
@@ -54,14 +54,16 @@ def merged(ordered: list[Hypothesis]) -> list[Hypothesis]:
     """Hypotheses, most likely first, with similar ones merged and the unlikely ones dropped."""
     likely = [each for each in ordered[: 4 * MAX_HYPOTHESES] if each.share > MIN_SHARE]
     left = likely or ordered[:1]  # the last one stays, however unlikely
+    means = np.stack([each.mean[COMPARED] for each in left])
+    covariances = np.stack([each.covariance[np.ix_(COMPARED, COMPARED)] for each in left])
+    numbers = np.arange(len(left))
     out: list[Hypothesis] = []
-    while left and len(out) < MAX_HYPOTHESES:
-        first, rest = left[0], left[1:]
-        inverse = np.asarray(np.linalg.inv(first.covariance[COMPARED]), np.float64)
-        group, left = [first], []
-        for each in rest:
-            alike = _divergence(each, first, inverse) < 2 * MERGE_SIGMAS**2
-            (group if alike else left).append(each)
+    while len(numbers) and len(out) < MAX_HYPOTHESES:
+        first = left[numbers[0]]
+        alike = _divergence(means[numbers], covariances[numbers]) < 2 * MERGE_SIGMAS**2
+        alike[0] = True
+        group = [left[number] for number in numbers[alike]]
+        numbers = numbers[~alike]
         mean, covariance = moments(group)
         share = sum(each.share for each in group)
         sighted = sum(each.share * each.sighted for each in group) / share
@@ -92,16 +94,19 @@ def major(group: Sequence[Hypothesis]) -> list[Hypothesis]:
     return [each for each in group if each.share >= least]
 
 
-def _divergence(one: Hypothesis, heavier: Hypothesis, inverse: Array) -> float:
-    """Kullback-Leibler divergence (nats) of a hypothesis from a more likely one.
+def _divergence(means: Array, covariances: Array) -> Array:
+    """Kullback-Leibler divergence (nats) of each of several Gaussians from the first, (N,).
 
-    In position, velocity and tilt; `inverse` (6, 6) is that of the more likely one's covariance. A
-    well-known place must not vanish in a wide hypothesis around it (docs/decisions/tracking.md, 8).
+    `means` (N, 6), `covariances` (N, 6, 6): the components `COMPARED`. A well-known place must not
+    vanish in a wide hypothesis around it (docs/decisions/tracking.md, 8).
     """
-    off = (one.mean - heavier.mean)[[0, 1, 2, 3, 6, 7]]
-    turned = inverse @ one.covariance[COMPARED]
+    inverse = np.linalg.inv(covariances[0])
+    off = means - means[0]
+    turned = inverse @ covariances
     _, log_det = np.linalg.slogdet(turned)
-    return float(off @ inverse @ off + np.trace(turned) - 6 - log_det) / 2
+    distance = np.einsum("ni,ij,nj->n", off, inverse, off)
+    spread = np.trace(turned, axis1=1, axis2=2)
+    return np.asarray((distance + spread - means.shape[1] - log_det) / 2)
 
 
 def moments(group: Sequence[Hypothesis]) -> tuple[Array, Array]:
