@@ -105,7 +105,7 @@ def add_recipe(parser: argparse._ActionsContainer) -> None:
         "--calibration-views",
         type=int,
         metavar="N",
-        help="simulated views of the orthophoto for calibrating the confidence (default 48)",
+        help="mirrored views that measure the level of chance on this map (default 24)",
     )
 
 
