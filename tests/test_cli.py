@@ -168,13 +168,16 @@ def test_localize(run, map_path, flight_path, out, names_in):
     done = run("localize", map_path, flight_path, "--out", out / "fixes.jsonl", "--json")
     assert (done.code, done.err) == (0, "") and names_in(out) == ["fixes.jsonl"]
     plain = json.loads(done.out)
-    assert plain["views"] == plain["n_fix"] == 30 and plain["median_latency_ms"] > 0
+    assert plain["views"] == plain["n_confident"] + plain["n_unsure"] == 30
+    assert plain["n_confident"] > 20 and plain["median_latency_ms"] > 0 and not plain["advice"]
     lines = [json.loads(line) for line in (out / "fixes.jsonl").read_text().splitlines()]
     assert [line["frame"] for line in lines] == [f"{n:04d}.jpg" for n in range(1, 31)]
     assert {line["status"] for line in lines} == {"fix"}
+    assert sum(line["confident"] for line in lines) == plain["n_confident"]
     few = shorten(shutil.copytree(flight_path, out / "flight"), 4)
     text = run("localize", map_path, few, "--out", out / "fixes.jsonl", "--prior", "none")
-    assert text.code == 0 and "4 views: 4 fixes" in text.out
+    assert text.code == 0 and "4 views: " in text.out
+    assert "confident (confidence 0.9 or more), " in text.out
 
 
 def test_localize_without_heading(run, map_path, flight_path, out):
@@ -186,7 +189,7 @@ def test_localize_without_heading(run, map_path, flight_path, out):
     unknown = run(
         "localize", map_path, frames, "--out", out / "b.jsonl", "--json", "--heading", "unknown"
     )
-    assert json.loads(known.out)["n_no_fix"] == 3 and json.loads(unknown.out)["n_fix"] == 3
+    assert json.loads(known.out)["n_none"] == 3 and json.loads(unknown.out)["n_none"] == 0
 
 
 def test_localize_as_a_track(run, map_path, flight_path, out):
@@ -496,7 +499,7 @@ def test_bad_images_may_be_skipped(run, map_path, flown, out):
     (flown / "frames" / "0009.jpg").write_bytes((flown / "frames/0009.jpg").read_bytes()[:3000])
     done = run("localize", map_path, flown, "--out", out / "f.jsonl", "--skip-bad-images", "--json")
     plain = json.loads(done.out)
-    assert done.code == 0 and (plain["n_fix"], plain["n_no_fix"]) == (8, 2)
+    assert done.code == 0 and plain["n_none"] == 2 and plain["views"] == 10
     results = read_results(out / "f.jsonl")
     assert [r.outcome.reason for r in results if not isinstance(r.outcome, Fix)] == [
         "bad_image"
@@ -510,7 +513,7 @@ def test_views_without_telemetry_do_not_end_a_flight(run, map_path, flown, out, 
     lines[4] = _with(lines[4], column, value)
     (flown / "telemetry.csv").write_text("\n".join(lines) + "\n")
     done = run("localize", map_path, flown, "--out", out / "fixes.jsonl", "--json")
-    assert (done.code, done.err) == (0, "") and json.loads(done.out)["n_no_fix"] == 1
+    assert (done.code, done.err) == (0, "") and json.loads(done.out)["n_none"] == 1
     outcome = read_results(out / "fixes.jsonl")[3].outcome
     assert outcome.reason == "missing_telemetry"
 

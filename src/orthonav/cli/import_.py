@@ -45,6 +45,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Import and print a summary."""
+    from orthonav.geo.headings import RADIANS
     from orthonav.sources import import_flight
 
     recording = open_source(options.source, options)
@@ -60,6 +61,8 @@ def run(options: argparse.Namespace) -> None:
             done.views - done.complete,
             done.views,
         )
+    if done.radians:
+        log.warning("%s", RADIANS)
     if options.json:
         plain = {"flight": str(options.out), "kind": recording.kind, "note": recording.note}
         print_json({**plain, **asdict(done)})
