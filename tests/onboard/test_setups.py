@@ -71,13 +71,21 @@ def test_mirrored_images_are_found(registering, views):
     assert found.setup.mirrored and found.confident == 2
 
 
-def test_a_map_of_another_area_is_not_explained(registering, views):
-    noise = np.random.default_rng(1).integers(0, 255, views[0].grey.shape, dtype=np.uint8)
-    prior = Prior(registering.sheet.frame.lat_deg, registering.sheet.frame.lon_deg, 30.0)
-    found = tried(
-        registering, [told(View(noise, views[0].camera, views[0].telemetry), prior=prior)]
-    )
-    assert not any(each.explains for each in found) and 5 <= len(found) <= 10
+def test_a_map_of_another_area_is_not_explained(views):
+    """At most ten set-ups are tried, and those of an unknown heading once."""
+
+    class Elsewhere:
+        asked = 0
+
+        def locate(self, view, prior, heading_known):
+            self.asked += 1
+            return NoFix("no_match", "")
+
+    prior = Prior(46.0, 3.0, 30.0)
+    many = [told(views[0], prior=prior, yaw_deg=0.7 * number) for number in range(SAMPLE)]
+    found = tried(elsewhere := Elsewhere(), many)
+    assert len(found) == 10 and elsewhere.asked == 40 and not any(e.explains for e in found)
+    assert len(tried(Elsewhere(), many, heading_known=False, use_prior=False)) == 5
     (said,) = setup_text(found, on_map=False)
     assert "none explains it" in said and "check first that the map shows the area" in said
     assert "the recorded positions lie on the map" in setup_text(found, on_map=True)[0]
