@@ -68,7 +68,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Measure, print the table, write JSON and report."""
     from orthonav.errors import FlightError
-    from orthonav.evaluate.flights import flights_to_json, summary, table, total
+    from orthonav.evaluate.flights import flights_to_json, summary, table, total, verdict
     from orthonav.files import write_text
     from orthonav.mapfile import open_map
 
@@ -95,7 +95,7 @@ def run(options: argparse.Namespace) -> None:
     if options.json:
         print_json(plain)
         return
-    print(f"{table(flights, whole)}\n\n{summary(flights, whole)}")
+    print(f"{verdict(whole)}\n\n{table(flights, whole)}\n\n{summary(flights, whole)}")
     if options.report:
         print(f"report: {options.report / 'index.html'}")
 
