@@ -603,13 +603,9 @@ LANDSCAPE = ["--size-m", "300", "300"]
 WRITERS = ["build", "simulate", "localize", "evaluate", "metrics", "landscape"]
 
 
-def files_in(folder):
-    return [path for path in folder.rglob("*") if not path.is_dir()]
-
-
 def nothing_in(folder):
-    """Neither files nor hidden temporaries; an empty folder does no harm."""
-    return files_in(folder) == [] and not [p for p in folder.iterdir() if p.name[0] == "."]
+    """Neither files nor hidden temporaries nor folders."""
+    return list(folder.iterdir()) == []
 
 
 @contextlib.contextmanager
@@ -656,7 +652,23 @@ def test_a_full_disk(run, writing, out, name, monkeypatch, undrawn):
 
     monkeypatch.setattr(os, "fsync", full)
     refused(run(*writing[name]), "disk full; nothing was written")
-    assert files_in(out) == []
+    assert nothing_in(out)
+
+
+def test_a_full_disk_and_a_folder(run, writing, out, monkeypatch):
+    """It is written to a temporary folder, which is not the one that is named."""
+    (out / "earlier").mkdir()
+    write, left = Path.write_bytes, [1]
+
+    def full(path, data):
+        if path.suffix == ".jpg" and not left.pop():
+            raise OSError(errno.ENOSPC, "No space left on device")
+        left.append(0)
+        return write(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    refused(run(*writing["simulate"]), f"disk full; nothing was written: {out / 'flight'}")
+    assert [path.name for path in out.iterdir()] == ["earlier"]
 
 
 @pytest.mark.parametrize("name", ["build", "metrics"])
