@@ -4,6 +4,7 @@ import contextlib
 import errno
 import hashlib
 import json
+import math
 import os
 import resource
 import shutil
@@ -158,6 +159,10 @@ def test_info(run, map_path):
     assert (done.code, done.err) == (0, "")
     assert str(map_path) in done.out and "2.5 m per pixel" in done.out and "2016-07" in done.out
     plain = json.loads(run("info", map_path, "--json").out)
+    manifest = open_map(map_path).manifest
+    assert plain["radius_m"] == manifest.registration["radius_m"] == 35.0  # that fixes state
+    assert plain["tile_radius_m"] == manifest.radius_m != 35.0
+    assert "confidence probability of an error below 35 m, with --registration off" in done.out
     assert plain["tiles"] == open_map(map_path).manifest.sheets[0].tiles and plain["calibrated"]
     west, south, east, north = plain["sheets"][0]["bounds_deg"]
     assert west < plain["sheets"][0]["centre_lon_deg"] < east and south < north
@@ -245,6 +250,66 @@ def test_evaluate(run, fixes_path, truth_path, map_path, out, names_in):
     assert metrics["acc_at_15m"] <= metrics["acc_at_40m"] and metrics["acc_at_40m"] >= 0.9
     stdout = run("evaluate", fixes_path, "--truth", truth_path, "--json")
     assert (stdout.code, stdout.err) == (0, "") and json.loads(stdout.out)["radius_m"] == 15
+
+
+def test_true_positions_of_another_place_are_named(run, fixes_path, truth_path, tmp_path):
+    lines = [line.split(",") for line in truth_path.read_text().splitlines()]
+    for name, told, said in (
+        ("swapped.csv", [[f, lon, lat] for f, lat, lon in lines[1:]], "seem to be swapped"),
+        ("far.csv", [[f, str(float(lat) - 5), lon] for f, lat, lon in lines[1:]], "same flight?"),
+    ):
+        rows = [",".join(row) for row in [lines[0], *told]]
+        (tmp_path / name).write_text("\n".join(rows) + "\n")
+        done = run("evaluate", fixes_path, "--truth", tmp_path / name)
+        assert done.code == 0 and said in done.err and " km from the fixes (median)" in done.err
+        assert " confident fixes are WRONG, by more than 35 m" in done.out.splitlines()[0]
+
+
+def test_a_map_of_another_area_is_named(run, map_path, flight_path, out):
+    """Nothing is tried where the recorded positions lie elsewhere; swapped ones are named."""
+    few = shorten(shutil.copytree(flight_path, out / "flight"), 4)
+    truth = few / "truth.csv"
+    rows = [line.split(",") for line in truth.read_text().splitlines()]
+    for told, said in (
+        ([[frame, str(float(lat) - 5), lon] for frame, lat, lon in rows[1:]], " km from the map; "),
+        ([[frame, lon, lat] for frame, lat, lon in rows[1:]], "seem to be swapped"),
+    ):
+        truth.write_text("\n".join(",".join(row) for row in [rows[0], *told]) + "\n")
+        done = run(
+            *("localize", map_path, few, "--out", out / "f.jsonl", "--json"),
+            *("--accept", "confidence:0.9999999"),
+        )
+        plain = json.loads(done.out)
+        assert plain["n_confident"] == 0 and plain["setups"] == [] and said in done.err
+        assert said in plain["advice"][0] and plain["advice"][0].startswith(
+            "the recorded positions"
+        )
+
+
+def test_a_wrong_heading_is_no_success(run, map_path, flight_path, out):
+    """Turned by 180 deg, and in radians."""
+    few = shorten(shutil.copytree(flight_path, out / "flight"), 5)
+    lines = (few / "telemetry.csv").read_text().splitlines()
+    yaw_deg = [float(line.split(",")[2]) for line in lines[1:]]
+    to = ["--out", out / "f.jsonl"]
+    turned = [
+        _with(line, 2, str((yaw + 180) % 360)) for line, yaw in zip(lines[1:], yaw_deg, strict=True)
+    ]
+    (few / "telemetry.csv").write_text("\n".join([lines[0], *turned]) + "\n")
+    done = run("localize", map_path, few, *to)
+    assert done.code == 0 and "5 views: 0 confident" in done.out
+    assert "unsure views are confident with any heading, " in done.out
+    assert "unsure positions are best guesses" in done.out
+    radians = [
+        _with(line, 2, str(math.radians(yaw))) for line, yaw in zip(lines[1:], yaw_deg, strict=True)
+    ]
+    (few / "telemetry.csv").write_text("\n".join([lines[0], *radians]) + "\n")
+    plain = json.loads(run("localize", map_path, few, *to, "--json").out)
+    assert plain["advice"][0].startswith("all headings are within -2 pi to 2 pi")
+    assert "with the headings taken as radians" in " ".join(plain["advice"])
+    assert plain["setups"][-1]["setup"] == "headings in radians"
+    imported = run("import", few, "--out", out / "imported")
+    assert imported.code == 0 and "as in radians" in imported.err
 
 
 def test_evaluate_several(run, fixes_path, truth_path):
