@@ -126,19 +126,19 @@ def setup_text(tried: "Sequence[Tried]", *, on_map: bool) -> list[str]:
     `on_map`: the flight recorded positions, and some of them lie on the map.
     """
     *failed, last = tried
-    views = last.views
     if not last.explains:
-        others = _listed(tried)
+        names = ", ".join(each.setup.name for each in tried)
+        most = max(each.confident for each in tried)
         where = (
             "the recorded positions lie on the map, so check the camera, and whether the ground "
             "changed or has no structure"
             if on_map
-            else "no position was recorded, so check first that the map shows the area; then the "
+            else "no position was recorded, so check first that the map shows the area, then the "
             "camera and the ground"
         )
-        return [f"{views} of the unsure views were tried with {others}: none explains it; {where}"]
-    counted = f"{last.confident} of {views} unsure views are confident"
-    lines = [f"{counted} {_explanation(last)}"]
+        tested = f"{names}: at most {most} of {last.views} unsure views are confident"
+        return [f"no other set-up explains it ({tested}); {where}"]
+    lines = [f"{last.confident} of {last.views} unsure views are confident {_explanation(last)}"]
     return [*lines, f"also tried: {_listed(failed)}"] if failed else lines
 
 
@@ -153,7 +153,7 @@ def _explanation(found: "Tried") -> str:
     if setup.without_prior:
         return "without the prior; check the prior positions"
     if setup.radians:
-        return "with the headings taken as radians; check the unit of the heading column"
+        return "with the headings taken as radians"
     if setup.mirrored:
         return "if mirrored left to right, with any heading; check where the images come from"
     if setup.any_heading:

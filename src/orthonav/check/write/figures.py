@@ -110,7 +110,11 @@ def _draw_route(axes: "Axes", result: CheckResult, along: Along) -> None:
         style: Any = (0, [each / risk.width for each in risk.dash]) if risk.dash else "-"
         looks = {"color": risk.colour, "linewidth": 0.5 * risk.width, "linestyle": style}
         found = [points[first : last + 1] for kind, first, last in drawn if kind == number]
-        edge = {"color": risk.edge, "linewidth": 0.5 * (risk.width + EDGE_PX), "zorder": 3}
+        edge: dict[str, Any] = {
+            "color": risk.edge,
+            "linewidth": 0.5 * (risk.width + EDGE_PX),
+            "zorder": 3,
+        }
         for i, line in enumerate(found):
             axes.plot(*line.T, **edge, solid_capstyle="round")
             axes.plot(*line.T, **looks, label="" if i else risk.range_text, zorder=4)
