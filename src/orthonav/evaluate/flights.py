@@ -31,7 +31,6 @@ _COLUMNS = (
     "of fixes",
     "median m",
     "95 % m",
-    "mean m",
     "max m",
     "latency ms",
 )
@@ -209,7 +208,6 @@ def _row(name: str, metrics: Metrics) -> list[str]:
         percent_text(metrics.accuracy_of_fixes),
         measure_text(metrics.standard.cep50_m),
         measure_text(metrics.standard.cep95_m),
-        measure_text(metrics.standard.ape.mean_m),
         measure_text(metrics.standard.ape.max_m),
         measure_text(metrics.latency_median_ms),
     ]
