@@ -82,16 +82,12 @@ def _confidence(manifest: "Manifest") -> dict[str, Any]:
 
 def _confidence_text(plain: Mapping[str, Any]) -> str:
     """What the confidence of a fix is the probability of."""
-
-    def stated(calibrated: bool, radius_m: float | None) -> str:
-        what = "probability of an error below" if calibrated else "none, for"
-        return f"{what} {'-' if radius_m is None else f'{radius_m:g}'} m"
-
-    text = stated(plain["calibrated"], plain["radius_m"])
+    radius = "-" if plain["radius_m"] is None else f"{plain['radius_m']:g}"
+    text = f"{'probability of an error below' if plain['calibrated'] else 'none, for'} {radius} m"
     if plain["registration"] is None:
         return text
-    tiles = stated(plain["tiles_calibrated"], plain["tile_radius_m"])
-    return f"{text}, with --registration off {tiles}"
+    tiles = f"{'' if plain['tiles_calibrated'] else 'none, for '}{plain['tile_radius_m']:g} m"
+    return f"{text}; with --registration off, {tiles}"
 
 
 def _registration(manifest: "Manifest") -> dict[str, Any] | None:
