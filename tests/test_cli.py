@@ -4,6 +4,7 @@ import contextlib
 import errno
 import hashlib
 import json
+import math
 import os
 import resource
 import shutil
@@ -158,6 +159,10 @@ def test_info(run, map_path):
     assert (done.code, done.err) == (0, "")
     assert str(map_path) in done.out and "2.5 m per pixel" in done.out and "2016-07" in done.out
     plain = json.loads(run("info", map_path, "--json").out)
+    manifest = open_map(map_path).manifest
+    assert plain["radius_m"] == manifest.registration["radius_m"] == 35.0  # that fixes state
+    assert plain["tile_radius_m"] == manifest.radius_m != 35.0
+    assert "confidence probability of an error below 35 m; with --registration off, " in done.out
     assert plain["tiles"] == open_map(map_path).manifest.sheets[0].tiles and plain["calibrated"]
     west, south, east, north = plain["sheets"][0]["bounds_deg"]
     assert west < plain["sheets"][0]["centre_lon_deg"] < east and south < north
@@ -168,13 +173,16 @@ def test_localize(run, map_path, flight_path, out, names_in):
     done = run("localize", map_path, flight_path, "--out", out / "fixes.jsonl", "--json")
     assert (done.code, done.err) == (0, "") and names_in(out) == ["fixes.jsonl"]
     plain = json.loads(done.out)
-    assert plain["views"] == plain["n_fix"] == 30 and plain["median_latency_ms"] > 0
+    assert plain["views"] == plain["n_confident"] + plain["n_unsure"] == 30
+    assert plain["n_confident"] > 20 and plain["median_latency_ms"] > 0 and not plain["advice"]
     lines = [json.loads(line) for line in (out / "fixes.jsonl").read_text().splitlines()]
     assert [line["frame"] for line in lines] == [f"{n:04d}.jpg" for n in range(1, 31)]
     assert {line["status"] for line in lines} == {"fix"}
+    assert sum(line["confident"] for line in lines) == plain["n_confident"]
     few = shorten(shutil.copytree(flight_path, out / "flight"), 4)
     text = run("localize", map_path, few, "--out", out / "fixes.jsonl", "--prior", "none")
-    assert text.code == 0 and "4 views: 4 fixes" in text.out
+    assert text.code == 0 and "4 views: " in text.out
+    assert "confident (confidence 0.9 or more), " in text.out
 
 
 def test_localize_without_heading(run, map_path, flight_path, out):
@@ -186,7 +194,7 @@ def test_localize_without_heading(run, map_path, flight_path, out):
     unknown = run(
         "localize", map_path, frames, "--out", out / "b.jsonl", "--json", "--heading", "unknown"
     )
-    assert json.loads(known.out)["n_no_fix"] == 3 and json.loads(unknown.out)["n_fix"] == 3
+    assert json.loads(known.out)["n_none"] == 3 and json.loads(unknown.out)["n_none"] == 0
 
 
 def test_localize_as_a_track(run, map_path, flight_path, out):
@@ -243,6 +251,66 @@ def test_evaluate(run, fixes_path, truth_path, map_path, out, names_in, monkeypa
     assert metrics["acc_at_15m"] <= metrics["acc_at_40m"] and metrics["acc_at_40m"] >= 0.9
     stdout = run("evaluate", fixes_path, "--truth", truth_path, "--json")
     assert (stdout.code, stdout.err) == (0, "") and json.loads(stdout.out)["radius_m"] == 15
+
+
+def test_true_positions_of_another_place_are_named(run, fixes_path, truth_path, tmp_path):
+    lines = [line.split(",") for line in truth_path.read_text().splitlines()]
+    for name, told, said in (
+        ("swapped.csv", [[f, lon, lat] for f, lat, lon in lines[1:]], "seem to be swapped"),
+        ("far.csv", [[f, str(float(lat) - 5), lon] for f, lat, lon in lines[1:]], "same flight?"),
+    ):
+        rows = [",".join(row) for row in [lines[0], *told]]
+        (tmp_path / name).write_text("\n".join(rows) + "\n")
+        done = run("evaluate", fixes_path, "--truth", tmp_path / name)
+        assert done.code == 0 and said in done.err and " km from the fixes (median)" in done.err
+        assert " confident fixes are WRONG, by more than 35 m" in done.out.splitlines()[0]
+
+
+def test_a_map_of_another_area_is_named(run, map_path, flight_path, out):
+    """Nothing is tried where the recorded positions lie elsewhere; swapped ones are named."""
+    few = shorten(shutil.copytree(flight_path, out / "flight"), 4)
+    truth = few / "truth.csv"
+    rows = [line.split(",") for line in truth.read_text().splitlines()]
+    for told, said in (
+        ([[frame, str(float(lat) - 5), lon] for frame, lat, lon in rows[1:]], " km from the map; "),
+        ([[frame, lon, lat] for frame, lat, lon in rows[1:]], "seem to be swapped"),
+    ):
+        truth.write_text("\n".join(",".join(row) for row in [rows[0], *told]) + "\n")
+        done = run(
+            *("localize", map_path, few, "--out", out / "f.jsonl", "--json"),
+            *("--accept", "confidence:0.9999999"),
+        )
+        plain = json.loads(done.out)
+        assert plain["n_confident"] == 0 and plain["setups"] == [] and said in done.err
+        assert said in plain["advice"][0] and plain["advice"][0].startswith(
+            "the recorded positions"
+        )
+
+
+def test_a_wrong_heading_is_no_success(run, map_path, flight_path, out):
+    """Turned by 180 deg, and in radians."""
+    few = shorten(shutil.copytree(flight_path, out / "flight"), 5)
+    lines = (few / "telemetry.csv").read_text().splitlines()
+    yaw_deg = [float(line.split(",")[2]) for line in lines[1:]]
+    to = ["--out", out / "f.jsonl"]
+    turned = [
+        _with(line, 2, str((yaw + 180) % 360)) for line, yaw in zip(lines[1:], yaw_deg, strict=True)
+    ]
+    (few / "telemetry.csv").write_text("\n".join([lines[0], *turned]) + "\n")
+    done = run("localize", map_path, few, *to)
+    assert done.code == 0 and "5 views: 0 confident" in done.out
+    assert "unsure views are confident with any heading, " in done.out
+    assert "unsure positions are best guesses" in done.out
+    radians = [
+        _with(line, 2, str(math.radians(yaw))) for line, yaw in zip(lines[1:], yaw_deg, strict=True)
+    ]
+    (few / "telemetry.csv").write_text("\n".join([lines[0], *radians]) + "\n")
+    plain = json.loads(run("localize", map_path, few, *to, "--json").out)
+    assert plain["advice"][0].startswith("all headings are within -2 pi to 2 pi")
+    assert "with the headings taken as radians" in " ".join(plain["advice"])
+    assert plain["setups"][-1]["setup"] == "headings in radians"
+    imported = run("import", few, "--out", out / "imported")
+    assert imported.code == 0 and "as in radians" in imported.err
 
 
 def test_evaluate_several(run, fixes_path, truth_path):
@@ -347,7 +415,7 @@ def test_build_refuses(run, ortho, out, names_in, make_ortho, tmp_path):
     refused(built("--ortho", cut, *small), "cut.tif")
     refused(built("--ortho", no_crs, *small), "coordinate reference system", "no_crs.tif")
     refused(built("--ortho", nothing, *small))
-    refused(built(*good, "--bounds=5.0,46.0,5.01,46.01", *small), "outside the orthophotos")
+    refused(built(*good, "--bounds=5.0,46.0,5.01,46.01", *small), "the orthophotos cover")
     refused(built(*good, "--bounds=5.0,46.0,4.0,46.01", *small), "west < east")
     refused(built(*good, "--bounds=nan,46.0,4.0,46.01", *small), "bounds")
     refused(built(*good, "--tile-px", "1024"), "larger than the area")
@@ -497,7 +565,7 @@ def test_bad_images_may_be_skipped(run, map_path, flown, out):
     (flown / "frames" / "0009.jpg").write_bytes((flown / "frames/0009.jpg").read_bytes()[:3000])
     done = run("localize", map_path, flown, "--out", out / "f.jsonl", "--skip-bad-images", "--json")
     plain = json.loads(done.out)
-    assert done.code == 0 and (plain["n_fix"], plain["n_no_fix"]) == (8, 2)
+    assert done.code == 0 and plain["n_none"] == 2 and plain["views"] == 10
     results = read_results(out / "f.jsonl")
     assert [r.outcome.reason for r in results if not isinstance(r.outcome, Fix)] == [
         "bad_image"
@@ -511,7 +579,7 @@ def test_views_without_telemetry_do_not_end_a_flight(run, map_path, flown, out, 
     lines[4] = _with(lines[4], column, value)
     (flown / "telemetry.csv").write_text("\n".join(lines) + "\n")
     done = run("localize", map_path, flown, "--out", out / "fixes.jsonl", "--json")
-    assert (done.code, done.err) == (0, "") and json.loads(done.out)["n_no_fix"] == 1
+    assert (done.code, done.err) == (0, "") and json.loads(done.out)["n_none"] == 1
     outcome = read_results(out / "fixes.jsonl")[3].outcome
     assert outcome.reason == "missing_telemetry"
 
@@ -607,13 +675,9 @@ LANDSCAPE = ["--size-m", "300", "300"]
 WRITERS = ["build", "simulate", "localize", "evaluate", "metrics", "landscape"]
 
 
-def files_in(folder):
-    return [path for path in folder.rglob("*") if not path.is_dir()]
-
-
 def nothing_in(folder):
-    """Neither files nor hidden temporaries; an empty folder does no harm."""
-    return files_in(folder) == [] and not [p for p in folder.iterdir() if p.name[0] == "."]
+    """Neither files nor hidden temporaries nor folders."""
+    return list(folder.iterdir()) == []
 
 
 @contextlib.contextmanager
@@ -660,7 +724,23 @@ def test_a_full_disk(run, writing, out, name, monkeypatch, undrawn):
 
     monkeypatch.setattr(os, "fsync", full)
     refused(run(*writing[name]), "disk full; nothing was written")
-    assert files_in(out) == []
+    assert nothing_in(out)
+
+
+def test_a_full_disk_and_a_folder(run, writing, out, monkeypatch):
+    """It is written to a temporary folder, which is not the one that is named."""
+    (out / "earlier").mkdir()
+    write, left = Path.write_bytes, [1]
+
+    def full(path, data):
+        if path.suffix == ".jpg" and not left.pop():
+            raise OSError(errno.ENOSPC, "No space left on device")
+        left.append(0)
+        return write(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    refused(run(*writing["simulate"]), f"disk full; nothing was written: {out / 'flight'}")
+    assert [path.name for path in out.iterdir()] == ["earlier"]
 
 
 @pytest.mark.parametrize("name", ["build", "metrics"])

@@ -3,6 +3,7 @@
 import errno
 import os
 import resource
+import shutil
 import stat
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from orthonav.errors import MissingFileError, OutputError, RouteError
-from orthonav.files import replacing, replacing_folder, require_file, write_text
+from orthonav.files import not_written, replacing, replacing_folder, require_file, write_text
 
 INTERRUPTIONS = pytest.mark.parametrize(
     "interruption", [ValueError("bug"), KeyboardInterrupt(), SystemExit(3), RouteError("known")]
@@ -28,7 +29,7 @@ def out(tmp_path):
 
 
 def names_in(folder):
-    return sorted(path.name for path in folder.iterdir())
+    return sorted(path.name for path in folder.iterdir()) if folder.exists() else []
 
 
 @pytest.mark.parametrize("old", [None, b"old"])
@@ -91,6 +92,38 @@ def test_refusals_of_the_system_are_named(out, writer, error, message):
     with pytest.raises(OutputError, match=message) as caught, writer(out):
         raise error
     assert str(caught.value).endswith(str(out)) and names_in(out.parent) == []
+
+
+@pytest.mark.parametrize("writer", [replacing, replacing_folder])
+def test_folders_that_were_made_for_it_are_removed(tmp_path, writer):
+    (tmp_path / "kept").mkdir()
+    with pytest.raises(OutputError), writer(tmp_path / "kept" / "a" / "b" / "out"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert names_in(tmp_path) == ["kept"]
+
+
+def test_a_full_disk_while_a_file_of_a_folder_is_written(out):
+    """The folder that was asked for is named, not the temporary one, and the old one stays."""
+    with replacing_folder(out) as temporary:
+        (temporary / "old").touch()
+    full = OSError(errno.ENOSPC, "No space left on device")
+    with (
+        pytest.raises(OutputError) as caught,
+        replacing_folder(out, lambda _: True) as temporary,
+        replacing(temporary / "figures" / "a.png"),
+    ):
+        raise full
+    assert str(caught.value) == f"disk full; nothing was written: {out}"
+    assert names_in(out) == ["old"] and names_in(out.parent) == ["result.bin"]
+
+
+@pytest.mark.parametrize(("free", "said"), [(0, "disk full"), (2**30, "cannot write")])
+def test_errors_of_libraries_name_a_full_disk(tmp_path, monkeypatch, free, said):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=free))
+    path = tmp_path / "a.tif"
+    text = f"{said} (no scanline); nothing was written: {path}"
+    assert str(not_written("no \n scanline", path)) == text
 
 
 @NEEDS_DEV_FULL

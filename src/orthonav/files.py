@@ -5,7 +5,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from orthonav.errors import MissingFileError, OutputError
@@ -18,22 +18,29 @@ def no_progress(stage: str, share: float) -> None:
     """Progress that nobody watches."""
 
 
+_ALMOST_NONE = 2**20
+"""With less free space, bytes, a failed write is that of a full disk."""
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success it is synced and renamed to `path`.
 
-    On any exception, an interrupt included, the temporary file is removed and `path` is untouched.
-    Raises `OutputError` where the system refuses to write (disk full, no permission).
+    On any exception, an interrupt included, the temporary file and the folders made for it are
+    removed and `path` is untouched. Raises `OutputError` where the system refuses to write (disk
+    full, no permission).
     """
     path = Path(path).resolve()
     if path.exists() and not path.is_file():
         raise OutputError(f"cannot write over a folder or a device: {path}")
+    made: list[Path] = []
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        made = _made_folders(path.parent)
         handle, name = tempfile.mkstemp(
             prefix=f".{path.name}.", suffix=f".tmp{path.suffix}", dir=path.parent
         )
     except OSError as error:
+        _remove_empty(made)
         raise _output_error(error, path) from error
     os.close(handle)
     temporary = Path(name)
@@ -48,6 +55,7 @@ def replacing(path: Path) -> Iterator[Path]:
         raise _output_error(error, path) from error
     finally:
         temporary.unlink(missing_ok=True)
+        _remove_empty(made)
 
 
 @contextmanager
@@ -56,17 +64,19 @@ def replacing_folder(path: Path, is_ours: Callable[[Path], bool] | None = None) 
 
     An existing empty folder is replaced; an existing folder with content is refused before any
     work is done, unless `is_ours` says that it may go. On any exception the temporary folder is
-    removed and the old one stays.
+    removed and the old one stays. Raises `OutputError` where the system refuses to write into it.
     """
     path = Path(path)
     if not _may_be_replaced(path, is_ours):
         raise OutputError(
             f"output folder exists and is not empty; remove it or name another: {path}"
         )
+    made: list[Path] = []
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        made = _made_folders(path.parent)
         temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
     except OSError as error:
+        _remove_empty(made)
         raise _output_error(error, path) from error
     try:
         yield temporary
@@ -77,11 +87,37 @@ def replacing_folder(path: Path, is_ours: Callable[[Path], bool] | None = None) 
             path.rmdir()  # refuses what appeared in it meanwhile
         temporary.replace(path)
     except OSError as error:
-        if isinstance(error, MissingFileError | OutputError) or error.errno is None:
+        cause = error.__cause__ if isinstance(error, OutputError) else error  # of a file in it
+        if isinstance(error, MissingFileError) or not isinstance(cause, OSError):
             raise
-        raise _output_error(error, path) from error
+        if cause.errno is None:
+            raise
+        raise _output_error(cause, path) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+        _remove_empty(made)
+
+
+def _made_folders(folder: Path) -> list[Path]:
+    """Make a folder; the folders that did not exist before, the innermost first."""
+    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    return missing
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Remove folders that are empty, the innermost first."""
+    with suppress(OSError):
+        for each in folders:
+            each.rmdir()
+
+
+def not_written(reason: object, path: Path) -> OutputError:
+    """The error of a library that gives no number of the system's error, as GDAL does."""
+    free = shutil.disk_usage(path.resolve().parent).free
+    full = "disk full" if free < _ALMOST_NONE else "cannot write"
+    said = " ".join(str(reason).split())[:200]
+    return OutputError(f"{full} ({said}); nothing was written: {path}")
 
 
 def _may_be_replaced(path: Path, is_ours: Callable[[Path], bool] | None) -> bool:

@@ -145,7 +145,8 @@ class ViewResult:
 
     `frame`: name of the view. `time_ns`: its exposure. `outcome`: the fix, or why there is none.
     `latency_ms`: time from picture to outcome, NaN where it was not processed. `state`: of the
-    track (`searching`, `tracking`, `lost`), None where views are placed one by one.
+    track (`searching`, `tracking`, `lost`), None where views are placed one by one. `accepted`:
+    whether a fix met the criterion of `--accept`, None where none was given.
     """
 
     frame: str
@@ -153,3 +154,11 @@ class ViewResult:
     outcome: Fix | NoFix
     latency_ms: float
     state: str | None = None
+    accepted: bool | None = None
+
+    @property
+    def is_confident(self) -> bool:
+        """Whether the position may be relied on; any other fix is the best guess."""
+        if not isinstance(self.outcome, Fix):
+            return False
+        return self.outcome.confidence >= CONFIDENT if self.accepted is None else self.accepted

@@ -41,6 +41,7 @@ NO_GO = Verdict(
         Reason("lost", "In stretch 3 dead reckoning drifts farther than is allowed.", Word.NO_GO),
         Reason("dates", "Only the map's own date was tried.", Word.MARGINAL),
         Reason("mean", "The mean probability is high.", Word.GO),
+        Reason("lookalikes", "One pair of places look alike, which costs fixes.", Word.GO),
     ),
 )
 

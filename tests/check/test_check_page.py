@@ -13,13 +13,15 @@ import made_check
 import numpy as np
 import pytest
 from made_check import EVIL, FILES, small_route
+from matplotlib import colormaps
+from matplotlib.colors import to_rgb
 
 from orthonav.check.outcome import CELL_VALUES
 from orthonav.check.write import imagery, write_check
 from orthonav.check.write.imagery import MAX_SIDE_PX, jpeg, map_image, visible_box
 from orthonav.check.write.page import _known_cells
 from orthonav.check.write.plain import to_plain
-from orthonav.check.write.risk import segments
+from orthonav.check.write.risk import RISKS, segments
 from orthonav.check.write.wording import share_text
 from orthonav.mapfile import open_map
 from orthonav.report import Drawing, metres_text
@@ -192,6 +194,23 @@ def test_a_map_without_a_layer_shows_its_preview(opened, frame, monkeypatch):
 def test_pictures_of_noise_stay_small():
     noise = np.random.default_rng(1).integers(0, 255, (1300, 2000), dtype=np.uint8)
     assert len(jpeg(noise)) <= imagery.MAX_BYTES
+
+
+def test_the_route_has_the_colours_of_the_cells():
+    """One scale: light is likely, and dark blue is not, on the route as in the cells."""
+    for risk in RISKS[:-1]:
+        above = min((r.least for r in RISKS[:-1] if r.least > risk.least), default=1.0)
+        wanted = to_rgb(colormaps["cividis"]((risk.least + above) / 2))
+        np.testing.assert_allclose(to_rgb(risk.colour), wanted, atol=0.02)
+
+
+def test_lookalikes_are_no_reason_to_go(folder):
+    """They cost fixes, so they have no green tick."""
+    text = (folder / "small_route" / "index.html").read_text(encoding="utf-8")
+    found = re.findall(r'<li class="is-(\w[\w-]*)"><b [^>]*>(.)</b> ([^<]*)', text)
+    (kind,) = {(kind, mark) for kind, mark, said in found if "look alike" in said}
+    assert kind == ("info", "i")
+    assert 'setAttribute("aria-label", "North is up")' in text
 
 
 def test_segments_take_the_worse_end():

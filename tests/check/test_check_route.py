@@ -122,7 +122,17 @@ def test_very_long_and_very_short_routes():
     long = predicted_along(area_of([[0, 0], [4900, 0]]), [100.0], 0.5, CONDITIONS, even)
     assert len(long.distance_m) <= 4001 and np.isfinite(long.drift_m).all()
     short = predicted_along(area_of([[0, 0], [3, 0]]), [100.0], SIDE_M, CONDITIONS, even)
-    assert len(short.distance_m) == 1
+    assert short.distance_m == pytest.approx([0, 3], abs=1e-3)
+
+
+def test_the_route_ends_at_its_last_waypoint():
+    along = predicted_along(
+        area_of([[0, 0], [100, 0], [100, 60]]), [200.0] * 2, SIDE_M, CONDITIONS, even
+    )
+    assert along.distance_m == pytest.approx([0, 25, 50, 75, 100, 125, 150, 160], abs=1e-3)
+    np.testing.assert_allclose(along.points_en_m[-1], [100, 60], atol=0.01)
+    whole = predicted_along(area_of([[0, 0], [100, 0]]), [200.0], SIDE_M, CONDITIONS, even)
+    assert along.drift_m.shape == (8,) and len(whole.distance_m) in (5, 6)
 
 
 def along_of(probability, step_m=25.0):

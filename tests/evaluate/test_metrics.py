@@ -1,6 +1,7 @@
 """Figures of an evaluation against cases worked out by hand."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.errors import FlightError
+from orthonav.evaluate.calibration_report import nees_words
+from orthonav.evaluate.flights import verdict
 from orthonav.evaluate.metrics import (
     CRITERIA,
     Comparison,
@@ -124,7 +127,7 @@ def test_all_is_defined_without_any_fix() -> None:
     undefined = (metrics.accuracy_of_fixes, metrics.standard.cep50_m, metrics.standard.cep95_m)
     assert all(map(math.isnan, undefined))
     assert all(map(math.isnan, (metrics.standard.ape.mean_m, metrics.standard.ape.max_m)))
-    assert metrics.reasons == {"blank": 1, "too_dark": 1}
+    assert metrics.reasons == {"blank": 1, "too_dark": 1, "no_result": 2}
     assert worst_views(compare(truth_of(TRUTH_EN_M), [no_fix("a")])) == []
 
 
@@ -132,7 +135,8 @@ def test_what_has_no_partner_is_counted_and_left_out() -> None:
     truth = {**truth_of(TRUTH_EN_M), "a": (math.nan, 0.0)}
     stranger = ViewResult("z", 0, NoFix("blank", ""), 1.0)
     metrics = measure(compare(truth, [fix("a", (0, 0)), fix("b", (0, 0)), stranger]))
-    assert (metrics.n_views, metrics.n_without_truth, metrics.n_without_result) == (1, 2, 2)
+    assert (metrics.n_views, metrics.n_without_truth, metrics.n_without_result) == (3, 2, 2)
+    assert metrics.coverage == metrics.accuracy == 1 / 3 and metrics.reasons == {"no_result": 2}
 
 
 def test_no_overlap_is_an_error_that_shows_both_names() -> None:
@@ -150,7 +154,7 @@ def test_two_results_for_a_frame_are_refused() -> None:
 def test_a_fix_without_a_finite_position_is_no_fix() -> None:
     broken = Fix(math.nan, 0.0, np.eye(2), 1.0, 15.0, 0.0, 100.0)
     metrics = measure(compare(truth_of(TRUTH_EN_M), [ViewResult("a", 0, broken, 1.0)]))
-    assert metrics.n_fixes == 0 and metrics.reasons == {"not_finite": 1}
+    assert metrics.n_fixes == 0 and metrics.reasons == {"not_finite": 1, "no_result": 3}
 
 
 def test_a_plane_of_ones_own_moves_positions_but_not_errors() -> None:
@@ -164,9 +168,9 @@ def test_pooled_flights_count_every_view() -> None:
     one = three_fixes()
     two = compare(truth_of(TRUTH_EN_M), [fix("a", (1.0, 0.0)), no_fix("b", "too_dark")])
     metrics = measure(pool([one, two]))
-    assert (metrics.n_views, metrics.n_fixes, metrics.n_without_result) == (6, 4, 2)
-    assert metrics.accuracy == 0.5
-    assert metrics.reasons == {"blank": 1, "too_dark": 1}
+    assert (metrics.n_views, metrics.n_fixes, metrics.n_without_result) == (8, 4, 2)
+    assert metrics.accuracy == 3 / 8
+    assert metrics.reasons == {"blank": 1, "too_dark": 1, "no_result": 2}
     with pytest.raises(ValueError, match="at least one flight"):
         pool([])
 
@@ -212,3 +216,34 @@ def test_curves_and_rows_agree_and_shares_grow(views: list[tuple[float, float | 
         kept = [error for error, value in views if value is not None and value >= threshold]
         assert share == pytest.approx(len(kept) / n)
         assert accuracy == pytest.approx(sum(error <= 15.0 for error in kept) / len(kept))
+
+
+def test_confident_and_wrong_is_told_from_a_wrong_guess() -> None:
+    """Wrong is above 35 m, the radius of the evaluation and the radius that the fix states."""
+    guess = measure(three_fixes())
+    assert (guess.n_confident, guess.n_confident_wrong) == (1, 0)
+    assert verdict(guess).startswith("No confident fix is wrong: none of 1 errs by more than 35 m")
+    assert "largest 5.0 m" in verdict(guess)
+    results = [fix("a", (0.0, 40.0), confidence=0.95), fix("b", (0.0, 30.0), confidence=0.95)]
+    wrong = compare(truth_of(TRUTH_EN_M), results)
+    assert worst_views(replace(wrong, errors_m=np.array([40.0, 50.0]))) == [1, 0]
+    assert worst_views(replace(wrong, errors_m=np.array([36.0, 35.0]))) == [0, 1]
+    assert verdict(measure(wrong)).startswith("1 of 2 confident fixes is WRONG, by more than 35 m")
+    wider = replace(wrong, own_radius_m=np.array([45.0, 45.0]))
+    assert measure(wider).n_confident_wrong == measure(wrong, 41.0).n_confident_wrong == 0
+    none = measure(compare(truth_of(TRUTH_EN_M), [fix("a", (0.0, 0.0), confidence=0.5)]))
+    assert verdict(none).startswith("No fix is confident") and "1 are best guesses" in verdict(none)
+    marked = [replace(result, accepted=False) for result in results]
+    assert measure(compare(truth_of(TRUTH_EN_M), marked)).n_confident == 0
+
+
+@pytest.mark.parametrize(
+    ("nees", "said"),
+    [
+        (8.0, "too small: errors are 2.0 times as large as stated"),
+        (0.5, "cautious: errors are 0.5 times as large as stated"),
+        (2.1, "consistent with the errors"),
+    ],
+)
+def test_consistency_is_put_in_words(nees, said) -> None:
+    assert nees_words(nees, 1.5, 2.6) == said

@@ -43,6 +43,7 @@ def made_flight(n: int, share_fixed: float = 0.9, name: str = "flight", seed: in
             ratio = 1.05 + random.random() * (0.2 if wrong else 2.0)
             known = {"peak_ratio": ratio, "lowe_ratio": 1.0 + random.random() / 5}
             confidence = min(ratio / 3, 1.0)
+            confidence = 0.95 if wrong and i % 2 else confidence
             outcome = Fix(fix_lat, fix_lon, np.eye(2), confidence, 15.0, 0.0, 100.0, known)
         results.append(ViewResult(frame, i * 500_000_000, outcome, 40.0 + random.random()))
     comparison = compare(truth, results, CENTRE)
@@ -167,7 +168,7 @@ def test_the_table_is_aligned() -> None:
     flights = [made_flight(30, name="one"), made_flight(5, 0.0, name="a longer name")]
     lines = table(flights, total(flights)).splitlines()
     header, *rows, rule, whole = lines
-    assert header.split()[:4] == ["flight", "views", "fixes", "coverage"]
+    assert header.split()[:4] == ["flight", "views", "confident", "wrong"]
     assert "acc@15 m" in header
     assert len(rows) == 2 and set(rule) == {"-"} and whole.startswith("total")
     assert len({len(line) for line in lines}) == 1
@@ -201,7 +202,8 @@ def test_the_map_shows_right_and_wrong_and_the_background(monkeypatch) -> None:
     plain = decoded(plots.map_picture(flight.comparison, 15.0))
     over = decoded(plots.map_picture(flight.comparison, 15.0, noisy_background()))
     for image in (plain, over):
-        assert has_colour(image, plots.RIGHT) and has_colour(image, plots.WRONG)
+        for colour in (plots.RIGHT, plots.UNSURE, plots.WRONG):
+            assert has_colour(image, colour)
     assert np.ptp(over, axis=2).mean() < 40
     assert over.mean() < plain.mean() - 20
 

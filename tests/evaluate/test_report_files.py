@@ -3,6 +3,7 @@
 import itertools
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from orthonav.errors import MissingExtraError, OutputError
 from orthonav.evaluate.flights import FlightReport
 from orthonav.evaluate.metrics import compare, measure
-from orthonav.evaluate.plots import map_picture, over_time_picture
+from orthonav.evaluate.plots import fix_classes, map_picture, over_time_picture
 from orthonav.evaluate.report import write_report
 from orthonav.geo.frames import LocalFrame
 from orthonav.records import Fix, NoFix, ViewResult
@@ -136,7 +137,16 @@ def test_errors_are_over_time_where_it_is_known(times_ns, axis, coarse) -> None:
 
 
 def test_the_legend_names_only_visible_marks(coarse) -> None:
-    comparison = flown("one").comparison
-    for radius_m, there in ((15.0, "right fix"), (0.5, "wrong fix")):
+    sure = flown("one").comparison
+    unsure = replace(sure, confident=np.zeros(12, dtype=bool))
+    wrong = replace(sure, errors_m=sure.errors_m + 50.0)
+    for comparison, radius_m, there in (
+        (sure, 15.0, "confident"),
+        (sure, 0.5, "confident, off by more than 0.5 m"),
+        (wrong, 0.5, "confident and wrong"),
+        (unsure, 15.0, "unsure"),
+        (unsure, 0.5, "unsure, off by more than 0.5 m"),
+    ):
         svg = map_picture(comparison, radius_m).svg
-        assert [name for name in ("right fix", "wrong fix") if f">{name}<" in svg] == [there]
+        names = [label for label, *_ in fix_classes(comparison, radius_m)]
+        assert [name for name in names if f">{name}<" in svg] == [there]

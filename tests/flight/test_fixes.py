@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -110,7 +111,7 @@ def test_no_fix_has_a_reason_and_no_position() -> None:
     no_fix = NoFix("blank", "the view has no texture", {"spread": 0.5})
     values = json.loads(result_to_json(ViewResult("a", 1_500_000_000, no_fix, 2.0)))
     assert values["time_s"] == 1.5
-    assert [values[key] for key in KEYS[3:10]] == [None] * 7
+    assert [values[key] for key in KEYS[3:11]] == [None] * 8
     assert values["reason"] == "blank"
     assert values["detail"] == "the view has no texture"
     assert values["evidence"] == {"spread": 0.5}
@@ -149,7 +150,9 @@ def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
         read_results(tmp_path / "fixes.jsonl")
 
 
-@pytest.mark.parametrize("key", [key for key in KEYS if key not in ("reason", "detail")])
+@pytest.mark.parametrize(
+    "key", [key for key in KEYS if key not in ("confident", "reason", "detail")]
+)
 def test_a_missing_key_of_a_fix_is_named(key: str) -> None:
     line = {name: value for name, value in FIX_LINE.items() if name != key}
     with pytest.raises(FlightError, match=f"key {key} is missing"):
@@ -209,3 +212,16 @@ def test_a_broken_line_is_named_by_its_number(tmp_path: Path, bad: bytes) -> Non
     path.write_bytes(json.dumps(FIX_LINE).encode() + b"\n" + bad + b"\n")
     with pytest.raises(FlightError, match=r"^line 2: .*fixes\.jsonl$"):
         read_results(path)
+
+
+def test_a_guess_is_marked() -> None:
+    """By the criterion of the run, else by its confidence, as in files without the mark."""
+    fix = result_from_json(json.dumps({**FIX_LINE, "confidence": 0.7}))
+    assert not fix.is_confident and result_from_json(json.dumps(FIX_LINE)).is_confident
+    lower = replace(fix, accepted=True)
+    assert json.loads(result_to_json(fix))["confident"] is False
+    assert json.loads(result_to_json(lower))["confident"] is True
+    assert result_from_json(result_to_json(lower)).is_confident
+    assert not result_from_json(json.dumps({**NO_FIX_LINE, "confident": True})).is_confident
+    with pytest.raises(FlightError, match="confident: expected true or false"):
+        result_from_json(json.dumps({**FIX_LINE, "confident": "yes"}))

@@ -258,12 +258,12 @@ REFUSED = {
     "outside": (
         lambda frame: {"bounds_deg": bounds_deg(frame, 3000, 3000, 3100, 3100)},
         AreaError,
-        "outside the orthophotos",
+        "the orthophotos cover",
     ),
     "just outside": (
         lambda frame: {"bounds_deg": bounds_deg(frame, 250, -50, 350, 50)},
         AreaError,
-        "outside the orthophotos",
+        "the orthophotos cover",
     ),
     "turned bounds": (lambda frame: {"bounds_deg": (3, 46, 2, 47)}, AreaError, "west < east"),
     "far route": (lambda frame: {"route": ROUTE, "band_m": 100.0}, AreaError, "no imagery"),

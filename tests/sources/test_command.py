@@ -155,7 +155,7 @@ def test_a_flight_is_localized_whatever_its_truth(run, tmp_path):
     source = folder_of(tmp_path / "recorded")
     (source / "truth.csv").write_text("frame,lat_deg,lon_deg\n0.png,north,east\n")
     code, out, err = run("localize", MAP, source, "--out", tmp_path / "fixes.jsonl")
-    assert code == 0 and "2 fixes" in out and "truth is ignored: line 2" in err
+    assert code == 0 and "2 views: 2 confident" in out and "truth is ignored: line 2" in err
 
 
 def test_doubtful_input_causes_a_warning(run, tmp_path):
@@ -256,7 +256,7 @@ def test_a_recording_far_from_the_map_is_named(run, tmp_path, camera):
     for index in range(2):
         add_gps(source / f"{index}.png", place(46.0, 3.0))
     code, _, err = run("localize", MAP, source, "--out", tmp_path / "a.jsonl", *camera)
-    assert code == 0 and re.search(r"first view is 5\d km from the map: check the map", err)
+    assert code == 0 and re.search(r"first view is 5\d km from the map; check the map", err)
     for index in range(2):
         add_gps(source / f"{index}.png", place(*PLACE))
     _, _, err = run("localize", MAP, source, "--out", tmp_path / "a.jsonl", *camera)

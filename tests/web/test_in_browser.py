@@ -1,6 +1,7 @@
 """The page as people have it: drawn, reached by keys and by touch, in a real browser."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -83,22 +84,23 @@ def test_the_run_is_drawn_where_it_is(page, columns):
     picture = page.picture()
     for i in (WRONG, COUNT - 1):
         place = page.on_screen((columns["x"][i], columns["y"][i]), CHUNK_PX)
-        assert painted(picture, page.colour("tracking"), place) > 15, i
+        assert painted(picture, page.colour("sure"), place) > 15, i
         assert (painted(picture, page.colour("wrong"), place, 9) > 15) == (i == WRONG), i
     truth = np.stack([columns["tx"], columns["ty"]], axis=1)
     for between in (truth[2:] + truth[1:-1]) / 2:
         assert painted(picture, page.colour("truth"), page.on_screen(between, CHUNK_PX), 2) >= 2
     course = page.locator("#chart").bounding_box()
     part = page.picture(clip=course)
-    assert painted(part, page.colour("tracking")) > 2000  # the band of states
+    assert painted(part, page.colour("sure")) > 2000  # the band of states
     assert painted(part, page.colour("wrong")) > 500  # the radius
     assert page.locator("#legend").inner_text().split("\n") == [
+        "●confident",
         "●tracking",
         "—truth",
         "◯confident and wrong",
     ]
     figures = page.locator("#figures").inner_text().replace("\n", " ")
-    assert figures.startswith("views 6 with a fix 83.3 % within 15 m 66.7 %")
+    assert figures.startswith("views 6 confident 83.3 % unsure 0.0 % no fix 16.7 % within")
     assert figures.endswith("confident and wrong 1")
 
 
@@ -116,7 +118,7 @@ def test_the_worst_view_with_its_images_and_values(page, small, ask):
     east_m, north_m = FRAME.en_from_latlon(fix["lat_deg"], fix["lon_deg"])
     error_m = np.hypot(east_m - PLACES_EN_M[WRONG][0], north_m - PLACES_EN_M[WRONG][1])
     for part in (
-        f"tracking, error {metres_text(error_m)}, CONFIDENT AND WRONG",
+        f"tracking, confident, error {metres_text(error_m)}, CONFIDENT AND WRONG",
         f"confidence {fix['confidence']:.3f} within {metres_text(fix['radius_m'])}",
         f"\N{GREEK SMALL LETTER SIGMA} {metres_text(spread_m)}, heading {fix['heading_deg']:.1f}°",
         f"{metres_text(fix['agl_m'])} high",
@@ -261,7 +263,7 @@ def test_everything_is_reached_by_tab_in_order(page):
         assert outlined, where
     expected = ["help-open", "map", "Zoom in", "Zoom out", "opacity", "blink", "on-map", "summary"]
     expected += ["which", "order", "named", "button", "first", "before", "play", "after", "last"]
-    expected += ["follow-view", "zoom-in", "zoom-out", "scrub"]
+    expected += ["zoom-in", "zoom-out", "scrub"]
     assert [each for each in reached if each in expected] == expected
     assert set(reached) - set(expected) <= {"list-box"}
 
@@ -319,18 +321,68 @@ def test_on_a_tablet_by_touch(visit, server, columns):
     page.chosen(2, COUNT)
 
 
+def test_on_a_phone(visit, server):
+    """Nothing sticks out, and the legend and the buttons lie beside the map."""
+    page = visit(server, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
+    page.chosen(0, COUNT)
+    page.select_option("#order", "error")
+    page.chosen(WRONG, COUNT)
+    page.settled()
+    fits(page)
+    steps = page.locator("#steps button")
+    assert len({each.bounding_box()["y"] for each in steps.all()}) == 1
+    map_box, legend = (page.locator(each).bounding_box() for each in ("#map", "#legend"))
+    assert legend["y"] >= map_box["y"] + map_box["height"] - 1
+
+
+def test_a_chosen_view_comes_into_sight_with_its_truth(page, columns):
+    """Its fix and its true position, also where the map was zoomed in on another view."""
+    page.keyboard.press("z")
+    page.settled()
+    page.locator(f"#list [data-view='{WRONG}']").click()
+    page.chosen(WRONG, COUNT)
+    page.settled()
+    box = page.locator("#map").bounding_box()
+    for x, y in (("x", "y"), ("tx", "ty")):
+        place = page.on_screen((columns[x][WRONG], columns[y][WRONG]), CHUNK_PX)
+        assert box["x"] < place[0] < box["x"] + box["width"]
+        assert box["y"] < place[1] < box["y"] + box["height"]
+
+
+def test_guesses_have_a_colour_of_their_own(visit, small, tmp_path):
+    """Single fixes of low confidence, or below the criterion of the run, are unsure."""
+    results = [result(i, None) for i in range(COUNT)]
+    results[0] = replace(results[0], outcome=replace(results[0].outcome, confidence=0.4))
+    results[1] = replace(results[1], accepted=False)
+    fixes = tmp_path / "fixes.jsonl"
+    fixes.write_text("".join(result_to_json(each) + "\n" for each in results))
+    run = open_run(ViewRequest(fixes, small.map_path, flight=small.flight))
+    with serving(run) as server:
+        page = visit(server)
+        page.chosen(0, COUNT)
+        expect(page.locator("#sentence")).to_contain_text("unsure, error")
+        assert page.locator("#legend").inner_text().split("\n")[:2] == ["●confident", "●unsure"]
+        mark = page.locator("#list button").first.locator(".mark")
+        expect(mark).to_have_attribute("aria-label", "unsure")
+        page.select_option("#which", "doubt")
+        expect(page.locator("#shown-count")).to_have_text(f"2 of {COUNT} views")
+        page.settled()
+        place = page.on_screen(((PLACES_EN_M[1][0] + 180) / GSD_M, (160 - 25) / GSD_M), CHUNK_PX)
+        assert painted(page.picture(), page.colour("unsure"), place) > 15
+
+
 def test_in_the_dark(visit, server, columns):
     """Other colours, and also those of the canvases, and changed while the page is open."""
     page = visit(server, color_scheme="dark")
     page.chosen(0, COUNT)
     page.settled()
-    dark, picture = page.colour("tracking"), page.picture()
+    dark, picture = page.colour("sure"), page.picture()
     assert picture[760, 100].max() < 60
     place = page.on_screen((columns["x"][5], columns["y"][5]), CHUNK_PX)
     assert painted(picture, dark, place) > 15
     page.emulate_media(color_scheme="light")
     page.wait_for_timeout(200)
-    light, picture = page.colour("tracking"), page.picture()
+    light, picture = page.colour("sure"), page.picture()
     assert picture[760, 100].min() > 200 and np.abs(light - dark).max() > 40
     assert painted(picture, light, place) > 15
 
@@ -414,7 +466,7 @@ def test_ten_thousand_views(visit, small, tmp_path):
         page = visit(server)
         page.chosen(0, MANY)
         page.settled()
-        inked = painted(page.picture(), page.colour("tracking"))
+        inked = painted(page.picture(), page.colour("sure"))
         assert inked > 5000
         for key, i in (("ArrowRight", 1), ("PageDown", 501), ("End", MANY - 1), ("PageUp", 9499)):
             page.keyboard.press(key)

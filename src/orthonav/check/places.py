@@ -158,9 +158,12 @@ def checked_extent(coverage: MapCoverage, area: Area | None) -> Extent:
     if area is None:
         return coverage.extent_en_m
     if not checked_m2(coverage, area):
+        west, south, east, north = coverage.extent_en_m
+        left, below, right, above = area.extent_en_m
+        far_m = math.hypot(max(left - east, west - right, 0), max(below - north, south - above, 0))
         raise AreaError(
-            "the band of the route does not touch the map; give the map of this route, and check "
-            "that latitude and longitude are not swapped"
+            f"the band of the route does not touch the map, {far_m / 1000:,.1f} km from it; give "
+            "the map of this route, and check that latitude and longitude are not swapped"
         )
     return area.extent_en_m
 

@@ -17,6 +17,8 @@ BLIND = 0.5
 POINTS_PER_VIEW = 4.0
 """Points along the route per side of a view, as many as cells."""
 MAX_POINTS = 4000
+_REACHED = 1e-6
+"""A shorter rest of the route, as a share of the distance between points, is none."""
 ACROSS = 5
 """Points across the band at every point along it."""
 NEGLIGIBLE = 1e-9
@@ -42,6 +44,9 @@ def predicted_along(
     step_m = max(view_side_m / POINTS_PER_VIEW, length_m / MAX_POINTS)
     points, course_deg = along_polyline_en_m(line, max(step_m, 1e-6))
     distance_m = np.minimum(np.arange(len(points)) * step_m, length_m)
+    if length_m - distance_m[-1] > _REACHED * step_m:  # the last waypoint
+        points, distance_m = np.vstack([points, line[-1]]), np.append(distance_m, length_m)
+        course_deg = np.append(course_deg, np.degrees(np.arctan2(*(line[-1] - points[-2]))) % 360)
     middle = predict(points)
     course = np.radians(course_deg)
     across = np.stack([np.cos(course), -np.sin(course)], axis=1)

@@ -92,7 +92,7 @@ def _is_earlier_demo(out: Path) -> bool:
 def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[Any, str]:
     from orthonav.cli.evaluate import map_background
     from orthonav.cli.info import recipe_text, summary, summary_text
-    from orthonav.evaluate.flights import FlightReport, metrics_to_json, table
+    from orthonav.evaluate.flights import FlightReport, metrics_to_json, table, verdict
     from orthonav.evaluate.metrics import compare, measure
     from orthonav.evaluate.report import MadeFrom, write_report
     from orthonav.flight import open_flight, read_truth
@@ -155,7 +155,7 @@ def _demo(folder: Path, options: argparse.Namespace, shown: Progress) -> tuple[A
     )
     write_report(folder / "report", [shown_flight], made_from)
     lines = [summary_text(about), "", f"check      {checked}", ""]
-    lines += [table([shown_flight], metrics), "", *_criteria_lines(metrics)]
+    lines += [verdict(metrics), "", table([shown_flight], metrics), "", *_criteria_lines(metrics)]
     return metrics_to_json(metrics), "\n".join(lines)
 
 

@@ -2,7 +2,9 @@
 
 import argparse
 import json
+import logging
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +20,10 @@ if TYPE_CHECKING:
     from orthonav.mapfile.reader import MapFile
     from orthonav.records import ViewResult
     from orthonav.report import Background
+
+_FAR_M = 50_000.0
+"""A larger median error is none of the method: maps of one sheet are smaller."""
+log = logging.getLogger(__name__)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -68,7 +74,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Measure, print the table, write JSON and report."""
     from orthonav.errors import FlightError
-    from orthonav.evaluate.flights import flights_to_json, summary, table, total
+    from orthonav.evaluate.flights import flights_to_json, summary, table, total, verdict
     from orthonav.files import write_text
     from orthonav.mapfile import open_map
 
@@ -95,7 +101,7 @@ def run(options: argparse.Namespace) -> None:
     if options.json:
         print_json(plain)
         return
-    print(f"{table(flights, whole)}\n\n{summary(flights, whole)}")
+    print(f"{verdict(whole)}\n\n{table(flights, whole)}\n\n{summary(flights, whole)}")
     if options.report:
         print(f"report: {options.report / 'index.html'}")
 
@@ -133,7 +139,9 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
     flights = []
     for i, (fixes, truth) in enumerate(zip(options.fixes, options.truth, strict=True)):
         results = read_results(fixes)
-        comparison = compare(read_truth(truth), results, local)
+        known = read_truth(truth)
+        comparison = compare(known, results, local)
+        _warn_if_far(known, results, truth)
         worst: tuple[Row, ...] = ()
         if opened and layer:
             worst = _worst(comparison, results, folders[i], opened, layer)
@@ -142,6 +150,37 @@ def _measured(options: argparse.Namespace, opened: "MapFile | None") -> "list[Fl
         gnss = measure_gnss(comparison, results)
         flights.append(FlightReport(names[i], comparison, metrics, background, track, worst, gnss))
     return flights
+
+
+def _warn_if_far(
+    truth: "Mapping[str, tuple[float, float]]", results: "list[ViewResult]", path: Path
+) -> None:
+    """Log a warning where true positions are so far from the fixes that one of both is misread."""
+    import numpy as np
+
+    from orthonav.geo.frames import distances_m
+    from orthonav.geo.swapped import HINT
+    from orthonav.records import Fix
+
+    both = [
+        (truth[result.frame], (result.outcome.lat_deg, result.outcome.lon_deg))
+        for result in results
+        if isinstance(result.outcome, Fix) and result.frame in truth
+    ]
+    if not both:
+        return
+    true, found = np.array(both).transpose(1, 0, 2)
+    far_m, swapped_m = (
+        float(np.nanmedian(distances_m(places, found))) for places in (true, true[:, ::-1])
+    )
+    if far_m > _FAR_M:
+        hint = HINT if swapped_m < _FAR_M else "are these of the same flight?"
+        log.warning(
+            "true positions are %s km from the fixes (median); %s: %s",
+            f"{far_m / 1000:,.0f}",
+            hint,
+            path,
+        )
 
 
 def _grey_layer(opened: "MapFile") -> "GreyLayer":

@@ -39,6 +39,9 @@ def take_flown(options: argparse.Namespace, flight: "Recording") -> "Mount | Non
     chosen: dict[str, Any] = {name: getattr(options, name) for name in (*_CHOICES, "accept")}
     chosen["track"] = options.track or options.smooth
     chosen["mount"] = mount
+    if flown.get("accept") is None:  # the runner logs every fix, so the default applies
+        flown.pop("accept", None)
+        chosen.pop("accept")
     differ = [name for name in chosen if name in flown and flown[name] != chosen[name]]
     if options.as_flown:
         for name in (*_CHOICES, "accept", "track"):

@@ -47,6 +47,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Import and print a summary."""
+    from orthonav.geo.headings import RADIANS
     from orthonav.sources import OverTerrain, import_flight
 
     dem = dem_of(options)
@@ -73,6 +74,8 @@ def run(options: argparse.Namespace) -> None:
             done.views - done.complete,
             done.views,
         )
+    if done.radians:
+        log.warning("%s", RADIANS)
     if options.json:
         plain = {"flight": str(options.out), "kind": recording.kind, "note": recording.note}
         print_json({**plain, **asdict(done)})

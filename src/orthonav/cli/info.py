@@ -41,8 +41,7 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
         "size_mb": round(size_mb, 4),
         "mb_per_km2": round(size_mb / area_km2, 4) if area_km2 > 0 else None,
         "recipe": manifest.recipe,
-        "radius_m": manifest.radius_m,
-        "calibrated": manifest.confidence is not None,
+        **_confidence(manifest),
         "registration": _registration(manifest),
         "terrain": _terrain(manifest),
         "sheets": [
@@ -63,6 +62,33 @@ def summary(manifest: "Manifest", size_bytes: int, path: Path) -> dict[str, Any]
             name: round(_part_bytes(part) / 1e6, 4) for name, part in manifest.parts.items()
         },
     }
+
+
+def _confidence(manifest: "Manifest") -> dict[str, Any]:
+    """The radius that fixes state, and whether their confidence was learnt; the same of tiles."""
+    tiles = {
+        "tile_radius_m": manifest.radius_m,
+        "tiles_calibrated": manifest.confidence is not None,
+    }
+    registered = manifest.registration
+    if registered is None:
+        return {"radius_m": manifest.radius_m, "calibrated": tiles["tiles_calibrated"], **tiles}
+    radius_m = registered.get("radius_m")
+    return {
+        "radius_m": radius_m if isinstance(radius_m, int | float) else None,
+        "calibrated": registered.get("confidence") is not None,
+        **tiles,
+    }
+
+
+def _confidence_text(plain: Mapping[str, Any]) -> str:
+    """What the confidence of a fix is the probability of."""
+    radius = "-" if plain["radius_m"] is None else f"{plain['radius_m']:g}"
+    text = f"{'probability of an error below' if plain['calibrated'] else 'none, for'} {radius} m"
+    if plain["registration"] is None:
+        return text
+    tiles = f"{'' if plain['tiles_calibrated'] else 'none, for '}{plain['tile_radius_m']:g} m"
+    return f"{text}; with --registration off, {tiles}"
 
 
 def _registration(manifest: "Manifest") -> dict[str, Any] | None:
@@ -158,8 +184,7 @@ def summary_text(plain: dict[str, Any]) -> str:
         terms = [source[key] for key in ("attribution", "licence") if source.get(key)]
         if terms:
             lines.append(f"           {', '.join(map(str, terms))}")
-    calibrated = "probability of an error below" if plain["calibrated"] else "none, for"
-    lines.append(f"confidence {calibrated} {plain['radius_m']:g} m")
+    lines.append(f"confidence {_confidence_text(plain)}")
     if "build_s" in plain:
         speed = plain["area_km2"] / plain["build_s"]
         lines.append(f"built in   {plain['build_s']:.1f} s, {speed:.2f} km2/s")

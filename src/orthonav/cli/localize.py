@@ -2,17 +2,20 @@
 
 import argparse
 import logging
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from orthonav.cli.common import print_json, progress
 from orthonav.cli.flown import compare_with_flight, take_flown
 from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
 from orthonav.cli.needs import require_extras
+from orthonav.cli.setups import Counts, Doubts
 from orthonav.cli.signed import add_signature, checked_signature
 from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
 
 if TYPE_CHECKING:
+    from orthonav.confidence.accept import Acceptance
     from orthonav.records import ViewResult
 
 EVERYDAY = (
@@ -78,8 +81,10 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--accept",
         metavar="NAME:MIN",
-        help="write fixes below a threshold as no_fix: confidence:0.9, peak_ratio:1.3, or the "
-        "paper's lowe_ratio:1.13 (with --registration off); default: all fixes are written",
+        default="confidence:0.9",
+        help="fixes from this threshold on count as confident: confidence:0.9 (default), "
+        "peak_ratio:1.3, or the paper's lowe_ratio:1.13 (with --registration off); the best guess "
+        "of the other views is written too, marked",
     )
     parser.add_argument(
         "--skip-bad-images",
@@ -146,13 +151,13 @@ def _on_map(options: argparse.Namespace) -> None:
     over_terrain = dem is not None or opened.manifest.sheets[0].terrain is not None
     flight = open_source(options.flight, options, over_terrain=over_terrain)
     mount = take_flown(options, flight)
-    accept = Acceptance.parse(options.accept) if options.accept else None
+    accept = Acceptance.parse(options.accept)
     localizer = Localizer(
         opened,
         registration=options.registration == "on",
         position=check_rule(options.position),
     )
-    if localizer.registration is not None and accept and accept.criterion == "lowe_ratio":
+    if localizer.registration is not None and accept.criterion == "lowe_ratio":
         raise VariantError("--accept lowe_ratio compares tiles: it needs --registration off")
     if localizer.registration is None and options.registration == "on":
         log.warning("the map has no registration layer: positions are at tile level")
@@ -170,8 +175,8 @@ def _on_map(options: argparse.Namespace) -> None:
         )
     if mount:
         locator = MountCorrected(locator, mount)
-    results = []
     heights = flight_heights(options, opened, flight, dem)
+    results, doubts = [], Doubts(options, flight, localizer, mount, heights)
     with progress(options) as shown:
         for result in localize_flight(
             locator,
@@ -179,16 +184,19 @@ def _on_map(options: argparse.Namespace) -> None:
             skip_bad_images=options.skip_bad_images,
             accept=accept,
             heights=heights,
+            views=doubts.watching(),
         ):
             results.append(result)
+            doubts.take(result)
             if flight.expected:
                 shown("localize", min(1.0, len(results) / flight.expected))
-    if tracker is not None and options.smooth:
-        results = smoothed_track(tracker, results, accept)
-    else:
-        compare_with_flight(flight, results)
-    write_results(options.out, results)
-    _print_summary(options, results)
+        if tracker is not None and options.smooth:
+            results = smoothed_track(tracker, results, accept)
+        else:
+            compare_with_flight(flight, results)
+        write_results(options.out, results)
+        advice, tried = doubts.advice(results, accept, shown)
+    _print_summary(options, results, accept, advice, tried)
 
 
 def _on_atlas(options: argparse.Namespace) -> None:
@@ -215,8 +223,8 @@ def _on_atlas(options: argparse.Namespace) -> None:
     if asked or options.registration == "off":
         named = ", ".join(f"--{name.replace('_', '-')}" for name in asked) or "--registration off"
         raise VariantError(f"{named} needs a map: cut one out of the atlas (orthonav atlas cut)")
-    accept = Acceptance.parse(options.accept) if options.accept else None
-    if accept and accept.criterion == "lowe_ratio":
+    accept = Acceptance.parse(options.accept)
+    if accept.criterion == "lowe_ratio":
         raise VariantError("--accept lowe_ratio needs a map and --registration off")
     flight = open_source(options.flight, options)
     say_assumed_heights(flight)
@@ -238,30 +246,43 @@ def _on_atlas(options: argparse.Namespace) -> None:
             if flight.expected:
                 shown("localize", min(1.0, len(results) / flight.expected))
     write_results(options.out, results)
-    _print_summary(options, results)
+    _print_summary(options, results, accept)
 
 
-def _print_summary(options: argparse.Namespace, results: "list[ViewResult]") -> None:
+def _print_summary(
+    options: argparse.Namespace,
+    results: "list[ViewResult]",
+    accept: "Acceptance",
+    advice: Sequence[str] = (),
+    tried: Sequence[dict[str, Any]] = (),
+) -> None:
     """Print the summary."""
     import numpy as np
 
-    from orthonav.records import Fix
-
-    fixes = sum(isinstance(result.outcome, Fix) for result in results)
+    counts = Counts.of(results)
     latencies = np.array([result.latency_ms for result in results])
     latencies = latencies[np.isfinite(latencies)]
     median_ms = float(np.median(latencies)) if latencies.size else None
     plain = {
         "fixes": str(options.out),
-        "views": len(results),
-        "n_fix": fixes,
-        "n_no_fix": len(results) - fixes,
+        "views": counts.views,
+        "n_confident": counts.confident,
+        "n_unsure": counts.unsure,
+        "n_none": counts.none,
+        "accept": options.accept,
         "median_latency_ms": None if median_ms is None else round(median_ms, 3),
+        "advice": list(advice),
+        "setups": list(tried),
     }
     if options.json:
         print_json(plain)
-    else:
-        print(
-            f"{plain['views']} views: {fixes} fixes, {plain['n_no_fix']} without; "
-            f"median {median_ms or 0:.1f} ms per view\nwritten to {options.out}"
-        )
+        return
+    least = f"{accept.criterion.replace('_', ' ')} {accept.threshold:g} or more"
+    print(
+        f"{counts.views} views: {counts.confident} confident ({least}), {counts.unsure} unsure, "
+        f"{counts.none} without a position; median {median_ms or 0:.1f} ms per view"
+    )
+    for line in advice:
+        print(f"! {line}")
+    guesses = "; unsure positions are best guesses, marked as such" * bool(counts.unsure)
+    print(f"written to {options.out}{guesses}")

@@ -9,7 +9,7 @@ from orthonav.cli.common import add_dem
 
 if TYPE_CHECKING:
     from orthonav.localizer import Localizer
-    from orthonav.sources import Recording
+    from orthonav.sources import Recording, SourceView
 
 FAR_M = 1000.0
 """A recorded position farther from the map causes a warning: GNSS and logs err by less."""
@@ -97,28 +97,42 @@ def add_source(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def warn_if_far_from_map(flight: "Recording", localizer: "Localizer") -> None:
-    """Log a warning where the first view was recorded far from the map."""
+def far_from_map(view: "SourceView", localizer: "Localizer") -> tuple[float, str] | None:
+    """Distance (m) of the recorded position of a view and of its prior from the map, the larger
+    one, 0 on the map, and a hint where swapped coordinates explain it; None without a position."""
     import numpy as np
 
-    view = next(iter(flight.views), None)
-    if view is None:
-        return
-    prior, place = view.telemetry.prior, getattr(view, "truth_latlon_deg", None)
-    if place is None and prior is not None:
-        place = prior.lat_deg, prior.lon_deg
-    if place is None:
-        return
-    grid, position = localizer.grid, localizer.sheet.frame.en_from_latlon(*place)
+    from orthonav.geo.swapped import swapped_hint
+
+    grid, frame = localizer.grid, localizer.sheet.frame
     low = np.array([grid.west_m, grid.north_m - grid.height_px * grid.gsd_m])
     high = np.array([grid.west_m + grid.width_px * grid.gsd_m, grid.north_m])
-    beyond_m = float(np.hypot(*np.maximum(np.maximum(low - position, position - high), 0.0)))
-    if beyond_m > FAR_M:
-        log.warning(
-            "the recorded position of the first view is %s km from the map: check the map, and "
-            "the order of latitude and longitude",
-            f"{beyond_m / 1000:,.0f}",
-        )
+
+    def beyond_m(lat_deg: float, lon_deg: float) -> float:
+        position = frame.en_from_latlon(lat_deg, lon_deg)
+        return float(np.hypot(*np.maximum(np.maximum(low - position, position - high), 0.0)))
+
+    prior, recorded = view.telemetry.prior, view.truth_latlon_deg
+    places = [] if recorded is None else [recorded]
+    places += [] if prior is None else [(prior.lat_deg, prior.lon_deg)]
+    found = [(beyond_m(*place), place) for place in places if np.isfinite(place).all()]
+    if not found:
+        return None
+    far_m, place = max(found)
+    return far_m, swapped_hint(*place, lambda lat, lon: beyond_m(lat, lon) <= FAR_M)
+
+
+def far_text(what: str, far_m: float, hint: str) -> str:
+    """A sentence about positions that are far from the map."""
+    return f"{what} {far_m / 1000:,.0f} km from the map; check the map and the positions{hint}"
+
+
+def warn_if_far_from_map(flight: "Recording", localizer: "Localizer") -> None:
+    """Log a warning where the first view was recorded far from the map."""
+    view = next(iter(flight.views), None)
+    found = None if view is None else far_from_map(view, localizer)
+    if found is not None and found[0] > FAR_M:
+        log.warning("%s", far_text("the recorded position of the first view is", *found))
 
 
 def open_source(

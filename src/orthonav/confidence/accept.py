@@ -38,13 +38,18 @@ class Acceptance:
 
     def __call__(self, outcome: Fix | NoFix) -> Fix | NoFix:
         """The outcome, or `NoFix` where the number is below the threshold or unknown."""
-        if isinstance(outcome, NoFix):
+        if isinstance(outcome, NoFix) or self.accepts(outcome):
             return outcome
-        value = outcome.confidence
-        if self.criterion != "confidence":
-            value = outcome.evidence.get(self.criterion, math.nan)
-        if value >= self.threshold:
-            return outcome
+        value = self._value(outcome)
         value_text = "unknown" if math.isnan(value) else f"{value:.3g}"
         detail = f"{self.criterion} is {value_text}, at least {self.threshold:g} is required"
         return NoFix("low_confidence", detail, outcome.evidence)
+
+    def accepts(self, outcome: Fix | NoFix) -> bool:
+        """Whether there is a fix whose number is known and not below the threshold."""
+        return isinstance(outcome, Fix) and self._value(outcome) >= self.threshold
+
+    def _value(self, fix: Fix) -> float:
+        if self.criterion == "confidence":
+            return fix.confidence
+        return fix.evidence.get(self.criterion, math.nan)

@@ -14,6 +14,7 @@ from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaincinv
 
 from orthonav.evaluate.figures import FloatArray, frozen, mean, share, wilson
 
@@ -183,6 +184,17 @@ def normalized_squared(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> FloatA
 def nees_bound(level: float) -> float:
     """The `level` quantile of chi-square with 2 degrees of freedom."""
     return -2.0 * math.log1p(-level)
+
+
+def nees_mean_bounds(n: float) -> tuple[float, float]:
+    """The 95 % interval of the mean NEES of `n` independent views; NaN for none.
+
+    chi2.ppf(p, 2 n) / n, and chi2.ppf(p, k) is 2 gammaincinv(k / 2, p).
+    """
+    if not n > 0:
+        return math.nan, math.nan
+    low, high = (float(2.0 * gammaincinv(n, p) / n) for p in (0.025, 0.975))
+    return low, high
 
 
 def _correlation(cov_en_m2: FloatArray) -> FloatArray:

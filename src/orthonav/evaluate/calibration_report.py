@@ -1,5 +1,6 @@
 """Standard figures, confidence criteria and calibration as JSON values, text, rows and figures."""
 
+import math
 from dataclasses import asdict
 
 from orthonav.evaluate import calibration_plots
@@ -8,6 +9,7 @@ from orthonav.evaluate.calibration import (
     ConfidenceCalibration,
     CovarianceConsistency,
     nees_bound,
+    nees_mean_bounds,
 )
 from orthonav.evaluate.figures import or_none
 from orthonav.evaluate.metrics import CriterionRow, Metrics, wrong_key
@@ -191,10 +193,19 @@ def covariance_text(consistency: CovarianceConsistency) -> str:
     levels = " / ".join(f"{100 * level:g}" for level in NEES_LEVELS)
     found = " / ".join(f"{100 * consistency.within[level]:.1f}" for level in NEES_LEVELS)
     return (
+        f"{nees_words(consistency.nees_mean, *nees_mean_bounds(consistency.nees.size))}; "
         f"NEES of {consistency.nees.size} correct fixes has mean {consistency.nees_mean:.3g} "
         f"(2 expected), median {consistency.nees_median:.3g} ({nees_bound(0.5):.2f} expected); "
         f"{found} % within the bounds of {levels} %" + (f"; {left_out}" if left_out else "")
     )
+
+
+def nees_words(nees: float, low: float, high: float) -> str:
+    """What a mean NEES says, given the 95 % interval of that of a consistent covariance."""
+    times = f"errors are {math.sqrt(nees / 2):.1f} times as large as stated"
+    if nees > high:
+        return f"too small: {times}"
+    return f"cautious: {times}" if nees < low else "consistent with the errors"
 
 
 def _accepted(row: CriterionRow, radius_m: float) -> str:

@@ -23,13 +23,14 @@ from orthonav.report.numbers import measure_text, percent_text
 _COLUMNS = (
     "flight",
     "views",
-    "fixes",
+    "confident",
+    "wrong",
+    "unsure",
     "coverage",
     "right",  # named after the radius
     "of fixes",
     "median m",
     "95 % m",
-    "mean m",
     "max m",
     "latency ms",
 )
@@ -99,6 +100,12 @@ def metrics_to_json(metrics: Metrics) -> dict[str, object]:
     return {
         "n_views": metrics.n_views,
         "n_fixes": metrics.n_fixes,
+        "n_confident": metrics.n_confident,
+        "n_unsure": metrics.n_fixes - metrics.n_confident,
+        "n_confident_wrong": metrics.n_confident_wrong,
+        "wrong_above_m": metrics.wrong_above_m,
+        "confident_error_median_m": or_none(metrics.confident_median_m),
+        "confident_error_max_m": or_none(metrics.confident_max_m),
         "n_without_truth": metrics.n_without_truth,
         "n_without_result": metrics.n_without_result,
         "radius_m": metrics.radius_m,
@@ -158,6 +165,25 @@ def summary(flights: Sequence[FlightReport], whole: Metrics) -> str:
     return "\n".join(lines)
 
 
+def verdict(metrics: Metrics) -> str:
+    """A sentence that answers whether any confident fix was wrong."""
+    confident, wrong = metrics.n_confident, metrics.n_confident_wrong
+    above = f"{metrics.wrong_above_m:g} m and the radius that it states"
+    if not confident:
+        unsure = metrics.n_fixes
+        return f"No fix is confident: no position may be relied on ({unsure} are best guesses)."
+    errors = (
+        f"median error {measure_text(metrics.confident_median_m, ' m')}, largest "
+        f"{measure_text(metrics.confident_max_m, ' m')}"
+    )
+    if not wrong:
+        return (
+            f"No confident fix is wrong: none of {confident} errs by more than {above}; {errors}."
+        )
+    verb = "is" if wrong == 1 else "are"
+    return f"{wrong} of {confident} confident fixes {verb} WRONG, by more than {above}; {errors}."
+
+
 def table_header(flights: Sequence[FlightReport]) -> list[str]:
     """Names of the columns. Raises `ValueError` as `total` does."""
     radius_m = _radius_m(flights)
@@ -174,13 +200,14 @@ def _row(name: str, metrics: Metrics) -> list[str]:
     return [
         " ".join(name.split()),
         str(metrics.n_views),
-        str(metrics.n_fixes),
+        str(metrics.n_confident),
+        str(metrics.n_confident_wrong),
+        str(metrics.n_fixes - metrics.n_confident),
         percent_text(metrics.coverage),
         percent_text(metrics.accuracy),
         percent_text(metrics.accuracy_of_fixes),
         measure_text(metrics.standard.cep50_m),
         measure_text(metrics.standard.cep95_m),
-        measure_text(metrics.standard.ape.mean_m),
         measure_text(metrics.standard.ape.max_m),
         measure_text(metrics.latency_median_ms),
     ]

@@ -20,7 +20,7 @@ from orthonav.evaluate.calibration import (
     calibrate,
     check_covariance,
 )
-from orthonav.evaluate.figures import FloatArray, frozen, percentile, share
+from orthonav.evaluate.figures import BoolArray, FloatArray, frozen, percentile, share
 from orthonav.evaluate.standard import RPE_DISTANCE_M, StandardFigures, standard_figures
 from orthonav.geo.frames import LocalFrame
 from orthonav.records import Fix, NoFix, ViewResult
@@ -30,6 +30,8 @@ Positions = Mapping[str, tuple[float, float]]
 
 FAR_M = 35.0
 """A larger error is wrong by any measure: half a tile of the paper, `wrong_by_35m`."""
+NO_RESULT = "no_result"
+"""Reason of true positions that no result belongs to."""
 RADII_M = (5.0, 10.0, 15.0, 25.0, 35.0, 50.0, 100.0)
 CRITERIA: Mapping[str, tuple[float, ...]] = MappingProxyType(
     {
@@ -50,6 +52,7 @@ class Comparison:
     `truth_en_m`, `fix_en_m` (N, 2): positions in metres; fixes NaN where there is none.
     `errors_m` (N,): distance between them, NaN without a fix.
     `cov_en_m2` (N, 2, 2), `own_radius_m` (N,): as each fix states, NaN where unknown.
+    `confident` (N,): whether the fix may be relied on; any other one is a best guess.
     `criteria`: for each name of `CRITERIA` values (N,), NaN where unknown or without a fix.
     `reasons`: code of each view without a fix, "" for a fix.
     `latency_ms` (N,): processing time of each view.
@@ -66,12 +69,23 @@ class Comparison:
     errors_m: FloatArray
     cov_en_m2: FloatArray
     own_radius_m: FloatArray
+    confident: BoolArray
     criteria: Mapping[str, FloatArray]
     reasons: tuple[str, ...]
     latency_ms: FloatArray
     n_without_truth: int
     n_without_result: int
     starts: tuple[int, ...] = (0,)
+
+    @property
+    def n_views(self) -> int:
+        """Number of true positions: views without a result have no fix either."""
+        return self.errors_m.size + self.n_without_result
+
+    def confident_wrong(self, least_m: float) -> BoolArray:
+        """(N,): confident fixes that err by more than `least_m` and the radius they state."""
+        wrong: BoolArray = self.confident & (self.errors_m > np.fmax(least_m, self.own_radius_m))
+        return wrong
 
 
 @dataclass(frozen=True)
@@ -113,7 +127,10 @@ class Metrics:
 
     `radius_m`: a fix within it is right.
     `n_views`, `n_fixes`, `n_without_truth`, `n_without_result`: counts, see `Comparison`.
-    `coverage`: share of views with a fix.
+    `n_confident`, `n_confident_wrong`: confident fixes, and those of them that err by more than
+    `wrong_above_m` and the radius they state.
+    `confident_median_m`, `confident_max_m`: errors of the confident fixes.
+    `coverage`: share of the true positions with a fix, guesses included.
     `acc_at_m`, `acc_fixes_at_m`: for each radius the share of all views, and of fixes, within it.
     `latency_*_ms`: of all views.
     `reasons`: number of views without a fix by reason.
@@ -127,6 +144,11 @@ class Metrics:
     n_fixes: int
     n_without_truth: int
     n_without_result: int
+    n_confident: int
+    n_confident_wrong: int
+    wrong_above_m: float
+    confident_median_m: float
+    confident_max_m: float
     coverage: float
     acc_at_m: Mapping[float, float]
     acc_fixes_at_m: Mapping[float, float]
@@ -188,6 +210,7 @@ def compare(
         errors_m=frozen(np.hypot(*(fix_en_m - truth_en_m).T)),
         cov_en_m2=frozen(np.array([_covariance(result.outcome) for result in matched])),
         own_radius_m=frozen([_own_radius(result.outcome) for result in matched]),
+        confident=_flags([result.is_confident for result in matched]),
         criteria=MappingProxyType(criteria),
         reasons=tuple(_reason(result.outcome) for result in matched),
         latency_ms=frozen([result.latency_ms for result in matched]),
@@ -220,6 +243,7 @@ def pool(comparisons: Sequence[Comparison]) -> Comparison:
         errors_m=frozen(np.concatenate([p.errors_m for p in parts])),
         cov_en_m2=frozen(np.concatenate([p.cov_en_m2 for p in parts])),
         own_radius_m=frozen(np.concatenate([p.own_radius_m for p in parts])),
+        confident=_flags(np.concatenate([p.confident for p in parts])),
         criteria=MappingProxyType(joined),
         reasons=tuple(reason for p in parts for reason in p.reasons),
         latency_ms=frozen(np.concatenate([p.latency_ms for p in parts])),
@@ -247,18 +271,28 @@ def measure(
     errors_m, own_radius_m = comparison.errors_m, comparison.own_radius_m
     errors_en_m = comparison.fix_en_m - comparison.truth_en_m
     of_fixes_m = errors_m[np.isfinite(errors_m)]
+    of_confident_m = errors_m[comparison.confident & np.isfinite(errors_m)]
+    wrong_above_m, n_views = float(max(far_m, radius_m)), comparison.n_views
+    reasons = Counter(reason for reason in comparison.reasons if reason)
+    if comparison.n_without_result:
+        reasons[NO_RESULT] += comparison.n_without_result
     return Metrics(
         radius_m=float(radius_m),
-        n_views=errors_m.size,
+        n_views=n_views,
         n_fixes=of_fixes_m.size,
         n_without_truth=comparison.n_without_truth,
         n_without_result=comparison.n_without_result,
-        coverage=share(of_fixes_m.size, errors_m.size),
-        acc_at_m=_within(of_fixes_m, radii, errors_m.size),
+        n_confident=of_confident_m.size,
+        n_confident_wrong=int(np.count_nonzero(comparison.confident_wrong(wrong_above_m))),
+        wrong_above_m=wrong_above_m,
+        confident_median_m=percentile(of_confident_m, 50.0),
+        confident_max_m=percentile(of_confident_m, 100.0),
+        coverage=share(of_fixes_m.size, n_views),
+        acc_at_m=_within(of_fixes_m, radii, n_views),
         acc_fixes_at_m=_within(of_fixes_m, radii, of_fixes_m.size),
         latency_median_ms=percentile(comparison.latency_ms, 50.0),
         latency_p95_ms=percentile(comparison.latency_ms, 95.0),
-        reasons=MappingProxyType(dict(Counter(r for r in comparison.reasons if r).most_common())),
+        reasons=MappingProxyType(dict(reasons.most_common())),
         criteria=criterion_rows(comparison, radius_m, far_m),
         curves=tuple(criterion_curve(comparison, name, radius_m) for name in CRITERIA),
         calibration=calibrate(
@@ -300,15 +334,16 @@ def criterion_curve(comparison: Comparison, name: str, radius_m: float) -> Crite
     return CriterionCurve(
         name=name,
         thresholds=frozen(ordered[last]),
-        share_accepted=frozen(n_accepted / max(values.size, 1)),
+        share_accepted=frozen(n_accepted / max(comparison.n_views, 1)),
         accuracy=frozen(n_right[last] / n_accepted),
     )
 
 
-def worst_views(comparison: Comparison, n: int = 10) -> list[int]:
-    """Indices of the `n` fixes with the largest error, largest first."""
+def worst_views(comparison: Comparison, n: int = 10, wrong_above_m: float = FAR_M) -> list[int]:
+    """Indices of the `n` fixes with the largest error, confident and wrong ones first."""
     fixes = np.flatnonzero(np.isfinite(comparison.errors_m))
-    order = np.argsort(-comparison.errors_m[fixes], kind="stable")
+    wrong = comparison.confident_wrong(wrong_above_m)
+    order = np.lexsort((-comparison.errors_m[fixes], ~wrong[fixes]))
     return [int(i) for i in fixes[order[:n]]]
 
 
@@ -325,7 +360,7 @@ def _criterion_row(
     return CriterionRow(
         name=name,
         threshold=threshold,
-        share_accepted=share(n_accepted, values.size) if known else math.nan,
+        share_accepted=share(n_accepted, comparison.n_views) if known else math.nan,
         accuracy=share(n_right, n_accepted),
         n_accepted=n_accepted,
         n_right=n_right,
@@ -343,6 +378,12 @@ def _covariance(outcome: Fix | NoFix) -> FloatArray:
         return nothing
     stated = np.asarray(outcome.cov_en_m2, dtype=np.float64)
     return stated if stated.shape == (2, 2) else nothing
+
+
+def _flags(values: Sequence[bool] | BoolArray) -> BoolArray:
+    flags = np.array(values, dtype=np.bool_)
+    flags.setflags(write=False)
+    return flags
 
 
 def _own_radius(outcome: Fix | NoFix) -> float:

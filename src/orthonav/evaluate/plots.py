@@ -1,6 +1,6 @@
 """Figures of an evaluation: map, error curve, criteria, errors over time.
 
-Right and wrong fixes differ in colour and in mark.
+Colour shows confidence and the mark shows the error; confident and wrong fixes stand out by both.
 """
 
 import math
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthonav.evaluate.figures import BoolArray, FloatArray, runs
-from orthonav.evaluate.metrics import Comparison, CriterionCurve, Metrics
+from orthonav.evaluate.metrics import FAR_M, Comparison, CriterionCurve, Metrics
 from orthonav.evaluate.track import seconds_since_first
 from orthonav.report.canvas import (
     BACKING,
@@ -18,6 +18,7 @@ from orthonav.report.canvas import (
     RIGHT,
     SOFT,
     TRUTH,
+    UNSURE,
     WRONG,
     Drawing,
     draw_axes,
@@ -43,6 +44,23 @@ MAIN = ("confidence", 0.9)
 _NO_FIX_SHADE = "#EFE6C8"
 
 
+def fix_classes(
+    comparison: Comparison, radius_m: float
+) -> list[tuple[str, BoolArray, str, str, float]]:
+    """Label, mask (N,), colour, mark and size of each kind of fix, the worst last."""
+    errors_m, sure = comparison.errors_m, comparison.confident
+    wrong = comparison.confident_wrong(max(FAR_M, radius_m))
+    near, off = errors_m <= radius_m, errors_m > radius_m
+    beyond = f"off by more than {radius_m:g} m"
+    return [
+        ("unsure", near & ~sure, UNSURE, "o", 4.5),
+        (f"unsure, {beyond}", off & ~sure, UNSURE, "x", 5.5),
+        ("confident", near & sure, RIGHT, "o", 5.0),
+        (f"confident, {beyond}", off & sure & ~wrong, RIGHT, "x", 5.5),
+        ("confident and wrong", wrong, WRONG, "X", 7.5),
+    ]
+
+
 def map_picture(
     comparison: Comparison, radius_m: float, background: Background | None = None
 ) -> Drawing:
@@ -55,7 +73,7 @@ def map_picture(
     def draw(axes: "Axes") -> None:
         draw_map(axes, box, background)
         _draw_positions(axes, comparison, radius_m, box)
-        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)
 
     return draw_axes(map_size_in(box, 7.5), draw)
 
@@ -73,7 +91,7 @@ def error_curve_picture(comparison: Comparison, metrics: Metrics) -> Drawing:
         x = np.concatenate([[low], shown_m, [high]])
         axes.step(x, [*shares, shares[-1]], where="post", color=RIGHT, linewidth=2)
         axes.axhline(100 * metrics.coverage, color=GREY, linestyle=(0, (4, 3)), linewidth=1)
-        coverage = f"{100 * metrics.coverage:.0f} % of views have a fix"
+        coverage = f"{100 * metrics.coverage:.0f} % have a position, guesses included"
         axes.annotate(coverage, (low, 100 * metrics.coverage), (6, 4), **OFFSET, color=SOFT)
         axes.axvline(radius_m, color=WRONG, linewidth=1.2)
         axes.plot([radius_m], [100 * metrics.accuracy], "o", color=WRONG, zorder=5)
@@ -122,12 +140,11 @@ def over_time_picture(comparison: Comparison, radius_m: float) -> Drawing:
             label = "no fix" if i == 0 else "_nolegend_"
             axes.axvspan(edges[start], edges[stop], color=_NO_FIX_SHADE, linewidth=0, label=label)
         axes.plot(x, shown_m, color="#BBBBBB", linewidth=0.9, zorder=2)
-        right = errors_m <= radius_m
-        wrong = errors_m > radius_m
-        marks: dict[str, Any] = {"linestyle": "none", "markersize": 4.5, "zorder": 3}
-        axes.plot(x[right], shown_m[right], "o", color=RIGHT, label=_if("right", right), **marks)
-        axes.plot(x[wrong], shown_m[wrong], "X", color=WRONG, label=_if("wrong", wrong), **marks)
-        axes.axhline(radius_m, color=WRONG, linewidth=1.2, label=f"{radius_m:g} m")
+        for label, chosen, colour, mark, size in fix_classes(comparison, radius_m):
+            if chosen.any():
+                style: dict[str, Any] = {"color": colour, "markersize": size, "label": label}
+                axes.plot(x[chosen], shown_m[chosen], mark, **style, zorder=3)
+        axes.axhline(radius_m, color=SOFT, linewidth=1.2, label=f"{radius_m:g} m")
         finite = shown_m[np.isfinite(shown_m)]
         low = min([radius_m / 10, *finite]) / 1.5
         high = max([radius_m * 10, *finite]) * 1.5
@@ -182,13 +199,8 @@ def inside_box(positions_en_m: FloatArray, box: tuple[float, ...]) -> BoolArray:
 def _draw_positions(
     axes: "Axes", comparison: Comparison, radius_m: float, box: tuple[float, ...]
 ) -> None:
-    truth, fixes, errors_m = comparison.truth_en_m, comparison.fix_en_m, comparison.errors_m
-    right, wrong = errors_m <= radius_m, errors_m > radius_m
-    for chosen, colour in ((right, RIGHT), (wrong, WRONG)):
-        lines = np.full((3 * int(chosen.sum()), 2), np.nan)  # truth, fix, pen up
-        lines[0::3], lines[1::3] = truth[chosen], fixes[chosen]
-        axes.plot(*lines.T, color=colour, linewidth=0.9, alpha=0.7, zorder=3)
-    none = np.isnan(errors_m)
+    truth, fixes = comparison.truth_en_m, comparison.fix_en_m
+    none = np.isnan(comparison.errors_m)
     ring: dict[str, Any] = {
         "linestyle": "none",
         "marker": "o",
@@ -196,12 +208,16 @@ def _draw_positions(
         "zorder": 4,
     }
     axes.plot(*truth[~none].T, ".", color=TRUTH, markersize=3, zorder=7, label=_if("truth", ~none))
-    axes.plot(
-        *fixes[right].T, "o", color=RIGHT, markersize=5.5, zorder=5, label=_if("right fix", right)
-    )
-    outside = wrong & ~inside_box(fixes, box)
-    label = "wrong fix" + (f" ({int(outside.sum())} outside)" if outside.any() else "")
-    axes.plot(*fixes[wrong].T, "X", color=WRONG, markersize=6.5, zorder=6, label=_if(label, wrong))
+    for order, (label, chosen, colour, mark, size) in enumerate(fix_classes(comparison, radius_m)):
+        if not chosen.any():
+            continue
+        lines = np.full((3 * int(chosen.sum()), 2), np.nan)  # truth, fix, pen up
+        lines[0::3], lines[1::3] = truth[chosen], fixes[chosen]
+        axes.plot(*lines.T, color=colour, linewidth=0.9, alpha=0.7, zorder=3)
+        outside = int((chosen & ~inside_box(fixes, box)).sum())
+        style: dict[str, Any] = {"color": colour, "markersize": size, "zorder": 5 + order / 10}
+        label += f" ({outside} outside)" if outside else ""
+        axes.plot(*fixes[chosen].T, mark, **style, label=label)
     axes.plot(*truth[none].T, color=TRUTH, markersize=4.5, label=_if("truth, no fix", none), **ring)
 
 

@@ -17,7 +17,8 @@ from orthonav.evaluate.calibration_report import (
     standard_rows,
 )
 from orthonav.evaluate.contact_sheet import row_text, sheet_picture
-from orthonav.evaluate.flights import FlightReport, table_header, table_rows, total
+from orthonav.evaluate.figures import share
+from orthonav.evaluate.flights import FlightReport, table_header, table_rows, total, verdict
 from orthonav.evaluate.gnss import gnss_figure, gnss_rows
 from orthonav.evaluate.metrics import Comparison, Metrics, pool, worst_views
 from orthonav.evaluate.track_plots import track_figures
@@ -89,9 +90,12 @@ def page_of(
     values: dict[str, Any] = {
         "title": title or f"Evaluation of {subject}",
         "kind": "Evaluation of flights",
+        "verdict": verdict(whole),
+        "verdict_kind": "bad" if whole.n_confident_wrong else "good" if whole.n_confident else "",
         "cards": _cards(whole),
         "notes": _notes(whole),
         "radius": f"{whole.radius_m:g} m",
+        "wrong_above": f"{whole.wrong_above_m:g} m",
         "table_header": table_header(flights),
         "table_rows": table_rows(flights, whole),
         "sections": [_section(*each) for each in zip(flights, drawn, strict=False)],
@@ -107,12 +111,13 @@ def page_of(
 
 def _cards(metrics: Metrics) -> tuple[tuple[str, str], ...]:
     radius = f"{metrics.radius_m:g} m"
+    confident = share(metrics.n_confident, metrics.n_views)
     return (
+        (percent_text(confident), f"of {metrics.n_views} views have a confident fix"),
+        (str(metrics.n_confident_wrong), "confident fixes are wrong"),
         (percent_text(metrics.accuracy), f"of all views have a fix within {radius}"),
-        (percent_text(metrics.coverage), f"of {metrics.n_views} views have a fix"),
-        (measure_text(metrics.standard.ape.rmse_m, " m"), "RMSE of fixes"),
-        (measure_text(metrics.standard.cep50_m, " m"), "CEP50, median error of fixes"),
-        (measure_text(metrics.standard.cep95_m, " m"), "CEP95, 95 % of fixes err less"),
+        (measure_text(metrics.standard.cep50_m, " m"), "CEP50, median error, guesses included"),
+        (measure_text(metrics.standard.cep95_m, " m"), "CEP95, 95 % err less, guesses included"),
         (measure_text(metrics.latency_median_ms, " ms"), "median time per view"),
     )
 
@@ -122,7 +127,9 @@ def _notes(metrics: Metrics) -> list[str]:
     if metrics.n_without_truth:
         notes.append(f"{metrics.n_without_truth} results have no true position and are left out.")
     if metrics.n_without_result:
-        notes.append(f"{metrics.n_without_result} true positions have no result and do not count.")
+        notes.append(
+            f"{metrics.n_without_result} true positions have no result: views without a fix."
+        )
     if not metrics.n_fixes:
         notes.append("No view has a fix, so errors are not defined.")
     return notes
@@ -166,14 +173,15 @@ def _drawn(flight: FlightReport) -> _Drawn:
     general = (
         Figure(
             "map",
-            f"Map of {metrics.n_views} true positions and {metrics.n_fixes} fixes",
+            f"Map of {metrics.n_views} true positions, {metrics.n_confident} confident fixes and "
+            f"{metrics.n_fixes - metrics.n_confident} best guesses",
             "Map, north up: each fix is joined to its true position.",
             plots.map_picture(comparison, radius_m, background),
         ),
         Figure(
             "error-over-time",
             f"Error of each view over time; {percent_text(metrics.coverage)} have a fix",
-            "Error over time; shaded where there is no fix.",
+            "Error over time, confident and unsure; shaded where there is no fix.",
             plots.over_time_picture(comparison, radius_m),
         ),
         *_figures(comparison, metrics),
@@ -233,17 +241,18 @@ def _named(drawn: _Drawn, name: str, file_name: str) -> _Drawn:
 
 def _worst(comparison: Comparison, metrics: Metrics) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
-    for i in worst_views(comparison, _N_WORST):
+    wrong = comparison.confident_wrong(metrics.wrong_above_m)
+    for i in worst_views(comparison, _N_WORST, metrics.wrong_above_m):
         east_m, north_m = comparison.fix_en_m[i] - comparison.truth_en_m[i]
-        right = comparison.errors_m[i] <= metrics.radius_m
         rows.append(
             (
                 comparison.frames[i],
                 f"{comparison.time_ns[i] / 1e9:.2f}",
-                measure_text(comparison.errors_m[i]) + ("" if right else " ✗"),
+                measure_text(comparison.errors_m[i]) + (" ✗" if wrong[i] else ""),
                 f"{east_m:+.1f}",
                 f"{north_m:+.1f}",
-                plain_text(comparison.criteria["confidence"][i]),
+                plain_text(comparison.criteria["confidence"][i])
+                + ("" if comparison.confident[i] else ", unsure"),
                 plain_text(comparison.criteria["peak_ratio"][i]),
             )
         )

@@ -13,9 +13,13 @@ from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
-from orthonav.evaluate.calibration import is_covariance, nees_bound, normalized_squared
+from orthonav.evaluate.calibration import (
+    is_covariance,
+    nees_bound,
+    nees_mean_bounds,
+    normalized_squared,
+)
 from orthonav.evaluate.figures import (
     BoolArray,
     FloatArray,
@@ -271,17 +275,6 @@ def check_consistency(errors_en_m: FloatArray, cov_en_m2: FloatArray) -> TrackCo
         effective_high=high,
         verdict=verdict if nees.size else "",
     )
-
-
-def nees_mean_bounds(n: float) -> tuple[float, float]:
-    """The 95 % interval of the mean NEES of `n` independent views; NaN for none.
-
-    chi2.ppf(p, 2 n) / n, and chi2.ppf(p, k) is 2 gammaincinv(k / 2, p).
-    """
-    if not n > 0:
-        return math.nan, math.nan
-    low, high = (float(2.0 * gammaincinv(n, p) / n) for p in (0.025, 0.975))
-    return low, high
 
 
 def effective_number(whitened: FloatArray) -> float:

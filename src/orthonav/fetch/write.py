@@ -1,7 +1,6 @@
 """Cells into one cloud-optimized GeoTIFF, block by block, whole or not at all."""
 
 import json
-import shutil
 import tempfile
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -23,7 +22,7 @@ from orthonav.fetch.download import FetchedCells
 from orthonav.fetch.grid import Selection
 from orthonav.fetch.options import Provenance
 from orthonav.fetch.service import CellSource
-from orthonav.files import Progress, replacing
+from orthonav.files import Progress, not_written, replacing
 
 BLOCK_PX = 512
 """GDAL's default block of a COG."""
@@ -82,7 +81,7 @@ def write_mosaic(
             _verify(temporary, raw, source)
             progress("pack", 1.0)
         except (RasterioError, MemoryError) as error:
-            raise _not_written(error, out) from error
+            raise not_written(error.__cause__ or error, out) from error
     return counts
 
 
@@ -223,10 +222,3 @@ def tags_of(provenance: Provenance, selection: Selection) -> dict[str, str]:
         elif len(date) == 10:
             tags["TIFFTAG_DATETIME"] = date.replace("-", ":") + " 00:00:00"
     return {name: value for name, value in tags.items() if value}
-
-
-def _not_written(error: BaseException, out: Path) -> OutputError:
-    reason = " ".join(str(error.__cause__ or error).split())[:200]
-    free = shutil.disk_usage(out.resolve().parent).free
-    full = " (disk full)" if free < 2**20 else ""
-    return OutputError(f"cannot write{full} ({reason}); nothing was written: {out}")

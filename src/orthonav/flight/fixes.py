@@ -24,7 +24,8 @@ KEYS = (
     "frame",  # name of the image in the flight folder
     "time_s",  # time of exposure
     "status",  # "fix" or "no_fix"
-    "lat_deg",  # WGS84; null for no_fix, like all down to agl_m
+    "confident",  # false: the position is the best guess; null for no_fix, like all down to agl_m
+    "lat_deg",  # WGS84
     "lon_deg",
     "cov_en_m2",  # [[east-east, east-north], [north-east, north-north]]
     "confidence",  # probability that the error is below radius_m, 0 to 1
@@ -42,7 +43,7 @@ TRACK_KEYS = (
 )
 STATES = ("searching", "tracking", "coasting", "lost")
 _NULL_IN_FIX = {"reason": None, "detail": None}
-_NULL_IN_NO_FIX = dict.fromkeys(KEYS[3:10])
+_NULL_IN_NO_FIX = dict.fromkeys(KEYS[3:11])
 MAX_LINE_BYTES = 2**20
 """Limit of a line; the evidence of a view takes about 1000 bytes."""
 MAX_RESULTS = 1_000_000
@@ -58,6 +59,8 @@ def result_to_json(result: ViewResult) -> str:
         "evidence": {str(k): _or_none(v) for k, v in result.outcome.evidence.items()},
         "latency_ms": _or_none(result.latency_ms),
     }
+    if isinstance(result.outcome, Fix):
+        values["confident"] = result.is_confident
     texts = {key: json.dumps(value, allow_nan=False) for key, value in values.items()}
     texts["time_s"] = _seconds(result.time_ns)
     keys: tuple[str, ...] = KEYS
@@ -85,6 +88,7 @@ def result_from_json(line: str) -> ViewResult:
         outcome=_outcome(values),
         latency_ms=_number(values, "latency_ms"),
         state=_state(values),
+        accepted=_accepted(values),
     )
 
 
@@ -143,6 +147,14 @@ def _state(values: Mapping[str, Any]) -> str | None:
     if state is not None and state not in STATES:
         raise FlightError(f"state: expected one of {', '.join(STATES)}, got {state!r:.40}")
     return state
+
+
+def _accepted(values: Mapping[str, Any]) -> bool | None:
+    """Whether a fix is marked as confident; None in files of earlier versions, without the mark."""
+    confident = values.get("confident")
+    if confident is not None and not isinstance(confident, bool):
+        raise FlightError(f"confident: expected true or false, got {_kind(confident)}")
+    return confident
 
 
 def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:

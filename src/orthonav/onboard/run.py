@@ -95,9 +95,9 @@ def localize_flight(
     """Results of the views of a recorded flight, in order, as they are computed.
 
     `heights`: turns reported heights into heights above ground; None: they are used as reported.
-    Fixes that do not pass `accept` become `NoFix` with their evidence. Raises `FlightError` at an
-    image that cannot be decoded, unless `skip_bad_images` makes it a `NoFix`; raises `CameraError`
-    where an image has not the camera's size.
+    With `accept` each result says whether its fix meets it. Raises `FlightError` at an image that
+    cannot be decoded, unless `skip_bad_images` makes it a `NoFix`; raises `CameraError` where an
+    image has not the camera's size.
     """
     for view in flight.views if views is None else views:
         outcome: Fix | NoFix
@@ -118,9 +118,10 @@ def localize_flight(
                 raise CameraError(f"{error}: {view.where}") from error
         if heights is not None:
             heights.observe(telemetry.time_ns, outcome, locator.state_name)
-        if accept is not None:
-            outcome = accept(outcome)
-        yield ViewResult(view.frame, telemetry.time_ns, outcome, latency_ms, locator.state_name)
+        accepted = None if accept is None else accept.accepts(outcome)
+        yield ViewResult(
+            view.frame, telemetry.time_ns, outcome, latency_ms, locator.state_name, accepted
+        )
 
 
 def smoothed_track(
@@ -128,9 +129,11 @@ def smoothed_track(
 ) -> list[ViewResult]:
     """Results of a whole flight after smoothing: every position uses all views."""
     placed = [_finite(outcome) for outcome in tracker.smoothed_track()]
-    chosen = placed if accept is None else [accept(outcome) for outcome in placed]
     return [
-        replace(result, outcome=outcome) for result, outcome in zip(results, chosen, strict=True)
+        replace(
+            result, outcome=outcome, accepted=None if accept is None else accept.accepts(outcome)
+        )
+        for result, outcome in zip(results, placed, strict=True)
     ]
 
 

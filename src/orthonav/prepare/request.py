@@ -190,12 +190,16 @@ def _area(request: BuildRequest, mosaic: Mosaic) -> Area:
         area = Area.from_bounds(request.bounds_deg)
     else:
         return Area.from_outline(outline[:, 0], outline[:, 1])
-    _check_not_swapped(area, outline)
+    _check_not_far(area, outline)
     return area
 
 
-def _check_not_swapped(area: Area, outline_deg: NDArray[np.float64]) -> None:
-    """Raise `AreaError` if swapping latitude and longitude brings an area into the imagery.
+_FAR_DEG = 0.02
+"""An area farther than this from the box of the imagery, about 2 km, is certainly outside it."""
+
+
+def _check_not_far(area: Area, outline_deg: NDArray[np.float64]) -> None:
+    """Raise `AreaError` for an area far from the imagery, or in it with swapped coordinates.
 
     `outline_deg` (N, 2): outline of the imagery. Areas that overlap its box are accepted.
     """
@@ -209,9 +213,9 @@ def _check_not_swapped(area: Area, outline_deg: NDArray[np.float64]) -> None:
     centre = area.frame.lat_deg, area.frame.lon_deg
     lat, lon = area.frame.latlon_from_en(np.array(area.extent_en_m).reshape(2, 2))
     lon += 360 * np.round(((west + east) / 2 - centre[1]) / 360)
-    apart = lat[1] < south or lat[0] > north or lon[1] < west or lon[0] > east
+    apart_deg = max(south - lat[1], lat[0] - north, west - lon[1], lon[0] - east)
     hint = swapped_hint(*centre, within)
-    if apart and hint:
+    if apart_deg > _FAR_DEG or (apart_deg > 0 and hint):
         raise AreaError(
             f"the area, at {centre[0]:.4f}, {centre[1]:.4f}, has no imagery: the orthophotos cover "
             f"{south:.4f} to {north:.4f} N, {west:.4f} to {east:.4f} E{hint}"

@@ -8,7 +8,7 @@ import hashlib
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,7 +95,8 @@ def _write(folder: Path, contents: Mapping[str, bytes], others: Mapping[Path, by
         if _is_ours(folder / name, earlier[name]):
             (folder / name).unlink(missing_ok=True)
     if old or new:
-        _write_list(folder, new)
+        with suppress(OutputError):  # all is in place, and the list names more than that
+            _write_list(folder, new)
 
 
 def file_names(texts: Sequence[str]) -> list[str]:

@@ -8,6 +8,7 @@ from orthonav.errors import FlightError
 from orthonav.files import replacing_folder
 from orthonav.flight import FlightWriter
 from orthonav.flight.writer import encoded
+from orthonav.geo.headings import seem_radians
 from orthonav.sources.recording import Recording, SourceView
 
 READABLE = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
@@ -27,6 +28,8 @@ class Imported:
     """Views left out because their image cannot be decoded, or has another size."""
     first_broken: str
     """The error of the first one of them."""
+    radians: bool
+    """Whether the headings look like radians."""
 
 
 def import_flight(
@@ -43,7 +46,7 @@ def import_flight(
     written.
     """
     views = truths = complete = broken = 0
-    first_broken = ""
+    first_broken, yaw_deg = "", []
     with replacing_folder(Path(out)) as folder:
         writer = FlightWriter(folder, recording.camera, recording.note)
         for view in recording.views:
@@ -54,6 +57,7 @@ def import_flight(
                 continue
             writer.add_encoded(frame, data, view.telemetry, view.truth_latlon_deg)
             views += 1
+            yaw_deg.append(view.telemetry.yaw_deg)
             truths += view.truth_latlon_deg is not None
             complete += not view.telemetry.missing()
             if recording.expected:
@@ -61,7 +65,7 @@ def import_flight(
         if views == 0:
             raise FlightError(first_broken or f"recording has no view: {recording.path}")
         writer.close()
-    return Imported(views, truths, complete, broken, first_broken)
+    return Imported(views, truths, complete, broken, first_broken, seem_radians(yaw_deg))
 
 
 def _encoded_image(

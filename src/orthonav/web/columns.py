@@ -14,7 +14,7 @@ from orthonav.evaluate.calibration import is_covariance
 from orthonav.evaluate.metrics import FAR_M
 from orthonav.flight.fixes import STATES
 from orthonav.flight.gnss import fault_of, gnss_of
-from orthonav.records import CONFIDENT, Fix, ViewResult
+from orthonav.records import Fix, ViewResult
 from orthonav.web.sheet import SheetImagery
 
 Array = NDArray[np.float64]
@@ -40,6 +40,7 @@ def columns_of(
     counter-clockwise from east.
     `head`, `agl`: heading (deg) and height (m).
     `state`: number in `STATES`, -1 without one; `reason`: "" for a fix.
+    `sure`: 1 if confident, 0 for a best guess or no fix.
     `wrong`: 1 if tracking or confident, with an error above 35 m, `radius_m` and its own radius.
     """
     fixes = [r.outcome if isinstance(r.outcome, Fix) else None for r in results]
@@ -48,7 +49,7 @@ def columns_of(
     error_m = np.hypot(*(fix_en_m - truth_en_m).T)
     own_m = np.array([math.nan if f is None else f.radius_m for f in fixes], dtype=np.float64)
     confident = [
-        f is not None and (f.confidence >= CONFIDENT or r.state == "tracking")
+        f is not None and (r.is_confident or r.state == "tracking")
         for f, r in zip(fixes, results, strict=True)
     ]
     wrong = np.array(confident, dtype=bool) & (error_m > np.fmax(max(FAR_M, radius_m), own_m))
@@ -80,6 +81,7 @@ def columns_of(
         "ms": _rounded(np.array([r.latency_ms for r in results], dtype=np.float64), 1),
         "state": [-1 if r.state is None else STATES.index(r.state) for r in results],
         "reason": [_reason(r) for r in results],
+        "sure": [int(r.is_confident) for r in results],
         "wrong": [int(each) for each in wrong],
     }
 

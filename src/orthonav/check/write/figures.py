@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from orthonav.check.outcome import Along, BlindStretch, CheckResult, Envelope
 from orthonav.check.write.imagery import Box, shrunk, visible_box
-from orthonav.check.write.risk import RISKS, segments
+from orthonav.check.write.risk import EDGE_PX, RISKS, segments
 from orthonav.check.write.shapes import stretch_en_m
 from orthonav.check.write.summary import summarize
 from orthonav.check.write.wording import share_text, tolerance_sentence
@@ -105,13 +105,18 @@ def _draw_cells(axes: "Axes", result: CheckResult) -> None:
 def _draw_route(axes: "Axes", result: CheckResult, along: Along) -> None:
     """The route in classes of risk; blind stretches in black, with numbers."""
     points = along.points_en_m
-    axes.plot(*points.T, color="white", linewidth=4.5, zorder=3, solid_capstyle="round")
     drawn = segments(along.probability)
     for number, risk in enumerate(RISKS):
         style: Any = (0, [each / risk.width for each in risk.dash]) if risk.dash else "-"
         looks = {"color": risk.colour, "linewidth": 0.5 * risk.width, "linestyle": style}
         found = [points[first : last + 1] for kind, first, last in drawn if kind == number]
+        edge: dict[str, Any] = {
+            "color": risk.edge,
+            "linewidth": 0.5 * (risk.width + EDGE_PX),
+            "zorder": 3,
+        }
         for i, line in enumerate(found):
+            axes.plot(*line.T, **edge, solid_capstyle="round")
             axes.plot(*line.T, **looks, label="" if i else risk.range_text, zorder=4)
     for number, each in enumerate(result.stretches, start=1):
         line = stretch_en_m(along, each.start_m, each.end_m)

@@ -9,7 +9,7 @@ from orthonav.check.outcome import CELL_VALUES, BlindStretch, CheckResult
 from orthonav.check.write.figures import MAX_LOOKALIKES
 from orthonav.check.write.imagery import jpeg, visible_box
 from orthonav.check.write.plain import Plain, plain, to_plain
-from orthonav.check.write.risk import RISKS, segments
+from orthonav.check.write.risk import EDGE_PX, RISKS, segments
 from orthonav.check.write.shapes import stretch_en_m
 from orthonav.check.write.summary import summarize
 from orthonav.check.write.wording import (
@@ -53,7 +53,7 @@ def page_of(result: CheckResult, image: Background, figures: list[Figure], leafl
         "title": f"Check of {about.map_name}" + f" for {about.route_name}" * bool(about.route_name),
         "kind": "Check before take-off",
         "result": result,
-        "symbols": {word.value: symbol for word, symbol in SYMBOLS.items()},
+        "symbols": {"info": "i", **{word.value: symbol for word, symbol in SYMBOLS.items()}},
         "sentence": verdict_sentence(result),
         "cards": _cards(result),
         "note": "" if result.second_date else SIMULATED,
@@ -184,6 +184,7 @@ def _page_data(result: CheckResult, image: Background) -> str:
         "colours": _colours(),
         "confident": CONFIDENT,
         "risks": [vars(risk) for risk in RISKS],
+        "edge_px": EDGE_PX,
         "most": {
             "error_m": _two_digits(max(most_m, 1.0)),
             "wrong": _two_digits(max(0.05, most_wrong)),

@@ -1,4 +1,4 @@
-"""Classes of risk along the route; they differ in width and dash as well as in colour."""
+"""Classes of risk along the route, in the colours of the cells, and differing in width and dash."""
 
 from dataclasses import dataclass
 
@@ -13,6 +13,8 @@ class Risk:
     """A class of places along the route.
 
     `least`: lowest probability of the class; NaN where the probability is unknown.
+    `colour`: that of the middle of its range on the scale of the cells (cividis: light is likely);
+    `edge`: behind it, so that it stands out on the cells.
     `width`: of the line in pixels; `dash`: lengths drawn and skipped, empty for a solid line.
     `range_text`: its range of probabilities.
     """
@@ -20,18 +22,22 @@ class Risk:
     name: str
     least: float
     colour: str
+    edge: str
     width: float
     dash: tuple[int, ...]
     range_text: str
 
 
+_DARK, _LIGHT = "#1a1a1a", "#ffffff"
 RISKS = (
-    Risk("confident", CONFIDENT, "#0072b2", 4.0, (), "0.9 or more"),
-    Risk("likely", 0.7, "#56b4e9", 4.0, (), "0.7 to 0.9"),
-    Risk("doubtful", 0.5, "#e69f00", 5.0, (9, 4), "0.5 to 0.7"),
-    Risk("unlikely", 0.0, "#d55e00", 6.5, (), "below 0.5"),
-    Risk("unknown", float("nan"), "#6e6e6e", 4.0, (4, 6), "unknown"),
+    Risk("confident", CONFIDENT, "#f3db42", _DARK, 4.0, (), "0.9 or more"),
+    Risk("likely", 0.7, "#c8b866", _DARK, 2.5, (), "0.7 to 0.9"),
+    Risk("doubtful", 0.5, "#948e77", _LIGHT, 5.0, (9, 4), "0.5 to 0.7"),
+    Risk("unlikely", 0.0, "#434e6c", _LIGHT, 6.5, (), "below 0.5"),
+    Risk("unknown", float("nan"), "#ffffff", _DARK, 4.0, (4, 6), "unknown"),
 )
+EDGE_PX = 3.0
+"""How much wider the edge is than the line."""
 
 
 def risk_of(probability: float) -> int:

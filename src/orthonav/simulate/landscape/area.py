@@ -1,6 +1,7 @@
 """Orthophotos of a generated landscape as GeoTIFF files, one per date."""
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 
 from orthonav.errors import AreaError, OutputError
 from orthonav.extras import missing_extra
-from orthonav.files import replacing
+from orthonav.files import not_written, replacing
 from orthonav.simulate.landscape.epoch import DEFAULT_DATES, Epoch
 from orthonav.simulate.landscape.scene import ORIGIN_M, Landscape, check_gsd
 from orthonav.simulate.landscape.window import chunks
@@ -42,23 +43,22 @@ def generate_area(
     if not names or len(set(names)) < len(names):
         raise AreaError(f"dates must be one or more with different names, got {names}")
     landscape = Landscape(seed)
-    paths = []
-    for number, date in enumerate(dates):
-        path = Path(out_dir) / f"{date.name}.tif"
+    paths = [Path(out_dir) / f"{name}.tif" for name in names]
+    with ExitStack() as stack:  # all are written before any is renamed
+        for number, (date, path) in enumerate(zip(dates, paths, strict=True)):
 
-        def report(share: float, done: int = number) -> None:
-            if progress is not None:
-                progress((done + share) / len(names))
+            def report(share: float, done: int = number) -> None:
+                if progress is not None:
+                    progress((done + share) / len(names))
 
-        report(0.0)
-        with replacing(path) as temporary:
+            report(0.0)
+            temporary = stack.enter_context(replacing(path))
             try:
                 _write(temporary, landscape, date, (width_px, height_px), gsd_m, report)
             except OSError as error:
                 if isinstance(error, OutputError) or error.errno is not None:
                     raise  # GDAL's own errors carry no number
-                raise OutputError(f"cannot write ({error.__cause__ or error}): {path}") from error
-        paths.append(path)
+                raise not_written(error.__cause__ or error, path) from error
     return paths
 
 

@@ -4,7 +4,7 @@
 import { getJson, mapUrl, rawUrl, viewUrl } from "./api.js";
 import { L, at } from "./map.js";
 import { clock, metres, number } from "./format.js";
-import { NAMES } from "./look.js";
+import { described } from "./look.js";
 
 const BLINK_MS = 600; // slower than three flashes a second
 const WAIT_MS = 90; // while stepping fast, images are not requested
@@ -205,7 +205,7 @@ export function sentence(store, i) {
   const parts = [store.rising ? clock(c.t[i]) : `view ${i + 1}`];
   const health = healthAt(store, i);
   if (c.reason[i]) parts.push(`no fix: ${c.reason[i]}`);
-  else parts.push(NAMES[store.state(i)]);
+  else parts.push(described(store, i));
   if (Number.isFinite(c.err[i])) parts.push(`error ${metres(c.err[i])}`);
   if (c.wrong[i]) parts.push("CONFIDENT AND WRONG");
   if (Number.isFinite(c.conf[i])) parts.push(`confidence ${number(c.conf[i], 3)} within ${metres(c.radius[i])}`);

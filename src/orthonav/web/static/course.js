@@ -9,6 +9,7 @@ import { CONFIDENT } from "./store.js";
 const MANY = 800;
 const BAND = 9;
 const GAP = 5;
+const HEIGHTS = { tracking: 1, alone: 1, searching: 0.75, coasting: 0.5, lost: 0.25, none: 0.15 };
 const FLOOR_M = 0.1; // a log axis has no zero
 const TIME_STEPS_S = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200];
 const LEVELS = { OK: "good", DEGRADED: "warn", FAILED: "bad" };
@@ -116,7 +117,7 @@ export class Course extends Chart {
     const positive = c.a.map((v) => (v > 0 ? v : NaN));
     this.area(context, this.places, null, positive, y, colour("shade"), bottom);
     if (withGnss) this.#points(context, gnss, (v) => Math.max(y(v), top), () => "gnss");
-    this.#points(context, c.err, (v) => Math.max(y(v), top), (i) => (c.wrong[i] ? "wrong" : "ink"));
+    this.#points(context, c.err, (v) => Math.max(y(v), top), (i) => (c.wrong[i] ? "wrong" : this.store.trust(i)));
     const text = withTruth ? "error; shaded: stated 1 σ" : "stated 1 σ";
     const more = withTruth ? "; green: error of GNSS" : "; green: GNSS from the map";
     this.label(context, withGnss ? text + more : text, LEFT + 5, top + 10);
@@ -126,7 +127,7 @@ export class Course extends Chart {
     const y = (v) => bottom - v * (bottom - top);
     this.rules(context, [0, 1], y, colour("line"));
     this.rules(context, [CONFIDENT], y, colour("soft"), { dash: [4, 3], text: String });
-    this.#points(context, this.store.columns.conf, y, (i) => this.store.state(i));
+    this.#points(context, this.store.columns.conf, y, (i) => this.store.trust(i));
     this.label(context, "confidence", LEFT + 5, bottom - 3);
   }
 
@@ -134,10 +135,10 @@ export class Course extends Chart {
     this.label(context, "state", 2, top + BAND);
     const { store, places } = this;
     for (let from = 0, i = 1; i <= store.count; i++) {
-      const state = store.state(from);
-      if (i < store.count && store.state(i) === state) continue;
+      const [state, trust] = [store.state(from), store.trust(from)];
+      if (i < store.count && store.state(i) === state && store.trust(i) === trust) continue;
       const end = i < store.count ? places[i] : places[i - 1] + 2;
-      this.#bar(context, places[from], end, top, state, state === "none" ? BAND / 3 : BAND);
+      this.#bar(context, places[from], end, top, trust, BAND * HEIGHTS[state]);
       from = i;
     }
   }

@@ -1,8 +1,7 @@
 // The list of views, filtered and ordered, one page at a time.
 
 import { clock, metres, number } from "./format.js";
-import { MARKS, NAMES } from "./look.js";
-import { CONFIDENT } from "./store.js";
+import { MARKS, described } from "./look.js";
 
 const PAGE = 40;
 
@@ -50,12 +49,12 @@ export class List {
     const { store } = this;
     const many = (rule) => { let n = 0; for (let i = 0; i < store.count; i++) n += rule(i) ? 1 : 0; return n; };
     const c = store.columns;
-    const choices = [["all", "all views", store.count], ["fix", "fixes", store.stats.fixes]];
+    const choices = [["all", "all views", store.count], ["sure", "confident", store.stats.sure]];
     if (store.stats.withTruth) {
       choices.push(["wrong", "confident and wrong", store.stats.wrong]);
       choices.push(["far", `error above ${metres(store.run.radius_m)}`, many((i) => c.err[i] > store.run.radius_m)]);
     }
-    choices.push(["doubt", `confidence below ${CONFIDENT}`, many((i) => !c.reason[i] && !(c.conf[i] >= CONFIDENT))]);
+    choices.push(["doubt", "unsure: best guesses", store.stats.fixes - store.stats.sure]);
     for (const state of store.run.states) {
       choices.push([`state:${state}`, state, many((i) => store.state(i) === state)]);
     }
@@ -91,7 +90,7 @@ export class List {
     const error = c.reason[i] || (Number.isFinite(c.err[i]) ? metres(c.err[i]) : `σ ${metres(c.a[i])}`);
     const name = this.store.rising ? `${clock(c.t[i])}  ${c.frame[i]}` : c.frame[i];
     const parts = [
-      ["mark", MARKS[this.store.state(i)]],
+      [`mark ${this.store.trust(i)}`, MARKS[this.store.state(i)]],
       ["name", name],
       [c.wrong[i] ? "bad" : "", c.wrong[i] ? `${error} confident!` : error],
       ["soft", Number.isFinite(c.conf[i]) ? number(c.conf[i], 2) : ""],
@@ -102,7 +101,7 @@ export class List {
       button.append(part);
     }
     button.firstChild.setAttribute("role", "img"); // a shape, and a word for screen readers
-    button.firstChild.setAttribute("aria-label", NAMES[this.store.state(i)]);
+    button.firstChild.setAttribute("aria-label", described(this.store, i));
     const item = document.createElement("li");
     item.append(button);
     return item;

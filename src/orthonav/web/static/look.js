@@ -1,6 +1,6 @@
 // Colours and marks, the same on map, course and list.
 
-const COLOURS = ["tracking", "coasting", "searching", "lost", "alone", "none", "truth", "wrong", "ink", "soft", "line",
+const COLOURS = ["sure", "unsure", "none", "truth", "wrong", "ink", "soft", "line",
   "paper", "shade", "strong", "good", "warn", "bad", "gnss"];
 let colours = {};
 
@@ -23,6 +23,14 @@ export const MARKS = { tracking: "●", coasting: "○", alone: "●", searching
 export const NAMES = {
   tracking: "tracking", coasting: "coasting", alone: "fix", searching: "searching", lost: "lost", none: "no fix",
 };
+
+export const TRUST = { sure: "confident", unsure: "unsure", none: "no fix" };
+
+/** State and confidence of a view in words. */
+export function described(store, i) {
+  const [state, trust] = [store.state(i), store.trust(i)];
+  return trust === "none" || state === "alone" ? TRUST[trust] : `${NAMES[state]}, ${TRUST[trust]}`;
+}
 
 /** Draws the mark of a state at a point; each state has its own shape. */
 export function drawMark(context, state, x, y, size) {
@@ -54,7 +62,8 @@ export function drawMark(context, state, x, y, size) {
   }
 }
 
-const KINDS = [...Object.keys(MARKS), "wrong", "ink", "gnss"];
+const KINDS = [...Object.keys(TRUST), "wrong", "ink", "gnss"];
+const SHAPES = Object.keys(MARKS);
 
 /** Of many thousand marks most cover equal ones: one in a small square is enough. */
 export class Squares {
@@ -63,10 +72,10 @@ export class Squares {
     this.last = new Uint8Array(this.across * (Math.ceil(height / side) + 1));
   }
 
-  /** Whether the last mark in the square of a point was of this kind; it is from now on. */
-  has(x, y, kind) {
+  /** Whether the last mark in the square of a point was of this kind and shape; it is from now on. */
+  has(x, y, kind, shape = "alone") {
     const square = Math.floor(y / this.side) * this.across + Math.floor(x / this.side);
-    const code = KINDS.indexOf(kind) + 1;
+    const code = SHAPES.indexOf(shape) * KINDS.length + KINDS.indexOf(kind) + 1;
     if (this.last[square] === code) return true;
     this.last[square] = code; // ignored outside
     return false;

@@ -7,8 +7,8 @@ import { Compare, sentence } from "./compare.js";
 import { HealthPart } from "./health.js";
 import { listen } from "./keys.js";
 import { List } from "./list.js";
-import { MARKS, NAMES, watchColours } from "./look.js";
-import { at, fitRun, makeMap, showCursor } from "./map.js";
+import { MARKS, NAMES, TRUST, watchColours } from "./look.js";
+import { L, at, fitRun, makeMap, nearSheet, showCursor } from "./map.js";
 import { Chosen, Marks } from "./marks.js";
 import { Store } from "./store.js";
 
@@ -73,7 +73,8 @@ function tie({ store, map, marks, chosen, compare, course, list, health }) {
     find("scrub").setAttribute("aria-valuetext", `view ${i + 1}: ${sentence(store, i)}`);
     say(sentence(store, i));
     if (detail.by !== "newest" && detail.by !== "") find("newest").checked = i === store.count - 1;
-    if (find("follow-view").checked || detail.by === "list") keepSeen(map, store);
+    const byHand = !["", "newest"].includes(detail.by);
+    if (byHand || find("follow-view").checked) bringIntoSight(map, store);
   });
 }
 
@@ -96,11 +97,14 @@ function say(text) {
   pause = setTimeout(() => find("sentence").setAttribute("aria-busy", "false"), 400);
 }
 
-/** Moves the map only if the selected view is near its edge. */
-function keepSeen(map, { columns: c, selected: i }) {
-  const place = Number.isFinite(c.x[i]) ? [c.x[i], c.y[i]] : [c.tx[i], c.ty[i]];
-  if (!place.every(Number.isFinite)) return;
-  if (!map.getBounds().pad(-0.15).contains(at(...place))) map.panTo(at(...place), { animate: false });
+/** Moves the map until it shows the fix and the true position of the selected view. */
+function bringIntoSight(map, { columns: c, selected: i, run }) {
+  const places = [[c.x[i], c.y[i]], [c.tx[i], c.ty[i]]].filter(([x, y]) => nearSheet(x, y, run.sheet));
+  if (!places.length) return;
+  const both = L.latLngBounds(places.map((place) => at(...place)));
+  if (map.getBounds().pad(-0.08).contains(both)) return;
+  const zoom = Math.min(map.getZoom(), map.getBoundsZoom(both.pad(0.2)));
+  map.setView(both.getCenter(), zoom, { animate: false });
 }
 
 function makePlay(store) {
@@ -144,7 +148,7 @@ function steps({ store, map, compare, course }, play) {
 
 /** Follows a run in progress. */
 function live({ store, map }) {
-  find("newest-label").hidden = false;
+  for (const id of ["newest-label", "follow-label"]) find(id).hidden = false;
   find("follow-view").checked = true;
   const badge = find("live");
   badge.hidden = false;
@@ -173,7 +177,8 @@ function drawFigures(store) {
   const { stats, count, run } = store;
   const errors = (store.columns.err ?? []).filter((v) => v >= 0).sort((p, q) => p - q);
   const quantile = (part) => errors[Math.min(errors.length - 1, Math.floor(part * errors.length))];
-  const rows = [["views", count], ["with a fix", ratio(stats.fixes, count)]];
+  const rows = [["views", count], ["confident", ratio(stats.sure, count)]];
+  rows.push(["unsure", ratio(stats.fixes - stats.sure, count)], ["no fix", ratio(count - stats.fixes, count)]);
   if (stats.withTruth) {
     rows.push([`within ${metres(run.radius_m)}`, ratio(stats.right, stats.withTruth)]);
     rows.push(["CEP50", metres(quantile(0.5) ?? NaN)], ["CEP95", metres(quantile(0.95) ?? NaN)]);
@@ -189,10 +194,16 @@ function drawFigures(store) {
 }
 
 function drawLegend(store) {
-  const states = new Set();
-  for (let i = 0; i < store.count; i++) states.add(store.state(i));
-  const rows = Object.keys(NAMES).filter((state) => states.has(state) && state !== "none")
-    .map((state) => [MARKS[state], NAMES[state], `var(--${state})`]);
+  const [states, trusts] = [new Set(), new Set()];
+  for (let i = 0; i < store.count; i++) {
+    states.add(store.state(i));
+    trusts.add(store.trust(i));
+  }
+  const rows = ["sure", "unsure"].filter((trust) => trusts.has(trust))
+    .map((trust) => ["●", TRUST[trust], `var(--${trust})`]);
+  for (const state of store.run.states) {
+    if (states.has(state)) rows.push([MARKS[state], NAMES[state], "var(--ink)"]);
+  }
   if (store.stats.withTruth) rows.push(["—", "truth", "var(--truth)"], ["◯", "confident and wrong", "var(--wrong)"]);
   if (store.stats.withGnss) rows.push(["—", "GNSS", "var(--gnss)"]);
   find("legend").replaceChildren(...rows.map(([mark, name, paint]) => {

@@ -94,7 +94,7 @@ export function fitRun(map, store) {
   const known = [];
   for (let i = 0; i < store.count; i++) {
     if (!Number.isNaN(c.tx[i])) known.push([c.tx[i], c.ty[i]]);
-    else if (!Number.isNaN(c.x[i]) && inside(c.x[i], c.y[i], store.run.sheet)) known.push([c.x[i], c.y[i]]);
+    else if (nearSheet(c.x[i], c.y[i], store.run.sheet)) known.push([c.x[i], c.y[i]]);
   }
   if (!known.length) return;
   const [xs, ys] = [known.map((p) => p[0]), known.map((p) => p[1])];
@@ -108,5 +108,6 @@ export function fitRun(map, store) {
 }
 
 const min = (values) => values.reduce((p, q) => Math.min(p, q), Infinity);
-const inside = (x, y, sheet) => x > -sheet.width_px && x < 2 * sheet.width_px
+/** Whether a place is known and no farther from the sheet than its own size. */
+export const nearSheet = (x, y, sheet) => x > -sheet.width_px && x < 2 * sheet.width_px
   && y > -sheet.height_px && y < 2 * sheet.height_px;

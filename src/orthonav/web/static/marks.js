@@ -88,11 +88,11 @@ export const Marks = L.Layer.extend({
         if (this._store.isShown[i] === faded) continue;
         const [x, y] = [view.x + c.x[i] * view.scale, view.y + c.y[i] * view.scale];
         if (!(x > -9 && y > -9 && x < view.width + 9 && y < view.height + 9)) continue;
-        const state = this._store.state(i);
+        const [state, trust] = [this._store.state(i), this._store.trust(i)];
         const ringed = c.wrong[i] && !faded;
-        if (count > MANY && !ringed && drawn.has(x, y, state)) continue;
-        if (state !== last) context.fillStyle = context.strokeStyle = colour(state);
-        last = state;
+        if (count > MANY && !ringed && drawn.has(x, y, trust, state)) continue;
+        if (trust !== last) context.fillStyle = context.strokeStyle = colour(trust);
+        last = trust;
         drawMark(context, state, x, y, size);
         if (ringed) this._ring(rings, view, i, x, y, size);
       }
@@ -144,7 +144,7 @@ export const Marks = L.Layer.extend({
       const i = inside[k];
       const [a, b] = [c.a[i] * perMetre, c.b[i] * perMetre];
       if (a < 3 || a > view.width) continue;
-      context.strokeStyle = colour(this._store.state(i));
+      context.strokeStyle = colour(this._store.trust(i));
       context.globalAlpha = 0.75;
       context.beginPath();
       context.ellipse(view.x + c.x[i] * view.scale, view.y + c.y[i] * view.scale, a, b,

@@ -26,7 +26,7 @@ export class Store extends EventTarget {
     this.listed = []; // the same in the order of the list
     this.isShown = [];
     this.rising = true;
-    this.stats = { fixes: 0, wrong: 0, right: 0, withTruth: 0, withGnss: 0, gnssAlarms: 0 };
+    this.stats = { fixes: 0, sure: 0, wrong: 0, right: 0, withTruth: 0, withGnss: 0, gnssAlarms: 0 };
   }
 
   /** Takes a response of api/news. */
@@ -57,6 +57,7 @@ export class Store extends EventTarget {
     const c = this.columns;
     if (c.reason[i]) this.reasons.set(c.reason[i], (this.reasons.get(c.reason[i]) ?? 0) + 1);
     else this.stats.fixes += 1;
+    this.stats.sure += c.sure[i];
     this.stats.wrong += c.wrong[i];
     this.stats.right += c.err[i] <= this.run.radius_m ? 1 : 0;
     this.stats.withTruth += Number.isNaN(c.tx[i]) ? 0 : 1;
@@ -75,6 +76,12 @@ export class Store extends EventTarget {
     if (this.columns.reason[i]) return "none";
     const state = this.columns.state[i];
     return state < 0 ? "alone" : this.run.states[state];
+  }
+
+  /** What its colour tells of a view: sure (confident), unsure (a best guess) or none (no fix). */
+  trust(i) {
+    if (this.columns.reason[i]) return "none";
+    return this.columns.sure[i] ? "sure" : "unsure";
   }
 
   select(i, by = "") {
@@ -124,11 +131,11 @@ export class Store extends EventTarget {
     const [kind, value] = this.which.split(/:(.*)/s);
     const rules = {
       all: () => true,
-      fix: (i) => !c.reason[i],
       none: (i) => Boolean(c.reason[i]),
       wrong: (i) => c.wrong[i] === 1,
       far: (i) => c.err[i] > this.run.radius_m,
-      doubt: (i) => !c.reason[i] && !(c.conf[i] >= CONFIDENT),
+      sure: (i) => c.sure[i] === 1,
+      doubt: (i) => this.trust(i) === "unsure",
       state: (i) => this.state(i) === value,
       reason: (i) => c.reason[i] === value,
     };

@@ -24,6 +24,15 @@ function makeMap() {
   const image = document.getElementById("check-image");
   L.imageOverlay(image.src, boundsOf(drawn.image), { pane: "image", alt: "" }).addTo(map);
   L.control.scale({ imperial: false, maxWidth: 150 }).addTo(map);
+  const north = L.control({ position: "topright" });
+  north.onAdd = () => {
+    const arrow = make("div", "N");
+    arrow.className = "north";
+    arrow.setAttribute("role", "img");
+    arrow.setAttribute("aria-label", "North is up");
+    return arrow;
+  };
+  north.addTo(map);
   map.on("focus", () => map.scrollWheelZoom.enable()); // otherwise the wheel scrolls the page
   map.on("blur", () => map.scrollWheelZoom.disable());
   document.getElementById("whole").addEventListener("click", () => map.fitBounds(whole));
@@ -87,7 +96,10 @@ function addRoute(map) {
     L.polygon(drawn.band.map((ring) => ring.map(at)), { ...quiet, color: colour, weight, fill: false }).addTo(group);
   }
   const line = drawn.route.map(at);
-  L.polyline(line, { ...quiet, color: "#fff", weight: 10 }).addTo(group);
+  for (const [risk, first, last] of drawn.segments) {
+    const { edge, width } = drawn.risks[risk];
+    L.polyline(line.slice(first, last + 1), { ...quiet, color: edge, weight: width + drawn.edge_px }).addTo(group);
+  }
   for (const [risk, first, last] of drawn.segments) {
     const { colour, width, dash } = drawn.risks[risk];
     const style = { ...quiet, color: colour, weight: width, dashArray: dash.length ? dash.join(" ") : null };

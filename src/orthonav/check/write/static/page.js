@@ -67,19 +67,21 @@ function showLegend(name, title) {
   if (!route) return;
   make("b", "probability along the route", legend);
   const used = new Set(drawn.segments.map(([risk]) => risk));
-  drawn.risks.forEach(({ name: risk, colour, width, dash, range_text: range }, i) => {
+  drawn.risks.forEach(({ name: risk, colour, edge, width, dash, range_text: range }, i) => {
     if (!used.has(i)) return;
     const row = make("div", "", legend);
     row.className = "risk";
     const sample = make("canvas", "", row);
     [sample.width, sample.height] = [34, 10];
     const context = sample.getContext("2d");
-    [context.strokeStyle, context.lineWidth] = [colour, width];
-    context.setLineDash(dash);
-    context.beginPath();
-    context.moveTo(0, 5);
-    context.lineTo(34, 5);
-    context.stroke();
+    for (const [paint, thick, dashes] of [[edge, width + drawn.edge_px, []], [colour, width, dash]]) {
+      [context.strokeStyle, context.lineWidth] = [paint, thick];
+      context.setLineDash(dashes);
+      context.beginPath();
+      context.moveTo(0, 5);
+      context.lineTo(34, 5);
+      context.stroke();
+    }
     make("span", `${risk}, ${range}`, row);
   });
 }

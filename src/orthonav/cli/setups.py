@@ -1,0 +1,184 @@
+"""Counts of a run, and what to check where few of its views are confident."""
+
+import argparse
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from orthonav.cli.source import FAR_M, far_from_map, far_text
+
+if TYPE_CHECKING:
+    from orthonav.cli.common import Progress
+    from orthonav.confidence.accept import Acceptance
+    from orthonav.flight.heights import FlownHeights
+    from orthonav.localizer import Localizer
+    from orthonav.onboard.setups import Tried
+    from orthonav.records import Telemetry, ViewResult
+    from orthonav.sources import Recording, SourceView
+
+_SCATTERED_DEG = 20.0
+"""Headings that differ by a constant scatter less about it: compasses err by some degrees."""
+
+
+_SILENT = (
+    "no fix states the criterion {criterion}, so none can be confident; build the map with "
+    "--calibration-views, or give --accept peak_ratio:1.3"
+)
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Views of a run by what is known of their positions."""
+
+    views: int
+    confident: int
+    unsure: int
+    none: int
+
+    @classmethod
+    def of(cls, results: "Sequence[ViewResult]") -> "Counts":
+        """The counts of these results."""
+        from orthonav.records import Fix
+
+        fixes = sum(isinstance(result.outcome, Fix) for result in results)
+        confident = sum(result.is_confident for result in results)
+        return cls(len(results), confident, fixes - confident, len(results) - fixes)
+
+    @property
+    def few(self) -> bool:
+        """Whether so few views are confident that the set-up is doubted."""
+        from orthonav.onboard.setups import FEW
+
+        return self.confident < FEW * self.views
+
+
+class Doubts:
+    """What is kept of a run to say in the end what to check."""
+
+    def __init__(
+        self,
+        options: argparse.Namespace,
+        flight: "Recording",
+        localizer: "Localizer",
+        mount: Any,
+        heights: "FlownHeights | None",
+    ) -> None:
+        from orthonav.onboard.setups import UnsureViews
+
+        self._options, self._flight, self._localizer = options, flight, localizer
+
+        def corrected(telemetry: "Telemetry") -> "Telemetry":
+            made = telemetry if heights is None else heights.corrected(telemetry)
+            return mount.corrected(made) if mount else made
+
+        self._unsure = UnsureViews(flight.camera, corrected)
+        self._nearest: tuple[float, str] | None = None
+        self._yaw_deg: list[float] = []
+
+    def watching(self) -> "Iterator[SourceView]":
+        """The views of the flight."""
+        for view in self._unsure.watching(self._flight.views):
+            found = far_from_map(view, self._localizer)
+            if found is not None and (self._nearest is None or found < self._nearest):
+                self._nearest = found
+            self._yaw_deg.append(view.telemetry.yaw_deg)
+            yield view
+
+    def take(self, result: "ViewResult") -> None:
+        """The result of the newest view."""
+        self._unsure.take(result)
+
+    def advice(
+        self, results: "Sequence[ViewResult]", accept: "Acceptance", shown: "Progress"
+    ) -> "tuple[list[str], list[dict[str, Any]]]":
+        """Sentences on what to check, and what was tried as JSON values; nothing without doubt."""
+        from orthonav.geo.headings import RADIANS, seem_radians
+        from orthonav.onboard.setups import try_setups
+
+        options, counts = self._options, Counts.of(results)
+        known = options.heading == "known"
+        lines = [RADIANS] if known and seem_radians(self._yaw_deg) else []
+        if not counts.few:
+            return lines, []
+        if self._nearest is not None and self._nearest[0] > FAR_M:
+            return [*lines, far_text("the recorded positions are", *self._nearest)], []
+        if counts.unsure and not any(_states(result, accept) for result in results):
+            return [*lines, _SILENT.format(criterion=accept.criterion)], []
+        if not self._unsure.views:
+            return lines, []
+        tried = try_setups(
+            self._localizer,
+            self._unsure.views,
+            accept.accepts,
+            use_prior=options.prior == "telemetry",
+            heading_known=known,
+            tracked=bool(options.track or options.smooth),
+            progress=lambda share: shown("set-ups", share),
+        )
+        return [*lines, *setup_text(tried, on_map=self._nearest is not None)], [
+            {"setup": each.setup.name, "views": each.views, "confident": each.confident}
+            for each in tried
+        ]
+
+
+def _states(result: "ViewResult", accept: "Acceptance") -> bool:
+    """Whether the number that the criterion compares is known."""
+    from dataclasses import replace
+
+    return replace(accept, threshold=-math.inf).accepts(result.outcome)
+
+
+def setup_text(tried: "Sequence[Tried]", *, on_map: bool) -> list[str]:
+    """Sentences: which change makes the views confident and what to check, and what else was tried.
+
+    `on_map`: the flight recorded positions, and some of them lie on the map.
+    """
+    *failed, last = tried
+    if not last.explains:
+        names = ", ".join(each.setup.name for each in tried)
+        most = max(each.confident for each in tried)
+        where = (
+            "the recorded positions lie on the map, so check the camera, and whether the ground "
+            "changed or has no structure"
+            if on_map
+            else "no position was recorded, so check first that the map shows the area, then the "
+            "camera and the ground"
+        )
+        tested = f"{names}: at most {most} of {last.views} unsure views are confident"
+        return [f"no other set-up explains it ({tested}); {where}"]
+    lines = [f"{last.confident} of {last.views} unsure views are confident {_explanation(last)}"]
+    return [*lines, f"also tried: {_listed(failed)}"] if failed else lines
+
+
+def _listed(tried: "Iterable[Tried]") -> str:
+    return ", ".join(f"{each.setup.name} ({each.confident} of {each.views})" for each in tried)
+
+
+def _explanation(found: "Tried") -> str:
+    setup, parts, checks = found.setup, [], []
+    if setup.name == "as reported":
+        return "if placed one by one: the set-up is right, but the views make no track"
+    if setup.without_prior:
+        return "without the prior; check the prior positions"
+    if setup.radians:
+        return "with the headings taken as radians"
+    if setup.mirrored:
+        return "if mirrored left to right, with any heading; check where the images come from"
+    if setup.any_heading:
+        off, std = found.heading_off_deg, found.heading_std_deg
+        constant = std < _SCATTERED_DEG
+        apart = (
+            f"{off:+.0f} deg from the reported one (standard deviation {std:.0f} deg)"
+            if constant
+            else "which differs from the reported one from view to view"
+        )
+        parts.append(f"with any heading, {apart}")
+        checks.append("the heading column" + " and the mounting of the camera" * constant)
+    if setup.factor != 1.0:
+        ratio = found.height_ratio
+        parts.append(
+            f"at {ratio:.2f} times the reported height (or {1 / ratio:.2f} times the focal length)"
+        )
+        checks.append("the height column (above ground?) and the camera")
+    return f"{' and '.join(parts)}; check {' and '.join(checks)}"
