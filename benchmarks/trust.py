@@ -10,6 +10,7 @@ evidence of every view: a second run takes seconds. About an hour on two cores.
 
 import argparse
 import os
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -72,10 +73,8 @@ class Judged:
 
     def fitted(self, train: NDArray[np.bool_], without: int | None = None) -> RegisteredConfidence:
         """Fitted to the rows `train`, with one of the features left out or none."""
-        chosen = self.features[train].copy()
-        if without is not None:
-            chosen[:, without] = 0.0
-        return fit_judge(chosen, self.right[train])
+        used = [i for i in range(len(FEATURES)) if i != without]
+        return fit_judge(self.features[train], self.right[train], used)
 
     def left_out(self, without: int | None = None) -> Array:
         """Confidence (N,) of each row by a fit to all other scenes."""
@@ -88,8 +87,13 @@ class Judged:
         return found
 
 
-def fit_judge(features: Array, right: NDArray[np.bool_]) -> RegisteredConfidence:
-    """Biases and weights, none negative, under which the outcome of views (N, F) is likeliest."""
+def fit_judge(
+    features: Array, right: NDArray[np.bool_], used: Sequence[int]
+) -> RegisteredConfidence:
+    """Biases and weights, none negative, under which the outcome of views (N, F) is likeliest.
+
+    Features that are not among `used` have no weight.
+    """
     mean, std = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-6)
     scaled, count = (features - mean) / std, len(FEATURES)
 
@@ -107,7 +111,9 @@ def fit_judge(features: Array, right: NDArray[np.bool_]) -> RegisteredConfidence
         return float(value + RIDGE * (weights**2).sum()), gradient
 
     start = np.full(2 + count, 0.3)
-    bounds = [(None, None)] * 2 + [(0.0, None)] * count
+    start[2:][[i for i in range(count) if i not in used]] = 0.0
+    most = [None if i in used else 0.0 for i in range(count)]
+    bounds = [(None, None)] * 2 + [(0.0, each) for each in most]
     found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
     weights = found[2:] / std
     biases = (
