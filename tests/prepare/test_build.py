@@ -263,7 +263,7 @@ REFUSED = {
     "just outside": (
         lambda frame: {"bounds_deg": bounds_deg(frame, 250, -50, 350, 50)},
         AreaError,
-        "the orthophotos cover",
+        "no imagery",
     ),
     "turned bounds": (lambda frame: {"bounds_deg": (3, 46, 2, 47)}, AreaError, "west < east"),
     "far route": (lambda frame: {"route": ROUTE, "band_m": 100.0}, AreaError, "no imagery"),
