@@ -207,7 +207,7 @@ def test_views_of_one_level_do_not_lower_the_chance_of_two(of_two):
     """On maps of small tiles most views are judged and finished at one level."""
     one = {"strength": 16.0, "look": 16.0, "fine": math.nan, "detail_ratio": math.nan}
     two = {"strength": 40.0, "look": 16.0, "fine": math.nan, "detail_ratio": 1.5}
-    usual = 16.0 * USUAL_CHANCES.total / USUAL_CHANCES.look
+    usual = 16.0 + USUAL_CHANCES.total - USUAL_CHANCES.look
     chances = module._chances([one] * 20 + [two] * of_two)
     assert chances.look == 16.0
     assert chances.total == pytest.approx(40.0 if of_two == module.MIN_NEGATIVES else usual)

@@ -190,7 +190,7 @@ def _chances(negatives: Sequence[Mapping[str, float]]) -> Chances:
     """
     look = _median(negatives, "look")
     both = [each for each in negatives if math.isfinite(each["detail_ratio"])]
-    total = look * USUAL_CHANCES.total / USUAL_CHANCES.look
+    total = look + USUAL_CHANCES.total - USUAL_CHANCES.look
     if len(both) >= MIN_NEGATIVES:
         total = _median(both, "strength")
     return Chances(total, look, _fine_chance(negatives, total))
