@@ -3,9 +3,9 @@
 `python -m benchmarks.trust --work DIR [--views 40] [--seed 1] [--workers 2] [--fit]` places views
 of all scenes of two dates beside the checkout (`../shared/data`, or the folder that ORTHONAV_DATA
 names) and of generated ones, and views that are on no map. It prints what the shipped confidence
-says of them, and what one says that was fitted to the other scenes only. `--fit` prints the weights
-fitted to all scenes, those of `orthonav.confidence.registered`. DIR keeps maps, flights and the
-evidence of every view: a second run takes seconds. About an hour on two cores.
+says of them, and what one says that was fitted to the other scenes only. `--fit` prints weights
+fitted to all of these views. DIR keeps maps, flights and the evidence of every view: a second run
+takes seconds. About an hour on two cores.
 """
 
 import argparse
@@ -210,7 +210,7 @@ def _scenes_table(judged: Judged) -> Table:
         f"accepted: confidence of {CONFIDENT:g} or more; right: within 35 m or 10 px; heading sd "
         "10 deg, height sd 10 %",
         "by a fit to the other scenes; shipped: by the weights of the program, which are fitted to "
-        "all of these scenes",
+        "other views of the real ones among these scenes",
     )
     return Table("Confidence on scenes left out", header, rows, notes)
 

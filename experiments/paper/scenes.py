@@ -41,7 +41,8 @@ UNTUNED = {
     "aral": ("2012_12", "2020_12", "1985_12", "1995_12", "2000_12", "2006_12", "2015_12"),
     "tours": ("1964", "1976"),
 }
-"""Scenes that nothing here was tuned on: dates of the map, of the views, and further ones."""
+"""Scenes on which nothing was tuned but the confidence of registered views: dates of the map, of
+the views, and further ones."""
 
 
 @dataclass(frozen=True)

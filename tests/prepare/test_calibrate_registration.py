@@ -1,13 +1,18 @@
 """What a map learns of its own registration: which views to believe, and how dates agree."""
 
 import logging
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from helpers import textured
-from orthonav.confidence.registered import USUAL_CONFIDENCE, RegisteredConfidence
+from orthonav.confidence.registered import (
+    USUAL_CHANCES,
+    USUAL_CONFIDENCE,
+    RegisteredConfidence,
+)
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.registration import RegistrationLocalizer
@@ -195,6 +200,17 @@ def test_mirrored_views_measure_chance_only(localizer, learnt):
     assert learnt.confidence == RegisteredConfidence.usual(chances) != USUAL_CONFIDENCE
     few = calibrated(localizer, crops_of(GREY, module.MIN_NEGATIVES - 1))
     assert few.confidence == USUAL_CONFIDENCE
+
+
+@pytest.mark.parametrize("of_two", [0, module.MIN_NEGATIVES - 1, module.MIN_NEGATIVES])
+def test_views_of_one_level_do_not_lower_the_chance_of_two(of_two):
+    """On maps of small tiles most views are judged and finished at one level."""
+    one = {"strength": 16.0, "look": 16.0, "fine": math.nan, "detail_ratio": math.nan}
+    two = {"strength": 40.0, "look": 16.0, "fine": math.nan, "detail_ratio": 1.5}
+    usual = 16.0 + USUAL_CHANCES.total - USUAL_CHANCES.look
+    chances = module._chances([one] * 20 + [two] * of_two)
+    assert chances.look == 16.0
+    assert chances.total == pytest.approx(40.0 if of_two == module.MIN_NEGATIVES else usual)
 
 
 def test_another_date_draws_the_usual_weights_to_it(localizer):

@@ -22,8 +22,8 @@ _SCATTERED_DEG = 20.0
 
 
 _SILENT = (
-    "no fix states the criterion {criterion}, so none can be confident; build the map with "
-    "--calibration-views, or give --accept peak_ratio:1.3"
+    "no fix states the criterion {criterion}, so none can be confident; build the map from a "
+    "larger or more varied area, or give --accept peak_ratio:1.3"
 )
 
 

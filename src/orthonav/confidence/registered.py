@@ -28,8 +28,8 @@ OLD_FEATURES = {"log_strength", "log_peak_ratio", "log_look_ratio"}
 CHANCES = ("total", "look", "fine")
 USUAL_BIASES = -8.43, -1.55
 USUAL_WEIGHTS = 3.69, 5.69, 5.10, 0.94, 2.69, 11.54
-"""What separates right from wrong, fitted to 3,549 views of the scenes of the benchmark of trust
-(docs/benchmarks.md), which shows how such weights judge scenes left out."""
+"""What separates right from wrong, fitted to 3,549 views (docs/decisions/confidence.md). The
+benchmark of trust shows how weights fitted in this way judge scenes left out."""
 RIDGE = 3e-2
 """Weight of the usual bias where views of another date of the map's area are fitted."""
 MAX_SHIFT = 5.0

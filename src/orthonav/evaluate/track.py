@@ -31,7 +31,7 @@ from orthonav.evaluate.figures import (
 )
 from orthonav.evaluate.metrics import FAR_M, Comparison
 from orthonav.flight.fixes import STATES
-from orthonav.records import CONFIDENT, Fix, ViewResult
+from orthonav.records import Fix, ViewResult
 
 RADII_M = (25.0, 60.0)
 """Radii of accuracy: a usual and a large error of a track."""
@@ -131,11 +131,11 @@ class TrackMetrics:
     state tracking.
     `after`: errors from then on.
     `share_of_views`, `share_of_time`: by state; `n_lost`: number of times the track was lost.
-    `low_confidence`: longest stretch without a confident fix (not tracking, or confidence below
-    `CONFIDENT`); `low_confidence_after`: the same from the first confirmed fix on.
+    `low_confidence`: longest stretch without a confident fix (not tracking, or not confident);
+    `low_confidence_after`: the same from the first confirmed fix on.
     `far_m`: the larger of `FAR_M` and the radius of the evaluation.
-    `n_confident_wrong`: views that are tracking, or have a confidence of `CONFIDENT` or more, with
-    an error above `far_m` and above the radius that the fix states.
+    `n_confident_wrong`: views that are tracking, or confident, with an error above `far_m` and
+    above the radius that the fix states.
     `n_false_locks`, `false_lock_longest_s`: stretches of such views.
     `along`, `across`: errors ahead and to the right, of the tracking views.
     `consistency`, `series`: NEES, and time series for figures.
@@ -177,7 +177,7 @@ def measure_track(
     states = np.array([result.state or "" for result in results])
     seconds_s = seconds_since_first([result.time_ns for result in results])
     path_m = _path_m(comparison.truth_en_m, rows, len(results))
-    confident = np.array([_confidence(result) >= CONFIDENT for result in results])
+    confident = np.array([result.is_confident for result in results])
     tracking = states == "tracking"
     confirmed = tracking & np.array([isinstance(result.outcome, Fix) for result in results])
     first = int(np.argmax(confirmed)) if confirmed.any() else len(results)
@@ -310,10 +310,6 @@ def _autocorrelation_time(part: FloatArray) -> float:
     stop = int(ends[0]) if ends.size else n - 1
     weights = 1.0 - np.arange(1, stop + 1) / n
     return 1.0 + 2.0 * float(weights @ correlation[:stop] ** 2)
-
-
-def _confidence(result: ViewResult) -> float:
-    return result.outcome.confidence if isinstance(result.outcome, Fix) else math.nan
 
 
 def _path_m(truth_en_m: FloatArray, rows: NDArray[np.intp], n: int) -> FloatArray:

@@ -183,8 +183,16 @@ def _fitted(outcomes: Sequence[_Outcome], radius_px: float) -> RegistrationCalib
 
 
 def _chances(negatives: Sequence[Mapping[str, float]]) -> Chances:
-    """The scores of chance by the evidence of mirrored views."""
-    total, look = _median(negatives, "strength"), _median(negatives, "look")
+    """The scores of chance by the evidence of mirrored views.
+
+    The strength of a view that is judged and finished at one level is the sum of one score, not of
+    two: with small tiles most views are such, and say nothing of the sum.
+    """
+    look = _median(negatives, "look")
+    both = [each for each in negatives if math.isfinite(each["detail_ratio"])]
+    total = look + USUAL_CHANCES.total - USUAL_CHANCES.look
+    if len(both) >= MIN_NEGATIVES:
+        total = _median(both, "strength")
     return Chances(total, look, _fine_chance(negatives, total))
 
 
