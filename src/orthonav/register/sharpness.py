@@ -18,8 +18,9 @@ from orthonav.register.reference import Reference
 from orthonav.register.template import Template, turn_planes
 
 Array = NDArray[np.float32]
-REACH_SHARE = 0.125
-"""The window is moved by up to this share of its sides to either side."""
+REACH_SHARE, MIN_REACH_PX = 0.125, 8
+"""The window is moved by up to this share of its sides to either side, and by so many pixels of the
+level at least."""
 PEAK_SHARE = 0.06
 """Moves below this share of the view's side belong to the place itself."""
 MIN_PEAK_PX = 3.0
@@ -51,7 +52,7 @@ def _moved_scores(template: Template, reference: Reference, pose: Pose) -> Array
     Not divided by the energy of the map under each move: that hardly changes.
     """
     height, width = template.mask.shape
-    rows, cols = int(height * REACH_SHARE), int(width * REACH_SHARE)
+    rows, cols = (max(MIN_REACH_PX, int(side * REACH_SHARE)) for side in (height, width))
     window = MapWindow.of(template, reference, pose, 0, (rows, cols))
     sampled = np.empty((*window.shape, CHANNELS), np.float32)
     window.sample(pose, sampled)
