@@ -118,15 +118,19 @@ def flight_heights(
     return heights
 
 
-def say_assumed_heights(flight: "Recording", terrain: str | None = None) -> None:
+def say_assumed_heights(
+    flight: "Recording",
+    terrain: str | None = None,
+    advice: str = "give --dem, or build the map with it",
+) -> None:
     """Log what is assumed about the heights of a flight, over a terrain or without one.
 
-    Other recordings than flights have said it when they were opened.
+    `advice`: what would help. Other recordings than flights have said it when they were opened.
     """
     from orthonav.flight.heights import assumed_heights
 
     first = next(iter(flight.views), None)
-    said = None if first is None else assumed_heights(first.telemetry, terrain)
+    said = None if first is None else assumed_heights(first.telemetry, terrain, advice)
     if said is not None and (terrain is not None or flight.kind in ("flight", "log")):
         log.log(logging.WARNING if terrain is None else logging.INFO, "%s", said)
 

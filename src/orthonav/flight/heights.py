@@ -45,7 +45,7 @@ def is_measured(telemetry: Telemetry) -> bool:
 
 
 def assumed_heights(
-    telemetry: Telemetry, terrain: str | None, advice: str = "give --dem, or build the map with it"
+    telemetry: Telemetry, terrain: str | None, advice: str = "give --dem"
 ) -> str | None:
     """What is assumed about the height of a view, in words; None where it was measured.
 
