@@ -199,3 +199,9 @@ def test_what_is_assumed_is_said(telemetry, terrain_name, words):
     said = assumed_heights(telemetry, terrain_name)
     assert (said is None) if words is None else re.search(words, said)
     assert is_measured(telemetry) == (telemetry.agl_m == 100.0 and telemetry.home_m != 100.0)
+
+
+def test_level_ground_is_not_assumed_where_the_terrain_has_no_height():
+    heights = FlownHeights(lambda lat, lon: np.full(lat.shape, np.nan), area())
+    assert math.isnan(heights.corrected(reported(agl_m=100.0, home_m=100.0)).agl_m)
+    assert heights.corrected(reported(agl_m=90.0, home_m=100.0)).agl_m == 90.0  # measured

@@ -169,6 +169,18 @@ def test_holes_stay_holes(make_dem, change, profile, guessed, caplog):
     assert error_m(dem) < 0.6
 
 
+@pytest.mark.parametrize("posting_m", [10.0, 20.0])
+def test_a_stray_value_for_no_data_is_not_averaged(make_dem, posting_m):
+    def change(heights):
+        heights[100, 100] = -1500.0  # -9999 is stated
+        return heights
+
+    dem = open_dem(make_dem(change=change, nodata=-9999), "msl")
+    east, north = -3000 + 1005, 3000 - 1005
+    around = dem.in_plane(FRAME, east - 400.0, north + 400.0, posting_m, 60, 40)
+    assert 0 < np.isnan(around).sum() <= 9 and np.nanmin(around) > 350
+
+
 @pytest.mark.parametrize(
     "change, words",
     [

@@ -385,3 +385,12 @@ def test_missing_pymavlink_is_named(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pymavlink.dialects.v20.common", None)
     with pytest.raises(MissingExtraError, match="autopilot"):
         AutopilotLink(Port().open, TelemetryBuffer(), Time().clocks)
+
+
+def test_heights_that_px4_names_otherwise(flying):
+    now = flying.boot_ns()
+    flying.hear(flying.autopilot.attitude(now))
+    # The barometer stands for the height above the sea; the terrain is 150 m above the origin.
+    flying.hear(flying.autopilot.say("altitude", now // 1000, 489.8, 489.8, 0, 55.0, 150.0, 80.0))
+    state = flying.link.state_at(flying.time.now_ns)
+    assert math.isnan(state.amsl_m) and state.height_m == 80.0

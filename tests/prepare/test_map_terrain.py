@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -227,6 +228,36 @@ def test_views_over_holes_have_no_height(run, flown, frame, tmp_path):
     unknown = sum(math.isnan(float(each)) for each in found)
     assert 0 < unknown < len(found)
     assert f"{unknown} views have no height above ground" in done.err
+
+
+def test_an_unknown_place_of_take_off_is_not_taken_for_level_ground(run, flown, frame, tmp_path):
+    flight = shutil.copytree(flown, tmp_path / "flight")
+    changed = [{**row, "amsl_m": "nan", "agl_m": row["home_m"]} for row in rows(flight)]
+    with (flight / "telemetry.csv").open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, changed[0])
+        writer.writeheader()
+        writer.writerows(changed)
+    with (flight / "truth.csv").open() as stream:
+        first = next(csv.DictReader(stream))
+    east, north = frame.en_from_latlon(float(first["lat_deg"]), float(first["lon_deg"]))
+
+    def holed(east_m, north_m):
+        near = np.hypot(east_m - east, north_m - north) < 40
+        return np.where(near, np.nan, hill(east_m, north_m))
+
+    path = write_dem(tmp_path / "holed.tif", frame, holed)
+    done = run("import", flight, "--dem", path, "--dem-datum", "msl", "--out", tmp_path / "out")
+    assert done.code == 0
+    assert {row["agl_m"] for row in rows(tmp_path / "out")} == {"nan"}
+
+
+def test_terrain_outside_the_map_is_refused(run, map_path, flown, tmp_path):
+    path = write_dem(tmp_path / "far.tif", LocalFrame(44.0, 3.0), hill)
+    done = run(
+        "localize", map_path, flown, "--dem", path, "--dem-datum", "msl",
+        "--out", tmp_path / "fixes.jsonl",
+    )  # fmt: skip
+    assert done.code == 1 and "the terrain lies outside the map" in done.err
 
 
 def test_random_views_report_heights_above_sea_only(run, area, dem, tmp_path):

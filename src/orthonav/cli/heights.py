@@ -5,7 +5,7 @@ import logging
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from orthonav.flight.heights import FlownHeights, Undulation
+    from orthonav.flight.heights import Array, FlownHeights, Undulation
     from orthonav.geo.ground import TerrainHeights
     from orthonav.geo.route import Route
     from orthonav.imagery.terrain import Dem
@@ -60,14 +60,20 @@ def map_heights(
     use_prior: bool = True,
 ) -> "FlownHeights | None":
     """Heights above ground on a map by `terrain`, else by its own; None where it has none."""
-    import numpy as np
-
     from orthonav.flight.heights import FlownHeights
     from orthonav.mapfile.terrain import TerrainLayer
 
     terrain = terrain or TerrainLayer.of(opened)
     if terrain is None:
         return None
+    area_deg = _area_deg(opened)
+    return FlownHeights(terrain, area_deg, take_off=take_off, geoid=geoid, use_prior=use_prior)
+
+
+def _area_deg(opened: "MapFile") -> "tuple[Array, Array]":
+    """Latitudes and longitudes spread over a map."""
+    import numpy as np
+
     sheet = opened.manifest.sheets[0]
     grid = sheet.grid
     half_m = grid.tile_m / 2
@@ -75,8 +81,7 @@ def map_heights(
         grid.west_m + np.linspace(half_m, grid.width_px * grid.gsd_m - half_m, AREA_POINTS),
         grid.north_m - np.linspace(half_m, grid.height_px * grid.gsd_m - half_m, AREA_POINTS),
     )
-    area_deg = sheet.frame.latlon_from_en(np.stack([east.ravel(), north.ravel()], axis=1))
-    return FlownHeights(terrain, area_deg, take_off=take_off, geoid=geoid, use_prior=use_prior)
+    return sheet.frame.latlon_from_en(np.stack([east.ravel(), north.ravel()], axis=1))
 
 
 def flight_heights(
@@ -87,8 +92,13 @@ def flight_heights(
 ) -> "FlownHeights | None":
     """Heights above ground of the views of a recorded flight; None without a terrain.
 
-    What is assumed about heights is logged once.
+    What is assumed about heights is logged once. Raises `ImageryError` where the terrain model lies
+    outside the map.
     """
+    from orthonav.errors import ImageryError
+
+    if dem is not None and not any(map(dem.covers, *_area_deg(opened))):
+        raise ImageryError(f"the terrain lies outside the map: {dem.path}")
     first = next(iter(flight.views), None)
     if first is None:
         return None
@@ -108,15 +118,19 @@ def flight_heights(
     return heights
 
 
-def say_assumed_heights(flight: "Recording", terrain: str | None = None) -> None:
+def say_assumed_heights(
+    flight: "Recording",
+    terrain: str | None = None,
+    advice: str = "give --dem, or build the map with it",
+) -> None:
     """Log what is assumed about the heights of a flight, over a terrain or without one.
 
-    Other recordings than flights have said it when they were opened.
+    `advice`: what would help. Other recordings than flights have said it when they were opened.
     """
     from orthonav.flight.heights import assumed_heights
 
     first = next(iter(flight.views), None)
-    said = None if first is None else assumed_heights(first.telemetry, terrain)
+    said = None if first is None else assumed_heights(first.telemetry, terrain, advice)
     if said is not None and (terrain is not None or flight.kind in ("flight", "log")):
         log.log(logging.WARNING if terrain is None else logging.INFO, "%s", said)
 

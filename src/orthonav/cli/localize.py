@@ -227,7 +227,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
     if accept.criterion == "lowe_ratio":
         raise VariantError("--accept lowe_ratio needs a map and --registration off")
     flight = open_source(options.flight, options)
-    say_assumed_heights(flight)
+    say_assumed_heights(flight, advice="cut a map with terrain out of the atlas")
     results = []
     with TileSearch(Atlas.open(options.map)) as search, progress(options) as shown:
         if search.unknown:

@@ -45,7 +45,7 @@ def is_measured(telemetry: Telemetry) -> bool:
 
 
 def assumed_heights(
-    telemetry: Telemetry, terrain: str | None, advice: str = "give --dem, or build the map with it"
+    telemetry: Telemetry, terrain: str | None, advice: str = "give --dem"
 ) -> str | None:
     """What is assumed about the height of a view, in words; None where it was measured.
 
@@ -143,16 +143,18 @@ class FlownHeights:
         self._last: tuple[int, Place, float] | None = None
 
     def corrected(self, telemetry: Telemetry) -> Telemetry:
-        """The telemetry with its height above ground; unchanged where that was measured."""
+        """The telemetry with its height above ground; unchanged where that was measured, NaN where
+        the terrain does not give it: level ground is not assumed."""
         if is_measured(telemetry):
             return telemetry
         self._check(telemetry)
         place, std_m = self._place(telemetry)
         below = None if place is None else ground_around(self._terrain, place, std_m)
         below = below or self._whole
-        if below is None:
-            return telemetry
-        return self._heights.above(telemetry, below, place or self._middle)
+        made = telemetry
+        if below is not None:
+            made = self._heights.above(telemetry, below, place or self._middle)
+        return replace(telemetry, agl_m=math.nan) if made is telemetry else made
 
     def observe(self, time_ns: int, outcome: Fix | NoFix, state: str | None) -> None:
         """Take note of the outcome of a view: a confident fix says where the aircraft is.

@@ -100,7 +100,25 @@ class Dem:
         The north-west corner of the first one is `west_m`, `north_m`. NaN for holes. Raises as
         `__call__`.
         """
-        fine = self.gsd_m < 0.75 * posting_m
+        row, col = np.mgrid[:rows, :cols] + 0.5
+        points = np.stack([west_m + col * posting_m, north_m - row * posting_m], axis=-1)
+        lat, lon = frame.latlon_from_en(points)
+        if self.gsd_m >= 0.75 * posting_m:
+            return self(lat, lon)
+        grid = {
+            "crs": CRS.from_string(frame.proj4),
+            "transform": Affine(posting_m, 0, west_m, 0, -posting_m, north_m),
+            "width": cols,
+            "height": rows,
+        }
+        mean = self._warped(Resampling.average, **grid)
+        # The mean of heights and of a value that no ground can have may look like a height.
+        for kind in (Resampling.min, Resampling.max):
+            mean = np.where(np.isnan(self._warped(kind, **grid)), np.nan, mean)
+        return self._above_sea(mean, lat, lon)
+
+    def _warped(self, resampling: Resampling, **grid: Any) -> Array:
+        """Heights in metres, resampled onto a grid of `WarpedVRT`."""
         try:
             with (
                 quiet(),
@@ -108,23 +126,16 @@ class Dem:
                 WarpedVRT(
                     self._data,
                     src_crs=CRS.from_wkt(self._horizontal.to_wkt()),
-                    crs=CRS.from_string(frame.proj4),
                     src_nodata=self._void,
                     nodata=math.nan,
                     dtype="float64",
-                    transform=Affine(posting_m, 0, west_m, 0, -posting_m, north_m),
-                    width=cols,
-                    height=rows,
-                    resampling=Resampling.average if fine else Resampling.bilinear,
+                    resampling=resampling,
+                    **grid,
                 ) as warped,
             ):
-                raw = warped.read(1, masked=True)
+                return self._metres(warped.read(1, masked=True))
         except (RasterioError, CPLE_BaseError) as error:
             raise _unreadable(self.path, error) from error
-        row, col = np.mgrid[:rows, :cols]
-        east, north = west_m + (col + 0.5) * posting_m, north_m - (row + 0.5) * posting_m
-        lat, lon = frame.latlon_from_en(np.stack([east, north], axis=-1))
-        return self._above_sea(self._metres(raw), lat, lon)
 
     def _above_sea(self, heights: Array, lat_deg: Array, lon_deg: Array) -> Array:
         if self.datum.above_ellipsoid:

@@ -295,8 +295,10 @@ class Runner:
             telemetry = replace(view.telemetry, prior=prior or view.telemetry.prior)
             view = replace(view, telemetry=telemetry)
         self._say_heights(view.telemetry)
-        telemetry = self._above_ground(view.telemetry)
-        view = replace(view, telemetry=telemetry)
+        known = self._above_ground(view.telemetry)
+        if isinstance(known, NoFix):
+            return self._refused(image, known, vehicle)
+        telemetry, view = known, replace(view, telemetry=known)
         self._log_view(image, view, latency, withheld=False)
         outcome: Fix | NoFix
         try:
@@ -412,10 +414,16 @@ class Runner:
         vehicle = self._link.state_at(image.exposed_ns)
         return vehicle, vehicle.telemetry(image.time_ns, self.options.mount_deg)
 
-    def _above_ground(self, telemetry: Telemetry) -> Telemetry:
-        """The telemetry with its height above ground by the terrain of the map, if it has one."""
+    def _above_ground(self, telemetry: Telemetry) -> Telemetry | NoFix:
+        """The telemetry with its height above ground by the terrain of the map, if it has one;
+        `NoFix` where the terrain cannot be read."""
         heights = self.options.heights
-        return telemetry if heights is None else heights.corrected(telemetry)
+        try:
+            return telemetry if heights is None else heights.corrected(telemetry)
+        except MapChangedError as error:
+            return self._refusal("internal_error", MAP_CHANGED, str(error))
+        except MapFileError as error:  # a crafted part of the map
+            return self._refusal("internal_error", MAP_DAMAGED, str(error))
 
     def _say_heights(self, telemetry: Telemetry) -> None:
         """Log once what is assumed about heights."""
@@ -428,14 +436,11 @@ class Runner:
             log.log(logging.WARNING if name is None else logging.INFO, "%s", said)
 
     def _missing(self, telemetry: Telemetry) -> NoFix | None:
-        try:
-            telemetry = self._above_ground(telemetry)
-        except MapChangedError as error:
-            return self._refusal("internal_error", MAP_CHANGED, str(error))
-        except MapFileError as error:  # a crafted part of the map
-            return self._refusal("internal_error", MAP_DAMAGED, str(error))
+        known = self._above_ground(telemetry)
+        if isinstance(known, NoFix):
+            return known
         missing = [
-            name for name in telemetry.missing() if name != "yaw_deg" or self.options.heading_known
+            name for name in known.missing() if name != "yaw_deg" or self.options.heading_known
         ]
         if not missing:
             return None

@@ -328,10 +328,16 @@ class AutopilotLink:
         if arrived_ns is None:
             return
         time_ns = reported_ns if abs(reported_ns - arrived_ns) < _FAR_NS else arrived_ns
-        if message.altitude_terrain > -1000:  # lower values mean "not known" (common.xml)
+        # `altitude_terrain` of PX4 is the height of the terrain above its origin, and
+        # `bottom_clearance` the one above ground (src/modules/mavlink/streams/ALTITUDE.hpp).
+        if message.bottom_clearance > 0:
+            self.buffer.add_height("terrain", time_ns, message.bottom_clearance)
+        elif message.altitude_terrain > -1000:  # lower values mean "not known" (common.xml)
             self.buffer.add_height("terrain", time_ns, message.altitude_terrain)
         self.buffer.add_height("relative", time_ns, message.altitude_relative)
-        self.buffer.add_height("altitude", time_ns, message.altitude_amsl)
+        # PX4 without an altitude above the sea repeats that of the standard atmosphere.
+        if message.altitude_amsl != message.altitude_monotonic:
+            self.buffer.add_height("altitude", time_ns, message.altitude_amsl)
 
     def _distance(self, message: Message, now_ns: int) -> None:
         within = message.min_distance < message.current_distance < message.max_distance

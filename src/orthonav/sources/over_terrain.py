@@ -60,7 +60,7 @@ class OverTerrain:
             below = None if place is None else ground_around(self.terrain, place, 0.0)
             if below is not None and place is not None:
                 telemetry = heights.above(telemetry, below, place)
-            elif not is_measured(telemetry):
-                telemetry = replace(telemetry, agl_m=math.nan)
+            if telemetry is view.telemetry and not is_measured(telemetry):
+                telemetry = replace(telemetry, agl_m=math.nan)  # level ground is not assumed
             self.without += math.isnan(telemetry.agl_m)
             yield replace(view, telemetry=rounded(telemetry))
