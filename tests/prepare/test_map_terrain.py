@@ -162,9 +162,7 @@ def test_a_flight_reports_heights_above_sea_and_take_off(flown):
     assert max(amsl) == pytest.approx(250 + hill(-350, -250), abs=1)
 
 
-def test_a_terrain_places_views_that_level_ground_does_not(
-    run, flown, map_path, dem, tmp_path
-):
+def test_a_terrain_places_views_that_level_ground_does_not(run, flown, map_path, dem, tmp_path):
     found = {}
     for name, arguments in {
         "level": [map_path],
