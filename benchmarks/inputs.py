@@ -1,6 +1,7 @@
 """Inputs of the benchmarks: generated orthophotos, cached between runs, and simulated flights."""
 
 import hashlib
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,8 @@ LANDSCAPE_SEED = 1
 FLIGHT_SEED = 7
 PAST, PRESENT = landscape.DEFAULT_DATES[:2]
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+DATA = Path(os.environ.get("ORTHONAV_DATA", REAL_DATA))
+"""Folder of optional real imagery."""
 NAIP = REAL_DATA / "naip_nd"
 USUAL_ERRORS = Errors(yaw_std_deg=5.0, agl_std=0.05)
 WIDE_ERRORS = Errors(yaw_std_deg=10.0, agl_std=0.1)
@@ -100,6 +103,17 @@ NAIP_ABSENT = (
     "NAIP skipped: the optional real imagery beside the checkout (../shared/data) is absent"
 )
 NAIP_PAST, NAIP_PRESENT = "20090818.tif", "20180716.tif"
+
+
+def file_of(name: str, work: Path) -> Path:
+    """A file below `DATA`, or of a generated area (`generated:SEED:DATE`), which `work` holds."""
+    if not name.startswith("generated:"):
+        return DATA / name
+    _, seed, date = name.split(":")
+    area = work / f"area{seed}"
+    if not area.is_dir():
+        landscape.generate_area(area, dates=landscape.DEFAULT_DATES, seed=int(seed))
+    return area / f"{date}.tif"
 
 
 def generator_digest() -> str:

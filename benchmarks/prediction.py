@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.inputs import REAL_DATA
+from benchmarks.inputs import DATA, file_of
 from benchmarks.record import Table, provenance
 from orthonav.check.outcome import Cells
 from orthonav.check.request import CheckRequest
@@ -40,9 +40,8 @@ from orthonav.onboard.run import SingleViews, localize_flight
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import CONFIDENT, Fix, Prior
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
-from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
+from orthonav.simulate.landscape import DEFAULT_DATES
 
-DATA = Path(os.environ.get("ORTHONAV_DATA", REAL_DATA))
 YAW_STD_DEG, AGL_STD = 5.0, 0.05
 WIDTHS_PX = (112, 160, 256)
 """Pixels of the map across a view, for orthophotos: views from three heights."""
@@ -120,7 +119,7 @@ def main() -> None:
     about = provenance("prediction of fixes")
     with tempfile.TemporaryDirectory(prefix="orthonav-prediction-") as folder:
         files = {
-            name: _file(name, Path(folder)) for each in chosen for name in (each.map, each.views)
+            name: file_of(name, Path(folder)) for each in chosen for name in (each.map, each.views)
         }
         maps = {each.map: _map(files[each.map], Path(folder)) for each in chosen}
         jobs = [
@@ -168,17 +167,6 @@ def _there(scene: Scene) -> bool:
     for name in missing:
         print(f"not there, left out: {DATA / name}")
     return not missing
-
-
-def _file(name: str, folder: Path) -> Path:
-    """A file of real imagery, or of a generated area (cached)."""
-    if not name.startswith("generated:"):
-        return DATA / name
-    _, seed, date = name.split(":")
-    area = folder / f"area{seed}"
-    if not area.is_dir():
-        generate_area(area, dates=DEFAULT_DATES, seed=int(seed))
-    return area / f"{date}.tif"
 
 
 def _map(ortho: Path, folder: Path) -> Path:

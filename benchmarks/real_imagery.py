@@ -19,7 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import cv2
 import numpy as np
 
-from benchmarks.inputs import REAL_DATA
+from benchmarks.inputs import DATA
 from benchmarks.negatives import SHARES, Sources, negatives
 from benchmarks.placing import row_of
 from benchmarks.record import Table, number, provenance
@@ -32,7 +32,6 @@ from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import CONFIDENT, Fix, Telemetry, View
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
-DATA = Path(os.environ.get("ORTHONAV_DATA", REAL_DATA))
 NAIP_MAP = "naip_nd/20090818.tif"
 NAIP_VIEWS = ("naip_nd/20120731.tif", "naip_nd/20150926.tif", "naip_nd/20180716.tif")
 SZADA = ("szada_1", "szada_5", "szada_7", "szada_mosaic")

@@ -23,8 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from benchmarks.inputs import file_of
 from benchmarks.record import Table, provenance
-from benchmarks.trust_views import file_of, pairs, views_of
+from benchmarks.trust_views import pairs, views_of
 from benchmarks.verdicts import percent
 from orthonav.confidence.registered import (
     FEATURES,

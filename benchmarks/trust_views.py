@@ -16,7 +16,7 @@ import numpy as np
 import rasterio
 from rasterio.warp import transform_bounds
 
-from benchmarks.real_imagery import DATA
+from benchmarks.inputs import DATA, file_of
 from orthonav.files import write_text
 from orthonav.flight import open_flight, read_truth
 from orthonav.flight.folder import read_image
@@ -26,7 +26,7 @@ from orthonav.mapfile import open_map
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import NoFix, Telemetry, View
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
-from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
+from orthonav.simulate.landscape import DEFAULT_DATES
 
 YAW_STD_DEG, AGL_STD = 10.0, 0.1
 FAR_PX, FAR_M = 10.0, 35.0
@@ -54,7 +54,7 @@ class Pair:
 class Case:
     """Views of one kind.
 
-    - `kind`: `found`, or those that are not on the map: `mirrored`, `elsewhere`, `beside`.
+    - `kind`: `found`, or those that are not on the map: `mirrored`, `other scene`, `beside`.
     - `width_px`: shorter side of the view on the ground, pixels of the map.
     - `share`: number of views, as a share of the requested one.
     - `heading_known`: whether the reported heading is used; `prior_px`: standard deviation of a
@@ -80,8 +80,8 @@ CASES = (
     Case("found", 64, 0.3, prior_px=40.0),
     Case("mirrored", 256, 0.4),
     Case("mirrored", 128, 0.4),
-    Case("elsewhere", 256, 0.4),
-    Case("elsewhere", 128, 0.4),
+    Case("other scene", 256, 0.4),
+    Case("other scene", 128, 0.4),
     Case("beside", 256, 1.0),
     Case("beside", 128, 1.0),
 )
@@ -118,7 +118,7 @@ def pairs() -> list[Pair]:
 def views_of(
     pair: Pair, others: Sequence[Pair], views: int, seed: int, work: Path
 ) -> list[dict[str, Any]]:
-    """Rows of all views of a pair; stored in `work`, where maps and flights are kept as well."""
+    """Rows of all views of a pair; stored in `work`, like maps and flights."""
     stored = work / f"{_plain(pair.map)}-{_plain(pair.views)}-{views}-{seed}.json"
     if not stored.is_file():
         cv2.setNumThreads(1)
@@ -136,12 +136,12 @@ def _rows(
     west, south, east, north = _bounds_deg(ortho)
     middle = (west + east) / 2
     half = _localizer(ortho, work, (west, south, middle, north))
-    elsewhere = [each for each in others if each.scene != pair.scene]
+    other_scenes = [each for each in others if each.scene != pair.scene]
     for number, case in enumerate(CASES):
         count = max(1, round(case.share * views))
         over, gsd_m = flown, None
-        if case.kind == "elsewhere":
-            over = file_of(elsewhere[(seed + number) % len(elsewhere)].views, work)
+        if case.kind == "other scene":
+            over = file_of(other_scenes[(seed + number) % len(other_scenes)].views, work)
             gsd_m = _gsd_m(over)
         folder = _flight(over, case, count, seed + number, work)
         localizer = half if case.kind == "beside" else whole
@@ -227,17 +227,6 @@ def _plain(name: str) -> str:
     return name.replace("/", "-").replace(":", "-")
 
 
-def file_of(name: str, work: Path) -> Path:
-    """A file of real imagery, or of a generated area, which is kept in `work`."""
-    if not name.startswith("generated:"):
-        return DATA / name
-    _, seed, date = name.split(":")
-    area = work / f"area{seed}"
-    if not area.is_dir():
-        generate_area(area, dates=DEFAULT_DATES, seed=int(seed))
-    return area / f"{date}.tif"
-
-
 def _localizer(
     ortho: Path, work: Path, bounds_deg: tuple[float, float, float, float] | None = None
 ) -> RegistrationLocalizer:
@@ -251,7 +240,7 @@ def _localizer(
 
 
 def _flight(ortho: Path, case: Case, count: int, seed: int, work: Path) -> Path:
-    """A simulated flight at random places, kept in `work`."""
+    """A simulated flight at random places, stored in `work`."""
     name = f"{ortho.parent.name}-{ortho.stem}-{case.width_px}-{count}-{case.prior_px}-{seed}"
     folder = work / name
     if not folder.is_dir():

@@ -160,6 +160,16 @@ def test_what_was_learnt_is_reported_and_saved_by_the_digest_of_the_map(
     assert "map_displaced" in flight.reasons()  # by more than maps usually are
 
 
+def moved_by_correction(flight):
+    """How far (m east, north) what is sent lies from the map's own position, after 20 views."""
+    flight.views(20)
+    flight.frames.clear()
+    result = flight.view()
+    (sent,) = flight.sent("GLOBAL_POSITION_SENSOR")
+    at_map = FRAME.en_from_latlon(result.outcome.lat_deg, result.outcome.lon_deg)
+    return FRAME.en_from_latlon(sent.lat * 1e-7, sent.lon * 1e-7) - at_map
+
+
 def test_positions_are_moved_only_where_asked_known_before_and_plausible(begin, caplog):
     good = known_biases(12.0, -5.0, 2.0, 3600.0)
     short = known_biases(12.0, -5.0, 2.0, 600.0)
@@ -177,13 +187,7 @@ def test_positions_are_moved_only_where_asked_known_before_and_plausible(begin, 
         flight = begin(known={"d": known}, correct=correct)
         assert ("not corrected" in caplog.text) is (correct and known is not good)
         flight.off_m = known.en_m
-        flight.views(20)
-        flight.frames.clear()
-        result = flight.view()
-        (sent,) = flight.sent("GLOBAL_POSITION_SENSOR")
-        at_map = FRAME.en_from_latlon(result.outcome.lat_deg, result.outcome.lon_deg)
-        place = FRAME.en_from_latlon(sent.lat * 1e-7, sent.lon * 1e-7)
-        assert place - at_map == pytest.approx(moved_m, abs=0.05)
+        assert moved_by_correction(flight) == pytest.approx(moved_m, abs=0.05)
         reasons = flight.health().reasons
         assert ("not_corrected" in reasons) is refused
         assert ("map_displaced" in reasons) is (known is spoofed)
@@ -194,12 +198,7 @@ def test_an_interrupted_flight_is_not_corrected_by_what_it_learnt(begin):
     before, dragged = known_biases(0.0, 0.0, 2.0, 3600.0), known_biases(12.0, 0.0, 1.0, 9000.0)
     flight = begin(known={"d": before}, correct=True, resumed=Resumed(dragged, before))
     flight.off_m = dragged.en_m
-    flight.views(20)
-    flight.frames.clear()
-    result = flight.view()
-    (sent,) = flight.sent("GLOBAL_POSITION_SENSOR")
-    at_map = FRAME.en_from_latlon(result.outcome.lat_deg, result.outcome.lon_deg)
-    assert FRAME.en_from_latlon(sent.lat * 1e-7, sent.lon * 1e-7) == pytest.approx(at_map, abs=0.05)
+    assert moved_by_correction(flight) == pytest.approx([0.0, 0.0], abs=0.05)
     saved = flight.watch.maps()["d"]
     assert saved["mean"][0] == pytest.approx(12.0, abs=0.5)  # it continues to learn
     flown = saved["flight"]

@@ -54,7 +54,7 @@ class Counts:
 
 
 class Doubts:
-    """What is kept of a run to say in the end what to check."""
+    """Views and doubts of a run, from which its summary advises what to check."""
 
     def __init__(
         self,
