@@ -232,15 +232,16 @@ def _features_table(judged: Judged) -> Table:
 
 def _cases_table(judged: Judged) -> Table:
     confidence = judged.left_out()
-    keys = ("kind", "width_px", "heading_known", "prior_px")
+    keys = ("kind", "width_px", "heading_known", "prior_px", "tracked")
     cases = dict.fromkeys(tuple(each[key] for key in keys) for each in judged.rows)
     rows = []
     for case in cases:
         inside = judged.where(**dict(zip(keys, case, strict=True)))
-        kind, width_px, known, prior_px = case
+        kind, width_px, known, prior_px, tracked = case
         words = [kind, f"{width_px} px"]
         words += [] if known else ["heading unknown"]
         words += [] if prior_px is None else [f"prior {prior_px:g} px"]
+        words += ["tracked"] if tracked else []
         rows.append(
             [
                 ", ".join(words),

@@ -500,6 +500,11 @@ def test_the_position_is_saved_about_once_a_second(begin, tmp_path, monkeypatch)
     saved = states.load(path)
     assert (saved.lat_deg, saved.lon_deg, saved.std_m) == (48.0, 2.0, pytest.approx(2.0))
     assert saved.age_s(flight.time.clocks.utc_ns(), flight.time.now_ns, states.boot_id()) < 1.2
+    flight.views(130, grey=BAD["too_dark"])
+    later = states.load(path)
+    assert later.mono_ns - saved.mono_ns < S
+    clock = flight.time.clocks.utc_ns(), flight.time.now_ns, states.boot_id()
+    assert later.stopped_s(*clock) < 11 < later.age_s(*clock)
     monkeypatch.setattr(states, "save", lambda *a: (_ for _ in ()).throw(OSError("read only")))
     flight.views(11)
     assert flight.reasons() == {"state_not_saved"}

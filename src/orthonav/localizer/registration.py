@@ -25,7 +25,7 @@ from orthonav.records import PRIOR_SIGMAS, Fix, NoFix, Prior, Telemetry, View
 from orthonav.register.pose import Pose, rotation
 from orthonav.register.reference import GreyPyramid, Reference
 from orthonav.register.refine import Placed
-from orthonav.register.registrar import Registered, Registrar
+from orthonav.register.registrar import Registered, Registrar, Searched
 from orthonav.register.search import Candidate, search
 from orthonav.register.template import ViewTemplates
 from orthonav.search.exact import rows_within
@@ -146,8 +146,9 @@ class RegistrationLocalizer:
     def best(self, view: PreparedView, prior: Prior | None) -> Registered | None:
         """The best place after all searches that had to be run; None where nothing was found."""
         judged: list[Placed] = []
+        direct: list[Placed] = []
         best: Registered | None = None
-        candidates = 0
+        candidates, searched = 0, self._searched_share(view, prior)
         rows = functools.cache(lambda: self._rows_near(view, prior))
         for each in self.plan.searches(
             view.levels,
@@ -159,27 +160,50 @@ class RegistrationLocalizer:
                 found = self.propose.candidates(view.rectified_at(0), each.poses, rows(), self.plan)
             else:
                 found = self._searched(view, prior, each)
-            judged += self.registrar.judged(
-                view.templates, view.levels, found, each.level, view.prior, judged
-            )
+            if each.level < view.levels.look:
+                direct = self.registrar.direct(view.templates, view.levels, found)
+            else:
+                judged += self.registrar.judged(
+                    view.templates, view.levels, found, each.level, view.prior, judged
+                )
             candidates += len(found)
             best = None
             enough = self.plan.enough(each.level, view.levels)
             if judged and self._seems_clear(view, judged, enough):
-                best = self._finished(view, judged, candidates)
+                best = self._finished(view, judged, direct, candidates, searched)
                 if self._is_clear(best, enough):
                     return best
         if not judged:
             return None
-        best = best or self._finished(view, judged, candidates)
+        best = best or self._finished(view, judged, direct, candidates, searched)
         if view.levels.final == 0 or not self._is_doubtful(best):
             return best
         made = view.rectified_at(view.levels.final - 1)
         finer = ViewTemplates(made.grey, made.valid, view.levels.final - 1)
         return self.registrar.deepened(view.templates, finer, view.levels, best, view.prior)
 
-    def _finished(self, view: PreparedView, judged: list[Placed], candidates: int) -> Registered:
-        return self.registrar.finished(view.templates, view.levels, judged, view.prior, candidates)
+    def _finished(
+        self,
+        view: PreparedView,
+        judged: list[Placed],
+        direct: list[Placed],
+        candidates: int,
+        searched: Searched,
+    ) -> Registered:
+        found = self.registrar.finished(
+            view.templates, view.levels, judged, view.prior, candidates, direct
+        )
+        return replace(found, searched=searched)
+
+    def _searched_share(self, view: PreparedView, prior: Prior | None) -> Searched:
+        """Share of the map and of all headings that is searched for a view."""
+        area, headings = 1.0, 1.0
+        if prior is not None:
+            rows, cols = self.registrar.reference.shape(0)
+            area = min((2 * self._reach_px(view, prior)) ** 2 / (rows * cols), 1.0)
+        if view.prior.turn_rad is not None:
+            headings = min(self.plan.bank_sigmas * view.prior.turn_std_rad / math.pi, 1.0)
+        return Searched(area, headings)
 
     def _seems_clear(self, view: PreparedView, judged: list[Placed], enough: ClearMargin) -> bool:
         """Whether the best candidate may end the search, before the cost of finishing it."""

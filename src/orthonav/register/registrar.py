@@ -106,6 +106,19 @@ class OwnRatios(NamedTuple):
     local: float
 
 
+class Searched(NamedTuple):
+    """How much was searched for a place: the less, the fewer chance matches.
+
+    `area`: share of the positions on the map. `headings`: share of the full circle.
+    """
+
+    area: float
+    headings: float
+
+
+EVERYWHERE = Searched(1.0, 1.0)
+
+
 @dataclass(frozen=True, eq=False)
 class Registered:
     """The best place of a view, with its rivals.
@@ -115,7 +128,7 @@ class Registered:
     `look_rival` compare all candidates at the level they were judged at; `fine_score` and
     `fine_rival` the finalists with one finer level added, NaN where that was not needed.
     `finalists` are the places that were finished, with their scores, best first. `own`: what the
-    place says of itself, without rivals.
+    place says of itself, without rivals. `searched`: how much was searched.
     """
 
     placed: Placed
@@ -126,6 +139,7 @@ class Registered:
     candidates: int
     finalists: tuple[tuple[float, Placed], ...]
     own: OwnRatios
+    searched: Searched = EVERYWHERE
     fine_score: float = math.nan
     fine_rival: float = math.nan
 
@@ -160,6 +174,8 @@ class Registered:
             "agreement": self.placed.agreement,
             "overlap": self.placed.overlap,
             "candidates": float(self.candidates),
+            "searched_area": self.searched.area,
+            "searched_headings": self.searched.headings,
         }
 
 
@@ -229,6 +245,14 @@ class Registrar:
                 placed = _hopeful(placed, prior, HOPE)[:KEPT_TO_LOOK]
         return placed
 
+    def direct(
+        self, templates: ViewTemplates, levels: Levels, candidates: Sequence[Candidate]
+    ) -> list[Placed]:
+        """Candidates found at the final level, with their scores at the judged one: refined there
+        they would be lost again."""
+        look = self.refiner(templates, levels, levels.look)
+        return [look.place(found.pose, 0) for found in candidates]
+
     def standing(
         self, templates: ViewTemplates, judged: Sequence[Placed], prior: PosePrior
     ) -> tuple[float, float]:
@@ -266,27 +290,31 @@ class Registrar:
         judged: Sequence[Placed],
         prior: PosePrior,
         candidates: int,
+        direct: Sequence[Placed] = (),
     ) -> Registered:
         """The best of the judged candidates, of one or more searches of `candidates` in all.
 
-        The best of them are refined at the final level, their rivals too. `judged` must not be
-        empty.
+        The best of them are refined at the final level, their rivals too, and all `direct` ones,
+        which were found there. `judged` must not be empty.
         """
         judged = _ranked(judged, prior)
         exclusion = EXCLUSION_SHARE * view_side_px(templates)
         finalists = _hopeful(_distinct(judged, KEPT_TO_FINISH, exclusion), prior, HOPE, 2)
         totals = [
             (total - prior.cost(each.pose), each)
-            for total, each in (self._at_final(templates, levels, each) for each in finalists)
+            for total, each in (
+                self._at_final(templates, levels, each) for each in (*finalists, *direct)
+            )
         ]
         totals.sort(key=lambda pair: -pair[0])
         score, best = totals[0]
+        judged = [*judged, *direct]
         nearest = min(judged, key=lambda each: apart_px(each, best))
         others = [each for each in judged if apart_px(each, best) > exclusion]
         return Registered(
             placed=self.with_covariance(templates, levels, best),
             score=score,
-            rival=totals[1][0] if len(totals) > 1 else 0.0,
+            rival=max((t for t, each in totals if apart_px(each, best) > exclusion), default=0.0),
             look_score=nearest.score - prior.cost(nearest.pose),
             look_rival=max((each.score - prior.cost(each.pose) for each in others), default=0.0),
             candidates=candidates,
@@ -313,7 +341,8 @@ class Registrar:
         ]
         totals.sort(key=lambda entry: -entry[0])
         fine_score, score, best = totals[0]
-        rivals = totals[1:]
+        exclusion = EXCLUSION_SHARE * view_side_px(templates)
+        rivals = [entry for entry in totals if apart_px(entry[2], best) > exclusion]
         changed = best is not found.finalists[0][1]
         deep = replace(
             found,
@@ -322,13 +351,14 @@ class Registrar:
         )
         if not changed:
             return deep
+        near = apart_px(best, found.placed) <= exclusion
         return replace(
             deep,
             placed=self.with_covariance(templates, levels, best),
             score=score,
             rival=max((entry[1] for entry in rivals), default=0.0),
-            look_score=found.look_rival,
-            look_rival=found.look_score,
+            look_score=found.look_score if near else found.look_rival,
+            look_rival=found.look_rival if near else found.look_score,
             own=self._own_ratios(templates, levels, score + prior.cost(best.pose), best),
         )
 
