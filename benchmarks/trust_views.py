@@ -31,8 +31,9 @@ from orthonav.simulate.landscape import DEFAULT_DATES
 YAW_STD_DEG, AGL_STD = 10.0, 0.1
 TRACK_YAW_STD_DEG, TRACK_AGL_STD = 2.0, 0.03
 """Errors of heading and height, and what a track knows of them."""
-FAR_PX, FAR_M = 10.0, 35.0
-"""A view is right within the larger of these, and one that a track predicts within the first."""
+FAR_PX, FAR_M, FAR_FROM_PRIOR_PX = 10.0, 35.0, 20.0
+"""A view is right within the larger of the first two, one with a prior within the third: chance
+finds places within 35 m of it too. Maps and views of Tours are up to 17 px apart."""
 METRES_PER_DEG = 111_320.0
 BESIDE_SHARE = 0.9
 """Views beside the map are farther from its border than this share of their width."""
@@ -204,7 +205,7 @@ def _placed(
     assert localizer.confidence is not None
     place = localizer.camera_en_m(seen.prepared, found.placed.pose)
     error_m = float(np.hypot(*(place - localizer.sheet.frame.en_from_latlon(*truth))))
-    far_m = FAR_PX * gsd_m if case.tracked else max(FAR_M, FAR_PX * gsd_m)
+    far_m = max(FAR_M, FAR_PX * gsd_m) if prior is None else FAR_FROM_PRIOR_PX * gsd_m
     right = case.kind == "found" and error_m <= far_m
     return {
         "evidence": found.evidence(),

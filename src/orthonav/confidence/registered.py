@@ -21,12 +21,13 @@ FEATURES = (
     "log_look_ratio",
     "blocks_t",
     "log_detail_ratio",
-    "log_narrow",
     "log_local_ratio",
 )
+OLD_FEATURES = {"log_strength", "log_peak_ratio", "log_look_ratio"}
+"""Features of maps up to version 0.1."""
 CHANCES = ("total", "look", "fine")
-USUAL_BIASES = -8.43, -1.55
-USUAL_WEIGHTS = 3.69, 5.69, 5.10, 0.94, 2.69, 0.0, 11.54
+USUAL_BIASES = -6.29, -1.75
+USUAL_WEIGHTS = 3.23, 6.16, 3.39, 0.47, 2.55, 10.35
 """What separates right from wrong, fitted to 3,549 views (docs/decisions/confidence.md). The
 benchmark of trust shows how weights fitted in this way judge scenes left out."""
 RIDGE = 3e-2
@@ -37,8 +38,6 @@ LEAST = 1e-9
 """Least and greatest (1 - LEAST) probability of the fit, for a finite loss."""
 STAND_IN = 0.7
 """Share of the chance value that stands in for a rival where a narrow search found none."""
-LEAST_SEARCHED = 1e-4
-"""Least share of positions and headings that makes a difference."""
 LEAST_LOCAL = 0.5
 """Least ratio to the ground nearby that makes a difference."""
 USUAL_DETAIL = 1.4
@@ -85,8 +84,6 @@ class RegisteredConfidence:
     - `blocks_t`: agreement of the blocks of the view. Views that one strong line places.
     - `log_detail_ratio`: score at the finest level over that at the coarser one. Chance matches
       lose more in detail.
-    - `log_narrow`: one over the share of positions and headings that was searched. Not evidence of
-      the place: fewer places match by chance.
     - `log_local_ratio`: score over the best one a little aside. Rows, lattices, single roads.
 
     A share of chance stands in for a rival where none was found, so that a narrow search does not
@@ -102,7 +99,7 @@ class RegisteredConfidence:
         return self.of(features_of(evidence, self.chances))
 
     def of(self, features: NDArray[np.float64]) -> float:
-        """The same, by features (7,)."""
+        """The same, by features (6,)."""
         fits = self.biases[0] + float(np.dot(self.weights[:-1], features[:-1]))
         alone = self.biases[1] + self.weights[-1] * float(features[-1])
         return probability(fits) * probability(alone)
@@ -124,13 +121,13 @@ class RegisteredConfidence:
     def from_plain(cls, plain: Any) -> "RegisteredConfidence":
         """Inverse of `to_plain`; raises `VariantError` if it does not fit.
 
-        Maps built before all of `FEATURES` existed get the usual weights, with their own scores
+        Maps built before all of `FEATURES` existed have the usual weights, with their own scores
         of chance.
         """
         try:
             chances = Chances(**{name: float(plain["chances"][name]) for name in CHANCES})
             stored = plain["weights"]
-            if set(stored) < set(FEATURES):
+            if set(stored) == OLD_FEATURES:
                 return cls.usual(chances)
             first, second = plain["biases"]
             biases = float(first), float(second)
@@ -148,7 +145,7 @@ class RegisteredConfidence:
 
 
 def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.float64]:
-    """Features (7,) of the evidence of a registered view, see `RegisteredConfidence`."""
+    """Features (6,) of the evidence of a registered view, see `RegisteredConfidence`."""
     strength, look = max(evidence["strength"], 1e-3), max(evidence["look"], 1e-3)
     detail, chance = evidence["detail_ratio"], chances.of_strength(evidence)
     if math.isnan(detail):
@@ -159,8 +156,7 @@ def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.f
         ratio = math.sqrt(ratio * max(fine, 1e-3) / max(fine_rival, STAND_IN * chances.fine))
     look_ratio = look / max(evidence["look_rival"], STAND_IN * chances.look)
     local = max(evidence["local_ratio"], LEAST_LOCAL)
-    searched = max(evidence["searched_area"] * evidence["searched_headings"], LEAST_SEARCHED)
-    logs = np.log([strength / chance, ratio, look_ratio, max(detail, 1e-3), 1 / searched, local])
+    logs = np.log([strength / chance, ratio, look_ratio, max(detail, 1e-3), local])
     return np.array([*logs[:3], evidence["blocks_t"], *logs[3:]], np.float64)
 
 

@@ -48,7 +48,6 @@ def places_of(
         for name, value in least.items():
             if not math.isnan(evidence[name]):
                 evidence[name] = max(evidence[name], value)
-        evidence["searched_area"] = 1.0
         alone = confidence(evidence)
         log_odds = min(there, logit(alone, LEAST))
         if not out or log_odds > WORTH_LOG_ODDS:

@@ -25,7 +25,7 @@ from orthonav.records import PRIOR_SIGMAS, Fix, NoFix, Prior, Telemetry, View
 from orthonav.register.pose import Pose, rotation
 from orthonav.register.reference import GreyPyramid, Reference
 from orthonav.register.refine import Placed
-from orthonav.register.registrar import Registered, Registrar, Searched
+from orthonav.register.registrar import Registered, Registrar
 from orthonav.register.search import Candidate, search
 from orthonav.register.template import ViewTemplates
 from orthonav.search.exact import rows_within
@@ -148,7 +148,7 @@ class RegistrationLocalizer:
         judged: list[Placed] = []
         direct: list[Placed] = []
         best: Registered | None = None
-        candidates, searched = 0, self._searched_share(view, prior)
+        candidates = 0
         rows = functools.cache(lambda: self._rows_near(view, prior))
         for each in self.plan.searches(
             view.levels,
@@ -170,12 +170,12 @@ class RegistrationLocalizer:
             best = None
             enough = self.plan.enough(each.level, view.levels)
             if judged and self._seems_clear(view, judged, enough):
-                best = self._finished(view, judged, direct, candidates, searched)
+                best = self._finished(view, judged, direct, candidates)
                 if self._is_clear(best, enough):
                     return best
         if not judged:
             return None
-        best = best or self._finished(view, judged, direct, candidates, searched)
+        best = best or self._finished(view, judged, direct, candidates)
         if view.levels.final == 0 or not self._is_doubtful(best):
             return best
         made = view.rectified_at(view.levels.final - 1)
@@ -183,27 +183,11 @@ class RegistrationLocalizer:
         return self.registrar.deepened(view.templates, finer, view.levels, best, view.prior)
 
     def _finished(
-        self,
-        view: PreparedView,
-        judged: list[Placed],
-        direct: list[Placed],
-        candidates: int,
-        searched: Searched,
+        self, view: PreparedView, judged: list[Placed], direct: list[Placed], candidates: int
     ) -> Registered:
-        found = self.registrar.finished(
+        return self.registrar.finished(
             view.templates, view.levels, judged, view.prior, candidates, direct
         )
-        return replace(found, searched=searched)
-
-    def _searched_share(self, view: PreparedView, prior: Prior | None) -> Searched:
-        """Share of the map and of all headings that is searched for a view."""
-        area, headings = 1.0, 1.0
-        if prior is not None:
-            rows, cols = self.registrar.reference.shape(0)
-            area = min((2 * self._reach_px(view, prior)) ** 2 / (rows * cols), 1.0)
-        if view.prior.turn_rad is not None:
-            headings = min(self.plan.bank_sigmas * view.prior.turn_std_rad / math.pi, 1.0)
-        return Searched(area, headings)
 
     def _seems_clear(self, view: PreparedView, judged: list[Placed], enough: ClearMargin) -> bool:
         """Whether the best candidate may end the search, before the cost of finishing it."""

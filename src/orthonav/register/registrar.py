@@ -106,19 +106,6 @@ class OwnRatios(NamedTuple):
     local: float
 
 
-class Searched(NamedTuple):
-    """How much was searched for a place: the less, the fewer chance matches.
-
-    `area`: share of the positions on the map. `headings`: share of the full circle.
-    """
-
-    area: float
-    headings: float
-
-
-EVERYWHERE = Searched(1.0, 1.0)
-
-
 @dataclass(frozen=True, eq=False)
 class Registered:
     """The best place of a view, with its rivals.
@@ -128,7 +115,7 @@ class Registered:
     `look_rival` compare all candidates at the level they were judged at; `fine_score` and
     `fine_rival` the finalists with one finer level added, NaN where that was not needed.
     `finalists` are the places that were finished, with their scores, best first. `own`: what the
-    place says of itself, without rivals. `searched`: how much was searched.
+    place says of itself, without rivals.
     """
 
     placed: Placed
@@ -139,7 +126,6 @@ class Registered:
     candidates: int
     finalists: tuple[tuple[float, Placed], ...]
     own: OwnRatios
-    searched: Searched = EVERYWHERE
     fine_score: float = math.nan
     fine_rival: float = math.nan
 
@@ -174,8 +160,6 @@ class Registered:
             "agreement": self.placed.agreement,
             "overlap": self.placed.overlap,
             "candidates": float(self.candidates),
-            "searched_area": self.searched.area,
-            "searched_headings": self.searched.headings,
         }
 
 
