@@ -282,6 +282,19 @@ def test_two_searches_of_one_place_are_no_rivals(registrar):
     assert both.candidates == 3 and both.peak_ratio > 1.8
 
 
+def test_a_place_found_at_the_final_level_competes_with_the_judged_ones(registrar):
+    pose = Pose(180.0, 200.0, 0.5, 0.0)
+    templates, prior = templates_of(GROUND, pose), prior_of(pose)
+    away = [near(pose, 90.0, -40.0), near(pose, -60.0, 80.0)]
+    judged = registrar.judged(templates, LEVELS, away, LEVELS.look, prior)
+    missed = registrar.finished(templates, LEVELS, judged, prior, 2)
+    assert apart_px(missed.placed.pose, pose) > 30
+    direct = registrar.direct(templates, LEVELS, [near(pose, 0.5)])
+    found = registrar.finished(templates, LEVELS, judged, prior, 3, direct)
+    assert apart_px(found.placed.pose, pose) < 0.3
+    assert found.rival == missed.score and found.look_rival == missed.look_score
+
+
 def test_candidates_without_hope_are_dropped_early_and_still_known_as_rivals(registrar):
     pose = Pose(180.0, 200.0, 0.5, 0.0)
     templates, prior = templates_of(GROUND, pose), prior_of(pose)
