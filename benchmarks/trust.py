@@ -208,10 +208,10 @@ def _scenes_table(judged: Judged) -> Table:
         *("calibration error", "shipped: accepted", "wrong", "calibration error"),
     )
     notes = (
-        f"accepted: confidence of {CONFIDENT:g} or more; right: within 35 m or 10 px; heading sd "
-        "10 deg, height sd 10 %",
+        f"accepted: confidence of {CONFIDENT:g} or more; right: within 35 m or 10 px, with a prior "
+        "within 20 px; heading sd 10 deg, height sd 10 %, tracked: 2 deg and 3 %",
         "by a fit to the other scenes; shipped: by the weights of the program, which are fitted to "
-        "other views of the real ones among these scenes",
+        "all of these views",
     )
     return Table("Confidence on scenes left out", header, rows, notes)
 

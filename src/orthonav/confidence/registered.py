@@ -28,7 +28,7 @@ OLD_FEATURES = {"log_strength", "log_peak_ratio", "log_look_ratio"}
 CHANCES = ("total", "look", "fine")
 USUAL_BIASES = -6.29, -1.75
 USUAL_WEIGHTS = 3.23, 6.16, 3.39, 0.47, 2.55, 10.35
-"""What separates right from wrong, fitted to 3,549 views (docs/decisions/confidence.md). The
+"""What separates right from wrong, fitted to 5,668 views (docs/decisions/confidence.md). The
 benchmark of trust shows how weights fitted in this way judge scenes left out."""
 RIDGE = 3e-2
 """Weight of the usual bias where views of another date of the map's area are fitted."""
