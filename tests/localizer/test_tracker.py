@@ -18,7 +18,7 @@ from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import localize_flight, smoothed_track
 from orthonav.records import Fix, NoFix, Prior, Telemetry, View
-from orthonav.track import ReportedAttitude, Sighting, State
+from orthonav.track import Estimate, ReportedAttitude, Sighting, State
 
 WIDE = Camera(320, 240, 200.0, 200.0, 160.0, 120.0)
 SPEED_MPS = 14.0
@@ -571,3 +571,24 @@ def test_a_wrong_place_found_after_a_loss_does_not_bias_the_search(localizer):
     rows = followed(tracker, localizer, seen[11:])
     assert all(row[0] < 10 for row in rows if row[2] == "tracking")
     assert rows[-1][2] == "tracking"
+
+
+@pytest.mark.parametrize(
+    ("state", "std_m", "confirms"),
+    [
+        (State.COASTING, 5.0, True),
+        (State.COASTING, 12.0, False),
+        (State.SEARCHING, 5.0, False),
+    ],
+)
+def test_exact_dead_reckoning_of_a_confirmed_track_is_confirmed_around_it(
+    localizer, state, std_m, confirms
+):
+    """Elsewhere only places that competed with the whole map confirm a track."""
+    covariance = np.eye(8) * std_m**2
+    expected = Estimate(np.zeros(8), covariance, 0.7, state, 0.5, 0.0, False, followed=True)
+    tracker = Tracker(localizer)
+    areas = [tracker._search_area(expected) for _ in range(2)]
+    whole, around = areas
+    assert whole == (None, None, True)
+    assert around[0] is not None and around[2] is confirms
