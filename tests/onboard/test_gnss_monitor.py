@@ -96,7 +96,7 @@ def test_a_fault_is_named_in_time(text, seconds, names):
 @pytest.mark.parametrize(
     ("name", "seed", "hours"),
     [
-        ("usual", 11, 0.5),
+        ("usual", 11, 0.3),
         pytest.param("usual", 11, 10 / 3, marks=pytest.mark.slow),
         pytest.param("poor", 12, 10 / 3, marks=pytest.mark.slow),
         pytest.param("high", 13, 10 / 3, marks=pytest.mark.slow),
