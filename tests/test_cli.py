@@ -672,7 +672,7 @@ def writing(ortho, map_path, short_flight, fixes_path, truth_path, out):
     return commands(ortho, map_path, short_flight, fixes_path, truth_path, out)
 
 
-LANDSCAPE = ["--size-m", "300", "300"]
+LANDSCAPE = ["--size-m", "200", "200"]
 WRITERS = ["build", "simulate", "localize", "evaluate", "metrics", "landscape"]
 
 

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+
 from absent import ABSENT
 
 FORBIDDEN = ("torch", "rasterio", "pyproj", "shapely", "matplotlib", "osgeo")

@@ -113,7 +113,7 @@ def test_the_same_whatever_the_number_of_workers(plan, half_blank, monkeypatch):
     assert multiprocessing.active_children() == []
 
 
-@pytest.mark.parametrize("how", ["killed", "interrupted"])
+@pytest.mark.parametrize("how", ["killed", pytest.param("interrupted", marks=pytest.mark.slow)])
 def test_workers_always_end(plan, how):
     def stop(_):
         if how == "interrupted":

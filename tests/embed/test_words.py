@@ -215,7 +215,7 @@ def test_places_are_found_again(learnt):
     turned = (cv2.warpAffine(grey, turn, (700, 700)) * 0.8).astype(np.uint8)
     right = 0
     rng = np.random.default_rng(0)
-    for _ in range(20):
+    for _ in range(10):
         centre = rng.uniform(220, 480, 2)  # x, y in the turned picture
         x, y = np.rint(centre - 64).astype(int)
         view = turned[y : y + 128, x : x + 128]
@@ -223,7 +223,7 @@ def test_places_are_found_again(learnt):
         place = cv2.invertAffineTransform(turn) @ [x + 63.5, y + 63.5, 1]
         best = np.array(starts[int(scores.argmax())])[::-1] + 63.5
         right += np.abs(best - place).max() <= 64
-    assert right >= 17
+    assert right >= 8
 
 
 def test_learning_gives_words_of_its_pictures(learnt):

@@ -141,9 +141,7 @@ def test_flights_at_different_radii_have_no_total() -> None:
         table([], one.metrics)
 
 
-def test_a_flight_without_any_fix_is_reported(
-    tmp_path: Path, coarse, no_calibration_plots
-) -> None:
+def test_a_flight_without_any_fix_is_reported(tmp_path: Path, coarse, no_calibration_plots) -> None:
     flight = made_flight(1, share_fixed=0.0)
     html = write_report(tmp_path, [flight]).read_text("utf-8")
     assert "No view has a fix" in html

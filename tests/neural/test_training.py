@@ -107,6 +107,7 @@ def test_the_auto_encoder_learns_to_reconstruct_the_area(tmp_path):
     assert "float32" in messages[-1][0]
 
 
+@pytest.mark.slow  # an experiment
 def test_the_triplet_network_learns_to_find_a_changed_place(tmp_path):
     recipe = TripletRecipe(width=4, epochs=30, batch=32, learning_rate=2e-3, apart=0.5)
     recipe = dataclasses.replace(recipe, similarity="cosine", margin=0.2)
@@ -342,6 +343,7 @@ def test_triplets_need_positives():
         learn_network(TRIPLET, sheet(), binary=False, seed=0, work=None, means=QUICK)
 
 
+@pytest.mark.slow  # an experiment
 def test_fast_options_give_the_same_result_up_to_rounding(tmp_path):
     recipe = dataclasses.replace(AUTO, epochs=4)
     plain = Means(bf16=False, fused=False, keep_memory=False, device="cpu")

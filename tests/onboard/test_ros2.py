@@ -814,13 +814,3 @@ def test_conflicting_options_end_with_one_line(flown, run, env):
     ):
         done = run("fly", path, *words)
         assert done.code == 1 and said in done.err and done.err.count("\n") == 1
-
-
-def test_a_missing_extra_is_named_in_one_line(flown, env, tmp_path):
-    errors = tmp_path / "errors"
-    (tmp_path / "cyclonedds.py").write_text("raise ImportError('not here')\n")
-    search = os.pathsep.join([str(tmp_path), *sys.path])
-    running = process({**env, "PYTHONPATH": search}, errors, "fly", flown[0], "--ros2")
-    assert running.wait(60) == 1
-    assert "pip install 'orthonav[ros2]'" in errors.read_text()
-    assert errors.read_text().count("\n") == 1

@@ -97,7 +97,6 @@ REQUESTS = {
     "plain": WITH_LAYER,
     "gray": {"edges": "gray"},
     "canny": {"edges": "canny:low=50,high=120"},
-    "64 dims": {"method": "gradient:dims=64"},
     "both": {"method": "gradient:dims=32,cells=16", "edges": "canny"},
     "seed": {**WITH_LAYER, "seed": 5, "calibration_views": 3},
 }
@@ -373,7 +372,7 @@ def test_own_views_are_confident_and_mirrored_ones_are_not(localizer, area):
     places = [localizer.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg) for fix in fixes]
     errors_m = np.abs(np.array(places) - truth).max(axis=1)
     own = np.array([fix.confidence for fix in fixes])
-    false = np.array([fix.confidence for fix in own_views(localizer, area.past, True)[0]])
+    false = np.array([fix.confidence for fix in own_views(localizer, area.past, True, 15)[0]])
     assert (errors_m <= localizer.grid.stride_m).mean() >= 0.95
     assert np.median(own) > 0.8 and np.median(false) < 0.4
     assert (false[:, None] < own).mean() > 0.97  # nearly every pair is separated

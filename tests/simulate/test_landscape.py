@@ -122,6 +122,7 @@ def test_shadow_lies_away_from_the_sun_and_is_as_long_as_it_should_be(date, gsd_
     assert abs((bearing_deg - date.sun_azimuth_deg) % 360.0 - 180.0) < 6.0
 
 
+@pytest.mark.slow  # how the generated ground looks
 def test_more_years_more_change():
     land = Landscape(3)
     cells = land._network.cells_near((0.0, 0.0, 700.0, 700.0))
@@ -232,6 +233,7 @@ def test_epoch_refuses_what_no_photograph_can_have(bad):
         replace(SUMMER, **bad)
 
 
+@pytest.mark.slow  # how the generated ground looks
 def test_low_sun_leaves_no_seam():
     low = replace(AUTUMN, sun_elevation_deg=16.0)
     whole = Landscape(1).render(low, ORIGIN_M[0] + 1650.0, NORTH_M, 200, 200, 1.0)
