@@ -25,7 +25,7 @@ def small_demo(area, monkeypatch):
     turns = tuple((east * 0.45, north * 0.35) for east, north in demo.WAYPOINTS_EN_M)
     monkeypatch.setattr(demo, "WAYPOINTS_EN_M", turns)
     monkeypatch.setattr(demo, "SPACING_M", 200.0)
-    monkeypatch.setattr(demo, "CHECK_EFFORT", 0.03)
+    monkeypatch.setattr(demo, "CHECK_EFFORT", 0.05)
     monkeypatch.setattr("orthonav.check.run.usable_cores", lambda: 1)
     monkeypatch.setattr("orthonav.report.canvas.DPI", 30)
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 24)
