@@ -852,10 +852,12 @@ def test_invalid_options_end_with_one_line(flown, run, tmp_path):
     assert done.code == 2 and "LAT,LON,STD_M" in done.err
 
 
-def test_a_flight_loads_neither_torch_nor_gdal():
+def test_a_flight_loads_neither_torch_nor_gdal_nor_ros():
     script = (
-        "import sys, orthonav.onboard.fly, orthonav.cli.fly, orthonav.localizer.tracker;"
-        "print({'torch', 'rasterio', 'pyproj', 'mcap'} & set(sys.modules))"
+        "import sys, orthonav.onboard.fly, orthonav.cli.fly, orthonav.localizer.tracker\n"
+        "import orthonav.cli.flying\n"
+        "unwanted = {'torch', 'rasterio', 'pyproj', 'mcap', 'cyclonedds', 'rosbags'}\n"
+        "print(unwanted & {name.partition('.')[0] for name in sys.modules})"
     )
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True

@@ -84,6 +84,7 @@ def test_registration_works_on_maps_of_other_methods(built, flight_path, method)
     assert np.median(errors) < 15
 
 
+@pytest.mark.slow  # as in tests/neural, with imagery
 def test_interrupted_training_resumes(area, tmp_path):
     class Killed(Exception):
         pass
@@ -134,6 +135,7 @@ def test_what_does_not_go_together_is_refused(area, tmp_path, method, edges, say
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow  # another method than the default one
 def test_the_same_request_gives_the_same_embeddings(area, tmp_path):
     parts = []
     for name in ("a.onav", "b.onav"):
