@@ -17,8 +17,8 @@ from typing import Any
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 PARTS = ("A", "B", "C", "D", "real", "untuned", "own", "baselines")
 WHAT = ("run", "report", "keep", "check")
-NETWORKS = ("triplet", "autoencoder")
-ORDER = ("triplet", "autoencoder", "gradient", "bovw")
+NETWORKS = ("triplet", "caevl", "autoencoder")
+ORDER = ("triplet", "caevl", "autoencoder", "gradient", "bovw")
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
@@ -100,6 +100,9 @@ def _run(options: argparse.Namespace, command: str) -> int:
         _say(f"{_minutes(start)}  {scene.name}: imagery is there")
     failed = 0
     for (_, scene, method), minutes in side_by_side(tasks, jobs):
+        if not options.keep_checkpoints:  # `run` has removed the last one; CAEVL has an earlier one
+            for left in place.work(scene, method.key).glob("*/checkpoint.pt"):
+                left.unlink()
         status = f"failed: {minutes!r}" if isinstance(minutes, Exception) else f"{minutes} min"
         failed += isinstance(minutes, Exception)
         _say(f"{_minutes(start)}  {scene.name} {method.key}: {status}")
@@ -173,7 +176,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--setting", choices=("reduced", "gpu", "full"), default="reduced")
     parser.add_argument("--only", nargs="+", choices=PARTS, help="only these parts")
     parser.add_argument(
-        "--methods", nargs="+", metavar="NAME", help="gradient, bovw, autoencoder, triplet"
+        "--methods", nargs="+", metavar="NAME", help="gradient, bovw, autoencoder, caevl, triplet"
     )
     parser.add_argument("--out", type=Path, default=Path("paper_results"), metavar="DIR")
     parser.add_argument(

@@ -1,12 +1,15 @@
 """The paper's section Methodology: which methods look at what, as orthonav names them."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from experiments.paper.trajectories import LEARNABLE, TABLE_1, Setting, epochs
 
-GREY, CANNY, SEGMENTS, SAM = "gray", "canny", "segments", "sam"
+GREY, CANNY, SEGMENTS, SAM, LEARNT = "gray", "canny", "segments", "sam", "onnx"
 DEFAULT = "gradient"
 PER_TILE = "per=tile"
+BETWEEN_DATES = Path(__file__).resolve().parent / "between_dates.onnx"
+"""Edges that stay between dates: made by `python -m experiments.paper.between_dates`."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +39,16 @@ class Method:
         return "-".join(part for part in parts if part)
 
 
-def tuned(family: str, recipe: str, scene: str) -> bool:
+def tuned(family: str, recipe: str, scene: str, edges: str = "") -> bool:
     """Whether a row was tuned with imagery or views of its scene, or of the same generator.
 
     docs/paper.md lists what was tuned on what. The default was chosen on generated landscapes, the
-    Szada pairs and NAIP; training of the reduced triplet network by its accuracy on B; the number
-    of words is chosen by its accuracy everywhere, as in the paper.
+    Szada pairs and NAIP; learnt edges are learnt on generated landscapes; training of the reduced
+    triplet network was chosen by its accuracy on B; the number of words is chosen by its accuracy
+    everywhere, as in the paper.
     """
+    if edges == LEARNT and column(scene) in TABLE_1:
+        return True
     if family == "gradient":
         return column(scene) in TABLE_1 or scene.startswith(("naip-", "szada-"))
     return family == "bovw" or (
@@ -55,13 +61,20 @@ def column(scene: str) -> str:
     return scene.partition("-")[0]
 
 
+REDUCED_CAEVL = ",batch=64,learning_rate=0.001,tuning_rate=0.001,projector=1024"
+CAEVL_EPOCHS = 100
+"""Epochs of CAEVL's fine-tuning, as released; the reduced setting shows half as many tiles in it as
+to the auto-encoder."""
 REDUCED_NETWORKS = {
-    "autoencoder": {GREY: "ABCD", CANNY: "ABCD", SEGMENTS: "B", SAM: "B"},
+    "autoencoder": {GREY: "ABCD", CANNY: "ABCD", SEGMENTS: "B", SAM: "B", LEARNT: "B"},
     "triplet": {GREY: "B", CANNY: "B"},
+    "caevl": {CANNY: "B"},
 }
 """Trajectories that the reduced setting trains a network on, by input."""
 
 
+FIELD = ("B", "naip-2018", "szada-1", "schiphol", "tours")
+"""Scenes of the section on the field today, where CAEVL and learnt edges are run too."""
 GPU_SCENES = ("B", "D")
 """Scenes of the setting "gpu": auto-encoder on Canny edges and grey levels."""
 
@@ -79,7 +92,7 @@ def methods(
 
     The reduced setting learns fewer networks: `REDUCED_NETWORKS`, and over imagery that no
     trajectory of the paper is flown over the auto-encoder on Canny edges, the paper's best, and on
-    grey levels over NAIP and Szada.
+    grey levels over NAIP and Szada; CAEVL and learnt edges on `FIELD`.
     """
     shown, width = setting.encoder_tiles, setting.encoder_width
     encoder = (
@@ -95,10 +108,18 @@ def methods(
         looked_at.append(f"{SAM}:weights={sam_weights}")
         if setting.name != "reduced":  # a row of the reduced setting would take days on a CPU
             looked_at.append(f"{SAM}:{PER_TILE},weights={sam_weights}")
+    tuned_on = epochs(tiles, None if shown is None else shown // 2)
+    small = "" if shown is None else REDUCED_CAEVL
+    caevl = (
+        f"caevl:width={width}{small},epochs={more_epochs or epochs(tiles, shown)},"
+        f"tuning_epochs={more_epochs or min(tuned_on, CAEVL_EPOCHS)}"
+    )
     rows = [Method(DEFAULT, DEFAULT, DEFAULT)]
     rows += [Method("bovw", f"bovw:words={words}", GREY) for words in setting.words]
     networks = [Method("autoencoder", encoder, edges) for edges in looked_at]
     networks += [Method("triplet", triplet, edges) for edges in looked_at]
+    networks.append(Method("autoencoder", encoder, f"{LEARNT}:weights={BETWEEN_DATES}"))
+    networks.append(Method("caevl", caevl, CANNY))
     ours = Method(DEFAULT, DEFAULT, DEFAULT, True)
     if setting.name == "gpu":
         return [rows[0], *(each for each in networks[:2] if column(scene) in GPU_SCENES), ours]
@@ -111,6 +132,8 @@ def _reduced(method: Method, scene: str) -> bool:
     edges = method.edges.partition(":")[0]
     name = column(scene)
     if name not in TABLE_1:
+        if method.family == "caevl" or edges == LEARNT:
+            return scene in FIELD
         wanted = (CANNY, GREY) if scene.startswith(("naip-", "szada-")) else (CANNY,)
         return method.family == "autoencoder" and edges in wanted
     return name in REDUCED_NETWORKS[method.family].get(edges, "")

@@ -12,7 +12,17 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from experiments.paper.methods import CANNY, DEFAULT, GREY, SAM, SEGMENTS, Method, column, methods
+from experiments.paper.methods import (
+    CANNY,
+    DEFAULT,
+    GREY,
+    LEARNT,
+    SAM,
+    SEGMENTS,
+    Method,
+    column,
+    methods,
+)
 from experiments.paper.results import Result, read
 from experiments.paper.scenes import REDUCED_REAL, UNTUNED
 from experiments.paper.trajectories import REDUCED, SETTINGS, TABLE_1
@@ -47,14 +57,23 @@ FAMILY = {
         "src/orthonav/prepare/change.py",
         "src/orthonav/prepare/encoders.py",
     ),
+    "caevl": (
+        *NETWORK,
+        "src/orthonav/embed/caevl.py",
+        "src/orthonav/neural/augment.py",
+        "src/orthonav/neural/autoencoder.py",
+        "src/orthonav/neural/caevl.py",
+        "src/orthonav/neural/vicreg.py",
+    ),
     BASELINES: ("benchmarks/posed.py", "experiments/paper/baselines.py"),
 }
 EDGES = {
-    DEFAULT: "src/orthonav/represent/gradients.py",
-    GREY: "src/orthonav/represent/gray.py",
-    CANNY: "src/orthonav/represent/canny.py",
-    SEGMENTS: "src/orthonav/represent/segments.py",
-    SAM: "src/orthonav/neural/sam.py",
+    DEFAULT: ("src/orthonav/represent/gradients.py",),
+    GREY: ("src/orthonav/represent/gray.py",),
+    CANNY: ("src/orthonav/represent/canny.py",),
+    SEGMENTS: ("src/orthonav/represent/segments.py",),
+    SAM: ("src/orthonav/neural/sam.py",),
+    LEARNT: ("src/orthonav/represent/learned.py", "experiments/paper/between_dates.onnx"),
 }
 REGISTRATION = (
     "src/orthonav/confidence/*.py",
@@ -67,14 +86,16 @@ def code(family: str, edges: str, *, registration: bool, generated: bool) -> dic
     """Digests of the files that decide the figures of a row, by path in the repository."""
     patterns = [*PROTOCOL, *FAMILY[family], *(REGISTRATION if registration else TILES)]
     patterns += GENERATED if generated else ()
-    patterns += [EDGES[edges.partition(":")[0]]] if edges else []
+    patterns += EDGES[edges.partition(":")[0]] if edges else ()
     paths = {path for pattern in patterns for path in ROOT.glob(pattern)}
     return {path.relative_to(ROOT).as_posix(): _digest(path) for path in sorted(paths)}
 
 
 @lru_cache
 def _digest(path: Path) -> str:
-    """Short digest of a source file without its comments and docstrings."""
+    """Short digest of a file, of a source file without its comments and docstrings."""
+    if path.suffix != ".py":
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
         body = getattr(node, "body", None)

@@ -18,6 +18,7 @@ FAMILIES = {
     "bovw": "Bag of Words",
     "triplet": "Triplet",
     "autoencoder": "Auto-Encoder",
+    "caevl": "CAEVL",
     "gradient": "orthonav",
 }
 EDGES = {
@@ -26,6 +27,7 @@ EDGES = {
     "segments": "segments",
     "sam": "Segment Anything, sheet",
     "sam-tile": "Segment Anything, tile",
+    "onnx": "learnt",
     "gradient": "gradients",
 }
 
@@ -346,7 +348,7 @@ def _name(each: Result) -> str:
 
 def is_tuned(each: Result) -> bool:
     """Whether a row was tuned on its scene."""
-    return tuned(each.family, each.plain["method"]["recipe"], each.scene)
+    return tuned(each.family, each.plain["method"]["recipe"], each.scene, each.edges)
 
 
 def _plain_name(each: Result) -> str:
