@@ -32,7 +32,7 @@ AREAS = ((101, 1.0), (102, 1.0), (103, 1.5), (104, 2.0), (105, 3.0), (106, 5.0))
 HELD_OUT = (107, 1.5)
 AREA_PX = 640
 WIDTH, DILATIONS = 24, (1, 2, 4, 1)
-CROP_PX, BATCH, STEPS, RATE = 128, 12, 400, 3e-3
+CROP_PX, BATCH, STEPS, RATE = 96, 12, 300, 3e-3
 GAIN, OFFSET = (0.5, 1.5), 0.2
 """Factor of the grey levels around their mean, and the largest brightness added, 0 to 1."""
 REACH_PX = 1

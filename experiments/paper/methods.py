@@ -1,5 +1,6 @@
 """The paper's section Methodology: which methods look at what, as orthonav names them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,6 +40,22 @@ class Method:
         return "-".join(part for part in parts if part)
 
 
+FLOWN = (
+    (DEFAULT, DEFAULT, True),
+    (DEFAULT, DEFAULT, False),
+    ("autoencoder", CANNY, False),
+    ("autoencoder", LEARNT, False),
+    ("caevl", CANNY, False),
+)
+"""Rows whose maps are flown on the views of the field today: family, edges and registration."""
+
+
+def flown(rows: Sequence[Method]) -> list[Method]:
+    """Those of `FLOWN`, in its order."""
+    found = {(each.family, each.edges.partition(":")[0], each.registration): each for each in rows}
+    return [found[each] for each in FLOWN if each in found]
+
+
 def tuned(family: str, recipe: str, scene: str, edges: str = "") -> bool:
     """Whether a row was tuned with imagery or views of its scene, or of the same generator.
 
@@ -73,7 +90,7 @@ REDUCED_NETWORKS = {
 """Trajectories that the reduced setting trains a network on, by input."""
 
 
-FIELD = ("B", "naip-2018", "szada-1", "schiphol", "tours")
+FIELD_SCENES = ("B", "naip-2018", "schiphol", "tours")
 """Scenes of the section on the field today, where CAEVL and learnt edges are run too."""
 GPU_SCENES = ("B", "D")
 """Scenes of the setting "gpu": auto-encoder on Canny edges and grey levels."""
@@ -92,7 +109,7 @@ def methods(
 
     The reduced setting learns fewer networks: `REDUCED_NETWORKS`, and over imagery that no
     trajectory of the paper is flown over the auto-encoder on Canny edges, the paper's best, and on
-    grey levels over NAIP and Szada; CAEVL and learnt edges on `FIELD`.
+    grey levels over NAIP and Szada; CAEVL and learnt edges on `FIELD_SCENES`.
     """
     shown, width = setting.encoder_tiles, setting.encoder_width
     encoder = (
@@ -133,7 +150,7 @@ def _reduced(method: Method, scene: str) -> bool:
     name = column(scene)
     if name not in TABLE_1:
         if method.family == "caevl" or edges == LEARNT:
-            return scene in FIELD
+            return scene in FIELD_SCENES
         wanted = (CANNY, GREY) if scene.startswith(("naip-", "szada-")) else (CANNY,)
         return method.family == "autoencoder" and edges in wanted
     return name in REDUCED_NETWORKS[method.family].get(edges, "")

@@ -7,6 +7,7 @@ import ast
 import hashlib
 import json
 import re
+from collections.abc import Iterable
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 from experiments.paper.methods import (
     CANNY,
     DEFAULT,
+    FIELD_SCENES,
     GREY,
     LEARNT,
     SAM,
@@ -30,7 +32,7 @@ from orthonav.files import write_text
 
 ROOT = Path(__file__).resolve().parents[2]
 ROWS = Path(__file__).resolve().parent / "rows"
-BASELINES = "baselines"
+BASELINES, FIELD = "baselines", "field"
 DIGITS = 5
 """Significant digits of figures in a row: a confidence to 1e-5, an error of 9 km to 0.1 m."""
 
@@ -66,6 +68,11 @@ FAMILY = {
         "src/orthonav/neural/vicreg.py",
     ),
     BASELINES: ("benchmarks/posed.py", "experiments/paper/baselines.py"),
+    FIELD: (
+        "benchmarks/posed.py",
+        "experiments/paper/field.py",
+        "experiments/paper/matchers.py",
+    ),
 }
 EDGES = {
     DEFAULT: ("src/orthonav/represent/gradients.py",),
@@ -120,6 +127,15 @@ def code_of(method: Method | None, scene: str) -> dict[str, str]:
     return code(method.family, method.edges, registration=method.registration, generated=generated)
 
 
+def code_of_field(flown: Iterable[Method], scene: str) -> dict[str, str]:
+    """The same of the section on the field today, where maps of these rows were flown."""
+    generated = column(scene) in TABLE_1
+    made = code(FIELD, "", registration=False, generated=generated)
+    for each in flown:
+        made |= code_of(each, scene)
+    return made
+
+
 def older(row: Result) -> list[str]:
     """What has changed since a row was made: files, "recipe" or "setting"; empty if it is current.
 
@@ -128,6 +144,8 @@ def older(row: Result) -> list[str]:
     plain = row.plain
     made = Method(**plain["method"]) if row.family else None
     known, now = plain.get("code", {}), code_of(made, row.scene)
+    if FIELD in plain:
+        now = code_of_field((Method(**each) for each in plain["methods"]), row.scene)
     changed = sorted(path for path in known.keys() | now if known.get(path) != now.get(path))
     setting = SETTINGS[plain["setting"]["name"]]
     if plain["setting"] != json.loads(json.dumps(asdict(setting))):
@@ -150,7 +168,7 @@ def expected() -> list[str]:
     """Names of all rows of the reduced setting, as files are named."""
     scenes = (*TABLE_1, *REDUCED_REAL, *UNTUNED)
     names = [f"{scene}-{each.key}" for scene in scenes for each in methods(REDUCED, scene, 1000)]
-    return [*names, f"B-{BASELINES}"]
+    return [*names, f"B-{BASELINES}", *(f"{scene}-{FIELD}" for scene in FIELD_SCENES)]
 
 
 def stored() -> list[Result]:
@@ -194,7 +212,7 @@ def rounded(value: Any) -> Any:
 def name_of(row: Result) -> str:
     """Scene and method of a row, as its file is named."""
     if not row.family:
-        return f"{row.scene}-{BASELINES}"
+        return f"{row.scene}-{FIELD if FIELD in row.plain else BASELINES}"
     return f"{row.scene}-{Method(**row.plain['method']).key}"
 
 

@@ -90,9 +90,9 @@ def add_recipe(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--edges",
         metavar="NAME[:FIELD=VALUE,..]",
-        help="image representation: gradient, gray, canny (canny:low=100,high=200), segments or "
-        "sam:weights=PATH (default: gradient; canny for autoencoder and caevl, gray for "
-        "triplet and bovw)",
+        help="image representation: gradient, gray, canny (canny:low=100,high=200), segments, "
+        "sam:weights=PATH or onnx:weights=PATH (default: gradient; canny for autoencoder and "
+        "caevl, gray for triplet and bovw)",
     )
     parser.add_argument("--seed", type=int, help="seed of all random draws (default 0)")
     parser.add_argument(
