@@ -15,8 +15,8 @@ from orthonav.geo.camera import (
     axis_on_ground_en_m,
     camera_from_en,
     counted_from_centres,
-    distort,
     footprint_en_m,
+    seen_px,
 )
 from orthonav.records import View
 
@@ -182,7 +182,4 @@ def _seen_px(camera: Camera, camera_from_window: Array, rows: Array, cols: Array
     """Where the camera saw a grid of the window (H, W, 2), NaN where it saw nothing."""
     x, y = np.meshgrid(cols, rows)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ camera_from_window.T
-    ahead = rays[..., 2] > 1e-9
-    plane = rays[..., :2] / np.where(ahead, rays[..., 2], np.nan)[..., None]
-    seen = distort(camera, plane) * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
-    return np.asarray(seen)
+    return seen_px(camera, rays)
