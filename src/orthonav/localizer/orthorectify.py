@@ -89,7 +89,7 @@ def _fine(view: View, index: Array) -> Mask:
         area = np.abs(right_x * down_y - right_y * down_x)
         high, wide = view.grey.shape
         inside = ((index >= 0) & (index <= [wide, high])).all(axis=-1)
-        finest = min(float(area[inside].max(initial=0.0)), 1.0)
+        finest = min(float(np.nanmax(area[inside], initial=0.0)), 1.0)
         return np.asarray(area >= finest / MAX_COARSER**2)
 
 
