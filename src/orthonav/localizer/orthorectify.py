@@ -42,19 +42,6 @@ class Orientation:
         return seen_px(camera, rays)
 
 
-@dataclass(frozen=True, eq=False)
-class GroundWindow:
-    """Ground points of a window of `shape` (H, W) pixels.
-
-    `nodes_m` (h, w, 3): metres east, north and above sea at pixel coordinates 0.5, 0.5 + `NODE_PX`,
-    .. of both axes, NaN where the height is unknown. `pixel_m`: side of a pixel on the ground.
-    """
-
-    nodes_m: Array
-    shape: tuple[int, int]
-    pixel_m: float
-
-
 def node_px(shape: tuple[int, int]) -> Array:
     """Pixel coordinates (h, w, 2) of the nodes of a window, x and y."""
     rows, cols = (np.arange(0.5, side + 2 * NODE_PX, NODE_PX) for side in shape)
@@ -62,16 +49,20 @@ def node_px(shape: tuple[int, int]) -> Array:
 
 
 def orthorectified(
-    view: View, orientation: Orientation, ground: GroundWindow
+    view: View, orientation: Orientation, nodes_m: Array, shape: tuple[int, int]
 ) -> tuple[NDArray[np.uint8], Mask]:
-    """Grey and valid (H, W) of a window of ground as a camera saw it; grey 0 where not valid."""
-    index = orientation.seen_px(view.camera, ground.nodes_m) - 0.5
+    """Grey and valid (H, W) of a window of ground as a camera saw it; grey 0 where not valid.
+
+    `nodes_m` (h, w, 3): metres east, north and above sea of the nodes (`node_px`) of a window of
+    `shape`; NaN where the height is unknown.
+    """
+    index = orientation.seen_px(view.camera, nodes_m) - 0.5
     usable = np.isfinite(index).all(axis=-1) & _fine(view, index)
-    usable &= ~hidden(ground.nodes_m, orientation.position_m)
+    usable &= ~hidden(nodes_m, orientation.position_m)
     seen = np.where(usable[..., None], index, -10.0)
     planes = np.dstack([seen, usable]).astype(np.float32)
     part = np.array([[1 / NODE_PX, 0, 0], [0, 1 / NODE_PX, 0]])
-    size = ground.shape[1], ground.shape[0]
+    size = shape[1], shape[0]
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     x, y, counted = cv2.split(cv2.warpAffine(planes, part, size, flags=flags))
     high, wide = view.grey.shape

@@ -1,5 +1,6 @@
 """A view made ready for registration: rectified with its own heading up, as templates."""
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -36,13 +37,15 @@ MIN_TILT_COS = 0.5
 class PreparedView:
     """A view made ready for registration.
 
-    `rectified_at`: makes the view at the ground resolution of a level. `templates`: its evidence.
+    `picture_at`: the view averaged towards the ground resolution of a level. `rectified_at`: makes
+    the view rectified at the ground resolution of a level. `templates`: its evidence.
     `levels`: levels of the map at which it is searched, judged and finished. `side_px`: root of the
     area seen, in pixels of level 0. `camera_px` (2,): the camera as seen from the middle of the
     view, heading up, x to the right and y down, in pixels of level 0. `prior`: expected heading and
     scale.
     """
 
+    picture_at: Callable[[int], View]
     rectified_at: Callable[[int], RectifiedView]
     templates: ViewTemplates
     levels: Levels
@@ -64,10 +67,13 @@ def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> P
     )
     levels = Levels.of(nominal_m / gsd_m, map_levels)
 
+    @functools.cache
+    def picture_at(level: int) -> View:
+        return downsampled(view, gsd_m * 2**level)
+
     def rectified_at(level: int) -> RectifiedView:
-        level_m = gsd_m * 2**level
         multiple = 2 ** max(0, levels.coarse - level)
-        return rectify_footprint(downsampled(view, level_m), gsd_m=level_m, multiple_px=multiple)
+        return rectify_footprint(picture_at(level), gsd_m=gsd_m * 2**level, multiple_px=multiple)
 
     rectified = rectified_at(levels.final)
     unit_px = 2**levels.final
@@ -77,6 +83,7 @@ def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> P
     offset = rectified.offset_en_m / gsd_m
     side_px = math.sqrt(float(rectified.valid.sum())) * unit_px
     return PreparedView(
+        picture_at,
         rectified_at,
         ViewTemplates(rectified.grey, rectified.valid, levels.final),
         levels,
