@@ -149,7 +149,7 @@ class RegistrationLocalizer:
             outside = NoFix("outside_map", "the map does not reach to where the prior says")
             return RegisteredView(prepared, outside)
         ground = self._on_ground(prepared)
-        found = self._best(prepared, prior, ground)
+        found = self.best(prepared, prior, ground)
         if found is None:
             detail = "no place of the map could be compared with the view"
             if prior is None:
@@ -161,13 +161,14 @@ class RegistrationLocalizer:
         """The view rectified and made ready for registration; `NoFix` where it shows too little."""
         return prepare(view, self.grid.gsd_m, self.pyramid.levels, heading_known)
 
-    def best(self, view: PreparedView, prior: Prior | None) -> Registered | None:
-        """The best place after all searches that had to be run; None where nothing was found."""
-        return self._best(view, prior, self._on_ground(view))
-
-    def _best(
-        self, view: PreparedView, prior: Prior | None, ground: ViewOnLevelGround
+    def best(
+        self, view: PreparedView, prior: Prior | None, ground: ViewOnLevelGround | None = None
     ) -> Registered | None:
+        """The best place after all searches that had to be run; None where nothing was found.
+
+        `ground`: the view on the ground of the map; None: made here.
+        """
+        ground = ground or self._on_ground(view)
         judged: list[Placed] = []
         best: Registered | None = None
         candidates = 0

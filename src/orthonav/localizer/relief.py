@@ -27,7 +27,6 @@ from orthonav.register.registrar import (
     PosePrior,
     Registered,
     Registrar,
-    view_side_px,
 )
 from orthonav.register.scale_map import SIGMAS, ScaleMap
 from orthonav.register.template import ViewTemplates
@@ -36,6 +35,11 @@ REFERENCE_NODES = 9
 """Nodes across and down a window whose mean height is its reference."""
 MIN_KNOWN = 0.5
 """Windows of which less is known are registered on level ground."""
+LEVEL_PX = 0.2
+"""Relief that displaces no ground of a window by more (pixels of the final level) is left out."""
+RIVAL_SHARE = 0.75
+"""Candidates whose score on the terrain at the judged level is below this share of the best one are
+finished on level ground: what fits by chance fits as well there, and it costs half."""
 AGAIN_PX = 1.0
 """A window that moved by more (pixels of the level, at its rim) is orthorectified again."""
 ROUNDS = 3
@@ -162,45 +166,65 @@ class ViewOverRelief(ViewOnLevelGround):
         super().__init__(registrar, view)
         self.relief = relief
         self._found: dict[Pose, _Placed] = {}
-        mask = view.templates.at(view.levels.final).mask
+        self._best_look = 0.0
+        valid = view.templates.valid
         rows, cols = (
-            (np.arange(REFERENCE_NODES) + 0.5) * side / REFERENCE_NODES for side in mask.shape
+            (np.arange(REFERENCE_NODES) + 0.5) * side / REFERENCE_NODES for side in valid.shape
         )
-        used = mask[np.ix_(rows.astype(int), cols.astype(int))] > 0
-        x, y = np.meshgrid(cols - mask.shape[1] / 2, rows - mask.shape[0] / 2)
+        used = valid[np.ix_(rows.astype(int), cols.astype(int))]
+        x, y = np.meshgrid(cols - valid.shape[1] / 2, rows - valid.shape[0] / 2)
         nodes = np.stack([x, y], axis=-1) * 2.0**view.levels.final
         self._reference_px = nodes[used] if used.any() else nodes.reshape(-1, 2)
 
     def finish(self, judged: Placed) -> Finished:
-        """A judged candidate at the final level: on the terrain, or on level ground where less
-        than half of it is known there, or where it fits better so."""
-        found = self._placed(judged.pose)
-        if found is None:
+        """A judged candidate at the final level: on the terrain, or on level ground where that is
+        as good, or where less than half of the ground is known."""
+        levels = self.view.levels
+        made = None
+        if not self._is_level(judged.pose):
+            made = self.templates_at(judged.pose, levels.look)
+        if made is None:
             return super().finish(judged)
-        look = found.total if found.look is None else found.look
-        if look < judged.score:
+        refiner = self.registrar.refiner(made, levels, levels.look)
+        first = refiner.place(judged.pose, FULL_STEPS, ROUGH_STEP_PX)
+        if first.score < RIVAL_SHARE * self._best_look:
+            return super().finish(judged)
+        self._best_look = max(self._best_look, first.score)
+        found = self._placed(first.pose)
+        if found is None or found.look is None:
+            return super().finish(judged)
+        if found.look < judged.score:
             level = super().finish(judged)
             if level.total > found.total:
                 return level
-        self._found[found.placed.pose] = _Placed(found, look / max(judged.score, 1e-6))
+        self._found[found.placed.pose] = _Placed(found, found.look / max(judged.score, 1e-6))
         return found
+
+    def _is_level(self, pose: Pose) -> bool:
+        """Whether relief displaces no ground of the window by a visible amount."""
+        ground = self.relief.ground_m(pose.map_px(self._reference_px))
+        orientation = self.orientation(pose)
+        if orientation is None or not np.isfinite(ground).all():
+            return False
+        offset = ground - orientation.position_m
+        rise = np.abs(ground[:, 2] - ground[:, 2].mean())
+        shift_m = rise * np.hypot(offset[:, 0], offset[:, 1]) / np.maximum(-offset[:, 2], 1.0)
+        pixel_m = self.relief.grid.gsd_m * 2.0**self.view.levels.final
+        return bool(shift_m.max() < LEVEL_PX * pixel_m)
 
     def _placed(self, pose: Pose) -> Finished | None:
         """A candidate refined on the terrain; None where too little of it is known."""
         levels, registrar = self.view.levels, self.registrar
-        made = self.templates_at(pose, levels.look)
-        if made is None:
-            return None
-        placed = registrar.refiner(made, levels, levels.look).place(pose, FULL_STEPS, ROUGH_STEP_PX)
         for _ in range(ROUNDS):
-            before = placed.pose
-            made = self.templates_at(before, levels.final)
-            if made is None:
+            seen = self.templates_at(pose, levels.final)
+            if seen is None:
                 return None
+            made = seen
             refiner = registrar.refiner(made, levels, levels.final)
-            placed = refiner.place(before, FULL_STEPS, ROUGH_STEP_PX)
-            if self._moved_px(before, placed.pose) < AGAIN_PX * 2**levels.final:
+            placed = refiner.place(pose, FULL_STEPS, ROUGH_STEP_PX)
+            if self._moved_px(pose, placed.pose) < AGAIN_PX * 2**levels.final:
                 break
+            pose = placed.pose
         if levels.final == levels.look:
             return Finished(placed.score, placed, made, placed.score)
         look = registrar.refiner(made, levels, levels.look).place(placed.pose, 0).score
@@ -208,7 +232,7 @@ class ViewOverRelief(ViewOnLevelGround):
 
     def _moved_px(self, one: Pose, other: Pose) -> float:
         """How far a window moved at its rim, pixels of level 0."""
-        half = view_side_px(self.view.templates) / 2
+        half = self.view.side_px / 2
         corners = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
         moved = one.map_px(corners) - other.map_px(corners)
         return float(np.hypot(*moved.T).max())
@@ -254,7 +278,7 @@ class ViewOverRelief(ViewOnLevelGround):
 
     def _on_terrain(self, pose: Pose) -> _Placed | None:
         """The finalist at a pose, None where it was placed on level ground."""
-        near = EXCLUSION_SHARE * view_side_px(self.view.templates)
+        near = EXCLUSION_SHARE * self.view.side_px
         for other, found in self._found.items():
             if math.hypot(pose.x_px - other.x_px, pose.y_px - other.y_px) < near:
                 return found
@@ -267,7 +291,7 @@ class ViewOverRelief(ViewOnLevelGround):
         if orientation is None:
             return None
         final = self.view.levels.final
-        rows, cols = self.view.templates.at(final).mask.shape
+        rows, cols = self.view.templates.valid.shape
         scale = 2.0 ** (final - level)
         shape = round(rows * scale), round(cols * scale)
         nodes = (node_px(shape) - [shape[1] / 2, shape[0] / 2]) * 2.0**level
