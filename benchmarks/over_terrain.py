@@ -7,8 +7,10 @@ nadir. Imagery is generated; with optional real imagery beside the checkout its 
 """
 
 import argparse
+import hashlib
 import logging
 import math
+import pickle
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -149,8 +151,15 @@ class Bench:
         """The views of a row, and its hills."""
         ground = self.ground(row.imagery)
         hills = ground.relief(row, self.seed)
-        rng = np.random.default_rng(self.seed)
-        return [self._seen(row, ground, hills, rng) for _ in range(self.views)], hills
+        key = hashlib.sha256(
+            f"{replace(row, wrong='')}{self.views}{self.seed}".encode()
+        ).hexdigest()
+        kept = self.work / f"{key[:16]}.views"
+        if not kept.is_file():
+            rng = np.random.default_rng(self.seed)
+            made = [self._seen(row, ground, hills, rng) for _ in range(self.views)]
+            kept.write_bytes(pickle.dumps(made))
+        return pickle.loads(kept.read_bytes()), hills
 
     def _seen(self, row: Row, ground: Ground, hills: Raster, rng: np.random.Generator) -> Seen:
         side_m = row.view_px * ground.gsd_m
@@ -171,9 +180,11 @@ class Bench:
                 continue
             middle = position + axis * (agl_m / -axis[2])
             near = middle[:2] + np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * side_m * 0.55
-            if ground.grey.holds(near).all() and ground.grey.holds(place):
+            if ground.grey.holds(near).all():
                 break
-        grey, seen = seen_view(ground.grey, hills, camera, attitude, position)
+        grey, seen = seen_view(
+            ground.grey, hills, camera, attitude, position, 1 if row.tilt_deg else 2
+        )
         grey = cv2.GaussianBlur(grey, (0, 0), 0.6)
         noisy = grey * rng.normal(1, 0.1) + rng.normal(0, 2, grey.shape)
         measured_m = agl_m * (1 + float(rng.normal(0, AGL_STD))) if row.measured else math.nan

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.localizer.checks import check_footprint
-from orthonav.localizer.rectify import RectifiedView, downsampled, rectify_footprint
+from orthonav.localizer.rectify import (
+    RectifiedView,
+    downsampled,
+    looks_aside,
+    near_part,
+    rectify_footprint,
+)
 from orthonav.records import (
     DEFAULT_AGL_STD,
     DEFAULT_YAW_STD_DEG,
@@ -65,6 +71,11 @@ def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> P
     nominal_m = (telemetry.agl_m / max(tilt, MIN_TILT_COS) ** 1.5) * math.sqrt(
         camera.width_px * camera.height_px / (camera.fx_px * camera.fy_px)
     )
+    if looks_aside(view):
+        near = near_part(view, gsd_m)
+        if near is None:
+            return NoFix("too_small", "the view shows no ground that is near enough")
+        nominal_m = math.sqrt(near.area_m2)
     levels = Levels.of(nominal_m / gsd_m, map_levels)
 
     @functools.cache

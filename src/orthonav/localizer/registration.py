@@ -201,7 +201,9 @@ class RegistrationLocalizer:
                     return best
         if not judged:
             return None
-        best = best or finished()
+        if best is None or self.relief is not None:
+            judged = ground.looked_again(judged)
+            best = finished()
         if view.levels.final == 0 or not self._is_doubtful(best):
             return best
         return self.registrar.deepened(

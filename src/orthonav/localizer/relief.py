@@ -142,6 +142,10 @@ class ViewOnLevelGround:
         """A judged candidate at the final level."""
         return self.registrar.at_final(self.view.templates, self.view.levels, judged)
 
+    def looked_again(self, judged: list[Placed]) -> list[Placed]:
+        """Judged candidates after all searches, where none of them stands out."""
+        return judged
+
     def templates_of(self, placed: Placed) -> ViewTemplates:
         """The templates by which a finalist was placed."""
         return self.view.templates
@@ -167,6 +171,7 @@ class ViewOverRelief(ViewOnLevelGround):
         self.relief = relief
         self._found: dict[Pose, _Placed] = {}
         self._best_look = 0.0
+        self._level_scores: dict[Pose, float] = {}
         valid = view.templates.valid
         rows, cols = (
             (np.arange(REFERENCE_NODES) + 0.5) * side / REFERENCE_NODES for side in valid.shape
@@ -193,12 +198,31 @@ class ViewOverRelief(ViewOnLevelGround):
         found = self._placed(first.pose)
         if found is None or found.look is None:
             return super().finish(judged)
-        if found.look < judged.score:
+        on_level = self._level_scores.get(judged.pose, judged.score)
+        if found.look < on_level:
             level = super().finish(judged)
             if level.total > found.total:
                 return level
-        self._found[found.placed.pose] = _Placed(found, found.look / max(judged.score, 1e-6))
+        self._found[found.placed.pose] = _Placed(found, found.look / max(on_level, 1e-6))
         return found
+
+    def looked_again(self, judged: list[Placed]) -> list[Placed]:
+        """All judged candidates on the terrain, at the judged level: where relief displaces much,
+        the right one may be far down the list of those on level ground."""
+        levels, out = self.view.levels, []
+        for each in judged:
+            made = None if self._is_level(each.pose) else self.templates_at(each.pose, levels.look)
+            if made is None:
+                out.append(each)
+                continue
+            refiner = self.registrar.refiner(made, levels, levels.look)
+            placed = refiner.place(each.pose, FULL_STEPS, ROUGH_STEP_PX)
+            if placed.score <= each.score:
+                out.append(each)
+                continue
+            self._level_scores[placed.pose] = each.score
+            out.append(placed)
+        return out
 
     def _is_level(self, pose: Pose) -> bool:
         """Whether relief displaces no ground of the window by a visible amount."""
