@@ -162,9 +162,9 @@ def test_the_search_stays_around_a_reported_start_unless_it_is_as_wide_as_the_ma
     tracker, priors = Tracker(localizer), []
     best = localizer.registration.best
 
-    def noted(view, prior):
+    def noted(view, prior, ground):
         priors.append(prior)
-        return best(view, prior)
+        return best(view, prior, ground)
 
     monkeypatch.setattr(localizer.registration, "best", noted)
     lat, lon = localizer.sheet.frame.latlon_from_en(np.array([-150.0, -120.0]))

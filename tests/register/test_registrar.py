@@ -453,14 +453,14 @@ def test_one_finer_level_tells_what_coarser_ones_cannot():
     assert levels.final == 1
     candidates = [near(pose, 3.0), near(twin, -2.0), near(twin, 0.0, 90.0)]
     found = verified(registrar, templates, levels, candidates, levels.look, prior_of(pose))
-    deep = registrar.deepened(templates, finer, levels, found, prior_of(pose))
+    deep = registrar.deepened(lambda _: templates, lambda _: finer, levels, found, prior_of(pose))
     assert apart_px(deep.placed.pose, pose) < 0.3 and deep.placed.covariance is not None
     assert deep.fine_score > deep.score and deep.fine_rival > 0
     assert deep.fine_score / deep.fine_rival > found.peak_ratio + 0.1
     # Told the wrong one of both, the finer level sets it right.
     both = verified(registrar, templates, levels, candidates[:2], levels.look, prior_of(pose))
     turned = replace(both, finalists=both.finalists[::-1])
-    again = registrar.deepened(templates, finer, levels, turned, prior_of(pose))
+    again = registrar.deepened(lambda _: templates, lambda _: finer, levels, turned, prior_of(pose))
     assert apart_px(again.placed.pose, pose) < 0.3 and again.fine_score > again.fine_rival
 
 
