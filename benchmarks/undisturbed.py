@@ -174,7 +174,8 @@ def _is_fit(pair: Pair, work: Path) -> bool:
     if pair.map.startswith("generated:"):
         return False
     with rasterio.open(file_of(pair.map, work)) as source:
-        return GSD_M[0] <= abs(source.transform.a) <= GSD_M[1]
+        gsd_m = abs(float(source.transform.a))
+    return GSD_M[0] <= gsd_m <= GSD_M[1]
 
 
 def main(arguments: Sequence[str]) -> int:
