@@ -151,8 +151,8 @@ class ViewResult:
 
     `frame`: name of the view. `time_ns`: its exposure. `outcome`: the fix, or why there is none.
     `latency_ms`: time from picture to outcome, NaN where it was not processed. `state`: of the
-    track (`searching`, `tracking`, `lost`), None where views are placed one by one. `accepted`:
-    whether a fix met the criterion of `--accept`, None where none was given.
+    track (`searching`, `tracking`, `coasting`, `lost`), None where views are placed one by one.
+    `accepted`: whether a fix met the criterion of `--accept`, None where none was given.
     """
 
     frame: str

@@ -490,6 +490,14 @@ def test_health_goes_to_the_ground_station(flight):
     assert flight.link.system_status == Level.DEGRADED.value
 
 
+@pytest.mark.parametrize(("least", "confident"), [(0.9, True), (0.99, False)])
+def test_results_are_confident_by_the_criterion_of_the_flight(begin, least, confident):
+    """Of a fix with 0.97."""
+    flight = begin(min_confidence=least)
+    result = flight.views(3)[-1]
+    assert reason_of(result) == "fix" and result.is_confident is confident
+
+
 def test_the_position_is_saved_about_once_a_second(begin, tmp_path, monkeypatch):
     path, saves = tmp_path / "state.json", []
     whole = states.save

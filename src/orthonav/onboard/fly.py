@@ -375,10 +375,18 @@ class Runner:
         self, image: CameraImage, outcome: Fix | NoFix, latency_ms: float, *, as_stated: bool = True
     ) -> ViewResult:
         state = self._locator.state_name
-        result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state)
+        accepted = self._accepts(outcome) if isinstance(outcome, Fix) else None
+        result = ViewResult(image.frame, image.time_ns, outcome, latency_ms, state, accepted)
         if self._gnss is None:
             return result
         return self._gnss.view(result, image.exposed_ns, as_stated=as_stated)
+
+    def _accepts(self, fix: Fix) -> bool:
+        """Whether a fix meets the criterion of this flight."""
+        accept = self.options.accept
+        return fix.confidence >= self.options.min_confidence and (
+            accept is None or accept.accepts(fix)
+        )
 
     def _map_changed(self) -> NoFix | None:
         """Reason to give no position where the map file was changed in place; None if it was not.
