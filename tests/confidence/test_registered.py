@@ -143,7 +143,11 @@ def test_plain_round_trip(biases, weights, chances):
 
 def test_an_older_map_has_the_usual_weights_and_its_own_chance():
     plain = {**PLAIN, "weights": dict.fromkeys(sorted(OLD_FEATURES), 2.0)}
-    assert RegisteredConfidence.from_plain(plain) == RegisteredConfidence.usual(CHANCE)
+    plain["chances"] = {"total": 45.0, "look": 15.0, "fine": 60.0}
+    usual = RegisteredConfidence.usual(Chances(45.0, 15.0, 60.0))
+    assert RegisteredConfidence.from_plain(plain) == usual
+    plain["chances"]["total"] = 16.0  # of views of one level
+    assert RegisteredConfidence.from_plain(plain).chances == Chances(32.0, 15.0, 60.0)
     with pytest.raises(VariantError, match="chances"):
         RegisteredConfidence.from_plain(without(plain, "chances"))
 

@@ -122,13 +122,15 @@ class RegisteredConfidence:
         """Inverse of `to_plain`; raises `VariantError` if it does not fit.
 
         Maps built before all of `FEATURES` existed have the usual weights, with their own scores
-        of chance.
+        of chance. With small tiles their `total` was measured on views of one level: it is at least
+        that of `look` and one more level.
         """
         try:
             chances = Chances(**{name: float(plain["chances"][name]) for name in CHANCES})
             stored = plain["weights"]
             if set(stored) == OLD_FEATURES:
-                return cls.usual(chances)
+                least = chances.look + USUAL_CHANCES.total - USUAL_CHANCES.look
+                return cls.usual(replace(chances, total=max(chances.total, least)))
             first, second = plain["biases"]
             biases = float(first), float(second)
             weights = tuple(float(stored[name]) for name in FEATURES)
