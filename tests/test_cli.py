@@ -180,8 +180,12 @@ def test_localize(run, map_path, flight_path, short_flight, out, names_in):
     assert {line["status"] for line in lines} == {"fix"}
     assert sum(line["confident"] for line in lines) == plain["n_confident"]
     few = shorten(shutil.copytree(flight_path, out / "flight"), 2)
-    text = run("localize", map_path, few, "--out", out / "fixes.jsonl", "--prior", "none")
+    to = ["--out", out / "fixes.jsonl", "--prior", "none"]
+    text = run("localize", map_path, few, *to, "--export", f"csv={out / 'cameras.csv'}")
     assert text.code == 0 and "2 views: " in text.out
+    cameras = (out / "cameras.csv").read_text().splitlines()
+    assert f"{len(cameras) - 1} camera positions: " in text.out
+    refused(run("localize", map_path, few, *to, "--export", "kml=a.kml"), "odm-geo")
     assert "confident (confidence 0.9 or more), " in text.out
 
 

@@ -118,6 +118,15 @@ def add(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="flight log: use the options of the flight",
     )
+    parser.add_argument(
+        "--export",
+        action="append",
+        default=[],
+        metavar="FORMAT=PATH",
+        help="write the confident camera positions for other programs too: csv, geojson, odm-geo "
+        "(OpenDroneMap's geo.txt) or exif (a table for `exiftool -csv=PATH FOLDER`); heights above "
+        "sea need a terrain; can be repeated",
+    )
     add_signature(parser)
     add_source(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -135,16 +144,19 @@ def run(options: argparse.Namespace) -> None:
 def _on_map(options: argparse.Namespace) -> None:
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
+    from orthonav.flight.export import export_all, export_of
     from orthonav.flight.fixes import write_results
     from orthonav.localizer import Localizer
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
+    from orthonav.mapfile.terrain import TerrainLayer
     from orthonav.onboard.calibrate import MountCorrected, model_of
     from orthonav.onboard.run import Locator, SingleViews, localize_flight, smoothed_track
     from orthonav.search.position import check_rule
 
     if options.lag is not None and not (options.smooth and options.lag >= 0):
         raise VariantError("--lag needs --smooth and a number of views, 0 or more")
+    exports = [export_of(each) for each in options.export]
     signature = checked_signature(options)
     dem = dem_of(options)
     opened = open_map(options.map, signature.manifest_sha256 if signature else None)
@@ -195,6 +207,7 @@ def _on_map(options: argparse.Namespace) -> None:
         else:
             compare_with_flight(flight, results)
         write_results(options.out, results)
+        export_all(exports, results, dem or TerrainLayer.of(opened))
         advice, tried = doubts.advice(results, accept, shown)
     _print_summary(options, results, accept, advice, tried)
 
@@ -208,6 +221,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
     from orthonav.atlas.tile_search import TileSearch
     from orthonav.confidence.accept import Acceptance
     from orthonav.errors import VariantError
+    from orthonav.flight.export import export_all, export_of
     from orthonav.flight.fixes import write_results
     from orthonav.onboard.run import localize_flight
 
@@ -226,6 +240,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
     accept = Acceptance.parse(options.accept)
     if accept.criterion == "lowe_ratio":
         raise VariantError("--accept lowe_ratio needs a map and --registration off")
+    exports = [export_of(each) for each in options.export]
     flight = open_source(options.flight, options)
     say_assumed_heights(flight, advice="cut a map with terrain out of the atlas")
     results = []
@@ -246,6 +261,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
             if flight.expected:
                 shown("localize", min(1.0, len(results) / flight.expected))
     write_results(options.out, results)
+    export_all(exports, results, None)
     _print_summary(options, results, accept)
 
 
@@ -284,5 +300,7 @@ def _print_summary(
     )
     for line in advice:
         print(f"! {line}")
+    for each in options.export:
+        print(f"{counts.confident} camera positions: {each.partition('=')[2]}")
     guesses = "; unsure positions are best guesses, marked as such" * bool(counts.unsure)
     print(f"written to {options.out}{guesses}")
