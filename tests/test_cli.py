@@ -189,6 +189,21 @@ def test_localize(run, map_path, flight_path, short_flight, out, names_in):
     assert "confident (confidence 0.9 or more), " in text.out
 
 
+def test_locate_pixel(run, map_path, short_flight, out):
+    fixes = out / "fixes.jsonl"
+    assert run("localize", map_path, short_flight, "--out", fixes).code == 0
+    to = ["locate-pixel", fixes, "0001.jpg", 10, 20, "--flight", short_flight]
+    plain = json.loads(run(*to, "--json").out)
+    placed = json.loads(fixes.read_text().splitlines()[0])
+    assert abs(plain["lat_deg"] - placed["lat_deg"]) < 0.01 and plain["height_m"] is None
+    assert plain["confident"] == placed["confident"]
+    assert plain["ellipse_95"]["major_m"] >= plain["ellipse_95"]["minor_m"] > 0
+    text = run(*to)
+    assert text.code == 0 and "95 % ellipse" in text.out
+    refused(run(*to[:2], "none.jpg", *to[3:]), "no view 'none.jpg'")
+    refused(run(*to, "--map", map_path), "no terrain")
+
+
 def test_localize_without_heading(run, map_path, flight_path, out):
     telemetry = (flight_path / "telemetry.csv").read_text().splitlines()
     frames = shutil.copytree(flight_path, out / "flight")

@@ -35,6 +35,7 @@ COMMANDS = {
     "import": "convert photographs, a video or a ROS recording to a flight folder",
     "calibrate": "estimate constant errors of mount, compass and height from a flight",
     "localize": "find the positions of the views of a flight",
+    "locate-pixel": "find the coordinates of a pixel of a localized view",
     "fly": "send position fixes from a live camera to an autopilot",
     "evaluate": "compare fixes with the truth",
     "view": "show a run in the browser: track, views beside the map, health",
@@ -185,7 +186,8 @@ def _shorten_help(
 
 
 def _module(command: str) -> ModuleType:
-    name = "import_" if command == "import" else command  # a word of Python's own
+    # "import" is a word of Python's own.
+    name = "import_" if command == "import" else command.replace("-", "_")
     return importlib.import_module(f"orthonav.cli.{name}")
 
 

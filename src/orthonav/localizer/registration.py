@@ -324,13 +324,16 @@ class RegistrationLocalizer:
     ) -> Fix:
         placed = best.placed
         lat, lon = self.sheet.frame.latlon_from_en(self.camera_en_m(view, placed.pose))
-        covariance = self.covariance(view, placed)[:2, :2]
+        spread = self.covariance(view, placed)
+        covariance = spread[:2, :2]
         if telemetry.tilt_std_deg is not None:
             tilt_m = telemetry.agl_m * math.radians(telemetry.tilt_std_deg)
             covariance = covariance + np.eye(2) * tilt_m**2
         covariance.flags.writeable = False
         evidence = best.evidence()
         confidence = math.nan if self.confidence is None else self.confidence(evidence)
+        evidence["heading_std_deg"] = math.degrees(math.sqrt(spread[2, 2]))
+        evidence["log_scale_std"] = math.sqrt(spread[3, 3])
         seen = None
         if ground is not None:
             evidence["terrain_gain"] = ground.gain

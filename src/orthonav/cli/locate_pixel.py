@@ -1,0 +1,98 @@
+"""`orthonav locate-pixel`: where on the ground a pixel of a placed view lies."""
+
+import argparse
+import math
+from pathlib import Path
+
+from orthonav.cli.common import print_json
+
+ELLIPSE_95 = math.sqrt(5.991)
+"""Axes of the 95 % ellipse over standard deviations: chi-squared of two degrees of freedom."""
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("fixes", type=Path, metavar="fixes.jsonl", help="of `orthonav localize`")
+    parser.add_argument("frame", metavar="FRAME", help="name of the view, as in the file")
+    parser.add_argument("x", type=float, metavar="X", help="pixels from the left border")
+    parser.add_argument("y", type=float, metavar="Y", help="pixels from the upper border")
+    parser.add_argument(
+        "--flight",
+        type=Path,
+        required=True,
+        metavar="FOLDER",
+        help="flight folder that was localized: camera, pitch and roll",
+    )
+    parser.add_argument(
+        "--map",
+        type=Path,
+        metavar="MAP.onav",
+        help="map whose terrain the ground is (default: level ground)",
+    )
+    parser.add_argument(
+        "--mount",
+        type=Path,
+        metavar="mount.json",
+        help="calibration of the mount with which the flight was localized",
+    )
+    parser.add_argument("--json", action="store_true", help="print the point as JSON")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Locate and print."""
+    from orthonav.errors import FlightError
+    from orthonav.flight import open_flight
+    from orthonav.flight.fixes import read_results
+    from orthonav.flight.mount import read_mount
+    from orthonav.flight.pixel import locate_pixel
+    from orthonav.mapfile import open_map
+    from orthonav.mapfile.terrain import TerrainLayer
+    from orthonav.publish.estimate import error_ellipse
+    from orthonav.records import Fix
+
+    result = {each.frame: each for each in read_results(options.fixes)}.get(options.frame)
+    if result is None:
+        raise FlightError(f"there is no view {options.frame!r}: {options.fixes}")
+    fix = result.outcome
+    if not isinstance(fix, Fix):
+        raise FlightError(f"view {options.frame!r} has no position ({fix.reason})")
+    flight = open_flight(options.flight)
+    view = next((each for each in flight.views if each.frame == options.frame), None)
+    if view is None:
+        raise FlightError(f"there is no view {options.frame!r}: {options.flight}")
+    telemetry = view.telemetry
+    if options.mount is not None:
+        telemetry = read_mount(options.mount).corrected(telemetry)
+    terrain = None
+    if options.map is not None:
+        terrain = TerrainLayer.of(open_map(options.map))
+        if terrain is None:
+            raise FlightError(f"the map has no terrain: {options.map}")
+    found = locate_pixel(flight.camera, telemetry, fix, (options.x, options.y), terrain)
+    major_m, minor_m, direction_deg = error_ellipse(found.cov_en_m2)
+    height_m = None if math.isnan(found.height_m) else round(found.height_m, 2)
+    if options.json:
+        print_json(
+            {
+                "lat_deg": round(found.lat_deg, 9),
+                "lon_deg": round(found.lon_deg, 9),
+                "height_m": height_m,
+                "range_m": round(found.range_m, 2),
+                "cov_en_m2": found.cov_en_m2.tolist(),
+                "ellipse_95": {
+                    "major_m": round(ELLIPSE_95 * major_m, 3),
+                    "minor_m": round(ELLIPSE_95 * minor_m, 3),
+                    "direction_deg": round(direction_deg, 1),
+                },
+                "confident": result.is_confident,
+            }
+        )
+        return
+    above = "" if height_m is None else f", {height_m:.1f} m above sea"
+    print(f"{found.lat_deg:.8f}, {found.lon_deg:.8f}{above}")
+    print(
+        f"95 % ellipse {ELLIPSE_95 * major_m:.1f} x {ELLIPSE_95 * minor_m:.1f} m, major axis at "
+        f"{direction_deg:.0f} deg; {found.range_m:.0f} m from the camera"
+    )
+    if not result.is_confident:
+        print("! the position of this view is a best guess")

@@ -1,0 +1,121 @@
+"""Coordinates of pixels: against lines of sight, and ellipses against errors."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from orthonav.errors import FlightError
+from orthonav.flight.pixel import locate_pixel
+from orthonav.geo.camera import Camera, ground_en_m
+from orthonav.geo.frames import LocalFrame
+from orthonav.records import Fix, Telemetry
+
+CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+FRAME = LocalFrame(48.0, 2.0)
+AGL_M = 200.0
+EVIDENCE = {"heading_std_deg": 0.8, "log_scale_std": 0.01}
+
+
+def telemetry(pitch_deg=0.0, roll_deg=0.0):
+    return Telemetry(0, 0.0, pitch_deg, roll_deg, AGL_M)
+
+
+def fix(east_m=0.0, north_m=0.0, heading_deg=30.0, agl_m=AGL_M, std_m=1.0, evidence=EVIDENCE):
+    lat, lon = FRAME.latlon_from_en([east_m, north_m])
+    covariance = np.eye(2) * std_m**2
+    return Fix(float(lat), float(lon), covariance, 0.99, 35.0, heading_deg, agl_m, evidence)
+
+
+def en_of(point):
+    return np.asarray(FRAME.en_from_latlon(point.lat_deg, point.lon_deg))
+
+
+def slope(lat_deg, lon_deg):
+    """A plane that rises by 0.3 to the east, 100 m above sea below the camera."""
+    east = FRAME.en_from_latlon(lat_deg, lon_deg)[..., 0]
+    return 100.0 + 0.3 * east
+
+
+@pytest.mark.parametrize("px", [(320, 240), (0, 0), (640, 100), (123.5, 400.25)])
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (12.0, -7.0)])
+def test_on_level_ground_it_is_where_the_line_of_sight_ends(px, tilt):
+    found = locate_pixel(CAMERA, telemetry(*tilt), fix(), px)
+    wanted = ground_en_m(CAMERA, np.array([px]), 30.0, *tilt, AGL_M)[0]
+    np.testing.assert_allclose(en_of(found), wanted, atol=1e-3)
+    assert math.isnan(found.height_m)
+    assert found.range_m == pytest.approx(math.hypot(*wanted, AGL_M))
+
+
+@pytest.mark.parametrize("px", [(320, 240), (0, 0), (640, 480)])
+def test_on_a_slope_it_is_where_the_line_of_sight_meets_it(px):
+    found = locate_pixel(CAMERA, telemetry(5.0, 3.0), fix(), px, slope)
+    direction = ground_en_m(CAMERA, np.array([px]), 30.0, 5.0, 3.0, 1.0)[0]
+    drop = AGL_M / (1 + 0.3 * direction[0])  # AGL - drop = 0.3 east
+    np.testing.assert_allclose(en_of(found), direction * drop, atol=0.02)
+    assert found.height_m == pytest.approx(100 + 0.3 * direction[0] * drop, abs=0.02)
+
+
+def test_a_hill_in_front_hides_what_is_behind():
+    def ridge(lat_deg, lon_deg):
+        east = FRAME.en_from_latlon(lat_deg, lon_deg)[..., 0]
+        return np.where((east > 60) & (east < 80), 100.0, 0.0)
+
+    found = locate_pixel(CAMERA, telemetry(), fix(heading_deg=0.0), (620, 240), ridge)
+    assert en_of(found)[0] == pytest.approx(60.0, abs=2.0)  # 120 m on level ground
+
+
+def test_biases_of_a_track_count():
+    tracked = {"pitch_bias_deg": 2.0, "heading_bias_std_deg": 0.5}
+    found = locate_pixel(CAMERA, telemetry(1.0), fix(evidence=tracked), (10, 20))
+    same = locate_pixel(CAMERA, telemetry(3.0), fix(), (10, 20))
+    np.testing.assert_allclose(en_of(found), en_of(same), atol=1e-6)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 25.0])
+@pytest.mark.parametrize("px", [(320, 240), (20, 30)])
+def test_ellipses_cover_what_they_state(px, tilt_deg):
+    """The middle of the view is measured, the camera follows from it."""
+    rng = np.random.default_rng(4)
+    tilted, middle = telemetry(tilt_deg), np.array([[320.0, 240.0]])
+    heading_std, scale_std, count, inside = math.radians(0.8), 0.01, 600, 0
+
+    def ground(pixel, heading_deg, agl_m):
+        return ground_en_m(CAMERA, np.array([pixel]), heading_deg, tilt_deg, 0.0, agl_m)[0]
+
+    at_camera = ground(middle[0], 30.0, AGL_M)
+    arm = float(at_camera @ at_camera)
+    lever = np.outer(at_camera, at_camera) * scale_std**2
+    lever += np.outer(at_camera[::-1] * [1, -1], at_camera[::-1] * [1, -1]) * heading_std**2
+    covariance = np.eye(2) + lever
+    assert np.trace(lever) == pytest.approx(arm * (scale_std**2 + heading_std**2))
+    for _ in range(count):
+        heading = 30.0 + math.degrees(rng.normal(0, heading_std))
+        agl_m = AGL_M * math.exp(rng.normal(0, scale_std))
+        place = rng.normal(0, 1.0, 2) + at_camera - ground(middle[0], heading, agl_m)
+        seen = replace(fix(*place, heading_deg=heading, agl_m=agl_m), cov_en_m2=covariance)
+        found = locate_pixel(CAMERA, tilted, seen, px)
+        off = en_of(found) - ground(px, 30.0, AGL_M)
+        inside += off @ np.linalg.solve(found.cov_en_m2, off) < 5.991
+    assert 0.92 < inside / count < 0.975
+
+
+@pytest.mark.parametrize("px", [(-1, 5), (641, 5), (5, 481)])
+def test_a_pixel_outside_is_refused(px):
+    with pytest.raises(FlightError, match="outside the picture of 640 x 480"):
+        locate_pixel(CAMERA, telemetry(), fix(), px)
+
+
+def test_no_ground_is_refused():
+    with pytest.raises(FlightError, match="no ground that is known"):
+        locate_pixel(CAMERA, telemetry(80.0), fix(), (320, 10))
+    with pytest.raises(FlightError, match="under the camera"):
+        locate_pixel(CAMERA, telemetry(), fix(), (0, 0), lambda lat, lon: lat * np.nan)
+
+    def near(lat_deg, lon_deg):
+        far = np.hypot(*np.moveaxis(FRAME.en_from_latlon(lat_deg, lon_deg), -1, 0)) > 20
+        return np.where(far, np.nan, 0.0)
+
+    with pytest.raises(FlightError, match="no ground that is known"):
+        locate_pixel(CAMERA, telemetry(), fix(), (0, 0), near)
