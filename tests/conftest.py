@@ -51,6 +51,15 @@ def pytest_collection():
         gc.enable()
 
 
+LONGEST = ("test_in_browser.py", "test_cli.py", "test_check_page.py", "test_tracker.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files come first: at the end, one of them would run alone."""
+    rank = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(LONGEST)))
+
+
 @dataclass(frozen=True)
 class SmallArea:
     """A generated area: one orthophoto per date, a camera whose views at `agl_m` fill a tile."""

@@ -30,7 +30,7 @@ from orthonav.prepare.layer import halved
 
 SIDE_PX, TILE_PX = 240, 64
 CROP_PX = round(1.5 * TILE_PX)
-FEW = 14
+FEW = 10
 
 
 class Pyramid:
@@ -175,7 +175,7 @@ def test_views_of_crops_are_vertical_with_telemetry_errors(localizer):
     ],
 )
 def test_the_floor_is_the_offset_of_the_other_date(localizer, moved_px, expected):
-    later = crops_of(GREY, 10, seed=2, moved_px=moved_px)
+    later = crops_of(GREY, 8, seed=2, moved_px=moved_px)
     found = calibrated(localizer, crops_of(GREY, 2), later)
     assert found.floor_px == pytest.approx(expected, rel=0.06)
 
