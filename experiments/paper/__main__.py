@@ -158,7 +158,7 @@ def _tasks(options: argparse.Namespace, place: Any, wanted: set[str]) -> list[An
         if not _whole(scene, wanted):
             needed = {baselines.MAP_OF} if "baselines" in wanted else set()
             if "field" in wanted and scene.name in FIELD_SCENES:
-                needed |= {each.key for each in flown(rows)}
+                needed |= {each.key for each in flown(chosen)}
             chosen = [each for each in rows if each.key in needed]
         tasks += [(place, scene, method) for method in chosen]
         _say(f"           {scene.name}: {tiles:,} tiles, {len(chosen)} runs")

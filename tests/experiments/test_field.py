@@ -192,6 +192,24 @@ def test_every_method_gets_the_same_views(placed):
     assert all(np.array_equal(a.grey, b.grey) for a, b in zip(first, again, strict=True))
 
 
+def test_a_map_that_was_built_later_is_added(placed, monkeypatch):
+    """Only what is missing is placed; a result of other code is made anew."""
+    place, scene = placed
+    out = place.result(scene, "field")
+    asked, whole = [], out.read_text()
+    monkeypatch.setattr(field, "ProcessPoolExecutor", HereAndNow)
+    monkeypatch.setattr(matchers, "LOCAL", {"SIFT, ratio test": Sift})
+    monkeypatch.setattr(field, "_measured", lambda *task: asked.append(task[-1]) or {})
+    plain = json.loads(whole)
+    del plain["field"]["gradient-gradient"]
+    out.write_text(json.dumps(plain))
+    assert field.run(place, scene) and asked == ["gradient-gradient"]
+    plain["code"]["experiments/paper/matchers.py"] = "0" * 12
+    out.write_text(json.dumps(plain))
+    assert field.run(place, scene) and asked[1:] == ["SIFT, ratio test", "gradient-gradient"]
+    out.write_text(whole)
+
+
 def test_a_row_of_the_field_is_checked_and_shown(placed):
     place, _ = placed
     (row,) = [each for each in read(place.results) if "field" in each.plain]
