@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from orthonav.records import Fix, NoFix, ViewResult
 
 
 def result(frame, lat_deg, lon_deg, confidence=0.97, heading_deg=271.5):
-    covariance = np.array([[9.0, 0.0], [0.0, 16.0]])
+    covariance = np.array([[9.0, 0.0], [0.0, 16.0]])  # and 3 m of the map
     fix = Fix(lat_deg, lon_deg, covariance, confidence, 35.0, heading_deg, 120.0)
     return ViewResult(frame, 0, fix, 1.0)
 
@@ -39,9 +40,11 @@ def written(tmp_path, name, terrain):
 
 def test_only_confident_positions_are_taken_with_heights_above_sea():
     one, other = camera_positions(RESULTS, hill)
-    assert (one.frame, one.height_m, one.std_m) == ("a.jpg", 425.0, 4.0)
+    assert (one.frame, one.height_m, one.std_m) == ("a.jpg", 425.0, 5.0)
     assert other.frame == "b.jpg" and other.height_m == pytest.approx(420.0 - 810.0)
     assert math.isnan(camera_positions(RESULTS, None)[0].height_m)
+    tracked = replace(RESULTS[0], state="tracking")
+    assert camera_positions([tracked], None)[0].std_m == 4.0
 
 
 @pytest.mark.parametrize(("terrain", "height"), [(hill, "425.000"), (None, "")])
@@ -55,7 +58,7 @@ def test_csv(tmp_path, terrain, height):
 def test_geojson(tmp_path):
     features = json.loads(written(tmp_path, "geojson", hill))["features"]
     assert features[0]["geometry"] == {"type": "Point", "coordinates": [-2.25, 48.5, 425.0]}
-    assert features[0]["properties"]["std_m"] == 4.0
+    assert features[0]["properties"]["std_m"] == 5.0
     assert features[1]["properties"]["heading_deg"] is None
     level = json.loads(written(tmp_path, "geojson", None))["features"]
     assert level[0]["geometry"]["coordinates"] == [-2.25, 48.5]
@@ -64,7 +67,7 @@ def test_geojson(tmp_path):
 def test_opendronemap_takes_accuracy_only_after_a_height(tmp_path):
     lines = written(tmp_path, "odm-geo", hill).splitlines()
     assert lines[0] == "EPSG:4326"
-    assert lines[1] == "a.jpg -2.25000000 48.50000000 425.000 0 0 0 4.000"
+    assert lines[1] == "a.jpg -2.25000000 48.50000000 425.000 0 0 0 5.000"
     assert written(tmp_path, "odm-geo", None).splitlines()[1] == "a.jpg -2.25000000 48.50000000"
 
 

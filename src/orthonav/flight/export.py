@@ -17,7 +17,7 @@ import numpy as np
 from orthonav.errors import VariantError
 from orthonav.files import write_text
 from orthonav.geo.ground import TerrainHeights
-from orthonav.records import Fix, ViewResult
+from orthonav.records import MAP_STD_M, Fix, ViewResult
 
 CSV_COLUMNS = ("frame", "lat_deg", "lon_deg", "height_m", "agl_m", "heading_deg", "std_m")
 
@@ -28,7 +28,8 @@ class CameraPosition:
 
     `lat_deg`, `lon_deg`: WGS84. `height_m`: above mean sea level, NaN without a terrain. `agl_m`:
     above ground. `heading_deg`: of the top of the picture, clockwise from north. `std_m`: standard
-    deviation of the position along its worst axis. `confidence`: probability in 0..1.
+    deviation of the position along its worst axis, the displacement of the map included.
+    `confidence`: probability in 0..1.
     """
 
     frame: str
@@ -53,7 +54,9 @@ def camera_positions(
         ground_m = math.nan
         if terrain is not None:
             ground_m = float(terrain(np.array([fix.lat_deg]), np.array([fix.lon_deg]))[0])
-        worst = float(np.linalg.eigvalsh(fix.cov_en_m2)[-1])
+        worst = max(float(np.linalg.eigvalsh(fix.cov_en_m2)[-1]), 0.0)
+        if result.state is None:  # that of a track has it already
+            worst += MAP_STD_M**2
         found.append(
             CameraPosition(
                 result.frame,
@@ -62,7 +65,7 @@ def camera_positions(
                 ground_m + fix.agl_m,
                 fix.agl_m,
                 fix.heading_deg,
-                math.sqrt(max(worst, 0.0)),
+                math.sqrt(worst),
                 fix.confidence,
             )
         )
