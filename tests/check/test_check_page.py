@@ -246,6 +246,7 @@ def visit(browser, folder):
 
     def opened(name, **options):
         context = browser.new_context(**{"viewport": {"width": 1366, "height": 900}, **options})
+        context.set_default_timeout(120_000)  # only ends a hang
         contexts.append(context)
         found = context.new_page()
         path = folder / name / "index.html"

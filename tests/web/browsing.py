@@ -39,7 +39,7 @@ class Visit:
     def __init__(self, browser, url, options):
         self.context = browser.new_context(**{**LAPTOP, **options})
         self.page = self.context.new_page()
-        self.page.set_default_timeout(20_000)
+        self.page.set_default_timeout(120_000)
         self.asked, self.elsewhere, self.wrong = [], [], []
         self.page.on("request", lambda request: self.asked.append(request.url))
         self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
@@ -88,7 +88,7 @@ class Visit:
 
     def until(self, holds):
         """Waits for what does not come at once; scripts of the page must not be made of text."""
-        last = time.monotonic() + 60
+        last = time.monotonic() + 120
         while not holds():
             assert time.monotonic() < last
             self.page.wait_for_timeout(30)

@@ -26,7 +26,7 @@ MAIN_PARTS = ("header", "#map-part", "#chosen", "#list-part", "#health-part", "#
 def browser():
     if chromium() is None:
         pytest.skip(HOW_TO_GET_ONE)
-    expect.set_options(timeout=20_000)
+    expect.set_options(timeout=120_000)  # only ends a hang
     with started() as found:
         yield found
 
