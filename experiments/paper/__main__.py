@@ -69,13 +69,15 @@ def _stored(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace, command: str) -> int:
     """Run all rows that are wanted, several at a time; how many failed."""
     from experiments.paper.estimate import lines
-    from experiments.paper.methods import GPU_SCENES
+    from experiments.paper.methods import BETWEEN_DATES, GPU_SCENES
     from experiments.paper.pool import cores, side_by_side
     from experiments.paper.runs import Workplace
     from experiments.paper.scenes import render
     from experiments.paper.trajectories import SETTINGS, dry
+    from orthonav.represent.learned import VARIABLE
 
     _require(options)
+    os.environ[VARIABLE] = str(BETWEEN_DATES)  # maps do not say where their network lies
     start = time.perf_counter()
     setting = dry(SETTINGS[options.setting]) if options.dry_run else SETTINGS[options.setting]
     place = Workplace(

@@ -11,7 +11,7 @@ import contextlib
 import io
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import cv2
@@ -180,7 +180,11 @@ class FeatureMap:
     """A method on the keypoints of a map's orthophoto."""
 
     def __init__(self, local: Local, picture: Picture) -> None:
-        self._local, self._picture = local, picture
+        nothing = np.empty((0, 0))  # the pixels are not carried
+        self._local = local
+        self._picture = replace(
+            picture, grey=nothing.astype(np.uint8), valid=nothing.astype(np.bool_)
+        )
         parts = list(_blocks(local, picture))
         self.features = Features(
             np.concatenate([each.points_px for each in parts]),
