@@ -7,6 +7,7 @@ of it, `tracker`, `orthonav.atlas` and `orthonav.check` use the place itself.
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -18,7 +19,15 @@ from orthonav.errors import MapFileError, VariantError
 from orthonav.localizer.plan import DEFAULT_PLAN, ClearMargin, Search, SearchPlan
 from orthonav.localizer.prepared import PreparedView, prepare
 from orthonav.localizer.propose import TileProposer
-from orthonav.localizer.relief import GroundSeen, Relief, ViewOnLevelGround, ViewOverRelief
+from orthonav.localizer.rectify import looks_aside
+from orthonav.localizer.relief import (
+    CameraFound,
+    GroundSeen,
+    LevelTerrain,
+    Relief,
+    ViewOnLevelGround,
+    ViewOverRelief,
+)
 from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import SheetInfo
 from orthonav.mapfile.reader import MapFile
@@ -36,12 +45,14 @@ from orthonav.search.exact import rows_within
 class RegisteredView:
     """A prepared view and its best place; `found` is a `NoFix` where it could not be compared.
 
-    `ground`: what it saw, where the map has a terrain.
+    `ground`: what it saw, where the map has a terrain or the view looks aside. `camera`: makes the
+    camera with its pitch and roll, None where these are not examined.
     """
 
     prepared: PreparedView
     found: Registered | NoFix
     ground: GroundSeen | None = None
+    camera: Callable[[], CameraFound | None] = lambda: None
 
 
 class RegistrationLocalizer:
@@ -122,7 +133,7 @@ class RegistrationLocalizer:
             return seen
         if isinstance(seen.found, NoFix):
             return seen.found
-        return self._fix(seen.prepared, seen.found, view.telemetry, seen.ground)
+        return self._fix(seen.prepared, seen.found, view.telemetry, seen)
 
     def register(
         self,
@@ -155,7 +166,8 @@ class RegistrationLocalizer:
             if prior is None:
                 detail += "; a large map needs a prior, or views as large as its tiles"
             return RegisteredView(prepared, NoFix("no_match", detail))
-        return RegisteredView(prepared, *ground.by_camera(found))
+        resect = functools.partial(ground.resected, found.placed)
+        return RegisteredView(prepared, *ground.by_camera(found), resect)
 
     def prepared(self, view: View, heading_known: bool) -> PreparedView | NoFix:
         """The view rectified and made ready for registration; `NoFix` where it shows too little."""
@@ -212,9 +224,12 @@ class RegistrationLocalizer:
 
     def _on_ground(self, view: PreparedView) -> ViewOnLevelGround:
         """The view on the terrain of the map, where it has one."""
-        if self.relief is None:
-            return ViewOnLevelGround(self.registrar, view)
-        return ViewOverRelief(self.relief, self.registrar, view)
+        if self.relief is not None:
+            return ViewOverRelief(self.relief, self.registrar, view)
+        if looks_aside(view.picture_at(view.levels.final)):
+            level = Relief(LevelTerrain(), self.grid)
+            return ViewOverRelief(level, self.registrar, view)
+        return ViewOnLevelGround(self.registrar, view)
 
     def _seems_clear(self, view: PreparedView, judged: list[Placed], enough: ClearMargin) -> bool:
         """Whether the best candidate may end the search, before the cost of finishing it."""
@@ -316,32 +331,42 @@ class RegistrationLocalizer:
         view: PreparedView,
         best: Registered,
         telemetry: Telemetry,
-        ground: GroundSeen | None,
+        seen: RegisteredView,
     ) -> Fix:
-        placed = best.placed
-        lat, lon = self.sheet.frame.latlon_from_en(self.camera_en_m(view, placed.pose))
+        placed, camera = best.placed, seen.camera()
+        place = self.camera_en_m(view, placed.pose)
         covariance = self.covariance(view, placed)[:2, :2]
-        if telemetry.tilt_std_deg is not None:
+        heading_deg = math.degrees(placed.pose.turn_rad) % 360
+        agl_m = telemetry.agl_m * math.exp(placed.pose.log_scale)
+        if camera is not None:
+            place, agl_m = camera.orientation.position_m[:2], camera.agl_m
+            heading_deg = float(camera.orientation.attitude_deg[0]) % 360
+            floor_m = self.floor_px * self.grid.gsd_m
+            covariance = camera.covariance[:2, :2] + np.eye(2) * floor_m**2
+        elif telemetry.tilt_std_deg is not None:
             tilt_m = telemetry.agl_m * math.radians(telemetry.tilt_std_deg)
             covariance = covariance + np.eye(2) * tilt_m**2
+        lat, lon = self.sheet.frame.latlon_from_en(place)
         covariance.flags.writeable = False
         evidence = best.evidence()
         confidence = math.nan if self.confidence is None else self.confidence(evidence)
-        seen = None
-        if ground is not None:
-            evidence["terrain_gain"] = ground.gain
-            seen_lat, seen_lon = self.sheet.frame.latlon_from_en(ground.middle_en_m)
-            seen = float(seen_lat), float(seen_lon)
+        middle = None
+        if seen.ground is not None:
+            if seen.ground.gain is not None:
+                evidence["terrain_gain"] = seen.ground.gain
+            middle_en_m = seen.ground.middle_en_m if camera is None else camera.middle_en_m
+            middle_deg = self.sheet.frame.latlon_from_en(middle_en_m)
+            middle = float(middle_deg[0]), float(middle_deg[1])
         return Fix(
             lat_deg=float(lat),
             lon_deg=float(lon),
             cov_en_m2=covariance,
             confidence=confidence,
             radius_m=self.radius_m,
-            heading_deg=math.degrees(placed.pose.turn_rad) % 360,
-            agl_m=telemetry.agl_m * math.exp(placed.pose.log_scale),
+            heading_deg=heading_deg,
+            agl_m=agl_m,
             evidence=MappingProxyType(evidence),
-            ground_latlon_deg=seen,
+            ground_latlon_deg=middle,
         )
 
     def camera_en_m(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
