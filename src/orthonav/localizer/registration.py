@@ -159,7 +159,7 @@ class RegistrationLocalizer:
         if prior is not None and not self._touches_map(prior, prepared):
             outside = NoFix("outside_map", "the map does not reach to where the prior says")
             return RegisteredView(prepared, outside)
-        ground = self._on_ground(prepared)
+        ground = self.on_ground(prepared)
         found = self.best(prepared, prior, ground)
         if found is None:
             detail = "no place of the map could be compared with the view"
@@ -180,7 +180,7 @@ class RegistrationLocalizer:
 
         `ground`: the view on the ground of the map; None: made here.
         """
-        ground = ground or self._on_ground(view)
+        ground = ground or self.on_ground(view)
         judged: list[Placed] = []
         best: Registered | None = None
         candidates = 0
@@ -222,8 +222,8 @@ class RegistrationLocalizer:
             ground.templates_of, ground.finer, view.levels, best, view.prior
         )
 
-    def _on_ground(self, view: PreparedView) -> ViewOnLevelGround:
-        """The view on the terrain of the map, where it has one."""
+    def on_ground(self, view: PreparedView) -> ViewOnLevelGround:
+        """A view on the terrain of the map, where it has one."""
         if self.relief is not None:
             return ViewOverRelief(self.relief, self.registrar, view)
         if looks_aside(view.picture_at(view.levels.final)):

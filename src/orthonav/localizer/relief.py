@@ -204,6 +204,12 @@ class ViewOnLevelGround:
         """The camera of a place with its pitch and roll; None where they are not examined."""
         return None
 
+    def score_near(self, pose: Pose, steps: int, small_step_px: float) -> float:
+        """Score at the final level near a pose of `by_camera`."""
+        levels = self.view.levels
+        refiner = self.registrar.refiner(self.view.templates, levels, levels.final)
+        return refiner.place(pose, steps, small_step_px).score
+
 
 class ViewOverRelief(ViewOnLevelGround):
     """One view on the ground of a sheet. Not to be shared between threads."""
@@ -329,6 +335,27 @@ class ViewOverRelief(ViewOnLevelGround):
             gain = None
         seen = GroundSeen(self.middle_en_m(orientation, pose), gain)
         return replace(found, placed=self._by_camera(found.placed), finalists=finalists), seen
+
+    def score_near(self, pose: Pose, steps: int, small_step_px: float) -> float:
+        """The same on the terrain."""
+        window = self._of_window(pose)
+        made = None if window is None else self.templates_at(window, self.view.levels.final)
+        if made is None or window is None:
+            return super().score_near(pose, steps, small_step_px)
+        refiner = self.registrar.refiner(made, self.view.levels, self.view.levels.final)
+        return refiner.place(window, steps, small_step_px).score
+
+    def _of_window(self, pose: Pose) -> Pose | None:
+        """The inverse of `_by_camera`; None where the ground is unknown."""
+        agl_m = self.view.picture_at(self.view.levels.final).telemetry.agl_m
+        camera = pose.map_px(self.view.camera_px)
+        below_m = float(self.relief.terrain.at_en_m(self.relief.en_m(camera)))
+        above_m = below_m + agl_m * math.exp(pose.log_scale) - self._reference_m(pose)
+        if not above_m > 0:  # also where it is unknown
+            return None
+        scaled = replace(pose, log_scale=math.log(above_m / agl_m))
+        x, y = camera - scaled.linear @ self.view.camera_px
+        return replace(scaled, x_px=float(x), y_px=float(y))
 
     def middle_en_m(self, orientation: Orientation, pose: Pose) -> tuple[float, float]:
         """Where the middle of the picture looks on the terrain; the middle of the window of `pose`

@@ -19,6 +19,9 @@ GROUND_STEP_M = 2.0
 """The same of a point along the ground: about the noise of a terrain model over its slope."""
 HUBER = 1.5
 """Blocks farther off than so many standard deviations count less."""
+CORRELATED = 5.0
+"""Errors of blocks are not independent, for those of terrain and imagery reach over several: the
+variance is so many times larger (`python -m benchmarks.relief_photographs`)."""
 REWEIGHTED = 3
 MIN_BLOCKS = 8
 """Fewer blocks do not show an attitude."""
@@ -69,8 +72,9 @@ def resected(
         left = gradient - np.einsum("nij,njp,p->ni", curvature, moved, correction)
         off = np.einsum("ni,nij,nj->n", left, inverse, left)
         # Two numbers of each block; the median of chi squared of two is 2 ln 2.
-        variance = max(float(np.median(off)) / (2 * np.log(2)), 1e-12)
-        weights = np.minimum(1.0, HUBER / np.maximum(np.sqrt(off / (2 * variance)), 1e-9))
+        alone = max(float(np.median(off)) / (2 * np.log(2)), 1e-12)
+        variance = CORRELATED * alone
+        weights = np.minimum(1.0, HUBER / np.maximum(np.sqrt(off / (2 * alone)), 1e-9))
     return Resection(correction, covariance)
 
 
