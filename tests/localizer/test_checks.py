@@ -56,14 +56,14 @@ def test_height(agl_m, expected):
 @pytest.mark.parametrize(
     "pitch_deg, roll_deg, expected",
     [
-        (44.9, 0, None),
-        (45.1, 0, "extreme_tilt"),
-        (-44.9, 0, None),
-        (-45.1, 0, "extreme_tilt"),
-        (0, 44.9, None),
-        (0, -45.1, "extreme_tilt"),
-        (32.7, 32.7, None),  # cos(32.765)^2 is cos(45)
-        (32.8, 32.8, "extreme_tilt"),
+        (64.9, 0, None),
+        (65.1, 0, "extreme_tilt"),
+        (-64.9, 0, None),
+        (-65.1, 0, "extreme_tilt"),
+        (0, 64.9, None),
+        (0, -65.1, "extreme_tilt"),
+        (49.4, 49.4, None),  # cos(49.454)^2 is cos(65)
+        (49.5, 49.5, "extreme_tilt"),
         (90, 0, "extreme_tilt"),
         (0, 180, "extreme_tilt"),
         (180, 180, None),  # twice over is straight down again

@@ -392,7 +392,7 @@ REFUSED = {
     "no pitch": ({"pitch_deg": math.nan}, "missing_telemetry"),
     "no height": ({"agl_m": math.nan}, "missing_telemetry"),
     "below ground": ({"agl_m": -3.0}, "bad_height"),
-    "tilted": ({"roll_deg": 60.0}, "extreme_tilt"),
+    "tilted": ({"roll_deg": 70.0}, "extreme_tilt"),
     "far up": ({"agl_m": 1e6}, "too_coarse"),
     "on the ground": ({"agl_m": 5.0}, "too_small"),
     "tiny height": ({"agl_m": 1e-300}, "too_small"),

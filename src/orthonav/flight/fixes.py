@@ -1,6 +1,7 @@
 """`fixes.jsonl`, written and read: one JSON object per view, in order of the flight.
 
-The keys of a line and their order are those of `KEYS`; those of a track end with `TRACK_KEYS`.
+The keys of a line and their order are those of `KEYS`; those of a track end with `TRACK_KEYS`,
+those of a view on terrain have `GROUND_KEYS` before.
 Unknown numbers (NaN, infinite) are written as null and read as NaN. `time_s` is written with up to
 nine decimals, so that nanoseconds since 1970 are exact, which a float64 of seconds cannot hold.
 """
@@ -37,6 +38,10 @@ KEYS = (
     "evidence",  # names and numbers
     "latency_ms",
 )
+GROUND_KEYS = (
+    "ground_lat_deg",  # what the middle of the picture shows, where the map has a terrain or the
+    "ground_lon_deg",  # camera looks more than 45 deg off nadir
+)
 TRACK_KEYS = (
     "tracked",  # true: the position is estimated from all views so far
     "state",  # one of `STATES`
@@ -64,6 +69,8 @@ def result_to_json(result: ViewResult) -> str:
     texts = {key: json.dumps(value, allow_nan=False) for key, value in values.items()}
     texts["time_s"] = _seconds(result.time_ns)
     keys: tuple[str, ...] = KEYS
+    if "ground_lat_deg" in values:
+        keys += GROUND_KEYS
     if result.state is not None:
         keys += TRACK_KEYS
         texts |= {"tracked": "true", "state": json.dumps(result.state)}
@@ -129,6 +136,9 @@ def _outcome_values(outcome: Fix | NoFix) -> dict[str, Any]:
     if isinstance(outcome, NoFix):
         no_fix = {"status": "no_fix", "reason": outcome.reason, "detail": outcome.detail}
         return {**no_fix, **_NULL_IN_NO_FIX}
+    ground = {}
+    if outcome.ground_latlon_deg is not None:
+        ground = dict(zip(GROUND_KEYS, map(_or_none, outcome.ground_latlon_deg), strict=True))
     return {
         "status": "fix",
         "lat_deg": _or_none(outcome.lat_deg),
@@ -139,6 +149,7 @@ def _outcome_values(outcome: Fix | NoFix) -> dict[str, Any]:
         "heading_deg": _or_none(outcome.heading_deg),
         "agl_m": _or_none(outcome.agl_m),
         **_NULL_IN_FIX,
+        **ground,
     }
 
 
@@ -177,7 +188,15 @@ def _outcome(values: Mapping[str, Any]) -> Fix | NoFix:
         heading_deg=_number(values, "heading_deg"),
         agl_m=_number(values, "agl_m"),
         evidence=evidence,
+        ground_latlon_deg=_ground(values),
     )
+
+
+def _ground(values: Mapping[str, Any]) -> tuple[float, float] | None:
+    """What the middle of the picture shows; None where a line does not say."""
+    if GROUND_KEYS[0] not in values:
+        return None
+    return _angle(values, GROUND_KEYS[0], 90.0), _angle(values, GROUND_KEYS[1], 180.0)
 
 
 def _seconds(time_ns: int) -> str:

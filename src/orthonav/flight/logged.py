@@ -251,7 +251,7 @@ def view_of(data: bytes) -> LoggedView:
     plain = from_json(data)
     try:
         prior, velocity = plain["prior"], plain["vel_en_mps"]
-        reported = {name: _number(plain[name]) for name in _REPORTED}
+        reported: dict[str, Any] = {name: _number(plain[name]) for name in _REPORTED}
         optional: dict[str, Any] = {
             name: None if plain.get(name) is None else _number(plain[name])
             for name in _REPORTED_IF_KNOWN

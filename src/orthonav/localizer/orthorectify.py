@@ -36,6 +36,10 @@ class Orientation:
     position_m: Array
     attitude_deg: Array
 
+    def moved(self, step: Array) -> "Orientation":
+        """This orientation after a step (6,): metres and degrees."""
+        return Orientation(self.position_m + step[:3], self.attitude_deg + step[3:])
+
     def seen_px(self, camera: Camera, ground_m: Array) -> Array:
         """Image points (..., 2) of ground points (..., 3); NaN where they cannot be seen."""
         rays = (ground_m - self.position_m) @ enu_from_camera(*self.attitude_deg.tolist())

@@ -7,6 +7,7 @@ of it, `tracker`, `orthonav.atlas` and `orthonav.check` use the place itself.
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -18,7 +19,15 @@ from orthonav.errors import MapFileError, VariantError
 from orthonav.localizer.plan import DEFAULT_PLAN, ClearMargin, Search, SearchPlan
 from orthonav.localizer.prepared import PreparedView, prepare
 from orthonav.localizer.propose import TileProposer
-from orthonav.localizer.relief import GroundSeen, Relief, ViewOnLevelGround, ViewOverRelief
+from orthonav.localizer.rectify import looks_aside
+from orthonav.localizer.relief import (
+    CameraFound,
+    GroundSeen,
+    LevelTerrain,
+    Relief,
+    ViewOnLevelGround,
+    ViewOverRelief,
+)
 from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import SheetInfo
 from orthonav.mapfile.reader import MapFile
@@ -36,12 +45,14 @@ from orthonav.search.exact import rows_within
 class RegisteredView:
     """A prepared view and its best place; `found` is a `NoFix` where it could not be compared.
 
-    `ground`: what it saw, where the map has a terrain.
+    `ground`: what it saw, where the map has a terrain or the view looks aside. `camera`: makes the
+    camera with its pitch and roll, None where these are not examined.
     """
 
     prepared: PreparedView
     found: Registered | NoFix
     ground: GroundSeen | None = None
+    camera: Callable[[], CameraFound | None] = lambda: None
 
 
 class RegistrationLocalizer:
@@ -122,7 +133,7 @@ class RegistrationLocalizer:
             return seen
         if isinstance(seen.found, NoFix):
             return seen.found
-        return self._fix(seen.prepared, seen.found, view.telemetry, seen.ground)
+        return self._fix(seen.prepared, seen.found, view.telemetry, seen)
 
     def register(
         self,
@@ -148,14 +159,15 @@ class RegistrationLocalizer:
         if prior is not None and not self._touches_map(prior, prepared):
             outside = NoFix("outside_map", "the map does not reach to where the prior says")
             return RegisteredView(prepared, outside)
-        ground = self._on_ground(prepared)
+        ground = self.on_ground(prepared)
         found = self.best(prepared, prior, ground)
         if found is None:
             detail = "no place of the map could be compared with the view"
             if prior is None:
                 detail += "; a large map needs a prior, or views as large as its tiles"
             return RegisteredView(prepared, NoFix("no_match", detail))
-        return RegisteredView(prepared, *ground.by_camera(found))
+        resect = functools.partial(ground.resected, found.placed)
+        return RegisteredView(prepared, *ground.by_camera(found), resect)
 
     def prepared(self, view: View, heading_known: bool) -> PreparedView | NoFix:
         """The view rectified and made ready for registration; `NoFix` where it shows too little."""
@@ -168,7 +180,7 @@ class RegistrationLocalizer:
 
         `ground`: the view on the ground of the map; None: made here.
         """
-        ground = ground or self._on_ground(view)
+        ground = ground or self.on_ground(view)
         judged: list[Placed] = []
         direct: list[Placed] = []
         best: Registered | None = None
@@ -214,11 +226,14 @@ class RegistrationLocalizer:
             ground.templates_of, ground.finer, view.levels, best, view.prior
         )
 
-    def _on_ground(self, view: PreparedView) -> ViewOnLevelGround:
-        """The view on the terrain of the map, where it has one."""
-        if self.relief is None:
-            return ViewOnLevelGround(self.registrar, view)
-        return ViewOverRelief(self.relief, self.registrar, view)
+    def on_ground(self, view: PreparedView) -> ViewOnLevelGround:
+        """A view on the terrain of the map, where it has one."""
+        if self.relief is not None:
+            return ViewOverRelief(self.relief, self.registrar, view)
+        if looks_aside(view.picture_at(view.levels.final)):
+            level = Relief(LevelTerrain(), self.grid)
+            return ViewOverRelief(level, self.registrar, view)
+        return ViewOnLevelGround(self.registrar, view)
 
     def _seems_clear(self, view: PreparedView, judged: list[Placed], enough: ClearMargin) -> bool:
         """Whether the best candidate may end the search, before the cost of finishing it."""
@@ -320,35 +335,49 @@ class RegistrationLocalizer:
         view: PreparedView,
         best: Registered,
         telemetry: Telemetry,
-        ground: GroundSeen | None,
+        seen: RegisteredView,
     ) -> Fix:
-        placed = best.placed
-        lat, lon = self.sheet.frame.latlon_from_en(self.camera_en_m(view, placed.pose))
+        placed, camera = best.placed, seen.camera()
+        place = self.camera_en_m(view, placed.pose)
         spread = self.covariance(view, placed)
         covariance = spread[:2, :2]
-        if telemetry.tilt_std_deg is not None:
+        heading_deg = math.degrees(placed.pose.turn_rad) % 360
+        agl_m = telemetry.agl_m * math.exp(placed.pose.log_scale)
+        stds = {
+            "heading_std_deg": math.degrees(math.sqrt(spread[2, 2])),
+            "log_scale_std": math.sqrt(spread[3, 3]),
+        }
+        if camera is not None:
+            place, agl_m = camera.orientation.position_m[:2], camera.agl_m
+            heading_deg = float(camera.orientation.attitude_deg[0]) % 360
+            floor_m = self.floor_px * self.grid.gsd_m
+            covariance = camera.covariance[:2, :2] + np.eye(2) * floor_m**2
+            stds = _attitude_found(camera, telemetry)
+        elif telemetry.tilt_std_deg is not None:
             tilt_m = telemetry.agl_m * math.radians(telemetry.tilt_std_deg)
             covariance = covariance + np.eye(2) * tilt_m**2
+        lat, lon = self.sheet.frame.latlon_from_en(place)
         covariance.flags.writeable = False
         evidence = best.evidence()
         confidence = math.nan if self.confidence is None else self.confidence(evidence)
-        evidence["heading_std_deg"] = math.degrees(math.sqrt(spread[2, 2]))
-        evidence["log_scale_std"] = math.sqrt(spread[3, 3])
-        seen = None
-        if ground is not None:
-            evidence["terrain_gain"] = ground.gain
-            seen_lat, seen_lon = self.sheet.frame.latlon_from_en(ground.middle_en_m)
-            seen = float(seen_lat), float(seen_lon)
+        evidence |= stds
+        middle = None
+        if seen.ground is not None:
+            if seen.ground.gain is not None:
+                evidence["terrain_gain"] = seen.ground.gain
+            middle_en_m = seen.ground.middle_en_m if camera is None else camera.middle_en_m
+            middle_deg = self.sheet.frame.latlon_from_en(middle_en_m)
+            middle = float(middle_deg[0]), float(middle_deg[1])
         return Fix(
             lat_deg=float(lat),
             lon_deg=float(lon),
             cov_en_m2=covariance,
             confidence=confidence,
             radius_m=self.radius_m,
-            heading_deg=math.degrees(placed.pose.turn_rad) % 360,
-            agl_m=telemetry.agl_m * math.exp(placed.pose.log_scale),
+            heading_deg=heading_deg,
+            agl_m=agl_m,
             evidence=MappingProxyType(evidence),
-            ground_latlon_deg=seen,
+            ground_latlon_deg=middle,
         )
 
     def camera_en_m(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:
@@ -381,3 +410,17 @@ class RegistrationLocalizer:
         spread[:2, :2] += np.eye(2) * self.floor_px**2
         metres = np.diag([self.grid.gsd_m, -self.grid.gsd_m, 1.0, 1.0])
         return np.asarray(metres @ spread @ metres)
+
+
+def _attitude_found(camera: CameraFound, telemetry: Telemetry) -> dict[str, float]:
+    """Pitch and roll by resection over the reported ones, and standard deviations."""
+    _, pitch_deg, roll_deg = camera.orientation.attitude_deg.tolist()
+    up_m, heading, pitch, roll = np.sqrt(np.diag(camera.covariance)[2:]).tolist()
+    return {
+        "heading_std_deg": heading,
+        "log_scale_std": up_m / camera.agl_m,
+        "pitch_bias_deg": pitch_deg - telemetry.pitch_deg,
+        "roll_bias_deg": roll_deg - telemetry.roll_deg,
+        "pitch_bias_std_deg": pitch,
+        "roll_bias_std_deg": roll,
+    }

@@ -10,11 +10,13 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from orthonav.geo.camera import enu_from_camera, undistort
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.orthorectify import Orientation, node_px, orthorectified
 from orthonav.localizer.prepared import MIN_AGL_STD, PreparedView
+from orthonav.localizer.resection import resected
 from orthonav.mapfile.terrain import TerrainLayer
 from orthonav.records import DEFAULT_AGL_STD
 from orthonav.register.pose import Pose
@@ -46,15 +48,29 @@ ROUNDS = 3
 """At most so many times at the final level."""
 MAP_NODES = 256
 """Nodes across the map of expected scales, at most."""
+SLOPE_M = 10.0
+"""Slopes are those over twice this distance."""
+RESECTIONS = 2
+"""The view is orthorectified and resected so many times."""
+SIGHT_ROUNDS = 12
+"""Rounds in which a ray meets the ground."""
 LARGEST_STD = 0.3
 """Largest standard deviation of the scales searched: three are scales of 0.41 to 2.46."""
 Array = NDArray[np.float64]
 
 
+class LevelTerrain:
+    """Level ground at sea level, for views far off nadir over maps without a terrain."""
+
+    def at_en_m(self, points_en_m: ArrayLike) -> Array:
+        """Zeros (...) at points (..., 2)."""
+        return np.zeros(np.shape(points_en_m)[:-1])
+
+
 class Relief:
     """The ground of a sheet, for all views. Safe to share between threads."""
 
-    def __init__(self, terrain: TerrainLayer, grid: TileGrid) -> None:
+    def __init__(self, terrain: TerrainLayer | LevelTerrain, grid: TileGrid) -> None:
         self.terrain, self.grid = terrain, grid
         self._means: dict[int, tuple[NDArray[np.float32], float]] = {}
 
@@ -67,6 +83,18 @@ class Relief:
         """Ground points (..., 3) east, north, above sea at map coordinates; NaN where unknown."""
         points = self.en_m(map_px)
         return np.concatenate([points, self.terrain.at_en_m(points)[..., None]], axis=-1)
+
+    def slopes(self, ground_m: Array) -> Array:
+        """Rise (N, 2) per metre east and north at ground points (N, 3)."""
+        out = np.empty((len(ground_m), 2))
+        for axis in range(2):
+            step = np.zeros(2)
+            step[axis] = SLOPE_M
+            ahead, behind = (
+                self.terrain.at_en_m(ground_m[:, :2] + sign * step) for sign in (1, -1)
+            )
+            out[:, axis] = (ahead - behind) / (2 * SLOPE_M)
+        return out
 
     def expected(self, view: PreparedView) -> PosePrior:
         """The prior of a view with the scale expected at each place, by its height above sea."""
@@ -123,12 +151,22 @@ class _Placed:
 
 @dataclass(frozen=True)
 class GroundSeen:
-    """What a fix says of the ground: `middle_en_m`, that of the ground seen, metres east and north;
-    `gain`, score on the terrain over that on level ground, 1 where it was placed on level ground.
-    """
+    """What a fix says of the ground: `middle_en_m`, that of the picture's middle, metres east and
+    north; `gain`, score on the terrain over that on level ground, None without a terrain."""
 
     middle_en_m: tuple[float, float]
-    gain: float
+    gain: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFound:
+    """The camera of a view by resection: `agl_m` above the ground below it, the covariance (6, 6)
+    of metres east, north, up and degrees of heading, pitch and roll, and what its middle shows."""
+
+    orientation: Orientation
+    agl_m: float
+    covariance: Array
+    middle_en_m: tuple[float, float]
 
 
 class ViewOnLevelGround:
@@ -161,6 +199,16 @@ class ViewOnLevelGround:
     def by_camera(self, found: Registered) -> tuple[Registered, GroundSeen | None]:
         """The places found, as poses of the view on level ground below the camera."""
         return found, None
+
+    def resected(self, placed: Placed) -> CameraFound | None:
+        """The camera of a place with its pitch and roll; None where they are not examined."""
+        return None
+
+    def score_near(self, pose: Pose, steps: int, small_step_px: float) -> float:
+        """Score at the final level near a pose of `by_camera`."""
+        levels = self.view.levels
+        refiner = self.registrar.refiner(self.view.templates, levels, levels.final)
+        return refiner.place(pose, steps, small_step_px).score
 
 
 class ViewOverRelief(ViewOnLevelGround):
@@ -282,9 +330,108 @@ class ViewOverRelief(ViewOnLevelGround):
         if orientation is None:
             return found, None
         on_terrain = self._on_terrain(pose)
-        east, north = self.relief.en_m(np.array([pose.x_px, pose.y_px])).tolist()
-        seen = GroundSeen((east, north), 1.0 if on_terrain is None else on_terrain.gain)
+        gain: float | None = 1.0 if on_terrain is None else on_terrain.gain
+        if isinstance(self.relief.terrain, LevelTerrain):
+            gain = None
+        seen = GroundSeen(self.middle_en_m(orientation, pose), gain)
         return replace(found, placed=self._by_camera(found.placed), finalists=finalists), seen
+
+    def score_near(self, pose: Pose, steps: int, small_step_px: float) -> float:
+        """The same on the terrain."""
+        window = self._of_window(pose)
+        made = None if window is None else self.templates_at(window, self.view.levels.final)
+        if made is None or window is None:
+            return super().score_near(pose, steps, small_step_px)
+        refiner = self.registrar.refiner(made, self.view.levels, self.view.levels.final)
+        return refiner.place(window, steps, small_step_px).score
+
+    def _of_window(self, pose: Pose) -> Pose | None:
+        """The inverse of `_by_camera`; None where the ground is unknown."""
+        agl_m = self.view.picture_at(self.view.levels.final).telemetry.agl_m
+        camera = pose.map_px(self.view.camera_px)
+        below_m = float(self.relief.terrain.at_en_m(self.relief.en_m(camera)))
+        above_m = below_m + agl_m * math.exp(pose.log_scale) - self._reference_m(pose)
+        if not above_m > 0:  # also where it is unknown
+            return None
+        scaled = replace(pose, log_scale=math.log(above_m / agl_m))
+        x, y = camera - scaled.linear @ self.view.camera_px
+        return replace(scaled, x_px=float(x), y_px=float(y))
+
+    def middle_en_m(self, orientation: Orientation, pose: Pose) -> tuple[float, float]:
+        """Where the middle of the picture looks on the terrain; the middle of the window of `pose`
+        where that is unknown."""
+        camera = self.view.picture_at(self.view.levels.final).camera
+        east, north = self.relief.en_m(np.array([pose.x_px, pose.y_px])).tolist()
+        px = np.array([camera.width_px / 2 - camera.cx_px, camera.height_px / 2 - camera.cy_px])
+        plane = undistort(camera, px / [camera.fx_px, camera.fy_px])
+        ray = enu_from_camera(*orientation.attitude_deg.tolist()) @ [*plane.tolist(), 1.0]
+        found = np.array([east, north])
+        for _ in range(SIGHT_ROUNDS):
+            above_m = orientation.position_m[2] - float(self.relief.terrain.at_en_m(found))
+            if not (ray[2] < -1e-6 and above_m > 0):
+                return east, north
+            found = orientation.position_m[:2] + ray[:2] * (above_m / -ray[2])
+        return float(found[0]), float(found[1])
+
+    def resected(self, placed: Placed) -> CameraFound | None:
+        """The camera of a place with its pitch and roll; None where their deviation is not reported
+        or the view does not show them."""
+        levels, pose = self.view.levels, placed.pose
+        picture = self.view.picture_at(levels.final)
+        orientation = self.orientation(pose)
+        if not picture.telemetry.tilt_std_deg or orientation is None:
+            return None
+        found = None
+        for _ in range(RESECTIONS):
+            made = self.templates_at(pose, levels.final, orientation)
+            if made is None:
+                return None
+            template = made.at(levels.final)
+            refiner = self.registrar.refiner(made, levels, levels.final)
+            to_px = np.array([1.0, -1.0]) / self.relief.grid.gsd_m
+            gradient, curvature = refiner.pulls(pose)
+            starts = zip(template.block_starts, template.mask.shape, strict=True)
+            rows, cols = (
+                (np.append(each[1:], side) + each) / 2 - side / 2 for each, side in starts
+            )
+            middles = np.stack(np.meshgrid(cols, rows), axis=-1).reshape(-1, 2) * 2.0**levels.final
+            ground = self.relief.ground_m(pose.map_px(middles))
+            found = resected(
+                picture.camera,
+                orientation,
+                ground,
+                self.relief.slopes(ground),
+                (gradient * to_px, curvature * to_px[:, None] * to_px),
+                self._attitude_prior(pose, orientation),
+            )
+            if found is None:
+                return None
+            orientation = orientation.moved(found.correction)
+        if found is None or not np.isfinite(found.covariance).all():
+            return None
+        east, north, above_sea_m = orientation.position_m.tolist()
+        below_m = float(self.relief.terrain.at_en_m([east, north]))
+        if not above_sea_m - below_m > 0:
+            return None
+        middle = self.middle_en_m(orientation, pose)
+        return CameraFound(orientation, above_sea_m - below_m, found.covariance, middle)
+
+    def _attitude_prior(self, pose: Pose, orientation: Orientation) -> tuple[Array, Array]:
+        """Expected correction (6,) of an orientation by telemetry, and its information (6, 6)."""
+        telemetry, prior = self.view.picture_at(self.view.levels.final).telemetry, self.view.prior
+        expected, std = 0.0, prior.log_scale_std
+        if prior.scale_map is not None:
+            expected, std = prior.scale_map.at(pose.x_px, pose.y_px), prior.scale_map.std
+        expected_m = self._reference_m(pose) + telemetry.agl_m * math.exp(expected)
+        up_m = expected_m - float(orientation.position_m[2])
+        turn = math.degrees(prior.turn_rad or 0.0) - orientation.attitude_deg[0]
+        tilt = np.array([telemetry.pitch_deg, telemetry.roll_deg]) - orientation.attitude_deg[1:]
+        mean = np.array([0.0, 0.0, up_m, math.remainder(turn, 360.0), *tilt.tolist()])
+        tilt_std = max(telemetry.tilt_std_deg or 0.0, 1e-3)
+        stds = np.array([1e4, 1e4, telemetry.agl_m * std, 180.0, tilt_std, tilt_std])
+        if prior.turn_rad is not None:
+            stds[3] = math.degrees(prior.turn_std_rad)
+        return mean, np.diag(stds**-2)
 
     def _by_camera(self, placed: Placed) -> Placed:
         pose, camera_px = placed.pose, self.view.camera_px
@@ -308,10 +455,12 @@ class ViewOverRelief(ViewOnLevelGround):
                 return found
         return None
 
-    def templates_at(self, pose: Pose, level: int) -> ViewTemplates | None:
+    def templates_at(
+        self, pose: Pose, level: int, orientation: Orientation | None = None
+    ) -> ViewTemplates | None:
         """The view orthorectified on the terrain under a pose, at a level; None where less than
-        half of the window is known."""
-        orientation = self.orientation(pose)
+        half of the window is known. `orientation`: of the camera; None: that of the pose."""
+        orientation = orientation or self.orientation(pose)
         if orientation is None:
             return None
         final = self.view.levels.final
@@ -325,13 +474,18 @@ class ViewOverRelief(ViewOnLevelGround):
 
     def orientation(self, pose: Pose) -> Orientation | None:
         """Where the camera is under a pose; None where less than half of its ground is known."""
-        heights = self.relief.ground_m(pose.map_px(self._reference_px))[:, 2]
-        known = np.isfinite(heights)
-        if known.mean() < MIN_KNOWN:
+        reference_m = self._reference_m(pose)
+        if math.isnan(reference_m):
             return None
         telemetry = self.view.picture_at(self.view.levels.final).telemetry
         above_m = telemetry.agl_m * math.exp(pose.log_scale)
         east, north = self.relief.en_m(pose.map_px(self.view.camera_px))
-        position = np.array([east, north, float(heights[known].mean()) + above_m])
+        position = np.array([east, north, reference_m + above_m])
         attitude = np.array([math.degrees(pose.turn_rad), telemetry.pitch_deg, telemetry.roll_deg])
         return Orientation(position, attitude)
+
+    def _reference_m(self, pose: Pose) -> float:
+        """Mean height of the ground of the window; NaN where less than half of it is known."""
+        heights = self.relief.ground_m(pose.map_px(self._reference_px))[:, 2]
+        known = np.isfinite(heights)
+        return float(heights[known].mean()) if known.mean() >= MIN_KNOWN else math.nan

@@ -160,10 +160,7 @@ class _TiltProfile:
         if not isinstance(view, PreparedView):
             return None
         pose = self._registration.pose_of(view, mean + sign * self.step_rad * slopes[:, axis])
-        refiner = self._registration.registrar.refiner(
-            view.templates, view.levels, view.levels.final
-        )
-        return refiner.place(pose, STEPS, SMALL_STEP_PX).score
+        return self._registration.on_ground(view).score_near(pose, STEPS, SMALL_STEP_PX)
 
     def fitted(
         self, middle: float, after: float, before: float, worth: float

@@ -120,6 +120,21 @@ class Refiner:
             best, covariance=covariance, agreement=seen.agreement(), blocks_t=seen.blocks_t()
         )
 
+    def pulls(self, pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What moves each block of the view over the map at `pose`: gradient (B * B, 2) of the
+        score's decrease and curvature (B * B, 2, 2), by level-0 pixels of the map."""
+        template = self.template
+        window = MapWindow.of(template, self.reference, pose, SLACK_PX)
+        seen = self._scratch.seen(window, pose)
+        terms = np.einsum("cphw,chw->phw", template.jacobian[:, :2], seen.residual)
+        slopes = template.block_sums(terms).astype(np.float64).T
+        share = template.block_sums(seen.counts) / np.maximum(template.block_pixels, 1.0)
+        each = np.tensordot(template.block_hessians, seen.squares, axes=([1], [0]))
+        to_window = np.linalg.inv(pose.linear * 2.0**template.level)
+        curvature = to_window.T @ (share[:, None, None] * each[:, :2, :2]) @ to_window
+        # A step of the window moves what it shows the other way.
+        return -slopes @ to_window, curvature
+
     def _hessian(self, seen: "_Seen") -> NDArray[np.float64]:
         """Gauss-Newton matrix (4, 4) over the part of the view that lies on the map."""
         if seen.overlap > WHOLE_OVERLAP:

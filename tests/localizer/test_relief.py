@@ -1,0 +1,190 @@
+"""Views of relief on a map with a terrain, against rays that are followed to the ground."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from benchmarks.relief_views import Raster, random_relief, seen_view
+from blots import AGL_M, CAMERA, FINEST_M, GROUND, as_grey, known_map, rendered
+
+from orthonav.geo.ground import Ground
+from orthonav.localizer import Localizer
+from orthonav.localizer.relief import Relief
+from orthonav.mapfile import open_map
+from orthonav.records import Fix, Telemetry, View
+
+SIDE_M, POSTING_M = 700.0, 10.0
+PLACE = np.array([30.0, -40.0])
+ATTITUDE = (70.0, 4.0, -3.0)
+BASE_M = 100.0
+
+
+class Terrain:
+    """Heights of a raster, as a terrain layer gives them."""
+
+    def __init__(self, raster):
+        self.raster = raster
+
+    def at_en_m(self, points_en_m):
+        points = np.asarray(points_en_m, float)
+        return self.raster.at(points[..., 0], points[..., 1])
+
+
+@pytest.fixture(scope="module")
+def opened(made_once, make_ortho):
+    return open_map(known_map(made_once, make_ortho).path)
+
+
+@pytest.fixture(scope="module")
+def grey():
+    at = np.arange(FINEST_M / 2, SIDE_M, FINEST_M) - SIDE_M / 2
+    east, north = np.meshgrid(at, -at)
+    made = as_grey(GROUND(east, north)).astype(np.float32)
+    return Raster(made, -SIDE_M / 2, SIDE_M / 2, FINEST_M)
+
+
+def hills(slope):
+    side = int(SIDE_M / POSTING_M)
+    made = random_relief((side, side), POSTING_M, slope, 120.0, 3) + np.float32(BASE_M)
+    return Raster(made, -SIDE_M / 2, SIDE_M / 2, POSTING_M)
+
+
+@pytest.fixture(scope="module")
+def relief():
+    return hills(0.3)
+
+
+def on_terrain(opened, relief):
+    localizer = Localizer(opened)
+    localizer.registration.relief = Relief(Terrain(relief), localizer.grid)
+    return localizer
+
+
+def seen_from(grey, relief, attitude=ATTITUDE, agl_m=AGL_M, place=PLACE):
+    """A view, and the position (3,) of its camera."""
+    below = float(relief.at(place[:1], place[1:])[0])
+    position = np.array([*place, below + agl_m])
+    picture, _ = seen_view(grey, relief, CAMERA, attitude, position, finer=1)
+    return picture, position
+
+
+def telemetry(attitude=ATTITUDE, agl_m=AGL_M, **more):
+    return Telemetry(0, *attitude, agl_m, **more)
+
+
+def error_m(localizer, fix, place=PLACE):
+    assert isinstance(fix, Fix), fix
+    return float(
+        np.hypot(*(localizer.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg) - place))
+    )
+
+
+def test_a_view_of_hills_is_placed_as_one_of_level_ground(opened, grey, relief):
+    picture, _ = seen_from(grey, relief)
+    view = View(picture, CAMERA, telemetry((73.0, 4.0, -3.0), AGL_M * 1.04))
+    fix = (localizer := on_terrain(opened, relief)).locate(view)
+    assert error_m(localizer, fix) < 0.5 and fix.confidence > 0.9
+    assert fix.agl_m == pytest.approx(AGL_M, rel=0.005)
+    assert abs(math.remainder(fix.heading_deg - ATTITUDE[0], 360)) < 0.3
+    level = (flat := Localizer(opened, level_ground=True)).locate(view)
+    assert error_m(flat, level) > 3 * error_m(localizer, fix)
+    assert fix.evidence["terrain_gain"] > 1.05 and fix.evidence["score"] > level.evidence["score"]
+    assert "terrain_gain" not in level.evidence and level.ground_latlon_deg is None
+
+
+def test_the_ground_seen_is_that_of_the_middle_of_the_picture(opened, grey, relief):
+    attitude = (70.0, 20.0, 0.0)
+    below = float(relief.at(PLACE[:1], PLACE[1:])[0])
+    position = np.array([*PLACE, below + AGL_M])
+    picture, ground = seen_view(grey, relief, CAMERA, attitude, position, finer=1)
+    fix = (localizer := on_terrain(opened, relief)).locate(
+        View(picture, CAMERA, telemetry(attitude))
+    )
+    seen = localizer.sheet.frame.en_from_latlon(*fix.ground_latlon_deg)
+    middle = ground[CAMERA.height_px // 2, CAMERA.width_px // 2]
+    assert float(np.hypot(*(seen - middle[:2]))) < 2.0
+
+
+def test_pitch_and_roll_are_estimated_where_their_deviation_is_reported(opened, grey, relief):
+    picture, _ = seen_from(grey, relief)
+    off = (72.0, ATTITUDE[1] + 1.5, ATTITUDE[2] - 1.5)
+    localizer = on_terrain(opened, relief)
+    errors = [
+        error_m(localizer, localizer.locate(View(picture, CAMERA, telemetry(off, **known))))
+        for known in ({}, {"tilt_std_deg": 1.5})
+    ]
+    assert errors[0] > 3.5 and errors[1] < 0.5 * errors[0]
+
+
+@pytest.mark.parametrize("wrong", ["displaced", "50 m too high", "inside out"])
+def test_a_wrong_terrain_gives_no_confident_wrong_position(opened, grey, relief, wrong):
+    values = relief.values
+    made = {
+        "displaced": replace(relief, west_m=relief.west_m + 200.0),
+        "50 m too high": replace(relief, values=values + np.float32(50)),
+        "inside out": replace(relief, values=2 * values.mean() - values),
+    }[wrong]
+    picture, position = seen_from(grey, relief)
+    below = Ground(float(made.values.mean()), float(made.values.std()), 1.0)
+    agl_m = float(position[2] - below.height_m)
+    own = math.hypot(0.08 * agl_m, below.std_m)
+    view = View(picture, CAMERA, telemetry(agl_m=agl_m, agl_std_m=own, below=below))
+    fix = (localizer := on_terrain(opened, made)).locate(view)
+    assert not isinstance(fix, Fix) or fix.confidence < 0.9 or error_m(localizer, fix) < 10
+    if wrong == "inside out" and isinstance(fix, Fix):
+        assert fix.evidence["terrain_gain"] <= 1
+
+
+def test_holes_are_not_compared(opened, grey, relief):
+    holed = replace(relief, values=relief.values.copy())
+    holed.values[:, 38:] = np.nan
+    picture, _ = seen_from(grey, relief)
+    fix = (localizer := on_terrain(opened, holed)).locate(View(picture, CAMERA, telemetry()))
+    assert not isinstance(fix, Fix) or fix.confidence < 0.9 or error_m(localizer, fix) < 10
+    nothing = replace(relief, values=np.full_like(relief.values, np.nan))
+    fix = (localizer := on_terrain(opened, nothing)).locate(View(picture, CAMERA, telemetry()))
+    level = Localizer(opened, level_ground=True).locate(View(picture, CAMERA, telemetry()))
+    assert (fix.lat_deg, fix.lon_deg) == (level.lat_deg, level.lon_deg)
+
+
+def test_the_scale_is_known_place_by_place(opened, grey):
+    """By the height above sea: a plain and a plateau, seen at scales that differ by 1.6."""
+    steps = hills(0.0)
+    east = steps.west_m + (np.arange(steps.values.shape[1]) + 0.5) * POSTING_M
+    steps.values[:, east > 0] += np.float32(60)
+    localizer = on_terrain(opened, steps)
+    below = Ground(float(steps.values.mean()), float(steps.values.std()), 1.0)
+    for place, agl_m in (([150.0, 20.0], 100.0), ([-150.0, 20.0], 160.0)):
+        picture, position = seen_from(grey, steps, (70.0, 0.0, 0.0), agl_m, np.array(place))
+        reported = float(position[2] - below.height_m)
+        own = math.hypot(0.03 * reported, below.std_m)
+        view = telemetry((72.0, 0.0, 0.0), reported, agl_std_m=own, below=below)
+        fix = localizer.locate(View(picture, CAMERA, view))
+        assert error_m(localizer, fix, np.array(place)) < 1.0 and fix.confidence > 0.9
+        assert fix.agl_m == pytest.approx(agl_m, rel=0.01)
+
+
+@pytest.mark.parametrize("pitch_deg", [50.0, 60.0])
+def test_views_far_off_nadir_over_level_ground(opened, pitch_deg):
+    attitude = (20.0, pitch_deg, 4.0)
+    place = np.array([-60.0, -150.0])
+    picture = rendered(GROUND, place, attitude, 100.0)
+    localizer = Localizer(opened)
+    fix = localizer.locate(View(picture, CAMERA, telemetry((22.0, *attitude[1:]), 102.0)))
+    assert error_m(localizer, fix, place) < 2.0 and fix.confidence > 0.9
+    assert fix.agl_m == pytest.approx(100.0, rel=0.02)
+    assert "terrain_gain" not in fix.evidence
+    seen = localizer.sheet.frame.en_from_latlon(*fix.ground_latlon_deg) - place
+    assert np.hypot(*seen) == pytest.approx(100 * math.tan(math.radians(pitch_deg)), rel=0.05)
+
+
+def test_level_ground_is_as_without_a_terrain(opened):
+    """Views of a map whose terrain is level are placed as on a map without one."""
+    picture = rendered(GROUND, PLACE, ATTITUDE)
+    view = View(picture, CAMERA, telemetry((72.0, 4.0, -3.0), AGL_M * 1.03))
+    fix, level = (each.locate(view) for each in (on_terrain(opened, hills(0.0)), Localizer(opened)))
+    assert fix.lat_deg == pytest.approx(level.lat_deg, abs=1e-9)
+    assert fix.confidence == level.confidence
+    assert fix.cov_en_m2.tolist() == level.cov_en_m2.tolist()
+    assert {**fix.evidence} == {**level.evidence, "terrain_gain": 1.0}
