@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from orthonav.changes.record import ChangedGround
 from orthonav.check.outcome import CheckedInputs
 from orthonav.errors import CheckError
 from orthonav.geo.camera import Camera
@@ -42,6 +43,7 @@ class CheckRequest:
     `extras`: also try other errors of heading and height, and other heights.
     `workers`: processes; None: one per core.
     `seed`: of the trials.
+    `changes`: ground that changed since the map was made, as a flight saw it; optional.
     `about`: texts for the report.
     """
 
@@ -62,6 +64,7 @@ class CheckRequest:
     extras: bool = True
     workers: int | None = None
     seed: int = 1
+    changes: ChangedGround | None = None
     about: CheckedInputs = field(default_factory=CheckedInputs)
 
     def __post_init__(self) -> None:

@@ -134,6 +134,7 @@ class _Check:
             request.prior_std_m,
             request.relief_m,
             request.seed,
+            changes=request.changes,
         )
         short_m, long_m = sorted((plan.width_m, plan.height_m))
         if long_m > MAX_ASPECT * short_m:
@@ -186,6 +187,7 @@ class _Check:
         """Run the trials and derive everything from them."""
         request, side_m = self.request, self.plan.side_m
         rng = np.random.default_rng([request.seed, 4])
+        lasting = self.coverage.without(request.changes, self.sheet.frame)
         places = trial_places(self.coverage, self.area, self.extent, side_m, request.effort, rng)
         own, other = self._trials(places)
         envelope, heights = self._extra_trials(own, rng) if request.extras else (None, [])
@@ -198,14 +200,16 @@ class _Check:
             other_date=other,
             # Trials do not show how well orthophotos of two dates agree.
             least_error_m=self.floor_px * self.sheet.grid.gsd_m * math.sqrt(2),
-            coverage=lambda points: self.coverage.seen_share(points, side_m),
+            coverage=lambda points: lasting.seen_share(points, side_m),
         )
         cells = self._cells(predictor, own)
         along = self._along(predictor)
-        outside = 0.0
+        outside = changed = 0.0
         if along is not None:
             outside = float(1 - self.coverage.covers(along.points_en_m).mean())
         known = np.isfinite(cells.probability)
+        if known.any():
+            changed = float(cells.changed[known].mean())
         mean = float(cells.probability[known].mean()) if known.any() else 0.0
         findings = Findings(
             conditions=self.conditions,
@@ -214,6 +218,7 @@ class _Check:
             wrong=int(predictor.wrong.sum()),
             trials=len(own) + len(other),
             outside=outside,
+            changed=changed,
             along=along,
             stretches=() if along is None else blind_stretches(along, self.conditions, side_m),
             lookalikes=found_lookalikes(
@@ -313,8 +318,17 @@ class _Check:
             whole[here] = getattr(found, each.name)
             columns[each.name] = whole.reshape(grid.rows, grid.cols)
         del columns["weight"]
+        columns["changed"] = self._changed(grid)
         trials = grid.counts(np.array([each.en_m for each in own]))
         return Cells(grid.west_m, grid.north_m, side_m, trials=trials, **columns)
+
+    def _changed(self, grid: CellGrid) -> Array:
+        """Share (rows, cols) of every cell that changed since the map was made."""
+        if self.request.changes is None:
+            return np.zeros((grid.rows, grid.cols))
+        whole = self.coverage.cell_share(grid)
+        lasting = self.coverage.without(self.request.changes, self.sheet.frame).cell_share(grid)
+        return np.clip(1 - lasting / np.maximum(whole, 1e-6), 0.0, 1.0) * (whole > 0)
 
     def _along(self, predictor: Predictor) -> Along | None:
         if self.area is None:

@@ -21,6 +21,8 @@ GO_OUTSIDE, NO_GO_OUTSIDE = 0.005, 0.1
 """Share of the route outside the map."""
 GO_WRONG, NO_GO_WRONG = 0.005, 0.02
 """Share of trials that were confident and wrong."""
+MAX_CHANGED = 0.1
+"""Share of the ground that changed since the map was made, beyond which a route is marginal."""
 MIN_WRONG = 2
 """A single wrong trial may be chance."""
 TOO_FAR = 2.0
@@ -36,6 +38,7 @@ class Findings:
     `calibrated`: the map carries a confidence model.
     `wrong`, `trials`: number of confident and wrong trials, and of all.
     `outside`: share of the route outside the map, 0 to 1.
+    `changed`: share of the checked area that changed since the map was made, 0 to 1.
     """
 
     conditions: Conditions
@@ -47,6 +50,7 @@ class Findings:
     along: Along | None
     stretches: tuple[BlindStretch, ...]
     lookalikes: tuple[Lookalike, ...]
+    changed: float = 0.0
 
 
 def verdict_of(found: Findings) -> Verdict:
@@ -55,7 +59,7 @@ def verdict_of(found: Findings) -> Verdict:
     if found.along is not None:
         reasons += [*_outside(found.outside), _drift(found, found.along)]
         reasons += _blind(found.stretches)
-    reasons += _lookalikes(found)
+    reasons += [*_changed(found), *_lookalikes(found)]
     reasons.sort(key=lambda reason: _ORDER.index(reason.word))
     return Verdict(reasons[0].word, tuple(reasons))
 
@@ -92,6 +96,18 @@ def _outside(share: float) -> list[Reason]:
         return []
     word = Word.NO_GO if share > NO_GO_OUTSIDE else Word.MARGINAL
     return [Reason("outside_map", f"{100 * share:.0f} % of the route is outside the map.", word)]
+
+
+def _changed(found: Findings) -> list[Reason]:
+    """A warning: what changed lowers the probability, from which the verdict follows."""
+    if found.changed <= 0:
+        return []
+    where = "along the route" if found.along is not None else "on the map"
+    text = f"{100 * found.changed:.1f} % of the ground {where} changed since the map was made: "
+    text += "fixes are rarer there; build the map from newer imagery."
+    return [
+        Reason("changed_ground", text, Word.MARGINAL if found.changed > MAX_CHANGED else Word.GO)
+    ]
 
 
 def _drift(found: Findings, along: Along) -> Reason:

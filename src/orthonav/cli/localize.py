@@ -6,6 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from orthonav.cli.changed import (
+    add_report_changes,
+    changes_text,
+    changes_to_plain,
+    check_comparable,
+    report_changes,
+)
 from orthonav.cli.common import print_json, progress
 from orthonav.cli.flown import compare_with_flight, take_flown
 from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
@@ -15,6 +22,7 @@ from orthonav.cli.signed import add_signature, checked_signature
 from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
 
 if TYPE_CHECKING:
+    from orthonav.changes.record import ChangedGround
     from orthonav.confidence.accept import Acceptance
     from orthonav.records import ViewResult
 
@@ -118,6 +126,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="flight log: use the options of the flight",
     )
+    add_report_changes(parser)
     add_signature(parser)
     add_source(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -161,6 +170,7 @@ def _on_map(options: argparse.Namespace) -> None:
         raise VariantError("--accept lowe_ratio compares tiles: it needs --registration off")
     if localizer.registration is None and options.registration == "on":
         log.warning("the map has no registration layer: positions are at tile level")
+    check_comparable(options, localizer.registration, opened)
     warn_if_far_from_map(flight, localizer)
     how = {
         "use_prior": options.prior == "telemetry",
@@ -196,7 +206,8 @@ def _on_map(options: argparse.Namespace) -> None:
             compare_with_flight(flight, results)
         write_results(options.out, results)
         advice, tried = doubts.advice(results, accept, shown)
-    _print_summary(options, results, accept, advice, tried)
+        changed = report_changes(options, opened, [(flight, results)], shown)
+    _print_summary(options, results, accept, advice, tried, changed)
 
 
 def _on_atlas(options: argparse.Namespace) -> None:
@@ -215,7 +226,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
         name
         for name in (
             *("track", "smooth", "mount", "as_flown", "require_signed", "not_before", "lag"),
-            *("dem", "dem_datum"),
+            *("dem", "dem_datum", "report_changes"),
         )
         if getattr(options, name) not in (None, False)
     ]
@@ -255,6 +266,7 @@ def _print_summary(
     accept: "Acceptance",
     advice: Sequence[str] = (),
     tried: Sequence[dict[str, Any]] = (),
+    changed: "ChangedGround | None" = None,
 ) -> None:
     """Print the summary."""
     import numpy as np
@@ -273,6 +285,7 @@ def _print_summary(
         "median_latency_ms": None if median_ms is None else round(median_ms, 3),
         "advice": list(advice),
         "setups": list(tried),
+        **changes_to_plain(options, changed),
     }
     if options.json:
         print_json(plain)
@@ -286,3 +299,5 @@ def _print_summary(
         print(f"! {line}")
     guesses = "; unsure positions are best guesses, marked as such" * bool(counts.unsure)
     print(f"written to {options.out}{guesses}")
+    for line in changes_text(options, changed):
+        print(line)
