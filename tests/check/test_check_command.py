@@ -10,6 +10,7 @@ import rasterio
 from made_trials import lost, right
 
 from helpers import write_dem
+from orthonav.changes.record import ChangedGround, ChangeGrid, write_changes
 from orthonav.check import run as check_run
 from orthonav.check.outcome import Word
 from orthonav.check.request import CheckRequest
@@ -22,6 +23,7 @@ from orthonav.geo.camera import Camera
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.route import Route
 from orthonav.mapfile import open_map
+from orthonav.mapfile.signature import map_digest
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 
@@ -356,6 +358,27 @@ def test_command(run, untried, half_blank, route_path, tmp_path):
 def unwritten(untried, monkeypatch):
     """Nothing is written."""
     monkeypatch.setattr("orthonav.check.write.write_check", lambda result, opened, out: out)
+
+
+def test_changed_ground_is_named(run, unwritten, half_blank, frame, tmp_path):
+    """In the west it is part of the cells, and the report of another map is doubted."""
+    grid = ChangeGrid(frame, -400.0, 100.0, 100.0, 2, 2)
+    ones = np.ones((2, 2))
+    path = tmp_path / "changes.geojson"
+    command = ("check", half_blank.map, *VIEWS, "--json", "--out", tmp_path / "report")
+    for digest, said in ((map_digest(half_blank.map), ""), ("0" * 64, "with another map")):
+        gone = ChangedGround(grid, ones, ones.astype(np.int32), ones > 0, "old.onav", digest)
+        write_changes(path, gone)
+        done = run(*command, "--changes", path)
+        assert said in done.err and (said or not done.err)
+    plain = json.loads(done.out)
+    assert "changed_ground" in [reason["code"] for reason in plain["verdict"]["reasons"]]
+    cells = plain["cells"]
+    changed_m2 = np.array(cells["changed"]).sum() * cells["side_m"] ** 2
+    assert changed_m2 == pytest.approx(4 * 100.0**2, rel=0.1)
+    unchanged = json.loads(run(*command).out)
+    assert not np.any(unchanged["cells"]["changed"])
+    assert "changed_ground" not in [each["code"] for each in unchanged["verdict"]["reasons"]]
 
 
 @pytest.mark.parametrize("word", list(Word), ids=lambda word: word.value)

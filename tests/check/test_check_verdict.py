@@ -55,6 +55,12 @@ def test_go():
     assert judged(FLOWN) == (Word.GO, {"fixes": Word.GO, "drift": Word.GO})
 
 
+def test_changed_ground_is_a_warning_and_much_of_it_is_marginal():
+    assert judged(replace(FINE, changed=0.02))[1]["changed_ground"] is Word.GO
+    word, reasons = judged(replace(FINE, changed=0.2))
+    assert word is Word.MARGINAL and reasons["changed_ground"] is Word.MARGINAL
+
+
 def test_exit_codes():
     assert {word: word.exit_code for word in Word} == {Word.GO: 0, Word.MARGINAL: 3, Word.NO_GO: 4}
 
