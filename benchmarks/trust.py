@@ -208,10 +208,10 @@ def _scenes_table(judged: Judged) -> Table:
         *("calibration error", "shipped: accepted", "wrong", "calibration error"),
     )
     notes = (
-        f"accepted: confidence of {CONFIDENT:g} or more; right: within 35 m or 10 px; heading sd "
-        "10 deg, height sd 10 %",
+        f"accepted: confidence of {CONFIDENT:g} or more; right: within 35 m or 10 px, with a prior "
+        "within 20 px; heading sd 10 deg, height sd 10 %, tracked: 2 deg and 3 %",
         "by a fit to the other scenes; shipped: by the weights of the program, which are fitted to "
-        "other views of the real ones among these scenes",
+        "all of these views",
     )
     return Table("Confidence on scenes left out", header, rows, notes)
 
@@ -232,15 +232,16 @@ def _features_table(judged: Judged) -> Table:
 
 def _cases_table(judged: Judged) -> Table:
     confidence = judged.left_out()
-    keys = ("kind", "width_px", "heading_known", "prior_px")
+    keys = ("kind", "width_px", "heading_known", "prior_px", "tracked")
     cases = dict.fromkeys(tuple(each[key] for key in keys) for each in judged.rows)
     rows = []
     for case in cases:
         inside = judged.where(**dict(zip(keys, case, strict=True)))
-        kind, width_px, known, prior_px = case
+        kind, width_px, known, prior_px, tracked = case
         words = [kind, f"{width_px} px"]
         words += [] if known else ["heading unknown"]
         words += [] if prior_px is None else [f"prior {prior_px:g} px"]
+        words += ["tracked"] if tracked else []
         rows.append(
             [
                 ", ".join(words),

@@ -24,13 +24,17 @@ from orthonav.localizer import Localizer
 from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.mapfile import open_map
 from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import NoFix, Telemetry, View
+from orthonav.records import PRIOR_SIGMAS, NoFix, Telemetry, View
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 from orthonav.simulate.landscape import DEFAULT_DATES
 
 YAW_STD_DEG, AGL_STD = 10.0, 0.1
-FAR_PX, FAR_M = 10.0, 35.0
-"""A view is right within the larger of these."""
+TRACK_YAW_STD_DEG, TRACK_AGL_STD = 2.0, 0.03
+"""Errors of heading and height, and what a track knows of them."""
+FAR_PX, FAR_M, FAR_FROM_PRIOR_PX = 10.0, 35.0, 20.0
+"""A view is right within the larger of the first two, one with a prior within the third: chance
+finds places within 35 m of it too. Maps and views of Tours are up to 17 px apart."""
+METRES_PER_DEG = 111_320.0
 BESIDE_SHARE = 0.9
 """Views beside the map are farther from its border than this share of their width."""
 
@@ -54,11 +58,13 @@ class Pair:
 class Case:
     """Views of one kind.
 
-    - `kind`: `found`, or those that are not on the map: `mirrored`, `other scene`, `beside`.
+    - `kind`: `found`, or those that are not on the map or not there: `mirrored`, `other scene`,
+      `beside`, `other prior` (that of another view).
     - `width_px`: shorter side of the view on the ground, pixels of the map.
     - `share`: number of views, as a share of the requested one.
     - `heading_known`: whether the reported heading is used; `prior_px`: standard deviation of a
       prior position, pixels of the map, None without.
+    - `tracked`: heading and height are known as a track knows them.
     """
 
     kind: str
@@ -66,6 +72,7 @@ class Case:
     share: float
     heading_known: bool = True
     prior_px: float | None = None
+    tracked: bool = False
 
 
 CASES = (
@@ -84,6 +91,16 @@ CASES = (
     Case("other scene", 128, 0.4),
     Case("beside", 256, 1.0),
     Case("beside", 128, 1.0),
+    Case("mirrored", 128, 0.4, prior_px=40.0),
+    Case("mirrored", 64, 0.3, prior_px=40.0),
+    Case("other prior", 128, 0.4, prior_px=40.0),
+    Case("other prior", 64, 0.3, prior_px=40.0),
+    Case("found", 256, 0.4, prior_px=12.0, tracked=True),
+    Case("found", 128, 0.4, prior_px=12.0, tracked=True),
+    Case("mirrored", 256, 0.4, prior_px=12.0, tracked=True),
+    Case("mirrored", 128, 0.4, prior_px=12.0, tracked=True),
+    Case("other prior", 256, 0.4, prior_px=12.0, tracked=True),
+    Case("other prior", 128, 0.4, prior_px=12.0, tracked=True),
 )
 
 
@@ -145,13 +162,7 @@ def _rows(
             gsd_m = _gsd_m(over)
         folder = _flight(over, case, count, seed + number, work)
         localizer = half if case.kind == "beside" else whole
-        for name, view, truth in _flown(folder):
-            if case.kind == "beside":
-                span_deg = case.width_px * _gsd_m(over) / 111_320
-                if truth[1] < middle + BESIDE_SHARE * span_deg / math.cos(math.radians(truth[0])):
-                    continue
-            if case.kind == "mirrored":
-                view = replace(view, grey=np.ascontiguousarray(view.grey[:, ::-1]))
+        for name, view, truth in _flown_for(case, folder, _gsd_m(over), middle):
             if gsd_m is not None:
                 scale = localizer.grid.gsd_m / gsd_m
                 view = replace(view, telemetry=_scaled(view.telemetry, scale))
@@ -161,6 +172,25 @@ def _rows(
                 if case.kind == "found" and not _is_covered(localizer, truth, case.width_px):
                     about["kind"] = "beside"
                 yield {**about, **row}
+
+
+def _flown_for(
+    case: Case, folder: Path, gsd_m: float, middle_deg: float
+) -> Iterator[tuple[str, View, tuple[float, float]]]:
+    """The views of a flight as a case needs them: mirrored, or some left out."""
+    flown = list(_flown(folder))
+    if case.kind == "other prior":
+        yield from _with_other_priors(flown, case, gsd_m)
+        return
+    for name, view, truth in flown:
+        if case.kind == "beside":
+            span_deg = case.width_px * gsd_m / METRES_PER_DEG
+            if truth[1] < middle_deg + BESIDE_SHARE * span_deg / math.cos(math.radians(truth[0])):
+                continue
+        if case.kind == "mirrored":
+            yield name, replace(view, grey=np.ascontiguousarray(view.grey[:, ::-1])), truth
+        else:
+            yield name, view, truth
 
 
 def _placed(
@@ -175,7 +205,8 @@ def _placed(
     assert localizer.confidence is not None
     place = localizer.camera_en_m(seen.prepared, found.placed.pose)
     error_m = float(np.hypot(*(place - localizer.sheet.frame.en_from_latlon(*truth))))
-    right = case.kind == "found" and error_m <= max(FAR_M, FAR_PX * gsd_m)
+    far_m = max(FAR_M, FAR_PX * gsd_m) if prior is None else FAR_FROM_PRIOR_PX * gsd_m
+    right = case.kind == "found" and error_m <= far_m
     return {
         "evidence": found.evidence(),
         "chances": asdict(localizer.confidence.chances),
@@ -212,6 +243,21 @@ def _flown(folder: Path) -> Iterator[tuple[str, View, tuple[float, float]]]:
         )
 
 
+def _with_other_priors(
+    views: Sequence[tuple[str, View, tuple[float, float]]], case: Case, gsd_m: float
+) -> Iterator[tuple[str, View, tuple[float, float]]]:
+    """Views with the prior of the view before, where that is far from their own place."""
+    assert case.prior_px is not None
+    least_m = (2 * PRIOR_SIGMAS * case.prior_px + case.width_px) * gsd_m
+    for number, (name, view, truth) in enumerate(views):
+        prior = views[number - 1][1].telemetry.prior
+        assert prior is not None
+        north_m = (prior.lat_deg - truth[0]) * METRES_PER_DEG
+        east_m = (prior.lon_deg - truth[1]) * METRES_PER_DEG * math.cos(math.radians(truth[0]))
+        if math.hypot(north_m, east_m) > least_m:
+            yield name, replace(view, telemetry=replace(view.telemetry, prior=prior)), truth
+
+
 def _scaled(telemetry: Telemetry, scale: float) -> Telemetry:
     """Telemetry at a height so much greater, for imagery of another ground resolution."""
     std_m = telemetry.agl_std_m
@@ -242,11 +288,15 @@ def _localizer(
 def _flight(ortho: Path, case: Case, count: int, seed: int, work: Path) -> Path:
     """A simulated flight at random places, stored in `work`."""
     name = f"{ortho.parent.name}-{ortho.stem}-{case.width_px}-{count}-{case.prior_px}-{seed}"
+    name += "-tracked" if case.tracked else ""
     folder = work / name
     if not folder.is_dir():
         gsd_m = _gsd_m(ortho)
         prior_m = None if case.prior_px is None else case.prior_px * gsd_m
-        errors = Errors(yaw_std_deg=YAW_STD_DEG, agl_std=AGL_STD, prior_std_m=prior_m)
+        yaw_std_deg, agl_std = YAW_STD_DEG, AGL_STD
+        if case.tracked:
+            yaw_std_deg, agl_std = TRACK_YAW_STD_DEG, TRACK_AGL_STD
+        errors = Errors(yaw_std_deg=yaw_std_deg, agl_std=agl_std, prior_std_m=prior_m)
         agl_m = case.width_px * gsd_m / min(DEFAULT_CAMERA.extent)
         request = SimulateRequest(
             [ortho], folder, random=count, agl_m=agl_m, errors=errors, seed=seed

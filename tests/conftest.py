@@ -34,8 +34,9 @@ SEED = 2
 # Nothing that tests write has to outlive the machine. A file that is closed is still an error.
 os.fsync = os.fstat
 cv2.setNumThreads(1)  # tests run side by side
+gc.set_threshold(20_000, 20, 50)  # of many small objects; the garbage of tests is little
 # A slow or busy machine fails no test: the time limit of a whole test is in pyproject.toml.
-hypothesis.settings.register_profile("orthonav", deadline=None)
+hypothesis.settings.register_profile("orthonav", deadline=None, max_examples=50)
 hypothesis.settings.load_profile("orthonav")
 
 

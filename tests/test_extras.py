@@ -20,7 +20,7 @@ from orthonav.errors import MissingExtraError
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-FOR_DEVELOPERS = {"dev", "docs", "test"}
+FOR_DEVELOPERS = {"dev", "docs", "matchers", "test"}
 USED = sorted({extra for needed in NEEDS.values() for extra in needed})
 
 BLOCKED = """

@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from absent import ABSENT
 
 FORBIDDEN = ("torch", "rasterio", "pyproj", "shapely", "matplotlib", "osgeo")
@@ -90,6 +92,7 @@ def test_a_fix_without_heavy_libraries(map_path, flight_path, tmp_path, names_in
     assert names_in(tmp_path) == []
 
 
+@pytest.mark.slow  # starts PyTorch again
 def test_importing_has_no_side_effect(tmp_path, names_in):
     names = json.loads(fresh(ALL_MODULES, *ABSENT, cwd=tmp_path))
     assert "orthonav.localizer.localizer" in names and len(names) > 50

@@ -35,7 +35,7 @@ def test_the_page_of_the_package_index_has_no_relative_link():
 
 def test_the_page_of_the_package_index_names_every_extra():
     text = (ROOT / PROJECT["readme"]).read_text("utf-8")
-    for name in set(PROJECT["optional-dependencies"]) - {"dev", "docs", "test"}:
+    for name in set(PROJECT["optional-dependencies"]) - {"dev", "docs", "matchers", "test"}:
         assert f"`orthonav[{name}]`" in text
 
 
@@ -65,7 +65,7 @@ def test_workflows_and_issue_forms_are_whole():
 def test_commands_of_the_wheel_script_are_understood():
     lines = [line for lines in try_wheel.COMMANDS.values() for line in lines]
     assert len(lines) > 10
-    extras = set(PROJECT["optional-dependencies"]) - {"dev", "docs", "test"}
+    extras = set(PROJECT["optional-dependencies"]) - {"dev", "docs", "matchers", "test"}
     assert extras <= set(try_wheel.COMMANDS | try_wheel.SCRIPTS)
     for words in map(shlex.split, lines):
         assert _parser(words).parse_args(words).command == words[0]

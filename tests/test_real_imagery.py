@@ -23,7 +23,7 @@ from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
 
 BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 DATA = Path(os.environ.get("ORTHONAV_DATA", BESIDE))
-VIEWS = 16
+VIEWS = 10
 WITHIN_STRIDES = 0.75
 ERRORS = Errors(yaw_std_deg=5.0, agl_std=0.05)
 PAIRS = {

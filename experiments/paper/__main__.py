@@ -14,11 +14,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from orthonav.errors import MissingExtraError
+
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-PARTS = ("A", "B", "C", "D", "real", "untuned", "own", "baselines")
+PARTS = ("A", "B", "C", "D", "real", "untuned", "own", "baselines", "field")
 WHAT = ("run", "report", "keep", "check")
-NETWORKS = ("triplet", "autoencoder")
-ORDER = ("triplet", "autoencoder", "gradient", "bovw")
+NETWORKS = ("triplet", "caevl", "autoencoder")
+ORDER = ("triplet", "caevl", "autoencoder", "gradient", "bovw")
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
@@ -66,7 +68,6 @@ def _stored(options: argparse.Namespace) -> int:
 
 def _run(options: argparse.Namespace, command: str) -> int:
     """Run all rows that are wanted, several at a time; how many failed."""
-    from experiments.paper import baselines
     from experiments.paper.estimate import lines
     from experiments.paper.methods import GPU_SCENES
     from experiments.paper.pool import cores, side_by_side
@@ -86,10 +87,11 @@ def _run(options: argparse.Namespace, command: str) -> int:
         options.keep_checkpoints,
     )
     wanted = set(options.only or (GPU_SCENES if options.setting == "gpu" else PARTS))
+    if "field" in wanted and not _has_matchers(options):
+        wanted.discard("field")
     tasks = _tasks(options, place, wanted)
     # Those that learn longest first, so that no core is idle at the end.
     tasks.sort(key=lambda task: ORDER.index(task[2].family))
-    based = [task for task in tasks if task[1].name == baselines.TRIED_ON]
     jobs = options.jobs or (cores() if options.setting == "reduced" else 1)
     on_gpu = _has_gpu(options, tasks)
     ahead = [task[1:] for task in tasks if not place.result(task[1], task[2].key).is_file()]
@@ -100,18 +102,51 @@ def _run(options: argparse.Namespace, command: str) -> int:
         _say(f"{_minutes(start)}  {scene.name}: imagery is there")
     failed = 0
     for (_, scene, method), minutes in side_by_side(tasks, jobs):
+        if not options.keep_checkpoints:  # `run` has removed the last one; CAEVL has an earlier one
+            for left in place.work(scene, method.key).glob("*/checkpoint.pt"):
+                left.unlink()
         status = f"failed: {minutes!r}" if isinstance(minutes, Exception) else f"{minutes} min"
         failed += isinstance(minutes, Exception)
         _say(f"{_minutes(start)}  {scene.name} {method.key}: {status}")
-    if "baselines" in wanted and based and baselines.run(place, based[0][1]):
-        _say(f"{_minutes(start)}  baselines")
+    for name in _on_maps(place, wanted, tasks):
+        _say(f"{_minutes(start)}  {name}")
     return failed
+
+
+def _on_maps(place: Any, wanted: set[str], tasks: Sequence[Any]) -> Iterator[str]:
+    """Run what takes the maps of the rows; what was run, as it ends."""
+    from experiments.paper import baselines
+    from experiments.paper.methods import FIELD_SCENES
+
+    for scene in {task[1].name: task[1] for task in tasks}.values():
+        tried = scene.name == baselines.TRIED_ON and "baselines" in wanted
+        if tried and baselines.run(place, scene):
+            yield "baselines"
+        if "field" in wanted and scene.name in FIELD_SCENES:
+            from experiments.paper import field
+
+            if field.run(place, scene):
+                yield f"{scene.name}: the field today"
+
+
+def _has_matchers(options: argparse.Namespace) -> bool:
+    """Whether local features can be run; raises `MissingExtraError` where they were asked for."""
+    from experiments.paper.matchers import require_packages
+
+    try:
+        require_packages()
+    except MissingExtraError as error:
+        if "field" in (options.only or ()):
+            raise
+        _say(f"field skipped: {error}")
+        return False
+    return True
 
 
 def _tasks(options: argparse.Namespace, place: Any, wanted: set[str]) -> list[Any]:
     """All rows of the chosen parts: workplace, scene and method."""
     from experiments.paper import baselines
-    from experiments.paper.methods import methods
+    from experiments.paper.methods import FIELD_SCENES, flown, methods
 
     tasks: list[Any] = []
     for scene in _scenes(options, place.setting, wanted):
@@ -120,11 +155,26 @@ def _tasks(options: argparse.Namespace, place: Any, wanted: set[str]) -> list[An
         chosen = [each for each in rows if not options.methods or each.family in options.methods]
         if not scene.others:
             chosen = [each for each in chosen if not each.needs_dates]
-        if scene.name not in wanted and scene.name == baselines.TRIED_ON:
-            chosen = [each for each in rows if each.key == baselines.MAP_OF]
+        if not _whole(scene, wanted):
+            needed = {baselines.MAP_OF} if "baselines" in wanted else set()
+            if "field" in wanted and scene.name in FIELD_SCENES:
+                needed |= {each.key for each in flown(rows)}
+            chosen = [each for each in rows if each.key in needed]
         tasks += [(place, scene, method) for method in chosen]
         _say(f"           {scene.name}: {tiles:,} tiles, {len(chosen)} runs")
     return tasks
+
+
+def _whole(scene: Any, wanted: set[str]) -> bool:
+    """Whether all rows of a scene are wanted, not only those that another part needs."""
+    from experiments.paper.scenes import REAL, UNTUNED
+    from experiments.paper.trajectories import TABLE_1
+
+    if scene.name in UNTUNED:
+        return "untuned" in wanted
+    if scene.name in {name for name, _, _ in REAL}:
+        return "real" in wanted
+    return scene.name not in TABLE_1 or scene.name in wanted
 
 
 def _require(options: argparse.Namespace) -> None:
@@ -150,19 +200,22 @@ def _has_gpu(options: argparse.Namespace, tasks: Sequence[Any]) -> bool:
 
 def _scenes(options: argparse.Namespace, setting: Any, wanted: set[str]) -> Iterator[Any]:
     from experiments.paper import scenes
+    from experiments.paper.methods import FIELD_SCENES
 
     for name in ("B", "D", "A", "C"):
-        if name in wanted or (name == "B" and "baselines" in wanted):
+        if name in wanted or (name == "B" and wanted & {"baselines", "field"}):
             yield scenes.generated(setting, name, options.out / "areas", options.gsd_m)
     if "own" in wanted and options.past and options.present:
         name = f"own-{options.past.stem}-{options.present.stem}"
         yield scenes.over(name, options.past, options.present, options.gsd_m).of(setting)
     sets = {"real": scenes.real(options.data, setting), "untuned": scenes.untuned(options.data)}
-    for name in (each for each in sets if each in wanted):
+    for name in (each for each in sets if wanted & {each, "field"}):
         found = list(sets[name])
         if not found:
             _say(f"{name} skipped: the optional real imagery beside the checkout is absent")
-        yield from (each.of(setting) for each in found)
+        for each in found:
+            if name in wanted or each.name in FIELD_SCENES:
+                yield each.of(setting)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -173,7 +226,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--setting", choices=("reduced", "gpu", "full"), default="reduced")
     parser.add_argument("--only", nargs="+", choices=PARTS, help="only these parts")
     parser.add_argument(
-        "--methods", nargs="+", metavar="NAME", help="gradient, bovw, autoencoder, triplet"
+        "--methods", nargs="+", metavar="NAME", help="gradient, bovw, autoencoder, caevl, triplet"
     )
     parser.add_argument("--out", type=Path, default=Path("paper_results"), metavar="DIR")
     parser.add_argument(

@@ -9,10 +9,11 @@ from typing import Any
 from experiments.paper.methods import Method
 from experiments.paper.scenes import Scene
 from orthonav import embed
+from orthonav.embed.caevl import CaevlRecipe
 from orthonav.embed.network import AutoEncoderRecipe, TripletRecipe
 from orthonav.variants import make_variant
 
-STEP_MS = {"autoencoder": 15.0, "triplet": 250.0}
+STEP_MS = {"autoencoder": 15.0, "triplet": 250.0, "caevl": 60.0}
 """A step of the full networks on a modern data-centre GPU: assumed from their arithmetic and memory
 traffic, not measured. The first minute of learning gives the true speed."""
 TRAINED_BYTES, STORED_BYTES = 16, 12
@@ -27,7 +28,8 @@ def steps(method: Method, tiles: int) -> int:
     recipe = make_variant(embed.TABLE, method.recipe)
     if not isinstance(recipe, AutoEncoderRecipe | TripletRecipe):
         return 0
-    return recipe.epochs * math.ceil(tiles / recipe.batch)
+    tuned = recipe.tuning_epochs if isinstance(recipe, CaevlRecipe) else 0
+    return (recipe.epochs + tuned) * math.ceil(tiles / recipe.batch)
 
 
 def parameters(method: Method) -> tuple[int, int]:
@@ -64,8 +66,9 @@ def lines(rows: Sequence[tuple[Scene, Method]], jobs: int, out: Path, on_gpu: bo
     for _, method in learnt:
         count, flown = parameters(method)
         whole, encoders = max(whole, count), encoders + flown
-        if method.family == "autoencoder":
-            batches = max(batches, 32 * ACTIVATION_MB / 1e3 * count / 172_506_561)
+        recipe = make_variant(embed.TABLE, method.recipe)
+        if isinstance(recipe, AutoEncoderRecipe):
+            batches = max(batches, recipe.batch * ACTIVATION_MB / 1e3 * count / 172_506_561)
     memory_gb = jobs * (whole * TRAINED_BYTES / GB + batches)
     tiles = sum(scene.trajectory.tiles for scene, _ in rows)
     disk_gb = (jobs * whole * STORED_BYTES + encoders * 4 + tiles * 2 * 1024) / GB

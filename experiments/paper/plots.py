@@ -20,6 +20,7 @@ COLOURS = {
     "segments": "tab:orange",
     "sam": "tab:red",
     "sam-tile": "tab:pink",
+    "onnx": "tab:olive",
 }
 OTHER = "tab:green"
 SWEPT = (("autoencoder", "Auto-Encoder"), ("triplet", "Triplet"), ("gradient", "orthonav"))

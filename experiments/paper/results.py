@@ -84,6 +84,11 @@ def numbers(values: Sequence[float | None], missing: float) -> Array:
     return np.array([missing if value is None else value for value in values], np.float64)
 
 
+def percent(value: float | None) -> str:
+    """A share in per cent, "-" where there is none."""
+    return "-" if value is None or math.isnan(value) else f"{100 * value:.0f}"
+
+
 def share(counted: Sequence[int]) -> float:
     """Share of views within 15 m: number of them, and of all."""
     hits, count = counted

@@ -7,12 +7,24 @@ import ast
 import hashlib
 import json
 import re
+from collections.abc import Iterable
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from experiments.paper.methods import CANNY, DEFAULT, GREY, SAM, SEGMENTS, Method, column, methods
+from experiments.paper.methods import (
+    CANNY,
+    DEFAULT,
+    FIELD_SCENES,
+    GREY,
+    LEARNT,
+    SAM,
+    SEGMENTS,
+    Method,
+    column,
+    methods,
+)
 from experiments.paper.results import Result, read
 from experiments.paper.scenes import REDUCED_REAL, UNTUNED
 from experiments.paper.trajectories import REDUCED, SETTINGS, TABLE_1
@@ -20,7 +32,7 @@ from orthonav.files import write_text
 
 ROOT = Path(__file__).resolve().parents[2]
 ROWS = Path(__file__).resolve().parent / "rows"
-BASELINES = "baselines"
+BASELINES, FIELD = "baselines", "field"
 DIGITS = 5
 """Significant digits of figures in a row: a confidence to 1e-5, an error of 9 km to 0.1 m."""
 
@@ -47,14 +59,28 @@ FAMILY = {
         "src/orthonav/prepare/change.py",
         "src/orthonav/prepare/encoders.py",
     ),
+    "caevl": (
+        *NETWORK,
+        "src/orthonav/embed/caevl.py",
+        "src/orthonav/neural/augment.py",
+        "src/orthonav/neural/autoencoder.py",
+        "src/orthonav/neural/caevl.py",
+        "src/orthonav/neural/vicreg.py",
+    ),
     BASELINES: ("benchmarks/posed.py", "experiments/paper/baselines.py"),
+    FIELD: (
+        "benchmarks/posed.py",
+        "experiments/paper/field.py",
+        "experiments/paper/matchers.py",
+    ),
 }
 EDGES = {
-    DEFAULT: "src/orthonav/represent/gradients.py",
-    GREY: "src/orthonav/represent/gray.py",
-    CANNY: "src/orthonav/represent/canny.py",
-    SEGMENTS: "src/orthonav/represent/segments.py",
-    SAM: "src/orthonav/neural/sam.py",
+    DEFAULT: ("src/orthonav/represent/gradients.py",),
+    GREY: ("src/orthonav/represent/gray.py",),
+    CANNY: ("src/orthonav/represent/canny.py",),
+    SEGMENTS: ("src/orthonav/represent/segments.py",),
+    SAM: ("src/orthonav/neural/sam.py",),
+    LEARNT: ("src/orthonav/represent/learned.py", "experiments/paper/between_dates.onnx"),
 }
 REGISTRATION = (
     "src/orthonav/confidence/*.py",
@@ -67,14 +93,16 @@ def code(family: str, edges: str, *, registration: bool, generated: bool) -> dic
     """Digests of the files that decide the figures of a row, by path in the repository."""
     patterns = [*PROTOCOL, *FAMILY[family], *(REGISTRATION if registration else TILES)]
     patterns += GENERATED if generated else ()
-    patterns += [EDGES[edges.partition(":")[0]]] if edges else []
+    patterns += EDGES[edges.partition(":")[0]] if edges else ()
     paths = {path for pattern in patterns for path in ROOT.glob(pattern)}
     return {path.relative_to(ROOT).as_posix(): _digest(path) for path in sorted(paths)}
 
 
 @lru_cache
 def _digest(path: Path) -> str:
-    """Short digest of a source file without its comments and docstrings."""
+    """Short digest of a file, of a source file without its comments and docstrings."""
+    if path.suffix != ".py":
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
@@ -99,6 +127,15 @@ def code_of(method: Method | None, scene: str) -> dict[str, str]:
     return code(method.family, method.edges, registration=method.registration, generated=generated)
 
 
+def code_of_field(flown: Iterable[Method], scene: str) -> dict[str, str]:
+    """The same of the section on the field today, where maps of these rows were flown."""
+    generated = column(scene) in TABLE_1
+    made = code(FIELD, "", registration=False, generated=generated)
+    for each in flown:
+        made |= code_of(each, scene)
+    return made
+
+
 def older(row: Result) -> list[str]:
     """What has changed since a row was made: files, "recipe" or "setting"; empty if it is current.
 
@@ -107,6 +144,8 @@ def older(row: Result) -> list[str]:
     plain = row.plain
     made = Method(**plain["method"]) if row.family else None
     known, now = plain.get("code", {}), code_of(made, row.scene)
+    if FIELD in plain:
+        now = code_of_field((Method(**each) for each in plain["methods"]), row.scene)
     changed = sorted(path for path in known.keys() | now if known.get(path) != now.get(path))
     setting = SETTINGS[plain["setting"]["name"]]
     if plain["setting"] != json.loads(json.dumps(asdict(setting))):
@@ -129,7 +168,7 @@ def expected() -> list[str]:
     """Names of all rows of the reduced setting, as files are named."""
     scenes = (*TABLE_1, *REDUCED_REAL, *UNTUNED)
     names = [f"{scene}-{each.key}" for scene in scenes for each in methods(REDUCED, scene, 1000)]
-    return [*names, f"B-{BASELINES}"]
+    return [*names, f"B-{BASELINES}", *(f"{scene}-{FIELD}" for scene in FIELD_SCENES)]
 
 
 def stored() -> list[Result]:
@@ -173,7 +212,7 @@ def rounded(value: Any) -> Any:
 def name_of(row: Result) -> str:
     """Scene and method of a row, as its file is named."""
     if not row.family:
-        return f"{row.scene}-{BASELINES}"
+        return f"{row.scene}-{FIELD if FIELD in row.plain else BASELINES}"
     return f"{row.scene}-{Method(**row.plain['method']).key}"
 
 

@@ -7,8 +7,9 @@ from pathlib import Path
 from benchmarks.record import Table, number
 
 from experiments.paper import published
-from experiments.paper.methods import column, tuned
-from experiments.paper.results import Result, accepted_at, ceiling, confident, read, share
+from experiments.paper.field_tables import field
+from experiments.paper.methods import Method, column, tuned
+from experiments.paper.results import Result, accepted_at, ceiling, confident, percent, read, share
 from experiments.paper.stored import name_of
 from experiments.paper.views import PLACEMENTS
 from orthonav.records import CONFIDENT
@@ -18,6 +19,7 @@ FAMILIES = {
     "bovw": "Bag of Words",
     "triplet": "Triplet",
     "autoencoder": "Auto-Encoder",
+    "caevl": "CAEVL",
     "gradient": "orthonav",
 }
 EDGES = {
@@ -26,6 +28,7 @@ EDGES = {
     "segments": "segments",
     "sam": "Segment Anything, sheet",
     "sam-tile": "Segment Anything, tile",
+    "onnx": "learnt",
     "gradient": "gradients",
 }
 
@@ -61,6 +64,7 @@ def tables(results: Sequence[Result]) -> list[Table]:
         *sensitivity(made),
         *resolutions(made),
         *baselines(results, made),
+        *field(results, _label),
         *costs(made),
         row_table(results),
     ]
@@ -334,11 +338,6 @@ def row_table(results: Sequence[Result]) -> Table:
     return Table("Rows", header, rows)
 
 
-def percent(value: float | None) -> str:
-    """A share in per cent, "-" where there is none."""
-    return "-" if value is None or math.isnan(value) else f"{100 * value:.0f}"
-
-
 def _name(each: Result) -> str:
     """Name of the method, with a star if it was tuned on its scene."""
     return _plain_name(each) + ("*" if is_tuned(each) else "")
@@ -346,7 +345,7 @@ def _name(each: Result) -> str:
 
 def is_tuned(each: Result) -> bool:
     """Whether a row was tuned on its scene."""
-    return tuned(each.family, each.plain["method"]["recipe"], each.scene)
+    return tuned(each.family, each.plain["method"]["recipe"], each.scene, each.edges)
 
 
 def _plain_name(each: Result) -> str:
@@ -356,6 +355,14 @@ def _plain_name(each: Result) -> str:
     if each.family == "gradient":
         return f"{name}, default" if each.registration else f"{name}, embedding only"
     return name
+
+
+def _label(method: Method) -> str:
+    """Name of a method and its input."""
+    edges = method.edges.partition(":")[0]
+    if method.family == "gradient":
+        return "orthonav, default" if method.registration else "orthonav, embedding only"
+    return f"{FAMILIES[method.family]}, {EDGES[edges]}"
 
 
 def _by_scene(results: Iterable[Result]) -> list[tuple[str, list[Result]]]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.geo.camera import Camera
+from orthonav.geo.ground import Ground
 
 CONFIDENT = 0.9
 """A fix of at least this confidence counts as confident: the default of publishing and reports."""
@@ -80,6 +81,9 @@ class Telemetry:
     """Height above mean sea level, as recorded."""
     hae_m: float | None = None
     """Height above the ellipsoid of WGS 84, as recorded."""
+    below: Ground | None = None
+    """The ground from which `agl_m` was computed by a height above sea; None where it was measured.
+    Its deviation is part of `agl_std_m`."""
 
     def missing(self) -> list[str]:
         """Names of the fields without which a view cannot be rectified, empty if all are there."""
@@ -124,6 +128,8 @@ class Fix:
     heading_deg: float
     agl_m: float
     evidence: Evidence = field(default_factory=lambda: MappingProxyType({}))
+    ground_latlon_deg: tuple[float, float] | None = None
+    """Middle of the ground seen, where it was placed on terrain or looked far off nadir."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from orthonav.geo.route import Route
 from orthonav.mapfile import open_map
 from orthonav.mapfile.signature import map_digest
 
-CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 
 
 @pytest.fixture(scope="module")

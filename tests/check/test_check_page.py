@@ -264,7 +264,7 @@ def visit(browser, folder):
     assert wrong == []
 
 
-@pytest.mark.parametrize("name", sorted(KINDS))
+@pytest.mark.parametrize("name", ["evil", "nearly_empty"])
 def test_the_page_comes_alive(visit, name):
     page = visit(name)
     assert page.locator("html.live").count() == 1
@@ -326,8 +326,8 @@ def test_the_panel_says_what_is_in_the_cell(visit, frame):
 
 @pytest.mark.parametrize(
     "options",
-    [TABLET, {"color_scheme": "dark"}, {"viewport": {"width": 390, "height": 800}}],
-    ids=["tablet", "dark", "phone"],
+    [TABLET, {"viewport": {"width": 390, "height": 800}}],
+    ids=["tablet", "phone"],
 )
 def test_other_screens(visit, options):
     page = visit("small_route", **options)

@@ -22,7 +22,7 @@ from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.prepare import BuildRequest, build_map
 
-CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 WEST = np.array([[-250.0, 60.0], [-180.0, -90.0], [-300.0, 120.0], [-220.0, 0.0], [-330.0, -60.0]])
 EAST = np.array([[200.0, 60.0], [250.0, -90.0], [300.0, 120.0]])
 
@@ -128,7 +128,7 @@ def test_the_same_whatever_the_number_of_workers(plan, half_blank, monkeypatch):
     assert multiprocessing.active_children() == []
 
 
-@pytest.mark.parametrize("how", ["killed", "interrupted"])
+@pytest.mark.parametrize("how", ["killed", pytest.param("interrupted", marks=pytest.mark.slow)])
 def test_workers_always_end(plan, how):
     def stop(_):
         if how == "interrupted":

@@ -88,7 +88,7 @@ def test_frequencies_are_counts_of_nearest_words():
     np.testing.assert_allclose(out, expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize("words", [256, 5000])
+@pytest.mark.parametrize("words", [256, 2000])
 def test_assignment_is_exact(words):
     """Whole numbers: the same as OpenCV's exhaustive search, ties included."""
     embedder = random_embedder(words)
@@ -215,7 +215,7 @@ def test_places_are_found_again(learnt):
     turned = (cv2.warpAffine(grey, turn, (700, 700)) * 0.8).astype(np.uint8)
     right = 0
     rng = np.random.default_rng(0)
-    for _ in range(20):
+    for _ in range(10):
         centre = rng.uniform(220, 480, 2)  # x, y in the turned picture
         x, y = np.rint(centre - 64).astype(int)
         view = turned[y : y + 128, x : x + 128]
@@ -223,7 +223,7 @@ def test_places_are_found_again(learnt):
         place = cv2.invertAffineTransform(turn) @ [x + 63.5, y + 63.5, 1]
         best = np.array(starts[int(scores.argmax())])[::-1] + 63.5
         right += np.abs(best - place).max() <= 64
-    assert right >= 17
+    assert right >= 8
 
 
 def test_learning_gives_words_of_its_pictures(learnt):
@@ -239,12 +239,14 @@ def test_learning_gives_words_of_its_pictures(learnt):
     assert within < 0.75 * whole
 
 
-def test_learning_is_deterministic_and_seeded(learnt):
-    def again(seed):
-        return learn_words(WordsRecipe(words=256), pictures_of(tiles(area())), seed=seed)
-
-    assert again(1).vocabulary.tobytes() == learnt.vocabulary.tobytes()
-    assert again(2).vocabulary.tobytes() != learnt.vocabulary.tobytes()
+@needs_faiss
+def test_learning_is_deterministic_and_seeded():
+    shown = pictures_of(tiles(area())[:12])
+    first, same, other = (
+        learn_words(WordsRecipe(words=256), shown, seed=seed).vocabulary.tobytes()
+        for seed in (1, 1, 2)
+    )
+    assert first == same != other
 
 
 @needs_faiss
@@ -261,19 +263,20 @@ def test_large_samples_are_drawn_evenly(monkeypatch):
     assert counts.min() >= 5 and counts.max() <= 40
     monkeypatch.setattr(words, "MIN_SAMPLES", 300)
     monkeypatch.setattr(words, "SAMPLES_PER_WORD", 1)
-    made = learn_words(WordsRecipe(words=256, tfidf=1), pictures_of(tiles(area())), seed=1)
-    assert made.vocabulary.shape == (256, 128) and made.idf.max() <= np.log(50) + 1e-5
+    shown = pictures_of(tiles(area())[:20])
+    made = learn_words(WordsRecipe(words=256, tfidf=1), shown, seed=1)
+    assert made.vocabulary.shape == (256, 128) and made.idf.max() <= np.log(21) + 1e-5
 
 
 @needs_faiss
 def test_rare_words_weigh_more():
     """Half of the pictures are one and the same: their words are common."""
     common, *rest = tiles(area())
-    shown = [common] * 15 + rest[:15]
+    shown = [common] * 7 + rest[:7]
     made = learn_words(WordsRecipe(words=256, tfidf=1), pictures_of(shown), seed=1)
     plain = WordsEmbedder(WordsRecipe(words=256), made.vocabulary, NOTHING)
     counts = np.stack([plain.counts(tile, everywhere(tile)) for tile in shown])
-    expected = np.log(31 / np.maximum(1, (counts > 0).sum(axis=0)))
+    expected = np.log(15 / np.maximum(1, (counts > 0).sum(axis=0)))
     np.testing.assert_allclose(made.idf, expected, rtol=1e-5)
     assert made.idf[counts[0] > 0].max() < made.idf.max()
 
@@ -288,8 +291,9 @@ def test_too_few_features_are_refused(greys):
 @needs_faiss
 def test_learning_reports_and_leaves_out_what_is_not_valid():
     shares, grey = [], area()
+    grey = grey[:400, :400]
     half = everywhere(grey)
-    half[:, 350:] = False
+    half[:, 300:] = False
     made = learn_words(WordsRecipe(words=256), [(grey, half)], seed=1, progress=shares.append)
     assert shares == sorted(shares) and shares[-1] == 1 and len(shares) > 5
     painted = np.where(half, grey, 7).astype(np.uint8)

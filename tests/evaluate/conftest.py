@@ -21,7 +21,12 @@ def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def only_new(monkeypatch: pytest.MonkeyPatch, coarse: None, no_plots: None) -> None:
-    """Only pictures of tracks and of worst views are drawn."""
+def no_calibration_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures of confidence and covariance are not drawn."""
     for name in CALIBRATION:
         monkeypatch.setattr(f"orthonav.evaluate.{name}", lambda *_: NOTHING)
+
+
+@pytest.fixture
+def only_new(coarse: None, no_plots: None, no_calibration_plots: None) -> None:
+    """Only pictures of tracks and of worst views are drawn."""

@@ -330,9 +330,7 @@ def test_json_names_and_keeps_what_was_there() -> None:
         (OFFSETS, 0.5, [[1.0, None], [None, 1.0]], ["1 without one"]),
     ],
 )
-def test_unknown_values_are_reported(
-    offsets, confidence, cov, words, tmp_path, coarse, no_plots
-) -> None:
+def test_unknown_values_are_reported(offsets, confidence, cov, words, tmp_path, only_new) -> None:
     comparison = flown(offsets, confidence, cov)
     metrics = measure(comparison)
     flight = FlightReport("f", comparison, metrics)
@@ -393,7 +391,7 @@ def test_a_file_with_an_impossible_confidence_is_refused() -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 40])
-def test_pictures_are_drawn_and_alike(n: int, coarse) -> None:
+def test_pictures_are_drawn(n: int, coarse) -> None:
     random = np.random.default_rng(9)
     offsets = [(float(e), float(k)) for e, k in random.normal(0.0, 8.0, (n, 2))]
     errors_m = np.hypot(*np.reshape(offsets, (-1, 2)).T)
@@ -401,9 +399,8 @@ def test_pictures_are_drawn_and_alike(n: int, coarse) -> None:
     calibration = calibrate(stated, errors_m, own_m, 15.0)
     cov = np.tile(64.0 * np.eye(2), (n, 1, 1))
     consistency = check_covariance(np.reshape(offsets, (-1, 2)), cov, own_m, 15.0)
-    for draw in (lambda: reliability_picture(calibration), lambda: nees_picture(consistency)):
-        drawing = draw()
-        assert drawing.png.startswith(b"\x89PNG") and (n != 1 or drawing == draw())
+    for drawing in (reliability_picture(calibration), nees_picture(consistency)):
+        assert drawing.png.startswith(b"\x89PNG")
 
 
 def test_errors_beyond_all_measure_can_be_drawn() -> None:

@@ -340,6 +340,7 @@ def test_what_a_series_takes_is_said(scene, tmp_path):
     assert [scene for scene in "ABCD" if len(methods(GPU, scene, 900)) > 2] == ["B", "D"]
 
 
+@pytest.mark.slow  # an experiment
 def test_a_dry_run_goes_through_every_step(scene, tmp_path, monkeypatch):
     """A small network, from imagery to the tables; no checkpoint is left."""
     monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 8)

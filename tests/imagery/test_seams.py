@@ -40,11 +40,9 @@ def cut(folder, scene, transform, side, make=write, **more):
     "source_gsd_m, gsd_m, side",
     [
         (1.0, 1.0, 50),
-        (1.0, 0.8, 37),
         (1.0, 1.7, 50),
         (0.2, 1.0, 220),  # cells of 5 pixels end where the files do
         (0.2, 0.5, 220),  # of 3 pixels they would not: 2 are taken
-        (0.2, 0.6, 220),
         (0.2, 1.0, 223),  # nothing fits
         (0.25, 1.3, 187),
     ],

@@ -180,7 +180,7 @@ def test_a_picture_beyond_the_horizon_is_not_valid():
     assert not view.valid[np.broadcast_to(north, east.shape) < -AGL_M / math.tan(0.767)].any()
 
 
-@pytest.mark.parametrize("lens, size", [("pinhole", (960, 720)), ("all", (963, 719))])
+@pytest.mark.parametrize("lens, size", [("pinhole", (800, 600)), ("all", (803, 599))])
 def test_fine_views_are_thinned_without_aliasing_or_shift(lens, size):
     """Stripes of two image pixels are gone, the ground below them stays in place."""
     camera, attitude = LENSES[lens].resized(*size), (37, 8, -6)

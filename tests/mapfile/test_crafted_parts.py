@@ -64,7 +64,7 @@ def located(opened):
 def mutations(part, rng):
     """Variants of the values of a part, of the same type and number of dimensions."""
     flat = part.reshape(-1)
-    for _ in range(3):
+    for _ in range(2):
         changed = flat.copy()
         at = rng.integers(0, len(changed), 3)
         changed[at] = rng.integers(0, 256, 3).astype(part.dtype)

@@ -62,12 +62,10 @@ print(json.dumps({"worst": worst, "contiguous": list(contiguous)}))
 """
 
 
+@pytest.mark.slow  # starts PyTorch again
 @pytest.mark.parametrize(
     "name, threads",
-    [
-        pytest.param("this processor", ["1"], marks=pytest.mark.slow),  # starts PyTorch again
-        ("AVX2", ["1", "2"]),
-    ],
+    [("this processor", ["1"]), ("AVX2", ["1", "2"])],
     ids=["this", "AVX2"],
 )
 def test_gradients_do_not_depend_on_the_processor(name, threads):

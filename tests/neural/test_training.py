@@ -107,6 +107,7 @@ def test_the_auto_encoder_learns_to_reconstruct_the_area(tmp_path):
     assert "float32" in messages[-1][0]
 
 
+@pytest.mark.slow  # an experiment
 def test_the_triplet_network_learns_to_find_a_changed_place(tmp_path):
     recipe = TripletRecipe(width=4, epochs=30, batch=32, learning_rate=2e-3, apart=0.5)
     recipe = dataclasses.replace(recipe, similarity="cosine", margin=0.2)
@@ -138,8 +139,11 @@ def test_an_interrupted_training_resumes_with_the_same_result(recipe, tmp_path):
     np.testing.assert_array_equal(learn(recipe, tmp_path / "killed").onnx, whole.onnx)
 
 
-@pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
-@pytest.mark.parametrize("at", ["epoch 1 of 3, batch 2", "epoch 2 of 3, batch 3"])
+@pytest.mark.parametrize(
+    ("recipe", "at"),
+    [(AUTO, "epoch 1 of 3, batch 2"), (TRIPLET, "epoch 2 of 3, batch 3")],
+    ids=["autoencoder", "triplet"],
+)
 def test_a_training_killed_within_an_epoch_resumes_within_it(recipe, at, tmp_path, monkeypatch):
     whole = undisturbed(recipe)
     monkeypatch.setattr(training, "PROGRESS_EVERY_S", 0)
@@ -176,6 +180,7 @@ here.learn(here.AUTO, Path(sys.argv[2]))
 """
 
 
+@pytest.mark.slow  # starts PyTorch again
 def test_a_kill_during_a_write_leaves_the_previous_checkpoint(tmp_path, monkeypatch):
     command = [sys.executable, "-c", KILLED, str(Path(__file__).parent), str(tmp_path)]
     assert subprocess.run(command, timeout=60).returncode == -signal.SIGKILL
@@ -190,13 +195,12 @@ def test_a_kill_during_a_write_leaves_the_previous_checkpoint(tmp_path, monkeypa
     np.testing.assert_allclose(losses(tmp_path), losses(alone), rtol=1e-4)
 
 
-@pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
-def test_epochs_can_be_added_to_a_finished_training_and_not_taken_away(recipe, tmp_path):
-    learn(dataclasses.replace(recipe, epochs=2), tmp_path)
-    np.testing.assert_array_equal(learn(recipe, tmp_path).onnx, undisturbed(recipe).onnx)
-    assert losses(tmp_path) == undisturbed(recipe).losses
+def test_epochs_can_be_added_to_a_finished_training_and_not_taken_away(tmp_path):
+    learn(dataclasses.replace(AUTO, epochs=2), tmp_path)
+    np.testing.assert_array_equal(learn(AUTO, tmp_path).onnx, undisturbed(AUTO).onnx)
+    assert losses(tmp_path) == undisturbed(AUTO).losses
     with pytest.raises(OutputError, match="of 3 epochs, 2 are asked"):
-        learn(dataclasses.replace(recipe, epochs=2), tmp_path)
+        learn(dataclasses.replace(AUTO, epochs=2), tmp_path)
 
 
 def test_the_time_left_is_that_of_the_present_speed(monkeypatch):
@@ -339,8 +343,9 @@ def test_triplets_need_positives():
         learn_network(TRIPLET, sheet(), binary=False, seed=0, work=None, means=QUICK)
 
 
+@pytest.mark.slow  # an experiment
 def test_fast_options_give_the_same_result_up_to_rounding(tmp_path):
-    recipe = dataclasses.replace(AUTO, epochs=8)
+    recipe = dataclasses.replace(AUTO, epochs=4)
     plain = Means(bf16=False, fused=False, keep_memory=False, device="cpu")
     fast = dataclasses.replace(QUICK, bf16=True)
     learn(recipe, tmp_path / "plain", means=plain)
@@ -370,16 +375,15 @@ def test_a_gpu_without_bfloat16_learns_in_float16(able, wanted, monkeypatch):
     assert means.mixed_precision(Means(), torch.device("cuda")) is wanted
 
 
-@pytest.mark.parametrize("recipe", [AUTO, TRIPLET], ids=["autoencoder", "triplet"])
-def test_scaled_gradients_give_the_same_result(recipe, tmp_path, monkeypatch):
+def test_scaled_gradients_give_the_same_result(tmp_path, monkeypatch):
     """What float16 needs: gradients times 65536, and divided by it before the step."""
     original = torch.amp.GradScaler
     monkeypatch.setattr(
         training.torch.amp, "GradScaler", lambda device, enabled: original(device, enabled=True)
     )
-    learn(recipe, tmp_path)
+    learn(AUTO, tmp_path)
     monkeypatch.undo()
-    np.testing.assert_allclose(losses(tmp_path), undisturbed(recipe).losses, rtol=1e-3)
+    np.testing.assert_allclose(losses(tmp_path), undisturbed(AUTO).losses, rtol=1e-3)
 
 
 SHARED = """

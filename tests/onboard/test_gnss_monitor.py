@@ -88,7 +88,7 @@ def test_agreement_is_reached_and_the_displacement_learnt():
 )
 def test_a_fault_is_named_in_time(text, seconds, names):
     """Delays of the requirement; positions of the map come once a second."""
-    first_s, last_s, name = delay(text, 3, MAPS["usual"], at_s=200.0, for_s=seconds + 15)
+    first_s, last_s, name = delay(text, 3, MAPS["usual"], at_s=150.0, for_s=seconds + 15)
     assert 0 <= first_s <= last_s and first_s <= seconds
     assert name in names
 
@@ -96,7 +96,7 @@ def test_a_fault_is_named_in_time(text, seconds, names):
 @pytest.mark.parametrize(
     ("name", "seed", "hours"),
     [
-        ("usual", 11, 0.5),
+        ("usual", 11, 0.3),
         pytest.param("usual", 11, 10 / 3, marks=pytest.mark.slow),
         pytest.param("poor", 12, 10 / 3, marks=pytest.mark.slow),
         pytest.param("high", 13, 10 / 3, marks=pytest.mark.slow),

@@ -24,7 +24,8 @@ from orthonav.onboard.state import (
 from orthonav.onboard.telemetry import Clocks
 
 S = 10**9
-SAVED = SavedState(48.1, 2.3, 4.0, 1_700_000_000 * S, 500 * S, "run-1", 77)
+UTC_NS, MONO_NS = 1_700_000_000 * S, 500 * S
+SAVED = SavedState(48.1, 2.3, 4.0, UTC_NS, MONO_NS, "run-1", 77, UTC_NS, MONO_NS)
 
 
 def test_a_saved_state_is_loaded(tmp_path, names_in):
@@ -139,11 +140,16 @@ def test_what_a_flight_learnt_counts_after_it(tmp_path):
     assert before_the_flight(path, "other")[1] is None
 
 
-@pytest.mark.parametrize(("age_s", "same_flight"), [(100.0, True), (-5.0, True), (301.0, False)])
-def test_a_recent_state_is_of_the_same_flight(tmp_path, age_s, same_flight):
+@pytest.mark.parametrize(
+    ("age_s", "ran_s", "same_flight"),
+    [(100.0, 0.0, True), (-5.0, 0.0, True), (301.0, 0.0, False), (1000.0, 800.0, True)],
+)
+def test_a_recent_state_is_of_the_same_flight(tmp_path, age_s, ran_s, same_flight):
+    """`ran_s`: how long the program ran on without a position."""
     path = tmp_path / "state.json"
     before, learnt = replace(unknown("c"), agreed_s=2000.0), replace(unknown("c"), agreed_s=4000.0)
-    save(path, replace(SAVED, boot_id=""), {"map": Resumed(learnt, before).to_plain(before)})
+    saved = replace(SAVED, boot_id="", saved_utc_ns=UTC_NS + round(ran_s * S))
+    save(path, saved, {"map": Resumed(learnt, before).to_plain(before)})
     clocks = Clocks(utc_ns=lambda: SAVED.utc_ns + round(age_s * S))
     options = Namespace(state=path, state_max_age_s=300.0)
     known, resumed = _learnt_before(options, "map", clocks)

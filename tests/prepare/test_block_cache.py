@@ -182,7 +182,6 @@ def test_a_killed_build_resumes(ortho, tmp_path, reads, names_in, whole):
 
 CHANGES = {
     "seed": {"seed": 1},
-    "resolution": {"gsd_m": 1.1},
     "edges": {"edges": "gray", "registration": False},
     "tiles": {"tile_px": 96},
 }

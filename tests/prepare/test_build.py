@@ -97,7 +97,6 @@ REQUESTS = {
     "plain": WITH_LAYER,
     "gray": {"edges": "gray"},
     "canny": {"edges": "canny:low=50,high=120"},
-    "64 dims": {"method": "gradient:dims=64"},
     "both": {"method": "gradient:dims=32,cells=16", "edges": "canny"},
     "seed": {**WITH_LAYER, "seed": 5, "calibration_views": 3},
 }
@@ -190,7 +189,7 @@ def test_imagery_with_a_hole_is_covered_around_it(make_ortho, tmp_path, frame):
     assert farthest_m(np.array([[215 - 200, 200 - 225.0]]), opened, frame)[0] > stride_m
 
 
-@pytest.mark.parametrize("asked, expected", [(None, 1.0), (0.5, 0.5), (1.7, 1.7), (2.0, 2.0)])
+@pytest.mark.parametrize("asked, expected", [(None, 1.0), (1.7, 1.7)])
 def test_ground_resolution(ortho, tmp_path, asked, expected):
     grid = built(ortho, tmp_path, gsd_m=asked, tile_px=32).manifest.sheets[0].grid
     assert grid.gsd_m == expected and grid.stride_m == 8 * expected
@@ -373,7 +372,7 @@ def test_own_views_are_confident_and_mirrored_ones_are_not(localizer, area):
     places = [localizer.sheet.frame.en_from_latlon(fix.lat_deg, fix.lon_deg) for fix in fixes]
     errors_m = np.abs(np.array(places) - truth).max(axis=1)
     own = np.array([fix.confidence for fix in fixes])
-    false = np.array([fix.confidence for fix in own_views(localizer, area.past, True)[0]])
+    false = np.array([fix.confidence for fix in own_views(localizer, area.past, True, 15)[0]])
     assert (errors_m <= localizer.grid.stride_m).mean() >= 0.95
     assert np.median(own) > 0.8 and np.median(false) < 0.4
     assert (false[:, None] < own).mean() > 0.97  # nearly every pair is separated

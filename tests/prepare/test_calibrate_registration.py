@@ -175,7 +175,7 @@ def test_views_of_crops_are_vertical_with_telemetry_errors(localizer):
     ],
 )
 def test_the_floor_is_the_offset_of_the_other_date(localizer, moved_px, expected):
-    later = crops_of(GREY, seed=2, moved_px=moved_px)
+    later = crops_of(GREY, 10, seed=2, moved_px=moved_px)
     found = calibrated(localizer, crops_of(GREY, 2), later)
     assert found.floor_px == pytest.approx(expected, rel=0.06)
 
@@ -187,7 +187,7 @@ def test_a_few_views_of_another_date_say_nothing(localizer):
 
 def test_another_place_does_not_count_as_another_date(localizer):
     """What is not found at its place is wrong, not badly registered."""
-    later = crops_of(textured((SIDE_PX, SIDE_PX), 7), seed=2)
+    later = crops_of(textured((SIDE_PX, SIDE_PX), 7), 8, seed=2)
     assert calibrated(localizer, crops_of(GREY, 2), later).floor_px == FLOOR_PX
 
 
@@ -236,7 +236,7 @@ def small(make_ortho, tmp_path, monkeypatch):
         ortho = make_ortho(tmp_path / "2020.tif", made_of, nodata=nodata)
         later = [make_ortho(tmp_path / "later.tif", picture) for picture in other_dates]
         request = BuildRequest([ortho], tmp_path / "map.onav", tile_px=64, other_dates=later)
-        build_map(replace(request, calibration_views=12))
+        build_map(replace(request, calibration_views=9))
         return open_map(request.out).manifest.registration
 
     build.grey = grey

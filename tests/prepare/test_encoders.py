@@ -21,6 +21,7 @@ from orthonav.variants import make_variant
 SMALL = {"tile_px": 64, "gsd_m": 5.0, "overlap": 0.75, "calibration_views": 2}
 METHODS = {
     "autoencoder:width=16,dims=64,epochs=2": NetworkEmbedder,
+    "caevl:width=16,dims=64,epochs=1,tuning_epochs=1,batch=16,projector=32": NetworkEmbedder,
     "triplet:width=4,epochs=1,batch=64": NetworkEmbedder,
     "bovw:words=256": WordsEmbedder,
 }
@@ -84,6 +85,7 @@ def test_registration_works_on_maps_of_other_methods(built, flight_path, method)
     assert np.median(errors) < 15
 
 
+@pytest.mark.slow  # as in tests/neural, with imagery
 def test_interrupted_training_resumes(area, tmp_path):
     class Killed(Exception):
         pass
@@ -134,6 +136,7 @@ def test_what_does_not_go_together_is_refused(area, tmp_path, method, edges, say
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow  # another method than the default one
 def test_the_same_request_gives_the_same_embeddings(area, tmp_path):
     parts = []
     for name in ("a.onav", "b.onav"):

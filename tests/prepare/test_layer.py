@@ -252,11 +252,11 @@ def test_levels_are_aligned(ortho, tmp_path):
 
 
 def test_far_from_the_route_there_is_nothing(make_ortho, tmp_path):
-    grey = textured((1500, 1500))
+    grey = textured((1200, 1200))
     wide = make_ortho(tmp_path / "wide.tif", grey)
     outline = Mosaic.open([wide]).outline_latlon_deg
     frame = Area.from_outline(outline[:, 0], outline[:, 1]).frame
-    ends = frame.latlon_from_en(np.array([[-700.0, -700.0], [700.0, 700.0]]))
+    ends = frame.latlon_from_en(np.array([[-550.0, -550.0], [550.0, 550.0]]))
     route = Route(tuple(zip(*(each.tolist() for each in ends), strict=True)))
     opened = built(wide, tmp_path, route=route, band_m=100.0)
     layer = GreyLayer.of(opened)

@@ -61,14 +61,15 @@ def hill_map(map_path, dem, tmp_path_factory):
     return out
 
 
-def test_terrain_is_all_that_a_map_gains(run, make_ortho, tmp_path):
+def test_terrain_is_all_that_a_map_gains(run, make_ortho, tmp_path, monkeypatch):
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 16)
     ortho = make_ortho(tmp_path / "past.tif")
     frame = LocalFrame(*LOCAL_DEG)
     dem = write_dem(tmp_path / "dem.tif", frame, hill)
     maps = []
     for name, more in (("flat", ()), ("hill", ("--dem", dem, "--dem-datum", "msl"))):
         out = tmp_path / f"{name}.onav"
-        sizes = ("--tile-px", 64, "--no-registration", "--out", out)
+        sizes = ("--tile-px", 64, "--overlap", 0.5, "--no-registration", "--out", out)
         assert run("build", "--ortho", ortho, *sizes, *more).code == 0
         maps.append(open_map(out))
     flat, hilly = maps
@@ -162,14 +163,19 @@ def test_a_flight_reports_heights_above_sea_and_take_off(flown):
     assert max(amsl) == pytest.approx(250 + hill(-350, -250), abs=1)
 
 
-def test_a_terrain_places_views_that_level_ground_does_not(run, flown, map_path, dem, tmp_path):
-    found = {}
+def test_a_terrain_places_views_that_level_ground_does_not(
+    run, flown, map_path, dem, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("orthonav.onboard.setups.FEW", 0.0)  # other set-ups are not tried
+    few, found = shutil.copytree(flown, tmp_path / "flight"), {}
+    header, *lines = (few / "telemetry.csv").read_text().splitlines()
+    (few / "telemetry.csv").write_text("\n".join([header, *lines[::2]]) + "\n")
     for name, arguments in {
         "level": [map_path],
         "terrain": [map_path, "--dem", dem, "--dem-datum", "msl"],
     }.items():
         out = tmp_path / f"{name}.jsonl"
-        done = run("localize", *arguments[:1], flown, *arguments[1:], "--out", out)
+        done = run("localize", *arguments[:1], few, *arguments[1:], "--out", out)
         assert done.code == 0
         assert ("level ground is assumed" in done.err) == (name == "level"), done.err
         scored = run("evaluate", out, "--truth", flown / "truth.csv", "--radius-m", 15, "--json")

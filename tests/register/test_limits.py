@@ -53,7 +53,7 @@ def test_a_part_of_the_map_is_converged_upon_as_fast_and_known_less_exactly(hole
     assert np.trace(part.covariance[:2, :2]) > np.trace(whole.covariance[:2, :2])
 
 
-@pytest.mark.parametrize("spread_rad", [0.12, 0.3, 0.6])
+@pytest.mark.parametrize("spread_rad", [0.12, 0.6])
 @pytest.mark.parametrize("level", [0, 1])
 def test_where_the_ground_runs_in_one_direction_the_covariance_covers_the_errors(spread_rad, level):
     """Furrows: a changed view says nothing along them, whatever its own noise says."""
@@ -61,7 +61,7 @@ def test_where_the_ground_runs_in_one_direction_the_covariance_covers_the_errors
     reference = reference_of(furrows, SHAPE)
     rng = np.random.default_rng(5)
     off, covariances = [], []
-    for pose in random_poses(50, SHAPE, REACH_PX, seed=5):
+    for pose in random_poses(35, SHAPE, REACH_PX, seed=5):
         view = noisy(furrows, pose, rng, noise=8.0, clutter=24.0).at(level)
         placed = Refiner(view, reference).place(pose, with_covariance=True)
         off.append(errors(placed, pose))

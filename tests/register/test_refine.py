@@ -333,7 +333,7 @@ def normalized_squares(off, covariances, part=np.s_[:2]):
 @pytest.mark.parametrize("view", [{"noise": 12.0}, {"noise": 8.0, "clutter": 24.0}], ids=str)
 def test_errors_are_as_large_as_the_covariance_says(reference, level, view):
     """Squared errors over the covariance average 2 where it is right, on two axes."""
-    off, covariances = many_placed(reference, level, 150, 10 + level, **view)
+    off, covariances = many_placed(reference, level, 100, 10 + level, **view)
     squares = normalized_squares(off, covariances)
     assert 0.75 < squares.mean() < 3.0
     assert np.mean(squares < 9.21) > 0.95  # 99 % of a true one's

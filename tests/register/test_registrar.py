@@ -282,6 +282,19 @@ def test_two_searches_of_one_place_are_no_rivals(registrar):
     assert both.candidates == 3 and both.peak_ratio > 1.8
 
 
+def test_a_place_found_at_the_final_level_competes_with_the_judged_ones(registrar):
+    pose = Pose(180.0, 200.0, 0.5, 0.0)
+    templates, prior = templates_of(GROUND, pose), prior_of(pose)
+    away = [near(pose, 90.0, -40.0), near(pose, -60.0, 80.0)]
+    judged = registrar.judged(templates, LEVELS, away, LEVELS.look, prior)
+    missed = registrar.finished(templates, LEVELS, judged, prior, 2)
+    assert apart_px(missed.placed.pose, pose) > 30
+    direct = registrar.direct(templates, LEVELS, [near(pose, 0.5)])
+    found = registrar.finished(templates, LEVELS, judged, prior, 3, direct)
+    assert apart_px(found.placed.pose, pose) < 0.3
+    assert found.rival == missed.score and found.look_rival == missed.look_score
+
+
 def test_candidates_without_hope_are_dropped_early_and_still_known_as_rivals(registrar):
     pose = Pose(180.0, 200.0, 0.5, 0.0)
     templates, prior = templates_of(GROUND, pose), prior_of(pose)
@@ -440,14 +453,14 @@ def test_one_finer_level_tells_what_coarser_ones_cannot():
     assert levels.final == 1
     candidates = [near(pose, 3.0), near(twin, -2.0), near(twin, 0.0, 90.0)]
     found = verified(registrar, templates, levels, candidates, levels.look, prior_of(pose))
-    deep = registrar.deepened(templates, finer, levels, found, prior_of(pose))
+    deep = registrar.deepened(lambda _: templates, lambda _: finer, levels, found, prior_of(pose))
     assert apart_px(deep.placed.pose, pose) < 0.3 and deep.placed.covariance is not None
     assert deep.fine_score > deep.score and deep.fine_rival > 0
     assert deep.fine_score / deep.fine_rival > found.peak_ratio + 0.1
     # Told the wrong one of both, the finer level sets it right.
     both = verified(registrar, templates, levels, candidates[:2], levels.look, prior_of(pose))
     turned = replace(both, finalists=both.finalists[::-1])
-    again = registrar.deepened(templates, finer, levels, turned, prior_of(pose))
+    again = registrar.deepened(lambda _: templates, lambda _: finer, levels, turned, prior_of(pose))
     assert apart_px(again.placed.pose, pose) < 0.3 and again.fine_score > again.fine_rival
 
 

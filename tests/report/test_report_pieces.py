@@ -67,6 +67,7 @@ def test_a_drawing_has_both_forms_and_its_text_is_text() -> None:
     assert {"N", "100 m", "east (m)", "path < 1 & more"} <= set(texts)
 
 
+@pytest.mark.slow  # starts matplotlib again
 def test_drawings_are_reproducible() -> None:
     code = (
         "import hashlib, sys; sys.path.insert(0, sys.argv[1]); import test_report_pieces as tests;"

@@ -8,6 +8,7 @@ import pickle
 import cv2
 import numpy as np
 import pytest
+from experiments.paper.methods import BETWEEN_DATES
 
 from orthonav.errors import VariantError
 from orthonav.represent import TABLE
@@ -21,8 +22,11 @@ SHAPES = [(1, 1), (1, 40), (2, 3), (16, 16), (33, 47), (64, 64), (256, 255)]
 
 
 @pytest.fixture(params=sorted(name for name, each in TABLE.items() if each.flies))
-def variant(request):
-    """Every entry of the table, with its defaults."""
+def variant(request, monkeypatch):
+    """Every entry of the table, with its defaults; edges by a network with that of the paper."""
+    if request.param == "onnx":
+        pytest.importorskip("onnxruntime", reason="edges by a network need onnxruntime")
+        monkeypatch.setenv("ORTHONAV_EDGES", str(BETWEEN_DATES))
     return make_variant(TABLE, request.param)
 
 

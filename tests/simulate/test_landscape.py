@@ -42,7 +42,7 @@ def pair() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
 
 def test_same_seed_same_pixels_in_any_order_of_rendering(pair):
     land = Landscape(1)
-    land.render(AUTUMN, WEST_M + 9000.0, NORTH_M, 64, 64, 1.0)
+    land.render(AUTUMN, WEST_M + 9000.0, NORTH_M, 16, 16, 1.0)
     again = land.render(SUMMER, WEST_M, NORTH_M, 400, 360, 1.0)
     assert again.dtype == np.uint8
     assert again.shape == (360, 400, 3)
@@ -59,7 +59,6 @@ def test_other_seed_other_land(pair):
     [
         (1.0, AUTUMN, (WEST_M, NORTH_M)),
         (0.3, SUMMER, (WEST_M + 700.1, NORTH_M + 0.25)),
-        (0.7, SPRING, (ORIGIN_M[0] + 900.0, ORIGIN_M[1] + 1700.0)),
         (0.7, SPRING, (WEST_M - 40000.3, NORTH_M + 30000.7)),
         (3.0, SPRING, (WEST_M - 500.0, NORTH_M + 300.0)),
     ],
@@ -82,8 +81,8 @@ def test_quarters_meet_without_seam(gsd_m, date, corner_m):
 
 
 def test_large_window_is_the_same_as_a_small_one(pair):
-    large = Landscape(1).render(SUMMER, WEST_M - 700.0, NORTH_M + 10.0, 1100, 380, 1.0)
-    largest, share = worst_difference(large[10:370, 700:1100], pair[0])
+    large = Landscape(1).render(SUMMER, WEST_M - 200.0, NORTH_M + 10.0, 600, 380, 1.0)
+    largest, share = worst_difference(large[10:370, 200:600], pair[0])
     assert largest <= 2
     assert share < 1e-3
 
@@ -123,6 +122,7 @@ def test_shadow_lies_away_from_the_sun_and_is_as_long_as_it_should_be(date, gsd_
     assert abs((bearing_deg - date.sun_azimuth_deg) % 360.0 - 180.0) < 6.0
 
 
+@pytest.mark.slow  # how the generated ground looks
 def test_more_years_more_change():
     land = Landscape(3)
     cells = land._network.cells_near((0.0, 0.0, 700.0, 700.0))
@@ -181,7 +181,7 @@ def test_geotiff_has_position_and_date(tmp_path: Path):
     seen: list[float] = []
     paths = generate_area(
         tmp_path / "area",
-        size_m=(500.0, 300.0),
+        size_m=(250.0, 150.0),
         gsd_m=2.0,
         dates=DEFAULT_DATES[:2],
         progress=seen.append,
@@ -192,15 +192,15 @@ def test_geotiff_has_position_and_date(tmp_path: Path):
     assert (seen[0], seen[-1]) == (0.0, 1.0)
     with rasterio.open(paths[0]) as image:
         assert image.crs.to_epsg() == 2154
-        assert (image.width, image.height, image.count) == (250, 150, 3)
+        assert (image.width, image.height, image.count) == (125, 75, 3)
         assert image.dtypes == ("uint8",) * 3
         assert image.transform.a == 2.0
-        assert image.bounds == (652000.0, 6862000.0, 652500.0, 6862300.0)
+        assert image.bounds == (652000.0, 6862000.0, 652250.0, 6862150.0)
         assert image.tags()["TIFFTAG_DATETIME"] == "2016:07:12 12:00:00"
         assert [band.name for band in image.colorinterp] == ["red", "green", "blue"]
         assert image.profile["compress"] == "deflate"
         pixels = np.moveaxis(image.read(), 0, 2)
-    assert np.array_equal(pixels, Landscape(1).render(SUMMER, 652000.0, 6862300.0, 250, 150, 2.0))
+    assert np.array_equal(pixels, Landscape(1).render(SUMMER, 652000.0, 6862150.0, 125, 75, 2.0))
 
 
 @pytest.mark.parametrize(
@@ -233,6 +233,7 @@ def test_epoch_refuses_what_no_photograph_can_have(bad):
         replace(SUMMER, **bad)
 
 
+@pytest.mark.slow  # how the generated ground looks
 def test_low_sun_leaves_no_seam():
     low = replace(AUTUMN, sun_elevation_deg=16.0)
     whole = Landscape(1).render(low, ORIGIN_M[0] + 1650.0, NORTH_M, 200, 200, 1.0)

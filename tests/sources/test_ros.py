@@ -261,7 +261,7 @@ def test_a_camera_file_and_a_log_may_stand_in(tmp_path, messages, topics):
     assert telemetry.missing() == [] and telemetry.yaw_deg == pytest.approx(352)
 
 
-@pytest.mark.parametrize("form", [*FORMATS, "file"])
+@pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("how", ["cut", "noise", "header"])
 def test_a_damaged_recording_is_one_error(tmp_path, form, how, capfd):
     messages = Messages(ros1=form == "bag")

@@ -321,6 +321,7 @@ def test_on_a_tablet_by_touch(visit, server, columns):
     page.chosen(2, COUNT)
 
 
+@pytest.mark.slow  # a tablet is tried in every run
 def test_on_a_phone(visit, server):
     """Nothing sticks out, and the legend and the buttons lie beside the map."""
     page = visit(server, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)

@@ -91,7 +91,7 @@ class _Check:
     def __post_init__(self) -> None:
         if len(self.opened.manifest.sheets) != 1:
             raise MapFileError(f"only maps of one sheet can be checked: {self.opened.path}")
-        registration = Localizer(self.opened).registration
+        registration = Localizer(self.opened, level_ground=True).registration
         if registration is None:
             raise MapFileError(
                 f"only maps with a registration layer can be checked: {self.opened.path}"

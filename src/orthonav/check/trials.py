@@ -163,7 +163,7 @@ class Trier:
 
     def __init__(self, plans: Sequence[TrialPlan]) -> None:
         """Open the map; raises `MapFileError` where it has no registration layer."""
-        registration = Localizer(open_map(plans[0].map_path)).registration
+        registration = Localizer(open_map(plans[0].map_path), level_ground=True).registration
         if registration is None:
             raise MapFileError(
                 f"only maps with a registration layer can be checked: {plans[0].map_path}"

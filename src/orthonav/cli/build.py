@@ -85,13 +85,14 @@ def add_recipe(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--method",
         metavar="NAME[:FIELD=VALUE,..]",
-        help="embedding: gradient (default), autoencoder, triplet or bovw",
+        help="embedding: gradient (default), autoencoder, caevl, triplet or bovw",
     )
     parser.add_argument(
         "--edges",
         metavar="NAME[:FIELD=VALUE,..]",
-        help="image representation: gradient, gray, canny (canny:low=100,high=200), segments or "
-        "sam:weights=PATH (default: gradient; canny for autoencoder, gray for triplet and bovw)",
+        help="image representation: gradient, gray, canny (canny:low=100,high=200), segments, "
+        "sam:weights=PATH or onnx:weights=PATH (default: gradient; canny for autoencoder and "
+        "caevl, gray for triplet and bovw)",
     )
     parser.add_argument("--seed", type=int, help="seed of all random draws (default 0)")
     parser.add_argument(

@@ -68,14 +68,14 @@ def _learnt_before(
 ) -> tuple[Mapping[str, Biases], Resumed | None]:
     """What was learnt before this flight, and by it, where it was interrupted.
 
-    A state that is no older than `--state-max-age-s` is that of this flight, also one whose age is
-    not known because a clock was set back.
+    A state is that of this flight if the program that saved it stopped no longer than
+    `--state-max-age-s` ago, or at an unknown time because a clock was set back.
     """
     if options.state is None:
         return {}, None
     saved = load(options.state)
     if saved is not None:
-        age_s = saved.age_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
-        if age_s > options.state_max_age_s:
+        stopped_s = saved.stopped_s(clocks.utc_ns(), clocks.mono_ns(), boot_id())
+        if stopped_s > options.state_max_age_s:
             return learnt_biases(options.state), None
     return before_the_flight(options.state, digest)

@@ -18,10 +18,11 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     # Only with these options or inputs; the part that needs it says so.
     "plan, import, localize, calibrate --dem": ("geo",),
     "build --edges segments": ("segments",),
-    "build --method autoencoder, triplet or bovw": ("train",),
+    "build --method autoencoder, caevl, triplet or bovw": ("train",),
     "atlas build, atlas index": ("atlas",),
     "atlas build --cluster": ("cluster",),
-    "localize, fly: a map with a neural encoder": ("neural",),
+    "build --edges onnx": ("neural",),
+    "localize, fly: a map with a neural encoder or with onnx edges": ("neural",),
     "localize --atlas": ("atlas",),
     "localize, fly --require-signed": ("signing",),
     "localize, import, calibrate: photographs, ROS, logs": ("flights",),

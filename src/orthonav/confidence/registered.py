@@ -26,9 +26,9 @@ FEATURES = (
 OLD_FEATURES = {"log_strength", "log_peak_ratio", "log_look_ratio"}
 """Features of maps up to version 0.1."""
 CHANCES = ("total", "look", "fine")
-USUAL_BIASES = -8.43, -1.55
-USUAL_WEIGHTS = 3.69, 5.69, 5.10, 0.94, 2.69, 11.54
-"""What separates right from wrong, fitted to 3,549 views (docs/decisions/confidence.md). The
+USUAL_BIASES = -6.29, -1.75
+USUAL_WEIGHTS = 3.23, 6.16, 3.39, 0.47, 2.55, 10.35
+"""What separates right from wrong, fitted to 5,668 views (docs/decisions/confidence.md). The
 benchmark of trust shows how weights fitted in this way judge scenes left out."""
 RIDGE = 3e-2
 """Weight of the usual bias where views of another date of the map's area are fitted."""

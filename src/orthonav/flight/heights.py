@@ -94,7 +94,7 @@ class GroundHeights:
         if spread_m > 0:
             own_m = DEFAULT_AGL_STD * abs(agl_m) if agl_std_m is None else agl_std_m
             agl_std_m = math.hypot(own_m, spread_m)
-        return replace(telemetry, agl_m=agl_m, agl_std_m=agl_std_m)
+        return replace(telemetry, agl_m=agl_m, agl_std_m=agl_std_m, below=below)
 
     def mismatch_m(self, telemetry: Telemetry) -> float:
         """Height above sea by take-off and terrain, minus the reported one; NaN where unknown."""

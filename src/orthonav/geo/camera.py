@@ -193,6 +193,14 @@ def undistort(camera: Camera, xy: Array) -> Array:
     return lens.brown_undistort(camera.distortion, xy)
 
 
+def seen_px(camera: Camera, rays: Array) -> Array:
+    """Image points (..., 2) of rays (..., 3) in camera axes; NaN behind the camera or the lens."""
+    ahead = rays[..., 2] > 1e-9
+    plane = rays[..., :2] / np.where(ahead, rays[..., 2], np.nan)[..., None]
+    seen = distort(camera, plane) * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
+    return np.asarray(seen)
+
+
 def footprint_en_m(
     camera: Camera, yaw_deg: float, pitch_deg: float, roll_deg: float, agl_m: float
 ) -> Array:

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import CameraError
-from orthonav.geo.camera import Camera, enu_from_camera
-from orthonav.localizer.rectify import RectifiedView
+from orthonav.geo.camera import Camera
+from orthonav.localizer.rectify import RectifiedView, off_nadir_deg
 from orthonav.records import NoFix, Telemetry, View
 
-MAX_TILT_DEG = 45.0
+MAX_TILT_DEG = 65.0
 MIN_SIDE_PX = 32
 MAX_COARSER = 4.0
 DARK_LEVEL = 16.0
@@ -43,8 +43,7 @@ def check_telemetry(
         return NoFix("missing_telemetry", f"not a number: {', '.join(missing)}")
     if telemetry.agl_m <= 0:
         return NoFix("bad_height", f"height above ground is {telemetry.agl_m:.1f} m")
-    axis_up = enu_from_camera(0.0, telemetry.pitch_deg, telemetry.roll_deg)[2, 2]
-    tilt_deg = math.degrees(math.acos(max(-1.0, min(1.0, -float(axis_up)))))
+    tilt_deg = off_nadir_deg(telemetry)
     if tilt_deg > MAX_TILT_DEG:
         return NoFix(
             "extreme_tilt",

@@ -25,6 +25,7 @@ class Localizer:
         registration: bool = True,
         position: PositionRule = "peak",
         flying: bool = True,
+        level_ground: bool = False,
     ) -> None:
         """Take an opened map; raises `MapFileError` if this program cannot fly it.
 
@@ -32,15 +33,18 @@ class Localizer:
         their tiles only; `position` is then the rule by which scores of tiles become a position.
         Without `flying`, maps whose representation is too slow to fly are accepted too: for
         experiments with maps of one's own, because such a representation loads networks from this
-        machine. Raises `MissingExtraError` where the map's encoder needs onnxruntime and it is not
-        installed.
+        machine. With `level_ground` the terrain of the map is not used for registration: for views
+        that were simulated over level ground. Raises `MissingExtraError` where the map's encoder
+        needs onnxruntime and it is not installed.
         """
         if len(opened.manifest.sheets) != 1:
             raise MapFileError(f"this program flies maps of one sheet: {opened.path}")
         self.tiles = TileLocalizer(opened, position=position, flying=flying)
         self.registration = None
         if registration:
-            self.registration = RegistrationLocalizer.of_map(opened, self.tiles.proposer())
+            self.registration = RegistrationLocalizer.of_map(
+                opened, self.tiles.proposer(), level_ground=level_ground
+            )
 
     @property
     def sheet(self) -> SheetInfo:

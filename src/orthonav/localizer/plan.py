@@ -10,7 +10,9 @@ three sources of candidates:
 Where the judged level is cheap (a prior, a small sheet) only that one is searched. Elsewhere the
 cheaper of the other two comes first; the next one follows only while the best place does not stand
 out, and only if its estimated cost is acceptable. At the judged level headings and scales come in
-stages, the most likely first, so that an ordinary view ends after the first stage.
+stages, the most likely first, so that an ordinary view ends after the first stage. Where position,
+heading and scale are known so well that the *final level*, one below, is cheap too, it comes last:
+weak texture, such as that of bare ground, is only seen there.
 
 This file decides; `registration` executes.
 """
@@ -78,6 +80,10 @@ class SearchPlan:
     docs/decisions/registration.md, 6."""
     judged_scale_step: float = 0.09
     """Spacing of log scales at the judged level; docs/decisions/registration.md, 6."""
+    final_turn_step_rad: float = math.radians(3.0)
+    """Spacing of headings at the final level, half of that at the judged one."""
+    final_scale_step: float = 0.045
+    """Spacing of log scales there, half of that at the judged level."""
     bank_sigmas: float = 3.0
     """Headings and scales reach so many standard deviations of the telemetry."""
     max_nats: float = 5.5
@@ -89,6 +95,8 @@ class SearchPlan:
     """Candidates of a search by FFT at the coarse level."""
     stage_candidates: int = 8
     """Candidates of one stage at the judged level."""
+    final_candidates: int = 2
+    """Candidates of a search at the final level: each is finished."""
     tile_candidates: int = 20
     """Candidates from tiles."""
     tile_apart_strides: float = 1.5
@@ -174,6 +182,10 @@ class SearchPlan:
                 stage = [pose for pose, nats in fine if least < nats <= most]
                 if stage:
                     yield Search(levels.look, stage, False, self.stage_candidates)
+        final = self._poses(prior, self.final_turn_step_rad, self.final_scale_step)
+        if levels.final < levels.look and fft_ms(levels.final, len(final)) <= self.cheap_ms:
+            poses = [pose for pose, _ in final]
+            yield Search(levels.final, poses, False, self.final_candidates)
 
     def _poses(
         self, prior: PosePrior, turn_step_rad: float, scale_step: float

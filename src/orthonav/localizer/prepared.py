@@ -1,5 +1,6 @@
 """A view made ready for registration: rectified with its own heading up, as templates."""
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.localizer.checks import check_footprint
-from orthonav.localizer.rectify import RectifiedView, downsampled, rectify_footprint
+from orthonav.localizer.rectify import (
+    RectifiedView,
+    downsampled,
+    looks_aside,
+    near_part,
+    rectify_footprint,
+)
 from orthonav.records import (
     DEFAULT_AGL_STD,
     DEFAULT_YAW_STD_DEG,
@@ -36,13 +43,15 @@ MIN_TILT_COS = 0.5
 class PreparedView:
     """A view made ready for registration.
 
-    `rectified_at`: makes the view at the ground resolution of a level. `templates`: its evidence.
+    `picture_at`: the view averaged towards the ground resolution of a level. `rectified_at`: makes
+    the view rectified at the ground resolution of a level. `templates`: its evidence.
     `levels`: levels of the map at which it is searched, judged and finished. `side_px`: root of the
     area seen, in pixels of level 0. `camera_px` (2,): the camera as seen from the middle of the
     view, heading up, x to the right and y down, in pixels of level 0. `prior`: expected heading and
     scale.
     """
 
+    picture_at: Callable[[int], View]
     rectified_at: Callable[[int], RectifiedView]
     templates: ViewTemplates
     levels: Levels
@@ -62,12 +71,20 @@ def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> P
     nominal_m = (telemetry.agl_m / max(tilt, MIN_TILT_COS) ** 1.5) * math.sqrt(
         camera.width_px * camera.height_px / (camera.fx_px * camera.fy_px)
     )
+    if looks_aside(view):
+        near = near_part(view, gsd_m)
+        if near is None:
+            return NoFix("too_small", "the view shows no ground that is near enough")
+        nominal_m = math.sqrt(near.area_m2)
     levels = Levels.of(nominal_m / gsd_m, map_levels)
 
+    @functools.cache
+    def picture_at(level: int) -> View:
+        return downsampled(view, gsd_m * 2**level)
+
     def rectified_at(level: int) -> RectifiedView:
-        level_m = gsd_m * 2**level
         multiple = 2 ** max(0, levels.coarse - level)
-        return rectify_footprint(downsampled(view, level_m), gsd_m=level_m, multiple_px=multiple)
+        return rectify_footprint(picture_at(level), gsd_m=gsd_m * 2**level, multiple_px=multiple)
 
     rectified = rectified_at(levels.final)
     unit_px = 2**levels.final
@@ -77,6 +94,7 @@ def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> P
     offset = rectified.offset_en_m / gsd_m
     side_px = math.sqrt(float(rectified.valid.sum())) * unit_px
     return PreparedView(
+        picture_at,
         rectified_at,
         ViewTemplates(rectified.grey, rectified.valid, levels.final),
         levels,

@@ -3,6 +3,7 @@
 The ground is taken as flat. Rolling shutter is ignored.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -15,12 +16,19 @@ from orthonav.geo.camera import (
     axis_on_ground_en_m,
     camera_from_en,
     counted_from_centres,
-    distort,
+    enu_from_camera,
     footprint_en_m,
+    ground_en_m,
+    seen_px,
 )
-from orthonav.records import View
+from orthonav.localizer.orthorectify import MAX_COARSER, Orientation, node_px, orthorectified
+from orthonav.records import Telemetry, View
 
 MAX_REACH = 2.0
+MAX_NEAR_NADIR_DEG = 45.0
+"""Views farther off nadir are used in part."""
+NEAR_CELLS = 32
+"""Cells along both sides of a picture in which it is found out how finely it sees the ground."""
 EDGE_PX = 1e-6
 NODE_PX, NODE_ERROR_PX = 4, 0.02
 """The lens is computed at every so many pixels where that makes no more difference than this."""
@@ -40,10 +48,63 @@ class RectifiedView:
     offset_en_m: Array
 
 
+def looks_aside(view: View) -> bool:
+    """Whether a view is far off nadir, or its picture does not hold its principal point: its part
+    near enough is then rectified (`near_part`)."""
+    camera = view.camera
+    inside = 0 <= camera.cx_px <= camera.width_px and 0 <= camera.cy_px <= camera.height_px
+    return not inside or off_nadir_deg(view.telemetry) > MAX_NEAR_NADIR_DEG
+
+
+def off_nadir_deg(telemetry: Telemetry) -> float:
+    """Angle between the optical axis and straight down, degrees."""
+    up = enu_from_camera(0.0, telemetry.pitch_deg, telemetry.roll_deg)[2, 2]
+    return math.degrees(math.acos(max(-1.0, min(1.0, -float(up)))))
+
+
+@dataclass(frozen=True)
+class NearPart:
+    """The part of a view that is seen finely enough, on flat ground, for a heading of 0.
+
+    `low_m`, `high_m`: its box, metres east and north of the camera. `area_m2`: what of the box is
+    seen. `finest_m`: side of the finest pixel on the ground.
+    """
+
+    low_m: Array
+    high_m: Array
+    area_m2: float
+    finest_m: float
+
+
+def near_part(view: View, gsd_m: float) -> NearPart | None:
+    """The part of a view that is not much coarser than its finest one and than `gsd_m`; None where
+    it sees no ground."""
+    camera, telemetry = view.camera, view.telemetry
+    cells = [np.linspace(0, side, NEAR_CELLS + 1) for side in (camera.width_px, camera.height_px)]
+    px = np.stack(np.meshgrid(*cells), axis=-1).reshape(-1, 2)
+    angles = 0.0, telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
+    ground = ground_en_m(camera, px, *angles).reshape(NEAR_CELLS + 1, NEAR_CELLS + 1, 2)
+    along, down = ground[1:, 1:] - ground[:-1, :-1], ground[1:, :-1] - ground[:-1, 1:]
+    with np.errstate(invalid="ignore"):
+        # Half the product of the diagonals of each cell.
+        area = np.abs(along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0]) / 2
+        pixel_m = np.sqrt(area * (NEAR_CELLS**2 / (camera.width_px * camera.height_px)))
+        finest_m = float(np.nanmin(pixel_m, initial=math.inf))
+        used = pixel_m <= MAX_COARSER * max(finest_m, gsd_m)
+    if not used.any():
+        return None
+    corners = np.stack([ground[:-1, :-1][used], ground[1:, 1:][used], ground[:-1, 1:][used]])
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    return NearPart(low, high, float(area[used].sum()), finest_m)
+
+
 def downsampled(view: View, gsd_m: float) -> View:
     """The view averaged down by whole numbers towards `gsd_m`, so that resampling cannot alias."""
     camera, agl_m = view.camera, view.telemetry.agl_m
-    factor = int(gsd_m / max(camera.gsd_m(agl_m), 1e-9))  # heights may be absurd, not yet refused
+    pixel_m = camera.gsd_m(agl_m)
+    if looks_aside(view) and (near := near_part(view, gsd_m)) is not None:
+        pixel_m = near.finest_m
+    factor = int(gsd_m / max(pixel_m, 1e-9))  # heights may be absurd, not yet refused
     width, height = camera.width_px // max(1, factor), camera.height_px // max(1, factor)
     if factor < 2 or width < 8 or height < 8:
         return view
@@ -77,6 +138,8 @@ def rectify_footprint(view: View, *, gsd_m: float, multiple_px: int) -> Rectifie
     """
     camera, telemetry = view.camera, view.telemetry
     pitch_deg, roll_deg, agl_m = telemetry.pitch_deg, telemetry.roll_deg, telemetry.agl_m
+    if looks_aside(view):
+        return _rectify_near(view, gsd_m, multiple_px)
     axis = np.array(axis_on_ground_en_m(0.0, pitch_deg, roll_deg, agl_m))
     half_m = np.array(camera.extent) * agl_m / 2
     low, high = axis - MAX_REACH * half_m, axis + MAX_REACH * half_m
@@ -92,6 +155,24 @@ def rectify_footprint(view: View, *, gsd_m: float, multiple_px: int) -> Rectifie
     attitude = 0.0, pitch_deg, roll_deg, agl_m
     grey, valid = _window(view, attitude, middle, gsd_m, (height, width))
     return RectifiedView(grey, valid, middle)
+
+
+def _rectify_near(view: View, gsd_m: float, multiple_px: int) -> RectifiedView:
+    """The part of a view that is seen finely enough, its own heading up."""
+    telemetry, near = view.telemetry, near_part(view, gsd_m)
+    if near is None:
+        empty = np.zeros((multiple_px, multiple_px), np.uint8)
+        return RectifiedView(empty, empty > 0, np.zeros(2))
+    middle = (near.low_m + near.high_m) / 2
+    width, height = (
+        max(1, int(side / gsd_m / multiple_px)) * multiple_px for side in near.high_m - near.low_m
+    )
+    px = node_px((height, width)) - [width / 2, height / 2]
+    nodes = np.dstack([middle + px * [gsd_m, -gsd_m], np.zeros(px.shape[:2])])
+    position = np.array([0.0, 0.0, telemetry.agl_m])
+    attitude = np.array([0.0, telemetry.pitch_deg, telemetry.roll_deg])
+    made = orthorectified(view, Orientation(position, attitude), nodes, (height, width))
+    return RectifiedView(*made, middle)
 
 
 def _window(
@@ -182,7 +263,4 @@ def _seen_px(camera: Camera, camera_from_window: Array, rows: Array, cols: Array
     """Where the camera saw a grid of the window (H, W, 2), NaN where it saw nothing."""
     x, y = np.meshgrid(cols, rows)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ camera_from_window.T
-    ahead = rays[..., 2] > 1e-9
-    plane = rays[..., :2] / np.where(ahead, rays[..., 2], np.nan)[..., None]
-    seen = distort(camera, plane) * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
-    return np.asarray(seen)
+    return seen_px(camera, rays)

@@ -18,25 +18,30 @@ from orthonav.errors import MapFileError, VariantError
 from orthonav.localizer.plan import DEFAULT_PLAN, ClearMargin, Search, SearchPlan
 from orthonav.localizer.prepared import PreparedView, prepare
 from orthonav.localizer.propose import TileProposer
+from orthonav.localizer.relief import GroundSeen, Relief, ViewOnLevelGround, ViewOverRelief
 from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import SheetInfo
 from orthonav.mapfile.reader import MapFile
+from orthonav.mapfile.terrain import TerrainLayer
 from orthonav.records import PRIOR_SIGMAS, Fix, NoFix, Prior, Telemetry, View
 from orthonav.register.pose import Pose, rotation
 from orthonav.register.reference import GreyPyramid, Reference
 from orthonav.register.refine import Placed
 from orthonav.register.registrar import Registered, Registrar
 from orthonav.register.search import Candidate, search
-from orthonav.register.template import ViewTemplates
 from orthonav.search.exact import rows_within
 
 
 @dataclass(frozen=True, eq=False)
 class RegisteredView:
-    """A prepared view and its best place; `found` is a `NoFix` where it could not be compared."""
+    """A prepared view and its best place; `found` is a `NoFix` where it could not be compared.
+
+    `ground`: what it saw, where the map has a terrain.
+    """
 
     prepared: PreparedView
     found: Registered | NoFix
+    ground: GroundSeen | None = None
 
 
 class RegistrationLocalizer:
@@ -52,24 +57,33 @@ class RegistrationLocalizer:
         floor_px: float,
         propose: TileProposer | None = None,
         plan: SearchPlan = DEFAULT_PLAN,
+        terrain: TerrainLayer | None = None,
     ) -> None:
         """Take a sheet and its imagery; `of_map` does so for a map.
 
         `confidence`: None before it is learnt. `radius_m`: the error that it is about. `floor_px`:
         standard deviation with which maps of two dates agree, in pixels of level 0. Without
-        `propose`, candidates come from searches by FFT only.
+        `propose`, candidates come from searches by FFT only; without `terrain` the ground is level.
         """
         self.sheet, self.grid = sheet, sheet.grid
         self.registrar = Registrar(Reference(layer))
         self.confidence, self.radius_m = confidence, radius_m
         self.propose, self.plan = propose, plan
         self.floor_px = floor_px
+        self.relief = None if terrain is None else Relief(terrain, self.grid)
 
     @classmethod
     def of_map(
-        cls, opened: MapFile, propose: TileProposer | None, plan: SearchPlan = DEFAULT_PLAN
+        cls,
+        opened: MapFile,
+        propose: TileProposer | None,
+        plan: SearchPlan = DEFAULT_PLAN,
+        *,
+        level_ground: bool = True,
     ) -> "RegistrationLocalizer | None":
         """A localizer for the only sheet of a map; None where the map has no registration layer.
+
+        Unless `level_ground`, views are placed on the map's terrain, where it has one.
 
         Raises `MapFileError` where the manifest's registration is damaged.
         """
@@ -93,6 +107,7 @@ class RegistrationLocalizer:
             floor_px=floor_px,
             propose=propose,
             plan=plan,
+            terrain=None if level_ground else TerrainLayer.of(opened),
         )
 
     @property
@@ -107,7 +122,7 @@ class RegistrationLocalizer:
             return seen
         if isinstance(seen.found, NoFix):
             return seen.found
-        return self._fix(seen.prepared, seen.found, view.telemetry)
+        return self._fix(seen.prepared, seen.found, view.telemetry, seen.ground)
 
     def register(
         self,
@@ -128,26 +143,42 @@ class RegistrationLocalizer:
         if heading_std_rad is not None:
             pose_prior = replace(prepared.prior, turn_std_rad=heading_std_rad)
             prepared = replace(prepared, prior=pose_prior)
+        if self.relief is not None:
+            prepared = replace(prepared, prior=self.relief.expected(prepared))
         if prior is not None and not self._touches_map(prior, prepared):
             outside = NoFix("outside_map", "the map does not reach to where the prior says")
             return RegisteredView(prepared, outside)
-        found = self.best(prepared, prior)
+        ground = self._on_ground(prepared)
+        found = self.best(prepared, prior, ground)
         if found is None:
             detail = "no place of the map could be compared with the view"
             if prior is None:
                 detail += "; a large map needs a prior, or views as large as its tiles"
             return RegisteredView(prepared, NoFix("no_match", detail))
-        return RegisteredView(prepared, found)
+        return RegisteredView(prepared, *ground.by_camera(found))
 
     def prepared(self, view: View, heading_known: bool) -> PreparedView | NoFix:
         """The view rectified and made ready for registration; `NoFix` where it shows too little."""
         return prepare(view, self.grid.gsd_m, self.pyramid.levels, heading_known)
 
-    def best(self, view: PreparedView, prior: Prior | None) -> Registered | None:
-        """The best place after all searches that had to be run; None where nothing was found."""
+    def best(
+        self, view: PreparedView, prior: Prior | None, ground: ViewOnLevelGround | None = None
+    ) -> Registered | None:
+        """The best place after all searches that had to be run; None where nothing was found.
+
+        `ground`: the view on the ground of the map; None: made here.
+        """
+        ground = ground or self._on_ground(view)
         judged: list[Placed] = []
+        direct: list[Placed] = []
         best: Registered | None = None
         candidates = 0
+
+        def finished() -> Registered:
+            return self.registrar.finished(
+                view.templates, view.levels, judged, view.prior, candidates, ground.finish, direct
+            )
+
         rows = functools.cache(lambda: self._rows_near(view, prior))
         for each in self.plan.searches(
             view.levels,
@@ -159,27 +190,35 @@ class RegistrationLocalizer:
                 found = self.propose.candidates(view.rectified_at(0), each.poses, rows(), self.plan)
             else:
                 found = self._searched(view, prior, each)
-            judged += self.registrar.judged(
-                view.templates, view.levels, found, each.level, view.prior, judged
-            )
+            if each.level < view.levels.look:
+                direct = self.registrar.direct(view.templates, view.levels, found)
+            else:
+                judged += self.registrar.judged(
+                    view.templates, view.levels, found, each.level, view.prior, judged
+                )
             candidates += len(found)
             best = None
             enough = self.plan.enough(each.level, view.levels)
             if judged and self._seems_clear(view, judged, enough):
-                best = self._finished(view, judged, candidates)
+                best = finished()
                 if self._is_clear(best, enough):
                     return best
         if not judged:
             return None
-        best = best or self._finished(view, judged, candidates)
+        if best is None or self.relief is not None:
+            judged = ground.looked_again(judged)
+            best = finished()
         if view.levels.final == 0 or not self._is_doubtful(best):
             return best
-        made = view.rectified_at(view.levels.final - 1)
-        finer = ViewTemplates(made.grey, made.valid, view.levels.final - 1)
-        return self.registrar.deepened(view.templates, finer, view.levels, best, view.prior)
+        return self.registrar.deepened(
+            ground.templates_of, ground.finer, view.levels, best, view.prior
+        )
 
-    def _finished(self, view: PreparedView, judged: list[Placed], candidates: int) -> Registered:
-        return self.registrar.finished(view.templates, view.levels, judged, view.prior, candidates)
+    def _on_ground(self, view: PreparedView) -> ViewOnLevelGround:
+        """The view on the terrain of the map, where it has one."""
+        if self.relief is None:
+            return ViewOnLevelGround(self.registrar, view)
+        return ViewOverRelief(self.relief, self.registrar, view)
 
     def _seems_clear(self, view: PreparedView, judged: list[Placed], enough: ClearMargin) -> bool:
         """Whether the best candidate may end the search, before the cost of finishing it."""
@@ -246,7 +285,8 @@ class RegistrationLocalizer:
                 self._reach_px(view, prior),
             )
         template = view.templates.at(run.level, recipe)
-        found = search(template, window, run.poses, run.candidates)
+        scales = view.prior.scale_map
+        found = search(template, window, run.poses, run.candidates, scales)
         least = self.plan.candidate_share
         worth = sum(each.score >= least * found[0].score for each in found)
         return found[: max(worth, self.plan.min_candidates)]
@@ -275,7 +315,13 @@ class RegistrationLocalizer:
         rows, cols = self.registrar.reference.shape(0)
         return -reach < x < cols + reach and -reach < y < rows + reach
 
-    def _fix(self, view: PreparedView, best: Registered, telemetry: Telemetry) -> Fix:
+    def _fix(
+        self,
+        view: PreparedView,
+        best: Registered,
+        telemetry: Telemetry,
+        ground: GroundSeen | None,
+    ) -> Fix:
         placed = best.placed
         lat, lon = self.sheet.frame.latlon_from_en(self.camera_en_m(view, placed.pose))
         covariance = self.covariance(view, placed)[:2, :2]
@@ -285,6 +331,11 @@ class RegistrationLocalizer:
         covariance.flags.writeable = False
         evidence = best.evidence()
         confidence = math.nan if self.confidence is None else self.confidence(evidence)
+        seen = None
+        if ground is not None:
+            evidence["terrain_gain"] = ground.gain
+            seen_lat, seen_lon = self.sheet.frame.latlon_from_en(ground.middle_en_m)
+            seen = float(seen_lat), float(seen_lon)
         return Fix(
             lat_deg=float(lat),
             lon_deg=float(lon),
@@ -294,6 +345,7 @@ class RegistrationLocalizer:
             heading_deg=math.degrees(placed.pose.turn_rad) % 360,
             agl_m=telemetry.agl_m * math.exp(placed.pose.log_scale),
             evidence=MappingProxyType(evidence),
+            ground_latlon_deg=seen,
         )
 
     def camera_en_m(self, view: PreparedView, pose: Pose) -> NDArray[np.float64]:

@@ -420,7 +420,9 @@ class Tracker:
             return whole_map
         lat, lon = self._localizer.sheet.frame.latlon_from_en(expected.mean[:2])
         prior = Prior(float(lat), float(lon), reach / PRIOR_SIGMAS)
-        return prior, (expected.mean[:2], reach), not competes
+        # Dead reckoning from a confirmed place that is still exact is as good as tracking.
+        exact = expected.state is not State.SEARCHING and reach <= MIN_LOCAL_M
+        return prior, (expected.mean[:2], reach), exact or not competes
 
     def _sightings(
         self,

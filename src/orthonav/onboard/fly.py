@@ -162,6 +162,7 @@ class Runner:
         self._heights_said = False
         self._last: states.SavedState | None = None
         self._saved: states.SavedState | None = None
+        self._saved_ns = 0
         self._mismatch = 0.0, 0.0
         self._utc_ahead_ns = clocks.utc_ns() - clocks.mono_ns()
         self._seen = {"jumps": 0, "outages": 0, "failed": 0, "lost": 0, "slow": 0}
@@ -568,13 +569,25 @@ class Runner:
 
     def _save_state(self) -> None:
         path, last = self.options.state_path, self._last
-        if path is None or last is None or last == self._saved:
+        if path is None or last is None:
+            return
+        utc_ns, mono_ns = self._clocks.utc_ns(), self._clocks.mono_ns()
+        if last == self._saved and mono_ns - self._saved_ns < states.SAVE_S * 1e9:
             return
         stamp = self._link.signing_now() if self._link is not None else None
         try:
             maps = None if self._gnss is None else self._gnss.maps()
-            states.save(path, replace(last, signing_timestamp_10us=stamp or 0), maps)
-            self._saved = last
+            states.save(
+                path,
+                replace(
+                    last,
+                    signing_timestamp_10us=stamp or 0,
+                    saved_utc_ns=utc_ns,
+                    saved_mono_ns=mono_ns,
+                ),
+                maps,
+            )
+            self._saved, self._saved_ns = last, mono_ns
         except OSError as error:
             if self.counter.total["state_failed"] == 0:
                 log.warning("state cannot be saved: %s", error)

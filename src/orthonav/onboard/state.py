@@ -22,6 +22,9 @@ VERSION = 1
 MAX_BYTES = 100_000
 MAX_MAPS = 100
 """Maps of which something is stored, the latest."""
+SAVE_S = 10.0
+"""A state is saved again after so long, also without a new position: it shows that the flight goes
+on."""
 SPEED_MPS = 30.0
 """Standard deviation of the speed of the aircraft since the position was saved: assumed."""
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -29,13 +32,14 @@ _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 @dataclass(frozen=True)
 class SavedState:
-    """A position, its standard deviation, and its time by two clocks.
+    """A position with its standard deviation, and when it was taken and saved, by two clocks.
 
     `lat_deg`, `lon_deg`, `std_m`: position (WGS84) and standard deviation along the worst axis.
     `utc_ns`: time of exposure in UTC.
     `mono_ns`: the same by the monotonic clock, valid while `boot_id` is the same.
     `boot_id`: identifies the run of the operating system.
     `signing_timestamp_10us`: must not decrease for a key, see `orthonav.publish.mavlink.Signing`.
+    `saved_utc_ns`, `saved_mono_ns`: time of the last save, when the program still ran.
     """
 
     lat_deg: float = math.nan
@@ -45,12 +49,20 @@ class SavedState:
     mono_ns: int = 0
     boot_id: str = ""
     signing_timestamp_10us: int = 0
+    saved_utc_ns: int = 0
+    saved_mono_ns: int = 0
 
     def age_s(self, utc_ns: int, mono_ns: int, boot_id: str) -> float:
-        """Age in seconds; negative where the clock was set back."""
+        """Age of the position in seconds; negative where the clock was set back."""
         if boot_id and boot_id == self.boot_id:
             return (mono_ns - self.mono_ns) / 1e9
         return (utc_ns - self.utc_ns) / 1e9
+
+    def stopped_s(self, utc_ns: int, mono_ns: int, boot_id: str) -> float:
+        """Seconds since the program that saved it ran; negative where the clock was set back."""
+        if boot_id and boot_id == self.boot_id:
+            return (mono_ns - self.saved_mono_ns) / 1e9
+        return (utc_ns - self.saved_utc_ns) / 1e9
 
 
 def boot_id() -> str:
@@ -143,6 +155,8 @@ def load(path: Path) -> SavedState | None:
             mono_ns=int(plain["mono_ns"]),
             boot_id=str(plain["boot_id"]),
             signing_timestamp_10us=int(plain["signing_timestamp_10us"]),
+            saved_utc_ns=int(plain.get("saved_utc_ns", plain["utc_ns"])),
+            saved_mono_ns=int(plain.get("saved_mono_ns", plain["mono_ns"])),
         )
     except (ValueError, KeyError, TypeError, OverflowError):
         return None

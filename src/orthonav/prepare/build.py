@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__, embed, represent
+from orthonav.embed.caevl import CaevlRecipe
 from orthonav.embed.contract import ViewEmbedder
 from orthonav.embed.network import TripletRecipe
 from orthonav.embed.whitened import WhitenedRecipe, learn
@@ -27,6 +28,7 @@ from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.mapfile.manifest import Manifest, SheetInfo
 from orthonav.mapfile.reader import MapFile
 from orthonav.mapfile.writer import write_map
+from orthonav.prepare.caevl import learn_caevl
 from orthonav.prepare.calibrate import (
     RADIUS_STRIDES,
     Crop,
@@ -141,7 +143,8 @@ def learn_embedding(
             read_pictures(date, inputs.area, grid, inputs.representation, progress)
             for date in (inputs.other_dates if isinstance(recipe, TripletRecipe) else ())
         ]
-        embedder, embeddings = learn_encoder(
+        learn_images = learn_caevl if isinstance(recipe, CaevlRecipe) else learn_encoder
+        embedder, embeddings = learn_images(
             recipe,
             sheet.pictures,
             dates,

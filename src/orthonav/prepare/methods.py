@@ -18,10 +18,12 @@ log = logging.getLogger(__name__)
 
 LEARNT_WITH = {
     "autoencoder": ("torch", "onnx", "onnxruntime"),
+    "caevl": ("torch", "onnx", "onnxruntime"),
     "triplet": ("torch", "onnx", "onnxruntime"),
     "bovw": ("faiss",),
 }
 """Modules of the extra "train" that learning a method needs."""
+USUAL_EDGES = {"autoencoder": "canny", "caevl": "canny", "triplet": "gray", "bovw": "gray"}
 DEVICES = ("auto", "cpu", "cuda")
 LOCAL_FIELDS = ("weights", "cache")
 
@@ -29,7 +31,7 @@ LOCAL_FIELDS = ("weights", "cache")
 def usual_edges(method: str) -> str:
     """The default representation of a method; for methods of the paper, its choice."""
     name = method.partition(":")[0]
-    return {"autoencoder": "canny", "triplet": "gray", "bovw": "gray"}.get(name, "gradient")
+    return USUAL_EDGES.get(name, "gradient")
 
 
 def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderRecipe:
@@ -49,7 +51,9 @@ def method_recipe(method: str, representation: Any) -> WhitenedRecipe | EncoderR
     if isinstance(recipe, WordsRecipe) and not isinstance(representation, Gray):
         raise VariantError("bovw needs grey levels; give --edges gray, or omit --edges")
     if isinstance(recipe, WhitenedRecipe) and getattr(representation, "per", "sheet") == "tile":
-        raise VariantError("edges per tile need a network; give --method autoencoder or triplet")
+        raise VariantError(
+            "edges per tile need a network; give --method autoencoder, caevl or triplet"
+        )
     if not represent.TABLE[_name_of(representation)].flies:
         log.warning(
             "%s is too slow for flight: this map is for experiments", _name_of(representation)

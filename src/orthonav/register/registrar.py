@@ -7,7 +7,7 @@ its score over that of the strongest rival is the evidence.
 
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from orthonav.register.evidence import COARSE, FINE, EvidenceRecipe
 from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
 from orthonav.register.refine import Placed, Refiner
+from orthonav.register.scale_map import ScaleMap
 from orthonav.register.search import Candidate, SearchWindow
 from orthonav.register.sharpness import local_ratio
 from orthonav.register.template import ViewTemplates
@@ -52,15 +53,24 @@ MAX_RATIO = 10.0
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Expected heading and scale: `turn_rad` (None: unknown), and standard deviations of both."""
+    """Expected heading and scale: `turn_rad` (None: unknown), and standard deviations of both.
+
+    `scale_map`: the log scale expected at each place, with a deviation of its own; None where 0 is
+    expected everywhere.
+    """
 
     turn_rad: float | None
     turn_std_rad: float
     log_scale_std: float
+    scale_map: ScaleMap | None = None
 
     def cost(self, pose: Pose) -> float:
         """What is subtracted from the score of a pose, by the prior."""
-        return NAT_SCORE * self.nats(pose.turn_rad, pose.log_scale)
+        if self.scale_map is None:
+            return NAT_SCORE * self.nats(pose.turn_rad, pose.log_scale)
+        own = PosePrior(self.turn_rad, self.turn_std_rad, self.scale_map.std)
+        expected = self.scale_map.at(pose.x_px, pose.y_px)
+        return NAT_SCORE * own.nats(pose.turn_rad, pose.log_scale - expected)
 
     def nats(
         self, turn_rad: float, log_scale: float, *, within: tuple[float, float] = (0.0, 0.0)
@@ -104,6 +114,17 @@ class OwnRatios(NamedTuple):
 
     detail: float
     local: float
+
+
+class Finished(NamedTuple):
+    """A candidate at the final level: `total`, its scores at the final and the judged level added
+    up; `placed`; the `templates` it was placed by; `look`: its score at the judged level, where
+    these differ from those it was judged by."""
+
+    total: float
+    placed: Placed
+    templates: ViewTemplates
+    look: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,6 +250,14 @@ class Registrar:
                 placed = _hopeful(placed, prior, HOPE)[:KEPT_TO_LOOK]
         return placed
 
+    def direct(
+        self, templates: ViewTemplates, levels: Levels, candidates: Sequence[Candidate]
+    ) -> list[Placed]:
+        """Candidates found at the final level, with their scores at the judged one: refined there
+        they would be lost again."""
+        look = self.refiner(templates, levels, levels.look)
+        return [look.place(found.pose, 0) for found in candidates]
+
     def standing(
         self, templates: ViewTemplates, judged: Sequence[Placed], prior: PosePrior
     ) -> tuple[float, float]:
@@ -266,54 +295,63 @@ class Registrar:
         judged: Sequence[Placed],
         prior: PosePrior,
         candidates: int,
+        finish: Callable[[Placed], Finished] | None = None,
+        direct: Sequence[Placed] = (),
     ) -> Registered:
         """The best of the judged candidates, of one or more searches of `candidates` in all.
 
-        The best of them are refined at the final level, their rivals too. `judged` must not be
-        empty.
+        The best of them are refined at the final level, their rivals too, and all `direct` ones,
+        which were found there; each by `finish` (None: `at_final`). `judged` must not be empty.
         """
         judged = _ranked(judged, prior)
         exclusion = EXCLUSION_SHARE * view_side_px(templates)
         finalists = _hopeful(_distinct(judged, KEPT_TO_FINISH, exclusion), prior, HOPE, 2)
-        totals = [
-            (total - prior.cost(each.pose), each)
-            for total, each in (self._at_final(templates, levels, each) for each in finalists)
-        ]
+        totals = []
+        for each in (*finalists, *direct):
+            made = finish(each) if finish else self.at_final(templates, levels, each)
+            totals.append((made.total - prior.cost(made.placed.pose), made))
         totals.sort(key=lambda pair: -pair[0])
-        score, best = totals[0]
+        (score, first), best = totals[0], totals[0][1].placed
+        rivals = [pair for pair in totals if apart_px(pair[1].placed, best) > exclusion]
+        judged = [*judged, *direct]
         nearest = min(judged, key=lambda each: apart_px(each, best))
         others = [each for each in judged if apart_px(each, best) > exclusion]
+        looks = [(each.score, each) for each in others]
+        looks += [(made.look, made.placed) for _, made in rivals if made.look is not None]
+        cost = prior.cost(nearest.pose) if first.look is None else prior.cost(best.pose)
         return Registered(
-            placed=self.with_covariance(templates, levels, best),
+            placed=self.with_covariance(first.templates, levels, best),
             score=score,
-            rival=totals[1][0] if len(totals) > 1 else 0.0,
-            look_score=nearest.score - prior.cost(nearest.pose),
-            look_rival=max((each.score - prior.cost(each.pose) for each in others), default=0.0),
+            rival=max((total for total, _ in rivals), default=0.0),
+            look_score=(nearest.score if first.look is None else first.look) - cost,
+            look_rival=max((look - prior.cost(each.pose) for look, each in looks), default=0.0),
             candidates=candidates,
-            finalists=tuple(totals),
-            own=self._own_ratios(templates, levels, score + prior.cost(best.pose), best),
+            finalists=tuple((total, made.placed) for total, made in totals),
+            own=self._own_ratios(first.templates, levels, score + prior.cost(best.pose), best),
         )
 
     def deepened(
         self,
-        templates: ViewTemplates,
-        finer: ViewTemplates,
+        templates: Callable[[Placed], ViewTemplates],
+        finer: Callable[[Placed], ViewTemplates],
         levels: Levels,
         found: Registered,
         prior: PosePrior,
     ) -> Registered:
-        """`found` judged again with one level finer than the final one, of which `finer` is made.
+        """`found` judged again with one level finer than the final one.
 
-        The best may become another of the finalists.
+        `templates` and `finer`: those of a finalist at the final level and at the finer one. The
+        best may become another of the finalists.
         """
-        refiner = Refiner(finer.at(finer.finest), self.reference)
-        totals = [
-            (score + refiner.place(each.pose, 2).score, score, each)
-            for score, each in found.finalists
-        ]
+        totals = []
+        for score, each in found.finalists:
+            made = finer(each)
+            refiner = Refiner(made.at(made.finest), self.reference)
+            totals.append((score + refiner.place(each.pose, 2).score, score, each))
         totals.sort(key=lambda entry: -entry[0])
         fine_score, score, best = totals[0]
-        rivals = totals[1:]
+        exclusion = EXCLUSION_SHARE * view_side_px(templates(best))
+        rivals = [entry for entry in totals if apart_px(entry[2], best) > exclusion]
         changed = best is not found.finalists[0][1]
         deep = replace(
             found,
@@ -322,14 +360,15 @@ class Registrar:
         )
         if not changed:
             return deep
+        near = apart_px(best, found.placed) <= exclusion
         return replace(
             deep,
-            placed=self.with_covariance(templates, levels, best),
+            placed=self.with_covariance(templates(best), levels, best),
             score=score,
             rival=max((entry[1] for entry in rivals), default=0.0),
-            look_score=found.look_rival,
-            look_rival=found.look_score,
-            own=self._own_ratios(templates, levels, score + prior.cost(best.pose), best),
+            look_score=found.look_score if near else found.look_rival,
+            look_rival=found.look_rival if near else found.look_score,
+            own=self._own_ratios(templates(best), levels, score + prior.cost(best.pose), best),
         )
 
     def with_covariance(self, templates: ViewTemplates, levels: Levels, best: Placed) -> Placed:
@@ -347,17 +386,15 @@ class Registrar:
             detail = max(best.score, 1e-3) / max(total - best.score, 1e-3)
         return OwnRatios(detail, local_ratio(final, self.reference, best.pose))
 
-    def _at_final(
-        self, templates: ViewTemplates, levels: Levels, judged: Placed
-    ) -> tuple[float, Placed]:
+    def at_final(self, templates: ViewTemplates, levels: Levels, judged: Placed) -> Finished:
         """A judged candidate refined at the final level, and the sum of its scores."""
         if levels.final == levels.look:
-            return judged.score, judged
+            return Finished(judged.score, judged, templates)
         placed = self.refiner(templates, levels, levels.final).place(
             judged.pose, FULL_STEPS, ROUGH_STEP_PX
         )
         again = self.refiner(templates, levels, levels.look).place(placed.pose, 0)
-        return placed.score + again.score, placed
+        return Finished(placed.score + again.score, placed, templates)
 
     def refiner(self, templates: ViewTemplates, levels: Levels, level: int) -> Refiner:
         """The refiner of a view at one of its levels."""

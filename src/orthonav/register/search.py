@@ -19,6 +19,7 @@ from orthonav.geo.camera import counted_from_centres
 from orthonav.register.evidence import GROUPS
 from orthonav.register.memory import thread_memory
 from orthonav.register.pose import Pose, even_scale, rotation
+from orthonav.register.scale_map import ScaleMap
 from orthonav.register.template import Template, energy_of, turn_planes
 
 Array = NDArray[np.float32]
@@ -103,9 +104,21 @@ def _even(channels: Array, counts: Array, view_px: int) -> Array:
 
 
 def search(
-    template: Template, window: SearchWindow, poses: list[tuple[float, float]], count: int
+    template: Template,
+    window: SearchWindow,
+    poses: list[tuple[float, float]],
+    count: int,
+    scales: ScaleMap | None = None,
 ) -> list[Candidate]:
-    """The `count` best candidates, best first, not closer together than an eighth of the view."""
+    """The `count` best candidates, best first, not closer together than an eighth of the view.
+
+    With `scales` every place is compared under the scales that are expected there only.
+    """
+    expected = (
+        None
+        if scales is None
+        else scales.over(window.level, window.row, window.col, (window.height, window.width))
+    )
     best = np.full((window.height, window.width), -np.inf, np.float32)
     which = np.zeros(best.shape, np.int32)
     numbers = np.empty(best.shape, np.int32)
@@ -115,6 +128,9 @@ def search(
         if scores is None:
             continue
         better = cv2.compare(scores, best, cv2.CMP_GT)
+        if scales is not None and expected is not None:
+            low, high = scales.reach(log_scale)
+            better = cv2.bitwise_and(better, cv2.inRange(expected, low, high))
         numbers.fill(number)
         cv2.copyTo(scores, better, best)
         cv2.copyTo(numbers, better, which)

@@ -161,6 +161,11 @@ class ViewTemplates:
         self._pictures = [(grey, valid)]
         self._made: dict[tuple[int, EvidenceRecipe], Template] = {}
 
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """What was seen (H, W), at the finest level."""
+        return self._pictures[0][1]
+
     def at(self, level: int, recipe: EvidenceRecipe = FINE) -> Template:
         """The template at a level, `finest` or coarser."""
         key = (level, recipe)

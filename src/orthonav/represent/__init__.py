@@ -11,5 +11,6 @@ TABLE = {
     "gray": Variant("orthonav.represent.gray:Gray"),
     "canny": Variant("orthonav.represent.canny:Canny"),
     "segments": Variant("orthonav.represent.segments:Segments", extra="segments"),
+    "onnx": Variant("orthonav.represent.learned:LearnedEdges", extra="neural"),
     "sam": Variant("orthonav.neural.sam:SamBoundaries", flies=False, extra="train"),
 }

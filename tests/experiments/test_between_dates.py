@@ -1,0 +1,82 @@
+"""Edges between dates: what is learnt is what the file gives, and it prefers what stays."""
+
+import hashlib
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="learning needs PyTorch")
+pytest.importorskip("onnx", reason="writing a network needs ONNX")
+pytest.importorskip("onnxruntime", reason="edges by a network need onnxruntime")
+
+from experiments.paper import between_dates as between  # noqa: E402
+from experiments.paper.methods import BETWEEN_DATES  # noqa: E402
+
+from orthonav.represent.learned import LearnedEdges  # noqa: E402
+
+
+def dates(seed=0, size=150):
+    """Two dates of fields with the same borders, each with stripes of its own."""
+    rng = np.random.default_rng(seed)
+    fields = np.kron(rng.integers(0, 5, (5, 5)), np.ones((30, 30)))[:size, :size] * 40
+    y, x = np.mgrid[:size, :size]
+    stripes = [((y // 3) % 2) * 30, ((x // 3) % 2) * 30]
+    return [np.clip(fields + each, 0, 255).astype(np.uint8) for each in stripes]
+
+
+def test_the_margin_is_what_the_convolutions_take():
+    model, size = between.network(), 64
+    margin = between.margin_px(model)
+    side = size + 2 * margin
+    assert model(torch.zeros(1, 1, side, side)).shape == (1, 1, size, size)
+
+
+def test_what_is_learnt_is_what_flies(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(between, "BATCH", 2)
+    monkeypatch.setattr(between, "CROP_PX", 64)
+    areas = [dates(seed) for seed in range(2)]
+    model = between.learn(areas, steps=4)
+    assert "step 4 of 4" in capsys.readouterr().out
+    shares = [np.mean(between.logits(model, grey) > 0) for each in areas for grey in each]
+    plain = [between.canny(grey).mean() for each in areas for grey in each]
+    assert np.mean(shares) == pytest.approx(np.mean(plain), rel=0.02)
+    path = tmp_path / "edges.onnx"
+    between.write(model, path)
+    first = path.read_bytes()
+    between.write(model, path)
+    assert path.read_bytes() == first
+    edges = LearnedEdges(str(path))
+    assert edges.margin_px == between.margin_px(model)
+    grey = areas[0][0]
+    expected = between.logits(model, grey)
+    found = edges(grey, np.ones(grey.shape, bool))[0]
+    clear = np.abs(expected) > 1e-4
+    np.testing.assert_array_equal(found[clear] > 0, expected[clear] > 0)
+
+
+def test_targets_are_edges_of_another_date(monkeypatch):
+    monkeypatch.setattr(between, "BATCH", 3)
+    monkeypatch.setattr(between, "CROP_PX", 32)
+    flat, edged = np.full((90, 90), 90, np.uint8), np.full((90, 90), 90, np.uint8)
+    edged[:, 45:] = 200
+    pairs = list(between.batches([[flat, edged]], 10, 6))
+    shapes = {(seen.shape, wanted.shape) for seen, wanted in pairs}
+    assert shapes == {((3, 1, 52, 52), (3, 1, 32, 32))}
+    for seen, wanted in pairs:
+        for view, target in zip(seen, wanted, strict=True):
+            assert not (np.ptp(view.numpy()) > 0.1 and target.any())  # the edge is at one date
+
+
+def test_unrelated_edges_do_not_agree():
+    rng = np.random.default_rng(0)
+    one, other = (rng.random((2, 200, 200)) < 0.1).astype(np.uint8)
+    assert between.agreement(one, one) == pytest.approx(1)
+    assert abs(between.agreement(one, other)) < 0.05
+
+
+def test_the_network_in_the_repository_flies():
+    edges = LearnedEdges(str(BETWEEN_DATES))
+    assert edges.sha256 == hashlib.sha256(BETWEEN_DATES.read_bytes()).hexdigest()
+    assert edges.margin_px == between.margin_px(between.network())
+    grey = dates()[0]
+    assert 0.01 < edges(grey, np.ones(grey.shape, bool)).mean() < 0.6

@@ -1,0 +1,37 @@
+"""Which searches are run for a view, in which order."""
+
+import math
+
+from orthonav.localizer.plan import DEFAULT_PLAN
+from orthonav.register.registrar import Levels, PosePrior
+
+LEVELS = Levels(2, 1, 0)
+TRACKED = PosePrior(0.5, math.radians(2.0), 0.03)
+
+
+def levels_of(prior, pose_ms, levels=LEVELS):
+    """Levels of the searches for a view where a pose at a level costs `pose_ms[level]`."""
+    searches = DEFAULT_PLAN.searches(
+        levels, prior, lambda level, poses: poses * pose_ms[level], lambda _: math.inf
+    )
+    return [each.level for each in searches]
+
+
+def test_the_final_level_comes_last_where_it_is_cheap():
+    levels = levels_of(TRACKED, (0.2, 0.1, 0.1))
+    assert levels[-1] == 0 and set(levels[:-1]) == {1}
+
+
+def test_the_final_level_is_left_out_where_it_is_dear():
+    assert 0 not in levels_of(TRACKED, (20.0, 0.1, 0.1))
+    assert 0 not in levels_of(PosePrior(None, math.pi, 0.1), (0.2, 0.1, 0.1))
+
+
+def test_a_small_view_is_finished_where_it_is_judged():
+    assert set(levels_of(TRACKED, (0.1, 0.1), Levels(1, 0, 0))) == {0}
+    searches = list(
+        DEFAULT_PLAN.searches(
+            Levels(1, 0, 0), TRACKED, lambda _, poses: 0.1 * poses, lambda _: math.inf
+        )
+    )
+    assert {each.candidates for each in searches} == {DEFAULT_PLAN.stage_candidates}

@@ -1,0 +1,160 @@
+"""Edges by a network: its file is checked when it is opened, and a map flies with its own only."""
+
+import json
+
+import numpy as np
+import pytest
+
+onnx = pytest.importorskip("onnx", reason="networks for the tests need ONNX")
+pytest.importorskip("onnxruntime", reason="edges by a network need onnxruntime")
+
+from orthonav.errors import MapFileError, MissingExtraError, MissingFileError, VariantError  # noqa: E402
+from orthonav.localizer import Localizer  # noqa: E402
+from orthonav.mapfile import open_map  # noqa: E402
+from orthonav.prepare import BuildRequest, build_map  # noqa: E402
+from orthonav.prepare.methods import stored_representation  # noqa: E402
+from orthonav.represent import TABLE, learned  # noqa: E402
+from orthonav.represent.learned import VARIABLE, LearnedEdges  # noqa: E402
+from orthonav.variants import make_variant, variant_from_recipe  # noqa: E402
+
+FLOAT, DOUBLE = onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE
+
+
+def sharp(side=5, threshold=0.02):
+    """Kernel of a pixel's difference to its neighbourhood."""
+    kernel = np.full((1, 1, side, side), 1 / side**2, np.float32)
+    kernel[0, 0, side // 2, side // 2] -= 1
+    return kernel, np.array([-threshold], np.float32)
+
+
+def write(
+    path, *, kernel=None, pads=(0, 0, 0, 0), names=("grey", "edges"), kind=FLOAT, strides=(1, 1)
+):
+    """A network of one convolution."""
+    weights, bias = sharp() if kernel is None else kernel
+    helper, arrays = onnx.helper, onnx.numpy_helper
+    numbers = np.float32 if kind == FLOAT else np.float64
+    node = helper.make_node(
+        "Conv", [names[0], "w", "b"], [names[1]], pads=list(pads), strides=list(strides)
+    )
+    graph = helper.make_graph(
+        [node],
+        "edges",
+        [helper.make_tensor_value_info(names[0], kind, [1, 1, None, None])],
+        [helper.make_tensor_value_info(names[1], kind, [1, None, None, None])],
+        [
+            arrays.from_array(weights.astype(numbers), "w"),
+            arrays.from_array(bias.astype(numbers), "b"),
+        ],
+    )
+    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
+    made.ir_version = 8
+    path.write_bytes(made.SerializeToString())
+    return path
+
+
+@pytest.fixture
+def network(tmp_path):
+    return write(tmp_path / "edges.onnx")
+
+
+def ones(grey):
+    return np.ones(grey.shape, bool)
+
+
+def test_edges_are_where_the_network_is_positive(network):
+    grey = np.random.default_rng(0).integers(0, 256, (40, 50)).astype(np.uint8)
+    made = make_variant(TABLE, f"onnx:weights={network}")
+    assert made.margin_px == 2 and made.channels == 1
+    padded = np.pad(grey.astype(np.float64) / 255, 2, mode="edge")
+    means = sum(padded[y : y + 40, x : x + 50] for y in range(5) for x in range(5)) / 25
+    np.testing.assert_array_equal(made(grey, ones(grey))[0], means - grey / 255 > 0.02)
+
+
+def test_a_map_stores_the_digest_and_not_the_path(network, monkeypatch):
+    stored = stored_representation(LearnedEdges(str(network)))
+    assert stored["weights"] == "" and len(stored["sha256"]) == 64
+    plain = json.loads(json.dumps(stored))
+    with pytest.raises(VariantError, match=VARIABLE):
+        variant_from_recipe(TABLE, plain, flying=True)
+    monkeypatch.setenv(VARIABLE, str(network))
+    assert variant_from_recipe(TABLE, plain, flying=True).margin_px == 2
+
+
+def test_another_network_than_the_maps_is_refused(network, tmp_path, monkeypatch):
+    plain = stored_representation(LearnedEdges(str(network)))
+    other = write(tmp_path / "other.onnx", kernel=sharp(threshold=0.03))
+    monkeypatch.setenv(VARIABLE, str(other))
+    with pytest.raises(VariantError, match="another edge network"):
+        variant_from_recipe(TABLE, plain, flying=True)
+
+
+def test_a_network_that_is_exchanged_in_flight_is_refused(network):
+    made = LearnedEdges(str(network))
+    write(network, kernel=sharp(threshold=0.5))
+    learned._network.cache_clear()
+    with pytest.raises(VariantError, match="another edge network"):
+        made(np.zeros((9, 9), np.uint8), np.ones((9, 9), bool))
+
+
+@pytest.mark.parametrize(
+    "fields, says",
+    [
+        ({"names": ("image", "edges")}, "no network from"),
+        ({"names": ("grey", "out")}, "no network from"),
+        ({"kind": DOUBLE}, "no network from"),
+        ({"strides": (2, 2)}, "same margin"),
+        ({"pads": (1, 0, 1, 0)}, "same margin"),
+        ({"pads": (3, 3, 3, 3)}, "margin of 0 to 32 px, got -1"),
+        ({"kernel": (sharp()[0].repeat(2, 0), sharp()[1].repeat(2))}, "same margin"),
+        ({"kernel": sharp(69)}, "margin of 0 to 32 px, got 34"),
+    ],
+)
+def test_a_network_of_another_shape_is_refused(tmp_path, fields, says):
+    path = write(tmp_path / "edges.onnx", **fields)
+    with pytest.raises(VariantError, match=says):
+        LearnedEdges(str(path))
+
+
+def test_what_is_no_network_is_refused(tmp_path, monkeypatch):
+    path = tmp_path / "edges.onnx"
+    with pytest.raises(MissingFileError, match="does not exist"):
+        LearnedEdges(str(path))
+    for data in (b"", b"no network", write(path).read_bytes()[:-40]):
+        path.write_bytes(data)
+        with pytest.raises(VariantError, match="no network from"):
+            LearnedEdges(str(path))
+    monkeypatch.setattr(learned, "LARGEST_BYTES", 3)
+    with pytest.raises(VariantError, match="larger than"):
+        LearnedEdges(str(path))
+    monkeypatch.delenv(VARIABLE, raising=False)
+    with pytest.raises(VariantError, match="weights=PATH"):
+        LearnedEdges()
+
+
+def test_the_extra_is_named_where_onnxruntime_is_absent(network, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
+    learned._network.cache_clear()
+    with pytest.raises(MissingExtraError, match=r"orthonav\[neural\]"):
+        LearnedEdges(str(network))
+
+
+def test_a_map_with_such_edges_flies_with_its_network_only(area, tmp_path, monkeypatch, network):
+    monkeypatch.setattr("orthonav.prepare.calibrate.CROPS", 12)
+    path = tmp_path / "area.onav"
+    build_map(
+        BuildRequest(
+            [area.past],
+            path,
+            edges=f"onnx:weights={network}",
+            registration=False,
+            tile_px=64,
+            gsd_m=5.0,
+            overlap=0.75,
+        )
+    )
+    assert str(network).encode() not in path.read_bytes()
+    with pytest.raises(MapFileError, match="map cannot be flown"):
+        Localizer(open_map(path), registration=False)
+    monkeypatch.setenv(VARIABLE, str(network))
+    assert Localizer(open_map(path), registration=False).tiles.representation.margin_px == 2
