@@ -34,6 +34,7 @@ from orthonav.check.places import (
     checked_m2,
     trial_places,
 )
+from orthonav.check.recalibrate import Recalibration
 from orthonav.check.request import CheckRequest
 from orthonav.check.route import blind_stretches, predicted_along
 from orthonav.check.trials import Trial, run_many
@@ -47,6 +48,7 @@ from orthonav.geo.route import distance_to_polyline_m
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.mapfile.reader import MapFile
+from orthonav.records import MAP_STD_M
 
 Array = NDArray[np.float64]
 BAND_PRIORS = 4.0
@@ -198,9 +200,10 @@ class _Check:
             view_side_m=side_m,
             spacing_m=math.sqrt(self._checked_m2 / max(len(own), 1)),
             other_date=other,
-            # Trials do not show how well orthophotos of two dates agree.
-            least_error_m=self.floor_px * self.sheet.grid.gsd_m * math.sqrt(2),
+            least_error_m=self._least_error_m,
             coverage=lambda points: lasting.seen_share(points, side_m),
+            recalibrated=self._recalibrated,
+            scenes_std=self._recalibration.std,
         )
         cells = self._cells(predictor, own)
         along = self._along(predictor)
@@ -211,9 +214,11 @@ class _Check:
         if known.any():
             changed = float(cells.changed[known].mean())
         mean = float(cells.probability[known].mean()) if known.any() else 0.0
+        low = float(cells.low[known].mean()) if known.any() else 0.0
         findings = Findings(
             conditions=self.conditions,
             mean=mean if along is None else float(along.probability.mean()),
+            low=low if along is None else float(along.low.mean()),
             calibrated=self.calibrated,
             wrong=int(predictor.wrong.sum()),
             trials=len(own) + len(other),
@@ -247,6 +252,30 @@ class _Check:
             envelope=envelope,
             alternatives=self._alternatives(heights, own, cells),
         )
+
+    @property
+    def _recalibration(self) -> Recalibration:
+        found = self.request.recalibration
+        return found.other_sensor() if self.request.other_sensor else found
+
+    def _recalibrated(self, share: Array) -> Array:
+        """Predicted shares (N,) from those of trials; a second date needs no recalibration."""
+        if self.request.other_date is not None:
+            return share
+        view_px = self.plan.side_m / self.sheet.grid.gsd_m
+        return self._recalibration(share, view_px, self.request.prior_std_m is not None)
+
+    @property
+    def _least_error_m(self) -> float:
+        """Errors of a fix that trials do not show, root mean square.
+
+        How well orthophotos of two dates agree, the displacement of the map as a whole, and the
+        unreported tilt of the camera, at a height that may be off.
+        """
+        floor_m = self.floor_px * self.sheet.grid.gsd_m
+        high_m = self.plan.agl_m * math.hypot(1.0, self.request.agl_std)
+        tilt_m = high_m * math.tan(math.radians(self.request.tilt_std_deg))
+        return math.sqrt(2) * math.hypot(floor_m, MAP_STD_M, tilt_m)
 
     def _trials(self, places: Array) -> tuple[list[Trial], list[Trial]]:
         """Trials with the map's imagery, and with that of the second date."""

@@ -15,8 +15,8 @@ from orthonav.check.outcome import (
 )
 
 # Thresholds of a planner's judgement, not of a measurement; docs/check.md lists them.
-GO_MEAN, NO_GO_MEAN = 0.6, 0.2
-"""Mean probability of a fix: go from the first on, no-go below the second."""
+GO_LOW, NO_GO_MEAN = 0.6, 0.2
+"""Go from this lower end of the mean probability on, no-go below this mean probability."""
 GO_OUTSIDE, NO_GO_OUTSIDE = 0.005, 0.1
 """Share of the route outside the map."""
 GO_WRONG, NO_GO_WRONG = 0.005, 0.02
@@ -34,7 +34,8 @@ _ORDER = (Word.NO_GO, Word.MARGINAL, Word.GO)
 class Findings:
     """The input of the verdict.
 
-    `mean`: mean probability along the route, or over the map.
+    `mean`, `low`: mean probability along the route, or over the map, and the lower end of its 80 %
+    interval.
     `calibrated`: the map carries a confidence model.
     `wrong`, `trials`: number of confident and wrong trials, and of all.
     `outside`: share of the route outside the map, 0 to 1.
@@ -43,6 +44,7 @@ class Findings:
 
     conditions: Conditions
     mean: float
+    low: float
     calibrated: bool
     wrong: int
     trials: int
@@ -77,9 +79,10 @@ def _trust(found: Findings) -> list[Reason]:
 
 def _mean(found: Findings) -> Reason:
     where = "along the route" if found.along is not None else "on the map"
-    fine = found.mean >= GO_MEAN
+    fine = found.low >= GO_LOW
     text = f"One view has {'' if fine else 'only '}{_article(found.mean)} {100 * found.mean:.0f} % "
-    text += f"chance of a confident, correct fix {where} (mean)."
+    text += f"chance of a confident, correct fix {where} (mean), "
+    text += f"at least {100 * found.low:.0f} % on nine of ten scenes."
     if fine:
         return Reason("fixes", text, Word.GO)
     return Reason("few_fixes", text, Word.NO_GO if found.mean < NO_GO_MEAN else Word.MARGINAL)

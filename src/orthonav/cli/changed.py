@@ -56,7 +56,7 @@ def report_changes(
 
     if options.report_changes is None:
         return None
-    registration = Localizer(opened).registration
+    registration = Localizer(opened, level_ground=True).registration
     check_comparable(options, registration, opened)
     assert registration is not None
     side_m = cell_side_m([(flight.camera, results) for flight, results in flights])

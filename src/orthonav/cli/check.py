@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING
 from orthonav.cli.common import ROUTE_HELP, add_dem, print_json, progress
 
 EVERYDAY = (
-    *("--route", "--band-m", "--other-date", "--changes", "--camera", "--agl-m", "--dem"),
+    *(
+        "--route",
+        "--band-m",
+        "--other-date",
+        "--other-sensor",
+        "--changes",
+        "--camera",
+        "--agl-m",
+        "--dem",
+    ),
     *("--yaw-std-deg", "--heading", "--prior-std-m", "--prior", "--quick", "--json"),
 )
 
@@ -125,6 +134,19 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
         help="standard deviation of the height of houses and trees, which causes relief "
         "displacement (default 3)",
     )
+    parser.add_argument(
+        "--tilt-std-deg",
+        type=float,
+        default=1.5,
+        help="standard deviation of the pitch and roll that are not reported; they displace fixes "
+        "(default 1.5)",
+    )
+    parser.add_argument(
+        "--other-sensor",
+        action="store_true",
+        help="the camera differs from the map's sensor by more than years do (a drone over "
+        "satellite imagery, infrared, another season only): fixes are predicted to be rarer",
+    )
     parser.add_argument("--speed-mps", type=float, default=20.0, help="ground speed (default 20)")
     parser.add_argument(
         "--drift",
@@ -208,6 +230,8 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         extras=not options.quick,
         workers=options.workers,
         seed=options.seed,
+        tilt_std_deg=options.tilt_std_deg,
+        other_sensor=options.other_sensor,
         changes=_changes(options),
         about=replace(_checked_inputs(options, route), height=origin),
     )
