@@ -64,13 +64,14 @@ def made_cells(rows, cols, side_m, seed=1, west_m=None, north_m=None):
         wrong=0.03 * (1 - probability),
         trials=rng.integers(4, 20, (rows, cols)).astype(np.int32),
         persistence=np.clip(probability + 0.1 * rng.normal(size=(rows, cols)), 0, 1),
+        changed=np.where(rng.random((rows, cols)) < 0.1, 1.0, 0.0),
     )
 
 
 def lost_in(cells, mask):
     """The same cells, unknown where `mask` is set."""
     hole = np.where(mask, np.nan, 1.0)
-    names = ("probability", "low", "high", "error_m", "wrong", "persistence")
+    names = ("probability", "low", "high", "error_m", "wrong", "persistence", "changed")
     values = {name: getattr(cells, name) * hole for name in names}
     trials = np.where(mask, 0, cells.trials).astype(np.int32)
     return Cells(cells.west_m, cells.north_m, cells.side_m, trials=trials, **values)

@@ -10,6 +10,7 @@ import rasterio
 from made_trials import lost, right
 
 from helpers import write_dem
+from orthonav.changes.record import ChangedGround, ChangeGrid, write_changes
 from orthonav.check import run as check_run
 from orthonav.check.outcome import Word
 from orthonav.check.request import CheckRequest
@@ -22,6 +23,7 @@ from orthonav.geo.camera import Camera
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.route import Route
 from orthonav.mapfile import open_map
+from orthonav.mapfile.signature import map_digest
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 
@@ -130,6 +132,24 @@ def test_the_same_check_twice(checked, frame):
     route = route_of(frame, [[-300, 0], [300, 100]])
     one, other = (to_json(checked(route=route)) for _ in range(2))
     assert one == other and one != to_json(checked(route=route, seed=2))
+
+
+def test_another_sensor_lowers_what_is_predicted(checked):
+    usual, other = checked(), checked(other_sensor=True)
+    assert halves(other.cells)[0] < halves(usual.cells)[0] - 0.02
+    low, lower = (np.nanmean(each.cells.low) for each in (usual, other))
+    assert lower < low - 0.05
+
+
+def test_expected_errors_hold_tilt_height_and_map(checked):
+    steady, leaning = checked(tilt_std_deg=0.0), checked(tilt_std_deg=5.0)
+    least = float(np.nanmin(steady.cells.error_m))
+    assert least > 3.0 * math.sqrt(2)  # displacement of the map
+    assert float(np.nanmin(leaning.cells.error_m)) > math.hypot(
+        least, math.sqrt(2) * 130.0 * math.tan(math.radians(5.0)) * 0.99
+    )
+    vague = checked(tilt_std_deg=5.0, agl_std=0.5)
+    assert np.nanmin(vague.cells.error_m) > 1.05 * np.nanmin(leaning.cells.error_m)
 
 
 def test_another_date_is_used(checked, half_blank):
@@ -356,6 +376,27 @@ def test_command(run, untried, half_blank, route_path, tmp_path):
 def unwritten(untried, monkeypatch):
     """Nothing is written."""
     monkeypatch.setattr("orthonav.check.write.write_check", lambda result, opened, out: out)
+
+
+def test_changed_ground_is_named(run, unwritten, half_blank, frame, tmp_path):
+    """In the west it is part of the cells, and the report of another map is doubted."""
+    grid = ChangeGrid(frame, -400.0, 100.0, 100.0, 2, 2)
+    ones = np.ones((2, 2))
+    path = tmp_path / "changes.geojson"
+    command = ("check", half_blank.map, *VIEWS, "--json", "--out", tmp_path / "report")
+    for digest, said in ((map_digest(half_blank.map), ""), ("0" * 64, "with another map")):
+        gone = ChangedGround(grid, ones, ones.astype(np.int32), ones > 0, "old.onav", digest)
+        write_changes(path, gone)
+        done = run(*command, "--changes", path)
+        assert said in done.err and (said or not done.err)
+    plain = json.loads(done.out)
+    assert "changed_ground" in [reason["code"] for reason in plain["verdict"]["reasons"]]
+    cells = plain["cells"]
+    changed_m2 = np.array(cells["changed"]).sum() * cells["side_m"] ** 2
+    assert changed_m2 == pytest.approx(4 * 100.0**2, rel=0.1)
+    unchanged = json.loads(run(*command).out)
+    assert not np.any(unchanged["cells"]["changed"])
+    assert "changed_ground" not in [each["code"] for each in unchanged["verdict"]["reasons"]]
 
 
 @pytest.mark.parametrize("word", list(Word), ids=lambda word: word.value)

@@ -5,10 +5,12 @@ import multiprocessing
 import os
 import signal
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from orthonav.changes.record import ChangedGround, ChangeGrid
 from orthonav.check import trials, views
 from orthonav.check.ortho import OrthoPyramid, require_overlap
 from orthonav.check.persistence import MARGIN_PX
@@ -73,6 +75,19 @@ def test_unchanged_views_are_found_with_less_telemetry(exact, changed):
 def test_large_errors_of_heading_and_height_prevent_a_fix(plan):
     off = TrialPlan(**(vars(plan) | {"yaw_off_deg": 60.0, "agl_off": -0.4}))
     assert max(trial.confidence for trial in run_trials(off, WEST[:3])) < 0.5
+
+
+def test_views_of_ground_that_changed_are_not_found(plan, registration):
+    grid = ChangeGrid(registration.sheet.frame, -450.0, 300.0, 100.0, 6, 9)
+    shape = grid.rows, grid.cols
+    gone = np.zeros(shape, np.bool_)
+    gone[:, :5] = True
+    changes = ChangedGround(grid, np.ones(shape), np.ones(shape, np.int32), gone)
+    still = ChangedGround(grid, np.ones(shape), np.ones(shape, np.int32), ~gone)
+    before = run_trials(plan, WEST[:3])
+    assert plain([before]) == plain([run_trials(replace(plan, changes=still), WEST[:3])])
+    after = run_trials(replace(plan, changes=changes), WEST[:3])
+    assert max(trial.confidence for trial in after) < 0.5 < max(t.confidence for t in before)
 
 
 def test_views_of_another_year_of_blank_ground_are_not_found(plan):

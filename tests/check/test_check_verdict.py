@@ -23,6 +23,7 @@ ALONG = Along(
 FINE = Findings(
     conditions=CONDITIONS,
     mean=0.9,
+    low=0.8,
     calibrated=True,
     wrong=0,
     trials=1000,
@@ -55,22 +56,28 @@ def test_go():
     assert judged(FLOWN) == (Word.GO, {"fixes": Word.GO, "drift": Word.GO})
 
 
+def test_changed_ground_is_a_warning_and_much_of_it_is_marginal():
+    assert judged(replace(FINE, changed=0.02))[1]["changed_ground"] is Word.GO
+    word, reasons = judged(replace(FINE, changed=0.2))
+    assert word is Word.MARGINAL and reasons["changed_ground"] is Word.MARGINAL
+
+
 def test_exit_codes():
     assert {word: word.exit_code for word in Word} == {Word.GO: 0, Word.MARGINAL: 3, Word.NO_GO: 4}
 
 
 @pytest.mark.parametrize(
-    "mean, code, word",
+    "mean, low, code, word",
     [
-        (0.6, "fixes", Word.GO),
-        (0.59, "few_fixes", Word.MARGINAL),
-        (0.2, "few_fixes", Word.MARGINAL),
-        (0.19, "few_fixes", Word.NO_GO),
-        (0.0, "few_fixes", Word.NO_GO),
+        (0.7, 0.6, "fixes", Word.GO),
+        (0.99, 0.59, "few_fixes", Word.MARGINAL),
+        (0.2, 0.1, "few_fixes", Word.MARGINAL),
+        (0.19, 0.1, "few_fixes", Word.NO_GO),
+        (0.0, 0.0, "few_fixes", Word.NO_GO),
     ],
 )
-def test_mean_probability(mean, code, word):
-    assert judged(replace(FINE, mean=mean)) == (word, {code: word})
+def test_go_rests_on_the_low_end(mean, low, code, word):
+    assert judged(replace(FINE, mean=mean, low=low)) == (word, {code: word})
 
 
 def test_a_map_without_confidence_is_no_go():
@@ -156,19 +163,22 @@ def test_lookalikes_never_worsen_the_verdict():
 
 
 @pytest.mark.parametrize(
-    "mean, text",
+    "mean, start",
     [
-        (0.85, "One view has an 85 % chance of a confident, correct fix on the map (mean)."),
-        (0.72, "One view has a 72 % chance of a confident, correct fix on the map (mean)."),
-        (0.11, "One view has only an 11 % chance of a confident, correct fix on the map (mean)."),
-        (0.08, "One view has only an 8 % chance of a confident, correct fix on the map (mean)."),
+        (0.85, "One view has an 85 % chance"),
+        (0.72, "One view has a 72 % chance"),
+        (0.11, "One view has only an 11 % chance"),
+        (0.08, "One view has only an 8 % chance"),
     ],
 )
-def test_the_chance_of_a_fix_is_a_sentence(mean, text):
-    assert verdict_of(replace(FINE, mean=mean)).reasons[0].text == text
+def test_the_chance_of_a_fix_is_a_sentence(mean, start):
+    low = mean - 0.06
+    rest = f" of a confident, correct fix on the map (mean), at least {100 * low:.0f} % on nine"
+    said = verdict_of(replace(FINE, mean=mean, low=low)).reasons[0].text
+    assert said == f"{start}{rest} of ten scenes."
 
 
 def test_the_worst_reason_decides():
-    findings = replace(FLOWN, mean=0.3, outside=0.5, calibrated=False)
+    findings = replace(FLOWN, mean=0.3, low=0.2, outside=0.5, calibrated=False)
     word, reasons = judged(findings)
     assert word is Word.NO_GO and reasons["few_fixes"] is Word.MARGINAL and len(reasons) == 4

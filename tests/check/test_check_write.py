@@ -141,9 +141,18 @@ def test_the_raster_lies_where_the_cells_do(written):
     cells = result.cells
     with rasterio.open(folder / "check.tif") as raster:
         assert raster.bounds == (-500, -500, 500, 500)
-        names = ("probability", "low", "high", "error_m", "wrong", "trials", "persistence")
+        names = (
+            "probability",
+            "low",
+            "high",
+            "error_m",
+            "wrong",
+            "trials",
+            "persistence",
+            "changed",
+        )
         assert raster.descriptions == names
-        assert raster.dtypes == ("float32",) * 7 and math.isnan(raster.nodata)
+        assert raster.dtypes == ("float32",) * len(names) and math.isnan(raster.nodata)
         assert raster.compression.name == "deflate"
         for number, name in enumerate(names, start=1):
             np.testing.assert_allclose(raster.read(number), getattr(cells, name), rtol=1e-6)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.check.recalibrate import PLAIN, expit, logit
 from orthonav.check.trials import Trial
 from orthonav.confidence.logistic import fit_weights
 
@@ -25,8 +26,6 @@ OTHER_DATE_WEIGHT = 3.0
 """Weight of a trial with imagery of a second date, which needs no simulated ageing."""
 SAME_COVERAGE = 0.12
 """Standard deviation of the weights over the share of a view that the map covers."""
-YEARS_LOGIT = 0.6
-"""Standard deviation of the logit from year to year, measured; see docs/check.md."""
 INTERVAL, INTERVAL_SIGMAS = (0.1, 0.9), 1.2816
 """Ends of the 80 % interval, and the same in standard deviations of a normal distribution."""
 JEFFREYS = 0.3
@@ -66,11 +65,14 @@ class Predictor:
         other_date: Sequence[Trial] = (),
         least_error_m: float = 0.0,
         coverage: Callable[[Array], Array],
+        recalibrated: Callable[[Array], Array] = np.asarray,
+        scenes_std: float = PLAIN.std,
     ) -> None:
         """`trials` of the map's own imagery, `other_date` of a second date.
 
         `coverage` returns the share (N,) of a view over places (N, 2) that the map covers; trials
-        count for places of similar coverage.
+        count for places of similar coverage. `recalibrated` turns shares (N,) of trials into those
+        of views of another date, whose logit varies from scene to scene by `scenes_std`.
         """
         every = [*trials, *other_date]
         self._points = np.array([each.en_m for each in every], np.float64).reshape(-1, 2)
@@ -83,6 +85,7 @@ class Predictor:
         self._least_error_m = least_error_m
         self._coverage_at, self._coverage = coverage, coverage(self._points)
         self._persistence = self._persistence_of(trials, other_date)
+        self._recalibrated, self._scenes_std = recalibrated, scenes_std
         self._expected = self._regression()
 
     def _persistence_of(self, trials: Sequence[Trial], other: Sequence[Trial]) -> Array:
@@ -126,7 +129,8 @@ class Predictor:
         bad = PRIOR_TRIALS * (1 - expected) + near @ ~self.right
         probability = good / (good + bad)
         low, high = (beta.ppf(end, good + JEFFREYS, bad + JEFFREYS) for end in INTERVAL)
-        years = INTERVAL_SIGMAS * YEARS_LOGIT
+        probability, low, high = (self._recalibrated(each) for each in (probability, low, high))
+        years = INTERVAL_SIGMAS * self._scenes_std
         squares = np.where(self.right, np.nan_to_num(self._error) ** 2, 0.0)
         overall = float(squares.sum() / max(self.right.sum(), 1))
         square_error = (near @ squares + overall) / (near @ self.right + 1.0)
@@ -152,10 +156,5 @@ class Predictor:
 def _widened(middle: Array, end: Array, by_logit: float) -> Array:
     """`end` of an interval moved outwards by the deviation between years, independent of it."""
 
-    def logit(p: Array) -> Array:
-        p = np.clip(p, 1e-4, 1 - 1e-4)
-        return np.asarray(np.log(p / (1 - p)))
-
     off = np.hypot(logit(end) - logit(middle), by_logit)
-    moved = logit(middle) + np.sign(by_logit) * off
-    return np.asarray(1 / (1 + np.exp(-moved)))
+    return expit(logit(middle) + np.sign(by_logit) * off)

@@ -67,6 +67,7 @@ class Cells:
     `wrong`: share of nearby trials that were confident and wrong, 0 to 1.
     `trials`: number of views tried in the cell, second date excluded.
     `persistence`: expected correlation of the ground's gradients with another year, 0 to 1.
+    `changed`: share that changed since the map was made, 0 to 1; 0 where nothing is known of it.
     """
 
     west_m: float
@@ -79,6 +80,7 @@ class Cells:
     wrong: Array
     trials: NDArray[np.int32]
     persistence: Array
+    changed: Array
 
 
 CELL_VALUES = {
@@ -89,6 +91,7 @@ CELL_VALUES = {
     "wrong": "share of trials that were confident and wrong",
     "trials": "number of views tried",
     "persistence": "expected correlation of the ground with another year, 0 to 1",
+    "changed": "share that changed since the map was made",
 }
 """Arrays of `Cells` and their meaning, in the order of the bands of the raster."""
 

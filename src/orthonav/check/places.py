@@ -1,14 +1,16 @@
 """Where a check samples: the imagery of a map, whole or in the band of a route, in square cells."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.changes.record import ChangedGround
 from orthonav.errors import AreaError
 from orthonav.geo.area import Area, Extent
+from orthonav.geo.frames import LocalFrame
 from orthonav.geo.grid import TileGrid
 from orthonav.register.reference import GreyPyramid
 
@@ -51,6 +53,15 @@ class MapCoverage:
         rows, cols = layer.shape(level)
         _, valid = layer.read(level, 0, 0, rows, cols)
         return cls(grid.west_m, grid.north_m, grid.gsd_m * 2**level, valid)
+
+    def without(self, changes: ChangedGround | None, frame: LocalFrame) -> "MapCoverage":
+        """The coverage without the ground that changed; `frame` is the plane of the sheet."""
+        if changes is None:
+            return self
+        rows, cols = self.valid.shape
+        pixels = CellGrid(self.west_m, self.north_m, self.pixel_m, rows, cols).centres_en_m
+        changed = changes.covers(pixels, frame).reshape(rows, cols)
+        return replace(self, valid=self.valid & ~changed)
 
     def covers(self, points_en_m: Array) -> NDArray[np.bool_]:
         """Which of points (N, 2) lie on imagery."""

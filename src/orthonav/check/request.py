@@ -3,7 +3,9 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from orthonav.changes.record import ChangedGround
 from orthonav.check.outcome import CheckedInputs
+from orthonav.check.recalibrate import LEARNT, Recalibration
 from orthonav.errors import CheckError
 from orthonav.geo.camera import Camera
 from orthonav.geo.route import Route
@@ -19,6 +21,10 @@ DEFAULT_PRIOR_STD_M = 150.0
 """About 5 km of dead reckoning at that drift."""
 DEFAULT_RELIEF_M = 3.0
 """Height of houses and trees in open country, one standard deviation."""
+
+DEFAULT_TILT_STD_DEG = 1.5
+"""Unreported pitch and roll: a good mount and attitude. Drones that report a level gimbal and lean
+were off by up to 9 deg."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +48,10 @@ class CheckRequest:
     `extras`: also try other errors of heading and height, and other heights.
     `workers`: processes; None: one per core.
     `seed`: of the trials.
+    `tilt_std_deg`: standard deviation of the tilt of the camera that is not reported, 0 to 20.
+    `other_sensor`: the camera differs from the map's sensor by more than years do.
+    `recalibration`: of what trials predict.
+    `changes`: ground that changed since the map was made, as a flight saw it; optional.
     `about`: texts for the report.
     """
 
@@ -62,6 +72,10 @@ class CheckRequest:
     extras: bool = True
     workers: int | None = None
     seed: int = 1
+    tilt_std_deg: float = DEFAULT_TILT_STD_DEG
+    other_sensor: bool = False
+    recalibration: Recalibration = LEARNT
+    changes: ChangedGround | None = None
     about: CheckedInputs = field(default_factory=CheckedInputs)
 
     def __post_init__(self) -> None:
@@ -74,6 +88,7 @@ class CheckRequest:
             "accept": (self.accept, 0.01, 0.999, ""),
             "speed_mps": (self.speed_mps, 0.1, 10_000.0, "m/s"),
             "drift": (self.drift, 0.0, 1.0, "(metres per metre flown: 0.03 is 3 %)"),
+            "tilt_std_deg": (self.tilt_std_deg, 0.0, 20.0, "deg"),
             "relief_m": (self.relief_m, 0.0, 1000.0, "m"),
             "effort": (self.effort, 0.05, 50.0, ""),
             "workers": (self.workers, 1, 1000, "processes"),

@@ -34,6 +34,7 @@ from orthonav.check.places import (
     checked_m2,
     trial_places,
 )
+from orthonav.check.recalibrate import Recalibration
 from orthonav.check.request import CheckRequest
 from orthonav.check.route import blind_stretches, predicted_along
 from orthonav.check.trials import Trial, run_many
@@ -47,6 +48,7 @@ from orthonav.geo.route import distance_to_polyline_m
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.mapfile.reader import MapFile
+from orthonav.records import MAP_STD_M
 
 Array = NDArray[np.float64]
 BAND_PRIORS = 4.0
@@ -134,6 +136,7 @@ class _Check:
             request.prior_std_m,
             request.relief_m,
             request.seed,
+            changes=request.changes,
         )
         short_m, long_m = sorted((plan.width_m, plan.height_m))
         if long_m > MAX_ASPECT * short_m:
@@ -186,6 +189,7 @@ class _Check:
         """Run the trials and derive everything from them."""
         request, side_m = self.request, self.plan.side_m
         rng = np.random.default_rng([request.seed, 4])
+        lasting = self.coverage.without(request.changes, self.sheet.frame)
         places = trial_places(self.coverage, self.area, self.extent, side_m, request.effort, rng)
         own, other = self._trials(places)
         envelope, heights = self._extra_trials(own, rng) if request.extras else (None, [])
@@ -196,24 +200,30 @@ class _Check:
             view_side_m=side_m,
             spacing_m=math.sqrt(self._checked_m2 / max(len(own), 1)),
             other_date=other,
-            # Trials do not show how well orthophotos of two dates agree.
-            least_error_m=self.floor_px * self.sheet.grid.gsd_m * math.sqrt(2),
-            coverage=lambda points: self.coverage.seen_share(points, side_m),
+            least_error_m=self._least_error_m,
+            coverage=lambda points: lasting.seen_share(points, side_m),
+            recalibrated=self._recalibrated,
+            scenes_std=self._recalibration.std,
         )
         cells = self._cells(predictor, own)
         along = self._along(predictor)
-        outside = 0.0
+        outside = changed = 0.0
         if along is not None:
             outside = float(1 - self.coverage.covers(along.points_en_m).mean())
         known = np.isfinite(cells.probability)
+        if known.any():
+            changed = float(cells.changed[known].mean())
         mean = float(cells.probability[known].mean()) if known.any() else 0.0
+        low = float(cells.low[known].mean()) if known.any() else 0.0
         findings = Findings(
             conditions=self.conditions,
             mean=mean if along is None else float(along.probability.mean()),
+            low=low if along is None else float(along.low.mean()),
             calibrated=self.calibrated,
             wrong=int(predictor.wrong.sum()),
             trials=len(own) + len(other),
             outside=outside,
+            changed=changed,
             along=along,
             stretches=() if along is None else blind_stretches(along, self.conditions, side_m),
             lookalikes=found_lookalikes(
@@ -242,6 +252,30 @@ class _Check:
             envelope=envelope,
             alternatives=self._alternatives(heights, own, cells),
         )
+
+    @property
+    def _recalibration(self) -> Recalibration:
+        found = self.request.recalibration
+        return found.other_sensor() if self.request.other_sensor else found
+
+    def _recalibrated(self, share: Array) -> Array:
+        """Predicted shares (N,) from those of trials; a second date needs no recalibration."""
+        if self.request.other_date is not None:
+            return share
+        view_px = self.plan.side_m / self.sheet.grid.gsd_m
+        return self._recalibration(share, view_px, self.request.prior_std_m is not None)
+
+    @property
+    def _least_error_m(self) -> float:
+        """Errors of a fix that trials do not show, root mean square.
+
+        How well orthophotos of two dates agree, the displacement of the map as a whole, and the
+        unreported tilt of the camera, at a height that may be off.
+        """
+        floor_m = self.floor_px * self.sheet.grid.gsd_m
+        high_m = self.plan.agl_m * math.hypot(1.0, self.request.agl_std)
+        tilt_m = high_m * math.tan(math.radians(self.request.tilt_std_deg))
+        return math.sqrt(2) * math.hypot(floor_m, MAP_STD_M, tilt_m)
 
     def _trials(self, places: Array) -> tuple[list[Trial], list[Trial]]:
         """Trials with the map's imagery, and with that of the second date."""
@@ -313,8 +347,17 @@ class _Check:
             whole[here] = getattr(found, each.name)
             columns[each.name] = whole.reshape(grid.rows, grid.cols)
         del columns["weight"]
+        columns["changed"] = self._changed(grid)
         trials = grid.counts(np.array([each.en_m for each in own]))
         return Cells(grid.west_m, grid.north_m, side_m, trials=trials, **columns)
+
+    def _changed(self, grid: CellGrid) -> Array:
+        """Share (rows, cols) of every cell that changed since the map was made."""
+        if self.request.changes is None:
+            return np.zeros((grid.rows, grid.cols))
+        whole = self.coverage.cell_share(grid)
+        lasting = self.coverage.without(self.request.changes, self.sheet.frame).cell_share(grid)
+        return np.clip(1 - lasting / np.maximum(whole, 1e-6), 0.0, 1.0) * (whole > 0)
 
     def _along(self, predictor: Predictor) -> Along | None:
         if self.area is None:

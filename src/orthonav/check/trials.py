@@ -215,7 +215,11 @@ class Trier:
         grey, valid, place = crop
         donor = self._own.donor(rng, size, level)
         inner = np.s_[MARGIN_PX : MARGIN_PX + size, MARGIN_PX : MARGIN_PX + size]
-        picture = np.where(valid[inner], grey[inner], donor)
+        lasting = valid[inner]
+        if plan.changes is not None and plan.other_path is None:
+            points = crops.points_en_m(place, size, level)
+            lasting = lasting & ~plan.changes.covers(points, registration.sheet.frame)
+        picture = np.where(lasting, grey[inner], donor)
         expected = math.nan
         if plan.other_path is None:
             maps = [each[inner] for each in reported_persistence(grey, gsd_m, final - level)]

@@ -15,12 +15,14 @@ from orthonav.check.outcome import (
 )
 
 # Thresholds of a planner's judgement, not of a measurement; docs/check.md lists them.
-GO_MEAN, NO_GO_MEAN = 0.6, 0.2
-"""Mean probability of a fix: go from the first on, no-go below the second."""
+GO_LOW, NO_GO_MEAN = 0.6, 0.2
+"""Go from this lower end of the mean probability on, no-go below this mean probability."""
 GO_OUTSIDE, NO_GO_OUTSIDE = 0.005, 0.1
 """Share of the route outside the map."""
 GO_WRONG, NO_GO_WRONG = 0.005, 0.02
 """Share of trials that were confident and wrong."""
+MAX_CHANGED = 0.1
+"""Share of the ground that changed since the map was made, beyond which a route is marginal."""
 MIN_WRONG = 2
 """A single wrong trial may be chance."""
 TOO_FAR = 2.0
@@ -32,14 +34,17 @@ _ORDER = (Word.NO_GO, Word.MARGINAL, Word.GO)
 class Findings:
     """The input of the verdict.
 
-    `mean`: mean probability along the route, or over the map.
+    `mean`, `low`: mean probability along the route, or over the map, and the lower end of its 80 %
+    interval.
     `calibrated`: the map carries a confidence model.
     `wrong`, `trials`: number of confident and wrong trials, and of all.
     `outside`: share of the route outside the map, 0 to 1.
+    `changed`: share of the checked area that changed since the map was made, 0 to 1.
     """
 
     conditions: Conditions
     mean: float
+    low: float
     calibrated: bool
     wrong: int
     trials: int
@@ -47,6 +52,7 @@ class Findings:
     along: Along | None
     stretches: tuple[BlindStretch, ...]
     lookalikes: tuple[Lookalike, ...]
+    changed: float = 0.0
 
 
 def verdict_of(found: Findings) -> Verdict:
@@ -55,7 +61,7 @@ def verdict_of(found: Findings) -> Verdict:
     if found.along is not None:
         reasons += [*_outside(found.outside), _drift(found, found.along)]
         reasons += _blind(found.stretches)
-    reasons += _lookalikes(found)
+    reasons += [*_changed(found), *_lookalikes(found)]
     reasons.sort(key=lambda reason: _ORDER.index(reason.word))
     return Verdict(reasons[0].word, tuple(reasons))
 
@@ -73,9 +79,10 @@ def _trust(found: Findings) -> list[Reason]:
 
 def _mean(found: Findings) -> Reason:
     where = "along the route" if found.along is not None else "on the map"
-    fine = found.mean >= GO_MEAN
+    fine = found.low >= GO_LOW
     text = f"One view has {'' if fine else 'only '}{_article(found.mean)} {100 * found.mean:.0f} % "
-    text += f"chance of a confident, correct fix {where} (mean)."
+    text += f"chance of a confident, correct fix {where} (mean), "
+    text += f"at least {100 * found.low:.0f} % on nine of ten scenes."
     if fine:
         return Reason("fixes", text, Word.GO)
     return Reason("few_fixes", text, Word.NO_GO if found.mean < NO_GO_MEAN else Word.MARGINAL)
@@ -92,6 +99,18 @@ def _outside(share: float) -> list[Reason]:
         return []
     word = Word.NO_GO if share > NO_GO_OUTSIDE else Word.MARGINAL
     return [Reason("outside_map", f"{100 * share:.0f} % of the route is outside the map.", word)]
+
+
+def _changed(found: Findings) -> list[Reason]:
+    """A warning: what changed lowers the probability, from which the verdict follows."""
+    if found.changed <= 0:
+        return []
+    where = "along the route" if found.along is not None else "on the map"
+    text = f"{100 * found.changed:.1f} % of the ground {where} changed since the map was made: "
+    text += "fixes are rarer there; build the map from newer imagery."
+    return [
+        Reason("changed_ground", text, Word.MARGINAL if found.changed > MAX_CHANGED else Word.GO)
+    ]
 
 
 def _drift(found: Findings, along: Along) -> Reason:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.changes.record import ChangedGround
 from orthonav.check.change import USUAL, Severity
 from orthonav.check.persistence import MARGIN_PX, default_model, features
 from orthonav.geo.camera import Camera
@@ -23,6 +24,7 @@ MIN_VALID = 0.3
 _DONOR_DRAWS = 12
 
 Grey = NDArray[np.uint8]
+Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class TrialPlan:
     `other_path`: orthophoto of a second date to cut views from; None: the map's imagery, aged.
     `yaw_off_deg`: additional heading error, to either side at random.
     `agl_off`: additional height error, a share of the height.
+    `changes`: ground that changed since the map, which views of the map's imagery do not show.
     """
 
     map_path: Path
@@ -51,6 +54,7 @@ class TrialPlan:
     other_path: Path | None = None
     yaw_off_deg: float = 0.0
     agl_off: float = 0.0
+    changes: ChangedGround | None = None
 
     @property
     def width_m(self) -> float:
@@ -120,6 +124,12 @@ class MapCrops:
         east = self._grid.west_m + (col + whole / 2) * unit_m
         north = self._grid.north_m - (row + whole / 2) * unit_m
         return grey, valid, np.array([east, north])
+
+    def points_en_m(self, place_en_m: NDArray[np.float64], size: int, level: int) -> Points:
+        """Centres (size, size, 2) of the pixels of a crop around its exact centre."""
+        unit_m = self._grid.gsd_m * 2**level
+        steps = (np.arange(size) + 0.5 - size / 2) * unit_m
+        return np.stack(np.meshgrid(steps, -steps), axis=-1) + place_en_m
 
     def donor(self, rng: np.random.Generator, size: int, level: int) -> Grey:
         """Mirrored ground (size, size) of a random place, so that it matches no place."""

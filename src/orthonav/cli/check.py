@@ -1,6 +1,7 @@
 """`orthonav check`: before take-off, where can views be placed and can a route be flown?"""
 
 import argparse
+import logging
 import shlex
 import sys
 from dataclasses import replace
@@ -10,10 +11,20 @@ from typing import TYPE_CHECKING
 from orthonav.cli.common import ROUTE_HELP, add_dem, print_json, progress
 
 EVERYDAY = (
-    *("--route", "--band-m", "--other-date", "--camera", "--agl-m", "--dem"),
+    *(
+        "--route",
+        "--band-m",
+        "--other-date",
+        "--other-sensor",
+        "--changes",
+        "--camera",
+        "--agl-m",
+        "--dem",
+    ),
     *("--yaw-std-deg", "--heading", "--prior-std-m", "--prior", "--quick", "--json"),
 )
 
+log = logging.getLogger(__name__)
 _REFERENCES = {
     None: "an unknown reference",
     "agl": "ground",
@@ -23,6 +34,7 @@ _REFERENCES = {
 }
 
 if TYPE_CHECKING:
+    from orthonav.changes.record import ChangedGround
     from orthonav.check.outcome import CheckedInputs
     from orthonav.check.request import CheckRequest
     from orthonav.geo.camera import Camera
@@ -49,6 +61,13 @@ def add(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="TIF",
         help="orthophoto of a second date, not in the map: improves the prediction",
+    )
+    parser.add_argument(
+        "--changes",
+        type=Path,
+        metavar="FILE.geojson",
+        help="ground that changed since the map was made, from localize or evaluate "
+        "--report-changes: warned of, and fixes there are predicted without it",
     )
     parser.add_argument(
         "--camera",
@@ -114,6 +133,19 @@ def _add_errors(parser: argparse.ArgumentParser) -> None:
         default=3.0,
         help="standard deviation of the height of houses and trees, which causes relief "
         "displacement (default 3)",
+    )
+    parser.add_argument(
+        "--tilt-std-deg",
+        type=float,
+        default=1.5,
+        help="standard deviation of the pitch and roll that are not reported; they displace fixes "
+        "(default 1.5)",
+    )
+    parser.add_argument(
+        "--other-sensor",
+        action="store_true",
+        help="the camera differs from the map's sensor by more than years do (a drone over "
+        "satellite imagery, infrared, another season only): fixes are predicted to be rarer",
     )
     parser.add_argument("--speed-mps", type=float, default=20.0, help="ground speed (default 20)")
     parser.add_argument(
@@ -198,8 +230,30 @@ def _request(options: argparse.Namespace) -> "CheckRequest":
         extras=not options.quick,
         workers=options.workers,
         seed=options.seed,
+        tilt_std_deg=options.tilt_std_deg,
+        other_sensor=options.other_sensor,
+        changes=_changes(options),
         about=replace(_checked_inputs(options, route), height=origin),
     )
+
+
+def _changes(options: argparse.Namespace) -> "ChangedGround | None":
+    """Ground that changed, with a warning where it was seen with another map."""
+    from orthonav.changes.record import read_changes
+    from orthonav.mapfile.signature import map_digest
+
+    if options.changes is None:
+        return None
+    found = read_changes(options.changes)
+    if found.map_sha256 and found.map_sha256 != map_digest(options.map):
+        log.warning(
+            "changes were found with another map (%.80s); where the imagery of %s is newer, they "
+            "may be in it already: %s",
+            found.map_name,
+            options.map.name,
+            options.changes,
+        )
+    return found
 
 
 def _agl_m(options: argparse.Namespace, route: "Route | None") -> tuple[float | None, str]:

@@ -8,10 +8,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthonav.cli.common import print_json
+from orthonav.cli.changed import (
+    add_report_changes,
+    changes_text,
+    changes_to_plain,
+    report_changes,
+)
+from orthonav.cli.common import print_json, progress
 from orthonav.cli.needs import require_extras
 
 if TYPE_CHECKING:
+    from orthonav.changes.record import ChangedGround
     from orthonav.evaluate.contact_sheet import Row
     from orthonav.evaluate.flights import FlightReport
     from orthonav.evaluate.metrics import Comparison, Metrics
@@ -66,9 +73,10 @@ def add(parser: argparse.ArgumentParser) -> None:
         type=Path,
         action="append",
         metavar="FLIGHT_DIR",
-        help="show the worst views beside the map in the report (with --map and --report); one per "
-        "file of fixes, in the same order",
+        help="show the worst views beside the map in the report (with --map and --report), and for "
+        "--report-changes; one per file of fixes, in the same order",
     )
+    add_report_changes(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -96,22 +104,45 @@ def run(options: argparse.Namespace) -> None:
     if options.report:
         _write_report(options.report, flights, whole, opened)
     plain = flights_to_json(flights, whole)
+    changed = _changed(options, opened)
+    plain |= changes_to_plain(options, changed)
     if options.metrics:
         write_text(options.metrics, json.dumps(plain, indent=1, allow_nan=False) + "\n")
     if options.json:
         print_json(plain)
         return
     print(f"{verdict(whole)}\n\n{table(flights, whole)}\n\n{summary(flights, whole)}")
+    for line in changes_text(options, changed):
+        print(line)
     if options.report:
         print(f"report: {options.report / 'index.html'}")
 
 
+def _changed(options: argparse.Namespace, opened: "MapFile | None") -> "ChangedGround | None":
+    """Write `--report-changes` by the views of all flights; None where it was not asked for."""
+    from orthonav.flight import open_flight
+    from orthonav.flight.fixes import read_results
+
+    if options.report_changes is None or opened is None:
+        return None
+    flights = [
+        (open_flight(folder), read_results(fixes))
+        for folder, fixes in zip(options.flight, options.fixes, strict=True)
+    ]
+    with progress(options) as shown:
+        return report_changes(options, opened, flights, shown)
+
+
 def _check_flights(options: argparse.Namespace) -> None:
-    """Raise `FlightError` where `--flight` lacks other options."""
+    """Raise `FlightError` where `--flight` or `--report-changes` lack other options."""
     from orthonav.errors import FlightError
 
     flights = options.flight or []
-    if flights and not (options.map and options.report):
+    if options.report_changes and not (options.map and flights):
+        raise FlightError(
+            "--report-changes compares views with the map; give --map and --flight too"
+        )
+    if flights and not (options.map and (options.report or options.report_changes)):
         raise FlightError(
             "--flight shows views beside the map in a report; give --map and --report too"
         )

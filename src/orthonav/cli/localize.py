@@ -6,6 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from orthonav.cli.changed import (
+    add_report_changes,
+    changes_text,
+    changes_to_plain,
+    check_comparable,
+    report_changes,
+)
 from orthonav.cli.common import print_json, progress
 from orthonav.cli.flown import compare_with_flight, take_flown
 from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
@@ -15,6 +22,7 @@ from orthonav.cli.signed import add_signature, checked_signature
 from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
 
 if TYPE_CHECKING:
+    from orthonav.changes.record import ChangedGround
     from orthonav.confidence.accept import Acceptance
     from orthonav.records import ViewResult
 
@@ -127,6 +135,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "(OpenDroneMap's geo.txt) or exif (a table for `exiftool -csv=PATH FOLDER`); heights above "
         "sea need a terrain; can be repeated",
     )
+    add_report_changes(parser)
     add_signature(parser)
     add_source(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -173,6 +182,7 @@ def _on_map(options: argparse.Namespace) -> None:
         raise VariantError("--accept lowe_ratio compares tiles: it needs --registration off")
     if localizer.registration is None and options.registration == "on":
         log.warning("the map has no registration layer: positions are at tile level")
+    check_comparable(options, localizer.registration, opened)
     warn_if_far_from_map(flight, localizer)
     how = {
         "use_prior": options.prior == "telemetry",
@@ -209,7 +219,8 @@ def _on_map(options: argparse.Namespace) -> None:
         write_results(options.out, results)
         export_all(exports, results, dem or TerrainLayer.of(opened))
         advice, tried = doubts.advice(results, accept, shown)
-    _print_summary(options, results, accept, advice, tried)
+        changed = report_changes(options, opened, [(flight, results)], shown)
+    _print_summary(options, results, accept, advice, tried, changed)
 
 
 def _on_atlas(options: argparse.Namespace) -> None:
@@ -229,7 +240,7 @@ def _on_atlas(options: argparse.Namespace) -> None:
         name
         for name in (
             *("track", "smooth", "mount", "as_flown", "require_signed", "not_before", "lag"),
-            *("dem", "dem_datum"),
+            *("dem", "dem_datum", "report_changes"),
         )
         if getattr(options, name) not in (None, False)
     ]
@@ -271,6 +282,7 @@ def _print_summary(
     accept: "Acceptance",
     advice: Sequence[str] = (),
     tried: Sequence[dict[str, Any]] = (),
+    changed: "ChangedGround | None" = None,
 ) -> None:
     """Print the summary."""
     import numpy as np
@@ -289,6 +301,7 @@ def _print_summary(
         "median_latency_ms": None if median_ms is None else round(median_ms, 3),
         "advice": list(advice),
         "setups": list(tried),
+        **changes_to_plain(options, changed),
     }
     if options.json:
         print_json(plain)
@@ -304,3 +317,5 @@ def _print_summary(
         print(f"{counts.confident} camera positions: {each.partition('=')[2]}")
     guesses = "; unsure positions are best guesses, marked as such" * bool(counts.unsure)
     print(f"written to {options.out}{guesses}")
+    for line in changes_text(options, changed):
+        print(line)

@@ -41,6 +41,7 @@ LAYERS = {
     "error_m": "expected error of a fix",
     "wrong": "confident and wrong",
     "persistence": "expected persistence of the ground",
+    "changed": "changed since the map was made",
 }
 """Layers of cells that the map can show."""
 

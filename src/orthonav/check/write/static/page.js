@@ -29,6 +29,7 @@ function rowsOf(east, north, index) {
   }
   rows.push(["confident and wrong", percent(here("wrong"))]);
   rows.push(["expected persistence", percent(here("persistence"))]);
+  if (here("changed") > 0) rows.push(["changed since the map", percent(here("changed"))]);
   rows.push(["views tried", known(here("trials")) ? String(here("trials")) : "–"]);
   return rows;
 }
