@@ -290,7 +290,7 @@ def test_a_place_found_at_the_final_level_competes_with_the_judged_ones(registra
     missed = registrar.finished(templates, LEVELS, judged, prior, 2)
     assert apart_px(missed.placed.pose, pose) > 30
     direct = registrar.direct(templates, LEVELS, [near(pose, 0.5)])
-    found = registrar.finished(templates, LEVELS, judged, prior, 3, direct)
+    found = registrar.finished(templates, LEVELS, judged, prior, 3, direct=direct)
     assert apart_px(found.placed.pose, pose) < 0.3
     assert found.rival == missed.score and found.look_rival == missed.look_score
 

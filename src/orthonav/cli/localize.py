@@ -24,6 +24,8 @@ from orthonav.cli.source import add_source, open_source, warn_if_far_from_map
 if TYPE_CHECKING:
     from orthonav.changes.record import ChangedGround
     from orthonav.confidence.accept import Acceptance
+    from orthonav.localizer import Localizer
+    from orthonav.mapfile import MapFile
     from orthonav.records import ViewResult
 
 EVERYDAY = (
@@ -155,13 +157,11 @@ def _on_map(options: argparse.Namespace) -> None:
     from orthonav.errors import VariantError
     from orthonav.flight.export import export_all, export_of
     from orthonav.flight.fixes import write_results
-    from orthonav.localizer import Localizer
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
     from orthonav.mapfile.terrain import TerrainLayer
     from orthonav.onboard.calibrate import MountCorrected, model_of
     from orthonav.onboard.run import Locator, SingleViews, localize_flight, smoothed_track
-    from orthonav.search.position import check_rule
 
     if options.lag is not None and not (options.smooth and options.lag >= 0):
         raise VariantError("--lag needs --smooth and a number of views, 0 or more")
@@ -221,6 +221,24 @@ def _on_map(options: argparse.Namespace) -> None:
         advice, tried = doubts.advice(results, accept, shown)
         changed = report_changes(options, opened, [(flight, results)], shown)
     _print_summary(options, results, accept, advice, tried, changed)
+
+
+def _localizer(options: argparse.Namespace, opened: "MapFile", accept: "Acceptance") -> "Localizer":
+    """The localizer of a map; raises `VariantError` where the criterion does not fit it."""
+    from orthonav.errors import VariantError
+    from orthonav.localizer import Localizer
+    from orthonav.search.position import check_rule
+
+    made = Localizer(
+        opened,
+        registration=options.registration == "on",
+        position=check_rule(options.position),
+    )
+    if made.registration is not None and accept.criterion == "lowe_ratio":
+        raise VariantError("--accept lowe_ratio compares tiles: it needs --registration off")
+    if made.registration is None and options.registration == "on":
+        log.warning("the map has no registration layer: positions are at tile level")
+    return made
 
 
 def _on_atlas(options: argparse.Namespace) -> None:

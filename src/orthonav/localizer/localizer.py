@@ -1,5 +1,7 @@
 """The front of this package: one map, one method that places a view on it."""
 
+from dataclasses import replace
+
 from orthonav.errors import MapFileError
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.checks import check_view
@@ -9,6 +11,9 @@ from orthonav.mapfile.manifest import SheetInfo
 from orthonav.mapfile.reader import MapFile
 from orthonav.records import Fix, NoFix, Prior, View
 from orthonav.search.position import PositionRule
+
+WIDEST_M = 2e7
+"""Half of the Earth's circumference: a position known no better may be anywhere."""
 
 
 class Localizer:
@@ -73,5 +78,7 @@ class Localizer:
         refused = check_view(view, self.grid.gsd_m, heading_known)
         if refused is not None:
             return refused
+        if prior is not None and prior.std_m > WIDEST_M:
+            prior = replace(prior, std_m=WIDEST_M)
         chosen = self.registration or self.tiles
         return chosen.locate(view, prior, heading_known)
