@@ -173,15 +173,7 @@ def _on_map(options: argparse.Namespace) -> None:
     flight = open_source(options.flight, options, over_terrain=over_terrain)
     mount = take_flown(options, flight)
     accept = Acceptance.parse(options.accept)
-    localizer = Localizer(
-        opened,
-        registration=options.registration == "on",
-        position=check_rule(options.position),
-    )
-    if localizer.registration is not None and accept.criterion == "lowe_ratio":
-        raise VariantError("--accept lowe_ratio compares tiles: it needs --registration off")
-    if localizer.registration is None and options.registration == "on":
-        log.warning("the map has no registration layer: positions are at tile level")
+    localizer = _localizer(options, opened, accept)
     check_comparable(options, localizer.registration, opened)
     warn_if_far_from_map(flight, localizer)
     how = {
