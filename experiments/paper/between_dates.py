@@ -35,6 +35,11 @@ WIDTH, DILATIONS = 24, (1, 2, 4, 1)
 CROP_PX, BATCH, STEPS, RATE = 96, 12, 300, 3e-3
 GAIN, OFFSET = (0.5, 1.5), 0.2
 """Factor of the grey levels around their mean, and the largest brightness added, 0 to 1."""
+RIDGE_PX = 4
+"""An edge is where a logit is above the mean of a square with so many pixels on each side: else
+woods and orchards would be all edge, and roads none."""
+COUNTED_PX = 256
+"""Edges are counted in the lower left corner of each landscape, of this size."""
 REACH_PX = 1
 """An edge counts as predicted this far from where Canny has it."""
 OPSET, IR_VERSION = 17, 8
@@ -117,13 +122,24 @@ def learn(areas: Sequence[Dates], steps: int = STEPS) -> nn.Sequential:
         if step % 50 == 0 or step == steps:
             took_s = time.monotonic() - start
             print(f"step {step} of {steps}, loss {np.mean(losses[-50:]):.4f}, {took_s:.0f} s")
-    share = float(np.mean([canny(grey).mean() for dates in areas for grey in dates]))
-    found = np.concatenate([logits(model, grey).ravel() for dates in areas for grey in dates])
-    last = model[-1]
-    assert isinstance(last, nn.Conv2d) and last.bias is not None
+    parts = [grey[-COUNTED_PX:, :COUNTED_PX] for dates in areas for grey in dates]
+    return cut_off(model, parts)
+
+
+def cut_off(model: nn.Sequential, pictures: Dates) -> nn.Sequential:
+    """The network with ridges as its last layer, and as many edges as Canny finds in pictures."""
+    side = 2 * RIDGE_PX + 1
+    last = nn.Conv2d(1, 1, side)
     with torch.no_grad():
-        last.bias -= float(np.quantile(found, 1 - share))
-    return model.eval()
+        last.weight.fill_(-1 / side**2)
+        last.weight[0, 0, RIDGE_PX, RIDGE_PX] += 1
+        last.bias.zero_()  # type: ignore[union-attr]
+    whole = nn.Sequential(*model, last).eval()
+    share = float(np.mean([canny(grey).mean() for grey in pictures]))
+    found = np.concatenate([logits(whole, grey).ravel() for grey in pictures])
+    with torch.no_grad():
+        last.bias.fill_(-float(np.quantile(found, 1 - share)))  # type: ignore[union-attr]
+    return whole
 
 
 def logits(model: nn.Sequential, grey: NDArray[np.uint8]) -> NDArray[np.float32]:

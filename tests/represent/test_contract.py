@@ -8,7 +8,7 @@ import pickle
 import cv2
 import numpy as np
 import pytest
-from experiments.paper.methods import BETWEEN_DATES
+from edge_networks import write
 
 from orthonav.errors import VariantError
 from orthonav.represent import TABLE
@@ -22,11 +22,12 @@ SHAPES = [(1, 1), (1, 40), (2, 3), (16, 16), (33, 47), (64, 64), (256, 255)]
 
 
 @pytest.fixture(params=sorted(name for name, each in TABLE.items() if each.flies))
-def variant(request, monkeypatch):
-    """Every entry of the table, with its defaults; edges by a network with that of the paper."""
+def variant(request, monkeypatch, tmp_path):
+    """Every entry of the table, with its defaults; edges by a network with a small one."""
     if request.param == "onnx":
+        pytest.importorskip("onnx", reason="a network for the test needs ONNX")
         pytest.importorskip("onnxruntime", reason="edges by a network need onnxruntime")
-        monkeypatch.setenv("ORTHONAV_EDGES", str(BETWEEN_DATES))
+        monkeypatch.setenv("ORTHONAV_EDGES", str(write(tmp_path / "edges.onnx")))
     return make_variant(TABLE, request.param)
 
 

@@ -8,6 +8,8 @@ import pytest
 onnx = pytest.importorskip("onnx", reason="networks for the tests need ONNX")
 pytest.importorskip("onnxruntime", reason="edges by a network need onnxruntime")
 
+from edge_networks import sharp, write  # noqa: E402
+
 from orthonav.errors import MapFileError, MissingExtraError, MissingFileError, VariantError  # noqa: E402
 from orthonav.localizer import Localizer  # noqa: E402
 from orthonav.mapfile import open_map  # noqa: E402
@@ -17,40 +19,7 @@ from orthonav.represent import TABLE, learned  # noqa: E402
 from orthonav.represent.learned import VARIABLE, LearnedEdges  # noqa: E402
 from orthonav.variants import make_variant, variant_from_recipe  # noqa: E402
 
-FLOAT, DOUBLE = onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE
-
-
-def sharp(side=5, threshold=0.02):
-    """Kernel of a pixel's difference to its neighbourhood."""
-    kernel = np.full((1, 1, side, side), 1 / side**2, np.float32)
-    kernel[0, 0, side // 2, side // 2] -= 1
-    return kernel, np.array([-threshold], np.float32)
-
-
-def write(
-    path, *, kernel=None, pads=(0, 0, 0, 0), names=("grey", "edges"), kind=FLOAT, strides=(1, 1)
-):
-    """A network of one convolution."""
-    weights, bias = sharp() if kernel is None else kernel
-    helper, arrays = onnx.helper, onnx.numpy_helper
-    numbers = np.float32 if kind == FLOAT else np.float64
-    node = helper.make_node(
-        "Conv", [names[0], "w", "b"], [names[1]], pads=list(pads), strides=list(strides)
-    )
-    graph = helper.make_graph(
-        [node],
-        "edges",
-        [helper.make_tensor_value_info(names[0], kind, [1, 1, None, None])],
-        [helper.make_tensor_value_info(names[1], kind, [1, None, None, None])],
-        [
-            arrays.from_array(weights.astype(numbers), "w"),
-            arrays.from_array(bias.astype(numbers), "b"),
-        ],
-    )
-    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
-    made.ir_version = 8
-    path.write_bytes(made.SerializeToString())
-    return path
+DOUBLE = onnx.TensorProto.DOUBLE
 
 
 @pytest.fixture
