@@ -8,11 +8,12 @@ import pytest
 from benchmarks.relief_views import Raster, random_relief, seen_view
 from blots import AGL_M, CAMERA, FINEST_M, GROUND, as_grey, known_map, rendered
 
+from orthonav.flight.fixes import result_to_json
 from orthonav.geo.ground import Ground
 from orthonav.localizer import Localizer
 from orthonav.localizer.relief import Relief
 from orthonav.mapfile import open_map
-from orthonav.records import Fix, Telemetry, View
+from orthonav.records import Fix, Telemetry, View, ViewResult
 
 SIDE_M, POSTING_M = 700.0, 10.0
 PLACE = np.array([30.0, -40.0])
@@ -188,3 +189,13 @@ def test_level_ground_is_as_without_a_terrain(opened):
     assert fix.confidence == level.confidence
     assert fix.cov_en_m2.tolist() == level.cov_en_m2.tolist()
     assert {**fix.evidence} == {**level.evidence, "terrain_gain": 1.0}
+
+
+def test_maps_without_a_terrain_take_none_of_these_paths(opened, monkeypatch):
+    """Up to 45 deg off nadir, and their lines have no new keys."""
+    for name in ("ViewOverRelief", "Relief", "LevelTerrain"):
+        monkeypatch.delattr(f"orthonav.localizer.registration.{name}")
+    picture = rendered(GROUND, np.zeros(2), (30.0, 44.0, 0.0))
+    fix = Localizer(opened).locate(View(picture, CAMERA, telemetry((30.0, 44.0, 0.0))))
+    assert fix.ground_latlon_deg is None and "terrain_gain" not in fix.evidence
+    assert "ground" not in result_to_json(ViewResult("a", 0, fix, 1.0))

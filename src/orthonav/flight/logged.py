@@ -17,6 +17,7 @@ from typing import Any
 from orthonav.errors import CameraError, FlightError, described
 from orthonav.flight.gnss import GnssSample
 from orthonav.geo.camera import Camera
+from orthonav.geo.ground import Ground
 from orthonav.records import Fix, Prior, Telemetry
 
 PROFILE = "orthonav"
@@ -123,6 +124,7 @@ TELEMETRY = Topic(
         {
             **dict.fromkeys(_REPORTED_IF_KNOWN, _NUMBER),
             "prior": _OBJECT,
+            "below": _OBJECT,
             "vel_en_mps": _numbers(),
             "camera_latency_ms": _NUMBER,
             "withheld": {"type": "boolean"},
@@ -239,6 +241,8 @@ def telemetry_message(view: LoggedView) -> bytes:
         and {name: float(v) for name, v in asdict(telemetry.prior).items()},
         "vel_en_mps": telemetry.vel_en_mps and [float(value) for value in telemetry.vel_en_mps],
     }
+    if telemetry.below is not None:
+        plain["below"] = {name: float(v) for name, v in asdict(telemetry.below).items()}
     if view.camera_latency_ms is not None:
         plain["camera_latency_ms"] = float(view.camera_latency_ms)
     if view.withheld:
@@ -256,13 +260,15 @@ def view_of(data: bytes) -> LoggedView:
             name: None if plain.get(name) is None else _number(plain[name])
             for name in _REPORTED_IF_KNOWN
         }
-        names = ("lat_deg", "lon_deg", "std_m")
+        names, below = ("lat_deg", "lon_deg", "std_m"), plain.get("below")
+        ground = ("height_m", "std_m", "known")
         telemetry = Telemetry(
             time_ns=_integer(plain["time_ns"]),
             **reported,
             **optional,
             prior=None if prior is None else Prior(*(_number(prior[name]) for name in names)),
             vel_en_mps=None if velocity is None else _pair(velocity),
+            below=None if below is None else Ground(*(_number(below[name]) for name in ground)),
         )
         index, number = _integer(plain["index"]), _integer(plain["number"])
         frame, picture = plain["frame"], plain["picture"]

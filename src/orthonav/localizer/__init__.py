@@ -10,7 +10,8 @@
 3. A search gives candidates: a correlation by FFT with the map (`orthonav.register.search`), or the
    tiles whose embeddings are most similar (`propose`).
 4. Candidates are refined from coarse to fine, the best is compared with its strongest rival
-   (`orthonav.register.registrar`); the search ends as soon as the best stands out.
+   (`orthonav.register.registrar`); the search ends as soon as the best stands out. On a map with a
+   terrain the best are orthorectified on it first (`relief`, `orthorectify`).
 5. The evidence becomes a confidence (`orthonav.confidence`) and the residuals a covariance.
 
 Where a map has no registration layer, or with `registration=False`, `tiles.TileLocalizer` takes the
