@@ -92,7 +92,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     about = provenance("check trust")
     chosen = _scenes_in_turn([each for each in pairs() if each.is_there])
-    found = []
+    found: list[Outcome] = []
     for turn in range(len(WIDTHS_PX)):
         for number, pair in enumerate(chosen):
             if options.conditions and len(found) >= options.conditions:
@@ -158,7 +158,7 @@ def _measured(pair: Pair, width_px: int, prior: bool, options: argparse.Namespac
             [over], folder, random=options.views, agl_m=agl_m, errors=errors, seed=options.seed
         )
         simulate_flight(request)
-    request = CheckRequest(
+    asked = CheckRequest(
         path,
         camera=DEFAULT_CAMERA,
         agl_m=agl_m,
@@ -172,7 +172,7 @@ def _measured(pair: Pair, width_px: int, prior: bool, options: argparse.Namespac
         workers=1,
         recalibration=PLAIN,
     )
-    cells = check_map(request)[0].cells
+    cells = check_map(asked)[0].cells
     grid = CellGrid(cells.west_m, cells.north_m, cells.side_m, *cells.probability.shape)
     shares, right, wrong, off_m, expected_m = [], [], 0, [], []
     truth = read_truth(folder / "truth.csv")
@@ -206,7 +206,7 @@ def fitted(found: Sequence[Outcome]) -> Recalibration:
     counts = {s: sum(len(each.right) for each in found if each.scene == s) for s in scenes}
 
     def loss(values: Array) -> float:
-        by = Recalibration(*values.tolist(), 0.0)
+        by = _recalibration(values)
         total = 0.0
         for each in found:
             predicted = each.predicted(by)
@@ -216,8 +216,14 @@ def fitted(found: Sequence[Outcome]) -> Recalibration:
         return total / len(scenes) + 0.01 * float(np.array(astuple(RIDGE)[:4]) @ off**2)
 
     values = minimize(loss, np.array(astuple(PLAIN)[:4]), method="Nelder-Mead").x
-    by = Recalibration(*(round(float(each), 2) for each in values), std=0.0)
+    by = _recalibration(np.round(values, 2))
     return replace(by, std=round(_between_scenes(found, by), 2))
+
+
+def _recalibration(values: Array) -> Recalibration:
+    """With the four values that are fitted."""
+    shift, slope, narrow, no_prior = (float(each) for each in values)
+    return Recalibration(shift, slope, narrow, no_prior, 0.0)
 
 
 def _between_scenes(found: Sequence[Outcome], by: Recalibration) -> float:

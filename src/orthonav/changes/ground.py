@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from orthonav.changes.record import ChangedGround, ChangeGrid
 from orthonav.changes.views import SeenCells
 
-# Chosen on the solar farm and Aral of `python -m benchmarks.changes`; its tables say what they do
-# there and on scenes that were not looked at.
+# Chosen on the scenes of `python -m benchmarks.changes` (docs/changes.md).
 TONE_WEIGHT, STRUCTURE_WEIGHT, BIAS = 2.0, 2.0, 3.0
 """Logit of a score: weights of the logarithm of 1 + the tone's deviation and of the correlation."""
 CHANGED_SCORE = 0.5

@@ -41,6 +41,8 @@ class Conditions:
     `radius_m`: largest error of a correct fix, from the map.
     `speed_mps`: ground speed.
     `drift`: error of dead reckoning in metres per metre flown without a fix.
+    `tilt_std_deg`: standard deviation of the tilt that is not reported.
+    `other_sensor`: the camera differs from the map's sensor by more than years do.
     """
 
     width_m: float
@@ -53,6 +55,8 @@ class Conditions:
     radius_m: float
     speed_mps: float
     drift: float
+    tilt_std_deg: float = 0.0
+    other_sensor: bool = False
 
 
 @dataclass(frozen=True, eq=False)

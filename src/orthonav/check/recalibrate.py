@@ -1,7 +1,7 @@
 """From the share of trials that are placed to the share of views that will be.
 
-Trials age the map's own imagery; what years do to other ground is more, or less. How much was
-learnt over real scenes of two dates (`python -m benchmarks.check_trust`).
+Trials age the map's own imagery; what years do to other ground is more, or less. How much is
+learnt over real scenes of two dates: `python -m benchmarks.check_trust --fit`.
 """
 
 import math
@@ -62,7 +62,7 @@ def expit(value: Array) -> Array:
 PLAIN = Recalibration(0.0, 1.0, 0.0, 0.0, 0.6)
 """Trials as they are; between dates of generated and NAIP imagery the logit differs by 0.6."""
 LEARNT = PLAIN
-"""What checks use."""
+"""What checks use: no correction, until the benchmark was run over all scenes."""
 OTHER_SENSOR_SHIFT, OTHER_SENSOR_STD = -0.8, 0.8
 """An assumption that rests on one flight: a drone over two satellite maps was placed less often
 than predicted by 0.6 and 1.0 (docs/check.md)."""

@@ -115,6 +115,8 @@ class _Check:
             self.radius_m,
             self.request.speed_mps,
             self.request.drift,
+            self.request.tilt_std_deg,
+            self.request.other_sensor,
         )
         self.area = self._area()
         if self.request.other_date is not None:

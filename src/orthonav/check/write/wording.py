@@ -130,6 +130,12 @@ def conditions_text(conditions: Conditions, band_m: float | None) -> dict[str, s
             if prior is None
             else f"{metres_text(prior)} per axis (standard deviation)"
         ),
+        "tilt that is not reported": f"{conditions.tilt_std_deg:g}° (standard deviation)",
+        "sensor": (
+            "differs from the map's by more than years do (assumed)"
+            if conditions.other_sensor
+            else "like the map's, of another year"
+        ),
         "confident fix": f"confidence of {conditions.accept:g} or more",
         "correct fix": f"error of at most {metres_text(conditions.radius_m)}",
         "ground speed": f"{conditions.speed_mps:g} m/s",
