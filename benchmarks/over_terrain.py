@@ -185,8 +185,8 @@ class Bench:
         grey, seen = seen_view(
             ground.grey, hills, camera, attitude, position, 1 if row.tilt_deg else 2
         )
-        grey = cv2.GaussianBlur(grey, (0, 0), 0.6)
-        noisy = grey * rng.normal(1, 0.1) + rng.normal(0, 2, grey.shape)
+        blurred = cv2.GaussianBlur(grey, (0, 0), 0.6)
+        noisy = blurred * rng.normal(1, 0.1) + rng.normal(0, 2, blurred.shape)
         measured_m = agl_m * (1 + float(rng.normal(0, AGL_STD))) if row.measured else math.nan
         telemetry = Telemetry(
             time_ns=0,
@@ -223,8 +223,8 @@ def home_m(hills: Raster) -> float:
 def layer_of(row: Row, ground: Ground, hills: Raster) -> PlaneTerrain:
     """The terrain of the map, with what is wrong with it."""
     rows, cols = (side // FINER for side in hills.values.shape)
-    values = cv2.resize(hills.values, (cols, rows), interpolation=cv2.INTER_AREA)
-    values, shift_m = np.asarray(values, np.float32), 0.0
+    coarse = cv2.resize(hills.values, (cols, rows), interpolation=cv2.INTER_AREA)
+    values, shift_m = np.asarray(coarse, np.float32), 0.0
     if row.wrong == "displaced by 200 m":
         shift_m = 200.0
     elif row.wrong == "50 m too high":

@@ -67,6 +67,7 @@ CORE_COMMANDS = {
     "verify MAP --public-key MAP": "signing",
     "import FLIGHT/frames --out new": "flights",
     "localize MAP FLIGHT/frames --out new.jsonl": "flights",
+    "locate-pixel FIXES 0001.jpg 10 10 --flight FLIGHT": None,
     "calibrate MAP FLIGHT/frames --out new.json": "flights",
     "localize new FLIGHT --atlas --out new.jsonl": "atlas",
     "localize MAP FLIGHT --require-signed MAP --out new.jsonl": "signing",
