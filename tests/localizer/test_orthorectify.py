@@ -122,7 +122,7 @@ def test_unknown_heights_and_ground_not_seen_are_not_valid(grey):
 
 def test_the_rasters_of_the_test_are_bilinear():
     heights = relief(0.3)
-    at = np.random.default_rng(0).uniform(100, 900, (2, 50))
+    at = np.random.default_rng(0).uniform(100, SIDE_M - 100, (2, 50))
     col, row = at[0] / POSTING_M - 0.5, (SIDE_M - at[1]) / POSTING_M - 0.5
     exact = bilinear(heights.values.astype(float), col, row)
     np.testing.assert_allclose(heights.at(*at), exact, atol=0.6)

@@ -35,6 +35,7 @@ from orthonav.flight.logged import (
 from orthonav.flight.mount import Bias, Mount, write_mount
 from orthonav.flight.png import lossless_png
 from orthonav.geo.camera import Camera
+from orthonav.geo.ground import Ground
 from orthonav.localizer import Localizer
 from orthonav.localizer.tracker import Tracker
 from orthonav.mapfile import open_map
@@ -230,7 +231,7 @@ def test_an_import_has_the_same_pictures(tmp_path, run):
 
 numbers = st.floats(allow_nan=True, allow_infinity=True)
 known = st.floats(allow_nan=False, allow_infinity=False)
-NAMED = ("time_ns", "yaw_deg", "pitch_deg", "roll_deg", "agl_m", "prior", "vel_en_mps")
+NAMED = ("time_ns", "yaw_deg", "pitch_deg", "roll_deg", "agl_m", "prior", "vel_en_mps", "below")
 OPTIONAL = [each.name for each in fields(Telemetry) if each.name not in NAMED]
 
 
@@ -240,11 +241,12 @@ OPTIONAL = [each.name for each in fields(Telemetry) if each.name not in NAMED]
     st.fixed_dictionaries(dict.fromkeys(OPTIONAL, st.none() | numbers)),
     st.none() | st.tuples(known, known, known),
     st.none() | st.tuples(numbers, numbers),
+    st.none() | st.builds(Ground, known, known, known),
 )
-def test_telemetry_comes_back_exactly(time_ns, four, others, prior, velocity):
+def test_telemetry_comes_back_exactly(time_ns, four, others, prior, velocity, below):
     """All fields that there are, also those that come later."""
     prior = prior and Prior(*prior)
-    before = Telemetry(time_ns, *four, prior=prior, vel_en_mps=velocity, **others)
+    before = Telemetry(time_ns, *four, prior=prior, vel_en_mps=velocity, below=below, **others)
     after = view_of(telemetry_message(LoggedView(3, 5, "ä/b.png", before, "full")))
     assert (after.index, after.number, after.frame, after.picture) == (3, 5, "ä/b.png", "full")
     assert repr(after.telemetry) == repr(before)

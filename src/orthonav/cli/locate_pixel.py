@@ -20,7 +20,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--flight",
         type=Path,
         required=True,
-        metavar="FOLDER",
+        metavar="FLIGHT_DIR",
         help="flight folder that was localized: camera, pitch and roll",
     )
     parser.add_argument(
