@@ -174,7 +174,10 @@ def read_changes(path: Path) -> ChangedGround:
         if plain["version"] != VERSION:
             raise FlightError(f"version {plain['version']}, expected {VERSION}")
         return _from_plain(plain)
-    except (ValueError, KeyError, TypeError, IndexError, RecursionError, OrthonavError) as error:
+    except (
+        *(ValueError, KeyError, TypeError, IndexError),
+        *(OverflowError, RecursionError, OrthonavError),
+    ) as error:
         raise FlightError(
             f"not a report of changed ground ({described(error)}); give a file written by "
             f"localize or evaluate --report-changes: {path}"
@@ -200,6 +203,8 @@ def _from_plain(plain: dict[str, Any]) -> ChangedGround:
         row, col = int(values["row"]), int(values["col"])
         if not (0 <= row < grid.rows and 0 <= col < grid.cols):
             raise FlightError(f"row {row}, column {col} outside the grid")
+        if not 0 < int(values["views"]) < 2**31:
+            raise FlightError(f"row {row}, column {col}: impossible number of views")
         score[row, col] = float(values["score"])
         views[row, col] = int(values["views"])
         changed[row, col] = values["changed"] is True

@@ -158,6 +158,8 @@ def _compared(
     structure = sums(a * b) / np.sqrt(np.maximum(sums(a * a) * sums(b * b), 1e-9))
     pixel_m = registration.grid.gsd_m * 2**level * math.exp(pose.log_scale)
     kept = pixels >= MIN_COVER * (grid.side_m / pixel_m) ** 2
+    if not kept.any():
+        return None
     tones = [sums(each) / pixels for each in (rectified.grey, map_grey)]
     return SeenCells(used[kept], structure[kept], tones[0][kept], tones[1][kept])
 

@@ -23,8 +23,8 @@ DEFAULT_RELIEF_M = 3.0
 """Height of houses and trees in open country, one standard deviation."""
 
 DEFAULT_TILT_STD_DEG = 1.5
-"""Unreported pitch and roll: a good mount and attitude. Drones that report a level gimbal and lean
-were off by up to 9 deg."""
+"""Unreported pitch and roll: a good mount and attitude. Drones that report a level gimbal
+were tilted by up to 9 deg."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,8 @@ class CheckRequest:
 
     def __post_init__(self) -> None:
         """Raise `CheckError` for values out of range."""
+        if self.other_sensor and self.other_date is not None:
+            raise CheckError("--other-sensor is for checks without --other-date, which shows it")
         limits: dict[str, tuple[float | None, float, float, str]] = {
             "height above ground": (self.agl_m, 1.0, 50_000.0, "m"),
             "yaw_std_deg": (self.yaw_std_deg, 0.0, 90.0, "deg"),

@@ -106,7 +106,8 @@ def _changed(found: Findings) -> list[Reason]:
     if found.changed <= 0:
         return []
     where = "along the route" if found.along is not None else "on the map"
-    text = f"{100 * found.changed:.1f} % of the ground {where} changed since the map was made: "
+    share = f"{100 * found.changed:.1f} %"
+    text = f"At least {share} of the ground {where} changed since the map was made: "
     text += "fixes are rarer there; build the map from newer imagery."
     return [
         Reason("changed_ground", text, Word.MARGINAL if found.changed > MAX_CHANGED else Word.GO)

@@ -33,7 +33,8 @@ def check_comparable(
     """Raise `MapFileError` where changes are asked for of a map without registration."""
     if options.report_changes and found is None:
         raise MapFileError(
-            f"--report-changes compares views by the map's registration layer: {opened.path}"
+            "--report-changes needs a map with a registration layer, and not --registration off: "
+            f"{opened.path}"
         )
 
 

@@ -144,7 +144,8 @@ def _check_flights(options: argparse.Namespace) -> None:
         )
     if flights and not (options.map and (options.report or options.report_changes)):
         raise FlightError(
-            "--flight shows views beside the map in a report; give --map and --report too"
+            "--flight shows views beside the map in a report; give --map and --report too, or "
+            "--report-changes"
         )
     if flights and len(flights) != len(options.fixes):
         raise FlightError(

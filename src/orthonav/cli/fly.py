@@ -313,7 +313,8 @@ def _add_flight(group: Any) -> None:
         type=float,
         default=300.0,
         metavar="S",
-        help="a saved state that is older is not of this flight (default 300)",
+        help="a position saved longer ago is no start; what GNSS learnt continues if the program "
+        "stopped no longer ago (default 300)",
     )
     group.add_argument(
         "--gnss",

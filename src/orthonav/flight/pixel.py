@@ -74,10 +74,12 @@ def locate_pixel(
     if not np.isfinite(here).all():
         raise FlightError(f"pixel {px[0]:g}, {px[1]:g} shows no ground that is known")
     slopes = _slopes(camera, px, values, relief)
+    if not np.isfinite(slopes).all():
+        raise FlightError(f"pixel {px[0]:g}, {px[1]:g} is next to the horizon or unknown ground")
     if "heading_bias_std_deg" in fix.evidence:  # of a track: the covariance is that of the camera
         covariance = fix.cov_en_m2 + _spread(slopes, stds)
     else:
-        at_middle = _slopes(camera, middle, values, relief)
+        at_middle = np.nan_to_num(_slopes(camera, middle, values, relief))
         covariance = _at_least(fix.cov_en_m2 - _spread(at_middle, stds), LEAST_M**2)
         covariance = covariance + _spread(slopes - at_middle, stds)
     lat, lon = frame.latlon_from_en(here)
@@ -146,7 +148,7 @@ def _slopes(camera: Camera, px: tuple[float, float], values: Array, relief: Reli
                 moved[number] += sign * STEP
             sides.append(_ground(camera, px, moved, relief))
         columns.append((sides[0] - sides[1]) / (2 * STEP))
-    return np.nan_to_num(np.stack(columns, axis=1))
+    return np.stack(columns, axis=1)
 
 
 def _spread(slopes: Array, stds: Array) -> Array:

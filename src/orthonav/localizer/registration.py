@@ -19,7 +19,7 @@ from orthonav.errors import MapFileError, VariantError
 from orthonav.localizer.plan import DEFAULT_PLAN, ClearMargin, Search, SearchPlan
 from orthonav.localizer.prepared import PreparedView, prepare
 from orthonav.localizer.propose import TileProposer
-from orthonav.localizer.rectify import looks_aside
+from orthonav.localizer.rectify import looks_aside, off_nadir_deg
 from orthonav.localizer.relief import (
     CameraFound,
     GroundSeen,
@@ -354,7 +354,9 @@ class RegistrationLocalizer:
             covariance = camera.covariance[:2, :2] + np.eye(2) * floor_m**2
             stds = _attitude_found(camera, telemetry)
         elif telemetry.tilt_std_deg is not None:
-            tilt_m = telemetry.agl_m * math.radians(telemetry.tilt_std_deg)
+            # A line of sight off nadir meets the ground farther out by 1 / cos^2.
+            cos = math.cos(math.radians(off_nadir_deg(telemetry)))
+            tilt_m = agl_m * math.radians(telemetry.tilt_std_deg) / cos**2
             covariance = covariance + np.eye(2) * tilt_m**2
         lat, lon = self.sheet.frame.latlon_from_en(place)
         covariance.flags.writeable = False

@@ -52,6 +52,8 @@ SLOPE_M = 10.0
 """Slopes are those over twice this distance."""
 RESECTIONS = 2
 """The view is orthorectified and resected so many times."""
+SIGHT_M = 0.5
+"""A line of sight has met the terrain where another step moves the point by less."""
 SIGHT_ROUNDS = 12
 """Rounds in which a ray meets the ground."""
 LARGEST_STD = 0.3
@@ -108,7 +110,8 @@ class Relief:
         means, step_px = self._mean_heights(view.side_px)
         over = np.maximum(1 + (below.height_m - means) / agl_m, 0.05)
         values = np.log(np.where(np.isfinite(over), over, 1.0)).astype(np.float32)
-        std = max(own_m / agl_m, MIN_AGL_STD)
+        focal_std = view.picture_at(view.levels.final).camera.focal_std
+        std = max(math.hypot(own_m / agl_m, focal_std), MIN_AGL_STD)
         reach = min(float(np.abs(values).max()) + SIGMAS * std, SIGMAS * prior.log_scale_std)
         if below.std_m / agl_m > std:
             reach = float(np.abs(values).max()) + SIGMAS * std
@@ -370,8 +373,10 @@ class ViewOverRelief(ViewOnLevelGround):
             above_m = orientation.position_m[2] - float(self.relief.terrain.at_en_m(found))
             if not (ray[2] < -1e-6 and above_m > 0):
                 return east, north
-            found = orientation.position_m[:2] + ray[:2] * (above_m / -ray[2])
-        return float(found[0]), float(found[1])
+            before, found = found, orientation.position_m[:2] + ray[:2] * (above_m / -ray[2])
+            if math.dist(before, found) < SIGHT_M:
+                return float(found[0]), float(found[1])
+        return east, north
 
     def resected(self, placed: Placed) -> CameraFound | None:
         """The camera of a place with its pitch and roll; None where their deviation is not reported

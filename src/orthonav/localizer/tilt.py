@@ -73,7 +73,8 @@ def with_tilt(
     tilts around the expected one.
     """
     if placed.covariance is None:
-        placed = registration.registrar.with_covariance(prepared.templates, prepared.levels, placed)
+        again = registration.registrar.with_covariance(prepared.templates, prepared.levels, placed)
+        placed = again if registration.relief is None else replace(again, pose=placed.pose)
     tilt = np.radians([view.telemetry.pitch_deg, view.telemetry.roll_deg])
     mean, known = registration.seen_from(prepared, placed.pose), np.zeros(2)
     slopes = _derivatives(view, mean)
@@ -82,9 +83,12 @@ def with_tilt(
     profile = _TiltProfile(registration, view, prepared.levels.final)
     for axis in np.flatnonzero(weights).tolist():
         after, before = (profile.score(mean, slopes, tilt, axis, sign) for sign in (1, -1))
-        if after is None or before is None:
+        middle: float | None = placed.score
+        if registration.relief is not None:  # it may have been placed on level ground
+            middle = profile.score(mean, slopes, tilt, axis, 0)
+        if middle is None or after is None or before is None:
             return None
-        known[axis], move = profile.fitted(placed.score, after, before, float(weights[axis]))
+        known[axis], move = profile.fitted(middle, after, before, float(weights[axis]))
         tilt[axis] += move
         mean += slopes[:, axis] * move
     spread = np.diag(1 / (known + WEAK_TILT_RAD**-2))
