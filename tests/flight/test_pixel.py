@@ -127,6 +127,8 @@ def test_the_middle_is_as_exact_as_registration_where_tilt_is_uncertain(pitch_de
     tilted = replace(telemetry(pitch_deg), tilt_std_deg=3.0)
     lever_m = 1.05 * AGL_M * math.radians(3.0) / math.cos(math.radians(pitch_deg)) ** 2
     exact = {"heading_std_deg": 0.0, "log_scale_std": 0.0}
-    seen = replace(fix(agl_m=1.05 * AGL_M, evidence=exact), cov_en_m2=np.eye(2) * (0.6**2 + lever_m**2))
+    seen = replace(
+        fix(agl_m=1.05 * AGL_M, evidence=exact), cov_en_m2=np.eye(2) * (0.6**2 + lever_m**2)
+    )
     found = locate_pixel(CAMERA, tilted, seen, (320, 240))
     assert np.sqrt(np.linalg.eigvalsh(found.cov_en_m2)[0]) > 0.3
