@@ -10,7 +10,7 @@ The reference takes colour only (a* and b* of CIELAB, means of cells), which vie
 are grey. A cell changed where no date up to the map's looks like any date from the views' on
 (`CHANGED` units apart), and these differences are no smaller than those among the dates of either
 side, which hold seasons. It is unchanged below half of that; cells between are left out. Where one
-side has one date only, nothing tells a season there from a change.
+side has one date only, nothing separates a season there from a change.
 """
 
 import argparse
@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from benchmarks.inputs import DATA
+from benchmarks.inputs import DATA, map_of
 from benchmarks.record import Table, provenance
 from benchmarks.verdicts import percent
 from orthonav.changes.ground import changed_ground
@@ -41,7 +41,6 @@ from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.mapfile.manifest import SheetInfo
 from orthonav.onboard.run import SingleViews, localize_flight
-from orthonav.prepare import BuildRequest, build_map
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
 YAW_STD_DEG, AGL_STD = 10.0, 0.1
@@ -164,7 +163,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _flown(record: Record, options: argparse.Namespace) -> Outcome:
     ground, confident = _changes(record, options)
-    sheet = open_map(_map_of(record, options.work)).manifest.sheets[0]
+    sheet = open_map(map_of(DATA / record.dates[record.map], options.work)).manifest.sheets[0]
     changed, unchanged = reference(record, sheet, ground.grid)
     known = (changed | unchanged) & (ground.views > 0)
     return Outcome(
@@ -178,17 +177,9 @@ def _flown(record: Record, options: argparse.Namespace) -> Outcome:
     )
 
 
-def _map_of(record: Record, work: Path) -> Path:
-    ortho = DATA / record.dates[record.map]
-    path: Path = work / f"{ortho.parent.name}-{ortho.stem}.onav"
-    if not path.is_file():
-        build_map(BuildRequest([ortho], path))
-    return path
-
-
 def _changes(record: Record, options: argparse.Namespace) -> tuple[ChangedGround, int]:
     """What a flight over the later date finds, as `localize --report-changes` does."""
-    localizer = Localizer(open_map(_map_of(record, options.work)))
+    localizer = Localizer(open_map(map_of(DATA / record.dates[record.map], options.work)))
     registration = localizer.registration
     assert registration is not None
     grid, over = registration.grid, DATA / record.dates[record.views]

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from benchmarks.inputs import file_of
+from benchmarks.inputs import file_of, map_of
 from benchmarks.record import Table, provenance
 from benchmarks.trust_views import Pair, pairs
 from orthonav.check.places import CellGrid
@@ -38,7 +38,6 @@ from orthonav.flight import open_flight, read_truth
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.onboard.run import SingleViews, localize_flight
-from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import CONFIDENT, Fix
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
@@ -143,9 +142,7 @@ def _outcome(pair: Pair, width_px: int, prior: bool, options: argparse.Namespace
 
 def _measured(pair: Pair, width_px: int, prior: bool, options: argparse.Namespace) -> Outcome:
     ortho, over = (file_of(each, options.work) for each in (pair.map, pair.views))
-    path = options.work / f"{ortho.parent.name}-{ortho.stem}.onav"
-    if not path.is_file():
-        build_map(BuildRequest([ortho], path))
+    path = map_of(ortho, options.work)
     localizer = Localizer(open_map(path))
     gsd_m = localizer.sheet.grid.gsd_m
     agl_m = width_px * gsd_m / min(DEFAULT_CAMERA.extent)

@@ -7,6 +7,7 @@ A JSON and a Markdown record go to the output folder.
 """
 
 import argparse
+import copy
 import os
 import shutil
 import sys
@@ -67,21 +68,32 @@ HEADER = (*("fault", "s", "views", "sent", "worst m", "wrong", "recovered s", "l
 
 
 class Ground:
-    """An orthophoto on the plane of a map."""
+    """An orthophoto on the plane of a map.
 
-    def __init__(self, path: Path, frame: LocalFrame) -> None:
-        half, pixels = SIDE_M / 2, SIDE_M
+    `corner` (2,): its first pixel, metres east and north. `size_px`: columns and rows.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        frame: LocalFrame,
+        *,
+        corner: tuple[float, float] = (-SIDE_M / 2, SIDE_M / 2),
+        size_px: tuple[int, int] = (SIDE_M, SIDE_M),
+        gsd_m: float = 1.0,
+    ) -> None:
+        (west_m, north_m), (cols, rows) = corner, size_px
         sheet = Mosaic.open([path]).sheet(
-            frame, west_m=-half, north_m=half, width_px=pixels, height_px=pixels, gsd_m=1.0
+            frame, west_m=west_m, north_m=north_m, width_px=cols, height_px=rows, gsd_m=gsd_m
         )
         with sheet as raster:
-            rgb = np.asarray(raster.read(0, 0, pixels, pixels).rgb)
-        self._corner, self._rgb = np.array([-half, half]), rgb
+            rgb = np.asarray(raster.read(0, 0, rows, cols).rgb)
+        self._corner, self._rgb, self._gsd_m = np.array(corner), rgb, gsd_m
 
     def mirrored(self) -> "Ground":
         """The same, east and west exchanged."""
-        made = object.__new__(Ground)
-        made._corner, made._rgb = self._corner, np.ascontiguousarray(self._rgb[:, ::-1])
+        made = copy.copy(self)
+        made._rgb = np.ascontiguousarray(self._rgb[:, ::-1])
         return made
 
     def picture(
@@ -93,7 +105,8 @@ class Ground:
     ) -> Grey:
         """What the camera sees."""
         corner = self._corner - place
-        seen = render_view(CAMERA, (*attitude, agl_m), self._rgb, corner, 1.0, EFFECTS, rng)
+        gsd_m = self._gsd_m
+        seen = render_view(CAMERA, (*attitude, agl_m), self._rgb, corner, gsd_m, EFFECTS, rng)
         return np.asarray(cv2.cvtColor(seen, cv2.COLOR_RGB2GRAY), np.uint8)
 
 

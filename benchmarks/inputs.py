@@ -105,6 +105,18 @@ NAIP_ABSENT = (
 NAIP_PAST, NAIP_PRESENT = "20090818.tif", "20180716.tif"
 
 
+def map_of(
+    ortho: Path, work: Path, bounds_deg: tuple[float, float, float, float] | None = None
+) -> Path:
+    """The map of an orthophoto, or of its part within bounds (west, south, east, north), built once
+    in `work`."""
+    part = "" if bounds_deg is None else "-part"
+    path = work / f"{ortho.parent.name}-{ortho.stem}{part}.onav"
+    if not path.is_file():
+        build_map(BuildRequest([ortho], path, bounds_deg=bounds_deg))
+    return path
+
+
 def file_of(name: str, work: Path) -> Path:
     """A file below `DATA`, or of a generated area (`generated:SEED:DATE`), which `work` holds."""
     if not name.startswith("generated:"):

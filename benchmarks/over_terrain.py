@@ -154,12 +154,12 @@ class Bench:
         key = hashlib.sha256(
             f"{replace(row, wrong='')}{self.views}{self.seed}".encode()
         ).hexdigest()
-        kept = self.work / f"{key[:16]}.views"
-        if not kept.is_file():
+        stored = self.work / f"{key[:16]}.views"
+        if not stored.is_file():
             rng = np.random.default_rng(self.seed)
             made = [self._seen(row, ground, hills, rng) for _ in range(self.views)]
-            kept.write_bytes(pickle.dumps(made))
-        return pickle.loads(kept.read_bytes()), hills
+            stored.write_bytes(pickle.dumps(made))
+        return pickle.loads(stored.read_bytes()), hills
 
     def _seen(self, row: Row, ground: Ground, hills: Raster, rng: np.random.Generator) -> Seen:
         side_m = row.view_px * ground.gsd_m
@@ -254,9 +254,9 @@ class Placed:
         """Cells of a table."""
         limit = np.maximum(row.radius_m, 0.03 * self.ranges_m if row.tilt_deg else 0.0)
         right = self.errors_m <= limit
-        sure = self.confidences >= CONFIDENT
-        accepted = (sure & right).sum() / max(right.sum(), 1)
-        wrong = int((sure & ~right).sum())
+        confident = self.confidences >= CONFIDENT
+        accepted = (confident & right).sum() / max(right.sum(), 1)
+        wrong = int((confident & ~right).sum())
         median = float(np.median(self.errors_m[right])) if right.any() else math.nan
         return (
             f"{right.mean():.0%} | {accepted:.0%} | {wrong} | {median:.1f} m | "

@@ -234,13 +234,14 @@ def errors_of(fix: Fix | NoFix, each: Window, opened: MapFile) -> list[float]:
 
 def line(rows: Array, level: bool, tilt_std_deg: float) -> str:
     """A row of the table."""
-    ground_px, camera, sure, took_ms = rows.T
+    ground_px, camera, confidences, took_ms = rows.T
+    confident = confidences >= CONFIDENT
     right = camera <= 0.01 if level else ground_px <= 3
     ground = "level" if level else "terrain"
     return (
         f"| {ground} | {f'off by {tilt_std_deg:g} deg' if tilt_std_deg else 'exact'} |"
         f" {(ground_px <= 3).mean():.0%} | {(camera <= 0.01).mean():.0%} |"
-        f" {(sure >= CONFIDENT).mean():.0%} | {int(((sure >= CONFIDENT) & ~right).sum())} |"
+        f" {confident.mean():.0%} | {int((confident & ~right).sum())} |"
         f" {np.median(ground_px):.1f} | {np.median(camera):.2%} | {np.median(took_ms):.0f} ms |"
     )
 

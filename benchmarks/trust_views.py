@@ -16,14 +16,13 @@ import numpy as np
 import rasterio
 from rasterio.warp import transform_bounds
 
-from benchmarks.inputs import DATA, file_of
+from benchmarks.inputs import DATA, file_of, map_of
 from orthonav.files import write_text
 from orthonav.flight import open_flight, read_truth
 from orthonav.flight.folder import read_image
 from orthonav.localizer import Localizer
 from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.mapfile import open_map
-from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import PRIOR_SIGMAS, NoFix, Telemetry, View
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 from orthonav.simulate.landscape import DEFAULT_DATES
@@ -276,11 +275,7 @@ def _plain(name: str) -> str:
 def _localizer(
     ortho: Path, work: Path, bounds_deg: tuple[float, float, float, float] | None = None
 ) -> RegistrationLocalizer:
-    part = "" if bounds_deg is None else "-part"
-    path = work / f"{ortho.parent.name}-{ortho.stem}{part}.onav"
-    if not path.is_file():
-        build_map(BuildRequest([ortho], path, bounds_deg=bounds_deg))
-    found = Localizer(open_map(path)).registration
+    found = Localizer(open_map(map_of(ortho, work, bounds_deg))).registration
     assert found is not None
     return found
 

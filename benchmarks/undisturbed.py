@@ -24,7 +24,6 @@ import cv2
 import numpy as np
 import rasterio
 
-from benchmarks.fakes import Array, Grey
 from benchmarks.fault_flights import (
     BEGIN_S,
     CAMERA,
@@ -34,17 +33,14 @@ from benchmarks.fault_flights import (
     World,
     undisturbed,
 )
-from benchmarks.faults import EFFECTS
-from benchmarks.inputs import file_of
+from benchmarks.faults import Ground
+from benchmarks.inputs import file_of, map_of
 from benchmarks.record import Section, Table, number, provenance, save
 from benchmarks.trust_views import Pair, pairs
-from orthonav.imagery.mosaic import Mosaic
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
-from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import NoFix, Telemetry, View
 from orthonav.register.sharpness import local_ratio
-from orthonav.simulate.render import render_view
 
 GSD_M = 0.9, 2.1
 AGL_PX, SPEED_PX_S = 150.0, 12.0
@@ -66,47 +62,18 @@ class Outcome:
     shown: tuple[bool, ...]
 
 
-class Ground:
-    """The imagery of the views, on the grid of the map."""
-
-    def __init__(self, path: Path, localizer: Localizer) -> None:
-        grid = localizer.grid
-        self._gsd_m = grid.gsd_m
-        self._corner = np.array([grid.west_m, grid.north_m])
-        sheet = Mosaic.open([path]).sheet(
-            localizer.sheet.frame,
-            west_m=grid.west_m,
-            north_m=grid.north_m,
-            width_px=grid.width_px,
-            height_px=grid.height_px,
-            gsd_m=grid.gsd_m,
-        )
-        with sheet as raster:
-            self._rgb = np.asarray(raster.read(0, 0, grid.height_px, grid.width_px).rgb)
-
-    def picture(
-        self,
-        place: Array,
-        attitude: tuple[float, float, float],
-        agl_m: float,
-        rng: np.random.Generator,
-    ) -> Grey:
-        """What the camera sees from metres east and north (2,)."""
-        corner = self._corner - place
-        view = render_view(CAMERA, (*attitude, agl_m), self._rgb, corner, self._gsd_m, EFFECTS, rng)
-        return np.asarray(cv2.cvtColor(view, cv2.COLOR_RGB2GRAY), np.uint8)
-
-
 @cache
 def _world(pair: Pair, work: Path) -> World:
     """The map of a pair, built once, and the ground of its other date."""
-    ortho = file_of(pair.map, work)
-    path = work / f"{ortho.parent.name}-{ortho.stem}.onav"
-    if not path.is_file():
-        build_map(BuildRequest([ortho], path))
-    localizer = Localizer(open_map(path))
+    localizer = Localizer(open_map(map_of(file_of(pair.map, work), work)))
     grid = localizer.grid
-    ground = Ground(file_of(pair.views, work), localizer)
+    ground = Ground(
+        file_of(pair.views, work),
+        localizer.sheet.frame,
+        corner=(grid.west_m, grid.north_m),
+        size_px=(grid.width_px, grid.height_px),
+        gsd_m=grid.gsd_m,
+    )
     reach_m = (min(grid.width_px, grid.height_px) / 2 - MARGIN_PX) * grid.gsd_m
     return World(
         localizer,

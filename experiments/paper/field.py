@@ -106,7 +106,9 @@ def seen(scene: Scene, localizer: Localizer, count: int) -> Iterator[Seen]:
     agl_m, gsd_m = scene.trajectory.agl_m, localizer.grid.gsd_m
     camera = views.camera_of(agl_m, gsd_m)
     places = views.places_en_m(localizer.tiles.centres_en_m, count)
-    told = Telemetry(0, 0.0, 0.0, 0.0, agl_m, yaw_std_deg=YAW_STD_DEG, agl_std_m=AGL_STD * agl_m)
+    telemetry = Telemetry(
+        0, 0.0, 0.0, 0.0, agl_m, yaw_std_deg=YAW_STD_DEG, agl_std_m=AGL_STD * agl_m
+    )
     for ground in views.grounds(scene, localizer.sheet.frame, localizer.grid, places):
         turned, lower, *off = np.clip(rng.normal(size=4), -CLIPPED, CLIPPED)
         grey = views.view_of(
@@ -118,7 +120,7 @@ def seen(scene: Scene, localizer: Localizer, count: int) -> Iterator[Seen]:
             drop_m=float(lower) * AGL_STD * agl_m,
         )
         prior = ground.truth_en_m + np.array(off) * PRIOR_STD_PX * gsd_m
-        yield Seen(grey, told, prior, ground.truth_en_m)
+        yield Seen(grey, telemetry, prior, ground.truth_en_m)
 
 
 def _measured(place: Workplace, scene: Scene, any_map: str, name: str) -> dict[str, Any]:

@@ -66,9 +66,9 @@ class Placed:
 
     def accepted(self, threshold: float) -> tuple[float, int]:
         """Share of the right views that a threshold accepts, and how many wrong ones."""
-        kept = self.evidence >= threshold
-        right = float(kept[self.right].mean()) if self.right.any() else math.nan
-        return right, int((kept & ~self.right).sum() + (self.mirrored >= threshold).sum())
+        accepted = self.evidence >= threshold
+        right = float(accepted[self.right].mean()) if self.right.any() else math.nan
+        return right, int((accepted & ~self.right).sum() + (self.mirrored >= threshold).sum())
 
     def median_m(self) -> float:
         """Median error of the right views."""

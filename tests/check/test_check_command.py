@@ -142,14 +142,14 @@ def test_another_sensor_lowers_what_is_predicted(checked):
 
 
 def test_expected_errors_hold_tilt_height_and_map(checked):
-    steady, leaning = checked(tilt_std_deg=0.0), checked(tilt_std_deg=5.0)
+    steady, tilted = checked(tilt_std_deg=0.0), checked(tilt_std_deg=5.0)
     least = float(np.nanmin(steady.cells.error_m))
     assert least > 3.0 * math.sqrt(2)  # displacement of the map
-    assert float(np.nanmin(leaning.cells.error_m)) > math.hypot(
+    assert float(np.nanmin(tilted.cells.error_m)) > math.hypot(
         least, math.sqrt(2) * 130.0 * math.tan(math.radians(5.0)) * 0.99
     )
     vague = checked(tilt_std_deg=5.0, agl_std=0.5)
-    assert np.nanmin(vague.cells.error_m) > 1.05 * np.nanmin(leaning.cells.error_m)
+    assert np.nanmin(vague.cells.error_m) > 1.05 * np.nanmin(tilted.cells.error_m)
 
 
 def test_another_date_is_used(checked, half_blank):

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 FULL_VIEW_PX = 256.0
 """Views of so many pixels of the map across need no correction for their width."""
 LEAST, MOST = 0.01, 0.99
-"""Limits of predictions: no check is surer of fixes, or of none."""
+"""Limits of predictions: no check is more certain of fixes, or of their absence."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import math
 import os
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,9 +60,8 @@ class SavedState:
 
     def stopped_s(self, utc_ns: int, mono_ns: int, boot_id: str) -> float:
         """Seconds since the program that saved it ran; negative where the clock was set back."""
-        if boot_id and boot_id == self.boot_id:
-            return (mono_ns - self.saved_mono_ns) / 1e9
-        return (utc_ns - self.saved_utc_ns) / 1e9
+        last = replace(self, utc_ns=self.saved_utc_ns, mono_ns=self.saved_mono_ns)
+        return last.age_s(utc_ns, mono_ns, boot_id)
 
 
 def boot_id() -> str:
