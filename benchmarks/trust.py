@@ -5,7 +5,7 @@ of all scenes of two dates beside the checkout (`../shared/data`, or the folder 
 names) and of generated ones, and views that are on no map. It prints what the shipped confidence
 says of them, and what one says that was fitted to the other scenes only. `--fit` prints weights
 fitted to all of these views. DIR keeps maps, flights and the evidence of every view: a second run
-takes seconds. About an hour on two cores.
+takes seconds. About an hour on two cores. `DIR/worst` shows the worst views of every scene.
 """
 
 import argparse
@@ -25,6 +25,7 @@ from scipy.optimize import minimize
 
 from benchmarks.inputs import file_of
 from benchmarks.record import Table, provenance
+from benchmarks.trust_pictures import write_worst
 from benchmarks.trust_views import pairs, views_of
 from benchmarks.verdicts import percent
 from orthonav.confidence.registered import (
@@ -152,6 +153,8 @@ def main() -> None:
     )
     text = "\n".join([head, "", *(table.markdown() for table in tables)])
     print("\n" + text)
+    for path in write_worst(rows, judged.right, judged.left_out(), options.work):
+        print(f"worst views: {path}")
     if options.fit:
         everything = np.ones(len(rows), np.bool_)
         judge = judged.fitted(everything)
