@@ -118,8 +118,11 @@ class Refiner:
         )
         at = (pose.x_px, pose.y_px, pose.turn_rad, pose.log_scale)
         images = window.made, template.values, template.slopes
-        found, *seen, converged, step = KERNEL.refine(*images, template.numbers, at, limits)
-        return Placed(Pose(*found), template.level, *seen, bool(converged)), step
+        found, score, correlations, weighted, overlap, converged, step = KERNEL.refine(
+            *images, template.numbers, at, limits
+        )
+        numbers = score, correlations, weighted, overlap, bool(converged)
+        return Placed(Pose(*found), template.level, *numbers), step
 
     def _refined_by_numpy(
         self, window: MapWindow, pose: Pose, steps: int, small_step_px: float

@@ -50,7 +50,7 @@ class Template:
     @cached_property
     def mask(self) -> Array:
         """1 where the view counts (H, W) float32."""
-        return self._planes[3]
+        return np.asarray(self._planes[3], np.float32)
 
     @cached_property
     def _planes(self) -> Array:
