@@ -80,6 +80,13 @@ class Refiner:
         self.template, self.reference = template, reference
         self._reach_px = math.hypot(*template.mask.shape) / 2
 
+    def prepare(self) -> None:
+        """Make what threads share, so that none makes it again."""
+        if KERNEL is None:
+            _ = self.template.self_slopes, self.template.hessians
+        else:
+            _ = self.template.numbers
+
     def place(
         self,
         pose: Pose,
