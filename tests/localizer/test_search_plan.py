@@ -49,7 +49,9 @@ def clock(monkeypatch):
 
 
 def test_the_first_search_is_never_left_out(clock):
-    assert Budget(5.0).allows(1e6)
+    budget = Budget(5.0)
+    clock[0] += 1
+    assert budget.allows(1e6) and not budget.allows(1.0)
 
 
 def test_a_search_that_would_end_too_late_is_left_out(clock):

@@ -221,15 +221,16 @@ class Budget:
 
     def __init__(self, budget_ms: float) -> None:
         self._budget_ms, self._begun_s = budget_ms, time.monotonic()
-        self._estimated_ms = 0.0
+        self._estimated_ms: float | None = None
 
     def allows(self, cost_ms: float) -> bool:
         """Whether a search of an estimated cost would end in time; the first one always may."""
-        spent_ms = 1e3 * (time.monotonic() - self._begun_s)
-        pace = spent_ms / self._estimated_ms if self._estimated_ms else 0.0
-        if spent_ms + pace * cost_ms > self._budget_ms:
-            return False
-        self._estimated_ms += cost_ms
+        if self._estimated_ms is not None:
+            spent_ms = 1e3 * (time.monotonic() - self._begun_s)
+            pace = spent_ms / self._estimated_ms if self._estimated_ms else 0.0
+            if spent_ms + pace * cost_ms > self._budget_ms:
+                return False
+        self._estimated_ms = (self._estimated_ms or 0.0) + cost_ms
         return True
 
 
