@@ -35,9 +35,9 @@ class Template:
     ) -> "Template":
         """The template of grey levels (H, W) at the ground resolution of `level`."""
         made, weights = evidence(grey, valid, recipe), (1.0, recipe.grey_share)
-        gains = np.ones(CHANNELS, np.float32)
+        energies, gains = np.einsum("hwc,hwc->c", made, made), np.ones(CHANNELS, np.float32)
         for group, weight in zip(GROUPS, weights, strict=True):
-            energy = float(np.square(made[..., group]).sum(dtype=np.float64))
+            energy = float(energies[group].sum())
             gains[group] = math.sqrt(weight / energy) if energy > 0 else 0.0
         made *= gains
         return cls(level, made, weights, recipe)
@@ -78,12 +78,17 @@ class Template:
 
     @cached_property
     def slopes(self) -> Array:
-        """Derivatives of the evidence along x and y (H, W, 8), each of four numbers, the last 0."""
-        out = np.zeros((*self.mask.shape, 2 * CHANNELS), np.float32)
-        for at, (x, y) in ((0, (1, 0)), (CHANNELS, (0, 1))):
-            made = cv2.Sobel(self.interleaved, cv2.CV_32F, x, y, scale=1 / 8)
-            np.multiply(made, self.values[..., 3:], out=out[..., at : at + 3])
-        return out
+        """Derivatives of the evidence along x and y (H, W, 8), each of four numbers, the last 0;
+        with the kernel only."""
+        return self._derived[0]
+
+    @cached_property
+    def _derived(self) -> tuple[Array, NDArray[np.float64]]:
+        """`slopes`, and all numbers of `block_hessians` and `self_slopes`, by the kernel."""
+        slopes = np.empty((*self.values.shape[:2], 2 * CHANNELS), np.float32)
+        out = np.empty(BLOCKS**2 * len(GROUPS) * 16 + len(GROUPS) * 4)
+        KERNEL.derive(self.values, slopes, out)
+        return slopes, out
 
     @cached_property
     def jacobian(self) -> Array:
@@ -102,9 +107,7 @@ class Template:
     def block_hessians(self) -> NDArray[np.float64]:
         """What each block of the view (row by row) adds to `hessians`: (B * B, G, 4, 4)."""
         if KERNEL is not None:
-            out = np.empty((BLOCKS**2, len(GROUPS), 4, 4))
-            KERNEL.curvatures(self.slopes, out.reshape(-1))
-            return out
+            return self._derived[1][: -4 * len(GROUPS)].reshape(BLOCKS**2, len(GROUPS), 4, 4)
         starts = zip(self.block_starts, self.mask.shape, strict=True)
         rows, cols = (np.append(first, side) for first, side in starts)
         return np.stack(
@@ -117,12 +120,9 @@ class Template:
     @cached_property
     def self_slopes(self) -> NDArray[np.float64]:
         """Derivatives by the steps times the view itself (G, 4)."""
-        x, y = _from_middle(*self.mask.shape)
-        parts = self.slopes.reshape(*self.mask.shape, 2, CHANNELS) * self.values[:, :, None]
-        rows, by_x = parts.sum(axis=1), np.tensordot(x[0], parts, axes=(0, 1))
-        (dx, dy), (dx_x, dy_x) = rows.swapaxes(0, 1), by_x.swapaxes(0, 1)
-        each = np.array([dx, dy, dy_x - y * dx, dx_x + y * dy], np.float64).sum(axis=1)
-        return np.array([each[:, group].sum(axis=1) for group in GROUPS])
+        if KERNEL is not None:
+            return self._derived[1][-4 * len(GROUPS) :].reshape(len(GROUPS), 4)
+        return by_kind(self, self.channels)
 
     @cached_property
     def numbers(self) -> NDArray[np.float64]:
@@ -147,6 +147,13 @@ class Template:
         """First rows and first columns of `BLOCKS` x `BLOCKS` blocks of the window."""
         rows, cols = ((np.arange(BLOCKS) * side) // BLOCKS for side in self.mask.shape)
         return rows.astype(np.intp), cols.astype(np.intp)
+
+
+def by_kind(template: Template, channels: Array) -> NDArray[np.float64]:
+    """Derivatives of a view by the steps times channels (3, H, W), summed by kind (G, 4)."""
+    parts = zip(template.jacobian, channels, strict=True)
+    each = np.array([rows.reshape(4, -1) @ part.reshape(-1) for rows, part in parts])
+    return np.array([each[group].sum(axis=0) for group in GROUPS], np.float64)
 
 
 def _products(jacobian: Array) -> NDArray[np.float64]:
