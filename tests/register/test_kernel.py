@@ -69,11 +69,22 @@ def test_curvatures_are_the_same(monkeypatch):
 
     def work():
         fresh = template.Template(made.level, made.values, made.weights, made.recipe)
-        return fresh.block_hessians, fresh.hessians
+        return fresh.block_hessians, fresh.hessians, fresh.self_slopes
 
     compiled, plain = both(monkeypatch, work)
     for one, other in zip(compiled, plain, strict=True):
         assert one == pytest.approx(other, rel=1e-4, abs=1e-6 * np.abs(other).max())
+
+
+@needs_kernel
+def test_derivatives_are_the_same():
+    view_valid = np.ones((96, 128), bool)
+    view_valid[:40, 90:] = False
+    made, _ = next(views(1, 3, 0, view_valid))
+    along = np.moveaxis(made.gradients, (0, 1), (3, 2))  # (H, W, 2, 3)
+    slopes = made.slopes.reshape(*made.mask.shape, 2, 4)
+    assert slopes[..., :3] == pytest.approx(along, abs=1e-6 * float(np.abs(along).max()))
+    assert not slopes[..., 3].any()
 
 
 def test_without_a_compiler_views_are_placed_too(reference, monkeypatch):

@@ -47,8 +47,8 @@ class Sums(NamedTuple):
 SUMS = 22 + BLOCKS**2
 
 
-def compared(template: Template, window: MapWindow, pose: Pose) -> Sums:
-    """The sums of a view under a pose."""
+def compared(template: Template, window: MapWindow, pose: Pose, slopes: bool = True) -> Sums:
+    """The sums of a view under a pose; those of derivatives are 0 unless `slopes`."""
     seen, valid = sampled_planes(template, window, pose)
     made = Sums.of_row(np.zeros(SUMS))
     if not (template.whole and valid.min() > FULLY_VALID):
@@ -59,11 +59,13 @@ def compared(template: Template, window: MapWindow, pose: Pose) -> Sums:
             made.left_pixels[:] = template.block_sums(left)
             view = template.channels * left
             made.left_energies[:] = [float(np.sum(np.square(view[group]))) for group in GROUPS]
-            made.left_slopes[:] = by_kind(template, view)
+            if slopes:
+                made.left_slopes[:] = by_kind(template, view)
     for kind, group in enumerate(GROUPS):
         mine, theirs = template.channels[group].reshape(-1), seen[group].reshape(-1)
         made.products[kind], made.energies[kind] = mine @ theirs, theirs @ theirs
-    made.slopes[:] = by_kind(template, seen)
+    if slopes:
+        made.slopes[:] = by_kind(template, seen)
     return made
 
 

@@ -91,12 +91,17 @@ class Template:
         return slopes, out
 
     @cached_property
+    def gradients(self) -> Array:
+        """Derivatives of the channels along x and y, per pixel: (3, 2, H, W)."""
+        return gradients(self.channels, self.mask)
+
+    @cached_property
     def jacobian(self) -> Array:
         """How the channels change with a small step of the window: (3, 4, H, W).
 
         Steps are x, y (pixels of the level), turn (rad) and log scale about the middle.
         """
-        return derivatives(self.channels, self.mask)
+        return by_steps(self.gradients.swapaxes(0, 1)).swapaxes(0, 1)
 
     @cached_property
     def hessians(self) -> NDArray[np.float64]:
@@ -165,23 +170,28 @@ def _products(jacobian: Array) -> NDArray[np.float64]:
     return out
 
 
-def derivatives(channels: Array, mask: Array) -> Array:
-    """How channels (C, H, W) change with a small step of the window: (C, 4, H, W)."""
-    height, width = mask.shape
-    x, y = _from_middle(height, width)
-    out = np.empty((len(channels), 4, height, width), dtype=np.float32)
+def gradients(channels: Array, mask: Array) -> Array:
+    """Derivatives (C, 2, H, W) of channels (C, H, W) by x and y, per pixel, 0 beyond the mask."""
+    out = np.empty((len(channels), 2, *mask.shape), dtype=np.float32)
     for channel, into in zip(channels, out, strict=True):
-        dx = np.asarray(cv2.Sobel(channel, cv2.CV_32F, 1, 0, scale=1 / 8), np.float32)
-        dy = np.asarray(cv2.Sobel(channel, cv2.CV_32F, 0, 1, scale=1 / 8), np.float32)
-        dx *= mask
-        dy *= mask
-        into[0], into[1] = dx, dy
-        np.subtract(dy * x, dx * y, out=into[2])
-        np.add(dx * x, dy * y, out=into[3])
+        cv2.Sobel(channel, cv2.CV_32F, 1, 0, dst=into[0], scale=1 / 8)
+        cv2.Sobel(channel, cv2.CV_32F, 0, 1, dst=into[1], scale=1 / 8)
+    out *= mask
     return out
 
 
-def _from_middle(height: int, width: int) -> tuple[Array, Array]:
+def by_steps(along: Array) -> Array:
+    """Terms (4, .., H, W) of steps along x and y, of a turn and of the log scale, of those along x
+    and y (2, .., H, W)."""
+    x, y = from_middle(*along.shape[-2:])
+    out = np.empty((4, *along.shape[1:]), np.float32)
+    out[:2] = along
+    np.subtract(along[1] * x, along[0] * y, out=out[2])
+    np.add(along[0] * x, along[1] * y, out=out[3])
+    return out
+
+
+def from_middle(height: int, width: int) -> tuple[Array, Array]:
     """Centres of pixels from the middle of a window, x (1, W) and y (H, 1)."""
     x = (np.arange(width, dtype=np.float32) + np.float32(0.5 - width / 2))[None]
     y = (np.arange(height, dtype=np.float32) + np.float32(0.5 - height / 2))[:, None]
