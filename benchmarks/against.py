@@ -181,7 +181,11 @@ def _placed(task: Task, tree: Path) -> dict[str, Any]:
     paths = os.pathsep.join([str(tree / "src"), str(ROOT)])
     command = [sys.executable, "-m", "benchmarks.placing", json.dumps(asdict(task))]
     run = subprocess.run(
-        command, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": paths}
+        command,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": paths},
     )
     if run.returncode:
         raise RuntimeError(f"{tree}: {run.stderr[-2000:]}")

@@ -2,8 +2,8 @@
  *
  * `compare` samples the map's evidence as the view's window shows it, turns its edge directions,
  * and adds up the products that a step needs, in one pass over the pixels. `refine` takes the steps.
- * `curvatures` adds up the products of the view's derivatives. The Python modules do the same with
- * NumPy; they are the oracle of this file and take its place where it was not compiled.
+ * `derive` makes the view's derivatives and adds up their products. The Python modules do the same
+ * with NumPy; they are the oracle of this file and take its place where it was not compiled.
  *
  * Only the stable ABI of Python 3.11 is used: buffers in, buffers out, no NumPy at build time. */
 
@@ -20,6 +20,7 @@
 #define OUTPUTS (22 + BLOCKS * BLOCKS)
 #define PER_BLOCK (2 * 4 * 4)
 #define CURVATURES (BLOCKS * BLOCKS * PER_BLOCK)
+#define DERIVED (CURVATURES + 8)
 #define CHUNK 128       /* pixels of a row whose taps are found together */
 #define LARGEST 32768   /* longest side, px */
 #define INLINE static inline __attribute__((always_inline)) /* for one processor alike */
@@ -185,22 +186,47 @@ static void compare(const window_t *window, const template_t *view, const double
     }
 }
 
-/* Products of the derivatives by each pair of steps, by block and kind of evidence. */
+/* Sobel's derivatives along x and y at one pixel, per pixel; the border is reflected. */
+INLINE void sobel(const float *const rows[3], int col, int cols, lanes out[2]) {
+    const int left = LANES * (col > 0 ? col - 1 : (cols > 1)), middle = LANES * col;
+    const int right = LANES * (col + 1 < cols ? col + 1 : (cols > 1 ? cols - 2 : 0));
+    const lanes a = load(rows[0] + left), b = load(rows[0] + middle), c = load(rows[0] + right);
+    const lanes d = load(rows[1] + left), f = load(rows[1] + right);
+    const lanes g = load(rows[2] + left), h = load(rows[2] + middle), i = load(rows[2] + right);
+    out[0] = (c - a + 2.0f * (f - d) + i - g) * 0.125f;
+    out[1] = (g - a + 2.0f * (h - b) + i - c) * 0.125f;
+}
+
+/* Derivatives of a view, and their products with each other by block and kind of evidence, then
+ * those with the view itself, by kind. */
 FOR_EVERY_PROCESSOR
-static void curvatures(const float *slopes, int rows, int cols, double *out) {
-    memset(out, 0, CURVATURES * sizeof(double));
+static void derive(const float *values, int rows, int cols, float *slopes, double *out) {
+    memset(out, 0, DERIVED * sizeof(double));
     for (int row = 0; row < rows; row++) {
         const float y = from_middle(row, rows);
+        const size_t width = (size_t)LANES * cols;
+        const int before = row > 0 ? row - 1 : (rows > 1);
+        const int after = row + 1 < rows ? row + 1 : (rows > 1 ? rows - 2 : 0);
+        const float *const around[3] = {values + before * width, values + row * width,
+                                        values + after * width};
         double *row_of_blocks = out + (size_t)BLOCKS * block_of(row, rows) * PER_BLOCK;
+        lanes self[4] = {{0}};
         for (int block = 0; block < BLOCKS; block++) {
             const int last = cols * (block + 1) / BLOCKS;
-            lanes sum[10] = {0};
+            lanes sum[10] = {{0}};
             for (int col = cols * block / BLOCKS; col < last; col++, slopes += 2 * LANES) {
-                const float x = from_middle(col, cols);
-                const lanes dx = load(slopes), dy = load(slopes + LANES);
+                const lanes mine = load(around[1] + LANES * col), x = all(from_middle(col, cols));
+                const lanes counts = {mine[3], mine[3], mine[3], 0.0f};
+                lanes slope[2];
+                sobel(around, col, cols, slope);
+                const lanes dx = slope[0] * counts, dy = slope[1] * counts;
+                memcpy(slopes, &dx, sizeof dx);
+                memcpy(slopes + LANES, &dy, sizeof dy);
                 const lanes step[4] = {dx, dy, x * dy - y * dx, x * dx + y * dy};
-                for (int i = 0, k = 0; i < 4; i++)
+                for (int i = 0, k = 0; i < 4; i++) {
+                    self[i] += step[i] * mine;
                     for (int j = i; j < 4; j++) sum[k++] += step[i] * step[j];
+                }
             }
             double *into = row_of_blocks + block * PER_BLOCK;
             for (int i = 0, k = 0; i < 4; i++)
@@ -212,6 +238,10 @@ static void curvatures(const float *slopes, int rows, int cols, double *out) {
                     into[4 * j + i] += first;
                     into[16 + 4 * j + i] += second;
                 }
+        }
+        for (int i = 0; i < 4; i++) {
+            out[CURVATURES + i] += (double)self[i][0] + self[i][1];
+            out[CURVATURES + 4 + i] += self[i][2];
         }
     }
 }
@@ -382,6 +412,17 @@ static int is_whole(const Py_buffer *buffer) {
     return buffer->strides[0] == buffer->shape[1] * buffer->strides[1];
 }
 
+/* Whether view and slopes are contiguous and of one shape; else an error is set. */
+static int are_alike(const Py_buffer *view, const Py_buffer *slopes) {
+    if (is_whole(view) && is_whole(slopes) && view->shape[0] == slopes->shape[0] &&
+        view->shape[1] == slopes->shape[1] && view->shape[0] <= LARGEST &&
+        view->shape[1] <= LARGEST)
+        return 1;
+    PyErr_SetString(PyExc_ValueError, "view and slopes must be contiguous and of one shape, and no "
+                                      "side longer than 32768");
+    return 0;
+}
+
 /* Buffers of a window and of a template, as C sees them. */
 typedef struct {
     Py_buffer made, view, slopes;
@@ -407,18 +448,19 @@ static int borrow_images(PyObject *const from[3], images_t *images) {
         return -1;
     }
     const Py_buffer *made = &images->made, *view = &images->view, *slopes = &images->slopes;
-    if (is_whole(view) && is_whole(slopes) && view->shape[0] == slopes->shape[0] &&
-        view->shape[1] == slopes->shape[1] && view->shape[0] <= LARGEST &&
-        view->shape[1] <= LARGEST && made->shape[1] <= LARGEST &&
-        made->strides[0] % 4 == 0 && made->shape[0] * (made->strides[0] / 4) <= INT_MAX) {
+    if (!are_alike(view, slopes)) {
+        give_back(images);
+        return -1;
+    }
+    if (made->shape[1] <= LARGEST && made->strides[0] % 4 == 0 &&
+        made->shape[0] * (made->strides[0] / 4) <= INT_MAX) {
         images->window = (window_t){made->buf, made->strides[0] / 4, (int)made->shape[0],
                                     (int)made->shape[1]};
         images->template = (template_t){view->buf, slopes->buf, (int)view->shape[0],
                                         (int)view->shape[1]};
         return 0;
     }
-    PyErr_SetString(PyExc_ValueError, "view and slopes must be contiguous and of one shape, and no "
-                                      "side longer than 32768");
+    PyErr_SetString(PyExc_ValueError, "window must be contiguous and smaller than 2^31 numbers");
     give_back(images);
     return -1;
 }
@@ -453,34 +495,32 @@ static PyObject *py_refine(PyObject *self, PyObject *arguments) {
                                        best.step[3]));
 }
 
-static PyObject *py_curvatures(PyObject *self, PyObject *arguments) {
-    PyObject *from, *to;
-    Py_buffer slopes, out;
+static PyObject *py_derive(PyObject *self, PyObject *arguments) {
+    PyObject *from, *to[2];
+    Py_buffer view, slopes, out;
     (void)self;
-    if (!PyArg_ParseTuple(arguments, "OO", &from, &to)) return NULL;
-    if (borrow(from, &slopes, 3, 2 * LANES, 'f', 0) < 0) return NULL;
-    if (borrow(to, &out, 1, CURVATURES, 'd', PyBUF_WRITABLE) < 0) {
-        PyBuffer_Release(&slopes);
-        return NULL;
-    }
-    const int fits = is_whole(&slopes) && slopes.shape[0] <= LARGEST && slopes.shape[1] <= LARGEST;
-    if (fits) {
+    if (!PyArg_ParseTuple(arguments, "OOO", &from, &to[0], &to[1])) return NULL;
+    if (borrow(from, &view, 3, LANES, 'f', 0) < 0) return NULL;
+    if (borrow(to[0], &slopes, 3, 2 * LANES, 'f', PyBUF_WRITABLE) < 0) goto free_view;
+    if (borrow(to[1], &out, 1, DERIVED, 'd', PyBUF_WRITABLE) < 0) goto free_slopes;
+    if (are_alike(&view, &slopes)) {
         Py_BEGIN_ALLOW_THREADS
-        curvatures(slopes.buf, (int)slopes.shape[0], (int)slopes.shape[1], out.buf);
+        derive(view.buf, (int)view.shape[0], (int)view.shape[1], slopes.buf, out.buf);
         Py_END_ALLOW_THREADS
-    } else {
-        PyErr_SetString(PyExc_ValueError, "slopes must be contiguous, with sides up to 32768");
     }
     PyBuffer_Release(&out);
+free_slopes:
     PyBuffer_Release(&slopes);
-    return fits ? Py_NewRef(Py_None) : NULL;
+free_view:
+    PyBuffer_Release(&view);
+    return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
 }
 
 static PyMethodDef functions[] = {
     {"refine", py_refine, METH_VARARGS,
      "refine(window, view, slopes, numbers, pose, limits): see orthonav.register.refine."},
-    {"curvatures", py_curvatures, METH_VARARGS,
-     "curvatures(slopes, out): see orthonav.register.sums."},
+    {"derive", py_derive, METH_VARARGS,
+     "derive(view, slopes, out): see orthonav.register.template."},
     {NULL, NULL, 0, NULL},
 };
 

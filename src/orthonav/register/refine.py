@@ -22,7 +22,7 @@ from orthonav.register.map_window import MapWindow
 from orthonav.register.pose import Pose, even_scale
 from orthonav.register.reference import Reference
 from orthonav.register.sums import FULLY_VALID, compared, sampled_planes
-from orthonav.register.template import BLOCKS, Template, derivatives
+from orthonav.register.template import BLOCKS, Template, by_steps, from_middle, gradients
 
 Array = NDArray[np.float32]
 STEPS = 6
@@ -80,6 +80,13 @@ class Refiner:
         self.template, self.reference = template, reference
         self._reach_px = math.hypot(*template.mask.shape) / 2
 
+    def prepare(self) -> None:
+        """Make what threads share, so that none makes it again."""
+        if KERNEL is None:
+            _ = self.template.self_slopes, self.template.hessians
+        else:
+            _ = self.template.numbers
+
     def place(
         self,
         pose: Pose,
@@ -96,7 +103,7 @@ class Refiner:
         placed, step = self._refined(window, pose, steps, small_step_px)
         if not with_covariance:
             return placed
-        pixels = _Pixels(Comparison(self.template, window, placed.pose), window)
+        pixels = _Pixels(Comparison(self.template, window, placed.pose, slopes=False), window)
         covariance = self._covariance(pixels)
         if not placed.converged:
             # Still moving: its last step is an error of its own.
@@ -118,8 +125,11 @@ class Refiner:
         )
         at = (pose.x_px, pose.y_px, pose.turn_rad, pose.log_scale)
         images = window.made, template.values, template.slopes
-        found, *seen, converged, step = KERNEL.refine(*images, template.numbers, at, limits)
-        return Placed(Pose(*found), template.level, *seen, bool(converged)), step
+        found, score, correlations, weighted, overlap, converged, step = KERNEL.refine(
+            *images, template.numbers, at, limits
+        )
+        numbers = score, correlations, weighted, overlap, bool(converged)
+        return Placed(Pose(*found), template.level, *numbers), step
 
     def _refined_by_numpy(
         self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
@@ -147,9 +157,9 @@ class Refiner:
         score's decrease and curvature (B * B, 2, 2), by level-0 pixels of the map."""
         template = self.template
         window = MapWindow.of(template, self.reference, pose, SLACK_PX)
-        seen = Comparison(template, window, pose)
+        seen = Comparison(template, window, pose, slopes=False)
         pixels = _Pixels(seen, window)
-        terms = np.einsum("cphw,chw->phw", template.jacobian[:, :2], pixels.residual)
+        terms = np.einsum("cphw,chw->phw", template.gradients, pixels.residual)
         slopes = template.block_sums(terms).astype(np.float64).T
         each = np.tensordot(template.block_hessians, seen.squares, axes=([1], [0]))
         to_window = np.linalg.inv(pose.linear * 2.0**template.level)
@@ -172,12 +182,26 @@ class Refiner:
         Noise and change have derivatives too: counted as if they held the view in place, they
         would make the position appear known along ground that runs in one direction.
         """
-        seen, mine = pixels.seen, self.template.jacobian.reshape(3, 4, -1)
-        theirs = derivatives(pixels.map, pixels.counts).reshape(3, 4, -1)
-        gains = np.repeat(seen.gains, [2, 1])
-        observed = np.zeros((4, 4))
-        for gain, one, other in zip(gains, mine, theirs, strict=True):
-            observed += gain * (one @ other.T)
+        seen, mine = pixels.seen, self.template.gradients
+        theirs = gradients(pixels.map, pixels.counts)
+        theirs *= np.repeat(seen.gains, [2, 1]).astype(np.float32)[:, None, None, None]
+        x, y = from_middle(*self.template.mask.shape)
+        rows, cols = (np.stack([np.ones(each.size, np.float32), each.ravel()]) for each in (y, x))
+        sums = np.empty((2, 4, 2, 2))  # of the view along x and y, of the map by the steps
+        for at in range(2):
+            products = mine[0, at] * theirs[0]
+            for one, other in zip(mine[1:, at], theirs[1:], strict=True):
+                products += one * other
+            sums[at] = rows @ by_steps(products) @ cols.T  # once, and times x and y
+        across, down = sums
+        observed = np.stack(
+            [
+                across[:, 0, 0],
+                down[:, 0, 0],
+                down[:, 0, 1] - across[:, 1, 0],
+                across[:, 0, 1] + down[:, 1, 0],
+            ]
+        )
         return _bounded_inverse((observed + observed.T) / 2, self._hessian(seen))
 
     def _step(self, seen: "Comparison") -> list[float]:
@@ -199,7 +223,7 @@ class Refiner:
 
     def _covariance(self, pixels: "_Pixels") -> NDArray[np.float64]:
         """Covariance (4, 4) of x, y (level-0 px), turn and log scale."""
-        terms = np.einsum("cphw,chw->phw", self.template.jacobian, pixels.residual)
+        terms = by_steps(np.einsum("cphw,chw->phw", self.template.gradients, pixels.residual))
         sums = self.template.block_sums(terms).astype(np.float64)
         spread = sums @ sums.T * (BLOCKS**2 / (BLOCKS**2 - 4))
         inverse = self._observed_inverse(pixels)
@@ -226,9 +250,12 @@ class Comparison:
     correlation.
     """
 
-    def __init__(self, template: Template, window: MapWindow, pose: Pose) -> None:
+    def __init__(
+        self, template: Template, window: MapWindow, pose: Pose, slopes: bool = True
+    ) -> None:
+        """`slopes`: whether a step will be asked for."""
         self.template, self.pose = template, pose
-        self._sums = compared(template, window, pose)
+        self._sums = compared(template, window, pose, slopes)
         pixels = template.pixels - float(self._sums.left_pixels.sum())
         self.overlap = pixels / max(template.pixels, 1.0)
         own = (template.energies - self._sums.left_energies).tolist()

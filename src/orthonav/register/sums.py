@@ -13,7 +13,7 @@ from orthonav.register.evidence import GROUPS
 from orthonav.register.map_window import MapWindow
 from orthonav.register.memory import thread_memory
 from orthonav.register.pose import Pose
-from orthonav.register.template import BLOCKS, Template, turn_planes
+from orthonav.register.template import BLOCKS, Template, by_kind, turn_planes
 
 Array = NDArray[np.float32]
 FULLY_VALID = 0.99
@@ -47,8 +47,8 @@ class Sums(NamedTuple):
 SUMS = 22 + BLOCKS**2
 
 
-def compared(template: Template, window: MapWindow, pose: Pose) -> Sums:
-    """The sums of a view under a pose."""
+def compared(template: Template, window: MapWindow, pose: Pose, slopes: bool = True) -> Sums:
+    """The sums of a view under a pose; those of derivatives are 0 unless `slopes`."""
     seen, valid = sampled_planes(template, window, pose)
     made = Sums.of_row(np.zeros(SUMS))
     if not (template.whole and valid.min() > FULLY_VALID):
@@ -59,11 +59,13 @@ def compared(template: Template, window: MapWindow, pose: Pose) -> Sums:
             made.left_pixels[:] = template.block_sums(left)
             view = template.channels * left
             made.left_energies[:] = [float(np.sum(np.square(view[group]))) for group in GROUPS]
-            made.left_slopes[:] = _by_kind(template, view)
+            if slopes:
+                made.left_slopes[:] = by_kind(template, view)
     for kind, group in enumerate(GROUPS):
         mine, theirs = template.channels[group].reshape(-1), seen[group].reshape(-1)
         made.products[kind], made.energies[kind] = mine @ theirs, theirs @ theirs
-    made.slopes[:] = _by_kind(template, seen)
+    if slopes:
+        made.slopes[:] = by_kind(template, seen)
     return made
 
 
@@ -78,10 +80,3 @@ def sampled_planes(template: Template, window: MapWindow, pose: Pose) -> tuple[A
     window.sample(pose, interleaved)
     turn_planes(interleaved, -pose.turn_rad, planes[4:8], planes[8:10])
     return planes[4:7], planes[7]
-
-
-def _by_kind(template: Template, channels: Array) -> NDArray[np.float64]:
-    """Derivatives of a view by the steps times channels (3, H, W): (2, 4)."""
-    parts = zip(template.jacobian, channels, strict=True)
-    each = np.array([rows.reshape(4, -1) @ part.reshape(-1) for rows, part in parts])
-    return np.array([each[group].sum(axis=0) for group in GROUPS], np.float64)

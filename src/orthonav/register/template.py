@@ -35,9 +35,9 @@ class Template:
     ) -> "Template":
         """The template of grey levels (H, W) at the ground resolution of `level`."""
         made, weights = evidence(grey, valid, recipe), (1.0, recipe.grey_share)
-        gains = np.ones(CHANNELS, np.float32)
+        energies, gains = np.einsum("hwc,hwc->c", made, made), np.ones(CHANNELS, np.float32)
         for group, weight in zip(GROUPS, weights, strict=True):
-            energy = float(np.square(made[..., group]).sum(dtype=np.float64))
+            energy = float(energies[group].sum())
             gains[group] = math.sqrt(weight / energy) if energy > 0 else 0.0
         made *= gains
         return cls(level, made, weights, recipe)
@@ -50,7 +50,7 @@ class Template:
     @cached_property
     def mask(self) -> Array:
         """1 where the view counts (H, W) float32."""
-        return self._planes[3]
+        return np.asarray(self._planes[3], np.float32)
 
     @cached_property
     def _planes(self) -> Array:
@@ -78,12 +78,22 @@ class Template:
 
     @cached_property
     def slopes(self) -> Array:
-        """Derivatives of the evidence along x and y (H, W, 8), each of four numbers, the last 0."""
-        out = np.zeros((*self.mask.shape, 2 * CHANNELS), np.float32)
-        for at, (x, y) in ((0, (1, 0)), (CHANNELS, (0, 1))):
-            made = cv2.Sobel(self.interleaved, cv2.CV_32F, x, y, scale=1 / 8)
-            np.multiply(made, self.values[..., 3:], out=out[..., at : at + 3])
-        return out
+        """Derivatives of the evidence along x and y (H, W, 8), each of four numbers, the last 0;
+        with the kernel only."""
+        return self._derived[0]
+
+    @cached_property
+    def _derived(self) -> tuple[Array, NDArray[np.float64]]:
+        """`slopes`, and all numbers of `block_hessians` and `self_slopes`, by the kernel."""
+        slopes = np.empty((*self.values.shape[:2], 2 * CHANNELS), np.float32)
+        out = np.empty(BLOCKS**2 * len(GROUPS) * 16 + len(GROUPS) * 4)
+        KERNEL.derive(self.values, slopes, out)
+        return slopes, out
+
+    @cached_property
+    def gradients(self) -> Array:
+        """Derivatives of the channels along x and y, per pixel: (3, 2, H, W)."""
+        return gradients(self.channels, self.mask)
 
     @cached_property
     def jacobian(self) -> Array:
@@ -91,7 +101,7 @@ class Template:
 
         Steps are x, y (pixels of the level), turn (rad) and log scale about the middle.
         """
-        return derivatives(self.channels, self.mask)
+        return by_steps(self.gradients.swapaxes(0, 1)).swapaxes(0, 1)
 
     @cached_property
     def hessians(self) -> NDArray[np.float64]:
@@ -102,9 +112,7 @@ class Template:
     def block_hessians(self) -> NDArray[np.float64]:
         """What each block of the view (row by row) adds to `hessians`: (B * B, G, 4, 4)."""
         if KERNEL is not None:
-            out = np.empty((BLOCKS**2, len(GROUPS), 4, 4))
-            KERNEL.curvatures(self.slopes, out.reshape(-1))
-            return out
+            return self._derived[1][: -4 * len(GROUPS)].reshape(BLOCKS**2, len(GROUPS), 4, 4)
         starts = zip(self.block_starts, self.mask.shape, strict=True)
         rows, cols = (np.append(first, side) for first, side in starts)
         return np.stack(
@@ -117,12 +125,9 @@ class Template:
     @cached_property
     def self_slopes(self) -> NDArray[np.float64]:
         """Derivatives by the steps times the view itself (G, 4)."""
-        x, y = _from_middle(*self.mask.shape)
-        parts = self.slopes.reshape(*self.mask.shape, 2, CHANNELS) * self.values[:, :, None]
-        rows, by_x = parts.sum(axis=1), np.tensordot(x[0], parts, axes=(0, 1))
-        (dx, dy), (dx_x, dy_x) = rows.swapaxes(0, 1), by_x.swapaxes(0, 1)
-        each = np.array([dx, dy, dy_x - y * dx, dx_x + y * dy], np.float64).sum(axis=1)
-        return np.array([each[:, group].sum(axis=1) for group in GROUPS])
+        if KERNEL is not None:
+            return self._derived[1][-4 * len(GROUPS) :].reshape(len(GROUPS), 4)
+        return by_kind(self, self.channels)
 
     @cached_property
     def numbers(self) -> NDArray[np.float64]:
@@ -149,6 +154,13 @@ class Template:
         return rows.astype(np.intp), cols.astype(np.intp)
 
 
+def by_kind(template: Template, channels: Array) -> NDArray[np.float64]:
+    """Derivatives of a view by the steps times channels (3, H, W), summed by kind (G, 4)."""
+    parts = zip(template.jacobian, channels, strict=True)
+    each = np.array([rows.reshape(4, -1) @ part.reshape(-1) for rows, part in parts])
+    return np.array([each[group].sum(axis=0) for group in GROUPS], np.float64)
+
+
 def _products(jacobian: Array) -> NDArray[np.float64]:
     """Products (G, 4, 4) of derivatives (3, 4, H, W), summed over the channels of each kind."""
     out = np.zeros((len(GROUPS), 4, 4))
@@ -158,23 +170,28 @@ def _products(jacobian: Array) -> NDArray[np.float64]:
     return out
 
 
-def derivatives(channels: Array, mask: Array) -> Array:
-    """How channels (C, H, W) change with a small step of the window: (C, 4, H, W)."""
-    height, width = mask.shape
-    x, y = _from_middle(height, width)
-    out = np.empty((len(channels), 4, height, width), dtype=np.float32)
+def gradients(channels: Array, mask: Array) -> Array:
+    """Derivatives (C, 2, H, W) of channels (C, H, W) by x and y, per pixel, 0 beyond the mask."""
+    out = np.empty((len(channels), 2, *mask.shape), dtype=np.float32)
     for channel, into in zip(channels, out, strict=True):
-        dx = np.asarray(cv2.Sobel(channel, cv2.CV_32F, 1, 0, scale=1 / 8), np.float32)
-        dy = np.asarray(cv2.Sobel(channel, cv2.CV_32F, 0, 1, scale=1 / 8), np.float32)
-        dx *= mask
-        dy *= mask
-        into[0], into[1] = dx, dy
-        np.subtract(dy * x, dx * y, out=into[2])
-        np.add(dx * x, dy * y, out=into[3])
+        cv2.Sobel(channel, cv2.CV_32F, 1, 0, dst=into[0], scale=1 / 8)
+        cv2.Sobel(channel, cv2.CV_32F, 0, 1, dst=into[1], scale=1 / 8)
+    out *= mask
     return out
 
 
-def _from_middle(height: int, width: int) -> tuple[Array, Array]:
+def by_steps(along: Array) -> Array:
+    """Terms (4, .., H, W) of steps along x and y, of a turn and of the log scale, of those along x
+    and y (2, .., H, W)."""
+    x, y = from_middle(*along.shape[-2:])
+    out = np.empty((4, *along.shape[1:]), np.float32)
+    out[:2] = along
+    np.subtract(along[1] * x, along[0] * y, out=out[2])
+    np.add(along[0] * x, along[1] * y, out=out[3])
+    return out
+
+
+def from_middle(height: int, width: int) -> tuple[Array, Array]:
     """Centres of pixels from the middle of a window, x (1, W) and y (H, 1)."""
     x = (np.arange(width, dtype=np.float32) + np.float32(0.5 - width / 2))[None]
     y = (np.arange(height, dtype=np.float32) + np.float32(0.5 - height / 2))[:, None]
