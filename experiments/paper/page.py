@@ -6,6 +6,7 @@ from experiments.paper.results import Result
 from experiments.paper.scenes import SEED
 from experiments.paper.stored import ROOT, expected, made_at, name_of, older
 from experiments.paper.tables import tables
+from experiments.paper.trainings import trainings
 from experiments.paper.trajectories import REDUCED, SETTINGS
 
 PAGE = ROOT / "docs" / "paper-results.md"
@@ -17,14 +18,17 @@ seed {SEED}.
 """
 
 
-def page(rows: Sequence[Result]) -> str:
-    """Text of the page: the tables of each setting, and the rows that are missing."""
+def page(rows: Sequence[Result], others: Sequence[Result] = ()) -> str:
+    """Text of the page: tables of each setting, other trainings, and the rows that are missing."""
     text = [HEAD]
     for name in SETTINGS:
         found = [row for row in rows if row.plain["setting"]["name"] == name]
         if found:
             text.append(f"## The {name} setting\n")
             text += [table.markdown() for table in tables(found)]
+    if others:
+        text.append("## Other trainings\n")
+        text.append(trainings([*others, *rows]).markdown())
     if names := missing(rows):
         lines = "\n".join(f"- `{name}`" for name in names)
         text.append(f"## Rows of the reduced setting without a stored result\n\n{lines}\n")

@@ -332,10 +332,19 @@ def row_table(results: Sequence[Result]) -> Table:
         changed = "yes" if made["dirty"] else "no"
         about = [str(made["commit"])[:10], changed, str(made["date"])[:10]]
         mark = "yes" if each.family and is_tuned(each) else "no"
-        cost = [number(each.plain["minutes"]), str(made["cpu"])]
+        times = [each.plain.get("cpu_minutes"), each.plain["minutes"]]
+        cost = [*("-" if minutes is None else number(minutes) for minutes in times), made["cpu"]]
         rows.append([name_of(each), mark, *about, *cost])
-    header = ("row", "tuned on it", "commit", "files not committed", "date", "minutes", "processor")
-    return Table("Rows", header, rows)
+    header = (
+        *("row", "tuned on it", "commit", "files not committed", "date"),
+        *("core minutes", "minutes", "processor"),
+    )
+    known = [each.plain["cpu_minutes"] for each in results if "cpu_minutes" in each.plain]
+    notes = (
+        f"core minutes: time of the processor, of {len(known)} rows together {sum(known):.0f}; "
+        "minutes: by the clock, longer beside other work",
+    )
+    return Table("Rows", header, rows, notes)
 
 
 def _name(each: Result) -> str:
