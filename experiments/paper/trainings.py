@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from benchmarks.record import Table, number
 
+from experiments.paper.labels import EDGES
 from experiments.paper.results import Result, percent, share
-from experiments.paper.tables import EDGES
 from orthonav import embed
 from orthonav.embed.network import AutoEncoderRecipe
 from orthonav.variants import make_variant
