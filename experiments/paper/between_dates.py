@@ -9,6 +9,7 @@ onnx:weights=experiments/paper/between_dates.onnx` takes.
 """
 
 import argparse
+import json
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -25,7 +26,7 @@ from torch.nn import functional
 
 from experiments.paper.methods import BETWEEN_DATES
 from orthonav.extras import needed
-from orthonav.files import replacing
+from orthonav.files import replacing, write_text
 from orthonav.neural.means import Means, mixed_precision
 from orthonav.represent.canny import Canny
 from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
@@ -51,6 +52,7 @@ AGREEMENT = 0.5
 SAID_EVERY = 100
 OPSET, IR_VERSION = 17, 8
 Dates = list[NDArray[np.uint8]]
+Agreement = dict[str, Any]
 
 
 def network() -> nn.Sequential:
@@ -229,6 +231,28 @@ def write(model: nn.Sequential, path: Path) -> None:
         temporary.write_bytes(made.SerializeToString())
 
 
+def agreements(model: nn.Sequential, area: tuple[int, float], dates: Dates) -> Iterator[Agreement]:
+    """How the edges of two dates agree, Canny's and learnt ones, for each pair of dates."""
+    learnt = [(logits(model, grey) > 0).astype(np.uint8) for grey in dates]
+    plain = [canny(grey) for grey in dates]
+    for one, other in combinations(range(len(dates)), 2):
+        yield {
+            "seed": area[0],
+            "gsd_m": area[1],
+            "dates": [DEFAULT_DATES[each].name for each in (one, other)],
+            "canny": round(agreement(plain[one], plain[other]), 3),
+            "learnt": round(agreement(learnt[one], learnt[other]), 3),
+            "share_canny": round(float(np.mean([plain[one], plain[other]])), 3),
+            "share_learnt": round(float(np.mean([learnt[one], learnt[other]])), 3),
+        }
+
+
+def write_agreements(found: Sequence[Agreement], path: Path) -> None:
+    """Write them beside the network, from where the page of results takes them."""
+    text = ",\n".join(json.dumps(each) for each in found)
+    write_text(path.with_suffix(".json"), f"[\n{text}\n]\n")
+
+
 def main() -> None:
     """Generate the landscapes, learn, write, and say how the edges of two dates agree."""
     parser = argparse.ArgumentParser(
@@ -242,16 +266,13 @@ def main() -> None:
     model = learn([made[each] for each in AREAS], options.steps)
     write(model, options.out)
     print(f"{sum(each.numel() for each in model.parameters()):,} parameters: {options.out}")
-    for area in HELD_OUT:
-        learnt = [(logits(model, grey) > 0).astype(np.uint8) for grey in made[area]]
-        plain = [canny(grey) for grey in made[area]]
-        for one, other in combinations(range(len(plain)), 2):
-            dates = f"{DEFAULT_DATES[one].name} and {DEFAULT_DATES[other].name}"
-            pair = [agreement(each[one], each[other]) for each in (plain, learnt)]
-            print(
-                f"{area[1]:g} m per pixel, not learnt from, correlation of {dates}: "
-                f"Canny {pair[0]:.2f}, learnt {pair[1]:.2f}"
-            )
+    found = [pair for area in HELD_OUT for pair in agreements(model, area, made[area])]
+    write_agreements(found, options.out)
+    for each in found:
+        print(
+            f"{each['gsd_m']:g} m per pixel, not learnt from, correlation of "
+            f"{' and '.join(each['dates'])}: Canny {each['canny']:.2f}, learnt {each['learnt']:.2f}"
+        )
 
 
 if __name__ == "__main__":
