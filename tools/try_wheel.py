@@ -28,6 +28,8 @@ ROOT = Path(__file__).resolve().parents[1]
 CONSTRAINTS = ROOT / "constraints.txt"
 LARGE = ("train", "cluster")
 """Extras that bring gigabytes (PyTorch) or hundreds of MB (Ray): only with --all."""
+KERNEL = "orthonav/register/_kernel.abi3.so"
+"""Compiled from `_kernel.c`; needs a C compiler and Python's headers."""
 MADE_BY_BUILD = ("PKG-INFO", "setup.cfg", "src/orthonav.egg-info/")
 
 ORTHO, MAP, FLIGHT, FIXES = "land/2016-07.tif", "area.onav", "flight", "fixes.jsonl"
@@ -137,6 +139,7 @@ def faults_of_wheel(wheel: Path) -> list[str]:
     wanted = {
         name.removeprefix("src/") for name in tracked_files() if name.startswith("src/orthonav/")
     }
+    wanted.add(KERNEL)
     return [
         *(f"wheel lacks {name}" for name in sorted(wanted - found)),
         *(f"wheel has {name}, which is not in src" for name in sorted(found - wanted)),

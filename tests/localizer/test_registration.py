@@ -20,6 +20,7 @@ from blots import (
 
 from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
+from orthonav.localizer.plan import DEFAULT_PLAN
 from orthonav.mapfile import GreyLayer, open_map
 from orthonav.mapfile.layer import part_names
 from orthonav.onboard.run import SingleViews, locate_view
@@ -373,6 +374,21 @@ def test_the_same_view_gives_the_same_fix(localizer, map_path, plain):
     assert same(localizer.locate(View(grey, CAMERA, reported)), fix)
     assert same(Localizer(open_map(map_path)).locate(View(grey, CAMERA, reported)), fix)
     np.testing.assert_array_equal(grey, kept)
+
+
+def test_threads_within_a_view_change_nothing(localizer, map_path, plain):
+    threaded = Localizer(open_map(map_path), plan=replace(DEFAULT_PLAN, threads=3))
+    view = View(plain[0], CAMERA, plain[1])
+    assert same(*(each.locate(view, heading_known=False) for each in (localizer, threaded)))
+
+
+def test_a_spent_budget_leaves_the_best_place_so_far(map_path, plain):
+    """One that ends before the first search does, so that only this one is made."""
+    hurried = Localizer(open_map(map_path), plan=replace(DEFAULT_PLAN, budget_ms=1e-6))
+    view = View(plain[0], CAMERA, plain[1])
+    whole = Localizer(open_map(map_path)).locate(view, heading_known=False)
+    fix = hurried.locate(view, heading_known=False)
+    assert isinstance(fix, Fix) and fix.evidence["candidates"] <= whole.evidence["candidates"]
 
 
 def test_threads_may_share_a_localizer(localizer, map_path):

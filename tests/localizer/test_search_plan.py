@@ -2,7 +2,10 @@
 
 import math
 
-from orthonav.localizer.plan import DEFAULT_PLAN
+import pytest
+
+from orthonav.localizer import plan
+from orthonav.localizer.plan import DEFAULT_PLAN, Budget
 from orthonav.register.registrar import Levels, PosePrior
 
 LEVELS = Levels(2, 1, 0)
@@ -35,3 +38,32 @@ def test_a_small_view_is_finished_where_it_is_judged():
         )
     )
     assert {each.candidates for each in searches} == {DEFAULT_PLAN.stage_candidates}
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that only moves when told, s."""
+    now = [100.0]
+    monkeypatch.setattr(plan.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_the_first_search_is_never_left_out(clock):
+    budget = Budget(5.0)
+    clock[0] += 1
+    assert budget.allows(1e6) and not budget.allows(1.0)
+
+
+def test_a_search_that_would_end_too_late_is_left_out(clock):
+    budget = Budget(100.0)
+    assert budget.allows(10.0)
+    clock[0] += 0.03  # three times as slow as estimated
+    assert not budget.allows(25.0)
+    assert budget.allows(20.0)
+
+
+def test_nothing_is_begun_after_the_budget_is_spent(clock):
+    budget = Budget(100.0)
+    assert budget.allows(10.0)
+    clock[0] += 0.2
+    assert not budget.allows(0.0)

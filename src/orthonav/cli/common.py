@@ -2,13 +2,20 @@
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
+
+if TYPE_CHECKING:
+    from orthonav.localizer.plan import SearchPlan
+
+MAX_THREADS = 64
 
 ROUTE_HELP = (
     "planned route: GeoJSON, CSV, KML or KMZ, GPX, WPML, a QGroundControl plan or a waypoint "
@@ -96,6 +103,37 @@ def add_dem(parser: argparse._ActionsContainer, effect: str) -> None:
         help="what its heights count from, where it does not state it: egm96, egm2008, msl, "
         "ellipsoid or EPSG:NUMBER of a vertical system",
     )
+
+
+def add_search(parser: argparse._ActionsContainer) -> None:
+    """Add `--budget-ms` and `--threads`."""
+    parser.add_argument(
+        "--budget-ms",
+        type=float,
+        metavar="MS",
+        help="begin no further search of a view that would end later than this after its first one "
+        "began (ms; default: no limit): the best place so far is the answer",
+    )
+    parser.add_argument(
+        "--threads",
+        type=int,
+        default=1,
+        metavar="N",
+        help="threads that share the search of a view (default 1); positions do not depend on them",
+    )
+
+
+def search_plan(options: argparse.Namespace) -> "SearchPlan":
+    """The plan of the search with `--budget-ms` and `--threads`; raises `VariantError`."""
+    from orthonav.errors import VariantError
+    from orthonav.localizer.plan import DEFAULT_PLAN
+
+    budget_ms = math.inf if options.budget_ms is None else options.budget_ms
+    if not budget_ms > 0:
+        raise VariantError(f"--budget-ms must be above 0, got {budget_ms:g}")
+    if not 1 <= options.threads <= MAX_THREADS:
+        raise VariantError(f"--threads must be 1 to {MAX_THREADS}, got {options.threads}")
+    return replace(DEFAULT_PLAN, budget_ms=budget_ms, threads=options.threads)
 
 
 def print_json(plain: Any) -> None:

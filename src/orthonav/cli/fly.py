@@ -6,6 +6,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from orthonav.cli.common import add_search
 from orthonav.cli.signed import add_signature
 
 EVERYDAY = (
@@ -331,6 +332,7 @@ def _add_flight(group: Any) -> None:
         metavar="MS",
         help="drop views that are older when their processing would start (default 500)",
     )
+    add_search(group)
     add_signature(group)
 
 

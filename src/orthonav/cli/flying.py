@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from orthonav.cli.common import search_plan
 from orthonav.cli.heights import map_heights
 from orthonav.cli.signed import checked_signature
 from orthonav.confidence.accept import Acceptance
@@ -64,7 +65,7 @@ def runner(options: argparse.Namespace, stopping: threading.Event, stack: ExitSt
     least = accept.threshold if accept.criterion == "confidence" else CONFIDENT
     mount = read_mount(options.mount) if options.mount else None
     camera = _camera(options)
-    localizer = Localizer(opened)
+    localizer = Localizer(opened, plan=search_plan(options))
     heading_known = options.heading == "known"
     tracker = Tracker(
         localizer, heading_known=heading_known, model=model_of(mount) if mount else None

@@ -13,7 +13,7 @@ from orthonav.cli.changed import (
     check_comparable,
     report_changes,
 )
-from orthonav.cli.common import print_json, progress
+from orthonav.cli.common import add_search, print_json, progress, search_plan
 from orthonav.cli.flown import compare_with_flight, take_flown
 from orthonav.cli.heights import dem_of, flight_heights, say_assumed_heights
 from orthonav.cli.needs import require_extras
@@ -96,6 +96,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "peak_ratio:1.3, or the paper's lowe_ratio:1.13 (with --registration off); the best guess "
         "of the other views is written too, marked",
     )
+    add_search(parser)
     parser.add_argument(
         "--skip-bad-images",
         action="store_true",
@@ -225,6 +226,7 @@ def _localizer(options: argparse.Namespace, opened: "MapFile", accept: "Acceptan
         opened,
         registration=options.registration == "on",
         position=check_rule(options.position),
+        plan=search_plan(options),
     )
     if made.registration is not None and accept.criterion == "lowe_ratio":
         raise VariantError("--accept lowe_ratio compares tiles: it needs --registration off")

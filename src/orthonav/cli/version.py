@@ -6,6 +6,7 @@ import json
 import os
 import platform
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -69,12 +70,14 @@ def _answer(extras: Sequence[str]) -> str:
 
 
 def _processor() -> dict[str, Any]:
-    """Architecture, cores that may be used, memory, and what OpenCV uses of the instruction set."""
+    """Architecture, cores that may be used, memory, what OpenCV uses of the instruction set, and
+    whether the kernel of registration was compiled."""
     return {
         "machine": platform.machine(),
         "cores": usable_cores(),
         "memory_mb": _memory_mb(),
         "features": _features(),
+        "kernel": find_spec("orthonav.register._kernel") is not None,
     }
 
 
@@ -109,6 +112,7 @@ def _text(plain: dict[str, Any]) -> str:
         f"platform    {plain['platform']}",
         f"processor   {processor['machine']}, {processor['cores']} cores, "
         f"{processor['memory_mb'] or '?'} MB of memory; {features}",
+        f"kernel      {'compiled' if processor['kernel'] else 'absent: registration is slower'}",
         "",
         f"{'core':<12}{_versions(plain['core'], [])}",
         *(

@@ -5,6 +5,7 @@ from dataclasses import replace
 from orthonav.errors import MapFileError
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.checks import check_view
+from orthonav.localizer.plan import DEFAULT_PLAN, SearchPlan
 from orthonav.localizer.registration import RegistrationLocalizer
 from orthonav.localizer.tiles import TileLocalizer
 from orthonav.mapfile.manifest import SheetInfo
@@ -31,6 +32,7 @@ class Localizer:
         position: PositionRule = "peak",
         flying: bool = True,
         level_ground: bool = False,
+        plan: SearchPlan = DEFAULT_PLAN,
     ) -> None:
         """Take an opened map; raises `MapFileError` if this program cannot fly it.
 
@@ -48,7 +50,7 @@ class Localizer:
         self.registration = None
         if registration:
             self.registration = RegistrationLocalizer.of_map(
-                opened, self.tiles.proposer(), level_ground=level_ground
+                opened, self.tiles.proposer(), plan, level_ground=level_ground
             )
 
     @property

@@ -18,6 +18,7 @@ This file decides; `registration` executes.
 """
 
 import math
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -52,13 +53,14 @@ class Search:
 
     `level`: level of the map at which candidates are found (those of tiles: refined first).
     `poses`: headings and log scales to try. `from_tiles`: by embeddings of tiles, else by FFT.
-    `candidates`: at most so many are taken.
+    `candidates`: at most so many are taken. `cost_ms`: its estimated cost.
     """
 
     level: int
     poses: list[Pose]
     from_tiles: bool
     candidates: int
+    cost_ms: float
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,11 @@ class SearchPlan:
     max_search_px: int = 8_000_000
     """Larger windows (some 300 MB) are not searched by FFT: on such a map views are found by
     tiles, or with a prior."""
+    budget_ms: float = math.inf
+    """No search after the first one is begun that would end later than this after the view came,
+    ms; the best place so far is the answer."""
+    threads: int = 1
+    """Threads that share the poses of a search and the candidates."""
     fft_pose_ms: float = 0.1
     """Estimated cost of one pose of an FFT search, whatever its size."""
     fft_pixel_ms: float = 5.5e-7
@@ -176,16 +183,18 @@ class SearchPlan:
                 if math.isinf(cost_ms) or (number and cost_ms > affordable):
                     break
                 count = self.tile_candidates if from_tiles else self.candidates
-                yield Search(levels.coarse, rough, from_tiles, count)
+                yield Search(levels.coarse, rough, from_tiles, count, cost_ms)
         if judged_ms <= max(self.last_ms, self.cheap_ms):
             for least, most in pairwise(self.stages_nats):
                 stage = [pose for pose, nats in fine if least < nats <= most]
                 if stage:
-                    yield Search(levels.look, stage, False, self.stage_candidates)
+                    cost_ms = fft_ms(levels.look, len(stage))
+                    yield Search(levels.look, stage, False, self.stage_candidates, cost_ms)
         final = self._poses(prior, self.final_turn_step_rad, self.final_scale_step)
-        if levels.final < levels.look and fft_ms(levels.final, len(final)) <= self.cheap_ms:
+        final_ms = fft_ms(levels.final, len(final))
+        if levels.final < levels.look and final_ms <= self.cheap_ms:
             poses = [pose for pose, _ in final]
-            yield Search(levels.final, poses, False, self.final_candidates)
+            yield Search(levels.final, poses, False, self.final_candidates, final_ms)
 
     def _poses(
         self, prior: PosePrior, turn_step_rad: float, scale_step: float
@@ -205,6 +214,24 @@ class SearchPlan:
         return sorted(
             (each for each in rated if each[1] <= self.max_nats), key=lambda each: each[1]
         )
+
+
+class Budget:
+    """Time that the searches of a view may take. Estimates are corrected by what they took."""
+
+    def __init__(self, budget_ms: float) -> None:
+        self._budget_ms, self._begun_s = budget_ms, time.monotonic()
+        self._estimated_ms: float | None = None
+
+    def allows(self, cost_ms: float) -> bool:
+        """Whether a search of an estimated cost would end in time; the first one always may."""
+        if self._estimated_ms is not None:
+            spent_ms = 1e3 * (time.monotonic() - self._begun_s)
+            pace = spent_ms / self._estimated_ms if self._estimated_ms else 0.0
+            if spent_ms + pace * cost_ms > self._budget_ms:
+                return False
+        self._estimated_ms = (self._estimated_ms or 0.0) + cost_ms
+        return True
 
 
 DEFAULT_PLAN = SearchPlan()

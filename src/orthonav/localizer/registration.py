@@ -8,7 +8,9 @@ of it, `tracker`, `orthonav.atlas` and `orthonav.check` use the place itself.
 import functools
 import math
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from types import MappingProxyType
 
 import numpy as np
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 
 from orthonav.confidence.registered import USUAL_CHANCES, Chances, RegisteredConfidence
 from orthonav.errors import MapFileError, VariantError
-from orthonav.localizer.plan import DEFAULT_PLAN, ClearMargin, Search, SearchPlan
+from orthonav.localizer.plan import DEFAULT_PLAN, Budget, ClearMargin, Search, SearchPlan
 from orthonav.localizer.prepared import PreparedView, prepare
 from orthonav.localizer.propose import TileProposer
 from orthonav.localizer.rectify import looks_aside, off_nadir_deg
@@ -77,7 +79,8 @@ class RegistrationLocalizer:
         `propose`, candidates come from searches by FFT only; without `terrain` the ground is level.
         """
         self.sheet, self.grid = sheet, sheet.grid
-        self.registrar = Registrar(Reference(layer))
+        self._pool = ThreadPoolExecutor(plan.threads) if plan.threads > 1 else None
+        self.registrar = Registrar(Reference(layer), self._pool)
         self.confidence, self.radius_m = confidence, radius_m
         self.propose, self.plan = propose, plan
         self.floor_px = floor_px
@@ -181,6 +184,7 @@ class RegistrationLocalizer:
         `ground`: the view on the ground of the map; None: made here.
         """
         ground = ground or self.on_ground(view)
+        budget = Budget(self.plan.budget_ms)
         judged: list[Placed] = []
         direct: list[Placed] = []
         best: Registered | None = None
@@ -192,12 +196,13 @@ class RegistrationLocalizer:
             )
 
         rows = functools.cache(lambda: self._rows_near(view, prior))
-        for each in self.plan.searches(
+        searches = self.plan.searches(
             view.levels,
             view.prior,
             lambda level, poses: self._fft_ms(view, prior, level, poses),
             lambda poses: self._tiles_ms(view, rows(), poses),
-        ):
+        )
+        for each in takewhile(lambda each: budget.allows(each.cost_ms), searches):
             if each.from_tiles and self.propose is not None:
                 found = self.propose.candidates(view.rectified_at(0), each.poses, rows(), self.plan)
             else:
@@ -220,7 +225,7 @@ class RegistrationLocalizer:
         if best is None or self.relief is not None:
             judged = ground.looked_again(judged)
             best = finished()
-        if view.levels.final == 0 or not self._is_doubtful(best):
+        if view.levels.final == 0 or not self._is_doubtful(best) or not budget.allows(0.0):
             return best
         return self.registrar.deepened(
             ground.templates_of, ground.finer, view.levels, best, view.prior
@@ -301,7 +306,7 @@ class RegistrationLocalizer:
             )
         template = view.templates.at(run.level, recipe)
         scales = view.prior.scale_map
-        found = search(template, window, run.poses, run.candidates, scales)
+        found = search(template, window, run.poses, run.candidates, scales, self._pool)
         least = self.plan.candidate_share
         worth = sum(each.score >= least * found[0].score for each in found)
         return found[: max(worth, self.plan.min_candidates)]

@@ -1,5 +1,6 @@
 """The part of the map under a view, sampled as the view's window shows it."""
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -43,24 +44,31 @@ class MapWindow:
         rows, cols = template.mask.shape
         height, width = rows + 2 * margins[0], cols + 2 * margins[1]
         unit = 2.0**template.level
-        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, height / 2]
-        at = pose.map_px(corners * unit) / unit
-        low, high = np.floor(at.min(axis=0)) - slack_px, np.ceil(at.max(axis=0)) + slack_px
-        col, row = int(low[0]), int(low[1])
-        size = (high - low).astype(int)
+        scale = math.exp(pose.log_scale) / 2
+        cos, sin = abs(scale * math.cos(pose.turn_rad)), abs(scale * math.sin(pose.turn_rad))
+        x, half_x = pose.x_px / unit, cos * width + sin * height
+        y, half_y = pose.y_px / unit, sin * width + cos * height
+        row, col = math.floor(y - half_y) - slack_px, math.floor(x - half_x) - slack_px
+        bottom, right = math.ceil(y + half_y) + slack_px, math.ceil(x + half_x) + slack_px
         made = reference.window(
-            template.level, row, col, int(size[1]), int(size[0]), template.recipe
+            template.level, row, col, bottom - row, right - col, template.recipe
         )
         return cls(made, row, col, unit, (height, width))
 
     def sample(self, pose: Pose, into: Array) -> None:
         """Evidence (H, W, 4) of the map as the window shows it under a pose."""
-        height, width = self.shape
-        linear = pose.linear
-        middle = np.array([pose.x_px, pose.y_px]) / self.unit - [self.col, self.row]
-        move = middle - linear @ [width / 2, height / 2]
-        # Pixel-is-area to pixel centres: source and target are both half a pixel off.
-        move = move + linear @ [0.5, 0.5] - 0.5
-        matrix = np.column_stack([linear, move])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        cv2.warpAffine(self.made, matrix, (width, height), dst=into, flags=flags)
+        matrix = np.reshape(self.matrix(pose), (2, 3))
+        cv2.warpAffine(self.made, matrix, self.shape[::-1], dst=into, flags=flags)
+
+    def matrix(self, pose: Pose) -> tuple[float, ...]:
+        """Numbers (6,) of the matrix (2, 3) from the window's pixels to those of `made` under a
+        pose, both counted from pixel centres, row by row."""
+        height, width = self.shape
+        scale = math.exp(pose.log_scale)
+        cos, sin = scale * math.cos(pose.turn_rad), scale * math.sin(pose.turn_rad)
+        # Pixel-is-area to pixel centres: source and target are both half a pixel off.
+        x, y = (width - 1) / 2, (height - 1) / 2
+        column = pose.x_px / self.unit - self.col - 0.5 - cos * x + sin * y
+        row = pose.y_px / self.unit - self.row - 0.5 - sin * x - cos * y
+        return cos, -sin, column, sin, cos, row

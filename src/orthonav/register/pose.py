@@ -1,6 +1,7 @@
 """The pose of a view on the map: a similarity, position, turn and scale."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,14 +39,15 @@ class Pose:
         """Map coordinates (..., 2) of points given from the middle of the window, level 0 px."""
         return np.asarray(from_middle_px @ self.linear.T + [self.x_px, self.y_px])
 
-    def stepped(self, step: Array) -> "Pose":
+    def stepped(self, step: Sequence[float]) -> "Pose":
         """This pose after the inverse of a small step (dx, dy, turn, log scale) of the window."""
-        moved = self.linear @ step[:2]
+        scale = math.exp(self.log_scale)
+        cos, sin = scale * math.cos(self.turn_rad), scale * math.sin(self.turn_rad)
         return Pose(
-            self.x_px - float(moved[0]),
-            self.y_px - float(moved[1]),
-            self.turn_rad - float(step[2]),
-            self.log_scale - float(step[3]),
+            self.x_px - (cos * step[0] - sin * step[1]),
+            self.y_px - (sin * step[0] + cos * step[1]),
+            self.turn_rad - step[2],
+            self.log_scale - step[3],
         )
 
 

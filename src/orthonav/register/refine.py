@@ -9,6 +9,7 @@ by blocks of the view, and the spread of those sums is what moves the peak.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -16,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.register.evidence import GROUPS
+from orthonav.register.kernel import KERNEL
 from orthonav.register.map_window import MapWindow
-from orthonav.register.memory import thread_memory
 from orthonav.register.pose import Pose, even_scale
 from orthonav.register.reference import Reference
-from orthonav.register.template import BLOCKS, Template, derivatives, turn_planes
+from orthonav.register.sums import FULLY_VALID, compared, sampled_planes
+from orthonav.register.template import BLOCKS, Template, derivatives
 
 Array = NDArray[np.float32]
 STEPS = 6
@@ -72,13 +74,18 @@ class Placed:
 
 
 class Refiner:
-    """Refines candidates of one view at one level. Not to be shared between threads."""
+    """Refines candidates of one view at one level."""
 
     def __init__(self, template: Template, reference: Reference) -> None:
         self.template, self.reference = template, reference
-        self._jacobian = [rows.reshape(4, -1) for rows in template.jacobian]
         self._reach_px = math.hypot(*template.mask.shape) / 2
-        self._scratch = _Scratch(template)
+
+    def prepare(self) -> None:
+        """Make what threads share, so that none makes it again."""
+        if KERNEL is None:
+            _ = self.template.self_slopes, self.template.hessians
+        else:
+            _ = self.template.numbers
 
     def place(
         self,
@@ -93,97 +100,120 @@ class Refiner:
         It ends where a step moves no part of the view by more than `small_step_px`.
         """
         window = MapWindow.of(self.template, self.reference, pose, SLACK_PX)
-        unit = np.array([2.0**self.template.level, 2.0**self.template.level, 1.0, 1.0])
-        converged, step = False, np.zeros(4)
-        seen = self._scratch.seen(window, pose)
-        best = seen.placed()
+        placed, step = self._refined(window, pose, steps, small_step_px)
+        if not with_covariance:
+            return placed
+        pixels = _Pixels(Comparison(self.template, window, placed.pose), window)
+        covariance = self._covariance(pixels)
+        if not placed.converged:
+            # Still moving: its last step is an error of its own.
+            covariance += np.outer(move := self._to_map(placed.pose) @ step, move)
+        return replace(
+            placed, covariance=covariance, agreement=pixels.agreement(), blocks_t=pixels.blocks_t()
+        )
+
+    def _refined(
+        self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
+    ) -> tuple[Placed, Sequence[float]]:
+        """The best pose of so many steps at most, and the last step (4,)."""
+        if KERNEL is None:
+            return self._refined_by_numpy(window, pose, steps, small_step_px)
+        template = self.template
+        limits = (
+            *(window.row, window.col, window.unit, steps, small_step_px),
+            *(MAX_STEP_PX, DAMPING, MIN_CORRELATION, WHOLE_OVERLAP),
+        )
+        at = (pose.x_px, pose.y_px, pose.turn_rad, pose.log_scale)
+        images = window.made, template.values, template.slopes
+        found, score, correlations, weighted, overlap, converged, step = KERNEL.refine(
+            *images, template.numbers, at, limits
+        )
+        numbers = score, correlations, weighted, overlap, bool(converged)
+        return Placed(Pose(*found), template.level, *numbers), step
+
+    def _refined_by_numpy(
+        self, window: MapWindow, pose: Pose, steps: int, small_step_px: float
+    ) -> tuple[Placed, Sequence[float]]:
+        """`_refined` without the kernel."""
+        unit = 2.0**self.template.level
+        converged, step = False, [0.0] * 4
+        seen = best = Comparison(self.template, window, pose)
         for _ in range(steps):
             step = self._step(seen)
             moves_px = self._moves_px(step)
-            step *= min(1.0, MAX_STEP_PX / max(moves_px, 1e-9))
-            seen = self._scratch.seen(window, seen.pose.stepped(step * unit))
+            share = min(1.0, MAX_STEP_PX / max(moves_px, 1e-9))
+            step = [share * each for each in step]
+            moved = seen.pose.stepped([unit * step[0], unit * step[1], *step[2:]])
+            seen = Comparison(self.template, window, moved)
             if seen.score > best.score:
-                best = seen.placed()
-            if moves_px < small_step_px:
-                converged = True
+                best = seen
+            converged = moves_px < small_step_px
+            if converged:
                 break
-        best = replace(best, converged=converged)
-        if not with_covariance:
-            return best
-        if seen.pose is not best.pose:
-            seen = self._scratch.seen(window, best.pose)
-        covariance = self._covariance(seen)
-        if not converged:
-            # Still moving: its last step is an error of its own.
-            covariance += np.outer(move := self._to_map(seen) @ step, move)
-        return replace(
-            best, covariance=covariance, agreement=seen.agreement(), blocks_t=seen.blocks_t()
-        )
+        return best.placed(converged), step
 
     def pulls(self, pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """What moves each block of the view over the map at `pose`: gradient (B * B, 2) of the
         score's decrease and curvature (B * B, 2, 2), by level-0 pixels of the map."""
         template = self.template
         window = MapWindow.of(template, self.reference, pose, SLACK_PX)
-        seen = self._scratch.seen(window, pose)
-        terms = np.einsum("cphw,chw->phw", template.jacobian[:, :2], seen.residual)
+        seen = Comparison(template, window, pose)
+        pixels = _Pixels(seen, window)
+        terms = np.einsum("cphw,chw->phw", template.jacobian[:, :2], pixels.residual)
         slopes = template.block_sums(terms).astype(np.float64).T
-        share = template.block_sums(seen.counts) / np.maximum(template.block_pixels, 1.0)
         each = np.tensordot(template.block_hessians, seen.squares, axes=([1], [0]))
         to_window = np.linalg.inv(pose.linear * 2.0**template.level)
-        curvature = to_window.T @ (share[:, None, None] * each[:, :2, :2]) @ to_window
+        curvature = to_window.T @ (seen.shares()[:, None, None] * each[:, :2, :2]) @ to_window
         # A step of the window moves what it shows the other way.
         return -slopes @ to_window, curvature
 
-    def _hessian(self, seen: "_Seen") -> NDArray[np.float64]:
+    def _hessian(self, seen: "Comparison") -> NDArray[np.float64]:
         """Gauss-Newton matrix (4, 4) over the part of the view that lies on the map."""
-        if seen.overlap > WHOLE_OVERLAP:
-            return np.asarray(np.tensordot(seen.squares, self.template.hessians, axes=1))
-        # Block by block: derivatives weigh alike within one.
-        share = self.template.block_sums(seen.counts) / np.maximum(self.template.block_pixels, 1.0)
-        each = np.tensordot(share, self.template.block_hessians, axes=1)
-        return np.asarray(np.tensordot(seen.squares, each, axes=1))
+        first, second = seen.squares
+        hessians = self.template.hessians
+        if seen.overlap <= WHOLE_OVERLAP:
+            # Block by block: derivatives weigh alike within one.
+            hessians = np.tensordot(seen.shares(), self.template.block_hessians, axes=1)
+        return np.asarray(first * hessians[0] + second * hessians[1])
 
-    def _observed_inverse(self, seen: "_Seen") -> NDArray[np.float64]:
+    def _observed_inverse(self, pixels: "_Pixels") -> NDArray[np.float64]:
         """Inverse (4, 4) of the view's derivatives times the map's.
 
         Noise and change have derivatives too: counted as if they held the view in place, they
         would make the position appear known along ground that runs in one direction.
         """
-        theirs = derivatives(seen.map, seen.counts).reshape(3, 4, -1)
+        seen, mine = pixels.seen, self.template.jacobian.reshape(3, 4, -1)
+        theirs = derivatives(pixels.map, pixels.counts).reshape(3, 4, -1)
         gains = np.repeat(seen.gains, [2, 1])
         observed = np.zeros((4, 4))
-        for gain, mine, other in zip(gains, self._jacobian, theirs, strict=True):
-            observed += gain * (mine @ other.T)
+        for gain, one, other in zip(gains, mine, theirs, strict=True):
+            observed += gain * (one @ other.T)
         return _bounded_inverse((observed + observed.T) / 2, self._hessian(seen))
 
-    def _step(self, seen: "_Seen") -> NDArray[np.float64]:
+    def _step(self, seen: "Comparison") -> list[float]:
         """Gauss-Newton step of the window: x, y (px of the level), turn, log scale."""
-        slope = sum(
-            rows @ part.reshape(-1)
-            for rows, part in zip(self._jacobian, seen.residual, strict=True)
-        )
         hessian = self._hessian(seen)
         hessian.flat[::5] *= 1 + DAMPING
         hessian.flat[::5] += 1e-12
-        return np.asarray(np.linalg.solve(hessian, np.asarray(slope, np.float64)))
+        found: list[float] = np.linalg.solve(hessian, seen.slope()).tolist()
+        return found
 
-    def _moves_px(self, step: NDArray[np.float64]) -> float:
-        return float(math.hypot(step[0], step[1]) + self._reach_px * math.hypot(step[2], step[3]))
+    def _moves_px(self, step: Sequence[float]) -> float:
+        return math.hypot(step[0], step[1]) + self._reach_px * math.hypot(step[2], step[3])
 
-    def _to_map(self, seen: "_Seen") -> NDArray[np.float64]:
+    def _to_map(self, pose: Pose) -> NDArray[np.float64]:
         """From steps of the window to position (level-0 px), turn and log scale: (4, 4)."""
         to_map = np.eye(4)
-        to_map[:2, :2] = seen.pose.linear * 2.0**self.template.level
+        to_map[:2, :2] = pose.linear * 2.0**self.template.level
         return to_map
 
-    def _covariance(self, seen: "_Seen") -> NDArray[np.float64]:
+    def _covariance(self, pixels: "_Pixels") -> NDArray[np.float64]:
         """Covariance (4, 4) of x, y (level-0 px), turn and log scale."""
-        terms = np.einsum("cphw,chw->phw", self.template.jacobian, seen.residual)
+        terms = np.einsum("cphw,chw->phw", self.template.jacobian, pixels.residual)
         sums = self.template.block_sums(terms).astype(np.float64)
         spread = sums @ sums.T * (BLOCKS**2 / (BLOCKS**2 - 4))
-        inverse = self._observed_inverse(seen)
-        to_map = self._to_map(seen)
+        inverse = self._observed_inverse(pixels)
+        to_map = self._to_map(pixels.seen.pose)
         return np.asarray(to_map @ inverse @ spread @ inverse @ to_map.T)
 
 
@@ -197,82 +227,80 @@ def _bounded_inverse(
     return np.asarray(inverse / np.outer(own, own))
 
 
-class _Scratch:
-    """Memory for one pose of a view, used again for every other: fresh pages would cost more than
-    the arithmetic. What `seen` returned before, from any refiner of the thread, is overwritten."""
+class Comparison:
+    """A view beside the map under one pose.
 
-    def __init__(self, template: Template) -> None:
-        self.template = template
-        planes = thread_memory("refine", 16 * template.mask.size).reshape(16, *template.mask.shape)
-        self.interleaved = planes[:4].reshape(*template.mask.shape, 4)
-        self.planes, self.turned = planes[4:8], planes[8:10]
-        self.residual, self.product, self.counts = planes[10:13], planes[13:16], planes[8]
-
-    def seen(self, window: MapWindow, pose: Pose) -> "_Seen":
-        """The view beside the map under a pose."""
-        window.sample(pose, self.interleaved)
-        turn_planes(self.interleaved, -pose.turn_rad, self.planes, self.turned)
-        return _Seen(self, pose)
-
-
-class _Seen:
-    """A template beside the map (4, H, W) under one pose.
-
-    `residual` (3, H, W): for each kind of evidence gain * map - correlation^2 * view, so that its
-    part of the step is what moves the peak, weighted by what that kind can say: steps from the
-    plain difference would fall short by the square of the correlation.
+    `correlations`, `squares` and `gains` by kind of evidence: the step is made of gain * map -
+    correlation^2 * view, so that its part of each kind is what moves the peak, weighted by what
+    that kind can say: steps from the plain difference would fall short by the square of the
+    correlation.
     """
 
-    def __init__(self, scratch: _Scratch, pose: Pose) -> None:
-        template = self._template = scratch.template
-        self.pose = pose
-        view, seen, valid = template.channels, scratch.planes[:3], scratch.planes[3]
-        counts = template.mask
-        if not (template.whole and valid.min() > 0.99):
-            counts = np.multiply(counts, valid > 0.99, out=scratch.counts)
-            seen *= counts
-        self.counts = counts
-        pixels = float(counts.sum())
+    def __init__(self, template: Template, window: MapWindow, pose: Pose) -> None:
+        self.template, self.pose = template, pose
+        self._sums = compared(template, window, pose)
+        pixels = template.pixels - float(self._sums.left_pixels.sum())
         self.overlap = pixels / max(template.pixels, 1.0)
-        if self.overlap < 0.9999:
-            view = np.multiply(view, counts, out=scratch.product)
-        self._view, self.map = view, seen
-        self.residual = scratch.residual
+        own = (template.energies - self._sums.left_energies).tolist()
         found, squares, gains = [], [], []
-        for group in GROUPS:
-            mine, theirs = view[group].reshape(-1), seen[group].reshape(-1)
-            product = float(mine @ theirs)
-            energy, own = float(theirs @ theirs), float(mine @ mine)
-            correlation = product / math.sqrt(energy * own) if energy * own > 0 else 0.0
+        for product, energy, mine in zip(
+            self._sums.products.tolist(), self._sums.energies.tolist(), own, strict=True
+        ):
+            correlation = product / math.sqrt(energy * mine) if energy * mine > 0 else 0.0
             square = max(correlation, MIN_CORRELATION) ** 2
-            gain = math.sqrt(square * own / energy) if energy > 0 else 0.0
-            for at in range(group.start, group.stop):
-                cv2.addWeighted(seen[at], gain, view[at], -square, 0, dst=self.residual[at])
             found.append(correlation)
-            gains.append(gain)
             squares.append(square)
-        self.correlations = tuple(found)
-        self.squares, self.gains = np.array(squares), np.array(gains)
-        total = float(np.dot(template.weights, found))
+            gains.append(math.sqrt(square * mine / energy) if energy > 0 else 0.0)
+        self.correlations, self.squares, self.gains = tuple(found), tuple(squares), tuple(gains)
+        total = sum(w * c for w, c in zip(template.weights, found, strict=True))
         self.weighted = total / sum(template.weights)
-        self.score = total * math.sqrt(pixels) * even_scale(pose.log_scale)
+        self.score = total * math.sqrt(max(pixels, 0.0)) * even_scale(pose.log_scale)
 
-    def placed(self) -> Placed:
+    def slope(self) -> NDArray[np.float64]:
+        """Derivatives (4,) of the score by the steps."""
+        own = self.template.self_slopes - self._sums.left_slopes
+        return np.asarray(self.gains @ self._sums.slopes - self.squares @ own)
+
+    def shares(self) -> NDArray[np.float64]:
+        """Share of each block of the view (B * B) that lies on valid map."""
+        pixels = self.template.block_pixels
+        return np.asarray((pixels - self._sums.left_pixels) / np.maximum(pixels, 1.0))
+
+    def placed(self, converged: bool) -> Placed:
         """The numbers of this pose."""
         return Placed(
             self.pose,
-            self._template.level,
+            self.template.level,
             self.score,
             self.correlations,
             self.weighted,
             self.overlap,
-            converged=False,
+            converged=converged,
         )
+
+
+class _Pixels:
+    """The pixels of a comparison: `map` (3, H, W) as the view's window shows it, `counts` (H, W), 1
+    where both are valid, and `residual` (3, H, W), gain * map - correlation^2 * view."""
+
+    def __init__(self, seen: Comparison, window: MapWindow) -> None:
+        self.seen, template = seen, seen.template
+        planes, valid = sampled_planes(template, window, seen.pose)
+        self.counts = template.mask * (valid > FULLY_VALID)
+        self.map = planes * self.counts
+        self._view = template.channels * self.counts
+        gains, squares = (np.repeat(each, [2, 1]) for each in (seen.gains, seen.squares))
+        self.residual = np.empty_like(self.map)
+        for at in range(len(self.map)):
+            cv2.addWeighted(
+                self.map[at], gains[at], self._view[at], -squares[at], 0, dst=self.residual[at]
+            )
 
     def agreement(self) -> float:
         """Share of the blocks of a view whose evidence correlates positively."""
-        sums = self._template.block_sums((self._view * self.map).sum(axis=0))
-        counts = self._template.block_sums(self.counts)
+        template = self.seen.template
+        sums = template.block_sums((self._view * self.map).sum(axis=0))
+        counts = template.block_sums(self.counts)
         used = counts > 0.25 * counts.max()
         return float((sums[used] > 0).mean()) if used.any() else 0.0
 
@@ -281,5 +309,5 @@ class _Seen:
         of their squares: large where many blocks agree, not a few strong ones."""
         gradients = GROUPS[0]
         products = (self._view[gradients] * self.map[gradients]).sum(axis=0)
-        sums = self._template.block_sums(products).astype(np.float64)
+        sums = self.seen.template.block_sums(products).astype(np.float64)
         return float(sums.sum() / max(math.sqrt(float(sums @ sums)), 1e-12))

@@ -7,7 +7,8 @@ its score over that of the strongest rival is the evidence.
 
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -187,8 +188,10 @@ class Registered:
 class Registrar:
     """Registers views on one sheet. Safe to share between threads."""
 
-    def __init__(self, reference: Reference) -> None:
+    def __init__(self, reference: Reference, pool: Executor | None = None) -> None:
+        """`pool`: threads that share the candidates; None: the caller's alone."""
         self.reference = reference
+        self._map: Callable[..., Iterable[Placed]] = pool.map if pool else map
         self._windows: dict[tuple[int, EvidenceRecipe, int], SearchWindow] = {}
         self._lock = threading.Lock()
 
@@ -276,7 +279,7 @@ class Registrar:
         self, refiner: Refiner, placed: list[Placed], prior: PosePrior, known: Sequence[Placed]
     ) -> list[Placed]:
         """Candidates refined at one level, best first; those without hope only a little."""
-        first = [refiner.place(each.pose, FIRST_STEPS, ROUGH_STEP_PX) for each in placed]
+        first = self._placed(refiner, placed, FIRST_STEPS)
         if not first:
             return []
         ranked = _ranked(first, prior)
@@ -285,8 +288,13 @@ class Registrar:
             least = HOPE * max(each.score - prior.cost(each.pose) for each in known)
             at_least = 1
         hopeful = _hopeful(ranked, prior, HOPE_AT_FIRST, at_least, least)
-        further = [refiner.place(each.pose, FULL_STEPS, ROUGH_STEP_PX) for each in hopeful]
+        further = self._placed(refiner, hopeful, FULL_STEPS)
         return _ranked(further + ranked[len(hopeful) :], prior)
+
+    def _placed(self, refiner: Refiner, found: Sequence[Placed], steps: int) -> list[Placed]:
+        """Candidates after so many steps at most, in their order."""
+        refiner.prepare()
+        return list(self._map(lambda each: refiner.place(each.pose, steps, ROUGH_STEP_PX), found))
 
     def finished(
         self,

@@ -8,6 +8,7 @@ scale, whereas correlation alone favours small views.
 """
 
 import math
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import cv2
@@ -25,6 +26,10 @@ from orthonav.register.template import Template, energy_of, turn_planes
 Array = NDArray[np.float32]
 ENERGY_FLOOR = 0.3
 """Share of the typical energy added to the local one, so that blank ground is not amplified."""
+
+
+POSES_AT_ONCE = 6
+"""Poses that a thread takes at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,29 +114,22 @@ def search(
     poses: list[tuple[float, float]],
     count: int,
     scales: ScaleMap | None = None,
+    pool: Executor | None = None,
 ) -> list[Candidate]:
     """The `count` best candidates, best first, not closer together than an eighth of the view.
 
-    With `scales` every place is compared under the scales that are expected there only.
+    With `scales` every place is compared under the scales that are expected there only. The threads
+    of `pool` share the poses; what comes out does not depend on them.
     """
-    expected = (
-        None
-        if scales is None
-        else scales.over(window.level, window.row, window.col, (window.height, window.width))
+    share = max(1, len(poses)) if pool is None else POSES_AT_ONCE
+    parts = [range(at, min(at + share, len(poses))) for at in range(0, len(poses), share)]
+    _ = template.interleaved  # made before threads ask for it
+    surfaces = (pool.map if pool else map)(
+        lambda part: _best_of(template, window, poses, part, scales), parts
     )
-    best = np.full((window.height, window.width), -np.inf, np.float32)
-    which = np.zeros(best.shape, np.int32)
-    numbers = np.empty(best.shape, np.int32)
-    scratch = _Scratch(window)
-    for number, (turn, log_scale) in enumerate(poses):
-        scores = scratch.scores(template, turn, log_scale)
-        if scores is None:
-            continue
+    best, which = next(surfaces)
+    for scores, numbers in surfaces:
         better = cv2.compare(scores, best, cv2.CMP_GT)
-        if scales is not None and expected is not None:
-            low, high = scales.reach(log_scale)
-            better = cv2.bitwise_and(better, cv2.inRange(expected, low, high))
-        numbers.fill(number)
         cv2.copyTo(scores, better, best)
         cv2.copyTo(numbers, better, which)
     if window.margin_px:
@@ -148,6 +146,35 @@ def search(
         pose = Pose((window.col + x) * unit, (window.row + y) * unit, turn, log_scale)
         found.append(Candidate(float(best[row, col]), pose))
     return found
+
+
+def _best_of(
+    template: Template,
+    window: SearchWindow,
+    poses: list[tuple[float, float]],
+    part: range,
+    scales: ScaleMap | None,
+) -> tuple[Array, NDArray[np.int32]]:
+    """The best score (H, W) of some of the poses at every place, and the number of its pose."""
+    shape = window.height, window.width
+    expected = None if scales is None else scales.over(window.level, window.row, window.col, shape)
+    best = np.full(shape, -np.inf, np.float32)
+    which = np.zeros(shape, np.int32)
+    numbers = np.empty(shape, np.int32)
+    scratch = _Scratch(window)
+    for number in part:
+        turn, log_scale = poses[number]
+        scores = scratch.scores(template, turn, log_scale)
+        if scores is None:
+            continue
+        better = cv2.compare(scores, best, cv2.CMP_GT)
+        if scales is not None and expected is not None:
+            low, high = scales.reach(log_scale)
+            better = cv2.bitwise_and(better, cv2.inRange(expected, low, high))
+        numbers.fill(number)
+        cv2.copyTo(scores, better, best)
+        cv2.copyTo(numbers, better, which)
+    return best, which
 
 
 class _Scratch:

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.register.evidence import FINE, GROUPS, EvidenceRecipe, evidence
+from orthonav.register.evidence import CHANNELS, FINE, GROUPS, EvidenceRecipe, evidence
+from orthonav.register.kernel import KERNEL
 
 Array = NDArray[np.float32]
 BLOCKS = 6
@@ -19,14 +20,12 @@ BLOCKS = 6
 class Template:
     """One view at one level.
 
-    `channels` (3, H, W): evidence, each kind scaled to the energy that its weight gives it; `mask`
-    (H, W) float32, 1 where it counts; `weights` of the kinds; `level` of the map whose ground
-    resolution it has.
+    `values` (H, W, 4): evidence, each kind scaled to the energy that its weight gives it, and 1
+    where it counts; `weights` of the kinds; `level` of the map whose ground resolution it has.
     """
 
     level: int
-    channels: Array
-    mask: Array
+    values: Array
     weights: tuple[float, ...]
     recipe: EvidenceRecipe
 
@@ -35,13 +34,27 @@ class Template:
         cls, grey: NDArray[np.uint8], valid: NDArray[np.bool_], level: int, recipe: EvidenceRecipe
     ) -> "Template":
         """The template of grey levels (H, W) at the ground resolution of `level`."""
-        made = np.ascontiguousarray(np.moveaxis(evidence(grey, valid, recipe), -1, 0))
-        channels, mask = made[:3], made[3]
-        weights = (1.0, recipe.grey_share)
+        made, weights = evidence(grey, valid, recipe), (1.0, recipe.grey_share)
+        gains = np.ones(CHANNELS, np.float32)
         for group, weight in zip(GROUPS, weights, strict=True):
-            energy = energy_of(channels[group])
-            channels[group] *= np.float32(math.sqrt(weight / energy) if energy > 0 else 0.0)
-        return cls(level, channels, mask, weights, recipe)
+            energy = float(np.square(made[..., group]).sum(dtype=np.float64))
+            gains[group] = math.sqrt(weight / energy) if energy > 0 else 0.0
+        made *= gains
+        return cls(level, made, weights, recipe)
+
+    @cached_property
+    def channels(self) -> Array:
+        """The evidence as planes (3, H, W)."""
+        return self._planes[:3]
+
+    @cached_property
+    def mask(self) -> Array:
+        """1 where the view counts (H, W) float32."""
+        return np.asarray(self._planes[3], np.float32)
+
+    @cached_property
+    def _planes(self) -> Array:
+        return np.ascontiguousarray(np.moveaxis(self.values, -1, 0))
 
     @cached_property
     def pixels(self) -> float:
@@ -55,8 +68,22 @@ class Template:
 
     @cached_property
     def interleaved(self) -> Array:
-        """The channels as (H, W, 3)."""
-        return np.ascontiguousarray(np.moveaxis(self.channels, 0, -1))
+        """The evidence as (H, W, 3)."""
+        return np.ascontiguousarray(self.values[..., :3])
+
+    @cached_property
+    def energies(self) -> NDArray[np.float64]:
+        """Sums of squares (G,) of the kinds of evidence."""
+        return np.array([energy_of(self.channels[group]) for group in GROUPS])
+
+    @cached_property
+    def slopes(self) -> Array:
+        """Derivatives of the evidence along x and y (H, W, 8), each of four numbers, the last 0."""
+        out = np.zeros((*self.mask.shape, 2 * CHANNELS), np.float32)
+        for at, (x, y) in ((0, (1, 0)), (CHANNELS, (0, 1))):
+            made = cv2.Sobel(self.interleaved, cv2.CV_32F, x, y, scale=1 / 8)
+            np.multiply(made, self.values[..., 3:], out=out[..., at : at + 3])
+        return out
 
     @cached_property
     def jacobian(self) -> Array:
@@ -69,11 +96,15 @@ class Template:
     @cached_property
     def hessians(self) -> NDArray[np.float64]:
         """Gauss-Newton matrices (G, 4, 4) of the steps, one for each kind of evidence."""
-        return _products(self.jacobian)
+        return np.asarray(self.block_hessians.sum(axis=0))
 
     @cached_property
     def block_hessians(self) -> NDArray[np.float64]:
         """What each block of the view (row by row) adds to `hessians`: (B * B, G, 4, 4)."""
+        if KERNEL is not None:
+            out = np.empty((BLOCKS**2, len(GROUPS), 4, 4))
+            KERNEL.curvatures(self.slopes, out.reshape(-1))
+            return out
         starts = zip(self.block_starts, self.mask.shape, strict=True)
         rows, cols = (np.append(first, side) for first, side in starts)
         return np.stack(
@@ -82,6 +113,23 @@ class Template:
                 for i, j in np.ndindex(BLOCKS, BLOCKS)
             ]
         )
+
+    @cached_property
+    def self_slopes(self) -> NDArray[np.float64]:
+        """Derivatives by the steps times the view itself (G, 4)."""
+        x, y = _from_middle(*self.mask.shape)
+        parts = self.slopes.reshape(*self.mask.shape, 2, CHANNELS) * self.values[:, :, None]
+        rows, by_x = parts.sum(axis=1), np.tensordot(x[0], parts, axes=(0, 1))
+        (dx, dy), (dx_x, dy_x) = rows.swapaxes(0, 1), by_x.swapaxes(0, 1)
+        each = np.array([dx, dy, dy_x - y * dx, dx_x + y * dy], np.float64).sum(axis=1)
+        return np.array([each[:, group].sum(axis=1) for group in GROUPS])
+
+    @cached_property
+    def numbers(self) -> NDArray[np.float64]:
+        """All numbers of the template that the kernel takes (`numbers_t` in `_kernel.c`)."""
+        parts = (self.pixels, self.energies, self.weights, self.self_slopes, self.hessians)
+        blocks = self.block_pixels, self.block_hessians
+        return np.concatenate([np.ravel(each).astype(np.float64) for each in (*parts, *blocks)])
 
     @cached_property
     def block_pixels(self) -> NDArray[np.float64]:

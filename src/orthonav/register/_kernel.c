@@ -1,0 +1,492 @@
+/* Refinement of a view on the map: the loop of orthonav.register.refine, compiled.
+ *
+ * `compare` samples the map's evidence as the view's window shows it, turns its edge directions,
+ * and adds up the products that a step needs, in one pass over the pixels. `refine` takes the steps.
+ * `curvatures` adds up the products of the view's derivatives. The Python modules do the same with
+ * NumPy; they are the oracle of this file and take its place where it was not compiled.
+ *
+ * Only the stable ABI of Python 3.11 is used: buffers in, buffers out, no NumPy at build time. */
+
+#define Py_LIMITED_API 0x030b0000
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+#include <limits.h>
+#include <math.h>
+#include <string.h>
+
+#define LANES 4         /* cosine and sine of the doubled direction, grey, valid or mask */
+#define BLOCKS 6        /* blocks along a side of a view: orthonav.register.template.BLOCKS */
+#define FULLY_VALID 0.99f
+#define OUTPUTS (22 + BLOCKS * BLOCKS)
+#define PER_BLOCK (2 * 4 * 4)
+#define CURVATURES (BLOCKS * BLOCKS * PER_BLOCK)
+#define CHUNK 128       /* pixels of a row whose taps are found together */
+#define LARGEST 32768   /* longest side, px */
+#define INLINE static inline __attribute__((always_inline)) /* for one processor alike */
+#define SHIFT 64        /* makes coordinates positive, so that truncation rounds down */
+
+typedef float lanes __attribute__((vector_size(16)));
+typedef float lanes_in_memory __attribute__((vector_size(16), aligned(4)));
+
+#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
+#define FOR_EVERY_PROCESSOR __attribute__((target_clones("arch=haswell", "default")))
+#else
+#define FOR_EVERY_PROCESSOR
+#endif
+
+typedef struct {
+    const float *first;     /* evidence (R, C, 4) */
+    Py_ssize_t stride;      /* floats from row to row */
+    int rows, cols;
+} window_t;
+
+typedef struct {
+    const float *view;      /* (H, W, 4): evidence of the view and its mask */
+    const float *slopes;    /* (H, W, 8): its derivatives along x, 0, along y, 0 */
+    int rows, cols;
+} template_t;
+
+typedef struct {
+    lanes product, energy;
+    lanes slope[2], slope_by_x[2];  /* along x and along y */
+} sums_t;
+
+typedef struct {
+    int offset[CHUNK];          /* of the upper left tap, floats from the first */
+    float right[CHUNK], below[CHUNK];
+} taps_t;
+
+INLINE float from_middle(int at, int side) { return (float)at + 0.5f - (float)side / 2.0f; }
+
+/* Block that a row or column belongs to: the first ones are floor(side * block / BLOCKS). */
+INLINE int block_of(int at, int side) { return ((at + 1) * BLOCKS - 1) / side; }
+
+INLINE lanes all(float value) { return (lanes){value, value, value, value}; }
+
+INLINE lanes load(const float *from) { return *(const lanes_in_memory *)from; }
+
+INLINE int below(float value) { return (int)(value + SHIFT) - SHIFT; }
+
+INLINE lanes tap(const window_t *window, int row, int col) {
+    if (row < 0 || col < 0 || row >= window->rows || col >= window->cols) return all(0.0f);
+    return load(window->first + row * window->stride + LANES * col);
+}
+
+/* Evidence at column x and row y, counted from pixel centres, bilinear; zero beyond the window. */
+INLINE lanes sampled(const window_t *window, float x, float y) {
+    if (!(x > -2.0f && y > -2.0f && x < (float)window->cols + 1.0f && y < (float)window->rows + 1.0f))
+        return all(0.0f);
+    const int col = below(x), row = below(y);
+    const lanes a = tap(window, row, col), b = tap(window, row, col + 1);
+    const lanes c = tap(window, row + 1, col), d = tap(window, row + 1, col + 1);
+    const float right = x - (float)col, down = y - (float)row;
+    const lanes top = a + right * (b - a), bottom = c + right * (d - c);
+    return top + down * (bottom - top);
+}
+
+/* The same where all four taps are inside. */
+INLINE lanes inside(const float *at, Py_ssize_t stride, float right, float down) {
+    const lanes upper = load(at), lower = load(at + stride);
+    const lanes next = load(at + LANES), last = load(at + stride + LANES);
+    const lanes left_side = upper + down * (lower - upper), right_side = next + down * (last - next);
+    return left_side + right * (right_side - left_side);
+}
+
+/* Taps of `count` pixels of a row from (x, y); whether all of them are inside the window. */
+INLINE int find_taps(const window_t *window, float x, float y, float dx, float dy, int count,
+                     taps_t *taps) {
+    const float end_x = x + dx * (float)(count - 1), end_y = y + dy * (float)(count - 1);
+    const float last_x = (float)window->cols - 1.001f, last_y = (float)window->rows - 1.001f;
+    if (!(x >= 0.001f && y >= 0.001f && end_x >= 0.001f && end_y >= 0.001f && x <= last_x &&
+          y <= last_y && end_x <= last_x && end_y <= last_y))
+        return 0;
+    const int stride = (int)window->stride;
+    for (int i = 0; i < count; i++) {
+        const float at_x = x + dx * (float)i, at_y = y + dy * (float)i;
+        const int col = (int)at_x, row = (int)at_y;
+        taps->offset[i] = row * stride + LANES * col;
+        taps->right[i] = at_x - (float)col;
+        taps->below[i] = at_y - (float)row;
+    }
+    return 1;
+}
+
+INLINE void add(sums_t *sum, const float *slopes, lanes mine, lanes other, lanes x) {
+    sum->product += mine * other;
+    sum->energy += other * other;
+    for (int axis = 0; axis < 2; axis++) {
+        const lanes step = load(slopes + LANES * axis) * other;
+        sum->slope[axis] += step;
+        sum->slope_by_x[axis] += x * step;
+    }
+}
+
+/* A row's products of derivatives along x and y, and of these times x, as those of steps along x, y,
+ * turn and log scale. */
+INLINE void add_row(double *out, const sums_t *sum, float y) {
+    for (int kind = 0; kind < 2; kind++, out += 4) {
+        double by[4];
+        for (int k = 0; k < 4; k++) {
+            const lanes from = k < 2 ? sum->slope[k] : sum->slope_by_x[k - 2];
+            by[k] = kind ? from[2] : (double)from[0] + from[1];
+        }
+        out[0] += by[0];
+        out[1] += by[1];
+        out[2] += by[3] - y * by[0];
+        out[3] += by[2] + y * by[1];
+    }
+}
+
+INLINE void add_kinds(double *out, lanes sum) {
+    out[0] += (double)sum[0] + sum[1];
+    out[1] += sum[2];
+}
+
+FOR_EVERY_PROCESSOR
+static void compare(const window_t *window, const template_t *view, const double matrix[6],
+                    float cosine, float sine, double *out) {
+    const lanes straight = {cosine, cosine, 1.0f, 1.0f}, crossed = {-sine, sine, 0.0f, 0.0f};
+    const float dx = (float)matrix[0], dy = (float)matrix[3];
+    const float *const made = window->first;
+    const Py_ssize_t stride = window->stride;
+    taps_t taps;
+    memset(out, 0, OUTPUTS * sizeof(double));
+    for (int row = 0; row < view->rows; row++) {
+        const float *values = view->view + (size_t)LANES * view->cols * row;
+        const float *slopes = view->slopes + (size_t)2 * LANES * view->cols * row;
+        const float down = from_middle(row, view->rows);
+        lanes x = all(from_middle(0, view->cols));
+        sums_t sum = {0}, left_out = {0};
+        for (int first = 0; first < view->cols; first += CHUNK) {
+            const int count = view->cols - first < CHUNK ? view->cols - first : CHUNK;
+            const float from_x = (float)(matrix[0] * first + matrix[1] * row + matrix[2]);
+            const float from_y = (float)(matrix[3] * first + matrix[4] * row + matrix[5]);
+            const int is_inside = find_taps(window, from_x, from_y, dx, dy, count, &taps);
+            for (int i = 0; i < count; i++, values += LANES, slopes += 2 * LANES, x += 1.0f) {
+                const lanes mine = load(values);
+                const lanes map =
+                    is_inside ? inside(made + taps.offset[i], stride, taps.right[i], taps.below[i])
+                              : sampled(window, from_x + dx * (float)i, from_y + dy * (float)i);
+                if (map[3] * mine[3] > FULLY_VALID) {
+                    const lanes other = {map[1], map[0], 0.0f, 0.0f};
+                    add(&sum, slopes, mine, map * straight + other * crossed, x);
+                } else if (mine[3] > 0.0f) {
+                    add(&left_out, slopes, mine, mine, x);
+                    out[22 + BLOCKS * block_of(row, view->rows) +
+                        block_of(first + i, view->cols)] += 1.0;
+                }
+            }
+        }
+        add_kinds(out, sum.product);
+        add_kinds(out + 2, sum.energy);
+        add_kinds(out + 4, left_out.energy);
+        add_row(out + 6, &sum, down);
+        add_row(out + 14, &left_out, down);
+    }
+}
+
+/* Products of the derivatives by each pair of steps, by block and kind of evidence. */
+FOR_EVERY_PROCESSOR
+static void curvatures(const float *slopes, int rows, int cols, double *out) {
+    memset(out, 0, CURVATURES * sizeof(double));
+    for (int row = 0; row < rows; row++) {
+        const float y = from_middle(row, rows);
+        double *row_of_blocks = out + (size_t)BLOCKS * block_of(row, rows) * PER_BLOCK;
+        for (int block = 0; block < BLOCKS; block++) {
+            const int last = cols * (block + 1) / BLOCKS;
+            lanes sum[10] = {0};
+            for (int col = cols * block / BLOCKS; col < last; col++, slopes += 2 * LANES) {
+                const float x = from_middle(col, cols);
+                const lanes dx = load(slopes), dy = load(slopes + LANES);
+                const lanes step[4] = {dx, dy, x * dy - y * dx, x * dx + y * dy};
+                for (int i = 0, k = 0; i < 4; i++)
+                    for (int j = i; j < 4; j++) sum[k++] += step[i] * step[j];
+            }
+            double *into = row_of_blocks + block * PER_BLOCK;
+            for (int i = 0, k = 0; i < 4; i++)
+                for (int j = i; j < 4; j++, k++) {
+                    const double first = (double)sum[k][0] + sum[k][1], second = sum[k][2];
+                    into[4 * i + j] += first;
+                    into[16 + 4 * i + j] += second;
+                    if (i == j) continue;
+                    into[4 * j + i] += first;
+                    into[16 + 4 * j + i] += second;
+                }
+        }
+    }
+}
+
+typedef struct {
+    double x, y, turn, log_scale;   /* level-0 px, rad */
+} pose_t;
+
+/* Numbers of a template; refine.py's `template_numbers` writes them in this order. */
+typedef struct {
+    double pixels, energies[2], weights[2], self_slopes[2][4], hessians[2][4][4];
+    double block_pixels[BLOCKS * BLOCKS], block_hessians[BLOCKS * BLOCKS][2][4][4];
+} numbers_t;
+#define NUMBERS ((Py_ssize_t)(sizeof(numbers_t) / sizeof(double)))
+
+/* Where the window's first pixel lies on its level, and the limits of refine.py. */
+typedef struct {
+    double row, col, unit, steps, small_step_px, max_step_px, damping, min_correlation,
+        whole_overlap;
+} limits_t;
+
+/* The best pose and what was seen there; the last step, scaled to its limit. */
+typedef struct {
+    pose_t pose;
+    double score, correlations[2], weighted, overlap, converged, step[4];
+} placed_t;
+
+typedef struct {
+    placed_t placed;
+    double sums[OUTPUTS], gains[2], squares[2];
+} seen_t;
+
+static void matrix_of(const pose_t *pose, const template_t *view, const limits_t *limits,
+                      double matrix[6]) {
+    const double scale = exp(pose->log_scale);
+    const double cosine = scale * cos(pose->turn), sine = scale * sin(pose->turn);
+    const double x = (view->cols - 1) / 2.0, y = (view->rows - 1) / 2.0;
+    matrix[0] = cosine, matrix[1] = -sine, matrix[3] = sine, matrix[4] = cosine;
+    matrix[2] = pose->x / limits->unit - limits->col - 0.5 - cosine * x + sine * y;
+    matrix[5] = pose->y / limits->unit - limits->row - 0.5 - sine * x - cosine * y;
+}
+
+/* As `Comparison` of refine.py. */
+static void look(const window_t *window, const template_t *view, const numbers_t *numbers,
+                 const limits_t *limits, const pose_t *pose, seen_t *seen) {
+    double matrix[6], total = 0.0, pixels = numbers->pixels;
+    const double turn = -pose->turn;
+    matrix_of(pose, view, limits, matrix);
+    compare(window, view, matrix, (float)cos(2 * turn), (float)sin(2 * turn), seen->sums);
+    for (int block = 0; block < BLOCKS * BLOCKS; block++) pixels -= seen->sums[22 + block];
+    for (int kind = 0; kind < 2; kind++) {
+        const double energy = seen->sums[2 + kind];
+        const double own = numbers->energies[kind] - seen->sums[4 + kind];
+        const double found =
+            energy * own > 0 ? seen->sums[kind] / sqrt(energy * own) : 0.0;
+        const double bounded = fmax(found, limits->min_correlation);
+        seen->placed.correlations[kind] = found;
+        seen->squares[kind] = bounded * bounded;
+        seen->gains[kind] = energy > 0 ? sqrt(bounded * bounded * own / energy) : 0.0;
+        total += numbers->weights[kind] * found;
+    }
+    seen->placed.pose = *pose;
+    seen->placed.overlap = pixels / fmax(numbers->pixels, 1.0);
+    seen->placed.weighted = total / (numbers->weights[0] + numbers->weights[1]);
+    seen->placed.score = total * sqrt(fmax(pixels, 0.0)) * exp(pose->log_scale / 2);
+}
+
+/* Gauss-Newton matrix over the part of the view that lies on the map. */
+static void hessian_of(const seen_t *seen, const numbers_t *numbers, const limits_t *limits,
+                       double out[4][4]) {
+    memset(out, 0, 16 * sizeof(double));
+    const int whole = seen->placed.overlap > limits->whole_overlap;
+    for (int block = 0; block < (whole ? 1 : BLOCKS * BLOCKS); block++) {
+        const double pixels = numbers->block_pixels[block];
+        const double share = whole ? 1.0 : (pixels - seen->sums[22 + block]) / fmax(pixels, 1.0);
+        const double(*from)[4][4] = whole ? numbers->hessians : numbers->block_hessians[block];
+        for (int i = 0; i < 4; i++)
+            for (int j = 0; j < 4; j++)
+                out[i][j] += share * (seen->squares[0] * from[0][i][j] +
+                                      seen->squares[1] * from[1][i][j]);
+    }
+}
+
+/* Solve for a step by elimination with pivots; the matrix and the right side are overwritten. */
+static void solve(double matrix[4][4], double right[4]) {
+    for (int k = 0; k < 4; k++) {
+        int pivot = k;
+        for (int i = k + 1; i < 4; i++)
+            if (fabs(matrix[i][k]) > fabs(matrix[pivot][k])) pivot = i;
+        for (int j = 0; j < 4; j++) {
+            const double kept = matrix[k][j];
+            matrix[k][j] = matrix[pivot][j], matrix[pivot][j] = kept;
+        }
+        const double kept = right[k];
+        right[k] = right[pivot], right[pivot] = kept;
+        for (int i = k + 1; i < 4; i++) {
+            const double factor = matrix[i][k] / matrix[k][k];
+            for (int j = k; j < 4; j++) matrix[i][j] -= factor * matrix[k][j];
+            right[i] -= factor * right[k];
+        }
+    }
+    for (int k = 3; k >= 0; k--) {
+        for (int j = k + 1; j < 4; j++) right[k] -= matrix[k][j] * right[j];
+        right[k] /= matrix[k][k];
+    }
+}
+
+static void step_of(const seen_t *seen, const numbers_t *numbers, const limits_t *limits,
+                    double step[4]) {
+    double hessian[4][4];
+    hessian_of(seen, numbers, limits, hessian);
+    for (int i = 0; i < 4; i++) {
+        hessian[i][i] = hessian[i][i] * (1 + limits->damping) + 1e-12;
+        step[i] = 0.0;
+        for (int kind = 0; kind < 2; kind++) {
+            const double own = numbers->self_slopes[kind][i] - seen->sums[14 + 4 * kind + i];
+            step[i] += seen->gains[kind] * seen->sums[6 + 4 * kind + i] - seen->squares[kind] * own;
+        }
+    }
+    solve(hessian, step);
+}
+
+/* As `Refiner.place` of refine.py. */
+static void refine(const window_t *window, const template_t *view, const numbers_t *numbers,
+                   const limits_t *limits, placed_t *best) {
+    const double reach_px = hypot(view->rows, view->cols) / 2;
+    seen_t seen;
+    double step[4] = {0}, converged = 0.0;
+    look(window, view, numbers, limits, &best->pose, &seen);
+    *best = seen.placed;
+    for (int count = 0; count < (int)limits->steps && converged == 0.0; count++) {
+        step_of(&seen, numbers, limits, step);
+        const double moves_px = hypot(step[0], step[1]) + reach_px * hypot(step[2], step[3]);
+        const double share = fmin(1.0, limits->max_step_px / fmax(moves_px, 1e-9));
+        for (int i = 0; i < 4; i++) step[i] *= share;
+        pose_t pose = seen.placed.pose;
+        const double scale = limits->unit * exp(pose.log_scale);
+        const double cosine = scale * cos(pose.turn), sine = scale * sin(pose.turn);
+        pose.x -= cosine * step[0] - sine * step[1];
+        pose.y -= sine * step[0] + cosine * step[1];
+        pose.turn -= step[2];
+        pose.log_scale -= step[3];
+        look(window, view, numbers, limits, &pose, &seen);
+        if (seen.placed.score > best->score) *best = seen.placed;
+        converged = moves_px < limits->small_step_px;
+    }
+    best->converged = converged;
+    memcpy(best->step, step, sizeof step);
+}
+
+/* Borrow a buffer of float32 or float64 with so many dimensions, each pixel's numbers together. */
+static int borrow(PyObject *from, Py_buffer *into, int dimensions, Py_ssize_t last, char kind,
+                  int flags) {
+    if (PyObject_GetBuffer(from, into, PyBUF_STRIDES | PyBUF_FORMAT | flags) < 0) return -1;
+    const Py_ssize_t size = kind == 'f' ? 4 : 8;
+    int good = into->ndim == dimensions && into->itemsize == size && into->format &&
+               into->format[0] == kind && into->shape[dimensions - 1] == last &&
+               into->strides[dimensions - 1] == size;
+    if (good && dimensions == 3) good = into->strides[1] == last * size && into->strides[0] >= 0;
+    if (good) return 0;
+    PyErr_Format(PyExc_ValueError, "expected %d dimensions of '%c', the last of %zd", dimensions,
+                 kind, last);
+    PyBuffer_Release(into);
+    return -1;
+}
+
+static int is_whole(const Py_buffer *buffer) {
+    return buffer->strides[0] == buffer->shape[1] * buffer->strides[1];
+}
+
+/* Buffers of a window and of a template, as C sees them. */
+typedef struct {
+    Py_buffer made, view, slopes;
+    window_t window;
+    template_t template;
+} images_t;
+
+static void give_back(images_t *images) {
+    PyBuffer_Release(&images->slopes);
+    PyBuffer_Release(&images->view);
+    PyBuffer_Release(&images->made);
+}
+
+static int borrow_images(PyObject *const from[3], images_t *images) {
+    if (borrow(from[0], &images->made, 3, LANES, 'f', 0) < 0) return -1;
+    if (borrow(from[1], &images->view, 3, LANES, 'f', 0) < 0) {
+        PyBuffer_Release(&images->made);
+        return -1;
+    }
+    if (borrow(from[2], &images->slopes, 3, 2 * LANES, 'f', 0) < 0) {
+        PyBuffer_Release(&images->view);
+        PyBuffer_Release(&images->made);
+        return -1;
+    }
+    const Py_buffer *made = &images->made, *view = &images->view, *slopes = &images->slopes;
+    if (is_whole(view) && is_whole(slopes) && view->shape[0] == slopes->shape[0] &&
+        view->shape[1] == slopes->shape[1] && view->shape[0] <= LARGEST &&
+        view->shape[1] <= LARGEST && made->shape[1] <= LARGEST &&
+        made->strides[0] % 4 == 0 && made->shape[0] * (made->strides[0] / 4) <= INT_MAX) {
+        images->window = (window_t){made->buf, made->strides[0] / 4, (int)made->shape[0],
+                                    (int)made->shape[1]};
+        images->template = (template_t){view->buf, slopes->buf, (int)view->shape[0],
+                                        (int)view->shape[1]};
+        return 0;
+    }
+    PyErr_SetString(PyExc_ValueError, "view and slopes must be contiguous and of one shape, and no "
+                                      "side longer than 32768");
+    give_back(images);
+    return -1;
+}
+
+static PyObject *py_refine(PyObject *self, PyObject *arguments) {
+    PyObject *from[3], *number_list;
+    images_t images;
+    Py_buffer numbers;
+    limits_t limits;
+    placed_t best;
+    double *l = (double *)&limits;
+    (void)self;
+    if (!PyArg_ParseTuple(arguments, "OOOO(dddd)(ddddddddd)", &from[0], &from[1], &from[2],
+                          &number_list, &best.pose.x, &best.pose.y, &best.pose.turn,
+                          &best.pose.log_scale, &l[0], &l[1], &l[2], &l[3], &l[4], &l[5], &l[6],
+                          &l[7], &l[8]))
+        return NULL;
+    if (borrow_images(from, &images) < 0) return NULL;
+    if (borrow(number_list, &numbers, 1, NUMBERS, 'd', 0) < 0) {
+        give_back(&images);
+        return NULL;
+    }
+    Py_BEGIN_ALLOW_THREADS
+    refine(&images.window, &images.template, numbers.buf, &limits, &best);
+    Py_END_ALLOW_THREADS
+    PyBuffer_Release(&numbers);
+    give_back(&images);
+    return Py_BuildValue("(dddd)d(dd)dddN", best.pose.x, best.pose.y, best.pose.turn,
+                         best.pose.log_scale, best.score, best.correlations[0],
+                         best.correlations[1], best.weighted, best.overlap, best.converged,
+                         Py_BuildValue("(dddd)", best.step[0], best.step[1], best.step[2],
+                                       best.step[3]));
+}
+
+static PyObject *py_curvatures(PyObject *self, PyObject *arguments) {
+    PyObject *from, *to;
+    Py_buffer slopes, out;
+    (void)self;
+    if (!PyArg_ParseTuple(arguments, "OO", &from, &to)) return NULL;
+    if (borrow(from, &slopes, 3, 2 * LANES, 'f', 0) < 0) return NULL;
+    if (borrow(to, &out, 1, CURVATURES, 'd', PyBUF_WRITABLE) < 0) {
+        PyBuffer_Release(&slopes);
+        return NULL;
+    }
+    const int fits = is_whole(&slopes) && slopes.shape[0] <= LARGEST && slopes.shape[1] <= LARGEST;
+    if (fits) {
+        Py_BEGIN_ALLOW_THREADS
+        curvatures(slopes.buf, (int)slopes.shape[0], (int)slopes.shape[1], out.buf);
+        Py_END_ALLOW_THREADS
+    } else {
+        PyErr_SetString(PyExc_ValueError, "slopes must be contiguous, with sides up to 32768");
+    }
+    PyBuffer_Release(&out);
+    PyBuffer_Release(&slopes);
+    return fits ? Py_NewRef(Py_None) : NULL;
+}
+
+static PyMethodDef functions[] = {
+    {"refine", py_refine, METH_VARARGS,
+     "refine(window, view, slopes, numbers, pose, limits): see orthonav.register.refine."},
+    {"curvatures", py_curvatures, METH_VARARGS,
+     "curvatures(slopes, out): see orthonav.register.sums."},
+    {NULL, NULL, 0, NULL},
+};
+
+static struct PyModuleDef module = {
+    PyModuleDef_HEAD_INIT, "_kernel", "Comparison of a view with the map.", 0, functions,
+    NULL, NULL, NULL, NULL,
+};
+
+PyMODINIT_FUNC PyInit__kernel(void) { return PyModule_Create(&module); }

@@ -1,0 +1,115 @@
+"""The compiled kernel does what NumPy does."""
+
+import math
+
+import numpy as np
+import pytest
+from scenes import Ground, apart_px, random_poses, reference_of, templates_of, turned_rad
+
+from orthonav.register import refine, template
+from orthonav.register.kernel import KERNEL
+from orthonav.register.pose import Pose
+from orthonav.register.refine import Refiner
+
+SHAPE = (256, 320)
+GROUND = Ground()
+needs_kernel = pytest.mark.skipif(KERNEL is None, reason="the kernel was not compiled")
+
+
+@pytest.fixture(scope="module")
+def reference():
+    """A map with a hole."""
+    valid = np.ones(SHAPE, bool)
+    valid[100:130, 60:150] = False
+    return reference_of(GROUND, SHAPE, valid)
+
+
+def both(monkeypatch, work):
+    """What `work` makes with the kernel, and without it."""
+    compiled = work()
+    for module in (refine, template):
+        monkeypatch.setattr(module, "KERNEL", None)
+    return compiled, work()
+
+
+def views(count, seed, level, view_valid=None):
+    """Templates of views all over the map and beyond its border, each with a pose nearby."""
+    for pose in random_poses(count, SHAPE, 10, seed=seed, log_scale=0.15):
+        made = templates_of(GROUND, pose, (96, 128), view_valid).at(level)
+        yield made, Pose(pose.x_px + 2, pose.y_px - 1, pose.turn_rad + 0.03, pose.log_scale - 0.02)
+
+
+@needs_kernel
+@pytest.mark.parametrize("level", [0, 1])
+@pytest.mark.parametrize("whole", [True, False])
+def test_steps_lead_to_the_same_place(reference, monkeypatch, level, whole):
+    view_valid = np.ones((96, 128), bool)
+    view_valid[:40, 90:] = whole
+
+    def work():
+        found = []
+        for made, near in views(25, 5, level, view_valid):
+            fresh = template.Template(made.level, made.values, made.weights, made.recipe)
+            found.append(Refiner(fresh, reference).place(near, with_covariance=True))
+        return found
+
+    for one, other in zip(*both(monkeypatch, work), strict=True):
+        assert apart_px(one.pose, other.pose) < 0.05
+        assert abs(turned_rad(one.pose, other.pose)) < 2e-3
+        assert one.pose.log_scale == pytest.approx(other.pose.log_scale, abs=2e-3)
+        assert one.score == pytest.approx(other.score, rel=5e-3, abs=0.02)
+        assert one.correlations == pytest.approx(other.correlations, abs=5e-3)
+        assert one.overlap == pytest.approx(other.overlap, abs=5e-3)
+        assert one.covariance == pytest.approx(other.covariance, rel=0.1, abs=1e-4)
+
+
+@needs_kernel
+def test_curvatures_are_the_same(monkeypatch):
+    made, _ = next(views(1, 3, 0))
+
+    def work():
+        fresh = template.Template(made.level, made.values, made.weights, made.recipe)
+        return fresh.block_hessians, fresh.hessians
+
+    compiled, plain = both(monkeypatch, work)
+    for one, other in zip(compiled, plain, strict=True):
+        assert one == pytest.approx(other, rel=1e-4, abs=1e-6 * np.abs(other).max())
+
+
+def test_without_a_compiler_views_are_placed_too(reference, monkeypatch):
+    monkeypatch.setattr(refine, "KERNEL", None)
+    monkeypatch.setattr(template, "KERNEL", None)
+    pose = Pose(220.0, 150.0, 0.7, 0.05)
+    near = Pose(222.0, 149.0, 0.73, 0.03)
+    placed = Refiner(templates_of(GROUND, pose).at(0), reference).place(near)
+    assert placed.converged and math.hypot(placed.pose.x_px - 220, placed.pose.y_px - 150) < 0.05
+
+
+@needs_kernel
+@pytest.mark.parametrize("pose", [(1e9, 0, 0, 0), (math.nan, 0, 0, 0), (0, 0, 0, 80.0)])
+def test_a_pose_beyond_all_bounds_touches_no_memory(pose):
+    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(0)
+    window = np.ones((20, 30, 4), np.float32)
+    limits = (0, 0, 1, 3, 0.01, 3.0, 1e-3, 0.08, 0.97)
+    found = KERNEL.refine(window, made.values, made.slopes, made.numbers, pose, limits)
+    assert found[1] == 0 or math.isnan(found[1])
+
+
+@needs_kernel
+@pytest.mark.parametrize("damage", ["type", "channels", "shape", "numbers", "strided"])
+def test_other_arrays_are_refused(damage):
+    made = templates_of(GROUND, Pose(150, 120, 0, 0)).at(0)
+    window, view = np.ones((20, 30, 4), np.float32), made.values
+    slopes, numbers = made.slopes, made.numbers
+    if damage == "type":
+        window = window.astype(np.float64)
+    elif damage == "channels":
+        window = window[..., :3]
+    elif damage == "shape":
+        slopes = slopes[:-1]
+    elif damage == "numbers":
+        numbers = numbers[:-1]
+    else:
+        view = view[:, ::2]
+    with pytest.raises(ValueError, match=r"expected|contiguous"):
+        KERNEL.refine(window, view, slopes, numbers, (0, 0, 0, 0), (0,) * 9)
