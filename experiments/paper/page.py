@@ -33,7 +33,7 @@ def page(rows: Sequence[Result], others: Sequence[Result] = ()) -> str:
     text.append(agreement().markdown())
     if others:
         text.append("## Other trainings\n")
-        text.append(trainings([*others, *rows]).markdown())
+        text.append(trainings(others, rows).markdown())
     if names := missing(rows):
         lines = "\n".join(f"- `{name}`" for name in names)
         text.append(f"## Rows of the reduced setting without a stored result\n\n{lines}\n")

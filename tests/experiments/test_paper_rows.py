@@ -153,17 +153,17 @@ def test_rows_above_the_default_are_named():
     assert above_default([canny]) == []
 
 
-def test_trainings_are_compared_where_the_setting_was_chosen():
+def test_trainings_are_compared_on_scenes_with_another_one():
     made = row()
     made.plain["rules"] = {"grid": {"cosine best": [3, 4]}}
     other = Result(made.plain | {"method": made.plain["method"] | {"recipe": "autoencoder"}})
     elsewhere = Result(made.plain | {"scene": "D"})
-    rows = trainings([made, other, elsewhere]).rows
-    assert [each[:4] for each in rows] == [
-        ["Canny", str(REDUCED.encoder_batch), f"{REDUCED.encoder_rate:g}", "18,800"],
-        ["Canny", "32", "0.0003", "188,000"],
+    rows = trainings([other], [made, elsewhere, other]).rows
+    assert [each[:5] for each in rows] == [
+        ["B", "Canny", "32", "0.0003", "188,000"],
+        ["B", "Canny", str(REDUCED.encoder_batch), f"{REDUCED.encoder_rate:g}", "18,800"],
     ]
-    assert rows[0][6] == "75"
+    assert rows[1][7] == "75"
 
 
 def test_a_row_is_not_older_for_the_training_of_another_method():
