@@ -33,6 +33,8 @@ from orthonav.files import write_text
 ROOT = Path(__file__).resolve().parents[2]
 ROWS = Path(__file__).resolve().parent / "rows"
 BASELINES, FIELD = "baselines", "field"
+TRIED = "tried"
+"""Folder of rows of another training than a setting's, from which the setting was chosen."""
 DIGITS = 5
 """Significant digits of figures in a row: a confidence to 1e-5, an error of 9 km to 0.1 m."""
 
@@ -82,6 +84,8 @@ EDGES = {
     SAM: ("src/orthonav/neural/sam.py",),
     LEARNT: ("src/orthonav/represent/learned.py", "experiments/paper/between_dates.onnx"),
 }
+PART_OF = {"encoder_": ("autoencoder", "caevl"), "triplet_": ("triplet",), "words": ("bovw",)}
+"""Which families a part of a setting decides, by the beginning of its name; others decide all."""
 REGISTRATION = (
     "src/orthonav/confidence/*.py",
     "src/orthonav/localizer/*.py",
@@ -148,7 +152,9 @@ def older(row: Result) -> list[str]:
         now = code_of_field((Method(**each) for each in plain["methods"]), row.scene)
     changed = sorted(path for path in known.keys() | now if known.get(path) != now.get(path))
     setting = SETTINGS[plain["setting"]["name"]]
-    if plain["setting"] != json.loads(json.dumps(asdict(setting))):
+    families = {each["family"] for each in plain.get("methods", ())} | {row.family}
+    today = json.loads(json.dumps(asdict(setting)))
+    if _relevant(plain["setting"], families) != _relevant(today, families):
         changed.append("setting")
     if made is not None:
         rows = methods(setting, row.scene, plain["tiles"], sam_weights="PATH")
@@ -157,6 +163,12 @@ def older(row: Result) -> list[str]:
         }:
             changed.append("recipe")
     return changed
+
+
+def _relevant(setting: dict[str, Any], families: set[str]) -> dict[str, Any]:
+    """What of a setting decides the figures of rows of these families."""
+    others = [part for part, users in PART_OF.items() if not families & set(users)]
+    return {name: value for name, value in setting.items() if not name.startswith(tuple(others))}
 
 
 def _plain(recipe: str) -> str:
@@ -176,11 +188,21 @@ def stored() -> list[Result]:
     return [row for name in SETTINGS for row in read(ROWS / name)]
 
 
-def keep(results: Path, setting: str) -> list[str]:
-    """Copy the results of a setting into the repository; the names of the rows that changed."""
+def tried() -> list[Result]:
+    """Rows of trainings from which the reduced setting was chosen, and of longer ones."""
+    return read(ROWS / TRIED)
+
+
+def keep(results: Path, setting: str, name: str | None = None) -> list[str]:
+    """Copy the results of a setting into the repository; the names of the rows that changed.
+
+    With a name they are kept as rows of another training, beside those of the setting.
+    """
     changed = []
     for path in sorted((results / setting).glob("*.json")):
         target = ROWS / setting / path.name
+        if name is not None:
+            target = ROWS / TRIED / f"{path.stem}-{name}.json"
         text = path.read_text(encoding="utf-8")
         if not target.is_file() or target.read_text(encoding="utf-8") != text:
             target.parent.mkdir(parents=True, exist_ok=True)
