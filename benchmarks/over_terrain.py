@@ -1,9 +1,10 @@
 """Views of relief, placed on level ground and on the terrain of the map.
 
 `python -m benchmarks.over_terrain [--views 30] [--only GROUP ..] [--work DIR]` drapes imagery of
-another date over generated hills, renders true perspective views of it (`benchmarks.relief_views`),
-and prints what of them is placed without and with the terrain, by wrong terrains, and far off
-nadir. Imagery is generated; with optional real imagery beside the checkout its rows use that.
+another date over generated hills, renders true perspective views of it
+(`orthonav.simulate.perspective`), and prints what of them is placed without and with the terrain,
+by wrong terrains, and far off nadir. Imagery is generated; with optional real imagery beside the
+checkout its rows use that.
 """
 
 import argparse
@@ -25,7 +26,6 @@ from numpy.typing import ArrayLike, NDArray
 from rasterio.windows import Window
 
 from benchmarks.inputs import DATA
-from benchmarks.relief_views import Raster, random_relief, seen_view
 from orthonav.cli.heights import map_heights
 from orthonav.geo.camera import Camera, enu_from_camera
 from orthonav.geo.frames import LocalFrame
@@ -36,6 +36,7 @@ from orthonav.mapfile import MapFile, open_map
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import CONFIDENT, Fix, NoFix, Telemetry, View
 from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
+from orthonav.simulate.perspective import Raster, random_relief, seen_view
 
 GROUPS = ("slopes", "wrong", "oblique")
 HEADER = (
