@@ -85,11 +85,10 @@ def rays_enu(camera: Camera, attitude_deg: tuple[float, float, float], finer: in
 
 def met(heights: Raster, rays: Array, position_m: Array) -> Array:
     """Ground points (H, W, 3) where rays first meet the ground; NaN where they do not."""
-    low, high = float(heights.values.min()), float(heights.values.max())
     flat = rays.reshape(-1, 3)
     along = np.hypot(flat[:, 0], flat[:, 1])
-    with np.errstate(divide="ignore"):
-        down = np.where(flat[:, 2] < -1e-6, -flat[:, 2], np.nan)
+    down = np.where(flat[:, 2] < -1e-6, -flat[:, 2], np.nan)
+    low, high = _between(heights, position_m, flat, down)
     near = np.maximum((position_m[2] - high - 0.1) / down, 0.0)
     far = (position_m[2] - low + 0.1) / down
     with np.errstate(invalid="ignore"):
@@ -120,6 +119,23 @@ def met(heights: Raster, rays: Array, position_m: Array) -> Array:
     points = np.full(flat.shape, np.nan)
     points[hits] = position_m + ((first + last) / 2)[:, None] * there
     return np.asarray(points.reshape(rays.shape))
+
+
+def _between(heights: Raster, position_m: Array, rays: Array, down: Array) -> tuple[float, float]:
+    """Least and greatest height of the box in which rays (N, 3) can meet the ground."""
+    low = float(heights.values.min())
+    if not np.isfinite(down).any():
+        return low, low
+    far = position_m[:2] + rays[:, :2] * ((position_m[2] - low + 0.1) / down)[:, None]
+    corners = np.vstack([position_m[None, :2], np.nanmin(far, axis=0), np.nanmax(far, axis=0)])
+    rows, cols = heights.values.shape
+    x = (corners[:, 0] - heights.west_m) / heights.pixel_m
+    y = (heights.north_m - corners[:, 1]) / heights.pixel_m
+    left, right = np.clip([x.min() - 2, x.max() + 2], 0, cols).astype(int)
+    top, bottom = np.clip([y.min() - 2, y.max() + 2], 0, rows).astype(int)
+    # Beyond the raster the heights of its border go on.
+    box = heights.values[min(top, rows - 1) : max(bottom, 1), min(left, cols - 1) : max(right, 1)]
+    return float(box.min()), float(box.max())
 
 
 def seen_view(
