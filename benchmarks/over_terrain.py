@@ -118,11 +118,13 @@ class Ground:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A view, where its camera was (3,), and the ground that its middle shows (3,)."""
+    """A view, where its camera was (3,), the ground that its middle shows (3,), and its true
+    heading, pitch and roll."""
 
     view: View
     position_m: Array
     middle_m: Array
+    attitude_deg: tuple[float, float, float]
 
 
 class Bench:
@@ -223,7 +225,7 @@ class Bench:
         )
         picture = np.clip(noisy, 0, 255).astype(np.uint8)
         middle_ground = seen[seen.shape[0] // 2, seen.shape[1] // 2]
-        return Seen(View(picture, camera, telemetry), position, middle_ground)
+        return Seen(View(picture, camera, telemetry), position, middle_ground, attitude)
 
 
 def camera_of(row: Row, gsd_m: float) -> tuple[Camera, float]:

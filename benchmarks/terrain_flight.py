@@ -160,7 +160,7 @@ def main() -> None:
     parser.add_argument("--pitch-deg", type=float, nargs="+", default=[0.0, 30.0])
     parser.add_argument("--verbose", action="store_true", help="log every view")
     options = parser.parse_args()
-    logging.basicConfig(level=logging.INFO if options.verbose else logging.ERROR)
+    logging.basicConfig(level=logging.DEBUG if options.verbose else logging.ERROR)
     cv2.setNumThreads(1)
     print("| " + " | ".join(HEADER) + " |\n|---|---|---|" + 6 * "--:|" + "---|")
     with tempfile.TemporaryDirectory() as temporary:
