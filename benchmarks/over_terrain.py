@@ -1,9 +1,10 @@
 """Views of relief, placed on level ground and on the terrain of the map.
 
 `python -m benchmarks.over_terrain [--views 30] [--only GROUP ..] [--work DIR]` drapes imagery of
-another date over generated hills, renders true perspective views of it (`benchmarks.relief_views`),
-and prints what of them is placed without and with the terrain, by wrong terrains, and far off
-nadir. Imagery is generated; with optional real imagery beside the checkout its rows use that.
+another date over generated hills, renders true perspective views of it
+(`orthonav.simulate.perspective`), and prints what of them is placed without and with the terrain,
+by wrong terrains, and far off nadir. Imagery is generated; with optional real imagery beside the
+checkout its rows use that.
 """
 
 import argparse
@@ -20,10 +21,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import rasterio
 from numpy.typing import ArrayLike, NDArray
+from rasterio.windows import Window
 
 from benchmarks.inputs import DATA
-from benchmarks.relief_views import Raster, random_relief, seen_view
 from orthonav.cli.heights import map_heights
 from orthonav.geo.camera import Camera, enu_from_camera
 from orthonav.geo.frames import LocalFrame
@@ -34,6 +36,7 @@ from orthonav.mapfile import MapFile, open_map
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import CONFIDENT, Fix, NoFix, Telemetry, View
 from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
+from orthonav.simulate.perspective import Raster, random_relief, seen_view
 
 GROUPS = ("slopes", "wrong", "oblique")
 HEADER = (
@@ -48,6 +51,10 @@ YAW_STD_DEG, AGL_STD, TILT_STD_DEG = 5.0, 0.05, 3.0
 FIELD = 0.96
 """Metres that a camera sees for each metre of height."""
 BASE_M = 200.0
+MAP_M, BEYOND_M = (2400, 2000), 1000
+"""Size of the generated map, and how far the ground goes on around it."""
+MAX_OFF_NADIR_DEG = 65.0
+"""Views farther off nadir are refused, and not drawn."""
 Array = NDArray[np.float64]
 
 
@@ -111,11 +118,13 @@ class Ground:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A view, where its camera was (3,), and the ground that its middle shows (3,)."""
+    """A view, where its camera was (3,), the ground that its middle shows (3,), and its true
+    heading, pitch and roll."""
 
     view: View
     position_m: Array
     middle_m: Array
+    attitude_deg: tuple[float, float, float]
 
 
 class Bench:
@@ -127,25 +136,40 @@ class Bench:
 
     def _ground(self, imagery: str) -> Ground:
         if imagery == "generated":
-            folder = self.work / "area"
-            size_m, dates = (2400.0, 2000.0), DEFAULT_DATES[:2]
-            paths = [folder / f"{date.name}.tif" for date in dates]
-            if not all(path.is_file() for path in paths):
-                paths = list(generate_area(folder, size_m=size_m, dates=dates, seed=3))
-            past, present = paths
+            past, present = self._generated()
         else:
             past, present = (DATA / name for name in imagery.split(","))
         path = self.work / f"{past.parent.name}-{past.stem}.onav"
         if not path.is_file():
             build_map(BuildRequest([past], path))
         opened = open_map(path)
-        sheet = opened.manifest.sheets[0]
-        with Mosaic.open([present]).grid_sheet(sheet.frame, sheet.grid) as raster:
-            grey = raster.read_grey(0, 0, sheet.grid.width_px, sheet.grid.height_px).grey
-        grid = sheet.grid
-        return Ground(
-            opened, Raster(grey.astype(np.float32), grid.west_m, grid.north_m, grid.gsd_m)
-        )
+        grid, frame = opened.manifest.sheets[0].grid, opened.manifest.sheets[0].frame
+        beyond = round(BEYOND_M / grid.gsd_m) if imagery == "generated" else 0
+        west_m, north_m = grid.west_m - beyond * grid.gsd_m, grid.north_m + beyond * grid.gsd_m
+        width_px, height_px = grid.width_px + 2 * beyond, grid.height_px + 2 * beyond
+        with Mosaic.open([present]).sheet(
+            frame, west_m=west_m, north_m=north_m, width_px=width_px, height_px=height_px,
+            gsd_m=grid.gsd_m,
+        ) as raster:  # fmt: skip
+            grey = raster.read_grey(0, 0, width_px, height_px).grey
+        return Ground(opened, Raster(grey.astype(np.float32), west_m, north_m, grid.gsd_m))
+
+    def _generated(self) -> tuple[Path, Path]:
+        """Orthophotos of the map and of the flight, which reaches beyond the map: so does what
+        cameras far off nadir see."""
+        folder, dates = self.work / "area", DEFAULT_DATES[:2]
+        map_path, (past, present) = folder / "map.tif", (folder / f"{d.name}.tif" for d in dates)
+        if not map_path.is_file():
+            size_m = (MAP_M[0] + 2 * BEYOND_M, MAP_M[1] + 2 * BEYOND_M)
+            generate_area(folder, size_m=size_m, dates=dates, seed=3)
+            with rasterio.open(past) as data:
+                part = Window(BEYOND_M, BEYOND_M, *MAP_M)
+                profile = data.profile | {"width": MAP_M[0], "height": MAP_M[1]}
+                profile["transform"] = data.window_transform(part)
+                pixels = data.read(window=part)
+            with rasterio.open(map_path, "w", **profile) as data:
+                data.write(pixels)
+        return map_path, present
 
     def seen(self, row: Row) -> tuple[list[Seen], Raster]:
         """The views of a row, and its hills."""
@@ -164,9 +188,9 @@ class Bench:
     def _seen(self, row: Row, ground: Ground, hills: Raster, rng: np.random.Generator) -> Seen:
         side_m = row.view_px * ground.gsd_m
         camera, agl_m = camera_of(row, ground.gsd_m)
-        rows, cols = ground.grey.values.shape
-        extent = np.array([cols, -rows]) * ground.grey.pixel_m
-        corner = np.array([ground.grey.west_m, ground.grey.north_m])
+        grid = ground.opened.manifest.sheets[0].grid
+        extent = np.array([grid.width_px, -grid.height_px]) * grid.gsd_m
+        corner = np.array([grid.west_m, grid.north_m])
         while True:
             share = rng.uniform(0, 1, 2)
             place = corner + share * extent
@@ -176,11 +200,11 @@ class Bench:
             below = float(hills.at(place[:1], place[1:])[0])
             position = np.array([*place, below + agl_m])
             axis = enu_from_camera(*attitude) @ [0.0, 0.0, 1.0]
-            if axis[2] > -0.2:
+            if axis[2] > -math.cos(math.radians(MAX_OFF_NADIR_DEG)):
                 continue
             middle = position + axis * (agl_m / -axis[2])
             near = middle[:2] + np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * side_m * 0.55
-            if ground.grey.holds(near).all():
+            if (abs((near - corner) / extent - 0.5) <= 0.5).all():
                 break
         grey, seen = seen_view(
             ground.grey, hills, camera, attitude, position, 1 if row.tilt_deg else 2
@@ -201,7 +225,7 @@ class Bench:
         )
         picture = np.clip(noisy, 0, 255).astype(np.uint8)
         middle_ground = seen[seen.shape[0] // 2, seen.shape[1] // 2]
-        return Seen(View(picture, camera, telemetry), position, middle_ground)
+        return Seen(View(picture, camera, telemetry), position, middle_ground, attitude)
 
 
 def camera_of(row: Row, gsd_m: float) -> tuple[Camera, float]:
@@ -327,10 +351,11 @@ def rows_of(options: argparse.Namespace) -> Iterator[Row]:
             yield Row("slopes", coarse, 256, slope, 600.0)
     for wrong in ("", "displaced by 200 m", "50 m too high", "with holes"):
         yield Row("wrong", fine, 192, 0.2, 300.0, wrong=wrong)
-    for tilt in (30.0, 45.0, 60.0):
-        yield Row(
-            "oblique", "generated", 480, 0.15, 300.0, tilt_deg=tilt, agl_m=250.0, radius_m=25.0
-        )
+    for tilt in (0.0, 30.0, 45.0, 60.0):
+        for slope in (0.0, 0.15):
+            yield Row(
+                "oblique", "generated", 480, slope, 300.0, tilt_deg=tilt, agl_m=250.0, radius_m=25.0
+            )
 
 
 def main() -> None:

@@ -24,13 +24,13 @@ from rasterio.warp import transform as transform_points
 from scipy.spatial.transform import Rotation
 
 from benchmarks.inputs import DATA
-from benchmarks.relief_views import Raster, met
 from orthonav.cli.heights import map_heights
 from orthonav.geo.camera import Camera, attitude_of
 from orthonav.localizer import Localizer
 from orthonav.mapfile import MapFile, open_map
 from orthonav.prepare import BuildRequest, build_map
 from orthonav.records import CONFIDENT, Fix, NoFix, Telemetry, View
+from orthonav.simulate.perspective import Raster, met
 
 FOLDER = DATA / "relief_ngi"
 STRIPS = (("05_0182", "05_0184"), ("06_0251", "06_0253"))

@@ -51,16 +51,16 @@ def main(arguments: list[str]) -> int:
 def _stored(options: argparse.Namespace) -> int:
     """Keep results, or check them; returns the exit code: 1 if the page is not of the rows."""
     from experiments.paper import page as pages
-    from experiments.paper.stored import keep, stored
+    from experiments.paper.stored import keep, stored, tried
 
     if options.what == "keep":
-        for name in keep(options.out, options.setting):
+        for name in keep(options.out, options.setting, options.tried):
             _say(f"stored: {name}")
-        pages.PAGE.write_text(pages.page(stored()), encoding="utf-8")
+        pages.PAGE.write_text(pages.page(stored(), tried()), encoding="utf-8")
     rows = stored()
     for line in pages.state(rows):
         print(line)
-    if pages.PAGE.read_text(encoding="utf-8") != pages.page(rows):
+    if pages.PAGE.read_text(encoding="utf-8") != pages.page(rows, tried()):
         _say(f"not made of the stored rows: {pages.PAGE}; run python -m experiments.paper keep")
         return 1
     return 0
@@ -262,6 +262,9 @@ def _parser() -> argparse.ArgumentParser:
         type=int,
         metavar="N",
         help="epochs of networks; added to a training whose checkpoint was kept",
+    )
+    parser.add_argument(
+        "--tried", metavar="NAME", help="keep the results as rows of another training"
     )
     parser.add_argument("--past", type=Path, help="an orthophoto of your own, for the map")
     parser.add_argument("--present", type=Path, help="the same ground at another date")

@@ -1,18 +1,21 @@
 """`python -m experiments.paper.between_dates`: learns edges that stay between dates.
 
-A small network sees one date of a generated landscape and predicts where Canny finds edges at
-another date. What crops, seasons and light draw is not there at the other date, so it is not
-predicted; what stays is. The network takes grey levels and needs no second date in flight. No
-landscape of the experiments is used, and no real imagery. The file is what `--edges
+A small network sees one date of a generated landscape and predicts the edges that Canny finds at
+all dates. What crops, seasons and light draw is not there at another date, so it is not predicted;
+what stays is. A second term of the loss asks for the same prediction from two dates of the same
+ground. The network takes grey levels and needs no second date in flight. No landscape of the
+experiments is used, and no real imagery. The file is what `--edges
 onnx:weights=experiments/paper/between_dates.onnx` takes.
 """
 
 import argparse
+import json
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from itertools import permutations
+from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,27 +26,33 @@ from torch.nn import functional
 
 from experiments.paper.methods import BETWEEN_DATES
 from orthonav.extras import needed
-from orthonav.files import replacing
+from orthonav.files import replacing, write_text
+from orthonav.neural.means import Means, mixed_precision
 from orthonav.represent.canny import Canny
 from orthonav.simulate.landscape import DEFAULT_DATES, generate_area
 
 AREAS = ((101, 1.0), (102, 1.0), (103, 1.5), (104, 2.0), (105, 3.0), (106, 5.0))
 """Seed and ground resolution of the landscapes; those of the experiments have other seeds."""
-HELD_OUT = (107, 1.5)
+HELD_OUT = ((107, 1.5), (108, 1.0), (109, 2.0))
 AREA_PX = 640
 WIDTH, DILATIONS = 24, (1, 2, 4, 1)
-CROP_PX, BATCH, STEPS, RATE = 96, 12, 300, 3e-3
+CROP_PX, PAIRS, STEPS, RATE = 96, 6, 900, 2e-3
 GAIN, OFFSET = (0.5, 1.5), 0.2
 """Factor of the grey levels around their mean, and the largest brightness added, 0 to 1."""
-RIDGE_PX = 4
-"""An edge is where a logit is above the mean of a square with so many pixels on each side: else
-woods and orchards would be all edge, and roads none."""
 COUNTED_PX = 256
 """Edges are counted in the lower left corner of each landscape, of this size."""
-REACH_PX = 1
-"""An edge counts as predicted this far from where Canny has it."""
+BLUR_STD_PX, BLUR_PX = 1.0, 7
+"""Edges are compared smoothed by a Gaussian; predictions in a window of this size."""
+STRAIGHT = 0.4
+"""Value of a straight edge, smoothed: 1 / sqrt(2 pi)."""
+RARE = -2.5
+"""Logits start at the share of edges, so that the first steps do not learn it."""
+AGREEMENT = 0.5
+"""Weight of the agreement of two dates in the loss."""
+SAID_EVERY = 100
 OPSET, IR_VERSION = 17, 8
 Dates = list[NDArray[np.uint8]]
+Agreement = dict[str, Any]
 
 
 def network() -> nn.Sequential:
@@ -51,7 +60,9 @@ def network() -> nn.Sequential:
     layers: list[nn.Module] = [nn.Conv2d(1, WIDTH, 5), nn.ReLU(inplace=True)]
     for dilation in DILATIONS:
         layers += [nn.Conv2d(WIDTH, WIDTH, 3, dilation=dilation), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers, nn.Conv2d(WIDTH, 1, 1))
+    last = nn.Conv2d(WIDTH, 1, 1)
+    nn.init.constant_(last.bias, RARE)  # type: ignore[arg-type]
+    return nn.Sequential(*layers, last)
 
 
 def margin_px(model: nn.Sequential) -> int:
@@ -72,36 +83,69 @@ def canny(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(Canny()(grey, np.ones(grey.shape, np.bool_))[0], np.uint8)
 
 
-def widened(edges: NDArray[np.uint8], reach_px: int = REACH_PX) -> NDArray[np.uint8]:
-    """Edges (H, W) and what lies this near to them."""
-    side = 2 * reach_px + 1
-    return np.asarray(cv2.dilate(edges, np.ones((side, side), np.uint8)), np.uint8)
+def lasting(dates: Dates) -> NDArray[np.float32]:
+    """Edges (H, W) that all dates have, 0 to 1: the least of the dates' blurred Canny edges.
+
+    A straight edge that all have in the same place is 1.
+    """
+    least = np.minimum.reduce([blurred(canny(grey)) for grey in dates])
+    return np.asarray(np.clip(least / STRAIGHT, 0, 1), np.float32)
+
+
+def blurred(edges: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Edges (H, W) smoothed, so that those a pixel apart agree."""
+    return np.asarray(cv2.GaussianBlur(edges.astype(np.float32), (0, 0), BLUR_STD_PX), np.float32)
 
 
 def batches(
     areas: Sequence[Dates], margin: int, steps: int
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-    """Crops of one date with another light, and where there are edges at another date."""
-    targets = [[widened(canny(grey)) for grey in dates] for dates in areas]
-    pairs = list(permutations(range(len(areas[0])), 2))
+    """Crops of two dates, each in a light of its own, and the edges of all dates.
+
+    The first half of a batch (2 * PAIRS, 1, S, S) is of one date, the second of another, in the
+    same order; edges (2 * PAIRS, 1, CROP_PX, CROP_PX).
+    """
+    targets = [lasting(dates) for dates in areas]
     rng = np.random.default_rng(0)
     side = CROP_PX + 2 * margin
     for _ in range(steps):
-        seen = np.empty((BATCH, 1, side, side), np.float32)
-        wanted = np.empty((BATCH, 1, CROP_PX, CROP_PX), np.float32)
-        for row in range(BATCH):
+        seen = np.empty((2, PAIRS, 1, side, side), np.float32)
+        wanted = np.empty((PAIRS, 1, CROP_PX, CROP_PX), np.float32)
+        for row in range(PAIRS):
             area = int(rng.integers(len(areas)))
-            one, other = pairs[int(rng.integers(len(pairs)))]
-            grey, edges = areas[area][one], targets[area][other]
-            y, x = (int(rng.integers(size - side + 1)) for size in grey.shape)
-            part = grey[y : y + side, x : x + side].astype(np.float32) / 255
-            level = part.mean()
-            light = level + (part - level) * rng.uniform(*GAIN) + rng.uniform(-OFFSET, OFFSET)
-            inner = edges[y + margin : y + side - margin, x + margin : x + side - margin]
+            two = rng.permutation(len(areas[area]))[:2]
+            y, x = (int(rng.integers(size - side + 1)) for size in targets[area].shape)
             turns, mirrored = int(rng.integers(4)), int(rng.choice([-1, 1]))
-            seen[row, 0] = np.rot90(np.clip(light, 0, 1), turns)[:, ::mirrored]
+            for number, date in enumerate(two):
+                part = areas[area][date][y : y + side, x : x + side].astype(np.float32) / 255
+                lit = relit(part, rng)
+                seen[number, row, 0] = np.rot90(lit, turns)[:, ::mirrored]
+            inner = targets[area][y + margin : y + side - margin, x + margin : x + side - margin]
             wanted[row, 0] = np.rot90(inner, turns)[:, ::mirrored]
-        yield torch.from_numpy(seen), torch.from_numpy(wanted)
+        pictures = torch.from_numpy(seen.reshape(-1, 1, side, side))
+        yield pictures, torch.from_numpy(np.concatenate([wanted, wanted]))
+
+
+def relit(part: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Grey levels (H, W), 0 to 1, with another contrast and brightness."""
+    level = part.mean()
+    lit = level + (part - level) * rng.uniform(*GAIN) + rng.uniform(-OFFSET, OFFSET)
+    return np.asarray(np.clip(lit, 0, 1), np.float32)
+
+
+def correlation(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+    """Correlation coefficient of two predictions (N, 1, H, W), smoothed as in `agreement`."""
+    line = torch.from_numpy(cv2.getGaussianKernel(BLUR_PX, BLUR_STD_PX).astype(np.float32))
+    kernel = (line @ line.T)[None, None]
+    a, b = (each - each.mean() for each in (functional.conv2d(p, kernel) for p in (one, other)))
+    return (a * b).mean() / (a.square().mean() * b.square().mean() + 1e-10).sqrt()
+
+
+def loss_of(found: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
+    """Cross-entropy of logits (2 N, 1, H, W), and how little those of two dates agree."""
+    entropy = functional.binary_cross_entropy_with_logits(found, wanted)
+    one, other = torch.sigmoid(found).chunk(2)
+    return entropy + AGREEMENT * (1 - correlation(one, other))
 
 
 def learn(areas: Sequence[Dates], steps: int = STEPS) -> nn.Sequential:
@@ -111,35 +155,33 @@ def learn(areas: Sequence[Dates], steps: int = STEPS) -> nn.Sequential:
     margin = margin_px(model)
     optimizer = torch.optim.Adam(model.parameters(), lr=RATE)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps)
+    quick = mixed_precision(Means(), torch.device("cpu")) is not None
     start, losses = time.monotonic(), []
     for step, (seen, wanted) in enumerate(batches(areas, margin, steps), start=1):
-        loss = functional.binary_cross_entropy_with_logits(model(seen), wanted)
+        with torch.autocast("cpu", torch.bfloat16, enabled=quick):
+            found = model(seen)
+        loss = loss_of(found.float(), wanted)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimizer.step()
         schedule.step()
         losses.append(float(loss.detach()))
-        if step % 50 == 0 or step == steps:
-            took_s = time.monotonic() - start
-            print(f"step {step} of {steps}, loss {np.mean(losses[-50:]):.4f}, {took_s:.0f} s")
+        if step % SAID_EVERY == 0 or step == steps:
+            mean, took_s = np.mean(losses[-SAID_EVERY:]), time.monotonic() - start
+            print(f"step {step} of {steps}, loss {mean:.4f}, {took_s:.0f} s", flush=True)
     parts = [grey[-COUNTED_PX:, :COUNTED_PX] for dates in areas for grey in dates]
     return cut_off(model, parts)
 
 
 def cut_off(model: nn.Sequential, pictures: Dates) -> nn.Sequential:
-    """The network with ridges as its last layer, and as many edges as Canny finds in pictures."""
-    side = 2 * RIDGE_PX + 1
-    last = nn.Conv2d(1, 1, side)
-    with torch.no_grad():
-        last.weight.fill_(-1 / side**2)
-        last.weight[0, 0, RIDGE_PX, RIDGE_PX] += 1
-        last.bias.zero_()  # type: ignore[union-attr]
-    whole = nn.Sequential(*model, last).eval()
+    """The network, in place, with as many edges as Canny finds in pictures."""
     share = float(np.mean([canny(grey).mean() for grey in pictures]))
-    found = np.concatenate([logits(whole, grey).ravel() for grey in pictures])
+    found = np.concatenate([logits(model, grey).ravel() for grey in pictures])
+    last: Any = model[-1]
     with torch.no_grad():
-        last.bias.fill_(-float(np.quantile(found, 1 - share)))  # type: ignore[union-attr]
-    return whole
+        last.bias -= float(np.quantile(found, 1 - share))
+    return model.eval()
 
 
 def logits(model: nn.Sequential, grey: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -155,8 +197,7 @@ def agreement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
 
     That of unrelated edges is 0, however many there are.
     """
-    maps = [cv2.GaussianBlur(each.astype(np.float32), (0, 0), REACH_PX) for each in (one, other)]
-    return float(np.corrcoef(maps[0].ravel(), maps[1].ravel())[0, 1])
+    return float(np.corrcoef(blurred(one).ravel(), blurred(other).ravel())[0, 1])
 
 
 def write(model: nn.Sequential, path: Path) -> None:
@@ -190,6 +231,28 @@ def write(model: nn.Sequential, path: Path) -> None:
         temporary.write_bytes(made.SerializeToString())
 
 
+def agreements(model: nn.Sequential, area: tuple[int, float], dates: Dates) -> Iterator[Agreement]:
+    """How the edges of two dates agree, Canny's and learnt ones, for each pair of dates."""
+    learnt = [(logits(model, grey) > 0).astype(np.uint8) for grey in dates]
+    plain = [canny(grey) for grey in dates]
+    for one, other in combinations(range(len(dates)), 2):
+        yield {
+            "seed": area[0],
+            "gsd_m": area[1],
+            "dates": [DEFAULT_DATES[each].name for each in (one, other)],
+            "canny": round(agreement(plain[one], plain[other]), 3),
+            "learnt": round(agreement(learnt[one], learnt[other]), 3),
+            "share_canny": round(float(np.mean([plain[one], plain[other]])), 3),
+            "share_learnt": round(float(np.mean([learnt[one], learnt[other]])), 3),
+        }
+
+
+def write_agreements(found: Sequence[Agreement], path: Path) -> None:
+    """Write them beside the network, from where the page of results takes them."""
+    text = ",\n".join(json.dumps(each) for each in found)
+    write_text(path.with_suffix(".json"), f"[\n{text}\n]\n")
+
+
 def main() -> None:
     """Generate the landscapes, learn, write, and say how the edges of two dates agree."""
     parser = argparse.ArgumentParser(
@@ -199,17 +262,17 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=STEPS)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="orthonav-dates-") as folder:
-        made = [landscape(*each, Path(folder) / str(each[0])) for each in (*AREAS, HELD_OUT)]
-    model = learn(made[:-1], options.steps)
+        made = {each: landscape(*each, Path(folder) / str(each[0])) for each in (*AREAS, *HELD_OUT)}
+    model = learn([made[each] for each in AREAS], options.steps)
     write(model, options.out)
-    held = made[-1]
-    learnt = [(logits(model, grey) > 0).astype(np.uint8) for grey in held]
-    plain = [canny(grey) for grey in held]
     print(f"{sum(each.numel() for each in model.parameters()):,} parameters: {options.out}")
-    for one, other in ((0, 1), (0, 2), (1, 2)):
-        dates = f"{DEFAULT_DATES[one].name} and {DEFAULT_DATES[other].name}"
-        pair = (agreement(plain[one], plain[other]), agreement(learnt[one], learnt[other]))
-        print(f"correlation of {dates}, not learnt from: Canny {pair[0]:.2f}, learnt {pair[1]:.2f}")
+    found = [pair for area in HELD_OUT for pair in agreements(model, area, made[area])]
+    write_agreements(found, options.out)
+    for each in found:
+        print(
+            f"{each['gsd_m']:g} m per pixel, not learnt from, correlation of "
+            f"{' and '.join(each['dates'])}: Canny {each['canny']:.2f}, learnt {each['learnt']:.2f}"
+        )
 
 
 if __name__ == "__main__":

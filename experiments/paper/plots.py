@@ -10,9 +10,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
+from experiments.paper.labels import EDGES, FAMILIES
 from experiments.paper.published import LOWE
 from experiments.paper.results import Result, confident, share
-from experiments.paper.tables import EDGES, FAMILIES
 
 COLOURS = {
     "gray": "tab:gray",

@@ -75,7 +75,7 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
         found: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
         if found["method"]["recipe"] == method.recipe:
             return found
-    start, before = time.perf_counter(), provenance("paper")
+    start, cpu_s, before = time.perf_counter(), time.process_time(), provenance("paper")
     work = place.work(scene, method.key)
     opened, built = _map(place, scene, method, work)
     localizer = Localizer(
@@ -90,6 +90,7 @@ def run(place: Workplace, scene: Scene, method: Method) -> dict[str, Any]:
     made |= {"method": asdict(method) | {"edges": edges}, **built, **_sizes(opened)}
     made |= _placed(scene, localizer, place.setting, method.registration)
     made["rules"] = {} if method.registration else _rules(scene, opened, place.setting)
+    made["cpu_minutes"] = round((time.process_time() - cpu_s) / 60, 2)
     written = save(out, made | {"code": code_of(method, scene.name)}, start)
     if not place.keep_checkpoints:
         (work / "checkpoint.pt").unlink(missing_ok=True)

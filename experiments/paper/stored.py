@@ -26,18 +26,23 @@ from experiments.paper.methods import (
     methods,
 )
 from experiments.paper.results import Result, read
-from experiments.paper.scenes import REDUCED_REAL, UNTUNED
+from experiments.paper.scenes import REDUCED_REAL, SEED, UNTUNED
 from experiments.paper.trajectories import REDUCED, SETTINGS, TABLE_1
 from orthonav.files import write_text
 
 ROOT = Path(__file__).resolve().parents[2]
 ROWS = Path(__file__).resolve().parent / "rows"
 BASELINES, FIELD = "baselines", "field"
+TRIED = "tried"
+"""Folder of rows of another training than a setting's, from which the setting was chosen."""
 DIGITS = 5
 """Significant digits of figures in a row: a confidence to 1e-5, an error of 9 km to 0.1 m."""
 
 PROTOCOL = ("experiments/paper/views.py", "experiments/paper/runs.py")
-GENERATED = ("src/orthonav/simulate/landscape/*.py",)
+GENERATED = "generated landscape"
+"""In place of the files that draw generated scenes: a digest of ground that they draw."""
+DRAWN_PX, DRAWN_GSD_M, DRAWN_FROM_M = 256, (0.2, 1.0, 2.0), (300.0, 900.0)
+"""Side and ground resolutions of that ground, and how far it lies from the landscape's origin."""
 TILES = (
     "src/orthonav/localizer/match.py",
     "src/orthonav/localizer/rectify.py",
@@ -82,6 +87,8 @@ EDGES = {
     SAM: ("src/orthonav/neural/sam.py",),
     LEARNT: ("src/orthonav/represent/learned.py", "experiments/paper/between_dates.onnx"),
 }
+PART_OF = {"encoder_": ("autoencoder", "caevl"), "triplet_": ("triplet",), "words": ("bovw",)}
+"""Which families a part of a setting decides, by the beginning of its name; others decide all."""
 REGISTRATION = (
     "src/orthonav/confidence/*.py",
     "src/orthonav/localizer/*.py",
@@ -92,10 +99,23 @@ REGISTRATION = (
 def code(family: str, edges: str, *, registration: bool, generated: bool) -> dict[str, str]:
     """Digests of the files that decide the figures of a row, by path in the repository."""
     patterns = [*PROTOCOL, *FAMILY[family], *(REGISTRATION if registration else TILES)]
-    patterns += GENERATED if generated else ()
     patterns += EDGES[edges.partition(":")[0]] if edges else ()
     paths = {path for pattern in patterns for path in ROOT.glob(pattern)}
-    return {path.relative_to(ROOT).as_posix(): _digest(path) for path in sorted(paths)}
+    found = {path.relative_to(ROOT).as_posix(): _digest(path) for path in sorted(paths)}
+    return found | ({GENERATED: _drawn()} if generated else {})
+
+
+@lru_cache
+def _drawn() -> str:
+    """Short digest of some ground of the generated landscape, at every date."""
+    from orthonav.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
+
+    made, digest = Landscape(SEED), hashlib.sha256()
+    corner = [origin + off for origin, off in zip(ORIGIN_M, DRAWN_FROM_M, strict=True)]
+    for gsd_m in DRAWN_GSD_M:
+        for date in DEFAULT_DATES:
+            digest.update(made.render(date, *corner, DRAWN_PX, DRAWN_PX, gsd_m).tobytes())
+    return digest.hexdigest()[:12]
 
 
 @lru_cache
@@ -148,7 +168,9 @@ def older(row: Result) -> list[str]:
         now = code_of_field((Method(**each) for each in plain["methods"]), row.scene)
     changed = sorted(path for path in known.keys() | now if known.get(path) != now.get(path))
     setting = SETTINGS[plain["setting"]["name"]]
-    if plain["setting"] != json.loads(json.dumps(asdict(setting))):
+    families = {each["family"] for each in plain.get("methods", ())} | {row.family}
+    today = json.loads(json.dumps(asdict(setting)))
+    if _relevant(plain["setting"], families) != _relevant(today, families):
         changed.append("setting")
     if made is not None:
         rows = methods(setting, row.scene, plain["tiles"], sam_weights="PATH")
@@ -157,6 +179,12 @@ def older(row: Result) -> list[str]:
         }:
             changed.append("recipe")
     return changed
+
+
+def _relevant(setting: dict[str, Any], families: set[str]) -> dict[str, Any]:
+    """What of a setting decides the figures of rows of these families."""
+    others = [part for part, users in PART_OF.items() if not families & set(users)]
+    return {name: value for name, value in setting.items() if not name.startswith(tuple(others))}
 
 
 def _plain(recipe: str) -> str:
@@ -176,11 +204,21 @@ def stored() -> list[Result]:
     return [row for name in SETTINGS for row in read(ROWS / name)]
 
 
-def keep(results: Path, setting: str) -> list[str]:
-    """Copy the results of a setting into the repository; the names of the rows that changed."""
+def tried() -> list[Result]:
+    """Rows of trainings from which the reduced setting was chosen, and of longer ones."""
+    return read(ROWS / TRIED)
+
+
+def keep(results: Path, setting: str, name: str | None = None) -> list[str]:
+    """Copy the results of a setting into the repository; the names of the rows that changed.
+
+    With a name they are kept as rows of another training, beside those of the setting.
+    """
     changed = []
     for path in sorted((results / setting).glob("*.json")):
         target = ROWS / setting / path.name
+        if name is not None:
+            target = ROWS / TRIED / f"{path.stem}-{name}.json"
         text = path.read_text(encoding="utf-8")
         if not target.is_file() or target.read_text(encoding="utf-8") != text:
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -7,30 +7,14 @@ from pathlib import Path
 from benchmarks.record import Table, number
 
 from experiments.paper import published
+from experiments.paper.comparison import above_default, orders
 from experiments.paper.field_tables import field
-from experiments.paper.methods import Method, column, tuned
+from experiments.paper.labels import EDGES, TUNED, best_words, by_scene, is_tuned, label, named
+from experiments.paper.methods import column
 from experiments.paper.results import Result, accepted_at, ceiling, confident, percent, read, share
 from experiments.paper.stored import name_of
 from experiments.paper.views import PLACEMENTS
 from orthonav.records import CONFIDENT
-
-TUNED = "*: tuned on this scene or on imagery of the same generator (docs/paper.md)"
-FAMILIES = {
-    "bovw": "Bag of Words",
-    "triplet": "Triplet",
-    "autoencoder": "Auto-Encoder",
-    "caevl": "CAEVL",
-    "gradient": "orthonav",
-}
-EDGES = {
-    "gray": "grey",
-    "canny": "Canny",
-    "segments": "segments",
-    "sam": "Segment Anything, sheet",
-    "sam-tile": "Segment Anything, tile",
-    "onnx": "learnt",
-    "gradient": "gradients",
-}
 
 
 def report(out: Path, setting: str) -> Path | None:
@@ -58,13 +42,14 @@ def tables(results: Sequence[Result]) -> list[Table]:
     return [
         *table_2(made),
         *orders(made),
+        *above_default(made),
         *table_3(made),
         *choice(made),
         *rules(made),
         *sensitivity(made),
         *resolutions(made),
         *baselines(results, made),
-        *field(results, _label),
+        *field(results, label),
         *costs(made),
         row_table(results),
     ]
@@ -74,8 +59,8 @@ def table_2(results: Sequence[Result]) -> list[Table]:
     """Accuracy at 15 m by method and scene, views on the grid and anywhere."""
     header = ("method", "input", "paper", "route", "on grid", "anywhere", "right tile", "of")
     made = []
-    for scene, found in _by_scene(results):
-        rows = [_table_2_row(each) for each in _best_words(found)]
+    for scene, found in by_scene(results):
+        rows = [_table_2_row(each) for each in best_words(found)]
         chance = found[0].plain["chance"]
         guessed = (percent(chance.get(name)) for name in PLACEMENTS)
         rows.append(["a guess", "", "-", *guessed, "", ""])
@@ -91,7 +76,7 @@ def _table_2_row(each: Result) -> list[str]:
         if each.registration
         else published.accuracy(each.family, each.edges, column(each.scene))
     )
-    return [_name(each), EDGES[each.edges], paper, *map(percent, placed), views]
+    return [named(each), EDGES[each.edges], paper, *map(percent, placed), views]
 
 
 def _area(found: Sequence[Result]) -> list[str]:
@@ -108,47 +93,6 @@ def _area(found: Sequence[Result]) -> list[str]:
     ]
 
 
-def _best_words(found: Sequence[Result]) -> list[Result]:
-    """All but the worse ones of several vocabularies: "the best performances will be displayed"."""
-    words = [each for each in found if each.family == "bovw"]
-    best = max(words, key=lambda each: each.accuracy("grid"), default=None)
-    shown = [each for each in found if each.family != "bovw" or each is best]
-    order = list(FAMILIES)
-    edges = list(EDGES)
-    return sorted(
-        shown, key=lambda r: (order.index(r.family), r.registration, edges.index(r.edges))
-    )
-
-
-def orders(results: Sequence[Result]) -> list[Table]:
-    """Each comparison of the paper's Table 2 beside the same one here."""
-    rows = []
-    for scene, found in _by_scene(results):
-        best = {(each.family, each.edges): each for each in _best_words(found)}
-        for one, other in published.COMPARED:
-            if scene in published.TRAJECTORIES and one in best and other in best:
-                rows.append(_order_row(scene, best[one], best[other]))
-    header = ("trajectory", "first", "second", "paper", "here", "same order")
-    notes = (
-        "accuracy at 15 m in %, first : second; here: views along the route; equal: the shares "
-        "differ by less than two standard errors of their difference",
-    )
-    return [Table("Order of the paper's methods", header, rows, notes)] if rows else []
-
-
-def _order_row(scene: str, one: Result, other: Result) -> list[str]:
-    said = [float(published.accuracy(each.family, each.edges, scene)) for each in (one, other)]
-    found = [each.accuracy("route") for each in (one, other)]
-    counts = [len(each.plain["views"]["route"]) for each in (one, other)]
-    spread = math.sqrt(sum(p * (1 - p) / n for p, n in zip(found, counts, strict=True)))
-    same = "yes" if (said[0] > said[1]) == (found[0] > found[1]) else "no"
-    if abs(found[0] - found[1]) <= 2 * spread:
-        same = "equal"
-    names = [f"{_name(each)}, {EDGES[each.edges]}" for each in (one, other)]
-    pairs = (f"{said[0]:.1f} : {said[1]:.1f}", f"{percent(found[0])} : {percent(found[1])}")
-    return [scene, *names, *pairs, same]
-
-
 def table_3(results: Sequence[Result]) -> list[Table]:
     """The confidence criterion and the ratio with an exclusion radius; views on the grid."""
     header = (
@@ -161,8 +105,8 @@ def table_3(results: Sequence[Result]) -> list[Table]:
         ),
     )
     rows = []
-    for scene, found in _by_scene(results):
-        for each in _best_words(found):
+    for scene, found in by_scene(results):
+        for each in best_words(found):
             if each.registration or each.family == "bovw":
                 continue
             rows.append(_table_3_row(scene, each))
@@ -184,13 +128,13 @@ def _table_3_row(scene: str, each: Result) -> list[str]:
     cells = [percent(accepted_at(right, ratio)) for ratio in (lowe, peak)]
     medians = [f"{_median(ratio):.3f}" for ratio in (lowe, peak)]
     both = f"{percent(found)} / {percent(accepted)}"
-    return [scene, _name(each), EDGES[each.edges], paper, both, *cells, *medians]
+    return [scene, named(each), EDGES[each.edges], paper, both, *cells, *medians]
 
 
 def choice(results: Sequence[Result]) -> list[Table]:
     """The paper's best method and orthonav over other imagery."""
     rows = []
-    for scene, found in _by_scene(results):
+    for scene, found in by_scene(results):
         shown = [e for e in found if e.family == "gradient" or _is_papers_best(e)]
         if column(scene) not in published.TRAJECTORIES and len(shown) > 1:
             rows += [_choice_row(scene, each) for each in shown]
@@ -222,7 +166,7 @@ def _choice_row(scene: str, each: Result) -> list[str]:
     criterion = f"confidence {CONFIDENT}" if each.registration else f"Lowe {published.LOWE}"
     figures = [plain["learn_s"], plain["mb_per_km2"], plain["encoder_mb"], plain["view_ms"]]
     both = f"{percent(found)} / {percent(accepted)}"
-    cells = [_name(each), EDGES[each.edges], *map(percent, shares), criterion, both]
+    cells = [named(each), EDGES[each.edges], *map(percent, shares), criterion, both]
     return [scene, *cells, *map(number, figures)]
 
 
@@ -233,10 +177,10 @@ def rules(results: Sequence[Result]) -> list[Table]:
         return []
     names = list(found[0].plain["rules"]["grid"])
     rows = []
-    for each in _best_words(found):
+    for each in best_words(found):
         for placement in ("grid", "anywhere"):
             shares = [share(each.plain["rules"][placement][name]) for name in names]
-            rows.append([f"{_name(each)}, {EDGES[each.edges]}", placement, *map(percent, shares)])
+            rows.append([f"{named(each)}, {EDGES[each.edges]}", placement, *map(percent, shares)])
     notes = (
         "product: embeddings without scaling; cosine: the same, scaled to length 1. best: the "
         "paper; weighted: all tiles by score (Bianchi and Barfoot); neighbours: after Couturier "
@@ -264,7 +208,7 @@ def baselines(results: Sequence[Result], made: Sequence[Result]) -> list[Table]:
             shares = [each.accuracy(placement) for placement in ("grid", "anywhere")]
             count = len(each.plain["views"]["anywhere"])
             ms = number(each.plain["view_ms"])
-            rows.append([each.scene, _name(each), *map(percent, shares), str(count), ms])
+            rows.append([each.scene, named(each), *map(percent, shares), str(count), ms])
     header = ("scene", "method", "on grid", "anywhere", "of", "ms per view")
     notes = ("the baselines carry the orthophoto itself; reported pose, whole map, no prior",)
     return [Table("Related work: accuracy at 15 m, %", header, rows, notes)]
@@ -273,7 +217,7 @@ def baselines(results: Sequence[Result], made: Sequence[Result]) -> list[Table]:
 def costs(results: Sequence[Result]) -> list[Table]:
     """What each method takes: time to learn, size of the map, time of a view."""
     rows = []
-    for scene, found in _by_scene(results):
+    for scene, found in by_scene(results):
         for each in found:
             plain = each.plain
             figures = [plain["learn_s"], plain["mb_per_km2"], plain["encoder_mb"], plain["view_ms"]]
@@ -292,13 +236,13 @@ def sensitivity(results: Sequence[Result]) -> list[Table]:
     """Accuracy at each error of heading and height, on the trajectory that the paper sweeps."""
     made = []
     for step, title in (("heading_deg", "heading error, deg"), ("drop_m", "height lower by, m")):
-        swept = [each for each in _best_words(results) if each.plain.get("sweep")]
+        swept = [each for each in best_words(results) if each.plain.get("sweep")]
         if swept:
             values = list(swept[0].plain["sweep"][step])
             count = swept[0].plain["sweep"][step][values[0]][1]
             rows = [
                 [
-                    f"{_name(each)}, {EDGES[each.edges]}",
+                    f"{named(each)}, {EDGES[each.edges]}",
                     *(percent(share(each.plain["sweep"][step][value])) for value in values),
                 ]
                 for each in swept
@@ -315,10 +259,10 @@ def resolutions(results: Sequence[Result]) -> list[Table]:
     for scene in sorted({each.scene for each in results if column(each.scene) != each.scene}):
         if column(scene) not in published.TRAJECTORIES:
             continue
-        for each in _best_words([e for e in results if e.scene in (scene, column(scene))]):
+        for each in best_words([e for e in results if e.scene in (scene, column(scene))]):
             shares = [ceiling(each.stride_m), each.accuracy("anywhere")]
             gsd_m = f"{each.plain['trajectory']['gsd_m']:g}"
-            cells = [_name(each), EDGES[each.edges], gsd_m, f"{each.stride_m:g}"]
+            cells = [named(each), EDGES[each.edges], gsd_m, f"{each.stride_m:g}"]
             rows.append([column(scene), *cells, *map(percent, shares)])
     header = ("trajectory", "method", "input", "m per pixel", "tile step m", "possible", "anywhere")
     return [Table("Accuracy anywhere by ground resolution, %", header, rows)] if rows else []
@@ -332,44 +276,19 @@ def row_table(results: Sequence[Result]) -> Table:
         changed = "yes" if made["dirty"] else "no"
         about = [str(made["commit"])[:10], changed, str(made["date"])[:10]]
         mark = "yes" if each.family and is_tuned(each) else "no"
-        cost = [number(each.plain["minutes"]), str(made["cpu"])]
+        times = [each.plain.get("cpu_minutes"), each.plain["minutes"]]
+        cost = [*("-" if minutes is None else number(minutes) for minutes in times), made["cpu"]]
         rows.append([name_of(each), mark, *about, *cost])
-    header = ("row", "tuned on it", "commit", "files not committed", "date", "minutes", "processor")
-    return Table("Rows", header, rows)
-
-
-def _name(each: Result) -> str:
-    """Name of the method, with a star if it was tuned on its scene."""
-    return _plain_name(each) + ("*" if is_tuned(each) else "")
-
-
-def is_tuned(each: Result) -> bool:
-    """Whether a row was tuned on its scene."""
-    return tuned(each.family, each.plain["method"]["recipe"], each.scene, each.edges)
-
-
-def _plain_name(each: Result) -> str:
-    name = FAMILIES[each.family]
-    if each.family == "bovw":
-        return f"{name}, k = {each.plain['dims']}"
-    if each.family == "gradient":
-        return f"{name}, default" if each.registration else f"{name}, embedding only"
-    return name
-
-
-def _label(method: Method) -> str:
-    """Name of a method and its input."""
-    edges = method.edges.partition(":")[0]
-    if method.family == "gradient":
-        return "orthonav, default" if method.registration else "orthonav, embedding only"
-    return f"{FAMILIES[method.family]}, {EDGES[edges]}"
-
-
-def _by_scene(results: Iterable[Result]) -> list[tuple[str, list[Result]]]:
-    scenes: dict[str, list[Result]] = {}
-    for each in results:
-        scenes.setdefault(each.scene, []).append(each)
-    return sorted(scenes.items())
+    header = (
+        *("row", "tuned on it", "commit", "files not committed", "date"),
+        *("core minutes", "minutes", "processor"),
+    )
+    known = [each.plain["cpu_minutes"] for each in results if "cpu_minutes" in each.plain]
+    notes = (
+        f"core minutes: time of the processor, of {len(known)} rows together {sum(known):.0f}; "
+        "minutes: by the clock, longer beside other work",
+    )
+    return Table("Rows", header, rows, notes)
 
 
 def _median(values: Iterable[float]) -> float:

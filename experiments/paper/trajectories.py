@@ -66,8 +66,8 @@ class Setting:
 
     - `name`: "reduced", "full", or "gpu": the full auto-encoder on B and D.
     - `encoder_width`, `triplet_width`: widths of the networks, 512 and 64 in the paper.
-    - `encoder_rate`: learning rate of the auto-encoder: 3e-4 in the paper; 1e-3, as in the authors'
-      released code, if there are few steps.
+    - `encoder_rate`, `encoder_batch`: learning rate of the auto-encoder, 3e-4 in the paper, and its
+      tiles per batch. With few tiles shown, more and larger steps.
     - `encoder_tiles`, `triplet_tiles`: tiles shown in training; None: the paper's 200 epochs.
     - `triplet_batch`: tiles per batch of the triplet network.
     - `triplet_more`: further fields of the triplet recipe. With the hardest negatives and plain
@@ -81,6 +81,7 @@ class Setting:
     name: str
     encoder_width: int
     encoder_rate: float
+    encoder_batch: int
     encoder_tiles: int | None
     triplet_width: int
     triplet_tiles: int | None
@@ -109,8 +110,8 @@ class Setting:
 
 
 LEARNABLE = ",mining=semihard,similarity=cosine,margin=0.2"
-REDUCED = Setting("reduced", 32, 1e-3, 19_200, 8, 28_800, 64, LEARNABLE, (256, 1024), 100, 40)
-FULL = Setting("full", 512, 3e-4, None, 64, None, 512, "", (256, 1000, 3000, 10_000), 300, 300)
+REDUCED = Setting("reduced", 32, 3e-3, 16, 19_200, 8, 28_800, 64, LEARNABLE, (256, 1024), 100, 40)
+FULL = Setting("full", 512, 3e-4, 32, None, 64, None, 512, "", (256, 1000, 3000, 10_000), 300, 300)
 GPU = replace(FULL, name="gpu")
 SETTINGS = {each.name: each for each in (REDUCED, GPU, FULL)}
 PAPER_EPOCHS = 200

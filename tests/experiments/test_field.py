@@ -193,7 +193,7 @@ def test_every_method_gets_the_same_views(placed):
 
 
 def test_a_map_that_was_built_later_is_added(placed, monkeypatch):
-    """Only what is missing is placed; a result of other code is made anew."""
+    """Only what is missing is placed, and what was placed by other code."""
     place, scene = placed
     out = place.result(scene, "field")
     asked, whole = [], out.read_text()
@@ -204,9 +204,13 @@ def test_a_map_that_was_built_later_is_added(placed, monkeypatch):
     del plain["field"]["gradient-gradient"]
     out.write_text(json.dumps(plain))
     assert field.run(place, scene) and asked == ["gradient-gradient"]
+    plain = json.loads(whole)
+    plain["code"]["src/orthonav/embed/whitened.py"] = "0" * 12
+    out.write_text(json.dumps(plain))
+    assert field.run(place, scene) and asked[1:] == ["gradient-gradient"]
     plain["code"]["experiments/paper/matchers.py"] = "0" * 12
     out.write_text(json.dumps(plain))
-    assert field.run(place, scene) and asked[1:] == ["SIFT, ratio test", "gradient-gradient"]
+    assert field.run(place, scene) and asked[2:] == ["SIFT, ratio test", "gradient-gradient"]
     out.write_text(whole)
 
 

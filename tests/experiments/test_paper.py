@@ -246,14 +246,15 @@ def test_rows_tuned_on_their_scene_are_marked():
 
     words = {"bovw-gray-256", "bovw-gray-1024"}
     ours = {"gradient-gradient", "gradient-gradient-registration"}
-    assert marked("B") == words | ours | {"triplet-canny", "triplet-gray"}
+    learnt = {f"autoencoder-{edges}" for edges in ("canny", "gray", "segments", "onnx")}
+    assert marked("B") == words | ours | learnt | {"triplet-canny", "triplet-gray"}
     assert marked("naip-2018") == words | ours
     for scene in scenes.UNTUNED:
         assert marked(scene) == words
     assert not any(
         tuned(each.family, each.recipe, "B")
         for each in methods(FULL, "B", 900)
-        if each.family == "triplet"
+        if each.family in ("triplet", "autoencoder")
     )
 
 

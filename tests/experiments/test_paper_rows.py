@@ -6,10 +6,12 @@ from dataclasses import asdict
 import pytest
 from experiments.paper import stored
 from experiments.paper.__main__ import main
+from experiments.paper.comparison import above_default, orders
 from experiments.paper.methods import methods
 from experiments.paper.page import PAGE, missing, page, state
 from experiments.paper.results import Result
-from experiments.paper.tables import orders, resolutions
+from experiments.paper.tables import resolutions
+from experiments.paper.trainings import trainings
 from experiments.paper.trajectories import REDUCED, TABLE_1
 
 TILES = 940
@@ -44,7 +46,7 @@ def row(key="autoencoder-canny", scene="B"):
 
 
 def test_the_page_is_made_of_the_rows_in_the_repository():
-    assert PAGE.read_text(encoding="utf-8") == page(stored.stored())
+    assert PAGE.read_text(encoding="utf-8") == page(stored.stored(), stored.tried())
 
 
 def test_a_row_of_todays_code_is_current():
@@ -130,11 +132,56 @@ def test_the_order_of_the_papers_methods_is_compared():
     canny.plain["views"]["route"] = [[1.0, 1.0, 1.0, 1.0, 0.0]] * 400
     (table,) = orders([grey, canny])
     assert table.rows == [
-        ["B", "Auto-Encoder, Canny", "Auto-Encoder, grey", "90.2 : 71.2", "100 : 0", "yes"]
+        ["B", "Auto-Encoder*, Canny", "Auto-Encoder*, grey", "90.2 : 71.2", "100 : 0", "yes"]
     ]
     grey.plain["views"]["route"] = canny.plain["views"]["route"]
     (table,) = orders([grey, canny])
     assert table.rows[0][-1] == "equal"
+
+
+def test_rows_above_the_default_are_named():
+    ours, canny = row("gradient-gradient-registration"), row()
+    for placement in ("grid", "anywhere"):
+        ours.plain["views"][placement] = [[1.0, 1.0, 1.0, 1.0, 0.0]] * 50
+    ours.plain["views"]["route"] = [[99.0, 1.0, 1.0, 1.0, 0.0]] * 50
+    canny.plain["views"]["route"] = [[1.0, 1.0, 1.0, 1.0, 0.0]] * 50
+    (table,) = above_default([canny, ours])
+    expected = ["B", "route", "50", "0", "Auto-Encoder*", "Canny", "100", "significant"]
+    assert table.rows == [expected] and "2 of 3" in table.notes[0]
+    ours.plain["views"]["route"] = [*[[1.0] * 5] * 49, [99.0] * 5]
+    assert above_default([canny, ours])[0].rows[0][-1] == "within the noise"
+    assert above_default([canny]) == []
+
+
+def test_trainings_are_compared_on_scenes_with_another_one():
+    made = row()
+    made.plain["rules"] = {"grid": {"cosine best": [3, 4]}}
+    other = Result(made.plain | {"method": made.plain["method"] | {"recipe": "autoencoder"}})
+    elsewhere = Result(made.plain | {"scene": "D"})
+    rows = trainings([other], [made, elsewhere, other]).rows
+    assert [each[:5] for each in rows] == [
+        ["B", "Canny", "32", "0.0003", "188,000"],
+        ["B", "Canny", str(REDUCED.encoder_batch), f"{REDUCED.encoder_rate:g}", "18,800"],
+    ]
+    assert rows[1][7] == "75"
+
+
+def test_a_row_is_not_older_for_the_training_of_another_method():
+    made = row("triplet-gray")
+    made.plain["setting"]["encoder_rate"] = 1.0
+    made.plain["setting"]["words"] = [1]
+    assert stored.older(made) == []
+    made.plain["setting"]["triplet_batch"] = 1
+    assert stored.older(made) == ["setting"]
+
+
+def test_results_of_another_training_are_kept_apart(tmp_path, monkeypatch):
+    monkeypatch.setattr(stored, "ROWS", tmp_path / "rows")
+    folder = tmp_path / "results" / "reduced"
+    folder.mkdir(parents=True)
+    (folder / "B-autoencoder-canny.json").write_text(stored.compact(row().plain))
+    assert stored.keep(tmp_path / "results", "reduced", "slow") == ["B-autoencoder-canny"]
+    assert stored.stored() == [] and len(stored.tried()) == 1
 
 
 def test_ground_resolutions_of_a_trajectory_are_compared():

@@ -2,13 +2,16 @@
 
 import json
 import math
+from functools import partial
+from types import SimpleNamespace
 
 import pytest
 
 from orthonav.errors import FlightError, MissingFileError
-from orthonav.flight.mount import Bias, Mount, read_mount, write_mount
+from orthonav.flight.mount import Bias, Mount, MountedFlight, read_mount, write_mount
 from orthonav.records import Telemetry
 
+Recorded = partial(SimpleNamespace, camera="camera", note="note", expected=1)
 MOUNT = Mount(
     Bias(4.0, 0.5, 1.0), Bias(-0.1, 0.01, 0.02), Bias(6.5, 0.3, 0.7), Bias(-1.25, 0.4, 0.5), 17
 )
@@ -71,3 +74,13 @@ def test_a_missing_field_is_named(tmp_path):
     path.write_text('{"camera": 1}')
     with pytest.raises(FlightError, match="orthonav_mount is missing"):
         read_mount(path)
+
+
+def test_a_flight_is_seen_without_the_errors_of_its_mount():
+    flight = Recorded(
+        views=(SimpleNamespace(frame="1.png", telemetry=Telemetry(5, 1.0, 2.0, 0.0, 9.0)),)
+    )
+    mounted = MountedFlight(flight, MOUNT)
+    (view,) = mounted.views
+    assert view.frame == "1.png" and view.telemetry.pitch_deg == 8.5
+    assert (mounted.camera, mounted.note, mounted.expected) == ("camera", "note", 1)

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.relief_views import Raster, random_relief, seen_view
 from blots import CAMERA, GROUND, as_grey
 
 from orthonav.geo.ground import bilinear
@@ -15,6 +14,7 @@ from orthonav.localizer.orthorectify import (
     orthorectified,
 )
 from orthonav.records import Telemetry, View
+from orthonav.simulate.perspective import Raster, random_relief, seen_view
 
 PIXEL_M, POSTING_M, SIDE_M = 1.0, 10.0, 800.0
 MIDDLE_M = SIDE_M / 2

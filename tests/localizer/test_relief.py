@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.relief_views import Raster, random_relief, seen_view
 from blots import AGL_M, CAMERA, FINEST_M, GROUND, as_grey, known_map, rendered
 
 from orthonav.flight.fixes import result_to_json
@@ -14,6 +13,7 @@ from orthonav.localizer import Localizer
 from orthonav.localizer.relief import Relief
 from orthonav.mapfile import open_map
 from orthonav.records import Fix, Telemetry, View, ViewResult
+from orthonav.simulate.perspective import Raster, random_relief, seen_view
 
 SIDE_M, POSTING_M = 700.0, 10.0
 PLACE = np.array([30.0, -40.0])
@@ -199,3 +199,12 @@ def test_maps_without_a_terrain_take_none_of_these_paths(opened, monkeypatch):
     fix = Localizer(opened).locate(View(picture, CAMERA, telemetry((30.0, 44.0, 0.0))))
     assert fix.ground_latlon_deg is None and "terrain_gain" not in fix.evidence
     assert "ground" not in result_to_json(ViewResult("a", 0, fix, 1.0))
+
+
+def test_views_far_off_nadir_are_found_on_hills(opened, grey, relief):
+    attitude = (70.0, 60.0, 0.0)
+    place = np.array([-60.0, -120.0])
+    picture, _ = seen_from(grey, relief, attitude, place=place)
+    localizer = on_terrain(opened, relief)
+    fix = localizer.locate(View(picture, CAMERA, telemetry((74.0, 60.0, 0.0))))
+    assert error_m(localizer, fix, place) < 5.0 and fix.confidence > 0.9

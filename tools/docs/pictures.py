@@ -96,6 +96,9 @@ def _draw(folder: Path) -> None:
     for name in ("error-curve", "reliability", "map"):
         shutil.copy(folder / "report" / "figures" / f"{name}.png", PICTURES)
     shutil.copy(folder / "tracked" / "figures" / "worst-views.png", PICTURES)
+    exceptions = str(PICTURES / "exceptions.jpg")
+    command = [sys.executable, "-m", "experiments.paper.exceptions", "--out", exceptions]
+    subprocess.run(command, cwd=ROOT, check=True)
 
 
 def _figure(name: str, size_in: tuple[float, float], draw: Callable[[Any], None]) -> None:

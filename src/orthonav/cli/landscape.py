@@ -22,13 +22,20 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--gsd-m", type=float, default=1.0, help="ground resolution, metres per pixel (default 1)"
     )
+    parser.add_argument(
+        "--hills",
+        type=float,
+        metavar="SLOPE",
+        help="also write the terrain dem.tif, hills of this root mean square slope (0.15), "
+        "and for each date the surface model *_dsm.tif with its buildings and trees",
+    )
     parser.add_argument("--seed", type=int, default=1, help="seed of the landscape (default 1)")
     parser.add_argument("--json", action="store_true", help="print the file names as JSON")
 
 
 def run(options: argparse.Namespace) -> None:
     """Generate the files and print their names."""
-    from orthonav.simulate.landscape import generate_area
+    from orthonav.simulate.landscape import generate_area, generate_heights
 
     with progress(options) as shown:
         files = generate_area(
@@ -38,6 +45,14 @@ def run(options: argparse.Namespace) -> None:
             seed=options.seed,
             progress=lambda share: shown("landscape", share),
         )
+        if options.hills is not None:
+            files += generate_heights(
+                options.out,
+                slope=options.hills,
+                size_m=tuple(options.size_m),
+                gsd_m=options.gsd_m,
+                seed=options.seed,
+            )
     if options.json:
         print_json({"files": [str(path) for path in files]})
     else:

@@ -158,6 +158,7 @@ def _on_map(options: argparse.Namespace) -> None:
     from orthonav.errors import VariantError
     from orthonav.flight.export import export_all, export_of
     from orthonav.flight.fixes import write_results
+    from orthonav.flight.mount import MountedFlight
     from orthonav.localizer.tracker import Tracker
     from orthonav.mapfile import open_map
     from orthonav.mapfile.terrain import TerrainLayer
@@ -212,7 +213,8 @@ def _on_map(options: argparse.Namespace) -> None:
         write_results(options.out, results)
         export_all(exports, results, dem or TerrainLayer.of(opened))
         advice, tried = doubts.advice(results, accept, shown)
-        changed = report_changes(options, opened, [(flight, results)], shown)
+        seen_by = MountedFlight(flight, mount) if mount else flight
+        changed = report_changes(options, opened, [(seen_by, results)], shown)
     _print_summary(options, results, accept, advice, tried, changed)
 
 

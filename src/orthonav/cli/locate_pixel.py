@@ -6,9 +6,6 @@ from pathlib import Path
 
 from orthonav.cli.common import print_json
 
-ELLIPSE_95 = math.sqrt(5.991)
-"""Axes of the 95 % ellipse over standard deviations: chi-squared of two degrees of freedom."""
-
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
@@ -47,7 +44,7 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.flight.pixel import locate_pixel
     from orthonav.mapfile import open_map
     from orthonav.mapfile.terrain import TerrainLayer
-    from orthonav.publish.estimate import error_ellipse
+    from orthonav.publish.estimate import ELLIPSE_95, error_ellipse
     from orthonav.records import Fix
 
     result = {each.frame: each for each in read_results(options.fixes)}.get(options.frame)

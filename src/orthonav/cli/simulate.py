@@ -27,7 +27,15 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--dem that at the first view of a route, which is flown at a constant altitude",
     )
     add_dem(
-        parser, "over which is flown; heights above sea level and take-off are reported, not ground"
+        parser,
+        "over which is flown and which views show in perspective; a surface model has its houses "
+        "and trees stand up; heights above sea level and take-off are reported, not ground",
+    )
+    parser.add_argument(
+        "--camera-pitch-deg",
+        type=float,
+        default=0.0,
+        help="angle by which the camera looks ahead of straight down, 0 to 65 (default 0)",
     )
     parser.add_argument(
         "--spacing-m",
@@ -151,6 +159,7 @@ def run(options: argparse.Namespace) -> None:
     if options.wind_from_deg is not None and options.wind_mps is None:
         raise FlightError("--wind-from-deg needs the speed of the wind (--wind-mps)")
     from_deg = 270.0 if options.wind_from_deg is None else options.wind_from_deg
+    dem = dem_of(options)
     request = SimulateRequest(
         orthos=options.ortho,
         out=options.out,
@@ -179,7 +188,9 @@ def run(options: argparse.Namespace) -> None:
         wind=None if options.wind_mps is None else Wind(options.wind_mps, from_deg),
         turn_radius_m=options.turn_radius_m,
         cloud_share=options.cloud_share,
-        terrain=dem_of(options),
+        terrain=dem,
+        terrain_posting_m=1.0 if dem is None else dem.gsd_m,
+        camera_pitch_deg=options.camera_pitch_deg,
         beyond=options.beyond,
         gnss=receiver_of(options.receiver) if options.receiver else None,
     )

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from orthonav.flight.terrain_fit import TerrainFit
 from orthonav.geo.frames import LocalFrame
 from orthonav.geo.ground import Ground, TerrainHeights, ground_around, ground_over
 from orthonav.records import CONFIDENT, DEFAULT_AGL_STD, Fix, NoFix, Telemetry
@@ -84,7 +85,7 @@ class GroundHeights:
         `place`: latitude and longitude, roughly. Unchanged where the height above ground was
         measured, and where no other height is known.
         """
-        found = None if is_measured(telemetry) else self._above_sea(telemetry, place)
+        found = None if is_measured(telemetry) else self.above_sea(telemetry, place)
         if found is None:
             return telemetry
         above_sea_m, std_m = found
@@ -102,7 +103,7 @@ class GroundHeights:
             return math.nan
         return telemetry.home_m + self.take_off.height_m - telemetry.amsl_m
 
-    def _above_sea(self, telemetry: Telemetry, place: Place) -> tuple[float, float] | None:
+    def above_sea(self, telemetry: Telemetry, place: Place) -> tuple[float, float] | None:
         """Height above sea level and its standard deviation by the terrain; None where unknown."""
         if telemetry.amsl_m is not None:
             return telemetry.amsl_m, 0.0
@@ -141,6 +142,7 @@ class FlownHeights:
         self._heights = GroundHeights(terrain, known or self._whole, geoid)
         self._checked = known is None
         self._last: tuple[int, Place, float] | None = None
+        self._fit, self._newest = TerrainFit(terrain), Telemetry(-1, 0.0, 0.0, 0.0, math.nan)
 
     def corrected(self, telemetry: Telemetry) -> Telemetry:
         """The telemetry with its height above ground; unchanged where that was measured, NaN where
@@ -148,6 +150,7 @@ class FlownHeights:
         if is_measured(telemetry):
             return telemetry
         self._check(telemetry)
+        self._newest = telemetry
         place, std_m = self._place(telemetry)
         below = None if place is None else ground_around(self._terrain, place, std_m)
         below = below or self._whole
@@ -168,6 +171,9 @@ class FlownHeights:
         if state in (None, "tracking"):
             std_m = math.sqrt(float(np.trace(outcome.cov_en_m2)) / 2)
             self._last = time_ns, (outcome.lat_deg, outcome.lon_deg), std_m
+            reported = self._heights.above_sea(self._newest, self._last[1])
+            if self._newest.time_ns == time_ns and reported is not None:
+                self._fit.take(outcome, reported[0])
 
     def _place(self, telemetry: Telemetry) -> tuple[Place | None, float]:
         """Expected position and its standard deviation per axis."""

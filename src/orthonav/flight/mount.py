@@ -4,11 +4,14 @@
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from orthonav.flight.calibrated import read_record, write_record
+from orthonav.flight.recording import Flight, WithTelemetry
+from orthonav.geo.camera import Camera
 from orthonav.records import Telemetry
 
 _LIMITS = {"heading_deg": 180.0, "log_scale": 1.0, "pitch_deg": 60.0, "roll_deg": 60.0}
@@ -48,6 +51,35 @@ class Mount:
             pitch_deg=telemetry.pitch_deg + self.pitch_deg.value,
             roll_deg=telemetry.roll_deg + self.roll_deg.value,
         )
+
+
+@dataclass(frozen=True)
+class MountedFlight:
+    """A recorded flight without the errors of its mount."""
+
+    flight: Flight
+    mount: Mount
+
+    @property
+    def camera(self) -> Camera:
+        """See `Flight.camera`."""
+        return self.flight.camera
+
+    @property
+    def note(self) -> str:
+        """See `Flight.note`."""
+        return self.flight.note
+
+    @property
+    def views(self) -> Iterator[WithTelemetry]:
+        """See `Flight.views`."""
+        for view in self.flight.views:
+            yield WithTelemetry(view, self.mount.corrected(view.telemetry))
+
+    @property
+    def expected(self) -> int:
+        """See `Flight.expected`."""
+        return self.flight.expected
 
 
 def write_mount(path: Path, mount: Mount) -> None:

@@ -15,13 +15,9 @@ from numpy.typing import NDArray
 from orthonav.errors import FlightError
 from orthonav.geo.camera import Camera, ground_en_m
 from orthonav.geo.frames import LocalFrame
-from orthonav.geo.ground import TerrainHeights
+from orthonav.geo.ground import TerrainHeights, sight_on_ground
 from orthonav.records import DEFAULT_AGL_STD, DEFAULT_YAW_STD_DEG, Fix, Telemetry
 
-SIGHT_STEPS = 512
-"""Points along a line of sight at which it is compared with the terrain."""
-DEEPEST_M = 1000.0
-"""Terrain is sought down to so far below the ground under the camera."""
 STEP = 1e-3
 """Step of the derivatives: rad, and log scale."""
 LEAST_M = 0.05
@@ -125,14 +121,7 @@ def _ground(camera: Camera, px: tuple[float, float], values: Array, relief: Reli
     slope = ground_en_m(camera, np.array([px]), yaw_deg, pitch_deg, roll_deg, 1.0)[0]
     if relief is None:
         return np.asarray(slope * agl_m)
-    drops = np.linspace(0.0, agl_m + DEEPEST_M, SIGHT_STEPS)
-    above = agl_m - drops - relief(drops[:, None] * slope)
-    reached = np.flatnonzero(above <= 0)
-    if not reached.size or reached[0] == 0 or not np.isfinite(above[: reached[0]]).all():
-        return np.full(2, np.nan)
-    last, first = above[reached[0] - 1], above[reached[0]]
-    drop = drops[reached[0] - 1] + (drops[1] - drops[0]) * last / (last - first)
-    return np.asarray(slope * drop)
+    return sight_on_ground(slope, agl_m, relief)
 
 
 def _slopes(camera: Camera, px: tuple[float, float], values: Array, relief: Relief | None) -> Array:

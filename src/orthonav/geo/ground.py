@@ -15,6 +15,9 @@ TerrainHeights = Callable[[Array, Array], Array]
 where they are unknown."""
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
 """Heights of the ground above mean sea level: the Dead Sea is at -430 m, Mount Everest at 8,849."""
+SIGHT_STEPS = 512
+"""Points along a line of sight at which it is compared with the ground."""
+DEEPEST_M = 1000.0
 _RINGS = 5
 
 
@@ -71,6 +74,25 @@ def bilinear(heights: Array, col: Array, row: Array) -> Array:
         (1 - x) * heights[bottom, left] + x * heights[bottom, right]
     )
     return np.where(beyond, np.nan, found)
+
+
+def sight_on_ground(slope_en: Array, height_m: float, ground_m: Callable[[Array], Array]) -> Array:
+    """Metres east and north of a camera (2,) where a line of sight first meets the ground.
+
+    `slope_en` (2,): how far it goes for each metre that it descends. `height_m`: of the camera,
+    `ground_m`: of the ground at metres east and north of the camera (N, 2), over the same level.
+    The ground is sought down to `DEEPEST_M` below that under the camera. NaN where it is not met,
+    or behind unknown ground.
+    """
+    below_m = float(ground_m(np.zeros((1, 2)))[0])
+    drops = np.linspace(0.0, height_m - below_m + DEEPEST_M, SIGHT_STEPS)
+    above = height_m - drops - ground_m(drops[:, None] * slope_en)
+    reached = np.flatnonzero(above <= 0)
+    if not reached.size or reached[0] == 0 or not np.isfinite(above[: reached[0]]).all():
+        return np.full(2, np.nan)
+    last, first = above[reached[0] - 1], above[reached[0]]
+    drop = drops[reached[0] - 1] + (drops[1] - drops[0]) * last / (last - first)
+    return np.asarray(slope_en * drop)
 
 
 def _disc() -> Array:

@@ -48,6 +48,10 @@ displacement cancels most of it."""
 SAME_BIAS = np.array([math.inf, 0.01, math.radians(0.1), math.radians(0.1)])
 """Changes of the biases of heading, log scale, pitch and roll up to which a view need not be
 rectified again. Heading has no limit: views are rectified with their heading up."""
+UNKNOWN_SLOPE, LEFT_OF_SLOPE = 0.1, 0.3
+"""Usual slope of ground whose slope is unknown, and the share of it that a terrain leaves."""
+LEAST_SCALED = 0.5
+"""Least height over that of the view before: the rest is an error."""
 Array = NDArray[np.float64]
 NO_BIAS: Array = np.zeros(4)
 
@@ -210,6 +214,37 @@ def displacement(
         scaled=pose.log_scale + float(now.bias[1] - before.bias[1]),
     )
     return ViewDisplacement(seen, min(max(placed.overlap, 0.0), 1.0))
+
+
+def over_terrain(
+    measured: ViewDisplacement, agl_m: tuple[float, float], slope: Array | None
+) -> ViewDisplacement:
+    """A displacement over ground that is not level.
+
+    `agl_m`: heights reported with both views. `slope` (2,): rise of the ground per metre east and
+    north; None where it is unknown. Level ground is assumed by the measurement: by parallax, a
+    slope along the way looks like a change of scale, one across it like a turn, each by half. And
+    the height above the ground below changes by what this rises (docs/decisions/terrain.md).
+    """
+    seen = measured.displacement
+    share_en = seen.moved_en_m / agl_m[0]
+    reported = math.log(agl_m[1] / agl_m[0])
+    rise, across = 0.0, 0.0
+    unknown = UNKNOWN_SLOPE
+    if slope is not None:
+        rise = float(share_en @ slope)
+        across = float(share_en[1] * slope[0] - share_en[0] * slope[1])
+        unknown *= LEFT_OF_SLOPE
+    unknown *= float(np.hypot(*share_en))
+    left = math.exp(seen.scaled + reported) - 1.5 * rise
+    over = replace(
+        seen,
+        turned_rad=seen.turned_rad + across / 2,
+        turned_std_rad=math.hypot(seen.turned_std_rad, unknown / 2),
+        scaled=math.log(max(left, LEAST_SCALED)) - reported,
+        scaled_std=math.hypot(seen.scaled_std, 1.5 * unknown),
+    )
+    return replace(measured, displacement=over)
 
 
 def _registered(

@@ -35,6 +35,10 @@ measured to be alike (docs/decisions/registration.md, 1)."""
 MIN_VIEW_PX = 24.0
 """Narrower views (pixels of the map across) are refused: a template of 24 px is a sixth of the size
 that views are finished at (docs/decisions/registration.md, 2)."""
+NEAR_SHARE = 0.6
+"""The part of a view far off nadir is judged as one so many times smaller, thus mostly one level
+finer: it is no square, and on its coarse levels too little is left of it
+(docs/decisions/terrain.md)."""
 MIN_TILT_COS = 0.5
 """Beyond a tilt of 60 deg the footprint is not expected to grow: it is cut off (`rectify`)."""
 
@@ -75,7 +79,7 @@ def prepare(view: View, gsd_m: float, map_levels: int, heading_known: bool) -> P
         near = near_part(view, gsd_m)
         if near is None:
             return NoFix("too_small", "the view shows no ground that is near enough")
-        nominal_m = math.sqrt(near.area_m2)
+        nominal_m = NEAR_SHARE * math.sqrt(near.area_m2)
     levels = Levels.of(nominal_m / gsd_m, map_levels)
 
     @functools.cache

@@ -18,18 +18,13 @@ from numpy.typing import NDArray
 
 from orthonav.confidence.registered import USUAL_CHANCES, Chances, RegisteredConfidence
 from orthonav.errors import MapFileError, VariantError
+from orthonav.localizer.over_relief import GroundSeen, ViewOnLevelGround, ViewOverRelief
 from orthonav.localizer.plan import DEFAULT_PLAN, Budget, ClearMargin, Search, SearchPlan
 from orthonav.localizer.prepared import PreparedView, prepare
 from orthonav.localizer.propose import TileProposer
 from orthonav.localizer.rectify import looks_aside, off_nadir_deg
-from orthonav.localizer.relief import (
-    CameraFound,
-    GroundSeen,
-    LevelTerrain,
-    Relief,
-    ViewOnLevelGround,
-    ViewOverRelief,
-)
+from orthonav.localizer.relief import LevelTerrain, Relief
+from orthonav.localizer.relief_camera import CameraFound
 from orthonav.mapfile.layer import GreyLayer
 from orthonav.mapfile.manifest import SheetInfo
 from orthonav.mapfile.reader import MapFile

@@ -13,11 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import MapFileError
+from orthonav.geo.ground import Ground
 from orthonav.localizer.checks import check_view
 from orthonav.localizer.localizer import Localizer
-from orthonav.localizer.odometry import OdometryView, ViewDisplacement, corrected_by, displacement
+from orthonav.localizer.odometry import (
+    OdometryView,
+    ViewDisplacement,
+    corrected_by,
+    displacement,
+    over_terrain,
+)
 from orthonav.localizer.places import places_of
 from orthonav.localizer.prepared import PreparedView
+from orthonav.localizer.relief import Relief
 from orthonav.localizer.tilt import with_tilt
 from orthonav.records import PRIOR_SIGMAS, Fix, NoFix, Prior, Telemetry, View
 from orthonav.register.registrar import Registered
@@ -31,7 +39,7 @@ from orthonav.track import (
     State,
 )
 from orthonav.track.hypotheses import within
-from orthonav.track.model import BIASES, HEADING, SCALE, TILT, VELOCITY
+from orthonav.track.model import BIASES, HEADING, POSITION, SCALE, TILT, VELOCITY
 from orthonav.track.motion import usual_velocity_std_mps
 from orthonav.track.smooth import History, Smoothed
 
@@ -59,6 +67,8 @@ RADIUS_SHARE = 0.025
 """Least radius of the confidence over the height: what an error of 1.4 deg in tilt makes."""
 KNOWN_MPS = 5.0
 """An estimated velocity with less uncertainty than this predicts the next displacement."""
+KNOWN_PLACE_M = 50.0
+"""The slope of the ground below is known where the position is known better than this."""
 Array = NDArray[np.float64]
 
 
@@ -324,7 +334,19 @@ class Tracker:
         if before is None or now is None or before.pixel_m != now.pixel_m:
             return None
         tilt_noise = self._tilt_noise(now.telemetry)
-        return displacement(before, now, tilt_noise, telemetry_noise, expected_en_m)
+        made = displacement(before, now, tilt_noise, telemetry_noise, expected_en_m)
+        if made is None or self._registration.relief is None:
+            return made
+        heights_m = before.view.telemetry.agl_m, now.view.telemetry.agl_m
+        return over_terrain(made, heights_m, self._slope(self._registration.relief))
+
+    def _slope(self, relief: Relief) -> Array | None:
+        """Rise of the ground below (2,) per metre east and north; None where it is unknown."""
+        best = self.mixture.likeliest
+        if best is None or np.trace(best.covariance[POSITION, POSITION]) > KNOWN_PLACE_M**2:
+            return None
+        slope = relief.slopes(best.mean[None, POSITION])[0]
+        return slope if np.isfinite(slope).all() else None
 
     def _update(self, view: View, overlap: float, ground: float) -> NoFix | None:
         """Register the view and update the mixture; a `NoFix` where it shows too little."""
@@ -332,10 +354,13 @@ class Tracker:
         expected = self.mixture.estimate(self._radius_m(telemetry), between_views=True)
         prior, searched, confirms = self._search_area(expected)
         bias, spread = self._correction(telemetry, expected, prior)
+        known = _known(corrected_by(telemetry, bias), spread)
+        if prior is not None and expected is not None and telemetry.below is not None:
+            known = self._above_expected(known, expected.mean[:2])
         corrected = replace(
             view,
             camera=replace(view.camera, focal_std=0.0),  # part of the spread of the scale
-            telemetry=_known(corrected_by(telemetry, bias), spread),
+            telemetry=known,
         )
         seen = self._registration.register(corrected, prior, self._heading_known)
         if isinstance(seen, NoFix):
@@ -357,6 +382,15 @@ class Tracker:
         self._seen = sightings
         self.mixture.update(attitude, sightings, newness, searched, ground, confirms=confirms)
         return None
+
+    def _above_expected(self, telemetry: Telemetry, place_en_m: Array) -> Telemetry:
+        """Corrected telemetry, its height above the ground where the aircraft is expected: what it
+        was corrected by includes the error of the ground that was assumed before."""
+        relief = self._registration.relief
+        height_m = math.nan if relief is None else float(relief.terrain.at_en_m(place_en_m))
+        if not math.isfinite(height_m):
+            return replace(telemetry, below=None)
+        return replace(telemetry, below=Ground(height_m, 0.0, 1.0))
 
     def _correction(
         self, telemetry: Telemetry, expected: Estimate | None, prior: Prior | None

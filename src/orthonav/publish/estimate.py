@@ -16,6 +16,8 @@ from orthonav.records import CONFIDENT, Fix, ViewResult
 
 _ROUNDING = 1e-9
 """Negative eigenvalues up to this share of the largest one are rounding errors."""
+ELLIPSE_95 = math.sqrt(5.991)
+"""Axes of the 95 % ellipse over standard deviations: chi-squared of two degrees of freedom."""
 
 
 class EstimateError(OrthonavError, ValueError):

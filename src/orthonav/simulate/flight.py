@@ -35,9 +35,16 @@ from orthonav.simulate.motion import (
     steady_path,
     windy_path,
 )
+from orthonav.simulate.perspective import Raster
 from orthonav.simulate.receiver import Good, samples_of, solutions
-from orthonav.simulate.render import ViewEffects, render_view
-from orthonav.simulate.terrain import ground_below_m, reported_heights
+from orthonav.simulate.render import ViewEffects, degraded, render_view
+from orthonav.simulate.terrain import (
+    ground_below_m,
+    near_ground_en_m,
+    reported_heights,
+    seen_over,
+    surface_of,
+)
 
 DEFAULT_CAMERA = Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)
 """A field of view of 65 x 51 deg, typical of survey drones."""
@@ -45,6 +52,7 @@ MAX_VIEWS = 1_000_000
 """Sanity limit."""
 TRIES_PER_VIEW = 400
 """Random positions tried per view; suffices if 2 % of them are covered by imagery."""
+MAX_PITCH_DEG = 65.0
 MARGIN_PX = 4
 """Margin of the ground window: radius of the bicubic kernel, and rounding."""
 Array = NDArray[np.float64]
@@ -133,8 +141,10 @@ class SimulateRequest:
     - `turn_radius_m`: radius of the corners of a route, 0..100,000 m; 0 turns on the spot.
     - `cloud_share`: share of the views with clouds, 0..1.
     - `beyond`: whether the route may leave the imagery, which is then mirrored at its border.
-    - `terrain`: heights of the ground above mean sea level. The telemetry then reports heights
-      above sea level and, on a route, above the first view, and no measured one above ground.
+    - `terrain`: heights of the ground or surface above mean sea level. Views are then true
+      perspectives of it, and the telemetry reports heights above sea level and, on a route, above
+      the first view, and no measured one above ground. `terrain_posting_m`: its resolution.
+    - `camera_pitch_deg`: angle by which the camera looks ahead of straight down, 0..65; reported.
     - `gnss`: receiver whose solutions are written to `gnss.csv`; only on a route.
     """
 
@@ -154,7 +164,14 @@ class SimulateRequest:
     cloud_share: float = 0.0
     beyond: bool = False
     terrain: TerrainHeights | None = None
+    terrain_posting_m: float = 5.0
+    camera_pitch_deg: float = 0.0
     gnss: Good | None = None
+
+    @property
+    def in_perspective(self) -> bool:
+        """Whether views are rendered ray by ray; else as level ground seen without the horizon."""
+        return self.terrain is not None or self.camera_pitch_deg > 0
 
 
 @dataclass(frozen=True)
@@ -210,6 +227,10 @@ def simulate_flight(
         coverage = Coverage(mosaic, area)
         poses = list(_poses(request, area, agl_m, coverage))
         ground = _ground(request, raster, (west, north, gsd_m), coverage)
+        surface = None
+        if request.in_perspective:
+            posting_m = request.terrain_posting_m
+            surface = surface_of(request.terrain, area.frame, area.extent_en_m, posting_m)
         clouds = None
         if request.cloud_share > 0:
             clouds = Clouds(len(poses), request.cloud_share, request.seed)
@@ -218,7 +239,7 @@ def simulate_flight(
         digits = max(4, len(str(len(poses))))
         for number, pose in enumerate(poses):
             rng = np.random.default_rng([request.seed, 1, number])
-            image = _picture(request, ground, clouds, number, pose, rng)
+            image = _picture(request, ground, surface, clouds, number, pose, rng)
             lat, lon = area.frame.latlon_from_en(pose.position_en_m)
             telemetry = _telemetry(request, area, pose, rng)
             quality = request.effects.jpeg_quality
@@ -259,6 +280,13 @@ def _check(request: SimulateRequest) -> None:
         raise FlightError(
             f"cloud_share must be 0 to 1 (a share of the views), got {request.cloud_share}"
         )
+    if not 0 <= request.camera_pitch_deg <= MAX_PITCH_DEG:
+        raise FlightError(
+            f"the camera must look 0 to {MAX_PITCH_DEG:g} deg ahead of straight down, "
+            f"got {request.camera_pitch_deg}"
+        )
+    if request.cloud_share and request.camera_pitch_deg:
+        raise FlightError("clouds are simulated below cameras that look straight down only")
     on_a_route = {
         "wind": request.wind is not None,
         "turn_radius_m": request.turn_radius_m > 0,
@@ -289,7 +317,7 @@ def _ground(
 ) -> GroundImagery:
     """The raster with `corner` (west, north, pixel size, metres), mirrored if requested."""
     west_m, north_m, gsd_m = corner
-    if not request.beyond:
+    if not (request.beyond or request.in_perspective):
         return GroundImagery(raster, west_m, north_m, gsd_m)
     west, south, east, north = coverage.box_en_m()
     box = (
@@ -301,10 +329,14 @@ def _ground(
     return GroundImagery(raster, west_m, north_m, gsd_m, box)
 
 
-def _sees_ground(coverage: Coverage, camera: Camera, pose: _Pose) -> bool:
-    """Whether imagery covers the whole view, without the horizon."""
+def _sees_ground(coverage: Coverage, request: SimulateRequest, pose: _Pose) -> bool:
+    """Whether imagery covers the whole view, or all that it sees from near."""
+    if request.camera_pitch_deg > 0:
+        angles = pose.yaw_deg, pose.pitch_deg, pose.roll_deg
+        outline = near_ground_en_m(request.camera, angles, pose.agl_m)
+        return outline is not None and coverage.whole(pose.position_en_m + outline)
     try:
-        return coverage.whole(_corners_en_m(camera, pose))
+        return coverage.whole(_corners_en_m(request.camera, pose))
     except CameraError:
         return False
 
@@ -321,7 +353,7 @@ def _poses(
         for _ in range(TRIES_PER_VIEW):
             place = rng.uniform([west, south], [east, north])
             pose = _tilted(request, rng, place, rng.uniform(0, 360), agl_m, number * 1.0)
-            if _sees_ground(coverage, request.camera, pose):
+            if _sees_ground(coverage, request, pose):
                 yield _above_sea(request, area, pose)
                 break
         else:
@@ -363,7 +395,7 @@ def _route_poses(
         pose = _tilted(request, rng, place, float(heading), above_m, time_s, velocity)
         if ground_m is not None:
             pose = replace(pose, home_m=agl_m, amsl_m=agl_m + float(ground_m[0]))
-        if not request.beyond and not _sees_ground(coverage, request.camera, pose):
+        if not request.beyond and not _sees_ground(coverage, request, pose):
             lat, lon = (float(value) for value in area.frame.latlon_from_en(place))
             raise AreaError(
                 f"view {number + 1} of the route, at {lat:.5f}, {lon:.5f}, "
@@ -426,7 +458,8 @@ def _tilted(
 ) -> _Pose:
     errors = request.errors
     tilt = np.clip(rng.normal(0, 1, 2), -2.5, 2.5) * errors.attitude_std_deg
-    reported = (float(yaw_deg), float(tilt[0]), float(tilt[1]))
+    pitch_deg = request.camera_pitch_deg + float(tilt[0])
+    reported = (float(yaw_deg), pitch_deg, float(tilt[1]))
     true = mounted(reported, *errors.mount_deg) if any(errors.mount_deg) else reported
     return _Pose(place, *true, agl_m, time_s, reported, reported_en_mps)
 
@@ -439,6 +472,7 @@ def _corners_en_m(camera: Camera, pose: _Pose) -> Array:
 def _picture(
     request: SimulateRequest,
     ground: GroundImagery,
+    surface: Raster | None,
     clouds: Clouds | None,
     number: int,
     pose: _Pose,
@@ -446,6 +480,14 @@ def _picture(
 ) -> NDArray[np.uint8]:
     """The image of the camera (H, W, 3), rendered from the window of imagery under it."""
     camera, attitude = request.camera, pose.attitude
+    if surface is not None:
+        above_m = pose.agl_m if pose.amsl_m is None else pose.amsl_m
+        position = np.array([*pose.position_en_m, above_m])
+        picture = seen_over(surface, ground, camera, attitude[:3], position, pose.agl_m, MARGIN_PX)
+        cover = None
+        if clouds is not None:
+            cover = clouds.before(number, camera, attitude, pose.position_en_m)
+        return degraded(picture, request.effects, rng, cover)
     rgb, corner_en_m = ground.window(_corners_en_m(camera, pose), MARGIN_PX)
     cover = None
     if clouds is not None:

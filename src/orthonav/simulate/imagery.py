@@ -36,7 +36,7 @@ class Coverage:
             self._missing = ~raster.read_grey(0, 0, width, height).valid
 
     def whole(self, corners_en_m: Array) -> bool:
-        """Whether imagery covers all of the quadrilateral (4, 2)."""
+        """Whether imagery covers all of the convex polygon (N, 2)."""
         x = (corners_en_m[:, 0] - self._west) / self._gsd_m
         y = (self._north - corners_en_m[:, 1]) / self._gsd_m
         height, width = self._missing.shape
@@ -94,7 +94,8 @@ class GroundImagery:
     mirror_px: tuple[int, int, int, int] | None = None
 
     def window(self, corners_en_m: Array, margin_px: int) -> tuple[NDArray[np.uint8], Array]:
-        """Pixels (H, W, 3) under a quadrilateral (4, 2), and the position (2,) of their corner."""
+        """Pixels (H, W, 3) of the box around points (N, 2), and the position (2,) of their
+        corner."""
         cols = (corners_en_m[:, 0] - self.west_m) / self.gsd_m
         rows = (self.north_m - corners_en_m[:, 1]) / self.gsd_m
         left, top = math.floor(cols.min()) - margin_px, math.floor(rows.min()) - margin_px

@@ -59,6 +59,16 @@ def render_view(
     and height (m).
     """
     picture = _projected(camera, attitude, ground_rgb, ground_corner_en_m, gsd_m)
+    return degraded(picture, effects, rng, clouds)
+
+
+def degraded(
+    picture: NDArray[np.uint8],
+    effects: ViewEffects,
+    rng: np.random.Generator,
+    clouds: CloudLayer | None = None,
+) -> NDArray[np.uint8]:
+    """A perfect image (H, W, 3) with clouds, blur, exposure and noise."""
     if clouds is not None:
         picture = clouds.over(picture)
     if effects.blur_px > 0:

@@ -12,12 +12,21 @@ from orthonav import __version__
 from orthonav.errors import FlightError, OrthonavError
 from orthonav.evaluate.contact_sheet import as_fixed
 from orthonav.flight.fixes import STATES
+from orthonav.flight.pixel import locate_pixel
+from orthonav.publish.estimate import ELLIPSE_95, error_ellipse
 from orthonav.records import Fix, Telemetry, ViewResult
 from orthonav.web.columns import columns_of
 from orthonav.web.feed import Batch, Feed
 from orthonav.web.images import Shot, ViewImages
 from orthonav.web.logs import LogReader
-from orthonav.web.sheet import GroundWindow, SheetImagery, small_jpeg, view_png, window_of
+from orthonav.web.sheet import (
+    GroundWindow,
+    SheetImagery,
+    image_px,
+    small_jpeg,
+    view_png,
+    window_of,
+)
 
 AT = ("fix", "truth")
 
@@ -167,6 +176,27 @@ class Run:
         window = self._placed(result, self._images.shot(result.frame)).window
         east, north = np.asarray(self.sheet.frame.en_from_latlon(*place)) + window.offset_en_m
         return self.sheet.crop_png((float(east), float(north)), window)
+
+    def ground(self, index: int, x: float, y: float) -> dict[str, float | None]:
+        """The ground at a point of the rectified view, shares of its window from the left and the
+        top, with its 95 % ellipse. Raises `IndexError` or `FlightError`."""
+        result = self._result(index)
+        fix = result.outcome
+        if not isinstance(fix, Fix):
+            raise FlightError(f"view {result.frame} has no position")
+        placed = self._placed(result, self._images.shot(result.frame))
+        camera = placed.shot.camera
+        px = image_px(placed.telemetry, camera, placed.window, (x, y))
+        found = locate_pixel(camera, placed.shot.telemetry, fix, px, self.sheet.terrain)
+        major_m, minor_m, direction_deg = error_ellipse(found.cov_en_m2)
+        return {
+            "lat_deg": found.lat_deg,
+            "lon_deg": found.lon_deg,
+            "height_m": _known(found.height_m),
+            "major_m": _known(ELLIPSE_95 * major_m),
+            "minor_m": _known(ELLIPSE_95 * minor_m),
+            "direction_deg": _known(direction_deg),
+        }
 
     def _result(self, index: int) -> ViewResult:
         with self._lock:

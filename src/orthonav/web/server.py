@@ -59,6 +59,7 @@ class Pages:
             (re.compile(r"/api/run"), self._summary),
             (re.compile(r"/api/news"), self._news),
             (re.compile(rf"/api/views/{number}"), self._view),
+            (re.compile(rf"/api/views/{number}/ground"), self._ground),
             (re.compile(rf"/api/views/{number}/view\.png"), self._view_png),
             (re.compile(rf"/api/views/{number}/raw\.jpg"), self._raw_jpeg),
             (re.compile(rf"/api/views/{number}/map-({'|'.join(AT)})\.png"), self._map_png),
@@ -103,6 +104,13 @@ class Pages:
 
     def _view(self, index: str, query: str) -> Response:
         return _json(self._run.detail(int(index)))
+
+    def _ground(self, index: str, query: str) -> Response:
+        fields = parse_qs(query, max_num_fields=10)
+        asked = [fields.get(name, [""])[0] for name in ("x", "y")]
+        if not all(re.fullmatch(r"[01](\.\d{1,9})?", each) for each in asked):
+            return _error(HTTPStatus.BAD_REQUEST, "x and y are shares, 0 to 1")
+        return _json(self._run.ground(int(index), *map(float, asked)))
 
     def _view_png(self, index: str, query: str) -> Response:
         return Response(HTTPStatus.OK, self._run.view_png(int(index)), "image/png")

@@ -13,11 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav.errors import CameraError, FlightError
-from orthonav.geo.camera import Camera, axis_on_ground_en_m, footprint_en_m
+from orthonav.geo.camera import (
+    Camera,
+    axis_on_ground_en_m,
+    enu_from_camera,
+    footprint_en_m,
+    seen_px,
+)
 from orthonav.localizer.checks import check_telemetry
 from orthonav.localizer.rectify import MAX_REACH, downsampled, rectify
 from orthonav.mapfile.layer import GreyLayer, preview
 from orthonav.mapfile.reader import MapFile
+from orthonav.mapfile.terrain import TerrainLayer
 from orthonav.records import Telemetry, View
 from orthonav.web.images import Grey
 
@@ -69,6 +76,20 @@ def window_of(telemetry: Telemetry, camera: Camera, gsd_m: float) -> GroundWindo
     return GroundWindow(side_m, size_px, axis)
 
 
+def image_px(
+    telemetry: Telemetry, camera: Camera, window: GroundWindow, place: tuple[float, float]
+) -> tuple[float, float]:
+    """The image point of a place in the window of a view, shares from the left and the top; the
+    inverse of `view_png`. Raises `FlightError` where the view does not show it."""
+    east = window.offset_en_m[0] + (place[0] - 0.5) * window.side_m
+    north = window.offset_en_m[1] + (0.5 - place[1]) * window.side_m
+    down = enu_from_camera(telemetry.yaw_deg, telemetry.pitch_deg, telemetry.roll_deg)
+    x, y = seen_px(camera, np.array([east, north, -telemetry.agl_m]) @ down).tolist()
+    if not (0 <= x <= camera.width_px and 0 <= y <= camera.height_px):  # also where it is NaN
+        raise FlightError("the view does not show this place")
+    return x, y
+
+
 def view_png(grey: Grey, telemetry: Telemetry, camera: Camera, window: GroundWindow) -> bytes:
     """A view rectified to nadir in its window, transparent outside."""
     height, width = grey.shape
@@ -111,6 +132,7 @@ class SheetImagery:
         """Raises `MapFileError` where layer or preview are damaged."""
         self.sheet = opened.manifest.sheets[0]
         self.frame, self.grid = self.sheet.frame, self.sheet.grid
+        self.terrain = TerrainLayer.of(opened)
         self._layer = GreyLayer.of(opened)
         self.preview = b""
         drawn = "preview_jpeg" if self._layer is None else "grey/bytes"

@@ -3,10 +3,10 @@
 Everything is a function of seed, position and date, so any window can be rendered on its own. The
 steps: `network` (roads, settlements, rivers), `parcels` and `plan` (content of each macro-cell,
 with the years of changes), `crops` (appearance at a date), `surface` and `relief` (colour, height,
-shadow), `sensor`, and `scene` and `area`, which combine them.
+shadow), `hills`, `sensor`, and `scene` and `area`, which combine them.
 """
 
-from orthonav.simulate.landscape.area import generate_area
+from orthonav.simulate.landscape.area import generate_area, generate_heights
 from orthonav.simulate.landscape.epoch import DEFAULT_DATES, Epoch, Season
 from orthonav.simulate.landscape.scene import GSD_RANGE_M, ORIGIN_M, Landscape
 
@@ -18,4 +18,5 @@ __all__ = [
     "Landscape",
     "Season",
     "generate_area",
+    "generate_heights",
 ]

@@ -1,8 +1,8 @@
-"""Orthophotos of a generated landscape as GeoTIFF files, one per date."""
+"""Orthophotos and heights of a generated landscape as GeoTIFF files."""
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from math import isfinite
+from math import ceil, isfinite
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -13,12 +13,16 @@ from orthonav.errors import AreaError, OutputError
 from orthonav.extras import missing_extra
 from orthonav.files import not_written, replacing
 from orthonav.simulate.landscape.epoch import DEFAULT_DATES, Epoch
+from orthonav.simulate.landscape.hills import hills
+from orthonav.simulate.landscape.noise import Float32
 from orthonav.simulate.landscape.scene import ORIGIN_M, Landscape, check_gsd
 from orthonav.simulate.landscape.window import chunks
 
 _BLOCK_PX = 512
 _WINDOW_PX = 1024  # a whole number of blocks, so that no block is compressed twice
 _LARGEST_PX = 2_000_000
+TERRAIN_POSTING_M = 5.0
+"""Distance of the heights of the generated terrain."""
 
 
 def generate_area(
@@ -60,6 +64,81 @@ def generate_area(
                     raise  # GDAL's own errors carry no number
                 raise not_written(error.__cause__ or error, path) from error
     return paths
+
+
+def generate_heights(
+    out_dir: Path,
+    *,
+    slope: float,
+    size_m: tuple[float, float] = (2000.0, 2000.0),
+    gsd_m: float = 1.0,
+    dates: Sequence[Epoch] = DEFAULT_DATES,
+    seed: int = 1,
+) -> list[Path]:
+    """Write the terrain `out_dir/dem.tif` under an area and, for each date, the surface model
+    `out_dir/<date name>_dsm.tif`: the terrain with its buildings and trees. Returns the paths.
+
+    slope: root mean square of the gradient of the hills, 0..1; 0 is level ground. The others are
+    those of `generate_area`. Heights are metres above mean sea level, float32. Raises as it does.
+    """
+    if not 0 <= slope <= 1:
+        raise AreaError(f"the slope of hills must be 0 to 1, got {slope}")
+    width_px, height_px = _size_px(size_m, gsd_m)
+    landscape, north_m = Landscape(seed), ORIGIN_M[1] + height_px * gsd_m
+
+    def ground(window: tuple[int, int, int, int], step_m: float) -> Float32:
+        col, row, width, height = window
+        east = (col + np.arange(width, dtype=np.float64) + 0.5) * step_m
+        south = (row + np.arange(height, dtype=np.float64) + 0.5) * step_m
+        return hills(seed, east, north_m - ORIGIN_M[1] - south, slope)
+
+    posting_m = max(TERRAIN_POSTING_M, gsd_m)
+    size = (ceil(width_px * gsd_m / posting_m), ceil(height_px * gsd_m / posting_m))
+    paths = [Path(out_dir) / "dem.tif"]
+    with replacing(paths[0]) as temporary:
+        _write_heights(
+            temporary, lambda window: ground(window, posting_m), size, posting_m, north_m
+        )
+    for date in dates:
+
+        def surface(window: tuple[int, int, int, int], date: Epoch = date) -> Float32:
+            col, row, width, height = window
+            corner = ORIGIN_M[0] + col * gsd_m, north_m - row * gsd_m
+            objects = landscape.object_heights(date, *corner, width, height, gsd_m)
+            return np.asarray(ground(window, gsd_m) + objects, np.float32)
+
+        paths.append(Path(out_dir) / f"{date.name}_dsm.tif")
+        with replacing(paths[-1]) as temporary:
+            _write_heights(temporary, surface, (width_px, height_px), gsd_m, north_m)
+    return paths
+
+
+def _write_heights(
+    path: Path,
+    heights: Callable[[tuple[int, int, int, int]], Float32],
+    size_px: tuple[int, int],
+    posting_m: float,
+    north_m: float,
+) -> None:
+    """Write heights, given for windows (col, row, width, height)."""
+    import rasterio
+    from rasterio import Affine
+    from rasterio.windows import Window
+
+    from orthonav.imagery.terrain import DATUM_TAG
+
+    width_px, height_px = size_px
+    profile: dict[str, Any] = {
+        "driver": "GTiff", "width": width_px, "height": height_px, "count": 1, "dtype": "float32",
+        "crs": "EPSG:2154", "tiled": True, "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX,
+        "transform": Affine(posting_m, 0.0, ORIGIN_M[0], 0.0, -posting_m, north_m),
+        "compress": "deflate", "predictor": 3, "BIGTIFF": "IF_SAFER",
+    }  # fmt: skip
+    with rasterio.open(path, "w", **profile) as target:
+        target.update_tags(**{DATUM_TAG: "msl", "TIFFTAG_SOFTWARE": "orthonav"})
+        for window in chunks(width_px, height_px, _WINDOW_PX):
+            # Centimetres are enough, and compress.
+            target.write(np.round(heights(window), 2), 1, window=Window(*window))
 
 
 def _size_px(size_m: tuple[float, float], gsd_m: float) -> tuple[int, int]:

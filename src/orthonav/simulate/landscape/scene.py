@@ -60,26 +60,40 @@ class Landscape:
         gsd_m: metres on the ground per pixel, 0.2..10. Windows on the same pixel grid agree where
         they overlap. Raises `AreaError` on impossible sizes.
         """
-        if width_px < 1 or height_px < 1:
-            raise AreaError(f"an image needs at least one pixel, got {width_px} x {height_px}")
-        check_gsd(gsd_m)
-        if not (np.isfinite(west_m) and np.isfinite(north_m)):
-            raise AreaError(f"the corner of an image must be finite, got {west_m}, {north_m}")
-        whole = PixelWindow.at(
-            west_m - ORIGIN_M[0], north_m - ORIGIN_M[1], width_px, height_px, gsd_m
-        )
+        whole = _window(west_m, north_m, width_px, height_px, gsd_m)
         out = np.empty((height_px, width_px, 3), np.uint8)
         factor = ceil(gsd_m / 1.25)
         for col, row, width, height in chunks(width_px, height_px, _CHUNK_PX // factor):
             part = whole.part(col, row, width, height)
-            picture = self._picture(part.finer(factor), date)
+            picture, _ = self._picture(part.finer(factor), date)
             if factor > 1:
                 picture = _averaged(picture, factor)
             out[row : row + height, col : col + width] = develop(picture, part, self.seed, date)
         return out
 
-    def _picture(self, window: PixelWindow, date: Epoch) -> Float32:
-        """Return the picture (H, W, 3) float of a window, drawn with a margin and cropped."""
+    def object_heights(
+        self,
+        date: Epoch,
+        west_m: float,
+        north_m: float,
+        width_px: int,
+        height_px: int,
+        gsd_m: float,
+    ) -> Float32:
+        """Return heights (H, W) of buildings, trees and woods above the ground, as `render`."""
+        whole = _window(west_m, north_m, width_px, height_px, gsd_m)
+        out = np.empty((height_px, width_px), np.float32)
+        factor = ceil(gsd_m / 1.25)
+        for col, row, width, height in chunks(width_px, height_px, _CHUNK_PX // factor):
+            _, heights = self._picture(whole.part(col, row, width, height).finer(factor), date)
+            out[row : row + height, col : col + width] = _averaged(heights[..., None], factor)[
+                ..., 0
+            ]
+        return out
+
+    def _picture(self, window: PixelWindow, date: Epoch) -> tuple[Float32, Float32]:
+        """Return the picture (H, W, 3) float of a window and the heights (H, W) of its objects,
+        drawn with a margin and cropped."""
         margin = ceil(max(shadow_reach_m(date), 24.0) / window.gsd_m) + 4
         wide = window.part(
             -margin, -margin, window.width_px + 2 * margin, window.height_px + 2 * margin
@@ -95,7 +109,8 @@ class Landscape:
         image = np.clip(rgb, 0.0, 255.0).astype(np.uint8)
         roofs = paint_buildings(image, height, plans, wide, date)
         light = lighting(height, roofs, wide, date)
-        return expose(image, light, wide, date)[margin:-margin, margin:-margin]
+        inner = np.s_[margin:-margin, margin:-margin]
+        return expose(image, light, wide, date)[inner], height[inner]
 
     def _plans_in(self, window: PixelWindow) -> list[CellPlan]:
         """Return the plans of the macro-cells that reach into a window, in a fixed order."""
@@ -118,6 +133,18 @@ class Landscape:
             self._plans[cell] = make_plan(self._network, *cell)
         self._plans.move_to_end(cell)
         return self._plans[cell]
+
+
+def _window(
+    west_m: float, north_m: float, width_px: int, height_px: int, gsd_m: float
+) -> PixelWindow:
+    """Return a window by its corner in EPSG:2154; raise `AreaError` for impossible sizes."""
+    if width_px < 1 or height_px < 1:
+        raise AreaError(f"an image needs at least one pixel, got {width_px} x {height_px}")
+    check_gsd(gsd_m)
+    if not (np.isfinite(west_m) and np.isfinite(north_m)):
+        raise AreaError(f"the corner of an image must be finite, got {west_m}, {north_m}")
+    return PixelWindow.at(west_m - ORIGIN_M[0], north_m - ORIGIN_M[1], width_px, height_px, gsd_m)
 
 
 def _averaged(picture: Float32, factor: int) -> Float32:

@@ -1,7 +1,7 @@
 // The selected view beside the map at its fix and at its true position, and overlaid on both to
 // compare by eye: faded, or blinking.
 
-import { getJson, mapUrl, rawUrl, viewUrl } from "./api.js";
+import { getGround, getJson, mapUrl, rawUrl, viewUrl } from "./api.js";
 import { L, at } from "./map.js";
 import { clock, metres, number } from "./format.js";
 import { described } from "./look.js";
@@ -20,6 +20,25 @@ export class Compare {
     this.find("opacity").addEventListener("input", () => this.#fade());
     this.find("on-map").addEventListener("change", () => this.#fade());
     this.find("blink").addEventListener("click", () => this.blink());
+    this.find("img-view").addEventListener("click", (event) => this.#ground(event));
+  }
+
+  /** Says what ground a point of the view shows. */
+  async #ground(event) {
+    const { asked } = this;
+    const box = this.find("img-view").getBoundingClientRect();
+    const share = (value, side) => Math.min(Math.max(value / side, 0), 1);
+    const [x, y] = [share(event.clientX - box.left, box.width), share(event.clientY - box.top, box.height)];
+    let said;
+    try {
+      const g = await getGround(this.store.selected, x, y);
+      const height = g.height_m === null ? "" : `, ${metres(g.height_m)} above sea`;
+      said = `${place(g.lat_deg, g.lon_deg)}${height}; 95 % ellipse ${metres(g.major_m)} x ${metres(g.minor_m)}, `
+        + `major axis at ${number(g.direction_deg, 0)}°`;
+    } catch (error) {
+      said = error.message;
+    }
+    if (asked === this.asked) this.find("ground").textContent = said;
   }
 
   /** Shows the selected view. */
@@ -42,6 +61,7 @@ export class Compare {
     this.over = null;
     for (const part of ["compare", "no-compare", "overlay"]) this.find(part).hidden = true;
     this.find("known").replaceChildren();
+    this.find("ground").textContent = "";
     this.find("chosen-name").textContent = "No view yet";
   }
 
@@ -62,6 +82,7 @@ export class Compare {
   }
 
   #pictures(i, detail) {
+    this.find("ground").textContent = "";
     const { generation, columns: c } = this.store;
     const { window } = detail;
     const [placed, taken] = [Number.isFinite(c.x[i]), Number.isFinite(c.tx[i])];

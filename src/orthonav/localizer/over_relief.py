@@ -1,0 +1,278 @@
+"""Registering a view on the ground as it is, at candidates that were found on level ground.
+
+The view is orthorectified on the terrain under the pose of a candidate and registered again, until
+it stays where it is.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+from orthonav.localizer.prepared import PreparedView
+from orthonav.localizer.relief import LevelTerrain, Relief
+from orthonav.localizer.relief_camera import CameraFound, camera_found
+from orthonav.localizer.relief_view import ReliefView
+from orthonav.register.pose import Pose
+from orthonav.register.refine import Placed
+from orthonav.register.registrar import (
+    EXCLUSION_SHARE,
+    FULL_STEPS,
+    ROUGH_STEP_PX,
+    Finished,
+    Registered,
+    Registrar,
+    apart_px,
+)
+from orthonav.register.search import search
+from orthonav.register.template import ViewTemplates
+
+RIVAL_SHARE = 0.75
+"""Candidates whose score on the terrain at the judged level is below this share of the best one are
+finished on level ground: what fits by chance fits as well there, and it costs half."""
+AGAIN_PX = 1.0
+"""A window that moved by more (pixels of the level, at its rim) is orthorectified again."""
+ROUNDS = 3
+"""At most so many times at the final level."""
+SETTLED = 6
+"""Places whose surroundings are searched on the terrain, where no place stands out."""
+NEAR_REACH = 0.2
+"""They are searched so far, as a share of the view's side,"""
+NEAR_TURNS_RAD, NEAR_SCALES = (-0.1, 0.0, 0.1), (-0.09, 0.0, 0.09)
+"""and under these headings and log scales around those of level ground."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """A candidate on the terrain: its `templates`, and the score at the judged level over that on
+    level ground."""
+
+    made: Finished
+    gain: float
+
+
+@dataclass(frozen=True)
+class GroundSeen:
+    """What a fix says of the ground: `middle_en_m`, that of the picture's middle, metres east and
+    north; `gain`, score on the terrain over that on level ground, None without a terrain."""
+
+    middle_en_m: tuple[float, float]
+    gain: float | None
+
+
+class ViewOnLevelGround:
+    """One view on level ground."""
+
+    def __init__(self, registrar: Registrar, view: PreparedView) -> None:
+        self.registrar, self.view = registrar, view
+        self._finer: ViewTemplates | None = None
+
+    def finish(self, judged: Placed) -> Finished:
+        """A judged candidate at the final level."""
+        return self.registrar.at_final(self.view.templates, self.view.levels, judged)
+
+    def looked_again(self, judged: list[Placed]) -> list[Placed]:
+        """Judged candidates after all searches, where none of them stands out."""
+        return judged
+
+    def templates_of(self, placed: Placed) -> ViewTemplates:
+        """The templates by which a finalist was placed."""
+        return self.view.templates
+
+    def finer(self, placed: Placed) -> ViewTemplates:
+        """The templates of a finalist one level finer than the final one."""
+        if self._finer is None:
+            level = self.view.levels.final - 1
+            made = self.view.rectified_at(level)
+            self._finer = ViewTemplates(made.grey, made.valid, level)
+        return self._finer
+
+    def by_camera(self, found: Registered) -> tuple[Registered, GroundSeen | None]:
+        """The places found, as poses of the view on level ground below the camera."""
+        return found, None
+
+    def resected(self, placed: Placed) -> CameraFound | None:
+        """The camera of a place with its pitch and roll; None where they are not examined."""
+        return None
+
+    def score_near(self, pose: Pose, steps: int, small_step_px: float) -> float:
+        """Score at the final level near a pose of `by_camera`."""
+        levels = self.view.levels
+        refiner = self.registrar.refiner(self.view.templates, levels, levels.final)
+        return refiner.place(pose, steps, small_step_px).score
+
+
+class ViewOverRelief(ViewOnLevelGround):
+    """One view on the ground of a sheet. Not to be shared between threads."""
+
+    def __init__(self, relief: Relief, registrar: Registrar, view: PreparedView) -> None:
+        super().__init__(registrar, view)
+        self.seen = ReliefView(relief, view)
+        # Finalists by their pose; None: finished on level ground.
+        self._found: dict[Pose, _Placed | None] = {}
+        self._best_look = 0.0
+        self._level_scores: dict[Pose, float] = {}
+
+    def finish(self, judged: Placed) -> Finished:
+        """A judged candidate at the final level: on the terrain, or on level ground where that is
+        as good, or where less than half of the ground is known."""
+        made = self._at_look(judged.pose)
+        if made is None:
+            return self._on_level_ground(judged)
+        first = self._refined(judged.pose, made)
+        if judged.pose not in self._level_scores:
+            first = self._settled(judged.pose, made, first)
+        if first.score < RIVAL_SHARE * self._best_look:
+            return self._on_level_ground(judged)
+        self._best_look = max(self._best_look, first.score)
+        found = self._placed(first.pose)
+        if found is None or found.look is None:
+            return self._on_level_ground(judged)
+        on_level = self._level_scores.get(judged.pose, judged.score)
+        if found.look < on_level:
+            level = self._on_level_ground(judged)
+            if level.total > found.total:
+                return level
+        self._found[found.placed.pose] = _Placed(found, found.look / max(on_level, 1e-6))
+        return found
+
+    def _on_level_ground(self, judged: Placed) -> Finished:
+        made = super().finish(judged)
+        self._found[made.placed.pose] = None
+        return made
+
+    def looked_again(self, judged: list[Placed]) -> list[Placed]:
+        """All judged candidates on the terrain, at the judged level, and the surroundings of the
+        best of them: where relief displaces much, the right one may be far down the list of those
+        on level ground, and off by more than refinement follows."""
+        made = [self._at_look(each.pose) for each in judged]
+        placed = [
+            each if seen is None else self._refined(each.pose, seen)
+            for each, seen in zip(judged, made, strict=True)
+        ]
+        for number in self._best_apart(placed):
+            seen = made[number]
+            if seen is not None:
+                placed[number] = self._settled(judged[number].pose, seen, placed[number])
+        for number, (before, after) in enumerate(zip(judged, placed, strict=True)):
+            if after.score > before.score:
+                self._level_scores[after.pose] = before.score
+            else:
+                placed[number] = before
+        return placed
+
+    def _best_apart(self, placed: list[Placed]) -> list[int]:
+        """Numbers of the best places that lie apart."""
+        prior, apart = self.view.prior, EXCLUSION_SHARE * self.view.side_px
+        ranked = sorted(
+            range(len(placed)), key=lambda n: prior.cost(placed[n].pose) - placed[n].score
+        )
+        chosen: list[int] = []
+        for number in ranked:
+            if all(apart_px(placed[number], placed[other]) > apart for other in chosen):
+                chosen.append(number)
+        return chosen[:SETTLED]
+
+    def _at_look(self, pose: Pose) -> ViewTemplates | None:
+        """Templates on the terrain at the judged level; None where level ground is as good."""
+        if self.seen.is_level(pose):
+            return None
+        return self.seen.templates_at(pose, self.view.levels.look)
+
+    def _refined(self, pose: Pose, made: ViewTemplates) -> Placed:
+        """A pose refined on the terrain at the judged level."""
+        levels = self.view.levels
+        return self.registrar.refiner(made, levels, levels.look).place(
+            pose, FULL_STEPS, ROUGH_STEP_PX
+        )
+
+    def _settled(self, pose: Pose, made: ViewTemplates, first: Placed) -> Placed:
+        """`first`, or a better place by a search around it at the coarse level: far off nadir,
+        relief displaces a view by more than refinement follows."""
+        levels, side_px = self.view.levels, self.view.side_px
+        recipe = levels.recipe(levels.coarse)
+        window = self.registrar.part_window(
+            levels.coarse, recipe, side_px, (pose.x_px, pose.y_px), NEAR_REACH * side_px
+        )
+        poses = [
+            (pose.turn_rad + turn, pose.log_scale + scale)
+            for turn in NEAR_TURNS_RAD
+            for scale in NEAR_SCALES
+        ]
+        template = made.at(levels.coarse, recipe)
+        for found in search(template, window, poses, 1, self.view.prior.scale_map):
+            first = max(first, self._refined(found.pose, made), key=lambda each: each.score)
+        return first
+
+    def _placed(self, pose: Pose) -> Finished | None:
+        """A candidate refined on the terrain; None where too little of it is known."""
+        levels, registrar = self.view.levels, self.registrar
+        for _ in range(ROUNDS):
+            seen = self.seen.templates_at(pose, levels.final)
+            if seen is None:
+                return None
+            made = seen
+            refiner = registrar.refiner(made, levels, levels.final)
+            placed = refiner.place(pose, FULL_STEPS, ROUGH_STEP_PX)
+            if self.seen.moved_px(pose, placed.pose) < AGAIN_PX * 2**levels.final:
+                break
+            pose = placed.pose
+        if levels.final == levels.look:
+            return Finished(placed.score, placed, made, placed.score)
+        look = registrar.refiner(made, levels, levels.look).place(placed.pose, 0).score
+        return Finished(placed.score + look, placed, made, look)
+
+    def templates_of(self, placed: Placed) -> ViewTemplates:
+        """The templates by which a finalist was placed."""
+        found = self._found.get(placed.pose)
+        return super().templates_of(placed) if found is None else found.made.templates
+
+    def finer(self, placed: Placed) -> ViewTemplates:
+        """The templates of a finalist one level finer than the final one."""
+        made = None
+        if self._found.get(placed.pose) is not None:
+            made = self.seen.templates_at(placed.pose, self.view.levels.final - 1)
+        return super().finer(placed) if made is None else made
+
+    def by_camera(self, found: Registered) -> tuple[Registered, GroundSeen | None]:
+        """The same, of a view on the terrain: heights are counted from the ground below the camera,
+        and the camera of the pose is where it is."""
+        finalists = tuple((score, self._by_camera(each)) for score, each in found.finalists)
+        pose = found.placed.pose
+        orientation = self.seen.orientation(pose)
+        if orientation is None:
+            return found, None
+        on_terrain = self._on_terrain(pose)
+        gain: float | None = 1.0 if on_terrain is None else on_terrain.gain
+        if isinstance(self.seen.relief.terrain, LevelTerrain):
+            gain = None
+        seen = GroundSeen(self.seen.middle_en_m(orientation, pose), gain)
+        return replace(found, placed=self._by_camera(found.placed), finalists=finalists), seen
+
+    def score_near(self, pose: Pose, steps: int, small_step_px: float) -> float:
+        """The same on the terrain."""
+        window = self.seen.of_window(pose)
+        made = None if window is None else self.seen.templates_at(window, self.view.levels.final)
+        if made is None or window is None:
+            return super().score_near(pose, steps, small_step_px)
+        refiner = self.registrar.refiner(made, self.view.levels, self.view.levels.final)
+        return refiner.place(window, steps, small_step_px).score
+
+    def resected(self, placed: Placed) -> CameraFound | None:
+        """The camera of a place with its pitch and roll; None where their deviation is not reported
+        or the view does not show them."""
+        return camera_found(self.seen, self.registrar, placed)
+
+    def _by_camera(self, placed: Placed) -> Placed:
+        if self._on_terrain(placed.pose) is None:
+            return placed
+        return replace(placed, pose=self.seen.below_camera(placed.pose))
+
+    def _on_terrain(self, pose: Pose) -> _Placed | None:
+        """The finalist at a pose, which may have been refined once more; None where it was placed
+        on level ground."""
+        near = EXCLUSION_SHARE * self.view.side_px
+
+        def apart(other: Pose) -> float:
+            return math.hypot(pose.x_px - other.x_px, pose.y_px - other.y_px)
+
+        nearest = min(self._found, key=apart, default=None)
+        return None if nearest is None or apart(nearest) > near else self._found[nearest]

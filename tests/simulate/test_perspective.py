@@ -1,0 +1,93 @@
+"""Views in perspective: level ground as by its homography, objects displaced as they stand."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from test_flight import FISH, LENS, PLAIN, SEEN
+
+from orthonav.errors import FlightError
+from orthonav.flight import open_flight, read_image, read_truth
+from orthonav.geo.camera import Camera
+from orthonav.imagery.terrain import open_dem
+from orthonav.simulate.flight import SimulateRequest, simulate_flight
+from orthonav.simulate.landscape import generate_area, generate_heights
+from orthonav.simulate.landscape.epoch import DEFAULT_DATES
+from orthonav.simulate.perspective import Raster, met, rays_enu, seen_view
+from orthonav.simulate.render import render_view
+
+CAMERA = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
+AUTUMN = DEFAULT_DATES[1]
+
+
+@pytest.fixture(scope="module")
+def imagery():
+    noise = np.random.default_rng(1).normal(0, 1, (500, 500, 3))
+    smooth = cv2.GaussianBlur(noise, (0, 0), 4.0)
+    return Raster(np.clip(128 + 900 * smooth, 0, 255).astype(np.uint8), -250.0, 250.0, 1.0)
+
+
+@pytest.mark.parametrize("camera", [SEEN, LENS, FISH], ids=["pinhole", "lens", "fisheye"])
+def test_level_ground_is_seen_as_by_its_homography(imagery, camera):
+    attitude, agl_m = (40.0, 12.0, -7.0), 150.0
+    level = Raster(np.full((2, 2), 30, np.float32), -250.0, 250.0, 250.0)
+    place = np.array([10.0, -20.0, 30.0 + agl_m])
+    seen, _ = seen_view(imagery, level, camera, attitude, place, 1)
+    corner = np.array([-250.0, 250.0]) - place[:2]
+    rng = np.random.default_rng(1)
+    flat = render_view(camera, (*attitude, agl_m), imagery.values, corner, 1.0, PLAIN, rng)
+    assert np.abs(seen.astype(float) - flat).mean() < 1.0
+
+
+def test_a_roof_stands_out_and_hides_the_ground_behind():
+    heights = np.zeros((400, 400), np.float32)
+    heights[170:180, 190:210] = 20.0  # 20 m to 30 m north of the camera
+    ground = Raster(heights, -200.0, 200.0, 1.0)
+    rays = rays_enu(CAMERA, (0.0, 0.0, 0.0), 1)
+    points = met(ground, rays, np.array([0.0, 0.0, 100.0]))
+    north, up = points[:, 80, 1], points[:, 80, 2]
+    roof = up > 19.0
+    assert north[roof].min() == pytest.approx(20.0, abs=1.5)
+    assert north[roof].max() == pytest.approx(30.0, abs=1.5)
+    # Its far edge hides the ground up to 30 * 100 / 80.
+    beyond = north[(up < 1.0) & (north > 30.5)]
+    assert beyond.min() == pytest.approx(37.5, abs=1.2)
+
+
+def test_a_flight_with_a_leaning_camera_over_a_surface_model(tmp_path):
+    size = {"size_m": (420.0, 400.0), "dates": (AUTUMN,), "seed": 2}
+    (ortho,) = generate_area(tmp_path, **size)
+    dem, dsm = (open_dem(p, None) for p in generate_heights(tmp_path, slope=0.1, **size))
+    request = {"random": 2, "agl_m": 50.0, "camera": CAMERA, "effects": PLAIN, "seed": 5}
+    pictures = {}
+    for name, terrain in (("dem", dem), ("dsm", dsm)):
+        simulate_flight(
+            SimulateRequest(
+                [ortho], tmp_path / name, terrain=terrain, terrain_posting_m=terrain.gsd_m,
+                camera_pitch_deg=60.0, **request,
+            )
+        )  # fmt: skip
+        flight, truth = open_flight(tmp_path / name), read_truth(tmp_path / name / "truth.csv")
+        telemetry = flight.views[0].telemetry
+        assert telemetry.pitch_deg == 60.0 and math.isnan(telemetry.agl_m)
+        below = float(terrain(*np.array([[each] for each in truth[flight.views[0].frame]]))[0])
+        assert telemetry.amsl_m == pytest.approx(below + 50.0, abs=0.1)
+        pictures[name] = np.stack([read_image(view.path) for view in flight.views]).astype(float)
+    assert (np.abs(pictures["dem"] - pictures["dsm"]) > 15).mean() > 0.005
+    with pytest.raises(FlightError, match="0 to 65 deg ahead"):
+        simulate_flight(SimulateRequest([ortho], tmp_path / "no", camera_pitch_deg=70.0, **request))
+
+
+def test_objects_of_the_landscape_stand_where_they_are_drawn(tmp_path):
+    size = {"size_m": (400.0, 400.0), "dates": (AUTUMN,), "seed": 1}
+    dem, dsm = generate_heights(tmp_path, slope=0.0, **size)
+    assert (dem.name, dsm.name) == ("dem.tif", "2021-10_dsm.tif")
+    import rasterio
+
+    with rasterio.open(dem) as ground, rasterio.open(dsm) as surface:
+        bare, over = ground.read(1), surface.read(1)
+    assert np.ptp(bare) == 0
+    objects = over - bare[0, 0]
+    assert 0.02 < (objects > 2).mean() < 0.9 and 5 < objects.max() <= 26
+    assert (objects >= 0).all()
