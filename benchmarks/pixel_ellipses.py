@@ -86,7 +86,6 @@ def measured(bench: Bench, row: Row) -> str:
     return (
         f"| {row.tilt_deg:.0f} deg | {row.slope:g} | {len(cameras)} | {inside[0]} | {inside[1]} |"
         f" {np.median(errors):.1f} m | {np.median(axes):.1f} m |"
-        f" chi2 {np.median(cameras):.2f} {np.median(pixels):.2f}"
     )
 
 
