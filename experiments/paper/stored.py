@@ -99,11 +99,11 @@ def code(family: str, edges: str, *, registration: bool, generated: bool) -> dic
     patterns += GENERATED if generated else ()
     patterns += EDGES[edges.partition(":")[0]] if edges else ()
     paths = {path for pattern in patterns for path in ROOT.glob(pattern)}
-    return {path.relative_to(ROOT).as_posix(): _digest(path) for path in sorted(paths)}
+    return {path.relative_to(ROOT).as_posix(): digest(path) for path in sorted(paths)}
 
 
 @lru_cache
-def _digest(path: Path) -> str:
+def digest(path: Path) -> str:
     """Short digest of a file, of a source file without its comments and docstrings."""
     if path.suffix != ".py":
         return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
