@@ -56,11 +56,6 @@ def _stored(options: argparse.Namespace) -> int:
     if options.what == "keep":
         for name in keep(options.out, options.setting, options.tried):
             _say(f"stored: {name}")
-        if options.imagery:
-            from experiments.paper.imagery import renew
-
-            for name in renew(options.imagery):
-                _say(f"of the same imagery: {name}")
         pages.PAGE.write_text(pages.page(stored(), tried()), encoding="utf-8")
     rows = stored()
     for line in pages.state(rows):
@@ -270,12 +265,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--tried", metavar="NAME", help="keep the results as rows of another training"
-    )
-    parser.add_argument(
-        "--imagery",
-        type=Path,
-        metavar="DIR",
-        help="keep: generate the imagery there, and renew rows whose imagery has not changed",
     )
     parser.add_argument("--past", type=Path, help="an orthophoto of your own, for the map")
     parser.add_argument("--present", type=Path, help="the same ground at another date")

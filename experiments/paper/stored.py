@@ -26,7 +26,7 @@ from experiments.paper.methods import (
     methods,
 )
 from experiments.paper.results import Result, read
-from experiments.paper.scenes import REDUCED_REAL, UNTUNED
+from experiments.paper.scenes import REDUCED_REAL, SEED, UNTUNED
 from experiments.paper.trajectories import REDUCED, SETTINGS, TABLE_1
 from orthonav.files import write_text
 
@@ -39,7 +39,10 @@ DIGITS = 5
 """Significant digits of figures in a row: a confidence to 1e-5, an error of 9 km to 0.1 m."""
 
 PROTOCOL = ("experiments/paper/views.py", "experiments/paper/runs.py")
-GENERATED = ("src/orthonav/simulate/landscape/*.py",)
+GENERATED = "generated landscape"
+"""In place of the files that draw generated scenes: a digest of ground that they draw."""
+DRAWN_PX, DRAWN_GSD_M, DRAWN_FROM_M = 256, (0.2, 1.0, 2.0), (300.0, 900.0)
+"""Side and ground resolutions of that ground, and how far it lies from the landscape's origin."""
 TILES = (
     "src/orthonav/localizer/match.py",
     "src/orthonav/localizer/rectify.py",
@@ -96,14 +99,27 @@ REGISTRATION = (
 def code(family: str, edges: str, *, registration: bool, generated: bool) -> dict[str, str]:
     """Digests of the files that decide the figures of a row, by path in the repository."""
     patterns = [*PROTOCOL, *FAMILY[family], *(REGISTRATION if registration else TILES)]
-    patterns += GENERATED if generated else ()
     patterns += EDGES[edges.partition(":")[0]] if edges else ()
     paths = {path for pattern in patterns for path in ROOT.glob(pattern)}
-    return {path.relative_to(ROOT).as_posix(): digest(path) for path in sorted(paths)}
+    found = {path.relative_to(ROOT).as_posix(): _digest(path) for path in sorted(paths)}
+    return found | ({GENERATED: _drawn()} if generated else {})
 
 
 @lru_cache
-def digest(path: Path) -> str:
+def _drawn() -> str:
+    """Short digest of some ground of the generated landscape, at every date."""
+    from orthonav.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
+
+    made, digest = Landscape(SEED), hashlib.sha256()
+    corner = [origin + off for origin, off in zip(ORIGIN_M, DRAWN_FROM_M, strict=True)]
+    for gsd_m in DRAWN_GSD_M:
+        for date in DEFAULT_DATES:
+            digest.update(made.render(date, *corner, DRAWN_PX, DRAWN_PX, gsd_m).tobytes())
+    return digest.hexdigest()[:12]
+
+
+@lru_cache
+def _digest(path: Path) -> str:
     """Short digest of a file, of a source file without its comments and docstrings."""
     if path.suffix != ".py":
         return hashlib.sha256(path.read_bytes()).hexdigest()[:12]

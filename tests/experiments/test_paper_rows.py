@@ -1,11 +1,10 @@
 """Rows in the repository: small, checked against the code they speak of, and the page of them."""
 
-import hashlib
 import json
 from dataclasses import asdict
 
 import pytest
-from experiments.paper import imagery, scenes, stored
+from experiments.paper import stored
 from experiments.paper.__main__ import main
 from experiments.paper.comparison import above_default, orders
 from experiments.paper.methods import methods
@@ -88,7 +87,7 @@ def test_comments_and_docstrings_are_not_code(tmp_path):
     for number, text in enumerate(texts):
         path = tmp_path / f"{number}.py"
         path.write_text(text)
-        digests.append(stored.digest(path))
+        digests.append(stored._digest(path))
     assert digests[0] == digests[1] != digests[2]
 
 
@@ -183,29 +182,6 @@ def test_results_of_another_training_are_kept_apart(tmp_path, monkeypatch):
     (folder / "B-autoencoder-canny.json").write_text(stored.compact(row().plain))
     assert stored.keep(tmp_path / "results", "reduced", "slow") == ["B-autoencoder-canny"]
     assert stored.stored() == [] and len(stored.tried()) == 1
-
-
-def test_a_row_of_the_same_imagery_is_not_older_than_the_generator(tmp_path, monkeypatch):
-    source = "src/orthonav/simulate/landscape/area.py"
-    monkeypatch.setattr(imagery, "ROWS", tmp_path)
-    monkeypatch.setattr(imagery.scenes, "generated", lambda *_: scene)
-    monkeypatch.setattr(imagery.scenes, "render", lambda scene: None)
-    scene = scenes.Scene("B", tmp_path / "a.tif", tmp_path / "b.tif", TABLE_1["B"])
-    for each in (scene.past, scene.present):
-        each.write_bytes(b"picture")
-    made = row().plain
-    made["code"][source] = "0" * 12
-    made["code"]["src/orthonav/simulate/landscape/gone.py"] = "0" * 12
-    made["inputs"] = {each: hashlib.sha256(b"picture").hexdigest() for each in ("a.tif", "b.tif")}
-    path = tmp_path / "reduced" / "B-autoencoder-canny.json"
-    path.parent.mkdir()
-    path.write_text(stored.compact(made))
-    assert list(imagery.renew(tmp_path)) == ["B-autoencoder-canny"]
-    assert stored.older(Result(json.loads(path.read_text()))) == []
-    path.write_text(stored.compact(made))
-    scene.past.write_bytes(b"another picture")
-    assert list(imagery.renew(tmp_path)) == []
-    assert source in stored.older(Result(json.loads(path.read_text())))
 
 
 def test_ground_resolutions_of_a_trajectory_are_compared():
