@@ -53,18 +53,18 @@ def measured(bench: Bench, row: Row) -> str:
     cameras, pixels, errors, axes = [], [], [], []
     for each in seen:
         off = rng.normal(0, TILT_STD_DEG, 2)
-        told = each.view.telemetry
-        told = replace(
-            told,
-            pitch_deg=told.pitch_deg + float(off[0]),
-            roll_deg=told.roll_deg + float(off[1]),
+        reported = each.view.telemetry
+        reported = replace(
+            reported,
+            pitch_deg=reported.pitch_deg + float(off[0]),
+            roll_deg=reported.roll_deg + float(off[1]),
             tilt_std_deg=TILT_STD_DEG,
             home_m=float(each.position_m[2] - home_m(hills)),
         )
         heights = map_heights(ground.opened, terrain)
         assert heights is not None
-        told = heights.corrected(told)
-        fix = localizer.locate(replace(each.view, telemetry=told))
+        reported = heights.corrected(reported)
+        fix = localizer.locate(replace(each.view, telemetry=reported))
         if not isinstance(fix, Fix) or fix.confidence < CONFIDENT:
             continue
         miss = frame.en_from_latlon(fix.lat_deg, fix.lon_deg) - each.position_m[:2]
@@ -73,7 +73,7 @@ def measured(bench: Bench, row: Row) -> str:
             px = share[0] * each.view.camera.width_px, share[1] * each.view.camera.height_px
             there = shown(each, hills, px)
             try:
-                found = locate_pixel(each.view.camera, told, fix, px, terrain)
+                found = locate_pixel(each.view.camera, reported, fix, px, terrain)
             except FlightError:
                 continue
             if not np.isfinite(there).all():

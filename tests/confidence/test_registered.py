@@ -10,10 +10,12 @@ from hypothesis import strategies as st
 
 from orthonav.confidence.registered import (
     BEFORE_PHASE,
+    BIAS_BEFORE_PHASE,
     CHANCES,
     FEATURES,
     OLD_FEATURES,
     STAND_IN,
+    USUAL_BIASES,
     USUAL_DETAIL,
     Chances,
     RegisteredConfidence,
@@ -21,6 +23,7 @@ from orthonav.confidence.registered import (
     fit_registered,
 )
 from orthonav.errors import VariantError
+from orthonav.records import CONFIDENT
 
 CHANCE = Chances(total=25.0, look=15.0, fine=40.0)
 MODEL = RegisteredConfidence((-8.0, -3.0), (0.5, 11.0, 1.5, 2.0, 1.0, 2.0, 3.0), CHANCE)
@@ -153,6 +156,22 @@ def test_an_older_map_has_the_usual_weights_and_its_own_chance():
         RegisteredConfidence.from_plain(without(plain, "chances"))
     plain["weights"] = dict.fromkeys(sorted(BEFORE_PHASE), 2.0)
     assert RegisteredConfidence.from_plain(plain).chances == Chances(16.0, 15.0, 60.0)
+
+
+@pytest.mark.parametrize(("shift", "kept"), [(-5.0, -5.0), (2.0, 0.0)])
+def test_an_older_map_stays_as_cautious_as_another_date_made_it(shift, kept):
+    plain = {**PLAIN, "weights": dict.fromkeys(sorted(BEFORE_PHASE), 2.0)}
+    plain["biases"] = [BIAS_BEFORE_PHASE + shift, -1.75]
+    found = RegisteredConfidence.from_plain(plain)
+    assert found.biases[0] == pytest.approx(USUAL_BIASES[0] + kept)
+    with pytest.raises(VariantError):
+        RegisteredConfidence.from_plain({**plain, "biases": [math.nan, 0.0]})
+
+
+def test_a_search_that_was_cut_short_is_not_confident():
+    model = RegisteredConfidence.usual(Chances(32.0, 15.0, 48.0))
+    clear = evidence(strength=200.0, look=90.0)
+    assert model(clear) > CONFIDENT > model({**clear, "cut_short": 1.0})
 
 
 def without(plain, *path):

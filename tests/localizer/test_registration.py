@@ -20,13 +20,14 @@ from blots import (
 
 from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
-from orthonav.localizer.plan import DEFAULT_PLAN
+from orthonav.localizer.plan import DEFAULT_PLAN, ClearMargin
 from orthonav.mapfile import GreyLayer, open_map
 from orthonav.mapfile.layer import part_names
 from orthonav.onboard.run import SingleViews, locate_view
 from orthonav.prepare import BuildRequest, build_map
-from orthonav.records import Fix, NoFix, Prior, Telemetry, View
+from orthonav.records import CONFIDENT, Fix, NoFix, Prior, Telemetry, View
 
+NEVER_CLEAR = ClearMargin(1e9, 1e9, 1e9)
 LENS = replace(CAMERA, distortion=(-0.25, 0.06, 0.001, -0.002))
 EVIDENCE = {"score", "strength", "rival", "look", "look_rival", "peak_ratio", "look_ratio"}
 EVIDENCE |= {"gradient_correlation", "grey_correlation", "agreement", "overlap", "candidates"}
@@ -383,12 +384,18 @@ def test_threads_within_a_view_change_nothing(localizer, map_path, plain):
 
 
 def test_a_spent_budget_leaves_the_best_place_so_far(map_path, plain):
-    """One that ends before the first search does, so that only this one is made."""
-    hurried = Localizer(open_map(map_path), plan=replace(DEFAULT_PLAN, budget_ms=1e-6))
+    """One that ends before the first search does, so that only this one is made. No margin is
+    enough to end the search here, and such a place is not confident."""
+    doubting = replace(DEFAULT_PLAN, clear=NEVER_CLEAR, clear_at_judged=NEVER_CLEAR)
     view = View(plain[0], CAMERA, plain[1])
-    whole = Localizer(open_map(map_path)).locate(view, heading_known=False)
-    fix = hurried.locate(view, heading_known=False)
-    assert isinstance(fix, Fix) and fix.evidence["candidates"] <= whole.evidence["candidates"]
+    whole, fix = (
+        Localizer(open_map(map_path), plan=plan).locate(view)
+        for plan in (doubting, replace(doubting, budget_ms=1e-6))
+    )
+    assert isinstance(whole, Fix) and isinstance(fix, Fix)
+    assert fix.evidence["candidates"] < whole.evidence["candidates"]
+    assert "cut_short" not in whole.evidence and fix.evidence["cut_short"] == 1
+    assert whole.confidence > CONFIDENT > fix.confidence
 
 
 def test_threads_may_share_a_localizer(localizer, map_path):

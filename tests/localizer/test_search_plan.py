@@ -42,7 +42,7 @@ def test_a_small_view_is_finished_where_it_is_judged():
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock that only moves when told, s."""
+    """A clock that only moves when advanced, s."""
     now = [100.0]
     monkeypatch.setattr(plan.time, "monotonic", lambda: now[0])
     return now

@@ -63,6 +63,20 @@ def test_steps_lead_to_the_same_place(reference, monkeypatch, level, whole):
         assert one.covariance == pytest.approx(other.covariance, rel=0.1, abs=1e-4)
 
 
+@pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_kernel), False])
+def test_views_that_touch_the_map_with_a_few_pixels_are_placed(reference, monkeypatch, compiled):
+    if not compiled:
+        for module in (refine, template):
+            monkeypatch.setattr(module, "KERNEL", None)
+    rng = np.random.default_rng(8)
+    made = templates_of(GROUND, Pose(160, 128, 0, 0)).at(0)
+    for _ in range(150):
+        inside_px = rng.uniform(0, 3)
+        pose = Pose(SHAPE[1] + 64 - inside_px, rng.uniform(0, SHAPE[0]), rng.normal(0, 0.02), 0.0)
+        placed = Refiner(made, reference).place(pose, with_covariance=True)
+        assert math.isfinite(placed.score) and math.isfinite(placed.pose.x_px)
+
+
 @needs_kernel
 def test_curvatures_are_the_same(monkeypatch):
     made, _ = next(views(1, 3, 0))

@@ -35,8 +35,11 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Generate the files and print their names."""
+    from orthonav.errors import AreaError
     from orthonav.simulate.landscape import generate_area, generate_heights
 
+    if options.hills is not None and not 0 <= options.hills <= 1:
+        raise AreaError(f"--hills must be 0 to 1 (0.15 is 15 %), got {options.hills:g}")
     with progress(options) as shown:
         files = generate_area(
             options.out,

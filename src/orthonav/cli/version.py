@@ -6,7 +6,6 @@ import json
 import os
 import platform
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -77,8 +76,17 @@ def _processor() -> dict[str, Any]:
         "cores": usable_cores(),
         "memory_mb": _memory_mb(),
         "features": _features(),
-        "kernel": find_spec("orthonav.register._kernel") is not None,
+        "kernel": _has_kernel(),
     }
+
+
+def _has_kernel() -> bool:
+    """Whether registration uses its compiled kernel; false without NumPy or OpenCV."""
+    try:
+        from orthonav.register.kernel import KERNEL
+    except ImportError:
+        return False
+    return KERNEL is not None
 
 
 def _features() -> list[str] | None:

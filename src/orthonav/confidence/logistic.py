@@ -86,12 +86,12 @@ def fit_few(
 ) -> LogisticConfidence:
     """Confidence from trials, as in `fit_logistic`, of which too few came out right for a fit.
 
-    It is the `usual` one, its bias drawn to the trials as far as they go. Without one it is the
-    share of the trials that came out right, whatever the evidence.
+    It is the `usual` one, its bias drawn to the trials as far as they go. Without one, or without
+    any trial, it is the share of the trials that came out right, whatever the evidence.
     """
     from scipy.optimize import minimize_scalar  # not needed to fly
 
-    if usual is None:
+    if usual is None or len(features) == 0:
         share = (sample_weight @ right + FEW_RIGHT) / (sample_weight.sum() + FEW)
         return LogisticConfidence(logit(float(share), RIDGE), (0.0,) * len(FEATURES))
     known = features @ np.array(usual.weights) + usual.bias

@@ -31,6 +31,11 @@ OLD_FEATURES = {"log_strength", "log_peak_ratio", "log_look_ratio"}
 BEFORE_PHASE = OLD_FEATURES | {"blocks_t", "log_detail_ratio", "log_local_ratio"}
 """Features of later ones, built before phase correlation was judged."""
 CHANCES = ("total", "look", "fine")
+CUT_SHORT = 0.89
+"""Largest confidence of a view whose search ended early (`--budget-ms`) before a place stood out:
+its rivals were not all looked for. Below `orthonav.records.CONFIDENT`."""
+BIAS_BEFORE_PHASE = -6.29
+"""The usual first bias of maps of `BEFORE_PHASE`."""
 USUAL_BIASES = -6.68, -8.0
 USUAL_WEIGHTS = 2.35, 4.29, 5.87, 2.7, 2.28, 4.05, 3.03
 """What separates right from wrong, fitted to 1,734 views (docs/decisions/confidence.md). The
@@ -103,7 +108,8 @@ class RegisteredConfidence:
 
     def __call__(self, evidence: Mapping[str, float]) -> float:
         """Probability in 0..1 that the fix is right."""
-        return self.of(features_of(evidence, self.chances))
+        found = self.of(features_of(evidence, self.chances))
+        return min(found, CUT_SHORT) if evidence.get("cut_short") else found
 
     def of(self, features: NDArray[np.float64]) -> float:
         """The same, by features (7,)."""
@@ -115,6 +121,12 @@ class RegisteredConfidence:
     def usual(cls, chances: Chances) -> "RegisteredConfidence":
         """With the usual weights, and a map's own scores of chance."""
         return cls(USUAL_BIASES, USUAL_WEIGHTS, chances)
+
+    def _lowered(self, shift: float) -> "RegisteredConfidence":
+        """With a first bias that is lower by a negative `shift`; raises `ValueError` for NaN."""
+        if math.isnan(shift):
+            raise ValueError("a bias is not a number")
+        return replace(self, biases=(self.biases[0] + min(shift, 0.0), self.biases[1]))
 
     def to_plain(self) -> dict[str, Any]:
         """Plain values for a manifest."""
@@ -129,8 +141,9 @@ class RegisteredConfidence:
         """Inverse of `to_plain`; raises `VariantError` if it does not fit.
 
         Maps built before all of `FEATURES` existed have the usual weights, with their own scores
-        of chance. With small tiles their `total` was measured on views of one level: it is at least
-        that of `look` and one more level.
+        of chance, and what views of another date had lowered the bias by. With small tiles their
+        `total` was measured on views of one level: it is at least that of `look` and one more
+        level.
         """
         try:
             chances = Chances(**{name: float(plain["chances"][name]) for name in CHANCES})
@@ -139,7 +152,7 @@ class RegisteredConfidence:
                 least = chances.look + USUAL_CHANCES.total - USUAL_CHANCES.look
                 return cls.usual(replace(chances, total=max(chances.total, least)))
             if set(stored) == BEFORE_PHASE:
-                return cls.usual(chances)
+                return cls.usual(chances)._lowered(float(plain["biases"][0]) - BIAS_BEFORE_PHASE)
             first, second = plain["biases"]
             biases = float(first), float(second)
             weights = tuple(float(stored[name]) for name in FEATURES)

@@ -128,8 +128,8 @@ class SearchPlan:
     """Larger windows (some 300 MB) are not searched by FFT: on such a map views are found by
     tiles, or with a prior."""
     budget_ms: float = math.inf
-    """No search after the first one is begun that would end later than this after the view came,
-    ms; the best place so far is the answer."""
+    """No search after the first one is begun that would end later than this after the first one
+    began, ms; the best place so far is the answer."""
     threads: int = 1
     """Threads that share the poses of a search and the candidates."""
     fft_pose_ms: float = 0.1
@@ -222,6 +222,7 @@ class Budget:
     def __init__(self, budget_ms: float) -> None:
         self._budget_ms, self._begun_s = budget_ms, time.monotonic()
         self._estimated_ms: float | None = None
+        self.cut_short = False
 
     def allows(self, cost_ms: float) -> bool:
         """Whether a search of an estimated cost would end in time; the first one always may."""
@@ -229,6 +230,7 @@ class Budget:
             spent_ms = 1e3 * (time.monotonic() - self._begun_s)
             pace = spent_ms / self._estimated_ms if self._estimated_ms else 0.0
             if spent_ms + pace * cost_ms > self._budget_ms:
+                self.cut_short = True
                 return False
         self._estimated_ms = (self._estimated_ms or 0.0) + cost_ms
         return True

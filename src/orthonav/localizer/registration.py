@@ -218,9 +218,15 @@ class RegistrationLocalizer:
         if not judged:
             return None
         if best is None or self.relief is not None:
-            judged = ground.looked_again(judged)
+            judged = ground.looked_again(judged) if budget.allows(0.0) else judged
             best = finished()
-        if view.levels.final == 0 or not self._is_doubtful(best) or not budget.allows(0.0):
+        return replace(self._deepened(view, ground, best), cut_short=budget.cut_short)
+
+    def _deepened(
+        self, view: PreparedView, ground: ViewOnLevelGround, best: Registered
+    ) -> Registered:
+        """A place judged one level finer too, where it is doubtful."""
+        if view.levels.final == 0 or not self._is_doubtful(best):
             return best
         return self.registrar.deepened(
             ground.templates_of, ground.finer, view.levels, best, view.prior
@@ -301,7 +307,10 @@ class RegistrationLocalizer:
             )
         template = view.templates.at(run.level, recipe)
         scales = view.prior.scale_map
-        found = search(template, window, run.poses, run.candidates, scales, self._pool)
+        # Every thread has memory for a whole window.
+        fits = math.prod(window.size) * self.plan.threads <= self.plan.max_search_px
+        pool = self._pool if fits else None
+        found = search(template, window, run.poses, run.candidates, scales, pool)
         least = self.plan.candidate_share
         worth = sum(each.score >= least * found[0].score for each in found)
         return found[: max(worth, self.plan.min_candidates)]

@@ -163,6 +163,8 @@ def calibrate_tiles(
 ) -> TileCalibration:
     """Calibrate the confidence of tile matches on generated views of the sheet."""
     representation = sheet.representation
+    name = stored_representation(representation)["name"]
+    is_usual = isinstance(embedding.embedder.recipe, WhitenedRecipe) and name == "gradient"
     return calibrate(
         sheet.sampler,
         sheet.grid,
@@ -172,8 +174,8 @@ def calibrate_tiles(
         embedding.centres_en_m,
         HEADING_STEP_DEG,
         progress,
-        usual=USUAL if isinstance(embedding.embedder.recipe, WhitenedRecipe) else None,
-        slow=not represent.TABLE[stored_representation(representation)["name"]].flies,
+        usual=USUAL if is_usual else None,
+        slow=not represent.TABLE[name].flies,
     )
 
 

@@ -14,6 +14,7 @@
 #include <math.h>
 #include <string.h>
 
+#define LAYOUT 1        /* of all arguments and results; kernel.py has the same number */
 #define LANES 4         /* cosine and sine of the doubled direction, grey, valid or mask */
 #define BLOCKS 6        /* blocks along a side of a view: orthonav.register.template.BLOCKS */
 #define FULLY_VALID 0.99f
@@ -294,7 +295,7 @@ static void look(const window_t *window, const template_t *view, const numbers_t
     for (int block = 0; block < BLOCKS * BLOCKS; block++) pixels -= seen->sums[22 + block];
     for (int kind = 0; kind < 2; kind++) {
         const double energy = seen->sums[2 + kind];
-        const double own = numbers->energies[kind] - seen->sums[4 + kind];
+        const double own = fmax(numbers->energies[kind] - seen->sums[4 + kind], 0.0);
         const double found =
             energy * own > 0 ? seen->sums[kind] / sqrt(energy * own) : 0.0;
         const double bounded = fmax(found, limits->min_correlation);
@@ -460,7 +461,7 @@ static int borrow_images(PyObject *const from[3], images_t *images) {
                                         (int)view->shape[1]};
         return 0;
     }
-    PyErr_SetString(PyExc_ValueError, "window must be contiguous and smaller than 2^31 numbers");
+    PyErr_SetString(PyExc_ValueError, "window must have at most 32768 columns and 2^31 numbers");
     give_back(images);
     return -1;
 }
@@ -529,4 +530,11 @@ static struct PyModuleDef module = {
     NULL, NULL, NULL, NULL,
 };
 
-PyMODINIT_FUNC PyInit__kernel(void) { return PyModule_Create(&module); }
+PyMODINIT_FUNC PyInit__kernel(void) {
+    PyObject *made = PyModule_Create(&module);
+    if (made && PyModule_AddIntConstant(made, "LAYOUT", LAYOUT) < 0) {
+        Py_DECREF(made);
+        return NULL;
+    }
+    return made;
+}

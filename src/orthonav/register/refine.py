@@ -258,7 +258,8 @@ class Comparison:
         self._sums = compared(template, window, pose, slopes)
         pixels = template.pixels - float(self._sums.left_pixels.sum())
         self.overlap = pixels / max(template.pixels, 1.0)
-        own = (template.energies - self._sums.left_energies).tolist()
+        # Rounding of a difference must not make it negative.
+        own = np.maximum(template.energies - self._sums.left_energies, 0.0).tolist()
         found, squares, gains = [], [], []
         for product, energy, mine in zip(
             self._sums.products.tolist(), self._sums.energies.tolist(), own, strict=True

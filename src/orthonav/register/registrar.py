@@ -137,7 +137,8 @@ class Registered:
     `look_rival` compare all candidates at the level they were judged at; `fine_score` and
     `fine_rival` the finalists with one finer level added, NaN where that was not needed.
     `finalists` are the places that were finished, with their scores, best first. `own`: what the
-    place says of itself, without rivals.
+    place says of itself, without rivals. `cut_short`: whether searches were left out for want of
+    time.
     """
 
     placed: Placed
@@ -150,6 +151,7 @@ class Registered:
     own: OwnRatios
     fine_score: float = math.nan
     fine_rival: float = math.nan
+    cut_short: bool = False
 
     @property
     def look_ratio(self) -> float:
@@ -164,7 +166,7 @@ class Registered:
     def evidence(self) -> dict[str, float]:
         """The numbers behind a fix, as `docs/reference/formats.md` lists them."""
         gradient, grey = self.placed.correlations
-        return {
+        found = {
             "score": self.placed.weighted,
             "strength": self.score,
             "rival": self.rival,
@@ -185,6 +187,7 @@ class Registered:
             "overlap": self.placed.overlap,
             "candidates": float(self.candidates),
         }
+        return found | ({"cut_short": 1.0} if self.cut_short else {})
 
 
 class Registrar:

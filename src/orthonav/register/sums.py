@@ -1,7 +1,6 @@
 """Sums over the pixels of a view beside the map, all that one step of refinement needs.
 
-The compiled kernel makes the same sums. OpenCV rounds positions to 1/32 px, the kernel does not, so
-their scores differ in the fifth digit.
+The compiled kernel makes the same sums. OpenCV rounds positions to 1/32 px, the kernel does not.
 """
 
 from typing import NamedTuple

@@ -196,6 +196,7 @@ class Run:
             "major_m": _known(ELLIPSE_95 * major_m),
             "minor_m": _known(ELLIPSE_95 * minor_m),
             "direction_deg": _known(direction_deg),
+            "confident": result.is_confident,
         }
 
     def _result(self, index: int) -> ViewResult:

@@ -33,7 +33,8 @@ export class Compare {
     try {
       const g = await getGround(this.store.selected, x, y);
       const height = g.height_m === null ? "" : `, ${metres(g.height_m)} above sea`;
-      said = `${place(g.lat_deg, g.lon_deg)}${height}; 95 % ellipse ${metres(g.major_m)} x ${metres(g.minor_m)}, `
+      said = g.confident ? "" : "Best guess, not a confident position: ";
+      said += `${place(g.lat_deg, g.lon_deg)}${height}; 95 % ellipse ${metres(g.major_m)} x ${metres(g.minor_m)}, `
         + `major axis at ${number(g.direction_deg, 0)}°`;
     } catch (error) {
       said = error.message;
