@@ -10,8 +10,8 @@ from orthonav.cli.common import print_json
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.epilog = (
-        "The 95 % ellipse is rather too large than too small; it holds no error of the terrain, nor "
-        "the height of houses and trees."
+        "The 95 % ellipse is rather too large than too small; it holds no error of the terrain, "
+        "nor the height of houses and trees."
     )
     parser.add_argument("fixes", type=Path, metavar="fixes.jsonl", help="of `orthonav localize`")
     parser.add_argument("frame", metavar="FRAME", help="name of the view, as in the file")
