@@ -47,6 +47,8 @@ PRIOR_PX = 60.0
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0001)
 SPREAD = 1.2816
 """Standard deviations of the logit from the middle to the ends of an 80 % interval."""
+STDS = np.arange(1, 31) / 10
+"""Standard deviations between scenes that are compared."""
 RIDGE = Recalibration(0.1, 2.0, 0.5, 0.5, 0.0)
 """Ridge of the fit, per unit of the mean log likelihood, over 100."""
 Array = NDArray[np.float64]
@@ -224,17 +226,27 @@ def _recalibration(values: Array) -> Recalibration:
 
 
 def _between_scenes(found: Sequence[Outcome], by: Recalibration) -> float:
-    """Standard deviation of the logit, of measured less predicted, beyond that of few views."""
-    off, chance = [], []
-    for each in found:
-        predicted, right = each.predicted(by), np.array(each.right)
-        if not len(right):
-            continue
-        held = (right.sum() + 0.5) / (len(right) + 1)
-        mean = float(predicted.mean())
-        off.append(float(logit(np.array(held)) - logit(np.array(mean))))
-        chance.append(1 / (len(right) * max(mean * (1 - mean), 0.02)))
-    return math.sqrt(max(float(np.mean(np.square(off)) - np.mean(chance)), 0.1))
+    """Standard deviation of the logit of measured less predicted, beyond that of few views.
+
+    The likeliest one, if the logit of each condition differs from the predicted one by a normal
+    deviate and views come out right independently.
+    """
+    nodes, weights = np.polynomial.hermite_e.hermegauss(41)
+    weights = weights / weights.sum()
+
+    def likelihood(std: float) -> float:
+        total = 0.0
+        for each in found:
+            if not each.right:
+                continue
+            middle = logit(each.predicted(by))
+            share = np.clip(expit(middle + std * nodes[:, None]).mean(axis=1), 1e-4, 1 - 1e-4)
+            right = sum(each.right)
+            chance = share**right * (1 - share) ** (len(each.right) - right)
+            total += math.log(float(weights @ chance))
+        return total
+
+    return float(max(STDS, key=likelihood))
 
 
 def tables(found: Sequence[Outcome], options: argparse.Namespace) -> list[Table]:

@@ -5,7 +5,7 @@ of all scenes of two dates beside the checkout (`../shared/data`, or the folder 
 names) and of generated ones, and views that are on no map. It prints what the shipped confidence
 says of them, and what one says that was fitted to the other scenes only. `--fit` prints weights
 fitted to all of these views. DIR keeps maps, flights and the evidence of every view: a second run
-takes seconds. About an hour on two cores.
+takes seconds. About an hour on two cores. `DIR/worst` shows the worst views of every scene.
 """
 
 import argparse
@@ -25,9 +25,11 @@ from scipy.optimize import minimize
 
 from benchmarks.inputs import file_of
 from benchmarks.record import Table, provenance
+from benchmarks.trust_pictures import write_worst
 from benchmarks.trust_views import pairs, views_of
 from benchmarks.verdicts import percent
 from orthonav.confidence.registered import (
+    ALONE,
     FEATURES,
     USUAL_CHANCES,
     Chances,
@@ -100,14 +102,14 @@ def fit_judge(
 
     def loss(parameters: Array) -> tuple[float, Array]:
         weights = parameters[2:]
-        fits = 1 / (1 + np.exp(-(parameters[0] + scaled[:, :-1] @ weights[:-1])))
-        alone = 1 / (1 + np.exp(-(parameters[1] + scaled[:, -1] * weights[-1])))
+        fits = 1 / (1 + np.exp(-(parameters[0] + scaled[:, :-ALONE] @ weights[:-ALONE])))
+        alone = 1 / (1 + np.exp(-(parameters[1] + scaled[:, -ALONE:] @ weights[-ALONE:])))
         both = np.clip(fits * alone, 1e-9, 1 - 1e-9)
         value = -np.log(np.where(right, both, 1 - both)).mean()
         slope = np.where(right, -1.0, both / (1 - both)) / len(right)
         first, second = slope * (1 - fits), slope * (1 - alone)
-        gradient = np.array([first.sum(), second.sum(), *(scaled[:, :-1].T @ first), 0.0])
-        gradient[-1] = scaled[:, -1] @ second
+        slopes = scaled[:, :-ALONE].T @ first, scaled[:, -ALONE:].T @ second
+        gradient = np.concatenate([[first.sum(), second.sum()], *slopes])
         gradient[2:] += 2 * RIDGE * weights
         return float(value + RIDGE * (weights**2).sum()), gradient
 
@@ -118,8 +120,8 @@ def fit_judge(
     found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
     weights = found[2:] / std
     biases = (
-        float(found[0] - weights[:-1] @ mean[:-1]),
-        float(found[1] - weights[-1] * mean[-1]),
+        float(found[0] - weights[:-ALONE] @ mean[:-ALONE]),
+        float(found[1] - weights[-ALONE:] @ mean[-ALONE:]),
     )
     return RegisteredConfidence(biases, tuple(float(each) for each in weights), USUAL_CHANCES)
 
@@ -152,6 +154,8 @@ def main() -> None:
     )
     text = "\n".join([head, "", *(table.markdown() for table in tables)])
     print("\n" + text)
+    for path in write_worst(rows, judged.right, judged.left_out(), options.work):
+        print(f"worst views: {path}")
     if options.fit:
         everything = np.ones(len(rows), np.bool_)
         judge = judged.fitted(everything)

@@ -7,7 +7,7 @@ to be found; mirrored views, views of other scenes and views of ground beside th
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -151,7 +151,8 @@ def _rows(
     whole = _localizer(ortho, work)
     west, south, east, north = _bounds_deg(ortho)
     middle = (west + east) / 2
-    half = _localizer(ortho, work, (west, south, middle, north))
+    half_deg = west, south, middle, north
+    half = _localizer(ortho, work, half_deg)
     other_scenes = [each for each in others if each.scene != pair.scene]
     for number, case in enumerate(CASES):
         count = max(1, round(case.share * views))
@@ -168,6 +169,7 @@ def _rows(
             row = _placed(localizer, case, view, truth)
             if row is not None:
                 about = {**asdict(pair), **asdict(case), "frame": f"{folder.name}/{name}"}
+                about["bounds_deg"] = half_deg if case.kind == "beside" else None
                 if case.kind == "found" and not _is_covered(localizer, truth, case.width_px):
                     about["kind"] = "beside"
                 yield {**about, **row}
@@ -211,6 +213,8 @@ def _placed(
         "chances": asdict(localizer.confidence.chances),
         "error_px": error_m / gsd_m,
         "right": right,
+        "pose": astuple(found.placed.pose),
+        "side_px": seen.prepared.side_px,
         "confidence": localizer.confidence(found.evidence()),
     }
 

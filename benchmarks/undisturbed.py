@@ -40,7 +40,7 @@ from benchmarks.trust_views import Pair, pairs
 from orthonav.localizer import Localizer
 from orthonav.mapfile import open_map
 from orthonav.records import NoFix, Telemetry, View
-from orthonav.register.sharpness import local_ratio
+from orthonav.register.sharpness import sharpness
 
 GSD_M = 0.9, 2.1
 AGL_PX, SPEED_PX_S = 150.0, 12.0
@@ -115,7 +115,8 @@ def _is_shown(flight: FaultFlight, at_s: float, rng: np.random.Generator) -> boo
     registrar = registration.registrar
     placed = registrar.refiner(prepared.templates, levels, levels.final).place(pose, 2)
     template = prepared.templates.at(levels.final, levels.recipe(levels.final))
-    return bool(local_ratio(template, registrar.reference, placed.pose) >= SHOWN_RATIO)
+    found = sharpness(template, registrar.reference, placed.pose)
+    return bool(found.ratio >= SHOWN_RATIO)
 
 
 def _row(outcome: Outcome) -> list[str]:

@@ -111,10 +111,11 @@ def _drawn() -> str:
     from orthonav.simulate.landscape import DEFAULT_DATES, ORIGIN_M, Landscape
 
     made, digest = Landscape(SEED), hashlib.sha256()
-    corner = [origin + off for origin, off in zip(ORIGIN_M, DRAWN_FROM_M, strict=True)]
+    west_m, north_m = (origin + off for origin, off in zip(ORIGIN_M, DRAWN_FROM_M, strict=True))
     for gsd_m in DRAWN_GSD_M:
         for date in DEFAULT_DATES:
-            digest.update(made.render(date, *corner, DRAWN_PX, DRAWN_PX, gsd_m).tobytes())
+            picture = made.render(date, west_m, north_m, DRAWN_PX, DRAWN_PX, gsd_m)
+            digest.update(picture.tobytes())
     return digest.hexdigest()[:12]
 
 

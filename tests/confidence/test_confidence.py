@@ -7,7 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthonav.confidence.logistic import FEATURES, LogisticConfidence, fit_logistic
+from orthonav.confidence.logistic import (
+    FEATURES,
+    USUAL,
+    LogisticConfidence,
+    fit_few,
+    fit_logistic,
+)
 from orthonav.confidence.ratios import MAX_RATIO, lowe_ratio, peak_ratio, rival_score
 from orthonav.errors import VariantError
 
@@ -138,6 +144,19 @@ def test_separable_and_constant_evidence_give_finite_weights():
     assert all(map(math.isfinite, (found.bias, *found.weights)))
     said = probabilities(found, features)
     assert said[0] < 0.1 and said[-1] > 0.9
+
+
+@pytest.mark.parametrize("usual", [USUAL, None])
+def test_few_trials_move_the_usual_confidence_and_none_do_not(usual):
+    evidence = {"score": 0.6, "margin": 0.2}
+    features, weight = np.tile([0.6, 0.2], (20, 1)), np.ones(20)
+    none = fit_few(np.zeros((0, 2)), np.zeros(0, np.bool_), np.zeros(0), usual)
+    wrong = fit_few(features, np.zeros(20, np.bool_), weight, usual)
+    few = fit_few(features, np.arange(20) < 8, weight, usual)
+    assert wrong(evidence) < few(evidence)
+    assert wrong(evidence) < none(evidence) < 0.9
+    if usual is not None:
+        assert none(evidence) == pytest.approx(usual(evidence), rel=1e-6)
 
 
 def test_the_same_data_give_the_same_weights():

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthonav.confidence.registered import (
+    BEFORE_PHASE,
     CHANCES,
     FEATURES,
     OLD_FEATURES,
@@ -22,7 +23,7 @@ from orthonav.confidence.registered import (
 from orthonav.errors import VariantError
 
 CHANCE = Chances(total=25.0, look=15.0, fine=40.0)
-MODEL = RegisteredConfidence((-6.0, -1.0), (0.5, 11.0, 1.5, 0.5, 2.0, 10.0), CHANCE)
+MODEL = RegisteredConfidence((-8.0, -3.0), (0.5, 11.0, 1.5, 2.0, 1.0, 2.0, 3.0), CHANCE)
 
 strengths = st.floats(1.0, 300.0)
 sometimes = st.one_of(st.just(math.nan), strengths)
@@ -30,8 +31,8 @@ evidences = st.fixed_dictionaries(
     {
         **{name: strengths for name in ("strength", "rival", "look", "look_rival")},
         **{name: sometimes for name in ("fine", "fine_rival")},
-        "local_ratio": st.floats(0, 10),
-        "blocks_t": st.floats(-6, 6),
+        "local_phase": st.floats(-5, 80),
+        "local_gradients": st.floats(-5, 80),
         "detail_ratio": st.one_of(st.just(math.nan), st.floats(1e-3, 1e3)),
     }
 )
@@ -45,8 +46,8 @@ def evidence(strength=60.0, rival=30.0, look=35.0, look_rival=18.0, **more):
         "look_rival": look_rival,
         "fine": math.nan,
         "fine_rival": math.nan,
-        "local_ratio": 2.0,
-        "blocks_t": 4.0,
+        "local_phase": 10.0,
+        "local_gradients": 8.0,
         "detail_ratio": 1.5,
         **more,
     }
@@ -55,22 +56,22 @@ def evidence(strength=60.0, rival=30.0, look=35.0, look_rival=18.0, **more):
 def test_features_by_hand():
     features = features_of(evidence(50.0, 40.0, 30.0, 20.0), CHANCE)
     ratios = [50 / 25, 50 / 40, 30 / 20]
-    np.testing.assert_allclose(features, [*np.log(ratios), 4.0, math.log(1.5), math.log(2.0)])
+    np.testing.assert_allclose(np.exp(features), [*ratios, 1.5, 10.0, 10.0, 8.0])
     assert len(features) == len(FEATURES)
 
 
 def test_a_view_of_one_level_is_compared_with_the_chance_of_one_level():
     features = features_of(evidence(30.0, 0.0, 30.0, 20.0, detail_ratio=math.nan), CHANCE)
     np.testing.assert_allclose(np.exp(features[:2]), [30 / 15, 1 / STAND_IN * 30 / 15])
-    assert features[4] == math.log(USUAL_DETAIL)
+    assert features[3] == math.log(USUAL_DETAIL)
 
 
 def test_a_place_that_fits_as_well_a_little_aside_is_not_believed():
     """A lattice: strong, without a rival far away."""
     usual = RegisteredConfidence.usual(CHANCE)
     strong = {"strength": 400.0, "rival": 30.0, "look": 200.0, "look_rival": 18.0}
-    assert usual(evidence(**strong, local_ratio=2.5)) > 0.99
-    assert usual(evidence(**strong, local_ratio=1.02)) < 0.5
+    assert usual(evidence(**strong)) > 0.99
+    assert usual(evidence(**strong, local_phase=3.0, local_gradients=2.5)) < 0.5
 
 
 def test_chance_stands_in_for_a_rival_that_is_missing():
@@ -109,7 +110,7 @@ def test_absurd_evidence_gives_a_probability(value):
 
 @given(evidences, st.floats(1.0, 4.0))
 def test_better_evidence_never_lowers_it(plain, gain):
-    for name in ("strength", "look", "fine", "local_ratio", "detail_ratio"):
+    for name in ("strength", "look", "fine", "local_phase", "local_gradients", "detail_ratio"):
         if math.isfinite(plain[name]):
             assert MODEL({**plain, name: gain * plain[name]}) >= MODEL(plain) - 1e-12
 
@@ -132,7 +133,7 @@ def test_strength_and_ratios_each_raise_it():
 
 @given(
     st.tuples(*[st.floats(-50, 50)] * 2),
-    st.tuples(*[st.floats(0, 50)] * 6),
+    st.tuples(*[st.floats(0, 50)] * len(FEATURES)),
     st.tuples(*[st.floats(1e-3, 1e4)] * 3),
 )
 def test_plain_round_trip(biases, weights, chances):
@@ -150,6 +151,8 @@ def test_an_older_map_has_the_usual_weights_and_its_own_chance():
     assert RegisteredConfidence.from_plain(plain).chances == Chances(32.0, 15.0, 60.0)
     with pytest.raises(VariantError, match="chances"):
         RegisteredConfidence.from_plain(without(plain, "chances"))
+    plain["weights"] = dict.fromkeys(sorted(BEFORE_PHASE), 2.0)
+    assert RegisteredConfidence.from_plain(plain).chances == Chances(16.0, 15.0, 60.0)
 
 
 def without(plain, *path):
@@ -216,7 +219,7 @@ def synthetic(count, seed, harder=0.0):
     look = 15 * np.exp(rng.normal(0.2, 0.2, count) + 0.2 * right + harder)
     local = np.exp(np.where(right, rng.normal(0.8, 0.4, count), rng.normal(0.1, 0.1, count)))
     views = [
-        evidence(s, s / r, k, k / r, local_ratio=a)
+        evidence(s, s / r, k, k / r, local_phase=3 * a, local_gradients=3 * a)
         for s, r, k, a in zip(strength, ratio, look, local, strict=True)
     ]
     return views, right

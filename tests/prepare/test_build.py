@@ -10,7 +10,8 @@ import pytest
 
 from helpers import textured
 from orthonav import represent
-from orthonav.confidence.logistic import FEATURES
+from orthonav.confidence.logistic import FEATURES, LogisticConfidence
+from orthonav.confidence.registered import RegisteredConfidence
 from orthonav.errors import AreaError, MissingFileError, OrthonavError, OutputError, VariantError
 from orthonav.geo.area import Area
 from orthonav.geo.camera import Camera
@@ -304,10 +305,23 @@ def test_imagery_that_is_not_there(tmp_path, names_in):
 
 
 def test_a_uniform_orthophoto_is_no_crash(make_ortho, tmp_path):
-    """Nothing to learn from: a map, but one that promises nothing."""
+    """Nothing to learn from: the usual confidence, which without a margin is low."""
     flat = make_ortho(tmp_path / "flat.tif", np.full((300, 300), 99, np.uint8))
     opened = built(flat, tmp_path)
-    assert opened.manifest.confidence is None and opened.manifest.view["position_std_m"] > 0
+    confidence = LogisticConfidence.from_plain(opened.manifest.confidence)
+    assert confidence({"score": 0.9, "margin": 0.0}) < 0.9
+    assert opened.manifest.view["position_std_m"] > 0
+
+
+@pytest.mark.parametrize("side_px", [96, 130])
+def test_a_small_map_states_confidence(make_ortho, tmp_path, side_px):
+    """With a registration layer or not; of one tile and of a few."""
+    rng = np.random.default_rng(side_px)
+    small = make_ortho(tmp_path / "small.tif", rng.integers(0, 255, (side_px,) * 2, np.uint8))
+    opened = built(small, tmp_path, tile_px=96, **WITH_LAYER)
+    tiles = LogisticConfidence.from_plain(opened.manifest.confidence)
+    RegisteredConfidence.from_plain(opened.manifest.registration["confidence"])
+    assert tiles({"score": 0.3, "margin": 0.0}) < 0.5
 
 
 @pytest.mark.parametrize("old", [None, b"an older map"])

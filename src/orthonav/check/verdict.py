@@ -68,8 +68,8 @@ def verdict_of(found: Findings) -> Verdict:
 
 def _trust(found: Findings) -> list[Reason]:
     if not found.calibrated:
-        text = "The map has no confidence model, so no fix would be accepted. Build it from a "
-        return [Reason("no_confidence", f"{text}larger or more varied area.", Word.NO_GO)]
+        text = "The map states no confidence, so no fix would be accepted. Build it again."
+        return [Reason("no_confidence", text, Word.NO_GO)]
     share = found.wrong / max(found.trials, 1)
     if found.wrong < MIN_WRONG or share < GO_WRONG:
         return []

@@ -19,16 +19,21 @@ FEATURES = (
     "log_strength",
     "log_peak_ratio",
     "log_look_ratio",
-    "blocks_t",
     "log_detail_ratio",
-    "log_local_ratio",
+    "log_local_phase",
+    "log_alone_phase",
+    "log_alone_gradients",
 )
+ALONE = 2
+"""The last so many say whether the view fits nowhere near as well, the others whether it fits."""
 OLD_FEATURES = {"log_strength", "log_peak_ratio", "log_look_ratio"}
-"""Features of maps up to version 0.1."""
+"""Features of the first maps."""
+BEFORE_PHASE = OLD_FEATURES | {"blocks_t", "log_detail_ratio", "log_local_ratio"}
+"""Features of later ones, built before phase correlation was judged."""
 CHANCES = ("total", "look", "fine")
-USUAL_BIASES = -6.29, -1.75
-USUAL_WEIGHTS = 3.23, 6.16, 3.39, 0.47, 2.55, 10.35
-"""What separates right from wrong, fitted to 5,668 views (docs/decisions/confidence.md). The
+USUAL_BIASES = -6.68, -8.0
+USUAL_WEIGHTS = 2.35, 4.29, 5.87, 2.7, 2.28, 4.05, 3.03
+"""What separates right from wrong, fitted to 1,734 views (docs/decisions/confidence.md). The
 benchmark of trust shows how weights fitted in this way judge scenes left out."""
 RIDGE = 3e-2
 """Weight of the usual bias where views of another date of the map's area are fitted."""
@@ -38,8 +43,8 @@ LEAST = 1e-9
 """Least and greatest (1 - LEAST) probability of the fit, for a finite loss."""
 STAND_IN = 0.7
 """Share of the chance value that stands in for a rival where a narrow search found none."""
-LEAST_LOCAL = 0.5
-"""Least ratio to the ground nearby that makes a difference."""
+LEAST_DEVIATIONS = 1.0
+"""Least height above the ground nearby, in standard deviations, that makes a difference."""
 USUAL_DETAIL = 1.4
 """Stands in for the detail ratio of views too small to be finished at a finer level."""
 
@@ -73,18 +78,20 @@ USUAL_CHANCES = Chances(32.0, 15.0, 48.0)
 class RegisteredConfidence:
     """P(right) = P(the view fits) P(it fits nowhere near as well).
 
-    Each is a logistic regression. The first has all `FEATURES` but the last, the second has the
-    last: a strong fit cannot outweigh ground that repeats. What each feature shows wrong:
+    Each is a logistic regression. The second has the last two `FEATURES`, the first has the others:
+    a strong fit cannot outweigh ground that repeats. What each feature shows wrong:
 
     - `log_strength`: score over that of chance. Views that show nothing of the map.
     - `log_peak_ratio`: score over that of the strongest rival. Ground that exists more than once.
       Where the view was doubtful enough to be judged one level finer too, it is the mean with and
       without it: on blurred views the finer level alone is overconfident.
     - `log_look_ratio`: the same among all candidates, at a coarser level.
-    - `blocks_t`: agreement of the blocks of the view. Views that one strong line places.
     - `log_detail_ratio`: score at the finest level over that at the coarser one. Chance matches
       lose more in detail.
-    - `log_local_ratio`: score over the best one a little aside. Rows, lattices, single roads.
+    - `log_local_phase`: phase correlation over that a little aside, in standard deviations. Views
+      that share shapes with the place, but not their detail.
+    - `log_alone_phase`, `log_alone_gradients`: the same number, and gradients over those a little
+      aside, in standard deviations. Rows, lattices, single roads.
 
     A share of chance stands in for a rival where none was found, so that a narrow search does not
     appear as certainty. Weights are never negative: more evidence never means less confidence.
@@ -99,9 +106,9 @@ class RegisteredConfidence:
         return self.of(features_of(evidence, self.chances))
 
     def of(self, features: NDArray[np.float64]) -> float:
-        """The same, by features (6,)."""
-        fits = self.biases[0] + float(np.dot(self.weights[:-1], features[:-1]))
-        alone = self.biases[1] + self.weights[-1] * float(features[-1])
+        """The same, by features (7,)."""
+        fits = self.biases[0] + float(np.dot(self.weights[:-ALONE], features[:-ALONE]))
+        alone = self.biases[1] + float(np.dot(self.weights[-ALONE:], features[-ALONE:]))
         return probability(fits) * probability(alone)
 
     @classmethod
@@ -131,6 +138,8 @@ class RegisteredConfidence:
             if set(stored) == OLD_FEATURES:
                 least = chances.look + USUAL_CHANCES.total - USUAL_CHANCES.look
                 return cls.usual(replace(chances, total=max(chances.total, least)))
+            if set(stored) == BEFORE_PHASE:
+                return cls.usual(chances)
             first, second = plain["biases"]
             biases = float(first), float(second)
             weights = tuple(float(stored[name]) for name in FEATURES)
@@ -147,7 +156,7 @@ class RegisteredConfidence:
 
 
 def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.float64]:
-    """Features (6,) of the evidence of a registered view, see `RegisteredConfidence`."""
+    """Features (7,) of the evidence of a registered view, see `RegisteredConfidence`."""
     strength, look = max(evidence["strength"], 1e-3), max(evidence["look"], 1e-3)
     detail, chance = evidence["detail_ratio"], chances.of_strength(evidence)
     if math.isnan(detail):
@@ -157,9 +166,12 @@ def features_of(evidence: Mapping[str, float], chances: Chances) -> NDArray[np.f
     if math.isfinite(fine + fine_rival):
         ratio = math.sqrt(ratio * max(fine, 1e-3) / max(fine_rival, STAND_IN * chances.fine))
     look_ratio = look / max(evidence["look_rival"], STAND_IN * chances.look)
-    local = max(evidence["local_ratio"], LEAST_LOCAL)
-    logs = np.log([strength / chance, ratio, look_ratio, max(detail, 1e-3), local])
-    return np.array([*logs[:3], evidence["blocks_t"], *logs[3:]], np.float64)
+    phase, gradients = (
+        max(evidence[name], LEAST_DEVIATIONS) for name in ("local_phase", "local_gradients")
+    )
+    return np.log(
+        [strength / chance, ratio, look_ratio, max(detail, 1e-3), phase, phase, gradients]
+    )
 
 
 def fit_registered(

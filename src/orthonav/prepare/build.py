@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthonav import __version__, embed, represent
+from orthonav.confidence.logistic import USUAL
 from orthonav.embed.caevl import CaevlRecipe
 from orthonav.embed.contract import ViewEmbedder
 from orthonav.embed.network import TripletRecipe
@@ -109,7 +110,7 @@ def _sheet_reader(inputs: BuildInputs) -> SheetReader:
         inputs.area,
         grid,
         representation,
-        CropSampler(grid.tile_px, inputs.request.seed),
+        CropSampler(grid.tile_px, inputs.request.seed, min(grid.height_px, grid.width_px)),
         registration=inputs.request.registration,
         pictures=SheetPictures(grid, representation) if inputs.learns_network else None,
     )
@@ -162,7 +163,7 @@ def calibrate_tiles(
 ) -> TileCalibration:
     """Calibrate the confidence of tile matches on generated views of the sheet."""
     representation = sheet.representation
-    calibration = calibrate(
+    return calibrate(
         sheet.sampler,
         sheet.grid,
         representation,
@@ -171,11 +172,9 @@ def calibrate_tiles(
         embedding.centres_en_m,
         HEADING_STEP_DEG,
         progress,
+        usual=USUAL if isinstance(embedding.embedder.recipe, WhitenedRecipe) else None,
         slow=not represent.TABLE[stored_representation(representation)["name"]].flies,
     )
-    if calibration.confidence is None:
-        log.warning("too little imagery to calibrate: fixes on this map will have no confidence")
-    return calibration
 
 
 def map_content(
@@ -206,7 +205,7 @@ def map_content(
             "min_valid_share": MIN_VIEW_VALID_SHARE,
             "position_std_m": calibration.position_std_m,
         },
-        confidence=calibration.confidence.to_plain() if calibration.confidence else None,
+        confidence=calibration.confidence.to_plain(),
         radius_m=RADIUS_STRIDES * grid.stride_m,
         created_by=f"orthonav {__version__}",
     )

@@ -4,9 +4,11 @@ Views are cropped from the reference at random positions with simulated ageing: 
 blur, noise, heading and height errors, and up to two thirds of the image replaced by another
 position. Mirrored views serve as negatives: no place is the mirror image of another. Both are
 searched, and a logistic regression is fitted to the outcome. The result is conservative rather than
-exact, because no second date is used.
+exact, because no second date is used. Where too few views are found, the usual confidence is drawn
+to them.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthonav.confidence.logistic import FEATURES, LogisticConfidence, fit_logistic
+from orthonav.confidence.logistic import FEATURES, LogisticConfidence, fit_few, fit_logistic
 from orthonav.embed.contract import ViewEmbedder
 from orthonav.files import Progress
 from orthonav.geo.grid import TileGrid
@@ -26,6 +28,8 @@ SLOW_CROPS = 32
 """The same for representations that take minutes per view."""
 CROP_TILES = 1.5
 """Width of a crop in tiles: a rotated tile fits into it."""
+SMALL_TILES = 2.5
+"""Sheets less wide, in tiles, whose border is not all imagery, have few crops of that width."""
 HEADING_STD_DEG = 5.0
 SCALE_STD = 0.05
 """Errors of heading and height: those of the benchmarks."""
@@ -41,7 +45,7 @@ MIN_VALID = 0.9
 ENOUGH_CROPS = 48
 """Whole crops from which on no others are taken."""
 MIN_RIGHT = 10
-"""Fewest correct fixes for a fit."""
+"""Fewest correct fixes for a fit of all weights."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,21 +61,22 @@ class Crop:
 class TileCalibration:
     """Calibration of tile matches.
 
-    `confidence`: None if too little could be learned. `position_std_m`: standard deviation per axis
-    of a correct fix.
+    `position_std_m`: standard deviation per axis of a correct fix.
     """
 
-    confidence: LogisticConfidence | None
+    confidence: LogisticConfidence
     position_std_m: float
 
 
 class CropSampler:
     """Collects crops at random positions from a stream of blocks of imagery."""
 
-    def __init__(self, tile_px: int, seed: int) -> None:
+    def __init__(self, tile_px: int, seed: int, sheet_px: float = math.inf) -> None:
+        """`sheet_px`: shorter side of the sheet; on a small one crops are no larger than tiles."""
         self._rng = np.random.default_rng([seed, 1])
         self._tile_px = tile_px
-        self.size_px = round(tile_px * CROP_TILES)
+        is_small = sheet_px < SMALL_TILES * tile_px
+        self.size_px = tile_px if is_small else round(tile_px * CROP_TILES)
         self._whole: list[Crop] = []
         self._partial: list[Crop] = []
 
@@ -143,11 +148,13 @@ def calibrate(
     heading_step_deg: float,
     progress: Progress,
     *,
+    usual: LogisticConfidence | None,
     slow: bool = False,
 ) -> TileCalibration:
     """Search changed and mirrored crops on the new map and fit the confidence to the outcome.
 
-    A `slow` representation (minutes per crop) is tried on `SLOW_CROPS` only.
+    `usual`: the confidence of such embeddings on other maps, None if unknown. A `slow`
+    representation (minutes per crop) is tried on `SLOW_CROPS` only.
     """
     sampled = sampler.crops
     rng = np.random.default_rng([len(sampled), 2])
@@ -172,7 +179,13 @@ def calibrate(
             errors.append(centres_en_m[match.tile] + np.array(match.shift_en_m) - truth)
             mirrored.append(mirror)
         progress("calibrate", (done + 1) / len(crops))
-    return _fitted(np.array(features), np.array(errors), np.array(mirrored, dtype=bool), grid)
+    return _fitted(
+        np.array(features).reshape(-1, len(FEATURES)),
+        np.array(errors).reshape(-1, 2),
+        np.array(mirrored, dtype=bool),
+        grid,
+        usual,
+    )
 
 
 def _fitted(
@@ -180,15 +193,13 @@ def _fitted(
     errors_en_m: NDArray[np.float64],
     mirrored: NDArray[np.bool_],
     grid: TileGrid,
+    usual: LogisticConfidence | None,
 ) -> TileCalibration:
-    fallback = TileCalibration(None, grid.stride_m)
-    if len(features) == 0:
-        return fallback
     near = np.hypot(*errors_en_m.T) <= RADIUS_STRIDES * grid.stride_m
     right = near & ~mirrored
-    if right.sum() < MIN_RIGHT:
-        return fallback
     weight = np.where(mirrored, MIRRORED_WEIGHT, 1.0)
+    if right.sum() < MIN_RIGHT:
+        return TileCalibration(fit_few(features, right, weight, usual), grid.stride_m)
     confidence = fit_logistic(features, right, weight)
     std_m = float(np.sqrt(np.mean(errors_en_m[right] ** 2)))
     return TileCalibration(confidence, max(std_m, grid.gsd_m))

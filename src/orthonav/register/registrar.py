@@ -20,7 +20,7 @@ from orthonav.register.reference import Reference
 from orthonav.register.refine import Placed, Refiner
 from orthonav.register.scale_map import ScaleMap
 from orthonav.register.search import Candidate, SearchWindow
-from orthonav.register.sharpness import local_ratio
+from orthonav.register.sharpness import Sharpness, sharpness
 from orthonav.register.template import ViewTemplates
 
 LOOK_PX = 72.0
@@ -110,11 +110,11 @@ class OwnRatios(NamedTuple):
     """What a place says of itself.
 
     `detail`: score at the final level over that at the judged level, NaN where these are the same
-    level. `local`: score at the final level over the best one nearby (`sharpness`).
+    level. `local`: how far it stands out from the ground around it, at the final level.
     """
 
     detail: float
-    local: float
+    local: Sharpness
 
 
 class Finished(NamedTuple):
@@ -177,7 +177,9 @@ class Registered:
             "gradient_correlation": gradient,
             "grey_correlation": grey,
             "detail_ratio": self.own.detail,
-            "local_ratio": self.own.local,
+            "local_ratio": self.own.local.ratio,
+            "local_gradients": self.own.local.gradients,
+            "local_phase": self.own.local.phase,
             "blocks_t": self.placed.blocks_t,
             "agreement": self.placed.agreement,
             "overlap": self.placed.overlap,
@@ -392,7 +394,7 @@ class Registrar:
         detail = math.nan
         if levels.final != levels.look:
             detail = max(best.score, 1e-3) / max(total - best.score, 1e-3)
-        return OwnRatios(detail, local_ratio(final, self.reference, best.pose))
+        return OwnRatios(detail, sharpness(final, self.reference, best.pose))
 
     def at_final(self, templates: ViewTemplates, levels: Levels, judged: Placed) -> Finished:
         """A judged candidate refined at the final level, and the sum of its scores."""

@@ -1,11 +1,14 @@
 """How much a place stands out from the ground around it: evidence against texture that repeats.
 
 A view of rows, lattices or a single road fits nearly as well a little aside. Places found by chance
-do so too. At the finest level, where rows show, the ratio is 1.2 at wrong places (median) and 3.3
-at right ones; at wrong places in an orchard it is 0.9 to 1.15.
+do so too. The view's window is moved a little aside, and what it scores there is compared with its
+score at the place itself: for all evidence, for gradients alone, and as phase correlation (Kuglin
+and Hines, 1975), which weighs all spatial frequencies alike. All three come from the same spectra.
+What they bring is in docs/decisions/evidence.md.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,26 +31,52 @@ MIN_PEAK_PX = 3.0
 NEAR_PX = 3.0
 """The place itself is the best within so many pixels."""
 MAX_RATIO = 10.0
+PHASE_FLOOR = 1e-3
+"""Frequencies of less power than this share of the mean count less in the phase correlation."""
 
 
-def local_ratio(template: Template, reference: Reference, pose: Pose) -> float:
-    """Correlation of a view at `pose` over the best one of the window moved a little, up to 10.
+class Sharpness(NamedTuple):
+    """How far the score of a place stands out from those a little aside.
 
-    Heading and scale stay those of `pose`. 0 where the view does not correlate at all.
+    `ratio`: of all evidence, over the best one aside, up to 10; 0 where the view does not correlate
+    at all. `gradients`, `phase`: of gradients alone, and by phase correlation of all evidence, over
+    the mean aside, in standard deviations.
     """
-    scores = _moved_scores(template, reference, pose)
-    rows, cols = (np.arange(side, dtype=np.float64) - side // 2 for side in scores.shape)
+
+    ratio: float
+    gradients: float
+    phase: float
+
+
+def sharpness(template: Template, reference: Reference, pose: Pose) -> Sharpness:
+    """How far a view stands out at `pose`; heading and scale stay those of `pose`."""
+    moved = _moved_scores(template, reference, pose)
+    rows, cols = (np.arange(side, dtype=np.float64) - side // 2 for side in moved.shape[1:])
     moved_px = np.hypot(rows[:, None], cols)
     peak_px = max(MIN_PEAK_PX, PEAK_SHARE * math.sqrt(template.pixels))
-    here = float(scores[moved_px <= NEAR_PX].max())
-    aside = float(scores[moved_px > peak_px].max(initial=0.0))
-    if here <= 0:
+    near, aside = moved_px <= NEAR_PX, moved_px > peak_px
+    return Sharpness(
+        _ratio(moved[0] + moved[1], near, aside),
+        _deviations(moved[0], near, aside),
+        _deviations(moved[2], near, aside),
+    )
+
+
+def _ratio(scores: Array, near: NDArray[np.bool_], aside: NDArray[np.bool_]) -> float:
+    here, rival = float(scores[near].max()), float(scores[aside].max(initial=0.0))
+    return min(here / max(rival, 1e-6), MAX_RATIO) if here > 0 else 0.0
+
+
+def _deviations(scores: Array, near: NDArray[np.bool_], aside: NDArray[np.bool_]) -> float:
+    others = scores[aside]
+    if not others.size:
         return 0.0
-    return min(here / max(aside, 1e-6), MAX_RATIO)
+    return float((scores[near].max() - others.mean()) / (others.std() + 1e-9))
 
 
 def _moved_scores(template: Template, reference: Reference, pose: Pose) -> Array:
-    """Scores (2 R + 1, 2 C + 1) of a view's window moved by up to R rows and C columns.
+    """Scores (3, 2 R + 1, 2 C + 1) of a view's window moved by up to R rows and C columns: of
+    gradients, of grey, and by phase correlation.
 
     Not divided by the energy of the map under each move: that hardly changes.
     """
@@ -64,5 +93,9 @@ def _moved_scores(template: Template, reference: Reference, pose: Pose) -> Array
     # Moves of less than the margin never reach over the border: no padding.
     size = tuple(next_fast_len(side, real=True) for side in window.shape)
     products = np.conj(rfft2(template.channels, s=size)) * rfft2(planes[:3], s=size)
-    moved = irfft2(products.sum(axis=0), s=size)[: 2 * rows + 1, : 2 * cols + 1]
+    power = np.abs(products)
+    floor = PHASE_FLOOR * power.mean(axis=(1, 2), keepdims=True) + 1e-12
+    phase = (products / (power + floor)).sum(axis=0)
+    parts = np.stack([*(products[group].sum(axis=0) for group in GROUPS), phase])
+    moved = irfft2(parts, s=size)[:, : 2 * rows + 1, : 2 * cols + 1]
     return np.asarray(moved, np.float32)

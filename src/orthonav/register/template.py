@@ -165,7 +165,8 @@ def _products(jacobian: Array) -> NDArray[np.float64]:
     """Products (G, 4, 4) of derivatives (3, 4, H, W), summed over the channels of each kind."""
     out = np.zeros((len(GROUPS), 4, 4))
     for number, group in enumerate(GROUPS):
-        for rows in jacobian[group].reshape(-1, 4, jacobian[0, 0].size):
+        for each in jacobian[group]:
+            rows = each.reshape(4, each[0].size)
             out[number] += rows @ rows.T
     return out
 
