@@ -130,8 +130,9 @@ class Seen:
 class Bench:
     """Maps and imagery, made once."""
 
-    def __init__(self, work: Path, views: int, seed: int) -> None:
-        self.work, self.views, self.seed = work, views, seed
+    def __init__(self, work: Path, views: int, seed: int, area: int = 3) -> None:
+        """`seed`: of hills and views; `area`: of the generated imagery."""
+        self.work, self.views, self.seed, self.area = work, views, seed, area
         self.ground = lru_cache(maxsize=1)(self._ground)
 
     def _ground(self, imagery: str) -> Ground:
@@ -161,7 +162,7 @@ class Bench:
         map_path, (past, present) = folder / "map.tif", (folder / f"{d.name}.tif" for d in dates)
         if not map_path.is_file():
             size_m = (MAP_M[0] + 2 * BEYOND_M, MAP_M[1] + 2 * BEYOND_M)
-            generate_area(folder, size_m=size_m, dates=dates, seed=3)
+            generate_area(folder, size_m=size_m, dates=dates, seed=self.area)
             with rasterio.open(past) as data:
                 part = Window(BEYOND_M, BEYOND_M, *MAP_M)
                 profile = data.profile | {"width": MAP_M[0], "height": MAP_M[1]}

@@ -1,8 +1,8 @@
 """How often the 95 % ellipse of a pixel holds the ground that it shows.
 
-`python -m benchmarks.pixel_ellipses [--views 40] [--work DIR]` places the views of
-`benchmarks.over_terrain` with pitch and roll reported off by 1 deg, and follows the true rays of
-some of their pixels to the ground.
+`python -m benchmarks.pixel_ellipses [--views 40] [--seed 1] [--area 3] [--work DIR]` places the
+views of `benchmarks.over_terrain` with pitch and roll reported off by 1 deg, on maps with a terrain
+and on level ground without one, and follows the true rays of some of their pixels to the ground.
 """
 
 import argparse
@@ -28,7 +28,9 @@ TILT_STD_DEG = 1.0
 AT = ((0.5, 0.5), (0.15, 0.8), (0.85, 0.8), (0.3, 0.4), (0.7, 0.4))
 """Pixels, as shares of the picture's sides."""
 CHI2_95 = 5.991
-HEADER = "| off nadir | slope | fixes | of the camera | of pixels | median pixel error | ellipse |"
+HEADER = (
+    "| off nadir | slope | map | fixes | of the camera | of pixels | median pixel error | ellipse |"
+)
 
 
 def shown(each: Seen, hills: Raster, px: tuple[float, float]) -> Array:
@@ -40,15 +42,16 @@ def shown(each: Seen, hills: Raster, px: tuple[float, float]) -> Array:
     return np.asarray(met(hills, rays_enu(alone, each.attitude_deg, 1), each.position_m)[0, 0])
 
 
-def measured(bench: Bench, row: Row) -> str:
+def measured(bench: Bench, row: Row, with_terrain: bool) -> str:
     """A row of the table."""
     ground = bench.ground(row.imagery)
     seen, hills = bench.seen(row)
     sheet = ground.opened.manifest.sheets[0]
-    terrain, frame = layer_of(row, ground, hills), sheet.frame
+    terrain, frame = layer_of(row, ground, hills) if with_terrain else None, sheet.frame
     localizer = Localizer(ground.opened)
-    assert localizer.registration is not None
-    localizer.registration.relief = Relief(terrain, localizer.grid)  # type: ignore[arg-type]
+    if terrain is not None:
+        assert localizer.registration is not None
+        localizer.registration.relief = Relief(terrain, localizer.grid)  # type: ignore[arg-type]
     rng = np.random.default_rng(11)
     cameras, pixels, errors, axes = [], [], [], []
     for each in seen:
@@ -61,9 +64,12 @@ def measured(bench: Bench, row: Row) -> str:
             tilt_std_deg=TILT_STD_DEG,
             home_m=float(each.position_m[2] - home_m(hills)),
         )
-        heights = map_heights(ground.opened, terrain)
-        assert heights is not None
-        reported = heights.corrected(reported)
+        if terrain is None:
+            reported = replace(reported, agl_m=float(each.position_m[2] - home_m(hills)))
+        else:
+            heights = map_heights(ground.opened, terrain)
+            assert heights is not None
+            reported = heights.corrected(reported)
         fix = localizer.locate(replace(each.view, telemetry=reported))
         if not isinstance(fix, Fix) or fix.confidence < CONFIDENT:
             continue
@@ -84,7 +90,8 @@ def measured(bench: Bench, row: Row) -> str:
             axes.append(math.sqrt(CHI2_95 * float(np.linalg.eigvalsh(found.cov_en_m2)[-1])))
     inside = [f"{np.mean(np.array(each) <= CHI2_95):.0%}" for each in (cameras, pixels)]
     return (
-        f"| {row.tilt_deg:.0f} deg | {row.slope:g} | {len(cameras)} | {inside[0]} | {inside[1]} |"
+        f"| {row.tilt_deg:.0f} deg | {row.slope:g} | {'terrain' if with_terrain else 'level'} |"
+        f" {len(cameras)} | {inside[0]} | {inside[1]} |"
         f" {np.median(errors):.1f} m | {np.median(axes):.1f} m |"
     )
 
@@ -95,18 +102,19 @@ def main() -> None:
     parser.add_argument("--work", type=Path, help="folder that is kept (default: a temporary one)")
     parser.add_argument("--views", type=int, default=40, help="views of a row")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--area", type=int, default=3, help="seed of the generated imagery")
     parser.add_argument("--tilt-deg", type=float, nargs="+", default=[0.0, 30.0, 60.0])
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    print(HEADER + "\n|--:|--:|--:|--:|--:|--:|--:|")
+    print(HEADER + "\n|--:|--:|---|--:|--:|--:|--:|--:|")
     with tempfile.TemporaryDirectory() as temporary:
         work = options.work or Path(temporary)
         work.mkdir(parents=True, exist_ok=True)
-        bench = Bench(work, options.views, options.seed)
+        bench = Bench(work, options.views, options.seed, options.area)
         for tilt_deg in options.tilt_deg:
-            for slope in (0.05, 0.15):
+            for slope, terrain in ((0.0, False), (0.05, True), (0.15, True)):
                 row = Row("oblique", "generated", 480, slope, 300.0, tilt_deg=tilt_deg, agl_m=250.0)
-                print(measured(bench, row), flush=True)
+                print(measured(bench, row, terrain), flush=True)
 
 
 if __name__ == "__main__":

@@ -94,7 +94,9 @@ def test_ellipses_cover_what_they_state(px, tilt_deg):
         heading = 30.0 + math.degrees(rng.normal(0, heading_std))
         agl_m = AGL_M * math.exp(rng.normal(0, scale_std))
         place = rng.normal(0, 1.0, 2) + at_camera - ground(middle[0], heading, agl_m)
-        seen = replace(fix(*place, heading_deg=heading, agl_m=agl_m), cov_en_m2=covariance)
+        evidence = EVIDENCE | {"middle_std_m": 1.0}
+        seen = fix(*place, heading_deg=heading, agl_m=agl_m, evidence=evidence)
+        seen = replace(seen, cov_en_m2=covariance)
         found = locate_pixel(CAMERA, tilted, seen, px)
         off = en_of(found) - ground(px, 30.0, AGL_M)
         inside += off @ np.linalg.solve(found.cov_en_m2, off) < 5.991
@@ -128,7 +130,11 @@ def test_the_middle_is_as_exact_as_registration_where_tilt_is_uncertain(pitch_de
     lever_m = 1.05 * AGL_M * math.radians(3.0) / math.cos(math.radians(pitch_deg)) ** 2
     exact = {"heading_std_deg": 0.0, "log_scale_std": 0.0}
     seen = replace(
-        fix(agl_m=1.05 * AGL_M, evidence=exact), cov_en_m2=np.eye(2) * (0.6**2 + lever_m**2)
+        fix(agl_m=1.05 * AGL_M, evidence=exact | {"middle_std_m": 0.6}),
+        cov_en_m2=np.eye(2) * (0.6**2 + lever_m**2),
     )
     found = locate_pixel(CAMERA, tilted, seen, (320, 240))
-    assert np.sqrt(np.linalg.eigvalsh(found.cov_en_m2)[0]) > 0.3
+    np.testing.assert_allclose(found.cov_en_m2, np.eye(2) * 0.6**2, atol=1e-9)
+    # A fix that does not say how well the middle is known is one of the camera.
+    found = locate_pixel(CAMERA, tilted, replace(seen, evidence=exact), (320, 240))
+    assert (np.linalg.eigvalsh(found.cov_en_m2 - seen.cov_en_m2) > 0).all()

@@ -111,11 +111,16 @@ def test_pitch_and_roll_are_estimated_where_their_deviation_is_reported(opened, 
     picture, _ = seen_from(grey, relief)
     off = (72.0, ATTITUDE[1] + 1.5, ATTITUDE[2] - 1.5)
     localizer = on_terrain(opened, relief)
-    errors = [
-        error_m(localizer, localizer.locate(View(picture, CAMERA, telemetry(off, **known))))
+    fixes = [
+        localizer.locate(View(picture, CAMERA, telemetry(off, **known)))
         for known in ({}, {"tilt_std_deg": 1.5})
     ]
+    errors = [error_m(localizer, fix) for fix in fixes]
     assert errors[0] > 3.5 and errors[1] < 0.5 * errors[0]
+    # The ground in the middle is known better than the camera, but no better than maps agree.
+    camera_m = math.sqrt(np.linalg.eigvalsh(fixes[1].cov_en_m2)[-1])
+    floor_m = localizer.registration.floor_px * localizer.grid.gsd_m
+    assert floor_m < fixes[1].evidence["middle_std_m"] < camera_m
 
 
 @pytest.mark.parametrize("wrong", ["displaced", "50 m too high", "inside out"])

@@ -9,6 +9,10 @@ from orthonav.cli.common import print_json
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
+    parser.epilog = (
+        "The 95 % ellipse is rather too large than too small; it holds no error of the terrain, "
+        "nor the height of houses and trees."
+    )
     parser.add_argument("fixes", type=Path, metavar="fixes.jsonl", help="of `orthonav localize`")
     parser.add_argument("frame", metavar="FRAME", help="name of the view, as in the file")
     parser.add_argument("x", type=float, metavar="X", help="pixels from the left border")

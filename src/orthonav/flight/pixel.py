@@ -2,7 +2,9 @@
 
 Registration places the ground that a view shows; where the camera was follows from it. So errors of
 heading, height and tilt move a pixel by what they change between the middle of the view and the
-pixel, not by what they change at the camera.
+pixel, not by what they change at the camera. Fixes of a track, and those that do not say how well
+the middle of their view is known (`middle_std_m`), are positions of the camera: all its errors
+count. Errors are taken as independent.
 """
 
 import math
@@ -20,8 +22,6 @@ from orthonav.records import DEFAULT_AGL_STD, DEFAULT_YAW_STD_DEG, Fix, Telemetr
 
 STEP = 1e-3
 """Step of the derivatives: rad, and log scale."""
-LEAST_M = 0.05
-"""Least standard deviation of the middle of a view along any axis."""
 Array = NDArray[np.float64]
 Relief = Callable[[Array], Array]
 """Heights (N,) above the ground under the camera at metres east and north of it (N, 2)."""
@@ -72,12 +72,11 @@ def locate_pixel(
     slopes = _slopes(camera, px, values, relief)
     if not np.isfinite(slopes).all():
         raise FlightError(f"pixel {px[0]:g}, {px[1]:g} is next to the horizon or unknown ground")
-    if "heading_bias_std_deg" in fix.evidence:  # of a track: the covariance is that of the camera
-        covariance = fix.cov_en_m2 + _spread(slopes, stds)
-    else:
+    covariance = fix.cov_en_m2 + _spread(slopes, stds)
+    middle_m = fix.evidence.get("middle_std_m")
+    if middle_m is not None and "heading_bias_std_deg" not in fix.evidence:
         at_middle = np.nan_to_num(_slopes(camera, middle, values, relief))
-        covariance = _at_least(fix.cov_en_m2 - _spread(at_middle, stds), LEAST_M**2)
-        covariance = covariance + _spread(slopes - at_middle, stds)
+        covariance = np.eye(2) * middle_m**2 + _spread(slopes - at_middle, stds)
     lat, lon = frame.latlon_from_en(here)
     height_m = math.nan if terrain is None else float(terrain(np.array([lat]), np.array([lon]))[0])
     drop_m = values[1] - (0.0 if terrain is None else height_m - below_m)
@@ -144,9 +143,3 @@ def _spread(slopes: Array, stds: Array) -> Array:
     """Covariance (2, 2) that standard deviations (4,) make by derivatives (2, 4)."""
     scaled = slopes * stds
     return np.asarray(scaled @ scaled.T)
-
-
-def _at_least(covariance: Array, variance: float) -> Array:
-    """A covariance (2, 2) whose eigenvalues are at least `variance`."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors @ np.diag(np.maximum(values, variance)) @ vectors.T)

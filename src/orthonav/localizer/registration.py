@@ -352,6 +352,11 @@ class RegistrationLocalizer:
         covariance = spread[:2, :2]
         heading_deg = math.degrees(placed.pose.turn_rad) % 360
         agl_m = telemetry.agl_m * math.exp(placed.pose.log_scale)
+        assert placed.covariance is not None
+        gsd_m = self.grid.gsd_m
+        # Coarse imagery of another date is displaced by more (benchmarks/pixel_ellipses.py).
+        floor_m = self.floor_px * gsd_m * 2.0**view.levels.final
+        of_middle: NDArray[np.float64] | None = placed.covariance[:2, :2] * gsd_m**2
         stds = {
             "heading_std_deg": math.degrees(math.sqrt(spread[2, 2])),
             "log_scale_std": math.sqrt(spread[3, 3]),
@@ -359,14 +364,17 @@ class RegistrationLocalizer:
         if camera is not None:
             place, agl_m = camera.orientation.position_m[:2], camera.agl_m
             heading_deg = float(camera.orientation.attitude_deg[0]) % 360
-            floor_m = self.floor_px * self.grid.gsd_m
             covariance = camera.covariance[:2, :2] + np.eye(2) * floor_m**2
             stds = _attitude_found(camera, telemetry)
+            of_middle = camera.middle_covariance
         elif telemetry.tilt_std_deg is not None:
             # A line of sight off nadir meets the ground farther out by 1 / cos^2.
             cos = math.cos(math.radians(off_nadir_deg(telemetry)))
             tilt_m = agl_m * math.radians(telemetry.tilt_std_deg) / cos**2
             covariance = covariance + np.eye(2) * tilt_m**2
+        if of_middle is not None:
+            widest = float(np.linalg.eigvalsh(of_middle)[-1])
+            stds["middle_std_m"] = math.sqrt(widest + floor_m**2)
         lat, lon = self.sheet.frame.latlon_from_en(place)
         covariance.flags.writeable = False
         evidence = best.evidence()

@@ -8,25 +8,29 @@ from numpy.typing import NDArray
 
 from orthonav.localizer.orthorectify import Orientation
 from orthonav.localizer.relief_view import ReliefView
-from orthonav.localizer.resection import resected
+from orthonav.localizer.resection import STEPS, resected
 from orthonav.register.pose import Pose
 from orthonav.register.refine import Placed
 from orthonav.register.registrar import Registrar
 
-RESECTIONS = 2
-"""The view is orthorectified and resected so many times."""
+RESECTIONS = 5
+"""The view is orthorectified and resected at most so many times,"""
+SETTLED = 0.1
+"""until a correction is below this share of its standard deviations."""
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class CameraFound:
     """The camera of a view by resection: `agl_m` above the ground below it, the covariance (6, 6)
-    of metres east, north, up and degrees of heading, pitch and roll, and what its middle shows."""
+    of metres east, north, up and degrees of heading, pitch and roll, what its middle shows, and the
+    covariance (2, 2) of that, None beside unknown ground."""
 
     orientation: Orientation
     agl_m: float
     covariance: Array
     middle_en_m: tuple[float, float]
+    middle_covariance: Array | None
 
 
 def camera_found(seen: ReliefView, registrar: Registrar, placed: Placed) -> CameraFound | None:
@@ -61,6 +65,8 @@ def camera_found(seen: ReliefView, registrar: Registrar, placed: Placed) -> Came
         if found is None:
             return None
         orientation = orientation.moved(found.correction)
+        if (np.abs(found.correction) < SETTLED * np.sqrt(np.diag(found.covariance))).all():
+            break
     if found is None or not np.isfinite(found.covariance).all():
         return None
     east, north, above_sea_m = orientation.position_m.tolist()
@@ -68,7 +74,21 @@ def camera_found(seen: ReliefView, registrar: Registrar, placed: Placed) -> Came
     if not above_sea_m - below_m > 0:
         return None
     middle = seen.middle_en_m(orientation, pose)
-    return CameraFound(orientation, above_sea_m - below_m, found.covariance, middle)
+    spread = _middle_covariance(seen, orientation, found.covariance)
+    return CameraFound(orientation, above_sea_m - below_m, found.covariance, middle, spread)
+
+
+def _middle_covariance(
+    seen: ReliefView, orientation: Orientation, covariance: Array
+) -> Array | None:
+    """Covariance (2, 2), m^2, of the ground that the middle of a view shows; None where unknown
+    ground is next to it."""
+    columns = []
+    for step in np.diag(STEPS):
+        ahead, behind = (seen.sight_en_m(orientation.moved(sign * step)) for sign in (1, -1))
+        columns.append((ahead - behind) / (2 * step.sum()))
+    slopes = np.stack(columns, axis=1)
+    return slopes @ covariance @ slopes.T if np.isfinite(slopes).all() else None
 
 
 def _attitude_prior(seen: ReliefView, pose: Pose, orientation: Orientation) -> tuple[Array, Array]:

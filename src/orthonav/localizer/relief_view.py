@@ -124,19 +124,23 @@ class ReliefView:
     def middle_en_m(self, orientation: Orientation, pose: Pose) -> tuple[float, float]:
         """Where the middle of the picture looks on the terrain; the middle of the window of `pose`
         where that is unknown."""
+        found = self.sight_en_m(orientation)
+        if not np.isfinite(found).all():
+            found = self.relief.en_m(np.array([pose.x_px, pose.y_px]))
+        return float(found[0]), float(found[1])
+
+    def sight_en_m(self, orientation: Orientation) -> Array:
+        """Metres east and north (2,) of the terrain that the middle of the picture shows; NaN where
+        that is unknown."""
         camera = self.view.picture_at(self.view.levels.final).camera
-        east, north = self.relief.en_m(np.array([pose.x_px, pose.y_px])).tolist()
         px = np.array([camera.width_px / 2 - camera.cx_px, camera.height_px / 2 - camera.cy_px])
         plane = undistort(camera, px / [camera.fx_px, camera.fy_px])
         ray = enu_from_camera(*orientation.attitude_deg.tolist()) @ [*plane.tolist(), 1.0]
         if not ray[2] < -1e-6:
-            return east, north
+            return np.full(2, np.nan)
 
         def above_sea_m(offset_en_m: Array) -> Array:
             return self.relief.terrain.at_en_m(orientation.position_m[:2] + offset_en_m)
 
         met = sight_on_ground(ray[:2] / -ray[2], float(orientation.position_m[2]), above_sea_m)
-        if not np.isfinite(met).all():
-            return east, north
-        found = orientation.position_m[:2] + met
-        return float(found[0]), float(found[1])
+        return np.asarray(orientation.position_m[:2] + met)
