@@ -1,8 +1,8 @@
 """Views placed by this checkout and by another one, in turn, in one run: speed and verdicts.
 
 `python -m benchmarks.against OTHER [--views N] [--rounds N] [--only WORDS ..] [--work DIR] [--out
-DIR]`. OTHER is a checkout of another commit. Both place the same views on the same maps, which are
-built once by this one; areas beside the checkout that are absent are left out. Times are of the
+DIR]`. OTHER is a checkout of an earlier commit. Both place the same views on the same maps, which
+are built once by OTHER; imagery beside the checkout that is absent is left out. Times are of the
 processor, so that other work on the machine counts little.
 """
 
@@ -22,7 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import rasterio
 
-from benchmarks.inputs import DATA, FLIGHT_SEED, PAST, PRESENT, WIDE_ERRORS, Workplace, map_of
+from benchmarks.inputs import DATA, FLIGHT_SEED, PAST, PRESENT, WIDE_ERRORS, Workplace
 from benchmarks.placing import BOTH, Task
 from benchmarks.record import Section, Table, number, provenance, save
 from benchmarks.verdicts import Verdict, from_placed, percent
@@ -134,7 +134,7 @@ def _wanted(words: Sequence[str]) -> Iterator[Case]:
 
 
 def _row(section: Section, case: Case, options: argparse.Namespace) -> list[str]:
-    map_path, flight, gsd_m = _inputs(case, options.work, options.views)
+    map_path, flight, gsd_m = _inputs(case, options)
     task = Task(
         BOTH,
         str(map_path),
@@ -178,10 +178,16 @@ def _row(section: Section, case: Case, options: argparse.Namespace) -> list[str]
 
 def _placed(task: Task, tree: Path) -> dict[str, Any]:
     """The views placed by the code of a checkout, in a process of its own."""
+    made = _run_of(tree, "benchmarks.placing", json.dumps(asdict(task)))
+    result: dict[str, Any] = json.loads(made)
+    return result
+
+
+def _run_of(tree: Path, module: str, *arguments: str) -> str:
+    """What a module prints with the code of a checkout; raises `RuntimeError` where it fails."""
     paths = os.pathsep.join([str(tree / "src"), str(ROOT)])
-    command = [sys.executable, "-m", "benchmarks.placing", json.dumps(asdict(task))]
     run = subprocess.run(
-        command,
+        [sys.executable, "-m", module, *arguments],
         capture_output=True,
         text=True,
         check=False,
@@ -189,12 +195,12 @@ def _placed(task: Task, tree: Path) -> dict[str, Any]:
     )
     if run.returncode:
         raise RuntimeError(f"{tree}: {run.stderr[-2000:]}")
-    result: dict[str, Any] = json.loads(run.stdout)
-    return result
+    return run.stdout
 
 
-def _inputs(case: Case, work: Path, views: int) -> tuple[Path, Path, float]:
+def _inputs(case: Case, options: argparse.Namespace) -> tuple[Path, Path, float]:
     """Map, flight and ground resolution of a case; made once."""
+    work, views = options.work, options.views
     ortho, flown = (_ortho(name, work) for name in ((case.map, PAST), (case.views, PRESENT)))
     with rasterio.open(ortho) as source:
         gsd_m = float(abs(source.transform.a))
@@ -215,7 +221,11 @@ def _inputs(case: Case, work: Path, views: int) -> tuple[Path, Path, float]:
                 seed=FLIGHT_SEED,
             )
         )
-    return map_of(ortho, work), folder, gsd_m
+    built = work / f"{ortho.parent.name}-{ortho.stem}.onav"
+    if not built.is_file():
+        arguments = "build", "--ortho", str(ortho), "--out", str(built)
+        _run_of(options.other.resolve(), "orthonav", *arguments)
+    return built, folder, gsd_m
 
 
 def _ortho(named: tuple[str, Any], work: Path) -> Path:
