@@ -24,7 +24,7 @@ import rasterio
 
 from benchmarks.inputs import DATA, FLIGHT_SEED, PAST, PRESENT, WIDE_ERRORS, Workplace
 from benchmarks.placing import BOTH, Task
-from benchmarks.record import Section, Table, number, provenance, save
+from benchmarks.record import Section, Table, git, number, provenance, save
 from benchmarks.verdicts import Verdict, from_placed, percent
 from orthonav.records import CONFIDENT
 from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
@@ -54,14 +54,14 @@ class Case:
 
     @property
     def words(self) -> str:
-        """What is known of its views."""
+        """Width of its views, knowledge of heading and prior."""
         heading = "heading to 10 deg" if self.heading_known else "heading unknown"
         prior = "" if self.prior_px is None else f", prior to {self.prior_px:g} px"
         return f"{self.width_px} px, {heading}{prior}"
 
     @property
     def name(self) -> str:
-        """Its map and what is known of its views."""
+        """Its map and its views."""
         return f"{self.map}: {self.words}"
 
 
@@ -109,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         rows.append(_row(section, case, options))
         print(Table(section.title, HEADER, rows[-1:], ()).markdown(), file=sys.stderr, flush=True)
     notes = (
-        f"other: commit {_commit(options.other)}; {options.rounds} rounds in turn, the least time "
+        f"other: commit {git('-C', str(options.other), 'describe', '--always', '--dirty')}; {options.rounds} rounds in turn, the least time "
         "of each view; processor time of one core; height known to 10 %; right: within 35 m or "
         f"10 px; accepted: of the right ones, confidence at least {CONFIDENT:g}",
     )
@@ -236,11 +236,6 @@ def _ortho(named: tuple[str, Any], work: Path) -> Path:
     return Workplace(work, work / "areas", quick=False).area(
         round(1000 * float(name.split()[0])), 1.0, [date]
     )[0]
-
-
-def _commit(tree: Path) -> str:
-    command = ["git", "-C", str(tree), "describe", "--always", "--dirty"]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 
 
 if __name__ == "__main__":

@@ -217,8 +217,8 @@ def provenance(run: str) -> dict[str, Any]:
     with Path("/proc/meminfo").open() as stream:
         memory_gb = int(stream.readline().split()[1]) / 2**20
     return {
-        "commit": _git("rev-parse", "HEAD") or "unknown",
-        "dirty": bool(_git("status", "--porcelain")),
+        "commit": git("rev-parse", "HEAD") or "unknown",
+        "dirty": bool(git("status", "--porcelain")),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "sources": sources_digest(),
         "run": run,
@@ -250,7 +250,8 @@ def _version(name: str) -> str:
         return "absent"
 
 
-def _git(*arguments: str) -> str:
+def git(*arguments: str) -> str:
+    """What git prints, without its end of line; empty where it fails."""
     try:
         found = subprocess.run(("git", *arguments), capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):

@@ -142,11 +142,11 @@ def rows(opened: MapFile, folder: Path, wrong: str) -> Iterator[tuple[str, ...]]
             errors.append(off_m)
             confident.append(sure_of)
             logging.info("%s %.1f %s", result.frame, errors[-1], fix)
-        off, sure = np.array(errors), np.array(confident)
+        off, accepted = np.array(errors), np.array(confident)
         right = off <= RIGHT_M
         yield (
-            method, f"{right.mean():.0%}", f"{sure.mean():.0%}",
-            f"{int((sure & (off > 35)).sum())}", f"{np.median(off):.1f} m",
+            method, f"{right.mean():.0%}", f"{accepted.mean():.0%}",
+            f"{int((accepted & (off > 35)).sum())}", f"{np.median(off):.1f} m",
             f"{np.percentile(off[np.isfinite(off)], 95):.1f} m",
             f"{biases[-1]:+.3f}", "; ".join(named.lines) or "no",
         )  # fmt: skip

@@ -158,12 +158,12 @@ def test_an_older_map_has_the_usual_weights_and_its_own_chance():
     assert RegisteredConfidence.from_plain(plain).chances == Chances(16.0, 15.0, 60.0)
 
 
-@pytest.mark.parametrize(("shift", "kept"), [(-5.0, -5.0), (2.0, 0.0)])
-def test_an_older_map_stays_as_cautious_as_another_date_made_it(shift, kept):
+@pytest.mark.parametrize(("shift", "expected"), [(-5.0, -5.0), (2.0, 0.0)])
+def test_an_older_map_stays_as_cautious_as_another_date_made_it(shift, expected):
     plain = {**PLAIN, "weights": dict.fromkeys(sorted(BEFORE_PHASE), 2.0)}
     plain["biases"] = [BIAS_BEFORE_PHASE + shift, -1.75]
     found = RegisteredConfidence.from_plain(plain)
-    assert found.biases[0] == pytest.approx(USUAL_BIASES[0] + kept)
+    assert found.biases[0] == pytest.approx(USUAL_BIASES[0] + expected)
     with pytest.raises(VariantError):
         RegisteredConfidence.from_plain({**plain, "biases": [math.nan, 0.0]})
 

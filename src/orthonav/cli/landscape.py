@@ -35,12 +35,18 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Generate the files and print their names."""
-    from orthonav.errors import AreaError
     from orthonav.simulate.landscape import generate_area, generate_heights
 
-    if options.hills is not None and not 0 <= options.hills <= 1:
-        raise AreaError(f"--hills must be 0 to 1 (0.15 is 15 %), got {options.hills:g}")
     with progress(options) as shown:
+        heights = []
+        if options.hills is not None:  # first, so that an impossible slope is refused at once
+            heights = generate_heights(
+                options.out,
+                slope=options.hills,
+                size_m=tuple(options.size_m),
+                gsd_m=options.gsd_m,
+                seed=options.seed,
+            )
         files = generate_area(
             options.out,
             size_m=tuple(options.size_m),
@@ -48,14 +54,7 @@ def run(options: argparse.Namespace) -> None:
             seed=options.seed,
             progress=lambda share: shown("landscape", share),
         )
-        if options.hills is not None:
-            files += generate_heights(
-                options.out,
-                slope=options.hills,
-                size_m=tuple(options.size_m),
-                gsd_m=options.gsd_m,
-                seed=options.seed,
-            )
+        files += heights
     if options.json:
         print_json({"files": [str(path) for path in files]})
     else:

@@ -1,4 +1,4 @@
-"""Whether a terrain fits the views of a flight: what is wrong with it is named once."""
+"""Whether a terrain fits the views of a flight; a fault of it is named once."""
 
 import logging
 import math

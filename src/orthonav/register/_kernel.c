@@ -333,11 +333,11 @@ static void solve(double matrix[4][4], double right[4]) {
         for (int i = k + 1; i < 4; i++)
             if (fabs(matrix[i][k]) > fabs(matrix[pivot][k])) pivot = i;
         for (int j = 0; j < 4; j++) {
-            const double kept = matrix[k][j];
-            matrix[k][j] = matrix[pivot][j], matrix[pivot][j] = kept;
+            const double swapped = matrix[k][j];
+            matrix[k][j] = matrix[pivot][j], matrix[pivot][j] = swapped;
         }
-        const double kept = right[k];
-        right[k] = right[pivot], right[pivot] = kept;
+        const double swapped = right[k];
+        right[k] = right[pivot], right[pivot] = swapped;
         for (int i = k + 1; i < 4; i++) {
             const double factor = matrix[i][k] / matrix[k][k];
             for (int j = k; j < 4; j++) matrix[i][j] -= factor * matrix[k][j];

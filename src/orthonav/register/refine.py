@@ -21,7 +21,7 @@ from orthonav.register.kernel import KERNEL
 from orthonav.register.map_window import MapWindow
 from orthonav.register.pose import Pose, even_scale
 from orthonav.register.reference import Reference
-from orthonav.register.sums import FULLY_VALID, compared, sampled_planes
+from orthonav.register.sums import FULLY_VALID, Sums, compared, sampled_planes
 from orthonav.register.template import BLOCKS, Template, by_steps, from_middle, gradients
 
 Array = NDArray[np.float32]
@@ -103,7 +103,7 @@ class Refiner:
         placed, step = self._refined(window, pose, steps, small_step_px)
         if not with_covariance:
             return placed
-        pixels = _Pixels(Comparison(self.template, window, placed.pose, slopes=False), window)
+        pixels = _Pixels(self.template, window, placed.pose)
         covariance = self._covariance(pixels)
         if not placed.converged:
             # Still moving: its last step is an error of its own.
@@ -137,14 +137,14 @@ class Refiner:
         """`_refined` without the kernel."""
         unit = 2.0**self.template.level
         converged, step = False, [0.0] * 4
-        seen = best = Comparison(self.template, window, pose)
+        seen = best = self._compared(window, pose)
         for _ in range(steps):
             step = self._step(seen)
             moves_px = self._moves_px(step)
             share = min(1.0, MAX_STEP_PX / max(moves_px, 1e-9))
             step = [share * each for each in step]
             moved = seen.pose.stepped([unit * step[0], unit * step[1], *step[2:]])
-            seen = Comparison(self.template, window, moved)
+            seen = self._compared(window, moved)
             if seen.score > best.score:
                 best = seen
             converged = moves_px < small_step_px
@@ -152,13 +152,18 @@ class Refiner:
                 break
         return best.placed(converged), step
 
+    def _compared(self, window: MapWindow, pose: Pose) -> "Comparison":
+        """The view beside the map under a pose."""
+        planes = sampled_planes(self.template, window, pose)
+        return Comparison(self.template, pose, compared(self.template, *planes))
+
     def pulls(self, pose: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """What moves each block of the view over the map at `pose`: gradient (B * B, 2) of the
         score's decrease and curvature (B * B, 2, 2), by level-0 pixels of the map."""
         template = self.template
         window = MapWindow.of(template, self.reference, pose, SLACK_PX)
-        seen = Comparison(template, window, pose, slopes=False)
-        pixels = _Pixels(seen, window)
+        pixels = _Pixels(template, window, pose)
+        seen = pixels.seen
         terms = np.einsum("cphw,chw->phw", template.gradients, pixels.residual)
         slopes = template.block_sums(terms).astype(np.float64).T
         each = np.tensordot(template.block_hessians, seen.squares, axes=([1], [0]))
@@ -250,12 +255,8 @@ class Comparison:
     correlation.
     """
 
-    def __init__(
-        self, template: Template, window: MapWindow, pose: Pose, slopes: bool = True
-    ) -> None:
-        """`slopes`: whether a step will be asked for."""
-        self.template, self.pose = template, pose
-        self._sums = compared(template, window, pose, slopes)
+    def __init__(self, template: Template, pose: Pose, sums: Sums) -> None:
+        self.template, self.pose, self._sums = template, pose, sums
         pixels = template.pixels - float(self._sums.left_pixels.sum())
         self.overlap = pixels / max(template.pixels, 1.0)
         # Rounding of a difference must not make it negative.
@@ -301,9 +302,10 @@ class _Pixels:
     """The pixels of a comparison: `map` (3, H, W) as the view's window shows it, `counts` (H, W), 1
     where both are valid, and `residual` (3, H, W), gain * map - correlation^2 * view."""
 
-    def __init__(self, seen: Comparison, window: MapWindow) -> None:
-        self.seen, template = seen, seen.template
-        planes, valid = sampled_planes(template, window, seen.pose)
+    def __init__(self, template: Template, window: MapWindow, pose: Pose) -> None:
+        planes, valid = sampled_planes(template, window, pose)
+        seen = Comparison(template, pose, compared(template, planes, valid, slopes=False))
+        self.seen = seen
         self.counts = template.mask * (valid > FULLY_VALID)
         self.map = planes * self.counts
         self._view = template.channels * self.counts

@@ -46,9 +46,11 @@ class Sums(NamedTuple):
 SUMS = 22 + BLOCKS**2
 
 
-def compared(template: Template, window: MapWindow, pose: Pose, slopes: bool = True) -> Sums:
-    """The sums of a view under a pose; those of derivatives are 0 unless `slopes`."""
-    seen, valid = sampled_planes(template, window, pose)
+def compared(template: Template, seen: Array, valid: Array, slopes: bool = True) -> Sums:
+    """The sums of a view beside `sampled_planes`; those of derivatives are 0 unless `slopes`.
+
+    `seen` becomes 0 where the view or the map does not count.
+    """
     made = Sums.of_row(np.zeros(SUMS))
     if not (template.whole and valid.min() > FULLY_VALID):
         counts = template.mask * (valid > FULLY_VALID)

@@ -125,7 +125,7 @@ def near_ground_en_m(
     camera: Camera, attitude_deg: tuple[float, float, float], agl_m: float
 ) -> Array | None:
     """Outline (N, 2), metres from the camera, of the level ground seen that is near enough to need
-    imagery; None where there is none."""
+    imagery; None without any."""
     sides = [np.linspace(0, side, BORDER) for side in (camera.width_px, camera.height_px)]
     px = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     ground = ground_en_m(camera, px, *attitude_deg, agl_m)

@@ -82,7 +82,7 @@ def generate_heights(
     those of `generate_area`. Heights are metres above mean sea level, float32. Raises as it does.
     """
     if not 0 <= slope <= 1:
-        raise AreaError(f"the slope of hills must be 0 to 1, got {slope}")
+        raise AreaError(f"the slope of hills must be 0 to 1 (0.15 is 15 %), got {slope:g}")
     width_px, height_px = _size_px(size_m, gsd_m)
     landscape, north_m = Landscape(seed), ORIGIN_M[1] + height_px * gsd_m
 
