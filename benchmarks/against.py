@@ -108,8 +108,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for case in _wanted(options.only):
         rows.append(_row(section, case, options))
         print(Table(section.title, HEADER, rows[-1:], ()).markdown(), file=sys.stderr, flush=True)
+    commit = git("-C", str(options.other), "describe", "--always", "--dirty")
     notes = (
-        f"other: commit {git('-C', str(options.other), 'describe', '--always', '--dirty')}; {options.rounds} rounds in turn, the least time "
+        f"other: commit {commit}; {options.rounds} rounds in turn, the least time "
         "of each view; processor time of one core; height known to 10 %; right: within 35 m or "
         f"10 px; accepted: of the right ones, confidence at least {CONFIDENT:g}",
     )

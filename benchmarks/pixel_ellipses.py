@@ -21,13 +21,14 @@ from orthonav.flight.pixel import locate_pixel
 from orthonav.geo.camera import Camera
 from orthonav.localizer import Localizer
 from orthonav.localizer.relief import Relief
+from orthonav.publish.estimate import ELLIPSE_95
 from orthonav.records import CONFIDENT, Fix
 from orthonav.simulate.perspective import Raster, met, rays_enu
 
 TILT_STD_DEG = 1.0
 AT = ((0.5, 0.5), (0.15, 0.8), (0.85, 0.8), (0.3, 0.4), (0.7, 0.4))
 """Pixels, as shares of the picture's sides."""
-CHI2_95 = 5.991
+CHI2_95 = ELLIPSE_95**2
 HEADER = (
     "| off nadir | slope | map | fixes | of the camera | of pixels | median pixel error | ellipse |"
 )
