@@ -73,6 +73,17 @@ def test_a_row_older_than_its_code_is_named(key, path):
     assert f"B-{key} (commit 0123456789, 2026-11-01) is older than {path}" == line
 
 
+@pytest.mark.parametrize("by, expected", [(0.1, []), (-0.1, []), (0.5, [stored.GENERATED])])
+def test_drawn_ground_is_the_same_up_to_rounding(by, expected):
+    made = row()
+    first, *others = made.plain["code"][stored.GENERATED].split()
+    made.plain["code"][stored.GENERATED] = " ".join([f"{float(first) + by:.2f}", *others])
+    assert stored.older(made) == expected
+    for unknown in ("0123456789ab", " ".join(others)):
+        made.plain["code"][stored.GENERATED] = unknown
+        assert stored.older(made) == [stored.GENERATED]
+
+
 def test_a_row_of_another_recipe_or_setting_is_named():
     made = row()
     made.plain["method"]["recipe"] = "autoencoder:width=8"
