@@ -15,7 +15,7 @@ TRACKED = PosePrior(0.5, math.radians(2.0), 0.03)
 def levels_of(prior, pose_ms, levels=LEVELS):
     """Levels of the searches for a view where a pose at a level costs `pose_ms[level]`."""
     searches = DEFAULT_PLAN.searches(
-        levels, prior, lambda level, poses: poses * pose_ms[level], lambda _: math.inf
+        levels, prior, lambda level, poses: poses * pose_ms[level], lambda: (0, 0)
     )
     return [each.level for each in searches]
 
@@ -34,7 +34,7 @@ def test_a_small_view_is_finished_where_it_is_judged():
     assert set(levels_of(TRACKED, (0.1, 0.1), Levels(1, 0, 0))) == {0}
     searches = list(
         DEFAULT_PLAN.searches(
-            Levels(1, 0, 0), TRACKED, lambda _, poses: 0.1 * poses, lambda _: math.inf
+            Levels(1, 0, 0), TRACKED, lambda _, poses: 0.1 * poses, lambda: (0, 0)
         )
     )
     assert {each.candidates for each in searches} == {DEFAULT_PLAN.stage_candidates}
@@ -67,3 +67,23 @@ def test_nothing_is_begun_after_the_budget_is_spent(clock):
     assert budget.allows(10.0)
     clock[0] += 0.2
     assert not budget.allows(0.0)
+
+
+def test_more_tiles_give_more_candidates_within_bounds():
+    least, most = DEFAULT_PLAN.tile_candidates
+    counts = [DEFAULT_PLAN.candidates_from(tiles, True) for tiles in (1, 8_000, 10**6)]
+    assert counts == [least, 8_000 // DEFAULT_PLAN.tiles_a_candidate, most]
+    assert DEFAULT_PLAN.candidates_from(6_000, False) == 2 * DEFAULT_PLAN.candidates_from(
+        6_000, True
+    )
+
+
+@pytest.mark.parametrize("tiles, from_tiles", [(10_000, True), (0, False)])
+def test_tiles_come_first_where_they_are_the_cheaper_way(tiles, from_tiles):
+    first = next(
+        DEFAULT_PLAN.searches(LEVELS, TRACKED, lambda _, poses: 50.0 * poses, lambda: (tiles, 128))
+    )
+    assert first.from_tiles == from_tiles and first.level == LEVELS.coarse
+    if from_tiles:
+        assert first.candidates == DEFAULT_PLAN.candidates_from(tiles, True)
+        assert DEFAULT_PLAN.enough(first, LEVELS) == DEFAULT_PLAN.clear_at_judged

@@ -29,6 +29,7 @@ from orthonav.register.registrar import (
     MAX_RATIO,
     MIN_HOPEFUL,
     NAT_SCORE,
+    WHOLE_WINDOW_PX,
     Levels,
     PosePrior,
     Registrar,
@@ -208,6 +209,21 @@ def test_what_lies_beside_the_best_is_no_rival(registrar):
         registrar, templates_of(GROUND, pose), LEVELS, further, LEVELS.look, prior_of(pose)
     )
     assert found.rival > 0 and found.look_rival > 0 and found.peak_ratio > 1.8
+
+
+@pytest.mark.parametrize("whole_px", [WHOLE_WINDOW_PX, 0])
+def test_candidates_move_to_the_best_place_near_by_and_places_are_named_once(
+    registrar, monkeypatch, whole_px
+):
+    monkeypatch.setattr("orthonav.register.registrar.WHOLE_WINDOW_PX", whole_px)
+    for pose in random_poses(6, SHAPE, 110, seed=16):
+        templates = templates_of(GROUND, pose)
+        asked = [near(pose, 20.0, -14.0), near(pose, -9.0, 18.0), near(pose, 90.0, 60.0)]
+        first, *others = registrar.nearby(templates, LEVELS, asked, 24.0)
+        assert apart_px(first.pose, pose) / 2**LEVELS.coarse < 0.5
+        assert len(others) == 1 and others[0].score < first.score
+        assert apart_px(others[0].pose, asked[2].pose) <= 24.0 * 2**0.5 + 2**LEVELS.coarse
+    assert registrar.nearby(templates, LEVELS, [], 24.0) == []
 
 
 def test_without_candidates_there_is_no_place(registrar):

@@ -100,7 +100,7 @@ def test_gate_is_a_closed_circle(centres, east, radius_m):
 @CACHES
 @pytest.mark.parametrize("count", [0, 1, BLOCK_ROWS - 1, BLOCK_ROWS, 2 * BLOCK_ROWS + 7])
 @pytest.mark.parametrize("asked", [1, 2, 50])
-def test_best_and_which_are_those_of_all_scores(cache_bytes, count, asked):
+def test_best_is_that_of_all_scores(cache_bytes, count, asked):
     index, many = ExactIndex(embeddings(count, 16), cache_bytes), queries(asked, 16)
     scores = index.scores(many)
     best = index.best(many)
@@ -108,9 +108,6 @@ def test_best_and_which_are_those_of_all_scores(cache_bytes, count, asked):
     np.testing.assert_allclose(best, scores.max(axis=1), atol=1e-6)
     rows = np.random.default_rng(3).permutation(count)[:40]
     np.testing.assert_allclose(index.best(many, rows), best[rows], atol=1e-6)
-    which = index.which(many, rows)
-    assert which.shape == rows.shape and which.dtype == np.intp
-    np.testing.assert_allclose(scores[rows, which], best[rows], atol=1e-6)
 
 
 def test_the_best_of_no_queries_is_an_error():

@@ -99,8 +99,13 @@ class SearchPlan:
     """Candidates of one stage at the judged level."""
     final_candidates: int = 2
     """Candidates of a search at the final level: each is finished."""
-    tile_candidates: int = 20
-    """Candidates from tiles."""
+    tile_candidates: tuple[int, int] = (20, 80)
+    """Least and largest number of candidates from tiles."""
+    tiles_a_candidate: int = 200
+    """Between these, one candidate for so many tiles, two where the heading is unknown: the right
+    tile ranks lower among more tiles; docs/decisions/registration.md, 12."""
+    tile_reach_strides: float = 1.1
+    """The place of a candidate from tiles is sought within so many strides of the tile grid."""
     tile_apart_strides: float = 1.5
     """Candidates from tiles lie at least so many strides of the tile grid apart: neighbours
     show the same ground."""
@@ -115,7 +120,9 @@ class SearchPlan:
     """The search ends with a place that stands out so far. Views of other places reach a ratio of
     1.4, rarely 1.6; docs/decisions/registration.md, 10."""
     clear_at_judged: ClearMargin = CLEAR_AT_JUDGED
-    """The same once the judged level was searched, if only in part: it misses least."""
+    """The same once the judged level was searched, if only in part: it misses least. Also after
+    tiles, where the place is confident as well: there can be more of them than places at the judged
+    level that could be searched."""
     doubt: float = 0.01
     """Views with a confidence from this to one minus this are judged one level finer too;
     docs/decisions/registration.md, 2."""
@@ -143,6 +150,8 @@ class SearchPlan:
     """Estimated cost of embedding the view under one pose."""
     tile_score_ms: float = 5e-8
     """Estimated cost of one number of one tile's embedding under one pose."""
+    tile_nearby_ms: float = 0.5
+    """Estimated cost of the place of one candidate from tiles."""
 
     def fft_ms(self, poses: int, rows: int, cols: int) -> float:
         """Estimated cost of an FFT search of a window; infinite where it is too large."""
@@ -152,37 +161,48 @@ class SearchPlan:
         return poses * (self.fft_pose_ms + self.fft_pixel_ms * pixels * math.log2(pixels))
 
     def tiles_ms(self, poses: int, tiles: int, dims: int) -> float:
-        """Estimated cost of candidates from so many tiles with embeddings of `dims` numbers."""
+        """Estimated cost of the most similar of so many tiles with embeddings of `dims` numbers."""
         return self.tile_view_ms + poses * (self.tile_pose_ms + self.tile_score_ms * tiles * dims)
 
-    def enough(self, level: int, levels: Levels) -> ClearMargin:
-        """The margin that ends the search after one at `level`."""
-        return self.clear_at_judged if level == levels.look else self.clear
+    def candidates_from(self, tiles: int, heading_known: bool) -> int:
+        """Number of candidates to take from so many tiles."""
+        least, most = self.tile_candidates
+        share = (1 if heading_known else 2) / self.tiles_a_candidate
+        return max(least, min(most, round(share * tiles)))
+
+    def enough(self, run: Search, levels: Levels) -> ClearMargin:
+        """The margin that ends the search after `run`."""
+        fine = run.from_tiles or run.level == levels.look
+        return self.clear_at_judged if fine else self.clear
 
     def searches(
         self,
         levels: Levels,
         prior: PosePrior,
         fft_ms: Callable[[int, int], float],
-        tiles_ms: Callable[[int], float],
+        tiles: Callable[[], tuple[int, int]],
     ) -> Iterator[Search]:
         """The searches for a view, to be run in this order until its place stands out.
 
-        `fft_ms(level, poses)` and `tiles_ms(poses)` are estimated costs, infinite where a search
-        is impossible.
+        `fft_ms(level, poses)` is an estimated cost, infinite where a search is impossible. `tiles()`:
+        how many there are to compare with the view, and how many numbers their embeddings have.
         """
         rough = [pose for pose, _ in self._poses(prior, self.turn_step_rad, self.scale_step)]
         fine = self._poses(prior, self.judged_turn_step_rad, self.judged_scale_step)
         judged_ms = fft_ms(levels.look, len(fine))
         if judged_ms > self.cheap_ms:
             coarse_ms = fft_ms(levels.coarse, len(rough))
-            both = sorted([(coarse_ms, False), (tiles_ms(len(rough)), True)])
+            both = [(coarse_ms, self.candidates, False)]
+            near, dims = tiles()
+            if near:
+                count = self.candidates_from(near, prior.turn_rad is not None)
+                cost_ms = self.tiles_ms(len(rough), near, dims) + self.tile_nearby_ms * count
+                both = sorted([*both, (cost_ms, count, True)])
             # The cheaper one wherever it is possible; the other only where it can be afforded.
             affordable = 0.0 if judged_ms <= self.last_ms else self.last_ms
-            for number, (cost_ms, from_tiles) in enumerate(both):
+            for number, (cost_ms, count, from_tiles) in enumerate(both):
                 if math.isinf(cost_ms) or (number and cost_ms > affordable):
                     break
-                count = self.tile_candidates if from_tiles else self.candidates
                 yield Search(levels.coarse, rough, from_tiles, count, cost_ms)
         if judged_ms <= max(self.last_ms, self.cheap_ms):
             for least, most in pairwise(self.stages_nats):

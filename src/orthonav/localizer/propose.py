@@ -11,12 +11,11 @@ from orthonav.embed.contract import ViewEmbedder
 from orthonav.embed.whitened import WhitenedEmbedder
 from orthonav.geo.grid import TileGrid
 from orthonav.localizer.match import TileMatcher
-from orthonav.localizer.plan import SearchPlan
 from orthonav.localizer.rectify import RectifiedView
 from orthonav.register.pose import Pose
 from orthonav.register.search import Candidate
 from orthonav.search.exact import ExactIndex, top_tiles
-from orthonav.search.peak import TileNeighbours
+from orthonav.search.peak import TileNeighbours, parabola_peak
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +45,10 @@ class TileProposer:
             tiles.grid, tiles.centres_en_m, tiles.index, embedder, representation, tiles.neighbours
         )
 
-    def fits(self, side_px: float, plan: SearchPlan) -> bool:
-        """Whether candidates are of use for views of this side (pixels of the map)."""
-        smallest, largest = plan.view_tiles
+    def fits(self, side_px: float, view_tiles: tuple[float, float]) -> bool:
+        """Whether a view of this side (pixels of the map) is from the least to the largest of
+        `view_tiles` tiles wide."""
+        smallest, largest = view_tiles
         return smallest * self.grid.tile_px <= side_px <= largest * self.grid.tile_px
 
     def candidates(
@@ -56,27 +56,48 @@ class TileProposer:
         view: RectifiedView,
         poses: list[tuple[float, float]],
         rows: NDArray[np.intp] | None,
-        plan: SearchPlan,
+        count: int,
+        apart_strides: float,
     ) -> list[Candidate]:
         """Candidates for a view rectified heading-up at the map's resolution, among tiles `rows`.
 
-        `poses` are headings (rad) and log scales; scores are those of the embeddings.
+        `poses` are headings (rad) and log scales; scores are those of the embeddings. Up to `count`
+        tiles, at least `apart_strides` strides of the tile grid from each other.
         """
         queries = embed_poses(
             self.embedder, self.representation, view.grey, view.valid, poses, self.grid.tile_px
         )
         scores = self.index.best(queries, rows)
         centres = self.centres_en_m if rows is None else self.centres_en_m[rows]
-        apart_m = plan.tile_apart_strides * self.grid.stride_m
-        chosen = top_tiles(scores, centres, plan.tile_candidates, apart_m)
+        chosen = top_tiles(scores, centres, count, apart_strides * self.grid.stride_m)
         tiles = chosen if rows is None else rows[chosen]
-        which = self.index.which(queries, tiles)
-        found = []
-        for place, tile, query in zip(chosen, tiles, which, strict=True):
+        by_pose = self.index.scores(queries, tiles)
+        tried, found = np.array(poses), []
+        for place, tile, similar in zip(chosen, tiles, by_pose, strict=True):
             shift = self.neighbours.peak_offset(scores, int(tile), rows)
             east, north = self.centres_en_m[tile] + np.array(shift) * self.grid.stride_m
             x_px = (float(east) - self.grid.west_m) / self.grid.gsd_m
             y_px = (self.grid.north_m - float(north)) / self.grid.gsd_m
-            pose = Pose(x_px, y_px, *poses[int(query)])
+            pose = Pose(x_px, y_px, *_peak_pose(tried, similar))
             found.append(Candidate(float(scores[place]), pose))
         return found
+
+
+def _peak_pose(poses: NDArray[np.float64], scores: NDArray[np.float32]) -> tuple[float, float]:
+    """Heading and log scale where the scores (Q,) of poses (Q, 2) on a grid have their peak.
+
+    By a parabola along each, or those of the best pose where one of its neighbours is missing.
+    """
+    best = int(scores.argmax())
+    off = poses - poses[best]
+    off[:, 0] = np.remainder(off[:, 0] + np.pi, 2 * np.pi) - np.pi
+    peak = poses[best].copy()
+    for axis in (0, 1):
+        along = off[:, axis]
+        others = np.flatnonzero(np.isclose(off[:, 1 - axis], 0.0) & ~np.isclose(along, 0.0))
+        ahead, behind = others[along[others] > 0], others[along[others] < 0]
+        if len(ahead) and len(behind):
+            after, before = ahead[along[ahead].argmin()], behind[along[behind].argmax()]
+            moved = parabola_peak(*scores[[before, best, after]].tolist())
+            peak[axis] += moved * (along[after] - along[before]) / 2
+    return float(peak[0]), float(peak[1])

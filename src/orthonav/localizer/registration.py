@@ -195,11 +195,11 @@ class RegistrationLocalizer:
             view.levels,
             view.prior,
             lambda level, poses: self._fft_ms(view, prior, level, poses),
-            lambda poses: self._tiles_ms(view, rows(), poses),
+            lambda: self._tiles(view, rows()),
         )
         for each in takewhile(lambda each: budget.allows(each.cost_ms), searches):
             if each.from_tiles and self.propose is not None:
-                found = self.propose.candidates(view.rectified_at(0), each.poses, rows(), self.plan)
+                found = self._from_tiles(view, prior, each, rows(), self.propose)
             else:
                 found = self._searched(view, prior, each)
             if each.level < view.levels.look:
@@ -210,10 +210,12 @@ class RegistrationLocalizer:
                 )
             candidates += len(found)
             best = None
-            enough = self.plan.enough(each.level, view.levels)
+            enough = self.plan.enough(each, view.levels)
             if judged and self._seems_clear(view, judged, enough):
                 best = finished()
-                if self._is_clear(best, enough):
+                # Candidates from tiles are not all places: their rivals alone prove too little.
+                proven = not each.from_tiles or not self._is_doubtful(best)
+                if proven and self._is_clear(best, enough):
                     return best
         if not judged:
             return None
@@ -273,13 +275,12 @@ class RegistrationLocalizer:
         reach_m = self._reach_px(view, prior) * grid.gsd_m + grid.stride_m
         return rows_within(self.propose.centres_en_m, centre, reach_m)
 
-    def _tiles_ms(self, view: PreparedView, rows: NDArray[np.intp] | None, poses: int) -> float:
-        """Estimated cost of candidates from tiles; infinite where there can be none."""
-        if self.propose is None or not self.propose.fits(view.side_px, self.plan):
-            return math.inf
-        tiles = len(self.propose.centres_en_m) if rows is None else len(rows)
-        dims = self.propose.embedder.dims
-        return self.plan.tiles_ms(poses, tiles, dims) if tiles else math.inf
+    def _tiles(self, view: PreparedView, rows: NDArray[np.intp] | None) -> tuple[int, int]:
+        """Number of tiles that can be compared with a view, and of numbers in their embeddings."""
+        if self.propose is None or not self.propose.fits(view.side_px, self.plan.view_tiles):
+            return 0, 0
+        count = len(self.propose.centres_en_m) if rows is None else len(rows)
+        return count, self.propose.embedder.dims
 
     def _fft_ms(self, view: PreparedView, prior: Prior | None, level: int, poses: int) -> float:
         """Estimated cost of an FFT search at a level, of the sheet or of what the prior allows."""
@@ -291,6 +292,31 @@ class RegistrationLocalizer:
         if prior is not None or min(rows, cols) < 3 * side:
             rows, cols = round(rows + side), round(cols + side)
         return self.plan.fft_ms(poses, rows, cols)
+
+    def _from_tiles(
+        self,
+        view: PreparedView,
+        prior: Prior | None,
+        run: Search,
+        rows: NDArray[np.intp] | None,
+        propose: TileProposer,
+    ) -> list[Candidate]:
+        """Candidates from the most similar tiles, each at its best place near by, best first."""
+        plan, stride_px = self.plan, self.grid.stride_m / self.grid.gsd_m
+        found = propose.candidates(
+            view.rectified_at(0), run.poses, rows, run.candidates, plan.tile_apart_strides
+        )
+        reach_px = plan.tile_reach_strides * stride_px
+        found = self.registrar.nearby(view.templates, view.levels, found, reach_px)
+        if prior is None:
+            return found
+        x, y = self._prior_px(prior, view)
+        most_px = self._reach_px(view, prior)
+        return [
+            each
+            for each in found
+            if max(abs(each.pose.x_px - x), abs(each.pose.y_px - y)) <= most_px
+        ]
 
     def _searched(self, view: PreparedView, prior: Prior | None, run: Search) -> list[Candidate]:
         """Candidates of one FFT search, best first."""

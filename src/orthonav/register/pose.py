@@ -35,6 +35,10 @@ class Pose:
         """Rotation and scale (2, 2) from the view's window to the map."""
         return rotation(self.turn_rad, math.exp(self.log_scale))
 
+    def distance_px(self, other: "Pose") -> float:
+        """Distance of two places, pixels of level 0."""
+        return math.hypot(self.x_px - other.x_px, self.y_px - other.y_px)
+
     def map_px(self, from_middle_px: Array) -> Array:
         """Map coordinates (..., 2) of points given from the middle of the window, level 0 px."""
         return np.asarray(from_middle_px @ self.linear.T + [self.x_px, self.y_px])

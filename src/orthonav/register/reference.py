@@ -63,7 +63,7 @@ class Reference:
         """Evidence (height, width, 4) of a window; zero beyond the sheet."""
         rows, cols = self.shape(level)
         if rows * cols <= WHOLE_LEVEL_PX:
-            return _cut(self.whole(level, recipe), row, col, height, width)
+            return cut(self.whole(level, recipe), row, col, height, width)
         # No more than the sheet: a window beyond it costs nothing.
         margin = recipe.margin_px
         top, left = max(row - margin, 0), max(col - margin, 0)
@@ -71,15 +71,16 @@ class Reference:
         if top >= bottom or left >= right:
             return np.zeros((height, width, CHANNELS), np.float32)
         grey, valid = self.pyramid.read(level, top, left, bottom - top, right - left)
-        return _cut(evidence(grey, valid, recipe), row - top, col - left, height, width)
+        return cut(evidence(grey, valid, recipe), row - top, col - left, height, width)
 
 
-def _cut(whole: Array, row: int, col: int, height: int, width: int) -> Array:
+def cut(whole: Array, row: int, col: int, height: int, width: int) -> Array:
+    """A window (height, width, C) of an array (H, W, C); zero beyond it. A view where possible."""
     rows, cols = whole.shape[:2]
     y0, x0, y1, x1 = max(row, 0), max(col, 0), min(row + height, rows), min(col + width, cols)
     if (y0, x0, y1, x1) == (row, col, row + height, col + width):
         return whole[y0:y1, x0:x1]
-    out = np.zeros((height, width, CHANNELS), np.float32)
+    out = np.zeros((height, width, whole.shape[2]), np.float32)
     if y0 < y1 and x0 < x1:
         out[y0 - row : y1 - row, x0 - col : x1 - col] = whole[y0:y1, x0:x1]
     return out

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,15 +19,16 @@ from orthonav.register.pose import Pose
 from orthonav.register.reference import Reference
 from orthonav.register.refine import Placed, Refiner
 from orthonav.register.scale_map import ScaleMap
-from orthonav.register.search import Candidate, SearchWindow
+from orthonav.register.search import Candidate, SearchWindow, best_near
 from orthonav.register.sharpness import Sharpness, sharpness
 from orthonav.register.template import ViewTemplates
 
 LOOK_PX = 72.0
 """A view is judged at the level where it is about so many pixels across
 (docs/decisions/registration.md, 2)."""
-KEPT_TO_LOOK = 14
-"""Candidates that pass from the coarse level to the judged one, at most."""
+KEPT_TO_LOOK = 24
+"""Candidates that pass from the coarse level to the judged one, at most: of those from many tiles the
+right one may stand below the 14th there (docs/decisions/registration.md, 12)."""
 KEPT_TO_FINISH = 3
 """Places that are finished: the best and its rivals."""
 HOPE_AT_FIRST = 0.4
@@ -48,6 +49,11 @@ NAT_SCORE = 1.0
 (docs/decisions/registration.md, 5)."""
 MAX_KEPT_WINDOWS = 4
 """Search windows of whole sheets in the cache."""
+SAME_PLACE_SHARE = 1 / 8
+"""Candidates from tiles closer together than this share of the view's side are one place."""
+WHOLE_WINDOW_PX = 2_000_000
+"""Up to so many pixels of the coarse level their surroundings are cut out of one window of the
+whole sheet (12 bytes each); of larger sheets a window is made for each."""
 MAX_RATIO = 10.0
 """Limit of the ratios in the evidence."""
 
@@ -196,7 +202,7 @@ class Registrar:
     def __init__(self, reference: Reference, pool: Executor | None = None) -> None:
         """`pool`: threads that share the candidates; None: the caller's alone."""
         self.reference = reference
-        self._map: Callable[..., Iterable[Placed]] = pool.map if pool else map
+        self._map: Callable[..., Iterable[Any]] = pool.map if pool else map
         self._windows: dict[tuple[int, EvidenceRecipe, int], SearchWindow] = {}
         self._lock = threading.Lock()
 
@@ -235,6 +241,36 @@ class Registrar:
         made = self.reference.window(level, low[1], low[0], size[1], size[0], recipe)
         side = _rounded_side(view_px / unit)
         return SearchWindow(made, level, low[1], low[0], side, margin)
+
+    def nearby(
+        self,
+        templates: ViewTemplates,
+        levels: Levels,
+        candidates: Sequence[Candidate],
+        reach_px: float,
+    ) -> list[Candidate]:
+        """Candidates at the best place within `reach_px` (level 0) of each, at the coarse level.
+
+        Best first; of candidates that end at the same place the best one stays.
+        """
+        recipe, side_px = levels.recipe(levels.coarse), view_side_px(templates)
+        template = templates.at(levels.coarse, recipe)
+        whole = None
+        if math.prod(self.reference.shape(levels.coarse)) <= WHOLE_WINDOW_PX:
+            whole = self.whole_window(levels.coarse, recipe, side_px)
+
+        def moved(found: Candidate) -> Candidate:
+            place = found.pose.x_px, found.pose.y_px
+            around_px = reach_px + side_px
+            window = whole or self.part_window(levels.coarse, recipe, side_px, place, around_px)
+            return best_near(template, window, found.pose, reach_px)
+
+        kept: list[Candidate] = []
+        same_px = side_px * SAME_PLACE_SHARE
+        for each in sorted(self._map(moved, candidates), key=lambda each: -each.score):
+            if all(each.pose.distance_px(other.pose) > same_px for other in kept):
+                kept.append(each)
+        return kept
 
     def judged(
         self,
@@ -454,4 +490,4 @@ def _distinct(placed: list[Placed], count: int, apart: float) -> list[Placed]:
 
 def apart_px(one: Placed, other: Placed) -> float:
     """Distance of two places in pixels of level 0."""
-    return math.hypot(one.pose.x_px - other.pose.x_px, one.pose.y_px - other.pose.y_px)
+    return one.pose.distance_px(other.pose)

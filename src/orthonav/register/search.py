@@ -10,6 +10,7 @@ scale, whereas correlation alone favours small views.
 import math
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from orthonav.geo.camera import counted_from_centres
 from orthonav.register.evidence import GROUPS
 from orthonav.register.memory import thread_memory
 from orthonav.register.pose import Pose, even_scale, rotation
+from orthonav.register.reference import cut
 from orthonav.register.scale_map import ScaleMap
 from orthonav.register.template import Template, energy_of, turn_planes
 
@@ -94,9 +96,20 @@ class SearchWindow:
             next_fast_len(max(self.height + pad, view_px), real=True),
             next_fast_len(max(self.width + pad, view_px), real=True),
         )
-        even = [_even(made[..., group], made[..., 3], view_px) for group in GROUPS]
-        planes = np.moveaxis(np.concatenate(even, axis=2), 2, 0)
-        self.spectra = np.asarray(rfft2(planes, s=self.size), np.complex64)
+        self._made, self._view_px = made, view_px
+
+    @cached_property
+    def channels(self) -> Array:
+        """The evidence (H, W, 3) divided by its local energy."""
+        groups = (self._made[..., group] for group in GROUPS)
+        even = [_even(group, self._made[..., 3], self._view_px) for group in groups]
+        return np.concatenate(even, axis=2)
+
+    @cached_property
+    def spectra(self) -> NDArray[np.complex64]:
+        """Spectra (3, h, w) of the channels, padded to `size`."""
+        planes = np.moveaxis(self.channels, 2, 0)
+        return np.asarray(rfft2(planes, s=self.size), np.complex64)
 
 
 def _even(channels: Array, counts: Array, view_px: int) -> Array:
@@ -146,6 +159,28 @@ def search(
         pose = Pose((window.col + x) * unit, (window.row + y) * unit, turn, log_scale)
         found.append(Candidate(float(best[row, col]), pose))
     return found
+
+
+def best_near(template: Template, window: SearchWindow, pose: Pose, reach_px: float) -> Candidate:
+    """The best place of a view within `reach_px` (level 0) of a pose, along each axis, under its
+    heading and scale."""
+    unit = 2.0**template.level
+    half, reach = posed_half_px(template, pose.log_scale), math.ceil(reach_px / unit)
+    # Middles of views lie on first corners of pixels, from these on.
+    row = round(pose.y_px / unit) - window.row - reach
+    col = round(pose.x_px / unit) - window.col - reach
+    posed = posed_channels(template, pose.turn_rad, pose.log_scale)
+    posed *= np.float32(even_scale(-pose.log_scale))
+    around = cut(window.channels, row - half, col - half, *2 * [2 * (half + reach)])
+    surface = np.asarray(
+        cv2.matchTemplate(around, np.ascontiguousarray(np.moveaxis(posed, 0, 2)), cv2.TM_CCORR),
+        np.float32,
+    )
+    down, right = divmod(int(surface.argmax()), surface.shape[1])
+    x, y = _between(surface, down, right)
+    x_px, y_px = (window.col + col + x) * unit, (window.row + row + y) * unit
+    place = Pose(x_px, y_px, pose.turn_rad, pose.log_scale)
+    return Candidate(float(surface[down, right]), place)
 
 
 def _best_of(

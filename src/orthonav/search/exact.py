@@ -64,13 +64,6 @@ class ExactIndex:
             some.max(axis=1, out=out[part])
         return out
 
-    def which(self, queries: NDArray[np.float32], rows: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Which of the queries (Q, D) scores highest with each of `rows`: indices (len(rows),).
-
-        For the few tiles that matter: finding it costs more than the score itself.
-        """
-        return np.asarray(self.scores(queries, rows).argmax(axis=1), dtype=np.intp)
-
     def _count(self, rows: NDArray[np.intp] | None) -> int:
         return len(self._stored) if rows is None else len(rows)
 
