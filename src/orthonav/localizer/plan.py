@@ -184,8 +184,8 @@ class SearchPlan:
     ) -> Iterator[Search]:
         """The searches for a view, to be run in this order until its place stands out.
 
-        `fft_ms(level, poses)` is an estimated cost, infinite where a search is impossible. `tiles()`:
-        how many there are to compare with the view, and how many numbers their embeddings have.
+        `fft_ms(level, poses)` is an estimated cost, infinite where a search is impossible.
+        `tiles()`: how many to compare with the view, and how many numbers their embeddings have.
         """
         rough = [pose for pose, _ in self._poses(prior, self.turn_step_rad, self.scale_step)]
         fine = self._poses(prior, self.judged_turn_step_rad, self.judged_scale_step)

@@ -27,8 +27,8 @@ LOOK_PX = 72.0
 """A view is judged at the level where it is about so many pixels across
 (docs/decisions/registration.md, 2)."""
 KEPT_TO_LOOK = 24
-"""Candidates that pass from the coarse level to the judged one, at most: of those from many tiles the
-right one may stand below the 14th there (docs/decisions/registration.md, 12)."""
+"""Candidates that pass from the coarse level to the judged one, at most
+(docs/decisions/registration.md, 12)."""
 KEPT_TO_FINISH = 3
 """Places that are finished: the best and its rivals."""
 HOPE_AT_FIRST = 0.4
