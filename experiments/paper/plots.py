@@ -23,7 +23,7 @@ COLOURS = {
     "onnx": "tab:olive",
 }
 OTHER = "tab:green"
-SWEPT = (("autoencoder", "Auto-Encoder"), ("triplet", "Triplet"), ("gradient", "orthonav"))
+SWEPT = ("autoencoder", "triplet", "caevl", "gradient")
 STEPS = (("heading_deg", "heading error, deg"), ("drop_m", "height below the reported one, m"))
 RATIOS = (("lowe_ratio", "Lowe's ratio"), ("peak_ratio", "excluding half a tile"))
 
@@ -42,8 +42,10 @@ def draw(results: Sequence[Result], folder: Path) -> list[Path]:
 
 def _sensitivity(results: Sequence[Result], out: Path) -> Path:
     """Accuracy at 15 m against heading and height errors, a column per method."""
-    figure, axes = plt.subplots(2, 3, figsize=(11, 6), sharey=True, layout="constrained")
-    for column, (family, title) in enumerate(SWEPT):
+    figure, axes = plt.subplots(
+        2, len(SWEPT), figsize=(14, 6), sharey=True, layout="constrained", squeeze=False
+    )
+    for column, family in enumerate(SWEPT):
         for row, (step, label) in enumerate(STEPS):
             axis = axes[row, column]
             for each in (e for e in results if e.family == family):
@@ -57,7 +59,7 @@ def _sensitivity(results: Sequence[Result], out: Path) -> Path:
             axis.grid(alpha=0.3)
             if axis.lines:
                 axis.legend(fontsize=8)
-        axes[0, column].set_title(title)
+        axes[0, column].set_title(FAMILIES[family])
     for row in range(2):
         axes[row, 0].set_ylabel("within 15 m, %")
     return _saved(figure, out)

@@ -209,7 +209,7 @@ def _relevant(setting: dict[str, Any], families: set[str]) -> dict[str, Any]:
 
 def _plain(recipe: str) -> str:
     """A recipe without its epochs, of which more may be learnt."""
-    return re.sub(r",epochs=\d+", "", recipe)
+    return re.sub(r",(tuning_)?epochs=\d+", "", recipe)
 
 
 def expected() -> list[str]:
