@@ -1,8 +1,10 @@
-"""How the time and memory of a view grow: area searched, headings and heights that may be."""
+"""How the time and memory of a view grow: a table and a plot per kind of work, slopes named."""
 
 import math
 import sys
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -12,87 +14,131 @@ from benchmarks.record import Section, Table, number
 from benchmarks.verdicts import from_placed, percent
 from orthonav.simulate.flight import Errors
 
-SIDES_M = (1000, 4000, 10000)
-USUAL_YAW_DEG, USUAL_AGL = 10.0, 0.1
-PRIOR_STD_M = 50.0
-HEADER = (
-    *("area km2", "heading", "height", "prior", "ms", "p99 ms", "first view ms", "open ms"),
-    *("peak MB", "15 m"),
+VIEWS_M = 1000
+"""Side of the square over which all views are flown."""
+ALIKE = (
+    "unless a table varies it: 16 km2 of generated ground at 1 m, views of 256 px, heading to "
+    "10 deg and height to 10 % (standard deviation), no prior",
+    "processor time of one core, one process per row; first view: the cold one, right after the "
+    "map was opened; open: the map and the localizer; ms (median) and p99: warm; peak MB: "
+    "resident memory of the process",
 )
+HEADER = ("ms", "p99 ms", "first view ms", "open ms", "peak MB", "15 m")
 
 
 @dataclass(frozen=True)
 class Case:
-    """One row: side of the area in m, deviations of heading (None: unknown), height and prior."""
+    """One row: map, view and what is known of it.
 
-    side_m: int
-    yaw_std_deg: float | None = USUAL_YAW_DEG
-    agl_std: float = USUAL_AGL
+    - `side_m`, `gsd_m`: side of the map's area and its ground resolution.
+    - `ground_m`: ground that the shorter side of a view covers.
+    - `yaw_std_deg`: standard deviation of the reported heading; None: heading unknown.
+    - `agl_std`: that of the reported height, as a share of it.
+    - `prior_std_m`: that of the prior; None: no prior.
+    """
+
+    side_m: int = 4000
+    gsd_m: float = 1.0
+    ground_m: float = 256.0
+    yaw_std_deg: float | None = 10.0
+    agl_std: float = 0.1
     prior_std_m: float | None = None
 
     @property
     def errors(self) -> Errors:
         """What the telemetry of its flight gets wrong."""
-        yaw_std_deg = USUAL_YAW_DEG if self.yaw_std_deg is None else self.yaw_std_deg
+        yaw_std_deg = 10.0 if self.yaw_std_deg is None else self.yaw_std_deg
         return Errors(yaw_std_deg=yaw_std_deg, agl_std=self.agl_std, prior_std_m=self.prior_std_m)
 
-    @property
-    def cells(self) -> list[str]:
-        """The first columns of its row."""
-        heading = "unknown" if self.yaw_std_deg is None else f"{self.yaw_std_deg:g} deg"
-        prior = "none" if self.prior_std_m is None else f"{self.prior_std_m:g} m"
-        area_km2 = number((self.side_m / 1000) ** 2)
-        return [area_km2, heading, f"{self.agl_std:.0%}", prior]
+
+@dataclass(frozen=True)
+class Axis:
+    """One kind of work that grows: `cases` by the amount of it, all else alike."""
+
+    title: str
+    cases: dict[float, Case]
+
+
+SIDES_M = 1000, 2000, 4000, 10000
+AXES = (
+    Axis("area, km2", {(side / 1e3) ** 2: Case(side) for side in SIDES_M}),
+    Axis(
+        "area, km2, heading unknown", {(s / 1e3) ** 2: Case(s, yaw_std_deg=None) for s in SIDES_M}
+    ),
+    Axis(
+        "area, km2, prior of 50 m",
+        {(side / 1e3) ** 2: Case(side, prior_std_m=50) for side in SIDES_M},
+    ),
+    Axis(
+        "heading standard deviation, deg",
+        {std: Case(yaw_std_deg=std) for std in (2.0, 5, 10, 20, 40)},
+    ),
+    Axis(
+        "height standard deviation, %",
+        {100 * std: Case(agl_std=std) for std in (0.02, 0.05, 0.1, 0.3)},
+    ),
+    Axis("width of a view, px of the map", {px: Case(ground_m=px) for px in (96.0, 128, 256, 512)}),
+    Axis(
+        "pixels per metre, same ground", {1 / gsd: Case(1000, gsd_m=gsd) for gsd in (2.0, 1.0, 0.5)}
+    ),
+)
 
 
 def measure(place: Workplace) -> Section:
-    """One process per row: cold start, then every view warm."""
-    section = Section("How a view's time grows")
-    sides = SIDES_M[:1] if place.quick else SIDES_M
-    views = 6 if place.quick else 60
-    present = place.area(SIDES_M[0], 1.0, [PRESENT])[0]
-    rows = []
-    for case in _cases(sides):
-        map_path = place.map(place.area(case.side_m, 1.0, [PAST])[0])
-        flight = place.flown(present, views, case.errors)
-        result = placed(
-            Task(
-                BOTH,
-                str(map_path),
-                str(flight),
-                heading_known=case.yaw_std_deg is not None,
-                use_prior=case.prior_std_m is not None,
-            )
-        )
-        rows.append([*case.cells, *_cells(section, case, result)])
-        print(f"        {', '.join(case.cells)} done", file=sys.stderr, flush=True)
-    notes = (
-        "sd of the reported heading and height, and of the prior; one core, one process per row, "
-        f"{views} views of 2021 over the inner 1 x 1 km, the same places in every row",
-        "first view: the cold one, right after the map was opened; open: the map and the "
-        "localizer; ms and p99: warm; peak MB: resident memory of the process, Python, NumPy "
-        "and OpenCV (about 45 MB) included",
+    """One process per row: cold start, then every view warm. Writes a plot, `growth.png`."""
+    section, known = Section("How a view's time grows"), dict[Case, dict[str, object]]()
+    views = 6 if place.quick else 40
+    seen = f"{views} views of 2021 over the inner 1 x 1 km, the same places in every row"
+    curves = []
+    for axis in AXES[:1] if place.quick else AXES:
+        cases = {
+            x: case for x, case in axis.cases.items() if not place.quick or case.side_m <= 1000
+        }
+        rows, times_ms = [], []
+        for x, case in cases.items():
+            if case not in known:
+                known[case] = _placed(place, case, views)
+                print(f"        {axis.title}: {x:g} done", file=sys.stderr, flush=True)
+            cells, quantiles_ms = _cells(section, f"{axis.title} {x:g}", case, known[case])
+            rows.append([f"{x:g}", *cells])
+            times_ms.append(quantiles_ms)
+        slope = slope_of(list(cases), [median for median, _ in times_ms])
+        notes = () if math.isnan(slope) else (f"time of a view grows as x^{slope:.2f}",)
+        section.tables.append(Table(f"Growth: {axis.title}", (axis.title, *HEADER), rows, notes))
+        curves.append((axis.title, list(cases), times_ms, slope))
+    section.tables[-1] = replace(
+        section.tables[-1], notes=[*section.tables[-1].notes, *ALIKE, seen]
     )
-    section.tables = [Table("Growth", HEADER, rows, notes)]
+    _plot(curves, place.cache.parent / "growth.png")
     return section
 
 
-def _cases(sides_m: tuple[int, ...]) -> list[Case]:
-    cases = []
-    for side_m in sides_m:
-        cases += [Case(side_m), Case(side_m, None), Case(side_m, prior_std_m=PRIOR_STD_M)]
-    middle = sides_m[len(sides_m) // 2]
-    cases += [Case(middle, yaw_std_deg=2.0), Case(middle, agl_std=0.02), Case(middle, agl_std=0.3)]
-    return cases
+def slope_of(x: Sequence[float], y: Sequence[float]) -> float:
+    """Exponent p of y = a x^p, by least squares of the logarithms; NaN of fewer than two points."""
+    if len(x) < 2:
+        return math.nan
+    return float(np.polyfit(np.log(x), np.log(y), 1)[0])
 
 
-def _cells(section: Section, case: Case, result: dict[str, object]) -> list[str]:
+def _placed(place: Workplace, case: Case, views: int) -> dict[str, object]:
+    map_path = place.map(place.area(case.side_m, case.gsd_m, [PAST])[0])
+    present = place.area(VIEWS_M, case.gsd_m, [PRESENT])[0]
+    flight = place.flown(present, views, case.errors, case.ground_m)
+    known = case.yaw_std_deg is not None
+    use_prior = case.prior_std_m is not None
+    return placed(Task(BOTH, str(map_path), str(flight), heading_known=known, use_prior=use_prior))
+
+
+def _cells(
+    section: Section, name: str, case: Case, result: dict[str, object]
+) -> tuple[list[str], tuple[float, float]]:
+    """Cells of a row, and its median and p99 in ms."""
     verdict = from_placed(result)
-    name = ", ".join(case.cells)
-    data = f"generated {case.side_m} m square, 1 m"
+    data = f"generated {case.side_m} m square, {case.gsd_m:g} m"
     time = section.add(f"{name}: time", "ms", verdict.times_ms, data=data, seed=FLIGHT_SEED)
     figures = {"first view": "cold_ms", "open": "opened_ms", "peak memory": "peak_mb"}
-    cells = [number(time.median), number(float(np.percentile(verdict.times_ms, 99)))]
+    p99_ms = float(np.percentile(verdict.times_ms, 99))
+    cells = [number(time.median), number(p99_ms)]
     for figure, key in figures.items():
         value = float(str(result.get(key, math.nan)))
         unit = "MB" if key == "peak_mb" else "ms"
@@ -100,4 +146,33 @@ def _cells(section: Section, case: Case, result: dict[str, object]) -> list[str]
         cells.append(number(value))
     hits = verdict.within(15.0)
     section.add_share(f"{name}: within 15 m", hits, data=data, seed=FLIGHT_SEED)
-    return [*cells, percent(float(hits.mean()))]
+    return [*cells, percent(float(hits.mean()))], (time.median, p99_ms)
+
+
+def _plot(
+    curves: Sequence[tuple[str, Sequence[float], Sequence[tuple[float, float]], float]], path: Path
+) -> Path:
+    """Median and p99 of the time over the amount of work, one panel per kind of work."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    columns = min(len(curves), 4)
+    rows = math.ceil(len(curves) / columns)
+    figure, axes = pyplot.subplots(
+        rows, columns, figsize=(3.6 * columns, 3 * rows), layout="constrained", squeeze=False
+    )
+    for axis, (title, x, times_ms, slope) in zip(axes.flat, curves, strict=False):
+        median, p99 = zip(*times_ms, strict=True)
+        axis.loglog(x, median, "o-", label=f"median, slope {slope:.2f}")
+        axis.loglog(x, p99, "o--", label="99 %")
+        axis.set(xlabel=title, ylabel="ms a view")
+        axis.grid(alpha=0.3, which="both")
+        axis.legend(fontsize=8)
+    for axis in axes.flat[len(curves) :]:
+        axis.remove()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+    return path

@@ -9,7 +9,7 @@ from pathlib import Path
 import orthonav.simulate.landscape as landscape
 from benchmarks.flights import Flight, read_views
 from orthonav.prepare import BuildRequest, build_map
-from orthonav.simulate.flight import Errors, SimulateRequest, simulate_flight
+from orthonav.simulate.flight import DEFAULT_CAMERA, Errors, SimulateRequest, simulate_flight
 
 LANDSCAPE_SEED = 1
 FLIGHT_SEED = 7
@@ -74,14 +74,18 @@ class Workplace:
             build_map(request)
         return out
 
-    def flown(self, ortho: Path, count: int, errors: Errors) -> Path:
-        """Folder of a flight with views at random places over an orthophoto, flown once per run."""
-        spreads = (errors.yaw_std_deg, errors.agl_std, errors.prior_std_m)
+    def flown(self, ortho: Path, count: int, errors: Errors, ground_m: float | None = None) -> Path:
+        """Folder of a flight with views at random places over an orthophoto, flown once per run.
+
+        `ground_m`: ground that the shorter side of a view covers; None: 256 px of the orthophoto.
+        """
+        agl_m = None if ground_m is None else ground_m / min(DEFAULT_CAMERA.extent)
+        spreads = (errors.yaw_std_deg, errors.agl_std, errors.prior_std_m, agl_m)
         name = f"{ortho.parent.name}-{ortho.stem}-{count}-" + "-".join(map(str, spreads))
         folder = self.scratch / name
         if not folder.is_dir():
             request = SimulateRequest(
-                [ortho], folder, random=count, errors=errors, seed=FLIGHT_SEED
+                [ortho], folder, random=count, agl_m=agl_m, errors=errors, seed=FLIGHT_SEED
             )
             simulate_flight(request)
         return folder

@@ -13,7 +13,7 @@ from benchmarks.looped_flight import played, rest_of, views_of
 from benchmarks.pair import Arrivals, FakeAutopilot, Fly, Lines, free_port, on_core, sample
 from pymavlink.dialects.v20 import common as mavlink
 
-from benchmarks import install, soak
+from benchmarks import growth, install, soak
 from orthonav.flight import open_flight, read_truth
 from orthonav.geo.frames import LocalFrame
 
@@ -144,3 +144,9 @@ def test_sizes_of_required_packages_add_up():
     assert not names & {"torch", "rasterio", "pyproj"}
     assert install.installed_mb(["numpy"]) > 5
     assert install.installed_mb(["orthonav[autopilot]"]) > install.installed_mb(["numpy", "scipy"])
+
+
+def test_the_exponent_of_growth_is_that_of_a_power():
+    areas = [1.0, 4.0, 16.0, 100.0]
+    assert growth.slope_of(areas, [3 * area**0.5 for area in areas]) == pytest.approx(0.5)
+    assert math.isnan(growth.slope_of([1.0], [3.0]))
