@@ -101,9 +101,10 @@ class SearchPlan:
     """Candidates of a search at the final level: each is finished."""
     tile_candidates: tuple[int, int] = (20, 80)
     """Least and largest number of candidates from tiles."""
+    tile_candidates_any_heading: int = 400
+    """Largest number of them where the heading is unknown; docs/decisions/registration.md, 12."""
     tiles_a_candidate: int = 200
-    """Between these, one candidate for so many tiles, two where the heading is unknown: the right
-    tile ranks lower among more tiles; docs/decisions/registration.md, 12."""
+    """Between these, one candidate for so many tiles: the right one ranks lower among more."""
     tile_reach_strides: float = 1.1
     """The place of a candidate from tiles is sought within so many strides of the tile grid."""
     tile_apart_strides: float = 1.5
@@ -167,8 +168,9 @@ class SearchPlan:
     def candidates_from(self, tiles: int, heading_known: bool) -> int:
         """Number of candidates to take from so many tiles."""
         least, most = self.tile_candidates
-        share = (1 if heading_known else 2) / self.tiles_a_candidate
-        return max(least, min(most, round(share * tiles)))
+        if not heading_known:
+            most = self.tile_candidates_any_heading
+        return max(least, min(most, round(tiles / self.tiles_a_candidate)))
 
     def enough(self, run: Search, levels: Levels) -> ClearMargin:
         """The margin that ends the search after `run`."""
