@@ -1,10 +1,10 @@
 """Views of relief, placed on level ground and on the terrain of the map.
 
-`python -m benchmarks.over_terrain [--views 30] [--only GROUP ..] [--work DIR]` drapes imagery of
-another date over generated hills, renders true perspective views of it
+`python -m benchmarks.over_terrain [--views 30] [--only GROUP ..] [--areas SEED ..] [--work DIR]`
+drapes imagery of another date over generated hills, renders true perspective views of it
 (`orthonav.simulate.perspective`), and prints what of them is placed without and with the terrain,
 by wrong terrains, and far off nadir. Imagery is generated; with optional real imagery beside the
-checkout its rows use that.
+checkout its rows use that. `--on`, `--off-nadir` and `--slopes` choose parts of the rows.
 """
 
 import argparse
@@ -14,8 +14,8 @@ import math
 import pickle
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import astuple, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -158,7 +158,7 @@ class Bench:
     def _generated(self) -> tuple[Path, Path]:
         """Orthophotos of the map and of the flight, which reaches beyond the map: so does what
         cameras far off nadir see."""
-        folder, dates = self.work / "area", DEFAULT_DATES[:2]
+        folder, dates = self.work / f"area-{self.area}", DEFAULT_DATES[:2]
         map_path, (past, present) = folder / "map.tif", (folder / f"{d.name}.tif" for d in dates)
         if not map_path.is_file():
             size_m = (MAP_M[0] + 2 * BEYOND_M, MAP_M[1] + 2 * BEYOND_M)
@@ -177,7 +177,7 @@ class Bench:
         ground = self.ground(row.imagery)
         hills = ground.relief(row, self.seed)
         key = hashlib.sha256(
-            f"{replace(row, wrong='')}{self.views}{self.seed}".encode()
+            f"{replace(row, wrong='')}{self.views}{self.seed}{self.area}".encode()
         ).hexdigest()
         stored = self.work / f"{key[:16]}.views"
         if not stored.is_file():
@@ -352,8 +352,8 @@ def rows_of(options: argparse.Namespace) -> Iterator[Row]:
             yield Row("slopes", coarse, 256, slope, 600.0)
     for wrong in ("", "displaced by 200 m", "50 m too high", "with holes"):
         yield Row("wrong", fine, 192, 0.2, 300.0, wrong=wrong)
-    for tilt in (0.0, 30.0, 45.0, 60.0):
-        for slope in (0.0, 0.15):
+    for tilt in options.off_nadir:
+        for slope in options.slopes:
             yield Row(
                 "oblique", "generated", 480, slope, 300.0, tilt_deg=tilt, agl_m=250.0, radius_m=25.0
             )
@@ -363,9 +363,23 @@ def main() -> None:
     """Place, print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--work", type=Path, help="folder that is kept (default: a temporary one)")
-    parser.add_argument("--views", type=int, default=30, help="views of a row")
+    parser.add_argument("--views", type=int, default=30, help="views of a row and area")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="+", choices=GROUPS, default=GROUPS)
+    parser.add_argument(
+        "--areas", type=int, nargs="+", default=[3], help="seeds of the generated imagery"
+    )
+    parser.add_argument(
+        "--on", nargs="+", choices=("level", "terrain"), default=("level", "terrain"),
+        help="what views are placed on",
+    )  # fmt: skip
+    parser.add_argument(
+        "--off-nadir", type=float, nargs="+", default=[0.0, 30.0, 45.0, 60.0],
+        help="of the oblique views, degrees",
+    )  # fmt: skip
+    parser.add_argument(
+        "--slopes", type=float, nargs="+", default=[0.0, 0.15], help="of the oblique views"
+    )
     parser.add_argument("--generated", action="store_true", help="generated imagery only")
     parser.add_argument("--verbose", action="store_true", help="log every view")
     options = parser.parse_args()
@@ -376,24 +390,29 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         work = options.work or Path(temporary)
         work.mkdir(parents=True, exist_ok=True)
-        bench = Bench(work, options.views, options.seed)
+        benches = [Bench(work, options.views, options.seed, area) for area in options.areas]
         for row in rows_of(options):
             if row.group in options.only:
-                _print(bench, row)
+                _print(benches, row, options.on)
 
 
-def _print(bench: Bench, row: Row) -> None:
-    ground = bench.ground(row.imagery)
-    seen, hills = bench.seen(row)
-    frame = ground.opened.manifest.sheets[0].frame
-    terrain = layer_of(row, ground, hills)
+def _print(benches: list[Bench], row: Row, on: Sequence[str]) -> None:
+    """The lines of a row, of the views over all areas together; real imagery is one area."""
+    found: dict[str, list[Placed]] = {}
+    for bench in benches if row.imagery == "generated" else benches[:1]:
+        ground = bench.ground(row.imagery)
+        seen, hills = bench.seen(row)
+        frame = ground.opened.manifest.sheets[0].frame
+        for way, locate in ways(ground, layer_of(row, ground, hills), hills):
+            if way in on and not (way == "level" and row.wrong):
+                found.setdefault(way, []).append(placed(locate, seen, frame))
+        bench.ground.cache_clear()
     height = "measured" if row.measured else "above sea"
-    name = f"{ground.gsd_m:.3g} m, {row.view_px} px, height {height}"
-    for way, locate in ways(ground, terrain, hills):
-        if way == "level" and row.wrong:
-            continue
-        cells = placed(locate, seen, frame).cells(row)
+    for way, parts in found.items():
+        whole = Placed(*(np.concatenate(each) for each in zip(*map(astuple, parts), strict=True)))
+        name = f"{len(whole.errors_m)} of {ground.gsd_m:.3g} m, {row.view_px} px, height {height}"
         shown = f"{way} {row.wrong}".strip()
+        cells = whole.cells(row)
         print(f"| {name} | {row.slope:g} | {row.tilt_deg:.0f} | {shown} | {cells} |", flush=True)
 
 

@@ -1,8 +1,9 @@
 """A flight over hills, tracked end to end: simulated over a surface model, placed on a terrain.
 
-`python -m benchmarks.terrain_flight [--work DIR] [--side-m 2600]` generates an area with hills,
+`python -m benchmarks.terrain_flight [--work DIR] [--pitch-deg 0 30]` generates an area with hills,
 builds a map of one date with its terrain, flies a route over the surface model of another date, in
-which houses and trees stand up, and follows it. The barometer is off; terrains are right or wrong.
+which houses and trees stand up, and follows it. The barometer is off. With a camera that looks down
+terrains are right or wrong, with one that looks ahead right.
 """
 
 import argparse

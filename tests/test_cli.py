@@ -198,6 +198,7 @@ def test_locate_pixel(run, map_path, short_flight, out):
     assert abs(plain["lat_deg"] - placed["lat_deg"]) < 0.01 and plain["height_m"] is None
     assert plain["confident"] == placed["confident"]
     assert plain["ellipse_95"]["major_m"] >= plain["ellipse_95"]["minor_m"] > 0
+    assert list(plain["ellipse_95"]) == ["major_m", "minor_m", "direction_deg"]
     text = run(*to)
     assert text.code == 0 and "95 % ellipse" in text.out
     refused(run(*to[:2], "none.jpg", *to[3:]), "no view 'none.jpg'")

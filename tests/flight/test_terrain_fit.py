@@ -44,3 +44,19 @@ def test_a_terrain_that_fits_is_not_named(caplog):
 def test_what_does_not_fit_is_named_once(terrain, named, caplog):
     said = said_of(terrain, caplog)
     assert len(said) == 1 and named in said[0]
+
+
+def test_a_long_flight_is_judged_by_its_latest_views(caplog, monkeypatch):
+    """A wrong datum is named once most of them lie on the part of the terrain that has it."""
+    monkeypatch.setattr("orthonav.flight.terrain_fit.MAX_VIEWS", 40)
+
+    def joined(lat, lon):
+        return np.where(np.asarray(lon) < 2.005, 200.0, 260.0)
+
+    fit = TerrainFit(joined)
+    for number in range(240):
+        if number == 200:
+            assert caplog.records == []
+        lon = 2.0 if number < 200 else 2.01
+        fit.take(Fix(47.0, lon, np.eye(2), 0.99, 15.0, 0.0, 250.0, {}), 450.0)
+    assert "m higher than reported" in caplog.records[0].getMessage()

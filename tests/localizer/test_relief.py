@@ -10,6 +10,7 @@ from blots import AGL_M, CAMERA, FINEST_M, GROUND, as_grey, known_map, rendered
 from orthonav.flight.fixes import result_to_json
 from orthonav.geo.ground import Ground
 from orthonav.localizer import Localizer
+from orthonav.localizer.plan import DEFAULT_PLAN
 from orthonav.localizer.relief import Relief
 from orthonav.mapfile import open_map
 from orthonav.records import Fix, Telemetry, View, ViewResult
@@ -213,3 +214,36 @@ def test_views_far_off_nadir_are_found_on_hills(opened, grey, relief):
     localizer = on_terrain(opened, relief)
     fix = localizer.locate(View(picture, CAMERA, telemetry((74.0, 60.0, 0.0))))
     assert error_m(localizer, fix, place) < 5.0 and fix.confidence > 0.9
+
+
+def looking(opened, relief, **changes):
+    """A localizer to which every further search is dear."""
+    plan = replace(DEFAULT_PLAN, **{"cheap_ms": 0.0, "look_ms": 0.0} | changes)
+    localizer = Localizer(opened, plan=plan)
+    localizer.registration.relief = Relief(Terrain(relief), localizer.grid)
+    return localizer
+
+
+def test_a_place_that_stands_out_on_the_terrain_ends_the_search(opened, grey, relief):
+    """Unless it is doubtful, or the time is limited."""
+    attitude, place = (70.0, 60.0, 0.0), np.array([-60.0, -120.0])
+    picture, _ = seen_from(grey, relief, attitude, place=place)
+    view = View(picture, CAMERA, telemetry((74.0, 60.0, 0.0)))
+    early = looking(opened, relief).locate(view)
+    whole, doubtful, limited = (
+        looking(opened, relief, **changes).locate(view)
+        for changes in ({"look_ms": math.inf}, {"doubt": 0.0}, {"budget_ms": 1e6})
+    )
+    assert early.evidence["candidates"] < whole.evidence["candidates"]
+    assert error_m(looking(opened, relief), early, place) < 1.0 and early.confidence > 0.99
+    for other in (doubtful, limited):
+        assert other.evidence["candidates"] == whole.evidence["candidates"]
+
+
+@pytest.mark.parametrize("attitude", [(70.0, 60.0, 0.0), (70.0, 30.0, 0.0)])
+def test_ground_of_another_place_does_not_end_the_search_with_confidence(
+    opened, grey, relief, attitude
+):
+    picture, _ = seen_from(replace(grey, values=grey.values[:, ::-1]), relief, attitude)
+    fix = looking(opened, relief).locate(View(picture, CAMERA, telemetry(attitude)))
+    assert not isinstance(fix, Fix) or fix.confidence < 0.9

@@ -13,6 +13,7 @@ from orthonav.publish.estimate import (
     Clock,
     EstimateError,
     NavigationEstimate,
+    ellipse_95,
     error_ellipse,
     estimate_from_result,
 )
@@ -97,6 +98,12 @@ def test_the_ellipse_is_that_of_the_covariance(turn: float, one: float, other: f
 
 def test_a_long_axis_to_the_north_east_points_there() -> None:
     assert error_ellipse(np.array([[5.0, 4.0], [4.0, 5.0]])) == pytest.approx((3.0, 1.0, 45.0))
+
+
+def test_the_95_percent_ellipse_is_wider_and_unknown_where_there_is_none() -> None:
+    found = ellipse_95(np.array([[5.0, 4.0], [4.0, 5.0]]))
+    assert found == {"major_m": 7.343, "minor_m": 2.448, "direction_deg": 45.0}
+    assert ellipse_95(np.full((2, 2), math.nan)) is None
 
 
 @pytest.mark.parametrize("cov", [[[1, 0], [0, math.nan]], [[1, 2], [2, 1]], [[-1, 0], [0, -1]]])

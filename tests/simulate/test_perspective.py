@@ -14,6 +14,7 @@ from orthonav.imagery.terrain import open_dem
 from orthonav.simulate.flight import SimulateRequest, simulate_flight
 from orthonav.simulate.landscape import generate_area, generate_heights
 from orthonav.simulate.landscape.epoch import DEFAULT_DATES
+from orthonav.simulate.landscape.scene import Landscape
 from orthonav.simulate.perspective import Raster, met, rays_enu, seen_view
 from orthonav.simulate.render import render_view
 
@@ -91,3 +92,21 @@ def test_objects_of_the_landscape_stand_where_they_are_drawn(tmp_path):
     objects = over - bare[0, 0]
     assert 0.02 < (objects > 2).mean() < 0.9 and 5 < objects.max() <= 26
     assert (objects >= 0).all()
+
+
+def test_heights_show_progress_and_an_interrupt_leaves_none(tmp_path, monkeypatch):
+    shares = []
+    size = {"size_m": (400.0, 300.0), "dates": (AUTUMN,), "seed": 1}
+    made = generate_heights(tmp_path / "whole", slope=0.1, progress=shares.append, **size)
+    assert sorted(each.name for each in (tmp_path / "whole").iterdir()) == sorted(
+        each.name for each in made
+    )
+    assert shares == sorted(shares) and shares[0] == 0 and shares[-1] == 1
+
+    def interrupted(self, *window):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Landscape, "object_heights", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        generate_heights(tmp_path / "stopped", slope=0.1, **size)
+    assert not (tmp_path / "stopped").exists()

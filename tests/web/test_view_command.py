@@ -62,6 +62,7 @@ def test_missing_and_damaged_files_are_reported_at_start(run, small, served, tmp
     refused(run("view", fixes, "--map", area, "--flight", tmp_path / "none"), "flight does not")
     refused(run("view", fixes, "--map", area, "--flight", area), "orthonav import")
     refused(run("view", fixes, "--map", area, "--truth", tmp_path / "none.csv"), "truth does not")
+    refused(run("view", fixes, "--map", area, "--mount", fixes), "not a mount file")
     refused(run("view", fixes, "--map", area, "--radius-m", "-1"), "radius")
     refused(run("view", fixes, "--map", area, "--host", "192.0.2.1"), "cannot listen")
     far = tmp_path / "none" / "live.jsonl"

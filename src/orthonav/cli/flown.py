@@ -94,6 +94,7 @@ def _check_map(options: argparse.Namespace, logged: Any) -> None:
 def _flown(logged: Any) -> dict[str, Any]:
     """Options of a log, validated: a log is untrusted input."""
     from orthonav.errors import FlightError
+    from orthonav.flight.mount import logged_mount
 
     if not isinstance(logged, dict):
         return {}
@@ -109,16 +110,5 @@ def _flown(logged: Any) -> dict[str, Any]:
                 raise FlightError(f"flight log: invalid option {name}: {logged[name]!r:.40}")
             found[name] = logged[name]
     if "mount" in logged:
-        found["mount"] = None if logged["mount"] is None else _mount(logged["mount"])
+        found["mount"] = logged_mount(logged)
     return found
-
-
-def _mount(plain: Any) -> "Mount":
-    from orthonav.errors import FlightError, described
-    from orthonav.flight.calibrated import BROKEN
-    from orthonav.flight.mount import mount_from_plain
-
-    try:
-        return mount_from_plain(plain)
-    except BROKEN as error:
-        raise FlightError(f"flight log: invalid mount ({described(error)})") from error

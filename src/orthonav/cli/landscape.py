@@ -46,6 +46,7 @@ def run(options: argparse.Namespace) -> None:
                 size_m=tuple(options.size_m),
                 gsd_m=options.gsd_m,
                 seed=options.seed,
+                progress=lambda share: shown("heights", share),
             )
         files = generate_area(
             options.out,

@@ -48,7 +48,7 @@ def run(options: argparse.Namespace) -> None:
     from orthonav.flight.pixel import locate_pixel
     from orthonav.mapfile import open_map
     from orthonav.mapfile.terrain import TerrainLayer
-    from orthonav.publish.estimate import ELLIPSE_95, error_ellipse
+    from orthonav.publish.estimate import ellipse_95
     from orthonav.records import Fix
 
     result = {each.frame: each for each in read_results(options.fixes)}.get(options.frame)
@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> None:
         if terrain is None:
             raise FlightError(f"the map has no terrain: {options.map}")
     found = locate_pixel(flight.camera, telemetry, fix, (options.x, options.y), terrain)
-    major_m, minor_m, direction_deg = error_ellipse(found.cov_en_m2)
+    ellipse = ellipse_95(found.cov_en_m2)
     height_m = None if math.isnan(found.height_m) else round(found.height_m, 2)
     if options.json:
         print_json(
@@ -80,20 +80,17 @@ def run(options: argparse.Namespace) -> None:
                 "height_m": height_m,
                 "range_m": round(found.range_m, 2),
                 "cov_en_m2": found.cov_en_m2.tolist(),
-                "ellipse_95": {
-                    "major_m": round(ELLIPSE_95 * major_m, 3),
-                    "minor_m": round(ELLIPSE_95 * minor_m, 3),
-                    "direction_deg": round(direction_deg, 1),
-                },
+                "ellipse_95": ellipse,
                 "confident": result.is_confident,
             }
         )
         return
     above = "" if height_m is None else f", {height_m:.1f} m above sea"
     print(f"{found.lat_deg:.8f}, {found.lon_deg:.8f}{above}")
-    print(
-        f"95 % ellipse {ELLIPSE_95 * major_m:.1f} x {ELLIPSE_95 * minor_m:.1f} m, major axis at "
-        f"{direction_deg:.0f} deg; {found.range_m:.0f} m from the camera"
-    )
+    axes = "unknown"
+    if ellipse is not None:
+        axes = f"{ellipse['major_m']:.1f} x {ellipse['minor_m']:.1f} m, major axis at "
+        axes += f"{ellipse['direction_deg']:.0f} deg"
+    print(f"95 % ellipse {axes}; {found.range_m:.0f} m from the camera")
     if not result.is_confident:
         print("! the position of this view is a best guess")

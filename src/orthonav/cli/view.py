@@ -40,6 +40,13 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="true positions (default: those of the flight folder, if any)",
     )
     parser.add_argument(
+        "--mount",
+        type=Path,
+        metavar="mount.json",
+        help="calibration of the mount with which the flight was localized (default: that of the "
+        "flight log, if RUN is one)",
+    )
+    parser.add_argument(
         "--radius-m", type=float, default=15.0, help="largest error of a correct fix (default 15)"
     )
     parser.add_argument(
@@ -71,6 +78,7 @@ def run(options: argparse.Namespace) -> None:
         map_path=options.map,
         flight=options.flight,
         truth=options.truth,
+        mount=options.mount,
         radius_m=options.radius_m,
         live=options.live,
     )

@@ -4,12 +4,13 @@
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from orthonav.flight.calibrated import read_record, write_record
+from orthonav.errors import FlightError, described
+from orthonav.flight.calibrated import BROKEN, read_record, write_record
 from orthonav.flight.recording import Flight, WithTelemetry
 from orthonav.geo.camera import Camera
 from orthonav.records import Telemetry
@@ -96,6 +97,15 @@ def mount_from_plain(plain: Any) -> Mount:
     """Inverse of `asdict`, checked; raises one of `calibrated.BROKEN` for an invalid mount."""
     biases = {name: _bias(plain[name], name) for name in _LIMITS}
     return Mount(**biases, views=int(plain["views"]))
+
+
+def logged_mount(options: Mapping[str, Any]) -> Mount | None:
+    """The mount among the options of a flight log, None for none. Raises `FlightError`."""
+    plain = options.get("mount")
+    try:
+        return None if plain is None else mount_from_plain(plain)
+    except BROKEN as error:
+        raise FlightError(f"flight log: invalid mount ({described(error)})") from error
 
 
 def _bias(plain: dict[str, Any], name: str) -> Bias:

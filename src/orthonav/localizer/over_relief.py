@@ -61,6 +61,9 @@ class GroundSeen:
 class ViewOnLevelGround:
     """One view on level ground."""
 
+    level = True
+    """Whether a view is registered as it is found; else again on the ground below it."""
+
     def __init__(self, registrar: Registrar, view: PreparedView) -> None:
         self.registrar, self.view = registrar, view
         self._finer: ViewTemplates | None = None
@@ -69,8 +72,8 @@ class ViewOnLevelGround:
         """A judged candidate at the final level."""
         return self.registrar.at_final(self.view.templates, self.view.levels, judged)
 
-    def looked_again(self, judged: list[Placed]) -> list[Placed]:
-        """Judged candidates after all searches, where none of them stands out."""
+    def looked_again(self, judged: list[Placed], at_most: int | None = None) -> list[Placed]:
+        """Judged candidates, `at_most` so many of them looked at again, where none stands out."""
         return judged
 
     def templates_of(self, placed: Placed) -> ViewTemplates:
@@ -103,6 +106,8 @@ class ViewOnLevelGround:
 class ViewOverRelief(ViewOnLevelGround):
     """One view on the ground of a sheet. Not to be shared between threads."""
 
+    level = False
+
     def __init__(self, relief: Relief, registrar: Registrar, view: PreparedView) -> None:
         super().__init__(registrar, view)
         self.seen = ReliefView(relief, view)
@@ -110,16 +115,17 @@ class ViewOverRelief(ViewOnLevelGround):
         self._found: dict[Pose, _Placed | None] = {}
         self._best_look = 0.0
         self._level_scores: dict[Pose, float] = {}
+        # Candidates of level ground on the terrain, and after a search around them.
+        self._looked: dict[Pose, tuple[ViewTemplates, Placed] | None] = {}
+        self._searched: dict[Pose, Placed] = {}
 
     def finish(self, judged: Placed) -> Finished:
         """A judged candidate at the final level: on the terrain, or on level ground where that is
         as good, or where less than half of the ground is known."""
-        made = self._at_look(judged.pose)
-        if made is None:
+        known = judged.pose in self._level_scores
+        first = self._looked_at(judged.pose) if known else self._settled(judged.pose)
+        if first is None:
             return self._on_level_ground(judged)
-        first = self._refined(judged.pose, made)
-        if judged.pose not in self._level_scores:
-            first = self._settled(judged.pose, made, first)
         if first.score < RIVAL_SHARE * self._best_look:
             return self._on_level_ground(judged)
         self._best_look = max(self._best_look, first.score)
@@ -139,19 +145,20 @@ class ViewOverRelief(ViewOnLevelGround):
         self._found[made.placed.pose] = None
         return made
 
-    def looked_again(self, judged: list[Placed]) -> list[Placed]:
-        """All judged candidates on the terrain, at the judged level, and the surroundings of the
-        best of them: where relief displaces much, the right one may be far down the list of those
-        on level ground, and off by more than refinement follows."""
-        made = [self._at_look(each.pose) for each in judged]
-        placed = [
-            each if seen is None else self._refined(each.pose, seen)
-            for each, seen in zip(judged, made, strict=True)
-        ]
-        for number in self._best_apart(placed):
-            seen = made[number]
-            if seen is not None:
-                placed[number] = self._settled(judged[number].pose, seen, placed[number])
+    def looked_again(self, judged: list[Placed], at_most: int | None = None) -> list[Placed]:
+        """Judged candidates on the terrain, at the judged level, and the surroundings of the best
+        of them: where relief displaces much, the right one may be far down the list of those on
+        level ground, and off by more than refinement follows.
+
+        `at_most`: only so many, the best that lie apart.
+        """
+        if at_most is not None:
+            best = self._best_apart(judged)[:at_most]
+            others = [each for number, each in enumerate(judged) if number not in best]
+            return self.looked_again([judged[number] for number in best]) + others
+        placed = [self._looked_at(each.pose) or each for each in judged]
+        for number in self._best_apart(placed)[:SETTLED]:
+            placed[number] = self._settled(judged[number].pose) or judged[number]
         for number, (before, after) in enumerate(zip(judged, placed, strict=True)):
             if after.score > before.score:
                 self._level_scores[after.pose] = before.score
@@ -169,25 +176,32 @@ class ViewOverRelief(ViewOnLevelGround):
         for number in ranked:
             if all(apart_px(placed[number], placed[other]) > apart for other in chosen):
                 chosen.append(number)
-        return chosen[:SETTLED]
+        return chosen
 
-    def _at_look(self, pose: Pose) -> ViewTemplates | None:
-        """Templates on the terrain at the judged level; None where level ground is as good."""
-        if self.seen.is_level(pose):
-            return None
-        return self.seen.templates_at(pose, self.view.levels.look)
+    def _looked_at(self, pose: Pose) -> Placed | None:
+        """A pose refined on the terrain at the judged level; None where level ground is as good."""
+        if pose not in self._looked:
+            made = None
+            if not self.seen.is_level(pose):
+                made = self.seen.templates_at(pose, self.view.levels.look)
+            self._looked[pose] = None if made is None else (made, self._refined(pose, made))
+        found = self._looked[pose]
+        return None if found is None else found[1]
 
     def _refined(self, pose: Pose, made: ViewTemplates) -> Placed:
-        """A pose refined on the terrain at the judged level."""
+        """A pose refined at the judged level."""
         levels = self.view.levels
         return self.registrar.refiner(made, levels, levels.look).place(
             pose, FULL_STEPS, ROUGH_STEP_PX
         )
 
-    def _settled(self, pose: Pose, made: ViewTemplates, first: Placed) -> Placed:
-        """`first`, or a better place by a search around it at the coarse level: far off nadir,
+    def _settled(self, pose: Pose) -> Placed | None:
+        """`_looked_at`, or a better place by a search around it at the coarse level: far off nadir,
         relief displaces a view by more than refinement follows."""
-        levels, side_px = self.view.levels, self.view.side_px
+        best, found = self._looked_at(pose), self._looked[pose]
+        if best is None or found is None or pose in self._searched:
+            return self._searched.get(pose)
+        made, levels, side_px = found[0], self.view.levels, self.view.side_px
         recipe = levels.recipe(levels.coarse)
         window = self.registrar.part_window(
             levels.coarse, recipe, side_px, (pose.x_px, pose.y_px), NEAR_REACH * side_px
@@ -198,9 +212,10 @@ class ViewOverRelief(ViewOnLevelGround):
             for scale in NEAR_SCALES
         ]
         template = made.at(levels.coarse, recipe)
-        for found in search(template, window, poses, 1, self.view.prior.scale_map):
-            first = max(first, self._refined(found.pose, made), key=lambda each: each.score)
-        return first
+        for near in search(template, window, poses, 1, self.view.prior.scale_map):
+            best = max(best, self._refined(near.pose, made), key=lambda each: each.score)
+        self._searched[pose] = best
+        return best
 
     def _placed(self, pose: Pose) -> Finished | None:
         """A candidate refined on the terrain; None where too little of it is known."""

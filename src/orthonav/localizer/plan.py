@@ -135,6 +135,11 @@ class SearchPlan:
     max_search_px: int = 8_000_000
     """Larger windows (some 300 MB) are not searched by FFT: on such a map views are found by
     tiles, or with a prior."""
+    look_ms: float = 20.0
+    """Before a search dearer than this the best candidates so far are placed on the terrain, which
+    costs about as much for each; `python -m benchmarks.over_terrain --only oblique`."""
+    looks: int = 3
+    """So many of them."""
     budget_ms: float = math.inf
     """No search after the first one is begun that would end later than this after the first one
     began, ms; the best place so far is the answer."""

@@ -184,8 +184,9 @@ class RegistrationLocalizer:
         direct: list[Placed] = []
         best: Registered | None = None
         candidates = 0
+        enough = self.plan.clear
 
-        def finished() -> Registered:
+        def finished(judged: list[Placed]) -> Registered:
             return self.registrar.finished(
                 view.templates, view.levels, judged, view.prior, candidates, ground.finish, direct
             )
@@ -198,6 +199,10 @@ class RegistrationLocalizer:
             lambda: self._tiles(view, rows()),
         )
         for each in takewhile(lambda each: budget.allows(each.cost_ms), searches):
+            if each.cost_ms > self.plan.look_ms and (
+                best := self._found_early(view, ground, judged, enough, finished)
+            ):
+                return best
             if each.from_tiles and self.propose is not None:
                 found = self._from_tiles(view, prior, each, rows(), self.propose)
             else:
@@ -212,7 +217,7 @@ class RegistrationLocalizer:
             best = None
             enough = self.plan.enough(each, view.levels)
             if judged and self._seems_clear(view, judged, enough):
-                best = finished()
+                best = finished(judged)
                 # Candidates from tiles are not all places: their rivals alone prove too little.
                 proven = not each.from_tiles or not self._is_doubtful(best)
                 if proven and self._is_clear(best, enough):
@@ -221,8 +226,30 @@ class RegistrationLocalizer:
             return None
         if best is None or self.relief is not None:
             judged = ground.looked_again(judged) if budget.allows(0.0) else judged
-            best = finished()
+            best = finished(judged)
         return replace(self._deepened(view, ground, best), cut_short=budget.cut_short)
+
+    def _found_early(
+        self,
+        view: PreparedView,
+        ground: ViewOnLevelGround,
+        judged: list[Placed],
+        enough: ClearMargin,
+        finished: Callable[[list[Placed]], Registered],
+    ) -> Registered | None:
+        """The best place so far, if it stands out on the ground as it is and is not doubtful.
+
+        None on level ground, where it would have ended the search before, and with a budget of
+        time, which does not know the cost of this.
+        """
+        if ground.level or not judged or math.isfinite(self.plan.budget_ms):
+            return None
+        looked = ground.looked_again(judged, self.plan.looks)
+        best, rival = self.registrar.standing(view.templates, looked, view.prior)
+        if best <= max(enough.look_ratio * rival, self._chances.look):
+            return None
+        found = finished(looked)
+        return found if self._is_clear(found, enough) and not self._is_doubtful(found) else None
 
     def _deepened(
         self, view: PreparedView, ground: ViewOnLevelGround, best: Registered

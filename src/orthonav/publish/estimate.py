@@ -201,6 +201,22 @@ def error_ellipse(cov_en: NDArray[np.float64]) -> tuple[float, float, float]:
     return major, minor, direction_deg
 
 
+def ellipse_95(cov_en: NDArray[np.float64]) -> dict[str, float] | None:
+    """The 95 % ellipse of a (2, 2) covariance in m^2, as commands and pages write it.
+
+    Semi-axes `major_m` and `minor_m` to a millimetre, `direction_deg` of the major one to a tenth
+    of a degree clockwise from north. None where `error_ellipse` has NaN.
+    """
+    major_m, minor_m, direction_deg = error_ellipse(cov_en)
+    if math.isnan(major_m):
+        return None
+    return {
+        "major_m": round(ELLIPSE_95 * major_m, 3),
+        "minor_m": round(ELLIPSE_95 * minor_m, 3),
+        "direction_deg": round(direction_deg, 1),
+    }
+
+
 def _both_clocks(
     time_ns: int, clock: Clock, utc_minus_boot_ns: int | None
 ) -> tuple[int | None, int | None]:

@@ -26,6 +26,7 @@ from orthonav.flight.logged import (
     picture_of,
     view_of,
 )
+from orthonav.flight.mount import Mount, logged_mount
 from orthonav.flight.png import grey_of_png
 from orthonav.geo.camera import Camera
 from orthonav.sources.flightlog import (
@@ -92,6 +93,7 @@ class LogReader:
     def _reset(self) -> None:
         self.camera: Camera | None = None
         self.session: dict[str, Any] = {}
+        self.mount: Mount | None = None
         self._views: dict[str, LoggedView] = {}
         self._places: dict[int, _ImagePlace] = {}
         self._results, self._health, self._broken = 0, 0, 0
@@ -168,6 +170,8 @@ class LogReader:
         elif found.topic == SESSION.name:
             self.session = session_of(data, path)
             self.camera = camera_of(self.session.get("camera"))
+            options = self.session.get("options")
+            self.mount = logged_mount(options if isinstance(options, dict) else {})
         elif found.topic == RESULT.name and len(data) <= MAX_JSON_BYTES:
             batch.results.append(result_from_json(data.decode("utf-8")))
             self._results += 1

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from orthonav.errors import FlightError, MissingFileError
 from orthonav.flight import read_truth
+from orthonav.flight.mount import read_mount
 from orthonav.mapfile import open_map
 from orthonav.mapfile.signature import map_digest
 from orthonav.sources.flightlog import is_flight_log
@@ -27,6 +28,7 @@ class ViewRequest:
     map_path: Path
     flight: Path | None = None
     truth: Path | None = None
+    mount: Path | None = None
     radius_m: float = 15.0
     live: bool = False
 
@@ -49,7 +51,8 @@ def open_run(request: ViewRequest) -> Run:
         truth=truth_name,
         live=request.live,
     )
-    run = Run(labels, feed, images, sheet, truth, request.radius_m)
+    mount = None if request.mount is None else read_mount(request.mount)
+    run = Run(labels, feed, images, sheet, truth, request.radius_m, mount)
     for problem in run.problems:
         log.warning("%s", problem)
     _warn(request, run, feed, truth)

@@ -3,7 +3,7 @@
 import math
 import threading
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,9 @@ from orthonav import __version__
 from orthonav.errors import FlightError, OrthonavError
 from orthonav.evaluate.contact_sheet import as_fixed
 from orthonav.flight.fixes import STATES
+from orthonav.flight.mount import Mount
 from orthonav.flight.pixel import locate_pixel
-from orthonav.publish.estimate import ELLIPSE_95, error_ellipse
+from orthonav.publish.estimate import ellipse_95
 from orthonav.records import Fix, Telemetry, ViewResult
 from orthonav.web.columns import columns_of
 from orthonav.web.feed import Batch, Feed
@@ -44,7 +45,8 @@ class RunLabels:
 
 @dataclass(frozen=True, eq=False)
 class _Placed:
-    """A view, the telemetry corrected by its fix, and the ground that it shows."""
+    """A view without the errors of its mount, the telemetry corrected by its fix, and the ground
+    that it shows."""
 
     shot: Shot
     telemetry: Telemetry
@@ -62,8 +64,13 @@ class Run:
         sheet: SheetImagery,
         truth: Mapping[str, tuple[float, float]],
         radius_m: float,
+        mount: Mount | None = None,
     ) -> None:
-        """Read what exists. Raises what the feed raises, and `FlightError` for an empty run."""
+        """Read what exists. `mount`: None: that of the flight log, where the feed is one.
+
+        Raises what the feed raises, and `FlightError` for an empty run.
+        """
+        self._mount = mount
         self.labels, self.sheet = labels, sheet
         self._feed, self._images = feed, images
         self._truth, self._radius_m = truth, radius_m
@@ -177,7 +184,7 @@ class Run:
         east, north = np.asarray(self.sheet.frame.en_from_latlon(*place)) + window.offset_en_m
         return self.sheet.crop_png((float(east), float(north)), window)
 
-    def ground(self, index: int, x: float, y: float) -> dict[str, float | None]:
+    def ground(self, index: int, x: float, y: float) -> dict[str, Any]:
         """The ground at a point of the rectified view, shares of its window from the left and the
         top, with its 95 % ellipse. Raises `IndexError` or `FlightError`."""
         result = self._result(index)
@@ -188,14 +195,11 @@ class Run:
         camera = placed.shot.camera
         px = image_px(placed.telemetry, camera, placed.window, (x, y))
         found = locate_pixel(camera, placed.shot.telemetry, fix, px, self.sheet.terrain)
-        major_m, minor_m, direction_deg = error_ellipse(found.cov_en_m2)
         return {
             "lat_deg": found.lat_deg,
             "lon_deg": found.lon_deg,
             "height_m": _known(found.height_m),
-            "major_m": _known(ELLIPSE_95 * major_m),
-            "minor_m": _known(ELLIPSE_95 * minor_m),
-            "direction_deg": _known(direction_deg),
+            "ellipse_95": ellipse_95(found.cov_en_m2),
             "confident": result.is_confident,
         }
 
@@ -206,6 +210,11 @@ class Run:
             return self._results[index]
 
     def _placed(self, result: ViewResult, shot: Shot) -> _Placed:
+        mount = self._mount
+        if mount is None and isinstance(self._feed, LogReader):
+            mount = self._feed.mount
+        if mount is not None:
+            shot = replace(shot, telemetry=mount.corrected(shot.telemetry))
         telemetry = as_fixed(shot.telemetry, result)
         return _Placed(shot, telemetry, window_of(telemetry, shot.camera, self.sheet.grid.gsd_m))
 

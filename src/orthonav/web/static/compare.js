@@ -32,10 +32,14 @@ export class Compare {
     let said;
     try {
       const g = await getGround(this.store.selected, x, y);
+      const ellipse = g.ellipse_95;
       const height = g.height_m === null ? "" : `, ${metres(g.height_m)} above sea`;
       said = g.confident ? "" : "Best guess, not a confident position: ";
-      said += `${place(g.lat_deg, g.lon_deg)}${height}; 95 % ellipse ${metres(g.major_m)} x ${metres(g.minor_m)}, `
-        + `major axis at ${number(g.direction_deg, 0)}°`;
+      said += place(g.lat_deg, g.lon_deg) + height;
+      if (ellipse !== null) {
+        said += `; 95 % ellipse ${metres(ellipse.major_m)} x ${metres(ellipse.minor_m)}, `
+          + `major axis at ${number(ellipse.direction_deg, 0)}°`;
+      }
     } catch (error) {
       said = error.message;
     }
