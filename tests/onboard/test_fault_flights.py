@@ -40,7 +40,7 @@ def fly(world, fault, recovery_s, seconds=None):
     "name",
     [
         "mirrored, velocity reversed",
-        "cloud, velocity 3 m/s off",
+        pytest.param("cloud, velocity 3 m/s off", marks=pytest.mark.slow),
     ],
 )
 def test_pictures_that_show_nothing_of_the_map_give_no_wrong_message(world, name):

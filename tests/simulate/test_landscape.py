@@ -59,7 +59,9 @@ def test_other_seed_other_land(pair):
     [
         (1.0, AUTUMN, (WEST_M, NORTH_M)),
         (0.3, SUMMER, (WEST_M + 700.1, NORTH_M + 0.25)),
-        (0.7, SPRING, (WEST_M - 40000.3, NORTH_M + 30000.7)),
+        pytest.param(
+            0.7, SPRING, (WEST_M - 40000.3, NORTH_M + 30000.7), marks=pytest.mark.slow
+        ),
         (3.0, SPRING, (WEST_M - 500.0, NORTH_M + 300.0)),
     ],
 )
