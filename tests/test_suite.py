@@ -9,9 +9,9 @@ import tomllib
 from collections import Counter
 from pathlib import Path
 
-import absent
 import pytest
 
+import absent
 from orthonav.extras import module_of
 
 ROOT = Path(__file__).resolve().parents[1]

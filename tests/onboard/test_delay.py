@@ -138,6 +138,7 @@ def test_clouds_over_a_part_do_no_harm():
     assert len(errors) > 5 and np.abs(errors).max() < 0.15
 
 
+@pytest.mark.slow
 def test_the_same_values_give_the_same_estimates():
     flown = Flown(20, seed=8)
     first, second = (Measured(flown, lambda _: 0.12, seconds=18) for _ in range(2))

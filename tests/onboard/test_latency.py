@@ -185,7 +185,9 @@ def test_a_stream_that_is_late_from_the_start():
     assert flight.gate.withheld["stale"] > 31
 
 
-@pytest.mark.parametrize(("late_s", "stamps"), [(0.7, False), pytest.param(8.0, True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("late_s", "stamps"), [(0.7, False), pytest.param(8.0, True, marks=pytest.mark.slow)]
+)
 def test_a_stall_after_which_the_stream_is_late(late_s, stamps):
     delay = {"s": 0.12}
     flight = LateFlight(Flown(110, seed=4), 0.12, lambda _: delay["s"])
